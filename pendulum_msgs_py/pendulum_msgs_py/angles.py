@@ -1,0 +1,52 @@
+"""Angles of the pendulum: theta = 0 hangs down, theta = pi is upright, counter-clockwise is positive."""
+
+from __future__ import annotations
+
+import math
+from typing import overload
+
+import numpy as np
+from numpy.typing import NDArray
+
+__all__ = ["UPRIGHT", "from_upright", "wrap"]
+
+UPRIGHT = math.pi
+"""Angle of the inverted pendulum [rad]."""
+
+_TWO_PI = 2.0 * math.pi
+
+
+
+@overload
+def wrap(angle: float) -> float: ...
+@overload
+def wrap(angle: NDArray[np.float64]) -> NDArray[np.float64]: ...
+def wrap(angle: float | NDArray[np.float64]) -> float | NDArray[np.float64]:
+    """Return the equivalent angle in [-pi, pi).
+
+    Angles that already lie there come back bit for bit, so that wrapping never adds rounding noise to a loop.
+
+    Args:
+        angle: Angle or array of angles [rad].
+    """
+    if isinstance(angle, np.ndarray):
+        wrapped = (angle + math.pi) % _TWO_PI - math.pi
+        return np.where((angle >= -math.pi) & (angle < math.pi), angle, wrapped)
+    if -math.pi <= angle < math.pi:
+        return angle
+    wrapped = (angle + math.pi) % _TWO_PI - math.pi
+    # The modulo of a tiny negative number rounds up to the modulus itself.
+    return wrapped if wrapped < math.pi else -math.pi
+
+
+@overload
+def from_upright(theta: float) -> float: ...
+@overload
+def from_upright(theta: NDArray[np.float64]) -> NDArray[np.float64]: ...
+def from_upright(theta: float | NDArray[np.float64]) -> float | NDArray[np.float64]:
+    """Return the deviation from upright, wrap(theta - pi) [rad], which is what controllers see.
+
+    Args:
+        theta: Joint angle or array of joint angles [rad].
+    """
+    return wrap(theta - UPRIGHT)

@@ -1,0 +1,41 @@
+"""Names on the ROS graph: one definition of each topic, service, joint and node."""
+
+from __future__ import annotations
+
+__all__ = [
+    "APPLIED_EFFORT",
+    "ARM",
+    "CLOCK",
+    "DIAGNOSTICS",
+    "DISTURBANCE",
+    "EFFORT_COMMAND",
+    "EVENTS",
+    "E_STOP",
+    "E_STOP_RESET",
+    "JOINT",
+    "JOINT_STATES",
+    "JOINT_TRAJECTORY",
+    "LINK",
+    "PUSH",
+]
+
+JOINT = "pendulum_joint"
+LINK = "pendulum_link"
+
+# Relative names: a namespace or a remap swaps the plant.
+JOINT_STATES = "joint_states"
+EFFORT_COMMAND = "effort_command"
+DISTURBANCE = "disturbance"
+JOINT_TRAJECTORY = "joint_trajectory"
+PUSH = "push"
+APPLIED_EFFORT = "applied_effort"
+EVENTS = "events"
+
+# Absolute names, by ROS convention.
+DIAGNOSTICS = "/diagnostics"
+CLOCK = "/clock"
+
+# Private services of a plant.
+ARM = "~/arm"
+E_STOP = "~/e_stop"
+E_STOP_RESET = "~/e_stop_reset"

@@ -1,0 +1,276 @@
+"""Typed tables of parameters: one row gives a parameter its name, default, unit, domain and meaning.
+
+The same table declares ROS parameters (with descriptor and range), checks YAML files and writes the table in a
+package's README.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from difflib import get_close_matches
+from pathlib import Path
+from typing import Any, Union
+
+import yaml
+
+from pendulum_msgs_py.errors import ParameterError
+
+__all__ = [
+    "ParameterSpec",
+    "ParameterValue",
+    "load_yaml",
+    "markdown_table",
+    "read_text",
+    "reject_unknown",
+    "require_mapping",
+    "validate",
+]
+
+ParameterValue = Union[bool, int, float, str, list[float], list[str]]
+
+_TYPE_NAMES = {bool: "true or false", int: "an integer", float: "a number", str: "text", list: "a list"}
+
+
+@dataclass(frozen=True)
+class ParameterSpec:
+    """One parameter.
+
+    Attributes:
+        name: Name, as in YAML and on the ROS side.
+        default: Default; its type is the parameter's type. A list's element type is that of its first element.
+        unit: SI unit, ``-`` where it has none, empty for text.
+        description: What it means, one sentence.
+        minimum: Smallest value allowed (of each element for a list).
+        maximum: Largest value allowed.
+        exclusive_minimum: The minimum itself is not allowed.
+        choices: Values allowed, for text.
+        read_only: Cannot change while the node runs.
+    """
+
+    name: str
+    default: ParameterValue
+    unit: str
+    description: str
+    minimum: float | None = None
+    maximum: float | None = None
+    exclusive_minimum: bool = False
+    choices: tuple[str, ...] = ()
+    read_only: bool = False
+
+    @property
+    def domain(self) -> str:
+        """The values allowed, in words: ``> 0``, ``0 to 1``, ``one of a, b``, or empty for any."""
+        if self.choices:
+            return "one of " + ", ".join(self.choices)
+        above = ">" if self.exclusive_minimum else ">="
+        if self.minimum is not None and self.maximum is not None:
+            if self.exclusive_minimum:
+                return f"> {self.minimum:g} and <= {self.maximum:g}"
+            return f"{self.minimum:g} to {self.maximum:g}"
+        if self.minimum is not None:
+            return f"{above} {self.minimum:g}"
+        if self.maximum is not None:
+            return f"<= {self.maximum:g}"
+        return ""
+
+    def check(self, value: object, *, where: str = "") -> Any:
+        """Return the value in the parameter's own type.
+
+        Args:
+            value: What the user gave.
+            where: Prefix of the message, such as ``plant.yaml:12``.
+
+        Raises:
+            ParameterError: The value has another type, is not finite, or lies outside the domain.
+        """
+        if isinstance(self.default, list):
+            if not isinstance(value, Sequence) or isinstance(value, (str, bytes)):
+                raise self._error(value, "expected a list", where)
+            sample: Any = self.default[0] if self.default else ""
+            return [self._check_scalar(element, type(sample), where) for element in value]
+        return self._check_scalar(value, type(self.default), where)
+
+    def _check_scalar(self, value: object, wanted: type, where: str) -> Any:
+        if wanted is float:
+            if isinstance(value, bool) or not isinstance(value, (int, float)):
+                raise self._error(value, f"expected {self._expected('a number')}", where)
+            number = float(value)
+            if not math.isfinite(number):
+                raise self._error(value, f"expected {self._expected('a finite number')}", where)
+            self._check_range(number, where)
+            return number
+        if wanted is int:
+            if isinstance(value, bool) or not isinstance(value, int):
+                raise self._error(value, f"expected {self._expected('an integer')}", where)
+            self._check_range(value, where)
+            return value
+        if not isinstance(value, wanted):
+            raise self._error(value, f"expected {_TYPE_NAMES[wanted]}", where)
+        if self.choices and value not in self.choices:
+            raise self._error(value, f"expected {self.domain}", where)
+        return value
+
+    def _check_range(self, number: float, where: str) -> None:
+        too_low = self.minimum is not None and (
+            number <= self.minimum if self.exclusive_minimum else number < self.minimum
+        )
+        if too_low or (self.maximum is not None and number > self.maximum):
+            raise self._error(number, f"expected {self.domain}", where)
+
+    def _expected(self, kind: str) -> str:
+        return f"{kind} {self.domain}" if self.domain else kind
+
+    def _error(self, value: object, expectation: str, where: str) -> ParameterError:
+        unit = f" {self.unit}" if self.unit not in {"", "-"} and isinstance(value, (int, float)) else ""
+        prefix = f"{where}: " if where else ""
+        return ParameterError(f"{prefix}{self.name} is {value!r}{unit}; {expectation}")
+
+
+def validate(
+    specs: Iterable[ParameterSpec], values: Mapping[str, object], *, where: str = ""
+) -> dict[str, Any]:
+    """Return all parameters of a table, given values checked, others at their default.
+
+    Raises:
+        ParameterError: A name is unknown, or a value is refused.
+    """
+    table = {spec.name: spec for spec in specs}
+    reject_unknown(values, table, where=where)
+    return {
+        name: spec.check(values[name], where=where) if name in values else spec.default
+        for name, spec in table.items()
+    }
+
+
+def reject_unknown(values: Mapping[str, object], known: Iterable[str], *, where: str = "") -> None:
+    """Raise a ParameterError that names the first unknown key and the nearest known one."""
+    known = list(known)
+    for name in values:
+        if name not in known:
+            near = get_close_matches(str(name), known, n=1)
+            hint = f"; did you mean {near[0]!r}?" if near else f"; expected one of {', '.join(known)}"
+            prefix = f"{where}: " if where else ""
+            raise ParameterError(f"{prefix}unknown parameter {name!r}{hint}")
+
+
+def require_mapping(value: object, what: str) -> dict[str, Any]:
+    """Return the value if it is a mapping with text keys, else raise a ParameterError that names it."""
+    if not isinstance(value, dict) or not all(isinstance(key, str) for key in value):
+        kind = "nothing" if value is None else type(value).__name__
+        raise ParameterError(f"{what} is {kind}; expected a mapping of names to values")
+    return value
+
+
+class _StrictLoader(yaml.SafeLoader):
+    """Safe YAML that refuses what YAML allows silently: a key given twice, and aliases that grow without bound."""
+
+    def compose_node(self, parent: Any, index: Any) -> Any:
+        if self.check_event(yaml.AliasEvent):
+            event = self.peek_event()
+            raise yaml.MarkedYAMLError(
+                problem=f"alias *{event.anchor} is not allowed here", problem_mark=event.start_mark
+            )
+        return super().compose_node(parent, index)
+
+    def construct_mapping(self, node: Any, deep: bool = False) -> Any:
+        seen: set[object] = set()
+        for key_node, _ in node.value:
+            key = self.construct_object(key_node, deep=True)
+            try:
+                repeated = key in seen
+            except TypeError as error:
+                raise yaml.MarkedYAMLError(
+                    problem="a key must be text", problem_mark=key_node.start_mark
+                ) from error
+            if repeated:
+                raise yaml.MarkedYAMLError(
+                    problem=f"key {key!r} is given twice", problem_mark=key_node.start_mark
+                )
+            seen.add(key)
+        return super().construct_mapping(node, deep)
+
+
+_MAX_YAML_BYTES = 1_000_000
+_MAX_YAML_DEPTH = 40
+
+
+def read_text(path: str | Path, what: str, *, limit: int = _MAX_YAML_BYTES) -> str:
+    """Return the text of a file, or raise a ParameterError that says why it cannot be read.
+
+    Args:
+        path: The file.
+        what: What the file should be, such as ``plant file``.
+        limit: Largest size accepted [bytes]; nobody writes a parameter file of a megabyte by hand.
+    """
+    path = Path(path)
+    try:
+        size = path.stat().st_size
+        if path.is_dir():
+            raise ParameterError(f"{what} {path} is a folder; expected a file")
+        if size > limit:
+            raise ParameterError(f"{what} {path} has {size} bytes; expected at most {limit}")
+        return path.read_text(encoding="utf-8")
+    except FileNotFoundError as error:
+        raise ParameterError(f"{what} {path} does not exist") from error
+    except UnicodeDecodeError as error:
+        raise ParameterError(f"{what} {path} is not UTF-8 text") from error
+    except (OSError, ValueError) as error:
+        if isinstance(error, ParameterError):
+            raise
+        reason = error.strerror if isinstance(error, OSError) else str(error)
+        raise ParameterError(f"{what} {path} cannot be read: {reason}") from error
+
+
+def load_yaml(path: str | Path, what: str = "file") -> dict[str, Any]:
+    """Return the mapping that a YAML file holds.
+
+    Args:
+        path: The file.
+        what: What it should be, for messages.
+
+    Raises:
+        ParameterError: The file is missing, not text, not YAML (with line and column), or holds no mapping.
+    """
+    text = read_text(path, what)
+    loader = _StrictLoader(text)
+    try:
+        _refuse_deep_nesting(text, what, path)
+        return require_mapping(loader.get_single_data(), f"{what} {path}")
+    except yaml.MarkedYAMLError as error:
+        mark = error.problem_mark or error.context_mark
+        place = f"{path}:{mark.line + 1}:{mark.column + 1}" if mark else str(path)
+        raise ParameterError(f"{place}: {error.problem or error.context}") from error
+    except (yaml.YAMLError, ValueError, RecursionError) as error:
+        if isinstance(error, ParameterError):
+            raise
+        raise ParameterError(f"{what} {path} is not YAML: {error}") from error
+    finally:
+        loader.dispose()
+
+
+def _refuse_deep_nesting(text: str, what: str, path: str | Path) -> None:
+    depth = 0
+    for event in yaml.parse(text, Loader=yaml.SafeLoader):
+        if isinstance(event, (yaml.MappingStartEvent, yaml.SequenceStartEvent)):
+            depth += 1
+            if depth > _MAX_YAML_DEPTH:
+                raise ParameterError(f"{what} {path} is nested deeper than {_MAX_YAML_DEPTH} levels")
+        elif isinstance(event, (yaml.MappingEndEvent, yaml.SequenceEndEvent)):
+            depth -= 1
+
+
+def markdown_table(specs: Iterable[ParameterSpec]) -> str:
+    """Return the table of parameters for a README."""
+    rows = ["| parameter | default | unit | allowed | meaning |", "|---|---|---|---|---|"]
+    for spec in specs:
+        default = str(spec.default).lower() if isinstance(spec.default, bool) else f"{spec.default}"
+        if spec.default == "":
+            default = '""'
+        fixed = " Read-only." if spec.read_only else ""
+        rows.append(
+            f"| `{spec.name}` | `{default}` | {spec.unit or '–'} | {spec.domain or 'any'} "
+            f"| {spec.description}{fixed} |"
+        )
+    return "\n".join(rows) + "\n"
