@@ -1,0 +1,154 @@
+"""JointState of one joint to and from CDR bytes with one precompiled struct.
+
+rclpy builds, serialises and deserialises a JointState in 4, 4 and 11 us; with a fixed layout the same takes a
+fraction of a microsecond. The layout is checked in full before a byte is believed: whatever differs (another
+joint, several joints, another byte order) is left to real deserialisation.
+
+Layout (XCDR1, little endian; offsets after the four bytes of encapsulation header)::
+
+    0   int32 sec, uint32 nanosec, uint32 length, frame_id with NUL, padding to 4
+        uint32 1, uint32 length, joint name with NUL, padding to 4
+        uint32 n, padding to 8 if n, n doubles: position; likewise velocity and effort
+
+Source: OMG CDR (formal/02-06-51, section 15.3); sensor_msgs/msg/JointState.
+"""
+
+from __future__ import annotations
+
+import struct
+from typing import NamedTuple
+
+from pendulum_msgs_py.names import JOINT
+from pendulum_msgs_py.values import NANOSECONDS
+
+__all__ = ["MAX_SECONDS", "JointStateFields", "decode_joint_state", "encode_joint_state"]
+
+MAX_SECONDS = 2**31 - 1
+"""Largest ``sec`` of a ROS time stamp."""
+
+_HEADER = b"\x00\x01\x00\x00"
+_PREFIX = struct.Struct("<4xiII")
+_COUNT = struct.Struct("<I")
+_MAX_TRAILING = 15
+
+
+class JointStateFields(NamedTuple):
+    """What a JointState of one joint holds; None for a quantity that the message leaves out."""
+
+    stamp_ns: int
+    frame_id: str
+    joint: str
+    position: float | None
+    velocity: float | None
+    effort: float | None
+
+
+def encode_joint_state(
+    stamp_ns: int,
+    *,
+    frame_id: str = "",
+    joint: str = JOINT,
+    position: float | None = None,
+    velocity: float | None = None,
+    effort: float | None = None,
+) -> bytes:
+    """Return the CDR bytes of a JointState of one joint, padding zeroed, so that equal messages are equal bytes.
+
+    Args:
+        stamp_ns: Stamp, 0 to ``MAX_SECONDS`` seconds [ns].
+        frame_id: Header frame, by our contract the name of the sender.
+        joint: Joint name.
+        position: theta [rad], or None to leave it out.
+        velocity: theta' [rad/s], or None.
+        effort: Torque [N m], or None.
+
+    Raises:
+        struct.error: The stamp does not fit a ROS time.
+    """
+    layout, name_bytes = _layout(frame_id, joint, position is not None, velocity is not None, effort is not None)
+    sec, nanosec = divmod(stamp_ns, NANOSECONDS)
+    frame = frame_id.encode() + b"\x00"
+    values: list[object] = [sec, nanosec, len(frame), frame, 1, len(name_bytes), name_bytes]
+    for quantity in (position, velocity, effort):
+        if quantity is None:
+            values.append(0)
+        else:
+            values.append(1)
+            values.append(quantity)
+    return _HEADER + layout.pack(*values)
+
+
+def decode_joint_state(data: bytes) -> JointStateFields | None:
+    """Return the fields of a one-joint JointState, or None where the bytes have any other layout.
+
+    Args:
+        data: A serialised message, encapsulation header included.
+    """
+    size = len(data)
+    if size < 24 or data[0:2] != b"\x00\x01":
+        return None
+    try:
+        sec, nanosec, frame_length = _PREFIX.unpack_from(data)
+        # Offsets below count from the start of ``data``; CDR aligns relative to byte 4, and 4 is a multiple of 4.
+        frame_end = 16 + frame_length
+        offset = (frame_end + 3) & ~3
+        if frame_length == 0 or offset + 8 > size or data[frame_end - 1] != 0:
+            return None
+        joints, name_length = struct.unpack_from("<II", data, offset)
+        name_start = offset + 8
+        name_end = name_start + name_length
+        if joints != 1 or name_length == 0 or name_end > size or data[name_end - 1] != 0:
+            return None
+        offset = (name_end + 3) & ~3
+        quantities: list[float | None] = []
+        for _ in range(3):
+            (count,) = _COUNT.unpack_from(data, offset)
+            offset += 4
+            if count == 0:
+                quantities.append(None)
+            elif count == 1:
+                offset += (4 - offset) & 7
+                quantities.append(struct.unpack_from("<d", data, offset)[0])
+                offset += 8
+            else:
+                return None
+        # rclpy reserves room for the alignment of each sequence, empty ones too, and leaves it at the end.
+        if size - offset > _MAX_TRAILING or nanosec >= NANOSECONDS:
+            return None
+        frame_id = data[16 : frame_end - 1].decode()
+        joint = data[name_start : name_end - 1].decode()
+    except (struct.error, UnicodeDecodeError):
+        return None
+    return JointStateFields(sec * NANOSECONDS + nanosec, frame_id, joint, *quantities)
+
+
+_layout_cache: dict[tuple[str, str, bool, bool, bool], tuple[struct.Struct, bytes]] = {}
+
+
+def _layout(
+    frame_id: str, joint: str, has_position: bool, has_velocity: bool, has_effort: bool
+) -> tuple[struct.Struct, bytes]:
+    key = (frame_id, joint, has_position, has_velocity, has_effort)
+    cached = _layout_cache.get(key)
+    if cached is not None:
+        return cached
+    frame_length = len(frame_id.encode()) + 1
+    name_bytes = joint.encode() + b"\x00"
+    pieces = ["<iII", f"{frame_length}s"]
+    offset = 12 + frame_length
+    pieces.append(f"{-offset % 4}xII{len(name_bytes)}s")
+    offset += -offset % 4 + 8 + len(name_bytes)
+    pieces.append(f"{-offset % 4}x")
+    offset += -offset % 4
+    for present in (has_position, has_velocity, has_effort):
+        pieces.append("I")
+        offset += 4
+        if present:
+            pieces.append(f"{-offset % 8}xd")
+            offset += -offset % 8 + 8
+    layout = struct.Struct("".join(pieces))
+    # A node sends under one or two names; a stranger's endless names must not grow the cache without bound.
+    if len(_layout_cache) >= 256:
+        _layout_cache.clear()
+    _layout_cache[key] = (layout, name_bytes)
+    return layout, name_bytes

@@ -1,0 +1,152 @@
+"""Position trajectories: the thesis's smooth ramp, and sampling of any trajectory between its points."""
+
+from __future__ import annotations
+
+import bisect
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from pendulum_msgs_py.errors import ParameterError
+
+__all__ = [
+    "MAX_RAMP_VELOCITY",
+    "RAMP_INCREMENT",
+    "RAMP_PERIOD",
+    "Trajectory",
+    "TrajectoryPoint",
+    "from_points",
+    "thesis_ramp",
+]
+
+RAMP_INCREMENT = 0.002
+"""Position step of the thesis's ramp [rad]."""
+RAMP_PERIOD = 0.01
+"""Time between two steps of the ramp, 100 Hz [s]."""
+MAX_RAMP_VELOCITY = 0.3
+"""Amplitude of the half-sine of commanded velocity [rad/s]."""
+
+
+@dataclass(frozen=True, slots=True)
+class TrajectoryPoint:
+    """One point of a trajectory: time from its start [s], position [rad], velocity [rad/s]."""
+
+    time: float
+    position: float
+    velocity: float
+
+
+@dataclass(frozen=True)
+class Trajectory:
+    """Points at increasing times; between them position and velocity are interpolated linearly.
+
+    Linear, not cubic, because the thesis commands position and velocity as two separate curves (a linear ramp and a
+    half sine that is no derivative of it) and a spline through both would be neither.
+    """
+
+    points: tuple[TrajectoryPoint, ...]
+
+    def __post_init__(self) -> None:
+        """Refuse what no position controller should be asked to follow."""
+        if not self.points:
+            raise ParameterError("trajectory has 0 points; expected at least one")
+        previous = -math.inf
+        for index, point in enumerate(self.points):
+            if not (
+                math.isfinite(point.time) and math.isfinite(point.position) and math.isfinite(point.velocity)
+            ):
+                raise ParameterError(f"trajectory point {index} is {point}; expected finite numbers")
+            if point.time < 0.0 or point.time <= previous:
+                raise ParameterError(
+                    f"trajectory point {index} is at {point.time} s; expected >= 0 s and later than {previous} s"
+                )
+            previous = point.time
+
+    @property
+    def duration(self) -> float:
+        """Time of the last point [s]."""
+        return self.points[-1].time
+
+    @property
+    def start(self) -> float:
+        """First position [rad]."""
+        return self.points[0].position
+
+    @property
+    def goal(self) -> float:
+        """Last position [rad]."""
+        return self.points[-1].position
+
+    def max_speed(self) -> float:
+        """Return the largest speed asked for, as commanded or as positions imply [rad/s]."""
+        speed = max(abs(point.velocity) for point in self.points)
+        for before, after in zip(self.points, self.points[1:]):
+            speed = max(speed, abs(after.position - before.position) / (after.time - before.time))
+        return speed
+
+    def at(self, time: float) -> tuple[float, float]:
+        """Return position [rad] and velocity [rad/s] at a time from the start [s]; held before and after."""
+        if time <= self.points[0].time:
+            return self.points[0].position, self.points[0].velocity
+        if time >= self.duration:
+            # At the end the hold begins: the thesis then commands a velocity of zero.
+            return self.goal, 0.0
+        index = bisect.bisect_right(self.points, time, key=lambda point: point.time)
+        before, after = self.points[index - 1], self.points[index]
+        share = (time - before.time) / (after.time - before.time)
+        return (
+            before.position + share * (after.position - before.position),
+            before.velocity + share * (after.velocity - before.velocity),
+        )
+
+
+def thesis_ramp(
+    start: float,
+    goal: float,
+    *,
+    increment: float = RAMP_INCREMENT,
+    period: float = RAMP_PERIOD,
+    max_velocity: float = MAX_RAMP_VELOCITY,
+) -> Trajectory:
+    """Return the thesis's smooth move: positions in steps of 0.002 rad at 100 Hz, velocity a half cycle of a sine.
+
+    Args:
+        start: First position [rad].
+        goal: Last position [rad].
+        increment: Position step [rad], > 0.
+        period: Time between two steps [s], > 0.
+        max_velocity: Amplitude of the half sine [rad/s]. A short move gets a smaller one.
+
+    Source:
+        Thesis, section "Determination of Gravitational force coefficient of the system".
+    """
+    for name, value in (("start", start), ("goal", goal), ("increment", increment), ("period", period)):
+        if not math.isfinite(value):
+            raise ParameterError(f"ramp {name} is {value}; expected a finite number")
+    if increment <= 0.0 or period <= 0.0:
+        raise ParameterError(f"ramp increment is {increment} rad and period {period} s; expected both > 0")
+    distance = goal - start
+    steps = max(1, math.ceil(abs(distance) / increment - 1e-9))
+    # The average of a half sine is 2/pi of its peak: it never has to promise more speed than the move needs.
+    peak = min(max_velocity, 0.5 * math.pi * abs(distance) / (steps * period))
+    direction = math.copysign(1.0, distance) if distance else 0.0
+    return Trajectory(
+        tuple(
+            TrajectoryPoint(
+                time=index * period,
+                position=start + distance * index / steps,
+                velocity=direction * peak * math.sin(math.pi * index / steps),
+            )
+            for index in range(steps + 1)
+        )
+    )
+
+
+def from_points(times: Sequence[float], positions: Sequence[float], velocities: Sequence[float]) -> Trajectory:
+    """Return a trajectory from three sequences of one length: times [s], positions [rad], velocities [rad/s]."""
+    if not len(times) == len(positions) == len(velocities):
+        raise ParameterError(
+            f"trajectory has {len(times)} times, {len(positions)} positions and {len(velocities)} velocities; "
+            "expected as many of each"
+        )
+    return Trajectory(tuple(map(TrajectoryPoint, times, positions, velocities)))
