@@ -1,0 +1,169 @@
+"""MCAP records as bytes (https://mcap.dev/spec), as far as a rosbag2 file needs them.
+
+Every record is an opcode (one byte), a length (uint64) and its content, little-endian throughout.
+"""
+
+from __future__ import annotations
+
+import struct
+import zlib
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+__all__ = [
+    "CHANNEL",
+    "CHUNK",
+    "CHUNK_INDEX",
+    "DATA_END",
+    "FOOTER",
+    "FOOTER_SIZE",
+    "HEADER",
+    "MAGIC",
+    "MESSAGE",
+    "MESSAGE_HEADER",
+    "MESSAGE_INDEX",
+    "METADATA",
+    "METADATA_INDEX",
+    "PADDING",
+    "RECORD_HEAD",
+    "RECORD_HEAD_SIZE",
+    "SCHEMA",
+    "STATISTICS",
+    "SUMMARY_OFFSET",
+    "ChunkIndex",
+    "channel_record",
+    "footer_record",
+    "header_record",
+    "metadata_index_record",
+    "metadata_record",
+    "padding_head",
+    "record",
+    "schema_record",
+    "statistics_record",
+    "summary_offset_record",
+]
+
+MAGIC = b"\x89MCAP0\r\n"
+HEADER, FOOTER, SCHEMA, CHANNEL, MESSAGE, CHUNK, MESSAGE_INDEX, CHUNK_INDEX = range(0x01, 0x09)
+STATISTICS, METADATA, METADATA_INDEX, SUMMARY_OFFSET, DATA_END = range(0x0B, 0x10)
+PADDING = 0x80
+"""A private opcode (0x80 to 0xFF are free for applications): every reader skips the record."""
+
+RECORD_HEAD = struct.Struct("<BQ")
+RECORD_HEAD_SIZE = RECORD_HEAD.size
+MESSAGE_HEADER = struct.Struct("<BQHIQQ")
+"""opcode, length, channel id, sequence, log time, publish time; the message bytes follow."""
+_FOOTER = struct.Struct("<QQI")
+FOOTER_SIZE = RECORD_HEAD_SIZE + _FOOTER.size
+_STATISTICS = struct.Struct("<QHIIIIQQI")
+
+
+def record(opcode: int, content: bytes) -> bytes:
+    """Return one whole record."""
+    return RECORD_HEAD.pack(opcode, len(content)) + content
+
+
+def _text(value: str) -> bytes:
+    data = value.encode()
+    return struct.pack("<I", len(data)) + data
+
+
+def _text_map(items: Mapping[str, str]) -> bytes:
+    body = b"".join(_text(key) + _text(value) for key, value in items.items())
+    return struct.pack("<I", len(body)) + body
+
+
+def header_record(library: str) -> bytes:
+    """Return the header of a ROS 2 file."""
+    return record(HEADER, _text("ros2") + _text(library))
+
+
+def schema_record(schema_id: int, name: str, encoding: str, definition: str) -> bytes:
+    """Return a message definition under an id of 1 or more."""
+    return record(SCHEMA, struct.pack("<H", schema_id) + _text(name) + _text(encoding) + _text(definition))
+
+
+def channel_record(channel_id: int, schema_id: int, topic: str, metadata: Mapping[str, str]) -> bytes:
+    """Return the description of one topic whose messages are CDR."""
+    head = struct.pack("<HH", channel_id, schema_id)
+    return record(CHANNEL, head + _text(topic) + _text("cdr") + _text_map(metadata))
+
+
+def metadata_record(name: str, items: Mapping[str, str]) -> bytes:
+    """Return a named map of strings."""
+    return record(METADATA, _text(name) + _text_map(items))
+
+
+def metadata_index_record(offset: int, length: int, name: str) -> bytes:
+    """Return the summary's pointer to a metadata record."""
+    return record(METADATA_INDEX, struct.pack("<QQ", offset, length) + _text(name))
+
+
+def statistics_record(
+    *,
+    message_count: int,
+    schema_count: int,
+    metadata_count: int,
+    chunk_count: int,
+    start_ns: int,
+    stop_ns: int,
+    channel_counts: Mapping[int, int],
+) -> bytes:
+    """Return counts and time span of the file."""
+    head = _STATISTICS.pack(
+        message_count,
+        schema_count,
+        len(channel_counts),
+        0,
+        metadata_count,
+        chunk_count,
+        start_ns,
+        stop_ns,
+        10 * len(channel_counts),
+    )
+    return record(STATISTICS, head + b"".join(struct.pack("<HQ", *item) for item in channel_counts.items()))
+
+
+def summary_offset_record(opcode: int, start: int, length: int) -> bytes:
+    """Return where the summary's records of one kind stand."""
+    return record(SUMMARY_OFFSET, struct.pack("<BQQ", opcode, start, length))
+
+
+def footer_record(summary_start: int, summary_offset_start: int, summary: bytes | None = None) -> bytes:
+    """Return the footer; with the summary's bytes it carries their checksum, without it says "no checksum"."""
+    if summary is None:
+        return record(FOOTER, _FOOTER.pack(summary_start, summary_offset_start, 0))
+    head = RECORD_HEAD.pack(FOOTER, _FOOTER.size) + struct.pack("<QQ", summary_start, summary_offset_start)
+    return head + struct.pack("<I", zlib.crc32(head, zlib.crc32(summary)))
+
+
+def padding_head(start: int, stop: int) -> bytes:
+    """Return the head of a private record that fills the bytes from ``start`` to ``stop``."""
+    return RECORD_HEAD.pack(PADDING, stop - start - RECORD_HEAD_SIZE)
+
+
+@dataclass(slots=True)
+class ChunkIndex:
+    """Where a chunk stands and which channels it holds (offsets of its message indexes, in file order)."""
+
+    start_ns: int
+    stop_ns: int
+    offset: int
+    length: int
+    message_index_offsets: dict[int, int]
+    message_index_length: int
+    compression: str
+    compressed_size: int
+    uncompressed_size: int
+
+    def to_record(self) -> bytes:
+        """Return the record for the summary."""
+        offsets = b"".join(struct.pack("<HQ", *item) for item in self.message_index_offsets.items())
+        return record(
+            CHUNK_INDEX,
+            struct.pack("<QQQQI", self.start_ns, self.stop_ns, self.offset, self.length, len(offsets))
+            + offsets
+            + struct.pack("<Q", self.message_index_length)
+            + _text(self.compression)
+            + struct.pack("<QQ", self.compressed_size, self.uncompressed_size),
+        )

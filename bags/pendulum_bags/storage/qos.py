@@ -1,0 +1,88 @@
+"""QoS profiles as a bag stores them (rosbag2 metadata version 9: named policies)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+__all__ = ["INFINITE_NS", "QosProfile"]
+
+INFINITE_NS = 2**63 - 1
+"""What rmw means by "no limit" for a deadline, a lifespan or a lease [ns]."""
+
+
+@dataclass(frozen=True, slots=True)
+class QosProfile:
+    """Offered QoS of one publisher, in the words of rosbag2.
+
+    Args:
+        history: ``keep_last``, ``keep_all`` or ``unknown`` (discovery does not tell).
+        depth: Queue length in messages (0 when discovery does not tell).
+        reliability: ``reliable`` or ``best_effort``.
+        durability: ``volatile`` or ``transient_local``.
+        deadline_ns: Promised longest interval between messages [ns].
+        lifespan_ns: Age after which a message is worthless [ns].
+        liveliness: ``automatic`` or ``manual_by_topic``.
+        lease_ns: Liveliness lease [ns].
+    """
+
+    history: str = "keep_last"
+    depth: int = 10
+    reliability: str = "reliable"
+    durability: str = "volatile"
+    deadline_ns: int = INFINITE_NS
+    lifespan_ns: int = INFINITE_NS
+    liveliness: str = "automatic"
+    lease_ns: int = INFINITE_NS
+
+    def to_yaml(self, indent: str) -> str:
+        """Return the profile as one item of a block-style YAML list."""
+        inner = indent + "  "
+        return (
+            f"{indent}- history: {self.history}\n"
+            f"{inner}depth: {self.depth}\n"
+            f"{inner}reliability: {self.reliability}\n"
+            f"{inner}durability: {self.durability}\n"
+            f"{_duration(inner, 'deadline', self.deadline_ns)}"
+            f"{_duration(inner, 'lifespan', self.lifespan_ns)}"
+            f"{inner}liveliness: {self.liveliness}\n"
+            f"{_duration(inner, 'liveliness_lease_duration', self.lease_ns)}"
+            f"{inner}avoid_ros_namespace_conventions: false\n"
+        )
+
+    @classmethod
+    def from_mapping(cls, item: dict[str, Any]) -> QosProfile:
+        """Read one profile of a ``metadata.yaml`` (version 9 names; older files use numbers)."""
+        return cls(
+            history=_name(item.get("history"), _HISTORY),
+            depth=int(item.get("depth", 10)),
+            reliability=_name(item.get("reliability"), _RELIABILITY),
+            durability=_name(item.get("durability"), _DURABILITY),
+            deadline_ns=_nanoseconds(item.get("deadline")),
+            lifespan_ns=_nanoseconds(item.get("lifespan")),
+            liveliness=_name(item.get("liveliness"), _LIVELINESS),
+            lease_ns=_nanoseconds(item.get("liveliness_lease_duration")),
+        )
+
+
+_HISTORY = ("system_default", "keep_last", "keep_all", "unknown")
+_RELIABILITY = ("system_default", "reliable", "best_effort", "unknown", "best_available")
+_DURABILITY = ("system_default", "transient_local", "volatile", "unknown", "best_available")
+_LIVELINESS = ("system_default", "automatic", "manual_by_node", "manual_by_topic", "unknown", "best_available")
+
+
+def _name(value: object, names: tuple[str, ...]) -> str:
+    if isinstance(value, int) and 0 <= value < len(names):
+        return names[value]
+    return value if isinstance(value, str) and value in names else "unknown"
+
+
+def _nanoseconds(value: object) -> int:
+    if not isinstance(value, dict):
+        return INFINITE_NS
+    return min(int(value.get("sec", 0)) * 10**9 + int(value.get("nsec", 0)), INFINITE_NS)
+
+
+def _duration(indent: str, key: str, nanoseconds: int) -> str:
+    sec, nsec = divmod(nanoseconds, 10**9)
+    return f"{indent}{key}:\n{indent}  sec: {sec}\n{indent}  nsec: {nsec}\n"
