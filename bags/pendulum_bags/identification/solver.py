@@ -1,0 +1,228 @@
+"""Levenberg-Marquardt on parameters and window states together; the states are eliminated window by window.
+
+The normal matrix is an arrowhead: a dense block for the few parameters, a 2 x 2 block for each window's
+initial state, and the coupling between them. The Schur complement costs O(windows), so a recording of any
+length is as cheap as its simulation. Source: Bock, "Recent advances in parameter identification techniques
+for ODE", 1983 (multiple shooting); Triggs et al., "Bundle adjustment", 2000, sec. 6 (Schur complement) and
+sec. 4.3 (robust weights); Golub and Pereyra, Inverse Problems 19, 2003 (separable problems).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pendulum_bags.identification import kernel
+from pendulum_bags.identification.model import BOUNDS, INDEX, PARAMETER_NAMES, FitModel
+from pendulum_bags.identification.problem import Piece, longest_step, simulate
+
+__all__ = ["Solution", "residuals", "robust_cost", "solve"]
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Solution:
+    """Result of one minimisation.
+
+    Args:
+        model: Parameters at the minimum.
+        states: Initial states by piece, each shape (w, 2).
+        cost: Robust cost, sum over samples [rad^2].
+        converged: Whether the step or the decrease became negligible.
+        iterations: Steps tried.
+    """
+
+    model: FitModel
+    states: list[Array]
+    cost: float
+    converged: bool
+    iterations: int
+
+
+def robust_cost(residual: Array, scale: float) -> float:
+    """Return the soft-L1 cost, sum of 2 s^2 (sqrt(1 + (r/s)^2) - 1); s = inf gives the sum of squares [rad^2]."""
+    if not np.isfinite(scale):
+        return float(residual @ residual)
+    ratio = residual / scale
+    return float(2.0 * scale * scale * np.sum(np.sqrt(1.0 + ratio * ratio) - 1.0))
+
+
+def residuals(model: FitModel, pieces: Sequence[Piece], states: Sequence[Array] | None = None) -> list[Array]:
+    """Return simulated minus measured angle of each piece, NaN outside its windows [rad]."""
+    start = [piece.states for piece in pieces] if states is None else states
+    return [simulate(model, p, x).theta - p.recording.position for p, x in zip(pieces, start)]
+
+
+def solve(
+    model: FitModel,
+    pieces: Sequence[Piece],
+    free: Sequence[str],
+    *,
+    states: Sequence[Array] | None = None,
+    scale: float = np.inf,
+    max_iterations: int = 60,
+    tolerance: float = 1e-9,
+    bounds: dict[str, tuple[float, float]] | None = None,
+) -> Solution:
+    """Minimise the robust sum of squared angle errors over the free parameters and all window states.
+
+    Args:
+        model: Start.
+        pieces: Data.
+        free: Names of the parameters to fit; none fits the window states alone.
+        states: Start of the window states; by default the pieces' first guesses.
+        scale: Where the loss turns from quadratic to linear [rad].
+        max_iterations: Most steps to try.
+        tolerance: Relative decrease of the cost below which the fit has converged.
+        bounds: Domain of parameters where it differs from ``BOUNDS``.
+    """
+    index = np.array([INDEX[name] for name in free], dtype=np.int64)
+    limits = {**BOUNDS, **(bounds or {})}
+    low = np.array([limits[name][0] for name in free])
+    high = np.array([limits[name][1] for name in free])
+    x = [np.array(s, dtype=float) for s in (states or [piece.states for piece in pieces])]
+    vector = np.array(model.vector)
+    vector[index] = np.clip(vector[index], low, high)
+    best = model.with_vector(vector)
+    # The steps must not change within one fit, or the cost would jump with them.
+    steps = [longest_step(best, piece.recording) for piece in pieces]
+    masks = [piece.mask() for piece in pieces]
+    typical = _typical_scales(index)
+    damping, cost, iterations, converged = 1e-4, np.inf, 0, False
+    blocks = None
+    while iterations < max_iterations:
+        iterations += 1
+        if blocks is None:
+            cost, blocks = _linearise(best, pieces, x, index, scale, steps, masks)
+            if not np.isfinite(cost):
+                break
+        step = _damped_step(blocks, vector[index], low, high, damping, typical)
+        if step is None:
+            damping *= 10.0
+            if damping > 1e12:
+                break
+            continue
+        d_p, d_x, gain = step
+        trial = vector.copy()
+        trial[index] = np.clip(vector[index] + d_p, low, high)
+        # An inertia is never negative: at most a fourfold change at a time.
+        if trial[0] < 0.25 * vector[0] or trial[0] > 4.0 * vector[0]:
+            damping *= 4.0
+            continue
+        candidate = model.with_vector(trial)
+        x_trial = [a + b for a, b in zip(x, d_x)]
+        new_cost = 0.0
+        for piece, state, h, mask in zip(pieces, x_trial, steps, masks):
+            r = simulate(candidate, piece, state, step=h).theta[mask] - piece.recording.position[mask]
+            new_cost += robust_cost(r, scale) if np.all(np.isfinite(r)) else np.inf
+        if new_cost < cost:
+            relative = (cost - new_cost) / cost
+            vector, best, x, blocks = trial, candidate, x_trial, None
+            good = (cost - new_cost) / max(gain, 1e-300) > 0.25
+            damping = max(damping * (0.2 if good else 1.0), 1e-10)
+            cost = new_cost
+            if relative < tolerance:
+                converged = True
+                break
+        else:
+            damping *= 5.0
+            if gain < tolerance * cost or damping > 1e10:
+                converged = gain < 1e-3 * cost
+                break
+    return Solution(best, x, cost, converged, iterations)
+
+
+def _typical_scales(index: NDArray[np.int64]) -> Array:
+    """Return the least scale by which each parameter is damped, so that a zero column cannot blow up."""
+    typical = {"transport_delay": 1e-2, "angle_offset": 1e-1, "stribeck_velocity": 1e-1}
+    return np.array([typical.get(PARAMETER_NAMES[i], 1.0) for i in index])
+
+
+def _linearise(
+    model: FitModel,
+    pieces: Sequence[Piece],
+    states: Sequence[Array],
+    index: NDArray[np.int64],
+    scale: float,
+    steps: Sequence[float],
+    masks: Sequence[NDArray[np.bool_]],
+) -> tuple[float, tuple[Array, list[Array], list[Array], Array, list[Array]]]:
+    k = index.size
+    h_pp, g_p = np.zeros((k, k)), np.zeros(k)
+    h_px, h_xx, g_x = [], [], []
+    cost = 0.0
+    for piece, state, h, mask in zip(pieces, states, steps, masks):
+        result = simulate(model, piece, state, free=index.tolist(), step=h)
+        residual = result.theta - piece.recording.position
+        inside = residual[mask]
+        if not (np.all(np.isfinite(inside)) and np.all(np.isfinite(result.jacobian))):
+            return np.inf, (h_pp, h_px, h_xx, g_p, g_x)
+        cost += robust_cost(inside, scale)
+        weight = np.ones_like(residual)
+        if np.isfinite(scale):
+            weight = 1.0 / np.sqrt(1.0 + (residual / scale) ** 2)
+        count = len(piece.windows)
+        blocks = np.zeros((count, k, 2)), np.zeros((count, 2, 2)), np.zeros((count, 2))
+        kernel.normal_blocks(
+            result.jacobian, residual, weight, piece.windows, h_pp, blocks[0], blocks[1], g_p, blocks[2]
+        )
+        h_px.append(blocks[0])
+        h_xx.append(blocks[1])
+        g_x.append(blocks[2])
+    return cost, (h_pp, h_px, h_xx, g_p, g_x)
+
+
+def _damped_step(
+    blocks: tuple[Array, list[Array], list[Array], Array, list[Array]],
+    values: Array,
+    low: Array,
+    high: Array,
+    damping: float,
+    typical: Array,
+) -> tuple[Array, list[Array], float] | None:
+    """Return the step of parameters and states and the decrease it predicts, or None if the system is singular."""
+    h_pp, h_px, h_xx, g_p, g_x = blocks
+    k = g_p.size
+    eye = np.eye(2)
+    inverses, reduced, gradient = [], h_pp.copy(), g_p.copy()
+    for px, xx, gx in zip(h_px, h_xx, g_x):
+        diagonal = np.einsum("nii->ni", xx)
+        damped = xx + damping * eye * (diagonal[:, :, None] + 1e-12)
+        inverse = np.linalg.inv(damped)
+        inverses.append(inverse)
+        reduced -= np.einsum("nai,nij,nbj->ab", px, inverse, px)
+        gradient -= np.einsum("nai,nij,nj->a", px, inverse, gx)
+    d_p = np.zeros(k)
+    if k:
+        floor = 1e-12 * max(float(np.max(np.diag(h_pp))), 1e-30)
+        diagonal = damping * (np.maximum(np.diag(h_pp), 0.0) + floor / typical**2)
+        system = reduced + np.diag(diagonal)
+        active = np.zeros(k, dtype=bool)
+        for _ in range(k + 1):
+            idle = np.flatnonzero(~active)
+            if not idle.size:
+                break
+            try:
+                step = np.linalg.solve(system[np.ix_(idle, idle)], -(gradient + system @ np.where(active, d_p, 0.0))[idle])
+            except np.linalg.LinAlgError:
+                return None
+            d_p[idle] = step
+            outside = ((values + d_p < low) | (values + d_p > high)) & ~active
+            if not outside.any():
+                break
+            # Parameters that would leave their domain stop at its edge; the others solve again around them.
+            d_p[outside] = np.clip(values + d_p, low, high)[outside] - values[outside]
+            active |= outside
+    d_x = []
+    predicted = -2.0 * float(g_p @ d_p) - float(d_p @ h_pp @ d_p)
+    for px, xx, gx, inverse in zip(h_px, h_xx, g_x, inverses):
+        right = -(gx + np.einsum("nai,a->ni", px, d_p))
+        step_x = np.einsum("nij,nj->ni", inverse, right)
+        d_x.append(step_x)
+        predicted -= float(np.sum(2.0 * gx * step_x) + np.einsum("ni,nij,nj->", step_x, xx, step_x))
+        predicted -= 2.0 * float(np.einsum("a,nai,ni->", d_p, px, step_x))
+    return d_p, d_x, predicted
