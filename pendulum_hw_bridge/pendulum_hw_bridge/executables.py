@@ -1,0 +1,7 @@
+"""The programs of this package: name and entry point, read by ``setup.py`` and ``python -m``."""
+
+__all__ = ["EXECUTABLES"]
+
+EXECUTABLES: dict[str, str] = {
+    "bridge": "pendulum_hw_bridge.bridge_node:main",
+}

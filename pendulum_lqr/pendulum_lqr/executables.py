@@ -1,0 +1,9 @@
+"""The programs of this package: name and entry point, read by ``setup.py`` and ``python -m``."""
+
+__all__ = ["EXECUTABLES"]
+
+EXECUTABLES: dict[str, str] = {
+    "controller": "pendulum_lqr.controller_node:main",
+    "disturbance": "pendulum_lqr.disturbance_node:main",
+    "design": "pendulum_lqr.design_cli:main",
+}

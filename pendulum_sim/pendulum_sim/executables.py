@@ -1,0 +1,9 @@
+"""The programs of this package: name and entry point, read by ``setup.py`` and ``python -m``."""
+
+__all__ = ["EXECUTABLES"]
+
+EXECUTABLES: dict[str, str] = {
+    "simulator": "pendulum_sim.simulator_node:main",
+    "viewer": "pendulum_sim.viewer_node:main",
+    "phase_plot": "pendulum_sim.phase_plot:main",
+}
