@@ -1,0 +1,406 @@
+"""Optimal gains: continuous and discrete LQR, LQI, Kalman filter, and what refuses to be designed.
+
+Riccati equations are solved by scipy. python-control enters only where margins and plots are asked for
+(:mod:`pendulum_lqr.analysis`), because it brings matplotlib with it, and a controller on a robot should start without.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import scipy.linalg
+from numpy.typing import ArrayLike, NDArray
+from pendulum_msgs_py.errors import ParameterError
+
+from pendulum_lqr.model import LinearModel, sort_poles
+
+__all__ = [
+    "DesignError",
+    "DiscreteModel",
+    "Gain",
+    "KalmanGain",
+    "continuous_lqr",
+    "cost_matrices",
+    "discrete_lqr",
+    "discretise",
+    "integral_lqr",
+    "kalman_gain",
+    "require_controllable",
+    "require_observable",
+    "sampled_cost",
+]
+
+Matrix = NDArray[np.float64]
+
+_RANK_TOLERANCE = 1e-9
+"""Smallest singular value, relative to the norm, under which a mode counts as out of reach."""
+
+
+class DesignError(ParameterError):
+    """A controller cannot be designed for what was asked; the sentence says which weight or mode is to blame."""
+
+
+@dataclass(frozen=True, slots=True)
+class Gain:
+    """State feedback u = -K x and the proof that came with it.
+
+    Attributes:
+        K: Gain, shape (n,) [N m/rad, N m s/rad, ...].
+        S: Solution of the Riccati equation, shape (n, n); x' S x is the cost to go and a Lyapunov function.
+        poles: Closed-loop eigenvalues, slowest first, shape (n,) [1/s], or on the z-plane for a discrete design.
+    """
+
+    K: Matrix
+    S: Matrix
+    poles: NDArray[np.complex128]
+
+
+@dataclass(frozen=True, slots=True)
+class DiscreteModel:
+    """Sampled model ``z[k+1] = A z[k] + B u[k]`` whose state is [x; the inputs still on their way, oldest first].
+
+    Attributes:
+        A: Shape (2 + m, 2 + m).
+        B: Shape (2 + m, 1).
+        period: Sampling period [s].
+        delay: Time from measuring a state to its torque acting [s].
+        pending: m, number of inputs that are still on their way.
+    """
+
+    A: Matrix
+    B: Matrix
+    period: float
+    delay: float
+    pending: int
+
+
+@dataclass(frozen=True, slots=True)
+class KalmanGain:
+    """Stationary Kalman filter.
+
+    Attributes:
+        L: Filter gain that corrects a prediction, shape (n, outputs).
+        P: Covariance of the prediction, shape (n, n).
+    """
+
+    L: Matrix
+    P: Matrix
+
+
+def cost_matrices(q: ArrayLike, r: float, size: int = 2) -> tuple[Matrix, Matrix]:
+    """Return the checked cost matrices Q (size, size) and R (1, 1).
+
+    Args:
+        q: Diagonal of Q, shape (size,), or the whole symmetric matrix, shape (size, size).
+        r: Cost of torque, > 0 [1/(N m)^2].
+        size: Number of states.
+
+    Raises:
+        DesignError: A weight is not finite, negative, not symmetric, or of the wrong shape.
+    """
+    weights = np.asarray(q, dtype=np.float64)
+    if weights.shape == (size,):
+        weights = np.diag(weights)
+    if weights.shape != (size, size):
+        raise DesignError(f"q has the shape {weights.shape}; expected ({size},) for a diagonal or ({size}, {size})")
+    if not np.all(np.isfinite(weights)):
+        raise DesignError(f"q is {_plain(q)}; expected finite weights")
+    if not np.allclose(weights, weights.T, rtol=1e-12, atol=0.0):
+        raise DesignError(f"q is {_plain(q)}; expected a symmetric matrix")
+    lowest = float(np.linalg.eigvalsh(weights)[0])
+    if lowest < -1e-12 * max(1.0, float(np.abs(weights).max())):
+        raise DesignError(f"q is {_plain(q)}, with the eigenvalue {lowest:.6g}; expected no negative weight")
+    if not (math.isfinite(r) and r > 0.0):
+        raise DesignError(f"r is {r} 1/(N m)^2; expected a finite weight > 0")
+    return weights, np.array([[float(r)]])
+
+
+def continuous_lqr(model: LinearModel, q: ArrayLike, r: float) -> Gain:
+    """Return the gain that minimises the integral of x' Q x + u' R u.
+
+    Args:
+        model: Linear model.
+        q: Weights of the state [theta, theta_dot]; see :func:`cost_matrices`.
+        r: Weight of the torque, > 0.
+
+    Raises:
+        DesignError: Weights out of domain, or a mode that torque cannot reach or that the cost does not see.
+
+    Source:
+        Thesis, section 6.1; Anderson and Moore, Optimal Control, 1990, section 3.2.
+    """
+    Q, R = cost_matrices(q, r)
+    return _care(model.A, model.B, Q, R)
+
+
+def integral_lqr(model: LinearModel, q: ArrayLike, r: float) -> Gain:
+    """Return the LQI gain on [theta, theta_dot, integral of (theta - set-point)], which leaves no offset.
+
+    Args:
+        model: Linear model.
+        q: Weights of the three states, shape (3,) or (3, 3); the third > 0.
+        r: Weight of the torque, > 0.
+
+    Raises:
+        DesignError: As :func:`continuous_lqr`; in particular if the integral carries no weight.
+    """
+    Q, R = cost_matrices(q, r, 3)
+    if not Q[2, 2] > 0.0:
+        raise DesignError(f"weight of the integral is {Q[2, 2]:g}; expected > 0, or use plain LQR")
+    A = np.zeros((3, 3))
+    A[:2, :2] = model.A
+    A[2, 0] = 1.0
+    B = np.vstack([model.B, [[0.0]]])
+    return _care(A, B, Q, R)
+
+
+def discretise(model: LinearModel, period: float, delay: float = 0.0) -> DiscreteModel:
+    """Sample the model exactly under zero-order hold with an input delay of any length.
+
+    With delay = (m - 1) period + rest, the torque of sample k acts from rest on in interval k + m - 1, so that m past
+    inputs join the state.
+
+    Args:
+        model: Linear model.
+        period: Sampling period, > 0 [s].
+        delay: Time from measuring a state to its torque acting, >= 0 [s].
+
+    Raises:
+        DesignError: Period or delay out of domain.
+
+    Source:
+        Astrom and Wittenmark, Computer-Controlled Systems, 3rd ed., 1997, section 3.2 (eq. 3.11 to 3.17).
+    """
+    if not (math.isfinite(period) and period > 0.0):
+        raise DesignError(f"period is {period} s; expected a finite value > 0")
+    if not (math.isfinite(delay) and delay >= 0.0):
+        raise DesignError(f"delay is {delay} s; expected a finite value >= 0")
+    whole = math.floor(delay / period + 1e-9)
+    rest = max(delay - whole * period, 0.0)
+    if rest < 1e-9 * period:
+        rest = 0.0
+    pending = whole + (1 if rest > 0.0 else 0)
+    # The interval is split where the newer input takes over: older input first, for ``rest``.
+    phi_new, gamma_new = _hold(model, period - rest)
+    phi_old, gamma_old = _hold(model, rest)
+    n = model.A.shape[0]
+    size = n + pending
+    A = np.zeros((size, size))
+    B = np.zeros((size, 1))
+    A[:n, :n] = phi_new @ phi_old
+    if pending == 0:
+        B[:n] = gamma_new
+        return DiscreteModel(A, B, period, delay, 0)
+    for row in range(pending - 1):
+        A[n + row, n + row + 1] = 1.0
+    B[-1, 0] = 1.0
+    if rest > 0.0:
+        A[:n, n : n + 1] = phi_new @ gamma_old
+        if pending > 1:
+            A[:n, n + 1 : n + 2] = gamma_new
+        else:
+            B[:n] = gamma_new
+    else:
+        A[:n, n : n + 1] = gamma_new
+    return DiscreteModel(A, B, period, delay, pending)
+
+
+def discrete_lqr(model: DiscreteModel, q: ArrayLike, r: float, cross: Matrix | None = None) -> Gain:
+    """Return the gain that minimises the sum of x' Q x + 2 x' N u + u' R u over the samples.
+
+    The weights act on [theta, theta_dot]; inputs that are still on their way cost nothing again.
+
+    Args:
+        model: Sampled model.
+        q: Weights of the state, shape (2,) or (2, 2).
+        r: Weight of the torque, > 0.
+        cross: N, shape (2, 1), as :func:`sampled_cost` gives it; none by default.
+
+    Raises:
+        DesignError: As :func:`continuous_lqr`.
+    """
+    Q2, R = cost_matrices(q, r)
+    size = model.A.shape[0]
+    Q = np.zeros((size, size))
+    Q[:2, :2] = Q2
+    N = None
+    if cross is not None:
+        N = np.zeros((size, 1))
+        N[:2] = cross
+    require_controllable(model.A, model.B, discrete=True)
+    try:
+        S = scipy.linalg.solve_discrete_are(model.A, model.B, Q, R, s=N)
+    except (np.linalg.LinAlgError, ValueError) as error:
+        raise DesignError(_no_solution(Q2, r, error)) from error
+    BS = model.B.T @ S
+    K = np.linalg.solve(R + BS @ model.B, BS @ model.A + (0.0 if N is None else N.T))
+    poles = sort_poles(np.linalg.eigvals(model.A - model.B @ K))
+    if np.max(np.abs(poles)) >= 1.0:
+        raise DesignError(f"closed loop has poles {poles} on or outside the unit circle; expected smaller weights")
+    return Gain(K[0], S, poles)
+
+
+def sampled_cost(model: LinearModel, q: ArrayLike, r: float, period: float) -> tuple[Matrix, float, Matrix]:
+    """Return (Q_d, R_d, N_d), the continuous cost collected over one period of zero-order hold.
+
+    A discrete LQR with these weights minimises the very cost of the continuous LQR, at any sampling period.
+
+    Args:
+        model: Linear model.
+        q: Continuous weights of the state.
+        r: Continuous weight of the torque.
+        period: Sampling period [s].
+
+    Source:
+        C. Van Loan, Computing integrals involving the matrix exponential, IEEE TAC 23(3), 1978, theorem 1.
+    """
+    Q, R = cost_matrices(q, r)
+    if not (math.isfinite(period) and period > 0.0):
+        raise DesignError(f"period is {period} s; expected a finite value > 0")
+    F = np.zeros((3, 3))
+    F[:2, :2] = model.A
+    F[:2, 2:] = model.B
+    W = np.zeros((3, 3))
+    W[:2, :2] = Q
+    W[2:, 2:] = R
+    # Long intervals would overflow exp(+214 s): collect over short pieces and add them up.
+    pieces = max(1, math.ceil(float(np.abs(F).sum(axis=1).max()) * period / 2.0))
+    step = period / pieces
+    block = np.zeros((6, 6))
+    block[:3, :3] = -F.T
+    block[:3, 3:] = W
+    block[3:, 3:] = F
+    exponential = scipy.linalg.expm(block * step)
+    forward = exponential[3:, 3:]
+    piece = forward.T @ exponential[:3, 3:]
+    total = np.zeros((3, 3))
+    transition = np.eye(3)
+    for _ in range(pieces):
+        total += transition.T @ piece @ transition
+        transition = forward @ transition
+    total = 0.5 * (total + total.T)
+    return total[:2, :2], float(total[2, 2]), total[:2, 2:]
+
+
+def kalman_gain(A: Matrix, C: Matrix, process: ArrayLike, measurement: ArrayLike) -> KalmanGain:
+    """Return the stationary Kalman filter of ``x[k+1] = A x[k] + w``, ``y[k] = C x[k] + v``.
+
+    Args:
+        A: State matrix, shape (n, n).
+        C: Output matrix, shape (m, n).
+        process: Covariance of w, shape (n, n).
+        measurement: Covariance of v, shape (m, m), positive definite.
+
+    Raises:
+        DesignError: The outputs do not show every mode that the noise drives, or a covariance is out of domain.
+    """
+    A = np.asarray(A, dtype=np.float64)
+    C = np.atleast_2d(np.asarray(C, dtype=np.float64))
+    W = np.atleast_2d(np.asarray(process, dtype=np.float64))
+    V = np.atleast_2d(np.asarray(measurement, dtype=np.float64))
+    for name, covariance in (("process", W), ("measurement", V)):
+        if not np.all(np.isfinite(covariance)) or float(np.linalg.eigvalsh(covariance)[0]) < -1e-15:
+            raise DesignError(f"{name} noise covariance is {covariance.tolist()}; expected finite, not negative")
+    if not float(np.linalg.eigvalsh(V)[0]) > 0.0:
+        raise DesignError(f"measurement noise covariance is {V.tolist()}; expected every variance > 0")
+    require_observable(A, C, discrete=True)
+    try:
+        P = scipy.linalg.solve_discrete_are(A.T, C.T, W, V)
+    except (np.linalg.LinAlgError, ValueError) as error:
+        raise DesignError(f"no stationary Kalman filter for the given noise: {error}") from error
+    L = P @ C.T @ np.linalg.inv(C @ P @ C.T + V)
+    return KalmanGain(L, P)
+
+
+def require_controllable(A: Matrix, B: Matrix, *, discrete: bool = False) -> None:
+    """Refuse a system with an unstable mode that the input does not reach (Hautus test).
+
+    Args:
+        A: State matrix, shape (n, n).
+        B: Input matrix, shape (n, m).
+        discrete: Whether stability is meant on the z-plane.
+
+    Raises:
+        DesignError: Names the mode.
+    """
+    for pole in np.linalg.eigvals(A):
+        if _decays(pole, discrete):
+            continue
+        pencil = np.hstack([pole * np.eye(A.shape[0]) - A, B])
+        if _deficient(pencil):
+            raise DesignError(f"mode at {_number(pole)} is not controllable: no torque reaches it; expected B = [0, 1/M]")
+
+
+def require_observable(A: Matrix, C: Matrix, *, discrete: bool = False) -> None:
+    """Refuse a system with an unstable mode that the outputs do not show (Hautus test).
+
+    Args:
+        A: State matrix, shape (n, n).
+        C: Output matrix, shape (m, n).
+        discrete: Whether stability is meant on the z-plane.
+
+    Raises:
+        DesignError: Names the mode.
+    """
+    for pole in np.linalg.eigvals(A):
+        if _decays(pole, discrete):
+            continue
+        pencil = np.vstack([pole * np.eye(A.shape[0]) - A, C])
+        if _deficient(pencil):
+            raise DesignError(
+                f"mode at {_number(pole)} is not observable: no measurement shows it; expected theta among the outputs"
+            )
+
+
+def _care(A: Matrix, B: Matrix, Q: Matrix, R: Matrix) -> Gain:
+    require_controllable(A, B)
+    try:
+        S = scipy.linalg.solve_continuous_are(A, B, Q, R)
+    except (np.linalg.LinAlgError, ValueError) as error:
+        raise DesignError(_no_solution(Q, float(R[0, 0]), error)) from error
+    K = np.linalg.solve(R, B.T @ S)
+    poles = sort_poles(np.linalg.eigvals(A - B @ K))
+    if np.max(poles.real) >= 0.0:
+        raise DesignError(_no_solution(Q, float(R[0, 0]), "the closed loop is not stable"))
+    return Gain(K[0], S, poles)
+
+
+def _no_solution(Q: Matrix, r: float, reason: object) -> str:
+    return f"no stabilising gain for q = {_plain(Q)}, r = {r:g}: {reason}; expected weights that see every slow mode"
+
+
+def _hold(model: LinearModel, time: float) -> tuple[Matrix, Matrix]:
+    """Return exp(A t) and the integral of exp(A s) B over [0, t]."""
+    n, m = model.B.shape
+    block = np.zeros((n + m, n + m))
+    block[:n, :n] = model.A
+    block[:n, n:] = model.B
+    exponential = scipy.linalg.expm(block * time)
+    return exponential[:n, :n], exponential[:n, n:]
+
+
+def _decays(pole: complex, discrete: bool) -> bool:
+    return abs(pole) < 1.0 - 1e-12 if discrete else pole.real < 0.0
+
+
+def _deficient(pencil: NDArray[np.complex128]) -> bool:
+    # Rows of different units (rad against rad/s) are brought to one size first, else the fast pole hides the slow one.
+    scaled = pencil / np.maximum(np.linalg.norm(pencil, axis=1, keepdims=True), 1e-300)
+    scaled = scaled / np.maximum(np.linalg.norm(scaled, axis=0, keepdims=True), 1e-300)
+    values = np.linalg.svd(scaled, compute_uv=False)
+    return bool(values[-1] < _RANK_TOLERANCE * values[0])
+
+
+def _plain(values: ArrayLike) -> object:
+    array = np.asarray(values, dtype=np.float64)
+    if array.ndim == 2 and np.count_nonzero(array - np.diag(np.diagonal(array))) == 0:
+        array = np.diagonal(array)
+    plain: Sequence[object] = array.tolist()
+    return plain
+
+
+def _number(pole: complex) -> str:
+    return f"{pole.real:.6g}" if abs(pole.imag) < 1e-12 else f"{pole:.6g}"
