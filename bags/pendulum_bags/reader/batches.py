@@ -1,0 +1,90 @@
+"""What a storage file hands to the parsers: many messages of one topic in one buffer."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Protocol
+
+import numpy as np
+import numpy.typing as npt
+
+__all__ = ["MCAP_HEAD", "Batch", "Bytes", "Int64", "Source", "Stream"]
+
+Bytes = npt.NDArray[np.uint8]
+Int64 = npt.NDArray[np.int64]
+
+MCAP_HEAD = 31
+"""Bytes of an MCAP message record before the message itself: opcode, length, channel, sequence, two times."""
+
+
+@dataclass(slots=True)
+class Batch:
+    """Messages of one channel of a storage file.
+
+    Args:
+        channel: Channel id (MCAP) or topic id (SQLite).
+        buffer: Bytes that hold all messages of the batch, shape (n,).
+        offsets: Where each message (SQLite) or each message record (MCAP) begins in ``buffer``, shape (k,).
+        times: Log time of each message [ns], shape (k,).
+        sizes: Bytes of each message, shape (k,); ``None`` for MCAP, whose records carry their length.
+    """
+
+    channel: int
+    buffer: Bytes
+    offsets: Int64
+    times: Int64
+    sizes: Int64 | None = None
+
+    @property
+    def head(self) -> int:
+        """Bytes between an offset and the first byte of its message."""
+        return MCAP_HEAD if self.sizes is None else 0
+
+    def payloads(self) -> Iterator[tuple[int, bytes]]:
+        """Yield (log time [ns], message bytes) one by one."""
+        view = memoryview(self.buffer)
+        if self.sizes is not None:
+            for time, start, size in zip(
+                self.times.tolist(), self.offsets.tolist(), self.sizes.tolist(), strict=True
+            ):
+                yield time, bytes(view[start : start + size])
+            return
+        for time, start in zip(self.times.tolist(), self.offsets.tolist(), strict=True):
+            size = int.from_bytes(view[start + 1 : start + 9], "little") - 22
+            yield time, bytes(view[start + MCAP_HEAD : start + MCAP_HEAD + size])
+
+
+@dataclass(frozen=True, slots=True)
+class Stream:
+    """A topic inside one storage file; ``definition`` is its message definition text, if the file has one."""
+
+    channel: int
+    topic: str
+    type: str
+    count: int
+    definition: str = ""
+    encoding: str = ""
+    hash: str = ""
+    qos: str = ""
+    serialization: str = "cdr"
+
+
+class Source(Protocol):
+    """A storage file that is open for reading."""
+
+    path: Path
+    streams: list[Stream]
+    compressed: bool
+    start_ns: int
+    stop_ns: int
+    damage: str
+
+    def batches(self, channels: set[int], start: int | None, stop: int | None) -> Iterator[Batch]:
+        """Yield all messages of some channels with start <= log time < stop, in the order of the file."""
+        ...
+
+    def close(self) -> None:
+        """Release the file."""
+        ...

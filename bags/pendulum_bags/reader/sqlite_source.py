@@ -1,0 +1,167 @@
+"""Reading rosbag2 databases (SQLite), of all schema versions, also those that a killed writer left behind."""
+
+from __future__ import annotations
+
+import shutil
+import sqlite3
+import tempfile
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+
+from pendulum_msgs_py.errors import BagError
+
+from pendulum_bags.reader.batches import Batch, Stream
+
+__all__ = ["SqliteSource"]
+
+_ROWS = 8192
+
+
+class SqliteSource:
+    """One ``.db3`` file.
+
+    A database whose writer died in a transaction has a journal or a write-ahead log beside it. It is copied with
+    them to a temporary folder, where SQLite brings it back to its last consistent state; the bag stays untouched
+    and ``damage`` says so.
+
+    Args:
+        path: The file.
+
+    Raises:
+        BagError: The file cannot be opened or is no rosbag2 database.
+    """
+
+    compressed = False
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self.damage = ""
+        self._copy: tempfile.TemporaryDirectory[str] | None = None
+        self._connection: sqlite3.Connection | None = None
+        self.start_ns = 0
+        self.stop_ns = 0
+        if not path.is_file():
+            raise BagError(f"{path} cannot be read: there is no such file")
+        beside = [path.with_name(path.name + end) for end in ("-journal", "-wal", "-shm")]
+        left_over = [file for file in beside if file.is_file() and file.stat().st_size]
+        try:
+            if left_over:
+                self._open_copy(left_over)
+            else:
+                self._connection = sqlite3.connect(f"{path.absolute().as_uri()}?mode=ro&immutable=1", uri=True)
+            self.streams = self._read_streams()
+        except sqlite3.Error as error:
+            self.close()
+            raise BagError(f"{path} is not a readable rosbag2 database: {error}") from error
+
+    def close(self) -> None:
+        """Close the database and remove the temporary copy, if there is one."""
+        if self._connection is not None:
+            self._connection.close()
+            self._connection = None
+        if self._copy is not None:
+            self._copy.cleanup()
+            self._copy = None
+
+    def keep(self, copy: tempfile.TemporaryDirectory[str]) -> None:
+        """Take charge of the temporary folder that the file is in."""
+        self._copy = copy
+
+    @property
+    def connection(self) -> sqlite3.Connection:
+        """The open database."""
+        if self._connection is None:
+            raise BagError(f"{self.path} is closed")
+        return self._connection
+
+    def _open_copy(self, left_over: list[Path]) -> None:
+        self.damage = f"its writer left {', '.join(file.name for file in left_over)} behind"
+        self._copy = tempfile.TemporaryDirectory(prefix="pendulum_bags_")
+        target = Path(self._copy.name, self.path.name)
+        for file in [self.path, *left_over]:
+            shutil.copyfile(file, target.with_name(file.name))
+        self._connection = sqlite3.connect(target)
+
+    def _read_streams(self) -> list[Stream]:
+        run = self.connection.execute
+        tables = {name for (name,) in run("SELECT name FROM sqlite_master WHERE type = 'table'")}
+        if not {"topics", "messages"} <= tables:
+            raise BagError(f"{self.path} has tables {sorted(tables)}; expected a rosbag2 database with topics, messages")
+        columns = [row[1] for row in run("PRAGMA table_info(topics)")]
+        definitions: dict[str, tuple[str, str]] = {}
+        if "message_definitions" in tables:
+            definitions = {
+                name: (encoding, text)
+                for name, encoding, text in run(
+                    "SELECT topic_type, encoding, encoded_message_definition FROM message_definitions"
+                )
+            }
+        counts: dict[int, int] = {}
+        for topic, count, first, last in run(
+            "SELECT topic_id, count(*), min(timestamp), max(timestamp) FROM messages GROUP BY topic_id"
+        ):
+            self.start_ns = first if not counts else min(self.start_ns, first)
+            self.stop_ns = max(self.stop_ns, last)
+            counts[topic] = count
+        wanted = ("id", "name", "type", "serialization_format", "offered_qos_profiles", "type_description_hash")
+        present = [column for column in wanted if column in columns]
+        streams = []
+        for row in run(f"SELECT {', '.join(present)} FROM topics ORDER BY id"):
+            item = dict(zip(present, row, strict=True))
+            encoding, text = definitions.get(item["type"], ("", ""))
+            streams.append(
+                Stream(
+                    item["id"],
+                    item["name"],
+                    item["type"],
+                    counts.get(item["id"], 0),
+                    text,
+                    encoding,
+                    item.get("type_description_hash", ""),
+                    item.get("offered_qos_profiles", ""),
+                    item["serialization_format"],
+                )
+            )
+        return streams
+
+    def custom_metadata(self) -> str:
+        """Return the text of ``metadata.yaml`` that the database holds (schema 3 and later), or nothing."""
+        try:
+            row = self.connection.execute("SELECT metadata FROM metadata ORDER BY id DESC LIMIT 1").fetchone()
+        except sqlite3.Error:
+            return ""
+        return row[0] if row else ""
+
+    def batches(self, channels: set[int], start: int | None, stop: int | None) -> Iterator[Batch]:
+        """Yield all messages of some topics with start <= log time < stop, in the order of the file."""
+        conditions, values = [], []
+        if channels != {stream.channel for stream in self.streams}:
+            conditions.append(f"topic_id IN ({', '.join('?' * len(channels))})")
+            values += sorted(channels)
+        if start is not None:
+            conditions.append("timestamp >= ?")
+            values.append(start)
+        if stop is not None:
+            conditions.append("timestamp < ?")
+            values.append(stop)
+        where = f" WHERE {' AND '.join(conditions)}" if conditions else ""
+        try:
+            cursor = self.connection.execute(f"SELECT topic_id, timestamp, data FROM messages{where}", values)
+            while rows := cursor.fetchmany(_ROWS):
+                yield from _batches(rows)
+        except sqlite3.Error as error:
+            raise BagError(f"{self.path} is damaged: {error}; try to repair the bag") from error
+
+
+def _batches(rows: list[tuple[int, int, bytes]]) -> Iterator[Batch]:
+    topics, times, datas = zip(*rows, strict=True)
+    sizes = np.fromiter(map(len, datas), np.int64, len(datas))
+    offsets = np.cumsum(sizes) - sizes
+    buffer = np.frombuffer(b"".join(datas), np.uint8)
+    topic = np.array(topics)
+    time = np.array(times, np.int64)
+    for channel in np.unique(topic):
+        mine = topic == channel
+        yield Batch(int(channel), buffer, offsets[mine], time[mine], sizes[mine])
