@@ -1,6 +1,6 @@
-"""Build script of this package: the same file in all five, since everything it needs stands in the files beside it.
+"""Build script of this package: the same file in all five, since what differs stands in the files beside it.
 
-``package.xml`` says who we are and ``<package>/executables.py`` which programs there are; nothing is said twice.
+``package.xml`` says who we are, ``<package>/executables.py`` which programs there are; nothing is said twice.
 """
 
 import ast
@@ -8,7 +8,6 @@ from pathlib import Path
 from xml.etree import ElementTree
 
 from setuptools import find_packages, setup
-
 
 DATA_ENDINGS = ["css", "csv", "html", "j2", "js", "json", "md", "npz", "png", "svg", "toml", "woff2", "yaml"]
 
@@ -46,7 +45,7 @@ setup(
     maintainer=manifest.findtext("maintainer", ""),
     maintainer_email=manifest.find("maintainer").get("email"),
     packages=find_packages(include=[name, f"{name}.*"]),
-    # Everything beside the modules that the package reads at run time: presets, templates, pages, the typing marker.
+    # What the package reads at run time beside its modules: presets, templates, pages; and the typing marker.
     package_data={"": [f"**/*.{ending}" for ending in DATA_ENDINGS] + ["py.typed"]},
     data_files=[
         ("share/ament_index/resource_index/packages", [f"resource/{name}"]),

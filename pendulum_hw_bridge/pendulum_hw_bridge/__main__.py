@@ -1,4 +1,4 @@
-"""Run a program of this package: ``python -m pendulum_hw_bridge EXE ARGS`` is ``ros2 run pendulum_hw_bridge EXE ARGS``."""
+"""Run a program of this package, as ``ros2 run pendulum_hw_bridge EXE`` does."""
 
 from pendulum_msgs_py.executables import run_package
 

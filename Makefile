@@ -1,0 +1,83 @@
+# `make` alone lists the targets. Everything runs in .venv, which the first target that needs it makes from the lock.
+SHELL := /bin/sh
+.DEFAULT_GOAL := help
+.DELETE_ON_ERROR:
+
+PACKAGES := pendulum_msgs_py pendulum_sim pendulum_lqr pendulum_hw_bridge bags
+VENV := .venv
+PY := $(VENV)/bin/python
+PIP := $(PY) -m pip --disable-pip-version-check --no-input --quiet
+
+# Everything that decides what an editable install looks like; the modules themselves are read in place.
+LINKED := $(foreach p,$(PACKAGES),$(wildcard $(p)/setup.py $(p)/setup.cfg $(p)/package.xml $(p)/*/executables.py))
+
+.PHONY: help venv experiment test bench lint types imports build faults lock docs clean
+
+help: # Print the targets, one line each
+	@awk -F ':[^#]*# ' '/^[a-z]+:[^#=]*# / {printf "make %-11s %s\n", $$1, $$2}' Makefile
+
+venv: $(VENV)/.linked # Make or renew .venv from the lock, with the five packages linked into it (PYTHON=... chooses the interpreter)
+
+# Three stamps, so that an interrupted step is done again and a finished one is not.
+$(VENV)/.made:
+	@for python in $(PYTHON) python3.12 python3.11 python3.10 python3 none; do \
+	  if $$python -c 'import sys; sys.exit(sys.implementation.name != "cpython" or not (3, 10) <= sys.version_info[:2] <= (3, 12))' 2>/dev/null; \
+	  then break; fi; \
+	done; \
+	if [ $$python = none ]; then echo "error: found no CPython 3.10, 3.11 or 3.12; install one, or name it with make PYTHON=/path/to/python3" >&2; exit 1; fi; \
+	echo "making $(VENV) with $$($$python --version)" && $$python -m venv $(VENV)
+	@touch $@
+
+$(VENV)/.locked: requirements.txt | $(VENV)/.made
+	@echo "installing $$(grep -c == requirements.txt) locked packages into $(VENV) (some minutes the first time)"
+	@$(PIP) install --prefer-binary --require-hashes -r requirements.txt
+	@touch $@
+
+# Compatible mode writes plain path entries. Those alone win over the folders of the repository that bear the packages'
+# names, which Python would otherwise take for namespace packages when it starts in this folder.
+$(VENV)/.linked: $(VENV)/.locked $(LINKED)
+	@echo "linking $(PACKAGES) into $(VENV)"
+	@$(PIP) install --no-deps --no-build-isolation --config-settings editable_mode=compat $(addprefix --editable ./,$(PACKAGES))
+	@touch $@
+
+experiment: $(VENV)/.linked # Run the thesis's experiment on simulator and emulated hardware, and compare them (OUT=DIR ARGS=...)
+	@$(PY) -m pendulum_bags experiment thesis $(if $(OUT),--out "$(OUT)") $(ARGS)
+
+test: $(VENV)/.linked # Run every test (ARGS="-k name" chooses)
+	@$(PY) -m pytest $(ARGS)
+
+bench: $(VENV)/.linked # Measure beside the peers, print a table, write build/bench.json (ONLY=area ARGS=...)
+	@$(PY) -m tests.benchmarks.run $(if $(ONLY),--only "$(ONLY)") $(ARGS)
+
+lint: $(VENV)/.linked # Check style with ruff
+	@$(PY) -m ruff check $(ARGS)
+
+types: $(VENV)/.linked # Check types with mypy
+	@$(PY) -m mypy $(ARGS)
+
+imports: $(VENV)/.linked # Check which package and which module may import what
+	@$(VENV)/bin/lint-imports $(ARGS)
+
+build: $(VENV)/.linked # Build the five packages with colcon into install/, as for ros2 run
+	@$(VENV)/bin/colcon build --base-paths $(PACKAGES) $(ARGS)
+
+faults: $(VENV)/.linked # Attack the running system, count what it stood, print a table (the long form of tests/faults)
+	@$(PY) -m tests.faults.run $(ARGS)
+
+# The lock covers CPython 3.10 to 3.12 at once; the peers of the benchmarks are locked beside it, on the same versions.
+UV := $(VENV)/.uv/bin/python -m uv
+LOCK := pip compile --quiet --universal --python-version 3.10 --generate-hashes --no-header --no-annotate --no-emit-index-url
+
+lock: $(VENV)/.made # Compile requirements*.in into requirements*.txt with hashes (ARGS=--upgrade renews the versions)
+	@test -x $(VENV)/.uv/bin/python || $(PY) -m venv $(VENV)/.uv
+	@$(VENV)/.uv/bin/python -m pip --disable-pip-version-check --quiet install uv
+	@$(UV) $(LOCK) $(ARGS) requirements.in --output-file requirements.txt
+	@$(UV) $(LOCK) $(ARGS) requirements-bench.in --constraint requirements.txt --output-file requirements-bench.txt
+
+docs: $(VENV)/.linked # Build the documentation site into build/site
+	@$(PY) -m mkdocs build --quiet --strict --config-file mkdocs.yml --site-dir build/site
+	@echo "the site is build/site/index.html"
+
+clean: # Remove what was built; .venv and bags/runs stay
+	@rm -rf build install log .mypy_cache .ruff_cache .pytest_cache .import_linter_cache .hypothesis $(foreach p,$(PACKAGES),$(p)/*.egg-info $(p)/build)
+	@find $(PACKAGES) tests -name __pycache__ -type d -prune -exec rm -rf {} +

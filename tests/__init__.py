@@ -1,0 +1,1 @@
+"""Everything that crosses packages: contract, integration, acceptance, goldens, benchmarks and faults."""

@@ -1,0 +1,108 @@
+"""Fixtures and helpers that every test may use; ``conftest.py`` at the root makes them known everywhere.
+
+Tests on the real middleware take ``domain_id``: a ROS domain of their own for as long as they run, also when
+several test runs share the machine. Tests with processes take ``processes``, which leaves none behind.
+"""
+
+from __future__ import annotations
+
+import fcntl
+import os
+import socket
+import tempfile
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import TypeVar
+
+import pytest
+
+from tests.processes import ProcessGroup
+
+__all__ = ["PROJECT", "domain_id", "processes", "shared_data", "wait_for"]
+
+PROJECT = Path(__file__).resolve().parents[1]
+"""The repository."""
+
+_T = TypeVar("_T")
+
+
+def wait_for(predicate: Callable[[], _T], timeout: float, what: str, *, period: float = 0.02) -> _T:
+    """Call ``predicate`` until it returns something true, and return that.
+
+    Args:
+        predicate: What to ask; an exception of it is not caught.
+        timeout: Longest time to wait [s]; take ten times what you expect.
+        what: What is waited for, as it should stand in the message.
+        period: Time between two calls [s].
+
+    Raises:
+        AssertionError: When the time is over.
+    """
+    deadline = time.monotonic() + timeout
+    while True:
+        if value := predicate():
+            return value
+        if time.monotonic() > deadline:
+            msg = f"waited {timeout:g} s for {what}; last answer was {value!r}"
+            raise AssertionError(msg)
+        time.sleep(period)
+
+
+@pytest.fixture(scope="session")
+def shared_data() -> Path:
+    """Return the folder of recorded runs of real pendulums, which lies beside the repository.
+
+    ``PENDULUM_SHARED_DATA`` names another place. They belong to their authors, so none of them is in the
+    repository.
+    """
+    folder = Path(os.environ.get("PENDULUM_SHARED_DATA", PROJECT.parent / "shared" / "data"))
+    if not folder.is_dir():
+        pytest.skip(f"no recordings of real pendulums at {folder}; PENDULUM_SHARED_DATA names their folder")
+    return folder
+
+
+@pytest.fixture
+def domain_id(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iterator[int]:
+    """Reserve a ROS domain (1 to 100) on this machine for this test, and put it into the environment."""
+    locks = Path(tempfile.gettempdir(), f"pendulum_domains_{os.getuid()}")
+    locks.mkdir(exist_ok=True)
+    # Each process starts its search elsewhere, so that tests in parallel seldom try the same file.
+    for step in range(100):
+        domain = 1 + (os.getpid() * 7 + step) % 100
+        with (locks / f"{domain}.lock").open("w") as lock:
+            try:
+                fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except BlockingIOError:
+                continue
+            if not _is_unused(domain):
+                continue
+            monkeypatch.setenv("ROS_DOMAIN_ID", str(domain))
+            monkeypatch.setenv("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
+            monkeypatch.setenv("ROS_LOG_DIR", str(tmp_path / "ros_log"))
+            yield domain
+            return
+    pytest.fail(f"all ROS domains from 1 to 100 are in use; the locks are in {locks}")
+
+
+def _is_unused(domain: int) -> bool:
+    """Tell whether no DDS participant, of whomever, listens in the domain.
+
+    Source: DDSI-RTPS 2.5, section 9.6.2.3: unicast ports start at 7400 + 250 domain + 10, one pair per
+        participant.
+    """
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+        try:
+            probe.bind(("", 7400 + 250 * domain + 10))
+        except OSError:
+            return False
+    return True
+
+
+@pytest.fixture
+def processes(tmp_path: Path) -> Iterator[ProcessGroup]:
+    """Start programs of the project, which end with the test; one that has to be killed then fails it."""
+    group = ProcessGroup(tmp_path / "processes", cwd=PROJECT)
+    yield group
+    if leftovers := group.close():
+        pytest.fail("processes that did not end by themselves: " + "; ".join(leftovers))

@@ -1,0 +1,50 @@
+"""The import rule that import-linter has no word for: only thin shells may touch ROS.
+
+A module is a shell when its name matches one of the patterns in ``pyproject.toml``; every other module is
+pure core. The core may import neither a ROS package nor a shell, so that it runs, and is tested, where no
+ROS is installed. Entry points (command lines) start shells and so may import them, but not ROS itself.
+"""
+
+from __future__ import annotations
+
+from fnmatch import fnmatch
+
+from grimp import ImportGraph
+from importlinter import Contract, ContractCheck, fields, output
+
+__all__ = ["RosShellsContract"]
+
+
+class RosShellsContract(Contract):
+    """Forbid ROS in everything but the shells, directly or through one of them."""
+
+    type_name = "ros_shells"
+
+    shells = fields.SetField(subfield=fields.StringField())
+    ros_packages = fields.SetField(subfield=fields.StringField())
+    entry_points = fields.SetField(subfield=fields.StringField())
+
+    def check(self, graph: ImportGraph, verbose: bool) -> ContractCheck:
+        """Look at each direct import: a chain from the core to ROS must pass one of them."""
+        external = {module for module in graph.modules if graph.is_module_squashed(module)}
+        ros = {module for module in external if _matches(module, self.ros_packages)}
+        shells = {module for module in graph.modules - external if _matches(module, self.shells)}
+        entry_points = {module for module in graph.modules - external if _matches(module, self.entry_points)}
+        offences = [
+            (importer, imported, detail["line_number"], detail["line_contents"])
+            for importer in sorted(graph.modules - external - shells)
+            for imported in sorted(graph.find_modules_directly_imported_by(importer))
+            if imported in ros or (imported in shells and importer not in entry_points)
+            for detail in graph.get_import_details(importer=importer, imported=imported)
+        ]
+        return ContractCheck(kept=not offences, metadata={"offences": offences})
+
+    def render_broken_contract(self, check: ContractCheck) -> None:
+        """Name each offence by module and line."""
+        for importer, _, line, text in check.metadata["offences"]:
+            output.print_error(f"{importer}, line {line}: {text}", bold=False)
+        output.print_error("expected: ROS and its shells imported by *_node modules and ros subpackages only")
+
+
+def _matches(module: str, patterns: set[str]) -> bool:
+    return any(fnmatch(module, pattern) for pattern in patterns)
