@@ -1,0 +1,385 @@
+"""What every plant offers on the graph: topics, services, command rules and diagnostics, in one place.
+
+A plant (simulator, bridge) owns its clock and its loop; it asks ``decide`` what to do and publishes what was done.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable, Mapping
+from typing import Protocol
+
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
+from rclpy.node import Node
+from sensor_msgs.msg import JointState
+from std_msgs.msg import String
+from std_srvs.srv import SetBool, Trigger
+from trajectory_msgs.msg import JointTrajectory
+
+from pendulum_msgs_py import names
+from pendulum_msgs_py.cdr import encode_joint_state
+from pendulum_msgs_py.errors import ParameterError
+from pendulum_msgs_py.parameters import ParameterSpec
+from pendulum_msgs_py.ros import qos
+from pendulum_msgs_py.ros.convert import (
+    command_from_bytes,
+    diagnostic_status,
+    event_message,
+    stamp_to_message,
+    trajectory_from_message,
+)
+from pendulum_msgs_py.supervisor import Drive, Input, Mode, PlantLimits, PlantSupervisor
+from pendulum_msgs_py.timing import LoopStatistics
+from pendulum_msgs_py.values import JointCommand, JointSample
+
+__all__ = ["LIMIT_SPECS", "PlantInterface", "limits_from_parameters"]
+
+DIAGNOSTICS_PERIOD = 0.5
+"""Time between two diagnostics [s]."""
+
+LIMIT_SPECS: tuple[ParameterSpec, ...] = (
+    ParameterSpec(
+        "effort_limit",
+        0.0,
+        "N m",
+        "Largest torque after the sum of controller and disturbance; 0 takes that of the plant file.",
+        minimum=0.0,
+        read_only=True,
+    ),
+    ParameterSpec(
+        "command_timeout",
+        0.05,
+        "s",
+        "Age at which a command counts for nothing and the torque goes to zero.",
+        minimum=0.0,
+        exclusive_minimum=True,
+        read_only=True,
+    ),
+    ParameterSpec(
+        "velocity_limit",
+        0.0,
+        "rad/s",
+        "Speed at which the armed plant faults, and the largest of a trajectory; 0 for none.",
+        minimum=0.0,
+        read_only=True,
+    ),
+    ParameterSpec(
+        "position_window",
+        [0.0, 0.0],
+        "rad",
+        "Angles between which the armed plant must stay, [low, high]; equal for no window.",
+        read_only=True,
+    ),
+    ParameterSpec(
+        "effort_slew_limit",
+        0.0,
+        "N m/s",
+        "Largest rate of change of the torque; 0 for none.",
+        minimum=0.0,
+        read_only=True,
+    ),
+    ParameterSpec(
+        "handover_time",
+        0.1,
+        "s",
+        "Time over which torque passes between position and effort control.",
+        minimum=0.0,
+        read_only=True,
+    ),
+    ParameterSpec(
+        "tracking_error_limit",
+        0.3,
+        "rad",
+        "Distance from a trajectory at which the plant faults.",
+        minimum=0.0,
+        exclusive_minimum=True,
+        read_only=True,
+    ),
+)
+
+
+def limits_from_parameters(
+    values: Mapping[str, object], plant_effort_limit: float, *, feedback_timeout: float = float("inf")
+) -> PlantLimits:
+    """Return the limits that the parameters of ``LIMIT_SPECS`` describe.
+
+    Args:
+        values: Parameter values by name.
+        plant_effort_limit: Effort limit of the plant file [N m]; the parameter can only lower it.
+        feedback_timeout: Age of a measurement that faults an armed plant [s].
+
+    Raises:
+        ParameterError: They contradict each other or the plant.
+    """
+
+    def number(name: str) -> float:
+        value = values[name]
+        assert isinstance(value, float)
+        return value
+
+    window = values["position_window"]
+    assert isinstance(window, list)
+    if len(window) != 2:
+        raise ParameterError(f"position_window has {len(window)} values; expected [low, high] in rad")
+    if number("effort_limit") > plant_effort_limit:
+        raise ParameterError(
+            f"effort_limit is {number('effort_limit')} N m; expected at most {plant_effort_limit} N m, "
+            "the limit of the plant file"
+        )
+    unlimited = float("inf")
+    bounded = window[0] != window[1]
+    return PlantLimits(
+        effort=number("effort_limit") or plant_effort_limit,
+        command_timeout=number("command_timeout"),
+        feedback_timeout=feedback_timeout,
+        velocity=number("velocity_limit") or unlimited,
+        position_min=window[0] if bounded else -unlimited,
+        position_max=window[1] if bounded else unlimited,
+        slew=number("effort_slew_limit") or unlimited,
+        handover_time=number("handover_time"),
+        tracking_error=number("tracking_error_limit"),
+    )
+
+
+class _CommandHook(Protocol):
+    def __call__(self, kind: Input, command: JointCommand) -> None: ...
+
+
+class PlantInterface:
+    """Topics, services and diagnostics of one plant.
+
+    Args:
+        node: The plant's node.
+        supervisor: Its rules and state.
+        clock: The plant's time [ns]: wall clock or simulated.
+        push: Whether the plant can take a torque on the link itself.
+        statistics: The loop's figures, shown in diagnostics.
+        more_diagnostics: Further key-value pairs for diagnostics.
+        on_command: Called after each accepted command of any torque input.
+    """
+
+    def __init__(
+        self,
+        node: Node,
+        supervisor: PlantSupervisor,
+        clock: Callable[[], int],
+        *,
+        push: bool = True,
+        statistics: LoopStatistics | None = None,
+        more_diagnostics: Callable[[], Mapping[str, object]] = dict,
+        on_command: _CommandHook | None = None,
+    ) -> None:
+        self.node = node
+        self.supervisor = supervisor
+        self.clock = clock
+        self.statistics = statistics
+        self.sample: JointSample | None = None
+        self.on_command = on_command
+        self.refused_trajectories: Counter[str] = Counter()
+        self._more_diagnostics = more_diagnostics
+        self._told_mode: tuple[Mode, bool] | None = None
+        self._told_refusals = 0
+        self._states = node.create_publisher(JointState, names.JOINT_STATES, qos.STATE)
+        self._applied = node.create_publisher(JointState, names.APPLIED_EFFORT, qos.STATE)
+        self._events = node.create_publisher(String, names.EVENTS, qos.EVENTS)
+        self._diagnostics = node.create_publisher(DiagnosticArray, names.DIAGNOSTICS, qos.DIAGNOSTICS)
+        inputs = [Input.EFFORT_COMMAND, Input.DISTURBANCE] + ([Input.PUSH] if push else [])
+        self._inputs = {
+            kind: node.create_subscription(JointState, kind.value, self._receiver(kind), qos.COMMAND, raw=True)
+            for kind in inputs
+        }
+        node.create_subscription(JointTrajectory, names.JOINT_TRAJECTORY, self._on_trajectory, qos.TRAJECTORY)
+        node.create_service(SetBool, names.ARM, self._on_arm)
+        node.create_service(Trigger, names.E_STOP, self._on_e_stop)
+        node.create_service(Trigger, names.E_STOP_RESET, self._on_e_stop_reset)
+        self._housekeeping = node.create_timer(DIAGNOSTICS_PERIOD, self._on_housekeeping)
+
+    # --- the plant's loop calls these ----------------------------------------------------------------------
+
+    def publish_state(self, sample: JointSample) -> None:
+        """Publish a state and remember it as the newest."""
+        self.sample = sample
+        self._states.publish(
+            encode_joint_state(
+                sample.stamp_ns, position=sample.position, velocity=sample.velocity, effort=sample.effort
+            )
+        )
+
+    def decide(self, now_ns: int | None = None) -> Drive:
+        """Return what to do now, by the supervisor's rules; says on the log when the answer changes."""
+        drive = self.supervisor.decide(self.clock() if now_ns is None else now_ns, self.sample)
+        told = (self.supervisor.mode, drive.starved)
+        if told != self._told_mode:
+            self._tell(drive)
+            self._told_mode = told
+        return drive
+
+    def publish_applied(self, stamp_ns: int, effort: float) -> None:
+        """Publish the torque that was really applied from the state with this stamp on, and remember it."""
+        self.supervisor.report_applied(effort)
+        self._applied.publish(encode_joint_state(stamp_ns, effort=effort))
+
+    def publish_event(self, name: str, **details: object) -> None:
+        """Publish an event at the plant's time."""
+        self._events.publish(event_message(self.clock(), name, **details))
+
+    # --- graph ---------------------------------------------------------------------------------------------
+
+    @property
+    def state_subscribers(self) -> int:
+        """How many subscriptions are matched with ``joint_states``."""
+        return self._states.get_subscription_count()
+
+    def commanders(self, kind: Input) -> int:
+        """Return how many publishers are matched with an input."""
+        return self._inputs[kind].get_publisher_count()
+
+    def safe_stop(self, reason: str) -> None:
+        """Disarm, say so in diagnostics; the plant then applies zero torque."""
+        self.supervisor.disarm(self.clock(), reason)
+        self.publish_diagnostics()
+
+    def publish_diagnostics(self) -> None:
+        """Publish the state of the plant."""
+        supervisor = self.supervisor
+        values: dict[str, object] = {
+            "mode": supervisor.mode.value,
+            "reason": supervisor.reason,
+            "commander": supervisor.gates[Input.EFFORT_COMMAND].commander,
+            "starved_periods": supervisor.starved_periods,
+            "saturated_periods": supervisor.saturated_periods,
+        }
+        for kind in self._inputs:
+            gate = supervisor.gates[kind]
+            values[f"{kind.value}.accepted"] = gate.accepted
+            for refusal, count in sorted(gate.refused.items()):
+                values[f"{kind.value}.refused.{refusal.value}"] = count
+        for reason, count in self.refused_trajectories.items():
+            values[f"joint_trajectory.refused.{reason}"] = count
+        if self.statistics is not None:
+            values.update(self.statistics.summary(self.clock()))
+        values.update(self._more_diagnostics())
+        message = DiagnosticArray(
+            status=[
+                diagnostic_status(
+                    f"{self.node.get_fully_qualified_name()}: plant",
+                    self._level(),
+                    f"{supervisor.mode.value}: {supervisor.reason}",
+                    values,
+                )
+            ]
+        )
+        message.header.stamp = stamp_to_message(self.clock())
+        self._diagnostics.publish(message)
+
+    # --- callbacks -----------------------------------------------------------------------------------------
+
+    def _receiver(self, kind: Input) -> Callable[[bytes], None]:
+        supervisor = self.supervisor
+
+        def receive(data: bytes) -> None:
+            command = command_from_bytes(data)
+            refusal = supervisor.offer(kind, command, self.clock())
+            if refusal is None and self.on_command is not None and command is not None:
+                self.on_command(kind, command)
+
+        return receive
+
+    def _on_trajectory(self, message: JointTrajectory) -> None:
+        try:
+            trajectory = trajectory_from_message(message)
+            if self.sample is None:
+                raise ParameterError("no measurement yet")
+            refusal = self.supervisor.accept_trajectory(trajectory, self.clock(), self.sample)
+            if refusal:
+                raise ParameterError(refusal)
+        except ParameterError as error:
+            kind = self.supervisor.mode.value if not self.supervisor.mode.armed else "invalid"
+            self.refused_trajectories[kind] += 1
+            self.node.get_logger().error(f"joint_trajectory refused: {error}")
+            self.publish_event("trajectory_refused", reason=str(error))
+            return
+        self.node.get_logger().info(
+            f"following a trajectory from {trajectory.start:.3f} to {trajectory.goal:.3f} rad in "
+            f"{trajectory.duration:.2f} s"
+        )
+
+    def _on_arm(self, request: SetBool.Request, response: SetBool.Response) -> SetBool.Response:
+        if request.data:
+            self._check_commanders()
+            refusal = self.supervisor.arm(self.clock(), self.sample)
+            response.success, response.message = not refusal, refusal or self.supervisor.mode.value
+        else:
+            self.supervisor.disarm(self.clock())
+            response.success = self.supervisor.mode is Mode.DISARMED
+            response.message = self.supervisor.mode.value
+        self.publish_diagnostics()
+        return response
+
+    def _on_e_stop(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+        self.supervisor.e_stop(self.clock())
+        response.success, response.message = True, "e-stop latched: zero torque"
+        self.publish_diagnostics()
+        return response
+
+    def _on_e_stop_reset(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+        refusal = self.supervisor.e_stop_reset(self.clock())
+        response.success, response.message = not refusal, refusal or "disarmed"
+        self.publish_diagnostics()
+        return response
+
+    def _on_housekeeping(self) -> None:
+        self._check_commanders()
+        self._tell_refusals()
+        self.publish_diagnostics()
+
+    def _check_commanders(self) -> None:
+        topic = self.node.resolve_topic_name(names.EFFORT_COMMAND)
+        found = Counter(
+            f"{info.node_namespace.rstrip('/')}/{info.node_name}"
+            for info in self.node.get_publishers_info_by_topic(topic)
+        )
+        twins = [name for name, count in found.items() if count > 1]
+        conflict = ""
+        if twins:
+            conflict = f"{found[twins[0]]} commanders named {twins[0]} on {topic}; expected one: zero torque"
+        elif len(found) > 1 and self.supervisor.gates[Input.EFFORT_COMMAND].commander == "":
+            unnamed = self.supervisor.gates[Input.EFFORT_COMMAND].newest_stamp_ns is not None
+            if unnamed:
+                conflict = f"{len(found)} unnamed commanders on {topic}; expected one, or a frame_id: zero torque"
+        if conflict and conflict != self.supervisor.commander_conflict:
+            self.node.get_logger().error(conflict)
+        self.supervisor.set_commander_conflict(conflict)
+
+    def _tell(self, drive: Drive) -> None:
+        supervisor = self.supervisor
+        logger = self.node.get_logger()
+        text = f"{supervisor.mode.value}: {supervisor.reason}"
+        if supervisor.mode in {Mode.FAULT, Mode.E_STOP}:
+            logger.error(text)
+        elif drive.starved and self._told_mode is not None:
+            logger.warning(text)
+        else:
+            logger.info(text)
+        self.publish_event("plant_mode", mode=supervisor.mode.value, reason=supervisor.reason)
+
+    def _tell_refusals(self) -> None:
+        gates = {kind: self.supervisor.gates[kind] for kind in self._inputs}
+        refused = sum(sum(gate.refused.values()) for gate in gates.values())
+        if refused > self._told_refusals:
+            details = ", ".join(
+                f"{kind.value} {refusal.value} {count}"
+                for kind, gate in gates.items()
+                for refusal, count in sorted(gate.refused.items())
+            )
+            self.node.get_logger().warning(f"commands refused so far: {details}")
+            self._told_refusals = refused
+
+    def _level(self) -> bytes:
+        mode = self.supervisor.mode
+        if mode in {Mode.FAULT, Mode.E_STOP}:
+            return DiagnosticStatus.ERROR
+        starved = self._told_mode is not None and self._told_mode[1]
+        conflict = bool(self.supervisor.commander_conflict)
+        second = any(gate.refused_commander for gate in self.supervisor.gates.values())
+        return DiagnosticStatus.WARN if starved or conflict or second else DiagnosticStatus.OK

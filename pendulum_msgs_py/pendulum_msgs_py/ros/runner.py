@@ -1,0 +1,180 @@
+"""The one way to run a node: signals, executor, errors, and a plant that is safe before the process ends."""
+
+from __future__ import annotations
+
+import os
+import signal
+import socket
+import sys
+import threading
+import traceback
+from collections.abc import Callable, Iterable, Sequence
+from typing import Protocol, runtime_checkable
+
+import rclpy
+from rclpy.experimental import EventsExecutor
+from rclpy.node import Node
+from rclpy.signals import SignalHandlerOptions
+from rclpy.task import Future
+
+from pendulum_msgs_py.errors import PendulumError
+from pendulum_msgs_py.executables import EXIT_USAGE, report_error
+from pendulum_msgs_py.parameters import ParameterSpec
+
+__all__ = ["Closeable", "run_node"]
+
+_SPIN_SLICE = 0.5
+"""EventsExecutor.spin() hangs in the Jazzy wheels; spinning in finite slices works [s]."""
+_STOP_SIGNALS = (signal.SIGINT, signal.SIGTERM)
+_KEPT_OPEN: list[socket.socket] = []
+"""Write ends of the signal sockets: closed by the garbage collector, they would take the wakeup with them."""
+
+
+@runtime_checkable
+class Closeable(Protocol):
+    """A node that has something to make safe before it goes."""
+
+    def close(self) -> None:
+        """Stop moving, say so on the graph, release what is held. Called once, with the context still valid."""
+
+
+def run_node(
+    make_node: Callable[[Callable[[], None]], Node],
+    argv: Sequence[str] | None = None,
+    *,
+    program: str,
+    description: str,
+    specs: Iterable[ParameterSpec] = (),
+    example: str = "",
+) -> int:
+    """Run one node until it asks to stop, SIGINT or SIGTERM; return the exit code.
+
+    rclpy's own signal handlers invalidate the context before a last zero torque could be sent, so signals are taken
+    by a thread here: the node is closed first, then the context is shut down. A second signal ends at once.
+
+    Args:
+        make_node: Makes the node; its argument is a function that asks the runner to stop.
+        argv: Arguments of the process, ROS arguments included.
+        program: ``PACKAGE EXECUTABLE``, for help.
+        description: What the node does, one sentence.
+        specs: Its parameters, for help.
+        example: A command line to show in help.
+    """
+    arguments = list(sys.argv[1:] if argv is None else argv)
+    if "-h" in arguments or "--help" in arguments:
+        print(_help(program, description, specs, example))
+        return 0
+    own = arguments[: arguments.index("--ros-args")] if "--ros-args" in arguments else arguments
+    if own:
+        print(
+            f"error: {program} does not know {own[0]!r}; parameters go after --ros-args, as in "
+            f"{example or f'python -m {program} --ros-args -p NAME:=VALUE'}",
+            file=sys.stderr,
+        )
+        return EXIT_USAGE
+    return _run(make_node, arguments)
+
+
+def _run(make_node: Callable[[Callable[[], None]], Node], arguments: Sequence[str]) -> int:
+    signals = _listen_for_stop_signals()
+    try:
+        rclpy.init(args=list(arguments), signal_handler_options=SignalHandlerOptions.NO)
+    except Exception as error:
+        return report_error(PendulumError(f"ROS arguments are not understood: {error}"))
+    executor = EventsExecutor()
+    stopped = Future(executor=None)
+
+    def stop() -> None:
+        if not stopped.done():
+            stopped.set_result(None)
+        executor.wake()
+
+    threading.Thread(target=_watch_signals, args=(signals, stop), daemon=True).start()
+    node: Node | None = None
+    exit_code = 0
+    try:
+        node = make_node(stop)
+        executor.add_node(node)
+        while not stopped.done() and rclpy.ok():
+            executor.spin_until_future_complete(stopped, _SPIN_SLICE)
+    except PendulumError as error:
+        exit_code = report_error(error)
+    except Exception:
+        traceback.print_exc()
+        exit_code = 1
+    finally:
+        exit_code = _close(node, executor) or exit_code
+    return exit_code
+
+
+def _close(node: Node | None, executor: rclpy.executors.Executor) -> int:
+    exit_code = 0
+    if node is not None:
+        try:
+            if isinstance(node, Closeable):
+                node.close()
+        except PendulumError as error:
+            exit_code = report_error(error)
+        except Exception:
+            traceback.print_exc()
+            exit_code = 1
+        exit_code = exit_code or int(getattr(node, "exit_code", 0))
+        executor.remove_node(node)
+        node.destroy_node()
+    executor.shutdown()
+    rclpy.try_shutdown()
+    return exit_code
+
+
+def _listen_for_stop_signals() -> socket.socket:
+    """Return a socket that gets one byte, the signal's number, for each stop signal.
+
+    The byte is written by the C handler in whichever thread the kernel picks, so that neither a busy callback nor an
+    idle executor delays it. A handler is set even where a shell started us in the background with SIGINT ignored.
+    """
+    reader, writer = socket.socketpair()
+    writer.setblocking(False)
+    _KEPT_OPEN.append(writer)
+    signal.set_wakeup_fd(writer.fileno(), warn_on_full_buffer=False)
+    for stop_signal in _STOP_SIGNALS:
+        signal.signal(stop_signal, lambda number, frame: None)
+    return reader
+
+
+def _watch_signals(signals: socket.socket, stop: Callable[[], None]) -> None:
+    first = _next_stop_signal(signals)
+    stop()
+    second = _next_stop_signal(signals)
+    print(f"second {signal.Signals(second).name}: leaving at once", file=sys.stderr, flush=True)
+    os._exit(128 + first)
+
+
+def _next_stop_signal(signals: socket.socket) -> int:
+    while True:
+        number = signals.recv(1)[0]
+        if number in _STOP_SIGNALS:
+            return number
+
+
+def _help(program: str, description: str, specs: Iterable[ParameterSpec], example: str) -> str:
+    lines = [f"usage: python -m {program} [--ros-args -p NAME:=VALUE ...]", "", description]
+    rows = [
+        (
+            spec.name,
+            str(spec.default).lower() if isinstance(spec.default, bool) else str(spec.default),
+            spec.unit if spec.unit != "-" else "",
+            spec.description + (f" ({spec.domain})" if spec.domain else ""),
+        )
+        for spec in specs
+    ]
+    if rows:
+        lines += ["", "parameters (name, default, meaning):"]
+        name_width = max(len(row[0]) for row in rows)
+        value_width = max(len(f"{row[1]} {row[2]}".strip()) for row in rows)
+        lines += [
+            f"  {name:<{name_width}}  {f'{default} {unit}'.strip():<{value_width}}  {text}"
+            for name, default, unit, text in rows
+        ]
+    if example:
+        lines += ["", f"example: {example}"]
+    return "\n".join(lines)
