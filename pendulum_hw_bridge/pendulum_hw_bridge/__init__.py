@@ -1,3 +1,1 @@
-"""The real pendulum behind the simulator's interface: actuator port, backends, safety, and the bridge node over them."""
-
-__version__ = "0.1.0"
+"""Hardware bridge: a HEBI X5-9, or its emulator, behind the same interface as the simulator."""

@@ -1,0 +1,400 @@
+"""The actuator port: everything that the bridge asks of a drive, whichever backend stands behind it.
+
+A backend (HEBI module, emulated X5-9, emulator in another process, replay of a bag) implements
+:class:`ActuatorPort`; nothing above this module knows which one it talks to.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from enum import Enum, IntEnum
+from typing import NamedTuple, Protocol, runtime_checkable
+
+from pendulum_hw_bridge.gains import GainSet
+from pendulum_msgs_py.errors import FaultError, ParameterError
+
+__all__ = [
+    "FEEDBACK_QUANTITIES",
+    "MAX_COMMAND_LIFETIME",
+    "NO_SETPOINT",
+    "ActuatorError",
+    "ActuatorInfo",
+    "ActuatorPort",
+    "Applied",
+    "Command",
+    "CommandLock",
+    "Feedback",
+    "HardwareLimits",
+    "LimitState",
+    "MStopAction",
+    "Strategy",
+    "TemperatureState",
+    "check_command",
+    "check_lifetime",
+]
+
+NO_SETPOINT = math.nan
+"""Setpoint of a loop that is switched off, by HEBI's convention."""
+MAX_COMMAND_LIFETIME = 5.0
+"""Longest command lifetime that the firmware knows [s]."""
+
+
+class ActuatorError(FaultError):
+    """The actuator cannot do what was asked, or has gone.
+
+    Attributes:
+        fault: Name of the fault, as in the README's fault table.
+    """
+
+    def __init__(self, fault: str, message: str) -> None:
+        super().__init__(message)
+        self.fault = fault
+
+
+class Strategy(IntEnum):
+    """Control strategies of the firmware.
+
+    ``OFF``: motor off, PWM 0. ``DIRECT_PWM``: the setpoint is the PWM duty. ``TORQUE_CASCADE`` (2): position and
+    velocity loops give torque, the effort loop gives PWM. ``PARALLEL_PWM`` (3): three loops, each giving PWM, are
+    clipped and added. ``MIXED`` (4): position loop gives torque, velocity loop PWM.
+    """
+
+    OFF = 0
+    DIRECT_PWM = 1
+    TORQUE_CASCADE = 2
+    PARALLEL_PWM = 3
+    MIXED = 4
+
+
+class TemperatureState(IntEnum):
+    """What the firmware does about its temperature."""
+
+    NORMAL = 0
+    CRITICAL = 1
+    EXCEED_MAX_MOTOR = 2
+    EXCEED_MAX_BOARD = 3
+
+
+class LimitState(IntEnum):
+    """Where a quantity lies with respect to its safety limit."""
+
+    BELOW = 0
+    AT_LOWER = 1
+    INSIDE = 2
+    AT_UPPER = 3
+    ABOVE = 4
+    UNINITIALIZED = 5
+
+
+class CommandLock(IntEnum):
+    """Who holds the command lifetime."""
+
+    UNLOCKED = 0
+    LOCKED_BY_OTHER = 1
+    LOCKED_BY_SENDER = 2
+
+
+class MStopAction(str, Enum):
+    """What the motion-stop button does to a module."""
+
+    DISABLED = "disabled"
+    MOTOR_OFF = "motor_off"
+    HOLD_POSITION = "hold_position"
+
+
+class Feedback(NamedTuple):
+    """One complete record of feedback; everything that the thesis records and what a safe bridge has to watch.
+
+    Attributes:
+        stamp_ns: Host time of receipt [ns].
+        hardware_ns: The actuator's own time of measurement [ns].
+        sequence: Number of the record; a number that does not grow means stale feedback.
+        position: Output angle [rad].
+        velocity: Output velocity [rad/s].
+        effort: Joint torque measured through the spring [N m].
+        position_command: Setpoint in force; NaN where the loop is off [rad].
+        velocity_command: Setpoint in force [rad/s].
+        effort_command: Setpoint in force [N m].
+        pwm_command: PWM duty that the firmware puts on the motor, -1 to 1 [-].
+        motor_current: Current taken from the supply [A].
+        winding_current: Estimated winding current [A].
+        motor_position: Rotor angle, before the gears [rad].
+        motor_velocity: Rotor velocity [rad/s].
+        deflection: Output minus motor angle, both at the output: effort = -k deflection [rad].
+        deflection_velocity: Its rate [rad/s].
+        voltage: Supply voltage [V].
+        winding_temperature: Estimated [degC].
+        housing_temperature: Estimated [degC].
+        motor_sensor_temperature: Measured at the motor [degC].
+        board_temperature: Measured on the board [degC].
+        processor_temperature: Measured in the processor [degC].
+        m_stop: Whether the motion stop is pressed.
+        temperature_state: See :class:`TemperatureState`.
+        lock: Who holds the command lifetime.
+        position_limit: See :class:`LimitState`.
+        velocity_limit: See :class:`LimitState`.
+        effort_limit: See :class:`LimitState`.
+    """
+
+    stamp_ns: int
+    hardware_ns: int
+    sequence: int
+    position: float
+    velocity: float
+    effort: float
+    position_command: float
+    velocity_command: float
+    effort_command: float
+    pwm_command: float
+    motor_current: float
+    winding_current: float
+    motor_position: float
+    motor_velocity: float
+    deflection: float
+    deflection_velocity: float
+    voltage: float
+    winding_temperature: float
+    housing_temperature: float
+    motor_sensor_temperature: float
+    board_temperature: float
+    processor_temperature: float
+    m_stop: bool = False
+    temperature_state: int = TemperatureState.NORMAL
+    lock: int = CommandLock.UNLOCKED
+    position_limit: int = LimitState.INSIDE
+    velocity_limit: int = LimitState.INSIDE
+    effort_limit: int = LimitState.INSIDE
+
+
+FEEDBACK_QUANTITIES: Mapping[str, str] = {
+    "position": "rad",
+    "velocity": "rad/s",
+    "effort": "N m",
+    "position_command": "rad",
+    "velocity_command": "rad/s",
+    "effort_command": "N m",
+    "pwm_command": "-",
+    "motor_current": "A",
+    "winding_current": "A",
+    "motor_position": "rad",
+    "motor_velocity": "rad/s",
+    "deflection": "rad",
+    "deflection_velocity": "rad/s",
+    "voltage": "V",
+    "winding_temperature": "degC",
+    "housing_temperature": "degC",
+    "motor_sensor_temperature": "degC",
+    "board_temperature": "degC",
+    "processor_temperature": "degC",
+}
+"""Physical quantities of a feedback record and their units, in the order of :class:`Feedback`."""
+
+
+@dataclass(frozen=True, slots=True)
+class Command:
+    """Setpoints for one command lifetime; a loop without setpoint (NaN) is off.
+
+    Attributes:
+        position: [rad].
+        velocity: [rad/s].
+        effort: [N m]; not under ``DIRECT_PWM``.
+        pwm: Duty, -1 to 1; only under ``DIRECT_PWM``.
+    """
+
+    position: float = NO_SETPOINT
+    velocity: float = NO_SETPOINT
+    effort: float = NO_SETPOINT
+    pwm: float = NO_SETPOINT
+
+
+@dataclass(frozen=True, slots=True)
+class Applied:
+    """What a command became: the setpoints that were sent, after limits, and under which strategy.
+
+    Attributes:
+        command: The setpoints as sent.
+        strategy: Strategy in force.
+        limited: Whether a limit changed a setpoint.
+        sent_ns: Host time of sending [ns].
+    """
+
+    command: Command
+    strategy: Strategy
+    limited: bool
+    sent_ns: int
+
+
+@dataclass(frozen=True)
+class HardwareLimits:
+    """Limits that the firmware itself keeps, behind those of the bridge.
+
+    Attributes:
+        effort: Largest effort setpoint [N m].
+        velocity: Largest velocity setpoint [rad/s].
+        position_min: Lower end of the position window [rad].
+        position_max: Upper end [rad].
+        pwm: Largest PWM duty [-].
+        m_stop: What the motion stop does.
+    """
+
+    effort: float = 13.0
+    velocity: float = 1.5
+    position_min: float = -math.inf
+    position_max: float = math.inf
+    pwm: float = 1.0
+    m_stop: MStopAction = MStopAction.MOTOR_OFF
+
+    def __post_init__(self) -> None:
+        """Refuse limits that limit nothing."""
+        for name, unit in (("effort", "N m"), ("velocity", "rad/s"), ("pwm", "of the supply")):
+            value = getattr(self, name)
+            if not (math.isfinite(value) and value > 0.0):
+                raise ParameterError(f"{name} limit is {value} {unit}; expected a finite number > 0")
+        if self.pwm > 1.0:
+            raise ParameterError(f"pwm limit is {self.pwm}; expected > 0 and <= 1")
+        if not self.position_min < self.position_max:
+            raise ParameterError(
+                f"position window is [{self.position_min}, {self.position_max}] rad; expected min < max"
+            )
+
+
+@dataclass(frozen=True)
+class ActuatorInfo:
+    """What a connected actuator says of itself, read back and not assumed.
+
+    Attributes:
+        backend: Name of the backend.
+        family: HEBI family.
+        name: HEBI name.
+        serial: Serial number.
+        firmware: Firmware revision.
+        strategy: Strategy in force.
+        feedback_rate: [Hz].
+        command_lifetime: [s].
+        limits: Limits of the firmware.
+        gains: Gains in force, or None where the backend cannot read them back.
+        drivetrain: Constants by name, where known (for records of a run).
+    """
+
+    backend: str
+    family: str
+    name: str
+    serial: str
+    firmware: str
+    strategy: Strategy
+    feedback_rate: float
+    command_lifetime: float
+    limits: HardwareLimits
+    gains: GainSet | None = None
+    drivetrain: Mapping[str, float] = field(default_factory=dict)
+
+
+@runtime_checkable
+class ActuatorPort(Protocol):
+    """One actuator. Methods may be called from one thread only; all raise :class:`ActuatorError`."""
+
+    @property
+    def strategy(self) -> Strategy:
+        """Strategy in force."""
+
+    def connect(self) -> ActuatorInfo:
+        """Find the actuator, set rate, lifetime, limits and gains, and return what reads back."""
+
+    def now_ns(self) -> int:
+        """Return the clock of the feedback stamps [ns]."""
+
+    def read(self, timeout: float) -> Feedback | None:
+        """Return the next feedback record, or None where none came within the timeout [s]."""
+
+    def write(self, command: Command) -> Applied:
+        """Send setpoints for one command lifetime; return what was really sent, after limits."""
+
+    def set_strategy(self, strategy: Strategy) -> Strategy:
+        """Change the strategy, all loops off, and return the one that reads back."""
+
+    def set_gains(self, gains: GainSet) -> GainSet:
+        """Set the gains of all loops and return what reads back."""
+
+    def set_limits(self, limits: HardwareLimits) -> HardwareLimits:
+        """Set the firmware's limits and return what reads back."""
+
+    def set_command_lifetime(self, lifetime: float) -> float:
+        """Set the command lifetime [s], > 0, and return what reads back."""
+
+    def set_feedback_rate(self, rate: float) -> float:
+        """Set the feedback rate [Hz] and return what reads back."""
+
+    def stop(self) -> None:
+        """Make it safe: effort zero, then strategy off. Safe to call at any time, twice, and after a failure."""
+
+    def close(self) -> None:
+        """Stop and let go of the actuator."""
+
+
+def check_lifetime(lifetime: float) -> float:
+    """Return the command lifetime if it is one that ends [s].
+
+    Raises:
+        ParameterError: Zero (which the firmware takes for "for ever"), negative, too long or not finite.
+    """
+    if not (math.isfinite(lifetime) and 0.0 < lifetime <= MAX_COMMAND_LIFETIME):
+        raise ParameterError(
+            f"command_lifetime is {lifetime} s; expected > 0 and <= {MAX_COMMAND_LIFETIME:g} s "
+            "(0 would keep the last command for ever)"
+        )
+    return lifetime
+
+
+def check_command(command: Command, strategy: Strategy, limits: HardwareLimits) -> tuple[Command, bool]:
+    """Return the command within the limits, and whether that changed it.
+
+    Args:
+        command: What the bridge wants.
+        strategy: Strategy in force.
+        limits: The firmware's limits; kept here too, because the firmware takes any number without complaint.
+
+    Raises:
+        ParameterError: A setpoint is infinite, or does not exist under this strategy.
+    """
+    for name, unit in (
+        ("position", "rad"),
+        ("velocity", "rad/s"),
+        ("effort", "N m"),
+        ("pwm", "of the supply"),
+    ):
+        if math.isinf(getattr(command, name)):
+            raise ParameterError(
+                f"{name} setpoint is {getattr(command, name)} {unit}; expected a finite number"
+            )
+    direct = strategy is Strategy.DIRECT_PWM
+    if not direct and not math.isnan(command.pwm):
+        raise ParameterError(
+            f"pwm setpoint under strategy {strategy.name}; expected one under DIRECT_PWM only"
+        )
+    if direct and not (
+        math.isnan(command.effort) and math.isnan(command.position) and math.isnan(command.velocity)
+    ):
+        raise ParameterError("position, velocity or effort setpoint under DIRECT_PWM; expected pwm only")
+    limited = Command(
+        position=_clip(command.position, limits.position_min, limits.position_max),
+        velocity=_clip(command.velocity, -limits.velocity, limits.velocity),
+        effort=_clip(command.effort, -limits.effort, limits.effort),
+        pwm=_clip(command.pwm, -limits.pwm, limits.pwm),
+    )
+    changed = any(
+        getattr(limited, name) != getattr(command, name)
+        for name in ("position", "velocity", "effort", "pwm")
+        if not math.isnan(getattr(command, name))
+    )
+    return limited, changed
+
+
+def _clip(value: float, low: float, high: float) -> float:
+    # NaN ("loop off") passes unchanged: both comparisons are false.
+    if value < low:
+        return low
+    if value > high:
+        return high
+    return value

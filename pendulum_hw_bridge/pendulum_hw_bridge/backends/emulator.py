@@ -1,0 +1,172 @@
+"""Backend for an emulated X5-9 in this process, on the wall clock or on simulated time."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import asdict
+
+import numpy as np
+
+from pendulum_hw_bridge.actuator import (
+    ActuatorError,
+    ActuatorInfo,
+    Applied,
+    Command,
+    Feedback,
+    HardwareLimits,
+    Strategy,
+    check_command,
+    check_lifetime,
+)
+from pendulum_hw_bridge.clocks import Clock, WallClock
+from pendulum_hw_bridge.emulation.faults import ActuatorFault
+from pendulum_hw_bridge.emulation.x5 import EmulatedX5
+from pendulum_hw_bridge.gains import GainSet
+from pendulum_msgs_py.values import NANOSECONDS
+
+__all__ = ["EmulatorBackend"]
+
+
+class EmulatorBackend:
+    """The actuator port of an :class:`EmulatedX5`.
+
+    Args:
+        actuator: The emulated actuator; its clock must start at the present of ``clock``.
+        clock: Host clock; feedback carries its time.
+        seed: Seed of the jitter of commands on their way.
+    """
+
+    name = "emulator"
+
+    def __init__(self, actuator: EmulatedX5, clock: Clock | None = None, *, seed: int = 0) -> None:
+        self.actuator = actuator
+        self.clock = clock or WallClock()
+        self._random = np.random.Generator(np.random.Philox(key=[seed, 1]))
+        self._connected = False
+
+    @property
+    def strategy(self) -> Strategy:
+        """Strategy in force, as the actuator says."""
+        return self.actuator.strategy
+
+    def connect(self) -> ActuatorInfo:
+        """Return what the emulated actuator says of itself."""
+        self._connected = True
+        self._catch_up()
+        actuator = self.actuator
+        return ActuatorInfo(
+            backend=self.name,
+            family="emulated",
+            name=actuator.parameters.plant.name,
+            serial="X5-9-E0001",
+            firmware="emulated X5-9",
+            strategy=actuator.strategy,
+            feedback_rate=actuator.feedback_rate,
+            command_lifetime=actuator.command_lifetime,
+            limits=actuator.limits,
+            gains=actuator.gains,
+            drivetrain=asdict(actuator.parameters.drivetrain),
+        )
+
+    def now_ns(self) -> int:
+        """Return the host clock [ns]."""
+        return self.clock.now_ns()
+
+    def read(self, timeout: float) -> Feedback | None:
+        """Return the newest feedback, waiting for one at most ``timeout`` [s]."""
+        self._require_connection()
+        deadline = self.clock.now_ns() + round(timeout * NANOSECONDS)
+        self._catch_up()
+        while True:
+            feedback = self.actuator.feedback(self.clock.now_ns())
+            if feedback is not None:
+                return feedback
+            delivery = self.actuator.next_delivery_ns
+            sample = self.actuator.next_sample_ns
+            # A record on its way comes before the next one is measured, unless it is held back.
+            target = sample if delivery is None else min(delivery, sample)
+            if target > deadline or self.clock.now_ns() > deadline:
+                self.clock.wait_until(deadline)
+                self._catch_up()
+                return self.actuator.feedback(deadline)
+            before = self.clock.now_ns()
+            self.clock.wait_until(target)
+            if self.clock.now_ns() < target and self.clock.now_ns() - before < target - before:
+                return None  # woken up early: the program ends
+            self._catch_up()
+
+    def write(self, command: Command) -> Applied:
+        """Send setpoints; they arrive after the way there."""
+        self._require_connection()
+        limited, changed = check_command(command, self.actuator.strategy, self.actuator.limits)
+        if ActuatorFault.SEND_FAILED in self.actuator.faults:
+            raise ActuatorError("send_failed", "command could not be sent: the network refuses it")
+        now = self.clock.now_ns()
+        self._catch_up()
+        timing = self.actuator.parameters.timing
+        delay = timing.command_delay + timing.delay_jitter * float(self._random.standard_normal())
+        self.actuator.deliver(limited, now + max(0, round(delay * NANOSECONDS)))
+        return Applied(limited, self.actuator.strategy, changed, now)
+
+    def set_strategy(self, strategy: Strategy) -> Strategy:
+        """Change the strategy."""
+        self._configure(strategy=strategy)
+        return self.actuator.strategy
+
+    def set_gains(self, gains: GainSet) -> GainSet:
+        """Set the gains of all loops."""
+        self._configure(gains=gains)
+        return self.actuator.gains
+
+    def set_limits(self, limits: HardwareLimits) -> HardwareLimits:
+        """Set the firmware's limits."""
+        self._configure(limits=limits)
+        return self.actuator.limits
+
+    def set_command_lifetime(self, lifetime: float) -> float:
+        """Set the command lifetime [s]."""
+        self._configure(command_lifetime=check_lifetime(lifetime))
+        return self.actuator.command_lifetime
+
+    def set_feedback_rate(self, rate: float) -> float:
+        """Set the feedback rate [Hz]."""
+        self._configure(feedback_rate=rate)
+        return self.actuator.feedback_rate
+
+    def push(self, torque: float) -> None:
+        """Hold a torque on the link itself, as a hand would [N m]."""
+        self._catch_up()
+        self.actuator.push = torque if math.isfinite(torque) else 0.0
+
+    def stop(self) -> None:
+        """Effort zero, then strategy off."""
+        if not self._connected:
+            return
+        self._catch_up()
+        if (
+            self.actuator.strategy is not Strategy.OFF
+            and ActuatorFault.SEND_FAILED not in self.actuator.faults
+        ):
+            zero = Command(pwm=0.0) if self.actuator.strategy is Strategy.DIRECT_PWM else Command(effort=0.0)
+            self.actuator.deliver(zero, self.clock.now_ns())
+            self._catch_up()
+        # With the way there cut, nothing arrives: the command lifetime then has to do it.
+        if not self.actuator.faults & {ActuatorFault.COMMANDS_LOST, ActuatorFault.SEND_FAILED}:
+            self.actuator.configure(strategy=Strategy.OFF)
+
+    def close(self) -> None:
+        """Stop and let go."""
+        self.stop()
+        self._connected = False
+
+    def _configure(self, **changes: object) -> None:
+        self._require_connection()
+        self._catch_up()
+        self.actuator.configure(**changes)  # type: ignore[arg-type]  # one of its keywords each
+
+    def _catch_up(self) -> None:
+        self.actuator.advance_to(self.clock.now_ns())
+
+    def _require_connection(self) -> None:
+        if not self._connected:
+            raise ActuatorError("not_connected", "emulated actuator is not connected; call connect() first")

@@ -1,0 +1,1 @@
+"""The emulated X5-9: physics, firmware, temperatures, faults, and the process that serves it."""

@@ -1,0 +1,92 @@
+"""Faults that the emulated actuator can be given, by name: what fails on real drives, cables and networks."""
+
+from __future__ import annotations
+
+import math
+from enum import Enum
+
+from pendulum_hw_bridge.actuator import Feedback, LimitState, TemperatureState
+
+__all__ = ["ActuatorFault", "distort"]
+
+
+class ActuatorFault(str, Enum):
+    """A fault of actuator, sensor or link to it; the comment says what it stands for."""
+
+    FEEDBACK_LOST = "feedback_lost"  # network cable pulled on the way back
+    FEEDBACK_FROZEN = "feedback_frozen"  # the module repeats its last record
+    FEEDBACK_SLOW = "feedback_slow"  # every tenth record arrives
+    FEEDBACK_LATE = "feedback_late"  # a queue holds each record back by 80 ms
+    POSITION_NAN = "position_nan"
+    VELOCITY_NAN = "velocity_nan"
+    EFFORT_NAN = "effort_nan"
+    POSITION_FROZEN = "position_frozen"  # output encoder stuck while the motor turns
+    POSITION_JUMP = "position_jump"  # output encoder slips by 0.5 rad
+    VELOCITY_SPIKE = "velocity_spike"  # velocity reads 5 rad/s
+    EFFORT_OFFSET = "effort_offset"  # spring encoder slips: effort reads 15 N m too much
+    PWM_STUCK = "pwm_stuck"  # the duty stays where it is, whatever the setpoint, until the strategy goes off
+    WINDING_OPEN = "winding_open"  # a motor phase breaks: PWM without current
+    COMMANDS_LOST = "commands_lost"  # network cable pulled on the way there
+    LOCKED_BY_OTHER = "locked_by_other"  # somebody else's Scope holds the module
+    STRATEGY_CHANGED = "strategy_changed"  # the module runs another strategy than confirmed
+    GAINS_LOST = "gains_lost"  # the module forgets its gains and loops output nothing
+    MODULE_REBOOT = "module_reboot"  # the module restarts: strategy off, its clock from zero
+    M_STOP = "m_stop"  # the motion-stop button is pressed
+    OVER_TEMPERATURE_MOTOR = "over_temperature_motor"
+    OVER_TEMPERATURE_BOARD = "over_temperature_board"
+    TEMPERATURE_CRITICAL = "temperature_critical"
+    WINDING_HOT = "winding_hot"  # the winding estimate reads 150 degC
+    VOLTAGE_LOW = "voltage_low"  # the supply sags to 18 V
+    VOLTAGE_HIGH = "voltage_high"  # the supply rises to 52 V
+    POSITION_LIMIT = "position_limit"  # the firmware's own position limit acts
+    VELOCITY_LIMIT = "velocity_limit"
+    EFFORT_LIMIT = "effort_limit"
+    OVERSPEED = "overspeed"  # somebody turns the link faster than the bridge allows
+    OUTSIDE_WINDOW = "outside_window"  # the position reads outside the window
+    SEND_FAILED = "send_failed"  # the network interface refuses to send
+
+
+def distort(feedback: Feedback, faults: set[ActuatorFault], frozen: Feedback | None) -> Feedback:
+    """Return a feedback record as the faulty sensors would give it.
+
+    Args:
+        feedback: The true record.
+        faults: Faults in force.
+        frozen: Record at the moment a freeze began.
+    """
+    changes: dict[str, object] = {}
+    fault = ActuatorFault
+    if fault.POSITION_NAN in faults:
+        changes["position"] = math.nan
+    if fault.VELOCITY_NAN in faults:
+        changes["velocity"] = math.nan
+    if fault.EFFORT_NAN in faults:
+        changes["effort"] = math.nan
+    if fault.POSITION_FROZEN in faults and frozen is not None:
+        changes["position"] = frozen.position
+    if fault.POSITION_JUMP in faults:
+        changes["position"] = feedback.position + 0.5
+    if fault.OUTSIDE_WINDOW in faults:
+        changes["position"] = feedback.position + 20.0
+    if fault.VELOCITY_SPIKE in faults:
+        changes["velocity"] = 5.0
+    if fault.OVERSPEED in faults:
+        changes["velocity"] = 1.8
+        changes["velocity_limit"] = LimitState.INSIDE
+    if fault.EFFORT_OFFSET in faults:
+        changes["effort"] = feedback.effort + 15.0
+    if fault.WINDING_HOT in faults:
+        changes["winding_temperature"] = 150.0
+    if fault.TEMPERATURE_CRITICAL in faults:
+        changes["temperature_state"] = TemperatureState.CRITICAL
+    if fault.OVER_TEMPERATURE_MOTOR in faults:
+        changes["temperature_state"] = TemperatureState.EXCEED_MAX_MOTOR
+    if fault.OVER_TEMPERATURE_BOARD in faults:
+        changes["temperature_state"] = TemperatureState.EXCEED_MAX_BOARD
+    if fault.POSITION_LIMIT in faults:
+        changes["position_limit"] = LimitState.ABOVE
+    if fault.VELOCITY_LIMIT in faults:
+        changes["velocity_limit"] = LimitState.ABOVE
+    if fault.EFFORT_LIMIT in faults:
+        changes["effort_limit"] = LimitState.ABOVE
+    return feedback._replace(**changes) if changes else feedback

@@ -1,0 +1,260 @@
+"""Inner loop of the emulator: motor, gears, spring, link, temperatures and firmware in steps of 0.25 ms.
+
+The equations are those of :mod:`pendulum_msgs_py.dynamics.series_elastic`, called here, not copied. Semi-implicit
+Euler: velocities first, then positions with the new velocities; dry friction implicitly, hysteresis exactly.
+"""
+
+from __future__ import annotations
+
+import math
+import os
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+import pendulum_msgs_py.dynamics.rigid as _rigid
+import pendulum_msgs_py.dynamics.series_elastic as _sea
+from pendulum_hw_bridge.emulation import firmware as _firmware
+from pendulum_hw_bridge.emulation import thermal as _thermal
+from pendulum_hw_bridge.emulation.firmware import control_pwm, njit
+
+__all__ = ["CONSTANTS", "STATES", "STEP", "STEPS_PER_CYCLE", "STEP_NS", "advance"]
+
+STEP = 2.5e-4
+"""Integration step [s]."""
+STEP_NS = 250_000
+"""Integration step [ns]."""
+STEPS_PER_CYCLE = round(_firmware.CONTROL_PERIOD / STEP)
+
+STATES = (
+    "motor_position",
+    "motor_velocity",
+    "position",
+    "velocity",
+    "hysteresis",
+    "winding_temperature",
+    "housing_temperature",
+    "body_temperature",
+    "pwm",
+    "current",
+    "spring_torque",
+    "heat",
+)
+"""Names of the state vector's entries, all at the output side of the gears; ``heat`` sums i^2 R [J]."""
+
+CONSTANTS = (
+    "gear_ratio",
+    "torque_constant",
+    "back_emf_constant",
+    "winding_resistance",
+    "resistance_coefficient",
+    "magnet_coefficient",
+    "supply_voltage",
+    "reflected_inertia",
+    "motor_damping",
+    "motor_coulomb",
+    "motor_static",
+    "motor_stribeck",
+    "stiffness",
+    "hardening",
+    "hysteresis_torque",
+    "hysteresis_deflection",
+    "link_inertia",
+    "link_damping",
+    "gravity",
+    "winding_housing",
+    "housing_body",
+    "body_ambient",
+    "winding_capacity",
+    "housing_capacity",
+    "body_capacity",
+    "ambient",
+    "max_winding",
+    "critical_winding",
+    "effort_normaliser",
+    "velocity_normaliser",
+    "velocity_clamp",
+    "effort_clamp",
+    "position_min",
+    "position_max",
+    "pwm_limit",
+    "pwm_step",
+    "enabled",
+)
+"""Names of the constant vector's entries."""
+
+_QM, _VM, _Q, _V, _Z, _TW, _TH, _TB, _PWM, _I, _TAU, _HEAT = range(12)
+(
+    _N,
+    _KT,
+    _KE,
+    _R20,
+    _ALPHA,
+    _BETA,
+    _VOLT,
+    _J,
+    _BV,
+    _TC,
+    _TS,
+    _VS,
+    _K,
+    _K3,
+    _TAUH,
+    _D0,
+    _M,
+    _BL,
+    _G,
+    _RWH,
+    _RHB,
+    _RBA,
+    _CW,
+    _CH,
+    _CB,
+    _AMBIENT,
+    _TMAX,
+    _TCRIT,
+    _FF_EFFORT,
+    _FF_VELOCITY,
+    _VCLAMP,
+    _ECLAMP,
+    _QMIN,
+    _QMAX,
+    _ULIMIT,
+    _USTEP,
+    _ENABLED,
+) = range(37)
+
+_CLAMP_BAND = 0.05
+"""Share of the velocity clamp over which the firmware takes the drive back to nothing."""
+
+_resistance_at = njit(cache=True)(_sea.winding_resistance_at)
+_winding_current = njit(cache=True)(_sea.winding_current)
+_spring_torque = njit(cache=True)(_sea.spring_torque)
+_dahl_step = njit(cache=True)(_sea.dahl_step)
+_motor_acceleration = njit(cache=True)(_sea.motor_acceleration)
+_dry_friction_step = njit(cache=True)(_sea.dry_friction_step)
+_link_acceleration = njit(cache=True)(_sea.link_acceleration)
+_friction_magnitude = njit(cache=True)(_rigid.friction_magnitude)
+_constant_at = njit(cache=True)(_thermal.torque_constant_at)
+
+
+@njit(cache=True)
+def advance(
+    state: np.ndarray,
+    constants: np.ndarray,
+    gains: np.ndarray,
+    memory: np.ndarray,
+    setpoints: np.ndarray,
+    strategy: int,
+    link_torque: float,
+    first_step: int,
+    steps: int,
+) -> None:
+    """Advance the emulated actuator and its link by some steps, in place.
+
+    Args:
+        state: Entries as in :data:`STATES`.
+        constants: Entries as in :data:`CONSTANTS`.
+        gains: (3, 14), see :mod:`.firmware`.
+        memory: (3, 5), of the firmware's loops.
+        setpoints: Position, velocity, effort (or PWM); NaN for off.
+        strategy: 0 to 4.
+        link_torque: Torque on the link itself, held over the steps [N m].
+        first_step: Number of the first step since power-up: the firmware runs every fourth.
+        steps: How many steps.
+    """
+    period = STEP * STEPS_PER_CYCLE
+    for number in range(first_step, first_step + steps):
+        deflection = state[_QM] - state[_Q]
+        if number % STEPS_PER_CYCLE == 0:
+            sensed = _spring_torque(deflection, 0.0, constants[_K], constants[_K3], 0.0)
+            wanted = setpoints
+            if not math.isnan(setpoints[2]) and strategy != 1 and abs(setpoints[2]) > constants[_ECLAMP]:
+                wanted = setpoints.copy()
+                wanted[2] = math.copysign(constants[_ECLAMP], setpoints[2])
+            pwm = control_pwm(
+                strategy,
+                gains,
+                memory,
+                wanted,
+                state[_Q],
+                state[_V],
+                sensed,
+                constants[_FF_EFFORT],
+                constants[_FF_VELOCITY],
+                period,
+            )
+            pwm = min(max(pwm, -constants[_ULIMIT]), constants[_ULIMIT])
+            if pwm * state[_VM] > 0.0:
+                # The firmware takes the drive back as the motor nears its speed limit.
+                room = (constants[_VCLAMP] - abs(state[_VM])) / (_CLAMP_BAND * constants[_VCLAMP])
+                pwm *= min(max(room, 0.0), 1.0)
+            if (state[_Q] > constants[_QMAX] and pwm > 0.0) or (state[_Q] < constants[_QMIN] and pwm < 0.0):
+                pwm = 0.0
+            if state[_TW] > constants[_TCRIT]:
+                cool = (constants[_TMAX] - state[_TW]) / (constants[_TMAX] - constants[_TCRIT])
+                pwm *= min(max(cool, 0.0), 1.0)
+            if constants[_ENABLED] == 0.0:
+                pwm = 0.0
+            state[_PWM] = math.floor(pwm / constants[_USTEP] + 0.5) * constants[_USTEP]
+        resistance = _resistance_at(state[_TW], constants[_R20], constants[_ALPHA])
+        current = _winding_current(
+            state[_PWM],
+            state[_VM],
+            constants[_VOLT],
+            _constant_at(state[_TH], constants[_KE], constants[_BETA]),
+            constants[_N],
+            resistance,
+        )
+        spring = _spring_torque(deflection, state[_Z], constants[_K], constants[_K3], constants[_TAUH])
+        motor_velocity = state[_VM] + STEP * _motor_acceleration(
+            current,
+            state[_VM],
+            spring,
+            _constant_at(state[_TH], constants[_KT], constants[_BETA]),
+            constants[_N],
+            constants[_BV],
+            constants[_J],
+        )
+        friction = _friction_magnitude(state[_VM], constants[_TC], constants[_TS], constants[_VS])
+        motor_velocity = _dry_friction_step(motor_velocity, friction, constants[_J], STEP)
+        velocity = state[_V] + STEP * _link_acceleration(
+            state[_Q], state[_V], spring, link_torque, constants[_M], constants[_BL], constants[_G]
+        )
+        state[_VM] = motor_velocity
+        state[_V] = velocity
+        state[_QM] += STEP * motor_velocity
+        state[_Q] += STEP * velocity
+        state[_Z] = _dahl_step(state[_Z], state[_QM] - state[_Q] - deflection, constants[_D0])
+        state[_I] = current
+        state[_TAU] = spring
+        power = current * current * resistance
+        state[_HEAT] += STEP * power
+        to_housing = (state[_TW] - state[_TH]) / constants[_RWH]
+        to_body = (state[_TH] - state[_TB]) / constants[_RHB]
+        to_ambient = (state[_TB] - constants[_AMBIENT]) / constants[_RBA]
+        state[_TW] += STEP * (power - to_housing) / constants[_CW]
+        state[_TH] += STEP * (to_housing - to_body) / constants[_CH]
+        state[_TB] += STEP * (to_body - to_ambient) / constants[_CB]
+
+
+def _drop_stale_cache(kernel: Any, modules: tuple[Any, ...]) -> None:
+    """Delete compiled code that is older than an equation that it was compiled from.
+
+    numba looks at the kernel's own file only; without this an edited equation would be ignored in silence.
+    """
+    cache = getattr(kernel, "_cache", None)
+    folder = getattr(cache, "cache_path", None)
+    if folder is None or not os.path.isdir(folder):
+        return
+    newest = max(os.path.getmtime(module.__file__) for module in modules)
+    for file in Path(folder).glob("kernel.*.nb[ic]"):
+        try:
+            if file.stat().st_mtime < newest:
+                file.unlink()
+        except OSError:
+            continue  # another process was faster, or the folder is read-only: numba copes with both
+
+
+_drop_stale_cache(advance, (_sea, _rigid, _firmware, _thermal))
