@@ -173,7 +173,7 @@ class BagWriter:
             try:
                 channel = self._ids[topic]
             except KeyError:
-                raise BagError(f"topic {topic} was not added to bag {self.path} before its first message") from None
+                raise self._unknown(topic) from None
             self._require_open()
             self._file.write(channel, log_time_ns, data)
             self._written[topic] += 1
@@ -183,8 +183,18 @@ class BagWriter:
     def write_many(self, items: Iterable[tuple[str, int, bytes]]) -> None:
         """Add many messages ``(topic, log_time_ns, data)`` under one lock."""
         with self._lock:
+            self._require_open()
+            file, ids, written = self._file, self._ids, self._written
             for topic, log_time_ns, data in items:
-                self.write(topic, log_time_ns, data)
+                try:
+                    channel = ids[topic]
+                except KeyError:
+                    raise self._unknown(topic) from None
+                file.write(channel, log_time_ns, data)
+                written[topic] += 1
+                if file.pending_size >= self._chunk_size:
+                    self.seal()
+                    file = self._file  # a seal may begin the next file
 
     def seal(self) -> None:
         """Make all messages so far visible on disk; they survive the death of the process.
@@ -235,6 +245,7 @@ class BagWriter:
             try:
                 self._close_file()
             finally:
+                # After the file gave back its unused room there may be space for this again.
                 self._replace_metadata()
 
     def abandon(self) -> None:
@@ -256,6 +267,9 @@ class BagWriter:
     def _require_open(self) -> None:
         if not self._open:
             raise BagError(f"bag {self.path} is closed; nothing can be written to it any more")
+
+    def _unknown(self, topic: str) -> BagError:
+        return BagError(f"topic {topic} was not added to bag {self.path} before its first message")
 
     def _open_file(self) -> _StorageFile:
         name = f"{self.path.name}_{len(self._files)}"

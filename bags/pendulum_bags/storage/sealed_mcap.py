@@ -222,7 +222,8 @@ class SealedMcapFile:
             self._fd = os.open(temporary, os.O_RDWR | os.O_CREAT | os.O_TRUNC, 0o644)
             self._data_end = len(head)
             self._size = _FIRST_ROOM
-            self._allocate_slots(_FIRST_SLOT)
+            self._slots = self._place_slots(_FIRST_SLOT)
+            self._limit = self._slots[0].start
             self._write(head + rec.padding_head(len(head), self._tail), 0)
             slot = self._slots[0]
             self._fill_slot(slot)
@@ -241,11 +242,14 @@ class SealedMcapFile:
         data_end = rec.record(rec.DATA_END, bytes(4))
         return data_end + rec.footer_record(slot.start, slot.offsets_start) + rec.MAGIC
 
-    def _allocate_slots(self, capacity: int) -> None:
+    def _place_slots(self, capacity: int) -> list[_Slot]:
         top = self._tail // _PAGE * _PAGE
-        self._slots = [_Slot(top - 2 * capacity, capacity), _Slot(top - capacity, capacity)]
-        self._live = 0
-        self._limit = top - 2 * capacity
+        return [_Slot(top - 2 * capacity, capacity), _Slot(top - capacity, capacity)]
+
+    @property
+    def _summary_stop(self) -> int:
+        """Where the padding behind a summary ends and the footer begins."""
+        return self._size - rec.FOOTER_SIZE - len(rec.MAGIC)
 
     def _write(self, data: bytes | Sequence[bytes], offset: int) -> None:
         view = memoryview(data if isinstance(data, bytes) else b"".join(data))
@@ -320,7 +324,7 @@ class SealedMcapFile:
         end = index_end + len(tail)
         if end + _HEAD > slot.start + slot.capacity:
             return False
-        self._write([*body, tail, rec.padding_head(end, self._size - rec.FOOTER_SIZE - len(rec.MAGIC))], start)
+        self._write([*body, tail, rec.padding_head(end, self._summary_stop)], start)
         slot.description_size = size
         slot.indexes = len(self._index_records)
         slot.index_end = index_end
@@ -340,34 +344,32 @@ class SealedMcapFile:
         summary = sum(map(len, self._summary_head())) + self._index_size + 4 * _PAGE
         capacity = max(_FIRST_SLOT, -(-2 * summary // _PAGE) * _PAGE)
         room = min(max(_FIRST_ROOM, self._data_end), _LARGEST_ROOM)
-        old_size, old_slots, old_live = self._size, self._slots, self._live
-        size = self._size + -(-(needed + room + 2 * capacity) // _PAGE) * _PAGE
-        # The summary in force, continued by padding up to the new footer, in the place that is not in force ...
-        keeper = old_slots[1 - old_live]
-        live = old_slots[old_live]
-        self._size = size
+        old_size = self._size
+        self._size += -(-(needed + room + 2 * capacity) // _PAGE) * _PAGE
+        live, keeper = self._slots[self._live], self._slots[1 - self._live]
         try:
-            content = self._read_summary(live)
-            moved = rec.padding_head(
-                keeper.start + len(content), size - rec.FOOTER_SIZE - len(rec.MAGIC)
-            )
-            # (summary offsets name absolute positions; those of the copy would be wrong, so it has none)
-            self._write(content + moved, keeper.start)
+            # The summary in force, continued by padding up to the new end, in the place that is not in force ...
+            content = os.pread(self._fd, live.offsets_start - live.start, live.start)
+            padding = rec.padding_head(keeper.start + len(content), self._summary_stop)
+            self._write(content + padding, keeper.start)
+            # ... then the end of the file moves there in one write (offsets name absolute places: the copy has none).
             tail = rec.record(rec.DATA_END, bytes(4)) + rec.footer_record(keeper.start, 0) + rec.MAGIC
-            # ... then the end of the file moves, in one write ...
             self._write(tail, self._tail)
         except OSError:
             self._size = old_size
             raise
-        # ... then the readers in order learn of it, and the summaries move to the new end.
+        keeper.description_size = live.description_size
+        keeper.indexes = live.indexes
+        keeper.index_end = keeper.start + live.index_end - live.start
+        keeper.offsets_start = keeper.start + len(content)
+        self._live = 1 - self._live
+        # Readers in order learn of the new end, and the summaries move to it.
         self._write(rec.padding_head(self._data_end, self._tail), self._data_end)
-        self._allocate_slots(capacity)
-        if not self._fill_slot(self._slots[0]):
-            raise AssertionError("a summary outgrew the place that was made for it")
-        self._write(self._tail_bytes(self._slots[0]), self._tail)
-
-    def _read_summary(self, slot: _Slot) -> bytes:
-        return os.pread(self._fd, slot.offsets_start - slot.start, slot.start)
+        slots = self._place_slots(capacity)
+        if not self._fill_slot(slots[0]):
+            raise BagError(f"{self.path}: a summary outgrew the {capacity} bytes that were made for it")
+        self._write(self._tail_bytes(slots[0]), self._tail)
+        self._slots, self._live, self._limit = slots, 0, slots[0].start
 
     def _compact(self, metadata: str) -> None:
         indexes: list[bytes] = []

@@ -1,0 +1,104 @@
+"""Reading the parameters of all nodes, so that a bag says with which values its data came about."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from typing import TYPE_CHECKING, Any
+
+from rcl_interfaces.msg import ParameterEvent, ParameterValue
+from rcl_interfaces.srv import GetParameters, ListParameters
+from rclpy.parameter import parameter_value_to_python
+from rclpy.qos import qos_profile_parameter_events
+
+if TYPE_CHECKING:
+    from rclpy.client import Client
+    from rclpy.node import Node
+
+__all__ = ["ParameterReader"]
+
+_PATIENCE = 50  # looks at the graph before a node that does not answer is given up
+
+
+class ParameterReader:
+    """Asks each node that appears for its parameters, and follows their changes.
+
+    Args:
+        node: The node that asks; its executor delivers the answers.
+        on_values: Called with all values so far (node -> parameter -> value) and the name of a node whose parameters
+            have changed after they were first read (else empty).
+    """
+
+    def __init__(self, node: Node, on_values: Callable[[Mapping[str, Mapping[str, Any]], str], None]) -> None:
+        self._node = node
+        self._on_values = on_values
+        self.values: dict[str, dict[str, Any]] = {}
+        self._waiting: dict[str, int] = {}
+        self._known: set[str] = {node.get_fully_qualified_name()}
+        self._clients: list[Client] = []
+        self._finished: list[Client] = []
+        node.create_subscription(ParameterEvent, "/parameter_events", self._on_event, qos_profile_parameter_events)
+
+    def look(self) -> None:
+        """Look for new nodes, and ask those whose services have appeared."""
+        for client in self._finished:
+            self._node.destroy_client(client)
+        self._finished.clear()
+        for name, namespace in self._node.get_node_names_and_namespaces():
+            full = f"{namespace.rstrip('/')}/{name}"
+            if full not in self._known and not name.startswith("_"):
+                self._known.add(full)
+                self._waiting[full] = 0
+        for full in list(self._waiting):
+            self._waiting[full] += 1
+            if self._ask(full) or self._waiting[full] > _PATIENCE:
+                del self._waiting[full]
+
+    def _client(self, kind: Any, full: str, service: str) -> Client:
+        return self._node.create_client(kind, f"{full}/{service}")
+
+    def _ask(self, full: str) -> bool:
+        lister = self._client(ListParameters, full, "list_parameters")
+        getter = self._client(GetParameters, full, "get_parameters")
+        if not (lister.service_is_ready() and getter.service_is_ready()):
+            self._finished += [lister, getter]
+            return False
+
+        def on_names(future: Any) -> None:
+            self._finished.append(lister)
+            answer = future.result()
+            if answer is None or not answer.result.names:
+                self._finished.append(getter)
+                return
+            names = list(answer.result.names)
+            asked = getter.call_async(GetParameters.Request(names=names))
+            asked.add_done_callback(lambda values: on_values(names, values))
+
+        def on_values(names: list[str], future: Any) -> None:
+            self._finished.append(getter)
+            answer = future.result()
+            if answer is None:
+                return
+            self.values[full] = {
+                name: _plain(value) for name, value in zip(names, answer.values, strict=False) if name != "use_sim_time"
+                or value.bool_value
+            }
+            self._on_values(self.values, "")
+
+        lister.call_async(ListParameters.Request()).add_done_callback(on_names)
+        return True
+
+    def _on_event(self, event: ParameterEvent) -> None:
+        values = self.values.get(event.node)
+        if values is None:
+            return
+        changed = {p.name: _plain(p.value) for p in [*event.new_parameters, *event.changed_parameters]}
+        if any(values.get(name, self) != value for name, value in changed.items()):
+            values.update(changed)
+            self._on_values(self.values, event.node)
+
+
+def _plain(value: ParameterValue) -> Any:
+    plain = parameter_value_to_python(value)
+    if plain is None or isinstance(plain, (bool, int, float, str)):
+        return plain
+    return list(plain)

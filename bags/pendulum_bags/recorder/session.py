@@ -1,0 +1,218 @@
+"""A recording as a bounded queue and one thread that writes: nobody who delivers messages ever waits for the disk."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from pendulum_msgs_py.errors import BagError
+
+from pendulum_bags.storage import BagWriter, QosProfile
+from pendulum_bags.storage.message_types import MessageType
+
+__all__ = ["RecordingSession", "SessionReport", "TopicCount"]
+
+MAX_QUEUE_BYTES = 256 << 20
+SEAL_INTERVAL = 0.1
+"""Time between two seals [s]; with what waits in the queue, a kill costs less than twice of it."""
+SYNC_INTERVAL = 5.0
+"""Time between two requests to the disk to keep what it was given [s]: what a power failure may cost."""
+
+
+@dataclass(slots=True)
+class TopicCount:
+    """Messages of one topic: arrived, refused by the full queue, never arrived, safely written."""
+
+    received: int = 0
+    refused: int = 0
+    missing: int = 0
+    written: int = 0
+
+    @property
+    def lost(self) -> int:
+        """Messages that were published to us and are not in the bag."""
+        return self.missing + self.received - self.written
+
+
+@dataclass(slots=True)
+class SessionReport:
+    """What a recording came to."""
+
+    path: Path
+    topics: dict[str, TopicCount] = field(default_factory=dict)
+    error: str = ""
+
+    @property
+    def received(self) -> int:
+        """Messages that arrived, over all topics."""
+        return sum(count.received for count in self.topics.values())
+
+    @property
+    def written(self) -> int:
+        """Messages in the bag, over all topics."""
+        return sum(count.written for count in self.topics.values())
+
+    @property
+    def lost(self) -> int:
+        """Messages that were published and are not in the bag, over all topics."""
+        return sum(count.lost for count in self.topics.values())
+
+    def sentence(self) -> str:
+        """Return the report in one sentence."""
+        text = f"{self.written} messages of {len(self.topics)} topics in {self.path}"
+        if self.lost:
+            worst = [f"{name} {count.lost}" for name, count in sorted(self.topics.items()) if count.lost]
+            text += f"; LOST {self.lost} of {self.received + sum(c.missing for c in self.topics.values())}"
+            text += f" ({', '.join(worst)})"
+        else:
+            text += ", nothing lost"
+        return text + (f"; stopped because {self.error}" if self.error else "")
+
+
+class RecordingSession:
+    """Write what is offered to a bag, by a thread of its own.
+
+    Args:
+        writer: The bag; the session closes it.
+        max_queue_bytes: Memory that may wait to be written [bytes]. What exceeds it is refused and counted.
+        seal_interval: Time between two seals [s].
+        sync_interval: Time between two syncs to disk [s]; 0 for never.
+        on_failure: Called once, from the writing thread, when the disk refuses to take more.
+    """
+
+    def __init__(
+        self,
+        writer: BagWriter,
+        *,
+        max_queue_bytes: int = MAX_QUEUE_BYTES,
+        seal_interval: float = SEAL_INTERVAL,
+        sync_interval: float = SYNC_INTERVAL,
+        on_failure: Callable[[str], None] | None = None,
+    ) -> None:
+        self.writer = writer
+        self.failure = ""
+        self._max_queue_bytes = max_queue_bytes
+        self._seal_interval = seal_interval
+        self._sync_interval = sync_interval
+        self._on_failure = on_failure
+        self._counts: dict[str, TopicCount] = {}
+        self._queue: list[tuple[str, int, bytes]] = []
+        self._queued_bytes = 0
+        self._lock = threading.Lock()
+        self._stop = threading.Event()
+        self._closed = False
+        self._thread = threading.Thread(target=self._run, name="bag writer", daemon=True)
+        self._thread.start()
+
+    def add_topic(self, name: str, type: MessageType, qos: Sequence[QosProfile]) -> None:
+        """Announce a topic before its first message.
+
+        Raises:
+            BagError: The bag holds the topic with another type.
+        """
+        if self.failure:
+            return
+        try:
+            self.writer.add_topic(name, type, qos)
+        except BagError:
+            raise
+        except OSError as error:
+            self._fail(error)
+        self._counts.setdefault(name, TopicCount())
+
+    def offer(self, topic: str, items: Sequence[tuple[int, bytes]]) -> int:
+        """Queue messages of a topic as (log time [ns], CDR bytes); return how many were refused.
+
+        Messages are refused when the queue is full (the disk does not keep up) or the disk has failed.
+        """
+        count = self._counts[topic]
+        count.received += len(items)
+        if self.failure or self._closed:
+            count.refused += len(items)
+            return len(items)
+        refused = 0
+        with self._lock:
+            for time_ns, data in items:
+                if self._queued_bytes + len(data) > self._max_queue_bytes:
+                    refused += 1
+                    continue
+                self._queued_bytes += len(data)
+                self._queue.append((topic, time_ns, data))
+        count.refused += refused
+        return refused
+
+    def note_missing(self, topic: str, number: int) -> None:
+        """Count messages that the middleware lost before they could be offered."""
+        self._counts[topic].missing += number
+
+    def counts(self) -> dict[str, TopicCount]:
+        """Return the counts so far; ``written`` are those that are safe on disk."""
+        sealed = self.writer.sealed
+        for name, count in self._counts.items():
+            count.written = sealed.get(name, 0)
+        return dict(self._counts)
+
+    def close(self) -> SessionReport:
+        """Write what is queued, close the bag and report; once more only reports."""
+        if not self._closed:
+            self._closed = True
+            self._stop.set()
+            self._thread.join()
+            if not self.failure:
+                try:
+                    self._write_queue()
+                    self._store_counts()
+                    self.writer.close()
+                except OSError as error:
+                    self._fail(error)
+        return SessionReport(self.writer.path, self.counts(), self.failure)
+
+    # -- the writing thread ------------------------------------------------------------------------------------
+
+    def _run(self) -> None:
+        synced = time.monotonic()
+        due = synced + self._seal_interval
+        while not self._stop.wait(max(due - time.monotonic(), 0.0)):
+            now = time.monotonic()
+            due = max(due + self._seal_interval, now)
+            try:
+                self._write_queue()
+                if self._sync_interval and now - synced >= self._sync_interval:
+                    synced = now
+                    self.writer.sync()
+            except OSError as error:
+                self._fail(error)
+                return
+
+    def _write_queue(self) -> None:
+        with self._lock:
+            items, self._queue = self._queue, []
+            self._queued_bytes = 0
+        if items:
+            self.writer.write_many(items)
+        self.writer.seal()
+
+    def _store_counts(self) -> None:
+        self.writer.seal()
+        self.writer.update_metadata(
+            {
+                "pendulum.recorder.counts": {
+                    name: {"received": c.received, "written": c.written, "lost": c.lost}
+                    for name, c in self.counts().items()
+                }
+            }
+        )
+
+    def _fail(self, error: OSError) -> None:
+        """Keep what is in the bag, give back the room that it does not need, and say why."""
+        self.failure = str(error.strerror or error).lower()
+        try:
+            self.writer.close()
+        except OSError:
+            # Not even the summary fits: the file as it was sealed last is complete without it.
+            self.writer.abandon()
+        if self._on_failure is not None:
+            self._on_failure(self.failure)

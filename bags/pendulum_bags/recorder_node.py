@@ -1,0 +1,517 @@
+"""``record``: write topics to a bag that survives anything that happens to the recorder."""
+
+from __future__ import annotations
+
+import importlib
+import json
+import platform
+import re
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+from rclpy.node import Node
+from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.subscription import Subscription
+from rclpy.topic_endpoint_info import TopicEndpointInfo
+from std_srvs.srv import Trigger
+
+from pendulum_bags import __version__
+from pendulum_bags.recorder import LOG_TIMES, GapCounter, RecordingSession, SessionReport, StampReader, stamp_reader
+from pendulum_bags.parameter_reader_node import ParameterReader
+from pendulum_bags.storage import STORAGES, QosProfile, open_writer
+from pendulum_bags.storage.message_types import MessageType, message_type
+from pendulum_msgs_py.errors import BagError, ParameterError
+from pendulum_msgs_py.executables import cli_main
+from pendulum_msgs_py.names import EVENTS
+from pendulum_msgs_py.parameters import ParameterSpec
+from pendulum_msgs_py.ros.convert import event_message
+from pendulum_msgs_py.ros.parameters import NodeParameters
+from pendulum_msgs_py.ros.runner import run_node
+
+__all__ = ["Recorder", "RecorderOptions", "main"]
+
+POLL_PERIOD = 0.02
+"""Time between two visits to the middleware [s]; the time of arrival is the middleware's, not that of the visit."""
+DISCOVERY_PERIOD = 0.2
+"""Time between two looks at the graph [s]."""
+DEPTH = 4000
+"""Messages that the middleware holds for us between two visits: four seconds at 1 kHz."""
+ALWAYS_LEFT_OUT = frozenset({"/parameter_events", "/rosout"})
+
+SPECS = (
+    ParameterSpec(
+        "annotation",
+        "",
+        "-",
+        "A note for the recording; setting it writes the event 'annotation', as the service ~/annotate does again.",
+    ),
+)
+
+
+@dataclass(frozen=True, slots=True)
+class RecorderOptions:
+    """What to record, and how.
+
+    Args:
+        output: Folder of the bag; it must not exist.
+        topics: Full topic names; empty for all (but ``/rosout`` and ``/parameter_events``).
+        regex: Pattern that a topic may match instead of being listed.
+        exclude: Pattern of topics to leave out.
+        storage: ``mcap`` or ``sqlite3``.
+        compression: ``None`` or ``zstd``.
+        max_size: Begin a new file at this size [bytes]; 0 for never.
+        max_duration: Begin a new file after this time [s]; 0 for never.
+        duration: Stop after this time [s]; 0 for never.
+        metadata: Run metadata to store.
+        log_time: ``receive`` or ``header``.
+        wait: Begin only when the service ``~/start`` is called.
+    """
+
+    output: Path
+    topics: tuple[str, ...] = ()
+    regex: str = ""
+    exclude: str = ""
+    storage: str = "mcap"
+    compression: str | None = None
+    max_size: int = 0
+    max_duration: float = 0.0
+    duration: float = 0.0
+    metadata: Mapping[str, Any] = field(default_factory=dict)
+    log_time: str = "receive"
+    wait: bool = False
+
+    def __post_init__(self) -> None:
+        if self.log_time not in LOG_TIMES:
+            raise ParameterError(f"log time is {self.log_time!r}; expected one of {', '.join(LOG_TIMES)}")
+        if self.storage not in STORAGES:
+            raise ParameterError(f"storage is {self.storage!r}; expected one of {', '.join(STORAGES)}")
+        for name, value in (("max-size", self.max_size), ("max-duration", self.max_duration), ("duration", self.duration)):
+            if not value >= 0:
+                raise ParameterError(f"{name} is {value}; expected >= 0")
+        for name in self.topics:
+            if not name.startswith("/"):
+                raise ParameterError(f"topic is {name!r}; expected its full name, such as /{name}")
+        for name, pattern in (("regex", self.regex), ("exclude", self.exclude)):
+            try:
+                re.compile(pattern)
+            except re.error as error:
+                raise ParameterError(f"{name} is {pattern!r}; expected a regular expression ({error})") from None
+
+    def wants(self, topic: str) -> bool:
+        """Tell whether a topic is to be recorded."""
+        if self.exclude and re.search(self.exclude, topic):
+            return False
+        if self.topics or self.regex:
+            return topic in self.topics or bool(self.regex and re.search(self.regex, topic))
+        return topic not in ALWAYS_LEFT_OUT
+
+
+@dataclass(slots=True)
+class _Tap:
+    """A subscription and what is needed to record from it."""
+
+    topic: str
+    type: MessageType
+    message_class: Any
+    subscription: Subscription
+    reliable: bool
+    latched: bool
+    stamp: StampReader | None
+    qos: tuple[QosProfile, ...]
+    gaps: GapCounter = field(default_factory=GapCounter)
+    publishers: int = 1
+    announced: RecordingSession | None = None
+
+
+class Recorder(Node):
+    """Subscribes to topics as they appear and hands their bytes to a :class:`RecordingSession`.
+
+    Messages are not dispatched by the executor, one wake-up each, but taken from the middleware every 20 ms, all
+    that have come: that costs a tenth, and loses no precision, because the middleware notes the time of arrival.
+
+    Args:
+        options: What to record, and how.
+        stop: Asks the runner to end the process.
+
+    Raises:
+        BagError: The output folder exists or cannot be created.
+    """
+
+    def __init__(self, options: RecorderOptions, stop: Callable[[], None]) -> None:
+        self._taps: dict[str, _Tap] = {}
+        super().__init__("recorder")
+        self.exit_code = 0
+        self.reports: list[SessionReport] = []
+        self._options = options
+        self._stop = stop
+        self._session: RecordingSession | None = None
+        self._started = time.monotonic()
+        self._newest_stamp = 0
+        self._refused_types: set[str] = set()
+        self._lock = threading.RLock()
+        self._events = f"{self.get_fully_qualified_name()}/{EVENTS}"
+        self._parameters = NodeParameters(self, SPECS, self._on_parameters)
+        self._parameter_reader = ParameterReader(self, self._on_node_parameters)
+        if not options.wait:
+            self._begin()
+        self.create_service(Trigger, "~/start", self._on_start)
+        self.create_service(Trigger, "~/stop", self._on_stop)
+        self.create_service(Trigger, "~/annotate", self._on_annotate)
+        self.create_service(Trigger, "~/status", self._on_status)
+        self._discover()
+        self.create_timer(DISCOVERY_PERIOD, self._discover)
+        self._leave = threading.Event()
+        self._poller = threading.Thread(target=self._poll, name="bag intake", daemon=True)
+        self._poller.start()
+
+    @property
+    def subscriptions(self) -> Iterable[Subscription]:
+        """Subscriptions for the executor: without those that this node visits by itself."""
+        own = {id(tap.subscription) for tap in self._taps.values()}
+        return (entry for entry in super().subscriptions if id(entry) not in own)
+
+    def close(self) -> None:
+        """Take what has arrived, close the bag and say what it holds."""
+        self._leave.set()
+        self._poller.join()
+        self._end()
+
+    # -- sessions ----------------------------------------------------------------------------------------------
+
+    def _begin(self) -> None:
+        number = len(self.reports)
+        base = self._options.output
+        path = base if not number else base.with_name(f"{base.name}_{number + 1}")
+        options = self._options
+        writer = open_writer(
+            path,
+            options.storage,
+            options.compression,
+            {**self._provenance(), **options.metadata},
+            max_size=options.max_size,
+            max_duration=options.max_duration,
+        )
+        with self._lock:
+            self._session = RecordingSession(writer, on_failure=self._on_failure)
+            self._session.add_topic(self._events, message_type("std_msgs/msg/String"), [QosProfile()])
+        self._started = time.monotonic()
+        print(f"recording to {writer.path}", flush=True)
+
+    def _end(self) -> SessionReport | None:
+        with self._lock:
+            session = self._session
+            if session is None:
+                return None
+            self._take_all()
+            session.writer.update_metadata(
+                {"pendulum.parameters": self._parameter_reader.values}
+            ) if not session.failure else None
+            self._session = None
+            report = session.close()
+        self.reports.append(report)
+        failed = bool(report.lost or report.error)
+        self.exit_code = 1 if failed else self.exit_code
+        print(f"{'error: ' if failed else ''}recorded {report.sentence()}", file=sys.stderr if failed else sys.stdout, flush=True)
+        return report
+
+    def _provenance(self) -> dict[str, Any]:
+        import rclpy
+
+        return {
+            "pendulum.recorder": {
+                "version": __version__,
+                "log_time": self._options.log_time,
+                "started_ns": time.time_ns(),
+                "host": platform.node(),
+                "system": platform.platform(),
+                "python": platform.python_version(),
+                "rmw": rclpy.get_rmw_implementation_identifier(),
+            }
+        }
+
+    def _on_failure(self, reason: str) -> None:
+        self.get_logger().error(f"recording stops: {reason}")
+        self._stop()
+
+    # -- intake ------------------------------------------------------------------------------------------------
+
+    def _poll(self) -> None:
+        while not self._leave.wait(POLL_PERIOD):
+            with self._lock:
+                self._take_all()
+            if self._options.duration and time.monotonic() - self._started >= self._options.duration:
+                self._stop()
+
+    def _take_all(self) -> None:
+        session = self._session
+        for tap in list(self._taps.values()):
+            self._take(tap, session)
+
+    def _take(self, tap: _Tap, session: RecordingSession | None) -> None:
+        take, message_class = tap.subscription.handle.take_message, tap.message_class
+        items: list[tuple[int, bytes]] = []
+        missing = 0
+        by_header = self._options.log_time == "header"
+        with tap.subscription.handle:
+            while (taken := take(message_class, True)) is not None:
+                data, info = taken
+                sequence = info["publication_sequence_number"]
+                if sequence:
+                    missing += tap.gaps.see(sequence, tap.publishers)
+                time_ns = info["received_timestamp"] or time.time_ns()
+                items.append((self._stamp(tap, data, time_ns) if by_header else time_ns, data))
+        if session is None or not items:
+            return
+        if tap.announced is not session:
+            session.add_topic(tap.topic, tap.type, tap.qos)
+            tap.announced = session
+        refused = session.offer(tap.topic, items)
+        if missing:
+            session.note_missing(tap.topic, missing)
+        if missing or refused:
+            self.get_logger().error(
+                f"LOST {missing + refused} messages of {tap.topic} ({missing} by the middleware, {refused} because "
+                "the disk does not keep up)"
+            )
+
+    def _stamp(self, tap: _Tap, data: bytes, received_ns: int) -> int:
+        stamp = tap.stamp(data) if tap.stamp is not None else None
+        if stamp is None or stamp < 0:
+            # Messages without a stamp go where the stamped ones are: wall and simulated time must not mix.
+            return self._newest_stamp or received_ns
+        self._newest_stamp = max(self._newest_stamp, stamp)
+        return stamp
+
+    # -- the graph ---------------------------------------------------------------------------------------------
+
+    def _discover(self) -> None:
+        for topic, types in self.get_topic_names_and_types():
+            if not self._options.wants(topic) or topic == self._events:
+                continue
+            tap = self._taps.get(topic)
+            if tap is not None and self.count_publishers(topic) == tap.publishers:
+                continue
+            publishers = self.get_publishers_info_by_topic(topic)
+            if not publishers:
+                continue
+            if len(types) > 1:
+                self._refuse(topic, f"it has the types {', '.join(types)}; expected one")
+                continue
+            self._tap(topic, publishers)
+        self._parameter_reader.look()
+
+    def _tap(self, topic: str, publishers: list[TopicEndpointInfo]) -> None:
+        reliable = all(p.qos_profile.reliability == ReliabilityPolicy.RELIABLE for p in publishers)
+        latched = all(p.qos_profile.durability == DurabilityPolicy.TRANSIENT_LOCAL for p in publishers)
+        tap = self._taps.get(topic)
+        if tap is not None:
+            tap.publishers = len(publishers)
+            if (reliable or not tap.reliable) and (latched or not tap.latched):
+                return
+            # A publisher has come that offers less than we ask for: ask for less, or it would never match.
+            with self._lock:
+                self._take(tap, self._session)
+                del self._taps[topic]
+            self.destroy_subscription(tap.subscription)
+        name = publishers[0].topic_type
+        message_class = _message_class(name)
+        if message_class is None:
+            self._refuse(topic, f"its type {name} cannot be imported")
+            return
+        type_hash = str(publishers[0].topic_type_hash)
+        profile = QoSProfile(
+            depth=DEPTH,
+            reliability=ReliabilityPolicy.RELIABLE if reliable else ReliabilityPolicy.BEST_EFFORT,
+            durability=DurabilityPolicy.TRANSIENT_LOCAL if latched else DurabilityPolicy.VOLATILE,
+        )
+        with self._lock:
+            subscription = self.create_subscription(message_class, topic, _not_called, profile, raw=True)
+            self._taps[topic] = _Tap(
+                topic,
+                message_type(name, type_hash if type_hash.startswith("RIHS") else ""),
+                message_class,
+                subscription,
+                reliable,
+                latched,
+                stamp_reader(name),
+                tuple(_offered(publisher) for publisher in publishers),
+                publishers=len(publishers),
+            )
+        print(f"subscribed to {topic} ({name})", flush=True)
+
+    def _refuse(self, topic: str, reason: str) -> None:
+        if topic not in self._refused_types:
+            self._refused_types.add(topic)
+            self.get_logger().error(f"{topic} is NOT recorded: {reason}")
+
+    # -- events, parameters, services --------------------------------------------------------------------------
+
+    def note(self, name: str, **details: Any) -> None:
+        """Write an event of the recorder itself to the bag."""
+        by_header = self._options.log_time == "header"
+        stamp = self._newest_stamp if by_header and self._newest_stamp else time.time_ns()
+        text = event_message(stamp, name, **details).data.encode() + b"\0"
+        data = b"\x00\x01\x00\x00" + len(text).to_bytes(4, "little") + text
+        with self._lock:
+            if self._session is not None:
+                self._session.offer(self._events, [(stamp, data)])
+
+    def _on_parameters(self, values: Mapping[str, Any]) -> None:
+        if values["annotation"]:
+            self.note("annotation", text=values["annotation"])
+
+    def _on_node_parameters(self, values: Mapping[str, Mapping[str, Any]], changed: str) -> None:
+        with self._lock:
+            if self._session is not None and not self._session.failure:
+                self._session.writer.update_metadata({"pendulum.parameters": values})
+        if changed:
+            self.note("parameters_changed", node=changed, values=values[changed])
+
+    def _on_start(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+        if self._session is not None:
+            response.success, response.message = False, f"recording to {self._session.writer.path} already"
+            return response
+        try:
+            self._begin()
+        except BagError as error:
+            response.success, response.message = False, str(error)
+            return response
+        response.success, response.message = True, str(self._session.writer.path) if self._session else ""
+        return response
+
+    def _on_stop(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+        report = self._end()
+        response.success = report is not None and not report.lost and not report.error
+        response.message = report.sentence() if report is not None else "nothing is being recorded"
+        return response
+
+    def _on_annotate(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+        self.note("annotation", text=self._parameters["annotation"])
+        response.success = self._session is not None
+        response.message = "noted" if response.success else "nothing is being recorded"
+        return response
+
+    def _on_status(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+        session = self._session
+        counts = session.counts() if session is not None else {}
+        response.success = session is not None
+        response.message = json.dumps(
+            {
+                "path": str(session.writer.path) if session is not None else None,
+                "subscribed": sorted(self._taps),
+                "topics": {
+                    name: {"received": count.received, "written": count.written, "lost": count.refused + count.missing}
+                    for name, count in counts.items()
+                },
+            }
+        )
+        return response
+
+
+def _not_called(_: bytes) -> None:
+    """Stand where a callback must be given: the recorder takes its messages itself."""
+
+
+def _message_class(name: str) -> Any:
+    package, _, short = name.split("/")
+    try:
+        return getattr(importlib.import_module(f"{package}.msg"), short)
+    except (ImportError, AttributeError):
+        return None
+
+
+def _offered(publisher: TopicEndpointInfo) -> QosProfile:
+    profile = publisher.qos_profile
+    return QosProfile(
+        history=profile.history.name.lower(),
+        depth=profile.depth,
+        reliability=profile.reliability.name.lower(),
+        durability=profile.durability.name.lower(),
+        deadline_ns=profile.deadline.nanoseconds,
+        lifespan_ns=profile.lifespan.nanoseconds,
+        liveliness=profile.liveliness.name.lower(),
+        lease_ns=profile.liveliness_lease_duration.nanoseconds,
+    )
+
+
+# -- command line ------------------------------------------------------------------------------------------------
+
+app = typer.Typer(add_completion=False, rich_markup_mode=None)
+
+
+@app.command(
+    epilog="Example: python -m pendulum_bags record -o runs/today --regex '^/(sim|hw)/' --compression zstd. "
+    "ROS arguments go behind --ros-args."
+)
+def record(
+    context: typer.Context,
+    output: Annotated[Path, typer.Option("-o", "--output", help="Folder of the bag; it must not exist.")],
+    topics: Annotated[list[str] | None, typer.Argument(help="Topics by their full names; by default all.")] = None,
+    regex: Annotated[str, typer.Option(help="Record topics that match this pattern, too.")] = "",
+    exclude: Annotated[str, typer.Option(help="Leave out topics that match this pattern.")] = "",
+    storage: Annotated[str, typer.Option(help="mcap or sqlite3.")] = "mcap",
+    compression: Annotated[str, typer.Option(help="zstd, or none.")] = "none",
+    max_size: Annotated[float, typer.Option(help="Begin a new file at this size [MB]; 0 for never.")] = 0.0,
+    max_duration: Annotated[float, typer.Option(help="Begin a new file after this time [s]; 0 for never.")] = 0.0,
+    duration: Annotated[float, typer.Option(help="Stop after this time [s]; 0 for never.")] = 0.0,
+    metadata: Annotated[Path | None, typer.Option(help="JSON object to store with the bag.")] = None,
+    log_time: Annotated[str, typer.Option(help="receive (time of arrival) or header (stamp of the message).")] = "receive",
+    wait: Annotated[bool, typer.Option("--wait", help="Begin when the service ~/start is called.")] = False,
+) -> int:
+    """Record topics to a rosbag2 folder that is complete and readable at every instant."""
+    options = RecorderOptions(
+        output,
+        tuple(topics or ()),
+        regex,
+        exclude,
+        storage,
+        None if compression in ("", "none") else compression,
+        round(max_size * 1e6),
+        max_duration,
+        duration,
+        _read_metadata(metadata),
+        log_time,
+        wait,
+    )
+    if output.exists():
+        raise BagError(f"bag {output} exists already; expected a new folder (bags are never overwritten)")
+    return run_node(
+        lambda stop: Recorder(options, stop),
+        list(context.obj),
+        program="pendulum_bags record",
+        description="Record topics to a bag.",
+        specs=SPECS,
+    )
+
+
+def _read_metadata(path: Path | None) -> dict[str, Any]:
+    if path is None:
+        return {}
+    try:
+        content = json.loads(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise ParameterError(f"metadata file {path} cannot be read: {error.strerror}") from error
+    except ValueError as error:
+        raise ParameterError(f"metadata file {path} is no JSON: {error}") from error
+    if not isinstance(content, dict):
+        raise ParameterError(f"metadata file {path} holds {type(content).__name__}; expected a JSON object")
+    return content
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Run the recorder; arguments from ``--ros-args`` on belong to ROS."""
+    arguments = list(sys.argv[1:] if argv is None else argv)
+    split = arguments.index("--ros-args") if "--ros-args" in arguments else len(arguments)
+    own, ros = arguments[:split], arguments[split:]
+    app.info.context_settings = {"obj": ros}
+    return cli_main(app, own, name="python -m pendulum_bags record")
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())
