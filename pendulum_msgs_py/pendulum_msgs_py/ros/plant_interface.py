@@ -177,7 +177,7 @@ class PlantInterface:
         self.on_command = on_command
         self.refused_trajectories: Counter[str] = Counter()
         self._more_diagnostics = more_diagnostics
-        self._told_mode: tuple[Mode, bool] | None = None
+        self._told_mode: tuple[Mode, bool, bool] | None = None
         self._told_refusals = 0
         self._states = node.create_publisher(JointState, names.JOINT_STATES, qos.STATE)
         self._applied = node.create_publisher(JointState, names.APPLIED_EFFORT, qos.STATE)
@@ -208,7 +208,7 @@ class PlantInterface:
     def decide(self, now_ns: int | None = None) -> Drive:
         """Return what to do now, by the supervisor's rules; says on the log when the answer changes."""
         drive = self.supervisor.decide(self.clock() if now_ns is None else now_ns, self.sample)
-        told = (self.supervisor.mode, drive.starved)
+        told = (self.supervisor.mode, drive.starved, self.supervisor.trajectory_finished)
         if told != self._told_mode:
             self._tell(drive)
             self._told_mode = told
@@ -361,7 +361,10 @@ class PlantInterface:
             logger.warning(text)
         else:
             logger.info(text)
-        self.publish_event("plant_mode", mode=supervisor.mode.value, reason=supervisor.reason)
+        if supervisor.trajectory_finished:
+            self.publish_event("trajectory_finished", reason=supervisor.reason)
+        else:
+            self.publish_event("plant_mode", mode=supervisor.mode.value, reason=supervisor.reason)
 
     def _tell_refusals(self) -> None:
         gates = {kind: self.supervisor.gates[kind] for kind in self._inputs}

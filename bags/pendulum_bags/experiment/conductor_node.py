@@ -1,0 +1,253 @@
+"""The node that conducts an experiment: it arms plants, moves them, switches controllers and disturbances."""
+
+from __future__ import annotations
+
+import json
+import signal
+import time
+from collections.abc import Callable, Mapping
+from types import FrameType, TracebackType
+from typing import Any, TypeVar
+
+import rclpy
+from lifecycle_msgs.msg import Transition
+from lifecycle_msgs.srv import ChangeState
+from rclpy.client import Client
+from rclpy.context import Context
+from rclpy.experimental import EventsExecutor
+from rclpy.node import Node
+from rclpy.signals import SignalHandlerOptions
+from rclpy.task import Future
+from sensor_msgs.msg import JointState
+from std_msgs.msg import String
+from std_srvs.srv import SetBool, Trigger
+from trajectory_msgs.msg import JointTrajectory
+
+from pendulum_msgs_py import names
+from pendulum_msgs_py.errors import FaultError
+from pendulum_msgs_py.ros import qos
+from pendulum_msgs_py.ros.convert import event_message, sample_from_bytes, trajectory_to_message
+from pendulum_msgs_py.trajectory import Trajectory
+from pendulum_msgs_py.values import JointSample
+
+__all__ = ["Conductor", "PlantClient"]
+
+_SLICE = 0.05
+_T = TypeVar("_T")
+
+
+class Conductor:
+    """An rclpy context and node of its own, spun only while it waits; Ctrl-C ends any wait at once.
+
+    Args:
+        domain: ROS domain.
+        watch: Called between two slices of waiting; raises to end the experiment (a process has died).
+        on_wait: Called between two slices with nothing to do but show progress.
+    """
+
+    def __init__(
+        self, domain: int, *, watch: Callable[[], None] = lambda: None, on_wait: Callable[[], None] = lambda: None
+    ) -> None:
+        self.domain = domain
+        self.watch = watch
+        self.on_wait = on_wait
+
+    def __enter__(self) -> Conductor:
+        """Join the graph."""
+        self._previous = signal.signal(signal.SIGTERM, _interrupt)
+        self.context = Context()
+        rclpy.init(
+            context=self.context, domain_id=self.domain, signal_handler_options=SignalHandlerOptions.NO, args=[]
+        )
+        self.node: Node = rclpy.create_node("conductor", context=self.context, start_parameter_services=False)
+        self._executor = EventsExecutor(context=self.context)
+        self._executor.add_node(self.node)
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        """Leave the graph."""
+        self._executor.shutdown()
+        self.node.destroy_node()
+        rclpy.try_shutdown(context=self.context)
+        signal.signal(signal.SIGTERM, self._previous)
+
+    def spin(self, duration: float) -> None:
+        """Do nothing but listen for a while [s]."""
+        deadline = time.monotonic() + duration
+        while (left := deadline - time.monotonic()) > 0:
+            self._slice(min(_SLICE, left))
+
+    def wait_for(self, what: str, predicate: Callable[[], _T], timeout: float) -> _T:
+        """Wait until a predicate holds and return its value.
+
+        Args:
+            what: What is waited for, for the message.
+            predicate: Asked between slices.
+            timeout: Longest time to wait [s].
+
+        Raises:
+            FaultError: It did not come to hold in time.
+        """
+        deadline = time.monotonic() + timeout
+        while not (value := predicate()):
+            if time.monotonic() > deadline:
+                raise FaultError(f"waited {timeout:g} s for {what}, in vain")
+            self._slice(_SLICE)
+        return value
+
+    def call(self, client: Client, request: Any, what: str, timeout: float = 10.0) -> Any:
+        """Call a service and return its response.
+
+        Raises:
+            FaultError: The service is not there or does not answer in time.
+        """
+        self.wait_for(f"service {client.srv_name}", client.service_is_ready, timeout)
+        future = client.call_async(request)
+        self.wait_for(what, future.done, timeout)
+        return future.result()
+
+    def _slice(self, duration: float) -> None:
+        self._executor.spin_until_future_complete(Future(executor=None), duration)
+        self.watch()
+        self.on_wait()
+
+
+class PlantClient:
+    """One plant with its controller and its disturbance, as the conductor sees them.
+
+    Args:
+        conductor: Who conducts.
+        namespace: Namespace of the plant's topics, such as ``/sim``.
+        plant: Name of the plant's node.
+        controller: Name of its controller's node, empty for none.
+        disturbance: Name of its disturbance's node, empty for none.
+    """
+
+    def __init__(
+        self,
+        conductor: Conductor,
+        namespace: str,
+        plant: str,
+        *,
+        controller: str = "controller",
+        disturbance: str = "disturbance",
+    ) -> None:
+        node = conductor.node
+        self.conductor = conductor
+        self.namespace = namespace
+        self.sample: JointSample | None = None
+        self.samples = 0
+        self.events: list[dict[str, Any]] = []
+        self._arm = node.create_client(SetBool, f"{namespace}/{plant}/arm")
+        self._e_stop = node.create_client(Trigger, f"{namespace}/{plant}/e_stop")
+        self._change_state = node.create_client(ChangeState, f"{namespace}/{controller}/change_state")
+        self._start = node.create_client(Trigger, f"{namespace}/{disturbance}/start")
+        self._trajectory = node.create_publisher(
+            JointTrajectory, f"{namespace}/{names.JOINT_TRAJECTORY}", qos.TRAJECTORY
+        )
+        self._events = node.create_publisher(String, f"{namespace}/{names.EVENTS}", qos.EVENTS)
+        node.create_subscription(String, f"{namespace}/{names.EVENTS}", self._on_event, qos.EVENTS)
+        node.create_subscription(
+            JointState, f"{namespace}/{names.JOINT_STATES}", self._on_state, qos.NEWEST_STATE, raw=True
+        )
+
+    def wait_until_ready(self, timeout: float, *, controller: bool = True, disturbance: bool = True) -> None:
+        """Wait until states flow and all services and the trajectory topic are there."""
+        wait = self.conductor.wait_for
+        wait(f"states on {self.namespace}/{names.JOINT_STATES}", lambda: self.sample is not None, timeout)
+        clients = [self._arm, self._e_stop]
+        clients += [self._change_state] if controller else []
+        clients += [self._start] if disturbance else []
+        for client in clients:
+            wait(f"service {client.srv_name}", client.service_is_ready, timeout)
+        wait(
+            f"a plant on {self.namespace}/{names.JOINT_TRAJECTORY}",
+            lambda: self._trajectory.get_subscription_count() > 0,
+            timeout,
+        )
+
+    def arm(self) -> None:
+        """Arm the plant.
+
+        Raises:
+            FaultError: It refuses; the message has its reason.
+        """
+        response = self.conductor.call(self._arm, SetBool.Request(data=True), f"{self.namespace} to arm")
+        if not response.success:
+            raise FaultError(f"{self.namespace} does not arm: {response.message}")
+
+    def disarm(self) -> None:
+        """Disarm the plant."""
+        self.conductor.call(self._arm, SetBool.Request(data=False), f"{self.namespace} to disarm")
+
+    def follow(self, trajectory: Trajectory, phase: str, **details: Any) -> None:
+        """Start a move under position control, and record it as a phase."""
+        self.mark(phase, **details)
+        self._finished_before = len(self.events)
+        self._trajectory.publish(trajectory_to_message(trajectory))
+
+    def trajectory_finished(self) -> bool:
+        """Tell whether the move last asked for has ended.
+
+        Raises:
+            FaultError: The plant refused it, or left position control.
+        """
+        for event in self.events[self._finished_before :]:
+            if event["name"] == "trajectory_refused":
+                raise FaultError(f"{self.namespace} refused the trajectory: {event.get('reason')}")
+            if event["name"] == "plant_mode" and event.get("mode") in {"fault", "e_stop", "disarmed"}:
+                raise FaultError(f"{self.namespace} went to {event['mode']}: {event.get('reason')}")
+            if event["name"] == "trajectory_finished":
+                return True
+        return False
+
+    def switch_controller(self, *, on: bool) -> None:
+        """Activate or deactivate the controller.
+
+        Raises:
+            FaultError: It refuses.
+        """
+        transition = Transition.TRANSITION_ACTIVATE if on else Transition.TRANSITION_DEACTIVATE
+        request = ChangeState.Request(transition=Transition(id=transition))
+        what = "activate" if on else "deactivate"
+        if not self.conductor.call(self._change_state, request, f"{self.namespace} controller to {what}").success:
+            raise FaultError(f"{self.namespace} controller does not {what}; its log says why")
+
+    def start_disturbance(self) -> Future:
+        """Ask the disturbance to start with the next state; returns at once."""
+        return self._start.call_async(Trigger.Request())
+
+    def mark(self, name: str, **details: Any) -> None:
+        """Record a phase change at the plant's newest time."""
+        stamp_ns = self.sample.stamp_ns if self.sample else 0
+        self._events.publish(event_message(stamp_ns, name, **details))
+
+    def has_event(self, name: str) -> Mapping[str, Any] | None:
+        """Return the newest event of a name, or None."""
+        return next((event for event in reversed(self.events) if event["name"] == name), None)
+
+    def check_mode(self) -> None:
+        """Raise a FaultError where the plant has faulted or been stopped."""
+        mode = self.has_event("plant_mode")
+        if mode is not None and mode.get("mode") in {"fault", "e_stop"}:
+            raise FaultError(f"{self.namespace} is in {mode['mode']}: {mode.get('reason')}")
+
+    def _on_event(self, message: String) -> None:
+        try:
+            event = json.loads(message.data)
+        except json.JSONDecodeError:
+            return
+        if isinstance(event, dict) and "name" in event:
+            self.events.append(event)
+
+    def _on_state(self, data: bytes) -> None:
+        sample = sample_from_bytes(data)
+        if sample is not None:
+            self.sample = sample
+            self.samples += 1
+
+
+def _interrupt(number: int, frame: FrameType | None) -> None:
+    raise KeyboardInterrupt

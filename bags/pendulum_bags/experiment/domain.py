@@ -1,0 +1,67 @@
+"""A ROS domain of its own for each experiment on a machine, so that two of them never hear each other."""
+
+from __future__ import annotations
+
+import contextlib
+import fcntl
+import os
+import socket
+import tempfile
+from collections.abc import Iterator
+from pathlib import Path
+
+from pendulum_msgs_py.errors import FaultError, ParameterError
+
+__all__ = ["MAX_DOMAIN", "reserve_domain"]
+
+MAX_DOMAIN = 100
+"""Beyond 101 the ports of a domain overlap those that Linux hands out to any client."""
+
+
+@contextlib.contextmanager
+def reserve_domain(requested: int | None = None) -> Iterator[int]:
+    """Reserve a ROS domain while the context lasts.
+
+    Args:
+        requested: The domain to use; None takes ``ROS_DOMAIN_ID`` or else the first one that nobody uses.
+
+    Raises:
+        ParameterError: The domain asked for is no domain.
+        FaultError: All domains are in use.
+    """
+    if requested is None and os.environ.get("ROS_DOMAIN_ID"):
+        text = os.environ["ROS_DOMAIN_ID"]
+        if not text.isdigit():
+            raise ParameterError(f"ROS_DOMAIN_ID is {text!r}; expected an integer from 0 to {MAX_DOMAIN}")
+        requested = int(text)
+    if requested is not None:
+        if not 0 <= requested <= MAX_DOMAIN:
+            raise ParameterError(f"ROS domain is {requested}; expected 0 to {MAX_DOMAIN}")
+        yield requested
+        return
+    folder = Path(tempfile.gettempdir(), f"pendulum_domains_{os.getuid()}")
+    folder.mkdir(exist_ok=True)
+    for step in range(MAX_DOMAIN):
+        domain = 1 + (os.getpid() + step) % MAX_DOMAIN
+        with (folder / f"{domain}.lock").open("w") as lock:
+            try:
+                fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except BlockingIOError:
+                continue
+            if is_unused(domain):
+                yield domain
+                return
+    raise FaultError(f"all ROS domains from 1 to {MAX_DOMAIN} are in use on this machine")
+
+
+def is_unused(domain: int) -> bool:
+    """Tell whether no DDS participant on this machine listens in the domain.
+
+    Source: DDSI-RTPS 2.5, section 9.6.2.3: unicast discovery ports start at 7400 + 250 domain + 10.
+    """
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+        try:
+            probe.bind(("", 7400 + 250 * domain + 10))
+        except OSError:
+            return False
+    return True

@@ -1,0 +1,149 @@
+"""Child processes that never outlive the experiment, whatever ends it."""
+
+from __future__ import annotations
+
+import contextlib
+import ctypes
+import os
+import signal
+import subprocess
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from types import TracebackType
+
+from pendulum_msgs_py.errors import FaultError
+from pendulum_msgs_py.graph import NodeProgram
+
+__all__ = ["Child", "ProcessSet"]
+
+_PR_SET_PDEATHSIG = 1
+_PATIENCE = 8.0
+"""Time that a child has to end after SIGINT before it is killed [s]."""
+
+
+@dataclass
+class Child:
+    """One running program."""
+
+    name: str
+    process: subprocess.Popen[bytes]
+    log: Path
+    ends_last: bool = False
+
+    def last_words(self, lines: int = 3) -> str:
+        """Return the end of its output, for messages."""
+        with contextlib.suppress(OSError):
+            text = [line for line in self.log.read_text(errors="replace").splitlines() if line.strip()]
+            return " / ".join(text[-lines:])
+        return ""
+
+
+@dataclass
+class ProcessSet:
+    """The programs of one run; leaving the context ends them all.
+
+    Args:
+        log_folder: One log file per program goes here.
+        environment: Variables to add, such as the ROS domain.
+    """
+
+    log_folder: Path
+    environment: Mapping[str, str]
+    children: list[Child] = field(default_factory=list)
+
+    def __enter__(self) -> ProcessSet:
+        """Make the folder of the logs."""
+        self.log_folder.mkdir(parents=True, exist_ok=True)
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        """End every program."""
+        self.stop()
+
+    def start_node(self, program: NodeProgram, *, niceness: int = 0) -> Child:
+        """Start a node."""
+        return self.start(program.full_name.strip("/").replace("/", "_"), program.command(), niceness=niceness)
+
+    def start(self, name: str, command: Sequence[str], *, ends_last: bool = False, niceness: int = 0) -> Child:
+        """Start a command in a process group of its own, so that Ctrl-C reaches it through us, in order.
+
+        Args:
+            name: For messages and the log file.
+            command: Program and arguments.
+            ends_last: Keep it until all others have ended: a recorder that hears their last words.
+            niceness: Scheduling priority to give away.
+        """
+        parent = os.getpid()
+        libc = ctypes.CDLL(None, use_errno=True)
+
+        def prepare() -> None:
+            # SIGINT: a child of a killed experiment ends as after Ctrl-C, plants at zero torque, bags closed.
+            libc.prctl(_PR_SET_PDEATHSIG, signal.SIGINT)
+            if os.getppid() != parent:
+                os._exit(1)
+            if niceness:
+                os.nice(niceness)
+
+        log = self.log_folder / f"{name}.log"
+        with log.open("wb") as sink:
+            process = subprocess.Popen(
+                list(command),
+                stdin=subprocess.DEVNULL,
+                stdout=sink,
+                stderr=subprocess.STDOUT,
+                env={**os.environ, **self.environment},
+                start_new_session=True,
+                preexec_fn=prepare,
+            )
+        child = Child(name, process, log, ends_last)
+        self.children.append(child)
+        return child
+
+    def check(self) -> None:
+        """Raise a FaultError that names the first program that has ended by itself."""
+        for child in self.children:
+            code = child.process.poll()
+            if code is not None:
+                ending = f"was ended by {signal.Signals(-code).name}" if code < 0 else f"ended with code {code}"
+                raise FaultError(f"{child.name} {ending}; its last words: {child.last_words() or 'none'}")
+
+    def finish(self, child: Child, patience: float = _PATIENCE) -> int:
+        """End one program by SIGINT, then by SIGKILL; return its exit code."""
+        self._signal(child, signal.SIGINT)
+        code = self._wait(child, patience)
+        if child in self.children:
+            self.children.remove(child)
+        return code
+
+    def stop(self) -> None:
+        """End all programs, recorders last: plants say a last zero torque that should be on record."""
+        for wave in (False, True):
+            children = [child for child in self.children if child.ends_last is wave]
+            for child in children:
+                self._signal(child, signal.SIGINT)
+            for child in children:
+                self._wait(child, _PATIENCE)
+        self.children.clear()
+
+    @staticmethod
+    def _signal(child: Child, number: int) -> None:
+        with contextlib.suppress(ProcessLookupError):
+            if child.process.poll() is None:
+                child.process.send_signal(number)
+
+    @staticmethod
+    def _wait(child: Child, patience: float) -> int:
+        deadline = time.monotonic() + patience
+        while child.process.poll() is None:
+            if time.monotonic() > deadline:
+                with contextlib.suppress(ProcessLookupError):
+                    os.killpg(child.process.pid, signal.SIGKILL)
+                child.process.wait()
+                break
+            with contextlib.suppress(subprocess.TimeoutExpired):
+                child.process.wait(0.05)
+        return int(child.process.returncode)

@@ -1,0 +1,62 @@
+"""Progress of a run in the terminal: a bar over all phases, and which one it is in."""
+
+from __future__ import annotations
+
+import time
+from types import TracebackType
+
+from rich.console import Console
+from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
+
+__all__ = ["PhaseProgress"]
+
+
+class PhaseProgress:
+    """A bar that moves with time through phases of known length; silent where the output is no terminal but for one
+    line a phase.
+
+    Args:
+        total: Expected length of all phases [s].
+        console: Where to draw.
+    """
+
+    def __init__(self, total: float, console: Console) -> None:
+        self._console = console
+        self._bar = Progress(
+            TextColumn("{task.description:<22}"),
+            BarColumn(bar_width=None),
+            TextColumn("{task.percentage:>3.0f} %"),
+            TimeRemainingColumn(),
+            console=console,
+            transient=True,
+            disable=not console.is_terminal,
+        )
+        self._task = self._bar.add_task("", total=total)
+        self._done = 0.0
+        self._length = 0.0
+        self._started = time.monotonic()
+
+    def __enter__(self) -> PhaseProgress:
+        """Show the bar."""
+        self._bar.start()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        """Remove the bar."""
+        self._bar.stop()
+
+    def phase(self, name: str, expected: float) -> None:
+        """Begin a phase of an expected length [s]; the one before counts as done."""
+        self._done += self._length
+        self._length = expected
+        self._started = time.monotonic()
+        self._bar.update(self._task, description=name, completed=self._done)
+        if not self._console.is_terminal:
+            self._console.print(f"{name} ({expected:.0f} s)", highlight=False)
+
+    def refresh(self) -> None:
+        """Move the bar with time, never past the end of the phase."""
+        elapsed = min(time.monotonic() - self._started, self._length)
+        self._bar.update(self._task, completed=self._done + elapsed)

@@ -1,0 +1,93 @@
+"""The folder of a run: where it is, what it may not overwrite, and what is known about the run."""
+
+from __future__ import annotations
+
+import importlib.metadata
+import json
+import os
+import platform
+import subprocess
+from datetime import datetime, timezone
+from pathlib import Path
+from typing import Any
+
+from pendulum_msgs_py.errors import BagError
+
+__all__ = ["create_run_folder", "git_revision", "versions", "write_json"]
+
+_PACKAGES = (
+    "pendulum_msgs_py",
+    "pendulum_sim",
+    "pendulum_lqr",
+    "pendulum_hw_bridge",
+    "pendulum_bags",
+    "numpy",
+    "scipy",
+    "control",
+    "rosbags",
+    "hebi-py",
+    "ros-jazzy-rclpy",
+)
+
+
+def create_run_folder(out: Path | None, experiment: str) -> Path:
+    """Create the folder of a run and return it.
+
+    Args:
+        out: Where the user wants it; None for ``bags/runs/<UTC>_<experiment>`` below the current folder.
+        experiment: Name of the experiment.
+
+    Raises:
+        BagError: The folder exists and is not empty, or cannot be written.
+    """
+    if out is None:
+        stamp = datetime.now(timezone.utc).strftime("%Y-%m-%dT%H-%M-%SZ")
+        out = Path("bags", "runs", f"{stamp}_{experiment}")
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+        if any(out.iterdir()):
+            raise BagError(f"run folder {out} exists and is not empty; expected a new one")
+    except FileExistsError as error:
+        raise BagError(f"run folder {out} is a file; expected a folder") from error
+    except OSError as error:
+        if isinstance(error, BagError):
+            raise
+        raise BagError(f"run folder {out} cannot be made: {error.strerror}") from error
+    if not os.access(out, os.W_OK):
+        raise BagError(f"run folder {out} cannot be written: permission denied")
+    return out
+
+
+def versions() -> dict[str, str]:
+    """Return the versions of Python and of the packages that a result depends on."""
+    found = {"python": platform.python_version()}
+    for package in _PACKAGES:
+        try:
+            found[package] = importlib.metadata.version(package)
+        except importlib.metadata.PackageNotFoundError:
+            continue
+    return found
+
+
+def git_revision() -> str:
+    """Return the revision of the project's checkout, with ``+changes`` where it was edited; empty outside one."""
+    here = Path(__file__).resolve().parent
+
+    def git(*arguments: str) -> str:
+        done = subprocess.run(
+            ["git", "-C", str(here), *arguments], capture_output=True, text=True, timeout=10, check=True
+        )
+        return done.stdout.strip()
+
+    try:
+        revision = git("rev-parse", "--short=12", "HEAD")
+        return revision + ("+changes" if git("status", "--porcelain", "--untracked-files=no") else "")
+    except (OSError, subprocess.SubprocessError):
+        return ""
+
+
+def write_json(path: Path, content: Any) -> None:
+    """Write JSON so that the file appears whole or not at all."""
+    partial = path.with_name(f".{path.name}.part")
+    partial.write_text(json.dumps(content, indent=2, allow_nan=False, default=str) + "\n", encoding="utf-8")
+    partial.replace(path)

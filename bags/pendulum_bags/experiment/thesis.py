@@ -1,0 +1,181 @@
+"""The thesis's experiment: upright on simulator and hardware, LQR under one and the same noise, down again."""
+
+from __future__ import annotations
+
+import os
+import sys
+import time
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+from pendulum_bags.experiment.conductor_node import Conductor, PlantClient
+from pendulum_bags.experiment.domain import reserve_domain
+from pendulum_bags.experiment.lockstep import LockstepRun, lockstep_processes
+from pendulum_bags.experiment.processes import Child, ProcessSet
+from pendulum_bags.experiment.progress import PhaseProgress
+from pendulum_bags.experiment.run_folder import write_json
+from pendulum_bags.experiment.settings import NoiseSettings, RegulationSettings
+from pendulum_msgs_py import graph
+from pendulum_msgs_py.angles import UPRIGHT
+from pendulum_msgs_py.errors import FaultError
+from pendulum_msgs_py.graph import NodeProgram
+from pendulum_msgs_py.trajectory import thesis_ramp
+
+__all__ = ["ros_environment", "run_thesis", "start_recorder"]
+
+START_TIMEOUT = 60.0
+"""Longest time for all programs to be up; the first start on a cold machine compiles code [s]."""
+SETTLE_TIME = 1.0
+"""Time under control before the noise starts [s]."""
+
+
+def ros_environment(domain: int, log_folder: Path) -> dict[str, str]:
+    """Return the environment of the programs of a run: its domain, this host only unless opened explicitly."""
+    return {
+        "ROS_DOMAIN_ID": str(domain),
+        "ROS_AUTOMATIC_DISCOVERY_RANGE": os.environ.get("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST"),
+        "ROS_LOG_DIR": str(log_folder / "ros"),
+        "PYTHONUNBUFFERED": "1",
+    }
+
+
+def start_recorder(
+    processes: ProcessSet, bag: Path, namespace: str, metadata: Path, storage: str, *, log_time: str = "receive"
+) -> Child:
+    """Start the recorder of all topics of one plant."""
+    command = [sys.executable, "-m", "pendulum_bags", "record", "-o", str(bag)]
+    command += ["--regex", f"^({namespace}/.*|/diagnostics|/clock)$", "--storage", storage]
+    command += ["--metadata", str(metadata), "--log-time", log_time]
+    return processes.start(f"recorder_{bag.name}", command, ends_last=True)
+
+
+def run_thesis(folder: Path, settings: RegulationSettings, domain: int | None, progress: PhaseProgress) -> None:
+    """Run the experiment and leave the bags ``sim``, ``hw`` and ``sim_500hz`` in the folder.
+
+    Args:
+        folder: The run's folder.
+        settings: What to run.
+        domain: ROS domain, or None for any free one.
+        progress: Shows where it is.
+
+    Raises:
+        FaultError: A program ended, a plant refused or faulted; everything is at rest again when this is raised.
+    """
+    logs = folder / "logs"
+    # The ramp up leaves the machine idle: the thesis's own simulation runs meanwhile, in a domain of its own.
+    own_protocol = LockstepRun(
+        folder / "sim_500hz",
+        replace(settings, noise=replace(settings.noise, seed=settings.noise.seed + 1, hold_time=0.002)),
+    )
+    with (
+        reserve_domain(domain) as main_domain,
+        ProcessSet(logs, ros_environment(main_domain, logs)) as processes,
+        reserve_domain() as other_domain,
+        lockstep_processes(own_protocol, other_domain, logs / "sim_500hz") as lockstep,
+        Conductor(main_domain, watch=processes.check, on_wait=progress.refresh) as conductor,
+    ):
+        progress.phase("starting", 6.0)
+        _refuse_occupied_domain(conductor)
+        _start(processes, folder, settings)
+        sim = PlantClient(conductor, "/sim", "simulator")
+        hw = PlantClient(conductor, "/hw", "bridge")
+        plants = (sim, hw)
+        try:
+            _conduct(conductor, plants, settings.noise, progress, lockstep)
+        finally:
+            _rest(plants)
+        progress.phase("closing the bags", 2.0)
+        processes.stop()
+        lockstep.finish()
+
+
+def _start(processes: ProcessSet, folder: Path, settings: RegulationSettings) -> None:
+    for name, plant in (("sim", settings.plant), ("hw", settings.hardware)):
+        metadata = folder / "logs" / f"{name}_metadata.json"
+        write_json(metadata, settings.metadata("thesis", plant=plant, namespace=f"/{name}"))
+        start_recorder(processes, folder / name, f"/{name}", metadata, settings.storage)
+    for program in _programs(settings):
+        processes.start_node(program)
+
+
+def _programs(settings: RegulationSettings) -> list[NodeProgram]:
+    return [
+        graph.simulator("/sim", plant=settings.plant, clock="realtime"),
+        graph.bridge("/hw", backend=settings.hardware, effort_strategy=settings.effort_strategy),
+        *(settings.controller_program(namespace, autostart=False) for namespace in ("/sim", "/hw")),
+        *(settings.disturbance_program(namespace, autostart=False) for namespace in ("/sim", "/hw")),
+    ]
+
+
+def _conduct(
+    conductor: Conductor,
+    plants: Sequence[PlantClient],
+    noise: NoiseSettings,
+    progress: PhaseProgress,
+    lockstep: LockstepRun,
+) -> None:
+    for plant in plants:
+        plant.wait_until_ready(START_TIMEOUT)
+    for plant in plants:
+        plant.arm()
+
+    lockstep.start()
+    _move(conductor, plants, UPRIGHT, "ramp_up", progress)
+
+    progress.phase("regulation", SETTLE_TIME)
+    for plant in plants:
+        plant.mark("regulation")
+        plant.switch_controller(on=True)
+    conductor.spin(SETTLE_TIME)
+
+    progress.phase("noise", noise.duration)
+    started = [plant.start_disturbance() for plant in plants]
+    conductor.wait_for("the disturbances to start", lambda: all(future.done() for future in started), 5.0)
+    for plant in plants:
+        conductor.wait_for(
+            f"the end of the noise on {plant.namespace}",
+            lambda plant=plant: plant.check_mode() or plant.has_event("noise_end"),
+            noise.duration + 15.0,
+        )
+
+    _move(conductor, plants, 0.0, "ramp_down", progress)
+    for plant in plants:
+        plant.switch_controller(on=False)
+        plant.disarm()
+        plant.mark("done")
+    conductor.spin(0.2)
+
+
+def _move(
+    conductor: Conductor, plants: Sequence[PlantClient], goal: float, phase: str, progress: PhaseProgress
+) -> None:
+    ramps = []
+    for plant in plants:
+        assert plant.sample is not None
+        ramps.append(thesis_ramp(plant.sample.position, goal))
+    progress.phase(phase.replace("_", " "), max(ramp.duration for ramp in ramps))
+    for plant, ramp in zip(plants, ramps):
+        plant.follow(ramp, phase, goal=goal)
+    for plant, ramp in zip(plants, ramps):
+        conductor.wait_for(
+            f"{plant.namespace} to end its {phase.replace('_', ' ')}", plant.trajectory_finished, ramp.duration + 15.0
+        )
+
+
+def _rest(plants: Sequence[PlantClient]) -> None:
+    """Disarm on every way out; a plant that no longer answers goes to rest by its own rules."""
+    for plant in plants:
+        plant.disarm_quietly()
+
+
+def _refuse_occupied_domain(conductor: Conductor) -> None:
+    deadline = time.monotonic() + 0.5
+    while time.monotonic() < deadline:
+        conductor.spin(0.1)
+    for name, namespace in conductor.node.get_node_names_and_namespaces():
+        if namespace in {"/sim", "/hw"}:
+            raise FaultError(
+                f"ROS domain {conductor.domain} is in use: {namespace}/{name} is already there; "
+                "choose another with --domain"
+            )

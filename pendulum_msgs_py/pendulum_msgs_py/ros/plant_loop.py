@@ -1,0 +1,245 @@
+"""The two clocks of a plant: absolute deadlines of wall time, or in lockstep with those who answer its states."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Mapping, Sequence
+from typing import Protocol
+
+from rclpy.clock import Clock, ClockType
+from rclpy.node import Node
+from rclpy.timer import Timer
+from rosgraph_msgs.msg import Clock as ClockMessage
+
+from pendulum_msgs_py import names
+from pendulum_msgs_py.parameters import ParameterSpec
+from pendulum_msgs_py.ros.convert import stamp_to_message
+from pendulum_msgs_py.ros.plant_interface import PlantInterface
+from pendulum_msgs_py.supervisor import Drive, Input, Mode
+from pendulum_msgs_py.timing import LoopStatistics, SteadyWallClock
+from pendulum_msgs_py.values import NANOSECONDS, JointCommand, JointSample
+
+__all__ = ["LOCKSTEP_EPOCH_NS", "LOOP_SPECS", "LockstepLoop", "RealtimeLoop", "Stepper", "create_wall_timer"]
+
+LOCKSTEP_EPOCH_NS = NANOSECONDS
+"""Stamp of the first state in lockstep [ns]; a stamp of zero means "no time" to ROS tools."""
+
+LOOP_SPECS: tuple[ParameterSpec, ...] = (
+    ParameterSpec(
+        "clock",
+        "realtime",
+        "",
+        "Absolute deadlines of wall time, or step only when all expected answers to a state have come.",
+        choices=("realtime", "lockstep"),
+        read_only=True,
+    ),
+    ParameterSpec(
+        "lockstep_inputs",
+        ["effort_command"],
+        "",
+        "Inputs that must answer a state before the next step, in lockstep.",
+        choices=tuple(kind.value for kind in Input),
+        read_only=True,
+    ),
+    ParameterSpec(
+        "lockstep_subscribers",
+        1,
+        "-",
+        "Subscriptions to joint_states that must be there before the first state, in lockstep.",
+        minimum=0,
+        read_only=True,
+    ),
+    ParameterSpec(
+        "lockstep_duration",
+        0.0,
+        "s",
+        "Simulated time after which the plant stops stepping and says so, in lockstep; 0 for never.",
+        minimum=0.0,
+        read_only=True,
+    ),
+)
+
+
+class Stepper(Protocol):
+    """What a loop needs of a plant: go on for one period under a decision."""
+
+    def __call__(self, drive: Drive, period_ns: int) -> tuple[JointSample, float]:
+        """Return the state at the end of the period, stamped, and the torque that was applied on the way [N m]."""
+
+
+def create_wall_timer(node: Node, period: float, callback: Callable[[], None]) -> Timer:
+    """Return a timer of steady time, deaf to simulated time and to steps of the system clock."""
+    return node.create_timer(period, callback, clock=Clock(clock_type=ClockType.STEADY_TIME))
+
+
+class RealtimeLoop:
+    """Steps the plant at absolute deadlines of wall time, without drift.
+
+    Late by a period or more, the plant is stepped through the periods it missed and only the newest state is
+    published; each missed period counts as an overrun.
+
+    Args:
+        interface: The plant on the graph.
+        step: Steps the plant.
+        statistics: Gets the loop's figures.
+        clock: Wall time.
+    """
+
+    def __init__(
+        self, interface: PlantInterface, step: Stepper, statistics: LoopStatistics, clock: SteadyWallClock
+    ) -> None:
+        self._interface = interface
+        self._step = step
+        self._statistics = statistics
+        self._clock = clock
+        self._deadline_ns = clock()
+        self.paused = False
+        self._timer = create_wall_timer(interface.node, statistics.period_ns / NANOSECONDS, self._on_timer)
+
+    def answered(self, kind: Input, command: JointCommand) -> None:
+        """Record the round trip of an accepted command."""
+        if kind is Input.EFFORT_COMMAND:
+            self._statistics.round_trip(self._clock() - command.stamp_ns)
+
+    def _on_timer(self) -> None:
+        now = self._clock()
+        period = self._statistics.period_ns
+        if self.paused:
+            self._deadline_ns = now
+            return
+        self._deadline_ns += period
+        self._statistics.cycle(now, self._deadline_ns)
+        while now - self._deadline_ns >= period:
+            self._advance(period)
+            self._deadline_ns += period
+        sample, _ = self._advance(period)
+        self._interface.publish_state(sample)
+
+    def _advance(self, period: int) -> tuple[JointSample, float]:
+        interface = self._interface
+        before = interface.sample
+        drive = interface.decide()
+        sample, applied = self._step(drive, period)
+        interface.publish_applied(before.stamp_ns if before else sample.stamp_ns - period, applied)
+        return sample, applied
+
+
+class LockstepLoop:
+    """Publishes a state and steps only when every expected answer stamped with it has come; runs as fast as they do.
+
+    The plant's time is simulated, goes out on ``/clock`` and depends on nothing but the number of steps, so that two
+    runs with one seed publish the same messages.
+
+    Args:
+        interface: The plant on the graph.
+        step: Steps the plant; stamps of its states must follow ``now_ns``.
+        period_ns: Time between two states [ns].
+        inputs: Inputs that must answer.
+        subscribers: Subscriptions to states that must be there before the first one.
+        duration: Simulated time after which to stop [s]; 0 for never.
+        publish_clock: Whether this plant owns ``/clock``.
+    """
+
+    def __init__(
+        self,
+        interface: PlantInterface,
+        step: Stepper,
+        period_ns: int,
+        inputs: Sequence[Input],
+        *,
+        subscribers: int = 1,
+        duration: float = 0.0,
+        publish_clock: bool = True,
+    ) -> None:
+        self._interface = interface
+        self._step = step
+        self._period_ns = period_ns
+        self._inputs = frozenset(inputs)
+        self._subscribers = subscribers
+        self._last_ns = LOCKSTEP_EPOCH_NS + round(duration * NANOSECONDS) if duration else None
+        self._answered: set[Input] = set()
+        self._waiting_since = time.monotonic()
+        self._told_waiting = False
+        self.now_ns = LOCKSTEP_EPOCH_NS
+        self.steps = 0
+        self.started = False
+        self.finished = False
+        self.paused = False
+        self._clock_publisher = (
+            interface.node.create_publisher(ClockMessage, names.CLOCK, 10) if publish_clock else None
+        )
+        # Free running (nobody has to answer) and all patience go through this timer.
+        create_wall_timer(interface.node, 0.001, self._on_timer)
+
+    def __call__(self) -> int:
+        """Return the simulated time [ns]: the loop is the plant's clock."""
+        return self.now_ns
+
+    def diagnostics(self) -> Mapping[str, object]:
+        """Return what the loop waits for."""
+        missing = sorted(kind.value for kind in self._inputs - self._answered)
+        return {
+            "lockstep_steps": self.steps,
+            "lockstep_waits_for": ", ".join(missing) if self._must_wait() else "nothing",
+        }
+
+    def answered(self, kind: Input, command: JointCommand) -> None:
+        """Take note of an accepted command; steps when it was the last one missing."""
+        if self.started and command.stamp_ns == self.now_ns:
+            self._answered.add(kind)
+            if not self.paused and not self._must_wait():
+                self.advance()
+
+    def advance(self) -> None:
+        """Take one step."""
+        interface = self._interface
+        if self.finished:
+            return
+        before_ns = self.now_ns
+        drive = interface.decide()
+        self.now_ns += self._period_ns
+        sample, applied = self._step(drive, self._period_ns)
+        interface.publish_applied(before_ns, applied)
+        self.steps += 1
+        self._publish(sample)
+        if self._last_ns is not None and self.now_ns >= self._last_ns:
+            self.finished = True
+            interface.publish_event("lockstep_finished", steps=self.steps)
+
+    def _publish(self, sample: JointSample) -> None:
+        self._answered.clear()
+        self._waiting_since = time.monotonic()
+        self._told_waiting = False
+        if self._clock_publisher is not None:
+            self._clock_publisher.publish(ClockMessage(clock=stamp_to_message(self.now_ns)))
+        self._interface.publish_state(sample)
+
+    def _must_wait(self) -> bool:
+        return self._interface.supervisor.mode is Mode.EFFORT and not self._inputs <= self._answered
+
+    def _on_timer(self) -> None:
+        if self.finished or self.paused:
+            return
+        if not self.started:
+            self._try_start()
+        elif not self._must_wait():
+            self.advance()
+        elif time.monotonic() - self._waiting_since > _PATIENCE and not self._told_waiting:
+            self._told_waiting = True
+            self._interface.node.get_logger().warning(
+                f"waiting for {self.diagnostics()['lockstep_waits_for']} in answer to the state at "
+                f"{self.now_ns / NANOSECONDS:.3f} s"
+            )
+
+    def _try_start(self) -> None:
+        interface = self._interface
+        ready = interface.state_subscribers >= self._subscribers and all(
+            interface.commanders(kind) > 0 for kind in self._inputs
+        )
+        if ready and interface.sample is not None:
+            self.started = True
+            self._publish(interface.sample)
+
+
+_PATIENCE = 2.0
+"""Wall time without an answer after which the log says what is missing [s]."""
