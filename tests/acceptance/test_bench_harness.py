@@ -1,0 +1,74 @@
+"""The benchmark harness tells what was measured, what a peer did, and what could not be measured."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+
+from tests.benchmarks import Row, measured, peer, run
+
+
+def test_a_ratio_above_one_always_means_that_we_are_better() -> None:
+    faster = measured("speed", 8.0, "1/s", peer=peer("them", lambda: 2.0), at_least_times_peer=4.0)
+    assert (faster.ratio, faster.holds, faster.target) == (4.0, True, ">= 4 x them")
+    shorter = measured("time", 2.0, "s", peer=peer("them", lambda: 8.0), at_most=1.0)
+    assert (shorter.ratio, shorter.holds, shorter.target) == (4.0, False, "<= 1 s")
+
+
+def test_a_missing_peer_is_reported_and_leaves_the_verdict_open() -> None:
+    def absent() -> float:
+        import no_such_library_of_anyone  # noqa: F401
+
+        return 1.0
+
+    row = measured("speed", 8.0, "1/s", peer=peer("them", absent), at_least_times_peer=4.0)
+    assert row.ratio is None
+    assert row.holds is None
+    assert row.note.startswith("them is not installed: ")
+
+
+def test_a_peer_that_fails_does_not_hide_a_target_of_ours_that_is_missed() -> None:
+    theirs = peer("them", lambda: 1.0 / 0.0)
+    row = measured("speed", 8.0, "1/s", peer=theirs, at_least=9.0, at_least_times_peer=4.0)
+    assert row.holds is False
+    assert "them failed: ZeroDivisionError" in row.note
+
+
+def test_a_figure_that_is_not_finite_never_holds() -> None:
+    assert measured("speed", float("nan"), "1/s").holds is False
+
+
+def test_measuring_one_area_again_keeps_the_rows_of_the_others() -> None:
+    old = [{"area": "bags", "what": "a"}, {"area": "sim", "what": "b"}]
+    assert run.merge(old, [{"area": "bags", "what": "c"}]) == [
+        {"area": "bags", "what": "c"},
+        {"area": "sim", "what": "b"},
+    ]
+
+
+def test_an_area_that_breaks_becomes_a_row_and_an_exit_code(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(run, "RESULTS", tmp_path / "build" / "bench.json")
+    monkeypatch.setattr(run, "areas", lambda: ["absent_area"])
+    assert run.main([]) == 1
+    (row,) = json.loads(run.RESULTS.read_text())
+    assert row["holds"] is False
+    assert "absent_area" in row["note"]
+    assert {"area", "what", "ours", "peer", "ratio", "target", "holds"} <= set(row)
+    assert "absent_area" in capsys.readouterr().out
+
+
+def test_an_unknown_area_is_refused_with_the_known_ones(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(run, "areas", lambda: ["sim"])
+    with pytest.raises(SystemExit):
+        run.main(["--only", "simm"])
+    assert "area is 'simm'; expected one of sim" in capsys.readouterr().err
+
+
+def test_a_table_has_a_line_for_each_row() -> None:
+    assert run.table([Row(what="speed", unit="1/s", ours=1.0, area="sim")]).row_count == 1

@@ -1,0 +1,174 @@
+"""What `ros2 run` and a user of `make` find: a colcon build into an empty folder, and the list of targets."""
+
+from __future__ import annotations
+
+import importlib
+import os
+import re
+import subprocess
+import sys
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from xml.etree import ElementTree
+
+import pytest
+
+from tests.fixtures import PROJECT
+
+FOLDERS = {
+    "pendulum_msgs_py": "pendulum_msgs_py",
+    "pendulum_sim": "pendulum_sim",
+    "pendulum_lqr": "pendulum_lqr",
+    "pendulum_hw_bridge": "pendulum_hw_bridge",
+    "pendulum_bags": "bags",
+}
+
+
+def executables(package: str) -> dict[str, str]:
+    return dict(getattr(importlib.import_module(f"{package}.executables"), "EXECUTABLES", {}))
+
+
+PROGRAMS = [(package, program) for package in FOLDERS for program in sorted(executables(package))]
+
+
+@pytest.fixture(scope="module")
+def install(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Build the five packages with colcon into an empty folder; return the install folder."""
+    base = tmp_path_factory.mktemp("colcon")
+    command = [
+        str(Path(sys.executable).with_name("colcon")),
+        "--log-base",
+        str(base / "log"),
+        "build",
+        "--base-paths",
+        *(str(PROJECT / folder) for folder in FOLDERS.values()),
+        "--build-base",
+        str(base / "build"),
+        "--install-base",
+        str(base / "install"),
+    ]
+    done = subprocess.run(command, cwd=base, capture_output=True, text=True, check=False, timeout=110)
+    assert done.returncode == 0, (
+        f"colcon build ended with code {done.returncode}:\n{done.stdout}\n{done.stderr}"
+    )
+    assert "5 packages finished" in done.stderr + done.stdout
+    return base / "install"
+
+
+@pytest.mark.parametrize("package", FOLDERS)
+def test_a_built_package_is_in_the_ament_index_with_its_manifest(install: Path, package: str) -> None:
+    share = install / package / "share"
+    assert (share / "ament_index" / "resource_index" / "packages" / package).is_file()
+    assert (share / package / "package.xml").read_bytes() == (
+        PROJECT / FOLDERS[package] / "package.xml"
+    ).read_bytes()
+    # Written by the ament build only: colcon's plain Python build, its silent fallback, has no such hook.
+    assert "AMENT_PREFIX_PATH" in (share / package / "hook" / "ament_prefix_path.sh").read_text()
+
+
+@pytest.mark.parametrize("package", FOLDERS)
+def test_a_built_package_carries_every_file_that_its_modules_read(install: Path, package: str) -> None:
+    source = PROJECT / FOLDERS[package] / package
+    (built,) = (install / package / "lib").glob(f"python*/site-packages/{package}")
+    of = {
+        root: {
+            path.relative_to(root)
+            for path in root.rglob("*")
+            if path.is_file() and "__pycache__" not in path.parts
+        }
+        for root in (source, built)
+    }
+    assert of[source] == of[built]
+
+
+def test_every_program_stands_where_ros2_run_looks_for_it_and_answers_help(install: Path) -> None:
+    """All at once, for most of their time is the import of libraries; what fails is told by name."""
+    site_packages = [str(path) for path in install.glob("*/lib/python*/site-packages")]
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(site_packages), "COLUMNS": "100"}
+
+    def problem(item: tuple[str, str]) -> str:
+        package, program = item
+        path = install / package / "lib" / package / program
+        if not os.access(path, os.X_OK):
+            return f"{package} {program}: {path} is missing or not executable"
+        command = [str(path), "--help"]
+        done = subprocess.run(
+            command, capture_output=True, text=True, check=False, timeout=60, env=environment
+        )
+        if done.returncode != 0 or "usage" not in done.stdout.lower():
+            tail = (done.stdout + done.stderr)[-600:]
+            return f"{package} {program} --help ended with code {done.returncode}: {tail}"
+        return ""
+
+    with ThreadPoolExecutor(os.cpu_count()) as pool:
+        problems = [text for text in pool.map(problem, PROGRAMS) if text]
+    assert not problems, "\n".join(problems)
+
+
+def test_a_built_program_runs_the_code_that_was_built(install: Path) -> None:
+    (site_packages,) = (install / "pendulum_sim" / "lib").glob("python*/site-packages")
+    where = "import pendulum_sim; print(pendulum_sim.__file__)"
+    environment = {**os.environ, "PYTHONPATH": str(site_packages)}
+    done = subprocess.run(
+        [sys.executable, "-c", where],
+        capture_output=True,
+        text=True,
+        check=True,
+        env=environment,
+        cwd=install,
+    )
+    assert Path(done.stdout.strip()).is_relative_to(install)
+
+
+@pytest.mark.parametrize("package", sorted({package for package, _ in PROGRAMS}))
+def test_python_m_from_the_root_of_the_repository_finds_the_package(package: str) -> None:
+    """A folder of the same name stands there; it would shadow a package that only a hook makes importable."""
+    done = subprocess.run(
+        [sys.executable, "-m", package, "--help"], cwd=PROJECT, capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 0, done.stderr
+    assert all(program in done.stdout for program in executables(package))
+
+
+@pytest.mark.parametrize(("package", "program"), PROGRAMS)
+def test_every_program_is_an_entry_point_of_the_installed_distribution(package: str, program: str) -> None:
+    from importlib.metadata import distribution
+
+    points = {point.name: point.value for point in distribution(package).entry_points}
+    assert points.get(program) == executables(package)[program]
+
+
+def test_the_five_build_scripts_are_one_and_the_same_file() -> None:
+    assert len({(PROJECT / folder / "setup.py").read_bytes() for folder in FOLDERS.values()}) == 1
+
+
+@pytest.mark.parametrize("package", FOLDERS)
+def test_a_manifest_is_valid_and_names_every_package_of_ros_that_the_code_imports(package: str) -> None:
+    from catkin_pkg.package import parse_package
+
+    folder = PROJECT / FOLDERS[package]
+    warnings: list[str] = []
+    manifest = parse_package(str(folder), warnings=warnings)
+    manifest.validate()
+    assert not warnings
+    assert manifest.get_build_type() == "ament_python"
+    assert manifest.licenses == ["Apache-2.0"]
+    named = {str(dependency.name) for dependency in manifest.exec_depends}
+    ours_or_of_ros = r"rclpy|std_srvs|(?:rcl|builtin)_interfaces|launch(?:_ros)?|\w+_msgs|pendulum_\w+"
+    pattern = rf"^\s*(?:from|import) ({ours_or_of_ros})\b"
+    imported = {
+        match[1]
+        for file in (folder / package).rglob("*.py")
+        for match in re.finditer(pattern, file.read_text(encoding="utf-8"), re.MULTILINE)
+    }
+    assert imported - named - {package} == set()
+    ordered = [element.text for element in ElementTree.parse(folder / "package.xml").iter("exec_depend")]
+    assert len(ordered) == len(set(ordered))
+
+
+def test_make_alone_prints_one_line_for_each_target() -> None:
+    done = subprocess.run(["make"], cwd=PROJECT, capture_output=True, text=True, check=True, timeout=20)
+    lines = done.stdout.splitlines()
+    rules = re.findall(r"^\.PHONY: (.+)$", (PROJECT / "Makefile").read_text(encoding="utf-8"), re.MULTILINE)
+    assert [line.split()[1] for line in lines] == rules[0].split()
+    assert all(re.fullmatch(r"make [a-z]+ +\S.*", line) for line in lines)
