@@ -311,8 +311,11 @@ class ActuatorPort(Protocol):
     def write(self, command: Command) -> Applied:
         """Send setpoints for one command lifetime; return what was really sent, after limits."""
 
-    def set_strategy(self, strategy: Strategy) -> Strategy:
-        """Change the strategy, all loops off, and return the one that reads back."""
+    def set_strategy(self, strategy: Strategy, command: Command | None = None) -> Strategy:
+        """Change the strategy, with first setpoints in the same packet, and return the one that reads back.
+
+        Without ``command`` all loops are off afterwards.
+        """
 
     def set_gains(self, gains: GainSet) -> GainSet:
         """Set the gains of all loops and return what reads back."""

@@ -136,17 +136,17 @@ def load_gains(path: str | Path) -> GainSet:
     strategy = int(_number(elements["control_strategy"], path)) if "control_strategy" in elements else 3
     if strategy not in DEFAULT_GAINS:
         raise ParameterError(f"gains file {path}: control_strategy is {strategy}; expected 1 to 4")
-    gains = DEFAULT_GAINS[strategy]
+    loops = {loop: DEFAULT_GAINS[strategy].loop(loop) for loop in LOOPS}
     for loop in LOOPS:
         if loop not in elements:
             continue
         given = {child.tag: _number(child, path) for child in elements[loop]}
         reject_unknown(given, GAIN_FIELDS, where=f"{path}: {loop}")
         try:
-            gains = replace(gains, **{loop: replace(gains.loop(loop), **given)})
+            loops[loop] = replace(loops[loop], **given)
         except ParameterError as error:
             raise ParameterError(f"gains file {path}: {loop}: {error}") from error
-    return gains
+    return GainSet(strategy, **loops)
 
 
 def write_gains(path: str | Path, gains: GainSet) -> Path:

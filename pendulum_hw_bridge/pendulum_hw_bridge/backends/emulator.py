@@ -26,6 +26,9 @@ from pendulum_msgs_py.values import NANOSECONDS
 
 __all__ = ["EmulatorBackend"]
 
+_CUT_OFF = {ActuatorFault.COMMANDS_LOST, ActuatorFault.SEND_FAILED, ActuatorFault.LOCKED_BY_OTHER}
+"""Faults in which settings do not reach the actuator either."""
+
 
 class EmulatorBackend:
     """The actuator port of an :class:`EmulatedX5`.
@@ -108,9 +111,12 @@ class EmulatorBackend:
         self.actuator.deliver(limited, now + max(0, round(delay * NANOSECONDS)))
         return Applied(limited, self.actuator.strategy, changed, now)
 
-    def set_strategy(self, strategy: Strategy) -> Strategy:
-        """Change the strategy."""
+    def set_strategy(self, strategy: Strategy, command: Command | None = None) -> Strategy:
+        """Change the strategy, with first setpoints at the same instant."""
+        limited = None if command is None else check_command(command, strategy, self.actuator.limits)[0]
         self._configure(strategy=strategy)
+        if limited is not None and self.actuator.strategy is strategy:
+            self.actuator.deliver(limited, self.clock.now_ns())
         return self.actuator.strategy
 
     def set_gains(self, gains: GainSet) -> GainSet:
@@ -151,7 +157,7 @@ class EmulatorBackend:
             self.actuator.deliver(zero, self.clock.now_ns())
             self._catch_up()
         # With the way there cut, nothing arrives: the command lifetime then has to do it.
-        if not self.actuator.faults & {ActuatorFault.COMMANDS_LOST, ActuatorFault.SEND_FAILED}:
+        if not self.actuator.faults & _CUT_OFF:
             self.actuator.configure(strategy=Strategy.OFF)
 
     def close(self) -> None:
@@ -162,6 +168,8 @@ class EmulatorBackend:
     def _configure(self, **changes: object) -> None:
         self._require_connection()
         self._catch_up()
+        if self.actuator.faults & _CUT_OFF:
+            raise ActuatorError("no_acknowledgement", f"actuator did not acknowledge {', '.join(changes)}")
         self.actuator.configure(**changes)  # type: ignore[arg-type]  # one of its keywords each
 
     def _catch_up(self) -> None:

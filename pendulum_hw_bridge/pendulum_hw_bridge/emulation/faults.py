@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from enum import Enum
+from typing import Any
 
 from pendulum_hw_bridge.actuator import Feedback, LimitState, TemperatureState
 
@@ -54,7 +55,7 @@ def distort(feedback: Feedback, faults: set[ActuatorFault], frozen: Feedback | N
         faults: Faults in force.
         frozen: Record at the moment a freeze began.
     """
-    changes: dict[str, object] = {}
+    changes: dict[str, Any] = {}
     fault = ActuatorFault
     if fault.POSITION_NAN in faults:
         changes["position"] = math.nan

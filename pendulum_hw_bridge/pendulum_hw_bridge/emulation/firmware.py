@@ -13,6 +13,7 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from pendulum_hw_bridge.gains import GAIN_FIELDS, LOOPS, GainSet
 
@@ -28,6 +29,7 @@ except ImportError:  # the emulator then runs interpreted, some twenty times slo
 __all__ = [
     "CONTROL_PERIOD",
     "EFFORT",
+    "Array",
     "POSITION",
     "VELOCITY",
     "control_pwm",
@@ -36,6 +38,8 @@ __all__ = [
     "njit",
     "pid_step",
 ]
+
+Array = NDArray[np.float64]
 
 CONTROL_PERIOD = 1e-3
 """Cycle of the firmware's loops [s]."""
@@ -46,20 +50,20 @@ _MIN_TARGET, _MAX_TARGET, _TARGET_LP, _MIN_OUT, _MAX_OUT, _OUT_LP, _D_ON_ERROR =
 _M_TARGET, _M_INTEGRAL, _M_PREVIOUS, _M_OUTPUT, _M_RUNNING = 0, 1, 2, 3, 4
 
 
-def gain_rows(gains: GainSet) -> np.ndarray:
+def gain_rows(gains: GainSet) -> Array:
     """Return the gains of the three loops as an array (3, 14)."""
     return np.array([[float(getattr(gains.loop(loop), name)) for name in GAIN_FIELDS] for loop in LOOPS])
 
 
-def new_loop_memory() -> np.ndarray:
+def new_loop_memory() -> Array:
     """Return the memory of three loops that have never run, (3, 5)."""
     return np.zeros((3, 5))
 
 
 @njit(cache=True)
 def pid_step(
-    gains: np.ndarray,
-    memory: np.ndarray,
+    gains: Array,
+    memory: Array,
     loop: int,
     target: float,
     measured: float,
@@ -117,9 +121,9 @@ def pid_step(
 @njit(cache=True)
 def control_pwm(
     strategy: int,
-    gains: np.ndarray,
-    memory: np.ndarray,
-    setpoints: np.ndarray,
+    gains: Array,
+    memory: Array,
+    setpoints: Array,
     position: float,
     velocity: float,
     effort: float,
@@ -146,7 +150,7 @@ def control_pwm(
     pwm = 0.0
     if strategy == 1:
         pwm = 0.0 if math.isnan(setpoints[EFFORT]) else setpoints[EFFORT]
-    elif strategy == 2 or strategy == 4:
+    elif strategy in (2, 4):
         from_position = pid_step(gains, memory, POSITION, setpoints[POSITION], position, 0.0, period)
         from_velocity = pid_step(
             gains, memory, VELOCITY, setpoints[VELOCITY], velocity, velocity_normaliser, period

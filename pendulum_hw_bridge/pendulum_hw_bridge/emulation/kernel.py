@@ -7,17 +7,14 @@ Euler: velocities first, then positions with the new velocities; dry friction im
 from __future__ import annotations
 
 import math
-import os
 from pathlib import Path
 from typing import Any
-
-import numpy as np
 
 import pendulum_msgs_py.dynamics.rigid as _rigid
 import pendulum_msgs_py.dynamics.series_elastic as _sea
 from pendulum_hw_bridge.emulation import firmware as _firmware
 from pendulum_hw_bridge.emulation import thermal as _thermal
-from pendulum_hw_bridge.emulation.firmware import control_pwm, njit
+from pendulum_hw_bridge.emulation.firmware import Array, control_pwm, njit
 
 __all__ = ["CONSTANTS", "STATES", "STEP", "STEPS_PER_CYCLE", "STEP_NS", "advance"]
 
@@ -141,11 +138,11 @@ _constant_at = njit(cache=True)(_thermal.torque_constant_at)
 
 @njit(cache=True)
 def advance(
-    state: np.ndarray,
-    constants: np.ndarray,
-    gains: np.ndarray,
-    memory: np.ndarray,
-    setpoints: np.ndarray,
+    state: Array,
+    constants: Array,
+    gains: Array,
+    memory: Array,
+    setpoints: Array,
     strategy: int,
     link_torque: float,
     first_step: int,
@@ -246,9 +243,9 @@ def _drop_stale_cache(kernel: Any, modules: tuple[Any, ...]) -> None:
     """
     cache = getattr(kernel, "_cache", None)
     folder = getattr(cache, "cache_path", None)
-    if folder is None or not os.path.isdir(folder):
+    if folder is None or not Path(folder).is_dir():
         return
-    newest = max(os.path.getmtime(module.__file__) for module in modules)
+    newest = max(Path(module.__file__).stat().st_mtime for module in modules)
     for file in Path(folder).glob("kernel.*.nb[ic]"):
         try:
             if file.stat().st_mtime < newest:

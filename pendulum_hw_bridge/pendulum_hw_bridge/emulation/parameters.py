@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from pendulum_hw_bridge.actuator import HardwareLimits
+from pendulum_hw_bridge.emulation.firmware import Array
 from pendulum_hw_bridge.emulation.kernel import CONSTANTS
 from pendulum_hw_bridge.emulation.thermal import ThermalParameters, torque_constant_at
 from pendulum_msgs_py.dynamics.series_elastic import shorted_winding_damping, winding_resistance_at
@@ -137,7 +138,7 @@ class EmulatorParameters:
             ),
         )
 
-    def constants(self, limits: HardwareLimits, supply_voltage: float, enabled: bool) -> np.ndarray:
+    def constants(self, limits: HardwareLimits, supply_voltage: float, enabled: bool) -> Array:
         """Return the constant vector of the kernel.
 
         Args:

@@ -1,0 +1,321 @@
+"""What the bridge does not believe: checks of each feedback record, each with a named fault.
+
+The common rules of a plant (position window, velocity, age of the measurement, command rules) are the supervisor's;
+here stand those that only an actuator has. Pure: one record in, named faults out.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections import deque
+from dataclasses import dataclass
+
+from pendulum_hw_bridge.actuator import Command, CommandLock, Feedback, LimitState, Strategy, TemperatureState
+from pendulum_msgs_py.dynamics.series_elastic import winding_current, winding_resistance_at
+from pendulum_msgs_py.errors import ParameterError
+from pendulum_msgs_py.plant_parameters import SeriesElasticParameters
+from pendulum_msgs_py.values import NANOSECONDS
+
+__all__ = ["FAULTS", "Fault", "SafetyLimits", "SafetyMonitor"]
+
+FAULTS = {
+    "feedback_lost": "no feedback for three cycles",
+    "feedback_frozen": "records come, but their sequence number stands still for three cycles",
+    "feedback_not_finite": "position, velocity or effort is NaN or infinite",
+    "feedback_late": "records are older than three cycles when they arrive",
+    "module_restarted": "the module's own clock or sequence number went back",
+    "position_jump": "position changed by more than its velocity allows",
+    "position_frozen": "position and velocity tell different motions over five cycles",
+    "m_stop": "the motion stop is pressed",
+    "over_temperature": "the firmware limits or cuts the output, or the winding is above its limit",
+    "locked_by_other": "another sender holds the module",
+    "voltage": "supply voltage outside its window",
+    "firmware_limit": "a safety limit of the firmware acts",
+    "effort_measured": "measured torque above its limit",
+    "command_not_in_force": "the module acts on something that was not sent",
+    "winding_current": "winding current does not fit PWM, velocity and resistance",
+    "strategy": "the strategy does not read back",
+    "send_failed": "a command could not be sent",
+    "no_acknowledgement": "a setting was not acknowledged",
+    "exception": "an error in the bridge itself",
+}
+"""Faults by name and what each means; those of the supervisor come in addition."""
+
+_COUNT = 3
+_MOTION_CYCLES = 5
+
+
+@dataclass(frozen=True)
+class Fault:
+    """One fault: its name in :data:`FAULTS` and a sentence with the values."""
+
+    name: str
+    message: str
+
+
+@dataclass(frozen=True)
+class SafetyLimits:
+    """Limits of the checks.
+
+    Attributes:
+        winding_temperature: Largest winding temperature [degC].
+        voltage_min: [V].
+        voltage_max: [V].
+        measured_effort: Largest torque that the spring may show [N m].
+        position_jump: Largest change of position beyond that of the velocity, in one cycle [rad].
+        position_disagreement: Largest disagreement of position and integrated velocity in five cycles [rad].
+        winding_current: Largest disagreement of the winding current; 0 switches the check off [A].
+        command_tolerance: Largest difference between what was sent and what the module acts on; relative to 1 [-].
+    """
+
+    winding_temperature: float = 120.0
+    voltage_min: float = 22.0
+    voltage_max: float = 50.0
+    measured_effort: float = 14.0
+    position_jump: float = 0.1
+    position_disagreement: float = 0.01
+    winding_current: float = 0.15
+    command_tolerance: float = 2e-3
+
+    def __post_init__(self) -> None:
+        """Refuse limits that limit nothing."""
+        for name, unit in (
+            ("winding_temperature", "degC"),
+            ("measured_effort", "N m"),
+            ("position_jump", "rad"),
+            ("position_disagreement", "rad"),
+        ):
+            if not getattr(self, name) > 0.0:
+                raise ParameterError(f"{name} limit is {getattr(self, name)} {unit}; expected > 0")
+        if not self.voltage_min < self.voltage_max:
+            raise ParameterError(
+                f"voltage window is [{self.voltage_min}, {self.voltage_max}] V; expected min < max"
+            )
+
+
+class SafetyMonitor:
+    """Checks feedback records in their order; remembers what it needs for checks over several.
+
+    Args:
+        limits: The limits.
+        period: Nominal feedback period [s].
+        drivetrain: Constants for the check of the winding current, or None.
+    """
+
+    def __init__(
+        self, limits: SafetyLimits, period: float, drivetrain: SeriesElasticParameters | None = None
+    ) -> None:
+        self.limits = limits
+        self.period = period
+        self.drivetrain = drivetrain
+        self._last: Feedback | None = None
+        self._last_new_ns: int | None = None
+        self._motion: deque[tuple[int, float, float]] = deque(maxlen=_MOTION_CYCLES + 1)
+        self._sent: deque[tuple[int, Command]] = deque(maxlen=256)
+        self._strategy = Strategy.OFF
+        self._strategy_since_ns = 0
+        self._wrong_commands = 0
+        self._wrong_currents = 0
+        self._clock_offset_ns: int | None = None
+
+    @property
+    def timeout(self) -> float:
+        """Age of feedback that is a fault: three cycles [s]."""
+        return _COUNT * self.period
+
+    def told(self, command: Command, strategy: Strategy, sent_ns: int) -> None:
+        """Take note of what was sent, to compare with what the module then acts on."""
+        if strategy is not self._strategy:
+            self._sent.clear()
+            self._wrong_commands = 0
+            self._strategy = strategy
+            self._strategy_since_ns = sent_ns
+        self._sent.append((sent_ns, command))
+
+    def stopped(self) -> None:
+        """Take note that nothing is commanded any more."""
+        self._sent.clear()
+        self._strategy = Strategy.OFF
+        self._wrong_commands = self._wrong_currents = 0
+
+    def is_new(self, feedback: Feedback) -> bool:
+        """Return whether a record is one that was not seen before, and remember when one last was."""
+        fresh = self._last is None or feedback.sequence != self._last.sequence
+        if fresh:
+            self._last_new_ns = feedback.stamp_ns
+        return fresh
+
+    def silence(self, now_ns: int) -> Fault | None:
+        """Return the fault of feedback that stays away, or None.
+
+        Args:
+            now_ns: Host clock [ns].
+        """
+        if self._last_new_ns is None:
+            return None
+        age = (now_ns - self._last_new_ns) / NANOSECONDS
+        if age > self.timeout:
+            return Fault(
+                "feedback_lost",
+                f"no new feedback for {age * 1e3:.0f} ms; expected one within {self.timeout * 1e3:.0f} ms",
+            )
+        return None
+
+    def check(self, feedback: Feedback) -> Fault | None:
+        """Return the first fault that a new record shows, or None."""
+        fault = (
+            self._check_values(feedback)
+            or self._check_continuity(feedback)
+            or self._check_state(feedback)
+            or self._check_motion(feedback)
+            or self._check_command(feedback)
+            or self._check_current(feedback)
+        )
+        self._last = feedback
+        return fault
+
+    # --- checks ---------------------------------------------------------------------------------------------
+
+    def _check_values(self, feedback: Feedback) -> Fault | None:
+        for name, unit in (("position", "rad"), ("velocity", "rad/s"), ("effort", "N m")):
+            value = getattr(feedback, name)
+            if not math.isfinite(value):
+                return Fault("feedback_not_finite", f"{name} reads {value} {unit}; expected a finite number")
+        return None
+
+    def _check_continuity(self, feedback: Feedback) -> Fault | None:
+        last = self._last
+        offset = feedback.stamp_ns - feedback.hardware_ns
+        if last is not None and feedback.hardware_ns < last.hardware_ns:
+            self._clock_offset_ns = None
+            return Fault(
+                "module_restarted",
+                f"module's clock went back by {(last.hardware_ns - feedback.hardware_ns) / NANOSECONDS:.3f} s",
+            )
+        if feedback.hardware_ns > 0:
+            # The smallest offset ever seen is that of the fastest way; what exceeds it waited somewhere.
+            if self._clock_offset_ns is None or offset < self._clock_offset_ns:
+                self._clock_offset_ns = offset
+            late = (offset - self._clock_offset_ns) / NANOSECONDS
+            # Two crystals part by some 50 ppm: let the reference follow slowly.
+            self._clock_offset_ns += round(1e-4 * self.period * NANOSECONDS)
+            if late > self.timeout:
+                return Fault(
+                    "feedback_late",
+                    f"feedback is {late * 1e3:.0f} ms late; expected at most {self.timeout * 1e3:.0f} ms",
+                )
+        return None
+
+    def _check_state(self, feedback: Feedback) -> Fault | None:
+        limits = self.limits
+        if feedback.m_stop:
+            return Fault("m_stop", "motion stop is pressed; release it, then disarm and arm again")
+        if feedback.temperature_state != TemperatureState.NORMAL:
+            state = TemperatureState(feedback.temperature_state).name
+            return Fault("over_temperature", f"firmware reports temperature state {state}; expected NORMAL")
+        if feedback.winding_temperature > limits.winding_temperature:
+            return Fault(
+                "over_temperature",
+                f"winding is at {feedback.winding_temperature:.0f} degC; "
+                f"expected at most {limits.winding_temperature:.0f} degC",
+            )
+        if feedback.lock == CommandLock.LOCKED_BY_OTHER:
+            return Fault("locked_by_other", "another sender holds the module; close Scope or other programs")
+        if not limits.voltage_min <= feedback.voltage <= limits.voltage_max:
+            return Fault(
+                "voltage",
+                f"supply is {feedback.voltage:.1f} V; expected {limits.voltage_min:g} to {limits.voltage_max:g} V",
+            )
+        for name in ("position_limit", "velocity_limit", "effort_limit"):
+            if getattr(feedback, name) in {LimitState.BELOW, LimitState.ABOVE}:
+                state = LimitState(getattr(feedback, name)).name
+                return Fault("firmware_limit", f"firmware's {name} reads {state}; expected INSIDE")
+        if abs(feedback.effort) > limits.measured_effort:
+            return Fault(
+                "effort_measured",
+                f"measured torque is {feedback.effort:.2f} N m; expected at most {limits.measured_effort:g} N m",
+            )
+        return None
+
+    def _check_motion(self, feedback: Feedback) -> Fault | None:
+        last = self._last
+        if last is not None and math.isfinite(last.position):
+            elapsed = (feedback.hardware_ns - last.hardware_ns) / NANOSECONDS
+            if 0.0 < elapsed < 2.0 * self.timeout:
+                expected = 0.5 * (feedback.velocity + last.velocity) * elapsed
+                jump = feedback.position - last.position - expected
+                if abs(jump) > self.limits.position_jump:
+                    return Fault(
+                        "position_jump",
+                        f"position jumped by {jump:.3f} rad in {elapsed * 1e3:.0f} ms; "
+                        f"expected at most {self.limits.position_jump:g} rad beside the velocity",
+                    )
+        self._motion.append((feedback.hardware_ns, feedback.position, feedback.velocity))
+        if len(self._motion) <= _MOTION_CYCLES:
+            return None
+        points = list(self._motion)
+        travelled = sum(
+            0.5 * (after[2] + before[2]) * (after[0] - before[0]) / NANOSECONDS
+            for before, after in itertools.pairwise(points)
+        )
+        gap = travelled - (points[-1][1] - points[0][1])
+        if abs(gap) > self.limits.position_disagreement:
+            return Fault(
+                "position_frozen",
+                f"velocity says {travelled:.4f} rad, position {points[-1][1] - points[0][1]:.4f} rad in "
+                f"{_MOTION_CYCLES} cycles; expected them within {self.limits.position_disagreement:g} rad",
+            )
+        return None
+
+    def _check_command(self, feedback: Feedback) -> Fault | None:
+        """Compare what the module acts on with what was sent lately."""
+        settled = feedback.stamp_ns - self._strategy_since_ns > self.timeout * NANOSECONDS
+        if self._strategy is Strategy.OFF or not self._sent or not settled:
+            self._wrong_commands = 0
+            return None
+        oldest = feedback.stamp_ns - round((self.timeout + 0.02) * NANOSECONDS)
+        recent = [command for sent, command in self._sent if sent >= oldest] or [self._sent[-1][1]]
+        if self._strategy is Strategy.DIRECT_PWM:
+            acts, candidates, name = feedback.pwm_command, [command.pwm for command in recent], "PWM"
+        elif math.isfinite(recent[-1].position):
+            acts, candidates, name = feedback.position_command, [c.position for c in recent], "position"
+        else:
+            acts, candidates, name = feedback.effort_command, [c.effort for c in recent], "effort"
+        tolerance = self.limits.command_tolerance
+        wanted = [0.0 if math.isnan(candidate) else candidate for candidate in candidates]
+        low, high = min(wanted) - tolerance, max(wanted) + tolerance
+        good = math.isfinite(acts) and low <= acts <= high
+        self._wrong_commands = 0 if good else self._wrong_commands + 1
+        if self._wrong_commands >= _COUNT:
+            return Fault(
+                "command_not_in_force",
+                f"module acts on {name} {acts:.4f}, sent were {low + tolerance:.4f} to {high - tolerance:.4f}; "
+                "is the strategy another, or does the command not arrive?",
+            )
+        return None
+
+    def _check_current(self, feedback: Feedback) -> Fault | None:
+        drive, tolerance = self.drivetrain, self.limits.winding_current
+        if drive is None or tolerance <= 0.0 or not math.isfinite(feedback.pwm_command):
+            return None
+        resistance = winding_resistance_at(
+            feedback.winding_temperature, drive.winding_resistance, drive.resistance_temperature_coefficient
+        )
+        expected = winding_current(
+            feedback.pwm_command,
+            feedback.motor_velocity / drive.gear_ratio,
+            feedback.voltage,
+            drive.back_emf_constant,
+            drive.gear_ratio,
+            resistance,
+        )
+        wrong = not abs(feedback.winding_current - expected) <= tolerance + 0.2 * abs(expected)
+        self._wrong_currents = self._wrong_currents + 1 if wrong else 0
+        if self._wrong_currents >= _COUNT:
+            return Fault(
+                "winding_current",
+                f"winding current is {feedback.winding_current:.3f} A; PWM {feedback.pwm_command:.3f} and velocity "
+                f"ask for {expected:.3f} A",
+            )
+        return None
