@@ -181,15 +181,14 @@ def delayed_spectral_radius(model: LinearModel, K: ArrayLike, period: float, del
     return float(np.max(np.abs(np.linalg.eigvals(sampled.A - sampled.B @ feedback))))
 
 
-def largest_stable_period(model: LinearModel, K: ArrayLike, delay: float = 0.0) -> float:
+def largest_stable_period(model: LinearModel, K: ArrayLike) -> float:
     """Return the first sampling period at which the held loop loses stability [s]; 0 if it never has it.
 
     Args:
         model: Linear model.
         K: Gain on [theta, theta_dot], shape (2,).
-        delay: Constant input delay [s].
     """
-    return _first_unstable(lambda period: delayed_spectral_radius(model, K, period, delay) < 1.0, model)
+    return _first_unstable(lambda period: delayed_spectral_radius(model, K, period) < 1.0, model)
 
 
 def _first_unstable(stable: Any, model: LinearModel) -> float:

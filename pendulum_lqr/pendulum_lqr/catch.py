@@ -1,0 +1,78 @@
+"""LQR that takes over near upright, within the region where it is proven to hold under the torque limit."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+from pendulum_msgs_py.angles import wrap
+from pendulum_msgs_py.plant_parameters import PlantParameters
+
+from pendulum_lqr.design import Gain, continuous_lqr
+from pendulum_lqr.model import linearise
+from pendulum_lqr.roa import proven_level
+
+__all__ = ["Catch", "make_catch"]
+
+_LET_GO = 2.0
+
+
+class Catch:
+    """LQR at upright with hysteresis: takes over inside x' S x <= level, lets go beyond twice the proven level.
+
+    Args:
+        gain: Gain and Riccati solution.
+        level: Level at which it takes over.
+        release: Level at which it lets go, larger.
+        effort_limit: Largest torque [N m].
+    """
+
+    def __init__(self, gain: Gain, level: float, release: float, effort_limit: float) -> None:
+        self.gain = gain
+        self.level = level
+        self.release = release
+        self.effort_limit = effort_limit
+        self.active = False
+        self._k0, self._k1 = (float(value) for value in gain.K)
+        self._s00, self._s01, self._s11 = (float(gain.S[0, 0]), float(gain.S[0, 1]), float(gain.S[1, 1]))
+
+    def reset(self) -> None:
+        """Let go."""
+        self.active = False
+
+    def value(self, angle: float, velocity: float) -> float:
+        """Return x' S x."""
+        return self._s00 * angle * angle + 2.0 * self._s01 * angle * velocity + self._s11 * velocity * velocity
+
+    def holds(self, angle: float, velocity: float) -> bool:
+        """Tell whether the LQR is in charge at a state, and remember it."""
+        angle = wrap(angle)
+        self.active = self.value(angle, velocity) <= (self.release if self.active else self.level)
+        return self.active
+
+    def command(self, angle: float, velocity: float) -> float:
+        """Return the LQR's torque within the limit [N m]."""
+        effort = -self._k0 * wrap(angle) - self._k1 * velocity
+        return max(-self.effort_limit, min(self.effort_limit, effort))
+
+    def describe(self) -> str:
+        """Return gain and level."""
+        reach = math.sqrt(self.level * self._s11 / (self._s00 * self._s11 - self._s01**2))
+        return f"K = [{self._k0:.4f}, {self._k1:.4f}] within {reach:.3f} rad"
+
+
+def make_catch(
+    plant: PlantParameters, q: Sequence[float], r: float, effort_limit: float, share: float = 0.9
+) -> Catch:
+    """Return the catch for a plant under a torque limit.
+
+    Args:
+        plant: Plant parameters.
+        q: Weights of angle and velocity.
+        r: Weight of torque.
+        effort_limit: Largest torque [N m].
+        share: Share of the proven level in which it takes over.
+    """
+    gain = continuous_lqr(linearise(plant), q, r)
+    level = proven_level(plant, gain, effort_limit)
+    return Catch(gain, share * level, _LET_GO * level, effort_limit)

@@ -1,0 +1,210 @@
+"""One interface for every controller, and the table from which a name chooses one.
+
+A controller is a class in a file of its own under ``controllers/`` plus one line in ``CONTROLLERS``. It sees
+x = [wrap(theta - pi), theta_dot] and answers with a torque; it knows no ROS and no clock.
+"""
+
+from __future__ import annotations
+
+import importlib
+import math
+from collections.abc import Mapping, Sequence
+from difflib import get_close_matches
+from typing import Any, ClassVar, Protocol, cast
+
+from pendulum_msgs_py.angles import wrap
+from pendulum_msgs_py.errors import ParameterError
+from pendulum_msgs_py.parameters import ParameterSpec, validate
+from pendulum_msgs_py.plant_parameters import PlantParameters
+
+from pendulum_lqr.velocity import VELOCITY_ESTIMATORS, VelocityEstimator, make_velocity_estimator
+
+__all__ = [
+    "COMMON_PARAMETERS",
+    "CONTROLLERS",
+    "BaseController",
+    "Controller",
+    "EstimatedVelocity",
+    "controller_class",
+    "controller_parameters",
+    "make_controller",
+]
+
+CONTROLLERS: dict[str, str] = {
+    "lqr": "pendulum_lqr.controllers.lqr:Lqr",
+    "lqi": "pendulum_lqr.controllers.lqi:Lqi",
+    "lqg": "pendulum_lqr.controllers.lqg:Lqg",
+    "discrete_lqr": "pendulum_lqr.controllers.discrete_lqr:DiscreteLqr",
+    "pid": "pendulum_lqr.controllers.pid:Pid",
+    "pd_gravity": "pendulum_lqr.controllers.pd_gravity:PdGravity",
+    "energy_swing_up": "pendulum_lqr.controllers.energy_swing_up:EnergySwingUp",
+    "sliding_mode": "pendulum_lqr.controllers.sliding_mode:SlidingMode",
+    "playback": "pendulum_lqr.controllers.playback:Playback",
+}
+"""Name -> ``module:class``; modules are imported when asked for, so that LQR does not pay for CasADi."""
+
+COMMON_PARAMETERS: tuple[ParameterSpec, ...] = (
+    ParameterSpec("set_point", 0.0, "rad", "Angle to hold, from upright.", minimum=-math.pi, maximum=math.pi),
+    ParameterSpec("effort_limit", 0.0, "N m", "Largest torque of the controller; 0 for the plant's own limit.", minimum=0.0),
+    ParameterSpec("velocity", "measured", "", "Where the velocity comes from.", choices=tuple(VELOCITY_ESTIMATORS)),
+)
+"""Parameters that every controller has."""
+
+
+class Controller(Protocol):
+    """What turns states into torques."""
+
+    effort_limit: float
+
+    def reset(self) -> None:
+        """Forget everything: integrals, filters, phases."""
+
+    def command(self, t: float, x: Sequence[float]) -> float:
+        """Return the torque [N m] that answers a state.
+
+        Args:
+            t: Time of the state since the controller was started [s]; it increases from call to call.
+            x: [wrap(theta - pi) [rad], theta_dot [rad/s]].
+        """
+
+    def describe(self) -> str:
+        """Return gains and figures in one line, for the log."""
+
+    def carry_over(self, previous: Controller) -> None:
+        """Take over integrals and filters from the controller that this one replaces, so that torque does not jump."""
+
+
+class BaseController:
+    """What most controllers share: a limit, a set-point, and nothing to remember."""
+
+    SUMMARY: ClassVar[str] = ""
+    """One sentence for tables."""
+    PARAMETERS: ClassVar[tuple[ParameterSpec, ...]] = ()
+    """Parameters of this controller beyond ``COMMON_PARAMETERS``."""
+
+    def __init__(self, effort_limit: float, set_point: float = 0.0) -> None:
+        self.effort_limit = effort_limit
+        self.set_point = set_point
+
+    @classmethod
+    def design(cls, plant: PlantParameters, period: float, p: Mapping[str, Any]) -> BaseController:
+        """Return the controller for a plant.
+
+        Args:
+            plant: Plant parameters.
+            period: Sampling period of the loop [s].
+            p: Checked values of ``COMMON_PARAMETERS`` and ``PARAMETERS``; ``effort_limit`` is already the one to keep.
+
+        Raises:
+            ParameterError: The values do not make a controller for this plant.
+        """
+        raise NotImplementedError(f"{cls.__name__}.design")
+
+    def reset(self) -> None:
+        """Forget everything."""
+
+    def command(self, t: float, x: Sequence[float]) -> float:
+        """Return the torque [N m] for the state x = [angle from upright [rad], velocity [rad/s]] at time t [s]."""
+        raise NotImplementedError(f"{type(self).__name__}.command")
+
+    def describe(self) -> str:
+        """Return gains and figures in one line."""
+        return type(self).__name__
+
+    def carry_over(self, previous: Controller) -> None:
+        """Take over what the previous controller remembers; nothing by default."""
+
+    def clamp(self, effort: float) -> float:
+        """Return the torque within the limit [N m]."""
+        limit = self.effort_limit
+        return limit if effort > limit else (-limit if effort < -limit else effort)
+
+    def error(self, angle: float) -> float:
+        """Return the deviation of an angle (from upright) from the set-point, the short way round [rad]."""
+        deviation = angle - self.set_point
+        return deviation if -math.pi <= deviation < math.pi else wrap(deviation)
+
+
+class EstimatedVelocity(BaseController):
+    """A controller that sees an estimated velocity in place of the measured one.
+
+    Args:
+        inner: The controller.
+        estimator: The velocity estimator; it is told the torque of the last answer.
+    """
+
+    def __init__(self, inner: Controller, estimator: VelocityEstimator) -> None:
+        super().__init__(inner.effort_limit)
+        self.inner = inner
+        self.estimator = estimator
+        self._last_effort = 0.0
+
+    def reset(self) -> None:
+        """Forget everything."""
+        self.inner.reset()
+        self.estimator.reset()
+        self._last_effort = 0.0
+
+    def command(self, t: float, x: Sequence[float]) -> float:
+        """Return the inner controller's torque for the estimated state [N m]."""
+        velocity = self.estimator.update(t, x[0], x[1], self._last_effort)
+        self._last_effort = self.inner.command(t, (x[0], velocity))
+        return self._last_effort
+
+    def describe(self) -> str:
+        """Return the inner controller's line and the estimator's name."""
+        return f"{self.inner.describe()}, velocity by {type(self.estimator).__name__}"
+
+    def carry_over(self, previous: Controller) -> None:
+        """Take over the filter too, where the previous controller had one of the same kind."""
+        if isinstance(previous, EstimatedVelocity):
+            if type(previous.estimator) is type(self.estimator):
+                self.estimator = previous.estimator
+            self._last_effort = previous._last_effort
+            self.inner.carry_over(previous.inner)
+        else:
+            self.inner.carry_over(previous)
+
+
+def controller_class(name: str) -> type[BaseController]:
+    """Return the class behind a name of ``CONTROLLERS``.
+
+    Raises:
+        ParameterError: No such controller; the message lists those there are.
+    """
+    if name not in CONTROLLERS:
+        near = get_close_matches(name, CONTROLLERS, n=1)
+        hint = f"; did you mean {near[0]!r}?" if near else f"; expected one of {', '.join(CONTROLLERS)}"
+        raise ParameterError(f"controller is {name!r}{hint}")
+    module, kind = CONTROLLERS[name].split(":")
+    return cast("type[BaseController]", getattr(importlib.import_module(module), kind))
+
+
+def controller_parameters(name: str) -> tuple[ParameterSpec, ...]:
+    """Return the specs of a controller, common ones first."""
+    return COMMON_PARAMETERS + controller_class(name).PARAMETERS
+
+
+def make_controller(
+    name: str, plant: PlantParameters, period: float, values: Mapping[str, object] | None = None
+) -> Controller:
+    """Design a controller.
+
+    Args:
+        name: Name in ``CONTROLLERS``.
+        plant: Parameters of the plant to design for.
+        period: Sampling period of the loop [s].
+        values: Parameters by name; others at their default.
+
+    Raises:
+        ParameterError: Unknown controller or parameter, a value out of domain, or a design that does not exist.
+    """
+    kind = controller_class(name)
+    p = validate(COMMON_PARAMETERS + kind.PARAMETERS, values or {})
+    if not (math.isfinite(period) and period > 0.0):
+        raise ParameterError(f"period is {period} s; expected a finite value > 0")
+    p["effort_limit"] = min(p["effort_limit"], plant.effort_limit) if p["effort_limit"] > 0.0 else plant.effort_limit
+    controller: Controller = kind.design(plant, period, p)
+    if p["velocity"] != "measured":
+        controller = EstimatedVelocity(controller, make_velocity_estimator(p["velocity"], plant, period))
+    return controller

@@ -1,0 +1,85 @@
+"""Swing-up by energy, caught by LQR with hysteresis."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from pendulum_msgs_py.parameters import ParameterSpec
+from pendulum_msgs_py.plant_parameters import PlantParameters
+
+from pendulum_lqr.catch import Catch, make_catch
+from pendulum_lqr.controller import BaseController
+
+__all__ = ["EnergySwingUp"]
+
+
+class EnergySwingUp(BaseController):
+    """Pumps energy until upright is within reach, then hands over to an LQR.
+
+    Pumping torque: u = clamp(k (E* + margin - E) theta_dot + b theta_dot + tau_C sgn(theta_dot)), with E = M theta_dot^2 / 2 +
+    G (1 + cos(theta - pi)) and E* = 2 G. Its first part is passive; the other two put back what friction takes.
+
+    Args:
+        plant: Plant parameters.
+        gain: k [s/rad].
+        margin: Energy beyond that of upright, as a share of E* [-].
+        catch: LQR with hysteresis.
+        effort_limit: Largest torque [N m].
+
+    Source: Astrom and Furuta, Swinging up a pendulum by energy control, Automatica 36(2), 2000, eq. 7.
+    """
+
+    SUMMARY = "swing-up by energy shaping, caught by LQR with hysteresis"
+    PARAMETERS = (
+        ParameterSpec("gain", 5.0, "s/rad", "Pumping torque per energy error and velocity.", minimum=0.0,
+                      exclusive_minimum=True),
+        ParameterSpec("energy_margin", 0.02, "-", "Energy aimed at beyond that of upright, relative.", minimum=-0.5,
+                      maximum=1.0),
+        ParameterSpec("catch_q", [10.0, 1.0], "1/rad^2, s^2/rad^2", "Weights of the LQR that catches.", minimum=0.0),
+        ParameterSpec("catch_r", 1.0, "1/(N m)^2", "Its weight of torque.", minimum=0.0, exclusive_minimum=True),
+        ParameterSpec("catch_share", 0.9, "-", "Share of the proven region of attraction in which it takes over.",
+                      minimum=0.0, maximum=1.0, exclusive_minimum=True),
+    )  # fmt: skip
+
+    def __init__(
+        self, plant: PlantParameters, gain: float, margin: float, catch: Catch, effort_limit: float
+    ) -> None:
+        super().__init__(effort_limit)
+        self.gain = gain
+        self.catch = catch
+        self._inertia = plant.inertia
+        self._gravity = plant.gravity
+        self._damping = plant.damping
+        self._coulomb = plant.coulomb_friction
+        self._target = 2.0 * plant.gravity * (1.0 + margin)
+
+    @classmethod
+    def design(cls, plant: PlantParameters, period: float, p: Mapping[str, Any]) -> EnergySwingUp:
+        """Return the swing-up controller with its catch designed under the torque limit."""
+        catch = make_catch(plant, p["catch_q"], p["catch_r"], p["effort_limit"], p["catch_share"])
+        return cls(plant, p["gain"], p["energy_margin"], catch, p["effort_limit"])
+
+    def reset(self) -> None:
+        """Start in the swing-up phase."""
+        self.catch.reset()
+
+    def command(self, t: float, x: Sequence[float]) -> float:
+        """Return the torque [N m]."""
+        if self.catch.holds(x[0], x[1]):
+            return self.catch.command(x[0], x[1])
+        return self.clamp(self.pump(x[0], x[1]))
+
+    def pump(self, angle: float, velocity: float) -> float:
+        """Return the torque that brings the energy to its target, before the limit [N m]."""
+        if abs(velocity) < 1e-3 and math.cos(angle) < -0.99:
+            # At rest at the bottom no velocity says where to push: start somewhere.
+            return self.effort_limit
+        energy = 0.5 * self._inertia * velocity * velocity + self._gravity * (1.0 + math.cos(angle))
+        friction = self._damping * velocity + math.copysign(self._coulomb, velocity)
+        return self.gain * (self._target - energy) * velocity + friction
+
+    def describe(self) -> str:
+        """Return gains of both phases."""
+        return f"k = {self.gain:g} s/rad, catch {self.catch.describe()}"

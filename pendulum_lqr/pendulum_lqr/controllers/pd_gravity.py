@@ -1,0 +1,58 @@
+"""PD with gravity compensation."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from pendulum_msgs_py.parameters import ParameterSpec
+from pendulum_msgs_py.plant_parameters import PlantParameters
+
+from pendulum_lqr.controller import BaseController
+
+__all__ = ["PdGravity"]
+
+
+class PdGravity(BaseController):
+    """u = G_c sin(theta) - k_p (theta - theta*) - k_d theta_dot: holds any angle, upright or not.
+
+    Args:
+        kp: Proportional gain [N m/rad].
+        kd: Derivative gain [N m s/rad].
+        gravity: G_c [N m].
+        effort_limit: Largest torque [N m].
+        set_point: Angle from upright [rad].
+    """
+
+    SUMMARY = "PD with gravity compensation: holds any angle"
+    PARAMETERS = (
+        ParameterSpec("bandwidth", 5.0, "rad/s", "Slowest pole asked for; sets the gains that are 0.", minimum=0.0,
+                      exclusive_minimum=True),
+        ParameterSpec("kp", 0.0, "N m/rad", "Proportional gain; 0 for that of the bandwidth.", minimum=0.0),
+        ParameterSpec("kd", 0.0, "N m s/rad", "Derivative gain; 0 for that of the bandwidth.", minimum=0.0),
+    )  # fmt: skip
+
+    def __init__(self, kp: float, kd: float, gravity: float, effort_limit: float, set_point: float = 0.0) -> None:
+        super().__init__(effort_limit, set_point)
+        self.kp = kp
+        self.kd = kd
+        self.gravity = gravity
+
+    @classmethod
+    def design(cls, plant: PlantParameters, period: float, p: Mapping[str, Any]) -> PdGravity:
+        """Place the slowest pole of M s^2 + (b + k_d) s + k_p at -bandwidth, critically damped if b allows."""
+        w = p["bandwidth"]
+        kd = p["kd"] if p["kd"] > 0.0 else max(0.0, 2.0 * plant.inertia * w - plant.damping)
+        # M w^2 - (b + k_d) w + k_p = 0; where damping is ample the other pole is faster.
+        kp = p["kp"] if p["kp"] > 0.0 else w * (plant.damping + kd) - plant.inertia * w * w
+        return cls(kp, kd, plant.gravity, p["effort_limit"], p["set_point"])
+
+    def command(self, t: float, x: Sequence[float]) -> float:
+        """Return the torque [N m]."""
+        # sin(theta) = -sin(theta - pi)
+        return self.clamp(-self.gravity * math.sin(x[0]) - self.kp * self.error(x[0]) - self.kd * x[1])
+
+    def describe(self) -> str:
+        """Return the gains."""
+        return f"kp = {self.kp:.6g} N m/rad, kd = {self.kd:.6g} N m s/rad"

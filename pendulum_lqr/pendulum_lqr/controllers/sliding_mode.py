@@ -1,0 +1,78 @@
+"""Sliding mode with a boundary layer."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from pendulum_msgs_py.parameters import ParameterSpec
+from pendulum_msgs_py.plant_parameters import PlantParameters
+
+from pendulum_lqr.controller import BaseController
+
+__all__ = ["SlidingMode"]
+
+
+class SlidingMode(BaseController):
+    """Drives s = theta_dot + lambda (theta - theta*) to zero: u = G sin(theta) - b lambda e - M lambda theta_dot - k sat(s/phi).
+
+    This leaves M s' = -b s - k sat(s / phi) - d: the plant's own damping is kept and not cancelled, because cancelling
+    b theta_dot through a sampled loop is unstable as soon as the period exceeds 2 M / b (9 ms for the thesis's plant).
+    Any disturbance below k is rejected; inside the layer the switching is smooth, so that it does not chatter.
+
+    Args:
+        plant: Plant parameters.
+        rate: lambda [1/s].
+        gain: k [N m].
+        layer: phi [rad/s].
+        effort_limit: Largest torque [N m].
+        set_point: Angle from upright [rad].
+
+    Source: Slotine and Li, Applied Nonlinear Control, 1991, section 7.2.
+    """
+
+    SUMMARY = "sliding mode with a boundary layer: rejects any torque below its gain"
+    PARAMETERS = (
+        ParameterSpec("rate", 5.0, "1/s", "Slope of the sliding line, lambda.", minimum=0.0, exclusive_minimum=True),
+        ParameterSpec("gain", 1.0, "N m", "Switching torque, k.", minimum=0.0),
+        ParameterSpec("layer", 0.5, "rad/s", "Half width of the boundary layer, phi.", minimum=0.0, exclusive_minimum=True),
+    )
+
+    def __init__(
+        self,
+        plant: PlantParameters,
+        rate: float,
+        gain: float,
+        layer: float,
+        effort_limit: float,
+        set_point: float = 0.0,
+    ) -> None:
+        super().__init__(effort_limit, set_point)
+        self.rate = rate
+        self.gain = gain
+        self.layer = layer
+        self._gravity = plant.gravity
+        self._proportional = plant.damping * rate
+        self._derivative = plant.inertia * rate
+
+    @classmethod
+    def design(cls, plant: PlantParameters, period: float, p: Mapping[str, Any]) -> SlidingMode:
+        """Return the controller; gains follow from the plant's inertia, damping and gravity."""
+        return cls(plant, p["rate"], p["gain"], p["layer"], p["effort_limit"], p["set_point"])
+
+    def command(self, t: float, x: Sequence[float]) -> float:
+        """Return the torque [N m]."""
+        error = self.error(x[0])
+        sliding = (x[1] + self.rate * error) / self.layer
+        switch = 1.0 if sliding > 1.0 else (-1.0 if sliding < -1.0 else sliding)
+        return self.clamp(
+            -self._gravity * math.sin(x[0])
+            - self._proportional * error
+            - self._derivative * x[1]
+            - self.gain * switch
+        )
+
+    def describe(self) -> str:
+        """Return slope, gain and layer."""
+        return f"lambda = {self.rate:g} 1/s, k = {self.gain:g} N m, phi = {self.layer:g} rad/s"

@@ -1,0 +1,258 @@
+"""Disturbance torques as pure functions of (parameters, seed, time since the start).
+
+Time is an integer of nanoseconds and a random signal is a function of (seed, sample index), so simulator, hardware and
+replay get the same torque at the same time, whatever loop asks and however often. A random signal changes every
+``hold_time``; how long a sample is held matters more to the response than the plant does, so it is always explicit.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from pendulum_msgs_py import noise
+from pendulum_msgs_py.errors import DataError, ParameterError
+from pendulum_msgs_py.parameters import ParameterSpec, validate
+from pendulum_msgs_py.values import NANOSECONDS
+
+__all__ = ["DISTURBANCES", "DISTURBANCE_SPECS", "Disturbance", "from_bag", "make_disturbance", "torques"]
+
+DISTURBANCE_SPECS: tuple[ParameterSpec, ...] = (
+    ParameterSpec("kind", "uniform", "", "Shape of the torque.",
+                  choices=("uniform", "gaussian", "sine", "chirp", "prbs", "step", "pulse_train", "from_bag")),
+    ParameterSpec("amplitude", 2.5, "N m", "Largest torque; the standard deviation for gaussian."),
+    ParameterSpec("hold_time", 0.01, "s", "How long one sample is held; 0 for a sine, chirp, step or pulse train means "
+                  "a smooth signal.", minimum=0.0, maximum=3600.0),
+    ParameterSpec("seed", 1, "-", "Seed of the random kinds; shifts the sequence of prbs.", minimum=0, maximum=2**63 - 1),
+    ParameterSpec("bandwidth", 10.0, "Hz", "Cut-off (-3 dB) of gaussian; 0 for white from sample to sample.", minimum=0.0),
+    ParameterSpec("frequency", 1.0, "Hz", "Frequency of sine, start of chirp, repetition of pulse_train.", minimum=0.0,
+                  exclusive_minimum=True),
+    ParameterSpec("frequency_end", 10.0, "Hz", "Frequency at the end of a chirp.", minimum=0.0, exclusive_minimum=True),
+    ParameterSpec("sweep_time", 10.0, "s", "Length of one chirp; it then starts again.", minimum=0.0,
+                  exclusive_minimum=True),
+    ParameterSpec("order", 9, "-", "Length of prbs: repeats after 2^order - 1 samples.", minimum=2, maximum=16),
+    ParameterSpec("start_time", 0.0, "s", "Time at which step and pulse_train begin.", minimum=0.0),
+    ParameterSpec("pulse_width", 0.1, "s", "Length of each pulse of pulse_train.", minimum=0.0, exclusive_minimum=True),
+)
+"""Parameters of every kind; each kind reads those that it needs."""
+
+_RANDOM_KINDS = frozenset({"uniform", "gaussian", "prbs"})
+
+# Taps (1-based) of maximum-length shift registers; P. Alfke, Xilinx XAPP 052, 1996, table 3.
+_TAPS: dict[int, tuple[int, ...]] = {
+    2: (2, 1), 3: (3, 2), 4: (4, 3), 5: (5, 3), 6: (6, 5), 7: (7, 6), 8: (8, 6, 5, 4), 9: (9, 5), 10: (10, 7),
+    11: (11, 9), 12: (12, 6, 4, 1), 13: (13, 4, 3, 1), 14: (14, 5, 3, 1), 15: (15, 14), 16: (16, 15, 13, 4),
+}  # fmt: skip
+
+
+class Disturbance(Protocol):
+    """A torque over time."""
+
+    def __call__(self, elapsed_ns: int) -> float:
+        """Return the torque at a time since the start [ns]; 0 before the start [N m]."""
+
+
+def make_disturbance(values: Mapping[str, object], recorded: Disturbance | None = None) -> Disturbance:
+    """Return the disturbance that a set of parameters describes.
+
+    Args:
+        values: Parameters of ``DISTURBANCE_SPECS``; others at their default.
+        recorded: The signal of kind ``from_bag``, made by :func:`from_bag` from what a recording holds.
+
+    Raises:
+        ParameterError: A value is refused, or ``from_bag`` lacks its recording.
+    """
+    parameters = validate(DISTURBANCE_SPECS, values)
+    kind = parameters["kind"]
+    if kind in _RANDOM_KINDS and not parameters["hold_time"] > 0.0:
+        raise ParameterError(f"hold_time is 0 s; expected > 0 for the random kind {kind}")
+    if kind == "from_bag":
+        if recorded is None:
+            raise ParameterError("kind is 'from_bag' without a recording; expected a recorded disturbance")
+        return recorded
+    hold_ns = round(parameters["hold_time"] * NANOSECONDS)
+    if parameters["hold_time"] > 0.0 and hold_ns < 1:
+        raise ParameterError(f"hold_time is {parameters['hold_time']} s; expected 0 or at least 1e-9 s")
+    return DISTURBANCES[kind](parameters, hold_ns)
+
+
+def torques(disturbance: Disturbance, elapsed_ns: ArrayLike) -> NDArray[np.float64]:
+    """Return the torques at many times, shape as given [N m].
+
+    Args:
+        disturbance: The signal.
+        elapsed_ns: Times since the start, integers [ns].
+    """
+    times = np.asarray(elapsed_ns, dtype=np.int64)
+    flat = [disturbance(int(time)) for time in times.ravel()]
+    return np.array(flat, dtype=np.float64).reshape(times.shape)
+
+
+def from_bag(elapsed_ns: ArrayLike, values: ArrayLike) -> Disturbance:
+    """Return the replay of a recorded torque: each value from its time on until the next; 0 before and after.
+
+    The last value is held as long as the one before it.
+
+    Args:
+        elapsed_ns: Times since the start of the disturbance, increasing integers, shape (n,) [ns].
+        values: Torques, shape (n,) [N m].
+
+    Raises:
+        DataError: Shapes differ, a value is not finite, or times do not increase.
+    """
+    times = np.asarray(elapsed_ns, dtype=np.int64)
+    recorded = np.asarray(values, dtype=np.float64)
+    if times.ndim != 1 or times.shape != recorded.shape or times.size == 0:
+        raise DataError(f"recorded disturbance has times {times.shape} and torques {recorded.shape}; expected equal (n,)")
+    if not np.all(np.isfinite(recorded)):
+        raise DataError("recorded disturbance holds a torque that is not finite")
+    if np.any(np.diff(times) <= 0):
+        index = int(np.argmax(np.diff(times) <= 0))
+        raise DataError(f"recorded disturbance: time {times[index + 1]} ns follows {times[index]} ns; expected increasing")
+    end = int(times[-1] + (times[-1] - times[-2] if times.size > 1 else NANOSECONDS // 100))
+    first = int(times[0])
+
+    def torque(time_ns: int) -> float:
+        if time_ns < first or time_ns >= end:
+            return 0.0
+        return float(recorded[int(np.searchsorted(times, time_ns, side="right")) - 1])
+
+    return torque
+
+
+def _uniform(p: Mapping[str, Any], hold_ns: int) -> Disturbance:
+    """Independent samples, uniform in [-amplitude, amplitude]."""
+    amplitude, seed = p["amplitude"], p["seed"]
+
+    def torque(time_ns: int) -> float:
+        return 0.0 if time_ns < 0 else float(noise.uniform(seed, time_ns // hold_ns, amplitude))
+
+    return torque
+
+
+def _gaussian(p: Mapping[str, Any], hold_ns: int) -> Disturbance:
+    """White normal samples through a Gaussian window of finite length, so that sample i needs no history.
+
+    The window exp(-t^2 / 2 sigma^2) has its -3 dB point at f = sqrt(ln 2) / (2 pi sigma); weights have unit energy.
+    """
+    amplitude, seed, bandwidth = p["amplitude"], p["seed"], p["bandwidth"]
+    weights = [1.0]
+    if bandwidth > 0.0:
+        sigma = math.sqrt(math.log(2.0)) / (2.0 * math.pi * bandwidth) * NANOSECONDS / hold_ns
+        reach = math.ceil(4.0 * sigma)
+        if reach > 5000:
+            raise ParameterError(
+                f"bandwidth is {bandwidth} Hz with hold_time {hold_ns / NANOSECONDS} s; expected a longer hold_time, "
+                "of at least 1/20000 of the correlation time"
+            )
+        shape = [math.exp(-0.5 * (k / sigma) ** 2) if sigma > 0.0 else float(k == 0) for k in range(-reach, reach + 1)]
+        energy = math.sqrt(sum(value * value for value in shape))
+        weights = [value / energy for value in shape]
+
+    def torque(time_ns: int) -> float:
+        if time_ns < 0:
+            return 0.0
+        index = time_ns // hold_ns
+        return amplitude * sum(
+            weight * _normal(seed, index + offset) for offset, weight in enumerate(weights)
+        )
+
+    return torque
+
+
+def _normal(seed: int, index: int) -> float:
+    """Return a standard normal number, a pure function of (seed, index), by Box and Muller from two uniform ones."""
+    first = 0.5 * (1.0 + float(noise.uniform(seed, 2 * index, 1.0)))
+    second = float(noise.uniform(seed, 2 * index + 1, math.pi))
+    return math.sqrt(-2.0 * math.log(max(first, 1e-300))) * math.cos(second)
+
+
+def _prbs(p: Mapping[str, Any], hold_ns: int) -> Disturbance:
+    """Maximum-length binary sequence of a shift register."""
+    amplitude, order = p["amplitude"], p["order"]
+    length = 2**order - 1
+    state = length
+    bits = []
+    for _ in range(length):
+        bits.append(amplitude if state & 1 else -amplitude)
+        feedback = 0
+        for tap in _TAPS[order]:
+            feedback ^= state >> (order - tap)
+        state = (state >> 1) | ((feedback & 1) << (order - 1))
+    shift = p["seed"] % length
+
+    def torque(time_ns: int) -> float:
+        return 0.0 if time_ns < 0 else bits[(time_ns // hold_ns + shift) % length]
+
+    return torque
+
+
+def _held(signal: Callable[[float], float], hold_ns: int) -> Disturbance:
+    def torque(time_ns: int) -> float:
+        if time_ns < 0:
+            return 0.0
+        return signal((time_ns - time_ns % hold_ns if hold_ns else time_ns) / NANOSECONDS)
+
+    return torque
+
+
+def _sine(p: Mapping[str, Any], hold_ns: int) -> Disturbance:
+    """Sine that starts at zero."""
+    amplitude, omega = p["amplitude"], 2.0 * math.pi * p["frequency"]
+    return _held(lambda t: amplitude * math.sin(omega * t), hold_ns)
+
+
+def _chirp(p: Mapping[str, Any], hold_ns: int) -> Disturbance:
+    """Exponential sweep: equal time in every octave; Farina, AES 108th Convention, 2000, eq. 4."""
+    amplitude, low, high, length = p["amplitude"], p["frequency"], p["frequency_end"], p["sweep_time"]
+    rate = math.log(high / low) / length
+    scale = 2.0 * math.pi * low
+
+    def signal(t: float) -> float:
+        t = t % length
+        phase = scale * t if rate == 0.0 else scale * math.expm1(rate * t) / rate
+        return float(amplitude * math.sin(phase))
+
+    return _held(signal, hold_ns)
+
+
+def _step(p: Mapping[str, Any], hold_ns: int) -> Disturbance:
+    """Constant torque from start_time on."""
+    amplitude, start = p["amplitude"], p["start_time"]
+    return _held(lambda t: amplitude if t >= start else 0.0, hold_ns)
+
+
+def _pulse_train(p: Mapping[str, Any], hold_ns: int) -> Disturbance:
+    """Pulses of pulse_width, once per 1/frequency, alternating in sign so that they push to both sides."""
+    amplitude, start, width, period = p["amplitude"], p["start_time"], p["pulse_width"], 1.0 / p["frequency"]
+    if width > period:
+        raise ParameterError(f"pulse_width is {width} s; expected at most 1/frequency = {period:g} s")
+
+    def signal(t: float) -> float:
+        if t < start:
+            return 0.0
+        # A time that is a whole number of periods must not land in the pulse before by rounding.
+        count = math.floor((t - start) / period + 1e-9)
+        if t - start - count * period >= width - 1e-12:
+            return 0.0
+        return float(amplitude if count % 2 == 0 else -amplitude)
+
+    return _held(signal, hold_ns)
+
+
+Maker = Callable[[Mapping[str, Any], int], Disturbance]
+
+DISTURBANCES: dict[str, Maker] = {
+    "uniform": _uniform,
+    "gaussian": _gaussian,
+    "sine": _sine,
+    "chirp": _chirp,
+    "prbs": _prbs,
+    "step": _step,
+    "pulse_train": _pulse_train,
+}
+"""Kinds that follow from parameters alone; ``from_bag`` needs a recording and is made by :func:`from_bag`."""
+
