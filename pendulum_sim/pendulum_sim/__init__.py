@@ -1,3 +1,3 @@
-"""The plant as mathematics: models, integrators, sensors, the batch engine, and the simulator node over them."""
+"""The plant as mathematics: models, integrators, sensors, batch engine; and the simulator node over them."""
 
 __version__ = "0.1.0"

@@ -1,0 +1,196 @@
+"""The link on a series-elastic actuator: motor, gear train, dry friction, spring with hysteresis.
+
+The torque command drives the motor in feed-forward, u = tau R / (N V K_t eta), as the actuator does with
+its effort loop off: what slows the link then is the back EMF of the winding, K_t K_e N^2 / R = 11.8 N m
+s/rad, which the rigid model of the thesis has as its damping. Equations and sources:
+``pendulum_msgs_py.dynamics.series_elastic``.
+"""
+
+from __future__ import annotations
+
+import math
+
+from pendulum_msgs_py.dynamics import friction_magnitude, gravity_torque
+from pendulum_msgs_py.dynamics.series_elastic import (
+    dahl_step,
+    dry_friction_step,
+    link_acceleration,
+    motor_acceleration,
+    spring_deflection,
+    spring_torque,
+    winding_current,
+    winding_resistance_at,
+)
+from pendulum_msgs_py.errors import ParameterError
+from pendulum_msgs_py.plant_parameters import PlantParameters
+from pendulum_sim.dry_friction import actuator_torque
+from pendulum_sim.plant import DelayLine, PlantState, check_start, check_step, period_segments
+
+__all__ = [
+    "MAX_SUBSTEP",
+    "SeriesElasticPlant",
+    "SeriesElasticTuple",
+    "pack_series_elastic",
+    "series_elastic_step",
+]
+
+MAX_SUBSTEP = 2.5e-4
+"""Longest step at which the semi-implicit scheme is trusted with springs up to 1000 N m/rad [s]."""
+
+SeriesElasticTuple = tuple[float, ...]
+
+
+def pack_series_elastic(parameters: PlantParameters) -> SeriesElasticTuple:
+    """Return link and drivetrain in the order that :func:`series_elastic_step` takes them."""
+    drive = parameters.drivetrain
+    if drive is None:
+        raise ParameterError(f"plant {parameters.name!r} has no drivetrain; expected a series-elastic plant")
+    resistance = winding_resistance_at(
+        drive.winding_temperature, drive.winding_resistance, drive.resistance_temperature_coefficient
+    )
+    return (
+        parameters.inertia, parameters.damping, parameters.gravity,
+        parameters.coulomb_friction, parameters.static_friction, parameters.stribeck_velocity,
+        parameters.load_friction, parameters.angle_offset,
+        drive.gear_ratio, drive.torque_constant, drive.back_emf_constant, resistance, drive.supply_voltage,
+        drive.reflected_inertia, drive.motor_damping,
+        drive.motor_coulomb_friction, drive.motor_static_friction, drive.motor_stribeck_velocity,
+        drive.stiffness, drive.stiffness_hardening, drive.hysteresis_torque, drive.hysteresis_deflection,
+    )  # fmt: skip
+
+
+def series_elastic_step(
+    q_m: float,
+    v_m: float,
+    q: float,
+    v: float,
+    z: float,
+    pwm: float,
+    disturbance: float,
+    h: float,
+    plant: SeriesElasticTuple,
+) -> tuple[float, float, float, float, float]:
+    """Return motor angle and velocity, link angle and velocity, hysteresis state after a step.
+
+    Args:
+        q_m: Motor angle at the output side [rad].
+        v_m: Its velocity [rad/s].
+        q: Link angle [rad].
+        v: Its velocity [rad/s].
+        z: Dahl state [-].
+        pwm: Duty in [-1, 1] [-].
+        disturbance: Torque on the link itself, offset included [N m].
+        h: Step [s].
+        plant: Parameters, packed.
+    """
+    (
+        inertia, damping, gravity, coulomb, static, stribeck_velocity, load, angle_offset,
+        gear_ratio, torque_constant, back_emf, resistance, supply,
+        motor_inertia, motor_damping, motor_coulomb, motor_static, motor_stribeck_velocity,
+        stiffness, hardening, hysteresis, hysteresis_deflection,
+    ) = plant  # fmt: skip
+    deflection = q_m - q
+    spring = spring_torque(deflection, z, stiffness, hardening, hysteresis)
+    current = winding_current(pwm, v_m, supply, back_emf, gear_ratio, resistance)
+    v_m_free = v_m + h * motor_acceleration(
+        current, v_m, spring, torque_constant, gear_ratio, motor_damping, motor_inertia
+    )
+    v_m = dry_friction_step(
+        v_m_free,
+        friction_magnitude(v_m, motor_coulomb, motor_static, motor_stribeck_velocity),
+        motor_inertia,
+        h,
+    )
+    v_free = v + h * link_acceleration(q - angle_offset, v, spring, disturbance, inertia, damping, gravity)
+    carried = load * abs(gravity_torque(q - angle_offset, gravity))
+    v = dry_friction_step(
+        v_free, friction_magnitude(v, coulomb + carried, static + carried, stribeck_velocity), inertia, h
+    )
+    q_m += h * v_m
+    q += h * v
+    z = dahl_step(z, (q_m - q) - deflection, hysteresis_deflection)
+    return q_m, v_m, q, v, z
+
+
+class SeriesElasticPlant:
+    """A link behind motor, gears and spring.
+
+    Args:
+        parameters: The plant, with its drivetrain.
+        dt: Period over which a command is held [s], > 0.
+        substeps: Integration steps in a period; None for as many as keep them at 0.25 ms or less.
+
+    Raises:
+        ParameterError: There is no drivetrain, or an argument is outside its domain.
+    """
+
+    method = "semi_implicit"
+
+    def __init__(self, parameters: PlantParameters, dt: float, *, substeps: int | None = None) -> None:
+        if substeps is None and math.isfinite(dt):
+            substeps = max(1, math.ceil(dt / MAX_SUBSTEP - 1e-9))
+        check_step(dt, substeps or 1)
+        self._packed = pack_series_elastic(parameters)
+        drive = parameters.drivetrain
+        assert drive is not None
+        self.parameters = parameters
+        self.dt = dt
+        self._delay = DelayLine(parameters.transport_delay, dt)
+        self._segments = period_segments(dt, self._delay.fraction, substeps or 1)
+        nominal = winding_resistance_at(
+            20.0, drive.winding_resistance, drive.resistance_temperature_coefficient
+        )
+        self._pwm_per_effort = nominal / (
+            drive.gear_ratio * drive.supply_voltage * drive.torque_constant * drive.efficiency
+        )
+        self._spring = (drive.stiffness, drive.stiffness_hardening)
+        self._steps = 0
+        self._torque = 0.0
+        self.q_m = self.v_m = self.theta = self.theta_dot = self.z = self.effort = 0.0
+
+    @property
+    def state(self) -> PlantState:
+        """The present state; the effort is what the deflection of the spring says."""
+        return PlantState(self._steps * self.dt, self.theta, self.theta_dot, self.effort)
+
+    def reset(self, theta: float = 0.0, theta_dot: float = 0.0) -> PlantState:
+        """Start anew with the spring carrying gravity, the hysteresis loop open and the motor unpowered.
+
+        Args:
+            theta: Link angle [rad].
+            theta_dot: Velocity of link and motor [rad/s].
+
+        Raises:
+            ParameterError: One of them is not finite.
+        """
+        check_start(theta, theta_dot)
+        weight = gravity_torque(theta - self.parameters.angle_offset, self.parameters.gravity)
+        self.theta, self.theta_dot, self.v_m = float(theta), float(theta_dot), float(theta_dot)
+        self.q_m = self.theta + spring_deflection(weight, *self._spring)
+        self.z = self._torque = 0.0
+        self.effort = spring_torque(self.q_m - self.theta, 0.0, *self._spring, 0.0)
+        self._steps = 0
+        self._delay.clear()
+        return self.state
+
+    def step(self, effort: float, push: float = 0.0) -> PlantState:
+        """Advance by one period.
+
+        Args:
+            effort: Commanded torque, held over the period; clamped to the effort limit [N m].
+            push: Torque on the link itself [N m].
+        """
+        parameters = self.parameters
+        limit = parameters.effort_limit
+        older, newer = self._delay.push(min(limit, max(-limit, effort)))
+        disturbance = push + parameters.torque_offset
+        x = (self.q_m, self.v_m, self.theta, self.theta_dot, self.z)
+        for is_newer, h in self._segments:
+            command = newer if is_newer else older
+            self._torque = actuator_torque(self._torque, command, h, parameters.actuator_time_constant)
+            pwm = min(1.0, max(-1.0, self._torque * self._pwm_per_effort))
+            x = series_elastic_step(*x, pwm, disturbance, h, self._packed)
+        self.q_m, self.v_m, self.theta, self.theta_dot, self.z = x
+        self.effort = spring_torque(self.q_m - self.theta, 0.0, *self._spring, 0.0)
+        self._steps += 1
+        return self.state
