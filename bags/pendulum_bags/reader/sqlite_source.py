@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import mmap
 import shutil
 import sqlite3
 import tempfile
@@ -12,7 +13,8 @@ import numpy as np
 
 from pendulum_msgs_py.errors import BagError
 
-from pendulum_bags.reader.batches import Batch, Stream
+from pendulum_bags.reader.batches import Batch, Bytes, Stream
+from pendulum_bags.reader.sqlite_pages import MessageRows, leaf_pages, message_rows, page_size
 
 __all__ = ["SqliteSource"]
 
@@ -40,6 +42,8 @@ class SqliteSource:
         self.damage = ""
         self._copy: tempfile.TemporaryDirectory[str] | None = None
         self._connection: sqlite3.Connection | None = None
+        self._rows: list[MessageRows] | None = None
+        self._buffer: Bytes = np.empty(0, np.uint8)
         self.start_ns = 0
         self.stop_ns = 0
         if not path.is_file():
@@ -51,6 +55,7 @@ class SqliteSource:
                 self._open_copy(left_over)
             else:
                 self._connection = sqlite3.connect(f"{path.absolute().as_uri()}?mode=ro&immutable=1", uri=True)
+                self._rows = self._read_pages()
             self.streams = self._read_streams()
         except sqlite3.Error as error:
             self.close()
@@ -58,6 +63,8 @@ class SqliteSource:
 
     def close(self) -> None:
         """Close the database and remove the temporary copy, if there is one."""
+        self._rows = None
+        self._buffer = np.empty(0, np.uint8)
         if self._connection is not None:
             self._connection.close()
             self._connection = None
@@ -84,6 +91,40 @@ class SqliteSource:
             shutil.copyfile(file, target.with_name(file.name))
         self._connection = sqlite3.connect(target)
 
+    def _read_pages(self) -> list[MessageRows] | None:
+        """Read the table of messages from its pages; ``None`` when only SQL can read this file."""
+        run = self.connection.execute
+        columns = [(name, key) for _, name, _, _, _, key in run("PRAGMA table_info(messages)")]
+        if columns != [("id", 1), ("topic_id", 0), ("timestamp", 0), ("data", 0)]:
+            return None
+        with self.path.open("rb") as file:
+            self._buffer = np.frombuffer(mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ), np.uint8)
+        size = page_size(self._buffer)
+        ((root,),) = run("SELECT rootpage FROM sqlite_master WHERE type = 'table' AND name = 'messages'")
+        leaves = leaf_pages(self._buffer, size, root) if size else None
+        if leaves is None:
+            return None
+        return list(message_rows(self._buffer, size, leaves))
+
+    def _counts(self) -> dict[int, int]:
+        """Return the number of messages by topic id, and note the time span of the file."""
+        counts: dict[int, int] = {}
+        if self._rows is not None:
+            filled = [block for block in self._rows if len(block.times)]
+            self.start_ns = min((int(block.times.min()) for block in filled), default=0)
+            self.stop_ns = max((int(block.times.max()) for block in filled), default=0)
+            for block in filled:
+                for topic, count in zip(*np.unique(block.topics, return_counts=True), strict=True):
+                    counts[int(topic)] = counts.get(int(topic), 0) + int(count)
+            return counts
+        for topic, count, first, last in self.connection.execute(
+            "SELECT topic_id, count(*), min(timestamp), max(timestamp) FROM messages GROUP BY topic_id"
+        ):
+            self.start_ns = first if not counts else min(self.start_ns, first)
+            self.stop_ns = max(self.stop_ns, last)
+            counts[topic] = count
+        return counts
+
     def _read_streams(self) -> list[Stream]:
         run = self.connection.execute
         tables = {name for (name,) in run("SELECT name FROM sqlite_master WHERE type = 'table'")}
@@ -98,13 +139,7 @@ class SqliteSource:
                     "SELECT topic_type, encoding, encoded_message_definition FROM message_definitions"
                 )
             }
-        counts: dict[int, int] = {}
-        for topic, count, first, last in run(
-            "SELECT topic_id, count(*), min(timestamp), max(timestamp) FROM messages GROUP BY topic_id"
-        ):
-            self.start_ns = first if not counts else min(self.start_ns, first)
-            self.stop_ns = max(self.stop_ns, last)
-            counts[topic] = count
+        counts = self._counts()
         wanted = ("id", "name", "type", "serialization_format", "offered_qos_profiles", "type_description_hash")
         present = [column for column in wanted if column in columns]
         streams = []
@@ -136,6 +171,25 @@ class SqliteSource:
 
     def batches(self, channels: set[int], start: int | None, stop: int | None) -> Iterator[Batch]:
         """Yield all messages of some topics with start <= log time < stop, in the order of the file."""
+        if self._rows is not None:
+            for block in self._rows:
+                inside = np.ones(len(block.times), bool)
+                if start is not None:
+                    inside &= block.times >= start
+                if stop is not None:
+                    inside &= block.times < stop
+                for channel in channels:
+                    wanted = (block.topics == channel) & inside
+                    mine = np.flatnonzero(wanted & block.local)
+                    if len(mine):
+                        yield Batch(
+                            channel, self._buffer, block.offsets[mine], block.times[mine], block.sizes[mine]
+                        )
+                    # Large messages go on elsewhere in the file: SQLite puts them together.
+                    for row_id in block.row_ids[wanted & ~block.local].tolist():
+                        query = "SELECT topic_id, timestamp, data FROM messages WHERE id = ?"
+                        yield from _batches(self.connection.execute(query, (row_id,)).fetchall())
+            return
         conditions, values = [], []
         if channels != {stream.channel for stream in self.streams}:
             conditions.append(f"topic_id IN ({', '.join('?' * len(channels))})")
