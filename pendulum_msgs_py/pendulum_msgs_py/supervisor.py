@@ -14,129 +14,38 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from enum import Enum
 
 from pendulum_msgs_py.commands import CommandGate, Refusal
-from pendulum_msgs_py.errors import ParameterError
-from pendulum_msgs_py.trajectory import Trajectory
+from pendulum_msgs_py.drive import Drive, DriveKind, Input, Mode, PlantLimits
+from pendulum_msgs_py.trajectory import MAX_RAMP_VELOCITY, Trajectory
 from pendulum_msgs_py.values import NANOSECONDS, JointCommand, JointSample
 
-__all__ = ["Drive", "DriveKind", "Input", "Mode", "PlantLimits", "PlantSupervisor"]
+__all__ = ["PUSH_LIMIT_FACTOR", "Drive", "DriveKind", "Input", "Mode", "PlantLimits", "PlantSupervisor"]
 
+PUSH_LIMIT_FACTOR = 10.0
+"""A push on the link is clamped to this multiple of the effort limit: 1e308 N m is finite, but no hand."""
 
-class Mode(str, Enum):
-    """State of a plant; the value is shown in diagnostics."""
-
-    DISARMED = "disarmed"
-    POSITION = "armed_position"
-    EFFORT = "armed_effort"
-    FAULT = "fault"
-    E_STOP = "e_stop"
-
-    @property
-    def armed(self) -> bool:
-        """Whether torque may flow."""
-        return self in {Mode.POSITION, Mode.EFFORT}
-
-
-class Input(str, Enum):
-    """The inputs that carry torque."""
-
-    EFFORT_COMMAND = "effort_command"
-    DISTURBANCE = "disturbance"
-    PUSH = "push"
-
-
-class DriveKind(str, Enum):
-    """What the plant has to do until the next decision."""
-
-    OFF = "off"
-    EFFORT = "effort"
-    POSITION = "position"
-
-
-@dataclass(frozen=True, slots=True)
-class Drive:
-    """One decision.
-
-    Attributes:
-        kind: Off (zero torque, drive released), torque, or position control.
-        effort: Torque to apply; under position control the feed-forward of the hand-over [N m].
-        position: Position to hold or follow [rad], for ``POSITION``.
-        velocity: Its velocity [rad/s].
-        controller: The controller's share of the effort, before limits [N m].
-        disturbance: The disturbance's share [N m].
-        push: Torque on the link itself [N m]; applied whatever the kind, as a hand would.
-        saturated: The sum was clamped.
-        starved: Armed for effort, but without a fresh command: zero torque.
-    """
-
-    kind: DriveKind
-    effort: float = 0.0
-    position: float = 0.0
-    velocity: float = 0.0
-    controller: float = 0.0
-    disturbance: float = 0.0
-    push: float = 0.0
-    saturated: bool = False
-    starved: bool = False
-
-
-@dataclass(frozen=True)
-class PlantLimits:
-    """Limits that a plant keeps.
-
-    Attributes:
-        effort: Largest torque, after the sum of controller and disturbance [N m].
-        command_timeout: Age at which a command counts for nothing [s].
-        feedback_timeout: Age of the measurement at which an armed plant faults [s].
-        velocity: Speed at which an armed plant faults, and largest of a trajectory [rad/s].
-        position_min: Lower end of the position window [rad].
-        position_max: Upper end [rad].
-        slew: Largest rate of change of the torque [N m/s].
-        handover_time: Time over which torque passes from position to effort control and back [s].
-        tracking_error: Distance from the trajectory at which the plant faults [rad].
-        arm_effort: Largest command that may be waiting when the plant is armed [N m].
-    """
-
-    effort: float
-    command_timeout: float = 0.05
-    feedback_timeout: float = math.inf
-    velocity: float = math.inf
-    position_min: float = -math.inf
-    position_max: float = math.inf
-    slew: float = math.inf
-    handover_time: float = 0.1
-    tracking_error: float = 0.3
-    arm_effort: float = 0.5
-
-    def __post_init__(self) -> None:
-        """Refuse limits that limit nothing or everything."""
-        if not (math.isfinite(self.effort) and self.effort > 0.0):
-            raise ParameterError(f"effort_limit is {self.effort} N m; expected a finite number > 0")
-        if not (math.isfinite(self.command_timeout) and self.command_timeout > 0.0):
-            raise ParameterError(f"command_timeout is {self.command_timeout} s; expected a finite number > 0")
-        for name, unit in (("feedback_timeout", "s"), ("velocity", "rad/s"), ("slew", "N m/s")):
-            if not getattr(self, name) > 0.0:
-                raise ParameterError(f"{name} is {getattr(self, name)} {unit}; expected > 0")
-        if not self.position_min < self.position_max:
-            raise ParameterError(
-                f"position window is [{self.position_min}, {self.position_max}] rad; expected min < max"
-            )
+_KEPT_TRANSITIONS = 50
+_LONGEST_STEP_NS = NANOSECONDS // 10
+"""Largest step in time by which one decision moves a trajectory or a fade on [ns]."""
 
 
 @dataclass
 class _Handover:
-    """Fade from the torque before a change of control to the torque after it."""
+    """Fade from the torque before a change of control to the one after it, and of the setpoint likewise."""
 
     start_ns: int
     effort: float
     offset: float = 0.0
+    offset_time: float = 0.0
 
     def remaining(self, now_ns: int, duration: float) -> float:
         if duration <= 0.0:
             return 0.0
         return min(1.0, max(0.0, 1.0 - (now_ns - self.start_ns) / (duration * NANOSECONDS)))
+
+    def remaining_offset(self, now_ns: int) -> float:
+        return self.offset * self.remaining(now_ns, self.offset_time)
 
 
 @dataclass
@@ -167,6 +76,7 @@ class PlantSupervisor:
         self._applied = 0.0
         self._last_effort = 0.0
         self._last_decision_ns: int | None = None
+        self._last_time_ns: int | None = None
         self._hold_position: float | None = None
 
     # --- messages ------------------------------------------------------------------------------------------
@@ -189,15 +99,20 @@ class PlantSupervisor:
         limits = self.limits
         if not self.mode.armed:
             return f"plant is {self.mode.value}; expected it armed before a trajectory"
-        if not sample.is_finite():
-            return "measured position is not finite"
+        fault = self._measurement_fault(now_ns, sample)
+        if fault:
+            return fault
         gap = trajectory.start - sample.position
         if abs(gap) > limits.tracking_error:
             return (
                 f"trajectory starts at {trajectory.start:.4f} rad, the pendulum is at {sample.position:.4f} rad; "
                 f"expected at most {limits.tracking_error} rad between them"
             )
+        # The gap is closed while the trajectory already runs, no faster than a ramp would.
+        offset_time = max(limits.handover_time, abs(gap) / MAX_RAMP_VELOCITY)
         speed = trajectory.max_speed()
+        if offset_time > 0.0:
+            speed += abs(gap) / offset_time
         if speed > limits.velocity:
             return f"trajectory asks for {speed:.3f} rad/s; expected at most {limits.velocity} rad/s"
         positions = [point.position for point in trajectory.points]
@@ -206,9 +121,10 @@ class PlantSupervisor:
                 f"trajectory covers {min(positions):.3f} to {max(positions):.3f} rad; expected it inside "
                 f"{limits.position_min} to {limits.position_max} rad"
             )
+        self._keep_pace(now_ns)
         self._trajectory = trajectory
         self._trajectory_start_ns = now_ns
-        self._handover = _Handover(now_ns, self._applied, offset=-gap)
+        self._handover = _Handover(now_ns, self._applied, offset=-gap, offset_time=offset_time)
         self._enter(Mode.POSITION, "following a trajectory", now_ns)
         return ""
 
@@ -226,6 +142,7 @@ class PlantSupervisor:
         self._handover = None
         self._trajectory = None
         self._applied = self._last_effort = 0.0
+        self._last_decision_ns = now_ns
         self._enter(Mode.EFFORT, "armed", now_ns)
         return ""
 
@@ -259,14 +176,17 @@ class PlantSupervisor:
             now_ns: The plant's clock [ns].
             sample: Newest measurement, or None before the first.
         """
+        self._keep_pace(now_ns)
         push_command = self.gates[Input.PUSH].fresh(now_ns)
-        push = push_command.effort if push_command else 0.0
+        push_limit = PUSH_LIMIT_FACTOR * self.limits.effort
+        push = min(push_limit, max(-push_limit, push_command.effort)) if push_command else 0.0
         if self.mode.armed:
             fault = self._measurement_fault(now_ns, sample)
             if fault:
                 self.fault(fault, now_ns)
         if not self.mode.armed or sample is None:
             self._last_effort = 0.0
+            self._last_decision_ns = now_ns
             return Drive(DriveKind.OFF, push=push)
         if self.mode is Mode.POSITION:
             drive = self._decide_position(now_ns, sample, push)
@@ -276,7 +196,7 @@ class PlantSupervisor:
 
     def report_applied(self, effort: float) -> None:
         """Tell what torque the plant really applied, so that the next hand-over starts from there [N m]."""
-        self._applied = effort
+        self._applied = self._clamp(effort)
 
     @property
     def trajectory_finished(self) -> bool:
@@ -289,6 +209,21 @@ class PlantSupervisor:
 
     # --- inside --------------------------------------------------------------------------------------------
 
+    def _keep_pace(self, now_ns: int) -> None:
+        """Let trajectory and fades wait where the plant itself did not run, or where its clock stepped.
+
+        A process that was stopped for half a second must not find its setpoint half a second further on.
+        """
+        last_ns, self._last_time_ns = self._last_time_ns, now_ns
+        if last_ns is None:
+            return
+        elapsed = now_ns - last_ns
+        lost = elapsed - min(_LONGEST_STEP_NS, max(0, elapsed))
+        if lost:
+            self._trajectory_start_ns += lost
+            if self._handover is not None:
+                self._handover.start_ns += lost
+
     def _decide_position(self, now_ns: int, sample: JointSample, push: float) -> Drive | None:
         trajectory = self._trajectory
         assert trajectory is not None
@@ -296,16 +231,17 @@ class PlantSupervisor:
         position, velocity = trajectory.at(elapsed)
         handover = self._handover
         remaining = handover.remaining(now_ns, self.limits.handover_time) if handover else 0.0
-        if handover:
-            position += handover.offset * remaining
-        if abs(sample.position - position) > self.limits.tracking_error:
+        offset = handover.remaining_offset(now_ns) if handover else 0.0
+        position += offset
+        # Negated, so that a setpoint that is not a number is a fault too.
+        if not abs(sample.position - position) <= self.limits.tracking_error:
             self.fault(
                 f"pendulum is at {sample.position:.3f} rad, the trajectory at {position:.3f} rad; "
                 f"expected at most {self.limits.tracking_error} rad between them",
                 now_ns,
             )
             return Drive(DriveKind.OFF, push=push)
-        if elapsed >= trajectory.duration:
+        if elapsed >= trajectory.duration and offset == 0.0:
             if self._hold_position is None:
                 self._hold_position = trajectory.goal
                 self.reason = "holding the end of a trajectory"
@@ -363,6 +299,8 @@ class PlantSupervisor:
         return min(self._last_effort + step, max(self._last_effort - step, effort))
 
     def _clamp(self, effort: float) -> float:
+        if math.isnan(effort):
+            return 0.0
         return min(self.limits.effort, max(-self.limits.effort, effort))
 
     def _measurement_fault(self, now_ns: int, sample: JointSample | None) -> str:
@@ -372,6 +310,9 @@ class PlantSupervisor:
         if not sample.is_finite():
             return f"measurement is not finite: {sample.position} rad, {sample.velocity} rad/s, {sample.effort} N m"
         age = (now_ns - sample.stamp_ns) / NANOSECONDS
+        if age < -limits.feedback_timeout:
+            # It would look fresh for as long, even if no other ever came.
+            return f"measurement is stamped {-age * 1e3:.0f} ms ahead of the plant's clock"
         if age > limits.feedback_timeout:
             return f"measurement is {age * 1e3:.0f} ms old; expected at most {limits.feedback_timeout * 1e3:.0f} ms"
         if not limits.position_min <= sample.position <= limits.position_max:
@@ -414,6 +355,3 @@ class PlantSupervisor:
             del self.transitions[:-_KEPT_TRANSITIONS]
         self.mode = mode
         self.reason = reason
-
-
-_KEPT_TRANSITIONS = 50
