@@ -80,6 +80,7 @@ class Source(Protocol):
     start_ns: int
     stop_ns: int
     damage: str
+    unclosed: bool
 
     def batches(self, channels: set[int], start: int | None, stop: int | None) -> Iterator[Batch]:
         """Yield all messages of some channels with start <= log time < stop, in the order of the file."""

@@ -56,7 +56,8 @@ class McapSource:
     """One MCAP file, read through a memory map.
 
     A file with a footer is read by its index. A file without one (its writer died), or with an index that does not
-    fit the file, is scanned from the start; then ``damage`` says what was found.
+    fit the file, is scanned from the start; then ``damage`` says what was found. ``unclosed`` is true for a file of
+    our recorder that is complete but was not closed.
 
     Args:
         path: The file.
@@ -69,6 +70,7 @@ class McapSource:
     def __init__(self, path: Path, data: bytes | None = None) -> None:
         self.path = path
         self.damage = ""
+        self.unclosed = False
         self.metadata: dict[str, dict[str, str]] = {}
         self._map: mmap.mmap | None = None
         self.buffer: Bytes = self._open(data)
@@ -134,8 +136,12 @@ class McapSource:
             at += _HEAD
             if at + length > footer:
                 raise _Damaged(f"a summary record of {length} bytes does not fit the file")
-            if opcode in (rec.SUMMARY_OFFSET, rec.PADDING):
+            if opcode == rec.PADDING:
+                self.unclosed = True  # complete, but its writer did not give back the room to grow
                 break
+            if opcode == rec.SUMMARY_OFFSET:
+                at += length
+                continue
             statistics |= self._take_summary_record(opcode, bytes(buffer[at : at + length]))
             at += length
         if not statistics and not self.chunks:

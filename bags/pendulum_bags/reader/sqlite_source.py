@@ -19,6 +19,7 @@ from pendulum_bags.reader.sqlite_pages import MessageRows, leaf_pages, message_r
 __all__ = ["SqliteSource"]
 
 _ROWS = 8192
+_LARGEST_SALVAGE = 64 << 30  # a damaged head may claim any size
 
 
 class SqliteSource:
@@ -36,6 +37,7 @@ class SqliteSource:
     """
 
     compressed = False
+    unclosed = False
 
     def __init__(self, path: Path) -> None:
         self.path = path
@@ -57,9 +59,11 @@ class SqliteSource:
                 self._connection = sqlite3.connect(f"{path.absolute().as_uri()}?mode=ro&immutable=1", uri=True)
                 self._rows = self._read_pages()
             self.streams = self._read_streams()
-        except sqlite3.Error as error:
+        except (sqlite3.Error, BagError) as error:
             self.close()
-            raise BagError(f"{path} is not a readable rosbag2 database: {error}") from error
+            if not self._salvage(str(error)):
+                self.close()
+                raise BagError(f"{path} is not a readable rosbag2 database: {error}") from error
 
     def close(self) -> None:
         """Close the database and remove the temporary copy, if there is one."""
@@ -90,6 +94,31 @@ class SqliteSource:
         for file in [self.path, *left_over]:
             shutil.copyfile(file, target.with_name(file.name))
         self._connection = sqlite3.connect(target)
+
+    def _salvage(self, reason: str) -> bool:
+        """Read what is left of a torn or truncated file: the topics by SQL, the messages page by page."""
+        content = self.path.read_bytes()
+        size = page_size(np.frombuffer(content, np.uint8))
+        if not size:
+            return False
+        pages = int.from_bytes(content[28:32], "big")
+        # SQLite refuses a file that is shorter than its head says, so the copy gets empty pages in place of lost ones.
+        missing = max(min(pages, _LARGEST_SALVAGE // size) * size - len(content), -len(content) % size)
+        self._copy = tempfile.TemporaryDirectory(prefix="pendulum_bags_")
+        copy = Path(self._copy.name, self.path.name)
+        copy.write_bytes(content + bytes(missing))
+        self._buffer = np.frombuffer(content, np.uint8)
+        starts = np.arange(0, len(content) - size + 1, size)
+        kinds = self._buffer[np.where(starts == 0, 100, starts)]
+        blocks = list(message_rows(self._buffer, size, starts[kinds == 0x0D]))
+        try:
+            self._connection = sqlite3.connect(copy)
+            self._rows = _first_of_each(blocks)
+            self.streams = self._read_streams()
+        except (sqlite3.Error, BagError):
+            return False
+        self.damage = f"SQLite refuses it ({reason}); {len(kinds)} pages of {pages or len(kinds)} are there"
+        return True
 
     def _read_pages(self) -> list[MessageRows] | None:
         """Read the table of messages from its pages; ``None`` when only SQL can read this file."""
@@ -207,6 +236,23 @@ class SqliteSource:
                 yield from _batches(rows)
         except sqlite3.Error as error:
             raise BagError(f"{self.path} is damaged: {error}; try to repair the bag") from error
+
+
+def _first_of_each(blocks: list[MessageRows]) -> list[MessageRows]:
+    """Drop rows that stand on several pages (a writer that moves rows leaves copies behind)."""
+    seen: set[int] = set()
+    kept = []
+    for block in blocks:
+        fresh = np.array([row not in seen for row in block.row_ids.tolist()], bool)
+        _, first = np.unique(block.row_ids, return_index=True)
+        once = np.zeros(len(fresh), bool)
+        once[first] = True
+        # Messages that continue on other pages need SQL, which cannot be asked here.
+        keep = fresh & once & block.local
+        seen.update(block.row_ids[keep].tolist())
+        columns = (block.row_ids, block.topics, block.times, block.offsets, block.sizes, block.local)
+        kept.append(MessageRows(*(column[keep] for column in columns)))
+    return kept
 
 
 def _batches(rows: list[tuple[int, int, bytes]]) -> Iterator[Batch]:

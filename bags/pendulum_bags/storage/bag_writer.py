@@ -68,8 +68,10 @@ class BagWriter:
         max_size: int,
         max_duration_ns: int,
         ros_distro: str,
+        file_stem: str,
     ) -> None:
         self.path = path
+        self._file_stem = file_stem
         self.storage = storage
         self._compression = compression
         self._chunk_size = chunk_size
@@ -272,7 +274,7 @@ class BagWriter:
         return BagError(f"topic {topic} was not added to bag {self.path} before its first message")
 
     def _open_file(self) -> _StorageFile:
-        name = f"{self.path.name}_{len(self._files)}"
+        name = f"{self._file_stem}_{len(self._files)}"
         if self.storage == "mcap":
             from pendulum_bags.storage.sealed_mcap import SealedMcapFile
 
@@ -336,6 +338,7 @@ def open_writer(
     max_size: int = 0,
     max_duration: float = 0.0,
     ros_distro: str = "jazzy",
+    file_stem: str = "",
 ) -> BagWriter:
     """Create a rosbag2 folder and return its writer.
 
@@ -348,6 +351,7 @@ def open_writer(
         max_size: Begin a new storage file at this size [bytes]; 0 for never.
         max_duration: Begin a new storage file after this time of messages [s]; 0 for never.
         ros_distro: What ``metadata.yaml`` names as distribution.
+        file_stem: Beginning of the names of storage files; by default the name of the folder.
 
     Raises:
         BagError: The folder exists or cannot be created.
@@ -371,5 +375,6 @@ def open_writer(
         max_size=max_size,
         max_duration_ns=round(max_duration * 1e9),
         ros_distro=ros_distro,
+        file_stem=file_stem or folder.name,
     )
 

@@ -325,6 +325,8 @@ class SealedSqliteFile:
         trunk = struct.pack(f">{len(free) + 2}I", 0, len(free), *free)
         pages.waiting[self._trunks[turn]] = trunk.ljust(PAGE, b"\0")
         self._write_runs()
+        if os.fstat(self._fd).st_size < pages.count * PAGE:
+            os.ftruncate(self._fd, pages.count * PAGE)  # places that were not used yet belong to the file, too
         self._write(self._first_page(self._trunks[turn], len(free) + 1), 0)
 
     def _write_runs(self) -> None:
@@ -398,6 +400,6 @@ class SealedSqliteFile:
             with copy.open("rb") as file:
                 os.fsync(file.fileno())
             os.replace(copy, self.path)
-        except (OSError, sqlite3.Error):
-            # The bag is whole without it; only seeking in a long one is slower.
+        except (OSError, sqlite3.OperationalError):
+            # No room for the copy. The bag is whole without it; only seeking in a long one is slower.
             copy.unlink(missing_ok=True)
