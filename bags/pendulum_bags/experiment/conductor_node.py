@@ -108,8 +108,12 @@ class Conductor:
         self.wait_for(what, future.done, timeout)
         return future.result()
 
-    def _slice(self, duration: float) -> None:
+    def listen(self, duration: float) -> None:
+        """Handle what arrives within a duration [s], without asking whether all is well."""
         self._executor.spin_until_future_complete(Future(executor=None), duration)
+
+    def _slice(self, duration: float) -> None:
+        self.listen(duration)
         self.watch()
         self.on_wait()
 
@@ -181,6 +185,15 @@ class PlantClient:
     def disarm(self) -> None:
         """Disarm the plant."""
         self.conductor.call(self._arm, SetBool.Request(data=False), f"{self.namespace} to disarm")
+
+    def disarm_quietly(self, timeout: float = 1.0) -> None:
+        """Disarm on the way out, where a plant that no longer answers must not keep others from being disarmed."""
+        if not self._arm.service_is_ready():
+            return
+        future = self._arm.call_async(SetBool.Request(data=False))
+        deadline = time.monotonic() + timeout
+        while not future.done() and time.monotonic() < deadline:
+            self.conductor.listen(_SLICE)
 
     def follow(self, trajectory: Trajectory, phase: str, **details: Any) -> None:
         """Start a move under position control, and record it as a phase."""

@@ -7,6 +7,7 @@ import ctypes
 import os
 import signal
 import subprocess
+import sys
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -16,7 +17,7 @@ from types import TracebackType
 from pendulum_msgs_py.errors import FaultError
 from pendulum_msgs_py.graph import NodeProgram
 
-__all__ = ["Child", "ProcessSet"]
+__all__ = ["Child", "ProcessSet", "ros_environment", "start_recorder"]
 
 _PR_SET_PDEATHSIG = 1
 _PATIENCE = 8.0
@@ -31,6 +32,7 @@ class Child:
     process: subprocess.Popen[bytes]
     log: Path
     ends_last: bool = False
+    ends_by_itself: bool = False
 
     def last_words(self, lines: int = 3) -> str:
         """Return the end of its output, for messages."""
@@ -68,14 +70,25 @@ class ProcessSet:
         """Start a node."""
         return self.start(program.full_name.strip("/").replace("/", "_"), program.command(), niceness=niceness)
 
-    def start(self, name: str, command: Sequence[str], *, ends_last: bool = False, niceness: int = 0) -> Child:
+    def start(
+        self,
+        name: str,
+        command: Sequence[str],
+        *,
+        ends_last: bool = False,
+        ends_by_itself: bool = False,
+        niceness: int = 0,
+        environment: Mapping[str, str] | None = None,
+    ) -> Child:
         """Start a command in a process group of its own, so that Ctrl-C reaches it through us, in order.
 
         Args:
             name: For messages and the log file.
             command: Program and arguments.
             ends_last: Keep it until all others have ended: a recorder that hears their last words.
+            ends_by_itself: Ending with code 0 is what it is for.
             niceness: Scheduling priority to give away.
+            environment: Variables to add for this one.
         """
         parent = os.getpid()
         libc = ctypes.CDLL(None, use_errno=True)
@@ -95,11 +108,11 @@ class ProcessSet:
                 stdin=subprocess.DEVNULL,
                 stdout=sink,
                 stderr=subprocess.STDOUT,
-                env={**os.environ, **self.environment},
+                env={**os.environ, **self.environment, **(environment or {})},
                 start_new_session=True,
                 preexec_fn=prepare,
             )
-        child = Child(name, process, log, ends_last)
+        child = Child(name, process, log, ends_last, ends_by_itself)
         self.children.append(child)
         return child
 
@@ -107,7 +120,7 @@ class ProcessSet:
         """Raise a FaultError that names the first program that has ended by itself."""
         for child in self.children:
             code = child.process.poll()
-            if code is not None:
+            if code is not None and not (child.ends_by_itself and code == 0):
                 ending = f"was ended by {signal.Signals(-code).name}" if code < 0 else f"ended with code {code}"
                 raise FaultError(f"{child.name} {ending}; its last words: {child.last_words() or 'none'}")
 
@@ -118,6 +131,18 @@ class ProcessSet:
         if child in self.children:
             self.children.remove(child)
         return code
+
+    def wait(self, child: Child, timeout: float) -> None:
+        """Wait for a program that ends by itself.
+
+        Raises:
+            FaultError: It ends with an error, or not in time.
+        """
+        try:
+            child.process.wait(timeout)
+        except subprocess.TimeoutExpired:
+            raise FaultError(f"{child.name} still runs after {timeout:g} s: {child.last_words()}") from None
+        self.check()
 
     def stop(self) -> None:
         """End all programs, recorders last: plants say a last zero torque that should be on record."""
@@ -147,3 +172,23 @@ class ProcessSet:
             with contextlib.suppress(subprocess.TimeoutExpired):
                 child.process.wait(0.05)
         return int(child.process.returncode)
+
+
+def ros_environment(domain: int, log_folder: Path) -> dict[str, str]:
+    """Return the environment of the programs of a run: its domain, this host only unless opened explicitly."""
+    return {
+        "ROS_DOMAIN_ID": str(domain),
+        "ROS_AUTOMATIC_DISCOVERY_RANGE": os.environ.get("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST"),
+        "ROS_LOG_DIR": str(log_folder / "ros"),
+        "PYTHONUNBUFFERED": "1",
+    }
+
+
+def start_recorder(
+    processes: ProcessSet, bag: Path, namespace: str, metadata: Path, storage: str, *, log_time: str = "receive"
+) -> Child:
+    """Start the recorder of all topics of one plant; ``log_time`` is ``receive`` or ``header``."""
+    command = [sys.executable, "-m", "pendulum_bags", "record", "-o", str(bag)]
+    command += ["--regex", f"^({namespace}/.*|/diagnostics|/clock)$", "--storage", storage]
+    command += ["--metadata", str(metadata), "--log-time", log_time]
+    return processes.start(f"recorder_{bag.name}", command, ends_last=True)

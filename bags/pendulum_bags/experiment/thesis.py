@@ -2,52 +2,31 @@
 
 from __future__ import annotations
 
-import os
 import sys
 import time
 from collections.abc import Sequence
-from dataclasses import replace
 from pathlib import Path
 
 from pendulum_bags.experiment.conductor_node import Conductor, PlantClient
 from pendulum_bags.experiment.domain import reserve_domain
-from pendulum_bags.experiment.lockstep import LockstepRun, lockstep_processes
-from pendulum_bags.experiment.processes import Child, ProcessSet
+from pendulum_bags.experiment.processes import Child, ProcessSet, ros_environment, start_recorder
 from pendulum_bags.experiment.progress import PhaseProgress
 from pendulum_bags.experiment.run_folder import write_json
-from pendulum_bags.experiment.settings import NoiseSettings, RegulationSettings
+from pendulum_bags.experiment.settings import RegulationSettings
 from pendulum_msgs_py import graph
 from pendulum_msgs_py.angles import UPRIGHT
 from pendulum_msgs_py.errors import FaultError
 from pendulum_msgs_py.graph import NodeProgram
 from pendulum_msgs_py.trajectory import thesis_ramp
 
-__all__ = ["ros_environment", "run_thesis", "start_recorder"]
+__all__ = ["run_thesis"]
 
 START_TIMEOUT = 60.0
 """Longest time for all programs to be up; the first start on a cold machine compiles code [s]."""
+OWN_PROTOCOL_SEED_STEP = 1_000_000
+"""Added to the seed for the unpaired simulation, whose noise must not be that of the hardware."""
 SETTLE_TIME = 1.0
 """Time under control before the noise starts [s]."""
-
-
-def ros_environment(domain: int, log_folder: Path) -> dict[str, str]:
-    """Return the environment of the programs of a run: its domain, this host only unless opened explicitly."""
-    return {
-        "ROS_DOMAIN_ID": str(domain),
-        "ROS_AUTOMATIC_DISCOVERY_RANGE": os.environ.get("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST"),
-        "ROS_LOG_DIR": str(log_folder / "ros"),
-        "PYTHONUNBUFFERED": "1",
-    }
-
-
-def start_recorder(
-    processes: ProcessSet, bag: Path, namespace: str, metadata: Path, storage: str, *, log_time: str = "receive"
-) -> Child:
-    """Start the recorder of all topics of one plant."""
-    command = [sys.executable, "-m", "pendulum_bags", "record", "-o", str(bag)]
-    command += ["--regex", f"^({namespace}/.*|/diagnostics|/clock)$", "--storage", storage]
-    command += ["--metadata", str(metadata), "--log-time", log_time]
-    return processes.start(f"recorder_{bag.name}", command, ends_last=True)
 
 
 def run_thesis(folder: Path, settings: RegulationSettings, domain: int | None, progress: PhaseProgress) -> None:
@@ -63,16 +42,9 @@ def run_thesis(folder: Path, settings: RegulationSettings, domain: int | None, p
         FaultError: A program ended, a plant refused or faulted; everything is at rest again when this is raised.
     """
     logs = folder / "logs"
-    # The ramp up leaves the machine idle: the thesis's own simulation runs meanwhile, in a domain of its own.
-    own_protocol = LockstepRun(
-        folder / "sim_500hz",
-        replace(settings, noise=replace(settings.noise, seed=settings.noise.seed + 1, hold_time=0.002)),
-    )
     with (
         reserve_domain(domain) as main_domain,
         ProcessSet(logs, ros_environment(main_domain, logs)) as processes,
-        reserve_domain() as other_domain,
-        lockstep_processes(own_protocol, other_domain, logs / "sim_500hz") as lockstep,
         Conductor(main_domain, watch=processes.check, on_wait=progress.refresh) as conductor,
     ):
         progress.phase("starting", 6.0)
@@ -82,12 +54,12 @@ def run_thesis(folder: Path, settings: RegulationSettings, domain: int | None, p
         hw = PlantClient(conductor, "/hw", "bridge")
         plants = (sim, hw)
         try:
-            _conduct(conductor, plants, settings.noise, progress, lockstep)
+            own_protocol = _conduct(conductor, plants, settings, progress, processes, folder)
         finally:
             _rest(plants)
         progress.phase("closing the bags", 2.0)
+        processes.wait(own_protocol, 60.0)
         processes.stop()
-        lockstep.finish()
 
 
 def _start(processes: ProcessSet, folder: Path, settings: RegulationSettings) -> None:
@@ -111,16 +83,19 @@ def _programs(settings: RegulationSettings) -> list[NodeProgram]:
 def _conduct(
     conductor: Conductor,
     plants: Sequence[PlantClient],
-    noise: NoiseSettings,
+    settings: RegulationSettings,
     progress: PhaseProgress,
-    lockstep: LockstepRun,
-) -> None:
+    processes: ProcessSet,
+    folder: Path,
+) -> Child:
+    noise = settings.noise
     for plant in plants:
         plant.wait_until_ready(START_TIMEOUT)
     for plant in plants:
         plant.arm()
 
-    lockstep.start()
+    # The ramp leaves the machine idle: the thesis's own simulation runs meanwhile, in a domain of its own.
+    own_protocol = _start_own_protocol(processes, folder, settings)
     _move(conductor, plants, UPRIGHT, "ramp_up", progress)
 
     progress.phase("regulation", SETTLE_TIME)
@@ -145,6 +120,18 @@ def _conduct(
         plant.disarm()
         plant.mark("done")
     conductor.spin(0.2)
+    return own_protocol
+
+
+def _start_own_protocol(processes: ProcessSet, folder: Path, settings: RegulationSettings) -> Child:
+    """Start the simulation as the thesis ran it: noise of its own, a new sample every 2 ms."""
+    noise = settings.noise
+    command = [sys.executable, "-m", "pendulum_bags", "experiment", "lockstep", "--bag", str(folder / "sim_500hz")]
+    command += ["--plant", settings.plant, "--controller", settings.controller, "--r", repr(settings.r)]
+    command += ["--q", *map(repr, settings.q), "--seed", str(noise.seed + OWN_PROTOCOL_SEED_STEP)]
+    command += ["--amplitude", repr(noise.amplitude), "--hold-time", "0.002", "--duration", repr(noise.duration)]
+    command += ["--storage", settings.storage]
+    return processes.start("sim_500hz", command, ends_by_itself=True, niceness=10, environment={"ROS_DOMAIN_ID": ""})
 
 
 def _move(

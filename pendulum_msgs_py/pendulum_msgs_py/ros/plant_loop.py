@@ -61,10 +61,13 @@ LOOP_SPECS: tuple[ParameterSpec, ...] = (
 
 
 class Stepper(Protocol):
-    """What a loop needs of a plant: go on for one period under a decision."""
+    """What a loop needs of a plant: go on for one period, until a given time, under a decision."""
 
-    def __call__(self, drive: Drive, period_ns: int) -> tuple[JointSample, float]:
-        """Return the state at the end of the period, stamped, and the torque that was applied on the way [N m]."""
+    def __call__(self, drive: Drive, stamp_ns: int) -> tuple[JointSample | None, float]:
+        """Return the state at the end of the period, so stamped, and the torque that was applied on the way [N m].
+
+        None stands for a measurement that was lost: nothing is published, time goes on.
+        """
 
 
 def create_wall_timer(node: Node, period: float, callback: Callable[[], None]) -> Timer:
@@ -110,18 +113,27 @@ class RealtimeLoop:
         self._deadline_ns += period
         self._statistics.cycle(now, self._deadline_ns)
         while now - self._deadline_ns >= period:
-            self._advance(period)
+            self._advance()
             self._deadline_ns += period
-        sample, _ = self._advance(period)
-        self._interface.publish_state(sample)
+        self._publish(self._advance())
 
-    def _advance(self, period: int) -> tuple[JointSample, float]:
+    def step_once(self) -> None:
+        """Take one step while paused."""
+        self._deadline_ns = self._clock()
+        self._publish(self._advance())
+
+    def _publish(self, sample: JointSample | None) -> None:
+        if sample is not None:
+            self._interface.publish_state(sample)
+
+    def _advance(self) -> JointSample | None:
         interface = self._interface
         before = interface.sample
         drive = interface.decide()
-        sample, applied = self._step(drive, period)
-        interface.publish_applied(before.stamp_ns if before else sample.stamp_ns - period, applied)
-        return sample, applied
+        sample, applied = self._step(drive, self._deadline_ns)
+        if before is not None:
+            interface.publish_applied(before.stamp_ns, applied)
+        return sample
 
 
 class LockstepLoop:
@@ -132,7 +144,7 @@ class LockstepLoop:
 
     Args:
         interface: The plant on the graph.
-        step: Steps the plant; stamps of its states must follow ``now_ns``.
+        step: Steps the plant.
         period_ns: Time between two states [ns].
         inputs: Inputs that must answer.
         subscribers: Subscriptions to states that must be there before the first one.
@@ -160,6 +172,7 @@ class LockstepLoop:
         self._answered: set[Input] = set()
         self._waiting_since = time.monotonic()
         self._told_waiting = False
+        self._told_finished = False
         self.now_ns = LOCKSTEP_EPOCH_NS
         self.steps = 0
         self.started = False
@@ -193,18 +206,26 @@ class LockstepLoop:
     def advance(self) -> None:
         """Take one step."""
         interface = self._interface
-        if self.finished:
-            return
-        before_ns = self.now_ns
-        drive = interface.decide()
-        self.now_ns += self._period_ns
-        sample, applied = self._step(drive, self._period_ns)
-        interface.publish_applied(before_ns, applied)
-        self.steps += 1
-        self._publish(sample)
-        if self._last_ns is not None and self.now_ns >= self._last_ns:
-            self.finished = True
+        sample = None
+        # A measurement that was lost has nobody to answer it: the plant goes on under its last decision's rules.
+        while sample is None and not self.finished:
+            before_ns = self.now_ns
+            drive = interface.decide()
+            self.now_ns += self._period_ns
+            sample, applied = self._step(drive, self.now_ns)
+            interface.publish_applied(before_ns, applied)
+            self.steps += 1
+            self.finished = self._last_ns is not None and self.now_ns >= self._last_ns
+        if sample is not None:
+            self._publish(sample)
+        if self.finished and not self._told_finished:
+            self._told_finished = True
             interface.publish_event("lockstep_finished", steps=self.steps)
+
+    def step_once(self) -> None:
+        """Take one step while paused."""
+        if self.started:
+            self.advance()
 
     def _publish(self, sample: JointSample) -> None:
         self._answered.clear()

@@ -7,6 +7,7 @@ import signal
 import socket
 import sys
 import threading
+import time
 import traceback
 from collections.abc import Callable, Iterable, Sequence
 from typing import Protocol, runtime_checkable
@@ -25,6 +26,8 @@ __all__ = ["Closeable", "run_node"]
 
 _SPIN_SLICE = 0.5
 """EventsExecutor.spin() hangs in the Jazzy wheels; spinning in finite slices works [s]."""
+_ECHO_TIME = 1.0
+"""Time within which a repeated stop signal is taken for an echo of the first [s]."""
 _STOP_SIGNALS = (signal.SIGINT, signal.SIGTERM)
 _KEPT_OPEN: list[socket.socket] = []
 """Write ends of the signal sockets: closed by the garbage collector, they would take the wakeup with them."""
@@ -144,7 +147,11 @@ def _listen_for_stop_signals() -> socket.socket:
 def _watch_signals(signals: socket.socket, stop: Callable[[], None]) -> None:
     first = _next_stop_signal(signals)
     stop()
+    # A launcher passes on the Ctrl-C that the terminal has sent already: only a later one is a second wish.
+    patience_ends = time.monotonic() + _ECHO_TIME
     second = _next_stop_signal(signals)
+    while time.monotonic() < patience_ends:
+        second = _next_stop_signal(signals)
     print(f"second {signal.Signals(second).name}: leaving at once", file=sys.stderr, flush=True)
     os._exit(128 + first)
 

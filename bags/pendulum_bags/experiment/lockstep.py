@@ -1,0 +1,124 @@
+"""One run as fast as possible: the same nodes over the same DDS, in step with each other instead of with the wall."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+from pendulum_bags.experiment.conductor_node import Conductor, PlantClient
+from pendulum_bags.experiment.domain import reserve_domain
+from pendulum_bags.experiment.processes import ProcessSet, ros_environment, start_recorder
+from pendulum_bags.experiment.run_folder import write_json
+from pendulum_bags.experiment.settings import RegulationSettings
+from pendulum_msgs_py import graph, names
+from pendulum_msgs_py.angles import UPRIGHT
+from pendulum_msgs_py.errors import BagError
+from pendulum_msgs_py.graph import NodeProgram
+
+__all__ = ["plant_program", "run_lockstep"]
+
+_START_TIMEOUT = 60.0
+_SLOWEST = 10.0
+"""Slowest pace at which a lockstep run still counts as alive, wall time per simulated time."""
+_LISTENERS = 3
+"""Those who hear the plant's states: controller, disturbance, recorder. The conductor makes one more."""
+
+
+def plant_program(side: str, settings: RegulationSettings, theta: float, duration: float) -> NodeProgram:
+    """Return the plant of a lockstep run, upright and armed from the first state on.
+
+    Args:
+        side: ``sim`` or ``hw``.
+        settings: What to run.
+        theta: Initial angle [rad].
+        duration: Simulated time after which the plant stops stepping [s].
+    """
+    loop: dict[str, graph.ParameterArgument] = {
+        "clock": "lockstep",
+        "lockstep_inputs": [names.EFFORT_COMMAND, names.DISTURBANCE],
+        "lockstep_subscribers": _LISTENERS + 1,
+        "lockstep_duration": float(duration),
+        "paused": True,
+        "initial_theta": float(theta),
+        "armed_at_start": True,
+    }
+    if side == "hw":
+        return graph.bridge("/hw", backend="emulator", effort_strategy=settings.effort_strategy, **loop)
+    return graph.simulator("/sim", plant=settings.plant, **loop)
+
+
+def run_lockstep(
+    bag: Path,
+    settings: RegulationSettings,
+    *,
+    side: str = "sim",
+    theta: float = UPRIGHT,
+    domain: int | None = None,
+    on_wait: Callable[[], None] = lambda: None,
+) -> Path:
+    """Run one plant under control and noise, as fast as the loop allows, and record it.
+
+    Args:
+        bag: Folder of the bag.
+        settings: What to run.
+        side: ``sim`` for the simulator, ``hw`` for the emulated hardware.
+        theta: Initial angle [rad].
+        domain: ROS domain, or None for any free one.
+        on_wait: Called while waiting.
+
+    Raises:
+        BagError: The bag exists.
+        FaultError: A program ended or did not answer.
+    """
+    if bag.exists():
+        raise BagError(f"bag {bag} exists; expected a new folder")
+    namespace = f"/{side}"
+    logs = bag.parent / "logs" / bag.name
+    duration = settings.noise.duration
+    with (
+        reserve_domain(domain) as reserved,
+        ProcessSet(logs, ros_environment(reserved, logs)) as processes,
+        Conductor(reserved, watch=processes.check, on_wait=on_wait) as conductor,
+    ):
+        metadata = logs / "metadata.json"
+        plant = settings.plant if side == "sim" else "emulator"
+        write_json(metadata, settings.metadata("lockstep", plant=plant, namespace=namespace, clock="lockstep"))
+        start_recorder(processes, bag, namespace, metadata, settings.storage, log_time="header")
+        program = plant_program(side, settings, theta, duration)
+        processes.start_node(settings.controller_program(namespace))
+        processes.start_node(settings.disturbance_program(namespace, autostart=True))
+        processes.start_node(program)
+        client = PlantClient(conductor, namespace, program.node_name)
+        _wait_until_all_hear_each_other(conductor, namespace)
+        client.resume(_START_TIMEOUT)
+        conductor.wait_for(
+            f"{duration:g} s of simulated time",
+            lambda: client.has_event("lockstep_finished"),
+            _START_TIMEOUT + _SLOWEST * duration,
+        )
+        conductor.spin(0.1)
+    return bag
+
+
+def _wait_until_all_hear_each_other(conductor: Conductor, namespace: str) -> None:
+    """Wait until every subscription of the run is on the graph, so that not even the first message is missed."""
+    node = conductor.node
+    wanted = {
+        # topic: how many listen
+        names.JOINT_STATES: _LISTENERS + 1,
+        names.EFFORT_COMMAND: 2,
+        names.DISTURBANCE: 2,
+        names.APPLIED_EFFORT: 1,
+        names.EVENTS: 2,
+    }
+
+    def complete() -> bool:
+        return all(
+            node.count_subscribers(f"{namespace}/{topic}") >= count
+            and node.count_publishers(f"{namespace}/{topic}") >= 1
+            for topic, count in wanted.items()
+        )
+
+    conductor.wait_for("all nodes to hear each other", complete, _START_TIMEOUT)
+    # What this node sees, the others see a moment later.
+    conductor.spin(0.3)
