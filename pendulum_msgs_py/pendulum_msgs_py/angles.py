@@ -16,13 +16,12 @@ UPRIGHT = math.pi
 _TWO_PI = 2.0 * math.pi
 
 
-
 @overload
 def wrap(angle: float) -> float: ...
 @overload
 def wrap(angle: NDArray[np.float64]) -> NDArray[np.float64]: ...
 def wrap(angle: float | NDArray[np.float64]) -> float | NDArray[np.float64]:
-    """Return the equivalent angle in [-pi, pi).
+    """Return the equivalent angle in [-pi, pi); what is no finite angle comes back as NaN.
 
     Angles that already lie there come back bit for bit, so that wrapping never adds rounding noise to a loop.
 
@@ -30,13 +29,17 @@ def wrap(angle: float | NDArray[np.float64]) -> float | NDArray[np.float64]:
         angle: Angle or array of angles [rad].
     """
     if isinstance(angle, np.ndarray):
-        wrapped = (angle + math.pi) % _TWO_PI - math.pi
+        with np.errstate(invalid="ignore"):
+            wrapped = (angle + math.pi) % _TWO_PI - math.pi
+        # The modulo of a tiny negative number rounds up to the modulus itself.
+        wrapped = np.where(wrapped >= math.pi, -math.pi, wrapped)
         return np.where((angle >= -math.pi) & (angle < math.pi), angle, wrapped)
     if -math.pi <= angle < math.pi:
         return angle
+    if math.isinf(angle):
+        return math.nan
     wrapped = (angle + math.pi) % _TWO_PI - math.pi
-    # The modulo of a tiny negative number rounds up to the modulus itself.
-    return wrapped if wrapped < math.pi else -math.pi
+    return -math.pi if wrapped >= math.pi else wrapped
 
 
 @overload

@@ -119,6 +119,8 @@ def decode_joint_state(data: bytes) -> JointStateFields | None:
         joint = data[name_start : name_end - 1].decode()
     except (struct.error, UnicodeDecodeError):
         return None
+    if "\0" in frame_id or "\0" in joint:
+        return None
     return JointStateFields(sec * NANOSECONDS + nanosec, frame_id, joint, *quantities)
 
 

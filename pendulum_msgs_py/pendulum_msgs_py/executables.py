@@ -18,7 +18,7 @@ from pendulum_msgs_py.errors import PendulumError
 if TYPE_CHECKING:
     import typer
 
-__all__ = ["EXIT_INTERRUPTED", "EXIT_USAGE", "cli_main", "report_error", "run_package"]
+__all__ = ["EXIT_INTERRUPTED", "EXIT_USAGE", "cli_main", "print_text", "report_error", "run_package"]
 
 EXIT_USAGE = 2
 """Exit code of a program that was asked for something it cannot do."""
@@ -36,7 +36,7 @@ def run_package(package: str, argv: Sequence[str] | None = None) -> int:
     arguments = list(sys.argv[1:] if argv is None else argv)
     table: dict[str, str] = importlib.import_module(f"{package}.executables").EXECUTABLES
     if not arguments or arguments[0] in {"-h", "--help"}:
-        _print_usage(package, table)
+        print_text(_usage(package, table))
         return 0 if arguments else EXIT_USAGE
     name, *rest = arguments
     if name not in table:
@@ -46,8 +46,13 @@ def run_package(package: str, argv: Sequence[str] | None = None) -> int:
         print(f"error: {package} has no executable {name!r}; expected one of {expected}{hint}", file=sys.stderr)
         return EXIT_USAGE
     module_name, function_name = table[name].split(":")
-    main = getattr(importlib.import_module(module_name), function_name)
-    return int(main(rest) or 0)
+    try:
+        main = getattr(importlib.import_module(module_name), function_name)
+        return int(main(rest) or 0)
+    except KeyboardInterrupt:
+        # Ctrl-C while the modules are still loading: nothing runs yet that could say so itself.
+        print("interrupted", file=sys.stderr)
+        return EXIT_INTERRUPTED
 
 
 def cli_main(app: typer.Typer, argv: Sequence[str] | None = None, *, name: str | None = None) -> int:
@@ -67,6 +72,8 @@ def cli_main(app: typer.Typer, argv: Sequence[str] | None = None, *, name: str |
         result = command.main(
             args=list(sys.argv[1:] if argv is None else argv), prog_name=name, standalone_mode=False
         )
+        # What is still buffered would else meet a broken pipe at exit, where nobody can catch it.
+        sys.stdout.flush()
     except PendulumError as error:
         return report_error(error)
     except (click.exceptions.Abort, KeyboardInterrupt):
@@ -78,10 +85,29 @@ def cli_main(app: typer.Typer, argv: Sequence[str] | None = None, *, name: str |
         error.show()
         return int(error.exit_code)
     except BrokenPipeError:
-        # The reader of our output (head, less) has gone: nothing is left to say, not even at exit.
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        _discard_output()
         return 0
+    except SystemExit as stop:
+        # click turns a broken pipe into exit code 1, also where it should leave exits to us.
+        if isinstance(stop.__context__, BrokenPipeError):
+            _discard_output()
+            return 0
+        return stop.code if isinstance(stop.code, int) else int(stop.code is not None)
     return int(result) if isinstance(result, int) else 0
+
+
+def print_text(text: str) -> None:
+    """Print a text; a reader that has gone (``| head``) is no error."""
+    try:
+        print(text, flush=True)
+    except BrokenPipeError:
+        _discard_output()
+
+
+def _discard_output() -> None:
+    """Send what is still buffered nowhere: the reader of our output has gone, nothing is left to say."""
+    with open(os.devnull, "w", encoding="utf-8") as nowhere:
+        os.dup2(nowhere.fileno(), sys.stdout.fileno())
 
 
 def report_error(error: BaseException) -> int:
@@ -90,8 +116,9 @@ def report_error(error: BaseException) -> int:
     return EXIT_USAGE
 
 
-def _print_usage(package: str, table: dict[str, str]) -> None:
-    print(f"usage: python -m {package} EXECUTABLE [ARGUMENTS]\n\nexecutables:")
-    for name in sorted(table):
-        print(f"  {name}")
-    print(f"\nexample: python -m {package} {sorted(table)[0]} --help")
+def _usage(package: str, table: dict[str, str]) -> str:
+    names = sorted(table)
+    lines = [f"usage: python -m {package} EXECUTABLE [ARGUMENTS]", "", "executables:"]
+    lines += [f"  {name}" for name in names]
+    lines += ["", f"example: python -m {package} {names[0]} --help"]
+    return "\n".join(lines)

@@ -1,12 +1,14 @@
 """Typed tables of parameters: one row gives a parameter its name, default, unit, domain and meaning.
 
-The same table declares ROS parameters (with descriptor and range), checks YAML files and writes the table in a
-package's README.
+The same table declares ROS parameters (with descriptor and range), checks YAML files and writes the table in
+a package's README.
 """
 
 from __future__ import annotations
 
 import math
+import re
+import stat
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from difflib import get_close_matches
@@ -20,6 +22,7 @@ from pendulum_msgs_py.errors import ParameterError
 __all__ = [
     "ParameterSpec",
     "ParameterValue",
+    "dump_yaml",
     "load_yaml",
     "markdown_table",
     "read_text",
@@ -39,7 +42,7 @@ class ParameterSpec:
 
     Attributes:
         name: Name, as in YAML and on the ROS side.
-        default: Default; its type is the parameter's type. A list's element type is that of its first element.
+        default: Default; its type is the parameter's type. A list's elements are of its first element's type.
         unit: SI unit, ``-`` where it has none, empty for text.
         description: What it means, one sentence.
         minimum: Smallest value allowed (of each element for a list).
@@ -96,7 +99,10 @@ class ParameterSpec:
         if wanted is float:
             if isinstance(value, bool) or not isinstance(value, (int, float)):
                 raise self._error(value, f"expected {self._expected('a number')}", where)
-            number = float(value)
+            try:
+                number = float(value)
+            except OverflowError:
+                number = math.inf
             if not math.isfinite(number):
                 raise self._error(value, f"expected {self._expected('a finite number')}", where)
             self._check_range(number, where)
@@ -157,22 +163,75 @@ def reject_unknown(values: Mapping[str, object], known: Iterable[str], *, where:
 
 def require_mapping(value: object, what: str) -> dict[str, Any]:
     """Return the value if it is a mapping with text keys, else raise a ParameterError that names it."""
-    if not isinstance(value, dict) or not all(isinstance(key, str) for key in value):
-        kind = "nothing" if value is None else type(value).__name__
+    if not isinstance(value, dict):
+        kind = "empty" if value is None else f"a {type(value).__name__}"
         raise ParameterError(f"{what} is {kind}; expected a mapping of names to values")
+    for key in value:
+        if not isinstance(key, str):
+            raise ParameterError(f"{what} has the key {key!r}; expected a name (quote it if it is one)")
     return value
 
 
+_NUMBERS = (
+    ("tag:yaml.org,2002:int", re.compile(r"[-+]?[0-9]+$"), "-+0123456789"),
+    (
+        "tag:yaml.org,2002:float",
+        re.compile(r"[-+]?(?:\.[0-9]+|[0-9]+\.[0-9]*|[0-9]+(?=[eE]))(?:[eE][-+]?[0-9]+)?$|[-+]?\.inf$|\.nan$"),
+        "-+.0123456789",
+    ),
+)
+
+
+def _read_numbers_as_yaml_1_2(kind: type[Any]) -> type[Any]:
+    """Let a loader or dumper see numbers as YAML 1.2 does: ``1e-5`` is one, ``1:30`` and ``1_0`` are text.
+
+    YAML 1.1 reads 1:30 as 90, 010 as 8 and 1e-5 as text, none of which anybody means in a parameter file.
+    """
+    numbers = {tag for tag, _, _ in _NUMBERS}
+    kind.yaml_implicit_resolvers = {
+        first: [(tag, pattern) for tag, pattern in resolvers if tag not in numbers]
+        for first, resolvers in kind.yaml_implicit_resolvers.items()
+    }
+    for tag, pattern, first_letters in _NUMBERS:
+        kind.add_implicit_resolver(tag, pattern, list(first_letters))
+    return kind
+
+
+@_read_numbers_as_yaml_1_2
+class _StrictDumper(yaml.SafeDumper):
+    """Safe YAML that quotes what the loader would take for a number, and writes everything in full."""
+
+    def ignore_aliases(self, data: Any) -> bool:
+        return True
+
+
+@_read_numbers_as_yaml_1_2
 class _StrictLoader(yaml.SafeLoader):
-    """Safe YAML that refuses what YAML allows silently: a key given twice, and aliases that grow without bound."""
+    """Safe YAML that refuses what YAML allows silently: keys given twice, aliases and nesting without bound."""
+
+    def __init__(self, text: str) -> None:
+        super().__init__(text)
+        self._depth = 0
 
     def compose_node(self, parent: Any, index: Any) -> Any:
-        if self.check_event(yaml.AliasEvent):
-            event = self.peek_event()
-            raise yaml.MarkedYAMLError(
-                problem=f"alias *{event.anchor} is not allowed here", problem_mark=event.start_mark
-            )
-        return super().compose_node(parent, index)
+        event = self.peek_event()
+        problem = ""
+        if isinstance(event, yaml.AliasEvent):
+            problem = f"alias *{event.anchor} is not allowed here"
+        elif event.tag is not None:
+            problem = f"tag {event.tag} is not allowed here"
+        elif self._depth > _MAX_YAML_DEPTH:
+            problem = f"nested deeper than {_MAX_YAML_DEPTH} levels"
+        if problem:
+            raise yaml.MarkedYAMLError(problem=problem, problem_mark=event.start_mark)
+        self._depth += 1
+        try:
+            return super().compose_node(parent, index)
+        finally:
+            self._depth -= 1
+
+    def construct_yaml_int(self, node: Any) -> int:
+        return int(self.construct_scalar(node))
 
     def construct_mapping(self, node: Any, deep: bool = False) -> Any:
         seen: set[object] = set()
@@ -192,7 +251,9 @@ class _StrictLoader(yaml.SafeLoader):
         return super().construct_mapping(node, deep)
 
 
-_MAX_YAML_BYTES = 1_000_000
+_StrictLoader.add_constructor("tag:yaml.org,2002:int", _StrictLoader.construct_yaml_int)
+
+_MAX_YAML_BYTES = 250_000
 _MAX_YAML_DEPTH = 40
 
 
@@ -202,16 +263,20 @@ def read_text(path: str | Path, what: str, *, limit: int = _MAX_YAML_BYTES) -> s
     Args:
         path: The file.
         what: What the file should be, such as ``plant file``.
-        limit: Largest size accepted [bytes]; nobody writes a parameter file of a megabyte by hand.
+        limit: Largest size accepted [bytes]; nobody writes a quarter of a megabyte of parameters by hand.
     """
     path = Path(path)
     try:
-        size = path.stat().st_size
-        if path.is_dir():
+        status = path.stat()
+        if stat.S_ISDIR(status.st_mode):
             raise ParameterError(f"{what} {path} is a folder; expected a file")
-        if size > limit:
-            raise ParameterError(f"{what} {path} has {size} bytes; expected at most {limit}")
-        return path.read_text(encoding="utf-8")
+        if not stat.S_ISREG(status.st_mode):
+            # A device has no end, a pipe may have no writer.
+            raise ParameterError(f"{what} {path} is a device or a pipe; expected a file")
+        if status.st_size > limit:
+            raise ParameterError(f"{what} {path} has {status.st_size} bytes; expected at most {limit}")
+        with path.open("rb") as file:
+            return file.read(limit).decode("utf-8")
     except FileNotFoundError as error:
         raise ParameterError(f"{what} {path} does not exist") from error
     except UnicodeDecodeError as error:
@@ -234,9 +299,9 @@ def load_yaml(path: str | Path, what: str = "file") -> dict[str, Any]:
         ParameterError: The file is missing, not text, not YAML (with line and column), or holds no mapping.
     """
     text = read_text(path, what)
-    loader = _StrictLoader(text)
+    loader = None
     try:
-        _refuse_deep_nesting(text, what, path)
+        loader = _StrictLoader(text)
         return require_mapping(loader.get_single_data(), f"{what} {path}")
     except yaml.MarkedYAMLError as error:
         mark = error.problem_mark or error.context_mark
@@ -245,20 +310,37 @@ def load_yaml(path: str | Path, what: str = "file") -> dict[str, Any]:
     except (yaml.YAMLError, ValueError, RecursionError) as error:
         if isinstance(error, ParameterError):
             raise
-        raise ParameterError(f"{what} {path} is not YAML: {error}") from error
+        sentence = " ".join(str(error).split())
+        raise ParameterError(f"{what} {path} is not YAML: {sentence}") from error
     finally:
-        loader.dispose()
+        if loader is not None:
+            loader.dispose()
 
 
-def _refuse_deep_nesting(text: str, what: str, path: str | Path) -> None:
-    depth = 0
-    for event in yaml.parse(text, Loader=yaml.SafeLoader):
-        if isinstance(event, (yaml.MappingStartEvent, yaml.SequenceStartEvent)):
-            depth += 1
-            if depth > _MAX_YAML_DEPTH:
-                raise ParameterError(f"{what} {path} is nested deeper than {_MAX_YAML_DEPTH} levels")
-        elif isinstance(event, (yaml.MappingEndEvent, yaml.SequenceEndEvent)):
-            depth -= 1
+def dump_yaml(document: Mapping[str, Any], what: str = "file") -> str:
+    """Return the text that :func:`load_yaml` reads back to the same mapping.
+
+    Args:
+        document: Plain values: mappings, lists, text, numbers, truth values, dates.
+        what: What it is, for messages.
+
+    Raises:
+        ParameterError: A value is of a type that YAML has no word for.
+    """
+    try:
+        return str(
+            yaml.dump(
+                dict(document),
+                Dumper=_StrictDumper,
+                sort_keys=False,
+                default_flow_style=None,
+                allow_unicode=True,
+                width=120,
+            )
+        )
+    except yaml.YAMLError as error:
+        sentence = " ".join(str(part) for part in error.args)
+        raise ParameterError(f"{what} cannot be written: {sentence}; expected plain values") from error
 
 
 def markdown_table(specs: Iterable[ParameterSpec]) -> str:

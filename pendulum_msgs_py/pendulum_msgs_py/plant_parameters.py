@@ -14,19 +14,23 @@ The file gives each value with its unit, so that a file in other units is refuse
 
 from __future__ import annotations
 
-import math
 import os
-import tempfile
+import sys
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from importlib import resources
 from pathlib import Path
 from typing import Any
 
-import yaml
-
 from pendulum_msgs_py.errors import ParameterError
-from pendulum_msgs_py.parameters import ParameterSpec, load_yaml, reject_unknown, require_mapping
+from pendulum_msgs_py.parameters import (
+    ParameterSpec,
+    dump_yaml,
+    load_yaml,
+    reject_unknown,
+    require_mapping,
+)
 
 __all__ = [
     "DRIVETRAIN_SPECS",
@@ -233,17 +237,17 @@ def write_plant(
         document["drivetrain"] = _quantities(parameters.drivetrain, DRIVETRAIN_SPECS, {})
     if provenance:
         document["provenance"] = dict(provenance)
-    text = yaml.safe_dump(document, sort_keys=False, default_flow_style=None, allow_unicode=True, width=120)
+    text = dump_yaml(document, f"plant file {path}")
+    temporary = path.with_name(f".{path.name}.{os.getpid()}")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        with tempfile.NamedTemporaryFile(
-            "w", dir=path.parent, prefix=f".{path.name}.", delete=False, encoding="utf-8"
-        ) as file:
-            file.write(text)
-        os.chmod(file.name, 0o644)
-        os.replace(file.name, path)
-    except OSError as error:
-        raise ParameterError(f"plant file {path} cannot be written: {error.strerror}") from error
+        temporary.write_text(text, encoding="utf-8")
+        temporary.replace(path)
+    except (OSError, ValueError) as error:
+        with suppress(OSError, ValueError):
+            temporary.unlink(missing_ok=True)
+        reason = error.strerror if isinstance(error, OSError) else str(error)
+        raise ParameterError(f"plant file {path} cannot be written: {reason}") from error
     return path
 
 
@@ -290,7 +294,7 @@ def _check_interval(interval: object, where: str, unit: str) -> list[float]:
     if (
         isinstance(interval, list)
         and len(interval) == 2
-        and all(isinstance(bound, (int, float)) and math.isfinite(bound) for bound in interval)
+        and all(type(bound) in {int, float} and abs(bound) <= sys.float_info.max for bound in interval)
         and interval[0] <= interval[1]
     ):
         return [float(bound) for bound in interval]

@@ -10,6 +10,8 @@ from dataclasses import dataclass
 from pendulum_msgs_py.errors import ParameterError
 
 __all__ = [
+    "MAX_POSITION",
+    "MAX_RAMP_STEPS",
     "MAX_RAMP_VELOCITY",
     "RAMP_INCREMENT",
     "RAMP_PERIOD",
@@ -25,6 +27,10 @@ RAMP_PERIOD = 0.01
 """Time between two steps of the ramp, 100 Hz [s]."""
 MAX_RAMP_VELOCITY = 0.3
 """Amplitude of the half-sine of commanded velocity [rad/s]."""
+MAX_POSITION = 1e6
+"""Largest position of a trajectory [rad]; beyond it, differences of positions lose their meaning."""
+MAX_RAMP_STEPS = 1_000_000
+"""Longest ramp: 2.8 h at 100 Hz. A slip in a unit should not fill the memory."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -40,8 +46,8 @@ class TrajectoryPoint:
 class Trajectory:
     """Points at increasing times; between them position and velocity are interpolated linearly.
 
-    Linear, not cubic, because the thesis commands position and velocity as two separate curves (a linear ramp and a
-    half sine that is no derivative of it) and a spline through both would be neither.
+    Linear, not cubic, because the thesis commands position and velocity as two separate curves (a linear ramp and
+    a half sine that is no derivative of it) and a spline through both would be neither.
     """
 
     points: tuple[TrajectoryPoint, ...]
@@ -56,9 +62,14 @@ class Trajectory:
                 math.isfinite(point.time) and math.isfinite(point.position) and math.isfinite(point.velocity)
             ):
                 raise ParameterError(f"trajectory point {index} is {point}; expected finite numbers")
+            if abs(point.position) > MAX_POSITION:
+                raise ParameterError(
+                    f"trajectory point {index} is at {point.position} rad; expected at most {MAX_POSITION:g} rad"
+                )
             if point.time < 0.0 or point.time <= previous:
                 raise ParameterError(
-                    f"trajectory point {index} is at {point.time} s; expected >= 0 s and later than {previous} s"
+                    f"trajectory point {index} is at {point.time} s; "
+                    f"expected >= 0 s and later than {previous} s"
                 )
             previous = point.time
 
@@ -80,14 +91,14 @@ class Trajectory:
     def max_speed(self) -> float:
         """Return the largest speed asked for, as commanded or as positions imply [rad/s]."""
         speed = max(abs(point.velocity) for point in self.points)
-        for before, after in zip(self.points, self.points[1:]):
+        for before, after in zip(self.points, self.points[1:], strict=False):
             speed = max(speed, abs(after.position - before.position) / (after.time - before.time))
         return speed
 
     def at(self, time: float) -> tuple[float, float]:
-        """Return position [rad] and velocity [rad/s] at a time from the start [s]; held before and after."""
-        if time <= self.points[0].time:
-            return self.points[0].position, self.points[0].velocity
+        """Return position [rad] and velocity [rad/s] at a time from the start [s]; at rest before and after."""
+        if time < self.points[0].time:
+            return self.points[0].position, 0.0
         if time >= self.duration:
             # At the end the hold begins: the thesis then commands a velocity of zero.
             return self.goal, 0.0
@@ -108,24 +119,40 @@ def thesis_ramp(
     period: float = RAMP_PERIOD,
     max_velocity: float = MAX_RAMP_VELOCITY,
 ) -> Trajectory:
-    """Return the thesis's smooth move: positions in steps of 0.002 rad at 100 Hz, velocity a half cycle of a sine.
+    """Return the thesis's smooth move: positions in steps of 0.002 rad at 100 Hz, velocity half a cycle of a sine.
 
     Args:
         start: First position [rad].
         goal: Last position [rad].
         increment: Position step [rad], > 0.
         period: Time between two steps [s], > 0.
-        max_velocity: Amplitude of the half sine [rad/s]. A short move gets a smaller one.
+        max_velocity: Amplitude of the half sine [rad/s], >= 0. A short move gets a smaller one.
+
+    Raises:
+        ParameterError: A value is outside its domain, or the ramp has more than ``MAX_RAMP_STEPS`` steps.
 
     Source:
         Thesis, section "Determination of Gravitational force coefficient of the system".
     """
-    for name, value in (("start", start), ("goal", goal), ("increment", increment), ("period", period)):
+    for name, value in (
+        ("start", start),
+        ("goal", goal),
+        ("increment", increment),
+        ("period", period),
+        ("max_velocity", max_velocity),
+    ):
         if not math.isfinite(value):
             raise ParameterError(f"ramp {name} is {value}; expected a finite number")
     if increment <= 0.0 or period <= 0.0:
         raise ParameterError(f"ramp increment is {increment} rad and period {period} s; expected both > 0")
+    if max_velocity < 0.0:
+        raise ParameterError(f"ramp max_velocity is {max_velocity} rad/s; expected >= 0")
     distance = goal - start
+    if not abs(distance) / increment < MAX_RAMP_STEPS:
+        raise ParameterError(
+            f"ramp from {start} to {goal} rad in steps of {increment} rad is too long; "
+            f"expected fewer than {MAX_RAMP_STEPS} steps"
+        )
     steps = max(1, math.ceil(abs(distance) / increment - 1e-9))
     # The average of a half sine is 2/pi of its peak: it never has to promise more speed than the move needs.
     peak = min(max_velocity, 0.5 * math.pi * abs(distance) / (steps * period))
@@ -142,11 +169,13 @@ def thesis_ramp(
     )
 
 
-def from_points(times: Sequence[float], positions: Sequence[float], velocities: Sequence[float]) -> Trajectory:
-    """Return a trajectory from three sequences of one length: times [s], positions [rad], velocities [rad/s]."""
+def from_points(
+    times: Sequence[float], positions: Sequence[float], velocities: Sequence[float]
+) -> Trajectory:
+    """Return a trajectory from sequences of one length: times [s], positions [rad], velocities [rad/s]."""
     if not len(times) == len(positions) == len(velocities):
         raise ParameterError(
-            f"trajectory has {len(times)} times, {len(positions)} positions and {len(velocities)} velocities; "
-            "expected as many of each"
+            f"trajectory has {len(times)} times, {len(positions)} positions and "
+            f"{len(velocities)} velocities; expected as many of each"
         )
     return Trajectory(tuple(map(TrajectoryPoint, times, positions, velocities)))
