@@ -9,16 +9,20 @@ from typing import Any
 
 import numpy as np
 from rclpy.node import Node
+from sensor_msgs.msg import JointState
 from std_srvs.srv import SetBool, Trigger
 
 from pendulum_msgs_py.errors import ParameterError
+from pendulum_msgs_py.names import JOINT
 from pendulum_msgs_py.parameters import ParameterSpec
 from pendulum_msgs_py.plant_parameters import load_plant
+from pendulum_msgs_py.ros import qos
+from pendulum_msgs_py.ros.convert import sample_from_message
 from pendulum_msgs_py.ros.parameters import NodeParameters
 from pendulum_msgs_py.ros.plant_interface import LIMIT_SPECS, PlantInterface, limits_from_parameters
 from pendulum_msgs_py.ros.plant_loop import LOCKSTEP_EPOCH_NS, LOOP_SPECS, LockstepLoop, RealtimeLoop
 from pendulum_msgs_py.ros.runner import run_node
-from pendulum_msgs_py.supervisor import Drive, DriveKind, Input, PlantSupervisor
+from pendulum_msgs_py.supervisor import Drive, DriveKind, Input, Mode, PlantSupervisor
 from pendulum_msgs_py.timing import LoopStatistics, SteadyWallClock
 from pendulum_msgs_py.values import NANOSECONDS, JointCommand, JointSample
 from pendulum_sim.integrators import METHODS
@@ -31,7 +35,9 @@ __all__ = ["SPECS", "SimulatorNode", "main"]
 _SENSOR_PREFIX = "sensor."
 
 SPECS: tuple[ParameterSpec, ...] = (
-    ParameterSpec("plant", "thesis", "", "Preset (thesis, x5_9, dfki) or path of a plant file.", read_only=True),
+    ParameterSpec(
+        "plant", "thesis", "", "Preset (thesis, x5_9, dfki) or path of a plant file.", read_only=True
+    ),
     ParameterSpec(
         "method",
         "auto",
@@ -44,7 +50,12 @@ SPECS: tuple[ParameterSpec, ...] = (
         "rate_hz", 500.0, "Hz", "Rate of states and commands.", minimum=50.0, maximum=2000.0, read_only=True
     ),
     ParameterSpec(
-        "substeps", 0, "-", "Integration steps in a period; 0 chooses by the plant.", minimum=0, read_only=True
+        "substeps",
+        0,
+        "-",
+        "Integration steps in a period; 0 chooses by the plant.",
+        minimum=0,
+        read_only=True,
     ),
     ParameterSpec(
         "start",
@@ -53,13 +64,15 @@ SPECS: tuple[ParameterSpec, ...] = (
         "Where the pendulum starts, and restarts on reset.",
         choices=("given", "bottom", "top", "random"),
     ),
-    ParameterSpec("initial_theta", 0.0, "rad", "Angle at a given start."),
+    ParameterSpec("initial_theta", 0.0, "rad", "Angle at a given start; 0 hangs down, pi is upright."),
     ParameterSpec("initial_theta_dot", 0.0, "rad/s", "Velocity at a given start."),
     ParameterSpec("seed", 0, "-", "Seed of random starts and of the sensors.", minimum=0, read_only=True),
     ParameterSpec(
         "armed_at_start", True, "", "Arm without being asked; nothing real moves here.", read_only=True
     ),
-    ParameterSpec("paused", False, "", "Start paused, until ~/pause or ~/step says otherwise.", read_only=True),
+    ParameterSpec(
+        "paused", False, "", "Start paused, until ~/pause or ~/step says otherwise.", read_only=True
+    ),
     *LOOP_SPECS,
     *LIMIT_SPECS,
     *(replace(spec, name=_SENSOR_PREFIX + spec.name, read_only=True) for spec in SENSOR_SPECS),
@@ -92,7 +105,8 @@ class SimulatorNode(Node):
         self._statistics = LoopStatistics(period_ns)
         self._supervisor = PlantSupervisor(limits_from_parameters(values, parameters.effort_limit))
         self._lockstep = values["clock"] == "lockstep"
-        wall = SteadyWallClock()
+        self._wall = wall = SteadyWallClock()
+        self._handed_out_ns = 0
         self._interface = PlantInterface(
             self,
             self._supervisor,
@@ -115,12 +129,13 @@ class SimulatorNode(Node):
             self._loop = RealtimeLoop(self._interface, self._advance, self._statistics, wall)
             self._stamp_ns = wall()
         self._loop.paused = values["paused"]
-        self._restart()
+        self._restart(*self._start_state(values))
         if values["armed_at_start"]:
             refusal = self._supervisor.arm(self._stamp_ns, self._interface.sample)
             if refusal:
                 raise ParameterError(f"armed_at_start: {refusal}")
         self.create_service(Trigger, "~/reset", self._on_reset)
+        self.create_subscription(JointState, "~/set_state", self._on_set_state, qos.TRAJECTORY)
         self.create_service(SetBool, "~/pause", self._on_pause)
         self.create_service(Trigger, "~/step", self._on_step)
         self.get_logger().info(
@@ -138,12 +153,15 @@ class SimulatorNode(Node):
         effort = drive.effort
         if drive.kind is DriveKind.POSITION:
             # The servo knows the weight it carries, so the hand-over's feed-forward would count it twice.
-            wanted = self._servo.effort(self._state.theta, self._state.theta_dot, drive.position, drive.velocity)
+            wanted = self._servo.effort(
+                self._state.theta, self._state.theta_dot, drive.position, drive.velocity
+            )
             limit = self._supervisor.limits.effort
             effort = min(limit, max(-limit, wanted))
         self._state = self._plant.step(effort, drive.push)
         # In real time this is the deadline, not the moment at which Python got there.
         self._stamp_ns = stamp_ns
+        self._handed_out_ns = self._wall()
         return self._measure(), effort
 
     def _measure(self) -> JointSample | None:
@@ -151,12 +169,15 @@ class SimulatorNode(Node):
         return self._sensors.measure(self._stamp_ns, state.theta, state.theta_dot, state.effort)
 
     def _on_command(self, kind: Input, command: JointCommand) -> None:
-        self._loop.answered(kind, command)
+        if self._lockstep:
+            self._loop.answered(kind, command)
+        elif kind is Input.EFFORT_COMMAND and command.stamp_ns == self._stamp_ns:
+            # From the state to its answer: how late the timer was is the jitter's business.
+            self._statistics.round_trip(self._wall() - self._handed_out_ns)
 
     # --- services and parameters ---------------------------------------------------------------------------
 
-    def _restart(self) -> None:
-        theta, theta_dot = self._start_state(self._parameters.values)
+    def _restart(self, theta: float, theta_dot: float) -> None:
         self._state: PlantState = self._plant.reset(theta, theta_dot)
         state = self._state
         # The first measurement is exact: arming and trajectories need one, and a sensor may drop it.
@@ -181,14 +202,29 @@ class SimulatorNode(Node):
                 raise ParameterError(f"{name} is {values[name]}; expected a finite number")
 
     def _on_reset(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
-        self._restart()
+        refusal = self._reset(*self._start_state(self._parameters.values))
+        state = self._state
+        response.success = not refusal
+        response.message = refusal or f"theta {state.theta:.6f} rad, theta_dot {state.theta_dot:.6f} rad/s"
+        return response
+
+    def _on_set_state(self, message: JointState) -> None:
+        sample = sample_from_message(message)
+        if sample is None or not sample.is_finite():
+            refusal = f"expected a finite position and velocity of {JOINT}"
+        else:
+            refusal = self._reset(sample.position, sample.velocity)
+        if refusal:
+            self.get_logger().error(f"set_state refused: {refusal}")
+
+    def _reset(self, theta: float, theta_dot: float) -> str:
+        if self._supervisor.mode is Mode.POSITION:
+            return "a trajectory is being followed; disarm first"
+        self._restart(theta, theta_dot)
         for gate in self._supervisor.gates.values():
             gate.reset()
-        state = self._state
-        response.success = True
-        response.message = f"theta {state.theta:.6f} rad, theta_dot {state.theta_dot:.6f} rad/s"
-        self._interface.publish_event("reset", theta=state.theta, theta_dot=state.theta_dot)
-        return response
+        self._interface.publish_event("reset", theta=theta, theta_dot=theta_dot)
+        return ""
 
     def _on_pause(self, request: SetBool.Request, response: SetBool.Response) -> SetBool.Response:
         self._loop.paused = request.data

@@ -1,0 +1,112 @@
+"""Sensors, outside the equations: what is measured of a state, and whether the measurement arrives.
+
+In this order: a drawn error of the sampling instant moves the angle along its velocity (jitter), a bias and
+Gaussian noise are added, the value is rounded to the sensor's step, and the sample may be lost. All are off
+by default. Each has a generator of its own, so that switching one on leaves the numbers of the others as
+they were.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from pendulum_msgs_py.parameters import ParameterSpec, validate
+from pendulum_msgs_py.values import JointSample
+
+__all__ = ["SENSOR_SPECS", "Sensors", "quantise"]
+
+_QUANTITIES = (("position", "rad"), ("velocity", "rad/s"), ("effort", "N m"))
+
+SENSOR_SPECS: tuple[ParameterSpec, ...] = (
+    *(
+        ParameterSpec(
+            f"{name}_step", 0.0, unit, f"Step to which the {name} is rounded; 0 for none.", minimum=0.0
+        )
+        for name, unit in _QUANTITIES
+    ),
+    *(
+        ParameterSpec(f"{name}_noise", 0.0, unit, f"Standard deviation of noise on the {name}.", minimum=0.0)
+        for name, unit in _QUANTITIES
+    ),
+    *(
+        ParameterSpec(f"{name}_bias", 0.0, unit, f"Constant error of the {name}.")
+        for name, unit in _QUANTITIES
+    ),
+    ParameterSpec(
+        "jitter", 0.0, "s", "Standard deviation of the sampling instant about its stamp.", minimum=0.0
+    ),
+    ParameterSpec("drop_rate", 0.0, "-", "Share of samples that never arrive.", minimum=0.0, maximum=1.0),
+)
+"""Parameters of the sensors; a node declares them with the prefix ``sensor.``."""
+
+
+def quantise(value: float, step: float) -> float:
+    """Return the multiple of ``step`` nearest to a value, or the value itself for a step of 0."""
+    return round(value / step) * step if step > 0.0 else value
+
+
+class Sensors:
+    """Sensors of angle, velocity and torque.
+
+    Args:
+        generator: Source of all random numbers; it is spawned, never drawn from.
+        **parameters: Values by name as in ``SENSOR_SPECS``; what is missing is off.
+
+    Raises:
+        ParameterError: A name is unknown or a value outside its domain.
+    """
+
+    def __init__(self, generator: np.random.Generator | None = None, **parameters: Any) -> None:
+        self.parameters: Mapping[str, Any] = validate(SENSOR_SPECS, parameters, where="sensors")
+        if generator is None:
+            generator = np.random.default_rng(0)
+        *noise, self._jitter_generator, self._drop_generator = generator.spawn(len(_QUANTITIES) + 2)
+        # (bias, noise, step, generator); None where a quantity is measured exactly.
+        self._channels = [
+            channel if any(channel[:3]) else None
+            for channel in (
+                (
+                    self.parameters[f"{name}_bias"],
+                    self.parameters[f"{name}_noise"],
+                    self.parameters[f"{name}_step"],
+                    g,
+                )
+                for (name, _), g in zip(_QUANTITIES, noise, strict=True)
+            )
+        ]
+        self._jitter = self.parameters["jitter"]
+        self._drop_rate = self.parameters["drop_rate"]
+        self.ideal = not (any(self._channels) or self._jitter or self._drop_rate)
+        self.dropped = 0
+
+    def measure(self, stamp_ns: int, theta: float, theta_dot: float, effort: float) -> JointSample | None:
+        """Return the measurement of a state, or None for a sample that is lost.
+
+        Args:
+            stamp_ns: Time of the state [ns].
+            theta: True angle [rad].
+            theta_dot: True velocity [rad/s].
+            effort: True torque at the joint [N m].
+        """
+        if self.ideal:
+            return JointSample(stamp_ns, theta, theta_dot, effort)
+        if self._jitter:
+            theta += theta_dot * self._jitter_generator.normal(0.0, self._jitter)
+        position, velocity, torque = (
+            value if channel is None else _distort(value, *channel)
+            for value, channel in zip((theta, theta_dot, effort), self._channels, strict=True)
+        )
+        if self._drop_rate and self._drop_generator.random() < self._drop_rate:
+            self.dropped += 1
+            return None
+        return JointSample(stamp_ns, position, velocity, torque)
+
+
+def _distort(value: float, bias: float, noise: float, step: float, generator: np.random.Generator) -> float:
+    value += bias
+    if noise:
+        value += generator.normal(0.0, noise)
+    return quantise(value, step)
