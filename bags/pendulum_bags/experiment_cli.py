@@ -1,0 +1,188 @@
+"""``experiment``: run an experiment from the first process to the last figure."""
+
+from __future__ import annotations
+
+import json
+import sys
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Annotated, Any, Optional
+
+import typer
+from rich.console import Console
+from rich.table import Table
+
+from pendulum_bags.experiment.progress import PhaseProgress
+from pendulum_bags.experiment.run_folder import create_run_folder, versions, write_json
+from pendulum_bags.experiment.settings import NoiseSettings, RegulationSettings
+from pendulum_msgs_py.executables import EXIT_INTERRUPTED, cli_main
+
+__all__ = ["app", "main"]
+
+app = typer.Typer(
+    help="Run an experiment: start the nodes, conduct, record, compare, report.\n\n"
+    "Example: python -m pendulum_bags experiment thesis --seed 7",
+    no_args_is_help=True,
+    rich_markup_mode=None,
+    pretty_exceptions_enable=False,
+    add_completion=False,
+)
+
+_EXPECTED_TOTAL = 52.0
+"""Expected length of the thesis's experiment, of which 31 s are the ramps [s]."""
+
+Plant = Annotated[str, typer.Option(help="Preset or plant file of the simulated plant; the controller is designed on it.")]
+Seed = Annotated[int, typer.Option(help="Seed of the noise; one seed is one signal.", min=0)]
+Amplitude = Annotated[float, typer.Option(help="Largest torque of the noise [N m].")]
+HoldTime = Annotated[float, typer.Option(help="Time for which a noise sample is held [s].")]
+Duration = Annotated[float, typer.Option(help="Length of the noise [s].")]
+Controller = Annotated[str, typer.Option(help="Kind of controller.")]
+Q = Annotated[tuple[float, float], typer.Option(help="Diagonal of Q.")]
+R = Annotated[float, typer.Option(help="R.")]
+Storage = Annotated[str, typer.Option(help="Storage of the bags: mcap or sqlite3.")]
+Domain = Annotated[Optional[int], typer.Option(help="ROS domain; by default ROS_DOMAIN_ID, or the first free one.")]
+Strategy = Annotated[str, typer.Option(help="How the actuator turns wanted torque into PWM.")]
+
+
+@app.command()
+def thesis(
+    out: Annotated[
+        Optional[Path], typer.Option(help="Folder of the run; it must be new. Default: bags/runs/<UTC>_thesis.")
+    ] = None,
+    plant: Plant = "thesis",
+    hardware: Annotated[str, typer.Option(help="emulator, or hebi for the real actuator.")] = "emulator",
+    strategy: Strategy = "direct_pwm",
+    seed: Seed = 1,
+    amplitude: Amplitude = 2.5,
+    hold_time: HoldTime = 0.01,
+    duration: Duration = 5.0,
+    controller: Controller = "lqr",
+    q: Q = (100.0, 0.01),
+    r: R = 0.1,
+    storage: Storage = "mcap",
+    domain: Domain = None,
+    json_output: Annotated[bool, typer.Option("--json", help="Print summary.json instead of the table.")] = False,
+) -> None:
+    """Regulate the upright pendulum under noise on simulator and hardware, and compare them, as the thesis does.
+
+    Example: python -m pendulum_bags experiment thesis --out /tmp/my_run --seed 7
+    """
+    from pendulum_bags.experiment.thesis import run_thesis
+
+    settings = RegulationSettings(
+        plant=plant,
+        hardware=hardware,
+        effort_strategy=strategy,
+        controller=controller,
+        q=q,
+        r=r,
+        noise=NoiseSettings(seed, amplitude, hold_time, duration),
+        storage=storage,
+    )
+    folder = create_run_folder(out, "thesis")
+    console = Console(stderr=json_output, highlight=False)
+    started = time.monotonic()
+    try:
+        with PhaseProgress(_EXPECTED_TOTAL, console) as progress:
+            run_thesis(folder, settings, domain, progress)
+            progress.phase("comparing", 5.0)
+            summary = _analyse(folder, settings)
+    except KeyboardInterrupt:
+        console.print(f"interrupted: all programs have ended; what was recorded until then is in {folder}")
+        raise typer.Exit(EXIT_INTERRUPTED) from None
+    if json_output:
+        print(json.dumps(summary, indent=2))
+    else:
+        _print_summary(console, summary)
+    elapsed = time.monotonic() - started
+    console.print(f"\nreport  {folder / 'report.html'}\nbags    {folder / 'sim'}, {folder / 'hw'}\n({elapsed:.0f} s)")
+
+
+@app.command()
+def lockstep(
+    bag: Annotated[Path, typer.Option(help="Folder of the bag; it must not exist.")],
+    side: Annotated[str, typer.Option(help="sim for the simulator, hw for the emulated hardware.")] = "sim",
+    plant: Plant = "thesis",
+    strategy: Strategy = "direct_pwm",
+    seed: Seed = 1,
+    amplitude: Amplitude = 2.5,
+    hold_time: HoldTime = 0.002,
+    duration: Duration = 5.0,
+    controller: Controller = "lqr",
+    q: Q = (100.0, 0.01),
+    r: R = 0.1,
+    storage: Storage = "mcap",
+    domain: Domain = None,
+) -> None:
+    """Record one plant under control and noise, as fast as the loop allows; two runs with one seed are identical.
+
+    Example: python -m pendulum_bags experiment lockstep --bag /tmp/seed_7 --seed 7
+    """
+    from pendulum_bags.experiment.lockstep import run_lockstep
+    from pendulum_msgs_py.errors import ParameterError
+
+    if side not in {"sim", "hw"}:
+        raise ParameterError(f"side is {side!r}; expected sim or hw")
+    settings = RegulationSettings(
+        plant=plant,
+        effort_strategy=strategy,
+        controller=controller,
+        q=q,
+        r=r,
+        noise=NoiseSettings(seed, amplitude, hold_time, duration),
+        storage=storage,
+    )
+    started = time.monotonic()
+    run_lockstep(bag, settings, side=side, domain=domain)
+    elapsed = time.monotonic() - started
+    print(f"{bag}: {duration:g} s simulated in {elapsed:.1f} s, starting the nodes included", file=sys.stderr)
+
+
+def _analyse(folder: Path, settings: RegulationSettings) -> dict[str, Any]:
+    from pendulum_bags.comparison import compare_runs
+    from pendulum_bags.report import write_report
+
+    paired = compare_runs(folder / "sim", folder / "hw", own_protocol=folder / "sim_500hz")
+    summary = {
+        "experiment": "thesis",
+        "seed": settings.noise.seed,
+        "strategy": settings.effort_strategy,
+        "versions": versions(),
+        **paired.to_json(),
+    }
+    write_json(folder / "summary.json", summary)
+    write_report(folder, summary)
+    return summary
+
+
+def _print_summary(console: Console, summary: dict[str, Any]) -> None:
+    table = Table(title="Simulation and hardware under the same noise", title_justify="left")
+    table.add_column("")
+    plants = summary["plants"]
+    for name in plants:
+        table.add_column(name, justify="right")
+    rows = (
+        ("rate", "rate_hz", "Hz", ".1f"),
+        ("missed deadlines", "missed_deadlines", "", "d"),
+        ("std of theta", "std_theta", "rad", ".5f"),
+        ("std of theta'", "std_theta_dot", "rad/s", ".5f"),
+        ("max |u|", "max_abs_u", "N m", ".3f"),
+    )
+    for label, key, unit, form in rows:
+        cells = [_cell(plants[name].get(key), form) for name in plants]
+        table.add_row(f"{label} [{unit}]".replace("[", r"\[") if unit else label, *cells)
+    console.print(table)
+    if verdict := summary.get("verdict"):
+        console.print(verdict if isinstance(verdict, str) else verdict.get("sentence", verdict))
+
+
+def _cell(value: Any, form: str) -> str:
+    if value is None:
+        return "–"
+    return format(int(value) if form == "d" else float(value), form)
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run the command line."""
+    return cli_main(app, argv, name="python -m pendulum_bags experiment")
