@@ -1,7 +1,8 @@
-"""Build the site into ``build/site``: every Markdown file of the repository, where it stands, with its pictures."""
+"""Build the site into ``build/site`` from the Markdown files where they stand, with their pictures."""
 
 from __future__ import annotations
 
+import os
 import shutil
 import subprocess
 import sys
@@ -22,7 +23,7 @@ def main() -> int:
     ).stdout.splitlines()
     if "README.md" not in listed:
         print(
-            "error: README.md is missing; expected it at the root, as the first page of the site",
+            "error: README.md is missing; expected the first page of the site there",
             file=sys.stderr,
         )
         return 2
@@ -33,7 +34,8 @@ def main() -> int:
         shutil.copyfile(PROJECT / name, target)
     configuration = str(PROJECT / ".docs" / "mkdocs.yml")
     command = [sys.executable, "-m", "mkdocs", "build", "--quiet", "--strict", "--config-file", configuration]
-    code = subprocess.run(command, cwd=PROJECT, check=False).returncode
+    environment = {**os.environ, "NO_MKDOCS_2_WARNING": "1"}
+    code = subprocess.run(command, cwd=PROJECT, env=environment, check=False).returncode
     if code == 0:
         print("the site is build/site/index.html")
     return code
