@@ -86,7 +86,7 @@ class SimulatorNode(Node):
         stop: Asks the runner to end the process.
     """
 
-    def __init__(self, stop: Callable[[], None]) -> None:
+    def __init__(self, stop: Callable[[], None]) -> None:  # noqa: ARG002  (the runner offers it to all)
         super().__init__("simulator")
         self._parameters = NodeParameters(self, SPECS, self._check_start)
         values = self._parameters.values
@@ -107,6 +107,7 @@ class SimulatorNode(Node):
         self._lockstep = values["clock"] == "lockstep"
         self._wall = wall = SteadyWallClock()
         self._handed_out_ns = 0
+        self._state: PlantState = self._plant.state
         self._interface = PlantInterface(
             self,
             self._supervisor,
@@ -178,7 +179,7 @@ class SimulatorNode(Node):
     # --- services and parameters ---------------------------------------------------------------------------
 
     def _restart(self, theta: float, theta_dot: float) -> None:
-        self._state: PlantState = self._plant.reset(theta, theta_dot)
+        self._state = self._plant.reset(theta, theta_dot)
         state = self._state
         # The first measurement is exact: arming and trajectories need one, and a sensor may drop it.
         self._interface.sample = self._measure() or JointSample(
@@ -262,5 +263,5 @@ def main(argv: Sequence[str] | None = None) -> int:
         program="pendulum_sim simulator",
         description="Simulated pendulum behind the interface that simulator and hardware share.",
         specs=SPECS,
-        example="python -m pendulum_sim simulator --ros-args -r __ns:=/sim -p plant:=thesis -p rate_hz:=500.0",
+        example="python -m pendulum_sim simulator --ros-args -r __ns:=/sim -p plant:=x5_9",
     )
