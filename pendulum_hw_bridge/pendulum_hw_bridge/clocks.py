@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import threading
-import time
+from collections.abc import Callable
 from typing import Protocol
+
+from pendulum_msgs_py.timing import SteadyWallClock
 
 __all__ = ["Clock", "SteppedClock", "WallClock"]
 
@@ -20,19 +22,20 @@ class Clock(Protocol):
 
 
 class WallClock:
-    """System time at the start, monotonic from there: stamps compare with other nodes', yet never jump.
+    """Wall time that never jumps.
 
     Args:
+        clock: Time since the epoch [ns]; by default one that counts on the monotonic clock.
         wake: Set to end a wait early, such as on shutdown.
     """
 
-    def __init__(self, wake: threading.Event | None = None) -> None:
-        self._offset_ns = time.time_ns() - time.monotonic_ns()
+    def __init__(self, clock: Callable[[], int] | None = None, wake: threading.Event | None = None) -> None:
+        self._clock = clock or SteadyWallClock()
         self._wake = wake or threading.Event()
 
     def now_ns(self) -> int:
         """Return the time since the epoch [ns]."""
-        return time.monotonic_ns() + self._offset_ns
+        return self._clock()
 
     def wait_until(self, time_ns: int) -> None:
         """Sleep until a time [ns], or until woken."""

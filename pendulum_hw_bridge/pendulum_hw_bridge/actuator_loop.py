@@ -1,0 +1,188 @@
+"""The thread that owns the actuator: one cycle per feedback record, and jobs for it from elsewhere in between.
+
+HEBI's library wants all calls of a group from one thread, and no slow callback of ROS may stand between feedback
+and the reaction to it. What reaches the outside (publish, decide) are functions given by the node.
+"""
+
+from __future__ import annotations
+
+import queue
+import threading
+from collections.abc import Callable
+from concurrent.futures import Future
+from concurrent.futures import TimeoutError as FutureTimeoutError
+from typing import Any, TypeVar
+
+from pendulum_hw_bridge.actuator import ActuatorError, Feedback
+from pendulum_hw_bridge.bridge import Bridge, Outcome
+from pendulum_msgs_py.supervisor import Drive, Input
+from pendulum_msgs_py.timing import LoopStatistics
+from pendulum_msgs_py.values import NANOSECONDS, JointCommand, JointSample
+
+__all__ = ["ActuatorLoop"]
+
+_T = TypeVar("_T")
+_IDLE = 0.1
+_JOIN = 5.0
+
+
+class ActuatorLoop:
+    """Runs a bridge's cycles in a thread of its own.
+
+    Args:
+        bridge: Bridge and actuator; only this thread touches the actuator.
+        statistics: Gets the figures of the loop.
+        on_state: Called with each new sample and its feedback record.
+        decide: Returns the decision for now.
+        on_outcome: Called with the stamp of the state answered [ns] and what was done.
+        answer_window: Share of the period in which to wait for answers to a state before acting [-].
+        report: Called with the text of an error that ended a cycle.
+    """
+
+    def __init__(
+        self,
+        bridge: Bridge,
+        statistics: LoopStatistics,
+        *,
+        on_state: Callable[[JointSample, Feedback], None],
+        decide: Callable[[], Drive],
+        on_outcome: Callable[[int, Outcome], None],
+        answer_window: float = 0.3,
+        report: Callable[[str], None] = lambda text: None,
+    ) -> None:
+        self.bridge = bridge
+        self.statistics = statistics
+        self.active = False
+        self._on_state = on_state
+        self._decide = decide
+        self._on_outcome = on_outcome
+        self._period = statistics.period_ns / NANOSECONDS
+        self._window = answer_window * self._period
+        self._report = report
+        self._jobs: queue.SimpleQueue[tuple[Callable[[], Any], Future[Any]]] = queue.SimpleQueue()
+        self._answers = threading.Condition()
+        self._answered: set[Input] = set()
+        self._state_ns = 0
+        self._closing = threading.Event()
+        self._job_waiting = threading.Event()
+        self._last_state_ns: int | None = None
+        self._thread = threading.Thread(target=self._run, name="actuator", daemon=True)
+        self._thread.start()
+
+    # --- from other threads ---------------------------------------------------------------------------------
+
+    def call(self, job: Callable[[], _T], timeout: float = 5.0) -> _T:
+        """Run a job in the actuator's thread and return what it returns.
+
+        Args:
+            job: What to run.
+            timeout: Longest time to wait for it [s].
+
+        Raises:
+            ActuatorError: The thread does not answer in time, or has ended.
+        """
+        if threading.current_thread() is self._thread:
+            return job()
+        future: Future[_T] = Future()
+        self._jobs.put((job, future))
+        self._job_waiting.set()
+        if not self._thread.is_alive():
+            raise ActuatorError("exception", "actuator thread has ended; restart the bridge")
+        try:
+            return future.result(timeout)
+        except FutureTimeoutError:
+            future.cancel()
+            raise ActuatorError("exception", f"actuator thread did not answer within {timeout:g} s") from None
+
+    def answered(self, kind: Input, command: JointCommand) -> None:
+        """Take note of an accepted command; the cycle goes on when all who answer have answered."""
+        with self._answers:
+            if command.stamp_ns == self._state_ns:
+                self._answered.add(kind)
+                self._answers.notify()
+        if kind is Input.EFFORT_COMMAND:
+            self.statistics.round_trip(self.bridge.port.now_ns() - command.stamp_ns)
+
+    def close(self) -> None:
+        """End the thread; the actuator is released and let go on the way out."""
+        self._closing.set()
+        self._job_waiting.set()
+        with self._answers:
+            self._answers.notify()
+        self._thread.join(_JOIN)
+
+    # --- in the thread --------------------------------------------------------------------------------------
+
+    def _run(self) -> None:
+        try:
+            while not self._closing.is_set():
+                self._run_jobs()
+                if self.active:
+                    self._guarded_cycle()
+                else:
+                    self._job_waiting.wait(_IDLE)
+        finally:
+            self.bridge.close()
+
+    def _run_jobs(self) -> None:
+        self._job_waiting.clear()
+        while True:
+            try:
+                job, future = self._jobs.get_nowait()
+            except queue.Empty:
+                return
+            if not future.set_running_or_notify_cancel():
+                continue
+            try:
+                future.set_result(job())
+            except BaseException as error:
+                future.set_exception(error)
+
+    def _guarded_cycle(self) -> None:
+        try:
+            self._cycle()
+        except Exception as error:
+            # Whatever broke, the drive goes off first; a second break in the next cycle finds it off already.
+            self.bridge.fail("exception", f"{type(error).__name__}: {error}")
+            self.bridge.release()
+            self._report(f"cycle of the actuator failed: {type(error).__name__}: {error}")
+            self._closing.wait(self._period)
+
+    def _cycle(self) -> None:
+        bridge = self.bridge
+        feedback = bridge.observe(0.5 * self._period)
+        if feedback is None:
+            if not bridge.supervisor.mode.armed:
+                self._decide_and_act()
+            return
+        sample = bridge.sample
+        assert sample is not None
+        now = bridge.port.now_ns()
+        expected = now if self._last_state_ns is None else self._last_state_ns + self.statistics.period_ns
+        self.statistics.cycle(now, expected)
+        self._last_state_ns = now
+        with self._answers:
+            self._state_ns = sample.stamp_ns
+            self._answered.clear()
+        self._on_state(sample, feedback)
+        self._wait_for_answers(sample.stamp_ns)
+        self._on_outcome(sample.stamp_ns, self._decide_and_act())
+
+    def _decide_and_act(self) -> Outcome:
+        was_armed = self.bridge.supervisor.mode.armed
+        return self.bridge.carry_out(self._decide(), was_armed=was_armed)
+
+    def _wait_for_answers(self, stamp_ns: int) -> None:
+        """Wait for those who answered lately; whoever is late or has never answered is not waited for again."""
+        supervisor = self.bridge.supervisor
+        if not supervisor.mode.armed:
+            return
+        now = self.bridge.port.now_ns()
+        expected = {
+            kind
+            for kind in (Input.EFFORT_COMMAND, Input.DISTURBANCE)
+            if supervisor.gates[kind].fresh(now) is not None
+        }
+        deadline = self._window
+        with self._answers:
+            self._answers.wait_for(lambda: expected <= self._answered or self._closing.is_set(), deadline)

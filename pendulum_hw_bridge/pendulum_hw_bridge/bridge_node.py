@@ -1,0 +1,373 @@
+"""``bridge``: a HEBI actuator, or its emulator, behind the contract that simulator and hardware share.
+
+A lifecycle node. ``configure`` connects the actuator and reads its settings back, ``activate`` lets states flow and
+arming be asked for; ``deactivate``, ``cleanup``, ``shutdown``, SIGINT, SIGTERM and every error end with effort zero
+and then strategy off.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
+from rclpy.qos import QoSProfile
+from sensor_msgs.msg import BatteryState, JointState, Temperature
+
+from pendulum_hw_bridge import bridge_parameters
+from pendulum_hw_bridge.actuator import ActuatorError, Feedback
+from pendulum_hw_bridge.actuator_loop import ActuatorLoop
+from pendulum_hw_bridge.bridge import Bridge, Outcome
+from pendulum_hw_bridge.bridge_parameters import BRIDGE_SPECS
+from pendulum_hw_bridge.clocks import SteppedClock, WallClock
+from pendulum_hw_bridge.feedback_message import encode_feedback
+from pendulum_hw_bridge.safety import SafetyMonitor
+from pendulum_hw_bridge.shared_supervisor import SharedSupervisor
+from pendulum_msgs_py.errors import PendulumError
+from pendulum_msgs_py.parameters import ParameterSpec, ParameterValue
+from pendulum_msgs_py.ros.convert import stamp_to_message
+from pendulum_msgs_py.ros.parameters import NodeParameters
+from pendulum_msgs_py.ros.plant_interface import LIMIT_SPECS, PlantInterface, limits_from_parameters
+from pendulum_msgs_py.ros.plant_loop import LOCKSTEP_EPOCH_NS, LOOP_SPECS, LockstepLoop, create_wall_timer
+from pendulum_msgs_py.ros.runner import run_node
+from pendulum_msgs_py.supervisor import Drive, Input
+from pendulum_msgs_py.timing import LoopStatistics, SteadyWallClock
+from pendulum_msgs_py.values import NANOSECONDS, JointCommand, JointSample
+
+__all__ = ["SPECS", "BridgeNode", "main"]
+
+_HARDWARE_DEFAULTS: dict[str, ParameterValue] = {"velocity_limit": 1.5, "position_window": [-4.0, 4.0], "effort_slew_limit": 2000.0}
+"""Limits that a simulated plant can do without and a real one cannot."""
+
+SPECS: tuple[ParameterSpec, ...] = (
+    *BRIDGE_SPECS,
+    *LOOP_SPECS,
+    *(
+        dataclasses.replace(spec, default=_HARDWARE_DEFAULTS.get(spec.name, spec.default))
+        for spec in LIMIT_SPECS
+    ),
+)
+"""All parameters of the node."""
+
+_SLOW_PERIOD = 0.5
+_FEEDBACK_QOS = QoSProfile(depth=50)
+
+
+def _logged(transition: Callable[..., TransitionCallbackReturn]) -> Callable[..., TransitionCallbackReturn]:
+    """Say why a transition failed: rclpy swallows exceptions in transitions without a word."""
+
+    @functools.wraps(transition)
+    def guarded(self: BridgeNode, state: LifecycleState) -> TransitionCallbackReturn:
+        try:
+            return transition(self, state)
+        except PendulumError as error:
+            self.failure = error
+            self.get_logger().error(str(error))
+        except Exception as error:
+            self.failure = error
+            self.get_logger().error(f"{transition.__name__}: {type(error).__name__}: {error}")
+        self.release_actuator()
+        return TransitionCallbackReturn.FAILURE
+
+    return guarded
+
+
+class BridgeNode(LifecycleNode):
+    """An actuator as a plant.
+
+    Args:
+        stop: Asks the runner to end the process.
+    """
+
+    def __init__(self, stop: Callable[[], None]) -> None:
+        super().__init__("bridge")
+        self._stop_runner = stop
+        self.failure: Exception | None = None
+        self._values = values = NodeParameters(self, SPECS).values
+        self._lockstep = values["clock"] == "lockstep"
+        self._period_ns = round(NANOSECONDS / values["feedback_rate"])
+        self._statistics = LoopStatistics(self._period_ns)
+        self._wall = SteadyWallClock()
+        self._active = False
+        self._loop: ActuatorLoop | None = None
+        self._bridge: Bridge | None = None
+        self._plant = bridge_parameters.plant_of(values)
+        self._gains = bridge_parameters.trajectory_gains(values)
+        # Four cycles: the monitor's three have named the fault by then, this one is behind it.
+        limits = limits_from_parameters(
+            values, self._plant.effort_limit, feedback_timeout=4.0 * self._period_ns / NANOSECONDS
+        )
+        self._supervisor = SharedSupervisor(limits, self._prepare, self._withdraw)
+        self._lockstep_loop: LockstepLoop | None = None
+        self._interface = PlantInterface(
+            self,
+            self._supervisor,
+            (lambda: self._lockstep_loop.now_ns if self._lockstep_loop else LOCKSTEP_EPOCH_NS)
+            if self._lockstep
+            else self._wall,
+            push=values["backend"].startswith("emulator"),
+            statistics=None if self._lockstep else self._statistics,
+            more_diagnostics=self._diagnostics,
+            on_command=self._on_command,
+        )
+        self._feedback = self.create_publisher(JointState, "actuator/feedback", _FEEDBACK_QOS)
+        self._temperature = self.create_publisher(Temperature, "actuator/winding_temperature", _FEEDBACK_QOS)
+        self._supply = self.create_publisher(BatteryState, "actuator/supply", _FEEDBACK_QOS)
+        create_wall_timer(self, _SLOW_PERIOD, self._publish_slow)
+        if self._lockstep:
+            self._lockstep_loop = LockstepLoop(
+                self._interface,
+                self._advance,
+                self._period_ns,
+                [Input(name) for name in values["lockstep_inputs"]],
+                subscribers=values["lockstep_subscribers"],
+                duration=values["lockstep_duration"],
+            )
+            self._lockstep_loop.paused = True
+        # Made once here as well, so that a refused parameter ends the process with its sentence.
+        self._settings = bridge_parameters.bridge_settings(
+            values,
+            effort=limits.effort,
+            velocity=min(limits.velocity, 1.5),
+            gains=self._gains,
+        )
+        self._mapping = bridge_parameters.effort_mapping(values, self._plant, self._gains)
+        self._safety = bridge_parameters.safety_limits(values)
+        if values["autostart"]:
+            self._autostart()
+
+    def close(self) -> None:
+        """Disarm, effort zero, strategy off; a last zero torque is published, so that a recording shows it."""
+        stamp_ns = self._interface.clock()
+        self._interface.safe_stop("bridge ends")
+        self.release_actuator()
+        self._interface.publish_applied(stamp_ns, 0.0)
+
+    def release_actuator(self) -> None:
+        """Let go of the actuator, on whichever way."""
+        self._active = False
+        if self._lockstep_loop is not None:
+            self._lockstep_loop.paused = True
+        if self._loop is not None:
+            self._loop.close()
+        elif self._bridge is not None:
+            self._bridge.close()
+        self._loop = None
+        self._bridge = None
+
+    # --- lifecycle -----------------------------------------------------------------------------------------
+
+    @_logged
+    def on_configure(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Connect the actuator; every setting must read back."""
+        values = self._values
+        clock = SteppedClock(LOCKSTEP_EPOCH_NS) if self._lockstep else WallClock(self._wall)
+        self._port_clock = clock
+        port = bridge_parameters.make_port(values, clock, lockstep=self._lockstep)
+        monitor = SafetyMonitor(self._safety, self._period_ns / NANOSECONDS, self._plant.drivetrain)
+        self._bridge = bridge = Bridge(port, self._supervisor, self._mapping, monitor, self._settings)
+        if not self._lockstep:
+            self._loop = ActuatorLoop(
+                bridge,
+                self._statistics,
+                on_state=self._on_state,
+                decide=self._interface.decide,
+                on_outcome=self._on_outcome,
+                answer_window=values["answer_window"],
+                report=self.get_logger().error,
+            )
+        info = self._call(bridge.connect, timeout=30.0)
+        self._interface.publish_event(
+            "actuator_connected",
+            backend=info.backend,
+            family=info.family,
+            actuator=info.name,
+            serial=info.serial,
+            firmware=info.firmware,
+            effort_strategy=self._mapping.kind.value,
+            firmware_strategy=int(self._mapping.strategy),
+            efficiency=self._mapping.efficiency,
+            feedback_rate=info.feedback_rate,
+            command_lifetime=info.command_lifetime,
+            drivetrain=dict(info.drivetrain),
+        )
+        self.get_logger().info(
+            f"connected to {info.backend} {info.family}/{info.name} ({info.serial}), {info.feedback_rate:g} Hz, "
+            f"command lifetime {info.command_lifetime * 1e3:g} ms, effort by {self._mapping.kind.value}"
+        )
+        return TransitionCallbackReturn.SUCCESS
+
+    @_logged
+    def on_activate(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Let states flow; arming is a request of its own."""
+        assert self._bridge is not None
+        if self._lockstep_loop is not None:
+            self._observe_now(self._lockstep_loop.now_ns)
+            self._lockstep_loop.paused = False
+        if self._loop is not None:
+            self._loop.active = True
+        self._active = True
+        return TransitionCallbackReturn.SUCCESS
+
+    @_logged
+    def on_deactivate(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Disarm; states stop."""
+        self._quieten("bridge deactivated")
+        return TransitionCallbackReturn.SUCCESS
+
+    @_logged
+    def on_cleanup(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Let go of the actuator."""
+        self._quieten("bridge cleaned up")
+        self.release_actuator()
+        return TransitionCallbackReturn.SUCCESS
+
+    @_logged
+    def on_shutdown(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Let go of the actuator and end the process."""
+        self._quieten("bridge shut down")
+        self.release_actuator()
+        self._stop_runner()
+        return TransitionCallbackReturn.SUCCESS
+
+    @_logged
+    def on_error(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Let go of the actuator after an error in a transition."""
+        self._quieten("error in a transition")
+        self.release_actuator()
+        return TransitionCallbackReturn.SUCCESS
+
+    def _autostart(self) -> None:
+        for step in (self.trigger_configure, self.trigger_activate):
+            if step() is not TransitionCallbackReturn.SUCCESS:
+                self.release_actuator()
+                if isinstance(self.failure, PendulumError):
+                    raise self.failure
+                raise ActuatorError("exception", f"bridge did not start: {self.failure}")
+
+    def _quieten(self, reason: str) -> None:
+        self._active = False
+        self._supervisor.disarm(self._interface.clock(), reason)
+        if self._lockstep_loop is not None:
+            self._lockstep_loop.paused = True
+        if self._loop is not None:
+            self._loop.active = False
+        if self._bridge is not None:
+            self._call(self._bridge.release)
+        self._interface.publish_diagnostics()
+
+    # --- arming --------------------------------------------------------------------------------------------
+
+    def _prepare(self) -> str:
+        if not self._active or self._bridge is None:
+            return "bridge is not active; configure and activate it first"
+        try:
+            return self._call(self._bridge.prepare, timeout=2.0)
+        except ActuatorError as error:
+            return str(error)
+
+    def _withdraw(self) -> None:
+        if self._bridge is not None:
+            self._call(self._bridge.release)
+
+    def _call(self, job: Callable[[], Any], timeout: float = 5.0) -> Any:
+        return job() if self._loop is None else self._loop.call(job, timeout)
+
+    # --- cycle ---------------------------------------------------------------------------------------------
+
+    def _on_state(self, sample: JointSample, feedback: Feedback) -> None:
+        self._interface.publish_state(sample)
+        self._feedback.publish(encode_feedback(feedback))
+
+    def _on_outcome(self, stamp_ns: int, outcome: Outcome) -> None:
+        self._interface.publish_applied(stamp_ns, outcome.effort)
+
+    def _on_command(self, kind: Input, command: JointCommand) -> None:
+        if self._lockstep_loop is not None:
+            self._lockstep_loop.answered(kind, command)
+        elif self._loop is not None:
+            self._loop.answered(kind, command)
+
+    def _advance(self, drive: Drive, stamp_ns: int) -> tuple[JointSample | None, float]:
+        """Carry out a decision, let simulated time pass until a stamp, and return what is measured then."""
+        bridge = self._bridge
+        assert bridge is not None
+        outcome = bridge.carry_out(drive, was_armed=self._supervisor.mode.armed)
+        self._port_clock.wait_until(stamp_ns)
+        return self._observe_now(stamp_ns), outcome.effort
+
+    def _observe_now(self, stamp_ns: int) -> JointSample | None:
+        bridge = self._bridge
+        assert bridge is not None
+        feedback = bridge.observe(0.0)
+        if feedback is None or bridge.sample is None:
+            return None
+        self._feedback.publish(encode_feedback(feedback._replace(stamp_ns=stamp_ns)))
+        sample = dataclasses.replace(bridge.sample, stamp_ns=stamp_ns)
+        bridge.sample = sample
+        if self._interface.sample is None:
+            self._interface.sample = sample
+        return sample
+
+    # --- slow ----------------------------------------------------------------------------------------------
+
+    def _publish_slow(self) -> None:
+        feedback = self._bridge.feedback if self._bridge is not None else None
+        if feedback is None or not self._active:
+            return
+        stamp = stamp_to_message(feedback.stamp_ns)
+        temperature = Temperature(temperature=feedback.winding_temperature)
+        temperature.header.stamp = stamp
+        temperature.header.frame_id = "motor_winding"
+        self._temperature.publish(temperature)
+        supply = BatteryState(
+            voltage=feedback.voltage,
+            current=-feedback.motor_current,
+            temperature=feedback.board_temperature,
+            charge=float("nan"),
+            capacity=float("nan"),
+            design_capacity=float("nan"),
+            percentage=float("nan"),
+            present=True,
+        )
+        supply.header.stamp = stamp
+        self._supply.publish(supply)
+
+    def _diagnostics(self) -> Mapping[str, object]:
+        bridge = self._bridge
+        values: dict[str, object] = {
+            "active": self._active,
+            "backend": self._values["backend"],
+            "effort_strategy": self._values["effort_strategy"],
+        }
+        if self._lockstep_loop is not None:
+            values.update(self._lockstep_loop.diagnostics())
+        if bridge is None or bridge.feedback is None:
+            return values
+        feedback = bridge.feedback
+        values.update(
+            {
+                "firmware_strategy": int(bridge.port.strategy),
+                "winding_temperature_degc": feedback.winding_temperature,
+                "voltage_v": feedback.voltage,
+                "pwm": feedback.pwm_command,
+                "winding_current_a": feedback.winding_current,
+                "last_fault": bridge.last_fault or "none",
+            }
+        )
+        values.update({f"faults.{name}": count for name, count in sorted(bridge.faults.items())})
+        return values
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run the bridge."""
+    return run_node(
+        BridgeNode,
+        argv,
+        program="pendulum_hw_bridge bridge",
+        description="Drives a HEBI X5-9, or its emulator, behind the same interface as the simulator.",
+        specs=SPECS,
+        example="python -m pendulum_hw_bridge bridge --ros-args -r __ns:=/hw -p backend:=emulator",
+    )

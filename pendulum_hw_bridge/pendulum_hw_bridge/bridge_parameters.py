@@ -1,0 +1,331 @@
+"""Parameters of the bridge and the objects that they make: one table for ROS, README and command line."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import asdict, replace
+from typing import Any
+
+from pendulum_hw_bridge.actuator import MAX_COMMAND_LIFETIME, ActuatorPort, HardwareLimits, MStopAction
+from pendulum_hw_bridge.backends import BACKENDS
+from pendulum_hw_bridge.bridge import BridgeSettings
+from pendulum_hw_bridge.clocks import Clock
+from pendulum_hw_bridge.effort_mapping import EffortMapping, EffortStrategy
+from pendulum_hw_bridge.gains import DEFAULT_GAINS, GainSet, load_gains
+from pendulum_hw_bridge.safety import SafetyLimits
+from pendulum_msgs_py.errors import ParameterError
+from pendulum_msgs_py.parameters import ParameterSpec
+from pendulum_msgs_py.plant_parameters import PlantParameters, SeriesElasticParameters
+from pendulum_msgs_py.values import NANOSECONDS
+
+__all__ = [
+    "BRIDGE_SPECS",
+    "POSITION_LOOP_STRATEGY",
+    "bridge_settings",
+    "drivetrain_of",
+    "effort_mapping",
+    "make_port",
+    "plant_of",
+    "safety_limits",
+    "trajectory_gains",
+]
+
+POSITION_LOOP_STRATEGY = 3
+_DEFAULT_ADDRESS = "127.0.0.1:17590"
+_LOCKSTEP_LEAD_NS = 500_000
+"""In lockstep, feedback is measured this long before the state that shows it [ns]."""
+
+
+def _fixed(name: str, default: Any, unit: str, description: str, **domain: Any) -> ParameterSpec:
+    return ParameterSpec(name, default, unit, description, read_only=True, **domain)
+
+
+BRIDGE_SPECS: tuple[ParameterSpec, ...] = (
+    _fixed("backend", "emulator", "", "What stands behind the actuator port.", choices=tuple(BACKENDS)),
+    _fixed("autostart", True, "", "Configure and activate at once, without a lifecycle manager."),
+    _fixed(
+        "plant",
+        "thesis",
+        "",
+        "Drivetrain and link: `thesis` or `x5_9`, or a plant file with a drivetrain; what the emulator is, and for "
+        "`hebi` the constants of the effort mapping.",
+    ),
+    _fixed("family", "", "", "HEBI family of the actuator; empty for any, if there is only one."),
+    _fixed("name", "", "", "HEBI name of the actuator; empty for any, if there is only one."),
+    _fixed(
+        "interface",
+        "",
+        "",
+        "Network address on which to look for the HEBI actuator; empty for all interfaces.",
+    ),
+    _fixed(
+        "feedback_rate",
+        100.0,
+        "Hz",
+        "Feedback records, and so control cycles, per second.",
+        minimum=1.0,
+        maximum=1000.0,
+    ),
+    _fixed(
+        "command_lifetime",
+        0.05,
+        "s",
+        "How long the actuator acts on a command after the bridge falls silent.",
+        minimum=0.0,
+        maximum=MAX_COMMAND_LIFETIME,
+        exclusive_minimum=True,
+    ),
+    _fixed(
+        "effort_strategy",
+        EffortStrategy.DIRECT_PWM.value,
+        "",
+        "How a torque becomes a setpoint; changes the damping that a controller sees.",
+        choices=tuple(kind.value for kind in EffortStrategy),
+    ),
+    _fixed(
+        "effort_efficiency",
+        0.0,
+        "-",
+        "Share of the motor's torque that reaches the joint, in the feed-forward; 0 takes that of the plant file.",
+        minimum=0.0,
+        maximum=1.0,
+    ),
+    _fixed(
+        "back_emf_compensation",
+        0.9,
+        "-",
+        "Share of the back-EMF that `direct_pwm_compensated` takes away.",
+        minimum=0.0,
+        maximum=1.0,
+    ),
+    _fixed("gains_file", "", "", "HEBI gains file (XML) for trajectories; empty for the X5-9's defaults."),
+    _fixed("joint_offset", 0.0, "rad", "Joint angle at which the actuator reads zero."),
+    _fixed("joint_sign", 1, "-", "1, or -1 where the actuator turns the other way.", minimum=-1, maximum=1),
+    _fixed(
+        "pwm_limit",
+        0.6,
+        "-",
+        "Largest PWM duty; 0.6 still reaches 13 N m at standstill.",
+        minimum=0.0,
+        maximum=1.0,
+        exclusive_minimum=True,
+    ),
+    _fixed(
+        "m_stop_action",
+        MStopAction.MOTOR_OFF.value,
+        "",
+        "What the module does when the motion stop is pressed.",
+        choices=tuple(action.value for action in MStopAction),
+    ),
+    _fixed(
+        "winding_temperature_limit",
+        120.0,
+        "degC",
+        "Winding temperature at which the bridge faults.",
+        minimum=0.0,
+        maximum=155.0,
+        exclusive_minimum=True,
+    ),
+    _fixed(
+        "voltage_window", [22.0, 50.0], "V", "Supply voltages between which the bridge drives, [low, high]."
+    ),
+    _fixed(
+        "measured_effort_limit",
+        14.0,
+        "N m",
+        "Torque of the spring at which the bridge faults.",
+        minimum=0.0,
+        exclusive_minimum=True,
+    ),
+    _fixed(
+        "winding_current_tolerance",
+        0.15,
+        "A",
+        "Disagreement of winding current and PWM at which the bridge faults; 0 switches the check off.",
+        minimum=0.0,
+    ),
+    _fixed(
+        "answer_window",
+        0.3,
+        "-",
+        "Share of a cycle in which to wait for the answers to a state before acting.",
+        minimum=0.0,
+        maximum=0.8,
+    ),
+    _fixed("initial_position", 0.0, "rad", "Emulator: where the pendulum is at the start, at rest."),
+    _fixed("seed", 0, "-", "Emulator: seed of sensor noise and timing jitter.", minimum=0),
+    _fixed("flat", False, "", "Emulator: the pendulum lies flat on a table, without gravity."),
+    _fixed(
+        "emulator_address", _DEFAULT_ADDRESS, "", "`emulator_process`: where the emulated actuator listens."
+    ),
+    _fixed("replay_file", "", "", "`replay`: feedback to play, an NPZ or CSV file."),
+)
+"""Parameters of the bridge beside those that every plant has."""
+
+
+def plant_of(values: Mapping[str, Any]) -> PlantParameters:
+    """Return the plant file's content; it must have a drivetrain.
+
+    Raises:
+        ParameterError: No such file, or a rigid plant.
+    """
+    from pendulum_hw_bridge.emulation.parameters import load_emulator
+
+    return load_emulator(values["plant"]).plant
+
+
+def drivetrain_of(plant: PlantParameters) -> SeriesElasticParameters:
+    """Return the drivetrain of a plant that has one."""
+    if plant.drivetrain is None:
+        raise ParameterError(f"plant {plant.name!r} has no drivetrain; expected one for the effort mapping")
+    return plant.drivetrain
+
+
+def make_port(values: Mapping[str, Any], clock: Clock, *, lockstep: bool = False) -> ActuatorPort:
+    """Return the backend that the parameters name, not connected yet.
+
+    Args:
+        values: Parameters of :data:`BRIDGE_SPECS`.
+        clock: Host clock.
+        lockstep: Whether time is simulated: feedback then comes without jitter, just before each state.
+
+    Raises:
+        ParameterError: A parameter of the backend is refused.
+    """
+    name = values["backend"]
+    if lockstep and name != "emulator":
+        raise ParameterError(
+            f"clock is 'lockstep' with backend {name!r}; expected backend 'emulator': others keep time"
+        )
+    if name == "emulator":
+        return _make_emulator(values, clock, lockstep)
+    makers: dict[str, Callable[[], ActuatorPort]] = {
+        "emulator_process": lambda: _make_emulator_process(values, clock),
+        "hebi": lambda: _make_hebi(values, clock),
+        "replay": lambda: _make_replay(values, clock),
+    }
+    return makers[name]()
+
+
+def _make_emulator(values: Mapping[str, Any], clock: Clock, lockstep: bool) -> ActuatorPort:
+    from pendulum_hw_bridge.backends.emulator import EmulatorBackend
+    from pendulum_hw_bridge.emulation.parameters import TimingParameters, load_emulator
+    from pendulum_hw_bridge.emulation.x5 import EmulatedX5
+
+    parameters = replace(load_emulator(values["plant"]), flat=values["flat"])
+    start_ns = clock.now_ns()
+    if lockstep:
+        quiet = replace(TimingParameters(), feedback_jitter=0.0, delay_jitter=0.0)
+        parameters = replace(parameters, timing=quiet)
+        period_ns = round(NANOSECONDS / values["feedback_rate"])
+        start_ns -= period_ns + min(_LOCKSTEP_LEAD_NS, period_ns // 2)
+    actuator = EmulatedX5(
+        parameters, seed=values["seed"], position=values["initial_position"], start_ns=start_ns
+    )
+    return EmulatorBackend(actuator, clock, seed=values["seed"])
+
+
+def _make_emulator_process(values: Mapping[str, Any], clock: Clock) -> ActuatorPort:
+    from pendulum_hw_bridge.backends.emulator_process import EmulatorProcessBackend
+
+    return EmulatorProcessBackend(values["emulator_address"], clock)
+
+
+def _make_hebi(values: Mapping[str, Any], clock: Clock) -> ActuatorPort:
+    from pendulum_hw_bridge.backends.hebi import HebiBackend
+
+    return HebiBackend(
+        values["family"],
+        values["name"],
+        clock=clock,
+        interface=values["interface"],
+        drivetrain=asdict(drivetrain_of(plant_of(values))),
+    )
+
+
+def _make_replay(values: Mapping[str, Any], clock: Clock) -> ActuatorPort:
+    from pendulum_hw_bridge.backends.replay import ReplayBackend, load_feedback
+
+    if not values["replay_file"]:
+        raise ParameterError(
+            "replay_file is empty; expected an NPZ or CSV file of feedback for backend 'replay'"
+        )
+    return ReplayBackend(load_feedback(values["replay_file"]), clock)
+
+
+def trajectory_gains(values: Mapping[str, Any]) -> GainSet:
+    """Return the gains for trajectories.
+
+    Raises:
+        ParameterError: The gains file is refused, or is for another strategy.
+    """
+    if not values["gains_file"]:
+        return DEFAULT_GAINS[POSITION_LOOP_STRATEGY]
+    gains = load_gains(values["gains_file"])
+    if gains.strategy != POSITION_LOOP_STRATEGY:
+        raise ParameterError(
+            f"gains file {values['gains_file']} is for strategy {gains.strategy}; "
+            f"expected {POSITION_LOOP_STRATEGY}, under which trajectories are followed"
+        )
+    return gains
+
+
+def effort_mapping(values: Mapping[str, Any], plant: PlantParameters, gains: GainSet) -> EffortMapping:
+    """Return the mapping of torque to setpoints."""
+    drivetrain = drivetrain_of(plant)
+    return EffortMapping(
+        EffortStrategy(values["effort_strategy"]),
+        drivetrain,
+        efficiency=values["effort_efficiency"] or drivetrain.efficiency,
+        compensation=values["back_emf_compensation"],
+        position_gain=gains.position.kp,
+    )
+
+
+def bridge_settings(
+    values: Mapping[str, Any], *, effort: float, velocity: float, gains: GainSet
+) -> BridgeSettings:
+    """Return what to set in the actuator.
+
+    Args:
+        values: Parameters of :data:`BRIDGE_SPECS`.
+        effort: Effort limit of the plant [N m].
+        velocity: Velocity limit of the plant [rad/s].
+        gains: For trajectories.
+
+    Raises:
+        ParameterError: ``joint_sign`` is zero, or a limit is refused.
+    """
+    if values["joint_sign"] == 0:
+        raise ParameterError("joint_sign is 0; expected 1 or -1")
+    return BridgeSettings(
+        feedback_rate=values["feedback_rate"],
+        command_lifetime=values["command_lifetime"],
+        limits=HardwareLimits(
+            effort=effort,
+            velocity=velocity,
+            pwm=values["pwm_limit"],
+            m_stop=MStopAction(values["m_stop_action"]),
+        ),
+        gains=gains,
+        joint_offset=values["joint_offset"],
+        joint_sign=values["joint_sign"],
+    )
+
+
+def safety_limits(values: Mapping[str, Any]) -> SafetyLimits:
+    """Return the limits of the feedback checks.
+
+    Raises:
+        ParameterError: ``voltage_window`` is not a window.
+    """
+    window = values["voltage_window"]
+    if len(window) != 2:
+        raise ParameterError(f"voltage_window has {len(window)} values; expected [low, high] in V")
+    return SafetyLimits(
+        winding_temperature=values["winding_temperature_limit"],
+        voltage_min=window[0],
+        voltage_max=window[1],
+        measured_effort=values["measured_effort_limit"],
+        winding_current=values["winding_current_tolerance"],
+    )

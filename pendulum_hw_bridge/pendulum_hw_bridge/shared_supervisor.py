@@ -1,0 +1,90 @@
+"""The supervisor, used from two threads: messages arrive in one, the actuator's cycle runs in the other."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable
+
+from pendulum_msgs_py.commands import Refusal
+from pendulum_msgs_py.supervisor import Drive, Input, Mode, PlantLimits, PlantSupervisor
+from pendulum_msgs_py.trajectory import Trajectory
+from pendulum_msgs_py.values import JointCommand, JointSample
+
+__all__ = ["SharedSupervisor"]
+
+
+class SharedSupervisor(PlantSupervisor):
+    """A plant supervisor whose every step is taken under one lock, and that has the drive prepared before arming.
+
+    Args:
+        limits: The limits to keep.
+        prepare: Sets and confirms the drive's strategy; returns why it could not, or an empty string. Called outside
+            the lock, because it waits for the actuator's thread.
+        withdraw: Called where the plant was prepared but then not armed.
+    """
+
+    def __init__(
+        self, limits: PlantLimits, prepare: Callable[[], str], withdraw: Callable[[], None] = lambda: None
+    ) -> None:
+        self._lock = threading.RLock()
+        self._prepare = prepare
+        self._withdraw = withdraw
+        self._not_prepared = ""
+        super().__init__(limits, preflight=lambda: self._not_prepared)
+
+    def offer(self, kind: Input, command: JointCommand | None, now_ns: int) -> Refusal | None:
+        """Offer a message of an input."""
+        with self._lock:
+            return super().offer(kind, command, now_ns)
+
+    def set_commander_conflict(self, conflict: str) -> None:
+        """Report several publishers behind one name."""
+        with self._lock:
+            super().set_commander_conflict(conflict)
+
+    def accept_trajectory(self, trajectory: Trajectory, now_ns: int, sample: JointSample) -> str:
+        """Start to follow a trajectory."""
+        with self._lock:
+            return super().accept_trajectory(trajectory, now_ns, sample)
+
+    def arm(self, now_ns: int, sample: JointSample | None) -> str:
+        """Have the strategy set and confirmed, then arm."""
+        if self.mode is not Mode.DISARMED:
+            with self._lock:
+                return super().arm(now_ns, sample)
+        self._not_prepared = self._prepare()
+        with self._lock:
+            refusal = super().arm(now_ns, sample)
+        if refusal:
+            self._withdraw()
+        return refusal
+
+    def disarm(self, now_ns: int, reason: str = "disarmed on request") -> None:
+        """Release the drive."""
+        with self._lock:
+            super().disarm(now_ns, reason)
+
+    def e_stop(self, now_ns: int, reason: str = "e-stop pressed") -> None:
+        """Latch the e-stop."""
+        with self._lock:
+            super().e_stop(now_ns, reason)
+
+    def e_stop_reset(self, now_ns: int) -> str:
+        """Leave the e-stop for disarmed."""
+        with self._lock:
+            return super().e_stop_reset(now_ns)
+
+    def fault(self, reason: str, now_ns: int) -> None:
+        """Go to the fault state."""
+        with self._lock:
+            super().fault(reason, now_ns)
+
+    def decide(self, now_ns: int, sample: JointSample | None) -> Drive:
+        """Return what the plant has to do now."""
+        with self._lock:
+            return super().decide(now_ns, sample)
+
+    def report_applied(self, effort: float) -> None:
+        """Tell what torque was really applied."""
+        with self._lock:
+            super().report_applied(effort)
