@@ -5,7 +5,7 @@ The model, in measured coordinates (theta as the encoder says, u as recorded):
     J th'' = e (k m - k_b th') + tau_0 - b th' - G sin(th - th_0) - F(th', th) sgn th'
     m = u(t - d)                                  for a torque or a voltage
     m = V clip(g (u(t - d) - th), -1, 1)          for a servo that follows a set point u
-    F = c + s exp(-(th'/v_s)^2) + l |G sin(th - th_0)| + l_m |e k m|
+    F = c + s z + (1 + l_s z) |l G sin(th - th_0) + l_m e k m|,  z = exp(-(th'/v_s)^2)
 
 Integrator: second-order leapfrog; the linear damping is exact (exponential), dry friction is a set-valued law
 with true standstill, and a reversal inside a step is split at its instant, so that the solution and its
@@ -45,9 +45,10 @@ PARAMETER_NAMES = (
     "transport_delay",
     "drive_damping",
     "drive_load_friction",
+    "load_stribeck",
 )
 """Order of the parameter vector; the constants below are its indices."""
-J, B, G, C, S, VS, LG, T0, TH0, K, D, KB, LM = range(13)
+J, B, G, C, S, VS, LG, T0, TH0, K, D, KB, LM, LS = range(14)
 
 
 @njit(cache=True)  # type: ignore[misc]
@@ -102,7 +103,7 @@ def simulate_windows(
     """Simulate each window from its own initial state; write theta, omega and d theta / d(parameters, state).
 
     Args:
-        p: Parameter vector in the order of ``PARAMETER_NAMES``, shape (13,).
+        p: Parameter vector in the order of ``PARAMETER_NAMES``, shape (14,).
         columns: Indices of the parameters to differentiate, shape (k,), int64.
         windows: First and one past last sample of each window, shape (w, 2), int64.
         states: Initial angle [rad] and velocity [rad/s] of each window, shape (w, 2).
@@ -120,9 +121,9 @@ def simulate_windows(
     dth = np.zeros(width)
     dw = np.zeros(width)
     # Direct derivatives of smooth torque, friction and damping rate with respect to each parameter.
-    f_p = np.zeros(13)
-    fr_p = np.zeros(13)
-    l_p = np.zeros(13)
+    f_p = np.zeros(14)
+    fr_p = np.zeros(14)
+    l_p = np.zeros(14)
     inertia, gravity = p[J], p[G]
     inv = 1.0 / inertia
     for n in range(windows.shape[0]):
@@ -166,9 +167,11 @@ def simulate_windows(
                 rate = (p[B] + on * p[KB]) * inv
                 smooth = drive + p[T0] - gravity * sine
                 speed = abs(w)
-                bump = math.exp(-((speed / p[VS]) ** 2)) if p[S] > 0.0 else 0.0
-                load = abs(gravity * sine)
-                friction = p[C] + p[S] * bump + p[LG] * load + p[LM] * abs(drive)
+                bump = math.exp(-((speed / p[VS]) ** 2)) if p[S] > 0.0 or p[LS] > 0.0 or want else 0.0
+                # What the gears carry: drive and gravity press the teeth together when they oppose each other.
+                carried = p[LG] * gravity * sine + p[LM] * drive
+                raise_load = 1.0 + p[LS] * bump
+                friction = p[C] + p[S] * bump + raise_load * abs(carried)
                 x = rate * h
                 if x > 1e-4:
                     decay = math.exp(-x)
@@ -201,21 +204,23 @@ def simulate_windows(
                     l_p[B] = inv
                     l_p[KB] = on * inv
                     l_p[J] = -rate * inv
-                    s_sine = 1.0 if sine > 0.0 else -1.0
-                    s_drive = p[LM] * (1.0 if drive > 0.0 else -1.0)
-                    s_load = p[LG] * s_sine
+                    side = raise_load if carried > 0.0 else -raise_load
+                    peak = p[S] + p[LS] * abs(carried)
+                    s_drive = p[LM] * side
+                    s_load = p[LG] * side
                     fr_p[C] = 1.0
                     fr_p[S] = bump
-                    fr_p[VS] = p[S] * bump * 2.0 * speed * speed / p[VS] ** 3
-                    fr_p[LG] = load
-                    fr_p[LM] = abs(drive)
+                    fr_p[VS] = peak * bump * 2.0 * speed * speed / p[VS] ** 3
+                    fr_p[LG] = side * gravity * sine
+                    fr_p[LM] = side * drive
+                    fr_p[LS] = bump * abs(carried)
                     fr_p[G] = s_load * sine
                     fr_p[TH0] = -s_load * gravity * cosine
                     fr_p[K] = s_drive * f_p[K]
                     fr_p[D] = s_drive * f_p[D]
                     f_th = drive_th - gravity * cosine
                     fr_th = s_load * gravity * cosine + s_drive * drive_th
-                    fr_w = -p[S] * bump * 2.0 * speed / p[VS] ** 2 * sign
+                    fr_w = -peak * bump * 2.0 * speed / p[VS] ** 2 * sign
                     for c in range(width):
                         d_mid = dth[c] + 0.5 * h * dw[c]
                         d_f = f_th * d_mid

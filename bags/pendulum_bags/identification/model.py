@@ -12,7 +12,7 @@ from pendulum_msgs_py.plant_parameters import PlantParameters
 
 from pendulum_bags.identification.kernel import PARAMETER_NAMES
 
-__all__ = ["BOUNDS", "FRICTION_MODELS", "INDEX", "UNITS", "FitModel", "from_plant", "to_plant"]
+__all__ = ["BOUNDS", "FRICTION_MODELS", "INDEX", "PLANT_FRICTION_MODELS", "SERVO_ONLY", "UNITS", "FitModel", "from_plant", "to_plant"]
 
 Array = NDArray[np.float64]
 
@@ -33,6 +33,7 @@ UNITS: Mapping[str, str] = {
     "transport_delay": "s",
     "drive_damping": "N m s/rad",
     "drive_load_friction": "-",
+    "load_stribeck": "-",
 }
 
 BOUNDS: Mapping[str, tuple[float, float]] = {
@@ -41,14 +42,15 @@ BOUNDS: Mapping[str, tuple[float, float]] = {
     "gravity": (0.0, 1e4),
     "coulomb_friction": (0.0, 1e3),
     "stribeck_excess": (0.0, 1e3),
-    "stribeck_velocity": (0.02, 5.0),
+    "stribeck_velocity": (0.02, 2.0),
     "load_friction": (0.0, 0.9),
     "torque_offset": (-1e3, 1e3),
     "angle_offset": (-0.5, 0.5),
     "input_gain": (-1e4, 1e4),
-    "transport_delay": (-0.05, 0.25),
+    "transport_delay": (-0.03, 0.1),
     "drive_damping": (0.0, 1e3),
     "drive_load_friction": (0.0, 0.9),
+    "load_stribeck": (0.0, 10.0),
 }
 """Domain in which each parameter is sought; a delay below 0 means an input stamped late."""
 
@@ -58,8 +60,29 @@ FRICTION_MODELS: Mapping[str, tuple[str, ...]] = {
     "stribeck": ("coulomb_friction", "stribeck_excess", "stribeck_velocity"),
     "load": ("coulomb_friction", "load_friction"),
     "stribeck_load": ("coulomb_friction", "stribeck_excess", "stribeck_velocity", "load_friction"),
+    "gear_load": ("coulomb_friction", "load_friction", "drive_load_friction"),
+    "stribeck_gear_load": (
+        "coulomb_friction",
+        "stribeck_excess",
+        "stribeck_velocity",
+        "load_friction",
+        "drive_load_friction",
+    ),
+    "gear_load_stribeck": (
+        "coulomb_friction",
+        "stribeck_velocity",
+        "load_friction",
+        "drive_load_friction",
+        "load_stribeck",
+    ),
 }
-"""Dry friction that each model adds to the viscous one."""
+"""Dry friction that each model adds to the viscous one, simplest first."""
+
+SERVO_ONLY = ("stribeck_gear_load", "gear_load_stribeck")
+"""Models of geared servos that are offered, but not tried, for other drives: seldom determined there."""
+
+PLANT_FRICTION_MODELS = ("viscous", "coulomb", "stribeck", "load", "stribeck_load")
+"""Those that a plant file can hold: its friction knows the load of gravity, not that of the drive."""
 
 _DEFAULTS: Mapping[str, float] = {"inertia": 1.0, "gravity": 1.0, "input_gain": 1.0, "stribeck_velocity": 0.2}
 

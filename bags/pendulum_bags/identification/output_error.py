@@ -1,0 +1,356 @@
+"""Output-error identification: simulate, compare angles, adjust; friction chosen by held-out windows."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from pendulum_msgs_py.errors import DataError
+
+from pendulum_bags.datasets import Recording
+from pendulum_bags.identification.cross_validation import CrossValidation, cross_validate
+from pendulum_bags.identification.model import BOUNDS, FRICTION_MODELS, SERVO_ONLY, FitModel
+from pendulum_bags.identification.problem import Piece, prepare
+from pendulum_bags.identification.solver import Solution, residuals, robust_cost, solve
+from pendulum_bags.identification.starts import first_models, rank
+
+__all__ = ["GRAVITY", "Candidate", "Geometry", "Options", "OutputErrorFit", "fit_output_error"]
+
+Array = NDArray[np.float64]
+
+GRAVITY = 9.80665
+"""Standard acceleration of free fall [m/s^2]."""
+
+_FRICTION_STARTS: Mapping[str, tuple[Mapping[str, float], ...]] = {
+    # As shares of the Coulomb friction found before, and velocities in rad/s.
+    "stribeck": tuple({"stribeck_excess": 0.3, "stribeck_velocity": v} for v in (0.1, 1.0)),
+    "load": ({"load_friction": 0.02}, {"load_friction": 0.1}),
+    "gear_load": (
+        {"load_friction": 0.02, "drive_load_friction": 0.02},
+        {"load_friction": 0.1, "drive_load_friction": 0.3},
+    ),
+    "gear_load_stribeck": (
+        {"load_friction": 0.02, "drive_load_friction": 0.02, "load_stribeck": 0.2, "stribeck_velocity": 0.3},
+        {"load_friction": 0.2, "drive_load_friction": 0.3, "load_stribeck": 0.4, "stribeck_velocity": 0.3},
+    ),
+}
+
+
+@dataclass(frozen=True)
+class Geometry:
+    """What is known of the pendulum from scales and rulers; None where unknown.
+
+    Args:
+        mass: Moving mass [kg].
+        length: Joint axis to centre of mass [m].
+        inertia: About the joint axis [kg m^2].
+    """
+
+    mass: float | None = None
+    length: float | None = None
+    inertia: float | None = None
+
+    def __post_init__(self) -> None:
+        """Check that what is given is positive."""
+        for name, unit in (("mass", "kg"), ("length", "m"), ("inertia", "kg m^2")):
+            value = getattr(self, name)
+            if value is not None and not (np.isfinite(value) and value > 0.0):
+                raise DataError(f"{name} is {value} {unit}; expected > 0")
+
+    @property
+    def gravity(self) -> float | None:
+        """Gravity coefficient m g l [N m]."""
+        return None if self.mass is None or self.length is None else self.mass * GRAVITY * self.length
+
+    @property
+    def least_inertia(self) -> float | None:
+        """Inertia about the joint that no body of this mass and centre can undercut, m l^2 [kg m^2]."""
+        return None if self.mass is None or self.length is None else self.mass * self.length**2
+
+
+@dataclass(frozen=True)
+class Options:
+    """Choices of a fit; the defaults are meant to serve unseen data.
+
+    Args:
+        window: Length of the shooting windows [s]; None: 1 s for a torque, 2 s for a voltage, the whole
+            recording for a servo, whose position loop keeps a long simulation from drifting away.
+        friction: ``auto`` or one of ``FRICTION_MODELS``.
+        geometry: Known mass, length, inertia.
+        fix_scale: Whether a known m g l fixes the scale of torque (else it is only checked against).
+        delay, angle_offset, torque_offset: Whether each is fitted.
+        multi_start: Whether to search from several starts.
+        folds: Most folds of the cross-validation.
+        robust: Whether to use the soft-L1 loss.
+    """
+
+    window: float | None = None
+    friction: str = "auto"
+    geometry: Geometry = Geometry()
+    fix_scale: bool = False
+    delay: bool = True
+    angle_offset: bool = True
+    torque_offset: bool = True
+    multi_start: bool = True
+    folds: int = 6
+    robust: bool = True
+
+    def __post_init__(self) -> None:
+        """Check names."""
+        if self.friction != "auto" and self.friction not in FRICTION_MODELS:
+            raise DataError(f"friction is {self.friction!r}; expected auto or one of {', '.join(FRICTION_MODELS)}")
+        if self.fix_scale and self.geometry.gravity is None:
+            raise DataError("the scale is to be fixed by geometry, but mass or length is missing; expected both")
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """One friction model, fitted to all data and cross-validated."""
+
+    friction: str
+    free: tuple[str, ...]
+    solution: Solution
+    training_rms: float
+    validation: CrossValidation | None
+    mean_cost: float
+    effective: float
+
+    @property
+    def score(self) -> float:
+        """Held-out rms where there is one, else the training rms [rad]."""
+        return self.training_rms if self.validation is None else self.validation.rms
+
+
+@dataclass(frozen=True)
+class OutputErrorFit:
+    """The chosen candidate and all others, with the data as cut."""
+
+    chosen: Candidate
+    candidates: tuple[Candidate, ...]
+    pieces: tuple[Piece, ...]
+    scale: float
+    options: Options
+    window: float | None
+    sign_flipped: bool
+
+    @property
+    def model(self) -> FitModel:
+        """The fitted model."""
+        return self.chosen.solution.model
+
+
+def fit_output_error(recordings: Sequence[Recording], options: Options = Options()) -> OutputErrorFit:
+    """Fit the model to recordings of one and the same pendulum.
+
+    Args:
+        recordings: At least one; all with the same kind of input.
+        options: Choices.
+
+    Raises:
+        DataError: for no data, mixed inputs, or a recording in which nothing moves.
+    """
+    fixed, free = _frame(recordings, options)
+    window = options.window or {"effort": 1.0, "none": 1.0, "voltage": 2.0}.get(fixed.input_kind)
+    pieces = [prepare(recording, window) for recording in recordings]
+    longest = max(recordings, key=lambda r: r.duration)
+    base = (*free, "coulomb_friction")
+    models = first_models(longest, fixed, base, spread=options.multi_start)
+    # Ranked twice: by a loss that can pull from far, and by one that a single pushed window cannot sway.
+    starts = [start for scale in (0.3, 0.03) for start in rank(models, pieces, base, scale=scale, keep=2)]
+    best, scale = _anneal(starts, pieces, base, options.robust)
+    names = [options.friction]
+    if options.friction == "auto":
+        names = [n for n in FRICTION_MODELS if n not in SERVO_ONLY or fixed.input_kind == "position_goal"]
+    candidates: list[Candidate] = []
+    for name in names:
+        candidates.append(_fit_friction(name, best, pieces, free, scale, candidates, options))
+    chosen = _choose(candidates)
+    flipped = fixed.input_kind in {"effort", "voltage"} and chosen.solution.model["input_gain"] < 0.0
+    return OutputErrorFit(chosen, tuple(candidates), tuple(pieces), scale, options, window, flipped)
+
+
+def _frame(recordings: Sequence[Recording], options: Options) -> tuple[FitModel, tuple[str, ...]]:
+    """Return what is fixed, and the names of what is fitted apart from dry friction."""
+    if not recordings:
+        raise DataError("there is no recording to identify from; expected at least one")
+    kinds = {recording.input_kind for recording in recordings}
+    if len(kinds) > 1:
+        raise DataError(f"the recordings have different inputs ({', '.join(sorted(kinds))}); expected one kind")
+    for recording in recordings:
+        if np.ptp(recording.position) < 1e-2:
+            raise DataError(
+                f"{recording.name} moves by {np.ptp(recording.position):.2g} rad only; expected a moving pendulum"
+            )
+    kind = kinds.pop()
+    geometry = options.geometry
+    values: dict[str, float] = {}
+    free = ["damping", "gravity"]
+    duty_gain = 0.0
+    if kind == "position_goal":
+        geometry = geometry if geometry.gravity is not None else _geometry_of(recordings)
+        values.update(gravity=geometry.gravity or 1.0, inertia=geometry.inertia or geometry.least_inertia or 1.0)
+        duty_gain = float(np.median([_duty_gain(recording) for recording in recordings]))
+        # The bob fixes the scale; its arm's zero is an angle, so a torque offset would only double it.
+        free = ["damping", "inertia", "input_gain", "drive_damping"]
+    elif kind == "none" or (kind == "voltage" and not options.fix_scale):
+        values["inertia"] = geometry.inertia or 1.0
+        if kind == "voltage":
+            free.append("input_gain")
+    elif options.fix_scale:
+        values["gravity"] = float(geometry.gravity or 1.0)
+        free = ["damping", "inertia", "input_gain"]
+    else:
+        free.append("inertia")
+    if options.torque_offset and kind in {"effort", "voltage"}:
+        free.append("torque_offset")
+    if options.angle_offset:
+        free.append("angle_offset")
+    if options.delay and kind != "none":
+        free.append("transport_delay")
+    return FitModel(values, kind, "coulomb", duty_gain), tuple(free)
+
+
+def _geometry_of(recordings: Sequence[Recording]) -> Geometry:
+    known = {(float(r.meta["mass"]), float(r.meta["length"])) for r in recordings if {"mass", "length"} <= r.meta.keys()}
+    if len(known) != 1:
+        raise DataError(f"the servo logs name {len(known)} pairs of mass and length; expected one, or --mass and --length")
+    mass, length = known.pop()
+    return Geometry(mass, length)
+
+
+def _duty_gain(recording: Recording) -> float:
+    """Return duty cycle per set-point error and firmware gain [1/rad], from the servo's own load report."""
+    if "load" not in recording.meta:
+        # P gain / 128 in encoder steps (4096 a turn) to PWM units (885 full), by the servo's control table.
+        return 4096.0 / (2.0 * np.pi) / (128.0 * 885.0)
+    load, error = np.asarray(recording.meta["load"]), recording.input - recording.position
+    use = np.abs(load) < 0.8
+    if recording.enabled is not None:
+        use &= recording.enabled > 0.5
+    kp = float(recording.meta.get("kp", 1.0))
+    slopes = load[use][np.abs(error[use]) > 0.03] / error[use][np.abs(error[use]) > 0.03]
+    return float(np.median(slopes) / kp) if slopes.size > 10 else 0.0025
+
+
+def _anneal(
+    starts: Sequence[Solution], pieces: Sequence[Piece], free: Sequence[str], robust: bool
+) -> tuple[Solution, float]:
+    """Return the best fit and the scale of its loss, tightened step by step so that a push by hand loses its pull."""
+    if not robust:
+        finals = [solve(s.model, pieces, free, tolerance=1e-7) for s in starts]
+        return min(finals, key=lambda s: s.cost), np.inf
+    finalists = []
+    for start in starts:
+        for first_scale in (0.3, 0.03):
+            s = solve(start.model, pieces, free, scale=first_scale, tolerance=1e-4, max_iterations=25)
+            finalists.append(
+                solve(s.model, pieces, free, states=s.states, scale=0.03, tolerance=1e-5, max_iterations=30)
+            )
+    best = min(finalists, key=lambda s: s.cost)
+    scale = _robust_scale(best, pieces)
+    return solve(best.model, pieces, free, states=best.states, scale=scale, tolerance=1e-7), scale
+
+
+def _robust_scale(solution: Solution, pieces: Sequence[Piece]) -> float:
+    """Return three robust standard deviations of the residual: the loss leaves good samples quadratic [rad]."""
+    parts = residuals(solution.model, pieces, solution.states)
+    inside = np.concatenate([part[piece.mask()] for part, piece in zip(parts, pieces)])
+    spread = 1.4826 * float(np.median(np.abs(inside - np.median(inside))))
+    return max(3.0 * spread, 1e-6)
+
+
+def _fit_friction(
+    name: str,
+    start: Solution,
+    pieces: Sequence[Piece],
+    free: Sequence[str],
+    scale: float,
+    simpler: Sequence[Candidate],
+    options: Options,
+) -> Candidate:
+    """Fit one friction model from the best simpler fits, and cross-validate it."""
+    names = FRICTION_MODELS[name]
+    everything = (*free, *names)
+    begin: list[tuple[FitModel, list[Array]]] = []
+    # A simpler model is contained in this one: starting there, the cost cannot end above it.
+    for previous in (start, *(c.solution for c in simpler if set(FRICTION_MODELS[c.friction]) <= set(names))):
+        model = previous.model
+        values = {k: v for k, v in model.values.items() if k in free or not _is_friction(k) or k in names}
+        plain = FitModel(values, model.input_kind, name, model.duty_gain)
+        begin.append((plain, previous.states))
+    kind = name.replace("stribeck_", "") if name != "stribeck" else name
+    additions = _FRICTION_STARTS.get(kind, ()) + (_FRICTION_STARTS["stribeck"] if name.startswith("stribeck_") else ())
+    coulomb = max(start.model["coulomb_friction"], 1e-3 * abs(start.model["gravity"]))
+    for addition in additions:
+        values = {**start.model.values, **addition}
+        if "stribeck_excess" in addition:
+            values["stribeck_excess"] = addition["stribeck_excess"] * coulomb
+        else:
+            values["coulomb_friction"] = 0.5 * coulomb
+        begin.append((FitModel(values, start.model.input_kind, name, start.model.duty_gain), start.states))
+    solutions = [solve(m, pieces, everything, states=s, scale=scale, tolerance=1e-7) for m, s in begin]
+    best = min(solutions, key=lambda s: s.cost)
+    best = replace(best, model=FitModel(best.model.values, best.model.input_kind, name, best.model.duty_gain))
+    parts = residuals(best.model, pieces, best.states)
+    inside = np.concatenate([part[piece.mask()] for part, piece in zip(parts, pieces)])
+    validation = cross_validate(best.model, pieces, best.states, everything, scale, count=options.folds)
+    mean_cost = robust_cost(inside, scale) / inside.size
+    rms = float(np.sqrt(np.mean(inside**2)))
+    return Candidate(name, everything, best, rms, validation, mean_cost, effective_samples(parts, pieces))
+
+
+def _is_friction(name: str) -> bool:
+    return any(name in names for names in FRICTION_MODELS.values())
+
+
+def effective_samples(parts: Sequence[Array], pieces: Sequence[Piece]) -> float:
+    """Return how many independent samples carry as much as the correlated residuals do, N / (1 + 2 sum rho)."""
+    total, longest = 0, max(int(np.max(np.diff(piece.windows, axis=1))) for piece in pieces)
+    products = np.zeros(min(longest, 2000))
+    for part, piece in zip(parts, pieces):
+        for first, stop in piece.windows:
+            r = part[first:stop]
+            total += r.size
+            spectrum = np.abs(np.fft.rfft(r, 2 * r.size)) ** 2
+            products[: r.size] += np.fft.irfft(spectrum)[: min(r.size, products.size)]
+    if products[0] <= 0.0:
+        return float(total)
+    rho = products / products[0]
+    # Sum up to the first zero crossing: beyond it an estimate of rho is noise.
+    end = int(np.argmax(rho <= 0.0)) or rho.size
+    return float(max(total / (1.0 + 2.0 * np.sum(rho[1:end])), 8.0))
+
+
+def _choose(candidates: Sequence[Candidate]) -> Candidate:
+    """Return the candidate of least information criterion among those that predict as well as the best.
+
+    Held-out windows rule out what predicts worse than the best by more than one standard error of the paired
+    difference (at least 2 %, the accuracy of the fits without a fold, and at most 25 %, since few folds give no
+    honest error); among the rest the training data decide by Schwarz's criterion on effective samples.
+    """
+    # One count for all: what a poor model leaves correlated is its own fault, not a lack of data.
+    count = max(candidate.effective for candidate in candidates)
+
+    def criterion(candidate: Candidate) -> float:
+        return float(count * np.log(max(candidate.mean_cost, 1e-18)) + len(candidate.free) * np.log(count))
+
+    if any(candidate.validation is None for candidate in candidates):
+        return min(candidates, key=criterion)
+    losses = {c.friction: c.validation.losses for c in candidates if c.validation is not None}
+    best = min(candidates, key=lambda c: float(losses[c.friction].sum()))
+    least = float(losses[best.friction].sum())
+    admissible = []
+    for candidate in candidates:
+        difference = losses[candidate.friction] - losses[best.friction]
+        error = float(np.std(difference, ddof=1) * np.sqrt(difference.size)) if difference.size > 1 else 0.0
+        if float(difference.sum()) <= np.clip(error, 0.02 * least, 0.25 * least):
+            admissible.append(candidate)
+    return min(admissible, key=criterion)
+
+
+def at_bounds(candidate: Candidate) -> list[str]:
+    """Return the fitted parameters that ended at the edge of their domain."""
+    model = candidate.solution.model
+    return [n for n in candidate.free if model[n] <= BOUNDS[n][0] or model[n] >= BOUNDS[n][1]]
