@@ -156,7 +156,7 @@ class Recorder(Node):
         self._refused_types: set[str] = set()
         self._lock = threading.RLock()
         self._events = f"{self.get_fully_qualified_name()}/{EVENTS}"
-        self._parameters = NodeParameters(self, SPECS, self._on_parameters)
+        self._settings = NodeParameters(self, SPECS, self._on_parameters)
         self._parameter_reader = ParameterReader(self, self._on_node_parameters)
         if not options.wait:
             self._begin()
@@ -392,7 +392,7 @@ class Recorder(Node):
         return response
 
     def _on_annotate(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
-        self.note("annotation", text=self._parameters["annotation"])
+        self.note("annotation", text=self._settings["annotation"])
         response.success = self._session is not None
         response.message = "noted" if response.success else "nothing is being recorded"
         return response

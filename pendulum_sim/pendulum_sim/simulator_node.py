@@ -88,8 +88,8 @@ class SimulatorNode(Node):
 
     def __init__(self, stop: Callable[[], None]) -> None:  # noqa: ARG002  (the runner offers it to all)
         super().__init__("simulator")
-        self._parameters = NodeParameters(self, SPECS, self._check_start)
-        values = self._parameters.values
+        self._settings = NodeParameters(self, SPECS, self._check_start)
+        values = self._settings.values
         parameters = load_plant(values["plant"])
         period_ns = round(NANOSECONDS / values["rate_hz"])
         self._dt = period_ns / NANOSECONDS
@@ -203,7 +203,7 @@ class SimulatorNode(Node):
                 raise ParameterError(f"{name} is {values[name]}; expected a finite number")
 
     def _on_reset(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
-        refusal = self._reset(*self._start_state(self._parameters.values))
+        refusal = self._reset(*self._start_state(self._settings.values))
         state = self._state
         response.success = not refusal
         response.message = refusal or f"theta {state.theta:.6f} rad, theta_dot {state.theta_dot:.6f} rad/s"
@@ -242,7 +242,7 @@ class SimulatorNode(Node):
         return response
 
     def _diagnostics(self) -> Mapping[str, object]:
-        values = self._parameters.values
+        values = self._settings.values
         figures: dict[str, object] = {
             "plant": values["plant"],
             "method": values["method"],
