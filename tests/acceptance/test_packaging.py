@@ -167,7 +167,7 @@ def test_a_manifest_is_valid_and_names_every_package_of_ros_that_the_code_import
 
 
 def test_make_alone_prints_one_line_for_each_target() -> None:
-    # A make that runs these tests hands its flags down, and a make below it would print the folders it enters.
+    # A make that runs these tests hands its flags down; with them make would print the folders it enters.
     environment = {name: value for name, value in os.environ.items() if not name.startswith("MAKE")}
     done = subprocess.run(
         ["make"], cwd=PROJECT, capture_output=True, text=True, check=True, timeout=20, env=environment
