@@ -67,7 +67,7 @@ imports: $(VENV)/.linked # Check which package and which module may import what
 	@$(VENV)/bin/lint-imports $(ARGS)
 
 build: $(VENV)/.linked # Build the five packages with colcon into install/, as for ros2 run
-	@$(VENV)/bin/colcon build --base-paths $(PACKAGES) $(ARGS)
+	@unset PYTHONDONTWRITEBYTECODE; exec $(VENV)/bin/colcon build --base-paths $(PACKAGES) $(ARGS)
 
 faults: $(VENV)/.linked # Attack the running system, count what it stood, print a table (the long form of tests/faults)
 	@$(PY) -m tests.faults.run $(ARGS)

@@ -1,0 +1,76 @@
+"""The import rules bite: each kind of offence, put into a copy of the packages, is found and named."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from tests.fixtures import PROJECT
+
+FOLDERS = ["pendulum_msgs_py", "pendulum_sim", "pendulum_lqr", "pendulum_hw_bridge", "bags"]
+
+OFFENCES = {
+    "a core that imports ROS": (
+        "pendulum_lqr/pendulum_lqr/offender.py",
+        "import rclpy",
+        "line 1: import rclpy",
+    ),
+    "a core that imports messages in a function": (
+        "pendulum_lqr/pendulum_lqr/offender.py",
+        "def late():\n    from sensor_msgs.msg import JointState\n    return JointState",
+        "line 2: from sensor_msgs.msg import JointState",
+    ),
+    "a core that imports a shell": (
+        "pendulum_lqr/pendulum_lqr/offender.py",
+        "from pendulum_msgs_py.ros import qos",
+        "pendulum_lqr.offender, line 1",
+    ),
+    "a robot that imports the simulator": (
+        "pendulum_hw_bridge/pendulum_hw_bridge/offender.py",
+        "import pendulum_sim",
+        "pendulum_hw_bridge.offender -> pendulum_sim",
+    ),
+    "a vocabulary that imports what stands on it": (
+        "pendulum_msgs_py/pendulum_msgs_py/offender.py",
+        "import pendulum_bags",
+        "pendulum_msgs_py.offender -> pendulum_bags",
+    ),
+    "a simulator that imports the vendor's library": (
+        "pendulum_sim/pendulum_sim/offender.py",
+        "import hebi",
+        "pendulum_sim.offender -> hebi",
+    ),
+}
+
+
+def lint_imports(root: Path) -> subprocess.CompletedProcess[str]:
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(str(root / folder) for folder in FOLDERS)}
+    command = [str(Path(sys.executable).with_name("lint-imports")), "--no-cache"]
+    return subprocess.run(command, cwd=root, env=environment, capture_output=True, text=True, check=False)
+
+
+@pytest.fixture
+def copy(tmp_path: Path) -> Path:
+    """Copy the packages and the rules, to be spoilt."""
+    for folder in FOLDERS:
+        shutil.copytree(
+            PROJECT / folder, tmp_path / folder, ignore=shutil.ignore_patterns("__pycache__", "runs")
+        )
+    (tmp_path / "tests").mkdir()
+    for name in ("pyproject.toml", "tests/__init__.py", "tests/import_rules.py"):
+        shutil.copyfile(PROJECT / name, tmp_path / name)
+    return tmp_path
+
+
+@pytest.mark.parametrize("offence", OFFENCES)
+def test_an_offence_is_found_and_named(copy: Path, offence: str) -> None:
+    where, code, named = OFFENCES[offence]
+    (copy / where).write_text(f"{code}\n", encoding="utf-8")
+    done = lint_imports(copy)
+    assert done.returncode == 1, done.stdout
+    assert named in " ".join(done.stdout.split()), done.stdout
