@@ -13,9 +13,11 @@ import typer
 from rich.console import Console
 from rich.table import Table
 
+from pendulum_bags.experiment.domain import check_domain
 from pendulum_bags.experiment.progress import PhaseProgress
-from pendulum_bags.experiment.run_folder import create_run_folder, versions, write_json
+from pendulum_bags.experiment.run_folder import create_run_folder, discard_if_empty, versions, write_json
 from pendulum_bags.experiment.settings import NoiseSettings, RegulationSettings
+from pendulum_msgs_py.errors import PendulumError
 from pendulum_msgs_py.executables import EXIT_INTERRUPTED, cli_main
 
 __all__ = ["app", "main"]
@@ -80,6 +82,7 @@ def thesis(
         noise=NoiseSettings(seed, amplitude, hold_time, duration),
         storage=storage,
     )
+    check_domain(domain)
     folder = create_run_folder(out, "thesis")
     console = Console(stderr=json_output, highlight=False)
     started = time.monotonic()
@@ -89,8 +92,12 @@ def thesis(
             progress.phase("comparing", 5.0)
             summary = _analyse(folder, settings)
     except KeyboardInterrupt:
-        console.print(f"interrupted: all programs have ended; what was recorded until then is in {folder}")
+        kept = f"what was recorded until then is in {folder}" if not discard_if_empty(folder) else "nothing was recorded"
+        console.print(f"interrupted: all programs have ended; {kept}")
         raise typer.Exit(EXIT_INTERRUPTED) from None
+    except PendulumError:
+        discard_if_empty(folder)
+        raise
     if json_output:
         print(json.dumps(summary, indent=2))
     else:

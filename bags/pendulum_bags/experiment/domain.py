@@ -12,7 +12,7 @@ from pathlib import Path
 
 from pendulum_msgs_py.errors import FaultError, ParameterError
 
-__all__ = ["MAX_DOMAIN", "reserve_domain"]
+__all__ = ["MAX_DOMAIN", "check_domain", "is_unused", "reserve_domain"]
 
 MAX_DOMAIN = 100
 """Beyond 101 the ports of a domain overlap those that Linux hands out to any client."""
@@ -29,14 +29,8 @@ def reserve_domain(requested: int | None = None) -> Iterator[int]:
         ParameterError: The domain asked for is no domain.
         FaultError: All domains are in use.
     """
-    if requested is None and os.environ.get("ROS_DOMAIN_ID"):
-        text = os.environ["ROS_DOMAIN_ID"]
-        if not text.isdigit():
-            raise ParameterError(f"ROS_DOMAIN_ID is {text!r}; expected an integer from 0 to {MAX_DOMAIN}")
-        requested = int(text)
+    requested = check_domain(requested)
     if requested is not None:
-        if not 0 <= requested <= MAX_DOMAIN:
-            raise ParameterError(f"ROS domain is {requested}; expected 0 to {MAX_DOMAIN}")
         yield requested
         return
     folder = Path(tempfile.gettempdir(), f"pendulum_domains_{os.getuid()}")
@@ -52,6 +46,22 @@ def reserve_domain(requested: int | None = None) -> Iterator[int]:
                 yield domain
                 return
     raise FaultError(f"all ROS domains from 1 to {MAX_DOMAIN} are in use on this machine")
+
+
+def check_domain(requested: int | None) -> int | None:
+    """Return the domain that the user or ``ROS_DOMAIN_ID`` asks for, None for any.
+
+    Raises:
+        ParameterError: It is no domain.
+    """
+    if requested is None and os.environ.get("ROS_DOMAIN_ID"):
+        text = os.environ["ROS_DOMAIN_ID"]
+        if not text.isdigit():
+            raise ParameterError(f"ROS_DOMAIN_ID is {text!r}; expected an integer from 0 to {MAX_DOMAIN}")
+        requested = int(text)
+    if requested is not None and not 0 <= requested <= MAX_DOMAIN:
+        raise ParameterError(f"ROS domain is {requested}; expected 0 to {MAX_DOMAIN}")
+    return requested
 
 
 def is_unused(domain: int) -> bool:

@@ -6,6 +6,7 @@ import importlib.metadata
 import json
 import os
 import platform
+import shutil
 import subprocess
 from datetime import datetime, timezone
 from pathlib import Path
@@ -13,7 +14,7 @@ from typing import Any
 
 from pendulum_msgs_py.errors import BagError
 
-__all__ = ["create_run_folder", "git_revision", "versions", "write_json"]
+__all__ = ["create_run_folder", "discard_if_empty", "git_revision", "versions", "write_json"]
 
 _PACKAGES = (
     "pendulum_msgs_py",
@@ -56,6 +57,14 @@ def create_run_folder(out: Path | None, experiment: str) -> Path:
     if not os.access(out, os.W_OK):
         raise BagError(f"run folder {out} cannot be written: permission denied")
     return out
+
+
+def discard_if_empty(folder: Path) -> bool:
+    """Remove a run's folder in which no bag has been begun; tell whether it was removed."""
+    if any(folder.glob("*/metadata.yaml")):
+        return False
+    shutil.rmtree(folder, ignore_errors=True)
+    return True
 
 
 def versions() -> dict[str, str]:

@@ -1,0 +1,167 @@
+"""``make experiment`` as its user meets it: a result, an interruption, a mistake."""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from pendulum_bags.reader import read_bag, same_messages
+from tests.fixtures import PROJECT
+from tests.processes import ProcessGroup
+
+NOISE = 5.0
+RAMP = math.pi / 0.002 / 100.0
+
+
+@pytest.fixture(scope="module")
+def run_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Run the whole experiment once, through make, and return its folder."""
+    folder = tmp_path_factory.mktemp("experiment") / "run"
+    environment = {key: value for key, value in os.environ.items() if key != "ROS_DOMAIN_ID"}
+    done = subprocess.run(
+        ["make", "--no-print-directory", "experiment", f"OUT={folder}"],
+        cwd=PROJECT,
+        env=environment,
+        capture_output=True,
+        text=True,
+        timeout=240,
+        check=False,
+    )
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert "report.html" in done.stdout
+    return folder
+
+
+@pytest.mark.timeout(300)
+def test_experiment_leaves_two_bags_a_summary_figures_and_a_report(run_folder: Path) -> None:
+    summary = json.loads((run_folder / "summary.json").read_text())
+
+    for plant in ("sim", "hw"):
+        figures = summary["plants"][plant]
+        assert {"rate_hz", "missed_deadlines", "std_theta", "std_theta_dot", "max_abs_u"} <= figures.keys()
+        # Under one and the same noise held for 10 ms: the bands of 200 simulated seeds, widened for one seed.
+        assert 0.002 < figures["std_theta"] < 0.009
+        assert 0.2 < figures["max_abs_u"] < 0.9
+    assert summary["plants"]["sim"]["rate_hz"] == pytest.approx(500.0, rel=0.02)
+    assert summary["plants"]["hw"]["rate_hz"] == pytest.approx(100.0, rel=0.02)
+    assert {"paired", "unpaired", "seed", "strategy", "versions"} <= summary.keys()
+    assert list((run_folder / "figures").glob("*.png"))
+    assert (run_folder / "report.html").stat().st_size < 5_000_000
+
+
+def test_both_bags_hold_the_whole_experiment(run_folder: Path) -> None:
+    for name in ("sim", "hw"):
+        bag = read_bag(run_folder / name)
+        states = bag[f"/{name}/joint_states"]
+        duration = (states["stamp_ns"][-1] - states["stamp_ns"][0]) * 1e-9
+        assert duration > 2 * RAMP + NOISE
+        assert states["position"].max() == pytest.approx(math.pi, abs=0.05)
+        assert abs(states["position"][-1]) < 0.05
+        events = [event["name"] for event in bag.events()]
+        for phase in ("ramp_up", "regulation", "noise_start", "noise_end", "ramp_down", "done"):
+            assert phase in events
+
+
+def test_hand_over_to_lqr_and_back_makes_no_jump_in_torque(run_folder: Path) -> None:
+    for name in ("sim", "hw"):
+        bag = read_bag(run_folder / name)
+        times = {event["name"]: event["stamp_ns"] for event in bag.events()}
+        applied = bag[f"/{name}/applied_effort"]
+        calm = (applied["stamp_ns"] > times["ramp_up"] + 500_000_000) & (
+            applied["stamp_ns"] < times["noise_start"] - 20_000_000
+        )
+        assert abs(applied["effort"][calm][1:] - applied["effort"][calm][:-1]).max() < 0.5
+
+
+def test_both_plants_got_the_same_noise(run_folder: Path) -> None:
+    signals = {}
+    for name in ("sim", "hw"):
+        bag = read_bag(run_folder / name)
+        start = next(event["stamp_ns"] for event in bag.events() if event["name"] == "noise_start")
+        noise = bag[f"/{name}/disturbance"]
+        index = (noise["stamp_ns"] - start) // 10_000_000
+        kept = (index >= 0) & (index < 500)
+        signals[name] = dict(zip(index[kept].tolist(), noise["effort"][kept].tolist()))
+    common = signals["sim"].keys() & signals["hw"].keys()
+    assert len(common) > 450
+    # The hardware's stamps jitter about the edges of the holds, so a sample may be read one hold late.
+    equal = sum(
+        signals["hw"][i] in {signals["sim"].get(i - 1), signals["sim"][i], signals["sim"].get(i + 1)} for i in common
+    )
+    assert equal == len(common)
+
+
+@pytest.mark.timeout(180)
+def test_lockstep_runs_with_one_seed_are_identical_message_by_message(tmp_path: Path) -> None:
+    for name, seed in (("first", 5), ("second", 5), ("other", 6)):
+        _lockstep(tmp_path / name, seed)
+    first, second, other = (tmp_path / name for name in ("first", "second", "other"))
+    topics = ["/sim/joint_states", "/sim/effort_command", "/sim/disturbance", "/sim/applied_effort", "/clock"]
+
+    assert same_messages(first, second, topics=topics)
+    assert not same_messages(first, other, topics=topics)
+    assert len(read_bag(first)["/sim/joint_states"]) == 501
+
+
+@pytest.mark.parametrize("moment", ["starting", "ramp up"])
+@pytest.mark.timeout(120)
+def test_ctrl_c_leaves_no_process_and_readable_bags(
+    processes: ProcessGroup, domain_id: int, tmp_path: Path, moment: str
+) -> None:
+    folder = tmp_path / "run"
+    program = processes.start("pendulum_bags", "experiment", "thesis", "--out", folder)
+    program.wait_for_output(moment, 60)
+    if moment == "ramp up":
+        program.wait_for_output("ramp up", 60)
+    program.interrupt()
+
+    assert program.wait(30) == 130
+    assert "interrupted" in program.output
+    assert processes.leftovers() == []
+    if moment == "ramp up":
+        for name in ("sim", "hw"):
+            states = read_bag(folder / name)[f"/{name}/applied_effort"]
+            assert states["effort"][-1] == 0.0
+
+
+@pytest.mark.parametrize(
+    ("arguments", "expected"),
+    [
+        (["--plant", "nope"], "plant is 'nope'; expected one of the presets"),
+        (["--plant", "/no/such/file.yaml"], "/no/such/file.yaml does not exist"),
+        (["--hardware", "arduino"], "hardware is 'arduino'; expected one of emulator, hebi"),
+        (["--amplitude", "nan"], "noise amplitude is nan N m; expected"),
+        (["--hold-time", "0"], "noise hold time is 0.0 s; expected"),
+        (["--out", "."], "exists and is not empty"),
+        (["--out", "/proc/run"], "cannot be made"),
+        (["--domain", "400"], "ROS domain is 400; expected 0 to 100"),
+    ],
+)
+def test_a_mistake_ends_with_one_sentence_and_leaves_nothing(
+    tmp_path: Path, arguments: list[str], expected: str
+) -> None:
+    (tmp_path / "something").touch()
+    done = subprocess.run(
+        [sys.executable, "-m", "pendulum_bags", "experiment", "thesis", *arguments],
+        cwd=tmp_path,
+        capture_output=True,
+        text=True,
+        timeout=60,
+        check=False,
+    )
+    assert done.returncode == 2
+    assert expected in done.stderr
+    assert "Traceback" not in done.stderr
+    assert [path.name for path in tmp_path.iterdir()] == ["something"]
+
+
+def _lockstep(bag: Path, seed: int) -> None:
+    command = [sys.executable, "-m", "pendulum_bags", "experiment", "lockstep", "--bag", str(bag)]
+    environment = {key: value for key, value in os.environ.items() if key != "ROS_DOMAIN_ID"}
+    subprocess.run([*command, "--seed", str(seed), "--duration", "1"], env=environment, timeout=90, check=True)
