@@ -77,7 +77,7 @@ faults: $(VENV)/.linked # Attack the running system, count what it stood, print 
 LOCK := $(VENV)/.uv/bin/uv pip compile --quiet --universal --python-version 3.10 --generate-hashes --no-header --no-annotate --no-emit-index-url
 
 lock: $(VENV)/.made # Compile requirements*.in into requirements*.txt with hashes (ARGS=--upgrade renews the versions)
-	@test -x $(VENV)/.uv/bin/uv || { $(PY) -m venv $(VENV)/.uv && $(VENV)/.uv/bin/pip --quiet --disable-pip-version-check install uv; }
+	@test -x $(VENV)/.uv/bin/uv || { $(PY) -m venv $(VENV)/.uv && $(VENV)/.uv/bin/pip --quiet --quiet --disable-pip-version-check install uv; }
 	@$(LOCK) $(ARGS) requirements.in --output-file requirements.txt
 	@$(LOCK) $(ARGS) requirements-bench.in --constraint requirements.txt --output-file requirements-bench.txt \
 	  $$(sed -n 's/^\([A-Za-z0-9._-]*\)==.*/--no-emit-package \1/p' requirements.txt)
