@@ -9,6 +9,8 @@ EXECUTABLES: dict[str, str] = {
     "experiment": "pendulum_bags.experiment_cli:main",
     "identify": "pendulum_bags.identify_cli:main",
     "report": "pendulum_bags.report_cli:main",
+    "export": "pendulum_bags.export_cli:main",
+    "play": "pendulum_bags.topic_replay_node:main",
     "info": "pendulum_bags.info_cli:main",
     "repair": "pendulum_bags.repair_cli:main",
 }

@@ -15,7 +15,7 @@ import numpy.typing as npt
 
 from pendulum_msgs_py.errors import BagError, DataError
 
-from pendulum_bags.reader.batches import Batch, Source, Stream
+from pendulum_bags.reader.batches import Batch, Int64, Source, Stream
 from pendulum_bags.reader.joint_state import JointStateParser
 from pendulum_bags.reader.open_source import BagFolder, open_folder, open_sources
 
@@ -156,6 +156,13 @@ class Bag(Mapping[str, Any]):
             rows = [(time, decompress().decompress(data)) for time, data in rows]
         rows.sort(key=lambda row: row[0])
         return rows
+
+    def log_times(self, topic: str) -> Int64:
+        """Return the log times of a topic in ascending order [ns], shape (n,), without reading its messages."""
+        if topic not in self._topics:
+            return self[topic]["log_time_ns"]  # raises
+        times = [batch.times for batch in self._batches({topic})[topic]]
+        return np.sort(np.concatenate(times)) if times else np.empty(0, np.int64)
 
     def messages(self, topic: str) -> list[StoredMessage]:
         """Return all messages of a topic as objects, whatever their type.
