@@ -6,4 +6,5 @@ EXECUTABLES: dict[str, str] = {
     "simulator": "pendulum_sim.simulator_node:main",
     "viewer": "pendulum_sim.viewer_node:main",
     "phase_plot": "pendulum_sim.phase_plot:main",
+    "export_model": "pendulum_sim.model_files:main",
 }

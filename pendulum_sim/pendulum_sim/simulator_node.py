@@ -86,7 +86,7 @@ class SimulatorNode(Node):
         stop: Asks the runner to end the process.
     """
 
-    def __init__(self, stop: Callable[[], None]) -> None:  # noqa: ARG002  (the runner offers it to all)
+    def __init__(self, stop: Callable[[], None]) -> None:
         super().__init__("simulator")
         self._settings = NodeParameters(self, SPECS, self._check_start)
         values = self._settings.values
