@@ -5,12 +5,11 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 
-from pendulum_msgs_py.angles import wrap
-from pendulum_msgs_py.plant_parameters import PlantParameters
-
 from pendulum_lqr.design import Gain, continuous_lqr
 from pendulum_lqr.model import linearise
 from pendulum_lqr.roa import proven_level
+from pendulum_msgs_py.angles import wrap
+from pendulum_msgs_py.plant_parameters import PlantParameters
 
 __all__ = ["Catch", "make_catch"]
 
@@ -42,7 +41,9 @@ class Catch:
 
     def value(self, angle: float, velocity: float) -> float:
         """Return x' S x."""
-        return self._s00 * angle * angle + 2.0 * self._s01 * angle * velocity + self._s11 * velocity * velocity
+        return (
+            self._s00 * angle * angle + 2.0 * self._s01 * angle * velocity + self._s11 * velocity * velocity
+        )
 
     def holds(self, angle: float, velocity: float) -> bool:
         """Tell whether the LQR is in charge at a state, and remember it."""

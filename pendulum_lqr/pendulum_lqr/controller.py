@@ -12,12 +12,11 @@ from collections.abc import Mapping, Sequence
 from difflib import get_close_matches
 from typing import Any, ClassVar, Protocol, cast
 
+from pendulum_lqr.velocity import VELOCITY_ESTIMATORS, VelocityEstimator, make_velocity_estimator
 from pendulum_msgs_py.angles import wrap
 from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.parameters import ParameterSpec, validate
 from pendulum_msgs_py.plant_parameters import PlantParameters
-
-from pendulum_lqr.velocity import VELOCITY_ESTIMATORS, VelocityEstimator, make_velocity_estimator
 
 __all__ = [
     "COMMON_PARAMETERS",
@@ -45,8 +44,16 @@ CONTROLLERS: dict[str, str] = {
 
 COMMON_PARAMETERS: tuple[ParameterSpec, ...] = (
     ParameterSpec("set_point", 0.0, "rad", "Angle to hold, from upright.", minimum=-math.pi, maximum=math.pi),
-    ParameterSpec("effort_limit", 0.0, "N m", "Largest torque of the controller; 0 for the plant's own limit.", minimum=0.0),
-    ParameterSpec("velocity", "measured", "", "Where the velocity comes from.", choices=tuple(VELOCITY_ESTIMATORS)),
+    ParameterSpec(
+        "effort_limit",
+        0.0,
+        "N m",
+        "Largest torque of the controller; 0 for the plant's own limit.",
+        minimum=0.0,
+    ),
+    ParameterSpec(
+        "velocity", "measured", "", "Where the velocity comes from.", choices=tuple(VELOCITY_ESTIMATORS)
+    ),
 )
 """Parameters that every controller has."""
 
@@ -117,7 +124,7 @@ class BaseController:
     def clamp(self, effort: float) -> float:
         """Return the torque within the limit [N m]."""
         limit = self.effort_limit
-        return limit if effort > limit else (-limit if effort < -limit else effort)
+        return limit if effort > limit else (max(effort, -limit))
 
     def error(self, angle: float) -> float:
         """Return the deviation of an angle (from upright) from the set-point, the short way round [rad]."""
@@ -203,7 +210,9 @@ def make_controller(
     p = validate(COMMON_PARAMETERS + kind.PARAMETERS, values or {})
     if not (math.isfinite(period) and period > 0.0):
         raise ParameterError(f"period is {period} s; expected a finite value > 0")
-    p["effort_limit"] = min(p["effort_limit"], plant.effort_limit) if p["effort_limit"] > 0.0 else plant.effort_limit
+    p["effort_limit"] = (
+        min(p["effort_limit"], plant.effort_limit) if p["effort_limit"] > 0.0 else plant.effort_limit
+    )
     controller: Controller = kind.design(plant, period, p)
     if p["velocity"] != "measured":
         controller = EstimatedVelocity(controller, make_velocity_estimator(p["velocity"], plant, period))

@@ -13,9 +13,9 @@ from dataclasses import dataclass
 import numpy as np
 import scipy.linalg
 from numpy.typing import ArrayLike, NDArray
-from pendulum_msgs_py.errors import ParameterError
 
 from pendulum_lqr.model import LinearModel, sort_poles
+from pendulum_msgs_py.errors import ParameterError
 
 __all__ = [
     "DesignError",
@@ -105,7 +105,9 @@ def cost_matrices(q: ArrayLike, r: float, size: int = 2) -> tuple[Matrix, Matrix
     if weights.shape == (size,):
         weights = np.diag(weights)
     if weights.shape != (size, size):
-        raise DesignError(f"q has the shape {weights.shape}; expected ({size},) for a diagonal or ({size}, {size})")
+        raise DesignError(
+            f"q has the shape {weights.shape}; expected ({size},) for a diagonal or ({size}, {size})"
+        )
     if not np.all(np.isfinite(weights)):
         raise DesignError(f"q is {_plain(q)}; expected finite weights")
     if not np.allclose(weights, weights.T, rtol=1e-12, atol=0.0):
@@ -239,7 +241,9 @@ def discrete_lqr(model: DiscreteModel, q: ArrayLike, r: float, cross: Matrix | N
     K = np.linalg.solve(R + BS @ model.B, BS @ model.A + (0.0 if N is None else N.T))
     poles = sort_poles(np.linalg.eigvals(model.A - model.B @ K))
     if np.max(np.abs(poles)) >= 1.0:
-        raise DesignError(f"closed loop has poles {poles} on or outside the unit circle; expected smaller weights")
+        raise DesignError(
+            f"closed loop has poles {poles} on or outside the unit circle; expected smaller weights"
+        )
     return Gain(K[0], S, poles)
 
 
@@ -303,7 +307,9 @@ def kalman_gain(A: Matrix, C: Matrix, process: ArrayLike, measurement: ArrayLike
     V = np.atleast_2d(np.asarray(measurement, dtype=np.float64))
     for name, covariance in (("process", W), ("measurement", V)):
         if not np.all(np.isfinite(covariance)) or float(np.linalg.eigvalsh(covariance)[0]) < -1e-15:
-            raise DesignError(f"{name} noise covariance is {covariance.tolist()}; expected finite, not negative")
+            raise DesignError(
+                f"{name} noise covariance is {covariance.tolist()}; expected finite, not negative"
+            )
     if not float(np.linalg.eigvalsh(V)[0]) > 0.0:
         raise DesignError(f"measurement noise covariance is {V.tolist()}; expected every variance > 0")
     require_observable(A, C, discrete=True)
@@ -331,7 +337,9 @@ def require_controllable(A: Matrix, B: Matrix, *, discrete: bool = False) -> Non
             continue
         pencil = np.hstack([pole * np.eye(A.shape[0]) - A, B])
         if _deficient(pencil):
-            raise DesignError(f"mode at {_number(pole)} is not controllable: no torque reaches it; expected B = [0, 1/M]")
+            raise DesignError(
+                f"mode at {_number(pole)} is not controllable: no torque reaches it; expected B = [0, 1/M]"
+            )
 
 
 def require_observable(A: Matrix, C: Matrix, *, discrete: bool = False) -> None:

@@ -13,6 +13,7 @@ from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+
 from pendulum_msgs_py import noise
 from pendulum_msgs_py.errors import DataError, ParameterError
 from pendulum_msgs_py.parameters import ParameterSpec, validate
@@ -21,21 +22,58 @@ from pendulum_msgs_py.values import NANOSECONDS
 __all__ = ["DISTURBANCES", "DISTURBANCE_SPECS", "Disturbance", "from_bag", "make_disturbance", "torques"]
 
 DISTURBANCE_SPECS: tuple[ParameterSpec, ...] = (
-    ParameterSpec("kind", "uniform", "", "Shape of the torque.",
-                  choices=("uniform", "gaussian", "sine", "chirp", "prbs", "step", "pulse_train", "from_bag")),
+    ParameterSpec(
+        "kind",
+        "uniform",
+        "",
+        "Shape of the torque.",
+        choices=("uniform", "gaussian", "sine", "chirp", "prbs", "step", "pulse_train", "from_bag"),
+    ),
     ParameterSpec("amplitude", 2.5, "N m", "Largest torque; the standard deviation for gaussian."),
-    ParameterSpec("hold_time", 0.01, "s", "How long one sample is held; 0 for a sine, chirp, step or pulse train means "
-                  "a smooth signal.", minimum=0.0, maximum=3600.0),
-    ParameterSpec("seed", 1, "-", "Seed of the random kinds; shifts the sequence of prbs.", minimum=0, maximum=2**63 - 1),
-    ParameterSpec("bandwidth", 10.0, "Hz", "Cut-off (-3 dB) of gaussian; 0 for white from sample to sample.", minimum=0.0),
-    ParameterSpec("frequency", 1.0, "Hz", "Frequency of sine, start of chirp, repetition of pulse_train.", minimum=0.0,
-                  exclusive_minimum=True),
-    ParameterSpec("frequency_end", 10.0, "Hz", "Frequency at the end of a chirp.", minimum=0.0, exclusive_minimum=True),
-    ParameterSpec("sweep_time", 10.0, "s", "Length of one chirp; it then starts again.", minimum=0.0,
-                  exclusive_minimum=True),
-    ParameterSpec("order", 9, "-", "Length of prbs: repeats after 2^order - 1 samples.", minimum=2, maximum=16),
+    ParameterSpec(
+        "hold_time",
+        0.01,
+        "s",
+        "How long one sample is held; 0 for a sine, chirp, step or pulse train means a smooth signal.",
+        minimum=0.0,
+        maximum=3600.0,
+    ),
+    ParameterSpec(
+        "seed", 1, "-", "Seed of the random kinds; shifts the sequence of prbs.", minimum=0, maximum=2**63 - 1
+    ),
+    ParameterSpec(
+        "bandwidth",
+        10.0,
+        "Hz",
+        "Cut-off (-3 dB) of gaussian; 0 for white from sample to sample.",
+        minimum=0.0,
+    ),
+    ParameterSpec(
+        "frequency",
+        1.0,
+        "Hz",
+        "Frequency of sine, start of chirp, repetition of pulse_train.",
+        minimum=0.0,
+        exclusive_minimum=True,
+    ),
+    ParameterSpec(
+        "frequency_end", 10.0, "Hz", "Frequency at the end of a chirp.", minimum=0.0, exclusive_minimum=True
+    ),
+    ParameterSpec(
+        "sweep_time",
+        10.0,
+        "s",
+        "Length of one chirp; it then starts again.",
+        minimum=0.0,
+        exclusive_minimum=True,
+    ),
+    ParameterSpec(
+        "order", 9, "-", "Length of prbs: repeats after 2^order - 1 samples.", minimum=2, maximum=16
+    ),
     ParameterSpec("start_time", 0.0, "s", "Time at which step and pulse_train begin.", minimum=0.0),
-    ParameterSpec("pulse_width", 0.1, "s", "Length of each pulse of pulse_train.", minimum=0.0, exclusive_minimum=True),
+    ParameterSpec(
+        "pulse_width", 0.1, "s", "Length of each pulse of pulse_train.", minimum=0.0, exclusive_minimum=True
+    ),
 )
 """Parameters of every kind; each kind reads those that it needs."""
 
@@ -106,12 +144,16 @@ def from_bag(elapsed_ns: ArrayLike, values: ArrayLike) -> Disturbance:
     times = np.asarray(elapsed_ns, dtype=np.int64)
     recorded = np.asarray(values, dtype=np.float64)
     if times.ndim != 1 or times.shape != recorded.shape or times.size == 0:
-        raise DataError(f"recorded disturbance has times {times.shape} and torques {recorded.shape}; expected equal (n,)")
+        raise DataError(
+            f"recorded disturbance has times {times.shape} and torques {recorded.shape}; expected equal (n,)"
+        )
     if not np.all(np.isfinite(recorded)):
         raise DataError("recorded disturbance holds a torque that is not finite")
     if np.any(np.diff(times) <= 0):
         index = int(np.argmax(np.diff(times) <= 0))
-        raise DataError(f"recorded disturbance: time {times[index + 1]} ns follows {times[index]} ns; expected increasing")
+        raise DataError(
+            f"recorded disturbance: time {times[index + 1]} ns follows {times[index]} ns; expected increasing"
+        )
     end = int(times[-1] + (times[-1] - times[-2] if times.size > 1 else NANOSECONDS // 100))
     first = int(times[0])
 
@@ -148,7 +190,10 @@ def _gaussian(p: Mapping[str, Any], hold_ns: int) -> Disturbance:
                 f"bandwidth is {bandwidth} Hz with hold_time {hold_ns / NANOSECONDS} s; expected a longer hold_time, "
                 "of at least 1/20000 of the correlation time"
             )
-        shape = [math.exp(-0.5 * (k / sigma) ** 2) if sigma > 0.0 else float(k == 0) for k in range(-reach, reach + 1)]
+        shape = [
+            math.exp(-0.5 * (k / sigma) ** 2) if sigma > 0.0 else float(k == 0)
+            for k in range(-reach, reach + 1)
+        ]
         energy = math.sqrt(sum(value * value for value in shape))
         weights = [value / energy for value in shape]
 
@@ -255,4 +300,3 @@ DISTURBANCES: dict[str, Maker] = {
     "pulse_train": _pulse_train,
 }
 """Kinds that follow from parameters alone; ``from_bag`` needs a recording and is made by :func:`from_bag`."""
-

@@ -17,6 +17,7 @@ from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
+
 from pendulum_msgs_py.angles import UPRIGHT
 from pendulum_msgs_py.errors import ParameterError
 
@@ -159,7 +160,9 @@ def fixed_points(plant: RigidPlant, effort: float = 0.0) -> tuple[FixedPoint, ..
     return (FixedPoint(low, effort, True), FixedPoint(high, effort, False))
 
 
-def overdamped_velocity(plant: RigidPlant, theta: NDArray[np.float64], effort: float = 0.0) -> NDArray[np.float64]:
+def overdamped_velocity(
+    plant: RigidPlant, theta: NDArray[np.float64], effort: float = 0.0
+) -> NDArray[np.float64]:
     """Return x' = (u0 - G_c sin x) / b_c, the velocity where damping outweighs inertia [rad/s].
 
     Args:

@@ -19,10 +19,10 @@ from typing import NamedTuple
 import numpy as np
 import scipy.linalg
 from numpy.typing import NDArray
-from pendulum_msgs_py.angles import UPRIGHT
 
 from pendulum_lqr.design import DesignError, Gain
 from pendulum_lqr.model import RigidPlant
+from pendulum_msgs_py.angles import UPRIGHT
 
 __all__ = ["Region", "Rollout", "proven_level", "region_of_attraction", "rigid_rollout", "sublevel_ellipse"]
 
@@ -121,7 +121,9 @@ def sublevel_ellipse(S: Array, level: float, points: int = 361) -> Array:
     """
     directions = np.linalg.inv(scipy.linalg.cholesky(S, lower=True)).T
     phi = np.linspace(0.0, 2.0 * math.pi, points)
-    return np.asarray(math.sqrt(level) * (directions @ np.vstack([np.cos(phi), np.sin(phi)])).T, dtype=np.float64)
+    return np.asarray(
+        math.sqrt(level) * (directions @ np.vstack([np.cos(phi), np.sin(phi)])).T, dtype=np.float64
+    )
 
 
 def region_of_attraction(
@@ -153,7 +155,9 @@ def region_of_attraction(
     end_angle, end_velocity = rollout(x.ravel(), v.ravel())
     arrived = (np.abs(end_angle) < tolerance[0]) & (np.abs(end_velocity) < tolerance[1])
     level = proven_level(plant, gain, effort_limit)
-    return Region(angles, velocities, arrived.reshape(x.shape), level, sublevel_ellipse(gain.S, level), gain.S)
+    return Region(
+        angles, velocities, arrived.reshape(x.shape), level, sublevel_ellipse(gain.S, level), gain.S
+    )
 
 
 def rigid_rollout(
@@ -211,7 +215,9 @@ def _decreases(plant: RigidPlant, gain: Gain, directions: Array, limit: float, r
             return True
         r_low, r_high, p_low, p_high = (edge[open_cells] for edge in (r_low, r_high, p_low, p_high))
         r_middle, p_middle = 0.5 * (r_low + r_high), 0.5 * (p_low + p_high)
-        centre = _rate(plant, gain, directions, limit, _Interval(r_middle, r_middle), _Interval(p_middle, p_middle))
+        centre = _rate(
+            plant, gain, directions, limit, _Interval(r_middle, r_middle), _Interval(p_middle, p_middle)
+        )
         if np.any(centre.low >= 0.0) or 4 * r_low.size > _MOST_CELLS:
             return False
         r_low, r_high = (

@@ -36,7 +36,9 @@ class PidGains:
     kd: float
 
 
-def pid_loop(model: LinearModel, gains: PidGains, period: float, filter_time: float) -> tuple[Matrix, Matrix, Matrix]:
+def pid_loop(
+    model: LinearModel, gains: PidGains, period: float, filter_time: float
+) -> tuple[Matrix, Matrix, Matrix]:
     """Return (A, B, F) of the sampled closed loop z[k+1] = A z[k] + B w[k], u[k] = F z[k].
 
     The state is [angle, velocity, integral, angle at the sample before, filtered derivative at the sample before]; w is
@@ -133,7 +135,9 @@ def tune_numerically(
         if best is None or result.fun < best.fun:
             best = result
     if best is None or best.fun >= 1e12:
-        raise DesignError(f"no stable PID found at a period of {period} s; expected a shorter period or a slower plant")
+        raise DesignError(
+            f"no stable PID found at a period of {period} s; expected a shorter period or a slower plant"
+        )
     return PidGains(*(float(value) for value in np.exp(best.x)))
 
 
@@ -153,16 +157,22 @@ def ultimate_gain(model: LinearModel, period: float) -> tuple[float, float]:
     inertia = 1.0 / float(model.B[1, 0])
 
     def poles(gain: float) -> NDArray[np.complex128]:
-        return np.asarray(np.linalg.eigvals(sampled.A - sampled.B @ np.array([[gain, 0.0]])), dtype=np.complex128)
+        return np.asarray(
+            np.linalg.eigvals(sampled.A - sampled.B @ np.array([[gain, 0.0]])), dtype=np.complex128
+        )
 
     low = max(float(model.A[1, 0]) * inertia, 0.0) * 1.001 + 1e-9
     if np.max(np.abs(poles(low * 1.01))) >= 1.0:
-        raise DesignError(f"no proportional gain stabilises the loop at a period of {period} s; expected a shorter period")
+        raise DesignError(
+            f"no proportional gain stabilises the loop at a period of {period} s; expected a shorter period"
+        )
     high = low * 1.01
     while np.max(np.abs(poles(high))) < 1.0:
         high *= 1.05
         if high > 1e9:
-            raise DesignError("no proportional gain makes the loop oscillate; expected numerical tuning instead")
+            raise DesignError(
+                "no proportional gain makes the loop oscillate; expected numerical tuning instead"
+            )
     low = high / 1.05
     for _ in range(60):
         middle = 0.5 * (low + high)

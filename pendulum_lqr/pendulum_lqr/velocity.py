@@ -11,12 +11,12 @@ from typing import Protocol
 
 import numpy as np
 import scipy.signal
-from pendulum_msgs_py.angles import wrap
-from pendulum_msgs_py.errors import ParameterError
-from pendulum_msgs_py.plant_parameters import PlantParameters
 
 from pendulum_lqr.design import discretise, kalman_gain
 from pendulum_lqr.model import LinearModel, linearise
+from pendulum_msgs_py.angles import wrap
+from pendulum_msgs_py.errors import ParameterError
+from pendulum_msgs_py.plant_parameters import PlantParameters
 
 __all__ = [
     "VELOCITY_ESTIMATORS",

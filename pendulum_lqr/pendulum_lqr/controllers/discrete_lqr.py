@@ -6,14 +6,13 @@ from collections import deque
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from pendulum_msgs_py.angles import UPRIGHT
-from pendulum_msgs_py.parameters import ParameterSpec
-from pendulum_msgs_py.plant_parameters import PlantParameters
-
 from pendulum_lqr.controller import BaseController, Controller
 from pendulum_lqr.controllers.specs import FEEDFORWARD, Q, R
 from pendulum_lqr.design import DesignError, Gain, discrete_lqr, discretise, sampled_cost
 from pendulum_lqr.model import linearise
+from pendulum_msgs_py.angles import UPRIGHT
+from pendulum_msgs_py.parameters import ParameterSpec
+from pendulum_msgs_py.plant_parameters import PlantParameters
 
 __all__ = ["DiscreteLqr"]
 
@@ -55,7 +54,9 @@ class DiscreteLqr(BaseController):
         model = linearise(plant, UPRIGHT + p["set_point"])
         delay = p["delay"] + plant.transport_delay
         if delay > _MOST_PENDING * period:
-            raise DesignError(f"delay is {delay} s at a period of {period} s; expected at most {_MOST_PENDING} periods")
+            raise DesignError(
+                f"delay is {delay} s at a period of {period} s; expected at most {_MOST_PENDING} periods"
+            )
         sampled = discretise(model, period, delay)
         if p["cost"] == "sum":
             gain = discrete_lqr(sampled, p["q"], p["r"])

@@ -6,11 +6,10 @@ import math
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from pendulum_msgs_py.parameters import ParameterSpec
-from pendulum_msgs_py.plant_parameters import PlantParameters
-
 from pendulum_lqr.catch import Catch, make_catch
 from pendulum_lqr.controller import BaseController
+from pendulum_msgs_py.parameters import ParameterSpec
+from pendulum_msgs_py.plant_parameters import PlantParameters
 
 __all__ = ["EnergySwingUp"]
 

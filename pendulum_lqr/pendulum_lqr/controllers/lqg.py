@@ -6,9 +6,6 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
-from pendulum_msgs_py.angles import UPRIGHT, wrap
-from pendulum_msgs_py.parameters import ParameterSpec
-from pendulum_msgs_py.plant_parameters import PlantParameters
 
 from pendulum_lqr.controller import BaseController, Controller
 from pendulum_lqr.controllers.specs import FEEDFORWARD, Q, R
@@ -22,6 +19,9 @@ from pendulum_lqr.design import (
     sampled_cost,
 )
 from pendulum_lqr.model import linearise
+from pendulum_msgs_py.angles import UPRIGHT, wrap
+from pendulum_msgs_py.parameters import ParameterSpec
+from pendulum_msgs_py.plant_parameters import PlantParameters
 
 __all__ = ["Lqg"]
 
@@ -78,7 +78,9 @@ class Lqg(BaseController):
         drive = sampled.B * p["torque_noise"]
         kalman = kalman_gain(sampled.A, np.array([[1.0, 0.0]]), drive @ drive.T, [[p["angle_noise"] ** 2]])
         hold = model.effort if p["feedforward"] else 0.0
-        return cls(sampled, discrete_lqr(sampled, q, r, cross), kalman, p["effort_limit"], p["set_point"], hold)
+        return cls(
+            sampled, discrete_lqr(sampled, q, r, cross), kalman, p["effort_limit"], p["set_point"], hold
+        )
 
     def reset(self) -> None:
         """Forget the estimate."""

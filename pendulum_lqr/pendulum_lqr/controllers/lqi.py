@@ -5,14 +5,13 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from pendulum_msgs_py.angles import UPRIGHT
-from pendulum_msgs_py.parameters import ParameterSpec
-from pendulum_msgs_py.plant_parameters import PlantParameters
-
 from pendulum_lqr.controller import BaseController, Controller
 from pendulum_lqr.controllers.specs import FEEDFORWARD, Q, R
 from pendulum_lqr.design import Gain, integral_lqr
 from pendulum_lqr.model import linearise
+from pendulum_msgs_py.angles import UPRIGHT
+from pendulum_msgs_py.parameters import ParameterSpec
+from pendulum_msgs_py.plant_parameters import PlantParameters
 
 __all__ = ["Lqi"]
 

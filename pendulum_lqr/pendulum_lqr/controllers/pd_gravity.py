@@ -6,10 +6,9 @@ import math
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+from pendulum_lqr.controller import BaseController
 from pendulum_msgs_py.parameters import ParameterSpec
 from pendulum_msgs_py.plant_parameters import PlantParameters
-
-from pendulum_lqr.controller import BaseController
 
 __all__ = ["PdGravity"]
 
@@ -33,7 +32,9 @@ class PdGravity(BaseController):
         ParameterSpec("kd", 0.0, "N m s/rad", "Derivative gain; 0 for that of the bandwidth.", minimum=0.0),
     )  # fmt: skip
 
-    def __init__(self, kp: float, kd: float, gravity: float, effort_limit: float, set_point: float = 0.0) -> None:
+    def __init__(
+        self, kp: float, kd: float, gravity: float, effort_limit: float, set_point: float = 0.0
+    ) -> None:
         super().__init__(effort_limit, set_point)
         self.kp = kp
         self.kd = kd

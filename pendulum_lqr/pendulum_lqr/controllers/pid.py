@@ -8,15 +8,15 @@ from functools import lru_cache
 from typing import Any
 
 import numpy as np
-from pendulum_msgs_py.angles import UPRIGHT
-from pendulum_msgs_py.parameters import ParameterSpec
-from pendulum_msgs_py.plant_parameters import PlantParameters
 
 from pendulum_lqr.controller import BaseController, Controller
 from pendulum_lqr.controllers.specs import Q, R
 from pendulum_lqr.design import DesignError
 from pendulum_lqr.model import linearise
 from pendulum_lqr.tuning import PidGains, pid_loop, tune_numerically, ziegler_nichols
+from pendulum_msgs_py.angles import UPRIGHT
+from pendulum_msgs_py.parameters import ParameterSpec
+from pendulum_msgs_py.plant_parameters import PlantParameters
 
 __all__ = ["Pid"]
 
@@ -59,7 +59,9 @@ class Pid(BaseController):
         self._slope = (1.0 - self._pole) / period
         integral_time = gains.kp / gains.ki if gains.ki > 0.0 else math.inf
         derivative_time = gains.kd / gains.kp if gains.kp > 0.0 else 0.0
-        tracking_time = max(math.sqrt(integral_time * derivative_time), period) if gains.ki > 0.0 else math.inf
+        tracking_time = (
+            max(math.sqrt(integral_time * derivative_time), period) if gains.ki > 0.0 else math.inf
+        )
         self._tracking = period / tracking_time
         self.reset()
 
@@ -69,7 +71,9 @@ class Pid(BaseController):
         if p["tuning"] == "manual":
             gains = PidGains(p["kp"], p["ki"], p["kd"])
         else:
-            gains = _tune(plant, period, p["set_point"], p["tuning"], p["derivative_filter"], tuple(p["q"]), p["r"])
+            gains = _tune(
+                plant, period, p["set_point"], p["tuning"], p["derivative_filter"], tuple(p["q"]), p["r"]
+            )
         return cls(gains, period, p["derivative_filter"], p["effort_limit"], p["set_point"])
 
     def reset(self) -> None:

@@ -6,10 +6,9 @@ import math
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+from pendulum_lqr.controller import BaseController
 from pendulum_msgs_py.parameters import ParameterSpec
 from pendulum_msgs_py.plant_parameters import PlantParameters
-
-from pendulum_lqr.controller import BaseController
 
 __all__ = ["SlidingMode"]
 
@@ -34,9 +33,18 @@ class SlidingMode(BaseController):
 
     SUMMARY = "sliding mode with a boundary layer: rejects any torque below its gain"
     PARAMETERS = (
-        ParameterSpec("rate", 5.0, "1/s", "Slope of the sliding line, lambda.", minimum=0.0, exclusive_minimum=True),
+        ParameterSpec(
+            "rate", 5.0, "1/s", "Slope of the sliding line, lambda.", minimum=0.0, exclusive_minimum=True
+        ),
         ParameterSpec("gain", 1.0, "N m", "Switching torque, k.", minimum=0.0),
-        ParameterSpec("layer", 0.5, "rad/s", "Half width of the boundary layer, phi.", minimum=0.0, exclusive_minimum=True),
+        ParameterSpec(
+            "layer",
+            0.5,
+            "rad/s",
+            "Half width of the boundary layer, phi.",
+            minimum=0.0,
+            exclusive_minimum=True,
+        ),
     )
 
     def __init__(
@@ -65,7 +73,7 @@ class SlidingMode(BaseController):
         """Return the torque [N m]."""
         error = self.error(x[0])
         sliding = (x[1] + self.rate * error) / self.layer
-        switch = 1.0 if sliding > 1.0 else (-1.0 if sliding < -1.0 else sliding)
+        switch = 1.0 if sliding > 1.0 else (max(sliding, -1.0))
         return self.clamp(
             -self._gravity * math.sin(x[0])
             - self._proportional * error

@@ -11,5 +11,8 @@ Q = ParameterSpec(
 )
 R = ParameterSpec("r", 0.1, "1/(N m)^2", "Weight of torque, R.", minimum=0.0, exclusive_minimum=True)
 FEEDFORWARD = ParameterSpec(
-    "feedforward", True, "", "Whether the torque that holds the set-point against gravity is added, G_c sin(theta*)."
+    "feedforward",
+    True,
+    "",
+    "Whether the torque that holds the set-point against gravity is added, G_c sin(theta*).",
 )

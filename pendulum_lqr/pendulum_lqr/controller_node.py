@@ -1,0 +1,264 @@
+"""The ``controller`` node: answers each new state of a plant once, with the state's stamp."""
+
+from __future__ import annotations
+
+import math
+import sys
+import time
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
+from rclpy.lifecycle import LifecycleState, TransitionCallbackReturn
+from rclpy.lifecycle import Node as LifecycleNode
+from sensor_msgs.msg import JointState
+from std_msgs.msg import Float64MultiArray
+
+from pendulum_lqr.answering import AnswerLoop
+from pendulum_lqr.controller import (
+    COMMON_PARAMETERS,
+    CONTROLLERS,
+    Controller,
+    controller_class,
+    make_controller,
+)
+from pendulum_msgs_py import names
+from pendulum_msgs_py.cdr import encode_joint_state
+from pendulum_msgs_py.errors import PendulumError
+from pendulum_msgs_py.parameters import ParameterSpec
+from pendulum_msgs_py.plant_parameters import PlantParameters, load_plant
+from pendulum_msgs_py.ros import qos
+from pendulum_msgs_py.ros.convert import diagnostic_status, sample_from_bytes, stamp_to_message
+from pendulum_msgs_py.ros.parameters import NodeParameters
+from pendulum_msgs_py.ros.runner import run_node
+from pendulum_msgs_py.timing import SteadyWallClock
+
+__all__ = ["NODE_SPECS", "ControllerNode", "main"]
+
+NODE_SPECS: tuple[ParameterSpec, ...] = (
+    ParameterSpec("controller", "lqr", "", "Which controller.", choices=tuple(CONTROLLERS), read_only=True),
+    ParameterSpec(
+        "plant", "thesis", "", "Plant to design for: thesis, x5_9, dfki or the path of a plant file.", read_only=True
+    ),
+    ParameterSpec(
+        "period", 0.01, "s", "Sampling period of the loop, which discrete designs and filters need.",
+        minimum=0.0, exclusive_minimum=True, read_only=True,
+    ),
+    ParameterSpec(
+        "state_timeout", 0.05, "s", "Age beyond which a state is refused; not used in simulated time.",
+        minimum=0.0, exclusive_minimum=True, read_only=True,
+    ),
+    ParameterSpec(
+        "command_type", "joint_state", "", "joint_state: to our plants; multi_array: std_msgs/Float64MultiArray, to an "
+        "effort controller of ros2_control.", choices=("joint_state", "multi_array"), read_only=True,
+    ),
+    ParameterSpec("autostart", True, "", "Configure and activate at once, without a lifecycle manager.", read_only=True),
+)  # fmt: skip
+"""Parameters of the node itself; those of the chosen controller join them."""
+
+_DIAGNOSTICS_PERIOD = 0.5
+_MULTI_ARRAY_TOPIC = "~/commands"
+
+
+class ControllerNode(LifecycleNode):
+    """Lifecycle node around a controller.
+
+    Unconfigured: parameters are known. Inactive: the gain is designed and printed, states are heard and not answered.
+    Active: every new state is answered once. Deactivation, shutdown and signals send zero torque and stop.
+
+    Args:
+        stop: Asks the runner to end the process.
+    """
+
+    def __init__(self, stop: Callable[[], None]) -> None:
+        super().__init__("controller", enable_logger_service=True)
+        self.exit_code = 0
+        self._stop = stop
+        self._active = False
+        self._loop: AnswerLoop | None = None
+        kind = self._choose()
+        self._own = {spec.name for spec in NODE_SPECS}
+        specs = NODE_SPECS + COMMON_PARAMETERS + controller_class(kind).PARAMETERS
+        self._settings = NodeParameters(self, specs, self._on_change)
+        self._plant: PlantParameters = load_plant(self._settings["plant"])
+        # A bad value at start ends the node with its reason instead of waiting for a transition to fail.
+        self._pending: Controller | None = self._design(self._settings.values)
+        self._simulated_time = bool(self.get_parameter("use_sim_time").value)
+        self._now = SteadyWallClock()
+        self._full_name = self.get_fully_qualified_name()
+        self._told_refusals = 0
+        self._multi_array = self._settings["command_type"] == "multi_array"
+        if self._multi_array:
+            self._command_publisher = self.create_publisher(
+                Float64MultiArray, _MULTI_ARRAY_TOPIC, qos.COMMAND
+            )
+        else:
+            self._command_publisher = self.create_publisher(JointState, names.EFFORT_COMMAND, qos.COMMAND)
+        self._diagnostics_publisher = self.create_publisher(
+            DiagnosticArray, names.DIAGNOSTICS, qos.DIAGNOSTICS
+        )
+        self.create_subscription(JointState, names.JOINT_STATES, self._on_state, qos.NEWEST_STATE, raw=True)
+        # Wall time on purpose: diagnostics must come even where simulated time stands still.
+        self.create_timer(_DIAGNOSTICS_PERIOD, self._on_timer, clock=_steady_clock())
+        if self._settings["autostart"]:
+            self._autostart()
+
+    # --- lifecycle -----------------------------------------------------------------------------------------
+
+    def on_configure(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Design the controller and print its gain."""
+        try:
+            controller = self._pending or self._design(self._settings.values)
+        except Exception as error:  # noqa: BLE001 - rclpy would swallow it: the log is the only witness
+            self.get_logger().error(f"cannot configure: {error}")
+            return TransitionCallbackReturn.FAILURE
+        self._pending = None
+        self._loop = AnswerLoop(
+            controller, self._settings["state_timeout"], simulated_time=self._simulated_time
+        )
+        self.get_logger().info(
+            f"{self._settings['controller']} for plant {self._plant.name}: {controller.describe()}, "
+            f"limit {controller.effort_limit:g} N m"
+        )
+        return super().on_configure(state)
+
+    def on_activate(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Start answering, with nothing remembered from before."""
+        if self._loop is None:
+            return TransitionCallbackReturn.FAILURE
+        self._loop.restart()
+        self._active = True
+        return super().on_activate(state)
+
+    def on_deactivate(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Stop answering and send zero torque."""
+        self._send_zero()
+        return super().on_deactivate(state)
+
+    def on_cleanup(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Drop the design."""
+        self._loop = None
+        return super().on_cleanup(state)
+
+    def on_shutdown(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Send zero torque, whatever the state was."""
+        self._send_zero()
+        return super().on_shutdown(state)
+
+    def close(self) -> None:
+        """Send zero torque while the context is still valid."""
+        self._send_zero()
+        self._publish_diagnostics()
+
+    # --- callbacks -----------------------------------------------------------------------------------------
+
+    def _on_state(self, data: bytes) -> None:
+        if not self._active or self._loop is None:
+            return
+        sample = sample_from_bytes(data)
+        effort = self._loop.answer(sample, self._now())
+        if effort is None or sample is None:
+            return
+        if self._multi_array:
+            self._command_publisher.publish(Float64MultiArray(data=[effort]))
+        else:
+            self._command_publisher.publish(
+                encode_joint_state(sample.stamp_ns, frame_id=self._full_name, effort=effort)
+            )
+
+    def _on_change(self, values: Mapping[str, Any]) -> None:
+        """Design aside, then swap at once; a design that fails leaves the old gain in force."""
+        controller = self._design(values)
+        if self._loop is None:
+            self._pending = controller
+            return
+        self._loop.replace(controller)
+        self.get_logger().info(f"changed while running: {controller.describe()}")
+
+    def _on_timer(self) -> None:
+        self._publish_diagnostics()
+        if self._loop is None:
+            return
+        refused = sum(self._loop.refused.values())
+        if refused > self._told_refusals:
+            counts = ", ".join(f"{why.value} {count}" for why, count in sorted(self._loop.refused.items()))
+            reason = f" ({self._loop.last_reason})" if self._loop.last_reason else ""
+            self.get_logger().warning(f"states refused so far: {counts}{reason}")
+            self._told_refusals = refused
+
+    # --- pieces --------------------------------------------------------------------------------------------
+
+    def _choose(self) -> str:
+        """Return which controller is asked for, before its own parameters can be declared."""
+        spec = NODE_SPECS[0]
+        given = self._parameter_overrides.get(spec.name)
+        return str(spec.check(spec.default if given is None else given.value))
+
+    def _design(self, values: Mapping[str, Any]) -> Controller:
+        own = {name: value for name, value in values.items() if name not in self._own}
+        return make_controller(values["controller"], self._plant, values["period"], own)
+
+    def _autostart(self) -> None:
+        if self.trigger_configure() != TransitionCallbackReturn.SUCCESS:
+            raise PendulumError("the controller cannot be configured; the log says why")
+        if self.trigger_activate() != TransitionCallbackReturn.SUCCESS:
+            raise PendulumError("the controller cannot be activated; the log says why")
+
+    def _send_zero(self) -> None:
+        was_active, self._active = self._active, False
+        if not was_active or self._loop is None:
+            return
+        if self._multi_array:
+            self._command_publisher.publish(Float64MultiArray(data=[0.0]))
+            return
+        # A second command with the stamp of the last answer would count as a duplicate, so the zero comes after it.
+        newest = self._loop.newest_stamp_ns
+        after = 0 if newest is None else newest + 1
+        stamp = after if self._simulated_time else max(after, self._now())
+        self._command_publisher.publish(encode_joint_state(stamp, frame_id=self._full_name, effort=0.0))
+
+    def _publish_diagnostics(self) -> None:
+        values: dict[str, object] = {"controller": self._settings["controller"], "plant": self._plant.name}
+        level, text = DiagnosticStatus.OK, "inactive"
+        if self._loop is not None:
+            values["gain"] = self._loop.controller.describe()
+            values["effort_limit"] = self._loop.controller.effort_limit
+            values.update(self._loop.summary(time.monotonic_ns()))
+        if self._active:
+            rate = values.get("answer_rate_hz")
+            answering = isinstance(rate, float) and (rate > 0.0 or math.isnan(rate))
+            text = "answering" if answering else "active, no states"
+            level = DiagnosticStatus.OK if answering else DiagnosticStatus.WARN
+        message = DiagnosticArray(
+            status=[diagnostic_status(f"{self.get_fully_qualified_name()}: controller", level, text, values)]
+        )
+        message.header.stamp = stamp_to_message(self._now())
+        self._diagnostics_publisher.publish(message)
+
+
+def _steady_clock() -> Any:
+    from rclpy.clock import Clock, ClockType
+
+    return Clock(clock_type=ClockType.STEADY_TIME)
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run the controller node and return the exit code."""
+    arguments = list(sys.argv[1:] if argv is None else argv)
+    return run_node(
+        ControllerNode,
+        arguments,
+        program="pendulum_lqr controller",
+        description="Answers each new joint state with a torque.",
+        specs=NODE_SPECS + COMMON_PARAMETERS + _specs_for_help(arguments),
+        example="python -m pendulum_lqr controller --ros-args -r __ns:=/sim -p controller:=lqr -p q:=[100.0,0.01]",
+    )
+
+
+def _specs_for_help(arguments: Sequence[str]) -> tuple[ParameterSpec, ...]:
+    """Return the parameters of the controller that the command line names, LQR by default."""
+    for argument in arguments:
+        name, separator, value = argument.partition(":=")
+        if separator and name == "controller" and value in CONTROLLERS:
+            return controller_class(value).PARAMETERS
+    return controller_class("lqr").PARAMETERS

@@ -1,0 +1,182 @@
+"""The ``disturbance`` node: answers each state of a plant with the disturbance torque of its stamp."""
+
+from __future__ import annotations
+
+import sys
+import time
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
+from rclpy.node import Node
+from sensor_msgs.msg import JointState
+from std_msgs.msg import String
+from std_srvs.srv import Trigger
+
+from pendulum_lqr.disturbance import DISTURBANCE_SPECS, Disturbance, from_bag, make_disturbance
+from pendulum_lqr.disturbing import DisturbanceLoop
+from pendulum_msgs_py import names
+from pendulum_msgs_py.cdr import encode_joint_state
+from pendulum_msgs_py.errors import DataError, ParameterError
+from pendulum_msgs_py.parameters import ParameterSpec, read_text
+from pendulum_msgs_py.ros import qos
+from pendulum_msgs_py.ros.convert import diagnostic_status, event_message, sample_from_bytes, stamp_to_message
+from pendulum_msgs_py.ros.parameters import NodeParameters
+from pendulum_msgs_py.ros.runner import run_node
+from pendulum_msgs_py.timing import SteadyWallClock
+from pendulum_msgs_py.values import NANOSECONDS
+
+__all__ = ["NODE_SPECS", "DisturbanceNode", "main"]
+
+NODE_SPECS: tuple[ParameterSpec, ...] = (
+    ParameterSpec("autostart", False, "", "Start with the first state, without a call of ~/start.", read_only=True),
+    ParameterSpec("duration", 0.0, "s", "How long to disturb; 0 until ~/stop.", minimum=0.0),
+    ParameterSpec(
+        "file", "", "", "For from_bag: CSV file with a header line and the columns time since the start [s] and "
+        "torque [N m].",
+    ),
+)  # fmt: skip
+"""Parameters of the node itself, next to those of the signal."""
+
+_DIAGNOSTICS_PERIOD = 0.5
+
+
+class DisturbanceNode(Node):
+    """Publishes the disturbance for each new stamp of ``joint_states``.
+
+    Before the start and after the end it answers with zero, so that a plant in lockstep gets its answer and a plant in
+    real time never keeps an old torque. Events ``noise_start`` and ``noise_end`` mark the first and the last state
+    that is disturbed.
+
+    Args:
+        stop: Asks the runner to end the process.
+    """
+
+    def __init__(self, stop: Callable[[], None]) -> None:
+        super().__init__("disturbance", enable_logger_service=True)
+        self._stop = stop
+        self._settings = NodeParameters(self, DISTURBANCE_SPECS + NODE_SPECS, self._on_change)
+        self._now = SteadyWallClock()
+        self._full_name = self.get_fully_qualified_name()
+        self._simulated_time = bool(self.get_parameter("use_sim_time").value)
+        self._loop = DisturbanceLoop(
+            _signal(self._settings.values), self._settings["duration"], simulated_time=self._simulated_time
+        )
+        self._torque_publisher = self.create_publisher(JointState, names.DISTURBANCE, qos.COMMAND)
+        self._event_publisher = self.create_publisher(String, names.EVENTS, qos.EVENTS)
+        self._diagnostics_publisher = self.create_publisher(
+            DiagnosticArray, names.DIAGNOSTICS, qos.DIAGNOSTICS
+        )
+        self.create_service(Trigger, "~/start", self._on_start)
+        self.create_service(Trigger, "~/stop", self._on_stop)
+        self.create_subscription(JointState, names.JOINT_STATES, self._on_state, qos.NEWEST_STATE, raw=True)
+        self.create_timer(_DIAGNOSTICS_PERIOD, self._publish_diagnostics, clock=_steady_clock())
+        if self._settings["autostart"]:
+            self._loop.start()
+
+    def close(self) -> None:
+        """End with zero torque while the context is still valid."""
+        if self._loop.running:
+            self._tell("noise_end", self._loop.newest_stamp_ns or self._now(), reason="stopped by a signal")
+        newest = self._loop.newest_stamp_ns
+        after = 0 if newest is None else newest + 1
+        if newest is not None:
+            stamp = after if self._simulated_time else max(after, self._now())
+            self._torque_publisher.publish(encode_joint_state(stamp, frame_id=self._full_name, effort=0.0))
+        self._loop.stop()
+        self._publish_diagnostics()
+
+    # --- callbacks -----------------------------------------------------------------------------------------
+
+    def _on_state(self, data: bytes) -> None:
+        sample = sample_from_bytes(data)
+        if sample is None:
+            return
+        answer = self._loop.answer(sample.stamp_ns)
+        if answer is None:
+            return
+        self._torque_publisher.publish(
+            encode_joint_state(sample.stamp_ns, frame_id=self._full_name, effort=answer.torque)
+        )
+        if answer.event:
+            self._tell(answer.event, sample.stamp_ns)
+
+    def _on_start(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+        response.success = self._loop.start()
+        response.message = (
+            "starts with the next state" if response.success else "already running; expected ~/stop first"
+        )
+        return response
+
+    def _on_stop(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+        response.success = self._loop.stop()
+        response.message = "ends with zero torque" if response.success else "was not running"
+        return response
+
+    def _on_change(self, values: Mapping[str, Any]) -> None:
+        signal = _signal(values)
+        if self._loop.running:
+            raise ParameterError(
+                "the disturbance is running; expected ~/stop before a change, so that a run has one signal"
+            )
+        self._loop.replace(signal, values["duration"])
+
+    # --- pieces --------------------------------------------------------------------------------------------
+
+    def _tell(self, name: str, stamp_ns: int, **more: object) -> None:
+        details = {spec.name: self._settings[spec.name] for spec in DISTURBANCE_SPECS}
+        self._event_publisher.publish(
+            event_message(stamp_ns, name, disturbance=details, duration=self._settings["duration"], **more)
+        )
+        self.get_logger().info(f"{name} at stamp {stamp_ns} ns")
+
+    def _publish_diagnostics(self) -> None:
+        values: dict[str, object] = {spec.name: self._settings[spec.name] for spec in DISTURBANCE_SPECS}
+        values.update(self._loop.summary(time.monotonic_ns()))
+        text = "disturbing" if self._loop.running else "zero torque"
+        name = f"{self.get_fully_qualified_name()}: disturbance"
+        message = DiagnosticArray(status=[diagnostic_status(name, DiagnosticStatus.OK, text, values)])
+        message.header.stamp = stamp_to_message(self._now())
+        self._diagnostics_publisher.publish(message)
+
+
+def _steady_clock() -> Any:
+    from rclpy.clock import Clock, ClockType
+
+    return Clock(clock_type=ClockType.STEADY_TIME)
+
+
+def _signal(values: Mapping[str, Any]) -> Disturbance:
+    own = {spec.name: values[spec.name] for spec in DISTURBANCE_SPECS}
+    recorded = _read_recording(values["file"]) if values["kind"] == "from_bag" else None
+    return make_disturbance(own, recorded)
+
+
+def _read_recording(file: str) -> Disturbance:
+    if not file:
+        raise ParameterError(
+            "kind is 'from_bag' without a file; expected -p file:=PATH of a CSV with time and torque"
+        )
+    rows = read_text(Path(file).expanduser(), "recorded disturbance", limit=200_000_000).splitlines()[1:]
+    try:
+        table = np.array([[float(cell) for cell in row.split(",")[:2]] for row in rows if row.strip()])
+        times, torques = table[:, 0], table[:, 1]
+    except (ValueError, IndexError) as error:
+        raise DataError(
+            f"recorded disturbance {file}: {error}; expected the columns time [s], torque [N m]"
+        ) from error
+    return from_bag(np.round(times * NANOSECONDS).astype(np.int64), torques)
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run the disturbance node and return the exit code."""
+    return run_node(
+        DisturbanceNode,
+        list(sys.argv[1:] if argv is None else argv),
+        program="pendulum_lqr disturbance",
+        description="Answers each joint state with a disturbance torque, a pure function of seed and time.",
+        specs=DISTURBANCE_SPECS + NODE_SPECS,
+        example="python -m pendulum_lqr disturbance --ros-args -r __ns:=/sim -p seed:=1 -p autostart:=true",
+    )
