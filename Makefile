@@ -64,7 +64,7 @@ types: $(VENV)/.linked # Check types with mypy
 	@$(PY) -m mypy $(ARGS)
 
 imports: $(VENV)/.linked # Check which package and which module may import what
-	@$(VENV)/bin/lint-imports $(ARGS)
+	@$(VENV)/bin/lint-imports --no-logo $(ARGS)
 
 build: $(VENV)/.linked # Build the five packages with colcon into install/, as for ros2 run
 	@unset PYTHONDONTWRITEBYTECODE; exec $(VENV)/bin/colcon build --base-paths $(PACKAGES) $(ARGS)
