@@ -38,7 +38,11 @@ from pendulum_msgs_py.values import NANOSECONDS, JointCommand, JointSample
 
 __all__ = ["SPECS", "BridgeNode", "main"]
 
-_HARDWARE_DEFAULTS: dict[str, ParameterValue] = {"velocity_limit": 1.5, "position_window": [-4.0, 4.0], "effort_slew_limit": 2000.0}
+_HARDWARE_DEFAULTS: dict[str, ParameterValue] = {
+    "velocity_limit": 1.5,
+    "position_window": [-4.0, 4.0],
+    "effort_slew_limit": 2000.0,
+}
 """Limits that a simulated plant can do without and a real one cannot."""
 
 SPECS: tuple[ParameterSpec, ...] = (

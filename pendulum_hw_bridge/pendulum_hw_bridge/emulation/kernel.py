@@ -60,6 +60,9 @@ CONSTANTS = (
     "link_inertia",
     "link_damping",
     "gravity",
+    "link_coulomb",
+    "link_static",
+    "link_stribeck",
     "winding_housing",
     "housing_body",
     "body_ambient",
@@ -102,6 +105,9 @@ _QM, _VM, _Q, _V, _Z, _TW, _TH, _TB, _PWM, _I, _TAU, _HEAT = range(12)
     _M,
     _BL,
     _G,
+    _LTC,
+    _LTS,
+    _LVS,
     _RWH,
     _RHB,
     _RBA,
@@ -120,7 +126,7 @@ _QM, _VM, _Q, _V, _Z, _TW, _TH, _TB, _PWM, _I, _TAU, _HEAT = range(12)
     _ULIMIT,
     _USTEP,
     _ENABLED,
-) = range(37)
+) = range(40)
 
 _CLAMP_BAND = 0.05
 """Share of the velocity clamp over which the firmware takes the drive back to nothing."""
@@ -219,6 +225,8 @@ def advance(
         velocity = state[_V] + STEP * _link_acceleration(
             state[_Q], state[_V], spring, link_torque, constants[_M], constants[_BL], constants[_G]
         )
+        friction = _friction_magnitude(state[_V], constants[_LTC], constants[_LTS], constants[_LVS])
+        velocity = _dry_friction_step(velocity, friction, constants[_M], STEP)
         state[_VM] = motor_velocity
         state[_V] = velocity
         state[_QM] += STEP * motor_velocity

@@ -36,6 +36,7 @@ class ThermalParameters:
         magnet_coefficient: Relative change of K_t and K_e per kelvin of the magnets [1/K]. Sm2Co17 loses 0.035 % of
             its flux per kelvin; with copper's 0.4 %/K the shorted-winding damping is then 11.87, 11.76 and
             10.84 N m s/rad at 20, 22 and 40 degC.
+        isothermal: Keep all temperatures as they are at the start.
     """
 
     winding_housing: float = 4.626
@@ -48,6 +49,7 @@ class ThermalParameters:
     max_winding: float = 155.0
     critical_winding: float = 140.0
     magnet_coefficient: float = -3.5e-4
+    isothermal: bool = False
 
     def __post_init__(self) -> None:
         """Refuse constants with which heat would flow uphill."""

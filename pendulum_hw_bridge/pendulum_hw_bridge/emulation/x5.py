@@ -381,7 +381,7 @@ class EmulatedX5:
     def _measure(self, arrival_ns: int) -> Feedback:
         state, drive, sensors = self._state, self.parameters.drivetrain, self.parameters.sensors
         noise = self._random.standard_normal(2)
-        deflection = float(state[2] - state[0]) + sensors.deflection_noise * float(
+        deflection = float(state[2] - state[0]) + sensors.effort_noise / drive.stiffness * float(
             self._random.uniform(-1.0, 1.0)
         )
         effort = spring_torque(-deflection, 0.0, drive.stiffness, drive.stiffness_hardening, 0.0)

@@ -1,0 +1,212 @@
+"""The thesis's experiments on the actuator, as pure values: a hand that turns the link, and the gravity staircase.
+
+Experiment 1 (inertia, damping): the pendulum lies flat, PWM is 0, a hand moves it from 0 to pi and back, in both
+directions, six trials. Experiment 2 (gravity): the pendulum hangs; steps of 10 degrees to 90 and back, then to -90
+and back, each a ramp and a hold.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+
+from pendulum_msgs_py.errors import ParameterError
+from pendulum_msgs_py.trajectory import Trajectory, thesis_ramp
+
+__all__ = [
+    "HAND_TRIALS",
+    "STAIRCASE_TRIALS",
+    "HandMotion",
+    "Phase",
+    "hand_trials",
+    "staircase",
+    "staircase_angles",
+]
+
+HAND_TRIALS = 6
+"""Trials of experiment 1."""
+STAIRCASE_TRIALS = 3
+"""Trials of experiment 2."""
+
+_HAND_STIFFNESS = 80.0
+_HAND_DAMPING = 4.0
+_TREMOR_TONES = 6
+_TREMOR_HERTZ = (0.3, 1.5)
+_TREMOR_RADIANS = 0.05
+
+
+@dataclass(frozen=True)
+class HandMotion:
+    """One trial of experiment 1: a hand turns the link from 0 to pi (or -pi), rests, and comes back.
+
+    The hand follows a minimum-jerk path with a tremor of a few slow tones on top, as a spring and a damper between
+    where it wants the link and where the link is.
+
+    Attributes:
+        direction: 1 for counter-clockwise first, -1 for clockwise.
+        start: Angle at which the trial starts [rad].
+        rest: Time at rest before, between and after the two strokes [s].
+        strokes: Duration of each stroke [s].
+        tremor: Amplitude [rad], frequency [Hz] and phase [rad] of each tone.
+    """
+
+    direction: int
+    start: float
+    rest: float
+    strokes: tuple[float, float]
+    tremor: tuple[tuple[float, float, float], ...]
+
+    @property
+    def duration(self) -> float:
+        """Time of the whole trial [s]."""
+        return 3.0 * self.rest + sum(self.strokes)
+
+    def reference(self, time: float) -> tuple[float, float]:
+        """Return where the hand wants the link, and how fast.
+
+        Args:
+            time: Since the start of the trial [s].
+
+        Returns:
+            Angle [rad] and velocity [rad/s].
+        """
+        out, back = self.strokes
+        since_out = time - self.rest
+        since_back = since_out - out - self.rest
+        distance = self.direction * math.pi
+        if since_back > 0.0:
+            share, rate = _minimum_jerk(since_back, back)
+            share, rate = 1.0 - share, -rate
+            envelope, slope = _envelope(since_back, back)
+        else:
+            share, rate = _minimum_jerk(since_out, out)
+            envelope, slope = _envelope(since_out, out)
+        tremor = sum(a * math.sin(math.tau * f * time + p) for a, f, p in self.tremor)
+        tremor_rate = sum(a * math.tau * f * math.cos(math.tau * f * time + p) for a, f, p in self.tremor)
+        return (
+            self.start + distance * share + envelope * tremor,
+            distance * rate + envelope * tremor_rate + slope * tremor,
+        )
+
+    def torque(self, time: float, position: float, velocity: float) -> float:
+        """Return the torque of the hand on the link [N m].
+
+        Args:
+            time: Since the start of the trial [s].
+            position: Of the link [rad].
+            velocity: Of the link [rad/s].
+        """
+        wanted, wanted_rate = self.reference(time)
+        return _HAND_STIFFNESS * (wanted - position) + _HAND_DAMPING * (wanted_rate - velocity)
+
+
+@dataclass(frozen=True)
+class Phase:
+    """One phase of an experiment, as it stands in the bag's events.
+
+    Attributes:
+        name: ``dynamic`` for a ramp, ``static`` for a hold.
+        trial: Number of the trial, from 1.
+        angle: Angle reached or held [rad].
+        upwards: Whether the step leads away from hanging down.
+        trajectory: The ramp; for a hold a trajectory of one point.
+        hold: Time to hold after the trajectory [s].
+    """
+
+    name: str
+    trial: int
+    angle: float
+    upwards: bool
+    trajectory: Trajectory
+    hold: float
+
+
+def hand_trials(seed: int, *, trials: int = HAND_TRIALS, start: float = 0.0) -> tuple[HandMotion, ...]:
+    """Return the trials of experiment 1, alternating in direction.
+
+    Args:
+        seed: Seed of durations and tremor; a trial does not depend on how many others there are.
+        trials: How many.
+        start: Angle at which each trial starts and ends [rad].
+
+    Source:
+        Thesis, section "Determination of moment of inertia and damping": six trials, both directions.
+    """
+    if trials < 1:
+        raise ParameterError(f"number of trials is {trials}; expected >= 1")
+    return tuple(_hand_trial(seed, index, start) for index in range(trials))
+
+
+def staircase_angles(step: float = 10.0, top: float = 90.0) -> tuple[float, ...]:
+    """Return the angles of the staircase in their order: 0 to 90, back, to -90 and back [rad].
+
+    Args:
+        step: Height of a step [deg].
+        top: Highest angle, a multiple of the step [deg].
+    """
+    count = round(top / step) if step > 0.0 else 0
+    if count < 1 or abs(count * step - top) > 1e-9 * top:
+        raise ParameterError(
+            f"staircase step is {step} deg and top {top} deg; expected top a multiple of step > 0"
+        )
+    half = [*range(1, count + 1), *range(count - 1, -1, -1)]
+    return tuple(math.radians(sign * step * index) for sign in (1.0, -1.0) for index in half)
+
+
+def staircase(
+    trial: int,
+    *,
+    step: float = 10.0,
+    top: float = 90.0,
+    hold: float = 2.0,
+    start: float = 0.0,
+) -> Iterator[Phase]:
+    """Yield the phases of one trial of experiment 2: a ramp to each angle, then a hold.
+
+    Args:
+        trial: Number of the trial, from 1.
+        step: [deg].
+        top: [deg].
+        hold: Time to hold each step [s].
+        start: Angle from which the first ramp starts [rad].
+
+    Source:
+        Thesis, section "Determination of Gravitational force coefficient of the system".
+    """
+    before = start
+    for angle in staircase_angles(step, top):
+        upwards = abs(angle) > abs(before)
+        ramp = thesis_ramp(before, angle)
+        yield Phase("dynamic", trial, angle, upwards, ramp, 0.0)
+        yield Phase("static", trial, angle, upwards, thesis_ramp(angle, angle), hold)
+        before = angle
+
+
+def _hand_trial(seed: int, index: int, start: float) -> HandMotion:
+    random = np.random.Generator(np.random.Philox(key=[seed, index]))
+    strokes = random.uniform(5.5, 8.0, 2)
+    amplitudes = _TREMOR_RADIANS * random.uniform(0.5, 1.0, _TREMOR_TONES) / math.sqrt(_TREMOR_TONES)
+    frequencies = random.uniform(*_TREMOR_HERTZ, _TREMOR_TONES)
+    phases = random.uniform(0.0, math.tau, _TREMOR_TONES)
+    return HandMotion(
+        direction=1 if index % 2 == 0 else -1,
+        start=start,
+        rest=0.5,
+        strokes=(float(strokes[0]), float(strokes[1])),
+        tremor=tuple(zip(amplitudes.tolist(), frequencies.tolist(), phases.tolist(), strict=True)),
+    )
+
+
+def _minimum_jerk(time: float, duration: float) -> tuple[float, float]:
+    """Return the share of a minimum-jerk stroke, 0 to 1, and its rate [1/s] (Flash and Hogan, 1985)."""
+    x = min(1.0, max(0.0, time / duration))
+    return x * x * x * (10.0 + x * (6.0 * x - 15.0)), 30.0 * x * x * (1.0 - x) * (1.0 - x) / duration
+
+
+def _envelope(time: float, duration: float) -> tuple[float, float]:
+    """Return the strength of the tremor within a stroke, 0 to 1 to 0, and its rate [1/s]."""
+    x = min(1.0, max(0.0, time / duration))
+    return math.sin(math.pi * x) ** 2, math.pi / duration * math.sin(2.0 * math.pi * x)
