@@ -1,0 +1,280 @@
+"""Equivalence tests against a stated margin: two one-sided tests, and what they mean in words.
+
+A test of "no difference" rewards little data. Two one-sided tests (Schuirmann, J. Pharmacokinet. Biopharm. 15, 1987)
+turn that round: equivalence is shown when the 90 % interval lies inside the margin, difference when it lies outside,
+and anything else is undecided, with the number of runs that would probably decide it.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, fields
+from enum import Enum
+from typing import Any
+
+from scipy import stats
+
+from pendulum_bags.comparison.statistics import Interval
+from pendulum_msgs_py.errors import ParameterError
+
+__all__ = ["EquivalenceTest", "Margins", "Outcome", "Verdict", "conclude", "equivalence_test"]
+
+LEVEL = 0.9
+"""Two one-sided tests at 5 % each are one interval of 90 %."""
+POWER = 0.8
+"""Probability with which the named number of runs would decide."""
+MOST_RUNS = 10_000
+
+
+class Outcome(str, Enum):
+    """What a test shows."""
+
+    EQUIVALENT = "equivalent"
+    DIFFERENT = "not equivalent"
+    UNDECIDED = "undecided"
+
+
+@dataclass(frozen=True)
+class Margins:
+    """How much difference does not matter.
+
+    Args:
+        position: Difference of the mean angles [rad].
+        velocity: Difference of the mean velocities [rad/s].
+        spread: Factor between standard deviations (of angle, velocity, torque), > 1; 1.25 is the range 0.80 to 1.25
+            of bioequivalence.
+        path: Root mean square distance of the two motions under one disturbance, per standard deviation of the
+            hardware's motion.
+        stated: Whether the user stated them; else they are the program's defaults, and the verdict says so.
+    """
+
+    position: float = 0.005
+    velocity: float = 0.05
+    spread: float = 1.25
+    path: float = 0.5
+    stated: bool = True
+
+    def __post_init__(self) -> None:
+        """Refuse what is no margin."""
+        for name, unit in (("position", "rad"), ("velocity", "rad/s"), ("path", "")):
+            value = getattr(self, name)
+            if not (math.isfinite(value) and value > 0.0):
+                raise ParameterError(f"margin {name} is {value} {unit}".rstrip() + "; expected a finite number > 0")
+        if not (math.isfinite(self.spread) and self.spread > 1.0):
+            raise ParameterError(f"margin spread is {self.spread}; expected a factor > 1, such as 1.25")
+
+    @classmethod
+    def parse(cls, margin: Margins | Mapping[str, float] | Sequence[str] | float | None) -> Margins:
+        """Return margins from what a user states.
+
+        Args:
+            margin: None for the defaults, a number for the angle [rad], a mapping of names to values, texts such as
+                ``position=0.005``, or margins.
+
+        Raises:
+            ParameterError: An unknown name or a value out of domain.
+        """
+        if margin is None or (not isinstance(margin, (int, float, Margins)) and len(margin) == 0):
+            return cls(stated=False)
+        if isinstance(margin, Margins):
+            return margin
+        if isinstance(margin, (int, float)):
+            return cls(position=float(margin))
+        if isinstance(margin, str):
+            margin = margin.split(",")
+        values = dict(margin) if isinstance(margin, Mapping) else dict(_parse_text(text) for text in margin)
+        known = [field.name for field in fields(cls) if field.name != "stated"]
+        for name in values:
+            if name not in known:
+                raise ParameterError(f"margin has no {name!r}; expected one of {', '.join(known)}")
+        numbers: dict[str, Any] = {name: float(value) for name, value in values.items()}
+        return cls(**numbers)
+
+
+def _parse_text(text: str) -> tuple[str, float]:
+    name, sign, value = text.partition("=")
+    if not sign:
+        name, value = "position", text
+    try:
+        return name.strip(), float(value)
+    except ValueError as error:
+        raise ParameterError(f"margin is {text!r}; expected a number in rad, or NAME=NUMBER") from error
+
+
+@dataclass(frozen=True)
+class EquivalenceTest:
+    """One quantity against its margin.
+
+    Args:
+        quantity: What was tested, in words.
+        unit: Unit of the figures.
+        interval: Estimate with its 90 % interval.
+        low: Lower margin; minus infinity for a one-sided test.
+        high: Upper margin.
+        outcome: What it shows.
+        more_runs: Runs to record in addition for a decision with 80 % probability; 0 where decided, None where more
+            runs would hardly help, since the estimate sits on the margin.
+        smallest_margin: Smallest margin at which it would be equivalent.
+    """
+
+    quantity: str
+    unit: str
+    interval: Interval
+    low: float
+    high: float
+    outcome: Outcome
+    more_runs: int | None
+    smallest_margin: float
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return everything for JSON."""
+        return {
+            "quantity": self.quantity,
+            "unit": self.unit,
+            **self.interval.as_dict(),
+            "margin_low": self.low if math.isfinite(self.low) else None,
+            "margin_high": self.high,
+            "outcome": self.outcome.value,
+            "more_runs": self.more_runs,
+            "smallest_margin": self.smallest_margin,
+        }
+
+    def sentence(self) -> str:
+        """Return the result in words."""
+        unit = f" {self.unit}" if self.unit not in {"", "-"} else ""
+        text = (
+            f"{self.quantity}: {self.interval.estimate:.3g}{unit}, 90 % interval {self.interval.low:.3g} to "
+            f"{self.interval.high:.3g}{unit}, {_margin_text(self)}{unit}: {self.outcome.value}"
+        )
+        if self.outcome is Outcome.UNDECIDED:
+            text += f": {_more(self.more_runs)}"
+        return text
+
+
+def _margin_text(test: EquivalenceTest) -> str:
+    if not math.isfinite(test.low):
+        return f"margin {test.high:.3g}"
+    if math.isclose(test.low, -test.high):
+        return f"margin ±{test.high:.3g}"
+    return f"margin {test.low:.3g} to {test.high:.3g}"
+
+
+def _more(runs: int | None) -> str:
+    if runs is None:
+        return "more runs would hardly decide it, the estimate sits on the margin"
+    return f"record {runs} more run{'s' if runs != 1 else ''}"
+
+
+def equivalence_test(
+    quantity: str, unit: str, interval: Interval, low: float, high: float, *, runs: int = 1, ratio: bool = False
+) -> EquivalenceTest:
+    """Test one quantity.
+
+    Args:
+        quantity: Name in words.
+        unit: Unit.
+        interval: Estimate and 90 % interval.
+        low: Lower margin; minus infinity for one-sided.
+        high: Upper margin.
+        runs: Runs that the interval rests on.
+        ratio: Whether it is a ratio, whose distances are logarithms.
+    """
+    scale = _logarithm if ratio else _same
+    estimate, left, right = (scale(value) for value in (interval.estimate, interval.low, interval.high))
+    bottom, top = (scale(value) for value in (low, high))
+    if left > bottom and right < top:
+        outcome = Outcome.EQUIVALENT
+    elif left > top or right < bottom:
+        outcome = Outcome.DIFFERENT
+    else:
+        outcome = Outcome.UNDECIDED
+    farthest = right if not math.isfinite(low) else max(abs(left), abs(right))
+    smallest = math.exp(farthest) if ratio else farthest
+    more: int | None = 0
+    if outcome is Outcome.UNDECIDED:
+        error = max(right - left, 0.0) / (2.0 * float(stats.norm.ppf(0.5 + 0.5 * interval.level)))
+        more = _runs_to_decide(min(abs(top - estimate), abs(estimate - bottom)), error, runs)
+    return EquivalenceTest(quantity, unit, interval, low, high, outcome, more, smallest)
+
+
+def _same(value: float) -> float:
+    return value
+
+
+def _logarithm(value: float) -> float:
+    return math.log(value) if value > 0.0 else -math.inf
+
+
+def _runs_to_decide(distance: float, error: float, runs: int) -> int | None:
+    """Return how many more runs bring the interval's end within reach of the nearest margin."""
+    if distance <= 0.0 or not math.isfinite(error):
+        return None
+    needed = runs * ((stats.norm.ppf(LEVEL + 0.5 * (1.0 - LEVEL)) + stats.norm.ppf(POWER)) * error / distance) ** 2
+    if needed > MOST_RUNS:
+        return None
+    return max(1, math.ceil(needed) - runs)
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """All tests together.
+
+    Args:
+        outcome: Equivalent if all are, not equivalent if one is not, undecided otherwise.
+        sentence: The verdict in words.
+        tests: The tests.
+        margins: What was asked for.
+    """
+
+    outcome: Outcome
+    sentence: str
+    tests: Sequence[EquivalenceTest]
+    margins: Margins
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return everything for JSON."""
+        return {
+            "outcome": self.outcome.value,
+            "sentence": self.sentence,
+            "margins": asdict(self.margins),
+            "tests": [test.as_dict() for test in self.tests],
+        }
+
+
+def conclude(tests: Sequence[EquivalenceTest], margins: Margins, first: str, second: str) -> Verdict:
+    """Return the verdict on a set of tests.
+
+    Args:
+        tests: At least one.
+        margins: Margins of the tests.
+        first: Name of the one plant.
+        second: Name of the other.
+    """
+    by_outcome = {outcome: [test for test in tests if test.outcome is outcome] for outcome in Outcome}
+    different, undecided = by_outcome[Outcome.DIFFERENT], by_outcome[Outcome.UNDECIDED]
+    whose = "the stated margins" if margins.stated else "the default margins (none were stated)"
+    if different:
+        outcome = Outcome.DIFFERENT
+        what = "; ".join(_short(test) for test in different)
+        text = f"{first} and {second} are not equivalent within {whose}: {what}."
+        if undecided:
+            text += f" Undecided: {', '.join(test.quantity for test in undecided)}."
+    elif undecided:
+        outcome = Outcome.UNDECIDED
+        counts = [test.more_runs for test in undecided]
+        runs = None if None in counts else max(count or 0 for count in counts)
+        what = ", ".join(test.quantity for test in undecided)
+        text = f"Undecided whether {first} and {second} are equivalent within {whose}: {_more(runs)} ({what})."
+    else:
+        outcome = Outcome.EQUIVALENT
+        text = f"{first} and {second} are equivalent within {whose}, in all {len(tests)} tests."
+    return Verdict(outcome, text[0].upper() + text[1:], tuple(tests), margins)
+
+
+def _short(test: EquivalenceTest) -> str:
+    unit = f" {test.unit}" if test.unit not in {"", "-"} else ""
+    return (
+        f"{test.quantity} is {test.interval.estimate:.3g}{unit} "
+        f"({test.interval.low:.3g} to {test.interval.high:.3g}), {_margin_text(test)}"
+    )
