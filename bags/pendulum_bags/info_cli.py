@@ -67,10 +67,14 @@ def _print(statistics: BagStatistics, metadata: dict[str, Any]) -> None:
             table.add_column(heading, justify="right")
         for name, topic in stamped.items():
             counts = (topic.duplicates, topic.backward, topic.clock_jumps)
-            table.add_row(name, _number(topic.age), _number(topic.age_p99), *(_alarm(count) for count in counts))
+            table.add_row(
+                name, _number(topic.age), _number(topic.age_p99), *(_alarm(count) for count in counts)
+            )
         console.print(table)
     if statistics.latencies:
-        table = Table("from", "to the answer on", title="latencies (by equal stamps, in ms)", title_justify="left")
+        table = Table(
+            "from", "to the answer on", title="latencies (by equal stamps, in ms)", title_justify="left"
+        )
         for heading in ("matched", "median", "p99", "longest"):
             table.add_column(heading, justify="right")
         for latency in statistics.latencies:
@@ -82,7 +86,12 @@ def _print(statistics: BagStatistics, metadata: dict[str, Any]) -> None:
         console.print(f"event {offset:+9.3f} s  {event['name']}", highlight=False, soft_wrap=True)
     for key, value in metadata.items():
         text = value if isinstance(value, str) else json.dumps(value)
-        console.print(f"{key}: {text if len(text) < 400 else text[:400] + ' ...'}", highlight=False, soft_wrap=True, markup=False)
+        console.print(
+            f"{key}: {text if len(text) < 400 else text[:400] + ' ...'}",
+            highlight=False,
+            soft_wrap=True,
+            markup=False,
+        )
 
 
 def _number(value: float) -> str:

@@ -36,7 +36,9 @@ class ParameterReader:
         self._known: set[str] = {node.get_fully_qualified_name()}
         self._clients: list[Client] = []
         self._finished: list[Client] = []
-        node.create_subscription(ParameterEvent, "/parameter_events", self._on_event, qos_profile_parameter_events)
+        node.create_subscription(
+            ParameterEvent, "/parameter_events", self._on_event, qos_profile_parameter_events
+        )
 
     def look(self) -> None:
         """Look for new nodes, and ask those whose services have appeared."""
@@ -79,8 +81,9 @@ class ParameterReader:
             if answer is None:
                 return
             self.values[full] = {
-                name: _plain(value) for name, value in zip(names, answer.values, strict=False) if name != "use_sim_time"
-                or value.bool_value
+                name: _plain(value)
+                for name, value in zip(names, answer.values, strict=False)
+                if name != "use_sim_time" or value.bool_value
             }
             self._on_values(self.values, "")
 

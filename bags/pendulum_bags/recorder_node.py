@@ -5,7 +5,6 @@ from __future__ import annotations
 import importlib
 import json
 import platform
-import re
 import sys
 import threading
 import time
@@ -22,11 +21,18 @@ from rclpy.topic_endpoint_info import TopicEndpointInfo
 from std_srvs.srv import Trigger
 
 from pendulum_bags import __version__
-from pendulum_bags.recorder import LOG_TIMES, GapCounter, RecordingSession, SessionReport, StampReader, stamp_reader
 from pendulum_bags.parameter_reader_node import ParameterReader
-from pendulum_bags.storage import STORAGES, QosProfile, open_writer
+from pendulum_bags.recorder import (
+    GapCounter,
+    RecordingSession,
+    SessionReport,
+    StampReader,
+    stamp_reader,
+)
+from pendulum_bags.recorder.options import RecorderOptions, read_metadata
+from pendulum_bags.storage import QosProfile, open_writer
 from pendulum_bags.storage.message_types import MessageType, message_type
-from pendulum_msgs_py.errors import BagError, ParameterError
+from pendulum_msgs_py.errors import BagError
 from pendulum_msgs_py.executables import cli_main
 from pendulum_msgs_py.names import EVENTS
 from pendulum_msgs_py.parameters import ParameterSpec
@@ -42,7 +48,6 @@ DISCOVERY_PERIOD = 0.2
 """Time between two looks at the graph [s]."""
 DEPTH = 4000
 """Messages that the middleware holds for us between two visits: four seconds at 1 kHz."""
-ALWAYS_LEFT_OUT = frozenset({"/parameter_events", "/rosout"})
 
 SPECS = (
     ParameterSpec(
@@ -52,64 +57,6 @@ SPECS = (
         "A note for the recording; setting it writes the event 'annotation', as the service ~/annotate does again.",
     ),
 )
-
-
-@dataclass(frozen=True, slots=True)
-class RecorderOptions:
-    """What to record, and how.
-
-    Args:
-        output: Folder of the bag; it must not exist.
-        topics: Full topic names; empty for all (but ``/rosout`` and ``/parameter_events``).
-        regex: Pattern that a topic may match instead of being listed.
-        exclude: Pattern of topics to leave out.
-        storage: ``mcap`` or ``sqlite3``.
-        compression: ``None`` or ``zstd``.
-        max_size: Begin a new file at this size [bytes]; 0 for never.
-        max_duration: Begin a new file after this time [s]; 0 for never.
-        duration: Stop after this time [s]; 0 for never.
-        metadata: Run metadata to store.
-        log_time: ``receive`` or ``header``.
-        wait: Begin only when the service ``~/start`` is called.
-    """
-
-    output: Path
-    topics: tuple[str, ...] = ()
-    regex: str = ""
-    exclude: str = ""
-    storage: str = "mcap"
-    compression: str | None = None
-    max_size: int = 0
-    max_duration: float = 0.0
-    duration: float = 0.0
-    metadata: Mapping[str, Any] = field(default_factory=dict)
-    log_time: str = "receive"
-    wait: bool = False
-
-    def __post_init__(self) -> None:
-        if self.log_time not in LOG_TIMES:
-            raise ParameterError(f"log time is {self.log_time!r}; expected one of {', '.join(LOG_TIMES)}")
-        if self.storage not in STORAGES:
-            raise ParameterError(f"storage is {self.storage!r}; expected one of {', '.join(STORAGES)}")
-        for name, value in (("max-size", self.max_size), ("max-duration", self.max_duration), ("duration", self.duration)):
-            if not value >= 0:
-                raise ParameterError(f"{name} is {value}; expected >= 0")
-        for name in self.topics:
-            if not name.startswith("/"):
-                raise ParameterError(f"topic is {name!r}; expected its full name, such as /{name}")
-        for name, pattern in (("regex", self.regex), ("exclude", self.exclude)):
-            try:
-                re.compile(pattern)
-            except re.error as error:
-                raise ParameterError(f"{name} is {pattern!r}; expected a regular expression ({error})") from None
-
-    def wants(self, topic: str) -> bool:
-        """Tell whether a topic is to be recorded."""
-        if self.exclude and re.search(self.exclude, topic):
-            return False
-        if self.topics or self.regex:
-            return topic in self.topics or bool(self.regex and re.search(self.regex, topic))
-        return topic not in ALWAYS_LEFT_OUT
 
 
 @dataclass(slots=True)
@@ -217,7 +164,11 @@ class Recorder(Node):
         self.reports.append(report)
         failed = bool(report.lost or report.error)
         self.exit_code = 1 if failed else self.exit_code
-        print(f"{'error: ' if failed else ''}recorded {report.sentence()}", file=sys.stderr if failed else sys.stdout, flush=True)
+        print(
+            f"{'error: ' if failed else ''}recorded {report.sentence()}",
+            file=sys.stderr if failed else sys.stdout,
+            flush=True,
+        )
         return report
 
     def _provenance(self) -> dict[str, Any]:
@@ -405,8 +356,15 @@ class Recorder(Node):
             {
                 "path": str(session.writer.path) if session is not None else None,
                 "subscribed": sorted(self._taps),
+                "matched": sorted(
+                    tap.topic for tap in self._taps.values() if tap.subscription.get_publisher_count()
+                ),
                 "topics": {
-                    name: {"received": count.received, "written": count.written, "lost": count.refused + count.missing}
+                    name: {
+                        "received": count.received,
+                        "written": count.written,
+                        "lost": count.refused + count.missing,
+                    }
                     for name, count in counts.items()
                 },
             }
@@ -452,16 +410,22 @@ app = typer.Typer(add_completion=False, rich_markup_mode=None)
 def record(
     context: typer.Context,
     output: Annotated[Path, typer.Option("-o", "--output", help="Folder of the bag; it must not exist.")],
-    topics: Annotated[list[str] | None, typer.Argument(help="Topics by their full names; by default all.")] = None,
+    topics: Annotated[
+        list[str] | None, typer.Argument(help="Topics by their full names; by default all.")
+    ] = None,
     regex: Annotated[str, typer.Option(help="Record topics that match this pattern, too.")] = "",
     exclude: Annotated[str, typer.Option(help="Leave out topics that match this pattern.")] = "",
     storage: Annotated[str, typer.Option(help="mcap or sqlite3.")] = "mcap",
     compression: Annotated[str, typer.Option(help="zstd, or none.")] = "none",
     max_size: Annotated[float, typer.Option(help="Begin a new file at this size [MB]; 0 for never.")] = 0.0,
-    max_duration: Annotated[float, typer.Option(help="Begin a new file after this time [s]; 0 for never.")] = 0.0,
+    max_duration: Annotated[
+        float, typer.Option(help="Begin a new file after this time [s]; 0 for never.")
+    ] = 0.0,
     duration: Annotated[float, typer.Option(help="Stop after this time [s]; 0 for never.")] = 0.0,
     metadata: Annotated[Path | None, typer.Option(help="JSON object to store with the bag.")] = None,
-    log_time: Annotated[str, typer.Option(help="receive (time of arrival) or header (stamp of the message).")] = "receive",
+    log_time: Annotated[
+        str, typer.Option(help="receive (time of arrival) or header (stamp of the message).")
+    ] = "receive",
     wait: Annotated[bool, typer.Option("--wait", help="Begin when the service ~/start is called.")] = False,
 ) -> int:
     """Record topics to a rosbag2 folder that is complete and readable at every instant."""
@@ -475,7 +439,7 @@ def record(
         round(max_size * 1e6),
         max_duration,
         duration,
-        _read_metadata(metadata),
+        read_metadata(metadata),
         log_time,
         wait,
     )
@@ -488,20 +452,6 @@ def record(
         description="Record topics to a bag.",
         specs=SPECS,
     )
-
-
-def _read_metadata(path: Path | None) -> dict[str, Any]:
-    if path is None:
-        return {}
-    try:
-        content = json.loads(path.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise ParameterError(f"metadata file {path} cannot be read: {error.strerror}") from error
-    except ValueError as error:
-        raise ParameterError(f"metadata file {path} is no JSON: {error}") from error
-    if not isinstance(content, dict):
-        raise ParameterError(f"metadata file {path} holds {type(content).__name__}; expected a JSON object")
-    return content
 
 
 def main(argv: list[str] | None = None) -> int:

@@ -13,11 +13,10 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from pendulum_msgs_py.errors import BagError, DataError
-
 from pendulum_bags.reader.batches import Batch, Int64, Source, Stream
 from pendulum_bags.reader.joint_state import JointStateParser
 from pendulum_bags.reader.open_source import BagFolder, open_folder, open_sources
+from pendulum_msgs_py.errors import BagError, DataError
 
 __all__ = ["Bag", "StoredMessage", "TopicInfo", "read_bag", "read_bags"]
 
@@ -76,12 +75,20 @@ class Bag(Mapping[str, Any]):
     """
 
     def __init__(
-        self, folder: BagFolder, sources: Sequence[Source], topics: Sequence[str] | None, start: int | None, stop: int | None
+        self,
+        folder: BagFolder,
+        sources: Sequence[Source],
+        topics: Sequence[str] | None,
+        start: int | None,
+        stop: int | None,
     ) -> None:
         self.path = folder.path
         self.storage = folder.storage
         self.metadata: dict[str, Any] = {key: _parsed(value) for key, value in folder.custom_data.items()}
-        self.damage = [*folder.damage, *(f"{source.path.name}: {source.damage}" for source in sources if source.damage)]
+        self.damage = [
+            *folder.damage,
+            *(f"{source.path.name}: {source.damage}" for source in sources if source.damage),
+        ]
         self._sources = list(sources)
         self._span = (start, stop)
         self._message_compression = folder.message_compression
@@ -235,7 +242,9 @@ class Bag(Mapping[str, Any]):
         fixed = [topic for topic in topics if self._is_fixed(topic)]
         if len(fixed) == 1 and any(source.compressed for source in self._sources):
             # A chunk that is decompressed for one topic serves the others too.
-            fixed += [t for t in self._topics if t not in fixed and t not in self._arrays and self._is_fixed(t)]
+            fixed += [
+                t for t in self._topics if t not in fixed and t not in self._arrays and self._is_fixed(t)
+            ]
         arrays = self._read_fixed(fixed) if fixed else {}
         for topic in dict.fromkeys([*topics, *arrays]):
             array = arrays.get(topic)
@@ -312,7 +321,9 @@ def _group(sources: Sequence[Source], hashes: Mapping[str, str]) -> dict[str, _T
     for name, streams in sorted(grouped.items()):
         types = {stream.type for _, stream in streams}
         if len(types) > 1:
-            raise BagError(f"topic {name} has the types {', '.join(sorted(types))}; expected one type for each topic")
+            raise BagError(
+                f"topic {name} has the types {', '.join(sorted(types))}; expected one type for each topic"
+            )
         first = next((stream for _, stream in streams if stream.definition), streams[0][1])
         info = TopicInfo(
             name,

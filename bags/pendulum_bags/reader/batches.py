@@ -44,7 +44,7 @@ class Batch:
 
     def payloads(self) -> Iterator[tuple[int, bytes]]:
         """Yield (log time [ns], message bytes) one by one."""
-        view = memoryview(self.buffer)
+        view = self.buffer.data
         if self.sizes is not None:
             for time, start, size in zip(
                 self.times.tolist(), self.offsets.tolist(), self.sizes.tolist(), strict=True

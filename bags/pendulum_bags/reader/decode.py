@@ -5,9 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
-from pendulum_msgs_py.errors import DataError
-
 from pendulum_bags.storage.message_types import typestore
+from pendulum_msgs_py.errors import DataError
 
 if TYPE_CHECKING:
     from pendulum_bags.reader.bag import TopicInfo
@@ -31,14 +30,20 @@ def decoder_for(info: TopicInfo) -> Callable[[bytes], Any]:
             types = get_types_from_msg(info.definition, info.type) if info.definition else {}
             store.register({name: value for name, value in types.items() if name not in store.fielddefs})
         except Exception as error:  # rosbags raises its own and parser errors
-            raise DataError(f"topic {info.name}: the definition of {info.type} is not readable: {error}") from error
+            raise DataError(
+                f"topic {info.name}: the definition of {info.type} is not readable: {error}"
+            ) from error
         if info.type not in store.fielddefs:
-            raise DataError(f"topic {info.name} has type {info.type}; expected a type that the bag or ROS 2 defines")
+            raise DataError(
+                f"topic {info.name} has type {info.type}; expected a type that the bag or ROS 2 defines"
+            )
 
     def decode(data: bytes) -> Any:
         try:
             return store.deserialize_cdr(data, info.type)
         except Exception as error:  # a damaged message fails in many ways
-            raise DataError(f"topic {info.name}: a message of {len(data)} bytes is no {info.type}: {error}") from error
+            raise DataError(
+                f"topic {info.name}: a message of {len(data)} bytes is no {info.type}: {error}"
+            ) from error
 
     return decode

@@ -234,7 +234,9 @@ def _parse_block(
     while left is None or len(left):
         if tried == len(layouts):
             first = 0 if left is None else int(left[0])
-            layout = layout_of(_message(batch, int(offsets[first]), None if sizes is None else int(sizes[first])))
+            layout = layout_of(
+                _message(batch, int(offsets[first]), None if sizes is None else int(sizes[first]))
+            )
             if layout is None or layout in layouts or tried >= _LAYOUTS:
                 return False
             layouts.append(layout)
@@ -272,7 +274,9 @@ def _fit(
         if places <= 0 or not inside.any():
             return rows
         sizes = None if sizes is None else sizes[inside]
-        rest = _fit_items(batch, plan, offsets[inside], times[inside], sizes, rows[inside], out, columns, layout)
+        rest = _fit_items(
+            batch, plan, offsets[inside], times[inside], sizes, rows[inside], out, columns, layout
+        )
         return np.sort(np.concatenate([rows[~inside], rest])) if rest is not None else rows[~inside]
     return _fit_items(batch, plan, offsets, times, sizes, left, out, columns, layout)
 
@@ -289,8 +293,11 @@ def _fit_items(
     layout: Layout,
 ) -> Int64 | None:
     # Every byte of the buffer as the possible start of a message: taking rows of it copies messages, nothing else.
-    anywhere = np.ndarray(
-        (len(batch.buffer) - plan.item.itemsize + 1,), f"V{plan.item.itemsize}", batch.buffer.data, strides=(1,)
+    anywhere: npt.NDArray[Any] = np.ndarray(
+        (len(batch.buffer) - plan.item.itemsize + 1,),
+        f"V{plan.item.itemsize}",
+        batch.buffer.data,
+        strides=(1,),
     )
     items = anywhere[offsets].view(plan.item)
     fits = items["length"] >= plan.least_length if sizes is None else sizes >= layout.size
@@ -328,7 +335,9 @@ def _with_frames(columns: _Columns) -> npt.NDArray[Any]:
         return array
     texts = [np.char.decode(kept, "utf-8", "replace") for _, _, kept in columns.frames]
     width = max(text.dtype.itemsize // 4 for text in texts)
-    wide = np.empty(len(array), [*((name, FIELDS[name]) for name in FIELDS.names or ()), ("frame_id", f"<U{width}")])
+    wide = np.empty(
+        len(array), [*((name, FIELDS[name]) for name in FIELDS.names or ()), ("frame_id", f"<U{width}")]
+    )
     for name in FIELDS.names or ():
         wide[name] = array[name]
     wide["frame_id"] = ""
@@ -346,7 +355,7 @@ def _ordered(array: npt.NDArray[Any]) -> npt.NDArray[Any]:
 
 
 def _message(batch: Batch, offset: int, size: int | None) -> bytes:
-    view = memoryview(batch.buffer)
+    view = batch.buffer.data
     if size is None:
         size = int.from_bytes(view[offset + 1 : offset + 9], "little") - 22
         offset += MCAP_HEAD

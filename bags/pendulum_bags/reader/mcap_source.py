@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import mmap
 import struct
 import zlib
@@ -12,10 +13,9 @@ from typing import Any
 
 import numpy as np
 
-from pendulum_msgs_py.errors import BagError
-
 from pendulum_bags.reader.batches import MCAP_HEAD, Batch, Bytes, Int64, Stream
 from pendulum_bags.storage import mcap_records as rec
+from pendulum_msgs_py.errors import BagError
 
 __all__ = ["Chunk", "McapSource", "decompress"]
 
@@ -35,7 +35,7 @@ _INDEX_ENTRY = np.dtype([("time", "<i8"), ("offset", "<i8")])
 _Table = dict[int, list[tuple[int, int]]]
 
 
-class _Damaged(Exception):
+class _DamagedError(Exception):
     """The file is not what its footer, index or records claim."""
 
 
@@ -88,7 +88,7 @@ class McapSource:
         self.stop_ns = 0
         try:
             self._read_summary()
-        except (_Damaged, struct.error, UnicodeDecodeError, KeyError, OverflowError) as error:
+        except (_DamagedError, struct.error, UnicodeDecodeError, KeyError, OverflowError) as error:
             self._scan(str(error) or type(error).__name__)
         self.compressed = any(chunk.compression for chunk in self.chunks)
         self.streams = [self._stream(channel) for channel in sorted(self._channels)]
@@ -97,10 +97,8 @@ class McapSource:
         """Release the memory map once no array refers to it any more."""
         self.buffer = np.empty(0, np.uint8)
         if self._map is not None:
-            try:
+            with contextlib.suppress(BufferError):  # an array still looks into it; it goes with that array
                 self._map.close()
-            except BufferError:
-                pass  # an array still looks into it; it goes with that array
             self._map = None
 
     # -- opening -----------------------------------------------------------------------------------------------
@@ -121,21 +119,21 @@ class McapSource:
         buffer, size = self.buffer, len(self.buffer)
         footer = size - _FOOTER_REGION
         if footer < 8 or bytes(buffer[-8:]) != rec.MAGIC:
-            raise _Damaged("the file has no footer")
+            raise _DamagedError("the file has no footer")
         opcode, length = rec.RECORD_HEAD.unpack(bytes(buffer[footer : footer + _HEAD]))
         if opcode != rec.FOOTER or length != 20:
-            raise _Damaged("the footer is not whole")
+            raise _DamagedError("the footer is not whole")
         (at,) = struct.unpack("<Q", bytes(buffer[footer + _HEAD : footer + _HEAD + 8]))
         if at == 0:
-            raise _Damaged("")  # allowed by the format: a file without a summary
+            raise _DamagedError("")  # allowed by the format: a file without a summary
         if not 8 <= at <= footer:
-            raise _Damaged(f"the footer points to byte {at} of {size}")
+            raise _DamagedError(f"the footer points to byte {at} of {size}")
         statistics = False
         while at < footer:
             opcode, length = rec.RECORD_HEAD.unpack(bytes(buffer[at : at + _HEAD]))
             at += _HEAD
             if at + length > footer:
-                raise _Damaged(f"a summary record of {length} bytes does not fit the file")
+                raise _DamagedError(f"a summary record of {length} bytes does not fit the file")
             if opcode == rec.PADDING:
                 self.unclosed = True  # complete, but its writer did not give back the room to grow
                 break
@@ -145,14 +143,14 @@ class McapSource:
             statistics |= self._take_summary_record(opcode, bytes(buffer[at : at + length]))
             at += length
         if not statistics and not self.chunks:
-            raise _Damaged("")
+            raise _DamagedError("")
         if self.chunks:
             if not self._counts or any(not chunk.indexes for chunk in self.chunks):
-                raise _Damaged("")  # no message index: the records must be walked through
+                raise _DamagedError("")  # no message index: the records must be walked through
             self.start_ns = min(chunk.start_ns for chunk in self.chunks)
             self.stop_ns = max(chunk.stop_ns for chunk in self.chunks)
         elif sum(self._counts.values()):
-            raise _Damaged("")  # messages outside of chunks have no index
+            raise _DamagedError("")  # messages outside of chunks have no index
 
     def _take_summary_record(self, opcode: int, content: bytes) -> bool:
         if opcode == rec.CHUNK_INDEX:
@@ -187,16 +185,16 @@ class McapSource:
             self.metadata[name] = _text_map(content, at)
 
     def _chunk_from_index(self, content: bytes) -> Chunk:
-        start, stop, offset, length, size = struct.unpack_from("<QQQQI", content)
+        start, stop, offset, _, size = struct.unpack_from("<QQQQI", content)
         indexes = dict(struct.iter_unpack("<HQ", content[36 : 36 + size]))
         at = 36 + size + 8
         compression, at = _text(content, at)
         packed, raw = struct.unpack_from("<QQ", content, at)
         data_start = offset + _HEAD + _CHUNK_FIELDS.size + len(compression) + 8
         if data_start + packed > len(self.buffer) or any(at >= len(self.buffer) for at in indexes.values()):
-            raise _Damaged("the index names a chunk beyond the end of the file")
+            raise _DamagedError("the index names a chunk beyond the end of the file")
         if self.buffer[offset] != rec.CHUNK:
-            raise _Damaged("the index names a chunk where there is none")
+            raise _DamagedError("the index names a chunk where there is none")
         return Chunk(start, stop, data_start, packed, raw, compression, indexes)
 
     def _stream(self, channel: int) -> Stream:
@@ -222,7 +220,7 @@ class McapSource:
         self._counts.clear()
         self.start_ns, self.stop_ns = 2**63 - 1, 0
         size = len(self.buffer)
-        view = memoryview(self.buffer)
+        view = self.buffer.data
         at = 8
         while at + _HEAD <= size:
             opcode, length = rec.RECORD_HEAD.unpack_from(view, at)
@@ -250,7 +248,7 @@ class McapSource:
             self.damage = self.damage or "a record of a topic is not readable"
 
     def _scan_chunk(self, body: int, length: int) -> None:
-        view = memoryview(self.buffer)
+        view = self.buffer.data
         try:
             start, stop, raw_size, crc, text_size = _CHUNK_FIELDS.unpack_from(view, body)
             compression, at = _text(bytes(view[body + 28 : body + 32 + text_size]), 0)
@@ -258,13 +256,13 @@ class McapSource:
             (packed,) = struct.unpack_from("<Q", view, at)
             at += 8
             if at + packed > body + length:
-                raise _Damaged("chunk")
+                raise _DamagedError("chunk")
             chunk = Chunk(start, stop, at, packed, raw_size, compression)
             raw = self._raw(chunk)
-            if crc and zlib.crc32(raw) != crc:
-                raise _Damaged("checksum")
+            if crc and zlib.crc32(raw.data) != crc:
+                raise _DamagedError("checksum")
             records = self._records(raw)
-        except (_Damaged, BagError, struct.error, UnicodeDecodeError):
+        except (_DamagedError, BagError, struct.error, UnicodeDecodeError):
             self.damage = self.damage or f"the chunk at byte {body - _HEAD} is not whole"
             return
         scanned: _Table = {}
@@ -284,7 +282,7 @@ class McapSource:
         while at + _HEAD <= size:
             opcode, length = rec.RECORD_HEAD.unpack_from(view, at)
             if at + _HEAD + length > size or (opcode == rec.MESSAGE and length < 22):
-                raise _Damaged("a record does not fit its chunk")
+                raise _DamagedError("a record does not fit its chunk")
             found.append((opcode, at, length))
             at += _HEAD + length
         return found
@@ -364,10 +362,14 @@ class McapSource:
         heads = self._take(_INDEX_HEAD, at)
         counts = heads["size"].astype(np.int64) // 16
         whole = (heads["opcode"] == rec.MESSAGE_INDEX) & (heads["channel"] == channel)
-        whole &= (heads["length"] == heads["size"] + np.uint64(6)) & (at + 15 + 16 * counts <= len(self.buffer))
+        whole &= (heads["length"] == heads["size"] + np.uint64(6)) & (
+            at + 15 + 16 * counts <= len(self.buffer)
+        )
         if not whole.all():
             wrong = int(at[~whole][0])
-            raise BagError(f"{self.path}: the message index at byte {wrong} is damaged; try to repair the bag")
+            raise BagError(
+                f"{self.path}: the message index at byte {wrong} is damaged; try to repair the bag"
+            )
         first = np.cumsum(counts) - counts
         rows_at = np.repeat(at + 15 - 16 * first, counts) + 16 * np.arange(int(counts.sum()))
         table = self._take(_INDEX_ENTRY, rows_at)
@@ -377,8 +379,12 @@ class McapSource:
         """Return copies of the items that begin at some bytes of the file."""
         places = max(len(self.buffer) - item.itemsize + 1, 0)
         if len(at) and not 0 <= int(at.max()) < places:
-            raise BagError(f"{self.path}: a message index lies beyond the end of the file; try to repair the bag")
-        anywhere = np.ndarray((places,), f"V{item.itemsize}", self.buffer.data, strides=(1,))
+            raise BagError(
+                f"{self.path}: a message index lies beyond the end of the file; try to repair the bag"
+            )
+        anywhere: np.ndarray[Any, Any] = np.ndarray(
+            (places,), f"V{item.itemsize}", self.buffer.data, strides=(1,)
+        )
         return anywhere[at].view(item)
 
     def _cut(self, batch: Batch, start: int | None, stop: int | None) -> Iterator[Batch]:
@@ -407,7 +413,7 @@ def decompress(packed: Bytes, compression: str, size: int, name: str) -> bytes:
         import zstandard
 
         try:
-            raw = zstandard.ZstdDecompressor().decompress(packed, max_output_size=size)
+            raw = zstandard.ZstdDecompressor().decompress(packed.data, max_output_size=size)
         except zstandard.ZstdError as error:
             raise BagError(f"{name}: a compressed chunk is damaged ({error})") from None
     elif compression == "lz4":

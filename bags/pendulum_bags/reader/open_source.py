@@ -10,12 +10,11 @@ from typing import Any
 
 import yaml
 
-from pendulum_msgs_py.errors import BagError
-
 from pendulum_bags.reader.batches import Source
 from pendulum_bags.reader.mcap_source import McapSource
 from pendulum_bags.reader.sqlite_source import SqliteSource
 from pendulum_bags.storage.metadata_file import METADATA_NAME, METADATA_VERSION
+from pendulum_msgs_py.errors import BagError
 
 __all__ = ["BagFolder", "open_folder", "open_source", "open_sources"]
 
@@ -63,7 +62,9 @@ def open_folder(path: Path) -> BagFolder:
     # A file that is not listed yet was begun by a recorder that died before it could say so.
     folder.files = listed + [file for file in present if file not in listed]
     if not folder.files:
-        raise BagError(f"{path} is no bag: it has neither {METADATA_NAME} with its files nor any .mcap or .db3 file")
+        raise BagError(
+            f"{path} is no bag: it has neither {METADATA_NAME} with its files nor any .mcap or .db3 file"
+        )
     folder.storage = folder.storage or _ENDINGS[_ending(folder.files[0])]
     return folder
 
@@ -123,7 +124,13 @@ def open_sources(folder: BagFolder) -> list[Source]:
 def open_source(file: Path) -> Source:
     """Open one storage file by its name; files compressed as a whole (``.zstd``) are decompressed first."""
     if file.suffix != ".zstd":
-        return McapSource(file) if file.suffix == ".mcap" else SqliteSource(file) if file.suffix == ".db3" else _unknown(file)
+        return (
+            McapSource(file)
+            if file.suffix == ".mcap"
+            else SqliteSource(file)
+            if file.suffix == ".db3"
+            else _unknown(file)
+        )
     import zstandard
 
     try:

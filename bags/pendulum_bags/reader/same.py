@@ -77,7 +77,9 @@ def _first_difference(
     clean = canonical if kind == "sensor_msgs/msg/JointState" else bytes
     for number, ((time_a, data_a), (time_b, data_b)) in enumerate(zip(a, b, strict=False)):
         if log_times and time_a != time_b:
-            return f"{topic} message {number} has log time {time_a} ns in one bag and {time_b} ns in the other"
+            return (
+                f"{topic} message {number} has log time {time_a} ns in one bag and {time_b} ns in the other"
+            )
         if data_a != data_b and clean(data_a) != clean(data_b):
             return f"{topic} message {number} at {time_a} ns differs"
     if len(a) != len(b):

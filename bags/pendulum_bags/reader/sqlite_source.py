@@ -11,10 +11,9 @@ from pathlib import Path
 
 import numpy as np
 
-from pendulum_msgs_py.errors import BagError
-
 from pendulum_bags.reader.batches import Batch, Bytes, Stream
 from pendulum_bags.reader.sqlite_pages import MessageRows, leaf_pages, message_rows, page_size
+from pendulum_msgs_py.errors import BagError
 
 __all__ = ["SqliteSource"]
 
@@ -56,7 +55,9 @@ class SqliteSource:
             if left_over:
                 self._open_copy(left_over)
             else:
-                self._connection = sqlite3.connect(f"{path.absolute().as_uri()}?mode=ro&immutable=1", uri=True)
+                self._connection = sqlite3.connect(
+                    f"{path.absolute().as_uri()}?mode=ro&immutable=1", uri=True
+                )
                 self._rows = self._read_pages()
             self.streams = self._read_streams()
         except (sqlite3.Error, BagError) as error:
@@ -158,7 +159,9 @@ class SqliteSource:
         run = self.connection.execute
         tables = {name for (name,) in run("SELECT name FROM sqlite_master WHERE type = 'table'")}
         if not {"topics", "messages"} <= tables:
-            raise BagError(f"{self.path} has tables {sorted(tables)}; expected a rosbag2 database with topics, messages")
+            raise BagError(
+                f"{self.path} has tables {sorted(tables)}; expected a rosbag2 database with topics, messages"
+            )
         columns = [row[1] for row in run("PRAGMA table_info(topics)")]
         definitions: dict[str, tuple[str, str]] = {}
         if "message_definitions" in tables:
@@ -169,10 +172,17 @@ class SqliteSource:
                 )
             }
         counts = self._counts()
-        wanted = ("id", "name", "type", "serialization_format", "offered_qos_profiles", "type_description_hash")
+        wanted = (
+            "id",
+            "name",
+            "type",
+            "serialization_format",
+            "offered_qos_profiles",
+            "type_description_hash",
+        )
         present = [column for column in wanted if column in columns]
         streams = []
-        for row in run(f"SELECT {', '.join(present)} FROM topics ORDER BY id"):
+        for row in run(f"SELECT {', '.join(present)} FROM topics ORDER BY id"):  # noqa: S608 (names from a list of ours)
             item = dict(zip(present, row, strict=True))
             encoding, text = definitions.get(item["type"], ("", ""))
             streams.append(
@@ -231,7 +241,7 @@ class SqliteSource:
             values.append(stop)
         where = f" WHERE {' AND '.join(conditions)}" if conditions else ""
         try:
-            cursor = self.connection.execute(f"SELECT topic_id, timestamp, data FROM messages{where}", values)
+            cursor = self.connection.execute(f"SELECT topic_id, timestamp, data FROM messages{where}", values)  # noqa: S608 (placeholders)
             while rows := cursor.fetchmany(_ROWS):
                 yield from _batches(rows)
         except sqlite3.Error as error:

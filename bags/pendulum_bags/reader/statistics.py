@@ -161,7 +161,9 @@ def _latencies(arrays: dict[str, npt.NDArray[Any]]) -> list[Latency]:
             if np.median(delays) <= 0:
                 continue  # the other direction is the answer (or all log times are the stamps themselves)
             median, p99 = np.quantile(delays, [0.5, 0.99])
-            found.append(Latency(source, answer, int(same.sum()), float(median), float(p99), float(delays.max())))
+            found.append(
+                Latency(source, answer, int(same.sum()), float(median), float(p99), float(delays.max()))
+            )
     return found
 
 
@@ -177,7 +179,9 @@ def bag_statistics(bag: Bag) -> BagStatistics:
         if isinstance(values, np.ndarray):
             arrays[name] = values
             senders = values["frame_id"] if "frame_id" in (values.dtype.names or ()) else None
-            result.topics[name] = time_statistics(info.type, values["log_time_ns"], values["stamp_ns"], senders)
+            result.topics[name] = time_statistics(
+                info.type, values["log_time_ns"], values["stamp_ns"], senders
+            )
         else:
             result.topics[name] = time_statistics(info.type, bag.log_times(name))
     result.latencies = _latencies(arrays)

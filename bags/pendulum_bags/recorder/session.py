@@ -8,10 +8,9 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from pendulum_msgs_py.errors import BagError
-
 from pendulum_bags.storage import BagWriter, QosProfile
 from pendulum_bags.storage.message_types import MessageType
+from pendulum_msgs_py.errors import BagError
 
 __all__ = ["RecordingSession", "SessionReport", "TopicCount"]
 

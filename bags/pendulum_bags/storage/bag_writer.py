@@ -10,8 +10,6 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any, Protocol
 
-from pendulum_msgs_py.errors import BagError, ParameterError
-
 from pendulum_bags.storage.message_types import MessageType, message_type
 from pendulum_bags.storage.metadata_file import (
     FileEntry,
@@ -21,6 +19,7 @@ from pendulum_bags.storage.metadata_file import (
     qos_yaml,
 )
 from pendulum_bags.storage.qos import QosProfile
+from pendulum_msgs_py.errors import BagError, ParameterError
 
 __all__ = ["STORAGES", "BagWriter", "open_writer"]
 
@@ -143,21 +142,27 @@ class BagWriter:
             BagError: The topic is in the bag with another type, or the writer is closed.
         """
         described = message_type(type) if isinstance(type, str) else type
-        profiles = (qos,) if isinstance(qos, QosProfile) else tuple(qos) if qos is not None else (QosProfile(),)
+        profiles = (
+            (qos,) if isinstance(qos, QosProfile) else tuple(qos) if qos is not None else (QosProfile(),)
+        )
         with self._lock:
             self._require_open()
             known = self._topics.get(name)
             if known is not None:
                 if known.type.name != described.name:
-                    raise BagError(f"topic {name} has type {described.name}; the bag holds it as {known.type.name}")
+                    raise BagError(
+                        f"topic {name} has type {described.name}; the bag holds it as {known.type.name}"
+                    )
                 return
             self._topics[name] = TopicEntry(name, described, profiles)
             self._ids[name] = len(self._ids) + 1
             self._written[name] = 0
-            # metadata.yaml first: rosbags passes over messages of topics that it does not list.
-            self._replace_metadata()
             self._add_channel(name)
-            self.seal()
+            # The file first: readers refuse a listed topic that has no definition. But before the first message:
+            # they pass over messages of topics that are not listed.
+            self._file.seal()
+            self._note_sealed()
+            self._replace_metadata()
 
     def write(self, topic: str, log_time_ns: int, data: bytes) -> None:
         """Add one serialised message.
@@ -377,4 +382,3 @@ def open_writer(
         ros_distro=ros_distro,
         file_stem=file_stem or folder.name,
     )
-

@@ -28,7 +28,7 @@ METADATA_NAME = "metadata.yaml"
 METADATA_VERSION = 9
 
 # YAML allows these only escaped, JSON leaves them as they are.
-_UNPRINTABLE = re.compile("[\x7f-\x9f\ud800-\udfff\ufeff\ufffe\uffff]")
+_UNPRINTABLE = re.compile("[\x7f-\x9f\u2028\u2029\ud800-\udfff\ufeff\ufffe\uffff]")
 
 
 @dataclass(slots=True)
@@ -162,4 +162,3 @@ def _custom_text(custom_data: Mapping[str, str]) -> str:
         return "  custom_data: ~\n"
     lines = "".join(f"    {yaml_string(key)}: {yaml_string(value)}\n" for key, value in custom_data.items())
     return f"  custom_data:\n{lines}"
-

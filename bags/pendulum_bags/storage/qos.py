@@ -68,7 +68,14 @@ class QosProfile:
 _HISTORY = ("system_default", "keep_last", "keep_all", "unknown")
 _RELIABILITY = ("system_default", "reliable", "best_effort", "unknown", "best_available")
 _DURABILITY = ("system_default", "transient_local", "volatile", "unknown", "best_available")
-_LIVELINESS = ("system_default", "automatic", "manual_by_node", "manual_by_topic", "unknown", "best_available")
+_LIVELINESS = (
+    "system_default",
+    "automatic",
+    "manual_by_node",
+    "manual_by_topic",
+    "unknown",
+    "best_available",
+)
 
 
 def _name(value: object, names: tuple[str, ...]) -> str:

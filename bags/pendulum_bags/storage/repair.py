@@ -71,7 +71,10 @@ def repair_bag(
     bag = Path(path)
     folder = open_folder(bag)
     sources = open_sources(folder)
-    damage = [*folder.damage, *(f"{source.path.name}: {source.damage}" for source in sources if source.damage)]
+    damage = [
+        *folder.damage,
+        *(f"{source.path.name}: {source.damage}" for source in sources if source.damage),
+    ]
     damage += [f"{source.path.name}: its recorder did not close it" for source in sources if source.unclosed]
     report = RepairReport(bag, damage)
     if not damage and not force:
@@ -82,9 +85,13 @@ def repair_bag(
     if in_place:
         target = bag.with_name(f"{bag.name}.repairing")
         if target.exists():
-            raise BagError(f"{target} exists already; expected no unfinished repair (remove it to begin again)")
+            raise BagError(
+                f"{target} exists already; expected no unfinished repair (remove it to begin again)"
+            )
     try:
-        compression = "zstd" if any(source.compressed for source in sources) and folder.storage == "mcap" else None
+        compression = (
+            "zstd" if any(source.compressed for source in sources) and folder.storage == "mcap" else None
+        )
         name = bag.name if in_place else target.name
         with open_writer(target, folder.storage, compression, folder.custom_data, file_stem=name) as writer:
             _copy(sources, folder.topic_hashes, folder.message_compression, writer)

@@ -28,10 +28,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from pendulum_msgs_py.errors import BagError
-
 from pendulum_bags.storage import mcap_records as rec
 from pendulum_bags.storage.message_types import MessageType
+from pendulum_msgs_py.errors import BagError
 
 __all__ = ["SealedMcapFile"]
 
@@ -279,7 +278,9 @@ class SealedMcapFile:
     def _summary_head(self) -> list[bytes]:
         return [*self._schema_records, *(channel.record for channel in self._channels.values())]
 
-    def _summary_tail(self, start: int, position: int, metadata_indexes: Sequence[bytes] = ()) -> tuple[bytes, int]:
+    def _summary_tail(
+        self, start: int, position: int, metadata_indexes: Sequence[bytes] = ()
+    ) -> tuple[bytes, int]:
         """Return statistics and offsets for a summary that began at ``start``; and where the offsets begin."""
         statistics = rec.statistics_record(
             message_count=self.count,

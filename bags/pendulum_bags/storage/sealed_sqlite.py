@@ -34,7 +34,8 @@ _SQLITE_VERSION = 3_045_001
 
 _TABLES = {
     "schema": "CREATE TABLE schema(schema_version INTEGER PRIMARY KEY, ros_distro TEXT NOT NULL)",
-    "metadata": "CREATE TABLE metadata(id INTEGER PRIMARY KEY, metadata_version INTEGER NOT NULL, metadata TEXT NOT NULL)",
+    "metadata": "CREATE TABLE metadata(id INTEGER PRIMARY KEY, metadata_version INTEGER NOT NULL, "
+    "metadata TEXT NOT NULL)",
     "topics": "CREATE TABLE topics(id INTEGER PRIMARY KEY, name TEXT NOT NULL, type TEXT NOT NULL, "
     "serialization_format TEXT NOT NULL, offered_qos_profiles TEXT NOT NULL, type_description_hash TEXT NOT NULL)",
     "message_definitions": "CREATE TABLE message_definitions(id INTEGER PRIMARY KEY, topic_type TEXT NOT NULL, "
@@ -47,7 +48,7 @@ _INDEX = "CREATE INDEX timestamp_idx ON messages (timestamp ASC)"
 
 
 def _varint(value: int) -> bytes:
-    """Return SQLite's big-endian variable-length integer (value >= 0, below 2**56)."""
+    """Return a big-endian variable-length integer as SQLite writes it (0 <= value < 2**56)."""
     if value < 0x80:
         return bytes((value,))
     groups = [value & 0x7F]
@@ -59,7 +60,7 @@ def _varint(value: int) -> bytes:
 
 
 def _record(values: tuple[Any, ...]) -> bytes:
-    """Return a table row without its id: ``None``, integers and texts."""
+    """Return a table row: ``None``, integers and texts."""
     types, body = b"", b""
     for value in values:
         if value is None:
@@ -98,7 +99,7 @@ class _Table:
         self._levels: list[list[tuple[int, int]]] = []
         self._rooms: list[int] = []
         self._places: list[tuple[int, int]] = []
-        self._turn = 0
+        self._shown = 0
         self._changed = True
         self.root = 0
 
@@ -149,23 +150,29 @@ class _Table:
         self._rooms[level] -= needed
 
     def place(self) -> None:
-        """Write the pages that are not full yet to the places that the file does not show."""
+        """Lay out the pages that are not full yet in the places that the file does not show."""
         if not self._changed:
             return
-        self._changed = False
-        self._turn = 1 - self._turn
         while len(self._places) <= len(self._levels):
             self._places.append((self._pages.new(), self._pages.new()))
-        page = self._places[0][self._turn]
+        hidden = 1 - self._shown
+        page = self._places[0][hidden]
         self._pages.waiting[page] = _leaf(self._cells)
         for level, children in enumerate(self._levels, 1):
-            below, page = page, self._places[level][self._turn]
+            below, page = page, self._places[level][hidden]
             self._pages.waiting[page] = _interior(children, below)
         self.root = page
 
+    def confirm(self) -> None:
+        """Take note that the file shows what was placed. (A commit that failed is tried in the same places.)"""
+        if self._changed:
+            self._shown = 1 - self._shown
+            self._changed = False
+
     def unused(self) -> list[int]:
-        """Return the pages whose turn it is not."""
-        return [pair[1 - self._turn] for pair in self._places]
+        """Return the places that the file will not show once what was placed is committed."""
+        free = self._shown if self._changed else 1 - self._shown
+        return [pair[free] for pair in self._places]
 
 
 def _leaf(cells: list[bytes]) -> bytes:
@@ -317,17 +324,22 @@ class SealedSqliteFile:
 
     def _commit(self) -> None:
         pages = self._pages
-        for table in self._tables.values():
+        tables = self._tables.values()
+        for table in tables:
             table.place()
-        self._commits += 1
-        turn = self._commits % 2
-        free = [self._trunks[1 - turn], *(page for table in self._tables.values() for page in table.unused())]
+        hidden = 1 - self._commits % 2
+        free = [self._trunks[1 - hidden], *(page for table in tables for page in table.unused())]
         trunk = struct.pack(f">{len(free) + 2}I", 0, len(free), *free)
-        pages.waiting[self._trunks[turn]] = trunk.ljust(PAGE, b"\0")
+        pages.waiting[self._trunks[hidden]] = trunk.ljust(PAGE, b"\0")
         self._write_runs()
         if os.fstat(self._fd).st_size < pages.count * PAGE:
-            os.ftruncate(self._fd, pages.count * PAGE)  # places that were not used yet belong to the file, too
-        self._write(self._first_page(self._trunks[turn], len(free) + 1), 0)
+            os.ftruncate(
+                self._fd, pages.count * PAGE
+            )  # places that were not used yet belong to the file, too
+        self._write(self._first_page(self._trunks[hidden], len(free) + 1), 0)
+        self._commits += 1
+        for table in tables:
+            table.confirm()
 
     def _write_runs(self) -> None:
         """Write the waiting pages, neighbours together; they stay waiting if that fails."""
@@ -355,7 +367,7 @@ class SealedSqliteFile:
             64,
             32,
             32,
-            self._commits,
+            self._commits + 1,
             self._pages.count,
             trunk,
             free,
@@ -367,7 +379,7 @@ class SealedSqliteFile:
             0,
             0,
             0,
-            self._commits,
+            self._commits + 1,
             _SQLITE_VERSION,
         )
         cells = []
