@@ -11,6 +11,7 @@ import os
 import sys
 from collections.abc import Sequence
 from difflib import get_close_matches
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 from pendulum_msgs_py.errors import PendulumError
@@ -106,7 +107,7 @@ def print_text(text: str) -> None:
 
 def _discard_output() -> None:
     """Send what is still buffered nowhere: the reader of our output has gone, nothing is left to say."""
-    with open(os.devnull, "w", encoding="utf-8") as nowhere:
+    with Path(os.devnull).open("w", encoding="utf-8") as nowhere:
         os.dup2(nowhere.fileno(), sys.stdout.fileno())
 
 

@@ -201,7 +201,7 @@ def _read_numbers_as_yaml_1_2(kind: type[Any]) -> type[Any]:
 class _StrictDumper(yaml.SafeDumper):
     """Safe YAML that quotes what the loader would take for a number, and writes everything in full."""
 
-    def ignore_aliases(self, data: Any) -> bool:
+    def ignore_aliases(self, _data: Any) -> bool:
         return True
 
 

@@ -16,11 +16,13 @@ from rclpy.node import Node
 from rclpy.parameter import Parameter
 
 from pendulum_msgs_py.errors import ParameterError
-from pendulum_msgs_py.parameters import ParameterSpec
+from pendulum_msgs_py.parameters import ParameterSpec, reject_unknown
 
 __all__ = ["NodeParameters"]
 
 _LARGEST_DOUBLE = 1.7976931348623157e308
+_PARAMETERS_OF_ROS = frozenset({"use_sim_time", "start_type_description_service"})
+_PREFIXES_OF_ROS = ("qos_overrides.",)
 
 
 class NodeParameters:
@@ -33,7 +35,8 @@ class NodeParameters:
             ParameterError refuses the change, and everything stays as it was.
 
     Raises:
-        ParameterError: A value given at start is refused.
+        ParameterError: A value given at start is refused, or a parameter was given that the node does not have.
+            Parameters that are declared elsewhere have to be so before.
     """
 
     def __init__(
@@ -45,6 +48,7 @@ class NodeParameters:
         self._specs = {spec.name: spec for spec in specs}
         self._on_change = on_change
         self.values: dict[str, Any] = {}
+        _refuse_unknown(node, self._specs)
         for spec in self._specs.values():
             self.values[spec.name] = self._declare(node, spec)
         node.add_on_set_parameters_callback(self._check_change)
@@ -60,18 +64,16 @@ class NodeParameters:
         except InvalidParameterTypeException as error:
             given = node._parameter_overrides.get(spec.name)
             value = given.value if given is not None else "of another type"
-            hint = ""
-            if isinstance(spec.default, float) and isinstance(value, int):
-                hint = f"; ROS tells whole numbers and decimals apart: write {float(value)}"
+            decimals = _as_decimals(spec, value)
+            hint = f"; ROS tells whole numbers and decimals apart: write {decimals}" if decimals else ""
             raise ParameterError(
-                f"{spec.name} is {value!r}; expected {_kind(spec)} {spec.domain}".rstrip() + hint
+                f"{spec.name} is {_plain(value)!r}; expected {_kind(spec)} {spec.domain}".rstrip() + hint
             ) from error
         except InvalidParameterValueException as error:
             given = node._parameter_overrides.get(spec.name)
             spec.check(given.value if given is not None else None)
             raise ParameterError(f"{spec.name} is refused: {error}; expected {spec.domain}") from error
-        value = parameter.value
-        return spec.check(list(value) if isinstance(spec.default, list) else value)
+        return spec.check(_plain(parameter.value))
 
     def _check_change(self, parameters: list[Parameter]) -> SetParametersResult:
         changed = dict(self.values)
@@ -80,14 +82,41 @@ class NodeParameters:
                 spec = self._specs.get(parameter.name)
                 if spec is None:
                     continue
-                value = list(parameter.value) if isinstance(spec.default, list) else parameter.value
-                changed[parameter.name] = spec.check(value)
+                changed[parameter.name] = spec.check(_plain(parameter.value))
             if self._on_change is not None and changed != self.values:
                 self._on_change(changed)
         except ParameterError as error:
             return SetParametersResult(successful=False, reason=str(error))
         self.values = changed
         return SetParametersResult(successful=True)
+
+
+def _refuse_unknown(node: Node, specs: Mapping[str, ParameterSpec]) -> None:
+    """ROS ignores a misspelt parameter and the default stays in force; here nobody should believe it was set."""
+    given = [
+        name
+        for name in node._parameter_overrides
+        if name not in _PARAMETERS_OF_ROS
+        and not name.startswith(_PREFIXES_OF_ROS)
+        and not node.has_parameter(name)
+    ]
+    reject_unknown(dict.fromkeys(given), specs, where=node.get_fully_qualified_name())
+
+
+def _plain(value: object) -> object:
+    """Return arrays of rclpy (of module ``array``) as lists."""
+    return value if isinstance(value, (bool, int, float, str)) or value is None else list(value)  # type: ignore[call-overload]
+
+
+def _as_decimals(spec: ParameterSpec, value: object) -> str:
+    """Return how to write whole numbers where ROS wants decimals, or nothing where that is not the trouble."""
+    if isinstance(spec.default, float) and isinstance(value, int) and not isinstance(value, bool):
+        return str(float(value))
+    if isinstance(spec.default, list) and spec.default and isinstance(spec.default[0], float):
+        numbers = _plain(value)
+        if isinstance(numbers, list) and all(type(number) is int for number in numbers):
+            return str([float(number) for number in numbers])
+    return ""
 
 
 def _kind(spec: ParameterSpec) -> str:

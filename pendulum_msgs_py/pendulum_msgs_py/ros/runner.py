@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import signal
 import socket
 import sys
@@ -13,13 +14,18 @@ from collections.abc import Callable, Iterable, Sequence
 from typing import Protocol, runtime_checkable
 
 import rclpy
+from rclpy.exceptions import (
+    InvalidNamespaceException,
+    InvalidNodeNameException,
+    InvalidTopicNameException,
+)
 from rclpy.experimental import EventsExecutor
 from rclpy.node import Node
 from rclpy.signals import SignalHandlerOptions
 from rclpy.task import Future
 
-from pendulum_msgs_py.errors import PendulumError
-from pendulum_msgs_py.executables import EXIT_USAGE, report_error
+from pendulum_msgs_py.errors import ParameterError, PendulumError
+from pendulum_msgs_py.executables import EXIT_USAGE, print_text, report_error
 from pendulum_msgs_py.parameters import ParameterSpec
 
 __all__ = ["Closeable", "run_node"]
@@ -65,7 +71,7 @@ def run_node(
     """
     arguments = list(sys.argv[1:] if argv is None else argv)
     if "-h" in arguments or "--help" in arguments:
-        print(_help(program, description, specs, example))
+        print_text(_help(program, description, specs, example))
         return 0
     own = arguments[: arguments.index("--ros-args")] if "--ros-args" in arguments else arguments
     if own:
@@ -83,7 +89,7 @@ def _run(make_node: Callable[[Callable[[], None]], Node], arguments: Sequence[st
     try:
         rclpy.init(args=list(arguments), signal_handler_options=SignalHandlerOptions.NO)
     except Exception as error:
-        return report_error(PendulumError(f"ROS arguments are not understood: {error}"))
+        return report_error(ParameterError(f"ROS arguments are not understood: {_sentence(error)}"))
     executor = EventsExecutor()
     stopped = Future(executor=None)
 
@@ -96,7 +102,7 @@ def _run(make_node: Callable[[Callable[[], None]], Node], arguments: Sequence[st
     node: Node | None = None
     exit_code = 0
     try:
-        node = make_node(stop)
+        node = _make(make_node, stop)
         executor.add_node(node)
         while not stopped.done() and rclpy.ok():
             executor.spin_until_future_complete(stopped, _SPIN_SLICE)
@@ -108,6 +114,20 @@ def _run(make_node: Callable[[Callable[[], None]], Node], arguments: Sequence[st
     finally:
         exit_code = _close(node, executor) or exit_code
     return exit_code
+
+
+def _make(make_node: Callable[[Callable[[], None]], Node], stop: Callable[[], None]) -> Node:
+    try:
+        return make_node(stop)
+    except (InvalidNodeNameException, InvalidNamespaceException, InvalidTopicNameException) as error:
+        raise ParameterError(f"ROS arguments are not understood: {_sentence(error)}") from error
+
+
+def _sentence(error: Exception) -> str:
+    """Return the first sentence of an error of rcl, which tells the rest again, with its line numbers in C."""
+    text = str(error)
+    quoted = re.search(r"error not set|Couldn't parse .*?(?=, at )", text)
+    return " ".join((quoted.group(0) if quoted else text).split())
 
 
 def _close(node: Node | None, executor: rclpy.executors.Executor) -> int:
@@ -132,15 +152,15 @@ def _close(node: Node | None, executor: rclpy.executors.Executor) -> int:
 def _listen_for_stop_signals() -> socket.socket:
     """Return a socket that gets one byte, the signal's number, for each stop signal.
 
-    The byte is written by the C handler in whichever thread the kernel picks, so that neither a busy callback nor an
-    idle executor delays it. A handler is set even where a shell started us in the background with SIGINT ignored.
+    The byte is written by the C handler in whichever thread the kernel picks, so that neither a busy callback nor
+    an idle executor delays it. A handler is set even where a shell started us in the background, SIGINT ignored.
     """
     reader, writer = socket.socketpair()
     writer.setblocking(False)
     _KEPT_OPEN.append(writer)
     signal.set_wakeup_fd(writer.fileno(), warn_on_full_buffer=False)
     for stop_signal in _STOP_SIGNALS:
-        signal.signal(stop_signal, lambda number, frame: None)
+        signal.signal(stop_signal, lambda _number, _frame: None)
     return reader
 
 
