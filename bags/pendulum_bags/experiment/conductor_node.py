@@ -30,7 +30,7 @@ from pendulum_msgs_py.ros.convert import event_message, sample_from_bytes, traje
 from pendulum_msgs_py.trajectory import Trajectory
 from pendulum_msgs_py.values import JointSample
 
-__all__ = ["Conductor", "PlantClient"]
+__all__ = ["Conductor", "PlantClient", "RecorderClient"]
 
 _SLICE = 0.05
 _T = TypeVar("_T")
@@ -145,6 +145,7 @@ class PlantClient:
         self.samples = 0
         self.events: list[dict[str, Any]] = []
         self._arm = node.create_client(SetBool, f"{namespace}/{plant}/arm")
+        self._pause = node.create_client(SetBool, f"{namespace}/{plant}/pause")
         self._e_stop = node.create_client(Trigger, f"{namespace}/{plant}/e_stop")
         self._change_state = node.create_client(ChangeState, f"{namespace}/{controller}/change_state")
         self._start = node.create_client(Trigger, f"{namespace}/{disturbance}/start")
@@ -185,6 +186,10 @@ class PlantClient:
     def disarm(self) -> None:
         """Disarm the plant."""
         self.conductor.call(self._arm, SetBool.Request(data=False), f"{self.namespace} to disarm")
+
+    def resume(self, timeout: float) -> None:
+        """Let a paused plant go."""
+        self.conductor.call(self._pause, SetBool.Request(data=False), f"{self.namespace} to go on", timeout)
 
     def disarm_quietly(self, timeout: float = 1.0) -> None:
         """Disarm on the way out, where a plant that no longer answers must not keep others from being disarmed."""
@@ -260,6 +265,24 @@ class PlantClient:
         if sample is not None:
             self.sample = sample
             self.samples += 1
+
+
+class RecorderClient:
+    """The recorder of one plant.
+
+    Args:
+        conductor: Who conducts.
+        namespace: Namespace of the plant.
+    """
+
+    def __init__(self, conductor: Conductor, namespace: str) -> None:
+        self._conductor = conductor
+        self._status = conductor.node.create_client(Trigger, f"{namespace}/recorder/status")
+
+    def heard(self) -> set[str]:
+        """Return the topics whose publishers the recorder is connected with."""
+        response = self._conductor.call(self._status, Trigger.Request(), "the recorder's status", 30.0)
+        return set(json.loads(response.message).get("matched", []))
 
 
 def _interrupt(number: int, frame: FrameType | None) -> None:

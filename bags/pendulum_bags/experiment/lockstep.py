@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from pathlib import Path
 
-from pendulum_bags.experiment.conductor_node import Conductor, PlantClient
+from pendulum_bags.experiment.conductor_node import Conductor, PlantClient, RecorderClient
 from pendulum_bags.experiment.domain import reserve_domain
 from pendulum_bags.experiment.processes import ProcessSet, ros_environment, start_recorder
 from pendulum_bags.experiment.run_folder import write_json
@@ -85,8 +85,8 @@ def run_lockstep(
         write_json(metadata, settings.metadata("lockstep", plant=plant, namespace=namespace, clock="lockstep"))
         start_recorder(processes, bag, namespace, metadata, settings.storage, log_time="header")
         program = plant_program(side, settings, theta, duration)
-        processes.start_node(settings.controller_program(namespace))
-        processes.start_node(settings.disturbance_program(namespace, autostart=True))
+        processes.start_node(settings.controller_program(namespace, use_sim_time=True))
+        processes.start_node(settings.disturbance_program(namespace, autostart=True, use_sim_time=True))
         processes.start_node(program)
         client = PlantClient(conductor, namespace, program.node_name)
         _wait_until_all_hear_each_other(conductor, namespace)
@@ -101,7 +101,7 @@ def run_lockstep(
 
 
 def _wait_until_all_hear_each_other(conductor: Conductor, namespace: str) -> None:
-    """Wait until every subscription of the run is on the graph, so that not even the first message is missed."""
+    """Wait until every subscription of the run is on the graph, and the recorder's are matched with a publisher."""
     node = conductor.node
     wanted = {
         # topic: how many listen
@@ -120,5 +120,8 @@ def _wait_until_all_hear_each_other(conductor: Conductor, namespace: str) -> Non
         )
 
     conductor.wait_for("all nodes to hear each other", complete, _START_TIMEOUT)
-    # What this node sees, the others see a moment later.
-    conductor.spin(0.3)
+    recorder = RecorderClient(conductor, namespace)
+    recorded = {f"{namespace}/{topic}" for topic in wanted} | {names.CLOCK}
+    conductor.wait_for("the recorder to hear all topics", lambda: recorded <= recorder.heard(), _START_TIMEOUT)
+    # What one side of a match knows, the other side knows a moment later.
+    conductor.spin(0.1)

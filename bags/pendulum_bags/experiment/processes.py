@@ -87,7 +87,7 @@ class ProcessSet:
             command: Program and arguments.
             ends_last: Keep it until all others have ended: a recorder that hears their last words.
             ends_by_itself: Ending with code 0 is what it is for.
-            niceness: Scheduling priority to give away.
+            niceness: Scheduling priority to give away, or to take where it is negative and permitted.
             environment: Variables to add for this one.
         """
         parent = os.getpid()
@@ -98,7 +98,8 @@ class ProcessSet:
             libc.prctl(_PR_SET_PDEATHSIG, signal.SIGINT)
             if os.getppid() != parent:
                 os._exit(1)
-            if niceness:
+            # Taking priority is a privilege; without it the run is as good as the machine is idle.
+            with contextlib.suppress(PermissionError):
                 os.nice(niceness)
 
         log = self.log_folder / f"{name}.log"
@@ -187,8 +188,18 @@ def ros_environment(domain: int, log_folder: Path) -> dict[str, str]:
 def start_recorder(
     processes: ProcessSet, bag: Path, namespace: str, metadata: Path, storage: str, *, log_time: str = "receive"
 ) -> Child:
-    """Start the recorder of all topics of one plant; ``log_time`` is ``receive`` or ``header``."""
+    """Start the recorder of all topics of one plant, as the node ``recorder`` in the plant's namespace.
+
+    Args:
+        processes: Where to start it.
+        bag: Folder of the bag.
+        namespace: Namespace of the plant.
+        metadata: JSON file about the run.
+        storage: ``mcap`` or ``sqlite3``.
+        log_time: ``receive``, or ``header`` for runs whose time is simulated.
+    """
     command = [sys.executable, "-m", "pendulum_bags", "record", "-o", str(bag)]
     command += ["--regex", f"^({namespace}/.*|/diagnostics|/clock)$", "--storage", storage]
     command += ["--metadata", str(metadata), "--log-time", log_time]
+    command += ["--ros-args", "-r", f"__ns:={namespace}"]
     return processes.start(f"recorder_{bag.name}", command, ends_last=True)

@@ -23,6 +23,8 @@ __all__ = ["run_thesis"]
 
 START_TIMEOUT = 60.0
 """Longest time for all programs to be up; the first start on a cold machine compiles code [s]."""
+LOOP_NICENESS = -10
+"""Priority of those who keep deadlines over all else on the machine, where we may take it."""
 OWN_PROTOCOL_SEED_STEP = 1_000_000
 """Added to the seed for the unpaired simulation, whose noise must not be that of the hardware."""
 SETTLE_TIME = 1.0
@@ -68,7 +70,7 @@ def _start(processes: ProcessSet, folder: Path, settings: RegulationSettings) ->
         write_json(metadata, settings.metadata("thesis", plant=plant, namespace=f"/{name}"))
         start_recorder(processes, folder / name, f"/{name}", metadata, settings.storage)
     for program in _programs(settings):
-        processes.start_node(program)
+        processes.start_node(program, niceness=LOOP_NICENESS)
 
 
 def _programs(settings: RegulationSettings) -> list[NodeProgram]:

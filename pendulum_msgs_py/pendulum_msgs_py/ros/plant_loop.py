@@ -245,6 +245,10 @@ class LockstepLoop:
             self._try_start()
         elif not self._must_wait():
             self.advance()
+        elif self.steps == 0 and not self._answered and time.monotonic() - self._waiting_since > _REPEAT:
+            # A match is known to one side before the other: a first state that nobody answers was heard by nobody.
+            assert self._interface.sample is not None
+            self._publish(self._interface.sample)
         elif time.monotonic() - self._waiting_since > _PATIENCE and not self._told_waiting:
             self._told_waiting = True
             self._interface.node.get_logger().warning(
@@ -262,5 +266,7 @@ class LockstepLoop:
             self._publish(interface.sample)
 
 
+_REPEAT = 1.0
+"""Wall time after which a first state that nobody answered is published again [s]."""
 _PATIENCE = 2.0
 """Wall time without an answer after which the log says what is missing [s]."""
