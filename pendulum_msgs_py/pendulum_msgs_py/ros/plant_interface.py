@@ -5,11 +5,13 @@ A plant (simulator, bridge) owns its clock and its loop; it asks ``decide`` what
 
 from __future__ import annotations
 
+import time
 from collections import Counter
 from collections.abc import Callable, Mapping
 from typing import Protocol
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
+from rclpy.duration import Duration
 from rclpy.node import Node
 from sensor_msgs.msg import JointState
 from std_msgs.msg import String
@@ -18,6 +20,7 @@ from trajectory_msgs.msg import JointTrajectory
 
 from pendulum_msgs_py import names
 from pendulum_msgs_py.cdr import encode_joint_state
+from pendulum_msgs_py.commands import Refusal
 from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.parameters import ParameterSpec
 from pendulum_msgs_py.ros import qos
@@ -36,6 +39,12 @@ __all__ = ["LIMIT_SPECS", "PlantInterface", "limits_from_parameters"]
 
 DIAGNOSTICS_PERIOD = 0.5
 """Time between two diagnostics [s]."""
+_LAST_WORDS = Duration(seconds=0.2)
+"""Longest wait for subscribers to have heard that the plant stops."""
+_TWIN_CHECK_PERIOD_NS = 50_000_000
+"""Least time between two looks at the graph after answers came twice [ns]."""
+_UNKNOWN_NODE = "_NODE_NAME_UNKNOWN_"
+"""What discovery calls a node whose name has not arrived yet."""
 
 LIMIT_SPECS: tuple[ParameterSpec, ...] = (
     ParameterSpec(
@@ -179,6 +188,10 @@ class PlantInterface:
         self._more_diagnostics = more_diagnostics
         self._told_mode: tuple[Mode, bool, bool] | None = None
         self._told_refusals = 0
+        self._checked_commanders_ns = 0
+        self._duplicates_at_check = 0
+        self._seconds_at_check = 0
+        self._second_commander = False
         self._states = node.create_publisher(JointState, names.JOINT_STATES, qos.STATE)
         self._applied = node.create_publisher(JointState, names.APPLIED_EFFORT, qos.STATE)
         self._events = node.create_publisher(String, names.EVENTS, qos.EVENTS)
@@ -235,9 +248,12 @@ class PlantInterface:
         return self._inputs[kind].get_publisher_count()
 
     def safe_stop(self, reason: str) -> None:
-        """Disarm, say so in diagnostics; the plant then applies zero torque."""
+        """Disarm and say so; the plant then applies zero torque. The last words arrive before this returns."""
         self.supervisor.disarm(self.clock(), reason)
+        self.publish_applied(self.clock(), 0.0)
         self.publish_diagnostics()
+        for publisher in (self._applied, self._diagnostics):
+            publisher.wait_for_all_acked(_LAST_WORDS)
 
     def publish_diagnostics(self) -> None:
         """Publish the state of the plant."""
@@ -246,6 +262,7 @@ class PlantInterface:
             "mode": supervisor.mode.value,
             "reason": supervisor.reason,
             "commander": supervisor.gates[Input.EFFORT_COMMAND].commander,
+            "refused_commander": supervisor.gates[Input.EFFORT_COMMAND].refused_commander,
             "starved_periods": supervisor.starved_periods,
             "saturated_periods": supervisor.saturated_periods,
         }
@@ -280,6 +297,8 @@ class PlantInterface:
         def receive(data: bytes) -> None:
             command = command_from_bytes(data)
             refusal = supervisor.offer(kind, command, self.clock())
+            if refusal is Refusal.DUPLICATE and kind is Input.EFFORT_COMMAND:
+                self._suspect_twins()
             if refusal is None and self.on_command is not None and command is not None:
                 self.on_command(kind, command)
 
@@ -330,8 +349,17 @@ class PlantInterface:
 
     def _on_housekeeping(self) -> None:
         self._check_commanders()
+        seconds = sum(gate.refused[Refusal.SECOND_COMMANDER] for gate in self.supervisor.gates.values())
+        self._second_commander = seconds > self._seconds_at_check
+        self._seconds_at_check = seconds
         self._tell_refusals()
         self.publish_diagnostics()
+
+    def _suspect_twins(self) -> None:
+        """Look at the graph at once when a state is answered twice: two commanders may share a name."""
+        now = time.monotonic_ns()
+        if now - self._checked_commanders_ns >= _TWIN_CHECK_PERIOD_NS:
+            self._check_commanders()
 
     def _check_commanders(self) -> None:
         topic = self.node.resolve_topic_name(names.EFFORT_COMMAND)
@@ -339,14 +367,22 @@ class PlantInterface:
             f"{info.node_namespace.rstrip('/')}/{info.node_name}"
             for info in self.node.get_publishers_info_by_topic(topic)
         )
-        twins = [name for name, count in found.items() if count > 1]
+        twins = [name for name, count in found.items() if count > 1 and not name.endswith(_UNKNOWN_NODE)]
+        gate = self.supervisor.gates[Input.EFFORT_COMMAND]
+        answered_twice = gate.refused[Refusal.DUPLICATE] - self._duplicates_at_check
+        self._duplicates_at_check = gate.refused[Refusal.DUPLICATE]
+        self._checked_commanders_ns = time.monotonic_ns()
         conflict = ""
         if twins:
             conflict = f"{found[twins[0]]} commanders named {twins[0]} on {topic}; expected one: zero torque"
-        elif len(found) > 1 and self.supervisor.gates[Input.EFFORT_COMMAND].commander == "":
-            unnamed = self.supervisor.gates[Input.EFFORT_COMMAND].newest_stamp_ns is not None
-            if unnamed:
-                conflict = f"{len(found)} unnamed commanders on {topic}; expected one, or a frame_id: zero torque"
+        elif found.total() > 1 and gate.newest_stamp_ns is not None:
+            if gate.commander == "":
+                conflict = f"{found.total()} unnamed commanders on {topic}; expected one, or a frame_id: zero torque"
+            elif answered_twice:
+                conflict = (
+                    f"{found.total()} commanders on {topic} answer the same state as {gate.commander!r}; "
+                    "expected a frame_id of its own for each: zero torque"
+                )
         if conflict and conflict != self.supervisor.commander_conflict:
             self.node.get_logger().error(conflict)
         self.supervisor.set_commander_conflict(conflict)
@@ -384,5 +420,5 @@ class PlantInterface:
             return DiagnosticStatus.ERROR
         starved = self._told_mode is not None and self._told_mode[1]
         conflict = bool(self.supervisor.commander_conflict)
-        second = any(gate.refused_commander for gate in self.supervisor.gates.values())
-        return DiagnosticStatus.WARN if starved or conflict or second else DiagnosticStatus.OK
+        warn = starved or conflict or self._second_commander
+        return DiagnosticStatus.WARN if warn else DiagnosticStatus.OK

@@ -126,7 +126,7 @@ def _make(make_node: Callable[[Callable[[], None]], Node], stop: Callable[[], No
 def _sentence(error: Exception) -> str:
     """Return the first sentence of an error of rcl, which tells the rest again, with its line numbers in C."""
     text = str(error)
-    quoted = re.search(r"error not set|Couldn't parse .*?(?=, at )", text)
+    quoted = re.search(r"Couldn't parse .*?(?=, at )", text)
     return " ".join((quoted.group(0) if quoted else text).split())
 
 
