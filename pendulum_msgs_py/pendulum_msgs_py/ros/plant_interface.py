@@ -192,6 +192,7 @@ class PlantInterface:
         self._duplicates_at_check = 0
         self._seconds_at_check = 0
         self._second_commander = False
+        self._stopping = False
         self._states = node.create_publisher(JointState, names.JOINT_STATES, qos.STATE)
         self._applied = node.create_publisher(JointState, names.APPLIED_EFFORT, qos.STATE)
         self._events = node.create_publisher(String, names.EVENTS, qos.EVENTS)
@@ -231,6 +232,8 @@ class PlantInterface:
         """Publish the torque that was really applied from the state with this stamp on, and remember it."""
         self.supervisor.report_applied(effort)
         self._applied.publish(encode_joint_state(stamp_ns, effort=effort))
+        if self._stopping:
+            self._applied.wait_for_all_acked(_LAST_WORDS)
 
     def publish_event(self, name: str, **details: object) -> None:
         """Publish an event at the plant's time."""
@@ -248,12 +251,11 @@ class PlantInterface:
         return self._inputs[kind].get_publisher_count()
 
     def safe_stop(self, reason: str) -> None:
-        """Disarm and say so; the plant then applies zero torque. The last words arrive before this returns."""
+        """Disarm, say so in diagnostics; the plant then applies zero torque and publishes that, to be heard too."""
         self.supervisor.disarm(self.clock(), reason)
-        self.publish_applied(self.clock(), 0.0)
         self.publish_diagnostics()
-        for publisher in (self._applied, self._diagnostics):
-            publisher.wait_for_all_acked(_LAST_WORDS)
+        self._diagnostics.wait_for_all_acked(_LAST_WORDS)
+        self._stopping = True
 
     def publish_diagnostics(self) -> None:
         """Publish the state of the plant."""
