@@ -15,7 +15,7 @@ from typing import Any, TypeVar
 
 from pendulum_hw_bridge.actuator import ActuatorError, Feedback
 from pendulum_hw_bridge.bridge import Bridge, Outcome
-from pendulum_msgs_py.supervisor import Drive, Input
+from pendulum_msgs_py.supervisor import Drive, DriveKind, Input
 from pendulum_msgs_py.timing import LoopStatistics
 from pendulum_msgs_py.values import NANOSECONDS, JointCommand, JointSample
 
@@ -152,8 +152,7 @@ class ActuatorLoop:
         bridge = self.bridge
         feedback = bridge.observe(0.5 * self._period)
         if feedback is None:
-            if not bridge.supervisor.mode.armed:
-                self._decide_and_act()
+            self._act_between()
             return
         sample = bridge.sample
         assert sample is not None
@@ -167,6 +166,13 @@ class ActuatorLoop:
         self._on_state(sample, feedback)
         self._wait_for_answers(sample.stamp_ns)
         self._on_outcome(sample.stamp_ns, self._decide_and_act())
+
+    def _act_between(self) -> None:
+        """Between two records only what ends torque is carried out: a command that went stale need not wait."""
+        was_armed = self.bridge.supervisor.mode.armed
+        drive = self._decide()
+        if drive.kind is DriveKind.OFF or drive.starved:
+            self.bridge.carry_out(drive, was_armed=was_armed)
 
     def _decide_and_act(self) -> Outcome:
         was_armed = self.bridge.supervisor.mode.armed

@@ -12,7 +12,7 @@ import functools
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
-from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
+from rclpy.lifecycle import LifecycleState, TransitionCallbackReturn
 from rclpy.qos import QoSProfile
 from sensor_msgs.msg import BatteryState, JointState, Temperature
 
@@ -23,11 +23,12 @@ from pendulum_hw_bridge.bridge import Bridge, Outcome
 from pendulum_hw_bridge.bridge_parameters import BRIDGE_SPECS
 from pendulum_hw_bridge.clocks import SteppedClock, WallClock
 from pendulum_hw_bridge.feedback_message import encode_feedback
-from pendulum_hw_bridge.safety import SafetyMonitor
+from pendulum_hw_bridge.safety import SHORTEST_TIMEOUT, SafetyMonitor
 from pendulum_hw_bridge.shared_supervisor import SharedSupervisor
 from pendulum_msgs_py.errors import PendulumError
 from pendulum_msgs_py.parameters import ParameterSpec, ParameterValue
 from pendulum_msgs_py.ros.convert import stamp_to_message
+from pendulum_msgs_py.ros.lifecycle import LifecycleNode
 from pendulum_msgs_py.ros.parameters import NodeParameters
 from pendulum_msgs_py.ros.plant_interface import LIMIT_SPECS, PlantInterface, limits_from_parameters
 from pendulum_msgs_py.ros.plant_loop import LOCKSTEP_EPOCH_NS, LOOP_SPECS, LockstepLoop, create_wall_timer
@@ -99,10 +100,9 @@ class BridgeNode(LifecycleNode):
         self._bridge: Bridge | None = None
         self._plant = bridge_parameters.plant_of(values)
         self._gains = bridge_parameters.trajectory_gains(values)
-        # Four cycles: the monitor's three have named the fault by then, this one is behind it.
-        limits = limits_from_parameters(
-            values, self._plant.effort_limit, feedback_timeout=4.0 * self._period_ns / NANOSECONDS
-        )
+        # A cycle more than the monitor has, which names the fault; this one is behind it.
+        patience = (values["feedback_watchdog"] + 1) * self._period_ns / NANOSECONDS
+        limits = limits_from_parameters(values, self._plant.effort_limit, feedback_timeout=patience)
         self._supervisor = SharedSupervisor(limits, self._prepare, self._withdraw)
         self._lockstep_loop: LockstepLoop | None = None
         self._interface = PlantInterface(

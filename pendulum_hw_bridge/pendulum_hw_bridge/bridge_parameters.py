@@ -127,6 +127,14 @@ BRIDGE_SPECS: tuple[ParameterSpec, ...] = (
         exclusive_minimum=True,
     ),
     _fixed(
+        "feedback_watchdog",
+        3,
+        "-",
+        "Feedback periods without a record after which the bridge faults. Raise it only for an emulator on a busy machine.",
+        minimum=2,
+        maximum=50,
+    ),
+    _fixed(
         "voltage_window", [22.0, 50.0], "V", "Supply voltages between which the bridge drives, [low, high]."
     ),
     _fixed(
@@ -328,4 +336,5 @@ def safety_limits(values: Mapping[str, Any]) -> SafetyLimits:
         voltage_max=window[1],
         measured_effort=values["measured_effort_limit"],
         winding_current=values["winding_current_tolerance"],
+        feedback_cycles=values["feedback_watchdog"],
     )

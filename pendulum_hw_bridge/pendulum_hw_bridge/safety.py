@@ -17,7 +17,7 @@ from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.plant_parameters import SeriesElasticParameters
 from pendulum_msgs_py.values import NANOSECONDS
 
-__all__ = ["FAULTS", "Fault", "SafetyLimits", "SafetyMonitor"]
+__all__ = ["FAULTS", "SHORTEST_TIMEOUT", "Fault", "SafetyLimits", "SafetyMonitor"]
 
 FAULTS = {
     "feedback_lost": "no feedback for three cycles",
@@ -26,7 +26,7 @@ FAULTS = {
     "feedback_late": "records are older than three cycles when they arrive",
     "module_restarted": "the module's own clock or sequence number went back",
     "position_jump": "position changed by more than its velocity allows",
-    "position_frozen": "position and velocity tell different motions over five cycles",
+    "motion_disagreement": "position and velocity tell different motions over five cycles (a stuck encoder)",
     "m_stop": "the motion stop is pressed",
     "over_temperature": "the firmware limits or cuts the output, or the winding is above its limit",
     "locked_by_other": "another sender holds the module",
@@ -42,8 +42,17 @@ FAULTS = {
 }
 """Faults by name and what each means; those of the supervisor come in addition."""
 
+SHORTEST_TIMEOUT = 0.02
+"""Shortest age of feedback that counts as a fault, at rates at which three cycles are less [s]."""
+
 _COUNT = 3
 _MOTION_CYCLES = 5
+_WAY = 1e-3
+"""Longest that a command takes to arrive, as a rule [s]."""
+_WRONG_COMMAND_TIME = 0.015
+"""Time for which a wrong setpoint must be in force to be a fault [s]."""
+_CLAMPED_SPEED = 1.35
+"""Speed above which the firmware may take the duty back [rad/s]."""
 
 
 @dataclass(frozen=True)
@@ -67,6 +76,7 @@ class SafetyLimits:
         position_disagreement: Largest disagreement of position and integrated velocity in five cycles [rad].
         winding_current: Largest disagreement of the winding current; 0 switches the check off [A].
         command_tolerance: Largest difference between what was sent and what the module acts on; relative to 1 [-].
+        feedback_cycles: Feedback periods without a record at which it counts as lost [-].
     """
 
     winding_temperature: float = 120.0
@@ -77,6 +87,7 @@ class SafetyLimits:
     position_disagreement: float = 0.01
     winding_current: float = 0.15
     command_tolerance: float = 2e-3
+    feedback_cycles: int = 3
 
     def __post_init__(self) -> None:
         """Refuse limits that limit nothing."""
@@ -112,17 +123,18 @@ class SafetyMonitor:
         self._last: Feedback | None = None
         self._last_new_ns: int | None = None
         self._motion: deque[tuple[int, float, float]] = deque(maxlen=_MOTION_CYCLES + 1)
-        self._sent: deque[tuple[int, Command]] = deque(maxlen=256)
+        self._sent: deque[tuple[int, Command]] = deque(maxlen=16)
         self._strategy = Strategy.OFF
         self._strategy_since_ns = 0
         self._wrong_commands = 0
+        self._wrong_since_ns = 0
         self._wrong_currents = 0
         self._clock_offset_ns: int | None = None
 
     @property
     def timeout(self) -> float:
-        """Age of feedback that is a fault: three cycles [s]."""
-        return _COUNT * self.period
+        """Age of feedback that is a fault [s]."""
+        return self.limits.feedback_cycles * self.period
 
     def told(self, command: Command, strategy: Strategy, sent_ns: int) -> None:
         """Take note of what was sent, to compare with what the module then acts on."""
@@ -262,7 +274,7 @@ class SafetyMonitor:
         gap = travelled - (points[-1][1] - points[0][1])
         if abs(gap) > self.limits.position_disagreement:
             return Fault(
-                "position_frozen",
+                "motion_disagreement",
                 f"velocity says {travelled:.4f} rad, position {points[-1][1] - points[0][1]:.4f} rad in "
                 f"{_MOTION_CYCLES} cycles; expected them within {self.limits.position_disagreement:g} rad",
             )
@@ -274,8 +286,7 @@ class SafetyMonitor:
         if self._strategy is Strategy.OFF or not self._sent or not settled:
             self._wrong_commands = 0
             return None
-        oldest = feedback.stamp_ns - round((self.timeout + 0.02) * NANOSECONDS)
-        recent = [command for sent, command in self._sent if sent >= oldest] or [self._sent[-1][1]]
+        recent = self._in_force(feedback.stamp_ns)
         if self._strategy is Strategy.DIRECT_PWM:
             acts, candidates, name = feedback.pwm_command, [command.pwm for command in recent], "PWM"
         elif math.isfinite(recent[-1].position):
@@ -284,16 +295,31 @@ class SafetyMonitor:
             acts, candidates, name = feedback.effort_command, [c.effort for c in recent], "effort"
         tolerance = self.limits.command_tolerance
         wanted = [0.0 if math.isnan(candidate) else candidate for candidate in candidates]
-        low, high = min(wanted) - tolerance, max(wanted) + tolerance
-        good = math.isfinite(acts) and low <= acts <= high
-        self._wrong_commands = 0 if good else self._wrong_commands + 1
-        if self._wrong_commands >= _COUNT:
+        good = any(abs(acts - candidate) <= tolerance for candidate in wanted)
+        if not good and self._strategy is Strategy.DIRECT_PWM and abs(feedback.velocity) > _CLAMPED_SPEED:
+            # Near its speed limit the firmware takes the duty back, never up and never round.
+            good = any(min(0.0, candidate) <= acts <= max(0.0, candidate) for candidate in wanted)
+        if good:
+            self._wrong_commands = 0
+            return None
+        if self._wrong_commands == 0:
+            self._wrong_since_ns = feedback.stamp_ns
+        self._wrong_commands += 1
+        lasts = (feedback.stamp_ns - self._wrong_since_ns) / NANOSECONDS
+        if self._wrong_commands >= _COUNT and lasts >= _WRONG_COMMAND_TIME:
             return Fault(
                 "command_not_in_force",
-                f"module acts on {name} {acts:.4f}, sent were {low + tolerance:.4f} to {high - tolerance:.4f}; "
+                f"module acts on {name} {acts:.4f}, sent was {wanted[-1]:.4f}; "
                 "is the strategy another, or does the command not arrive?",
             )
         return None
+
+    def _in_force(self, stamp_ns: int) -> list[Command]:
+        """Return the commands that a record with this stamp may show: the newest that had arrived, and its neighbours."""
+        window = round((1.2 * self.period + _WAY) * NANOSECONDS)
+        arrived = [command for sent, command in self._sent if sent <= stamp_ns - round(_WAY * NANOSECONDS)]
+        recent = [command for sent, command in self._sent if stamp_ns - window <= sent <= stamp_ns]
+        return (arrived[-1:] + recent) or [self._sent[-1][1]]
 
     def _check_current(self, feedback: Feedback) -> Fault | None:
         drive, tolerance = self.drivetrain, self.limits.winding_current

@@ -46,17 +46,19 @@ class EmulatorBackend:
         self.clock = clock or WallClock()
         self._random = np.random.Generator(np.random.Philox(key=[seed, 1]))
         self._connected = False
+        self._strategy = Strategy.OFF
 
     @property
     def strategy(self) -> Strategy:
-        """Strategy in force, as the actuator says."""
-        return self.actuator.strategy
+        """Strategy that was last confirmed; the actuator may have changed its mind since."""
+        return self._strategy
 
     def connect(self) -> ActuatorInfo:
         """Return what the emulated actuator says of itself."""
         self._connected = True
         self._catch_up()
         actuator = self.actuator
+        self._strategy = actuator.strategy
         return ActuatorInfo(
             backend=self.name,
             family="emulated",
@@ -101,7 +103,7 @@ class EmulatorBackend:
     def write(self, command: Command) -> Applied:
         """Send setpoints; they arrive after the way there."""
         self._require_connection()
-        limited, changed = check_command(command, self.actuator.strategy, self.actuator.limits)
+        limited, changed = check_command(command, self._strategy, self.actuator.limits)
         if ActuatorFault.SEND_FAILED in self.actuator.faults:
             raise ActuatorError("send_failed", "command could not be sent: the network refuses it")
         now = self.clock.now_ns()
@@ -109,15 +111,16 @@ class EmulatorBackend:
         timing = self.actuator.parameters.timing
         delay = timing.command_delay + timing.delay_jitter * float(self._random.standard_normal())
         self.actuator.deliver(limited, now + max(0, round(delay * NANOSECONDS)))
-        return Applied(limited, self.actuator.strategy, changed, now)
+        return Applied(limited, self._strategy, changed, now)
 
     def set_strategy(self, strategy: Strategy, command: Command | None = None) -> Strategy:
         """Change the strategy, with first setpoints at the same instant."""
         limited = None if command is None else check_command(command, strategy, self.actuator.limits)[0]
         self._configure(strategy=strategy)
-        if limited is not None and self.actuator.strategy is strategy:
+        self._strategy = self.actuator.strategy
+        if limited is not None and self._strategy is strategy:
             self.actuator.deliver(limited, self.clock.now_ns())
-        return self.actuator.strategy
+        return self._strategy
 
     def set_gains(self, gains: GainSet) -> GainSet:
         """Set the gains of all loops."""
