@@ -206,6 +206,13 @@ class PlantClient:
         self._finished_before = len(self.events)
         self._trajectory.publish(trajectory_to_message(trajectory))
 
+    def is_following(self) -> bool:
+        """Tell whether the plant has taken up the move last asked for; raises as :meth:`trajectory_finished`."""
+        return self.trajectory_finished() or any(
+            event["name"] == "plant_mode" and event.get("mode") == "armed_position"
+            for event in self.events[self._finished_before :]
+        )
+
     def trajectory_finished(self) -> bool:
         """Tell whether the move last asked for has ended.
 
@@ -221,15 +228,19 @@ class PlantClient:
                 return True
         return False
 
-    def switch_controller(self, *, on: bool) -> None:
-        """Activate or deactivate the controller.
+    def configure_controller(self) -> None:
+        """Let the controller design itself, so that activating it takes no time."""
+        self._transition(Transition.TRANSITION_CONFIGURE, "configure")
 
-        Raises:
-            FaultError: It refuses.
-        """
-        transition = Transition.TRANSITION_ACTIVATE if on else Transition.TRANSITION_DEACTIVATE
+    def switch_controller(self, *, on: bool) -> None:
+        """Activate or deactivate the controller."""
+        if on:
+            self._transition(Transition.TRANSITION_ACTIVATE, "activate")
+        else:
+            self._transition(Transition.TRANSITION_DEACTIVATE, "deactivate")
+
+    def _transition(self, transition: int, what: str) -> None:
         request = ChangeState.Request(transition=Transition(id=transition))
-        what = "activate" if on else "deactivate"
         if not self.conductor.call(self._change_state, request, f"{self.namespace} controller to {what}").success:
             raise FaultError(f"{self.namespace} controller does not {what}; its log says why")
 

@@ -44,7 +44,7 @@ def plant_program(side: str, settings: RegulationSettings, theta: float, duratio
     }
     if side == "hw":
         return graph.bridge("/hw", backend="emulator", effort_strategy=settings.effort_strategy, **loop)
-    return graph.simulator("/sim", plant=settings.plant, **loop)
+    return graph.simulator("/sim", plant=settings.plant, method=settings.method, **loop)
 
 
 def run_lockstep(

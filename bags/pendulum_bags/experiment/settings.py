@@ -60,6 +60,7 @@ class RegulationSettings:
         r: R.
         noise: The disturbance.
         storage: Storage of the bags.
+        method: Integrator of the simulator; Euler as in the thesis.
     """
 
     plant: str = "thesis"
@@ -70,6 +71,7 @@ class RegulationSettings:
     r: float = 0.1
     noise: NoiseSettings = NoiseSettings()
     storage: str = "mcap"
+    method: str = "euler"
 
     def __post_init__(self) -> None:
         """Refuse unknown plants and backends before anything is started."""

@@ -25,6 +25,8 @@ START_TIMEOUT = 60.0
 """Longest time for all programs to be up; the first start on a cold machine compiles code [s]."""
 LOOP_NICENESS = -10
 """Priority of those who keep deadlines over all else on the machine, where we may take it."""
+EMULATOR_WATCHDOG = 25
+"""Feedback periods that the bridge waits for the emulator on a machine that does other things too."""
 OWN_PROTOCOL_SEED_STEP = 1_000_000
 """Added to the seed for the unpaired simulation, whose noise must not be that of the hardware."""
 SETTLE_TIME = 1.0
@@ -74,9 +76,13 @@ def _start(processes: ProcessSet, folder: Path, settings: RegulationSettings) ->
 
 
 def _programs(settings: RegulationSettings) -> list[NodeProgram]:
+    # An emulator's feedback is as punctual as this machine, which may be a busy one; a real actuator keeps the default.
+    patience: dict[str, graph.ParameterArgument] = (
+        {"feedback_watchdog": EMULATOR_WATCHDOG, "command_lifetime": 0.25} if settings.hardware == "emulator" else {}
+    )
     return [
-        graph.simulator("/sim", plant=settings.plant, clock="realtime"),
-        graph.bridge("/hw", backend=settings.hardware, effort_strategy=settings.effort_strategy),
+        graph.simulator("/sim", plant=settings.plant, method=settings.method, clock="realtime"),
+        graph.bridge("/hw", backend=settings.hardware, effort_strategy=settings.effort_strategy, **patience),
         *(settings.controller_program(namespace, autostart=False) for namespace in ("/sim", "/hw")),
         *(settings.disturbance_program(namespace, autostart=False) for namespace in ("/sim", "/hw")),
     ]
@@ -94,11 +100,12 @@ def _conduct(
     for plant in plants:
         plant.wait_until_ready(START_TIMEOUT)
     for plant in plants:
+        plant.configure_controller()
         plant.arm()
 
     # The ramp leaves the machine idle: the thesis's own simulation runs meanwhile, in a domain of its own.
     own_protocol = _start_own_protocol(processes, folder, settings)
-    _move(conductor, plants, UPRIGHT, "ramp_up", progress)
+    _wait_for_goal(conductor, plants, _start_move(conductor, plants, UPRIGHT, "ramp_up", progress))
 
     progress.phase("regulation", SETTLE_TIME)
     for plant in plants:
@@ -116,9 +123,12 @@ def _conduct(
             noise.duration + 15.0,
         )
 
-    _move(conductor, plants, 0.0, "ramp_down", progress)
+    durations = _start_move(conductor, plants, 0.0, "ramp_down", progress)
+    # Before the ramp ends: a controller that is still awake then would be handed a pendulum half a turn from upright.
     for plant in plants:
         plant.switch_controller(on=False)
+    _wait_for_goal(conductor, plants, durations)
+    for plant in plants:
         plant.disarm()
         plant.mark("done")
     conductor.spin(0.2)
@@ -136,9 +146,10 @@ def _start_own_protocol(processes: ProcessSet, folder: Path, settings: Regulatio
     return processes.start("sim_500hz", command, ends_by_itself=True, niceness=10, environment={"ROS_DOMAIN_ID": ""})
 
 
-def _move(
+def _start_move(
     conductor: Conductor, plants: Sequence[PlantClient], goal: float, phase: str, progress: PhaseProgress
-) -> None:
+) -> list[float]:
+    """Start the thesis's ramp on all plants at once; return how long each takes [s]."""
     ramps = []
     for plant in plants:
         assert plant.sample is not None
@@ -146,10 +157,14 @@ def _move(
     progress.phase(phase.replace("_", " "), max(ramp.duration for ramp in ramps))
     for plant, ramp in zip(plants, ramps):
         plant.follow(ramp, phase, goal=goal)
-    for plant, ramp in zip(plants, ramps):
-        conductor.wait_for(
-            f"{plant.namespace} to end its {phase.replace('_', ' ')}", plant.trajectory_finished, ramp.duration + 15.0
-        )
+    for plant in plants:
+        conductor.wait_for(f"{plant.namespace} to follow the {phase.replace('_', ' ')}", plant.is_following, 5.0)
+    return [ramp.duration for ramp in ramps]
+
+
+def _wait_for_goal(conductor: Conductor, plants: Sequence[PlantClient], durations: Sequence[float]) -> None:
+    for plant, duration in zip(plants, durations):
+        conductor.wait_for(f"{plant.namespace} to end its move", plant.trajectory_finished, duration + 15.0)
 
 
 def _rest(plants: Sequence[PlantClient]) -> None:

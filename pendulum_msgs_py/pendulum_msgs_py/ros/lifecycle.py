@@ -1,0 +1,36 @@
+"""A lifecycle node that survives a transition which is not possible in its state."""
+
+from __future__ import annotations
+
+from lifecycle_msgs.srv import ChangeState
+from rclpy.lifecycle import LifecycleNode as RclpyLifecycleNode
+
+__all__ = ["LifecycleNode"]
+
+
+class LifecycleNode(RclpyLifecycleNode):
+    """rclpy's lifecycle node, but a request for an impossible transition is refused instead of ending the process.
+
+    rclpy lets the error of its C library out of the service's callback, so that a second ``activate`` kills a
+    controller that holds a pendulum. The callback is private there; this overrides it under its mangled name.
+    """
+
+    def _LifecycleNodeMixin__on_change_state(
+        self, request: ChangeState.Request, response: ChangeState.Response
+    ) -> ChangeState.Response:
+        possible = {transition[0]: transition[1] for transition in self._state_machine.available_transitions}
+        wanted = request.transition
+        if wanted.label:
+            fits = wanted.label in possible.values()
+        else:
+            fits = wanted.id in possible
+        if not fits:
+            _, state = self._state_machine.current_state
+            self.get_logger().error(
+                f"transition {wanted.label or wanted.id} is not possible in state {state}; "
+                f"expected one of {', '.join(sorted(possible.values()))}"
+            )
+            response.success = False
+            return response
+        response = super()._LifecycleNodeMixin__on_change_state(request, response)
+        return response
