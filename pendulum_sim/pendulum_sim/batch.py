@@ -1,0 +1,183 @@
+"""Many pendulums at once: compiled, closed loop under linear state feedback and seeded noise.
+
+Each pendulum has its own parameters, gain, start, seed and noise amplitude::
+
+    u_k = clamp(-K [wrap(theta_k - target), theta_dot_k] + noise(seed, k // hold), effort_limit)
+
+Equations, integrators and noise are those of :class:`pendulum_sim.plant.RigidPlant` and of
+``pendulum_msgs_py.noise``, compiled, so that one pendulum of a batch moves like one on the graph. Memory does not
+depend on the number of steps, unless the trajectories are asked for.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from pendulum_msgs_py.angles import UPRIGHT
+from pendulum_msgs_py.errors import ParameterError
+from pendulum_msgs_py.noise import stream_key
+from pendulum_msgs_py.plant_parameters import PlantParameters
+from pendulum_sim.dry_friction import PACKED
+from pendulum_sim.integrators import get_integrator
+from pendulum_sim.plant import check_step, pack
+
+__all__ = ["BatchResult", "simulate_batch"]
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class BatchResult:
+    """What came of a batch of B pendulums.
+
+    Attributes:
+        theta: Final angles, shape (B,), not wrapped [rad].
+        theta_dot: Final velocities, shape (B,) [rad/s].
+        max_effort: Largest |K x| before noise and limit, shape (B,) [N m].
+        mean_theta: Mean of wrap(theta - target) over the steps, shape (B,) [rad].
+        std_theta: Its standard deviation, shape (B,) [rad].
+        mean_theta_dot: Mean of the velocity, shape (B,) [rad/s].
+        std_theta_dot: Its standard deviation, shape (B,) [rad/s].
+        trajectories: theta [rad], theta_dot [rad/s] and applied effort [N m] at the start of each step, shape
+            (steps, 3, B); None unless asked for.
+    """
+
+    theta: Array
+    theta_dot: Array
+    max_effort: Array
+    mean_theta: Array
+    std_theta: Array
+    mean_theta_dot: Array
+    std_theta_dot: Array
+    trajectories: Array | None = None
+
+
+def simulate_batch(
+    parameters: PlantParameters | Sequence[PlantParameters],
+    *,
+    steps: int,
+    dt: float = 2e-3,
+    method: str = "etd4",
+    substeps: int = 1,
+    theta: ArrayLike = UPRIGHT,
+    theta_dot: ArrayLike = 0.0,
+    gain: ArrayLike = (0.0, 0.0),
+    target: float = UPRIGHT,
+    seeds: ArrayLike = 0,
+    amplitude: ArrayLike = 0.0,
+    hold: int = 1,
+    record: bool = False,
+    threads: int | None = None,
+) -> BatchResult:
+    """Integrate a batch; its size B is that of the longest argument, and single values hold for all.
+
+    Args:
+        parameters: One plant or B plants, all rigid.
+        steps: Steps to take, >= 1.
+        dt: Step, over which control and noise are held [s].
+        method: Integrator, any of ``integrators.METHODS`` but ``adaptive``.
+        substeps: Integration steps in a step.
+        theta: Initial angles, scalar or (B,) [rad].
+        theta_dot: Initial velocities, scalar or (B,) [rad/s].
+        gain: K, shape (2,) or (B, 2) [N m/rad, N m s/rad]; zeros for an open loop.
+        target: Angle to regulate to [rad].
+        seeds: Seeds of the noise, scalar or (B,), 0 to 2^64 - 1.
+        amplitude: Half width of the uniform noise, scalar or (B,) [N m].
+        hold: Steps for which a noise sample is held, >= 1.
+        record: Return the trajectories.
+        threads: Threads to use; None for numba's default.
+
+    Raises:
+        ParameterError: Shapes do not go together, or a value is outside its domain.
+    """
+    import numba
+
+    from pendulum_sim.batch_kernels import ROWS, general_kernel, smooth_kernel
+
+    check_step(dt, substeps)
+    integrator = get_integrator(method)
+    if method == "adaptive":
+        raise ParameterError("method is 'adaptive' in a batch; expected a compiled one, such as etd4")
+    if steps < 1 or hold < 1:
+        raise ParameterError(f"steps is {steps} and hold is {hold}; expected both >= 1")
+    plants = [parameters] if isinstance(parameters, PlantParameters) else list(parameters)
+    if any(plant.drivetrain is not None for plant in plants):
+        raise ParameterError("a batch takes rigid plants; one of these is series elastic")
+    gains = np.atleast_2d(np.asarray(gain, dtype=np.float64))
+    if gains.ndim != 2 or gains.shape[1] != 2:
+        raise ParameterError(f"gain has shape {gains.shape}; expected (2,) or (B, 2)")
+    columns = {
+        "theta": _column("theta", theta),
+        "theta_dot": _column("theta_dot", theta_dot),
+        "amplitude": _column("amplitude", amplitude),
+    }
+    seed_list = [int(seed) for seed in np.atleast_1d(np.asarray(seeds, dtype=object))]
+    lengths = {name: column.size for name, column in columns.items()}
+    lengths |= {"parameters": len(plants), "gain": len(gains), "seeds": len(seed_list)}
+    size = max(lengths.values())
+    for name, length in lengths.items():
+        if length not in {1, size}:
+            raise ParameterError(f"{name} has {length} entries; expected 1 or {size}")
+
+    packed = np.array([pack(plant) for plant in plants], dtype=np.float64)
+    rates = [float(row[1] / row[0]) for row in packed]
+    h = dt / substeps
+    coefficients = np.array([integrator.coefficients(rate, h) for rate in rates], dtype=np.float64)
+    limits = np.array([plant.effort_limit for plant in plants])
+    delays = np.array([plant.transport_delay for plant in plants])
+    smooth = not (delays.any() or packed[:, 4].any() or packed[:, 6].any() or packed[:, 9].any())
+
+    keys = _spread(np.array([stream_key(seed) for seed in seed_list], dtype=np.uint64), size)
+    record_of = np.empty((steps, 3, size)) if record else np.empty((0, 3, size))
+    table = np.zeros((len(ROWS) + coefficients.shape[1], size))
+    rows = dict(zip(ROWS, table, strict=False))
+    rows["x"][:], rows["v"][:], rows["amplitude"][:] = (
+        columns["theta"],
+        columns["theta_dot"],
+        columns["amplitude"],
+    )
+    rows["gain_1"][:], rows["gain_2"][:] = gains.T
+    rows["limit"][:] = limits
+    for name, values in zip(PACKED, packed.T, strict=True):
+        rows[name][:] = values
+    table[len(ROWS) :] = coefficients.T
+    before = numba.get_num_threads()
+    numba.set_num_threads(min(threads or before, numba.config.NUMBA_NUM_THREADS))
+    try:
+        if smooth:
+            run = smooth_kernel(method, coefficients.shape[1])
+            run(table, keys, target, h, steps, hold, substeps, record_of)
+        else:
+            run = general_kernel(method)
+            run(table, _spread(delays, size), keys, target, dt, steps, hold, substeps, record_of)
+    finally:
+        numba.set_num_threads(before)
+    mean_x, mean_v = rows["sum_x"] / steps, rows["sum_v"] / steps
+    return BatchResult(
+        theta=rows["x"].copy(),
+        theta_dot=rows["v"].copy(),
+        max_effort=rows["max"].copy(),
+        mean_theta=mean_x,
+        std_theta=np.sqrt(np.maximum(0.0, rows["sum_xx"] / steps - mean_x**2)),
+        mean_theta_dot=mean_v,
+        std_theta_dot=np.sqrt(np.maximum(0.0, rows["sum_vv"] / steps - mean_v**2)),
+        trajectories=record_of if record else None,
+    )
+
+
+def _column(name: str, values: ArrayLike) -> Array:
+    column = np.atleast_1d(np.asarray(values, dtype=np.float64))
+    if column.ndim != 1 or not np.all(np.isfinite(column)):
+        raise ParameterError(
+            f"{name} has shape {column.shape}; expected finite numbers, one or one per pendulum"
+        )
+    return column
+
+
+def _spread(values: NDArray[np.generic], size: int) -> NDArray[np.generic]:
+    """Return a contiguous copy whose last axis has ``size`` entries."""
+    return np.ascontiguousarray(np.broadcast_to(values, (*values.shape[:-1], size))).copy()
