@@ -84,7 +84,7 @@ def residual_tests(fit: OutputErrorFit, *, lags: int = 25) -> ResidualTests:
     widening = float(np.sqrt(max(1.0 + 2.0 * np.sum(own[1:] * auto[1:]), 1.0)))
     limit = float(stats.norm.ppf(1.0 - 0.005 / past.size)) / np.sqrt(samples) * widening
     worst = float(np.max(np.abs(past)))
-    independent = worst <= limit
+    independent = bool(worst <= limit)
     middle = float(np.median(rms))
     outliers = tuple((*label, value) for label, value in zip(labels, rms) if len(rms) > 3 and value > 5.0 * middle)
     white = white_p > 0.01

@@ -1,0 +1,231 @@
+"""The outcome of an identification: figures, words, a plant file that everything else loads."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import platform
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from datetime import datetime, timezone
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from pendulum_msgs_py.errors import DataError
+from pendulum_msgs_py.plant_parameters import PlantParameters, write_plant
+
+from pendulum_bags.datasets import Recording
+from pendulum_bags.identification.geometry import GeometryCheck, check_geometry
+from pendulum_bags.identification.model import PLANT_FRICTION_MODELS, UNITS, FitModel, to_plant
+from pendulum_bags.identification.output_error import Candidate, Options, OutputErrorFit, fit_output_error
+from pendulum_bags.identification.residual_tests import ResidualTests, residual_tests
+from pendulum_bags.identification.uncertainty import Uncertainty, assess
+from pendulum_bags.identification.window_score import WindowScore, free_run, window_score
+
+__all__ = ["IdentificationResult", "identify", "load_fit_model"]
+
+FORMAT = "pendulum_identification/1"
+
+
+@dataclass(frozen=True)
+class IdentificationResult:
+    """Fit, intervals, tests and scores of one identification.
+
+    Args:
+        fit: Chosen and rejected candidates.
+        uncertainty: Intervals and what cannot be determined.
+        tests: Of the residuals.
+        geometry: Comparison with mass and length, None where they are unknown.
+        held_out: Scores on recordings that took no part in the fit, by name.
+        created: Date, ISO 8601.
+    """
+
+    fit: OutputErrorFit
+    uncertainty: Uncertainty
+    tests: ResidualTests
+    geometry: GeometryCheck | None
+    held_out: Mapping[str, WindowScore]
+    created: str
+
+    @property
+    def model(self) -> FitModel:
+        """The fitted model."""
+        return self.fit.model
+
+    @property
+    def score(self) -> float | None:
+        """Angle error on held-out windows (cross-validation) [rad]; None for a single window."""
+        validation = self.fit.chosen.validation
+        return None if validation is None else validation.rms
+
+    @property
+    def plant_candidate(self) -> Candidate:
+        """The fit that a plant file can hold: the chosen one, or the best without load of the drive."""
+        if self.fit.chosen.friction in PLANT_FRICTION_MODELS:
+            return self.fit.chosen
+        fits = [c for c in self.fit.candidates if c.friction in PLANT_FRICTION_MODELS]
+        return min(fits, key=lambda c: c.score) if fits else self.fit.chosen
+
+    def plant(self, name: str = "identified", effort_limit: float = 13.0) -> PlantParameters:
+        """Return the plant that simulator, bridge and controller load."""
+        return to_plant(self.plant_candidate.solution.model, name=name, effort_limit=effort_limit)
+
+    def sentences(self) -> list[str]:
+        """Return what there is to say about the fit, most important first."""
+        said = list(self.geometry.sentences) if self.geometry is not None else []
+        if self.fit.sign_flipped:
+            said.append(
+                "The recorded effort has the opposite sign of the motion that it causes (an external torque?): the fit "
+                "counts it with sign -1."
+            )
+        if self.score is None:
+            said.append("There is one window only: no held-out score; give a longer recording or a shorter --window.")
+        return [*said, *self.tests.sentences, *self.uncertainty.sentences]
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return everything as plain JSON values."""
+        chosen = self.fit.chosen
+        return {
+            "format": FORMAT,
+            "created": self.created,
+            "method": "output_error",
+            "input_kind": self.model.input_kind,
+            "duty_gain": self.model.duty_gain,
+            "friction": chosen.friction,
+            "window": self.fit.window,
+            "held_out_rms": self.score,
+            "training_rms": chosen.training_rms,
+            "natural_frequency": self.model.natural_frequency,
+            "sign_flipped": self.fit.sign_flipped,
+            "parameters": {n: self.model[n] for n in UNITS},
+            "units": dict(UNITS),
+            "fitted": list(chosen.free),
+            "intervals": {
+                n: {"value": i.value, "low": i.low, "high": i.high, "standard_error": i.standard_error}
+                for n, i in self.uncertainty.intervals.items()
+            },
+            "profiles": {n: list(p) for n, p in self.uncertainty.profiles.items()},
+            "covariance": {"names": list(self.uncertainty.names), "matrix": self.uncertainty.covariance.tolist()},
+            "correlation": self.uncertainty.correlation.tolist(),
+            "condition_number": self.uncertainty.condition_number,
+            "interval_basis": self.uncertainty.basis,
+            "candidates": [
+                {
+                    "friction": c.friction,
+                    "held_out_rms": None if c.validation is None else c.validation.rms,
+                    "training_rms": c.training_rms,
+                    "parameters": {n: c.solution.model[n] for n in c.free},
+                }
+                for c in self.fit.candidates
+            ],
+            "residuals": {
+                "white": self.tests.white,
+                "white_p": self.tests.white_p,
+                "independent_of_input": self.tests.independent,
+                "worst_cross_correlation": self.tests.worst_cross,
+            },
+            "geometry": None
+            if self.geometry is None
+            else {"contradicts": self.geometry.contradicts, "rows": [list(r) for r in self.geometry.rows]},
+            "held_out": {
+                name: {"window_rms": score.rms, "mean_absolute": score.mean_absolute}
+                for name, score in self.held_out.items()
+            },
+            "sentences": self.sentences(),
+            "data": [_fingerprint(p.recording) for p in self.fit.pieces],
+        }
+
+    def write(self, path: str | Path, *, name: str = "identified", effort_limit: float = 13.0) -> Path:
+        """Write the plant file with intervals and provenance, and everything else as JSON beside it.
+
+        Args:
+            path: Plant file to write, ``*.yaml``; the JSON gets the same name.
+            name: Name of the plant.
+            effort_limit: Of the actuator [N m]; a recording does not tell.
+        """
+        target = Path(path)
+        if target.suffix not in {".yaml", ".yml"}:
+            raise DataError(f"plant file is {target.name!r}; expected a name that ends in .yaml")
+        candidate = self.plant_candidate
+        same = candidate is self.fit.chosen
+        intervals = {}
+        plant = self.plant(name, effort_limit)
+        if same:
+            names = [f for f in PlantParameters.__dataclass_fields__ if f in self.uncertainty.intervals]
+            for field in names:
+                interval = self.uncertainty.intervals[field]
+                intervals[field] = (interval.low, interval.high)
+        torque = self.model.input_kind in {"effort", "position_goal"}
+        remark = "torques are per unit of inertia: the recording does not fix their scale"
+        provenance = {
+            "method": "output error, multiple shooting",
+            "date": self.created,
+            "data": [_fingerprint(p.recording) for p in self.fit.pieces],
+            "friction": candidate.friction,
+            "held_out_rms_rad": candidate.score,
+            "training_rms_rad": candidate.training_rms,
+            "input_gain": candidate.solution.model["input_gain"],
+            "python": platform.python_version(),
+            "remarks": [*([] if torque or self.fit.options.fix_scale else [remark]), *self.sentences()],
+        }
+        if not same:
+            provenance["remarks"].insert(
+                0, f"the best fit has friction {self.fit.chosen.friction}, which a plant file cannot hold; see the JSON"
+            )
+        write_plant(target, plant, provenance=provenance, intervals=intervals)
+        target.with_suffix(".json").write_text(json.dumps(self.to_dict(), indent=2) + "\n", encoding="utf-8")
+        return target
+
+
+def identify(
+    recordings: Sequence[Recording],
+    options: Options = Options(),
+    *,
+    held_out: Sequence[Recording] = (),
+    profiles: int = 2,
+) -> IdentificationResult:
+    """Identify a pendulum by output error and judge the result.
+
+    Args:
+        recordings: Data to fit; all of one pendulum, with one kind of input.
+        options: Choices; the defaults serve unseen data.
+        held_out: Recordings to score only.
+        profiles: For how many weak parameters to compute profile intervals.
+    """
+    fit = fit_output_error(recordings, options)
+    tests = residual_tests(fit)
+    uncertainty = assess(fit, tests, profiles=profiles)
+    geometry = check_geometry(fit.model, uncertainty, options.geometry)
+    scores = {}
+    for recording in held_out:
+        if recording.input_kind == "position_goal":
+            scores[recording.name] = free_run(fit.model, recording, fitted=False)
+        else:
+            scores[recording.name] = window_score(fit.model, recording, fit.window)
+    created = datetime.now(timezone.utc).isoformat(timespec="seconds")
+    return IdentificationResult(fit, uncertainty, tests, geometry, scores, created)
+
+
+def load_fit_model(path: str | Path) -> FitModel:
+    """Return the fit model from the JSON that :meth:`IdentificationResult.write` left beside the plant file."""
+    source = Path(path)
+    try:
+        content = json.loads(source.read_text(encoding="utf-8"))
+    except (OSError, json.JSONDecodeError) as error:
+        raise DataError(f"{source} cannot be read as an identification: {error}") from error
+    if not isinstance(content, dict) or content.get("format") != FORMAT:
+        raise DataError(f"{source} is no identification; expected a JSON file with format {FORMAT!r}")
+    return FitModel(content["parameters"], content["input_kind"], content["friction"], content["duty_gain"])
+
+
+def _fingerprint(recording: Recording) -> dict[str, Any]:
+    digest = hashlib.sha256()
+    for values in (recording.time, recording.position, recording.input):
+        digest.update(np.ascontiguousarray(values).tobytes())
+    return {
+        "source": str(recording.meta.get("source", "")),
+        "samples": int(recording.time.size),
+        "duration_s": round(recording.duration, 6),
+        "sha256": digest.hexdigest()[:16],
+    }

@@ -1,0 +1,281 @@
+"""The thesis's method: two linear regressions without intercept, with their full tables.
+
+Experiment 1: effort = b theta' + M theta'' on a flat pendulum moved by hand, acceleration by finite differences of
+velocity. Experiment 2: mean effort over static holds = G sin(theta), approached from both sides. Coefficients are
+averaged over trials. Source: thesis "Control of a Pendulum System: From Simulation to Reality", section 4.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from pendulum_msgs_py.errors import DataError
+from scipy import stats
+
+from pendulum_bags.datasets import Recording
+
+__all__ = ["Regression", "StaticHold", "ThesisResult", "fit_gravity", "fit_inertia_damping", "static_holds"]
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Regression:
+    """One ordinary least-squares fit without intercept.
+
+    Args:
+        trial: Name of the recording.
+        names: Coefficients.
+        values, errors, t, p: Per coefficient, shape (k,).
+        intervals: 95 % intervals, shape (k, 2).
+        r_squared: Uncentred, as there is no intercept.
+        summary: The full table as statsmodels prints it.
+        regressors, response: The data, shape (n, k) and (n,).
+    """
+
+    trial: str
+    names: tuple[str, ...]
+    values: Array
+    errors: Array
+    t: Array
+    p: Array
+    intervals: Array
+    r_squared: float
+    summary: str
+    regressors: Array
+    response: Array
+
+
+@dataclass(frozen=True)
+class StaticHold:
+    """Mean over one hold: angle [rad], effort [N m], times [s], and whether it was reached going up."""
+
+    position: float
+    effort: float
+    start: float
+    stop: float
+    upward: bool
+
+
+@dataclass(frozen=True)
+class ThesisResult:
+    """Regressions of all trials and their average.
+
+    Args:
+        kind: ``inertia_damping`` or ``gravity``.
+        trials: One regression per recording.
+        average: Mean coefficient by name, sign made positive.
+        intervals: 95 % interval of the mean by name: over trials, or that of the regression for a single trial.
+        sign: -1 where the actuator reports the torque of the environment.
+        hysteresis: For gravity: mean of effort going up minus coming down [N m], else 0.
+        sentences: What to know before believing it.
+    """
+
+    kind: str
+    trials: tuple[Regression, ...]
+    average: dict[str, float]
+    intervals: dict[str, tuple[float, float]]
+    sign: int
+    hysteresis: float
+    sentences: tuple[str, ...]
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the result as plain JSON values."""
+        return {
+            "method": "thesis",
+            "kind": self.kind,
+            "average": self.average,
+            "intervals": {name: list(ends) for name, ends in self.intervals.items()},
+            "sign": self.sign,
+            "hysteresis": self.hysteresis,
+            "trials": [
+                {
+                    "trial": r.trial,
+                    "coefficients": dict(zip(r.names, r.values.tolist())),
+                    "standard_errors": dict(zip(r.names, r.errors.tolist())),
+                    "t": dict(zip(r.names, r.t.tolist())),
+                    "p": dict(zip(r.names, r.p.tolist())),
+                    "intervals": dict(zip(r.names, r.intervals.tolist())),
+                    "r_squared": r.r_squared,
+                }
+                for r in self.trials
+            ],
+            "sentences": list(self.sentences),
+        }
+
+
+def regress(trial: str, names: Sequence[str], regressors: Array, response: Array) -> Regression:
+    """Fit response = regressors @ coefficients by ordinary least squares, without intercept.
+
+    Args:
+        trial: For the table.
+        names: Of the regressors, length k.
+        regressors: shape (n, k). response: shape (n,).
+    """
+    # statsmodels takes a second to import: only those who ask for tables wait for it.
+    import statsmodels.api as sm
+
+    if len(response) <= len(names):
+        raise DataError(f"{trial} has {len(response)} points for {len(names)} coefficients; expected more")
+    table = sm.OLS(response, regressors).fit()
+    return Regression(
+        trial,
+        tuple(names),
+        np.asarray(table.params),
+        np.asarray(table.bse),
+        np.asarray(table.tvalues),
+        np.asarray(table.pvalues),
+        np.asarray(table.conf_int(0.05)),
+        float(table.rsquared),
+        str(table.summary(yname="effort", xname=list(names))),
+        regressors,
+        response,
+    )
+
+
+def fit_inertia_damping(recordings: Sequence[Recording]) -> ThesisResult:
+    """Regress effort on velocity and acceleration, trial by trial (experiment 1).
+
+    Args:
+        recordings: Flat pendulum moved by hand; the effort is the measured one, at the stamps of the velocity.
+
+    Raises:
+        DataError: where velocity or effort is missing.
+    """
+    trials = []
+    for recording in recordings:
+        _require_effort(recording)
+        if recording.velocity is None:
+            raise DataError(f"{recording.name} has no velocity; the regression of experiment 1 needs it")
+        acceleration = np.gradient(recording.velocity, recording.time)
+        regressors = np.stack((recording.velocity, acceleration), axis=1)
+        trials.append(regress(recording.name, ("damping", "inertia"), regressors, recording.input))
+    average, intervals, sign = _average(trials)
+    said = []
+    low, high = intervals["inertia"]
+    share = np.mean([_share(r) for r in trials])
+    said.append(
+        f"The inertial torque is {100 * share:.1f} % of the viscous one (rms): inertia is determined to "
+        f"{low:.3g} to {high:.3g} kg m^2 only, damping to {intervals['damping'][0]:.4g} to "
+        f"{intervals['damping'][1]:.4g} N m s/rad."
+    )
+    if low <= 0.0:
+        said.append("The data are compatible with no inertia at all: this experiment cannot determine it.")
+    if sign < 0:
+        said.append("The coefficients were negative: the actuator reports the torque of the environment; signs are turned.")
+    said.append(
+        "Finite differences of a noisy velocity bias the inertia towards zero; `--method output_error` has no such bias."
+    )
+    return ThesisResult("inertia_damping", tuple(trials), average, intervals, sign, 0.0, tuple(said))
+
+
+def static_holds(recording: Recording, *, speed: float = 0.02, least: float = 0.4) -> list[StaticHold]:
+    """Return the holds of a staircase: by the events of a bag, or else where the joint stands still.
+
+    Args:
+        recording: Staircase with measured effort.
+        speed: Without events: standing still means slower than this [rad/s].
+        least: Shortest hold [s].
+    """
+    spans = _event_spans(recording) or _still_spans(recording, speed, least)
+    holds: list[StaticHold] = []
+    for start, stop in spans:
+        # The first third of a hold still carries the motion before it.
+        inside = (recording.time >= start + (stop - start) / 3.0) & (recording.time <= stop)
+        before = recording.position[(recording.time < start) & (recording.time > start - 1.0)]
+        effort = np.interp(recording.time[inside], recording.input_stamps, recording.input)
+        if inside.sum() < 3:
+            continue
+        position = float(recording.position[inside].mean())
+        last = holds[-1].position if holds else (float(before[0]) if before.size else position)
+        holds.append(StaticHold(position, float(effort.mean()), float(start), float(stop), abs(position) > abs(last)))
+    return holds
+
+
+def fit_gravity(recordings: Sequence[Recording]) -> ThesisResult:
+    """Regress the mean effort of static holds on sin(theta), trial by trial (experiment 2).
+
+    Args:
+        recordings: Staircases up and down, measured effort.
+
+    Raises:
+        DataError: where a recording has fewer than four holds.
+    """
+    trials, loops = [], []
+    for recording in recordings:
+        _require_effort(recording)
+        holds = static_holds(recording)
+        if len(holds) < 4:
+            raise DataError(f"{recording.name} has {len(holds)} static holds; expected at least 4")
+        position = np.array([hold.position for hold in holds])
+        effort = np.array([hold.effort for hold in holds])
+        trials.append(regress(recording.name, ("gravity",), np.sin(position)[:, None], effort))
+        up = [h.effort * np.sign(h.position) for h in holds if h.upward and abs(h.position) > 0.1]
+        down = [h.effort * np.sign(h.position) for h in holds if not h.upward and abs(h.position) > 0.1]
+        if up and down:
+            loops.append(float(np.mean(up) - np.mean(down)))
+    average, intervals, sign = _average(trials)
+    hysteresis = abs(float(np.mean(loops))) if loops else 0.0
+    said = [
+        f"Effort going up and coming down differs by {hysteresis:.3g} N m on average: dry friction or hysteresis of "
+        f"{0.5 * hysteresis:.3g} N m, which the average of both directions removes."
+    ]
+    if sign < 0:
+        said.append("The coefficient was negative: the actuator reports the torque of the environment; signs are turned.")
+    return ThesisResult("gravity", tuple(trials), average, intervals, sign, hysteresis, tuple(said))
+
+
+def _require_effort(recording: Recording) -> None:
+    if recording.input_kind != "effort":
+        raise DataError(f"{recording.name} has the input {recording.input_kind!r}; the regressions need an effort")
+    if recording.input_time is not None and recording.meta.get("effort") == "applied":
+        raise DataError(f"{recording.name} was read with applied effort; the regressions need the measured one")
+
+
+def _average(trials: Sequence[Regression]) -> tuple[dict[str, float], dict[str, tuple[float, float]], int]:
+    if not trials:
+        raise DataError("there is no recording to regress; expected at least one")
+    values = np.array([r.values for r in trials])
+    sign = -1 if values[:, 0].mean() < 0.0 else 1
+    average, intervals = {}, {}
+    for i, name in enumerate(trials[0].names):
+        column = sign * values[:, i]
+        average[name] = float(column.mean())
+        inside = float(np.sqrt(np.sum([r.errors[i] ** 2 for r in trials])) / len(trials))
+        half = 1.96 * inside
+        if len(trials) > 1:
+            # The trials' scatter sees what a regression's own error does not: correlated residuals, other hands.
+            scatter = float(column.std(ddof=1) / np.sqrt(len(trials)))
+            half = max(half, float(stats.t.ppf(0.975, len(trials) - 1)) * scatter)
+        intervals[name] = (average[name] - half, average[name] + half)
+    return average, intervals, sign
+
+
+def _share(regression: Regression) -> float:
+    viscous = regression.values[0] * regression.regressors[:, 0]
+    inertial = regression.values[1] * regression.regressors[:, 1]
+    return float(np.sqrt(np.mean(inertial**2) / max(np.mean(viscous**2), 1e-300)))
+
+
+def _event_spans(recording: Recording) -> list[tuple[float, float]]:
+    phases = recording.meta.get("phases") or []
+    spans = []
+    for (time, name, _), (following, _, _) in zip(phases, [*phases[1:], (float(recording.time[-1]), "", {})]):
+        if name in {"static", "hold"} and following > time:
+            spans.append((float(time), float(following)))
+    return spans
+
+
+def _still_spans(recording: Recording, speed: float, least: float) -> list[tuple[float, float]]:
+    count = max(3, round(0.1 / recording.period))
+    smooth = np.convolve(np.pad(recording.position, count, mode="edge"), np.ones(count) / count, mode="same")
+    velocity = np.gradient(smooth[count:-count], recording.time)
+    still = np.concatenate(([0], (np.abs(velocity) < speed).astype(int), [0]))
+    edges = np.flatnonzero(np.diff(still))
+    time = recording.time
+    spans = [(float(time[a]), float(time[b - 1])) for a, b in zip(edges[::2], edges[1::2])]
+    return [(a, b) for a, b in spans if b - a >= least]
