@@ -22,6 +22,7 @@ from std_srvs.srv import Trigger
 
 from pendulum_bags import __version__
 from pendulum_bags.parameter_reader_node import ParameterReader
+from pendulum_bags.reader.joint_state import Trimmer
 from pendulum_bags.recorder import (
     GapCounter,
     RecordingSession,
@@ -70,6 +71,7 @@ class _Tap:
     reliable: bool
     latched: bool
     stamp: StampReader | None
+    trim: Callable[[bytes], bytes]
     qos: tuple[QosProfile, ...]
     gaps: GapCounter = field(default_factory=GapCounter)
     publishers: int = 1
@@ -205,7 +207,7 @@ class Recorder(Node):
             self._take(tap, session)
 
     def _take(self, tap: _Tap, session: RecordingSession | None) -> None:
-        take, message_class = tap.subscription.handle.take_message, tap.message_class
+        take, message_class, trim = tap.subscription.handle.take_message, tap.message_class, tap.trim
         items: list[tuple[int, bytes]] = []
         missing = 0
         by_header = self._options.log_time == "header"
@@ -215,6 +217,7 @@ class Recorder(Node):
                 sequence = info["publication_sequence_number"]
                 if sequence:
                     missing += tap.gaps.see(sequence, tap.publishers)
+                data = trim(data)
                 time_ns = info["received_timestamp"] or time.time_ns()
                 items.append((self._stamp(tap, data, time_ns) if by_header else time_ns, data))
         if session is None or not items:
@@ -291,6 +294,7 @@ class Recorder(Node):
                 reliable,
                 latched,
                 stamp_reader(name),
+                Trimmer() if name == "sensor_msgs/msg/JointState" else bytes,
                 tuple(_offered(publisher) for publisher in publishers),
                 publishers=len(publishers),
             )

@@ -24,7 +24,7 @@ import numpy.typing as npt
 from pendulum_bags.reader.batches import MCAP_HEAD, Batch, Int64
 from pendulum_bags.storage.mcap_records import MESSAGE
 
-__all__ = ["FIELDS", "JointStateParser", "Layout", "canonical", "layout_of"]
+__all__ = ["FIELDS", "JointStateParser", "Layout", "Trimmer", "canonical", "layout_of"]
 
 FIELDS = np.dtype(
     [("log_time_ns", "<i8"), ("stamp_ns", "<i8"), ("position", "<f8"), ("velocity", "<f8"), ("effort", "<f8")]
@@ -110,6 +110,27 @@ def canonical(data: bytes) -> bytes:
     for start, stop in spans:
         clean[start:stop] = data[start:stop]
     return bytes(clean)
+
+
+class Trimmer:
+    """Cuts off what rclpy's serialiser leaves behind one-joint JointStates of one topic.
+
+    Up to twelve bytes that mean nothing; readers such as rosbags refuse such messages. Other bytes pass unchanged.
+    """
+
+    def __init__(self) -> None:
+        self._layouts: list[Layout] = []
+
+    def __call__(self, data: bytes) -> bytes:
+        """Return the message without what is behind it."""
+        for layout in self._layouts:
+            if all(data[start : start + len(content)] == content for start, content in layout.constants):
+                return data if len(data) <= layout.size else data[: layout.size]
+        layout_found = layout_of(data)
+        if layout_found is None:
+            return data
+        self._layouts = [*self._layouts[-_LAYOUTS:], layout_found]
+        return data[: layout_found.size]
 
 
 # -- arrays ------------------------------------------------------------------------------------------------------

@@ -39,6 +39,10 @@ class _DamagedError(Exception):
     """The file is not what its footer, index or records claim."""
 
 
+class _NoIndexError(Exception):
+    """The file has no index, as the format allows: its records must be walked through."""
+
+
 @dataclass(slots=True)
 class Chunk:
     """One chunk: where its records stand in the file, and where its message indexes do (channel -> offset)."""
@@ -88,6 +92,8 @@ class McapSource:
         self.stop_ns = 0
         try:
             self._read_summary()
+        except _NoIndexError:
+            self._scan("")
         except (_DamagedError, struct.error, UnicodeDecodeError, KeyError, OverflowError) as error:
             self._scan(str(error) or type(error).__name__)
         self.compressed = any(chunk.compression for chunk in self.chunks)
@@ -125,7 +131,7 @@ class McapSource:
             raise _DamagedError("the footer is not whole")
         (at,) = struct.unpack("<Q", bytes(buffer[footer + _HEAD : footer + _HEAD + 8]))
         if at == 0:
-            raise _DamagedError("")  # allowed by the format: a file without a summary
+            raise _NoIndexError
         if not 8 <= at <= footer:
             raise _DamagedError(f"the footer points to byte {at} of {size}")
         statistics = False
@@ -143,14 +149,14 @@ class McapSource:
             statistics |= self._take_summary_record(opcode, bytes(buffer[at : at + length]))
             at += length
         if not statistics and not self.chunks:
-            raise _DamagedError("")
+            raise _NoIndexError
         if self.chunks:
             if not self._counts or any(not chunk.indexes for chunk in self.chunks):
-                raise _DamagedError("")  # no message index: the records must be walked through
+                raise _NoIndexError
             self.start_ns = min(chunk.start_ns for chunk in self.chunks)
             self.stop_ns = max(chunk.stop_ns for chunk in self.chunks)
         elif sum(self._counts.values()):
-            raise _DamagedError("")  # messages outside of chunks have no index
+            raise _NoIndexError  # messages outside of chunks
 
     def _take_summary_record(self, opcode: int, content: bytes) -> bool:
         if opcode == rec.CHUNK_INDEX:

@@ -164,7 +164,7 @@ class _Table:
         self.root = page
 
     def confirm(self) -> None:
-        """Take note that the file shows what was placed. (A commit that failed is tried in the same places.)"""
+        """Take note that the file shows what was placed; a commit that failed is tried in the same places."""
         if self._changed:
             self._shown = 1 - self._shown
             self._changed = False
