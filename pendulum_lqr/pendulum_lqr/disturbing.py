@@ -24,6 +24,10 @@ class DisturbanceAnswer(NamedTuple):
 class DisturbanceLoop:
     """Turns stamps into torques: zero, then the signal from the first state after the start, then zero again.
 
+    The torque that answers a state acts until the next state, so the signal is taken at the middle of that interval.
+    A plant at the rate of the signal's holds whose stamps jitter by a fraction of a millisecond would otherwise read
+    the edges of the holds: some samples twice, others never, and not the signal that another plant gets.
+
     Args:
         signal: The disturbance.
         duration: How long it acts [s]; 0 until it is stopped.
@@ -40,6 +44,7 @@ class DisturbanceLoop:
         self._simulated_time = simulated_time
         self._armed = False
         self._start_ns: int | None = None
+        self._shortest_interval_ns: int | None = None
         self._window = (0, 0)
         self._ending = False
 
@@ -82,6 +87,11 @@ class DisturbanceLoop:
         ):
             self.refused += 1
             return None
+        if newest is not None and stamp_ns > newest:
+            interval = stamp_ns - newest
+            # The shortest: a state that was lost on the way must not look like a longer period.
+            known = self._shortest_interval_ns
+            self._shortest_interval_ns = interval if known is None else min(known, interval)
         self.newest_stamp_ns = stamp_ns
         self.answered += 1
         event = ""
@@ -95,7 +105,7 @@ class DisturbanceLoop:
                 self._start_ns = None
                 event = "noise_end"
             else:
-                torque = self._signal(elapsed)
+                torque = self._signal(elapsed + (self._shortest_interval_ns or 0) // 2)
         elif self._ending:
             event = "noise_end"
         self._ending = False
