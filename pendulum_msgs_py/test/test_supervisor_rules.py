@@ -93,6 +93,28 @@ class PlantRules(RuleBasedStateMachine):
             self._period()
             self.bounds()
 
+    @rule(effort=_USUAL)
+    def bring_up(self, effort: float) -> None:
+        """Do what a careful user does, so that many sequences start from an armed plant."""
+        self.supervisor.set_commander_conflict("")
+        self.e_stop()
+        self.reset()
+        self.now += NANOSECONDS
+        self._measure(0.1, 0.0)
+        self._period()
+        assert self.supervisor.arm(self.now, self.sample) == ""
+        self.run_with_a_controller(effort, 0.0, 3)
+        assert self.supervisor.mode is Mode.EFFORT
+
+    @precondition(lambda self: self.supervisor.mode is Mode.EFFORT)
+    @rule(effort=_USUAL, duration=st.sampled_from([0.01, 0.05, 0.2]))
+    def move_and_come_back(self, effort: float, duration: float) -> None:
+        self._measure(0.1, 0.0)
+        self.supervisor.accept_trajectory(
+            from_points([0.0, duration], [0.1, 0.1], [0.0, 0.0]), self.now, self.sample
+        )
+        self.run_with_a_controller(effort, 0.0, 8)
+
     @rule(position=_ANY, velocity=_ANY, effort=_ANY)
     def any_measurement(self, position: float, velocity: float, effort: float) -> None:
         self.now += _PERIOD_NS
