@@ -199,7 +199,7 @@ class PlantInterface:
         self._diagnostics = node.create_publisher(DiagnosticArray, names.DIAGNOSTICS, qos.DIAGNOSTICS)
         inputs = [Input.EFFORT_COMMAND, Input.DISTURBANCE] + ([Input.PUSH] if push else [])
         self._inputs = {
-            kind: node.create_subscription(JointState, kind.value, self._receiver(kind), qos.COMMAND, raw=True)
+            kind: node.create_subscription(JointState, kind.value, self._receiver(kind), qos.COMMAND_INPUT, raw=True)
             for kind in inputs
         }
         node.create_subscription(JointTrajectory, names.JOINT_TRAJECTORY, self._on_trajectory, qos.TRAJECTORY)

@@ -13,6 +13,7 @@ from rosgraph_msgs.msg import Clock as ClockMessage
 
 from pendulum_msgs_py import names
 from pendulum_msgs_py.parameters import ParameterSpec
+from pendulum_msgs_py.ros import qos
 from pendulum_msgs_py.ros.convert import stamp_to_message
 from pendulum_msgs_py.ros.plant_interface import PlantInterface
 from pendulum_msgs_py.supervisor import Drive, Input, Mode
@@ -179,7 +180,7 @@ class LockstepLoop:
         self.finished = False
         self.paused = False
         self._clock_publisher = (
-            interface.node.create_publisher(ClockMessage, names.CLOCK, 10) if publish_clock else None
+            interface.node.create_publisher(ClockMessage, names.CLOCK, qos.CLOCK) if publish_clock else None
         )
         # Free running (nobody has to answer) and all patience go through this timer.
         create_wall_timer(interface.node, 0.001, self._on_timer)
