@@ -7,7 +7,7 @@ import sys
 import time
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated, Any, Optional
+from typing import Annotated, Any
 
 import typer
 from rich.console import Console
@@ -34,7 +34,7 @@ app = typer.Typer(
 _EXPECTED_TOTAL = 52.0
 """Expected length of the thesis's experiment, of which 31 s are the ramps [s]."""
 
-Plant = Annotated[str, typer.Option(help="Preset or plant file of the simulated plant; the controller is designed on it.")]
+Plant = Annotated[str, typer.Option(help="Preset or plant file of the simulated plant, and of the controller's design.")]
 Seed = Annotated[int, typer.Option(help="Seed of the noise; one seed is one signal.", min=0)]
 Amplitude = Annotated[float, typer.Option(help="Largest torque of the noise [N m].")]
 HoldTime = Annotated[float, typer.Option(help="Time for which a noise sample is held [s].")]
@@ -43,14 +43,14 @@ Controller = Annotated[str, typer.Option(help="Kind of controller.")]
 Q = Annotated[tuple[float, float], typer.Option(help="Diagonal of Q.")]
 R = Annotated[float, typer.Option(help="R.")]
 Storage = Annotated[str, typer.Option(help="Storage of the bags: mcap or sqlite3.")]
-Domain = Annotated[Optional[int], typer.Option(help="ROS domain; by default ROS_DOMAIN_ID, or the first free one.")]
+Domain = Annotated[int | None, typer.Option(help="ROS domain; by default ROS_DOMAIN_ID, or the first free one.")]
 Strategy = Annotated[str, typer.Option(help="How the actuator turns wanted torque into PWM.")]
 
 
 @app.command()
 def thesis(
     out: Annotated[
-        Optional[Path], typer.Option(help="Folder of the run; it must be new. Default: bags/runs/<UTC>_thesis.")
+        Path | None, typer.Option(help="Folder of the run; it must be new. Default: bags/runs/<UTC>_thesis.")
     ] = None,
     plant: Plant = "thesis",
     hardware: Annotated[str, typer.Option(help="emulator, or hebi for the real actuator.")] = "emulator",
@@ -92,7 +92,7 @@ def thesis(
             progress.phase("comparing", 5.0)
             summary = _analyse(folder, settings)
     except KeyboardInterrupt:
-        kept = f"what was recorded until then is in {folder}" if not discard_if_empty(folder) else "nothing was recorded"
+        kept = "nothing was recorded" if discard_if_empty(folder) else f"what was recorded is in {folder}"
         console.print(f"interrupted: all programs have ended; {kept}")
         raise typer.Exit(EXIT_INTERRUPTED) from None
     except PendulumError:

@@ -6,11 +6,11 @@ import shlex
 import sys
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Union
+from typing import TypeAlias
 
 __all__ = ["NodeProgram", "ParameterArgument", "bridge", "controller", "disturbance", "simulator"]
 
-ParameterArgument = Union[bool, int, float, str, list[str], list[float]]
+ParameterArgument: TypeAlias = bool | int | float | str | list[str] | list[float]
 
 
 @dataclass(frozen=True)

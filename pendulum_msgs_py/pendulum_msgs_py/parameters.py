@@ -13,7 +13,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from difflib import get_close_matches
 from pathlib import Path
-from typing import Any, Union
+from typing import Any, TypeAlias
 
 import yaml
 
@@ -31,7 +31,7 @@ __all__ = [
     "validate",
 ]
 
-ParameterValue = Union[bool, int, float, str, list[float], list[str]]
+ParameterValue: TypeAlias = bool | int | float | str | list[float] | list[str]
 
 _TYPE_NAMES = {bool: "true or false", int: "an integer", float: "a number", str: "text", list: "a list"}
 

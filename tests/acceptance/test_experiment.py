@@ -87,7 +87,7 @@ def test_both_plants_got_the_same_noise(run_folder: Path) -> None:
         noise = bag[f"/{name}/disturbance"]
         index = (noise["stamp_ns"] - start) // 10_000_000
         kept = (index >= 0) & (index < 500)
-        signals[name] = dict(zip(index[kept].tolist(), noise["effort"][kept].tolist()))
+        signals[name] = dict(zip(index[kept].tolist(), noise["effort"][kept].tolist(), strict=True))
     common = signals["sim"].keys() & signals["hw"].keys()
     assert len(common) > 450
     # The hardware's stamps jitter about the edges of the holds, so a sample may be read one hold late.
@@ -101,12 +101,12 @@ def test_both_plants_got_the_same_noise(run_folder: Path) -> None:
 def test_lockstep_runs_with_one_seed_are_identical_message_by_message(tmp_path: Path) -> None:
     for name, seed in (("first", 5), ("second", 5), ("other", 6)):
         _lockstep(tmp_path / name, seed)
-    first, second, other = (tmp_path / name for name in ("first", "second", "other"))
+    first, second, other = (read_bag(tmp_path / name) for name in ("first", "second", "other"))
     topics = ["/sim/joint_states", "/sim/effort_command", "/sim/disturbance", "/sim/applied_effort", "/clock"]
 
     assert same_messages(first, second, topics=topics)
     assert not same_messages(first, other, topics=topics)
-    assert len(read_bag(first)["/sim/joint_states"]) == 501
+    assert len(first["/sim/joint_states"]) == 501
 
 
 @pytest.mark.parametrize("moment", ["starting", "ramp up"])

@@ -127,6 +127,7 @@ class PlantClient:
         plant: Name of the plant's node.
         controller: Name of its controller's node, empty for none.
         disturbance: Name of its disturbance's node, empty for none.
+        watch: Subscribe to its states now; a plant in lockstep waits for its last listener, which may be this one.
     """
 
     def __init__(
@@ -137,6 +138,7 @@ class PlantClient:
         *,
         controller: str = "controller",
         disturbance: str = "disturbance",
+        watch: bool = True,
     ) -> None:
         node = conductor.node
         self.conductor = conductor
@@ -154,8 +156,13 @@ class PlantClient:
         )
         self._events = node.create_publisher(String, f"{namespace}/{names.EVENTS}", qos.EVENTS)
         node.create_subscription(String, f"{namespace}/{names.EVENTS}", self._on_event, qos.EVENTS)
-        node.create_subscription(
-            JointState, f"{namespace}/{names.JOINT_STATES}", self._on_state, qos.NEWEST_STATE, raw=True
+        if watch:
+            self.watch()
+
+    def watch(self) -> None:
+        """Subscribe to the plant's states."""
+        self.conductor.node.create_subscription(
+            JointState, f"{self.namespace}/{names.JOINT_STATES}", self._on_state, qos.NEWEST_STATE, raw=True
         )
 
     def wait_until_ready(self, timeout: float, *, controller: bool = True, disturbance: bool = True) -> None:
@@ -296,5 +303,5 @@ class RecorderClient:
         return set(json.loads(response.message).get("matched", []))
 
 
-def _interrupt(number: int, frame: FrameType | None) -> None:
+def _interrupt(_number: int, _frame: FrameType | None) -> None:
     raise KeyboardInterrupt

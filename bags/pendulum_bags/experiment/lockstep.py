@@ -25,7 +25,7 @@ _LISTENERS = 3
 
 
 def plant_program(side: str, settings: RegulationSettings, theta: float, duration: float) -> NodeProgram:
-    """Return the plant of a lockstep run, upright and armed from the first state on.
+    """Return the plant of a lockstep run; it takes its first step when the conductor has armed or resumed it.
 
     Args:
         side: ``sim`` or ``hw``.
@@ -38,12 +38,12 @@ def plant_program(side: str, settings: RegulationSettings, theta: float, duratio
         "lockstep_inputs": [names.EFFORT_COMMAND, names.DISTURBANCE],
         "lockstep_subscribers": _LISTENERS + 1,
         "lockstep_duration": float(duration),
-        "paused": True,
-        "initial_theta": float(theta),
-        "armed_at_start": True,
     }
     if side == "hw":
+        # No hardware is armed by a parameter: the conductor does it, before it becomes the last listener.
+        loop.update(initial_position=float(theta), seed=settings.noise.seed)
         return graph.bridge("/hw", backend="emulator", effort_strategy=settings.effort_strategy, **loop)
+    loop.update(initial_theta=float(theta), armed_at_start=True, paused=True)
     return graph.simulator("/sim", plant=settings.plant, method=settings.method, **loop)
 
 
@@ -88,9 +88,13 @@ def run_lockstep(
         processes.start_node(settings.controller_program(namespace, use_sim_time=True))
         processes.start_node(settings.disturbance_program(namespace, autostart=True, use_sim_time=True))
         processes.start_node(program)
-        client = PlantClient(conductor, namespace, program.node_name)
+        client = PlantClient(conductor, namespace, program.node_name, watch=False)
         _wait_until_all_hear_each_other(conductor, namespace)
-        client.resume(_START_TIMEOUT)
+        if side == "hw":
+            client.arm()
+        client.watch()
+        if side == "sim":
+            client.resume(_START_TIMEOUT)
         conductor.wait_for(
             f"{duration:g} s of simulated time",
             lambda: client.has_event("lockstep_finished"),
@@ -105,7 +109,7 @@ def _wait_until_all_hear_each_other(conductor: Conductor, namespace: str) -> Non
     node = conductor.node
     wanted = {
         # topic: how many listen
-        names.JOINT_STATES: _LISTENERS + 1,
+        names.JOINT_STATES: _LISTENERS,
         names.EFFORT_COMMAND: 2,
         names.DISTURBANCE: 2,
         names.APPLIED_EFFORT: 1,

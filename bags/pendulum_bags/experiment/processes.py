@@ -111,7 +111,7 @@ class ProcessSet:
                 stderr=subprocess.STDOUT,
                 env={**os.environ, **self.environment, **(environment or {})},
                 start_new_session=True,
-                preexec_fn=prepare,
+                preexec_fn=prepare,  # noqa: PLW1509  # prctl and nice only; no lock is taken between fork and exec
             )
         child = Child(name, process, log, ends_last, ends_by_itself)
         self.children.append(child)

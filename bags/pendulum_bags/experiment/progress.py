@@ -12,8 +12,7 @@ __all__ = ["PhaseProgress"]
 
 
 class PhaseProgress:
-    """A bar that moves with time through phases of known length; silent where the output is no terminal but for one
-    line a phase.
+    """A bar that moves with time through phases of known length; one line a phase where the output is no terminal.
 
     Args:
         total: Expected length of all phases [s].

@@ -5,6 +5,7 @@ from __future__ import annotations
 import sys
 import time
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 
 from pendulum_bags.experiment.conductor_node import Conductor, PlantClient
@@ -119,7 +120,7 @@ def _conduct(
     for plant in plants:
         conductor.wait_for(
             f"the end of the noise on {plant.namespace}",
-            lambda plant=plant: plant.check_mode() or plant.has_event("noise_end"),
+            partial(_noise_ended, plant),
             noise.duration + 15.0,
         )
 
@@ -133,6 +134,11 @@ def _conduct(
         plant.mark("done")
     conductor.spin(0.2)
     return own_protocol
+
+
+def _noise_ended(plant: PlantClient) -> bool:
+    plant.check_mode()
+    return plant.has_event("noise_end") is not None
 
 
 def _start_own_protocol(processes: ProcessSet, folder: Path, settings: RegulationSettings) -> Child:
@@ -155,7 +161,7 @@ def _start_move(
         assert plant.sample is not None
         ramps.append(thesis_ramp(plant.sample.position, goal))
     progress.phase(phase.replace("_", " "), max(ramp.duration for ramp in ramps))
-    for plant, ramp in zip(plants, ramps):
+    for plant, ramp in zip(plants, ramps, strict=True):
         plant.follow(ramp, phase, goal=goal)
     for plant in plants:
         conductor.wait_for(f"{plant.namespace} to follow the {phase.replace('_', ' ')}", plant.is_following, 5.0)
@@ -163,7 +169,7 @@ def _start_move(
 
 
 def _wait_for_goal(conductor: Conductor, plants: Sequence[PlantClient], durations: Sequence[float]) -> None:
-    for plant, duration in zip(plants, durations):
+    for plant, duration in zip(plants, durations, strict=True):
         conductor.wait_for(f"{plant.namespace} to end its move", plant.trajectory_finished, duration + 15.0)
 
 

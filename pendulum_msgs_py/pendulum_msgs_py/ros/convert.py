@@ -144,5 +144,5 @@ def _format(value: object) -> str:
 def _deserialise(data: bytes) -> JointState | None:
     try:
         return deserialize_message(data, JointState)
-    except Exception:  # rclpy raises its C library's error types, which have no common base
+    except Exception:  # noqa: BLE001  # rclpy raises its C library's error types, which have no common base
         return None

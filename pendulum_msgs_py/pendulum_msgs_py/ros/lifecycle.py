@@ -15,15 +15,12 @@ class LifecycleNode(RclpyLifecycleNode):
     controller that holds a pendulum. The callback is private there; this overrides it under its mangled name.
     """
 
-    def _LifecycleNodeMixin__on_change_state(
+    def _LifecycleNodeMixin__on_change_state(  # noqa: N802
         self, request: ChangeState.Request, response: ChangeState.Response
     ) -> ChangeState.Response:
         possible = {transition[0]: transition[1] for transition in self._state_machine.available_transitions}
         wanted = request.transition
-        if wanted.label:
-            fits = wanted.label in possible.values()
-        else:
-            fits = wanted.id in possible
+        fits = wanted.label in possible.values() if wanted.label else wanted.id in possible
         if not fits:
             _, state = self._state_machine.current_state
             self.get_logger().error(
@@ -32,5 +29,4 @@ class LifecycleNode(RclpyLifecycleNode):
             )
             response.success = False
             return response
-        response = super()._LifecycleNodeMixin__on_change_state(request, response)
-        return response
+        return super()._LifecycleNodeMixin__on_change_state(request, response)

@@ -108,7 +108,7 @@ def _run(make_node: Callable[[Callable[[], None]], Node], arguments: Sequence[st
             executor.spin_until_future_complete(stopped, _SPIN_SLICE)
     except PendulumError as error:
         exit_code = report_error(error)
-    except Exception:
+    except Exception:  # noqa: BLE001  # printed in full, and the plant is made safe
         traceback.print_exc()
         exit_code = 1
     finally:
@@ -138,7 +138,7 @@ def _close(node: Node | None, executor: rclpy.executors.Executor) -> int:
                 node.close()
         except PendulumError as error:
             exit_code = report_error(error)
-        except Exception:
+        except Exception:  # noqa: BLE001  # printed in full, and the plant is made safe
             traceback.print_exc()
             exit_code = 1
         exit_code = exit_code or int(getattr(node, "exit_code", 0))
