@@ -204,6 +204,14 @@ class _StrictDumper(yaml.SafeDumper):
     def ignore_aliases(self, _data: Any) -> bool:
         return True
 
+    def represent_text(self, text: str) -> Any:
+        # Plain or single-quoted, PyYAML writes these three line breaks as they are and reads them as spaces.
+        style = '"' if any(character in text for character in "\x85\u2028\u2029") else None
+        return self.represent_scalar("tag:yaml.org,2002:str", text, style=style)
+
+
+_StrictDumper.add_representer(str, _StrictDumper.represent_text)
+
 
 @_read_numbers_as_yaml_1_2
 class _StrictLoader(yaml.SafeLoader):

@@ -1,0 +1,205 @@
+"""Tables of parameters, and the YAML that nobody should be able to misuse."""
+
+from __future__ import annotations
+
+import math
+import os
+from pathlib import Path
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from pendulum_msgs_py.errors import ParameterError
+from pendulum_msgs_py.parameters import (
+    ParameterSpec,
+    dump_yaml,
+    load_yaml,
+    markdown_table,
+    read_text,
+    validate,
+)
+
+_SPECS = (
+    ParameterSpec("rate_hz", 500.0, "Hz", "Rate.", minimum=0.0, exclusive_minimum=True),
+    ParameterSpec("share", 0.5, "-", "Share.", minimum=0.0, maximum=1.0),
+    ParameterSpec("steps", 3, "-", "Steps.", minimum=1),
+    ParameterSpec("method", "rk4", "", "Method.", choices=("euler", "rk4")),
+    ParameterSpec("window", [0.0, 1.0], "rad", "Window.", minimum=-4.0),
+    ParameterSpec("verbose", False, "", "Talk.", read_only=True),
+    ParameterSpec("label", "", "", "Label."),
+)
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "message"),
+    [
+        ("rate_hz", 0.0, "rate_hz is 0.0 Hz; expected > 0"),
+        ("rate_hz", -1.0, "rate_hz is -1.0 Hz; expected > 0"),
+        ("rate_hz", math.nan, "rate_hz is nan Hz; expected a finite number > 0"),
+        ("rate_hz", math.inf, "rate_hz is inf Hz; expected a finite number > 0"),
+        ("rate_hz", 10**400, "expected a finite number > 0"),
+        ("rate_hz", None, "rate_hz is None; expected a number > 0"),
+        ("rate_hz", "500", "rate_hz is '500'; expected a number > 0"),
+        ("rate_hz", True, "expected a number > 0"),
+        ("share", 1.5, "share is 1.5; expected 0 to 1"),
+        ("steps", 2.0, "steps is 2.0; expected an integer >= 1"),
+        ("steps", True, "expected an integer >= 1"),
+        ("method", "rk5", "method is 'rk5'; expected one of euler, rk4"),
+        ("window", 3.0, "window is 3.0 rad; expected a list"),
+        ("window", "ab", "window is 'ab'; expected a list"),
+        ("window", [0.0, None], "window is None; expected a number >= -4"),
+        ("verbose", 1, "verbose is 1; expected true or false"),
+        ("label", 1, "label is 1; expected text"),
+        ("rat_hz", 1.0, "unknown parameter 'rat_hz'; did you mean 'rate_hz'?"),
+        ("xyz", 1.0, "unknown parameter 'xyz'; expected one of rate_hz, share"),
+    ],
+)
+def test_a_refusal_names_parameter_value_unit_and_domain(name: str, value: object, message: str) -> None:
+    with pytest.raises(ParameterError) as caught:
+        validate(_SPECS, {name: value}, where="run.yaml")
+    assert message in str(caught.value)
+    assert str(caught.value).startswith("run.yaml: ")
+
+
+def test_values_come_back_in_their_own_type_and_the_rest_at_default() -> None:
+    values = validate(_SPECS, {"rate_hz": 100, "window": (1, 2)})
+    assert values["rate_hz"] == 100.0
+    assert isinstance(values["rate_hz"], float)
+    assert values["window"] == [1.0, 2.0]
+    assert values["method"] == "rk4"
+
+
+@given(value=st.one_of(st.none(), st.booleans(), st.integers(), st.floats(), st.text(), st.lists(st.floats())))
+def test_a_value_passes_or_raises_our_error_and_passes_again(value: object) -> None:
+    for spec in _SPECS:
+        try:
+            checked = spec.check(value)
+        except ParameterError:
+            continue
+        assert spec.check(checked) == checked
+
+
+def test_the_markdown_table_has_a_row_for_each_parameter() -> None:
+    lines = markdown_table(_SPECS).splitlines()
+    assert len(lines) == len(_SPECS) + 2
+    assert lines[2] == "| `rate_hz` | `500.0` | Hz | > 0 | Rate. |"
+    assert lines[7] == "| `verbose` | `false` | – | any | Talk. Read-only. |"
+
+
+# --- YAML ------------------------------------------------------------------------------------------------------
+
+
+def _load(tmp_path: Path, text: str) -> dict[str, object]:
+    path = tmp_path / "file.yaml"
+    path.write_text(text, encoding="utf-8")
+    return load_yaml(path)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("a: 1\na: 2", "file.yaml:2:1: key 'a' is given twice"),
+        ("b: {a: 1, a: 2}", "file.yaml:1:11: key 'a' is given twice"),
+        ("a: &x 1\nb: *x", "alias *x is not allowed here"),
+        ("a: &x [*x]", "alias *x is not allowed here"),
+        ("a: !!python/object/apply:os.system [ls]", "tag tag:yaml.org,2002:python/object/apply:os.system"),
+        ("a: !!python/name:os.system", "is not allowed here"),
+        ("a: !!timestamp x", "is not allowed here"),
+        ("a: !!bool maybe", "is not allowed here"),
+        ("a: !custom x", "tag !custom is not allowed here"),
+        ("<<: {a: 1}", "merge"),
+        ("a: " + "[" * 10_000, "nested deeper than 40 levels"),
+        ("a: " + "{b: " * 10_000, "nested deeper than 40 levels"),
+        ("a: \x00", "special characters are not allowed"),
+        ("a: [1", "file.yaml:1:6: expected ',' or ']'"),
+        ("? [1]\n: 2", "a key must be text"),
+        ("1: 2", "has the key 1; expected a name"),
+        ("yes: 2", "has the key True; expected a name"),
+        ("a: 1\n---\nb: 1", "found another document"),
+        ("a: 2020-13-45", "month must be in 1..12"),
+        ("a: " + "9" * 5000, "is not YAML"),
+        ("- 1", "is a list; expected a mapping"),
+        ("text", "is a str; expected a mapping"),
+        ("", "is empty; expected a mapping"),
+        ("x" * 300_000, "has 300000 bytes; expected at most 250000"),
+    ],
+)
+def test_yaml_that_could_mislead_is_refused_in_one_sentence(tmp_path: Path, text: str, message: str) -> None:
+    with pytest.raises(ParameterError) as caught:
+        _load(tmp_path, text)
+    assert message in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("text", "value"),
+    [
+        ("1e-5", 1e-5),
+        ("1E5", 1e5),
+        ("1.5e3", 1500.0),
+        (".5", 0.5),
+        ("-3", -3),
+        ("010", 10),
+        ("1:30", "1:30"),
+        ("1_000", "1_000"),
+        ("0x10", "0x10"),
+        ("inf", "inf"),
+        (".inf", math.inf),
+        ("null", None),
+        ("true", True),
+    ],
+)
+def test_numbers_are_what_they_look_like(tmp_path: Path, text: str, value: object) -> None:
+    loaded = _load(tmp_path, f"a: {text}")["a"]
+    assert loaded == value
+    assert type(loaded) is type(value)
+
+
+@given(
+    st.dictionaries(
+        st.text(max_size=8),
+        st.recursive(
+            st.one_of(st.none(), st.booleans(), st.integers(), st.floats(allow_nan=False), st.text(max_size=12)),
+            lambda inner: st.one_of(st.lists(inner, max_size=3), st.dictionaries(st.text(max_size=5), inner)),
+            max_leaves=8,
+        ),
+        max_size=4,
+    )
+)
+def test_what_is_dumped_is_loaded_again(tmp_path_factory: pytest.TempPathFactory, document: dict) -> None:
+    path = tmp_path_factory.getbasetemp() / "round_trip.yaml"
+    path.write_text(dump_yaml(document), encoding="utf-8", newline="")
+    assert load_yaml(path) == document
+
+
+@given(st.one_of(st.binary(max_size=60), st.text("ab:-[]{}!&*?|>%@`'\"#,\n\t 0.1~<", max_size=40).map(str.encode)))
+def test_any_bytes_load_or_raise_our_error(tmp_path_factory: pytest.TempPathFactory, data: bytes) -> None:
+    path = tmp_path_factory.getbasetemp() / "any.yaml"
+    path.write_bytes(data)
+    try:
+        load_yaml(path)
+    except ParameterError as error:
+        assert "\n" not in str(error)
+
+
+def test_what_yaml_has_no_word_for_is_named() -> None:
+    with pytest.raises(ParameterError, match="expected plain values"):
+        dump_yaml({"a": object()})
+
+
+def test_what_is_no_file_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(ParameterError, match="does not exist"):
+        load_yaml(tmp_path / "none.yaml")
+    with pytest.raises(ParameterError, match="is a folder"):
+        load_yaml(tmp_path)
+    with pytest.raises(ParameterError, match="is a device or a pipe"):
+        load_yaml("/dev/zero")
+    os.mkfifo(tmp_path / "pipe")
+    with pytest.raises(ParameterError, match="is a device or a pipe"):
+        load_yaml(tmp_path / "pipe")
+    (tmp_path / "latin").write_bytes(b"a: \xe9")
+    with pytest.raises(ParameterError, match="is not UTF-8 text"):
+        read_text(tmp_path / "latin", "file")
+    with pytest.raises(ParameterError, match="cannot be read"):
+        read_text("a\0b", "file")
