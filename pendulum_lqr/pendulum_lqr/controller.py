@@ -37,6 +37,10 @@ CONTROLLERS: dict[str, str] = {
     "pid": "pendulum_lqr.controllers.pid:Pid",
     "pd_gravity": "pendulum_lqr.controllers.pd_gravity:PdGravity",
     "energy_swing_up": "pendulum_lqr.controllers.energy_swing_up:EnergySwingUp",
+    "time_optimal": "pendulum_lqr.controllers.time_optimal:TimeOptimal",
+    "tvlqr": "pendulum_lqr.controllers.tvlqr:Tvlqr",
+    "mpc": "pendulum_lqr.controllers.mpc:LinearMpc",
+    "nmpc": "pendulum_lqr.controllers.nmpc:NonlinearMpc",
     "sliding_mode": "pendulum_lqr.controllers.sliding_mode:SlidingMode",
     "playback": "pendulum_lqr.controllers.playback:Playback",
 }

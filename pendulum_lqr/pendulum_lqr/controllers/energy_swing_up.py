@@ -32,13 +32,13 @@ class EnergySwingUp(BaseController):
 
     SUMMARY = "swing-up by energy shaping, caught by LQR with hysteresis"
     PARAMETERS = (
-        ParameterSpec("gain", 5.0, "s/rad", "Pumping torque per energy error and velocity.", minimum=0.0,
+        ParameterSpec("gain", 50.0, "s/rad", "Pumping torque per energy error and velocity.", minimum=0.0,
                       exclusive_minimum=True),
-        ParameterSpec("energy_margin", 0.02, "-", "Energy aimed at beyond that of upright, relative.", minimum=-0.5,
+        ParameterSpec("energy_margin", 0.1, "-", "Energy aimed at beyond that of upright, relative.", minimum=-0.5,
                       maximum=1.0),
-        ParameterSpec("catch_q", [10.0, 1.0], "1/rad^2, s^2/rad^2", "Weights of the LQR that catches.", minimum=0.0),
+        ParameterSpec("catch_q", [30.0, 0.3], "1/rad^2, s^2/rad^2", "Weights of the LQR that catches.", minimum=0.0),
         ParameterSpec("catch_r", 1.0, "1/(N m)^2", "Its weight of torque.", minimum=0.0, exclusive_minimum=True),
-        ParameterSpec("catch_share", 0.9, "-", "Share of the proven region of attraction in which it takes over.",
+        ParameterSpec("catch_share", 1.0, "-", "Share of the proven region of attraction in which it takes over.",
                       minimum=0.0, maximum=1.0, exclusive_minimum=True),
     )  # fmt: skip
 
@@ -52,7 +52,8 @@ class EnergySwingUp(BaseController):
         self._gravity = plant.gravity
         self._damping = plant.damping
         self._coulomb = plant.coulomb_friction
-        self._target = 2.0 * plant.gravity * (1.0 + margin)
+        self._first_margin = margin
+        self.reset()
 
     @classmethod
     def design(cls, plant: PlantParameters, period: float, p: Mapping[str, Any]) -> EnergySwingUp:
@@ -63,11 +64,14 @@ class EnergySwingUp(BaseController):
     def reset(self) -> None:
         """Start in the swing-up phase."""
         self.catch.reset()
+        self._margin = self._first_margin
+        self._last = (math.pi, 0.0)
 
     def command(self, t: float, x: Sequence[float]) -> float:
         """Return the torque [N m]."""
         if self.catch.holds(x[0], x[1]):
             return self.catch.command(x[0], x[1])
+        self._learn(x[0], x[1])
         return self.clamp(self.pump(x[0], x[1]))
 
     def pump(self, angle: float, velocity: float) -> float:
@@ -77,7 +81,18 @@ class EnergySwingUp(BaseController):
             return self.effort_limit
         energy = 0.5 * self._inertia * velocity * velocity + self._gravity * (1.0 + math.cos(angle))
         friction = self._damping * velocity + math.copysign(self._coulomb, velocity)
-        return self.gain * (self._target - energy) * velocity + friction
+        return self.gain * (2.0 * self._gravity * (1.0 + self._margin) - energy) * velocity + friction
+
+    def _learn(self, angle: float, velocity: float) -> None:
+        """Aim lower after passing upright uncaught, higher after turning back before it: the model is never exact."""
+        last_angle, last_velocity = self._last
+        self._last = (angle, velocity)
+        if abs(angle) > 1.0 or abs(last_angle) > 1.0:
+            return
+        if angle * last_angle < 0.0:
+            self._margin *= 0.5
+        elif velocity * last_velocity < 0.0:
+            self._margin = min(1.5 * max(self._margin, 0.0) + 0.01, 1.0)
 
     def describe(self) -> str:
         """Return gains of both phases."""

@@ -1,0 +1,105 @@
+"""Swing-up in minimum time, by dynamic programming, caught by LQR."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from functools import lru_cache
+from typing import Any
+
+from pendulum_msgs_py.parameters import ParameterSpec
+from pendulum_msgs_py.plant_parameters import PlantParameters
+
+from pendulum_lqr.catch import Catch, make_catch
+from pendulum_lqr.controller import BaseController
+from pendulum_lqr.minimum_time import TimeToGo, minimum_time
+
+__all__ = ["TimeOptimal"]
+
+
+class TimeOptimal(BaseController):
+    """Picks the torque whose successor has the least time to go to the catch's region; a feedback from every state.
+
+    Args:
+        plant: Plant parameters.
+        table: Time to go.
+        catch: LQR with hysteresis.
+        effort_limit: Largest torque [N m].
+        horizon: How far a candidate torque looks ahead [s].
+    """
+
+    SUMMARY = "swing-up in minimum time by dynamic programming, caught by LQR"
+    PARAMETERS = (
+        ParameterSpec("grid", 400, "-", "Grid points in angle and in velocity.", minimum=40, maximum=1000),
+        ParameterSpec("catch_q", [100.0, 1.0], "1/rad^2, s^2/rad^2", "Weights of the LQR that catches.", minimum=0.0),
+        ParameterSpec(
+            "catch_r", 0.1, "1/(N m)^2", "Its weight of torque.", minimum=0.0, exclusive_minimum=True
+        ),
+        ParameterSpec(
+            "catch_share",
+            0.9,
+            "-",
+            "Share of the proven region of attraction in which it takes over.",
+            minimum=0.0,
+            maximum=1.0,
+            exclusive_minimum=True,
+        ),
+    )
+
+    def __init__(
+        self, plant: PlantParameters, table: TimeToGo, catch: Catch, effort_limit: float, horizon: float
+    ) -> None:
+        super().__init__(effort_limit)
+        self.table = table
+        self.catch = catch
+        self.horizon = horizon
+        self._plant = plant
+        self._substeps = max(2, math.ceil(horizon * plant.damping / plant.inertia / 0.5))
+
+    @classmethod
+    def design(cls, plant: PlantParameters, period: float, p: Mapping[str, Any]) -> TimeOptimal:
+        """Return the controller; the table takes a second or two and is kept for the next design."""
+        catch = make_catch(plant, p["catch_q"], p["catch_r"], p["effort_limit"], p["catch_share"])
+        table = _table(
+            plant, p["effort_limit"], tuple(p["catch_q"]), p["catch_r"], p["catch_share"], p["grid"]
+        )
+        return cls(plant, table, catch, p["effort_limit"], max(period, table.step))
+
+    def reset(self) -> None:
+        """Let go."""
+        self.catch.reset()
+
+    def command(self, t: float, x: Sequence[float]) -> float:
+        """Return the torque [N m]."""
+        angle, velocity = x[0], x[1]
+        if self.catch.holds(angle, velocity):
+            return self.catch.command(angle, velocity)
+        limit = self.effort_limit
+        forward = self.table.lookup(*self._ahead(angle, velocity, limit))
+        backward = self.table.lookup(*self._ahead(angle, velocity, -limit))
+        # Exactly symmetric states (hanging at rest) have no better side: take one.
+        return limit if forward <= backward else -limit
+
+    def _ahead(self, angle: float, velocity: float, effort: float) -> tuple[float, float]:
+        plant = self._plant
+        h = self.horizon / self._substeps
+        for _ in range(self._substeps):
+            dry = plant.coulomb_friction * math.tanh(velocity / 0.05)
+            acceleration = (
+                effort - dry - plant.damping * velocity + plant.gravity * math.sin(angle)
+            ) / plant.inertia
+            angle += h * (velocity + 0.5 * h * acceleration)
+            velocity += h * acceleration
+        return angle, velocity
+
+    def describe(self) -> str:
+        """Return the time from hanging at rest, and the catch."""
+        return f"{self.table.time(-math.pi, 0.0):.3f} s from hanging to the catch, {self.catch.describe()}"
+
+
+@lru_cache(maxsize=8)
+def _table(
+    plant: PlantParameters, limit: float, q: tuple[float, ...], r: float, share: float, grid: int
+) -> TimeToGo:
+    catch = make_catch(plant, q, r, limit, share)
+    return minimum_time(plant, limit, (catch.gain.S, catch.level), angles=grid, velocities=grid + 1 - grid % 2)

@@ -1,0 +1,177 @@
+"""TVLQR: follows an optimised swing-up with time-varying gains."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+import scipy.linalg
+from numpy.typing import NDArray
+from pendulum_msgs_py.angles import wrap
+from pendulum_msgs_py.parameters import ParameterSpec
+from pendulum_msgs_py.plant_parameters import PlantParameters
+
+from pendulum_lqr.catch import Catch, make_catch
+from pendulum_lqr.controller import BaseController
+from pendulum_lqr.controllers.energy_swing_up import EnergySwingUp
+from pendulum_lqr.design import cost_matrices
+from pendulum_lqr.model import LinearModel
+from pendulum_lqr.trajectory_optimisation import OptimisedTrajectory, swing_up_trajectory
+
+__all__ = ["Tvlqr"]
+
+Array = NDArray[np.float64]
+
+_LOST = 1.0
+"""Weighted distance from the trajectory at which it is given up: 0.5 rad, or 2 rad/s."""
+_CLOSE = 0.3
+_MOST_LOSSES = 2
+_ANGLE_SCALE, _VELOCITY_SCALE = 0.5, 2.0
+
+
+class Tvlqr(BaseController):
+    """u = u0(t) - K(t) (x - x0(t)) along an optimised swing-up, then LQR.
+
+    The trajectory and its mirror image are tracked from wherever the state is close to one of them; far from both the
+    pendulum is pumped by energy until it is close again, so that a wrong start or a push does not end the swing-up.
+
+    Args:
+        plant: Plant parameters.
+        period: Sampling period [s].
+        trajectory: The swing-up.
+        gains: K at each sample, shape (n, 2).
+        catch: LQR with hysteresis.
+        pump: What swings it up where no trajectory is near.
+        effort_limit: Largest torque [N m].
+
+    Source: Tedrake, Underactuated Robotics, section 8.2 (finite-horizon LQR along a trajectory).
+    """
+
+    SUMMARY = "swing-up along a trajectory by direct collocation, tracked by time-varying LQR"
+    PARAMETERS = (
+        ParameterSpec(
+            "q", [10.0, 1.0], "1/rad^2, s^2/rad^2", "Weights of angle and velocity along the trajectory.", minimum=0.0
+        ),
+        ParameterSpec("r", 1.0, "1/(N m)^2", "Weight of torque.", minimum=0.0, exclusive_minimum=True),
+        ParameterSpec("reserve", 0.1, "-", "Share of the torque limit that is left to the feedback.", minimum=0.0,
+                      maximum=0.9),
+        ParameterSpec("nodes", 100, "-", "Collocation intervals.", minimum=20, maximum=1000),
+        ParameterSpec("catch_q", [100.0, 1.0], "1/rad^2, s^2/rad^2", "Weights of the LQR that catches.", minimum=0.0),
+        ParameterSpec("catch_r", 0.1, "1/(N m)^2", "Its weight of torque.", minimum=0.0, exclusive_minimum=True),
+    )  # fmt: skip
+
+    def __init__(
+        self,
+        plant: PlantParameters,
+        period: float,
+        trajectory: OptimisedTrajectory,
+        q: Sequence[float],
+        r: float,
+        catch: Catch,
+        pump: EnergySwingUp,
+        effort_limit: float,
+    ) -> None:
+        super().__init__(effort_limit)
+        self.trajectory = trajectory
+        self.catch = catch
+        self.pump = pump
+        self.period = period
+        samples = math.ceil(trajectory.duration / period)
+        times = period * np.arange(samples + 1)
+        self.states = np.column_stack(
+            [np.interp(times, trajectory.times, trajectory.states[:, axis]) for axis in (0, 1)]
+        )
+        # A held sample does best with the torque of the middle of its interval.
+        self.efforts = np.interp(times + 0.5 * period, trajectory.times, trajectory.efforts)
+        self.efforts[times >= trajectory.duration] = 0.0
+        self.gains = _gains(plant, period, self.states, q, r, catch.gain.S)
+        self._scaled = self.states / np.array([_ANGLE_SCALE, _VELOCITY_SCALE])
+        self.reset()
+
+    @classmethod
+    def design(cls, plant: PlantParameters, period: float, p: Mapping[str, Any]) -> Tvlqr:
+        """Optimise the trajectory (a second or so) and its gains."""
+        limit = p["effort_limit"]
+        trajectory = swing_up_trajectory(plant, limit * (1.0 - p["reserve"]), p["nodes"])
+        catch = make_catch(plant, p["catch_q"], p["catch_r"], limit)
+        pump_catch = make_catch(plant, (30.0, 0.3), 1.0, limit, 1.0)
+        pump = EnergySwingUp(plant, 50.0, 0.1, pump_catch, limit)
+        return cls(plant, period, trajectory, p["q"], p["r"], catch, pump, limit)
+
+    def reset(self) -> None:
+        """Forget where on the trajectory it was."""
+        self.catch.reset()
+        self.pump.reset()
+        self._index: int | None = None
+        self._sign = 1.0
+        self._losses = 0
+
+    def command(self, t: float, x: Sequence[float]) -> float:
+        """Return the torque [N m]."""
+        angle, velocity = x[0], x[1]
+        if self.catch.holds(angle, velocity):
+            self._index, self._losses = None, 0
+            return self.catch.command(angle, velocity)
+        if self._index is not None:
+            self._index += 1
+            if self._index >= len(self.efforts) or self._distance(self._index, angle, velocity) > _LOST:
+                self._index = None
+                self._losses += 1
+        # A plant that cannot be kept on the trajectory differs from the model; energy asks less of the model.
+        if self._index is None and self._losses < _MOST_LOSSES:
+            self._find(angle, velocity)
+        if self._index is None:
+            return self.clamp(self.pump.command(t, x))
+        k = self._index
+        nominal = self.states[k]
+        gain = self.gains[k]
+        error = wrap(self._sign * angle - float(nominal[0]))
+        feedback = float(gain[0]) * error + float(gain[1]) * (self._sign * velocity - float(nominal[1]))
+        return self.clamp(self._sign * (float(self.efforts[k]) - feedback))
+
+    def describe(self) -> str:
+        """Return the trajectory's length and the catch."""
+        return f"trajectory of {self.trajectory.duration:.3f} s, catch {self.catch.describe()}"
+
+    def _distance(self, index: int, angle: float, velocity: float) -> float:
+        error = wrap(self._sign * angle - float(self.states[index, 0])) / _ANGLE_SCALE
+        return math.hypot(error, (self._sign * velocity - float(self.states[index, 1])) / _VELOCITY_SCALE)
+
+    def _find(self, angle: float, velocity: float) -> None:
+        """Join the trajectory, or its mirror image, where it passes closest; not at all if that is too far."""
+        best = _CLOSE
+        for sign in (1.0, -1.0):
+            error = (sign * angle - self.states[:, 0] + math.pi) % (2.0 * math.pi) - math.pi
+            distance = np.hypot(error / _ANGLE_SCALE, sign * velocity / _VELOCITY_SCALE - self._scaled[:, 1])
+            # The last samples lie within the catch: joining there would follow a trajectory that is over.
+            index = int(np.argmin(distance[:-1]))
+            if distance[index] < best:
+                best = float(distance[index])
+                self._index, self._sign = index, sign
+
+
+def _gains(
+    plant: PlantParameters, period: float, states: Array, q: Sequence[float], r: float, terminal: Array
+) -> Array:
+    """Return the discrete time-varying gains by the backward Riccati recursion, shape (n, 2)."""
+    Q, R = cost_matrices(q, r)
+    S = terminal
+    gains = np.zeros((len(states), 2))
+    for k in range(len(states) - 1, -1, -1):
+        model = _linearised(plant, float(states[k, 0]))
+        block = np.zeros((3, 3))
+        block[:2, :2], block[:2, 2:] = model.A, model.B
+        step = scipy.linalg.expm(block * period)
+        A, B = step[:2, :2], step[:2, 2:]
+        K = np.linalg.solve(R * period + B.T @ S @ B, B.T @ S @ A)
+        S = Q * period + A.T @ S @ (A - B @ K)
+        S = 0.5 * (S + S.T)
+        gains[k] = K[0]
+    return gains
+
+
+def _linearised(plant: PlantParameters, angle: float) -> LinearModel:
+    A = np.array([[0.0, 1.0], [plant.gravity * math.cos(angle) / plant.inertia, -plant.damping / plant.inertia]])
+    return LinearModel(A, np.array([[0.0], [1.0 / plant.inertia]]))
