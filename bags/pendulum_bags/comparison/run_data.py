@@ -34,6 +34,7 @@ class RunData:
         whole: Motion of the whole recording, ramps included.
         disturbance: Disturbance torque as commanded, None where none was recorded [N m].
         applied: Torque that the plant says it applied, None where none was recorded [N m].
+        measured: Measured joint torque over the whole recording, None where states have none [N m].
         arrival: Intervals between arrivals of states at the recorder during the noise, shape (n - 1,) [s].
         rate_hz: Sampling rate during the noise [Hz].
         missed_deadlines: Periods during the noise for which the plant published no state.
@@ -48,6 +49,7 @@ class RunData:
     whole: Series
     disturbance: Signal | None
     applied: Signal | None
+    measured: Signal | None
     arrival: NDArray[np.float64]
     rate_hz: float
     missed_deadlines: int
@@ -135,6 +137,7 @@ def read_run(
         whole=whole,
         disturbance=_signal(disturbance, start, stop, f"disturbance on {name}"),
         applied=_signal(applied, start, stop, f"torque applied to {name}"),
+        measured=_measured(states, times, name),
         arrival=np.diff(states["log_time_ns"][inside]) / NANOSECONDS,
         rate_hz=window.rate,
         missed_deadlines=missed_periods(stamps[inside]),
@@ -202,6 +205,11 @@ def _answers(stamps: NDArray[np.int64], commands: NDArray[Any] | None, otherwise
     # Long after the last command nobody commands any more.
     age = (stamps - commands["stamp_ns"][np.maximum(index, 0)]) / NANOSECONDS
     return np.where((index >= 0) & (age < 0.1), held, 0.0)
+
+
+def _measured(states: NDArray[Any], times: NDArray[np.float64], name: str) -> Signal | None:
+    known = np.isfinite(states["effort"])
+    return Signal(times[known], states["effort"][known], f"measured torque of {name}") if known.any() else None
 
 
 def _signal(array: NDArray[Any] | None, start: int, stop: int, name: str) -> Signal | None:

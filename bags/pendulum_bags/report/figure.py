@@ -1,0 +1,158 @@
+"""A figure as data: what is drawn, with labels and units, told once and rendered for files and for the page alike."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+__all__ = ["ROLES", "Figure", "Mark", "Panel", "Style", "Trace", "thinned"]
+
+Kind = Literal["line", "step", "points", "interval"]
+
+
+@dataclass(frozen=True)
+class Style:
+    """How a role looks. Dash and marker differ too, so that a greyscale print can be read.
+
+    Args:
+        colour: From the colour-blind safe set of Okabe and Ito.
+        dash: ``solid``, ``dash``, ``dot`` or ``dashdot``.
+        width: Line width [pt].
+        marker: ``circle``, ``square``, ``triangle`` or ``cross``.
+    """
+
+    colour: str
+    dash: str = "solid"
+    width: float = 1.4
+    marker: str = "circle"
+
+
+ROLES: dict[str, Style] = {
+    "sim": Style("#0072b2", "solid", 1.3),
+    "hw": Style("#d55e00", "dash", 1.5, "square"),
+    "own": Style("#56b4e9", "dashdot", 1.2, "triangle"),
+    "noise": Style("#8a8a8a", "dot", 1.0, "cross"),
+    "difference": Style("#222222", "solid", 1.1),
+    "aligned": Style("#009e73", "dash", 1.2, "triangle"),
+    "fit": Style("#222222", "dashdot", 1.4, "cross"),
+    "reference": Style("#999999", "dash", 1.0, "cross"),
+    "equivalent": Style("#009e73", "solid", 2.2, "circle"),
+    "not equivalent": Style("#d55e00", "solid", 2.2, "cross"),
+    "undecided": Style("#7a7a7a", "solid", 2.2, "square"),
+    "stable": Style("#222222", "solid", 1.0, "circle"),
+    "unstable": Style("#222222", "solid", 1.0, "cross"),
+}
+"""Role -> look; a new role is one line."""
+
+
+@dataclass(frozen=True)
+class Trace:
+    """One curve.
+
+    Args:
+        x: Shape (n,).
+        y: Shape (n,); for ``interval`` the row of each interval.
+        label: Legend entry; empty for none.
+        role: Key of ``ROLES``.
+        kind: ``line``, ``step`` (held until the next x), ``points``, or ``interval`` (horizontal, from ``low`` to
+            ``high`` through x).
+        low, high: Ends of intervals, shape (n,).
+    """
+
+    x: NDArray[np.float64]
+    y: NDArray[np.float64]
+    label: str
+    role: str
+    kind: Kind = "line"
+    low: NDArray[np.float64] | None = None
+    high: NDArray[np.float64] | None = None
+
+
+@dataclass(frozen=True)
+class Mark:
+    """A straight line across a panel, such as a margin.
+
+    Args:
+        value: Where.
+        axis: ``x`` for a vertical line at that x, ``y`` for a horizontal one.
+        label: Text beside it.
+    """
+
+    value: float
+    axis: Literal["x", "y"] = "y"
+    label: str = ""
+
+
+@dataclass(frozen=True)
+class Panel:
+    """One pair of axes.
+
+    Args:
+        x_label, y_label: With units.
+        traces: What is drawn.
+        marks: Straight lines.
+        title: Above the axes; empty for none.
+        x_log, y_log: Logarithmic axes.
+        x_range, y_range: Limits; None to fit the data.
+        y_ticks: Names at 0, 1, 2, ... in place of numbers; empty for numbers.
+        square: Whether a unit is as long on both axes.
+    """
+
+    x_label: str
+    y_label: str
+    traces: Sequence[Trace]
+    marks: Sequence[Mark] = ()
+    title: str = ""
+    x_log: bool = False
+    y_log: bool = False
+    x_range: tuple[float, float] | None = None
+    y_range: tuple[float, float] | None = None
+    y_ticks: Sequence[str] = ()
+    square: bool = False
+
+
+@dataclass(frozen=True)
+class Figure:
+    """A figure.
+
+    Args:
+        name: File stem and anchor.
+        title: Heading.
+        sentence: What is seen, computed from the data.
+        panels: One or more.
+        stacked: True for panels above each other on one x axis; False for panels side by side.
+        section: Heading of the section it belongs to.
+        panel_height: Height of a panel [px on the page].
+    """
+
+    name: str
+    title: str
+    sentence: str
+    panels: Sequence[Panel]
+    stacked: bool = True
+    section: str = ""
+    panel_height: int = 190
+
+
+def thinned(x: ArrayLike, y: ArrayLike, most: int = 3000) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return a curve with at most about ``most`` points that looks the same: first, least, greatest of each bin.
+
+    Args:
+        x: Shape (n,), increasing.
+        y: Shape (n,).
+        most: Largest number of points.
+    """
+    xs, ys = np.asarray(x, dtype=float), np.asarray(y, dtype=float)
+    if xs.size <= most:
+        return xs, ys
+    bins = max(1, most // 2)
+    size = xs.size // bins
+    whole = ys[: bins * size].reshape(bins, size)
+    rows = np.arange(bins)[:, None] * size
+    keep = np.sort(np.concatenate((rows + whole.argmin(axis=1)[:, None], rows + whole.argmax(axis=1)[:, None]), axis=1))
+    index = np.unique(np.concatenate(([0], keep.ravel(), np.arange(bins * size, xs.size), [xs.size - 1])))
+    return xs[index], ys[index]
