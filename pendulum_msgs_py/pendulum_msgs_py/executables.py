@@ -65,9 +65,10 @@ def cli_main(app: typer.Typer, argv: Sequence[str] | None = None, *, name: str |
         name: Program name for the help text, such as ``python -m pendulum_lqr design``.
     """
     # Imported late: a node that has no command line should not pay for typer and rich.
-    import click
     import typer.main
 
+    # typer brings a click of its own, which is no other click's: its errors are found through what it exports.
+    usage_error = next(kind for kind in typer.BadParameter.__mro__ if kind.__name__ == "ClickException")
     command = typer.main.get_command(app)
     try:
         result = command.main(
@@ -77,12 +78,12 @@ def cli_main(app: typer.Typer, argv: Sequence[str] | None = None, *, name: str |
         sys.stdout.flush()
     except PendulumError as error:
         return report_error(error)
-    except (click.exceptions.Abort, KeyboardInterrupt):
+    except (typer.Abort, KeyboardInterrupt):
         print("interrupted", file=sys.stderr)
         return EXIT_INTERRUPTED
-    except click.exceptions.Exit as stop:
+    except typer.Exit as stop:
         return int(stop.exit_code)
-    except click.ClickException as error:
+    except usage_error as error:
         error.show()
         return int(error.exit_code)
     except BrokenPipeError:
@@ -94,6 +95,8 @@ def cli_main(app: typer.Typer, argv: Sequence[str] | None = None, *, name: str |
             _discard_output()
             return 0
         return stop.code if isinstance(stop.code, int) else int(stop.code is not None)
+    if result == EXIT_INTERRUPTED:
+        print("interrupted", file=sys.stderr)
     return int(result) if isinstance(result, int) else 0
 
 

@@ -144,7 +144,7 @@ def test_a_file_is_refused_with_file_entry_value_and_unit(
 
 
 def test_friction_that_feeds_energy_in_is_refused() -> None:
-    with pytest.raises(ParameterError, match="static_friction is 0.1 N m; expected >= coulomb_friction = 0.2 N m"):
+    with pytest.raises(ParameterError, match=r"static_friction is 0.1 N m; expected >= coulomb_friction = 0.2 N m"):
         PlantParameters(1.0, 1.0, 1.0, coulomb_friction=0.2, static_friction=0.1)
     with pytest.raises(ParameterError, match="motor_static_friction"):
         SeriesElasticParameters(motor_static_friction=0.1)
@@ -152,7 +152,7 @@ def test_friction_that_feeds_energy_in_is_refused() -> None:
 
 
 def test_an_unknown_preset_names_the_known_ones() -> None:
-    with pytest.raises(ParameterError, match="plant is 'thesi'; expected one of the presets thesis, x5_9, dfki"):
+    with pytest.raises(ParameterError, match=r"plant is 'thesi'; expected one of the presets thesis, x5_9, dfki"):
         load_plant("thesi")
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 
 from hypothesis import settings
@@ -287,7 +288,7 @@ class Loop:
 
     def largest_jump(self, since: int = 0) -> float:
         values = self.applied[since:]
-        return max(abs(after - before) for before, after in zip(values, values[1:], strict=False))
+        return max(abs(after - before) for before, after in itertools.pairwise(values))
 
 
 def _hold(duration: float = 0.2, position: float = 0.0) -> Trajectory:
@@ -363,7 +364,7 @@ def test_the_gap_to_a_trajectory_is_closed_no_faster_than_a_ramp() -> None:
     loop.position = 0.1
     loop.run(1.2)
     positions = [drive.position for drive in loop.drives]
-    assert max(abs(b - a) for a, b in zip(positions, positions[1:], strict=False)) <= 0.3e-3 + 1e-9
+    assert max(abs(b - a) for a, b in itertools.pairwise(positions)) <= 0.3e-3 + 1e-9
     assert positions[-1] == 0.29
 
 

@@ -1,0 +1,119 @@
+"""The codec of one-joint states against the middleware's own serialisation."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from pendulum_msgs_py.cdr import MAX_SECONDS, decode_joint_state, encode_joint_state
+from pendulum_msgs_py.names import JOINT
+from pendulum_msgs_py.values import NANOSECONDS
+
+serialization = pytest.importorskip("rclpy.serialization")
+JointState = pytest.importorskip("sensor_msgs.msg").JointState
+convert = pytest.importorskip("pendulum_msgs_py.ros.convert")
+
+_STAMPS = st.integers(0, MAX_SECONDS * NANOSECONDS + NANOSECONDS - 1)
+_NAMES = st.text(st.characters(exclude_categories=["Cs"], exclude_characters="\0"), max_size=40)
+_QUANTITIES = st.one_of(st.none(), st.floats(allow_nan=False))
+
+
+def _message(stamp_ns: int, frame: str, joint: str, *quantities: float | None) -> JointState:
+    message = JointState(name=[joint])
+    message.header.stamp.sec, message.header.stamp.nanosec = divmod(stamp_ns, NANOSECONDS)
+    message.header.frame_id = frame
+    message.position, message.velocity, message.effort = ([] if q is None else [q] for q in quantities)
+    return message
+
+
+@given(_STAMPS, _NAMES, _NAMES, _QUANTITIES, _QUANTITIES, _QUANTITIES)
+def test_the_middleware_reads_what_we_write(
+    stamp: int, frame: str, joint: str, position: float | None, velocity: float | None, effort: float | None
+) -> None:
+    data = encode_joint_state(
+        stamp, frame_id=frame, joint=joint, position=position, velocity=velocity, effort=effort
+    )
+    message = serialization.deserialize_message(data, JointState)
+    assert message == _message(stamp, frame, joint, position, velocity, effort)
+    assert decode_joint_state(data) == (stamp, frame, joint, position, velocity, effort)
+
+
+@given(_STAMPS, _NAMES, _NAMES, _QUANTITIES, _QUANTITIES, _QUANTITIES)
+def test_we_read_what_the_middleware_writes(
+    stamp: int, frame: str, joint: str, position: float | None, velocity: float | None, effort: float | None
+) -> None:
+    data = serialization.serialize_message(_message(stamp, frame, joint, position, velocity, effort))
+    assert decode_joint_state(data) == (stamp, frame, joint, position, velocity, effort)
+
+
+@pytest.mark.parametrize("length", range(70))
+def test_every_length_of_frame_id_is_read_fast(length: int) -> None:
+    message = _message(5, "f" * length, JOINT, None, None, 1.5)
+    fields = decode_joint_state(serialization.serialize_message(message))
+    assert fields is not None
+    assert fields.effort == 1.5
+
+
+def test_equal_messages_are_equal_bytes() -> None:
+    assert encode_joint_state(7, frame_id="abc", effort=1.0) == encode_joint_state(7, frame_id="abc", effort=1.0)
+
+
+def test_not_a_number_travels() -> None:
+    fields = decode_joint_state(encode_joint_state(0, position=math.nan, effort=math.inf))
+    assert fields is not None
+    assert math.isnan(fields.position)
+    assert fields.effort == math.inf
+
+
+@pytest.mark.parametrize(
+    ("names", "efforts"), [([], []), ([JOINT], []), ([JOINT, "b"], [1.0, 2.0]), ([JOINT], [1.0, 2.0])]
+)
+def test_what_is_no_command_of_one_joint_is_none(names: list[str], efforts: list[float]) -> None:
+    message = JointState(name=names, effort=efforts)
+    assert convert.command_from_bytes(serialization.serialize_message(message)) is None
+
+
+def test_a_command_without_a_joint_name_is_for_the_only_joint() -> None:
+    command = convert.command_from_bytes(serialization.serialize_message(JointState(effort=[1.0])))
+    assert command.joints == ()
+    assert command.effort == 1.0
+
+
+def test_a_state_among_other_joints_is_found() -> None:
+    message = JointState(name=["a", JOINT], position=[1.0, 2.0], velocity=[3.0, 4.0], effort=[5.0, 6.0])
+    sample = convert.sample_from_bytes(serialization.serialize_message(message))
+    assert (sample.position, sample.velocity, sample.effort) == (2.0, 4.0, 6.0)
+
+
+@given(st.binary(max_size=120))
+def test_any_bytes_are_refused_without_an_error(data: bytes) -> None:
+    for tail in (data, b"\x00\x01\x00\x00" + data):
+        decode_joint_state(tail)
+        convert.command_from_bytes(tail)
+        convert.sample_from_bytes(tail)
+
+
+@given(st.integers(0, 200), st.integers(0, 255), st.integers(0, 140))
+def test_a_damaged_message_is_refused_without_an_error(place: int, value: int, cut: int) -> None:
+    data = bytearray(encode_joint_state(5, frame_id="lqr", position=1.0, velocity=2.0, effort=3.0))
+    data[place % len(data)] = value
+    for damaged in (bytes(data), bytes(data[:cut]), bytes(data) + b"\xff" * cut):
+        decode_joint_state(damaged)
+        convert.command_from_bytes(damaged)
+        convert.sample_from_bytes(damaged)
+
+
+def test_a_name_with_a_nul_inside_is_left_to_the_middleware() -> None:
+    assert decode_joint_state(encode_joint_state(0, frame_id="a\0b", effort=1.0)) is None
+
+
+def test_trajectories_travel_to_a_nanosecond() -> None:
+    from pendulum_msgs_py.trajectory import thesis_ramp
+
+    ramp = thesis_ramp(0.1, 0.3)
+    back = convert.trajectory_from_message(convert.trajectory_to_message(ramp))
+    assert [(p.position, p.velocity) for p in back.points] == [(p.position, p.velocity) for p in ramp.points]
+    assert max(abs(a.time - b.time) for a, b in zip(ramp.points, back.points, strict=True)) < 1e-9

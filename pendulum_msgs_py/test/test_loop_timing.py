@@ -1,0 +1,56 @@
+"""Clocks and loop statistics, with time as an argument."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from pendulum_msgs_py.timing import LoopStatistics, RingOfTimes, SteadyWallClock
+
+_MS = 1_000_000
+
+
+def test_the_wall_clock_ignores_a_step_of_the_system_clock() -> None:
+    wall, monotonic = [10_000], [500]
+    clock = SteadyWallClock(lambda: wall[0], lambda: monotonic[0])
+    assert clock() == 10_000
+    wall[0], monotonic[0] = 3, 700
+    assert clock() == 10_200
+    assert clock.to_monotonic(clock()) == 700
+
+
+@given(st.lists(st.integers(0, 10**12), min_size=1, max_size=40), st.integers(1, 20))
+def test_percentiles_are_those_of_the_last_durations(durations: list[int], size: int) -> None:
+    ring = RingOfTimes(size)
+    for duration in durations:
+        ring.add(duration)
+    assert ring.count == len(durations)
+    expected = np.percentile(durations[-size:], [50, 99, 100]) / 1e3
+    assert ring.percentiles_us(50, 99, 100) == pytest.approx(expected.tolist())
+
+
+def test_before_the_first_cycle_figures_are_not_numbers_but_zero_counts() -> None:
+    summary = LoopStatistics(_MS).summary(0)
+    assert summary["cycles"] == summary["overruns"] == 0
+    assert math.isnan(summary["rate_hz"])
+    assert math.isnan(summary["jitter_p99_us"])
+
+
+def test_rate_jitter_overruns_and_latency_are_what_happened() -> None:
+    statistics = LoopStatistics(_MS)
+    for index in range(1000):
+        late = 1_500_000 if index == 500 else 20_000
+        statistics.cycle(index * _MS + late, index * _MS)
+        statistics.round_trip(300_000)
+    summary = statistics.summary(1000 * _MS)
+    assert summary["rate_hz"] == pytest.approx(1000.0, rel=1e-3)
+    assert summary["overruns"] == 1
+    assert summary["jitter_p50_us"] == 20.0
+    assert summary["jitter_max_us"] == 1500.0
+    assert summary["command_latency_p50_us"] == 300.0
+    # The rate is that since the last summary; nothing ran since.
+    assert statistics.summary(2000 * _MS)["rate_hz"] == 0.0

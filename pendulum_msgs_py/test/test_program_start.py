@@ -1,0 +1,149 @@
+"""How programs start and end: one table, one sentence, one exit code."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+import types
+from collections.abc import Callable
+
+import pytest
+import typer
+
+from pendulum_msgs_py.errors import ParameterError
+from pendulum_msgs_py.executables import EXIT_INTERRUPTED, EXIT_USAGE, cli_main, report_error, run_package
+
+
+@pytest.fixture
+def package(monkeypatch: pytest.MonkeyPatch) -> Callable[..., None]:
+    """Make a package ``arm`` whose program ``node`` is the given function."""
+
+    def make(main: Callable[[list[str]], int | None]) -> None:
+        table = types.ModuleType("arm.executables")
+        table.EXECUTABLES = {"node": "arm.node:main", "design": "arm.node:main"}
+        node = types.ModuleType("arm.node")
+        node.main = main
+        for name, module in {"arm": types.ModuleType("arm"), "arm.executables": table, "arm.node": node}.items():
+            monkeypatch.setitem(sys.modules, name, module)
+
+    return make
+
+
+def test_a_program_gets_its_arguments_and_gives_its_exit_code(package: Callable[..., None]) -> None:
+    seen: list[list[str]] = []
+    package(lambda arguments: seen.append(arguments) or 7)
+    assert run_package("arm", ["node", "--ros-args", "-p", "a:=1"]) == 7
+    assert seen == [["--ros-args", "-p", "a:=1"]]
+
+
+def test_no_exit_code_is_success(package: Callable[..., None]) -> None:
+    package(lambda _: None)
+    assert run_package("arm", ["node"]) == 0
+
+
+def test_help_lists_the_programs(package: Callable[..., None], capsys: pytest.CaptureFixture[str]) -> None:
+    package(lambda _: 0)
+    assert run_package("arm", ["--help"]) == 0
+    assert run_package("arm", []) == EXIT_USAGE
+    assert "  design\n  node\n" in capsys.readouterr().out
+
+
+def test_an_unknown_program_names_the_nearest(
+    package: Callable[..., None], capsys: pytest.CaptureFixture[str]
+) -> None:
+    package(lambda _: 0)
+    assert run_package("arm", ["nod"]) == EXIT_USAGE
+    error = capsys.readouterr().err
+    assert error == "error: arm has no executable 'nod'; expected one of design, node; did you mean 'node'?\n"
+
+
+def test_an_interrupt_while_loading_is_no_traceback(
+    package: Callable[..., None], capsys: pytest.CaptureFixture[str]
+) -> None:
+    def main(_: list[str]) -> int:
+        raise KeyboardInterrupt
+
+    package(main)
+    assert run_package("arm", ["node"]) == EXIT_INTERRUPTED
+    assert capsys.readouterr().err == "interrupted\n"
+
+
+def _app() -> typer.Typer:
+    app = typer.Typer()
+
+    @app.command()
+    def run(gain: float, code: int = 0) -> None:
+        if gain < 0:
+            raise ParameterError(f"gain is {gain} N m; expected >= 0")
+        if gain == 3.0:
+            raise KeyboardInterrupt
+        if code:
+            raise typer.Exit(code)
+
+    return app
+
+
+@pytest.mark.parametrize(
+    ("arguments", "code", "message"),
+    [
+        (["1.0"], 0, ""),
+        (["1.0", "--code", "4"], 4, ""),
+        (["--", "-1.0"], 2, "error: gain is -1.0 N m; expected >= 0\n"),
+        (["one"], 2, "Invalid value for 'gain'"),
+        ([], 2, "Missing argument"),
+        (["1.0", "--bogus"], 2, "--bogus"),
+        (["3.0"], 130, "interrupted"),
+    ],
+)
+def test_a_command_line_ends_with_a_sentence_and_a_code(
+    arguments: list[str], code: int, message: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert cli_main(_app(), arguments, name="python -m arm run") == code
+    error = capsys.readouterr().err
+    assert message in error
+    assert "Traceback" not in error
+
+
+def test_an_error_is_one_sentence(capsys: pytest.CaptureFixture[str]) -> None:
+    assert report_error(ParameterError("gain is 1; expected 2")) == EXIT_USAGE
+    assert capsys.readouterr().err == "error: gain is 1; expected 2\n"
+
+
+_LONG_OUTPUT = """
+import typer
+from pendulum_msgs_py.executables import cli_main
+app = typer.Typer()
+@app.command()
+def main():
+    for index in range(100000):
+        print("line", index)
+raise SystemExit(cli_main(app, []))
+"""
+_LONG_TEXT = """
+from pendulum_msgs_py.executables import print_text
+print_text("line\\n" * 200000)
+"""
+_SHORT_OUTPUT = """
+import time, typer
+from pendulum_msgs_py.executables import cli_main
+app = typer.Typer()
+@app.command()
+def main():
+    time.sleep(0.3)
+    print("line")
+raise SystemExit(cli_main(app, []))
+"""
+
+
+@pytest.mark.parametrize("program", [_LONG_OUTPUT, _LONG_TEXT, _SHORT_OUTPUT])
+def test_a_reader_that_goes_is_no_error(program: str) -> None:
+    process = subprocess.Popen(
+        [sys.executable, "-c", program], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    )
+    assert process.stdout is not None
+    if program is not _SHORT_OUTPUT:
+        process.stdout.readline()
+    process.stdout.close()
+    assert process.wait(30) == 0
+    assert process.stderr is not None
+    assert process.stderr.read() == ""
