@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from pendulum_lqr.design import DesignError, Gain
 from pendulum_lqr.model import RigidPlant
-from pendulum_msgs_py.angles import UPRIGHT
+from pendulum_msgs_py.angles import UPRIGHT, wrap
 
 __all__ = ["Region", "Rollout", "proven_level", "region_of_attraction", "rigid_rollout", "sublevel_ellipse"]
 
@@ -153,7 +153,7 @@ def region_of_attraction(
     velocities = np.linspace(-velocity_span, velocity_span, points)
     x, v = np.meshgrid(angles, velocities)
     end_angle, end_velocity = rollout(x.ravel(), v.ravel())
-    arrived = (np.abs(end_angle) < tolerance[0]) & (np.abs(end_velocity) < tolerance[1])
+    arrived = (np.abs(wrap(np.asarray(end_angle, dtype=np.float64))) < tolerance[0]) & (np.abs(end_velocity) < tolerance[1])
     level = proven_level(plant, gain, effort_limit)
     return Region(
         angles, velocities, arrived.reshape(x.shape), level, sublevel_ellipse(gain.S, level), gain.S
@@ -163,7 +163,7 @@ def region_of_attraction(
 def rigid_rollout(
     plant: RigidPlant, gain: Gain, effort_limit: float, duration: float = 8.0, dt: float = 0.002
 ) -> Rollout:
-    """Return a batch simulation of the smooth rigid plant under u = clamp(-K x), by RK4, angles not wrapped.
+    """Return a batch simulation of the smooth rigid plant under u = clamp(-K x), by RK4; the controller sees wrapped angles.
 
     The simulator's batch engine does the same for plants with friction, delay and lag; this one draws the design's figure.
 
@@ -180,7 +180,7 @@ def rigid_rollout(
     steps = math.ceil(duration / step)
 
     def acceleration(x: Array, v: Array) -> Array:
-        u = np.clip(-k0 * x - k1 * v, -effort_limit, effort_limit)
+        u = np.clip(-k0 * wrap(x) - k1 * v, -effort_limit, effort_limit)
         return np.asarray((u - plant.damping * v - plant.gravity * np.sin(x + UPRIGHT)) / plant.inertia)
 
     def run(angle: Array, velocity: Array) -> tuple[Array, Array]:
@@ -196,7 +196,7 @@ def rigid_rollout(
             a4 = acceleration(x + h * v3, v4)
             x = x + h / 6.0 * (v + 2.0 * v2 + 2.0 * v3 + v4)
             v = v + h / 6.0 * (a1 + 2.0 * a2 + 2.0 * a3 + a4)
-        return x, v
+        return np.asarray(wrap(x)), v
 
     return run
 

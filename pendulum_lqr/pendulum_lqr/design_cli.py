@@ -1,0 +1,220 @@
+"""``python -m pendulum_lqr design``: a table of gains for lists of weights, and the figures of one of them."""
+
+from __future__ import annotations
+
+import json
+import math
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+from pendulum_msgs_py.angles import UPRIGHT
+from pendulum_msgs_py.errors import ParameterError
+from pendulum_msgs_py.executables import cli_main
+from pendulum_msgs_py.plant_parameters import PRESETS, load_plant
+from rich.console import Console
+from rich.table import Table
+
+from pendulum_lqr.analysis import LoopReport, analyse
+from pendulum_lqr.design import Gain, continuous_lqr
+from pendulum_lqr.model import LinearModel, linearise
+
+__all__ = ["THESIS_CHOICE", "THESIS_WEIGHTS", "app", "main"]
+
+THESIS_WEIGHTS: tuple[tuple[tuple[float, float], float], ...] = (
+    ((1.0, 0.01), 0.1),
+    ((1.0, 0.1), 0.1),
+    ((100.0, 0.01), 0.1),
+    ((100.0, 0.1), 0.1),
+)
+"""Combinations 1 to 4 of the thesis: (q11, q22) and r."""
+THESIS_CHOICE = 3
+"""The combination that the thesis runs on its hardware."""
+
+app = typer.Typer(add_completion=False)
+
+
+@app.command()
+def design(
+    preset: Annotated[str, typer.Option(help=f"Plant: {', '.join(PRESETS)}.")] = "thesis",
+    plant: Annotated[Path | None, typer.Option(help="Plant file, instead of a preset.")] = None,
+    q: Annotated[
+        list[str] | None, typer.Option(help="Diagonal of Q, as 100,0.01; may be given again for more rows.")
+    ] = None,
+    r: Annotated[list[float] | None, typer.Option(help="R; may be given again. Every Q meets every R.")] = None,
+    theta: Annotated[float, typer.Option(help="Angle of the fixed point, 0 hanging down [rad].")] = UPRIGHT,
+    effort_limit: Annotated[float, typer.Option(help="Torque limit [N m]; 0 for the plant's.")] = 0.0,
+    figures: Annotated[Path | None, typer.Option(help="Folder for the figures (PNG).")] = None,
+    row: Annotated[int, typer.Option(help="Row that the figures show; 0 for the thesis's choice or the last.")] = 0,
+    as_json: Annotated[bool, typer.Option("--json", help="Print JSON instead of tables.")] = False,
+) -> None:
+    """Design LQR gains: eigenvalues, K, time constant, damping, margins and largest stable sampling period.
+
+    Without --q and --r the four combinations of the thesis are designed. Example:
+
+        python -m pendulum_lqr design --preset dfki --q 10,1 --q 100,1 --r 1 --figures build/design
+    """
+    parameters = load_plant(str(plant) if plant is not None else preset)
+    model = linearise(parameters, theta)
+    weights = _weights(q, r)
+    gains = [continuous_lqr(model, diagonal, cost) for diagonal, cost in weights]
+    reports = [analyse(model, None), *(analyse(model, gain.K) for gain in gains)]
+    chosen = _chosen_row(row, len(weights), default=THESIS_CHOICE if not (q or r) else len(weights))
+    if as_json:
+        sys.stdout.write(json.dumps(_document(parameters.name, model, weights, reports), indent=2) + "\n")
+    else:
+        # A pipe has no width: wide enough that no number is cut in two.
+        console = Console(width=None if sys.stdout.isatty() else 120, highlight=False)
+        _print(console, parameters.name, model, weights, reports, chosen)
+    if figures is not None:
+        limit = effort_limit if effort_limit > 0.0 else parameters.effort_limit
+        for path in _save(parameters, model, weights, gains, chosen, limit, figures):
+            print(path, file=sys.stderr if as_json else sys.stdout)
+
+
+def _weights(q: Sequence[str] | None, r: Sequence[float] | None) -> list[tuple[tuple[float, ...], float]]:
+    if not q and not r:
+        return [*THESIS_WEIGHTS]
+    diagonals = [_diagonal(text) for text in q] if q else sorted({weights for weights, _ in THESIS_WEIGHTS})
+    costs = list(r) if r else [0.1]
+    return [(diagonal, cost) for diagonal in diagonals for cost in costs]
+
+
+def _diagonal(text: str) -> tuple[float, ...]:
+    try:
+        values = tuple(float(part) for part in text.split(","))
+    except ValueError as error:
+        raise ParameterError(f"--q is {text!r}; expected two numbers, as 100,0.01") from error
+    if len(values) != 2:
+        raise ParameterError(f"--q is {text!r}; expected two numbers, as 100,0.01")
+    return values
+
+
+def _chosen_row(row: int, count: int, default: int) -> int:
+    if row < 0 or row > count:
+        raise ParameterError(f"--row is {row}; expected 1 to {count}, or 0 for the default")
+    return row or default
+
+
+def _print(
+    console: Console,
+    name: str,
+    model: LinearModel,
+    weights: Sequence[tuple[tuple[float, ...], float]],
+    reports: Sequence[LoopReport],
+    chosen: int,
+) -> None:
+    console.print(
+        f"plant {name} at theta = {model.theta:.4f} rad: A = [[0, 1], [{model.A[1, 0]:.2f}, {model.A[1, 1]:.2f}]], "
+        f"B = [0, {model.B[1, 0]:.2f}], u* = {model.effort:.4g} N m"
+    )
+    table = Table(title="Eigenvalues and gains", title_justify="left", header_style="bold")
+    for heading in ("#", "q11", "q22", "r", "eigenvalues [1/s]", "computed", "K", "tau [s]", "damping"):
+        table.add_column(heading, justify="left" if heading.startswith("eig") else "right", no_wrap=True)
+    margins_table = Table(title="Robustness of the loop", title_justify="left", header_style="bold")
+    for heading in ("#", "gain up", "gain down", "phase margin", "delay margin", "modulus", "largest period"):
+        margins_table.add_column(heading, justify="right", no_wrap=True)
+    for index, report in enumerate(reports):
+        (q11, q22), cost = weights[index - 1] if index else ((math.nan, math.nan), math.nan)
+        cells = [f"{value:g}" if index else "\u2013" for value in (q11, q22, cost)]
+        stable = math.isfinite(report.time_constant)
+        table.add_row(
+            f"{index}",
+            *cells,
+            _poles(report.poles, 2),
+            _poles(report.poles, 6),
+            ", ".join(f"{value:.6f}" for value in report.K) if index else "\u2013",
+            f"{report.time_constant:.4f}" if stable else "unstable",
+            f"{report.damping_ratio:.3f}",
+            style="bold cyan" if index == chosen else "",
+        )
+        margins = report.margins
+        if margins is not None:
+            margins_table.add_row(
+                f"{index}",
+                "any" if math.isinf(margins.gain_up) else f"{margins.gain_up:.3f}",
+                f"{margins.gain_down:.4f}",
+                f"{math.degrees(margins.phase):.2f}\u00b0",
+                f"{margins.delay:.4f} s" if math.isfinite(margins.delay) else "any",
+                f"{margins.modulus:.3f}",
+                "none" if report.largest_period is None else _period(report.largest_period),
+                style="bold cyan" if index == chosen else "",
+            )
+    console.print(table)
+    console.print(margins_table)
+    K = ", ".join(f"{value:.3f}" for value in reports[chosen].K)
+    slowest = reports[chosen].poles[0].real
+    tau = reports[chosen].time_constant
+    console.print(
+        f"combination {chosen}: K = \\[{K}], tau = {tau:.4f} s; from the rounded eigenvalue "
+        f"1/{-slowest:.2f} = {1.0 / round(-slowest, 2):.4f} s"
+        if slowest < -0.005
+        else f"combination {chosen}: K = \\[{K}], tau = {tau:.4f} s"
+    )
+
+
+def _poles(poles: Sequence[complex], digits: int) -> str:
+    if all(abs(pole.imag) < 1e-9 for pole in poles):
+        return ", ".join(f"{pole.real:.{digits}f}" for pole in poles)
+    return f"{poles[0].real:.{digits}f} \u00b1 {abs(poles[0].imag):.{digits}f}j"
+
+
+def _period(period: float) -> str:
+    return "any" if math.isinf(period) else f"{period:.4f} s"
+
+
+def _document(
+    name: str,
+    model: LinearModel,
+    weights: Sequence[tuple[tuple[float, ...], float]],
+    reports: Sequence[LoopReport],
+) -> dict[str, Any]:
+    rows = []
+    for index, report in enumerate(reports):
+        row: dict[str, Any] = {"combination": index, "q": None, "r": None, **report.to_dict()}
+        if index:
+            row["q"], row["r"] = list(weights[index - 1][0]), weights[index - 1][1]
+        rows.append(row)
+    return {
+        "plant": name,
+        "theta": model.theta,
+        "effort": model.effort,
+        "A": model.A.tolist(),
+        "B": model.B.tolist(),
+        "rows": rows,
+    }
+
+
+def _save(
+    plant: Any,
+    model: LinearModel,
+    weights: Sequence[tuple[tuple[float, ...], float]],
+    gains: Sequence[Gain],
+    chosen: int,
+    effort_limit: float,
+    folder: Path,
+) -> list[Path]:
+    # Imported late: without --figures nobody waits for matplotlib.
+    from pendulum_lqr.figures import design_figures
+
+    rows = [
+        (f"{index}: Q = ({diagonal[0]:g}, {diagonal[1]:g}), R = {cost:g}", gain)
+        for index, ((diagonal, cost), gain) in enumerate(zip(weights, gains, strict=True), start=1)
+    ]
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        paths = []
+        for name, figure in design_figures(plant, model, rows, chosen - 1, effort_limit).items():
+            path = folder / f"{name}.png"
+            figure.savefig(path)
+            paths.append(path)
+    except OSError as error:
+        raise ParameterError(f"figures cannot be written to {folder}: {error.strerror}") from error
+    return paths
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run the design command and return the exit code."""
+    return cli_main(app, argv, name="python -m pendulum_lqr design")
