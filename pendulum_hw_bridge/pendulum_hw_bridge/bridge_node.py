@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+import sys
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
@@ -366,10 +367,16 @@ class BridgeNode(LifecycleNode):
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run the bridge."""
+    """Run the bridge, or with ``--check`` the checklist that comes before arming."""
+    arguments = list(sys.argv[1:] if argv is None else argv)
+    if "--check" in arguments:
+        from pendulum_hw_bridge.check_cli import main as check
+
+        arguments.remove("--check")
+        return check(arguments)
     return run_node(
         BridgeNode,
-        argv,
+        arguments,
         program="pendulum_hw_bridge bridge",
         description="Drives a HEBI X5-9, or its emulator, behind the same interface as the simulator.",
         specs=SPECS,

@@ -166,7 +166,7 @@ BRIDGE_SPECS: tuple[ParameterSpec, ...] = (
     _fixed(
         "emulator_address", _DEFAULT_ADDRESS, "", "`emulator_process`: where the emulated actuator listens."
     ),
-    _fixed("replay_file", "", "", "`replay`: feedback to play, an NPZ or CSV file."),
+    _fixed("replay_file", "", "", "`replay`: feedback to play: a bag folder, an NPZ or a CSV file."),
 )
 """Parameters of the bridge beside those that every plant has."""
 
@@ -256,7 +256,7 @@ def _make_replay(values: Mapping[str, Any], clock: Clock) -> ActuatorPort:
 
     if not values["replay_file"]:
         raise ParameterError(
-            "replay_file is empty; expected an NPZ or CSV file of feedback for backend 'replay'"
+            "replay_file is empty; expected a bag folder, NPZ or CSV file of feedback for backend 'replay'"
         )
     return ReplayBackend(load_feedback(values["replay_file"]), clock)
 

@@ -4,4 +4,8 @@ __all__ = ["EXECUTABLES"]
 
 EXECUTABLES: dict[str, str] = {
     "bridge": "pendulum_hw_bridge.bridge_node:main",
+    "check": "pendulum_hw_bridge.check_cli:main",
+    "emulator": "pendulum_hw_bridge.emulator_cli:main",
+    "emulator_fault": "pendulum_hw_bridge.emulator_cli:fault_main",
+    "procedure": "pendulum_hw_bridge.procedure_node:main",
 }

@@ -52,5 +52,5 @@ def encode_feedback(feedback: Feedback) -> bytes:
     """
     message = bytearray(_TEMPLATE)
     _STAMP.pack_into(message, _STAMP_AT, *divmod(feedback.stamp_ns, NANOSECONDS))
-    _VALUES.pack_into(message, _VALUES_AT, *feedback[_SLICE])
+    _VALUES.pack_into(message, _VALUES_AT, *tuple(feedback)[_SLICE])
     return bytes(message)

@@ -1,0 +1,238 @@
+"""Backend for an emulated X5-9 that runs in a process of its own, so that it outlives the bridge like a real one."""
+
+from __future__ import annotations
+
+import math
+import select
+import socket
+from typing import Any
+
+from pendulum_hw_bridge.actuator import (
+    ActuatorError,
+    ActuatorInfo,
+    Applied,
+    Command,
+    Feedback,
+    HardwareLimits,
+    Strategy,
+    check_command,
+    check_lifetime,
+)
+from pendulum_hw_bridge.clocks import Clock, WallClock
+from pendulum_hw_bridge.emulation import wire
+from pendulum_hw_bridge.gains import GainSet
+from pendulum_msgs_py.values import NANOSECONDS
+
+__all__ = ["EmulatorProcessBackend"]
+
+_ACKNOWLEDGE = 0.25
+_ATTEMPTS = 3
+_CONNECT_ATTEMPTS = 40
+_RENEW_NS = NANOSECONDS // 2
+
+
+class EmulatorProcessBackend:
+    """The actuator port of an emulated actuator behind a UDP address.
+
+    Args:
+        address: ``HOST:PORT``.
+        clock: Host clock; feedback is stamped with it on receipt.
+    """
+
+    name = "emulator_process"
+
+    def __init__(self, address: str, clock: Clock | None = None) -> None:
+        self._address = wire.parse_address(address)
+        self._clock = clock or WallClock()
+        self._socket: socket.socket | None = None
+        self._strategy = Strategy.OFF
+        self._limits = HardwareLimits()
+        self._requests = 0
+        self._push = 0.0
+        self._newest: Feedback | None = None
+        self._renewed_ns = 0
+
+    @property
+    def strategy(self) -> Strategy:
+        """Strategy that was last confirmed."""
+        return self._strategy
+
+    def connect(self) -> ActuatorInfo:
+        """Ask the emulated actuator for its settings; waits some seconds for one that is just starting."""
+        attempts = _ATTEMPTS
+        if self._socket is None:
+            self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+            self._socket.connect(self._address)
+            self._socket.setblocking(False)
+            attempts = _CONNECT_ATTEMPTS
+        status = self._request({}, attempts=attempts)
+        self._strategy = Strategy(status["strategy"])
+        return ActuatorInfo(
+            backend=self.name,
+            family="emulated",
+            name=str(status["name"]),
+            serial="X5-9-E0001",
+            firmware="emulated X5-9",
+            strategy=self._strategy,
+            feedback_rate=float(status["feedback_rate"]),
+            command_lifetime=float(status["command_lifetime"]),
+            limits=wire.limits_from_json(status["limits"]),
+            gains=wire.gains_from_json(status["gains"]),
+        )
+
+    def now_ns(self) -> int:
+        """Return the host clock [ns]."""
+        return self._clock.now_ns()
+
+    def read(self, timeout: float) -> Feedback | None:
+        """Return the newest feedback, waiting for one at most ``timeout`` [s]."""
+        self._renew()
+        deadline = self._clock.now_ns() + round(timeout * NANOSECONDS)
+        while True:
+            self._receive()
+            if self._newest is not None:
+                newest, self._newest = self._newest, None
+                return newest
+            remaining = (deadline - self._clock.now_ns()) / NANOSECONDS
+            if remaining <= 0.0:
+                return None
+            select.select([self._require_socket()], [], [], remaining)
+
+    def write(self, command: Command) -> Applied:
+        """Send setpoints, checked and limited before they are sent."""
+        limited, changed = check_command(command, self._strategy, self._limits)
+        now = self._clock.now_ns()
+        self._send(wire.encode_command(limited))
+        return Applied(limited, self._strategy, changed, now)
+
+    def set_strategy(self, strategy: Strategy, command: Command | None = None) -> Strategy:
+        """Change the strategy, then send first setpoints."""
+        limited = None if command is None else check_command(command, strategy, self._limits)[0]
+        self._strategy = Strategy(self._request({"settings": {"strategy": int(strategy)}})["strategy"])
+        if limited is not None and self._strategy is strategy:
+            self._send(wire.encode_command(limited))
+        return self._strategy
+
+    def set_gains(self, gains: GainSet) -> GainSet:
+        """Set the gains of all loops."""
+        return wire.gains_from_json(
+            self._request({"settings": {"gains": wire.gains_to_json(gains)}})["gains"]
+        )
+
+    def set_limits(self, limits: HardwareLimits) -> HardwareLimits:
+        """Set the firmware's limits."""
+        status = self._request({"settings": {"limits": wire.limits_to_json(limits)}})
+        self._limits = wire.limits_from_json(status["limits"])
+        return self._limits
+
+    def set_command_lifetime(self, lifetime: float) -> float:
+        """Set the command lifetime [s]."""
+        status = self._request({"settings": {"command_lifetime": check_lifetime(lifetime)}})
+        return float(status["command_lifetime"])
+
+    def set_feedback_rate(self, rate: float) -> float:
+        """Set the feedback rate [Hz]."""
+        return float(self._request({"settings": {"feedback_rate": rate}})["feedback_rate"])
+
+    def push(self, torque: float) -> None:
+        """Hold a torque on the link itself, as a hand would [N m]."""
+        torque = torque if math.isfinite(torque) else 0.0
+        if torque != self._push:
+            self._push = torque
+            self._send(wire.encode_json(wire.REQUEST, {"push": torque}))
+
+    def stop(self) -> None:
+        """Effort zero, then strategy off; the strategy is tried several times, because a packet may be lost."""
+        if self._socket is None:
+            return
+        if self._strategy is not Strategy.OFF:
+            zero = Command(pwm=0.0) if self._strategy is Strategy.DIRECT_PWM else Command(effort=0.0)
+            self._strategy = Strategy.OFF
+            try:
+                self._send(wire.encode_command(zero))
+            finally:
+                self._request({"settings": {"strategy": int(Strategy.OFF)}}, patience=0.02)
+
+    def close(self) -> None:
+        """Stop and let go."""
+        try:
+            self.stop()
+        finally:
+            if self._socket is not None:
+                self._socket.close()
+            self._socket = None
+
+    def status(self) -> dict[str, Any]:
+        """Return what the emulator knows of itself, the truth behind the feedback included."""
+        return self._request({})
+
+    def inject(self, *faults: str) -> None:
+        """Let faults begin, by name."""
+        self._request({"inject": list(faults)})
+
+    def clear_faults(self) -> None:
+        """Mend everything."""
+        self._request({"clear_faults": True})
+
+    # --- inside ---------------------------------------------------------------------------------------------
+
+    def _require_socket(self) -> socket.socket:
+        if self._socket is None:
+            raise ActuatorError("not_connected", "emulator process is not connected; call connect() first")
+        return self._socket
+
+    def _send(self, packet: bytes) -> None:
+        try:
+            self._require_socket().send(packet)
+        except ConnectionRefusedError:
+            # The answer to an earlier packet: nobody listens there any more. Feedback stays away, which is seen.
+            return
+        except OSError as error:
+            raise ActuatorError("send_failed", f"command could not be sent: {error.strerror}") from error
+
+    def _renew(self) -> None:
+        now = self._clock.now_ns()
+        if now - self._renewed_ns > _RENEW_NS:
+            self._renewed_ns = now
+            self._send(wire.encode_json(wire.REQUEST, {"renew": True}))
+
+    def _receive(self) -> dict[str, Any]:
+        """Take in all packets that wait; return the last reply among them, or an empty object."""
+        reply: dict[str, Any] = {}
+        while True:
+            try:
+                packet = self._require_socket().recv(wire.MAX_PACKET)
+            except BlockingIOError:
+                return reply
+            except OSError:
+                return reply  # "connection refused": nobody listens there, or not yet
+            kind = wire.kind_of(packet)
+            if kind == wire.FEEDBACK:
+                feedback = wire.decode_feedback(packet)
+                if feedback is not None:
+                    self._newest = feedback._replace(stamp_ns=self._clock.now_ns())
+            elif kind == wire.REPLY:
+                answer = wire.decode_json(packet)
+                if answer.get("id") == self._requests:
+                    reply = answer
+
+    def _request(
+        self, request: dict[str, Any], *, attempts: int = _ATTEMPTS, patience: float = _ACKNOWLEDGE
+    ) -> dict[str, Any]:
+        self._requests += 1
+        packet = wire.encode_json(wire.REQUEST, {"id": self._requests, **request})
+        for _ in range(attempts):
+            self._send(packet)
+            deadline = self._clock.now_ns() + round(patience * NANOSECONDS)
+            while (remaining := (deadline - self._clock.now_ns()) / NANOSECONDS) > 0.0:
+                select.select([self._require_socket()], [], [], remaining)
+                reply = self._receive()
+                if "error" in reply:
+                    raise ActuatorError("no_acknowledgement", f"emulator refused: {reply['error']}")
+                if reply:
+                    return reply
+        host, port = self._address
+        raise ActuatorError(
+            "no_acknowledgement",
+            f"emulator at {host}:{port} does not answer; start it with: python -m pendulum_hw_bridge emulator",
+        )

@@ -1,0 +1,409 @@
+"""Backend for a real HEBI module, through hebi-py.
+
+hebi-py checks nothing that it sends, returns views of buffers that change, and wants one thread: everything is
+checked before it is sent, copied when it is read, and a call from another thread is refused. The library is imported
+when a module is connected and never before; its licence and its wheels are not for everybody.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import math
+import threading
+from collections.abc import Callable, Mapping
+from typing import Any
+
+from pendulum_hw_bridge.actuator import (
+    ActuatorError,
+    ActuatorInfo,
+    Applied,
+    Command,
+    CommandLock,
+    Feedback,
+    HardwareLimits,
+    LimitState,
+    MStopAction,
+    Strategy,
+    TemperatureState,
+    check_command,
+    check_lifetime,
+)
+from pendulum_hw_bridge.clocks import Clock, WallClock
+from pendulum_hw_bridge.gains import DEFAULT_GAINS, GAIN_FIELDS, LOOPS, GainSet, PidGains
+from pendulum_msgs_py.errors import ParameterError
+from pendulum_msgs_py.values import NANOSECONDS
+
+__all__ = ["HebiBackend", "connect_group"]
+
+_LOOKUP_TIMEOUT = 5.0
+_ACKNOWLEDGE_MS = 200
+_STOP_ATTEMPTS = 3
+_PASCAL_M_STOP = {
+    MStopAction.DISABLED: "Disabled",
+    MStopAction.MOTOR_OFF: "MotorOff",
+    MStopAction.HOLD_POSITION: "HoldPosition",
+}
+_M_STOP_BY_NUMBER = {0: MStopAction.DISABLED, 1: MStopAction.MOTOR_OFF, 2: MStopAction.HOLD_POSITION}
+_FLOATS = {
+    "position": "position",
+    "velocity": "velocity",
+    "effort": "effort",
+    "position_command": "position_command",
+    "velocity_command": "velocity_command",
+    "effort_command": "effort_command",
+    "pwm_command": "pwm_command",
+    "motor_current": "motor_current",
+    "winding_current": "motor_winding_current",
+    "motor_position": "motor_position",
+    "motor_velocity": "motor_velocity",
+    "deflection": "deflection",
+    "deflection_velocity": "deflection_velocity",
+    "voltage": "voltage",
+    "winding_temperature": "motor_winding_temperature",
+    "housing_temperature": "motor_housing_temperature",
+    "motor_sensor_temperature": "motor_sensor_temperature",
+    "board_temperature": "board_temperature",
+    "processor_temperature": "processor_temperature",
+}
+"""Our quantity -> attribute of hebi-py's feedback."""
+
+
+def _import_hebi() -> Any:
+    try:
+        # The library greets on standard output when an optional module of its own is missing.
+        with contextlib.redirect_stdout(io.StringIO()):
+            import hebi
+    except ImportError as error:
+        raise ActuatorError(
+            "not_installed", f"hebi-py cannot be imported ({error}); install it with: pip install hebi-py"
+        ) from error
+    return hebi
+
+
+def connect_group(family: str, name: str, interface: str = "", timeout: float = _LOOKUP_TIMEOUT) -> Any:
+    """Return hebi-py's group of the one module that is meant.
+
+    Args:
+        family: HEBI family; empty for any.
+        name: HEBI name; empty for any.
+        interface: Network address to look on; empty for all.
+        timeout: Longest time to look [s].
+
+    Raises:
+        ActuatorError: hebi-py is not installed, no such module answers, or several do.
+    """
+    hebi = _import_hebi()
+    lookup = hebi.Lookup([interface]) if interface else hebi.Lookup()
+    waiting = threading.Event()
+    found: list[tuple[str, str]] = []
+    for _ in range(max(1, round(timeout / 0.25))):
+        waiting.wait(0.25)
+        found = [(str(entry.family), str(entry.name)) for entry in lookup.entrylist]
+        matching = [(f, n) for f, n in found if family in {"", f} and name in {"", n}]
+        # An exact name may be taken as soon as it answers; "the only one" needs the whole time to be sure of.
+        if matching and family and name:
+            break
+    wanted = f"{family or '*'}/{name or '*'}"
+    matching = [(f, n) for f, n in found if family in {"", f} and name in {"", n}]
+    if not matching:
+        listed = ", ".join(f"{f}/{n}" for f, n in found) or "none"
+        raise ActuatorError(
+            "module_lost", f"no HEBI module {wanted} answered within {timeout:g} s; modules seen: {listed}"
+        )
+    if len(matching) > 1:
+        listed = ", ".join(f"{f}/{n}" for f, n in matching)
+        raise ActuatorError(
+            "module_lost", f"HEBI module {wanted} is not the only one: {listed}; give family and name"
+        )
+    group = lookup.get_group_from_names([matching[0][0]], [matching[0][1]], round(1000 * timeout))
+    if group is None:
+        raise ActuatorError("module_lost", f"HEBI module {wanted} was seen but does not connect")
+    return group
+
+
+class HebiBackend:
+    """The actuator port of one HEBI module.
+
+    Args:
+        family: HEBI family; empty for any.
+        name: HEBI name; empty for any.
+        clock: Host clock; feedback is stamped with it on receipt.
+        interface: Network address to look on; empty for all.
+        drivetrain: Constants to report with a run.
+        make_group: Returns hebi-py's group; by default the module is looked up on the network.
+        imitation: The group is hebi-py's imitation, which has no module to read settings or times back from.
+    """
+
+    name = "hebi"
+
+    def __init__(
+        self,
+        family: str = "",
+        name: str = "",
+        *,
+        clock: Clock | None = None,
+        interface: str = "",
+        drivetrain: Mapping[str, float] | None = None,
+        make_group: Callable[[], Any] | None = None,
+        imitation: bool = False,
+    ) -> None:
+        self._clock = clock or WallClock()
+        self._make_group = make_group or (lambda: connect_group(family, name, interface))
+        self._imitation = imitation
+        self._drivetrain = dict(drivetrain or {})
+        self._family, self._name = family, name
+        self._group: Any = None
+        self._hebi: Any = None
+        self._command: Any = None
+        self._feedback: Any = None
+        self._owner: int | None = None
+        self._strategy = Strategy.OFF
+        self._limits = HardwareLimits()
+        self._gains: GainSet | None = None
+        self._counter = 0
+        self._last_receive_us = -1
+        self._next_ns = 0
+
+    # --- port -----------------------------------------------------------------------------------------------
+
+    @property
+    def strategy(self) -> Strategy:
+        """Strategy that was last confirmed."""
+        return self._strategy
+
+    def connect(self) -> ActuatorInfo:
+        """Find the module, once, and return what it says of itself."""
+        if self._group is None:
+            self._hebi = _import_hebi()
+            self._owner = threading.get_ident()
+            self._group = self._make_group()
+            if self._group.size != 1:
+                raise ActuatorError("module_lost", f"HEBI group has {self._group.size} modules; expected 1")
+            self._command = self._hebi.GroupCommand(1)
+            self._feedback = self._hebi.GroupFeedback(1)
+        self._own()
+        info = self._read_info()
+        family, name, serial, firmware = self._family, self._name, "", ""
+        if info is not None:
+            self._strategy = Strategy(int(info.control_strategy[0]))
+            family, name = str(info.family[0]), str(info.name[0])
+            serial, firmware = str(info.serial[0]), str(info.firmware_revision[0])
+        return ActuatorInfo(
+            backend=self.name,
+            family=family,
+            name=name,
+            serial=serial,
+            firmware=firmware,
+            strategy=self._strategy,
+            feedback_rate=float(self._group.feedback_frequency),
+            command_lifetime=float(self._group.command_lifetime) * 1e-3,
+            limits=self._limits,
+            gains=self._gains,
+            drivetrain=self._drivetrain,
+        )
+
+    def now_ns(self) -> int:
+        """Return the host clock [ns]."""
+        return self._clock.now_ns()
+
+    def read(self, timeout: float) -> Feedback | None:
+        """Return the next feedback, copied out of the library's buffers."""
+        self._own()
+        deadline = self._clock.now_ns() + round(timeout * NANOSECONDS)
+        if self._imitation:
+            # The imitation answers at once, always: without a pace of our own the loop would spin.
+            self._clock.wait_until(min(self._next_ns, deadline))
+            if self._next_ns > deadline:
+                return None
+            self._next_ns = self._clock.now_ns() + round(NANOSECONDS / self._group.feedback_frequency)
+        record = self._group.get_next_feedback(max(1.0, 1000.0 * timeout), self._feedback)
+        if record is None:
+            self._clock.wait_until(deadline)
+            return None
+        now = self._clock.now_ns()
+        receive_us = int(record.receive_time_us[0])
+        if not self._imitation:
+            if receive_us == self._last_receive_us:
+                self._clock.wait_until(deadline)
+                return None
+            self._last_receive_us = receive_us
+        self._counter += 1
+        return self._copy(record, now)
+
+    def write(self, command: Command) -> Applied:
+        """Send setpoints, checked and limited before they are sent."""
+        self._own()
+        limited, changed = check_command(command, self._strategy, self._limits)
+        now = self._clock.now_ns()
+        self._command.clear()
+        self._set_setpoints(limited, self._strategy)
+        self._send()
+        return Applied(limited, self._strategy, changed, now)
+
+    def set_strategy(self, strategy: Strategy, command: Command | None = None) -> Strategy:
+        """Change the strategy, with first setpoints in the same packet."""
+        self._own()
+        limited, _ = check_command(command or Command(), strategy, self._limits)
+        self._command.clear()
+        self._command.control_strategy = int(strategy)
+        self._set_setpoints(limited, strategy)
+        self._acknowledged("strategy")
+        info = self._read_info()
+        self._strategy = strategy if info is None else Strategy(int(info.control_strategy[0]))
+        return self._strategy
+
+    def set_gains(self, gains: GainSet) -> GainSet:
+        """Set the gains of all loops and read them back."""
+        self._own()
+        self._command.clear()
+        for loop in LOOPS:
+            for name in GAIN_FIELDS:
+                value = getattr(gains.loop(loop), name)
+                if math.isfinite(value):
+                    setattr(self._command, f"{loop}_{name}", bool(value) if name == "d_on_error" else value)
+        self._acknowledged("gains")
+        info = self._read_info()
+        self._gains = gains if info is None else self._gains_of(info, gains.strategy)
+        return self._gains
+
+    def set_limits(self, limits: HardwareLimits) -> HardwareLimits:
+        """Set the module's safety parameters and read them back."""
+        self._own()
+        command = self._command
+        command.clear()
+        command.effort_limit_min, command.effort_limit_max = -limits.effort, limits.effort
+        command.velocity_limit_min, command.velocity_limit_max = -limits.velocity, limits.velocity
+        if math.isfinite(limits.position_min) and math.isfinite(limits.position_max):
+            command.position_limit_min = limits.position_min
+            command.position_limit_max = limits.position_max
+        command.mstop_strategy = _PASCAL_M_STOP[limits.m_stop]
+        self._acknowledged("limits")
+        info = self._read_info()
+        self._limits = limits if info is None else self._limits_of(info, limits)
+        return self._limits
+
+    def set_command_lifetime(self, lifetime: float) -> float:
+        """Set the command lifetime [s]; zero, which would be for ever, is refused."""
+        self._own()
+        milliseconds = max(1, round(1000.0 * check_lifetime(lifetime)))
+        self._group.command_lifetime = milliseconds
+        return float(self._group.command_lifetime) * 1e-3
+
+    def set_feedback_rate(self, rate: float) -> float:
+        """Set the rate of the library's background requests [Hz]."""
+        self._own()
+        if not (math.isfinite(rate) and 0.0 < rate <= 1000.0):
+            raise ParameterError(f"feedback_rate is {rate} Hz; expected > 0 and <= 1000 Hz")
+        self._group.feedback_frequency = float(rate)
+        return float(self._group.feedback_frequency)
+
+    def stop(self) -> None:
+        """Effort zero, then strategy off, acknowledged; tried several times, because a packet may be lost."""
+        if self._group is None or threading.get_ident() != self._owner:
+            return
+        zero = Command(pwm=0.0) if self._strategy is Strategy.DIRECT_PWM else Command(effort=0.0)
+        if self._strategy is not Strategy.OFF:
+            self._command.clear()
+            self._set_setpoints(zero, self._strategy)
+            self._group.send_command(self._command)
+        for _ in range(_STOP_ATTEMPTS):
+            self._command.clear()
+            self._command.control_strategy = int(Strategy.OFF)
+            self._set_setpoints(Command(), Strategy.OFF)
+            if self._group.send_command_with_acknowledgement(self._command, _ACKNOWLEDGE_MS):
+                self._strategy = Strategy.OFF
+                return
+        # Nobody hears us; what drives the motor now ends with the command lifetime.
+        self._strategy = Strategy.OFF
+
+    def close(self) -> None:
+        """Stop, and let the library's thread for this group go."""
+        self.stop()
+        self._group = self._command = self._feedback = None
+        self._owner = None
+
+    # --- inside ---------------------------------------------------------------------------------------------
+
+    def _own(self) -> None:
+        if self._group is None:
+            raise ActuatorError("not_connected", "HEBI module is not connected; call connect() first")
+        if threading.get_ident() != self._owner:
+            raise ActuatorError(
+                "exception",
+                "HEBI group was called from a second thread; expected only the one that connected",
+            )
+
+    def _set_setpoints(self, command: Command, strategy: Strategy) -> None:
+        self._command.position = command.position
+        self._command.velocity = command.velocity
+        # Under direct PWM the effort field carries the duty.
+        self._command.effort = command.pwm if strategy is Strategy.DIRECT_PWM else command.effort
+
+    def _send(self) -> None:
+        if not self._group.send_command(self._command):
+            raise ActuatorError("send_failed", "command could not be sent to the HEBI module: network down?")
+
+    def _acknowledged(self, what: str) -> None:
+        if not self._group.send_command_with_acknowledgement(self._command, _ACKNOWLEDGE_MS):
+            raise ActuatorError(
+                "no_acknowledgement",
+                f"HEBI module did not acknowledge its {what} within {_ACKNOWLEDGE_MS} ms",
+            )
+
+    def _read_info(self) -> Any:
+        if self._imitation:
+            return None
+        info = self._group.request_info(_ACKNOWLEDGE_MS)
+        if info is None:
+            raise ActuatorError("module_lost", f"HEBI module did not answer within {_ACKNOWLEDGE_MS} ms")
+        return info
+
+    def _copy(self, record: Any, now_ns: int) -> Feedback:
+        values = {ours: float(getattr(record, theirs)[0]) for ours, theirs in _FLOATS.items()}
+        hardware_us = int(record.hardware_transmit_time_us[0])
+        return Feedback(
+            stamp_ns=now_ns,
+            hardware_ns=1000 * hardware_us if hardware_us else now_ns,
+            sequence=self._counter,
+            m_stop=int(record.mstop_state[0]) == 0 and not self._imitation,
+            temperature_state=_known(TemperatureState, record.temperature_state[0]),
+            lock=_known(CommandLock, record.command_lifetime_state[0]),
+            position_limit=self._limit(record.position_limit_state[0]),
+            velocity_limit=self._limit(record.velocity_limit_state[0]),
+            effort_limit=self._limit(record.effort_limit_state[0]),
+            **values,
+        )
+
+    def _limit(self, number: Any) -> int:
+        return LimitState.INSIDE if self._imitation else _known(LimitState, number)
+
+    def _gains_of(self, info: Any, strategy: int) -> GainSet:
+        defaults = DEFAULT_GAINS.get(strategy, DEFAULT_GAINS[3])
+        loops: dict[str, PidGains] = {}
+        for loop in LOOPS:
+            read = {name: float(getattr(info, f"{loop}_{name}")[0]) for name in GAIN_FIELDS}
+            known = {name: value for name, value in read.items() if not math.isnan(value)}
+            standard = {name: getattr(defaults.loop(loop), name) for name in GAIN_FIELDS}
+            loops[loop] = PidGains(**{**standard, **known})
+        return GainSet(strategy, **loops)
+
+    @staticmethod
+    def _limits_of(info: Any, wanted: HardwareLimits) -> HardwareLimits:
+        low, high = float(info.position_limit_min[0]), float(info.position_limit_max[0])
+        return HardwareLimits(
+            effort=float(info.effort_limit_max[0]),
+            velocity=float(info.velocity_limit_max[0]),
+            position_min=-math.inf if math.isnan(low) else low,
+            position_max=math.inf if math.isnan(high) else high,
+            pwm=wanted.pwm,
+            m_stop=_M_STOP_BY_NUMBER.get(int(info.mstop_strategy[0]), MStopAction.DISABLED),
+        )
+
+
+def _known(kind: Any, number: Any) -> int:
+    """Return a state of the firmware as ours; one that a newer firmware may have added stays a number."""
+    try:
+        return int(kind(int(number)))
+    except ValueError:
+        return int(number)

@@ -1,0 +1,328 @@
+"""Backend that plays recorded feedback, so that everything above the port meets real data.
+
+Setpoints change nothing in a recording; they are checked, limited and answered like those of any other backend.
+"""
+
+from __future__ import annotations
+
+import csv
+import math
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from pendulum_hw_bridge.actuator import (
+    FEEDBACK_QUANTITIES,
+    ActuatorError,
+    ActuatorInfo,
+    Applied,
+    Command,
+    Feedback,
+    HardwareLimits,
+    Strategy,
+    check_command,
+    check_lifetime,
+)
+from pendulum_hw_bridge.clocks import Clock, WallClock
+from pendulum_hw_bridge.gains import GainSet
+from pendulum_msgs_py.errors import DataError
+from pendulum_msgs_py.values import NANOSECONDS
+
+__all__ = ["FeedbackRecording", "ReplayBackend", "load_feedback"]
+
+_REQUIRED = ("time", "position", "velocity", "effort")
+_LIMIT = 200_000_000
+_DEFAULTS = {"voltage": 36.0}
+_FLAGS = tuple(Feedback._field_defaults.values())
+
+
+class FeedbackRecording:
+    """Feedback over time, as arrays.
+
+    Args:
+        quantities: ``time`` [s], increasing, and quantities by their name in
+            :data:`pendulum_hw_bridge.actuator.FEEDBACK_QUANTITIES`, in SI units, all of one length. ``position``,
+            ``velocity`` and ``effort`` are required.
+        where: Where it comes from, for messages.
+
+    Raises:
+        DataError: A quantity is missing or unknown, lengths differ, or time does not increase.
+    """
+
+    def __init__(self, quantities: Mapping[str, ArrayLike], *, where: str = "recording") -> None:
+        known = {"time", *FEEDBACK_QUANTITIES}
+        arrays: dict[str, NDArray[np.float64]] = {}
+        for name, values in quantities.items():
+            if name not in known:
+                raise DataError(
+                    f"{where}: unknown quantity {name!r}; expected time or one of {', '.join(FEEDBACK_QUANTITIES)}"
+                )
+            arrays[name] = np.asarray(values, dtype=np.float64)
+        for name in _REQUIRED:
+            if name not in arrays:
+                raise DataError(f"{where}: {name} is missing; expected {', '.join(_REQUIRED)}")
+        size = arrays["time"].size
+        for name, values in arrays.items():
+            if values.ndim != 1 or values.size != size:
+                raise DataError(f"{where}: {name} has shape {values.shape}; expected ({size},) like time")
+        if size == 0:
+            raise DataError(f"{where}: 0 records; expected at least 1")
+        time = arrays.pop("time")
+        if not np.all(np.isfinite(time)) or np.any(np.diff(time) <= 0.0):
+            raise DataError(
+                f"{where}: time does not increase from record to record; expected seconds in order"
+            )
+        self.time_ns = np.rint((time - time[0]) * NANOSECONDS).astype(np.int64)
+        self.columns = arrays
+        self.size = size
+
+    @property
+    def rate(self) -> float:
+        """Median rate of the records [Hz]."""
+        if self.size < 2:
+            return 100.0
+        return float(NANOSECONDS / np.median(np.diff(self.time_ns)))
+
+    def record(self, index: int, stamp_ns: int) -> Feedback:
+        """Return one record; quantities that were not recorded are NaN, the voltage nominal.
+
+        Args:
+            index: Number of the record.
+            stamp_ns: Host time to stamp it with [ns].
+        """
+        values = {name: _DEFAULTS.get(name, math.nan) for name in FEEDBACK_QUANTITIES}
+        values.update({name: float(column[index]) for name, column in self.columns.items()})
+        return Feedback._make(
+            (stamp_ns, stamp_ns, index + 1, *(values[name] for name in FEEDBACK_QUANTITIES), *_FLAGS)
+        )
+
+
+def load_feedback(path: str | Path) -> FeedbackRecording:
+    """Return the recording in an NPZ file (arrays by name), a CSV file (a header of names), or a rosbag2 folder.
+
+    From a bag the complete records on ``actuator/feedback`` are taken, else position, velocity and effort on
+    ``joint_states``.
+
+    Raises:
+        DataError: No such file, another format, or content that is refused; the message names file and place.
+    """
+    path = Path(path)
+    try:
+        if path.is_dir():
+            return FeedbackRecording(_read_bag(path), where=str(path))
+        if path.stat().st_size > _LIMIT:
+            raise DataError(f"{path} has {path.stat().st_size} bytes; expected at most {_LIMIT}")
+        if path.suffix == ".npz":
+            with np.load(path, allow_pickle=False) as archive:
+                return FeedbackRecording({name: archive[name] for name in archive.files}, where=str(path))
+        if path.suffix == ".csv":
+            return FeedbackRecording(_read_csv(path), where=str(path))
+    except OSError as error:
+        raise DataError(f"feedback file {path} cannot be read: {error.strerror or error}") from error
+    except ValueError as error:
+        if isinstance(error, DataError):
+            raise
+        raise DataError(f"feedback file {path}: {error}") from error
+    raise DataError(f"feedback file {path} ends in {path.suffix!r}; expected .npz or .csv")
+
+
+def _read_csv(path: Path) -> dict[str, list[float]]:
+    with path.open(newline="", encoding="utf-8") as file:
+        reader = csv.reader(file)
+        header = [name.strip() for name in next(reader, [])]
+        columns: dict[str, list[float]] = {name: [] for name in header}
+        if len(columns) != len(header):
+            raise DataError(f"{path}:1: a column name is given twice in {', '.join(header)}")
+        for row in reader:
+            if not row:
+                continue
+            if len(row) != len(header):
+                raise DataError(f"{path}:{reader.line_num}: {len(row)} values; expected {len(header)}")
+            for name, text in zip(header, row, strict=True):
+                try:
+                    columns[name].append(float(text))
+                except ValueError as error:
+                    raise DataError(
+                        f"{path}:{reader.line_num}: {name} is {text!r}; expected a number"
+                    ) from error
+    return columns
+
+
+def _read_bag(folder: Path) -> dict[str, list[float]]:
+    try:
+        from rosbags.highlevel import AnyReader, AnyReaderError
+        from rosbags.typesys import Stores, get_typestore
+    except ImportError as error:
+        raise DataError(
+            f"bag {folder} needs rosbags to be read ({error}); install it with: pip install rosbags"
+        ) from error
+    columns: dict[str, list[float]] = {}
+    try:
+        with AnyReader([folder], default_typestore=get_typestore(Stores.ROS2_JAZZY)) as reader:
+            for ending in ("actuator/feedback", "joint_states"):
+                connections = [c for c in reader.connections if c.topic.endswith(f"/{ending}")]
+                if len({c.topic for c in connections}) > 1:
+                    topics = ", ".join(sorted({c.topic for c in connections}))
+                    raise DataError(f"bag {folder} holds several recordings: {topics}; expected one")
+                if connections:
+                    break
+            for connection, _, raw in reader.messages(connections=connections):
+                message: Any = reader.deserialize(raw, connection.msgtype)
+                stamp = message.header.stamp.sec + message.header.stamp.nanosec * 1e-9
+                columns.setdefault("time", []).append(stamp)
+                if ending == "joint_states":
+                    values = {name: getattr(message, name)[0] for name in ("position", "velocity", "effort")}
+                else:
+                    values = dict(zip(message.name, message.position, strict=True))
+                for name, value in values.items():
+                    columns.setdefault(name, []).append(float(value))
+    except AnyReaderError as error:
+        raise DataError(f"bag {folder} cannot be read: {error}") from error
+    if not columns:
+        raise DataError(
+            f"bag {folder} has no feedback; expected messages on actuator/feedback or joint_states"
+        )
+    return columns
+
+
+class ReplayBackend:
+    """The actuator port of a recording.
+
+    Args:
+        recording: What to play.
+        clock: Host clock; the recording starts when it is connected.
+        loop: Start again at the end instead of falling silent.
+    """
+
+    name = "replay"
+
+    def __init__(
+        self, recording: FeedbackRecording, clock: Clock | None = None, *, loop: bool = False
+    ) -> None:
+        self.recording = recording
+        self._clock = clock or WallClock()
+        self._loop = loop
+        self._start_ns: int | None = None
+        self._index = 0
+        self._rounds = 0
+        self._strategy = Strategy.OFF
+        self._limits = HardwareLimits()
+        self._lifetime = 0.25
+        self._rate = recording.rate
+        self._gains: GainSet | None = None
+
+    @property
+    def strategy(self) -> Strategy:
+        """Strategy that was last asked for."""
+        return self._strategy
+
+    @property
+    def finished(self) -> bool:
+        """Whether all records were played."""
+        return self._index >= self.recording.size
+
+    def connect(self) -> ActuatorInfo:
+        """Start to play."""
+        if self._start_ns is None:
+            self._start_ns = self._clock.now_ns()
+        return ActuatorInfo(
+            backend=self.name,
+            family="recorded",
+            name="recording",
+            serial="",
+            firmware="",
+            strategy=self._strategy,
+            feedback_rate=self._rate,
+            command_lifetime=self._lifetime,
+            limits=self._limits,
+            gains=self._gains,
+        )
+
+    def now_ns(self) -> int:
+        """Return the host clock [ns]."""
+        return self._clock.now_ns()
+
+    def read(self, timeout: float) -> Feedback | None:
+        """Return the newest record that is due, waiting for one at most ``timeout`` [s]."""
+        start_ns = self._require_start()
+        deadline = self._clock.now_ns() + round(timeout * NANOSECONDS)
+        if self.finished and self._loop:
+            self._restart()
+            start_ns = self._require_start()
+        if self.finished:
+            self._clock.wait_until(deadline)
+            return None
+        due = start_ns + int(self.recording.time_ns[self._index])
+        if due > deadline:
+            self._clock.wait_until(deadline)
+            return None
+        self._clock.wait_until(due)
+        # A reader that came late gets the newest record that is due; those before it are lost, as on a network.
+        elapsed = self._clock.now_ns() - start_ns
+        newest = int(np.searchsorted(self.recording.time_ns, elapsed, side="right")) - 1
+        index = max(self._index, newest)
+        self._index = index + 1
+        stamp_ns = start_ns + int(self.recording.time_ns[index])
+        record = self.recording.record(index, stamp_ns)
+        return record._replace(sequence=record.sequence + self._rounds * self.recording.size)
+
+    def write(self, command: Command) -> Applied:
+        """Check and limit setpoints; the recording does not listen."""
+        self._require_start()
+        limited, changed = check_command(command, self._strategy, self._limits)
+        return Applied(limited, self._strategy, changed, self._clock.now_ns())
+
+    def set_strategy(self, strategy: Strategy, command: Command | None = None) -> Strategy:
+        """Take note of a strategy."""
+        self._require_start()
+        check_command(command or Command(), strategy, self._limits)
+        self._strategy = strategy
+        return strategy
+
+    def set_gains(self, gains: GainSet) -> GainSet:
+        """Take note of gains."""
+        self._require_start()
+        self._gains = gains
+        return gains
+
+    def set_limits(self, limits: HardwareLimits) -> HardwareLimits:
+        """Take note of limits; setpoints are limited by them."""
+        self._require_start()
+        self._limits = limits
+        return limits
+
+    def set_command_lifetime(self, lifetime: float) -> float:
+        """Take note of a lifetime."""
+        self._require_start()
+        self._lifetime = check_lifetime(lifetime)
+        return self._lifetime
+
+    def set_feedback_rate(self, rate: float) -> float:
+        """Take note of a rate; the recording keeps its own."""
+        self._require_start()
+        self._rate = rate
+        return rate
+
+    def stop(self) -> None:
+        """Take note that nothing drives."""
+        self._strategy = Strategy.OFF
+
+    def close(self) -> None:
+        """Stop to play."""
+        self.stop()
+        self._start_ns = None
+
+    def _restart(self) -> None:
+        assert self._start_ns is not None
+        period = round(NANOSECONDS / self.recording.rate)
+        self._start_ns += int(self.recording.time_ns[-1]) + period
+        self._index = 0
+        self._rounds += 1
+
+    def _require_start(self) -> int:
+        if self._start_ns is None:
+            raise ActuatorError("not_connected", "replay is not connected; call connect() first")
+        return self._start_ns

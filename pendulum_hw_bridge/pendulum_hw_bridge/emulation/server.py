@@ -1,0 +1,168 @@
+"""An emulated actuator that lives in a process of its own and answers on UDP, whoever uses it and however they end."""
+
+from __future__ import annotations
+
+import select
+import socket
+from collections.abc import Callable
+from dataclasses import asdict
+from typing import Any
+
+from pendulum_hw_bridge.actuator import Strategy
+from pendulum_hw_bridge.emulation import wire
+from pendulum_hw_bridge.emulation.faults import ActuatorFault
+from pendulum_hw_bridge.emulation.x5 import EmulatedX5
+from pendulum_msgs_py.errors import PendulumError
+from pendulum_msgs_py.timing import SteadyWallClock
+from pendulum_msgs_py.values import NANOSECONDS
+
+__all__ = ["EmulatorServer"]
+
+_LEASE = 2.0
+"""Time for which a listener gets feedback after its last packet [s]."""
+_BATCH = 64
+_UNREACHABLE = {ActuatorFault.COMMANDS_LOST, ActuatorFault.LOCKED_BY_OTHER}
+
+Address = tuple[str, int]
+
+
+class EmulatorServer:
+    """Serves one emulated actuator.
+
+    Args:
+        actuator: The actuator; its clock must start at the present of ``clock``.
+        address: Host and port to listen on; port 0 takes any.
+        clock: Wall time [ns].
+
+    Raises:
+        PendulumError: The address is in use or not ours.
+    """
+
+    def __init__(
+        self, actuator: EmulatedX5, address: Address, clock: Callable[[], int] | None = None
+    ) -> None:
+        self.actuator = actuator
+        self._clock = clock or SteadyWallClock()
+        self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        try:
+            self._socket.bind(address)
+        except OSError as error:
+            self._socket.close()
+            raise PendulumError(
+                f"emulator cannot listen on {address[0]}:{address[1]}: {error.strerror}"
+            ) from error
+        self._socket.setblocking(False)
+        self._listeners: dict[Address, int] = {}
+        self.refused_packets = 0
+
+    @property
+    def address(self) -> Address:
+        """Host and port that it listens on."""
+        host, port = self._socket.getsockname()
+        return str(host), int(port)
+
+    def serve(self, running: Callable[[], bool]) -> None:
+        """Serve until ``running`` says no; it is asked at least ten times a second."""
+        try:
+            while running():
+                self._turn(0.1)
+        finally:
+            self._socket.close()
+
+    def _turn(self, patience: float) -> None:
+        actuator = self.actuator
+        now = self._clock()
+        due = min(
+            actuator.next_sample_ns,
+            actuator.next_delivery_ns if actuator.next_delivery_ns is not None else actuator.next_sample_ns,
+        )
+        wait = min(patience, max(0.0, (due - now) / NANOSECONDS))
+        ready, _, _ = select.select([self._socket], [], [], wait)
+        now = self._clock()
+        if ready:
+            for _ in range(_BATCH):
+                try:
+                    packet, sender = self._socket.recvfrom(wire.MAX_PACKET)
+                except (BlockingIOError, ConnectionRefusedError):
+                    break
+                self._receive(packet, sender, now)
+        actuator.advance_to(now)
+        feedback = actuator.feedback(now)
+        if feedback is not None:
+            packet = wire.encode_feedback(feedback)
+            for listener, until in list(self._listeners.items()):
+                if until < now:
+                    del self._listeners[listener]
+                else:
+                    self._send(packet, listener)
+
+    def _receive(self, packet: bytes, sender: Address, now: int) -> None:
+        kind = wire.kind_of(packet)
+        if kind == wire.COMMAND:
+            command = wire.decode_command(packet)
+            if command is not None:
+                timing = self.actuator.parameters.timing
+                arrival = now + round(timing.command_delay * NANOSECONDS)
+                self.actuator.deliver(command, arrival, sender=hash(sender) & 0x7FFFFFFF)
+                self._listeners[sender] = now + round(_LEASE * NANOSECONDS)
+                return
+        elif kind == wire.REQUEST:
+            request = wire.decode_json(packet)
+            if request:
+                self._listeners[sender] = now + round(_LEASE * NANOSECONDS)
+                self.actuator.advance_to(now)
+                self._answer(request, sender)
+                return
+        self.refused_packets += 1
+
+    def _answer(self, request: dict[str, Any], sender: Address) -> None:
+        settings = request.get("settings")
+        if settings is not None and self.actuator.faults & _UNREACHABLE:
+            return  # the packet was lost, or the module listens to somebody else: no acknowledgement
+        reply: dict[str, Any] = {"id": request.get("id")}
+        try:
+            if settings is not None:
+                self._configure(settings)
+            if "push" in request:
+                self.actuator.push = float(request["push"])
+            for name in request.get("inject", []):
+                self.actuator.inject(ActuatorFault(name))
+            if request.get("clear_faults"):
+                self.actuator.clear_faults()
+        except (PendulumError, TypeError, ValueError, KeyError) as error:
+            reply["error"] = str(error)
+        reply.update(self._status())
+        self._send(wire.encode_json(wire.REPLY, reply), sender)
+
+    def _configure(self, settings: dict[str, Any]) -> None:
+        changes: dict[str, Any] = {}
+        if "strategy" in settings:
+            changes["strategy"] = Strategy(int(settings["strategy"]))
+        if "gains" in settings:
+            changes["gains"] = wire.gains_from_json(settings["gains"])
+        if "limits" in settings:
+            changes["limits"] = wire.limits_from_json(settings["limits"])
+        for name in ("command_lifetime", "feedback_rate"):
+            if name in settings:
+                changes[name] = float(settings[name])
+        self.actuator.configure(**changes)
+
+    def _status(self) -> dict[str, Any]:
+        actuator = self.actuator
+        return {
+            "name": actuator.parameters.plant.name,
+            "strategy": int(actuator.strategy),
+            "feedback_rate": actuator.feedback_rate,
+            "command_lifetime": actuator.command_lifetime,
+            "limits": wire.limits_to_json(actuator.limits),
+            "gains": wire.gains_to_json(actuator.gains),
+            "lifetime_expiries": actuator.lifetime_expiries,
+            "faults": sorted(fault.value for fault in actuator.faults),
+            "link": asdict(actuator.link),
+        }
+
+    def _send(self, packet: bytes, receiver: Address) -> None:
+        try:
+            self._socket.sendto(packet, receiver)
+        except OSError:
+            self._listeners.pop(receiver, None)

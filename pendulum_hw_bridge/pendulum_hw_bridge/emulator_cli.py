@@ -1,0 +1,100 @@
+"""``emulator``: an emulated X5-9 in a process of its own; ``emulator_fault``: lets faults begin and end in it."""
+
+from __future__ import annotations
+
+import signal
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Annotated
+
+import typer
+from rich.console import Console
+from rich.table import Table
+
+from pendulum_hw_bridge.emulation.faults import ActuatorFault
+from pendulum_msgs_py.errors import ParameterError
+from pendulum_msgs_py.executables import cli_main
+
+__all__ = ["fault_main", "main"]
+
+_ADDRESS = "127.0.0.1:17590"
+
+app = typer.Typer(add_completion=False, no_args_is_help=False)
+fault_app = typer.Typer(add_completion=False)
+
+
+@app.command()
+def emulator(
+    address: Annotated[str, typer.Option(help="HOST:PORT to listen on (UDP).")] = _ADDRESS,
+    plant: Annotated[str, typer.Option(help="thesis, x5_9, or a plant file with a drivetrain.")] = "thesis",
+    position: Annotated[float, typer.Option(help="Where the pendulum is at the start [rad].")] = 0.0,
+    seed: Annotated[int, typer.Option(min=0, help="Seed of sensor noise and timing jitter.")] = 0,
+    flat: Annotated[bool, typer.Option(help="The pendulum lies flat: no gravity.")] = False,
+    heating: Annotated[bool, typer.Option(help="Let the motor of the preset thesis warm up too.")] = False,
+) -> None:
+    """Serve an emulated X5-9 that goes on when the bridge ends, as a real one does.
+
+    Example: python -m pendulum_hw_bridge emulator --plant x5_9 --position 3.14
+    """
+    from pendulum_hw_bridge.emulation import wire
+    from pendulum_hw_bridge.emulation.parameters import load_emulator
+    from pendulum_hw_bridge.emulation.server import EmulatorServer
+    from pendulum_hw_bridge.emulation.x5 import EmulatedX5
+    from pendulum_msgs_py.timing import SteadyWallClock
+
+    stopped: list[int] = []
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, lambda received, frame: stopped.append(received))
+    clock = SteadyWallClock()
+    parameters = replace(load_emulator(plant, heating=heating), flat=flat)
+    actuator = EmulatedX5(parameters, seed=seed, position=position, start_ns=clock())
+    # Code is compiled before anybody listens: the first seconds are not real time otherwise.
+    actuator.advance_to(clock())
+    server = EmulatorServer(actuator, wire.parse_address(address), clock)
+    host, port = server.address
+    print(f"emulated X5-9 ({parameters.plant.name}) listens on {host}:{port}", flush=True)
+    server.serve(lambda: not stopped)
+    print("emulated X5-9 ends", flush=True)
+
+
+@fault_app.command()
+def emulator_fault(
+    faults: Annotated[
+        list[str] | None, typer.Argument(help="Names of faults to begin; none lists them.")
+    ] = None,
+    clear: Annotated[bool, typer.Option("--clear", help="End all faults first.")] = False,
+    address: Annotated[str, typer.Option(help="HOST:PORT of the emulator.")] = _ADDRESS,
+) -> None:
+    """Let faults begin or end in a running emulator.
+
+    Example: python -m pendulum_hw_bridge emulator_fault m_stop
+    """
+    from pendulum_hw_bridge.backends.emulator_process import EmulatorProcessBackend
+
+    known = [fault.value for fault in ActuatorFault]
+    for name in faults or []:
+        if name not in known:
+            raise ParameterError(f"unknown fault {name!r}; expected one of {', '.join(known)}")
+    if not faults and not clear:
+        table = Table("fault", title="Faults of the emulated actuator")
+        for name in known:
+            table.add_row(name)
+        Console().print(table)
+        return
+    backend = EmulatorProcessBackend(address)
+    backend.connect()
+    if clear:
+        backend.clear_faults()
+    if faults:
+        backend.inject(*faults)
+    print("faults in force: " + (", ".join(backend.status()["faults"]) or "none"))
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run the emulator."""
+    return cli_main(app, argv, name="python -m pendulum_hw_bridge emulator")
+
+
+def fault_main(argv: Sequence[str] | None = None) -> int:
+    """Run the fault switch."""
+    return cli_main(fault_app, argv, name="python -m pendulum_hw_bridge emulator_fault")
