@@ -1,0 +1,423 @@
+"""Gymnasium environment ``PendulumX59-v0``: the pendulum of the thesis for learning libraries.
+
+Observation: x = [wrap(theta - pi), theta_dot] [rad, rad/s], as controllers see it: 0 is upright.
+Action: torque u [N m], Box of shape (1,), clamped to the effort limit.
+Reward: -(q_1 x_1^2 + q_2 x_2^2 + r u^2) at the state in which the action was chosen.
+Episodes never terminate; they are truncated after 5 s by default.
+
+Importing ``pendulum_sim.environment`` registers it, and so does
+``gymnasium.make("pendulum_sim.environment:PendulumX59-v0")``.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any, ClassVar
+
+import gymnasium
+import numpy as np
+from gymnasium import spaces
+from gymnasium.vector import AutoresetMode, VectorEnv
+from numpy.typing import NDArray
+
+from pendulum_msgs_py import noise
+from pendulum_msgs_py.angles import UPRIGHT, from_upright
+from pendulum_msgs_py.errors import ParameterError
+from pendulum_msgs_py.plant_parameters import PlantParameters, load_plant
+from pendulum_sim.environment_kernel import is_smooth, lane_table, step_kernel
+from pendulum_sim.plant import check_start, check_step, make_plant
+
+__all__ = ["ENVIRONMENT_ID", "PendulumEnv", "PendulumVectorEnv", "register"]
+
+ENVIRONMENT_ID = "PendulumX59-v0"
+EPISODE_STEPS = 2500
+"""Steps after which an episode is truncated: 5 s at 2 ms, the length of the thesis's runs."""
+STARTS = ("bottom", "top", "random")
+_THESIS_Q = (100.0, 0.01)
+_THESIS_R = 0.1
+_LANES = 256
+Array = NDArray[np.float64]
+
+
+class PendulumEnv(gymnasium.Env[Array, Array]):
+    """One pendulum.
+
+    Args:
+        plant: Preset, path of a plant file, or parameters; any plant, series elastic too.
+        dt: Step over which an action is held [s].
+        method: Integrator; ``auto`` chooses by the plant.
+        substeps: Integration steps in a step.
+        start: ``bottom``, ``top`` or ``random``; ``reset(options={"state": [x_1, x_2]})`` overrides it.
+        disturbance: Half width of uniform noise on the torque [N m].
+        hold: Steps for which a noise sample is held.
+        q: Weights of angle and velocity in the reward.
+        r: Weight of the torque.
+        render_mode: None, ``human`` or ``rgb_array``.
+        screen_size: Width and height of the picture [px].
+
+    Raises:
+        ParameterError: An argument is outside its domain.
+    """
+
+    metadata: ClassVar[dict[str, Any]] = {"render_modes": ["human", "rgb_array"], "render_fps": 50}
+
+    def __init__(
+        self,
+        plant: str | PlantParameters = "thesis",
+        *,
+        dt: float = 2e-3,
+        method: str = "auto",
+        substeps: int = 1,
+        start: str = "top",
+        disturbance: float = 0.0,
+        hold: int = 1,
+        q: tuple[float, float] = _THESIS_Q,
+        r: float = _THESIS_R,
+        render_mode: str | None = None,
+        screen_size: tuple[int, int] = (600, 600),
+    ) -> None:
+        parameters = plant if isinstance(plant, PlantParameters) else load_plant(plant)
+        _check_arguments(dt, substeps, start, disturbance, hold, method)
+        if render_mode is not None and render_mode not in self.metadata["render_modes"]:
+            raise ParameterError(f"render_mode is {render_mode!r}; expected None, human or rgb_array")
+        self.parameters = parameters
+        self.dt = dt
+        self.render_mode = render_mode
+        self.observation_space = observation_space(parameters, disturbance)
+        self.action_space = action_space(parameters)
+        self._start = start
+        self._amplitude = float(disturbance)
+        self._hold = hold
+        self._q, self._r = q, r
+        self._keys = np.zeros(1, dtype=np.uint64)
+        self._counts = np.zeros(1, dtype=np.int64)
+        self._rewards = np.zeros(1)
+        self._kernel: Any = None
+        self._plant: Any = None
+        self._screen_size = screen_size
+        self._window: Any = None
+        self.effort = 0.0
+        if is_smooth(parameters) and method != "adaptive":
+            method = "etd4" if method == "auto" else method
+            self._h, self._substeps = dt / substeps, substeps
+            self._w = lane_table(parameters, method, self._h, 1, self._amplitude, q, r).reshape(-1)
+            self._kernel = step_kernel(method, 1)
+        else:
+            self._plant = make_plant(
+                parameters, dt, method=method, substeps=substeps if substeps > 1 else None
+            )
+
+    @property
+    def theta(self) -> float:
+        """Angle, 0 hanging, not wrapped [rad]."""
+        return float(self._w[0] if self._plant is None else self._plant.state.theta)
+
+    @property
+    def theta_dot(self) -> float:
+        """Velocity [rad/s]."""
+        return float(self._w[1] if self._plant is None else self._plant.state.theta_dot)
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Array, dict[str, Any]]:
+        """Start an episode.
+
+        Args:
+            seed: Seed of starts and noise.
+            options: ``state``: the start [x_1, x_2] in the observation's convention; ``start``: one of ``STARTS``.
+
+        Returns:
+            Observation, shape (2,), and an empty dict.
+        """
+        super().reset(seed=seed)
+        options = options or {}
+        unknown = set(options) - {"state", "start"}
+        if unknown:
+            raise ParameterError(f"reset option {min(unknown)!r} is unknown; expected state or start")
+        state = options.get("state")
+        if state is None:
+            x = draw_start(options.get("start", self._start), self.np_random, 1)[0]
+        else:
+            x = np.asarray(state, dtype=np.float64)
+            if x.shape != (2,):
+                raise ParameterError(f"start state has shape {x.shape}; expected (2,)")
+        theta, theta_dot = float(x[0]) + UPRIGHT, float(x[1])
+        check_start(theta, theta_dot)
+        self._keys[0] = noise.stream_key(int(self.np_random.integers(2**63)))
+        self._counts[0] = 0
+        self.effort = 0.0
+        if self._plant is None:
+            self._w[0], self._w[1] = theta, theta_dot
+        else:
+            self._plant.reset(theta, theta_dot)
+        if self.render_mode == "human":
+            self.render()
+        return np.array([from_upright(theta), theta_dot]), {}
+
+    def step(self, action: Array) -> tuple[Array, float, bool, bool, dict[str, Any]]:
+        """Hold a torque for one step.
+
+        Args:
+            action: u, shape (1,) [N m].
+
+        Returns:
+            Observation (2,), reward, terminated (never), truncated (never: a wrapper does), and an empty dict.
+        """
+        if type(action) is not np.ndarray:
+            action = np.asarray(action, dtype=np.float32)
+        if self._plant is None:
+            observation = np.empty(2)
+            self._kernel(
+                self._w,
+                self._keys,
+                self._counts,
+                self._hold,
+                self._h,
+                self._substeps,
+                action,
+                observation,
+                self._rewards,
+            )
+            reward = float(self._rewards[0])
+            if math.isnan(reward):
+                raise ParameterError(f"action is {action} N m; expected a finite number")
+            if self.render_mode == "human":
+                self.render()
+            return observation, reward, False, False, {}
+        return self._step_any(float(action[0]))
+
+    def _step_any(self, action: float) -> tuple[Array, float, bool, bool, dict[str, Any]]:
+        if not math.isfinite(action):
+            raise ParameterError(f"action is {action} N m; expected a finite number")
+        limit = self.parameters.effort_limit
+        self.effort = min(limit, max(-limit, action))
+        disturbance = self._amplitude * noise.unit_interval(
+            noise.scramble(int(self._keys[0]), int(self._counts[0]) // self._hold)
+        )
+        self._counts[0] += 1
+        before = self._plant.state
+        deviation = from_upright(before.theta)
+        reward = -(self._q[0] * deviation**2 + self._q[1] * before.theta_dot**2 + self._r * self.effort**2)
+        state = self._plant.step(self.effort + disturbance)
+        if self.render_mode == "human":
+            self.render()
+        return np.array([from_upright(state.theta), state.theta_dot]), reward, False, False, {}
+
+    def render(self) -> NDArray[np.uint8] | None:
+        """Draw the present state: into a window, or as an array of shape (height, width, 3)."""
+        if self.render_mode is None:
+            gymnasium.logger.warn("render() was called, but render_mode is None; expected human or rgb_array")
+            return None
+        # Imported late: training runs without pictures.
+        from pendulum_sim.drawing import PendulumPicture, Window
+
+        if self._window is None:
+            picture = PendulumPicture(self._screen_size, self.parameters.effort_limit)
+            self._window = Window(picture) if self.render_mode == "human" else picture
+        torque = self.effort if self._plant is not None else float(self._w[2])
+        time = int(self._counts[0]) * self.dt
+        if self.render_mode == "human":
+            self._window.show(self.theta, self.theta_dot, torque, time=time, fps=self.metadata["render_fps"])
+            return None
+        self._window.draw(self.theta, self.theta_dot, torque, time=time)
+        return self._window.array()
+
+    def close(self) -> None:
+        """Close the window, if there is one."""
+        if self._window is not None and self.render_mode == "human":
+            self._window.close()
+        self._window = None
+
+
+class PendulumVectorEnv(VectorEnv[Array, Array, NDArray[Any]]):
+    """Many equal pendulums in one compiled step, for learning libraries; rigid plants without dry friction or lag.
+
+    Args:
+        num_envs: Pendulums, >= 1.
+        max_episode_steps: Steps after which an episode is truncated; it restarts with the step after that.
+        plant: As for :class:`PendulumEnv`.
+        dt: As for :class:`PendulumEnv`.
+        method: As for :class:`PendulumEnv`.
+        substeps: As for :class:`PendulumEnv`.
+        start: As for :class:`PendulumEnv`.
+        disturbance: As for :class:`PendulumEnv`.
+        hold: As for :class:`PendulumEnv`.
+        q: As for :class:`PendulumEnv`.
+        r: As for :class:`PendulumEnv`.
+
+    Raises:
+        ParameterError: An argument is outside its domain.
+    """
+
+    metadata: ClassVar[dict[str, Any]] = {"autoreset_mode": AutoresetMode.NEXT_STEP, "render_modes": []}
+
+    def __init__(
+        self,
+        num_envs: int = 1,
+        *,
+        max_episode_steps: int = EPISODE_STEPS,
+        plant: str | PlantParameters = "thesis",
+        dt: float = 2e-3,
+        method: str = "auto",
+        substeps: int = 1,
+        start: str = "top",
+        disturbance: float = 0.0,
+        hold: int = 1,
+        q: tuple[float, float] = _THESIS_Q,
+        r: float = _THESIS_R,
+        render_mode: str | None = None,
+    ) -> None:
+        parameters = plant if isinstance(plant, PlantParameters) else load_plant(plant)
+        _check_arguments(dt, substeps, start, disturbance, hold, method)
+        if num_envs < 1 or max_episode_steps < 1:
+            raise ParameterError(
+                f"num_envs is {num_envs} and max_episode_steps {max_episode_steps}; expected both >= 1"
+            )
+        if render_mode is not None:
+            raise ParameterError(
+                f"render_mode is {render_mode!r}; expected None: draw one PendulumEnv instead"
+            )
+        if not is_smooth(parameters):
+            raise ParameterError(
+                f"plant {parameters.name!r} has dry friction, lag, delay or a drivetrain; expected none of them here: "
+                "use gymnasium's SyncVectorEnv with it"
+            )
+        method = "etd4" if method == "auto" else method
+        if method == "adaptive":
+            raise ParameterError("method is 'adaptive'; expected a compiled one, such as etd4")
+        self.num_envs = num_envs
+        self.parameters = parameters
+        self.single_observation_space = observation_space(parameters, disturbance)
+        self.single_action_space = action_space(parameters)
+        self.observation_space = gymnasium.vector.utils.batch_space(self.single_observation_space, num_envs)
+        self.action_space = gymnasium.vector.utils.batch_space(self.single_action_space, num_envs)
+        self._start = start
+        self._hold = hold
+        self._h, self._substeps = dt / substeps, substeps
+        self._max_steps = max_episode_steps
+        blocks = -(-num_envs // _LANES)
+        table = lane_table(parameters, method, self._h, _LANES, disturbance, q, r)
+        self._w = np.repeat(table.reshape(1, -1), blocks, axis=0)
+        self._keys = np.zeros((blocks, _LANES), dtype=np.uint64)
+        self._counts = np.zeros((blocks, _LANES), dtype=np.int64)
+        self._actions = np.zeros((blocks, _LANES))
+        self._kernel = step_kernel(method, _LANES)
+        self._done = np.zeros(num_envs, dtype=np.bool_)
+
+    def reset(
+        self, *, seed: int | list[int | None] | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Array, dict[str, Any]]:
+        """Start all episodes, or those of ``options["reset_mask"]``; returns observations of shape (N, 2)."""
+        super().reset(seed=seed[0] if isinstance(seed, list) else seed, options=options)
+        mask = (options or {}).get("reset_mask")
+        which = np.arange(self.num_envs) if mask is None else np.flatnonzero(mask)
+        self._restart(which)
+        self._done[which] = False
+        return self._observe(), {}
+
+    def step(self, actions: Array) -> tuple[Array, NDArray[Any], NDArray[Any], NDArray[Any], dict[str, Any]]:
+        """Hold a torque each for one step.
+
+        Args:
+            actions: Shape (N, 1) [N m].
+
+        Returns:
+            Observations (N, 2), rewards (N,), terminated (N,), truncated (N,), and an empty dict.
+        """
+        n = self.num_envs
+        self._actions.reshape(-1)[:n] = np.reshape(actions, n)
+        observations = np.empty((self._w.shape[0], 2 * _LANES))
+        rewards = np.empty((self._w.shape[0], _LANES))
+        restart = np.flatnonzero(self._done)
+        for block in range(self._w.shape[0]):
+            self._kernel(
+                self._w[block], self._keys[block], self._counts[block], self._hold, self._h, self._substeps,
+                self._actions[block], observations[block], rewards[block],
+            )  # fmt: skip
+        result = observations.reshape(-1, 2)[:n]
+        reward = rewards.reshape(-1)[:n]
+        if not np.isfinite(reward).all():
+            raise ParameterError(
+                f"action {int(np.argmin(np.isfinite(reward)))} is not a finite number of N m"
+            )
+        if restart.size:
+            # By gymnasium's rule for NEXT_STEP this step starts their next episodes; its action counts for nothing.
+            self._restart(restart)
+            result[restart] = self._observe()[restart]
+            reward[restart] = 0.0
+        truncated = self._counts.reshape(-1)[:n] >= self._max_steps
+        self._done = truncated
+        return result, reward, np.zeros(n, dtype=np.bool_), truncated, {}
+
+    def _restart(self, which: NDArray[np.intp]) -> None:
+        starts = draw_start(self._start, self.np_random, which.size)
+        seeds = self.np_random.integers(2**63, size=which.size)
+        block, lane = which // _LANES, which % _LANES
+        self._w[block, lane] = starts[:, 0] + UPRIGHT
+        self._w[block, _LANES + lane] = starts[:, 1]
+        self._keys[block, lane] = [noise.stream_key(int(seed)) for seed in seeds]
+        self._counts[block, lane] = 0
+
+    def _observe(self) -> Array:
+        theta = self._w[:, :_LANES].reshape(-1)[: self.num_envs]
+        theta_dot = self._w[:, _LANES : 2 * _LANES].reshape(-1)[: self.num_envs]
+        return np.stack([from_upright(theta), theta_dot], axis=1)
+
+
+def observation_space(parameters: PlantParameters, disturbance: float) -> spaces.Box:
+    """Return the space of x; the speed is bounded where friction bounds it."""
+    speed = math.inf
+    if parameters.drivetrain is None and parameters.damping > 0.0:
+        # b |theta'| cannot exceed the sum of all other torques for long: beyond that speed it only slows down.
+        torques = parameters.effort_limit + parameters.gravity + abs(parameters.torque_offset) + disturbance
+        speed = max(20.0, 1.1 * torques / parameters.damping)
+    high = np.array([math.pi, speed])
+    return spaces.Box(-high, high, dtype=np.float64)
+
+
+def action_space(parameters: PlantParameters) -> spaces.Box:
+    """Return the space of u."""
+    limit = parameters.effort_limit
+    return spaces.Box(-limit, limit, shape=(1,), dtype=np.float32)
+
+
+def draw_start(start: str, generator: np.random.Generator, count: int) -> Array:
+    """Return starts x of shape (count, 2): at the bottom or top, or at a random angle and up to 1 rad/s."""
+    if start not in STARTS:
+        raise ParameterError(f"start is {start!r}; expected one of {', '.join(STARTS)}")
+    x = np.zeros((count, 2))
+    if start == "bottom":
+        x[:, 0] = -math.pi
+    elif start == "random":
+        x[:] = generator.uniform([-math.pi, -1.0], [math.pi, 1.0], (count, 2))
+    return x
+
+
+def register() -> None:
+    """Register ``PendulumX59-v0`` with gymnasium; done on import, and harmless twice."""
+    if ENVIRONMENT_ID not in gymnasium.registry:
+        gymnasium.register(
+            ENVIRONMENT_ID,
+            entry_point="pendulum_sim.environment:PendulumEnv",
+            vector_entry_point="pendulum_sim.environment:PendulumVectorEnv",
+            max_episode_steps=EPISODE_STEPS,
+        )
+
+
+def _check_arguments(
+    dt: float, substeps: int, start: str, disturbance: float, hold: int, method: str
+) -> None:
+    from pendulum_sim.integrators import get_integrator
+
+    check_step(dt, substeps)
+    if method != "auto":
+        get_integrator(method)
+    if start not in STARTS:
+        raise ParameterError(f"start is {start!r}; expected one of {', '.join(STARTS)}")
+    if not (math.isfinite(disturbance) and disturbance >= 0.0):
+        raise ParameterError(f"disturbance is {disturbance} N m; expected a finite number >= 0")
+    if hold < 1:
+        raise ParameterError(f"hold is {hold} steps; expected >= 1")
+
+
+register()

@@ -1,0 +1,175 @@
+"""Figures: the evolution of a run, and the overdamped phase plot with its fixed points."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from matplotlib.figure import Figure
+from numpy.typing import ArrayLike
+
+from pendulum_msgs_py.errors import DataError, ParameterError
+from pendulum_msgs_py.plant_parameters import PlantParameters
+
+__all__ = ["FixedPoint", "fixed_points", "plot_evolution", "plot_overdamped_phase", "save_figure"]
+
+_STABLE, _UNSTABLE, _LINE = "#1b7f5c", "#c4472f", "#2b6cb0"
+
+
+@dataclass(frozen=True)
+class FixedPoint:
+    """Where an overdamped pendulum can stay.
+
+    Attributes:
+        theta: Angle [rad].
+        stable: Whether it returns there after a small push.
+        rate: Slope of x' over x, -G cos(theta) / b: negative for stable [1/s].
+    """
+
+    theta: float
+    stable: bool
+    rate: float
+
+
+def fixed_points(parameters: PlantParameters, torque: float = 0.0) -> list[FixedPoint]:
+    """Return the fixed points of b x' + G sin(x) = u_0 in [-pi, pi), by angle; none where |u_0| > G.
+
+    Args:
+        parameters: The plant.
+        torque: Constant torque u_0 [N m].
+
+    Raises:
+        ParameterError: Without damping or gravity there is no such flow.
+    """
+    damping, gravity = parameters.damping, parameters.gravity
+    if damping <= 0.0 or gravity <= 0.0:
+        raise ParameterError(f"damping is {damping} N m s/rad and gravity {gravity} N m; expected both > 0")
+    ratio = torque / gravity
+    if abs(ratio) > 1.0:
+        return []
+    low = math.asin(ratio)
+    high = math.pi - low
+    angles = {low, high - 2.0 * math.pi if high >= math.pi else high}
+    points = []
+    for theta in sorted(angles):
+        rate = -gravity * math.cos(theta) / damping
+        # At |u_0| = G both points meet: what comes from one side is held, from the other it passes.
+        points.append(FixedPoint(theta + parameters.angle_offset, rate < -1e-12, rate))
+    return points
+
+
+def plot_overdamped_phase(parameters: PlantParameters, torque: float = 0.0) -> Figure:
+    """Draw x' = (u_0 - G sin x) / b over x from -2 pi to 2 pi, with its fixed points and the direction of flow.
+
+    Args:
+        parameters: The plant.
+        torque: Constant torque u_0 [N m].
+
+    Source:
+        Thesis, phase plot of the overdamped pendulum.
+    """
+    points = fixed_points(parameters, torque)
+    figure = Figure(figsize=(8.0, 4.5), layout="constrained")
+    axes = figure.add_subplot()
+    x = np.linspace(-2.0 * math.pi, 2.0 * math.pi, 801)
+    speed = (torque - parameters.gravity * np.sin(x - parameters.angle_offset)) / parameters.damping
+    axes.axhline(0.0, color="0.6", linewidth=0.8)
+    axes.plot(x, speed, color=_LINE, linewidth=1.8)
+    arrows = np.arange(-1.875 * math.pi, 2.0 * math.pi, 0.25 * math.pi)
+    flow = torque - parameters.gravity * np.sin(arrows - parameters.angle_offset)
+    moving = np.abs(flow) > 0.25 * parameters.gravity
+    for marker, chosen in ((">", moving & (flow > 0.0)), ("<", moving & (flow < 0.0))):
+        axes.plot(arrows[chosen], np.zeros(chosen.sum()), marker, color="0.35", markersize=6)
+    for kind, colour, fill in ((True, _STABLE, _STABLE), (False, _UNSTABLE, "white")):
+        angles = [
+            point.theta + turn
+            for point in points
+            if point.stable is kind
+            for turn in (-math.tau, 0.0, math.tau)
+        ]
+        inside = [angle for angle in angles if abs(angle) <= 2.0 * math.pi + 1e-9]
+        label = "stable fixed point" if kind else "unstable fixed point"
+        axes.plot(
+            inside, np.zeros(len(inside)), "o", markersize=10, color=colour, markerfacecolor=fill, label=label
+        )
+    axes.set_xticks([k * math.pi for k in range(-2, 3)], [r"$-2\pi$", r"$-\pi$", "0", r"$\pi$", r"$2\pi$"])
+    axes.set_xlim(-2.05 * math.pi, 2.05 * math.pi)
+    axes.set_xlabel(r"$\theta$ [rad]")
+    axes.set_ylabel(r"$\dot\theta$ [rad/s]")
+    axes.set_title(rf"Overdamped pendulum, $b\,\dot\theta + G\,\sin\theta = u_0$, $u_0$ = {torque:g} N m")
+    if points:
+        figure.legend(loc="outside lower center", ncols=2, frameon=False)
+    return figure
+
+
+def plot_evolution(
+    times: ArrayLike,
+    states: ArrayLike,
+    efforts: ArrayLike | None = None,
+    disturbances: ArrayLike | None = None,
+    *,
+    title: str = "",
+) -> Figure:
+    """Draw how the state of a run evolves: angle, velocity and, if given, torques.
+
+    Args:
+        times: Shape (N,) [s].
+        states: x = [theta, theta_dot] in whatever convention, shape (N, 2) [rad, rad/s].
+        efforts: Torque of the controller, shape (N,) [N m].
+        disturbances: Torque of the disturbance, shape (N,) [N m].
+        title: Title of the figure.
+
+    Raises:
+        DataError: The shapes do not go together.
+    """
+    t, x = np.asarray(times, dtype=float), np.asarray(states, dtype=float)
+    if t.ndim != 1 or x.shape != (t.size, 2):
+        raise DataError(f"times have shape {t.shape} and states {x.shape}; expected (N,) and (N, 2)")
+    torques = [
+        (np.asarray(values, dtype=float), label, colour)
+        for values, label, colour in (
+            (disturbances, "disturbance", "#dc8c14"),
+            (efforts, "controller", _LINE),
+        )
+        if values is not None
+    ]
+    for values, label, _ in torques:
+        if values.shape != t.shape:
+            raise DataError(f"torques of the {label} have shape {values.shape}; expected {t.shape}")
+    rows = 3 if torques else 2
+    figure = Figure(figsize=(8.0, 2.2 * rows), layout="constrained")
+    axes = figure.subplots(rows, 1, sharex=True)
+    axes[0].plot(t, x[:, 0], color=_LINE, linewidth=1.2)
+    axes[0].set_ylabel(r"$\theta$ [rad]")
+    axes[1].plot(t, x[:, 1], color=_STABLE, linewidth=1.2)
+    axes[1].set_ylabel(r"$\dot\theta$ [rad/s]")
+    if torques:
+        for values, label, colour in torques:
+            axes[2].plot(t, values, color=colour, linewidth=1.0, label=label)
+        axes[2].set_ylabel("torque [N m]")
+        axes[2].legend(loc="upper right")
+    axes[-1].set_xlabel("time [s]")
+    for axis in axes:
+        axis.grid(alpha=0.3)
+    if title:
+        figure.suptitle(title)
+    return figure
+
+
+def save_figure(figure: Figure, path: str | Path) -> Path:
+    """Write a figure; the ending of the path chooses PNG, SVG or PDF.
+
+    Raises:
+        ParameterError: The file cannot be written, or the ending is unknown.
+    """
+    path = Path(path)
+    if path.suffix.lower() not in {".png", ".svg", ".pdf"}:
+        raise ParameterError(f"figure {path} ends in {path.suffix!r}; expected .png, .svg or .pdf")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        figure.savefig(path, dpi=150)
+    except OSError as error:
+        raise ParameterError(f"figure {path} cannot be written: {error.strerror}") from error
+    return path

@@ -1,0 +1,57 @@
+"""``phase_plot``: the overdamped phase plot of the thesis, with its fixed points and their stability."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import asdict
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from pendulum_msgs_py.executables import cli_main
+from pendulum_msgs_py.plant_parameters import load_plant
+
+__all__ = ["main"]
+
+app = typer.Typer(add_completion=False)
+
+
+@app.command()
+def phase_plot(
+    plant: Annotated[str, typer.Option(help="Preset or path of a plant file.")] = "thesis",
+    torque: Annotated[float, typer.Option(help="Constant torque u_0 [N m].")] = 0.0,
+    output: Annotated[Path, typer.Option(help="Figure to write (.png, .svg, .pdf).")] = Path(
+        "phase_plot.png"
+    ),
+    as_json: Annotated[bool, typer.Option("--json", help="Print the fixed points as JSON.")] = False,
+) -> None:
+    """Draw x' over x of b x' + G sin(x) = u_0 and list its fixed points.
+
+    Example: python -m pendulum_sim phase_plot --plant thesis --torque 0.5 --output phase.png
+    """
+    # Imported late: --help should not wait for matplotlib.
+    from rich.console import Console
+    from rich.table import Table
+
+    from pendulum_sim.figures import fixed_points, plot_overdamped_phase, save_figure
+
+    parameters = load_plant(plant)
+    points = fixed_points(parameters, torque)
+    path = save_figure(plot_overdamped_phase(parameters, torque), output)
+    if as_json:
+        typer.echo(json.dumps({"figure": str(path), "fixed_points": [asdict(point) for point in points]}))
+        return
+    table = Table(title=f"fixed points of {parameters.name}, u_0 = {torque:g} N m")
+    for column in ("theta [rad]", "stability", "rate [1/s]"):
+        table.add_column(column, justify="left" if column == "stability" else "right")
+    for point in points:
+        table.add_row(f"{point.theta:.6f}", "stable" if point.stable else "unstable", f"{point.rate:+.6f}")
+    console = Console()
+    console.print(table if points else "no fixed point: the torque exceeds gravity, the pendulum turns over")
+    console.print(f"figure: {path}", soft_wrap=True)
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Run the command line."""
+    return cli_main(app, argv, name="python -m pendulum_sim phase_plot")
