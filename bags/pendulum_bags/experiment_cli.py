@@ -114,7 +114,9 @@ def lockstep(
     strategy: Strategy = "direct_pwm",
     seed: Seed = 1,
     amplitude: Amplitude = 2.5,
-    hold_time: HoldTime = 0.002,
+    hold_time: Annotated[
+        float | None, typer.Option(help="Time for which a noise sample is held [s]; by default the plant's period.")
+    ] = None,
     duration: Duration = 5.0,
     controller: Controller = "lqr",
     q: Q = (100.0, 0.01),
@@ -137,7 +139,7 @@ def lockstep(
         controller=controller,
         q=q,
         r=r,
-        noise=NoiseSettings(seed, amplitude, hold_time, duration),
+        noise=NoiseSettings(seed, amplitude, hold_time or (0.002 if side == "sim" else 0.01), duration),
         storage=storage,
     )
     started = time.monotonic()

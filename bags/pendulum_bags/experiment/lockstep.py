@@ -83,7 +83,7 @@ def run_lockstep(
         metadata = logs / "metadata.json"
         plant = settings.plant if side == "sim" else "emulator"
         write_json(metadata, settings.metadata("lockstep", plant=plant, namespace=namespace, clock="lockstep"))
-        start_recorder(processes, bag, namespace, metadata, settings.storage, log_time="header")
+        recorder = start_recorder(processes, bag, namespace, metadata, settings.storage, log_time="header")
         program = plant_program(side, settings, theta, duration)
         processes.start_node(settings.controller_program(namespace, use_sim_time=True))
         processes.start_node(settings.disturbance_program(namespace, autostart=True, use_sim_time=True))
@@ -100,7 +100,9 @@ def run_lockstep(
             lambda: client.has_event("lockstep_finished"),
             _START_TIMEOUT + _SLOWEST * duration,
         )
-        conductor.spin(0.1)
+        conductor.spin(0.2)
+        # Simulated time stands still from here on: what nodes say on their way out is no part of the run.
+        processes.finish(recorder)
     return bag
 
 

@@ -1,0 +1,34 @@
+"""Experiments over the real middleware: determinism in lockstep, the thesis's two identifications, studies."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from pendulum_bags.reader import read_bag, same_messages
+
+
+def run_experiment(*arguments: str | Path, timeout: float = 150.0) -> subprocess.CompletedProcess[str]:
+    """Run ``python -m pendulum_bags experiment``; its output is in the message of a failure."""
+    command = [sys.executable, "-m", "pendulum_bags", "experiment", *map(str, arguments)]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=timeout, check=False)
+    assert done.returncode == 0, done.stdout + done.stderr
+    return done
+
+
+@pytest.mark.timeout(180)
+def test_lockstep_runs_of_the_emulated_hardware_with_one_seed_are_identical(domain_id: int, tmp_path: Path) -> None:
+    for name, seed in (("first", 5), ("second", 5), ("other", 6)):
+        run_experiment("lockstep", "--side", "hw", "--bag", tmp_path / name, "--seed", seed, "--duration", "1")
+    first, second, other = (read_bag(tmp_path / name) for name in ("first", "second", "other"))
+    topics = ["joint_states", "effort_command", "disturbance", "applied_effort", "actuator/feedback"]
+    topics = [f"/hw/{topic}" for topic in topics] + ["/clock"]
+
+    assert same_messages(first, second, topics=topics)
+    assert not same_messages(first, other, topics=topics)
+    states = first["/hw/joint_states"]
+    assert len(states) == 101
+    assert abs(states["position"] - 3.14159).max() < 0.05
