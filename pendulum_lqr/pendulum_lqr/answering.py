@@ -87,7 +87,9 @@ class AnswerLoop:
         refusal = self._judge(sample, now_ns)
         if refusal is not None:
             self.refused[refusal] += 1
-            return None
+            # A plant in lockstep repeats a state when the answer did not reach it: the same answer again.
+            repeated = refusal is StateRefusal.DUPLICATE and self.simulated_time
+            return self.last_effort if repeated else None
         assert sample is not None
         if self._start_ns is None:
             self._start_ns = sample.stamp_ns

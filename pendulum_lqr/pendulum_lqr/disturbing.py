@@ -86,7 +86,9 @@ class DisturbanceLoop:
             and not (self._simulated_time and newest - stamp_ns >= _RESTART_NS)
         ):
             self.refused += 1
-            return None
+            # A plant in lockstep repeats a state when the answer did not reach it: the same answer again.
+            repeated = self._simulated_time and stamp_ns == newest
+            return DisturbanceAnswer(self.last_torque, "") if repeated else None
         if newest is not None and stamp_ns > newest:
             interval = stamp_ns - newest
             # The shortest: a state that was lost on the way must not look like a longer period.

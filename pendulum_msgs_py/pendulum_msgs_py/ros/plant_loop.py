@@ -246,16 +246,24 @@ class LockstepLoop:
             self._try_start()
         elif not self._must_wait():
             self.advance()
-        elif self.steps == 0 and not self._answered and time.monotonic() - self._waiting_since > _REPEAT:
-            # A match is known to one side before the other: a first state that nobody answers was heard by nobody.
-            assert self._interface.sample is not None
-            self._publish(self._interface.sample)
-        elif time.monotonic() - self._waiting_since > _PATIENCE and not self._told_waiting:
+        elif time.monotonic() - self._waiting_since > _PATIENCE:
+            self._repeat()
+
+    def _repeat(self) -> None:
+        """Publish the state again: a match is known to one side before the other, so it may have been heard by nobody.
+
+        Who has answered already answers the same, and the plant refuses the second copy.
+        """
+        sample = self._interface.sample
+        assert sample is not None
+        self._waiting_since = time.monotonic()
+        if not self._told_waiting:
             self._told_waiting = True
             self._interface.node.get_logger().warning(
                 f"waiting for {self.diagnostics()['lockstep_waits_for']} in answer to the state at "
-                f"{self.now_ns / NANOSECONDS:.3f} s"
+                f"{self.now_ns / NANOSECONDS:.3f} s; publishing it again"
             )
+        self._interface.publish_state(sample)
 
     def _try_start(self) -> None:
         interface = self._interface
@@ -267,7 +275,5 @@ class LockstepLoop:
             self._publish(interface.sample)
 
 
-_REPEAT = 1.0
-"""Wall time after which a first state that nobody answered is published again [s]."""
-_PATIENCE = 2.0
-"""Wall time without an answer after which the log says what is missing [s]."""
+_PATIENCE = 1.0
+"""Wall time without an answer after which a state is published again [s]."""
