@@ -144,7 +144,7 @@ def test_a_file_is_refused_with_file_entry_value_and_unit(
 
 
 def test_friction_that_feeds_energy_in_is_refused() -> None:
-    with pytest.raises(ParameterError, match=r"static_friction is 0.1 N m; expected >= coulomb_friction = 0.2 N m"):
+    with pytest.raises(ParameterError, match=r"static_friction is 0\.1 N m; expected >= coulomb_friction = 0\.2 N m"):
         PlantParameters(1.0, 1.0, 1.0, coulomb_friction=0.2, static_friction=0.1)
     with pytest.raises(ParameterError, match="motor_static_friction"):
         SeriesElasticParameters(motor_static_friction=0.1)
