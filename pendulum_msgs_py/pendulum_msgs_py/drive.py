@@ -84,6 +84,7 @@ class PlantLimits:
         handover_time: Time over which torque passes from position to effort control and back [s].
         tracking_error: Distance from the trajectory at which the plant faults [rad].
         arm_effort: Largest command that may be waiting when the plant is armed [N m].
+        handover_effort: Largest distance of a command from the torque that holds, for it to take over [N m].
     """
 
     effort: float
@@ -96,6 +97,7 @@ class PlantLimits:
     handover_time: float = 0.1
     tracking_error: float = 0.3
     arm_effort: float = 0.5
+    handover_effort: float = 2.0
 
     def __post_init__(self) -> None:
         """Refuse limits that limit nothing or everything; NaN, which compares false, would do the first."""

@@ -248,12 +248,25 @@ class PlantSupervisor:
             command = self.gates[Input.EFFORT_COMMAND].fresh(now_ns)
             end_ns = self._trajectory_start_ns + round(trajectory.duration * NANOSECONDS)
             if command is not None and command.stamp_ns >= end_ns and not self.commander_conflict:
+                jump = abs(self._clamp(command.effort) - self._applied)
+                if not jump <= self.limits.handover_effort:
+                    # A controller for another place: awake at the bottom, one for upright asks for all it has.
+                    self.reason = (
+                        f"holding: {command.source or 'a controller'} asks for {command.effort:.2f} N m, "
+                        f"{jump:.2f} N m from what holds; expected at most {self.limits.handover_effort} N m"
+                    )
+                    return self._hold(handover, remaining, position, velocity, push)
                 self._trajectory = None
                 self._handover = _Handover(now_ns, self._applied)
                 self._last_effort = self._applied
                 self._last_decision_ns = now_ns
                 self._enter(Mode.EFFORT, f"commanded by {command.source or 'an unnamed node'}", now_ns)
                 return None
+        return self._hold(handover, remaining, position, velocity, push)
+
+    def _hold(
+        self, handover: _Handover | None, remaining: float, position: float, velocity: float, push: float
+    ) -> Drive:
         effort = handover.effort * remaining if handover else 0.0
         return Drive(
             DriveKind.POSITION, effort=self._clamp(effort), position=position, velocity=velocity, push=push

@@ -96,6 +96,15 @@ LIMIT_SPECS: tuple[ParameterSpec, ...] = (
         read_only=True,
     ),
     ParameterSpec(
+        "handover_effort_limit",
+        2.0,
+        "N m",
+        "A command takes over from position control only if it is this close to the torque that holds.",
+        minimum=0.0,
+        exclusive_minimum=True,
+        read_only=True,
+    ),
+    ParameterSpec(
         "tracking_error_limit",
         0.3,
         "rad",
@@ -147,6 +156,7 @@ def limits_from_parameters(
         slew=number("effort_slew_limit") or unlimited,
         handover_time=number("handover_time"),
         tracking_error=number("tracking_error_limit"),
+        handover_effort=number("handover_effort_limit"),
     )
 
 
