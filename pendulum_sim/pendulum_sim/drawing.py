@@ -237,17 +237,29 @@ class Window:
         pygame.display.set_caption(title)
         self._clock = pygame.time.Clock()
 
-    def show(self, theta: float, theta_dot: float, effort: float, *, fps: int = 0, **more: Any) -> None:
-        """Draw a state and put it on the screen; ``more`` as for :meth:`PendulumPicture.draw`.
+    def show(
+        self,
+        theta: float,
+        theta_dot: float,
+        effort: float,
+        *,
+        disturbance: float = 0.0,
+        time: float | None = None,
+        note: str = "",
+        fps: int = 0,
+    ) -> None:
+        """Draw a state and put it on the screen.
 
         Args:
             theta: Angle [rad].
             theta_dot: Velocity [rad/s].
             effort: Torque [N m].
+            disturbance: Disturbance torque [N m].
+            time: Time to write [s].
+            note: A line of text.
             fps: Wait so that there are at most this many pictures per second; 0 for no wait.
-            **more: Passed on.
         """
-        self.picture.draw(theta, theta_dot, effort, **more)
+        self.picture.draw(theta, theta_dot, effort, disturbance=disturbance, time=time, note=note)
         self._screen.blit(self.picture.surface, (0, 0))
         self._pygame.display.flip()
         if fps:

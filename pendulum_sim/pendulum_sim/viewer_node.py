@@ -1,0 +1,195 @@
+"""``viewer``: a window, PNG and GIF of any plant's ``joint_states``, simulated or real."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from rclpy.node import Node
+from sensor_msgs.msg import JointState
+from std_srvs.srv import Trigger
+
+from pendulum_msgs_py import names
+from pendulum_msgs_py.errors import ParameterError, PendulumError
+from pendulum_msgs_py.parameters import ParameterSpec
+from pendulum_msgs_py.ros import qos
+from pendulum_msgs_py.ros.convert import command_from_bytes, sample_from_bytes
+from pendulum_msgs_py.ros.parameters import NodeParameters
+from pendulum_msgs_py.ros.plant_loop import create_wall_timer
+from pendulum_msgs_py.ros.runner import run_node
+from pendulum_msgs_py.values import NANOSECONDS, JointSample
+from pendulum_sim.drawing import PendulumPicture, Window, save_gif, save_png
+
+__all__ = ["SPECS", "ViewerNode", "main"]
+
+SPECS: tuple[ParameterSpec, ...] = (
+    ParameterSpec(
+        "window", True, "", "Open a window; without one, PNG and GIF are still written.", read_only=True
+    ),
+    ParameterSpec("width", 600, "px", "Width of the picture.", minimum=120, maximum=4096, read_only=True),
+    ParameterSpec("height", 600, "px", "Height of the picture.", minimum=120, maximum=4096, read_only=True),
+    ParameterSpec("fps", 30.0, "Hz", "Pictures per second.", minimum=1.0, maximum=120.0, read_only=True),
+    ParameterSpec(
+        "effort_scale",
+        13.0,
+        "N m",
+        "Torque at which the arc is full.",
+        minimum=0.0,
+        exclusive_minimum=True,
+        read_only=True,
+    ),
+    ParameterSpec(
+        "trail", 60, "-", "Positions that the trail shows.", minimum=1, maximum=1000, read_only=True
+    ),
+    ParameterSpec(
+        "png", "", "", "File for a picture at the end and on ~/snapshot; empty for none.", read_only=True
+    ),
+    ParameterSpec(
+        "gif",
+        "",
+        "",
+        "File for an animation of the last seconds, at the end; empty for none.",
+        read_only=True,
+    ),
+    ParameterSpec(
+        "gif_fps",
+        12.5,
+        "Hz",
+        "Pictures per second of the animation.",
+        minimum=1.0,
+        maximum=50.0,
+        read_only=True,
+    ),
+    ParameterSpec(
+        "gif_duration", 8.0, "s", "Length of the animation.", minimum=0.1, maximum=60.0, read_only=True
+    ),
+    ParameterSpec("duration", 0.0, "s", "Time after which to end; 0 for never.", minimum=0.0, read_only=True),
+)
+_STALE = 0.5
+"""Age at which a torque is no longer drawn, by the clock of the states [s]."""
+
+
+class ViewerNode(Node):
+    """Shows a plant; takes part in nothing.
+
+    Args:
+        stop: Asks the runner to end the process.
+
+    Raises:
+        ParameterError: A parameter is refused, or there is no display for the window.
+    """
+
+    def __init__(self, stop: Callable[[], None]) -> None:
+        super().__init__("viewer")
+        self._stop = stop
+        values = NodeParameters(self, SPECS).values
+        self._values = values
+        self._picture = PendulumPicture(
+            (values["width"], values["height"]), values["effort_scale"], trail=values["trail"]
+        )
+        title = f"{self.get_namespace().rstrip('/')}/{names.JOINT_STATES}"
+        self._topic = self.resolve_topic_name(names.JOINT_STATES)
+        self._window = Window(self._picture, title) if values["window"] else None
+        self._sample: JointSample | None = None
+        self._start_ns: int | None = None
+        self._torques: dict[str, tuple[int, float]] = {}
+        self._drawn = 0
+        self._every = max(1, round(values["fps"] / values["gif_fps"]))
+        kept = max(1, round(values["gif_duration"] * values["fps"] / self._every)) if values["gif"] else 1
+        self._frames: deque[NDArray[np.uint8]] = deque(maxlen=kept)
+        self.create_subscription(JointState, names.JOINT_STATES, self._on_state, qos.NEWEST_STATE, raw=True)
+        for topic in (names.APPLIED_EFFORT, names.DISTURBANCE, names.PUSH):
+            self.create_subscription(JointState, topic, self._receiver(topic), qos.NEWEST_STATE, raw=True)
+        self.create_service(Trigger, "~/snapshot", self._on_snapshot)
+        create_wall_timer(self, 1.0 / values["fps"], self._on_timer)
+        if values["duration"] > 0.0:
+            create_wall_timer(self, values["duration"], stop)
+
+    def close(self) -> None:
+        """Write the files that were asked for, and close the window."""
+        self._draw()
+        if self._values["png"]:
+            save_png(self._values["png"], self._picture.array())
+        if self._values["gif"] and self._frames:
+            save_gif(self._values["gif"], list(self._frames), self._values["fps"] / self._every)
+        if self._window is not None:
+            self._window.close()
+
+    # --- callbacks -----------------------------------------------------------------------------------------
+
+    def _on_state(self, data: bytes) -> None:
+        sample = sample_from_bytes(data)
+        if sample is None or not sample.is_finite():
+            return
+        if self._start_ns is None or sample.stamp_ns < self._start_ns:
+            # A first state, or a plant that began again: what the trail remembers is another run.
+            self._start_ns = sample.stamp_ns
+            self._picture.clear_trail()
+        self._sample = sample
+
+    def _receiver(self, topic: str) -> Callable[[bytes], None]:
+        def receive(data: bytes) -> None:
+            command = command_from_bytes(data)
+            if command is not None and np.isfinite(command.effort):
+                self._torques[topic] = (command.stamp_ns, command.effort)
+
+        return receive
+
+    def _on_timer(self) -> None:
+        self._draw()
+        self._drawn += 1
+        if self._values["gif"] and self._drawn % self._every == 0 and self._sample is not None:
+            self._frames.append(self._picture.array())
+        if self._window is not None and self._window.closed:
+            self._stop()
+
+    def _on_snapshot(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+        try:
+            if not self._values["png"]:
+                raise ParameterError("png is empty; expected the file to write")
+            response.message = str(Path(save_png(self._values["png"], self._picture.array())).resolve())
+            response.success = True
+        except PendulumError as error:
+            response.success, response.message = False, str(error)
+        return response
+
+    # --- picture -------------------------------------------------------------------------------------------
+
+    def _torque(self, topic: str, now_ns: int) -> float:
+        stamp_ns, effort = self._torques.get(topic, (0, 0.0))
+        return effort if abs(now_ns - stamp_ns) < _STALE * NANOSECONDS else 0.0
+
+    def _draw(self) -> None:
+        sample = self._sample
+        if sample is None:
+            sample, note = JointSample(0, 0.0, 0.0), f"waiting for {self._topic}"
+            time = None
+        else:
+            time, note = (sample.stamp_ns - (self._start_ns or 0)) / NANOSECONDS, self._topic
+        applied = self._torque(names.APPLIED_EFFORT, sample.stamp_ns)
+        disturbance = self._torque(names.DISTURBANCE, sample.stamp_ns) + self._torque(
+            names.PUSH, sample.stamp_ns
+        )
+        if self._window is not None:
+            self._window.show(
+                sample.position, sample.velocity, applied, disturbance=disturbance, time=time, note=note
+            )
+        else:
+            self._picture.draw(
+                sample.position, sample.velocity, applied, disturbance=disturbance, time=time, note=note
+            )
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run the viewer."""
+    return run_node(
+        ViewerNode,
+        argv,
+        program="pendulum_sim viewer",
+        description="Shows a plant: angle, torque, disturbance, trail and numbers; also writes PNG and GIF.",
+        specs=SPECS,
+        example="python -m pendulum_sim viewer --ros-args -r __ns:=/sim -p gif:=sim.gif",
+    )
