@@ -83,7 +83,9 @@ def cross_validate(
             if out.size:
                 part = piece.subset(out)
                 test.append(Piece(part.recording, part.windows, state[out], part.integral, part.enabled))
-        fitted = solve(model, train, free, states=train_states, scale=scale, max_iterations=25, tolerance=1e-5).model
+        fitted = solve(
+            model, train, free, states=train_states, scale=scale, max_iterations=25, tolerance=1e-5, coarse=3.0
+        ).model
         vectors.append(np.array(fitted.vector))
         total, loss, number = 0.0, 0.0, 0
         for piece in test:

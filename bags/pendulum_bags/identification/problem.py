@@ -127,7 +127,7 @@ def longest_step(model: FitModel, recording: Recording) -> float:
         stiffness += abs(model["input_gain"]) * _supply(recording) * _servo_gain(model, recording)
         rate += model["drive_damping"] / inertia
     frequency = math.sqrt(stiffness / inertia) if stiffness > 0.0 else 0.0
-    return float(np.clip(min(0.06 / max(frequency, 1e-3), 0.4 / max(rate, 1e-3)), 1e-4, 0.01))
+    return float(np.clip(min(0.02 / max(frequency, 1e-3), 0.4 / max(rate, 1e-3)), 1e-4, 0.01))
 
 
 def _supply(recording: Recording) -> float:

@@ -19,7 +19,7 @@ from pendulum_bags.identification import kernel
 from pendulum_bags.identification.model import BOUNDS, INDEX, PARAMETER_NAMES, FitModel
 from pendulum_bags.identification.problem import Piece, longest_step, simulate
 
-__all__ = ["Solution", "residuals", "robust_cost", "solve"]
+__all__ = ["Solution", "refine", "residuals", "robust_cost", "solve"]
 
 Array = NDArray[np.float64]
 
@@ -67,6 +67,7 @@ def solve(
     max_iterations: int = 60,
     tolerance: float = 1e-9,
     bounds: dict[str, tuple[float, float]] | None = None,
+    coarse: float = 1.0,
 ) -> Solution:
     """Minimise the robust sum of squared angle errors over the free parameters and all window states.
 
@@ -79,6 +80,7 @@ def solve(
         max_iterations: Most steps to try.
         tolerance: Relative decrease of the cost below which the fit has converged.
         bounds: Domain of parameters where it differs from ``BOUNDS``.
+        coarse: Factor on the integration step; a search may take 3, an answer 1.
     """
     index = np.array([INDEX[name] for name in free], dtype=np.int64)
     limits = {**BOUNDS, **(bounds or {})}
@@ -89,7 +91,7 @@ def solve(
     vector[index] = np.clip(vector[index], low, high)
     best = model.with_vector(vector)
     # The steps must not change within one fit, or the cost would jump with them.
-    steps = [longest_step(best, piece.recording) for piece in pieces]
+    steps = [coarse * longest_step(best, piece.recording) for piece in pieces]
     masks = [piece.mask() for piece in pieces]
     typical = _typical_scales(index)
     damping, cost, iterations, converged = 1e-4, np.inf, 0, False
@@ -134,6 +136,46 @@ def solve(
                 converged = gain < 1e-3 * cost
                 break
     return Solution(best, x, cost, converged, iterations)
+
+
+def refine(
+    solution: Solution,
+    pieces: Sequence[Piece],
+    free: Sequence[str],
+    *,
+    scale: float,
+    tolerance: float = 1e-8,
+    rounds: int = 3,
+) -> Solution:
+    """Return a solution that other initial states of single windows cannot better.
+
+    Near standstill dry friction makes the cost of a window's initial velocity have several valleys (it moves on,
+    or it sticks first): a joint search stays in the one where it began. Each window tries others by itself, and
+    what helps is taken into a new joint search.
+    """
+    for _ in range(rounds):
+        states, gain = [], 0.0
+        for piece, current in zip(pieces, solution.states):
+            better = current.copy()
+            for i in range(len(piece.windows)):
+                single = [piece.subset([i])]
+                kept = solve(solution.model, single, (), states=[current[[i]]], scale=scale, max_iterations=5)
+                speed = max(abs(current[i, 1]), 0.02)
+                lowest = kept.cost
+                for velocity in (0.0, -speed, speed, float(piece.states[i, 1])):
+                    start = np.array([[current[i, 0], velocity]])
+                    trial = solve(solution.model, single, (), states=[start], scale=scale, max_iterations=15)
+                    if trial.cost < lowest * (1.0 - 1e-6):
+                        gain += lowest - trial.cost
+                        lowest, better[i] = trial.cost, trial.states[0][0]
+            states.append(better)
+        if gain <= 1e-5 * solution.cost:
+            break
+        renewed = solve(solution.model, pieces, free, states=states, scale=scale, tolerance=tolerance)
+        if renewed.cost >= solution.cost:
+            break
+        solution = renewed
+    return solution
 
 
 def _typical_scales(index: NDArray[np.int64]) -> Array:

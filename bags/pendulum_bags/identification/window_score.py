@@ -68,8 +68,15 @@ def window_score(
 
 def fit_states(model: FitModel, piece: Piece) -> Array:
     """Return the initial state of each window that fits it best in least squares, shape (w, 2)."""
-    # Window by window: each has its own damping, so that a hard one does not hold up the others.
-    states = [solve(model, [piece.subset([i])], (), max_iterations=40).states[0] for i in range(len(piece.windows))]
+    # Window by window: each has its own damping, so that a hard one does not hold up the others. Dry friction
+    # makes two valleys at standstill (it moves on, or it sticks first), so each begins from both sides.
+    states = []
+    for i in range(len(piece.windows)):
+        single = [piece.subset([i])]
+        guess = single[0].states
+        begin = (guess, guess * np.array([1.0, 0.0]))
+        trials = [solve(model, single, (), states=[start], max_iterations=30) for start in begin]
+        states.append(min(trials, key=lambda trial: trial.cost).states[0])
     return np.concatenate(states)
 
 
