@@ -95,14 +95,15 @@ def sort_poles(poles: NDArray[np.complex128]) -> NDArray[np.complex128]:
 
 
 def equilibrium_effort(plant: RigidPlant, theta: float) -> float:
-    """Return the torque u* = G_c sin(theta) - torque_offset that holds the pendulum at an angle [N m].
+    """Return the torque u* = G_c sin(theta - angle_offset) - torque_offset that holds the pendulum at an angle [N m].
 
     Args:
         plant: Plant parameters.
         theta: Angle, 0 hanging down [rad].
     """
     # sin(math.pi) is 1.2e-16, not 0: upright must not ask for a torque.
-    lift = 0.0 if theta == UPRIGHT else plant.gravity * math.sin(theta)
+    angle = theta - float(getattr(plant, "angle_offset", 0.0))
+    lift = 0.0 if angle == UPRIGHT else plant.gravity * math.sin(angle)
     return lift - float(getattr(plant, "torque_offset", 0.0))
 
 
@@ -121,7 +122,8 @@ def linearise(plant: RigidPlant, theta: float = UPRIGHT) -> LinearModel:
     """
     if not math.isfinite(theta):
         raise ParameterError(f"theta of the fixed point is {theta} rad; expected a finite angle")
-    slope = -1.0 if theta == UPRIGHT else math.cos(theta)
+    angle = theta - float(getattr(plant, "angle_offset", 0.0))
+    slope = -1.0 if angle == UPRIGHT else math.cos(angle)
     A = np.array([[0.0, 1.0], [-plant.gravity * slope / plant.inertia, -plant.damping / plant.inertia]])
     B = np.array([[0.0], [1.0 / plant.inertia]])
     return LinearModel(A, B, theta, equilibrium_effort(plant, theta))
@@ -137,7 +139,8 @@ def state_derivative(plant: RigidPlant, theta: float, theta_dot: float, effort: 
         effort: Torque [N m].
     """
     offset = float(getattr(plant, "torque_offset", 0.0))
-    torque = effort + offset - plant.damping * theta_dot - plant.gravity * math.sin(theta)
+    angle = theta - float(getattr(plant, "angle_offset", 0.0))
+    torque = effort + offset - plant.damping * theta_dot - plant.gravity * math.sin(angle)
     return theta_dot, torque / plant.inertia
 
 
