@@ -67,7 +67,12 @@ def regulate(
 
 
 def write_bag(
-    path: Path, columns: Columns, prefix: str, *, metadata: Mapping[str, Any] | None = None, ramps: bool = True
+    path: Path,
+    columns: Columns,
+    prefix: str,
+    *,
+    metadata: Mapping[str, Any] | None = None,
+    ramps: bool = True,
 ) -> Path:
     """Write a run as a recorder would: ramps around the noise, events, one message for each state."""
     period = float(columns["t"][1] - columns["t"][0])
@@ -88,7 +93,11 @@ def write_bag(
             bag.write(f"{prefix}/joint_states", stamp(t) + late, data)
 
         def effort(topic: str, t: float, value: float) -> None:
-            bag.write(f"{prefix}/{topic}", stamp(t) + 400_000, encode_joint_state(stamp(t), frame_id=topic, effort=value))
+            bag.write(
+                f"{prefix}/{topic}",
+                stamp(t) + 400_000,
+                encode_joint_state(stamp(t), frame_id=topic, effort=value),
+            )
 
         def event(t: float, name: str) -> None:
             text = json.dumps({"stamp_ns": stamp(t), "name": name}).encode() + b"\0"
@@ -98,7 +107,9 @@ def write_bag(
             event(-lead.duration - 1.0, "ramp_up")
             for t in np.arange(0.0, lead.duration, period):
                 position, velocity = lead.at(t)
-                state(t - lead.duration - 1.0, position, velocity, 1.678 * np.sin(position) + 11.77 * velocity)
+                state(
+                    t - lead.duration - 1.0, position, velocity, 1.678 * np.sin(position) + 11.77 * velocity
+                )
             event(-1.0, "regulation")
             for t in np.arange(-1.0, -period / 2, period):
                 state(t, UPRIGHT, 0.0, 0.0)
@@ -128,7 +139,13 @@ def run_metadata(seed: int, hold_time: float = 0.01) -> dict[str, Any]:
             "experiment": "thesis",
             "strategy": "direct_pwm",
             "seed": seed,
-            "disturbance": {"kind": "uniform", "seed": seed, "amplitude": 2.5, "hold_time": hold_time, "duration": 5.0},
+            "disturbance": {
+                "kind": "uniform",
+                "seed": seed,
+                "amplitude": 2.5,
+                "hold_time": hold_time,
+                "duration": 5.0,
+            },
             "controller": {"kind": "lqr", "q": [100.0, 0.01], "r": 0.1},
             "versions": {"python": "3.11.0", "pendulum_bags": "0.1.0"},
             "git_revision": "0123456789ab",

@@ -1,11 +1,11 @@
-"""``compare``: is the simulation good enough? A table, ``comparison.json`` and a verdict from two bags or run folders."""
+"""``compare``: is the simulation good enough? Tables and a verdict from two bags or from run folders."""
 
 from __future__ import annotations
 
 import json
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Optional
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -19,9 +19,11 @@ __all__ = ["main"]
 
 app = typer.Typer(add_completion=False)
 
-Paths = Annotated[list[Path], typer.Argument(help="Simulation and hardware bag, or run folders with sim and hw.")]
+Paths = Annotated[
+    list[Path], typer.Argument(help="Simulation and hardware bag, or run folders with sim and hw.")
+]
 MarginOption = Annotated[
-    Optional[list[str]],
+    list[str] | None,
     typer.Option(
         "--margin",
         help="What difference does not matter: a number in rad for the mean angle, or position=, velocity=, "
@@ -35,13 +37,15 @@ def compare(
     paths: Paths,
     margin: MarginOption = None,
     out: Annotated[
-        Optional[Path], typer.Option("--out", "-o", help="Folder for comparison.json and figures; none by default.")
+        Path | None,
+        typer.Option("--out", "-o", help="Folder for comparison.json and figures; none by default."),
     ] = None,
     own_protocol: Annotated[
-        Optional[Path], typer.Option(help="Bag of a simulation with noise of its own, for the thesis's analysis.")
+        Path | None,
+        typer.Option(help="Bag of a simulation with noise of its own, for the thesis's analysis."),
     ] = None,
-    sim_prefix: Annotated[Optional[str], typer.Option(help="Namespace of the simulation's topics.")] = None,
-    hw_prefix: Annotated[Optional[str], typer.Option(help="Namespace of the hardware's topics.")] = None,
+    sim_prefix: Annotated[str | None, typer.Option(help="Namespace of the simulation's topics.")] = None,
+    hw_prefix: Annotated[str | None, typer.Option(help="Namespace of the hardware's topics.")] = None,
     json_output: Annotated[bool, typer.Option("--json", help="Print JSON instead of tables.")] = False,
 ) -> None:
     """Compare simulation and hardware under noise: statistics of the difference, equivalence tests, a verdict.
@@ -107,7 +111,9 @@ def _print(result: Comparison, content: dict[str, Any]) -> None:
     ):
         table.add_row(label, *(_number(plant.get(key), form) for plant in plants.values()))
     console.print(table)
-    blocks = [("Unpaired: hardware interpolated at the simulation's stamps, minus simulation", content["unpaired"])]
+    blocks = [
+        ("Unpaired: hardware interpolated at the simulation's stamps, minus simulation", content["unpaired"])
+    ]
     if "position" in content["paired"]:
         blocks.append(("Paired: hardware minus simulation under one disturbance", content["paired"]))
     for title, block in blocks:

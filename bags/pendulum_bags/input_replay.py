@@ -100,7 +100,8 @@ class InputReplay:
             "divergence_threshold_rad": self.threshold,
             "one_step_rms_rad": self.horizons[0].rms if self.horizons else None,
             "horizons": [
-                {"steps": one.steps, "time_s": one.time, "rms_rad": one.rms, "starts": one.starts} for one in self.horizons
+                {"steps": one.steps, "time_s": one.time, "rms_rad": one.rms, "starts": one.starts}
+                for one in self.horizons
             ],
         }
 
@@ -108,8 +109,8 @@ class InputReplay:
         """Return the result in words."""
         where = "never" if self.diverges_at is None else f"after {self.diverges_at:.2f} s"
         return (
-            f"Driven by the measured torque of {self.name}, the plant {self.plant.name!r} errs by {self.rms:.4f} rad rms "
-            f"over windows of {self.window:g} s (best {self.by_window.min():.4f}, worst {self.by_window.max():.4f}); "
+            f"Driven by the measured torque of {self.name}, the plant {self.plant.name!r} errs by {self.rms:.4f} rad "
+            f"rms over windows of {self.window:g} s (best {self.by_window.min():.4f}, worst {self.by_window.max():.4f}); "
             f"in free run by {self.free_run_rms:.4f} rad (fit {self.fit:.1f} %), and it departs by more than "
             f"{self.threshold:.2f} rad {where}."
         )
@@ -177,7 +178,9 @@ def replay_input(recording: Recording, parameters: PlantParameters, *, window: f
         DataError: The input is no torque.
     """
     if recording.input_kind != "effort":
-        raise DataError(f"{recording.name} has the input {recording.input_kind!r}; expected 'effort' [N m] to drive a plant")
+        raise DataError(
+            f"{recording.name} has the input {recording.input_kind!r}; expected 'effort' [N m] to drive a plant"
+        )
     if not window > 0.0:
         raise DataError(f"window is {window} s; expected > 0")
     driven = _Driven.of(recording, parameters)
@@ -188,7 +191,9 @@ def replay_input(recording: Recording, parameters: PlantParameters, *, window: f
         start = tuple(score.states[0])
     else:
         window_time, window_angle, by_window = _windows(driven, window)
-        rms = float(np.sqrt(np.mean((window_angle - np.interp(window_time, driven.time, driven.position)) ** 2)))
+        rms = float(
+            np.sqrt(np.mean((window_angle - np.interp(window_time, driven.time, driven.position)) ** 2))
+        )
         start = (float(driven.position[0]), float(driven.velocity[0]))
     free = driven.run(0, driven.time.size - 1, (float(start[0]), float(start[1])))
     error = free - driven.position
@@ -300,7 +305,9 @@ def _horizons(driven: _Driven, longest: float) -> tuple[HorizonError, ...]:
     period = float(driven.time[1] - driven.time[0])
     reach = min(max(1, round(longest / period)), driven.time.size - 1)
     starts = np.unique(np.linspace(0, driven.time.size - 1 - reach, MOST_STARTS).astype(int))
-    error = np.stack([driven.run(int(first), reach) - driven.position[first : first + reach + 1] for first in starts])
+    error = np.stack(
+        [driven.run(int(first), reach) - driven.position[first : first + reach + 1] for first in starts]
+    )
     steps = sorted({k for k in (m * 10**e for e in range(7) for m in (1, 2, 5)) if k < reach} | {reach})
     return tuple(
         HorizonError(k, k * period, float(np.sqrt(np.mean(error[:, k] ** 2))), starts.size) for k in steps

@@ -12,6 +12,7 @@ from typing import Any, TypeAlias
 from pendulum_bags.comparison.equivalence import Margins, Verdict, conclude
 from pendulum_bags.comparison.metrics import episode_of, summarise_metrics
 from pendulum_bags.comparison.pairs import (
+    SAME_DISTURBANCE,
     Difference,
     Pair,
     distribution_tests,
@@ -54,7 +55,10 @@ class Comparison:
     @property
     def plants(self) -> dict[str, dict[str, Any]]:
         """Figures of each plant: means over runs, sums of missed deadlines, the largest torque."""
-        groups = {"sim": [pair.simulation for pair in self.pairs], "hw": [pair.hardware for pair in self.pairs]}
+        groups = {
+            "sim": [pair.simulation for pair in self.pairs],
+            "hw": [pair.hardware for pair in self.pairs],
+        }
         if any(all(run is not pair.simulation for pair in self.pairs) for run in self.own):
             groups["sim_500hz"] = list(self.own)
         return {name: _pool([plant_summary(run) for run in runs]) for name, runs in groups.items()}
@@ -77,7 +81,8 @@ class Comparison:
         return {
             **self.thesis.statistics(),
             "noise_hold_time": hold,
-            "same_noise": any(run is pair.simulation for run in self.own for pair in self.pairs) and self.is_paired,
+            "same_noise": any(run is pair.simulation for run in self.own for pair in self.pairs)
+            and self.is_paired,
             "distributions": distribution_tests(self.own[0].window, self.pairs[0].hardware.window),
             "verdict": self.unpaired_verdict.sentence,
             "tests": [test.as_dict() for test in self.unpaired_verdict.tests],
@@ -115,7 +120,7 @@ class Comparison:
             return "no disturbance was recorded on both plants"
         return (
             f"the recorded disturbances differ: their correlation is {pair.clock.correlation:.2f} at best, "
-            "expected above 0.9"
+            f"expected above {SAME_DISTURBANCE}"
         )
 
 
@@ -186,7 +191,9 @@ def compare_folders(folders: Sequence[PathArgument], *, margin: MarginArgument =
         for name in ("sim", "hw"):
             if not (folder / name).is_dir():
                 raise BagError(f"run folder {folder} has no bag {name}; expected the folders sim and hw")
-        pairs.append((read_run(folder / "sim", label="simulation"), read_run(folder / "hw", label="hardware")))
+        pairs.append(
+            (read_run(folder / "sim", label="simulation"), read_run(folder / "hw", label="hardware"))
+        )
         if (folder / "sim_500hz").is_dir():
             own.append(read_run(folder / "sim_500hz", label="simulation, own noise"))
     return compare(pairs, own=own, margin=margins)

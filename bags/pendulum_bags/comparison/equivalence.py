@@ -60,7 +60,9 @@ class Margins:
         for name, unit in (("position", "rad"), ("velocity", "rad/s"), ("path", "")):
             value = getattr(self, name)
             if not (math.isfinite(value) and value > 0.0):
-                raise ParameterError(f"margin {name} is {value} {unit}".rstrip() + "; expected a finite number > 0")
+                raise ParameterError(
+                    f"margin {name} is {value} {unit}".rstrip() + "; expected a finite number > 0"
+                )
         if not (math.isfinite(self.spread) and self.spread > 1.0):
             raise ParameterError(f"margin spread is {self.spread}; expected a factor > 1, such as 1.25")
 
@@ -167,7 +169,14 @@ def _more(runs: int | None) -> str:
 
 
 def equivalence_test(
-    quantity: str, unit: str, interval: Interval, low: float, high: float, *, runs: int = 1, ratio: bool = False
+    quantity: str,
+    unit: str,
+    interval: Interval,
+    low: float,
+    high: float,
+    *,
+    runs: int = 1,
+    ratio: bool = False,
 ) -> EquivalenceTest:
     """Test one quantity.
 
@@ -210,7 +219,9 @@ def _runs_to_decide(distance: float, error: float, runs: int) -> int | None:
     """Return how many more runs bring the interval's end within reach of the nearest margin."""
     if distance <= 0.0 or not math.isfinite(error):
         return None
-    needed = runs * ((stats.norm.ppf(LEVEL + 0.5 * (1.0 - LEVEL)) + stats.norm.ppf(POWER)) * error / distance) ** 2
+    needed = (
+        runs * ((stats.norm.ppf(LEVEL + 0.5 * (1.0 - LEVEL)) + stats.norm.ppf(POWER)) * error / distance) ** 2
+    )
     if needed > MOST_RUNS:
         return None
     return max(1, math.ceil(needed) - runs)
@@ -265,7 +276,9 @@ def conclude(tests: Sequence[EquivalenceTest], margins: Margins, first: str, sec
         counts = [test.more_runs for test in undecided]
         runs = None if None in counts else max(count or 0 for count in counts)
         what = ", ".join(test.quantity for test in undecided)
-        text = f"Undecided whether {first} and {second} are equivalent within {whose}: {_more(runs)} ({what})."
+        text = (
+            f"Undecided whether {first} and {second} are equivalent within {whose}: {_more(runs)} ({what})."
+        )
     else:
         outcome = Outcome.EQUIVALENT
         text = f"{first} and {second} are equivalent within {whose}, in all {len(tests)} tests."
@@ -276,5 +289,5 @@ def _short(test: EquivalenceTest) -> str:
     unit = f" {test.unit}" if test.unit not in {"", "-"} else ""
     return (
         f"{test.quantity} is {test.interval.estimate:.3g}{unit} "
-        f"({test.interval.low:.3g} to {test.interval.high:.3g}), {_margin_text(test)}"
+        f"(90 % interval {test.interval.low:.3g} to {test.interval.high:.3g}; {_margin_text(test)})"
     )

@@ -169,7 +169,11 @@ def summarise_metrics(episodes: Mapping[str, Episode]) -> list[dict[str, float |
     rows: list[dict[str, float | str | None]] = []
     for metric in METRICS:
         if any(metric.name in found for found in values.values()):
-            row: dict[str, float | str | None] = {"metric": metric.name, "unit": metric.unit, "meaning": metric.meaning}
+            row: dict[str, float | str | None] = {
+                "metric": metric.name,
+                "unit": metric.unit,
+                "meaning": metric.meaning,
+            }
             for name, found in values.items():
                 value = found.get(metric.name, float("nan"))
                 row[name] = value if np.isfinite(value) else None

@@ -21,7 +21,18 @@ from pendulum_bags.comparison.statistics import (
     resample,
 )
 
-__all__ = ["Difference", "Pair", "interpolated_difference", "paired_tests", "same_disturbance", "unpaired_tests"]
+__all__ = [
+    "Difference",
+    "Pair",
+    "interpolated_difference",
+    "paired_tests",
+    "same_disturbance",
+    "unpaired_tests",
+]
+
+
+SAME_DISTURBANCE = 0.6
+"""Correlation from which two recorded disturbances count as one: independent noise of 5 s stays below 0.3."""
 
 
 @dataclass(frozen=True)
@@ -112,8 +123,8 @@ class Pair:
 
     @property
     def is_paired(self) -> bool:
-        """Whether both had one disturbance: the recorded signals agree in time but for a sample here and there."""
-        return self.clock is not None and self.clock.correlation > 0.9
+        """Whether both had one disturbance, but for samples that a late loop skipped or repeated."""
+        return self.clock is not None and self.clock.correlation > SAME_DISTURBANCE
 
     def as_dict(self) -> dict[str, Any]:
         """Return the figures of this pair for JSON."""
@@ -134,6 +145,7 @@ def _rms(values: Array) -> float:
 
 
 # -- tests on columns of samples ---------------------------------------------------------------------------------
+
 
 def _variance(means: Array, first: int) -> Array:
     """Return the variance from the means of x and x^2 in two neighbouring columns."""
@@ -191,7 +203,12 @@ def paired_tests(pairs: Sequence[Pair], margins: Margins) -> list[EquivalenceTes
     runs = len(pairs)
     tests = [
         equivalence_test(
-            f"mean {what} difference", unit, bootstrap_interval(resampled, _column(i)), -margin, margin, runs=runs
+            f"mean {what} difference",
+            unit,
+            bootstrap_interval(resampled, _column(i)),
+            -margin,
+            margin,
+            runs=runs,
         )
         for i, what, unit, margin in (
             (0, "angle", "rad", margins.position),

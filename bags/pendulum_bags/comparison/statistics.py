@@ -204,7 +204,9 @@ def resample(runs: Sequence[Array], *, resamples: int = RESAMPLES, seed: int = 0
     pooled = np.concatenate(runs).mean(axis=0)
     # Sums of large equal numbers would lose what differs between resamples.
     centred = [samples - pooled for samples in runs]
-    return Resampled(pooled, pooled + bootstrap_means(centred, lengths, resamples=resamples, seed=seed), blocks)
+    return Resampled(
+        pooled, pooled + bootstrap_means(centred, lengths, resamples=resamples, seed=seed), blocks
+    )
 
 
 def bootstrap_interval(
@@ -256,7 +258,9 @@ def kolmogorov_smirnov(first: ArrayLike, second: ArrayLike) -> KolmogorovSmirnov
     """Compare two samples of correlated values; the p-value uses effective sample sizes."""
     a, b = np.sort(np.asarray(first, dtype=float)), np.sort(np.asarray(second, dtype=float))
     values = np.concatenate((a, b))
-    difference = np.searchsorted(a, values, side="right") / a.size - np.searchsorted(b, values, side="right") / b.size
+    difference = (
+        np.searchsorted(a, values, side="right") / a.size - np.searchsorted(b, values, side="right") / b.size
+    )
     index = int(np.argmax(np.abs(difference)))
     distance = float(abs(difference[index]))
     sizes = effective_size(first), effective_size(second)

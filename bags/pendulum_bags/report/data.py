@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
@@ -14,6 +15,9 @@ if TYPE_CHECKING:
     from pendulum_bags.input_replay import InputReplay
 
 __all__ = ["ReportData", "quantity", "ratio_in_words"]
+
+
+_SUPERSCRIPT = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 
 
 @dataclass(frozen=True)
@@ -53,13 +57,17 @@ class ReportData:
 
 
 def quantity(value: float, unit: str = "", digits: int = 3) -> str:
-    """Return a number with its unit as text, ``digits`` significant digits, never in exponents a reader must decode."""
-    if value != value:
+    """Return a number with its unit as text, with ``digits`` significant digits, powers of ten where needed."""
+    if math.isnan(value):
         return "–"
     magnitude = abs(value)
-    text = f"{value:.2e}" if magnitude != 0.0 and (magnitude < 1e-5 or magnitude >= 1e6) else f"{value:.{digits}g}"
-    if "e" in text and magnitude >= 1e-5:
-        text = f"{value:.8f}".rstrip("0") if magnitude < 1.0 else f"{value:.0f}"
+    if magnitude != 0.0 and (magnitude < 1e-4 or magnitude >= 1e6):
+        mantissa, exponent = f"{value:.{digits - 1}e}".split("e")
+        text = f"{mantissa}×10{str(int(exponent)).translate(_SUPERSCRIPT)}"
+    else:
+        text = f"{value:.{digits}g}"
+        if "e" in text:
+            text = f"{value:.0f}"
     return f"{text.replace('-', '−')} {unit}".rstrip()
 
 

@@ -9,7 +9,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-__all__ = ["ROLES", "Figure", "Mark", "Panel", "Style", "Trace", "thinned"]
+__all__ = ["ROLES", "Figure", "Kind", "Mark", "Panel", "Style", "Trace", "thinned"]
 
 Kind = Literal["line", "step", "points", "interval"]
 
@@ -35,7 +35,9 @@ ROLES: dict[str, Style] = {
     "sim": Style("#0072b2", "solid", 1.3),
     "hw": Style("#d55e00", "dash", 1.5, "square"),
     "own": Style("#56b4e9", "dashdot", 1.2, "triangle"),
-    "noise": Style("#8a8a8a", "dot", 1.0, "cross"),
+    "noise": Style("#b4b4b4", "solid", 0.8, "cross"),
+    "own alone": Style("#0072b2", "solid", 1.1, "triangle"),
+    "hw alone": Style("#d55e00", "solid", 1.1, "square"),
     "difference": Style("#222222", "solid", 1.1),
     "aligned": Style("#009e73", "dash", 1.2, "triangle"),
     "fit": Style("#222222", "dashdot", 1.4, "cross"),
@@ -153,6 +155,8 @@ def thinned(x: ArrayLike, y: ArrayLike, most: int = 3000) -> tuple[NDArray[np.fl
     size = xs.size // bins
     whole = ys[: bins * size].reshape(bins, size)
     rows = np.arange(bins)[:, None] * size
-    keep = np.sort(np.concatenate((rows + whole.argmin(axis=1)[:, None], rows + whole.argmax(axis=1)[:, None]), axis=1))
+    keep = np.sort(
+        np.concatenate((rows + whole.argmin(axis=1)[:, None], rows + whole.argmax(axis=1)[:, None]), axis=1)
+    )
     index = np.unique(np.concatenate(([0], keep.ravel(), np.arange(bins * size, xs.size), [xs.size - 1])))
     return xs[index], ys[index]

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Union
 
 from pendulum_bags.comparison import Comparison
 from pendulum_bags.report import analysis_figures, model_figures, motion_figures
@@ -12,7 +11,7 @@ from pendulum_bags.report.figure import Figure
 
 __all__ = ["FIGURES", "comparison_figures", "make_figures"]
 
-Maker = Callable[[ReportData], Union[Figure, str]]
+Maker = Callable[[ReportData], Figure | str]
 
 FIGURES: tuple[tuple[str, Maker], ...] = (
     ("Equivalence tests", analysis_figures.equivalence),

@@ -30,11 +30,14 @@ def overdamped_phase(data: ReportData) -> Figure | str:
     ]
     slope = plant.gravity / plant.damping
     sentence = (
-        f"Without torque the overdamped pendulum rests at 0 (stable) and at π (unstable), from where it falls with a rate "
-        f"of {quantity(slope, '1/s')}; a constant torque below G = {quantity(plant.gravity, 'N m', 4)} only shifts both."
+        f"Without torque the overdamped pendulum rests at 0 (stable) and at π (unstable), from where it falls with a "
+        f"rate of {quantity(slope, '1/s')}; a constant torque below G = {quantity(plant.gravity, 'N m', 4)} only "
+        "shifts both."
     )
     panel = Panel("θ [rad]", "θ′ [rad/s]", traces)
-    return Figure("overdamped_phase", "Overdamped phase plot", sentence, [panel], section="Model", panel_height=260)
+    return Figure(
+        "overdamped_phase", "Overdamped phase plot", sentence, [panel], section="Model", panel_height=260
+    )
 
 
 def _fit(theta: Array, velocity: Array, torque: Array) -> tuple[Array, float]:
@@ -81,8 +84,17 @@ def gravity_fit(data: ReportData) -> Figure | str:
         )
     if not panels:
         return "needs ramps with measured torque"
-    sentence = f"Least squares of the measured torque on sin θ, θ′ and a constant over the way up gives {'; '.join(words)}."
-    return Figure("gravity_fit", "Torque over sin θ", sentence, panels, stacked=False, section="Dynamic phase", panel_height=230)
+    gives = "; ".join(words)
+    sentence = f"Least squares of the measured torque on sin θ, θ′ and a constant over the way up gives {gives}."
+    return Figure(
+        "gravity_fit",
+        "Torque over sin θ",
+        sentence,
+        panels,
+        stacked=False,
+        section="Dynamic phase",
+        panel_height=230,
+    )
 
 
 def replay(data: ReportData) -> Figure | str:

@@ -8,7 +8,7 @@ from pendulum_bags.comparison.pairs import Difference
 from pendulum_bags.comparison.run_data import RunData, noise_hold_time
 from pendulum_bags.comparison.series import Array, Series
 from pendulum_bags.report.data import ReportData, quantity, ratio_in_words
-from pendulum_bags.report.figure import Figure, Panel, Trace
+from pendulum_bags.report.figure import Figure, Kind, Panel, Trace
 
 __all__ = [
     "both_together",
@@ -57,13 +57,17 @@ def simulation_under_noise(data: ReportData) -> Figure:
     run = data.comparison.own[0]
     own = run is not data.comparison.pairs[0].simulation
     title = "Simulation under noise" + (", by the thesis's own protocol" if own else "")
-    return _under_noise(run, "own" if own else "sim", "simulation_under_noise", title, "The two plants under noise")
+    return _under_noise(
+        run, "own alone" if own else "sim", "simulation_under_noise", title, "The two plants under noise"
+    )
 
 
 def hardware_under_noise(data: ReportData) -> Figure:
     """Return the hardware under noise."""
     run = data.comparison.pairs[0].hardware
-    return _under_noise(run, "hw", "hardware_under_noise", "Hardware under noise", "The two plants under noise")
+    return _under_noise(
+        run, "hw alone", "hardware_under_noise", "Hardware under noise", "The two plants under noise"
+    )
 
 
 def both_together(data: ReportData) -> Figure:
@@ -71,12 +75,19 @@ def both_together(data: ReportData) -> Figure:
     pair = data.comparison.pairs[0]
     sim, hw = pair.simulation.window, pair.hardware.window
     ratio = float(hw.position.std() / sim.position.std())
-    fit = 100.0 * (1.0 - float(np.sqrt(np.mean(pair.difference.position**2)) / pair.difference.hardware.position.std()))
+    fit = 100.0 * (
+        1.0 - float(np.sqrt(np.mean(pair.difference.position**2)) / pair.difference.hardware.position.std())
+    )
     shared = "the same noise" if pair.is_paired else "noise of their own"
-    follows = f", and the simulation explains {fit:.0f} % of the hardware's angle" if pair.is_paired else ""
+    follows = f", and the simulated angle fits the measured one to {fit:.0f} %" if pair.is_paired else ""
     sentence = (
-        f"Under {shared}, the spread of the hardware's angle is {quantity(float(hw.position.std(ddof=1)), 'rad')} against "
-        f"{quantity(float(sim.position.std(ddof=1)), 'rad')} in simulation ({ratio_in_words(ratio)}){follows}."
+        f"Under {shared}, the spread of the hardware's angle is {quantity(float(hw.position.std(ddof=1)), 'rad')} "
+        f"against {quantity(float(sim.position.std(ddof=1)), 'rad')} in simulation ({ratio_in_words(ratio)}){follows}."
+    )
+    rows: tuple[tuple[str, Array, Array, Kind], ...] = (
+        (ANGLE, _deviation(sim), _deviation(hw), "line"),
+        (VELOCITY, sim.velocity, hw.velocity, "line"),
+        ("controller torque u [N m]", sim.effort, hw.effort, "step"),
     )
     panels = [
         Panel(
@@ -87,14 +98,15 @@ def both_together(data: ReportData) -> Figure:
                 Trace(hw.t, second, "hardware", "hw", kind),
             ],
         )
-        for label, first, second, kind in (
-            (ANGLE, _deviation(sim), _deviation(hw), "line"),
-            (VELOCITY, sim.velocity, hw.velocity, "line"),
-            ("controller torque u [N m]", sim.effort, hw.effort, "step"),
-        )
+        for label, first, second, kind in rows
     ]
     return Figure(
-        "both_together", "Simulation and hardware together", sentence, panels, section="Paired comparison", panel_height=165
+        "both_together",
+        "Simulation and hardware together",
+        sentence,
+        panels,
+        section="Paired comparison",
+        panel_height=165,
     )
 
 
@@ -118,7 +130,9 @@ def torque_and_noise(data: ReportData) -> Figure | str:
         f"Below, the noise is scaled by {factor:.3g}."
     )
     panels = [
-        Panel(TIME, TORQUE, [Trace(noise.t, noise.value, "noise d", "noise", "step"), *used], title="Unscaled"),
+        Panel(
+            TIME, TORQUE, [Trace(noise.t, noise.value, "noise d", "noise", "step"), *used], title="Unscaled"
+        ),
         Panel(
             TIME,
             TORQUE,
@@ -251,12 +265,32 @@ def ramps(data: ReportData) -> Figure | str:
     for way, parts in moves.items():
         for text, name in (("θ [rad]", "position"), (VELOCITY, "velocity")):
             traces = [
-                Trace(series.t - start, getattr(series, name), label, role) for label, role, series, start in parts
+                Trace(series.t - start, getattr(series, name), label, role)
+                for label, role, series, start in parts
             ]
             if traces:
-                panels.append(Panel(f"time since the ramp {way} began [s]", text, traces, title=f"{text[:2].strip()} {way}"))
+                panels.append(
+                    Panel(
+                        f"time since the ramp {way} began [s]",
+                        text,
+                        traces,
+                        title=f"{text[:2].strip()} {way}",
+                    )
+                )
     fastest = max(float(np.abs(series.velocity).max()) for parts in moves.values() for *_, series, _ in parts)
-    last = [f"{label} {quantity(float(series.position[-1]), 'rad', 5)}" for label, _, series, _ in moves["up"]]
+    last = [
+        f"{label} {quantity(float(series.position[-1]), 'rad', 5)}" for label, _, series, _ in moves["up"]
+    ]
     reached = f" The way up ends at {' and '.join(last)}." if last else ""
-    sentence = f"Both plants move along the half-sine ramps with at most {quantity(fastest, 'rad/s')}.{reached}"
-    return Figure("ramps", "Ramps up and down", sentence, panels, stacked=False, section="Dynamic phase", panel_height=180)
+    sentence = (
+        f"Both plants move along the half-sine ramps with at most {quantity(fastest, 'rad/s')}.{reached}"
+    )
+    return Figure(
+        "ramps",
+        "Ramps up and down",
+        sentence,
+        panels,
+        stacked=False,
+        section="Dynamic phase",
+        panel_height=180,
+    )

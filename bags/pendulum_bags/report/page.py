@@ -70,6 +70,7 @@ def render_page(
         made_at=made_at,
         verdict=verdict,
         unpaired=data.comparison.unpaired_verdict,
+        noise_note=_noise_note(data),
         is_paired=data.comparison.is_paired,
         facts=_facts(data),
         sections=sections,
@@ -97,9 +98,26 @@ def _facts(data: ReportData) -> list[tuple[str, str]]:
     ]
     if comparison.is_paired:
         facts.append(("paths apart (rms)", quantity(float(pair.as_dict()["rms_position"]), "rad")))
-    facts.append(("hardware answers", f"{1e3 * pair.response.delay:.1f} ms later"))
+    facts.append(
+        (
+            "hardware answers",
+            f"{abs(1e3 * pair.response.delay):.1f} ms {'later' if pair.response.delay >= 0.0 else 'earlier'}",
+        )
+    )
     facts.append(("seed", str(data.summary.get("seed", "unknown"))))
     return facts
+
+
+def _noise_note(data: ReportData) -> str:
+    """Say how long each side held its noise, where that differs: it matters more than the plant."""
+    hold = data.comparison.unpaired["noise_hold_time"]
+    sim, hw = hold["sim"], hold["hw"]
+    if not sim or not hw or abs(sim - hw) < 1e-6:
+        return ""
+    return (
+        f"The simulation by the thesis's own protocol holds each noise sample for {1e3 * sim:.3g} ms, the hardware for "
+        f"{1e3 * hw:.3g} ms; noise that is held longer moves the pendulum more, whatever the plant."
+    )
 
 
 def _anchor(text: str) -> str:
@@ -114,5 +132,5 @@ def _script_json(value: Any) -> str:
 @lru_cache(maxsize=1)
 def _packed_plotly() -> str:
     """Return plotly.js, gzipped and in base64: a third of its size, and browsers unpack gzip by themselves."""
-    source = resources.files("plotly").joinpath("package_data", "plotly.min.js").read_bytes()
+    source = resources.files("plotly").joinpath("package_data").joinpath("plotly.min.js").read_bytes()
     return base64.b64encode(gzip.compress(source, 9, mtime=0)).decode("ascii")

@@ -14,9 +14,14 @@ if TYPE_CHECKING:
 
 __all__ = ["write_figures"]
 
-_DASHES: dict[str, Any] = {"solid": "-", "dash": (0, (5, 2)), "dot": (0, (1, 1.4)), "dashdot": (0, (6, 2, 1, 2))}
+_DASHES: dict[str, Any] = {
+    "solid": "-",
+    "dash": (0, (5, 2)),
+    "dot": (0, (1, 1.4)),
+    "dashdot": (0, (6, 2, 1, 2)),
+}
 _MARKERS = {"circle": "o", "square": "s", "triangle": "^", "cross": "x"}
-_STYLE = {
+_STYLE: dict[Any, Any] = {
     "font.size": 9.0,
     "axes.titlesize": 9.5,
     "axes.labelsize": 9.0,
@@ -36,7 +41,9 @@ _WIDTH = 6.6
 _RESOLUTION = 150
 
 
-def write_figures(figures: Sequence[Figure], folder: Path, formats: Sequence[str] = ("png", "pdf")) -> list[Path]:
+def write_figures(
+    figures: Sequence[Figure], folder: Path, formats: Sequence[str] = ("png", "pdf")
+) -> list[Path]:
     """Draw figures into a folder, which is made; existing files of the same names are replaced.
 
     Args:
@@ -93,7 +100,7 @@ def _draw(figure: Figure, canvas_type: Any) -> Any:
     for ax in axes[count:]:
         ax.set_visible(False)
     widest = max((len(name) for panel in figure.panels for name in panel.y_ticks), default=0)
-    left = min(0.55, 0.11 + 0.0105 * widest)
+    left = min(0.55, 0.13 + 0.0105 * widest)
     if figure.stacked:
         for ax in axes[: count - 1]:
             ax.set_xlabel("")
@@ -108,7 +115,12 @@ def _draw(figure: Figure, canvas_type: Any) -> Any:
         lines = -(-len(handles) // across)
         top += 0.17 * (lines - 1)
         canvas.legend(
-            handles.values(), handles.keys(), loc="upper center", ncols=across, bbox_to_anchor=(0.5, 1.0), handlelength=3.0
+            handles.values(),
+            handles.keys(),
+            loc="upper center",
+            ncols=across,
+            bbox_to_anchor=(0.5, 1.0),
+            handlelength=3.0,
         )
     titled = any(panel.title for panel in figure.panels)
     canvas.subplots_adjust(
@@ -117,7 +129,7 @@ def _draw(figure: Figure, canvas_type: Any) -> Any:
         bottom=0.5 / height,
         top=1.0 - (top + (0.2 if titled else 0.0)) / height,
         hspace=(0.3 if titled else 0.16) if figure.stacked else 0.55,
-        wspace=0.34,
+        wspace=0.42,
     )
     return canvas
 
@@ -130,7 +142,11 @@ def _draw_panel(ax: Axes, panel: Panel) -> None:
         line(mark.value, color="#555555", linewidth=0.9, linestyle=(0, (3, 2)))
         if mark.label:
             if mark.axis == "y":
-                place: dict[str, Any] = {"xy": (1.0, mark.value), "xycoords": ("axes fraction", "data"), "ha": "right"}
+                place: dict[str, Any] = {
+                    "xy": (1.0, mark.value),
+                    "xycoords": ("axes fraction", "data"),
+                    "ha": "right",
+                }
                 ax.annotate(mark.label, va="bottom", fontsize=7.5, color="#333333", **place)
             else:
                 place = {"xy": (mark.value, 1.0), "xycoords": ("data", "axes fraction"), "ha": "left"}
@@ -158,12 +174,21 @@ def _draw_trace(ax: Axes, trace: Trace) -> None:
     label = trace.label or "_nolegend_"
     marker: Any = _MARKERS[style.marker]
     if trace.kind == "points":
-        ax.plot(trace.x, trace.y, linestyle="none", marker=marker, markersize=3.2, color=style.colour, label=label)
+        ax.plot(
+            trace.x, trace.y, linestyle="none", marker=marker, markersize=3.2, color=style.colour, label=label
+        )
         return
     if trace.kind == "interval" and trace.low is not None and trace.high is not None:
         spread = [trace.x - trace.low, trace.high - trace.x]
         ax.errorbar(
-            trace.x, trace.y, xerr=spread, fmt=marker, color=style.colour, elinewidth=style.width, capsize=3, label=label
+            trace.x,
+            trace.y,
+            xerr=spread,
+            fmt=marker,
+            color=style.colour,
+            elinewidth=style.width,
+            capsize=3,
+            label=label,
         )
         return
     if trace.kind == "step":

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import base64
+import math
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from pendulum_bags.report.data import quantity
 from pendulum_bags.report.figure import ROLES, Figure, Panel, Trace, thinned
 
 __all__ = ["graphs_of"]
@@ -30,14 +32,25 @@ def _graph(figure: Figure, panels: list[Panel]) -> dict[str, Any]:
     share = (1.0 - gap * (count - 1)) / count
     data: list[dict[str, Any]] = []
     named: set[str] = set()
+    titled = bool(panels[0].title)
     layout: dict[str, Any] = {
         "font": _FONT,
-        "margin": {"l": 64, "r": 14, "t": 34, "b": 48},
-        "height": 84 + figure.panel_height * count + (40 if not figure.stacked else 0),
+        "margin": {"l": 64, "r": 14, "t": 54 if titled else 34, "b": 48},
+        "height": 84
+        + figure.panel_height * count
+        + (40 if not figure.stacked else 0)
+        + (20 if titled else 0),
         "paper_bgcolor": "rgba(0,0,0,0)",
         "plot_bgcolor": "#fff",
         "hovermode": "x" if figure.stacked else "closest",
-        "legend": {"orientation": "h", "x": 0, "y": 1.0, "yanchor": "bottom", "font": {"size": 12}},
+        "legend": {
+            "orientation": "h",
+            "x": 0,
+            "y": 1,
+            "yref": "container",
+            "yanchor": "top",
+            "font": {"size": 12},
+        },
         "dragmode": "zoom",
         "shapes": [],
         "annotations": [],
@@ -46,7 +59,13 @@ def _graph(figure: Figure, panels: list[Panel]) -> dict[str, Any]:
         suffix = "" if i == 0 else str(i + 1)
         top = 1.0 - i * (share + gap)
         last = i == count - 1
-        axis = {"gridcolor": _GRID, "zeroline": False, "linecolor": "#888", "ticks": "outside", "tickcolor": "#888"}
+        axis = {
+            "gridcolor": _GRID,
+            "zeroline": False,
+            "linecolor": "#888",
+            "ticks": "outside",
+            "tickcolor": "#888",
+        }
         x_axis: dict[str, Any] = {**axis, "anchor": f"y{suffix}", "type": "log" if panel.x_log else "linear"}
         y_axis: dict[str, Any] = {
             **axis,
@@ -62,22 +81,44 @@ def _graph(figure: Figure, panels: list[Panel]) -> dict[str, Any]:
             x_axis["showticklabels"] = False
         if i:
             x_axis["matches"] = "x"
-        for limits, target, log in ((panel.x_range, x_axis, panel.x_log), (panel.y_range, y_axis, panel.y_log)):
+        for limits, target, log in (
+            (panel.x_range, x_axis, panel.x_log),
+            (panel.y_range, y_axis, panel.y_log),
+        ):
             if limits:
                 target["range"] = [float(np.log10(v)) if log else float(v) for v in limits]
+        for log, target, letter in ((panel.x_log, x_axis, "x"), (panel.y_log, y_axis, "y")):
+            if log:
+                target.update(_log_ticks([getattr(trace, letter) for trace in panel.traces]))
         if panel.y_ticks:
-            y_axis.update(tickmode="array", tickvals=list(range(len(panel.y_ticks))), ticktext=list(panel.y_ticks))
+            y_axis.update(
+                tickmode="array", tickvals=list(range(len(panel.y_ticks))), ticktext=list(panel.y_ticks)
+            )
         if panel.square:
             y_axis["scaleanchor"] = f"x{suffix}"
         layout[f"xaxis{suffix}"], layout[f"yaxis{suffix}"] = x_axis, y_axis
         if panel.title:
-            layout["annotations"].append(_note(panel.title, 0.0, top, "paper", "paper", "left", "bottom", size=13))
+            layout["annotations"].append(
+                _note(panel.title, 0.0, top, "paper", "paper", "left", "bottom", size=13)
+            )
         for trace in panel.traces:
             data.append(_trace(trace, suffix, trace.label not in named))
             named.add(trace.label)
         _add_marks(layout, panel, suffix)
     layout["showlegend"] = any(trace.get("showlegend") for trace in data)
     return {"data": data, "layout": layout}
+
+
+def _log_ticks(values: list[NDArray[np.float64]]) -> dict[str, Any]:
+    """Return ticks at 1, 2, 5 of each decade, or at decades alone where there are many, written as numbers."""
+    joined = np.concatenate(values)
+    joined = joined[joined > 0.0]
+    if not joined.size:
+        return {}
+    low, high = math.floor(math.log10(joined.min())), math.ceil(math.log10(joined.max()))
+    shares = (1.0, 2.0, 5.0) if high - low <= 3 else (1.0,)
+    ticks = [share * 10.0**power for power in range(low, high + 1) for share in shares]
+    return {"tickmode": "array", "tickvals": ticks, "ticktext": [quantity(tick, "", 1) for tick in ticks]}
 
 
 def _add_marks(layout: dict[str, Any], panel: Panel, suffix: str) -> None:
@@ -97,7 +138,14 @@ def _add_marks(layout: dict[str, Any], panel: Panel, suffix: str) -> None:
 
 
 def _note(
-    text: str, x: float, y: float, x_reference: str, y_reference: str, x_anchor: str, y_anchor: str, size: int = 11
+    text: str,
+    x: float,
+    y: float,
+    x_reference: str,
+    y_reference: str,
+    x_anchor: str,
+    y_anchor: str,
+    size: int = 11,
 ) -> dict[str, Any]:
     return {
         "text": text,
@@ -127,7 +175,12 @@ def _trace(trace: Trace, suffix: str, first: bool) -> dict[str, Any]:
         "xaxis": f"x{suffix}",
         "yaxis": f"y{suffix}",
     }
-    marker = {"color": style.colour, "symbol": _MARKERS[style.marker], "size": 5, "line": {"color": style.colour, "width": 1.4}}
+    marker = {
+        "color": style.colour,
+        "symbol": _MARKERS[style.marker],
+        "size": 5,
+        "line": {"color": style.colour, "width": 1.4},
+    }
     if trace.kind == "points":
         return {**graph, "mode": "markers", "marker": marker}
     if trace.kind == "interval" and trace.low is not None and trace.high is not None:

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import json
 import math
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -19,6 +21,9 @@ __all__ = ["Table", "make_tables", "provenance_table"]
 
 WEIGHTS = ((1.0, 0.01, 0.1), (1.0, 0.1, 0.1), (100.0, 0.01, 0.1), (100.0, 0.1, 0.1))
 """q11, q22 and r of the combinations in the thesis."""
+
+
+_NUMERIC = re.compile(r"^[−–±]?[\d.]*(×10[⁻⁰¹²³⁴⁵⁶⁷⁸⁹]+)?$")
 
 
 @dataclass(frozen=True)
@@ -38,6 +43,11 @@ class Table:
     head: Sequence[str]
     rows: Sequence[Sequence[str]]
     section: str
+
+    @property
+    def numeric(self) -> list[bool]:
+        """Return for each column whether it holds numbers only, which then align to the right."""
+        return [all(_NUMERIC.match(row[i]) for row in self.rows) for i in range(len(self.head))]
 
 
 def make_tables(data: ReportData) -> list[Table]:
@@ -63,22 +73,34 @@ _PLANT_ROWS = (
 def _plants(data: ReportData) -> Table:
     plants = data.comparison.plants
     rows = [
-        (label, *(_cell(plant.get(key), digits) for plant in plants.values())) for label, key, digits in _PLANT_ROWS
+        (label, *(_cell(plant.get(key), digits) for plant in plants.values()))
+        for label, key, digits in _PLANT_ROWS
     ]
     sim, hw = plants["sim"], plants["hw"]
     sentence = (
         f"Torque stays below {quantity(max(sim['max_abs_u'], hw['max_abs_u']), 'N m')} on both plants; "
-        f"{int(sim['missed_deadlines'])} deadlines were missed in simulation and {int(hw['missed_deadlines'])} on hardware."
+        f"{int(sim['missed_deadlines'])} deadlines were missed in simulation and {int(hw['missed_deadlines'])} on "
+        "hardware."
     )
-    return Table("Plants under noise", sentence, ("", *(_PLANT_NAMES[name] for name in plants)), rows, "Verdict")
+    return Table(
+        "Plants under noise", sentence, ("", *(_PLANT_NAMES[name] for name in plants)), rows, "Verdict"
+    )
 
 
 def _tests(data: ReportData) -> Table:
     rows = []
     for test in data.comparison.verdict.tests:
         interval = test.interval
-        margin = f"{quantity(test.low)} to {quantity(test.high)}" if math.isfinite(test.low) else f"below {quantity(test.high)}"
-        more = "–" if test.more_runs == 0 else ("more runs hardly help" if test.more_runs is None else str(test.more_runs))
+        margin = (
+            f"{quantity(test.low)} to {quantity(test.high)}"
+            if math.isfinite(test.low)
+            else f"below {quantity(test.high)}"
+        )
+        more = (
+            "–"
+            if test.more_runs == 0
+            else ("more runs hardly help" if test.more_runs is None else str(test.more_runs))
+        )
         rows.append(
             (
                 test.quantity + (f" [{test.unit}]" if test.unit != "-" else ""),
@@ -90,11 +112,17 @@ def _tests(data: ReportData) -> Table:
                 more,
             )
         )
-    head = ("quantity", "estimate", "90 % interval", "margin", "result", "smallest margin that would hold", "runs to add")
-    stated = data.comparison.verdict.margins.stated
-    sentence = (
-        f"Two one-sided tests at 5 % each, intervals by block bootstrap; the margins {'were stated' if stated else 'are defaults'}."
+    head = (
+        "quantity",
+        "estimate",
+        "90 % interval",
+        "margin",
+        "result",
+        "smallest margin that would hold",
+        "runs to add",
     )
+    whose = "were stated" if data.comparison.verdict.margins.stated else "are defaults"
+    sentence = f"Two one-sided tests at 5 % each, intervals by block bootstrap; the margins {whose}."
     return Table("Tests against the margins", sentence, head, rows, "Verdict")
 
 
@@ -120,36 +148,47 @@ def _unpaired(data: ReportData) -> Table:
     position, velocity = block["position"], block["velocity"]
     small = abs(position["mean"]) < 0.01 and abs(velocity["mean"]) < 0.05
     sentence = (
-        "As the thesis concludes, mean differences of both position and velocity are close to zero."
+        "As the thesis concludes, the mean differences of position and velocity are close to zero "
+        "(below 0.01 rad and 0.05 rad/s)."
         if small
         else f"Unlike in the thesis, the means are not close to zero: {quantity(position['mean'], 'rad')} and "
         f"{quantity(velocity['mean'], 'rad/s')}."
     )
-    return _statistics(
-        block, "Statistics of the difference", sentence, "The thesis's analysis (unpaired)"
-    )
+    return _statistics(block, "Statistics of the difference", sentence, "The thesis's analysis (unpaired)")
 
 
 def _metrics(data: ReportData) -> Table:
     rows = [
-        (f"{row['metric'].replace('_', ' ')} [{row['unit']}]", _cell(row["sim"], 4), _cell(row["hw"], 4), row["meaning"])
+        (
+            f"{row['metric'].replace('_', ' ')} [{row['unit']}]",
+            _cell(row["sim"], 4),
+            _cell(row["hw"], 4),
+            row["meaning"],
+        )
         for row in data.comparison.metrics
     ]
     ratio = {row["metric"]: (row["sim"], row["hw"]) for row in data.comparison.metrics}
     rough = ratio.get("smoothness", (None, None))
     sentence = (
-        f"The torque changes at {quantity(rough[0], 'N m/s')} (rms) in simulation and {quantity(rough[1], 'N m/s')} on hardware."
+        f"The torque changes at {quantity(rough[0], 'N m/s')} (rms) in simulation and {quantity(rough[1], 'N m/s')} "
+        "on hardware."
         if rough[0] is not None and rough[1] is not None
         else "Metrics of the regulation."
     )
-    return Table("Metrics of the regulation", sentence, ("metric", "simulation", "hardware", "meaning"), rows, "Paired comparison")
+    return Table(
+        "Metrics of the regulation",
+        sentence,
+        ("metric", "simulation", "hardware", "meaning"),
+        rows,
+        "Paired comparison",
+    )
 
 
 def _eigenvalues(data: ReportData) -> Table | None:
     if data.plant is None or data.plant.drivetrain is not None:
         return None
     model = linearise(data.plant)
-    open_loop = sort_poles(np.linalg.eigvals(model.A))
+    open_loop = sort_poles(np.linalg.eigvals(model.A).astype(complex))
     rows = [("none", "–", "–", "–", _poles(open_loop), "–")]
     for number, (q11, q22, r) in enumerate(WEIGHTS, start=1):
         gain = continuous_lqr(model, [q11, q22], r)
@@ -157,12 +196,16 @@ def _eigenvalues(data: ReportData) -> Table | None:
         rows.append((str(number), *values))
     chosen = data.run.get("controller", {})
     used = next(
-        (n for n, w in enumerate(WEIGHTS, 1) if [*chosen.get("q", ()), chosen.get("r")] == [w[0], w[1], w[2]]), None
+        (
+            n
+            for n, w in enumerate(WEIGHTS, 1)
+            if [*chosen.get("q", ()), chosen.get("r")] == [w[0], w[1], w[2]]
+        ),
+        None,
     )
     unstable = float(np.max(open_loop.real))
-    sentence = (
-        f"Upright, the plant runs away at {unstable:.6f} 1/s without control; "
-        + (f"this run used combination {used}." if used else "this run used other weights than these.")
+    sentence = f"Upright, the plant runs away at {unstable:.6f} 1/s without control; " + (
+        f"this run used combination {used}." if used else "this run used other weights than these."
     )
     head = ("#", "q11", "q22", "r", "eigenvalues [1/s]", "K [N m/rad, N m s/rad]")
     return Table("Eigenvalues of the linearised system", sentence, head, rows, "Model")
@@ -170,7 +213,8 @@ def _eigenvalues(data: ReportData) -> Table | None:
 
 def _poles(poles: Any) -> str:
     return ", ".join(
-        f"{pole.real:.6f}".replace("-", "−") if abs(pole.imag) < 1e-12 else f"{pole:.6g}" for pole in np.atleast_1d(poles)
+        f"{pole.real:.6f}".replace("-", "−") if abs(pole.imag) < 1e-12 else f"{pole:.6g}"
+        for pole in np.atleast_1d(poles)
     )
 
 
@@ -178,9 +222,14 @@ def _model(data: ReportData) -> Table | None:
     plant = data.plant
     if plant is None:
         return None
-    rows = [(spec.name, quantity(getattr(plant, spec.name), "", 6), spec.unit, spec.description) for spec in PLANT_SPECS]
-    sentence = f"The simulation and the controller's design use the plant {plant.name!r}: M θ″ + b θ′ + G sin θ = u + d."
-    return Table("Parameters of the model", sentence, ("parameter", "value", "unit", "meaning"), rows, "Model")
+    rows = [
+        (spec.name, quantity(getattr(plant, spec.name), "", 6), spec.unit, spec.description)
+        for spec in PLANT_SPECS
+    ]
+    sentence = f"Simulation and design of the controller use the plant {plant.name!r}: M θ″ + b θ′ + G sin θ = u + d."
+    return Table(
+        "Parameters of the model", sentence, ("parameter", "value", "unit", "meaning"), rows, "Model"
+    )
 
 
 def provenance_table(data: ReportData) -> Table:
@@ -195,17 +244,28 @@ def provenance_table(data: ReportData) -> Table:
         for one in (pair.simulation, pair.hardware):
             plant = one.metadata.get("pendulum.run", {})
             name = plant.get("plant", "unknown") if isinstance(plant, Mapping) else "unknown"
-            rows.append((f"bag of the {one.label}", f"{one.source} (plant {name})"))
+            rows.append((f"bag of the {one.label}", f"{_short_path(one.source)} (plant {name})"))
             rows += [(f"damage of the {one.label}'s bag", text) for text in one.damage]
     for run_data in data.comparison.own:
         if all(run_data is not pair.simulation for pair in data.comparison.pairs):
-            rows.append((f"bag of the {run_data.label}", run_data.source))
+            rows.append((f"bag of the {run_data.label}", _short_path(run_data.source)))
     for key in ("controller", "disturbance"):
         if key in run:
             rows.append((key, json.dumps(run[key])))
     versions = summary.get("versions") or run.get("versions") or {}
     rows += [(f"version of {name}", str(version)) for name, version in versions.items()]
-    return Table("Provenance", "Everything that is needed to make these figures again.", ("what", "value"), rows, "Provenance")
+    return Table(
+        "Provenance",
+        "Everything that is needed to make these figures again.",
+        ("what", "value"),
+        rows,
+        "Provenance",
+    )
+
+
+def _short_path(path: str) -> str:
+    """Return folder and bag: the rest of the path is nobody else's business."""
+    return "/".join(Path(path).parts[-2:])
 
 
 def _cell(value: Any, digits: int) -> str:

@@ -58,10 +58,17 @@ def write_report(
 
     out = Path(run_folder)
     if comparison is None:
-        comparison = compare_folders(list(folders) or [out], margin=_margin_of(summary) if margin is None else margin)
+        comparison = compare_folders(
+            list(folders) or [out], margin=_margin_of(summary) if margin is None else margin
+        )
     content = {**comparison.to_json(), **(summary or {})}
     found = [find_real_recording()] if recordings is None else list(recordings)
-    replays = [replay for path in found if path is not None for replay in _replay(path, required=recordings is not None)]
+    replays = [
+        replay
+        for path in found
+        if path is not None
+        for replay in _replay(path, required=recordings is not None)
+    ]
     names = [Path(folder).name for folder in folders] or [out.resolve().name]
     data = ReportData(comparison, content, replays, names)
     figures, missing = make_figures(data)
@@ -92,7 +99,11 @@ def find_real_recording() -> Path | None:
     the folder that holds this checkout.
     """
     told = os.environ.get("PENDULUM_SHARED_DATA")
-    places = [Path(told)] if told else [parent / "shared" / "data" for parent in Path(__file__).resolve().parents[3:5]]
+    places = (
+        [Path(told)]
+        if told
+        else [parent / "shared" / "data" for parent in Path(__file__).resolve().parents[3:5]]
+    )
     return next((place / REAL_RECORDING for place in places if (place / REAL_RECORDING).is_file()), None)
 
 
