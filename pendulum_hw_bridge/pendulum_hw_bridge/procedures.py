@@ -31,8 +31,10 @@ HAND_TRIALS = 6
 STAIRCASE_TRIALS = 3
 """Trials of experiment 2."""
 
-_HAND_STIFFNESS = 80.0
-_HAND_DAMPING = 4.0
+_HAND_FEEL = 11.8
+"""Torque that the hand has learnt to give for a velocity [N m s/rad]."""
+_HAND_STIFFNESS = 15.0
+_HAND_DAMPING = 0.2
 _TREMOR_TONES = 6
 _TREMOR_HERTZ = (0.3, 1.5)
 _TREMOR_RADIANS = 0.05
@@ -42,8 +44,8 @@ _TREMOR_RADIANS = 0.05
 class HandMotion:
     """One trial of experiment 1: a hand turns the link from 0 to pi (or -pi), rests, and comes back.
 
-    The hand follows a minimum-jerk path with a tremor of a few slow tones on top, as a spring and a damper between
-    where it wants the link and where the link is.
+    The hand follows a minimum-jerk path with a tremor of a few slow tones on top. It gives the torque that the motion
+    is known to take, and corrects softly: a stiff hand that reacts once in 10 ms would shake the link on its spring.
 
     Attributes:
         direction: 1 for counter-clockwise first, -1 for clockwise.
@@ -100,7 +102,8 @@ class HandMotion:
             velocity: Of the link [rad/s].
         """
         wanted, wanted_rate = self.reference(time)
-        return _HAND_STIFFNESS * (wanted - position) + _HAND_DAMPING * (wanted_rate - velocity)
+        correction = _HAND_STIFFNESS * (wanted - position) + _HAND_DAMPING * (wanted_rate - velocity)
+        return _HAND_FEEL * wanted_rate + correction
 
 
 @dataclass(frozen=True)
