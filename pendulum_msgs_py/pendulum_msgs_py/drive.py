@@ -113,6 +113,8 @@ class PlantLimits:
                 raise ParameterError(f"{name} is {getattr(self, name)} {unit}; expected >= 0")
         if not math.isfinite(self.handover_time):
             raise ParameterError(f"handover_time is {self.handover_time} s; expected a finite number >= 0")
+        if not self.handover_effort > 0.0:
+            raise ParameterError(f"handover_effort is {self.handover_effort} N m; expected > 0")
         if not self.tracking_error > 0.0:
             raise ParameterError(f"tracking_error is {self.tracking_error} rad; expected > 0")
         if not self.position_min < self.position_max:

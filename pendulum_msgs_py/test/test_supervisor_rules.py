@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import dataclasses
 import itertools
 import math
 
+import pytest
 from hypothesis import settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, precondition, rule
 
+from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.supervisor import (
     PUSH_LIMIT_FACTOR,
     Drive,
@@ -56,6 +59,7 @@ class PlantRules(RuleBasedStateMachine):
             handover_time=handover,
             position_min=window[0],
             position_max=window[1],
+            handover_effort=math.inf,
         )
         self.supervisor = PlantSupervisor(self.limits)
         self._measure(0.1, 0.0)
@@ -307,7 +311,7 @@ def test_torque_passes_from_effort_to_position_control_without_a_jump() -> None:
 
 
 def test_torque_passes_from_position_to_effort_control_without_a_jump() -> None:
-    loop = Loop()
+    loop = Loop(handover_effort=math.inf)
     loop.servo = 1.7
     assert loop.follow(_hold(0.2)) == ""
     loop.run(0.25, command=-3.0)
@@ -334,9 +338,21 @@ def test_a_controller_that_dies_during_the_fade_leaves_zero_torque() -> None:
 def test_commands_during_a_trajectory_wait_for_its_end() -> None:
     loop = Loop()
     loop.follow(_hold(0.1))
+    loop.servo = 2.5
     loop.run(0.09, command=3.0)
     assert loop.supervisor.mode is Mode.POSITION
     loop.run(0.02, command=3.0)
+    assert loop.supervisor.mode is Mode.EFFORT
+
+
+def test_a_controller_for_another_place_takes_over_nothing() -> None:
+    loop = Loop(handover_effort=2.0)
+    loop.servo = 0.2
+    loop.follow(_hold(0.1))
+    loop.run(0.5, command=-4.9)
+    assert loop.supervisor.mode is Mode.POSITION
+    assert "lqr asks for -4.90 N m" in loop.supervisor.reason
+    loop.run(0.01, command=2.1)
     assert loop.supervisor.mode is Mode.EFFORT
 
 
@@ -484,3 +500,20 @@ def test_two_huge_torques_of_opposite_sign_stay_finite() -> None:
     drive = loop.supervisor.decide(loop.now, loop.sample())
     assert drive.effort == 5.0
     assert drive.saturated
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        *((name, math.nan) for name in sorted({field.name for field in dataclasses.fields(PlantLimits)})),
+        *((name, -1.0) for name in ("effort", "command_timeout", "velocity", "slew", "handover_time", "arm_effort")),
+        ("effort", math.inf),
+        ("effort", 0.0),
+        ("command_timeout", math.inf),
+        ("handover_time", math.inf),
+        ("tracking_error", 0.0),
+    ],
+)
+def test_limits_that_limit_nothing_or_everything_are_refused(name: str, value: float) -> None:
+    with pytest.raises(ParameterError, match="expected"):
+        PlantLimits(**{"effort": 5.0, name: value})

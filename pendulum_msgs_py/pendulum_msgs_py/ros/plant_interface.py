@@ -28,21 +28,26 @@ from pendulum_msgs_py.ros.convert import (
     command_from_bytes,
     diagnostic_status,
     event_message,
+    stamp_from_message,
     stamp_to_message,
     trajectory_from_message,
 )
 from pendulum_msgs_py.supervisor import Drive, Input, Mode, PlantLimits, PlantSupervisor
 from pendulum_msgs_py.timing import LoopStatistics
-from pendulum_msgs_py.values import JointCommand, JointSample
+from pendulum_msgs_py.values import NANOSECONDS, JointCommand, JointSample
 
 __all__ = ["LIMIT_SPECS", "PlantInterface", "limits_from_parameters"]
 
 DIAGNOSTICS_PERIOD = 0.5
 """Time between two diagnostics [s]."""
+TRAJECTORY_AGE_LIMIT = 1.0
+"""Largest distance of a trajectory's stamp from the plant's time [s]: an old wish should not move a machine."""
 _LAST_WORDS = Duration(seconds=0.2)
 """Longest wait for subscribers to have heard that the plant stops."""
 _TWIN_CHECK_PERIOD_NS = 50_000_000
 """Least time between two looks at the graph after answers came twice [ns]."""
+_CONTRADICTION_HOLD_NS = 1_000_000_000
+"""Time after the last contradiction between two commanders at which they are believed again [ns]."""
 _UNKNOWN_NODE = "_NODE_NAME_UNKNOWN_"
 """What discovery calls a node whose name has not arrived yet."""
 
@@ -199,7 +204,7 @@ class PlantInterface:
         self._told_mode: tuple[Mode, bool, bool] | None = None
         self._told_refusals = 0
         self._checked_commanders_ns = 0
-        self._duplicates_at_check = 0
+        self._contradicted_ns: int | None = None
         self._seconds_at_check = 0
         self._second_commander = False
         self._stopping = False
@@ -309,8 +314,8 @@ class PlantInterface:
         def receive(data: bytes) -> None:
             command = command_from_bytes(data)
             refusal = supervisor.offer(kind, command, self.clock())
-            if refusal is Refusal.DUPLICATE and kind is Input.EFFORT_COMMAND:
-                self._suspect_twins()
+            if refusal is Refusal.DUPLICATE and kind is Input.EFFORT_COMMAND and command is not None:
+                self._suspect_twins(command)
             if refusal is None and self.on_command is not None and command is not None:
                 self.on_command(kind, command)
 
@@ -321,6 +326,13 @@ class PlantInterface:
             trajectory = trajectory_from_message(message)
             if self.sample is None:
                 raise ParameterError("no measurement yet")
+            stamp_ns = stamp_from_message(message.header.stamp)
+            age = (self.clock() - stamp_ns) / NANOSECONDS
+            if stamp_ns != 0 and abs(age) > TRAJECTORY_AGE_LIMIT:
+                raise ParameterError(
+                    f"trajectory is stamped {age:.3f} s before the plant's time; expected at most "
+                    f"{TRAJECTORY_AGE_LIMIT:g} s either way, or a stamp of 0 for now"
+                )
             refusal = self.supervisor.accept_trajectory(trajectory, self.clock(), self.sample)
             if refusal:
                 raise ParameterError(refusal)
@@ -367,9 +379,15 @@ class PlantInterface:
         self._tell_refusals()
         self.publish_diagnostics()
 
-    def _suspect_twins(self) -> None:
-        """Look at the graph at once when a state is answered twice: two commanders may share a name."""
-        now = time.monotonic_ns()
+    def _suspect_twins(self, command: JointCommand) -> None:
+        """Look at the graph at once when a state is answered in two ways: two commanders may share a name.
+
+        Answered alike, it is one commander that repeats itself, as in lockstep after a lost message.
+        """
+        newest = self.supervisor.gates[Input.EFFORT_COMMAND].fresh(self.clock())
+        if newest is None or newest.effort == command.effort:
+            return
+        now = self._contradicted_ns = time.monotonic_ns()
         if now - self._checked_commanders_ns >= _TWIN_CHECK_PERIOD_NS:
             self._check_commanders()
 
@@ -381,18 +399,16 @@ class PlantInterface:
         )
         twins = [name for name, count in found.items() if count > 1 and not name.endswith(_UNKNOWN_NODE)]
         gate = self.supervisor.gates[Input.EFFORT_COMMAND]
-        answered_twice = gate.refused[Refusal.DUPLICATE] - self._duplicates_at_check
-        self._duplicates_at_check = gate.refused[Refusal.DUPLICATE]
-        self._checked_commanders_ns = time.monotonic_ns()
+        self._checked_commanders_ns = now = time.monotonic_ns()
         conflict = ""
         if twins:
             conflict = f"{found[twins[0]]} commanders named {twins[0]} on {topic}; expected one: zero torque"
         elif found.total() > 1 and gate.newest_stamp_ns is not None:
             if gate.commander == "":
                 conflict = f"{found.total()} unnamed commanders on {topic}; expected one, or a frame_id: zero torque"
-            elif answered_twice:
+            elif self._contradicted_ns is not None and now - self._contradicted_ns < _CONTRADICTION_HOLD_NS:
                 conflict = (
-                    f"{found.total()} commanders on {topic} answer the same state as {gate.commander!r}; "
+                    f"{found.total()} commanders on {topic} give two answers to one state as {gate.commander!r}; "
                     "expected a frame_id of its own for each: zero torque"
                 )
         if conflict and conflict != self.supervisor.commander_conflict:

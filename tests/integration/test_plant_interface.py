@@ -1,0 +1,367 @@
+"""The shared interface of a plant over real DDS: services, refusals, signals, parameters."""
+
+from __future__ import annotations
+
+import signal
+import subprocess
+import sys
+import time
+from collections import deque
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+
+rclpy = pytest.importorskip("rclpy")
+from diagnostic_msgs.msg import DiagnosticArray  # noqa: E402
+from rcl_interfaces.msg import Parameter, ParameterValue  # noqa: E402
+from rcl_interfaces.srv import SetParameters  # noqa: E402
+from rclpy.executors import SingleThreadedExecutor  # noqa: E402
+from sensor_msgs.msg import JointState  # noqa: E402
+from std_srvs.srv import SetBool, Trigger  # noqa: E402
+from trajectory_msgs.msg import JointTrajectory  # noqa: E402
+
+from pendulum_msgs_py.names import JOINT  # noqa: E402
+from pendulum_msgs_py.ros import qos  # noqa: E402
+from pendulum_msgs_py.ros.convert import stamp_to_message, trajectory_to_message  # noqa: E402
+from pendulum_msgs_py.trajectory import from_points  # noqa: E402
+from tests.processes import ProcessGroup, RunningProgram  # noqa: E402
+
+_PLANT = Path(__file__).with_name("tiny_plant.py")
+
+
+class Peer:
+    """Everybody who may speak to the plant, in one node of this process."""
+
+    def __init__(self) -> None:
+        self.context = rclpy.Context()
+        rclpy.init(context=self.context)
+        self.executor = SingleThreadedExecutor(context=self.context)
+        self.nodes: list = []
+        self.node = self.add_node("peer")
+        self.states: deque[JointState] = deque(maxlen=1000)
+        self.applied: deque[JointState] = deque(maxlen=2000)
+        self.diagnostics: dict[str, str] = {}
+        self.level = b"\x00"
+        self.command = self.node.create_publisher(JointState, "effort_command", qos.COMMAND)
+        self.push = self.node.create_publisher(JointState, "push", qos.COMMAND)
+        self.disturbance = self.node.create_publisher(JointState, "disturbance", qos.COMMAND)
+        self.trajectory = self.node.create_publisher(JointTrajectory, "joint_trajectory", qos.TRAJECTORY)
+        self.node.create_subscription(JointState, "joint_states", lambda message: self.states.append(message), qos.STATE)
+        self.node.create_subscription(JointState, "applied_effort", lambda message: self.applied.append(message), qos.STATE)
+        self.node.create_subscription(DiagnosticArray, "/diagnostics", self._on_diagnostics, qos.DIAGNOSTICS)
+        self.arm_client = self.node.create_client(SetBool, "tiny_plant/arm")
+        self.e_stop_client = self.node.create_client(Trigger, "tiny_plant/e_stop")
+        self.reset_client = self.node.create_client(Trigger, "tiny_plant/e_stop_reset")
+        self.set_client = self.node.create_client(SetParameters, "tiny_plant/set_parameters")
+        self.answer: Callable[[JointState], None] | None = None
+
+    def add_node(self, name: str):
+        node = rclpy.create_node(name, context=self.context)
+        self.executor.add_node(node)
+        self.nodes.append(node)
+        return node
+
+    def _on_diagnostics(self, message: DiagnosticArray) -> None:
+        for status in message.status:
+            if status.name.endswith(": plant"):
+                self.diagnostics = {pair.key: pair.value for pair in status.values}
+                self.level = status.level
+
+    def until(self, predicate: Callable[[], object], what: str, timeout: float = 10.0) -> None:
+        deadline = time.monotonic() + timeout
+        while not predicate():
+            assert time.monotonic() < deadline, f"waited {timeout} s for {what}; diagnostics {self.diagnostics}"
+            seen = len(self.states) and self.states[-1]
+            self.executor.spin_once(timeout_sec=0.02)
+            if self.answer is not None and self.states and self.states[-1] is not seen:
+                self.answer(self.states[-1])
+
+    def spin(self, seconds: float) -> None:
+        deadline = time.monotonic() + seconds
+        self.until(lambda: time.monotonic() > deadline, "time to pass", seconds + 5.0)
+
+    def call(self, client, request):
+        assert client.wait_for_service(10.0)
+        future = client.call_async(request)
+        self.until(future.done, "the answer of a service")
+        return future.result()
+
+    def arm(self, on: bool = True):
+        return self.call(self.arm_client, SetBool.Request(data=on))
+
+    def count(self, key: str) -> int:
+        return int(self.diagnostics.get(f"effort_command.refused.{key}", 0))
+
+    def message(self, effort: float, *, stamp: object = None, frame: str = "lqr") -> JointState:
+        message = JointState(name=[JOINT], effort=[effort])
+        message.header.stamp = self.states[-1].header.stamp if stamp is None else stamp
+        message.header.frame_id = frame
+        return message
+
+    def stream(self, effort: float, frame: str = "lqr") -> None:
+        self.answer = lambda state: self.command.publish(
+            self.message(effort, stamp=state.header.stamp, frame=frame)
+        )
+
+    def close(self) -> None:
+        self.executor.shutdown()
+        for node in self.nodes:
+            node.destroy_node()
+        rclpy.shutdown(context=self.context)
+
+
+@pytest.fixture
+def peer(domain_id: int) -> Iterator[Peer]:
+    made = Peer()
+    yield made
+    made.close()
+
+
+def _start(processes: ProcessGroup, *arguments: str) -> RunningProgram:
+    return processes.start_command([sys.executable, str(_PLANT), *arguments], name="tiny_plant")
+
+
+@pytest.fixture
+def plant(processes: ProcessGroup, peer: Peer) -> RunningProgram:
+    program = _start(processes)
+    peer.until(
+        lambda: peer.states and peer.diagnostics and peer.command.get_subscription_count() == 1, "the plant", 20.0
+    )
+    return program
+
+
+def test_services_walk_through_the_states_and_a_reset_never_re_arms(plant: RunningProgram, peer: Peer) -> None:
+    assert peer.diagnostics["mode"] == "disarmed"
+    assert peer.arm().success
+    assert peer.call(peer.e_stop_client, Trigger.Request()).success
+    refused = peer.arm()
+    assert not refused.success
+    assert refused.message == "e-stop is latched; reset it first"
+    assert not peer.arm(False).success
+    assert peer.call(peer.reset_client, Trigger.Request()).message == "disarmed"
+    again = peer.call(peer.reset_client, Trigger.Request())
+    assert not again.success
+    assert again.message == "plant is disarmed; expected e_stop"
+    peer.stream(1.0)
+    peer.spin(0.3)
+    assert peer.applied[-1].effort[0] == 0.0
+    peer.answer = None
+    peer.spin(0.1)
+    assert peer.arm().success
+
+
+def test_every_refusal_is_counted_under_its_name_and_moves_nothing(plant: RunningProgram, peer: Peer) -> None:
+    assert peer.arm().success
+    peer.spin(0.1)
+    stamp = peer.states[-1].header.stamp
+    now_ns = stamp.sec * 10**9 + stamp.nanosec
+    peer.command.publish(JointState(name=[JOINT]))
+    peer.command.publish(JointState(name=[JOINT, "elbow"], effort=[1.0, 1.0]))
+    peer.command.publish(peer.message(float("nan")))
+    peer.command.publish(peer.message(float("inf")))
+    elbow = peer.message(3.0)
+    elbow.name = ["elbow"]
+    peer.command.publish(elbow)
+    peer.command.publish(peer.message(3.0, stamp=stamp_to_message(now_ns - 10**9)))
+    peer.command.publish(peer.message(3.0, stamp=stamp_to_message(now_ns + 10**10)))
+    peer.until(lambda: peer.count("from_future") == 1, "the last refusal")
+    assert [peer.count(key) for key in ("not_one_joint", "not_finite", "other_joint", "too_old")] == [2, 2, 1, 1]
+    assert all(message.effort[0] == 0.0 for message in peer.applied)
+
+
+def test_a_second_commander_is_refused_named_and_reported(plant: RunningProgram, peer: Peer) -> None:
+    assert peer.arm().success
+    peer.stream(1.0)
+    peer.until(lambda: peer.applied[-1].effort[0] == 1.0, "the first commander's torque")
+
+    def both(state: JointState) -> None:
+        peer.command.publish(peer.message(1.0, stamp=state.header.stamp))
+        peer.command.publish(peer.message(-4.0, stamp=state.header.stamp, frame="intruder"))
+
+    peer.answer = both
+    peer.until(lambda: peer.count("second_commander") > 5, "refusals of the second commander")
+    assert peer.diagnostics["commander"] == "lqr"
+    assert peer.diagnostics["refused_commander"] == "intruder"
+    assert peer.level == b"\x01"
+    assert min(message.effort[0] for message in peer.applied) >= 0.0
+
+
+@pytest.mark.parametrize("name", ["peer", "another"])
+def test_twins_behind_one_frame_id_get_no_torque(plant: RunningProgram, peer: Peer, name: str) -> None:
+    assert peer.arm().success
+    peer.stream(1.0)
+    peer.until(lambda: peer.applied[-1].effort[0] == 1.0, "torque")
+    twin_node = peer.add_node(name)
+    twin = twin_node.create_publisher(JointState, "effort_command", qos.COMMAND)
+    peer.until(lambda: twin.get_subscription_count() == 1, "the twin to be matched")
+
+    def both(state: JointState) -> None:
+        peer.command.publish(peer.message(1.0, stamp=state.header.stamp))
+        twin.publish(peer.message(-4.0, stamp=state.header.stamp))
+
+    peer.answer = both
+    peer.until(lambda: "expected" in peer.diagnostics["reason"], "the conflict to be seen")
+    assert peer.applied[-1].effort[0] == 0.0
+    twin_node.destroy_publisher(twin)
+    peer.stream(1.0)
+    peer.until(lambda: peer.applied[-1].effort[0] == 1.0, "torque after the twin has gone")
+
+
+def test_torque_is_the_clamped_sum_and_ends_with_the_commands(plant: RunningProgram, peer: Peer) -> None:
+    assert peer.arm().success
+
+    def both(state: JointState) -> None:
+        peer.command.publish(peer.message(4.0, stamp=state.header.stamp))
+        peer.disturbance.publish(peer.message(0.5, stamp=state.header.stamp, frame="noise"))
+
+    peer.answer = both
+    peer.until(lambda: peer.applied[-1].effort[0] == 4.5, "the sum")
+    peer.stream(1e308)
+    peer.until(lambda: peer.applied[-1].effort[0] == 5.0, "the clamped torque")
+    peer.answer = None
+    last = time.monotonic()
+    peer.until(lambda: peer.applied[-1].effort[0] == 0.0, "zero torque", 2.0)
+    # command_timeout 50 ms and a period of 10 ms; the rest is this process's own scheduling.
+    assert time.monotonic() - last < 0.5
+    peer.stream(2.0)
+    peer.until(lambda: peer.applied[-1].effort[0] == 2.0, "recovery by itself")
+
+
+def test_a_trajectory_is_followed_and_handed_over(plant: RunningProgram, peer: Peer) -> None:
+    move = trajectory_to_message(from_points([0.0, 0.3], [0.0, 0.05], [0.0, 0.0]))
+    peer.trajectory.publish(move)
+    peer.until(lambda: peer.diagnostics.get("joint_trajectory.refused.disarmed") == "1", "the refusal")
+    assert peer.arm().success
+    peer.trajectory.publish(move)
+    peer.until(lambda: peer.diagnostics["mode"] == "armed_position", "position control")
+    peer.until(lambda: "holding" in peer.diagnostics["reason"], "the end of the trajectory")
+    peer.stream(0.4)
+    peer.until(lambda: peer.diagnostics["mode"] == "armed_effort", "effort control")
+    peer.until(lambda: peer.applied[-1].effort[0] == 0.4, "the controller's torque")
+    bad = trajectory_to_message(from_points([0.0], [2.0], [0.0]))
+    peer.trajectory.publish(bad)
+    peer.until(lambda: peer.diagnostics.get("joint_trajectory.refused.invalid") == "1", "the second refusal")
+    stale = trajectory_to_message(from_points([0.0, 1.0], [0.0, 0.0], [0.0, 0.0]), stamp_ns=5)
+    peer.trajectory.publish(stale)
+    peer.until(lambda: peer.diagnostics.get("joint_trajectory.refused.invalid") == "2", "the third refusal")
+
+
+def test_parameters_change_at_run_time_or_say_why_not(plant: RunningProgram, peer: Peer) -> None:
+    def set_parameter(name: str, **value: object) -> tuple[bool, str]:
+        parameter = Parameter(name=name, value=ParameterValue(**value))
+        result = peer.call(peer.set_client, SetParameters.Request(parameters=[parameter])).results[0]
+        return result.successful, result.reason
+
+    assert set_parameter("gain", type=3, double_value=2.0) == (True, "")
+    refusals = {
+        "range": set_parameter("gain", type=3, double_value=-2.0),
+        "nan": set_parameter("gain", type=3, double_value=float("nan")),
+        "type": set_parameter("gain", type=4, string_value="2"),
+        "integer": set_parameter("gain", type=2, integer_value=2),
+        "choice": set_parameter("method", type=4, string_value="rk4"),
+        "together": set_parameter("gain", type=3, double_value=50.0),
+        "fixed": set_parameter("fixed", type=3, double_value=1.0),
+        "list": set_parameter("offsets", type=8, double_array_value=[0.0, float("inf")]),
+        "nothing": set_parameter("offsets", type=0),
+        "unknown": set_parameter("gian", type=3, double_value=1.0),
+    }
+    assert not [name for name, (accepted, _) in refusals.items() if accepted]
+    assert refusals["together"][1] == "gain times cycles is 150.0; expected at most 100"
+    assert refusals["choice"][1] == "method is 'rk4'; expected one of exact, euler"
+    assert "offsets is inf rad; expected a finite number" in refusals["list"][1]
+    assert all(reason for _, reason in refusals.values())
+    assert plant.returncode is None
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_stop_signal_ends_it_within_a_second_with_zero_torque_last(
+    plant: RunningProgram, peer: Peer, number: signal.Signals
+) -> None:
+    assert peer.arm().success
+    peer.stream(3.0)
+    peer.until(lambda: peer.applied[-1].effort[0] == 3.0, "torque")
+    start = time.monotonic()
+    plant.send_signal(number)
+    peer.until(lambda: plant.returncode is not None, "the end", 5.0)
+    assert time.monotonic() - start < 1.0
+    assert plant.returncode == 0
+    assert "closed" in plant.output
+    assert "Traceback" not in plant.output
+    peer.answer = None
+    peer.spin(0.2)
+    assert peer.applied[-1].effort[0] == 0.0
+    assert peer.diagnostics["mode"] == "disarmed"
+    assert peer.diagnostics["reason"] == "plant ends"
+
+
+def test_an_echo_of_the_signal_does_not_cut_the_way_out_short_but_a_second_wish_does(
+    processes: ProcessGroup, domain_id: int
+) -> None:
+    program = _start(processes, "--ros-args", "-p", "stubborn:=0.5")
+    program.wait_for_output("running", 20.0)
+    program.send_signal(signal.SIGINT)
+    program.send_signal(signal.SIGINT)
+    assert program.wait(5.0) == 0
+    assert "closed" in program.output
+
+    program = _start(processes, "--ros-args", "-p", "stubborn:=60.0")
+    program.wait_for_output("running", 20.0)
+    program.send_signal(signal.SIGTERM)
+    time.sleep(1.2)
+    program.send_signal(signal.SIGTERM)
+    assert program.wait(3.0) == 128 + signal.SIGTERM
+    assert "second SIGTERM: leaving at once" in program.output
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["-p", "gain:=1"], "gain is 1; expected a number >= 0; ROS tells whole numbers and decimals apart: write 1.0"),
+        (["-p", "gain:=-1.0"], "gain is -1.0 N m/rad; expected >= 0"),
+        (["-p", "gain:=.nan"], "gain is nan N m/rad; expected a finite number >= 0"),
+        (["-p", "gain:=abc"], "gain is 'abc'; expected a number >= 0"),
+        (["-p", "cycles:=2.5"], "cycles is 2.5; expected an integer 1 to 9"),
+        (["-p", "cycles:=10"], "cycles is 10; expected 1 to 9"),
+        (["-p", "method:=rk4"], "method is 'rk4'; expected one of exact, euler"),
+        (["-p", "offsets:=[1, 2]"], "offsets is [1, 2]; expected a list"),
+        (["-p", "gian:=1.0"], "/tiny_plant: unknown parameter 'gian'; did you mean 'gain'?"),
+        (["-p", "effort_limit:=6.0"], "effort_limit is 6.0 N m; expected at most 5.0 N m"),
+        (["-p", "position_window:=[1.0, 0.0]"], "position window is [1.0, 0.0] rad; expected min < max"),
+        (["-p", "gain"], "ROS arguments are not understood: Couldn't parse parameter override rule"),
+        (["-r", "__ns:=no namespace"], "ROS arguments are not understood"),
+        (["--params-file", "/nowhere.yaml"], "ROS arguments are not understood"),
+    ],
+)
+def test_a_bad_parameter_is_one_sentence_and_exit_code_2(
+    processes: ProcessGroup, domain_id: int, arguments: list[str], message: str
+) -> None:
+    program = _start(processes, "--ros-args", *arguments)
+    assert program.wait(20.0) == 2
+    errors = [line for line in program.output.splitlines() if line.startswith("error: ")]
+    assert len(errors) == 1
+    assert message in errors[0]
+    assert "Traceback" not in program.output
+
+
+def test_parameters_of_ros_itself_are_no_strangers(processes: ProcessGroup, domain_id: int) -> None:
+    program = _start(
+        processes,
+        "--ros-args",
+        *("-p", "use_sim_time:=false", "-p", "start_type_description_service:=false"),
+        *("-p", "qos_overrides./parameter_events.publisher.depth:=10"),
+    )
+    program.wait_for_output("running", 20.0)
+    program.send_signal(signal.SIGINT)
+    assert program.wait(5.0) == 0
+
+
+def test_help_shows_every_parameter_and_survives_a_reader_that_goes() -> None:
+    command = [sys.executable, str(_PLANT), "--help"]
+    text = subprocess.run(command, capture_output=True, text=True, check=True, timeout=30).stdout
+    for name in ("gain", "cycles", "effort_limit", "command_timeout", "example:"):
+        assert name in text
+    process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    process.stdout.close()
+    assert process.wait(30) == 0
+    assert process.stderr.read() == ""
