@@ -1,0 +1,73 @@
+"""Every command in a README runs; those of the pages are collected here, so that none is forgotten."""
+
+from __future__ import annotations
+
+import os
+import re
+import shlex
+import subprocess
+from pathlib import Path
+
+import pytest
+
+from tests.fixtures import PROJECT
+from tests.processes import ProcessGroup
+
+PAGES = sorted(
+    path
+    for path in PROJECT.rglob("*.md")
+    if not {".venv", "build", "install", "runs"} & set(path.relative_to(PROJECT).parts)
+)
+NODES = {"simulator", "bridge", "controller", "disturbance", "record"}
+TESTED_ELSEWHERE = {
+    "make experiment": "tests/acceptance/test_experiment.py",
+    "make test": "this very run",
+}
+_BLOCK = re.compile(r"^```sh\n(.*?)^```", re.MULTILINE | re.DOTALL)
+
+
+def _commands() -> list[tuple[str, str]]:
+    found = []
+    for page in PAGES:
+        for block in _BLOCK.findall(page.read_text(encoding="utf-8")):
+            for line in block.replace("\\\n", " ").splitlines():
+                command = line.split(" #")[0].strip()
+                if command:
+                    found.append((str(page.relative_to(PROJECT)), command))
+    return found
+
+
+COMMANDS = _commands()
+
+
+def test_readme_has_commands() -> None:
+    assert ("README.md", "make experiment") in COMMANDS
+
+
+@pytest.mark.timeout(180)
+@pytest.mark.parametrize(("page", "command"), COMMANDS, ids=[f"{page}: {command}" for page, command in COMMANDS])
+def test_command_of_a_page_runs(
+    processes: ProcessGroup, domain_id: int, tmp_path: Path, page: str, command: str
+) -> None:
+    if command in TESTED_ELSEWHERE:
+        pytest.skip(f"run by {TESTED_ELSEWHERE[command]}")
+    if "../shared/" in command and not (PROJECT.parent / "shared").is_dir():
+        pytest.skip("the recordings of real pendulums are not at hand")
+    words = shlex.split(command)
+    environment = {**os.environ, "PATH": f"{PROJECT / '.venv' / 'bin'}:{os.environ['PATH']}"}
+    if words[0] == "python" and words[1] == "-m" and words[3] in NODES:
+        program = processes.start(words[2], words[3], *words[4:], cwd=tmp_path)
+        program.wait_for_output(r"\[INFO\]|recording to", 60)
+        program.interrupt()
+        assert program.wait(20) == 0, program.output
+        return
+    # Pages are written for the project's root; what a command writes must not land there.
+    (tmp_path / "shared").symlink_to(PROJECT.parent / "shared")
+    root = tmp_path / "root"
+    root.mkdir()
+    for entry in PROJECT.iterdir():
+        (root / entry.name).symlink_to(entry)
+    done = subprocess.run(
+        command, shell=True, cwd=root, env=environment, capture_output=True, text=True, timeout=150, check=False
+    )
+    assert done.returncode == 0, f"{page}: {command}\n{done.stdout}\n{done.stderr}"
