@@ -17,6 +17,7 @@ from pendulum_bags.experiment.domain import check_domain
 from pendulum_bags.experiment.progress import PhaseProgress
 from pendulum_bags.experiment.run_folder import create_run_folder, discard_if_empty, versions, write_json
 from pendulum_bags.experiment.settings import NoiseSettings, RegulationSettings
+from pendulum_bags.experiment_trials_cli import add_commands as add_trial_commands
 from pendulum_msgs_py.errors import PendulumError
 from pendulum_msgs_py.executables import EXIT_INTERRUPTED, cli_main
 
@@ -146,6 +147,9 @@ def lockstep(
     run_lockstep(bag, settings, side=side, domain=domain)
     elapsed = time.monotonic() - started
     print(f"{bag}: {duration:g} s simulated in {elapsed:.1f} s, starting the nodes included", file=sys.stderr)
+
+
+add_trial_commands(app)
 
 
 def _analyse(folder: Path, settings: RegulationSettings) -> dict[str, Any]:

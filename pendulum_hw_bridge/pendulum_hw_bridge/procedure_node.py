@@ -24,7 +24,6 @@ from pendulum_msgs_py.ros import qos
 from pendulum_msgs_py.ros.convert import event_message, sample_from_bytes, trajectory_to_message
 from pendulum_msgs_py.ros.parameters import NodeParameters
 from pendulum_msgs_py.ros.runner import run_node
-from pendulum_msgs_py.values import JointSample
 
 __all__ = ["SPECS", "ProcedureNode", "main"]
 
@@ -81,6 +80,7 @@ class ProcedureNode(Node):
         self._trajectory = self.create_publisher(JointTrajectory, names.JOINT_TRAJECTORY, qos.TRAJECTORY)
         self._events = self.create_publisher(String, names.EVENTS, qos.EVENTS)
         self._newest_ns: int | None = None
+        self._answer: tuple[float | None, float | None] = (None, None)
         self.create_subscription(String, names.EVENTS, self._on_event, qos.EVENTS)
         self.create_subscription(JointState, names.JOINT_STATES, self._on_state, qos.NEWEST_STATE, raw=True)
         self.create_service(Trigger, "~/start", self._on_start)
@@ -95,7 +95,11 @@ class ProcedureNode(Node):
 
     def _on_state(self, data: bytes) -> None:
         sample = sample_from_bytes(data)
-        if sample is None or (self._newest_ns is not None and sample.stamp_ns <= self._newest_ns):
+        if sample is None or (self._newest_ns is not None and sample.stamp_ns < self._newest_ns):
+            return
+        if sample.stamp_ns == self._newest_ns:
+            # A plant in lockstep repeats a state whose answer it missed.
+            self._send()
             return
         self._newest_ns = sample.stamp_ns
         trial = self._trial
@@ -110,14 +114,18 @@ class ProcedureNode(Node):
             self._events.publish(event_message(stamp_ns, name, **details))
             self.get_logger().info(f"{name} {details}")
         if trial.finished and self._simulated_time and not answer.last:
+            self._answer = (None, None)
             return
-        # The push first: under lockstep, the effort may be the answer that makes the plant step.
-        if answer.push is not None:
-            self._push.publish(encode_joint_state(sample.stamp_ns, frame_id=self._full_name, effort=answer.push))
-        if answer.effort is not None:
-            self._effort.publish(
-                encode_joint_state(sample.stamp_ns, frame_id=self._full_name, effort=answer.effort)
-            )
+        self._answer = (answer.push, answer.effort)
+        self._send()
+
+    def _send(self) -> None:
+        assert self._newest_ns is not None
+        for publisher, torque in zip((self._push, self._effort), self._answer, strict=True):
+            if torque is not None:
+                publisher.publish(
+                    encode_joint_state(self._newest_ns, frame_id=self._full_name, effort=torque)
+                )
 
     def _on_event(self, message: String) -> None:
         failure = self._trial.hear(message.data)

@@ -194,6 +194,17 @@ class PlantClient:
         """Disarm the plant."""
         self.conductor.call(self._arm, SetBool.Request(data=False), f"{self.namespace} to disarm")
 
+    def call(self, service: str) -> None:
+        """Call a Trigger service of a node beside the plant, such as ``procedure/start``.
+
+        Raises:
+            FaultError: It is not there, or refuses.
+        """
+        client = self.conductor.node.create_client(Trigger, f"{self.namespace}/{service}")
+        response = self.conductor.call(client, Trigger.Request(), f"{self.namespace}/{service}")
+        if not response.success:
+            raise FaultError(f"{self.namespace}/{service} refuses: {response.message}")
+
     def resume(self, timeout: float) -> None:
         """Let a paused plant go."""
         self.conductor.call(self._pause, SetBool.Request(data=False), f"{self.namespace} to go on", timeout)

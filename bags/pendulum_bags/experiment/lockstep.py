@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 
 from pendulum_bags.experiment.conductor_node import Conductor, PlantClient, RecorderClient
@@ -15,13 +15,21 @@ from pendulum_msgs_py.angles import UPRIGHT
 from pendulum_msgs_py.errors import BagError
 from pendulum_msgs_py.graph import NodeProgram
 
-__all__ = ["plant_program", "run_lockstep"]
+__all__ = ["plant_program", "run_lockstep", "wait_until_all_hear_each_other"]
 
 _START_TIMEOUT = 60.0
 _SLOWEST = 10.0
 """Slowest pace at which a lockstep run still counts as alive, wall time per simulated time."""
 _LISTENERS = 3
 """Those who hear the plant's states: controller, disturbance, recorder. The conductor makes one more."""
+_RUN_LISTENERS = {
+    names.JOINT_STATES: _LISTENERS,
+    names.EFFORT_COMMAND: 2,
+    names.DISTURBANCE: 2,
+    names.APPLIED_EFFORT: 1,
+    names.EVENTS: 2,
+}
+"""How many listen to each topic of a run: its reader, the recorder, and to events the conductor."""
 
 
 def plant_program(side: str, settings: RegulationSettings, theta: float, duration: float) -> NodeProgram:
@@ -89,7 +97,7 @@ def run_lockstep(
         processes.start_node(settings.disturbance_program(namespace, autostart=True, use_sim_time=True))
         processes.start_node(program)
         client = PlantClient(conductor, namespace, program.node_name, watch=False)
-        _wait_until_all_hear_each_other(conductor, namespace)
+        wait_until_all_hear_each_other(conductor, namespace, _RUN_LISTENERS)
         if side == "hw":
             client.arm()
         client.watch()
@@ -106,28 +114,30 @@ def run_lockstep(
     return bag
 
 
-def _wait_until_all_hear_each_other(conductor: Conductor, namespace: str) -> None:
-    """Wait until every subscription of the run is on the graph, and the recorder's are matched with a publisher."""
+def wait_until_all_hear_each_other(
+    conductor: Conductor, namespace: str, listeners: Mapping[str, int], *, clock: bool = True
+) -> None:
+    """Wait until every subscription of a run is on the graph, and the recorder's are matched with a publisher.
+
+    Args:
+        conductor: Who conducts.
+        namespace: Namespace of the plant.
+        listeners: How many subscriptions each topic of the plant must have, by relative name.
+        clock: Whether the plant keeps simulated time, which is recorded too.
+    """
     node = conductor.node
-    wanted = {
-        # topic: how many listen
-        names.JOINT_STATES: _LISTENERS,
-        names.EFFORT_COMMAND: 2,
-        names.DISTURBANCE: 2,
-        names.APPLIED_EFFORT: 1,
-        names.EVENTS: 2,
-    }
 
     def complete() -> bool:
         return all(
             node.count_subscribers(f"{namespace}/{topic}") >= count
-            and node.count_publishers(f"{namespace}/{topic}") >= 1
-            for topic, count in wanted.items()
+            and node.count_publishers(f"{namespace}/{topic}") >= (1 if count else 0)
+            for topic, count in listeners.items()
         )
 
     conductor.wait_for("all nodes to hear each other", complete, _START_TIMEOUT)
     recorder = RecorderClient(conductor, namespace)
-    recorded = {f"{namespace}/{topic}" for topic in wanted} | {names.CLOCK}
+    recorded = {f"{namespace}/{topic}" for topic, count in listeners.items() if count}
+    recorded |= {names.CLOCK} if clock else set()
     conductor.wait_for("the recorder to hear all topics", lambda: recorded <= recorder.heard(), _START_TIMEOUT)
     # What one side of a match knows, the other side knows a moment later.
     conductor.spin(0.1)
