@@ -108,10 +108,11 @@ class InputReplay:
     def sentence(self) -> str:
         """Return the result in words."""
         where = "never" if self.diverges_at is None else f"after {self.diverges_at:.2f} s"
+        best, worst = self.by_window.min(), self.by_window.max()
         return (
             f"Driven by the measured torque of {self.name}, the plant {self.plant.name!r} errs by {self.rms:.4f} rad "
-            f"rms over windows of {self.window:g} s (best {self.by_window.min():.4f}, worst {self.by_window.max():.4f}); "
-            f"in free run by {self.free_run_rms:.4f} rad (fit {self.fit:.1f} %), and it departs by more than "
+            f"rms over windows of {self.window:g} s (best {best:.4f}, worst {worst:.4f}); in free run by "
+            f"{self.free_run_rms:.4f} rad (fit {self.fit:.1f} %), and it departs by more than "
             f"{self.threshold:.2f} rad {where}."
         )
 
@@ -144,6 +145,8 @@ def replay_recording(
     window: float = 1.0,
     mapping: str | Path | None = None,
     effort: str = "applied",
+    start: float | None = None,
+    stop: float | None = None,
 ) -> InputReplay:
     """Read a recording (CSV or bag) and drive a plant with its torque.
 
@@ -153,12 +156,17 @@ def replay_recording(
         window: Length of the windows [s].
         mapping: Mapping file of a CSV.
         effort: For bags, ``applied`` or ``measured`` torque.
+        start, stop: Part to use, from the beginning of the recording [s].
 
     Raises:
         DataError: The recording is damaged or its input is no torque.
         ParameterError: The plant file is refused.
     """
     recording = read_recording(path, mapping, effort=effort)
+    if start is not None or stop is not None:
+        begin = float(recording.time[0])
+        last = math.inf if stop is None else begin + stop
+        recording = recording.between(begin + (start or 0.0), last)
     parameters = plant if isinstance(plant, PlantParameters) else load_plant(plant)
     return replay_input(recording, parameters, window=window)
 

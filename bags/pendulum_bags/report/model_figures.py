@@ -85,7 +85,9 @@ def gravity_fit(data: ReportData) -> Figure | str:
     if not panels:
         return "needs ramps with measured torque"
     gives = "; ".join(words)
-    sentence = f"Least squares of the measured torque on sin θ, θ′ and a constant over the way up gives {gives}."
+    sentence = (
+        f"Least squares of the measured torque on sin θ, θ′ and a constant over the way up gives {gives}."
+    )
     return Figure(
         "gravity_fit",
         "Torque over sin θ",

@@ -277,14 +277,17 @@ def ramps(data: ReportData) -> Figure | str:
                         title=f"{text[:2].strip()} {way}",
                     )
                 )
-    fastest = max(float(np.abs(series.velocity).max()) for parts in moves.values() for *_, series, _ in parts)
+    speeds = {
+        label: float(np.median(np.abs(series.velocity)))
+        for label, _, series, _ in moves["up"] or moves["down"]
+    }
+    spans = [series.duration for parts in moves.values() for *_, series, _ in parts]
     last = [
         f"{label} {quantity(float(series.position[-1]), 'rad', 5)}" for label, _, series, _ in moves["up"]
     ]
     reached = f" The way up ends at {' and '.join(last)}." if last else ""
-    sentence = (
-        f"Both plants move along the half-sine ramps with at most {quantity(fastest, 'rad/s')}.{reached}"
-    )
+    typical = " and ".join(f"{quantity(speed, 'rad/s')} ({label})" for label, speed in speeds.items())
+    sentence = f"A ramp takes {max(spans):.1f} s; the median speed is {typical}.{reached}"
     return Figure(
         "ramps",
         "Ramps up and down",
