@@ -30,10 +30,10 @@ def wrap(angle: float | NDArray[np.float64]) -> float | NDArray[np.float64]:
     """
     if isinstance(angle, np.ndarray):
         with np.errstate(invalid="ignore"):
-            wrapped = (angle + math.pi) % _TWO_PI - math.pi
+            turned = (angle + math.pi) % _TWO_PI - math.pi
         # The modulo of a tiny negative number rounds up to the modulus itself.
-        wrapped = np.where(wrapped >= math.pi, -math.pi, wrapped)
-        return np.where((angle >= -math.pi) & (angle < math.pi), angle, wrapped)
+        turned = np.where(turned >= math.pi, -math.pi, turned)
+        return np.where((angle >= -math.pi) & (angle < math.pi), angle, turned)
     if -math.pi <= angle < math.pi:
         return angle
     if math.isinf(angle):

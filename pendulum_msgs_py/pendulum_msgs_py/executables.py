@@ -12,7 +12,7 @@ import sys
 from collections.abc import Sequence
 from difflib import get_close_matches
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from pendulum_msgs_py.errors import PendulumError
 
@@ -68,7 +68,7 @@ def cli_main(app: typer.Typer, argv: Sequence[str] | None = None, *, name: str |
     import typer.main
 
     # typer brings a click of its own, which is no other click's: its errors are found through what it exports.
-    usage_error = next(kind for kind in typer.BadParameter.__mro__ if kind.__name__ == "ClickException")
+    usage_error: Any = next(kind for kind in typer.BadParameter.__mro__ if kind.__name__ == "ClickException")
     command = typer.main.get_command(app)
     try:
         result = command.main(

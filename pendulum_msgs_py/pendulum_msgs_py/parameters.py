@@ -222,7 +222,7 @@ class _StrictLoader(yaml.SafeLoader):
         self._depth = 0
 
     def compose_node(self, parent: Any, index: Any) -> Any:
-        event = self.peek_event()
+        event: Any = self.peek_event()  # type: ignore[no-untyped-call]  # PyYAML's own
         problem = ""
         if isinstance(event, yaml.AliasEvent):
             problem = f"alias *{event.anchor} is not allowed here"

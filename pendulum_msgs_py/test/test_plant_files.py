@@ -166,6 +166,6 @@ def test_a_file_that_cannot_be_written_leaves_nothing_behind(tmp_path: Path) -> 
 
 
 def test_with_values_checks_again() -> None:
-    with pytest.raises(ParameterError, match="damping is -1.0"):
+    with pytest.raises(ParameterError, match=r"damping is -1\.0"):
         load_plant("thesis").with_values(damping=-1.0)
     assert math.isclose(load_plant("thesis").with_values(damping=2).damping, 2.0)

@@ -47,8 +47,8 @@ class Peer:
         self.push = self.node.create_publisher(JointState, "push", qos.COMMAND)
         self.disturbance = self.node.create_publisher(JointState, "disturbance", qos.COMMAND)
         self.trajectory = self.node.create_publisher(JointTrajectory, "joint_trajectory", qos.TRAJECTORY)
-        self.node.create_subscription(JointState, "joint_states", lambda message: self.states.append(message), qos.STATE)
-        self.node.create_subscription(JointState, "applied_effort", lambda message: self.applied.append(message), qos.STATE)
+        self.node.create_subscription(JointState, "joint_states", self._on_state, qos.STATE)
+        self.node.create_subscription(JointState, "applied_effort", self._on_applied, qos.STATE)
         self.node.create_subscription(DiagnosticArray, "/diagnostics", self._on_diagnostics, qos.DIAGNOSTICS)
         self.arm_client = self.node.create_client(SetBool, "tiny_plant/arm")
         self.e_stop_client = self.node.create_client(Trigger, "tiny_plant/e_stop")
@@ -61,6 +61,12 @@ class Peer:
         self.executor.add_node(node)
         self.nodes.append(node)
         return node
+
+    def _on_state(self, message: JointState) -> None:
+        self.states.append(message)
+
+    def _on_applied(self, message: JointState) -> None:
+        self.applied.append(message)
 
     def _on_diagnostics(self, message: DiagnosticArray) -> None:
         for status in message.status:
@@ -362,6 +368,8 @@ def test_help_shows_every_parameter_and_survives_a_reader_that_goes() -> None:
     for name in ("gain", "cycles", "effort_limit", "command_timeout", "example:"):
         assert name in text
     process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    assert process.stdout is not None
+    assert process.stderr is not None
     process.stdout.close()
     assert process.wait(30) == 0
     assert process.stderr.read() == ""

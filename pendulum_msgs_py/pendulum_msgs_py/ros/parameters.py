@@ -103,9 +103,9 @@ def _refuse_unknown(node: Node, specs: Mapping[str, ParameterSpec]) -> None:
     reject_unknown(dict.fromkeys(given), specs, where=node.get_fully_qualified_name())
 
 
-def _plain(value: object) -> object:
+def _plain(value: Any) -> object:
     """Return arrays of rclpy (of module ``array``) as lists."""
-    return value if isinstance(value, (bool, int, float, str)) or value is None else list(value)  # type: ignore[call-overload]
+    return value if isinstance(value, (bool, int, float, str)) or value is None else list(value)
 
 
 def _as_decimals(spec: ParameterSpec, value: object) -> str:
@@ -127,7 +127,10 @@ def _kind(spec: ParameterSpec) -> str:
 def _descriptor(spec: ParameterSpec) -> ParameterDescriptor:
     unit = f" [{spec.unit}]" if spec.unit not in {"", "-"} else ""
     descriptor = ParameterDescriptor(
-        name=spec.name, description=spec.description + unit, read_only=spec.read_only, additional_constraints=spec.domain
+        name=spec.name,
+        description=spec.description + unit,
+        read_only=spec.read_only,
+        additional_constraints=spec.domain,
     )
     bounded = spec.minimum is not None or spec.maximum is not None
     if bounded and isinstance(spec.default, float):

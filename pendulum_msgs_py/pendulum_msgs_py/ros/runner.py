@@ -88,7 +88,7 @@ def _run(make_node: Callable[[Callable[[], None]], Node], arguments: Sequence[st
     signals = _listen_for_stop_signals()
     try:
         rclpy.init(args=list(arguments), signal_handler_options=SignalHandlerOptions.NO)
-    except Exception as error:
+    except Exception as error:  # noqa: BLE001  # rcl's errors have no common base
         return report_error(ParameterError(f"ROS arguments are not understood: {_sentence(error)}"))
     executor = EventsExecutor()
     stopped = Future(executor=None)
