@@ -7,6 +7,7 @@ EXECUTABLES: dict[str, str] = {
     "compare": "pendulum_bags.compare_cli:main",
     "replay": "pendulum_bags.replay_cli:main",
     "experiment": "pendulum_bags.experiment_cli:main",
+    "excite": "pendulum_bags.excite_cli:main",
     "identify": "pendulum_bags.identify_cli:main",
     "report": "pendulum_bags.report_cli:main",
     "export": "pendulum_bags.export_cli:main",

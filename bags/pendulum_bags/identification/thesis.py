@@ -214,10 +214,11 @@ def fit_gravity(recordings: Sequence[Recording]) -> ThesisResult:
         position = np.array([hold.position for hold in holds])
         effort = np.array([hold.effort for hold in holds])
         trials.append(regress(recording.name, ("gravity",), np.sin(position)[:, None], effort))
-        up = [h.effort * np.sign(h.position) for h in holds if h.upward and abs(h.position) > 0.1]
-        down = [h.effort * np.sign(h.position) for h in holds if not h.upward and abs(h.position) > 0.1]
-        if up and down:
-            loops.append(float(np.mean(up) - np.mean(down)))
+        outward = np.sign(position) * (effort - trials[-1].values[0] * np.sin(position))
+        upward = np.array([hold.upward for hold in holds])
+        off_centre = np.abs(position) > 0.1
+        if (upward & off_centre).any() and (~upward & off_centre).any():
+            loops.append(float(outward[upward & off_centre].mean() - outward[~upward & off_centre].mean()))
     average, intervals, sign = _average(trials)
     hysteresis = abs(float(np.mean(loops))) if loops else 0.0
     said = [
