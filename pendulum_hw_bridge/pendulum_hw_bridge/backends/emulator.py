@@ -152,13 +152,11 @@ class EmulatorBackend:
         if not self._connected:
             return
         self._catch_up()
-        if (
-            self.actuator.strategy is not Strategy.OFF
-            and ActuatorFault.SEND_FAILED not in self.actuator.faults
-        ):
-            zero = Command(pwm=0.0) if self.actuator.strategy is Strategy.DIRECT_PWM else Command(effort=0.0)
+        if self._strategy is not Strategy.OFF and ActuatorFault.SEND_FAILED not in self.actuator.faults:
+            zero = Command(pwm=0.0) if self._strategy is Strategy.DIRECT_PWM else Command(effort=0.0)
             self.actuator.deliver(zero, self.clock.now_ns())
             self._catch_up()
+        self._strategy = Strategy.OFF
         # With the way there cut, nothing arrives: the command lifetime then has to do it.
         if not self.actuator.faults & _CUT_OFF:
             self.actuator.configure(strategy=Strategy.OFF)

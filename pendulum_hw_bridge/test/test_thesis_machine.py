@@ -1,0 +1,103 @@
+"""The thesis's two experiments on the emulated machine find the thesis's coefficients."""
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy import stats
+
+from pendulum_hw_bridge.actuator import Command, Strategy
+from pendulum_hw_bridge.backends.emulator import EmulatorBackend
+from pendulum_hw_bridge.clocks import SteppedClock
+from pendulum_hw_bridge.emulation.parameters import load_emulator
+from pendulum_hw_bridge.emulation.x5 import EmulatedX5
+from pendulum_hw_bridge.procedures import HandMotion, hand_trials, staircase, staircase_angles
+from pendulum_msgs_py.errors import ParameterError
+
+SECOND = 1e9
+
+
+def hand_trial(motion: HandMotion, seed: int) -> tuple[float, float]:
+    """Return inertia and damping by the thesis's regression on one trial."""
+    actuator = EmulatedX5(replace(load_emulator("thesis"), flat=True), seed=seed)
+    port = EmulatorBackend(actuator, SteppedClock())
+    port.connect()
+    port.set_strategy(Strategy.DIRECT_PWM)
+    rows = []
+    while port.now_ns() < motion.duration * SECOND:
+        feedback = port.read(0.1)
+        assert feedback is not None
+        port.push(motion.torque(feedback.stamp_ns / SECOND, feedback.position, feedback.velocity))
+        port.write(Command(pwm=0.0))
+        rows.append((feedback.stamp_ns / SECOND, feedback.velocity, feedback.effort))
+    time, velocity, effort = np.array(rows).T
+    regressors = np.column_stack([np.gradient(velocity, time), velocity])
+    # The actuator reports an external torque with a negative sign.
+    inertia, damping = np.linalg.lstsq(regressors, -effort, rcond=None)[0]
+    return float(inertia), float(damping)
+
+
+def test_experiment_1_finds_inertia_and_damping() -> None:
+    found = np.array([hand_trial(motion, 10 + index) for index, motion in enumerate(hand_trials(1))])
+    half_width = stats.t.ppf(0.975, len(found) - 1) * found.std(axis=0, ddof=1) / math.sqrt(len(found))
+    inertia, damping = found.mean(axis=0)
+    assert abs(inertia - 0.055) < half_width[0]
+    assert abs(damping - 11.77) < max(half_width[1], 0.005)
+
+
+def test_experiment_2_finds_gravity_and_the_offset_between_up_and_down() -> None:
+    actuator = EmulatedX5(load_emulator("thesis"), seed=2)
+    port = EmulatorBackend(actuator, SteppedClock())
+    port.connect()
+    port.set_strategy(Strategy.PARALLEL_PWM)
+    holds = []
+    for phase in staircase(1):
+        begin, rows = port.now_ns(), []
+        while port.now_ns() < begin + (phase.trajectory.duration + phase.hold) * SECOND:
+            feedback = port.read(0.1)
+            assert feedback is not None
+            position, velocity = phase.trajectory.at((port.now_ns() - begin) / SECOND)
+            port.write(Command(position=position, velocity=velocity))
+            rows.append((feedback.position, feedback.effort))
+        if phase.name == "static":
+            position, effort = np.mean(rows[len(rows) // 4 :], axis=0)
+            holds.append((position, effort, phase.angle, phase.upwards))
+    position, effort, angle, upwards = np.array(holds).T
+    sine = np.sin(position)
+    gravity = float(sine @ effort / (sine @ sine))
+    error = math.sqrt(float(np.sum((effort - gravity * sine) ** 2)) / (len(sine) - 1) / float(sine @ sine))
+    assert abs(gravity - 1.678) < 1.96 * error
+    offset = (effort - 1.678 * sine) * np.sign(angle)
+    climbing, falling = offset[(upwards == 1) & (angle != 0)], offset[(upwards == 0) & (angle != 0)]
+    assert climbing.min() > 0.02
+    assert falling.max() < -0.02
+
+
+def test_staircase_goes_to_90_degrees_and_back_on_both_sides() -> None:
+    degrees = [round(math.degrees(angle)) for angle in staircase_angles()]
+    assert degrees == [*range(10, 100, 10), *range(80, -10, -10), *range(-10, -100, -10), *range(-80, 10, 10)]
+    phases = list(staircase(2, hold=1.5))
+    assert [phase.name for phase in phases[:4]] == ["dynamic", "static", "dynamic", "static"]
+    assert max(phase.trajectory.max_speed() for phase in phases) <= 0.3 + 1e-9
+    assert all(phase.trial == 2 for phase in phases)
+
+
+def test_hand_motion_is_smooth_and_ends_where_it_began() -> None:
+    for motion in hand_trials(4, start=0.2):
+        times = np.arange(0.0, motion.duration, 0.001)
+        path = np.array([motion.reference(time) for time in times])
+        assert path[0, 0] == pytest.approx(0.2)
+        assert path[-1, 0] == pytest.approx(0.2)
+        assert np.max(np.abs(path[:, 0] - 0.2)) == pytest.approx(math.pi, abs=0.05)
+        np.testing.assert_allclose(np.gradient(path[:, 0], times)[5:-5], path[5:-5, 1], atol=2e-3)
+
+
+def test_hand_trials_depend_on_seed_and_number_alone_and_alternate() -> None:
+    assert hand_trials(3, trials=6)[:2] == hand_trials(3, trials=2)
+    assert hand_trials(3) != hand_trials(4)
+    assert [motion.direction for motion in hand_trials(0)] == [1, -1, 1, -1, 1, -1]
+    with pytest.raises(ParameterError, match="number of trials is 0"):
+        hand_trials(0, trials=0)
+    with pytest.raises(ParameterError, match="multiple of step"):
+        staircase_angles(7.0, 90.0)

@@ -1,0 +1,229 @@
+"""Packets from strangers, recordings from disk, parameters and the checklist before arming."""
+
+import json
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from rclpy.serialization import deserialize_message
+from sensor_msgs.msg import JointState
+
+from pendulum_hw_bridge import check_cli
+from pendulum_hw_bridge.actuator import Command, Feedback, HardwareLimits, Strategy
+from pendulum_hw_bridge.backends.emulator import EmulatorBackend
+from pendulum_hw_bridge.backends.replay import FeedbackRecording, ReplayBackend, load_feedback
+from pendulum_hw_bridge.bridge import BridgeSettings
+from pendulum_hw_bridge.bridge_parameters import BRIDGE_SPECS, make_port
+from pendulum_hw_bridge.checklist import run_checklist
+from pendulum_hw_bridge.clocks import SteppedClock
+from pendulum_hw_bridge.emulation import wire
+from pendulum_hw_bridge.emulation.faults import ActuatorFault
+from pendulum_hw_bridge.emulation.parameters import load_emulator
+from pendulum_hw_bridge.emulation.server import EmulatorServer
+from pendulum_hw_bridge.emulation.x5 import EmulatedX5
+from pendulum_hw_bridge.feedback_message import QUANTITIES, encode_feedback
+from pendulum_hw_bridge.gains import DEFAULT_GAINS
+from pendulum_hw_bridge.safety import SafetyLimits
+from pendulum_msgs_py.errors import DataError, ParameterError, PendulumError
+from pendulum_msgs_py.parameters import validate
+
+
+def a_record() -> Feedback:
+    actuator = EmulatedX5(load_emulator("x5_9"), position=0.4)
+    actuator.advance_to(20_000_000)
+    record = actuator.feedback(20_000_000)
+    assert record is not None
+    return record
+
+
+def test_feedback_and_commands_come_through_the_wire_unchanged() -> None:
+    record = a_record()
+    assert str(wire.decode_feedback(wire.encode_feedback(record))) == str(
+        record._replace(temperature_state=0, lock=0, position_limit=2, velocity_limit=2, effort_limit=2)
+    )
+    command = Command(position=1.0, pwm=-0.5)
+    assert str(wire.decode_command(wire.encode_command(command))) == str(command)
+    assert wire.gains_from_json(wire.gains_to_json(DEFAULT_GAINS[2])) == DEFAULT_GAINS[2]
+    limits = HardwareLimits(effort=3.0, position_min=-1.0)
+    assert wire.limits_from_json(wire.limits_to_json(limits)) == limits
+
+
+@given(st.binary(max_size=300), st.sampled_from([b"", wire.COMMAND, wire.FEEDBACK, wire.REQUEST, wire.REPLY]))
+def test_no_packet_of_a_stranger_raises(tail: bytes, head: bytes) -> None:
+    packet = head + tail
+    wire.kind_of(packet)
+    wire.decode_command(packet)
+    wire.decode_feedback(packet)
+    wire.decode_json(packet)
+
+
+SERVED = EmulatorServer(EmulatedX5(load_emulator("thesis")), ("127.0.0.1", 0), lambda: 0)
+
+
+@given(
+    st.one_of(
+        st.binary(max_size=60).map(lambda tail: wire.COMMAND + tail),
+        st.recursive(
+            st.one_of(
+                st.none(), st.booleans(), st.integers(-5, 5), st.floats(allow_nan=False), st.text(max_size=5)
+            ),
+            lambda inner: st.dictionaries(
+                st.sampled_from(
+                    ["settings", "strategy", "gains", "limits", "push", "inject", "command_lifetime"]
+                ),
+                inner,
+                max_size=3,
+            ),
+            max_leaves=6,
+        ).map(lambda value: wire.REQUEST + json.dumps(value).encode()),
+    )
+)
+def test_no_request_of_a_stranger_brings_the_emulator_down(packet: bytes) -> None:
+    SERVED._receive(packet, ("127.0.0.1", 9), 0)
+    SERVED.actuator.push = 0.0
+
+
+@pytest.mark.parametrize("address", ["", "localhost", "host:", ":80", "host:x", "host:70000"])
+def test_a_wrong_address_is_refused(address: str) -> None:
+    with pytest.raises(ParameterError, match="expected HOST:PORT"):
+        wire.parse_address(address)
+
+
+def test_an_address_in_use_is_told() -> None:
+    with pytest.raises(PendulumError, match="emulator cannot listen on"):
+        EmulatorServer(SERVED.actuator, SERVED.address)
+
+
+def test_the_full_record_is_a_joint_state_that_ros_reads() -> None:
+    record = a_record()
+    message = deserialize_message(encode_feedback(record), JointState)
+    assert tuple(message.name) == QUANTITIES
+    read = dict(zip(message.name, message.position, strict=True))
+    assert read["position"] == record.position
+    assert math.isnan(read["effort_command"])
+    assert read["processor_temperature"] == record.processor_temperature
+    assert (message.header.stamp.sec, message.header.stamp.nanosec) == divmod(record.stamp_ns, 1_000_000_000)
+    assert not message.velocity
+    assert not message.effort
+
+
+def test_replay_plays_what_was_recorded_when_it_was_recorded(tmp_path: Path) -> None:
+    time = np.arange(0.0, 1.0, 0.01)
+    columns = {
+        "time": 5.0 + time,
+        "position": time,
+        "velocity": 2 * time,
+        "effort": 3 * time,
+        "pwm_command": 0 * time,
+    }
+    np.savez(tmp_path / "run.npz", **columns)
+    header = ",".join(columns)
+    np.savetxt(
+        tmp_path / "run.csv",
+        np.column_stack(list(columns.values())),
+        delimiter=",",
+        header=header,
+        comments="",
+    )
+    for name in ("run.npz", "run.csv"):
+        port = ReplayBackend(load_feedback(tmp_path / name), SteppedClock())
+        port.connect()
+        records = []
+        while (record := port.read(0.05)) is not None:
+            records.append(record)
+        assert len(records) == 100
+        assert port.finished
+        np.testing.assert_allclose([record.effort for record in records], 3 * time)
+        np.testing.assert_allclose([record.stamp_ns * 1e-9 for record in records], time, atol=1e-9)
+        assert math.isnan(records[0].winding_current)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("time,position\n0,1\n", "velocity is missing"),
+        ("time,position,velocity,effort\n0,1,1,1\n0,1,1,1\n", "time does not increase"),
+        ("time,position,velocity,effort\n0,1,1\n", ":2: 3 values; expected 4"),
+        ("time,position,velocity,effort\n0,1,x,1\n", "velocity is 'x'; expected a number"),
+        ("time,position,velocity,torque\n0,1,1,1\n", "unknown quantity 'torque'"),
+        ("time,time\n", "given twice"),
+        ("", "time is missing"),
+    ],
+)
+def test_a_wrong_recording_is_refused_with_its_place(tmp_path: Path, text: str, message: str) -> None:
+    path = tmp_path / "run.csv"
+    path.write_text(text)
+    with pytest.raises(DataError, match=message):
+        load_feedback(path)
+    with pytest.raises(DataError, match="cannot be read"):
+        load_feedback(tmp_path / "missing.csv")
+    with pytest.raises(DataError, match=r"expected \.npz or \.csv"):
+        other = tmp_path / "run.txt"
+        other.write_text(text)
+        load_feedback(other)
+
+
+def test_a_recording_needs_equal_lengths() -> None:
+    with pytest.raises(DataError, match=r"effort has shape \(1,\)"):
+        FeedbackRecording({"time": [0.0, 1.0], "position": [0, 0], "velocity": [0, 0], "effort": [0]})
+
+
+def test_defaults_of_all_parameters_pass_their_own_checks() -> None:
+    values = validate(BRIDGE_SPECS, {})
+    assert {spec.name: spec.check(values[spec.name]) for spec in BRIDGE_SPECS} == values
+    with pytest.raises(ParameterError, match="did you mean 'backend'"):
+        validate(BRIDGE_SPECS, {"bakend": "hebi"})
+
+
+def test_only_the_emulator_can_run_in_lockstep() -> None:
+    values = validate(BRIDGE_SPECS, {"backend": "hebi"})
+    with pytest.raises(ParameterError, match="expected backend 'emulator'"):
+        make_port(values, SteppedClock(), lockstep=True)
+
+
+def checklist(fault: ActuatorFault | None) -> dict[str, bool]:
+    actuator = EmulatedX5(load_emulator("thesis"), seed=1)
+    port = EmulatorBackend(actuator, SteppedClock())
+    if fault is not None:
+        actuator.inject(fault)
+    items = run_checklist(port, BridgeSettings(gains=DEFAULT_GAINS[3]), SafetyLimits(), window=(-4.0, 4.0))
+    assert actuator.strategy is Strategy.OFF
+    return {item.name: item.passed for item in items}
+
+
+def test_a_healthy_actuator_passes_every_line() -> None:
+    lines = checklist(None)
+    assert len(lines) >= 15
+    assert all(lines.values())
+
+
+@pytest.mark.parametrize(
+    ("fault", "line"),
+    [
+        (ActuatorFault.M_STOP, "motion stop is released"),
+        (ActuatorFault.VOLTAGE_LOW, "supply voltage"),
+        (ActuatorFault.WINDING_HOT, "winding temperature"),
+        (ActuatorFault.FEEDBACK_LOST, "feedback flows"),
+        (ActuatorFault.POSITION_NAN, "position, velocity, effort are numbers"),
+        (ActuatorFault.VELOCITY_SPIKE, "pendulum is at rest"),
+        (ActuatorFault.EFFORT_OFFSET, "measured torque is plausible"),
+        (ActuatorFault.OUTSIDE_WINDOW, "angle is inside its window"),
+        (ActuatorFault.LOCKED_BY_OTHER, "no_acknowledgement"),
+        (ActuatorFault.OVER_TEMPERATURE_MOTOR, "firmware's temperature state"),
+    ],
+)
+def test_each_defect_fails_its_own_line(fault: ActuatorFault, line: str) -> None:
+    assert checklist(fault)[line] is False
+
+
+def test_check_prints_json_and_says_by_its_exit_code_whether_to_arm(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    assert check_cli.main(["--backend", "emulator", "--json"]) == 0
+    printed = json.loads(capsys.readouterr().out)
+    assert printed["ready"] is True
+    assert check_cli.main(["--backend", "emulater"]) == 2
+    assert "backend is 'emulater'; expected one of" in capsys.readouterr().err
