@@ -122,19 +122,18 @@ def tune_numerically(
 
     inertia = 1.0 / float(model.B[1, 0])
     lift = max(float(model.A[1, 0]) * inertia, 0.0)
-    best: scipy.optimize.OptimizeResult | None = None
-    for rate in (1.0, 4.0, 16.0):
+    starts = []
+    for rate in (0.5, 1.0, 2.0, 4.0, 8.0, 16.0):
         damping = max(-float(model.A[1, 1]) * inertia, 2.0 * inertia * rate)
         kp = lift + rate * damping
         # A derivative far below what the plant damps by itself is where the search for an overdamped plant starts.
         kd = max(damping + float(model.A[1, 1]) * inertia, 1e-3 * damping)
-        start = np.log([kp, 0.3 * rate * kp, kd])
-        result = scipy.optimize.minimize(
-            cost, start, method="Nelder-Mead", options={"xatol": 1e-5, "fatol": 1e-12, "maxiter": 2000}
-        )
-        if best is None or result.fun < best.fun:
-            best = result
-    if best is None or best.fun >= 1e12:
+        starts.append(np.log([kp, 0.3 * rate * kp, kd]))
+    start = min(starts, key=cost)
+    best = scipy.optimize.minimize(
+        cost, start, method="Nelder-Mead", options={"xatol": 1e-4, "fatol": 1e-9, "maxiter": 1000}
+    )
+    if best.fun >= 1e12:
         raise DesignError(
             f"no stable PID found at a period of {period} s; expected a shorter period or a slower plant"
         )

@@ -65,7 +65,7 @@ def test_double_integrator_has_the_closed_form_gain():
 
 
 @given(PLANTS, WEIGHTS, st.floats(0.01, 10.0))
-@settings(max_examples=40)
+@settings(deadline=None, max_examples=40)
 def test_second_order_gain_has_its_closed_form(plant, q, r):
     # From the Riccati equation of x'' = a x - d x' + c u: both entries of K are roots of scalar quadratics.
     model = linearise(plant)
@@ -76,7 +76,7 @@ def test_second_order_gain_has_its_closed_form(plant, q, r):
 
 
 @given(PLANTS, WEIGHTS, st.floats(0.01, 10.0))
-@settings(max_examples=30)
+@settings(deadline=None, max_examples=30)
 def test_gain_agrees_with_python_control(plant, q, r):
     model = linearise(plant)
     theirs = control.lqr(model.A, model.B, np.diag(q), np.array([[r]]))[0]
@@ -106,7 +106,7 @@ def test_discrete_gain_solves_the_riccati_equation_of_scipy(delay):
 
 
 @given(PLANTS, st.floats(0.002, 0.05), st.floats(0.0, 0.12))
-@settings(max_examples=40)
+@settings(deadline=None, max_examples=40)
 def test_sampled_model_with_delay_agrees_with_a_simulation_in_small_pieces(plant, period, delay):
     model = linearise(plant)
     sampled = discretise(model, period, delay)
@@ -218,7 +218,7 @@ def test_kalman_gain_agrees_with_python_control():
 
 
 @given(PLANTS, WEIGHTS, st.floats(0.01, 10.0))
-@settings(max_examples=25)
+@settings(deadline=None, max_examples=25)
 def test_every_continuous_lqr_has_the_guaranteed_margins(plant, q, r):
     # Gain margin (1/2, inf), phase margin 60 degrees, modulus margin 1: Safonov and Athans, IEEE TAC 22(2), 1977.
     model = linearise(plant)

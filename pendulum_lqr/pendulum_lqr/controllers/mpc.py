@@ -79,12 +79,23 @@ class LinearMpc(BaseController):
         )
         self._n = n
         self._state_limit = np.tile(self._limits, n)
+        self._hessian = scipy.sparse.triu(hessian, format="csc")
+        self._constraints = scipy.sparse.csc_matrix(constraints)
+        self.reset()
+
+    @classmethod
+    def design(cls, plant: PlantParameters, period: float, p: Mapping[str, Any]) -> LinearMpc:
+        """Return the MPC for the plant linearised at the set-point."""
+        return cls(linearise(plant, UPRIGHT + p["set_point"]), period, p)
+
+    def reset(self) -> None:
+        """Set the solver up anew: what it learnt from past states (start, step size) would colour the next answers."""
         lower, upper = self._bounds(np.zeros(2))
         self._solver = osqp.OSQP()
         self._solver.setup(
-            scipy.sparse.triu(hessian, format="csc"),
-            np.zeros(n + 2),
-            scipy.sparse.csc_matrix(constraints),
+            self._hessian,
+            np.zeros(self._n + 2),
+            self._constraints,
             lower,
             upper,
             verbose=False,
@@ -92,12 +103,10 @@ class LinearMpc(BaseController):
             eps_rel=1e-6,
             max_iter=4000,
             polishing=False,
+            # By iterations: an adaptation by elapsed time would make answers depend on the machine's load.
+            adaptive_rho=1,
+            adaptive_rho_interval=50,
         )
-
-    @classmethod
-    def design(cls, plant: PlantParameters, period: float, p: Mapping[str, Any]) -> LinearMpc:
-        """Return the MPC for the plant linearised at the set-point."""
-        return cls(linearise(plant, UPRIGHT + p["set_point"]), period, p)
 
     def command(self, t: float, x: Sequence[float]) -> float:
         """Return the first torque of the plan; the limited LQR's where the solver finds none [N m]."""
@@ -107,7 +116,7 @@ class LinearMpc(BaseController):
         linear = np.zeros(self._n + 2)
         linear[: self._n] = self._linear @ state
         self._solver.update(q=linear, l=lower, u=upper)
-        result = self._solver.solve()
+        result = self._solver.solve(raise_error=False)
         plan = result.x
         if plan is None or not np.isfinite(plan[0]) or result.info.status_val not in {1, 2}:
             self.failures += 1
