@@ -6,8 +6,11 @@ import subprocess
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
 
+from pendulum_bags.experiment.in_process import simulate
+from pendulum_bags.experiment.run_spec import RunSpec
 from pendulum_bags.reader import read_bag, same_messages
 
 
@@ -32,3 +35,26 @@ def test_lockstep_runs_of_the_emulated_hardware_with_one_seed_are_identical(doma
     states = first["/hw/joint_states"]
     assert len(states) == 101
     assert abs(states["position"] - 3.14159).max() < 0.05
+
+
+@pytest.mark.timeout(120)
+def test_simulator_as_nodes_and_in_one_process_give_the_same_numbers_to_the_last_bit(
+    domain_id: int, tmp_path: Path
+) -> None:
+    run_experiment("lockstep", "--bag", tmp_path / "bag", "--seed", 7, "--duration", "1")
+    bag = read_bag(tmp_path / "bag")
+
+    spec = RunSpec(
+        controller_parameters={"q": [100.0, 0.01], "r": 0.1},
+        disturbance={"amplitude": 2.5, "hold_time": 0.002, "duration": 1.0},
+        duration=1.0,
+        seed=7,
+    )
+    arrays = simulate(spec)
+    states = bag["/sim/joint_states"]
+    assert np.array_equal(states["stamp_ns"], arrays.stamp_ns)
+    assert np.array_equal(states["position"], arrays.position)
+    assert np.array_equal(states["velocity"], arrays.velocity)
+    assert np.array_equal(bag["/sim/effort_command"]["effort"], arrays.command)
+    assert np.array_equal(bag["/sim/disturbance"]["effort"], arrays.disturbance)
+    assert np.array_equal(bag["/sim/applied_effort"]["effort"], arrays.applied)

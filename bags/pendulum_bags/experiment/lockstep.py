@@ -9,13 +9,14 @@ from pendulum_bags.experiment.conductor_node import Conductor, PlantClient, Reco
 from pendulum_bags.experiment.domain import reserve_domain
 from pendulum_bags.experiment.processes import ProcessSet, ros_environment, start_recorder
 from pendulum_bags.experiment.run_folder import write_json
+from pendulum_bags.experiment.run_spec import RunSpec
 from pendulum_bags.experiment.settings import RegulationSettings
-from pendulum_msgs_py import graph, names
+from pendulum_lqr.controller import controller_parameters
+from pendulum_msgs_py import names
 from pendulum_msgs_py.angles import UPRIGHT
 from pendulum_msgs_py.errors import BagError
-from pendulum_msgs_py.graph import NodeProgram
 
-__all__ = ["plant_program", "run_lockstep", "wait_until_all_hear_each_other"]
+__all__ = ["record_run", "run_lockstep", "wait_until_all_hear_each_other"]
 
 _START_TIMEOUT = 60.0
 _SLOWEST = 10.0
@@ -32,29 +33,6 @@ _RUN_LISTENERS = {
 """How many listen to each topic of a run: its reader, the recorder, and to events the conductor."""
 
 
-def plant_program(side: str, settings: RegulationSettings, theta: float, duration: float) -> NodeProgram:
-    """Return the plant of a lockstep run; it takes its first step when the conductor has armed or resumed it.
-
-    Args:
-        side: ``sim`` or ``hw``.
-        settings: What to run.
-        theta: Initial angle [rad].
-        duration: Simulated time after which the plant stops stepping [s].
-    """
-    loop: dict[str, graph.ParameterArgument] = {
-        "clock": "lockstep",
-        "lockstep_inputs": [names.EFFORT_COMMAND, names.DISTURBANCE],
-        "lockstep_subscribers": _LISTENERS + 1,
-        "lockstep_duration": float(duration),
-    }
-    if side == "hw":
-        # No hardware is armed by a parameter: the conductor does it, before it becomes the last listener.
-        loop.update(initial_position=float(theta), seed=settings.noise.seed)
-        return graph.bridge("/hw", backend="emulator", effort_strategy=settings.effort_strategy, **loop)
-    loop.update(initial_theta=float(theta), armed_at_start=True, paused=True)
-    return graph.simulator("/sim", plant=settings.plant, method=settings.method, **loop)
-
-
 def run_lockstep(
     bag: Path,
     settings: RegulationSettings,
@@ -64,7 +42,7 @@ def run_lockstep(
     domain: int | None = None,
     on_wait: Callable[[], None] = lambda: None,
 ) -> Path:
-    """Run one plant under control and noise, as fast as the loop allows, and record it.
+    """Run one plant of the thesis's experiment under control and noise, as fast as the loop allows, and record it.
 
     Args:
         bag: Folder of the bag.
@@ -78,35 +56,73 @@ def run_lockstep(
         BagError: The bag exists.
         FaultError: A program ended or did not answer.
     """
+    noise = settings.noise
+    parameters = controller_parameters(settings.controller)
+    tuning = {"q": [float(value) for value in settings.q], "r": float(settings.r)}
+    spec = RunSpec(
+        side=side,
+        plant=settings.plant if side == "sim" else "thesis",
+        design_plant=settings.plant,
+        strategy=settings.effort_strategy,
+        controller=settings.controller,
+        controller_parameters={key: value for key, value in tuning.items() if key in {p.name for p in parameters}},
+        disturbance={
+            "kind": "uniform",
+            "amplitude": noise.amplitude,
+            "hold_time": noise.hold_time,
+            "duration": noise.duration,
+        },
+        theta=theta,
+        duration=noise.duration,
+        seed=noise.seed,
+        method=settings.method,
+        storage=settings.storage,
+    )
+    return record_run(bag, spec, domain=domain, on_wait=on_wait)
+
+
+def record_run(
+    bag: Path, spec: RunSpec, *, domain: int | None = None, on_wait: Callable[[], None] = lambda: None
+) -> Path:
+    """Carry out one run over DDS, in lockstep, and record it.
+
+    Args:
+        bag: Folder of the bag.
+        spec: What to run.
+        domain: ROS domain, or None for any free one.
+        on_wait: Called while waiting.
+
+    Raises:
+        BagError: The bag exists.
+        FaultError: A program ended or did not answer, or the plant faulted.
+    """
     if bag.exists():
         raise BagError(f"bag {bag} exists; expected a new folder")
-    namespace = f"/{side}"
+    namespace = spec.namespace
     logs = bag.parent / "logs" / bag.name
-    duration = settings.noise.duration
     with (
         reserve_domain(domain) as reserved,
         ProcessSet(logs, ros_environment(reserved, logs)) as processes,
         Conductor(reserved, watch=processes.check, on_wait=on_wait) as conductor,
     ):
         metadata = logs / "metadata.json"
-        plant = settings.plant if side == "sim" else "emulator"
-        write_json(metadata, settings.metadata("lockstep", plant=plant, namespace=namespace, clock="lockstep"))
-        recorder = start_recorder(processes, bag, namespace, metadata, settings.storage, log_time="header")
-        program = plant_program(side, settings, theta, duration)
-        processes.start_node(settings.controller_program(namespace, use_sim_time=True))
-        processes.start_node(settings.disturbance_program(namespace, autostart=True, use_sim_time=True))
+        write_json(metadata, spec.metadata())
+        recorder = start_recorder(processes, bag, namespace, metadata, spec.storage, log_time="header")
+        program = spec.plant_program(_LISTENERS + 1)
+        processes.start_node(spec.controller_program())
+        processes.start_node(spec.disturbance_program())
         processes.start_node(program)
         client = PlantClient(conductor, namespace, program.node_name, watch=False)
         wait_until_all_hear_each_other(conductor, namespace, _RUN_LISTENERS)
-        if side == "hw":
+        if spec.side == "hw":
             client.arm()
         client.watch()
-        if side == "sim":
+        if spec.side == "sim":
             client.resume(_START_TIMEOUT)
         conductor.wait_for(
-            f"{duration:g} s of simulated time",
-            lambda: client.has_event("lockstep_finished"),
-            _START_TIMEOUT + _SLOWEST * duration,
+            f"{spec.duration:g} s of simulated time",
+            lambda: client.check_mode() or client.has_event("lockstep_finished"),
+            _START_TIMEOUT + _SLOWEST * spec.duration,
         )
         conductor.spin(0.2)
         # Simulated time stands still from here on: what nodes say on their way out is no part of the run.

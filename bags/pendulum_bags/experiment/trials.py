@@ -87,7 +87,7 @@ class TrialSettings:
         if self.trials < 1:
             raise ParameterError(f"number of trials is {self.trials}; expected >= 1")
         if self.top / self.step != round(self.top / self.step):
-            raise ParameterError(f"staircase top is {self.top:g} deg; expected a multiple of its step, {self.step:g} deg")
+            raise ParameterError(f"staircase top is {self.top:g} deg; expected a multiple of step, {self.step:g} deg")
 
     @property
     def lockstep(self) -> bool:
