@@ -1,0 +1,127 @@
+"""Which states are answered, and what is told about it."""
+
+import math
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from pendulum_lqr.answering import AnswerLoop, StateRefusal
+from pendulum_lqr.controller import BaseController, make_controller
+from pendulum_msgs_py.plant_parameters import load_plant
+from pendulum_msgs_py.values import JointSample
+
+THESIS = load_plant("thesis")
+MS = 1_000_000
+SECOND = 1_000_000_000
+START = 1_000 * SECOND
+
+
+def loop(**options):
+    return AnswerLoop(make_controller("lqr", THESIS, 0.01), 0.05, **options)
+
+
+def sample(stamp_ns, angle=0.1, velocity=0.2):
+    return JointSample(stamp_ns, math.pi + angle, velocity)
+
+
+def test_each_new_state_is_answered_once_with_the_law():
+    answering = loop()
+    assert answering.answer(sample(START), START) == pytest.approx(-3.3663251, abs=1e-6)
+    assert answering.answer(sample(START), START) is None
+    assert answering.refused == {StateRefusal.DUPLICATE: 1}
+    assert answering.answered == 1
+
+
+@pytest.mark.parametrize(
+    ("state", "reason"),
+    [
+        (None, StateRefusal.MALFORMED),
+        (sample(START, angle=math.nan), StateRefusal.NOT_FINITE),
+        (sample(START, velocity=math.inf), StateRefusal.NOT_FINITE),
+        (sample(START - 51 * MS), StateRefusal.STALE),
+        (sample(START + 51 * MS), StateRefusal.FROM_FUTURE),
+        (sample(START - 11 * MS), StateRefusal.OUT_OF_ORDER),
+    ],
+)
+def test_a_state_that_must_not_be_answered_is_refused_and_counted(state, reason):
+    answering = loop()
+    assert answering.answer(sample(START - 10 * MS), START) is not None
+    assert answering.answer(state, START) is None
+    assert answering.refused == {reason: 1}
+    assert answering.summary(1)[f"refused.{reason.value}"] == 1
+    # The next good state is answered as if nothing had been.
+    assert answering.answer(sample(START), START) is not None
+
+
+@given(st.lists(st.integers(-100 * MS, 100 * MS), max_size=30))
+def test_answers_have_increasing_stamps_whatever_comes(offsets):
+    answering = loop()
+    newest = -1
+    for offset in offsets:
+        if answering.answer(sample(START + offset), START) is not None:
+            assert answering.newest_stamp_ns > newest
+            newest = answering.newest_stamp_ns
+    assert answering.answered + sum(answering.refused.values()) == len(offsets)
+
+
+def test_simulated_time_has_no_age_and_may_start_anew():
+    answering = loop(simulated_time=True)
+    assert answering.answer(sample(5 * SECOND), START) is not None
+    assert answering.answer(sample(5 * SECOND - MS), START) is None
+    assert answering.answer(sample(0), START) is not None
+    assert answering.restarts == 1
+    # A plant in lockstep repeats a state whose answer was lost, and gets the same answer.
+    assert answering.answer(sample(0), START) == answering.last_effort
+
+
+def test_a_controller_that_fails_or_answers_nonsense_gives_no_answer_and_a_reason():
+    class Broken(BaseController):
+        def command(self, t, x):
+            if t > 0.0:
+                return math.nan
+            raise ZeroDivisionError("division by zero")
+
+    answering = AnswerLoop(Broken(1.0), 0.05)
+    assert answering.answer(sample(START), START) is None
+    assert "ZeroDivisionError: division by zero" in answering.last_reason
+    assert answering.answer(sample(START + MS), START) is None
+    assert answering.refused == {StateRefusal.NO_ANSWER: 2}
+
+
+def test_time_counts_from_the_first_state():
+    times = []
+
+    class Watch(BaseController):
+        def command(self, t, x):
+            times.append(t)
+            return 0.0
+
+    answering = AnswerLoop(Watch(1.0), 0.05)
+    for k in range(3):
+        answering.answer(sample(START + k * 10 * MS), START + k * 10 * MS)
+    answering.restart()
+    answering.answer(sample(START + 40 * MS), START + 40 * MS)
+    assert times == pytest.approx([0.0, 0.01, 0.02, 0.0])
+
+
+def test_diagnostics_tell_rate_saturation_age_and_compute_time():
+    answering = loop()
+    answering.summary(SECOND)
+    for k in range(10):
+        answering.answer(sample(START + k * 10 * MS, angle=1.0 if k < 4 else 0.0), START + k * 10 * MS + 2 * MS)
+    told = answering.summary(SECOND + 100 * MS)
+    assert told["answer_rate_hz"] == pytest.approx(100.0)
+    assert told["saturation_share"] == pytest.approx(0.4)
+    assert told["state_age_p50_us"] == pytest.approx(2000.0)
+    assert 0.0 < told["compute_time_p50_us"] < 1000.0
+    assert answering.summary(SECOND + 200 * MS)["saturation_share"] == 0.0
+
+
+def test_a_new_controller_takes_over_between_two_states():
+    answering = AnswerLoop(make_controller("lqi", THESIS, 0.01), 0.05)
+    for k in range(100):
+        answering.answer(sample(START + k * 10 * MS, 0.01, 0.0), START + k * 10 * MS)
+    before = answering.last_effort
+    answering.replace(make_controller("lqi", THESIS, 0.01))
+    after = answering.answer(sample(START + SECOND, 0.01, 0.0), START + SECOND)
+    assert after == pytest.approx(before, abs=0.02)

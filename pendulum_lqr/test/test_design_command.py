@@ -1,0 +1,80 @@
+"""``python -m pendulum_lqr design``."""
+
+import json
+
+import pytest
+from pendulum_lqr.design_cli import main
+from pendulum_msgs_py.plant_parameters import load_plant, write_plant
+
+
+def test_the_table_of_the_thesis_is_printed_to_its_last_digit(capsys):
+    assert main(["--preset", "thesis"]) == 0
+    printed = " ".join(capsys.readouterr().out.split())
+    for row in (
+        "0.14, -214.14 │ 0.142471, -214.142471",
+        "-0.30, -214.22 │ -0.303843, -214.219476",
+        "-0.30, -214.91 │ -0.302863, -214.912785",
+        "-2.69, -214.20 │ -2.687959, -214.202827",
+        "-2.68, -214.90 │ -2.679285, -214.896296",
+        "33.345265, 0.158993",
+    ):
+        assert row in printed
+    assert "K = [33.345, 0.159], tau = 0.3720 s; from the rounded eigenvalue 1/2.69 = 0.3717 s" in printed
+
+
+def test_json_has_every_pair_of_weights(capsys):
+    assert main(["--preset", "dfki", "--q", "10,1", "--q", "100,1", "--r", "1", "--r", "0.1", "--json"]) == 0
+    document = json.loads(capsys.readouterr().out)
+    assert [(row["q"], row["r"]) for row in document["rows"]] == [
+        (None, None),
+        ([10.0, 1.0], 1.0),
+        ([10.0, 1.0], 0.1),
+        ([100.0, 1.0], 1.0),
+        ([100.0, 1.0], 0.1),
+    ]
+    assert document["rows"][0]["time_constant"] is None
+    assert document["rows"][1]["margins"]["gain_up"] is None
+    assert document["rows"][1]["largest_period"] == pytest.approx(0.1856, abs=1e-3)
+
+
+def test_a_plant_file_and_another_fixed_point(tmp_path, capsys):
+    path = write_plant(tmp_path / "mine.yaml", load_plant("dfki").with_values(name="mine"))
+    assert main(["--plant", str(path), "--theta", "0.5", "--q", "1,1", "--json"]) == 0
+    document = json.loads(capsys.readouterr().out)
+    assert document["plant"] == "mine"
+    assert document["effort"] == pytest.approx(2.996955 * 0.479425538604203)
+
+
+def test_the_figures_are_written(tmp_path, capsys):
+    arguments = ["--preset", "dfki", "--q", "10,1", "--r", "1", "--figures", str(tmp_path / "figures")]
+    assert main(arguments) == 0
+    names = {path.name for path in (tmp_path / "figures").iterdir()}
+    assert names == {"pole_map.png", "root_locus.png", "bode.png", "step_response.png", "phase_portrait.png"}
+    assert all(path.stat().st_size > 20_000 for path in (tmp_path / "figures").iterdir())
+    assert "phase_portrait.png" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["--preset", "thesys"], "plant is 'thesys'; expected one of the presets"),
+        (["--q", "1"], "--q is '1'; expected two numbers, as 100,0.01"),
+        (["--q", "1,x"], "--q is '1,x'; expected two numbers"),
+        (["--q", "1,-1"], "expected no negative weight"),
+        (["--r", "0"], "r is 0.0 1/(N m)^2; expected a finite weight > 0"),
+        (["--row", "9"], "--row is 9; expected 1 to 4"),
+        (["--theta", "nan"], "theta of the fixed point is nan rad"),
+        (["--figures", "/proc/nowhere"], "figures cannot be written to /proc/nowhere"),
+    ],
+)
+def test_a_mistake_ends_with_one_sentence_and_code_2(arguments, message, capsys):
+    assert main(arguments) == 2
+    told = capsys.readouterr().err
+    assert message in told
+    assert told.count("\n") == 1
+    assert "Traceback" not in told
+
+
+def test_help_has_an_example(capsys):
+    assert main(["--help"]) == 0
+    assert "--preset dfki --q 10,1" in " ".join(capsys.readouterr().out.split())
