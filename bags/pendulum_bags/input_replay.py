@@ -156,7 +156,8 @@ def replay_recording(
         window: Length of the windows [s].
         mapping: Mapping file of a CSV.
         effort: For bags, ``applied`` or ``measured`` torque.
-        start, stop: Part to use, from the beginning of the recording [s].
+        start: Leave out what comes before, from the beginning of the recording [s].
+        stop: Leave out what comes after [s].
 
     Raises:
         DataError: The recording is damaged or its input is no torque.

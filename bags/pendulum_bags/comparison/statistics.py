@@ -35,6 +35,11 @@ __all__ = [
 RESAMPLES = 2000
 """Bootstrap resamples: the Monte Carlo error of a 5 % quantile is then below half a percent of probability."""
 
+LONGER = 2.0
+"""Factor on the block length of the rule; with it, 90 % intervals from some seven effective samples cover 84 %."""
+LEAST_BLOCKS = 5
+"""Blocks that a run must at least hold, however correlated it is."""
+
 
 def describe(values: ArrayLike) -> dict[str, float]:
     """Return count, mean, std, min, quartiles and max, under the names and definitions of ``pandas`` ``describe``.
@@ -197,9 +202,13 @@ class Resampled:
 def resample(runs: Sequence[Array], *, resamples: int = RESAMPLES, seed: int = 0) -> Resampled:
     """Return the means of all columns over all runs, and the same of every resample.
 
-    The block is the longest that any column of a run asks for.
+    The block is ``LONGER`` times the longest that any column of a run asks for: the rule balances bias and variance
+    of the interval's width, but an interval that is too narrow deceives, and one that varies does not.
     """
-    lengths = [max(block_length(column) for column in samples.T) for samples in runs]
+    lengths = [
+        min(math.ceil(LONGER * max(block_length(column) for column in samples.T)), max(1, len(samples) // LEAST_BLOCKS))
+        for samples in runs
+    ]
     blocks = sum(max(1, len(samples) // length) for samples, length in zip(runs, lengths, strict=True))
     pooled = np.concatenate(runs).mean(axis=0)
     # Sums of large equal numbers would lose what differs between resamples.
@@ -214,8 +223,9 @@ def bootstrap_interval(
 ) -> Interval:
     """Return a statistic of column means with its percentile interval.
 
-    Few blocks make bootstrap intervals too short. Their ends are moved out by the ratio of Student's t with
-    (blocks - 1) degrees of freedom to the normal quantile, which is what a mean of that many values needs.
+    Few blocks make bootstrap intervals too short, for two reasons known from means of few values, and their ends are
+    moved out accordingly: by the ratio of Student's t with (blocks - 1) degrees of freedom to the normal quantile, and
+    by sqrt(blocks / (blocks - 1)), since blocks were centred on their own mean.
 
     Args:
         resampled: From :func:`resample`.
@@ -227,7 +237,7 @@ def bootstrap_interval(
     tail = 0.5 * (1.0 - level)
     low, high = np.quantile(draws, (tail, 1.0 - tail))
     freedom = max(resampled.blocks - 1, 2)
-    stretch = float(stats.t.ppf(1.0 - tail, freedom) / stats.norm.ppf(1.0 - tail))
+    stretch = float(stats.t.ppf(1.0 - tail, freedom) / stats.norm.ppf(1.0 - tail)) * math.sqrt(1.0 + 1.0 / freedom)
     return Interval(
         estimate,
         estimate + stretch * min(float(low) - estimate, 0.0),

@@ -1,0 +1,97 @@
+"""Statistics of correlated samples."""
+
+from __future__ import annotations
+
+import numpy as np
+import pandas as pd
+import pytest
+from scipy import signal, stats
+
+from pendulum_bags.comparison.statistics import (
+    block_length,
+    bootstrap_interval,
+    describe,
+    effective_size,
+    kolmogorov_smirnov,
+    resample,
+)
+from pendulum_msgs_py.errors import DataError
+
+
+def autoregressive(size: int, coefficient: float, seed: int) -> np.ndarray:
+    """Return x[k] = coefficient x[k-1] + white noise, stationary."""
+    noise = np.random.default_rng(seed).standard_normal(size + 500)
+    return signal.lfilter([1.0], [1.0, -coefficient], noise)[500:]
+
+
+def test_description_is_that_of_pandas() -> None:
+    values = np.random.default_rng(1).gamma(2.0, size=137)
+    expected = pd.Series(values).describe()
+    found = describe(values)
+    assert list(found) == list(expected.index)
+    np.testing.assert_allclose(list(found.values()), expected.to_numpy(), rtol=1e-13)
+
+
+def test_description_of_one_sample_is_refused() -> None:
+    with pytest.raises(DataError, match="statistics of 1 samples; expected at least 2"):
+        describe([1.0])
+
+
+@pytest.mark.parametrize("coefficient", [0.0, 0.5, 0.9])
+def test_effective_size_of_an_autoregressive_process_is_that_of_theory(coefficient: float) -> None:
+    sizes = [effective_size(autoregressive(4000, coefficient, seed)) for seed in range(10)]
+    theory = 4000 * (1.0 - coefficient) / (1.0 + coefficient)
+    assert np.median(sizes) == pytest.approx(theory, rel=0.25)
+
+
+def test_blocks_grow_with_correlation() -> None:
+    lengths = [
+        np.median([block_length(autoregressive(1000, coefficient, seed)) for seed in range(5)])
+        for coefficient in (0.0, 0.6, 0.95)
+    ]
+    assert lengths[0] <= 8
+    assert lengths[0] < lengths[1] < lengths[2]
+
+
+def test_interval_of_a_mean_covers_the_truth_as_often_as_it_says_in_spite_of_correlation() -> None:
+    covered = naive = 0
+    trials = 150
+    for seed in range(trials):
+        values = autoregressive(500, 0.9, seed)
+        interval = bootstrap_interval(resample([values[:, None]], resamples=400, seed=seed), lambda m: m[..., 0])
+        covered += interval.low <= 0.0 <= interval.high
+        naive += abs(values.mean()) <= 1.645 * values.std() / np.sqrt(values.size)
+    # 90 % is meant; the binomial error of 150 trials is 2.5 %. Counting samples instead of blocks gives about a third.
+    assert covered / trials >= 0.83
+    assert naive / trials < 0.5
+
+
+def test_interval_is_the_same_each_time() -> None:
+    values = autoregressive(300, 0.8, 3)[:, None]
+    first, second = (bootstrap_interval(resample([values]), lambda m: m[..., 0]) for _ in range(2))
+    assert first == second
+
+
+def test_interval_of_several_runs_counts_what_differs_between_them() -> None:
+    rng = np.random.default_rng(0)
+    offsets = rng.standard_normal(8)
+    runs = [(offset + 0.01 * rng.standard_normal(200))[:, None] for offset in offsets]
+    interval = bootstrap_interval(resample(runs), lambda m: m[..., 0])
+    assert interval.high - interval.low > 1.5 * offsets.std() / np.sqrt(8)
+    assert interval.estimate == pytest.approx(np.mean([run.mean() for run in runs]))
+
+
+def test_kolmogorov_smirnov_has_the_distance_of_scipy_and_counts_correlated_samples_less() -> None:
+    a, b = autoregressive(600, 0.95, 1), autoregressive(400, 0.95, 2)
+    found = kolmogorov_smirnov(a, b)
+    reference = stats.ks_2samp(a, b)
+    assert found.distance == pytest.approx(reference.statistic)
+    assert found.p_value > reference.pvalue
+    assert max(found.sizes) < 100
+
+
+def test_kolmogorov_smirnov_of_equal_samples_finds_nothing() -> None:
+    a = autoregressive(200, 0.5, 1)
+    found = kolmogorov_smirnov(a, a)
+    assert found.distance == 0.0
+    assert found.p_value == pytest.approx(1.0)
