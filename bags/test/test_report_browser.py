@@ -1,0 +1,87 @@
+"""The report in a real browser, offline, at desktop and phone width."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from pendulum_bags.report import write_report
+from tests.synthetic_runs import write_run_folder
+
+BROWSER = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
+SWITCHES = [
+    "--no-sandbox",
+    "--disable-gpu",
+    "--disable-background-networking",
+    "--disable-component-update",
+    "--disable-sync",
+]
+WIDTHS = {"desktop": 1280, "phone": 390}
+
+pytestmark = pytest.mark.skipif(BROWSER is None, reason="no Chromium is installed")
+
+
+@pytest.fixture(scope="module")
+def report(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = write_run_folder(tmp_path_factory.mktemp("browser") / "run", seed=1)
+    return write_report(folder, recordings=[], formats=[])
+
+
+@pytest.fixture(scope="module")
+def browser() -> Iterator[Any]:
+    playwright = pytest.importorskip("playwright.sync_api")
+    with playwright.sync_playwright() as running:
+        opened = running.chromium.launch(executable_path=BROWSER, args=SWITCHES)
+        yield opened
+        opened.close()
+
+
+@pytest.fixture(params=WIDTHS)
+def page(request: pytest.FixtureRequest, browser: Any, report: Path) -> Iterator[Any]:
+    context = browser.new_context(viewport={"width": WIDTHS[request.param], "height": 900}, offline=True)
+    opened = context.new_page()
+    opened.messages = []
+    opened.on("console", lambda message: opened.messages.append(message.text))
+    opened.on("pageerror", lambda error: opened.messages.append(str(error)))
+    opened.goto(report.resolve().as_uri())
+    opened.wait_for_function("document.documentElement.dataset.ready === 'true'", timeout=60_000)
+    yield opened
+    context.close()
+
+
+def test_page_is_whole_and_usable(page: Any) -> None:
+    # One visit for all that is seen at one width: loading takes seconds on a small machine.
+    assert page.messages == []
+    plots = page.locator(".graph")
+    assert plots.count() >= 20
+    assert page.locator(".graph .main-svg").count() >= plots.count()
+    drawn = "nodes => nodes.every(n => n.querySelector('.xy path, .xy g.points path, .scatterlayer path'))"
+    assert plots.evaluate_all(drawn)
+    assert page.evaluate("document.documentElement.scrollWidth <= window.innerWidth")
+    outside = "nodes => nodes.filter(n => n.getBoundingClientRect().right > window.innerWidth + 1).length"
+    assert page.locator("header, figure, .graph").evaluate_all(outside) == 0
+    assert page.locator("#failure").is_hidden()
+
+    # By keyboard: a plot takes the focus, zooms, moves and comes back.
+    plot = page.locator('[data-graph="both_together-0"]')
+    plot.focus()
+    span = "n => n._fullLayout.xaxis.range[1] - n._fullLayout.xaxis.range[0]"
+    before = plot.evaluate(span)
+    page.keyboard.press("+")
+    page.wait_for_timeout(200)
+    assert plot.evaluate(span) < 0.8 * before
+    page.keyboard.press("0")
+    page.wait_for_timeout(200)
+    assert plot.evaluate(span) == pytest.approx(before, rel=0.02)
+
+    # The animation runs from its button.
+    page.locator("#play").focus()
+    page.keyboard.press("Enter")
+    page.wait_for_function("Number(document.getElementById('seek').value) > 2", timeout=10_000)
+    page.keyboard.press("Enter")
+    assert page.locator("#play").inner_text() == "Play"
+    assert page.messages == []
