@@ -1,0 +1,213 @@
+"""Measures plant and controller as two processes over DDS: round trips, missed deadlines, CPU and memory."""
+
+from __future__ import annotations
+
+import math
+import os
+import statistics
+import tempfile
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import psutil
+import rclpy
+from diagnostic_msgs.msg import DiagnosticArray
+from rclpy.executors import SingleThreadedExecutor
+
+from pendulum_bags.experiment.domain import reserve_domain
+from pendulum_msgs_py import graph, names
+from pendulum_msgs_py.graph import NodeProgram
+from tests.processes import ProcessGroup, RunningProgram
+
+__all__ = ["LoopFigures", "lockstep_speed", "plain_cpu", "realtime_figures"]
+
+_ROOT = Path(__file__).parents[2]
+_WARM_UP = 6.0
+_DIAGNOSTICS_PERIOD = 0.5
+_START_TIMEOUT = 40.0
+
+
+@dataclass(frozen=True)
+class LoopFigures:
+    """What a realtime run showed.
+
+    Attributes:
+        p50: Median of the round trip from state to command [us].
+        p99: 99th percentile [us].
+        missed: Share of deadlines missed by a period or more [%].
+        cpu: CPU of simulator and controller together [% of a core].
+        memory: Largest resident memory of the simulator [MB].
+        growth: Growth of it during the run [MB].
+    """
+
+    p50: float
+    p99: float
+    missed: float
+    cpu: float
+    memory: float
+    growth: float
+
+
+class _Diagnostics:
+    """The plant's diagnostics, as they come."""
+
+    def __init__(self, domain: int) -> None:
+        self._context = rclpy.Context()
+        rclpy.init(context=self._context, domain_id=domain)
+        self._node = rclpy.create_node("bench_listener", context=self._context)
+        self._executor = SingleThreadedExecutor(context=self._context)
+        self._executor.add_node(self._node)
+        self._node.create_subscription(DiagnosticArray, names.DIAGNOSTICS, self._on_message, 10)
+        self.rows: list[dict[str, str]] = []
+
+    def _on_message(self, message: DiagnosticArray) -> None:
+        for status in message.status:
+            if status.name.endswith("simulator: plant"):
+                self.rows.append({pair.key: pair.value for pair in status.values})
+
+    def listen(self, duration: float) -> None:
+        deadline = time.monotonic() + duration
+        while (left := deadline - time.monotonic()) > 0.0:
+            self._executor.spin_once(timeout_sec=left)
+
+    def wait_for_latency(self) -> None:
+        deadline = time.monotonic() + _START_TIMEOUT
+        while time.monotonic() < deadline:
+            self.listen(0.5)
+            if self.rows and math.isfinite(float(self.rows[-1].get("command_latency_p50_us", "nan"))):
+                return
+        raise TimeoutError(f"the loop did not close within {_START_TIMEOUT:g} s")
+
+    def close(self) -> None:
+        self._executor.shutdown()
+        self._node.destroy_node()
+        rclpy.shutdown(context=self._context)
+
+
+def realtime_figures(
+    duration: float, *, rate: float = 1000.0, cores: Sequence[int] | None = None
+) -> LoopFigures:
+    """Run simulator and controller in real time and return what they cost.
+
+    Args:
+        duration: Length of the measurement [s].
+        rate: States per second [Hz].
+        cores: Cores that both are pinned to; None leaves them to the scheduler.
+    """
+    with tempfile.TemporaryDirectory() as folder, reserve_domain(None) as domain:
+        group = ProcessGroup(Path(folder), _ROOT)
+        listener = _Diagnostics(domain)
+        try:
+            programs = [
+                _start(group, domain, graph.simulator("/sim", rate_hz=rate, initial_theta=math.pi - 0.1)),
+                _start(group, domain, graph.controller("/sim")),
+            ]
+            listener.wait_for_latency()
+            processes = [psutil.Process(program.pid) for program in programs]
+            for process in processes:
+                if cores is not None:
+                    process.cpu_affinity(list(cores))
+            listener.listen(_WARM_UP)
+            memory = processes[0].memory_info().rss
+            listener.rows.clear()
+            busy, wall = _cpu(processes), time.monotonic()
+            listener.listen(duration)
+            elapsed = time.monotonic() - wall
+            cpu = 100.0 * (_cpu(processes) - busy) / elapsed
+            after = listener.rows[-1]
+            expected = (len(listener.rows) - 1) * _DIAGNOSTICS_PERIOD * rate
+            cycles = int(after["cycles"]) - int(listener.rows[0]["cycles"])
+            # Periods that a late timer stepped through in one go are no cycles of their own.
+            missed = max(expected - cycles, int(after["overruns"]) - int(listener.rows[0]["overruns"]))
+            return LoopFigures(
+                p50=statistics.median(float(row["command_latency_p50_us"]) for row in listener.rows),
+                p99=statistics.median(float(row["command_latency_p99_us"]) for row in listener.rows),
+                missed=100.0 * max(0.0, missed) / expected,
+                cpu=cpu,
+                memory=processes[0].memory_info().rss / 1e6,
+                growth=(processes[0].memory_info().rss - memory) / 1e6,
+            )
+        finally:
+            listener.close()
+            group.close()
+
+
+def plain_cpu(duration: float, *, rate: float = 1000.0) -> float:
+    """Return the CPU of the plain loop, plant and controller together [% of a core]."""
+    with tempfile.TemporaryDirectory() as folder, reserve_domain(None) as domain:
+        group = ProcessGroup(Path(folder), _ROOT)
+        try:
+            programs = [
+                group.start("tests.benchmarks.plain_loop", role, str(rate), env=_environment(domain))
+                for role in ("plant", "controller")
+            ]
+            time.sleep(_WARM_UP)
+            processes = [psutil.Process(program.pid) for program in programs]
+            busy, wall = _cpu(processes), time.monotonic()
+            time.sleep(duration)
+            return 100.0 * (_cpu(processes) - busy) / (time.monotonic() - wall)
+        finally:
+            group.close()
+
+
+def lockstep_speed(duration: float, *, rate: float = 500.0) -> float:
+    """Return simulated time per wall time of a lockstep run with controller and disturbance as processes [-].
+
+    Args:
+        duration: Simulated time [s].
+        rate: States per second [Hz].
+    """
+    with tempfile.TemporaryDirectory() as folder, reserve_domain(None) as domain:
+        group = ProcessGroup(Path(folder), _ROOT)
+        listener = _Diagnostics(domain)
+        try:
+            _start(group, domain, graph.controller("/sim", use_sim_time=True))
+            _start(group, domain, graph.disturbance("/sim", autostart=True, duration=duration, use_sim_time=True))
+            plant = graph.simulator(
+                "/sim",
+                clock="lockstep",
+                rate_hz=rate,
+                initial_theta=math.pi,
+                lockstep_inputs=["effort_command", "disturbance"],
+                lockstep_subscribers=2,
+            )
+            _start(group, domain, plant)
+            deadline = time.monotonic() + _START_TIMEOUT
+            while not (listener.rows and int(listener.rows[-1].get("lockstep_steps", 0)) > 200):
+                listener.listen(0.1)
+                if time.monotonic() > deadline:
+                    raise TimeoutError("the lockstep run did not start")
+            listener.rows.clear()
+            listener.listen(1.0)
+            first, start = int(listener.rows[-1]["lockstep_steps"]), time.monotonic()
+            end = start + duration / 3.0
+            while time.monotonic() < end:
+                listener.listen(0.5)
+            count = len(listener.rows)
+            while len(listener.rows) == count:
+                listener.listen(0.01)
+            steps = int(listener.rows[-1]["lockstep_steps"]) - first
+            return steps / rate / (time.monotonic() - start)
+        finally:
+            listener.close()
+            group.close()
+
+
+def _start(group: ProcessGroup, domain: int, program: NodeProgram) -> RunningProgram:
+    return group.start(
+        program.package, program.executable, *program.ros_arguments(), env=_environment(domain)
+    )
+
+
+def _environment(domain: int) -> dict[str, str]:
+    return {
+        "ROS_DOMAIN_ID": str(domain),
+        "ROS_AUTOMATIC_DISCOVERY_RANGE": os.environ.get("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST"),
+        "PYTHONSAFEPATH": "",
+    }
+
+
+def _cpu(processes: Sequence[psutil.Process]) -> float:
+    return sum(sum(process.cpu_times()[:2]) for process in processes)
