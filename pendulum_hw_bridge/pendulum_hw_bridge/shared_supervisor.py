@@ -53,6 +53,8 @@ class SharedSupervisor(PlantSupervisor):
             with self._lock:
                 return super().arm(now_ns, sample)
         self._not_prepared = self._prepare()
+        if self._not_prepared:
+            return self._not_prepared
         with self._lock:
             refusal = super().arm(now_ns, sample)
         if refusal:

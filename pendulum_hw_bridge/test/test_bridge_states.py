@@ -148,7 +148,7 @@ def test_arming_sets_and_confirms_the_strategy_first() -> None:
     [
         (ActuatorFault.COMMANDS_LOST, "did not acknowledge"),
         (ActuatorFault.LOCKED_BY_OTHER, "did not acknowledge"),
-        (ActuatorFault.FEEDBACK_LOST, "ms old"),
+        (ActuatorFault.FEEDBACK_LOST, "no new feedback"),
     ],
 )
 def test_arming_is_refused_while_something_is_wrong(fault: ActuatorFault, reason: str) -> None:

@@ -174,6 +174,8 @@ class EmulatedX5:
         """Change settings of the firmware, as an acknowledged command does; changing the strategy ends all loops."""
         if strategy is not None:
             self.strategy = Strategy(strategy)
+            # Setpoints still on their way were meant for the strategy before, and were sent before.
+            self._inbox.clear()
             self._end_command()
         if gains is not None:
             self.gains = gains

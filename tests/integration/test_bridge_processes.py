@@ -1,0 +1,242 @@
+"""The bridge as a process, on real DDS, with an emulated actuator that outlives it: signals, lifecycle, lockstep."""
+
+from __future__ import annotations
+
+import signal
+import socket
+import time
+from collections.abc import Callable, Iterator
+
+import pytest
+
+rclpy = pytest.importorskip("rclpy")
+from lifecycle_msgs.msg import State, Transition  # noqa: E402
+from lifecycle_msgs.srv import ChangeState, GetState  # noqa: E402
+from rclpy.executors import SingleThreadedExecutor  # noqa: E402
+from sensor_msgs.msg import JointState  # noqa: E402
+from std_srvs.srv import SetBool  # noqa: E402
+
+from pendulum_hw_bridge.actuator import Strategy  # noqa: E402
+from pendulum_hw_bridge.backends.emulator_process import EmulatorProcessBackend  # noqa: E402
+from pendulum_msgs_py.ros import qos  # noqa: E402
+from pendulum_msgs_py.ros.convert import stamp_from_message  # noqa: E402
+from tests.processes import ProcessGroup, RunningProgram  # noqa: E402
+
+UPRIGHT_ISH = "3.19"
+
+
+class Lab:
+    """An emulator process, a bridge process, a controller process, and us."""
+
+    def __init__(self, processes: ProcessGroup) -> None:
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+            probe.bind(("127.0.0.1", 0))
+            port = probe.getsockname()[1]
+        self.processes = processes
+        self.address = f"127.0.0.1:{port}"
+        self.emulator = processes.start(
+            "pendulum_hw_bridge", "emulator", "--address", self.address, "--position", UPRIGHT_ISH
+        )
+        self.emulator.wait_for_output("listens on", 60.0)
+        self.truth = EmulatorProcessBackend(self.address)
+        self.truth.connect()
+        self.context = rclpy.Context()
+        rclpy.init(context=self.context)
+        self.node = rclpy.create_node("observer", context=self.context)
+        self.executor = SingleThreadedExecutor(context=self.context)
+        self.executor.add_node(self.node)
+        self.states: list[JointState] = []
+        self.full: list[JointState] = []
+        self.node.create_subscription(JointState, "joint_states", self.states.append, qos.STATE)
+        self.node.create_subscription(JointState, "actuator/feedback", self.full.append, qos.STATE)
+        self.arm_client = self.node.create_client(SetBool, "bridge/arm")
+        self.change_client = self.node.create_client(ChangeState, "bridge/change_state")
+        self.state_client = self.node.create_client(GetState, "bridge/get_state")
+
+    def bridge(self, *parameters: str) -> RunningProgram:
+        arguments = ["-p", "backend:=emulator_process", "-p", f"emulator_address:='{self.address}'"]
+        for parameter in parameters:
+            arguments += ["-p", parameter]
+        return self.processes.start("pendulum_hw_bridge", "bridge", "--ros-args", *arguments)
+
+    def driving(self) -> RunningProgram:
+        """Return a bridge that is armed and regulates."""
+        bridge = self.bridge()
+        self.until(lambda: self.states, "states", 60.0)
+        response = self.call(self.arm_client, SetBool.Request(data=True))
+        assert response.success, response.message
+        # Only now: arming is refused while somebody already commands a large torque.
+        self.processes.start("pendulum_lqr", "controller", "--ros-args", "-p", "autostart:=true")
+        self.until(lambda: self.truth.status()["link"]["pwm"] != 0.0, "torque", 30.0)
+        return bridge
+
+    def until(self, predicate: Callable[[], object], what: str, timeout: float) -> None:
+        deadline = time.monotonic() + timeout
+        while not predicate():
+            assert time.monotonic() < deadline, f"waited {timeout} s for {what}"
+            self.executor.spin_once(timeout_sec=0.02)
+
+    def call(self, client, request):
+        assert client.wait_for_service(30.0)
+        future = client.call_async(request)
+        self.until(future.done, "the answer of a service", 30.0)
+        return future.result()
+
+    def lifecycle_state(self) -> int:
+        return self.call(self.state_client, GetState.Request()).current_state.id
+
+    def change(self, transition: int) -> bool:
+        return self.call(
+            self.change_client, ChangeState.Request(transition=Transition(id=transition))
+        ).success
+
+    def milliseconds_to_zero_torque(self, timeout: float = 1.0) -> float:
+        """Return the time until the motor has no duty any more, as the emulator's own clock says."""
+        begin = self.truth.status()["link"]["time_ns"]
+        deadline = time.monotonic() + timeout
+        while (link := self.truth.status()["link"])["pwm"] != 0.0:
+            assert time.monotonic() < deadline, "the motor is still driven"
+        return (link["time_ns"] - begin) * 1e-6
+
+    def close(self) -> None:
+        self.truth.close()
+        self.executor.shutdown()
+        self.node.destroy_node()
+        self.context.shutdown()
+
+
+@pytest.fixture
+def lab(processes: ProcessGroup, domain_id: int) -> Iterator[Lab]:
+    laboratory = Lab(processes)
+    yield laboratory
+    laboratory.close()
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_ends_torque_at_once_and_the_process_cleanly(lab: Lab, number: int) -> None:
+    bridge = lab.driving()
+    expiries = lab.truth.status()["lifetime_expiries"]
+    bridge.send_signal(number)
+    assert bridge.wait(15.0) == 0
+    status = lab.truth.status()
+    assert status["strategy"] == Strategy.OFF
+    assert status["link"]["pwm"] == 0.0
+    # It was switched off, not left to run out.
+    assert status["lifetime_expiries"] == expiries
+
+
+def test_after_sigkill_the_command_lifetime_ends_torque(lab: Lab) -> None:
+    bridge = lab.driving()
+    before = lab.truth.status()
+    assert before["strategy"] == Strategy.DIRECT_PWM
+    assert before["command_lifetime"] == 0.05
+    bridge.send_signal(signal.SIGKILL)
+    # The lifetime is 50 ms; the rest is the way of the signal and of our question on a busy machine.
+    assert lab.milliseconds_to_zero_torque() < 200.0
+    after = lab.truth.status()
+    assert after["lifetime_expiries"] == before["lifetime_expiries"] + 1
+    assert after["strategy"] == Strategy.DIRECT_PWM
+    time.sleep(0.2)
+    assert lab.truth.status()["link"]["pwm"] == 0.0
+    bridge.wait(5.0)
+
+
+def test_lifecycle_moves_states_and_torque(lab: Lab) -> None:
+    lab.bridge("autostart:=false")
+    assert lab.lifecycle_state() == State.PRIMARY_STATE_UNCONFIGURED
+    refused = lab.call(lab.arm_client, SetBool.Request(data=True))
+    assert not refused.success
+    assert "not active" in refused.message
+    assert lab.change(Transition.TRANSITION_CONFIGURE)
+    assert lab.lifecycle_state() == State.PRIMARY_STATE_INACTIVE
+    assert not lab.states
+    assert lab.change(Transition.TRANSITION_ACTIVATE)
+    lab.until(lambda: len(lab.states) > 20, "states", 30.0)
+    assert lab.call(lab.arm_client, SetBool.Request(data=True)).success
+    assert lab.truth.status()["strategy"] == Strategy.DIRECT_PWM
+    assert lab.change(Transition.TRANSITION_DEACTIVATE)
+    assert lab.truth.status()["strategy"] == Strategy.OFF
+    assert lab.change(Transition.TRANSITION_CLEANUP)
+    assert lab.change(Transition.TRANSITION_CONFIGURE)
+    assert lab.change(Transition.TRANSITION_ACTIVATE)
+    count = len(lab.states)
+    lab.until(lambda: len(lab.states) > count + 5, "states again", 30.0)
+
+
+def test_full_feedback_flows_with_every_state(lab: Lab) -> None:
+    lab.bridge()
+    lab.until(lambda: len(lab.full) >= 50 and len(lab.states) >= 50, "feedback", 60.0)
+    names = list(lab.full[-1].name)
+    for quantity in (
+        "pwm_command",
+        "motor_current",
+        "winding_current",
+        "winding_temperature",
+        "effort_command",
+    ):
+        assert quantity in names
+    stamps = {stamp_from_message(message.header.stamp) for message in lab.full}
+    assert stamp_from_message(lab.states[-2].header.stamp) in stamps
+
+
+def test_an_emulator_that_dies_puts_the_bridge_into_its_fault_state(lab: Lab) -> None:
+    bridge = lab.driving()
+    lab.emulator.send_signal(signal.SIGKILL)
+    bridge.wait_for_output(r"fault: feedback_lost", 15.0)
+    lab.emulator.wait(5.0)
+
+
+def test_a_missing_actuator_is_one_sentence_and_exit_code_2(processes: ProcessGroup, domain_id: int) -> None:
+    program = processes.start(
+        "pendulum_hw_bridge",
+        "bridge",
+        *("--ros-args", "-p", "backend:=emulator_process", "-p", "emulator_address:='127.0.0.1:9'"),
+    )
+    assert program.wait(60.0) == 2
+    assert "does not answer; start it with: python -m pendulum_hw_bridge emulator" in program.output
+    assert "Traceback" not in program.output
+
+
+def lockstep_run(processes: ProcessGroup, seconds: float) -> list[tuple[int, float, float]]:
+    context = rclpy.Context()
+    rclpy.init(context=context)
+    node = rclpy.create_node("observer", context=context)
+    executor = SingleThreadedExecutor(context=context)
+    executor.add_node(node)
+    seen: list[tuple[int, float, float]] = []
+
+    def on_state(message: JointState) -> None:
+        seen.append((stamp_from_message(message.header.stamp), message.position[0], message.velocity[0]))
+
+    node.create_subscription(JointState, "joint_states", on_state, qos.STATE)
+    programs = [
+        processes.start(
+            "pendulum_hw_bridge",
+            "bridge",
+            *("--ros-args", "-p", "clock:=lockstep", "-p", f"initial_position:={UPRIGHT_ISH}"),
+            *("-p", "seed:=3", "-p", "lockstep_subscribers:=2", "-p", f"lockstep_duration:={seconds}"),
+        ),
+        processes.start("pendulum_lqr", "controller", "--ros-args", "-p", "use_sim_time:=true"),
+    ]
+    arm = node.create_client(SetBool, "bridge/arm")
+    assert arm.wait_for_service(60.0)
+    deadline = time.monotonic() + 60.0
+    # Armed before the first state: the whole run is then the same, whenever everybody was ready.
+    future = arm.call_async(SetBool.Request(data=True))
+    while not (seen and seen[-1][0] >= (1 + seconds) * 1e9):
+        assert time.monotonic() < deadline, f"{len(seen)} states: {programs[0].output}"
+        executor.spin_once(timeout_sec=0.02)
+    assert future.result().success
+    for program in programs:
+        program.interrupt()
+        assert program.wait(15.0) == 0
+    executor.shutdown()
+    node.destroy_node()
+    context.shutdown()
+    return seen
+
+
+def test_in_lockstep_two_runs_with_one_seed_are_the_same(processes: ProcessGroup, domain_id: int) -> None:
+    first, second = lockstep_run(processes, 3.0), lockstep_run(processes, 3.0)
+    assert len(first) == 301
+    assert first == second
