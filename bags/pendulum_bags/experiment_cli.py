@@ -152,6 +152,20 @@ def lockstep(
 add_trial_commands(app)
 
 
+@app.command()
+def examples(
+    out: Annotated[Path, typer.Option(help="Folder for the recordings.")] = Path("bags", "examples"),
+) -> None:
+    """Record anew the small recordings that come with the project, in lockstep.
+
+    Example: python -m pendulum_bags experiment examples --out bags/examples
+    """
+    from pendulum_bags.experiment.examples import make_examples
+
+    for bag in make_examples(out):
+        print(bag)
+
+
 def _analyse(folder: Path, settings: RegulationSettings) -> dict[str, Any]:
     from pendulum_bags.comparison import compare_runs
     from pendulum_bags.report import write_report
