@@ -99,7 +99,7 @@ class AnswerLoop:
         try:
             effort = self.controller.command((sample.stamp_ns - self._start_ns) / NANOSECONDS, x)
         except (ArithmeticError, ValueError, RuntimeError) as error:
-            # A solver that gives up must not end the node: the plant's own timeout turns a missing answer into zero torque.
+            # A solver that gives up must not end the node: without an answer the plant's timeout makes it zero.
             self.last_reason = f"{type(error).__name__}: {error}"
             effort = math.nan
         if not math.isfinite(effort):

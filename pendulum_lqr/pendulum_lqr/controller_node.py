@@ -10,7 +10,6 @@ from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from rclpy.lifecycle import LifecycleState, TransitionCallbackReturn
-from pendulum_msgs_py.ros.lifecycle import LifecycleNode
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64MultiArray
 
@@ -29,6 +28,7 @@ from pendulum_msgs_py.parameters import ParameterSpec
 from pendulum_msgs_py.plant_parameters import PlantParameters, load_plant
 from pendulum_msgs_py.ros import qos
 from pendulum_msgs_py.ros.convert import diagnostic_status, sample_from_bytes, stamp_to_message
+from pendulum_msgs_py.ros.lifecycle import LifecycleNode
 from pendulum_msgs_py.ros.parameters import NodeParameters
 from pendulum_msgs_py.ros.runner import run_node
 from pendulum_msgs_py.timing import SteadyWallClock
@@ -49,10 +49,10 @@ NODE_SPECS: tuple[ParameterSpec, ...] = (
         minimum=0.0, exclusive_minimum=True, read_only=True,
     ),
     ParameterSpec(
-        "command_type", "joint_state", "", "joint_state: to our plants; multi_array: std_msgs/Float64MultiArray, to an "
-        "effort controller of ros2_control.", choices=("joint_state", "multi_array"), read_only=True,
+        "command_type", "joint_state", "", "joint_state: to our plants; multi_array: std_msgs/Float64MultiArray, to "
+        "an effort controller of ros2_control.", choices=("joint_state", "multi_array"), read_only=True,
     ),
-    ParameterSpec("autostart", True, "", "Configure and activate at once, without a lifecycle manager.", read_only=True),
+    ParameterSpec("autostart", True, "", "Configure and activate at once, without a manager.", read_only=True),
 )  # fmt: skip
 """Parameters of the node itself; those of the chosen controller join them."""
 

@@ -10,16 +10,16 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import typer
-from pendulum_msgs_py.angles import UPRIGHT
-from pendulum_msgs_py.errors import ParameterError
-from pendulum_msgs_py.executables import cli_main
-from pendulum_msgs_py.plant_parameters import PRESETS, load_plant
 from rich.console import Console
 from rich.table import Table
 
 from pendulum_lqr.analysis import LoopReport, analyse
 from pendulum_lqr.design import Gain, continuous_lqr
 from pendulum_lqr.model import LinearModel, linearise
+from pendulum_msgs_py.angles import UPRIGHT
+from pendulum_msgs_py.errors import ParameterError
+from pendulum_msgs_py.executables import cli_main
+from pendulum_msgs_py.plant_parameters import PRESETS, load_plant
 
 __all__ = ["THESIS_CHOICE", "THESIS_WEIGHTS", "app", "main"]
 
@@ -43,11 +43,15 @@ def design(
     q: Annotated[
         list[str] | None, typer.Option(help="Diagonal of Q, as 100,0.01; may be given again for more rows.")
     ] = None,
-    r: Annotated[list[float] | None, typer.Option(help="R; may be given again. Every Q meets every R.")] = None,
+    r: Annotated[
+        list[float] | None, typer.Option(help="R; may be given again. Every Q meets every R.")
+    ] = None,
     theta: Annotated[float, typer.Option(help="Angle of the fixed point, 0 hanging down [rad].")] = UPRIGHT,
     effort_limit: Annotated[float, typer.Option(help="Torque limit [N m]; 0 for the plant's.")] = 0.0,
     figures: Annotated[Path | None, typer.Option(help="Folder for the figures (PNG).")] = None,
-    row: Annotated[int, typer.Option(help="Row that the figures show; 0 for the thesis's choice or the last.")] = 0,
+    row: Annotated[
+        int, typer.Option(help="Row that the figures show; 0 for the thesis's choice or the last.")
+    ] = 0,
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON instead of tables.")] = False,
 ) -> None:
     """Design LQR gains: eigenvalues, K, time constant, damping, margins and largest stable sampling period.

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -86,11 +86,8 @@ _TAPS: dict[int, tuple[int, ...]] = {
 }  # fmt: skip
 
 
-class Disturbance(Protocol):
-    """A torque over time."""
-
-    def __call__(self, elapsed_ns: int) -> float:
-        """Return the torque at a time since the start [ns]; 0 before the start [N m]."""
+Disturbance = Callable[[int], float]
+"""A torque over time: from the time since the start [ns] to the torque [N m]; 0 before the start."""
 
 
 def make_disturbance(values: Mapping[str, object], recorded: Disturbance | None = None) -> Disturbance:

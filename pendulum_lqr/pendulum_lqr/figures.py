@@ -1,12 +1,13 @@
-"""Figures of a design: pole map, root locus, Bode plot with margins, step response, phase portrait with region of attraction.
+"""Figures of a design: poles, root locus, Bode plot, step response, phase portrait with region of attraction.
 
-Each function returns a matplotlib figure made without pyplot, so that nothing global is touched and no display is needed.
+Each function returns a matplotlib figure made without pyplot: nothing global is touched, no display needed.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from typing import Any
 
 import matplotlib as mpl
 import numpy as np
@@ -14,12 +15,12 @@ import scipy.signal
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
-from pendulum_msgs_py.angles import UPRIGHT
 
 from pendulum_lqr.analysis import LoopReport, analyse, closed_loop_poles, loop_transfer
 from pendulum_lqr.design import Gain
 from pendulum_lqr.model import LinearModel, RigidPlant
 from pendulum_lqr.roa import Region, region_of_attraction, rigid_rollout
+from pendulum_msgs_py.angles import UPRIGHT
 
 __all__ = [
     "bode_figure",
@@ -36,8 +37,8 @@ INK, MUTED, GRID = "#1f2a37", "#6b7280", "#e5e7eb"
 COLOURS = ("#2563eb", "#dc2626", "#059669", "#d97706", "#7c3aed", "#0891b2")
 
 
-def _figure(rows: int = 1, height: float = 4.4, **options: object) -> tuple[Figure, list[Axes]]:
-    style = {
+def _figure(rows: int = 1, height: float = 4.4) -> tuple[Figure, list[Axes]]:
+    style: Any = {
         "font.size": 10,
         "axes.edgecolor": MUTED,
         "axes.labelcolor": INK,
@@ -47,7 +48,7 @@ def _figure(rows: int = 1, height: float = 4.4, **options: object) -> tuple[Figu
     }
     with mpl.rc_context(style):
         figure = Figure(figsize=(7.2, height), dpi=150, layout="constrained")
-        axes = figure.subplots(rows, 1, squeeze=False, **options)[:, 0]
+        axes = figure.subplots(rows, 1, squeeze=False, sharex=True)[:, 0]
     for ax in axes:
         ax.grid(visible=True, color=GRID, linewidth=0.8)
         ax.set_axisbelow(True)
@@ -103,7 +104,15 @@ def pole_map_figure(model: LinearModel, gains: Mapping[str, Array]) -> Figure:
     poles = {label: closed_loop_poles(model, K) for label, K in gains.items()}
     _s_plane(ax, np.concatenate([open_loop, *poles.values()]), _spread(open_loop))
     ax.plot(
-        open_loop.real, open_loop.imag, "o", mfc="white", mec=INK, ms=9, mew=1.5, label="without feedback", zorder=4
+        open_loop.real,
+        open_loop.imag,
+        "o",
+        mfc="white",
+        mec=INK,
+        ms=9,
+        mew=1.5,
+        label="without feedback",
+        zorder=4,
     )
     for index, (label, values) in enumerate(poles.items()):
         # Gains of one table often share a pole: sizes differ so that none hides another.
@@ -151,7 +160,7 @@ def bode_figure(model: LinearModel, K: Array) -> Figure:
     centre = margins.crossover if math.isfinite(margins.crossover) else abs(model.poles[0])
     omega = np.logspace(math.log10(centre) - 2.5, math.log10(centre) + 3.0, 800)
     loop = loop_transfer(model, K, omega)
-    figure, (top, bottom) = _figure(2, 5.6, sharex=True)
+    figure, (top, bottom) = _figure(2, 5.6)
     top.semilogx(omega, 20.0 * np.log10(np.abs(loop)), color=COLOURS[0], linewidth=1.8)
     top.axhline(0.0, color=MUTED, linewidth=0.9)
     top.set_ylabel("|L| [dB]")
@@ -177,7 +186,8 @@ def bode_figure(model: LinearModel, K: Array) -> Figure:
         )  # fmt: skip
     up = "any factor" if math.isinf(margins.gain_up) else f"{margins.gain_up:.3g}"
     top.text(
-        0.98, 0.93, f"gain may grow by {up}\nand shrink to {margins.gain_down:.3f}\nmodulus margin {margins.modulus:.3f}",
+        0.98, 0.93, f"gain may grow by {up}\nand shrink to {margins.gain_down:.3f}\n"
+        f"modulus margin {margins.modulus:.3f}",
         transform=top.transAxes, ha="right", va="top", fontsize=9, color=COLOURS[2],
         bbox={"facecolor": "white", "edgecolor": "none", "alpha": 0.85},
     )  # fmt: skip
@@ -192,7 +202,7 @@ def step_figure(model: LinearModel, gains: Mapping[str, Array], report: LoopRepo
         gains: Label -> K, shape (2,).
         report: Figures of the gain that sets the time scale.
     """
-    figure, (top, bottom) = _figure(2, 5.2, sharex=True)
+    figure, (top, bottom) = _figure(2, 5.2)
     horizon = 6.0 * report.time_constant if math.isfinite(report.time_constant) else 5.0
     times = np.linspace(0.0, horizon, 800)
     inertia = 1.0 / float(model.B[1, 0])
@@ -211,7 +221,9 @@ def step_figure(model: LinearModel, gains: Mapping[str, Array], report: LoopRepo
     top.set_ylabel("angle [rad]")
     bottom.set_ylabel("torque [N m]")
     bottom.set_xlabel("time [s]")
-    top.set_title("Step of the set-point by 0.1 rad (linear model, gravity fed forward)", loc="left", fontweight="bold")
+    top.set_title(
+        "Step of the set-point by 0.1 rad (linear model, gravity fed forward)", loc="left", fontweight="bold"
+    )
     top.legend(frameon=False, fontsize=9, loc="lower right")
     return figure
 
@@ -237,7 +249,9 @@ def phase_portrait_figure(plant: RigidPlant, gain: Gain, effort_limit: float, re
     ax.streamplot(x, v, v, acceleration, color="#94a3b8", linewidth=0.7, density=1.3, arrowsize=0.8, zorder=1)
     ax.plot(region.ellipse[:, 0], region.ellipse[:, 1], color=COLOURS[1], linewidth=2.0, zorder=3)
     ax.plot([0.0], [0.0], "o", color=INK, ms=6, zorder=4)
-    ax.fill_between([], [], color="#dbeafe", label=f"attracted, by simulation (torque limit {effort_limit:g} N m)")
+    ax.fill_between(
+        [], [], color="#dbeafe", label=f"attracted, by simulation (torque limit {effort_limit:g} N m)"
+    )
     ax.plot([], [], color=COLOURS[1], linewidth=2.0, label=f"proven: x'Sx \u2264 {region.level:.4g}")
     ax.plot([], [], "o", color=INK, ms=6, label="upright")
     ax.set_xlim(angles[0], angles[-1])

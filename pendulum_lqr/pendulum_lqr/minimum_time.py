@@ -17,6 +17,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+
 from pendulum_msgs_py.plant_parameters import PlantParameters
 
 __all__ = ["TimeToGo", "minimum_time"]
@@ -58,7 +59,7 @@ class TimeToGo:
         i = math.floor(a)
         fraction = a - i
         b = (velocity + self.velocity_span) / (2.0 * self.velocity_span) * (m - 1)
-        b = 0.0 if b < 0.0 else (m - 1.000001 if b > m - 1.000001 else b)
+        b = 0.0 if b < 0.0 else (min(b, m - 1.000001))
         j = int(b)
         rest = b - j
         low, high = rows[i % n], rows[(i + 1) % n]

@@ -1,7 +1,7 @@
 """The pendulum linearised about a fixed point.
 
-``M_c theta'' + b_c theta' + G_c sin(theta) = u`` with the state x = [theta - theta*, theta'] and the input u - u*, where
-u* = G_c sin(theta*) holds the pendulum at theta*:
+``M_c theta'' + b_c theta' + G_c sin(theta) = u`` with the state x = [theta - theta*, theta'] and the input u - u*,
+where u* = G_c sin(theta*) holds the pendulum at theta*:
 
     A = [[0, 1], [-G_c cos(theta*) / M_c, -b_c / M_c]],   B = [0, 1 / M_c]
 
@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -88,7 +88,7 @@ class FixedPoint:
     stable: bool
 
 
-def sort_poles(poles: NDArray[np.complex128]) -> NDArray[np.complex128]:
+def sort_poles(poles: NDArray[Any]) -> NDArray[np.complex128]:
     """Return the poles with the slowest (largest real part) first."""
     values = np.asarray(poles, dtype=np.complex128)
     return values[np.lexsort((values.imag, -values.real))]

@@ -1,12 +1,12 @@
 """Region of attraction of u = clamp(-K x) under the torque limit: a proven part, and the whole by sampling.
 
-The proven part is a sublevel set of the Riccati solution's Lyapunov function V = x' S x. In the coordinates x = rho n(phi)
-with n' S n = 1, so that V = rho^2,
+The proven part is a sublevel set of the Riccati solution's Lyapunov function V = x' S x. In the coordinates
+x = rho n(phi) with n' S n = 1, so that V = rho^2,
 
     V' / rho^2 = 2 n' S [n_1, (-b n_1 + G n_0 sinc(rho n_0) + clamp(-K n, limit / rho)) / M]
 
-is bounded by interval arithmetic over cells of (rho, phi), which are split until every bound is negative. The quotient has
-no singularity at rho = 0, so that the proof covers the whole ellipse and not only its rim.
+is bounded by interval arithmetic over cells of (rho, phi), which are split until every bound is negative. The
+quotient has no singularity at rho = 0, so that the proof covers the whole ellipse and not only its rim.
 """
 
 from __future__ import annotations
@@ -74,7 +74,7 @@ class Region:
         return math.pi * self.level / math.sqrt(float(np.linalg.det(self.S)))
 
     def counterexamples(self) -> int:
-        """Return how many samples inside the proven set were not attracted: 0, or the proof or the sampling is wrong."""
+        """Return how many samples in the proven set were not attracted: 0, or proof or sampling is wrong."""
         x, v = np.meshgrid(self.angles, self.velocities)
         S = self.S
         value = S[0, 0] * x * x + 2.0 * S[0, 1] * x * v + S[1, 1] * v * v
@@ -153,7 +153,9 @@ def region_of_attraction(
     velocities = np.linspace(-velocity_span, velocity_span, points)
     x, v = np.meshgrid(angles, velocities)
     end_angle, end_velocity = rollout(x.ravel(), v.ravel())
-    arrived = (np.abs(wrap(np.asarray(end_angle, dtype=np.float64))) < tolerance[0]) & (np.abs(end_velocity) < tolerance[1])
+    arrived = (np.abs(wrap(np.asarray(end_angle, dtype=np.float64))) < tolerance[0]) & (
+        np.abs(end_velocity) < tolerance[1]
+    )
     level = proven_level(plant, gain, effort_limit)
     return Region(
         angles, velocities, arrived.reshape(x.shape), level, sublevel_ellipse(gain.S, level), gain.S
@@ -163,9 +165,9 @@ def region_of_attraction(
 def rigid_rollout(
     plant: RigidPlant, gain: Gain, effort_limit: float, duration: float = 8.0, dt: float = 0.002
 ) -> Rollout:
-    """Return a batch simulation of the smooth rigid plant under u = clamp(-K x), by RK4; the controller sees wrapped angles.
+    """Return a batch simulation of the smooth rigid plant under u = clamp(-K x), by RK4; feedback sees wrapped angles.
 
-    The simulator's batch engine does the same for plants with friction, delay and lag; this one draws the design's figure.
+    The simulator's batch engine does the same for plants with friction; this one draws the design's figure.
 
     Args:
         plant: Plant parameters.

@@ -10,9 +10,9 @@ from typing import Any
 import casadi
 import numpy as np
 from numpy.typing import NDArray
-from pendulum_msgs_py.plant_parameters import PlantParameters
 
 from pendulum_lqr.design import DesignError
+from pendulum_msgs_py.plant_parameters import PlantParameters
 
 __all__ = ["OptimisedTrajectory", "rigid_dynamics", "swing_up_trajectory"]
 
@@ -94,7 +94,13 @@ def swing_up_trajectory(plant: PlantParameters, effort_limit: float, nodes: int 
     opti.minimize(duration + 1e-3 * casadi.sumsqr(U[1:] - U[:-1]))
     opti.solver(
         "ipopt",
-        {"expand": True, "print_time": False, "ipopt.print_level": 0, "ipopt.sb": "yes", "ipopt.max_iter": 600},
+        {
+            "expand": True,
+            "print_time": False,
+            "ipopt.print_level": 0,
+            "ipopt.sb": "yes",
+            "ipopt.max_iter": 600,
+        },
     )
     best: OptimisedTrajectory | None = None
     s = np.linspace(0.0, 1.0, nodes + 1)

@@ -1,6 +1,6 @@
 """Tuning of the PID controller on the plant's own model, so that a comparison with LQR is fair.
 
-Numerical tuning minimises the very cost that the LQR minimises, over the three gains of a PID that sees the angle alone.
+Numerical tuning minimises the cost that the LQR minimises, over the three gains of a PID that sees the angle alone.
 """
 
 from __future__ import annotations
@@ -73,8 +73,9 @@ def pid_cost(
 ) -> float:
     """Return the LQR cost of a PID loop, summed over a release from 0.1 rad and the onset of 1 N m; inf if unstable.
 
-    Both parts count x' Q x + R (u - u_end)^2 per second, where u_end is the torque that remains: without it any integral
-    action would cost infinitely much under a constant load. Without an integral (k_i = 0) the second part is infinite.
+    Both parts count x' Q x + R (u - u_end)^2 per second, where u_end is the torque that remains: without it any
+    integral action would cost infinitely much under a constant load. Without an integral (k_i = 0) the second part
+    is infinite.
 
     Args:
         model: Linear model.

@@ -122,7 +122,7 @@ class SavitzkyGolay:
             del samples[0]
         if len(samples) < self.window:
             return velocity
-        return sum(weight * sample for weight, sample in zip(self._weights, samples))
+        return sum(weight * sample for weight, sample in zip(self._weights, samples, strict=True))
 
 
 class KalmanVelocity:
@@ -177,7 +177,7 @@ VELOCITY_ESTIMATORS: dict[str, Callable[[PlantParameters, float], VelocityEstima
     "measured": lambda plant, period: MeasuredVelocity(),
     "filtered_difference": lambda plant, period: FilteredDifference(2.0 * period),
     "savitzky_golay": lambda plant, period: SavitzkyGolay(period),
-    "kalman": lambda plant, period: KalmanVelocity(plant, period),
+    "kalman": KalmanVelocity,
 }
 """Name -> maker from plant and sampling period."""
 

@@ -9,6 +9,7 @@ from typing import NamedTuple
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+
 from pendulum_lqr.controller import Controller
 from pendulum_lqr.disturbance import Disturbance
 from pendulum_msgs_py.angles import from_upright

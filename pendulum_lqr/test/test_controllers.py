@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+
 from pendulum_lqr import controller as registry
 from pendulum_lqr.controller import (
     COMMON_PARAMETERS,
@@ -87,7 +88,12 @@ def test_integral_action_removes_the_offset_of_a_constant_torque(name, simulate,
     offset = {}
     for kind in ("lqr", name):
         run = simulate(
-            THESIS, design(kind, THESIS, playback_file), theta=math.pi, duration=25.0, period=0.02, disturbance=load
+            THESIS,
+            design(kind, THESIS, playback_file),
+            theta=math.pi,
+            duration=25.0,
+            period=0.02,
+            disturbance=load,
         )
         offset[kind] = abs(run.angle[-1])
     # LQR alone gives way by d / (K1 - G).
@@ -194,7 +200,14 @@ def test_numerical_tuning_finds_a_minimum_of_the_cost(plant):
     arguments = (0.01, 0.02, (100.0, 0.01), 0.1)
     best = tune_numerically(model, *arguments)
     least = pid_cost(model, best, *arguments)
-    for factors in ((1.1, 1.0, 1.0), (0.9, 1.0, 1.0), (1.0, 1.2, 1.0), (1.0, 0.8, 1.0), (1.0, 1.0, 1.1), (1.0, 1.0, 0.9)):
+    for factors in (
+        (1.1, 1.0, 1.0),
+        (0.9, 1.0, 1.0),
+        (1.0, 1.2, 1.0),
+        (1.0, 0.8, 1.0),
+        (1.0, 1.0, 1.1),
+        (1.0, 1.0, 0.9),
+    ):
         other = PidGains(best.kp * factors[0], best.ki * factors[1], best.kd * factors[2])
         assert pid_cost(model, other, *arguments) >= least * (1.0 - 1e-6)
 
@@ -269,7 +282,11 @@ def test_playback_without_a_file_is_refused():
         ("lqr", {"set_point": 9.0}, r"set_point is 9\.0 rad"),
         ("lqr", {"velocity": "guess"}, "velocity is 'guess'; expected one of measured"),
         ("discrete_lqr", {"delay": 0.5, "q": [1.0, 1.0, 1.0]}, "q has the shape"),
-        ("mpc", {"set_point": 1.5, "effort_limit": 1.0}, r"holding set_point 1\.5 rad takes .* N m; expected less"),
+        (
+            "mpc",
+            {"set_point": 1.5, "effort_limit": 1.0},
+            r"holding set_point 1\.5 rad takes .* N m; expected less",
+        ),
     ],
 )
 def test_a_bad_parameter_is_refused_with_its_reason(name, values, message):

@@ -3,6 +3,7 @@
 import json
 
 import pytest
+
 from pendulum_lqr.design_cli import main
 from pendulum_msgs_py.plant_parameters import load_plant, write_plant
 

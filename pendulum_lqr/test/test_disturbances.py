@@ -7,6 +7,7 @@ import pytest
 import scipy.signal
 from hypothesis import given, settings
 from hypothesis import strategies as st
+
 from pendulum_lqr.disturbance import DISTURBANCE_SPECS, DISTURBANCES, from_bag, make_disturbance, torques
 from pendulum_lqr.disturbing import DisturbanceLoop
 from pendulum_msgs_py import noise
@@ -40,7 +41,9 @@ def test_a_random_sample_is_held_for_the_hold_time(seed, elapsed_ns, hold_time):
 
 
 def test_uniform_fills_its_interval_and_is_white():
-    values = torques(make_disturbance({"seed": 2, "amplitude": 2.5, "hold_time": 0.002}), np.arange(20000) * 2 * MS)
+    values = torques(
+        make_disturbance({"seed": 2, "amplitude": 2.5, "hold_time": 0.002}), np.arange(20000) * 2 * MS
+    )
     assert -2.5 <= values.min() < -2.49
     assert 2.49 < values.max() < 2.5
     assert values.std() == pytest.approx(2.5 / math.sqrt(3.0), rel=0.02)
@@ -49,7 +52,9 @@ def test_uniform_fills_its_interval_and_is_white():
 
 def test_gaussian_has_its_deviation_and_its_bandwidth():
     values = torques(
-        make_disturbance({"kind": "gaussian", "seed": 2, "amplitude": 0.7, "hold_time": 0.005, "bandwidth": 10.0}),
+        make_disturbance(
+            {"kind": "gaussian", "seed": 2, "amplitude": 0.7, "hold_time": 0.005, "bandwidth": 10.0}
+        ),
         np.arange(12000) * 5 * MS,
     )
     assert values.std() == pytest.approx(0.7, rel=0.05)
@@ -97,7 +102,14 @@ def test_sine_and_its_held_samples():
 
 def test_chirp_passes_every_octave_in_the_same_time():
     signal = make_disturbance(
-        {"kind": "chirp", "frequency": 1.0, "frequency_end": 16.0, "sweep_time": 8.0, "hold_time": 0.0, "amplitude": 1.0}
+        {
+            "kind": "chirp",
+            "frequency": 1.0,
+            "frequency_end": 16.0,
+            "sweep_time": 8.0,
+            "hold_time": 0.0,
+            "amplitude": 1.0,
+        }
     )
     values = torques(signal, np.arange(0, 8 * SECOND, MS))
     # Two seconds an octave: f integrates to (2^k - 2^(k-1)) 2 / ln 2 turns in octave k.
@@ -112,7 +124,14 @@ def test_step_and_pulses_begin_at_their_time():
     step = make_disturbance({"kind": "step", "amplitude": 1.5, "start_time": 1.0, "hold_time": 0.0})
     assert (step(SECOND - 1), step(SECOND)) == (0.0, 1.5)
     pulses = make_disturbance(
-        {"kind": "pulse_train", "amplitude": 1.5, "frequency": 2.0, "pulse_width": 0.1, "start_time": 1.0, "hold_time": 0.0}
+        {
+            "kind": "pulse_train",
+            "amplitude": 1.5,
+            "frequency": 2.0,
+            "pulse_width": 0.1,
+            "start_time": 1.0,
+            "hold_time": 0.0,
+        }
     )
     got = [pulses(t * MS) for t in (999, 1000, 1099, 1101, 1499, 1500, 1599, 1601, 2000)]
     assert got == [0.0, 1.5, 1.5, 0.0, 0.0, -1.5, -1.5, 0.0, 1.5]

@@ -6,7 +6,14 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from pendulum_lqr.model import equilibrium_effort, fixed_points, linearise, overdamped_velocity, state_derivative
+
+from pendulum_lqr.model import (
+    equilibrium_effort,
+    fixed_points,
+    linearise,
+    overdamped_velocity,
+    state_derivative,
+)
 from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.plant_parameters import PlantParameters, load_plant
 

@@ -1,13 +1,16 @@
 """Gains against the thesis, closed forms, scipy and python-control; refusals; margins against simulation."""
 
 import math
+from itertools import pairwise
 
 import control
 import numpy as np
 import pytest
+import scipy.integrate
 import scipy.linalg
 from hypothesis import given, settings
 from hypothesis import strategies as st
+
 from pendulum_lqr.analysis import analyse, delayed_spectral_radius, largest_stable_period, loop_margins
 from pendulum_lqr.design import (
     DesignError,
@@ -86,7 +89,9 @@ def test_gain_agrees_with_python_control(plant, q, r):
 def test_scalar_discrete_riccati_equation_has_its_closed_form():
     # Angle alone, x[k+1] = a x[k] + b u[k]: s solves s = q + a^2 s - (a b s)^2 / (r + b^2 s).
     a, b, q, r = 1.1, 0.3, 2.0, 0.5
-    s = scipy.linalg.solve_discrete_are(np.array([[a]]), np.array([[b]]), np.array([[q]]), np.array([[r]]))[0, 0]
+    s = scipy.linalg.solve_discrete_are(np.array([[a]]), np.array([[b]]), np.array([[q]]), np.array([[r]]))[
+        0, 0
+    ]
     p = b * b * q - r * (1 - a * a)
     assert s == pytest.approx((p + math.sqrt(p * p + 4 * b * b * q * r)) / (2 * b * b))
 
@@ -119,7 +124,7 @@ def test_sampled_model_with_delay_agrees_with_a_simulation_in_small_pieces(plant
     # The same, exactly: the input changes at k period + delay; integrate from change to change.
     end = len(efforts) * period
     edges = sorted({0.0, end, *(t for k in range(len(efforts)) if 0.0 < (t := k * period + delay) < end)})
-    for start, stop in zip(edges[:-1], edges[1:], strict=True):
+    for start, stop in pairwise(edges):
         index = math.floor((0.5 * (start + stop) - delay) / period)
         effort = efforts[index] if index >= 0 else 0.0
         block = np.zeros((3, 3))
@@ -133,7 +138,7 @@ def test_delay_compensation_restores_the_undelayed_poles():
     plain = discrete_lqr(discretise(UPRIGHT, 0.01), (100.0, 0.01), 0.1)
     delayed = discrete_lqr(discretise(UPRIGHT, 0.01, 0.02), (100.0, 0.01), 0.1)
     # A delay of whole samples adds poles at zero and changes nothing else, only the cost.
-    slowest = sorted(delayed.poles.real)[-1]
+    slowest = max(delayed.poles.real)
     assert slowest == pytest.approx(max(plain.poles.real), rel=1e-6)
     assert np.sum(np.abs(delayed.poles) < 1e-4) >= 2
 
@@ -164,7 +169,7 @@ def test_sampled_cost_agrees_with_quadrature():
     for t in times:
         step = scipy.linalg.expm(block * t)
         values.append(step.T @ np.diag([10.0, 1.0, 2.0]) @ step)
-    total = np.trapezoid(values, times, axis=0) if hasattr(np, "trapezoid") else np.trapz(values, times, axis=0)
+    total = scipy.integrate.trapezoid(values, times, axis=0)
     np.testing.assert_allclose(np.block([[Q, N], [N.T, np.array([[R]])]]), total, rtol=1e-4, atol=1e-7)
 
 
@@ -260,7 +265,9 @@ def test_an_unstable_gain_has_no_stable_period():
     assert largest_stable_period(UPRIGHT, [0.1, 0.0]) == 0.0
 
 
-@pytest.mark.parametrize(("period", "delay"), [(0.0, 0.0), (-1.0, 0.0), (math.nan, 0.0), (0.01, -1.0), (0.01, math.inf)])
+@pytest.mark.parametrize(
+    ("period", "delay"), [(0.0, 0.0), (-1.0, 0.0), (math.nan, 0.0), (0.01, -1.0), (0.01, math.inf)]
+)
 def test_a_bad_period_or_delay_is_refused(period, delay):
     with pytest.raises(DesignError, match=r"(period|delay) is .* s; expected a finite value"):
         discretise(UPRIGHT, period, delay)

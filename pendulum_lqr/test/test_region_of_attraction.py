@@ -4,6 +4,7 @@ import math
 
 import numpy as np
 import pytest
+
 from pendulum_lqr.design import DesignError, continuous_lqr
 from pendulum_lqr.model import linearise
 from pendulum_lqr.roa import proven_level, region_of_attraction, rigid_rollout, sublevel_ellipse
@@ -78,7 +79,13 @@ def test_sampling_through_the_batch_engine_of_the_simulator_contains_the_proven_
 
     def rollout(angle, velocity):
         end = simulate_batch(
-            smooth, steps=3000, dt=2e-3, theta=angle + math.pi, theta_dot=velocity, gain=gain.K, target=math.pi
+            smooth,
+            steps=3000,
+            dt=2e-3,
+            theta=angle + math.pi,
+            theta_dot=velocity,
+            gain=gain.K,
+            target=math.pi,
         )
         return end.theta - math.pi, end.theta_dot
 

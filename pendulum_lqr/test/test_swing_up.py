@@ -8,6 +8,7 @@ import math
 
 import numpy as np
 import pytest
+
 from pendulum_lqr.controller import make_controller
 from pendulum_lqr.minimum_time import minimum_time
 from pendulum_lqr.trajectory_optimisation import swing_up_trajectory
@@ -89,7 +90,14 @@ def test_a_push_out_of_upright_is_answered_by_a_new_swing_up(simulate):
     from pendulum_lqr.disturbance import make_disturbance
 
     kick = make_disturbance(
-        {"kind": "pulse_train", "amplitude": 6.0, "start_time": 4.0, "frequency": 0.05, "pulse_width": 0.5, "hold_time": 0.0}
+        {
+            "kind": "pulse_train",
+            "amplitude": 6.0,
+            "start_time": 4.0,
+            "frequency": 0.05,
+            "pulse_width": 0.5,
+            "hold_time": 0.0,
+        }
     )
     strong = DFKI.with_values(effort_limit=8.0)
     limited = make_controller("energy_swing_up", DFKI, 0.01)

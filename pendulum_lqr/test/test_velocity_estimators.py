@@ -4,6 +4,7 @@ import math
 
 import numpy as np
 import pytest
+
 from pendulum_lqr.controller import make_controller
 from pendulum_lqr.velocity import VELOCITY_ESTIMATORS, KalmanVelocity, SavitzkyGolay, make_velocity_estimator
 from pendulum_msgs_py.angles import wrap
@@ -84,5 +85,7 @@ def test_kalman_holds_on_the_stiff_plant_too():
 
 
 def test_an_unknown_estimator_is_refused():
-    with pytest.raises(ParameterError, match="velocity is 'magic'; expected one of measured, filtered_difference"):
+    with pytest.raises(
+        ParameterError, match="velocity is 'magic'; expected one of measured, filtered_difference"
+    ):
         make_velocity_estimator("magic", THESIS, 0.01)

@@ -35,8 +35,8 @@ class DiscreteLqr(BaseController):
         R,
         ParameterSpec("delay", 0.0, "s", "Delay from state to torque, beyond the plant's own transport_delay.",
                       minimum=0.0, maximum=1.0),
-        ParameterSpec("cost", "sampled", "", "sampled: the continuous cost collected over each period; sum: the cost at "
-                      "the samples alone.", choices=("sampled", "sum")),
+        ParameterSpec("cost", "sampled", "", "sampled: the continuous cost collected over each period; sum: the cost "
+                      "at the samples alone.", choices=("sampled", "sum")),
         FEEDFORWARD,
     )  # fmt: skip
 
@@ -74,7 +74,7 @@ class DiscreteLqr(BaseController):
     def command(self, t: float, x: Sequence[float]) -> float:
         """Return the torque [N m]."""
         wanted = self.hold - self._k0 * self.error(x[0]) - self._k1 * x[1]
-        for gain, effort in zip(self._pending_gain, self._pending):
+        for gain, effort in zip(self._pending_gain, self._pending, strict=True):
             wanted -= gain * effort
         effort = self.clamp(wanted)
         # What is on its way is what was sent, limits included, as a deviation from the holding torque.

@@ -17,8 +17,9 @@ __all__ = ["EnergySwingUp"]
 class EnergySwingUp(BaseController):
     """Pumps energy until upright is within reach, then hands over to an LQR.
 
-    Pumping torque: u = clamp(k (E* + margin - E) theta_dot + b theta_dot + tau_C sgn(theta_dot)), with E = M theta_dot^2 / 2 +
-    G (1 + cos(theta - pi)) and E* = 2 G. Its first part is passive; the other two put back what friction takes.
+    Pumping torque: u = clamp(k (E* (1 + margin) - E) theta_dot + b theta_dot + tau_C sgn(theta_dot)), with
+    E = M theta_dot^2 / 2 + G (1 + cos(theta - pi)) and E* = 2 G. Its first part is passive; the other two put
+    back what friction takes.
 
     Args:
         plant: Plant parameters.

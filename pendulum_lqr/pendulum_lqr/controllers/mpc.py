@@ -11,14 +11,14 @@ import osqp
 import scipy.linalg
 import scipy.sparse
 from numpy.typing import NDArray
-from pendulum_msgs_py.angles import UPRIGHT
-from pendulum_msgs_py.parameters import ParameterSpec
-from pendulum_msgs_py.plant_parameters import PlantParameters
 
 from pendulum_lqr.controller import BaseController
 from pendulum_lqr.controllers.specs import FEEDFORWARD, Q, R
 from pendulum_lqr.design import DesignError, Gain, discrete_lqr, discretise, sampled_cost
 from pendulum_lqr.model import LinearModel, linearise
+from pendulum_msgs_py.angles import UPRIGHT
+from pendulum_msgs_py.parameters import ParameterSpec
+from pendulum_msgs_py.plant_parameters import PlantParameters
 
 __all__ = ["LinearMpc"]
 
@@ -30,8 +30,8 @@ _SLACK_WEIGHT = 1e4
 class LinearMpc(BaseController):
     """Minimises the LQR's cost over N samples plus its cost to go, under limits of torque, angle and velocity.
 
-    Without active limits the answer is that of the discrete LQR. The torque limit is hard; angle and velocity limits are
-    soft (one slack each, dear), because a hard state limit has no answer once a disturbance has broken it.
+    Without active limits the answer is that of the discrete LQR. The torque limit is hard; angle and velocity
+    limits are soft (one slack each, dear), because a hard state limit has no answer once a disturbance has broken it.
 
     Args:
         model: Linear model at the set-point.
@@ -44,7 +44,9 @@ class LinearMpc(BaseController):
         Q,
         R,
         ParameterSpec("horizon", 20, "-", "Samples of the horizon.", minimum=1, maximum=200),
-        ParameterSpec("angle_limit", 0.5, "rad", "Largest deviation from the set-point; 0 for none.", minimum=0.0),
+        ParameterSpec(
+            "angle_limit", 0.5, "rad", "Largest deviation from the set-point; 0 for none.", minimum=0.0
+        ),
         ParameterSpec("velocity_limit", 0.0, "rad/s", "Largest velocity; 0 for none.", minimum=0.0),
         FEEDFORWARD,
     )

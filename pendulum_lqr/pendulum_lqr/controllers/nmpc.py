@@ -9,12 +9,12 @@ from typing import Any
 import casadi
 import numpy as np
 from numpy.typing import NDArray
-from pendulum_msgs_py.parameters import ParameterSpec
-from pendulum_msgs_py.plant_parameters import PlantParameters
 
 from pendulum_lqr.catch import Catch, make_catch
 from pendulum_lqr.controller import BaseController
 from pendulum_lqr.trajectory_optimisation import rigid_dynamics
+from pendulum_msgs_py.parameters import ParameterSpec
+from pendulum_msgs_py.plant_parameters import PlantParameters
 
 __all__ = ["NonlinearMpc"]
 
@@ -24,8 +24,8 @@ Array = NDArray[np.float64]
 class NonlinearMpc(BaseController):
     """Multiple shooting with RK4 over N steps, warm-started from the last plan; LQR takes over near upright.
 
-    Minimises the sum of h (q0 2 (1 - cos e) + q1 theta_dot^2 + r u^2) and a terminal cost of the same form; 2 (1 - cos e) is
-    e^2 near upright and knows no difference between turns.
+    Minimises the sum of h (q0 2 (1 - cos e) + q1 theta_dot^2 + r u^2) and a terminal cost of the same form;
+    2 (1 - cos e) is e^2 near upright and knows no difference between turns.
 
     Args:
         plant: Plant parameters.

@@ -76,7 +76,7 @@ class Playback(BaseController):
                 raise DataError(f"{path}:{number}: {row!r}; expected time [s], effort [N m]") from error
         if len(values) < 2:
             raise DataError(f"playback file {path} has {len(values)} samples; expected at least 2")
-        times, efforts = zip(*values)
+        times, efforts = zip(*values, strict=True)
         return cls(times, efforts, p["effort_limit"])
 
     def command(self, t: float, x: Sequence[float]) -> float:

@@ -14,7 +14,9 @@ __all__ = ["SlidingMode"]
 
 
 class SlidingMode(BaseController):
-    """Drives s = theta_dot + lambda (theta - theta*) to zero: u = G sin(theta) - b lambda e - M lambda theta_dot - k sat(s/phi).
+    """Drives s = theta_dot + lambda e, with e = theta - theta*, to zero.
+
+        u = G sin(theta) - b lambda e - M lambda theta_dot - k sat(s / phi)
 
     This leaves M s' = -b s - k sat(s / phi) - d: the plant's own damping is kept and not cancelled, because cancelling
     b theta_dot through a sampled loop is unstable as soon as the period exceeds 2 M / b (9 ms for the thesis's plant).

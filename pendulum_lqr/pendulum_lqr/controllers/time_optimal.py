@@ -7,12 +7,11 @@ from collections.abc import Mapping, Sequence
 from functools import lru_cache
 from typing import Any
 
-from pendulum_msgs_py.parameters import ParameterSpec
-from pendulum_msgs_py.plant_parameters import PlantParameters
-
 from pendulum_lqr.catch import Catch, make_catch
 from pendulum_lqr.controller import BaseController
 from pendulum_lqr.minimum_time import TimeToGo, minimum_time
+from pendulum_msgs_py.parameters import ParameterSpec
+from pendulum_msgs_py.plant_parameters import PlantParameters
 
 __all__ = ["TimeOptimal"]
 
@@ -31,7 +30,9 @@ class TimeOptimal(BaseController):
     SUMMARY = "swing-up in minimum time by dynamic programming, caught by LQR"
     PARAMETERS = (
         ParameterSpec("grid", 400, "-", "Grid points in angle and in velocity.", minimum=40, maximum=1000),
-        ParameterSpec("catch_q", [100.0, 1.0], "1/rad^2, s^2/rad^2", "Weights of the LQR that catches.", minimum=0.0),
+        ParameterSpec(
+            "catch_q", [100.0, 1.0], "1/rad^2, s^2/rad^2", "Weights of the LQR that catches.", minimum=0.0
+        ),
         ParameterSpec(
             "catch_r", 0.1, "1/(N m)^2", "Its weight of torque.", minimum=0.0, exclusive_minimum=True
         ),
@@ -102,4 +103,6 @@ def _table(
     plant: PlantParameters, limit: float, q: tuple[float, ...], r: float, share: float, grid: int
 ) -> TimeToGo:
     catch = make_catch(plant, q, r, limit, share)
-    return minimum_time(plant, limit, (catch.gain.S, catch.level), angles=grid, velocities=grid + 1 - grid % 2)
+    return minimum_time(
+        plant, limit, (catch.gain.S, catch.level), angles=grid, velocities=grid + 1 - grid % 2
+    )

@@ -9,9 +9,6 @@ from typing import Any
 import numpy as np
 import scipy.linalg
 from numpy.typing import NDArray
-from pendulum_msgs_py.angles import wrap
-from pendulum_msgs_py.parameters import ParameterSpec
-from pendulum_msgs_py.plant_parameters import PlantParameters
 
 from pendulum_lqr.catch import Catch, make_catch
 from pendulum_lqr.controller import BaseController
@@ -19,6 +16,9 @@ from pendulum_lqr.controllers.energy_swing_up import EnergySwingUp
 from pendulum_lqr.design import cost_matrices
 from pendulum_lqr.model import LinearModel
 from pendulum_lqr.trajectory_optimisation import OptimisedTrajectory, swing_up_trajectory
+from pendulum_msgs_py.angles import wrap
+from pendulum_msgs_py.parameters import ParameterSpec
+from pendulum_msgs_py.plant_parameters import PlantParameters
 
 __all__ = ["Tvlqr"]
 
@@ -173,5 +173,7 @@ def _gains(
 
 
 def _linearised(plant: PlantParameters, angle: float) -> LinearModel:
-    A = np.array([[0.0, 1.0], [plant.gravity * math.cos(angle) / plant.inertia, -plant.damping / plant.inertia]])
+    A = np.array(
+        [[0.0, 1.0], [plant.gravity * math.cos(angle) / plant.inertia, -plant.damping / plant.inertia]]
+    )
     return LinearModel(A, np.array([[0.0], [1.0 / plant.inertia]]))

@@ -1,0 +1,278 @@
+"""Controller and disturbance nodes on the real middleware, with this test as the plant."""
+
+import json
+import math
+import signal
+import time
+from collections.abc import Iterator
+
+import pytest
+
+from pendulum_lqr.disturbance import make_disturbance
+from pendulum_msgs_py.cdr import decode_joint_state, encode_joint_state
+
+rclpy = pytest.importorskip("rclpy")
+
+from diagnostic_msgs.msg import DiagnosticArray  # noqa: E402
+from lifecycle_msgs.msg import Transition  # noqa: E402
+from lifecycle_msgs.srv import ChangeState  # noqa: E402
+from rcl_interfaces.srv import SetParameters  # noqa: E402
+from rclpy.experimental import EventsExecutor  # noqa: E402
+from rclpy.parameter import Parameter  # noqa: E402
+from rclpy.task import Future  # noqa: E402
+from sensor_msgs.msg import JointState  # noqa: E402
+from std_msgs.msg import Float64MultiArray, String  # noqa: E402
+from std_srvs.srv import Trigger  # noqa: E402
+
+from pendulum_msgs_py.ros import qos  # noqa: E402
+
+STATE = {"position": math.pi + 0.1, "velocity": 0.2, "effort": 0.0}
+ANSWER = -(33.345265 * 0.1 + 0.158993 * 0.2)
+
+
+class FakePlant:
+    """Publishes states and keeps what comes back."""
+
+    def __init__(self) -> None:
+        self.context = rclpy.Context()
+        self.context.init()
+        self.node = rclpy.create_node("plant", namespace="/sim", context=self.context)
+        self.executor = EventsExecutor(context=self.context)
+        self.executor.add_node(self.node)
+        self.states = self.node.create_publisher(JointState, "joint_states", qos.STATE)
+        self.commands: list = []
+        self.disturbances: list = []
+        self.arrays: list[float] = []
+        self.events: list[dict] = []
+        self.diagnostics: dict[str, dict] = {}
+        subscribe = self.node.create_subscription
+        subscribe(
+            JointState, "effort_command", lambda m: self.commands.append(decode_joint_state(m)), 10, raw=True
+        )
+        subscribe(
+            JointState, "disturbance", lambda m: self.disturbances.append(decode_joint_state(m)), 10, raw=True
+        )
+        subscribe(Float64MultiArray, "controller/commands", lambda m: self.arrays.extend(m.data), 10)
+        subscribe(String, "events", lambda m: self.events.append(json.loads(m.data)), qos.EVENTS)
+        subscribe(DiagnosticArray, "/diagnostics", self._on_diagnostics, 10)
+
+    def _on_diagnostics(self, message: DiagnosticArray) -> None:
+        for status in message.status:
+            values = {pair.key: pair.value for pair in status.values}
+            self.diagnostics[status.name] = {"message": status.message, "level": status.level, **values}
+
+    def spin(self, seconds: float) -> None:
+        self.executor.spin_until_future_complete(Future(executor=self.executor), seconds)
+
+    def wait(self, predicate, what: str, timeout: float = 30.0):
+        end = time.monotonic() + timeout
+        while not (value := predicate()):
+            assert time.monotonic() < end, f"waited {timeout} s for {what}"
+            self.spin(0.02)
+        return value
+
+    def publish(self, stamp_ns: int | None = None, **state: float) -> int:
+        stamp = time.time_ns() if stamp_ns is None else stamp_ns
+        self.states.publish(encode_joint_state(stamp, **(STATE | state)))
+        return stamp
+
+    def run(self, count: int, period: float = 0.005) -> list[int]:
+        stamps = []
+        for _ in range(count):
+            stamps.append(self.publish())
+            self.spin(period)
+        self.spin(0.1)
+        return stamps
+
+    def connect(self, nodes: int = 1) -> None:
+        self.wait(lambda: self.states.get_subscription_count() >= nodes, "subscriptions")
+
+    def call(self, kind, name: str, request):
+        client = self.node.create_client(kind, name)
+        self.wait(client.service_is_ready, f"service {name}")
+        future = client.call_async(request)
+        self.wait(future.done, f"answer of {name}")
+        return future.result()
+
+    def set_parameters(self, node: str, **values):
+        request = SetParameters.Request(
+            parameters=[Parameter(name, value=value).to_parameter_msg() for name, value in values.items()]
+        )
+        return self.call(SetParameters, f"{node}/set_parameters", request).results[0]
+
+    def close(self) -> None:
+        self.executor.shutdown()
+        self.node.destroy_node()
+        self.context.try_shutdown()
+
+
+@pytest.fixture
+def plant(domain_id: int) -> Iterator[FakePlant]:
+    fake = FakePlant()
+    yield fake
+    fake.close()
+
+
+def ros(*parameters: str) -> list[str]:
+    arguments = ["--ros-args", "-r", "__ns:=/sim"]
+    for parameter in parameters:
+        arguments += ["-p", parameter]
+    return arguments
+
+
+def test_the_controller_answers_each_state_once_by_its_stamp_and_ends_with_zero(plant, processes):
+    # A busy machine may deliver a state late; how old is too old is the business of a test without a middleware.
+    program = processes.start("pendulum_lqr", "controller", *ros("state_timeout:=2.0"))
+    program.wait_for_output(r"lqr for plant thesis: K = \[33\.345265, 0\.158993\]", 30)
+    plant.wait(lambda: plant.publish() and plant.commands, "the first answer")
+    plant.spin(0.5)
+    plant.commands.clear()
+    stamps = plant.run(60, period=0.01)
+    answered = [command.stamp_ns for command in plant.commands]
+    # Only the newest state is kept, so a busy machine may skip some; none is answered twice.
+    assert len(answered) >= 30
+    assert answered == sorted(set(answered))
+    assert set(answered) <= set(stamps)
+    assert plant.commands[0].frame_id == "/sim/controller"
+    assert all(command.effort == pytest.approx(ANSWER, abs=1e-5) for command in plant.commands)
+    assert all(command.position is None and command.velocity is None for command in plant.commands)
+    # What must not be answered, one state at a time because only the newest is kept.
+    plant.spin(0.5)
+    count = len(plant.commands)
+    for state in ({"stamp_ns": time.time_ns() - 10**10}, {"position": math.nan}):
+        plant.publish(**state)
+        plant.spin(0.3)
+    assert len(plant.commands) == count
+    told = plant.wait(
+        lambda: (
+            (d := plant.diagnostics.get("/sim/controller: controller", {})).get("refused.not_finite") and d
+        ),
+        "diagnostics of the refusals",
+    )
+    assert (told["refused.stale"], told["refused.not_finite"]) == ("1", "1")
+    # A change designs aside and swaps; a bad value leaves the old gain in force and says why.
+    refused = plant.set_parameters("controller", q=[1.0, 0.01, 5.0])
+    assert not refused.successful
+    assert refused.reason.startswith("q has the shape (3,); expected (2,)")
+    assert not plant.set_parameters("controller", r=-1.0).successful
+    plant.run(3)
+    assert plant.commands[-1].effort == pytest.approx(ANSWER, abs=1e-5)
+    assert plant.set_parameters("controller", q=[1.0, 0.01]).successful
+    plant.run(3)
+    assert plant.commands[-1].effort == pytest.approx(-(5.257900 * 0.1 + 0.028783 * 0.2), abs=1e-5)
+    assert not plant.set_parameters("controller", plant="dfki").successful
+    program.send_signal(signal.SIGTERM)
+    assert program.wait(15) == 0
+    plant.wait(lambda: plant.commands[-1].effort == 0.0, "the last zero")
+    assert plant.commands[-1].stamp_ns > plant.commands[-2].stamp_ns
+
+
+def test_a_manager_can_hold_the_controller_and_deactivation_sends_zero(plant, processes):
+    program = processes.start(
+        "pendulum_lqr", "controller", *ros("autostart:=false", "controller:=pd_gravity")
+    )
+    plant.connect()
+    plant.run(5)
+    assert not plant.commands
+
+    def change(transition):
+        request = ChangeState.Request(transition=Transition(id=transition))
+        return plant.call(ChangeState, "controller/change_state", request).success
+
+    assert change(Transition.TRANSITION_CONFIGURE)
+    plant.run(5)
+    assert not plant.commands
+    assert change(Transition.TRANSITION_ACTIVATE)
+    plant.run(10)
+    assert plant.commands
+    assert plant.commands[-1].effort != 0.0
+    assert change(Transition.TRANSITION_DEACTIVATE)
+    plant.spin(0.2)
+    assert plant.commands[-1].effort == 0.0
+    count = len(plant.commands)
+    plant.run(5)
+    assert len(plant.commands) == count
+    assert change(Transition.TRANSITION_ACTIVATE)
+    plant.run(5)
+    assert len(plant.commands) > count
+    program.interrupt()
+    assert program.wait(15) == 0
+
+
+def test_multi_array_speaks_to_an_effort_controller_of_ros2_control(plant, processes):
+    program = processes.start("pendulum_lqr", "controller", *ros("command_type:=multi_array"))
+    plant.connect()
+    plant.wait(lambda: plant.publish() and plant.arrays, "commands")
+    assert plant.arrays[-1] == pytest.approx(ANSWER, abs=1e-5)
+    assert not plant.commands
+    program.send_signal(signal.SIGINT)
+    assert program.wait(15) == 0
+    plant.wait(lambda: plant.arrays[-1] == 0.0, "the last zero")
+
+
+def test_the_disturbance_follows_seed_and_stamp_between_start_and_end(plant, processes):
+    program = processes.start("pendulum_lqr", "disturbance", *ros("seed:=7", "duration:=0.2"))
+    plant.wait(lambda: plant.publish() and plant.disturbances, "the first answer")
+    plant.run(20, period=0.01)
+    assert all(answer.effort == 0.0 for answer in plant.disturbances)
+    assert plant.call(Trigger, "disturbance/start", Trigger.Request()).success
+    assert not plant.call(Trigger, "disturbance/start", Trigger.Request()).success
+    running = plant.set_parameters("disturbance", amplitude=1.0)
+    assert not running.successful
+    assert "is running; expected ~/stop before a change" in running.reason
+    count = len(plant.disturbances)
+    plant.run(60, period=0.01)
+    plant.wait(lambda: len(plant.events) >= 2, "both events")
+    begin, end = plant.events
+    assert (begin["name"], end["name"]) == ("noise_start", "noise_end")
+    assert begin["disturbance"]["seed"] == 7
+    assert begin["disturbance"]["hold_time"] == 0.01
+    signal_7 = make_disturbance({"seed": 7})
+    allowed = {signal_7(k * 10_000_000) for k in range(21)}
+    during = [a for a in plant.disturbances[count:] if begin["stamp_ns"] <= a.stamp_ns < end["stamp_ns"]]
+    assert len(during) >= 10
+    assert {answer.effort for answer in during} <= allowed
+    assert end["stamp_ns"] - begin["stamp_ns"] >= 200_000_000
+    assert all(a.effort == 0.0 for a in plant.disturbances if a.stamp_ns >= end["stamp_ns"])
+    assert plant.set_parameters("disturbance", amplitude=1.0).successful
+    program.send_signal(signal.SIGINT)
+    assert program.wait(15) == 0
+
+
+def test_a_stopped_process_ends_a_running_disturbance_with_zero(plant, processes):
+    program = processes.start("pendulum_lqr", "disturbance", *ros("kind:=step", "autostart:=true"))
+    plant.connect()
+    plant.wait(lambda: plant.publish() and any(a.effort == 2.5 for a in plant.disturbances), "the step")
+    program.send_signal(signal.SIGTERM)
+    assert program.wait(15) == 0
+    plant.wait(lambda: plant.disturbances[-1].effort == 0.0, "the last zero")
+    assert plant.wait(lambda: [e for e in plant.events if e["name"] == "noise_end"], "the event")
+
+
+@pytest.mark.parametrize(
+    ("executable", "parameters", "message"),
+    [
+        ("controller", ["controller:=lrq"], "controller is 'lrq'; expected one of lqr, lqi"),
+        ("controller", ["r:=-0.5"], "r is -0.5"),
+        ("controller", ["r:=1"], "write 1.0"),
+        ("controller", ["plant:=nowhere"], "plant is 'nowhere'; expected one of the presets"),
+        ("controller", ["controller:=playback"], "file is empty; expected the path of a CSV"),
+        ("disturbance", ["kind:=brown"], "kind is 'brown'; expected one of uniform"),
+        ("disturbance", ["kind:=from_bag"], "without a file"),
+    ],
+)
+def test_a_bad_parameter_at_start_ends_the_program_with_one_sentence(
+    executable, parameters, message, domain_id, processes
+):
+    program = processes.start("pendulum_lqr", executable, *ros(*parameters))
+    assert program.wait(30) == 2
+    assert message in program.output
+    assert "Traceback" not in program.output
+
+
+@pytest.mark.parametrize("executable", ["controller", "disturbance"])
+def test_help_lists_the_parameters_with_units(executable, processes):
+    program = processes.start("pendulum_lqr", executable, "--help")
+    assert program.wait(30) == 0
+    assert "N m" in program.output
+    assert "example:" in program.output
