@@ -199,9 +199,10 @@ def start_recorder(
         log_time: ``receive``, or ``header`` for runs whose time is simulated.
     """
     command = [sys.executable, "-m", "pendulum_bags", "record", "-o", str(bag)]
-    # Diagnostics tell of wall time, which has no place in a bag whose time is simulated.
-    diagnostics = "" if log_time == "header" else "|/diagnostics"
-    command += ["--regex", f"^({namespace}/.*|/clock{diagnostics})$", "--storage", storage]
+    command += ["--regex", f"^({namespace}/.*|/diagnostics|/clock)$", "--storage", storage]
     command += ["--metadata", str(metadata), "--log-time", log_time]
+    if log_time == "header":
+        # What is stamped with wall time has no place in a bag whose time is simulated.
+        command += ["--exclude", "^/diagnostics$|/transition_event$"]
     command += ["--ros-args", "-r", f"__ns:={namespace}"]
     return processes.start(f"recorder_{bag.name}", command, ends_last=True)
