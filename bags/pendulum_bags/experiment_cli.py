@@ -18,6 +18,7 @@ from pendulum_bags.experiment.progress import PhaseProgress
 from pendulum_bags.experiment.run_folder import create_run_folder, discard_if_empty, versions, write_json
 from pendulum_bags.experiment.settings import NoiseSettings, RegulationSettings
 from pendulum_bags.experiment_trials_cli import add_commands as add_trial_commands
+from pendulum_bags.study_cli import add_commands as add_study_commands
 from pendulum_msgs_py.errors import PendulumError
 from pendulum_msgs_py.executables import EXIT_INTERRUPTED, cli_main
 
@@ -35,7 +36,9 @@ app = typer.Typer(
 _EXPECTED_TOTAL = 52.0
 """Expected length of the thesis's experiment, of which 31 s are the ramps [s]."""
 
-Plant = Annotated[str, typer.Option(help="Preset or plant file of the simulated plant, and of the controller's design.")]
+Plant = Annotated[
+    str, typer.Option(help="Preset or plant file of the simulated plant, and of the controller's design.")
+]
 Seed = Annotated[int, typer.Option(help="Seed of the noise; one seed is one signal.", min=0)]
 Amplitude = Annotated[float, typer.Option(help="Largest torque of the noise [N m].")]
 HoldTime = Annotated[float, typer.Option(help="Time for which a noise sample is held [s].")]
@@ -44,7 +47,9 @@ Controller = Annotated[str, typer.Option(help="Kind of controller.")]
 Q = Annotated[tuple[float, float], typer.Option(help="Diagonal of Q.")]
 R = Annotated[float, typer.Option(help="R.")]
 Storage = Annotated[str, typer.Option(help="Storage of the bags: mcap or sqlite3.")]
-Domain = Annotated[int | None, typer.Option(help="ROS domain; by default ROS_DOMAIN_ID, or the first free one.")]
+Domain = Annotated[
+    int | None, typer.Option(help="ROS domain; by default ROS_DOMAIN_ID, or the first free one.")
+]
 Strategy = Annotated[str, typer.Option(help="How the actuator turns wanted torque into PWM.")]
 
 
@@ -65,7 +70,9 @@ def thesis(
     r: R = 0.1,
     storage: Storage = "mcap",
     domain: Domain = None,
-    json_output: Annotated[bool, typer.Option("--json", help="Print summary.json instead of the table.")] = False,
+    json_output: Annotated[
+        bool, typer.Option("--json", help="Print summary.json instead of the table.")
+    ] = False,
 ) -> None:
     """Regulate the upright pendulum under noise on simulator and hardware, and compare them, as the thesis does.
 
@@ -104,7 +111,9 @@ def thesis(
     else:
         _print_summary(console, summary)
     elapsed = time.monotonic() - started
-    console.print(f"\nreport  {folder / 'report.html'}\nbags    {folder / 'sim'}, {folder / 'hw'}\n({elapsed:.0f} s)")
+    console.print(
+        f"\nreport  {folder / 'report.html'}\nbags    {folder / 'sim'}, {folder / 'hw'}\n({elapsed:.0f} s)"
+    )
 
 
 @app.command()
@@ -116,7 +125,8 @@ def lockstep(
     seed: Seed = 1,
     amplitude: Amplitude = 2.5,
     hold_time: Annotated[
-        float | None, typer.Option(help="Time for which a noise sample is held [s]; by default the plant's period.")
+        float | None,
+        typer.Option(help="Time for which a noise sample is held [s]; by default the plant's period."),
     ] = None,
     duration: Duration = 5.0,
     controller: Controller = "lqr",
@@ -150,6 +160,7 @@ def lockstep(
 
 
 add_trial_commands(app)
+add_study_commands(app)
 
 
 @app.command()

@@ -1,0 +1,206 @@
+"""PID against LQR: both controllers on both plants, the same noise and the same step, over many seeds."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from rich.console import Console
+from rich.table import Table
+from scipy import stats
+
+from pendulum_bags.comparison.metrics import METRICS, Episode, metrics_of
+from pendulum_bags.report.figure import Figure, Panel, Trace
+from pendulum_bags.report.render_files import write_figures
+from pendulum_bags.study.results import episode_of_run, group_runs
+from pendulum_bags.study.study_file import Study
+
+__all__ = ["COMPARED", "analyse", "print_table"]
+
+COMPARED = ("ise", "itae", "effort_energy", "smoothness", "max_effort")
+"""Metrics taken from each run; smaller is better in all of them."""
+OF_THE_MEAN = ("overshoot", "settling_time", "rise_time")
+"""Metrics of the response to the step, taken from the mean over seeds, in which the noise has averaged out."""
+_RESAMPLES = 500
+
+Array = NDArray[np.float64]
+
+
+def analyse(folder: Path, study: Study, records: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+    """Return the comparison as JSON: a row for each plant and controller, and a paired test for each plant.
+
+    Writes ``figures/pid_vs_lqr_*.png`` and ``.pdf``.
+    """
+    runs = {run.number: run for run in study.runs}
+    responses: dict[tuple[str, str], list[Episode]] = {}
+    for record in records:
+        if record["status"] == "done":
+            run = runs[record["number"]]
+            assert run.spec is not None
+            key = (str(run.labels["plant"]), str(run.labels["controller"]))
+            responses.setdefault(key, []).append(episode_of_run(folder / "runs" / run.name, run.spec))
+    rows = []
+    for group in group_runs(records):
+        key = (str(group.labels["plant"]), str(group.labels["controller"]))
+        if key not in responses:
+            continue
+        row: dict[str, Any] = {"plant": key[0], "controller": key[1], "runs": len(group.seeds), "failed": group.failed}
+        for name in COMPARED:
+            mean, low, high = group.mean(name)
+            worst, seed = group.worst(name)
+            row[name] = {"mean": mean, "low": low, "high": high, "worst": worst, "worst_seed": seed}
+        row.update(_mean_response(responses[key]))
+        rows.append(row)
+    result = {"rows": rows, "paired": _paired(records)}
+    result["sentences"] = _sentences(result)
+    write_figures(_figures(rows, responses, result["sentences"]), folder / "figures")
+    return result
+
+
+def print_table(console: Console, result: Mapping[str, Any]) -> None:
+    """Print the table."""
+    rows = result["rows"]
+    table = Table(title="PID and LQR: mean over seeds, 95 % interval, worst seed", title_justify="left")
+    table.add_column("")
+    for row in rows:
+        table.add_column(f"{row['plant']} {row['controller']}\n{row['runs']} runs", justify="right")
+    units = {metric.name: metric.unit for metric in METRICS}
+    for name in (*OF_THE_MEAN, *COMPARED):
+        cells = []
+        for row in rows:
+            value = row[name]
+            if value["mean"] is None:
+                cells.append("never")
+                continue
+            text = f"{value['mean']:.4g}\n{value['low']:.4g} to {value['high']:.4g}"
+            worst = f"\nworst {value['worst']:.4g} (seed {value['worst_seed']})" if "worst" in value else ""
+            cells.append(text + worst)
+        table.add_row(f"{name} \\[{units[name]}]", *cells)
+    console.print(table)
+    for sentence in result["sentences"]:
+        console.print(f"- {sentence}", markup=False)
+
+
+def _mean_response(episodes: Sequence[Episode]) -> dict[str, Any]:
+    """Return the metrics of the step response averaged over seeds, with bootstrap intervals over the seeds."""
+    errors = np.stack([episode.error for episode in episodes])
+    first = episodes[0]
+
+    def measure(rows: Array) -> dict[str, float]:
+        mean = rows.mean(axis=0)
+        # The step itself is known; its first sample carries the sensor's noise.
+        return metrics_of(Episode(first.t, mean, first.velocity, first.effort, float(errors[:, 0].mean())))
+
+    centre = measure(errors)
+    generator = np.random.default_rng(0)
+    draws = [measure(errors[generator.integers(0, len(errors), len(errors))]) for _ in range(_RESAMPLES)]
+    found: dict[str, Any] = {}
+    for name in OF_THE_MEAN:
+        low, high = np.percentile([draw[name] for draw in draws], (2.5, 97.5))
+        found[name] = {
+            key: float(value) if math.isfinite(value) else None
+            for key, value in (("mean", centre[name]), ("low", low), ("high", high))
+        }
+    return found
+
+
+def _paired(records: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
+    """Compare the controllers seed by seed: the same noise on both, so that its luck cancels."""
+    values: dict[tuple[str, str], dict[tuple[int, int], Mapping[str, Any]]] = {}
+    for record in records:
+        if record["status"] == "done":
+            labels = record["labels"]
+            key = (labels["plant"], labels["controller"])
+            values.setdefault(key, {})[(labels["seed"], labels["repeat"])] = record["metrics"]
+    controllers = list(dict.fromkeys(controller for _, controller in values))
+    found: list[dict[str, Any]] = []
+    if len(controllers) != 2:
+        return found
+    one, other = controllers
+    for plant in dict.fromkeys(plant for plant, _ in values):
+        first, second = values.get((plant, one), {}), values.get((plant, other), {})
+        common = sorted(first.keys() & second.keys())
+        if len(common) < 2:
+            continue
+        for name in COMPARED:
+            ratio = np.log([second[seed][name] / first[seed][name] for seed in common])
+            half = float(stats.t.ppf(0.975, len(common) - 1) * ratio.std(ddof=1) / math.sqrt(len(common)))
+            mean = float(ratio.mean())
+            found.append(
+                {
+                    "plant": plant,
+                    "metric": name,
+                    "of": other,
+                    "per": one,
+                    "ratio": math.exp(mean),
+                    "low": math.exp(mean - half),
+                    "high": math.exp(mean + half),
+                    "seeds": len(common),
+                }
+            )
+    return found
+
+
+def _sentences(result: Mapping[str, Any]) -> list[str]:
+    said = []
+    for pair in result["paired"]:
+        if pair["metric"] not in {"ise", "effort_energy", "smoothness"}:
+            continue
+        if pair["low"] > 1.0 or pair["high"] < 1.0:
+            verdict = f"{abs(pair['ratio'] - 1.0):.1%} {'more' if pair['ratio'] > 1.0 else 'less'} than"
+        else:
+            verdict = "not told apart from"
+        said.append(
+            f"On {pair['plant']}, {pair['metric']} of {pair['of']} is {verdict} that of {pair['per']}: ratio "
+            f"{pair['ratio']:.3f} (95 % interval {pair['low']:.3f} to {pair['high']:.3f}, {pair['seeds']} pairs)."
+        )
+    return said
+
+
+def _figures(
+    rows: Sequence[Mapping[str, Any]], responses: Mapping[tuple[str, str], Sequence[Episode]], said: Sequence[str]
+) -> list[Figure]:
+    roles = {0: "sim", 1: "hw", 2: "aligned", 3: "difference"}
+    panels = []
+    for plant in dict.fromkeys(plant for plant, _ in responses):
+        traces = []
+        for index, ((_, controller), episodes) in enumerate(
+            (key, value) for key, value in responses.items() if key[0] == plant
+        ):
+            errors = 1e3 * np.stack([episode.error for episode in episodes])
+            t = episodes[0].t
+            role = roles[index % len(roles)]
+            low, high = np.percentile(errors, (5.0, 95.0), axis=0)
+            traces.append(Trace(t, errors.mean(axis=0), f"{controller}: mean of {len(episodes)} seeds", role))
+            traces.append(Trace(t, low, f"{controller}: 5 to 95 %", "reference"))
+            traces.append(Trace(t, high, "", "reference"))
+        panels.append(Panel("time [s]", "theta - set-point [mrad]", traces, title=plant))
+    figures = [
+        Figure("pid_vs_lqr_step", "Step under noise", " ".join(said), panels, section="pid_vs_lqr", panel_height=230)
+    ]
+    panels = []
+    for name in COMPARED:
+        unit = next(metric.unit for metric in METRICS if metric.name == name)
+        trace = Trace(
+            np.array([row[name]["mean"] for row in rows]),
+            np.arange(len(rows), dtype=float),
+            "mean, 95 % interval",
+            "sim",
+            kind="interval",
+            low=np.array([row[name]["low"] for row in rows]),
+            high=np.array([row[name]["high"] for row in rows]),
+        )
+        worst_values = np.array([row[name]["worst"] for row in rows])
+        worst = Trace(worst_values, np.arange(len(rows), dtype=float), "worst seed", "hw", "points")
+        ticks = [f"{row['plant']} {row['controller']}" for row in rows]
+        panels.append(Panel(f"{name} [{unit}]", "", [trace, worst], y_ticks=ticks))
+    figures.append(
+        Figure(
+            "pid_vs_lqr_metrics", "Metrics over all seeds", " ".join(said), panels, stacked=True, section="pid_vs_lqr"
+        )
+    )
+    return figures
