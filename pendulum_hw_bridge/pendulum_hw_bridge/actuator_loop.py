@@ -22,6 +22,8 @@ from pendulum_msgs_py.values import NANOSECONDS, JointCommand, JointSample
 __all__ = ["ActuatorLoop"]
 
 _T = TypeVar("_T")
+_PATIENCE = 0.005
+"""Longest wait for feedback before commands and silence are looked at again [s]."""
 _IDLE = 0.1
 _JOIN = 5.0
 
@@ -150,7 +152,7 @@ class ActuatorLoop:
 
     def _cycle(self) -> None:
         bridge = self.bridge
-        feedback = bridge.observe(0.5 * self._period)
+        feedback = bridge.observe(_PATIENCE)
         if feedback is None:
             self._act_between()
             return

@@ -104,7 +104,7 @@ class Rig:
     def _cycle(self) -> None:
         """One turn of the actuator's thread, with its guard around it."""
         try:
-            feedback = self.bridge.observe(0.5 * self.period)
+            feedback = self.bridge.observe(0.005)
             armed = self.supervisor.mode.armed
             if feedback is None:
                 drive = self._decide()

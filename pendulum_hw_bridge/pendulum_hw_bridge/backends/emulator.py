@@ -45,6 +45,7 @@ class EmulatorBackend:
         self.actuator = actuator
         self.clock = clock or WallClock()
         self._random = np.random.Generator(np.random.Philox(key=[seed, 1]))
+        self._feedback_delay_ns = round(actuator.parameters.timing.feedback_delay * NANOSECONDS)
         self._connected = False
         self._strategy = Strategy.OFF
 
@@ -87,8 +88,8 @@ class EmulatorBackend:
             if feedback is not None:
                 return feedback
             delivery = self.actuator.next_delivery_ns
-            sample = self.actuator.next_sample_ns
-            # A record on its way comes before the next one is measured, unless it is held back.
+            sample = self.actuator.next_sample_ns + self._feedback_delay_ns
+            # A record on its way comes before the next one, unless it is held back.
             target = sample if delivery is None else min(delivery, sample)
             if target > deadline or self.clock.now_ns() > deadline:
                 self.clock.wait_until(deadline)
