@@ -111,19 +111,17 @@ def _print(result: Comparison, content: dict[str, Any]) -> None:
     ):
         table.add_row(label, *(_number(plant.get(key), form) for plant in plants.values()))
     console.print(table)
-    blocks = [
-        ("Unpaired: hardware interpolated at the simulation's stamps, minus simulation", content["unpaired"])
-    ]
-    if "position" in content["paired"]:
-        blocks.append(("Paired: hardware minus simulation under one disturbance", content["paired"]))
-    for title, block in blocks:
-        statistics = Table(title=title, title_justify="left")
-        statistics.add_column("")
-        for name in block["position"]:
-            statistics.add_column(name, justify="right")
-        for key, unit in (("position", "rad"), ("velocity", "rad/s")):
-            statistics.add_row(f"{key} / {unit}", *(f"{value:.4g}" for value in block[key].values()))
-        console.print(statistics)
+    blocks = [("paired", content["paired"])] if "position" in content["paired"] else []
+    blocks.append(("unpaired", content["unpaired"]))
+    statistics = Table(title="Hardware minus simulation", title_justify="left")
+    statistics.add_column("")
+    for title, _ in blocks:
+        statistics.add_column(f"{title} \\[rad]", justify="right")
+        statistics.add_column(f"{title} \\[rad/s]", justify="right")
+    for name in content["unpaired"]["position"]:
+        cells = [f"{block[key][name]:.4g}" for _, block in blocks for key in ("position", "velocity")]
+        statistics.add_row(name, *cells)
+    console.print(statistics)
     if result.is_paired:
         pair = result.pairs[0]
         delay = pair.response.delay * 1e3
@@ -134,9 +132,20 @@ def _print(result: Comparison, content: dict[str, Any]) -> None:
         )
     else:
         console.print(f"Not paired: {content['paired']['reason']}.")
-    console.print()
+    tests = Table(title="Equivalence tests", title_justify="left")
+    for heading in ("quantity", "estimate", "90 % interval", "margin", "result", "add runs"):
+        tests.add_column(heading, justify="left" if heading in {"quantity", "result"} else "right")
     for test in result.verdict.tests:
-        console.print(f"- {test.sentence()}", highlight=False)
+        interval = test.interval
+        tests.add_row(
+            test.quantity + (f" \\[{test.unit}]" if test.unit != "-" else ""),
+            f"{interval.estimate:.3g}",
+            f"{interval.low:.3g} .. {interval.high:.3g}",
+            test.margin_text().removeprefix("margin "),
+            test.outcome.value,
+            {None: "no use", 0: ""}.get(test.more_runs, str(test.more_runs)),
+        )
+    console.print(tests)
     console.print(f"\n[bold]{result.verdict.sentence}[/bold]", highlight=False)
 
 

@@ -142,24 +142,24 @@ class EquivalenceTest:
             "smallest_margin": self.smallest_margin,
         }
 
+    def margin_text(self) -> str:
+        """Return the margin as text, without its unit."""
+        if not math.isfinite(self.low):
+            return f"margin {self.high:.3g}"
+        if math.isclose(self.low, -self.high):
+            return f"margin ±{self.high:.3g}"
+        return f"margin {self.low:.3g} to {self.high:.3g}"
+
     def sentence(self) -> str:
         """Return the result in words."""
         unit = f" {self.unit}" if self.unit not in {"", "-"} else ""
         text = (
             f"{self.quantity}: {self.interval.estimate:.3g}{unit}, 90 % interval {self.interval.low:.3g} to "
-            f"{self.interval.high:.3g}{unit}, {_margin_text(self)}{unit}: {self.outcome.value}"
+            f"{self.interval.high:.3g}{unit}, {self.margin_text()}{unit}: {self.outcome.value}"
         )
         if self.outcome is Outcome.UNDECIDED:
             text += f": {_more(self.more_runs)}"
         return text
-
-
-def _margin_text(test: EquivalenceTest) -> str:
-    if not math.isfinite(test.low):
-        return f"margin {test.high:.3g}"
-    if math.isclose(test.low, -test.high):
-        return f"margin ±{test.high:.3g}"
-    return f"margin {test.low:.3g} to {test.high:.3g}"
 
 
 def _more(runs: int | None) -> str:
@@ -289,5 +289,5 @@ def _short(test: EquivalenceTest) -> str:
     unit = f" {test.unit}" if test.unit not in {"", "-"} else ""
     return (
         f"{test.quantity} is {test.interval.estimate:.3g}{unit} "
-        f"(90 % interval {test.interval.low:.3g} to {test.interval.high:.3g}; {_margin_text(test)})"
+        f"(90 % interval {test.interval.low:.3g} to {test.interval.high:.3g}; {test.margin_text()})"
     )

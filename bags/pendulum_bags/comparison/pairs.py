@@ -179,7 +179,7 @@ def _spread_tests(
     """Test the ratios of spreads; the moments of the two sides begin at the columns given."""
     return [
         equivalence_test(
-            f"spread of {what}, hardware per simulation",
+            f"spread of {what} (ratio)",
             "-",
             bootstrap_interval(resampled, _spread_ratio(hardware + index, simulation + index)),
             1.0 / margins.spread,
@@ -219,11 +219,7 @@ def paired_tests(pairs: Sequence[Pair], margins: Margins) -> list[EquivalenceTes
     path = bootstrap_interval(
         resampled, lambda means: np.asarray(np.sqrt(np.maximum(means[..., 2], 0.0) / _variance(means, 9)))
     )
-    tests.append(
-        equivalence_test(
-            "distance of the paths per spread of the hardware", "-", path, -np.inf, margins.path, runs=runs
-        )
-    )
+    tests.append(equivalence_test("path distance per spread", "-", path, -np.inf, margins.path, runs=runs))
     return tests
 
 

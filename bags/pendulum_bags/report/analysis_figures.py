@@ -45,10 +45,7 @@ def equivalence(data: ReportData) -> Figure:
         f"{quantity(closest.interval.low)} to {quantity(closest.interval.high)}, resting on "
         f"{closest.interval.blocks} independent blocks."
     )
-    names = [
-        test.quantity.replace(", hardware per simulation", "").replace(" per spread of the hardware", "")
-        for test in tests
-    ]
+    names = [test.quantity for test in tests]
     reach = max(1.3, *(abs(value) * 1.08 for test in tests for value in _relative(test)))
     panel = Panel(
         "in units of the margin (ratios: of its logarithm)",

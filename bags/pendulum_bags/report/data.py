@@ -63,7 +63,8 @@ def quantity(value: float, unit: str = "", digits: int = 3) -> str:
     magnitude = abs(value)
     if magnitude != 0.0 and (magnitude < 1e-4 or magnitude >= 1e6):
         mantissa, exponent = f"{value:.{digits - 1}e}".split("e")
-        text = f"{mantissa}×10{str(int(exponent)).translate(_SUPERSCRIPT)}"
+        power = f"10{str(int(exponent)).translate(_SUPERSCRIPT)}"
+        text = power if mantissa == "1" else f"{mantissa}×{power}"
     else:
         text = f"{value:.{digits}g}"
         if "e" in text:

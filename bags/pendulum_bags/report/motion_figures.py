@@ -58,16 +58,14 @@ def simulation_under_noise(data: ReportData) -> Figure:
     own = run is not data.comparison.pairs[0].simulation
     title = "Simulation under noise" + (", by the thesis's own protocol" if own else "")
     return _under_noise(
-        run, "own alone" if own else "sim", "simulation_under_noise", title, "The two plants under noise"
+        run, "own alone" if own else "sim", "simulation_under_noise", title, "Plants under noise"
     )
 
 
 def hardware_under_noise(data: ReportData) -> Figure:
     """Return the hardware under noise."""
     run = data.comparison.pairs[0].hardware
-    return _under_noise(
-        run, "hw alone", "hardware_under_noise", "Hardware under noise", "The two plants under noise"
-    )
+    return _under_noise(run, "hw alone", "hardware_under_noise", "Hardware under noise", "Plants under noise")
 
 
 def both_together(data: ReportData) -> Figure:
@@ -136,7 +134,7 @@ def torque_and_noise(data: ReportData) -> Figure | str:
         Panel(
             TIME,
             TORQUE,
-            [Trace(noise.t, factor * noise.value, "noise d, scaled", "noise", "step"), *used],
+            [Trace(noise.t, factor * noise.value, "noise d", "noise", "step"), *used],
             title="Noise scaled to the controllers' torque",
         ),
     ]
@@ -177,7 +175,7 @@ def interpolation(data: ReportData) -> Figure:
         "Original and interpolated hardware data",
         sentence,
         panels,
-        section="The thesis's analysis (unpaired)",
+        section="The thesis's analysis",
     )
 
 
@@ -215,7 +213,7 @@ def unpaired_difference(data: ReportData) -> Figure:
         "Difference over time",
         sentence,
         _difference_panels([("hardware − simulation", "difference", difference)]),
-        section="The thesis's analysis (unpaired)",
+        section="The thesis's analysis",
     )
 
 

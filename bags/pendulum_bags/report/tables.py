@@ -122,7 +122,11 @@ def _tests(data: ReportData) -> Table:
         "runs to add",
     )
     whose = "were stated" if data.comparison.verdict.margins.stated else "are defaults"
-    sentence = f"Two one-sided tests at 5 % each, intervals by block bootstrap; the margins {whose}."
+    sentence = (
+        "Two one-sided tests at 5 % each, intervals by block bootstrap. Ratios are hardware per simulation; the path "
+        "distance is the rms distance per standard deviation of the hardware's angle. "
+        f"The margins {whose}."
+    )
     return Table("Tests against the margins", sentence, head, rows, "Verdict")
 
 
@@ -154,7 +158,7 @@ def _unpaired(data: ReportData) -> Table:
         else f"Unlike in the thesis, the means are not close to zero: {quantity(position['mean'], 'rad')} and "
         f"{quantity(velocity['mean'], 'rad/s')}."
     )
-    return _statistics(block, "Statistics of the difference", sentence, "The thesis's analysis (unpaired)")
+    return _statistics(block, "Statistics of the difference", sentence, "The thesis's analysis")
 
 
 def _metrics(data: ReportData) -> Table:

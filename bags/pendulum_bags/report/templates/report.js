@@ -72,6 +72,11 @@
         layout.margin.r = 6;
         layout.font.size = 12;
         layout.dragmode = false; // a finger on a phone scrolls the page
+        const names = data.filter((trace) => trace.showlegend).map((trace) => trace.name);
+        const wide = names.reduce((sum, name) => sum + 52 + 6.5 * name.length, 0);
+        const more = 19 * Math.max(0, Math.ceil(wide / (window.innerWidth - 70)) - 1);
+        layout.margin.t += more;
+        layout.height += more;
       }
       place.firstRanges = {};
       for (const [name, axis] of Object.entries(layout)) {
@@ -85,8 +90,15 @@
         action(place);
       });
     }
+    // Paper is narrower than most screens: draw for its width, and go back afterwards.
     window.addEventListener("beforeprint", () => {
-      for (const place of document.querySelectorAll(".graph")) Plotly.Plots.resize(place);
+      for (const place of document.querySelectorAll(".graph")) {
+        const beside = place.parentElement.classList.contains("side-by-side");
+        Plotly.relayout(place, { autosize: false, width: beside ? 325 : 670 });
+      }
+    });
+    window.addEventListener("afterprint", () => {
+      for (const place of document.querySelectorAll(".graph")) Plotly.relayout(place, { autosize: true, width: null });
     });
     document.documentElement.dataset.ready = "true";
   }
