@@ -17,7 +17,6 @@ from typing import Any, ClassVar
 import gymnasium
 import numpy as np
 from gymnasium import spaces
-from gymnasium.vector import AutoresetMode, VectorEnv
 from numpy.typing import NDArray
 
 from pendulum_msgs_py import noise
@@ -25,17 +24,27 @@ from pendulum_msgs_py.angles import UPRIGHT, from_upright
 from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.plant_parameters import PlantParameters, load_plant
 from pendulum_sim.environment_kernel import is_smooth, lane_table, step_kernel
+from pendulum_sim.integrators import get_integrator
 from pendulum_sim.plant import check_start, check_step, make_plant
 
-__all__ = ["ENVIRONMENT_ID", "PendulumEnv", "PendulumVectorEnv", "register"]
+__all__ = [
+    "ENVIRONMENT_ID",
+    "EPISODE_STEPS",
+    "STARTS",
+    "PendulumEnv",
+    "action_space",
+    "check_arguments",
+    "draw_start",
+    "observation_space",
+    "register",
+]
 
 ENVIRONMENT_ID = "PendulumX59-v0"
 EPISODE_STEPS = 2500
 """Steps after which an episode is truncated: 5 s at 2 ms, the length of the thesis's runs."""
 STARTS = ("bottom", "top", "random")
-_THESIS_Q = (100.0, 0.01)
-_THESIS_R = 0.1
-_LANES = 256
+THESIS_Q = (100.0, 0.01)
+THESIS_R = 0.1
 Array = NDArray[np.float64]
 
 
@@ -71,13 +80,13 @@ class PendulumEnv(gymnasium.Env[Array, Array]):
         start: str = "top",
         disturbance: float = 0.0,
         hold: int = 1,
-        q: tuple[float, float] = _THESIS_Q,
-        r: float = _THESIS_R,
+        q: tuple[float, float] = THESIS_Q,
+        r: float = THESIS_R,
         render_mode: str | None = None,
         screen_size: tuple[int, int] = (600, 600),
     ) -> None:
         parameters = plant if isinstance(plant, PlantParameters) else load_plant(plant)
-        _check_arguments(dt, substeps, start, disturbance, hold, method)
+        check_arguments(dt, substeps, start, disturbance, hold, method)
         if render_mode is not None and render_mode not in self.metadata["render_modes"]:
             raise ParameterError(f"render_mode is {render_mode!r}; expected None, human or rgb_array")
         self.parameters = parameters
@@ -229,141 +238,6 @@ class PendulumEnv(gymnasium.Env[Array, Array]):
         self._window = None
 
 
-class PendulumVectorEnv(VectorEnv[Array, Array, NDArray[Any]]):
-    """Many equal pendulums in one compiled step, for learning libraries; rigid plants without dry friction or lag.
-
-    Args:
-        num_envs: Pendulums, >= 1.
-        max_episode_steps: Steps after which an episode is truncated; it restarts with the step after that.
-        plant: As for :class:`PendulumEnv`.
-        dt: As for :class:`PendulumEnv`.
-        method: As for :class:`PendulumEnv`.
-        substeps: As for :class:`PendulumEnv`.
-        start: As for :class:`PendulumEnv`.
-        disturbance: As for :class:`PendulumEnv`.
-        hold: As for :class:`PendulumEnv`.
-        q: As for :class:`PendulumEnv`.
-        r: As for :class:`PendulumEnv`.
-
-    Raises:
-        ParameterError: An argument is outside its domain.
-    """
-
-    metadata: ClassVar[dict[str, Any]] = {"autoreset_mode": AutoresetMode.NEXT_STEP, "render_modes": []}
-
-    def __init__(
-        self,
-        num_envs: int = 1,
-        *,
-        max_episode_steps: int = EPISODE_STEPS,
-        plant: str | PlantParameters = "thesis",
-        dt: float = 2e-3,
-        method: str = "auto",
-        substeps: int = 1,
-        start: str = "top",
-        disturbance: float = 0.0,
-        hold: int = 1,
-        q: tuple[float, float] = _THESIS_Q,
-        r: float = _THESIS_R,
-        render_mode: str | None = None,
-    ) -> None:
-        parameters = plant if isinstance(plant, PlantParameters) else load_plant(plant)
-        _check_arguments(dt, substeps, start, disturbance, hold, method)
-        if num_envs < 1 or max_episode_steps < 1:
-            raise ParameterError(
-                f"num_envs is {num_envs} and max_episode_steps {max_episode_steps}; expected both >= 1"
-            )
-        if render_mode is not None:
-            raise ParameterError(
-                f"render_mode is {render_mode!r}; expected None: draw one PendulumEnv instead"
-            )
-        if not is_smooth(parameters):
-            raise ParameterError(
-                f"plant {parameters.name!r} has dry friction, lag, delay or a drivetrain; expected none of them here: "
-                "use gymnasium's SyncVectorEnv with it"
-            )
-        method = "etd4" if method == "auto" else method
-        if method == "adaptive":
-            raise ParameterError("method is 'adaptive'; expected a compiled one, such as etd4")
-        self.num_envs = num_envs
-        self.parameters = parameters
-        self.single_observation_space = observation_space(parameters, disturbance)
-        self.single_action_space = action_space(parameters)
-        self.observation_space = gymnasium.vector.utils.batch_space(self.single_observation_space, num_envs)
-        self.action_space = gymnasium.vector.utils.batch_space(self.single_action_space, num_envs)
-        self._start = start
-        self._hold = hold
-        self._h, self._substeps = dt / substeps, substeps
-        self._max_steps = max_episode_steps
-        blocks = -(-num_envs // _LANES)
-        table = lane_table(parameters, method, self._h, _LANES, disturbance, q, r)
-        self._w = np.repeat(table.reshape(1, -1), blocks, axis=0)
-        self._keys = np.zeros((blocks, _LANES), dtype=np.uint64)
-        self._counts = np.zeros((blocks, _LANES), dtype=np.int64)
-        self._actions = np.zeros((blocks, _LANES))
-        self._kernel = step_kernel(method, _LANES)
-        self._done = np.zeros(num_envs, dtype=np.bool_)
-
-    def reset(
-        self, *, seed: int | list[int | None] | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[Array, dict[str, Any]]:
-        """Start all episodes, or those of ``options["reset_mask"]``; returns observations of shape (N, 2)."""
-        super().reset(seed=seed[0] if isinstance(seed, list) else seed, options=options)
-        mask = (options or {}).get("reset_mask")
-        which = np.arange(self.num_envs) if mask is None else np.flatnonzero(mask)
-        self._restart(which)
-        self._done[which] = False
-        return self._observe(), {}
-
-    def step(self, actions: Array) -> tuple[Array, NDArray[Any], NDArray[Any], NDArray[Any], dict[str, Any]]:
-        """Hold a torque each for one step.
-
-        Args:
-            actions: Shape (N, 1) [N m].
-
-        Returns:
-            Observations (N, 2), rewards (N,), terminated (N,), truncated (N,), and an empty dict.
-        """
-        n = self.num_envs
-        self._actions.reshape(-1)[:n] = np.reshape(actions, n)
-        observations = np.empty((self._w.shape[0], 2 * _LANES))
-        rewards = np.empty((self._w.shape[0], _LANES))
-        restart = np.flatnonzero(self._done)
-        for block in range(self._w.shape[0]):
-            self._kernel(
-                self._w[block], self._keys[block], self._counts[block], self._hold, self._h, self._substeps,
-                self._actions[block], observations[block], rewards[block],
-            )  # fmt: skip
-        result = observations.reshape(-1, 2)[:n]
-        reward = rewards.reshape(-1)[:n]
-        if not np.isfinite(reward).all():
-            raise ParameterError(
-                f"action {int(np.argmin(np.isfinite(reward)))} is not a finite number of N m"
-            )
-        if restart.size:
-            # By gymnasium's rule for NEXT_STEP this step starts their next episodes; its action counts for nothing.
-            self._restart(restart)
-            result[restart] = self._observe()[restart]
-            reward[restart] = 0.0
-        truncated = self._counts.reshape(-1)[:n] >= self._max_steps
-        self._done = truncated
-        return result, reward, np.zeros(n, dtype=np.bool_), truncated, {}
-
-    def _restart(self, which: NDArray[np.intp]) -> None:
-        starts = draw_start(self._start, self.np_random, which.size)
-        seeds = self.np_random.integers(2**63, size=which.size)
-        block, lane = which // _LANES, which % _LANES
-        self._w[block, lane] = starts[:, 0] + UPRIGHT
-        self._w[block, _LANES + lane] = starts[:, 1]
-        self._keys[block, lane] = [noise.stream_key(int(seed)) for seed in seeds]
-        self._counts[block, lane] = 0
-
-    def _observe(self) -> Array:
-        theta = self._w[:, :_LANES].reshape(-1)[: self.num_envs]
-        theta_dot = self._w[:, _LANES : 2 * _LANES].reshape(-1)[: self.num_envs]
-        return np.stack([from_upright(theta), theta_dot], axis=1)
-
-
 def observation_space(parameters: PlantParameters, disturbance: float) -> spaces.Box:
     """Return the space of x; the speed is bounded where friction bounds it."""
     speed = math.inf
@@ -399,16 +273,13 @@ def register() -> None:
         gymnasium.register(
             ENVIRONMENT_ID,
             entry_point="pendulum_sim.environment:PendulumEnv",
-            vector_entry_point="pendulum_sim.environment:PendulumVectorEnv",
+            vector_entry_point="pendulum_sim.vector_environment:PendulumVectorEnv",
             max_episode_steps=EPISODE_STEPS,
         )
 
 
-def _check_arguments(
-    dt: float, substeps: int, start: str, disturbance: float, hold: int, method: str
-) -> None:
-    from pendulum_sim.integrators import get_integrator
-
+def check_arguments(dt: float, substeps: int, start: str, disturbance: float, hold: int, method: str) -> None:
+    """Refuse arguments that make no environment."""
     check_step(dt, substeps)
     if method != "auto":
         get_integrator(method)

@@ -5,6 +5,7 @@ __all__ = ["EXECUTABLES"]
 EXECUTABLES: dict[str, str] = {
     "simulator": "pendulum_sim.simulator_node:main",
     "viewer": "pendulum_sim.viewer_node:main",
+    "markers": "pendulum_sim.markers_node:main",
     "phase_plot": "pendulum_sim.phase_plot:main",
     "export_model": "pendulum_sim.model_files:main",
 }

@@ -46,7 +46,7 @@ def _single(
         (load_plant("thesis"), "etd2", (0.0, 0.0)),
         (_PLAIN, "semi_implicit", (6.0, 0.6)),
         (_PLAIN, "rk4", (6.0, 0.6)),
-        (_FULL, "etd4", (6.0, 0.6)),
+        (_FULL, "etd2", (6.0, 0.6)),
     ],
 )
 def test_each_pendulum_of_a_batch_equals_the_single_plant_to_1e_12(
@@ -122,7 +122,8 @@ def test_memory_does_not_grow_with_the_number_of_steps() -> None:
         return highest
 
     peak(10)
-    assert peak(20_000) < 1.2 * peak(100)
+    # A record of the long run would take 245 MB.
+    assert peak(20_000) - peak(100) < 1_000_000
 
 
 def test_the_polynomial_sine_is_within_4e_16_of_the_true_one() -> None:
