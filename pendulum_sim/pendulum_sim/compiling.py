@@ -70,6 +70,7 @@ def tuple_loader(length: int, stride: int) -> Any:
         others = tuple_loader(length - 1, stride)
 
         def load(array: Any, start: int) -> Any:
-            return (*others(array, start), array[start + offset])
+            # Not (*others, x): compilers of Python 3.10 to 3.12 spell that differently, and numba follows late.
+            return others(array, start) + (array[start + offset],)  # noqa: RUF005
 
     return numba.njit(load, forceinline=True)
