@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from functools import lru_cache
 
 from pendulum_lqr.design import Gain, continuous_lqr
 from pendulum_lqr.model import linearise
@@ -74,6 +75,13 @@ def make_catch(
         effort_limit: Largest torque [N m].
         share: Share of the proven level in which it takes over.
     """
-    gain = continuous_lqr(linearise(plant), q, r)
-    level = proven_level(plant, gain, effort_limit)
+    gain, level = _proven(plant, tuple(q), r, effort_limit)
     return Catch(gain, share * level, _LET_GO * level, effort_limit)
+
+
+@lru_cache(maxsize=32)
+def _proven(
+    plant: PlantParameters, q: tuple[float, ...], r: float, effort_limit: float
+) -> tuple[Gain, float]:
+    gain = continuous_lqr(linearise(plant), q, r)
+    return gain, proven_level(plant, gain, effort_limit)

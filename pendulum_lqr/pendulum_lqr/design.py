@@ -238,7 +238,7 @@ def discrete_lqr(model: DiscreteModel, q: ArrayLike, r: float, cross: Matrix | N
     except (np.linalg.LinAlgError, ValueError) as error:
         raise DesignError(_no_solution(Q2, r, error)) from error
     BS = model.B.T @ S
-    K = np.linalg.solve(R + BS @ model.B, BS @ model.A + (0.0 if N is None else N.T))
+    K = (BS @ model.A + (0.0 if N is None else N.T)) / float((R + BS @ model.B)[0, 0])
     poles = sort_poles(np.linalg.eigvals(model.A - model.B @ K))
     if np.max(np.abs(poles)) >= 1.0:
         raise DesignError(
@@ -317,7 +317,7 @@ def kalman_gain(A: Matrix, C: Matrix, process: ArrayLike, measurement: ArrayLike
         P = scipy.linalg.solve_discrete_are(A.T, C.T, W, V)
     except (np.linalg.LinAlgError, ValueError) as error:
         raise DesignError(f"no stationary Kalman filter for the given noise: {error}") from error
-    L = P @ C.T @ np.linalg.inv(C @ P @ C.T + V)
+    L = scipy.linalg.solve(C @ P @ C.T + V, C @ P, assume_a="pos").T
     return KalmanGain(L, P)
 
 
@@ -369,7 +369,7 @@ def _care(A: Matrix, B: Matrix, Q: Matrix, R: Matrix) -> Gain:
         S = scipy.linalg.solve_continuous_are(A, B, Q, R)
     except (np.linalg.LinAlgError, ValueError) as error:
         raise DesignError(_no_solution(Q, float(R[0, 0]), error)) from error
-    K = np.linalg.solve(R, B.T @ S)
+    K = B.T @ S / R[0, 0]
     poles = sort_poles(np.linalg.eigvals(A - B @ K))
     if np.max(poles.real) >= 0.0:
         raise DesignError(_no_solution(Q, float(R[0, 0]), "the closed loop is not stable"))

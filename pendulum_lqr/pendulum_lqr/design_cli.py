@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+# isort: off
+import pendulum_lqr.one_thread  # noqa: F401  # before anything that imports numpy
+# isort: on
+
 import json
 import math
 import sys

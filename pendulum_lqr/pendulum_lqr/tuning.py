@@ -95,7 +95,7 @@ def pid_cost(
     S = scipy.linalg.solve_discrete_lyapunov(A.T, weight) * period
     # A derivative that started at rest: the sample before showed the same angle.
     release = 0.1 * np.array([1.0, 0.0, 0.0, 1.0, 0.0])
-    rest = np.linalg.solve(np.eye(5) - A, B[:, 0])
+    rest = scipy.linalg.solve(np.eye(5) - A, B[:, 0])
     return float(release @ S @ release + rest @ S @ rest)
 
 

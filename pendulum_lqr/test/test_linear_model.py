@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from pendulum_lqr.model import (
@@ -28,6 +28,7 @@ PLANTS = st.builds(
 
 
 @given(PLANTS, st.floats(-7.0, 7.0))
+@settings(deadline=None)
 def test_linearisation_agrees_with_finite_differences_about_any_fixed_point(plant, theta):
     model = linearise(plant, theta)
     h = 1e-5
@@ -42,6 +43,7 @@ def test_linearisation_agrees_with_finite_differences_about_any_fixed_point(plan
 
 
 @given(PLANTS, st.floats(-7.0, 7.0))
+@settings(deadline=None)
 def test_the_holding_torque_leaves_no_acceleration(plant, theta):
     acceleration = state_derivative(plant, theta, 0.0, equilibrium_effort(plant, theta))[1]
     assert abs(acceleration) * plant.inertia < 1e-12
@@ -56,6 +58,7 @@ def test_the_thesis_plant_has_the_matrices_of_the_thesis():
 
 
 @given(st.floats(-0.99, 0.99))
+@settings(deadline=None)
 def test_a_constant_torque_has_one_stable_and_one_unstable_fixed_point(share):
     plant = load_plant("thesis")
     points = fixed_points(plant, share * plant.gravity)

@@ -165,7 +165,7 @@ def _gains(
         block[:2, :2], block[:2, 2:] = model.A, model.B
         step = scipy.linalg.expm(block * period)
         A, B = step[:2, :2], step[:2, 2:]
-        K = np.linalg.solve(R * period + B.T @ S @ B, B.T @ S @ A)
+        K = (B.T @ S @ A) / float((R * period + B.T @ S @ B)[0, 0])
         S = Q * period + A.T @ S @ (A - B @ K)
         S = 0.5 * (S + S.T)
         gains[k] = K[0]

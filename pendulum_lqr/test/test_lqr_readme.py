@@ -1,0 +1,56 @@
+"""The README says what the tables in the code say."""
+
+import re
+from pathlib import Path
+
+import pytest
+
+from pendulum_lqr.answering import StateRefusal
+from pendulum_lqr.controller import COMMON_PARAMETERS, CONTROLLERS, controller_class
+from pendulum_lqr.disturbance import DISTURBANCE_SPECS
+from pendulum_msgs_py.parameters import markdown_table
+
+README = (Path(__file__).resolve().parents[1] / "README.md").read_text(encoding="utf-8")
+
+
+def table(name: str) -> str:
+    found = re.search(rf"<!-- table: {name} -->\n\n(.*?)\n<!-- end -->", README, re.DOTALL)
+    assert found, f"README.md has no table {name!r}"
+    return found.group(1)
+
+
+@pytest.mark.parametrize("name", CONTROLLERS)
+def test_every_controller_is_listed_with_its_parameters(name):
+    assert f"| `{name}` | {controller_class(name).SUMMARY} |" in README
+    assert table(name) == markdown_table(controller_class(name).PARAMETERS)
+
+
+def test_the_tables_of_the_nodes_are_those_of_the_code():
+    pytest.importorskip("rclpy")
+    from pendulum_lqr import controller_node, disturbance_node
+
+    assert table("common") == markdown_table(COMMON_PARAMETERS)
+    assert table("node") == markdown_table(controller_node.NODE_SPECS)
+    assert table("disturbance") == markdown_table(DISTURBANCE_SPECS + disturbance_node.NODE_SPECS)
+
+
+def test_refusals_of_states_are_explained():
+    assert "refused.no_answer" in README
+    words = {
+        "malformed": "carries none of our joint",
+        "duplicate": "repeated",
+        "from_future": "from the future",
+    }
+    for refusal in StateRefusal:
+        assert (
+            words.get(refusal.value, refusal.value.replace("_", " ")) in README
+            or "no_answer" in refusal.value
+        )
+
+
+def test_the_example_of_the_readme_runs():
+    code = re.search(r"```python\n(from pendulum_lqr.*?)```", README, re.DOTALL)
+    assert code
+    names: dict[str, object] = {}
+    exec(code.group(1), names)
+    assert names["effort"] == pytest.approx(-3.3345265, abs=1e-6)
