@@ -8,7 +8,7 @@ import platform
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any
@@ -102,6 +102,7 @@ class Recorder(Node):
         self._session: RecordingSession | None = None
         self._started = time.monotonic()
         self._newest_stamp = 0
+        self._unstamped: list[tuple[_Tap, int, bytes]] = []
         self._refused_types: set[str] = set()
         self._lock = threading.RLock()
         self._events = f"{self.get_fully_qualified_name()}/{EVENTS}"
@@ -158,6 +159,7 @@ class Recorder(Node):
             if session is None:
                 return None
             self._take_all()
+            self._offer_unstamped(session)
             session.writer.update_metadata(
                 {"pendulum.parameters": self._parameter_reader.values}
             ) if not session.failure else None
@@ -205,6 +207,8 @@ class Recorder(Node):
         session = self._session
         for tap in list(self._taps.values()):
             self._take(tap, session)
+        if session is not None and self._unstamped and self._newest_stamp:
+            self._offer_unstamped(session)
 
     def _take(self, tap: _Tap, session: RecordingSession | None) -> None:
         take, message_class, trim = tap.subscription.handle.take_message, tap.message_class, tap.trim
@@ -219,9 +223,21 @@ class Recorder(Node):
                     missing += tap.gaps.see(sequence, tap.publishers)
                 data = trim(data)
                 time_ns = info["received_timestamp"] or time.time_ns()
-                items.append((self._stamp(tap, data, time_ns) if by_header else time_ns, data))
-        if session is None or not items:
-            return
+                if by_header:
+                    stamp = self._stamp(tap, data)
+                    if stamp is None:
+                        self._unstamped.append((tap, time_ns, data))
+                        continue
+                    time_ns = stamp
+                items.append((time_ns, data))
+        if session is None:
+            self._unstamped.clear()
+        elif items or missing:
+            self._offer(tap, session, items, missing)
+
+    def _offer(
+        self, tap: _Tap, session: RecordingSession, items: Sequence[tuple[int, bytes]], missing: int = 0
+    ) -> None:
         if tap.announced is not session:
             session.add_topic(tap.topic, tap.type, tap.qos)
             tap.announced = session
@@ -234,13 +250,21 @@ class Recorder(Node):
                 "the disk does not keep up)"
             )
 
-    def _stamp(self, tap: _Tap, data: bytes, received_ns: int) -> int:
+    def _stamp(self, tap: _Tap, data: bytes) -> int | None:
+        """Return the log time by header; messages without a stamp go where the stamped ones are.
+
+        Wall time and simulated time must not mix: what comes before the first stamp has to wait for it.
+        """
         stamp = tap.stamp(data) if tap.stamp is not None else None
         if stamp is None or stamp < 0:
-            # Messages without a stamp go where the stamped ones are: wall and simulated time must not mix.
-            return self._newest_stamp or received_ns
+            return self._newest_stamp or None
         self._newest_stamp = max(self._newest_stamp, stamp)
         return stamp
+
+    def _offer_unstamped(self, session: RecordingSession) -> None:
+        for tap, received_ns, data in self._unstamped:
+            self._offer(tap, session, [(self._newest_stamp or received_ns, data)])
+        self._unstamped.clear()
 
     # -- the graph ---------------------------------------------------------------------------------------------
 

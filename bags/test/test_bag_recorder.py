@@ -294,23 +294,27 @@ def test_a_recording_holds_everything_and_says_so(tmp_path: Path, node: Node) ->
 def test_recording_starts_and_stops_by_service_and_by_header_time(tmp_path: Path, node: Node) -> None:
     bag = tmp_path / "run"
     states = node.create_publisher(JointState, "/joint_states", qos.STATE)
+    plain = node.create_publisher(Float64, "/plain", qos.STATE)  # a type without a stamp
     recording = Recording(
-        "-o", str(bag), "/joint_states", "--storage", "sqlite3", "--log-time", "header", "--wait"
+        "-o", str(bag), "/joint_states", "/plain", "--storage", "sqlite3", "--log-time", "header", "--wait"
     )
-    wait_until_matched(states)
+    wait_until_matched(states, plain)
     states.publish(encode_joint_state(1, position=0.0))
     time.sleep(0.2)
     assert not bag.exists()
     for number in (1, 2):
         assert call(node, "/recorder/start").success
         assert not call(node, "/recorder/start").success
+        plain.publish(Float64(data=1.0))
+        time.sleep(0.1)
         for index in range(50):
             states.publish(encode_joint_state(1000 + index, position=float(number)))
         time.sleep(0.3)
-        assert "50 messages" in call(node, "/recorder/stop").message
+        assert "51 messages" in call(node, "/recorder/stop").message
     assert recording.stop(signal.SIGTERM) == 0
     first, second = read_bag(bag), read_bag(tmp_path / "run_2")
     assert first["/joint_states"]["log_time_ns"].tolist() == list(range(1000, 1050))
+    assert first["/plain"][0].log_time_ns < 1050  # wall time and header time must not mix
     assert second["/joint_states"]["position"].tolist() == [2.0] * 50
 
 
