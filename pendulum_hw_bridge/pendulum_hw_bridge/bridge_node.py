@@ -14,7 +14,6 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 from rclpy.lifecycle import LifecycleState, TransitionCallbackReturn
-from rclpy.qos import QoSProfile
 from sensor_msgs.msg import BatteryState, JointState, Temperature
 
 from pendulum_hw_bridge import bridge_parameters
@@ -24,10 +23,11 @@ from pendulum_hw_bridge.bridge import Bridge, Outcome
 from pendulum_hw_bridge.bridge_parameters import BRIDGE_SPECS
 from pendulum_hw_bridge.clocks import SteppedClock, WallClock
 from pendulum_hw_bridge.feedback_message import encode_feedback
-from pendulum_hw_bridge.safety import SHORTEST_TIMEOUT, SafetyMonitor
+from pendulum_hw_bridge.safety import SafetyMonitor
 from pendulum_hw_bridge.shared_supervisor import SharedSupervisor
 from pendulum_msgs_py.errors import PendulumError
 from pendulum_msgs_py.parameters import ParameterSpec, ParameterValue
+from pendulum_msgs_py.ros import qos
 from pendulum_msgs_py.ros.convert import stamp_to_message
 from pendulum_msgs_py.ros.lifecycle import LifecycleNode
 from pendulum_msgs_py.ros.parameters import NodeParameters
@@ -58,7 +58,8 @@ SPECS: tuple[ParameterSpec, ...] = (
 """All parameters of the node."""
 
 _SLOW_PERIOD = 0.5
-_FEEDBACK_QOS = QoSProfile(depth=50)
+_FEEDBACK_QOS = qos.STATE
+"""As deep as that of the states: in lockstep, half a second of wall time is hundreds of records."""
 
 
 def _logged(transition: Callable[..., TransitionCallbackReturn]) -> Callable[..., TransitionCallbackReturn]:
@@ -71,7 +72,7 @@ def _logged(transition: Callable[..., TransitionCallbackReturn]) -> Callable[...
         except PendulumError as error:
             self.failure = error
             self.get_logger().error(str(error))
-        except Exception as error:
+        except Exception as error:  # noqa: BLE001  (a transition may fail for any reason)
             self.failure = error
             self.get_logger().error(f"{transition.__name__}: {type(error).__name__}: {error}")
         self.release_actuator()
