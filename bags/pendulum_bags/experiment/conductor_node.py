@@ -33,6 +33,7 @@ from pendulum_msgs_py.values import JointSample
 __all__ = ["Conductor", "PlantClient", "RecorderClient"]
 
 _SLICE = 0.05
+_QUIET_POLLS = 3
 _T = TypeVar("_T")
 
 
@@ -310,8 +311,37 @@ class RecorderClient:
 
     def heard(self) -> set[str]:
         """Return the topics whose publishers the recorder is connected with."""
+        return set(self._ask().get("matched", []))
+
+    def wait_for_all(self, topic: str, expected: int, timeout: float = 60.0) -> None:
+        """Wait until a topic's messages have arrived, and no more of any other do: a recorder may be seconds behind.
+
+        Args:
+            topic: Name of the topic.
+            expected: Messages that were published on it.
+            timeout: Longest time to wait [s].
+
+        Raises:
+            FaultError: Messages are missing.
+        """
+        counts: dict[str, int] = {}
+        quiet = 0
+        deadline = time.monotonic() + timeout
+        while counts.get(topic, 0) < expected or quiet < _QUIET_POLLS:
+            if time.monotonic() > deadline:
+                raise FaultError(
+                    f"the recorder has {counts.get(topic, 0)} of {expected} messages of {topic} after {timeout:g} s"
+                )
+            self._conductor.spin(_SLICE)
+            before, counts = counts, {
+                name: entry["received"] for name, entry in self._ask().get("topics", {}).items()
+            }
+            quiet = quiet + 1 if counts == before else 0
+
+    def _ask(self) -> dict[str, Any]:
         response = self._conductor.call(self._status, Trigger.Request(), "the recorder's status", 30.0)
-        return set(json.loads(response.message).get("matched", []))
+        status: dict[str, Any] = json.loads(response.message)
+        return status
 
 
 def _interrupt(_number: int, _frame: FrameType | None) -> None:

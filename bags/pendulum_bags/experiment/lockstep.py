@@ -7,16 +7,16 @@ from pathlib import Path
 
 from pendulum_bags.experiment.conductor_node import Conductor, PlantClient, RecorderClient
 from pendulum_bags.experiment.domain import reserve_domain
-from pendulum_bags.experiment.processes import ProcessSet, ros_environment, start_recorder
+from pendulum_bags.experiment.processes import Child, ProcessSet, ros_environment, start_recorder
 from pendulum_bags.experiment.run_folder import write_json
 from pendulum_bags.experiment.run_spec import RunSpec
 from pendulum_bags.experiment.settings import RegulationSettings
 from pendulum_lqr.controller import controller_parameters
 from pendulum_msgs_py import names
 from pendulum_msgs_py.angles import UPRIGHT
-from pendulum_msgs_py.errors import BagError
+from pendulum_msgs_py.errors import BagError, FaultError
 
-__all__ = ["record_run", "run_lockstep", "wait_until_all_hear_each_other"]
+__all__ = ["finish_recording", "record_run", "run_lockstep", "wait_until_all_hear_each_other"]
 
 _START_TIMEOUT = 60.0
 _SLOWEST = 10.0
@@ -124,10 +124,30 @@ def record_run(
             lambda: client.check_mode() or client.has_event("lockstep_finished"),
             _START_TIMEOUT + _SLOWEST * spec.duration,
         )
-        conductor.spin(0.2)
-        # Simulated time stands still from here on: what nodes say on their way out is no part of the run.
-        processes.finish(recorder)
+        finish_recording(conductor, processes, recorder, client, spec.steps + 1)
     return bag
+
+
+def finish_recording(
+    conductor: Conductor, processes: ProcessSet, recorder: Child, plant: PlantClient, states: int
+) -> None:
+    """Close the bag of a run in lockstep when it holds everything.
+
+    Simulated time stands still by then: what the nodes say on their way out is no part of the run.
+
+    Args:
+        conductor: Who conducts.
+        processes: The run's programs.
+        recorder: The recorder among them.
+        plant: The plant.
+        states: How many states the plant has published.
+
+    Raises:
+        FaultError: Messages were lost.
+    """
+    RecorderClient(conductor, plant.namespace).wait_for_all(f"{plant.namespace}/{names.JOINT_STATES}", states)
+    if processes.finish(recorder) != 0:
+        raise FaultError(recorder.last_words(1))
 
 
 def wait_until_all_hear_each_other(

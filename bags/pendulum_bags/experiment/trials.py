@@ -9,7 +9,7 @@ from pathlib import Path
 
 from pendulum_bags.experiment.conductor_node import Conductor, PlantClient
 from pendulum_bags.experiment.domain import reserve_domain
-from pendulum_bags.experiment.lockstep import wait_until_all_hear_each_other
+from pendulum_bags.experiment.lockstep import finish_recording, wait_until_all_hear_each_other
 from pendulum_bags.experiment.processes import ProcessSet, ros_environment, start_recorder
 from pendulum_bags.experiment.progress import PhaseProgress
 from pendulum_bags.experiment.run_folder import git_revision, versions, write_json
@@ -17,10 +17,13 @@ from pendulum_bags.experiment.settings import HARDWARE
 from pendulum_bags.experiment.thesis import EMULATOR_WATCHDOG, LOOP_NICENESS, START_TIMEOUT
 from pendulum_msgs_py import graph, names
 from pendulum_msgs_py.errors import FaultError, ParameterError
+from pendulum_msgs_py.ros.plant_loop import LOCKSTEP_EPOCH_NS
 from pendulum_msgs_py.trajectory import RAMP_INCREMENT, RAMP_PERIOD
 
 __all__ = ["GRAVITY", "INERTIA_DAMPING", "TrialKind", "TrialSettings", "run_trials"]
 
+FEEDBACK_PERIOD_NS = 10_000_000
+"""Feedback at 100 Hz, as in the thesis [ns]."""
 _SLOWEST = 3.0
 """Slowest pace at which a trial still counts as alive, wall time per simulated time."""
 _LONGEST_BY_HAND = 600.0
@@ -203,12 +206,14 @@ def _run_trial(
                 plant.call("procedure/finish")
             longest = _LONGEST_BY_HAND if settings.by_person else START_TIMEOUT + _SLOWEST * settings.expected_duration
             conductor.wait_for(f"the end of trial {trial}", lambda: _has_ended(plant), longest)
+            if settings.lockstep:
+                # Before the plant is disarmed: from then on it waits for nobody, and runs on.
+                assert plant.sample is not None
+                states = 1 + (plant.sample.stamp_ns - LOCKSTEP_EPOCH_NS) // FEEDBACK_PERIOD_NS
+                finish_recording(conductor, processes, recorder, plant, states)
         finally:
             plant.disarm_quietly()
         conductor.spin(0.2)
-        if settings.lockstep:
-            # Simulated time stands still from here on: what nodes say on their way out is no part of the trial.
-            processes.finish(recorder)
     return bag
 
 

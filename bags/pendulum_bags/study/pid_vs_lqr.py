@@ -14,7 +14,7 @@ from rich.table import Table
 from scipy import stats
 
 from pendulum_bags.comparison.metrics import METRICS, Episode, metrics_of
-from pendulum_bags.report.figure import Figure, Panel, Trace
+from pendulum_bags.report.figure import Figure, Mark, Panel, Trace
 from pendulum_bags.report.render_files import write_figures
 from pendulum_bags.study.results import episode_of_run, group_runs
 from pendulum_bags.study.study_file import Study
@@ -57,7 +57,7 @@ def analyse(folder: Path, study: Study, records: Sequence[Mapping[str, Any]]) ->
         rows.append(row)
     result = {"rows": rows, "paired": _paired(records)}
     result["sentences"] = _sentences(result)
-    write_figures(_figures(rows, responses, result["sentences"]), folder / "figures")
+    write_figures(_figures(result["paired"], responses, result["sentences"]), folder / "figures")
     return result
 
 
@@ -73,16 +73,17 @@ def print_table(console: Console, result: Mapping[str, Any]) -> None:
         cells = []
         for row in rows:
             value = row[name]
-            if value["mean"] is None:
-                cells.append("never")
-                continue
-            text = f"{value['mean']:.4g}\n{value['low']:.4g} to {value['high']:.4g}"
+            text = f"{_text(value['mean'])}\n{_text(value['low'])} to {_text(value['high'])}"
             worst = f"\nworst {value['worst']:.4g} (seed {value['worst_seed']})" if "worst" in value else ""
             cells.append(text + worst)
         table.add_row(f"{name} \\[{units[name]}]", *cells)
     console.print(table)
     for sentence in result["sentences"]:
         console.print(f"- {sentence}", markup=False)
+
+
+def _text(value: float | None) -> str:
+    return "never" if value is None else f"{value:.4g}"
 
 
 def _mean_response(episodes: Sequence[Episode]) -> dict[str, Any]:
@@ -100,7 +101,8 @@ def _mean_response(episodes: Sequence[Episode]) -> dict[str, Any]:
     draws = [measure(errors[generator.integers(0, len(errors), len(errors))]) for _ in range(_RESAMPLES)]
     found: dict[str, Any] = {}
     for name in OF_THE_MEAN:
-        low, high = np.percentile([draw[name] for draw in draws], (2.5, 97.5))
+        # Some means may never settle: infinity is a value here, between which and another there is nothing.
+        low, high = np.percentile([draw[name] for draw in draws], (2.5, 97.5), method="nearest")
         found[name] = {
             key: float(value) if math.isfinite(value) else None
             for key, value in (("mean", centre[name]), ("low", low), ("high", high))
@@ -162,7 +164,7 @@ def _sentences(result: Mapping[str, Any]) -> list[str]:
 
 
 def _figures(
-    rows: Sequence[Mapping[str, Any]], responses: Mapping[tuple[str, str], Sequence[Episode]], said: Sequence[str]
+    paired: Sequence[Mapping[str, Any]], responses: Mapping[tuple[str, str], Sequence[Episode]], said: Sequence[str]
 ) -> list[Figure]:
     roles = {0: "sim", 1: "hw", 2: "aligned", 3: "difference"}
     panels = []
@@ -183,24 +185,22 @@ def _figures(
         Figure("pid_vs_lqr_step", "Step under noise", " ".join(said), panels, section="pid_vs_lqr", panel_height=230)
     ]
     panels = []
-    for name in COMPARED:
-        unit = next(metric.unit for metric in METRICS if metric.name == name)
+    for plant in dict.fromkeys(pair["plant"] for pair in paired):
+        pairs = [pair for pair in paired if pair["plant"] == plant]
         trace = Trace(
-            np.array([row[name]["mean"] for row in rows]),
-            np.arange(len(rows), dtype=float),
-            "mean, 95 % interval",
+            np.array([pair["ratio"] for pair in pairs]),
+            np.arange(len(pairs), dtype=float),
+            "" if panels else f"{pairs[0]['of']} per {pairs[0]['per']}, paired, 95 % interval",
             "sim",
             kind="interval",
-            low=np.array([row[name]["low"] for row in rows]),
-            high=np.array([row[name]["high"] for row in rows]),
+            low=np.array([pair["low"] for pair in pairs]),
+            high=np.array([pair["high"] for pair in pairs]),
         )
-        worst_values = np.array([row[name]["worst"] for row in rows])
-        worst = Trace(worst_values, np.arange(len(rows), dtype=float), "worst seed", "hw", "points")
-        ticks = [f"{row['plant']} {row['controller']}" for row in rows]
-        panels.append(Panel(f"{name} [{unit}]", "", [trace, worst], y_ticks=ticks))
-    figures.append(
-        Figure(
-            "pid_vs_lqr_metrics", "Metrics over all seeds", " ".join(said), panels, stacked=True, section="pid_vs_lqr"
+        ticks = [pair["metric"] for pair in pairs]
+        panels.append(
+            Panel("ratio [-]", "", [trace], [Mark(1.0, "x")], title=plant, y_ticks=ticks, x_log=True)
         )
-    )
+    if panels:
+        title = "One controller's metrics in units of the other's"
+        figures.append(Figure("pid_vs_lqr_ratio", title, " ".join(said), panels, section="pid_vs_lqr"))
     return figures

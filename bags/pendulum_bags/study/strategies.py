@@ -14,7 +14,7 @@ from rich.table import Table
 from pendulum_bags.datasets import Recording
 from pendulum_bags.experiment.run_spec import RunSpec
 from pendulum_bags.reader import read_bag
-from pendulum_bags.report.figure import ROLES, Figure, Panel, Trace
+from pendulum_bags.report.figure import Figure, Panel, Trace
 from pendulum_bags.report.render_files import write_figures
 from pendulum_bags.study.study_file import Study
 from pendulum_msgs_py.angles import UPRIGHT
@@ -164,37 +164,25 @@ def _add_gaps(rows: Sequence[dict[str, Any]], motions: Mapping[str, tuple[np.nda
 
 
 def _figure(rows: Sequence[Mapping[str, Any]], motions: Mapping[str, tuple[np.ndarray, np.ndarray]]) -> Figure:
-    """Draw damping with its interval, and a stretch of each motion over that of the simulation."""
-    roles = [name for name in ("hw", "aligned", "difference", "own") if name in ROLES]
-    hardware = [row for row in rows if row["side"] == "hw"]
+    """Draw a stretch of each motion over that of the simulation, with the damping that was identified from it."""
     twin = next((row for row in rows if row["side"] == "sim"), None)
-    ends = [row["damping_interval"] or [row["damping"]] * 2 for row in rows]
-    damping = Trace(
-        np.array([row["damping"] for row in rows]),
-        np.arange(len(rows), dtype=float),
-        "apparent damping, 95 % interval",
-        "sim",
-        kind="interval",
-        low=np.array([low for low, _ in ends]),
-        high=np.array([high for _, high in ends]),
-    )
-    panels = [Panel("apparent damping [N m s/rad]", "", [damping], y_ticks=[str(row["plant"]) for row in rows])]
-    for index, row in enumerate(hardware):
+    panels = []
+    for row in rows:
+        if row["side"] == "sim":
+            continue
         traces = []
-        for source, label, role in ((twin, "simulation", "sim"), (row, row["plant"], roles[index % len(roles)])):
+        for source, label, role in ((twin, "simulation", "sim"), (row, "hardware", "hw")):
             if source is not None:
                 time, angle = motions[source["run"]]
                 shown = time <= _SHOWN
-                traces.append(Trace(time[shown], 1e3 * angle[shown], str(label), role))
-        panels.append(Panel("time [s]", "theta - pi [mrad]", traces))
-    return Figure(
-        "strategies",
-        "One controller, one noise, three strategies",
-        sentence(rows),
-        panels,
-        stacked=True,
-        section="strategies",
-    )
+                # Every panel has the same two curves: the first one's legend serves all.
+                legend = "" if panels else label
+                traces.append(Trace(time[shown], 1e3 * angle[shown], legend, role))
+        low, high = row["damping_interval"] or (math.nan, math.nan)
+        title = f"{row['plant']}: damping {row['damping']:.2f} ({low:.2f} to {high:.2f}) N m s/rad"
+        panels.append(Panel("time [s]", "theta - pi [mrad]", traces, title=title))
+    title = "One controller, one noise, one machine: the strategy changes the plant"
+    return Figure("strategies", title, sentence(rows), panels, section="strategies", panel_height=210)
 
 
 _SHOWN = 3.0
