@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import json
 import math
 import random
 import shutil
+import sqlite3
 import struct
 from pathlib import Path
 from typing import Any
@@ -19,6 +21,8 @@ from rosbags.highlevel import AnyReader
 from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin
 from rosbags.rosbag2 import Writer as RosbagsWriter
 
+from pendulum_bags.export_cli import main as export_main
+from pendulum_bags.info_cli import main as info_main
 from pendulum_bags.reader import Bag, canonical, read_bag, read_bags, same_messages
 from pendulum_bags.reader.batches import Batch
 from pendulum_bags.reader.joint_state import JointStateParser, layout_of
@@ -450,6 +454,69 @@ def test_parquet_reads_back(tmp_path: Path) -> None:
             writer.write("/a", index, encode_joint_state(index, position=0.1 * index))
     (file, _) = export_bag(read_bag(path), tmp_path / "out")
     assert pd.read_parquet(file)["position"].tolist() == [0.1 * index for index in range(10)]
+
+
+def test_databases_of_the_first_rosbag2_versions_are_read(tmp_path: Path) -> None:
+    """Schema 1 had neither QoS nor definitions nor hashes; its metadata was version 2."""
+    path = tmp_path / "old"
+    path.mkdir()
+    connection = sqlite3.connect(path / "old_0.db3")
+    connection.execute(
+        "CREATE TABLE topics(id INTEGER PRIMARY KEY, name TEXT NOT NULL, type TEXT NOT NULL, "
+        "serialization_format TEXT NOT NULL)"
+    )
+    connection.execute(
+        "CREATE TABLE messages(id INTEGER PRIMARY KEY, topic_id INTEGER NOT NULL, timestamp INTEGER NOT NULL, "
+        "data BLOB NOT NULL)"
+    )
+    connection.execute("INSERT INTO topics VALUES(7, '/a', ?, 'cdr')", (JOINT_STATE,))
+    for index in range(2000):
+        data = encode_joint_state(index, position=float(index))
+        connection.execute("INSERT INTO messages(topic_id, timestamp, data) VALUES(7, ?, ?)", (index, data))
+    connection.commit()
+    connection.close()
+    bag = read_bag(path)
+    assert bag.damage == ["metadata.yaml is missing"]
+    assert bag["/a"]["position"].tolist() == [float(index) for index in range(2000)]
+
+
+def test_rows_that_were_deleted_and_moved_are_read_as_sqlite_has_them(tmp_path: Path) -> None:
+    """A database that others have worked on: holes, rewritten pages, small integers, an index."""
+    path = tmp_path / "bag"
+    with open_writer(path, "sqlite3") as writer:
+        writer.add_topic("/a", JOINT_STATE)
+        for index in range(5000):
+            writer.write("/a", index, encode_joint_state(index, position=float(index)))
+    connection = sqlite3.connect(path / "bag_0.db3")
+    connection.execute("DELETE FROM messages WHERE id % 3 = 0")
+    connection.execute("UPDATE messages SET timestamp = timestamp - 100 WHERE id < 1000")
+    connection.commit()
+    expected = [row[0] for row in connection.execute("SELECT timestamp FROM messages ORDER BY timestamp, id")]
+    connection.close()
+    assert read_bag(path)["/a"]["log_time_ns"].tolist() == expected
+
+
+def test_the_commands_print_tables_json_and_sentences(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = tmp_path / "bag"
+    with open_writer(path, metadata={"run": {"seed": 1}}) as writer:
+        writer.add_topic("/a", JOINT_STATE)
+        for index in range(100):
+            writer.write(
+                "/a", 1000 + index * 2_000_000, encode_joint_state(1 + index * 2_000_000, position=0.0)
+            )
+    assert info_main([str(path)]) == 0
+    assert "/a" in (table := capsys.readouterr().out)
+    assert "500.000" in table
+    assert info_main([str(path), "--json"]) == 0
+    document = json.loads(capsys.readouterr().out)
+    assert document["topics"]["/a"]["count"] == 100
+    assert document["metadata"] == {"run": {"seed": 1}}
+    assert export_main([str(path), "-o", str(tmp_path / "out"), "--format", "csv"]) == 0
+    assert capsys.readouterr().out.splitlines()[0].endswith("a.csv")
+    assert info_main([str(tmp_path / "nothing")]) == 2
+    assert "does not exist" in capsys.readouterr().err
 
 
 def test_a_bag_whose_files_were_renamed_or_lost_is_read_as_far_as_it_goes(tmp_path: Path) -> None:
