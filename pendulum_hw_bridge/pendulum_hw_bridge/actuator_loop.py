@@ -137,13 +137,13 @@ class ActuatorLoop:
                 continue
             try:
                 future.set_result(job())
-            except BaseException as error:
+            except BaseException as error:  # noqa: BLE001  (the caller gets it, whatever it is)
                 future.set_exception(error)
 
     def _guarded_cycle(self) -> None:
         try:
             self._cycle()
-        except Exception as error:
+        except Exception as error:  # noqa: BLE001
             # Whatever broke, the drive goes off first; a second break in the next cycle finds it off already.
             self.bridge.fail("exception", f"{type(error).__name__}: {error}")
             self.bridge.release()

@@ -7,7 +7,7 @@ driving goes through ``release``: effort zero, then strategy off.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 from pendulum_hw_bridge.actuator import (
     ActuatorError,
@@ -49,7 +49,7 @@ class BridgeSettings:
 
     feedback_rate: float = 100.0
     command_lifetime: float = 0.05
-    limits: HardwareLimits = HardwareLimits()
+    limits: HardwareLimits = field(default_factory=HardwareLimits)
     gains: GainSet | None = None
     joint_offset: float = 0.0
     joint_sign: int = 1
@@ -151,7 +151,8 @@ class Bridge:
         """Effort zero, then strategy off; never raises."""
         try:
             self.port.stop()
-        except Exception as error:  # whatever happens here, the command lifetime still ends all torque
+        # Whatever happens here, the command lifetime still ends all torque.
+        except Exception as error:  # noqa: BLE001
             self._note(getattr(error, "fault", "exception"))
         self._strategy = Strategy.OFF
         self.monitor.stopped()
@@ -162,7 +163,7 @@ class Bridge:
         self.release()
         try:
             self.port.close()
-        except Exception as error:
+        except Exception as error:  # noqa: BLE001
             self._note(getattr(error, "fault", "exception"))
 
     # --- cycle ----------------------------------------------------------------------------------------------

@@ -130,7 +130,8 @@ BRIDGE_SPECS: tuple[ParameterSpec, ...] = (
         "feedback_watchdog",
         3,
         "-",
-        "Feedback periods without a record after which the bridge faults. Raise it only for an emulator on a busy machine.",
+        "Feedback periods without a record after which the bridge faults. "
+        "Raise it only for an emulator on a busy machine.",
         minimum=2,
         maximum=50,
     ),

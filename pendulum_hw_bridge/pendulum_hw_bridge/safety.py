@@ -17,7 +17,7 @@ from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.plant_parameters import SeriesElasticParameters
 from pendulum_msgs_py.values import NANOSECONDS
 
-__all__ = ["FAULTS", "SHORTEST_TIMEOUT", "Fault", "SafetyLimits", "SafetyMonitor"]
+__all__ = ["FAULTS", "Fault", "SafetyLimits", "SafetyMonitor"]
 
 FAULTS = {
     "feedback_lost": "no feedback for three cycles",
@@ -41,9 +41,6 @@ FAULTS = {
     "exception": "an error in the bridge itself",
 }
 """Faults by name and what each means; those of the supervisor come in addition."""
-
-SHORTEST_TIMEOUT = 0.02
-"""Shortest age of feedback that counts as a fault, at rates at which three cycles are less [s]."""
 
 _COUNT = 3
 _MOTION_CYCLES = 5
@@ -315,7 +312,7 @@ class SafetyMonitor:
         return None
 
     def _in_force(self, stamp_ns: int) -> list[Command]:
-        """Return the commands that a record with this stamp may show: the newest that had arrived, and its neighbours."""
+        """Return the commands that a record with this stamp may show: the newest to have arrived, and neighbours."""
         window = round((1.2 * self.period + _WAY) * NANOSECONDS)
         arrived = [command for sent, command in self._sent if sent <= stamp_ns - round(_WAY * NANOSECONDS)]
         recent = [command for sent, command in self._sent if stamp_ns - window <= sent <= stamp_ns]

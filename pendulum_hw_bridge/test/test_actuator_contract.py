@@ -179,7 +179,7 @@ def test_limits_and_commands_are_checked_in_one_place() -> None:
         Command(position=9.0), Strategy.PARALLEL_PWM, HardwareLimits(position_max=4.0)
     )
     assert (limited.position, changed) == (4.0, True)
-    with pytest.raises(ParameterError, match="effort limit is 0.0 N m; expected a finite number > 0"):
+    with pytest.raises(ParameterError, match=r"effort limit is 0.0 N m; expected a finite number > 0"):
         HardwareLimits(effort=0.0)
     with pytest.raises(ParameterError, match="expected min < max"):
         HardwareLimits(position_min=1.0, position_max=1.0)

@@ -1,5 +1,6 @@
 """The bridge's states, each against each input, and hand-over between them, on the emulated actuator."""
 
+import itertools
 import math
 
 import pytest
@@ -34,9 +35,7 @@ class Plant:
         limits = PlantLimits(
             effort=13.0, feedback_timeout=0.04, velocity=1.5, position_min=-4.0, position_max=4.0
         )
-        self.supervisor = SharedSupervisor(
-            limits, lambda: self.bridge.prepare(), lambda: self.bridge.release()
-        )
+        self.supervisor = SharedSupervisor(limits, self._prepare, self._withdraw)
         self.bridge = Bridge(
             self.port,
             self.supervisor,
@@ -48,6 +47,12 @@ class Plant:
         self.regulating = False
         self.duties: list[float] = []
         self.cycles(2)
+
+    def _prepare(self) -> str:
+        return self.bridge.prepare()
+
+    def _withdraw(self) -> None:
+        self.bridge.release()
 
     def cycles(self, count: int) -> None:
         for _ in range(count):
@@ -193,7 +198,7 @@ def test_control_passes_from_position_to_effort_and_back_without_a_jump(kind: Ef
     plant.regulating = False
     plant.cycles(50)
     assert plant.mode is Mode.POSITION
-    steps = [abs(after - before) for before, after in zip(plant.duties, plant.duties[1:])]
+    steps = [abs(after - before) for before, after in itertools.pairwise(plant.duties)]
     # 13 N m is a duty of 0.33; one newton metre of jump would be 0.025.
     assert max(steps) < 0.03
     assert abs(plant.actuator.link.position - UPRIGHT) < 0.06

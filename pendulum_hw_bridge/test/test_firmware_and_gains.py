@@ -60,7 +60,10 @@ def test_defaults_are_the_x5_9s() -> None:
 def test_each_strategy_combines_its_loops_as_documented() -> None:
     setpoints, measured = (0.6, 0.2, 1.0), (0.5, 0.1, 0.8)
     position, velocity = 0.1, 0.1
-    effort_of = lambda target: 0.25 * (target - 0.8) + target * 0.05
+
+    def effort_of(target: float) -> float:
+        return 0.25 * (target - 0.8) + target * 0.05
+
     forward = 0.05 * velocity + 0.2 * 0.3
     assert pwm(0, setpoints, measured) == 0.0
     assert pwm(1, (OFF, OFF, 0.4), measured) == 0.4
@@ -158,5 +161,5 @@ def test_a_wrong_gains_file_is_refused_with_its_reason(tmp_path: Path, text: str
 def test_gains_that_are_no_numbers_are_refused() -> None:
     with pytest.raises(ParameterError, match="gain kp is nan"):
         PidGains(kp=math.nan)
-    with pytest.raises(ParameterError, match="output_lowpass is 0.0"):
+    with pytest.raises(ParameterError, match=r"output_lowpass is 0.0"):
         PidGains(output_lowpass=0.0)

@@ -160,9 +160,9 @@ def test_a_wrong_recording_is_refused_with_its_place(tmp_path: Path, text: str, 
         load_feedback(path)
     with pytest.raises(DataError, match="cannot be read"):
         load_feedback(tmp_path / "missing.csv")
+    other = tmp_path / "run.txt"
+    other.write_text(text)
     with pytest.raises(DataError, match=r"expected \.npz or \.csv"):
-        other = tmp_path / "run.txt"
-        other.write_text(text)
         load_feedback(other)
 
 

@@ -163,7 +163,8 @@ def _loop() -> Iterator[Row]:
         figures = loop_figures(rate, SECONDS)
         what = f"loop on the emulator at {rate:g} Hz for {SECONDS:g} s, bridge and controller"
         yield measured(f"{what}: rate", figures.rate, "Hz", at_least=0.99 * rate, less_is_better=False)
-        note = f"p99 {figures.jitter_p99:.0f} us, largest {figures.jitter_max:.0f} us; the actuator's own is 4 to 10 % of the period"
+        note = f"p99 {figures.jitter_p99:.0f} us, largest {figures.jitter_max:.0f} us; "
+        note += "the actuator's own is 5 to 10 % of the period"
         yield measured(
             f"{what}: jitter of the states, p50", figures.jitter_p50, "us", note=note, less_is_better=True
         )

@@ -71,9 +71,11 @@ def loop_figures(rate: float, duration: float) -> BridgeLoopFigures:
         diagnostics: list[dict[str, str]] = []
 
         def on_diagnostics(message: DiagnosticArray) -> None:
-            for status in message.status:
-                if status.name.endswith("bridge: plant"):
-                    diagnostics.append({pair.key: pair.value for pair in status.values})
+            diagnostics.extend(
+                {pair.key: pair.value for pair in status.values}
+                for status in message.status
+                if status.name.endswith("bridge: plant")
+            )
 
         node.create_subscription(DiagnosticArray, names.DIAGNOSTICS, on_diagnostics, 10)
         arm = node.create_client(SetBool, "/hw/bridge/arm")
@@ -87,7 +89,9 @@ def loop_figures(rate: float, duration: float) -> BridgeLoopFigures:
             "ROS_DOMAIN_ID": str(domain),
             "ROS_AUTOMATIC_DISCOVERY_RANGE": os.environ.get("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST"),
         }
-        bridge = graph.bridge("/hw", feedback_rate=rate, initial_position=math.pi)
+        # What a desktop's scheduler may sleep, 25 ms, is many cycles at a high rate.
+        watchdog = max(3, math.ceil(0.025 * rate))
+        bridge = graph.bridge("/hw", feedback_rate=rate, initial_position=math.pi, feedback_watchdog=watchdog)
         controller = graph.controller("/hw")
         try:
             programs = [

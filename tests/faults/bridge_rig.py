@@ -116,7 +116,7 @@ class Rig:
             outcome = self.bridge.carry_out(self._decide(), was_armed=armed)
             self.largest_commanded = max(self.largest_commanded, abs(outcome.effort))
             self.supervisor.report_applied(outcome.effort)
-        except Exception as error:
+        except Exception as error:  # noqa: BLE001
             self.bridge.fail("exception", str(error))
             self.bridge.release()
             self.clock.wait_until(self.clock.now_ns() + round(self.period * SECOND))

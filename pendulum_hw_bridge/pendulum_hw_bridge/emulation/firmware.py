@@ -29,9 +29,9 @@ except ImportError:  # the emulator then runs interpreted, some twenty times slo
 __all__ = [
     "CONTROL_PERIOD",
     "EFFORT",
-    "Array",
     "POSITION",
     "VELOCITY",
+    "Array",
     "control_pwm",
     "gain_rows",
     "new_loop_memory",

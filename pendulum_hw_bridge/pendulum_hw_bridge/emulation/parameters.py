@@ -42,8 +42,8 @@ EMULATOR_PRESETS = ("thesis", "x5_9")
 class SensorParameters:
     """Noise and steps of the feedback.
 
-    Source: steps and deflection noise measured on a public log of an X5 (deflection noise at most 0.2 mrad); position and
-        velocity noise inferred.
+    Source: steps and deflection noise (at most 0.2 mrad) measured on a public log of an X5; position and velocity
+        noise inferred.
 
     Attributes:
         position_step: Step of the output encoder [rad].
