@@ -1,0 +1,133 @@
+"""The launch files: what they would start is checked everywhere, that launch loads them where launch is installed."""
+
+from __future__ import annotations
+
+import importlib
+import importlib.util
+import itertools
+from pathlib import Path
+from typing import Any
+from xml.etree import ElementTree
+
+import pytest
+import yaml
+
+from pendulum_hw_bridge.bridge_node import SPECS as BRIDGE_SPECS
+from pendulum_lqr.bringup import ARGUMENTS, SIDES, programs
+from pendulum_lqr.controller import COMMON_PARAMETERS, controller_parameters
+from pendulum_lqr.controller_node import NODE_SPECS as CONTROLLER_SPECS
+from pendulum_lqr.disturbance import DISTURBANCE_SPECS
+from pendulum_lqr.disturbance_node import NODE_SPECS as DISTURBANCE_NODE_SPECS
+from pendulum_msgs_py.errors import ParameterError
+from pendulum_msgs_py.graph import NodeProgram
+from pendulum_msgs_py.parameters import validate
+from pendulum_sim import markers_node, model_files, simulator_node, viewer_node
+from tests.fixtures import PROJECT
+
+LAUNCH_FILES = sorted(PROJECT.glob("pendulum_*/launch/*.launch.py"))
+DEFAULTS = {argument.name: argument.default for argument in ARGUMENTS}
+
+
+def _specs(program: NodeProgram) -> Any:
+    if program.executable == "controller":
+        own = controller_parameters(str(program.parameters["controller"]))
+        return {spec.name: spec for spec in (*CONTROLLER_SPECS, *COMMON_PARAMETERS, *own)}.values()
+    table = {
+        "simulator": simulator_node.SPECS,
+        "viewer": viewer_node.SPECS,
+        "markers": markers_node.SPECS,
+        "bridge": BRIDGE_SPECS,
+        "disturbance": DISTURBANCE_SPECS + DISTURBANCE_NODE_SPECS,
+    }
+    return table[program.executable]
+
+
+def test_there_are_launch_files() -> None:
+    assert {path.name for path in LAUNCH_FILES} == {"bringup.launch.py", "rviz.launch.py"}
+
+
+@pytest.mark.parametrize("plant", SIDES)
+def test_every_choice_starts_nodes_that_know_their_parameters(plant: str) -> None:
+    choices = {
+        it.name: it.choices for it in ARGUMENTS if it.name in {"controller", "disturbance", "start", "viewer"}
+    }
+    for combination in itertools.product(*choices.values()):
+        value = {**DEFAULTS, "plant": plant, **dict(zip(choices, combination, strict=True))}
+        found = programs(value)
+        assert len({program.full_name for program in found}) == len(found)
+        for program in found:
+            validate(_specs(program), dict(program.parameters), where=program.full_name)
+
+
+def test_both_plants_differ_by_namespace_only_for_controller_and_disturbance() -> None:
+    found = programs({**DEFAULTS, "plant": "both", "disturbance": "uniform"})
+    names = [program.full_name for program in found]
+    assert names == [
+        *("/sim/simulator", "/sim/controller", "/sim/disturbance"),
+        *("/hw/bridge", "/hw/controller", "/hw/disturbance"),
+    ]
+    periods = {it.namespace: it.parameters["period"] for it in found if it.executable == "controller"}
+    assert periods == {"/sim": 0.002, "/hw": 0.01}
+
+
+def test_a_real_actuator_is_never_told_where_it_stands() -> None:
+    bridge = programs({**DEFAULTS, "plant": "hebi", "start": "top"})[0]
+    assert bridge.parameters["backend"] == "hebi"
+    assert "initial_position" not in bridge.parameters
+
+
+@pytest.mark.parametrize(("name", "text"), [("sim_rate", "fast"), ("sim_rate", "-1"), ("seed", "1.5")])
+def test_a_number_that_is_none_is_refused_by_name(name: str, text: str) -> None:
+    with pytest.raises(ParameterError, match=f"{name} is '{text}'"):
+        programs({**DEFAULTS, "disturbance": "uniform", name: text})
+
+
+def test_the_parameter_file_fits_the_nodes() -> None:
+    text = (PROJECT / "pendulum_lqr" / "config" / "lqr_thesis.yaml").read_text(encoding="utf-8")
+    for key, content in yaml.safe_load(text).items():
+        values = content["ros__parameters"]
+        program = NodeProgram("pendulum_lqr", key.split("/")[-1], parameters=values)
+        assert validate(_specs(program), values, where=key)
+
+
+def test_rviz_shows_what_is_published() -> None:
+    configuration = yaml.safe_load((PROJECT / "pendulum_sim/rviz/pendulum.rviz").read_text(encoding="utf-8"))
+    displays = configuration["Visualization Manager"]["Displays"]
+    topics = {
+        display[key]["Value"]
+        for display in displays
+        for key in ("Topic", "Description Topic")
+        if key in display
+    }
+    assert topics == {
+        f"/{side}/{topic}" for side in ("sim", "hw") for topic in ("markers", "robot_description")
+    }
+
+
+@pytest.mark.parametrize("model", ["thesis", "x5_9", "dfki"])
+def test_the_urdf_of_every_preset_has_the_joint_of_the_contract(model: str) -> None:
+    robot = ElementTree.fromstring(model_files.urdf(model_files.load_plant(model)))
+    joint = robot.find("joint")
+    assert joint is not None
+    assert joint.get("name") == "pendulum_joint"
+    assert {link.get("name") for link in robot.findall("link")} >= {"base_link", "pendulum_link"}
+
+
+def test_the_arc_of_a_torque_turns_the_way_of_the_joint() -> None:
+    points = markers_node.arc_points(2.0, 13.0, 0.1)
+    assert points[0] == pytest.approx((0.0, 0.0, 0.1))
+    assert points[1][0] < 0.0
+    assert markers_node.arc_points(0.0, 13.0, 0.1) == []
+
+
+@pytest.mark.parametrize("path", LAUNCH_FILES, ids=lambda path: path.name)
+def test_launch_loads_the_file(path: Path) -> None:
+    launch = pytest.importorskip(
+        "launch", reason="launch is not among the wheels; it needs a full ROS installation"
+    )
+    spec = importlib.util.spec_from_file_location(path.stem.replace(".", "_"), path)
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    assert isinstance(module.generate_launch_description(), launch.LaunchDescription)
