@@ -1,0 +1,1 @@
+"""Attacks on the running system, counted. ``make faults`` runs the long form and prints a table."""

@@ -1,0 +1,25 @@
+"""The short form of the campaign on the running system; ``make faults`` is the long one."""
+
+from __future__ import annotations
+
+import random
+from collections.abc import Iterator
+
+import pytest
+
+from pendulum_bags.experiment.domain import reserve_domain
+from tests.faults.campaign import CAMPAIGN, Fault, try_fault
+from tests.faults.live import LiveSystem
+
+
+@pytest.fixture(scope="module")
+def system(tmp_path_factory: pytest.TempPathFactory) -> Iterator[LiveSystem]:
+    with reserve_domain() as domain, LiveSystem(tmp_path_factory.mktemp("live"), domain) as running:
+        yield running
+
+
+@pytest.mark.timeout(150)
+@pytest.mark.parametrize("fault", [fault for fault in CAMPAIGN if fault.short], ids=lambda fault: fault.name)
+def test_running_system_survives(system: LiveSystem, fault: Fault) -> None:
+    outcome = try_fault(system, fault, random.Random(fault.name))
+    assert outcome.survived, outcome.detail
