@@ -177,8 +177,9 @@ def _figures(
             t = episodes[0].t
             role = roles[index % len(roles)]
             low, high = np.percentile(errors, (5.0, 95.0), axis=0)
-            traces.append(Trace(t, errors.mean(axis=0), f"{controller}: mean of {len(episodes)} seeds", role))
-            traces.append(Trace(t, low, f"{controller}: 5 to 95 %", "reference"))
+            legend = "" if panels else f"{controller}: mean of {len(episodes)} seeds"
+            traces.append(Trace(t, errors.mean(axis=0), legend, role))
+            traces.append(Trace(t, low, "" if panels or index else "5 to 95 % of the seeds", "reference"))
             traces.append(Trace(t, high, "", "reference"))
         panels.append(Panel("time [s]", "theta - set-point [mrad]", traces, title=plant))
     figures = [
