@@ -1,0 +1,242 @@
+"""The HEBI backend on a group that answers as a module does: what is sent, copied, read back and refused.
+
+No module is at hand where tests run, and hebi-py's imitation has no settings to read back; hebi-py's own command and
+feedback objects are used, only the way to the module is ours.
+"""
+
+import math
+from collections.abc import Callable
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from pendulum_hw_bridge.actuator import (
+    ActuatorError,
+    Command,
+    CommandLock,
+    HardwareLimits,
+    LimitState,
+    MStopAction,
+    Strategy,
+    TemperatureState,
+)
+from pendulum_hw_bridge.backends import hebi as backend_module
+from pendulum_hw_bridge.backends.hebi import HebiBackend, connect_group
+from pendulum_hw_bridge.gains import DEFAULT_GAINS, GAIN_FIELDS, LOOPS
+
+hebi = pytest.importorskip("hebi", reason="hebi-py is not installed")
+
+
+class Module:
+    """What a module remembers of the commands that reach it, and the group through which they come."""
+
+    size = 1
+
+    def __init__(self) -> None:
+        self.command_lifetime = 250
+        self.feedback_frequency = 100.0
+        self.settings: dict[str, Any] = {"control_strategy": 3}
+        self.sent: list[tuple[float, float, float]] = []
+        self.hears = self.acknowledges = self.answers = self.flows = True
+        self.time_us = 1_000_000
+        self.values: dict[str, float] = {}
+        self.states = {
+            "mstop_state": 1,
+            "temperature_state": 0,
+            "command_lifetime_state": 2,
+            "position_limit_state": 2,
+            "velocity_limit_state": 2,
+            "effort_limit_state": 2,
+        }
+
+    def send_command(self, command: Any) -> bool:
+        self.sent.append((float(command.position[0]), float(command.velocity[0]), float(command.effort[0])))
+        return self.hears
+
+    def send_command_with_acknowledgement(self, command: Any, timeout_ms: int) -> bool:
+        if not (self.hears and self.acknowledges):
+            return False
+        self.send_command(command)
+        names = [f"{loop}_{name}" for loop in LOOPS for name in GAIN_FIELDS]
+        names += ["effort_limit_max", "velocity_limit_max", "position_limit_min", "position_limit_max"]
+        for name in names:
+            value = float(getattr(command, name)[0])
+            if not math.isnan(value):
+                self.settings[name] = value
+        if command.control_strategy[0] or not self.settings:
+            self.settings["control_strategy"] = int(command.control_strategy[0])
+        if command.mstop_strategy[0]:
+            self.settings["mstop_strategy"] = int(command.mstop_strategy[0])
+        return True
+
+    def request_info(self, timeout_ms: int) -> Any:
+        if not self.answers:
+            return None
+        known = {
+            "family": "Lab",
+            "name": "Pendulum",
+            "serial": "X-1",
+            "firmware_revision": "15",
+            "mstop_strategy": 1,
+        }
+        module = self
+
+        class Info:
+            def __getattr__(self, name: str) -> list[Any]:
+                return [module.settings.get(name, known.get(name, math.nan))]
+
+        return Info()
+
+    def get_next_feedback(self, timeout_ms: float, reuse: Any) -> Any:
+        if not self.flows:
+            return None
+        self.time_us += 10_000
+        quantities = {
+            theirs: np.array([self.values.get(theirs, 0.5)]) for theirs in backend_module._FLOATS.values()
+        }
+        times = {"receive_time_us": self.time_us, "hardware_transmit_time_us": self.time_us + 7}
+        return SimpleNamespace(
+            **quantities, **{name: np.array([value]) for name, value in {**times, **self.states}.items()}
+        )
+
+
+@pytest.fixture
+def module() -> Module:
+    return Module()
+
+
+@pytest.fixture
+def port(module: Module) -> HebiBackend:
+    backend = HebiBackend(make_group=lambda: module)
+    backend.connect()
+    return backend
+
+
+def test_it_says_who_it_is(port: HebiBackend) -> None:
+    info = port.connect()
+    assert (info.family, info.name, info.serial, info.firmware) == ("Lab", "Pendulum", "X-1", "15")
+    assert info.strategy is Strategy.PARALLEL_PWM
+
+
+def test_the_effort_field_carries_the_duty_under_direct_pwm(port: HebiBackend, module: Module) -> None:
+    port.set_strategy(Strategy.DIRECT_PWM, Command(pwm=0.25))
+    assert module.sent[-1][2] == 0.25
+    port.write(Command(pwm=-0.5))
+    assert module.sent[-1][2] == -0.5
+    assert math.isnan(module.sent[-1][0])
+
+
+def test_settings_are_sent_and_read_back(port: HebiBackend, module: Module) -> None:
+    assert port.set_command_lifetime(0.05) == 0.05
+    assert module.command_lifetime == 50
+    # The module keeps single precision.
+    assert port.set_gains(DEFAULT_GAINS[3]).velocity.kp == pytest.approx(0.05, rel=1e-6)
+    assert module.settings["position_kp"] == 1.5
+    limits = HardwareLimits(
+        effort=4.0, velocity=1.0, position_min=-3.0, position_max=3.0, m_stop=MStopAction.HOLD_POSITION
+    )
+    assert port.set_limits(limits) == limits
+    module.settings["effort_limit_max"] = 9.0
+    module.send_command_with_acknowledgement = lambda command, timeout: True  # type: ignore[method-assign]
+    assert port.set_limits(limits).effort == 9.0
+
+
+def test_feedback_is_copied_not_viewed(port: HebiBackend, module: Module) -> None:
+    module.values = {"position": 1.25, "motor_winding_current": 0.3}
+    first = port.read(0.1)
+    module.values = {"position": 9.0}
+    second = port.read(0.1)
+    assert first is not None
+    assert second is not None
+    assert (first.position, first.winding_current, second.position) == (1.25, 0.3, 9.0)
+    assert type(first.position) is float
+    assert second.sequence == first.sequence + 1
+    assert second.hardware_ns - first.hardware_ns == 10_000_000
+
+
+def test_states_of_the_firmware_become_ours(port: HebiBackend, module: Module) -> None:
+    module.states.update(mstop_state=0, temperature_state=2, command_lifetime_state=1, position_limit_state=4)
+    record = port.read(0.1)
+    assert record is not None
+    assert record.m_stop
+    assert record.temperature_state == TemperatureState.EXCEED_MAX_MOTOR
+    assert record.lock == CommandLock.LOCKED_BY_OTHER
+    assert record.position_limit == LimitState.ABOVE
+    module.states.update(temperature_state=77)
+    record = port.read(0.1)
+    assert record is not None
+    assert record.temperature_state == 77
+
+
+def test_silence_is_no_feedback(port: HebiBackend, module: Module) -> None:
+    module.flows = False
+    assert port.read(0.01) is None
+
+
+@pytest.mark.parametrize(
+    ("defect", "act", "fault"),
+    [
+        ("hears", lambda port: port.write(Command()), "send_failed"),
+        ("acknowledges", lambda port: port.set_strategy(Strategy.DIRECT_PWM), "no_acknowledgement"),
+        ("acknowledges", lambda port: port.set_gains(DEFAULT_GAINS[3]), "no_acknowledgement"),
+        ("answers", lambda port: port.connect(), "module_lost"),
+    ],
+)
+def test_each_way_of_losing_the_module_has_its_name(
+    port: HebiBackend, module: Module, defect: str, act: Callable[[HebiBackend], object], fault: str
+) -> None:
+    setattr(module, defect, False)
+    with pytest.raises(ActuatorError) as caught:
+        act(port)
+    assert caught.value.fault == fault
+
+
+def test_stop_sends_zero_then_off_even_to_a_module_that_does_not_acknowledge(
+    port: HebiBackend, module: Module
+) -> None:
+    port.set_strategy(Strategy.DIRECT_PWM)
+    module.sent.clear()
+    port.stop()
+    assert module.sent[0][2] == 0.0
+    assert math.isnan(module.sent[-1][2])
+    module.acknowledges = False
+    port.set_strategy = None  # type: ignore[method-assign, assignment]
+    port.stop()
+    port.close()
+
+
+def test_a_group_of_several_modules_is_refused() -> None:
+    backend = HebiBackend(make_group=lambda: hebi.util.create_imitation_group(2), imitation=True)
+    with pytest.raises(ActuatorError, match="HEBI group has 2 modules; expected 1"):
+        backend.connect()
+
+
+class Lookup:
+    def __init__(self, *found: tuple[str, str]) -> None:
+        self.entrylist = [SimpleNamespace(family=family, name=name) for family, name in found]
+
+    def get_group_from_names(self, families: list[str], names: list[str], timeout_ms: int) -> Any:
+        return SimpleNamespace(size=1, who=(families[0], names[0]))
+
+
+@pytest.mark.parametrize(
+    ("found", "family", "name", "message"),
+    [
+        ((), "Lab", "Pendulum", r"no HEBI module Lab/Pendulum answered within 0.25 s; modules seen: none"),
+        ((("Lab", "Arm"),), "Lab", "Pendulum", r"modules seen: Lab/Arm"),
+        ((("Lab", "A"), ("Lab", "B")), "Lab", "", r"is not the only one: Lab/A, Lab/B; give family and name"),
+    ],
+)
+def test_a_module_that_is_not_meant_is_not_driven(
+    monkeypatch: pytest.MonkeyPatch, found: tuple[tuple[str, str], ...], family: str, name: str, message: str
+) -> None:
+    monkeypatch.setattr(hebi, "Lookup", lambda *arguments: Lookup(*found))
+    with pytest.raises(ActuatorError, match=message):
+        connect_group(family, name, timeout=0.25)
+
+
+def test_the_only_module_needs_no_name(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(hebi, "Lookup", lambda *arguments: Lookup(("Lab", "Pendulum")))
+    assert connect_group("", "", timeout=0.25).who == ("Lab", "Pendulum")
