@@ -85,6 +85,8 @@ def run_node(
 
 
 def _run(make_node: Callable[[Callable[[], None]], Node], arguments: Sequence[str]) -> int:
+    # A plant that the whole subnet may command is a decision, not a default.
+    os.environ.setdefault("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
     signals = _listen_for_stop_signals()
     try:
         rclpy.init(args=list(arguments), signal_handler_options=SignalHandlerOptions.NO)
