@@ -222,6 +222,9 @@ def test_topics_can_be_chosen_and_missing_ones_are_named(tmp_path: Path) -> None
         read_bag(path, ["/c"])
     with pytest.raises(DataError, match="has no topic /c; it has /a, /b"):
         read_bag(path)["/c"]
+    assert "/a" in read_bag(path)
+    assert "/c" not in read_bag(path)
+    assert read_bag(path).get("/c") is None
     with pytest.raises(BagError, match="does not exist"):
         read_bag(tmp_path / "nothing")
 

@@ -126,6 +126,14 @@ class Bag(Mapping[str, Any]):
             self._load([topic])
         return self._arrays[topic]
 
+    def __contains__(self, topic: object) -> bool:
+        # (the mapping's own would read the topic, and expects a KeyError)
+        return topic in self._topics
+
+    def get(self, topic: str, default: Any = None) -> Any:
+        """Return a topic as ``bag[topic]`` does, or a default where the bag has none of that name."""
+        return self[topic] if topic in self._topics else default
+
     def __iter__(self) -> Iterator[str]:
         return iter(self._topics)
 
