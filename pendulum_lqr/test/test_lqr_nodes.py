@@ -27,6 +27,8 @@ from std_srvs.srv import Trigger  # noqa: E402
 from pendulum_msgs_py.ros import qos  # noqa: E402
 
 STATE = {"position": math.pi + 0.1, "velocity": 0.2, "effort": 0.0}
+# A busy machine delivers states late; how old is too old is judged by tests that need no middleware.
+PATIENT = "state_timeout:=2.0"
 ANSWER = -(33.345265 * 0.1 + 0.158993 * 0.2)
 
 
@@ -121,8 +123,7 @@ def ros(*parameters: str) -> list[str]:
 
 
 def test_the_controller_answers_each_state_once_by_its_stamp_and_ends_with_zero(plant, processes):
-    # A busy machine may deliver a state late; how old is too old is the business of a test without a middleware.
-    program = processes.start("pendulum_lqr", "controller", *ros("state_timeout:=2.0"))
+    program = processes.start("pendulum_lqr", "controller", *ros(PATIENT))
     program.wait_for_output(r"lqr for plant thesis: K = \[33\.345265, 0\.158993\]", 30)
     plant.wait(lambda: plant.publish() and plant.commands, "the first answer")
     plant.spin(0.5)
@@ -169,7 +170,7 @@ def test_the_controller_answers_each_state_once_by_its_stamp_and_ends_with_zero(
 
 def test_a_manager_can_hold_the_controller_and_deactivation_sends_zero(plant, processes):
     program = processes.start(
-        "pendulum_lqr", "controller", *ros("autostart:=false", "controller:=pd_gravity")
+        "pendulum_lqr", "controller", *ros("autostart:=false", "controller:=pd_gravity", PATIENT)
     )
     plant.connect()
     plant.run(5)
@@ -200,7 +201,7 @@ def test_a_manager_can_hold_the_controller_and_deactivation_sends_zero(plant, pr
 
 
 def test_multi_array_speaks_to_an_effort_controller_of_ros2_control(plant, processes):
-    program = processes.start("pendulum_lqr", "controller", *ros("command_type:=multi_array"))
+    program = processes.start("pendulum_lqr", "controller", *ros("command_type:=multi_array", PATIENT))
     plant.connect()
     plant.wait(lambda: plant.publish() and plant.arrays, "commands")
     assert plant.arrays[-1] == pytest.approx(ANSWER, abs=1e-5)
