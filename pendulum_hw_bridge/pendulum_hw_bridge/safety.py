@@ -38,9 +38,13 @@ FAULTS = {
     "strategy": "the strategy does not read back",
     "send_failed": "a command could not be sent",
     "no_acknowledgement": "a setting was not acknowledged",
+    "supervisor": "a limit that every plant has: velocity, position window, trajectory, age of the measurement",
     "exception": "an error in the bridge itself",
+    "module_lost": "the module is not there, is not the only one that fits, or does not answer",
+    "not_connected": "the actuator is used before it is connected",
+    "not_installed": "hebi-py is not installed",
 }
-"""Faults by name and what each means; those of the supervisor come in addition."""
+"""Faults by name and what each means."""
 
 _COUNT = 3
 _MOTION_CYCLES = 5

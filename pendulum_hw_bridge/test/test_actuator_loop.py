@@ -1,0 +1,155 @@
+"""The thread that owns the actuator, on the wall clock: cycles, jobs, errors, and the way out."""
+
+import threading
+import time
+from collections.abc import Callable, Iterator
+
+import pytest
+
+from pendulum_hw_bridge.actuator import ActuatorError, Feedback, Strategy
+from pendulum_hw_bridge.actuator_loop import ActuatorLoop
+from pendulum_hw_bridge.backends.emulator import EmulatorBackend
+from pendulum_hw_bridge.bridge import Bridge, BridgeSettings, Outcome
+from pendulum_hw_bridge.clocks import WallClock
+from pendulum_hw_bridge.effort_mapping import EffortMapping, EffortStrategy
+from pendulum_hw_bridge.emulation.parameters import load_emulator
+from pendulum_hw_bridge.emulation.x5 import EmulatedX5
+from pendulum_hw_bridge.gains import DEFAULT_GAINS
+from pendulum_hw_bridge.safety import SafetyLimits, SafetyMonitor
+from pendulum_hw_bridge.shared_supervisor import SharedSupervisor
+from pendulum_msgs_py.supervisor import Drive, Input, Mode, PlantLimits
+from pendulum_msgs_py.timing import LoopStatistics
+from pendulum_msgs_py.values import JointCommand, JointSample
+
+
+class Running:
+    """A loop on the emulator in real time; patient, because the machine may be busy."""
+
+    def __init__(self) -> None:
+        parameters = load_emulator("thesis")
+        clock = WallClock()
+        self.actuator = EmulatedX5(parameters, seed=1, start_ns=clock.now_ns())
+        self.port = EmulatorBackend(self.actuator, clock)
+        self.supervisor = SharedSupervisor(
+            PlantLimits(effort=13.0, command_timeout=0.5, feedback_timeout=0.5), self._prepare
+        )
+        self.bridge = Bridge(
+            self.port,
+            self.supervisor,
+            EffortMapping(EffortStrategy.DIRECT_PWM, parameters.drivetrain),
+            SafetyMonitor(SafetyLimits(feedback_cycles=50), 0.01, parameters.drivetrain),
+            BridgeSettings(gains=DEFAULT_GAINS[3], command_lifetime=1.0),
+        )
+        self.states: list[JointSample] = []
+        self.outcomes: list[tuple[int, Outcome]] = []
+        self.errors: list[str] = []
+        self.threads: set[int] = set()
+        self.on_state: Callable[[JointSample], None] = lambda sample: None
+        self.loop = ActuatorLoop(
+            self.bridge,
+            LoopStatistics(10_000_000),
+            on_state=self._on_state,
+            decide=self._decide,
+            on_outcome=lambda stamp, outcome: self.outcomes.append((stamp, outcome)),
+            report=self.errors.append,
+        )
+        self.loop.call(self.bridge.connect)
+
+    def _prepare(self) -> str:
+        return self.loop.call(self.bridge.prepare)
+
+    def _on_state(self, sample: JointSample, feedback: Feedback) -> None:
+        assert feedback.stamp_ns == sample.stamp_ns
+        self.threads.add(threading.get_ident())
+        self.states.append(sample)
+        self.on_state(sample)
+
+    def _decide(self) -> Drive:
+        return self.supervisor.decide(self.port.now_ns(), self.bridge.sample)
+
+    def until(self, predicate: Callable[[], object], what: str) -> None:
+        deadline = time.monotonic() + 20.0
+        while not predicate():
+            assert time.monotonic() < deadline, f"waited 20 s for {what}"
+            time.sleep(0.005)
+
+    def arm(self) -> None:
+        self.loop.active = True
+        self.until(lambda: self.states, "states")
+        assert self.supervisor.arm(self.port.now_ns(), self.states[-1]) == ""
+
+
+@pytest.fixture
+def running() -> Iterator[Running]:
+    rig = Running()
+    yield rig
+    rig.loop.close()
+
+
+def test_states_come_from_one_thread_and_each_is_acted_upon_once(running: Running) -> None:
+    running.loop.active = True
+    running.until(lambda: len(running.outcomes) > 30, "outcomes")
+    running.loop.active = False
+    running.loop.call(lambda: None)
+    assert running.threads == {running.loop._thread.ident}
+    assert [stamp for stamp, _ in running.outcomes] == [sample.stamp_ns for sample in running.states]
+    assert all(outcome.effort == 0.0 for _, outcome in running.outcomes)
+
+
+def test_an_answer_is_acted_upon_in_the_cycle_of_its_state(running: Running) -> None:
+    def answer(sample: JointSample) -> None:
+        def later() -> None:
+            command = JointCommand(sample.stamp_ns, 0.4, "c")
+            if running.supervisor.offer(Input.EFFORT_COMMAND, command, running.port.now_ns()) is None:
+                running.loop.answered(Input.EFFORT_COMMAND, command)
+
+        threading.Thread(target=later).start()
+
+    running.arm()
+    running.on_state = answer
+    running.until(lambda: running.outcomes[-1][1].effort != 0.0, "torque")
+    assert running.outcomes[-1][1].effort == pytest.approx(0.4, abs=1e-9)
+    running.until(lambda: running.actuator.link.pwm != 0.0, "a duty on the motor")
+    assert running.loop.statistics.latency.count > 0
+
+
+def test_an_error_in_a_cycle_releases_the_drive_and_is_told(running: Running) -> None:
+    running.arm()
+
+    def fail(sample: JointSample) -> None:
+        raise ValueError("a bug")
+
+    running.on_state = fail
+    running.until(lambda: running.supervisor.mode is Mode.FAULT, "the fault")
+    assert "exception: ValueError: a bug" in running.supervisor.reason
+    assert running.actuator.strategy is Strategy.OFF
+    running.until(lambda: running.errors, "the report")
+    running.on_state = lambda sample: None
+    count = len(running.outcomes)
+    running.until(lambda: len(running.outcomes) > count, "states again")
+
+
+def test_an_error_of_a_job_goes_to_its_caller(running: Running) -> None:
+    with pytest.raises(ZeroDivisionError):
+        running.loop.call(lambda: 1 / 0)
+    assert running.loop.call(lambda: 7) == 7
+
+
+def test_a_job_for_a_busy_thread_ends_in_time(running: Running) -> None:
+    busy = threading.Event()
+    thread = threading.Thread(target=lambda: running.loop.call(lambda: busy.wait(5.0)))
+    thread.start()
+    time.sleep(0.05)
+    with pytest.raises(ActuatorError, match=r"did not answer within 0\.05 s"):
+        running.loop.call(lambda: None, timeout=0.05)
+    busy.set()
+    thread.join()
+
+
+def test_closing_releases_the_drive_and_a_closed_loop_takes_no_jobs(running: Running) -> None:
+    running.arm()
+    assert running.actuator.strategy is Strategy.DIRECT_PWM
+    running.loop.close()
+    assert running.actuator.strategy is Strategy.OFF
+    with pytest.raises(ActuatorError, match="actuator thread has ended"):
+        running.loop.call(lambda: None)
