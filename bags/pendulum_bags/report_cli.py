@@ -22,7 +22,7 @@ app = typer.Typer(add_completion=False)
 def report(
     folders: Annotated[
         list[Path],
-        typer.Argument(help="Run folders (each with sim and hw); or two bags, simulation and hardware."),
+        typer.Argument(help="Run folders (each with sim and hw), or two bags; folders of trials join in."),
     ],
     out: Annotated[
         Path | None,
@@ -46,6 +46,12 @@ def report(
     from pendulum_bags.report import write_report
 
     started = time.monotonic()
+    trials = [folder for folder in folders if (folder / "trial_1").exists()]
+    folders = [folder for folder in folders if folder not in trials]
+    if trials and not folders:
+        raise BagError(
+            f"{trials[0]} holds trials and no run; expected a run folder beside it (identify --page shows trials alone)"
+        )
     margins = Margins.parse(margin)
     summary = None
     if all((folder / "sim").exists() and (folder / "hw").exists() for folder in folders):
@@ -66,6 +72,7 @@ def report(
         summary,
         comparison=result,
         folders=folders if len(folders) > 1 else (),
+        trials=trials,
         recordings=recording,
         formats=("png",) if png_only else ("png", "pdf"),
     )

@@ -12,12 +12,15 @@ import pytest
 
 from pendulum_bags.comparison import Comparison, compare_folders
 from pendulum_bags.report import FIGURES, write_report
-from pendulum_bags.report.data import ReportData, quantity, ratio_in_words
+from pendulum_bags.report.data import ReportData
 from pendulum_bags.report.figure import ROLES, thinned
 from pendulum_bags.report.figures import comparison_figures, make_figures
+from pendulum_bags.report.numbers import quantity, ratio_in_words
 from pendulum_bags.report.render_plotly import graphs_of
 from pendulum_bags.report.tables import make_tables, provenance_table
 from pendulum_bags.report_cli import main
+from pendulum_bags.storage import open_writer
+from pendulum_msgs_py.cdr import encode_joint_state
 from tests.synthetic_runs import write_run_folder
 
 
@@ -165,3 +168,59 @@ def test_two_bags_make_a_report_too(folder: Path, tmp_path: Path) -> None:
 def test_a_folder_that_is_no_run_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main([str(tmp_path)]) == 2
     assert "has no bags sim and hw" in capsys.readouterr().err
+
+
+# -- the thesis's identification experiments -------------------------------------------------------------------
+
+
+def write_trial(path: Path, t: np.ndarray, position: np.ndarray, effort: np.ndarray) -> None:
+    velocity = np.gradient(position, t)
+    with open_writer(path) as bag:
+        bag.add_topic("/hw/joint_states", "sensor_msgs/msg/JointState")
+        bag.add_topic("/hw/events", "std_msgs/msg/String")
+        for name, time in (("trial_start", t[0]), ("trial_end", t[-1] + 0.01)):
+            stamp = round((10.0 + time) * 1e9)
+            content = json.dumps({"stamp_ns": stamp, "name": name}).encode() + b"\0"
+            bag.write("/hw/events", stamp, b"\0\1\0\0" + len(content).to_bytes(4, "little") + content)
+        for time, angle, speed, torque in zip(t, position, velocity, effort, strict=True):
+            stamp = round((10.0 + time) * 1e9)
+            data = encode_joint_state(stamp, position=angle, velocity=speed, effort=torque)
+            bag.write("/hw/joint_states", stamp, data)
+
+
+def hand_trials(folder: Path) -> Path:
+    t = np.arange(0.0, 6.0, 0.01)
+    for number in (1, 2):
+        position = 0.5 * np.pi * (1.0 - np.cos(2.0 * np.pi * t / 6.0)) + 0.02 * number * np.sin(9.0 * t)
+        velocity = np.gradient(position, t)
+        write_trial(folder / f"trial_{number}", t, position, -11.77 * velocity - 0.055 * np.gradient(velocity, t))
+    return folder
+
+
+def staircase_trials(folder: Path) -> Path:
+    steps = np.radians([0, 10, 20, 30, 40, 50, 60, 70, 80, 90, 60, 30, 10, 0, -10, -40, -70, -90, -40, -10, 0])
+    t = np.arange(0.0, 2.0 * steps.size, 0.01)
+    share = np.clip((t % 2.0) / 0.8, 0.0, 1.0)
+    index = (t // 2.0).astype(int)
+    position = np.r_[0.0, steps][index] * (1.0 - share) + steps[index] * share
+    noise = 0.01 * np.random.default_rng(0).standard_normal(t.size)
+    way = 0.03 * np.sign(np.gradient(np.abs(steps)))[index] * np.sign(position)
+    write_trial(folder / "trial_1", t, position, 1.678 * np.sin(position) + way + noise)
+    return folder
+
+
+def test_identification_experiments_join_the_report(folder: Path, tmp_path: Path) -> None:
+    trials = [str(hand_trials(tmp_path / "table")), str(staircase_trials(tmp_path / "staircase"))]
+    assert main([str(folder), *trials, "-o", str(tmp_path / "out"), "--png-only"]) == 0
+    text = (tmp_path / "out" / "report.html").read_text(encoding="utf-8")
+    assert re.search(r"damping 11\.77 N m s/rad", text)
+    assert re.search(r"gravity 1\.6[678]\d* N m", text)
+    for name in ("effort_over_velocity", "effort_over_acceleration", "trials", "dynamic_phase", "static_phase"):
+        assert (tmp_path / "out" / "figures" / f"{name}.png").exists()
+    for title in ("Regression of experiment 1", "Coefficients of experiment 2"):
+        assert title in text
+
+
+def test_trials_alone_point_to_the_command_that_shows_them(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main([str(hand_trials(tmp_path / "table"))]) == 2
+    assert "holds trials and no run" in capsys.readouterr().err

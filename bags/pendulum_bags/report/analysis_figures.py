@@ -10,8 +10,9 @@ import numpy as np
 from pendulum_bags.comparison.equivalence import EquivalenceTest
 from pendulum_bags.comparison.series import Array, Series
 from pendulum_bags.comparison.statistics import effective_size, kolmogorov_smirnov, quantile_pairs
-from pendulum_bags.report.data import ReportData, quantity, ratio_in_words
+from pendulum_bags.report.data import ReportData
 from pendulum_bags.report.figure import Figure, Mark, Panel, Trace
+from pendulum_bags.report.numbers import quantity, ratio_in_words
 
 __all__ = ["alignment", "distributions", "effort", "equivalence", "pooled_runs", "spectra", "timing"]
 

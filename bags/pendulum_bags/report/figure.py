@@ -45,6 +45,12 @@ ROLES: dict[str, Style] = {
     "equivalent": Style("#009e73", "solid", 2.2, "circle"),
     "not equivalent": Style("#d55e00", "solid", 2.2, "cross"),
     "undecided": Style("#7a7a7a", "solid", 2.2, "square"),
+    "trial 1": Style("#0072b2", "solid", 1.1, "circle"),
+    "trial 2": Style("#d55e00", "dash", 1.2, "square"),
+    "trial 3": Style("#009e73", "dot", 1.4, "triangle"),
+    "trial 4": Style("#222222", "dashdot", 1.1, "cross"),
+    "trial 5": Style("#cc79a7", "solid", 1.8, "circle"),
+    "trial 6": Style("#56b4e9", "dash", 1.8, "square"),
     "stable": Style("#222222", "solid", 1.0, "circle"),
     "unstable": Style("#222222", "solid", 1.0, "cross"),
 }

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 
 from pendulum_bags.comparison import Comparison
-from pendulum_bags.report import analysis_figures, model_figures, motion_figures
+from pendulum_bags.report import analysis_figures, model_figures, motion_figures, trial_figures
 from pendulum_bags.report.data import ReportData
 from pendulum_bags.report.figure import Figure
 
@@ -29,6 +29,12 @@ FIGURES: tuple[tuple[str, Maker], ...] = (
     ("Difference over time", motion_figures.unpaired_difference),
     ("Ramps up and down", motion_figures.ramps),
     ("Torque over sin θ", model_figures.gravity_fit),
+    ("Effort over velocity", trial_figures.effort_over_velocity),
+    ("Effort over acceleration", trial_figures.effort_over_acceleration),
+    ("Trials by hand", trial_figures.effort_over_time),
+    ("Dynamic phase", trial_figures.dynamic_phase),
+    ("Static phase", trial_figures.static_phase),
+    ("Effort over sin θ, static", trial_figures.effort_over_sine),
     ("Timing of the states", analysis_figures.timing),
     ("Overdamped phase plot", model_figures.overdamped_phase),
     ("Replay of a real pendulum", model_figures.replay),

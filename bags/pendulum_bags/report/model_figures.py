@@ -7,8 +7,9 @@ import math
 import numpy as np
 
 from pendulum_bags.comparison.series import Array
-from pendulum_bags.report.data import ReportData, quantity
+from pendulum_bags.report.data import ReportData
 from pendulum_bags.report.figure import Figure, Panel, Trace
+from pendulum_bags.report.numbers import quantity
 from pendulum_lqr.model import overdamped_velocity
 
 __all__ = ["gravity_fit", "overdamped_phase", "replay"]

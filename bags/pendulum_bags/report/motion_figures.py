@@ -7,8 +7,9 @@ import numpy as np
 from pendulum_bags.comparison.pairs import Difference
 from pendulum_bags.comparison.run_data import RunData, noise_hold_time
 from pendulum_bags.comparison.series import Array, Series
-from pendulum_bags.report.data import ReportData, quantity, ratio_in_words
+from pendulum_bags.report.data import ReportData
 from pendulum_bags.report.figure import Figure, Kind, Panel, Trace
+from pendulum_bags.report.numbers import quantity, ratio_in_words
 
 __all__ = [
     "both_together",

@@ -13,6 +13,7 @@ from typing import Any
 from pendulum_bags.report.animation import animation_of
 from pendulum_bags.report.data import ReportData
 from pendulum_bags.report.figure import Figure
+from pendulum_bags.report.numbers import quantity
 from pendulum_bags.report.render_plotly import graphs_of
 from pendulum_bags.report.tables import Table, provenance_table
 
@@ -26,6 +27,8 @@ SECTIONS = (
     "The thesis's analysis",
     "Dynamic phase",
     "Timing",
+    "Experiment 1: inertia and damping",
+    "Experiment 2: gravity",
     "Model",
     "A real pendulum",
 )
@@ -86,8 +89,6 @@ def render_page(
 
 
 def _facts(data: ReportData) -> list[tuple[str, str]]:
-    from pendulum_bags.report.data import quantity
-
     comparison = data.comparison
     pair = comparison.pairs[0]
     plants = comparison.plants

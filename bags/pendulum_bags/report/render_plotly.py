@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pendulum_bags.report.data import quantity
 from pendulum_bags.report.figure import ROLES, Figure, Panel, Trace, thinned
+from pendulum_bags.report.numbers import quantity
 
 __all__ = ["graphs_of"]
 

@@ -12,7 +12,9 @@ from typing import Any
 
 import numpy as np
 
-from pendulum_bags.report.data import ReportData, quantity
+from pendulum_bags.report.data import ReportData
+from pendulum_bags.report.numbers import quantity
+from pendulum_bags.report.trial_figures import GRAVITY, INERTIA, UNITS, TrialSet
 from pendulum_lqr.design import continuous_lqr
 from pendulum_lqr.model import linearise, sort_poles
 from pendulum_msgs_py.plant_parameters import PLANT_SPECS
@@ -52,8 +54,9 @@ class Table:
 
 def make_tables(data: ReportData) -> list[Table]:
     """Return all tables that the data allow, in the order of the report."""
+    regressions = [table for trials in data.trials for table in _regression(trials)]
     makers = (_plants, _tests, _paired, _unpaired, _metrics, _eigenvalues, _model)
-    return [table for maker in makers for table in [maker(data)] if table is not None]
+    return [table for maker in makers for table in [maker(data)] if table is not None] + regressions
 
 
 _PLANT_NAMES = {"sim": "simulation", "hw": "hardware", "sim_500hz": "simulation, own noise"}
@@ -234,6 +237,47 @@ def _model(data: ReportData) -> Table | None:
     return Table(
         "Parameters of the model", sentence, ("parameter", "value", "unit", "meaning"), rows, "Model"
     )
+
+
+def _regression(trials: TrialSet) -> list[Table]:
+    """Return the regression table of an experiment, trial by trial, and its averaged coefficients."""
+    result = trials.result
+    first = result.kind == "inertia_damping"
+    section = INERTIA if first else GRAVITY
+    rows = [
+        (
+            f"trial {number}, {name}",
+            quantity(float(trial.values[i]), "", 5),
+            quantity(float(trial.errors[i])),
+            quantity(float(trial.t[i])),
+            quantity(float(trial.p[i])),
+            quantity(float(trial.intervals[i, 0]), "", 5),
+            quantity(float(trial.intervals[i, 1]), "", 5),
+            f"{trial.r_squared:.5f}",
+        )
+        for number, trial in enumerate(result.trials, start=1)
+        for i, name in enumerate(trial.names)
+    ]
+    head = ("coefficient", "value", "standard error", "t", "p", "95 % from", "to", "R² (uncentred)")
+    averages = [
+        (
+            f"{name} [{UNITS[name]}]",
+            quantity(value, "", 5),
+            *(quantity(end, "", 5) for end in result.intervals[name]),
+        )
+        for name, value in result.average.items()
+    ]
+    number = "1" if first else "2"
+    return [
+        Table(f"Regression of experiment {number}", " ".join(result.sentences), head, rows, section),
+        Table(
+            f"Coefficients of experiment {number}",
+            f"Means over {len(result.trials)} trials, with the intervals of those means.",
+            ("coefficient", "mean", "95 % from", "to"),
+            averages,
+            section,
+        ),
+    ]
 
 
 def provenance_table(data: ReportData) -> Table:

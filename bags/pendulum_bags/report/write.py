@@ -13,6 +13,7 @@ from pendulum_bags.report.figures import make_figures
 from pendulum_bags.report.page import render_page
 from pendulum_bags.report.render_files import write_figures
 from pendulum_bags.report.tables import make_tables
+from pendulum_bags.report.trial_figures import read_trials
 from pendulum_msgs_py.errors import BagError, PendulumError
 
 if TYPE_CHECKING:
@@ -31,6 +32,7 @@ def write_report(
     *,
     comparison: Comparison | None = None,
     folders: Sequence[str | os.PathLike[str]] = (),
+    trials: Sequence[str | os.PathLike[str]] = (),
     recordings: Sequence[Path] | None = None,
     margin: MarginArgument = None,
     formats: Sequence[str] = ("png", "pdf"),
@@ -43,6 +45,7 @@ def write_report(
         summary: Content of ``summary.json``; by default that of the comparison.
         comparison: A comparison that has been made already.
         folders: Run folders to pool.
+        trials: Folders of the thesis's identification experiments, each with bags ``trial_1``, ``trial_2``, ...
         recordings: Recordings of real pendulums to replay; by default the one that lies beside the project, if any.
         margin: What difference does not matter.
         formats: Formats of the figures.
@@ -70,7 +73,7 @@ def write_report(
         for replay in _replay(path, required=recordings is not None)
     ]
     names = [Path(folder).name for folder in folders] or [out.resolve().name]
-    data = ReportData(comparison, content, replays, names)
+    data = ReportData(comparison, content, replays, names, [read_trials(path) for path in trials])
     figures, missing = make_figures(data)
     page = render_page(
         data,
