@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 # isort: off
-import pendulum_lqr.one_thread  # noqa: F401  # before anything that imports numpy
+import pendulum_msgs_py.one_thread  # noqa: F401  # before anything that imports numpy
 # isort: on
 
 import sys

@@ -34,6 +34,7 @@ def run_package(package: str, argv: Sequence[str] | None = None) -> int:
         package: Import name of the package.
         argv: Executable name and its arguments; by default those of the process.
     """
+    importlib.import_module("pendulum_msgs_py.one_thread")
     arguments = list(sys.argv[1:] if argv is None else argv)
     table: dict[str, str] = importlib.import_module(f"{package}.executables").EXECUTABLES
     if not arguments or arguments[0] in {"-h", "--help"}:

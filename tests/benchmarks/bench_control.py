@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 # isort: off
-import pendulum_lqr.one_thread  # noqa: F401  # as the nodes do, before numpy
+import pendulum_msgs_py.one_thread  # noqa: F401  # as the nodes do, before numpy
 # isort: on
 
 import math

@@ -7,6 +7,7 @@ import importlib
 import json
 import os
 import platform
+import sys
 import time
 import traceback
 from collections.abc import Iterable, Iterator, Sequence
@@ -65,7 +66,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     if unknown := [area for area in chosen if area not in known]:
         parser.error(f"area is {unknown[0]!r}; expected one of {', '.join(known)}")
 
-    console = Console()
+    console = Console(width=None if sys.stdout.isatty() else 160)
     rows: list[Row] = []
     interrupted = False
     for area in chosen:
