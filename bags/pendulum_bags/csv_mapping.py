@@ -23,10 +23,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from pendulum_msgs_py.errors import DataError
-from pendulum_msgs_py.parameters import load_yaml
 
 from pendulum_bags.datasets import Array, Recording
+from pendulum_msgs_py.errors import DataError
+from pendulum_msgs_py.parameters import load_yaml
 
 __all__ = ["MAPPINGS", "UNITS", "read_csv"]
 
@@ -148,7 +148,9 @@ def _read_table(source: Path, delimiter: str) -> tuple[list[str], Array]:
     head, _, body = text.partition("\n")
     names = [name.strip() for name in next(csv.reader([head.lstrip("# ").strip()], delimiter=delimiter), [])]
     if not names or all(_is_number(name) for name in names):
-        raise DataError(f"{source} begins with {head[:60]!r}; expected a first line with the names of the columns")
+        raise DataError(
+            f"{source} begins with {head[:60]!r}; expected a first line with the names of the columns"
+        )
     try:
         table = np.loadtxt(io.StringIO(body), delimiter=delimiter, ndmin=2)
     except ValueError as error:
@@ -156,7 +158,9 @@ def _read_table(source: Path, delimiter: str) -> tuple[list[str], Array]:
     if table.size == 0:
         raise DataError(f"{source} has no rows below its header")
     if table.shape[1] != len(names):
-        raise DataError(f"{source} has {table.shape[1]} columns of numbers but {len(names)} names in its header")
+        raise DataError(
+            f"{source} has {table.shape[1]} columns of numbers but {len(names)} names in its header"
+        )
     return names, table
 
 
@@ -164,7 +168,7 @@ def _first_bad_cell(body: str, names: list[str], delimiter: str) -> str | None:
     for number, row in enumerate(csv.reader(io.StringIO(body), delimiter=delimiter), start=2):
         if row and len(row) != len(names):
             return f"line {number} has {len(row)} cells; expected {len(names)} ({', '.join(names)})"
-        for name, cell in zip(names, row):
+        for name, cell in zip(names, row, strict=True):
             if not _is_number(cell):
                 return f"line {number}, column {name!r} holds {cell.strip()!r}; expected a number"
     return None
@@ -182,13 +186,15 @@ def _row_range(rules: Mapping[str, Any], count: int, origin: str) -> tuple[int, 
     rows = rules.get("rows", [0, count])
     valid = isinstance(rows, (list, tuple)) and len(rows) == 2 and all(isinstance(r, int) for r in rows)
     if not valid or not 0 <= rows[0] < min(rows[1], count):
-        raise DataError(f"{origin}: rows is {rows!r}; expected [first, stop] within the {count} rows of the file")
+        raise DataError(
+            f"{origin}: rows is {rows!r}; expected [first, stop] within the {count} rows of the file"
+        )
     return int(rows[0]), min(int(rows[1]), count)
 
 
 def _factor(name: str, section: Mapping[str, Any], quantity: str, origin: str) -> float:
     unit = section.get("unit")
-    if unit not in UNITS[quantity]:
+    if not isinstance(unit, str) or unit not in UNITS[quantity]:
         raise DataError(f"{origin}: unit of {name} is {unit!r}; expected one of {', '.join(UNITS[quantity])}")
     return UNITS[quantity][unit]
 
@@ -253,7 +259,11 @@ def _check_magnitudes(source: Path, time: Array, position: Array) -> None:
     if time.size > 1:
         step = float(np.median(np.abs(np.diff(time))))
         if step >= 1.0:
-            raise DataError(f"{source}: the median time step is {step:.3g} s; expected < 1 s: is the unit ms, us or ns?")
+            raise DataError(
+                f"{source}: the median time step is {step:.3g} s; expected < 1 s: is the unit ms, us or ns?"
+            )
     if time.size > 10 and np.max(np.abs(np.diff(position))) > 25.0:
         largest = float(np.max(np.abs(np.diff(position))))
-        raise DataError(f"{source}: the angle jumps by {largest:.3g} rad between samples; expected rad: is the unit deg?")
+        raise DataError(
+            f"{source}: the angle jumps by {largest:.3g} rad between samples; expected rad: is the unit deg?"
+        )

@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+
 from pendulum_msgs_py.errors import DataError
 
 __all__ = ["INPUT_KINDS", "Recording", "check_consistency", "read_recording", "read_servo_log"]
@@ -46,7 +47,7 @@ class Recording:
             between samples (a measurement).
         input_time: Stamps of the input where they differ from ``time``, shape (m,) [s].
         enabled: Share of the time in which the drive is on, shape of ``input``, 0 or 1; None for always.
-        meta: Provenance and constants of the rig, such as ``source``, ``mass`` [kg], ``length`` [m], ``kp``, ``vin`` [V].
+        meta: Provenance and constants of the rig: ``source``, ``mass`` [kg], ``length`` [m], ``kp``, ``vin`` [V].
 
     Raises:
         DataError: on stamps that do not increase, on NaN, or on arrays that do not fit together.
@@ -131,7 +132,9 @@ class Recording:
         """Return samples ``start`` to ``stop`` (exclusive); the whole input stays, so that a delay can look back."""
         cut = slice(start, stop)
         if self.time[cut].size < 3:
-            raise DataError(f"{self.name}: rows {start} to {stop} hold fewer than 3 of {self.time.size} samples")
+            raise DataError(
+                f"{self.name}: rows {start} to {stop} hold fewer than 3 of {self.time.size} samples"
+            )
         return replace(
             self,
             time=self.time[cut],
@@ -211,7 +214,9 @@ def read_recording(
         from pendulum_bags.csv_mapping import read_csv
 
         return check_consistency(read_csv(source, mapping))
-    raise DataError(f"{source} has the suffix {suffix!r}; expected .csv, .txt, .json, .mcap, .db3 or a bag folder")
+    raise DataError(
+        f"{source} has the suffix {suffix!r}; expected .csv, .txt, .json, .mcap, .db3 or a bag folder"
+    )
 
 
 def read_servo_log(path: str | Path) -> Recording:
@@ -229,7 +234,11 @@ def read_servo_log(path: str | Path) -> Recording:
         content = json.loads(source.read_text(encoding="utf-8"))
     except (json.JSONDecodeError, UnicodeDecodeError) as error:
         raise DataError(f"{source} is not JSON: {error}") from error
-    if not isinstance(content, dict) or not isinstance(content.get("entries"), list) or not content["entries"]:
+    if (
+        not isinstance(content, dict)
+        or not isinstance(content.get("entries"), list)
+        or not content["entries"]
+    ):
         raise DataError(f"{source} has no list 'entries'; expected a log of the friction study")
     entries: list[dict[str, Any]] = content["entries"]
     columns: dict[str, Array] = {}
@@ -241,7 +250,9 @@ def read_servo_log(path: str | Path) -> Recording:
             except (TypeError, ValueError) as error:
                 raise DataError(f"{source}: entries[].{key} is not a number everywhere: {error}") from error
         elif key in _SERVO_ENTRY_KEYS:
-            raise DataError(f"{source}: entry {missing[0]} has no {key!r}; expected {', '.join(_SERVO_ENTRY_KEYS)}")
+            raise DataError(
+                f"{source}: entry {missing[0]} has no {key!r}; expected {', '.join(_SERVO_ENTRY_KEYS)}"
+            )
     meta = {key: value for key, value in content.items() if key != "entries"}
     meta["source"] = str(source)
     if "load" in columns:

@@ -7,9 +7,10 @@ import subprocess
 import sys
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated, Optional
+from typing import Annotated
 
 import typer
+
 from pendulum_msgs_py.executables import cli_main
 
 __all__ = ["app", "main"]
@@ -26,7 +27,9 @@ def excite(
     kind: Annotated[str, typer.Option(help="multisine, chirp, prbs, or best of all.")] = "best",
     duration: Annotated[float, typer.Option(help="[s]")] = 20.0,
     rate: Annotated[float, typer.Option(help="Samples and torque values per second [Hz].")] = 100.0,
-    max_effort: Annotated[Optional[float], typer.Option(help="[N m]; by default half the plant's limit.")] = None,
+    max_effort: Annotated[
+        float | None, typer.Option(help="[N m]; by default half the plant's limit.")
+    ] = None,
     max_speed: Annotated[float, typer.Option(help="[rad/s]")] = 10.0,
     max_angle: Annotated[float, typer.Option(help="Distance from hanging down [rad].")] = 2.5,
     noise: Annotated[float, typer.Option(help="Standard deviation of the angle sensor [rad].")] = 1e-3,
@@ -41,10 +44,9 @@ def excite(
 
     Example: python -m pendulum_bags excite --plant dfki --max-effort 4 --max-angle 2 --out excitation.csv
     """
-    from pendulum_msgs_py.plant_parameters import load_plant
-
     from pendulum_bags.identification.excitation import KINDS, Limits, design_excitation
     from pendulum_bags.identification.model import UNITS
+    from pendulum_msgs_py.plant_parameters import load_plant
 
     prior = load_plant(plant)
     limits = Limits(0.5 * prior.effort_limit if max_effort is None else max_effort, max_speed, max_angle)
@@ -81,7 +83,9 @@ def excite(
         from rich.table import Table
 
         console = Console()
-        table = Table(title=f"{design.kind}, {duration:g} s: predicted 95 % intervals, if the prior plant is true")
+        table = Table(
+            title=f"{design.kind}, {duration:g} s: predicted 95 % intervals, if the prior plant is true"
+        )
         for heading in ("parameter", "half width", "relative", "unit"):
             table.add_column(heading)
         for name, width in design.predicted.items():
@@ -92,7 +96,9 @@ def excite(
             f"{abs(design.position).max():.3g} rad from hanging",
             highlight=False,
         )
-        console.print(f"wrote {out}; play it with\n  {' '.join(command[1:])}", highlight=False, soft_wrap=True)
+        console.print(
+            f"wrote {out}; play it with\n  {' '.join(command[1:])}", highlight=False, soft_wrap=True
+        )
     if play:
         # The node is a program of its own, as on a robot: this command ends when it does.
         raise typer.Exit(subprocess.run(command, check=False).returncode)

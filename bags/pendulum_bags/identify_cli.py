@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import json
+import os
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Optional
+from typing import TYPE_CHECKING, Annotated
 
 import typer
+
 from pendulum_msgs_py.errors import DataError
 from pendulum_msgs_py.executables import cli_main
 
@@ -23,28 +25,34 @@ app = typer.Typer(add_completion=False, rich_markup_mode="rich")
 
 @app.command()
 def identify(
-    data: Annotated[list[Path], typer.Argument(help="Bags, CSV files or friction-study JSON logs of one pendulum.")],
-    method: Annotated[str, typer.Option(help="output_error, or thesis (two linear regressions).")] = "output_error",
+    data: Annotated[
+        list[Path], typer.Argument(help="Bags, CSV files or friction-study JSON logs of one pendulum.")
+    ],
+    method: Annotated[
+        str, typer.Option(help="output_error, or thesis (two linear regressions).")
+    ] = "output_error",
     mapping: Annotated[
-        Optional[str], typer.Option(help="Mapping file for CSV columns, or pendulum, voltage_40hz.")
+        str | None, typer.Option(help="Mapping file for CSV columns, or pendulum, voltage_40hz.")
     ] = None,
-    effort: Annotated[str, typer.Option(help="Of a bag: applied (what the plant received) or measured.")] = "applied",
+    effort: Annotated[
+        str, typer.Option(help="Of a bag: applied (what the plant received) or measured.")
+    ] = "applied",
     experiment: Annotated[
         str, typer.Option(help="With --method thesis: inertia_damping or gravity; auto asks the recording.")
     ] = "auto",
     friction: Annotated[
         str, typer.Option(help="auto, viscous, coulomb, stribeck, load, stribeck_load, gear_load, ...")
     ] = "auto",
-    window: Annotated[Optional[float], typer.Option(help="Length of the shooting windows [s].")] = None,
-    mass: Annotated[Optional[float], typer.Option(help="Moving mass [kg], to check or fix the scale.")] = None,
-    length: Annotated[Optional[float], typer.Option(help="Joint axis to centre of mass [m].")] = None,
-    inertia: Annotated[Optional[float], typer.Option(help="About the joint axis [kg m^2], if known.")] = None,
+    window: Annotated[float | None, typer.Option(help="Length of the shooting windows [s].")] = None,
+    mass: Annotated[float | None, typer.Option(help="Moving mass [kg], to check or fix the scale.")] = None,
+    length: Annotated[float | None, typer.Option(help="Joint axis to centre of mass [m].")] = None,
+    inertia: Annotated[float | None, typer.Option(help="About the joint axis [kg m^2], if known.")] = None,
     fix_scale: Annotated[bool, typer.Option(help="Take the scale of torque from mass and length.")] = False,
     held_out: Annotated[
-        Optional[list[Path]], typer.Option(help="Recordings to score only; may be given more than once.")
+        list[Path] | None, typer.Option(help="Recordings to score only; may be given more than once.")
     ] = None,
     out: Annotated[
-        Optional[Path], typer.Option(help="Plant file to write (*.yaml), with a .json and figures beside it.")
+        Path | None, typer.Option(help="Plant file to write (*.yaml), with a .json and figures beside it.")
     ] = None,
     name: Annotated[str, typer.Option(help="Name of the plant in that file.")] = "identified",
     effort_limit: Annotated[float, typer.Option(help="Largest torque of the actuator [N m].")] = 13.0,
@@ -63,7 +71,7 @@ def identify(
         recordings = [read_recording(path, mapping, effort="measured") for path in data]
         _thesis(recordings, experiment, out, page, as_json)
         return
-    from pendulum_bags.identification.output_error import Geometry, Options
+    from pendulum_bags.identification.options import Geometry, Options
     from pendulum_bags.identification.result import identify as run
 
     options = Options(
@@ -142,7 +150,9 @@ def _print_result(result: IdentificationResult, out: Path | None) -> None:
         unit = UNITS.get(key, "rad/s")
         interval = result.uncertainty.intervals.get(key)
         value = result.model[key] if key in UNITS else result.model.natural_frequency
-        table.add_row(key, f"{value:.5g}", f"{interval.low:.4g} to {interval.high:.4g}" if interval else "-", unit)
+        table.add_row(
+            key, f"{value:.5g}", f"{interval.low:.4g} to {interval.high:.4g}" if interval else "-", unit
+        )
     console.print(table)
     models = Table(title="Friction models")
     for heading in ("model", "held-out rms [mrad]", "training rms [mrad]", ""):
@@ -153,7 +163,9 @@ def _print_result(result: IdentificationResult, out: Path | None) -> None:
         models.add_row(candidate.friction, held, f"{1e3 * candidate.training_rms:.3f}", mark)
     console.print(models)
     for label, score in result.held_out.items():
-        console.print(f"held out {label}: rms {1e3 * score.rms:.3f} mrad, mean absolute {1e3 * score.mean_absolute:.3f} mrad")
+        console.print(
+            f"held out {label}: rms {1e3 * score.rms:.3f} mrad, mean absolute {1e3 * score.mean_absolute:.3f} mrad"
+        )
     for sentence in result.sentences():
         style = "bold red" if sentence.startswith("CONTRADICTION") else None
         console.print(f"- {sentence}", style=style, markup=False, highlight=False)
@@ -163,6 +175,8 @@ def _print_result(result: IdentificationResult, out: Path | None) -> None:
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command line and return the exit code: 0, 2 for an error, 3 for a contradiction with geometry."""
+    # The matrices are small: threads of the linear algebra would only wait for one another.
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     return cli_main(app, argv, name="python -m pendulum_bags identify")
 
 

@@ -35,7 +35,9 @@ def test_a_csv_with_the_usual_names_needs_no_mapping(tmp_path):
 
 
 def test_a_mapping_file_turns_units_signs_and_offsets_into_si(tmp_path):
-    path = write(tmp_path / "run.csv", "ms,deg,dps,mv", 1e3 * TIME, 180.0 - np.degrees(ANGLE), -np.degrees(SPEED), TIME)
+    path = write(
+        tmp_path / "run.csv", "ms,deg,dps,mv", 1e3 * TIME, 180.0 - np.degrees(ANGLE), -np.degrees(SPEED), TIME
+    )
     mapping = tmp_path / "map.yaml"
     mapping.write_text(
         "format: pendulum_columns/1\n"
@@ -62,7 +64,7 @@ def test_irregular_sampling_stays_as_it_is(tmp_path):
 
 def test_a_missing_column_is_named_with_those_that_there_are(tmp_path):
     path = write(tmp_path / "run.csv", "time,angle,torque", TIME, ANGLE, SPEED)
-    with pytest.raises(DataError, match="no column 'position' for position .* it has time, angle, torque"):
+    with pytest.raises(DataError, match=r"no column 'position' for position .* it has time, angle, torque"):
         read_recording(path)
 
 
@@ -121,7 +123,10 @@ def test_time_in_milliseconds_without_saying_so_is_refused(tmp_path):
     ("mapping", "text"),
     [
         ({"time": {"column": "time", "unit": "s"}}, "has no 'position'"),
-        ({"time": {"column": "time", "unit": "h"}, "position": {"column": "position", "unit": "rad"}}, "unit of time is 'h'"),
+        (
+            {"time": {"column": "time", "unit": "h"}, "position": {"column": "position", "unit": "rad"}},
+            "unit of time is 'h'",
+        ),
         ({"tme": {}, "position": {}}, "did you mean 'time'?"),
         (
             {
@@ -141,7 +146,14 @@ def test_a_wrong_mapping_is_refused(tmp_path, mapping, text):
 
 def test_a_servo_log_is_read_with_its_constants(tmp_path):
     entries = [
-        {"timestamp": 0.01 * i, "position": 0.1, "speed": 0.0, "goal_position": 0.2, "torque_enable": i > 2, "load": 65530}
+        {
+            "timestamp": 0.01 * i,
+            "position": 0.1,
+            "speed": 0.0,
+            "goal_position": 0.2,
+            "torque_enable": i > 2,
+            "load": 65530,
+        }
         for i in range(10)
     ]
     path = tmp_path / "log.json"

@@ -57,7 +57,9 @@ def test_the_integrator_is_of_second_order():
     model = from_plant(PlantParameters(inertia=0.05, damping=0.03, gravity=1.5))
     start = np.array([[0.0, 0.0]])
     fine = simulate(model, piece, start, step=1e-4).theta
-    errors = [np.max(np.abs(simulate(model, piece, start, step=h).theta - fine)) for h in (5e-3, 2.5e-3, 1.25e-3)]
+    errors = [
+        np.max(np.abs(simulate(model, piece, start, step=h).theta - fine)) for h in (5e-3, 2.5e-3, 1.25e-3)
+    ]
     slopes = np.diff(np.log2(errors))
     np.testing.assert_allclose(slopes, -2.0, atol=0.15)
 
@@ -96,7 +98,13 @@ def test_every_sensitivity_is_the_derivative_of_the_simulation(name, kind):
     gain = 0.0
     if kind == "position_goal":
         recording = Recording(
-            recording.time, recording.position, None, 1.5 * recording.input, kind, "zero", meta={"kp": 2.0, "vin": 3.0}
+            recording.time,
+            recording.position,
+            None,
+            1.5 * recording.input,
+            kind,
+            "zero",
+            meta={"kp": 2.0, "vin": 3.0},
         )
         gain = 0.6
     model = FitModel(values, kind, "gear_load_stribeck", gain)
@@ -132,7 +140,7 @@ def test_jitter_of_stamps_makes_no_extra_window():
 
 def test_a_window_that_is_not_positive_or_too_short_is_refused():
     time = np.arange(0.0, 1.0, 0.1)
-    with pytest.raises(DataError, match="window is 0.0 s; expected > 0"):
+    with pytest.raises(DataError, match=r"window is 0\.0 s; expected > 0"):
         cut_windows(time, 0.0)
     with pytest.raises(DataError, match="fewer than 4 samples"):
         cut_windows(time, 0.2)

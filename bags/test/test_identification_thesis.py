@@ -89,7 +89,11 @@ def test_the_figures_of_the_thesis_are_drawn(tmp_path):
     assert set(first) == {"effort_over_velocity", "effort_over_acceleration", "trials"}
     stairs = [staircase(0)]
     page = write_thesis_page(fit_gravity(stairs), stairs, tmp_path)
-    assert {p.stem for p in (tmp_path / "figures").iterdir()} == {"dynamic_phase", "static_phase", "effort_over_sine"}
+    assert {p.stem for p in (tmp_path / "figures").iterdir()} == {
+        "dynamic_phase",
+        "static_phase",
+        "effort_over_sine",
+    }
     assert "gravity" in page.read_text()
 
 

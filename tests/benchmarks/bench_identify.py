@@ -11,14 +11,14 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+
 from pendulum_bags.datasets import Recording, read_recording
 from pendulum_bags.identification.model import FitModel, from_plant
-from pendulum_bags.identification.output_error import Options
+from pendulum_bags.identification.options import Options
 from pendulum_bags.identification.result import identify
 from pendulum_bags.identification.synthetic import multisine, synthetic_recording
 from pendulum_bags.identification.window_score import free_run, free_run_rms, window_rms
 from pendulum_msgs_py.plant_parameters import PlantParameters
-
 from tests.benchmarks import Peer, Row, measured, peer
 
 DATA = Path(os.environ.get("PENDULUM_SHARED_DATA", Path(__file__).resolve().parents[3] / "shared" / "data"))
@@ -54,14 +54,27 @@ def _swing_up() -> Iterator[Row]:
     result = identify([ddp])
     ours = time.perf_counter() - begin
     theirs = Peer("published parameters", window_rms(published, ddp))
-    yield measured("swing-up, 1 s windows, trained on it", window_rms(result.model, ddp), "rad", peer=theirs, at_most=0.0036)
+    yield measured(
+        "swing-up, 1 s windows, trained on it",
+        window_rms(result.model, ddp),
+        "rad",
+        peer=theirs,
+        at_most=0.0036,
+    )
     theirs = Peer("published parameters", window_rms(published, pd))
-    yield measured("PD run by the swing-up's parameters", window_rms(result.model, pd), "rad", peer=theirs, at_most=0.040)
+    yield measured(
+        "PD run by the swing-up's parameters", window_rms(result.model, pd), "rad", peer=theirs, at_most=0.040
+    )
     intervals = result.uncertainty.intervals
     yield measured(
-        "stated uncertainty of the scale of J and m l (half width)", intervals["gravity"].relative, "-", at_least=0.1
+        "stated uncertainty of the scale of J and m l (half width)",
+        intervals["gravity"].relative,
+        "-",
+        at_least=0.1,
     )
-    yield measured("stated uncertainty of w0 (half width)", intervals["natural_frequency"].relative, "-", at_most=0.02)
+    yield measured(
+        "stated uncertainty of w0 (half width)", intervals["natural_frequency"].relative, "-", at_most=0.02
+    )
     yield measured("identification of a 6 s, 500 Hz run, all models", ours, "s", at_most=10.0)
     yield _against_single_shooting(ddp)
 
@@ -91,7 +104,13 @@ def _against_single_shooting(recording: Recording) -> Row:
     if reached and rms > 1.1 * reached["rms"]:
         raise AssertionError(f"our fit is worse than the peer's: {note}")
     return measured(
-        "one model, one 2 s window", ours, "s", peer=other, at_least_times_peer=1.0, less_is_better=True, note=note
+        "one model, one 2 s window",
+        ours,
+        "s",
+        peer=other,
+        at_least_times_peer=1.0,
+        less_is_better=True,
+        note=note,
     )
 
 
@@ -108,7 +127,13 @@ def _scipy_single_shooting(part: Recording, start: FitModel, free: Sequence[str]
             return state[1], (u - damping * state[1] - gravity * math.sin(state[0]) - dry) / inertia
 
         found = solve_ivp(
-            rate, (part.time[0], part.time[-1]), (theta, omega), t_eval=part.time, rtol=1e-5, atol=1e-7, max_step=0.02
+            rate,
+            (part.time[0], part.time[-1]),
+            (theta, omega),
+            t_eval=part.time,
+            rtol=1e-5,
+            atol=1e-7,
+            max_step=0.02,
         )
         return found.y[0] - part.position if found.success else np.full(part.time.size, 1e3)
 
@@ -120,7 +145,13 @@ def _scipy_single_shooting(part: Recording, start: FitModel, free: Sequence[str]
 def _disc() -> Iterator[Row]:
     disc = read_recording(DATA / "tue_unbalanced_disk" / "first_20000.csv", "voltage_40hz")
     authors = FitModel(
-        {"inertia": 1.0, "gravity": 11.340**2, "damping": 1.333, "coulomb_friction": 6.063, "input_gain": 28.14},
+        {
+            "inertia": 1.0,
+            "gravity": 11.340**2,
+            "damping": 1.333,
+            "coulomb_friction": 6.063,
+            "input_gain": 28.14,
+        },
         "voltage",
     )
     held_out = disc.rows(15000)
@@ -184,7 +215,8 @@ def published_error(parameters: Mapping[str, float], log: Recording, *, duty_gai
             share = math.exp(-(abs(dq / parameters["dtheta_stribeck"]) ** parameters["alpha"]))
             rise = get("friction_stribeck", 0.0)
             rise += abs(
-                bias * get("load_friction_external_stribeck", 0.0) - motor * get("load_friction_motor_stribeck", 0.0)
+                bias * get("load_friction_external_stribeck", 0.0)
+                - motor * get("load_friction_motor_stribeck", 0.0)
             )
             if bias * motor < 0.0:
                 quadratic = (
@@ -204,7 +236,12 @@ def published_error(parameters: Mapping[str, float], log: Recording, *, duty_gai
 
 def _coverage(seeds: int = 200) -> Iterator[Row]:
     plant = PlantParameters(
-        inertia=0.05, damping=0.03, gravity=1.5, coulomb_friction=0.05, angle_offset=0.01, transport_delay=0.006
+        inertia=0.05,
+        damping=0.03,
+        gravity=1.5,
+        coulomb_friction=0.05,
+        angle_offset=0.01,
+        transport_delay=0.006,
     )
     truth = from_plant(plant)
     hits: dict[str, list[bool]] = {}
@@ -222,6 +259,8 @@ def _coverage(seeds: int = 200) -> Iterator[Row]:
     every = [hit for values in hits.values() for hit in values]
     note = ", ".join(f"{name} {100.0 * np.mean(values):.0f} %" for name, values in hits.items())
     share = float(np.mean(every))
-    row = measured(f"95 % intervals that cover the truth, {seeds} seeds", share, "-", at_least=0.90, note=note)
+    row = measured(
+        f"95 % intervals that cover the truth, {seeds} seeds", share, "-", at_least=0.90, note=note
+    )
     yield row
     yield measured("the same, not too wide", share, "-", at_most=0.99)

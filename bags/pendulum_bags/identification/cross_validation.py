@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -47,7 +48,7 @@ def folds(pieces: Sequence[Piece], count: int = 6) -> list[list[NDArray[np.int64
     blocks = np.array_split(np.arange(sum(sizes)), number)
     starts = np.concatenate(([0], np.cumsum(sizes)))
     return [
-        [block[(block >= a) & (block < b)] - a for a, b in zip(starts[:-1], starts[1:])] for block in blocks
+        [block[(block >= a) & (block < b)] - a for a, b in itertools.pairwise(starts)] for block in blocks
     ]
 
 
@@ -64,7 +65,8 @@ def cross_validate(
 
     Args:
         model: Fit on all data: start of each partial fit.
-        pieces, states: Data and fitted window states.
+        pieces: Data.
+        states: Fitted window states by piece.
         free: Fitted parameters.
         scale: Of the robust loss [rad].
         count: Most folds.
@@ -75,7 +77,7 @@ def cross_validate(
     squares, samples, losses, vectors = [], [], [], []
     for held in parts:
         train, train_states, test = [], [], []
-        for piece, state, out in zip(pieces, states, held):
+        for piece, state, out in zip(pieces, states, held, strict=True):
             rest = np.setdiff1d(np.arange(len(piece.windows)), out)
             if rest.size:
                 train.append(piece.subset(rest))
@@ -84,13 +86,23 @@ def cross_validate(
                 part = piece.subset(out)
                 test.append(Piece(part.recording, part.windows, state[out], part.integral, part.enabled))
         fitted = solve(
-            model, train, free, states=train_states, scale=scale, max_iterations=25, tolerance=1e-5, coarse=3.0
+            model,
+            train,
+            free,
+            states=train_states,
+            scale=scale,
+            max_iterations=25,
+            tolerance=1e-5,
+            coarse=3.0,
         ).model
         vectors.append(np.array(fitted.vector))
         total, loss, number = 0.0, 0.0, 0
         for piece in test:
             mask = piece.mask()
-            error = simulate(fitted, piece, fit_states(fitted, piece)).theta[mask] - piece.recording.position[mask]
+            error = (
+                simulate(fitted, piece, fit_states(fitted, piece)).theta[mask]
+                - piece.recording.position[mask]
+            )
             total += float(error @ error)
             loss += robust_cost(error, scale)
             number += error.size

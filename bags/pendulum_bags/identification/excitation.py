@@ -2,8 +2,9 @@
 
 Candidates (multisine of random phase, chirp, pseudo-random binary sequence) are simulated on a prior plant, scaled
 until torque, speed and angle limits are just kept, and judged by the Fisher information of the angle, with
-windows as the fit cuts them, their initial states and all other parameters as nuisance. The best is improved by small random changes.
-Source: Goodwin and Payne, Dynamic System Identification, 1977, ch. 6; Schroeder, IEEE Trans. Inf. Theory 16, 1970.
+windows as the fit cuts them, their initial states and all other parameters as nuisance. The best is improved by
+small random changes.
+Source: Goodwin and Payne, Dynamic System Identification, 1977, ch. 6.
 """
 
 from __future__ import annotations
@@ -14,12 +15,12 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
-from pendulum_msgs_py.errors import DataError
-from pendulum_msgs_py.plant_parameters import PlantParameters
 
 from pendulum_bags.datasets import Recording
 from pendulum_bags.identification.model import BOUNDS, INDEX, from_plant
 from pendulum_bags.identification.problem import prepare, simulate
+from pendulum_msgs_py.errors import DataError
+from pendulum_msgs_py.plant_parameters import PlantParameters
 
 __all__ = ["KINDS", "Excitation", "Limits", "design_excitation"]
 
@@ -125,7 +126,9 @@ def design_excitation(
             raise DataError(f"kind is {kind!r}; expected one of {', '.join(KINDS)}")
     for name in parameters:
         if name not in BOUNDS or name == "input_gain":
-            raise DataError(f"parameter is {name!r}; expected some of {', '.join(n for n in BOUNDS if n != 'input_gain')}")
+            raise DataError(
+                f"parameter is {name!r}; expected some of {', '.join(n for n in BOUNDS if n != 'input_gain')}"
+            )
     if not parameters or not kinds:
         raise DataError("parameters or kinds is empty; expected at least one of each")
     if not (period > 0.0 and duration >= 50.0 * period):
@@ -172,7 +175,9 @@ def _shape(kind: str, time: Array, genes: Array, plant: PlantParameters) -> Arra
     own = np.sqrt(max(plant.gravity, 1e-9) / plant.inertia) / (2.0 * np.pi)
     rate = plant.damping / plant.inertia / (2.0 * np.pi)
     # Up to above resonance, or to the corner of an overdamped plant, but not where nothing answers.
-    top = float(np.clip((1.0 + 4.0 * genes[0]) * max(own, min(rate, 2.0), 0.2), 0.5, 0.2 / (time[1] - time[0])))
+    top = float(
+        np.clip((1.0 + 4.0 * genes[0]) * max(own, min(rate, 2.0), 0.2), 0.5, 0.2 / (time[1] - time[0]))
+    )
     bottom = max(1.0 / duration, 0.1 * own * (0.2 + genes[1]))
     if kind == "multisine":
         frequency = np.unique(np.round(np.geomspace(bottom, top, 10) * duration)) / duration
@@ -216,7 +221,9 @@ def _windowed(problem: _Problem, effort: Array, theta: Array, omega: Array, free
 
 def _keeps(problem: _Problem, shape: Array) -> bool:
     theta, omega, _ = _simulated(problem, problem.limits.effort * shape, None)
-    return bool(np.max(np.abs(theta)) <= problem.limits.angle and np.max(np.abs(omega)) <= problem.limits.speed)
+    return bool(
+        np.max(np.abs(theta)) <= problem.limits.angle and np.max(np.abs(omega)) <= problem.limits.speed
+    )
 
 
 def _judge(problem: _Problem, kind: str, shape: Array) -> Excitation:

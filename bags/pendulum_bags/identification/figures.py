@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 
 from pendulum_bags.datasets import Recording
 from pendulum_bags.identification.problem import simulate
-from pendulum_bags.identification.thesis import ThesisResult, static_holds
+from pendulum_bags.identification.thesis import ThesisResult, static_holds, trial_part
 
 if TYPE_CHECKING:
     from pendulum_bags.identification.result import IdentificationResult
@@ -22,9 +22,11 @@ MEASURED, SIMULATED = "#444444", "#c2410c"
 
 
 def fit_figures(result: IdentificationResult) -> dict[str, Figure]:
-    """Return the figures of an output-error fit: measured and simulated by recording, residual tests, friction models."""
+    """Return the figures of an output-error fit: by recording, residual tests, friction models."""
     figures: dict[str, Figure] = {}
-    for i, (piece, state) in enumerate(zip(result.fit.pieces, result.fit.chosen.solution.states)):
+    for i, (piece, state) in enumerate(
+        zip(result.fit.pieces, result.fit.chosen.solution.states, strict=True)
+    ):
         recording = piece.recording
         simulated = simulate(result.model, piece, state)
         figure = Figure(figsize=(9.0, 5.2), layout="constrained")
@@ -37,7 +39,9 @@ def fit_figures(result: IdentificationResult) -> dict[str, Figure]:
         top.set_ylabel("angle [rad]")
         top.legend(loc="upper right")
         top.set_title(recording.name)
-        middle.plot(recording.time, 1e3 * (simulated.theta - recording.position), color=SIMULATED, linewidth=0.7)
+        middle.plot(
+            recording.time, 1e3 * (simulated.theta - recording.position), color=SIMULATED, linewidth=0.7
+        )
         middle.axhline(0.0, color="black", linewidth=0.5)
         middle.set_ylabel("residual [mrad]")
         low.plot(recording.input_stamps, recording.input, color=MEASURED, linewidth=0.7)
@@ -70,8 +74,16 @@ def _candidate_figure(result: IdentificationResult) -> Figure:
     axes = figure.subplots()
     names = [c.friction for c in result.fit.candidates]
     place = np.arange(len(names))
-    axes.bar(place - 0.2, [1e3 * c.training_rms for c in result.fit.candidates], 0.4, color=MEASURED, label="training")
-    axes.bar(place + 0.2, [1e3 * c.score for c in result.fit.candidates], 0.4, color=SIMULATED, label="held out")
+    axes.bar(
+        place - 0.2,
+        [1e3 * c.training_rms for c in result.fit.candidates],
+        0.4,
+        color=MEASURED,
+        label="training",
+    )
+    axes.bar(
+        place + 0.2, [1e3 * c.score for c in result.fit.candidates], 0.4, color=SIMULATED, label="held out"
+    )
     axes.set_xticks(place, [f"{n} (chosen)" if n == result.fit.chosen.friction else n for n in names])
     axes.set_ylabel("angle rms [mrad]")
     axes.legend()
@@ -80,6 +92,7 @@ def _candidate_figure(result: IdentificationResult) -> Figure:
 
 def thesis_figures(result: ThesisResult, recordings: Sequence[Recording]) -> dict[str, Figure]:
     """Return the thesis's figures of experiment 1 (trials) or 2 (dynamic phase, static phase, fit over the sine)."""
+    recordings = [trial_part(recording) for recording in recordings]
     if result.kind == "inertia_damping":
         return _inertia_damping_figures(result, recordings)
     return _gravity_figures(result, recordings)
@@ -87,9 +100,12 @@ def thesis_figures(result: ThesisResult, recordings: Sequence[Recording]) -> dic
 
 def _inertia_damping_figures(result: ThesisResult, recordings: Sequence[Recording]) -> dict[str, Figure]:
     figures = {}
-    for kind, column, label in (("velocity", 0, "velocity [rad/s]"), ("acceleration", 1, "acceleration [rad/s^2]")):
+    for kind, column, label in (
+        ("velocity", 0, "velocity [rad/s]"),
+        ("acceleration", 1, "acceleration [rad/s^2]"),
+    ):
         figure, panels = _grid(len(result.trials))
-        for axes, trial in zip(panels, result.trials):
+        for axes, trial in zip(panels, result.trials, strict=False):
             axes.plot(trial.regressors[:, column], trial.response, ".", markersize=2, color=MEASURED)
             ends = np.array([trial.regressors[:, column].min(), trial.regressors[:, column].max()])
             axes.plot(ends, trial.values[column] * ends, color=SIMULATED, linewidth=1.0)
@@ -98,7 +114,7 @@ def _inertia_damping_figures(result: ThesisResult, recordings: Sequence[Recordin
             axes.set_ylabel("effort [N m]")
         figures[f"effort_over_{kind}"] = figure
     figure, panels = _grid(len(result.trials))
-    for axes, trial, recording in zip(panels, result.trials, recordings):
+    for axes, trial, recording in zip(panels, result.trials, recordings, strict=False):
         axes.plot(recording.time, trial.response, color=MEASURED, linewidth=0.8, label="measured")
         fitted = trial.regressors @ trial.values
         axes.plot(recording.time, fitted, color=SIMULATED, linewidth=0.8, label="fitted")
@@ -119,7 +135,7 @@ def _gravity_figures(result: ThesisResult, recordings: Sequence[Recording]) -> d
         if recording.velocity is not None:
             panels[1].plot(recording.time, recording.velocity, linewidth=0.6)
         panels[2].plot(recording.input_stamps, recording.input, linewidth=0.6)
-    for axes, label in zip(panels, ("angle [rad]", "velocity [rad/s]", "effort [N m]")):
+    for axes, label in zip(panels, ("angle [rad]", "velocity [rad/s]", "effort [N m]"), strict=True):
         axes.set_ylabel(label)
     panels[2].set_xlabel("time [s]")
     panels[0].legend(fontsize=7)
@@ -127,7 +143,7 @@ def _gravity_figures(result: ThesisResult, recordings: Sequence[Recording]) -> d
 
     static = Figure(figsize=(9.0, 3.2), layout="constrained")
     chosen = static.subplots(1, 3)
-    for axes, degrees in zip(chosen, (10.0, 90.0, -10.0)):
+    for axes, degrees in zip(chosen, (10.0, 90.0, -10.0), strict=True):
         for recording in recordings:
             holds = static_holds(recording)
             nearest = sorted(holds, key=lambda h: abs(np.degrees(h.position) - degrees))[:2]

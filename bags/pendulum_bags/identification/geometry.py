@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from pendulum_bags.identification.model import FitModel
-from pendulum_bags.identification.output_error import GRAVITY, Geometry
+from pendulum_bags.identification.options import GRAVITY, Geometry
 from pendulum_bags.identification.uncertainty import Uncertainty
 
 __all__ = ["GeometryCheck", "check_geometry"]
@@ -48,8 +48,9 @@ def check_geometry(model: FitModel, uncertainty: Uncertainty, geometry: Geometry
         rows.append((name, unit, known, value, low, high, agrees))
         if not agrees:
             said.append(
-                f"CONTRADICTION: {name} is {value:.4g} {unit} by identification (95 % interval {low:.4g} to {high:.4g}) "
-                f"but {known:.4g} {unit} by geometry, a factor of {value / known:.2f}."
+                f"CONTRADICTION: {name} is {value:.4g} {unit} by identification "
+                f"(95 % interval {low:.4g} to {high:.4g}) but {known:.4g} {unit} by geometry, "
+                f"a factor of {value / known:.2f}."
             )
 
     known_gravity = geometry.gravity
@@ -74,11 +75,13 @@ def check_geometry(model: FitModel, uncertainty: Uncertainty, geometry: Geometry
         w0 = uncertainty.intervals.get("natural_frequency")
         if w0 is not None and w0.low > fastest * (1.0 + TOLERANCE):
             said.append(
-                f"CONTRADICTION: w0 is {w0.value:.3f} rad/s, but a centre of mass at {geometry.length:g} m cannot swing "
-                f"faster than sqrt(g / l) = {fastest:.3f} rad/s."
+                f"CONTRADICTION: w0 is {w0.value:.3f} rad/s, but a centre of mass at {geometry.length:g} m "
+                f"cannot swing faster than sqrt(g / l) = {fastest:.3f} rad/s."
             )
     if known_gravity is not None and geometry.inertia is not None:
-        compare("natural_frequency", "rad/s", (known_gravity / geometry.inertia) ** 0.5, model.natural_frequency)
+        compare(
+            "natural_frequency", "rad/s", (known_gravity / geometry.inertia) ** 0.5, model.natural_frequency
+        )
     if not rows and not said:
         return None
     contradicts = any(s.startswith("CONTRADICTION") for s in said)
@@ -89,5 +92,7 @@ def check_geometry(model: FitModel, uncertainty: Uncertainty, geometry: Geometry
         )
     else:
         ratios = ", ".join(f"{name} {value / known:.2f}" for name, _, known, value, *_ in rows)
-        said.append(f"Identification and geometry agree within their intervals (identified over geometry: {ratios}).")
+        said.append(
+            f"Identification and geometry agree within their intervals (identified over geometry: {ratios})."
+        )
     return GeometryCheck(tuple(rows), tuple(said), contradicts)

@@ -51,7 +51,7 @@ PARAMETER_NAMES = (
 J, B, G, C, S, VS, LG, T0, TH0, K, D, KB, LM, LS = range(14)
 
 
-@njit(cache=True)  # type: ignore[misc]
+@njit(cache=True)
 def cumulative_input(stamps: Array, values: Array, linear: bool) -> Array:
     """Return the integral of the input from its first stamp to each stamp, shape (m,)."""
     total = np.zeros(stamps.size)
@@ -61,7 +61,7 @@ def cumulative_input(stamps: Array, values: Array, linear: bool) -> Array:
     return total
 
 
-@njit(cache=True)  # type: ignore[misc]
+@njit(cache=True)
 def _input_at(
     t: float, j: int, stamps: Array, values: Array, integral: Array, linear: bool
 ) -> tuple[int, float, float]:
@@ -80,7 +80,7 @@ def _input_at(
     return j, values[j] + slope * since, integral[j] + (values[j] + 0.5 * slope * since) * since
 
 
-@njit(cache=True)  # type: ignore[misc]
+@njit(cache=True)
 def simulate_windows(
     p: Array,
     columns: Any,
@@ -108,11 +108,17 @@ def simulate_windows(
         windows: First and one past last sample of each window, shape (w, 2), int64.
         states: Initial angle [rad] and velocity [rad/s] of each window, shape (w, 2).
         time: Sample stamps, shape (n,) [s].
-        stamps, values, integral, enabled: The input, shape (m,).
+        stamps: Of the input, shape (m,) [s].
+        values: The input, shape (m,).
+        integral: Of the input up to each stamp, shape (m,).
+        enabled: Drive switch at each stamp, 0 or 1, shape (m,).
         linear: Whether the input varies linearly between its stamps.
-        servo: Whether the input is a set point; ``servo_gain`` [1/rad] and ``supply`` [V] belong to it.
+        servo: Whether the input is a set point [rad].
+        servo_gain: Duty cycle per set-point error [1/rad].
+        supply: Voltage at full duty [V].
         longest_step: Integration steps are at most this long [s].
-        theta, omega: Output, shape (n,); samples outside the windows are left alone.
+        theta: Output: angle, shape (n,); samples outside the windows are left alone.
+        omega: Output: velocity, shape (n,).
         jacobian: Output, shape (n, k + 2), or (0, 0) for none.
     """
     want = jacobian.shape[0] > 0
@@ -141,7 +147,7 @@ def simulate_windows(
         index, u0, area0 = _input_at(start, index, stamps, values, integral, linear)
         for i in range(first + 1, stop):
             gap = time[i] - time[i - 1]
-            substeps = max(1, int(math.ceil(gap / longest_step - 1e-9)))
+            substeps = max(1, math.ceil(gap / longest_step - 1e-9))
             h = gap / substeps
             for sub in range(substeps):
                 index, u1, area1 = _input_at(
@@ -181,10 +187,9 @@ def simulate_windows(
                     decay = 1.0 - x + 0.5 * x * x
                     phi = h * (1.0 - 0.5 * x + x * x / 6.0)
                     phi_l = -h * h * (0.5 - x / 3.0)
-                if w != 0.0:
-                    sign = 1.0 if w > 0.0 else -1.0
-                else:
-                    sign = 1.0 if smooth > 0.0 else -1.0
+                # At rest, friction opposes the motion that is about to begin.
+                moving = w if w != 0.0 else smooth
+                sign = 1.0 if moving > 0.0 else -1.0
                 stuck = w == 0.0 and abs(smooth) <= friction
                 net = smooth - sign * friction
                 w1 = 0.0 if stuck else decay * w + phi * net * inv
@@ -260,7 +265,7 @@ def simulate_windows(
                 jacobian[i, :] = dth
 
 
-@njit(cache=True)  # type: ignore[misc]
+@njit(cache=True)
 def normal_blocks(
     jacobian: Array,
     residual: Array,
@@ -275,8 +280,15 @@ def normal_blocks(
     """Accumulate the arrowhead normal equations of one recording (parameters p, initial states x by window).
 
     Args:
-        jacobian: shape (n, k + 2). residual, weight: shape (n,).
-        h_pp: (k, k), h_px: (w, k, 2), h_xx: (w, 2, 2), g_p: (k,), g_x: (w, 2); added to.
+        jacobian: Sensitivities, shape (n, k + 2).
+        residual: Simulated minus measured, shape (n,).
+        weight: Of each sample, shape (n,).
+        windows: First and one past last sample of each window, shape (w, 2).
+        h_pp: Added to: parameters with parameters, shape (k, k).
+        h_px: Added to: parameters with states, shape (w, k, 2).
+        h_xx: Added to: states with states, shape (w, 2, 2).
+        g_p: Added to: gradient of the parameters, shape (k,).
+        g_x: Added to: gradient of the states, shape (w, 2).
     """
     k = g_p.size
     for n in range(windows.shape[0]):

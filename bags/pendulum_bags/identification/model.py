@@ -7,12 +7,22 @@ from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
+
+from pendulum_bags.identification.kernel import PARAMETER_NAMES
 from pendulum_msgs_py.errors import DataError
 from pendulum_msgs_py.plant_parameters import PlantParameters
 
-from pendulum_bags.identification.kernel import PARAMETER_NAMES
-
-__all__ = ["BOUNDS", "FRICTION_MODELS", "INDEX", "PLANT_FRICTION_MODELS", "SERVO_ONLY", "UNITS", "FitModel", "from_plant", "to_plant"]
+__all__ = [
+    "BOUNDS",
+    "FRICTION_MODELS",
+    "INDEX",
+    "PLANT_FRICTION_MODELS",
+    "SERVO_ONLY",
+    "UNITS",
+    "FitModel",
+    "from_plant",
+    "to_plant",
+]
 
 Array = NDArray[np.float64]
 
@@ -109,10 +119,14 @@ class FitModel:
         vector = np.zeros(len(PARAMETER_NAMES))
         for name, value in {**_DEFAULTS, **self.values}.items():
             if name not in INDEX:
-                raise DataError(f"fit model has no parameter {name!r}; expected one of {', '.join(PARAMETER_NAMES)}")
+                raise DataError(
+                    f"fit model has no parameter {name!r}; expected one of {', '.join(PARAMETER_NAMES)}"
+                )
             vector[INDEX[name]] = value
         if not np.all(np.isfinite(vector)) or vector[INDEX["inertia"]] <= 0.0:
-            raise DataError(f"fit model has the values {dict(self.values)}; expected finite numbers and inertia > 0")
+            raise DataError(
+                f"fit model has the values {dict(self.values)}; expected finite numbers and inertia > 0"
+            )
         vector.setflags(write=False)
         object.__setattr__(self, "vector", vector)
 
@@ -127,7 +141,7 @@ class FitModel:
 
     def with_vector(self, vector: Array) -> FitModel:
         """Return the model with other values."""
-        values = dict(zip(PARAMETER_NAMES, map(float, vector)))
+        values = dict(zip(PARAMETER_NAMES, map(float, vector), strict=True))
         return FitModel(values, self.input_kind, self.friction, self.duty_gain)
 
 

@@ -7,21 +7,20 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
-from pendulum_msgs_py.errors import DataError
 
 from pendulum_bags.datasets import Recording
-from pendulum_bags.identification.cross_validation import CrossValidation, cross_validate
-from pendulum_bags.identification.model import BOUNDS, FRICTION_MODELS, SERVO_ONLY, FitModel
+from pendulum_bags.identification.cross_validation import cross_validate
+from pendulum_bags.identification.model import FRICTION_MODELS, SERVO_ONLY, FitModel
+from pendulum_bags.identification.options import DEFAULTS, Geometry, Options
 from pendulum_bags.identification.problem import Piece, prepare
+from pendulum_bags.identification.selection import Candidate, choose, effective_samples
 from pendulum_bags.identification.solver import Solution, refine, residuals, robust_cost, solve
 from pendulum_bags.identification.starts import first_models, rank
+from pendulum_msgs_py.errors import DataError
 
-__all__ = ["GRAVITY", "Candidate", "Geometry", "Options", "OutputErrorFit", "fit_output_error"]
+__all__ = ["DEFAULTS", "Geometry", "Options", "OutputErrorFit", "fit_output_error"]
 
 Array = NDArray[np.float64]
-
-GRAVITY = 9.80665
-"""Standard acceleration of free fall [m/s^2]."""
 
 COARSE = 3.0
 """Factor on the integration step while searching; the chosen model is fitted to the end without it."""
@@ -42,91 +41,6 @@ _FRICTION_STARTS: Mapping[str, tuple[Mapping[str, float], ...]] = {
 
 
 @dataclass(frozen=True)
-class Geometry:
-    """What is known of the pendulum from scales and rulers; None where unknown.
-
-    Args:
-        mass: Moving mass [kg].
-        length: Joint axis to centre of mass [m].
-        inertia: About the joint axis [kg m^2].
-    """
-
-    mass: float | None = None
-    length: float | None = None
-    inertia: float | None = None
-
-    def __post_init__(self) -> None:
-        """Check that what is given is positive."""
-        for name, unit in (("mass", "kg"), ("length", "m"), ("inertia", "kg m^2")):
-            value = getattr(self, name)
-            if value is not None and not (np.isfinite(value) and value > 0.0):
-                raise DataError(f"{name} is {value} {unit}; expected > 0")
-
-    @property
-    def gravity(self) -> float | None:
-        """Gravity coefficient m g l [N m]."""
-        return None if self.mass is None or self.length is None else self.mass * GRAVITY * self.length
-
-    @property
-    def least_inertia(self) -> float | None:
-        """Inertia about the joint that no body of this mass and centre can undercut, m l^2 [kg m^2]."""
-        return None if self.mass is None or self.length is None else self.mass * self.length**2
-
-
-@dataclass(frozen=True)
-class Options:
-    """Choices of a fit; the defaults are meant to serve unseen data.
-
-    Args:
-        window: Length of the shooting windows [s]; None: 1 s for a torque, 2 s for a voltage, the whole
-            recording for a servo, whose position loop keeps a long simulation from drifting away.
-        friction: ``auto`` or one of ``FRICTION_MODELS``.
-        geometry: Known mass, length, inertia.
-        fix_scale: Whether a known m g l fixes the scale of torque (else it is only checked against).
-        delay, angle_offset, torque_offset: Whether each is fitted.
-        multi_start: Whether to search from several starts.
-        folds: Most folds of the cross-validation.
-        robust: Whether to use the soft-L1 loss.
-    """
-
-    window: float | None = None
-    friction: str = "auto"
-    geometry: Geometry = Geometry()
-    fix_scale: bool = False
-    delay: bool = True
-    angle_offset: bool = True
-    torque_offset: bool = True
-    multi_start: bool = True
-    folds: int = 6
-    robust: bool = True
-
-    def __post_init__(self) -> None:
-        """Check names."""
-        if self.friction != "auto" and self.friction not in FRICTION_MODELS:
-            raise DataError(f"friction is {self.friction!r}; expected auto or one of {', '.join(FRICTION_MODELS)}")
-        if self.fix_scale and self.geometry.gravity is None:
-            raise DataError("the scale is to be fixed by geometry, but mass or length is missing; expected both")
-
-
-@dataclass(frozen=True)
-class Candidate:
-    """One friction model, fitted to all data and cross-validated."""
-
-    friction: str
-    free: tuple[str, ...]
-    solution: Solution
-    training_rms: float
-    validation: CrossValidation | None
-    mean_cost: float
-    effective: float
-
-    @property
-    def score(self) -> float:
-        """Held-out rms where there is one, else the training rms [rad]."""
-        return self.training_rms if self.validation is None else self.validation.rms
-
-
-@dataclass(frozen=True)
 class OutputErrorFit:
     """The chosen candidate and all others, with the data as cut."""
 
@@ -144,7 +58,7 @@ class OutputErrorFit:
         return self.chosen.solution.model
 
 
-def fit_output_error(recordings: Sequence[Recording], options: Options = Options()) -> OutputErrorFit:
+def fit_output_error(recordings: Sequence[Recording], options: Options = DEFAULTS) -> OutputErrorFit:
     """Fit the model to recordings of one and the same pendulum.
 
     Args:
@@ -170,7 +84,7 @@ def fit_output_error(recordings: Sequence[Recording], options: Options = Options
     candidates: list[Candidate] = []
     for name in names:
         candidates.append(_fit_friction(name, best, pieces, free, scale, candidates, options))
-    first = _choose(candidates)
+    first = choose(candidates)
     chosen = _finish(first, pieces, scale)
     candidates[candidates.index(first)] = chosen
     flipped = fixed.input_kind in {"effort", "voltage"} and chosen.solution.model["input_gain"] < 0.0
@@ -183,7 +97,9 @@ def _frame(recordings: Sequence[Recording], options: Options) -> tuple[FitModel,
         raise DataError("there is no recording to identify from; expected at least one")
     kinds = {recording.input_kind for recording in recordings}
     if len(kinds) > 1:
-        raise DataError(f"the recordings have different inputs ({', '.join(sorted(kinds))}); expected one kind")
+        raise DataError(
+            f"the recordings have different inputs ({', '.join(sorted(kinds))}); expected one kind"
+        )
     for recording in recordings:
         if np.ptp(recording.position) < 1e-2:
             raise DataError(
@@ -196,7 +112,9 @@ def _frame(recordings: Sequence[Recording], options: Options) -> tuple[FitModel,
     duty_gain = 0.0
     if kind == "position_goal":
         geometry = geometry if geometry.gravity is not None else _geometry_of(recordings)
-        values.update(gravity=geometry.gravity or 1.0, inertia=geometry.inertia or geometry.least_inertia or 1.0)
+        values.update(
+            gravity=geometry.gravity or 1.0, inertia=geometry.inertia or geometry.least_inertia or 1.0
+        )
         duty_gain = float(np.median([_duty_gain(recording) for recording in recordings]))
         # The bob fixes the scale; its arm's zero is an angle, so a torque offset would only double it.
         free = ["damping", "inertia", "input_gain", "drive_damping"]
@@ -219,9 +137,15 @@ def _frame(recordings: Sequence[Recording], options: Options) -> tuple[FitModel,
 
 
 def _geometry_of(recordings: Sequence[Recording]) -> Geometry:
-    known = {(float(r.meta["mass"]), float(r.meta["length"])) for r in recordings if {"mass", "length"} <= r.meta.keys()}
+    known = {
+        (float(r.meta["mass"]), float(r.meta["length"]))
+        for r in recordings
+        if {"mass", "length"} <= r.meta.keys()
+    }
     if len(known) != 1:
-        raise DataError(f"the servo logs name {len(known)} pairs of mass and length; expected one, or --mass and --length")
+        raise DataError(
+            f"the servo logs name {len(known)} pairs of mass and length; expected one, or --mass and --length"
+        )
     mass, length = known.pop()
     return Geometry(mass, length)
 
@@ -250,10 +174,19 @@ def _anneal(
     finalists = []
     for start in starts:
         for first_scale in (0.3, 0.03):
-            s = solve(start.model, pieces, free, scale=first_scale, tolerance=1e-4, max_iterations=25, coarse=COARSE)
+            s = solve(
+                start.model, pieces, free, scale=first_scale, tolerance=1e-4, max_iterations=25, coarse=COARSE
+            )
             finalists.append(
                 solve(
-                    s.model, pieces, free, states=s.states, scale=0.03, tolerance=1e-5, max_iterations=30, coarse=COARSE
+                    s.model,
+                    pieces,
+                    free,
+                    states=s.states,
+                    scale=0.03,
+                    tolerance=1e-5,
+                    max_iterations=30,
+                    coarse=COARSE,
                 )
             )
     best = min(finalists, key=lambda s: s.cost)
@@ -270,7 +203,9 @@ def _offsets(
     An offset of torque and one of angle do nearly the same to a swing: together they chase each other's errors.
     """
     offsets = [name for name in ("angle_offset", "torque_offset") if name in free]
-    subsets = [tuple(o for o in offsets if o not in left_out) for left_out in ((), *((o,) for o in offsets), offsets)]
+    subsets = [
+        tuple(o for o in offsets if o not in left_out) for left_out in ((), *((o,) for o in offsets), offsets)
+    ]
     candidates = []
     for kept in dict.fromkeys(subsets):
         names = tuple(n for n in free if n not in offsets or n in kept)
@@ -278,14 +213,14 @@ def _offsets(
         start = replace(best, model=FitModel(values, best.model.input_kind, "coulomb", best.model.duty_gain))
         candidates.append(_fit_friction("coulomb", start, pieces, names, scale, (), options))
     # An offset that is kept by luck biases all others: the stricter penalty (Schwarz) keeps few of those.
-    chosen = _choose(candidates, strict=True)
+    chosen = choose(candidates, strict=True)
     return tuple(n for n in chosen.free if n in free), chosen.solution
 
 
 def _robust_scale(solution: Solution, pieces: Sequence[Piece]) -> float:
     """Return three robust standard deviations of the residual: the loss leaves good samples quadratic [rad]."""
     parts = residuals(solution.model, pieces, solution.states)
-    inside = np.concatenate([part[piece.mask()] for part, piece in zip(parts, pieces)])
+    inside = np.concatenate([part[piece.mask()] for part, piece in zip(parts, pieces, strict=True)])
     spread = 1.4826 * float(np.median(np.abs(inside - np.median(inside))))
     return max(3.0 * spread, 1e-6)
 
@@ -310,7 +245,9 @@ def _fit_friction(
         plain = FitModel(values, model.input_kind, name, model.duty_gain)
         begin.append((plain, previous.states))
     kind = name.replace("stribeck_", "") if name != "stribeck" else name
-    additions = _FRICTION_STARTS.get(kind, ()) + (_FRICTION_STARTS["stribeck"] if name.startswith("stribeck_") else ())
+    additions = _FRICTION_STARTS.get(kind, ()) + (
+        _FRICTION_STARTS["stribeck"] if name.startswith("stribeck_") else ()
+    )
     coulomb = max(start.model["coulomb_friction"], 1e-3 * abs(start.model["gravity"]))
     for addition in additions:
         values = {**start.model.values, **addition}
@@ -325,7 +262,7 @@ def _fit_friction(
     best = min(solutions, key=lambda s: s.cost)
     best = replace(best, model=FitModel(best.model.values, best.model.input_kind, name, best.model.duty_gain))
     parts = residuals(best.model, pieces, best.states)
-    inside = np.concatenate([part[piece.mask()] for part, piece in zip(parts, pieces)])
+    inside = np.concatenate([part[piece.mask()] for part, piece in zip(parts, pieces, strict=True)])
     validation = cross_validate(best.model, pieces, best.states, everything, scale, count=options.folds)
     mean_cost = robust_cost(inside, scale) / inside.size
     rms = float(np.sqrt(np.mean(inside**2)))
@@ -343,66 +280,7 @@ def _finish(candidate: Candidate, pieces: Sequence[Piece], scale: float) -> Cand
     final = refine(final, pieces, candidate.free, scale=scale)
     model = FitModel(final.model.values, found.model.input_kind, candidate.friction, found.model.duty_gain)
     parts = residuals(model, pieces, final.states)
-    inside = np.concatenate([part[piece.mask()] for part, piece in zip(parts, pieces)])
-    return replace(candidate, solution=replace(final, model=model), training_rms=float(np.sqrt(np.mean(inside**2))))
-
-
-def effective_samples(parts: Sequence[Array], pieces: Sequence[Piece]) -> float:
-    """Return how many independent samples carry as much as the correlated residuals do, N / (1 + 2 sum rho)."""
-    total, longest = 0, max(int(np.max(np.diff(piece.windows, axis=1))) for piece in pieces)
-    products = np.zeros(min(longest, 2000))
-    for part, piece in zip(parts, pieces):
-        for first, stop in piece.windows:
-            r = part[first:stop]
-            total += r.size
-            spectrum = np.abs(np.fft.rfft(r, 2 * r.size)) ** 2
-            products[: r.size] += np.fft.irfft(spectrum)[: min(r.size, products.size)]
-    if products[0] <= 0.0:
-        return float(total)
-    rho = products / products[0]
-    # Sum up to the first zero crossing: beyond it an estimate of rho is noise.
-    end = int(np.argmax(rho <= 0.0)) or rho.size
-    return float(max(total / (1.0 + 2.0 * np.sum(rho[1:end])), 8.0))
-
-
-def _choose(candidates: Sequence[Candidate], *, strict: bool = False) -> Candidate:
-    """Return the candidate of least information criterion among those that predict as well as the best.
-
-    Held-out windows rule out what predicts worse than the best by more than one standard error of the paired
-    difference (at least 2 %, the accuracy of the fits without a fold, and at most 25 %, since few folds give no
-    honest error); among the rest the training data decide by Akaike's criterion on effective samples.
-    Static friction beyond three times the sliding one is no friction but an excuse for other faults: left out.
-    """
-    penalty = 2.0
-    # One count for all: what a poor model leaves correlated is its own fault, not a lack of data.
-    count = max(candidate.effective for candidate in candidates)
-    if strict:
-        penalty = float(np.log(count))
-
-    def criterion(candidate: Candidate) -> float:
-        return float(count * np.log(max(candidate.mean_cost, 1e-18)) + penalty * len(candidate.free))
-
-    if any(candidate.validation is None for candidate in candidates):
-        return min(candidates, key=criterion)
-    candidates = [c for c in candidates if _is_plausible(c)] or list(candidates)
-    losses = {id(c): c.validation.losses for c in candidates if c.validation is not None}
-    best = min(candidates, key=lambda c: float(losses[id(c)].sum()))
-    least = float(losses[id(best)].sum())
-    admissible = []
-    for candidate in candidates:
-        difference = losses[id(candidate)] - losses[id(best)]
-        error = float(np.std(difference, ddof=1) * np.sqrt(difference.size)) if difference.size > 1 else 0.0
-        if float(difference.sum()) <= np.clip(error, 0.02 * least, 0.25 * least):
-            admissible.append(candidate)
-    return min(admissible, key=criterion)
-
-
-def _is_plausible(candidate: Candidate) -> bool:
-    model = candidate.solution.model
-    return model["stribeck_excess"] <= 2.0 * model["coulomb_friction"] + 1e-9
-
-
-def at_bounds(candidate: Candidate) -> list[str]:
-    """Return the fitted parameters that ended at the edge of their domain."""
-    model = candidate.solution.model
-    return [n for n in candidate.free if model[n] <= BOUNDS[n][0] or model[n] >= BOUNDS[n][1]]
+    inside = np.concatenate([part[piece.mask()] for part, piece in zip(parts, pieces, strict=True)])
+    return replace(
+        candidate, solution=replace(final, model=model), training_rms=float(np.sqrt(np.mean(inside**2)))
+    )

@@ -38,13 +38,18 @@ def write_page(result: IdentificationResult, folder: str | Path) -> Path:
         ends = f"{interval.low:.4g} to {interval.high:.4g}" if interval else "at the edge of its domain"
         parameters.append((name, f"{value:.5g}", ends, UNITS.get(name, "rad/s")))
     models = [
-        (c.friction, "-" if c.validation is None else f"{1e3 * c.validation.rms:.3f}", f"{1e3 * c.training_rms:.3f}")
+        (
+            c.friction,
+            "-" if c.validation is None else f"{1e3 * c.validation.rms:.3f}",
+            f"{1e3 * c.training_rms:.3f}",
+        )
         for c in result.fit.candidates
     ]
     held = [(n, f"{1e3 * s.rms:.3f}", f"{1e3 * s.mean_absolute:.3f}") for n, s in result.held_out.items()]
     names = result.uncertainty.names
     correlation = [
-        (name, *(f"{value:+.2f}" for value in row)) for name, row in zip(names, result.uncertainty.correlation)
+        (name, *(f"{value:+.2f}" for value in row))
+        for name, row in zip(names, result.uncertainty.correlation, strict=True)
     ]
     body = [
         f"<p>Friction model <b>{escape(chosen.friction)}</b>, {escape(result.created)}.</p>",
@@ -52,7 +57,11 @@ def write_page(result: IdentificationResult, folder: str | Path) -> Path:
         _table("Parameters", ("parameter", "value", "95 % interval", "unit"), parameters),
         _table("Friction models", ("model", "held-out rms [mrad]", "training rms [mrad]"), models),
         _table("Other recordings", ("recording", "rms [mrad]", "mean absolute [mrad]"), held),
-        _table(f"Correlation (condition number {result.uncertainty.condition_number:.2g})", ("", *names), correlation),
+        _table(
+            f"Correlation (condition number {result.uncertainty.condition_number:.2g})",
+            ("", *names),
+            correlation,
+        ),
         *map(_image, figures),
     ]
     return _write(target, "Identification", body)

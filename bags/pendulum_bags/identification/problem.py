@@ -8,11 +8,11 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from pendulum_msgs_py.errors import DataError
 
 from pendulum_bags.datasets import Recording
 from pendulum_bags.identification import kernel
 from pendulum_bags.identification.model import FitModel
+from pendulum_msgs_py.errors import DataError
 
 __all__ = ["Piece", "Simulation", "cut_windows", "longest_step", "prepare"]
 
@@ -98,11 +98,11 @@ def prepare(recording: Recording, window: float | None) -> Piece:
     stamps = recording.input_stamps
     integral = kernel.cumulative_input(stamps, recording.input, recording.hold == "linear")
     enabled = np.ones(stamps.size) if recording.enabled is None else recording.enabled
-    states = np.array([_first_state(recording, first, stop) for first, stop in windows])
+    states = np.array([_first_state(recording, first) for first, _ in windows])
     return Piece(recording, windows, states, integral, enabled)
 
 
-def _first_state(recording: Recording, first: int, stop: int) -> tuple[float, float]:
+def _first_state(recording: Recording, first: int) -> tuple[float, float]:
     """Return angle and velocity at a sample from a parabola through its neighbours on both sides."""
     reach = max(4, round(0.02 / recording.period))
     low, high = max(first - reach, 0), min(first + reach + 1, recording.time.size)
@@ -127,7 +127,7 @@ def longest_step(model: FitModel, recording: Recording) -> float:
         stiffness += abs(model["input_gain"]) * _supply(recording) * _servo_gain(model, recording)
         rate += model["drive_damping"] / inertia
     frequency = math.sqrt(stiffness / inertia) if stiffness > 0.0 else 0.0
-    return float(np.clip(min(0.02 / max(frequency, 1e-3), 0.4 / max(rate, 1e-3)), 1e-4, 0.01))
+    return float(np.clip(min(0.02 / max(frequency, 1e-3), 0.15 / max(rate, 1e-3)), 1e-4, 0.01))
 
 
 def _supply(recording: Recording) -> float:
@@ -158,7 +158,7 @@ def simulate(
         The simulation; samples outside the windows are NaN.
     """
     recording = piece.recording
-    if model.input_kind != recording.input_kind and recording.input_kind != "none":
+    if recording.input_kind not in (model.input_kind, "none"):
         raise DataError(
             f"{recording.name} has the input {recording.input_kind!r}; the model expects {model.input_kind!r}"
         )

@@ -60,7 +60,7 @@ def residual_tests(fit: OutputErrorFit, *, lags: int = 25) -> ResidualTests:
     parts = residuals(fit.model, fit.pieces, fit.chosen.solution.states)
     segments, inputs, rms = [], [], []
     labels: list[tuple[str, float, float]] = []
-    for part, piece in zip(parts, fit.pieces):
+    for part, piece in zip(parts, fit.pieces, strict=True):
         drive = _input_at_samples(piece)
         for first, stop in piece.windows:
             r = part[first:stop]
@@ -76,7 +76,9 @@ def residual_tests(fit: OutputErrorFit, *, lags: int = 25) -> ResidualTests:
     states = 2 * len(segments)
     # The fitted window states and parameters take degrees of freedom, which shows as a small negative correlation.
     shift = (states + len(fit.chosen.free)) / samples
-    statistic = samples * (samples + 2) * float(np.sum((auto[1:] + shift) ** 2 / (samples - np.arange(1, lags + 1))))
+    statistic = (
+        samples * (samples + 2) * float(np.sum((auto[1:] + shift) ** 2 / (samples - np.arange(1, lags + 1))))
+    )
     white_p = float(stats.chi2.sf(statistic, lags))
     past = cross[lags:]
     # The input is coloured: its own correlation widens the bound of a sum over samples.
@@ -86,11 +88,17 @@ def residual_tests(fit: OutputErrorFit, *, lags: int = 25) -> ResidualTests:
     worst = float(np.max(np.abs(past)))
     independent = bool(worst <= limit)
     middle = float(np.median(rms))
-    outliers = tuple((*label, value) for label, value in zip(labels, rms) if len(rms) > 3 and value > 5.0 * middle)
+    outliers = tuple(
+        (*label, value)
+        for label, value in zip(labels, rms, strict=True)
+        if len(rms) > 3 and value > 5.0 * middle
+    )
     white = white_p > 0.01
     sentences = []
     if white:
-        sentences.append(f"The residuals are white (Ljung-Box p = {white_p:.2f}): the model explains all but noise.")
+        sentences.append(
+            f"The residuals are white (Ljung-Box p = {white_p:.2f}): the model explains all but noise."
+        )
     else:
         sentences.append(
             f"The residuals are not white (lag-1 correlation {auto[1]:.2f}): the model misses some dynamics, and the "
@@ -125,7 +133,7 @@ def _correlation(first: Sequence[Array], second: Sequence[Array], lags: int) -> 
     mean_b = float(np.mean(np.concatenate(second)))
     total = np.zeros(2 * lags + 1)
     power_a = power_b = 0.0
-    for a, b in zip(first, second):
+    for a, b in zip(first, second, strict=True):
         x, y = a - mean_a, b - mean_b
         power_a += float(x @ x)
         power_b += float(y @ y)

@@ -12,16 +12,18 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from pendulum_msgs_py.errors import DataError
-from pendulum_msgs_py.plant_parameters import PlantParameters, write_plant
 
 from pendulum_bags.datasets import Recording
 from pendulum_bags.identification.geometry import GeometryCheck, check_geometry
 from pendulum_bags.identification.model import PLANT_FRICTION_MODELS, UNITS, FitModel, to_plant
-from pendulum_bags.identification.output_error import Candidate, Options, OutputErrorFit, fit_output_error
+from pendulum_bags.identification.options import DEFAULTS, Options
+from pendulum_bags.identification.output_error import OutputErrorFit, fit_output_error
 from pendulum_bags.identification.residual_tests import ResidualTests, residual_tests
+from pendulum_bags.identification.selection import Candidate
 from pendulum_bags.identification.uncertainty import Uncertainty, assess
 from pendulum_bags.identification.window_score import WindowScore, free_run, window_score
+from pendulum_msgs_py.errors import DataError
+from pendulum_msgs_py.plant_parameters import PlantParameters, write_plant
 
 __all__ = ["IdentificationResult", "identify", "load_fit_model"]
 
@@ -80,7 +82,9 @@ class IdentificationResult:
                 "counts it with sign -1."
             )
         if self.score is None:
-            said.append("There is one window only: no held-out score; give a longer recording or a shorter --window.")
+            said.append(
+                "There is one window only: no held-out score; give a longer recording or a shorter --window."
+            )
         return [*said, *self.tests.sentences, *self.uncertainty.sentences]
 
     def to_dict(self) -> dict[str, Any]:
@@ -106,7 +110,10 @@ class IdentificationResult:
                 for n, i in self.uncertainty.intervals.items()
             },
             "profiles": {n: list(p) for n, p in self.uncertainty.profiles.items()},
-            "covariance": {"names": list(self.uncertainty.names), "matrix": self.uncertainty.covariance.tolist()},
+            "covariance": {
+                "names": list(self.uncertainty.names),
+                "matrix": self.uncertainty.covariance.tolist(),
+            },
             "correlation": self.uncertainty.correlation.tolist(),
             "condition_number": self.uncertainty.condition_number,
             "interval_basis": self.uncertainty.basis,
@@ -158,7 +165,7 @@ class IdentificationResult:
                 intervals[field] = (interval.low, interval.high)
         torque = self.model.input_kind in {"effort", "position_goal"}
         remark = "torques are per unit of inertia: the recording does not fix their scale"
-        provenance = {
+        provenance: dict[str, Any] = {
             "method": "output error, multiple shooting",
             "date": self.created,
             "data": [_fingerprint(p.recording) for p in self.fit.pieces],
@@ -171,7 +178,8 @@ class IdentificationResult:
         }
         if not same:
             provenance["remarks"].insert(
-                0, f"the best fit has friction {self.fit.chosen.friction}, which a plant file cannot hold; see the JSON"
+                0,
+                f"the best fit has friction {self.fit.chosen.friction}, which a plant file cannot hold; see the JSON",
             )
         write_plant(target, plant, provenance=provenance, intervals=intervals)
         target.with_suffix(".json").write_text(json.dumps(self.to_dict(), indent=2) + "\n", encoding="utf-8")
@@ -180,7 +188,7 @@ class IdentificationResult:
 
 def identify(
     recordings: Sequence[Recording],
-    options: Options = Options(),
+    options: Options = DEFAULTS,
     *,
     held_out: Sequence[Recording] = (),
     profiles: int = 2,

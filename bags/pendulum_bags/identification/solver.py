@@ -16,7 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pendulum_bags.identification import kernel
-from pendulum_bags.identification.model import BOUNDS, INDEX, PARAMETER_NAMES, FitModel
+from pendulum_bags.identification.kernel import PARAMETER_NAMES
+from pendulum_bags.identification.model import BOUNDS, INDEX, FitModel
 from pendulum_bags.identification.problem import Piece, longest_step, simulate
 
 __all__ = ["Solution", "refine", "residuals", "robust_cost", "solve"]
@@ -54,7 +55,7 @@ def robust_cost(residual: Array, scale: float) -> float:
 def residuals(model: FitModel, pieces: Sequence[Piece], states: Sequence[Array] | None = None) -> list[Array]:
     """Return simulated minus measured angle of each piece, NaN outside its windows [rad]."""
     start = [piece.states for piece in pieces] if states is None else states
-    return [simulate(model, p, x).theta - p.recording.position for p, x in zip(pieces, start)]
+    return [simulate(model, p, x).theta - p.recording.position for p, x in zip(pieces, start, strict=True)]
 
 
 def solve(
@@ -116,9 +117,9 @@ def solve(
             damping *= 4.0
             continue
         candidate = model.with_vector(trial)
-        x_trial = [a + b for a, b in zip(x, d_x)]
+        x_trial = [a + b for a, b in zip(x, d_x, strict=True)]
         new_cost = 0.0
-        for piece, state, h, mask in zip(pieces, x_trial, steps, masks):
+        for piece, state, h, mask in zip(pieces, x_trial, steps, masks, strict=True):
             r = simulate(candidate, piece, state, step=h).theta[mask] - piece.recording.position[mask]
             new_cost += robust_cost(r, scale) if np.all(np.isfinite(r)) else np.inf
         if new_cost < cost:
@@ -155,7 +156,7 @@ def refine(
     """
     for _ in range(rounds):
         states, gain = [], 0.0
-        for piece, current in zip(pieces, solution.states):
+        for piece, current in zip(pieces, solution.states, strict=True):
             better = current.copy()
             for i in range(len(piece.windows)):
                 single = [piece.subset([i])]
@@ -195,9 +196,11 @@ def _linearise(
 ) -> tuple[float, tuple[Array, list[Array], list[Array], Array, list[Array]]]:
     k = index.size
     h_pp, g_p = np.zeros((k, k)), np.zeros(k)
-    h_px, h_xx, g_x = [], [], []
+    h_px: list[Array] = []
+    h_xx: list[Array] = []
+    g_x: list[Array] = []
     cost = 0.0
-    for piece, state, h, mask in zip(pieces, states, steps, masks):
+    for piece, state, h, mask in zip(pieces, states, steps, masks, strict=True):
         result = simulate(model, piece, state, free=index.tolist(), step=h)
         residual = result.theta - piece.recording.position
         inside = residual[mask]
@@ -231,7 +234,7 @@ def _damped_step(
     k = g_p.size
     eye = np.eye(2)
     inverses, reduced, gradient = [], h_pp.copy(), g_p.copy()
-    for px, xx, gx in zip(h_px, h_xx, g_x):
+    for px, xx, gx in zip(h_px, h_xx, g_x, strict=True):
         diagonal = np.einsum("nii->ni", xx)
         damped = xx + damping * eye * (diagonal[:, :, None] + 1e-12)
         inverse = np.linalg.inv(damped)
@@ -249,7 +252,9 @@ def _damped_step(
             if not idle.size:
                 break
             try:
-                step = np.linalg.solve(system[np.ix_(idle, idle)], -(gradient + system @ np.where(active, d_p, 0.0))[idle])
+                step = np.linalg.solve(
+                    system[np.ix_(idle, idle)], -(gradient + system @ np.where(active, d_p, 0.0))[idle]
+                )
             except np.linalg.LinAlgError:
                 return None
             d_p[idle] = step
@@ -261,7 +266,7 @@ def _damped_step(
             active |= outside
     d_x = []
     predicted = -2.0 * float(g_p @ d_p) - float(d_p @ h_pp @ d_p)
-    for px, xx, gx, inverse in zip(h_px, h_xx, g_x, inverses):
+    for px, xx, gx, inverse in zip(h_px, h_xx, g_x, inverses, strict=True):
         right = -(gx + np.einsum("nai,a->ni", px, d_p))
         step_x = np.einsum("nij,nj->ni", inverse, right)
         d_x.append(step_x)

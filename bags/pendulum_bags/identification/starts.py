@@ -10,12 +10,12 @@ from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
-from pendulum_msgs_py.errors import DataError
 
 from pendulum_bags.datasets import Recording
 from pendulum_bags.identification.model import FitModel
 from pendulum_bags.identification.problem import Piece
 from pendulum_bags.identification.solver import Solution, solve
+from pendulum_msgs_py.errors import DataError
 
 __all__ = ["equation_error", "first_models", "rank"]
 
@@ -66,7 +66,9 @@ def equation_error(recording: Recording, *, window: float = 0.2) -> Array:
     return np.linalg.lstsq(np.stack(columns, axis=1), filtered(drive, bump), rcond=None)[0]
 
 
-def first_models(recording: Recording, fixed: FitModel, free: Sequence[str], *, spread: bool = True) -> list[FitModel]:
+def first_models(
+    recording: Recording, fixed: FitModel, free: Sequence[str], *, spread: bool = True
+) -> list[FitModel]:
     """Return start models around the equation-error estimate.
 
     Args:
@@ -159,7 +161,10 @@ def rank(
     total = sum(len(piece.windows) for piece in pieces)
     stride = max(1, total // windows)
     few = [piece.subset(range(0, len(piece.windows), stride)) for piece in pieces]
-    trials = [solve(model, few, free, scale=scale, max_iterations=15, tolerance=1e-4, coarse=3.0) for model in models]
+    trials = [
+        solve(model, few, free, scale=scale, max_iterations=15, tolerance=1e-4, coarse=3.0)
+        for model in models
+    ]
     trials.sort(key=lambda solution: solution.cost if np.isfinite(solution.cost) else np.inf)
     chosen: list[Solution] = []
     for trial in trials:

@@ -1,7 +1,7 @@
 """Recordings of a known pendulum, to test identification and excitation against the truth.
 
 The integrator is not that of the fit: RK4 with small steps on the shared equations of motion, dry friction
-smoothed over 1e-3 rad/s, so that a fault of the fit's kernel cannot cancel in the test.
+smoothed over 1e-4 rad/s, so that a fault of the fit's kernel cannot cancel in the test.
 """
 
 from __future__ import annotations
@@ -11,10 +11,10 @@ import math
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
-from pendulum_msgs_py.dynamics import friction_magnitude, rigid_acceleration
-from pendulum_msgs_py.plant_parameters import PlantParameters
 
 from pendulum_bags.datasets import Recording
+from pendulum_msgs_py.dynamics import friction_magnitude, rigid_acceleration
+from pendulum_msgs_py.plant_parameters import PlantParameters
 
 __all__ = ["multisine", "synthetic_recording"]
 
@@ -24,7 +24,7 @@ _acceleration = njit(cache=True)(rigid_acceleration)
 _friction = njit(cache=True)(friction_magnitude)
 
 
-@njit(cache=True)  # type: ignore[misc]
+@njit(cache=True)
 def _integrate(
     effort: Array, period: float, substeps: int, delay: float, state: Array, plant: Array
 ) -> Array:
@@ -44,7 +44,7 @@ def _integrate(
                     step = h if stage == 3 else 0.5 * h
                     a, b = theta + step * last_t, omega + step * last_w
                 dry = _friction(b, coulomb, static, stribeck) + load * abs(gravity * math.sin(a - angle))
-                net = u + offset - dry * math.tanh(b / 1e-3)
+                net = u + offset - dry * math.tanh(b / 1e-4)
                 last_t, last_w = b, _acceleration(a - angle, b, net, inertia, damping, gravity)
                 weight = 1.0 / 3.0 if stage in (1, 2) else 1.0 / 6.0
                 k_theta += weight * last_t
@@ -54,7 +54,9 @@ def _integrate(
     return out
 
 
-def multisine(time: Array, amplitude: float, rng: np.random.Generator, *, tones: int = 8, top: float = 3.0) -> Array:
+def multisine(
+    time: Array, amplitude: float, rng: np.random.Generator, *, tones: int = 8, top: float = 3.0
+) -> Array:
     """Return a sum of sines of random phase between 0.2 Hz and ``top`` [Hz], peak ``amplitude``; shape of ``time``."""
     frequency = np.geomspace(0.2, top, tones)
     phase = rng.uniform(0.0, 2.0 * np.pi, tones)
@@ -96,14 +98,21 @@ def synthetic_recording(
             plant.angle_offset,
         ]
     )
-    # The smoothed friction is stiff: its rate is torque over (inertia times 1e-3 rad/s).
+    # The smoothed friction is stiff: its rate is torque over (inertia times 1e-4 rad/s).
     dry = plant.static_friction + plant.load_friction * plant.gravity
-    rate = max(dry / plant.inertia / 1e-3, plant.damping / plant.inertia, 1.0)
+    rate = max(dry / plant.inertia / 1e-4, plant.damping / plant.inertia, 1.0)
     substeps = max(10, math.ceil(period * rate / 2.0))
-    clean = _integrate(np.asarray(effort, dtype=float), period, substeps, plant.transport_delay, np.array(start), values)
+    clean = _integrate(
+        np.asarray(effort, dtype=float), period, substeps, plant.transport_delay, np.array(start), values
+    )
     position = clean[:, 0] + noise * rng.standard_normal(len(clean))
     if resolution > 0.0:
         position = resolution * np.round(position / resolution)
     return Recording(
-        period * np.arange(len(clean)), position, None, effort, hold="zero", meta={"source": "synthetic", "plant": plant.name}
+        period * np.arange(len(clean)),
+        position,
+        None,
+        effort,
+        hold="zero",
+        meta={"source": "synthetic", "plant": plant.name},
     )

@@ -13,14 +13,26 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from pendulum_msgs_py.errors import DataError
 from scipy import stats
 
 from pendulum_bags.datasets import Recording
+from pendulum_msgs_py.errors import DataError
 
-__all__ = ["Regression", "StaticHold", "ThesisResult", "fit_gravity", "fit_inertia_damping", "static_holds"]
+__all__ = [
+    "Regression",
+    "StaticHold",
+    "ThesisResult",
+    "fit_gravity",
+    "fit_inertia_damping",
+    "static_holds",
+    "trial_part",
+]
 
 Array = NDArray[np.float64]
+
+
+_HOLD_EVENTS = ("static", "hold")
+_TRIAL_EVENTS = ("trial_start", "trial_end")
 
 
 @dataclass(frozen=True)
@@ -95,11 +107,11 @@ class ThesisResult:
             "trials": [
                 {
                     "trial": r.trial,
-                    "coefficients": dict(zip(r.names, r.values.tolist())),
-                    "standard_errors": dict(zip(r.names, r.errors.tolist())),
-                    "t": dict(zip(r.names, r.t.tolist())),
-                    "p": dict(zip(r.names, r.p.tolist())),
-                    "intervals": dict(zip(r.names, r.intervals.tolist())),
+                    "coefficients": dict(zip(r.names, r.values.tolist(), strict=True)),
+                    "standard_errors": dict(zip(r.names, r.errors.tolist(), strict=True)),
+                    "t": dict(zip(r.names, r.t.tolist(), strict=True)),
+                    "p": dict(zip(r.names, r.p.tolist(), strict=True)),
+                    "intervals": dict(zip(r.names, r.intervals.tolist(), strict=True)),
                     "r_squared": r.r_squared,
                 }
                 for r in self.trials
@@ -114,7 +126,8 @@ def regress(trial: str, names: Sequence[str], regressors: Array, response: Array
     Args:
         trial: For the table.
         names: Of the regressors, length k.
-        regressors: shape (n, k). response: shape (n,).
+        regressors: shape (n, k).
+        response: shape (n,).
     """
     # statsmodels takes a second to import: only those who ask for tables wait for it.
     import statsmodels.api as sm
@@ -147,16 +160,28 @@ def fit_inertia_damping(recordings: Sequence[Recording]) -> ThesisResult:
         DataError: where velocity or effort is missing.
     """
     trials = []
-    for recording in recordings:
+    for recording in map(trial_part, recordings):
         _require_effort(recording)
         if recording.velocity is None:
             raise DataError(f"{recording.name} has no velocity; the regression of experiment 1 needs it")
         acceleration = np.gradient(recording.velocity, recording.time)
         regressors = np.stack((recording.velocity, acceleration), axis=1)
-        trials.append(regress(recording.name, ("damping", "inertia"), regressors, recording.input))
+        effort = np.interp(recording.time, recording.input_stamps, recording.input)
+        trials.append(regress(recording.name, ("damping", "inertia"), regressors, effort))
     average, intervals, sign = _average(trials)
     said = []
+    # Velocity and effort of one stamp may be taken anywhere within a period: a shift tau turns b theta' into
+    # b theta' + b tau theta'', which is an inertia. No regression of such samples can tell the two apart.
+    period = float(np.median([recording.period for recording in recordings]))
+    shift = 0.5 * period * average["damping"]
+    statistical = intervals["inertia"]
+    intervals["inertia"] = (statistical[0] - shift, statistical[1] + shift)
     low, high = intervals["inertia"]
+    said.append(
+        f"A shift of 1 ms between the samples of velocity and effort changes the inertia by "
+        f"{1e-3 * average['damping']:.3g} kg m^2; its interval allows for half a period, {500.0 * period:.3g} ms "
+        f"({statistical[0]:.4g} to {statistical[1]:.4g} kg m^2 without)."
+    )
     share = np.mean([_share(r) for r in trials])
     said.append(
         f"The inertial torque is {100 * share:.1f} % of the viscous one (rms): inertia is determined to "
@@ -166,9 +191,12 @@ def fit_inertia_damping(recordings: Sequence[Recording]) -> ThesisResult:
     if low <= 0.0:
         said.append("The data are compatible with no inertia at all: this experiment cannot determine it.")
     if sign < 0:
-        said.append("The coefficients were negative: the actuator reports the torque of the environment; signs are turned.")
+        said.append(
+            "The coefficients were negative: the actuator reports the torque of the environment; signs are turned."
+        )
     said.append(
-        "Finite differences of a noisy velocity bias the inertia towards zero; `--method output_error` has no such bias."
+        "Finite differences of a noisy velocity bias the inertia towards zero; "
+        "`--method output_error` has no such bias."
     )
     return ThesisResult("inertia_damping", tuple(trials), average, intervals, sign, 0.0, tuple(said))
 
@@ -192,7 +220,9 @@ def static_holds(recording: Recording, *, speed: float = 0.02, least: float = 0.
             continue
         position = float(recording.position[inside].mean())
         last = holds[-1].position if holds else (float(before[0]) if before.size else position)
-        holds.append(StaticHold(position, float(effort.mean()), float(start), float(stop), abs(position) > abs(last)))
+        holds.append(
+            StaticHold(position, float(effort.mean()), float(start), float(stop), abs(position) > abs(last))
+        )
     return holds
 
 
@@ -206,7 +236,7 @@ def fit_gravity(recordings: Sequence[Recording]) -> ThesisResult:
         DataError: where a recording has fewer than four holds.
     """
     trials, loops = [], []
-    for recording in recordings:
+    for recording in map(trial_part, recordings):
         _require_effort(recording)
         holds = static_holds(recording)
         if len(holds) < 4:
@@ -222,19 +252,27 @@ def fit_gravity(recordings: Sequence[Recording]) -> ThesisResult:
     average, intervals, sign = _average(trials)
     hysteresis = abs(float(np.mean(loops))) if loops else 0.0
     said = [
-        f"Effort going up and coming down differs by {hysteresis:.3g} N m on average: dry friction or hysteresis of "
-        f"{0.5 * hysteresis:.3g} N m, which the average of both directions removes."
+        (
+            f"Effort going up and coming down differs by {hysteresis:.3g} N m on average: dry friction or "
+            f"hysteresis of {0.5 * hysteresis:.3g} N m, which the average of both directions removes."
+        )
     ]
     if sign < 0:
-        said.append("The coefficient was negative: the actuator reports the torque of the environment; signs are turned.")
+        said.append(
+            "The coefficient was negative: the actuator reports the torque of the environment; signs are turned."
+        )
     return ThesisResult("gravity", tuple(trials), average, intervals, sign, hysteresis, tuple(said))
 
 
 def _require_effort(recording: Recording) -> None:
     if recording.input_kind != "effort":
-        raise DataError(f"{recording.name} has the input {recording.input_kind!r}; the regressions need an effort")
+        raise DataError(
+            f"{recording.name} has the input {recording.input_kind!r}; the regressions need an effort"
+        )
     if recording.input_time is not None and recording.meta.get("effort") == "applied":
-        raise DataError(f"{recording.name} was read with applied effort; the regressions need the measured one")
+        raise DataError(
+            f"{recording.name} was read with applied effort; the regressions need the measured one"
+        )
 
 
 def _average(trials: Sequence[Regression]) -> tuple[dict[str, float], dict[str, tuple[float, float]], int]:
@@ -262,11 +300,21 @@ def _share(regression: Regression) -> float:
     return float(np.sqrt(np.mean(inertial**2) / max(np.mean(viscous**2), 1e-300)))
 
 
+def trial_part(recording: Recording) -> Recording:
+    """Return what lies between the events ``trial_start`` and ``trial_end``; all of it without such events."""
+    times = {name: time for time, name, _ in recording.meta.get("phases") or [] if name in _TRIAL_EVENTS}
+    start = times.get("trial_start", float(recording.time[0]))
+    stop = times.get("trial_end", float(recording.time[-1]) + 1.0)
+    return recording.between(start, stop) if times else recording
+
+
 def _event_spans(recording: Recording) -> list[tuple[float, float]]:
-    phases = recording.meta.get("phases") or []
+    known = {*_HOLD_EVENTS, *_TRIAL_EVENTS, "dynamic"}
+    phases = [phase for phase in recording.meta.get("phases") or [] if phase[1] in known]
+    ends = [time for time, _, _ in phases[1:]] + [float(recording.time[-1])]
     spans = []
-    for (time, name, _), (following, _, _) in zip(phases, [*phases[1:], (float(recording.time[-1]), "", {})]):
-        if name in {"static", "hold"} and following > time:
+    for (time, name, _), following in zip(phases, ends[: len(phases)], strict=True):
+        if name in _HOLD_EVENTS and following > time:
             spans.append((float(time), float(following)))
     return spans
 
@@ -278,5 +326,5 @@ def _still_spans(recording: Recording, speed: float, least: float) -> list[tuple
     still = np.concatenate(([0], (np.abs(velocity) < speed).astype(int), [0]))
     edges = np.flatnonzero(np.diff(still))
     time = recording.time
-    spans = [(float(time[a]), float(time[b - 1])) for a, b in zip(edges[::2], edges[1::2])]
+    spans = [(float(time[a]), float(time[b - 1])) for a, b in zip(edges[::2], edges[1::2], strict=True)]
     return [(a, b) for a, b in spans if b - a >= least]

@@ -10,37 +10,16 @@ from numpy.typing import NDArray
 from scipy import stats
 
 from pendulum_bags.identification.model import INDEX, FitModel
-from pendulum_bags.identification.output_error import Candidate, OutputErrorFit, at_bounds
+from pendulum_bags.identification.output_error import OutputErrorFit
 from pendulum_bags.identification.problem import Piece, longest_step, simulate
 from pendulum_bags.identification.residual_tests import ResidualTests
+from pendulum_bags.identification.selection import Candidate, at_bounds
 from pendulum_bags.identification.solver import solve
+from pendulum_bags.identification.wording import Interval, plain_sentences
 
 __all__ = ["Interval", "Uncertainty", "assess", "profile_interval"]
 
 Array = NDArray[np.float64]
-
-
-@dataclass(frozen=True)
-class Interval:
-    """A value with its 95 % interval.
-
-    Args:
-        value: Estimate.
-        low, high: Ends of the interval.
-        standard_error: One standard error, all sources that count included.
-        white: The part that white residuals alone would give.
-    """
-
-    value: float
-    low: float
-    high: float
-    standard_error: float
-    white: float
-
-    @property
-    def relative(self) -> float:
-        """Half width over value, inf at zero."""
-        return 0.5 * (self.high - self.low) / abs(self.value) if self.value else float("inf")
 
 
 @dataclass(frozen=True)
@@ -101,13 +80,14 @@ def assess(fit: OutputErrorFit, tests: ResidualTests, *, profiles: int = 2) -> U
     names = tuple(n for n in chosen.free if n not in set(at_bounds(chosen)))
     information = _information(model, fit.pieces, chosen.solution.states, names)
     white, singular, condition = _white_covariance(information, fit.scale, model, names)
-    linear, covariance, basis = white, white, "white residuals"
+    # Even white residuals are not alike everywhere: near a reversal the fit bends, and the sandwich sees it.
+    linear, basis = _sandwich(white, information, fit.scale, clusters=not tests.white), "white residuals"
+    covariance = linear
     freedom = float(information.samples - information.states - len(names))
-    deviation = np.sqrt(np.maximum(np.diag(white), 0.0))
+    deviation = np.sqrt(np.maximum(np.diag(linear), 0.0))
     if not tests.white and names:
         # Along a firm direction the fit is as good as linear, and the sandwich is its error; along a weak one it
         # is not, and only fits without a part of the data show how far it moves.
-        linear = _sandwich(white, information, fit.scale)
         basis = "correlated residuals and folds"
         folds = len(chosen.validation.vectors) if chosen.validation is not None else 6
         freedom = float(folds - 1)
@@ -127,9 +107,11 @@ def assess(fit: OutputErrorFit, tests: ResidualTests, *, profiles: int = 2) -> U
     correlation = covariance / np.outer(safe, safe)
     white_deviation = np.sqrt(np.maximum(np.diag(white), 1e-300))
     inflation = float(np.max(deviation / white_deviation)) if names else 1.0
-    weak = sorted((n for n in names if n in intervals), key=lambda n: -min(intervals[n].relative, 1e6))[:profiles]
+    weak = sorted((n for n in names if n in intervals), key=lambda n: -min(intervals[n].relative, 1e6))[
+        :profiles
+    ]
     found = {name: profile_interval(fit, name, inflation=inflation) for name in weak}
-    sentences = _sentences(intervals, names, correlation, condition, singular, found, fit)
+    sentences = plain_sentences(intervals, names, correlation, condition, singular, found, fit)
     return Uncertainty(
         intervals, names, covariance, correlation, condition, inflation, basis, found, tuple(sentences)
     )
@@ -145,7 +127,7 @@ def _information(
     """Return, by window, the sensitivities with the window's initial state projected out, and the residuals."""
     index = [INDEX[name] for name in names]
     projected, residual, samples, count = [], [], 0, 0
-    for piece, state in zip(pieces, states):
+    for piece, state in zip(pieces, states, strict=True):
         result = simulate(model, piece, state, free=index, step=longest_step(model, piece.recording))
         for first, stop in piece.windows:
             jacobian = result.jacobian[first:stop]
@@ -178,7 +160,11 @@ def _white_covariance(
     size = np.array([max(abs(model[name]), _least_scale(name)) for name in names])
     _, singular, right = np.linalg.svd(stacked * size, full_matrices=False)
     condition = float((singular[0] / max(singular[-1], 1e-300)) ** 2) if singular.size else 1.0
-    inverse = (right.T / np.maximum(singular, 1e-12 * max(singular[0], 1e-300)) ** 2) @ right if singular.size else stacked
+    inverse = (
+        (right.T / np.maximum(singular, 1e-12 * max(singular[0], 1e-300)) ** 2) @ right
+        if singular.size
+        else stacked
+    )
     return variance * inverse * np.outer(size, size), right[-1] if len(names) else np.zeros(0), condition
 
 
@@ -186,14 +172,16 @@ def _least_scale(name: str) -> float:
     return {"transport_delay": 1e-3, "angle_offset": 1e-2, "torque_offset": 1e-2}.get(name, 1e-6)
 
 
-def _sandwich(white: Array, information: _Information, scale: float) -> Array:
+def _sandwich(white: Array, information: _Information, scale: float, *, clusters: bool) -> Array:
     """Return the covariance raised to that of residuals correlated within windows: serially, and as clusters."""
+    if not white.size:
+        return white
     stacked = np.concatenate(information.projected)
     _, slopes = _influence(np.concatenate(information.residual), scale)
     weight = max(float(np.mean(slopes)), 1e-3)
     bread = np.linalg.pinv(weight * stacked.T @ stacked, rcond=1e-14)
     serial, cluster = np.zeros_like(bread), np.zeros_like(bread)
-    for sensitivity, residual in zip(information.projected, information.residual):
+    for sensitivity, residual in zip(information.projected, information.residual, strict=True):
         psi, _ = _influence(residual, scale)
         scores = sensitivity * psi[:, None]
         reach = max(1, len(psi) // 4)
@@ -205,7 +193,7 @@ def _sandwich(white: Array, information: _Information, scale: float) -> Array:
         cluster += np.outer(total, total)
     count = len(information.projected)
     errors = [white, bread @ serial @ bread]
-    if count > 1:
+    if clusters and count > 1:
         errors.append(bread @ cluster @ bread * count / (count - 1))
     old = np.sqrt(np.maximum(np.diag(white), 1e-300))
     factor = np.sqrt(np.max([np.maximum(np.diag(e), 0.0) for e in errors], axis=0)) / old
@@ -238,8 +226,8 @@ def _add_frequency(
     gradient = np.zeros(len(names))
     for name in relevant:
         gradient[list(names).index(name)] = (0.5 if name == "gravity" else -0.5) * w0 / model[name]
-    error = float(np.sqrt(max(gradient @ linear @ gradient, 0.0)))
-    white_error = float(np.sqrt(max(gradient @ white @ gradient, 0.0)))
+    error = float(np.sqrt(max(float(gradient @ linear @ gradient), 0.0)))
+    white_error = float(np.sqrt(max(float(gradient @ white @ gradient), 0.0)))
     half = quantile * error
     intervals["natural_frequency"] = Interval(w0, w0 - half, w0 + half, error, white_error)
 
@@ -275,8 +263,13 @@ def profile_interval(fit: OutputErrorFit, name: str, *, inflation: float = 1.0) 
             vector = np.array(start.vector)
             vector[INDEX[name]] = value
             trial = solve(
-                start.with_vector(vector), fit.pieces, others, states=states, scale=fit.scale,
-                max_iterations=15, tolerance=1e-5,
+                start.with_vector(vector),
+                fit.pieces,
+                others,
+                states=states,
+                scale=fit.scale,
+                max_iterations=15,
+                tolerance=1e-5,
             )
             if trial.cost - solution.cost > rise:
                 high = distance
@@ -289,65 +282,3 @@ def profile_interval(fit: OutputErrorFit, name: str, *, inflation: float = 1.0) 
         value = best[name] + direction * reach
         ends.append(max(value, 0.0) if _positive(name) else value)
     return ends[0], ends[1]
-
-
-def _sentences(
-    intervals: Mapping[str, Interval],
-    names: Sequence[str],
-    correlation: Array,
-    condition: float,
-    weakest: Array,
-    profiles: Mapping[str, tuple[float, float]],
-    fit: OutputErrorFit,
-) -> list[str]:
-    """Return what the recording cannot determine, in words."""
-    said = []
-    pieces = fit.pieces
-    kind = pieces[0].recording.input_kind
-    if kind == "none":
-        said.append(
-            "The pendulum swings freely: only ratios to the inertia can be determined, not the absolute scale of "
-            "inertia, gravity and friction; give mass and length, or record a run with a known torque."
-        )
-    elif kind == "voltage" and "inertia" not in names:
-        said.append(
-            "The input is a voltage: all torques are per unit of inertia (inertia is set to "
-            f"{fit.model['inertia']:g} kg m^2); give mass and length to fix the scale."
-        )
-    scale = [n for n in ("inertia", "gravity") if n in intervals]
-    frequency = intervals.get("natural_frequency")
-    if len(scale) == 2 and frequency is not None:
-        common = max(intervals[n].relative for n in scale)
-        if common > max(3.0 * frequency.relative, 0.02):
-            said.append(
-                f"The common scale of inertia and gravity is uncertain by +-{100 * common:.0f} %, their ratio is "
-                f"firm: w0 = {frequency.value:.3f} rad/s +-{100 * frequency.relative:.1f} %. A torque known "
-                "independently, or a known mass and length, would fix the scale."
-            )
-    for name in names:
-        interval = intervals[name]
-        if interval.relative > 0.3 and name not in {"torque_offset", "angle_offset", "transport_delay"}:
-            text = f"{name} is weakly determined: {interval.value:.3g}, 95 % interval {interval.low:.3g} to {interval.high:.3g}"
-            if interval.low <= 0.0:
-                text += "; the data are compatible with none at all"
-            if name in profiles:
-                text += f" (profile {profiles[name][0]:.3g} to {profiles[name][1]:.3g})"
-            said.append(text + ".")
-    for i, first in enumerate(names):
-        for j in range(i):
-            if abs(correlation[i, j]) > 0.95:
-                said.append(
-                    f"{names[j]} and {first} are correlated by {correlation[i, j]:+.3f}: the data determine a "
-                    "combination of them better than either."
-                )
-    if condition > 1e8:
-        parts = ", ".join(f"{names[i]} ({weakest[i]:+.2f})" for i in np.argsort(-np.abs(weakest))[:3])
-        said.append(
-            f"The condition number is {condition:.1e}: there is a direction that the data do not see, made of {parts}."
-        )
-    for name in at_bounds(fit.chosen):
-        said.append(
-            f"{name} ended at the edge of its domain, {fit.model[name]:.3g}: the data want no more of it, and it has "
-            "no interval."
-        )
-    return said

@@ -9,12 +9,12 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from pendulum_msgs_py.plant_parameters import PlantParameters
 
 from pendulum_bags.datasets import Recording
 from pendulum_bags.identification.model import FitModel, from_plant
 from pendulum_bags.identification.problem import Piece, prepare, simulate
 from pendulum_bags.identification.solver import solve
+from pendulum_msgs_py.plant_parameters import PlantParameters
 
 __all__ = ["WindowScore", "free_run", "free_run_rms", "window_rms", "window_score"]
 

@@ -1,0 +1,98 @@
+"""Which friction model, which offsets: by held-out windows first, by parsimony among those that predict as well."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pendulum_bags.identification.cross_validation import CrossValidation
+from pendulum_bags.identification.model import BOUNDS
+from pendulum_bags.identification.problem import Piece
+from pendulum_bags.identification.solver import Solution
+
+__all__ = ["Candidate", "at_bounds", "choose", "effective_samples", "is_plausible"]
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """One friction model, fitted to all data and cross-validated."""
+
+    friction: str
+    free: tuple[str, ...]
+    solution: Solution
+    training_rms: float
+    validation: CrossValidation | None
+    mean_cost: float
+    effective: float
+
+    @property
+    def score(self) -> float:
+        """Held-out rms where there is one, else the training rms [rad]."""
+        return self.training_rms if self.validation is None else self.validation.rms
+
+
+def effective_samples(parts: Sequence[Array], pieces: Sequence[Piece]) -> float:
+    """Return how many independent samples carry as much as the correlated residuals do, N / (1 + 2 sum rho)."""
+    total, longest = 0, max(int(np.max(np.diff(piece.windows, axis=1))) for piece in pieces)
+    products = np.zeros(min(longest, 2000))
+    for part, piece in zip(parts, pieces, strict=True):
+        for first, stop in piece.windows:
+            r = part[first:stop]
+            total += r.size
+            spectrum = np.abs(np.fft.rfft(r, 2 * r.size)) ** 2
+            products[: r.size] += np.fft.irfft(spectrum)[: min(r.size, products.size)]
+    if products[0] <= 0.0:
+        return float(total)
+    rho = products / products[0]
+    # Sum up to the first zero crossing: beyond it an estimate of rho is noise.
+    end = int(np.argmax(rho <= 0.0)) or rho.size
+    return float(max(total / (1.0 + 2.0 * np.sum(rho[1:end])), 8.0))
+
+
+def choose(candidates: Sequence[Candidate], *, strict: bool = False) -> Candidate:
+    """Return the candidate of least information criterion among those that predict as well as the best.
+
+    Held-out windows rule out what predicts worse than the best by more than one standard error of the paired
+    difference (at least 2 %, the accuracy of the fits without a fold, and at most 25 %, since few folds give no
+    honest error); among the rest the training data decide by Akaike's criterion on effective samples.
+    Static friction beyond three times the sliding one is no friction but an excuse for other faults: left out.
+    """
+    penalty = 2.0
+    # One count for all: what a poor model leaves correlated is its own fault, not a lack of data.
+    count = max(candidate.effective for candidate in candidates)
+    if strict:
+        penalty = float(np.log(count))
+
+    def criterion(candidate: Candidate) -> float:
+        return float(count * np.log(max(candidate.mean_cost, 1e-18)) + penalty * len(candidate.free))
+
+    if any(candidate.validation is None for candidate in candidates):
+        return min(candidates, key=criterion)
+    candidates = [c for c in candidates if is_plausible(c)] or list(candidates)
+    losses = {id(c): c.validation.losses for c in candidates if c.validation is not None}
+    best = min(candidates, key=lambda c: float(losses[id(c)].sum()))
+    least = float(losses[id(best)].sum())
+    admissible = []
+    for candidate in candidates:
+        difference = losses[id(candidate)] - losses[id(best)]
+        error = float(np.std(difference, ddof=1) * np.sqrt(difference.size)) if difference.size > 1 else 0.0
+        if float(difference.sum()) <= np.clip(error, 0.02 * least, 0.25 * least):
+            admissible.append(candidate)
+    return min(admissible, key=criterion)
+
+
+def is_plausible(candidate: Candidate) -> bool:
+    """Return whether static friction is at most three times the sliding one."""
+    model = candidate.solution.model
+    return model["stribeck_excess"] <= 2.0 * model["coulomb_friction"] + 1e-9
+
+
+def at_bounds(candidate: Candidate) -> list[str]:
+    """Return the fitted parameters that ended at the edge of their domain."""
+    model = candidate.solution.model
+    return [n for n in candidate.free if model[n] <= BOUNDS[n][0] or model[n] >= BOUNDS[n][1]]
