@@ -11,7 +11,7 @@ depend on the number of steps, unless the trajectories are asked for.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -38,6 +38,7 @@ class BatchResult:
         theta: Final angles, shape (B,), not wrapped [rad].
         theta_dot: Final velocities, shape (B,) [rad/s].
         max_effort: Largest |K x| before noise and limit, shape (B,) [N m].
+        max_theta: Largest |wrap(theta - target)|, shape (B,) [rad].
         mean_theta: Mean of wrap(theta - target) over the steps, shape (B,) [rad].
         std_theta: Its standard deviation, shape (B,) [rad].
         mean_theta_dot: Mean of the velocity, shape (B,) [rad/s].
@@ -49,6 +50,7 @@ class BatchResult:
     theta: Array
     theta_dot: Array
     max_effort: Array
+    max_theta: Array
     mean_theta: Array
     std_theta: Array
     mean_theta_dot: Array
@@ -59,6 +61,7 @@ class BatchResult:
 def simulate_batch(
     parameters: PlantParameters | Sequence[PlantParameters],
     *,
+    variations: Mapping[str, ArrayLike] | None = None,
     steps: int,
     dt: float = 2e-3,
     method: str = "etd4",
@@ -77,6 +80,8 @@ def simulate_batch(
 
     Args:
         parameters: One plant or B plants, all rigid.
+        variations: Values of plant parameters by name, each scalar or (B,), in place of those of the one plant: a
+            million plants without a million objects.
         steps: Steps to take, >= 1.
         dt: Step, over which control and noise are held [s].
         method: Integrator, any of ``integrators.METHODS`` but ``adaptive``.
@@ -96,7 +101,7 @@ def simulate_batch(
     """
     import numba
 
-    from pendulum_sim.batch_kernels import ROWS, general_kernel, smooth_kernel
+    from pendulum_sim.batch_kernels import ROWS, coefficients_kernel, general_kernel, smooth_kernel
 
     check_step(dt, substeps)
     integrator = get_integrator(method)
@@ -117,6 +122,9 @@ def simulate_batch(
     }
     seed_list = [int(seed) for seed in np.atleast_1d(np.asarray(seeds, dtype=object))]
     lengths = {name: column.size for name, column in columns.items()}
+    varied = {name: _column(name, values) for name, values in (variations or {}).items()}
+    _check_variations(varied, plants)
+    lengths |= {name: column.size for name, column in varied.items()}
     lengths |= {"parameters": len(plants), "gain": len(gains), "seeds": len(seed_list)}
     size = max(lengths.values())
     for name, length in lengths.items():
@@ -124,9 +132,19 @@ def simulate_batch(
             raise ParameterError(f"{name} has {length} entries; expected 1 or {size}")
 
     packed = np.array([pack(plant) for plant in plants], dtype=np.float64)
-    rates = [float(row[1] / row[0]) for row in packed]
     h = dt / substeps
-    coefficients = np.array([integrator.coefficients(rate, h) for rate in rates], dtype=np.float64)
+    if varied:
+        packed = np.repeat(packed, size, axis=0)
+        for name, column in varied.items():
+            packed[:, PACKED.index(name)] = column
+        rates = packed[:, 1] / packed[:, 0]
+        count = len(integrator.coefficients(float(rates[0]), h))
+        by_rate = np.empty((count, size))
+        coefficients_kernel(method)(rates, h, by_rate)
+        coefficients = by_rate.T
+    else:
+        rows_of = [integrator.coefficients(float(row[1] / row[0]), h) for row in packed]
+        coefficients = np.array(rows_of, dtype=np.float64)
     limits = np.array([plant.effort_limit for plant in plants])
     delays = np.array([plant.transport_delay for plant in plants])
     smooth = not (delays.any() or packed[:, 4].any() or packed[:, 6].any() or packed[:, 9].any())
@@ -161,12 +179,26 @@ def simulate_batch(
         theta=rows["x"].copy(),
         theta_dot=rows["v"].copy(),
         max_effort=rows["max"].copy(),
+        max_theta=rows["max_x"].copy(),
         mean_theta=mean_x,
         std_theta=np.sqrt(np.maximum(0.0, rows["sum_xx"] / steps - mean_x**2)),
         mean_theta_dot=mean_v,
         std_theta_dot=np.sqrt(np.maximum(0.0, rows["sum_vv"] / steps - mean_v**2)),
         trajectories=record_of if record else None,
     )
+
+
+def _check_variations(varied: Mapping[str, Array], plants: Sequence[PlantParameters]) -> None:
+    """Refuse what is no parameter of a rigid plant, or a value that no plant can have."""
+    if varied and len(plants) != 1:
+        raise ParameterError(f"variations go with one plant; got {len(plants)}")
+    for name, column in varied.items():
+        if name not in PACKED:
+            raise ParameterError(f"variation {name!r} is unknown; expected one of {', '.join(PACKED)}")
+        if name == "inertia" and column.min() <= 0.0:
+            raise ParameterError(f"inertia has a value of {column.min()} kg m^2; expected > 0")
+        if name not in {"inertia", "gravity", "torque_offset", "angle_offset"} and column.min() < 0.0:
+            raise ParameterError(f"{name} has a value of {column.min()}; expected >= 0")
 
 
 def _column(name: str, values: ArrayLike) -> Array:

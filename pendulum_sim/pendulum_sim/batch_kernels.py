@@ -19,7 +19,7 @@ from pendulum_sim.compiling import compile_tree, tuple_loader
 from pendulum_sim.dry_friction import PACKED, acceleration_with_friction, actuator_torque, advance_dry
 from pendulum_sim.integrators import get_integrator
 
-__all__ = ["BLOCK", "general_kernel", "smooth_kernel"]
+__all__ = ["BLOCK", "coefficients_kernel", "general_kernel", "smooth_kernel"]
 
 BLOCK = 256
 """Pendulums in a block."""
@@ -27,11 +27,12 @@ BLOCK = 256
 _PLANT_ROWS = len(PACKED)
 ROWS = (
     "x", "v", "torque", "noise", "amplitude", "gain_1", "gain_2", "limit", "max", "sum_x", "sum_xx", "sum_v", "sum_vv",
-    *PACKED,
+    "max_x", *PACKED,
 )  # fmt: skip
 """Rows of a block's array, the integrator's coefficients below them."""
 (
-    _X, _V, _TORQUE, _NOISE, _AMPLITUDE, _GAIN_1, _GAIN_2, _LIMIT, _MAX, _SUM_X, _SUM_XX, _SUM_V, _SUM_VV, _PLANT,
+    _X, _V, _TORQUE, _NOISE, _AMPLITUDE, _GAIN_1, _GAIN_2, _LIMIT, _MAX, _SUM_X, _SUM_XX, _SUM_V, _SUM_VV,
+    _MAX_X, _PLANT,
 ) = (row * BLOCK for row in range(len(ROWS) - _PLANT_ROWS + 1))  # fmt: skip
 _COEFFICIENTS = len(ROWS) * BLOCK
 _scramble = compile_tree(noise.scramble)
@@ -66,6 +67,7 @@ def smooth_kernel(method: str, coefficient_rows: int) -> Any:
                 v = w[_V + j]
                 control = -(w[_GAIN_1 + j] * deviation + w[_GAIN_2 + j] * v)
                 w[_MAX + j] = max(w[_MAX + j], abs(control))
+                w[_MAX_X + j] = max(w[_MAX_X + j], abs(deviation))
                 w[_SUM_X + j] += deviation
                 w[_SUM_XX + j] += deviation * deviation
                 w[_SUM_V + j] += v
@@ -102,6 +104,20 @@ def smooth_kernel(method: str, coefficient_rows: int) -> Any:
                 block_keys[j] = keys[source]
             run_block(w.reshape(-1), block_keys, target, h, steps, hold, substeps, record[:, :, first:last])
             columns[:, first:last] = w[:, : last - first]
+
+    return run
+
+
+@cache
+def coefficients_kernel(method: str) -> Any:
+    """Return the loop that fills ``out``, shape (coefficients, B), for damping rates of shape (B,) and one step."""
+    coefficients_of = compile_tree(get_integrator(method).coefficients)
+
+    @numba.njit(parallel=True, error_model="numpy")
+    def run(rates: Any, h: float, out: Any) -> None:
+        for j in numba.prange(rates.size):
+            for row, value in enumerate(coefficients_of(rates[j], h)):
+                out[row, j] = value
 
     return run
 
@@ -160,6 +176,7 @@ def general_kernel(method: str) -> Any:
             deviation = _wrap(x - target)
             control = -(w[_GAIN_1 // BLOCK] * deviation + w[_GAIN_2 // BLOCK] * v)
             w[_MAX // BLOCK] = max(w[_MAX // BLOCK], abs(control))
+            w[_MAX_X // BLOCK] = max(w[_MAX_X // BLOCK], abs(deviation))
             w[_SUM_X // BLOCK] += deviation
             w[_SUM_XX // BLOCK] += deviation * deviation
             w[_SUM_V // BLOCK] += v
