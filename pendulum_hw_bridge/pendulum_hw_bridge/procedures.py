@@ -190,7 +190,8 @@ def staircase(
 
 def _hand_trial(seed: int, index: int, start: float) -> HandMotion:
     random = np.random.Generator(np.random.Philox(key=[seed, index]))
-    strokes = random.uniform(5.5, 8.0, 2)
+    # At 1.07 rad/s and more, hand and tremor together would ask the spring for more than its 13 N m.
+    strokes = random.uniform(7.0, 10.0, 2)
     amplitudes = _TREMOR_RADIANS * random.uniform(0.5, 1.0, _TREMOR_TONES) / math.sqrt(_TREMOR_TONES)
     frequencies = random.uniform(*_TREMOR_HERTZ, _TREMOR_TONES)
     phases = random.uniform(0.0, math.tau, _TREMOR_TONES)

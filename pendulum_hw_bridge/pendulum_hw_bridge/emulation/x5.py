@@ -20,18 +20,17 @@ from pendulum_hw_bridge.actuator import (
     CommandLock,
     Feedback,
     HardwareLimits,
-    LimitState,
     MStopAction,
     Strategy,
-    TemperatureState,
     check_lifetime,
 )
 from pendulum_hw_bridge.emulation import kernel
 from pendulum_hw_bridge.emulation.faults import ActuatorFault, distort
 from pendulum_hw_bridge.emulation.firmware import gain_rows, new_loop_memory
 from pendulum_hw_bridge.emulation.parameters import EmulatorParameters
+from pendulum_hw_bridge.emulation.sensing import measure
 from pendulum_hw_bridge.gains import DEFAULT_GAINS, GainSet
-from pendulum_msgs_py.dynamics.series_elastic import spring_deflection, spring_torque
+from pendulum_msgs_py.dynamics.series_elastic import spring_deflection
 from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.values import NANOSECONDS
 
@@ -113,6 +112,7 @@ class EmulatedX5:
         self._deliveries = 0
         self._outbox: deque[tuple[int, Feedback]] = deque()
         self._sequence = 0
+        self._fault_sequence = 0
         self._samples = 0
         self._clock_offset_ns = 0
         self._frozen: Feedback | None = None
@@ -196,6 +196,7 @@ class EmulatedX5:
         """Let a fault begin now."""
         self.faults.add(ActuatorFault(fault))
         self._frozen = self._last
+        self._fault_sequence = self._sequence
         if fault is ActuatorFault.MODULE_REBOOT:
             self.strategy = Strategy.OFF
             self._end_command()
@@ -366,10 +367,18 @@ class EmulatedX5:
         timing = self.parameters.timing
         delay = timing.feedback_delay + timing.delay_jitter * float(self._random.standard_normal())
         arrival = self.now_ns + max(0, round(NANOSECONDS * delay))
-        record = self._measure(arrival)
+        record = measure(
+            self._state, self._setpoints, self.parameters, self.limits, self.voltage, self._random
+        )._replace(
+            stamp_ns=arrival,
+            hardware_ns=self.now_ns + self._clock_offset_ns,
+            sequence=self._sequence,
+            m_stop=fault.M_STOP in self.faults,
+            lock=self._lock(),
+        )
         if fault.FEEDBACK_LOST in self.faults:
             return
-        if fault.FEEDBACK_SLOW in self.faults and self._sequence % _SLOW_FEEDBACK:
+        if fault.FEEDBACK_SLOW in self.faults and (self._sequence - self._fault_sequence) % _SLOW_FEEDBACK:
             return
         if fault.FEEDBACK_FROZEN in self.faults and self._frozen is not None:
             record = self._frozen._replace(stamp_ns=arrival)
@@ -380,65 +389,7 @@ class EmulatedX5:
             self._last = record
         self._outbox.append((record.stamp_ns, record))
 
-    def _measure(self, arrival_ns: int) -> Feedback:
-        state, drive, sensors = self._state, self.parameters.drivetrain, self.parameters.sensors
-        noise = self._random.standard_normal(2)
-        deflection = float(state[2] - state[0]) + sensors.effort_noise / drive.stiffness * float(
-            self._random.uniform(-1.0, 1.0)
-        )
-        effort = spring_torque(-deflection, 0.0, drive.stiffness, drive.stiffness_hardening, 0.0)
-        velocity = float(state[3]) + sensors.velocity_noise * float(noise[0])
-        pwm, current = float(state[8]), float(state[9])
-        bus = sensors.idle_current + pwm * current
-        motor = float(state[0]) * drive.gear_ratio
-        return Feedback(
-            stamp_ns=arrival_ns,
-            hardware_ns=self.now_ns + self._clock_offset_ns,
-            sequence=self._sequence,
-            position=_step(float(state[2]), sensors.position_step),
-            velocity=velocity,
-            effort=effort,
-            position_command=float(self._setpoints[0]),
-            velocity_command=float(self._setpoints[1]),
-            effort_command=float(self._setpoints[2]),
-            pwm_command=_step(pwm, sensors.pwm_step),
-            motor_current=_step(bus, sensors.motor_current_step),
-            winding_current=current,
-            motor_position=_step(motor, sensors.motor_position_step),
-            motor_velocity=float(state[1]) * drive.gear_ratio,
-            deflection=deflection,
-            deflection_velocity=float(state[3] - state[1]),
-            voltage=_step(self.voltage, sensors.voltage_step),
-            winding_temperature=float(state[5]),
-            housing_temperature=float(state[6]),
-            motor_sensor_temperature=float(state[6]),
-            board_temperature=float(state[7]) + 5.0,
-            processor_temperature=float(state[7]) + 8.0,
-            m_stop=ActuatorFault.M_STOP in self.faults,
-            temperature_state=self._temperature_state(float(state[5])),
-            lock=self._lock(),
-            position_limit=_limit_state(float(state[2]), self.limits.position_min, self.limits.position_max),
-        )
-
-    def _temperature_state(self, winding: float) -> TemperatureState:
-        thermal = self.parameters.thermal
-        if winding >= thermal.max_winding:
-            return TemperatureState.EXCEED_MAX_MOTOR
-        if winding >= thermal.critical_winding:
-            return TemperatureState.CRITICAL
-        return TemperatureState.NORMAL
-
     def _lock(self) -> CommandLock:
         if ActuatorFault.LOCKED_BY_OTHER in self.faults or self._lock_holder == _OTHER_SENDER:
             return CommandLock.LOCKED_BY_OTHER
         return CommandLock.UNLOCKED if self._lock_holder is None else CommandLock.LOCKED_BY_SENDER
-
-
-def _step(value: float, step: float) -> float:
-    return math.floor(value / step + 0.5) * step if step > 0.0 else value
-
-
-def _limit_state(value: float, low: float, high: float) -> LimitState:
-    if value < low:
-        return LimitState.BELOW
-    return LimitState.ABOVE if value > high else LimitState.INSIDE
