@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import subprocess
 import sys
 from pathlib import Path
@@ -58,3 +59,36 @@ def test_simulator_as_nodes_and_in_one_process_give_the_same_numbers_to_the_last
     assert np.array_equal(bag["/sim/effort_command"]["effort"], arrays.command)
     assert np.array_equal(bag["/sim/disturbance"]["effort"], arrays.disturbance)
     assert np.array_equal(bag["/sim/applied_effort"]["effort"], arrays.applied)
+
+
+@pytest.mark.timeout(240)
+def test_the_two_experiments_of_the_thesis_give_back_its_coefficients(tmp_path: Path) -> None:
+    run_experiment("inertia_damping", "--out", tmp_path / "hand", "--trials", 3)
+    run_experiment("gravity", "--out", tmp_path / "stairs", "--trials", 1, "--step", 30, "--hold", 1)
+
+    hand = json.loads((tmp_path / "hand" / "identified.json").read_text())["intervals"]
+    stairs = json.loads((tmp_path / "stairs" / "identified.json").read_text())["intervals"]
+    assert hand["damping"][0] < 11.77 < hand["damping"][1]
+    assert hand["inertia"][0] < 0.055 < hand["inertia"][1]
+    assert stairs["gravity"][0] < 1.678 < stairs["gravity"][1]
+
+    bag = read_bag(tmp_path / "stairs" / "trial_1")
+    steps = [event["name"] for event in bag.events() if event["name"] in {"dynamic", "static"}]
+    assert steps == ["dynamic", "static"] * 12
+    quantities = bag["/hw/actuator/feedback"][0].message.name
+    recorded = {"position", "velocity", "effort", "position_command", "velocity_command", "effort_command"}
+    assert recorded | {"pwm_command", "motor_current", "winding_current"} <= set(quantities)
+
+
+@pytest.mark.timeout(120)
+def test_a_study_over_dds_runs_in_parallel_and_leaves_a_table(tmp_path: Path) -> None:
+    file = tmp_path / "study.yaml"
+    file.write_text(
+        "format: pendulum_study/1\nname: small\nduration: 0.5\nplants:\n  sim: {}\n  hw: {side: hw}\n"
+        "controllers:\n  lqr: {q: [100.0, 0.01], r: 0.1}\ndisturbances:\n  noise: {amplitude: 2.5, hold_time: 0.01}\n",
+        encoding="utf-8",
+    )
+    run_experiment("study", file, "--out", tmp_path / "out", "--workers", 2)
+    rows = (tmp_path / "out" / "runs.csv").read_text().splitlines()
+    assert len(rows) == 3
+    assert all(",done," in row for row in rows[1:])
