@@ -50,7 +50,9 @@ _COUNT = 3
 _MOTION_CYCLES = 5
 _WAY = 1e-3
 """Longest that a command takes to arrive, as a rule [s]."""
-_WRONG_COMMAND_TIME = 0.015
+_WRONG_COMMANDS = 2
+"""Records that show a wrong setpoint to be a fault: one packet may get lost, two in a row do not on a cable [-]."""
+_WRONG_COMMAND_TIME = 0.008
 """Time for which a wrong setpoint must be in force to be a fault [s]."""
 _CLAMPED_SPEED = 1.35
 """Speed above which the firmware may take the duty back [rad/s]."""
@@ -76,7 +78,8 @@ class SafetyLimits:
         position_jump: Largest change of position beyond that of the velocity, in one cycle [rad].
         position_disagreement: Largest disagreement of position and integrated velocity in five cycles [rad].
         winding_current: Largest disagreement of the winding current; 0 switches the check off [A].
-        command_tolerance: Largest difference between what was sent and what the module acts on; relative to 1 [-].
+        command_tolerance: Largest difference between the setpoint sent and the one in force [rad or N m].
+        pwm_tolerance: The same for a PWM duty; the firmware's steps are 2.4e-4 [-].
         feedback_cycles: Feedback periods without a record at which it counts as lost [-].
     """
 
@@ -88,6 +91,7 @@ class SafetyLimits:
     position_disagreement: float = 0.01
     winding_current: float = 0.15
     command_tolerance: float = 2e-3
+    pwm_tolerance: float = 5e-4
     feedback_cycles: int = 3
 
     def __post_init__(self) -> None:
@@ -294,10 +298,11 @@ class SafetyMonitor:
             acts, candidates, name = feedback.position_command, [c.position for c in recent], "position"
         else:
             acts, candidates, name = feedback.effort_command, [c.effort for c in recent], "effort"
-        tolerance = self.limits.command_tolerance
+        direct = self._strategy is Strategy.DIRECT_PWM
+        tolerance = self.limits.pwm_tolerance if direct else self.limits.command_tolerance
         wanted = [0.0 if math.isnan(candidate) else candidate for candidate in candidates]
         good = any(abs(acts - candidate) <= tolerance for candidate in wanted)
-        if not good and self._strategy is Strategy.DIRECT_PWM and abs(feedback.velocity) > _CLAMPED_SPEED:
+        if not good and direct and abs(feedback.velocity) > _CLAMPED_SPEED:
             # Near its speed limit the firmware takes the duty back, never up and never round.
             good = any(min(0.0, candidate) <= acts <= max(0.0, candidate) for candidate in wanted)
         if good:
@@ -307,7 +312,7 @@ class SafetyMonitor:
             self._wrong_since_ns = feedback.stamp_ns
         self._wrong_commands += 1
         lasts = (feedback.stamp_ns - self._wrong_since_ns) / NANOSECONDS
-        if self._wrong_commands >= _COUNT and lasts >= _WRONG_COMMAND_TIME:
+        if self._wrong_commands >= _WRONG_COMMANDS and lasts >= _WRONG_COMMAND_TIME:
             return Fault(
                 "command_not_in_force",
                 f"module acts on {name} {acts:.4f}, sent was {wanted[-1]:.4f}; "

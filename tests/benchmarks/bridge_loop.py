@@ -25,6 +25,7 @@ __all__ = ["BridgeLoopFigures", "loop_figures"]
 _ROOT = Path(__file__).parents[2]
 _TIMEOUT = 60.0
 _WARM_UP = 3.0
+_NICENESS = -10
 
 
 @dataclass(frozen=True)
@@ -109,8 +110,9 @@ def loop_figures(rate: float, duration: float) -> BridgeLoopFigures:
                 listen(0.5)
                 if time.monotonic() > deadline:
                     raise TimeoutError(f"the loop did not close within {_TIMEOUT:g} s: {programs[0].output}")
-            listen(_WARM_UP)
             processes = [psutil.Process(program.pid) for program in programs]
+            _give_priority(processes)
+            listen(_WARM_UP)
             diagnostics.clear()
             listen(1.0)
             first, wall, busy = diagnostics[-1], time.monotonic(), _cpu(processes)
@@ -128,7 +130,8 @@ def loop_figures(rate: float, duration: float) -> BridgeLoopFigures:
                 latency_p99=_median(diagnostics, "command_latency_p99_us"),
                 overruns=100.0 * (int(last["overruns"]) - int(first["overruns"])) / max(1, cycles),
                 cpu=cpu,
-                faults=sum(int(value) for key, value in last.items() if key.startswith("faults.")),
+                faults=sum(int(value) for key, value in last.items() if key.startswith("faults."))
+                - sum(int(value) for key, value in first.items() if key.startswith("faults.")),
             )
         finally:
             executor.shutdown()
@@ -139,6 +142,15 @@ def loop_figures(rate: float, duration: float) -> BridgeLoopFigures:
 
 def _median(rows: list[dict[str, str]], key: str) -> float:
     return statistics.median(float(row[key]) for row in rows)
+
+
+def _give_priority(processes: list[psutil.Process]) -> None:
+    """Let both go before whatever else the machine does, where we may."""
+    for process in processes:
+        try:
+            process.nice(_NICENESS)
+        except psutil.AccessDenied:
+            return
 
 
 def _cpu(processes: list[psutil.Process]) -> float:

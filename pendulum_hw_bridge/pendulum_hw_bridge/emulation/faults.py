@@ -72,7 +72,7 @@ def distort(feedback: Feedback, faults: set[ActuatorFault], frozen: Feedback | N
     if fault.VELOCITY_SPIKE in faults:
         changes["velocity"] = 5.0
     if fault.OVERSPEED in faults:
-        changes["velocity"] = 1.8
+        changes["velocity"] = 1.55
         changes["velocity_limit"] = LimitState.INSIDE
     if fault.EFFORT_OFFSET in faults:
         changes["effort"] = feedback.effort + 15.0
