@@ -112,6 +112,7 @@ class SimulatorNode(Node):
             self,
             self._supervisor,
             (lambda: self._loop.now_ns) if self._lockstep else wall,
+            lockstep=self._lockstep,
             statistics=None if self._lockstep else self._statistics,
             more_diagnostics=self._diagnostics,
             on_command=self._on_command,

@@ -177,6 +177,7 @@ class PlantInterface:
         supervisor: Its rules and state.
         clock: The plant's time [ns]: wall clock or simulated.
         push: Whether the plant can take a torque on the link itself.
+        lockstep: Whether every answer is waited for, so that none may be lost.
         statistics: The loop's figures, shown in diagnostics.
         more_diagnostics: Further key-value pairs for diagnostics.
         on_command: Called after each accepted command of any torque input.
@@ -189,6 +190,7 @@ class PlantInterface:
         clock: Callable[[], int],
         *,
         push: bool = True,
+        lockstep: bool = False,
         statistics: LoopStatistics | None = None,
         more_diagnostics: Callable[[], Mapping[str, object]] = dict,
         on_command: _CommandHook | None = None,
@@ -214,7 +216,7 @@ class PlantInterface:
         self._diagnostics = node.create_publisher(DiagnosticArray, names.DIAGNOSTICS, qos.DIAGNOSTICS)
         inputs = [Input.EFFORT_COMMAND, Input.DISTURBANCE] + ([Input.PUSH] if push else [])
         self._inputs = {
-            kind: node.create_subscription(JointState, kind.value, self._receiver(kind), qos.COMMAND_INPUT, raw=True)
+            kind: node.create_subscription(JointState, kind.value, self._receiver(kind), qos.command_input(reliable=lockstep), raw=True)
             for kind in inputs
         }
         node.create_subscription(JointTrajectory, names.JOINT_TRAJECTORY, self._on_trajectory, qos.TRAJECTORY)
@@ -246,7 +248,9 @@ class PlantInterface:
     def publish_applied(self, stamp_ns: int, effort: float) -> None:
         """Publish the torque that was really applied from the state with this stamp on, and remember it."""
         self.supervisor.report_applied(effort)
-        self._applied.publish(encode_joint_state(stamp_ns, effort=effort))
+        # Building and publishing what nobody hears would be a tenth of the loop.
+        if self._applied.get_subscription_count():
+            self._applied.publish(encode_joint_state(stamp_ns, effort=effort))
         if self._stopping:
             self._applied.wait_for_all_acked(_LAST_WORDS)
 
