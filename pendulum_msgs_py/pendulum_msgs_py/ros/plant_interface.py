@@ -216,7 +216,9 @@ class PlantInterface:
         self._diagnostics = node.create_publisher(DiagnosticArray, names.DIAGNOSTICS, qos.DIAGNOSTICS)
         inputs = [Input.EFFORT_COMMAND, Input.DISTURBANCE] + ([Input.PUSH] if push else [])
         self._inputs = {
-            kind: node.create_subscription(JointState, kind.value, self._receiver(kind), qos.command_input(reliable=lockstep), raw=True)
+            kind: node.create_subscription(
+                JointState, kind.value, self._receiver(kind), qos.command_input(reliable=lockstep), raw=True
+            )
             for kind in inputs
         }
         node.create_subscription(JointTrajectory, names.JOINT_TRAJECTORY, self._on_trajectory, qos.TRAJECTORY)
@@ -409,7 +411,9 @@ class PlantInterface:
             conflict = f"{found[twins[0]]} commanders named {twins[0]} on {topic}; expected one: zero torque"
         elif found.total() > 1 and gate.newest_stamp_ns is not None:
             if gate.commander == "":
-                conflict = f"{found.total()} unnamed commanders on {topic}; expected one, or a frame_id: zero torque"
+                conflict = (
+                    f"{found.total()} unnamed commanders on {topic}; expected one, or a frame_id: zero torque"
+                )
             elif self._contradicted_ns is not None and now - self._contradicted_ns < _CONTRADICTION_HOLD_NS:
                 conflict = (
                     f"{found.total()} commanders on {topic} give two answers to one state as {gate.commander!r}; "

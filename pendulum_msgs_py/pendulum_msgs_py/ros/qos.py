@@ -4,12 +4,25 @@ from __future__ import annotations
 
 from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
 
-__all__ = ["CLOCK", "COMMAND", "DIAGNOSTICS", "EVENTS", "STATE", "TRAJECTORY", "WATCHED_STATE", "command_input", "newest_state"]
+__all__ = [
+    "CLOCK",
+    "COMMAND",
+    "DIAGNOSTICS",
+    "EVENTS",
+    "STATE",
+    "TRAJECTORY",
+    "WATCHED_STATE",
+    "command_input",
+    "newest_state",
+]
 
 
 def _profile(depth: int, durability: DurabilityPolicy = DurabilityPolicy.VOLATILE) -> QoSProfile:
     return QoSProfile(
-        depth=depth, history=HistoryPolicy.KEEP_LAST, reliability=ReliabilityPolicy.RELIABLE, durability=durability
+        depth=depth,
+        history=HistoryPolicy.KEEP_LAST,
+        reliability=ReliabilityPolicy.RELIABLE,
+        durability=durability,
     )
 
 
