@@ -130,8 +130,8 @@ def loop_figures(rate: float, duration: float) -> BridgeLoopFigures:
                 latency_p99=_median(diagnostics, "command_latency_p99_us"),
                 overruns=100.0 * (int(last["overruns"]) - int(first["overruns"])) / max(1, cycles),
                 cpu=cpu,
-                faults=sum(int(value) for key, value in last.items() if key.startswith("faults."))
-                - sum(int(value) for key, value in first.items() if key.startswith("faults.")),
+                # From the start: a loop that faulted before would be measured without torque.
+                faults=sum(int(value) for key, value in last.items() if key.startswith("faults.")),
             )
         finally:
             executor.shutdown()
