@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib
 import json
+import os
 import platform
 import sys
 import threading
@@ -49,6 +50,12 @@ DISCOVERY_PERIOD = 0.2
 """Time between two looks at the graph [s]."""
 DEPTH = 4000
 """Messages that the middleware holds for us between two visits: four seconds at 1 kHz."""
+
+_TRANSPORT_SETTINGS = (
+    "FASTDDS_BUILTIN_TRANSPORTS",
+    "FASTDDS_DEFAULT_PROFILES_FILE",
+    "FASTRTPS_DEFAULT_PROFILES_FILE",
+)
 
 SPECS = (
     ParameterSpec(
@@ -473,6 +480,7 @@ def record(
     )
     if output.exists():
         raise BagError(f"bag {output} exists already; expected a new folder (bags are never overwritten)")
+    _leave_no_shared_memory()
     return run_node(
         lambda stop: Recorder(options, stop),
         list(context.obj),
@@ -480,6 +488,17 @@ def record(
         description="Record topics to a bag.",
         specs=SPECS,
     )
+
+
+def _leave_no_shared_memory() -> None:
+    """Receive over the loopback network, unless the user has configured the middleware.
+
+    Fast DDS passes messages between processes through shared memory. A process that is killed while it holds some
+    leaves it locked: measured with a publisher of five topics at 500 Hz, after some ten kills new subscribers, matched
+    as they were, got nothing any more. A recorder must survive a kill, and so must those whom it records.
+    """
+    if not any(os.environ.get(name) for name in _TRANSPORT_SETTINGS):
+        os.environ["FASTDDS_BUILTIN_TRANSPORTS"] = "UDPv4"
 
 
 def main(argv: list[str] | None = None) -> int:
