@@ -1,0 +1,108 @@
+"""Monte Carlo: chunks are pure functions, whoever computes them; probabilities and replays are right."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from pendulum_bags.study.monte_carlo import (
+    MonteCarlo,
+    draw_chunk,
+    replay,
+    run_chunk,
+    run_monte_carlo,
+    sobol,
+    uncertainty_of,
+)
+from pendulum_msgs_py.errors import BagError, ParameterError
+
+SMALL = MonteCarlo(runs=700, chunk=300, duration=0.4)
+
+def has_arrow() -> bool:
+    try:
+        import pyarrow  # noqa: F401
+    except ImportError:
+        return False
+    return True
+
+
+arrow = pytest.mark.skipif(not has_arrow(), reason="pyarrow cannot be imported with this numpy")
+
+
+def test_a_chunk_depends_on_settings_and_index_alone() -> None:
+    first, again = run_chunk(SMALL, 1), run_chunk(SMALL, 1, threads=1)
+    for name, values in first.items():
+        assert np.array_equal(values, again[name]), name
+    assert len(run_chunk(SMALL, 2)["max_theta"]) == 100
+
+
+def test_parameters_scatter_as_told_and_stay_positive() -> None:
+    drawn = draw_chunk(replace(SMALL, runs=200_000, chunk=200_000), 0)
+    assert drawn["damping"].mean() == pytest.approx(11.77, rel=1e-3)
+    assert drawn["damping"].std() == pytest.approx(0.05 * 11.77, rel=1e-2)
+    assert drawn["inertia"].min() > 0.0
+
+
+def test_one_run_replayed_alone_is_the_run_of_the_batch() -> None:
+    columns = run_chunk(SMALL, 1)
+    row, motion = replay(SMALL, 300 + 17)
+    assert row["max_theta"] == columns["max_theta"][17]
+    assert row["theta_end"] == columns["theta_end"][17]
+    assert np.abs(motion[:, 0] - np.pi).max() == pytest.approx(row["max_theta"], abs=1e-15)
+
+
+@arrow
+def test_an_interrupted_monte_carlo_goes_on_and_workers_change_no_bit(tmp_path: Path) -> None:
+    def stop(done: int, _total: int) -> None:
+        if done == 1:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        run_monte_carlo(tmp_path / "one", SMALL, on_progress=stop)
+    one = run_monte_carlo(tmp_path / "one", SMALL)
+    other = run_monte_carlo(tmp_path / "other", SMALL)
+    assert one == other
+    for file in (tmp_path / "one").glob("*.parquet"):
+        assert file.read_bytes() == (tmp_path / "other" / file.name).read_bytes()
+    low, high = one["probability_interval"]
+    assert low <= one["probability_inside"] <= high
+    with pytest.raises(BagError, match="other settings"):
+        run_monte_carlo(tmp_path / "one", replace(SMALL, seed=2))
+
+
+@arrow
+@pytest.mark.timeout(120)
+def test_a_dask_cluster_gives_the_same_bits(tmp_path: Path) -> None:
+    pytest.importorskip("dask.distributed")
+    here = run_monte_carlo(tmp_path / "here", SMALL)
+    cluster = run_monte_carlo(tmp_path / "cluster", SMALL, workers=2)
+    assert here == cluster
+    for file in (tmp_path / "here").glob("*.parquet"):
+        assert file.read_bytes() == (tmp_path / "cluster" / file.name).read_bytes()
+
+
+def test_sobol_indices_see_that_noise_rules_and_damping_comes_next() -> None:
+    found = sobol(replace(SMALL, duration=1.0, uncertainty={"damping": 0.2, "gravity": 0.05}), base=256)
+    total = {entry["factor"]: entry["total"] for entry in found["indices"]}
+    assert total["noise"] > total["damping"] > total["gravity"]
+
+
+def test_uncertainty_comes_from_the_intervals_of_an_identification(tmp_path: Path) -> None:
+    file = tmp_path / "plant.yaml"
+    file.write_text(
+        "format: pendulum_plant/1\nname: found\nparameters:\n"
+        "  inertia: {value: 0.05, unit: kg m^2, interval: [0.0402, 0.0598]}\n"
+        "  damping: {value: 10.0, unit: N m s/rad}\n  gravity: {value: 1.6, unit: N m}\n",
+        encoding="utf-8",
+    )
+    assert uncertainty_of(str(file)) == {"inertia": pytest.approx(0.1)}
+    with pytest.raises(ParameterError, match="preset"):
+        uncertainty_of("thesis")
+
+
+def test_an_unknown_parameter_is_refused() -> None:
+    with pytest.raises(ParameterError, match="expected one of inertia, damping, gravity"):
+        MonteCarlo(uncertainty={"mass": 0.1})
