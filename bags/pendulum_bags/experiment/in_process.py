@@ -15,14 +15,15 @@ from pendulum_lqr.disturbance import DISTURBANCE_SPECS, make_disturbance
 from pendulum_lqr.disturbing import DisturbanceLoop
 from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.parameters import validate
-from pendulum_msgs_py.plant_parameters import load_plant
+from pendulum_msgs_py.plant_parameters import PlantParameters, load_plant
 from pendulum_msgs_py.ros.plant_interface import LIMIT_SPECS, limits_from_parameters
 from pendulum_msgs_py.ros.plant_loop import LOCKSTEP_EPOCH_NS
 from pendulum_msgs_py.supervisor import Input, PlantSupervisor
 from pendulum_msgs_py.values import NANOSECONDS, JointCommand, JointSample
 from pendulum_sim.plant import make_plant
+from pendulum_sim.sensors import Sensors
 
-__all__ = ["RunArrays", "simulate"]
+__all__ = ["RunArrays", "simulate", "simulate_plant"]
 
 Array = NDArray[np.float64]
 
@@ -58,8 +59,19 @@ def simulate(spec: RunSpec) -> RunArrays:
     """
     if spec.side != "sim" or spec.plant_parameters:
         raise ParameterError("a run in one process is of the plain simulator; others run as nodes")
+    return simulate_plant(spec, load_plant(spec.plant))
+
+
+def simulate_plant(spec: RunSpec, parameters: PlantParameters, sensors: Sensors | None = None) -> RunArrays:
+    """Run a run of the simulator on any plant and with any sensors, for what-if questions.
+
+    Args:
+        spec: The run; its ``plant`` is not looked at.
+        parameters: The plant.
+        sensors: What the controller sees; None for the truth. They must not drop samples.
+    """
     period_ns = round(NANOSECONDS * spec.period)
-    parameters = load_plant(spec.plant)
+    sensors = sensors or Sensors()
     plant = make_plant(parameters, period_ns / NANOSECONDS, method=spec.method)
     limits: dict[str, Any] = validate(LIMIT_SPECS, {})
     supervisor = PlantSupervisor(limits_from_parameters(limits, parameters.effort_limit))
@@ -78,7 +90,9 @@ def simulate(spec: RunSpec) -> RunArrays:
     stamps = LOCKSTEP_EPOCH_NS + period_ns * np.arange(count + 1, dtype=np.int64)
     rows = np.full((count + 1, 6), np.nan)
     state = plant.reset(spec.theta, 0.0)
-    sample = JointSample(LOCKSTEP_EPOCH_NS, state.theta, state.theta_dot, state.effort)
+    sample = sensors.measure(LOCKSTEP_EPOCH_NS, state.theta, state.theta_dot, state.effort)
+    if sample is None:
+        raise ParameterError("sensors drop samples; expected a drop_rate of 0 in a run in one process")
     supervisor.arm(LOCKSTEP_EPOCH_NS, sample)
     for index in range(count + 1):
         now_ns = sample.stamp_ns
@@ -97,5 +111,8 @@ def simulate(spec: RunSpec) -> RunArrays:
         state = plant.step(drive.effort, drive.push)
         supervisor.report_applied(drive.effort)
         row[5] = drive.effort
-        sample = JointSample(int(stamps[index + 1]), state.theta, state.theta_dot, state.effort)
+        measured = sensors.measure(int(stamps[index + 1]), state.theta, state.theta_dot, state.effort)
+        if measured is None:
+            raise ParameterError("sensors drop samples; expected a drop_rate of 0 in a run in one process")
+        sample = measured
     return RunArrays(stamps, rows[:, 0], rows[:, 1], rows[:, 2], rows[:, 3], rows[:, 4], rows[:-1, 5])
