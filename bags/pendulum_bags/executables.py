@@ -12,6 +12,7 @@ EXECUTABLES: dict[str, str] = {
     "report": "pendulum_bags.report_cli:main",
     "export": "pendulum_bags.export_cli:main",
     "play": "pendulum_bags.topic_replay_node:main",
+    "console": "pendulum_bags.console_node:main",
     "info": "pendulum_bags.info_cli:main",
     "repair": "pendulum_bags.repair_cli:main",
 }

@@ -1,0 +1,113 @@
+"""Programs that the console starts: a recorder, an experiment. They end with it."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from dataclasses import dataclass
+from pathlib import Path
+
+from pendulum_msgs_py.errors import FaultError
+
+__all__ = ["Job", "Jobs"]
+
+_PATIENCE = 10.0
+
+
+@dataclass
+class Job:
+    """One started program.
+
+    Attributes:
+        kind: ``record`` or ``experiment``.
+        folder: What it writes.
+        process: The process.
+        log: Its output.
+    """
+
+    kind: str
+    folder: Path
+    process: subprocess.Popen[bytes]
+    log: Path
+
+    @property
+    def running(self) -> bool:
+        """Whether it still runs."""
+        return self.process.poll() is None
+
+    def last_line(self) -> str:
+        """Return the last line of its output."""
+        text = self.log.read_text(encoding="utf-8", errors="replace").replace("\r", "\n")
+        lines = [line.strip() for line in text.splitlines() if line.strip()]
+        return lines[-1] if lines else ""
+
+
+class Jobs:
+    """At most one program of each kind at a time.
+
+    Args:
+        runs: Folder in which each gets a folder of its own.
+    """
+
+    def __init__(self, runs: Path) -> None:
+        self.runs = runs
+        self._jobs: dict[str, Job] = {}
+
+    def __getitem__(self, kind: str) -> Job | None:
+        """Return the newest program of a kind."""
+        return self._jobs.get(kind)
+
+    def record(self) -> Job:
+        """Start recording all plants, and what belongs to them, into one bag."""
+        arguments = ["record", "--exclude", "^/(parameter_events|rosout)$"]
+        return self._start("record", arguments, "-o", os.environ)
+
+    def experiment(self, seed: int) -> Job:
+        """Run the thesis's experiment in a ROS domain of its own; its folder gets a report.
+
+        Args:
+            seed: Seed of the noise.
+        """
+        # Not in our domain: its plants have the names of those that are shown here.
+        environment = {name: value for name, value in os.environ.items() if name != "ROS_DOMAIN_ID"}
+        return self._start("experiment", ["experiment", "thesis", "--seed", str(seed)], "--out", environment)
+
+    def _start(
+        self, kind: str, arguments: list[str], option: str, environment: os._Environ[str] | dict[str, str]
+    ) -> Job:
+        job = self._jobs.get(kind)
+        if job is not None and job.running:
+            raise FaultError(f"{kind} runs already, into {job.folder}; expected it to end first")
+        self.runs.mkdir(parents=True, exist_ok=True)
+        folder = self.runs / f"{time.strftime('%Y-%m-%dT%H-%M-%SZ', time.gmtime())}_console_{kind}"
+        log = folder.with_suffix(".log")
+        command = [sys.executable, "-m", "pendulum_bags", *arguments, option, str(folder)]
+        with log.open("wb") as sink:
+            process = subprocess.Popen(
+                command, stdin=subprocess.DEVNULL, stdout=sink, stderr=subprocess.STDOUT,
+                env=dict(environment), start_new_session=True,
+            )  # fmt: skip
+        self._jobs[kind] = Job(kind, folder, process, log)
+        return self._jobs[kind]
+
+    def stop(self, kind: str) -> str:
+        """End a program as Ctrl-C does and return its last words."""
+        job = self._jobs.get(kind)
+        if job is None:
+            return f"no {kind} was started here"
+        if job.running:
+            job.process.send_signal(signal.SIGINT)
+            try:
+                job.process.wait(_PATIENCE)
+            except subprocess.TimeoutExpired:
+                job.process.kill()
+                job.process.wait()
+        return job.last_line()
+
+    def close(self) -> None:
+        """End everything."""
+        for kind in list(self._jobs):
+            self.stop(kind)

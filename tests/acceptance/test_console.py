@@ -1,0 +1,146 @@
+"""The console in a real browser, on real plants: seen, tuned, stopped; and who is not let in."""
+
+from __future__ import annotations
+
+import socket
+import urllib.error
+import urllib.request
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from pendulum_bags.console.security import refusal
+from tests.fixtures import wait_for
+from tests.processes import ProcessGroup, RunningProgram
+
+CHROMIUM = Path("/usr/bin/chromium")
+QUIET = ["--no-sandbox", "--disable-gpu", "--disable-background-networking", "--disable-component-update"]
+STOP_LIMIT_MS = 100.0
+
+
+@pytest.mark.parametrize(
+    ("headers", "query", "token", "expected"),
+    [
+        ({"host": "localhost:8090"}, "", "", ""),
+        ({"host": "127.0.0.1:8090", "origin": "http://127.0.0.1:8090"}, "", "", ""),
+        ({"host": "localhost:8090", "origin": "https://evil.example"}, "", "", "another site"),
+        ({"host": "evil.example:8090"}, "", "", "not this machine"),
+        ({"host": "lab:8090"}, "", "secret", "token"),
+        ({"host": "lab:8090"}, "token=secret", "secret", ""),
+        ({"host": "lab:8090", "cookie": "pendulum_console=secret"}, "", "secret", ""),
+        ({"host": "lab:8090", "cookie": "pendulum_console=guess"}, "", "secret", "token"),
+        ({"host": "lab:8090", "origin": "http://evil"}, "token=secret", "secret", "another site"),
+    ],
+)
+def test_only_own_pages_and_bearers_of_the_token_are_let_in(
+    headers: dict[str, str], query: str, token: str, expected: str
+) -> None:
+    reason = refusal(headers, query, token)
+    assert expected in reason
+    assert bool(reason) is bool(expected)
+
+
+@pytest.fixture
+def simulator(processes: ProcessGroup, domain_id: int) -> RunningProgram:
+    """Start a simulator with controller and disturbance in /sim."""
+    at = ["--ros-args", "-r", "__ns:=/sim"]
+    plant = processes.start("pendulum_sim", "simulator", *at, "-p", "start:=top")
+    processes.start("pendulum_lqr", "controller", *at, "-p", "period:=0.002")
+    processes.start("pendulum_lqr", "disturbance", *at)
+    return plant
+
+
+@pytest.fixture
+def address(processes: ProcessGroup, simulator: RunningProgram, tmp_path: Path) -> str:
+    """Start the console and return its address."""
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        port = probe.getsockname()[1]
+    console = processes.start("pendulum_bags", "console", "--port", port, "--runs", tmp_path / "runs")
+    console.wait_for_output(r"console at http://localhost", 60)
+    return f"http://localhost:{port}/"
+
+
+@pytest.fixture
+def browser() -> Iterator[Any]:
+    """Start Chromium, or skip where there is none."""
+    playwright = pytest.importorskip("playwright.sync_api")
+    if not CHROMIUM.is_file():
+        pytest.skip(f"no browser at {CHROMIUM}")
+    with playwright.sync_playwright() as play:
+        chromium = play.chromium.launch(executable_path=str(CHROMIUM), args=QUIET)
+        yield chromium
+        chromium.close()
+
+
+def _open(browser: Any, address: str, width: int = 1280, height: int = 860) -> Any:
+    page = browser.new_page(viewport={"width": width, "height": height})
+    page.goto(address)
+    page.wait_for_selector("[data-plant='/sim'] .armed_effort", timeout=60_000)
+    return page
+
+
+def _mode(page: Any) -> str:
+    return str(page.evaluate("(pendulumConsole.plants['/sim'] || {}).mode"))
+
+
+@pytest.mark.timeout(180)
+def test_two_clients_see_stop_tune_and_meet_a_new_simulator(
+    browser: Any, address: str, simulator: RunningProgram, processes: ProcessGroup
+) -> None:
+    desk, phone = _open(browser, address), _open(browser, address, 390, 844)
+
+    # Phone: nothing hangs over the edge, and the stop is in reach.
+    assert phone.evaluate("document.documentElement.scrollWidth") <= 390
+    box = phone.locator("#e_stop").bounding_box()
+    assert box["y"] + box["height"] <= 844
+    assert box["width"] > 300
+
+    # A refused value is explained, and the value in force comes back.
+    field = desk.locator("input[aria-label='R [1/(N m)²]'][type=number]")
+    wait_for(lambda: field.input_value() == "0.1", 20, "the value in force")
+    field.fill("-1")
+    field.press("Tab")
+    notice = desk.locator(".q-notification", has_text="refuses r")
+    notice.wait_for(timeout=10_000)
+    assert "-1" in notice.inner_text()
+    wait_for(lambda: field.input_value() == "0.1", 10, "the old value")
+
+    # From the key to the plant, on one clock; the best of five, since neighbours on the machine are not our delay.
+    delays = []
+    for _ in range(5):
+        desk.keyboard.press("Space")
+        wait_for(lambda: _mode(desk) == "e_stop", 5, "the e-stop")
+        delays.append(
+            float(desk.evaluate("pendulumConsole.plants['/sim'].mode_ms - pendulumConsole.stopPressed"))
+        )
+        wait_for(lambda: _mode(phone) == "e_stop", 5, "the other client to see it")
+        desk.get_by_role("button", name="Reset e-stop").click()
+        wait_for(lambda: _mode(desk) == "disarmed", 10, "the reset")
+    assert 0.0 <= min(delays) <= STOP_LIMIT_MS, delays
+    desk.get_by_role("button", name="Arm", exact=True).click()
+    wait_for(lambda: _mode(desk) == "armed_effort", 10, "the plant to be armed")
+
+    # The node goes and comes back; the page goes on with the new one.
+    simulator.interrupt()
+    assert simulator.wait(20) == 0
+    wait_for(
+        lambda: desk.evaluate("Object.keys(pendulumConsole.plants).length") == 0, 30, "the plant to be gone"
+    )
+    processes.start("pendulum_sim", "simulator", "--ros-args", "-r", "__ns:=/sim", "-p", "start:=top")
+    wait_for(lambda: _mode(desk) == "armed_effort", 60, "the new plant")
+    before = desk.evaluate("pendulumConsole.plants['/sim'].stamp_ns")
+    wait_for(lambda: desk.evaluate("pendulumConsole.plants['/sim'].stamp_ns") != before, 10, "new states")
+
+
+@pytest.mark.timeout(120)
+def test_a_foreign_page_cannot_press_the_button(address: str) -> None:
+    request = urllib.request.Request(
+        address + "e_stop", method="POST", headers={"Origin": "http://evil.example"}
+    )
+    with pytest.raises(urllib.error.HTTPError) as caught:
+        urllib.request.urlopen(request, timeout=10)
+    assert caught.value.code == 403
+    assert "another site" in caught.value.read().decode()
