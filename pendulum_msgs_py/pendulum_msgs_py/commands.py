@@ -93,7 +93,9 @@ class CommandGate:
         # Measured from the stamp and from the moment of hearing it: a clock that jumps either way only shortens it.
         age = now_ns - newest.stamp_ns
         silence = now_ns - self._heard_ns
-        if age > self.timeout_ns or silence > self.timeout_ns or age < -self.future_tolerance_ns or silence < 0:
+        # Heard "later than now" is not only a clock that stepped back: a plant that catches up with periods it missed
+        # decides as of each of them.
+        if age > self.timeout_ns or age < -self.future_tolerance_ns or abs(silence) > self.timeout_ns:
             return None
         return newest
 

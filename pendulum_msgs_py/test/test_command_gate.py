@@ -124,5 +124,6 @@ def test_what_is_fresh_is_always_finite_and_young_by_stamp_and_by_hearing(
             if fresh is not None:
                 assert math.isfinite(fresh.effort)
                 assert -5 * _MS <= later - fresh.stamp_ns <= 50 * _MS
-                assert 0 <= later - heard <= 50 * _MS
+                # A plant that catches up with missed periods decides as of times before it heard the command.
+                assert -50 * _MS <= later - heard <= 50 * _MS
     assert gate.accepted + sum(gate.refused.values()) == len(events)
