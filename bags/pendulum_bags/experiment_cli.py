@@ -18,6 +18,7 @@ from pendulum_bags.experiment.progress import PhaseProgress
 from pendulum_bags.experiment.run_folder import create_run_folder, discard_if_empty, versions, write_json
 from pendulum_bags.experiment.settings import NoiseSettings, RegulationSettings
 from pendulum_bags.experiment_trials_cli import add_commands as add_trial_commands
+from pendulum_bags.leaderboard_cli import leaderboard
 from pendulum_bags.monte_carlo_cli import monte_carlo
 from pendulum_bags.study_cli import add_commands as add_study_commands
 from pendulum_msgs_py.errors import PendulumError
@@ -163,6 +164,7 @@ def lockstep(
 add_trial_commands(app)
 add_study_commands(app)
 app.command(name="monte_carlo")(monte_carlo)
+app.command(name="leaderboard")(leaderboard)
 
 
 @app.command()

@@ -19,7 +19,7 @@ from pendulum_msgs_py.plant_parameters import PlantParameters, load_plant
 from pendulum_msgs_py.ros.plant_interface import LIMIT_SPECS, limits_from_parameters
 from pendulum_msgs_py.ros.plant_loop import LOCKSTEP_EPOCH_NS
 from pendulum_msgs_py.supervisor import Input, PlantSupervisor
-from pendulum_msgs_py.values import NANOSECONDS, JointCommand, JointSample
+from pendulum_msgs_py.values import NANOSECONDS, JointCommand
 from pendulum_sim.plant import make_plant
 from pendulum_sim.sensors import Sensors
 

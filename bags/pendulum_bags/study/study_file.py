@@ -6,7 +6,7 @@ import hashlib
 import itertools
 import json
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping, Sequence, Sized
 from dataclasses import dataclass, field
 from importlib import resources
 from pathlib import Path
@@ -30,6 +30,7 @@ _KEYS = (
 )  # fmt: skip
 _PLANT_KEYS = ("side", "plant", "design_plant", "strategy", "method", "engine", "parameters", "hardware")
 _MAX_RUNS = 100_000
+_LARGEST = 1e300  # whole numbers in YAML have no end
 
 # Measured on two cores; an estimate for --dry-run, not a promise.
 _NODE_START = 5.0
@@ -137,8 +138,8 @@ def load_study(source: str | Path, *, seeds: Sequence[int] | None = None) -> Stu
     analysis = _choice(file, "analysis", ANALYSES, "metrics" if experiment == "run" else "none")
     values = list(seeds) if seeds is not None else _seeds(file)
     repeats = file.get("repeats", int, 1, "a whole number >= 1")
-    if repeats < 1:
-        file.fail(f"repeats is {repeats}; expected >= 1", "repeats")
+    if not 1 <= repeats <= _MAX_RUNS:
+        file.fail(f"repeats is {repeats}; expected 1 to {_MAX_RUNS}", "repeats")
     make = _plain_runs if experiment == "run" else _named_runs
     runs = tuple(make(file, experiment, values, repeats))
     return Study(
@@ -152,7 +153,7 @@ def load_study(source: str | Path, *, seeds: Sequence[int] | None = None) -> Stu
 
 
 def _plain_runs(file: LocatedMapping, _: str, seeds: Sequence[int], repeats: int) -> list[StudyRun]:
-    duration = float(file.get("duration", (int, float), 5.0, "a number of seconds"))
+    duration = _duration(file)
     plants, controllers = _axis(file, "plants"), _axis(file, "controllers")
     disturbances = _axis(file, "disturbances", {"none": {}})
     set_points = file.get("set_points", list, [0.0], "a list of angles from upright [rad]")
@@ -166,9 +167,7 @@ def _plain_runs(file: LocatedMapping, _: str, seeds: Sequence[int], repeats: int
         if not _is_number(value):
             file.fail(f"set-point is {value!r}; expected an angle from upright [rad]", "set_points", index)
     axes = (plants, controllers, disturbances, set_points, starts, seeds, range(1, repeats + 1))
-    count = math.prod(len(axis) for axis in axes)
-    if count > _MAX_RUNS:
-        file.fail(f"the matrix has {count} runs; expected at most {_MAX_RUNS}")
+    _limit_runs(file, axes)
     runs = []
     for number, (plant, controller, disturbance, set_point, start, seed, repeat) in enumerate(
         itertools.product(*axes), start=1
@@ -214,6 +213,12 @@ def _plain_runs(file: LocatedMapping, _: str, seeds: Sequence[int], repeats: int
     return runs
 
 
+def _limit_runs(file: LocatedMapping, axes: Sequence[Sized]) -> None:
+    count = math.prod(len(axis) for axis in axes)
+    if count > _MAX_RUNS:
+        file.fail(f"the matrix has {count} runs; expected at most {_MAX_RUNS}")
+
+
 def _named_runs(file: LocatedMapping, experiment: str, seeds: Sequence[int], repeats: int) -> list[StudyRun]:
     plants = _axis(file, "plants", {"thesis": {}})
     runs = []
@@ -227,6 +232,7 @@ def _named_runs(file: LocatedMapping, experiment: str, seeds: Sequence[int], rep
         )
     trials = file.get("trials", int, 6 if experiment == "inertia_damping" else 3, "a whole number >= 1")
     axes = (plants, controllers, disturbances, seeds, range(1, repeats + 1))
+    _limit_runs(file, axes)
     for number, (plant, controller, disturbance, seed, repeat) in enumerate(
         itertools.product(*axes), start=1
     ):
@@ -238,7 +244,7 @@ def _named_runs(file: LocatedMapping, experiment: str, seeds: Sequence[int], rep
             arguments += _thesis_arguments(controllers[controller], controller, disturbances[disturbance])
             arguments += [
                 "--duration",
-                repr(float(file.get("duration", (int, float), 5.0, "a number of seconds"))),
+                repr(_duration(file)),
             ]
             seconds, size = _THESIS_SECONDS, _THESIS_BYTES
         else:
@@ -266,7 +272,10 @@ def _thesis_arguments(controller: LocatedMapping, name: str, disturbance: Locate
         arguments += ["--q", *(repr(float(value)) for value in q)]
     for key, source in (("r", controller), ("amplitude", disturbance), ("hold_time", disturbance)):
         if key in source.values:
-            value = float(source.get(key, (int, float), None, "a number"))
+            value = source.get(key, (int, float), None, "a number")
+            if not _is_number(value):
+                source.fail(f"{key} is {value!r}; expected a number", key)
+            value = float(value)
             arguments += [f"--{key.replace('_', '-')}", repr(value)]
     return arguments
 
@@ -291,6 +300,8 @@ def _seeds(file: LocatedMapping) -> list[int]:
         entry.reject_unknown(("first", "count"))
         first = entry.get("first", int, 1, "a whole number >= 0")
         count = entry.get("count", int, None, "a whole number >= 1")
+        if not 1 <= count <= _MAX_RUNS:
+            entry.fail(f"count is {count}; expected 1 to {_MAX_RUNS}", "count")
         value = list(range(first, first + count))
     if not value or not all(
         isinstance(seed, int) and not isinstance(seed, bool) and seed >= 0 for seed in value
@@ -315,5 +326,12 @@ def _start_angle(start: Any, seed: int) -> float:
     return STARTS[start] if isinstance(start, str) else float(start)
 
 
+def _duration(file: LocatedMapping) -> float:
+    value = file.get("duration", (int, float), 5.0, "a number of seconds")
+    if not _is_number(value):
+        file.fail(f"duration is {value!r}; expected a finite number of seconds", "duration")
+    return float(value)
+
+
 def _is_number(value: Any) -> bool:
-    return isinstance(value, (int, float)) and not isinstance(value, bool) and math.isfinite(value)
+    return isinstance(value, (int, float)) and not isinstance(value, bool) and abs(value) < _LARGEST

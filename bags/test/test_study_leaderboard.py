@@ -1,0 +1,66 @@
+"""The leaderboard: costs and scores by hand, physics of the result, a page that stands alone."""
+
+from __future__ import annotations
+
+import math
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from pendulum_bags.experiment.in_process import RunArrays
+from pendulum_bags.study.leaderboard import COSTS, contenders, costs_of, evaluate, scores
+from pendulum_bags.study.leaderboard_page import write_page
+from pendulum_lqr.controller import CONTROLLERS
+
+
+def test_costs_of_a_motion_known_in_closed_form() -> None:
+    count = 1000
+    stamp = np.arange(count + 1, dtype=np.int64) * 10_000_000
+    position = np.where(np.arange(count + 1) < 300, 0.0, math.pi)
+    velocity = np.full(count + 1, 0.25)
+    still = np.zeros(count + 1)
+    arrays = RunArrays(stamp, position, velocity, still, still, still, np.full(count, -2.0))
+    success, uptime, costs = costs_of(arrays)
+    assert success
+    assert uptime == pytest.approx(701 / 1001)
+    assert costs == pytest.approx(
+        {
+            "time": 3.0,
+            "max_torque": 2.0,
+            "energy": 5.0,
+            "torque_integral": 20.0,
+            "torque_squared": 40.0,
+            "smoothness": 0.0,
+            "velocity": 0.625,
+        }
+    )
+    found = scores(success, uptime, costs)
+    # v1 by hand: .2 * 3/10 + .1 * 2/2 + .1 * 5/100 + .1 * 20/20 + .1 * 40/40 + 0 + .2 * .625/100.
+    assert found["v1"] == pytest.approx(1.0 - 0.06 - 0.1 - 0.005 - 0.1 - 0.1 - 0.00125)
+    assert found["v2"] == pytest.approx(
+        1.0 - np.mean(np.tanh(np.pi * np.array([0.3, 1.0, 0.05, 1.0, 1.0, 0.0, 0.00625])))
+    )
+    assert found["v3"] == uptime
+
+
+def test_weights_of_the_first_version_sum_to_one() -> None:
+    assert sum(cost.weight for cost in COSTS) == pytest.approx(1.0)
+
+
+def test_a_motor_too_weak_to_lift_the_pendulum_needs_a_swing_up() -> None:
+    assert not evaluate("dfki", "lqr", robustness=False).success
+    assert evaluate("dfki", "energy_swing_up", robustness=False).success
+
+
+def test_every_controller_is_on_the_board() -> None:
+    assert set(contenders()) == set(CONTROLLERS) - {"playback"}
+
+
+def test_page_stands_alone_and_every_row_has_its_run(tmp_path: Path) -> None:
+    entries = [evaluate("thesis", name, duration=4.0, robustness=False) for name in ("lqr", "pid")]
+    text = write_page(tmp_path / "board.html", entries, 4.0).read_text(encoding="utf-8")
+    assert not re.search(r'(src|href)="(?!data:|#)', text)
+    for anchor in re.findall(r'href="#([^"]+)"', text):
+        assert f'id="{anchor}"' in text
