@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 import os
 import shutil
 import subprocess
@@ -10,6 +11,50 @@ from pathlib import Path
 
 PROJECT = Path(__file__).resolve().parents[1]
 GATHERED = PROJECT / "build" / "docs"
+PACKAGES = ("pendulum_sim", "pendulum_hw_bridge", "pendulum_lqr", "pendulum_bags")
+NODES = (
+    ("simulator", "pendulum_sim.simulator_node", ("SPECS",)),
+    ("viewer", "pendulum_sim.viewer_node", ("SPECS",)),
+    ("markers", "pendulum_sim.markers_node", ("SPECS",)),
+    ("bridge", "pendulum_hw_bridge.bridge_node", ("SPECS",)),
+    ("disturbance", "pendulum_lqr.disturbance_node", ("DISTURBANCE_SPECS", "NODE_SPECS")),
+    ("recorder", "pendulum_bags.recorder_node", ("SPECS",)),
+    ("play", "pendulum_bags.topic_replay_node", ("SPECS",)),
+)
+"""Node, module, its tables of parameters."""
+
+
+def reference() -> str:
+    """Return the reference page, from the tables that the programs themselves read."""
+    from pendulum_lqr.bringup import ARGUMENTS
+    from pendulum_lqr.controller import COMMON_PARAMETERS, CONTROLLERS, controller_class
+    from pendulum_msgs_py.parameters import markdown_table
+
+    parts = [
+        "# Reference\n\nGenerated from the code: what stands here is what the programs read.\n\n## Programs\n"
+    ]
+    for package in PACKAGES:
+        for name, target in importlib.import_module(f"{package}.executables").EXECUTABLES.items():
+            text = (importlib.import_module(target.split(":")[0]).__doc__ or "").strip().splitlines()[0]
+            parts.append(f"- `python -m {package} {name}`: {text.partition(': ')[2] or text}")
+    parts.append("\n## Parameters of the nodes\n")
+    for name, module, tables in NODES:
+        specs = [spec for table in tables for spec in getattr(importlib.import_module(module), table)]
+        parts.append(f"### {name}\n\n{markdown_table(specs)}\n")
+    node = importlib.import_module("pendulum_lqr.controller_node").NODE_SPECS
+    parts.append(f"### controller\n\n{markdown_table([*node, *COMMON_PARAMETERS])}\n\n## Controllers\n")
+    for name in CONTROLLERS:
+        own = controller_class(name)
+        table = markdown_table(own.PARAMETERS) if own.PARAMETERS else "No parameters of its own."
+        parts.append(f"### {name}\n\n{own.SUMMARY}.\n\n{table}\n")
+    parts.append(
+        "## Arguments of `bringup.launch.py`\n\n| argument | default | choices | meaning |\n|---|---|---|---|"
+    )
+    parts += [
+        f"| `{it.name}` | `{it.default or chr(34) * 2}` | {', '.join(it.choices) or 'any'} | {it.description} |"
+        for it in ARGUMENTS
+    ]
+    return "\n".join(parts) + "\n"
 
 
 def main() -> int:
@@ -32,6 +77,7 @@ def main() -> int:
         target = GATHERED / name
         target.parent.mkdir(parents=True, exist_ok=True)
         shutil.copyfile(PROJECT / name, target)
+    (GATHERED / "reference.md").write_text(reference(), encoding="utf-8")
     configuration = str(PROJECT / ".docs" / "mkdocs.yml")
     command = [sys.executable, "-m", "mkdocs", "build", "--quiet", "--strict", "--config-file", configuration]
     environment = {**os.environ, "NO_MKDOCS_2_WARNING": "1"}

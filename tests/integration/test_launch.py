@@ -82,10 +82,11 @@ def test_a_number_that_is_none_is_refused_by_name(name: str, text: str) -> None:
         programs({**DEFAULTS, "disturbance": "uniform", name: text})
 
 
-def test_the_parameter_file_fits_the_nodes() -> None:
-    text = (PROJECT / "pendulum_lqr" / "config" / "lqr_thesis.yaml").read_text(encoding="utf-8")
+@pytest.mark.parametrize("file", ["lqr_thesis.yaml", "ros2_control_lqr.yaml"])
+def test_the_parameter_file_fits_the_nodes(file: str) -> None:
+    text = (PROJECT / "pendulum_lqr" / "config" / file).read_text(encoding="utf-8")
     for key, content in yaml.safe_load(text).items():
-        values = content["ros__parameters"]
+        values = {name: value for name, value in content["ros__parameters"].items() if name != "use_sim_time"}
         program = NodeProgram("pendulum_lqr", key.split("/")[-1], parameters=values)
         assert validate(_specs(program), values, where=key)
 

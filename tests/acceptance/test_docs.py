@@ -1,0 +1,93 @@
+"""The pages: links lead somewhere, commands that build on each other run in order, the site needs no network."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import subprocess
+from pathlib import Path
+from xml.etree import ElementTree
+
+import pytest
+import yaml
+
+from pendulum_msgs_py import names
+from tests.fixtures import PROJECT
+
+PAGES = sorted(
+    PROJECT / name
+    for name in subprocess.run(
+        ["git", "ls-files", "*.md"], cwd=PROJECT, capture_output=True, text=True, check=True
+    ).stdout.splitlines()
+)
+_LINK = re.compile(r"\]\(([^)#\s]+)[^)]*\)")
+_IN_ORDER = re.compile(r"^<!-- run in order -->\n```console\n(.*?)^```", re.MULTILINE | re.DOTALL)
+_ELSEWHERE = re.compile(r"<(?:script|img|link|iframe)\b[^>]*\b(?:src|href)=\"?(https?:|//)[^>]*>")
+CHAINS = [page for page in PAGES if _IN_ORDER.search(page.read_text(encoding="utf-8"))]
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(PROJECT)))
+def test_links_of_a_page_lead_somewhere(page: Path) -> None:
+    text = re.sub(r"```.*?```", "", page.read_text(encoding="utf-8"), flags=re.DOTALL)
+    targets = [
+        target for target in _LINK.findall(text) if "://" not in target and not target.startswith("mailto:")
+    ]
+    assert [target for target in targets if not (page.parent / target).exists()] == []
+
+
+@pytest.mark.timeout(180)
+@pytest.mark.parametrize("page", CHAINS, ids=lambda page: str(page.relative_to(PROJECT)))
+def test_commands_that_build_on_each_other_run(page: Path, domain_id: int, tmp_path: Path) -> None:
+    environment = {**os.environ, "PATH": f"{PROJECT / '.venv' / 'bin'}:{os.environ['PATH']}"}
+    for block in _IN_ORDER.findall(page.read_text(encoding="utf-8")):
+        for line in block.splitlines():
+            if not line.startswith("$ "):
+                continue
+            done = subprocess.run(
+                line[2:], shell=True, cwd=tmp_path, env=environment, capture_output=True, text=True, timeout=120,
+                check=False,
+            )  # fmt: skip
+            assert done.returncode == 0, f"{line}\n{done.stdout}\n{done.stderr}"
+
+
+@pytest.mark.timeout(180)
+def test_the_site_is_built_and_needs_no_other_server() -> None:
+    done = subprocess.run(
+        ["make", "--no-print-directory", "docs"],
+        cwd=PROJECT,
+        capture_output=True,
+        text=True,
+        timeout=170,
+        check=False,
+    )
+    assert done.returncode == 0, done.stdout + done.stderr
+    site = PROJECT / "build" / "site"
+    pages = list(site.rglob("*.html"))
+    assert len(pages) > 15
+    for page in pages:
+        found = _ELSEWHERE.search(page.read_text(encoding="utf-8"))
+        # The address of the page itself, for search engines, is no request.
+        assert found is None or 'rel="canonical"' in found.group(0), f"{page}: {found and found.group(0)}"
+    text = (site / "reference" / "index.html").read_text(encoding="utf-8")
+    for word in ("handover_effort_limit", "energy_swing_up", "bringup.launch.py", "pendulum_bags console"):
+        assert word in text
+
+
+def test_layouts_show_signals_that_exist() -> None:
+    folder = PROJECT / "bags" / "config"
+    known = {names.JOINT_STATES, names.EFFORT_COMMAND, names.DISTURBANCE, names.APPLIED_EFFORT}
+    curves = ElementTree.parse(folder / "plotjuggler_layout.xml").getroot().iter("curve")
+    plotjuggler = {str(curve.get("name")) for curve in curves}
+    assert {name.split("/")[2] for name in plotjuggler} == known
+    assert {name.split("/")[1] for name in plotjuggler} == {"sim", "hw"}
+    layout = json.loads((folder / "foxglove_layout.json").read_text(encoding="utf-8"))
+    panels = [panel for name, panel in layout["configById"].items() if name.startswith("Plot!")]
+    paths = {path["value"].split(".")[0] for panel in panels for path in panel["paths"]}
+    assert paths == {f"/{side}/{topic}" for side in ("sim", "hw") for topic in known}
+
+
+def test_the_controller_manager_is_told_our_joint() -> None:
+    path = PROJECT / "pendulum_lqr" / "config" / "ros2_control_controllers.yaml"
+    content = yaml.safe_load(path.read_text(encoding="utf-8"))
+    assert content["effort_controller"]["ros__parameters"]["joints"] == [names.JOINT]
