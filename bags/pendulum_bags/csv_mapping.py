@@ -82,10 +82,16 @@ def read_csv(path: str | Path, mapping: str | Path | Mapping[str, Any] | None = 
     """
     source = Path(path)
     rules, origin = _load_mapping(mapping)
-    names, table = _read_table(source, str(rules.get("delimiter", ",")))
+    delimiter = rules.get("delimiter", ",")
+    if not isinstance(delimiter, str) or len(delimiter) != 1 or delimiter in '\r\n"':
+        raise DataError(f"{origin}: delimiter is {delimiter!r}; expected one character")
+    names, table = _read_table(source, delimiter)
     first, last = _row_range(rules, len(table), origin)
     table = table[first:last]
-    meta = {"source": str(source), "mapping": origin, **dict(rules.get("meta", {}))}
+    given = rules.get("meta") or {}
+    if not isinstance(given, Mapping):
+        raise DataError(f"{origin}: meta is {given!r}; expected names and values")
+    meta = {"source": str(source), "mapping": origin, **given}
     if first or last < len(table) + first:
         meta["rows"] = [first, last]
     time = _time(rules["time"], names, table, source, origin, first)
@@ -146,7 +152,11 @@ def _read_table(source: Path, delimiter: str) -> tuple[list[str], Array]:
     except (OSError, UnicodeDecodeError) as error:
         raise DataError(f"{source} cannot be read as text: {error}") from error
     head, _, body = text.partition("\n")
-    names = [name.strip() for name in next(csv.reader([head.lstrip("# ").strip()], delimiter=delimiter), [])]
+    try:
+        cells = next(csv.reader([head.lstrip("# ").strip()], delimiter=delimiter), [])
+    except (csv.Error, TypeError) as error:
+        raise DataError(f"{source} begins with a line that is no CSV: {error}") from error
+    names = [name.strip() for name in cells]
     if not names or all(_is_number(name) for name in names):
         raise DataError(
             f"{source} begins with {head[:60]!r}; expected a first line with the names of the columns"
@@ -165,8 +175,14 @@ def _read_table(source: Path, delimiter: str) -> tuple[list[str], Array]:
 
 
 def _first_bad_cell(body: str, names: list[str], delimiter: str) -> str | None:
-    for number, row in enumerate(csv.reader(io.StringIO(body), delimiter=delimiter), start=2):
-        if row and len(row) != len(names):
+    for number, line in enumerate(io.StringIO(body), start=2):
+        try:
+            row = next(csv.reader([line], delimiter=delimiter), [])
+        except csv.Error as error:
+            return f"line {number} is no CSV: {error}"
+        if not row:
+            continue
+        if len(row) != len(names):
             return f"line {number} has {len(row)} cells; expected {len(names)} ({', '.join(names)})"
         for name, cell in zip(names, row, strict=True):
             if not _is_number(cell):
@@ -184,7 +200,7 @@ def _is_number(text: str) -> bool:
 
 def _row_range(rules: Mapping[str, Any], count: int, origin: str) -> tuple[int, int]:
     rows = rules.get("rows", [0, count])
-    valid = isinstance(rows, (list, tuple)) and len(rows) == 2 and all(isinstance(r, int) for r in rows)
+    valid = isinstance(rows, (list, tuple)) and len(rows) == 2 and all(type(r) is int for r in rows)
     if not valid or not 0 <= rows[0] < min(rows[1], count):
         raise DataError(
             f"{origin}: rows is {rows!r}; expected [first, stop] within the {count} rows of the file"
@@ -201,7 +217,7 @@ def _factor(name: str, section: Mapping[str, Any], quantity: str, origin: str) -
 
 def _quantity_of(unit: Any, origin: str) -> str:
     for quantity in ("effort", "voltage", "angle"):
-        if unit in UNITS[quantity]:
+        if isinstance(unit, str) and unit in UNITS[quantity]:
             return quantity
     expected = ", ".join(u for quantity in ("effort", "voltage", "angle") for u in UNITS[quantity])
     raise DataError(f"{origin}: unit of input is {unit!r}; expected one of {expected}")
@@ -218,7 +234,9 @@ def _column(
     first_row: int,
 ) -> Array | None:
     wanted = section.get("column")
-    candidates = [wanted] if isinstance(wanted, str) else list(wanted or [])
+    candidates = wanted if isinstance(wanted, (list, tuple)) else [wanted] if wanted else []
+    if not all(isinstance(candidate, str) for candidate in candidates):
+        raise DataError(f"{origin}: column of {name} is {wanted!r}; expected a name or a list of names")
     found = next((column for column in candidates if column in names), None)
     if found is None:
         if section.get("optional"):
@@ -238,20 +256,27 @@ def _column(
             f"{source}: column {found!r} is {raw[bad[0]]} in row {bad[0] + first_row} ({bad.size} such rows); "
             "expected finite numbers: cut with `rows` or repair the file"
         )
-    return np.asarray(sign * (raw + float(section.get("offset", 0.0))) * factor)
+    return np.asarray(sign * (raw + _number("offset", section, name, origin)) * factor)
 
 
 def _time(
     section: Mapping[str, Any], names: list[str], table: Array, source: Path, origin: str, first_row: int
 ) -> Array:
     if "period" in section:
-        period = float(section["period"]) * _factor("time", section, "time", origin)
+        period = _number("period", section, "time", origin) * _factor("time", section, "time", origin)
         if not (math.isfinite(period) and period > 0.0):
             raise DataError(f"{origin}: period of time is {section['period']!r}; expected > 0")
         return (np.arange(len(table)) + first_row) * period
     column = _column("time", section, "time", names, table, source, origin, first_row)
     assert column is not None
-    return column - float(section.get("start", 0.0))
+    return column - _number("start", section, "time", origin)
+
+
+def _number(key: str, section: Mapping[str, Any], name: str, origin: str) -> float:
+    value = section.get(key, 0.0)
+    if isinstance(value, bool) or not isinstance(value, (int, float)) or not abs(value) < 1e300:
+        raise DataError(f"{origin}: {key} of {name} is {value!r}; expected a finite number")
+    return float(value)
 
 
 def _check_magnitudes(source: Path, time: Array, position: Array) -> None:

@@ -232,7 +232,9 @@ def read_servo_log(path: str | Path) -> Recording:
     source = Path(path)
     try:
         content = json.loads(source.read_text(encoding="utf-8"))
-    except (json.JSONDecodeError, UnicodeDecodeError) as error:
+    except OSError as error:
+        raise DataError(f"{source} cannot be read: {error.strerror or error}") from error
+    except (ValueError, RecursionError) as error:
         raise DataError(f"{source} is not JSON: {error}") from error
     if (
         not isinstance(content, dict)
@@ -241,13 +243,16 @@ def read_servo_log(path: str | Path) -> Recording:
     ):
         raise DataError(f"{source} has no list 'entries'; expected a log of the friction study")
     entries: list[dict[str, Any]] = content["entries"]
+    wrong = next((i for i, entry in enumerate(entries) if not isinstance(entry, dict)), None)
+    if wrong is not None:
+        raise DataError(f"{source}: entry {wrong} is {entries[wrong]!r}; expected a mapping")
     columns: dict[str, Array] = {}
     for key in (*_SERVO_ENTRY_KEYS, "speed", "load", "input_volts", "temp"):
         missing = [i for i, entry in enumerate(entries) if key not in entry]
         if not missing:
             try:
                 columns[key] = np.array([entry[key] for entry in entries], dtype=float)
-            except (TypeError, ValueError) as error:
+            except (TypeError, ValueError, OverflowError) as error:
                 raise DataError(f"{source}: entries[].{key} is not a number everywhere: {error}") from error
         elif key in _SERVO_ENTRY_KEYS:
             raise DataError(

@@ -127,15 +127,16 @@ def load_gains(path: str | Path) -> GainSet:
         raise ParameterError(f"gains file {path} declares a document type; expected plain XML")
     try:
         root = ElementTree.fromstring(text)
-    except ElementTree.ParseError as error:
+    except (ElementTree.ParseError, LookupError, ValueError) as error:  # the latter two: an encoding of its own
         raise ParameterError(f"gains file {path} is not XML: {error}") from error
     if root.tag != "group_gains":
         raise ParameterError(f"gains file {path}: root element is <{root.tag}>; expected <group_gains>")
     elements = {child.tag: child for child in root}
     reject_unknown(dict.fromkeys(elements), ("control_strategy", *LOOPS), where=str(path))
-    strategy = int(_number(elements["control_strategy"], path)) if "control_strategy" in elements else 3
-    if strategy not in DEFAULT_GAINS:
-        raise ParameterError(f"gains file {path}: control_strategy is {strategy}; expected 1 to 4")
+    number = _number(elements["control_strategy"], path) if "control_strategy" in elements else 3.0
+    if number not in DEFAULT_GAINS:
+        raise ParameterError(f"gains file {path}: control_strategy is {number:g}; expected 1 to 4")
+    strategy = int(number)
     loops = {loop: DEFAULT_GAINS[strategy].loop(loop) for loop in LOOPS}
     for loop in LOOPS:
         if loop not in elements:

@@ -220,10 +220,13 @@ def load_fit_model(path: str | Path) -> FitModel:
     source = Path(path)
     try:
         content = json.loads(source.read_text(encoding="utf-8"))
-    except (OSError, json.JSONDecodeError) as error:
+    except (OSError, ValueError, RecursionError) as error:
         raise DataError(f"{source} cannot be read as an identification: {error}") from error
     if not isinstance(content, dict) or content.get("format") != FORMAT:
         raise DataError(f"{source} is no identification; expected a JSON file with format {FORMAT!r}")
+    for key in ("parameters", "input_kind", "friction", "duty_gain"):
+        if key not in content:
+            raise DataError(f"{source} has no {key!r}; expected the identification as it was written")
     return FitModel(content["parameters"], content["input_kind"], content["friction"], content["duty_gain"])
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import json
 import os
 from collections.abc import Iterator, Mapping, Sequence
@@ -15,6 +16,7 @@ import numpy.typing as npt
 
 from pendulum_bags.reader.batches import Batch, Int64, Source, Stream
 from pendulum_bags.reader.joint_state import JointStateParser
+from pendulum_bags.reader.mcap_source import decompress_bounded
 from pendulum_bags.reader.open_source import BagFolder, open_folder, open_sources
 from pendulum_msgs_py.errors import BagError, DataError
 
@@ -165,10 +167,8 @@ class Bag(Mapping[str, Any]):
             return self[topic]  # raises
         rows = [row for batch in self._batches({topic})[topic] for row in batch.payloads()]
         if self._message_compression:
-            import zstandard
-
-            decompress = zstandard.ZstdDecompressor().decompressobj
-            rows = [(time, decompress().decompress(data)) for time, data in rows]
+            name = f"{self.path}: topic {topic}"
+            rows = [(time, decompress_bounded(io.BytesIO(data), name)) for time, data in rows]
         rows.sort(key=lambda row: row[0])
         return rows
 
@@ -207,6 +207,9 @@ class Bag(Mapping[str, Any]):
                 parsed = _parsed(text)
                 event = parsed if isinstance(parsed, dict) else {"name": text}
                 events.append({"stamp_ns": time, "name": "", **event, "topic": name, "log_time_ns": time})
+        for event in events:
+            if not isinstance(event["stamp_ns"], int):
+                event["stamp_ns"] = event["log_time_ns"]  # anybody may write there
         events.sort(key=lambda event: (event["stamp_ns"], event["log_time_ns"]))
         return events
 
@@ -351,5 +354,5 @@ def _parsed(text: Any) -> Any:
         return text
     try:
         return json.loads(text)
-    except ValueError:
+    except (ValueError, RecursionError):
         return text

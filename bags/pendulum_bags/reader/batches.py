@@ -10,6 +10,8 @@ from typing import Protocol
 import numpy as np
 import numpy.typing as npt
 
+from pendulum_msgs_py.errors import BagError
+
 __all__ = ["MCAP_HEAD", "Batch", "Bytes", "Int64", "Source", "Stream"]
 
 Bytes = npt.NDArray[np.uint8]
@@ -17,6 +19,7 @@ Int64 = npt.NDArray[np.int64]
 
 MCAP_HEAD = 31
 """Bytes of an MCAP message record before the message itself: opcode, length, channel, sequence, two times."""
+_OVERLAP = "the bag names messages that overlap each other; try to repair it"
 
 
 @dataclass(slots=True)
@@ -45,14 +48,23 @@ class Batch:
     def payloads(self) -> Iterator[tuple[int, bytes]]:
         """Yield (log time [ns], message bytes) one by one."""
         view = self.buffer.data
+        # Messages do not overlap, so together they are no larger than the buffer; an index that says otherwise is
+        # damaged, or a bomb that names one large message a million times.
+        left = len(view)
         if self.sizes is not None:
             for time, start, size in zip(
                 self.times.tolist(), self.offsets.tolist(), self.sizes.tolist(), strict=True
             ):
+                left -= size
+                if left < 0:
+                    raise BagError(_OVERLAP)
                 yield time, bytes(view[start : start + size])
             return
         for time, start in zip(self.times.tolist(), self.offsets.tolist(), strict=True):
             size = int.from_bytes(view[start + 1 : start + 9], "little") - 22
+            left -= max(size, 0)
+            if left < 0:
+                raise BagError(_OVERLAP)
             yield time, bytes(view[start + MCAP_HEAD : start + MCAP_HEAD + size])
 
 

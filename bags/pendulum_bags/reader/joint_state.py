@@ -32,6 +32,9 @@ FIELDS = np.dtype(
 """Columns of the arrays: times [ns], position [rad], velocity [rad/s], effort [N m]; absent values are NaN."""
 
 _BLOCK = 8192  # messages parsed at once: their bytes stay in the cache
+_MAX_EXPECTED = 1 << 22  # messages that memory is taken for before they are seen: a damaged file may claim any number
+_MAX_COPY = 1 << 26  # bytes of messages that are copied at once
+_MAX_FRAME = 255  # bytes of a frame id that are kept: no name in ROS is longer
 _LAYOUTS = 16  # layouts tried in one batch before a topic counts as not fixed
 
 
@@ -176,7 +179,7 @@ def _plan(layout: Layout, head: int, channel: int) -> _Plan:
     column("nanosec", "<u4", head + 8)
     start, size = layout.frame
     if size:
-        column("frame", f"S{size}", head + start)
+        column("frame", f"S{min(size, _MAX_FRAME)}", head + start)
     for name, offset in zip(("position", "velocity", "effort"), layout.values, strict=True):
         if offset >= 0:
             column(name, "<f8", head + offset)
@@ -206,7 +209,7 @@ class JointStateParser:
     """
 
     def __init__(self, count: int) -> None:
-        self._columns = _Columns(np.empty(count, FIELDS))
+        self._columns = _Columns(np.empty(min(count, _MAX_EXPECTED), FIELDS))
         self._fixed = True
 
     def add(self, batch: Batch) -> None:
@@ -216,7 +219,7 @@ class JointStateParser:
         columns = self._columns
         needed = columns.at + len(batch.offsets)
         if needed > len(columns.array):
-            spare = np.empty(needed - len(columns.array), FIELDS)
+            spare = np.empty(max(needed, 2 * len(columns.array)) - len(columns.array), FIELDS)
             columns.array = np.concatenate([columns.array, spare])
         self._fixed = _parse_batch(batch, columns)
 
@@ -313,10 +316,23 @@ def _fit_items(
     columns: _Columns,
     layout: Layout,
 ) -> Int64 | None:
+    size = plan.item.itemsize
+    if len(offsets) > 1 and len(offsets) * size > _MAX_COPY:
+        # Long frame ids: halves, so that the copy stays small whatever the messages claim.
+        rows = np.arange(len(out)) if left is None else left
+        rests = [
+            _fit_items(
+                batch, plan, offsets[part], times[part], None if sizes is None else sizes[part], rows[part], out,
+                columns, layout,
+            )
+            for part in (slice(None, len(offsets) // 2), slice(len(offsets) // 2, None))
+        ]  # fmt: skip
+        found = [rest for rest in rests if rest is not None]
+        return np.concatenate(found) if found else None
     # Every byte of the buffer as the possible start of a message: taking rows of it copies messages, nothing else.
     anywhere: npt.NDArray[Any] = np.ndarray(
-        (len(batch.buffer) - plan.item.itemsize + 1,),
-        f"V{plan.item.itemsize}",
+        (len(batch.buffer) - size + 1,),
+        f"V{size}",
         batch.buffer.data,
         strides=(1,),
     )

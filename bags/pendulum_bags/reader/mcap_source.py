@@ -9,7 +9,7 @@ import zlib
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 import numpy as np
 
@@ -17,12 +17,13 @@ from pendulum_bags.reader.batches import MCAP_HEAD, Batch, Bytes, Int64, Stream
 from pendulum_bags.storage import mcap_records as rec
 from pendulum_msgs_py.errors import BagError
 
-__all__ = ["Chunk", "McapSource", "decompress"]
+__all__ = ["Chunk", "McapSource", "decompress", "decompress_bounded"]
 
 _HEAD = rec.RECORD_HEAD_SIZE
 _FOOTER_REGION = rec.FOOTER_SIZE + len(rec.MAGIC)
 _CHUNK_FIELDS = struct.Struct("<QQQII")
 _GROUP_SIZE = 1 << 20  # decompressed bytes that are parsed at once
+_MAX_CHUNK = 1 << 28  # decompressed bytes of one chunk: recorders write chunks of about 1 MB, bombs larger ones
 _INDEX_HEAD = np.dtype(
     {
         "names": ["opcode", "length", "channel", "size"],
@@ -94,7 +95,7 @@ class McapSource:
             self._read_summary()
         except _NoIndexError:
             self._scan("")
-        except (_DamagedError, struct.error, UnicodeDecodeError, KeyError, OverflowError) as error:
+        except (_DamagedError, struct.error, ValueError, KeyError, OverflowError, IndexError) as error:
             self._scan(str(error) or type(error).__name__)
         self.compressed = any(chunk.compression for chunk in self.chunks)
         self.streams = [self._stream(channel) for channel in sorted(self._channels)]
@@ -153,6 +154,8 @@ class McapSource:
         if self.chunks:
             if not self._counts or any(not chunk.indexes for chunk in self.chunks):
                 raise _NoIndexError
+            if len({chunk.data_start for chunk in self.chunks}) != len(self.chunks):
+                raise _DamagedError("the index names a chunk twice")
             self.start_ns = min(chunk.start_ns for chunk in self.chunks)
             self.stop_ns = max(chunk.stop_ns for chunk in self.chunks)
         elif sum(self._counts.values()):
@@ -240,7 +243,10 @@ class McapSource:
             if opcode == rec.CHUNK:
                 self._scan_chunk(body, length)
             elif opcode == rec.MESSAGE:
-                self._note(view, at, self._loose, at)
+                if length < 22:
+                    self.damage = self.damage or f"the message at byte {at} is not whole"
+                else:
+                    self._note(view, at, self._loose, at)
             elif opcode in (rec.SCHEMA, rec.CHANNEL, rec.METADATA):
                 self._try_description(opcode, bytes(view[body : body + length]))
             at = body + length
@@ -294,7 +300,7 @@ class McapSource:
         return found
 
     def _note(self, raw: Any, offset: int, into: _Table, position: int) -> None:
-        channel, _, time = struct.unpack_from("<HIQ", raw, offset + _HEAD)
+        channel, _, time = struct.unpack_from("<HIq", raw, offset + _HEAD)
         into.setdefault(channel, []).append((time, position))
         self._counts[channel] = self._counts.get(channel, 0) + 1
         self.start_ns = min(self.start_ns, time)
@@ -366,6 +372,8 @@ class McapSource:
             return np.empty(0, np.int64), np.empty(0, np.int64)
         at, base = np.array(places, np.int64).T
         heads = self._take(_INDEX_HEAD, at)
+        if len(np.unique(at)) != len(at):
+            raise BagError(f"{self.path}: two chunks name one message index; try to repair the bag")
         counts = heads["size"].astype(np.int64) // 16
         whole = (heads["opcode"] == rec.MESSAGE_INDEX) & (heads["channel"] == channel)
         whole &= (heads["length"] == heads["size"] + np.uint64(6)) & (
@@ -412,13 +420,20 @@ class McapSource:
 def decompress(packed: Bytes, compression: str, size: int, name: str) -> bytes:
     """Return the content of a chunk.
 
+    Never more is decompressed than the head of the chunk says, and that has a bound.
+
     Raises:
-        BagError: Unknown compression, or the bytes are damaged.
+        BagError: Unknown compression, a chunk larger than any recorder's, or the bytes are damaged.
     """
+    if size > _MAX_CHUNK:
+        raise BagError(f"{name}: a chunk claims to hold {size} bytes; expected at most {_MAX_CHUNK}")
     if compression == "zstd":
         import zstandard
 
         try:
+            claimed = zstandard.frame_content_size(packed.data)  # -1 where the frame does not say
+            if claimed not in (-1, size):
+                raise BagError(f"{name}: a chunk claims to hold {claimed} bytes; its head says {size}")
             raw = zstandard.ZstdDecompressor().decompress(packed.data, max_output_size=size)
         except zstandard.ZstdError as error:
             raise BagError(f"{name}: a compressed chunk is damaged ({error})") from None
@@ -426,14 +441,37 @@ def decompress(packed: Bytes, compression: str, size: int, name: str) -> bytes:
         import lz4.frame
 
         try:
-            raw = lz4.frame.decompress(packed.tobytes())
-        except RuntimeError as error:
+            raw = lz4.frame.LZ4FrameDecompressor().decompress(packed.tobytes(), max_length=size + 1)
+        except (RuntimeError, EOFError) as error:
             raise BagError(f"{name}: a compressed chunk is damaged ({error})") from None
     else:
         raise BagError(f"{name}: chunk compression is {compression!r}; expected zstd, lz4 or none")
     if len(raw) != size:
         raise BagError(f"{name}: a chunk holds {len(raw)} bytes; its head says {size}")
     return raw
+
+
+def decompress_bounded(packed: BinaryIO, name: str, limit: int = _MAX_CHUNK) -> bytes:
+    """Return the content of a zstd stream that does not say how much it holds, or cannot be believed.
+
+    Raises:
+        BagError: It holds more than ``limit`` bytes, or is damaged.
+    """
+    import zstandard
+
+    parts, size = [], 0
+    try:
+        with zstandard.ZstdDecompressor().stream_reader(packed) as stream:
+            while part := stream.read(1 << 20):
+                parts.append(part)
+                size += len(part)
+                if size > limit:
+                    raise BagError(f"{name} holds more than {limit} bytes when decompressed")
+    except (OSError, zstandard.ZstdError) as error:
+        if isinstance(error, BagError):
+            raise
+        raise BagError(f"{name} cannot be decompressed: {error}") from None
+    return b"".join(parts)
 
 
 def _text(content: bytes, at: int) -> tuple[str, int]:

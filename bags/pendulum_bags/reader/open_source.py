@@ -11,7 +11,7 @@ from typing import Any
 import yaml
 
 from pendulum_bags.reader.batches import Source
-from pendulum_bags.reader.mcap_source import McapSource
+from pendulum_bags.reader.mcap_source import McapSource, decompress_bounded
 from pendulum_bags.reader.sqlite_source import SqliteSource
 from pendulum_bags.storage.metadata_file import METADATA_NAME, METADATA_VERSION
 from pendulum_msgs_py.errors import BagError
@@ -19,6 +19,10 @@ from pendulum_msgs_py.errors import BagError
 __all__ = ["BagFolder", "open_folder", "open_source", "open_sources"]
 
 _ENDINGS = {".mcap": "mcap", ".db3": "sqlite3"}
+_LEAST_ROOM = 1 << 28
+_MAX_RATIO = 100
+"""A file compressed as a whole may hold this many times its size: states shrink to a fifth, bombs to nothing."""
+_MAX_METADATA = 16 << 20
 
 
 @dataclass(slots=True)
@@ -47,16 +51,20 @@ def open_folder(path: Path) -> BagFolder:
         return BagFolder(path, [path], _ENDINGS.get(_ending(path), ""))
     folder = BagFolder(path, [])
     try:
-        text = (path / METADATA_NAME).read_text(encoding="utf-8")
+        text = _read_metadata(path / METADATA_NAME)
     except FileNotFoundError:
         folder.damage.append(f"{METADATA_NAME} is missing")
     except (OSError, UnicodeDecodeError) as error:
         folder.damage.append(f"{METADATA_NAME} is not readable: {error}")
     else:
         _take_metadata(folder, text)
-    present = sorted((file for file in path.iterdir() if _ending(file) in _ENDINGS), key=_file_order)
+    try:
+        inside = [file for file in path.iterdir() if _ending(file) in _ENDINGS and file.is_file()]
+    except OSError as error:
+        raise BagError(f"{path} cannot be read as a bag: {error.strerror or error}") from error
+    present = sorted(inside, key=_file_order)
     present = [file for file in present if not file.name.startswith(".")]
-    listed = [file for file in folder.files if file.exists()]
+    listed = [file for file in dict.fromkeys(folder.files) if file.is_file()]
     if missing := [file.name for file in folder.files if file not in listed]:
         folder.damage.append(f"listed but missing: {', '.join(missing)}")
     # A file that is not listed yet was begun by a recorder that died before it could say so.
@@ -69,9 +77,25 @@ def open_folder(path: Path) -> BagFolder:
     return folder
 
 
+def _read_metadata(path: Path) -> str:
+    if path.exists() and not path.is_file():
+        raise OSError("it is no file")  # a pipe would keep us waiting for ever
+    if path.stat().st_size > _MAX_METADATA:
+        raise OSError(f"it has more than {_MAX_METADATA} bytes")
+    return path.read_text(encoding="utf-8")
+
+
+def _load_yaml(text: str) -> Any:
+    """Return what YAML text says; aliases are refused, which can make gigabytes out of a line."""
+    loader = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
+    if "*" in text and any(isinstance(event, yaml.AliasEvent) for event in yaml.parse(text, loader)):
+        raise ValueError("aliases are not allowed here")
+    return yaml.load(text, Loader=loader)
+
+
 def _take_metadata(folder: BagFolder, text: str) -> None:
     try:
-        document = yaml.load(text, Loader=getattr(yaml, "CSafeLoader", yaml.SafeLoader))
+        document = _load_yaml(text)
         info: dict[str, Any] = document["rosbag2_bagfile_information"]
         version = int(info["version"])
         if version > METADATA_VERSION:
@@ -82,10 +106,10 @@ def _take_metadata(folder: BagFolder, text: str) -> None:
         folder.custom_data = {str(key): str(value) for key, value in custom.items()}
         for item in info.get("topics_with_message_count", []):
             topic: Mapping[str, Any] = item["topic_metadata"]
-            folder.topic_hashes[topic["name"]] = topic.get("type_description_hash", "")
+            folder.topic_hashes[str(topic["name"])] = str(topic.get("type_description_hash", ""))
         folder.message_count = int(info["message_count"])
         folder.message_compression = str(info.get("compression_mode") or "").lower() == "message"
-    except (yaml.YAMLError, KeyError, TypeError, ValueError, AttributeError) as error:
+    except (yaml.YAMLError, KeyError, TypeError, ValueError, AttributeError, RecursionError, OverflowError) as error:
         sentence = " ".join(str(error).split())
         folder.damage.append(f"{METADATA_NAME} is not what a bag has: {sentence or type(error).__name__}")
 
@@ -131,13 +155,13 @@ def open_source(file: Path) -> Source:
             if file.suffix == ".db3"
             else _unknown(file)
         )
-    import zstandard
-
     try:
         with file.open("rb") as packed:
-            data = zstandard.ZstdDecompressor().stream_reader(packed).read()
-    except (OSError, zstandard.ZstdError) as error:
-        raise BagError(f"{file} cannot be decompressed: {error}") from error
+            data = decompress_bounded(packed, str(file), max(_LEAST_ROOM, _MAX_RATIO * file.stat().st_size))
+    except OSError as error:
+        if isinstance(error, BagError):
+            raise
+        raise BagError(f"{file} cannot be read: {error.strerror or error}") from error
     if _ending(file) == ".mcap":
         return McapSource(file, data)
     folder = tempfile.TemporaryDirectory(prefix="pendulum_bags_")
@@ -161,8 +185,8 @@ def _metadata_from_storage(folder: BagFolder, source: Source) -> None:
     if not text:
         return
     try:
-        info = yaml.load(text, Loader=getattr(yaml, "CSafeLoader", yaml.SafeLoader))
-    except yaml.YAMLError:
+        info = _load_yaml(text)
+        info = info.get("rosbag2_bagfile_information", info)
+        folder.custom_data = {str(key): str(value) for key, value in (info.get("custom_data") or {}).items()}
+    except (yaml.YAMLError, AttributeError, TypeError, ValueError, RecursionError, OverflowError):
         return
-    info = info.get("rosbag2_bagfile_information", info) if isinstance(info, dict) else {}
-    folder.custom_data = {str(key): str(value) for key, value in (info.get("custom_data") or {}).items()}

@@ -66,6 +66,8 @@ def leaf_pages(buffer: Bytes, size: int, root: int) -> Int64 | None:
     """
     pages = np.array([root], np.int64)
     for _ in range(20):  # no file is deeper
+        if len(pages) * size > len(buffer):
+            return None  # a page has one parent, so there cannot be more of them than the file holds
         starts = (pages - 1) * size
         if len(starts) == 0 or int(starts.min()) < 0 or int(starts.max()) + size > len(buffer):
             return None
@@ -74,13 +76,13 @@ def leaf_pages(buffer: Bytes, size: int, root: int) -> Int64 | None:
             return starts
         if not (kinds == _INTERIOR).all():
             return None
-        pages = np.concatenate([_children(buffer, int(start)) for start in starts])
+        pages = np.concatenate([_children(buffer, int(start), size) for start in starts])
     return None
 
 
-def _children(buffer: Bytes, start: int) -> Int64:
+def _children(buffer: Bytes, start: int, size: int) -> Int64:
     head = start + (100 if start == 0 else 0)
-    count = int(buffer[head + 3]) << 8 | int(buffer[head + 4])
+    count = min(int(buffer[head + 3]) << 8 | int(buffer[head + 4]), (start + size - head - 12) // 2)
     pointers = np.frombuffer(buffer, ">u2", count, head + 12).astype(np.int64) + start
     last = np.array([head + 8], np.int64)
     at = np.concatenate([pointers, last])

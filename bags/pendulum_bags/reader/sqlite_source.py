@@ -19,6 +19,8 @@ __all__ = ["SqliteSource"]
 
 _ROWS = 8192
 _LARGEST_SALVAGE = 64 << 30  # a damaged head may claim any size
+# What SQLite and numpy say to a file that is not what it claims to be: SQLite's columns hold values of any type.
+_UNREADABLE = (sqlite3.Error, BagError, ValueError, TypeError, KeyError, IndexError, OverflowError, OSError)
 
 
 class SqliteSource:
@@ -60,7 +62,7 @@ class SqliteSource:
                 )
                 self._rows = self._read_pages()
             self.streams = self._read_streams()
-        except (sqlite3.Error, BagError) as error:
+        except _UNREADABLE as error:
             self.close()
             if not self._salvage(str(error)):
                 self.close()
@@ -107,7 +109,9 @@ class SqliteSource:
         missing = max(min(pages, _LARGEST_SALVAGE // size) * size - len(content), -len(content) % size)
         self._copy = tempfile.TemporaryDirectory(prefix="pendulum_bags_")
         copy = Path(self._copy.name, self.path.name)
-        copy.write_bytes(content + bytes(missing))
+        with copy.open("wb") as file:
+            file.write(content)
+            file.truncate(len(content) + missing)  # a hole: it takes neither memory nor disk
         self._buffer = np.frombuffer(content, np.uint8)
         starts = np.arange(0, len(content) - size + 1, size)
         kinds = self._buffer[np.where(starts == 0, 100, starts)]
@@ -116,7 +120,7 @@ class SqliteSource:
             self._connection = sqlite3.connect(copy)
             self._rows = _first_of_each(blocks)
             self.streams = self._read_streams()
-        except (sqlite3.Error, BagError):
+        except _UNREADABLE:
             return False
         self.damage = f"SQLite refuses it ({reason}); {len(kinds)} pages of {pages or len(kinds)} are there"
         return True
@@ -124,6 +128,8 @@ class SqliteSource:
     def _read_pages(self) -> list[MessageRows] | None:
         """Read the table of messages from its pages; ``None`` when only SQL can read this file."""
         run = self.connection.execute
+        if any(hidden for *_, hidden in run("PRAGMA table_xinfo(messages)")):
+            raise BagError(f"{self.path}: the table of messages computes its columns; expected stored ones")
         columns = [(name, key) for _, name, _, _, _, key in run("PRAGMA table_info(messages)")]
         if columns != [("id", 1), ("topic_id", 0), ("timestamp", 0), ("data", 0)]:
             return None
@@ -184,6 +190,10 @@ class SqliteSource:
         streams = []
         for row in run(f"SELECT {', '.join(present)} FROM topics ORDER BY id"):  # noqa: S608 (names from a list of ours)
             item = dict(zip(present, row, strict=True))
+            if not isinstance(item["id"], int) or not all(
+                isinstance(item[name], str) for name in present if name != "id"
+            ):
+                raise BagError(f"{self.path}: topic {item.get('name')!r} is described by values that are no text")
             encoding, text = definitions.get(item["type"], ("", ""))
             streams.append(
                 Stream(
@@ -206,7 +216,7 @@ class SqliteSource:
             row = self.connection.execute("SELECT metadata FROM metadata ORDER BY id DESC LIMIT 1").fetchone()
         except sqlite3.Error:
             return ""
-        return row[0] if row else ""
+        return row[0] if row and isinstance(row[0], str) else ""
 
     def batches(self, channels: set[int], start: int | None, stop: int | None) -> Iterator[Batch]:
         """Yield all messages of some topics with start <= log time < stop, in the order of the file."""
@@ -227,7 +237,10 @@ class SqliteSource:
                     # Large messages go on elsewhere in the file: SQLite puts them together.
                     for row_id in block.row_ids[wanted & ~block.local].tolist():
                         query = "SELECT topic_id, timestamp, data FROM messages WHERE id = ?"
-                        yield from _batches(self.connection.execute(query, (row_id,)).fetchall())
+                        try:
+                            yield from _batches(self.connection.execute(query, (row_id,)).fetchall())
+                        except (sqlite3.Error, ValueError, TypeError) as error:
+                            raise BagError(f"{self.path}: message {row_id} is damaged: {error}") from error
             return
         conditions, values = [], []
         if channels != {stream.channel for stream in self.streams}:
@@ -244,7 +257,7 @@ class SqliteSource:
             cursor = self.connection.execute(f"SELECT topic_id, timestamp, data FROM messages{where}", values)  # noqa: S608 (placeholders)
             while rows := cursor.fetchmany(_ROWS):
                 yield from _batches(rows)
-        except sqlite3.Error as error:
+        except (sqlite3.Error, ValueError, TypeError, OverflowError) as error:
             raise BagError(f"{self.path} is damaged: {error}; try to repair the bag") from error
 
 

@@ -94,7 +94,7 @@ def read_metadata(path: Path | None) -> dict[str, Any]:
         content = json.loads(path.read_text(encoding="utf-8"))
     except OSError as error:
         raise ParameterError(f"metadata file {path} cannot be read: {error.strerror}") from error
-    except ValueError as error:
+    except (ValueError, RecursionError) as error:
         raise ParameterError(f"metadata file {path} is no JSON: {error}") from error
     if not isinstance(content, dict):
         raise ParameterError(f"metadata file {path} holds {type(content).__name__}; expected a JSON object")

@@ -139,7 +139,7 @@ def load_study(source: str | Path, *, seeds: Sequence[int] | None = None) -> Stu
     values = list(seeds) if seeds is not None else _seeds(file)
     repeats = file.get("repeats", int, 1, "a whole number >= 1")
     if not 1 <= repeats <= _MAX_RUNS:
-        file.fail(f"repeats is {repeats}; expected 1 to {_MAX_RUNS}", "repeats")
+        file.fail(f"repeats is {repeats}; expected >= 1 and <= {_MAX_RUNS}", "repeats")
     make = _plain_runs if experiment == "run" else _named_runs
     runs = tuple(make(file, experiment, values, repeats))
     return Study(

@@ -7,6 +7,8 @@ from __future__ import annotations
 
 import csv
 import math
+import zipfile
+import zlib
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -116,8 +118,7 @@ def load_feedback(path: str | Path) -> FeedbackRecording:
         if path.stat().st_size > _LIMIT:
             raise DataError(f"{path} has {path.stat().st_size} bytes; expected at most {_LIMIT}")
         if path.suffix == ".npz":
-            with np.load(path, allow_pickle=False) as archive:
-                return FeedbackRecording({name: archive[name] for name in archive.files}, where=str(path))
+            return FeedbackRecording(_read_npz(path), where=str(path))
         if path.suffix == ".csv":
             return FeedbackRecording(_read_csv(path), where=str(path))
     except OSError as error:
@@ -126,7 +127,22 @@ def load_feedback(path: str | Path) -> FeedbackRecording:
         if isinstance(error, DataError):
             raise
         raise DataError(f"feedback file {path}: {error}") from error
+    except csv.Error as error:
+        raise DataError(f"feedback file {path} is no CSV file: {error}") from error
     raise DataError(f"feedback file {path} ends in {path.suffix!r}; expected .npz or .csv")
+
+
+def _read_npz(path: Path) -> dict[str, NDArray[np.float64]]:
+    try:
+        with zipfile.ZipFile(path) as archive:
+            # Zeros shrink to a thousandth: what counts is what they grow to.
+            size = sum(entry.file_size for entry in archive.infolist())
+        if size > _LIMIT:
+            raise DataError(f"{path} holds {size} bytes when unpacked; expected at most {_LIMIT}")
+        with np.load(path, allow_pickle=False) as arrays:
+            return {name: arrays[name] for name in arrays.files}
+    except (zipfile.BadZipFile, zlib.error, EOFError, RuntimeError, KeyError, MemoryError) as error:
+        raise DataError(f"feedback file {path} is no NPZ file: {error}") from error
 
 
 def _read_csv(path: Path) -> dict[str, list[float]]:
