@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import re
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -13,6 +14,8 @@ from pendulum_bags.experiment.in_process import RunArrays
 from pendulum_bags.study.leaderboard import COSTS, contenders, costs_of, evaluate, scores
 from pendulum_bags.study.leaderboard_page import write_page
 from pendulum_lqr.controller import CONTROLLERS
+
+BROWSER = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
 
 
 def test_costs_of_a_motion_known_in_closed_form() -> None:
@@ -64,3 +67,29 @@ def test_page_stands_alone_and_every_row_has_its_run(tmp_path: Path) -> None:
     assert not re.search(r'(src|href)="(?!data:|#)', text)
     for anchor in re.findall(r'href="#([^"]+)"', text):
         assert f'id="{anchor}"' in text
+
+
+@pytest.mark.skipif(BROWSER is None, reason="no Chromium is installed")
+@pytest.mark.parametrize("width", [1280, 390])
+def test_page_sorts_in_a_browser_without_an_error_and_opens_the_run_of_a_row(tmp_path: Path, width: int) -> None:
+    playwright = pytest.importorskip("playwright.sync_api")
+    entries = [evaluate("thesis", name, duration=4.0, robustness=False) for name in ("lqr", "pid")]
+    path = write_page(tmp_path / "board.html", entries, 4.0)
+    with playwright.sync_playwright() as running:
+        browser = running.chromium.launch(executable_path=BROWSER, args=["--no-sandbox", "--disable-gpu"])
+        page = browser.new_context(viewport={"width": width, "height": 900}, offline=True).new_page()
+        messages: list[str] = []
+        page.on("console", lambda message: messages.append(message.text))
+        page.on("pageerror", lambda error: messages.append(str(error)))
+        page.goto(path.resolve().as_uri())
+        names = page.locator("tbody th")
+        button = page.locator("thead button").first
+        button.press("Enter")
+        down = names.all_inner_texts()
+        button.press("Enter")
+        assert names.all_inner_texts() == down[::-1]
+        page.locator("tbody a").first.click()
+        page.locator("details[open] img").wait_for(timeout=5000)
+        assert page.evaluate("document.documentElement.scrollWidth") <= width
+        assert messages == []
+        browser.close()

@@ -30,9 +30,9 @@ def write_page(path: Path, entries: Sequence[Entry], duration: float) -> Path:
     environment = Environment(
         loader=PackageLoader("pendulum_bags.study", "templates"), autoescape=select_autoescape(["html", "j2"])
     )
-    plants: dict[str, list[dict[str, Any]]] = {}
+    plants: dict[str, list[dict[str, Any]]] = {entry.plant: [] for entry in entries}
     for entry in sorted(entries, key=lambda one: -one.scores.get(_ORDER, -math.inf)):
-        plants.setdefault(entry.plant, []).append(_row(entry))
+        plants[entry.plant].append(_row(entry))
     heads = [("controller", ""), ("up", ""), ("v1", ""), ("v2", ""), ("v3", "")]
     heads += [(cost.name.replace("_", " "), cost.unit) for cost in COSTS]
     heads += [(name.replace("_", " "), "%") for name in PERTURBATIONS]
