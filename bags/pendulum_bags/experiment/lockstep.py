@@ -121,11 +121,16 @@ def record_run(
             client.resume(_START_TIMEOUT)
         conductor.wait_for(
             f"{spec.duration:g} s of simulated time",
-            lambda: client.check_mode() or client.has_event("lockstep_finished"),
+            lambda: _is_finished(client),
             _START_TIMEOUT + _SLOWEST * spec.duration,
         )
         finish_recording(conductor, processes, recorder, client, spec.steps + 1)
     return bag
+
+
+def _is_finished(plant: PlantClient) -> bool:
+    plant.check_mode()
+    return plant.has_event("lockstep_finished") is not None
 
 
 def finish_recording(

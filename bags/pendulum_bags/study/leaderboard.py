@@ -189,7 +189,7 @@ def evaluate(
     """
     true = load_plant(plant)
     # Hanging exactly down is an equilibrium that no torque of an energy controller leaves.
-    spec = {
+    spec: dict[str, Any] = {
         "plant": plant, "design_plant": plant, "controller": controller, "controller_parameters": parameters or {},
         "theta": 0.01, "duration": duration, "method": "etd4",
     }  # fmt: skip

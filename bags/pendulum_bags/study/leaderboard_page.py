@@ -86,7 +86,7 @@ def to_json(entries: Sequence[Entry]) -> list[dict[str, Any]]:
 
 
 def _row(entry: Entry) -> dict[str, Any]:
-    cells = [("yes" if entry.success else "no", int(entry.success))]
+    cells: list[tuple[str, float | str]] = [("yes" if entry.success else "no", int(entry.success))]
     cells += [_cell(entry.scores.get(name), ".3f") for name in ("v1", "v2", "v3")]
     cells += [_cell(entry.costs.get(cost.name), ".3g") for cost in COSTS]
     cells += [_cell(entry.robustness.get(name), ".0f", 100.0) for name in PERTURBATIONS]

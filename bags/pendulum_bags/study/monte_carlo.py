@@ -319,7 +319,7 @@ def _columns(drawn: Mapping[str, NDArray[Any]], result: Any) -> dict[str, NDArra
         "theta_end": result.theta,
         "theta_dot_end": result.theta_dot,
     }
-    return {name: computed.get(name, drawn.get(name)) for name in COLUMNS}
+    return {name: computed[name] if name in computed else drawn[name] for name in COLUMNS}
 
 
 def _carry_out(

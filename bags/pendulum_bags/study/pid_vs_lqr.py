@@ -55,10 +55,10 @@ def analyse(folder: Path, study: Study, records: Sequence[Mapping[str, Any]]) ->
             row[name] = {"mean": mean, "low": low, "high": high, "worst": worst, "worst_seed": seed}
         row.update(_mean_response(responses[key]))
         rows.append(row)
-    result = {"rows": rows, "paired": _paired(records)}
-    result["sentences"] = _sentences(result)
-    write_figures(_figures(result["paired"], responses, result["sentences"]), folder / "figures")
-    return result
+    paired = _paired(records)
+    sentences = _sentences(paired)
+    write_figures(_figures(paired, responses, sentences), folder / "figures")
+    return {"rows": rows, "paired": paired, "sentences": sentences}
 
 
 def print_table(console: Console, result: Mapping[str, Any]) -> None:
@@ -147,9 +147,9 @@ def _paired(records: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
     return found
 
 
-def _sentences(result: Mapping[str, Any]) -> list[str]:
+def _sentences(paired: Sequence[Mapping[str, Any]]) -> list[str]:
     said = []
-    for pair in result["paired"]:
+    for pair in paired:
         if pair["metric"] not in {"ise", "effort_energy", "smoothness"}:
             continue
         if pair["low"] > 1.0 or pair["high"] < 1.0:
@@ -167,7 +167,7 @@ def _figures(
     paired: Sequence[Mapping[str, Any]], responses: Mapping[tuple[str, str], Sequence[Episode]], said: Sequence[str]
 ) -> list[Figure]:
     roles = {0: "sim", 1: "hw", 2: "aligned", 3: "difference"}
-    panels = []
+    panels: list[Panel] = []
     for plant in dict.fromkeys(plant for plant, _ in responses):
         traces = []
         for index, ((_, controller), episodes) in enumerate(

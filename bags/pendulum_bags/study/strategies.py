@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 from rich.console import Console
 from rich.table import Table
 
@@ -23,6 +24,8 @@ from pendulum_msgs_py.values import NANOSECONDS
 
 __all__ = ["analyse", "apparent_plant", "commanded_recording", "print_table"]
 
+Array = NDArray[np.float64]
+
 _SETTLED = 0.5
 """Start of a run that is left out of its spread [s]."""
 
@@ -36,7 +39,7 @@ def analyse(folder: Path, study: Study) -> list[dict[str, Any]]:
         folder: Of the study.
         study: The study; its first plant of side ``sim`` is the simulation that the others are compared with.
     """
-    motions: dict[str, tuple[np.ndarray, np.ndarray]] = {}
+    motions: dict[str, tuple[Array, Array]] = {}
     rows: list[dict[str, Any]] = []
     for run in study.runs:
         place = folder / "runs" / run.name
@@ -149,7 +152,7 @@ def _paired(row: Mapping[str, Any]) -> float:
     return float(row["paired_rms"])
 
 
-def _add_gaps(rows: Sequence[dict[str, Any]], motions: Mapping[str, tuple[np.ndarray, np.ndarray]]) -> None:
+def _add_gaps(rows: Sequence[dict[str, Any]], motions: Mapping[str, tuple[Array, Array]]) -> None:
     """Add to each hardware run its distance from the simulation under the same seed."""
     for row in rows:
         twin = next((other for other in rows if other["side"] == "sim" and other["seed"] == row["seed"]), None)
@@ -163,10 +166,10 @@ def _add_gaps(rows: Sequence[dict[str, Any]], motions: Mapping[str, tuple[np.nda
         row["paired_rms"] = float(np.sqrt(np.mean((angle[inside] - simulated) ** 2)))
 
 
-def _figure(rows: Sequence[Mapping[str, Any]], motions: Mapping[str, tuple[np.ndarray, np.ndarray]]) -> Figure:
+def _figure(rows: Sequence[Mapping[str, Any]], motions: Mapping[str, tuple[Array, Array]]) -> Figure:
     """Draw a stretch of each motion over that of the simulation, with the damping that was identified from it."""
     twin = next((row for row in rows if row["side"] == "sim"), None)
-    panels = []
+    panels: list[Panel] = []
     for row in rows:
         if row["side"] == "sim":
             continue
