@@ -23,6 +23,7 @@ _LEAST_ROOM = 1 << 28
 _MAX_RATIO = 100
 """A file compressed as a whole may hold this many times its size: states shrink to a fifth, bombs to nothing."""
 _MAX_METADATA = 16 << 20
+_MAX_DEPTH = 40
 
 
 @dataclass(slots=True)
@@ -86,10 +87,22 @@ def _read_metadata(path: Path) -> str:
 
 
 def _load_yaml(text: str) -> Any:
-    """Return what YAML text says; aliases are refused, which can make gigabytes out of a line."""
+    """Return what YAML text says.
+
+    Aliases are refused, which can make gigabytes out of a line, and depth, which overflows the stack of libyaml's
+    composer and with it ends the process.
+    """
     loader = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
-    if "*" in text and any(isinstance(event, yaml.AliasEvent) for event in yaml.parse(text, loader)):
-        raise ValueError("aliases are not allowed here")
+    depth = 0
+    for event in yaml.parse(text, loader):
+        if isinstance(event, yaml.CollectionStartEvent):
+            depth += 1
+            if depth > _MAX_DEPTH:
+                raise ValueError(f"nested deeper than {_MAX_DEPTH} levels")
+        elif isinstance(event, yaml.CollectionEndEvent):
+            depth -= 1
+        elif isinstance(event, yaml.AliasEvent):
+            raise ValueError("aliases are not allowed")
     return yaml.load(text, Loader=loader)
 
 
