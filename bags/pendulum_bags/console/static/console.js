@@ -93,6 +93,7 @@
     return [c, width, height];
   }
 
+  const tick = (value) => (Math.abs(value) < 0.1 ? value.toFixed(3) : value.toPrecision(3));
   const ink = (name) => getComputedStyle(document.documentElement).getPropertyValue(name);
 
   function drawPendulum(names) {
@@ -131,7 +132,7 @@
     const place = context("plots");
     if (!place) return;
     const [c, width, height] = place;
-    const left = 48, right = width - 6, each = (height - 22) / ROWS.length;
+    const left = 50, right = width - 6, each = (height - 22) / ROWS.length;
     c.font = "11px system-ui, sans-serif";
     ROWS.forEach(([title], row) => {
       const top = row * each + 14, bottom = (row + 1) * each - 4;
@@ -141,14 +142,14 @@
         if (point[0] > now - SPAN && value !== undefined) { low = Math.min(low, value); high = Math.max(high, value); }
       }
       if (!(high >= low)) { low = -1; high = 1; }
-      const pad = Math.max(0.08 * (high - low), 1e-3);
+      const pad = Math.max(0.08 * (high - low), 5e-3);
       low -= pad; high += pad;
       c.strokeStyle = ink("--line"); c.lineWidth = 1;
       c.strokeRect(left, top, right - left, bottom - top);
       c.fillStyle = ink("--faint");
       c.textAlign = "left"; c.fillText(title, left, top - 3);
       c.textAlign = "right";
-      c.fillText(high.toPrecision(3), left - 4, top + 9); c.fillText(low.toPrecision(3), left - 4, bottom);
+      c.fillText(tick(high), left - 4, top + 9); c.fillText(tick(low), left - 4, bottom);
       c.save();
       c.beginPath(); c.rect(left, top, right - left, bottom - top); c.clip();
       names.forEach((name, index) => {

@@ -1,0 +1,102 @@
+"""Wheels and source archives of the five packages: built without a network, installed into an empty folder, run."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import subprocess
+import sys
+import tarfile
+import zipfile
+from pathlib import Path
+
+import pytest
+
+from pendulum_bags.reader import read_bag
+from tests.fixtures import PROJECT
+
+FOLDERS = ("pendulum_msgs_py", "pendulum_sim", "pendulum_lqr", "pendulum_hw_bridge", "bags")
+
+
+def _run(*command: str | Path, cwd: Path, env: dict[str, str] | None = None) -> str:
+    done = subprocess.run(
+        [str(word) for word in command],
+        cwd=cwd,
+        env={**os.environ, **(env or {})},
+        capture_output=True,
+        text=True,
+        timeout=150,
+        check=False,
+    )
+    assert done.returncode == 0, f"{command}\n{done.stdout}\n{done.stderr}"
+    return done.stdout
+
+
+def _copy_of(folder: str, to: Path) -> Path:
+    """Copy what git knows, as a clean clone has it: a build leaves its traces in its folder."""
+    known = ["git", "ls-files", "--cached", "--others", "--exclude-standard", folder]
+    listed = subprocess.run(known, cwd=PROJECT, capture_output=True, text=True, check=True).stdout
+    for name in listed.splitlines():
+        if (PROJECT / name).is_file():
+            (to / name).parent.mkdir(parents=True, exist_ok=True)
+            shutil.copyfile(PROJECT / name, to / name)
+    return to / folder
+
+
+@pytest.fixture(scope="module")
+def wheels(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Build each package's source archive, and its wheel from that; return the folder of the wheels."""
+    base = tmp_path_factory.mktemp("distributions")
+    archives = base / "archives"
+    archives.mkdir()
+    hook = f"from setuptools.build_meta import build_sdist; build_sdist({str(archives)!r})"
+    for folder in FOLDERS:
+        _run(sys.executable, "-c", hook, cwd=_copy_of(folder, base / "source"))
+    pip = [sys.executable, "-m", "pip", "--disable-pip-version-check", "wheel", "--no-deps", "--no-index"]
+    _run(*pip, "--no-build-isolation", "-w", base / "wheels", *sorted(archives.iterdir()), cwd=base)
+    return base / "wheels"
+
+
+@pytest.mark.timeout(300)
+def test_the_five_packages_are_wheels_with_launch_files_and_layouts(wheels: Path) -> None:
+    assert len(list(wheels.glob("*.whl"))) == 5
+    held = {name for wheel in wheels.glob("*.whl") for name in zipfile.ZipFile(wheel).namelist()}
+    for ending in (
+        "share/pendulum_lqr/launch/bringup.launch.py",
+        "share/pendulum_sim/rviz/pendulum.rviz",
+        "share/pendulum_bags/config/foxglove_layout.json",
+        "pendulum_bags/console/static/console.js",
+        "pendulum_msgs_py/presets/thesis.yaml",
+    ):
+        assert any(name.endswith(ending) for name in held), ending
+    archives = list((wheels.parent / "archives").glob("*.tar.gz"))
+    assert len(archives) == 5
+    for archive in archives:
+        with tarfile.open(archive) as content:
+            assert any(name.endswith("/package.xml") for name in content.getnames()), archive.name
+
+
+@pytest.mark.timeout(300)
+def test_what_the_wheels_install_runs_an_experiment(wheels: Path, domain_id: int, tmp_path: Path) -> None:
+    place = tmp_path / "place"
+    pip = [sys.executable, "-m", "pip", "--disable-pip-version-check", "install", "--no-deps", "--no-index"]
+    _run(*pip, "--target", place, *sorted(wheels.glob("*.whl")), cwd=tmp_path)
+    env = {"PYTHONPATH": str(place)}
+    where = _run(
+        sys.executable, "-c", "import pendulum_bags; print(pendulum_bags.__file__)", cwd=tmp_path, env=env
+    )
+    assert Path(where.strip()).is_relative_to(place)
+
+    command = ["experiment", "lockstep", "--bag", tmp_path / "bag", "--duration", "0.5"]
+    _run(sys.executable, "-m", "pendulum_bags", *command, cwd=tmp_path, env=env)
+    assert len(read_bag(tmp_path / "bag")["/sim/joint_states"]) == 251
+
+
+@pytest.mark.parametrize("module", ["pendulum_lqr", "pendulum_bags"])
+def test_colours_respect_no_color(module: str, tmp_path: Path) -> None:
+    command = {"pendulum_lqr": ["design"], "pendulum_bags": ["compare", "--help"]}[module]
+    text = _run(
+        sys.executable, "-m", module, *command, cwd=tmp_path, env={"NO_COLOR": "1", "FORCE_COLOR": "1"}
+    )
+    # Bold and the like are no colours; 30 to 49 and 90 to 107 are.
+    assert not any(f"\x1b[{code}m" in text for code in (*range(30, 50), *range(90, 108)))
