@@ -39,6 +39,9 @@ EXCLUDED = {"playback": "plays a recording of another run"}
 GOAL_ANGLE, GOAL_VELOCITY = 0.1, 0.5
 """Region that counts as up: angle from upright [rad], velocity [rad/s]."""
 
+PATIENCE = 8.0
+"""Wall time of the plain run beyond which the perturbations, 25 more runs, are left out [s]."""
+
 Array = NDArray[np.float64]
 
 
@@ -175,7 +178,7 @@ def evaluate(
     parameters: Mapping[str, Any] | None = None,
     duration: float = 10.0,
     robustness: bool = True,
-    patience: float = 20.0,
+    patience: float = PATIENCE,
 ) -> Entry:
     """Return the line of a controller: from hanging down to upright, on the plant that it was designed for.
 
@@ -185,7 +188,7 @@ def evaluate(
         parameters: Of the controller; by default those that it comes with.
         duration: Length of each run [s].
         robustness: Whether to try the perturbations.
-        patience: Wall time of the plain run beyond which no perturbation is tried [s].
+        patience: Wall time of the plain run beyond which no perturbation is tried [s]; the board then shows a dash.
     """
     true = load_plant(plant)
     # Hanging exactly down is an equilibrium that no torque of an energy controller leaves.

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from pendulum_bags.experiment.run_folder import git_revision, versions
-from pendulum_bags.study.leaderboard import COSTS, GOAL_ANGLE, GOAL_VELOCITY, PERTURBATIONS, Entry
+from pendulum_bags.study.leaderboard import COSTS, GOAL_ANGLE, GOAL_VELOCITY, PATIENCE, PERTURBATIONS, Entry
 
 __all__ = ["best_sentence", "to_json", "write_page"]
 
@@ -42,6 +42,7 @@ def write_page(path: Path, entries: Sequence[Entry], duration: float) -> Path:
         duration=f"{duration:g}",
         angle=GOAL_ANGLE,
         velocity=GOAL_VELOCITY,
+        patience=PATIENCE,
         sentence=best_sentence(entries),
         provenance={"revision": git_revision() or "unknown", **versions()},
     )
