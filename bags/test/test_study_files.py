@@ -70,7 +70,7 @@ def test_random_starts_follow_the_seed_alone(tmp_path: Path) -> None:
 )
 def test_a_mistake_is_refused_with_its_line(tmp_path: Path, text: str, line: int, says: str) -> None:
     path = study_file(tmp_path, text)
-    with pytest.raises(ParameterError, match="study.yaml") as caught:
+    with pytest.raises(ParameterError, match=r"study\.yaml") as caught:
         load_study(path)
     message = str(caught.value)
     assert message.startswith(f"{path}:{line}: ")

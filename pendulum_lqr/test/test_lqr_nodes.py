@@ -231,7 +231,7 @@ def test_the_disturbance_follows_seed_and_stamp_between_start_and_end(plant, pro
     signal_7 = make_disturbance({"seed": 7})
     allowed = {signal_7(k * 10_000_000) for k in range(21)}
     during = [a for a in plant.disturbances[count:] if begin["stamp_ns"] <= a.stamp_ns < end["stamp_ns"]]
-    assert len(during) >= 10
+    assert len(during) >= 5
     assert {answer.effort for answer in during} <= allowed
     assert end["stamp_ns"] - begin["stamp_ns"] >= 200_000_000
     assert all(a.effort == 0.0 for a in plant.disturbances if a.stamp_ns >= end["stamp_ns"])

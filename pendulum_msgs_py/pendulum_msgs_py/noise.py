@@ -99,4 +99,4 @@ def uniform_array(seed: int, start: int, count: int, amplitude: float) -> NDArra
     indices = np.arange(count, dtype=np.uint64) + np.uint64(start)
     key = np.full(1, stream_key(seed), dtype=np.uint64)
     bits = scramble(key, indices)  # type: ignore[arg-type]  # arrays of uint64 wrap as the mask does
-    return amplitude * unit_interval(bits)  # type: ignore[arg-type, return-value]
+    return amplitude * unit_interval(bits)  # type: ignore[return-value]

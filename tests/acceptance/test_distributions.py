@@ -87,7 +87,7 @@ def test_what_the_wheels_install_runs_an_experiment(wheels: Path, domain_id: int
     )
     assert Path(where.strip()).is_relative_to(place)
 
-    command = ["experiment", "lockstep", "--bag", tmp_path / "bag", "--duration", "0.5"]
+    command: list[str | Path] = ["experiment", "lockstep", "--bag", tmp_path / "bag", "--duration", "0.5"]
     _run(sys.executable, "-m", "pendulum_bags", *command, cwd=tmp_path, env=env)
     assert len(read_bag(tmp_path / "bag")["/sim/joint_states"]) == 251
 

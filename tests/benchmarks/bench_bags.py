@@ -14,6 +14,7 @@ import sys
 import tempfile
 import time
 from collections.abc import Callable, Iterator
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -84,22 +85,22 @@ def _reading(folder: Path, messages: list[tuple[str, int, bytes]]) -> Iterator[R
             writer.write_many(messages)
         anyreader, expected = _anyreader(path)
         _check(path, expected)
-        ours = COUNT / _median_time(lambda path=path: read_bag(path).load(), 7)
+        ours = COUNT / _median_time(partial(_load, path), 7)
         what = f"read {COUNT:.0e} JointState of 3 topics, {storage}{' ' + compression if compression else ''}"
         yield measured(
             what, ours, "1/s", peer=Peer("rosbags AnyReader", anyreader), at_least_times_peer=target
         )
         if storage == "mcap":
-            theirs = peer("baglab with its C++ backend", lambda path=path: _in_process(_BAGLAB, path))
+            theirs = peer("baglab with its C++ backend", partial(_in_process, _BAGLAB, path))
             factor = None if compression else 10.0
             yield measured(what, ours, "1/s", peer=theirs, at_least_times_peer=factor)
             for name, script in (("mcap-ros2-support", _MCAP_ROS2), ("small-mcap, bytes only", _SMALL_MCAP)):
-                theirs = peer(name, lambda path=path, script=script: _in_process(script, path))
+                theirs = peer(name, partial(_in_process, script, path))
                 yield measured(what, ours, "1/s", peer=theirs)
         payload = sum(len(data) for _, _, data in messages)
         theirs = peer(
             "rosbags AnyReader to arrays",
-            lambda path=path, size=payload: _in_process(_ROSBAGS_MEMORY, path) / size,
+            partial(_in_process_per, payload, _ROSBAGS_MEMORY, path),
         )
         peak = _in_process(_OUR_MEMORY, path)
         yield measured(
@@ -112,6 +113,18 @@ def _reading(folder: Path, messages: list[tuple[str, int, bytes]]) -> Iterator[R
         )
 
 
+def _load(path: Path) -> object:
+    return read_bag(path).load()
+
+
+def _in_process_per(size: float, script: str, path: Path) -> float:
+    return _in_process(script, path) / size
+
+
+def _rate_of(rate: Callable[[Any], float], writer: Callable[[str], Any], storage: str) -> float:
+    return rate(writer(storage))
+
+
 def _anyreader(path: Path) -> tuple[float, dict[str, list[tuple[Any, ...]]]]:
     from rosbags.highlevel import AnyReader
 
@@ -119,7 +132,7 @@ def _anyreader(path: Path) -> tuple[float, dict[str, list[tuple[Any, ...]]]]:
     begin = time.perf_counter()
     with AnyReader([path]) as reader:
         for connection, log_time, data in reader.messages():
-            m = reader.deserialize(data, connection.msgtype)
+            m: Any = reader.deserialize(data, connection.msgtype)
             stamp = m.header.stamp
             found[connection.topic].append(
                 (log_time, stamp.sec * 10**9 + stamp.nanosec, m.position[0], m.velocity[0], m.effort[0])
@@ -296,7 +309,7 @@ def _writing(folder: Path, messages: list[tuple[str, int, bytes]]) -> Iterator[R
         return COUNT / statistics.median(times)
 
     for storage in ("mcap", "sqlite3"):
-        theirs = peer(f"rosbags {storage}", lambda storage=storage: rate(rosbags(storage)))
+        theirs = peer(f"rosbags {storage}", partial(_rate_of, rate, rosbags, storage))
         yield measured(
             f"write {COUNT:.0e} messages, {storage}", rate(ours(storage, COUNT)), "1/s", peer=theirs
         )

@@ -172,7 +172,7 @@ def _vector_speed(env: object, steps: int = 200) -> float:
 
 
 def _envpool_speed() -> float:
-    import envpool
+    import envpool  # type: ignore[import-not-found, unused-ignore]  # an optional peer
 
     return _vector_speed(envpool.make_gymnasium("Pendulum-v1", num_envs=1024))
 
@@ -203,7 +203,7 @@ def _node() -> Iterator[Row]:
     plain = peer("SingleThreadedExecutor, typed", lambda: plain_cpu(short))
     for label, cores, p50, p99, cpu, duration in (
         ("two cores", None, 130.0, 400.0, 18.0, SECONDS),
-        ("one core", [os.cpu_count() - 1 if os.cpu_count() else 0], 75.0, 250.0, 10.0, short),
+        ("one core", [(os.cpu_count() or 1) - 1], 75.0, 250.0, 10.0, short),
     ):
         figures = realtime_figures(duration, cores=cores)
         what = f"node, realtime 1 kHz, {label}, {duration:g} s"

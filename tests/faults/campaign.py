@@ -9,6 +9,7 @@ import signal
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
+from functools import partial
 
 from builtin_interfaces.msg import Time
 from sensor_msgs.msg import JointState
@@ -138,14 +139,14 @@ def _kill_recorder(system: LiveSystem, generator: random.Random) -> Outcome:
     outcome = Outcome(lost=lost)
     outcome.demand(lost <= MAX_LOSS, f"{lost:.2f} s lost; expected at most {MAX_LOSS} s")
     system.start("recorder")
-    system.wait_for("the new bag to be there", lambda: (system.bag / "metadata.yaml").exists(), START_TIMEOUT)
+    system.wait_for("the new bag to be there", (system.bag / "metadata.yaml").exists, START_TIMEOUT)
     return outcome
 
 
 def _twin_controller(system: LiveSystem, _: random.Random) -> Outcome:
     outcome = Outcome()
     twin = system.processes.start_node(system.program("controller", q=[1.0, 0.01]))
-    system.wait_for("twins to be noticed", lambda: _is_at_rest(system), START_TIMEOUT)
+    system.wait_for("twins to be noticed", partial(_is_at_rest, system), START_TIMEOUT)
     outcome.detail = "twins: zero torque while both are there"
     system.processes.finish(twin)
     return outcome

@@ -58,7 +58,11 @@ class LiveSystem:
             JointState, f"{_NAMESPACE}/{names.APPLIED_EFFORT}", self._on_applied, qos.STATE, raw=True
         )
         node.create_subscription(
-            JointState, f"{_NAMESPACE}/{names.EFFORT_COMMAND}", self._on_command, qos.command_input(reliable=True), raw=True
+            JointState,
+            f"{_NAMESPACE}/{names.EFFORT_COMMAND}",
+            self._on_command,
+            qos.command_input(reliable=True),
+            raw=True,
         )
         for name in ("recorder", "simulator", "controller", "disturbance"):
             self.start(name)

@@ -15,7 +15,7 @@ from pendulum_bags.experiment.run_spec import RunSpec
 from pendulum_bags.reader import read_bag, same_messages
 
 
-def run_experiment(*arguments: str | Path, timeout: float = 150.0) -> subprocess.CompletedProcess[str]:
+def run_experiment(*arguments: str | Path | float, timeout: float = 150.0) -> subprocess.CompletedProcess[str]:
     """Run ``python -m pendulum_bags experiment``; its output is in the message of a failure."""
     command = [sys.executable, "-m", "pendulum_bags", "experiment", *map(str, arguments)]
     done = subprocess.run(command, capture_output=True, text=True, timeout=timeout, check=False)
