@@ -92,3 +92,32 @@ def test_a_study_over_dds_runs_in_parallel_and_leaves_a_table(tmp_path: Path) ->
     rows = (tmp_path / "out" / "runs.csv").read_text().splitlines()
     assert len(rows) == 3
     assert all(",done," in row for row in rows[1:])
+
+
+@pytest.mark.parametrize(
+    ("hold_time", "max_abs_u", "std_theta", "std_theta_dot"),
+    [
+        # Bands of 200 seeds, 5 to 95 %, and the medians of an independent program (Euler, 2 ms).
+        (0.002, (0.152, 0.286), 0.00213, 0.0637),
+        (0.010, (0.344, 0.605), 0.00479, 0.100),
+    ],
+    ids=["noise at 500 Hz", "noise at 100 Hz"],
+)
+def test_twenty_seeds_reproduce_the_thesis_under_noise(
+    hold_time: float, max_abs_u: tuple[float, float], std_theta: float, std_theta_dot: float
+) -> None:
+    runs = [
+        simulate(
+            RunSpec(
+                controller_parameters={"q": [100.0, 0.01], "r": 0.1},
+                disturbance={"amplitude": 2.5, "hold_time": hold_time, "duration": 5.0},
+                duration=5.0,
+                seed=seed,
+            )
+        )
+        for seed in range(20)
+    ]
+    low, high = max_abs_u
+    assert low < np.median([abs(run.command).max() for run in runs]) < high
+    assert np.median([run.position.std() for run in runs]) == pytest.approx(std_theta, rel=0.15)
+    assert np.median([run.velocity.std() for run in runs]) == pytest.approx(std_theta_dot, rel=0.05)
