@@ -96,7 +96,8 @@ def _check_plant(bag: Bag, plant: str, limit: float, allowance: float) -> Torque
     longest = float(np.max(age[driven], initial=0.0))
     allowed = COMMAND_LIFE + period + allowance
     if longest > allowed:
-        violations.append(f"torque {longest * 1e3:.0f} ms after the last command; expected at most {allowed * 1e3:.0f} ms")
+        late = f"torque {longest * 1e3:.0f} ms after the last command"
+        violations.append(f"{late}; expected at most {allowed * 1e3:.0f} ms")
     return TorqueRecord(plant, len(times), int(judged.sum()), largest, longest, tuple(violations))
 
 
