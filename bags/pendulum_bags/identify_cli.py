@@ -155,7 +155,7 @@ def _print_result(result: IdentificationResult, out: Path | None) -> None:
         )
     console.print(table)
     models = Table(title="Friction models")
-    for heading in ("model", "held-out rms [mrad]", "training rms [mrad]", ""):
+    for heading in ("model", "held-out rms \\[mrad]", "training rms \\[mrad]", ""):
         models.add_column(heading)
     for candidate in result.fit.candidates:
         held = "-" if candidate.validation is None else f"{1e3 * candidate.validation.rms:.3f}"
