@@ -36,7 +36,7 @@ from pendulum_msgs_py import names
 from pendulum_msgs_py.errors import FaultError, ParameterError
 from pendulum_msgs_py.executables import cli_main
 from pendulum_msgs_py.ros import qos
-from pendulum_msgs_py.ros.convert import command_from_bytes, sample_from_bytes
+from pendulum_msgs_py.ros.convert import command_from_bytes, sample_from_bytes, stamp_from_message
 
 __all__ = ["Hub", "main"]
 
@@ -232,8 +232,9 @@ class Hub:
                 plant = self._plants.get(status.name.partition(":")[0])
                 if plant is not None:
                     plant.figures = {pair.key: pair.value for pair in status.values}
-                    # A transient local event came first; this says the same to who joined late.
-                    plant.mode, plant.reason = plant.figures.get("mode", plant.mode), status.message
+                    # For who joined late; what was written before the newest event would take it back.
+                    if stamp_from_message(message.header.stamp) > plant.mode_stamp_ns:
+                        plant.mode, plant.reason = plant.figures.get("mode", plant.mode), status.message
 
     def _read(self, plant: _Plant) -> dict[str, Any]:
         for key, subscription in plant.taps.items():
