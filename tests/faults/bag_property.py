@@ -88,7 +88,9 @@ def _check_plant(bag: Bag, plant: str, limit: float, allowance: float) -> Torque
     command = _last_before(times, _log_times(bag, plant, names.EFFORT_COMMAND))
     # A disturbance or a push is a command, too: each ends by itself after its life.
     others = (names.DISTURBANCE, names.PUSH)
-    latest = np.maximum.reduce([command, *(_last_before(times, _log_times(bag, plant, name)) for name in others)])
+    latest = np.maximum.reduce(
+        [command, *(_last_before(times, _log_times(bag, plant, name)) for name in others)]
+    )
     trajectory = _last_before(times, _log_times(bag, plant, names.JOINT_TRAJECTORY))
     judged = (command > trajectory) & (command > 0)
     age = (times - latest) * 1e-9
