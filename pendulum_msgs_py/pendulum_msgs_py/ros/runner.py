@@ -117,6 +117,9 @@ def _run(make_node: Callable[[Callable[[], None]], Node], arguments: Sequence[st
         exit_code = 1
     finally:
         exit_code = _close(node, executor) or exit_code
+        # The interpreter gives signals their default back while it ends, and a launcher repeats the terminal's SIGINT:
+        # a node that has ended properly would then count as killed.
+        signal.signal(signal.SIGINT, signal.SIG_IGN)
     return exit_code
 
 
