@@ -18,8 +18,10 @@ from pendulum_bags.experiment.domain import reserve_domain
 from pendulum_msgs_py.errors import FaultError
 from pendulum_msgs_py.executables import cli_main
 from tests.faults.bridge_rig import SCENARIOS, run_scenario
-from tests.faults.campaign import CAMPAIGN, MAX_TIME_TO_ZERO, Fault, Outcome, try_fault
+from tests.faults.campaign import CAMPAIGN, MACHINE_PATIENCE, MAX_TIME_TO_ZERO, Fault, Outcome, try_fault
+from tests.faults.fuzz import fuzz_all
 from tests.faults.live import LiveSystem
+from tests.faults.network import cut_cable, why_not
 
 app = typer.Typer(add_completion=False, rich_markup_mode=None, pretty_exceptions_enable=False)
 
@@ -28,10 +30,16 @@ app = typer.Typer(add_completion=False, rich_markup_mode=None, pretty_exceptions
 def campaign(
     repetitions: Annotated[int, typer.Option(help="How often each fault is tried.", min=1)] = 5,
     seed: Annotated[int, typer.Option(help="Seed of the moments at which faults come.")] = 1,
+    minutes: Annotated[float, typer.Option(help="How long each parser is attacked [min].", min=0.0)] = 1.0,
     out: Annotated[Path, typer.Option(help="Where the table is written.")] = Path("build", "faults.json"),
 ) -> int:
     """Attack the running system and count what it stood."""
-    rows = [*_bridge_rows(max(repetitions, 20)), *_live_rows(repetitions, seed)]
+    rows = [
+        *_bridge_rows(max(repetitions, 20)),
+        *_live_rows(repetitions, seed),
+        *_network_rows(),
+        *_parser_rows(minutes, seed),
+    ]
     table = Table("fault", "tried", "survived", "data lost", "longest time to zero", "remarks", title="Faults")
     for row in rows:
         table.add_row(
@@ -92,6 +100,36 @@ def _live_rows(repetitions: int, seed: int) -> list[dict[str, Any]]:
                 progress.advance(task)
             rows.append(_row(fault, outcomes))
     return rows
+
+
+def _network_rows() -> list[dict[str, Any]]:
+    name = "network: cable between plant and controller out for 1 s and 30 s"
+    row = {"fault": name, "tried": 0, "survived": 0, "lost_s": None, "time_to_zero_s": None, "remarks": why_not()}
+    if row["remarks"]:
+        return [row]
+    with tempfile.TemporaryDirectory(prefix="pendulum_network_") as folder:
+        try:
+            cuts = cut_cable(Path(folder), [1.0, 30.0])
+        except FaultError as error:
+            return [{**row, "tried": 1, "remarks": str(error)}]
+    longest = max(cut.time_to_zero for cut in cuts)
+    row["survived"] = sum(cut.time_to_zero <= MAX_TIME_TO_ZERO + MACHINE_PATIENCE for cut in cuts)
+    back = ", ".join(f"{cut.time_to_return:.2f}" for cut in cuts)
+    return [{**row, "tried": len(cuts), "time_to_zero_s": longest, "remarks": f"torque again after {back} s"}]
+
+
+def _parser_rows(minutes: float, seed: int) -> list[dict[str, Any]]:
+    return [
+        {
+            "fault": f"spoilt files: {row['parser']}",
+            "tried": max(row["tried"], 1),
+            "survived": max(row["tried"] - sum(row["findings"].values()), 0),
+            "lost_s": None,
+            "time_to_zero_s": None,
+            "remarks": "; ".join(row["findings"]) or f"slowest read {row['slowest_s'] * 1e3:.0f} ms",
+        }
+        for row in fuzz_all(minutes * 60.0, seed)
+    ]
 
 
 def _try(system: LiveSystem, fault: Fault, generator: random.Random) -> Outcome:
