@@ -96,7 +96,7 @@ class _Inside(ProcessSet):
 
     namespace = ""
 
-    def start(self, name, command, **options):  # type: ignore[no-untyped-def, override]
+    def start(self, name, command, **options):
         return super().start(name, _inside(self.namespace, command), **options)
 
 
@@ -120,7 +120,8 @@ def cut_cable(folder: Path, durations: Sequence[float]) -> list[CutReport]:
         "FASTDDS_BUILTIN_TRANSPORTS": "UDPv4",
     }
     cuts = []
-    with _two_machines() as (plant, peer), _Inside(logs, environment) as processes:
+    processes = _Inside(logs, environment)
+    with _two_machines() as (plant, peer), processes:
         processes.namespace = plant
         start_recorder(processes, bag, "/sim", folder / "metadata.json", "mcap")
         processes.start_node(graph.simulator("/sim", initial_theta=math.pi, effort_limit=_EFFORT_LIMIT))
