@@ -47,7 +47,7 @@ def test_a_full_disk_is_told_and_what_was_sealed_is_kept(small_disk: Path, stora
                 writer.seal()
                 sealed = i + 1
 
-    with pytest.raises(OSError, match="(?i)space"):
+    with pytest.raises(OSError, match=r"(?i)space"):
         record()
     writer.abandon()
     with read_bag(bag) as opened:

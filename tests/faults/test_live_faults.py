@@ -8,8 +8,9 @@ from collections.abc import Iterator
 import pytest
 
 from pendulum_bags.experiment.domain import reserve_domain
-from tests.faults.campaign import CAMPAIGN, Fault, try_fault
-from tests.faults.live import LiveSystem
+from tests.faults.bag_property import check_bag
+from tests.faults.campaign import CAMPAIGN, MACHINE_PATIENCE, Fault, try_fault
+from tests.faults.live import EFFORT_LIMIT, LiveSystem
 
 
 @pytest.fixture(scope="module")
@@ -23,3 +24,9 @@ def system(tmp_path_factory: pytest.TempPathFactory) -> Iterator[LiveSystem]:
 def test_running_system_survives(system: LiveSystem, fault: Fault) -> None:
     outcome = try_fault(system, fault, random.Random(fault.name))
     assert outcome.survived, outcome.detail
+
+
+def test_every_bag_of_the_campaign_keeps_the_rule_of_the_last_command(system: LiveSystem) -> None:
+    for bag in sorted(system.folder.glob("bag_*")):
+        for record in check_bag(bag, limit=EFFORT_LIMIT, allowance=MACHINE_PATIENCE):
+            assert record.violations == (), f"{bag.name}: {record}"
