@@ -311,7 +311,9 @@ class BridgeNode(LifecycleNode):
         feedback = bridge.observe(0.0)
         if feedback is None or bridge.sample is None:
             return None
-        self._feedback.publish(encode_feedback(feedback._replace(stamp_ns=stamp_ns)))
+        # Before the first step nobody need be listening yet, and two runs must publish the same.
+        if self._lockstep_loop is None or self._lockstep_loop.started:
+            self._feedback.publish(encode_feedback(feedback._replace(stamp_ns=stamp_ns)))
         sample = dataclasses.replace(bridge.sample, stamp_ns=stamp_ns)
         bridge.sample = sample
         if self._interface.sample is None:
