@@ -68,15 +68,17 @@ def test_both_bags_hold_the_whole_experiment(run_folder: Path) -> None:
             assert phase in events
 
 
-def test_hand_over_to_lqr_and_back_makes_no_jump_in_torque(run_folder: Path) -> None:
+def test_hand_over_to_lqr_makes_no_jump_in_torque(run_folder: Path) -> None:
     for name in ("sim", "hw"):
         bag = read_bag(run_folder / name)
         times = {event["name"]: event["stamp_ns"] for event in bag.events()}
         applied = bag[f"/{name}/applied_effort"]
-        calm = (applied["stamp_ns"] > times["ramp_up"] + 500_000_000) & (
+        # The controller is activated at ``regulation`` and takes over within a few periods.
+        about = (applied["stamp_ns"] > times["regulation"] - 50_000_000) & (
             applied["stamp_ns"] < times["noise_start"] - 20_000_000
         )
-        assert abs(applied["effort"][calm][1:] - applied["effort"][calm][:-1]).max() < 0.5
+        assert about.sum() > 50
+        assert abs(applied["effort"][about][1:] - applied["effort"][about][:-1]).max() < 0.5
 
 
 def test_both_plants_got_the_same_noise(run_folder: Path) -> None:
