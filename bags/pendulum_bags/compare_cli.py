@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 __all__ = ["main"]
 
-app = typer.Typer(add_completion=False)
+app = typer.Typer(add_completion=False, rich_markup_mode=None)
 
 Paths = Annotated[
     list[Path], typer.Argument(help="Simulation and hardware bag, or run folders with sim and hw.")

@@ -15,7 +15,7 @@ from pendulum_msgs_py.executables import cli_main
 
 __all__ = ["app", "main"]
 
-app = typer.Typer(add_completion=False, rich_markup_mode="rich")
+app = typer.Typer(add_completion=False, rich_markup_mode=None)
 
 
 @app.command()
@@ -66,6 +66,7 @@ def excite(
     command = [
         *(sys.executable, "-m", "pendulum_lqr", "disturbance", "--ros-args", "-r", f"__ns:={namespace}"),
         *("-p", "kind:=from_bag", "-p", f"file:={out.resolve()}", "-p", "autostart:=true"),
+        *("-p", f"duration:={float(duration)}"),
     ]
     if as_json:
         content = {
@@ -97,7 +98,7 @@ def excite(
             highlight=False,
         )
         console.print(
-            f"wrote {out}; play it with\n  {' '.join(command[1:])}", highlight=False, soft_wrap=True
+            f"wrote {out}; play it, while a controller answers the plant, with\n  python {' '.join(command[1:])}", highlight=False, soft_wrap=True
         )
     if play:
         # The node is a program of its own, as on a robot: this command ends when it does.

@@ -15,7 +15,7 @@ from pendulum_msgs_py.executables import cli_main
 
 __all__ = ["main"]
 
-app = typer.Typer(add_completion=False)
+app = typer.Typer(add_completion=False, rich_markup_mode=None)
 
 
 @app.command()

@@ -29,7 +29,7 @@ __all__ = ["main"]
 EXIT_NOT_READY = 1
 """Exit code where an item of the checklist is not as it should be."""
 
-app = typer.Typer(add_completion=False)
+app = typer.Typer(add_completion=False, rich_markup_mode=None)
 
 
 @app.command()

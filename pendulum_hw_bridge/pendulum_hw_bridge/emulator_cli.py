@@ -20,7 +20,7 @@ __all__ = ["fault_main", "main"]
 _ADDRESS = "127.0.0.1:17590"
 
 app = typer.Typer(add_completion=False, no_args_is_help=False)
-fault_app = typer.Typer(add_completion=False)
+fault_app = typer.Typer(add_completion=False, rich_markup_mode=None)
 
 
 @app.command()

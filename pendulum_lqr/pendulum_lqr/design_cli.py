@@ -37,7 +37,7 @@ THESIS_WEIGHTS: tuple[tuple[tuple[float, float], float], ...] = (
 THESIS_CHOICE = 3
 """The combination that the thesis runs on its hardware."""
 
-app = typer.Typer(add_completion=False)
+app = typer.Typer(add_completion=False, rich_markup_mode=None)
 
 
 @app.command()

@@ -14,7 +14,7 @@ from pendulum_msgs_py.plant_parameters import load_plant
 
 __all__ = ["main"]
 
-app = typer.Typer(add_completion=False)
+app = typer.Typer(add_completion=False, rich_markup_mode=None)
 
 
 @app.command()
