@@ -98,7 +98,9 @@ def excite(
             highlight=False,
         )
         console.print(
-            f"wrote {out}; play it, while a controller answers the plant, with\n  python {' '.join(command[1:])}", highlight=False, soft_wrap=True
+            f"wrote {out}; play it, while a controller answers the plant, with\n  python {' '.join(command[1:])}",
+            highlight=False,
+            soft_wrap=True,
         )
     if play:
         # The node is a program of its own, as on a robot: this command ends when it does.
