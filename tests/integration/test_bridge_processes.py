@@ -209,7 +209,6 @@ def lockstep_run(processes: ProcessGroup, seconds: float) -> list[tuple[int, flo
     def on_state(message: JointState) -> None:
         seen.append((stamp_from_message(message.header.stamp), message.position[0], message.velocity[0]))
 
-    node.create_subscription(JointState, "joint_states", on_state, qos.STATE)
     programs = [
         processes.start(
             "pendulum_hw_bridge",
@@ -222,12 +221,14 @@ def lockstep_run(processes: ProcessGroup, seconds: float) -> list[tuple[int, flo
     arm = node.create_client(SetBool, "bridge/arm")
     assert arm.wait_for_service(60.0)
     deadline = time.monotonic() + 60.0
-    # Armed before the first state: the whole run is then the same, whenever everybody was ready.
+    # Armed before the first state, which waits for this node to listen: the whole run is then the same.
     future = arm.call_async(SetBool.Request(data=True))
+    executor.spin_until_future_complete(future, 30.0)
+    assert future.result().success
+    node.create_subscription(JointState, "joint_states", on_state, qos.STATE)
     while not (seen and seen[-1][0] >= (1 + seconds) * 1e9):
         assert time.monotonic() < deadline, f"{len(seen)} states: {programs[0].output}"
         executor.spin_once(timeout_sec=0.02)
-    assert future.result().success
     for program in programs:
         program.interrupt()
         assert program.wait(15.0) == 0
