@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import fcntl
 import os
-import socket
 import tempfile
 import time
 from collections.abc import Callable, Iterator
@@ -17,6 +16,7 @@ from typing import TypeVar
 
 import pytest
 
+from pendulum_bags.experiment.domain import is_unused
 from tests.processes import ProcessGroup
 
 __all__ = ["PROJECT", "domain_id", "processes", "shared_data", "wait_for"]
@@ -75,7 +75,7 @@ def domain_id(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iterator[int]:
                 fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
             except BlockingIOError:
                 continue
-            if not _is_unused(domain):
+            if not is_unused(domain):
                 continue
             monkeypatch.setenv("ROS_DOMAIN_ID", str(domain))
             monkeypatch.setenv("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
@@ -83,20 +83,6 @@ def domain_id(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iterator[int]:
             yield domain
             return
     pytest.fail(f"all ROS domains from 1 to 100 are in use; the locks are in {locks}")
-
-
-def _is_unused(domain: int) -> bool:
-    """Tell whether no DDS participant, of whomever, listens in the domain.
-
-    Source: DDSI-RTPS 2.5, section 9.6.2.3: unicast ports start at 7400 + 250 domain + 10, one pair per
-        participant.
-    """
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
-        try:
-            probe.bind(("", 7400 + 250 * domain + 10))
-        except OSError:
-            return False
-    return True
 
 
 @pytest.fixture

@@ -13,7 +13,7 @@ from pathlib import Path
 import psutil
 import pytest
 
-from tests import fixtures
+from pendulum_bags.experiment.domain import is_unused
 from tests.fixtures import PROJECT, wait_for
 from tests.processes import ProcessGroup
 
@@ -45,10 +45,10 @@ def test_a_domain_is_reserved_for_as_long_as_the_test_runs(domain_id: int, tmp_p
 
 
 def test_a_domain_in_which_someone_listens_is_not_handed_out(domain_id: int) -> None:
-    assert fixtures._is_unused(domain_id)
+    assert is_unused(domain_id)
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as participant:
         participant.bind(("", 7400 + 250 * domain_id + 10))
-        assert not fixtures._is_unused(domain_id)
+        assert not is_unused(domain_id)
 
 
 def test_waiting_returns_the_answer_or_says_what_it_waited_for() -> None:
