@@ -166,6 +166,27 @@ def test_a_wrong_recording_is_refused_with_its_place(tmp_path: Path, text: str, 
         load_feedback(other)
 
 
+def test_a_bag_is_replayed_and_one_that_is_no_recording_is_refused(tmp_path: Path) -> None:
+    from rosbags.rosbag2 import StoragePlugin, Writer
+    from rosbags.typesys import Stores, get_typestore
+
+    from pendulum_msgs_py.cdr import encode_joint_state
+
+    store = get_typestore(Stores.ROS2_JAZZY)
+    with Writer(tmp_path / "bag", version=9, storage_plugin=StoragePlugin.MCAP) as writer:
+        states = writer.add_connection("/hw/joint_states", "sensor_msgs/msg/JointState", typestore=store)
+        for i in range(20):
+            stamp = 1_700_000_000_000_000_000 + 10_000_000 * i
+            writer.write(states, stamp, encode_joint_state(stamp, position=0.1 * i, velocity=1.0, effort=0.5))
+    recording = load_feedback(tmp_path / "bag")
+    np.testing.assert_allclose(recording.columns["position"], 0.1 * np.arange(20))
+    np.testing.assert_allclose(np.diff(recording.time_ns), 10_000_000, atol=1000)
+    (file,) = (tmp_path / "bag").glob("*.mcap")
+    file.write_bytes(file.read_bytes()[:200])
+    with pytest.raises(DataError, match=r"bag .* cannot be read: \S+"):
+        load_feedback(tmp_path / "bag")
+
+
 def test_a_recording_needs_equal_lengths() -> None:
     with pytest.raises(DataError, match=r"effort has shape \(1,\)"):
         FeedbackRecording({"time": [0.0, 1.0], "position": [0, 0], "velocity": [0, 0], "effort": [0]})

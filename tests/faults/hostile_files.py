@@ -181,6 +181,23 @@ _EIGHT = b"\0\1\0\0" + bytes(8)
 _CODE_NAME = 'a/msg/B:\n    pass\nopen("owned","w").close()\nclass C'
 _CODE_CONSTANT = "string X=\"');open('owned','w').close();('\"\nint32 x\n"
 
+_NEXT = "\n" + "=" * 80 + "\nMSG: "
+_DEFINITIONS = {
+    "a thousand million texts": "string[900000000] x\n",
+    "a thousand million things of no size": f"a/Z[900000000] x{_NEXT}a/Z\nuint8[0] x\n",
+    "a type that holds itself": "a/B x\n",
+    "a type that holds many of itself": "a/B[] x\n",
+    "doubling at every level": "a/C0 x\n" + "".join(f"{_NEXT}a/C{i}\na/C{i + 1}[9] x\n" for i in range(12)),
+    "2000 levels": "a/C0 x\n" + "".join(f"{_NEXT}a/C{i}\na/C{i + 1} x\n" for i in range(2000)),
+    "50 000 fields": "".join(f"int32 x{i}\n" for i in range(50_000)),
+    "a call for a name": 'int32 x\na/C(open("owned","w")) y\n',
+}
+
+
+def _defining(text: str) -> Callable[[Path], Path]:
+    return _text("b.mcap", _mcap(_described(kind="a/msg/B", definition=text) + _message(_EIGHT)))
+
+
 HOSTILE: Sequence[HostileFile] = (
     HostileFile("a billion laughs", "plant YAML", _text("p.yaml", _laughs("format: pendulum_plant/1\n"))),
     HostileFile("a tag that calls", "plant YAML", _text("p.yaml", "!!python/object/apply:os.system [touch owned]\n")),
@@ -254,6 +271,7 @@ HOSTILE: Sequence[HostileFile] = (
         _text("b.mcap", _mcap(_described(kind="a/msg/Code", definition=_CODE_CONSTANT) + _message(_EIGHT))),
         refused=False,
     ),
+    *(HostileFile(f"a definition with {what}", "bag: MCAP", _defining(text)) for what, text in _DEFINITIONS.items()),
     HostileFile(
         "a head that claims 2^31 pages", "bag: SQLite",
         _database([_TOPICS, _ONE_TOPIC, _MESSAGES], lambda data: data[:28] + b"\x7f\xff\xff\xff" + data[32:]),

@@ -32,6 +32,8 @@ from pendulum_msgs_py.plant_parameters import PRESETS, load_plant, write_plant
 
 __all__ = ["PARSERS", "Parser", "mutate", "read_whole_bag"]
 
+_WHOLE = "whole_bag"
+"""Folder of a bag whose storage file is read together with its metadata."""
 _START_NS = 1_700_000_000_000_000_000
 _CSV = "time,position,velocity,torque\n" + "".join(
     f"{0.01 * i:.2f},{0.001 * i:.4f},0.1,{0.2 * (-1) ** i}\n" for i in range(60)
@@ -64,12 +66,14 @@ class Parser:
         make: Writes a good file or bag under a folder and returns its path.
         read: Reads it as far as the project ever does.
         text: The format is text, so that words are worth trying.
+        slow: Reading starts a process, so that the short form tries a few files only.
     """
 
     name: str
     make: Callable[[Path], Path]
     read: Callable[[Path], object]
     text: bool = False
+    slow: bool = False
 
     def survives(self, path: Path) -> str:
         """Return an empty string where the parser stands the file, else what it did instead."""
@@ -232,6 +236,17 @@ def _bag_metadata(folder: Path) -> Path:
     return make_bag(folder) / "metadata.yaml"
 
 
+def _feedback_bag(storage: str) -> Callable[[Path], Path]:
+    make_file = _bag_file(storage)
+
+    def make(folder: Path) -> Path:
+        file = make_file(folder)
+        whole = file.parent.rename(folder / _WHOLE)
+        return whole / file.name
+
+    return make
+
+
 def _read_csv_by(mapping: Path) -> object:
     data = mapping.with_name("data.csv")
     if not data.exists():
@@ -259,6 +274,8 @@ PARSERS: Sequence[Parser] = (
     Parser("HEBI gains XML", _gains, load_gains, text=True),
     Parser("feedback NPZ", _feedback_npz, load_feedback),
     Parser("feedback CSV", _feedback_csv, load_feedback, text=True),
+    Parser("feedback bag: MCAP", _feedback_bag("mcap"), lambda path: load_feedback(path.parent), slow=True),
+    Parser("feedback bag: SQLite", _feedback_bag("sqlite3"), lambda path: load_feedback(path.parent), slow=True),
     Parser("bag: metadata.yaml", _bag_metadata, lambda path: read_whole_bag(path.parent), text=True),
     Parser("bag: MCAP", _bag_file("mcap"), read_whole_bag),
     Parser("bag: MCAP in zstd chunks", _bag_file("mcap", "zstd"), read_whole_bag),
@@ -268,6 +285,6 @@ PARSERS: Sequence[Parser] = (
 
 def copy_of(path: Path, folder: Path) -> Path:
     """Copy a file, or the bag around it, to a folder of its own."""
-    if path.name == "metadata.yaml":
+    if path.name == "metadata.yaml" or path.parent.name == _WHOLE:
         return Path(shutil.copytree(path.parent, folder / path.parent.name, dirs_exist_ok=True)) / path.name
     return Path(shutil.copy2(path, folder / path.name))

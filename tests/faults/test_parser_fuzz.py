@@ -33,7 +33,7 @@ def test_a_spoilt_file_ends_in_an_error_of_ours_or_in_data(parser: Parser, tmp_p
     assert parser.survives(good) == ""
     target = copy_of(good, tmp_path)
 
-    @_FEW
+    @settings(_FEW, max_examples=3 if parser.slow else 25)
     @given(seed=st.integers(0, 2**32))
     def attack(seed: int) -> None:
         target.write_bytes(mutate(data, random.Random(seed), text=parser.text))

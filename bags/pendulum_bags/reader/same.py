@@ -6,9 +6,8 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
-from pendulum_bags.reader.decode import decoder_for
+from pendulum_bags.reader.decode import decoder_for, store_for
 from pendulum_bags.reader.joint_state import canonical
-from pendulum_bags.storage.message_types import typestore
 from pendulum_msgs_py.errors import DataError
 
 if TYPE_CHECKING:
@@ -87,7 +86,7 @@ def _canonical_of(info: TopicInfo) -> Callable[[bytes], bytes]:
 
     def again(data: bytes) -> bytes:
         try:
-            return bytes(typestore().serialize_cdr(decode(data), info.type))
+            return bytes(store_for(info).serialize_cdr(decode(data), info.type))
         except DataError:
             return data
 

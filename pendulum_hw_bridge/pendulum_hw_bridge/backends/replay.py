@@ -11,7 +11,6 @@ import zipfile
 import zlib
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -28,6 +27,7 @@ from pendulum_hw_bridge.actuator import (
     check_command,
     check_lifetime,
 )
+from pendulum_hw_bridge.backends.bag_feedback import read_bag_feedback
 from pendulum_hw_bridge.clocks import Clock, WallClock
 from pendulum_hw_bridge.gains import GainSet
 from pendulum_msgs_py.errors import DataError
@@ -114,7 +114,7 @@ def load_feedback(path: str | Path) -> FeedbackRecording:
     path = Path(path)
     try:
         if path.is_dir():
-            return FeedbackRecording(_read_bag(path), where=str(path))
+            return FeedbackRecording(read_bag_feedback(path), where=str(path))
         if path.stat().st_size > _LIMIT:
             raise DataError(f"{path} has {path.stat().st_size} bytes; expected at most {_LIMIT}")
         if path.suffix == ".npz":
@@ -164,43 +164,6 @@ def _read_csv(path: Path) -> dict[str, list[float]]:
                     raise DataError(
                         f"{path}:{reader.line_num}: {name} is {text!r}; expected a number"
                     ) from error
-    return columns
-
-
-def _read_bag(folder: Path) -> dict[str, list[float]]:
-    try:
-        from rosbags.highlevel import AnyReader, AnyReaderError
-        from rosbags.typesys import Stores, get_typestore
-    except ImportError as error:
-        raise DataError(
-            f"bag {folder} needs rosbags to be read ({error}); install it with: pip install rosbags"
-        ) from error
-    columns: dict[str, list[float]] = {}
-    try:
-        with AnyReader([folder], default_typestore=get_typestore(Stores.ROS2_JAZZY)) as reader:
-            for ending in ("actuator/feedback", "joint_states"):
-                connections = [c for c in reader.connections if c.topic.endswith(f"/{ending}")]
-                if len({c.topic for c in connections}) > 1:
-                    topics = ", ".join(sorted({c.topic for c in connections}))
-                    raise DataError(f"bag {folder} holds several recordings: {topics}; expected one")
-                if connections:
-                    break
-            for connection, _, raw in reader.messages(connections=connections):
-                message: Any = reader.deserialize(raw, connection.msgtype)
-                stamp = message.header.stamp.sec + message.header.stamp.nanosec * 1e-9
-                columns.setdefault("time", []).append(stamp)
-                if ending == "joint_states":
-                    values = {name: getattr(message, name)[0] for name in ("position", "velocity", "effort")}
-                else:
-                    values = dict(zip(message.name, message.position, strict=True))
-                for name, value in values.items():
-                    columns.setdefault(name, []).append(float(value))
-    except AnyReaderError as error:
-        raise DataError(f"bag {folder} cannot be read: {error}") from error
-    if not columns:
-        raise DataError(
-            f"bag {folder} has no feedback; expected messages on actuator/feedback or joint_states"
-        )
     return columns
 
 
