@@ -5,12 +5,12 @@ A plant (simulator, bridge) owns its clock and its loop; it asks ``decide`` what
 
 from __future__ import annotations
 
-import time
 from collections import Counter
 from collections.abc import Callable, Mapping
 from typing import Protocol
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
+from rclpy.clock import Clock, ClockType
 from rclpy.duration import Duration
 from rclpy.node import Node
 from sensor_msgs.msg import JointState
@@ -24,6 +24,7 @@ from pendulum_msgs_py.commands import Refusal
 from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.parameters import ParameterSpec
 from pendulum_msgs_py.ros import qos
+from pendulum_msgs_py.ros.commander_watch import CommanderWatch
 from pendulum_msgs_py.ros.convert import (
     command_from_bytes,
     diagnostic_status,
@@ -44,12 +45,6 @@ TRAJECTORY_AGE_LIMIT = 1.0
 """Largest distance of a trajectory's stamp from the plant's time [s]: an old wish should not move a machine."""
 _LAST_WORDS = Duration(seconds=0.2)
 """Longest wait for subscribers to have heard that the plant stops."""
-_TWIN_CHECK_PERIOD_NS = 50_000_000
-"""Least time between two looks at the graph after answers came twice [ns]."""
-_CONTRADICTION_HOLD_NS = 1_000_000_000
-"""Time after the last contradiction between two commanders at which they are believed again [ns]."""
-_UNKNOWN_NODE = "_NODE_NAME_UNKNOWN_"
-"""What discovery calls a node whose name has not arrived yet."""
 
 LIMIT_SPECS: tuple[ParameterSpec, ...] = (
     ParameterSpec(
@@ -205,8 +200,7 @@ class PlantInterface:
         self._more_diagnostics = more_diagnostics
         self._told_mode: tuple[Mode, bool, bool] | None = None
         self._told_refusals = 0
-        self._checked_commanders_ns = 0
-        self._contradicted_ns: int | None = None
+        self._commanders = CommanderWatch(node, supervisor)
         self._seconds_at_check = 0
         self._second_commander = False
         self._stopping = False
@@ -225,13 +219,17 @@ class PlantInterface:
         node.create_service(SetBool, names.ARM, self._on_arm)
         node.create_service(Trigger, names.E_STOP, self._on_e_stop)
         node.create_service(Trigger, names.E_STOP_RESET, self._on_e_stop_reset)
-        self._housekeeping = node.create_timer(DIAGNOSTICS_PERIOD, self._on_housekeeping)
+        # Steady time: it must go on where simulated time stands still, or where the system clock is set back.
+        self._housekeeping = node.create_timer(
+            DIAGNOSTICS_PERIOD, self._on_housekeeping, clock=Clock(clock_type=ClockType.STEADY_TIME)
+        )
 
     # --- the plant's loop calls these ----------------------------------------------------------------------
 
     def publish_state(self, sample: JointSample) -> None:
         """Publish a state and remember it as the newest."""
         self.sample = sample
+        self._commanders.note_state(sample.stamp_ns)
         self._states.publish(
             encode_joint_state(
                 sample.stamp_ns, position=sample.position, velocity=sample.velocity, effort=sample.effort
@@ -321,7 +319,9 @@ class PlantInterface:
             command = command_from_bytes(data)
             refusal = supervisor.offer(kind, command, self.clock())
             if refusal is Refusal.DUPLICATE and kind is Input.EFFORT_COMMAND and command is not None:
-                self._suspect_twins(command)
+                self._commanders.suspect_twins(command, self.clock())
+            if refusal is None and kind is Input.EFFORT_COMMAND and command is not None:
+                self._commanders.suspect_second_plant(command)
             if refusal is None and self.on_command is not None and command is not None:
                 self.on_command(kind, command)
 
@@ -355,7 +355,7 @@ class PlantInterface:
 
     def _on_arm(self, request: SetBool.Request, response: SetBool.Response) -> SetBool.Response:
         if request.data:
-            self._check_commanders()
+            self._commanders.check()
             refusal = self.supervisor.arm(self.clock(), self.sample)
             response.success, response.message = not refusal, refusal or self.supervisor.mode.value
         else:
@@ -378,50 +378,12 @@ class PlantInterface:
         return response
 
     def _on_housekeeping(self) -> None:
-        self._check_commanders()
+        self._commanders.check()
         seconds = sum(gate.refused[Refusal.SECOND_COMMANDER] for gate in self.supervisor.gates.values())
         self._second_commander = seconds > self._seconds_at_check
         self._seconds_at_check = seconds
         self._tell_refusals()
         self.publish_diagnostics()
-
-    def _suspect_twins(self, command: JointCommand) -> None:
-        """Look at the graph at once when a state is answered in two ways: two commanders may share a name.
-
-        Answered alike, it is one commander that repeats itself, as in lockstep after a lost message.
-        """
-        newest = self.supervisor.gates[Input.EFFORT_COMMAND].fresh(self.clock())
-        if newest is None or newest.effort == command.effort:
-            return
-        now = self._contradicted_ns = time.monotonic_ns()
-        if now - self._checked_commanders_ns >= _TWIN_CHECK_PERIOD_NS:
-            self._check_commanders()
-
-    def _check_commanders(self) -> None:
-        topic = self.node.resolve_topic_name(names.EFFORT_COMMAND)
-        found = Counter(
-            f"{info.node_namespace.rstrip('/')}/{info.node_name}"
-            for info in self.node.get_publishers_info_by_topic(topic)
-        )
-        twins = [name for name, count in found.items() if count > 1 and not name.endswith(_UNKNOWN_NODE)]
-        gate = self.supervisor.gates[Input.EFFORT_COMMAND]
-        self._checked_commanders_ns = now = time.monotonic_ns()
-        conflict = ""
-        if twins:
-            conflict = f"{found[twins[0]]} commanders named {twins[0]} on {topic}; expected one: zero torque"
-        elif found.total() > 1 and gate.newest_stamp_ns is not None:
-            if gate.commander == "":
-                conflict = (
-                    f"{found.total()} unnamed commanders on {topic}; expected one, or a frame_id: zero torque"
-                )
-            elif self._contradicted_ns is not None and now - self._contradicted_ns < _CONTRADICTION_HOLD_NS:
-                conflict = (
-                    f"{found.total()} commanders on {topic} give two answers to one state as {gate.commander!r}; "
-                    "expected a frame_id of its own for each: zero torque"
-                )
-        if conflict and conflict != self.supervisor.commander_conflict:
-            self.node.get_logger().error(conflict)
-        self.supervisor.set_commander_conflict(conflict)
 
     def _tell(self, drive: Drive) -> None:
         supervisor = self.supervisor

@@ -1,0 +1,113 @@
+"""Who commands a plant, as far as the graph tells: twins behind one name, and a second plant under our names."""
+
+from __future__ import annotations
+
+import time
+from collections import Counter, deque
+
+from rclpy.node import Node
+
+from pendulum_msgs_py import names
+from pendulum_msgs_py.supervisor import Input, PlantSupervisor
+from pendulum_msgs_py.values import JointCommand
+
+__all__ = ["CommanderWatch"]
+
+_CHECK_PERIOD_NS = 50_000_000
+"""Least time between two looks at the graph after a message gave reason for one [ns]."""
+_HOLD_NS = 1_000_000_000
+"""Time after the last contradiction at which commands are believed again [ns]."""
+_OWN_STATES = 64
+"""Stamps of own states that an answer is looked up among: those that are young enough to be answered, and more."""
+_UNKNOWN_NODE = "_NODE_NAME_UNKNOWN_"
+"""What discovery calls a node whose name has not arrived yet."""
+
+
+class CommanderWatch:
+    """Tells a supervisor that several stand where one is expected, which no single message shows.
+
+    Args:
+        node: The plant's node.
+        supervisor: Told the conflict, or that there is none; while there is one, nobody's torque is applied.
+    """
+
+    def __init__(self, node: Node, supervisor: PlantSupervisor) -> None:
+        self._node = node
+        self._supervisor = supervisor
+        self._commands = node.resolve_topic_name(names.EFFORT_COMMAND)
+        self._states = node.resolve_topic_name(names.JOINT_STATES)
+        self._checked_ns = 0
+        self._contradicted_ns: int | None = None
+        self._own_stamps: deque[int] = deque(maxlen=_OWN_STATES)
+        self._foreign_ns: int | None = None
+
+    def note_state(self, stamp_ns: int) -> None:
+        """Remember the stamp of a state that this plant publishes [ns]."""
+        self._own_stamps.appendleft(stamp_ns)
+
+    def suspect_twins(self, command: JointCommand, now_ns: int) -> None:
+        """Look at the graph at once when a state is answered in two ways: two commanders may share a name.
+
+        Answered alike, it is one commander that repeats itself, as in lockstep after a lost message.
+
+        Args:
+            command: The second answer.
+            now_ns: The plant's clock [ns].
+        """
+        newest = self._supervisor.gates[Input.EFFORT_COMMAND].fresh(now_ns)
+        if newest is None or newest.effort == command.effort:
+            return
+        self._contradicted_ns = time.monotonic_ns()
+        self._check_soon(self._contradicted_ns)
+
+    def suspect_second_plant(self, command: JointCommand) -> None:
+        """Look at the graph when a command answers a state that is not ours: a second plant may share our names.
+
+        A controller that stamps with the time of day is none, as long as nobody else publishes states.
+        """
+        if command.stamp_ns not in self._own_stamps:
+            self._foreign_ns = time.monotonic_ns()
+            self._check_soon(self._foreign_ns)
+
+    def check(self) -> None:
+        """Look at the graph and tell the supervisor what is wrong, or that nothing is."""
+        self._checked_ns = now = time.monotonic_ns()
+        conflict = self._two_commanders(now) or self._two_plants(now)
+        if conflict and conflict != self._supervisor.commander_conflict:
+            self._node.get_logger().error(conflict)
+        self._supervisor.set_commander_conflict(conflict)
+
+    def _check_soon(self, now: int) -> None:
+        if now - self._checked_ns >= _CHECK_PERIOD_NS:
+            self.check()
+
+    def _two_commanders(self, now: int) -> str:
+        topic = self._commands
+        found = Counter(
+            f"{info.node_namespace.rstrip('/')}/{info.node_name}"
+            for info in self._node.get_publishers_info_by_topic(topic)
+        )
+        twins = [name for name, count in found.items() if count > 1 and not name.endswith(_UNKNOWN_NODE)]
+        if twins:
+            return f"{found[twins[0]]} commanders named {twins[0]} on {topic}; expected one: zero torque"
+        gate = self._supervisor.gates[Input.EFFORT_COMMAND]
+        if found.total() < 2 or gate.newest_stamp_ns is None:
+            return ""
+        if gate.commander == "":
+            return f"{found.total()} unnamed commanders on {topic}; expected one, or a frame_id: zero torque"
+        if self._contradicted_ns is not None and now - self._contradicted_ns < _HOLD_NS:
+            return (
+                f"{found.total()} commanders on {topic} give two answers to one state as {gate.commander!r}; "
+                "expected a frame_id of its own for each: zero torque"
+            )
+        return ""
+
+    def _two_plants(self, now: int) -> str:
+        if self._foreign_ns is None or now - self._foreign_ns >= _HOLD_NS:
+            return ""
+        plants = self._node.count_publishers(self._states)
+        if plants < 2:
+            return ""
+        return (
+            f"{plants} plants on {self._states}, and commands answer another's states; expected one: zero torque"
+        )
