@@ -17,6 +17,7 @@ import typer
 from diagnostic_msgs.msg import DiagnosticArray
 from rcl_interfaces.msg import Parameter as ParameterMessage
 from rcl_interfaces.srv import SetParameters
+from rclpy.clock import Clock, ClockType
 from rclpy.context import Context
 from rclpy.experimental import EventsExecutor
 from rclpy.node import Node
@@ -87,7 +88,7 @@ class Hub:
         self._node.create_subscription(
             DiagnosticArray, names.DIAGNOSTICS, self._on_diagnostics, qos.DIAGNOSTICS
         )
-        self._node.create_timer(_LOOK_PERIOD, self._look)
+        self._node.create_timer(_LOOK_PERIOD, self._look, clock=Clock(clock_type=ClockType.STEADY_TIME))
         self._done = Future(executor=None)
         self._executor = EventsExecutor(context=self._context)
         self._executor.add_node(self._node)

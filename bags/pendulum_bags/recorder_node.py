@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import typer
+from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.subscription import Subscription
@@ -122,7 +123,8 @@ class Recorder(Node):
         self.create_service(Trigger, "~/annotate", self._on_annotate)
         self.create_service(Trigger, "~/status", self._on_status)
         self._discover()
-        self.create_timer(DISCOVERY_PERIOD, self._discover)
+        # Steady time: topics are looked for also where the system clock is set back, or simulated time stands still.
+        self.create_timer(DISCOVERY_PERIOD, self._discover, clock=Clock(clock_type=ClockType.STEADY_TIME))
         self._leave = threading.Event()
         self._poller = threading.Thread(target=self._poll, name="bag intake", daemon=True)
         self._poller.start()
@@ -167,9 +169,7 @@ class Recorder(Node):
                 return None
             self._take_all()
             self._offer_unstamped(session)
-            session.writer.update_metadata(
-                {"pendulum.parameters": self._parameter_reader.values}
-            ) if not session.failure else None
+            session.update_metadata({"pendulum.parameters": self._parameter_reader.values})
             self._session = None
             report = session.close()
         self.reports.append(report)
@@ -204,6 +204,16 @@ class Recorder(Node):
     # -- intake ------------------------------------------------------------------------------------------------
 
     def _poll(self) -> None:
+        try:
+            self._poll_until_told()
+        except Exception as error:  # noqa: BLE001  # a recorder that hears nothing any more must not look alive
+            self.exit_code = 1
+            with self._lock:
+                if self._session is not None:
+                    self._session.fail(error)
+            self._stop()
+
+    def _poll_until_told(self) -> None:
         while not self._leave.wait(POLL_PERIOD):
             with self._lock:
                 self._take_all()
@@ -354,8 +364,8 @@ class Recorder(Node):
 
     def _on_node_parameters(self, values: Mapping[str, Mapping[str, Any]], changed: str) -> None:
         with self._lock:
-            if self._session is not None and not self._session.failure:
-                self._session.writer.update_metadata({"pendulum.parameters": values})
+            if self._session is not None:
+                self._session.update_metadata({"pendulum.parameters": values})
         if changed:
             self.note("parameters_changed", node=changed, values=values[changed])
 

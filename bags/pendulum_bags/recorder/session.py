@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 from pendulum_bags.storage import BagWriter, QosProfile
 from pendulum_bags.storage.message_types import MessageType
@@ -119,7 +120,7 @@ class RecordingSession:
         except BagError:
             raise
         except OSError as error:
-            self._fail(error)
+            self.fail(error)
         self._counts.setdefault(name, TopicCount())
 
     def offer(self, topic: str, items: Sequence[tuple[int, bytes]]) -> int:
@@ -143,6 +144,15 @@ class RecordingSession:
         count.refused += refused
         return refused
 
+    def update_metadata(self, metadata: Mapping[str, Any]) -> None:
+        """Add or replace entries of the bag's metadata; a disk that has failed gets no more."""
+        if self.failure:
+            return
+        try:
+            self.writer.update_metadata(metadata)
+        except OSError as error:
+            self.fail(error)
+
     def note_missing(self, topic: str, number: int) -> None:
         """Count messages that the middleware lost before they could be offered."""
         self._counts[topic].missing += number
@@ -165,8 +175,8 @@ class RecordingSession:
                     self._write_queue()
                     self._store_counts()
                     self.writer.close()
-                except OSError as error:
-                    self._fail(error)
+                except Exception as error:  # noqa: BLE001  # whatever it is, the report must say it
+                    self.fail(error)
         return SessionReport(self.writer.path, self.counts(), self.failure)
 
     # -- the writing thread ------------------------------------------------------------------------------------
@@ -182,8 +192,8 @@ class RecordingSession:
                 if self._sync_interval and now - synced >= self._sync_interval:
                     synced = now
                     self.writer.sync()
-            except OSError as error:
-                self._fail(error)
+            except Exception as error:  # noqa: BLE001  # a thread that dies in silence would record nothing any more
+                self.fail(error)
                 return
 
     def _write_queue(self) -> None:
@@ -205,13 +215,23 @@ class RecordingSession:
             }
         )
 
-    def _fail(self, error: OSError) -> None:
-        """Keep what is in the bag, give back the room that it does not need, and say why."""
-        self.failure = str(error.strerror or error).lower()
+    def fail(self, error: Exception) -> None:
+        """Keep what is in the bag, give back the room that it does not need, and say why; the first reason counts."""
+        if self.failure:
+            return
+        self.failure = _reason(error)
         try:
             self.writer.close()
-        except OSError:
+        except Exception:  # noqa: BLE001  # out of room, out of memory: it does not matter any more
             # Not even the summary fits: the file as it was sealed last is complete without it.
             self.writer.abandon()
         if self._on_failure is not None:
             self._on_failure(self.failure)
+
+
+def _reason(error: Exception) -> str:
+    if isinstance(error, MemoryError):
+        return "memory is exhausted"
+    if isinstance(error, OSError):
+        return str(error.strerror or error).lower()
+    return f"{type(error).__name__}: {error}"
