@@ -22,6 +22,7 @@ from pendulum_bags.identification.result import load_fit_model
 from pendulum_bags.reader import read_bag
 from pendulum_bags.reader.statistics import bag_statistics
 from pendulum_bags.recorder.options import read_metadata
+from pendulum_bags.storage import mcap_records as rec
 from pendulum_bags.storage import open_writer
 from pendulum_bags.study.study_file import load_study
 from pendulum_hw_bridge.backends.replay import load_feedback
@@ -232,6 +233,25 @@ def _bag_file(storage: str, compression: str | None = None) -> Callable[[Path], 
     return make
 
 
+def _bag_of_own_types(folder: Path) -> Path:
+    """Write an MCAP file whose message is of a type that only the file defines."""
+    separator = "\n" + "=" * 80 + "\n"
+    definition = (
+        "# a comment\nint32 LIMIT=3\nown/Part[2] parts\nown/Part[<=3] more\nfloat64[3] numbers\nstring<=9 text \"t\"\n"
+        f"builtin_interfaces/Time at\n{separator}MSG: own/Part\nuint8 a\nbool[] flags\n"
+        f"{separator}MSG: builtin_interfaces/Time\nint32 sec\nuint32 nanosec\n"
+    )
+    data = b"\0\1\0\0" + bytes(48) + b"\1" + bytes(47)  # the text is not longer than its end
+    path = folder / "own_types.mcap"
+    path.write_bytes(
+        rec.MAGIC + rec.header_record("fuzz")
+        + rec.schema_record(1, "own/msg/Whole", "ros2msg", definition) + rec.channel_record(1, 1, "/own", {})
+        + rec.MESSAGE_HEADER.pack(rec.MESSAGE, 22 + len(data), 1, 0, 5, 5) + data
+        + rec.record(rec.DATA_END, bytes(4)) + rec.footer_record(0, 0) + rec.MAGIC
+    )  # fmt: skip
+    return path
+
+
 def _bag_metadata(folder: Path) -> Path:
     return make_bag(folder) / "metadata.yaml"
 
@@ -279,6 +299,7 @@ PARSERS: Sequence[Parser] = (
     Parser("bag: metadata.yaml", _bag_metadata, lambda path: read_whole_bag(path.parent), text=True),
     Parser("bag: MCAP", _bag_file("mcap"), read_whole_bag),
     Parser("bag: MCAP in zstd chunks", _bag_file("mcap", "zstd"), read_whole_bag),
+    Parser("bag: own types", _bag_of_own_types, read_whole_bag, text=True),
     Parser("bag: SQLite", _bag_file("sqlite3"), read_whole_bag),
 )
 
