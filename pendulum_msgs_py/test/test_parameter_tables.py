@@ -20,6 +20,7 @@ from pendulum_msgs_py.parameters import (
     read_text,
     validate,
 )
+from pendulum_msgs_py.ros.shared_parameters import given_to_every_node, refuse_near_misses
 
 _SPECS = (
     ParameterSpec("rate_hz", 500.0, "Hz", "Rate.", minimum=0.0, exclusive_minimum=True),
@@ -202,3 +203,39 @@ def test_what_is_no_file_is_refused(tmp_path: Path) -> None:
         read_text(tmp_path / "latin", "file")
     with pytest.raises(ParameterError, match="cannot be read"):
         read_text("a\0b", "file")
+
+
+_SHARED_FILE = """
+/**:
+  ros__parameters:
+    everybodys: 1.0
+    ours_too: 1.0
+    nested: {deep: 1.0}
+/sim/*:
+  ros__parameters: {of_the_namespace: 1.0}
+/**/controller:
+  ros__parameters: {ours_too: 2.0}
+sim:
+  controller:
+    ros__parameters: {only_ours: 1.0}
+/hw/controller:
+  ros__parameters: {everybodys: 3.0}
+"""
+
+
+def test_only_what_a_file_gives_to_every_node_may_be_left_to_others(tmp_path: Path) -> None:
+    file = tmp_path / "shared.yaml"
+    file.write_text(_SHARED_FILE, encoding="utf-8")
+    arguments = ["--ros-args", "--params-file", str(file), "-p", "of_the_namespace:=2.0"]
+    assert given_to_every_node(arguments, "/sim/controller") == {"everybodys", "nested.deep"}
+    named = [*arguments, "-p", "controller:everybodys:=1.0"]
+    assert given_to_every_node(named, "/sim/controller") == {"nested.deep"}
+    assert given_to_every_node(["--ros-args", "-p", "everybodys:=1.0"], "/sim/controller") == set()
+    assert "everybodys" not in given_to_every_node(arguments, "/hw/controller")
+    assert "ours_too" in given_to_every_node(arguments, "/sim/disturbance")
+
+
+def test_a_misspelling_is_refused_wherever_it_stands() -> None:
+    refuse_near_misses(["initial_theta", "plant"], ["effort_limit", "initial_position"], where="/hw/bridge")
+    with pytest.raises(ParameterError, match=r"/hw/bridge: unknown parameter 'effort_limt'.* 'effort_limit'"):
+        refuse_near_misses(["plant", "effort_limt"], ["effort_limit", "backend"], where="/hw/bridge")

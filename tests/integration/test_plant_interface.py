@@ -362,6 +362,26 @@ def test_parameters_of_ros_itself_are_no_strangers(processes: ProcessGroup, doma
     assert program.wait(5.0) == 0
 
 
+def test_a_file_for_every_node_may_hold_what_other_nodes_know_but_no_misspelling(
+    processes: ProcessGroup, domain_id: int, tmp_path: Path
+) -> None:
+    file = tmp_path / "all.yaml"
+    file.write_text("/**:\n  ros__parameters: {use_sim_time: false, gain: 3.0, of_another: 1.0}\n", encoding="utf-8")
+    program = _start(processes, "--ros-args", "--params-file", str(file))
+    program.wait_for_output("left to other nodes, from a section for every node: of_another", 20.0)
+    program.wait_for_output("running", 20.0)
+    program.send_signal(signal.SIGINT)
+    assert program.wait(5.0) == 0
+    file.write_text("/**:\n  ros__parameters: {effort_limt: 1.0}\n", encoding="utf-8")
+    program = _start(processes, "--ros-args", "--params-file", str(file))
+    assert program.wait(20.0) == 2
+    assert "unknown parameter 'effort_limt'" in program.output
+    file.write_text("/tiny_plant:\n  ros__parameters: {of_another: 1.0}\n", encoding="utf-8")
+    program = _start(processes, "--ros-args", "--params-file", str(file))
+    assert program.wait(20.0) == 2
+    assert "unknown parameter 'of_another'" in program.output
+
+
 def test_help_shows_every_parameter_and_survives_a_reader_that_goes() -> None:
     command = [sys.executable, str(_PLANT), "--help"]
     text = subprocess.run(command, capture_output=True, text=True, check=True, timeout=30).stdout

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Callable, Iterable, Mapping
 from typing import Any
 
@@ -17,10 +18,10 @@ from rclpy.parameter import Parameter
 
 from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.parameters import ParameterSpec, reject_unknown
+from pendulum_msgs_py.ros.shared_parameters import given_to_every_node, refuse_near_misses
 
 __all__ = ["NodeParameters"]
 
-_LARGEST_DOUBLE = 1.7976931348623157e308
 _PARAMETERS_OF_ROS = frozenset({"use_sim_time", "start_type_description_service"})
 _PREFIXES_OF_ROS = ("qos_overrides.",)
 
@@ -35,8 +36,8 @@ class NodeParameters:
             ParameterError refuses the change, and everything stays as it was.
 
     Raises:
-        ParameterError: A value given at start is refused, or a parameter was given that the node does not have.
-            Parameters that are declared elsewhere have to be so before.
+        ParameterError: A value given at start is refused, or a parameter was given that the node does not have, unless
+            in a section of a file that is for every node. Parameters that are declared elsewhere have to be so before.
     """
 
     def __init__(
@@ -92,7 +93,10 @@ class NodeParameters:
 
 
 def _refuse_unknown(node: Node, specs: Mapping[str, ParameterSpec]) -> None:
-    """ROS ignores a misspelt parameter and the default stays in force; here nobody should believe it was set."""
+    """ROS ignores a misspelt parameter and the default stays in force; here nobody should believe it was set.
+
+    A file may serve several nodes, though: what its sections for every node give may be another's.
+    """
     given = [
         name
         for name in node._parameter_overrides
@@ -100,7 +104,15 @@ def _refuse_unknown(node: Node, specs: Mapping[str, ParameterSpec]) -> None:
         and not name.startswith(_PREFIXES_OF_ROS)
         and not node.has_parameter(name)
     ]
-    reject_unknown(dict.fromkeys(given), specs, where=node.get_fully_qualified_name())
+    unknown = [name for name in given if name not in specs]
+    if not unknown:
+        return
+    where = node.get_fully_qualified_name()
+    shared = given_to_every_node(sys.argv, where)
+    refuse_near_misses((name for name in unknown if name in shared), specs, where=where)
+    reject_unknown(dict.fromkeys(name for name in unknown if name not in shared), specs, where=where)
+    left = ", ".join(sorted(unknown))
+    node.get_logger().info(f"left to other nodes, from a section for every node: {left}")
 
 
 def _plain(value: Any) -> object:
@@ -132,13 +144,15 @@ def _descriptor(spec: ParameterSpec) -> ParameterDescriptor:
         read_only=spec.read_only,
         additional_constraints=spec.domain,
     )
-    bounded = spec.minimum is not None or spec.maximum is not None
-    if bounded and isinstance(spec.default, float):
-        low = -_LARGEST_DOUBLE if spec.minimum is None else float(spec.minimum)
-        high = _LARGEST_DOUBLE if spec.maximum is None else float(spec.maximum)
-        descriptor.floating_point_range = [FloatingPointRange(from_value=low, to_value=high)]
-    elif bounded and isinstance(spec.default, int) and not isinstance(spec.default, bool):
-        low_integer = -(2**63) if spec.minimum is None else int(spec.minimum)
-        high_integer = 2**63 - 1 if spec.maximum is None else int(spec.maximum)
-        descriptor.integer_range = [IntegerRange(from_value=low_integer, to_value=high_integer, step=1)]
+    # ROS knows ranges with two ends only; tools make sliders of them. A domain with one end stands in the constraints,
+    # and our own refusal says it better than "out of range, Max: 1.797e+308".
+    if spec.minimum is not None and spec.maximum is not None:
+        if isinstance(spec.default, float):
+            descriptor.floating_point_range = [
+                FloatingPointRange(from_value=float(spec.minimum), to_value=float(spec.maximum))
+            ]
+        elif isinstance(spec.default, int) and not isinstance(spec.default, bool):
+            descriptor.integer_range = [
+                IntegerRange(from_value=int(spec.minimum), to_value=int(spec.maximum), step=1)
+            ]
     return descriptor

@@ -1,0 +1,91 @@
+"""Parameters that a file gives to every node, as in a ``/**:`` section: what of them a node may leave to others."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from difflib import get_close_matches
+from itertools import pairwise
+from typing import Any
+
+from pendulum_msgs_py.errors import ParameterError
+from pendulum_msgs_py.parameters import load_yaml
+
+__all__ = ["given_to_every_node", "refuse_near_misses"]
+
+_CONTENT = "ros__parameters"
+_MISSPELT = 0.85
+"""Likeness from which a name is a misspelling of ours, not another node's; the names of our own nodes differ more."""
+
+
+def given_to_every_node(arguments: Sequence[str], node: str) -> set[str]:
+    """Return the names that reached a node only because a parameter file gives them to everybody.
+
+    A section whose pattern ends in ``*`` or ``**`` (``/**``, ``/sim/*``) names no node. What a section that does
+    (``controller``, ``/**/controller``) or ``-p`` gives as well is meant for this one.
+
+    Args:
+        arguments: Arguments of the process, ROS arguments included.
+        node: Full name of the node.
+
+    Raises:
+        ParameterError: A parameter file holds what ROS reads and this project refuses, such as a key given twice.
+    """
+    files = [value for flag, value in pairwise(arguments) if flag == "--params-file"]
+    sections = [section for file in files for section in _sections(load_yaml(file, "parameter file"), "")]
+    to_all: set[str] = set()
+    to_us: set[str] = set()
+    for pattern, content in sections:
+        if pattern.endswith("*"):
+            to_all |= set(_flat(content, ""))
+        elif _matches(pattern, node):
+            to_us |= set(_flat(content, ""))
+    for flag, value in pairwise(arguments):
+        if flag in {"-p", "--param"}:
+            to_us.add(value.partition(":=")[0].rpartition(":")[2])
+    return to_all - to_us
+
+
+def refuse_near_misses(names: Iterable[str], known: Iterable[str], *, where: str) -> None:
+    """Raise a ParameterError for the first name that looks like a misspelling of a known one.
+
+    A shared section may hold what other nodes know, but a limit that is misspelt there would silently not be in force.
+
+    Args:
+        names: Names that the node does not have.
+        known: Names that it has.
+        where: Full name of the node, for the message.
+    """
+    known = list(known)
+    for name in names:
+        near = get_close_matches(name, known, n=1, cutoff=_MISSPELT)
+        if near:
+            raise ParameterError(
+                f"{where}: unknown parameter {name!r} in a section for every node; did you mean {near[0]!r}? "
+                "If it belongs to another node, give it in that node's section"
+            )
+
+
+def _sections(content: Mapping[str, Any], prefix: str) -> Iterator[tuple[str, Mapping[str, Any]]]:
+    """Yield the sections of a file; namespaces may be nested."""
+    for key, value in content.items():
+        if key == _CONTENT:
+            if isinstance(value, Mapping):
+                yield prefix, value
+        elif isinstance(value, Mapping):
+            yield from _sections(value, f"{prefix}/{key.strip('/')}")
+
+
+def _flat(content: Mapping[str, Any], prefix: str) -> Iterator[str]:
+    for key, value in content.items():
+        if isinstance(value, Mapping):
+            yield from _flat(value, f"{prefix}{key}.")
+        else:
+            yield f"{prefix}{key}"
+
+
+def _matches(pattern: str, node: str) -> bool:
+    """Tell whether a section is for a node: ``*`` stands for one part of the name, ``**`` for any number of them."""
+    parts = pattern.strip("/").split("/")
+    expression = "".join({"*": "/[^/]+", "**": "(?:/[^/]+)*"}.get(part, f"/{re.escape(part)}") for part in parts)
+    return re.fullmatch(expression, node) is not None
