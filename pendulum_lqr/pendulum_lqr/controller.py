@@ -183,8 +183,8 @@ def controller_class(name: str) -> type[BaseController]:
     Raises:
         ParameterError: No such controller; the message lists those there are.
     """
-    if name not in CONTROLLERS:
-        near = get_close_matches(name, CONTROLLERS, n=1)
+    if not isinstance(name, str) or name not in CONTROLLERS:  # a file may say 7
+        near = get_close_matches(str(name), CONTROLLERS, n=1)
         hint = f"; did you mean {near[0]!r}?" if near else f"; expected one of {', '.join(CONTROLLERS)}"
         raise ParameterError(f"controller is {name!r}{hint}")
     module, kind = CONTROLLERS[name].split(":")

@@ -75,6 +75,8 @@ def _child(storage: str, place: Path, flags: Sequence[str]) -> None:
     sys.path.insert(0, str(ATHERIS))
     atheris: Any = importlib.import_module("atheris")
     with atheris.instrument_imports(include=["pendulum_bags.reader", "pendulum_bags.storage", "rosbags"]):
+        for module in ("rosbags.serde", "rosbags.typesys"):
+            importlib.import_module(module)
         from tests.faults.parsers import PARSERS
     parser = next(parser for parser in PARSERS if parser.name == STORAGES[storage])
     (place / "good").mkdir()

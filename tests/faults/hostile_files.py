@@ -136,7 +136,8 @@ def _indexed(entries: int, chunks: int) -> bytes:
     table = struct.pack("<qQ", 5, 0) * entries
     index = rec.record(rec.MESSAGE_INDEX, struct.pack("<HI", 1, len(table)) + table)
     summary_at = index_at + len(index)
-    entry = rec.ChunkIndex(5, 5, at, len(chunk), {1: index_at}, len(index), "", len(records), len(records)).to_record()
+    places = [(1, index_at)]
+    entry = rec.chunk_index_record(5, 5, at, len(chunk), places, len(index), "", len(records), len(records))
     statistics = rec.statistics_record(
         message_count=entries, schema_count=1, metadata_count=0, chunk_count=chunks, start_ns=5, stop_ns=5,
         channel_counts={1: 2**60},
@@ -210,6 +211,10 @@ HOSTILE: Sequence[HostileFile] = (
     HostileFile(
         "named runs without end", "study YAML",
         _text("s.yaml", "format: pendulum_study/1\nname: a\nexperiment: thesis\nrepeats: 1000000000000\n"),
+    ),
+    HostileFile(
+        "a controller that is a number", "study YAML",
+        _text("s.yaml", "format: pendulum_study/1\nname: a\nplants: {thesis: {}}\ncontrollers: {0: {}}\n"),
     ),
     HostileFile("100 000 brackets", "JSON log", _text("l.json", "[" * 100_000)),
     HostileFile("entries that are numbers", "JSON log", _text("l.json", '{"entries": [1, 2, 3]}')),

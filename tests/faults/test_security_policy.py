@@ -2,85 +2,159 @@
 
 from __future__ import annotations
 
+import asyncio
 from pathlib import Path
+from typing import Any
 from xml.etree import ElementTree
 
 import pytest
 
-from pendulum_bags.experiment.conductor_node import Conductor
+from pendulum_bags.console_node import Hub
+from pendulum_bags.experiment.conductor_node import Conductor, PlantClient, RecorderClient
 from pendulum_bags.experiment.domain import reserve_domain
-from pendulum_bags.experiment.processes import ProcessSet, ros_environment
+from pendulum_bags.experiment.processes import ProcessSet, ros_environment, start_recorder
 from pendulum_msgs_py import graph, names
-from pendulum_msgs_py.security import NODES, permissions, policy, resolve
+from pendulum_msgs_py.errors import FaultError, ParameterError
+from pendulum_msgs_py.graph import NodeProgram
+from pendulum_msgs_py.security import PLANTS, Permissions, enclaves, granted, policy
 
+_RULES = ("publish", "subscribe", "reply", "request")
 _OPTIONAL = {names.CLOCK, "/parameter_events"}
 """A plant publishes the clock in lockstep only; the clock is heard under simulated time only."""
+_PASSING = ("/get_parameters", "/list_parameters")
+"""Clients of these services live for as long as an answer takes."""
 
 
-@pytest.mark.timeout(120)
-def test_nodes_do_what_the_policy_allows_and_nothing_else(tmp_path: Path) -> None:
-    programs = {
-        "/sim": (graph.simulator("/sim"), graph.controller("/sim"), graph.disturbance("/sim")),
-        "/hw": (graph.bridge("/hw", backend="emulator"),),
-    }
+def used_by(node: Any, full: str) -> dict[str, set[str]]:
+    """Return what a node of the running graph speaks on, hears, offers and calls."""
+    space, _, name = full.rpartition("/")
+    look = (
+        node.get_publisher_names_and_types_by_node,
+        node.get_subscriber_names_and_types_by_node,
+        node.get_service_names_and_types_by_node,
+        node.get_client_names_and_types_by_node,
+    )
+    return {rule: {topic for topic, _ in ask(name, space or "/")} for rule, ask in zip(_RULES, look, strict=True)}
+
+
+def missing(wanted: Permissions, now: dict[str, set[str]], absent: set[str]) -> dict[str, set[str]]:
+    """Return what a node never uses, of what it may; leaving out topics and services of nodes that are not started."""
+    rest = {rule: set(getattr(wanted, rule)) - now[rule] - _OPTIONAL for rule in _RULES}
+    rest["request"] = {name for name in rest["request"] if not name.endswith(_PASSING)}
+    return {rule: {name for name in found if name not in absent} for rule, found in rest.items() if found - absent}
+
+
+def extra(wanted: Permissions, now: dict[str, set[str]]) -> dict[str, set[str]]:
+    """Return what a node uses and may not."""
+    return {rule: found for rule in _RULES if (found := now[rule] - set(getattr(wanted, rule)))}
+
+
+async def _drive(hub: Hub) -> None:
+    """Press every button of the console once."""
+    await hub.e_stop()
+    for space, node in hub.plants().items():
+        await hub.trigger(f"{space}/disturbance/start")
+        await hub.trigger(f"{space}/disturbance/stop")
+        await hub.trigger(f"{node}/e_stop_reset")
+        await hub.arm(node, on=False)
+        await hub.set_parameter(f"{space}/controller", "r", 1.0)
+        await hub.set_parameter(f"{space}/disturbance", "amplitude", 1.0)
+
+
+@pytest.mark.timeout(180)
+def test_nodes_do_what_the_policy_allows_and_nothing_else(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    programs = [
+        graph.simulator("/sim"),
+        graph.bridge("/hw", backend="emulator"),
+        *(make(side) for side in PLANTS for make in (graph.controller, graph.disturbance)),
+        NodeProgram("pendulum_hw_bridge", "procedure", "/hw"),
+        NodeProgram("pendulum_sim", "viewer", "/sim", parameters={"window": False}),
+        NodeProgram("pendulum_sim", "markers", "/sim"),
+    ]
+    metadata = tmp_path / "run.json"
+    metadata.write_text("{}", encoding="utf-8")
+    allowed = granted()
     with (
         reserve_domain() as domain,
         ProcessSet(tmp_path, ros_environment(domain, tmp_path)) as processes,
         Conductor(domain) as conductor,
     ):
-        for group in programs.values():
-            for program in group:
-                processes.start_node(program)
-        node = conductor.node
-        for namespace, group in programs.items():
-            for program in group:
-                name = program.node_name
+        for program in programs:
+            processes.start_node(program)
+        start_recorder(processes, tmp_path / "bag", "/hw", metadata, "mcap")
+        for variable, value in ros_environment(domain, tmp_path).items():
+            monkeypatch.setenv(variable, value)
+        hub = Hub()
+        try:
+            for side, plant in PLANTS.items():
+                PlantClient(conductor, side, plant).wait_until_ready(40.0)
+            RecorderClient(conductor, "/hw").heard()
+            with pytest.raises(FaultError, match="refuses"):
+                PlantClient(conductor, "/hw", "bridge").call("procedure/finish")
+            conductor.wait_for("the console to see both plants", lambda: set(hub.plants()) == set(PLANTS), 20.0)
+            asyncio.run(_drive(hub))
+            here = {program.full_name for program in programs}
+            here |= {"/hw/recorder", "/conductor", "/console", "/console_taps"}
+            # Services of nodes that are not there, and of a trial that is not begun here.
+            absent = {"/sim/recorder/status", "/hw/procedure/start"}
+            found: dict[str, tuple[Any, Any]] = {}
 
-                def used(name: str = name, namespace: str = namespace) -> dict[str, set[str]]:
-                    found = {
-                        "publish": node.get_publisher_names_and_types_by_node(name, namespace),
-                        "subscribe": node.get_subscriber_names_and_types_by_node(name, namespace),
-                        "reply": node.get_service_names_and_types_by_node(name, namespace),
-                        "request": node.get_client_names_and_types_by_node(name, namespace),
-                    }
-                    return {rule: {topic for topic, _ in entries} for rule, entries in found.items()}
-
-                def allowed(name: str = name, namespace: str = namespace) -> dict[str, set[str]]:
-                    rules = permissions(name)
-                    return {
-                        rule: {resolve(entry, name, namespace) for entry in getattr(rules, rule)}
-                        for rule in ("publish", "subscribe", "reply", "request")
-                    }
-
-                def complete(name: str = name, namespace: str = namespace) -> bool:
+            def as_allowed() -> bool:
+                found.clear()
+                for full in sorted(here):
                     try:
-                        now = used(name, namespace)
+                        now = used_by(conductor.node, full)
                     except Exception as error:  # noqa: BLE001 (rclpy's NodeNameNonExistentError while it starts)
                         assert "exist" in str(error)  # noqa: PT017
-                        return False
-                    wanted = allowed(name, namespace)
-                    return all(wanted[rule] - _OPTIONAL <= now[rule] for rule in wanted)
+                        found[full] = "is not there yet", {}
+                        continue
+                    # What the recorder hears is what has been said so far: topics without a publisher are not there.
+                    silent = {"/hw/markers", "/hw/recorder/transition_event"} if full == "/hw/recorder" else set()
+                    problems = missing(allowed[full], now, absent | silent), extra(allowed[full], now)
+                    if any(problems):
+                        found[full] = problems
+                return not found
 
-                try:
-                    conductor.wait_for(f"all endpoints of {name}", complete, 40.0)
-                finally:
-                    processes.check()
-                    now, wanted = used(), allowed()
-                    missing = {rule: wanted[rule] - now[rule] - _OPTIONAL for rule in now}
-                    extra = {rule: now[rule] - wanted[rule] for rule in now}
-                assert not any(missing.values()), f"{name} never uses {missing}"
-                assert not any(extra.values()), f"{name} is not allowed {extra}"
+            try:
+                conductor.wait_for("all endpoints", as_allowed, 40.0)
+            except FaultError:
+                pytest.fail("\n".join(f"{full}: never uses {a}, is not allowed {b}" for full, (a, b) in found.items()))
+        finally:
+            hub.close()
 
 
-def test_the_policy_is_what_sros_2_reads_and_gives_each_node_an_enclave() -> None:
+def test_the_policy_is_what_sros_2_reads_and_gives_each_process_an_enclave() -> None:
     root = ElementTree.fromstring(policy())
-    paths = [enclave.get("path") for enclave in root.iter("enclave")]
-    assert paths == [f"{ns}/{node}" for ns, plant in (("/sim", "simulator"), ("/hw", "bridge"))
-                     for node in (plant, "controller", "disturbance")]  # fmt: skip
-    allowed = {topic.text for topics in root.iter("topics") if topics.get("publish") for topic in topics}
-    assert "/sim/push" not in allowed
-    assert set(NODES) == {"simulator", "bridge", "controller", "disturbance"}
+    assert [enclave.get("path") for enclave in root.iter("enclave")] == list(enclaves())
+    profiles = {f"{profile.get('ns').rstrip('/')}/{profile.get('node')}" for profile in root.iter("profile")}  # type: ignore[union-attr]
+    assert profiles == set(granted())
+    assert len(enclaves()) == len(granted()) - 1  # the console's two nodes are one process
+    for rule in ("publish", "subscribe"):
+        told = {topic.text for topics in root.iter("topics") if topics.get(rule) == "ALLOW" for topic in topics}
+        assert told == {topic for allowed in granted().values() for topic in getattr(allowed, rule)}
+    assert all(name and name.startswith("/") and "{" not in name for element in root.iter("topic")
+               for name in [element.text])  # fmt: skip
 
 
-def test_only_the_controller_may_command_torque() -> None:
-    assert [name for name in NODES if names.EFFORT_COMMAND in permissions(name).publish] == ["controller"]
+def test_only_who_drives_a_plant_may_command_torque() -> None:
+    torque = {f"{side}/{names.EFFORT_COMMAND}" for side in PLANTS}
+    speakers = {name for name, allowed in granted().items() if torque & set(allowed.publish)}
+    assert speakers == {"/sim/controller", "/hw/controller", "/hw/procedure"}
+    for watcher in ("recorder", "viewer", "markers"):
+        allowed = granted()[f"/sim/{watcher}"]
+        assert {t for t in allowed.publish if t.startswith("/sim/")} <= {"/sim/markers"}
+        assert all(service.endswith(_PASSING) for service in allowed.request)
+
+
+def test_no_node_of_one_side_speaks_on_the_other() -> None:
+    for full, allowed in granted().items():
+        side = "/" + full.split("/")[1]
+        if side in PLANTS:
+            other = next(space for space in PLANTS if space != side)
+            assert not [name for name in (*allowed.publish, *allowed.subscribe) if name.startswith(other + "/")]
+
+
+def test_a_side_without_a_plant_is_refused() -> None:
+    with pytest.raises(ParameterError, match="plant is toaster"):
+        policy([("/sim", "toaster")])
+    assert set(granted([("/left", "bridge")])) >= {"/left/bridge", "/left/controller", "/conductor"}
