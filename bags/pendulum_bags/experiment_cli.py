@@ -20,6 +20,7 @@ from pendulum_bags.experiment.settings import NoiseSettings, RegulationSettings
 from pendulum_bags.experiment_trials_cli import add_commands as add_trial_commands
 from pendulum_bags.leaderboard_cli import leaderboard
 from pendulum_bags.monte_carlo_cli import monte_carlo
+from pendulum_bags.region_cli import region_of_attraction
 from pendulum_bags.study_cli import add_commands as add_study_commands
 from pendulum_msgs_py.errors import PendulumError
 from pendulum_msgs_py.executables import EXIT_INTERRUPTED, cli_main
@@ -164,6 +165,7 @@ def lockstep(
 add_trial_commands(app)
 add_study_commands(app)
 app.command(name="monte_carlo")(monte_carlo)
+app.command(name="region_of_attraction")(region_of_attraction)
 app.command(name="leaderboard")(leaderboard)
 
 

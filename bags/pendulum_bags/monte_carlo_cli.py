@@ -12,7 +12,6 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 from rich.table import Table
 
-from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.executables import EXIT_INTERRUPTED
 
 __all__ = ["monte_carlo"]
@@ -24,7 +23,7 @@ def monte_carlo(
     ] = None,
     plant: Annotated[str, typer.Option(help="Preset or plant file; the controller is designed on it.")] = "thesis",
     uncertainty: Annotated[
-        str, typer.Option(help="identified (intervals of the plant file), or shares, such as inertia=0.3,damping=0.05.")
+        str, typer.Option(help="identified (covariance of the plant file), or shares: inertia=0.3,damping=0.05.")
     ] = "inertia=0.3,damping=0.05,gravity=0.05",
     runs: Annotated[int, typer.Option(help="Number of closed-loop runs.", min=1)] = 1_000_000,
     seed: Annotated[int, typer.Option(help="Seed of everything.", min=0)] = 1,
@@ -48,12 +47,13 @@ def monte_carlo(
     Example: python -m pendulum_bags experiment monte_carlo --runs 100000 --out /tmp/mc
     """
     from pendulum_bags.study import monte_carlo as engine
+    from pendulum_bags.study.uncertain import parse_uncertainty
 
     settings = engine.MonteCarlo(
         plant=plant,
         runs=runs,
         seed=seed,
-        uncertainty=_uncertainty(uncertainty, plant),
+        uncertainty=parse_uncertainty(uncertainty, plant),
         q=q,
         r=r,
         amplitude=amplitude,
@@ -95,21 +95,6 @@ def monte_carlo(
         console.print(f"({elapsed:.0f} s)")
 
 
-def _uncertainty(text: str, plant: str) -> dict[str, float]:
-    from pendulum_bags.study.monte_carlo import uncertainty_of
-
-    if text == "identified":
-        return uncertainty_of(plant)
-    found = {}
-    for part in filter(None, text.split(",")):
-        name, _, value = part.partition("=")
-        try:
-            found[name.strip()] = float(value)
-        except ValueError:
-            raise ParameterError(f"uncertainty has {part!r}; expected NAME=SHARE, such as damping=0.05") from None
-    return found
-
-
 def _replay(console: Console, settings: Any, number: int, folder: Path) -> None:
     import numpy as np
 
@@ -135,6 +120,10 @@ def _print(console: Console, result: dict[str, Any], folder: Path) -> None:
         f"{result['runs']} runs: theta stays within {settings['bound']:g} rad of upright with probability "
         f"{result['probability_inside']:.5f} (95 % interval {low:.5f} to {high:.5f})"
     )
+    uncertain = settings["uncertainty"]
+    told = ", ".join(f"{name} {100.0 * share:.2g} %" for name, share in uncertain["shares"].items()) or "nothing"
+    correlated = ", correlated" if uncertain["correlation"] else ""
+    console.print(f"uncertain: {told}{correlated} ({uncertain['source']})")
     table = Table(title="Quantiles", title_justify="left")
     shares = next(iter(result["quantiles"].values()))
     for heading in ("", *shares):
@@ -143,13 +132,16 @@ def _print(console: Console, result: dict[str, Any], folder: Path) -> None:
         table.add_row(name, *(f"{value:.5g}" for value in values.values()))
     console.print(table)
     table = Table(title="Worst runs", title_justify="left")
-    for heading in ("run", "inertia", "damping", "gravity", "noise seed", "max theta \\[rad]"):
+    names = list(uncertain["shares"])
+    for heading in ("run", *names, "noise seed", "max theta \\[rad]"):
         table.add_column(heading, justify="right")
     for row in result["worst"][:5]:
         table.add_row(
-            str(row["run"]), f"{row['inertia']:.4g}", f"{row['damping']:.4g}", f"{row['gravity']:.4g}",
-            f"{row['noise_seed']:.0f}", f"{row['max_theta']:.5f}",
-        )  # fmt: skip
+            str(row["run"]),
+            *(f"{row[name]:.4g}" for name in names),
+            f"{row['noise_seed']:.0f}",
+            f"{row['max_theta']:.5f}",
+        )
     console.print(table)
     if "sobol" in result:
         table = Table(title=f"Sobol indices of {result['sobol']['output']}", title_justify="left")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import replace
 from pathlib import Path
 
@@ -15,8 +16,8 @@ from pendulum_bags.study.monte_carlo import (
     run_chunk,
     run_monte_carlo,
     sobol,
-    uncertainty_of,
 )
+from pendulum_bags.study.uncertain import Uncertainty, parse_uncertainty, uncertainty_of
 from pendulum_msgs_py.errors import BagError, ParameterError
 
 SMALL = MonteCarlo(runs=700, chunk=300, duration=0.4)
@@ -85,24 +86,50 @@ def test_a_dask_cluster_gives_the_same_bits(tmp_path: Path) -> None:
 
 
 def test_sobol_indices_see_that_noise_rules_and_damping_comes_next() -> None:
-    found = sobol(replace(SMALL, duration=1.0, uncertainty={"damping": 0.2, "gravity": 0.05}), base=256)
+    found = sobol(replace(SMALL, duration=1.0, uncertainty=Uncertainty({"damping": 0.2, "gravity": 0.05})), base=256)
     total = {entry["factor"]: entry["total"] for entry in found["indices"]}
     assert total["noise"] > total["damping"] > total["gravity"]
 
 
-def test_uncertainty_comes_from_the_intervals_of_an_identification(tmp_path: Path) -> None:
+IDENTIFIED = (
+    "format: pendulum_plant/1\nname: found\nparameters:\n"
+    "  inertia: {value: 0.05, unit: kg m^2, interval: [0.0402, 0.0598]}\n"
+    "  damping: {value: 10.0, unit: N m s/rad, interval: [9.8, 10.2]}\n  gravity: {value: 1.6, unit: N m}\n"
+)
+
+
+def test_uncertainty_comes_from_the_intervals_where_an_identification_left_no_covariance(tmp_path: Path) -> None:
     file = tmp_path / "plant.yaml"
-    file.write_text(
-        "format: pendulum_plant/1\nname: found\nparameters:\n"
-        "  inertia: {value: 0.05, unit: kg m^2, interval: [0.0402, 0.0598]}\n"
-        "  damping: {value: 10.0, unit: N m s/rad}\n  gravity: {value: 1.6, unit: N m}\n",
-        encoding="utf-8",
-    )
-    assert uncertainty_of(str(file)) == {"inertia": pytest.approx(0.1)}
+    file.write_text(IDENTIFIED, encoding="utf-8")
+    found = uncertainty_of(str(file))
+    assert found.shares == {"inertia": pytest.approx(0.1, rel=1e-4), "damping": pytest.approx(0.0102, rel=1e-3)}
+    assert not found.correlation
     with pytest.raises(ParameterError, match="preset"):
         uncertainty_of("thesis")
 
 
-def test_an_unknown_parameter_is_refused() -> None:
+def test_plants_are_drawn_with_the_covariance_of_the_identification(tmp_path: Path) -> None:
+    file = tmp_path / "plant.yaml"
+    file.write_text(IDENTIFIED, encoding="utf-8")
+    # Standard deviations of 0.005 kg m^2 and 0.1 N m s/rad, correlation -0.8; a third parameter stands between.
+    matrix = [[2.5e-5, 0.0, -4e-4], [0.0, 1.0, 0.0], [-4e-4, 0.0, 1e-2]]
+    told = {"covariance": {"names": ["inertia", "load_friction", "damping"], "matrix": matrix}}
+    file.with_suffix(".json").write_text(json.dumps(told), encoding="utf-8")
+    found = parse_uncertainty("identified", str(file))
+    assert found.shares == pytest.approx({"inertia": 0.1, "damping": 0.01})
+    drawn = draw_chunk(MonteCarlo(plant=str(file), uncertainty=found, runs=200_000, chunk=200_000), 0)
+    sample = np.cov(drawn["inertia"], drawn["damping"])
+    assert sample == pytest.approx(np.array([[2.5e-5, -4e-4], [-4e-4, 1e-2]]), rel=0.02)
+    assert (drawn["gravity"] == 1.6).all()
+    file.with_suffix(".json").write_text("{}", encoding="utf-8")
+    with pytest.raises(ParameterError, match="no covariance of inertia, damping"):
+        uncertainty_of(str(file))
+
+
+def test_an_uncertainty_that_makes_no_distribution_is_refused() -> None:
     with pytest.raises(ParameterError, match="expected one of inertia, damping, gravity"):
-        MonteCarlo(uncertainty={"mass": 0.1})
+        Uncertainty({"mass": 0.1})
+    with pytest.raises(ParameterError, match="not positive definite"):
+        Uncertainty({"inertia": 0.1, "damping": 0.1}, [[1.0, 1.5], [1.5, 1.0]])
+    with pytest.raises(ParameterError, match="'damping'; expected identified"):
+        parse_uncertainty("damping", "thesis")
