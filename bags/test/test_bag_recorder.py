@@ -4,15 +4,13 @@ from __future__ import annotations
 
 import json
 import math
-import os
 import random
 import signal
-import subprocess
-import sys
 import threading
 import time
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -35,9 +33,9 @@ from pendulum_msgs_py.cdr import encode_joint_state
 from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.ros import qos
 from pendulum_msgs_py.ros.convert import event_message
+from tests.fixtures import wait_for
+from tests.processes import ProcessGroup
 
-DOMAIN = "43"
-ENVIRONMENT = {**os.environ, "ROS_DOMAIN_ID": DOMAIN, "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST"}
 JOINT_STATE = "sensor_msgs/msg/JointState"
 STRING = "std_msgs/msg/String"
 
@@ -112,16 +110,14 @@ def test_a_disk_that_fails_ends_the_session_in_a_sentence(
     session = RecordingSession(writer, seal_interval=0.02, on_failure=reasons.append)
     session.add_topic("/a", message_type(JOINT_STATE), ())
     session.offer("/a", [(1, encode_joint_state(1, position=1.0))])
-    time.sleep(0.2)
+    wait_for(lambda: session.counts()["/a"].written, 10.0, "the first seal")
 
     def full(*_: object) -> None:
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr(writer._file, "_write", full)
+    monkeypatch.setattr(writer._file._layout, "_write", full)  # type: ignore[attr-defined]
     session.offer("/a", [(2, encode_joint_state(2, position=1.0))])
-    deadline = time.monotonic() + 5
-    while not reasons and time.monotonic() < deadline:
-        time.sleep(0.01)
+    wait_for(lambda: reasons, 10.0, "the session to say why it stops")
     report = session.close()
     assert reasons == ["no space left on device"]
     assert report.sentence().endswith("stopped because no space left on device")
@@ -162,48 +158,10 @@ def test_an_existing_folder_is_refused_with_exit_code_2(
 # -- over DDS ----------------------------------------------------------------------------------------------------
 
 
-class Recording:
-    """A recorder process."""
-
-    def __init__(self, *arguments: str, program: str = "record") -> None:
-        self.lines: list[str] = []
-        self.process = subprocess.Popen(
-            [sys.executable, "-m", "pendulum_bags", program, *arguments],
-            stdout=subprocess.PIPE,
-            stderr=subprocess.STDOUT,
-            text=True,
-            env=ENVIRONMENT,
-        )
-        self._thread = threading.Thread(target=self._read, daemon=True)
-        self._thread.start()
-
-    def _read(self) -> None:
-        assert self.process.stdout is not None
-        for line in self.process.stdout:
-            self.lines.append(line)  # one by one: the test looks on
-
-    def wait_for(self, text: str, timeout: float = 30.0) -> None:
-        end = time.monotonic() + timeout
-        while not any(text in line for line in self.lines):
-            assert time.monotonic() < end, f"{text!r} did not come; the recorder said {self.lines}"
-            assert self.process.poll() is None or self._thread.is_alive(), self.lines
-            time.sleep(0.02)
-
-    def stop(self, number: int = signal.SIGINT) -> int:
-        self.process.send_signal(number)
-        return self.wait()
-
-    def wait(self) -> int:
-        code = self.process.wait(30)
-        self._thread.join(5)
-        return code
-
-
 @pytest.fixture
-def node(monkeypatch: pytest.MonkeyPatch) -> Iterator[Node]:
-    monkeypatch.setenv("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
+def node(domain_id: int) -> Iterator[Node]:
     context = rclpy.Context()
-    rclpy.init(context=context, domain_id=int(DOMAIN))
+    rclpy.init(context=context, domain_id=domain_id)
     node = Node("source", context=context)
     executor = SingleThreadedExecutor(context=context)
     executor.add_node(node)
@@ -218,24 +176,42 @@ def node(monkeypatch: pytest.MonkeyPatch) -> Iterator[Node]:
 
 def call(node: Node, service: str) -> Trigger.Response:
     client = node.create_client(Trigger, service)
-    assert client.wait_for_service(20)
-    future = client.call_async(Trigger.Request())
-    end = time.monotonic() + 20
-    while not future.done() and time.monotonic() < end:
-        time.sleep(0.01)
-    response = future.result()
-    assert response is not None
-    return response
+    try:
+        assert client.wait_for_service(30)
+        future = client.call_async(Trigger.Request())
+        wait_for(future.done, 30.0, f"the answer of {service}")
+        response = future.result()
+        assert response is not None
+        return response
+    finally:
+        node.destroy_client(client)
+
+
+def wait_until_received(node: Node, **numbers: int) -> dict[str, Any]:
+    """Wait until the recorder says that so many messages of some topics have arrived; return its status."""
+
+    def received() -> dict[str, Any]:
+        status: dict[str, Any] = json.loads(call(node, "/recorder/status").message)
+        topics = {name.strip("/").replace("/", "_"): counts for name, counts in status["topics"].items()}
+        whole = all(
+            topics.get(name, {"received": 0})["received"] >= number for name, number in numbers.items()
+        )
+        return status if whole else {}
+
+    return wait_for(received, 30.0, f"the recorder to receive {numbers}", period=0.05)
 
 
 def wait_until_matched(*publishers: object) -> None:
-    end = time.monotonic() + 20
-    while not all(publisher.get_subscription_count() for publisher in publishers):  # type: ignore[attr-defined]
-        assert time.monotonic() < end
-        time.sleep(0.01)
+    wait_for(
+        lambda: all(publisher.get_subscription_count() for publisher in publishers),  # type: ignore[attr-defined]
+        30.0,
+        "the recorder to subscribe",
+    )
 
 
-def test_a_recording_holds_everything_and_says_so(tmp_path: Path, node: Node) -> None:
+def test_a_recording_holds_everything_and_says_so(
+    tmp_path: Path, node: Node, processes: ProcessGroup
+) -> None:
     bag = tmp_path / "run"
     metadata = tmp_path / "metadata.json"
     metadata.write_text(json.dumps({"pendulum.run": {"seed": 42}}))
@@ -247,7 +223,9 @@ def test_a_recording_holds_everything_and_says_so(tmp_path: Path, node: Node) ->
     )
     events = node.create_publisher(String, "/sim/events", qos.EVENTS)
     events.publish(event_message(5, "ramp_up"))  # before the recorder is there
-    recording = Recording("-o", str(bag), "--metadata", str(metadata), "--exclude", "parameter_events|rosout")
+    recording = processes.start(
+        "pendulum_bags", "record", "-o", bag, "--metadata", metadata, "--exclude", "parameter_events|rosout"
+    )
     wait_until_matched(fast, plain, sloppy, events)
     for index in range(400):
         fast.publish(encode_joint_state(index * 2_000_000, position=0.01 * index, velocity=0.0, effort=0.0))
@@ -259,12 +237,14 @@ def test_a_recording_holds_everything_and_says_so(tmp_path: Path, node: Node) ->
         time.sleep(0.001)
     events.publish(event_message(6, "hold"))
     node.set_parameters([Parameter("gain", value=[3.0, 4.0])])
-    time.sleep(0.3)
-    status = json.loads(call(node, "/recorder/status").message)
+    status = wait_until_received(
+        node, sim_joint_states=400, sim_effort_command=400, sloppy=400, sim_events=2, recorder_events=1
+    )
     assert status["topics"]["/sim/joint_states"]["received"] == 400
     assert call(node, "/recorder/annotate").success
-    assert recording.stop() == 0
-    assert any("nothing lost" in line for line in recording.lines)
+    recording.interrupt()
+    assert recording.wait(30.0) == 0
+    assert "nothing lost" in recording.output
 
     opened = read_bag(bag)
     assert not opened.damage
@@ -291,41 +271,44 @@ def test_a_recording_holds_everything_and_says_so(tmp_path: Path, node: Node) ->
     assert count == sum(info.count for info in opened.topics.values())
 
 
-def test_recording_starts_and_stops_by_service_and_by_header_time(tmp_path: Path, node: Node) -> None:
+def test_recording_starts_and_stops_by_service_and_by_header_time(
+    tmp_path: Path, node: Node, processes: ProcessGroup
+) -> None:
     bag = tmp_path / "run"
     states = node.create_publisher(JointState, "/joint_states", qos.STATE)
     plain = node.create_publisher(Float64, "/plain", qos.STATE)  # a type without a stamp
-    recording = Recording(
-        "-o", str(bag), "/joint_states", "/plain", "--storage", "sqlite3", "--log-time", "header", "--wait"
-    )
+    choice = ("--storage", "sqlite3", "--log-time", "header", "--wait")
+    recording = processes.start("pendulum_bags", "record", "-o", bag, "/joint_states", "/plain", *choice)
     wait_until_matched(states, plain)
     states.publish(encode_joint_state(1, position=0.0))
-    time.sleep(0.2)
+    assert not json.loads(call(node, "/recorder/status").message)["topics"]
     assert not bag.exists()
     for number in (1, 2):
         assert call(node, "/recorder/start").success
         assert not call(node, "/recorder/start").success
         plain.publish(Float64(data=1.0))
-        time.sleep(0.1)
         for index in range(50):
             states.publish(encode_joint_state(1000 + index, position=float(number)))
-        time.sleep(0.3)
+        wait_until_received(node, joint_states=50, plain=1)
         assert "51 messages" in call(node, "/recorder/stop").message
-    assert recording.stop(signal.SIGTERM) == 0
+    recording.send_signal(signal.SIGTERM)
+    assert recording.wait(30.0) == 0
     first, second = read_bag(bag), read_bag(tmp_path / "run_2")
     assert first["/joint_states"]["log_time_ns"].tolist() == list(range(1000, 1050))
     assert first["/plain"][0].log_time_ns < 1050  # wall time and header time must not mix
     assert second["/joint_states"]["position"].tolist() == [2.0] * 50
 
 
-def test_kill_9_loses_at_most_a_fifth_of_a_second(tmp_path: Path, node: Node) -> None:
+def test_kill_9_loses_at_most_a_fifth_of_a_second(
+    tmp_path: Path, node: Node, processes: ProcessGroup
+) -> None:
     rng = random.Random(21)
     for number in range(3):
         bag = tmp_path / f"run{number}"
         # New names each time: for a while the middleware still believes in the recorder that was killed.
         topics = [f"/run{number}/t{k}" for k in range(5)]
         publishers = [node.create_publisher(JointState, topic, qos.STATE) for topic in topics]
-        recording = Recording("-o", str(bag), "--regex", f"^/run{number}/")
+        recording = processes.start("pendulum_bags", "record", "-o", bag, "--regex", f"^/run{number}/")
         wait_until_matched(*publishers)
         end = math.inf
         sent = 0
@@ -341,7 +324,8 @@ def test_kill_9_loses_at_most_a_fifth_of_a_second(tmp_path: Path, node: Node) ->
             next_time += 0.002
             time.sleep(max(next_time - time.monotonic(), 0.0))
         killed = time.time_ns()
-        assert recording.stop(signal.SIGKILL) == -signal.SIGKILL
+        recording.send_signal(signal.SIGKILL)
+        assert recording.wait(30.0) == -signal.SIGKILL
         with AnyReader([bag]) as reader:
             total = sum(1 for _ in reader.messages())
         opened = read_bag(bag)
@@ -353,7 +337,7 @@ def test_kill_9_loses_at_most_a_fifth_of_a_second(tmp_path: Path, node: Node) ->
             np.testing.assert_array_equal(np.diff(array["position"]), 1.0)
 
 
-def test_a_bag_is_played_as_it_was_recorded(tmp_path: Path, node: Node) -> None:
+def test_a_bag_is_played_as_it_was_recorded(tmp_path: Path, node: Node, processes: ProcessGroup) -> None:
     source = tmp_path / "source"
     with open_writer(source) as writer:
         writer.add_topic("/sim/joint_states", JOINT_STATE)
@@ -366,14 +350,14 @@ def test_a_bag_is_played_as_it_was_recorded(tmp_path: Path, node: Node) -> None:
         text = b'{"name": "hold"}\0'
         writer.write("/sim/events", 5_500_000_000, b"\0\1\0\0" + len(text).to_bytes(4, "little") + text)
     copy = tmp_path / "copy"
-    recording = Recording("-o", str(copy), "/copy", "/sim/events", "/clock")
-    player = Recording(
-        str(source), "--rate", "2", "--remap", "/sim/joint_states:=/copy", "--wait", "15", program="play"
-    )
-    assert player.wait() == 0
-    assert any("played 201 messages" in line for line in player.lines)
-    time.sleep(0.2)
-    assert recording.stop() == 0
+    recording = processes.start("pendulum_bags", "record", "-o", copy, "/copy", "/sim/events", "/clock")
+    remap = ("--remap", "/sim/joint_states:=/copy")
+    player = processes.start("pendulum_bags", "play", source, "--rate", "2", *remap, "--wait", "30")
+    assert player.wait(60.0) == 0
+    assert "played 201 messages" in player.output
+    wait_until_received(node, copy=200, sim_events=1)
+    recording.interrupt()
+    assert recording.wait(30.0) == 0
     original, opened = read_bag(source), read_bag(copy)
     np.testing.assert_array_equal(opened["/copy"]["stamp_ns"], original["/sim/joint_states"]["stamp_ns"])
     duration = np.ptp(opened["/copy"]["log_time_ns"]) * 1e-9

@@ -14,11 +14,18 @@ from pathlib import Path
 
 import pytest
 import yaml
-from mcap.reader import NonSeekingReader, make_reader
+from mcap.reader import McapReader, NonSeekingReader, SeekingReader, make_reader
 from rosbags.highlevel import AnyReader
 
 from pendulum_bags.reader import read_bag
-from pendulum_bags.storage import QosProfile, message_type, open_writer, sealed_mcap, sealed_sqlite
+from pendulum_bags.storage import (
+    QosProfile,
+    mcap_layout,
+    message_type,
+    open_writer,
+    sealed_mcap,
+    sealed_sqlite,
+)
 from pendulum_msgs_py.cdr import encode_joint_state
 from pendulum_msgs_py.errors import BagError, ParameterError
 
@@ -111,7 +118,7 @@ def test_no_write_of_a_commit_ever_leaves_a_broken_bag(
         return len(view)
 
     writer = open_writer(bag, storage)
-    monkeypatch.setattr(sealed_mcap if storage == "mcap" else sealed_sqlite, "os", _WatchedOs(watched))
+    monkeypatch.setattr(mcap_layout if storage == "mcap" else sealed_sqlite, "os", _WatchedOs(watched))
     writer.add_topic("/a", STRING)
     for round_number in range(14):
         for _ in range(rng.randrange(1, 5)):
@@ -127,6 +134,78 @@ def test_no_write_of_a_commit_ever_leaves_a_broken_bag(
     writer.close()
     assert set(count_everywhere(bag)) == {total}
     assert moments > 60
+
+
+@pytest.mark.parametrize("compression", [None, "zstd"])
+def test_small_chunks_become_large_ones_unseen(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, compression: str | None
+) -> None:
+    """Stop after every single write while chunks are staged and settled, areas used again and summaries outgrown."""
+    monkeypatch.setattr(mcap_layout, "_FIRST_ROOM", 1 << 16)
+    monkeypatch.setattr(mcap_layout, "_LARGEST_ROOM", 1 << 16)
+    monkeypatch.setattr(mcap_layout, "_FIRST_SLOT", 2 * 4096)
+    monkeypatch.setattr(sealed_mcap, "_LARGEST_NUMBER", 8)
+    bag = tmp_path / "bag"
+    rng = random.Random(8)
+    sealed = total = moments = 0
+
+    def numbers(reader: McapReader) -> list[int]:
+        messages = reader.iter_messages(log_time_order=False)
+        return [int.from_bytes(message.data[4:12], "little") for _, _, message in messages]
+
+    def check() -> None:
+        with (bag / "bag_0.mcap").open("rb") as stream:
+            by_index = numbers(SeekingReader(stream, validate_crcs=True))
+            stream.seek(0)
+            in_order = numbers(NonSeekingReader(stream, validate_crcs=True))
+        for found in (by_index, in_order):
+            assert found == list(range(len(found)))
+            assert sealed <= len(found) <= total
+
+    def watched(fd: int, data: bytes, offset: int) -> int:
+        nonlocal moments
+        done = os.pwrite(fd, data, offset)
+        moments += 1
+        check()
+        return done
+
+    writer = open_writer(bag, compression=compression)
+    monkeypatch.setattr(mcap_layout, "os", _WatchedOs(watched))
+    ends = []
+    for round_number in range(25 if compression else 60):
+        if round_number % 20 == 0:
+            for number in range(12):
+                writer.add_topic(f"/t{round_number}_{number}", STRING)
+        for _ in range(rng.randrange(1, 5)):
+            size = rng.choice([0, 3, 300, 2000, 2000, 50_000 if round_number % 15 == 7 else 3000])
+            topic = f"/t{rng.randrange(0, round_number + 1, 20)}_0"
+            writer.write(
+                topic,
+                total,
+                b"\0\1\0\0"
+                + total.to_bytes(8, "little")
+                + (rng.randbytes(size // 2) + bytes(size - size // 2)),
+            )
+            total += 1
+        if round_number % 13 == 12:
+            writer.sync()
+        else:
+            writer.seal()
+        sealed = total
+        check()
+        ends.append(writer._file._layout._size)  # type: ignore[attr-defined]
+    writer.close()
+    check()
+    assert len(set(ends)) > (
+        1 if compression else 2
+    )  # the end of the file moved, also while chunks were staged
+    assert moments > (80 if compression else 200)
+    with (bag / "bag_0.mcap").open("rb") as stream:
+        summary = make_reader(stream).get_summary()
+    assert summary is not None
+    assert 2 < len(summary.chunk_indexes) < 30
+    assert not read_bag(bag).damage
+    assert sum(len(read_bag(bag).raw(topic)) for topic in read_bag(bag).topics) == total
 
 
 class _WatchedOs:
@@ -148,7 +227,8 @@ def test_a_commit_head_never_straddles_two_pages(tmp_path: Path) -> None:
     for index in range(600):
         writer.write("/a", index, text_message("y" * rng.randrange(0, 5000)))
         writer.seal()
-        heads.append(writer._file._data_end % 4096)  # type: ignore[attr-defined]
+        layout = writer._file._layout  # type: ignore[attr-defined]
+        heads += [layout.settled_end % 4096, layout._chain_end % 4096]
     assert max(heads) <= 4096 - 9
     assert set(count_everywhere(bag)) == {600}
     assert count_in_order(bag) == 600
@@ -180,7 +260,7 @@ def test_a_file_outgrows_its_room_and_its_summaries_many_times(tmp_path: Path) -
 def test_a_bag_splits_by_size_and_by_time(tmp_path: Path, storage: str) -> None:
     for name, limits in (("size", {"max_size": 60_000}), ("time", {"max_duration": 0.5})):
         bag = tmp_path / name
-        with open_writer(bag, storage, **limits) as writer:  # type: ignore[arg-type]
+        with open_writer(bag, storage, **limits) as writer:
             writer.add_topic("/a", JOINT_STATE)
             for index in range(1000):
                 writer.write("/a", index * 2_000_000, state(index))

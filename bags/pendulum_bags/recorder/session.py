@@ -1,4 +1,4 @@
-"""A recording as a bounded queue and one thread that writes: nobody who delivers messages ever waits for the disk."""
+"""A recording as a bounded queue and threads that write: nobody who delivers messages ever waits for the disk."""
 
 from __future__ import annotations
 
@@ -73,7 +73,7 @@ class SessionReport:
 
 
 class RecordingSession:
-    """Write what is offered to a bag, by a thread of its own.
+    """Write what is offered to a bag, by threads of its own.
 
     Args:
         writer: The bag; the session closes it.
@@ -105,7 +105,9 @@ class RecordingSession:
         self._stop = threading.Event()
         self._closed = False
         self._thread = threading.Thread(target=self._run, name="bag writer", daemon=True)
+        self._syncer = threading.Thread(target=self._run_sync, name="bag sync", daemon=True)
         self._thread.start()
+        self._syncer.start()
 
     def add_topic(self, name: str, type: MessageType, qos: Sequence[QosProfile]) -> None:
         """Announce a topic before its first message.
@@ -170,6 +172,7 @@ class RecordingSession:
             self._closed = True
             self._stop.set()
             self._thread.join()
+            self._syncer.join()
             if not self.failure:
                 try:
                     self._write_queue()
@@ -179,20 +182,26 @@ class RecordingSession:
                     self.fail(error)
         return SessionReport(self.writer.path, self.counts(), self.failure)
 
-    # -- the writing thread ------------------------------------------------------------------------------------
+    # -- the threads -------------------------------------------------------------------------------------------
 
     def _run(self) -> None:
-        synced = time.monotonic()
-        due = synced + self._seal_interval
+        due = time.monotonic() + self._seal_interval
         while not self._stop.wait(max(due - time.monotonic(), 0.0)):
-            now = time.monotonic()
-            due = max(due + self._seal_interval, now)
+            due = max(due + self._seal_interval, time.monotonic())
             try:
                 self._write_queue()
-                if self._sync_interval and now - synced >= self._sync_interval:
-                    synced = now
-                    self.writer.sync()
             except Exception as error:  # noqa: BLE001  # a thread that dies in silence would record nothing any more
+                self.fail(error)
+                return
+
+    def _run_sync(self) -> None:
+        """Wait for the disk apart from the thread that seals: a slow disk must not delay what a kill would cost."""
+        if not self._sync_interval:
+            return
+        while not self._stop.wait(self._sync_interval):
+            try:
+                self.writer.sync()
+            except Exception as error:  # noqa: BLE001  # as above
                 self.fail(error)
                 return
 

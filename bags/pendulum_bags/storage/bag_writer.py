@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import shutil
 import threading
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Protocol
@@ -32,10 +32,13 @@ class _StorageFile(Protocol):
 
     suffix: str
     path: Path
-    count: int
-    start_ns: int
-    stop_ns: int
 
+    @property
+    def count(self) -> int: ...
+    @property
+    def start_ns(self) -> int: ...
+    @property
+    def stop_ns(self) -> int: ...
     @property
     def data_size(self) -> int: ...
     @property
@@ -43,7 +46,8 @@ class _StorageFile(Protocol):
     def add_channel(self, channel_id: int, topic: str, type: MessageType, qos: str) -> None: ...
     def write(self, channel_id: int, log_time_ns: int, data: bytes) -> None: ...
     def seal(self) -> None: ...
-    def sync(self) -> None: ...
+    def settle(self) -> None: ...
+    def duplicate(self) -> int: ...
     def close(self, metadata: str = "") -> None: ...
     def abandon(self) -> None: ...
 
@@ -211,18 +215,34 @@ class BagWriter:
         """
         with self._lock:
             self._require_open()
-            before = self._file.count
-            self._file.seal()
-            if self._file.count != before:
-                self._note_sealed()
-                self._replace_metadata()
-            if self._is_due():
-                self._split()
+            self._seal(self._file.seal)
+
+    def _seal(self, work: Callable[[], None]) -> None:
+        before = self._file.count
+        work()
+        if self._file.count != before:
+            self._note_sealed()
+            self._replace_metadata()
+        if self._is_due():
+            self._split()
 
     def sync(self) -> None:
-        """Wait until what was sealed has reached the disk (survives a power failure)."""
+        """Seal, and wait until what was sealed has reached the disk (it survives a power failure).
+
+        Other threads may go on writing meanwhile.
+
+        Raises:
+            OSError: The disk is full or fails; what was sealed before remains readable.
+        """
         with self._lock:
-            self._file.sync()
+            self._require_open()
+            # What waits for the disk is never written again: what has reached it must not be at risk later.
+            self._seal(self._file.settle)
+            descriptor = self._file.duplicate()
+        try:
+            os.fdatasync(descriptor)
+        finally:
+            os.close(descriptor)
 
     def split(self) -> None:
         """Go on in a new storage file of the same bag."""

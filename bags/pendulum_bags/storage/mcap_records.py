@@ -7,8 +7,7 @@ from __future__ import annotations
 
 import struct
 import zlib
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
 
 __all__ = [
     "CHANNEL",
@@ -30,8 +29,8 @@ __all__ = [
     "SCHEMA",
     "STATISTICS",
     "SUMMARY_OFFSET",
-    "ChunkIndex",
     "channel_record",
+    "chunk_index_record",
     "footer_record",
     "header_record",
     "metadata_index_record",
@@ -142,28 +141,24 @@ def padding_head(start: int, stop: int) -> bytes:
     return RECORD_HEAD.pack(PADDING, stop - start - RECORD_HEAD_SIZE)
 
 
-@dataclass(slots=True)
-class ChunkIndex:
-    """Where a chunk stands and which channels it holds (offsets of its message indexes, in file order)."""
-
-    start_ns: int
-    stop_ns: int
-    offset: int
-    length: int
-    message_index_offsets: dict[int, int]
-    message_index_length: int
-    compression: str
-    compressed_size: int
-    uncompressed_size: int
-
-    def to_record(self) -> bytes:
-        """Return the record for the summary."""
-        offsets = b"".join(struct.pack("<HQ", *item) for item in self.message_index_offsets.items())
-        return record(
-            CHUNK_INDEX,
-            struct.pack("<QQQQI", self.start_ns, self.stop_ns, self.offset, self.length, len(offsets))
-            + offsets
-            + struct.pack("<Q", self.message_index_length)
-            + _text(self.compression)
-            + struct.pack("<QQ", self.compressed_size, self.uncompressed_size),
-        )
+def chunk_index_record(
+    start_ns: int,
+    stop_ns: int,
+    offset: int,
+    length: int,
+    message_indexes: Sequence[tuple[int, int]],
+    message_index_length: int,
+    compression: str,
+    packed_size: int,
+    raw_size: int,
+) -> bytes:
+    """Return where a chunk stands and which channels it holds (channel and place of its message index, in order)."""
+    offsets = b"".join(struct.pack("<HQ", *item) for item in message_indexes)
+    return record(
+        CHUNK_INDEX,
+        struct.pack("<QQQQI", start_ns, stop_ns, offset, length, len(offsets))
+        + offsets
+        + struct.pack("<Q", message_index_length)
+        + _text(compression)
+        + struct.pack("<QQ", packed_size, raw_size),
+    )

@@ -292,9 +292,13 @@ class SealedSqliteFile:
             self._pending = self._pending_size = 0
             self._pending_span = (2**63 - 1, 0)
 
-    def sync(self) -> None:
-        """Wait until what was sealed has reached the disk."""
-        os.fdatasync(self._fd)
+    def settle(self) -> None:
+        """Seal; there is nothing that would be written a second time."""
+        self.seal()
+
+    def duplicate(self) -> int:
+        """Return a file descriptor of its own, to wait for the disk with, which the caller closes."""
+        return os.dup(self._fd)
 
     def close(self, metadata: str = "") -> None:
         """Seal, add the index over time that rosbag2 seeks by, and close.
