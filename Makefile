@@ -11,7 +11,7 @@ PIP := $(PY) -m pip --disable-pip-version-check --no-input --quiet --quiet
 # Everything that decides what an editable install looks like; the modules themselves are read in place.
 LINKED := $(foreach p,$(PACKAGES),$(wildcard $(p)/setup.py $(p)/setup.cfg $(p)/package.xml $(p)/*/executables.py))
 
-.PHONY: help venv experiment test bench lint types imports build faults lock docs clean
+.PHONY: help venv experiment test bench lint types imports build faults lock audit docs clean
 
 help: # Print the targets, one line each
 	@awk -F ':[^#]*# ' '/^[a-z]+:[^#=]*# / {printf "make %-11s %s\n", $$1, $$2}' Makefile
@@ -81,6 +81,10 @@ lock: $(VENV)/.made # Compile requirements*.in into requirements*.txt with hashe
 	@$(LOCK) $(ARGS) requirements.in --output-file requirements.txt
 	@$(LOCK) $(ARGS) requirements-bench.in --constraint requirements.txt --output-file requirements-bench.txt \
 	  $$(sed -n 's/^\([A-Za-z0-9._-]*\)==.*/--no-emit-package \1/p' requirements.txt)
+
+audit: $(VENV)/.linked # Look the locked versions up for known vulnerabilities (ARGS="--advisories all.zip" without a network)
+	@test -x $(VENV)/.audit/bin/pip-audit || { $(PY) -m venv $(VENV)/.audit && $(VENV)/.audit/bin/pip --quiet --quiet --disable-pip-version-check install pip-audit; }
+	@$(PY) -m tests.audit $(ARGS)
 
 docs: $(VENV)/.linked # Build the documentation site into build/site
 	@$(PY) .docs/build.py
