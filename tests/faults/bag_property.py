@@ -55,7 +55,9 @@ def check_bag(path: Path, *, limit: float, allowance: float = 0.0) -> list[Torqu
     """Check the torque of every plant in a bag.
 
     Under position control (from a trajectory to the next torque command) the plant makes its own torque: there only
-    the limit is checked. Log times are compared, since they are of one clock.
+    the limit is checked. A torque is excused by a command that is recent in log times, which are of one clock, or in
+    stamps, which are of the plant's: a message that had to be sent again comes late in the one, a stranger's clock
+    shows in the other.
 
     Args:
         path: The bag.
@@ -91,9 +93,14 @@ def _check_plant(bag: Bag, plant: str, limit: float, allowance: float) -> Torque
     latest = np.maximum.reduce(
         [command, *(_last_before(times, _log_times(bag, plant, name)) for name in others)]
     )
+    stamps = applied["stamp_ns"]
+    answered = np.maximum.reduce(
+        [_last_before(stamps, _stamps(bag, plant, name)) for name in (names.EFFORT_COMMAND, *others)]
+    )
     trajectory = _last_before(times, _log_times(bag, plant, names.JOINT_TRAJECTORY))
     judged = (command > trajectory) & (command > 0)
-    age = (times - latest) * 1e-9
+    # From the state with this stamp on, a torque acts for a period.
+    age = np.minimum((times - latest) * 1e-9, (stamps - answered) * 1e-9 + period)
     driven = judged & (efforts != 0.0)
     longest = float(np.max(age[driven], initial=0.0))
     allowed = COMMAND_LIFE + period + allowance
@@ -106,6 +113,11 @@ def _check_plant(bag: Bag, plant: str, limit: float, allowance: float) -> Torque
 def _log_times(bag: Bag, plant: str, topic: str) -> np.ndarray:
     name = f"{plant}/{topic}"
     return bag.log_times(name) if name in bag else np.empty(0, np.int64)
+
+
+def _stamps(bag: Bag, plant: str, topic: str) -> np.ndarray:
+    name = f"{plant}/{topic}"
+    return np.sort(bag.array(name)["stamp_ns"]) if name in bag and len(bag.log_times(name)) else np.empty(0, np.int64)
 
 
 def _last_before(times: np.ndarray, events: np.ndarray) -> np.ndarray:

@@ -6,9 +6,11 @@ import math
 import os
 import signal
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
+from typing import NamedTuple
 
+from diagnostic_msgs.msg import DiagnosticArray
 from rclpy.publisher import Publisher
 from sensor_msgs.msg import JointState
 
@@ -20,12 +22,28 @@ from pendulum_msgs_py.cdr import decode_joint_state, encode_joint_state
 from pendulum_msgs_py.graph import NodeProgram
 from pendulum_msgs_py.ros import qos
 
-__all__ = ["EFFORT_LIMIT", "LiveSystem"]
+__all__ = ["EFFORT_LIMIT", "NAMESPACE", "NODES", "START_TIMEOUT", "Applied", "LiveSystem"]
 
 EFFORT_LIMIT = 5.0
 """Limit given to the plant under attack, below what an angry controller asks for [N m]."""
 START_TIMEOUT = 60.0
-_NAMESPACE = "/sim"
+NAMESPACE = "/sim"
+NODES = ("recorder", "simulator", "controller", "disturbance")
+"""The nodes of the system, in the order in which they usually start."""
+
+
+class Applied(NamedTuple):
+    """A torque that the plant says it applied.
+
+    Attributes:
+        when: When the probe heard of it, on its monotonic clock [s].
+        effort: Torque [N m].
+        stamp_ns: Stamp of the state from which on it acted [ns].
+    """
+
+    when: float
+    effort: float
+    stamp_ns: int
 
 
 class LiveSystem:
@@ -36,37 +54,61 @@ class LiveSystem:
     Args:
         folder: For logs and the bag.
         domain: ROS domain of the system's own.
+        order: The nodes to start, in this order; none of them is waited for.
+        environment: Variables to add for the nodes.
+        parameters: ROS parameters to add for a node, by its name.
+
+    Attributes:
+        applied: Every torque that the plant said it applied.
+        commands: When the controller's commands were heard, on the probe's monotonic clock [s].
+        diagnostics: Newest key-value pairs by name of the status, such as ``/sim/simulator: plant``.
+        diagnosed: When each status was heard last, on the probe's monotonic clock [s].
     """
 
-    def __init__(self, folder: Path, domain: int) -> None:
+    def __init__(
+        self,
+        folder: Path,
+        domain: int,
+        *,
+        order: Sequence[str] = NODES,
+        environment: Mapping[str, str] | None = None,
+        parameters: Mapping[str, Mapping[str, graph.ParameterArgument]] | None = None,
+    ) -> None:
         self.folder = folder
         self.domain = domain
         self.children: dict[str, Child] = {}
-        self.applied: list[tuple[float, float]] = []
+        self.applied: list[Applied] = []
         self.commands: list[float] = []
+        self.diagnostics: dict[str, dict[str, str]] = {}
+        self.diagnosed: dict[str, float] = {}
+        self._order = order
+        self._environment = environment or {}
+        self._parameters = parameters or {}
         self._bags = 0
 
     def __enter__(self) -> LiveSystem:
         """Start everything and wait until torque flows."""
         logs = self.folder / "logs"
-        self.processes = ProcessSet(logs, ros_environment(self.domain, logs))
+        self.processes = ProcessSet(logs, {**ros_environment(self.domain, logs), **self._environment})
         self.processes.__enter__()
         self.conductor = Conductor(self.domain)
         self.conductor.__enter__()
         node = self.conductor.node
         node.create_subscription(
-            JointState, f"{_NAMESPACE}/{names.APPLIED_EFFORT}", self._on_applied, qos.STATE, raw=True
+            JointState, f"{NAMESPACE}/{names.APPLIED_EFFORT}", self._on_applied, qos.STATE, raw=True
         )
         node.create_subscription(
             JointState,
-            f"{_NAMESPACE}/{names.EFFORT_COMMAND}",
+            f"{NAMESPACE}/{names.EFFORT_COMMAND}",
             self._on_command,
             qos.command_input(reliable=True),
             raw=True,
         )
-        for name in ("recorder", "simulator", "controller", "disturbance"):
+        node.create_subscription(DiagnosticArray, names.DIAGNOSTICS, self._on_diagnostics, qos.DIAGNOSTICS)
+        for name in self._order:
             self.start(name)
-        self.wait_for("torque to flow", self.torque_flows, START_TIMEOUT)
+        if self._order:
+            self.wait_for("torque to flow", self.torque_flows, START_TIMEOUT)
         return self
 
     def __exit__(self, *_: object) -> None:
@@ -85,9 +127,9 @@ class LiveSystem:
             self._bags += 1
             metadata = self.folder / "metadata.json"
             write_json(metadata, {"pendulum.run": {"experiment": "faults"}})
-            child = start_recorder(self.processes, self.bag, _NAMESPACE, metadata, "mcap")
+            child = start_recorder(self.processes, self.bag, NAMESPACE, metadata, "mcap")
         else:
-            child = self.processes.start_node(self.program(name, **changes))
+            child = self.processes.start_node(self.program(name, **{**self._parameters.get(name, {}), **changes}))
         self.children[name] = child
         return child
 
@@ -95,10 +137,12 @@ class LiveSystem:
     def program(name: str, **changes: graph.ParameterArgument) -> NodeProgram:
         """Return the description of one of the nodes."""
         if name == "simulator":
-            return graph.simulator(_NAMESPACE, initial_theta=math.pi, effort_limit=EFFORT_LIMIT, **changes)
+            return graph.simulator(NAMESPACE, initial_theta=math.pi, effort_limit=EFFORT_LIMIT, **changes)
         if name == "controller":
-            return graph.controller(_NAMESPACE, **changes)
-        return graph.disturbance(_NAMESPACE, autostart=True, hold_time=0.01, **changes)
+            return graph.controller(NAMESPACE, **changes)
+        if name == "viewer":
+            return NodeProgram("pendulum_sim", "viewer", NAMESPACE, parameters={"window": False, "fps": 5.0, **changes})
+        return graph.disturbance(NAMESPACE, autostart=True, hold_time=0.01, **changes)
 
     @property
     def bag(self) -> Path:
@@ -115,6 +159,20 @@ class LiveSystem:
         child.process.send_signal(number)
         child.process.wait(15.0)
         self.processes.children.remove(child)
+
+    def finish_all(self) -> list[str]:
+        """End all nodes as Ctrl-C does, recorders last; return a sentence for each that did not end well."""
+        complaints = []
+        for name in sorted(self.children, key=lambda name: name == "recorder"):
+            child = self.children.pop(name)
+            code = self.processes.finish(child, START_TIMEOUT)
+            if code:
+                complaints.append(f"{name} ended with code {code}: {child.last_words(1)}")
+        return complaints
+
+    def is_on_graph(self, name: str) -> bool:
+        """Tell whether a node of this name has been discovered."""
+        return (name, NAMESPACE) in self.conductor.node.get_node_names_and_namespaces()
 
     def alive(self) -> list[str]:
         """Return the names of the nodes that run."""
@@ -140,7 +198,7 @@ class LiveSystem:
     def torque_flows(self) -> bool:
         """Tell whether torque was applied within the last 50 ms."""
         now = time.monotonic()
-        return any(effort != 0.0 for when, effort in self.applied[-40:] if now - when < 0.05)
+        return any(applied.effort != 0.0 for applied in self.applied[-40:] if now - applied.when < 0.05)
 
     def time_to_zero(self, patience: float = 1.0) -> float:
         """Return the time from the last command to the first zero torque after it [s]; inf where it did not come."""
@@ -148,14 +206,14 @@ class LiveSystem:
         if not self.commands:
             return math.inf
         last = self.commands[-1]
-        after = [(when, effort) for when, effort in self.applied if when > last]
+        after = [applied for applied in self.applied if applied.when > last]
         # The torque must stay zero: find the last one that was not.
-        driven = [when for when, effort in after if effort != 0.0]
-        return (driven[-1] if driven else last) - last if after and after[-1][1] == 0.0 else math.inf
+        driven = [applied.when for applied in after if applied.effort != 0.0]
+        return (driven[-1] if driven else last) - last if after and after[-1].effort == 0.0 else math.inf
 
     def largest_torque(self) -> float:
         """Return the largest torque that was ever applied [N m]."""
-        return max((abs(effort) for _, effort in self.applied), default=0.0)
+        return max((abs(applied.effort) for applied in self.applied), default=0.0)
 
     def rate(self, duration: float = 1.0) -> float:
         """Listen for a while and return how many torques a second were applied [Hz]."""
@@ -166,7 +224,7 @@ class LiveSystem:
 
     def publisher(self, topic: str) -> Publisher:
         """Return a publisher of the probe's on one of the plant's inputs."""
-        return self.conductor.node.create_publisher(JointState, f"{_NAMESPACE}/{topic}", qos.COMMAND)
+        return self.conductor.node.create_publisher(JointState, f"{NAMESPACE}/{topic}", qos.COMMAND)
 
     def attack(self, topic: str, messages: Iterable[JointState | bytes], *, rate: float | None = None) -> int:
         """Publish messages on an input and return how many were sent.
@@ -202,9 +260,20 @@ class LiveSystem:
     def _on_applied(self, data: bytes) -> None:
         fields = decode_joint_state(data)
         if fields is not None and fields.effort is not None:
-            self.applied.append((time.monotonic(), fields.effort))
+            self.applied.append(Applied(time.monotonic(), fields.effort, fields.stamp_ns))
 
     def _on_command(self, data: bytes) -> None:
         fields = decode_joint_state(data)
-        if fields is not None and fields.frame_id == f"{_NAMESPACE}/controller":
+        if fields is not None and fields.frame_id == f"{NAMESPACE}/controller":
             self.commands.append(time.monotonic())
+
+    def _on_diagnostics(self, message: DiagnosticArray) -> None:
+        for status in message.status:
+            self.diagnostics[status.name] = {pair.key: pair.value for pair in status.values}
+            self.diagnosed[status.name] = time.monotonic()
+
+    def refused(self) -> dict[str, int]:
+        """Return how many commands the plant has refused so far, by reason, as its newest diagnostics say."""
+        values = self.diagnostics.get(f"{NAMESPACE}/simulator: plant", {})
+        prefix = f"{names.EFFORT_COMMAND}.refused."
+        return {key[len(prefix) :]: int(value) for key, value in values.items() if key.startswith(prefix)}

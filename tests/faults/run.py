@@ -4,7 +4,10 @@ from __future__ import annotations
 
 import json
 import random
+import re
+import sys
 import tempfile
+import time
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Any
@@ -15,13 +18,15 @@ from rich.progress import Progress, track
 from rich.table import Table
 
 from pendulum_bags.experiment.domain import reserve_domain
-from pendulum_msgs_py.errors import FaultError
+from pendulum_msgs_py.errors import FaultError, PendulumError
 from pendulum_msgs_py.executables import cli_main
+from tests.faults.bag_property import check_bag
 from tests.faults.bridge_rig import SCENARIOS, run_scenario
-from tests.faults.campaign import CAMPAIGN, MACHINE_PATIENCE, MAX_TIME_TO_ZERO, Fault, Outcome, try_fault
+from tests.faults.campaign import CAMPAIGN
 from tests.faults.fuzz import fuzz_all
-from tests.faults.live import LiveSystem
+from tests.faults.live import EFFORT_LIMIT, LiveSystem
 from tests.faults.network import cut_cable, why_not
+from tests.faults.outcome import MACHINE_PATIENCE, MAX_TIME_TO_ZERO, Fault, Outcome, try_fault
 
 app = typer.Typer(add_completion=False, rich_markup_mode=None, pretty_exceptions_enable=False)
 
@@ -31,15 +36,20 @@ def campaign(
     repetitions: Annotated[int, typer.Option(help="How often each fault is tried.", min=1)] = 5,
     seed: Annotated[int, typer.Option(help="Seed of the moments at which faults come.")] = 1,
     minutes: Annotated[float, typer.Option(help="How long each parser is attacked [min].", min=0.0)] = 1.0,
+    only: Annotated[str, typer.Option(help="Try only the faults of the running system whose names match.")] = "",
+    keep: Annotated[Path | None, typer.Option(help="New folder that keeps logs and bags.")] = None,
     out: Annotated[Path, typer.Option(help="Where the table is written.")] = Path("build", "faults.json"),
 ) -> int:
     """Attack the running system and count what it stood."""
-    rows = [
-        *_bridge_rows(max(repetitions, 20)),
-        *_live_rows(repetitions, seed),
-        *_network_rows(),
-        *_parser_rows(minutes, seed),
-    ]
+    wanted = [fault for fault in CAMPAIGN if not only or re.search(only, fault.name)]
+    rows = _live_rows(wanted, repetitions, seed, keep) if wanted else []
+    if not only:
+        rows = [
+            *_bridge_rows(max(repetitions, 20)),
+            *rows,
+            *_network_rows(),
+            *_parser_rows(minutes, seed),
+        ]
     table = Table("fault", "tried", "survived", "data lost", "longest time to zero", "remarks", title="Faults")
     for row in rows:
         table.add_row(
@@ -82,24 +92,52 @@ def _bridge_rows(repetitions: int) -> list[dict[str, Any]]:
     return rows
 
 
-def _live_rows(repetitions: int, seed: int) -> list[dict[str, Any]]:
+def _live_rows(faults: Sequence[Fault], repetitions: int, seed: int, keep: Path | None) -> list[dict[str, Any]]:
     rows = []
     generator = random.Random(seed)
     with (
         reserve_domain() as domain,
-        tempfile.TemporaryDirectory(prefix="pendulum_faults_") as folder,
-        LiveSystem(Path(folder), domain) as system,
+        tempfile.TemporaryDirectory(prefix="pendulum_faults_") as temporary,
+        LiveSystem(folder := keep or Path(temporary), domain) as system,
         Progress(transient=True) as progress,
     ):
-        task = progress.add_task("", total=len(CAMPAIGN) * repetitions)
-        for fault in CAMPAIGN:
+        task = progress.add_task("", total=sum(fault.tries or repetitions for fault in faults))
+        for fault in faults:
             outcomes = []
-            for _ in range(repetitions):
+            began = time.monotonic()
+            for _ in range(fault.tries or repetitions):
                 progress.update(task, description=fault.name)
                 outcomes.append(_try(system, fault, generator))
                 progress.advance(task)
             rows.append(_row(fault, outcomes))
+            if not progress.console.is_terminal:
+                took = (time.monotonic() - began) / len(outcomes)
+                sys.stderr.write(f"{fault.name}: {rows[-1]['survived']} of {len(outcomes)}, {took:.1f} s each\n")
+        rows.append(_property_row(folder))
     return rows
+
+
+def _property_row(folder: Path) -> dict[str, Any]:
+    """Judge every bag that was recorded on the way by the rule of the last command."""
+    outcomes = []
+    longest = 0.0
+    for bag in sorted(folder.glob("bag_*")):
+        outcome = Outcome()
+        try:
+            records = check_bag(bag, limit=EFFORT_LIMIT, allowance=MACHINE_PATIENCE)
+        except PendulumError as error:
+            outcome.demand(False, f"{bag.name}: {error}")
+        else:
+            for record in records:
+                longest = max(longest, record.longest)
+                outcome.demand(not record.violations, f"{bag.name}: {'; '.join(record.violations)}")
+        outcomes.append(outcome)
+    row = _row(Fault("every bag of these: bounded torque, none without a command", _nothing), outcomes)
+    return {**row, "time_to_zero_s": longest}
+
+
+def _nothing(_system: LiveSystem, _generator: random.Random) -> Outcome:
+    return Outcome()
 
 
 def _network_rows() -> list[dict[str, Any]]:

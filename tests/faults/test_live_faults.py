@@ -9,8 +9,9 @@ import pytest
 
 from pendulum_bags.experiment.domain import reserve_domain
 from tests.faults.bag_property import check_bag
-from tests.faults.campaign import CAMPAIGN, MACHINE_PATIENCE, Fault, try_fault
+from tests.faults.campaign import CAMPAIGN
 from tests.faults.live import EFFORT_LIMIT, LiveSystem
+from tests.faults.outcome import MACHINE_PATIENCE, Fault, try_fault
 
 
 @pytest.fixture(scope="module")

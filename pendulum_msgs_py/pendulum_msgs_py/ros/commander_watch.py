@@ -17,7 +17,7 @@ _CHECK_PERIOD_NS = 50_000_000
 """Least time between two looks at the graph after a message gave reason for one [ns]."""
 _HOLD_NS = 1_000_000_000
 """Time after the last contradiction at which commands are believed again [ns]."""
-_OWN_STATES = 64
+_OWN_STATES = 128
 """Stamps of own states that an answer is looked up among: those that are young enough to be answered, and more."""
 _UNKNOWN_NODE = "_NODE_NAME_UNKNOWN_"
 """What discovery calls a node whose name has not arrived yet."""

@@ -1,0 +1,224 @@
+"""Two of a kind where one is expected, and nodes that are restarted or started in any order."""
+
+from __future__ import annotations
+
+import itertools
+import random
+import signal
+import time
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+
+from pendulum_bags.experiment.processes import Child, start_recorder
+from pendulum_bags.reader import read_bag
+from pendulum_msgs_py import names
+from pendulum_msgs_py.errors import PendulumError
+from tests.faults.bag_property import check_bag
+from tests.faults.live import EFFORT_LIMIT, NAMESPACE, NODES, START_TIMEOUT, LiveSystem
+from tests.faults.outcome import MACHINE_PATIENCE, Fault, Outcome, is_at_rest
+
+__all__ = ["DOUBLES", "FIVE_NODES", "ORDERS", "start_in_order"]
+
+FIVE_NODES = (*NODES, "viewer")
+ORDERS: tuple[tuple[str, ...], ...] = tuple(itertools.permutations(FIVE_NODES))
+"""All 120 orders in which five nodes can start."""
+_PERIOD_NS = 2_000_000
+_STATES = f"{NAMESPACE}/{names.JOINT_STATES}"
+_APPLIED = f"{NAMESPACE}/{names.APPLIED_EFFORT}"
+
+
+# --- two plants, two controllers -------------------------------------------------------------------------------
+
+
+def _twin_plant(name: str) -> Fault:
+    def act(system: LiveSystem, _: random.Random) -> Outcome:
+        program = system.program("simulator")
+        twin = system.processes.start_node(type(program)(**{**vars(program), "name": name}))
+        outcome = Outcome()
+        # Each plant's stamps lie on a grid of its own, which tells the torques of the two apart.
+        first = system.applied[-1].stamp_ns % _PERIOD_NS
+
+        def of_second(since: float) -> list[float]:
+            recent = itertools.takewhile(lambda applied: applied.when > since, reversed(system.applied))
+            return [applied.effort for applied in recent if applied.stamp_ns % _PERIOD_NS != first]
+
+        system.wait_for("the second plant", lambda: bool(of_second(time.monotonic() - 1.0)), START_TIMEOUT)
+        seen = time.monotonic()
+
+        def rests() -> bool:
+            efforts = of_second(time.monotonic() - 0.1)
+            return len(efforts) > 10 and not any(efforts)
+
+        system.wait_for("the second plant to rest", rests, START_TIMEOUT)
+        settled = time.monotonic()
+        outcome.detail = f"zero torque of the second {settled - seen:.1f} s after it was heard"
+        system.listen(2.0)
+        outcome.demand(not any(of_second(settled)), "the second plant applied torque that answers the first")
+        outcome.demand(system.processes.finish(twin) == 0, "the second plant ended with an error")
+        return outcome
+
+    kind = "one name" if name == "simulator" else "two names"
+    return Fault(f"two simulators under {kind}", act, short=name == "simulator")
+
+
+def _twin_controller(system: LiveSystem, _: random.Random) -> Outcome:
+    outcome = Outcome()
+    twin = system.processes.start_node(system.program("controller", q=[1.0, 0.01]))
+    system.wait_for("twins to be noticed", partial(is_at_rest, system), START_TIMEOUT)
+    outcome.detail = "twins: zero torque while both are there"
+    system.processes.finish(twin)
+    return outcome
+
+
+def _second_controller(system: LiveSystem, _: random.Random) -> Outcome:
+    program = system.program("controller", q=[1.0, 0.01])
+    second = system.processes.start_node(type(program)(**{**vars(program), "name": "usurper"}))
+    system.listen(4.0)
+    outcome = Outcome()
+    outcome.demand(system.torque_flows(), "the first controller lost the plant to the second")
+    system.processes.finish(second)
+    return outcome
+
+
+# --- two recorders ---------------------------------------------------------------------------------------------
+
+
+def _second_recorder(system: LiveSystem, bag: Path) -> Child:
+    return start_recorder(system.processes, bag, NAMESPACE, system.folder / "metadata.json", "mcap")
+
+
+def _stamps(bag: Path) -> list[int]:
+    try:
+        with read_bag(bag, [_STATES]) as opened:
+            return [int(stamp) for stamp in opened.array(_STATES)["stamp_ns"]]
+    except PendulumError:  # not yet there
+        return []
+
+
+def _two_recorders(system: LiveSystem, generator: random.Random) -> Outcome:
+    bag = system.folder / f"second_{generator.randrange(10**9)}"
+    second = _second_recorder(system, bag)
+    system.wait_for("the second recorder", lambda: bool(_stamps(bag)), START_TIMEOUT)
+    system.listen(1.0)
+    code = system.processes.finish(second)
+    outcome = Outcome()
+    outcome.demand(code == 0, f"the second recorder ended with code {code}: {second.last_words(1)}")
+    own = _stamps(bag)
+    system.wait_for("the first bag to have it all", lambda: _stamps(system.bag)[-1] >= own[-1], 10.0)
+    missing = set(own) - set(_stamps(system.bag))
+    outcome.demand(not missing, f"{len(missing)} states of the second bag are not in the first")
+    outcome.demand(len(set(own)) == len(own) > 100, f"{len(own)} states in the second bag, some twice")
+    outcome.detail = outcome.detail or f"{len(own)} states in both"
+    return outcome
+
+
+def _two_recorders_in_one_folder(system: LiveSystem, _: random.Random) -> Outcome:
+    system.wait_for("the bag to be there", (system.bag / "metadata.yaml").exists, START_TIMEOUT)
+    second = _second_recorder(system, system.bag)
+    system.wait_for("the second recorder to end", lambda: second.process.poll() is not None, START_TIMEOUT)
+    system.processes.children.remove(second)
+    outcome = Outcome()
+    code, words = second.process.returncode, second.last_words(1)
+    outcome.demand(code == 2 and "exists" in words, f"the second recorder ended with code {code}: {words}")
+    before = len(_stamps(system.bag))
+    system.wait_for("the first recorder to go on", lambda: len(_stamps(system.bag)) > before, 10.0)
+    return outcome
+
+
+# --- orders ----------------------------------------------------------------------------------------------------
+
+
+def _restart_all(system: LiveSystem, generator: random.Random) -> Outcome:
+    order = generator.sample(NODES, len(NODES))
+    for name in order:
+        system.kill(name, generator.choice((signal.SIGKILL, signal.SIGINT, signal.SIGTERM)))
+        system.listen(generator.uniform(0.0, 0.3))
+        system.start(name)
+    began = time.monotonic()
+    system.wait_for("torque to flow again", system.torque_flows, START_TIMEOUT)
+    return Outcome(detail=f"torque {time.monotonic() - began:.1f} s after the last start ({', '.join(order)})")
+
+
+def start_in_order(system: LiveSystem, order: tuple[str, ...], *, one_by_one: bool) -> Outcome:
+    """End everything, start the nodes in this order, and see them come to a loop that is recorded.
+
+    Args:
+        system: Running, or with no node at all.
+        order: Which nodes.
+        one_by_one: Wait until each is on the graph before the next starts.
+    """
+    outcome = Outcome()
+    for complaint in system.finish_all():
+        outcome.demand(False, complaint)
+    system.listen(0.1)
+    heard = len(system.applied)
+    controlled = float("inf")
+    for name in order:
+        if name == "controller":
+            system.listen(0.05)
+            controlled = time.monotonic()
+        system.start(name)
+        if one_by_one:
+            system.wait_for(f"{name} to be on the graph", partial(system.is_on_graph, name), START_TIMEOUT)
+    system.wait_for("torque to flow", system.torque_flows, START_TIMEOUT)
+    early = [applied for applied in system.applied[heard:] if applied.when < controlled and applied.effort != 0.0]
+    outcome.demand(not early, f"{len(early)} torques before there was a controller")
+    system.wait_for("the torque to be recorded", partial(_has_torque, system.bag), START_TIMEOUT)
+    died = set(order) - set(system.alive())
+    outcome.demand(not died, f"{', '.join(sorted(died))} died")
+    for record in check_bag(system.bag, limit=EFFORT_LIMIT, allowance=MACHINE_PATIENCE):
+        outcome.demand(not record.violations, "; ".join(record.violations))
+    if not outcome.survived:
+        outcome.detail += f" ({', '.join(order)})"
+    return outcome
+
+
+def _has_torque(bag: Path) -> bool:
+    try:
+        with read_bag(bag, [_APPLIED]) as opened:
+            return bool(np.any(opened.array(_APPLIED)["effort"] != 0.0))
+    except PendulumError:  # not yet there
+        return False
+
+
+class _EveryOrder:
+    """One order after the other, mixed so that two neighbours have little in common."""
+
+    def __init__(self) -> None:
+        self._orders = itertools.cycle(random.Random(120).sample(ORDERS, len(ORDERS)))
+
+    def __call__(self, system: LiveSystem, _: random.Random) -> Outcome:
+        return start_in_order(system, next(self._orders), one_by_one=True)
+
+
+def _random_orders(system: LiveSystem, generator: random.Random) -> Outcome:
+    outcome = Outcome()
+    for _ in range(2):
+        one = start_in_order(system, generator.choice(ORDERS), one_by_one=False)
+        outcome.demand(one.survived, one.detail)
+    system.processes.finish(system.children.pop("viewer"))
+    return outcome
+
+
+def _back_to_four(system: LiveSystem, _: random.Random) -> Outcome:
+    viewer = system.children.pop("viewer", None)
+    outcome = Outcome()
+    if viewer is not None:
+        outcome.demand(system.processes.finish(viewer) == 0, "the viewer ended with an error")
+    return outcome
+
+
+DOUBLES: tuple[Fault, ...] = (
+    _twin_plant("simulator"),
+    _twin_plant("impostor"),
+    Fault("two controllers under one name", _twin_controller),
+    Fault("two controllers under two names", _second_controller, short=True),
+    Fault("two recorders into two folders", _two_recorders, short=True),
+    Fault("two recorders into one folder", _two_recorders_in_one_folder),
+    Fault("every node killed and started again, in any order", _restart_all),
+    Fault("five nodes started all at once, in any order", _random_orders, short=True),
+    Fault("five nodes started one by one, in all 120 orders", _EveryOrder(), tries=len(ORDERS)),
+    Fault("viewer: SIGINT", _back_to_four, tries=1),
+)

@@ -1,0 +1,219 @@
+"""A controller that answers late, twice, never, with stamps of the past or of the future: the probe plays it.
+
+What the plant does with it is measured on the plant's own clock, which no busy machine disturbs: a torque says from
+which state on it acted, and the command that it came from says which state it answers.
+"""
+
+from __future__ import annotations
+
+import random
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+
+from sensor_msgs.msg import JointState
+
+from pendulum_msgs_py import names
+from pendulum_msgs_py.cdr import decode_joint_state, encode_joint_state
+from pendulum_msgs_py.ros import qos
+from tests.faults.live import NAMESPACE, START_TIMEOUT, LiveSystem
+from tests.faults.outcome import MAX_TIME_TO_ZERO, Fault, Outcome
+
+__all__ = ["IMPOSTORS"]
+
+_PERIOD = 0.002
+_MILLISECOND = 1_000_000
+_EFFORT = 0.5
+_OTHER_EFFORT = -1.5
+
+
+@dataclass
+class _Impostor:
+    """Answers states in the controller's name, in a way that can be changed at any moment.
+
+    Attributes:
+        system: The system whose controller has ended.
+        answer: Called with each state's stamp [ns].
+        valid_ns: Stamp of the newest command that a plant must believe [ns].
+    """
+
+    system: LiveSystem
+
+    def __post_init__(self) -> None:
+        self.valid_ns = 0
+        self.newest_ns = 0
+        self.pending: list[tuple[float, int]] = []
+        self.answer: Callable[[int], None] = self.punctual
+        node = self.system.conductor.node
+        self._publisher = node.create_publisher(JointState, f"{NAMESPACE}/{names.EFFORT_COMMAND}", qos.COMMAND)
+        self._states = node.create_subscription(
+            JointState, f"{NAMESPACE}/{names.JOINT_STATES}", self._on_state, qos.newest_state(reliable=False), raw=True
+        )
+
+    def send(self, stamp_ns: int, effort: float = _EFFORT) -> None:
+        self._publisher.publish(
+            encode_joint_state(stamp_ns, frame_id=f"{NAMESPACE}/controller", effort=effort)
+        )
+
+    def punctual(self, stamp_ns: int) -> None:
+        self.valid_ns = max(self.valid_ns, stamp_ns)
+        self.send(stamp_ns)
+
+    def close(self) -> None:
+        # A state that has come already is still handed over.
+        self.answer = lambda _stamp_ns: None
+        self.pending.clear()
+        self.system.conductor.node.destroy_subscription(self._states)
+        self.system.conductor.node.destroy_publisher(self._publisher)
+
+    def _on_state(self, data: bytes) -> None:
+        fields = decode_joint_state(data)
+        if fields is not None:
+            self.newest_ns = fields.stamp_ns
+            self.answer(fields.stamp_ns)
+        self.send_due()
+
+    def send_due(self) -> None:
+        """Send the answers that have waited long enough."""
+        while self.pending and self.pending[0][0] <= time.monotonic():
+            self.send(self.pending.pop(0)[1])
+
+
+@contextmanager
+def _in_its_place(system: LiveSystem) -> Iterator[_Impostor]:
+    """Let the probe stand where the controller was, without a disturbance that would add to what it sends."""
+    for name in ("controller", "disturbance"):
+        system.processes.finish(system.children.pop(name))
+    impostor = _Impostor(system)
+    try:
+        system.wait_for("the plant to believe the probe", system.torque_flows, START_TIMEOUT)
+        yield impostor
+    finally:
+        impostor.close()
+        system.start("controller")
+        system.start("disturbance")
+
+
+def _no_longer_valid(misbehave: Callable[[_Impostor, int], None], refusal: str) -> Callable[..., Outcome]:
+    """Return a fault after which nothing that is sent is valid any more: torque must end."""
+
+    def act(system: LiveSystem, generator: random.Random) -> Outcome:
+        outcome = Outcome()
+        with _in_its_place(system) as impostor:
+            system.listen(generator.uniform(0.2, 0.4))
+            before = system.refused().get(refusal, 0)
+            impostor.answer = lambda stamp_ns: misbehave(impostor, stamp_ns)
+            last_ns = impostor.valid_ns
+            system.listen(1.2)
+            # From a state's stamp on, a torque acts for one period.
+            driven = [applied.stamp_ns for applied in system.applied[-2000:] if applied.effort != 0.0]
+            outcome.time_to_zero = (max(driven) - last_ns) * 1e-9 + _PERIOD
+            outcome.demand(
+                outcome.time_to_zero <= MAX_TIME_TO_ZERO,
+                f"torque {outcome.time_to_zero * 1e3:.0f} ms after the last valid command, on the plant's clock",
+            )
+            if refusal:
+                counted = system.refused().get(refusal, 0) - before
+                outcome.demand(counted > 100, f"{counted} commands counted as {refusal}; expected more than 100")
+                outcome.detail = outcome.detail or f"{counted} refused as {refusal}"
+        return outcome
+
+    return act
+
+
+def _never(_impostor: _Impostor, _stamp_ns: int) -> None:
+    """Do not answer."""
+
+
+def _late(delay: float) -> Callable[[_Impostor, int], None]:
+    def misbehave(impostor: _Impostor, stamp_ns: int) -> None:
+        impostor.pending.append((time.monotonic() + delay, stamp_ns))
+
+    return misbehave
+
+
+def _shifted(milliseconds: int) -> Callable[[_Impostor, int], None]:
+    def misbehave(impostor: _Impostor, stamp_ns: int) -> None:
+        impostor.send(stamp_ns + milliseconds * _MILLISECOND)
+
+    return misbehave
+
+
+def _of_last_minute(impostor: _Impostor, _stamp_ns: int) -> None:
+    impostor.send(impostor.valid_ns - 60_000 * _MILLISECOND)
+
+
+def _zero_stamp(impostor: _Impostor, _stamp_ns: int) -> None:
+    impostor.send(0)
+
+
+def _a_little_late(system: LiveSystem, _: random.Random) -> Outcome:
+    """Answer 20 ms late: within what a command may be old, so torque goes on."""
+    outcome = Outcome()
+    with _in_its_place(system) as impostor:
+        impostor.answer = lambda stamp_ns: _late(0.02)(impostor, stamp_ns)
+        system.listen(1.0)
+        recent = system.applied[-200:]
+        driven = sum(applied.effort != 0.0 for applied in recent)
+        # A busy machine may make some of them later than that.
+        outcome.demand(driven > 100, f"torque in {driven} of {len(recent)} periods; expected most of them")
+        outcome.demand(all(applied.effort in (0.0, _EFFORT) for applied in recent), "a torque that nobody sent")
+    return outcome
+
+
+def _twice(system: LiveSystem, _: random.Random) -> Outcome:
+    """Answer each state in two ways: the first counts, the second is counted."""
+    outcome = Outcome()
+    with _in_its_place(system) as impostor:
+        def both(stamp_ns: int) -> None:
+            impostor.send(stamp_ns)
+            impostor.send(stamp_ns, _OTHER_EFFORT)
+
+        before = system.refused().get("duplicate", 0)
+        began = len(system.applied)
+        impostor.answer = both
+        system.listen(1.2)
+        counted = system.refused().get("duplicate", 0) - before
+        outcome.demand(counted > 100, f"{counted} second answers counted; expected more than 100")
+        efforts = {applied.effort for applied in system.applied[began:]}
+        outcome.demand(efforts <= {0.0, _EFFORT}, f"torques {sorted(efforts)}; expected the first answer's alone")
+        outcome.detail = outcome.detail or f"{counted} refused as duplicate"
+    return outcome
+
+
+def _backwards(system: LiveSystem, _: random.Random) -> Outcome:
+    """Answer states in pairs, the newer first: the older one must not act after the newer."""
+    outcome = Outcome()
+    with _in_its_place(system) as impostor:
+        held: list[int] = []
+
+        def swapped(stamp_ns: int) -> None:
+            held.append(stamp_ns)
+            if len(held) == 2:
+                impostor.send(held[1])
+                impostor.send(held[0], _OTHER_EFFORT)
+                held.clear()
+
+        before = system.refused().get("out_of_order", 0)
+        began = len(system.applied)
+        impostor.answer = swapped
+        system.listen(1.2)
+        counted = system.refused().get("out_of_order", 0) - before
+        outcome.demand(counted > 50, f"{counted} answers counted as out of order; expected more than 50")
+        efforts = {applied.effort for applied in system.applied[began:]}
+        outcome.demand(efforts <= {0.0, _EFFORT}, f"torques {sorted(efforts)}; expected the newer answer's alone")
+        outcome.detail = outcome.detail or f"{counted} refused as out_of_order"
+    return outcome
+
+
+IMPOSTORS: tuple[Fault, ...] = (
+    Fault("controller answers 20 ms late", _a_little_late),
+    Fault("controller answers 80 ms late", _no_longer_valid(_late(0.08), "too_old"), short=True),
+    Fault("controller answers twice, differently", _twice),
+    Fault("controller answers never", _no_longer_valid(_never, "")),
+    Fault("controller answers with stamps of a minute ago", _no_longer_valid(_of_last_minute, "too_old")),
+    Fault("controller answers with a stamp of zero", _no_longer_valid(_zero_stamp, "too_old")),
+    Fault("controller answers with stamps 1 s ahead", _no_longer_valid(_shifted(1000), "from_future"), short=True),
+    Fault("controller answers out of order", _backwards),
+)

@@ -1,0 +1,101 @@
+"""What a fault is, how it is tried once, and what must hold after any."""
+
+from __future__ import annotations
+
+import math
+import random
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+from tests.faults.live import EFFORT_LIMIT, START_TIMEOUT, LiveSystem
+
+__all__ = [
+    "MACHINE_PATIENCE",
+    "MAX_LOSS",
+    "MAX_TIME_TO_ZERO",
+    "Fault",
+    "Outcome",
+    "demand_zero",
+    "is_at_rest",
+    "try_fault",
+]
+
+MAX_TIME_TO_ZERO = 0.060
+"""Longest time from the last valid command to zero torque [s]."""
+MACHINE_PATIENCE = 0.060
+"""Allowance for a machine that lets the probe and the plant wait while other processes run [s]."""
+MAX_LOSS = 0.2
+"""Longest stretch of data that a killed recorder may lose [s]."""
+
+
+@dataclass
+class Outcome:
+    """What one try of a fault showed.
+
+    Attributes:
+        survived: Everything that must hold did hold.
+        detail: Why not, or a figure worth telling.
+        time_to_zero: From the last command to zero torque [s]; None where commands went on.
+        lost: Data lost by a killed recorder [s]; None where none was killed.
+    """
+
+    survived: bool = True
+    detail: str = ""
+    time_to_zero: float | None = None
+    lost: float | None = None
+
+    def demand(self, holds: bool, otherwise: str) -> None:
+        """Take note of something that must hold."""
+        if not holds:
+            self.survived = False
+            self.detail = f"{self.detail}; {otherwise}" if self.detail else otherwise
+
+
+@dataclass(frozen=True)
+class Fault:
+    """One kind of fault.
+
+    Attributes:
+        name: What is done, as the table says it.
+        act: Does it and says what it saw.
+        expected_alive: Nodes that must run afterwards.
+        short: Part of the short form.
+        tries: How often the long form tries it, whatever is asked for; 0 for as often as is asked for.
+    """
+
+    name: str
+    act: Callable[[LiveSystem, random.Random], Outcome]
+    short: bool = False
+    tries: int = 0
+    expected_alive: tuple[str, ...] = field(default=("recorder", "simulator", "controller", "disturbance"))
+
+
+def try_fault(system: LiveSystem, fault: Fault, generator: random.Random) -> Outcome:
+    """Try a fault once on a system that runs, and check what must hold after any fault."""
+    system.wait_for("torque to flow before the fault", system.torque_flows, START_TIMEOUT)
+    # At a random moment of the loop, as faults come.
+    system.listen(generator.uniform(0.05, 0.25))
+    outcome = fault.act(system, generator)
+    system.wait_for(f"torque to flow again after: {fault.name}", system.torque_flows, START_TIMEOUT)
+    missing = set(fault.expected_alive) - set(system.alive())
+    outcome.demand(not missing, f"{', '.join(sorted(missing))} died")
+    largest = system.largest_torque()
+    outcome.demand(largest <= EFFORT_LIMIT, f"{largest:.3f} N m applied; expected at most {EFFORT_LIMIT} N m")
+    return outcome
+
+
+def demand_zero(outcome: Outcome) -> None:
+    """Take note of a time to zero torque that is too long."""
+    reached = outcome.time_to_zero
+    outcome.demand(
+        reached is not None and reached <= MAX_TIME_TO_ZERO + MACHINE_PATIENCE,
+        f"zero torque after {math.inf if reached is None else reached * 1e3:.0f} ms; "
+        f"expected at most {MAX_TIME_TO_ZERO * 1e3:.0f} ms",
+    )
+
+
+def is_at_rest(system: LiveSystem) -> bool:
+    """Tell whether every plant that is heard has applied zero torque for a tenth of a second."""
+    recent = [applied.effort for applied in system.applied[-60:] if time.monotonic() - applied.when < 0.1]
+    return len(recent) > 10 and not any(recent)
