@@ -4,6 +4,7 @@ __all__ = ["EXECUTABLES"]
 
 EXECUTABLES: dict[str, str] = {
     "record": "pendulum_bags.recorder_node:main",
+    "analyse": "pendulum_bags.analyse_cli:main",
     "compare": "pendulum_bags.compare_cli:main",
     "replay": "pendulum_bags.replay_cli:main",
     "experiment": "pendulum_bags.experiment_cli:main",
