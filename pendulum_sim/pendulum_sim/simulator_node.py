@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import math
+import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
 import numpy as np
-from rclpy.node import Node
 from sensor_msgs.msg import JointState
 from std_srvs.srv import SetBool, Trigger
 
@@ -21,6 +21,7 @@ from pendulum_msgs_py.ros.convert import sample_from_message
 from pendulum_msgs_py.ros.parameters import NodeParameters
 from pendulum_msgs_py.ros.plant_interface import LIMIT_SPECS, PlantInterface, limits_from_parameters
 from pendulum_msgs_py.ros.plant_loop import LOCKSTEP_EPOCH_NS, LOOP_SPECS, LockstepLoop, RealtimeLoop
+from pendulum_msgs_py.ros.polled import PollingNode
 from pendulum_msgs_py.ros.runner import run_node
 from pendulum_msgs_py.supervisor import Drive, DriveKind, Input, Mode, PlantSupervisor
 from pendulum_msgs_py.timing import LoopStatistics, SteadyWallClock
@@ -79,7 +80,7 @@ SPECS: tuple[ParameterSpec, ...] = (
 )
 
 
-class SimulatorNode(Node):
+class SimulatorNode(PollingNode):
     """A simulated pendulum as a plant.
 
     Args:
@@ -105,7 +106,7 @@ class SimulatorNode(Node):
         self._statistics = LoopStatistics(period_ns)
         self._supervisor = PlantSupervisor(limits_from_parameters(values, parameters.effort_limit))
         self._lockstep = values["clock"] == "lockstep"
-        self._wall = wall = SteadyWallClock()
+        wall = SteadyWallClock()
         self._handed_out_ns = 0
         self._state: PlantState = self._plant.state
         self._interface = PlantInterface(
@@ -113,6 +114,7 @@ class SimulatorNode(Node):
             self._supervisor,
             (lambda: self._loop.now_ns) if self._lockstep else wall,
             lockstep=self._lockstep,
+            polled=not self._lockstep,
             statistics=None if self._lockstep else self._statistics,
             more_diagnostics=self._diagnostics,
             on_command=self._on_command,
@@ -151,6 +153,10 @@ class SimulatorNode(Node):
 
     # --- the loop ------------------------------------------------------------------------------------------
 
+    def run_due(self) -> float | None:
+        """Step the plant if its deadline has come; return the time until the next [s], None in lockstep."""
+        return None if self._lockstep else self._loop.run_due()
+
     def _advance(self, drive: Drive, stamp_ns: int) -> tuple[JointSample | None, float]:
         effort = drive.effort
         if drive.kind is DriveKind.POSITION:
@@ -163,7 +169,8 @@ class SimulatorNode(Node):
         self._state = self._plant.step(effort, drive.push)
         # In real time this is the deadline, not the moment at which Python got there.
         self._stamp_ns = stamp_ns
-        self._handed_out_ns = self._wall()
+        # System time, as in which DDS notes arrivals; the two differ by a fraction of a period, so a step is unlikely.
+        self._handed_out_ns = time.time_ns()
         return self._measure(), effort
 
     def _measure(self) -> JointSample | None:
@@ -174,8 +181,8 @@ class SimulatorNode(Node):
         if self._lockstep:
             self._loop.answered(kind, command)
         elif kind is Input.EFFORT_COMMAND and command.stamp_ns == self._stamp_ns:
-            # From the state to its answer: how late the timer was is the jitter's business.
-            self._statistics.round_trip(self._wall() - self._handed_out_ns)
+            # Until the answer reached this process; that it waits there for the next deadline costs it nothing.
+            self._statistics.round_trip(self._interface.arrived_ns - self._handed_out_ns)
 
     # --- services and parameters ---------------------------------------------------------------------------
 

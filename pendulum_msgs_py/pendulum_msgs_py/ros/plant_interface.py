@@ -33,6 +33,7 @@ from pendulum_msgs_py.ros.convert import (
     stamp_to_message,
     trajectory_from_message,
 )
+from pendulum_msgs_py.ros.polled import PolledInput, PollingNode
 from pendulum_msgs_py.supervisor import Drive, Input, Mode, PlantLimits, PlantSupervisor
 from pendulum_msgs_py.timing import LoopStatistics
 from pendulum_msgs_py.values import NANOSECONDS, JointCommand, JointSample
@@ -173,9 +174,15 @@ class PlantInterface:
         clock: The plant's time [ns]: wall clock or simulated.
         push: Whether the plant can take a torque on the link itself.
         lockstep: Whether every answer is waited for, so that none may be lost.
+        polled: Whether torque inputs wait for :meth:`take_inputs` instead of waking the node; it is a
+            :class:`PollingNode` then.
         statistics: The loop's figures, shown in diagnostics.
         more_diagnostics: Further key-value pairs for diagnostics.
         on_command: Called after each accepted command of any torque input.
+
+    Attributes:
+        sample: Newest state that was published.
+        arrived_ns: System time at which the message being handled reached this process, for polled inputs [ns].
     """
 
     def __init__(
@@ -186,6 +193,7 @@ class PlantInterface:
         *,
         push: bool = True,
         lockstep: bool = False,
+        polled: bool = False,
         statistics: LoopStatistics | None = None,
         more_diagnostics: Callable[[], Mapping[str, object]] = dict,
         on_command: _CommandHook | None = None,
@@ -195,6 +203,7 @@ class PlantInterface:
         self.clock = clock
         self.statistics = statistics
         self.sample: JointSample | None = None
+        self.arrived_ns = 0
         self.on_command = on_command
         self.refused_trajectories: Counter[str] = Counter()
         self._more_diagnostics = more_diagnostics
@@ -209,12 +218,18 @@ class PlantInterface:
         self._events = node.create_publisher(String, names.EVENTS, qos.EVENTS)
         self._diagnostics = node.create_publisher(DiagnosticArray, names.DIAGNOSTICS, qos.DIAGNOSTICS)
         inputs = [Input.EFFORT_COMMAND, Input.DISTURBANCE] + ([Input.PUSH] if push else [])
-        self._inputs = {
-            kind: node.create_subscription(
-                JointState, kind.value, self._receiver(kind), qos.command_input(reliable=lockstep), raw=True
-            )
-            for kind in inputs
-        }
+        profile = qos.command_input(reliable=lockstep)
+        self._polled: list[tuple[PolledInput, Callable[..., None]]] = []
+        self._inputs = {}
+        for kind in inputs:
+            receive = self._receiver(kind)
+            if polled:
+                assert isinstance(node, PollingNode)
+                source = node.create_polled_input(JointState, kind.value, profile)
+                self._polled.append((source, receive))
+                self._inputs[kind] = source.subscription
+            else:
+                self._inputs[kind] = node.create_subscription(JointState, kind.value, receive, profile, raw=True)
         node.create_subscription(JointTrajectory, names.JOINT_TRAJECTORY, self._on_trajectory, qos.TRAJECTORY)
         node.create_service(SetBool, names.ARM, self._on_arm)
         node.create_service(Trigger, names.E_STOP, self._on_e_stop)
@@ -225,6 +240,11 @@ class PlantInterface:
         )
 
     # --- the plant's loop calls these ----------------------------------------------------------------------
+
+    def take_inputs(self) -> None:
+        """Take the torques that came since the last look, where inputs are polled."""
+        for source, receive in self._polled:
+            source.take(receive)
 
     def publish_state(self, sample: JointSample) -> None:
         """Publish a state and remember it as the newest."""
@@ -312,10 +332,11 @@ class PlantInterface:
 
     # --- callbacks -----------------------------------------------------------------------------------------
 
-    def _receiver(self, kind: Input) -> Callable[[bytes], None]:
+    def _receiver(self, kind: Input) -> Callable[..., None]:
         supervisor = self.supervisor
 
-        def receive(data: bytes) -> None:
+        def receive(data: bytes, arrived_ns: int = 0) -> None:
+            self.arrived_ns = arrived_ns
             command = command_from_bytes(data)
             refusal = supervisor.offer(kind, command, self.clock())
             if refusal is Refusal.DUPLICATE and kind is Input.EFFORT_COMMAND and command is not None:

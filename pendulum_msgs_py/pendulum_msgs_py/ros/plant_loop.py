@@ -80,10 +80,11 @@ class RealtimeLoop:
     """Steps the plant at absolute deadlines of wall time, without drift.
 
     Late by a period or more, the plant is stepped through the periods it missed and only the newest state is
-    published; each missed period counts as an overrun.
+    published; each missed period counts as an overrun. Its runner calls :meth:`run_due`: a timer of rclpy's would
+    cost two more threads' attention a period, and drop the periods it missed.
 
     Args:
-        interface: The plant on the graph.
+        interface: The plant on the graph, its inputs polled.
         step: Steps the plant.
         statistics: Gets the loop's figures.
         clock: Wall time.
@@ -96,22 +97,24 @@ class RealtimeLoop:
         self._step = step
         self._statistics = statistics
         self._clock = clock
-        self._deadline_ns = clock()
+        self._deadline_ns = clock() + statistics.period_ns
         self.paused = False
-        self._timer = create_wall_timer(interface.node, statistics.period_ns / NANOSECONDS, self._on_timer)
 
-    def answered(self, kind: Input, command: JointCommand) -> None:
-        """Record the round trip of an accepted command."""
-        if kind is Input.EFFORT_COMMAND:
-            self._statistics.round_trip(self._clock() - command.stamp_ns)
-
-    def _on_timer(self) -> None:
+    def run_due(self) -> float:
+        """Do what is due; return the time until the next deadline [s]."""
         now = self._clock()
-        period = self._statistics.period_ns
-        if self.paused:
-            self._deadline_ns = now
-            return
-        self._deadline_ns += period
+        if now >= self._deadline_ns:
+            self._interface.take_inputs()
+            period = self._statistics.period_ns
+            if self.paused:
+                self._deadline_ns = now
+            else:
+                self._run(now, period)
+            self._deadline_ns += period
+            now = self._clock()
+        return (self._deadline_ns - now) / NANOSECONDS
+
+    def _run(self, now: int, period: int) -> None:
         self._statistics.cycle(now, self._deadline_ns)
         while now - self._deadline_ns >= period:
             self._advance()
@@ -120,6 +123,7 @@ class RealtimeLoop:
 
     def step_once(self) -> None:
         """Take one step while paused."""
+        self._interface.take_inputs()
         self._deadline_ns = self._clock()
         self._publish(self._advance())
 

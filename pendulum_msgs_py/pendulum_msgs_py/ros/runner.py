@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import contextlib
+import gc
 import os
 import re
 import signal
@@ -11,6 +13,7 @@ import threading
 import time
 import traceback
 from collections.abc import Callable, Iterable, Sequence
+from pathlib import Path
 from typing import Protocol, runtime_checkable
 
 import rclpy
@@ -24,11 +27,12 @@ from rclpy.node import Node
 from rclpy.signals import SignalHandlerOptions
 from rclpy.task import Future
 
+from pendulum_msgs_py import completion
 from pendulum_msgs_py.errors import ParameterError, PendulumError
 from pendulum_msgs_py.executables import EXIT_USAGE, print_text, report_error
 from pendulum_msgs_py.parameters import ParameterSpec
 
-__all__ = ["Closeable", "run_node"]
+__all__ = ["Closeable", "Paced", "run_node"]
 
 _SPIN_SLICE = 0.5
 """EventsExecutor.spin() hangs in the Jazzy wheels; spinning in finite slices works [s]."""
@@ -37,6 +41,14 @@ _ECHO_TIME = 1.0
 _STOP_SIGNALS = (signal.SIGINT, signal.SIGTERM)
 _KEPT_OPEN: list[socket.socket] = []
 """Write ends of the signal sockets: closed by the garbage collector, they would take the wakeup with them."""
+
+
+@runtime_checkable
+class Paced(Protocol):
+    """A node with deadlines of its own."""
+
+    def run_due(self) -> float | None:
+        """Do what is due; return the time until the next deadline [s], or None if there will be none."""
 
 
 @runtime_checkable
@@ -70,6 +82,9 @@ def run_node(
         example: A command line to show in help.
     """
     arguments = list(sys.argv[1:] if argv is None else argv)
+    if completion.asked():
+        print_text("\n".join(completion.of_node(specs, arguments)))
+        return 0
     if "-h" in arguments or "--help" in arguments:
         print_text(_help(program, description, specs, example))
         return 0
@@ -85,9 +100,12 @@ def run_node(
 
 
 def _run(make_node: Callable[[Callable[[], None]], Node], arguments: Sequence[str]) -> int:
+    if os.environ.get("NO_COLOR"):  # https://no-color.org, which rcutils does not know
+        os.environ.setdefault("RCUTILS_COLORIZED_OUTPUT", "0")
     # A plant that the whole subnet may command is a decision, not a default.
     os.environ.setdefault("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
     signals = _listen_for_stop_signals()
+    _wake_punctually()
     try:
         rclpy.init(args=list(arguments), signal_handler_options=SignalHandlerOptions.NO)
     except Exception as error:  # noqa: BLE001  # rcl's errors have no common base
@@ -108,8 +126,17 @@ def _run(make_node: Callable[[Callable[[], None]], Node], arguments: Sequence[st
         # The first line that rclpy logs takes 30 ms; said now, it does not come in the middle of a loop.
         node.get_logger().info("ready")
         executor.add_node(node)
+        # What is there now stays: the collector need not look at it again in the middle of a loop.
+        gc.collect()
+        gc.freeze()
+        pace = node.run_due if isinstance(node, Paced) else None
         while not stopped.done() and rclpy.ok():
-            executor.spin_until_future_complete(stopped, _SPIN_SLICE)
+            left = pace() if pace is not None else None
+            if left is None:
+                executor.spin_until_future_complete(stopped, _SPIN_SLICE)
+            else:
+                # One event at most, so that a flood of them cannot make the node miss its deadlines.
+                executor.spin_once(max(0.0, left))
     except PendulumError as error:
         exit_code = report_error(error)
     except Exception:  # noqa: BLE001  # printed in full, and the plant is made safe
@@ -121,6 +148,12 @@ def _run(make_node: Callable[[Callable[[], None]], Node], arguments: Sequence[st
         # a node that has ended properly would then count as killed.
         signal.signal(signal.SIGINT, signal.SIG_IGN)
     return exit_code
+
+
+def _wake_punctually() -> None:
+    """Ask the kernel to wake this thread, and those it will start, when they want and not 50 us later."""
+    with contextlib.suppress(OSError):
+        Path("/proc/self/timerslack_ns").write_text("1000", encoding="ascii")
 
 
 def _make(make_node: Callable[[Callable[[], None]], Node], stop: Callable[[], None]) -> Node:
