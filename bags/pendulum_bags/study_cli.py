@@ -128,7 +128,10 @@ def run(
     spec: Annotated[Path, typer.Argument(help="JSON file with one run.")],
     bag: Annotated[Path, typer.Option(help="Folder of the bag; it must not exist.")],
 ) -> None:
-    """Carry out one run of a study."""
+    """Carry out one run of a study; its programs start each other this way.
+
+    Example: python -m pendulum_bags experiment run run.json --bag /tmp/bag
+    """
     from pendulum_bags.experiment.lockstep import record_run
     from pendulum_bags.experiment.run_spec import RunSpec
 

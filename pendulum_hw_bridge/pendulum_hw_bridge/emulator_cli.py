@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import signal
 from collections.abc import Sequence
 from dataclasses import replace
@@ -64,6 +65,7 @@ def emulator_fault(
     ] = None,
     clear: Annotated[bool, typer.Option("--clear", help="End all faults first.")] = False,
     address: Annotated[str, typer.Option(help="HOST:PORT of the emulator.")] = _ADDRESS,
+    as_json: Annotated[bool, typer.Option("--json", help="Print the list, or what is in force, as JSON.")] = False,
 ) -> None:
     """Let faults begin or end in a running emulator.
 
@@ -76,6 +78,9 @@ def emulator_fault(
         if name not in known:
             raise ParameterError(f"unknown fault {name!r}; expected one of {', '.join(known)}")
     if not faults and not clear:
+        if as_json:
+            print(json.dumps({"faults": known}))
+            return
         table = Table("fault", title="Faults of the emulated actuator")
         for name in known:
             table.add_row(name)
@@ -87,6 +92,9 @@ def emulator_fault(
         backend.clear_faults()
     if faults:
         backend.inject(*faults)
+    if as_json:
+        print(json.dumps({"in_force": backend.status()["faults"]}))
+        return
     print("faults in force: " + (", ".join(backend.status()["faults"]) or "none"))
 
 

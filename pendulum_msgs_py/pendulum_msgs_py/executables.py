@@ -14,6 +14,7 @@ from difflib import get_close_matches
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from pendulum_msgs_py import completion
 from pendulum_msgs_py.errors import PendulumError
 
 if TYPE_CHECKING:
@@ -37,6 +38,15 @@ def run_package(package: str, argv: Sequence[str] | None = None) -> int:
     importlib.import_module("pendulum_msgs_py.one_thread")
     arguments = list(sys.argv[1:] if argv is None else argv)
     table: dict[str, str] = importlib.import_module(f"{package}.executables").EXECUTABLES
+    if completion.asked() and len(arguments) < 2:
+        print_text("\n".join(completion.of_package(table, arguments)))
+        return 0
+    if arguments and arguments[0] == "--completion":
+        try:
+            print_text(completion.script(arguments[1] if len(arguments) > 1 else "bash"))
+        except PendulumError as error:
+            return report_error(error)
+        return 0
     if not arguments or arguments[0] in {"-h", "--help"}:
         print_text(_usage(package, table))
         return 0 if arguments else EXIT_USAGE
@@ -71,6 +81,9 @@ def cli_main(app: typer.Typer, argv: Sequence[str] | None = None, *, name: str |
     # typer brings a click of its own, which is no other click's: its errors are found through what it exports.
     usage_error: Any = next(kind for kind in typer.BadParameter.__mro__ if kind.__name__ == "ClickException")
     command = typer.main.get_command(app)
+    if completion.asked():
+        print_text("\n".join(completion.of_command(command, list(sys.argv[1:] if argv is None else argv))))
+        return 0
     try:
         result = command.main(
             args=list(sys.argv[1:] if argv is None else argv), prog_name=name, standalone_mode=False
@@ -126,4 +139,5 @@ def _usage(package: str, table: dict[str, str]) -> str:
     lines = [f"usage: python -m {package} EXECUTABLE [ARGUMENTS]", "", "executables:"]
     lines += [f"  {name}" for name in names]
     lines += ["", f"example: python -m {package} {names[0]} --help"]
+    lines += [f"completion with the Tab key, in bash or zsh: source <(python -m {package} --completion bash)"]
     return "\n".join(lines)

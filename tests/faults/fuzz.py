@@ -122,6 +122,7 @@ def fuzz(
     seed: Annotated[int, typer.Option(help="Seed of the spoiling.")] = 1,
     keep: Annotated[Path | None, typer.Option(help="Folder for files that a parser did not stand.")] = None,
     only: Annotated[str, typer.Option(help="Only parsers with this in their name.")] = "",
+    as_json: Annotated[bool, typer.Option("--json", help="Print the rows as JSON.")] = False,
     child: Annotated[str, typer.Option(hidden=True)] = "",
 ) -> int:
     """Read files that are wrong in random ways; only the project's own errors may come out."""
@@ -133,6 +134,9 @@ def fuzz(
         print(json.dumps(fuzz_one(parser, minutes * 60.0, seed, keep)))
         return 0
     rows = fuzz_all(minutes * 60.0, seed, keep, only)
+    if as_json:
+        print(json.dumps(rows, indent=2))
+        return 1 if any(row["findings"] for row in rows) else 0
     table = Table("parser", "files", "findings", "slowest", title="Spoilt files")
     for row in rows:
         found = "; ".join(f"{kind} ({count})" for kind, count in row["findings"].items())

@@ -156,6 +156,7 @@ def fuzz(
     seed: Annotated[int, typer.Option(help="Seed of libFuzzer.")] = 1,
     keep: Annotated[Path | None, typer.Option(help="Folder for bags that the reader did not stand.")] = None,
     only: Annotated[str, typer.Option(help=f"One of {', '.join(STORAGES)}.")] = "",
+    as_json: Annotated[bool, typer.Option("--json", help="Print the rows as JSON.")] = False,
     child: Annotated[str, typer.Option(hidden=True)] = "",
     place: Annotated[Path, typer.Option(hidden=True)] = Path(),
     flag: Annotated[list[str] | None, typer.Option(hidden=True)] = None,
@@ -171,6 +172,9 @@ def fuzz(
             f"install it with: {sys.executable} -m pip install --no-deps --target {ATHERIS} atheris==3.0.0"
         )
     rows = [fuzz_storage(storage, minutes * 60.0, seed, keep) for storage in STORAGES if only in {"", storage}]
+    if as_json:
+        print(json.dumps(rows, indent=2))
+        return 1 if any(row["findings"] or not row["tried"] for row in rows) else 0
     table = Table("storage", "files", "edges reached", "findings", title="Bags by libFuzzer")
     for row in rows:
         table.add_row(row["storage"], str(row["tried"]), str(row["reached"]), "\n".join(row["findings"]) or "none")

@@ -1,0 +1,145 @@
+"""Completion of command lines in bash and zsh: ``source <(python -m pendulum_bags --completion bash)``.
+
+Programs are started as ``python -m PACKAGE EXECUTABLE``, which no library for command lines completes: the shell sees a
+program named python. So the script that is printed here sends what was typed to the program itself, marked by an
+environment variable, and the program answers with what may follow instead of running.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterable, Sequence
+from importlib.metadata import distributions
+from importlib.util import find_spec
+from typing import TYPE_CHECKING, Any
+
+from pendulum_msgs_py.errors import ParameterError
+
+if TYPE_CHECKING:
+    from pendulum_msgs_py.parameters import ParameterSpec
+
+__all__ = ["SHELLS", "VARIABLE", "asked", "of_command", "of_node", "of_package", "script"]
+
+VARIABLE = "_PENDULUM_COMPLETE"
+"""Set by the shell where what was typed is to be completed, not run; its last word is incomplete."""
+
+_SCRIPT = r"""
+_pendulum_complete() {{
+  local line="${{COMP_LINE:0:$COMP_POINT}}" at candidate
+  local -a typed
+  {split}
+  [[ "$line" == *[[:space:]] ]] && typed+=("")
+  COMPREPLY=()
+  if [[ "${{typed[1]}}" != -m || -z "${{typed[2]}}" \
+      || ( pendulum_ != "${{typed[2]}}"* && "${{typed[2]}}" != pendulum_* ) ]]; then
+    [[ -n "$_pendulum_before" ]] && "$_pendulum_before" "$@"
+    return
+  fi
+  if [[ "${{#typed[@]}}" -eq 3 ]]; then
+    for candidate in {packages}; do
+      [[ "$candidate" == "${{typed[2]}}"* ]] && COMPREPLY+=("$candidate")
+    done
+    return
+  fi
+  while IFS= read -r candidate; do
+    COMPREPLY+=("$candidate")
+    {nospace}
+  done < <({variable}=1 "${{typed[0]/#\~/$HOME}}" "${{typed[@]:1}}" 2>/dev/null)
+}}
+"""
+_BASH = """\
+declare -F _completion_loader >/dev/null && _completion_loader python 2>/dev/null
+_pendulum_before=$(complete -p python 2>/dev/null | sed -n 's/.* -F \\([^ ]*\\) .*/\\1/p')
+[[ "$_pendulum_before" == _pendulum_complete ]] && _pendulum_before=
+complete -o default -o bashdefault -F _pendulum_complete python python3 .venv/bin/python
+"""
+_ZSH_HEAD = "autoload -U +X compinit && compinit -u\nautoload -U +X bashcompinit && bashcompinit\n"
+_ZSH = "complete -o default -F _pendulum_complete python python3 .venv/bin/python\n"
+
+SHELLS = ("bash", "zsh")
+
+
+def asked() -> bool:
+    """Tell whether the shell wants to know what may follow."""
+    return bool(os.environ.get(VARIABLE))
+
+
+def script(shell: str) -> str:
+    """Return what a shell is to source.
+
+    Args:
+        shell: One of :data:`SHELLS`.
+
+    Raises:
+        ParameterError: Another shell.
+    """
+    if shell not in SHELLS:
+        raise ParameterError(f"shell is {shell!r}; expected one of {', '.join(SHELLS)}")
+    names = {str(found.metadata["Name"]).replace("-", "_") for found in distributions()}
+    ours = sorted(name for name in names if name.startswith("pendulum_") and find_spec(f"{name}.__main__"))
+    values = {"packages": " ".join(ours), "variable": VARIABLE}
+    if shell == "bash":
+        nospace = '[[ "$candidate" == *= ]] && compopt -o nospace'
+        return _SCRIPT.format(split='read -ra typed <<< "$line"', nospace=nospace, **values) + _BASH
+    split = "setopt local_options ksh_arrays; typed=(${=line})"
+    return _ZSH_HEAD + _SCRIPT.format(split=split, nospace=":", **values) + _ZSH
+
+
+def of_package(table: Iterable[str], words: Sequence[str]) -> list[str]:
+    """Return which executables of a package what was typed may become.
+
+    Args:
+        table: Their names.
+        words: What was typed behind the package.
+    """
+    incomplete = words[-1] if words else ""
+    return _beginning(["--completion", "--help"] if incomplete.startswith("-") else sorted(table), incomplete)
+
+
+def of_command(command: Any, words: Sequence[str]) -> list[str]:
+    """Return what may follow on the command line of a typer application.
+
+    Args:
+        command: Its command, or group of commands.
+        words: What was typed behind the program; the last word is incomplete.
+
+    Returns:
+        Commands, options, or the choices of an option; nothing where a file or a free value belongs.
+    """
+    *before, incomplete = words or [""]
+    while before and (command_below := getattr(command, "commands", {}).get(before[0])) is not None:
+        command, before = command_below, before[1:]
+    options = [found for found in command.params if found.param_type_name == "option" and not found.hidden]
+    for option in options:
+        if before and before[-1] in option.opts and not option.is_flag:
+            return _beginning(map(str, getattr(option.type, "choices", ())), incomplete)
+    below = [name for name, found in getattr(command, "commands", {}).items() if not found.hidden]
+    if below and not incomplete.startswith("-"):
+        return _beginning(sorted(below), incomplete)
+    if not incomplete.startswith("-"):
+        return []  # an argument: files, which the shell knows
+    named = [name for option in options for name in (*option.opts, *option.secondary_opts)]
+    return _beginning(sorted({*named, "--help"}), incomplete)
+
+
+def of_node(specs: Iterable[ParameterSpec], words: Sequence[str]) -> list[str]:
+    """Return what may follow on the command line of a node.
+
+    Args:
+        specs: Its parameters.
+        words: What was typed behind the program; the last word is incomplete.
+    """
+    *before, incomplete = words or [""]
+    if "--ros-args" not in before:
+        return _beginning(["--help", "--ros-args"], incomplete)
+    if before[-1] == "-p":
+        return _beginning([f"{spec.name}:=" for spec in specs], incomplete)
+    if before[-1] == "-r":
+        return _beginning(["__node:=", "__ns:="], incomplete)
+    if before[-1] in {"--params-file", "--enclave", "--log-level"}:
+        return []
+    return _beginning(["--enclave", "--log-level", "--params-file", "-p", "-r"], incomplete)
+
+
+def _beginning(candidates: Iterable[str], incomplete: str) -> list[str]:
+    return [candidate for candidate in candidates if candidate.startswith(incomplete)]

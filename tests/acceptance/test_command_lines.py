@@ -1,0 +1,263 @@
+"""Every command line of the project: an example in its help, JSON for its tables, completion, colours only if wanted.
+
+The command lines are found, not listed: all programs of all packages with all their subcommands, and the tools of the
+tests.
+"""
+
+from __future__ import annotations
+
+import ast
+import importlib
+import inspect
+import json
+import os
+import pty
+import re
+import shutil
+import subprocess
+import sys
+from collections.abc import Iterator
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import pytest
+import typer.main
+
+from pendulum_msgs_py import completion
+from pendulum_msgs_py.errors import ParameterError
+from tests.acceptance.test_packaging import PROGRAMS, executables
+from tests.fixtures import PROJECT
+
+TOOLS = sorted(
+    ".".join(path.relative_to(PROJECT).with_suffix("").parts)
+    for path in (PROJECT / "tests").rglob("*.py")
+    if re.search(r"^app = typer\.Typer\(", path.read_text(encoding="utf-8"), re.MULTILINE)
+)
+
+
+@dataclass(frozen=True)
+class CommandLine:
+    """One command: how it is typed, and what typer knows of it."""
+
+    typed: str
+    command: Any
+
+
+def _calls(function: Any) -> dict[str, ast.Call]:
+    tree = ast.parse(inspect.getsource(function))
+    calls = [node for node in ast.walk(tree) if isinstance(node, ast.Call)]
+    return {call.func.id: call for call in calls if isinstance(call.func, ast.Name)}
+
+
+def application(module: Any, function: str) -> Any | None:
+    """Return the typer application that a main function runs, or None for a node."""
+    calls = _calls(getattr(module, function))
+    if "cli_main" not in calls:
+        assert "run_node" in calls, f"{module.__name__}:{function} is neither a command line nor a node"
+        return None
+    (first, *_) = calls["cli_main"].args
+    assert isinstance(first, ast.Name)
+    return getattr(module, first.id)
+
+
+def _below(typed: str, command: Any) -> Iterator[CommandLine]:
+    commands = getattr(command, "commands", {})
+    if not commands:
+        yield CommandLine(typed, command)
+    for name, found in commands.items():
+        yield from _below(f"{typed} {name}", found)
+
+
+@cache
+def command_lines() -> tuple[CommandLine, ...]:
+    """Find all of them."""
+    found: list[CommandLine] = []
+    for package, program in PROGRAMS:
+        module, function = executables(package)[program].split(":")
+        app = application(importlib.import_module(module), function)
+        if app is not None:
+            found += _below(f"python -m {package} {program}", typer.main.get_command(app))
+    for tool in TOOLS:
+        found += _below(f"python -m {tool}", typer.main.get_command(importlib.import_module(tool).app))
+    return tuple(found)
+
+
+def nodes() -> list[tuple[str, str]]:
+    """Find all programs that are nodes and nothing else."""
+    entries = [(package, program, *executables(package)[program].split(":")) for package, program in PROGRAMS]
+    return [
+        (package, program)
+        for package, program, module, function in entries
+        if application(importlib.import_module(module), function) is None
+    ]
+
+
+def _functions(module: Any) -> dict[str, ast.AST]:
+    tree = ast.parse(inspect.getsource(module))
+    return {node.name: node for node in tree.body if isinstance(node, ast.FunctionDef)}
+
+
+def prints_a_table(callback: Any) -> bool:
+    """Tell whether a command, or a function of its module that it calls, makes a table for the terminal."""
+    function = inspect.unwrap(callback)
+    known = _functions(sys.modules[function.__module__])
+    seen: set[str] = set()
+    todo = [function.__name__]
+    while todo:
+        name = todo.pop()
+        if name in seen or name not in known:
+            continue
+        seen.add(name)
+        for node in ast.walk(known[name]):
+            if isinstance(node, ast.Call):
+                called = node.func.id if isinstance(node.func, ast.Name) else getattr(node.func, "attr", "")
+                if called in {"Table", "print_table"}:
+                    return True
+                todo.append(called)
+    return False
+
+
+def test_all_programs_are_found() -> None:
+    found = {line.typed for line in command_lines()}
+    assert len(found) > 25
+    for expected in ("pendulum_bags info", "pendulum_bags experiment leaderboard", "tests.faults.run"):
+        assert f"python -m {expected}" in found
+    assert ("pendulum_sim", "simulator") in nodes()
+    assert len(nodes()) + len({typed.split()[2] + typed.split()[3] for typed in found if "tests." not in typed}) == len(
+        PROGRAMS
+    )
+
+
+def test_the_help_of_every_command_shows_an_example_of_it() -> None:
+    without = []
+    for line in command_lines():
+        text = " ".join(f"{line.command.help or ''} {line.command.epilog or ''}".split())
+        if not re.search(rf"Example: {re.escape(line.typed)}(?![\w.])", text):
+            without.append(line.typed)
+    assert not without
+
+
+def test_the_help_of_every_node_shows_an_example_and_its_parameters(capsys: pytest.CaptureFixture[str]) -> None:
+    for package, program in nodes():
+        module, function = executables(package)[program].split(":")
+        assert getattr(importlib.import_module(module), function)(["--help"]) == 0
+        text = capsys.readouterr().out
+        assert f"example: python -m {package} {program}" in text
+        assert "parameters (name, default, meaning):" in text
+
+
+def test_what_prints_a_table_prints_json_too() -> None:
+    tables = [line for line in command_lines() if prints_a_table(line.command.callback)]
+    assert len(tables) > 12
+
+    def has_json(line: CommandLine) -> bool:
+        written = [option.default for option in line.command.params if "--out" in option.opts]
+        asked = any("--json" in option.opts for option in line.command.params)
+        return asked or any(Path(str(path)).suffix == ".json" for path in written)
+
+    assert not [line.typed for line in tables if not has_json(line)]
+
+
+def test_every_command_completes_its_options(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Through the same way as the shell: a run of the program that must do nothing but answer."""
+    monkeypatch.setenv(completion.VARIABLE, "1")
+    for line in command_lines():
+        if "tests." in line.typed:
+            continue
+        package, program, *below = line.typed.split()[2:]
+        module, function = executables(package)[program].split(":")
+        assert getattr(importlib.import_module(module), function)([*below, "--"]) == 0
+        told = set(capsys.readouterr().out.split())
+        expected = {
+            name for option in line.command.params if option.param_type_name == "option" for name in option.opts
+        }
+        assert {name for name in expected if name.startswith("--")} <= told, line.typed
+    for package, program in nodes():
+        module, function = executables(package)[program].split(":")
+        assert getattr(importlib.import_module(module), function)(["--ros-args", "-p", ""]) == 0
+        assert ":=" in capsys.readouterr().out, program
+
+
+_ASK = """
+ask() {{ COMP_LINE="$1"; COMP_POINT=${{#1}}; {words}COMPREPLY=(); _pendulum_complete; echo "${{COMPREPLY[*]}}"; }}
+ask "{python} -m pendul"
+ask "{python} -m pendulum_bags rep"
+ask "{python} -m pendulum_bags experiment the"
+ask "{python} -m pendulum_bags compare --js"
+ask "{python} -m pendulum_lqr controller --ros-args -p set_po"
+ask "{python} -m http.ser"
+"""
+
+
+@pytest.mark.parametrize("shell", completion.SHELLS)
+def test_the_shell_completes_what_is_typed(shell: str) -> None:
+    program = shutil.which(shell)
+    if program is None:
+        pytest.skip(f"{shell} is not installed")
+    ask = _ASK.format(python=sys.executable, words="words=(${=1}); " if shell == "zsh" else "")
+    text = completion.script(shell) + ask
+    done = subprocess.run([program, "-c", text], capture_output=True, text=True, timeout=60, check=True, cwd=PROJECT)
+    packages, programs, below, option, parameter, other = done.stdout.splitlines()[-6:]
+    assert {"pendulum_bags", "pendulum_sim"} <= set(packages.split())
+    assert programs.split() == ["repair", "replay", "report"]
+    assert below == "thesis"
+    assert option == "--json"
+    assert parameter == "set_point:="
+    assert other == ""
+
+
+def test_another_shell_is_refused_with_a_sentence(capsys: pytest.CaptureFixture[str]) -> None:
+    from pendulum_msgs_py.executables import run_package
+
+    with pytest.raises(ParameterError):
+        completion.script("tcsh")
+    assert run_package("pendulum_bags", ["--completion", "tcsh"]) == 2
+    assert "expected one of bash, zsh" in capsys.readouterr().err
+    assert run_package("pendulum_bags", ["--completion"]) == 0
+    assert "_pendulum_complete" in capsys.readouterr().out
+
+
+def _in_a_terminal(arguments: list[str], **environment: str) -> str:
+    """Run a program in a terminal of its own and return what it wrote there."""
+    ours, theirs = pty.openpty()
+    unset = {"NO_COLOR", "FORCE_COLOR", "TTY_COMPATIBLE"}
+    inherited = {name: value for name, value in os.environ.items() if name not in unset}
+    process = subprocess.Popen(
+        [sys.executable, "-m", *arguments],
+        stdin=subprocess.DEVNULL, stdout=theirs, stderr=theirs, cwd=PROJECT,
+        env={**inherited, "TERM": "xterm-256color", "COLUMNS": "100", **environment},
+    )  # fmt: skip
+    os.close(theirs)
+    told = b""
+    try:
+        while data := os.read(ours, 65536):
+            told += data
+    except OSError:
+        pass  # the terminal's other end is closed
+    finally:
+        os.close(ours)
+    assert process.wait(30) == 0
+    return told.decode()
+
+
+def test_colours_are_left_out_where_nobody_wants_them(tmp_path: Path) -> None:
+    colour = re.compile(r"\x1b\[[0-9;]*(?:3[0-7]|4[0-7]|9[0-7]|38;|48;)[0-9;]*m")
+    arguments = ["pendulum_sim", "phase_plot", "--output", str(tmp_path / "phase.svg")]
+    assert colour.search(_in_a_terminal(arguments))
+    assert not colour.search(_in_a_terminal(arguments, NO_COLOR="1"))
+    # Nobody writes colours past the library that knows when not to.
+    sources = [path for folder in ("pendulum_*", "bags") for path in PROJECT.glob(f"{folder}/pendulum_*/**/*.py")]
+    assert len(sources) > 100
+    raw = re.compile(r"\\033\[|\\x1b\[|\\u001b\[|force_terminal|color_system")
+    assert [str(path) for path in sources if raw.search(path.read_text(encoding="utf-8"))] == []
+
+
+def test_json_of_a_table_is_json(capsys: pytest.CaptureFixture[str]) -> None:
+    from pendulum_hw_bridge.emulator_cli import fault_main
+
+    assert fault_main(["--json"]) == 0
+    assert "m_stop" in json.loads(capsys.readouterr().out)["faults"]
