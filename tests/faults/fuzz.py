@@ -26,7 +26,7 @@ from rich.table import Table
 from pendulum_msgs_py.executables import cli_main
 from tests.faults.parsers import PARSERS, Parser, copy_of, mutate
 
-__all__ = ["HEADROOM", "PATIENCE", "bound_memory", "fuzz_all", "fuzz_one"]
+__all__ = ["HEADROOM", "PATIENCE", "bound_memory", "fuzz_all", "fuzz_one", "too_slow"]
 
 HEADROOM = 512 << 20
 """Memory that a parser may take for a small file, beyond what the interpreter and its libraries take [bytes]."""
@@ -87,7 +87,8 @@ def fuzz_one(parser: Parser, seconds: float, seed: int, keep: Path | None = None
     return {"parser": parser.name, "tried": tried, "findings": findings, "slowest_s": slowest}
 
 
-def _too_slow(*_: object) -> None:
+def too_slow(*_: object) -> None:
+    """Raise a TimeoutError: a handler of the signals that tell that reading takes too long."""
     raise TimeoutError(f"reading took more than {PATIENCE} s of computing, or ten times that of waiting")
 
 
@@ -127,8 +128,8 @@ def fuzz(
 ) -> int:
     """Read files that are wrong in random ways; only the project's own errors may come out."""
     if child:
-        signal.signal(signal.SIGALRM, _too_slow)
-        signal.signal(signal.SIGPROF, _too_slow)
+        signal.signal(signal.SIGALRM, too_slow)
+        signal.signal(signal.SIGPROF, too_slow)
         parser = next(parser for parser in PARSERS if parser.name == child)
         bound_memory()
         print(json.dumps(fuzz_one(parser, minutes * 60.0, seed, keep)))

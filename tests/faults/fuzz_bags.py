@@ -12,6 +12,7 @@ import importlib
 import json
 import os
 import re
+import signal
 import subprocess
 import sys
 import tempfile
@@ -25,6 +26,7 @@ from rich.table import Table
 
 from pendulum_msgs_py.errors import PendulumError
 from pendulum_msgs_py.executables import cli_main
+from tests.faults.fuzz import PATIENCE, too_slow
 
 __all__ = ["STORAGES", "fuzz_storage", "watch"]
 
@@ -93,7 +95,9 @@ def _child(storage: str, place: Path, flags: Sequence[str]) -> None:
 
     def read(data: bytes) -> None:
         target.write_bytes(data)
+        signal.setitimer(signal.ITIMER_PROF, PATIENCE)
         problem = parser.survives(target) or (f"reaches out: {watched[0]}" if watched else "")
+        signal.setitimer(signal.ITIMER_PROF, 0.0)
         watched.clear()
         kind = re.sub(r"\d+", "#", problem.split(" [")[0])[:120]
         if problem and kind not in known:
@@ -102,6 +106,7 @@ def _child(storage: str, place: Path, flags: Sequence[str]) -> None:
             with (place / "findings.jsonl").open("a", encoding="utf-8") as file:
                 file.write(json.dumps(problem) + "\n")
 
+    signal.signal(signal.SIGPROF, too_slow)
     atheris.Setup([sys.argv[0], *flags, str(corpus)], read)
     atheris.Fuzz()
 
@@ -126,7 +131,8 @@ def fuzz_storage(storage: str, seconds: float, seed: int, keep: Path | None = No
         words.write_text("".join(f'"{word}"\n' for word in _WORDS), encoding="ascii")
         flags = [
             f"-max_total_time={max(1, round(seconds))}", f"-seed={seed}", f"-max_len={_LARGEST}", f"-dict={words}",
-            "-rss_limit_mb=1500", "-timeout=20", "-print_final_stats=1", f"-artifact_prefix={place}/finding_",
+            f"-timeout={round(10 * PATIENCE)}", "-rss_limit_mb=1500", "-print_final_stats=1",
+            f"-artifact_prefix={place}/finding_",
         ]  # fmt: skip
         done = subprocess.run(
             [
