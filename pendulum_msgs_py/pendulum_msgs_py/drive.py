@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from enum import Enum
+from typing import NamedTuple
 
 from pendulum_msgs_py.errors import ParameterError
 
@@ -23,7 +24,8 @@ class Mode(str, Enum):
     @property
     def armed(self) -> bool:
         """Whether torque may flow."""
-        return self in {Mode.POSITION, Mode.EFFORT}
+        # Asked several times a period: a set would hash the members, which enum does in Python.
+        return self is Mode.EFFORT or self is Mode.POSITION
 
 
 class Input(str, Enum):
@@ -42,8 +44,7 @@ class DriveKind(str, Enum):
     POSITION = "position"
 
 
-@dataclass(frozen=True, slots=True)
-class Drive:
+class Drive(NamedTuple):
     """One decision.
 
     Attributes:

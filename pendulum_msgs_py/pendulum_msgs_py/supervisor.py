@@ -69,6 +69,10 @@ class PlantSupervisor:
         """Make one gate per input."""
         timeout = self.limits.command_timeout
         self.gates = {kind: CommandGate(timeout) for kind in Input}
+        # By name as well: enum hashes its members in Python, which a lookup would pay for at each decision.
+        self._commands = self.gates[Input.EFFORT_COMMAND]
+        self._disturbances = self.gates[Input.DISTURBANCE]
+        self._pushes = self.gates[Input.PUSH]
         self.commander_conflict = ""
         self._trajectory: Trajectory | None = None
         self._trajectory_start_ns = 0
@@ -177,7 +181,7 @@ class PlantSupervisor:
             sample: Newest measurement, or None before the first.
         """
         self._keep_pace(now_ns)
-        push_command = self.gates[Input.PUSH].fresh(now_ns)
+        push_command = self._pushes.fresh(now_ns)
         push_limit = PUSH_LIMIT_FACTOR * self.limits.effort
         push = min(push_limit, max(-push_limit, push_command.effort)) if push_command else 0.0
         if self.mode.armed:
@@ -205,7 +209,7 @@ class PlantSupervisor:
 
     def has_fresh_command(self, now_ns: int) -> bool:
         """Whether a controller is answering."""
-        return self.gates[Input.EFFORT_COMMAND].fresh(now_ns) is not None
+        return self._commands.fresh(now_ns) is not None
 
     # --- inside --------------------------------------------------------------------------------------------
 
@@ -245,7 +249,7 @@ class PlantSupervisor:
             if self._hold_position is None:
                 self._hold_position = trajectory.goal
                 self.reason = "holding the end of a trajectory"
-            command = self.gates[Input.EFFORT_COMMAND].fresh(now_ns)
+            command = self._commands.fresh(now_ns)
             end_ns = self._trajectory_start_ns + round(trajectory.duration * NANOSECONDS)
             if command is not None and command.stamp_ns >= end_ns and not self.commander_conflict:
                 jump = abs(self._clamp(command.effort) - self._applied)
@@ -273,7 +277,7 @@ class PlantSupervisor:
         )
 
     def _decide_effort(self, now_ns: int, push: float) -> Drive:
-        command = None if self.commander_conflict else self.gates[Input.EFFORT_COMMAND].fresh(now_ns)
+        command = None if self.commander_conflict else self._commands.fresh(now_ns)
         if command is None:
             self.starved_periods += 1
             self._handover = None
@@ -281,7 +285,7 @@ class PlantSupervisor:
             self._last_decision_ns = now_ns
             self.reason = self.commander_conflict or "no fresh command: zero torque"
             return Drive(DriveKind.EFFORT, push=push, starved=True)
-        disturbance_command = self.gates[Input.DISTURBANCE].fresh(now_ns)
+        disturbance_command = self._disturbances.fresh(now_ns)
         disturbance = disturbance_command.effort if disturbance_command else 0.0
         wanted = self._clamp(command.effort + disturbance)
         saturated = wanted != command.effort + disturbance
@@ -347,7 +351,7 @@ class PlantSupervisor:
         fault = self._measurement_fault(now_ns, sample)
         if fault:
             return fault
-        command = self.gates[Input.EFFORT_COMMAND].fresh(now_ns)
+        command = self._commands.fresh(now_ns)
         if command is not None and abs(command.effort) > self.limits.arm_effort:
             return (
                 f"{command.source or 'a controller'} already commands {command.effort:.3f} N m; "

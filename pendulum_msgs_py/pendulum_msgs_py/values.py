@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from typing import NamedTuple
 
 __all__ = ["NANOSECONDS", "JointCommand", "JointSample"]
 
@@ -11,8 +11,7 @@ NANOSECONDS = 1_000_000_000
 """Nanoseconds in a second; stamps are integers of nanoseconds so that no time is ever rounded."""
 
 
-@dataclass(frozen=True, slots=True)
-class JointSample:
+class JointSample(NamedTuple):
     """State of the joint at one instant.
 
     Attributes:
@@ -32,8 +31,7 @@ class JointSample:
         return math.isfinite(self.position) and math.isfinite(self.velocity) and math.isfinite(self.effort)
 
 
-@dataclass(frozen=True, slots=True)
-class JointCommand:
+class JointCommand(NamedTuple):
     """Torque asked for, in answer to one state.
 
     Attributes:

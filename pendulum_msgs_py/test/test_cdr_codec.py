@@ -8,6 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from pendulum_msgs_py import cdr
 from pendulum_msgs_py.cdr import MAX_SECONDS, decode_joint_state, encode_joint_state
 from pendulum_msgs_py.names import JOINT
 from pendulum_msgs_py.values import NANOSECONDS
@@ -117,3 +118,25 @@ def test_trajectories_travel_to_a_nanosecond() -> None:
     back = convert.trajectory_from_message(convert.trajectory_to_message(ramp))
     assert [(p.position, p.velocity) for p in back.points] == [(p.position, p.velocity) for p in ramp.points]
     assert max(abs(a.time - b.time) for a, b in zip(ramp.points, back.points, strict=True)) < 1e-9
+
+
+@given(
+    frame=st.sampled_from(["", "lqr", "/controller", "/sim/pid"]),
+    quantities=st.sampled_from([(1.0, 2.0, 3.0), (None, None, 4.0), (1.0, 2.0, None)]),
+    place=st.integers(0, 140),
+    value=st.integers(0, 255),
+    cut=st.integers(0, 8),
+)
+def test_a_remembered_layout_reads_what_an_unknown_one_would(
+    frame: str, quantities: tuple[float | None, ...], place: int, value: int, cut: int
+) -> None:
+    position, velocity, effort = quantities
+    whole = encode_joint_state(5, frame_id=frame, position=position, velocity=velocity, effort=effort)
+    data = bytearray(whole)
+    data[place % len(data)] = value
+    for damaged in (bytes(data), bytes(data) + bytes(cut), bytes(data)[: len(data) - cut]):
+        cdr.forget_layouts()
+        unknown = decode_joint_state(damaged)
+        cdr.forget_layouts()
+        decode_joint_state(whole)
+        assert repr(decode_joint_state(damaged)) == repr(unknown)
