@@ -122,8 +122,9 @@ class BridgeNode(LifecycleNode):
         self._feedback = self.create_publisher(JointState, "actuator/feedback", _FEEDBACK_QOS)
         self._temperature = self.create_publisher(Temperature, "actuator/winding_temperature", _FEEDBACK_QOS)
         self._supply = self.create_publisher(BatteryState, "actuator/supply", _FEEDBACK_QOS)
-        create_wall_timer(self, _SLOW_PERIOD, self._publish_slow)
-        if self._lockstep:
+        if not self._lockstep:
+            create_wall_timer(self, _SLOW_PERIOD, self._publish_slow)
+        else:
             self._lockstep_loop = LockstepLoop(
                 self._interface,
                 self._advance,
@@ -314,7 +315,9 @@ class BridgeNode(LifecycleNode):
         # Before the first step nobody need be listening yet, and two runs must publish the same.
         if self._lockstep_loop is None or self._lockstep_loop.started:
             self._feedback.publish(encode_feedback(feedback._replace(stamp_ns=stamp_ns)))
-        sample = dataclasses.replace(bridge.sample, stamp_ns=stamp_ns)
+            if (stamp_ns - LOCKSTEP_EPOCH_NS) % round(_SLOW_PERIOD * NANOSECONDS) < self._period_ns:
+                self._publish_slow(stamp_ns)
+        sample = bridge.sample._replace(stamp_ns=stamp_ns)
         bridge.sample = sample
         if self._interface.sample is None:
             self._interface.sample = sample
@@ -322,11 +325,12 @@ class BridgeNode(LifecycleNode):
 
     # --- slow ----------------------------------------------------------------------------------------------
 
-    def _publish_slow(self) -> None:
+    def _publish_slow(self, stamp_ns: int | None = None) -> None:
+        """Publish temperature and supply, by wall time; in lockstep by simulated time, so that two runs say the same."""
         feedback = self._bridge.feedback if self._bridge is not None else None
         if feedback is None or not self._active:
             return
-        stamp = stamp_to_message(feedback.stamp_ns)
+        stamp = stamp_to_message(feedback.stamp_ns if stamp_ns is None else stamp_ns)
         temperature = Temperature(temperature=feedback.winding_temperature)
         temperature.header.stamp = stamp
         temperature.header.frame_id = "motor_winding"
