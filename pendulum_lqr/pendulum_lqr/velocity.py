@@ -10,7 +10,6 @@ from collections.abc import Callable
 from typing import Protocol
 
 import numpy as np
-import scipy.signal
 
 from pendulum_lqr.design import discretise, kalman_gain
 from pendulum_lqr.model import LinearModel, linearise
@@ -101,6 +100,9 @@ class SavitzkyGolay:
     def __init__(self, period: float, window: int = 7, order: int = 2) -> None:
         self.period = period
         self.window = window
+        # Here, because it costs every controller 40 MB that few have a use for.
+        import scipy.signal
+
         weights = scipy.signal.savgol_coeffs(window, order, deriv=1, delta=period, pos=window - 1, use="dot")
         self._weights = [float(weight) for weight in weights]
         self.reset()
