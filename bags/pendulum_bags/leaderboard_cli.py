@@ -20,7 +20,9 @@ __all__ = ["leaderboard"]
 
 def leaderboard(
     out: Annotated[Path, typer.Option(help="Folder of the page.")] = Path("bags/runs/leaderboard"),
-    plants: Annotated[str, typer.Option(help="Rigid plants, presets or files, separated by commas.")] = "thesis,dfki",
+    plants: Annotated[
+        str, typer.Option(help="Rigid plants (presets or files) and hw, the emulated X5-9, separated by commas.")
+    ] = "thesis,dfki",
     controllers: Annotated[str, typer.Option(help="Controllers, separated by commas; empty for all.")] = "",
     duration: Annotated[float, typer.Option(help="Length of each run [s].", min=1.0)] = 10.0,
     robustness: Annotated[bool, typer.Option(help="Try model errors, noise, delay, lag and pushes too.")] = True,
@@ -29,10 +31,13 @@ def leaderboard(
 ) -> None:
     """Score every controller from hanging down to upright: three public scores, costs, robustness, one page.
 
+    On hw each run is four nodes over DDS: about 7 s for the plain run of a controller, 2 min with the perturbations.
+
     Example: python -m pendulum_bags experiment leaderboard --plants thesis --controllers lqr,pid --no-robustness
     """
     from pendulum_bags.experiment.run_folder import write_json
     from pendulum_bags.study.leaderboard import contenders, evaluate
+    from pendulum_bags.study.leaderboard_hardware import HARDWARE, evaluate_hardware
     from pendulum_bags.study.leaderboard_page import best_sentence, to_json, write_page
     from pendulum_lqr.controller import controller_class
     from pendulum_msgs_py.plant_parameters import load_plant
@@ -42,7 +47,8 @@ def leaderboard(
     for name in names:
         controller_class(name)
     for name in machines:
-        load_plant(name)
+        if name != HARDWARE:
+            load_plant(name)
     console = Console(stderr=json_output, highlight=False)
     bar = Progress(
         TextColumn("{task.description}"), BarColumn(bar_width=None), MofNCompleteColumn(), console=console,
@@ -54,7 +60,9 @@ def leaderboard(
         with bar:
             task = bar.add_task("controllers", total=len(names) * len(machines))
             jobs = [
-                pool.submit(evaluate, machine, name, duration=duration, robustness=robustness)
+                pool.submit(evaluate_hardware, name, duration=duration, robustness=robustness)
+                if machine == HARDWARE
+                else pool.submit(evaluate, machine, name, duration=duration, robustness=robustness)
                 for machine in machines
                 for name in names
             ]

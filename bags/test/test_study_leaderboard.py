@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import math
 import re
 import shutil
@@ -11,7 +12,10 @@ import numpy as np
 import pytest
 
 from pendulum_bags.experiment.in_process import RunArrays
-from pendulum_bags.study.leaderboard import COSTS, contenders, costs_of, evaluate, scores
+from pendulum_bags.experiment_cli import main
+from pendulum_bags.reader import read_bag
+from pendulum_bags.study.leaderboard import COSTS, PERTURBATIONS, contenders, costs_of, evaluate, scores
+from pendulum_bags.study.leaderboard_hardware import HARDWARE_PERTURBATIONS, arrays_of_bag
 from pendulum_bags.study.leaderboard_page import write_page
 from pendulum_lqr.controller import CONTROLLERS
 
@@ -59,6 +63,52 @@ def test_a_motor_too_weak_to_lift_the_pendulum_needs_a_swing_up() -> None:
 
 def test_every_controller_is_on_the_board() -> None:
     assert set(contenders()) == set(CONTROLLERS) - {"playback"}
+
+
+MINE = """
+from pendulum_lqr.controller import BaseController
+
+class Mine(BaseController):
+    SUMMARY = "A spring to upright."
+
+    @classmethod
+    def design(cls, plant, period, p):
+        return cls(p["effort_limit"], p["set_point"])
+
+    def command(self, t, x):
+        return self.clamp(-40.0 * self.error(x[0]) - 2.0 * x[1])
+"""
+
+
+def test_a_controller_that_is_added_to_the_table_is_on_the_board(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "plugged_in.py").write_text(MINE, encoding="utf-8")
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.setitem(CONTROLLERS, "mine", "plugged_in:Mine")
+    assert "mine" in contenders()
+    out = tmp_path / "board"
+    arguments = ["leaderboard", "--plants", "thesis", "--controllers", "mine,lqr", "--no-robustness"]
+    assert main([*arguments, "--duration", "4", "--workers", "1", "--out", str(out)]) == 0
+    rows = {row["controller"]: row for row in json.loads((out / "leaderboard.json").read_text(encoding="utf-8"))}
+    assert rows["mine"]["success"]
+    assert rows["mine"]["scores"]["v2"] != rows["lqr"]["scores"]["v2"]
+    page = (out / "leaderboard.html").read_text(encoding="utf-8")
+    assert 'id="thesis-mine"' in page
+    assert main([*arguments[:3], "--controllers", "mein"]) == 2
+
+
+def test_a_recorded_run_of_the_machine_is_scored_as_a_simulated_one_is() -> None:
+    example = Path(__file__).parents[1] / "examples" / "regulation_hw"
+    arrays = arrays_of_bag(example, "/hw")
+    assert arrays.stamp_ns.size == arrays.applied.size + 1
+    success, uptime, costs = costs_of(arrays)
+    assert success
+    assert uptime == 1.0
+    assert costs["time"] == 0.0
+    with read_bag(example) as bag:
+        assert costs["max_torque"] == np.abs(bag.array("/hw/applied_effort")["effort"]).max()
+    assert set(HARDWARE_PERTURBATIONS) <= set(PERTURBATIONS)
 
 
 def test_page_stands_alone_and_every_row_has_its_run(tmp_path: Path) -> None:

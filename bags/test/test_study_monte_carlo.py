@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import json
+import os
+import signal
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from pendulum_bags.study.chunks import cluster_client
 from pendulum_bags.study.monte_carlo import (
     MonteCarlo,
     draw_chunk,
@@ -19,6 +22,7 @@ from pendulum_bags.study.monte_carlo import (
 )
 from pendulum_bags.study.uncertain import Uncertainty, parse_uncertainty, uncertainty_of
 from pendulum_msgs_py.errors import BagError, ParameterError
+from tests.fixtures import wait_for
 
 SMALL = MonteCarlo(runs=700, chunk=300, duration=0.4)
 
@@ -75,11 +79,23 @@ def test_an_interrupted_monte_carlo_goes_on_and_workers_change_no_bit(tmp_path: 
 
 
 @arrow
-@pytest.mark.timeout(120)
-def test_a_dask_cluster_gives_the_same_bits(tmp_path: Path) -> None:
-    pytest.importorskip("dask.distributed")
-    here = run_monte_carlo(tmp_path / "here", SMALL)
-    cluster = run_monte_carlo(tmp_path / "cluster", SMALL, workers=2)
+@pytest.mark.timeout(180)
+def test_a_cluster_that_loses_a_worker_mid_run_gives_the_same_bits(tmp_path: Path) -> None:
+    pytest.importorskip("distributed")
+    settings = replace(SMALL, chunk=50)
+    here = run_monte_carlo(tmp_path / "here", settings)
+    with cluster_client(workers=2) as client:
+        before = set(client.run(os.getpid).values())
+        victim = max(before)
+
+        def kill(done: int, _total: int) -> None:
+            if done == 1:
+                os.kill(victim, signal.SIGKILL)
+
+        cluster = run_monte_carlo(tmp_path / "cluster", settings, client=client, on_progress=kill)
+        wait_for(lambda: len(client.scheduler_info()["workers"]) == 2, 30, "the cluster to replace its worker")
+        after = set(client.run(os.getpid).values())
+    assert victim not in after
     assert here == cluster
     for file in (tmp_path / "here").glob("*.parquet"):
         assert file.read_bytes() == (tmp_path / "cluster" / file.name).read_bytes()

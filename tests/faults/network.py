@@ -9,7 +9,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -21,8 +21,9 @@ from pendulum_bags.reader import read_bag
 from pendulum_msgs_py import graph
 from pendulum_msgs_py.errors import FaultError, PendulumError
 from tests.faults.bag_property import COMMAND_LIFE
+from tests.faults.slow_cable import DEVICE, SlowCable
 
-__all__ = ["CutReport", "cut_cable", "why_not"]
+__all__ = ["CutReport", "Inside", "cable_environment", "cut_cable", "two_machines", "wait_for_torque", "why_not"]
 
 _EFFORT_LIMIT = 5.0
 _START_TIMEOUT = 60.0
@@ -67,37 +68,52 @@ def _ip(*arguments: str, check: bool = True) -> int:
 
 
 @contextmanager
-def _two_machines() -> Iterator[tuple[str, str]]:
-    """Make two network namespaces joined by one cable; yields their names."""
-    names = tuple(f"pendulum_{side}_{os.getpid()}" for side in (_PLANT, _PEER))
-    try:
+def two_machines(*, slow: bool = False) -> Iterator[tuple[str, str, SlowCable | None]]:
+    """Make two network namespaces joined by one cable; yields their names and the cable, where it can be slow.
+
+    Args:
+        slow: Make it a cable that delays and loses frames when told to.
+    """
+    names = (f"pendulum_{_PLANT}_{os.getpid()}", f"pendulum_{_PEER}_{os.getpid()}")
+    with ExitStack() as stack:
         for name in names:
             _ip("netns", "add", name)
-        cable = ("type", "veth", "peer", "name", "cable", "netns", names[1])
-        _ip("link", "add", "cable", "netns", names[0], *cable)
+            stack.callback(_ip, "netns", "del", name, check=False)
+        cable = None
+        if slow:
+            cable = stack.enter_context(SlowCable(names))
+        else:
+            _ip("link", "add", DEVICE, "netns", names[0], "type", "veth", "peer", "name", DEVICE, "netns", names[1])
         for number, name in enumerate(names, start=1):
-            _ip("-n", name, "address", "add", f"10.213.7.{number}/24", "dev", "cable")
-            for device in ("lo", "cable"):
+            _ip("-n", name, "address", "add", f"10.213.7.{number}/24", "dev", DEVICE)
+            for device in ("lo", DEVICE):
                 _ip("-n", name, "link", "set", device, "up")
             # Discovery is by multicast, which wants a route.
-            _ip("-n", name, "route", "add", "224.0.0.0/4", "dev", "cable")
-        yield names[0], names[1]
-    finally:
-        for name in names:
-            _ip("netns", "del", name, check=False)
+            _ip("-n", name, "route", "add", "224.0.0.0/4", "dev", DEVICE)
+        yield names[0], names[1], cable
 
 
 def _inside(namespace: str, command: Sequence[str]) -> list[str]:
     return ["ip", "netns", "exec", namespace, *command]
 
 
-class _Inside(ProcessSet):
+class Inside(ProcessSet):
     """Programs that start in a network namespace."""
 
     namespace = ""
 
     def start(self, name, command, **options):
         return super().start(name, _inside(self.namespace, command), **options)
+
+
+def cable_environment(logs: Path) -> dict[str, str]:
+    """Return the environment of nodes that meet over a cable and nothing else."""
+    # Shared memory would go around the cable.
+    return {
+        **ros_environment(1, logs),
+        "ROS_AUTOMATIC_DISCOVERY_RANGE": "SUBNET",
+        "FASTDDS_BUILTIN_TRANSPORTS": "UDPv4",
+    }
 
 
 def cut_cable(folder: Path, durations: Sequence[float]) -> list[CutReport]:
@@ -113,36 +129,31 @@ def cut_cable(folder: Path, durations: Sequence[float]) -> list[CutReport]:
     logs = folder / "logs"
     bag = folder / "bag"
     write_json(folder / "metadata.json", {"pendulum.run": {"experiment": "network"}})
-    # Shared memory would go around the cable.
-    environment = {
-        **ros_environment(1, logs),
-        "ROS_AUTOMATIC_DISCOVERY_RANGE": "SUBNET",
-        "FASTDDS_BUILTIN_TRANSPORTS": "UDPv4",
-    }
     cuts = []
-    processes = _Inside(logs, environment)
-    with _two_machines() as (plant, peer), processes:
+    processes = Inside(logs, cable_environment(logs))
+    with two_machines() as (plant, peer, _), processes:
         processes.namespace = plant
         start_recorder(processes, bag, "/sim", folder / "metadata.json", "mcap")
         processes.start_node(graph.simulator("/sim", initial_theta=math.pi, effort_limit=_EFFORT_LIMIT))
         processes.namespace = peer
         for program in (graph.controller("/sim"), graph.disturbance("/sim", autostart=True, hold_time=0.01)):
             processes.start_node(program)
-        _wait_for_torque(bag, processes, time.time_ns())
+        wait_for_torque(bag, processes, time.time_ns())
         for duration in durations:
             time.sleep(1.0)
             pulled_ns = time.time_ns()
-            _ip("-n", plant, "link", "set", "cable", "down")
+            _ip("-n", plant, "link", "set", DEVICE, "down")
             time.sleep(duration)
             plugged_ns = time.time_ns()
-            _ip("-n", plant, "link", "set", "cable", "up")
-            _ip("-n", plant, "route", "add", "224.0.0.0/4", "dev", "cable")
-            _wait_for_torque(bag, processes, plugged_ns)
+            _ip("-n", plant, "link", "set", DEVICE, "up")
+            _ip("-n", plant, "route", "add", "224.0.0.0/4", "dev", DEVICE)
+            wait_for_torque(bag, processes, plugged_ns)
             cuts.append((duration, pulled_ns, plugged_ns))
     return [_report(bag, *cut) for cut in cuts]
 
 
-def _wait_for_torque(bag: Path, processes: ProcessSet, since_ns: int) -> None:
+def wait_for_torque(bag: Path, processes: ProcessSet, since_ns: int) -> None:
+    """Wait until a command and a torque that is not zero are in the bag, both after a time."""
     deadline = time.monotonic() + _START_TIMEOUT
     while time.monotonic() < deadline:
         processes.check()

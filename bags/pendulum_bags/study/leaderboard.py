@@ -32,6 +32,9 @@ __all__ = [
     "contenders",
     "costs_of",
     "evaluate",
+    "model_errors",
+    "motion_of",
+    "push_trains",
     "scores",
 ]
 
@@ -133,12 +136,26 @@ Variation = tuple[PlantParameters, Mapping[str, Any], Mapping[str, float]]
 """Plant, disturbance, sensors."""
 
 
-def _model_error(plant: PlantParameters) -> Sequence[Variation]:
+def model_errors(plant: PlantParameters) -> list[PlantParameters]:
+    """Return plants by which a model may be wrong: inertia with gravity, or damping, by 10 and 25 %."""
     changed = []
     for share in (0.75, 0.9, 1.1, 1.25):
         changed.append(replace(plant, inertia=share * plant.inertia, gravity=share * plant.gravity))
         changed.append(replace(plant, damping=share * plant.damping))
-    return [(one, {}, {}) for one in changed]
+    return changed
+
+
+def push_trains(plant: PlantParameters) -> list[dict[str, Any]]:
+    """Return disturbances that push, when the pendulum is up, with shares of the largest torque."""
+    return [
+        {"kind": "pulse_train", "amplitude": share * plant.effort_limit, "frequency": 0.4, "pulse_width": 0.1,
+         "start_time": 5.0, "hold_time": 0.0, "duration": 7.0}
+        for share in (0.1, 0.2, 0.4, 0.6)
+    ]  # fmt: skip
+
+
+def _model_error(plant: PlantParameters) -> Sequence[Variation]:
+    return [(one, {}, {}) for one in model_errors(plant)]
 
 
 def _noise(plant: PlantParameters) -> Sequence[Variation]:
@@ -154,11 +171,7 @@ def _torque_response(plant: PlantParameters) -> Sequence[Variation]:
 
 
 def _pushes(plant: PlantParameters) -> Sequence[Variation]:
-    return [
-        (plant, {"kind": "pulse_train", "amplitude": share * plant.effort_limit, "frequency": 0.4, "pulse_width": 0.1,
-                 "start_time": 5.0, "hold_time": 0.0, "duration": 7.0}, {})
-        for share in (0.1, 0.2, 0.4, 0.6)
-    ]  # fmt: skip
+    return [(plant, push, {}) for push in push_trains(plant)]
 
 
 PERTURBATIONS: Mapping[str, Callable[[PlantParameters], Sequence[Variation]]] = {
@@ -217,10 +230,11 @@ def evaluate(
                     outcomes.append(False)
             held[name] = float(np.mean(outcomes))
     score = scores(success, uptime, costs)
-    return Entry(plant, controller, "", success, costs, score, held, wall, _motion(arrays))
+    return Entry(plant, controller, "", success, costs, score, held, wall, motion_of(arrays))
 
 
-def _motion(arrays: RunArrays) -> Array:
+def motion_of(arrays: RunArrays) -> Array:
+    """Return time, angle from upright and torque of a run, thinned for a plot, shape (3, n)."""
     step = max(1, len(arrays.applied) // 500)
     t = (arrays.stamp_ns[:-1] - arrays.stamp_ns[0]) / NANOSECONDS
     return np.stack([t, wrap(arrays.position[:-1] - UPRIGHT), arrays.applied])[:, ::step]
