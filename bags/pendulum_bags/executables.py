@@ -3,7 +3,7 @@
 __all__ = ["EXECUTABLES"]
 
 EXECUTABLES: dict[str, str] = {
-    "record": "pendulum_bags.recorder_node:main",
+    "record": "pendulum_bags.record_cli:main",
     "analyse": "pendulum_bags.analyse_cli:main",
     "compare": "pendulum_bags.compare_cli:main",
     "replay": "pendulum_bags.replay_cli:main",
@@ -13,7 +13,7 @@ EXECUTABLES: dict[str, str] = {
     "report": "pendulum_bags.report_cli:main",
     "export": "pendulum_bags.export_cli:main",
     "play": "pendulum_bags.topic_replay_node:main",
-    "console": "pendulum_bags.console_node:main",
+    "console": "pendulum_bags.console_cli:main",
     "info": "pendulum_bags.info_cli:main",
     "repair": "pendulum_bags.repair_cli:main",
 }

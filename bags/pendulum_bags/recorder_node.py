@@ -1,62 +1,40 @@
-"""``record``: write topics to a bag that survives anything that happens to the recorder."""
+"""The recorder: a node that subscribes to what there is and writes it down."""
 
 from __future__ import annotations
 
-import importlib
 import json
-import os
 import platform
 import sys
 import threading
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
-from pathlib import Path
-from typing import Annotated, Any
+from typing import Any
 
-import typer
 from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
-from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.subscription import Subscription
 from rclpy.topic_endpoint_info import TopicEndpointInfo
 from std_srvs.srv import Trigger
 
 from pendulum_bags import __version__
 from pendulum_bags.parameter_reader_node import ParameterReader
-from pendulum_bags.reader.joint_state import Trimmer
-from pendulum_bags.recorder import (
-    GapCounter,
-    RecordingSession,
-    SessionReport,
-    StampReader,
-    stamp_reader,
-)
-from pendulum_bags.recorder.options import RecorderOptions, read_metadata
+from pendulum_bags.recorder import RecordingSession, SessionReport
+from pendulum_bags.recorder.options import RecorderOptions
+from pendulum_bags.recorder_tap_node import Tap
 from pendulum_bags.storage import QosProfile, open_writer
-from pendulum_bags.storage.message_types import MessageType, message_type
+from pendulum_bags.storage.message_types import message_type
 from pendulum_msgs_py.errors import BagError
-from pendulum_msgs_py.executables import cli_main
 from pendulum_msgs_py.names import EVENTS
 from pendulum_msgs_py.parameters import ParameterSpec
 from pendulum_msgs_py.ros.convert import event_message
 from pendulum_msgs_py.ros.parameters import NodeParameters
-from pendulum_msgs_py.ros.runner import run_node
 
-__all__ = ["Recorder", "RecorderOptions", "main"]
+__all__ = ["SPECS", "Recorder"]
 
 POLL_PERIOD = 0.02
 """Time between two visits to the middleware [s]; the time of arrival is the middleware's, not that of the visit."""
 DISCOVERY_PERIOD = 0.2
 """Time between two looks at the graph [s]."""
-DEPTH = 4000
-"""Messages that the middleware holds for us between two visits: four seconds at 1 kHz."""
-
-_TRANSPORT_SETTINGS = (
-    "FASTDDS_BUILTIN_TRANSPORTS",
-    "FASTDDS_DEFAULT_PROFILES_FILE",
-    "FASTRTPS_DEFAULT_PROFILES_FILE",
-)
 
 SPECS = (
     ParameterSpec(
@@ -66,24 +44,6 @@ SPECS = (
         "A note for the recording; setting it writes the event 'annotation', as the service ~/annotate does again.",
     ),
 )
-
-
-@dataclass(slots=True)
-class _Tap:
-    """A subscription and what is needed to record from it."""
-
-    topic: str
-    type: MessageType
-    message_class: Any
-    subscription: Subscription
-    reliable: bool
-    latched: bool
-    stamp: StampReader | None
-    trim: Callable[[bytes], bytes]
-    qos: tuple[QosProfile, ...]
-    gaps: GapCounter = field(default_factory=GapCounter)
-    publishers: int = 1
-    announced: RecordingSession | None = None
 
 
 class Recorder(Node):
@@ -101,7 +61,7 @@ class Recorder(Node):
     """
 
     def __init__(self, options: RecorderOptions, stop: Callable[[], None]) -> None:
-        self._taps: dict[str, _Tap] = {}
+        self._taps: dict[str, Tap] = {}
         super().__init__("recorder")
         self.exit_code = 0
         self.reports: list[SessionReport] = []
@@ -110,7 +70,7 @@ class Recorder(Node):
         self._session: RecordingSession | None = None
         self._started = time.monotonic()
         self._newest_stamp = 0
-        self._unstamped: list[tuple[_Tap, int, bytes]] = []
+        self._unstamped: list[tuple[Tap, int, bytes]] = []
         self._refused_types: set[str] = set()
         self._lock = threading.RLock()
         self._events = f"{self.get_fully_qualified_name()}/{EVENTS}"
@@ -227,33 +187,27 @@ class Recorder(Node):
         if session is not None and self._unstamped and self._newest_stamp:
             self._offer_unstamped(session)
 
-    def _take(self, tap: _Tap, session: RecordingSession | None) -> None:
-        take, message_class, trim = tap.subscription.handle.take_message, tap.message_class, tap.trim
+    def _take(self, tap: Tap, session: RecordingSession | None) -> None:
         items: list[tuple[int, bytes]] = []
         missing = 0
         by_header = self._options.log_time == "header"
-        with tap.subscription.handle:
-            while (taken := take(message_class, True)) is not None:
-                data, info = taken
-                sequence = info["publication_sequence_number"]
-                if sequence:
-                    missing += tap.gaps.see(sequence, tap.publishers)
-                data = trim(data)
-                time_ns = info["received_timestamp"] or time.time_ns()
-                if by_header:
-                    stamp = self._stamp(tap, data)
-                    if stamp is None:
-                        self._unstamped.append((tap, time_ns, data))
-                        continue
-                    time_ns = stamp
-                items.append((time_ns, data))
+        for received_ns, data, gap in tap.take():
+            missing += gap
+            time_ns = received_ns or time.time_ns()
+            if by_header:
+                stamp = self._stamp(tap, data)
+                if stamp is None:
+                    self._unstamped.append((tap, time_ns, data))
+                    continue
+                time_ns = stamp
+            items.append((time_ns, data))
         if session is None:
             self._unstamped.clear()
         elif items or missing:
             self._offer(tap, session, items, missing)
 
     def _offer(
-        self, tap: _Tap, session: RecordingSession, items: Sequence[tuple[int, bytes]], missing: int = 0
+        self, tap: Tap, session: RecordingSession, items: Sequence[tuple[int, bytes]], missing: int = 0
     ) -> None:
         if tap.announced is not session:
             session.add_topic(tap.topic, tap.type, tap.qos)
@@ -267,7 +221,7 @@ class Recorder(Node):
                 "the disk does not keep up)"
             )
 
-    def _stamp(self, tap: _Tap, data: bytes) -> int | None:
+    def _stamp(self, tap: Tap, data: bytes) -> int | None:
         """Return the log time by header; messages without a stamp go where the stamped ones are.
 
         Wall time and simulated time must not mix: what comes before the first stamp has to wait for it.
@@ -302,44 +256,23 @@ class Recorder(Node):
         self._parameter_reader.look()
 
     def _tap(self, topic: str, publishers: list[TopicEndpointInfo]) -> None:
-        reliable = all(p.qos_profile.reliability == ReliabilityPolicy.RELIABLE for p in publishers)
-        latched = all(p.qos_profile.durability == DurabilityPolicy.TRANSIENT_LOCAL for p in publishers)
         tap = self._taps.get(topic)
         if tap is not None:
-            tap.publishers = len(publishers)
-            if (reliable or not tap.reliable) and (latched or not tap.latched):
+            if tap.suits(publishers):
                 return
             # A publisher has come that offers less than we ask for: ask for less, or it would never match.
             with self._lock:
                 self._take(tap, self._session)
                 del self._taps[topic]
+            tap.close()
             self.destroy_subscription(tap.subscription)
-        name = publishers[0].topic_type
-        message_class = _message_class(name)
-        if message_class is None:
-            self._refuse(topic, f"its type {name} cannot be imported")
-            return
-        type_hash = str(publishers[0].topic_type_hash)
-        profile = QoSProfile(
-            depth=DEPTH,
-            reliability=ReliabilityPolicy.RELIABLE if reliable else ReliabilityPolicy.BEST_EFFORT,
-            durability=DurabilityPolicy.TRANSIENT_LOCAL if latched else DurabilityPolicy.VOLATILE,
-        )
         with self._lock:
-            subscription = self.create_subscription(message_class, topic, _not_called, profile, raw=True)
-            self._taps[topic] = _Tap(
-                topic,
-                message_type(name, type_hash if type_hash.startswith("RIHS") else ""),
-                message_class,
-                subscription,
-                reliable,
-                latched,
-                stamp_reader(name),
-                Trimmer() if name == "sensor_msgs/msg/JointState" else bytes,
-                tuple(_offered(publisher) for publisher in publishers),
-                publishers=len(publishers),
-            )
-        print(f"subscribed to {topic} ({name})", flush=True)
+            try:
+                self._taps[topic] = Tap(self, topic, publishers)
+            except ImportError:
+                self._refuse(topic, f"its type {publishers[0].topic_type} cannot be imported")
+                return
+        print(f"subscribed to {topic} ({publishers[0].topic_type})", flush=True)
 
     def _refuse(self, topic: str, reason: str) -> None:
         if topic not in self._refused_types:
@@ -415,110 +348,3 @@ class Recorder(Node):
             }
         )
         return response
-
-
-def _not_called(_: bytes) -> None:
-    """Stand where a callback must be given: the recorder takes its messages itself."""
-
-
-def _message_class(name: str) -> Any:
-    package, _, short = name.split("/")
-    try:
-        return getattr(importlib.import_module(f"{package}.msg"), short)
-    except (ImportError, AttributeError):
-        return None
-
-
-def _offered(publisher: TopicEndpointInfo) -> QosProfile:
-    profile = publisher.qos_profile
-    return QosProfile(
-        history=profile.history.name.lower(),
-        depth=profile.depth,
-        reliability=profile.reliability.name.lower(),
-        durability=profile.durability.name.lower(),
-        deadline_ns=profile.deadline.nanoseconds,
-        lifespan_ns=profile.lifespan.nanoseconds,
-        liveliness=profile.liveliness.name.lower(),
-        lease_ns=profile.liveliness_lease_duration.nanoseconds,
-    )
-
-
-# -- command line ------------------------------------------------------------------------------------------------
-
-app = typer.Typer(add_completion=False, rich_markup_mode=None)
-
-
-@app.command(
-    epilog="Example: python -m pendulum_bags record -o runs/today --regex '^/(sim|hw)/' --compression zstd. "
-    "ROS arguments go behind --ros-args."
-)
-def record(
-    context: typer.Context,
-    output: Annotated[Path, typer.Option("-o", "--output", help="Folder of the bag; it must not exist.")],
-    topics: Annotated[
-        list[str] | None, typer.Argument(help="Topics by their full names; by default all.")
-    ] = None,
-    regex: Annotated[str, typer.Option(help="Record topics that match this pattern, too.")] = "",
-    exclude: Annotated[str, typer.Option(help="Leave out topics that match this pattern.")] = "",
-    storage: Annotated[str, typer.Option(help="mcap or sqlite3.")] = "mcap",
-    compression: Annotated[str, typer.Option(help="zstd, or none.")] = "none",
-    max_size: Annotated[float, typer.Option(help="Begin a new file at this size [MB]; 0 for never.")] = 0.0,
-    max_duration: Annotated[
-        float, typer.Option(help="Begin a new file after this time [s]; 0 for never.")
-    ] = 0.0,
-    duration: Annotated[float, typer.Option(help="Stop after this time [s]; 0 for never.")] = 0.0,
-    metadata: Annotated[Path | None, typer.Option(help="JSON object to store with the bag.")] = None,
-    log_time: Annotated[
-        str, typer.Option(help="receive (time of arrival) or header (stamp of the message).")
-    ] = "receive",
-    wait: Annotated[bool, typer.Option("--wait", help="Begin when the service ~/start is called.")] = False,
-) -> int:
-    """Record topics to a rosbag2 folder that is complete and readable at every instant."""
-    options = RecorderOptions(
-        output,
-        tuple(topics or ()),
-        regex,
-        exclude,
-        storage,
-        None if compression in ("", "none") else compression,
-        round(max_size * 1e6),
-        max_duration,
-        duration,
-        read_metadata(metadata),
-        log_time,
-        wait,
-    )
-    if output.exists():
-        raise BagError(f"bag {output} exists already; expected a new folder (bags are never overwritten)")
-    _leave_no_shared_memory()
-    return run_node(
-        lambda stop: Recorder(options, stop),
-        list(context.obj),
-        program="pendulum_bags record",
-        description="Record topics to a bag.",
-        specs=SPECS,
-    )
-
-
-def _leave_no_shared_memory() -> None:
-    """Receive over the loopback network, unless the user has configured the middleware.
-
-    Fast DDS passes messages between processes through shared memory. A process that is killed while it holds some
-    leaves it locked: measured with a publisher of five topics at 500 Hz, after some ten kills new subscribers, matched
-    as they were, got nothing any more. A recorder must survive a kill, and so must those whom it records.
-    """
-    if not any(os.environ.get(name) for name in _TRANSPORT_SETTINGS):
-        os.environ["FASTDDS_BUILTIN_TRANSPORTS"] = "UDPv4"
-
-
-def main(argv: list[str] | None = None) -> int:
-    """Run the recorder; arguments from ``--ros-args`` on belong to ROS."""
-    arguments = list(sys.argv[1:] if argv is None else argv)
-    split = arguments.index("--ros-args") if "--ros-args" in arguments else len(arguments)
-    own, ros = arguments[:split], arguments[split:]
-    app.info.context_settings = {"obj": ros}
-    return cli_main(app, own, name="python -m pendulum_bags record")
-
-
-if __name__ == "__main__":
-    raise SystemExit(main())

@@ -25,9 +25,9 @@ from std_msgs.msg import Float64, String
 from std_srvs.srv import Trigger
 
 from pendulum_bags.reader import read_bag, same_messages
+from pendulum_bags.record_cli import main as record_main
 from pendulum_bags.recorder import GapCounter, RecordingSession, stamp_reader
 from pendulum_bags.recorder.options import RecorderOptions
-from pendulum_bags.recorder_node import main as record_main
 from pendulum_bags.storage import message_type, open_writer
 from pendulum_msgs_py.cdr import encode_joint_state
 from pendulum_msgs_py.errors import ParameterError
@@ -44,7 +44,7 @@ STRING = "std_msgs/msg/String"
 
 
 def test_gaps_of_one_publisher_are_counted() -> None:
-    counter = GapCounter()
+    counter = GapCounter(lambda: (1, 1))
     assert [counter.see(number) for number in (5, 6, 7, 10, 11, 13)] == [0, 0, 0, 2, 0, 1]
     assert counter.missing == 3
 
@@ -60,17 +60,48 @@ def test_gaps_of_interleaved_publishers_are_counted() -> None:
             lost += 200 - len(stream)
         order = [k for k, stream in enumerate(streams) for _ in stream]
         rng.shuffle(order)
-        counter = GapCounter()
+        counter = GapCounter(lambda: (3, 3))
         iterators = [iter(stream) for stream in streams]
+        for k in [0, 1, 2]:
+            counter.see(next(iterators[k]))
+            order.remove(k)
         for k in order:
-            counter.see(next(iterators[k]), 3)
+            counter.see(next(iterators[k]))
         assert counter.missing == lost
 
 
 def test_a_publisher_that_starts_again_leaves_no_gap() -> None:
-    counter = GapCounter()
-    for number in [1, 2, 3, 1, 2, 3, 4]:
-        assert counter.see(number, 1) == 0
+    met = [1, 1]
+    counter = GapCounter(lambda: (met[0], met[1]))
+    assert [counter.see(number) for number in (1, 2, 3)] == [0, 0, 0]
+    met[0] = 2
+    assert [counter.see(number) for number in (1, 2, 3, 4)] == [0, 0, 0, 0]
+
+
+def test_a_publisher_that_is_met_late_leaves_no_gap() -> None:
+    met = [1, 1]
+    counter = GapCounter(lambda: (met[0], met[1]))
+    for number in range(3, 10):
+        counter.see(number)
+    met[:] = 2, 2  # it has said some things already, before it was matched: its first number here is 14
+    for number in range(300):
+        assert counter.see(14 + number) == 0
+        assert counter.see(10 + number) == 0
+    assert counter.missing == 0
+
+
+def test_a_publisher_that_is_met_late_in_the_place_of_one_that_left_leaves_no_gap() -> None:
+    counter = GapCounter(lambda: (2, 1))
+    assert sum(counter.see(number) for number in range(3, 10)) == 0
+    assert sum(counter.see(number) for number in range(14, 500)) == 0
+
+
+def test_a_publisher_that_is_silent_hides_no_gap_of_another() -> None:
+    counter = GapCounter(lambda: (2, 2))
+    assert sum(counter.see(number) for number in range(3, 10)) == 0
+    assert sum(counter.see(number) for number in range(14, 500)) == 4
+    assert sum(counter.see(number) for number in range(502, 900)) == 2
+    assert counter.missing == 6
 
 
 def test_stamps_are_read_from_headers_times_and_events() -> None:
@@ -177,9 +208,9 @@ def node(domain_id: int) -> Iterator[Node]:
 def call(node: Node, service: str) -> Trigger.Response:
     client = node.create_client(Trigger, service)
     try:
-        assert client.wait_for_service(30)
+        assert client.wait_for_service(60)
         future = client.call_async(Trigger.Request())
-        wait_for(future.done, 30.0, f"the answer of {service}")
+        wait_for(future.done, 60.0, f"the answer of {service}")
         response = future.result()
         assert response is not None
         return response
@@ -198,13 +229,13 @@ def wait_until_received(node: Node, **numbers: int) -> dict[str, Any]:
         )
         return status if whole else {}
 
-    return wait_for(received, 30.0, f"the recorder to receive {numbers}", period=0.05)
+    return wait_for(received, 60.0, f"the recorder to receive {numbers}", period=0.05)
 
 
 def wait_until_matched(*publishers: object) -> None:
     wait_for(
         lambda: all(publisher.get_subscription_count() for publisher in publishers),  # type: ignore[attr-defined]
-        30.0,
+        60.0,
         "the recorder to subscribe",
     )
 
@@ -223,10 +254,15 @@ def test_a_recording_holds_everything_and_says_so(
     )
     events = node.create_publisher(String, "/sim/events", qos.EVENTS)
     events.publish(event_message(5, "ramp_up"))  # before the recorder is there
+    shared = [node.create_publisher(Float64, "/shared", qos.STATE) for _ in range(2)]
+    for index in range(40):
+        shared[index % 4 == 3].publish(
+            Float64(data=-1.0)
+        )  # the one is at number 30 when it is met, the other at 10
     recording = processes.start(
         "pendulum_bags", "record", "-o", bag, "--metadata", metadata, "--exclude", "parameter_events|rosout"
     )
-    wait_until_matched(fast, plain, sloppy, events)
+    wait_until_matched(fast, plain, sloppy, events, *shared)
     for index in range(400):
         fast.publish(encode_joint_state(index * 2_000_000, position=0.01 * index, velocity=0.0, effort=0.0))
         message = JointState(name=["pendulum_joint"], effort=[0.1 * index])
@@ -234,11 +270,18 @@ def test_a_recording_holds_everything_and_says_so(
         message.header.stamp.nanosec = index
         plain.publish(message)  # serialised by rclpy: noise in the padding and behind the message
         sloppy.publish(Float64(data=float(index)))
+        shared[index % 2].publish(Float64(data=float(index)))
         time.sleep(0.001)
     events.publish(event_message(6, "hold"))
     node.set_parameters([Parameter("gain", value=[3.0, 4.0])])
     status = wait_until_received(
-        node, sim_joint_states=400, sim_effort_command=400, sloppy=400, sim_events=2, recorder_events=1
+        node,
+        sim_joint_states=400,
+        sim_effort_command=400,
+        sloppy=400,
+        shared=400,
+        sim_events=2,
+        recorder_events=1,
     )
     assert status["topics"]["/sim/joint_states"]["received"] == 400
     assert call(node, "/recorder/annotate").success

@@ -2,9 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 __all__ = ["GapCounter"]
 
 _LARGEST_GAP = 1_000_000  # beyond this a number is taken for that of another publisher
+_MOST_STREAMS = 64
+_PATIENCE = 200
+"""Messages of a topic after which a publisher that did not go on is taken for one that never paused."""
 
 
 class GapCounter:
@@ -12,40 +17,72 @@ class GapCounter:
 
     DDS numbers the samples of each publisher from 1 on, but rclpy does not tell which publisher a sample is from.
     So every publisher seen so far is remembered by its last number, and a sample belongs to the one that it
-    continues. A sample that continues none is from a new publisher while there are fewer of them known than the
-    graph says; otherwise it leaves a gap behind the nearest lower number.
+    continues. A sample that continues none is the first of a new publisher (who may have published before it met
+    us), or there is a gap before it. Where more publishers have been met than heard, both are possible, and what comes
+    next tells: the publisher whose number it could have continued goes on, or has left, or the gap was real.
+
+    Args:
+        matched: Returns how many publishers have been met since the beginning, and how many are there now.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, matched: Callable[[], tuple[int, int]]) -> None:
         self.missing = 0
+        self._matched = matched
         self._last: list[int] = []
+        self._heard = 0
+        self._departed = 0
+        self._doubts: dict[
+            int, list[int]
+        ] = {}  # last number of a publisher -> [gap behind it, samples to wait]
 
-    def see(self, sequence: int, publishers: int = 1) -> int:
-        """Take note of a sample and return how many are missing before it.
-
-        Args:
-            sequence: Its number at its publisher.
-            publishers: Publishers of the topic now.
-        """
+    def see(self, sequence: int) -> int:
+        """Take note of a sample, by its number at its publisher, and return how many are found to be missing."""
         last = self._last
         before = sequence - 1
+        missing = self._judge_doubts(before) if self._doubts else 0
         if last and last[0] == before:  # by far the most frequent case
             last[0] = sequence
+            return missing
+        if before in last:
+            last.remove(before)
+            last.insert(0, sequence)
+            return missing
+        return missing + self._see_jump(sequence)
+
+    def _see_jump(self, sequence: int) -> int:
+        total, _ = self._matched()
+        lower = max((number for number in self._last if number < sequence), default=0)
+        gap = sequence - lower - 1
+        if sequence == 1 or not lower or gap > _LARGEST_GAP or self._heard < total:
+            if self._heard < total:
+                self._heard += 1
+                if lower and sequence > 1 and gap <= _LARGEST_GAP:
+                    self._doubts[lower] = [gap, _PATIENCE]
+            self._last.insert(0, sequence)
+            del self._last[_MOST_STREAMS:]
             return 0
-        for index, number in enumerate(last):
-            if number == before:
-                last[index] = sequence
-                return 0
-        lower = [(number, index) for index, number in enumerate(last) if number < sequence]
-        if sequence == 1 or not lower or len(last) < publishers:
-            last.append(sequence)
-            # Publishers that have left must not swallow gaps for ever.
-            del last[: max(len(last) - max(publishers, 1) - 1, 0)]
-            return 0
-        number, index = max(lower)
-        gap = sequence - number - 1
-        last[index] = sequence
-        if gap > _LARGEST_GAP:
-            return 0
+        self._doubts.pop(lower, None)
+        self._last.remove(lower)
+        self._last.insert(0, sequence)
         self.missing += gap
         return gap
+
+    def _judge_doubts(self, continued: int) -> int:
+        """Drop the doubt about a publisher that goes on; return the gaps of those that have been silent for long."""
+        self._doubts.pop(continued, None)
+        found = 0
+        for number, doubt in list(self._doubts.items()):
+            doubt[1] -= 1
+            if doubt[1] > 0:
+                continue
+            del self._doubts[number]
+            total, now = self._matched()
+            if total - now > self._departed:
+                self._departed += 1  # it has left: nothing of it can be missing
+                continue
+            if number in self._last:
+                self._last.remove(number)
+            self._heard -= 1
+            found += doubt[0]
+        self.missing += found
+        return found

@@ -1,0 +1,104 @@
+"""``record``: write topics to a bag that survives anything that happens to the recorder."""
+
+from __future__ import annotations
+
+import os
+import sys
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from pendulum_bags.recorder.options import RecorderOptions, read_metadata
+from pendulum_msgs_py.errors import BagError
+from pendulum_msgs_py.executables import cli_main
+
+__all__ = ["main"]
+
+_TRANSPORT_SETTINGS = (
+    "FASTDDS_BUILTIN_TRANSPORTS",
+    "FASTDDS_DEFAULT_PROFILES_FILE",
+    "FASTRTPS_DEFAULT_PROFILES_FILE",
+)
+
+app = typer.Typer(add_completion=False, rich_markup_mode=None)
+
+
+@app.command(
+    epilog="Example: python -m pendulum_bags record -o runs/today --regex '^/(sim|hw)/' --compression zstd. "
+    "ROS arguments go behind --ros-args."
+)
+def record(
+    context: typer.Context,
+    output: Annotated[Path, typer.Option("-o", "--output", help="Folder of the bag; it must not exist.")],
+    topics: Annotated[
+        list[str] | None, typer.Argument(help="Topics by their full names; by default all.")
+    ] = None,
+    regex: Annotated[str, typer.Option(help="Record topics that match this pattern, too.")] = "",
+    exclude: Annotated[str, typer.Option(help="Leave out topics that match this pattern.")] = "",
+    storage: Annotated[str, typer.Option(help="mcap or sqlite3.")] = "mcap",
+    compression: Annotated[str, typer.Option(help="zstd, or none.")] = "none",
+    max_size: Annotated[float, typer.Option(help="Begin a new file at this size [MB]; 0 for never.")] = 0.0,
+    max_duration: Annotated[
+        float, typer.Option(help="Begin a new file after this time [s]; 0 for never.")
+    ] = 0.0,
+    duration: Annotated[float, typer.Option(help="Stop after this time [s]; 0 for never.")] = 0.0,
+    metadata: Annotated[Path | None, typer.Option(help="JSON object to store with the bag.")] = None,
+    log_time: Annotated[
+        str, typer.Option(help="receive (time of arrival) or header (stamp of the message).")
+    ] = "receive",
+    wait: Annotated[bool, typer.Option("--wait", help="Begin when the service ~/start is called.")] = False,
+) -> int:
+    """Record topics to a rosbag2 folder that is complete and readable at every instant."""
+    options = RecorderOptions(
+        output,
+        tuple(topics or ()),
+        regex,
+        exclude,
+        storage,
+        None if compression in ("", "none") else compression,
+        round(max_size * 1e6),
+        max_duration,
+        duration,
+        read_metadata(metadata),
+        log_time,
+        wait,
+    )
+    if output.exists():
+        raise BagError(f"bag {output} exists already; expected a new folder (bags are never overwritten)")
+    _leave_no_shared_memory()
+
+    from pendulum_bags.recorder_node import SPECS, Recorder
+    from pendulum_msgs_py.ros.runner import run_node
+
+    return run_node(
+        lambda stop: Recorder(options, stop),
+        list(context.obj),
+        program="pendulum_bags record",
+        description="Record topics to a bag.",
+        specs=SPECS,
+    )
+
+
+def _leave_no_shared_memory() -> None:
+    """Receive over the loopback network, unless the user has configured the middleware.
+
+    Fast DDS passes messages between processes through shared memory. A process that is killed while it holds some
+    leaves it locked: measured with a publisher of five topics at 500 Hz, after some ten kills new subscribers, matched
+    as they were, got nothing any more. A recorder must survive a kill, and so must those whom it records.
+    """
+    if not any(os.environ.get(name) for name in _TRANSPORT_SETTINGS):
+        os.environ["FASTDDS_BUILTIN_TRANSPORTS"] = "UDPv4"
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Run the recorder; arguments from ``--ros-args`` on belong to ROS."""
+    arguments = list(sys.argv[1:] if argv is None else argv)
+    split = arguments.index("--ros-args") if "--ros-args" in arguments else len(arguments)
+    own, ros = arguments[:split], arguments[split:]
+    app.info.context_settings = {"obj": ros}
+    return cli_main(app, own, name="python -m pendulum_bags record")
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())
