@@ -197,10 +197,11 @@ def _mujoco_single() -> float:
 
 
 def _node() -> Iterator[Row]:
-    from tests.benchmarks.sim_loop import lockstep_speed, plain_cpu, realtime_figures
+    from tests.benchmarks.sim_loop import lockstep_speed, peer_cpu, realtime_figures
 
     short = min(SECONDS, 20.0)
-    plain = peer("SingleThreadedExecutor, typed", lambda: plain_cpu(short))
+    plain = peer("SingleThreadedExecutor, typed", lambda: peer_cpu("plain_loop", short))
+    bare = peer("two empty processes, best effort", lambda: peer_cpu("bare_loop", short))
     for label, cores, p50, p99, cpu, duration in (
         ("two cores", None, 130.0, 400.0, 18.0, SECONDS),
         ("one core", [(os.cpu_count() or 1) - 1], 75.0, 250.0, 10.0, short),
@@ -215,6 +216,10 @@ def _node() -> Iterator[Row]:
             at_least_times_peer=3.0 if cores is None else None,
         )  # fmt: skip
         if cores is None:
+            yield measured(
+                f"{what}: the same beside two nodes that only publish and take", figures.cpu, "% of a core", peer=bare,
+                less_is_better=True, note="what rclpy and Fast DDS cost before anything is done",
+            )  # fmt: skip
             yield measured(f"{what}: memory", figures.memory, "MB", at_most=100.0)
             yield measured(f"{what}: growth of memory", max(0.0, figures.growth), "MB", at_most=1.0)
     speed = lockstep_speed(60.0)

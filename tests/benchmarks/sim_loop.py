@@ -21,7 +21,7 @@ from pendulum_msgs_py import graph, names
 from pendulum_msgs_py.graph import NodeProgram
 from tests.processes import ProcessGroup, RunningProgram
 
-__all__ = ["LoopFigures", "lockstep_speed", "plain_cpu", "realtime_figures"]
+__all__ = ["LoopFigures", "lockstep_speed", "peer_cpu", "realtime_figures"]
 
 _ROOT = Path(__file__).parents[2]
 _WARM_UP = 6.0
@@ -108,7 +108,7 @@ def realtime_figures(
             processes = [psutil.Process(program.pid) for program in programs]
             for process in processes:
                 if cores is not None:
-                    process.cpu_affinity(list(cores))
+                    _pin(process, cores)
             listener.listen(_WARM_UP)
             memory = processes[0].memory_info().rss
             listener.rows.clear()
@@ -134,13 +134,19 @@ def realtime_figures(
             group.close()
 
 
-def plain_cpu(duration: float, *, rate: float = 1000.0) -> float:
-    """Return the CPU of the plain loop, plant and controller together [% of a core]."""
+def peer_cpu(module: str, duration: float, *, rate: float = 1000.0) -> float:
+    """Return the CPU of a loop to compare with, plant and controller together [% of a core].
+
+    Args:
+        module: ``tests.benchmarks`` module that runs either, by a first argument of ``plant`` or ``controller``.
+        duration: Length of the measurement [s].
+        rate: States per second [Hz].
+    """
     with tempfile.TemporaryDirectory() as folder, reserve_domain(None) as domain:
         group = ProcessGroup(Path(folder), _ROOT)
         try:
             programs = [
-                group.start("tests.benchmarks.plain_loop", role, str(rate), env=_environment(domain))
+                group.start(f"tests.benchmarks.{module}", role, str(rate), env=_environment(domain))
                 for role in ("plant", "controller")
             ]
             time.sleep(_WARM_UP)
@@ -207,6 +213,12 @@ def _environment(domain: int) -> dict[str, str]:
         "ROS_AUTOMATIC_DISCOVERY_RANGE": os.environ.get("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST"),
         "PYTHONSAFEPATH": "",
     }
+
+
+def _pin(process: psutil.Process, cores: Sequence[int]) -> None:
+    """Pin all threads of a process; its own affinity is only that of the first."""
+    for thread in process.threads():
+        os.sched_setaffinity(thread.id, cores)
 
 
 def _cpu(processes: Sequence[psutil.Process]) -> float:
