@@ -165,6 +165,10 @@ class BridgeNode(LifecycleNode):
         self._loop = None
         self._bridge = None
 
+    def run_due(self) -> float | None:
+        """Let the lockstep loop do what is due; return when it wants to be called again [s], None in real time."""
+        return None if self._lockstep_loop is None else self._lockstep_loop.run_due()
+
     # --- lifecycle -----------------------------------------------------------------------------------------
 
     @_logged
@@ -326,7 +330,7 @@ class BridgeNode(LifecycleNode):
     # --- slow ----------------------------------------------------------------------------------------------
 
     def _publish_slow(self, stamp_ns: int | None = None) -> None:
-        """Publish temperature and supply, by wall time; in lockstep by simulated time, so that two runs say the same."""
+        """Publish temperature and supply: by wall time, or in lockstep by simulated time, as all else."""
         feedback = self._bridge.feedback if self._bridge is not None else None
         if feedback is None or not self._active:
             return

@@ -224,7 +224,10 @@ def _make_emulator(values: Mapping[str, Any], clock: Clock, lockstep: bool) -> A
     parameters = replace(load_emulator(values["plant"]), flat=values["flat"])
     start_ns = clock.now_ns()
     if lockstep:
-        quiet = replace(TimingParameters(), feedback_jitter=0.0, delay_jitter=0.0)
+        # At this rate from the start: one that is set later begins a new raster, without the lead.
+        quiet = replace(
+            TimingParameters(), feedback_rate=values["feedback_rate"], feedback_jitter=0.0, delay_jitter=0.0
+        )
         parameters = replace(parameters, timing=quiet)
         period_ns = round(NANOSECONDS / values["feedback_rate"])
         start_ns -= period_ns + min(_LOCKSTEP_LEAD_NS, period_ns // 2)

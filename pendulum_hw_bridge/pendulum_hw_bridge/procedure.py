@@ -26,13 +26,11 @@ class TrialAnswer:
         effort: Torque of the drive [N m], None for no answer.
         push: Torque on the link [N m], None for no answer.
         events: To record.
-        last: Whether this is the last answer of the trial.
     """
 
     effort: float | None = 0.0
     push: float | None = None
     events: list[Event] = field(default_factory=list)
-    last: bool = False
 
 
 class Trial:
@@ -112,10 +110,12 @@ class StaircaseTrial(Trial):
     Args:
         number: Of the trial.
         phases: The phases in their order.
+        release: Whether a command of zero torque takes over at the end; otherwise the plant holds the last angle.
     """
 
-    def __init__(self, number: int, phases: Sequence[Phase]) -> None:
+    def __init__(self, number: int, phases: Sequence[Phase], *, release: bool = True) -> None:
         super().__init__(number)
+        self._release = release
         self.trajectory, self._times = join_phases(phases)
         self._phases = list(phases)
         self._follows_since_ns: int | None = None
@@ -147,8 +147,10 @@ class StaircaseTrial(Trial):
 
     def answer(self, sample: JointSample) -> TrialAnswer:
         """Return no torque while the plant follows, so that it keeps following; zero before and after."""
-        if self.start_ns is None or self.finished:
+        if self.start_ns is None:
             return TrialAnswer()
+        if self.finished:
+            return TrialAnswer(effort=self._last_effort)
         events: list[Event] = []
         if self._asked:
             self._asked = False
@@ -168,8 +170,12 @@ class StaircaseTrial(Trial):
         if self._asked_to_finish or sample.stamp_ns >= end_ns:
             self.finished = True
             events.append((min(end_ns, sample.stamp_ns), "trial_end", {"trial": self.number}))
-            return TrialAnswer(effort=0.0, events=events, last=True)
+            return TrialAnswer(effort=self._last_effort, events=events)
         return TrialAnswer(effort=None, events=events)
+
+    @property
+    def _last_effort(self) -> float | None:
+        return 0.0 if self._release else None
 
 
 def join_phases(phases: Sequence[Phase]) -> tuple[Trajectory, list[float]]:

@@ -59,8 +59,9 @@ SPECS: tuple[ParameterSpec, ...] = (
 class ProcedureNode(Node):
     """One trial: answers each state of the plant until the trial is over.
 
-    Before and after the trial the answer is zero torque; after it, in simulated time, silence, so that a plant in
-    lockstep stands still with the trial's end. Events: ``trial_start``, the phases, ``trial_end``, ``trial_failed``.
+    Before and after the trial the answer is zero torque. In simulated time a staircase ends on its last step, held:
+    when a command of zero torque would take over depends on how busy the machine is, and what is recorded must not.
+    Events: ``trial_start``, the phases, ``trial_end``, ``trial_failed``.
 
     Args:
         stop: Asks the runner to end the process.
@@ -71,8 +72,7 @@ class ProcedureNode(Node):
         self._stop = stop
         self._settings = NodeParameters(self, SPECS)
         values = self._settings.values
-        self._trial = make_trial(values)
-        self._simulated_time = bool(self.get_parameter("use_sim_time").value)
+        self._trial = make_trial(values, release=not self.get_parameter("use_sim_time").value)
         self._full_name = self.get_fully_qualified_name()
         self._asked_to_start = values["autostart"]
         self._effort = self.create_publisher(JointState, names.EFFORT_COMMAND, qos.COMMAND)
@@ -115,9 +115,6 @@ class ProcedureNode(Node):
         for stamp_ns, name, details in answer.events:
             self._events.publish(event_message(stamp_ns, name, **details))
             self.get_logger().info(f"{name} {details}")
-        if trial.finished and self._simulated_time and not answer.last:
-            self._answer = (None, None)
-            return
         self._answer = (answer.push, answer.effort)
         self._send()
 
@@ -148,17 +145,20 @@ class ProcedureNode(Node):
         return response
 
 
-def make_trial(values: dict[str, Any]) -> Trial:
+def make_trial(values: dict[str, Any], *, release: bool = True) -> Trial:
     """Return the trial that the parameters describe.
+
+    Args:
+        values: Of the parameters, by name.
+        release: Whether a staircase ends with a command of zero torque, or held.
 
     Raises:
         ParameterError: They describe none.
     """
     number = values["trial"]
     if values["procedure"] == "staircase":
-        return StaircaseTrial(
-            number, list(staircase(number, step=values["step"], top=values["top"], hold=values["hold"]))
-        )
+        phases = list(staircase(number, step=values["step"], top=values["top"], hold=values["hold"]))
+        return StaircaseTrial(number, phases, release=release)
     motion = None if values["person"] else hand_trials(values["seed"], trials=number)[-1]
     return HandTrial(number, motion)
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -38,6 +38,8 @@ _HAND_DAMPING = 0.2
 _TREMOR_TONES = 6
 _TREMOR_HERTZ = (0.3, 1.5)
 _TREMOR_RADIANS = 0.05
+_FASTEST = 1.05
+"""Largest speed of the hand [rad/s]: at b = 11.77 N m s/rad it gives 12.4 N m, and the actuator stands 13 N m."""
 
 
 @dataclass(frozen=True)
@@ -190,18 +192,30 @@ def staircase(
 
 def _hand_trial(seed: int, index: int, start: float) -> HandMotion:
     random = np.random.Generator(np.random.Philox(key=[seed, index]))
-    # At 1.07 rad/s and more, hand and tremor together would ask the spring for more than its 13 N m.
     strokes = random.uniform(7.0, 10.0, 2)
     amplitudes = _TREMOR_RADIANS * random.uniform(0.5, 1.0, _TREMOR_TONES) / math.sqrt(_TREMOR_TONES)
     frequencies = random.uniform(*_TREMOR_HERTZ, _TREMOR_TONES)
     phases = random.uniform(0.0, math.tau, _TREMOR_TONES)
-    return HandMotion(
+    motion = HandMotion(
         direction=1 if index % 2 == 0 else -1,
         start=start,
         rest=0.5,
         strokes=(float(strokes[0]), float(strokes[1])),
         tremor=tuple(zip(amplitudes.tolist(), frequencies.tolist(), phases.tolist(), strict=True)),
     )
+    return _slowed(motion)
+
+
+def _slowed(motion: HandMotion) -> HandMotion:
+    """Return the motion with so much of its tremor that it stays below the largest speed."""
+    stroke = replace(motion, tremor=())
+    share = 1.0
+    for time in np.arange(0.0, motion.duration, 0.02):
+        smooth = stroke.reference(time)[1]
+        shaking = motion.reference(time)[1] - smooth
+        if shaking != 0.0:
+            share = min(share, (_FASTEST - math.copysign(smooth, smooth * shaking)) / abs(shaking))
+    return replace(motion, tremor=tuple((share * a, f, p) for a, f, p in motion.tremor))
 
 
 def _minimum_jerk(time: float, duration: float) -> tuple[float, float]:

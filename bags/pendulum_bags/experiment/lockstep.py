@@ -150,7 +150,9 @@ def finish_recording(
     Raises:
         FaultError: Messages were lost.
     """
-    RecorderClient(conductor, plant.namespace).wait_for_all(f"{plant.namespace}/{names.JOINT_STATES}", states)
+    # The clock ticks once for each state, and neither topic waits for the other.
+    for topic in (f"{plant.namespace}/{names.JOINT_STATES}", names.CLOCK):
+        RecorderClient(conductor, plant.namespace).wait_for_all(topic, states)
     if processes.finish(recorder) != 0:
         raise FaultError(recorder.last_words(1))
 

@@ -17,17 +17,16 @@ from pendulum_bags.experiment.settings import HARDWARE
 from pendulum_bags.experiment.thesis import EMULATOR_WATCHDOG, LOOP_NICENESS, START_TIMEOUT
 from pendulum_msgs_py import graph, names
 from pendulum_msgs_py.errors import FaultError, ParameterError
-from pendulum_msgs_py.ros.plant_loop import LOCKSTEP_EPOCH_NS
 from pendulum_msgs_py.trajectory import RAMP_INCREMENT, RAMP_PERIOD
 
 __all__ = ["GRAVITY", "INERTIA_DAMPING", "TrialKind", "TrialSettings", "run_trials"]
 
-FEEDBACK_PERIOD_NS = 10_000_000
-"""Feedback at 100 Hz, as in the thesis [ns]."""
 _SLOWEST = 3.0
 """Slowest pace at which a trial still counts as alive, wall time per simulated time."""
 _LONGEST_BY_HAND = 600.0
 """Time after which a trial by hand that nobody ends is given up [s]."""
+_MARGIN = 1.0
+"""Time beyond the steps of the staircase, whose ramps end on whole increments [s]."""
 
 
 @dataclass(frozen=True)
@@ -40,7 +39,7 @@ class TrialKind:
         trials: How many, as in the thesis.
         flat: Whether the pendulum lies on a table, without gravity.
         inputs: Inputs of the plant that answer each state.
-        expected: Length of one trial, about [s].
+        longest: Time that the simulated hand takes at most [s]; 0 where the settings tell.
     """
 
     name: str
@@ -48,11 +47,11 @@ class TrialKind:
     trials: int
     flat: bool
     inputs: tuple[str, ...]
-    expected: float
+    longest: float = 0.0
 
 
-INERTIA_DAMPING = TrialKind("inertia_damping", "hand", 6, True, (names.EFFORT_COMMAND, names.PUSH), 16.0)
-GRAVITY = TrialKind("gravity", "staircase", 3, False, (names.EFFORT_COMMAND,), 104.0)
+INERTIA_DAMPING = TrialKind("inertia_damping", "hand", 6, True, (names.EFFORT_COMMAND, names.PUSH), 22.0)
+GRAVITY = TrialKind("gravity", "staircase", 3, False, (names.EFFORT_COMMAND,))
 
 
 @dataclass(frozen=True)
@@ -104,10 +103,11 @@ class TrialSettings:
 
     @property
     def expected_duration(self) -> float:
-        """Expected length of one trial [s]."""
+        """Length of one trial, at most [s]."""
         if self.kind.procedure == "hand":
-            return self.kind.expected
-        return 4.0 * self.top / self.step * (self.hold + math.radians(self.step) / RAMP_INCREMENT * RAMP_PERIOD)
+            return self.kind.longest
+        ramp = math.radians(self.step) / RAMP_INCREMENT * RAMP_PERIOD
+        return _MARGIN + 4.0 * self.top / self.step * (self.hold + ramp)
 
     def plant_program(self, trial: int) -> graph.NodeProgram:
         """Return the bridge."""
@@ -116,8 +116,12 @@ class TrialSettings:
             # Sensor noise differs from trial to trial, as it would.
             parameters.update(flat=self.kind.flat, seed=1000 * self.seed + trial)
             if self.lockstep:
+                # It ends by simulated time, too: when the conductor sees the end depends on how busy the machine is.
                 parameters.update(
-                    clock="lockstep", lockstep_inputs=list(self.kind.inputs), lockstep_subscribers=_LISTENERS + 1
+                    clock="lockstep",
+                    lockstep_inputs=list(self.kind.inputs),
+                    lockstep_subscribers=_LISTENERS + 1,
+                    lockstep_duration=self.expected_duration,
                 )
             else:
                 parameters.update(feedback_watchdog=EMULATOR_WATCHDOG, command_lifetime=0.25)
@@ -205,23 +209,25 @@ def _run_trial(
                 ask("Turn it slowly to half a turn and back, in 10 to 20 s; then press Enter.")
                 plant.call("procedure/finish")
             longest = _LONGEST_BY_HAND if settings.by_person else START_TIMEOUT + _SLOWEST * settings.expected_duration
-            conductor.wait_for(f"the end of trial {trial}", lambda: _has_ended(plant), longest)
+            conductor.wait_for(
+                f"the end of trial {trial}", lambda: _has_ended(plant, lockstep=settings.lockstep), longest
+            )
             if settings.lockstep:
-                # Before the plant is disarmed: from then on it waits for nobody, and runs on.
-                assert plant.sample is not None
-                states = 1 + (plant.sample.stamp_ns - LOCKSTEP_EPOCH_NS) // FEEDBACK_PERIOD_NS
-                finish_recording(conductor, processes, recorder, plant, states)
+                finished = plant.has_event("lockstep_finished")
+                assert finished is not None
+                finish_recording(conductor, processes, recorder, plant, 1 + int(finished["steps"]))
         finally:
             plant.disarm_quietly()
         conductor.spin(0.2)
     return bag
 
 
-def _has_ended(plant: PlantClient) -> bool:
+def _has_ended(plant: PlantClient, *, lockstep: bool) -> bool:
     plant.check_mode()
     if failed := plant.has_event("trial_failed"):
         raise FaultError(f"{plant.namespace}: {failed.get('reason')}")
-    return plant.has_event("trial_end") is not None
+    ended = plant.has_event("trial_end") is not None
+    return ended and (not lockstep or plant.has_event("lockstep_finished") is not None)
 
 
 def _topics(settings: TrialSettings) -> dict[str, int]:

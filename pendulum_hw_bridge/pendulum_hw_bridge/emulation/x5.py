@@ -187,9 +187,10 @@ class EmulatedX5:
         if feedback_rate is not None:
             if not (math.isfinite(feedback_rate) and 0.0 < feedback_rate <= 1000.0):
                 raise ParameterError(f"feedback_rate is {feedback_rate} Hz; expected > 0 and <= 1000 Hz")
+            if feedback_rate != self.feedback_rate:
+                self._next_sample_ns = self.now_ns
+                self._samples = 0
             self.feedback_rate = feedback_rate
-            self._next_sample_ns = self.now_ns
-            self._samples = 0
         self._refresh()
 
     def inject(self, fault: ActuatorFault) -> None:
