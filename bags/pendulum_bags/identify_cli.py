@@ -40,6 +40,13 @@ def identify(
     experiment: Annotated[
         str, typer.Option(help="With --method thesis: inertia_damping or gravity; auto asks the recording.")
     ] = "auto",
+    skew: Annotated[
+        float | None,
+        typer.Option(
+            help="With --method thesis: longest time between velocity and effort of one sample [s]; by default "
+            "0.0005 for bags, half a sampling period for files."
+        ),
+    ] = None,
     friction: Annotated[
         str, typer.Option(help="auto, viscous, coulomb, stribeck, load, stribeck_load, gear_load, ...")
     ] = "auto",
@@ -69,7 +76,7 @@ def identify(
         raise DataError(f"method is {method!r}; expected output_error or thesis")
     if method == "thesis":
         recordings = [read_recording(path, mapping, effort="measured") for path in data]
-        _thesis(recordings, experiment, out, page, as_json)
+        _thesis(recordings, experiment, skew, out, page, as_json)
         return
     from pendulum_bags.identification.options import Geometry, Options
     from pendulum_bags.identification.result import identify as run
@@ -95,7 +102,12 @@ def identify(
 
 
 def _thesis(
-    recordings: Sequence[Recording], experiment: str, out: Path | None, page: bool, as_json: bool
+    recordings: Sequence[Recording],
+    experiment: str,
+    skew: float | None,
+    out: Path | None,
+    page: bool,
+    as_json: bool,
 ) -> None:
     from pendulum_bags.identification.thesis import fit_gravity, fit_inertia_damping, static_holds
 
@@ -103,7 +115,8 @@ def _thesis(
         raise DataError(f"experiment is {experiment!r}; expected auto, inertia_damping or gravity")
     if experiment == "auto":
         experiment = "gravity" if all(len(static_holds(r)) >= 4 for r in recordings) else "inertia_damping"
-    result = (fit_gravity if experiment == "gravity" else fit_inertia_damping)(recordings)
+    gravity = experiment == "gravity"
+    result = fit_gravity(recordings) if gravity else fit_inertia_damping(recordings, skew=skew)
     if out is not None:
         out.parent.mkdir(parents=True, exist_ok=True)
         out.with_suffix(".json").write_text(json.dumps(result.to_dict(), indent=2) + "\n", encoding="utf-8")

@@ -19,6 +19,7 @@ from pendulum_bags.datasets import Recording
 from pendulum_msgs_py.errors import DataError
 
 __all__ = [
+    "RECORD_SKEW",
     "Regression",
     "StaticHold",
     "ThesisResult",
@@ -30,6 +31,9 @@ __all__ = [
 
 Array = NDArray[np.float64]
 
+
+RECORD_SKEW = 0.5e-3
+"""Time between two quantities of one record of an actuator: half a cycle of its firmware, which runs at 1 kHz [s]."""
 
 _HOLD_EVENTS = ("static", "hold")
 _TRIAL_EVENTS = ("trial_start", "trial_end")
@@ -150,16 +154,23 @@ def regress(trial: str, names: Sequence[str], regressors: Array, response: Array
     )
 
 
-def fit_inertia_damping(recordings: Sequence[Recording]) -> ThesisResult:
+def fit_inertia_damping(recordings: Sequence[Recording], *, skew: float | None = None) -> ThesisResult:
     """Regress effort on velocity and acceleration, trial by trial (experiment 1).
+
+    The interval of the inertia combines the scatter of the trials with the unknown time between the samples of
+    velocity and effort, taken as uniformly distributed (ISO/IEC Guide 98-3, type B).
 
     Args:
         recordings: Flat pendulum moved by hand; the effort is the measured one, at the stamps of the velocity.
+        skew: Longest time between velocity and effort of one sample [s]; by default that of one actuator record
+            (``RECORD_SKEW``) for a bag, and half a sampling period for other files.
 
     Raises:
         DataError: where velocity or effort is missing.
     """
-    trials = []
+    if skew is not None and not 0.0 <= skew < 1.0:
+        raise DataError(f"skew is {skew} s; expected at least 0 and less than 1 s")
+    trials, noisy = [], []
     for recording in map(trial_part, recordings):
         _require_effort(recording)
         if recording.velocity is None:
@@ -168,26 +179,29 @@ def fit_inertia_damping(recordings: Sequence[Recording]) -> ThesisResult:
         regressors = np.stack((recording.velocity, acceleration), axis=1)
         effort = np.interp(recording.time, recording.input_stamps, recording.input)
         trials.append(regress(recording.name, ("damping", "inertia"), regressors, effort))
+        noisy.append(_noise_share(recording.velocity, acceleration, recording.period))
     average, intervals, sign = _average(trials)
-    said = []
-    # Velocity and effort of one stamp may be taken anywhere within a period: a shift tau turns b theta' into
+    # Velocity and effort of one stamp are not taken at one instant: a shift tau turns b theta' into
     # b theta' + b tau theta'', which is an inertia. No regression of such samples can tell the two apart.
-    period = float(np.median([recording.period for recording in recordings]))
-    shift = 0.5 * period * average["damping"]
-    statistical = intervals["inertia"]
-    intervals["inertia"] = (statistical[0] - shift, statistical[1] + shift)
-    low, high = intervals["inertia"]
-    said.append(
-        f"A shift of 1 ms between the samples of velocity and effort changes the inertia by "
-        f"{1e-3 * average['damping']:.3g} kg m^2; its interval allows for half a period, {500.0 * period:.3g} ms "
-        f"({statistical[0]:.4g} to {statistical[1]:.4g} kg m^2 without)."
-    )
+    shift = max(_skew(recording) for recording in recordings) if skew is None else skew
+    scatter = 0.5 * (intervals["inertia"][1] - intervals["inertia"][0])
+    half = float(np.hypot(scatter, 1.96 / np.sqrt(3.0) * shift * average["damping"]))
+    low, high = average["inertia"] - half, average["inertia"] + half
+    intervals["inertia"] = (low, high)
     share = np.mean([_share(r) for r in trials])
-    said.append(
-        f"The inertial torque is {100 * share:.1f} % of the viscous one (rms): inertia is determined to "
-        f"{low:.3g} to {high:.3g} kg m^2 only, damping to {intervals['damping'][0]:.4g} to "
-        f"{intervals['damping'][1]:.4g} N m s/rad."
-    )
+    said = [
+        (
+            f"The inertial torque is {100 * share:.1f} % of the viscous one (rms): inertia is determined to "
+            f"{low:.3g} to {high:.3g} kg m^2 only, damping to {intervals['damping'][0]:.4g} to "
+            f"{intervals['damping'][1]:.4g} N m s/rad."
+        ),
+        (
+            f"A shift of 1 ms between the samples of velocity and effort is {1e-3 * average['damping']:.3g} kg m^2 of "
+            f"inertia, and nothing in these recordings tells the two apart: the interval allows for "
+            f"{1e3 * shift:.3g} ms (`--skew`) and for the scatter of the trials, {scatter:.2g} kg m^2 either way. "
+            "A velocity that the actuator filters lags by more."
+        ),
+    ]
     if low <= 0.0:
         said.append("The data are compatible with no inertia at all: this experiment cannot determine it.")
     if sign < 0:
@@ -195,10 +209,23 @@ def fit_inertia_damping(recordings: Sequence[Recording]) -> ThesisResult:
             "The coefficients were negative: the actuator reports the torque of the environment; signs are turned."
         )
     said.append(
-        "Finite differences of a noisy velocity bias the inertia towards zero; "
-        "`--method output_error` has no such bias."
+        f"Noise of the velocity is {100 * np.mean(noisy):.2g} % of the power of its finite differences, and makes the "
+        "inertia too small by as much."
     )
     return ThesisResult("inertia_damping", tuple(trials), average, intervals, sign, 0.0, tuple(said))
+
+
+def _skew(recording: Recording) -> float:
+    """Return how far apart velocity and effort of one sample may have been taken [s]."""
+    same_record = recording.input_time is None and "topic" in recording.meta
+    return RECORD_SKEW if same_record else 0.5 * recording.period
+
+
+def _noise_share(velocity: Array, acceleration: Array, period: float) -> float:
+    """Return the share of white noise of the velocity in the power of its central differences."""
+    # Second differences of a motion that is smooth at the sampling rate are noise: six times its variance.
+    noise = np.mean(np.diff(velocity, 2) ** 2) / 6.0
+    return float(min(1.0, noise / (2.0 * period**2) / max(float(np.mean(acceleration**2)), 1e-300)))
 
 
 def static_holds(recording: Recording, *, speed: float = 0.02, least: float = 0.4) -> list[StaticHold]:
