@@ -89,11 +89,15 @@ def serve(
     @app.websocket("/stream")
     async def stream(socket: WebSocket) -> None:
         await socket.accept()
+        due = time.monotonic()
         try:
             while True:
-                picture = {"t": time.monotonic(), "plants": graph.frame()}
+                now = time.monotonic()
+                picture = {"t": now, "plants": graph.frame()}
                 await socket.send_text(json.dumps(picture, separators=(",", ":")))
-                await asyncio.sleep(FRAME_PERIOD)
+                # Counted from the last due time: the work does not add to the period, and what was missed is missed.
+                due = max(due + FRAME_PERIOD, now)
+                await asyncio.sleep(due - time.monotonic())
         except (WebSocketDisconnect, RuntimeError):
             return
 

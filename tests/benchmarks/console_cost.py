@@ -1,0 +1,255 @@
+"""Measures what looking costs the loops: both plants, without the console, with it, with a reader, with a browser."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import math
+import os
+import shutil
+import socket
+import statistics
+import tempfile
+import threading
+import time
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import psutil
+import rclpy
+import websockets
+from diagnostic_msgs.msg import DiagnosticArray
+from rclpy.executors import SingleThreadedExecutor
+from std_srvs.srv import SetBool
+
+from pendulum_bags.experiment.domain import reserve_domain
+from pendulum_msgs_py import graph, names
+from tests.processes import ProcessGroup, RunningProgram
+
+__all__ = ["CHROMIUM", "Look", "looks"]
+
+CHROMIUM = Path("/usr/bin/chromium")
+RATE = 500.0
+"""States per second of each plant [Hz]."""
+_ROOT = Path(__file__).parents[2]
+_WARM_UP = 4.0
+_START_TIMEOUT = 60.0
+_AS_A_PERSON = "setpriv --bounding-set=-sys_nice" if os.geteuid() == 0 and shutil.which("setpriv") else ""
+"""Root's Chromium raises its own priority above every loop's; a person's cannot."""
+_NICENESS = 10
+"""Of the browser, as a person would start one beside a loop on a small machine."""
+_PLANTS = ("/sim/simulator", "/hw/bridge")
+_BROWSER_FLAGS = ["--no-sandbox", "--disable-gpu", "--disable-background-networking", "--disable-component-update"]
+
+
+@dataclass(frozen=True)
+class Look:
+    """What one way of looking cost.
+
+    Attributes:
+        way: ``nobody``, ``console``, ``reader`` or ``browser``.
+        rate: Slower plant's rate [Hz].
+        jitter: 99th percentile of the jitter, of the worse plant [us].
+        loop_cpu: CPU of plants, controllers and disturbances [% of a core].
+        console_cpu: CPU of the console's process [% of a core].
+        browser_cpu: CPU of the browser [% of a core].
+        pictures: Pictures that reached the one who looks [1/s].
+        faults: Reasons of the plants that are in a fault at the end.
+    """
+
+    way: str
+    rate: float
+    jitter: float
+    loop_cpu: float
+    console_cpu: float = 0.0
+    browser_cpu: float = 0.0
+    pictures: float = 0.0
+    faults: Sequence[str] = ()
+
+
+class _Loops:
+    """The plants' diagnostics, by plant, as they come."""
+
+    def __init__(self, domain: int) -> None:
+        self._context = rclpy.Context()
+        rclpy.init(context=self._context, domain_id=domain)
+        self._node = rclpy.create_node("bench_listener", context=self._context)
+        self._executor = SingleThreadedExecutor(context=self._context)
+        self._executor.add_node(self._node)
+        self._node.create_subscription(DiagnosticArray, names.DIAGNOSTICS, self._on_message, 10)
+        self.rows: dict[str, list[dict[str, str]]] = {plant: [] for plant in _PLANTS}
+
+    def _on_message(self, message: DiagnosticArray) -> None:
+        for status in message.status:
+            plant = status.name.partition(":")[0]
+            if plant in self.rows:
+                self.rows[plant].append({pair.key: pair.value for pair in status.values})
+
+    def listen(self, duration: float) -> None:
+        deadline = time.monotonic() + duration
+        while (left := deadline - time.monotonic()) > 0.0:
+            self._executor.spin_once(timeout_sec=left)
+
+    def wait(self) -> None:
+        """Wait until both loops are closed."""
+        deadline = time.monotonic() + _START_TIMEOUT
+        while time.monotonic() < deadline:
+            self.listen(0.5)
+            last = [rows[-1] for rows in self.rows.values() if rows]
+            if len(last) == len(_PLANTS) and all(
+                math.isfinite(float(row.get("command_latency_p50_us", "nan"))) for row in last
+            ):
+                return
+        raise TimeoutError(f"the loops did not close within {_START_TIMEOUT:g} s")
+
+    def arm(self) -> None:
+        """Arm the bridge, which starts disarmed, so that its controller's torque is applied."""
+        client = self._node.create_client(SetBool, "/hw/bridge/arm")
+        asked = client.call_async(SetBool.Request(data=True)) if client.wait_for_service(_START_TIMEOUT) else None
+        if asked is not None:
+            self._executor.spin_until_future_complete(asked, _START_TIMEOUT)
+        if asked is None or not asked.done() or not asked.result().success:
+            raise TimeoutError(f"/hw/bridge was not armed within {_START_TIMEOUT:g} s")
+
+    def close(self) -> None:
+        self._executor.shutdown()
+        self._node.destroy_node()
+        rclpy.shutdown(context=self._context)
+
+
+def looks(duration: float, ways: Sequence[str] = ("nobody", "console", "reader", "browser")) -> Iterator[Look]:
+    """Run both plants under noise and yield what each way of looking costs.
+
+    Args:
+        duration: Length of each measurement [s].
+        ways: Which ways, in this order.
+    """
+    with tempfile.TemporaryDirectory() as scratch, reserve_domain(None) as domain:
+        group, loops = ProcessGroup(Path(scratch), _ROOT), _Loops(domain)
+        environment = {"ROS_DOMAIN_ID": str(domain), "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST"}
+        try:
+            nodes = (
+                graph.simulator("/sim", rate_hz=RATE, start="top"),
+                graph.bridge("/hw", backend="emulator", feedback_rate=RATE, initial_position=math.pi),
+                *(graph.controller(space, period=1.0 / RATE) for space in ("/sim", "/hw")),
+                *(graph.disturbance(space, autostart=True) for space in ("/sim", "/hw")),
+            )
+            started = [group.start(it.package, it.executable, *it.ros_arguments(), env=environment) for it in nodes]
+            processes = {"loops": [psutil.Process(program.pid) for program in started]}
+            loops.wait()
+            loops.arm()
+            address = ""
+            for way in ways:
+                if way != "nobody" and not address:
+                    console, address = _console(group, environment, Path(scratch, "runs"))
+                    processes["console"] = [psutil.Process(console.pid)]
+                with contextlib.ExitStack() as stack:
+                    count: Callable[[], float] = float
+                    processes["browser"] = []
+                    if way == "reader":
+                        count = stack.enter_context(_Reader(address)).count
+                    elif way == "browser":
+                        count, processes["browser"] = stack.enter_context(_browser(address))
+                    loops.listen(_WARM_UP)
+                    yield _measure(way, duration, loops, processes, count)
+        finally:
+            loops.close()
+            group.close()
+
+
+def _measure(
+    way: str,
+    duration: float,
+    loops: _Loops,
+    processes: dict[str, list[psutil.Process]],
+    count: Callable[[], float],
+) -> Look:
+    for rows in loops.rows.values():
+        rows.clear()
+    before = {name: _cpu(group) for name, group in processes.items()}
+    seen, wall = count(), time.monotonic()
+    loops.listen(duration)
+    elapsed = time.monotonic() - wall
+    cpu = {name: 100.0 * (_cpu(group) - before[name]) / elapsed for name, group in processes.items()}
+
+    def median(key: str) -> list[float]:
+        return [statistics.median(float(row[key]) for row in rows) for rows in loops.rows.values()]
+
+    return Look(
+        way,
+        rate=min(median("rate_hz")),
+        jitter=max(median("jitter_p99_us")),
+        loop_cpu=cpu["loops"],
+        console_cpu=cpu.get("console", 0.0),
+        browser_cpu=cpu["browser"],
+        pictures=(count() - seen) / elapsed,
+        faults=[rows[-1]["reason"] for rows in loops.rows.values() if rows[-1]["mode"] == "fault"],
+    )
+
+
+def _console(group: ProcessGroup, environment: dict[str, str], runs: Path) -> tuple[RunningProgram, str]:
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        port = probe.getsockname()[1]
+    console = group.start(
+        "pendulum_bags", "console", "--port", str(port), "--runs", runs, env=environment
+    )
+    console.wait_for_output(r"console at http://localhost", _START_TIMEOUT)
+    return console, f"localhost:{port}"
+
+
+class _Reader:
+    """Takes every picture and draws none."""
+
+    def __init__(self, address: str) -> None:
+        self._address = address
+        self._seen = 0
+        self._stop = threading.Event()
+        self._thread = threading.Thread(target=lambda: asyncio.run(self._read()), daemon=True)
+
+    def count(self) -> float:
+        return float(self._seen)
+
+    async def _read(self) -> None:
+        async with websockets.connect(f"ws://{self._address}/stream") as socket_:
+            while not self._stop.is_set():
+                await socket_.recv()
+                self._seen += 1
+
+    def __enter__(self) -> _Reader:
+        self._thread.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._stop.set()
+        self._thread.join(5.0)
+
+
+@contextlib.contextmanager
+def _browser(address: str) -> Iterator[tuple[Callable[[], float], list[psutil.Process]]]:
+    from playwright.sync_api import sync_playwright
+
+    with tempfile.TemporaryDirectory() as folder:
+        niced = Path(folder, "chromium")
+        niced.write_text(f'#!/bin/sh\nexec {_AS_A_PERSON} nice -n {_NICENESS} {CHROMIUM} "$@"\n', encoding="utf-8")
+        niced.chmod(0o755)
+        with sync_playwright() as play:
+            chromium = play.chromium.launch(executable_path=str(niced), args=_BROWSER_FLAGS)
+            page = chromium.new_page(viewport={"width": 1280, "height": 860})
+            page.goto(f"http://{address}/")
+            page.wait_for_function("Object.keys(pendulumConsole.plants).length == 2", timeout=60_000)
+            here = psutil.Process(os.getpid())
+            children = [it for it in here.children(recursive=True) if "chrom" in it.name()]
+            yield (lambda: float(page.evaluate("pendulumConsole.drawn"))), children
+            chromium.close()
+
+
+def _cpu(processes: list[psutil.Process]) -> float:
+    total = 0.0
+    for process in processes:
+        with contextlib.suppress(psutil.NoSuchProcess):
+            times = process.cpu_times()
+            total += times.user + times.system
+    return total
+
