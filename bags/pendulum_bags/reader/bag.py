@@ -15,8 +15,8 @@ import numpy as np
 import numpy.typing as npt
 
 from pendulum_bags.reader.batches import Batch, Int64, Source, Stream
+from pendulum_bags.reader.decompression import decompress_bounded
 from pendulum_bags.reader.joint_state import JointStateParser
-from pendulum_bags.reader.mcap_source import decompress_bounded
 from pendulum_bags.reader.open_source import BagFolder, open_folder, open_sources
 from pendulum_msgs_py.errors import BagError, DataError
 

@@ -37,9 +37,13 @@ def store_for(info: TopicInfo) -> Typestore:
         if info.type in shared.fielddefs:
             return shared  # in a language that rosbags does not read, such as IDL in other clothes
         reason = " ".join(str(error).split())[:200]
-        raise DataError(f"topic {info.name}: the definition of {info.type} is not readable: {reason}") from error
+        raise DataError(
+            f"topic {info.name}: the definition of {info.type} is not readable: {reason}"
+        ) from error
     if info.type not in store.fielddefs:
-        raise DataError(f"topic {info.name} has type {info.type}; expected a type that the bag or ROS 2 defines")
+        raise DataError(
+            f"topic {info.name} has type {info.type}; expected a type that the bag or ROS 2 defines"
+        )
     return store
 
 

@@ -32,7 +32,9 @@ FIELDS = np.dtype(
 """Columns of the arrays: times [ns], position [rad], velocity [rad/s], effort [N m]; absent values are NaN."""
 
 _BLOCK = 8192  # messages parsed at once: their bytes stay in the cache
-_MAX_EXPECTED = 1 << 22  # messages that memory is taken for before they are seen: a damaged file may claim any number
+_MAX_EXPECTED = (
+    1 << 22
+)  # messages that memory is taken for before they are seen: a damaged file may claim any number
 _MAX_COPY = 1 << 26  # bytes of messages that are copied at once
 _MAX_FRAME = 255  # bytes of a frame id that are kept: no name in ROS is longer
 _LAYOUTS = 16  # layouts tried in one batch before a topic counts as not fixed

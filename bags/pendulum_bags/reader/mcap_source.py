@@ -7,23 +7,23 @@ import mmap
 import struct
 import zlib
 from collections.abc import Iterator
-from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any
 
 import numpy as np
 
 from pendulum_bags.reader.batches import MCAP_HEAD, Batch, Bytes, Int64, Stream
+from pendulum_bags.reader.decompression import decompress
+from pendulum_bags.reader.mcap_chunks import Chunk, keep_staged, read_text, read_text_map
 from pendulum_bags.storage import mcap_records as rec
 from pendulum_msgs_py.errors import BagError
 
-__all__ = ["Chunk", "McapSource", "decompress", "decompress_bounded"]
+__all__ = ["McapSource"]
 
 _HEAD = rec.RECORD_HEAD_SIZE
 _FOOTER_REGION = rec.FOOTER_SIZE + len(rec.MAGIC)
 _CHUNK_FIELDS = struct.Struct("<QQQII")
 _GROUP_SIZE = 1 << 20  # decompressed bytes that are parsed at once
-_MAX_CHUNK = 1 << 28  # decompressed bytes of one chunk: recorders write chunks of about 1 MB, bombs larger ones
 _INDEX_HEAD = np.dtype(
     {
         "names": ["opcode", "length", "channel", "size"],
@@ -42,19 +42,6 @@ class _DamagedError(Exception):
 
 class _NoIndexError(Exception):
     """The file has no index, as the format allows: its records must be walked through."""
-
-
-@dataclass(slots=True)
-class Chunk:
-    """One chunk: where its records stand in the file, and where its message indexes do (channel -> offset)."""
-
-    start_ns: int
-    stop_ns: int
-    data_start: int
-    data_size: int
-    raw_size: int
-    compression: str
-    indexes: dict[int, int] = field(default_factory=dict)
 
 
 class McapSource:
@@ -158,6 +145,8 @@ class McapSource:
                 raise _DamagedError("the index names a chunk twice")
             self.start_ns = min(chunk.start_ns for chunk in self.chunks)
             self.stop_ns = max(chunk.stop_ns for chunk in self.chunks)
+            if self.unclosed:
+                keep_staged(self.buffer, self.chunks)
         elif sum(self._counts.values()):
             raise _NoIndexError  # messages outside of chunks
 
@@ -180,31 +169,31 @@ class McapSource:
     def _take_description(self, opcode: int, content: bytes) -> None:
         if opcode == rec.SCHEMA:
             (key,) = struct.unpack_from("<H", content)
-            name, at = _text(content, 2)
-            encoding, at = _text(content, at)
-            definition, at = _text(content, at)
+            name, at = read_text(content, 2)
+            encoding, at = read_text(content, at)
+            definition, at = read_text(content, at)
             self._schemas[key] = (name, encoding, definition)
         elif opcode == rec.CHANNEL:
             key, schema = struct.unpack_from("<HH", content)
-            topic, at = _text(content, 4)
-            encoding, at = _text(content, at)
-            self._channels[key] = (schema, topic, encoding, _text_map(content, at))
+            topic, at = read_text(content, 4)
+            encoding, at = read_text(content, at)
+            self._channels[key] = (schema, topic, encoding, read_text_map(content, at))
         elif opcode == rec.METADATA:
-            name, at = _text(content, 0)
-            self.metadata[name] = _text_map(content, at)
+            name, at = read_text(content, 0)
+            self.metadata[name] = read_text_map(content, at)
 
     def _chunk_from_index(self, content: bytes) -> Chunk:
         start, stop, offset, _, size = struct.unpack_from("<QQQQI", content)
         indexes = dict(struct.iter_unpack("<HQ", content[36 : 36 + size]))
         at = 36 + size + 8
-        compression, at = _text(content, at)
+        compression, at = read_text(content, at)
         packed, raw = struct.unpack_from("<QQ", content, at)
         data_start = offset + _HEAD + _CHUNK_FIELDS.size + len(compression) + 8
         if data_start + packed > len(self.buffer) or any(at >= len(self.buffer) for at in indexes.values()):
             raise _DamagedError("the index names a chunk beyond the end of the file")
         if self.buffer[offset] != rec.CHUNK:
             raise _DamagedError("the index names a chunk where there is none")
-        return Chunk(start, stop, data_start, packed, raw, compression, indexes)
+        return Chunk(self.buffer, start, stop, data_start, packed, raw, compression, indexes)
 
     def _stream(self, channel: int) -> Stream:
         schema, topic, encoding, metadata = self._channels[channel]
@@ -263,13 +252,13 @@ class McapSource:
         view = self.buffer.data
         try:
             start, stop, raw_size, crc, text_size = _CHUNK_FIELDS.unpack_from(view, body)
-            compression, at = _text(bytes(view[body + 28 : body + 32 + text_size]), 0)
+            compression, at = read_text(bytes(view[body + 28 : body + 32 + text_size]), 0)
             at += body + 28
             (packed,) = struct.unpack_from("<Q", view, at)
             at += 8
             if at + packed > body + length:
                 raise _DamagedError("chunk")
-            chunk = Chunk(start, stop, at, packed, raw_size, compression)
+            chunk = Chunk(self.buffer, start, stop, at, packed, raw_size, compression)
             raw = self._raw(chunk)
             if crc and zlib.crc32(raw.data) != crc:
                 raise _DamagedError("checksum")
@@ -309,7 +298,7 @@ class McapSource:
     # -- reading -----------------------------------------------------------------------------------------------
 
     def _raw(self, chunk: Chunk) -> Bytes:
-        packed = self.buffer[chunk.data_start : chunk.data_start + chunk.data_size]
+        packed = chunk.buffer[chunk.data_start : chunk.data_start + chunk.data_size]
         if not chunk.compression:
             return packed
         return np.frombuffer(decompress(packed, chunk.compression, chunk.raw_size, str(self.path)), np.uint8)
@@ -320,40 +309,45 @@ class McapSource:
             if channel in channels:
                 table = np.array(entries, np.int64)
                 yield from self._cut(Batch(channel, self.buffer, table[:, 1], table[:, 0]), start, stop)
-        for buffer, members in self._groups(channels, start, stop):
+        for buffer, index, members in self._groups(channels, start, stop):
             for channel in channels:
-                times, offsets = self._entries(channel, members)
+                times, offsets = self._entries(channel, index, members)
                 if len(times):
                     yield from self._cut(Batch(channel, buffer, offsets, times), start, stop)
 
     def _groups(
         self, channels: set[int], start: int | None, stop: int | None
-    ) -> Iterator[tuple[Bytes, list[tuple[int, int]]]]:
-        """Yield buffers that hold many chunks, each with (number of the chunk, where it begins in the buffer)."""
-        plain: list[tuple[int, int]] = []
+    ) -> Iterator[tuple[Bytes, Bytes, list[tuple[int, int]]]]:
+        """Yield buffers that hold many chunks, and their index, with (number of the chunk, where it begins)."""
+        plain: dict[int, list[tuple[int, int]]] = {}
         packed: list[tuple[int, int]] = []
         parts: list[Bytes] = []
         size = 0
+        index = self.buffer
         for number, chunk in enumerate(self.chunks):
             if (start is not None and chunk.stop_ns < start) or (stop is not None and chunk.start_ns >= stop):
                 continue
             if channels.isdisjoint(self._scanned[number] if self._scanned else chunk.indexes):
                 continue
             if not chunk.compression:
-                plain.append((number, chunk.data_start))  # they all lie in the same map
+                plain.setdefault(id(chunk.buffer), []).append(
+                    (number, chunk.data_start)
+                )  # they lie in the same map
                 continue
+            if packed and (size >= _GROUP_SIZE or index is not chunk.buffer):
+                yield np.concatenate(parts), index, packed
+                packed, parts, size = [], [], 0
+            index = chunk.buffer
             parts.append(self._raw(chunk))
             packed.append((number, size))
             size += chunk.raw_size
-            if size >= _GROUP_SIZE:
-                yield np.concatenate(parts), packed
-                packed, parts, size = [], [], 0
         if packed:
-            yield np.concatenate(parts), packed
-        if plain:
-            yield self.buffer, plain
+            yield np.concatenate(parts), index, packed
+        for members in plain.values():
+            buffer = self.chunks[members[0][0]].buffer
+            yield buffer, buffer, members
 
-    def _entries(self, channel: int, members: list[tuple[int, int]]) -> tuple[Int64, Int64]:
+    def _entries(self, channel: int, index: Bytes, members: list[tuple[int, int]]) -> tuple[Int64, Int64]:
         """Return log times [ns] and record offsets of a channel's messages in a group of chunks."""
         if self._scanned:
             rows = [
@@ -364,21 +358,19 @@ class McapSource:
             table = np.array(rows, np.int64).reshape(-1, 2)
             return table[:, 0], table[:, 1]
         places = [
-            (index, base)
+            (place, base)
             for number, base in members
-            if (index := self.chunks[number].indexes.get(channel)) is not None
+            if (place := self.chunks[number].indexes.get(channel)) is not None
         ]
         if not places:
             return np.empty(0, np.int64), np.empty(0, np.int64)
         at, base = np.array(places, np.int64).T
-        heads = self._take(_INDEX_HEAD, at)
+        heads = self._take(index, _INDEX_HEAD, at)
         if len(np.unique(at)) != len(at):
             raise BagError(f"{self.path}: two chunks name one message index; try to repair the bag")
         counts = heads["size"].astype(np.int64) // 16
         whole = (heads["opcode"] == rec.MESSAGE_INDEX) & (heads["channel"] == channel)
-        whole &= (heads["length"] == heads["size"] + np.uint64(6)) & (
-            at + 15 + 16 * counts <= len(self.buffer)
-        )
+        whole &= (heads["length"] == heads["size"] + np.uint64(6)) & (at + 15 + 16 * counts <= len(index))
         if not whole.all():
             wrong = int(at[~whole][0])
             raise BagError(
@@ -386,19 +378,17 @@ class McapSource:
             )
         first = np.cumsum(counts) - counts
         rows_at = np.repeat(at + 15 - 16 * first, counts) + 16 * np.arange(int(counts.sum()))
-        table = self._take(_INDEX_ENTRY, rows_at)
+        table = self._take(index, _INDEX_ENTRY, rows_at)
         return table["time"], table["offset"] + np.repeat(base, counts)
 
-    def _take(self, item: np.dtype[Any], at: Int64) -> Any:
-        """Return copies of the items that begin at some bytes of the file."""
-        places = max(len(self.buffer) - item.itemsize + 1, 0)
+    def _take(self, buffer: Bytes, item: np.dtype[Any], at: Int64) -> Any:
+        """Return copies of the items that begin at some bytes of a buffer."""
+        places = max(len(buffer) - item.itemsize + 1, 0)
         if len(at) and not 0 <= int(at.max()) < places:
             raise BagError(
                 f"{self.path}: a message index lies beyond the end of the file; try to repair the bag"
             )
-        anywhere: np.ndarray[Any, Any] = np.ndarray(
-            (places,), f"V{item.itemsize}", self.buffer.data, strides=(1,)
-        )
+        anywhere: np.ndarray[Any, Any] = np.ndarray((places,), f"V{item.itemsize}", buffer.data, strides=(1,))
         return anywhere[at].view(item)
 
     def _cut(self, batch: Batch, start: int | None, stop: int | None) -> Iterator[Batch]:
@@ -415,78 +405,3 @@ class McapSource:
         if int(batch.offsets.min()) < 0 or int(batch.offsets.max()) + MCAP_HEAD > len(batch.buffer):
             raise BagError(f"{self.path}: a message index points outside of its chunk; try to repair the bag")
         yield batch
-
-
-def decompress(packed: Bytes, compression: str, size: int, name: str) -> bytes:
-    """Return the content of a chunk.
-
-    Never more is decompressed than the head of the chunk says, and that has a bound.
-
-    Raises:
-        BagError: Unknown compression, a chunk larger than any recorder's, or the bytes are damaged.
-    """
-    if size > _MAX_CHUNK:
-        raise BagError(f"{name}: a chunk claims to hold {size} bytes; expected at most {_MAX_CHUNK}")
-    if compression == "zstd":
-        import zstandard
-
-        try:
-            claimed = zstandard.frame_content_size(packed.data)  # -1 where the frame does not say
-            if claimed not in (-1, size):
-                raise BagError(f"{name}: a chunk claims to hold {claimed} bytes; its head says {size}")
-            raw = zstandard.ZstdDecompressor().decompress(packed.data, max_output_size=size)
-        except zstandard.ZstdError as error:
-            raise BagError(f"{name}: a compressed chunk is damaged ({error})") from None
-    elif compression == "lz4":
-        import lz4.frame
-
-        try:
-            raw = lz4.frame.LZ4FrameDecompressor().decompress(packed.tobytes(), max_length=size + 1)
-        except (RuntimeError, EOFError) as error:
-            raise BagError(f"{name}: a compressed chunk is damaged ({error})") from None
-    else:
-        raise BagError(f"{name}: chunk compression is {compression!r}; expected zstd, lz4 or none")
-    if len(raw) != size:
-        raise BagError(f"{name}: a chunk holds {len(raw)} bytes; its head says {size}")
-    return raw
-
-
-def decompress_bounded(packed: BinaryIO, name: str, limit: int = _MAX_CHUNK) -> bytes:
-    """Return the content of a zstd stream that does not say how much it holds, or cannot be believed.
-
-    Raises:
-        BagError: It holds more than ``limit`` bytes, or is damaged.
-    """
-    import zstandard
-
-    parts, size = [], 0
-    try:
-        with zstandard.ZstdDecompressor().stream_reader(packed) as stream:
-            while part := stream.read(1 << 20):
-                parts.append(part)
-                size += len(part)
-                if size > limit:
-                    raise BagError(f"{name} holds more than {limit} bytes when decompressed")
-    except (OSError, zstandard.ZstdError) as error:
-        if isinstance(error, BagError):
-            raise
-        raise BagError(f"{name} cannot be decompressed: {error}") from None
-    return b"".join(parts)
-
-
-def _text(content: bytes, at: int) -> tuple[str, int]:
-    (size,) = struct.unpack_from("<I", content, at)
-    end = at + 4 + size
-    if end > len(content):
-        raise struct.error("text beyond the end of its record")
-    return content[at + 4 : end].decode(), end
-
-
-def _text_map(content: bytes, at: int) -> dict[str, str]:
-    (size,) = struct.unpack_from("<I", content, at)
-    end, at = at + 4 + size, at + 4
-    items = {}
-    while at < end:
-        key, at = _text(content, at)
-        items[key], at = _text(content, at)
-    return items

@@ -11,7 +11,8 @@ from typing import Any
 import yaml
 
 from pendulum_bags.reader.batches import Source
-from pendulum_bags.reader.mcap_source import McapSource, decompress_bounded
+from pendulum_bags.reader.decompression import decompress_bounded
+from pendulum_bags.reader.mcap_source import McapSource
 from pendulum_bags.reader.sqlite_source import SqliteSource
 from pendulum_bags.storage.metadata_file import METADATA_NAME, METADATA_VERSION
 from pendulum_msgs_py.errors import BagError
@@ -122,7 +123,15 @@ def _take_metadata(folder: BagFolder, text: str) -> None:
             folder.topic_hashes[str(topic["name"])] = str(topic.get("type_description_hash", ""))
         folder.message_count = int(info["message_count"])
         folder.message_compression = str(info.get("compression_mode") or "").lower() == "message"
-    except (yaml.YAMLError, KeyError, TypeError, ValueError, AttributeError, RecursionError, OverflowError) as error:
+    except (
+        yaml.YAMLError,
+        KeyError,
+        TypeError,
+        ValueError,
+        AttributeError,
+        RecursionError,
+        OverflowError,
+    ) as error:
         sentence = " ".join(str(error).split())
         folder.damage.append(f"{METADATA_NAME} is not what a bag has: {sentence or type(error).__name__}")
 

@@ -193,7 +193,9 @@ class SqliteSource:
             if not isinstance(item["id"], int) or not all(
                 isinstance(item[name], str) for name in present if name != "id"
             ):
-                raise BagError(f"{self.path}: topic {item.get('name')!r} is described by values that are no text")
+                raise BagError(
+                    f"{self.path}: topic {item.get('name')!r} is described by values that are no text"
+                )
             encoding, text = definitions.get(item["type"], ("", ""))
             streams.append(
                 Stream(
