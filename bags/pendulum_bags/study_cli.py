@@ -230,18 +230,22 @@ def _analyse(folder: Path, found: Study, records: Sequence[dict[str, Any]]) -> d
 
 
 def _print_matrix(console: Console, found: Study, workers: int) -> None:
-    table = Table(title=f"{found.name}: {found.description}", title_justify="left")
+    console.print(f"{found.name}: {found.description}" if found.description else found.name, markup=False)
+    table = Table()
     for heading in ("axis", "values"):
         table.add_column(heading)
     for axis in ("plant", "controller", "disturbance", "set_point", "start", "seed", "repeat"):
-        values = list(dict.fromkeys(str(run.labels[axis]) for run in found.runs))
+        values = list(dict.fromkeys(_label(run.labels[axis]) for run in found.runs))
+        if values == [""]:
+            continue  # this experiment has no such axis
         text = ", ".join(values[:8]) + (f", ... ({len(values)})" if len(values) > 8 else "")
         table.add_row(axis, text)
     console.print(table)
     seconds = sum(run.seconds for run in found.runs) / max(1, min(workers, len(found.runs)))
     size = sum(run.bytes for run in found.runs) / 1e6
+    runs = "1 run" if len(found.runs) == 1 else f"{len(found.runs)} runs"
     console.print(
-        f"{len(found.runs)} runs, about {_duration(seconds)} with {workers} at once, about {size:.0f} MB on disk"
+        f"{runs}, about {_duration(seconds)} with {workers} at once, about {size:.0f} MB on disk"
     )
 
 
@@ -292,6 +296,10 @@ def _cell(group: Group, metric: str) -> str:
         return "never"
     interval = "" if math.isnan(low) else f"\n{low:.4g} to {high:.4g}"
     return f"{mean:.4g}{interval}" + (f"\nnever in {never}" if never else "")
+
+
+def _label(value: Any) -> str:
+    return f"{value:.4g}" if isinstance(value, float) else str(value)
 
 
 def _duration(seconds: float) -> str:

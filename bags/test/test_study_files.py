@@ -66,6 +66,10 @@ def test_random_starts_follow_the_seed_alone(tmp_path: Path) -> None:
         (HEAD + BODY + "duration: long\n", 7, "expected a number of seconds"),
         (HEAD + BODY + "repeats: 0\n", 7, "expected >= 1"),
         (HEAD + "plants:\n  sim: {side: hw, engine: process}\ncontrollers:\n  lqr: {}\n", 4, "plain simulator"),
+        (HEAD + BODY + "clock: fast\n", 7, "expected one of lockstep, realtime"),
+        (HEAD + "clock: realtime\nplants:\n  sim: {engine: process}\ncontrollers:\n  lqr: {}\n", 5, "in real time"),
+        (HEAD + "clock: realtime\nplants:\n  h: {side: hw}\ncontrollers:\n  lqr: {}\nstarts: [1.0]\n", 5, "at rest"),
+        (HEAD + "experiment: thesis\nclock: lockstep\n", 4, "expected realtime"),
     ],
 )
 def test_a_mistake_is_refused_with_its_line(tmp_path: Path, text: str, line: int, says: str) -> None:
@@ -80,3 +84,18 @@ def test_a_mistake_is_refused_with_its_line(tmp_path: Path, text: str, line: int
 def test_unknown_study_lists_those_there_are() -> None:
     with pytest.raises(ParameterError, match="pid_vs_lqr"):
         load_study("pid_vs_lqg")
+
+
+def test_a_study_says_whether_it_keeps_the_time_of_the_wall(tmp_path: Path) -> None:
+    study = load_study(study_file(tmp_path, HEAD + BODY + "clock: realtime\n"))
+    assert study.realtime
+    (run,) = study.runs
+    assert run.spec is not None
+    program = run.spec.plant_program(4)
+    assert program.parameters["clock"] == "realtime"
+    assert not any(name.startswith("lockstep") for name in program.parameters)
+    assert run.spec.controller_program().parameters["use_sim_time"] is False
+    named = load_study(study_file(tmp_path, HEAD + "experiment: gravity\nclock: realtime\n"))
+    assert named.runs[0].arguments[-1] == "--realtime"
+    assert not load_study("gravity").realtime
+    assert load_study("thesis").realtime

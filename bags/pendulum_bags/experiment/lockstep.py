@@ -1,10 +1,11 @@
-"""One run as fast as possible: the same nodes over the same DDS, in step with each other instead of with the wall."""
+"""One run of the nodes over DDS: in step with each other as fast as they answer, or in step with the wall."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from pathlib import Path
 
+from pendulum_bags.comparison.run_data import END_EVENT, START_EVENT
 from pendulum_bags.experiment.conductor_node import Conductor, PlantClient, RecorderClient
 from pendulum_bags.experiment.domain import reserve_domain
 from pendulum_bags.experiment.processes import Child, ProcessSet, ros_environment, start_recorder
@@ -15,10 +16,14 @@ from pendulum_lqr.controller import controller_parameters
 from pendulum_msgs_py import names
 from pendulum_msgs_py.angles import UPRIGHT
 from pendulum_msgs_py.errors import BagError, FaultError
+from pendulum_msgs_py.values import NANOSECONDS
 
 __all__ = ["finish_recording", "record_run", "run_lockstep", "wait_until_all_hear_each_other"]
 
 _START_TIMEOUT = 60.0
+_LOOP_NICENESS = -10
+_LAST_WORDS = 0.2
+"""Time in which the recorder hears the end of a run in real time [s]."""
 _SLOWEST = 10.0
 """Slowest pace at which a lockstep run still counts as alive, wall time per simulated time."""
 _LISTENERS = 3
@@ -84,7 +89,7 @@ def run_lockstep(
 def record_run(
     bag: Path, spec: RunSpec, *, domain: int | None = None, on_wait: Callable[[], None] = lambda: None
 ) -> Path:
-    """Carry out one run over DDS, in lockstep, and record it.
+    """Carry out one run over DDS, in lockstep or in real time as it says, and record it.
 
     Args:
         bag: Folder of the bag.
@@ -107,13 +112,19 @@ def record_run(
     ):
         metadata = logs / "metadata.json"
         write_json(metadata, spec.metadata())
-        recorder = start_recorder(processes, bag, namespace, metadata, spec.storage, log_time="header")
+        simulated = spec.simulated_time
+        log_time = "header" if simulated else "receive"
+        recorder = start_recorder(processes, bag, namespace, metadata, spec.storage, log_time=log_time)
         program = spec.plant_program(_LISTENERS + 1)
-        processes.start_node(spec.controller_program())
-        processes.start_node(spec.disturbance_program())
-        processes.start_node(program)
+        niceness = 0 if simulated else _LOOP_NICENESS
+        processes.start_node(spec.controller_program(), niceness=niceness)
+        processes.start_node(spec.disturbance_program(), niceness=niceness)
+        processes.start_node(program, niceness=niceness)
         client = PlantClient(conductor, namespace, program.node_name, watch=False)
-        wait_until_all_hear_each_other(conductor, namespace, _RUN_LISTENERS)
+        wait_until_all_hear_each_other(conductor, namespace, _RUN_LISTENERS, clock=simulated)
+        if not simulated:
+            _keep_time(conductor, client, spec, processes, recorder)
+            return bag
         if spec.side == "hw":
             client.arm()
         client.watch()
@@ -126,6 +137,36 @@ def record_run(
         )
         finish_recording(conductor, processes, recorder, client, spec.steps + 1)
     return bag
+
+
+def _keep_time(
+    conductor: Conductor, plant: PlantClient, spec: RunSpec, processes: ProcessSet, recorder: Child
+) -> None:
+    """Let a run in real time go, wait for its length by the plant's clock, and put the plant to rest."""
+    plant.watch()
+    try:
+        if spec.side == "hw":
+            plant.arm()
+        else:
+            plant.resume(_START_TIMEOUT)
+        conductor.wait_for("states", lambda: plant.sample is not None, _START_TIMEOUT)
+        assert plant.sample is not None
+        plant.mark(START_EVENT)
+        end_ns = plant.sample.stamp_ns + round(spec.duration * NANOSECONDS)
+        conductor.wait_for(
+            f"{spec.duration:g} s of real time", lambda: _has_reached(plant, end_ns), _START_TIMEOUT + spec.duration
+        )
+        plant.mark(END_EVENT)
+        conductor.spin(_LAST_WORDS)
+    finally:
+        plant.disarm_quietly()
+    if processes.finish(recorder) != 0:
+        raise FaultError(recorder.last_words(1))
+
+
+def _has_reached(plant: PlantClient, end_ns: int) -> bool:
+    plant.check_mode()
+    return plant.sample is not None and plant.sample.stamp_ns >= end_ns
 
 
 def _is_finished(plant: PlantClient) -> bool:

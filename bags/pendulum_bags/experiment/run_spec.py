@@ -1,4 +1,4 @@
-"""One run as a value: which plant, controller, disturbance, start and seed. Studies are made of these."""
+"""One run as a value: which plant, controller, disturbance, start, seed and clock. Studies are made of these."""
 
 from __future__ import annotations
 
@@ -18,16 +18,22 @@ from pendulum_msgs_py.graph import NodeProgram
 from pendulum_msgs_py.parameters import reject_unknown, validate
 from pendulum_msgs_py.plant_parameters import load_plant
 
-__all__ = ["PERIODS", "SIDES", "RunSpec"]
+__all__ = ["CLOCKS", "EMULATOR_WATCHDOG", "PERIODS", "SIDES", "RunSpec"]
 
+CLOCKS = ("lockstep", "realtime")
 SIDES = ("sim", "hw")
+EMULATOR_WATCHDOG = 25
+"""Feedback periods that the bridge waits for an emulator, on a machine that does other things too."""
+_AT_REST = 1e-9
 PERIODS = {"sim": 0.002, "hw": 0.01}
 """Period of the states of each plant, as in the thesis [s]."""
+_OF_THE_NODE = {"duration", "file"}
+"""Parameters of the disturbance that are the node's, not the signal's."""
 
 
 @dataclass(frozen=True)
 class RunSpec:
-    """One run of one plant under one controller and one disturbance, in simulated time.
+    """One run of one plant under one controller and one disturbance.
 
     Attributes:
         side: ``sim`` for the simulator, ``hw`` for the emulated hardware.
@@ -44,6 +50,7 @@ class RunSpec:
         method: Integrator of the simulator; Euler as in the thesis.
         plant_parameters: Further parameters of the plant's node, such as sensor noise.
         storage: Storage of the bag.
+        clock: ``lockstep`` for as fast as the nodes answer each other, ``realtime`` for the wall's time.
     """
 
     side: str = "sim"
@@ -60,11 +67,20 @@ class RunSpec:
     method: str = "euler"
     plant_parameters: Mapping[str, Any] = field(default_factory=dict)
     storage: str = "mcap"
+    clock: str = "lockstep"
 
     def __post_init__(self) -> None:
         """Refuse what cannot be run before anything is started."""
         if self.side not in SIDES:
             raise ParameterError(f"side is {self.side!r}; expected sim or hw")
+        if self.clock not in CLOCKS:
+            raise ParameterError(f"clock is {self.clock!r}; expected lockstep or realtime")
+        off_rest = min(abs(self.theta), abs(self.theta - UPRIGHT))
+        if self.clock == "realtime" and self.side == "hw" and off_rest > _AT_REST:
+            # Nobody holds it between its start and the moment in which it is armed.
+            raise ParameterError(
+                f"start angle is {self.theta} rad; expected upright or bottom, where a machine in real time is at rest"
+            )
         for name, value, unit in (("start angle", self.theta, "rad"), ("duration", self.duration, "s")):
             if not math.isfinite(value):
                 raise ParameterError(f"{name} is {value} {unit}; expected a finite number")
@@ -75,9 +91,10 @@ class RunSpec:
         load_plant(self.design_plant)
         given = {**self.controller_parameters, "set_point": self.set_point}
         validate(controller_parameters(self.controller), given, where=f"controller {self.controller}")
-        own = {spec.name for spec in DISTURBANCE_SPECS} | {"duration"}
+        own = {spec.name for spec in DISTURBANCE_SPECS} | _OF_THE_NODE
         reject_unknown(self.disturbance, own, where="disturbance")
-        validate(DISTURBANCE_SPECS, {k: v for k, v in self.disturbance.items() if k != "duration"}, where="disturbance")
+        signal = {k: v for k, v in self.disturbance.items() if k not in _OF_THE_NODE}
+        validate(DISTURBANCE_SPECS, signal, where="disturbance")
 
     @property
     def namespace(self) -> str:
@@ -88,6 +105,11 @@ class RunSpec:
     def period(self) -> float:
         """Time between two states [s]."""
         return PERIODS[self.side]
+
+    @property
+    def simulated_time(self) -> bool:
+        """Whether time is that of the plant and not that of the wall."""
+        return self.clock == "lockstep"
 
     @property
     def steps(self) -> int:
@@ -106,14 +128,16 @@ class RunSpec:
         Args:
             listeners: Subscriptions to its states that it waits for.
         """
-        loop: dict[str, graph.ParameterArgument] = {
-            "clock": "lockstep",
-            "lockstep_inputs": ["effort_command", "disturbance"],
-            "lockstep_subscribers": listeners,
-            "lockstep_duration": float(self.duration),
-            "plant": _absolute(self.plant),
-            **self.plant_parameters,
-        }
+        loop: dict[str, graph.ParameterArgument] = {"clock": self.clock, "plant": _absolute(self.plant)}
+        if self.simulated_time:
+            loop.update(
+                lockstep_inputs=["effort_command", "disturbance"],
+                lockstep_subscribers=listeners,
+                lockstep_duration=float(self.duration),
+            )
+        elif self.side == "hw":
+            loop.update(feedback_watchdog=EMULATOR_WATCHDOG, command_lifetime=0.25)
+        loop.update(self.plant_parameters)
         if self.side == "hw":
             # No hardware is armed by a parameter: the conductor does it, before it becomes the last listener.
             loop.update(initial_position=float(self.theta), seed=self.seed)
@@ -131,14 +155,14 @@ class RunSpec:
                 "plant": _absolute(self.design_plant),
                 "period": self.period,
                 "set_point": float(self.set_point),
-                "use_sim_time": True,
+                "use_sim_time": self.simulated_time,
             },
         )
 
     def disturbance_program(self) -> NodeProgram:
         """Return the disturbance."""
         return graph.disturbance(
-            self.namespace, **self.disturbance_parameters(), autostart=True, use_sim_time=True
+            self.namespace, **self.disturbance_parameters(), autostart=True, use_sim_time=self.simulated_time
         )
 
     def metadata(self) -> dict[str, Any]:
@@ -146,11 +170,10 @@ class RunSpec:
         return {
             "pendulum.run": {
                 **self.to_json(),
-                "experiment": "lockstep",
+                "experiment": self.clock,
                 "plant": self.plant if self.side == "sim" else "emulator",
                 "emulated_plant": self.plant if self.side == "hw" else "",
                 "namespace": self.namespace,
-                "clock": "lockstep",
                 "disturbance": self.disturbance_parameters(),
                 "controller": {"kind": self.controller, **self.controller_parameters},
                 "versions": versions(),

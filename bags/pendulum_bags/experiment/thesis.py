@@ -13,6 +13,7 @@ from pendulum_bags.experiment.domain import reserve_domain
 from pendulum_bags.experiment.processes import Child, ProcessSet, ros_environment, start_recorder
 from pendulum_bags.experiment.progress import PhaseProgress
 from pendulum_bags.experiment.run_folder import write_json
+from pendulum_bags.experiment.run_spec import EMULATOR_WATCHDOG
 from pendulum_bags.experiment.settings import RegulationSettings
 from pendulum_msgs_py import graph
 from pendulum_msgs_py.angles import UPRIGHT
@@ -26,8 +27,6 @@ START_TIMEOUT = 60.0
 """Longest time for all programs to be up; the first start on a cold machine compiles code [s]."""
 LOOP_NICENESS = -10
 """Priority of those who keep deadlines over all else on the machine, where we may take it."""
-EMULATOR_WATCHDOG = 25
-"""Feedback periods that the bridge waits for the emulator on a machine that does other things too."""
 OWN_PROTOCOL_SEED_STEP = 1_000_000
 """Added to the seed for the unpaired simulation, whose noise must not be that of the hardware."""
 SETTLE_TIME = 1.0

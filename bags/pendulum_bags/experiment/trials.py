@@ -13,8 +13,9 @@ from pendulum_bags.experiment.lockstep import finish_recording, wait_until_all_h
 from pendulum_bags.experiment.processes import ProcessSet, ros_environment, start_recorder
 from pendulum_bags.experiment.progress import PhaseProgress
 from pendulum_bags.experiment.run_folder import git_revision, versions, write_json
+from pendulum_bags.experiment.run_spec import EMULATOR_WATCHDOG
 from pendulum_bags.experiment.settings import HARDWARE
-from pendulum_bags.experiment.thesis import EMULATOR_WATCHDOG, LOOP_NICENESS, START_TIMEOUT
+from pendulum_bags.experiment.thesis import LOOP_NICENESS, START_TIMEOUT
 from pendulum_msgs_py import graph, names
 from pendulum_msgs_py.errors import FaultError, ParameterError
 from pendulum_msgs_py.trajectory import RAMP_INCREMENT, RAMP_PERIOD

@@ -12,7 +12,7 @@ from importlib import resources
 from pathlib import Path
 from typing import Any
 
-from pendulum_bags.experiment.run_spec import PERIODS, RunSpec
+from pendulum_bags.experiment.run_spec import CLOCKS, PERIODS, RunSpec
 from pendulum_bags.study.located import LocatedMapping
 from pendulum_msgs_py import noise
 from pendulum_msgs_py.angles import UPRIGHT
@@ -25,8 +25,8 @@ EXPERIMENTS = ("run", "thesis", "inertia_damping", "gravity")
 ANALYSES = ("metrics", "strategies", "pid_vs_lqr", "none")
 STARTS = {"upright": UPRIGHT, "bottom": 0.0}
 _KEYS = (
-    "format", "name", "description", "experiment", "analysis", "duration", "plants", "controllers", "disturbances",
-    "set_points", "starts", "seeds", "repeats", "trials",
+    "format", "name", "description", "experiment", "analysis", "clock", "duration", "plants", "controllers",
+    "disturbances", "set_points", "starts", "seeds", "repeats", "trials",
 )  # fmt: skip
 _PLANT_KEYS = ("side", "plant", "design_plant", "strategy", "method", "engine", "parameters", "hardware")
 _MAX_RUNS = 100_000
@@ -90,6 +90,7 @@ class Study:
         analysis: What is made of the runs.
         runs: The matrix.
         text: The file, as it is kept beside the results.
+        clock: ``lockstep``, as fast as possible, or ``realtime``.
     """
 
     name: str
@@ -98,11 +99,12 @@ class Study:
     analysis: str
     runs: tuple[StudyRun, ...]
     text: str = field(repr=False, default="")
+    clock: str = "lockstep"
 
     @property
     def realtime(self) -> bool:
         """Whether runs keep the wall's time, so that no two of them may share the machine."""
-        return self.experiment == "thesis"
+        return self.clock == "realtime"
 
 
 def shipped_studies() -> dict[str, Path]:
@@ -135,13 +137,16 @@ def load_study(source: str | Path, *, seeds: Sequence[int] | None = None) -> Stu
     if file.get("format", str, None, repr(FORMAT)) != FORMAT:
         file.fail(f"format is {file.values['format']!r}; expected {FORMAT!r}", "format")
     experiment = _choice(file, "experiment", EXPERIMENTS, "run")
+    clock = _choice(file, "clock", CLOCKS, "realtime" if experiment == "thesis" else "lockstep")
+    if experiment == "thesis" and clock != "realtime":
+        file.fail("clock is 'lockstep'; expected realtime, the thesis's experiment knows no other", "clock")
     analysis = _choice(file, "analysis", ANALYSES, "metrics" if experiment == "run" else "none")
     values = list(seeds) if seeds is not None else _seeds(file)
     repeats = file.get("repeats", int, 1, "a whole number >= 1")
     if not 1 <= repeats <= _MAX_RUNS:
         file.fail(f"repeats is {repeats}; expected >= 1 and <= {_MAX_RUNS}", "repeats")
     make = _plain_runs if experiment == "run" else _named_runs
-    runs = tuple(make(file, experiment, values, repeats))
+    runs = tuple(make(file, experiment, clock, values, repeats))
     return Study(
         file.get("name", str, None, "a name"),
         file.get("description", str, "", "a sentence"),
@@ -149,10 +154,11 @@ def load_study(source: str | Path, *, seeds: Sequence[int] | None = None) -> Stu
         analysis,
         runs,
         path.read_text(encoding="utf-8"),
+        clock,
     )
 
 
-def _plain_runs(file: LocatedMapping, _: str, seeds: Sequence[int], repeats: int) -> list[StudyRun]:
+def _plain_runs(file: LocatedMapping, _: str, clock: str, seeds: Sequence[int], repeats: int) -> list[StudyRun]:
     duration = _duration(file)
     plants, controllers = _axis(file, "plants"), _axis(file, "controllers")
     disturbances = _axis(file, "disturbances", {"none": {}})
@@ -190,6 +196,7 @@ def _plain_runs(file: LocatedMapping, _: str, seeds: Sequence[int], repeats: int
                 set_point=float(set_point),
                 duration=duration,
                 seed=seed,
+                clock=clock,
             )
         except ParameterError as error:
             where = next(
@@ -202,12 +209,18 @@ def _plain_runs(file: LocatedMapping, _: str, seeds: Sequence[int], repeats: int
             plants[plant].fail(
                 f"engine is {engine!r}; expected nodes, or process for a plain simulator", "engine"
             )
+        if engine == "process" and (settings.get("parameters") or clock == "realtime"):
+            plants[plant].fail(
+                "engine is 'process'; expected nodes for a plant with parameters of its own, and in real time", "engine"
+            )
         labels = {
             "plant": plant, "controller": controller, "disturbance": disturbance, "set_point": float(set_point),
             "start": start, "seed": seed, "repeat": repeat,
         }  # fmt: skip
         steps = duration / PERIODS[spec.side]
         seconds = 0.05 + 8e-5 * steps if engine == "process" else _NODE_START + _SECONDS_PER_STEP * steps
+        if clock == "realtime":
+            seconds = _NODE_START + duration
         size = 56 * steps if engine == "process" else _BYTES_PER_RUN + _BYTES_PER_STEP[spec.side] * steps
         runs.append(StudyRun(number, labels, spec, engine, (), seconds, round(size)))
     return runs
@@ -219,7 +232,9 @@ def _limit_runs(file: LocatedMapping, axes: Sequence[Sized]) -> None:
         file.fail(f"the matrix has {count} runs; expected at most {_MAX_RUNS}")
 
 
-def _named_runs(file: LocatedMapping, experiment: str, seeds: Sequence[int], repeats: int) -> list[StudyRun]:
+def _named_runs(
+    file: LocatedMapping, experiment: str, clock: str, seeds: Sequence[int], repeats: int
+) -> list[StudyRun]:
     plants = _axis(file, "plants", {"thesis": {}})
     runs = []
     if experiment == "thesis":
@@ -248,7 +263,7 @@ def _named_runs(file: LocatedMapping, experiment: str, seeds: Sequence[int], rep
             ]
             seconds, size = _THESIS_SECONDS, _THESIS_BYTES
         else:
-            arguments += ["--trials", str(trials)]
+            arguments += ["--trials", str(trials), *(["--realtime"] if clock == "realtime" else [])]
             seconds, size = trials * _TRIAL_SECONDS[experiment], trials * _TRIAL_BYTES[experiment]
         labels = {
             "plant": plant, "controller": controller, "disturbance": disturbance, "set_point": 0.0, "start": "",
