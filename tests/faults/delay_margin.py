@@ -33,7 +33,15 @@ from pendulum_msgs_py.angles import UPRIGHT, wrap
 from pendulum_msgs_py.errors import FaultError
 from pendulum_msgs_py.plant_parameters import PlantParameters, write_plant
 from pendulum_msgs_py.values import NANOSECONDS
-from tests.faults.network import Inside, cable_environment, two_machines, wait_for_torque, why_not
+from tests.faults.network import (
+    PEER_ADDRESS,
+    PLANT_ADDRESS,
+    Inside,
+    cable_environment,
+    two_machines,
+    wait_for_torque,
+    why_not,
+)
 from tests.faults.slow_cable import SlowCable
 
 __all__ = [
@@ -48,11 +56,11 @@ __all__ = [
 ]
 
 LIGHT = PlantParameters(inertia=0.1495, damping=0.1, gravity=2.996955, effort_limit=100.0, name="light")
-"""A pendulum that feels delay: that of the preset ``dfki`` without dry friction, with a motor that does not saturate."""
+"""A pendulum that feels delay: the preset ``dfki`` without dry friction, with a motor that does not saturate."""
 Q, R = (1000.0, 1.0), 0.1
 PERIOD = 0.002
 
-_FALLEN = 0.7
+_FALLEN = 0.3
 _SETTLE_NS = 1_000_000_000
 _RECENT_NS = 1_000_000_000
 _POLL = 0.3
@@ -209,7 +217,7 @@ def _loop(folder: Path) -> Iterator[tuple[Path, SlowCable, ProcessSet]]:
     folder.mkdir(parents=True, exist_ok=True)
     write_json(folder / "metadata.json", {"pendulum.run": {"experiment": "network"}})
     plant_file = str(write_plant(folder / "light.yaml", LIGHT))
-    processes = Inside(logs, cable_environment(logs))
+    processes = Inside(logs, cable_environment(logs, static_peer=PEER_ADDRESS))
     with two_machines(slow=True) as (plant, peer, cable), processes:
         assert cable is not None
         processes.namespace = plant
@@ -222,6 +230,7 @@ def _loop(folder: Path) -> Iterator[tuple[Path, SlowCable, ProcessSet]]:
             graph.disturbance("/sim", kind="uniform", amplitude=_NOISE, hold_time=0.01, autostart=True)
         )
         processes.namespace = peer
+        processes.environment = cable_environment(logs, static_peer=PLANT_ADDRESS)
         processes.start_node(
             graph.controller("/sim", controller="lqr", plant=plant_file, q=list(Q), r=R, period=PERIOD)
         )

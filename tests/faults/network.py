@@ -23,11 +23,23 @@ from pendulum_msgs_py.errors import FaultError, PendulumError
 from tests.faults.bag_property import COMMAND_LIFE
 from tests.faults.slow_cable import DEVICE, SlowCable
 
-__all__ = ["CutReport", "Inside", "cable_environment", "cut_cable", "two_machines", "wait_for_torque", "why_not"]
+__all__ = [
+    "PEER_ADDRESS",
+    "PLANT_ADDRESS",
+    "CutReport",
+    "Inside",
+    "cable_environment",
+    "cut_cable",
+    "two_machines",
+    "wait_for_torque",
+    "why_not",
+]
 
 _EFFORT_LIMIT = 5.0
 _START_TIMEOUT = 60.0
 _PLANT, _PEER = "plant", "peer"
+_SUBNET = "10.213.7"
+PLANT_ADDRESS, PEER_ADDRESS = f"{_SUBNET}.1", f"{_SUBNET}.2"
 
 
 @dataclass(frozen=True)
@@ -85,7 +97,7 @@ def two_machines(*, slow: bool = False) -> Iterator[tuple[str, str, SlowCable | 
         else:
             _ip("link", "add", DEVICE, "netns", names[0], "type", "veth", "peer", "name", DEVICE, "netns", names[1])
         for number, name in enumerate(names, start=1):
-            _ip("-n", name, "address", "add", f"10.213.7.{number}/24", "dev", DEVICE)
+            _ip("-n", name, "address", "add", f"{_SUBNET}.{number}/24", "dev", DEVICE)
             for device in ("lo", DEVICE):
                 _ip("-n", name, "link", "set", device, "up")
             # Discovery is by multicast, which wants a route.
@@ -106,14 +118,19 @@ class Inside(ProcessSet):
         return super().start(name, _inside(self.namespace, command), **options)
 
 
-def cable_environment(logs: Path) -> dict[str, str]:
-    """Return the environment of nodes that meet over a cable and nothing else."""
+def cable_environment(logs: Path, static_peer: str = "") -> dict[str, str]:
+    """Return the environment of nodes that meet over a cable and nothing else.
+
+    Args:
+        logs: Folder of the logs.
+        static_peer: Address of the other machine, for discovery without multicast that is closed to all others; empty
+            for the whole subnet.
+    """
+    discovery = {"ROS_AUTOMATIC_DISCOVERY_RANGE": "SUBNET"}
+    if static_peer:
+        discovery = {"ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST", "ROS_STATIC_PEERS": static_peer}
     # Shared memory would go around the cable.
-    return {
-        **ros_environment(1, logs),
-        "ROS_AUTOMATIC_DISCOVERY_RANGE": "SUBNET",
-        "FASTDDS_BUILTIN_TRANSPORTS": "UDPv4",
-    }
+    return {**ros_environment(1, logs), **discovery, "FASTDDS_BUILTIN_TRANSPORTS": "UDPv4"}
 
 
 def cut_cable(folder: Path, durations: Sequence[float]) -> list[CutReport]:
