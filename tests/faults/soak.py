@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import json
 import math
+import os
 import tempfile
 import time
 from collections.abc import Sequence
@@ -24,6 +25,7 @@ from pendulum_bags.experiment.conductor_node import Conductor, PlantClient, Reco
 from pendulum_bags.experiment.domain import reserve_domain
 from pendulum_bags.experiment.processes import Child, ProcessSet, ros_environment, start_recorder
 from pendulum_bags.experiment.run_folder import write_json
+from pendulum_bags.experiment.thesis import LOOP_NICENESS
 from pendulum_bags.reader import Bag, read_bag
 from pendulum_msgs_py import graph, names
 from pendulum_msgs_py.executables import cli_main
@@ -101,6 +103,8 @@ class SoakReport:
         jitter_us: Percentiles 50 and 99 of the plant's own loop in its first and its last minute [us].
         lateness_us: Percentiles 50, 99 and 99.9 of the delay from a state's deadline to its arrival, likewise [us].
         overruns: Periods of the simulator's loop that came a whole period late.
+        load: Load of the machine by core, every two seconds; above 1, processes wait for each other.
+        resident: Resident memory of each process over time [bytes], likewise.
         recorders: What each recorder said at its end.
         violations: One sentence for each thing that did not hold.
     """
@@ -111,6 +115,8 @@ class SoakReport:
     jitter_us: list[list[float]] = field(default_factory=list)
     lateness_us: list[list[float]] = field(default_factory=list)
     overruns: int = 0
+    load: list[float] = field(default_factory=list)
+    resident: dict[str, list[int]] = field(default_factory=dict)
     recorders: list[str] = field(default_factory=list)
     violations: list[str] = field(default_factory=list)
 
@@ -143,6 +149,7 @@ def soak(folder: Path, domain: int, minutes: float) -> SoakReport:
                 footprint.times.append(elapsed)
                 footprint.resident.append(process.memory_info().rss)
                 footprint.descriptors.append(process.num_fds())
+            report.load.append(os.getloadavg()[0] / (os.cpu_count() or 1))
             conductor.spin(min(_SAMPLE_PERIOD, max(duration - elapsed, 0.0)))
         # Those who answer first, then the plants, then the recorders: every last word is heard.
         for child in reversed(processes.children.copy()):
@@ -167,7 +174,9 @@ def _start(processes: ProcessSet, conductor: Conductor, folder: Path) -> list[Ch
             start_recorder(processes, folder / f"bag_{namespace[1:]}", namespace, metadata, "mcap")
         )
     for program in _programs():
-        processes.start_node(program)
+        # As in an experiment: who keeps deadlines goes first, who only shows goes last.
+        shows = program.executable in {"viewer", "markers"}
+        processes.start_node(program, niceness=0 if shows else LOOP_NICENESS)
     plant = PlantClient(conductor, "/sim", "simulator", watch=False)
     bridge = PlantClient(conductor, "/hw", "bridge")
     for namespace in ("/sim", "/hw"):
@@ -213,6 +222,7 @@ def _programs() -> list[NodeProgram]:
 
 
 def _judge_footprints(report: SoakReport, footprints: dict[str, Footprint], warm_up: float) -> None:
+    report.resident = {name: footprint.resident for name, footprint in footprints.items()}
     for name, footprint in footprints.items():
         before, after, opened, still = report.footprints[name] = footprint.after(warm_up)
         growth = after / before - 1.0
@@ -323,6 +333,8 @@ def print_report(report: SoakReport, console: Console) -> None:
     for name, column in (("state arrives p50", 0), ("state arrives p99", 1), ("state arrives p99.9", 2)):
         timing.add_row(name, *(f"{minute[column]:.0f} us" for minute in report.lateness_us))
     timing.add_row("overruns in all", "", str(report.overruns))
+    tenth = max(len(report.load) // 10, 1)
+    timing.add_row("load by core", f"{np.mean(report.load[:tenth]):.1f}", f"{np.mean(report.load[-tenth:]):.1f}")
     console.print(timing)
     for sentence in (*report.recorders, *report.violations):
         console.print(sentence, soft_wrap=True)

@@ -20,6 +20,11 @@ from pendulum_msgs_py.graph import NodeProgram
 __all__ = ["Child", "ProcessSet", "ros_environment", "start_recorder"]
 
 _PR_SET_PDEATHSIG = 1
+_RECORDER_NICENESS = -5
+"""Priority of a recorder, where we may take it: behind those who keep deadlines, ahead of all else on the machine.
+
+Kept waiting for seconds, it finds that publishers have overwritten what it had not taken yet.
+"""
 _PATIENCE = 8.0
 """Time that a child has to end after SIGINT before it is killed [s]."""
 
@@ -56,8 +61,15 @@ class ProcessSet:
     children: list[Child] = field(default_factory=list)
 
     def __enter__(self) -> ProcessSet:
-        """Make the folder of the logs."""
-        self.log_folder.mkdir(parents=True, exist_ok=True)
+        """Make the folder of the logs.
+
+        Raises:
+            FaultError: It cannot be made.
+        """
+        try:
+            self.log_folder.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise FaultError(f"log folder {self.log_folder} cannot be created: {error.strerror}") from error
         return self
 
     def __exit__(
@@ -205,4 +217,4 @@ def start_recorder(
         # What is stamped with wall time has no place in a bag whose time is simulated.
         command += ["--exclude", "^/diagnostics$|/transition_event$"]
     command += ["--ros-args", "-r", f"__ns:={namespace}"]
-    return processes.start(f"recorder_{bag.name}", command, ends_last=True)
+    return processes.start(f"recorder_{bag.name}", command, ends_last=True, niceness=_RECORDER_NICENESS)
