@@ -215,12 +215,15 @@ def _study(
 def _analyse(folder: Path, found: Study, records: Sequence[dict[str, Any]]) -> dict[str, Any]:
     from pendulum_bags.experiment.run_folder import write_json
     from pendulum_bags.study import pid_vs_lqr as pid_analysis
+    from pendulum_bags.study import pooled
     from pendulum_bags.study import strategies as strategies_analysis
     from pendulum_bags.study.results import group_runs, groups_to_json
 
     result: dict[str, Any] = {"study": found.name, "runs": len(records)}
     if found.experiment == "run":
         result["groups"] = groups_to_json(group_runs(records))
+    else:
+        result["pooled"] = pooled.analyse(folder, found, records)
     if found.analysis == "strategies":
         result["strategies"] = strategies_analysis.analyse(folder, found)
     elif found.analysis == "pid_vs_lqr":
@@ -253,6 +256,7 @@ def _print_result(
     console: Console, found: Study, folder: Path, result: dict[str, Any], records: Sequence[dict[str, Any]]
 ) -> None:
     from pendulum_bags.study import pid_vs_lqr as pid_analysis
+    from pendulum_bags.study import pooled
     from pendulum_bags.study import strategies as strategies_analysis
     from pendulum_bags.study.results import group_runs
 
@@ -262,6 +266,8 @@ def _print_result(
         pid_analysis.print_table(console, result["pid_vs_lqr"])
     elif found.experiment == "run":
         _print_groups(console, group_runs(records))
+    else:
+        pooled.print_table(console, result["pooled"])
     wall = sum(record["wall_s"] for record in records)
     simulated = sum(record["simulated_s"] or 0.0 for record in records)
     told = f", {simulated:.0f} s simulated" if simulated else ""
