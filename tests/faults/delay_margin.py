@@ -185,6 +185,8 @@ def find_delay_margin(folder: Path, *, first: float = 0.008, step: float = 0.001
             if fallen:
                 break
         means = cable.means
+    if len(spans) == 1:
+        raise FaultError("the pendulum falls without any delay of the cable: this machine is too busy to measure one")
     steps = [_step(bag, *span, held=index + 1 < len(spans)) for index, span in enumerate(spans)]
     return MarginReport(steps, predicted, continuous, means)
 
@@ -264,7 +266,7 @@ def _step(bag: Path, delay: float, began_ns: int, ended_ns: int, *, held: bool) 
 
 
 def _loss(bag: Path, loss: float, began_ns: int, ended_ns: int, held: bool) -> LossReport:
-    start = began_ns + _SETTLE_NS
+    start = began_ns + min(_SETTLE_NS, (ended_ns - began_ns) // 3)
     with read_bag(bag, [_STATES, _COMMANDS, _APPLIED], start=start, stop=ended_ns) as opened:
         states, commands = opened.array(_STATES), opened.array(_COMMANDS)
         applied = opened.array(_APPLIED)
