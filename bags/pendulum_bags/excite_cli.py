@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 import json
-import subprocess
-import sys
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from pendulum_msgs_py.executables import cli_main
+from pendulum_msgs_py.errors import DataError
+from pendulum_msgs_py.executables import EXIT_INTERRUPTED, cli_main
+
+if TYPE_CHECKING:
+    from pendulum_bags.identification.excitation import Excitation, Limits
 
 __all__ = ["app", "main"]
 
@@ -36,13 +38,30 @@ def excite(
     seed: Annotated[int, typer.Option(help="Of the search.")] = 0,
     trials: Annotated[int, typer.Option(help="Candidates to try, and again to improve the best.")] = 60,
     out: Annotated[Path, typer.Option(help="CSV (time, torque) to write.")] = Path("excitation.csv"),
-    play: Annotated[bool, typer.Option(help="Play it through the disturbance node when designed.")] = False,
-    namespace: Annotated[str, typer.Option(help="Of the plant, for --play.")] = "/sim",
+    play: Annotated[bool, typer.Option(help="Play it when it is designed, and record.")] = False,
+    on: Annotated[
+        str,
+        typer.Option(
+            help="With --play: sim or emulator, started for it and run in lockstep; or running, the plant in "
+            "--namespace."
+        ),
+    ] = "sim",
+    bag: Annotated[
+        Path | None,
+        typer.Option(help="With --play: bag to write; by default the name of --out without .csv."),
+    ] = None,
+    namespace: Annotated[str, typer.Option(help="With --on running: of the plant.")] = "/sim",
+    arm: Annotated[
+        bool, typer.Option(help="With --on running: arm the plant, and disarm it at the end. It will move.")
+    ] = False,
+    domain: Annotated[int | None, typer.Option(help="ROS domain; by default ROS_DOMAIN_ID.")] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print the result as JSON.")] = False,
 ) -> None:
     """Design the torque over time that tells most about a plant within limits, starting at rest.
 
-    Example: python -m pendulum_bags excite --plant dfki --max-effort 4 --max-angle 2 --out excitation.csv
+    A played excitation starts and ends at rest, with nobody else commanding the plant, and ends by itself.
+
+    Example: python -m pendulum_bags excite --plant dfki --max-effort 1.5 --max-angle 2 --out excitation.csv --play
     """
     from pendulum_bags.identification.excitation import KINDS, Limits, design_excitation
     from pendulum_bags.identification.model import UNITS
@@ -62,12 +81,13 @@ def excite(
         seed=seed,
         trials=trials,
     )
+    if on not in {"sim", "emulator", "running"}:
+        raise DataError(f"on is {on!r}; expected sim, emulator or running")
+    if max_effort is not None and max_effort > prior.effort_limit:
+        raise DataError(
+            f"max_effort is {max_effort:g} N m; expected at most {prior.effort_limit:g} N m, the plant's limit"
+        )
     design.write(out)
-    command = [
-        *(sys.executable, "-m", "pendulum_lqr", "disturbance", "--ros-args", "-r", f"__ns:={namespace}"),
-        *("-p", "kind:=from_bag", "-p", f"file:={out.resolve()}", "-p", "autostart:=true"),
-        *("-p", f"duration:={float(duration)}"),
-    ]
     if as_json:
         content = {
             "kind": design.kind,
@@ -97,14 +117,49 @@ def excite(
             f"{abs(design.position).max():.3g} rad from hanging",
             highlight=False,
         )
-        console.print(
-            f"wrote {out}; play it, while a controller answers the plant, with\n  python {' '.join(command[1:])}",
-            highlight=False,
-            soft_wrap=True,
-        )
+        console.print(f"wrote {out}", highlight=False)
     if play:
-        # The node is a program of its own, as on a robot: this command ends when it does.
-        raise typer.Exit(subprocess.run(command, check=False).returncode)
+        target = bag or out.with_suffix("")
+        _play(
+            design, limits, out, target, plant, on, namespace, arm=arm, noise=noise, seed=seed, domain=domain
+        )
+        typer.echo(f"played and recorded; next\n  python -m pendulum_bags identify {target}", err=as_json)
+
+
+def _play(
+    design: Excitation,
+    limits: Limits,
+    file: Path,
+    bag: Path,
+    plant: str,
+    on: str,
+    namespace: str,
+    *,
+    arm: bool,
+    noise: float,
+    seed: int,
+    domain: int | None,
+) -> None:
+    from pendulum_bags.experiment.excitation import ExcitationPlay, play_in_lockstep, play_on_running_plant
+
+    period = float(design.time[1] - design.time[0])
+    prediction: dict[str, Any] = {
+        "kind": design.kind,
+        "plant": plant,
+        "predicted": design.predicted,
+        "noise": noise,
+    }
+    duration = period * len(design.time)
+    play = ExcitationPlay(file, duration, period, limits.effort, limits.speed, limits.angle, prediction)
+    try:
+        if on == "running":
+            play_on_running_plant(bag, play, f"/{namespace.strip('/')}", arm=arm, domain=domain)
+        else:
+            side = "sim" if on == "sim" else "hw"
+            play_in_lockstep(bag, play, side=side, plant=plant, noise=noise, seed=seed, domain=domain)
+    except KeyboardInterrupt:
+        typer.echo("interrupted: the torque is zero, all programs have ended", err=True)
+        raise typer.Exit(EXIT_INTERRUPTED) from None
 
 
 def main(argv: Sequence[str] | None = None) -> int:

@@ -157,15 +157,17 @@ def _print_result(result: IdentificationResult, out: Path | None) -> None:
 
     console = Console()
     table = Table(title=f"Identified by output error, friction {result.fit.chosen.friction}")
-    for heading in ("parameter", "value", "95 % interval", "unit"):
+    predicted = result.predicted
+    for heading in ("parameter", "value", "95 % interval", *(["predicted"] if predicted else []), "unit"):
         table.add_column(heading)
     for key in (*result.fit.chosen.free, "natural_frequency"):
         unit = UNITS.get(key, "rad/s")
         interval = result.uncertainty.intervals.get(key)
         value = result.model[key] if key in UNITS else result.model.natural_frequency
-        table.add_row(
-            key, f"{value:.5g}", f"{interval.low:.4g} to {interval.high:.4g}" if interval else "-", unit
-        )
+        cells = [key, f"{value:.5g}", f"{interval.low:.4g} to {interval.high:.4g}" if interval else "-"]
+        if predicted:
+            cells.append(f"+-{predicted[key]:.2g}" if key in predicted else "-")
+        table.add_row(*cells, unit)
     console.print(table)
     models = Table(title="Friction models")
     for heading in ("model", "held-out rms \\[mrad]", "training rms \\[mrad]", ""):

@@ -69,7 +69,7 @@ def staircase_recording(seed: int, trial: int) -> Recording:
     """Return one trial of experiment 2, from 1, with its phases."""
     port = _port(1000 * seed + trial, flat=False, strategy=Strategy.PARALLEL_PWM)
     records: list[tuple[float, Feedback]] = []
-    phases = []
+    phases: list[tuple[float, str, dict[str, object]]] = []
     begin = 0.0
     for phase in staircase(trial):
         phases.append((begin, phase.name, {}))

@@ -85,7 +85,33 @@ class IdentificationResult:
             said.append(
                 "There is one window only: no held-out score; give a longer recording or a shorter --window."
             )
-        return [*said, *self.tests.sentences, *self.uncertainty.sentences]
+        return [*said, *self._calibration(), *self.tests.sentences, *self.uncertainty.sentences]
+
+    @property
+    def predicted(self) -> dict[str, float]:
+        """Half widths of the intervals that the design of the excitation predicted; empty for other recordings."""
+        if len(self.fit.pieces) != 1:
+            return {}
+        design = self.fit.pieces[0].recording.meta.get("pendulum.excitation")
+        values = design.get("predicted") if isinstance(design, Mapping) else None
+        if not isinstance(values, Mapping):
+            return {}
+        return {
+            name: float(width)
+            for name, width in values.items()
+            if isinstance(width, (int, float)) and 0.0 < width < np.inf and name in self.uncertainty.intervals
+        }
+
+    def _calibration(self) -> list[str]:
+        ratios = {}
+        for name, width in self.predicted.items():
+            interval = self.uncertainty.intervals[name]
+            ratios[name] = 0.5 * (interval.high - interval.low) / width
+        if not ratios:
+            return []
+        listing = ", ".join(f"{name} {ratio:.2g}" for name, ratio in ratios.items())
+        text = f"Half widths obtained over those that the design of the excitation predicted: {listing}; they are 1 "
+        return [text + "where the prior plant and the sensor noise were true and the model misses nothing."]
 
     def to_dict(self) -> dict[str, Any]:
         """Return everything as plain JSON values."""
@@ -117,6 +143,7 @@ class IdentificationResult:
             "correlation": self.uncertainty.correlation.tolist(),
             "condition_number": self.uncertainty.condition_number,
             "interval_basis": self.uncertainty.basis,
+            "predicted_half_widths": self.predicted,
             "candidates": [
                 {
                     "friction": c.friction,
@@ -156,13 +183,8 @@ class IdentificationResult:
             raise DataError(f"plant file is {target.name!r}; expected a name that ends in .yaml")
         candidate = self.plant_candidate
         same = candidate is self.fit.chosen
-        intervals = {}
         plant = self.plant(name, effort_limit)
-        if same:
-            names = [f for f in PlantParameters.__dataclass_fields__ if f in self.uncertainty.intervals]
-            for field in names:
-                interval = self.uncertainty.intervals[field]
-                intervals[field] = (interval.low, interval.high)
+        intervals, remarks = self._file_intervals(plant) if same else ({}, [])
         torque = self.model.input_kind in {"effort", "position_goal"}
         remark = "torques are per unit of inertia: the recording does not fix their scale"
         provenance: dict[str, Any] = {
@@ -174,7 +196,11 @@ class IdentificationResult:
             "training_rms_rad": candidate.training_rms,
             "input_gain": candidate.solution.model["input_gain"],
             "python": platform.python_version(),
-            "remarks": [*([] if torque or self.fit.options.fix_scale else [remark]), *self.sentences()],
+            "remarks": [
+                *([] if torque or self.fit.options.fix_scale else [remark]),
+                *remarks,
+                *self.sentences(),
+            ],
         }
         if not same:
             provenance["remarks"].insert(
@@ -184,6 +210,31 @@ class IdentificationResult:
         write_plant(target, plant, provenance=provenance, intervals=intervals)
         target.with_suffix(".json").write_text(json.dumps(self.to_dict(), indent=2) + "\n", encoding="utf-8")
         return target
+
+    def _file_intervals(self, plant: PlantParameters) -> tuple[dict[str, tuple[float, float]], list[str]]:
+        """Return the intervals of what the plant file holds, and remarks on those that are of something else."""
+        intervals: dict[str, tuple[float, float]] = {}
+        remarks = []
+        for field, interval in self.uncertainty.intervals.items():
+            if field not in PlantParameters.__dataclass_fields__:
+                continue
+            value = float(getattr(plant, field))
+            # A delay that may be 0 keeps the part of its interval that a plant can have.
+            low = max(interval.low, 0.0) if field == "transport_delay" else interval.low
+            if low <= value <= interval.high:
+                intervals[field] = (low, interval.high)
+            else:
+                remarks.append(
+                    f"{field} is {value:g} {UNITS[field]} here, and {interval.value:.5g} ({interval.low:.5g} to "
+                    f"{interval.high:.5g}) {UNITS[field]} in the recording: {_DIFFERENCES.get(field, 'see the JSON')}"
+                )
+        return intervals, remarks
+
+
+_DIFFERENCES = {
+    "transport_delay": "an input stamped late, which is no delay of the plant",
+    "damping": "that of the drive, switched on, is added",
+}
 
 
 def identify(

@@ -82,6 +82,13 @@ def plain_sentences(
                 f"firm: w0 = {frequency.value:.3f} rad/s +-{100 * frequency.relative:.1f} %. A torque known "
                 "independently, or a known mass and length, would fix the scale."
             )
+    delay = intervals.get("transport_delay")
+    if delay is not None and delay.high < 0.0:
+        said.append(
+            f"The input acts {-1e3 * delay.value:.3g} ms before its stamps ({-1e3 * delay.high:.3g} to "
+            f"{-1e3 * delay.low:.3g} ms): it was stamped late, by a filter or another clock. That belongs to the "
+            "recording, not to the pendulum: a plant file gets no delay from it."
+        )
     for name in names:
         interval = intervals[name]
         if interval.relative > 0.3 and name not in {"torque_offset", "angle_offset", "transport_delay"}:
