@@ -18,6 +18,7 @@ NODES = (
     ("markers", "pendulum_sim.markers_node", ("SPECS",)),
     ("bridge", "pendulum_hw_bridge.bridge_node", ("SPECS",)),
     ("disturbance", "pendulum_lqr.disturbance_node", ("DISTURBANCE_SPECS", "NODE_SPECS")),
+    ("effort_adapter", "pendulum_lqr.effort_adapter_node", ("NODE_SPECS",)),
     ("recorder", "pendulum_bags.recorder_node", ("SPECS",)),
     ("play", "pendulum_bags.topic_replay_node", ("SPECS",)),
 )

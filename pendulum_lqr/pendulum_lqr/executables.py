@@ -5,5 +5,6 @@ __all__ = ["EXECUTABLES"]
 EXECUTABLES: dict[str, str] = {
     "controller": "pendulum_lqr.controller_node:main",
     "disturbance": "pendulum_lqr.disturbance_node:main",
+    "effort_adapter": "pendulum_lqr.effort_adapter_node:main",
     "design": "pendulum_lqr.design_cli:main",
 }

@@ -21,6 +21,7 @@ from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.executables import cli_main
 from pendulum_msgs_py.names import JOINT, LINK
 from pendulum_msgs_py.plant_parameters import PlantParameters, load_plant
+from pendulum_sim.ros2_control_tags import add_ros2_control
 
 __all__ = ["LinkShape", "link_shape", "main", "mjcf", "urdf"]
 
@@ -67,11 +68,13 @@ def link_shape(parameters: PlantParameters) -> LinkShape:
     return LinkShape(mass, length, parameters.inertia - at_bob, min(radius, 0.4 * length))
 
 
-def urdf(parameters: PlantParameters) -> str:
+def urdf(parameters: PlantParameters, *, ros2_control: str = "none", namespace: str = "/sim") -> str:
     """Return the URDF of the link, for RViz and robot_state_publisher; the joint bears the contract's name.
 
     Args:
         parameters: The plant.
+        ros2_control: Hardware for ros2_control: ``none``, ``gz`` or ``topic_based``.
+        namespace: Namespace of the plant behind ``topic_based``.
     """
     shape = link_shape(parameters)
     drive = parameters.drivetrain
@@ -102,6 +105,7 @@ def urdf(parameters: PlantParameters) -> str:
     _add(joint, "axis", xyz="0 -1 0")
     _add(joint, "limit", effort=_n(parameters.effort_limit), velocity=_n(speed))
     _add(joint, "dynamics", damping=_n(parameters.damping), friction=_n(parameters.coulomb_friction))
+    add_ros2_control(robot, ros2_control, namespace, parameters.effort_limit)
     return _text(robot)
 
 
@@ -239,15 +243,21 @@ def export(
     plant: Annotated[str, typer.Option(help="Preset or path of a plant file.")] = "thesis",
     kind: Annotated[str, typer.Option("--format", help="urdf or mjcf.")] = "urdf",
     output: Annotated[Path | None, typer.Option(help="File to write; standard output by default.")] = None,
+    ros2_control: Annotated[
+        str, typer.Option(help="In a URDF, hardware for ros2_control: none, gz (Gazebo) or topic_based (our plants).")
+    ] = "none",
+    namespace: Annotated[str, typer.Option(help="Namespace of the plant behind topic_based.")] = "/sim",
 ) -> None:
     """Write the URDF or MJCF of a plant.
 
     Example: python -m pendulum_sim export_model --plant x5_9 --format mjcf --output x5_9.xml
     """
-    writers = {"urdf": urdf, "mjcf": mjcf}
-    if kind not in writers:
+    if kind not in {"urdf", "mjcf"}:
         raise ParameterError(f"format is {kind!r}; expected urdf or mjcf")
-    text = writers[kind](load_plant(plant))
+    if kind == "mjcf" and ros2_control != "none":
+        raise ParameterError(f"ros2_control is {ros2_control!r} for mjcf; expected --format urdf, MuJoCo knows none")
+    parameters = load_plant(plant)
+    text = mjcf(parameters) if kind == "mjcf" else urdf(parameters, ros2_control=ros2_control, namespace=namespace)
     if output is None:
         typer.echo(text, nl=False)
         return

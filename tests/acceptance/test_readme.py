@@ -18,7 +18,7 @@ PAGES = sorted(
     for path in PROJECT.rglob("*.md")
     if not {".venv", "build", "install", "runs"} & set(path.relative_to(PROJECT).parts)
 )
-NODES = {"simulator", "bridge", "controller", "disturbance", "record"}
+NODES = {"simulator", "bridge", "controller", "disturbance", "effort_adapter", "record"}
 TESTED_ELSEWHERE = {
     "make experiment": "tests/acceptance/test_experiment.py",
     "make test": "this very run",
