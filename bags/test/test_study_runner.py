@@ -11,7 +11,7 @@ import pytest
 
 from pendulum_bags.experiment.in_process import simulate
 from pendulum_bags.experiment.run_spec import RunSpec
-from pendulum_bags.study import runner
+from pendulum_bags.study import pooled, runner
 from pendulum_bags.study.results import collect, episode_of_run, group_runs, run_metrics
 from pendulum_bags.study.runner import open_study_folder, read_record, run_study
 from pendulum_bags.study.study_file import Study, load_study
@@ -121,3 +121,26 @@ def test_run_survives_the_way_through_json() -> None:
     assert RunSpec.from_json(json.loads(json.dumps(spec.to_json()))) == spec
     with pytest.raises(ParameterError, match="unknown parameter"):
         RunSpec.from_json({**spec.to_json(), "colour": "red"})
+
+
+def test_hands_of_an_identification_experiment_are_pooled(tmp_path: Path) -> None:
+    path = tmp_path / "hands.yaml"
+    path.write_text(
+        "format: pendulum_study/1\nname: hands\nexperiment: inertia_damping\nseeds: [1, 2, 3]\n", encoding="utf-8"
+    )
+    hands = load_study(path)
+    records = []
+    for run, damping in zip(hands.runs, (11.0, 12.0, 99.0), strict=True):
+        place = tmp_path / "runs" / run.name / "run"
+        place.mkdir(parents=True)
+        found = {"average": {"damping": damping}, "intervals": {"damping": [damping - 0.1, damping + 0.1]}}
+        (place / "identified.json").write_text(json.dumps(found), encoding="utf-8")
+        records.append({"number": run.number, "status": "failed" if damping == 99.0 else "done"})
+    result = pooled.analyse(tmp_path, hands, records)
+    assert [row["seed"] for row in result["identified"]] == [1, 2]
+    # Student's t of one degree of freedom at 97.5 %: 12.706.
+    half = 12.706204736174698 * math.sqrt(0.5) / math.sqrt(2.0)
+    assert result["pooled"]["damping"] == pytest.approx({"mean": 11.5, "low": 11.5 - half, "high": 11.5 + half})
+    (tmp_path / "runs" / hands.runs[0].name / "run" / "identified.json").write_text("{}", encoding="utf-8")
+    with pytest.raises(DataError, match="holds no identification"):
+        pooled.analyse(tmp_path, hands, records)

@@ -1,13 +1,25 @@
-"""Plant and controller on two machines, and a cable pulled; ``python -m tests.faults.network`` also for 30 s."""
+"""Plant and controller on two machines, and a cable pulled; ``python -m tests.faults.network`` also for 30 s.
+
+``python -m tests.faults.delay_margin`` delays that cable until the pendulum falls.
+"""
 
 from __future__ import annotations
 
+import subprocess
+import sys
+from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 
+from pendulum_lqr.design import continuous_lqr
+from pendulum_lqr.model import linearise
+from pendulum_sim.batch import simulate_batch
 from tests.faults.bag_property import COMMAND_LIFE, check_bag
-from tests.faults.network import cut_cable, why_not
+from tests.faults.delay_margin import LIGHT, PERIOD, Q, R, predicted_margin
+from tests.faults.network import PLANT_ADDRESS, cut_cable, two_machines, why_not
+from tests.faults.slow_cable import SlowCable
 
 _MACHINE_PATIENCE = 0.060
 
@@ -22,6 +34,81 @@ def test_a_pulled_cable_ends_the_torque_and_a_plugged_one_brings_it_back(tmp_pat
     assert report.largest <= 5.0
     (record,) = check_bag(tmp_path / "bag", limit=5.0, allowance=_MACHINE_PATIENCE)
     assert record.violations == ()
+
+
+_ECHO = """
+import socket
+s = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+s.bind(("", 5005))
+print("ready", flush=True)
+while True:
+    text, sender = s.recvfrom(2000)
+    s.sendto(text, sender)
+"""
+_ASK = f"""
+import socket, statistics, time
+s = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+s.settimeout(0.2)
+times, lost = [], 0
+for _ in range(40):
+    began = time.monotonic()
+    s.sendto(b"x", ("{PLANT_ADDRESS}", 5005))
+    try:
+        s.recv(100)
+        times.append(time.monotonic() - began)
+    except TimeoutError:
+        lost += 1
+print(min(times), lost)
+"""
+
+
+@pytest.mark.timeout(60)
+def test_cable_delays_and_loses_what_it_is_told_to() -> None:
+    reason = why_not()
+    if reason:
+        pytest.skip(reason)
+    with two_machines(slow=True) as (plant, other, cable):
+        assert isinstance(cable, SlowCable)
+        echo = subprocess.Popen(
+            ["ip", "netns", "exec", plant, sys.executable, "-c", _ECHO], stdout=subprocess.PIPE, text=True
+        )
+        try:
+            assert echo.stdout is not None
+            assert echo.stdout.readline() == "ready\n"
+            quick, lost = _ask(other)
+            assert (quick < 0.008, lost) == (True, 0)
+            cable.set(0.010)
+            slow, lost = _ask(other)
+            # Nobody is faster than the cable; how much slower is a question of the machine.
+            assert slow >= 0.020
+            assert lost == 0
+            cable.set(0.0, 0.3)
+            assert 5 <= _ask(other)[1] <= 35
+        finally:
+            echo.kill()
+            echo.wait(10.0)
+            echo.stdout.close()
+
+
+def _ask(namespace: str) -> tuple[float, int]:
+    done = subprocess.run(
+        ["ip", "netns", "exec", namespace, sys.executable, "-c", _ASK], capture_output=True, text=True, timeout=40,
+        check=True,
+    )  # fmt: skip
+    fastest, lost = done.stdout.split()
+    return float(fastest), int(lost)
+
+
+def test_predicted_margin_is_where_the_simulated_loop_turns_unstable() -> None:
+    predicted, continuous = predicted_margin()
+    assert 0.0 < continuous - predicted < PERIOD
+    K = continuous_lqr(linearise(LIGHT), Q, R).K
+    ends = []
+    for delay in (0.93 * predicted, 1.07 * predicted):
+        plant = replace(LIGHT, transport_delay=delay)
+        result = simulate_batch(plant, steps=2000, dt=PERIOD, theta=np.pi + 1e-4, gain=K)
+        ends.append(float(abs(result.theta[0] - np.pi)))
+    assert ends[0] < 1e-4 < 1e-2 < ends[1]
 
 
 @pytest.mark.parametrize("side", ["sim", "hw"])
