@@ -38,6 +38,7 @@ from pendulum_msgs_py.errors import FaultError, ParameterError
 from pendulum_msgs_py.executables import cli_main
 from pendulum_msgs_py.ros import qos
 from pendulum_msgs_py.ros.convert import command_from_bytes, sample_from_bytes, stamp_from_message
+from pendulum_msgs_py.ros.middleware import set_middleware_defaults
 
 __all__ = ["Hub", "main"]
 
@@ -77,6 +78,7 @@ class Hub:
     """
 
     def __init__(self) -> None:
+        set_middleware_defaults()
         self._context = Context()
         rclpy.init(context=self._context, args=[], signal_handler_options=SignalHandlerOptions.NO)
         self._node = Node("console", context=self._context)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import sys
 from pathlib import Path
 from typing import Annotated
@@ -14,12 +13,6 @@ from pendulum_msgs_py.errors import BagError
 from pendulum_msgs_py.executables import cli_main
 
 __all__ = ["main"]
-
-_TRANSPORT_SETTINGS = (
-    "FASTDDS_BUILTIN_TRANSPORTS",
-    "FASTDDS_DEFAULT_PROFILES_FILE",
-    "FASTRTPS_DEFAULT_PROFILES_FILE",
-)
 
 app = typer.Typer(add_completion=False, rich_markup_mode=None)
 
@@ -66,7 +59,6 @@ def record(
     )
     if output.exists():
         raise BagError(f"bag {output} exists already; expected a new folder (bags are never overwritten)")
-    _leave_no_shared_memory()
 
     from pendulum_bags.recorder_node import SPECS, Recorder
     from pendulum_msgs_py.ros.runner import run_node
@@ -78,17 +70,6 @@ def record(
         description="Record topics to a bag.",
         specs=SPECS,
     )
-
-
-def _leave_no_shared_memory() -> None:
-    """Receive over the loopback network, unless the user has configured the middleware.
-
-    Fast DDS passes messages between processes through shared memory. A process that is killed while it holds some
-    leaves it locked: measured with a publisher of five topics at 500 Hz, after some ten kills new subscribers, matched
-    as they were, got nothing any more. A recorder must survive a kill, and so must those whom it records.
-    """
-    if not any(os.environ.get(name) for name in _TRANSPORT_SETTINGS):
-        os.environ["FASTDDS_BUILTIN_TRANSPORTS"] = "UDPv4"
 
 
 def main(argv: list[str] | None = None) -> int:

@@ -21,7 +21,7 @@ from typing import NamedTuple
 from pendulum_msgs_py.names import JOINT
 from pendulum_msgs_py.values import NANOSECONDS
 
-__all__ = ["MAX_SECONDS", "JointStateFields", "decode_joint_state", "encode_joint_state"]
+__all__ = ["MAX_SECONDS", "JointStateFields", "decode_joint_state", "encode_clock", "encode_joint_state"]
 
 MAX_SECONDS = 2**31 - 1
 """Largest ``sec`` of a ROS time stamp."""
@@ -29,6 +29,7 @@ MAX_SECONDS = 2**31 - 1
 _HEADER = b"\x00\x01\x00\x00"
 _PREFIX = struct.Struct("<4xiII")
 _COUNT = struct.Struct("<I")
+_TIME = struct.Struct("<iI")
 _MAX_TRAILING = 15
 _MOST_KNOWN = 64
 """Layouts that are remembered; a stranger's endless names must not take memory without bound."""
@@ -78,6 +79,18 @@ def encode_joint_state(
             values.append(1)
             values.append(quantity)
     return _HEADER + layout.pack(*values)
+
+
+def encode_clock(stamp_ns: int) -> bytes:
+    """Return the CDR bytes of a rosgraph_msgs/Clock.
+
+    Args:
+        stamp_ns: Simulated time, 0 to ``MAX_SECONDS`` seconds [ns].
+
+    Raises:
+        struct.error: The time does not fit a ROS time.
+    """
+    return _HEADER + _TIME.pack(*divmod(stamp_ns, NANOSECONDS))
 
 
 def decode_joint_state(data: bytes) -> JointStateFields | None:

@@ -9,12 +9,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from pendulum_msgs_py import cdr
-from pendulum_msgs_py.cdr import MAX_SECONDS, decode_joint_state, encode_joint_state
+from pendulum_msgs_py.cdr import MAX_SECONDS, decode_joint_state, encode_clock, encode_joint_state
 from pendulum_msgs_py.names import JOINT
 from pendulum_msgs_py.values import NANOSECONDS
 
 serialization = pytest.importorskip("rclpy.serialization")
 JointState = pytest.importorskip("sensor_msgs.msg").JointState
+Clock = pytest.importorskip("rosgraph_msgs.msg").Clock
 convert = pytest.importorskip("pendulum_msgs_py.ros.convert")
 
 _STAMPS = st.integers(0, MAX_SECONDS * NANOSECONDS + NANOSECONDS - 1)
@@ -56,6 +57,12 @@ def test_every_length_of_frame_id_is_read_fast(length: int) -> None:
     fields = decode_joint_state(serialization.serialize_message(message))
     assert fields is not None
     assert fields.effort == 1.5
+
+
+@given(st.integers(0, MAX_SECONDS), st.integers(0, 999_999_999))
+def test_the_clock_is_what_rclpy_reads(sec: int, nanosec: int) -> None:
+    message = serialization.deserialize_message(encode_clock(sec * 1_000_000_000 + nanosec), Clock)
+    assert (message.clock.sec, message.clock.nanosec) == (sec, nanosec)
 
 
 def test_equal_messages_are_equal_bytes() -> None:

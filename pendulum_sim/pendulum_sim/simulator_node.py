@@ -153,9 +153,10 @@ class SimulatorNode(PollingNode):
 
     # --- the loop ------------------------------------------------------------------------------------------
 
-    def run_due(self) -> float | None:
-        """Step the plant if its deadline has come; return the time until the next [s], None in lockstep."""
-        return None if self._lockstep else self._loop.run_due()
+    def run_due(self) -> float:
+        """Let the loop do what is due; return the time until it wants to be called again [s]."""
+        due: float = self._loop.run_due()
+        return due
 
     def _advance(self, drive: Drive, stamp_ns: int) -> tuple[JointSample | None, float]:
         effort = drive.effort

@@ -27,6 +27,7 @@ from pendulum_msgs_py import names
 from pendulum_msgs_py.errors import FaultError
 from pendulum_msgs_py.ros import qos
 from pendulum_msgs_py.ros.convert import event_message, sample_from_bytes, trajectory_to_message
+from pendulum_msgs_py.ros.middleware import set_middleware_defaults
 from pendulum_msgs_py.trajectory import Trajectory
 from pendulum_msgs_py.values import JointSample
 
@@ -56,6 +57,7 @@ class Conductor:
     def __enter__(self) -> Conductor:
         """Join the graph."""
         self._previous = signal.signal(signal.SIGTERM, _interrupt)
+        set_middleware_defaults()
         self.context = Context()
         rclpy.init(
             context=self.context, domain_id=self.domain, signal_handler_options=SignalHandlerOptions.NO, args=[]

@@ -12,9 +12,9 @@ from rclpy.timer import Timer
 from rosgraph_msgs.msg import Clock as ClockMessage
 
 from pendulum_msgs_py import names
+from pendulum_msgs_py.cdr import encode_clock
 from pendulum_msgs_py.parameters import ParameterSpec
 from pendulum_msgs_py.ros import qos
-from pendulum_msgs_py.ros.convert import stamp_to_message
 from pendulum_msgs_py.ros.plant_interface import PlantInterface
 from pendulum_msgs_py.supervisor import Drive, Input, Mode
 from pendulum_msgs_py.timing import LoopStatistics, SteadyWallClock
@@ -187,8 +187,7 @@ class LockstepLoop:
         self._clock_publisher = (
             interface.node.create_publisher(ClockMessage, names.CLOCK, qos.CLOCK) if publish_clock else None
         )
-        # Free running (nobody has to answer) and all patience go through this timer.
-        create_wall_timer(interface.node, 0.001, self._on_timer)
+        self._next_look = 0.0
 
     def __call__(self) -> int:
         """Return the simulated time [ns]: the loop is the plant's clock."""
@@ -201,6 +200,17 @@ class LockstepLoop:
             "lockstep_steps": self.steps,
             "lockstep_waits_for": ", ".join(missing) if self._must_wait() else "nothing",
         }
+
+    def run_due(self) -> float:
+        """Start, step where nobody has to answer, ask again where patience has ended; return when to look again [s].
+
+        Its runner calls this after each event; answers alone make the pace where they are waited for.
+        """
+        now = time.monotonic()
+        if now >= self._next_look:
+            self._look()
+            self._next_look = now + (_LOOK_WAITING if self.started and self._must_wait() else _LOOK_FREE)
+        return self._next_look - now
 
     def answered(self, kind: Input, command: JointCommand) -> None:
         """Take note of an accepted command; steps when it was the last one missing."""
@@ -238,13 +248,13 @@ class LockstepLoop:
         self._waiting_since = time.monotonic()
         self._told_waiting = False
         if self._clock_publisher is not None:
-            self._clock_publisher.publish(ClockMessage(clock=stamp_to_message(self.now_ns)))
+            self._clock_publisher.publish(encode_clock(self.now_ns))
         self._interface.publish_state(sample)
 
     def _must_wait(self) -> bool:
         return self._interface.supervisor.mode is Mode.EFFORT and not self._inputs <= self._answered
 
-    def _on_timer(self) -> None:
+    def _look(self) -> None:
         if self.finished or self.paused:
             return
         if not self.started:
@@ -280,5 +290,9 @@ class LockstepLoop:
             self._publish(interface.sample)
 
 
+_LOOK_FREE = 0.001
+"""Wall time between two steps that nobody has to answer, and between two looks for those who will [s]."""
+_LOOK_WAITING = 0.1
+"""Wall time between two looks for answers that are overdue [s]."""
 _PATIENCE = 1.0
 """Wall time without an answer after which a state is published again [s]."""

@@ -29,8 +29,9 @@ from rclpy.task import Future
 
 from pendulum_msgs_py import completion
 from pendulum_msgs_py.errors import ParameterError, PendulumError
-from pendulum_msgs_py.executables import EXIT_USAGE, print_text, report_error
+from pendulum_msgs_py.executables import EXIT_USAGE, print_text, report_error, report_exhaustion
 from pendulum_msgs_py.parameters import ParameterSpec
+from pendulum_msgs_py.ros.middleware import set_middleware_defaults
 
 __all__ = ["Closeable", "Paced", "run_node"]
 
@@ -102,8 +103,7 @@ def run_node(
 def _run(make_node: Callable[[Callable[[], None]], Node], arguments: Sequence[str]) -> int:
     if os.environ.get("NO_COLOR"):  # https://no-color.org, which rcutils does not know
         os.environ.setdefault("RCUTILS_COLORIZED_OUTPUT", "0")
-    # A plant that the whole subnet may command is a decision, not a default.
-    os.environ.setdefault("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
+    set_middleware_defaults()
     signals = _listen_for_stop_signals()
     _wake_punctually()
     try:
@@ -139,8 +139,9 @@ def _run(make_node: Callable[[Callable[[], None]], Node], arguments: Sequence[st
                 executor.spin_once(max(0.0, left))
     except PendulumError as error:
         exit_code = report_error(error)
-    except Exception:  # noqa: BLE001  # printed in full, and the plant is made safe
-        traceback.print_exc()
+    except Exception as error:  # noqa: BLE001  # printed in full, and the plant is made safe
+        if not report_exhaustion(error):
+            traceback.print_exc()
         exit_code = 1
     finally:
         exit_code = _close(node, executor) or exit_code
