@@ -58,12 +58,26 @@ def test_interval_of_a_mean_covers_the_truth_as_often_as_it_says_in_spite_of_cor
     trials = 150
     for seed in range(trials):
         values = autoregressive(500, 0.9, seed)
-        interval = bootstrap_interval(resample([values[:, None]], resamples=400, seed=seed), lambda m: m[..., 0])
+        interval = bootstrap_interval(
+            resample([values[:, None]], resamples=400, seed=seed), lambda m: m[..., 0]
+        )
         covered += interval.low <= 0.0 <= interval.high
         naive += abs(values.mean()) <= 1.645 * values.std() / np.sqrt(values.size)
     # 90 % is meant; the binomial error of 150 trials is 2.5 %. Counting samples instead of blocks gives about a third.
     assert covered / trials >= 0.83
     assert naive / trials < 0.5
+
+
+def test_interval_of_two_runs_that_differ_owns_that_two_are_few() -> None:
+    rng = np.random.default_rng(5)
+    covered = 0
+    trials = 150
+    for seed in range(trials):
+        runs = [(offset + 0.3 * rng.standard_normal(60))[:, None] for offset in rng.standard_normal(2)]
+        interval = bootstrap_interval(resample(runs, resamples=300, seed=seed), lambda m: m[..., 0])
+        covered += interval.low <= 0.0 <= interval.high
+    # 90 % is meant. Drawing runs alone, without Student's t for their number, covers in two thirds of the cases.
+    assert covered / trials >= 0.82
 
 
 def test_interval_is_the_same_each_time() -> None:

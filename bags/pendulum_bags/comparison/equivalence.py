@@ -8,7 +8,7 @@ and anything else is undecided, with the number of runs that would probably deci
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, fields
 from enum import Enum
 from typing import Any
@@ -203,7 +203,7 @@ def equivalence_test(
     more: int | None = 0
     if outcome is Outcome.UNDECIDED:
         error = max(right - left, 0.0) / (2.0 * float(stats.norm.ppf(0.5 + 0.5 * interval.level)))
-        more = _runs_to_decide(min(abs(top - estimate), abs(estimate - bottom)), error, runs)
+        more = _runs_to_decide(estimate, bottom, top, error, runs)
     return EquivalenceTest(quantity, unit, interval, low, high, outcome, more, smallest)
 
 
@@ -215,16 +215,44 @@ def _logarithm(value: float) -> float:
     return math.log(value) if value > 0.0 else -math.inf
 
 
-def _runs_to_decide(distance: float, error: float, runs: int) -> int | None:
-    """Return how many more runs bring the interval's end within reach of the nearest margin."""
-    if distance <= 0.0 or not math.isfinite(error):
+def _runs_to_decide(estimate: float, bottom: float, top: float, error: float, runs: int) -> int | None:
+    """Return how many more runs would decide with the stated power, if the estimate were the truth.
+
+    The error falls with the square root of the number of runs.
+    """
+    if not (math.isfinite(error) and math.isfinite(estimate)) or _power(estimate, bottom, top, 0.0) < POWER:
         return None
-    needed = (
-        runs * ((stats.norm.ppf(LEVEL + 0.5 * (1.0 - LEVEL)) + stats.norm.ppf(POWER)) * error / distance) ** 2
+    enough = next(
+        (n for n in _doubled(runs) if _power(estimate, bottom, top, error * math.sqrt(runs / n)) >= POWER), 0
     )
-    if needed > MOST_RUNS:
+    if not enough:
         return None
-    return max(1, math.ceil(needed) - runs)
+    few = runs
+    while enough - few > 1:
+        middle = (few + enough) // 2
+        if _power(estimate, bottom, top, error * math.sqrt(runs / middle)) >= POWER:
+            enough = middle
+        else:
+            few = middle
+    return enough - runs
+
+
+def _doubled(runs: int) -> Iterator[int]:
+    more = 1
+    while runs + more <= MOST_RUNS:
+        yield runs + more
+        more *= 2
+
+
+def _power(estimate: float, bottom: float, top: float, error: float) -> float:
+    """Return the probability that an interval with some standard error lies on one side of each margin."""
+    inside, below, above = (estimate - bottom, top - estimate), bottom - estimate, estimate - top
+    if error <= 0.0:
+        return float(min(inside) > 0.0 or below > 0.0 or above > 0.0)
+    reach = float(stats.norm.ppf(0.5 + 0.5 * LEVEL))
+    equivalent = sum(float(stats.norm.cdf(distance / error - reach)) for distance in inside) - 1.0
+    different = sum(float(stats.norm.cdf(distance / error - reach)) for distance in (below, above))
+    return max(equivalent, 0.0) + different
 
 
 @dataclass(frozen=True)

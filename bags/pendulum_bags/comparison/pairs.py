@@ -235,7 +235,9 @@ def unpaired_tests(
     joined = Resampled(
         np.concatenate([side.means for side in sides]),
         np.concatenate([side.draws for side in sides], axis=1),
+        np.concatenate([side.within for side in sides], axis=1),
         min(side.blocks for side in sides),
+        min(side.runs for side in sides),
     )
     count = sides[0].means.size
     runs = min(len(simulations), len(hardware))

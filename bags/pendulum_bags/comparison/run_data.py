@@ -18,7 +18,15 @@ from pendulum_msgs_py import names
 from pendulum_msgs_py.errors import DataError
 from pendulum_msgs_py.values import NANOSECONDS
 
-__all__ = ["END_EVENT", "START_EVENT", "RunData", "find_prefix", "missed_periods", "plant_summary", "read_run"]
+__all__ = [
+    "END_EVENT",
+    "START_EVENT",
+    "RunData",
+    "find_prefix",
+    "missed_periods",
+    "plant_summary",
+    "read_run",
+]
 
 START_EVENT = "noise_start"
 END_EVENT = "noise_end"

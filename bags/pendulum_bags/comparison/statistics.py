@@ -122,7 +122,7 @@ def block_length(values: ArrayLike) -> int:
 
 def bootstrap_means(
     runs: Sequence[Array], lengths: Sequence[int], *, resamples: int = RESAMPLES, seed: int = 0
-) -> Array:
+) -> tuple[Array, Array]:
     """Resample runs, and blocks within each run, and return the mean of every column.
 
     Several runs are drawn with replacement first, so that what differs from run to run counts; the blocks inside
@@ -135,7 +135,8 @@ def bootstrap_means(
         seed: Seed of the resampling; the same data give the same interval.
 
     Returns:
-        Means of the columns over all samples of each resample, shape (B, m).
+        Means of the columns over all samples of each resample, shape (B, m); and the same with each run drawn once,
+        which vary only by what varies within a run.
     """
     rng = np.random.default_rng(seed)
     columns = runs[0].shape[1]
@@ -143,13 +144,14 @@ def bootstrap_means(
     for k, (samples, length) in enumerate(zip(runs, lengths, strict=True)):
         sums[k] = _circular_block_sums(samples, length, resamples, rng)
     sizes = np.array([len(samples) for samples in runs], dtype=float)
+    within = np.asarray(sums.sum(axis=0) / sizes.sum())
     if len(runs) == 1:
-        return np.asarray(sums[0] / sizes[0])
+        return within, within
     chosen = rng.integers(len(runs), size=(len(runs), resamples))
     # A run that is drawn twice is resampled twice: take its blocks from another resample.
     turn = (np.arange(resamples) + rng.integers(resamples, size=(len(runs), 1))) % resamples
     total = sums[chosen, turn].sum(axis=0)
-    return np.asarray(total / sizes[chosen].sum(axis=0)[:, None])
+    return np.asarray(total / sizes[chosen].sum(axis=0)[:, None]), within
 
 
 def _circular_block_sums(samples: Array, length: int, resamples: int, rng: np.random.Generator) -> Array:
@@ -192,11 +194,21 @@ class Interval(NamedTuple):
 
 @dataclass(frozen=True)
 class Resampled:
-    """What a bootstrap of several columns left behind."""
+    """What a bootstrap of several columns left behind.
+
+    Args:
+        means: Of the columns, over all samples, shape (m,).
+        draws: The same of each resample, shape (B, m).
+        within: The same of each resample with every run drawn once, shape (B, m).
+        blocks: Independent pieces.
+        runs: Recordings.
+    """
 
     means: Array
     draws: Array
+    within: Array
     blocks: int
+    runs: int = 1
 
 
 def resample(runs: Sequence[Array], *, resamples: int = RESAMPLES, seed: int = 0) -> Resampled:
@@ -206,16 +218,18 @@ def resample(runs: Sequence[Array], *, resamples: int = RESAMPLES, seed: int = 0
     of the interval's width, but an interval that is too narrow deceives, and one that varies does not.
     """
     lengths = [
-        min(math.ceil(LONGER * max(block_length(column) for column in samples.T)), max(1, len(samples) // LEAST_BLOCKS))
+        min(
+            math.ceil(LONGER * max(block_length(column) for column in samples.T)),
+            max(1, len(samples) // LEAST_BLOCKS),
+        )
         for samples in runs
     ]
     blocks = sum(max(1, len(samples) // length) for samples, length in zip(runs, lengths, strict=True))
     pooled = np.concatenate(runs).mean(axis=0)
     # Sums of large equal numbers would lose what differs between resamples.
     centred = [samples - pooled for samples in runs]
-    return Resampled(
-        pooled, pooled + bootstrap_means(centred, lengths, resamples=resamples, seed=seed), blocks
-    )
+    draws, within = bootstrap_means(centred, lengths, resamples=resamples, seed=seed)
+    return Resampled(pooled, pooled + draws, pooled + within, blocks, len(runs))
 
 
 def bootstrap_interval(
@@ -223,9 +237,11 @@ def bootstrap_interval(
 ) -> Interval:
     """Return a statistic of column means with its percentile interval.
 
-    Few blocks make bootstrap intervals too short, for two reasons known from means of few values, and their ends are
-    moved out accordingly: by the ratio of Student's t with (blocks - 1) degrees of freedom to the normal quantile, and
-    by sqrt(blocks / (blocks - 1)), since blocks were centred on their own mean.
+    Few blocks make bootstrap intervals too short, for two reasons known from means of few values: the spread is
+    estimated around the blocks' own mean, and it is itself uncertain. The same holds for few runs that differ from one
+    another. So the ends are moved out by the ratio of the unbiased standard error to that of the resamples, and by the
+    ratio of Student's t to the normal quantile, with the degrees of freedom of a sum of two variances, that
+    between runs and that within them (Satterthwaite, Biometrics Bulletin 2, 1946).
 
     Args:
         resampled: From :func:`resample`.
@@ -236,8 +252,11 @@ def bootstrap_interval(
     draws = np.asarray(statistic(resampled.draws), dtype=float)
     tail = 0.5 * (1.0 - level)
     low, high = np.quantile(draws, (tail, 1.0 - tail))
-    freedom = max(resampled.blocks - 1, 2)
-    stretch = float(stats.t.ppf(1.0 - tail, freedom) / stats.norm.ppf(1.0 - tail)) * math.sqrt(1.0 + 1.0 / freedom)
+    variance, freedom = _variance_of(resampled, statistic, float(draws.var(ddof=1)))
+    spread = max(float(draws.std(ddof=1)), 1e-300)
+    stretch = (
+        float(stats.t.ppf(1.0 - tail, freedom) / stats.norm.ppf(1.0 - tail)) * math.sqrt(variance) / spread
+    )
     return Interval(
         estimate,
         estimate + stretch * min(float(low) - estimate, 0.0),
@@ -246,6 +265,28 @@ def bootstrap_interval(
         stretch * float(draws.std(ddof=1)),
         resampled.blocks,
     )
+
+
+def _variance_of(
+    resampled: Resampled, statistic: Callable[[Array], Array], total: float
+) -> tuple[float, float]:
+    """Return the unbiased variance of a statistic and its degrees of freedom.
+
+    Drawing R runs, and blocks in them, gives the variance V (R - 1) / R + W, where V is that of the statistic and W the
+    part of V that comes from within runs, which drawing the blocks alone gives.
+    """
+    runs = resampled.runs
+    blocks = max(resampled.blocks, runs + 2)
+    if runs == 1:
+        return total * blocks / (blocks - 1), blocks - 1
+    within = (
+        float(np.var(np.asarray(statistic(resampled.within), dtype=float), ddof=1)) * blocks / (blocks - runs)
+    )
+    between = max((total - within) * runs / (runs - 1) - within, 0.0)
+    variance = between + within
+    if variance <= 0.0:
+        return total, runs - 1
+    return variance, variance**2 / (between**2 / (runs - 1) + within**2 / (blocks - runs))
 
 
 class KolmogorovSmirnov(NamedTuple):
