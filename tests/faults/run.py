@@ -23,6 +23,7 @@ from pendulum_msgs_py.executables import cli_main
 from tests.faults.bag_property import check_bag
 from tests.faults.bridge_rig import SCENARIOS, run_scenario
 from tests.faults.campaign import CAMPAIGN
+from tests.faults.delay_margin import LOSSES, survive_loss
 from tests.faults.fuzz import fuzz_all
 from tests.faults.live import EFFORT_LIMIT, LiveSystem
 from tests.faults.network import cut_cable, why_not
@@ -48,6 +49,7 @@ def campaign(
             *_bridge_rows(max(repetitions, 20)),
             *rows,
             *_network_rows(),
+            *_loss_rows(),
             *_parser_rows(minutes, seed),
         ]
     table = Table("fault", "tried", "survived", "data lost", "longest time to zero", "remarks", title="Faults")
@@ -154,6 +156,21 @@ def _network_rows() -> list[dict[str, Any]]:
     row["survived"] = sum(cut.time_to_zero <= MAX_TIME_TO_ZERO + MACHINE_PATIENCE for cut in cuts)
     back = ", ".join(f"{cut.time_to_return:.2f}" for cut in cuts)
     return [{**row, "tried": len(cuts), "time_to_zero_s": longest, "remarks": f"torque again after {back} s"}]
+
+
+def _loss_rows() -> list[dict[str, Any]]:
+    name = "network: frames lost on the way, 5 ms each way, an upright loop with 27 ms of margin"
+    row = {"fault": name, "tried": 0, "survived": 0, "lost_s": None, "time_to_zero_s": None, "remarks": why_not()}
+    if row["remarks"]:
+        return [row]
+    with tempfile.TemporaryDirectory(prefix="pendulum_network_") as folder:
+        try:
+            reports = survive_loss(Path(folder), LOSSES)
+        except FaultError as error:
+            return [{**row, "tried": 1, "remarks": str(error)}]
+    told = "; ".join(f"{100.0 * one.loss:g} %: {100.0 * one.answered:.0f} % of states answered" for one in reports)
+    # What follows a fall is not tried any more.
+    return [{**row, "tried": len(reports), "survived": sum(one.held for one in reports), "remarks": told}]
 
 
 def _parser_rows(minutes: float, seed: int) -> list[dict[str, Any]]:
