@@ -20,7 +20,15 @@ from pendulum_msgs_py.errors import PendulumError
 if TYPE_CHECKING:
     import typer
 
-__all__ = ["EXIT_INTERRUPTED", "EXIT_USAGE", "cli_main", "print_text", "report_error", "run_package"]
+__all__ = [
+    "EXIT_INTERRUPTED",
+    "EXIT_USAGE",
+    "cli_main",
+    "print_text",
+    "report_error",
+    "report_exhaustion",
+    "run_package",
+]
 
 EXIT_USAGE = 2
 """Exit code of a program that was asked for something it cannot do."""
@@ -65,6 +73,10 @@ def run_package(package: str, argv: Sequence[str] | None = None) -> int:
         # Ctrl-C while the modules are still loading: nothing runs yet that could say so itself.
         print("interrupted", file=sys.stderr)
         return EXIT_INTERRUPTED
+    except Exception as error:
+        if code := report_exhaustion(error):
+            return code
+        raise
 
 
 def cli_main(app: typer.Typer, argv: Sequence[str] | None = None, *, name: str | None = None) -> int:
@@ -132,6 +144,28 @@ def report_error(error: BaseException) -> int:
     """Print an error as one sentence on standard error and return the exit code for it."""
     print(f"error: {error}", file=sys.stderr, flush=True)
     return EXIT_USAGE
+
+
+def report_exhaustion(error: BaseException) -> int:
+    """Say in one sentence that a limit of the process's memory was met, and return exit code 1; 0 for other errors.
+
+    Under a limit it is chance who meets it: Python, the loader of a library, or a library that starts a thread.
+    """
+    text = str(error)
+    if not (isinstance(error, MemoryError) or any(sign in text for sign in _SIGNS_OF_EXHAUSTION)):
+        return 0
+    first = text.splitlines()[0] if text else "no more could be had"
+    print(f"error: memory is exhausted: {first}", file=sys.stderr, flush=True)
+    return 1
+
+
+_SIGNS_OF_EXHAUSTION = (
+    "failed to map segment",
+    "annot allocate memory",
+    "bad_alloc",
+    "pthread_create failed",
+    "can't start new thread",
+)
 
 
 def _usage(package: str, table: dict[str, str]) -> str:
