@@ -1,9 +1,11 @@
 """Identification finds known truths, says what it does not know, and contradicts a wrong geometry loudly."""
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
+import yaml
 
 from pendulum_bags import identify_cli
 from pendulum_bags.datasets import Recording
@@ -173,6 +175,36 @@ def test_a_designed_excitation_keeps_its_limits_and_predicts_its_intervals():
     for name in ("inertia", "damping", "gravity", "coulomb_friction"):
         interval = result.uncertainty.intervals[name]
         assert 0.5 * (interval.high - interval.low) == pytest.approx(design.predicted[name], rel=0.5)
+
+
+def test_a_late_stamp_of_the_input_is_no_delay_of_the_plant(tmp_path):
+    recording = run()
+    late = replace(recording, input_time=recording.time + 0.012)
+    result = identify([late], Options(friction="coulomb", multi_start=False), profiles=0)
+    assert result.model["transport_delay"] == pytest.approx(-0.006, abs=1e-3)
+    assert any("stamped late" in sentence for sentence in result.sentences())
+    plant, provenance = load_plant_file(result.write(tmp_path / "plant.yaml"))
+    assert plant.transport_delay == 0.0
+    content = yaml.safe_load((tmp_path / "plant.yaml").read_text())
+    assert "interval" not in content["parameters"]["transport_delay"]
+    assert "interval" in content["parameters"]["inertia"]
+    assert any(text.startswith("transport_delay is 0 s here, and -0.00") for text in provenance["remarks"])
+
+
+def test_no_interval_of_a_plant_file_leaves_its_value_out(found, tmp_path):
+    content = yaml.safe_load(found.write(tmp_path / "plant.yaml").read_text())
+    held = {n: p["interval"] for n, p in content["parameters"].items() if "interval" in p}
+    assert {"inertia", "gravity", "transport_delay"} <= held.keys()
+    assert all(low <= content["parameters"][name]["value"] <= high for name, (low, high) in held.items())
+
+
+def test_intervals_obtained_stand_beside_those_that_the_excitation_promised():
+    recording = run()
+    promised = {"predicted": {"inertia": 1e-4, "gravity": 3e-3, "magic": 1.0, "damping": float("nan")}}
+    played = replace(recording, meta={**recording.meta, "pendulum.excitation": promised})
+    result = identify([played], Options(friction="coulomb", multi_start=False), profiles=0)
+    assert result.predicted == {"inertia": 1e-4, "gravity": 3e-3}
+    assert any("the excitation predicted: inertia" in sentence for sentence in result.sentences())
 
 
 def test_the_command_line_prints_json_and_ends_with_3_on_a_contradiction(tmp_path, capsys):

@@ -1,5 +1,7 @@
 """The thesis's two regressions on data made from known coefficients."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -55,6 +57,22 @@ def test_inertia_and_damping_come_back_within_their_intervals():
     assert all(trial.r_squared > 0.99 for trial in result.trials)
     assert "R-squared" in result.trials[0].summary
     assert any("inertial torque is" in sentence for sentence in result.sentences)
+
+
+def test_the_interval_of_the_inertia_allows_for_what_is_not_known_of_the_timing():
+    trials = [hand_trial(seed) for seed in range(3)]
+    from_a_bag = [replace(t, meta={**t.meta, "topic": "/hw/joint_states"}) for t in trials]
+
+    def half(recordings, skew=None):
+        low, high = fit_inertia_damping(recordings, skew=skew).intervals["inertia"]
+        return 0.5 * (high - low)
+
+    scatter = half(trials, skew=0.0)
+    for recordings, skew in ((trials, 0.005), (from_a_bag, 0.0005)):
+        expected = np.hypot(scatter, 1.96 / np.sqrt(3.0) * skew * B)
+        assert half(recordings) == pytest.approx(expected, rel=1e-3)
+    with pytest.raises(DataError, match=r"skew is -0\.001 s; expected at least 0"):
+        fit_inertia_damping(trials, skew=-0.001)
 
 
 def test_an_actuator_that_reports_the_torque_of_the_environment_is_turned_and_said():

@@ -5,6 +5,9 @@ from __future__ import annotations
 import json
 import math
 import os
+import subprocess
+import sys
+import tempfile
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
@@ -17,9 +20,12 @@ from pendulum_bags.identification.model import FitModel, from_plant
 from pendulum_bags.identification.options import Options
 from pendulum_bags.identification.result import identify
 from pendulum_bags.identification.synthetic import multisine, synthetic_recording
+from pendulum_bags.identification.thesis import fit_gravity, fit_inertia_damping
 from pendulum_bags.identification.window_score import free_run, free_run_rms, window_rms
+from pendulum_bags.reader import read_bag, same_messages
 from pendulum_msgs_py.plant_parameters import PlantParameters
 from tests.benchmarks import Peer, Row, measured, peer
+from tests.benchmarks.thesis_trials import hand_recording, staircase_recording
 
 DATA = Path(os.environ.get("PENDULUM_SHARED_DATA", Path(__file__).resolve().parents[3] / "shared" / "data"))
 
@@ -35,6 +41,8 @@ def rows() -> Iterator[Row]:
     else:
         yield Row("real rigs", note=f"no recordings of real pendulums at {DATA}")
     yield from _coverage()
+    yield from _thesis_coverage()
+    yield _busy_machine()
 
 
 def _swing_up() -> Iterator[Row]:
@@ -264,3 +272,57 @@ def _coverage(seeds: int = 200) -> Iterator[Row]:
     )
     yield row
     yield measured("the same, not too wide", share, "-", at_most=0.99)
+
+
+def _thesis_coverage(seeds: int = 20) -> Iterator[Row]:
+    """The thesis's two experiments on the emulated machine: do their intervals hold its coefficients?"""
+    truth = {"inertia": 0.055, "damping": 11.77, "gravity": 1.678}
+    hits: dict[str, list[bool]] = {name: [] for name in truth}
+    widths: dict[str, list[float]] = {name: [] for name in truth}
+    for seed in range(seeds):
+        for result in (
+            fit_inertia_damping([hand_recording(seed, 1 + trial) for trial in range(6)]),
+            fit_gravity([staircase_recording(seed, 1 + trial) for trial in range(3)]),
+        ):
+            for name, (low, high) in result.intervals.items():
+                hits[name].append(low <= truth[name] <= high)
+                widths[name].append(0.5 * (high - low))
+    for name, unit in (("inertia", "kg m^2"), ("damping", "N m s/rad"), ("gravity", "N m")):
+        yield measured(
+            f"thesis's method on its machine: 95 % intervals of {name} that cover, {seeds} seeds",
+            float(np.mean(hits[name])),
+            "-",
+            at_least=0.85,
+            note=f"half width {np.mean(widths[name]):.2g} {unit}",
+        )
+
+
+def _busy_machine() -> Row:
+    """One trial by hand in lockstep, with idle and with busy cores: are the bags the same, message by message?"""
+    with tempfile.TemporaryDirectory() as folder:
+        bags = []
+        for name in ("idle", "busy"):
+            burners = [
+                subprocess.Popen([sys.executable, "-c", "while True: pass"])
+                for _ in range(0 if name == "idle" else 1 + (os.cpu_count() or 1))
+            ]
+            try:
+                out = Path(folder) / name
+                command = [
+                    sys.executable,
+                    "-m",
+                    "pendulum_bags",
+                    "experiment",
+                    "inertia_damping",
+                    "--trials",
+                    "1",
+                ]
+                subprocess.run([*command, "--out", str(out)], check=True, capture_output=True, timeout=240)
+            finally:
+                for burner in burners:
+                    burner.kill()
+                    burner.wait()
+            bags.append(read_bag(out / "trial_1"))
+        same = same_messages(*bags, topics=[topic for topic in bags[0].topics if "recorder" not in topic])
+        what = "one trial in lockstep on an idle and on a busy machine: the same bag"
+        return Row(what=what, target="equal messages", holds=bool(same), note=str(same))

@@ -13,6 +13,7 @@ import pytest
 from pendulum_bags.experiment.in_process import simulate
 from pendulum_bags.experiment.run_spec import RunSpec
 from pendulum_bags.reader import read_bag, same_messages
+from tests.processes import ProcessGroup
 
 
 def run_experiment(*arguments: str | Path | float, timeout: float = 150.0) -> subprocess.CompletedProcess[str]:
@@ -78,6 +79,39 @@ def test_the_two_experiments_of_the_thesis_give_back_its_coefficients(tmp_path: 
     quantities = bag["/hw/actuator/feedback"][0].message.name
     recorded = {"position", "velocity", "effort", "position_command", "velocity_command", "effort_command"}
     assert recorded | {"pwm_command", "motor_current", "winding_current"} <= set(quantities)
+
+
+@pytest.mark.timeout(180)
+def test_an_excitation_is_played_alone_on_a_running_plant_and_ends_at_zero_torque(
+    processes: ProcessGroup, domain_id: int, tmp_path: Path
+) -> None:
+    zero = tmp_path / "zero.csv"
+    zero.write_text("time,effort\n0,0\n1,0\n", encoding="utf-8")
+    simulator = processes.start(
+        "pendulum_sim", "simulator", "--ros-args", "-r", "__ns:=/sim", "-p", "plant:=dfki", "-p", "rate_hz:=100.0"
+    )
+    playback = ("--ros-args", "-r", "__ns:=/sim", "-p", "controller:=playback", "-p", f"file:={zero}")
+    other = processes.start("pendulum_lqr", "controller", *playback)
+    simulator.wait_for_output("commanded by /sim/controller", 60)
+    bag = tmp_path / "excited"
+    command = [sys.executable, "-m", "pendulum_bags", "excite", "--plant", "dfki", "--max-angle", "0.5"]
+    command += ["--duration", "1", "--trials", "3", "--out", str(tmp_path / "e.csv"), "--bag", str(bag)]
+    command += ["--play", "--on", "running"]
+
+    refused = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
+    assert refused.returncode == 2
+    assert "/sim/effort_command has a publisher, /sim/controller; expected none" in refused.stderr
+    assert not bag.exists()
+
+    other.interrupt()
+    assert other.wait(20) == 0
+    done = subprocess.run(command, capture_output=True, text=True, timeout=100, check=False)
+    assert done.returncode == 0, done.stdout + done.stderr
+    recorded = read_bag(bag)
+    applied = recorded["/sim/applied_effort"]["effort"]
+    assert 0.1 < np.max(np.abs(applied)) <= 0.75
+    assert np.all(applied[-20:] == 0.0)
+    assert {"inertia", "gravity"} <= recorded.metadata["pendulum.excitation"]["predicted"].keys()
 
 
 @pytest.mark.timeout(120)

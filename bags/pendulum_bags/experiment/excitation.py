@@ -27,7 +27,7 @@ __all__ = ["ExcitationPlay", "play_in_lockstep", "play_on_running_plant"]
 _REST = 0.5
 """Time at rest after the last torque, so that the recording has the end of the motion [s]."""
 _START_TIMEOUT = 60.0
-_FIND_TIMEOUT = 15.0
+_FIND_TIMEOUT = 30.0
 _AT_REST_ANGLE = 0.1
 _AT_REST_SPEED = 0.3
 """What counts as hanging at rest [rad], [rad/s]; a noisy velocity sensor shows up to 0.2 rad/s."""
@@ -177,6 +177,7 @@ def play_on_running_plant(
         )
         conductor.wait_for(f"a state of {namespace}", lambda: plant.sample is not None, _FIND_TIMEOUT)
         _require_rest(conductor, plant)
+        armed = _is_armed(plant, may_arm=arm)
         metadata = logs / "metadata.json"
         run = {"experiment": "excitation", "namespace": namespace, "plant": node_name, "clock": "realtime"}
         write_json(metadata, {"pendulum.run": run, "pendulum.excitation": dict(play.prediction)})
@@ -197,8 +198,9 @@ def play_on_running_plant(
         }
         ears = RecorderClient(conductor, namespace)
         conductor.wait_for("the recorder to hear the plant", lambda: wanted <= ears.heard(), _START_TIMEOUT)
-        armed_here = _require_armed(plant, arm=arm)
         try:
+            if not armed:
+                plant.arm()
             plant.start_disturbance()
             longest = play.duration + _START_TIMEOUT
             conductor.wait_for("the end of the excitation", lambda: _watch(plant, play), longest)
@@ -207,7 +209,7 @@ def play_on_running_plant(
             # Beyond its limits, or interrupted: the drive lets go now, not when the programs have ended.
             plant.disarm_quietly()
             raise
-        if armed_here:
+        if not armed:
             plant.disarm_quietly()
         if processes.finish(recorder) != 0:
             raise FaultError(recorder.last_words(1))
@@ -257,18 +259,16 @@ def _require_rest(conductor: Conductor, plant: PlantClient) -> None:
             )
 
 
-def _require_armed(plant: PlantClient, *, arm: bool) -> bool:
-    """Return whether the plant was armed here."""
+def _is_armed(plant: PlantClient, *, may_arm: bool) -> bool:
     mode = plant.has_event("plant_mode")
     if mode is not None and str(mode.get("mode", "")).startswith("armed"):
-        return False
-    if not arm:
+        return True
+    if not may_arm:
         told = "has not said its mode" if mode is None else f"is {mode.get('mode')}"
         raise ParameterError(
             f"{plant.namespace} {told}; expected it armed, or --arm to arm it for the excitation"
         )
-    plant.arm()
-    return True
+    return False
 
 
 def _watch(plant: PlantClient, play: ExcitationPlay) -> bool:
