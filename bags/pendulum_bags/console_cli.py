@@ -1,4 +1,7 @@
-"""The start of ``console``: loads what it needs at low priority, because the loops it is to show may be running."""
+"""``console``: a web page on which the plants of a ROS domain are seen live, tuned, armed and stopped.
+
+Loads what it needs at low priority, because the loops that it is to show may be running.
+"""
 
 from __future__ import annotations
 
