@@ -27,14 +27,23 @@ def reserve_domain(requested: int | None = None) -> Iterator[int]:
 
     Raises:
         ParameterError: The domain asked for is no domain.
-        FaultError: All domains are in use.
+        FaultError: Another experiment runs in the domain asked for, or all domains are in use.
     """
     requested = check_domain(requested)
-    if requested is not None:
-        yield requested
-        return
     folder = Path(tempfile.gettempdir(), f"pendulum_domains_{os.getuid()}")
     folder.mkdir(exist_ok=True)
+    if requested is not None:
+        # A file of its own: who reserves a domain for a while may ask for experiments in it, but for one at a time.
+        with (folder / f"{requested}.experiment.lock").open("w") as lock:
+            try:
+                fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except BlockingIOError:
+                raise FaultError(
+                    f"ROS domain {requested} is in use by another experiment on this machine; "
+                    "choose another with --domain or ROS_DOMAIN_ID, or none for the first free one"
+                ) from None
+            yield requested
+        return
     for step in range(MAX_DOMAIN):
         domain = 1 + (os.getpid() + step) % MAX_DOMAIN
         with (folder / f"{domain}.lock").open("w") as lock:
