@@ -1,0 +1,67 @@
+"""rosdep brings what the packages import; the page says where the rest comes from; nothing is named in vain."""
+
+from __future__ import annotations
+
+import ast
+import re
+import shlex
+import sys
+from pathlib import Path
+from typing import Any
+from xml.etree import ElementTree
+
+import pytest
+import yaml
+
+from tests.acceptance.test_packaging import FOLDERS
+from tests.fixtures import PROJECT
+
+KNOWN: dict[str, Any] = yaml.safe_load(Path(__file__).with_name("rosdep_keys.yaml").read_text(encoding="utf-8"))
+PAGE = (PROJECT / "pendulum_msgs_py" / "docs" / "install_on_ros.md").read_text(encoding="utf-8")
+_OF_ROS = re.compile(r"rclpy|launch|launch_ros|std_srvs|\w+_interfaces|\w+_msgs|pendulum_\w+")
+
+
+def imported(package: str) -> set[str]:
+    """Return the modules of others that a package imports, anywhere in its code."""
+    found: set[str] = set()
+    for path in (PROJECT / FOLDERS[package] / package).rglob("*.py"):
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            if isinstance(node, ast.Import):
+                found.update(alias.name.split(".")[0] for alias in node.names)
+            elif isinstance(node, ast.ImportFrom) and node.module and node.level == 0:
+                found.add(node.module.split(".")[0])
+    return {name for name in found if name not in sys.stdlib_module_names and not _OF_ROS.fullmatch(name)}
+
+
+def keys(package: str, kind: str) -> set[str]:
+    """Return the dependencies of a kind that are no packages of ROS."""
+    manifest = ElementTree.parse(PROJECT / FOLDERS[package] / "package.xml")
+    named = {str(element.text) for element in manifest.iter(kind)}
+    return {name for name in named if re.match(r"python|.*-pip$", name)}
+
+
+@pytest.mark.parametrize("package", FOLDERS)
+def test_the_manifest_names_the_key_of_every_library_and_no_other(package: str) -> None:
+    of_module = {entry["module"]: key for key, entry in KNOWN["keys"].items()}
+    libraries = imported(package)
+    unknown = libraries - of_module.keys() - KNOWN["pip_only"].keys()
+    assert not unknown, f"look up the rosdep keys of {unknown}, as rosdep_keys.yaml says"
+    assert keys(package, "exec_depend") == {of_module[name] for name in libraries & of_module.keys()}
+    assert keys(package, "test_depend") == set(KNOWN["test_keys"])
+
+
+def test_the_page_installs_what_rosdep_has_no_key_for() -> None:
+    (line,) = re.findall(r"^.*pip install (.*)$", PAGE, re.MULTILINE)
+    named = {re.split("[<>=]", requirement)[0] for requirement in shlex.split(line)}
+    assert named == set(KNOWN["pip_only"].values())
+    used = set().union(*(imported(package) for package in FOLDERS))
+    assert KNOWN["pip_only"].keys() <= used
+    assert {entry["module"] for entry in KNOWN["keys"].values()} <= used
+
+
+def test_what_the_page_says_of_other_processors_is_about_pins_of_the_lock() -> None:
+    lock = (PROJECT / "requirements.txt").read_text(encoding="utf-8")
+    table = PAGE.split("## arm64")[1]
+    named = re.findall(r"^\| `([a-z0-9-]+)==([^`]+)`", table, re.MULTILINE)
+    assert named
+    assert [f"{name}=={version}" for name, version in named if f"{name}=={version}" not in lock] == []
