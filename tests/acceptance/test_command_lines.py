@@ -45,21 +45,28 @@ class CommandLine:
     command: Any
 
 
-def _calls(function: Any) -> dict[str, ast.Call]:
-    tree = ast.parse(inspect.getsource(function))
-    calls = [node for node in ast.walk(tree) if isinstance(node, ast.Call)]
-    return {call.func.id: call for call in calls if isinstance(call.func, ast.Name)}
+@cache
+def application(package: str, program: str) -> Any | None:
+    """Return the command that a program runs, or None for a node: asked as the shell does that wants to complete it."""
+    asked: list[Any] = []
+
+    def note(command: Any, _: Any) -> list[str]:
+        asked.append(command)
+        return []
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv(completion.VARIABLE, "1")
+        patch.setattr(completion, "of_command", note)
+        patch.setattr(completion, "of_node", lambda _, words: note(None, words))
+        assert run(package, program, [""]) == 0
+    assert len(asked) == 1, f"{package} {program} does not let itself be completed"
+    return asked[0]
 
 
-def application(module: Any, function: str) -> Any | None:
-    """Return the typer application that a main function runs, or None for a node."""
-    calls = _calls(getattr(module, function))
-    if "cli_main" not in calls:
-        assert "run_node" in calls, f"{module.__name__}:{function} is neither a command line nor a node"
-        return None
-    (first, *_) = calls["cli_main"].args
-    assert isinstance(first, ast.Name)
-    return getattr(module, first.id)
+def run(package: str, program: str, arguments: list[str]) -> int:
+    """Run a program in this process and return its exit code."""
+    module, function = executables(package)[program].split(":")
+    return int(getattr(importlib.import_module(module), function)(arguments))
 
 
 def _below(typed: str, command: Any) -> Iterator[CommandLine]:
@@ -75,10 +82,9 @@ def command_lines() -> tuple[CommandLine, ...]:
     """Find all of them."""
     found: list[CommandLine] = []
     for package, program in PROGRAMS:
-        module, function = executables(package)[program].split(":")
-        app = application(importlib.import_module(module), function)
-        if app is not None:
-            found += _below(f"python -m {package} {program}", typer.main.get_command(app))
+        command = application(package, program)
+        if command is not None:
+            found += _below(f"python -m {package} {program}", command)
     for tool in TOOLS:
         found += _below(f"python -m {tool}", typer.main.get_command(importlib.import_module(tool).app))
     return tuple(found)
@@ -86,12 +92,7 @@ def command_lines() -> tuple[CommandLine, ...]:
 
 def nodes() -> list[tuple[str, str]]:
     """Find all programs that are nodes and nothing else."""
-    entries = [(package, program, *executables(package)[program].split(":")) for package, program in PROGRAMS]
-    return [
-        (package, program)
-        for package, program, module, function in entries
-        if application(importlib.import_module(module), function) is None
-    ]
+    return [(package, program) for package, program in PROGRAMS if application(package, program) is None]
 
 
 def _functions(module: Any) -> dict[str, ast.AST]:
@@ -141,8 +142,7 @@ def test_the_help_of_every_command_shows_an_example_of_it() -> None:
 
 def test_the_help_of_every_node_shows_an_example_and_its_parameters(capsys: pytest.CaptureFixture[str]) -> None:
     for package, program in nodes():
-        module, function = executables(package)[program].split(":")
-        assert getattr(importlib.import_module(module), function)(["--help"]) == 0
+        assert run(package, program, ["--help"]) == 0
         text = capsys.readouterr().out
         assert f"example: python -m {package} {program}" in text
         assert "parameters (name, default, meaning):" in text
@@ -169,16 +169,14 @@ def test_every_command_completes_its_options(
         if "tests." in line.typed:
             continue
         package, program, *below = line.typed.split()[2:]
-        module, function = executables(package)[program].split(":")
-        assert getattr(importlib.import_module(module), function)([*below, "--"]) == 0
+        assert run(package, program, [*below, "--"]) == 0
         told = set(capsys.readouterr().out.split())
         expected = {
             name for option in line.command.params if option.param_type_name == "option" for name in option.opts
         }
         assert {name for name in expected if name.startswith("--")} <= told, line.typed
     for package, program in nodes():
-        module, function = executables(package)[program].split(":")
-        assert getattr(importlib.import_module(module), function)(["--ros-args", "-p", ""]) == 0
+        assert run(package, program, ["--ros-args", "-p", ""]) == 0
         assert ":=" in capsys.readouterr().out, program
 
 
