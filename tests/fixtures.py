@@ -6,9 +6,7 @@ several test runs share the machine. Tests with processes take ``processes``, wh
 
 from __future__ import annotations
 
-import fcntl
 import os
-import tempfile
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -16,7 +14,7 @@ from typing import TypeVar
 
 import pytest
 
-from pendulum_bags.experiment.domain import is_unused
+from pendulum_bags.experiment.domain import reserve_domain
 from tests.processes import ProcessGroup
 
 __all__ = ["PROJECT", "domain_id", "processes", "shared_data", "wait_for"]
@@ -64,25 +62,13 @@ def shared_data() -> Path:
 
 @pytest.fixture
 def domain_id(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iterator[int]:
-    """Reserve a ROS domain (1 to 100) on this machine for this test, and put it into the environment."""
-    locks = Path(tempfile.gettempdir(), f"pendulum_domains_{os.getuid()}")
-    locks.mkdir(exist_ok=True)
-    # Each process starts its search elsewhere, so that tests in parallel seldom try the same file.
-    for step in range(100):
-        domain = 1 + (os.getpid() * 7 + step) % 100
-        with (locks / f"{domain}.lock").open("w") as lock:
-            try:
-                fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            except BlockingIOError:
-                continue
-            if not is_unused(domain):
-                continue
-            monkeypatch.setenv("ROS_DOMAIN_ID", str(domain))
-            monkeypatch.setenv("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
-            monkeypatch.setenv("ROS_LOG_DIR", str(tmp_path / "ros_log"))
-            yield domain
-            return
-    pytest.fail(f"all ROS domains from 1 to 100 are in use; the locks are in {locks}")
+    """Reserve a ROS domain on this machine for this test, and put it into the environment."""
+    monkeypatch.delenv("ROS_DOMAIN_ID", raising=False)
+    with reserve_domain() as domain:
+        monkeypatch.setenv("ROS_DOMAIN_ID", str(domain))
+        monkeypatch.setenv("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
+        monkeypatch.setenv("ROS_LOG_DIR", str(tmp_path / "ros_log"))
+        yield domain
 
 
 @pytest.fixture
