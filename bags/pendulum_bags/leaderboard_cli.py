@@ -36,8 +36,8 @@ def leaderboard(
     Example: python -m pendulum_bags experiment leaderboard --plants thesis --controllers lqr,pid --no-robustness
     """
     from pendulum_bags.experiment.run_folder import write_json
-    from pendulum_bags.study.leaderboard import contenders, evaluate
-    from pendulum_bags.study.leaderboard_hardware import HARDWARE, evaluate_hardware
+    from pendulum_bags.study.leaderboard import HARDWARE, contenders, evaluate
+    from pendulum_bags.study.leaderboard_hardware import evaluate_hardware
     from pendulum_bags.study.leaderboard_page import best_sentence, to_json, write_page
     from pendulum_lqr.controller import controller_class
     from pendulum_msgs_py.plant_parameters import load_plant

@@ -26,6 +26,7 @@ from pendulum_sim.sensors import Sensors
 __all__ = [
     "COSTS",
     "EXCLUDED",
+    "HARDWARE",
     "PERTURBATIONS",
     "Cost",
     "Entry",
@@ -37,6 +38,9 @@ __all__ = [
     "push_trains",
     "scores",
 ]
+
+HARDWARE = "hw"
+"""Name of the emulated machine on the board."""
 
 EXCLUDED = {"playback": "plays a recording of another run"}
 GOAL_ANGLE, GOAL_VELOCITY = 0.1, 0.5

@@ -22,15 +22,20 @@ import numpy as np
 from pendulum_bags.experiment.in_process import RunArrays
 from pendulum_bags.experiment.run_spec import RunSpec
 from pendulum_bags.reader import read_bag
-from pendulum_bags.study.leaderboard import Entry, costs_of, model_errors, motion_of, push_trains, scores
+from pendulum_bags.study.leaderboard import (
+    HARDWARE,
+    Entry,
+    costs_of,
+    model_errors,
+    motion_of,
+    push_trains,
+    scores,
+)
 from pendulum_msgs_py import names
 from pendulum_msgs_py.errors import DataError, FaultError, PendulumError
 from pendulum_msgs_py.plant_parameters import load_plant, write_plant
 
-__all__ = ["HARDWARE", "HARDWARE_PERTURBATIONS", "arrays_of_bag", "evaluate_hardware"]
-
-HARDWARE = "hw"
-"""Name of the machine on the board."""
+__all__ = ["HARDWARE_PERTURBATIONS", "arrays_of_bag", "evaluate_hardware"]
 
 _PLANT = "thesis"
 _STRATEGY = "direct_pwm"

@@ -10,7 +10,15 @@ from pathlib import Path
 from typing import Any
 
 from pendulum_bags.experiment.run_folder import git_revision, versions
-from pendulum_bags.study.leaderboard import COSTS, GOAL_ANGLE, GOAL_VELOCITY, PATIENCE, PERTURBATIONS, Entry
+from pendulum_bags.study.leaderboard import (
+    COSTS,
+    GOAL_ANGLE,
+    GOAL_VELOCITY,
+    HARDWARE,
+    PATIENCE,
+    PERTURBATIONS,
+    Entry,
+)
 
 __all__ = ["best_sentence", "to_json", "write_page"]
 
@@ -38,6 +46,7 @@ def write_page(path: Path, entries: Sequence[Entry], duration: float) -> Path:
     heads += [(name.replace("_", " "), "%") for name in PERTURBATIONS]
     text = environment.get_template("leaderboard.html.j2").render(
         plants=plants,
+        hardware=HARDWARE,
         heads=heads,
         duration=f"{duration:g}",
         angle=GOAL_ANGLE,
