@@ -82,6 +82,10 @@ def test_layouts_show_signals_that_exist() -> None:
     assert {name.split("/")[2] for name in plotjuggler} == known
     assert {name.split("/")[1] for name in plotjuggler} == {"sim", "hw"}
     layout = json.loads((folder / "foxglove_layout.json").read_text(encoding="utf-8"))
+    # Panels are named by their type; the layout may show those only that are configured.
+    kinds = {name.partition("!")[0] for name in layout["configById"]}
+    assert kinds == {"Plot", "3D", "DiagnosticSummary"}
+    assert set(re.findall(r"\w+![\w]+", json.dumps(layout["layout"]))) <= set(layout["configById"])
     panels = [panel for name, panel in layout["configById"].items() if name.startswith("Plot!")]
     paths = {path["value"].split(".")[0] for panel in panels for path in panel["paths"]}
     assert paths == {f"/{side}/{topic}" for side in ("sim", "hw") for topic in known}

@@ -92,6 +92,23 @@ def test_the_parameter_file_fits_the_nodes(file: str) -> None:
         assert validate(_specs(program), values, where=key)
 
 
+_PLUGINS = ("Grid", "RobotModel", "MarkerArray", "TF", "MoveCamera", "Measure", "Orbit")
+_RVIZ_CLASSES = {*(f"rviz_default_plugins/{it}" for it in _PLUGINS), "rviz_common/Displays", "rviz_common/Views"}
+"""Of those that RViz of Jazzy has: ``plugins_description.xml`` of rviz_default_plugins, panels of rviz_common."""
+
+
+def _classes(node: object) -> set[str]:
+    if isinstance(node, dict):
+        own = {str(node["Class"])} if node.get("Class") else set()
+        return own.union(*(_classes(value) for value in node.values()))
+    return set().union(*(_classes(value) for value in node)) if isinstance(node, list) else set()
+
+
+def test_rviz_is_asked_for_plugins_that_it_has() -> None:
+    configuration = yaml.safe_load((PROJECT / "pendulum_sim/rviz/pendulum.rviz").read_text(encoding="utf-8"))
+    assert _classes(configuration) == _RVIZ_CLASSES
+
+
 def test_rviz_shows_what_is_published() -> None:
     configuration = yaml.safe_load((PROJECT / "pendulum_sim/rviz/pendulum.rviz").read_text(encoding="utf-8"))
     displays = configuration["Visualization Manager"]["Displays"]
