@@ -107,6 +107,10 @@ NODES: dict[str, Permissions] = {
         subscribe=(names.JOINT_STATES,),
         reply=(*_LIFECYCLE, *_LOGGER),
     ),
+    "effort_controller": Permissions(
+        publish=(names.EFFORT_COMMAND, names.DIAGNOSTICS),
+        subscribe=(names.JOINT_STATES, "~/commands", "joint_commands"),
+    ),
     "disturbance": Permissions(
         publish=(names.DISTURBANCE, names.EVENTS, names.DIAGNOSTICS),
         subscribe=(names.JOINT_STATES,),
@@ -156,7 +160,7 @@ PLANTS = {"/sim": "simulator", "/hw": "bridge"}
 BESIDE_PLANTS = {"conductor": "/conductor", "console": "/console", "console_taps": "/console", "recorder": "/recorder"}
 """Nodes that have to do with all sides, in the root namespace, and the enclave of each: that of its process."""
 
-_SIDE_NODES = ("controller", "disturbance", "recorder", "viewer", "markers")
+_SIDE_NODES = ("controller", "effort_controller", "disturbance", "recorder", "viewer", "markers")
 _WITH_PLANT = {"bridge": ("procedure",)}
 _WITHOUT_PARAMETERS = {"conductor", "console_taps"}
 

@@ -16,7 +16,8 @@ from pendulum_bags.experiment.processes import ProcessSet, ros_environment, star
 from pendulum_msgs_py import graph, names
 from pendulum_msgs_py.errors import FaultError, ParameterError
 from pendulum_msgs_py.graph import NodeProgram
-from pendulum_msgs_py.security import PLANTS, Permissions, enclaves, granted, policy
+from pendulum_msgs_py.security import NODES, PLANTS, Permissions, enclaves, granted, policy
+from tests.acceptance.test_command_lines import nodes
 
 _RULES = ("publish", "subscribe", "reply", "request")
 _OPTIONAL = {names.CLOCK, "/parameter_events"}
@@ -67,6 +68,7 @@ def test_nodes_do_what_the_policy_allows_and_nothing_else(tmp_path: Path, monkey
         graph.simulator("/sim"),
         graph.bridge("/hw", backend="emulator"),
         *(make(side) for side in PLANTS for make in (graph.controller, graph.disturbance)),
+        NodeProgram("pendulum_lqr", "effort_adapter", "/sim", name="effort_controller"),
         NodeProgram("pendulum_hw_bridge", "procedure", "/hw"),
         NodeProgram("pendulum_sim", "viewer", "/sim", parameters={"window": False}),
         NodeProgram("pendulum_sim", "markers", "/sim"),
@@ -96,7 +98,7 @@ def test_nodes_do_what_the_policy_allows_and_nothing_else(tmp_path: Path, monkey
             here = {program.full_name for program in programs}
             here |= {"/hw/recorder", "/conductor", "/console", "/console_taps"}
             # Services of nodes that are not there, and of a trial that is not begun here.
-            absent = {"/sim/recorder/status", "/hw/procedure/start"}
+            absent = {"/sim/recorder/status", "/hw/procedure/start", "/sim/joint_commands"}
             found: dict[str, tuple[Any, Any]] = {}
 
             def as_allowed() -> bool:
@@ -139,11 +141,20 @@ def test_the_policy_is_what_sros_2_reads_and_gives_each_process_an_enclave() -> 
 def test_only_who_drives_a_plant_may_command_torque() -> None:
     torque = {f"{side}/{names.EFFORT_COMMAND}" for side in PLANTS}
     speakers = {name for name, allowed in granted().items() if torque & set(allowed.publish)}
-    assert speakers == {"/sim/controller", "/hw/controller", "/hw/procedure"}
+    drivers = {f"{side}/{node}" for side in PLANTS for node in ("controller", "effort_controller")}
+    assert speakers == {*drivers, "/hw/procedure"}
     for watcher in ("recorder", "viewer", "markers"):
         allowed = granted()[f"/sim/{watcher}"]
         assert {t for t in allowed.publish if t.startswith("/sim/")} <= {"/sim/markers"}
         assert all(service.endswith(_PASSING) for service in allowed.request)
+
+
+def test_every_node_has_permissions_but_the_player() -> None:
+    programs = {program for _, program in nodes()}
+    assert {"simulator", "bridge", "controller"} <= programs
+    named_otherwise = {"effort_adapter": "effort_controller"}
+    assert {named_otherwise.get(program, program) for program in programs} <= NODES.keys()
+    assert "player" not in NODES
 
 
 def test_no_node_of_one_side_speaks_on_the_other() -> None:
