@@ -1,4 +1,4 @@
-"""Many bags, the same questions: rows as the single commands give them, kept answers, the same bits by any cluster."""
+"""Many bags, the same questions: rows as the single commands give them, kept answers, what cannot be asked."""
 
 from __future__ import annotations
 
@@ -70,16 +70,6 @@ def test_interrupted_analysis_goes_on_and_a_changed_bag_is_asked_again(runs: Pat
     shutil.copytree(EXAMPLES / "regulation_sim", runs / "wednesday")
     mended = analyse_bags(tmp_path / "out", find_pieces([runs], ["metrics"]), ["metrics"])
     assert (mended.kept, mended.failed) == (4, 0)
-
-
-def test_a_cluster_gives_the_same_bits_and_bags_of_a_file_name_are_found(runs: Path, tmp_path: Path) -> None:
-    pytest.importorskip("distributed")
-    pieces = find_pieces([runs / "monday"], ["metrics"])
-    assert [piece.name for piece in pieces] == ["hw", "sim"]
-    here = analyse_bags(tmp_path / "here", pieces, ["metrics"])
-    there = analyse_bags(tmp_path / "there", pieces, ["metrics"], workers=1)
-    assert here == there
-    assert (tmp_path / "here" / "bags.csv").read_bytes() == (tmp_path / "there" / "bags.csv").read_bytes()
 
 
 def test_what_cannot_be_asked_is_refused(

@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from pendulum_bags.study.bag_table import analyse_bags, find_pieces
 from pendulum_bags.study.chunks import cluster_client
 from pendulum_bags.study.monte_carlo import (
     MonteCarlo,
@@ -24,6 +25,7 @@ from pendulum_bags.study.uncertain import Uncertainty, parse_uncertainty, uncert
 from pendulum_msgs_py.errors import BagError, ParameterError
 from tests.fixtures import wait_for
 
+EXAMPLES = Path(__file__).parents[1] / "examples"
 SMALL = MonteCarlo(runs=700, chunk=300, duration=0.4)
 
 def has_arrow() -> bool:
@@ -95,6 +97,12 @@ def test_a_cluster_that_loses_a_worker_mid_run_gives_the_same_bits(tmp_path: Pat
         cluster = run_monte_carlo(tmp_path / "cluster", settings, client=client, on_progress=kill)
         wait_for(lambda: len(client.scheduler_info()["workers"]) == 2, 30, "the cluster to replace its worker")
         after = set(client.run(os.getpid).values())
+        pieces = find_pieces([EXAMPLES], ["metrics"])
+        bags = analyse_bags(tmp_path / "bags_there", pieces, ["metrics"], client=client)
+    assert analyse_bags(tmp_path / "bags_here", pieces, ["metrics"]) == bags
+    assert bags.failed == 0
+    for name in ("bags.csv", "bags.json"):
+        assert (tmp_path / "bags_there" / name).read_bytes() == (tmp_path / "bags_here" / name).read_bytes()
     assert victim not in after
     assert here == cluster
     for file in (tmp_path / "here").glob("*.parquet"):
