@@ -29,6 +29,7 @@ def reference() -> str:
     """Return the reference page, from the tables that the programs themselves read."""
     from pendulum_lqr.bringup import ARGUMENTS
     from pendulum_lqr.controller import COMMON_PARAMETERS, CONTROLLERS, controller_class
+    from pendulum_msgs_py.executables import summary
     from pendulum_msgs_py.parameters import markdown_table
 
     parts = [
@@ -36,8 +37,7 @@ def reference() -> str:
     ]
     for package in PACKAGES:
         for name, target in importlib.import_module(f"{package}.executables").EXECUTABLES.items():
-            text = (importlib.import_module(target.split(":")[0]).__doc__ or "").strip().splitlines()[0]
-            parts.append(f"- `python -m {package} {name}`: {text.partition(': ')[2] or text}")
+            parts.append(f"- `python -m {package} {name}`: {summary(name, target)}.")
     parts.append("\n## Parameters of the nodes\n")
     for name, module, tables in NODES:
         specs = [spec for table in tables for spec in getattr(importlib.import_module(module), table)]

@@ -1,4 +1,4 @@
-"""``emulator``: an emulated X5-9 in a process of its own; ``emulator_fault``: lets faults begin and end in it."""
+"""``emulator``: an emulated X5-9 in a process of its own; ``emulator_fault``: starts and ends its faults."""
 
 from __future__ import annotations
 

@@ -6,8 +6,11 @@ scripts of ``setup.py`` and ``python -m`` both read it, so neither can offer wha
 
 from __future__ import annotations
 
+import ast
 import importlib
+import importlib.util
 import os
+import re
 import sys
 from collections.abc import Sequence
 from difflib import get_close_matches
@@ -28,6 +31,7 @@ __all__ = [
     "report_error",
     "report_exhaustion",
     "run_package",
+    "summary",
 ]
 
 EXIT_USAGE = 2
@@ -168,10 +172,26 @@ _SIGNS_OF_EXHAUSTION = (
 )
 
 
+def summary(name: str, target: str) -> str:
+    """Return what a program is for: the first line of its module's docstring, read without importing the module.
+
+    Args:
+        name: The program; where the line speaks of several (```one``: this; ``other``: that``), its part is returned.
+        target: Its entry point, ``module:function``.
+    """
+    spec = importlib.util.find_spec(target.partition(":")[0])
+    source = Path(spec.origin).read_text(encoding="utf-8") if spec is not None and spec.origin else ""
+    text = (ast.get_docstring(ast.parse(source)) or "").partition("\n")[0]
+    own = re.search(rf"``{re.escape(name)}``: (.*?)(?:; ``|$)", text)
+    words = own.group(1) if own else text.partition(": ")[2] or text
+    return words[:1].upper() + words[1:].rstrip(".").replace("``", "")
+
+
 def _usage(package: str, table: dict[str, str]) -> str:
     names = sorted(table)
     lines = [f"usage: python -m {package} EXECUTABLE [ARGUMENTS]", "", "executables:"]
-    lines += [f"  {name}" for name in names]
+    width = max(len(name) for name in names)
+    lines += [f"  {name:<{width}}  {summary(name, table[name])}".rstrip() for name in names]
     lines += ["", f"example: python -m {package} {names[0]} --help"]
     lines += [f"completion with the Tab key, in bash or zsh: source <(python -m {package} --completion bash)"]
     return "\n".join(lines)

@@ -13,6 +13,7 @@ from xml.etree import ElementTree
 
 import pytest
 
+from pendulum_msgs_py.executables import summary
 from tests.fixtures import PROJECT
 
 FOLDERS = {
@@ -176,3 +177,12 @@ def test_make_alone_prints_one_line_for_each_target() -> None:
     rules = re.findall(r"^\.PHONY: (.+)$", (PROJECT / "Makefile").read_text(encoding="utf-8"), re.MULTILINE)
     assert [line.split()[1] for line in lines] == rules[0].split()
     assert all(re.fullmatch(r"make [a-z]+ +\S.*", line) for line in lines)
+
+
+@pytest.mark.parametrize(("package", "program"), PROGRAMS)
+def test_the_list_of_programs_says_what_each_is_for(package: str, program: str) -> None:
+    text = summary(program, executables(package)[program])
+    assert 15 < len(text) < 110, text
+    assert "``" not in text
+    lines = {summary(name, target) for name, target in executables(package).items()}
+    assert len(lines) == len(executables(package))
