@@ -24,7 +24,7 @@ from typing import Any
 
 import numpy as np
 
-from pendulum_bags.datasets import Array, Recording
+from pendulum_bags.datasets import Array, Recording, first_of_each_stamp
 from pendulum_msgs_py.errors import DataError
 from pendulum_msgs_py.parameters import load_yaml
 
@@ -110,6 +110,11 @@ def read_csv(path: str | Path, mapping: str | Path | Mapping[str, Any] | None = 
         kind = {"effort": "effort", "voltage": "voltage", "angle": "position_goal"}[quantity]
         hold = str(section.get("hold", "linear" if kind == "effort" else "zero"))
     _check_magnitudes(source, time, position)
+    kept = first_of_each_stamp(time)
+    if not kept.all():
+        meta["repeated_stamps"] = int(np.sum(~kept))
+        time, position, drive = time[kept], position[kept], drive[kept]
+        velocity = None if velocity is None else velocity[kept]
     return Recording(time, position, velocity, drive, input_kind=kind, hold=hold, meta=meta)
 
 
@@ -157,10 +162,18 @@ def _read_table(source: Path, delimiter: str) -> tuple[list[str], Array]:
     except (csv.Error, TypeError) as error:
         raise DataError(f"{source} begins with a line that is no CSV: {error}") from error
     names = [name.strip() for name in cells]
+    others = [mark for mark in (";", "\t", ",") if mark != delimiter and mark in head]
+    if len(names) == 1 and others:
+        raise DataError(
+            f"{source} has one column, {names[0][:60]!r}, between {delimiter!r}; expected several: a mapping file with "
+            f"`delimiter: {others[0]!r}` reads it otherwise"
+        )
     if not names or all(_is_number(name) for name in names):
         raise DataError(
             f"{source} begins with {head[:60]!r}; expected a first line with the names of the columns"
         )
+    if not body.strip():
+        raise DataError(f"{source} has no rows below its header")
     try:
         table = np.loadtxt(io.StringIO(body), delimiter=delimiter, ndmin=2)
     except ValueError as error:
@@ -238,6 +251,11 @@ def _column(
     if not all(isinstance(candidate, str) for candidate in candidates):
         raise DataError(f"{origin}: column of {name} is {wanted!r}; expected a name or a list of names")
     found = next((column for column in candidates if column in names), None)
+    if found is None:
+        # Capital letters are no other quantity, as long as only one column can be meant.
+        wanted_names = {str(candidate).casefold() for candidate in candidates}
+        alike = [column for column in names if column.casefold() in wanted_names]
+        found = alike[0] if len(alike) == 1 else None
     if found is None:
         if section.get("optional"):
             return None

@@ -17,7 +17,14 @@ from numpy.typing import NDArray
 
 from pendulum_msgs_py.errors import DataError
 
-__all__ = ["INPUT_KINDS", "Recording", "check_consistency", "read_recording", "read_servo_log"]
+__all__ = [
+    "INPUT_KINDS",
+    "Recording",
+    "check_consistency",
+    "first_of_each_stamp",
+    "read_recording",
+    "read_servo_log",
+]
 
 Array = NDArray[np.float64]
 
@@ -150,6 +157,11 @@ class Recording:
         return self.rows(int(first), int(last))
 
 
+def first_of_each_stamp(time: Array) -> NDArray[np.bool_]:
+    """Return which samples to keep where a logger wrote some stamps more than once: the first of each, shape (n,)."""
+    return np.append(True, np.diff(time) != 0.0) if time.size else np.zeros(0, dtype=bool)
+
+
 def check_consistency(recording: Recording, *, minimum_travel: float = 0.2) -> Recording:
     """Return the recording if its velocity is the derivative of its position, else name the likely unit.
 
@@ -264,6 +276,12 @@ def read_servo_log(path: str | Path) -> Recording:
         # The register is 16 bit two's complement in thousandths of full duty.
         load = columns["load"]
         meta["load"] = np.where(load > 32767, load - 65536, load) / 1000.0
+    kept = first_of_each_stamp(columns["timestamp"])
+    if not kept.all():
+        meta["repeated_stamps"] = int(np.sum(~kept))
+        columns = {key: values[kept] for key, values in columns.items()}
+        if "load" in meta:
+            meta["load"] = meta["load"][kept]
     for key in ("input_volts", "temp"):
         if key in columns:
             meta[f"mean_{key}"] = float(columns[key].mean())

@@ -74,6 +74,8 @@ def identify(
 
     if method not in {"output_error", "thesis"}:
         raise DataError(f"method is {method!r}; expected output_error or thesis")
+    if effort not in {"applied", "measured"}:
+        raise DataError(f"effort is {effort!r}; expected applied or measured")
     if method == "thesis":
         recordings = [read_recording(path, mapping, effort="measured") for path in data]
         _thesis(recordings, experiment, skew, out, page, as_json)

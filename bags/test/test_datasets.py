@@ -76,6 +76,34 @@ def test_unsorted_time_is_refused_with_both_stamps(tmp_path):
         read_recording(path)
 
 
+def test_a_stamp_that_a_logger_wrote_twice_counts_once(tmp_path):
+    stamps = TIME.copy()
+    stamps[7] = stamps[6]
+    path = write(tmp_path / "run.csv", "time,position,torque", stamps, ANGLE, SPEED)
+    recording = read_recording(path)
+    assert recording.meta["repeated_stamps"] == 1
+    np.testing.assert_allclose(recording.time, np.delete(stamps, 7))
+    np.testing.assert_allclose(recording.position, np.delete(ANGLE, 7))
+
+
+def test_capital_letters_and_blanks_in_a_header_are_the_same_names(tmp_path):
+    path = write(tmp_path / "run.csv", "Time , POSITION, Torque", TIME, ANGLE, SPEED)
+    np.testing.assert_allclose(read_recording(path).position, ANGLE)
+    path = write(tmp_path / "two.csv", "time,Position,POSITION,torque", TIME, ANGLE, ANGLE, SPEED)
+    with refused("no column 'position'"):
+        read_recording(path)
+
+
+def test_another_delimiter_and_a_file_without_rows_are_named(tmp_path):
+    path = tmp_path / "run.csv"
+    path.write_text("time;position;torque\n0;0;0\n0.01;0;0\n")
+    with refused("a mapping file with `delimiter: ';'` reads it otherwise"):
+        read_recording(path)
+    path.write_text("time,position,torque\n")
+    with refused("has no rows below its header"):
+        read_recording(path)
+
+
 def test_nan_is_refused_with_column_and_row(tmp_path):
     angle = ANGLE.copy()
     angle[11] = np.nan
@@ -175,6 +203,16 @@ def test_rows_keep_the_input_before_them_for_delays():
     assert part.time[0] == TIME[50]
     assert part.input_stamps[0] == TIME[0]
     assert recording.between(0.5, 1.0).time.size == 50
+
+
+def test_the_duty_gain_of_a_part_of_a_servo_log_is_that_of_its_own_rows():
+    from pendulum_bags.identification.output_error import _duty_gain
+
+    goal = ANGLE + 0.1 * np.sign(np.sin(7.0 * TIME))
+    meta = {"kp": 100.0, "load": 0.25 * (goal - ANGLE)}
+    log = Recording(TIME, ANGLE, SPEED, goal, "position_goal", "zero", enabled=np.ones_like(TIME), meta=meta)
+    for part in (log, log.rows(50, 150), log.between(0.5, 1.0)):
+        assert _duty_gain(part) == pytest.approx(0.0025)
 
 
 def test_what_does_not_exist_or_has_an_unknown_suffix_is_refused(tmp_path):

@@ -75,7 +75,9 @@ class Options:
     robust: bool = True
 
     def __post_init__(self) -> None:
-        """Check names."""
+        """Check names and the window."""
+        if self.window is not None and not (np.isfinite(self.window) and self.window > 0.0):
+            raise DataError(f"window is {self.window} s; expected > 0")
         if self.friction != "auto" and self.friction not in FRICTION_MODELS:
             raise DataError(
                 f"friction is {self.friction!r}; expected auto or one of {', '.join(FRICTION_MODELS)}"

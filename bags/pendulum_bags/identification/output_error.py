@@ -155,10 +155,12 @@ def _duty_gain(recording: Recording) -> float:
     if "load" not in recording.meta:
         # P gain / 128 in encoder steps (4096 a turn) to PWM units (885 full), by the servo's control table.
         return 4096.0 / (2.0 * np.pi) / (128.0 * 885.0)
-    load, error = np.asarray(recording.meta["load"]), recording.input - recording.position
+    # A part of a log keeps the whole input: the rows of its own samples are wanted.
+    own = np.isin(recording.input_stamps, recording.time)
+    load, error = np.asarray(recording.meta["load"])[own], recording.input[own] - recording.position
     use = np.abs(load) < 0.8
     if recording.enabled is not None:
-        use &= recording.enabled > 0.5
+        use &= recording.enabled[own] > 0.5
     kp = float(recording.meta.get("kp", 1.0))
     slopes = load[use][np.abs(error[use]) > 0.03] / error[use][np.abs(error[use]) > 0.03]
     return float(np.median(slopes) / kp) if slopes.size > 10 else 0.0025

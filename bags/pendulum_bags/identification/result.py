@@ -81,6 +81,12 @@ class IdentificationResult:
                 "The recorded effort has the opposite sign of the motion that it causes (an external torque?): the fit "
                 "counts it with sign -1."
             )
+        said.extend(
+            f"{piece.recording.name}: {piece.recording.meta['repeated_stamps']} samples repeat the stamp before them "
+            "and are left out."
+            for piece in self.fit.pieces
+            if piece.recording.meta.get("repeated_stamps")
+        )
         if self.score is None:
             said.append(
                 "There is one window only: no held-out score; give a longer recording or a shorter --window."
