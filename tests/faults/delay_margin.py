@@ -130,7 +130,7 @@ class LossReport:
     Attributes:
         loss: Share of frames lost, each way.
         std_theta: [rad].
-        longest: Longest time without a command [s].
+        longest: Longest time without torque [s].
         answered: Share of the states that were answered.
         idle: Share of the states at which no torque acted: commands had become too old.
         held: Whether the pendulum stayed up.
@@ -270,10 +270,11 @@ def _loss(bag: Path, loss: float, began_ns: int, ended_ns: int, held: bool) -> L
     with read_bag(bag, [_STATES, _COMMANDS, _APPLIED], start=start, stop=ended_ns) as opened:
         states, commands = opened.array(_STATES), opened.array(_COMMANDS)
         applied = opened.array(_APPLIED)
+    driven = applied["stamp_ns"][applied["effort"] != 0.0]
     return LossReport(
         loss=loss,
         std_theta=float(np.std(wrap(states["position"] - UPRIGHT))),
-        longest=float(np.max(np.diff(commands["log_time_ns"])) / NANOSECONDS),
+        longest=max(float(np.max(np.diff(driven), initial=0) / NANOSECONDS) - PERIOD, 0.0),
         answered=len(np.unique(commands["stamp_ns"])) / len(np.unique(states["stamp_ns"])),
         idle=float(np.mean(applied["effort"] == 0.0)),
         held=held,
@@ -297,8 +298,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         for lost in survive_loss(Path(folder, "loss"), LOSSES):
             sys.stdout.write(
                 f"{100.0 * lost.loss:g} % of frames lost each way, 5 ms delay: {100.0 * lost.answered:.1f} % of states "
-                f"answered, longest wait for a command {lost.longest * 1e3:.0f} ms, no torque in "
-                f"{100.0 * lost.idle:.1f} % of the periods, std of theta {lost.std_theta:.4f} rad, "
+                f"answered, no torque in {100.0 * lost.idle:.1f} % of the periods, at most "
+                f"for {lost.longest * 1e3:.0f} ms, std of theta {lost.std_theta:.4f} rad, "
                 f"{'stands' if lost.held else 'falls'}\n"
             )
     return 0
