@@ -212,6 +212,13 @@ class Recorder(Node):
         if tap.announced is not session:
             session.add_topic(tap.topic, tap.type, tap.qos)
             tap.announced = session
+        if missing and tap.is_settling:
+            session.note_early(tap.topic, missing)
+            self.get_logger().warning(
+                f"{missing} messages of {tap.topic} are not recorded: they were published before the subscription was "
+                "complete"
+            )
+            missing = 0
         refused = session.offer(tap.topic, items)
         if missing:
             session.note_missing(tap.topic, missing)

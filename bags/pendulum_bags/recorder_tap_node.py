@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib
+import time
 from collections.abc import Iterator, Sequence
 from typing import Any
 
@@ -21,6 +22,12 @@ __all__ = ["Tap", "wanted_qos"]
 
 DEPTH = 4000
 """Messages that the middleware holds for us between two visits: four seconds at 1 kHz."""
+SETTLING = 5.0
+"""Time after which a publisher and its subscription know of each other [s].
+
+A publisher that serves others already may be heard as soon as we know it. It sends again what was missed only once it
+knows us, too, which took up to 2 s where recorders had been killed before.
+"""
 
 
 def wanted_qos(publishers: Sequence[TopicEndpointInfo]) -> tuple[bool, bool]:
@@ -65,6 +72,7 @@ class Tap:
             reliability=ReliabilityPolicy.RELIABLE if self.reliable else ReliabilityPolicy.BEST_EFFORT,
             durability=DurabilityPolicy.TRANSIENT_LOCAL if self.latched else DurabilityPolicy.VOLATILE,
         )
+        self._opened = time.monotonic()
         self.subscription = node.create_subscription(self._class, topic, _not_called, profile, raw=True)
         # Taken when it is asked for, not delivered by the executor: it must be as new as the messages.
         with self.subscription.handle:
@@ -73,8 +81,15 @@ class Tap:
             )
         self._gaps = GapCounter(self._count_publishers)
 
+    @property
+    def is_settling(self) -> bool:
+        """Whether some publisher may not know of us yet."""
+        return time.monotonic() - self._opened < SETTLING
+
     def suits(self, publishers: Sequence[TopicEndpointInfo]) -> bool:
         """Tell whether the subscription can match all these publishers; take note of how many they are."""
+        if len(publishers) > self.publishers:
+            self._opened = time.monotonic()
         self.publishers = len(publishers)
         reliable, latched = wanted_qos(publishers)
         return (reliable or not self.reliable) and (latched or not self.latched)

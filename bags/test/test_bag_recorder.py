@@ -133,6 +133,20 @@ def test_a_full_queue_refuses_and_counts(tmp_path: Path) -> None:
     assert read_bag(tmp_path / "bag").metadata["pendulum.recorder.counts"]["/a"]["lost"] == refused
 
 
+def test_messages_before_the_subscription_was_complete_are_told_and_are_no_loss(tmp_path: Path) -> None:
+    session = RecordingSession(open_writer(tmp_path / "bag"))
+    session.add_topic("/a", message_type(JOINT_STATE), ())
+    session.offer("/a", [(1, encode_joint_state(1, position=1.0))])
+    session.note_early("/a", 905)
+    report = session.close()
+    assert report.lost == 0
+    assert (
+        "nothing lost; published before the subscription was complete, and not recorded: /a 905"
+        in report.sentence()
+    )
+    assert read_bag(tmp_path / "bag").metadata["pendulum.recorder.counts"]["/a"]["early"] == 905
+
+
 def test_a_disk_that_fails_ends_the_session_in_a_sentence(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

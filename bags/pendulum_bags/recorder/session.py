@@ -24,12 +24,17 @@ SYNC_INTERVAL = 5.0
 
 @dataclass(slots=True)
 class TopicCount:
-    """Messages of one topic: arrived, refused by the full queue, never arrived, safely written."""
+    """Messages of one topic: arrived, refused by the full queue, never arrived, safely written.
+
+    ``early`` are those that were published between the first message that arrived and the moment at which the
+    subscription was complete: the recording of the topic begins with a gap, but nothing that was due is lost.
+    """
 
     received: int = 0
     refused: int = 0
     missing: int = 0
     written: int = 0
+    early: int = 0
 
     @property
     def lost(self) -> int:
@@ -69,6 +74,8 @@ class SessionReport:
             text += f" ({', '.join(worst)})"
         else:
             text += ", nothing lost"
+        if early := [f"{name} {count.early}" for name, count in sorted(self.topics.items()) if count.early]:
+            text += f"; published before the subscription was complete, and not recorded: {', '.join(early)}"
         return text + (f"; stopped because {self.error}" if self.error else "")
 
 
@@ -159,6 +166,10 @@ class RecordingSession:
         """Count messages that the middleware lost before they could be offered."""
         self._counts[topic].missing += number
 
+    def note_early(self, topic: str, number: int) -> None:
+        """Count messages that were published before the subscription was complete."""
+        self._counts[topic].early += number
+
     def counts(self) -> dict[str, TopicCount]:
         """Return the counts so far; ``written`` are those that are safe on disk."""
         sealed = self.writer.sealed
@@ -218,7 +229,7 @@ class RecordingSession:
         self.writer.update_metadata(
             {
                 "pendulum.recorder.counts": {
-                    name: {"received": c.received, "written": c.written, "lost": c.lost}
+                    name: {"received": c.received, "written": c.written, "lost": c.lost, "early": c.early}
                     for name, c in self.counts().items()
                 }
             }
