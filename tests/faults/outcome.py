@@ -7,6 +7,7 @@ import random
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from pathlib import Path
 
 from tests.faults.live import EFFORT_LIMIT, START_TIMEOUT, LiveSystem
 
@@ -16,6 +17,7 @@ __all__ = [
     "MAX_TIME_TO_ZERO",
     "Fault",
     "Outcome",
+    "Trial",
     "demand_zero",
     "is_at_rest",
     "try_fault",
@@ -69,6 +71,21 @@ class Fault:
     short: bool = False
     tries: int = 0
     expected_alive: tuple[str, ...] = field(default=("recorder", "simulator", "controller", "disturbance"))
+
+
+@dataclass(frozen=True)
+class Trial:
+    """A fault that is tried on a system of its own.
+
+    Attributes:
+        name: What is done, as the table says it.
+        act: Does it in a folder and says what it saw.
+        why_not: Returns why it cannot be tried on this machine, empty where it can.
+    """
+
+    name: str
+    act: Callable[[Path, random.Random], Outcome]
+    why_not: Callable[[], str] = lambda: ""
 
 
 def try_fault(system: LiveSystem, fault: Fault, generator: random.Random) -> Outcome:

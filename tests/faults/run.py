@@ -23,11 +23,16 @@ from pendulum_msgs_py.executables import cli_main
 from tests.faults.bag_property import check_bag
 from tests.faults.bridge_rig import SCENARIOS, run_scenario
 from tests.faults.campaign import CAMPAIGN
+from tests.faults.clocks import CLOCK_TRIALS
 from tests.faults.delay_margin import LOSSES, survive_loss
 from tests.faults.fuzz import fuzz_all
 from tests.faults.live import EFFORT_LIMIT, LiveSystem
 from tests.faults.network import cut_cable, why_not
-from tests.faults.outcome import MACHINE_PATIENCE, MAX_TIME_TO_ZERO, Fault, Outcome, try_fault
+from tests.faults.outcome import MACHINE_PATIENCE, MAX_TIME_TO_ZERO, Fault, Outcome, Trial, try_fault
+from tests.faults.resources import RESOURCE_TRIALS
+from tests.faults.side_by_side import DOMAIN_TRIALS
+
+_TRIALS = (*CLOCK_TRIALS, *RESOURCE_TRIALS, *DOMAIN_TRIALS)
 
 app = typer.Typer(add_completion=False, rich_markup_mode=None, pretty_exceptions_enable=False)
 
@@ -37,13 +42,15 @@ def campaign(
     repetitions: Annotated[int, typer.Option(help="How often each fault is tried.", min=1)] = 5,
     seed: Annotated[int, typer.Option(help="Seed of the moments at which faults come.")] = 1,
     minutes: Annotated[float, typer.Option(help="How long each parser is attacked [min].", min=0.0)] = 1.0,
-    only: Annotated[str, typer.Option(help="Try only the faults of the running system whose names match.")] = "",
+    only: Annotated[str, typer.Option(help="Try only the faults of running systems whose names match.")] = "",
     keep: Annotated[Path | None, typer.Option(help="New folder that keeps logs and bags.")] = None,
     out: Annotated[Path, typer.Option(help="Where the table is written.")] = Path("build", "faults.json"),
 ) -> int:
     """Attack the running system and count what it stood."""
     wanted = [fault for fault in CAMPAIGN if not only or re.search(only, fault.name)]
     rows = _live_rows(wanted, repetitions, seed, keep) if wanted else []
+    trials = [trial for trial in _TRIALS if not only or re.search(only, trial.name)]
+    rows += [_trial_row(trial, seed, keep) for trial in trials]
     if not only:
         rows = [
             *_bridge_rows(max(repetitions, 20)),
@@ -117,6 +124,26 @@ def _live_rows(faults: Sequence[Fault], repetitions: int, seed: int, keep: Path 
                 sys.stderr.write(f"{fault.name}: {rows[-1]['survived']} of {len(outcomes)}, {took:.1f} s each\n")
         rows.append(_property_row(folder))
     return rows
+
+
+def _trial_row(trial: Trial, seed: int, keep: Path | None) -> dict[str, Any]:
+    """Try a fault once on a system of its own."""
+    if reason := trial.why_not():
+        row = _row(Fault(trial.name, _nothing), [])
+        return {**row, "remarks": f"not tried: {reason}"}
+    began = time.monotonic()
+    with tempfile.TemporaryDirectory(prefix="pendulum_fault_") as temporary:
+        folder = Path(temporary)
+        if keep is not None:
+            folder = keep / re.sub(r"\W+", "_", trial.name)
+            folder.mkdir(parents=True)
+        try:
+            outcome = trial.act(folder, random.Random(seed))
+        except PendulumError as error:
+            outcome = Outcome(survived=False, detail=str(error))
+    sys.stderr.write(f"{trial.name}: {'survived' if outcome.survived else 'NOT survived'}, ")
+    sys.stderr.write(f"{time.monotonic() - began:.1f} s\n")
+    return _row(Fault(trial.name, _nothing), [outcome])
 
 
 def _property_row(folder: Path) -> dict[str, Any]:
@@ -197,7 +224,7 @@ def _try(system: LiveSystem, fault: Fault, generator: random.Random) -> Outcome:
 def _row(fault: Fault, outcomes: Sequence[Outcome]) -> dict[str, Any]:
     times = [outcome.time_to_zero for outcome in outcomes if outcome.time_to_zero is not None]
     losses = [outcome.lost for outcome in outcomes if outcome.lost is not None]
-    told = [outcome for outcome in outcomes if not outcome.survived] or list(outcomes)
+    told = [outcome for outcome in outcomes if not outcome.survived] or list(outcomes) or [Outcome()]
     return {
         "fault": fault.name,
         "tried": len(outcomes),
