@@ -87,7 +87,8 @@ def test_cable_delays_and_loses_what_it_is_told_to() -> None:
         finally:
             echo.kill()
             echo.wait(10.0)
-            echo.stdout.close()
+            if echo.stdout is not None:
+                echo.stdout.close()
 
 
 def _ask(namespace: str) -> tuple[float, int]:
