@@ -1,4 +1,4 @@
-"""Faults of time, memory, folders and domains, in short; ``make faults`` has the long forms."""
+"""Faults of time, memory and folders, in short; ``make faults`` has the long forms."""
 
 from __future__ import annotations
 
@@ -10,7 +10,6 @@ import pytest
 from tests.faults.clocks import simulate_hours
 from tests.faults.outcome import Trial
 from tests.faults.resources import RESOURCE_TRIALS
-from tests.faults.side_by_side import run_side_by_side
 
 _SHORT = [trial for trial in RESOURCE_TRIALS if trial.name.startswith("recorder:")]
 
@@ -21,12 +20,6 @@ def test_a_recorder_that_fails_says_so_and_keeps_what_was_sealed(trial: Trial, t
     if reason := trial.why_not():
         pytest.skip(reason)
     outcome = trial.act(tmp_path, random.Random(trial.name))
-    assert outcome.survived, outcome.detail
-
-
-@pytest.mark.timeout(300)
-def test_two_experiments_at_once_hear_nothing_of_each_other(tmp_path: Path) -> None:
-    outcome = run_side_by_side(tmp_path, 0.5)
     assert outcome.survived, outcome.detail
 
 
