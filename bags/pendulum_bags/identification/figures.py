@@ -37,7 +37,7 @@ def fit_figures(result: IdentificationResult) -> dict[str, Figure]:
         theta[piece.windows[1:, 0]] = np.nan
         top.plot(recording.time, theta, color=SIMULATED, linewidth=0.9, label="simulated")
         top.set_ylabel("angle [rad]")
-        top.legend(loc="upper right")
+        top.legend(loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=2, frameon=False)
         top.set_title(recording.name)
         middle.plot(
             recording.time, 1e3 * (simulated.theta - recording.position), color=SIMULATED, linewidth=0.7

@@ -22,7 +22,8 @@ _STYLE = """
 body { font: 15px/1.5 system-ui, sans-serif; max-width: 60rem; margin: 2rem auto; padding: 0 1rem; color: #1c1917; }
 table { border-collapse: collapse; margin: 1rem 0; } th, td { padding: .2rem .8rem; text-align: right; }
 th { border-bottom: 1px solid #78716c; } td:first-child, th:first-child { text-align: left; }
-img { max-width: 100%; } .alarm { color: #b91c1c; font-weight: bold; } pre { font-size: 12px; overflow-x: auto; }
+img { max-width: 100%; } .wide { overflow-x: auto; } td { white-space: nowrap; }
+.alarm { color: #b91c1c; font-weight: bold; } pre { font-size: 12px; overflow-x: auto; }
 """
 
 
@@ -97,7 +98,7 @@ def _table(title: str, head: Sequence[str], rows: Sequence[Sequence[str]]) -> st
         return ""
     cells = "".join(f"<th>{escape(h)}</th>" for h in head)
     lines = "".join("<tr>" + "".join(f"<td>{escape(c)}</td>" for c in row) + "</tr>" for row in rows)
-    return f"<h2>{escape(title)}</h2><table><tr>{cells}</tr>{lines}</table>"
+    return f'<h2>{escape(title)}</h2><div class="wide"><table><tr>{cells}</tr>{lines}</table></div>'
 
 
 def _image(path: Path) -> str:
@@ -108,7 +109,8 @@ def _image(path: Path) -> str:
 def _write(folder: Path, title: str, body: Sequence[str]) -> Path:
     parts: Mapping[str, str] = {"title": escape(title), "style": _STYLE, "body": "\n".join(body)}
     page = (
-        '<!doctype html><html lang="en"><meta charset="utf-8"><title>{title}</title><style>{style}</style>'
+        '<!doctype html><html lang="en"><meta charset="utf-8"><meta name="viewport" content="width=device-width">'
+        "<title>{title}</title><style>{style}</style>"
         "<h1>{title}</h1>{body}</html>\n"
     ).format(**parts)
     path = folder / "index.html"
