@@ -179,7 +179,10 @@ def summary(name: str, target: str) -> str:
         name: The program; where the line speaks of several (```one``: this; ``other``: that``), its part is returned.
         target: Its entry point, ``module:function``.
     """
-    spec = importlib.util.find_spec(target.partition(":")[0])
+    try:
+        spec = importlib.util.find_spec(target.partition(":")[0])
+    except (ImportError, ValueError):  # help must not fail for want of a module that nobody runs yet
+        spec = None
     source = Path(spec.origin).read_text(encoding="utf-8") if spec is not None and spec.origin else ""
     text = (ast.get_docstring(ast.parse(source)) or "").partition("\n")[0]
     own = re.search(rf"``{re.escape(name)}``: (.*?)(?:; ``|$)", text)
