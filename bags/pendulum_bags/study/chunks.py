@@ -89,9 +89,10 @@ def cluster_client(scheduler: str = "", workers: int = 1) -> Iterator[Any]:
         finally:
             client.close()
         return
-    # What it says of a worker that died and was replaced is for those who run a cluster, not for whom it serves.
+    # What it says of a worker that died and was replaced is for those who run a cluster, not for whom it serves; its
+    # status page takes any free port of this machine alone, so that two clusters do not meet on the usual one.
     cluster = LocalCluster(
-        n_workers=workers, threads_per_worker=1, dashboard_address=None, silence_logs=logging.CRITICAL
+        n_workers=workers, threads_per_worker=1, dashboard_address="127.0.0.1:0", silence_logs=logging.CRITICAL
     )
     try:
         client = Client(cluster)
