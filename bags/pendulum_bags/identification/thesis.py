@@ -7,6 +7,7 @@ averaged over trials. Source: thesis "Control of a Pendulum System: From Simulat
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -139,6 +140,10 @@ def regress(trial: str, names: Sequence[str], regressors: Array, response: Array
     if len(response) <= len(names):
         raise DataError(f"{trial} has {len(response)} points for {len(names)} coefficients; expected more")
     table = sm.OLS(response, regressors).fit()
+    with warnings.catch_warnings():
+        # The table of few points says so itself, by a test of normality that has no value.
+        warnings.simplefilter("ignore")
+        summary = str(table.summary(yname="effort", xname=list(names)))
     return Regression(
         trial,
         tuple(names),
@@ -148,7 +153,7 @@ def regress(trial: str, names: Sequence[str], regressors: Array, response: Array
         np.asarray(table.pvalues),
         np.asarray(table.conf_int(0.05)),
         float(table.rsquared),
-        str(table.summary(yname="effort", xname=list(names))),
+        summary,
         regressors,
         response,
     )
