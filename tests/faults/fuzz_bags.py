@@ -26,7 +26,6 @@ from rich.table import Table
 
 from pendulum_msgs_py.errors import PendulumError
 from pendulum_msgs_py.executables import cli_main
-from tests.faults.fuzz import PATIENCE, too_slow
 
 __all__ = ["STORAGES", "fuzz_storage", "watch"]
 
@@ -47,6 +46,8 @@ _WORDS = (
 """What stands in bags, in the notation of libFuzzer's dictionaries."""
 _WATCHED = {"os.system", "os.exec", "os.posix_spawn", "subprocess.Popen", "socket.connect", "os.remove", "os.rename"}
 _LARGEST = 1 << 16
+PATIENCE = 20.0
+"""Longest time of computing that one bag may take to read [s]."""
 
 app = typer.Typer(add_completion=False, rich_markup_mode=None, pretty_exceptions_enable=False)
 
@@ -79,6 +80,8 @@ def _child(storage: str, place: Path, flags: Sequence[str]) -> None:
     with atheris.instrument_imports(include=["pendulum_bags.reader", "pendulum_bags.storage", "rosbags"]):
         for module in ("rosbags.serde", "rosbags.typesys"):
             importlib.import_module(module)
+        # Not above: what is imported before is not watched.
+        from tests.faults.fuzz import too_slow
         from tests.faults.parsers import PARSERS
     parser = next(parser for parser in PARSERS if parser.name == STORAGES[storage])
     (place / "good").mkdir()
