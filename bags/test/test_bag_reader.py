@@ -408,6 +408,17 @@ def test_a_late_message_is_a_gap_but_none_is_missing() -> None:
     assert (result.gaps, result.missing) == (1, 0)
 
 
+def test_bursts_of_events_leave_no_gaps_but_a_periodic_topic_without_stamps_does() -> None:
+    event = "std_msgs/msg/String"
+    bursts = np.array([0, 1_000, 3_000, 4_000, 2_000_000_000, 2_000_001_000, 2_000_004_000], np.int64)
+    result = time_statistics(event, bursts)
+    assert (result.gaps, result.missing) == (0, 0)
+    assert result.longest == pytest.approx(2000, rel=1e-3)
+    periodic = np.delete(np.arange(100, dtype=np.int64) * 10_000_000, [50, 51])
+    result = time_statistics(event, periodic)
+    assert (result.gaps, result.missing) == (1, 2)
+
+
 def test_latencies_are_matched_by_echoed_stamps(tmp_path: Path) -> None:
     path = tmp_path / "bag"
     with open_writer(path) as writer:
@@ -444,6 +455,23 @@ def test_tables_have_the_columns_of_the_arrays(tmp_path: Path) -> None:
         export_bag(bag, tmp_path / "xls", "xls")
     with pytest.raises(BagError, match="exists already"):
         export_bag(bag, tmp_path / "csv", "csv")
+
+
+def test_tables_leave_out_the_constants_of_a_type_and_keep_times_whole_without_messages(
+    tmp_path: Path,
+) -> None:
+    path = tmp_path / "bag"
+    status = STORE.types["diagnostic_msgs/msg/DiagnosticStatus"]
+    message = status(level=1, name="n", message="m", hardware_id="h", values=[])
+    with open_writer(path) as writer:
+        writer.add_topic("/status", message.__msgtype__)
+        writer.add_topic("/silent", "std_msgs/msg/String")
+        writer.write("/status", 1, bytes(STORE.serialize_cdr(message, message.__msgtype__)))
+    bag = read_bag(path)
+    assert list(to_pandas(bag, "/status").columns) == [
+        "log_time_ns", "level", "name", "message", "hardware_id", "values",
+    ]  # fmt: skip
+    assert to_pandas(bag, "/silent").dtypes.to_dict() == {"log_time_ns": np.dtype(np.int64)}
 
 
 def test_parquet_reads_back(tmp_path: Path) -> None:

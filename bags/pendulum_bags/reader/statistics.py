@@ -15,6 +15,8 @@ __all__ = ["BagStatistics", "Latency", "TopicStatistics", "bag_statistics", "tim
 
 GAP_FACTOR = 1.5
 """An interval counts as a gap when it is longer than this many median intervals."""
+BURST_FACTOR = 2.0
+"""Messages without stamps come in bursts when their mean interval is longer than this many median intervals."""
 CLOCK_JUMP = 0.05
 """A step of the difference between log time and stamp counts as a clock jump from this size [s]."""
 _LEAST_SHARE = 0.5
@@ -33,7 +35,7 @@ class TopicStatistics:
         jitter: Standard deviation of the intervals.
         period_p99: 99 % of the intervals are at most that long.
         longest: Longest interval.
-        gaps: Intervals longer than 1.5 median intervals.
+        gaps: Intervals longer than 1.5 median intervals; none where messages come in bursts (see ``time_statistics``).
         missing: Messages that would fill the gaps at the median interval (a late message leaves none behind).
         duplicates: Messages that carry the stamp of an earlier one (of the same sender, where they name it).
         backward: Messages whose stamp lies before that of the message before.
@@ -99,7 +101,8 @@ def time_statistics(
     """Return the timing of one topic.
 
     Intervals are those between stamps where messages have them (a recorder that reads in batches cannot blur them),
-    else those between log times.
+    else those between log times. Messages without stamps whose mean interval is more than twice the median come in
+    bursts, as events do: they have no period that could leave gaps.
 
     Args:
         kind: Message type.
@@ -124,6 +127,8 @@ def time_statistics(
     result.jitter = float(np.std(ascending)) * _MS
     result.period_p99 = float(np.quantile(ascending, 0.99)) * _MS
     result.longest = float(ascending.max()) * _MS
+    if not stamped and float(np.mean(ascending)) > BURST_FACTOR * median:
+        return result
     result.gaps = int(np.sum(ascending > GAP_FACTOR * median))
     # A late message makes a long interval and a short one: together they miss nothing.
     result.missing = max(int(np.sum(np.rint(ascending / median) - 1)), 0)

@@ -34,8 +34,9 @@ def to_pandas(bag: Bag, topic: str) -> pd.DataFrame:
     values = bag[topic]
     if isinstance(values, np.ndarray):
         return pd.DataFrame({name: values[name] for name in values.dtype.names or ()})
-    rows = [{"log_time_ns": stored.log_time_ns, **_flat(stored.message)} for stored in values]
-    return pd.DataFrame(rows, columns=None if rows else ["log_time_ns"])
+    if not values:
+        return pd.DataFrame({"log_time_ns": np.empty(0, np.int64)})
+    return pd.DataFrame([{"log_time_ns": stored.log_time_ns, **_flat(stored.message)} for stored in values])
 
 
 def export_bag(bag: Bag, folder: Path, format: str = "parquet") -> list[Path]:
@@ -93,8 +94,8 @@ def _require_pyarrow() -> None:
 def _flat(value: Any, prefix: str = "") -> dict[str, Any]:
     row: dict[str, Any] = {}
     for field in dataclasses.fields(value):
-        if field.name.startswith("__"):
-            continue  # what rosbags adds, such as the type's name
+        if str(field.type).startswith("ClassVar"):
+            continue  # constants of the type, and what rosbags adds, such as the type's name
         item = getattr(value, field.name)
         name = f"{prefix}{field.name}"
         if dataclasses.is_dataclass(item):
