@@ -223,9 +223,10 @@ class Recorder(Node):
         if missing:
             session.note_missing(tap.topic, missing)
         if missing or refused:
+            why = "the disk failed" if session.failure else "the disk does not keep up"
             self.get_logger().error(
                 f"LOST {missing + refused} messages of {tap.topic} ({missing} by the middleware, {refused} because "
-                "the disk does not keep up)"
+                f"{why})"
             )
 
     def _stamp(self, tap: Tap, data: bytes) -> int | None:
