@@ -380,6 +380,19 @@ def test_one_flipped_byte_makes_bags_different(tmp_path: Path) -> None:
     assert same_messages(a, late, log_times=False)
 
 
+def test_messages_of_one_log_time_have_no_order_but_must_all_be_there(tmp_path: Path) -> None:
+    def write(name: str, positions: list[float]) -> Bag:
+        with open_writer(tmp_path / name) as writer:
+            writer.add_topic("/a", JOINT_STATE)
+            for position in positions:
+                writer.write("/a", 1, encode_joint_state(1, position=position))
+        return read_bag(tmp_path / name)
+
+    one = write("one", [1.0, 2.0])
+    assert same_messages(one, write("other", [2.0, 1.0]))
+    assert not same_messages(one, write("third", [2.0, 2.0]))
+
+
 # -- timing and tables ---------------------------------------------------------------------------------------------
 
 
