@@ -11,9 +11,9 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
-from rich.table import Table
 
 from pendulum_msgs_py.executables import EXIT_INTERRUPTED, cli_main
+from pendulum_msgs_py.terminal import WholeTable, make_console
 
 if TYPE_CHECKING:
     from pendulum_bags.study.bag_table import Table as BagTable
@@ -51,9 +51,7 @@ def analyse(
 
     questions = [name.strip() for name in ask.split(",") if name.strip()]
     pieces = find_pieces(folders, questions)
-    console = Console(stderr=json_output, highlight=False)
-    if not console.is_terminal:
-        console = Console(stderr=json_output, highlight=False, width=150)
+    console = make_console(stderr=json_output, highlight=False)
     bar = Progress(
         TextColumn("{task.description}"), BarColumn(bar_width=None), MofNCompleteColumn(), TimeRemainingColumn(),
         console=console, transient=True, disable=not console.is_terminal,
@@ -86,7 +84,7 @@ def _print(console: Console, found: BagTable, out: Path, elapsed: float) -> None
         if not rows:
             continue
         names = [name for name in _SHOWN if any(row.get(name) is not None for row in rows)]
-        table = Table(title=title, title_justify="left")
+        table = WholeTable(title=title, title_justify="left")
         for heading in ("bag", "plant", *names) if file == "bags" else ("run", *names):
             table.add_column(heading.replace("_", " "), justify="left" if heading in {"bag", "run"} else "right")
         for row in rows[:_MOST_ROWS]:

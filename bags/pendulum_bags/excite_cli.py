@@ -100,11 +100,10 @@ def excite(
         }
         typer.echo(json.dumps(content, indent=2))
     else:
-        from rich.console import Console
-        from rich.table import Table
+        from pendulum_msgs_py.terminal import WholeTable, make_console
 
-        console = Console()
-        table = Table(
+        console = make_console()
+        table = WholeTable(
             title=f"{design.kind}, {duration:g} s: predicted 95 % intervals, if the prior plant is true"
         )
         for heading in ("parameter", "half width", "relative", "unit"):

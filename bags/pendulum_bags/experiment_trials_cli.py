@@ -14,6 +14,7 @@ from pendulum_bags.experiment.progress import PhaseProgress
 from pendulum_bags.experiment.run_folder import create_run_folder, discard_if_empty
 from pendulum_msgs_py.errors import PendulumError
 from pendulum_msgs_py.executables import EXIT_INTERRUPTED
+from pendulum_msgs_py.terminal import make_console
 
 if TYPE_CHECKING:
     from pendulum_bags.experiment.trials import TrialSettings
@@ -93,7 +94,7 @@ def _run(settings: TrialSettings, out: Path | None, domain: int | None, json_out
     check_domain(domain)
     name = settings.kind.name
     folder = create_run_folder(out, name)
-    console = Console(stderr=json_output, highlight=False)
+    console = make_console(stderr=json_output, highlight=False)
     started = time.monotonic()
     total = settings.trials * (4.0 + settings.expected_duration / (10.0 if settings.lockstep else 1.0))
     try:
@@ -111,7 +112,8 @@ def _run(settings: TrialSettings, out: Path | None, domain: int | None, json_out
     code = identify_cli.main([*map(str, bags), *arguments, *(["--json"] if json_output else [])])
     console.print(
         f"\nbags    {folder / 'trial_1'} to {folder / f'trial_{len(bags)}'} ({elapsed:.0f} s)\n"
-        f"again   python -m pendulum_bags identify {folder}/trial_* --method thesis --experiment {name}"
+        f"again   python -m pendulum_bags identify {folder}/trial_* --method thesis --experiment {name}",
+        soft_wrap=True,
     )
     if code:
         raise typer.Exit(code)

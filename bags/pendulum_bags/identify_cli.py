@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -133,32 +134,43 @@ def _thesis(
 
 
 def _print_thesis(result: ThesisResult) -> None:
-    from rich.console import Console
-    from rich.table import Table
+    from pendulum_bags.identification.model import UNITS
+    from pendulum_msgs_py.terminal import WholeTable, make_console
 
-    console = Console()
+    console = make_console()
     for regression in result.trials:
         console.print(f"[bold]{regression.trial}[/bold]")
-        console.print(regression.summary, markup=False, highlight=False)
-    table = Table(title=f"Average over {len(result.trials)} trials")
-    for heading in ("coefficient", "value", "95 % interval"):
+        print(_narrow(regression.summary))
+    table = WholeTable(title=f"Average over {len(result.trials)} trial{'s' if len(result.trials) != 1 else ''}")
+    for heading in ("coefficient", "value", "95 % interval", "unit"):
         table.add_column(heading)
     for key, value in result.average.items():
         low, high = result.intervals[key]
-        table.add_row(key, f"{value:.5g}", f"{low:.5g} to {high:.5g}")
+        table.add_row(key, f"{value:.5g}", f"{low:.5g} to {high:.5g}", UNITS[key])
     console.print(table)
     for sentence in result.sentences:
         console.print(f"- {sentence}", markup=False, highlight=False)
 
 
+def _narrow(summary: str, width: int = 78) -> str:
+    """Make the head of statsmodels' summary, widened by its labels, as narrow as the rest: blanks of it go."""
+    lines = [line.rstrip() for line in summary.splitlines()]
+    rules = [index for index, line in enumerate(lines) if line and not line.strip("=")]
+    excess = len(lines[rules[0]]) - width if len(rules) > 1 else 0
+    if excess > 0:
+        lines[rules[0]] = "=" * width
+        for index in range(rules[0] + 1, rules[1]):
+            if len(lines[index]) > width:
+                lines[index] = re.sub(rf" {{{excess}}}(?= *\S+$)", "", lines[index], count=1)
+    return "\n".join(lines)
+
+
 def _print_result(result: IdentificationResult, out: Path | None) -> None:
-    from rich.console import Console
-    from rich.table import Table
-
     from pendulum_bags.identification.model import UNITS
+    from pendulum_msgs_py.terminal import WholeTable, make_console
 
-    console = Console()
-    table = Table(title=f"Identified by output error, friction {result.fit.chosen.friction}")
+    console = make_console()
+    table = WholeTable(title=f"Identified by output error, friction {result.fit.chosen.friction}")
     predicted = result.predicted
     for heading in ("parameter", "value", "95 % interval", *(["predicted"] if predicted else []), "unit"):
         table.add_column(heading)
@@ -171,7 +183,7 @@ def _print_result(result: IdentificationResult, out: Path | None) -> None:
             cells.append(f"+-{predicted[key]:.2g}" if key in predicted else "-")
         table.add_row(*cells, unit)
     console.print(table)
-    models = Table(title="Friction models")
+    models = WholeTable(title="Friction models")
     for heading in ("model", "held-out rms \\[mrad]", "training rms \\[mrad]", ""):
         models.add_column(heading)
     for candidate in result.fit.candidates:

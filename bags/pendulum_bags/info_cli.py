@@ -9,12 +9,11 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import typer
-from rich.console import Console
-from rich.table import Table
 
 from pendulum_bags.reader import read_bag
 from pendulum_bags.reader.statistics import BagStatistics, bag_statistics
 from pendulum_msgs_py.executables import cli_main
+from pendulum_msgs_py.terminal import WholeTable, make_console
 
 __all__ = ["main"]
 
@@ -38,7 +37,7 @@ def info(
 
 
 def _print(statistics: BagStatistics, metadata: dict[str, Any]) -> None:
-    console = Console(width=None if Console().is_terminal else 150)
+    console = make_console()
     console.print(
         f"{statistics.path} ({statistics.storage}): {statistics.count} messages in {statistics.duration:.3f} s",
         highlight=False,
@@ -47,7 +46,7 @@ def _print(statistics: BagStatistics, metadata: dict[str, Any]) -> None:
     for sentence in statistics.damage:
         console.print(f"damaged: {sentence}", style="bold red", highlight=False, soft_wrap=True)
     # One line a topic for the rate, one table for what can be wrong with it.
-    table = Table("topic", "type", title="topics (intervals between stamps, in ms)", title_justify="left")
+    table = WholeTable("topic", "type", title="topics (intervals between stamps, in ms)", title_justify="left")
     for heading in ("count", "rate [Hz]", "median", "jitter", "p99", "longest", "gaps", "missing"):
         table.add_column(heading, justify="right")
     for name, topic in statistics.topics.items():
@@ -62,7 +61,7 @@ def _print(statistics: BagStatistics, metadata: dict[str, Any]) -> None:
     console.print(table)
     stamped = {name: topic for name, topic in statistics.topics.items() if not math.isnan(topic.age)}
     if stamped:
-        table = Table("topic", title="stamps (age = log time - stamp, in ms)", title_justify="left")
+        table = WholeTable("topic", title="stamps (age = log time - stamp, in ms)", title_justify="left")
         for heading in ("age", "age p99", "duplicates", "backward", "clock jumps"):
             table.add_column(heading, justify="right")
         for name, topic in stamped.items():
@@ -72,7 +71,7 @@ def _print(statistics: BagStatistics, metadata: dict[str, Any]) -> None:
             )
         console.print(table)
     if statistics.latencies:
-        table = Table(
+        table = WholeTable(
             "from", "to the answer on", title="latencies (by equal stamps, in ms)", title_justify="left"
         )
         for heading in ("matched", "median", "p99", "longest"):

@@ -9,11 +9,10 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
-from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn
-from rich.table import Table
 
 from pendulum_msgs_py.executables import EXIT_INTERRUPTED
+from pendulum_msgs_py.terminal import WholeTable, make_console
 
 __all__ = ["leaderboard"]
 
@@ -49,7 +48,7 @@ def leaderboard(
     for name in machines:
         if name != HARDWARE:
             load_plant(name)
-    console = Console(stderr=json_output, highlight=False)
+    console = make_console(stderr=json_output, highlight=False)
     bar = Progress(
         TextColumn("{task.description}"), BarColumn(bar_width=None), MofNCompleteColumn(), console=console,
         transient=True, disable=not console.is_terminal,
@@ -80,7 +79,7 @@ def leaderboard(
     if json_output:
         print(json.dumps(to_json(entries), indent=2))
         return
-    table = Table(title="Leaderboard", title_justify="left")
+    table = WholeTable(title="Leaderboard", title_justify="left")
     for heading in ("plant", "controller", "up", "v1", "v2", "v3", "time \\[s]", "robustness \\[%]"):
         table.add_column(heading, justify="left" if heading in {"plant", "controller"} else "right")
     for entry in sorted(entries, key=lambda one: (machines.index(one.plant), -one.scores.get("v2", -1.0))):
@@ -95,4 +94,4 @@ def leaderboard(
         )
     console.print(table)
     console.print(best_sentence(entries))
-    console.print(f"page    {page}")
+    console.print(f"page    {page}", soft_wrap=True)

@@ -10,9 +10,9 @@ from typing import Annotated, Any
 import typer
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
-from rich.table import Table
 
 from pendulum_msgs_py.executables import EXIT_INTERRUPTED
+from pendulum_msgs_py.terminal import WholeTable, make_console
 
 __all__ = ["monte_carlo"]
 
@@ -63,7 +63,7 @@ def monte_carlo(
         bound=bound,
     )
     folder = out or Path("bags", "runs", "monte_carlo")
-    console = Console(stderr=json_output, highlight=False)
+    console = make_console(stderr=json_output, highlight=False)
     if replay >= 0:
         _replay(console, settings, replay, folder)
         return
@@ -124,14 +124,14 @@ def _print(console: Console, result: dict[str, Any], folder: Path) -> None:
     told = ", ".join(f"{name} {100.0 * share:.2g} %" for name, share in uncertain["shares"].items()) or "nothing"
     correlated = ", correlated" if uncertain["correlation"] else ""
     console.print(f"uncertain: {told}{correlated} ({uncertain['source']})")
-    table = Table(title="Quantiles", title_justify="left")
+    table = WholeTable(title="Quantiles", title_justify="left")
     shares = next(iter(result["quantiles"].values()))
     for heading in ("", *shares):
         table.add_column(heading, justify="right")
     for name, values in result["quantiles"].items():
         table.add_row(name, *(f"{value:.5g}" for value in values.values()))
     console.print(table)
-    table = Table(title="Worst runs", title_justify="left")
+    table = WholeTable(title="Worst runs", title_justify="left")
     names = list(uncertain["shares"])
     for heading in ("run", *names, "noise seed", "max theta \\[rad]"):
         table.add_column(heading, justify="right")
@@ -144,7 +144,7 @@ def _print(console: Console, result: dict[str, Any], folder: Path) -> None:
         )
     console.print(table)
     if "sobol" in result:
-        table = Table(title=f"Sobol indices of {result['sobol']['output']}", title_justify="left")
+        table = WholeTable(title=f"Sobol indices of {result['sobol']['output']}", title_justify="left")
         for heading in ("factor", "first order", "total"):
             table.add_column(heading, justify="right")
         for entry in result["sobol"]["indices"]:

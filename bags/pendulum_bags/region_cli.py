@@ -8,10 +8,10 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
-from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 from pendulum_msgs_py.executables import EXIT_INTERRUPTED
+from pendulum_msgs_py.terminal import make_console
 
 __all__ = ["region_of_attraction"]
 
@@ -62,7 +62,7 @@ def region_of_attraction(
         seed=seed,
     )
     folder = out or Path("bags", "runs", "region_of_attraction")
-    console = Console(stderr=json_output, highlight=False)
+    console = make_console(stderr=json_output, highlight=False)
     bar = Progress(
         TextColumn("{task.description}"), BarColumn(bar_width=None), MofNCompleteColumn(), TimeRemainingColumn(),
         console=console, transient=True, disable=not console.is_terminal,
@@ -86,4 +86,5 @@ def region_of_attraction(
         print(json.dumps(result.to_json(), indent=2))
         return
     console.print(region_sentence(result))
-    console.print(f"\npicture {picture}\nmap     {folder / 'map.parquet'}\n({time.monotonic() - started:.0f} s)")
+    elapsed = time.monotonic() - started
+    console.print(f"\npicture {picture}\nmap     {folder / 'map.parquet'}\n({elapsed:.0f} s)", soft_wrap=True)

@@ -98,12 +98,11 @@ def _write(folder: Path, result: Any, content: dict[str, Any]) -> list[Path]:
 
 
 def _print(result: InputReplay | ControllerReplay, content: dict[str, Any]) -> None:
-    from rich.console import Console
-    from rich.table import Table
+    from pendulum_msgs_py.terminal import WholeTable, make_console
 
-    console = Console()
+    console = make_console()
     if "horizons" in content:
-        table = Table(title="Error of predictions from measured states, by horizon", title_justify="left")
+        table = WholeTable(title="Error of predictions from measured states, by horizon", title_justify="left")
         for heading in (
             "samples",
             "time [s]".replace("[", r"\["),

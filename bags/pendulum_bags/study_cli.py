@@ -11,10 +11,10 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn
-from rich.table import Table
 
 from pendulum_msgs_py.errors import FaultError, ParameterError
 from pendulum_msgs_py.executables import EXIT_INTERRUPTED
+from pendulum_msgs_py.terminal import WholeTable, make_console
 
 if TYPE_CHECKING:
     from pendulum_bags.study.results import Group
@@ -161,7 +161,7 @@ def _study(
         raise ParameterError(
             f"workers is {workers}; expected 1: runs in real time must not share the machine"
         )
-    console = Console(stderr=json_output, highlight=False)
+    console = make_console(stderr=json_output, highlight=False)
     if dry_run:
         _print_matrix(console, found, workers)
         return
@@ -234,7 +234,7 @@ def _analyse(folder: Path, found: Study, records: Sequence[dict[str, Any]]) -> d
 
 def _print_matrix(console: Console, found: Study, workers: int) -> None:
     console.print(f"{found.name}: {found.description}" if found.description else found.name, markup=False)
-    table = Table()
+    table = WholeTable()
     for heading in ("axis", "values"):
         table.add_column(heading)
     for axis in ("plant", "controller", "disturbance", "set_point", "start", "seed", "repeat"):
@@ -272,12 +272,13 @@ def _print_result(
     simulated = sum(record["simulated_s"] or 0.0 for record in records)
     told = f", {simulated:.0f} s simulated" if simulated else ""
     console.print(
-        f"\nstudy   {folder}\ntable   {folder / 'runs.csv'}\n({len(records)} runs, {wall:.0f} s of runs{told})"
+        f"\nstudy   {folder}\ntable   {folder / 'runs.csv'}\n({len(records)} runs, {wall:.0f} s of runs{told})",
+        soft_wrap=True,
     )
 
 
 def _print_groups(console: Console, groups: Sequence[Group]) -> None:
-    table = Table(title="Mean over seeds, 95 % interval", title_justify="left")
+    table = WholeTable(title="Mean over seeds, 95 % interval", title_justify="left")
     table.add_column("")
     for group in groups:
         table.add_column(

@@ -8,8 +8,6 @@ from dataclasses import asdict
 from typing import Annotated, Any
 
 import typer
-from rich.console import Console
-from rich.table import Table
 
 from pendulum_hw_bridge.bridge_parameters import (
     BRIDGE_SPECS,
@@ -23,6 +21,7 @@ from pendulum_hw_bridge.checklist import CheckItem, run_checklist
 from pendulum_hw_bridge.clocks import WallClock
 from pendulum_msgs_py.executables import cli_main
 from pendulum_msgs_py.parameters import validate
+from pendulum_msgs_py.terminal import WholeTable, make_console
 
 __all__ = ["main"]
 
@@ -71,7 +70,7 @@ def check(
     )
     effort = plant_of(values).effort_limit
     settings = bridge_settings(values, effort=effort, velocity=1.5, gains=trajectory_gains(values))
-    console = Console(stderr=True)
+    console = make_console(stderr=True)
     items = run_checklist(
         make_port(values, WallClock()),
         settings,
@@ -88,11 +87,11 @@ def check(
 
 
 def _print(items: list[CheckItem], ready: bool) -> None:
-    table = Table("", "check", "seen", "expected", title="Before arming")
+    table = WholeTable("", "check", "seen", "expected", title="Before arming")
     for item in items:
         mark = "[green]ok[/green]" if item.passed else "[bold red]NO[/bold red]"
         table.add_row(mark, item.name, item.seen, item.expected)
-    console = Console()
+    console = make_console()
     console.print(table)
     if ready:
         console.print(

@@ -9,12 +9,11 @@ from dataclasses import replace
 from typing import Annotated
 
 import typer
-from rich.console import Console
-from rich.table import Table
 
 from pendulum_hw_bridge.emulation.faults import ActuatorFault
 from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.executables import cli_main
+from pendulum_msgs_py.terminal import WholeTable, make_console
 
 __all__ = ["fault_main", "main"]
 
@@ -81,10 +80,10 @@ def emulator_fault(
         if as_json:
             print(json.dumps({"faults": known}))
             return
-        table = Table("fault", title="Faults of the emulated actuator")
+        table = WholeTable("fault", title="Faults of the emulated actuator")
         for name in known:
             table.add_row(name)
-        Console().print(table)
+        make_console().print(table)
         return
     backend = EmulatorProcessBackend(address)
     backend.connect()

@@ -15,7 +15,6 @@ from typing import Annotated, Any
 
 import typer
 from rich.console import Console
-from rich.table import Table
 
 from pendulum_lqr.analysis import LoopReport, analyse
 from pendulum_lqr.design import Gain, continuous_lqr
@@ -24,6 +23,7 @@ from pendulum_msgs_py.angles import UPRIGHT
 from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.executables import cli_main
 from pendulum_msgs_py.plant_parameters import PRESETS, load_plant
+from pendulum_msgs_py.terminal import WholeTable, make_console
 
 __all__ = ["THESIS_CHOICE", "THESIS_WEIGHTS", "app", "main"]
 
@@ -73,8 +73,7 @@ def design(
     if as_json:
         sys.stdout.write(json.dumps(_document(parameters.name, model, weights, reports), indent=2) + "\n")
     else:
-        # A pipe has no width: wide enough that no number is cut in two.
-        console = Console(width=None if sys.stdout.isatty() else 120, highlight=False)
+        console = make_console(highlight=False)
         _print(console, parameters.name, model, weights, reports, chosen)
     if figures is not None:
         limit = effort_limit if effort_limit > 0.0 else parameters.effort_limit
@@ -118,12 +117,12 @@ def _print(
         f"plant {name} at theta = {model.theta:.4f} rad: A = [[0, 1], [{model.A[1, 0]:.2f}, {model.A[1, 1]:.2f}]], "
         f"B = [0, {model.B[1, 0]:.2f}], u* = {model.effort:.4g} N m"
     )
-    table = Table(title="Eigenvalues and gains", title_justify="left", header_style="bold")
-    for heading in ("#", "q11", "q22", "r", "eigenvalues [1/s]", "computed", "K", "tau [s]", "damping"):
+    table = WholeTable(title="Eigenvalues and gains", title_justify="left", header_style="bold")
+    for heading in ("#", "q11", "q22", "r", "eigenvalues \\[1/s]", "computed", "K", "tau \\[s]", "damping"):
         table.add_column(heading, justify="left" if heading.startswith("eig") else "right", no_wrap=True)
-    margins_table = Table(title="Robustness of the loop", title_justify="left", header_style="bold")
+    margins_table = WholeTable(title="Robustness of the loop", title_justify="left", header_style="bold")
     for heading in ("#", "gain up", "gain down", "phase margin", "delay margin", "modulus", "largest period"):
-        margins_table.add_column(heading, justify="right", no_wrap=True)
+        margins_table.add_column(heading, justify="right")
     for index, report in enumerate(reports):
         (q11, q22), cost = weights[index - 1] if index else ((math.nan, math.nan), math.nan)
         cells = [f"{value:g}" if index else "\u2013" for value in (q11, q22, cost)]

@@ -31,9 +31,7 @@ def phase_plot(
     Example: python -m pendulum_sim phase_plot --plant thesis --torque 0.5 --output phase.png
     """
     # Imported late: --help should not wait for matplotlib.
-    from rich.console import Console
-    from rich.table import Table
-
+    from pendulum_msgs_py.terminal import WholeTable, make_console
     from pendulum_sim.figures import fixed_points, plot_overdamped_phase, save_figure
 
     parameters = load_plant(plant)
@@ -42,12 +40,12 @@ def phase_plot(
     if as_json:
         typer.echo(json.dumps({"figure": str(path), "fixed_points": [asdict(point) for point in points]}))
         return
-    table = Table(title=f"fixed points of {parameters.name}, u_0 = {torque:g} N m")
-    for column in ("theta [rad]", "stability", "rate [1/s]"):
+    table = WholeTable(title=f"fixed points of {parameters.name}, u_0 = {torque:g} N m")
+    for column in ("theta \\[rad]", "stability", "rate \\[1/s]"):
         table.add_column(column, justify="left" if column == "stability" else "right")
     for point in points:
         table.add_row(f"{point.theta:.6f}", "stable" if point.stable else "unstable", f"{point.rate:+.6f}")
-    console = Console()
+    console = make_console()
     console.print(table if points else "no fixed point: the torque exceeds gravity, the pendulum turns over")
     console.print(f"figure: {path}", soft_wrap=True)
 

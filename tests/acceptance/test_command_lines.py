@@ -114,7 +114,7 @@ def prints_a_table(callback: Any) -> bool:
         for node in ast.walk(known[name]):
             if isinstance(node, ast.Call):
                 called = node.func.id if isinstance(node.func, ast.Name) else getattr(node.func, "attr", "")
-                if called in {"Table", "print_table"}:
+                if called in {"WholeTable", "print_table"}:
                     return True
                 todo.append(called)
     return False

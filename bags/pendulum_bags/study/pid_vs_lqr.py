@@ -10,7 +10,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 from rich.console import Console
-from rich.table import Table
 from scipy import stats
 
 from pendulum_bags.comparison.metrics import METRICS, Episode, metrics_of
@@ -18,6 +17,7 @@ from pendulum_bags.report.figure import Figure, Mark, Panel, Trace
 from pendulum_bags.report.render_files import write_figures
 from pendulum_bags.study.results import episode_of_run, group_runs
 from pendulum_bags.study.study_file import Study
+from pendulum_msgs_py.terminal import WholeTable
 
 __all__ = ["COMPARED", "analyse", "print_table"]
 
@@ -64,7 +64,7 @@ def analyse(folder: Path, study: Study, records: Sequence[Mapping[str, Any]]) ->
 def print_table(console: Console, result: Mapping[str, Any]) -> None:
     """Print the table."""
     rows = result["rows"]
-    table = Table(title="PID and LQR: mean over seeds, 95 % interval, worst seed", title_justify="left")
+    table = WholeTable(title="PID and LQR: mean over seeds, 95 % interval, worst seed", title_justify="left")
     table.add_column("")
     for row in rows:
         table.add_column(f"{row['plant']} {row['controller']}\n{row['runs']} runs", justify="right")

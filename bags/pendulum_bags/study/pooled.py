@@ -9,12 +9,12 @@ from typing import Any
 
 import numpy as np
 from rich.console import Console
-from rich.table import Table
 from scipy import stats
 
 from pendulum_bags.comparison import compare_folders
 from pendulum_bags.study.study_file import Study
 from pendulum_msgs_py.errors import DataError
+from pendulum_msgs_py.terminal import WholeTable
 
 __all__ = ["analyse", "print_table"]
 
@@ -53,7 +53,7 @@ def print_table(console: Console, result: Mapping[str, Any]) -> None:
         pooled = "1 run" if content["runs"] == 1 else f"{content['runs']} runs pooled"
         console.print(f"{pooled}: {content['verdict']['sentence']}")
         return
-    table = Table(title="Identified, 95 % interval over trials", title_justify="left")
+    table = WholeTable(title="Identified, 95 % interval over trials", title_justify="left")
     table.add_column("seed", justify="right")
     for name in result["pooled"]:
         table.add_column(f"{name} \\[{UNITS.get(name, '')}]", justify="right")

@@ -10,7 +10,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 from rich.console import Console
-from rich.table import Table
 
 from pendulum_bags.datasets import Recording
 from pendulum_bags.experiment.run_spec import RunSpec
@@ -20,6 +19,7 @@ from pendulum_bags.report.render_files import write_figures
 from pendulum_bags.study.study_file import Study
 from pendulum_msgs_py.angles import UPRIGHT
 from pendulum_msgs_py.plant_parameters import load_plant
+from pendulum_msgs_py.terminal import WholeTable
 from pendulum_msgs_py.values import NANOSECONDS
 
 __all__ = ["analyse", "apparent_plant", "commanded_recording", "print_table"]
@@ -104,18 +104,18 @@ def apparent_plant(recording: Recording) -> dict[str, Any]:
 
 def print_table(console: Console, rows: Sequence[Mapping[str, Any]]) -> None:
     """Print the table."""
-    table = Table(title="The plant that the controller sees, by strategy", title_justify="left")
+    table = WholeTable(title="The plant that the controller sees, by strategy", title_justify="left")
     headings = ("damping\nN m s/rad", "inertia\nkg m^2", "std theta\nrad", "std ratio\nto sim", "paired rms\nrad")
-    table.add_column("", no_wrap=True)
+    table.add_column("")
     for heading in headings:
-        table.add_column(heading, justify="right", no_wrap=True)
+        table.add_column(heading, justify="right")
     for row in rows:
         low, high = row["damping_interval"] or (math.nan, math.nan)
         inertia_low, inertia_high = row["inertia_interval"] or (math.nan, math.nan)
         table.add_row(
             row["plant"],
-            f"{row['damping']:.2f}\n{low:.2f}..{high:.2f}",
-            f"{row['inertia']:.3f}\n{inertia_low:.3f}..{inertia_high:.3f}",
+            f"{row['damping']:.2f}\n{low:.2f} to {high:.2f}",
+            f"{row['inertia']:.3f}\n{inertia_low:.3f} to {inertia_high:.3f}",
             f"{row['std_theta']:.5f}",
             "–" if row.get("std_ratio") is None else f"{row['std_ratio']:.2f}",
             "–" if row.get("paired_rms") is None else f"{row['paired_rms']:.5f}",
