@@ -93,27 +93,27 @@ def _write(out: Path, result: Comparison, content: dict[str, Any]) -> None:
 
 
 def _print(result: Comparison, content: dict[str, Any]) -> None:
-    from rich.console import Console
-    from rich.table import Table
+    from pendulum_bags.comparison.run_data import timing_warning
+    from pendulum_msgs_py.terminal import WholeTable, make_console
 
-    console = Console()
+    console = make_console()
     plants = content["plants"]
-    table = Table(title="Plants during the noise", title_justify="left")
+    table = WholeTable(title="Plants during the noise", title_justify="left")
     for heading in ("", *plants):
         table.add_column(heading, justify="left" if not heading else "right")
     for label, key, form in (
-        ("rate / Hz", "rate_hz", ".1f"),
+        ("rate \\[Hz]", "rate_hz", ".1f"),
         ("missed deadlines", "missed_deadlines", ".0f"),
-        ("noise held for / s", "noise_hold_time", ".4f"),
-        ("std of theta / rad", "std_theta", ".5f"),
-        ("std of theta' / rad/s", "std_theta_dot", ".5f"),
-        ("max |u| / N m", "max_abs_u", ".4f"),
+        ("noise held for \\[s]", "noise_hold_time", ".4f"),
+        ("std of theta \\[rad]", "std_theta", ".5f"),
+        ("std of theta' \\[rad/s]", "std_theta_dot", ".5f"),
+        ("max |u| \\[N m]", "max_abs_u", ".4f"),
     ):
         table.add_row(label, *(_number(plant.get(key), form) for plant in plants.values()))
     console.print(table)
     blocks = [("paired", content["paired"])] if "position" in content["paired"] else []
     blocks.append(("unpaired", content["unpaired"]))
-    statistics = Table(title="Hardware minus simulation", title_justify="left")
+    statistics = WholeTable(title="Hardware minus simulation", title_justify="left")
     statistics.add_column("")
     for title, _ in blocks:
         statistics.add_column(f"{title} \\[rad]", justify="right")
@@ -122,6 +122,8 @@ def _print(result: Comparison, content: dict[str, Any]) -> None:
         cells = [f"{block[key][name]:.4g}" for _, block in blocks for key in ("position", "velocity")]
         statistics.add_row(name, *cells)
     console.print(statistics)
+    if warning := timing_warning(plants):
+        console.print(warning, style="bold red", highlight=False)
     if result.is_paired:
         pair = result.pairs[0]
         delay = pair.response.delay * 1e3
@@ -132,7 +134,7 @@ def _print(result: Comparison, content: dict[str, Any]) -> None:
         )
     else:
         console.print(f"Not paired: {content['paired']['reason']}.")
-    tests = Table(title="Equivalence tests", title_justify="left")
+    tests = WholeTable(title="Equivalence tests", title_justify="left")
     for heading in ("quantity", "estimate", "90 % interval", "margin", "result", "add runs"):
         tests.add_column(heading, justify="left" if heading in {"quantity", "result"} else "right")
     for test in result.verdict.tests:
@@ -140,7 +142,7 @@ def _print(result: Comparison, content: dict[str, Any]) -> None:
         tests.add_row(
             test.quantity + (f" \\[{test.unit}]" if test.unit != "-" else ""),
             f"{interval.estimate:.3g}",
-            f"{interval.low:.3g} .. {interval.high:.3g}",
+            f"{interval.low:.3g} to {interval.high:.3g}",
             test.margin_text().removeprefix("margin "),
             test.outcome.value,
             {None: "no use", 0: ""}.get(test.more_runs, str(test.more_runs)),

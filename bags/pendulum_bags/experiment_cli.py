@@ -11,7 +11,6 @@ from typing import Annotated, Any
 
 import typer
 from rich.console import Console
-from rich.table import Table
 
 from pendulum_bags.experiment.domain import check_domain
 from pendulum_bags.experiment.progress import PhaseProgress
@@ -24,6 +23,7 @@ from pendulum_bags.region_cli import region_of_attraction
 from pendulum_bags.study_cli import add_commands as add_study_commands
 from pendulum_msgs_py.errors import PendulumError
 from pendulum_msgs_py.executables import EXIT_INTERRUPTED, cli_main
+from pendulum_msgs_py.terminal import WholeTable, make_console
 
 __all__ = ["app", "main"]
 
@@ -95,7 +95,7 @@ def thesis(
     )
     check_domain(domain)
     folder = create_run_folder(out, "thesis")
-    console = Console(stderr=json_output, highlight=False)
+    console = make_console(stderr=json_output, highlight=False)
     started = time.monotonic()
     try:
         with PhaseProgress(_EXPECTED_TOTAL, console) as progress:
@@ -115,7 +115,8 @@ def thesis(
         _print_summary(console, summary)
     elapsed = time.monotonic() - started
     console.print(
-        f"\nreport  {folder / 'report.html'}\nbags    {folder / 'sim'}, {folder / 'hw'}\n({elapsed:.0f} s)"
+        f"\nreport  {folder / 'report.html'}\nbags    {folder / 'sim'}, {folder / 'hw'}\n({elapsed:.0f} s)",
+        soft_wrap=True,
     )
 
 
@@ -201,7 +202,9 @@ def _analyse(folder: Path, settings: RegulationSettings) -> dict[str, Any]:
 
 
 def _print_summary(console: Console, summary: dict[str, Any]) -> None:
-    table = Table(title="Simulation and hardware under the same noise", title_justify="left")
+    from pendulum_bags.comparison.run_data import timing_warning
+
+    table = WholeTable(title="Simulation and hardware under the same noise", title_justify="left")
     table.add_column("")
     plants = summary["plants"]
     for name in plants:
@@ -217,8 +220,11 @@ def _print_summary(console: Console, summary: dict[str, Any]) -> None:
         cells = [_cell(plants[name].get(key), form) for name in plants]
         table.add_row(f"{label} [{unit}]".replace("[", r"\[") if unit else label, *cells)
     console.print(table)
-    if verdict := summary.get("verdict"):
-        console.print(verdict if isinstance(verdict, str) else verdict.get("sentence", verdict))
+    if "sim_500hz" in plants:
+        console.print("(sim_500hz: simulation by the thesis's own protocol, with new noise every 2 ms)")
+    if warning := timing_warning(plants):
+        console.print(warning, style="bold red")
+    console.print(summary["verdict"]["sentence"])
 
 
 def _cell(value: Any, form: str) -> str:

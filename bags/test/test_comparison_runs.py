@@ -12,7 +12,7 @@ from scipy.interpolate import CubicSpline
 
 from pendulum_bags.compare_cli import main
 from pendulum_bags.comparison import Outcome, compare_folders, compare_runs, read_run
-from pendulum_bags.comparison.run_data import missed_periods
+from pendulum_bags.comparison.run_data import missed_periods, timing_warning
 from pendulum_bags.storage import open_writer
 from pendulum_msgs_py.cdr import encode_joint_state
 from pendulum_msgs_py.errors import BagError, DataError
@@ -104,6 +104,13 @@ def test_pooled_runs_narrow_the_intervals(folder: Path, tmp_path: Path) -> None:
 def test_states_that_are_missing_count_as_missed_deadlines() -> None:
     stamps = np.array([0, 2, 4, 10, 12, 14, 16, 20]) * 1_000_000
     assert missed_periods(stamps) == 3
+
+
+def test_a_run_that_lost_many_states_is_told_apart_from_a_sound_one(folder: Path) -> None:
+    plants = compare_folders([folder]).plants
+    assert timing_warning(plants) == ""
+    disturbed = {**plants, "sim": {**plants["sim"], "samples": 2384, "missed_deadlines": 116}}
+    assert "sim missed 116 of 2500 states (4.6 %); end other programs" in timing_warning(disturbed)
 
 
 def test_without_events_the_window_is_that_of_the_disturbance(tmp_path: Path) -> None:

@@ -331,7 +331,10 @@ class PlantSupervisor:
             # It would look fresh for as long, even if no other ever came.
             return f"measurement is stamped {-age * 1e3:.0f} ms ahead of the plant's clock"
         if age > limits.feedback_timeout:
-            return f"measurement is {age * 1e3:.0f} ms old; expected at most {limits.feedback_timeout * 1e3:.0f} ms"
+            return (
+                f"measurement is {age * 1e3:.0f} ms old; expected at most {limits.feedback_timeout * 1e3:.0f} ms: "
+                "is the machine too busy, or the link to the actuator lost?"
+            )
         if not limits.position_min <= sample.position <= limits.position_max:
             return (
                 f"position is {sample.position:.3f} rad; expected inside {limits.position_min} to "

@@ -305,7 +305,7 @@ def conclude(tests: Sequence[EquivalenceTest], margins: Margins, first: str, sec
         runs = None if None in counts else max(count or 0 for count in counts)
         what = ", ".join(test.quantity for test in undecided)
         text = (
-            f"Undecided whether {first} and {second} are equivalent within {whose}: {_more(runs)} ({what})."
+            f"Undecided whether {first} and {second} are equivalent within {whose} in {what}: {_more(runs)}."
         )
     else:
         outcome = Outcome.EQUIVALENT

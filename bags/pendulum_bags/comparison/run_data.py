@@ -26,6 +26,7 @@ __all__ = [
     "missed_periods",
     "plant_summary",
     "read_run",
+    "timing_warning",
 ]
 
 START_EVENT = "noise_start"
@@ -86,6 +87,27 @@ def find_prefix(bag: Bag) -> str:
             f"bag {bag.path} has no topic that ends in {ending}; it has {', '.join(bag.topics) or 'none'}"
         )
     raise DataError(f"bag {bag.path} holds several plants ({', '.join(found)}); choose one by its namespace")
+
+
+def timing_warning(plants: Mapping[str, Mapping[str, Any]]) -> str:
+    """Return a sentence where a plant left out so many states that the run tells more of the machine than of the plant.
+
+    Args:
+        plants: Figures of :func:`plant_summary`, by the plant's name.
+    """
+    words = []
+    for name, plant in plants.items():
+        missed, samples = int(plant["missed_deadlines"]), int(plant["samples"])
+        if missed > _TOLERATED * (missed + samples):
+            share = missed / (missed + samples)
+            words.append(f"{name} missed {missed} of {missed + samples} states ({100.0 * share:.1f} %)")
+    if not words:
+        return ""
+    return f"The machine was too busy for these plants: {', '.join(words)}; end other programs and repeat the run."
+
+
+_TOLERATED = 0.02
+"""Share of states that may be missing before a run is called disturbed."""
 
 
 def missed_periods(stamps_ns: NDArray[np.int64]) -> int:

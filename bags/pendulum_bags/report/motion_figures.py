@@ -46,8 +46,8 @@ def _under_noise(run: RunData, role: str, name: str, title: str, section: str) -
         f"more than {quantity(float(np.abs(window.effort).max()), 'N m')}."
     )
     panels = [
-        Panel(TIME, ANGLE, [Trace(window.t, _deviation(window), "angle", role)]),
-        Panel(TIME, VELOCITY, [Trace(window.t, window.velocity, "velocity", role)]),
+        Panel(TIME, ANGLE, [Trace(window.t, _deviation(window), "", role)]),
+        Panel(TIME, VELOCITY, [Trace(window.t, window.velocity, "", role)]),
         Panel(TIME, TORQUE, torque),
     ]
     return Figure(name, title, sentence, panels, section=section, panel_height=150)

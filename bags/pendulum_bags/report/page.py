@@ -10,6 +10,7 @@ from functools import lru_cache
 from importlib import resources
 from typing import Any
 
+from pendulum_bags.comparison.run_data import timing_warning
 from pendulum_bags.report.animation import animation_of
 from pendulum_bags.report.data import ReportData
 from pendulum_bags.report.figure import Figure
@@ -75,6 +76,7 @@ def render_page(
         unpaired=data.comparison.unpaired_verdict,
         noise_note=_noise_note(data),
         is_paired=data.comparison.is_paired,
+        timing_warning=timing_warning(data.comparison.plants),
         facts=_facts(data),
         sections=sections,
         missing=missing,
