@@ -113,6 +113,14 @@ def _replay(console: Console, settings: Any, number: int, folder: Path) -> None:
     console.print(f"motion  {path}")
 
 
+def _with_unit(name: str) -> str:
+    """Return the name of a parameter or an outcome with its unit, as a cell of a table."""
+    from pendulum_bags.identification.model import UNITS
+
+    known = {**UNITS, "max_theta": "rad", "std_theta": "rad", "max_effort": "N m"}
+    return f"{name} \\[{known[name]}]" if name in known else name
+
+
 def _print(console: Console, result: dict[str, Any], folder: Path) -> None:
     settings = result["settings"]
     low, high = result["probability_interval"]
@@ -129,11 +137,11 @@ def _print(console: Console, result: dict[str, Any], folder: Path) -> None:
     for heading in ("", *shares):
         table.add_column(heading, justify="right")
     for name, values in result["quantiles"].items():
-        table.add_row(name, *(f"{value:.5g}" for value in values.values()))
+        table.add_row(_with_unit(name), *(f"{value:.5g}" for value in values.values()))
     console.print(table)
     table = WholeTable(title="Worst runs", title_justify="left")
     names = list(uncertain["shares"])
-    for heading in ("run", *names, "noise seed", "max theta \\[rad]"):
+    for heading in ("run", *map(_with_unit, names), "noise seed", "max theta \\[rad]"):
         table.add_column(heading, justify="right")
     for row in result["worst"][:5]:
         table.add_row(

@@ -152,8 +152,10 @@ def _sentences(paired: Sequence[Mapping[str, Any]]) -> list[str]:
     for pair in paired:
         if pair["metric"] not in {"ise", "effort_energy", "smoothness"}:
             continue
-        if pair["low"] > 1.0 or pair["high"] < 1.0:
-            verdict = f"{abs(pair['ratio'] - 1.0):.1%} {'more' if pair['ratio'] > 1.0 else 'less'} than"
+        if pair["low"] > 1.0 and pair["ratio"] >= 2.0:
+            verdict = f"{pair['ratio']:.1f} times"
+        elif pair["low"] > 1.0 or pair["high"] < 1.0:
+            verdict = f"{100.0 * abs(pair['ratio'] - 1.0):.1f} % {'more' if pair['ratio'] > 1.0 else 'less'} than"
         else:
             verdict = "not told apart from"
         said.append(
