@@ -213,6 +213,10 @@ def test_verdict_is_the_worst_outcome_in_words() -> None:
     verdict = conclude([good, open_, bad], Margins(stated=False), "simulation", "hardware")
     assert verdict.outcome is Outcome.DIFFERENT
     assert "not equivalent within the default margins (none were stated): spread is 3" in verdict.sentence
+    partly = conclude([good], Margins.parse(["position=0.01", "spread=1.5"]), "simulation", "hardware")
+    assert "within the stated margins and, for velocity, path, the default ones, in all" in partly.sentence
+    whole = Margins.parse({"position": 0.01, "velocity": 0.1, "spread": 1.5, "path": 0.5})
+    assert "within the stated margins, in all" in conclude([good], whole, "simulation", "hardware").sentence
 
 
 @pytest.mark.parametrize(

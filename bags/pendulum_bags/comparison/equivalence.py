@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass, field
 from enum import Enum
 from typing import Any
 
@@ -47,6 +47,7 @@ class Margins:
         path: Root mean square distance of the two motions under one disturbance, per standard deviation of the
             hardware's motion.
         stated: Whether the user stated them; else they are the program's defaults, and the verdict says so.
+        defaults: Names of margins that a user who stated some of them left at their defaults.
     """
 
     position: float = 0.005
@@ -54,6 +55,7 @@ class Margins:
     spread: float = 1.25
     path: float = 0.5
     stated: bool = True
+    defaults: tuple[str, ...] = field(default=(), compare=False)
 
     def __post_init__(self) -> None:
         """Refuse what is no margin."""
@@ -82,16 +84,25 @@ class Margins:
         if isinstance(margin, Margins):
             return margin
         if isinstance(margin, (int, float)):
-            return cls(position=float(margin))
+            margin = {"position": float(margin)}
         if isinstance(margin, str):
             margin = margin.split(",")
         values = dict(margin) if isinstance(margin, Mapping) else dict(_parse_text(text) for text in margin)
-        known = [field.name for field in fields(cls) if field.name != "stated"]
+        known = ["position", "velocity", "spread", "path"]
         for name in values:
             if name not in known:
                 raise ParameterError(f"margin has no {name!r}; expected one of {', '.join(known)}")
         numbers: dict[str, Any] = {name: float(value) for name, value in values.items()}
-        return cls(**numbers)
+        return cls(**numbers, defaults=tuple(name for name in known if name not in numbers))
+
+    @property
+    def whose(self) -> str:
+        """Whose margins these are, in words."""
+        if not self.stated:
+            return "the default margins (none were stated)"
+        if not self.defaults:
+            return "the stated margins"
+        return f"the stated margins and, for {', '.join(self.defaults)}, the default ones"
 
 
 def _parse_text(text: str) -> tuple[str, float]:
@@ -292,7 +303,7 @@ def conclude(tests: Sequence[EquivalenceTest], margins: Margins, first: str, sec
     """
     by_outcome = {outcome: [test for test in tests if test.outcome is outcome] for outcome in Outcome}
     different, undecided = by_outcome[Outcome.DIFFERENT], by_outcome[Outcome.UNDECIDED]
-    whose = "the stated margins" if margins.stated else "the default margins (none were stated)"
+    whose = margins.whose
     if different:
         outcome = Outcome.DIFFERENT
         what = "; ".join(_short(test) for test in different)

@@ -49,7 +49,7 @@ def equivalence(data: ReportData) -> Figure:
     names = [test.quantity for test in tests]
     reach = max(1.3, *(abs(value) * 1.08 for test in tests for value in _relative(test)))
     panel = Panel(
-        "in units of the margin (ratios: of its logarithm)",
+        "in margins (ratios: logarithm)",
         "",
         traces,
         marks=[Mark(-1.0, "x", "−margin"), Mark(1.0, "x", "+margin"), Mark(0.0, "x")],

@@ -124,7 +124,10 @@ def _tests(data: ReportData) -> Table:
         "smallest margin that would hold",
         "runs to add",
     )
-    whose = "were stated" if data.comparison.verdict.margins.stated else "are defaults"
+    margins = data.comparison.verdict.margins
+    whose = "were stated" if margins.stated else "are defaults"
+    if margins.stated and margins.defaults:
+        whose += f", but for {', '.join(margins.defaults)}, which are defaults"
     sentence = (
         "Two one-sided tests at 5 % each, intervals by block bootstrap. Ratios are hardware per simulation; the path "
         "distance is the rms distance per standard deviation of the hardware's angle. "

@@ -128,4 +128,5 @@ def _margin_of(summary: Mapping[str, Any] | None) -> MarginArgument:
     margins = verdict.get("margins") if isinstance(verdict, Mapping) else None
     if not isinstance(margins, Mapping) or not margins.get("stated"):
         return None
-    return {name: value for name, value in margins.items() if name != "stated"}
+    left_out = {"stated", "defaults", *margins.get("defaults", ())}
+    return {name: value for name, value in margins.items() if name not in left_out}
