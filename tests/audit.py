@@ -21,11 +21,10 @@ from typing import Annotated, Any
 
 import typer
 from packaging.version import InvalidVersion, Version
-from rich.console import Console
-from rich.table import Table
 
 from pendulum_msgs_py.errors import DataError
 from pendulum_msgs_py.executables import cli_main
+from pendulum_msgs_py.terminal import WholeTable, make_console
 
 __all__ = ["Finding", "from_advisories", "from_pip_audit", "pinned"]
 
@@ -175,10 +174,10 @@ def audit(
         print(json.dumps(content, indent=2))
         return 1 if findings else 0
     if findings:
-        table = Table("package", "version", "advisory", "fixed in", title="Known vulnerabilities")
+        table = WholeTable("package", "version", "advisory", "fixed in", title="Known vulnerabilities")
         for found in findings:
             table.add_row(found.package, found.version, found.advisory, found.fixed_in)
-        Console().print(table)
+        make_console().print(table)
     # Wheels of ROS come from another index; nobody collects advisories on them.
     left_out = f"; not known there: {', '.join(missing)}" if (missing := sorted(set(pins) - looked_up)) else ""
     print(f"{len(findings)} known vulnerabilities in {len(looked_up)} of {len(pins)} pins{left_out}")

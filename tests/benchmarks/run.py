@@ -7,7 +7,6 @@ import importlib
 import json
 import os
 import platform
-import sys
 import time
 import traceback
 from collections.abc import Iterable, Iterator, Sequence
@@ -15,10 +14,9 @@ from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
-from rich.console import Console
-from rich.table import Table
 from rich.text import Text
 
+from pendulum_msgs_py.terminal import WholeTable, make_console
 from tests.benchmarks import Row
 
 __all__ = ["areas", "main", "measure", "merge"]
@@ -66,7 +64,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     if unknown := [area for area in chosen if area not in known]:
         parser.error(f"area is {unknown[0]!r}; expected one of {', '.join(known)}")
 
-    console = Console(width=None if sys.stdout.isatty() else 160)
+    console = make_console()
     rows: list[Row] = []
     interrupted = False
     for area in chosen:
@@ -90,9 +88,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     return int(failed or (arguments.strict and bool(missed)))
 
 
-def table(rows: Sequence[Row]) -> Table:
+def table(rows: Sequence[Row]) -> WholeTable:
     """Lay the rows out for the terminal."""
-    result = Table(title="benchmarks", title_justify="left")
+    result = WholeTable(title="benchmarks", title_justify="left")
     for heading in ("area", "what"):
         result.add_column(heading, overflow="fold")
     for heading in ("ours", "peer", "ratio"):

@@ -20,10 +20,9 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import typer
-from rich.console import Console
-from rich.table import Table
 
 from pendulum_msgs_py.executables import cli_main
+from pendulum_msgs_py.terminal import WholeTable, make_console
 from tests.faults.parsers import PARSERS, Parser, copy_of, mutate
 
 __all__ = ["HEADROOM", "PATIENCE", "bound_memory", "fuzz_all", "fuzz_one", "too_slow"]
@@ -138,12 +137,11 @@ def fuzz(
     if as_json:
         print(json.dumps(rows, indent=2))
         return 1 if any(row["findings"] for row in rows) else 0
-    table = Table("parser", "files", "findings", "slowest", title="Spoilt files")
+    table = WholeTable("parser", "files", "findings", "slowest", title="Spoilt files")
     for row in rows:
         found = "; ".join(f"{kind} ({count})" for kind, count in row["findings"].items())
         table.add_row(row["parser"], str(row["tried"]), found or "none", f"{row['slowest_s'] * 1e3:.0f} ms")
-    console = Console()
-    (console if console.is_terminal else Console(width=160)).print(table)
+    make_console().print(table)
     return 1 if any(row["findings"] for row in rows) else 0
 
 

@@ -21,11 +21,10 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import typer
-from rich.console import Console
-from rich.table import Table
 
 from pendulum_msgs_py.errors import PendulumError
 from pendulum_msgs_py.executables import cli_main
+from pendulum_msgs_py.terminal import WholeTable, make_console
 
 __all__ = ["STORAGES", "fuzz_storage", "watch"]
 
@@ -184,11 +183,10 @@ def fuzz(
     if as_json:
         print(json.dumps(rows, indent=2))
         return 1 if any(row["findings"] or not row["tried"] for row in rows) else 0
-    table = Table("storage", "files", "edges reached", "findings", title="Bags by libFuzzer")
+    table = WholeTable("storage", "files", "edges reached", "findings", title="Bags by libFuzzer")
     for row in rows:
         table.add_row(row["storage"], str(row["tried"]), str(row["reached"]), "\n".join(row["findings"]) or "none")
-    console = Console()
-    (console if console.is_terminal else Console(width=160)).print(table)
+    make_console().print(table)
     return 1 if any(row["findings"] or not row["tried"] for row in rows) else 0
 
 

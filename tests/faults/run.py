@@ -13,13 +13,12 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import typer
-from rich.console import Console
 from rich.progress import Progress, track
-from rich.table import Table
 
 from pendulum_bags.experiment.domain import reserve_domain
 from pendulum_msgs_py.errors import FaultError, PendulumError
 from pendulum_msgs_py.executables import cli_main
+from pendulum_msgs_py.terminal import WholeTable, make_console
 from tests.faults.bag_property import check_bag
 from tests.faults.bridge_rig import SCENARIOS, run_scenario
 from tests.faults.campaign import CAMPAIGN
@@ -59,7 +58,7 @@ def campaign(
             *_loss_rows(),
             *_parser_rows(minutes, seed),
         ]
-    table = Table("fault", "tried", "survived", "data lost", "longest time to zero", "remarks", title="Faults")
+    table = WholeTable("fault", "tried", "survived", "data lost", "longest time to zero", "remarks", title="Faults")
     for row in rows:
         table.add_row(
             row["fault"],
@@ -69,9 +68,8 @@ def campaign(
             "–" if row["time_to_zero_s"] is None else f"{row['time_to_zero_s'] * 1e3:.0f} ms",
             row["remarks"],
         )
-    console = Console()
     # A file or a pipe has no width: there, rows stay whole.
-    (console if console.is_terminal else Console(width=160)).print(table)
+    make_console().print(table)
     out.parent.mkdir(parents=True, exist_ok=True)
     out.write_text(json.dumps(rows, indent=2) + "\n", encoding="utf-8")
     return 0 if all(row["tried"] == row["survived"] for row in rows) else 1

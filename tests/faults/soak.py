@@ -19,7 +19,6 @@ import numpy as np
 import psutil
 import typer
 from rich.console import Console
-from rich.table import Table
 
 from pendulum_bags.experiment.conductor_node import Conductor, PlantClient, RecorderClient
 from pendulum_bags.experiment.domain import reserve_domain
@@ -30,6 +29,7 @@ from pendulum_bags.reader import Bag, read_bag
 from pendulum_msgs_py import graph, names
 from pendulum_msgs_py.executables import cli_main
 from pendulum_msgs_py.graph import NodeProgram
+from pendulum_msgs_py.terminal import WholeTable, make_console
 from tests.faults.bag_property import check_bag
 
 __all__ = ["MAX_GROWTH", "SoakReport", "TopicTally", "soak"]
@@ -312,11 +312,11 @@ def _judge_timing(report: SoakReport, bag: Bag, duration: float) -> None:
 
 def print_report(report: SoakReport, console: Console) -> None:
     """Print the tables of a soak."""
-    sent = Table("topic", "sent", "in the bag", title=f"{report.minutes:g} min: messages")
+    sent = WholeTable("topic", "sent", "in the bag", title=f"{report.minutes:g} min: messages")
     for tally in report.tallies:
         sent.add_row(tally.topic, str(tally.sent), str(tally.received))
     console.print(sent)
-    memory = Table("process", "memory after warm-up", "at the end", "growth", "files open", "at the end")
+    memory = WholeTable("process", "memory after warm-up", "at the end", "growth", "files open", "at the end")
     for name, (before, after, opened, still) in report.footprints.items():
         memory.add_row(
             name,
@@ -327,7 +327,7 @@ def print_report(report: SoakReport, console: Console) -> None:
             str(still),
         )
     console.print(memory)
-    timing = Table("simulator's loop", "first minute", "last minute")
+    timing = WholeTable("simulator's loop", "first minute", "last minute")
     for name, column in (("jitter p50", 0), ("jitter p99", 1)):
         timing.add_row(name, *(f"{minute[column]:.0f} us" for minute in report.jitter_us))
     for name, column in (("state arrives p50", 0), ("state arrives p99", 1), ("state arrives p99.9", 2)):
@@ -348,8 +348,7 @@ def run_soak(
     """Run all nodes and two recorders for a while, and compare the end with the beginning."""
     with reserve_domain() as domain, tempfile.TemporaryDirectory(prefix="pendulum_soak_") as folder:
         report = soak(Path(folder), domain, minutes)
-    console = Console()
-    print_report(report, console if console.is_terminal else Console(width=120))
+    print_report(report, make_console())
     out.parent.mkdir(parents=True, exist_ok=True)
     out.write_text(json.dumps(as_json(report), indent=2) + "\n", encoding="utf-8")
     return 1 if report.violations else 0
