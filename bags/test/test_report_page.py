@@ -50,7 +50,7 @@ def test_every_figure_has_units_a_sentence_from_the_data_and_known_roles(compari
             assert panel.traces, figure.name
             numbered = [panel.x_label] if panel.y_ticks else [panel.x_label, panel.y_label]
             for label in numbered:
-                assert re.search(r"\[.+\]|units of|run", label), f"{figure.name}: {label}"
+                assert re.search(r"\[.+\]|in margins|run", label), f"{figure.name}: {label}"
             assert {trace.role for trace in panel.traces} <= set(ROLES)
 
 
