@@ -156,8 +156,9 @@ class ControllerNode(LifecycleNode):
         return super().on_shutdown(state)
 
     def close(self) -> None:
-        """Send zero torque while the context is still valid."""
+        """Send zero torque while the context is still valid, and give it time to be heard."""
         self._send_zero()
+        self._command_publisher.wait_for_all_acked(qos.LAST_WORDS)
         self._publish_diagnostics()
 
     # --- callbacks -----------------------------------------------------------------------------------------

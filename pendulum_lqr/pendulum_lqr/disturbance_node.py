@@ -95,6 +95,7 @@ class DisturbanceNode(Node):
         if newest is not None:
             stamp = after if self._simulated_time else max(after, self._now())
             self._torque_publisher.publish(encode_joint_state(stamp, frame_id=self._full_name, effort=0.0))
+            self._torque_publisher.wait_for_all_acked(qos.LAST_WORDS)
         self._loop.stop()
         self._publish_diagnostics()
 

@@ -27,6 +27,7 @@ __all__ = [
     "EXIT_INTERRUPTED",
     "EXIT_USAGE",
     "cli_main",
+    "is_exhaustion",
     "print_text",
     "report_error",
     "report_exhaustion",
@@ -150,14 +151,19 @@ def report_error(error: BaseException) -> int:
     return EXIT_USAGE
 
 
+def is_exhaustion(error: BaseException) -> bool:
+    """Tell whether an error says, in one library's words or another's, that memory is exhausted."""
+    return isinstance(error, MemoryError) or any(sign in str(error) for sign in _SIGNS_OF_EXHAUSTION)
+
+
 def report_exhaustion(error: BaseException) -> int:
     """Say in one sentence that a limit of the process's memory was met, and return exit code 1; 0 for other errors.
 
     Under a limit it is chance who meets it: Python, the loader of a library, or a library that starts a thread.
     """
-    text = str(error)
-    if not (isinstance(error, MemoryError) or any(sign in text for sign in _SIGNS_OF_EXHAUSTION)):
+    if not is_exhaustion(error):
         return 0
+    text = str(error)
     first = text.splitlines()[0] if text else "no more could be had"
     print(f"error: memory is exhausted: {first}", file=sys.stderr, flush=True)
     return 1
@@ -167,6 +173,7 @@ _SIGNS_OF_EXHAUSTION = (
     "failed to map segment",
     "annot allocate memory",
     "bad_alloc",
+    "ould not allocate",
     "pthread_create failed",
     "can't start new thread",
 )

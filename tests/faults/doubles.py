@@ -48,8 +48,9 @@ def _twin_plant(name: str) -> Fault:
         seen = time.monotonic()
 
         def rests() -> bool:
-            efforts = of_second(time.monotonic() - 0.1)
-            return len(efforts) > 10 and not any(efforts)
+            # Long enough for a plant that is new here to have heard commands, and to have found out whom they answer.
+            efforts = of_second(time.monotonic() - 1.0)
+            return len(efforts) > 100 and not any(efforts)
 
         system.wait_for("the second plant to rest", rests, START_TIMEOUT)
         settled = time.monotonic()

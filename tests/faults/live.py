@@ -200,6 +200,10 @@ class LiveSystem:
         now = time.monotonic()
         return any(applied.effort != 0.0 for applied in self.applied[-40:] if now - applied.when < 0.05)
 
+    def hears_controller(self) -> bool:
+        """Tell whether the probe has heard the controller within the last 50 ms: it is matched to this very process."""
+        return bool(self.commands) and time.monotonic() - self.commands[-1] < 0.05
+
     def time_to_zero(self, patience: float = 1.0) -> float:
         """Return the time from the last command to the first zero torque after it [s]; inf where it did not come."""
         self.listen(patience)

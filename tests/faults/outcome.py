@@ -90,7 +90,11 @@ class Trial:
 
 def try_fault(system: LiveSystem, fault: Fault, generator: random.Random) -> Outcome:
     """Try a fault once on a system that runs, and check what must hold after any fault."""
-    system.wait_for("torque to flow before the fault", system.torque_flows, START_TIMEOUT)
+    system.wait_for(
+        "torque to flow, and its commands to be heard, before the fault",
+        lambda: system.torque_flows() and system.hears_controller(),
+        START_TIMEOUT,
+    )
     # At a random moment of the loop, as faults come.
     system.listen(generator.uniform(0.05, 0.25))
     outcome = fault.act(system, generator)

@@ -12,6 +12,7 @@ from typing import Any
 from pendulum_bags.storage import BagWriter, QosProfile
 from pendulum_bags.storage.message_types import MessageType
 from pendulum_msgs_py.errors import BagError
+from pendulum_msgs_py.executables import is_exhaustion
 
 __all__ = ["RecordingSession", "SessionReport", "TopicCount"]
 
@@ -250,7 +251,7 @@ class RecordingSession:
 
 
 def _reason(error: Exception) -> str:
-    if isinstance(error, MemoryError):
+    if is_exhaustion(error):
         return "memory is exhausted"
     if isinstance(error, OSError):
         return str(error.strerror or error).lower()

@@ -11,7 +11,6 @@ from typing import Protocol
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from rclpy.clock import Clock, ClockType
-from rclpy.duration import Duration
 from rclpy.node import Node
 from sensor_msgs.msg import JointState
 from std_msgs.msg import String
@@ -44,8 +43,6 @@ DIAGNOSTICS_PERIOD = 0.5
 """Time between two diagnostics [s]."""
 TRAJECTORY_AGE_LIMIT = 1.0
 """Largest distance of a trajectory's stamp from the plant's time [s]: an old wish should not move a machine."""
-_LAST_WORDS = Duration(seconds=0.2)
-"""Longest wait for subscribers to have heard that the plant stops."""
 
 LIMIT_SPECS: tuple[ParameterSpec, ...] = (
     ParameterSpec(
@@ -272,7 +269,7 @@ class PlantInterface:
         if self._applied.get_subscription_count():
             self._applied.publish(encode_joint_state(stamp_ns, effort=effort))
         if self._stopping:
-            self._applied.wait_for_all_acked(_LAST_WORDS)
+            self._applied.wait_for_all_acked(qos.LAST_WORDS)
 
     def publish_event(self, name: str, **details: object) -> None:
         """Publish an event at the plant's time."""
@@ -293,7 +290,7 @@ class PlantInterface:
         """Disarm, say so in diagnostics; the plant then applies zero torque and publishes that, to be heard too."""
         self.supervisor.disarm(self.clock(), reason)
         self.publish_diagnostics()
-        self._diagnostics.wait_for_all_acked(_LAST_WORDS)
+        self._diagnostics.wait_for_all_acked(qos.LAST_WORDS)
         self._stopping = True
 
     def publish_diagnostics(self) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from rclpy.duration import Duration
 from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
 
 __all__ = [
@@ -9,6 +10,7 @@ __all__ = [
     "COMMAND",
     "DIAGNOSTICS",
     "EVENTS",
+    "LAST_WORDS",
     "STATE",
     "TRAJECTORY",
     "WATCHED_STATE",
@@ -43,6 +45,8 @@ TRAJECTORY = _profile(1)
 EVENTS = _profile(100, DurabilityPolicy.TRANSIENT_LOCAL)
 """Phase changes of an experiment; late recorders get the earlier ones too."""
 DIAGNOSTICS = _profile(100)
+LAST_WORDS = Duration(seconds=0.2)
+"""Longest wait of a node that ends for its reliable subscribers to have heard its last message."""
 
 
 def newest_state(*, reliable: bool) -> QoSProfile:
