@@ -20,7 +20,7 @@ import typer
 
 from pendulum_bags.reader import Bag, read_bag
 from pendulum_msgs_py import names
-from pendulum_msgs_py.errors import DataError
+from pendulum_msgs_py.cdr import decode_joint_state
 from pendulum_msgs_py.executables import cli_main
 
 __all__ = ["COMMAND_LIFE", "TorqueRecord", "check_bag"]
@@ -123,13 +123,11 @@ def _log_times(bag: Bag, plant: str, topic: str) -> np.ndarray:
 
 def _stamps(bag: Bag, plant: str, topic: str) -> np.ndarray:
     name = f"{plant}/{topic}"
-    if name not in bag or not len(bag.log_times(name)):
+    if name not in bag:
         return np.empty(0, np.int64)
-    try:
-        return np.sort(bag.array(name)["stamp_ns"])
-    except DataError:
-        # Strange messages of a fault among the commands: the log times alone must excuse the torque then.
-        return np.empty(0, np.int64)
+    # One by one: among the commands there may be the strange messages of a fault, which no plant acts on.
+    commands = [decode_joint_state(data) for _, data in bag.raw(name)]
+    return np.sort(np.array([fields.stamp_ns for fields in commands if fields is not None], np.int64))
 
 
 def _last_before(times: np.ndarray, events: np.ndarray) -> np.ndarray:

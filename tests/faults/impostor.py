@@ -26,6 +26,8 @@ _PERIOD = 0.002
 _MILLISECOND = 1_000_000
 _EFFORT = 0.5
 _OTHER_EFFORT = -1.5
+_LISTENERS = 3
+"""Subscriptions to the commands: the plant's, the recorder's and the probe's."""
 
 
 @dataclass
@@ -44,12 +46,16 @@ class _Impostor:
         self.valid_ns = 0
         self.newest_ns = 0
         self.pending: list[tuple[float, int]] = []
-        self.answer: Callable[[int], None] = self.punctual
+        self.answer: Callable[[int], None] = lambda _stamp_ns: None
         node = self.system.conductor.node
         self._publisher = node.create_publisher(JointState, f"{NAMESPACE}/{names.EFFORT_COMMAND}", qos.COMMAND)
         self._states = node.create_subscription(
             JointState, f"{NAMESPACE}/{names.JOINT_STATES}", self._on_state, qos.newest_state(reliable=False), raw=True
         )
+
+    def is_heard(self) -> bool:
+        """Tell whether plant, recorder and probe are matched, so that the bag has the command behind each torque."""
+        return bool(self._publisher.get_subscription_count() >= _LISTENERS)
 
     def send(self, stamp_ns: int, effort: float = _EFFORT) -> None:
         self._publisher.publish(
@@ -87,6 +93,8 @@ def _in_its_place(system: LiveSystem) -> Iterator[_Impostor]:
         system.processes.finish(system.children.pop(name))
     impostor = _Impostor(system)
     try:
+        system.wait_for("plant and recorder to hear the probe", impostor.is_heard, START_TIMEOUT)
+        impostor.answer = impostor.punctual
         system.wait_for("the plant to believe the probe", system.torque_flows, START_TIMEOUT)
         yield impostor
     finally:

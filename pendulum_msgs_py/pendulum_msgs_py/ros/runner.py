@@ -179,8 +179,9 @@ def _close(node: Node | None, executor: rclpy.executors.Executor) -> int:
                 node.close()
         except PendulumError as error:
             exit_code = report_error(error)
-        except Exception:  # noqa: BLE001  # printed in full, and the plant is made safe
-            traceback.print_exc()
+        except Exception as error:  # noqa: BLE001  # printed in full, and the plant is made safe
+            if not report_exhaustion(error):
+                traceback.print_exc()
             exit_code = 1
         exit_code = exit_code or int(getattr(node, "exit_code", 0))
         executor.remove_node(node)
