@@ -9,7 +9,7 @@ from xml.etree import ElementTree
 
 from setuptools import find_packages, setup
 
-DATA_ENDINGS = ["css", "csv", "html", "j2", "js", "json", "md", "npz", "png", "svg", "toml", "woff2", "yaml"]
+DATA_ENDINGS = ["css", "csv", "html", "j2", "js", "json", "md", "npz", "png", "svg", "toml", "woff2", "xml", "yaml"]
 
 
 def read_executables(path: Path) -> dict[str, str]:

@@ -38,7 +38,7 @@ from pendulum_msgs_py.errors import FaultError, ParameterError
 from pendulum_msgs_py.executables import cli_main
 from pendulum_msgs_py.ros import qos
 from pendulum_msgs_py.ros.convert import command_from_bytes, sample_from_bytes, stamp_from_message
-from pendulum_msgs_py.ros.middleware import set_middleware_defaults
+from pendulum_msgs_py.ros.middleware import check_closed, set_middleware_defaults
 
 __all__ = ["Hub", "main"]
 
@@ -82,6 +82,7 @@ class Hub:
         self._context = Context()
         rclpy.init(context=self._context, args=[], signal_handler_options=SignalHandlerOptions.NO)
         self._node = Node("console", context=self._context)
+        check_closed(self._context.get_domain_id())
         self._silent = Node("console_taps", context=self._context, start_parameter_services=False)
         self._lock = threading.Lock()
         self._plants: dict[str, _Plant] = {}

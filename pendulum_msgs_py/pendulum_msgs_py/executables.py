@@ -84,13 +84,16 @@ def run_package(package: str, argv: Sequence[str] | None = None) -> int:
         raise
 
 
-def cli_main(app: typer.Typer, argv: Sequence[str] | None = None, *, name: str | None = None) -> int:
+def cli_main(
+    app: typer.Typer, argv: Sequence[str] | None = None, *, name: str | None = None, takes_ros_arguments: bool = False
+) -> int:
     """Run a typer application and return its exit code; our own errors end as one sentence.
 
     Args:
         app: The application.
         argv: Arguments; by default those of the process.
         name: Program name for the help text, such as ``python -m pendulum_lqr design``.
+        takes_ros_arguments: Arguments from ``--ros-args`` on belong to ROS; the command finds them in ``context.obj``.
     """
     # Imported late: a node that has no command line should not pay for typer and rich.
     import typer.main
@@ -98,13 +101,14 @@ def cli_main(app: typer.Typer, argv: Sequence[str] | None = None, *, name: str |
     # typer brings a click of its own, which is no other click's: its errors are found through what it exports.
     usage_error: Any = next(kind for kind in typer.BadParameter.__mro__ if kind.__name__ == "ClickException")
     command = typer.main.get_command(app)
+    arguments = list(sys.argv[1:] if argv is None else argv)
+    split = arguments.index("--ros-args") if takes_ros_arguments and "--ros-args" in arguments else len(arguments)
+    own, ros = arguments[:split], arguments[split:]
     if completion.asked():
-        print_text("\n".join(completion.of_command(command, list(sys.argv[1:] if argv is None else argv))))
+        print_text("\n".join(completion.of_command(command, own)))
         return 0
     try:
-        result = command.main(
-            args=list(sys.argv[1:] if argv is None else argv), prog_name=name, standalone_mode=False
-        )
+        result = command.main(args=own, prog_name=name, standalone_mode=False, obj=ros)
         # What is still buffered would else meet a broken pipe at exit, where nobody can catch it.
         sys.stdout.flush()
     except PendulumError as error:

@@ -27,7 +27,7 @@ from pendulum_msgs_py import names
 from pendulum_msgs_py.errors import FaultError
 from pendulum_msgs_py.ros import qos
 from pendulum_msgs_py.ros.convert import event_message, sample_from_bytes, trajectory_to_message
-from pendulum_msgs_py.ros.middleware import set_middleware_defaults
+from pendulum_msgs_py.ros.middleware import check_closed, set_middleware_defaults
 from pendulum_msgs_py.trajectory import Trajectory
 from pendulum_msgs_py.values import JointSample
 
@@ -63,6 +63,7 @@ class Conductor:
             context=self.context, domain_id=self.domain, signal_handler_options=SignalHandlerOptions.NO, args=[]
         )
         self.node: Node = rclpy.create_node("conductor", context=self.context, start_parameter_services=False)
+        check_closed(self.domain)
         self._executor = EventsExecutor(context=self.context)
         self._executor.add_node(self.node)
         return self

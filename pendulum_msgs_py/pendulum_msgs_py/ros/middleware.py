@@ -3,25 +3,95 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Mapping
+from pathlib import Path
 
-__all__ = ["set_middleware_defaults"]
+from rclpy.utilities import get_rmw_implementation_identifier
 
-_TRANSPORT_SETTINGS = (
-    "FASTDDS_BUILTIN_TRANSPORTS",
-    "FASTDDS_DEFAULT_PROFILES_FILE",
-    "FASTRTPS_DEFAULT_PROFILES_FILE",
-)
+from pendulum_msgs_py.errors import FaultError
+
+__all__ = ["check_closed", "middleware_defaults", "set_middleware_defaults"]
+
+_RANGE = "ROS_AUTOMATIC_DISCOVERY_RANGE"
+_PROFILES = "FASTRTPS_DEFAULT_PROFILES_FILE"
+_TRANSPORT_SETTINGS = ("FASTDDS_BUILTIN_TRANSPORTS", "FASTDDS_DEFAULT_PROFILES_FILE", _PROFILES)
+_LOOPBACK = Path(__file__).with_name("loopback.xml")
+_PORTS_OF_DOMAIN = 250
+_FIRST_PORT = 7400
 
 
 def set_middleware_defaults() -> None:
     """Stay on this host, and pass messages through sockets; to be called before ``rclpy.init``.
 
     A plant that the whole subnet may command is a decision, not a default.
-
-    Fast DDS passes messages between processes through shared memory. A process that is killed while it holds some
-    leaves it locked: measured with a publisher of five topics at 500 Hz, after some ten kills new subscribers, matched
-    as they were, got nothing any more. The kernel closes the sockets of the dead, and round trips take as long.
     """
-    os.environ.setdefault("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
-    if not any(os.environ.get(name) for name in _TRANSPORT_SETTINGS):
-        os.environ["FASTDDS_BUILTIN_TRANSPORTS"] = "UDPv4"
+    os.environ.update(middleware_defaults(os.environ, get_rmw_implementation_identifier()))
+
+
+def middleware_defaults(environment: Mapping[str, str], middleware: str) -> dict[str, str]:
+    """Return the variables to add to an environment.
+
+    The range ``LOCALHOST`` keeps a program of Jazzy from calling out, but its sockets listen on every interface:
+    whoever names this host as a static peer is let in. Where nothing was opened, a profile binds Fast DDS to the
+    loopback address; other middleware is left with ``LOCALHOST``.
+
+    Sockets, because Fast DDS passes messages between processes through shared memory otherwise, and a process that is
+    killed while it holds some leaves it locked: with a publisher of five topics at 500 Hz, after some ten kills new
+    subscribers, matched as they were, got nothing any more. The kernel closes the sockets of the dead, and round trips
+    take as long.
+
+    Args:
+        environment: What the user has set.
+        middleware: Identifier of the RMW implementation.
+
+    Raises:
+        FaultError: The profile is not where it was installed.
+    """
+    asked = environment.get(_RANGE) or "LOCALHOST"
+    if not middleware.startswith("rmw_fastrtps") or any(environment.get(name) for name in _TRANSPORT_SETTINGS):
+        return {_RANGE: asked}
+    if asked != "LOCALHOST" or environment.get("ROS_STATIC_PEERS"):
+        return {_RANGE: asked, "FASTDDS_BUILTIN_TRANSPORTS": "UDPv4"}
+    if not _LOOPBACK.is_file():
+        # Without it Fast DDS would listen to the whole subnet.
+        raise FaultError(f"{_LOOPBACK} is missing; expected it where pendulum_msgs_py is installed")
+    # SYSTEM_DEFAULT leaves the network to the profile; the older variable of ROS would overrule it.
+    older = {"ROS_LOCALHOST_ONLY": "0"} if environment.get("ROS_LOCALHOST_ONLY") == "1" else {}
+    return {_RANGE: "SYSTEM_DEFAULT", _PROFILES: str(_LOOPBACK), **older}
+
+
+def check_closed(domain: int) -> None:
+    """Check that this process listens to this host alone, where nobody has opened it.
+
+    Args:
+        domain: ROS domain that the process has joined.
+
+    Raises:
+        FaultError: The middleware has taken no notice of the profile.
+    """
+    sockets = Path("/proc/self/net/udp")
+    if os.environ.get(_PROFILES) != str(_LOOPBACK) or not sockets.is_file():
+        return
+    ports = range(_FIRST_PORT + _PORTS_OF_DOMAIN * domain, _FIRST_PORT + _PORTS_OF_DOMAIN * (domain + 1))
+    own = _open_sockets()
+    for line in sockets.read_text(encoding="ascii").splitlines()[1:]:
+        fields = line.split()
+        address, port = fields[1].split(":")
+        if int(port, 16) in ports and fields[9] in own and not address.endswith("7F"):
+            raise FaultError(
+                f"the middleware listens on UDP port {int(port, 16)} of every network; expected the loopback address "
+                f"alone, as {_LOOPBACK} says (open it with {_RANGE}=SUBNET, if that is meant)"
+            )
+
+
+def _open_sockets() -> set[str]:
+    """Return the numbers of the sockets of this process, as the kernel's tables tell them."""
+    found = set()
+    for descriptor in Path("/proc/self/fd").iterdir():
+        try:
+            target = str(descriptor.readlink())
+        except OSError:  # closed meanwhile: the folder's own
+            continue
+        if target.startswith("socket:["):
+            found.add(target[len("socket:[") : -1])
+    return found

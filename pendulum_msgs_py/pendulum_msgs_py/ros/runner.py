@@ -31,7 +31,7 @@ from pendulum_msgs_py import completion
 from pendulum_msgs_py.errors import ParameterError, PendulumError
 from pendulum_msgs_py.executables import EXIT_USAGE, print_text, report_error, report_exhaustion
 from pendulum_msgs_py.parameters import ParameterSpec
-from pendulum_msgs_py.ros.middleware import set_middleware_defaults
+from pendulum_msgs_py.ros.middleware import check_closed, set_middleware_defaults
 
 __all__ = ["Closeable", "Paced", "run_node"]
 
@@ -103,11 +103,13 @@ def run_node(
 def _run(make_node: Callable[[Callable[[], None]], Node], arguments: Sequence[str]) -> int:
     if os.environ.get("NO_COLOR"):  # https://no-color.org, which rcutils does not know
         os.environ.setdefault("RCUTILS_COLORIZED_OUTPUT", "0")
-    set_middleware_defaults()
     signals = _listen_for_stop_signals()
     _wake_punctually()
     try:
+        set_middleware_defaults()
         rclpy.init(args=list(arguments), signal_handler_options=SignalHandlerOptions.NO)
+    except PendulumError as error:
+        return report_error(error)
     except Exception as error:  # noqa: BLE001  # rcl's errors have no common base
         return report_error(ParameterError(f"ROS arguments are not understood: {_sentence(error)}"))
     executor = EventsExecutor()
@@ -123,6 +125,7 @@ def _run(make_node: Callable[[Callable[[], None]], Node], arguments: Sequence[st
     exit_code = 0
     try:
         node = _make(make_node, stop)
+        check_closed(node.context.get_domain_id())
         # The first line that rclpy logs takes 30 ms; said now, it does not come in the middle of a loop.
         node.get_logger().info("ready")
         executor.add_node(node)

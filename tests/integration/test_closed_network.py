@@ -1,0 +1,155 @@
+"""Who is let in: this machine alone, unless somebody opens the network."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import psutil
+import pytest
+
+from pendulum_msgs_py.errors import FaultError
+from pendulum_msgs_py.ros import middleware
+from pendulum_msgs_py.ros.middleware import check_closed, middleware_defaults
+from tests.faults.network import PLANT_ADDRESS, two_machines, why_not
+from tests.fixtures import PROJECT
+from tests.processes import ProcessGroup, RunningProgram
+
+_FAST = "rmw_fastrtps_cpp"
+_ROS_VARIABLES = (
+    "ROS_AUTOMATIC_DISCOVERY_RANGE",
+    "ROS_STATIC_PEERS",
+    "ROS_LOCALHOST_ONLY",
+    "FASTDDS_BUILTIN_TRANSPORTS",
+    "FASTRTPS_DEFAULT_PROFILES_FILE",
+)
+
+
+@pytest.mark.parametrize("asked", [{}, {"ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST"}, {"ROS_LOCALHOST_ONLY": "1"}])
+def test_a_network_that_nobody_opened_is_closed(asked: dict[str, str]) -> None:
+    added = middleware_defaults(asked, _FAST)
+    assert Path(added["FASTRTPS_DEFAULT_PROFILES_FILE"]).is_file()
+    assert added["ROS_AUTOMATIC_DISCOVERY_RANGE"] == "SYSTEM_DEFAULT"
+    assert added.get("ROS_LOCALHOST_ONLY", "0") == "0"
+    # A program that we start has both in its environment, and stays as it is.
+    assert middleware_defaults({**asked, **added}, _FAST) == {"ROS_AUTOMATIC_DISCOVERY_RANGE": "SYSTEM_DEFAULT"}
+
+
+@pytest.mark.parametrize(
+    ("asked", "range_"),
+    [
+        ({"ROS_AUTOMATIC_DISCOVERY_RANGE": "SUBNET"}, "SUBNET"),
+        ({"ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST", "ROS_STATIC_PEERS": "192.0.2.1"}, "LOCALHOST"),
+        ({"FASTRTPS_DEFAULT_PROFILES_FILE": "/mine.xml"}, "LOCALHOST"),
+    ],
+)
+def test_what_the_user_asked_for_is_left_alone(asked: dict[str, str], range_: str) -> None:
+    added = middleware_defaults(asked, _FAST)
+    assert added["ROS_AUTOMATIC_DISCOVERY_RANGE"] == range_
+    assert "FASTRTPS_DEFAULT_PROFILES_FILE" not in added
+
+
+def test_other_middleware_gets_no_range_that_would_open_it() -> None:
+    assert middleware_defaults({}, "rmw_cyclonedds_cpp") == {"ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST"}
+
+
+def test_a_profile_that_is_missing_ends_a_program(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(middleware, "_LOOPBACK", Path("/nowhere/loopback.xml"))
+    with pytest.raises(FaultError, match=r"/nowhere/loopback\.xml is missing"):
+        middleware_defaults({}, _FAST)
+
+
+@pytest.fixture
+def simulator(
+    domain_id: int, processes: ProcessGroup, monkeypatch: pytest.MonkeyPatch, request: pytest.FixtureRequest
+) -> RunningProgram:
+    for name in _ROS_VARIABLES:
+        monkeypatch.delenv(name, raising=False)
+    program = processes.start("pendulum_sim", "simulator", "--ros-args", "-r", "__ns:=/sim", env=request.param)
+    program.wait_for_output("ready", 30.0)
+    return program
+
+
+def _listening(program: RunningProgram) -> set[str]:
+    return {connection.laddr.ip for connection in psutil.Process(program.pid).net_connections("udp4")}
+
+
+@pytest.mark.parametrize("simulator", [{}, {"ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST"}], indirect=True)
+def test_every_socket_of_a_node_is_bound_to_the_loopback_address(simulator: RunningProgram) -> None:
+    assert _listening(simulator) == {"127.0.0.1"}
+
+
+@pytest.mark.parametrize("simulator", [{"ROS_AUTOMATIC_DISCOVERY_RANGE": "SUBNET"}], indirect=True)
+def test_a_network_that_was_opened_is_open(simulator: RunningProgram) -> None:
+    assert "0.0.0.0" in _listening(simulator)
+
+
+def test_a_profile_that_is_not_heeded_ends_the_program(domain_id: int, tmp_path: Path) -> None:
+    everywhere = tmp_path / "loopback.xml"
+    lines = Path(middleware.__file__).with_name("loopback.xml").read_text().splitlines()
+    everywhere.write_text("\n".join(line for line in lines if "interfaceWhiteList" not in line))
+    code = f"""
+import sys
+from pathlib import Path
+from pendulum_msgs_py.ros import middleware
+middleware._LOOPBACK = Path({str(everywhere)!r})
+from pendulum_sim.simulator_node import main
+sys.exit(main(["--ros-args", "-r", "__ns:=/sim"]))
+"""
+    ended = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, timeout=60, check=False, cwd=PROJECT
+    )
+    assert ended.returncode != 0
+    assert "listens on UDP port" in ended.stderr
+    assert "ROS_AUTOMATIC_DISCOVERY_RANGE=SUBNET" in ended.stderr
+
+
+def test_the_check_is_for_networks_that_nobody_opened(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("FASTRTPS_DEFAULT_PROFILES_FILE", "/mine.xml")
+    check_closed(0)
+
+
+_LOOK = """
+import time
+import rclpy
+rclpy.init()
+node = rclpy.create_node("stranger")
+end = time.monotonic() + float({patience!r})
+while time.monotonic() < end and not node.count_publishers("/sim/joint_states"):
+    time.sleep(0.05)
+print("found" if node.count_publishers("/sim/joint_states") else "nobody")
+"""
+
+
+def _look(namespace: str, patience: float, **variables: str) -> str:
+    ended = subprocess.run(
+        ["ip", "netns", "exec", namespace, sys.executable, "-c", _LOOK.format(patience=patience)],
+        env={**os.environ, **variables}, capture_output=True, text=True, timeout=60, check=True,
+    )  # fmt: skip
+    return ended.stdout.strip()
+
+
+@pytest.mark.timeout(120)
+def test_a_host_that_names_ours_as_its_peer_is_not_let_in(
+    processes: ProcessGroup, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    reason = why_not()
+    if reason:
+        pytest.skip(reason)
+    for name in _ROS_VARIABLES:
+        monkeypatch.delenv(name, raising=False)
+    monkeypatch.setenv("ROS_DOMAIN_ID", "5")
+    monkeypatch.setenv("ROS_LOG_DIR", str(tmp_path))
+    peers = {"ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST", "ROS_STATIC_PEERS": PLANT_ADDRESS}
+    with two_machines() as (plant, stranger, _):
+        node = [sys.executable, "-m", "pendulum_sim", "simulator", "--ros-args", "-r", "__ns:=/sim"]
+        program = processes.start_command(["ip", "netns", "exec", plant, *node], name="simulator")
+        program.wait_for_output("ready", 30.0)
+        # Tools of this machine find it whatever their range, and this shows that there is something to be found.
+        assert _look(plant, 10.0) == "found"
+        assert _look(stranger, 4.0, **peers) == "nobody"
+        assert _look(stranger, 2.0, ROS_AUTOMATIC_DISCOVERY_RANGE="SUBNET") == "nobody"
+        program.interrupt()
+        assert program.wait(10.0) == 0
