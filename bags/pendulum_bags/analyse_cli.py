@@ -10,9 +10,9 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
-from pendulum_msgs_py.executables import EXIT_INTERRUPTED, cli_main
+from pendulum_bags.counted_progress import counted_progress
+from pendulum_msgs_py.executables import cli_main
 from pendulum_msgs_py.terminal import WholeTable, make_console
 
 if TYPE_CHECKING:
@@ -52,25 +52,9 @@ def analyse(
     questions = [name.strip() for name in ask.split(",") if name.strip()]
     pieces = find_pieces(folders, questions)
     console = make_console(stderr=json_output, highlight=False)
-    bar = Progress(
-        TextColumn("{task.description}"), BarColumn(bar_width=None), MofNCompleteColumn(), TimeRemainingColumn(),
-        console=console, transient=True, disable=not console.is_terminal,
-    )  # fmt: skip
     started = time.monotonic()
-    with bar:
-        task = bar.add_task("bags", total=len(pieces))
-        try:
-            table = analyse_bags(
-                out,
-                pieces,
-                questions,
-                scheduler=scheduler,
-                workers=workers,
-                on_progress=lambda done, total: bar.update(task, completed=done, total=total),
-            )
-        except KeyboardInterrupt:
-            console.print(f"interrupted: the same command with --out {out} goes on where it stopped")
-            raise typer.Exit(EXIT_INTERRUPTED) from None
+    with counted_progress(console, "bags", len(pieces), out) as on_progress:
+        table = analyse_bags(out, pieces, questions, scheduler=scheduler, workers=workers, on_progress=on_progress)
     if json_output:
         print(json.dumps({"bags": table.bags, "runs": table.runs}, indent=2))
     else:

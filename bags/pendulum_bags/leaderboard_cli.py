@@ -9,8 +9,8 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn
 
+from pendulum_bags.counted_progress import counting_bar
 from pendulum_msgs_py.executables import EXIT_INTERRUPTED
 from pendulum_msgs_py.terminal import WholeTable, make_console
 
@@ -49,14 +49,10 @@ def leaderboard(
         if name != HARDWARE:
             load_plant(name)
     console = make_console(stderr=json_output, highlight=False)
-    bar = Progress(
-        TextColumn("{task.description}"), BarColumn(bar_width=None), MofNCompleteColumn(), console=console,
-        transient=True, disable=not console.is_terminal,
-    )  # fmt: skip
     entries = []
     pool = ProcessPoolExecutor(workers or os.cpu_count() or 1)
     try:
-        with bar:
+        with counting_bar(console) as bar:
             task = bar.add_task("controllers", total=len(names) * len(machines))
             jobs = [
                 pool.submit(evaluate_hardware, name, duration=duration, robustness=robustness)

@@ -9,9 +9,8 @@ from typing import Annotated, Any
 
 import typer
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
-from pendulum_msgs_py.executables import EXIT_INTERRUPTED
+from pendulum_bags.counted_progress import counted_progress
 from pendulum_msgs_py.terminal import WholeTable, make_console
 
 __all__ = ["monte_carlo"]
@@ -67,24 +66,9 @@ def monte_carlo(
     if replay >= 0:
         _replay(console, settings, replay, folder)
         return
-    bar = Progress(
-        TextColumn("{task.description}"), BarColumn(bar_width=None), MofNCompleteColumn(), TimeRemainingColumn(),
-        console=console, transient=True, disable=not console.is_terminal,
-    )  # fmt: skip
     started = time.monotonic()
-    with bar:
-        task = bar.add_task("chunks", total=settings.chunks)
-        try:
-            result = engine.run_monte_carlo(
-                folder,
-                settings,
-                scheduler=scheduler,
-                workers=workers,
-                on_progress=lambda done, total: bar.update(task, completed=done, total=total),
-            )
-        except KeyboardInterrupt:
-            console.print(f"interrupted: the same command with --out {folder} goes on where it stopped")
-            raise typer.Exit(EXIT_INTERRUPTED) from None
+    with counted_progress(console, "chunks", settings.chunks, folder) as on_progress:
+        result = engine.run_monte_carlo(folder, settings, scheduler=scheduler, workers=workers, on_progress=on_progress)
     if sobol:
         result["sobol"] = engine.sobol(settings, base=sobol)
     elapsed = time.monotonic() - started

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 from pathlib import Path
 from typing import Annotated
 
@@ -74,11 +73,7 @@ def record(
 
 def main(argv: list[str] | None = None) -> int:
     """Run the recorder; arguments from ``--ros-args`` on belong to ROS."""
-    arguments = list(sys.argv[1:] if argv is None else argv)
-    split = arguments.index("--ros-args") if "--ros-args" in arguments else len(arguments)
-    own, ros = arguments[:split], arguments[split:]
-    app.info.context_settings = {"obj": ros}
-    return cli_main(app, own, name="python -m pendulum_bags record")
+    return cli_main(app, argv, name="python -m pendulum_bags record", takes_ros_arguments=True)
 
 
 if __name__ == "__main__":

@@ -8,9 +8,8 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
-from pendulum_msgs_py.executables import EXIT_INTERRUPTED
+from pendulum_bags.counted_progress import counted_progress
 from pendulum_msgs_py.terminal import make_console
 
 __all__ = ["region_of_attraction"]
@@ -63,24 +62,9 @@ def region_of_attraction(
     )
     folder = out or Path("bags", "runs", "region_of_attraction")
     console = make_console(stderr=json_output, highlight=False)
-    bar = Progress(
-        TextColumn("{task.description}"), BarColumn(bar_width=None), MofNCompleteColumn(), TimeRemainingColumn(),
-        console=console, transient=True, disable=not console.is_terminal,
-    )  # fmt: skip
     started = time.monotonic()
-    with bar:
-        task = bar.add_task("chunks", total=settings.chunks)
-        try:
-            result = run_region_map(
-                folder,
-                settings,
-                scheduler=scheduler,
-                workers=workers,
-                on_progress=lambda done, total: bar.update(task, completed=done, total=total),
-            )
-        except KeyboardInterrupt:
-            console.print(f"interrupted: the same command with --out {folder} goes on where it stopped")
-            raise typer.Exit(EXIT_INTERRUPTED) from None
+    with counted_progress(console, "chunks", settings.chunks, folder) as on_progress:
+        result = run_region_map(folder, settings, scheduler=scheduler, workers=workers, on_progress=on_progress)
     picture = write_region_figure(folder / "region.png", result)
     if json_output:
         print(json.dumps(result.to_json(), indent=2))

@@ -10,10 +10,10 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn
+from rich.progress import TextColumn
 
+from pendulum_bags.counted_progress import counting_bar, resumable
 from pendulum_msgs_py.errors import FaultError, ParameterError
-from pendulum_msgs_py.executables import EXIT_INTERRUPTED
 from pendulum_msgs_py.terminal import WholeTable, make_console
 
 if TYPE_CHECKING:
@@ -167,15 +167,6 @@ def _study(
         return
     folder = out or Path("bags", "runs", found.name)
     open_study_folder(folder, found)
-    bar = Progress(
-        TextColumn("{task.description}"),
-        BarColumn(bar_width=None),
-        MofNCompleteColumn(),
-        TextColumn("{task.fields[remaining]} left"),
-        console=console,
-        transient=True,
-        disable=not console.is_terminal,
-    )
     told = -1
 
     def show(progress: StudyProgress) -> None:
@@ -188,13 +179,9 @@ def _study(
                 f"{progress.done} of {progress.total} runs{failed}, {_duration(progress.remaining)} left"
             )
 
-    with bar:
+    with resumable(console, folder), counting_bar(console, TextColumn("{task.fields[remaining]} left")) as bar:
         task = bar.add_task(found.name, total=len(found.runs), remaining="")
-        try:
-            end = run_study(folder, found, workers=workers, retry_failed=retry_failed, on_progress=show)
-        except KeyboardInterrupt:
-            console.print(f"interrupted: the same command with --out {folder} goes on where it stopped")
-            raise typer.Exit(EXIT_INTERRUPTED) from None
+        end = run_study(folder, found, workers=workers, retry_failed=retry_failed, on_progress=show)
     records = collect(folder, found)
     write_table(folder / "runs.csv", records)
     for record in records:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import importlib
 import json
-import sys
 import threading
 import time
 from collections.abc import Callable, Sequence
@@ -322,11 +321,7 @@ def play(
 
 def main(argv: list[str] | None = None) -> int:
     """Run the player; arguments from ``--ros-args`` on belong to ROS."""
-    arguments = list(sys.argv[1:] if argv is None else argv)
-    split = arguments.index("--ros-args") if "--ros-args" in arguments else len(arguments)
-    own, ros = arguments[:split], arguments[split:]
-    app.info.context_settings = {"obj": ros}
-    return cli_main(app, own, name="python -m pendulum_bags play")
+    return cli_main(app, argv, name="python -m pendulum_bags play", takes_ros_arguments=True)
 
 
 if __name__ == "__main__":

@@ -17,14 +17,11 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import psutil
-import rclpy
 import websockets
-from diagnostic_msgs.msg import DiagnosticArray
-from rclpy.executors import SingleThreadedExecutor
-from std_srvs.srv import SetBool
 
 from pendulum_bags.experiment.domain import reserve_domain
-from pendulum_msgs_py import graph, names
+from pendulum_msgs_py import graph
+from tests.benchmarks.plant_listener import PlantListener, cpu_time, domain_environment
 from tests.processes import ProcessGroup, RunningProgram
 
 __all__ = ["CHROMIUM", "Look", "looks"]
@@ -68,56 +65,6 @@ class Look:
     faults: Sequence[str] = ()
 
 
-class _Loops:
-    """The plants' diagnostics, by plant, as they come."""
-
-    def __init__(self, domain: int) -> None:
-        self._context = rclpy.Context()
-        rclpy.init(context=self._context, domain_id=domain)
-        self._node = rclpy.create_node("bench_listener", context=self._context)
-        self._executor = SingleThreadedExecutor(context=self._context)
-        self._executor.add_node(self._node)
-        self._node.create_subscription(DiagnosticArray, names.DIAGNOSTICS, self._on_message, 10)
-        self.rows: dict[str, list[dict[str, str]]] = {plant: [] for plant in _PLANTS}
-
-    def _on_message(self, message: DiagnosticArray) -> None:
-        for status in message.status:
-            plant = status.name.partition(":")[0]
-            if plant in self.rows:
-                self.rows[plant].append({pair.key: pair.value for pair in status.values})
-
-    def listen(self, duration: float) -> None:
-        deadline = time.monotonic() + duration
-        while (left := deadline - time.monotonic()) > 0.0:
-            self._executor.spin_once(timeout_sec=left)
-
-    def wait(self) -> None:
-        """Wait until both loops are closed."""
-        deadline = time.monotonic() + _START_TIMEOUT
-        while time.monotonic() < deadline:
-            self.listen(0.5)
-            last = [rows[-1] for rows in self.rows.values() if rows]
-            if len(last) == len(_PLANTS) and all(
-                math.isfinite(float(row.get("command_latency_p50_us", "nan"))) for row in last
-            ):
-                return
-        raise TimeoutError(f"the loops did not close within {_START_TIMEOUT:g} s")
-
-    def arm(self) -> None:
-        """Arm the bridge, which starts disarmed, so that its controller's torque is applied."""
-        client = self._node.create_client(SetBool, "/hw/bridge/arm")
-        asked = client.call_async(SetBool.Request(data=True)) if client.wait_for_service(_START_TIMEOUT) else None
-        if asked is not None:
-            self._executor.spin_until_future_complete(asked, _START_TIMEOUT)
-        if asked is None or not asked.done() or not asked.result().success:
-            raise TimeoutError(f"/hw/bridge was not armed within {_START_TIMEOUT:g} s")
-
-    def close(self) -> None:
-        self._executor.shutdown()
-        self._node.destroy_node()
-        rclpy.shutdown(context=self._context)
-
-
 def looks(duration: float, ways: Sequence[str] = ("nobody", "console", "reader", "browser")) -> Iterator[Look]:
     """Run both plants under noise and yield what each way of looking costs.
 
@@ -126,8 +73,8 @@ def looks(duration: float, ways: Sequence[str] = ("nobody", "console", "reader",
         ways: Which ways, in this order.
     """
     with tempfile.TemporaryDirectory() as scratch, reserve_domain(None) as domain:
-        group, loops = ProcessGroup(Path(scratch), _ROOT), _Loops(domain)
-        environment = {"ROS_DOMAIN_ID": str(domain), "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST"}
+        group, loops = ProcessGroup(Path(scratch), _ROOT), PlantListener(domain, *_PLANTS)
+        environment = domain_environment(domain)
         try:
             nodes = (
                 graph.simulator("/sim", rate_hz=RATE, start="top"),
@@ -137,8 +84,8 @@ def looks(duration: float, ways: Sequence[str] = ("nobody", "console", "reader",
             )
             started = [group.start(it.package, it.executable, *it.ros_arguments(), env=environment) for it in nodes]
             processes = {"loops": [psutil.Process(program.pid) for program in started]}
-            loops.wait()
-            loops.arm()
+            loops.wait_for_loops()
+            loops.arm("/hw/bridge")
             address = ""
             for way in ways:
                 if way != "nobody" and not address:
@@ -161,17 +108,16 @@ def looks(duration: float, ways: Sequence[str] = ("nobody", "console", "reader",
 def _measure(
     way: str,
     duration: float,
-    loops: _Loops,
+    loops: PlantListener,
     processes: dict[str, list[psutil.Process]],
     count: Callable[[], float],
 ) -> Look:
-    for rows in loops.rows.values():
-        rows.clear()
-    before = {name: _cpu(group) for name, group in processes.items()}
+    loops.clear()
+    before = {name: cpu_time(group) for name, group in processes.items()}
     seen, wall = count(), time.monotonic()
     loops.listen(duration)
     elapsed = time.monotonic() - wall
-    cpu = {name: 100.0 * (_cpu(group) - before[name]) / elapsed for name, group in processes.items()}
+    cpu = {name: 100.0 * (cpu_time(group) - before[name]) / elapsed for name, group in processes.items()}
 
     def median(key: str) -> list[float]:
         return [statistics.median(float(row[key]) for row in rows) for rows in loops.rows.values()]
@@ -243,13 +189,3 @@ def _browser(address: str) -> Iterator[tuple[Callable[[], float], list[psutil.Pr
             children = [it for it in here.children(recursive=True) if "chrom" in it.name()]
             yield (lambda: float(page.evaluate("pendulumConsole.drawn"))), children
             chromium.close()
-
-
-def _cpu(processes: list[psutil.Process]) -> float:
-    total = 0.0
-    for process in processes:
-        with contextlib.suppress(psutil.NoSuchProcess):
-            times = process.cpu_times()
-            total += times.user + times.system
-    return total
-

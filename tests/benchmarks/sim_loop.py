@@ -12,13 +12,11 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import psutil
-import rclpy
-from diagnostic_msgs.msg import DiagnosticArray
-from rclpy.executors import SingleThreadedExecutor
 
 from pendulum_bags.experiment.domain import reserve_domain
-from pendulum_msgs_py import graph, names
+from pendulum_msgs_py import graph
 from pendulum_msgs_py.graph import NodeProgram
+from tests.benchmarks.plant_listener import PlantListener, cpu_time, domain_environment
 from tests.processes import ProcessGroup, RunningProgram
 
 __all__ = ["LoopFigures", "lockstep_speed", "peer_cpu", "realtime_figures"]
@@ -26,7 +24,7 @@ __all__ = ["LoopFigures", "lockstep_speed", "peer_cpu", "realtime_figures"]
 _ROOT = Path(__file__).parents[2]
 _WARM_UP = 6.0
 _DIAGNOSTICS_PERIOD = 0.5
-_START_TIMEOUT = 40.0
+_SIMULATOR = "/sim/simulator"
 
 
 @dataclass(frozen=True)
@@ -50,42 +48,6 @@ class LoopFigures:
     growth: float
 
 
-class _Diagnostics:
-    """The plant's diagnostics, as they come."""
-
-    def __init__(self, domain: int) -> None:
-        self._context = rclpy.Context()
-        rclpy.init(context=self._context, domain_id=domain)
-        self._node = rclpy.create_node("bench_listener", context=self._context)
-        self._executor = SingleThreadedExecutor(context=self._context)
-        self._executor.add_node(self._node)
-        self._node.create_subscription(DiagnosticArray, names.DIAGNOSTICS, self._on_message, 10)
-        self.rows: list[dict[str, str]] = []
-
-    def _on_message(self, message: DiagnosticArray) -> None:
-        for status in message.status:
-            if status.name.endswith("simulator: plant"):
-                self.rows.append({pair.key: pair.value for pair in status.values})
-
-    def listen(self, duration: float) -> None:
-        deadline = time.monotonic() + duration
-        while (left := deadline - time.monotonic()) > 0.0:
-            self._executor.spin_once(timeout_sec=left)
-
-    def wait_for_latency(self) -> None:
-        deadline = time.monotonic() + _START_TIMEOUT
-        while time.monotonic() < deadline:
-            self.listen(0.5)
-            if self.rows and math.isfinite(float(self.rows[-1].get("command_latency_p50_us", "nan"))):
-                return
-        raise TimeoutError(f"the loop did not close within {_START_TIMEOUT:g} s")
-
-    def close(self) -> None:
-        self._executor.shutdown()
-        self._node.destroy_node()
-        rclpy.shutdown(context=self._context)
-
-
 def realtime_figures(
     duration: float, *, rate: float = 1000.0, cores: Sequence[int] | None = None
 ) -> LoopFigures:
@@ -98,32 +60,33 @@ def realtime_figures(
     """
     with tempfile.TemporaryDirectory() as folder, reserve_domain(None) as domain:
         group = ProcessGroup(Path(folder), _ROOT)
-        listener = _Diagnostics(domain)
+        listener = PlantListener(domain, _SIMULATOR)
+        said = listener.rows[_SIMULATOR]
         try:
             programs = [
                 _start(group, domain, graph.simulator("/sim", rate_hz=rate, initial_theta=math.pi - 0.1)),
                 _start(group, domain, graph.controller("/sim")),
             ]
-            listener.wait_for_latency()
+            listener.wait_for_loops()
             processes = [psutil.Process(program.pid) for program in programs]
             for process in processes:
                 if cores is not None:
                     _pin(process, cores)
             listener.listen(_WARM_UP)
             memory = processes[0].memory_info().rss
-            listener.rows.clear()
-            busy, wall = _cpu(processes), time.monotonic()
+            said.clear()
+            busy, wall = cpu_time(processes), time.monotonic()
             listener.listen(duration)
             elapsed = time.monotonic() - wall
-            cpu = 100.0 * (_cpu(processes) - busy) / elapsed
-            after = listener.rows[-1]
-            expected = (len(listener.rows) - 1) * _DIAGNOSTICS_PERIOD * rate
-            cycles = int(after["cycles"]) - int(listener.rows[0]["cycles"])
+            cpu = 100.0 * (cpu_time(processes) - busy) / elapsed
+            after = said[-1]
+            expected = (len(said) - 1) * _DIAGNOSTICS_PERIOD * rate
+            cycles = int(after["cycles"]) - int(said[0]["cycles"])
             # Periods that a late timer stepped through in one go are no cycles of their own.
-            missed = max(expected - cycles, int(after["overruns"]) - int(listener.rows[0]["overruns"]))
+            missed = max(expected - cycles, int(after["overruns"]) - int(said[0]["overruns"]))
             return LoopFigures(
-                p50=statistics.median(float(row["command_latency_p50_us"]) for row in listener.rows),
-                p99=statistics.median(float(row["command_latency_p99_us"]) for row in listener.rows),
+                p50=statistics.median(float(row["command_latency_p50_us"]) for row in said),
+                p99=statistics.median(float(row["command_latency_p99_us"]) for row in said),
                 missed=100.0 * max(0.0, missed) / expected,
                 cpu=cpu,
                 memory=processes[0].memory_info().rss / 1e6,
@@ -146,14 +109,14 @@ def peer_cpu(module: str, duration: float, *, rate: float = 1000.0) -> float:
         group = ProcessGroup(Path(folder), _ROOT)
         try:
             programs = [
-                group.start(f"tests.benchmarks.{module}", role, str(rate), env=_environment(domain))
+                group.start(f"tests.benchmarks.{module}", role, str(rate), env=domain_environment(domain))
                 for role in ("plant", "controller")
             ]
             time.sleep(_WARM_UP)
             processes = [psutil.Process(program.pid) for program in programs]
-            busy, wall = _cpu(processes), time.monotonic()
+            busy, wall = cpu_time(processes), time.monotonic()
             time.sleep(duration)
-            return 100.0 * (_cpu(processes) - busy) / (time.monotonic() - wall)
+            return 100.0 * (cpu_time(processes) - busy) / (time.monotonic() - wall)
         finally:
             group.close()
 
@@ -167,7 +130,8 @@ def lockstep_speed(duration: float, *, rate: float = 500.0) -> float:
     """
     with tempfile.TemporaryDirectory() as folder, reserve_domain(None) as domain:
         group = ProcessGroup(Path(folder), _ROOT)
-        listener = _Diagnostics(domain)
+        listener = PlantListener(domain, _SIMULATOR)
+        said = listener.rows[_SIMULATOR]
         try:
             _start(group, domain, graph.controller("/sim", use_sim_time=True))
             _start(group, domain, graph.disturbance("/sim", autostart=True, duration=duration, use_sim_time=True))
@@ -180,21 +144,19 @@ def lockstep_speed(duration: float, *, rate: float = 500.0) -> float:
                 lockstep_subscribers=2,
             )
             _start(group, domain, plant)
-            deadline = time.monotonic() + _START_TIMEOUT
-            while not (listener.rows and int(listener.rows[-1].get("lockstep_steps", 0)) > 200):
-                listener.listen(0.1)
-                if time.monotonic() > deadline:
-                    raise TimeoutError("the lockstep run did not start")
-            listener.rows.clear()
+            listener.wait_until(
+                lambda: bool(said) and int(said[-1].get("lockstep_steps", 0)) > 200, "the start of the lockstep run"
+            )
+            said.clear()
             listener.listen(1.0)
-            first, start = int(listener.rows[-1]["lockstep_steps"]), time.monotonic()
+            first, start = int(said[-1]["lockstep_steps"]), time.monotonic()
             end = start + duration / 3.0
             while time.monotonic() < end:
                 listener.listen(0.5)
-            count = len(listener.rows)
-            while len(listener.rows) == count:
+            count = len(said)
+            while len(said) == count:
                 listener.listen(0.01)
-            steps = int(listener.rows[-1]["lockstep_steps"]) - first
+            steps = int(said[-1]["lockstep_steps"]) - first
             return steps / rate / (time.monotonic() - start)
         finally:
             listener.close()
@@ -203,23 +165,11 @@ def lockstep_speed(duration: float, *, rate: float = 500.0) -> float:
 
 def _start(group: ProcessGroup, domain: int, program: NodeProgram) -> RunningProgram:
     return group.start(
-        program.package, program.executable, *program.ros_arguments(), env=_environment(domain)
+        program.package, program.executable, *program.ros_arguments(), env=domain_environment(domain)
     )
-
-
-def _environment(domain: int) -> dict[str, str]:
-    return {
-        "ROS_DOMAIN_ID": str(domain),
-        "ROS_AUTOMATIC_DISCOVERY_RANGE": os.environ.get("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST"),
-        "PYTHONSAFEPATH": "",
-    }
 
 
 def _pin(process: psutil.Process, cores: Sequence[int]) -> None:
     """Pin all threads of a process; its own affinity is only that of the first."""
     for thread in process.threads():
         os.sched_setaffinity(thread.id, cores)
-
-
-def _cpu(processes: Sequence[psutil.Process]) -> float:
-    return sum(sum(process.cpu_times()[:2]) for process in processes)

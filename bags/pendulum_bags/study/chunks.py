@@ -18,7 +18,15 @@ from numpy.typing import NDArray
 from pendulum_bags.experiment.run_folder import write_json
 from pendulum_msgs_py.errors import BagError, FaultError, ParameterError
 
-__all__ = ["carry_out", "cluster_client", "open_results", "read_columns", "write_columns"]
+__all__ = [
+    "carry_out",
+    "chunk_path",
+    "cluster_client",
+    "open_results",
+    "read_columns",
+    "run_chunks",
+    "write_columns",
+]
 
 Job = TypeVar("Job")
 Result = TypeVar("Result")
@@ -61,6 +69,46 @@ def carry_out(
         return
     with cluster_client(scheduler, workers) as own:
         yield from _on_cluster(own, task, job, numbers)
+
+
+def run_chunks(
+    folder: Path,
+    task: Callable[[Job, int, int | None], Mapping[str, NDArray[Any]]],
+    job: Job,
+    chunks: int,
+    *,
+    scheduler: str = "",
+    workers: int = 0,
+    client: Any = None,
+    on_progress: Callable[[int, int], None] = lambda done, total: None,
+) -> None:
+    """Carry out the chunks that are not on disk yet, and write the columns of each to a file of its own.
+
+    Args:
+        folder: Where the files go.
+        task: Returns the columns of a chunk; else as in ``carry_out``, like ``job`` and the last arguments.
+        job: What all chunks have in common.
+        chunks: How many there are.
+        scheduler: Address of a Dask scheduler.
+        workers: Processes of a local Dask cluster.
+        client: A Dask client to use in place of either.
+        on_progress: Called with chunks done and in all.
+
+    Raises:
+        FaultError: As ``carry_out``.
+    """
+    missing = [index for index in range(chunks) if not chunk_path(folder, index).is_file()]
+    done = chunks - len(missing)
+    on_progress(done, chunks)
+    for index, columns in carry_out(task, job, missing, scheduler=scheduler, workers=workers, client=client):
+        write_columns(chunk_path(folder, index), columns)
+        done += 1
+        on_progress(done, chunks)
+
+
+def chunk_path(folder: Path, index: int) -> Path:
+    """Return the file of a chunk."""
+    return folder / f"runs_{index:05}.parquet"
 
 
 @contextmanager

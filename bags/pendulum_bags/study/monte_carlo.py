@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pendulum_bags.experiment.run_folder import write_json
-from pendulum_bags.study.chunks import carry_out, open_results, read_columns, write_columns
+from pendulum_bags.study.chunks import chunk_path, open_results, read_columns, run_chunks
 from pendulum_bags.study.uncertain import VARIED, Uncertainty, batch_variations
 from pendulum_lqr.design import continuous_lqr
 from pendulum_lqr.model import linearise
@@ -188,14 +188,11 @@ def run_monte_carlo(
         BagError: The folder holds something else.
     """
     open_results(folder, "Monte Carlo", settings.fingerprint(), asdict(settings))
-    missing = [index for index in range(settings.chunks) if not _path(folder, index).is_file()]
-    done = settings.chunks - len(missing)
-    on_progress(done, settings.chunks)
     job = (settings, load_plant(settings.plant))
-    for index, columns in carry_out(_run_chunk, job, missing, scheduler=scheduler, workers=workers, client=client):
-        write_columns(_path(folder, index), columns)
-        done += 1
-        on_progress(done, settings.chunks)
+    run_chunks(
+        folder, _run_chunk, job, settings.chunks, scheduler=scheduler, workers=workers, client=client,
+        on_progress=on_progress,
+    )  # fmt: skip
     result = summarise(folder, settings)
     write_json(folder / "monte_carlo.json", result)
     return result
@@ -205,7 +202,7 @@ def summarise(folder: Path, settings: MonteCarlo) -> dict[str, Any]:
     """Return the probability of staying inside the bound, quantiles and the worst runs, from the Parquet files."""
     columns: dict[str, list[Array]] = {name: [] for name in ("max_theta", "max_effort", "std_theta", "theta_end")}
     for index in range(settings.chunks):
-        table = read_columns(_path(folder, index), columns)
+        table = read_columns(chunk_path(folder, index), columns)
         for name, parts in columns.items():
             parts.append(table[name])
     values = {name: np.concatenate(parts) for name, parts in columns.items()}
@@ -330,10 +327,6 @@ def _columns(drawn: Mapping[str, NDArray[Any]], result: BatchResult) -> dict[str
         "theta_dot_end": result.theta_dot,
     }
     return {name: computed[name] if name in computed else drawn[name] for name in COLUMNS}
-
-
-def _path(folder: Path, index: int) -> Path:
-    return folder / f"runs_{index:05}.parquet"
 
 
 def _wilson(hits: int, runs: int) -> tuple[float, float]:

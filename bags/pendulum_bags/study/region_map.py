@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pendulum_bags.experiment.run_folder import write_json
-from pendulum_bags.study.chunks import carry_out, open_results, read_columns, write_columns
+from pendulum_bags.study.chunks import chunk_path, open_results, read_columns, run_chunks, write_columns
 from pendulum_bags.study.uncertain import VARIED, Uncertainty, batch_variations
 from pendulum_lqr.design import Gain, continuous_lqr
 from pendulum_lqr.model import linearise
@@ -217,13 +217,10 @@ def run_region_map(
     """
     job = (settings, settings.believed(), tuple(float(value) for value in settings.gain().K))
     open_results(folder, "map", settings.fingerprint(), asdict(settings))
-    missing = [index for index in range(settings.chunks) if not _path(folder, index).is_file()]
-    done = settings.chunks - len(missing)
-    on_progress(done, settings.chunks)
-    for index, columns in carry_out(_run_chunk, job, missing, scheduler=scheduler, workers=workers, client=client):
-        write_columns(_path(folder, index), columns)
-        done += 1
-        on_progress(done, settings.chunks)
+    run_chunks(
+        folder, _run_chunk, job, settings.chunks, scheduler=scheduler, workers=workers, client=client,
+        on_progress=on_progress,
+    )  # fmt: skip
     result = _summarise(folder, settings)
     write_columns(folder / "map.parquet", _map_columns(result))
     write_json(folder / "region.json", result.to_json())
@@ -277,7 +274,7 @@ def _summarise(folder: Path, settings: RegionMap) -> RegionResult:
     believed = np.zeros(shape, dtype=np.bool_)
     moving = 0
     for index in range(settings.chunks):
-        columns = read_columns(_path(folder, index), ("attracted", "theta_end", "theta_dot_end"))
+        columns = read_columns(chunk_path(folder, index), ("attracted", "theta_end", "theta_dot_end"))
         attracted = columns["attracted"].reshape(-1, *shape)
         turns = np.round((columns["theta_end"].reshape(-1, *shape) - UPRIGHT) / _TWO_PI)
         hits += attracted.sum(axis=0)
@@ -322,7 +319,3 @@ def _map_columns(result: RegionResult) -> dict[str, NDArray[Any]]:
         "turned": result.turned.ravel(),
     }
     return {name: columns[name] for name in MAP_COLUMNS}
-
-
-def _path(folder: Path, index: int) -> Path:
-    return folder / f"runs_{index:05}.parquet"
