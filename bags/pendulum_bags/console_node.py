@@ -20,10 +20,8 @@ from rcl_interfaces.srv import SetParameters
 from rclpy.clock import Clock, ClockType
 from rclpy.context import Context
 from rclpy.experimental import EventsExecutor
-from rclpy.node import Node
 from rclpy.parameter import Parameter
 from rclpy.signals import SignalHandlerOptions
-from rclpy.subscription import Subscription
 from rclpy.task import Future
 from sensor_msgs.msg import JointState
 from std_msgs.msg import String
@@ -39,6 +37,7 @@ from pendulum_msgs_py.executables import cli_main
 from pendulum_msgs_py.ros import qos
 from pendulum_msgs_py.ros.convert import command_from_bytes, sample_from_bytes, stamp_from_message
 from pendulum_msgs_py.ros.middleware import check_closed, set_middleware_defaults
+from pendulum_msgs_py.ros.polled import PolledInput, PollingNode
 
 __all__ = ["Hub", "main"]
 
@@ -60,7 +59,7 @@ class _Plant:
 
     namespace: str
     node: str
-    taps: dict[str, Subscription[Any]]
+    taps: dict[str, PolledInput]
     others: list[Any] = field(default_factory=list)
     values: dict[str, float] = field(default_factory=dict)
     stamp_ns: int = 0
@@ -73,17 +72,16 @@ class _Plant:
 class Hub:
     """The console's end of the graph.
 
-    States and torques come at up to 2 kHz and are drawn 60 times a second. Their subscriptions keep one message,
-    belong to a node that nobody spins, and are read when a picture is due: what is not drawn costs no Python at all.
+    States and torques come at up to 2 kHz and are drawn 60 times a second. Their inputs keep one message and are looked
+    at when a picture is due: what is not drawn costs no Python at all.
     """
 
     def __init__(self) -> None:
         set_middleware_defaults()
         self._context = Context()
         rclpy.init(context=self._context, args=[], signal_handler_options=SignalHandlerOptions.NO)
-        self._node = Node("console", context=self._context)
+        self._node = PollingNode("console", context=self._context)
         check_closed(self._context.get_domain_id())
-        self._silent = Node("console_taps", context=self._context, start_parameter_services=False)
         self._lock = threading.Lock()
         self._plants: dict[str, _Plant] = {}
         self._clients: dict[str, Any] = {}
@@ -104,7 +102,6 @@ class Hub:
         self._executor.wake()
         self._thread.join(2.0)
         self._executor.shutdown()
-        self._silent.destroy_node()
         self._node.destroy_node()
         rclpy.try_shutdown(context=self._context)
 
@@ -202,8 +199,8 @@ class Hub:
                 gone = self._plants.pop(node)
                 stale = [name for name in self._clients if name.startswith(f"{gone.namespace}/")]
                 clients = [self._clients.pop(name) for name in stale]
-            for subscription in gone.taps.values():
-                self._silent.destroy_subscription(subscription)
+            for tap in gone.taps.values():
+                self._node.destroy_polled_input(tap)
             for subscription in gone.others:
                 self._node.destroy_subscription(subscription)
             for client in clients:
@@ -213,9 +210,7 @@ class Hub:
         space = node.rpartition("/")[0]
         topics = {"state": names.JOINT_STATES, **_TORQUES}
         taps = {
-            key: self._silent.create_subscription(
-                JointState, f"{space}/{topic}", _not_called, qos.WATCHED_STATE, raw=True
-            )
+            key: self._node.create_polled_input(JointState, f"{space}/{topic}", qos.WATCHED_STATE)
             for key, topic in topics.items()
         }
         plant = _Plant(space, node, taps)
@@ -241,17 +236,14 @@ class Hub:
                         plant.mode, plant.reason = plant.figures.get("mode", plant.mode), status.message
 
     def _read(self, plant: _Plant) -> dict[str, Any]:
-        for key, subscription in plant.taps.items():
-            with subscription.handle:
-                taken = subscription.handle.take_message(JointState, True)
-            if taken is None:
-                continue
-            if key != "state":
-                command = command_from_bytes(taken[0])
-                plant.values[key] = command.effort if command is not None else 0.0
-            elif (sample := sample_from_bytes(taken[0])) is not None:
-                plant.values.update(theta=sample.position, theta_dot=sample.velocity, measured=sample.effort)
-                plant.stamp_ns = sample.stamp_ns
+        for key, tap in plant.taps.items():
+            for data, _ in tap.messages():
+                if key != "state":
+                    command = command_from_bytes(data)
+                    plant.values[key] = command.effort if command is not None else 0.0
+                elif (sample := sample_from_bytes(data)) is not None:
+                    plant.values.update(theta=sample.position, theta_dot=sample.velocity, measured=sample.effort)
+                    plant.stamp_ns = sample.stamp_ns
         return {
             **plant.values,
             "stamp_ns": str(plant.stamp_ns),
@@ -272,10 +264,6 @@ def _on_event(plant: _Plant, message: String) -> None:
     if isinstance(event, dict) and event.get("name") == "plant_mode":
         plant.mode, plant.reason = str(event.get("mode", "")), str(event.get("reason", ""))
         plant.mode_stamp_ns = int(event.get("stamp_ns", 0))
-
-
-def _not_called(_: Any) -> None:
-    """Stand where a callback must be given; see :class:`Hub`."""
 
 
 def _accepted(who: str, response: Any) -> str:

@@ -7,12 +7,10 @@ import platform
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 from rclpy.clock import Clock, ClockType
-from rclpy.node import Node
-from rclpy.subscription import Subscription
 from rclpy.topic_endpoint_info import TopicEndpointInfo
 from std_srvs.srv import Trigger
 
@@ -28,6 +26,7 @@ from pendulum_msgs_py.names import EVENTS
 from pendulum_msgs_py.parameters import ParameterSpec
 from pendulum_msgs_py.ros.convert import event_message
 from pendulum_msgs_py.ros.parameters import NodeParameters
+from pendulum_msgs_py.ros.polled import PollingNode
 
 __all__ = ["SPECS", "Recorder"]
 
@@ -46,7 +45,7 @@ SPECS = (
 )
 
 
-class Recorder(Node):
+class Recorder(PollingNode):
     """Subscribes to topics as they appear and hands their bytes to a :class:`RecordingSession`.
 
     Messages are not dispatched by the executor, one wake-up each, but taken from the middleware every 20 ms, all
@@ -88,12 +87,6 @@ class Recorder(Node):
         self._leave = threading.Event()
         self._poller = threading.Thread(target=self._poll, name="bag intake", daemon=True)
         self._poller.start()
-
-    @property
-    def subscriptions(self) -> Iterable[Subscription]:
-        """Subscriptions for the executor: without those that this node visits by itself."""
-        own = {id(tap.subscription) for tap in self._taps.values()}
-        return (entry for entry in super().subscriptions if id(entry) not in own)
 
     def close(self) -> None:
         """Take what has arrived, close the bag and say what it holds."""
@@ -273,7 +266,7 @@ class Recorder(Node):
                 self._take(tap, self._session)
                 del self._taps[topic]
             tap.close()
-            self.destroy_subscription(tap.subscription)
+            self.destroy_polled_input(tap.source)
         with self._lock:
             try:
                 self._taps[topic] = Tap(self, topic, publishers)
@@ -343,7 +336,7 @@ class Recorder(Node):
                 "path": str(session.writer.path) if session is not None else None,
                 "subscribed": sorted(self._taps),
                 "matched": sorted(
-                    tap.topic for tap in self._taps.values() if tap.subscription.get_publisher_count()
+                    tap.topic for tap in self._taps.values() if tap.source.subscription.get_publisher_count()
                 ),
                 "topics": {
                     name: {

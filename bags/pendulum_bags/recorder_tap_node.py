@@ -9,7 +9,6 @@ from typing import Any
 
 from rclpy.event_handler import QoSSubscriptionEventType
 from rclpy.impl.implementation_singleton import rclpy_implementation
-from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.topic_endpoint_info import TopicEndpointInfo
 
@@ -17,6 +16,7 @@ from pendulum_bags.reader.joint_state import Trimmer
 from pendulum_bags.recorder import GapCounter, RecordingSession, stamp_reader
 from pendulum_bags.storage import QosProfile
 from pendulum_bags.storage.message_types import message_type
+from pendulum_msgs_py.ros.polled import PollingNode
 
 __all__ = ["Tap", "wanted_qos"]
 
@@ -50,11 +50,11 @@ class Tap:
         ImportError: The type of the messages is not installed.
 
     Attributes:
-        subscription: The subscription; the node that made it destroys it after ``close``.
+        source: Where its messages come from; the node that made it destroys it after ``close``.
         announced: The session that knows the topic.
     """
 
-    def __init__(self, node: Node, topic: str, publishers: Sequence[TopicEndpointInfo]) -> None:
+    def __init__(self, node: PollingNode, topic: str, publishers: Sequence[TopicEndpointInfo]) -> None:
         name = publishers[0].topic_type
         type_hash = str(publishers[0].topic_type_hash)
         self.topic = topic
@@ -65,7 +65,6 @@ class Tap:
         self.announced: RecordingSession | None = None
         self.stamp = stamp_reader(name)
         self.type = message_type(name, type_hash if type_hash.startswith("RIHS") else "")
-        self._class = _message_class(name)
         self._trim = Trimmer() if name == "sensor_msgs/msg/JointState" else bytes
         profile = QoSProfile(
             depth=DEPTH,
@@ -73,12 +72,11 @@ class Tap:
             durability=DurabilityPolicy.TRANSIENT_LOCAL if self.latched else DurabilityPolicy.VOLATILE,
         )
         self._opened = time.monotonic()
-        self.subscription = node.create_subscription(self._class, topic, _not_called, profile, raw=True)
+        self.source = node.create_polled_input(_message_class(name), topic, profile)
         # Taken when it is asked for, not delivered by the executor: it must be as new as the messages.
-        with self.subscription.handle:
-            self._matched = rclpy_implementation.EventHandle(
-                self.subscription.handle, QoSSubscriptionEventType.RCL_SUBSCRIPTION_MATCHED
-            )
+        handle = self.source.subscription.handle
+        with handle:
+            self._matched = rclpy_implementation.EventHandle(handle, QoSSubscriptionEventType.RCL_SUBSCRIPTION_MATCHED)
         self._gaps = GapCounter(self._count_publishers)
 
     @property
@@ -96,30 +94,19 @@ class Tap:
 
     def take(self) -> Iterator[tuple[int, bytes, int]]:
         """Yield what has arrived: time of arrival [ns] or 0, CDR bytes, and messages that are missing before it."""
-        take, message_class, see, trim = (
-            self.subscription.handle.take_message,
-            self._class,
-            self._gaps.see,
-            self._trim,
-        )
-        with self.subscription.handle:
-            while (taken := take(message_class, True)) is not None:
-                data, info = taken
-                sequence = info["publication_sequence_number"]
-                yield info["received_timestamp"], trim(data), see(sequence) if sequence else 0
+        see, trim = self._gaps.see, self._trim
+        for data, info in self.source.messages():
+            sequence = info["publication_sequence_number"]
+            yield info["received_timestamp"], trim(data), see(sequence) if sequence else 0
 
     def close(self) -> None:
-        """Let go of the middleware before the subscription is destroyed."""
+        """Let go of the middleware before the source is destroyed."""
         self._matched.destroy_when_not_in_use()
 
     def _count_publishers(self) -> tuple[int, int]:
         with self._matched:
             status = self._matched.take_event()
         return (status.total_count, status.current_count) if status else (0, 0)
-
-
-def _not_called(_: bytes) -> None:
-    """Stand where a callback must be given: the recorder takes its messages itself."""
 
 
 def _message_class(name: str) -> Any:

@@ -317,7 +317,8 @@ class BridgeNode(LifecycleNode):
         if feedback is None or bridge.sample is None:
             return None
         # Before the first step nobody need be listening yet, and two runs must publish the same.
-        if self._lockstep_loop is None or self._lockstep_loop.started:
+        assert self._lockstep_loop is not None
+        if self._lockstep_loop.started:
             self._feedback.publish(encode_feedback(feedback._replace(stamp_ns=stamp_ns)))
             if (stamp_ns - LOCKSTEP_EPOCH_NS) % round(_SLOW_PERIOD * NANOSECONDS) < self._period_ns:
                 self._publish_slow(stamp_ns)

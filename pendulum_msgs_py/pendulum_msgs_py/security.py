@@ -137,7 +137,15 @@ NODES: dict[str, Permissions] = {
         ),
     ),
     "console": Permissions(
-        subscribe=(names.DIAGNOSTICS, _SIDE + names.EVENTS),
+        subscribe=(
+            names.DIAGNOSTICS,
+            *(
+                _SIDE + name
+                for name in (
+                    names.EVENTS, names.JOINT_STATES, names.EFFORT_COMMAND, names.DISTURBANCE, names.APPLIED_EFFORT
+                )
+            ),
+        ),
         request=(
             *_READ_PARAMETERS,
             *(_PLANT + service for service in ("arm", "e_stop", "e_stop_reset")),
@@ -145,24 +153,18 @@ NODES: dict[str, Permissions] = {
             *(_SIDE + node + "/set_parameters" for node in ("controller", "disturbance")),
         ),
     ),
-    "console_taps": Permissions(
-        subscribe=tuple(
-            _SIDE + name
-            for name in (names.JOINT_STATES, names.EFFORT_COMMAND, names.DISTURBANCE, names.APPLIED_EFFORT)
-        )
-    ),
 }
 """Permissions of the nodes, beyond those of every node (parameters, log, clock)."""
 
 PLANTS = {"/sim": "simulator", "/hw": "bridge"}
 """Namespace of each side, and its plant."""
 
-BESIDE_PLANTS = {"conductor": "/conductor", "console": "/console", "console_taps": "/console", "recorder": "/recorder"}
+BESIDE_PLANTS = {"conductor": "/conductor", "console": "/console", "recorder": "/recorder"}
 """Nodes that have to do with all sides, in the root namespace, and the enclave of each: that of its process."""
 
 _SIDE_NODES = ("controller", "effort_controller", "disturbance", "recorder", "viewer", "markers")
 _WITH_PLANT = {"bridge": ("procedure",)}
-_WITHOUT_PARAMETERS = {"conductor", "console_taps"}
+_WITHOUT_PARAMETERS = {"conductor"}
 
 
 def _resolve(name: str, node: str, namespace: str) -> str:

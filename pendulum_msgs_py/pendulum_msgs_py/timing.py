@@ -52,11 +52,14 @@ class RingOfTimes:
         return self._count
 
     def percentiles_us(self, *percents: float) -> list[float]:
-        """Return percentiles of the durations kept [us]; NaN before the first."""
+        """Return percentiles of the durations kept, each the nearest in rank [us]; NaN before the first."""
         kept = self._values[: min(self._count, self._values.size)]
         if kept.size == 0:
             return [float("nan")] * len(percents)
-        return [float(value) / 1e3 for value in np.percentile(kept, percents)]
+        # In the middle of a loop, where numpy's general percentile would cost a quarter of a period at 1 kHz.
+        ranks = [round((kept.size - 1) * percent / 100.0) for percent in percents]
+        ordered = np.partition(kept, ranks)
+        return [float(ordered[rank]) / 1e3 for rank in ranks]
 
 
 class LoopStatistics:

@@ -59,24 +59,28 @@ def main(argv: Sequence[str] | None = None) -> int:
         "--only", metavar="AREA", action="append", help=f"one of {', '.join(known) or '(none yet)'}"
     )
     parser.add_argument("--strict", action="store_true", help="exit with 1 when a target is not reached")
+    parser.add_argument("--json", action="store_true", help="print the rows as JSON instead of a table")
     arguments = parser.parse_args(argv)
     chosen = arguments.only or known
     if unknown := [area for area in chosen if area not in known]:
         parser.error(f"area is {unknown[0]!r}; expected one of {', '.join(known)}")
 
-    console = make_console()
+    console = make_console(stderr=arguments.json)
     rows: list[Row] = []
     interrupted = False
     for area in chosen:
         start = time.monotonic()
         with console.status(f"measuring {area}"):
             try:
-                rows.extend(measure(area))
+                rows += list(measure(area))
             except KeyboardInterrupt:
                 interrupted = True
                 break
         console.print(f"{area}: measured in {time.monotonic() - start:.1f} s", style="dim")
-    console.print(table(rows))
+    if arguments.json:
+        print(json.dumps([asdict(row) for row in rows], indent=2))
+    else:
+        console.print(table(rows))
     _store(rows)
     reached = sum(row.holds is True for row in rows)
     missed = [row for row in rows if row.holds is False]

@@ -170,58 +170,59 @@ def _a_little_late(system: LiveSystem, _: random.Random) -> Outcome:
     return outcome
 
 
-def _twice(system: LiveSystem, _: random.Random) -> Outcome:
-    """Answer each state in two ways: the first counts, the second is counted."""
-    outcome = Outcome()
-    with _in_its_place(system) as impostor:
-        def both(stamp_ns: int) -> None:
-            impostor.send(stamp_ns)
-            impostor.send(stamp_ns, _OTHER_EFFORT)
+def _send_twice(impostor: _Impostor) -> Callable[[int], None]:
+    """Answer each state in two ways: the first counts."""
 
-        before = system.refused().get("duplicate", 0)
-        began = len(system.applied)
-        impostor.answer = both
-        system.listen(1.2)
-        counted = system.refused().get("duplicate", 0) - before
-        outcome.demand(counted > 100, f"{counted} second answers counted; expected more than 100")
-        efforts = {applied.effort for applied in system.applied[began:]}
-        outcome.demand(efforts <= {0.0, _EFFORT}, f"torques {sorted(efforts)}; expected the first answer's alone")
-        outcome.detail = outcome.detail or f"{counted} refused as duplicate"
-    return outcome
+    def answer(stamp_ns: int) -> None:
+        impostor.send(stamp_ns)
+        impostor.send(stamp_ns, _OTHER_EFFORT)
+
+    return answer
 
 
-def _backwards(system: LiveSystem, _: random.Random) -> Outcome:
+def _send_backwards(impostor: _Impostor) -> Callable[[int], None]:
     """Answer states in pairs, the newer first: the older one must not act after the newer."""
-    outcome = Outcome()
-    with _in_its_place(system) as impostor:
-        held: list[int] = []
+    held: list[int] = []
 
-        def swapped(stamp_ns: int) -> None:
-            held.append(stamp_ns)
-            if len(held) == 2:
-                impostor.send(held[1])
-                impostor.send(held[0], _OTHER_EFFORT)
-                held.clear()
+    def answer(stamp_ns: int) -> None:
+        held.append(stamp_ns)
+        if len(held) == 2:
+            impostor.send(held[1])
+            impostor.send(held[0], _OTHER_EFFORT)
+            held.clear()
 
-        before = system.refused().get("out_of_order", 0)
-        began = len(system.applied)
-        impostor.answer = swapped
-        system.listen(1.2)
-        counted = system.refused().get("out_of_order", 0) - before
-        outcome.demand(counted > 50, f"{counted} answers counted as out of order; expected more than 50")
-        efforts = {applied.effort for applied in system.applied[began:]}
-        outcome.demand(efforts <= {0.0, _EFFORT}, f"torques {sorted(efforts)}; expected the newer answer's alone")
-        outcome.detail = outcome.detail or f"{counted} refused as out_of_order"
-    return outcome
+    return answer
+
+
+def _half_refused(
+    answering: Callable[[_Impostor], Callable[[int], None]], refusal: str, at_least: int
+) -> Callable[[LiveSystem, random.Random], Outcome]:
+    """Answer so that one of two answers must be refused and counted, and never act."""
+
+    def act(system: LiveSystem, _: random.Random) -> Outcome:
+        outcome = Outcome()
+        with _in_its_place(system) as impostor:
+            before = system.refused().get(refusal, 0)
+            began = len(system.applied)
+            impostor.answer = answering(impostor)
+            system.listen(1.2)
+            counted = system.refused().get(refusal, 0) - before
+            outcome.demand(counted > at_least, f"{counted} answers counted as {refusal}; expected more than {at_least}")
+            efforts = {applied.effort for applied in system.applied[began:]}
+            outcome.demand(efforts <= {0.0, _EFFORT}, f"torques {sorted(efforts)}; expected {_EFFORT} or none")
+            outcome.detail = outcome.detail or f"{counted} refused as {refusal}"
+        return outcome
+
+    return act
 
 
 IMPOSTORS: tuple[Fault, ...] = (
     Fault("controller answers 20 ms late", _a_little_late),
     Fault("controller answers 80 ms late", _no_longer_valid(_late(0.08), "too_old"), short=True),
-    Fault("controller answers twice, differently", _twice),
+    Fault("controller answers twice, differently", _half_refused(_send_twice, "duplicate", 100)),
     Fault("controller answers never", _no_longer_valid(_never, "")),
     Fault("controller answers with stamps of a minute ago", _no_longer_valid(_of_last_minute, "too_old")),
     Fault("controller answers with a stamp of zero", _no_longer_valid(_zero_stamp, "too_old")),
     Fault("controller answers with stamps 1 s ahead", _no_longer_valid(_shifted(1000), "from_future"), short=True),
-    Fault("controller answers out of order", _backwards),
+    Fault("controller answers out of order", _half_refused(_send_backwards, "out_of_order", 50)),
 )

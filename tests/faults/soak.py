@@ -344,13 +344,17 @@ def print_report(report: SoakReport, console: Console) -> None:
 def run_soak(
     minutes: Annotated[float, typer.Option(help="How long [min].", min=0.2)] = 30.0,
     out: Annotated[Path, typer.Option(help="Where the figures are written.")] = Path("build", "soak.json"),
+    json_output: Annotated[bool, typer.Option("--json", help="Print the figures as JSON instead of tables.")] = False,
 ) -> int:
     """Run all nodes and two recorders for a while, and compare the end with the beginning."""
     with reserve_domain() as domain, tempfile.TemporaryDirectory(prefix="pendulum_soak_") as folder:
         report = soak(Path(folder), domain, minutes)
-    print_report(report, make_console())
     out.parent.mkdir(parents=True, exist_ok=True)
-    out.write_text(json.dumps(as_json(report), indent=2) + "\n", encoding="utf-8")
+    write_json(out, as_json(report))
+    if json_output:
+        print(json.dumps(as_json(report), indent=2))
+    else:
+        print_report(report, make_console())
     return 1 if report.violations else 0
 
 

@@ -96,7 +96,7 @@ def test_nodes_do_what_the_policy_allows_and_nothing_else(tmp_path: Path, monkey
             conductor.wait_for("the console to see both plants", lambda: set(hub.plants()) == set(PLANTS), 20.0)
             asyncio.run(_drive(hub))
             here = {program.full_name for program in programs}
-            here |= {"/hw/recorder", "/conductor", "/console", "/console_taps"}
+            here |= {"/hw/recorder", "/conductor", "/console"}
             # Services of nodes that are not there, and of a trial that is not begun here.
             absent = {"/sim/recorder/status", "/hw/procedure/start", "/sim/joint_commands"}
             found: dict[str, tuple[Any, Any]] = {}

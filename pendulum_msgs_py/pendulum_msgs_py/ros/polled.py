@@ -1,12 +1,13 @@
 """Inputs that a node looks at when it needs them, instead of being woken for each message.
 
 A plant that acts at deadlines has no use for a torque before the next one. Emptying its inputs there saves it one
-wake-up a period, a third of its time at 1 kHz, and bounds what a flood of messages can cost.
+wake-up a period, a third of its time at 1 kHz, and bounds what a flood of messages can cost. A recorder empties its
+inputs every few milliseconds, a page when a picture is due.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from typing import Any
 
 from rclpy.node import Node
@@ -31,7 +32,7 @@ class PolledInput:
         self._looks = range(depth)
 
     def take(self, receive: Callable[[bytes, int], object]) -> None:
-        """Hand over what has come since the last look.
+        """Hand over what has come since the last look, to the thread that owns the node.
 
         Args:
             receive: Gets each message, serialised, and the system time at which it reached this process [ns].
@@ -41,6 +42,12 @@ class PolledInput:
             if taken is None:
                 return
             receive(taken[0], taken[1]["received_timestamp"])
+
+    def messages(self) -> Iterator[tuple[bytes, Mapping[str, int]]]:
+        """Yield what has come since the last look, serialised, with what the middleware knows of it; in any thread."""
+        with self.subscription.handle:
+            while (taken := self._take(self._type, True)) is not None:
+                yield taken
 
 
 class PollingNode(Node):
@@ -60,6 +67,11 @@ class PollingNode(Node):
         subscription = self.create_subscription(message_type, topic, _never_called, profile, raw=True)
         self._polled.add(subscription)
         return PolledInput(subscription, profile.depth)
+
+    def destroy_polled_input(self, polled: PolledInput) -> None:
+        """Let go of an input."""
+        self.destroy_subscription(polled.subscription)
+        self._polled.discard(polled.subscription)
 
 
 def _never_called(_data: bytes) -> None:
