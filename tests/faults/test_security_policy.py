@@ -130,7 +130,7 @@ def test_the_policy_is_what_sros_2_reads_and_gives_each_process_an_enclave() -> 
     assert [enclave.get("path") for enclave in root.iter("enclave")] == list(enclaves())
     profiles = {f"{profile.get('ns').rstrip('/')}/{profile.get('node')}" for profile in root.iter("profile")}  # type: ignore[union-attr]
     assert profiles == set(granted())
-    assert len(enclaves()) == len(granted()) - 1  # the console's two nodes are one process
+    assert len(enclaves()) == len(granted())  # each node is a process
     for rule in ("publish", "subscribe"):
         told = {topic.text for topics in root.iter("topics") if topics.get(rule) == "ALLOW" for topic in topics}
         assert told == {topic for allowed in granted().values() for topic in getattr(allowed, rule)}
