@@ -197,7 +197,11 @@ def check_consistency(recording: Recording, *, minimum_travel: float = 0.2) -> R
 
 
 def read_recording(
-    path: str | Path, mapping: str | Path | Mapping[str, Any] | None = None, *, effort: str = "applied"
+    path: str | Path,
+    mapping: str | Path | Mapping[str, Any] | None = None,
+    *,
+    effort: str = "applied",
+    namespace: str | None = None,
 ) -> Recording:
     """Read a CSV file, a friction-study JSON log or a rosbag2 bag.
 
@@ -207,6 +211,7 @@ def read_recording(
             columns must be called as in the built-in mapping ``pendulum``.
         effort: For bags: ``applied`` takes what the plant says it applied (topic ``applied_effort``),
             ``measured`` the measured joint torque in ``joint_states``.
+        namespace: For bags with several plants, such as ``/sim``.
 
     Raises:
         DataError: for missing columns, unsorted time, NaN, wrong units.
@@ -219,7 +224,7 @@ def read_recording(
     if source.is_dir() or suffix in {".mcap", ".db3"}:
         from pendulum_bags.bag_recordings import read_bag_recording
 
-        return check_consistency(read_bag_recording(source, effort=effort))
+        return check_consistency(read_bag_recording(source, effort=effort, namespace=namespace))
     if suffix == ".json":
         return check_consistency(read_servo_log(source))
     if suffix in {".csv", ".txt"}:

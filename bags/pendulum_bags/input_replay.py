@@ -147,6 +147,7 @@ def replay_recording(
     effort: str = "applied",
     start: float | None = None,
     stop: float | None = None,
+    namespace: str | None = None,
 ) -> InputReplay:
     """Read a recording (CSV or bag) and drive a plant with its torque.
 
@@ -158,12 +159,13 @@ def replay_recording(
         effort: For bags, ``applied`` or ``measured`` torque.
         start: Leave out what comes before, from the beginning of the recording [s].
         stop: Leave out what comes after [s].
+        namespace: For bags with several plants, such as ``/sim``.
 
     Raises:
         DataError: The recording is damaged or its input is no torque.
         ParameterError: The plant file is refused.
     """
-    recording = read_recording(path, mapping, effort=effort)
+    recording = read_recording(path, mapping, effort=effort, namespace=namespace)
     if start is not None or stop is not None:
         begin = float(recording.time[0])
         last = math.inf if stop is None else begin + stop

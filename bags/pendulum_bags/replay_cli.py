@@ -44,7 +44,7 @@ def replay(
         str, typer.Option(help="Torque of a bag: applied (said by the plant) or measured.")
     ] = "applied",
     prefix: Annotated[
-        str, typer.Option(help="Namespace of a bag's topics, where it holds several plants.")
+        str, typer.Option(help="Namespace of a bag's topics, where it holds several plants: /sim.")
     ] = "",
     out: Annotated[
         Path | None, typer.Option("--out", "-o", help="Folder for figure and replay.json.")
@@ -78,13 +78,14 @@ def replay(
             effort=effort,
             start=start,
             stop=stop,
+            namespace=prefix or None,
         )
     content = result.as_dict()
     files = _write(folder, result, content)
     if json_output:
         print(json.dumps(content, indent=2, allow_nan=False))
         return
-    _print(result, content)
+    _print(result, content, chosen=bool(params))
     print(f"\nfigure  {files[0]}")
 
 
@@ -97,7 +98,7 @@ def _write(folder: Path, result: Any, content: dict[str, Any]) -> list[Path]:
     return files
 
 
-def _print(result: InputReplay | ControllerReplay, content: dict[str, Any]) -> None:
+def _print(result: InputReplay | ControllerReplay, content: dict[str, Any], *, chosen: bool) -> None:
     from pendulum_msgs_py.terminal import WholeTable, make_console
 
     console = make_console()
@@ -115,6 +116,7 @@ def _print(result: InputReplay | ControllerReplay, content: dict[str, Any]) -> N
                 str(row["steps"]), f"{row['time_s']:.4g}", f"{row['rms_rad']:.3g}", str(row["starts"])
             )
         console.print(table)
+        console.print(f"plant {content['plant']}" + ("" if chosen else " (--params names another)"), highlight=False)
         fit, diverges = content["free_run_fit_percent"], content["diverges_at_s"]
         console.print(
             f"free run: rms {content['free_run_rms_rad']:.4f} rad, fit {fit:.1f} %, "

@@ -6,6 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import yaml
+from threadpoolctl import threadpool_limits
 
 from pendulum_bags import identify_cli
 from pendulum_bags.datasets import Recording
@@ -147,8 +148,10 @@ def test_the_plant_file_carries_intervals_and_provenance(found, tmp_path):
 
 def test_the_same_data_give_the_same_result(found):
     options = Options(friction="coulomb", multi_start=False)
-    first, second = (identify([run()], options, profiles=0).model.vector for _ in range(2))
-    assert first == pytest.approx(second, rel=1e-12)
+    first = identify([run()], options, profiles=0).model.vector
+    with threadpool_limits(limits=1, user_api="blas"):  # as on a worker of a cluster
+        second = identify([run()], options, profiles=0).model.vector
+    assert list(first) == list(second)
     assert first == pytest.approx(found.model.vector, rel=2e-2, abs=1e-3)
 
 

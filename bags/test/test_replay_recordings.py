@@ -116,6 +116,15 @@ def test_command_refuses_bad_files_and_writes_nothing(tmp_path: Path, capsys: py
     assert main([str(bad), "--params", "nothing"]) == 2
 
 
+def test_command_takes_the_plant_of_a_bag_that_is_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    bag = write_bag(tmp_path / "bag", regulate(rate=100.0, seed=3, duration=2.0), "/sim", ramps=False)
+    arguments = [str(bag), "-o", str(tmp_path / "out")]
+    assert main([*arguments, "--prefix", "/sim"]) == 0
+    assert "plant thesis (--params names another)" in capsys.readouterr().out
+    assert main([*arguments, "--prefix", "/hw"]) == 2
+    assert "has no topic /hw/joint_states; it has" in capsys.readouterr().err
+
+
 # -- controllers -------------------------------------------------------------------------------------------------
 
 

@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from threadpoolctl import threadpool_limits
 
 from pendulum_bags.datasets import Recording
 from pendulum_bags.identification.geometry import GeometryCheck, check_geometry
@@ -243,6 +244,9 @@ _DIFFERENCES = {
 }
 
 
+# BLAS splits long sums by the cores that it finds, and a fit magnifies the last digits: on one core, a recording has
+# the same result on every worker.
+@threadpool_limits.wrap(limits=1, user_api="blas")
 def identify(
     recordings: Sequence[Recording],
     options: Options = DEFAULTS,

@@ -170,7 +170,7 @@ def _unpaired(data: ReportData) -> Table:
 def _metrics(data: ReportData) -> Table:
     rows = [
         (
-            f"{row['metric'].replace('_', ' ')} [{row['unit']}]",
+            f"{row['metric'].replace('_', ' ')} [{row['unit'].replace('^2', '²')}]",
             _cell(row["sim"], 4),
             _cell(row["hw"], 4),
             row["meaning"],
