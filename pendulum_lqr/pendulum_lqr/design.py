@@ -332,14 +332,9 @@ def require_controllable(A: Matrix, B: Matrix, *, discrete: bool = False) -> Non
     Raises:
         DesignError: Names the mode.
     """
-    for pole in np.linalg.eigvals(A):
-        if _decays(pole, discrete):
-            continue
-        pencil = np.hstack([pole * np.eye(A.shape[0]) - A, B])
-        if _deficient(pencil):
-            raise DesignError(
-                f"mode at {_number(pole)} is not controllable: no torque reaches it; expected B = [0, 1/M]"
-            )
+    pole = _unreached_mode(A, B, discrete)
+    if pole is not None:
+        raise DesignError(f"mode at {_number(pole)} is not controllable: no torque reaches it; expected B = [0, 1/M]")
 
 
 def require_observable(A: Matrix, C: Matrix, *, discrete: bool = False) -> None:
@@ -353,14 +348,20 @@ def require_observable(A: Matrix, C: Matrix, *, discrete: bool = False) -> None:
     Raises:
         DesignError: Names the mode.
     """
+    # The dual of controllability: what A' and C' do not reach, A and C do not show.
+    pole = _unreached_mode(A.T, C.T, discrete)
+    if pole is not None:
+        raise DesignError(
+            f"mode at {_number(pole)} is not observable: no measurement shows it; expected theta among the outputs"
+        )
+
+
+def _unreached_mode(A: Matrix, B: Matrix, discrete: bool) -> complex | None:
+    """Return a mode that neither decays by itself nor is reached by the input, by the rank of [s I - A, B]."""
     for pole in np.linalg.eigvals(A):
-        if _decays(pole, discrete):
-            continue
-        pencil = np.vstack([pole * np.eye(A.shape[0]) - A, C])
-        if _deficient(pencil):
-            raise DesignError(
-                f"mode at {_number(pole)} is not observable: no measurement shows it; expected theta among the outputs"
-            )
+        if not _decays(pole, discrete) and _deficient(np.hstack([pole * np.eye(A.shape[0]) - A, B])):
+            return complex(pole)
+    return None
 
 
 def _care(A: Matrix, B: Matrix, Q: Matrix, R: Matrix) -> Gain:
