@@ -16,6 +16,7 @@ from std_msgs.msg import Header
 from std_srvs.srv import Trigger
 
 from pendulum_bags.reader import read_bag
+from pendulum_msgs_py.errors import BagError
 from pendulum_msgs_py.names import JOINT
 from tests.faults.doubles import DOUBLES
 from tests.faults.impostor import IMPOSTORS
@@ -77,6 +78,19 @@ def _freeze(name: str, longest: float) -> Callable[[LiveSystem, random.Random], 
     return act
 
 
+def _wait_for_states_in_bag(system: LiveSystem) -> None:
+    """Wait until a recorder that was started has met the plant; before, there is nothing to lose."""
+
+    def holds_states() -> bool:
+        try:
+            with read_bag(system.bag) as bag:
+                return bag.topics["/sim/joint_states"].count > 0
+        except (BagError, KeyError):
+            return False
+
+    system.wait_for("states in the new bag", holds_states, START_TIMEOUT)
+
+
 def _end_recorder(number: int) -> Callable[[LiveSystem, random.Random], Outcome]:
     """Ask the recorder to end: everything that it heard must be in its bag."""
 
@@ -90,7 +104,7 @@ def _end_recorder(number: int) -> Callable[[LiveSystem, random.Random], Outcome]
         stamps = np.sort(read_bag(bag)["/sim/applied_effort"]["stamp_ns"])
         outcome.demand(bool(np.all(np.diff(stamps) < 100_000_000)), "a hole in the bag")
         system.start("recorder")
-        system.wait_for("the new bag to be there", (system.bag / "metadata.yaml").exists, START_TIMEOUT)
+        _wait_for_states_in_bag(system)
         return outcome
 
     return act
@@ -118,7 +132,7 @@ def _kill_recorder(system: LiveSystem, generator: random.Random) -> Outcome:
     outcome = Outcome(lost=lost)
     outcome.demand(lost <= MAX_LOSS, f"{lost:.2f} s lost; expected at most {MAX_LOSS} s")
     system.start("recorder")
-    system.wait_for("the new bag to be there", (system.bag / "metadata.yaml").exists, START_TIMEOUT)
+    _wait_for_states_in_bag(system)
     return outcome
 
 

@@ -236,7 +236,7 @@ def _parser_rows(minutes: float, seed: int) -> Iterator[Row]:
 def _try(system: LiveSystem, fault: Fault, generator: random.Random) -> Outcome:
     try:
         return try_fault(system, fault, generator)
-    except FaultError as error:
+    except PendulumError as error:
         return Outcome(survived=False, detail=str(error))
 
 
