@@ -9,7 +9,6 @@ import signal
 import time
 from collections.abc import Callable, Iterator
 
-import numpy as np
 from builtin_interfaces.msg import Time
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Header
@@ -95,14 +94,17 @@ def _end_recorder(number: int) -> Callable[[LiveSystem, random.Random], Outcome]
     """Ask the recorder to end: everything that it heard must be in its bag."""
 
     def act(system: LiveSystem, generator: random.Random) -> Outcome:
+        began = len(system.applied)
         system.listen(generator.uniform(0.5, 1.5))
         bag, child = system.bag, system.children["recorder"]
         system.kill("recorder", number)
         outcome = Outcome(lost=0.0)
         code, words = child.process.returncode, child.last_words(1)
         outcome.demand(code == 0 and "nothing lost" in words, f"the recorder ended with code {code}: {words}")
-        stamps = np.sort(read_bag(bag)["/sim/applied_effort"]["stamp_ns"])
-        outcome.demand(bool(np.all(np.diff(stamps) < 100_000_000)), "a hole in the bag")
+        kept = set(read_bag(bag)["/sim/applied_effort"]["stamp_ns"].tolist())
+        # Beside what the probe heard, for the plant itself may have been held up.
+        missing = {applied.stamp_ns for applied in system.applied[began:] if applied.stamp_ns <= max(kept)} - kept
+        outcome.demand(not missing, f"{len(missing)} torques that the probe heard are not in the bag")
         system.start("recorder")
         _wait_for_states_in_bag(system)
         return outcome
