@@ -29,7 +29,7 @@ __all__ = ["RESOURCE_TRIALS", "recorder_cannot_begin", "recorder_runs_out_of_mem
 _TOPIC = "/sim/joint_states"
 _NOISE_TOPIC = "/sim/noise"
 _TIMEOUT = 60.0
-_SHORT_OF_MEMORY = ("memory is exhausted", "bad_alloc", "Resource temporarily unavailable")
+_SHORT_OF_MEMORY = ("memory is exhausted", "is limited to", "bad_alloc", "Resource temporarily unavailable")
 """What a program says that is short of memory: ours, the C++ library, the middleware that ends its process."""
 _ENOUGH = 100
 """States in a bag before the fault comes."""

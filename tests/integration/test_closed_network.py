@@ -33,8 +33,17 @@ def test_a_network_that_nobody_opened_is_closed(asked: dict[str, str]) -> None:
     assert Path(added["FASTRTPS_DEFAULT_PROFILES_FILE"]).is_file()
     assert added["ROS_AUTOMATIC_DISCOVERY_RANGE"] == "SYSTEM_DEFAULT"
     assert added.get("ROS_LOCALHOST_ONLY", "0") == "0"
-    # A program that we start has both in its environment, and stays as it is.
-    assert middleware_defaults({**asked, **added}, _FAST) == {"ROS_AUTOMATIC_DISCOVERY_RANGE": "SYSTEM_DEFAULT"}
+    # A program that we start has both in its environment, and stays closed.
+    child = {**asked, **added}
+    assert child == {**child, **middleware_defaults(child, _FAST)}
+    # Unless it is told to open itself.
+    opened = middleware_defaults({**child, "ROS_AUTOMATIC_DISCOVERY_RANGE": "SUBNET"}, _FAST)
+    assert opened["ROS_AUTOMATIC_DISCOVERY_RANGE"] == "SUBNET"
+    assert opened["FASTRTPS_DEFAULT_PROFILES_FILE"] == ""
+    # And what an open one starts can be closed again.
+    closed = middleware_defaults({**child, **opened, "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST"}, _FAST)
+    assert closed.items() <= added.items()
+    assert closed["FASTRTPS_DEFAULT_PROFILES_FILE"]
 
 
 @pytest.mark.parametrize(
@@ -48,7 +57,7 @@ def test_a_network_that_nobody_opened_is_closed(asked: dict[str, str]) -> None:
 def test_what_the_user_asked_for_is_left_alone(asked: dict[str, str], range_: str) -> None:
     added = middleware_defaults(asked, _FAST)
     assert added["ROS_AUTOMATIC_DISCOVERY_RANGE"] == range_
-    assert "FASTRTPS_DEFAULT_PROFILES_FILE" not in added
+    assert not added.get("FASTRTPS_DEFAULT_PROFILES_FILE")
 
 
 def test_other_middleware_gets_no_range_that_would_open_it() -> None:

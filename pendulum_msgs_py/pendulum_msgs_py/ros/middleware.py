@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import resource
 from collections.abc import Mapping
 from pathlib import Path
 
@@ -14,8 +15,11 @@ __all__ = ["check_closed", "middleware_defaults", "set_middleware_defaults"]
 
 _RANGE = "ROS_AUTOMATIC_DISCOVERY_RANGE"
 _PROFILES = "FASTRTPS_DEFAULT_PROFILES_FILE"
-_TRANSPORT_SETTINGS = ("FASTDDS_BUILTIN_TRANSPORTS", "FASTDDS_DEFAULT_PROFILES_FILE", _PROFILES)
+_TRANSPORTS = "FASTDDS_BUILTIN_TRANSPORTS"
+_SETTINGS = (_TRANSPORTS, "FASTDDS_DEFAULT_PROFILES_FILE", _PROFILES)
 _LOOPBACK = Path(__file__).with_name("loopback.xml")
+_LEAST_MEMORY = 1 << 30
+"""Address space in which Fast DDS starts its threads; with less, it ends the process in ways of its own [bytes]."""
 _PORTS_OF_DOMAIN = 250
 _FIRST_PORT = 7400
 
@@ -24,12 +28,25 @@ def set_middleware_defaults() -> None:
     """Stay on this host, and pass messages through sockets; to be called before ``rclpy.init``.
 
     A plant that the whole subnet may command is a decision, not a default.
+
+    Raises:
+        FaultError: The profile is not where it was installed, or the memory of this process is limited too much.
     """
-    os.environ.update(middleware_defaults(os.environ, get_rmw_implementation_identifier()))
+    limit, _ = resource.getrlimit(resource.RLIMIT_AS)
+    if limit != resource.RLIM_INFINITY and limit < _LEAST_MEMORY:
+        raise FaultError(
+            f"the memory of this process is limited to {limit >> 20} MB (ulimit -v); expected at least "
+            f"{_LEAST_MEMORY >> 20} MB, which the middleware reserves for its threads"
+        )
+    for name, value in middleware_defaults(os.environ, get_rmw_implementation_identifier()).items():
+        if value:
+            os.environ[name] = value
+        else:
+            os.environ.pop(name, None)
 
 
 def middleware_defaults(environment: Mapping[str, str], middleware: str) -> dict[str, str]:
-    """Return the variables to add to an environment.
+    """Return the variables to set in an environment, and with an empty value those to take out of it.
 
     The range ``LOCALHOST`` keeps a program of Jazzy from calling out, but its sockets listen on every interface:
     whoever names this host as a static peer is let in. Where nothing was opened, a profile binds Fast DDS to the
@@ -41,23 +58,27 @@ def middleware_defaults(environment: Mapping[str, str], middleware: str) -> dict
     take as long.
 
     Args:
-        environment: What the user has set.
+        environment: What the user has set, or a program of ours that starts others.
         middleware: Identifier of the RMW implementation.
 
     Raises:
         FaultError: The profile is not where it was installed.
     """
     asked = environment.get(_RANGE) or "LOCALHOST"
-    if not middleware.startswith("rmw_fastrtps") or any(environment.get(name) for name in _TRANSPORT_SETTINGS):
+    ours = {_PROFILES: str(_LOOPBACK), _TRANSPORTS: "UDPv4"}
+    if asked == "SYSTEM_DEFAULT" and environment.get(_PROFILES) == ours[_PROFILES]:
+        asked = "LOCALHOST"
+    own_settings = [name for name in _SETTINGS if environment.get(name) not in {None, "", ours.get(name)}]
+    if not middleware.startswith("rmw_fastrtps") or own_settings:
         return {_RANGE: asked}
     if asked != "LOCALHOST" or environment.get("ROS_STATIC_PEERS"):
-        return {_RANGE: asked, "FASTDDS_BUILTIN_TRANSPORTS": "UDPv4"}
+        return {_RANGE: asked, _TRANSPORTS: ours[_TRANSPORTS], _PROFILES: ""}
     if not _LOOPBACK.is_file():
         # Without it Fast DDS would listen to the whole subnet.
         raise FaultError(f"{_LOOPBACK} is missing; expected it where pendulum_msgs_py is installed")
     # SYSTEM_DEFAULT leaves the network to the profile; the older variable of ROS would overrule it.
     older = {"ROS_LOCALHOST_ONLY": "0"} if environment.get("ROS_LOCALHOST_ONLY") == "1" else {}
-    return {_RANGE: "SYSTEM_DEFAULT", _PROFILES: str(_LOOPBACK), **older}
+    return {_RANGE: "SYSTEM_DEFAULT", _PROFILES: ours[_PROFILES], **older}
 
 
 def check_closed(domain: int) -> None:
