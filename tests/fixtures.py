@@ -63,10 +63,17 @@ def shared_data() -> Path:
 @pytest.fixture
 def domain_id(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iterator[int]:
     """Reserve a ROS domain on this machine for this test, and put it into the environment."""
+    # Imported late: most tests know nothing of ROS.
+    from rclpy.utilities import get_rmw_implementation_identifier
+
+    from pendulum_msgs_py.ros.middleware import middleware_defaults
+
     monkeypatch.delenv("ROS_DOMAIN_ID", raising=False)
     with reserve_domain() as domain:
         monkeypatch.setenv("ROS_DOMAIN_ID", str(domain))
-        monkeypatch.setenv("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
+        # Fast DDS reads its profile once in a process: tests that join the graph themselves do so as our programs do.
+        for name, value in middleware_defaults({}, get_rmw_implementation_identifier()).items():
+            monkeypatch.setenv(name, value)
         monkeypatch.setenv("ROS_LOG_DIR", str(tmp_path / "ros_log"))
         yield domain
 

@@ -194,10 +194,14 @@ class Recorder(PollingNode):
                     continue
                 time_ns = stamp
             items.append((time_ns, data))
+        unheard = tap.unheard()
         if session is None:
             self._unstamped.clear()
-        elif items or missing:
+            return
+        if items or missing:
             self._offer(tap, session, items, missing)
+        if unheard:
+            self._tell_early(tap, session, unheard)
 
     def _offer(
         self, tap: Tap, session: RecordingSession, items: Sequence[tuple[int, bytes]], missing: int = 0
@@ -206,11 +210,7 @@ class Recorder(PollingNode):
             session.add_topic(tap.topic, tap.type, tap.qos)
             tap.announced = session
         if missing and tap.is_settling:
-            session.note_early(tap.topic, missing)
-            self.get_logger().warning(
-                f"{missing} messages of {tap.topic} are not recorded: they were published before the subscription was "
-                "complete"
-            )
+            self._tell_early(tap, session, missing)
             missing = 0
         refused = session.offer(tap.topic, items)
         if missing:
@@ -221,6 +221,13 @@ class Recorder(PollingNode):
                 f"LOST {missing + refused} messages of {tap.topic} ({missing} by the middleware, {refused} because "
                 f"{why})"
             )
+
+    def _tell_early(self, tap: Tap, session: RecordingSession, count: int) -> None:
+        session.note_early(tap.topic, count)
+        self.get_logger().warning(
+            f"{count} messages of {tap.topic} are not recorded: they were published before the subscription was "
+            "complete"
+        )
 
     def _stamp(self, tap: Tap, data: bytes) -> int | None:
         """Return the log time by header; messages without a stamp go where the stamped ones are.

@@ -71,7 +71,8 @@ class Tap:
             reliability=ReliabilityPolicy.RELIABLE if self.reliable else ReliabilityPolicy.BEST_EFFORT,
             durability=DurabilityPolicy.TRANSIENT_LOCAL if self.latched else DurabilityPolicy.VOLATILE,
         )
-        self._opened = time.monotonic()
+        self._opened = self._first_opened = time.monotonic()
+        self._told_unmet = 0
         self.source = node.create_polled_input(_message_class(name), topic, profile)
         # Taken when it is asked for, not delivered by the executor: it must be as new as the messages.
         handle = self.source.subscription.handle
@@ -98,6 +99,15 @@ class Tap:
         for data, info in self.source.messages():
             sequence = info["publication_sequence_number"]
             yield info["received_timestamp"], trim(data), see(sequence) if sequence else 0
+
+    def unheard(self) -> int:
+        """Return how many messages were sent by publishers that came later before the first that was heard of them.
+
+        Those since the last call; of publishers that were there before the subscription nobody expects the beginning.
+        """
+        late = self._gaps.unmet - self._told_unmet
+        self._told_unmet = self._gaps.unmet
+        return late if time.monotonic() - self._first_opened > SETTLING else 0
 
     def close(self) -> None:
         """Let go of the middleware before the source is destroyed."""

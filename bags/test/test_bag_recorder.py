@@ -76,6 +76,7 @@ def test_a_publisher_that_starts_again_leaves_no_gap() -> None:
     assert [counter.see(number) for number in (1, 2, 3)] == [0, 0, 0]
     met[0] = 2
     assert [counter.see(number) for number in (1, 2, 3, 4)] == [0, 0, 0, 0]
+    assert counter.unmet == 0
 
 
 def test_a_publisher_that_is_met_late_leaves_no_gap() -> None:
@@ -88,12 +89,14 @@ def test_a_publisher_that_is_met_late_leaves_no_gap() -> None:
         assert counter.see(14 + number) == 0
         assert counter.see(10 + number) == 0
     assert counter.missing == 0
+    assert counter.unmet == 2 + 13  # what each had said before
 
 
 def test_a_publisher_that_is_met_late_in_the_place_of_one_that_left_leaves_no_gap() -> None:
     counter = GapCounter(lambda: (2, 1))
     assert sum(counter.see(number) for number in range(3, 10)) == 0
     assert sum(counter.see(number) for number in range(14, 500)) == 0
+    assert counter.unmet == 2 + 13
 
 
 def test_a_publisher_that_is_silent_hides_no_gap_of_another() -> None:
@@ -102,6 +105,7 @@ def test_a_publisher_that_is_silent_hides_no_gap_of_another() -> None:
     assert sum(counter.see(number) for number in range(14, 500)) == 4
     assert sum(counter.see(number) for number in range(502, 900)) == 2
     assert counter.missing == 6
+    assert counter.unmet == 2
 
 
 def test_stamps_are_read_from_headers_times_and_events() -> None:

@@ -25,7 +25,7 @@ def python(code: str) -> list[str]:
 def test_a_domain_is_reserved_for_as_long_as_the_test_runs(domain_id: int, tmp_path: Path) -> None:
     assert 1 <= domain_id <= 100
     assert os.environ["ROS_DOMAIN_ID"] == str(domain_id)
-    assert os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] == "LOCALHOST"
+    assert Path(os.environ["FASTRTPS_DEFAULT_PROFILES_FILE"]).name == "loopback.xml"
     inner = tmp_path / "test_inner.py"
     inner.write_text("def test_prints_its_domain(domain_id):\n    print(f'domain={domain_id}')\n")
     command = [

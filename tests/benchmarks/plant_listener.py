@@ -15,6 +15,7 @@ from rclpy.executors import SingleThreadedExecutor
 from std_srvs.srv import SetBool
 
 from pendulum_msgs_py import names
+from pendulum_msgs_py.ros.middleware import set_middleware_defaults
 
 __all__ = ["PlantListener", "cpu_time", "domain_environment"]
 
@@ -33,6 +34,7 @@ class PlantListener:
     """
 
     def __init__(self, domain: int, *plants: str) -> None:
+        set_middleware_defaults()
         self._context = rclpy.Context()
         rclpy.init(context=self._context, domain_id=domain)
         self._node = rclpy.create_node("bench_listener", context=self._context)

@@ -95,7 +95,11 @@ def test_a_network_that_was_opened_is_open(simulator: RunningProgram) -> None:
     assert "0.0.0.0" in _listening(simulator)
 
 
-def test_a_profile_that_is_not_heeded_ends_the_program(domain_id: int, tmp_path: Path) -> None:
+def test_a_profile_that_is_not_heeded_ends_the_program(
+    domain_id: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for name in _ROS_VARIABLES:
+        monkeypatch.delenv(name, raising=False)
     everywhere = tmp_path / "loopback.xml"
     lines = Path(middleware.__file__).with_name("loopback.xml").read_text().splitlines()
     everywhere.write_text("\n".join(line for line in lines if "interfaceWhiteList" not in line))

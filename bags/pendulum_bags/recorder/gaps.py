@@ -10,6 +10,7 @@ _LARGEST_GAP = 1_000_000  # beyond this a number is taken for that of another pu
 _MOST_STREAMS = 64
 _PATIENCE = 200
 """Messages of a topic after which a publisher that did not go on is taken for one that never paused."""
+_NO_DOUBT = [0, 0, 0]
 
 
 class GapCounter:
@@ -23,17 +24,22 @@ class GapCounter:
 
     Args:
         matched: Returns how many publishers have been met since the beginning, and how many are there now.
+
+    Attributes:
+        missing: Samples that are missing between others of their publisher.
+        unmet: Samples that publishers had sent before the first that was heard of them.
     """
 
     def __init__(self, matched: Callable[[], tuple[int, int]]) -> None:
         self.missing = 0
+        self.unmet = 0
         self._matched = matched
         self._last: list[int] = []
         self._heard = 0
         self._departed = 0
         self._doubts: dict[
             int, list[int]
-        ] = {}  # last number of a publisher -> [gap behind it, samples to wait]
+        ] = {}  # last number of a publisher -> [gap behind it, samples to wait, samples before it if it is another's]
 
     def see(self, sequence: int) -> int:
         """Take note of a sample, by its number at its publisher, and return how many are found to be missing."""
@@ -51,13 +57,16 @@ class GapCounter:
 
     def _see_jump(self, sequence: int) -> int:
         total, _ = self._matched()
+        before = sequence - 1
         lower = max((number for number in self._last if number < sequence), default=0)
         gap = sequence - lower - 1
         if sequence == 1 or not lower or gap > _LARGEST_GAP or self._heard < total:
             if self._heard < total:
                 self._heard += 1
                 if lower and sequence > 1 and gap <= _LARGEST_GAP:
-                    self._doubts[lower] = [gap, _PATIENCE]
+                    self._doubts[lower] = [gap, _PATIENCE, before]
+                else:
+                    self.unmet += before
             self._last.insert(0, sequence)
             del self._last[_MOST_STREAMS:]
             return 0
@@ -69,7 +78,7 @@ class GapCounter:
 
     def _judge_doubts(self, continued: int) -> int:
         """Drop the doubt about a publisher that goes on; return the gaps of those that have been silent for long."""
-        self._doubts.pop(continued, None)
+        self.unmet += self._doubts.pop(continued, _NO_DOUBT)[2]
         found = 0
         for number, doubt in list(self._doubts.items()):
             doubt[1] -= 1
@@ -79,6 +88,7 @@ class GapCounter:
             total, now = self._matched()
             if total - now > self._departed:
                 self._departed += 1  # it has left: nothing of it can be missing
+                self.unmet += doubt[2]
                 continue
             if number in self._last:
                 self._last.remove(number)
