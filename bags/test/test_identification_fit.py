@@ -146,6 +146,26 @@ def test_the_plant_file_carries_intervals_and_provenance(found, tmp_path):
     assert load_fit_model(tmp_path / "plant.json").vector == pytest.approx(found.model.vector)
 
 
+@pytest.mark.parametrize(
+    ("key", "value", "message"),
+    [
+        ("parameters", [1.0], "expected numbers by name"),
+        ("parameters", {"inertia": None}, "'inertia' is None; expected a finite number"),
+        ("parameters", {"inertia": 10**400}, "expected a finite number"),
+        ("parameters", {"inertia": 1.0, "mass": 1.0}, "has no parameter 'mass'"),
+        ("duty_gain", "1", "'duty_gain' is 1; expected a finite number"),
+        ("friction", [], "expected one of viscous"),
+        ("input_kind", "force", "'input_kind' is 'force'; expected one of effort"),
+    ],
+)
+def test_a_spoilt_identification_is_refused_by_the_entry(found, tmp_path, key, value, message):
+    found.write(tmp_path / "plant.yaml")
+    path = tmp_path / "plant.json"
+    path.write_text(json.dumps({**json.loads(path.read_text()), key: value}))
+    with pytest.raises(DataError, match=message):
+        load_fit_model(path)
+
+
 def test_the_same_data_give_the_same_result(found):
     options = Options(friction="coulomb", multi_start=False)
     first = identify([run()], options, profiles=0).model.vector

@@ -14,9 +14,15 @@ from typing import Any
 import numpy as np
 from threadpoolctl import threadpool_limits
 
-from pendulum_bags.datasets import Recording
+from pendulum_bags.datasets import INPUT_KINDS, Recording
 from pendulum_bags.identification.geometry import GeometryCheck, check_geometry
-from pendulum_bags.identification.model import PLANT_FRICTION_MODELS, UNITS, FitModel, to_plant
+from pendulum_bags.identification.model import (
+    FRICTION_MODELS,
+    PLANT_FRICTION_MODELS,
+    UNITS,
+    FitModel,
+    to_plant,
+)
 from pendulum_bags.identification.options import DEFAULTS, Options
 from pendulum_bags.identification.output_error import OutputErrorFit, fit_output_error
 from pendulum_bags.identification.residual_tests import ResidualTests, residual_tests
@@ -276,6 +282,9 @@ def identify(
     return IdentificationResult(fit, uncertainty, tests, geometry, scores, created)
 
 
+_LARGEST_VALUE = 1e300
+
+
 def load_fit_model(path: str | Path) -> FitModel:
     """Return the fit model from the JSON that :meth:`IdentificationResult.write` left beside the plant file."""
     source = Path(path)
@@ -288,6 +297,15 @@ def load_fit_model(path: str | Path) -> FitModel:
     for key in ("parameters", "input_kind", "friction", "duty_gain"):
         if key not in content:
             raise DataError(f"{source} has no {key!r}; expected the identification as it was written")
+    values = content["parameters"]
+    if not isinstance(values, dict):
+        raise DataError(f"{source}: 'parameters' is {values!r}; expected numbers by name")
+    for name, value in {**values, "duty_gain": content["duty_gain"]}.items():
+        if isinstance(value, bool) or not isinstance(value, int | float) or not abs(value) <= _LARGEST_VALUE:
+            raise DataError(f"{source}: {name!r} is {str(value)[:40]}; expected a finite number")
+    for key, known in (("input_kind", INPUT_KINDS), ("friction", FRICTION_MODELS)):
+        if not isinstance(content[key], str) or content[key] not in known:
+            raise DataError(f"{source}: {key!r} is {content[key]!r}; expected one of {', '.join(known)}")
     return FitModel(content["parameters"], content["input_kind"], content["friction"], content["duty_gain"])
 
 
