@@ -5,9 +5,6 @@ from __future__ import annotations
 import re
 from pathlib import Path
 
-import pytest
-
-pytest.importorskip("rclpy")
 from pendulum_hw_bridge.actuator import FEEDBACK_QUANTITIES
 from pendulum_hw_bridge.bridge_node import SPECS
 from pendulum_hw_bridge.safety import FAULTS

@@ -7,24 +7,19 @@ import time
 from collections.abc import Iterator
 
 import pytest
+from diagnostic_msgs.msg import DiagnosticArray
+from lifecycle_msgs.msg import Transition
+from lifecycle_msgs.srv import ChangeState
+from rcl_interfaces.srv import SetParameters
+from rclpy.parameter import Parameter
+from sensor_msgs.msg import JointState
+from std_msgs.msg import Float64MultiArray, String
+from std_srvs.srv import Trigger
 
 from pendulum_lqr.disturbance import make_disturbance
 from pendulum_msgs_py.cdr import decode_joint_state, encode_joint_state
-
-rclpy = pytest.importorskip("rclpy")
-
-from diagnostic_msgs.msg import DiagnosticArray  # noqa: E402
-from lifecycle_msgs.msg import Transition  # noqa: E402
-from lifecycle_msgs.srv import ChangeState  # noqa: E402
-from rcl_interfaces.srv import SetParameters  # noqa: E402
-from rclpy.experimental import EventsExecutor  # noqa: E402
-from rclpy.parameter import Parameter  # noqa: E402
-from rclpy.task import Future  # noqa: E402
-from sensor_msgs.msg import JointState  # noqa: E402
-from std_msgs.msg import Float64MultiArray, String  # noqa: E402
-from std_srvs.srv import Trigger  # noqa: E402
-
-from pendulum_msgs_py.ros import qos  # noqa: E402
+from pendulum_msgs_py.ros import qos
+from tests.graph_peer import GraphPeer
 
 STATE = {"position": math.pi + 0.1, "velocity": 0.2, "effort": 0.0}
 # A busy machine delivers states late; how old is too old is judged by tests that need no middleware.
@@ -32,15 +27,11 @@ PATIENT = "state_timeout:=2.0"
 ANSWER = -(33.345265 * 0.1 + 0.158993 * 0.2)
 
 
-class FakePlant:
+class FakePlant(GraphPeer):
     """Publishes states and keeps what comes back."""
 
     def __init__(self) -> None:
-        self.context = rclpy.Context()
-        self.context.init()
-        self.node = rclpy.create_node("plant", namespace="/sim", context=self.context)
-        self.executor = EventsExecutor(context=self.context)
-        self.executor.add_node(self.node)
+        super().__init__("plant", namespace="/sim")
         self.states = self.node.create_publisher(JointState, "joint_states", qos.STATE)
         self.commands: list = []
         self.disturbances: list = []
@@ -63,16 +54,6 @@ class FakePlant:
             values = {pair.key: pair.value for pair in status.values}
             self.diagnostics[status.name] = {"message": status.message, "level": status.level, **values}
 
-    def spin(self, seconds: float) -> None:
-        self.executor.spin_until_future_complete(Future(executor=self.executor), seconds)
-
-    def wait(self, predicate, what: str, timeout: float = 30.0):
-        end = time.monotonic() + timeout
-        while not (value := predicate()):
-            assert time.monotonic() < end, f"waited {timeout} s for {what}"
-            self.spin(0.02)
-        return value
-
     def publish(self, stamp_ns: int | None = None, **state: float) -> int:
         stamp = time.time_ns() if stamp_ns is None else stamp_ns
         self.states.publish(encode_joint_state(stamp, **(STATE | state)))
@@ -87,25 +68,13 @@ class FakePlant:
         return stamps
 
     def connect(self, nodes: int = 1) -> None:
-        self.wait(lambda: self.states.get_subscription_count() >= nodes, "subscriptions")
-
-    def call(self, kind, name: str, request):
-        client = self.node.create_client(kind, name)
-        self.wait(client.service_is_ready, f"service {name}")
-        future = client.call_async(request)
-        self.wait(future.done, f"answer of {name}")
-        return future.result()
+        self.until(lambda: self.states.get_subscription_count() >= nodes, "subscriptions")
 
     def set_parameters(self, node: str, **values):
         request = SetParameters.Request(
             parameters=[Parameter(name, value=value).to_parameter_msg() for name, value in values.items()]
         )
         return self.call(SetParameters, f"{node}/set_parameters", request).results[0]
-
-    def close(self) -> None:
-        self.executor.shutdown()
-        self.node.destroy_node()
-        self.context.try_shutdown()
 
 
 @pytest.fixture
@@ -125,7 +94,7 @@ def ros(*parameters: str) -> list[str]:
 def test_the_controller_answers_each_state_once_by_its_stamp_and_ends_with_zero(plant, processes):
     program = processes.start("pendulum_lqr", "controller", *ros(PATIENT))
     program.wait_for_output(r"lqr for plant thesis: K = \[33\.345265, 0\.158993\]", 30)
-    plant.wait(lambda: plant.publish() and plant.commands, "the first answer")
+    plant.until(lambda: plant.publish() and plant.commands, "the first answer")
     plant.spin(0.5)
     plant.commands.clear()
     stamps = plant.run(60, period=0.01)
@@ -144,7 +113,7 @@ def test_the_controller_answers_each_state_once_by_its_stamp_and_ends_with_zero(
         plant.publish(**state)
         plant.spin(0.3)
     assert len(plant.commands) == count
-    told = plant.wait(
+    told = plant.until(
         lambda: (
             (d := plant.diagnostics.get("/sim/controller: controller", {})).get("refused.not_finite") and d
         ),
@@ -164,7 +133,7 @@ def test_the_controller_answers_each_state_once_by_its_stamp_and_ends_with_zero(
     assert not plant.set_parameters("controller", plant="dfki").successful
     program.send_signal(signal.SIGTERM)
     assert program.wait(15) == 0
-    plant.wait(lambda: plant.commands[-1].effort == 0.0, "the last zero")
+    plant.until(lambda: plant.commands[-1].effort == 0.0, "the last zero")
     assert plant.commands[-1].stamp_ns > plant.commands[-2].stamp_ns
 
 
@@ -203,17 +172,17 @@ def test_a_manager_can_hold_the_controller_and_deactivation_sends_zero(plant, pr
 def test_multi_array_speaks_to_an_effort_controller_of_ros2_control(plant, processes):
     program = processes.start("pendulum_lqr", "controller", *ros("command_type:=multi_array", PATIENT))
     plant.connect()
-    plant.wait(lambda: plant.publish() and plant.arrays, "commands")
+    plant.until(lambda: plant.publish() and plant.arrays, "commands")
     assert plant.arrays[-1] == pytest.approx(ANSWER, abs=1e-5)
     assert not plant.commands
     program.send_signal(signal.SIGINT)
     assert program.wait(15) == 0
-    plant.wait(lambda: plant.arrays[-1] == 0.0, "the last zero")
+    plant.until(lambda: plant.arrays[-1] == 0.0, "the last zero")
 
 
 def test_the_disturbance_follows_seed_and_stamp_between_start_and_end(plant, processes):
     program = processes.start("pendulum_lqr", "disturbance", *ros("seed:=7", "duration:=0.2"))
-    plant.wait(lambda: plant.publish() and plant.disturbances, "the first answer")
+    plant.until(lambda: plant.publish() and plant.disturbances, "the first answer")
     plant.run(20, period=0.01)
     assert all(answer.effort == 0.0 for answer in plant.disturbances)
     assert plant.call(Trigger, "disturbance/start", Trigger.Request()).success
@@ -223,7 +192,7 @@ def test_the_disturbance_follows_seed_and_stamp_between_start_and_end(plant, pro
     assert "is running; expected ~/stop before a change" in running.reason
     count = len(plant.disturbances)
     plant.run(60, period=0.01)
-    plant.wait(lambda: len(plant.events) >= 2, "both events")
+    plant.until(lambda: len(plant.events) >= 2, "both events")
     begin, end = plant.events
     assert (begin["name"], end["name"]) == ("noise_start", "noise_end")
     assert begin["disturbance"]["seed"] == 7
@@ -243,11 +212,11 @@ def test_the_disturbance_follows_seed_and_stamp_between_start_and_end(plant, pro
 def test_a_stopped_process_ends_a_running_disturbance_with_zero(plant, processes):
     program = processes.start("pendulum_lqr", "disturbance", *ros("kind:=step", "autostart:=true"))
     plant.connect()
-    plant.wait(lambda: plant.publish() and any(a.effort == 2.5 for a in plant.disturbances), "the step")
+    plant.until(lambda: plant.publish() and any(a.effort == 2.5 for a in plant.disturbances), "the step")
     program.send_signal(signal.SIGTERM)
     assert program.wait(15) == 0
-    plant.wait(lambda: plant.disturbances[-1].effort == 0.0, "the last zero")
-    assert plant.wait(lambda: [e for e in plant.events if e["name"] == "noise_end"], "the event")
+    plant.until(lambda: plant.disturbances[-1].effort == 0.0, "the last zero")
+    assert plant.until(lambda: [e for e in plant.events if e["name"] == "noise_end"], "the event")
 
 
 @pytest.mark.parametrize(

@@ -7,7 +7,6 @@ from pathlib import Path
 
 import pytest
 
-pytest.importorskip("rclpy")
 from pendulum_msgs_py.parameters import markdown_table
 from pendulum_sim import simulator_node, viewer_node
 

@@ -11,29 +11,23 @@ from itertools import pairwise
 from pathlib import Path
 
 import pytest
+from diagnostic_msgs.msg import DiagnosticArray
+from sensor_msgs.msg import JointState
+from std_srvs.srv import SetBool, Trigger
 
-rclpy = pytest.importorskip("rclpy")
-from diagnostic_msgs.msg import DiagnosticArray  # noqa: E402
-from rclpy.executors import SingleThreadedExecutor  # noqa: E402
-from sensor_msgs.msg import JointState  # noqa: E402
-from std_srvs.srv import SetBool, Trigger  # noqa: E402
-
-from pendulum_msgs_py import names  # noqa: E402
-from pendulum_msgs_py.plant_parameters import load_plant  # noqa: E402
-from pendulum_msgs_py.ros import qos  # noqa: E402
-from pendulum_msgs_py.ros.convert import stamp_from_message  # noqa: E402
-from pendulum_sim.plant import RigidPlant  # noqa: E402
+from pendulum_msgs_py import names
+from pendulum_msgs_py.plant_parameters import load_plant
+from pendulum_msgs_py.ros import qos
+from pendulum_msgs_py.ros.convert import stamp_from_message
+from pendulum_sim.plant import RigidPlant
+from tests.graph_peer import GraphPeer
 
 
-class Peer:
+class Peer(GraphPeer):
     """Controller, listener and client of one simulator, in this process."""
 
     def __init__(self) -> None:
-        self.context = rclpy.Context()
-        rclpy.init(context=self.context)
-        self.node = rclpy.create_node("peer", context=self.context)
-        self.executor = SingleThreadedExecutor(context=self.context)
-        self.executor.add_node(self.node)
+        super().__init__("peer")
         self.states: list[JointState] = []
         self.applied: list[JointState] = []
         self.diagnostics: dict[str, str] = {}
@@ -56,24 +50,9 @@ class Peer:
         for status in message.status:
             self.diagnostics = {pair.key: pair.value for pair in status.values}
 
-    def until(self, predicate: Callable[[], object], what: str, timeout: float = 30.0) -> None:
-        deadline = time.monotonic() + timeout
-        while not predicate():
-            assert time.monotonic() < deadline, f"waited {timeout} s for {what}"
-            self.executor.spin_once(timeout_sec=0.1)
-
-    def call(self, service: str, request: object = None) -> object:
+    def ask(self, service: str, request: object = None) -> object:
         kind = SetBool if isinstance(request, SetBool.Request) else Trigger
-        client = self.node.create_client(kind, f"simulator/{service}")
-        assert client.wait_for_service(30.0)
-        future = client.call_async(request or Trigger.Request())
-        self.until(future.done, service)
-        return future.result()
-
-    def close(self) -> None:
-        self.executor.shutdown()
-        self.node.destroy_node()
-        rclpy.shutdown(context=self.context)
+        return self.call(kind, f"simulator/{service}", request or Trigger.Request())
 
 
 @pytest.fixture
@@ -91,18 +70,18 @@ def _start(processes, *parameters: str):
 def test_pause_step_reset_and_set_state(peer: Peer, processes) -> None:
     program = _start(processes, "rate_hz:=100.0", "initial_theta:=2.0", "method:=rk4", "start:=given")
     peer.until(lambda: len(peer.states) > 5, "states")
-    assert peer.call("pause", SetBool.Request(data=True)).success
+    assert peer.ask("pause", SetBool.Request(data=True)).success
     peer.executor.spin_once(timeout_sec=0.2)
     count = len(peer.states)
-    assert peer.call("step").success
+    assert peer.ask("step").success
     peer.until(lambda: len(peer.states) > count, "the state of a single step")
 
-    assert peer.call("reset").message == "theta 2.000000 rad, theta_dot 0.000000 rad/s"
+    assert peer.ask("reset").message == "theta 2.000000 rad, theta_dot 0.000000 rad/s"
     twin = RigidPlant(load_plant("thesis"), 0.01, method="rk4")
     twin.reset(2.0)
     for _ in range(3):
         count = len(peer.states)
-        peer.call("step")
+        peer.ask("step")
         peer.until(lambda count=count: len(peer.states) > count, "the state of a single step")
         expected = twin.step(0.0)
         assert (peer.states[-1].position[0], peer.states[-1].velocity[0]) == (
@@ -112,11 +91,11 @@ def test_pause_step_reset_and_set_state(peer: Peer, processes) -> None:
 
     peer.set_state.publish(JointState(name=[names.JOINT], position=[0.5], velocity=[0.1]))
     peer.until(
-        lambda: (peer.call("step"), peer.states)[1] and abs(peer.states[-1].position[0] - 0.5) < 0.05,
+        lambda: (peer.ask("step"), peer.states)[1] and abs(peer.states[-1].position[0] - 0.5) < 0.05,
         "the state set",
     )
-    assert peer.call("pause", SetBool.Request(data=False)).success
-    assert not peer.call("step").success
+    assert peer.ask("pause", SetBool.Request(data=False)).success
+    assert not peer.ask("step").success
     program.send_signal(signal.SIGINT)
     assert program.wait(10.0) == 0
 

@@ -75,12 +75,12 @@ def loop_figures(rate: float, duration: float) -> BridgeLoopFigures:
             listener.wait_for_loops()
             processes = [psutil.Process(program.pid) for program in programs]
             _give_priority(processes)
-            listener.listen(_WARM_UP)
+            listener.spin(_WARM_UP)
             said.clear()
-            listener.listen(1.0)
+            listener.spin(1.0)
             first, wall, busy = said[-1], time.monotonic(), cpu_time(processes)
             said.clear()
-            listener.listen(duration)
+            listener.spin(duration)
             cpu = 100.0 * (cpu_time(processes) - busy) / (time.monotonic() - wall)
             last = said[-1]
             cycles = int(last["cycles"]) - int(first["cycles"])

@@ -98,7 +98,7 @@ def looks(duration: float, ways: Sequence[str] = ("nobody", "console", "reader",
                         count = stack.enter_context(_Reader(address)).count
                     elif way == "browser":
                         count, processes["browser"] = stack.enter_context(_browser(address))
-                    loops.listen(_WARM_UP)
+                    loops.spin(_WARM_UP)
                     yield _measure(way, duration, loops, processes, count)
         finally:
             loops.close()
@@ -115,7 +115,7 @@ def _measure(
     loops.clear()
     before = {name: cpu_time(group) for name, group in processes.items()}
     seen, wall = count(), time.monotonic()
-    loops.listen(duration)
+    loops.spin(duration)
     elapsed = time.monotonic() - wall
     cpu = {name: 100.0 * (cpu_time(group) - before[name]) / elapsed for name, group in processes.items()}
 

@@ -72,11 +72,11 @@ def realtime_figures(
             for process in processes:
                 if cores is not None:
                     _pin(process, cores)
-            listener.listen(_WARM_UP)
+            listener.spin(_WARM_UP)
             memory = processes[0].memory_info().rss
             said.clear()
             busy, wall = cpu_time(processes), time.monotonic()
-            listener.listen(duration)
+            listener.spin(duration)
             elapsed = time.monotonic() - wall
             cpu = 100.0 * (cpu_time(processes) - busy) / elapsed
             after = said[-1]
@@ -144,18 +144,18 @@ def lockstep_speed(duration: float, *, rate: float = 500.0) -> float:
                 lockstep_subscribers=2,
             )
             _start(group, domain, plant)
-            listener.wait_until(
+            listener.until(
                 lambda: bool(said) and int(said[-1].get("lockstep_steps", 0)) > 200, "the start of the lockstep run"
             )
             said.clear()
-            listener.listen(1.0)
+            listener.spin(1.0)
             first, start = int(said[-1]["lockstep_steps"]), time.monotonic()
             end = start + duration / 3.0
             while time.monotonic() < end:
-                listener.listen(0.5)
+                listener.spin(0.5)
             count = len(said)
             while len(said) == count:
-                listener.listen(0.01)
+                listener.spin(0.01)
             steps = int(said[-1]["lockstep_steps"]) - first
             return steps / rate / (time.monotonic() - start)
         finally:

@@ -5,30 +5,29 @@ from __future__ import annotations
 import signal
 import socket
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 
 import pytest
+from lifecycle_msgs.msg import State, Transition
+from lifecycle_msgs.srv import ChangeState, GetState
+from sensor_msgs.msg import JointState
+from std_srvs.srv import SetBool
 
-rclpy = pytest.importorskip("rclpy")
-from lifecycle_msgs.msg import State, Transition  # noqa: E402
-from lifecycle_msgs.srv import ChangeState, GetState  # noqa: E402
-from rclpy.executors import SingleThreadedExecutor  # noqa: E402
-from sensor_msgs.msg import JointState  # noqa: E402
-from std_srvs.srv import SetBool  # noqa: E402
-
-from pendulum_hw_bridge.actuator import Strategy  # noqa: E402
-from pendulum_hw_bridge.backends.emulator_process import EmulatorProcessBackend  # noqa: E402
-from pendulum_msgs_py.ros import qos  # noqa: E402
-from pendulum_msgs_py.ros.convert import stamp_from_message  # noqa: E402
-from tests.processes import ProcessGroup, RunningProgram  # noqa: E402
+from pendulum_hw_bridge.actuator import Strategy
+from pendulum_hw_bridge.backends.emulator_process import EmulatorProcessBackend
+from pendulum_msgs_py.ros import qos
+from pendulum_msgs_py.ros.convert import stamp_from_message
+from tests.graph_peer import GraphPeer
+from tests.processes import ProcessGroup, RunningProgram
 
 UPRIGHT_ISH = "3.19"
 
 
-class Lab:
+class Lab(GraphPeer):
     """An emulator process, a bridge process, a controller process, and us."""
 
     def __init__(self, processes: ProcessGroup) -> None:
+        super().__init__("observer")
         with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
             probe.bind(("127.0.0.1", 0))
             port = probe.getsockname()[1]
@@ -40,18 +39,10 @@ class Lab:
         self.emulator.wait_for_output("listens on", 60.0)
         self.truth = EmulatorProcessBackend(self.address)
         self.truth.connect()
-        self.context = rclpy.Context()
-        rclpy.init(context=self.context)
-        self.node = rclpy.create_node("observer", context=self.context)
-        self.executor = SingleThreadedExecutor(context=self.context)
-        self.executor.add_node(self.node)
         self.states: list[JointState] = []
         self.full: list[JointState] = []
         self.node.create_subscription(JointState, "joint_states", self.states.append, qos.STATE)
         self.node.create_subscription(JointState, "actuator/feedback", self.full.append, qos.STATE)
-        self.arm_client = self.node.create_client(SetBool, "bridge/arm")
-        self.change_client = self.node.create_client(ChangeState, "bridge/change_state")
-        self.state_client = self.node.create_client(GetState, "bridge/get_state")
 
     def bridge(self, *parameters: str) -> RunningProgram:
         arguments = ["-p", "backend:=emulator_process", "-p", f"emulator_address:='{self.address}'"]
@@ -64,31 +55,19 @@ class Lab:
         # Patient with a busy machine, whose pauses are not what is tested here.
         bridge = self.bridge("feedback_watchdog:=50", *parameters)
         self.until(lambda: self.states, "states", 60.0)
-        response = self.call(self.arm_client, SetBool.Request(data=True))
+        response = self.call(SetBool, "bridge/arm", SetBool.Request(data=True))
         assert response.success, response.message
         # Only now: arming is refused while somebody already commands a large torque.
         self.processes.start("pendulum_lqr", "controller", "--ros-args", "-p", "autostart:=true")
         self.until(lambda: self.truth.status()["link"]["pwm"] != 0.0, "torque", 30.0)
         return bridge
 
-    def until(self, predicate: Callable[[], object], what: str, timeout: float) -> None:
-        deadline = time.monotonic() + timeout
-        while not predicate():
-            assert time.monotonic() < deadline, f"waited {timeout} s for {what}"
-            self.executor.spin_once(timeout_sec=0.02)
-
-    def call(self, client, request):
-        assert client.wait_for_service(30.0)
-        future = client.call_async(request)
-        self.until(future.done, "the answer of a service", 30.0)
-        return future.result()
-
     def lifecycle_state(self) -> int:
-        return self.call(self.state_client, GetState.Request()).current_state.id
+        return self.call(GetState, "bridge/get_state", GetState.Request()).current_state.id
 
     def change(self, transition: int) -> bool:
         return self.call(
-            self.change_client, ChangeState.Request(transition=Transition(id=transition))
+            ChangeState, "bridge/change_state", ChangeState.Request(transition=Transition(id=transition))
         ).success
 
     def milliseconds_to_zero_torque(self, timeout: float = 1.0) -> float:
@@ -101,9 +80,7 @@ class Lab:
 
     def close(self) -> None:
         self.truth.close()
-        self.executor.shutdown()
-        self.node.destroy_node()
-        self.context.shutdown()
+        super().close()
 
 
 @pytest.fixture
@@ -145,7 +122,7 @@ def test_after_sigkill_the_command_lifetime_ends_torque(lab: Lab) -> None:
 def test_lifecycle_moves_states_and_torque(lab: Lab) -> None:
     lab.bridge("autostart:=false")
     assert lab.lifecycle_state() == State.PRIMARY_STATE_UNCONFIGURED
-    refused = lab.call(lab.arm_client, SetBool.Request(data=True))
+    refused = lab.call(SetBool, "bridge/arm", SetBool.Request(data=True))
     assert not refused.success
     assert "not active" in refused.message
     assert lab.change(Transition.TRANSITION_CONFIGURE)
@@ -153,7 +130,7 @@ def test_lifecycle_moves_states_and_torque(lab: Lab) -> None:
     assert not lab.states
     assert lab.change(Transition.TRANSITION_ACTIVATE)
     lab.until(lambda: len(lab.states) > 20, "states", 30.0)
-    assert lab.call(lab.arm_client, SetBool.Request(data=True)).success
+    assert lab.call(SetBool, "bridge/arm", SetBool.Request(data=True)).success
     assert lab.truth.status()["strategy"] == Strategy.DIRECT_PWM
     assert lab.change(Transition.TRANSITION_DEACTIVATE)
     assert lab.truth.status()["strategy"] == Strategy.OFF
@@ -199,11 +176,7 @@ def test_a_missing_actuator_is_one_sentence_and_exit_code_2(processes: ProcessGr
 
 
 def lockstep_run(processes: ProcessGroup, seconds: float) -> list[tuple[int, float, float]]:
-    context = rclpy.Context()
-    rclpy.init(context=context)
-    node = rclpy.create_node("observer", context=context)
-    executor = SingleThreadedExecutor(context=context)
-    executor.add_node(node)
+    observer = GraphPeer("observer")
     seen: list[tuple[int, float, float]] = []
 
     def on_state(message: JointState) -> None:
@@ -218,23 +191,14 @@ def lockstep_run(processes: ProcessGroup, seconds: float) -> list[tuple[int, flo
         ),
         processes.start("pendulum_lqr", "controller", "--ros-args", "-p", "use_sim_time:=true"),
     ]
-    arm = node.create_client(SetBool, "bridge/arm")
-    assert arm.wait_for_service(60.0)
-    deadline = time.monotonic() + 60.0
     # Armed before the first state, which waits for this node to listen: the whole run is then the same.
-    future = arm.call_async(SetBool.Request(data=True))
-    executor.spin_until_future_complete(future, 30.0)
-    assert future.result().success
-    node.create_subscription(JointState, "joint_states", on_state, qos.STATE)
-    while not (seen and seen[-1][0] >= (1 + seconds) * 1e9):
-        assert time.monotonic() < deadline, f"{len(seen)} states: {programs[0].output}"
-        executor.spin_once(timeout_sec=0.02)
+    assert observer.call(SetBool, "bridge/arm", SetBool.Request(data=True)).success
+    observer.node.create_subscription(JointState, "joint_states", on_state, qos.STATE)
+    observer.until(lambda: seen and seen[-1][0] >= (1 + seconds) * 1e9, "the last state", 60.0)
     for program in programs:
         program.interrupt()
         assert program.wait(15.0) == 0
-    executor.shutdown()
-    node.destroy_node()
-    context.shutdown()
+    observer.close()
     return seen
 
 

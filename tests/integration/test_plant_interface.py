@@ -11,34 +11,28 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
+from diagnostic_msgs.msg import DiagnosticArray
+from rcl_interfaces.msg import Parameter, ParameterValue
+from rcl_interfaces.srv import SetParameters
+from sensor_msgs.msg import JointState
+from std_srvs.srv import SetBool, Trigger
+from trajectory_msgs.msg import JointTrajectory
 
-rclpy = pytest.importorskip("rclpy")
-from diagnostic_msgs.msg import DiagnosticArray  # noqa: E402
-from rcl_interfaces.msg import Parameter, ParameterValue  # noqa: E402
-from rcl_interfaces.srv import SetParameters  # noqa: E402
-from rclpy.executors import SingleThreadedExecutor  # noqa: E402
-from sensor_msgs.msg import JointState  # noqa: E402
-from std_srvs.srv import SetBool, Trigger  # noqa: E402
-from trajectory_msgs.msg import JointTrajectory  # noqa: E402
-
-from pendulum_msgs_py.names import JOINT  # noqa: E402
-from pendulum_msgs_py.ros import qos  # noqa: E402
-from pendulum_msgs_py.ros.convert import stamp_to_message, trajectory_to_message  # noqa: E402
-from pendulum_msgs_py.trajectory import from_points  # noqa: E402
-from tests.processes import ProcessGroup, RunningProgram  # noqa: E402
+from pendulum_msgs_py.names import JOINT
+from pendulum_msgs_py.ros import qos
+from pendulum_msgs_py.ros.convert import stamp_to_message, trajectory_to_message
+from pendulum_msgs_py.trajectory import from_points
+from tests.graph_peer import GraphPeer
+from tests.processes import ProcessGroup, RunningProgram
 
 _PLANT = Path(__file__).with_name("tiny_plant.py")
 
 
-class Peer:
+class Peer(GraphPeer):
     """Everybody who may speak to the plant, in one node of this process."""
 
     def __init__(self) -> None:
-        self.context = rclpy.Context()
-        rclpy.init(context=self.context)
-        self.executor = SingleThreadedExecutor(context=self.context)
-        self.nodes: list = []
-        self.node = self.add_node("peer")
+        super().__init__("peer")
         self.states: deque[JointState] = deque(maxlen=1000)
         self.applied: deque[JointState] = deque(maxlen=2000)
         self.diagnostics: dict[str, str] = {}
@@ -50,17 +44,7 @@ class Peer:
         self.node.create_subscription(JointState, "joint_states", self._on_state, qos.STATE)
         self.node.create_subscription(JointState, "applied_effort", self._on_applied, qos.STATE)
         self.node.create_subscription(DiagnosticArray, "/diagnostics", self._on_diagnostics, qos.DIAGNOSTICS)
-        self.arm_client = self.node.create_client(SetBool, "tiny_plant/arm")
-        self.e_stop_client = self.node.create_client(Trigger, "tiny_plant/e_stop")
-        self.reset_client = self.node.create_client(Trigger, "tiny_plant/e_stop_reset")
-        self.set_client = self.node.create_client(SetParameters, "tiny_plant/set_parameters")
         self.answer: Callable[[JointState], None] | None = None
-
-    def add_node(self, name: str):
-        node = rclpy.create_node(name, context=self.context)
-        self.executor.add_node(node)
-        self.nodes.append(node)
-        return node
 
     def _on_state(self, message: JointState) -> None:
         self.states.append(message)
@@ -74,27 +58,17 @@ class Peer:
                 self.diagnostics = {pair.key: pair.value for pair in status.values}
                 self.level = status.level
 
-    def until(self, predicate: Callable[[], object], what: str, timeout: float = 10.0) -> None:
-        deadline = time.monotonic() + timeout
-        while not predicate():
-            assert time.monotonic() < deadline, f"waited {timeout} s for {what}; diagnostics {self.diagnostics}"
-            seen = len(self.states) and self.states[-1]
-            self.executor.spin_once(timeout_sec=0.02)
-            if self.answer is not None and self.states and self.states[-1] is not seen:
-                self.answer(self.states[-1])
+    def spin_once(self, timeout: float = 0.02) -> None:
+        seen = len(self.states) and self.states[-1]
+        super().spin_once(timeout)
+        if self.answer is not None and self.states and self.states[-1] is not seen:
+            self.answer(self.states[-1])
 
-    def spin(self, seconds: float) -> None:
-        deadline = time.monotonic() + seconds
-        self.until(lambda: time.monotonic() > deadline, "time to pass", seconds + 5.0)
-
-    def call(self, client, request):
-        assert client.wait_for_service(10.0)
-        future = client.call_async(request)
-        self.until(future.done, "the answer of a service")
-        return future.result()
+    def known(self) -> str:
+        return f"; diagnostics {self.diagnostics}"
 
     def arm(self, on: bool = True):
-        return self.call(self.arm_client, SetBool.Request(data=on))
+        return self.call(SetBool, "tiny_plant/arm", SetBool.Request(data=on))
 
     def count(self, key: str) -> int:
         return int(self.diagnostics.get(f"effort_command.refused.{key}", 0))
@@ -109,12 +83,6 @@ class Peer:
         self.answer = lambda state: self.command.publish(
             self.message(effort, stamp=state.header.stamp, frame=frame)
         )
-
-    def close(self) -> None:
-        self.executor.shutdown()
-        for node in self.nodes:
-            node.destroy_node()
-        rclpy.shutdown(context=self.context)
 
 
 @pytest.fixture
@@ -140,13 +108,13 @@ def plant(processes: ProcessGroup, peer: Peer) -> RunningProgram:
 def test_services_walk_through_the_states_and_a_reset_never_re_arms(plant: RunningProgram, peer: Peer) -> None:
     assert peer.diagnostics["mode"] == "disarmed"
     assert peer.arm().success
-    assert peer.call(peer.e_stop_client, Trigger.Request()).success
+    assert peer.call(Trigger, "tiny_plant/e_stop", Trigger.Request()).success
     refused = peer.arm()
     assert not refused.success
     assert refused.message == "e-stop is latched; reset it first"
     assert not peer.arm(False).success
-    assert peer.call(peer.reset_client, Trigger.Request()).message == "disarmed"
-    again = peer.call(peer.reset_client, Trigger.Request())
+    assert peer.call(Trigger, "tiny_plant/e_stop_reset", Trigger.Request()).message == "disarmed"
+    again = peer.call(Trigger, "tiny_plant/e_stop_reset", Trigger.Request())
     assert not again.success
     assert again.message == "plant is disarmed; expected e_stop"
     peer.stream(1.0)
@@ -256,7 +224,8 @@ def test_a_trajectory_is_followed_and_handed_over(plant: RunningProgram, peer: P
 def test_parameters_change_at_run_time_or_say_why_not(plant: RunningProgram, peer: Peer) -> None:
     def set_parameter(name: str, **value: object) -> tuple[bool, str]:
         parameter = Parameter(name=name, value=ParameterValue(**value))
-        result = peer.call(peer.set_client, SetParameters.Request(parameters=[parameter])).results[0]
+        request = SetParameters.Request(parameters=[parameter])
+        result = peer.call(SetParameters, "tiny_plant/set_parameters", request).results[0]
         return result.successful, result.reason
 
     assert set_parameter("gain", type=3, double_value=2.0) == (True, "")

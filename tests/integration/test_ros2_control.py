@@ -3,15 +3,12 @@
 from __future__ import annotations
 
 import math
-import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from xml.etree import ElementTree
 
 import pytest
-import rclpy
 import yaml
 from diagnostic_msgs.msg import DiagnosticArray
-from rclpy.executors import SingleThreadedExecutor
 from sensor_msgs.msg import JointState
 
 from pendulum_msgs_py import names
@@ -19,6 +16,7 @@ from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.plant_parameters import load_plant
 from pendulum_sim.model_files import urdf
 from tests.fixtures import PROJECT
+from tests.graph_peer import GraphPeer
 from tests.processes import ProcessGroup
 
 IN_SIM = ("--ros-args", "-r", "__ns:=/sim")
@@ -26,15 +24,11 @@ PATIENT = ("-p", "command_timeout:=1.0")
 """What is tested is who is heard, not how fast a shared machine is."""
 
 
-class Watcher:
+class Watcher(GraphPeer):
     """Sees the plant, and commands it as hardware of ros2_control does."""
 
     def __init__(self, domain: int) -> None:
-        self._context = rclpy.Context()
-        rclpy.init(context=self._context, domain_id=domain)
-        self.node = rclpy.create_node("watcher", context=self._context)
-        self._executor = SingleThreadedExecutor(context=self._context)
-        self._executor.add_node(self.node)
+        super().__init__("watcher", domain=domain)
         self.theta = self.applied = math.nan
         self.adapter: dict[str, str] = {}
         self.node.create_subscription(JointState, "/sim/joint_states", self._on_state, 1)
@@ -51,17 +45,6 @@ class Watcher:
         for status in message.status:
             if status.name.endswith("effort adapter"):
                 self.adapter = {"message": status.message, **{pair.key: pair.value for pair in status.values}}
-
-    def until(self, done: Callable[[], bool], what: str, timeout: float = 40.0) -> None:
-        deadline = time.monotonic() + timeout
-        while not done():
-            assert time.monotonic() < deadline, f"waited {timeout:g} s for {what}"
-            self._executor.spin_once(timeout_sec=0.02)
-
-    def close(self) -> None:
-        self._executor.shutdown()
-        self.node.destroy_node()
-        rclpy.shutdown(context=self._context)
 
 
 @pytest.fixture
