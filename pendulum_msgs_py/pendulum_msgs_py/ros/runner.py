@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import faulthandler
 import gc
 import os
 import re
@@ -37,6 +38,8 @@ __all__ = ["Closeable", "Paced", "run_node"]
 
 _SPIN_SLICE = 0.5
 """EventsExecutor.spin() hangs in the Jazzy wheels; spinning in finite slices works [s]."""
+_LEAVE_TIMEOUT = 5.0
+"""Time that the middleware may take to leave the graph [s]; once in thousands of times it did not come back."""
 _ECHO_TIME = 1.0
 """Time within which a repeated stop signal is taken for an echo of the first [s]."""
 _STOP_SIGNALS = (signal.SIGINT, signal.SIGTERM)
@@ -187,10 +190,15 @@ def _close(node: Node | None, executor: rclpy.executors.Executor) -> int:
                 traceback.print_exc()
             exit_code = 1
         exit_code = exit_code or int(getattr(node, "exit_code", 0))
+    # The node is safe and what it holds is written: from here on a process that hangs is only in the way. The watchdog
+    # needs no interpreter, which the middleware may hold.
+    faulthandler.dump_traceback_later(_LEAVE_TIMEOUT, exit=True)
+    if node is not None:
         executor.remove_node(node)
         node.destroy_node()
     executor.shutdown()
     rclpy.try_shutdown()
+    faulthandler.cancel_dump_traceback_later()
     return exit_code
 
 
