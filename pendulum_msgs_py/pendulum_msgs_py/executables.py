@@ -84,6 +84,12 @@ def run_package(package: str, argv: Sequence[str] | None = None) -> int:
         raise
 
 
+def split_ros_arguments(arguments: Sequence[str]) -> tuple[list[str], list[str]]:
+    """Return a program's own arguments, and those of ROS: from ``--ros-args`` on."""
+    split = arguments.index("--ros-args") if "--ros-args" in arguments else len(arguments)
+    return list(arguments[:split]), list(arguments[split:])
+
+
 def cli_main(
     app: typer.Typer, argv: Sequence[str] | None = None, *, name: str | None = None, takes_ros_arguments: bool = False
 ) -> int:
@@ -102,8 +108,7 @@ def cli_main(
     usage_error: Any = next(kind for kind in typer.BadParameter.__mro__ if kind.__name__ == "ClickException")
     command = typer.main.get_command(app)
     arguments = list(sys.argv[1:] if argv is None else argv)
-    split = arguments.index("--ros-args") if takes_ros_arguments and "--ros-args" in arguments else len(arguments)
-    own, ros = arguments[:split], arguments[split:]
+    own, ros = split_ros_arguments(arguments) if takes_ros_arguments else (arguments, [])
     if completion.asked():
         print_text("\n".join(completion.of_command(command, own)))
         return 0

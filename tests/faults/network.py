@@ -129,8 +129,7 @@ def cable_environment(logs: Path, static_peer: str = "") -> dict[str, str]:
     discovery = {"ROS_AUTOMATIC_DISCOVERY_RANGE": "SUBNET"}
     if static_peer:
         discovery = {"ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST", "ROS_STATIC_PEERS": static_peer}
-    # Shared memory would go around the cable.
-    return {**ros_environment(1, logs), **discovery, "FASTDDS_BUILTIN_TRANSPORTS": "UDPv4"}
+    return {**ros_environment(1, logs), **discovery}
 
 
 def cut_cable(folder: Path, durations: Sequence[float]) -> list[CutReport]:

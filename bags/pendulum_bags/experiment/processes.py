@@ -188,10 +188,9 @@ class ProcessSet:
 
 
 def ros_environment(domain: int, log_folder: Path) -> dict[str, str]:
-    """Return the environment of the programs of a run: its domain, this host only unless opened explicitly."""
+    """Return the environment of the programs of a run: its domain; the network they close or open by themselves."""
     return {
         "ROS_DOMAIN_ID": str(domain),
-        "ROS_AUTOMATIC_DISCOVERY_RANGE": os.environ.get("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST"),
         "ROS_LOG_DIR": str(log_folder / "ros"),
         "PYTHONUNBUFFERED": "1",
     }

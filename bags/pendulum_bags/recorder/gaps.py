@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass
 
 __all__ = ["GapCounter"]
 
@@ -10,7 +11,21 @@ _LARGEST_GAP = 1_000_000  # beyond this a number is taken for that of another pu
 _MOST_STREAMS = 64
 _PATIENCE = 200
 """Messages of a topic after which a publisher that did not go on is taken for one that never paused."""
-_NO_DOUBT = [0, 0, 0]
+
+
+@dataclass
+class _Doubt:
+    """What a sample may mean that continues nobody, told under the last number of whom it could belong to.
+
+    Attributes:
+        gap: Samples that are missing, if it belongs to that publisher.
+        unmet: Samples that came before it, if it is the first of another.
+        patience: Samples of the topic until it is taken for the former.
+    """
+
+    gap: int
+    unmet: int
+    patience: int = _PATIENCE
 
 
 class GapCounter:
@@ -37,9 +52,7 @@ class GapCounter:
         self._last: list[int] = []
         self._heard = 0
         self._departed = 0
-        self._doubts: dict[
-            int, list[int]
-        ] = {}  # last number of a publisher -> [gap behind it, samples to wait, samples before it if it is another's]
+        self._doubts: dict[int, _Doubt] = {}
 
     def see(self, sequence: int) -> int:
         """Take note of a sample, by its number at its publisher, and return how many are found to be missing."""
@@ -59,12 +72,12 @@ class GapCounter:
         total, _ = self._matched()
         before = sequence - 1
         lower = max((number for number in self._last if number < sequence), default=0)
-        gap = sequence - lower - 1
+        gap = before - lower
         if sequence == 1 or not lower or gap > _LARGEST_GAP or self._heard < total:
             if self._heard < total:
                 self._heard += 1
                 if lower and sequence > 1 and gap <= _LARGEST_GAP:
-                    self._doubts[lower] = [gap, _PATIENCE, before]
+                    self._doubts[lower] = _Doubt(gap, unmet=before)
                 else:
                     self.unmet += before
             self._last.insert(0, sequence)
@@ -78,21 +91,22 @@ class GapCounter:
 
     def _judge_doubts(self, continued: int) -> int:
         """Drop the doubt about a publisher that goes on; return the gaps of those that have been silent for long."""
-        self.unmet += self._doubts.pop(continued, _NO_DOUBT)[2]
+        if continued in self._doubts:
+            self.unmet += self._doubts.pop(continued).unmet
         found = 0
         for number, doubt in list(self._doubts.items()):
-            doubt[1] -= 1
-            if doubt[1] > 0:
+            doubt.patience -= 1
+            if doubt.patience > 0:
                 continue
             del self._doubts[number]
             total, now = self._matched()
             if total - now > self._departed:
                 self._departed += 1  # it has left: nothing of it can be missing
-                self.unmet += doubt[2]
+                self.unmet += doubt.unmet
                 continue
             if number in self._last:
                 self._last.remove(number)
             self._heard -= 1
-            found += doubt[0]
+            found += doubt.gap
         self.missing += found
         return found

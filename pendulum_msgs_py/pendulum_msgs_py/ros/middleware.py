@@ -32,17 +32,21 @@ def set_middleware_defaults() -> None:
     Raises:
         FaultError: The profile is not where it was installed, or the memory of this process is limited too much.
     """
+    _require_memory()
+    for name, value in middleware_defaults(os.environ, get_rmw_implementation_identifier()).items():
+        if value:
+            os.environ[name] = value
+        else:
+            os.environ.pop(name, None)
+
+
+def _require_memory() -> None:
     limit, _ = resource.getrlimit(resource.RLIMIT_AS)
     if limit != resource.RLIM_INFINITY and limit < _LEAST_MEMORY:
         raise FaultError(
             f"the memory of this process is limited to {limit >> 20} MB (ulimit -v); expected at least "
             f"{_LEAST_MEMORY >> 20} MB, which the middleware reserves for its threads"
         )
-    for name, value in middleware_defaults(os.environ, get_rmw_implementation_identifier()).items():
-        if value:
-            os.environ[name] = value
-        else:
-            os.environ.pop(name, None)
 
 
 def middleware_defaults(environment: Mapping[str, str], middleware: str) -> dict[str, str]:

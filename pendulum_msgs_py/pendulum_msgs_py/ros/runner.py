@@ -30,7 +30,13 @@ from rclpy.task import Future
 
 from pendulum_msgs_py import completion
 from pendulum_msgs_py.errors import ParameterError, PendulumError
-from pendulum_msgs_py.executables import EXIT_USAGE, print_text, report_error, report_exhaustion
+from pendulum_msgs_py.executables import (
+    EXIT_USAGE,
+    print_text,
+    report_error,
+    report_exhaustion,
+    split_ros_arguments,
+)
 from pendulum_msgs_py.parameters import ParameterSpec
 from pendulum_msgs_py.ros.middleware import check_closed, set_middleware_defaults
 
@@ -92,7 +98,7 @@ def run_node(
     if "-h" in arguments or "--help" in arguments:
         print_text(_help(program, description, specs, example))
         return 0
-    own = arguments[: arguments.index("--ros-args")] if "--ros-args" in arguments else arguments
+    own, _ = split_ros_arguments(arguments)
     if own:
         print(
             f"error: {program} does not know {own[0]!r}; parameters go after --ros-args, as in "
