@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import ctypes
 import faulthandler
 import gc
 import os
@@ -46,6 +47,9 @@ _SPIN_SLICE = 0.5
 """EventsExecutor.spin() hangs in the Jazzy wheels; spinning in finite slices works [s]."""
 _LEAVE_TIMEOUT = 5.0
 """Time that the middleware may take to leave the graph [s]; once in thousands of times it did not come back."""
+_M_MMAP_THRESHOLD = -3
+_LARGEST_HEAP_BLOCK = 128 * 1024
+"""[bytes]"""
 _ECHO_TIME = 1.0
 """Time within which a repeated stop signal is taken for an echo of the first [s]."""
 _STOP_SIGNALS = (signal.SIGINT, signal.SIGTERM)
@@ -114,6 +118,7 @@ def _run(make_node: Callable[[Callable[[], None]], Node], arguments: Sequence[st
         os.environ.setdefault("RCUTILS_COLORIZED_OUTPUT", "0")
     signals = _listen_for_stop_signals()
     _wake_punctually()
+    _give_memory_back()
     try:
         set_middleware_defaults()
         rclpy.init(args=list(arguments), signal_handler_options=SignalHandlerOptions.NO)
@@ -167,6 +172,16 @@ def _wake_punctually() -> None:
     """Ask the kernel to wake this thread, and those it will start, when they want and not 50 us later."""
     with contextlib.suppress(OSError):
         Path("/proc/self/timerslack_ns").write_text("1000", encoding="ascii")
+
+
+def _give_memory_back() -> None:
+    """Keep big blocks of memory out of the heap, where what is freed below a block in use stays with the process.
+
+    glibc does so for blocks above 128 KiB, but raises that bound to whatever was freed: after one pause of the disk or
+    the machine a recorder kept its longest queue for good. A bound that has been set stays where it is (mallopt(3)).
+    """
+    with contextlib.suppress(OSError, AttributeError):  # another C library has other habits
+        ctypes.CDLL(None).mallopt(_M_MMAP_THRESHOLD, _LARGEST_HEAP_BLOCK)
 
 
 def _make(make_node: Callable[[Callable[[], None]], Node], stop: Callable[[], None]) -> Node:
