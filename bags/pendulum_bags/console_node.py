@@ -210,7 +210,7 @@ class Hub:
         space = node.rpartition("/")[0]
         topics = {"state": names.JOINT_STATES, **_TORQUES}
         taps = {
-            key: self._node.create_polled_input(JointState, f"{space}/{topic}", qos.WATCHED_STATE)
+            key: self._node.create_polled_input(JointState, f"{space}/{topic}", qos.NEWEST_STATE)
             for key, topic in topics.items()
         }
         plant = _Plant(space, node, taps)

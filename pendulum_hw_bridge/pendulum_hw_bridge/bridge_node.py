@@ -114,7 +114,6 @@ class BridgeNode(LifecycleNode):
             if self._lockstep
             else self._wall,
             push=values["backend"].startswith("emulator"),
-            lockstep=self._lockstep,
             statistics=None if self._lockstep else self._statistics,
             more_diagnostics=self._diagnostics,
             on_command=self._on_command,

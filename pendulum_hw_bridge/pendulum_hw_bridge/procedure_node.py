@@ -82,9 +82,7 @@ class ProcedureNode(Node):
         self._newest_ns: int | None = None
         self._answer: tuple[float | None, float | None] = (None, None)
         self.create_subscription(String, names.EVENTS, self._on_event, qos.EVENTS)
-        self.create_subscription(
-            JointState, names.JOINT_STATES, self._on_state, qos.newest_state(reliable=True), raw=True
-        )
+        self.create_subscription(JointState, names.JOINT_STATES, self._on_state, qos.NEWEST_STATE, raw=True)
         self.create_service(Trigger, "~/start", self._on_start)
         self.create_service(Trigger, "~/finish", self._on_finish)
 

@@ -101,13 +101,7 @@ class ControllerNode(LifecycleNode):
         self._diagnostics_publisher = self.create_publisher(
             DiagnosticArray, names.DIAGNOSTICS, qos.DIAGNOSTICS
         )
-        self.create_subscription(
-            JointState,
-            names.JOINT_STATES,
-            self._on_state,
-            qos.newest_state(reliable=self._simulated_time),
-            raw=True,
-        )
+        self.create_subscription(JointState, names.JOINT_STATES, self._on_state, qos.NEWEST_STATE, raw=True)
         # Wall time on purpose: diagnostics must come even where simulated time stands still.
         self.create_timer(_DIAGNOSTICS_PERIOD, self._on_timer, clock=_steady_clock())
         if self._settings["autostart"]:

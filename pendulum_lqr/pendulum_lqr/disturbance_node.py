@@ -75,13 +75,7 @@ class DisturbanceNode(Node):
         )
         self.create_service(Trigger, "~/start", self._on_start)
         self.create_service(Trigger, "~/stop", self._on_stop)
-        self.create_subscription(
-            JointState,
-            names.JOINT_STATES,
-            self._on_state,
-            qos.newest_state(reliable=self._simulated_time),
-            raw=True,
-        )
+        self.create_subscription(JointState, names.JOINT_STATES, self._on_state, qos.NEWEST_STATE, raw=True)
         self.create_timer(_DIAGNOSTICS_PERIOD, self._publish_diagnostics, clock=_steady_clock())
         if self._settings["autostart"]:
             self._loop.start()

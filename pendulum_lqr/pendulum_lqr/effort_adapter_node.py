@@ -64,15 +64,13 @@ class EffortAdapterNode(Node):
         self._simulated_time = bool(self.get_parameter("use_sim_time").value)
         self._publisher = self.create_publisher(JointState, names.EFFORT_COMMAND, qos.COMMAND)
         self._diagnostics = self.create_publisher(DiagnosticArray, names.DIAGNOSTICS, qos.DIAGNOSTICS)
-        states = qos.newest_state(reliable=self._simulated_time)
-        self.create_subscription(JointState, names.JOINT_STATES, self._on_state, states, raw=True)
-        commands = qos.command_input(reliable=self._simulated_time)
+        self.create_subscription(JointState, names.JOINT_STATES, self._on_state, qos.NEWEST_STATE, raw=True)
         if self._settings["command_type"] == "multi_array":
             self._topic = _ARRAY_TOPIC
-            self.create_subscription(Float64MultiArray, self._topic, self._on_array, commands)
+            self.create_subscription(Float64MultiArray, self._topic, self._on_array, qos.COMMAND_INPUT)
         else:
             self._topic = _JOINT_TOPIC
-            self.create_subscription(JointState, self._topic, self._on_joints, commands)
+            self.create_subscription(JointState, self._topic, self._on_joints, qos.COMMAND_INPUT)
         self.create_timer(_DIAGNOSTICS_PERIOD, self._look, clock=Clock(clock_type=ClockType.STEADY_TIME))
 
     def close(self) -> None:

@@ -87,7 +87,7 @@ class MarkersNode(Node):
         self._torques: dict[str, tuple[int, float]] = {}
         self._publisher = self.create_publisher(MarkerArray, "markers", qos.TRAJECTORY)
         for topic in _ARCS:
-            self.create_subscription(JointState, topic, self._receiver(topic), qos.WATCHED_STATE, raw=True)
+            self.create_subscription(JointState, topic, self._receiver(topic), qos.NEWEST_STATE, raw=True)
         create_wall_timer(self, 1.0 / self._settings["rate"], self._publish)
 
     def _receiver(self, topic: str) -> Callable[[bytes], None]:

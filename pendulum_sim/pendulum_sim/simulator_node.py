@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
@@ -107,13 +106,11 @@ class SimulatorNode(PollingNode):
         self._supervisor = PlantSupervisor(limits_from_parameters(values, parameters.effort_limit))
         self._lockstep = values["clock"] == "lockstep"
         wall = SteadyWallClock()
-        self._handed_out_ns = 0
         self._state: PlantState = self._plant.state
         self._interface = PlantInterface(
             self,
             self._supervisor,
             (lambda: self._loop.now_ns) if self._lockstep else wall,
-            lockstep=self._lockstep,
             polled=not self._lockstep,
             statistics=None if self._lockstep else self._statistics,
             more_diagnostics=self._diagnostics,
@@ -170,8 +167,6 @@ class SimulatorNode(PollingNode):
         self._state = self._plant.step(effort, drive.push)
         # In real time this is the deadline, not the moment at which Python got there.
         self._stamp_ns = stamp_ns
-        # System time, as in which DDS notes arrivals; the two differ by a fraction of a period, so a step is unlikely.
-        self._handed_out_ns = time.time_ns()
         return self._measure(), effort
 
     def _measure(self) -> JointSample | None:
@@ -182,8 +177,9 @@ class SimulatorNode(PollingNode):
         if self._lockstep:
             self._loop.answered(kind, command)
         elif kind is Input.EFFORT_COMMAND and command.stamp_ns == self._stamp_ns:
-            # Until the answer reached this process; that it waits there for the next deadline costs it nothing.
-            self._statistics.round_trip(self._interface.arrived_ns - self._handed_out_ns)
+            # Until the answer reached this process; that it waits there for the next deadline costs it nothing. Both
+            # are system time; they differ by a fraction of a period, so a step of that clock between them is unlikely.
+            self._statistics.round_trip(self._interface.arrived_ns - self._interface.published_ns)
 
     # --- services and parameters ---------------------------------------------------------------------------
 

@@ -100,9 +100,9 @@ class ViewerNode(Node):
         self._every = max(1, round(values["fps"] / values["gif_fps"]))
         kept = max(1, round(values["gif_duration"] * values["fps"] / self._every)) if values["gif"] else 1
         self._frames: deque[NDArray[np.uint8]] = deque(maxlen=kept)
-        self.create_subscription(JointState, names.JOINT_STATES, self._on_state, qos.WATCHED_STATE, raw=True)
+        self.create_subscription(JointState, names.JOINT_STATES, self._on_state, qos.NEWEST_STATE, raw=True)
         for topic in (names.APPLIED_EFFORT, names.DISTURBANCE, names.PUSH):
-            self.create_subscription(JointState, topic, self._receiver(topic), qos.WATCHED_STATE, raw=True)
+            self.create_subscription(JointState, topic, self._receiver(topic), qos.NEWEST_STATE, raw=True)
         self.create_service(Trigger, "~/snapshot", self._on_snapshot)
         create_wall_timer(self, 1.0 / values["fps"], self._on_timer)
         if values["duration"] > 0.0:

@@ -203,7 +203,7 @@ def simulate_hours(hours: float, rate_hz: float = 50.0) -> Outcome:
             state = plant.step(drive.effort, drive.push)
             return JointSample(stamp_ns, state.theta, state.theta_dot, state.effort), drive.effort
 
-        interface = PlantInterface(node, supervisor, lambda: loop.now_ns, lockstep=True)
+        interface = PlantInterface(node, supervisor, lambda: loop.now_ns)
         loop = LockstepLoop(
             interface, step, period_ns, [Input.EFFORT_COMMAND, Input.DISTURBANCE], publish_clock=False
         )

@@ -50,7 +50,7 @@ class _Impostor:
         node = self.system.conductor.node
         self._publisher = node.create_publisher(JointState, f"{NAMESPACE}/{names.EFFORT_COMMAND}", qos.COMMAND)
         self._states = node.create_subscription(
-            JointState, f"{NAMESPACE}/{names.JOINT_STATES}", self._on_state, qos.newest_state(reliable=False), raw=True
+            JointState, f"{NAMESPACE}/{names.JOINT_STATES}", self._on_state, qos.NEWEST_STATE, raw=True
         )
 
     def is_heard(self) -> bool:

@@ -101,7 +101,7 @@ class LiveSystem:
             JointState,
             f"{NAMESPACE}/{names.EFFORT_COMMAND}",
             self._on_command,
-            qos.command_input(reliable=True),
+            qos.COMMAND,
             raw=True,
         )
         node.create_subscription(DiagnosticArray, names.DIAGNOSTICS, self._on_diagnostics, qos.DIAGNOSTICS)

@@ -166,7 +166,7 @@ class PlantClient:
     def watch(self) -> None:
         """Subscribe to the plant's states."""
         self.conductor.node.create_subscription(
-            JointState, f"{self.namespace}/{names.JOINT_STATES}", self._on_state, qos.WATCHED_STATE, raw=True
+            JointState, f"{self.namespace}/{names.JOINT_STATES}", self._on_state, qos.NEWEST_STATE, raw=True
         )
 
     def wait_until_ready(self, timeout: float, *, controller: bool = True, disturbance: bool = True) -> None:

@@ -5,6 +5,7 @@ A plant (simulator, bridge) owns its clock and its loop; it asks ``decide`` what
 
 from __future__ import annotations
 
+import time
 from collections import Counter
 from collections.abc import Callable, Mapping
 from typing import Protocol
@@ -170,7 +171,6 @@ class PlantInterface:
         supervisor: Its rules and state.
         clock: The plant's time [ns]: wall clock or simulated.
         push: Whether the plant can take a torque on the link itself.
-        lockstep: Whether every answer is waited for, so that none may be lost.
         polled: Whether torque inputs wait for :meth:`take_inputs` instead of waking the node; it is a
             :class:`PollingNode` then.
         statistics: The loop's figures, shown in diagnostics.
@@ -179,6 +179,7 @@ class PlantInterface:
 
     Attributes:
         sample: Newest state that was published.
+        published_ns: System time at which it was, in which DDS notes arrivals too [ns].
         arrived_ns: System time at which the message being handled reached this process, for polled inputs [ns].
     """
 
@@ -189,7 +190,6 @@ class PlantInterface:
         clock: Callable[[], int],
         *,
         push: bool = True,
-        lockstep: bool = False,
         polled: bool = False,
         statistics: LoopStatistics | None = None,
         more_diagnostics: Callable[[], Mapping[str, object]] = dict,
@@ -200,6 +200,7 @@ class PlantInterface:
         self.clock = clock
         self.statistics = statistics
         self.sample: JointSample | None = None
+        self.published_ns = 0
         self.arrived_ns = 0
         self.on_command = on_command
         self.refused_trajectories: Counter[str] = Counter()
@@ -215,18 +216,19 @@ class PlantInterface:
         self._events = node.create_publisher(String, names.EVENTS, qos.EVENTS)
         self._diagnostics = node.create_publisher(DiagnosticArray, names.DIAGNOSTICS, qos.DIAGNOSTICS)
         inputs = [Input.EFFORT_COMMAND, Input.DISTURBANCE] + ([Input.PUSH] if push else [])
-        profile = qos.command_input(reliable=lockstep)
         self._polled: list[tuple[PolledInput, Callable[..., None]]] = []
         self._inputs = {}
         for kind in inputs:
             receive = self._receiver(kind)
             if polled:
                 assert isinstance(node, PollingNode)
-                source = node.create_polled_input(JointState, kind.value, profile)
+                source = node.create_polled_input(JointState, kind.value, qos.COMMAND_INPUT)
                 self._polled.append((source, receive))
                 self._inputs[kind] = source.subscription
             else:
-                self._inputs[kind] = node.create_subscription(JointState, kind.value, receive, profile, raw=True)
+                self._inputs[kind] = node.create_subscription(
+                    JointState, kind.value, receive, qos.COMMAND_INPUT, raw=True
+                )
         node.create_subscription(JointTrajectory, names.JOINT_TRAJECTORY, self._on_trajectory, qos.TRAJECTORY)
         node.create_service(SetBool, names.ARM, self._on_arm)
         node.create_service(Trigger, names.E_STOP, self._on_e_stop)
@@ -247,11 +249,11 @@ class PlantInterface:
         """Publish a state and remember it as the newest."""
         self.sample = sample
         self._commanders.note_state(sample.stamp_ns)
-        self._states.publish(
-            encode_joint_state(
-                sample.stamp_ns, position=sample.position, velocity=sample.velocity, effort=sample.effort
-            )
+        data = encode_joint_state(
+            sample.stamp_ns, position=sample.position, velocity=sample.velocity, effort=sample.effort
         )
+        self.published_ns = time.time_ns()
+        self._states.publish(data)
 
     def decide(self, now_ns: int | None = None) -> Drive:
         """Return what to do now, by the supervisor's rules; says on the log when the answer changes."""

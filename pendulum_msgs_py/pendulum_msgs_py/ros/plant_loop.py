@@ -117,29 +117,27 @@ class RealtimeLoop:
     def _run(self, now: int, period: int) -> None:
         self._statistics.cycle(now, self._deadline_ns)
         while now - self._deadline_ns >= period:
-            self._advance()
+            self._advance(publish=False)
             self._deadline_ns += period
-        self._publish(self._advance())
+        self._advance()
 
     def step_once(self) -> None:
         """Take one step while paused."""
         self._interface.take_inputs()
         self._deadline_ns = self._clock()
-        self._publish(self._advance())
+        self._advance()
 
-    def _publish(self, sample: JointSample | None) -> None:
-        if sample is not None:
-            self._interface.publish_state(sample)
-
-    def _advance(self) -> JointSample | None:
+    def _advance(self, *, publish: bool = True) -> None:
         interface = self._interface
         before = interface.sample
         # As of the deadline: a plant that catches up must not chase a setpoint of the time at which it was noticed.
         drive = interface.decide(self._deadline_ns)
         sample, applied = self._step(drive, self._deadline_ns)
+        # The state first: somebody waits to answer it.
+        if publish and sample is not None:
+            interface.publish_state(sample)
         if before is not None:
             interface.publish_applied(before.stamp_ns, applied)
-        return sample
 
 
 class LockstepLoop:
@@ -229,11 +227,12 @@ class LockstepLoop:
             drive = interface.decide()
             self.now_ns += self._period_ns
             sample, applied = self._step(drive, self.now_ns)
-            interface.publish_applied(before_ns, applied)
             self.steps += 1
             self.finished = self._last_ns is not None and self.now_ns >= self._last_ns
-        if sample is not None:
-            self._publish(sample)
+            # The state first: somebody waits to answer it.
+            if sample is not None:
+                self._publish(sample)
+            interface.publish_applied(before_ns, applied)
         if self.finished and not self._told_finished:
             self._told_finished = True
             interface.publish_event("lockstep_finished", steps=self.steps)
@@ -247,9 +246,9 @@ class LockstepLoop:
         self._answered.clear()
         self._waiting_since = time.monotonic()
         self._told_waiting = False
+        self._interface.publish_state(sample)
         if self._clock_publisher is not None:
             self._clock_publisher.publish(encode_clock(self.now_ns))
-        self._interface.publish_state(sample)
 
     def _must_wait(self) -> bool:
         return self._interface.supervisor.mode is Mode.EFFORT and not self._inputs <= self._answered

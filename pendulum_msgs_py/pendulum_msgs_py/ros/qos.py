@@ -8,23 +8,23 @@ from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPo
 __all__ = [
     "CLOCK",
     "COMMAND",
+    "COMMAND_INPUT",
     "DIAGNOSTICS",
     "EVENTS",
     "LAST_WORDS",
+    "NEWEST_STATE",
     "STATE",
     "TRAJECTORY",
-    "WATCHED_STATE",
-    "command_input",
-    "newest_state",
 ]
 
 
-def _profile(depth: int, durability: DurabilityPolicy = DurabilityPolicy.VOLATILE) -> QoSProfile:
+def _profile(
+    depth: int,
+    durability: DurabilityPolicy = DurabilityPolicy.VOLATILE,
+    reliability: ReliabilityPolicy = ReliabilityPolicy.RELIABLE,
+) -> QoSProfile:
     return QoSProfile(
-        depth=depth,
-        history=HistoryPolicy.KEEP_LAST,
-        reliability=ReliabilityPolicy.RELIABLE,
-        durability=durability,
+        depth=depth, history=HistoryPolicy.KEEP_LAST, reliability=reliability, durability=durability
     )
 
 
@@ -47,31 +47,12 @@ EVENTS = _profile(100, DurabilityPolicy.TRANSIENT_LOCAL)
 DIAGNOSTICS = _profile(100)
 LAST_WORDS = Duration(seconds=0.2)
 """Longest wait of a node that ends for its reliable subscribers to have heard its last message."""
+NEWEST_STATE = _profile(1, reliability=ReliabilityPolicy.BEST_EFFORT)
+"""The subscription of controllers and viewers to states: only the newest is worth an answer, or a look.
 
-
-def newest_state(*, reliable: bool) -> QoSProfile:
-    """Return a controller's subscription to states: only the newest is worth an answer.
-
-    Args:
-        reliable: For lockstep, where none may be lost. In real time the next state comes before a repeated one would,
-            and acknowledging each costs a seventh of the loop.
-    """
-    return _input(1, reliable=reliable)
-
-
-def command_input(*, reliable: bool) -> QoSProfile:
-    """Return a plant's subscription to torques, a few deep, so that a second commander is seen and not overwritten.
-
-    Args:
-        reliable: As for :func:`newest_state`.
-    """
-    return _input(10, reliable=reliable)
-
-
-def _input(depth: int, *, reliable: bool) -> QoSProfile:
-    reliability = ReliabilityPolicy.RELIABLE if reliable else ReliabilityPolicy.BEST_EFFORT
-    return QoSProfile(depth=depth, history=HistoryPolicy.KEEP_LAST, reliability=reliability)
-
-
-WATCHED_STATE = newest_state(reliable=False)
-"""The subscription of those who only look: viewers, the conductor of an experiment."""
+Acknowledging each state and each torque would cost a seventh of a loop in real time and a tenth of its speed in
+lockstep. Nothing needs it: in real time the next state comes before a repeated one would, and in lockstep the plant
+publishes a state again that is not answered.
+"""
+COMMAND_INPUT = _profile(10, reliability=ReliabilityPolicy.BEST_EFFORT)
+"""A plant's subscription to torques, a few deep, so that a second commander is seen and not overwritten."""
