@@ -48,13 +48,17 @@ def analyse(
 ) -> None:
     """Ask many bags the same questions: metrics, timing, identified parameters, equivalence; one table."""
     from pendulum_bags.study.bag_table import analyse_bags, find_pieces
+    from pendulum_bags.study.chunks import cluster_client
 
     questions = [name.strip() for name in ask.split(",") if name.strip()]
     pieces = find_pieces(folders, questions)
     console = make_console(stderr=json_output, highlight=False)
     started = time.monotonic()
-    with counted_progress(console, "bags", len(pieces), out) as on_progress:
-        table = analyse_bags(out, pieces, questions, scheduler=scheduler, workers=workers, on_progress=on_progress)
+    with (
+        counted_progress(console, "bags", len(pieces), out) as on_progress,
+        cluster_client(scheduler, workers) as client,
+    ):
+        table = analyse_bags(out, pieces, questions, client=client, on_progress=on_progress)
     if json_output:
         print(json.dumps({"bags": table.bags, "runs": table.runs}, indent=2))
     else:

@@ -46,6 +46,7 @@ def monte_carlo(
     Example: python -m pendulum_bags experiment monte_carlo --runs 100000 --out /tmp/mc
     """
     from pendulum_bags.study import monte_carlo as engine
+    from pendulum_bags.study.chunks import cluster_client
     from pendulum_bags.study.uncertain import parse_uncertainty
 
     settings = engine.MonteCarlo(
@@ -67,8 +68,11 @@ def monte_carlo(
         _replay(console, settings, replay, folder)
         return
     started = time.monotonic()
-    with counted_progress(console, "chunks", settings.chunks, folder) as on_progress:
-        result = engine.run_monte_carlo(folder, settings, scheduler=scheduler, workers=workers, on_progress=on_progress)
+    with (
+        counted_progress(console, "chunks", settings.chunks, folder) as on_progress,
+        cluster_client(scheduler, workers) as client,
+    ):
+        result = engine.run_monte_carlo(folder, settings, client=client, on_progress=on_progress)
     if sobol:
         result["sobol"] = engine.sobol(settings, base=sobol)
     elapsed = time.monotonic() - started

@@ -43,6 +43,7 @@ def region_of_attraction(
 
     Example: python -m pendulum_bags experiment region_of_attraction --plant dfki --plants 20 --out /tmp/region
     """
+    from pendulum_bags.study.chunks import cluster_client
     from pendulum_bags.study.region_figure import region_sentence, write_region_figure
     from pendulum_bags.study.region_map import RegionMap, run_region_map
     from pendulum_bags.study.uncertain import parse_uncertainty
@@ -63,8 +64,11 @@ def region_of_attraction(
     folder = out or Path("bags", "runs", "region_of_attraction")
     console = make_console(stderr=json_output, highlight=False)
     started = time.monotonic()
-    with counted_progress(console, "chunks", settings.chunks, folder) as on_progress:
-        result = run_region_map(folder, settings, scheduler=scheduler, workers=workers, on_progress=on_progress)
+    with (
+        counted_progress(console, "chunks", settings.chunks, folder) as on_progress,
+        cluster_client(scheduler, workers) as client,
+    ):
+        result = run_region_map(folder, settings, client=client, on_progress=on_progress)
     picture = write_region_figure(folder / "region.png", result)
     if json_output:
         print(json.dumps(result.to_json(), indent=2))

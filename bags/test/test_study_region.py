@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pendulum_bags.study.chunks import carry_out, read_columns
+from pendulum_bags.study.chunks import cluster_client, read_columns
 from pendulum_bags.study.region_figure import region_sentence, write_region_figure
 from pendulum_bags.study.region_map import RegionMap, run_region_map
 from pendulum_bags.study.uncertain import Uncertainty
@@ -97,9 +97,8 @@ def test_what_cannot_be_mapped_is_refused() -> None:
 def test_a_scheduler_that_is_not_there_is_one_sentence(monkeypatch: pytest.MonkeyPatch) -> None:
     pytest.importorskip("distributed")
     monkeypatch.setattr("pendulum_bags.study.chunks._CONNECT_TIMEOUT", 0.2)
-    with pytest.raises(FaultError, match=r"no Dask scheduler answers at 'tcp://127\.0\.0\.1:9'"):
-        list(carry_out(_double, 2, [1, 2], scheduler="tcp://127.0.0.1:9"))
-
-
-def _double(job: int, number: int, _threads: int | None) -> int:
-    return job * number
+    with (
+        pytest.raises(FaultError, match=r"no Dask scheduler answers at 'tcp://127\.0\.0\.1:9'"),
+        cluster_client("tcp://127.0.0.1:9"),
+    ):
+        pass

@@ -117,8 +117,6 @@ def analyse_bags(
     pieces: Sequence[Piece],
     questions: Sequence[str],
     *,
-    scheduler: str = "",
-    workers: int = 0,
     client: Any = None,
     on_progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> Table:
@@ -128,9 +126,8 @@ def analyse_bags(
         folder: Where answers and tables go; with one answer a piece, it is gone on with.
         pieces: What to ask.
         questions: Names of ``QUESTIONS``.
-        scheduler: Address of a Dask scheduler whose workers see the bags under the same paths.
-        workers: Processes of a local Dask cluster; 0 asks one after the other in this process.
-        client: A Dask client to use in place of either.
+        client: Of a Dask cluster (`cluster_client`) that sees the bags under the same paths; None asks one after the
+            other in this process.
         on_progress: Called with pieces done and in all.
     """
     began = time.monotonic()
@@ -143,7 +140,7 @@ def analyse_bags(
     on_progress(kept, len(pieces))
     job = (tuple(pieces), tuple(questions), str(folder.resolve()))
     missing = [index for index in range(len(pieces)) if index not in rows]
-    for index, found in carry_out(_ask, job, missing, scheduler=scheduler, workers=workers, client=client):
+    for index, found in carry_out(_ask, job, missing, client):
         write_json(answers / f"{keys[index]}.json", found)
         rows[index] = found
         on_progress(len(rows), len(pieces))

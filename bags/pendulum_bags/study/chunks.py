@@ -38,9 +38,6 @@ def carry_out(
     task: Callable[[Job, int, int | None], Result],
     job: Job,
     missing: Iterable[int],
-    *,
-    scheduler: str = "",
-    workers: int = 0,
     client: Any = None,
 ) -> Iterator[tuple[int, Result]]:
     """Yield number and result of each piece, in the order in which they are finished.
@@ -50,25 +47,16 @@ def carry_out(
             for all.
         job: What all pieces have in common; it travels to the workers.
         missing: Numbers to carry out.
-        scheduler: Address of a Dask scheduler, ``tcp://HOST:PORT``; empty for none.
-        workers: Processes of a local Dask cluster; 0 carries out one after the other in this process.
-        client: A Dask client to use in place of either.
+        client: Of a Dask cluster; None carries out one after the other in this process.
 
     Raises:
-        FaultError: The scheduler cannot be reached, or its workers keep dying.
+        FaultError: The cluster's workers keep dying.
     """
-    numbers = list(missing)
-    if not numbers:
-        return
-    if client is None and not scheduler and not workers:
-        for number in numbers:
-            yield number, task(job, number, None)
-        return
     if client is not None:
-        yield from _on_cluster(client, task, job, numbers)
+        yield from _on_cluster(client, task, job, list(missing))
         return
-    with cluster_client(scheduler, workers) as own:
-        yield from _on_cluster(own, task, job, numbers)
+    for number in missing:
+        yield number, task(job, number, None)
 
 
 def run_chunks(
@@ -77,8 +65,6 @@ def run_chunks(
     job: Job,
     chunks: int,
     *,
-    scheduler: str = "",
-    workers: int = 0,
     client: Any = None,
     on_progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> None:
@@ -86,12 +72,10 @@ def run_chunks(
 
     Args:
         folder: Where the files go.
-        task: Returns the columns of a chunk; else as in ``carry_out``, like ``job`` and the last arguments.
+        task: Returns the columns of a chunk; else as in ``carry_out``, like ``job`` and ``client``.
         job: What all chunks have in common.
         chunks: How many there are.
-        scheduler: Address of a Dask scheduler.
-        workers: Processes of a local Dask cluster.
-        client: A Dask client to use in place of either.
+        client: Of a Dask cluster.
         on_progress: Called with chunks done and in all.
 
     Raises:
@@ -100,7 +84,7 @@ def run_chunks(
     missing = [index for index in range(chunks) if not chunk_path(folder, index).is_file()]
     done = chunks - len(missing)
     on_progress(done, chunks)
-    for index, columns in carry_out(task, job, missing, scheduler=scheduler, workers=workers, client=client):
+    for index, columns in carry_out(task, job, missing, client):
         write_columns(chunk_path(folder, index), columns)
         done += 1
         on_progress(done, chunks)
@@ -112,13 +96,20 @@ def chunk_path(folder: Path, index: int) -> Path:
 
 
 @contextmanager
-def cluster_client(scheduler: str = "", workers: int = 1) -> Iterator[Any]:
+def cluster_client(scheduler: str = "", workers: int = 0) -> Iterator[Any]:
     """Connect to a Dask scheduler, or start a local cluster of single-threaded processes for as long as it is used.
+
+    Args:
+        scheduler: Its address, ``tcp://HOST:PORT``; empty for none.
+        workers: Processes of a local cluster; 0 for none. With neither, what is yielded is None: this process.
 
     Raises:
         ParameterError: Dask cannot be imported.
         FaultError: The scheduler cannot be reached.
     """
+    if not scheduler and not workers:
+        yield None
+        return
     try:
         from distributed import Client, LocalCluster
     except ImportError as error:

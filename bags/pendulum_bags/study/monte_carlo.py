@@ -169,8 +169,6 @@ def run_monte_carlo(
     folder: Path,
     settings: MonteCarlo,
     *,
-    scheduler: str = "",
-    workers: int = 0,
     client: Any = None,
     on_progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> dict[str, Any]:
@@ -179,9 +177,7 @@ def run_monte_carlo(
     Args:
         folder: Where the files go; a folder of the same settings is gone on with.
         settings: What to run.
-        scheduler: Address of a Dask scheduler, ``tcp://...``; empty for none.
-        workers: Processes of a local Dask cluster; 0 runs in this process, on all cores.
-        client: A Dask client to use in place of either.
+        client: Of a Dask cluster (`cluster_client`); None runs in this process, on all cores.
         on_progress: Called with chunks done and in all.
 
     Raises:
@@ -189,10 +185,7 @@ def run_monte_carlo(
     """
     open_results(folder, "Monte Carlo", settings.fingerprint(), asdict(settings))
     job = (settings, load_plant(settings.plant))
-    run_chunks(
-        folder, _run_chunk, job, settings.chunks, scheduler=scheduler, workers=workers, client=client,
-        on_progress=on_progress,
-    )  # fmt: skip
+    run_chunks(folder, _run_chunk, job, settings.chunks, client=client, on_progress=on_progress)
     result = summarise(folder, settings)
     write_json(folder / "monte_carlo.json", result)
     return result

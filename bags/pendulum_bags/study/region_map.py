@@ -197,8 +197,6 @@ def run_region_map(
     folder: Path,
     settings: RegionMap,
     *,
-    scheduler: str = "",
-    workers: int = 0,
     client: Any = None,
     on_progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> RegionResult:
@@ -207,9 +205,7 @@ def run_region_map(
     Args:
         folder: Where the files go; a folder of the same settings is gone on with.
         settings: What to map.
-        scheduler: Address of a Dask scheduler, ``tcp://...``; empty for none.
-        workers: Processes of a local Dask cluster; 0 runs in this process, on all cores.
-        client: A Dask client to use in place of either.
+        client: Of a Dask cluster (`cluster_client`); None runs in this process, on all cores.
         on_progress: Called with chunks done and in all.
 
     Raises:
@@ -217,10 +213,7 @@ def run_region_map(
     """
     job = (settings, settings.believed(), tuple(float(value) for value in settings.gain().K))
     open_results(folder, "map", settings.fingerprint(), asdict(settings))
-    run_chunks(
-        folder, _run_chunk, job, settings.chunks, scheduler=scheduler, workers=workers, client=client,
-        on_progress=on_progress,
-    )  # fmt: skip
+    run_chunks(folder, _run_chunk, job, settings.chunks, client=client, on_progress=on_progress)
     result = _summarise(folder, settings)
     write_columns(folder / "map.parquet", _map_columns(result))
     write_json(folder / "region.json", result.to_json())
