@@ -275,18 +275,21 @@ class Verdict:
         sentence: The verdict in words.
         tests: The tests.
         margins: What was asked for.
+        more_runs: Runs to record in addition for a decision; 0 where decided, None where more hardly help.
     """
 
     outcome: Outcome
     sentence: str
     tests: Sequence[EquivalenceTest]
     margins: Margins
+    more_runs: int | None = 0
 
     def as_dict(self) -> dict[str, Any]:
         """Return everything for JSON."""
         return {
             "outcome": self.outcome.value,
             "sentence": self.sentence,
+            "more_runs": self.more_runs,
             "margins": asdict(self.margins),
             "tests": [test.as_dict() for test in self.tests],
         }
@@ -304,6 +307,7 @@ def conclude(tests: Sequence[EquivalenceTest], margins: Margins, first: str, sec
     by_outcome = {outcome: [test for test in tests if test.outcome is outcome] for outcome in Outcome}
     different, undecided = by_outcome[Outcome.DIFFERENT], by_outcome[Outcome.UNDECIDED]
     whose = margins.whose
+    more: int | None = 0
     if different:
         outcome = Outcome.DIFFERENT
         what = "; ".join(_short(test) for test in different)
@@ -313,15 +317,15 @@ def conclude(tests: Sequence[EquivalenceTest], margins: Margins, first: str, sec
     elif undecided:
         outcome = Outcome.UNDECIDED
         counts = [test.more_runs for test in undecided]
-        runs = None if None in counts else max(count or 0 for count in counts)
+        more = None if None in counts else max(count or 0 for count in counts)
         what = ", ".join(test.quantity for test in undecided)
         text = (
-            f"Undecided whether {first} and {second} are equivalent within {whose} in {what}: {_more(runs)}."
+            f"Undecided whether {first} and {second} are equivalent within {whose} in {what}: {_more(more)}."
         )
     else:
         outcome = Outcome.EQUIVALENT
         text = f"{first} and {second} are equivalent within {whose}, in all {len(tests)} tests."
-    return Verdict(outcome, text[0].upper() + text[1:], tuple(tests), margins)
+    return Verdict(outcome, text[0].upper() + text[1:], tuple(tests), margins, more)
 
 
 def _short(test: EquivalenceTest) -> str:
