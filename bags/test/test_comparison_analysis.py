@@ -209,7 +209,9 @@ def test_verdict_is_the_worst_outcome_in_words() -> None:
     bad = equivalence_test("spread", "-", interval(3.0, 2.5, 3.5), 0.8, 1.25, ratio=True)
     open_ = equivalence_test("path", "-", interval(0.9, 0.5, 1.4), -math.inf, 1.0)
     assert conclude([good], Margins(), "simulation", "hardware").outcome is Outcome.EQUIVALENT
-    assert "record" in conclude([good, open_], Margins(), "simulation", "hardware").sentence
+    undecided = conclude([good, open_], Margins(), "simulation", "hardware")
+    assert undecided.more_runs == open_.more_runs
+    assert f"record {open_.more_runs} more run" in undecided.sentence
     verdict = conclude([good, open_, bad], Margins(stated=False), "simulation", "hardware")
     assert verdict.outcome is Outcome.DIFFERENT
     assert "not equivalent within the default margins (none were stated): spread is 3" in verdict.sentence
