@@ -86,6 +86,9 @@ class MetadataFile:
 
     def __init__(self, folder: Path, storage: str, ros_distro: str) -> None:
         self.path = folder / METADATA_NAME
+        # Made once: pathlib interns the parts of each new path, and twenty a second fill the interpreter's table of
+        # strings, which after ten minutes takes a megabyte more.
+        self._temporary = folder / f".{METADATA_NAME}.tmp"
         self._storage = storage
         self._ros_distro = ros_distro
         self._key: tuple[Any, ...] | None = None
@@ -136,12 +139,11 @@ class MetadataFile:
         self, topics: Sequence[TopicEntry], files: Sequence[FileEntry], custom_data: Mapping[str, str]
     ) -> None:
         """Write the file; a reader, and a kill at any moment, sees the old text or the new one."""
-        temporary = self.path.with_name(f".{self.path.name}.tmp")
         try:
-            temporary.write_text(self.render(topics, files, custom_data), encoding="utf-8")
-            os.replace(temporary, self.path)
+            self._temporary.write_text(self.render(topics, files, custom_data), encoding="utf-8")
+            os.replace(self._temporary, self.path)
         except OSError:
-            temporary.unlink(missing_ok=True)
+            self._temporary.unlink(missing_ok=True)
             raise
 
 
