@@ -1,4 +1,4 @@
-"""``make faults``: try every fault several times, print a table, write ``build/faults.json``."""
+"""``make faults``: try every fault several times, print a table, write ``build/faults.json`` and ``.md``."""
 
 from __future__ import annotations
 
@@ -34,6 +34,8 @@ from tests.faults.side_by_side import DOMAIN_TRIALS
 
 _TRIALS = (*CLOCK_TRIALS, *RESOURCE_TRIALS, *DOMAIN_TRIALS)
 
+_HEADINGS = ("fault", "tried", "survived", "data lost", "longest time to zero", "remarks")
+
 app = typer.Typer(add_completion=False, rich_markup_mode=None, pretty_exceptions_enable=False)
 
 
@@ -57,6 +59,12 @@ class Row:
     time_to_zero_s: float | None = None
     remarks: str = ""
 
+    def cells(self) -> tuple[str, ...]:
+        """Return what stands below ``_HEADINGS``."""
+        lost = "–" if self.lost_s is None else f"{self.lost_s:.3f} s"
+        to_zero = "–" if self.time_to_zero_s is None else f"{self.time_to_zero_s * 1e3:.0f} ms"
+        return self.fault, str(self.tried), str(self.survived), lost, to_zero, " ".join(self.remarks.split())
+
 
 @app.command(epilog="Example: python -m tests.faults.run --repetitions 3 --seed 7")
 def campaign(
@@ -65,7 +73,7 @@ def campaign(
     minutes: Annotated[float, typer.Option(help="How long each parser is attacked [min].", min=0.0)] = 1.0,
     only: Annotated[str, typer.Option(help="Try only the faults of running systems whose names match.")] = "",
     keep: Annotated[Path | None, typer.Option(help="New folder that keeps logs and bags.")] = None,
-    out: Annotated[Path, typer.Option(help="Where the rows are written, after each fault.")] = Path(
+    out: Annotated[Path, typer.Option(help="Where the rows go after each fault; Markdown beside it.")] = Path(
         "build", "faults.json"
     ),
     json_output: Annotated[bool, typer.Option("--json", help="Print the rows as JSON instead of a table.")] = False,
@@ -79,6 +87,7 @@ def campaign(
             rows.append(row)
             # What was tried for an hour is kept, whatever ends the next hour.
             write_json(out, [asdict(each) for each in rows])
+            out.with_suffix(".md").write_text(_markdown(rows), encoding="utf-8")
             sys.stderr.write(f"{row.fault}: {row.survived} of {row.tried}\n")
     except KeyboardInterrupt:
         interrupted = True
@@ -108,17 +117,15 @@ def _rows(repetitions: int, seed: int, minutes: float, only: str, keep: Path | N
 
 
 def _table(rows: Sequence[Row]) -> WholeTable:
-    table = WholeTable("fault", "tried", "survived", "data lost", "longest time to zero", "remarks", title="Faults")
+    table = WholeTable(*_HEADINGS, title="Faults")
     for row in rows:
-        table.add_row(
-            row.fault,
-            str(row.tried),
-            str(row.survived),
-            "–" if row.lost_s is None else f"{row.lost_s:.3f} s",
-            "–" if row.time_to_zero_s is None else f"{row.time_to_zero_s * 1e3:.0f} ms",
-            row.remarks,
-        )
+        table.add_row(*row.cells())
     return table
+
+
+def _markdown(rows: Sequence[Row]) -> str:
+    lines = [_HEADINGS, ("---",) * len(_HEADINGS), *(row.cells() for row in rows)]
+    return "".join(f"| {' | '.join(cell.replace('|', chr(92) + '|') for cell in line)} |\n" for line in lines)
 
 
 def _bridge_rows(repetitions: int) -> Iterator[Row]:
