@@ -48,9 +48,10 @@ def _twin_plant(name: str) -> Fault:
         seen = time.monotonic()
 
         def rests() -> bool:
-            # Long enough for a plant that is new here to have heard commands, and to have found out whom they answer.
+            # Long enough for a plant that is new here to have heard commands, and to have found out whom they answer:
+            # most of a second, for it may meet the controller half a second before it meets the other plant.
             efforts = of_second(time.monotonic() - 1.0)
-            return len(efforts) > 100 and not any(efforts)
+            return len(efforts) > 400 and not any(efforts)
 
         system.wait_for("the second plant to rest", rests, START_TIMEOUT)
         settled = time.monotonic()

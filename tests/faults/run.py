@@ -149,20 +149,21 @@ def _bridge_rows(repetitions: int) -> Iterator[Row]:
 
 def _live_rows(faults: Sequence[Fault], repetitions: int, seed: int, keep: Path | None) -> Iterator[Row]:
     generator = random.Random(seed)
-    with (
-        reserve_domain() as domain,
-        tempfile.TemporaryDirectory(prefix="pendulum_faults_") as temporary,
-        LiveSystem(folder := keep or Path(temporary), domain) as system,
-        Progress(transient=True, disable=not sys.stdout.isatty()) as progress,
-    ):
-        task = progress.add_task("", total=sum(fault.tries or repetitions for fault in faults))
-        for fault in faults:
-            outcomes = []
-            for _ in range(fault.tries or repetitions):
-                progress.update(task, description=fault.name)
-                outcomes.append(_try(system, fault, generator))
-                progress.advance(task)
-            yield _row(fault.name, outcomes)
+    with reserve_domain() as domain, tempfile.TemporaryDirectory(prefix="pendulum_faults_") as temporary:
+        folder = keep or Path(temporary)
+        with (
+            LiveSystem(folder, domain) as system,
+            Progress(transient=True, disable=not sys.stdout.isatty()) as progress,
+        ):
+            task = progress.add_task("", total=sum(fault.tries or repetitions for fault in faults))
+            for fault in faults:
+                outcomes = []
+                for _ in range(fault.tries or repetitions):
+                    progress.update(task, description=fault.name)
+                    outcomes.append(_try(system, fault, generator))
+                    progress.advance(task)
+                yield _row(fault.name, outcomes)
+        # Now that the last bag is closed, too: what came late to its recorder is in it, or counted.
         yield _property_row(folder)
 
 
