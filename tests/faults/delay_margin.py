@@ -131,7 +131,6 @@ class LossReport:
         loss: Share of frames lost, each way.
         std_theta: [rad].
         longest: Longest time without torque [s].
-        answered: Share of the states that were answered.
         idle: Share of the states at which no torque acted: commands had become too old.
         held: Whether the pendulum stayed up.
     """
@@ -139,7 +138,6 @@ class LossReport:
     loss: float
     std_theta: float
     longest: float
-    answered: float
     idle: float
     held: bool
 
@@ -267,15 +265,13 @@ def _step(bag: Path, delay: float, began_ns: int, ended_ns: int, *, held: bool) 
 
 def _loss(bag: Path, loss: float, began_ns: int, ended_ns: int, held: bool) -> LossReport:
     start = began_ns + min(_SETTLE_NS, (ended_ns - began_ns) // 3)
-    with read_bag(bag, [_STATES, _COMMANDS, _APPLIED], start=start, stop=ended_ns) as opened:
-        states, commands = opened.array(_STATES), opened.array(_COMMANDS)
-        applied = opened.array(_APPLIED)
+    with read_bag(bag, [_STATES, _APPLIED], start=start, stop=ended_ns) as opened:
+        states, applied = opened.array(_STATES), opened.array(_APPLIED)
     driven = applied["stamp_ns"][applied["effort"] != 0.0]
     return LossReport(
         loss=loss,
         std_theta=float(np.std(wrap(states["position"] - UPRIGHT))),
         longest=max(float(np.max(np.diff(driven), initial=0) / NANOSECONDS) - PERIOD, 0.0),
-        answered=len(np.unique(commands["stamp_ns"])) / len(np.unique(states["stamp_ns"])),
         idle=float(np.mean(applied["effort"] == 0.0)),
         held=held,
     )
@@ -297,9 +293,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         sys.stdout.write(f"{report.sentence()}\n")
         for lost in survive_loss(Path(folder, "loss"), LOSSES):
             sys.stdout.write(
-                f"{100.0 * lost.loss:g} % of frames lost each way, 5 ms delay: {100.0 * lost.answered:.1f} % of states "
-                f"answered, no torque in {100.0 * lost.idle:.1f} % of the periods, at most "
-                f"for {lost.longest * 1e3:.0f} ms, std of theta {lost.std_theta:.4f} rad, "
+                f"{100.0 * lost.loss:g} % of frames lost each way, 5 ms delay: no torque in {100.0 * lost.idle:.1f} % "
+                f"of the periods, at most for {lost.longest * 1e3:.0f} ms, std of theta {lost.std_theta:.4f} rad, "
                 f"{'stands' if lost.held else 'falls'}\n"
             )
     return 0

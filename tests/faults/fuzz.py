@@ -15,7 +15,7 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -91,9 +91,8 @@ def too_slow(*_: object) -> None:
     raise TimeoutError(f"reading took more than {PATIENCE} s of computing, or ten times that of waiting")
 
 
-def fuzz_all(seconds: float, seed: int, keep: Path | None = None, only: str = "") -> list[dict[str, Any]]:
-    """Try every parser, each in a process of its own, and return a row for each."""
-    rows = []
+def fuzz_all(seconds: float, seed: int, keep: Path | None = None, only: str = "") -> Iterator[dict[str, Any]]:
+    """Try every parser, each in a process of its own, and yield a row for each."""
     for parser in PARSERS:
         if only and only not in parser.name:
             continue
@@ -108,12 +107,11 @@ def fuzz_all(seconds: float, seed: int, keep: Path | None = None, only: str = ""
             check=False,
         )
         if done.returncode == 0:
-            rows.append(json.loads(done.stdout.splitlines()[-1]))
+            yield json.loads(done.stdout.splitlines()[-1])
         else:
             tail = (done.stderr.strip().splitlines() or ["no word"])[-1]
             row = {"parser": parser.name, "tried": 0, "findings": {f"ended with {done.returncode}: {tail}": 1}}
-            rows.append({**row, "slowest_s": 0.0})
-    return rows
+            yield {**row, "slowest_s": 0.0}
 
 
 @app.command(epilog="Example: python -m tests.faults.fuzz --minutes 10 --seed 7")
@@ -133,7 +131,7 @@ def fuzz(
         bound_memory()
         print(json.dumps(fuzz_one(parser, minutes * 60.0, seed, keep)))
         return 0
-    rows = fuzz_all(minutes * 60.0, seed, keep, only)
+    rows = list(fuzz_all(minutes * 60.0, seed, keep, only))
     if as_json:
         print(json.dumps(rows, indent=2))
         return 1 if any(row["findings"] for row in rows) else 0

@@ -210,7 +210,7 @@ def recorder_runs_out_of_memory(folder: Path, headroom: int = 48 << 20) -> Outco
         _demand_sentence(outcome, "recorder", child.process.poll(), child.log.read_text(), *_SHORT_OF_MEMORY)
         kept = _states_in(bag)
         outcome.demand(kept >= sealed >= _ENOUGH, f"{kept} states in the bag, {sealed} were sealed")
-        outcome.detail = outcome.detail or child.last_words(1)[-80:]
+        outcome.detail = outcome.detail or f"ended by itself; {kept} states in the bag, {sealed} were sealed"
     return outcome
 
 

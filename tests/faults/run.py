@@ -226,7 +226,7 @@ def _try_cuts(name: str, folder: Path) -> Row:
 
 def _try_losses(name: str, folder: Path) -> Row:
     reports = survive_loss(folder, LOSSES)
-    told = "; ".join(f"{100.0 * one.loss:g} %: {100.0 * one.answered:.0f} % of states answered" for one in reports)
+    told = "; ".join(f"{100.0 * one.loss:g} %: no torque in {100.0 * one.idle:.1f} % of periods" for one in reports)
     # What follows a fall is not tried any more.
     return Row(name, len(reports), sum(one.held for one in reports), remarks=told)
 
