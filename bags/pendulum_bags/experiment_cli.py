@@ -16,7 +16,7 @@ from rich.console import Console
 from pendulum_bags.experiment.domain import check_domain
 from pendulum_bags.experiment.progress import PhaseProgress
 from pendulum_bags.experiment.run_folder import create_run_folder, discard_if_empty, versions, write_json
-from pendulum_bags.experiment.settings import NoiseSettings, RegulationSettings
+from pendulum_bags.experiment.settings import TIME_BESIDE_NOISE, NoiseSettings, RegulationSettings
 from pendulum_bags.experiment_trials_cli import add_commands as add_trial_commands
 from pendulum_bags.leaderboard_cli import leaderboard
 from pendulum_bags.monte_carlo_cli import monte_carlo
@@ -36,9 +36,6 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     add_completion=False,
 )
-
-_EXPECTED_BESIDE_NOISE = 47.0
-"""Expected length of the thesis's experiment without its noise; 31 s are the ramps [s]."""
 
 Plant = Annotated[
     str, typer.Option(help="Preset or plant file of the simulated plant, and of the controller's design.")
@@ -99,7 +96,7 @@ def thesis(
     console = make_console(stderr=json_output, highlight=False)
     started = time.monotonic()
     try:
-        with PhaseProgress(_EXPECTED_BESIDE_NOISE + duration, console) as progress:
+        with PhaseProgress(TIME_BESIDE_NOISE + duration, console) as progress:
             run_thesis(folder, settings, domain, progress)
             progress.phase("comparing", 5.0)
             summary = _analyse(folder, settings)
@@ -116,7 +113,7 @@ def thesis(
         _print_summary(console, summary)
         if more := summary["verdict"]["more_runs"]:
             # What decides is how long the noise lasts, in many runs or in one.
-            console.print(f"(or one run with --duration {math.ceil(duration * (1 + more)):g})")
+            console.print(f"(or one run with --duration {math.ceil(duration * (1 + more))})")
     elapsed = time.monotonic() - started
     console.print(
         f"\nreport  {folder / 'report.html'}\nbags    {folder / 'sim'}, {folder / 'hw'}\n({elapsed:.0f} s)",

@@ -282,7 +282,7 @@ class Verdict:
     sentence: str
     tests: Sequence[EquivalenceTest]
     margins: Margins
-    more_runs: int | None = 0
+    more_runs: int | None
 
     def as_dict(self) -> dict[str, Any]:
         """Return everything for JSON."""

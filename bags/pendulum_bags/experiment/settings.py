@@ -13,9 +13,11 @@ from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.graph import NodeProgram
 from pendulum_msgs_py.plant_parameters import load_plant
 
-__all__ = ["HARDWARE", "NoiseSettings", "RegulationSettings"]
+__all__ = ["HARDWARE", "TIME_BESIDE_NOISE", "NoiseSettings", "RegulationSettings"]
 
 HARDWARE = ("emulator", "hebi")
+TIME_BESIDE_NOISE = 47.0
+"""Wall time of the thesis's experiment without its noise, measured on two cores; 31 s are the ramps [s]."""
 
 
 @dataclass(frozen=True)

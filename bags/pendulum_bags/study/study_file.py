@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from pendulum_bags.experiment.run_spec import CLOCKS, PERIODS, RunSpec
+from pendulum_bags.experiment.settings import TIME_BESIDE_NOISE
 from pendulum_bags.study.located import LocatedMapping
 from pendulum_msgs_py import noise
 from pendulum_msgs_py.angles import UPRIGHT
@@ -37,7 +38,6 @@ _NODE_START = 5.0
 _SECONDS_PER_STEP = 1.5e-3
 _BYTES_PER_STEP = {"sim": 600, "hw": 1300}
 _BYTES_PER_RUN = 60_000
-_THESIS_SECONDS = 52.0
 _THESIS_BYTES = 25_000_000
 _TRIAL_SECONDS = {"inertia_damping": 7.0, "gravity": 17.0}
 _TRIAL_BYTES = {"inertia_damping": 2_500_000, "gravity": 14_000_000}
@@ -257,11 +257,9 @@ def _named_runs(
         if experiment == "thesis":
             arguments += ["--strategy", str(settings.get("strategy", "direct_pwm"))]
             arguments += _thesis_arguments(controllers[controller], controller, disturbances[disturbance])
-            arguments += [
-                "--duration",
-                repr(_duration(file)),
-            ]
-            seconds, size = _THESIS_SECONDS, _THESIS_BYTES
+            duration = _duration(file)
+            arguments += ["--duration", repr(duration)]
+            seconds, size = TIME_BESIDE_NOISE + duration, _THESIS_BYTES
         else:
             arguments += ["--trials", str(trials), *(["--realtime"] if clock == "realtime" else [])]
             seconds, size = trials * _TRIAL_SECONDS[experiment], trials * _TRIAL_BYTES[experiment]
