@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import time
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -54,11 +55,9 @@ def analyse(
     pieces = find_pieces(folders, questions)
     console = make_console(stderr=json_output, highlight=False)
     started = time.monotonic()
-    with (
-        counted_progress(console, "bags", len(pieces), out) as on_progress,
-        cluster_client(scheduler, workers) as client,
-    ):
-        table = analyse_bags(out, pieces, questions, client=client, on_progress=on_progress)
+    connect = partial(cluster_client, scheduler, workers)
+    with counted_progress(console, "bags", len(pieces), out) as on_progress:
+        table = analyse_bags(out, pieces, questions, connect=connect, on_progress=on_progress)
     if json_output:
         print(json.dumps({"bags": table.bags, "runs": table.runs}, indent=2))
     else:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import time
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -68,11 +69,9 @@ def monte_carlo(
         _replay(console, settings, replay, folder)
         return
     started = time.monotonic()
-    with (
-        counted_progress(console, "chunks", settings.chunks, folder) as on_progress,
-        cluster_client(scheduler, workers) as client,
-    ):
-        result = engine.run_monte_carlo(folder, settings, client=client, on_progress=on_progress)
+    connect = partial(cluster_client, scheduler, workers)
+    with counted_progress(console, "chunks", settings.chunks, folder) as on_progress:
+        result = engine.run_monte_carlo(folder, settings, connect=connect, on_progress=on_progress)
     if sobol:
         result["sobol"] = engine.sobol(settings, base=sobol)
     elapsed = time.monotonic() - started

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import time
+from functools import partial
 from pathlib import Path
 from typing import Annotated
 
@@ -64,11 +65,9 @@ def region_of_attraction(
     folder = out or Path("bags", "runs", "region_of_attraction")
     console = make_console(stderr=json_output, highlight=False)
     started = time.monotonic()
-    with (
-        counted_progress(console, "chunks", settings.chunks, folder) as on_progress,
-        cluster_client(scheduler, workers) as client,
-    ):
-        result = run_region_map(folder, settings, client=client, on_progress=on_progress)
+    connect = partial(cluster_client, scheduler, workers)
+    with counted_progress(console, "chunks", settings.chunks, folder) as on_progress:
+        result = run_region_map(folder, settings, connect=connect, on_progress=on_progress)
     picture = write_region_figure(folder / "region.png", result)
     if json_output:
         print(json.dumps(result.to_json(), indent=2))

@@ -5,7 +5,9 @@ from __future__ import annotations
 import json
 import os
 import signal
+from contextlib import nullcontext
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -87,6 +89,7 @@ def test_a_cluster_that_loses_a_worker_mid_run_gives_the_same_bits(tmp_path: Pat
     settings = replace(SMALL, chunk=50)
     here = run_monte_carlo(tmp_path / "here", settings)
     with cluster_client(workers=2) as client:
+        connect = partial(nullcontext, client)
         before = set(client.run(os.getpid).values())
         victim = max(before)
 
@@ -94,11 +97,11 @@ def test_a_cluster_that_loses_a_worker_mid_run_gives_the_same_bits(tmp_path: Pat
             if done == 1:
                 os.kill(victim, signal.SIGKILL)
 
-        cluster = run_monte_carlo(tmp_path / "cluster", settings, client=client, on_progress=kill)
+        cluster = run_monte_carlo(tmp_path / "cluster", settings, connect=connect, on_progress=kill)
         wait_for(lambda: len(client.scheduler_info()["workers"]) == 2, 30, "the cluster to replace its worker")
         after = set(client.run(os.getpid).values())
         pieces = find_pieces([EXAMPLES], ["metrics"])
-        bags = analyse_bags(tmp_path / "bags_there", pieces, ["metrics"], client=client)
+        bags = analyse_bags(tmp_path / "bags_there", pieces, ["metrics"], connect=connect)
     assert analyse_bags(tmp_path / "bags_here", pieces, ["metrics"]) == bags
     assert bags.failed == 0
     for name in ("bags.csv", "bags.json"):

@@ -12,7 +12,9 @@ import sys
 import tempfile
 import time
 from collections.abc import Iterator
+from contextlib import nullcontext
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 from pendulum_bags.study.bag_table import analyse_bags, find_pieces
@@ -94,10 +96,11 @@ def _dask(folder: Path) -> Iterator[Row]:
     results, walls = {}, {}
     for workers in (1, 2):
         with cluster_client(workers=workers) as client:
+            connect = partial(nullcontext, client)
             # Start and compilation happen once for each process, whatever the work: they are no question of scaling.
             client.run(run_chunk, replace(settings, runs=100, duration=0.1), 0, 1)
             began = time.perf_counter()
-            results[workers] = run_monte_carlo(folder / f"dask_{workers}", settings, client=client)
+            results[workers] = run_monte_carlo(folder / f"dask_{workers}", settings, connect=connect)
             walls[workers] = time.perf_counter() - began
     if results[1] != results[2]:
         raise AssertionError("one worker and two gave different results")
@@ -111,6 +114,7 @@ def _dask(folder: Path) -> Iterator[Row]:
     )
     lost = []
     with cluster_client(workers=2) as client:
+        connect = partial(nullcontext, client)
         victim = max(client.run(os.getpid).values())
 
         def kill(done: int, total: int) -> None:
@@ -118,7 +122,7 @@ def _dask(folder: Path) -> Iterator[Row]:
                 os.kill(victim, signal.SIGKILL)
                 lost.append(done)
 
-        result = run_monte_carlo(folder / "dask_killed", settings, client=client, on_progress=kill)
+        result = run_monte_carlo(folder / "dask_killed", settings, connect=connect, on_progress=kill)
         gone = victim not in client.run(os.getpid).values()
     if not lost or not gone:
         raise AssertionError("no worker was killed")
@@ -146,11 +150,12 @@ def _bags_on_dask(folder: Path) -> Iterator[Row]:
     walls = {}
     for workers in (1, 2):
         with cluster_client(workers=workers) as client:
+            connect = partial(nullcontext, client)
             warm = folder / f"warm_{workers}"
             for _ in range(workers):
-                analyse_bags(warm, pieces[:2], ["metrics", "identify"], client=client)
+                analyse_bags(warm, pieces[:2], ["metrics", "identify"], connect=connect)
                 shutil.rmtree(warm)
-            table = analyse_bags(folder / f"analysed_{workers}", pieces, ["metrics", "identify"], client=client)
+            table = analyse_bags(folder / f"analysed_{workers}", pieces, ["metrics", "identify"], connect=connect)
         if table != here:
             raise AssertionError("a cluster and this process gave different tables")
         walls[workers] = table.wall

@@ -12,6 +12,7 @@ import json
 import math
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import nullcontext
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -24,7 +25,7 @@ from pendulum_bags.comparison.run_data import plant_summary
 from pendulum_bags.experiment.run_folder import write_json
 from pendulum_bags.reader import Bag, read_bag
 from pendulum_bags.reader.statistics import bag_statistics
-from pendulum_bags.study.chunks import carry_out
+from pendulum_bags.study.chunks import Connect, carry_out
 from pendulum_msgs_py import names
 from pendulum_msgs_py.angles import UPRIGHT
 from pendulum_msgs_py.errors import BagError, DataError, ParameterError, PendulumError
@@ -117,7 +118,7 @@ def analyse_bags(
     pieces: Sequence[Piece],
     questions: Sequence[str],
     *,
-    client: Any = None,
+    connect: Connect = nullcontext,
     on_progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> Table:
     """Ask every piece what has not been answered yet, and write ``bags.csv``, ``runs.csv`` and their JSON.
@@ -126,8 +127,8 @@ def analyse_bags(
         folder: Where answers and tables go; with one answer a piece, it is gone on with.
         pieces: What to ask.
         questions: Names of ``QUESTIONS``.
-        client: Of a Dask cluster (`cluster_client`) that sees the bags under the same paths; None asks one after the
-            other in this process.
+        connect: To a Dask cluster (`cluster_client`) that sees the bags under the same paths; by default one after
+            the other is asked in this process.
         on_progress: Called with pieces done and in all.
     """
     began = time.monotonic()
@@ -140,7 +141,7 @@ def analyse_bags(
     on_progress(kept, len(pieces))
     job = (tuple(pieces), tuple(questions), str(folder.resolve()))
     missing = [index for index in range(len(pieces)) if index not in rows]
-    for index, found in carry_out(_ask, job, missing, client):
+    for index, found in carry_out(_ask, job, missing, connect):
         write_json(answers / f"{keys[index]}.json", found)
         rows[index] = found
         on_progress(len(rows), len(pieces))

@@ -9,7 +9,7 @@ from __future__ import annotations
 import json
 import logging
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -19,6 +19,7 @@ from pendulum_bags.experiment.run_folder import write_json
 from pendulum_msgs_py.errors import BagError, FaultError, ParameterError
 
 __all__ = [
+    "Connect",
     "carry_out",
     "chunk_path",
     "cluster_client",
@@ -30,6 +31,8 @@ __all__ = [
 
 Job = TypeVar("Job")
 Result = TypeVar("Result")
+Connect = Callable[[], AbstractContextManager[Any]]
+"""Connects to a Dask cluster when there is something to do: gives its client, or None for this process."""
 
 _CONNECT_TIMEOUT = 15.0
 
@@ -38,7 +41,7 @@ def carry_out(
     task: Callable[[Job, int, int | None], Result],
     job: Job,
     missing: Iterable[int],
-    client: Any = None,
+    connect: Connect = nullcontext,
 ) -> Iterator[tuple[int, Result]]:
     """Yield number and result of each piece, in the order in which they are finished.
 
@@ -47,16 +50,21 @@ def carry_out(
             for all.
         job: What all pieces have in common; it travels to the workers.
         missing: Numbers to carry out.
-        client: Of a Dask cluster; None carries out one after the other in this process.
+        connect: To a Dask cluster (`cluster_client`), not called where nothing is missing; by default one after the
+            other is carried out in this process.
 
     Raises:
-        FaultError: The cluster's workers keep dying.
+        FaultError: The scheduler cannot be reached, or its workers keep dying.
     """
-    if client is not None:
-        yield from _on_cluster(client, task, job, list(missing))
+    numbers = list(missing)
+    if not numbers:
         return
-    for number in missing:
-        yield number, task(job, number, None)
+    with connect() as client:
+        if client is not None:
+            yield from _on_cluster(client, task, job, numbers)
+            return
+        for number in numbers:
+            yield number, task(job, number, None)
 
 
 def run_chunks(
@@ -65,17 +73,17 @@ def run_chunks(
     job: Job,
     chunks: int,
     *,
-    client: Any = None,
+    connect: Connect = nullcontext,
     on_progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> None:
     """Carry out the chunks that are not on disk yet, and write the columns of each to a file of its own.
 
     Args:
         folder: Where the files go.
-        task: Returns the columns of a chunk; else as in ``carry_out``, like ``job`` and ``client``.
+        task: Returns the columns of a chunk; else as in ``carry_out``, like ``job`` and ``connect``.
         job: What all chunks have in common.
         chunks: How many there are.
-        client: Of a Dask cluster.
+        connect: To a Dask cluster.
         on_progress: Called with chunks done and in all.
 
     Raises:
@@ -84,7 +92,7 @@ def run_chunks(
     missing = [index for index in range(chunks) if not chunk_path(folder, index).is_file()]
     done = chunks - len(missing)
     on_progress(done, chunks)
-    for index, columns in carry_out(task, job, missing, client):
+    for index, columns in carry_out(task, job, missing, connect):
         write_columns(chunk_path(folder, index), columns)
         done += 1
         on_progress(done, chunks)

@@ -11,6 +11,7 @@ import json
 import math
 import warnings
 from collections.abc import Callable, Mapping
+from contextlib import nullcontext
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -19,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pendulum_bags.experiment.run_folder import write_json
-from pendulum_bags.study.chunks import chunk_path, open_results, read_columns, run_chunks
+from pendulum_bags.study.chunks import Connect, chunk_path, open_results, read_columns, run_chunks
 from pendulum_bags.study.uncertain import VARIED, Uncertainty, batch_variations
 from pendulum_lqr.design import continuous_lqr
 from pendulum_lqr.model import linearise
@@ -169,7 +170,7 @@ def run_monte_carlo(
     folder: Path,
     settings: MonteCarlo,
     *,
-    client: Any = None,
+    connect: Connect = nullcontext,
     on_progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> dict[str, Any]:
     """Run all chunks that are not on disk yet, one Parquet file each, and sum up.
@@ -177,7 +178,7 @@ def run_monte_carlo(
     Args:
         folder: Where the files go; a folder of the same settings is gone on with.
         settings: What to run.
-        client: Of a Dask cluster (`cluster_client`); None runs in this process, on all cores.
+        connect: To a Dask cluster (`cluster_client`); by default in this process, on all cores.
         on_progress: Called with chunks done and in all.
 
     Raises:
@@ -185,7 +186,7 @@ def run_monte_carlo(
     """
     open_results(folder, "Monte Carlo", settings.fingerprint(), asdict(settings))
     job = (settings, load_plant(settings.plant))
-    run_chunks(folder, _run_chunk, job, settings.chunks, client=client, on_progress=on_progress)
+    run_chunks(folder, _run_chunk, job, settings.chunks, connect=connect, on_progress=on_progress)
     result = summarise(folder, settings)
     write_json(folder / "monte_carlo.json", result)
     return result

@@ -11,6 +11,7 @@ import hashlib
 import json
 import math
 from collections.abc import Callable
+from contextlib import nullcontext
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -19,7 +20,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pendulum_bags.experiment.run_folder import write_json
-from pendulum_bags.study.chunks import chunk_path, open_results, read_columns, run_chunks, write_columns
+from pendulum_bags.study.chunks import (
+    Connect,
+    chunk_path,
+    open_results,
+    read_columns,
+    run_chunks,
+    write_columns,
+)
 from pendulum_bags.study.uncertain import VARIED, Uncertainty, batch_variations
 from pendulum_lqr.design import Gain, continuous_lqr
 from pendulum_lqr.model import linearise
@@ -197,7 +205,7 @@ def run_region_map(
     folder: Path,
     settings: RegionMap,
     *,
-    client: Any = None,
+    connect: Connect = nullcontext,
     on_progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> RegionResult:
     """Run what is not on disk yet, one Parquet file for each chunk, and write the map and its figures.
@@ -205,7 +213,7 @@ def run_region_map(
     Args:
         folder: Where the files go; a folder of the same settings is gone on with.
         settings: What to map.
-        client: Of a Dask cluster (`cluster_client`); None runs in this process, on all cores.
+        connect: To a Dask cluster (`cluster_client`); by default in this process, on all cores.
         on_progress: Called with chunks done and in all.
 
     Raises:
@@ -213,7 +221,7 @@ def run_region_map(
     """
     job = (settings, settings.believed(), tuple(float(value) for value in settings.gain().K))
     open_results(folder, "map", settings.fingerprint(), asdict(settings))
-    run_chunks(folder, _run_chunk, job, settings.chunks, client=client, on_progress=on_progress)
+    run_chunks(folder, _run_chunk, job, settings.chunks, connect=connect, on_progress=on_progress)
     result = _summarise(folder, settings)
     write_columns(folder / "map.parquet", _map_columns(result))
     write_json(folder / "region.json", result.to_json())
