@@ -1,0 +1,300 @@
+"""The answer to "is the simulation good enough to design a controller on?" as the sum of four layers of evidence.
+
+Each layer answers a question of its own, with a mark, a sentence, evidence with intervals, and what to do next. A layer
+is a value: whoever measures it makes a :class:`LayerResult`, and :func:`sum_up` makes one answer of those there are.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from enum import Enum
+from pathlib import Path
+from typing import Any
+
+from pendulum_msgs_py.errors import DataError
+
+__all__ = [
+    "Answer",
+    "Evidence",
+    "Layer",
+    "LayerResult",
+    "Mark",
+    "not_measured",
+    "read_layers",
+    "sum_up",
+    "write_layer",
+]
+
+FOLDER = "layers"
+"""Folder within a run folder in which layers are kept, each in a file ``<key>.json``."""
+
+
+class Mark(str, Enum):
+    """What a layer, or one row of its evidence, says."""
+
+    YES = "yes"
+    NO = "no"
+    UNDECIDED = "undecided"
+    NOT_MEASURED = "not measured"
+
+
+class Layer(Enum):
+    """The four questions, from the narrowest to the widest."""
+
+    SAME_RUN = ("same_run", "same run", "Do both move alike under one controller and one disturbance?")
+    SAME_PLANT = ("same_plant", "same plant", "Where in frequency do the plants differ, and how surely?")
+    WHICH_CONTROLLERS = ("which_controllers", "which controllers", "Which designs are safe to carry over?")
+    SAME_CHOICE = ("same_choice", "same choice", "Would the simulation have picked the right controller?")
+
+    @property
+    def key(self) -> str:
+        """Name in JSON and of files."""
+        return self.value[0]
+
+    @property
+    def title(self) -> str:
+        """Name in tables."""
+        return self.value[1]
+
+    @property
+    def question(self) -> str:
+        """What it answers."""
+        return self.value[2]
+
+    @classmethod
+    def of(cls, key: str) -> Layer:
+        """Return the layer of a key.
+
+        Raises:
+            DataError: There is none.
+        """
+        for layer in cls:
+            if layer.key == key:
+                return layer
+        raise DataError(f"layer is {key!r}; expected one of {', '.join(layer.key for layer in cls)}")
+
+
+@dataclass(frozen=True)
+class Evidence:
+    """One measured quantity of a layer.
+
+    Args:
+        quantity: What was measured, in words.
+        unit: Its unit; empty for none.
+        estimate: Its value; None where it does not exist.
+        low: Lower end of its interval; None for none.
+        high: Upper end; None for none.
+        expected: What it was held against, in words, such as ``within ±0.3 deg``; empty where it only tells.
+        mark: What it says.
+        note: Anything that a reader must know.
+    """
+
+    quantity: str
+    unit: str
+    estimate: float | None
+    low: float | None = None
+    high: float | None = None
+    expected: str = ""
+    mark: Mark = Mark.UNDECIDED
+    note: str = ""
+
+    def to_json(self) -> dict[str, Any]:
+        """Return it as JSON values; numbers that do not exist are None."""
+        return {
+            "quantity": self.quantity,
+            "unit": self.unit,
+            "estimate": _finite(self.estimate),
+            "low": _finite(self.low),
+            "high": _finite(self.high),
+            "expected": self.expected,
+            "mark": self.mark.value,
+            "note": self.note,
+        }
+
+    @classmethod
+    def from_json(cls, content: Mapping[str, Any]) -> Evidence:
+        """Return the evidence that JSON values describe."""
+        return cls(**{**content, "mark": Mark(content["mark"])})
+
+
+@dataclass(frozen=True)
+class LayerResult:
+    """What one layer found.
+
+    Args:
+        layer: Which.
+        mark: Its answer.
+        sentence: The answer in words: one sentence that stands alone.
+        evidence: What it rests on.
+        next_steps: What to do next, one sentence or command each; empty where there is nothing to do.
+        reason: Half a sentence for the answer as a whole, without a full stop: why it says no or is undecided, such as
+            "the spread of the velocity is 31 % smaller on the hardware".
+        holds: Half a sentence: what may be relied on although another layer says no, such as "designs with a margin
+            above 0.21 stabilise the hardware too"; empty for nothing.
+    """
+
+    layer: Layer
+    mark: Mark
+    sentence: str
+    evidence: Sequence[Evidence] = ()
+    next_steps: Sequence[str] = ()
+    reason: str = ""
+    holds: str = ""
+
+    def to_json(self) -> dict[str, Any]:
+        """Return it as JSON values."""
+        return {
+            "layer": self.layer.key,
+            "name": self.layer.title,
+            "question": self.layer.question,
+            "mark": self.mark.value,
+            "sentence": self.sentence,
+            "evidence": [row.to_json() for row in self.evidence],
+            "next_steps": list(self.next_steps),
+            "reason": self.reason,
+            "holds": self.holds,
+        }
+
+    @classmethod
+    def from_json(cls, content: Mapping[str, Any]) -> LayerResult:
+        """Return the result that JSON values describe.
+
+        Raises:
+            DataError: They describe none.
+        """
+        try:
+            return cls(
+                Layer.of(content["layer"]),
+                Mark(content["mark"]),
+                str(content["sentence"]),
+                tuple(Evidence.from_json(row) for row in content["evidence"]),
+                tuple(map(str, content["next_steps"])),
+                str(content["reason"]),
+                str(content["holds"]),
+            )
+        except (KeyError, TypeError, ValueError) as error:
+            raise DataError(f"the content is no result of a layer: {error}") from error
+
+
+def not_measured(layer: Layer, how: str) -> LayerResult:
+    """Return the result of a layer that nobody measured.
+
+    Args:
+        layer: Which.
+        how: The command that measures it.
+    """
+    return LayerResult(layer, Mark.NOT_MEASURED, f"Not measured: {how} measures it.", next_steps=(how,))
+
+
+@dataclass(frozen=True)
+class Answer:
+    """The sum of all layers.
+
+    Args:
+        mark: Yes, no or undecided.
+        sentence: The answer in words.
+        layers: One result for each layer, in order.
+        next_steps: What to do next.
+    """
+
+    mark: Mark
+    sentence: str
+    layers: Sequence[LayerResult]
+    next_steps: Sequence[str]
+
+    def to_json(self) -> dict[str, Any]:
+        """Return it as JSON values."""
+        return {
+            "mark": self.mark.value,
+            "sentence": self.sentence,
+            "layers": [result.to_json() for result in self.layers],
+            "next_steps": list(self.next_steps),
+        }
+
+
+HOW = {
+    Layer.SAME_RUN: "make experiment",
+    Layer.SAME_PLANT: "python -m pendulum_bags experiment frequency_response",
+    Layer.WHICH_CONTROLLERS: "python -m pendulum_bags experiment frequency_response",
+    Layer.SAME_CHOICE: "python -m pendulum_bags experiment ranking",
+}
+"""The command that measures each layer."""
+
+
+def sum_up(results: Iterable[LayerResult], *, hardware: str = "hardware") -> Answer:
+    """Return one answer from the layers that were measured.
+
+    One layer that says no makes it no: each asks something that designing needs. It is yes where at least one layer was
+    measured and all of those say yes; the sentence then names what was not measured. What a layer certifies stays true
+    where another says no, and is said too.
+
+    Args:
+        results: At most one for each layer; the others count as not measured.
+        hardware: What the simulation was compared with, in words, such as ``the emulated hardware``.
+
+    Raises:
+        DataError: A layer was given twice.
+    """
+    given: dict[Layer, LayerResult] = {}
+    for result in results:
+        if result.layer in given:
+            raise DataError(f"layer {result.layer.title!r} was given twice; expected each once")
+        given[result.layer] = result
+    layers = tuple(given.get(layer) or not_measured(layer, HOW[layer]) for layer in Layer)
+    by_mark = {mark: [result for result in layers if result.mark is mark] for mark in Mark}
+    measured = [result for result in layers if result.mark is not Mark.NOT_MEASURED]
+    if by_mark[Mark.NO]:
+        mark = Mark.NO
+        text = f"No: {_reasons(by_mark[mark])}."
+    elif by_mark[Mark.UNDECIDED] or not measured:
+        mark = Mark.UNDECIDED
+        text = f"Undecided: {_reasons(by_mark[mark]) or 'nothing was measured'}."
+    else:
+        mark = Mark.YES
+        text = f"Yes: {_reasons(by_mark[mark])}."
+    holds = [result.holds for result in layers if result.holds and result.mark is Mark.YES]
+    if holds and mark is not Mark.YES:
+        text += f" What holds: {'; '.join(holds)}."
+    if mark is Mark.YES and by_mark[Mark.NOT_MEASURED]:
+        missing = " and ".join(f"“{result.layer.title}”" for result in by_mark[Mark.NOT_MEASURED])
+        text += f" Not measured: {missing}."
+    # What mends a no comes before what decides, and that before what was left out.
+    order = (*by_mark[Mark.NO], *by_mark[Mark.UNDECIDED], *by_mark[Mark.YES], *by_mark[Mark.NOT_MEASURED])
+    steps = tuple(dict.fromkeys(step for result in order for step in result.next_steps))
+    return Answer(mark, text.replace("the hardware", hardware), layers, steps)
+
+
+def write_layer(folder: Path, result: LayerResult) -> Path:
+    """Keep a layer's result in a run folder, where the report finds it; return the file."""
+    path = folder / FOLDER / f"{result.layer.key}.json"
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(json.dumps(result.to_json(), indent=2, allow_nan=False) + "\n", encoding="utf-8")
+    return path
+
+
+def read_layers(folder: Path) -> list[LayerResult]:
+    """Return the layers that are kept in a run folder, in order.
+
+    Raises:
+        DataError: A file holds no result of a layer.
+    """
+    found = []
+    for layer in Layer:
+        path = folder / FOLDER / f"{layer.key}.json"
+        if path.is_file():
+            try:
+                found.append(LayerResult.from_json(json.loads(path.read_text(encoding="utf-8"))))
+            except (ValueError, DataError) as error:
+                raise DataError(f"{path} holds no result of a layer: {error}") from error
+    return found
+
+
+def _reasons(results: Sequence[LayerResult]) -> str:
+    return "; ".join(result.reason or result.sentence.rstrip(".") for result in results)
+
+
+def _finite(value: float | None) -> float | None:
+    return float(value) if value is not None and math.isfinite(value) else None

@@ -1,0 +1,71 @@
+"""The answer as the sum of its layers."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from pendulum_bags.verdict import Evidence, Layer, LayerResult, Mark, read_layers, sum_up, write_layer
+from pendulum_msgs_py.errors import DataError
+
+
+def result(layer: Layer, mark: Mark, **more: str) -> LayerResult:
+    row = Evidence("spread of angle", "rad", 1.2, 1.1, float("nan"), "within ±25 %", mark)
+    steps = (f"mend {layer.title}",) if mark is not Mark.YES else ()
+    return LayerResult(layer, mark, f"{layer.title} says {mark.value}.", (row,), steps, **more)
+
+
+def test_one_layer_that_says_no_makes_it_no_and_what_another_certifies_is_still_told() -> None:
+    answer = sum_up(
+        [
+            result(
+                Layer.WHICH_CONTROLLERS,
+                Mark.YES,
+                holds="designs with a margin above 0.21 stabilise the hardware",
+            ),
+            result(Layer.SAME_RUN, Mark.NO, reason="the hardware moves 31 % less"),
+        ],
+        hardware="the emulated hardware",
+    )
+    assert answer.mark is Mark.NO
+    assert answer.sentence == (
+        "No: the emulated hardware moves 31 % less. "
+        "What holds: designs with a margin above 0.21 stabilise the emulated hardware."
+    )
+    assert [one.layer for one in answer.layers] == list(Layer)
+    assert answer.next_steps[0] == "mend same run"
+
+
+def test_yes_needs_all_measured_layers_and_names_those_that_were_not() -> None:
+    answer = sum_up([result(Layer.SAME_RUN, Mark.YES), result(Layer.SAME_PLANT, Mark.YES)])
+    assert answer.mark is Mark.YES
+    assert answer.sentence.endswith("Not measured: “which controllers” and “same choice”.")
+    assert "python -m pendulum_bags experiment ranking" in answer.next_steps
+    assert sum_up([result(layer, Mark.YES) for layer in Layer]).sentence.count("Not measured") == 0
+
+
+def test_undecided_is_neither_and_nothing_measured_is_undecided() -> None:
+    assert (
+        sum_up([result(Layer.SAME_RUN, Mark.YES), result(Layer.SAME_PLANT, Mark.UNDECIDED)]).mark
+        is Mark.UNDECIDED
+    )
+    nothing = sum_up([])
+    assert nothing.mark is Mark.UNDECIDED
+    assert nothing.next_steps[0] == "make experiment"
+
+
+def test_a_layer_given_twice_is_refused() -> None:
+    with pytest.raises(DataError, match="layer 'same run' was given twice"):
+        sum_up([result(Layer.SAME_RUN, Mark.YES), result(Layer.SAME_RUN, Mark.NO)])
+
+
+def test_layers_kept_in_a_run_folder_are_read_back(tmp_path: Path) -> None:
+    kept = result(Layer.SAME_CHOICE, Mark.NO, reason="the pick costs 12 % more")
+    write_layer(tmp_path, kept)
+    (back,) = read_layers(tmp_path)
+    assert back.evidence[0].high is None
+    assert back.to_json() == kept.to_json()
+    (tmp_path / "layers" / "same_run.json").write_text("{}")
+    with pytest.raises(DataError, match=r"same_run.json holds no result of a layer"):
+        read_layers(tmp_path)
