@@ -15,9 +15,10 @@ from typing import TypeVar
 import pytest
 
 from pendulum_bags.experiment.domain import reserve_domain
+from tests.mcap_js_reader import McapJs, mcap_js_process
 from tests.processes import ProcessGroup
 
-__all__ = ["PROJECT", "domain_id", "processes", "shared_data", "wait_for"]
+__all__ = ["PROJECT", "domain_id", "mcap_js", "processes", "shared_data", "wait_for"]
 
 PROJECT = Path(__file__).resolve().parents[1]
 """The repository."""
@@ -58,6 +59,13 @@ def shared_data() -> Path:
     if not folder.is_dir():
         pytest.skip(f"no recordings of real pendulums at {folder}; PENDULUM_SHARED_DATA names their folder")
     return folder
+
+
+@pytest.fixture(scope="session")
+def mcap_js() -> Iterator[McapJs]:
+    """Offer the JavaScript readers of MCAP; tests skip where Node.js cannot be had."""
+    with mcap_js_process() as readers:
+        yield readers
 
 
 @pytest.fixture

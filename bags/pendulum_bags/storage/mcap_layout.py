@@ -8,8 +8,9 @@ reader skips::
                                    ^ settled_end  ^ area.start    ^ area.stop
 
 A chunk is written into room that no reader sees, and the summary that lists it into whichever of the two places the
-footer does not point to. Two small writes then make it visible: a record head (opcode and length, for readers that go
-through the file in order) and the footer (for readers that use the index).
+footer does not point to, each with a data end right before it, where Foxglove's reader looks for one. Two small writes
+then make it visible: a record head (opcode and length, for readers that go through the file in order) and the footer
+(for readers that use the index).
 
 What is sealed many times a second makes small chunks, and an index that grows with each of them: hours of them would
 cost more to list than to write. So small chunks are only staged. When enough have come together, one large chunk with
@@ -22,8 +23,9 @@ When the room is used up, one write far beyond the end moves the end of the file
 occupies no disk. ``finish`` puts summary and footer right behind the data and cuts the rest off.
 
 Each of these commits lies within one page of memory, which the kernel copies as a whole: a process that is killed
-between any two instructions leaves the state before or after, never between. (A power failure is another matter,
-because the disk may reorder pages: ``sync`` bounds what it can cost.)
+between any two instructions leaves the state before or after, never between. (One reader notices the moment at which
+the end of the file moves: that of Foxglove for streams insists on nothing behind the last record. A power failure is
+another matter, because the disk may reorder pages: ``sync`` bounds what it can cost.)
 """
 
 from __future__ import annotations
@@ -103,7 +105,7 @@ class McapLayout:
             self._size = _FIRST_ROOM + _FIRST_ROOM // 2 + 2 * _FIRST_SLOT
             self._slots = self._place_slots(_FIRST_SLOT)
             self._area = self._next_area = _Area(
-                self._slots[0].start - _FIRST_ROOM // 2, self._slots[0].start
+                self._slots[0].start - _FIRST_ROOM // 2, self._slots[0].start - len(_DATA_END)
             )
             self._cursor = self._area.start
             self._write(header + rec.padding_head(len(header), self._tail), 0)
@@ -301,8 +303,11 @@ class McapLayout:
             body = summary.staged[slot.staged :]
         tail, offsets_start = summary.tail(slot.start)
         end = start + len(body) + len(tail)
-        if end + _HEAD > slot.start + slot.capacity:
+        # Before a summary stands a data end: that of the next slot is the last thing in this one.
+        if end + _HEAD > slot.start + slot.capacity - len(_DATA_END):
             return False
+        if slot.described < 0:
+            self._write(_DATA_END, slot.start - len(_DATA_END))
         self._write(b"".join([body, tail, rec.padding_head(end, self._summary_stop)]), start)
         slot.described, slot.settled = len(description), len(summary.settled)
         slot.group, slot.staged = summary.group, len(summary.staged)
@@ -323,7 +328,7 @@ class McapLayout:
             content = os.pread(self._fd, live.offsets_start - live.start, live.start)
             padding = rec.padding_head(keeper.start + len(content), self._summary_stop)
             keeper.described = -1
-            self._write(content + padding, keeper.start)
+            self._write(_DATA_END + content + padding, keeper.start - len(_DATA_END))
             # ... then the end of the file moves there in one write (offsets name absolute places: the copy has none).
             self._write(_DATA_END + rec.footer_record(keeper.start, 0) + rec.MAGIC, self._tail)
         except OSError:
@@ -338,7 +343,7 @@ class McapLayout:
             raise BagError(f"{self.path}: a summary outgrew the {capacity} bytes that were made for it")
         self._write(self._tail_bytes(slots[0]), self._tail)
         self._slots, self._live = slots, 0
-        self._next_area = _Area(slots[0].start - staging, slots[0].start)
+        self._next_area = _Area(slots[0].start - staging, slots[0].start - len(_DATA_END))
         if self._chain_end == self.settled_end:
             self._area = self._next_area
             self._cursor = self._area.start

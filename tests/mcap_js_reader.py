@@ -1,0 +1,91 @@
+"""The JavaScript readers of MCAP, as tests ask them: those with which Foxglove and its kin open our files."""
+
+from __future__ import annotations
+
+import fcntl
+import json
+import os
+import shutil
+import subprocess
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+__all__ = ["McapJs", "mcap_js_process"]
+
+_FOLDER = Path(__file__).resolve().parent / "mcap_js"
+
+
+@dataclass
+class McapJs:
+    """A process that reads one file after the other."""
+
+    process: subprocess.Popen[str]
+
+    def read(self, file: Path) -> dict[str, Any]:
+        """Return what both readers found: ``byIndex`` and ``inOrder``, each with ``count`` and ``sha256`` of the data."""
+        assert self.process.stdin is not None
+        assert self.process.stdout is not None
+        self.process.stdin.write(f"{file}\n")
+        self.process.stdin.flush()
+        line = self.process.stdout.readline()
+        assert line, f"the JavaScript reader ended at {file}"
+        return dict(json.loads(line))
+
+    def counts(self, file: Path) -> tuple[int, int]:
+        """Return how many messages the reader by index and the reader in order found; both must open the file."""
+        answer = self.read(file)
+        for name, found in answer.items():
+            assert "error" not in found, f"{name}: {found['error']}"
+        assert answer["inOrder"]["done"], "the reader in order waits for more"
+        return answer["byIndex"]["count"], answer["inOrder"]["count"]
+
+
+def _skip(reason: str) -> None:
+    pytest.skip(f"the JavaScript readers of MCAP cannot be had here: {reason}")
+
+
+def _install() -> None:
+    """Install the packages of the lock beside the script, once for all test runs on this checkout."""
+    for program in ("node", "npm"):
+        if shutil.which(program) is None:
+            _skip(f"{program} is not installed")
+    folder = os.open(_FOLDER, os.O_RDONLY)
+    try:
+        fcntl.flock(folder, fcntl.LOCK_EX)
+        mark = _FOLDER / "node_modules" / ".of_lock"
+        lock = (_FOLDER / "package-lock.json").read_text(encoding="utf-8")
+        if mark.is_file() and mark.read_text(encoding="utf-8") == lock:
+            return
+        command = ["npm", "ci", "--ignore-scripts", "--no-audit", "--no-fund", "--silent"]
+        try:
+            done = subprocess.run(command, cwd=_FOLDER, capture_output=True, text=True, timeout=60, check=False)
+        except subprocess.TimeoutExpired:
+            _skip("npm found no registry within 60 s")
+        if done.returncode:
+            reason = (done.stderr or done.stdout).strip().splitlines()
+            _skip(f"npm ci failed ({reason[0] if reason else done.returncode})")
+        mark.write_text(lock, encoding="utf-8")
+    finally:
+        os.close(folder)
+
+
+@contextmanager
+def mcap_js_process() -> Iterator[McapJs]:
+    """Start the readers; skip the test where Node.js or its packages cannot be had."""
+    _install()
+    process = subprocess.Popen(
+        ["node", str(_FOLDER / "read.mjs")], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+    )
+    try:
+        yield McapJs(process)
+    finally:
+        assert process.stdin is not None
+        process.stdin.close()
+        process.wait(timeout=20)
+        assert process.stdout is not None
+        process.stdout.close()
