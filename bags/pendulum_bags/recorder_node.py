@@ -70,7 +70,7 @@ class Recorder(PollingNode):
         self._started = time.monotonic()
         self._newest_stamp = 0
         self._unstamped: list[tuple[Tap, int, bytes]] = []
-        self._refused_types: set[str] = set()
+        self._refused: dict[str, str] = {}
         self._lock = threading.RLock()
         self._events = f"{self.get_fully_qualified_name()}/{EVENTS}"
         self._settings = NodeParameters(self, SPECS, self._on_parameters)
@@ -125,12 +125,12 @@ class Recorder(PollingNode):
             session.update_metadata({"pendulum.parameters": self._parameter_reader.values})
             self._session = None
             report = session.close()
+        report.unrecorded = self._options.unmet(self._taps) | self._refused
         self.reports.append(report)
-        failed = bool(report.lost or report.error)
-        self.exit_code = 1 if failed else self.exit_code
+        self.exit_code = 1 if report.failed else self.exit_code
         print(
-            f"{'error: ' if failed else ''}recorded {report.sentence()}",
-            file=sys.stderr if failed else sys.stdout,
+            f"{'error: ' if report.failed else ''}recorded {report.sentence()}",
+            file=sys.stderr if report.failed else sys.stdout,
             flush=True,
         )
         return report
@@ -206,9 +206,7 @@ class Recorder(PollingNode):
     def _offer(
         self, tap: Tap, session: RecordingSession, items: Sequence[tuple[int, bytes]], missing: int = 0
     ) -> None:
-        if tap.announced is not session:
-            session.add_topic(tap.topic, tap.type, tap.qos)
-            tap.announced = session
+        tap.announce(session)
         if missing and tap.is_settling:
             self._tell_early(tap, session, missing)
             missing = 0
@@ -223,6 +221,7 @@ class Recorder(PollingNode):
             )
 
     def _tell_early(self, tap: Tap, session: RecordingSession, count: int) -> None:
+        tap.announce(session)
         session.note_early(tap.topic, count)
         self.get_logger().warning(
             f"{count} messages of {tap.topic} are not recorded: they were published before the subscription was "
@@ -257,6 +256,8 @@ class Recorder(PollingNode):
             publishers = self.get_publishers_info_by_topic(topic)
             if not publishers:
                 continue
+            if tap is not None and {p.topic_type for p in publishers} != {tap.type_name}:
+                types = sorted({tap.type_name, *(p.topic_type for p in publishers)})
             if len(types) > 1:
                 self._refuse(topic, f"it has the types {', '.join(types)}; expected one")
                 continue
@@ -283,8 +284,8 @@ class Recorder(PollingNode):
         print(f"subscribed to {topic} ({publishers[0].topic_type})", flush=True)
 
     def _refuse(self, topic: str, reason: str) -> None:
-        if topic not in self._refused_types:
-            self._refused_types.add(topic)
+        if topic not in self._refused:
+            self._refused[topic] = reason
             self.get_logger().error(f"{topic} is NOT recorded: {reason}")
 
     # -- events, parameters, services --------------------------------------------------------------------------
@@ -324,7 +325,7 @@ class Recorder(PollingNode):
 
     def _on_stop(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         report = self._end()
-        response.success = report is not None and not report.lost and not report.error
+        response.success = report is not None and not report.failed
         response.message = report.sentence() if report is not None else "nothing is being recorded"
         return response
 

@@ -93,6 +93,12 @@ class Tap:
         reliable, latched = wanted_qos(publishers)
         return (reliable or not self.reliable) and (latched or not self.latched)
 
+    def announce(self, session: RecordingSession) -> None:
+        """See that a session knows the topic, before anything of it is told or offered."""
+        if self.announced is not session:
+            session.add_topic(self.topic, self.type, self.qos)
+            self.announced = session
+
     def take(self) -> Iterator[tuple[int, bytes, int]]:
         """Yield what has arrived: time of arrival [ns] or 0, CDR bytes, and messages that are missing before it."""
         see, trim = self._gaps.see, self._trim

@@ -24,10 +24,12 @@ from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64, String
 from std_srvs.srv import Trigger
 
+from pendulum_bags import recorder_tap_node
 from pendulum_bags.reader import read_bag, same_messages
 from pendulum_bags.record_cli import main as record_main
 from pendulum_bags.recorder import GapCounter, RecordingSession, stamp_reader
 from pendulum_bags.recorder.options import RecorderOptions
+from pendulum_bags.recorder_node import Recorder
 from pendulum_bags.storage import message_type, open_writer
 from pendulum_msgs_py.cdr import encode_joint_state
 from pendulum_msgs_py.errors import ParameterError
@@ -172,6 +174,49 @@ def test_a_disk_that_fails_ends_the_session_in_a_sentence(
     assert report.sentence().endswith("stopped because no space left on device")
     assert (report.written, report.lost) == (1, 1)
     assert read_bag(tmp_path / "bag")["/a"]["stamp_ns"].tolist() == [1]
+
+
+def test_a_topic_that_appears_after_the_disk_failed_is_counted_as_lost(tmp_path: Path) -> None:
+    session = RecordingSession(open_writer(tmp_path / "bag"))
+    session.fail(MemoryError())
+    session.add_topic("/late", message_type(JOINT_STATE), ())
+    session.note_early("/late", 3)
+    session.note_missing("/late", 2)
+    session.offer("/late", [(1, encode_joint_state(1, position=1.0))])
+    report = session.close()
+    assert "LOST 3 of 3 (/late 3)" in report.sentence()
+    assert "/late 3; stopped because memory is exhausted" in report.sentence()
+
+
+def test_a_topic_that_appears_while_the_disk_fails_ends_no_recorder(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The thread that writes meets the failure, and closes the bag, while another announces a topic."""
+    session = RecordingSession(open_writer(tmp_path / "bag"))
+    add_topic = session.writer.add_topic
+
+    def fail_first(*arguments: Any) -> None:
+        session.fail(OSError(28, "No space left on device"))
+        add_topic(*arguments)
+
+    monkeypatch.setattr(session.writer, "add_topic", fail_first)
+    session.add_topic("/late", message_type(JOINT_STATE), ())
+    session.offer("/late", [(1, encode_joint_state(1, position=1.0))])
+    assert "LOST 1 of 1 (/late 1); stopped because no space left" in session.close().sentence()
+
+
+def test_what_was_asked_for_and_never_came_is_named() -> None:
+    some = RecorderOptions(Path("bag"), ("/a", "/b", "/left"), "^/sim/", "left")
+    assert some.unmet(["/a", "/sim/x"]) == {
+        "/b": "nobody published it",
+        "/left": "it is left out by the pattern of exclude",
+    }
+    assert some.unmet(["/a", "/b"]) == {
+        "/left": "it is left out by the pattern of exclude",
+        "topics that match '^/sim/'": "nobody published any",
+    }
+    assert RecorderOptions(Path("bag")).unmet([]) == {"any topic": "nobody published one"}
+    assert not RecorderOptions(Path("bag")).unmet(["/a"])
 
 
 @pytest.mark.parametrize(
@@ -358,6 +403,55 @@ def test_recording_starts_and_stops_by_service_and_by_header_time(
     assert first["/joint_states"]["log_time_ns"].tolist() == list(range(1000, 1050))
     assert first["/plain"][0].log_time_ns < 1050  # wall time and header time must not mix
     assert second["/joint_states"]["position"].tolist() == [2.0] * 50
+
+
+def test_a_topic_that_nobody_publishes_is_named_and_fails(tmp_path: Path, processes: ProcessGroup, node: Node) -> None:
+    there = node.create_publisher(Float64, "/there", qos.STATE)
+    recording = processes.start("pendulum_bags", "record", "-o", tmp_path / "run", "/there", "/typo")
+    wait_until_matched(there)
+    there.publish(Float64(data=1.0))
+    wait_until_received(node, there=1)
+    recording.interrupt()
+    assert recording.wait(30.0) == 1
+    assert "NOT recorded: /typo (nobody published it)" in recording.output
+    assert "nothing lost" not in recording.output
+    assert len(read_bag(tmp_path / "run")["/there"]) == 1
+
+
+@pytest.mark.parametrize("log_time", ["receive", "header"])
+def test_a_topic_whose_beginning_was_missed_is_announced_before_that_is_told(
+    tmp_path: Path, domain_id: int, monkeypatch: pytest.MonkeyPatch, log_time: str
+) -> None:
+    """Messages without a stamp wait for the first that has one: till then the bag does not know their topic."""
+    monkeypatch.setattr(recorder_tap_node, "SETTLING", 0.0)
+    rclpy.init(domain_id=domain_id)
+    recorder = source = None
+    try:
+        source = rclpy.create_node("source")
+        plain = source.create_publisher(Float64, "/plain", qos.STATE)
+        for _ in range(20):
+            plain.publish(Float64(data=1.0))
+        stops: list[int] = []
+        options = RecorderOptions(tmp_path / "run", ("/plain",), log_time=log_time)
+        recorder = Recorder(options, lambda: stops.append(1))
+        wait_for(lambda: recorder._discover() or plain.get_subscription_count(), 30.0, "the recorder to subscribe")
+        session = recorder._session
+        assert session is not None
+
+        def told() -> int:
+            plain.publish(Float64(data=2.0))
+            return bool(stops) or getattr(session.counts().get("/plain"), "early", 0)
+
+        wait_for(told, 30.0, "what came before to be told")
+        assert not stops, session.failure
+        recorder.close()
+        assert recorder.exit_code == 0
+        assert recorder.reports[0].topics["/plain"].early == 20
+    finally:
+        for each in (recorder, source):
+            if each is not None:
+                each.destroy_node()
+        rclpy.shutdown()
 
 
 def test_kill_9_loses_at_most_a_fifth_of_a_second(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -80,6 +80,21 @@ class RecorderOptions:
         if self.topics or self.regex:
             return topic in self.topics or bool(self.regex and re.search(self.regex, topic))
         return topic not in ALWAYS_LEFT_OUT
+
+    def unmet(self, met: Iterable[str]) -> dict[str, str]:
+        """Return what was asked for that nobody published, and why it is missing.
+
+        Args:
+            met: Topics that had a publisher while there was a recorder.
+        """
+        found = list(met)
+        unmet = {name: "nobody published it" for name in self.topics if self.wants(name) and name not in found}
+        unmet |= {name: "it is left out by the pattern of exclude" for name in self.topics if not self.wants(name)}
+        if self.regex and not any(re.search(self.regex, name) for name in found):
+            unmet[f"topics that match {self.regex!r}"] = "nobody published any"
+        if not self.topics and not self.regex and not found:
+            unmet["any topic"] = "nobody published one"
+        return unmet
 
 
 def read_metadata(path: Path | None) -> dict[str, Any]:

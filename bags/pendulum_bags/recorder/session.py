@@ -50,6 +50,13 @@ class SessionReport:
     path: Path
     topics: dict[str, TopicCount] = field(default_factory=dict)
     error: str = ""
+    unrecorded: dict[str, str] = field(default_factory=dict)
+    """What was asked for and is not in the bag, and why: a topic or a pattern of topics, and a reason."""
+
+    @property
+    def failed(self) -> bool:
+        """Whether the bag holds less than what was asked for."""
+        return bool(self.lost or self.error or self.unrecorded)
 
     @property
     def received(self) -> int:
@@ -73,8 +80,11 @@ class SessionReport:
             worst = [f"{name} {count.lost}" for name, count in sorted(self.topics.items()) if count.lost]
             text += f"; LOST {self.lost} of {self.received + sum(c.missing for c in self.topics.values())}"
             text += f" ({', '.join(worst)})"
-        else:
+        elif not self.failed:
             text += ", nothing lost"
+        if self.unrecorded:
+            reasons = [f"{name} ({reason})" for name, reason in sorted(self.unrecorded.items())]
+            text += f"; NOT recorded: {', '.join(reasons)}"
         if early := [f"{name} {count.early}" for name, count in sorted(self.topics.items()) if count.early]:
             text += f"; published before the subscription was complete, and not recorded: {', '.join(early)}"
         return text + (f"; stopped because {self.error}" if self.error else "")
@@ -123,14 +133,15 @@ class RecordingSession:
         Raises:
             BagError: The bag holds the topic with another type.
         """
-        if self.failure:
-            return
-        try:
-            self.writer.add_topic(name, type, qos)
-        except BagError:
-            raise
-        except OSError as error:
-            self.fail(error)
+        if not self.failure:
+            try:
+                self.writer.add_topic(name, type, qos)
+            except BagError:
+                if not self.failure:  # else the writer was closed meanwhile, by the thread that met the failure
+                    raise
+            except OSError as error:
+                self.fail(error)
+        # Also of a topic that the disk did not take any more: what arrives of it is lost, and has to be counted.
         self._counts.setdefault(name, TopicCount())
 
     def offer(self, topic: str, items: Sequence[tuple[int, bytes]]) -> int:
