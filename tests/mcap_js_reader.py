@@ -27,7 +27,7 @@ class McapJs:
     process: subprocess.Popen[str]
 
     def read(self, file: Path) -> dict[str, Any]:
-        """Return what ``byIndex`` and ``inOrder`` found, each with ``count`` and ``sha256`` of the data, or ``error``."""
+        """Return what ``byIndex`` and ``inOrder`` found, each with ``count`` and ``sha256`` of the data, or error."""
         assert self.process.stdin is not None
         assert self.process.stdout is not None
         self.process.stdin.write(f"{file}\n")

@@ -251,15 +251,17 @@ class Recorder(PollingNode):
             if not self._options.wants(topic) or topic == self._events:
                 continue
             tap = self._taps.get(topic)
-            if tap is not None and self.count_publishers(topic) == tap.publishers:
+            if tap is not None and len(types) == 1 and self.count_publishers(topic) == tap.publishers:
                 continue
             publishers = self.get_publishers_info_by_topic(topic)
             if not publishers:
                 continue
-            if tap is not None and {p.topic_type for p in publishers} != {tap.type_name}:
-                types = sorted({tap.type_name, *(p.topic_type for p in publishers)})
-            if len(types) > 1:
-                self._refuse(topic, f"it has the types {', '.join(types)}; expected one")
+            # What others subscribe to with another type gets them nothing, and is no reason to refuse the topic.
+            published = {publisher.topic_type for publisher in publishers}
+            if tap is not None:
+                published.add(tap.type_name)
+            if len(published) > 1:
+                self._refuse(topic, f"it has the types {', '.join(sorted(published))}; expected one")
                 continue
             self._tap(topic, publishers)
         self._parameter_reader.look()

@@ -36,6 +36,7 @@ from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.ros import qos
 from pendulum_msgs_py.ros.convert import event_message
 from tests.fixtures import wait_for
+from tests.graph_peer import GraphPeer
 from tests.processes import ProcessGroup
 
 JOINT_STATE = "sensor_msgs/msg/JointState"
@@ -405,8 +406,20 @@ def test_recording_starts_and_stops_by_service_and_by_header_time(
     assert second["/joint_states"]["position"].tolist() == [2.0] * 50
 
 
-def test_a_topic_that_nobody_publishes_is_named_and_fails(tmp_path: Path, processes: ProcessGroup, node: Node) -> None:
+@pytest.fixture
+def stranger(domain_id: int) -> Iterator[GraphPeer]:
+    peer = GraphPeer("stranger", domain=domain_id)
+    yield peer
+    peer.close()
+
+
+def test_a_topic_that_nobody_publishes_is_named_and_fails(
+    tmp_path: Path, processes: ProcessGroup, node: Node, stranger: GraphPeer
+) -> None:
     there = node.create_publisher(Float64, "/there", qos.STATE)
+    stranger.node.create_subscription(String, "/there", lambda _: None, qos.STATE)  # that takes it for something else
+    known = lambda: len(dict(node.get_topic_names_and_types()).get("/there", ())) == 2  # noqa: E731
+    wait_for(known, 30.0, "both types to be known")
     recording = processes.start("pendulum_bags", "record", "-o", tmp_path / "run", "/there", "/typo")
     wait_until_matched(there)
     there.publish(Float64(data=1.0))
