@@ -52,6 +52,14 @@ BRIDGE_SPECS: tuple[ParameterSpec, ...] = (
     ),
     _fixed("family", "", "", "HEBI family of the actuator; empty for any, if there is only one."),
     _fixed("name", "", "", "HEBI name of the actuator; empty for any, if there is only one."),
+    _fixed("mac_address", "", "", "MAC address of the HEBI actuator; empty for any. `scan` lists them."),
+    _fixed("serial", "", "", "Serial number of the HEBI actuator; empty for any."),
+    _fixed(
+        "module_type",
+        "X5-9",
+        "",
+        "Type that the HEBI actuator must be of, since constants and limits are those of an X5-9; empty for any.",
+    ),
     _fixed(
         "interface",
         "",
@@ -245,10 +253,12 @@ def _make_emulator_process(values: Mapping[str, Any], clock: Clock) -> ActuatorP
 
 def _make_hebi(values: Mapping[str, Any], clock: Clock) -> ActuatorPort:
     from pendulum_hw_bridge.backends.hebi import HebiBackend
+    from pendulum_hw_bridge.backends.hebi_discovery import ModuleSelection
 
     return HebiBackend(
-        values["family"],
-        values["name"],
+        ModuleSelection(
+            values["family"], values["name"], values["mac_address"], values["serial"], values["module_type"]
+        ),
         clock=clock,
         interface=values["interface"],
         drivetrain=asdict(drivetrain_of(plant_of(values))),

@@ -8,4 +8,5 @@ EXECUTABLES: dict[str, str] = {
     "emulator": "pendulum_hw_bridge.emulator_cli:main",
     "emulator_fault": "pendulum_hw_bridge.emulator_cli:fault_main",
     "procedure": "pendulum_hw_bridge.procedure_node:main",
+    "scan": "pendulum_hw_bridge.scan_cli:main",
 }

@@ -23,7 +23,7 @@ from pendulum_hw_bridge.actuator import (
     TemperatureState,
 )
 from pendulum_hw_bridge.backends import hebi as backend_module
-from pendulum_hw_bridge.backends.hebi import HebiBackend, connect_group
+from pendulum_hw_bridge.backends.hebi import HebiBackend
 from pendulum_hw_bridge.gains import DEFAULT_GAINS, GAIN_FIELDS, LOOPS
 
 hebi = pytest.importorskip("hebi", reason="hebi-py is not installed")
@@ -212,31 +212,3 @@ def test_a_group_of_several_modules_is_refused() -> None:
     with pytest.raises(ActuatorError, match="HEBI group has 2 modules; expected 1"):
         backend.connect()
 
-
-class Lookup:
-    def __init__(self, *found: tuple[str, str]) -> None:
-        self.entrylist = [SimpleNamespace(family=family, name=name) for family, name in found]
-
-    def get_group_from_names(self, families: list[str], names: list[str], timeout_ms: int) -> Any:
-        return SimpleNamespace(size=1, who=(families[0], names[0]))
-
-
-@pytest.mark.parametrize(
-    ("found", "family", "name", "message"),
-    [
-        ((), "Lab", "Pendulum", r"no HEBI module Lab/Pendulum answered within 0.25 s; modules seen: none"),
-        ((("Lab", "Arm"),), "Lab", "Pendulum", r"modules seen: Lab/Arm"),
-        ((("Lab", "A"), ("Lab", "B")), "Lab", "", r"is not the only one: Lab/A, Lab/B; give family and name"),
-    ],
-)
-def test_a_module_that_is_not_meant_is_not_driven(
-    monkeypatch: pytest.MonkeyPatch, found: tuple[tuple[str, str], ...], family: str, name: str, message: str
-) -> None:
-    monkeypatch.setattr(hebi, "Lookup", lambda *arguments: Lookup(*found))
-    with pytest.raises(ActuatorError, match=message):
-        connect_group(family, name, timeout=0.25)
-
-
-def test_the_only_module_needs_no_name(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(hebi, "Lookup", lambda *arguments: Lookup(("Lab", "Pendulum")))
-    assert connect_group("", "", timeout=0.25).who == ("Lab", "Pendulum")

@@ -29,12 +29,13 @@ from pendulum_hw_bridge.actuator import (
     check_command,
     check_lifetime,
 )
+from pendulum_hw_bridge.backends.hebi_discovery import LOOK_TIME, ModuleSelection, discover, select_module
 from pendulum_hw_bridge.clocks import Clock, WallClock
 from pendulum_hw_bridge.gains import DEFAULT_GAINS, GAIN_FIELDS, LOOPS, GainSet, PidGains
 from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.values import NANOSECONDS
 
-__all__ = ["HebiBackend", "connect_group"]
+__all__ = ["HebiBackend", "connect_group", "open_lookup"]
 
 _LOOKUP_TIMEOUT = 5.0
 _ACKNOWLEDGE_MS = 200
@@ -81,53 +82,42 @@ def _import_hebi() -> Any:
     return hebi
 
 
-def connect_group(family: str, name: str, interface: str = "", timeout: float = _LOOKUP_TIMEOUT) -> Any:
+def connect_group(wanted: ModuleSelection, interface: str = "", look_time: float = LOOK_TIME) -> Any:
     """Return hebi-py's group of the one module that is meant.
 
     Args:
-        family: HEBI family; empty for any.
-        name: HEBI name; empty for any.
+        wanted: Which module.
         interface: Network address to look on; empty for all.
-        timeout: Longest time to look [s].
+        look_time: Time to look for, at least [s].
 
     Raises:
-        ActuatorError: hebi-py is not installed, no such module answers, or several do.
+        ActuatorError: hebi-py is not installed, no such module answers, several do, or it is of another type.
+    """
+    lookup = open_lookup(interface)
+    patience = max(look_time, min(_LOOKUP_TIMEOUT, 3.0 * look_time))
+    module = select_module(discover(lookup, look_time=look_time, patience=patience), wanted, seconds=patience)
+    # By address, never by name: a twin may appear between looking and connecting.
+    group = lookup.get_group_from_macs([module.mac_address], round(1000 * _LOOKUP_TIMEOUT))
+    if group is None:
+        raise ActuatorError("module_lost", f"HEBI module {module} was seen but does not connect")
+    return group
+
+
+def open_lookup(interface: str = "") -> Any:
+    """Return hebi-py's ``Lookup``, on one network address or on all.
+
+    Raises:
+        ActuatorError: hebi-py is not installed.
     """
     hebi = _import_hebi()
-    lookup = hebi.Lookup([interface]) if interface else hebi.Lookup()
-    waiting = threading.Event()
-    found: list[tuple[str, str]] = []
-    for _ in range(max(1, round(timeout / 0.25))):
-        waiting.wait(0.25)
-        found = [(str(entry.family), str(entry.name)) for entry in lookup.entrylist]
-        matching = [(f, n) for f, n in found if family in {"", f} and name in {"", n}]
-        # An exact name may be taken as soon as it answers; "the only one" needs the whole time to be sure of.
-        if matching and family and name:
-            break
-    wanted = f"{family or '*'}/{name or '*'}"
-    matching = [(f, n) for f, n in found if family in {"", f} and name in {"", n}]
-    if not matching:
-        listed = ", ".join(f"{f}/{n}" for f, n in found) or "none"
-        raise ActuatorError(
-            "module_lost", f"no HEBI module {wanted} answered within {timeout:g} s; modules seen: {listed}"
-        )
-    if len(matching) > 1:
-        listed = ", ".join(f"{f}/{n}" for f, n in matching)
-        raise ActuatorError(
-            "module_lost", f"HEBI module {wanted} is not the only one: {listed}; give family and name"
-        )
-    group = lookup.get_group_from_names([matching[0][0]], [matching[0][1]], round(1000 * timeout))
-    if group is None:
-        raise ActuatorError("module_lost", f"HEBI module {wanted} was seen but does not connect")
-    return group
+    return hebi.Lookup([interface]) if interface else hebi.Lookup()
 
 
 class HebiBackend:
     """The actuator port of one HEBI module.
 
     Args:
-        family: HEBI family; empty for any.
-        name: HEBI name; empty for any.
+        wanted: Which module.
         clock: Host clock; feedback is stamped with it on receipt.
         interface: Network address to look on; empty for all.
         drivetrain: Constants to report with a run.
@@ -139,8 +129,7 @@ class HebiBackend:
 
     def __init__(
         self,
-        family: str = "",
-        name: str = "",
+        wanted: ModuleSelection = ModuleSelection(),  # noqa: B008  (immutable)
         *,
         clock: Clock | None = None,
         interface: str = "",
@@ -149,10 +138,10 @@ class HebiBackend:
         imitation: bool = False,
     ) -> None:
         self._clock = clock or WallClock()
-        self._make_group = make_group or (lambda: connect_group(family, name, interface))
+        self._make_group = make_group or (lambda: connect_group(wanted, interface))
         self._imitation = imitation
         self._drivetrain = dict(drivetrain or {})
-        self._family, self._name = family, name
+        self._wanted = wanted
         self._group: Any = None
         self._hebi: Any = None
         self._command: Any = None
@@ -184,7 +173,7 @@ class HebiBackend:
             self._feedback = self._hebi.GroupFeedback(1)
         self._own()
         info = self._read_info()
-        family, name, serial, firmware = self._family, self._name, "", ""
+        family, name, serial, firmware = self._wanted.family, self._wanted.name, "", ""
         if info is not None:
             self._strategy = Strategy(int(info.control_strategy[0]))
             family, name = str(info.family[0]), str(info.name[0])

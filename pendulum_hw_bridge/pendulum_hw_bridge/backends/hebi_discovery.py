@@ -1,0 +1,179 @@
+"""Who is on the network: HEBI modules with their identity, and the choice of the one that is meant.
+
+Names are given by people and may be given twice; MAC address and serial number are not. A choice is made only when
+exactly one module fits, after the whole time of looking: the first to answer may have a twin.
+"""
+
+from __future__ import annotations
+
+import re
+import threading
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from pendulum_hw_bridge.actuator import ActuatorError
+
+__all__ = ["LOOK_TIME", "ModuleRecord", "ModuleSelection", "discover", "select_module"]
+
+LOOK_TIME = 2.0
+"""Time for which to look before a choice is made: ten of hebi-py's lookup periods [s]."""
+_STEP = 0.25
+_ANSWER_MS = 500
+
+
+@dataclass(frozen=True)
+class ModuleRecord:
+    """One module on the network.
+
+    Attributes:
+        family: HEBI family.
+        name: HEBI name.
+        mac_address: ``aa:bb:cc:dd:ee:ff``.
+        serial: Serial number; empty where the module did not answer.
+        type: Mechanical type, such as ``X5-9``; empty where the module did not answer.
+        firmware: Firmware revision; empty where the module did not answer.
+        address: IP address.
+        stale: Whether it has not been heard lately.
+    """
+
+    family: str
+    name: str
+    mac_address: str
+    serial: str = ""
+    type: str = ""
+    firmware: str = ""
+    address: str = ""
+    stale: bool = False
+
+    def __str__(self) -> str:
+        """Return who it is, in one breath."""
+        marks = [self.serial or "no answer", self.mac_address, "stale" if self.stale else ""]
+        return f"{self.family}/{self.name} ({', '.join(mark for mark in marks if mark)})"
+
+
+@dataclass(frozen=True)
+class ModuleSelection:
+    """Which module is meant; what is empty may be anything.
+
+    Attributes:
+        family: HEBI family.
+        name: HEBI name.
+        mac_address: In any of the usual ways to write it.
+        serial: Serial number.
+        module_type: Mechanical type that it must be of, such as ``X5-9``.
+    """
+
+    family: str = ""
+    name: str = ""
+    mac_address: str = ""
+    serial: str = ""
+    module_type: str = ""
+
+    def __str__(self) -> str:
+        """Return what was asked for."""
+        marks = [text for text in (self.serial, self.mac_address) if text]
+        return f"{self.family or '*'}/{self.name or '*'}" + (f" ({', '.join(marks)})" if marks else "")
+
+    def names(self, module: ModuleRecord) -> bool:
+        """Tell whether a module is the one that is meant, whatever its type."""
+        return (
+            self.family in {"", module.family}
+            and self.name in {"", module.name}
+            and _plain(self.mac_address) in {"", _plain(module.mac_address)}
+            and self.serial.strip().lower() in {"", module.serial.strip().lower()}
+        )
+
+
+def discover(
+    lookup: Any,
+    *,
+    look_time: float = LOOK_TIME,
+    patience: float = 5.0,
+    wait: Callable[[float], object] | None = None,
+) -> list[ModuleRecord]:
+    """Return the modules on the network, each asked for its identity, in the order of their names.
+
+    Args:
+        lookup: hebi-py's ``Lookup``.
+        look_time: Time for which to look in any case [s].
+        patience: Time after which to give up where nobody has answered [s].
+        wait: Waits for some seconds; by default on the wall clock.
+    """
+    pause = wait or threading.Event().wait
+    waited = 0.0
+    entries: list[Any] = []
+    while waited < look_time or (not entries and waited < patience):
+        pause(_STEP)
+        waited += _STEP
+        entries = list(lookup.entrylist)
+    records = [_identify(lookup, entry) for entry in entries]
+    return sorted(records, key=lambda record: (record.family, record.name, record.mac_address))
+
+
+def select_module(
+    modules: Sequence[ModuleRecord], wanted: ModuleSelection, *, seconds: float
+) -> ModuleRecord:
+    """Return the one module that is meant.
+
+    Args:
+        modules: All that were seen.
+        wanted: Which is meant.
+        seconds: For how long was looked, for the message [s].
+
+    Raises:
+        ActuatorError: None fits, several do, it is stale, or it is of another type.
+    """
+    listed = ", ".join(map(str, modules)) or "none"
+    fitting = [module for module in modules if wanted.names(module)]
+    alive = [module for module in fitting if not module.stale]
+    if fitting and not alive:
+        raise ActuatorError(
+            "module_lost", f"HEBI module {fitting[0]} was seen but is silent now; is its supply on?"
+        )
+    if not alive:
+        raise ActuatorError(
+            "module_lost", f"no HEBI module {wanted} answered within {seconds:g} s; modules seen: {listed}"
+        )
+    if len(alive) > 1:
+        twins = ", ".join(map(str, alive))
+        raise ActuatorError(
+            "module_lost",
+            f"HEBI module {wanted} is not the only one: {twins}; choose by serial or mac_address",
+        )
+    module = alive[0]
+    if wanted.module_type and _plain(wanted.module_type) != _plain(module.type):
+        reads = repr(module.type) if module.type else "not known, for it did not answer"
+        raise ActuatorError(
+            "module_lost",
+            f"type of HEBI module {module} is {reads}; expected {wanted.module_type!r}, whose constants and limits "
+            "are used (parameter module_type; empty for any)",
+        )
+    return module
+
+
+def _identify(lookup: Any, entry: Any) -> ModuleRecord:
+    mac = str(entry.mac_address)
+    record = ModuleRecord(
+        str(entry.family), str(entry.name), mac, address=str(entry.ip_address), stale=bool(entry.is_stale)
+    )
+    if record.stale:
+        return record
+    group = lookup.get_group_from_macs([mac], _ANSWER_MS)
+    info = None if group is None else group.request_info(_ANSWER_MS)
+    if info is None:
+        return record
+    return ModuleRecord(
+        record.family,
+        record.name,
+        mac,
+        serial=str(info.serial[0] or ""),
+        type=str(info.mechanical_type[0] or ""),
+        firmware=str(info.firmware_revision[0] or ""),
+        address=record.address,
+    )
+
+
+def _plain(text: str) -> str:
+    """Return letters and digits alone: AA-BB, aa:bb and aabb are one address, X5-9 and X5_9 one type."""
+    return re.sub(r"[^0-9a-z]", "", text.lower())
