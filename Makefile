@@ -3,7 +3,7 @@ SHELL := /bin/sh
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
 
-PACKAGES := pendulum_msgs_py pendulum_sim pendulum_lqr pendulum_hw_bridge bags
+PACKAGES := pendulum_msgs_py pendulum_sim pendulum_lqr pendulum_hw_bridge bags/pendulum_rosbag bags/pendulum_bags
 VENV := .venv
 PY := $(VENV)/bin/python
 PIP := $(PY) -m pip --disable-pip-version-check --no-input --quiet --quiet
@@ -16,7 +16,7 @@ LINKED := $(foreach p,$(PACKAGES),$(wildcard $(p)/setup.py $(p)/setup.cfg $(p)/p
 help: # Print the targets, one line each
 	@awk -F ':[^#]*# ' '/^[a-z]+:[^#=]*# / {printf "make %-11s %s\n", $$1, $$2}' Makefile
 
-venv: $(VENV)/.linked # Make or renew .venv from the lock, with the five packages linked into it (PYTHON=... chooses the interpreter)
+venv: $(VENV)/.linked # Make or renew .venv from the lock, with the packages linked into it (PYTHON=... chooses the interpreter)
 
 # Three stamps, so that an interrupted step is done again and a finished one is not.
 $(VENV)/.made:
@@ -66,7 +66,7 @@ types: $(VENV)/.linked # Check types with mypy
 imports: $(VENV)/.linked # Check which package and which module may import what
 	@$(VENV)/bin/lint-imports --no-logo $(ARGS)
 
-build: $(VENV)/.linked # Build the five packages with colcon into install/, as for ros2 run
+build: $(VENV)/.linked # Build the packages with colcon into install/, as for ros2 run
 	@unset PYTHONDONTWRITEBYTECODE; exec $(VENV)/bin/colcon build --base-paths $(PACKAGES) $(ARGS)
 
 faults: $(VENV)/.linked # Attack the running system, count what it stood, print a table (the long form of tests/faults)

@@ -6,6 +6,13 @@ pytest_plugins = ["tests.fixtures"]
 
 # pytest names a test module after its path, `pendulum_sim.test.test_x`, and would take the repository's folder for the
 # package of that name, unless the package is there already.
-importlib.import_module("pendulum_msgs_py.one_thread")
-for _package in ("pendulum_msgs_py", "pendulum_sim", "pendulum_lqr", "pendulum_hw_bridge", "pendulum_bags"):
+importlib.import_module("pendulum_msgs_py.programs.one_thread")
+for _package in (
+    "pendulum_msgs_py",
+    "pendulum_sim",
+    "pendulum_lqr",
+    "pendulum_hw_bridge",
+    "pendulum_rosbag",
+    "pendulum_bags",
+):
     importlib.import_module(_package)

@@ -11,7 +11,7 @@ from pathlib import Path
 
 PROJECT = Path(__file__).resolve().parents[1]
 GATHERED = PROJECT / "build" / "docs"
-PACKAGES = ("pendulum_sim", "pendulum_hw_bridge", "pendulum_lqr", "pendulum_bags")
+PACKAGES = ("pendulum_sim", "pendulum_hw_bridge", "pendulum_lqr", "pendulum_rosbag", "pendulum_bags")
 NODES = (
     ("simulator", "pendulum_sim.simulator_node", ("SPECS",)),
     ("viewer", "pendulum_sim.viewer_node", ("SPECS",)),
@@ -19,8 +19,8 @@ NODES = (
     ("bridge", "pendulum_hw_bridge.bridge_node", ("SPECS",)),
     ("disturbance", "pendulum_lqr.disturbance_node", ("DISTURBANCE_SPECS", "NODE_SPECS")),
     ("effort_adapter", "pendulum_lqr.effort_adapter_node", ("NODE_SPECS",)),
-    ("recorder", "pendulum_bags.recorder_node", ("SPECS",)),
-    ("play", "pendulum_bags.topic_replay_node", ("SPECS",)),
+    ("recorder", "pendulum_rosbag.recorder.recorder_node", ("SPECS",)),
+    ("play", "pendulum_rosbag.player.player_node", ("SPECS",)),
 )
 """Node, module, its tables of parameters."""
 
@@ -29,8 +29,8 @@ def reference() -> str:
     """Return the reference page, from the tables that the programs themselves read."""
     from pendulum_lqr.bringup import ARGUMENTS
     from pendulum_lqr.controller import COMMON_PARAMETERS, CONTROLLERS, controller_class
-    from pendulum_msgs_py.executables import summary
     from pendulum_msgs_py.parameters import markdown_table
+    from pendulum_msgs_py.programs.executables import summary
 
     parts = [
         "# Reference\n\nGenerated from the code: what stands here is what the programs read.\n\n## Programs\n"

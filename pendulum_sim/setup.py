@@ -1,4 +1,4 @@
-"""Build script of this package: the same file in all five, since what differs stands in the files beside it.
+"""Build script of this package: the same file in all packages, since what differs stands in the files beside it.
 
 ``package.xml`` says who we are, ``<package>/executables.py`` which programs there are; nothing is said twice.
 """
@@ -14,6 +14,8 @@ DATA_ENDINGS = ["css", "csv", "html", "j2", "js", "json", "md", "npz", "png", "s
 
 def read_executables(path: Path) -> dict[str, str]:
     """Read the table of programs without importing the package: a build has none of its dependencies."""
+    if not path.is_file():
+        return {}
     for node in ast.parse(path.read_text(encoding="utf-8")).body:
         targets = [node.target] if isinstance(node, ast.AnnAssign) else getattr(node, "targets", [])
         if any(getattr(target, "id", None) == "EXECUTABLES" for target in targets):

@@ -23,8 +23,8 @@ import typer
 from packaging.version import InvalidVersion, Version
 
 from pendulum_msgs_py.errors import DataError
-from pendulum_msgs_py.executables import cli_main
-from pendulum_msgs_py.terminal import WholeTable, make_console
+from pendulum_msgs_py.programs.executables import cli_main
+from pendulum_msgs_py.programs.terminal import WholeTable, make_console
 
 __all__ = ["Finding", "from_advisories", "from_pip_audit", "pinned"]
 

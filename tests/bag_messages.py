@@ -10,9 +10,9 @@ from typing import Any
 import numpy as np
 from rosbags.highlevel import AnyReader
 
-from pendulum_bags.reader import Bag, canonical
-from pendulum_bags.reader.joint_state import layout_of
-from pendulum_bags.storage import typestore
+from pendulum_rosbag.reader import Bag, canonical
+from pendulum_rosbag.reader.joint_state import layout_of
+from pendulum_rosbag.storage import typestore
 
 __all__ = ["JOINT_STATE", "STORE", "as_rclpy_leaves_it", "assert_equals_rosbags", "joint_state", "mixed_messages"]
 

@@ -8,8 +8,8 @@ from pathlib import Path
 from mcap.reader import NonSeekingReader, make_reader
 from rosbags.highlevel import AnyReader
 
-from pendulum_bags.reader import read_bag
-from pendulum_msgs_py.cdr import encode_joint_state
+from pendulum_msgs_py.contract.cdr import encode_joint_state
+from pendulum_rosbag.reader import read_bag
 
 __all__ = ["JOINT_STATE", "STRING", "count_everywhere", "count_in_order", "state", "text_message"]
 

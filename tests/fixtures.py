@@ -14,7 +14,7 @@ from typing import TypeVar
 
 import pytest
 
-from pendulum_bags.experiment.domain import reserve_domain
+from pendulum_bags.experiments.domain import reserve_domain
 from tests.mcap_js_reader import McapJs, mcap_js_process
 from tests.processes import ProcessGroup
 

@@ -13,12 +13,12 @@ from typing import Any
 
 import numpy as np
 
-from pendulum_bags.storage import open_writer
-from pendulum_msgs_py.angles import UPRIGHT, from_upright
-from pendulum_msgs_py.cdr import encode_joint_state
-from pendulum_msgs_py.noise import uniform_array
-from pendulum_msgs_py.plant_parameters import load_plant
-from pendulum_msgs_py.trajectory import thesis_ramp
+from pendulum_msgs_py.contract.angles import UPRIGHT, from_upright
+from pendulum_msgs_py.contract.cdr import encode_joint_state
+from pendulum_msgs_py.contract.noise import uniform_array
+from pendulum_msgs_py.contract.trajectory import thesis_ramp
+from pendulum_msgs_py.plants.plant_parameters import load_plant
+from pendulum_rosbag.storage import open_writer
 from pendulum_sim.plant import make_plant
 
 K = (33.345265, 0.158993)

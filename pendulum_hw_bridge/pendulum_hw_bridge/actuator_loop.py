@@ -15,9 +15,9 @@ from typing import Any, TypeVar
 
 from pendulum_hw_bridge.actuator import ActuatorError, Feedback
 from pendulum_hw_bridge.bridge import Bridge, Outcome
-from pendulum_msgs_py.supervisor import Drive, DriveKind, Input
-from pendulum_msgs_py.timing import LoopStatistics
-from pendulum_msgs_py.values import NANOSECONDS, JointCommand, JointSample
+from pendulum_msgs_py.contract.supervisor import Drive, DriveKind, Input
+from pendulum_msgs_py.contract.timing import LoopStatistics
+from pendulum_msgs_py.contract.values import NANOSECONDS, JointCommand, JointSample
 
 __all__ = ["ActuatorLoop"]
 

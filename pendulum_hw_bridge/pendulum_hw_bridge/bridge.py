@@ -23,8 +23,8 @@ from pendulum_hw_bridge.actuator import (
 from pendulum_hw_bridge.effort_mapping import EffortMapping
 from pendulum_hw_bridge.gains import GainSet
 from pendulum_hw_bridge.safety import SafetyMonitor
-from pendulum_msgs_py.supervisor import Drive, DriveKind, PlantSupervisor
-from pendulum_msgs_py.values import NANOSECONDS, JointSample
+from pendulum_msgs_py.contract.supervisor import Drive, DriveKind, PlantSupervisor
+from pendulum_msgs_py.contract.values import NANOSECONDS, JointSample
 
 __all__ = ["TRAJECTORY_STRATEGY", "Bridge", "BridgeSettings", "Outcome"]
 

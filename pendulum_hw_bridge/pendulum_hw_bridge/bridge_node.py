@@ -25,6 +25,9 @@ from pendulum_hw_bridge.clocks import SteppedClock, WallClock
 from pendulum_hw_bridge.feedback_message import encode_feedback
 from pendulum_hw_bridge.safety import SafetyMonitor
 from pendulum_hw_bridge.shared_supervisor import SharedSupervisor
+from pendulum_msgs_py.contract.supervisor import Drive, Input
+from pendulum_msgs_py.contract.timing import LoopStatistics, SteadyWallClock
+from pendulum_msgs_py.contract.values import NANOSECONDS, JointCommand, JointSample
 from pendulum_msgs_py.errors import PendulumError
 from pendulum_msgs_py.parameters import ParameterSpec, ParameterValue
 from pendulum_msgs_py.ros import qos
@@ -34,9 +37,6 @@ from pendulum_msgs_py.ros.parameters import NodeParameters
 from pendulum_msgs_py.ros.plant_interface import LIMIT_SPECS, PlantInterface, limits_from_parameters
 from pendulum_msgs_py.ros.plant_loop import LOCKSTEP_EPOCH_NS, LOOP_SPECS, LockstepLoop, create_wall_timer
 from pendulum_msgs_py.ros.runner import run_node
-from pendulum_msgs_py.supervisor import Drive, Input
-from pendulum_msgs_py.timing import LoopStatistics, SteadyWallClock
-from pendulum_msgs_py.values import NANOSECONDS, JointCommand, JointSample
 
 __all__ = ["SPECS", "BridgeNode", "main"]
 

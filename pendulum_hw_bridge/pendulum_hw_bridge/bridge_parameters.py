@@ -13,10 +13,10 @@ from pendulum_hw_bridge.clocks import Clock
 from pendulum_hw_bridge.effort_mapping import EffortMapping, EffortStrategy
 from pendulum_hw_bridge.gains import DEFAULT_GAINS, GainSet, load_gains
 from pendulum_hw_bridge.safety import SafetyLimits
+from pendulum_msgs_py.contract.values import NANOSECONDS
 from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.parameters import ParameterSpec
-from pendulum_msgs_py.plant_parameters import PlantParameters, SeriesElasticParameters
-from pendulum_msgs_py.values import NANOSECONDS
+from pendulum_msgs_py.plants.plant_parameters import PlantParameters, SeriesElasticParameters
 
 __all__ = [
     "BRIDGE_SPECS",

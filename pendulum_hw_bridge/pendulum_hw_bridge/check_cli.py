@@ -19,9 +19,9 @@ from pendulum_hw_bridge.bridge_parameters import (
 )
 from pendulum_hw_bridge.checklist import CheckItem, run_checklist
 from pendulum_hw_bridge.clocks import WallClock
-from pendulum_msgs_py.executables import cli_main
 from pendulum_msgs_py.parameters import validate
-from pendulum_msgs_py.terminal import WholeTable, make_console
+from pendulum_msgs_py.programs.executables import cli_main
+from pendulum_msgs_py.programs.terminal import WholeTable, make_console
 
 __all__ = ["main"]
 

@@ -20,8 +20,8 @@ from pendulum_hw_bridge.actuator import (
 )
 from pendulum_hw_bridge.bridge import BridgeSettings
 from pendulum_hw_bridge.safety import SafetyLimits
+from pendulum_msgs_py.contract.values import NANOSECONDS
 from pendulum_msgs_py.errors import PendulumError
-from pendulum_msgs_py.values import NANOSECONDS
 
 __all__ = ["CheckItem", "run_checklist"]
 

@@ -6,7 +6,7 @@ import threading
 from collections.abc import Callable
 from typing import Protocol
 
-from pendulum_msgs_py.timing import SteadyWallClock
+from pendulum_msgs_py.contract.timing import SteadyWallClock
 
 __all__ = ["Clock", "SteppedClock", "WallClock"]
 

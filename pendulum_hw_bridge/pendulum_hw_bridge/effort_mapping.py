@@ -19,7 +19,7 @@ from enum import Enum
 
 from pendulum_hw_bridge.actuator import Command, Feedback, Strategy
 from pendulum_msgs_py.errors import ParameterError
-from pendulum_msgs_py.plant_parameters import SeriesElasticParameters
+from pendulum_msgs_py.plants.plant_parameters import SeriesElasticParameters
 
 __all__ = ["EffortMapping", "EffortStrategy"]
 

@@ -12,8 +12,8 @@ import typer
 
 from pendulum_hw_bridge.emulation.faults import ActuatorFault
 from pendulum_msgs_py.errors import ParameterError
-from pendulum_msgs_py.executables import cli_main
-from pendulum_msgs_py.terminal import WholeTable, make_console
+from pendulum_msgs_py.programs.executables import cli_main
+from pendulum_msgs_py.programs.terminal import WholeTable, make_console
 
 __all__ = ["fault_main", "main"]
 
@@ -40,7 +40,7 @@ def emulator(
     from pendulum_hw_bridge.emulation.parameters import load_emulator
     from pendulum_hw_bridge.emulation.server import EmulatorServer
     from pendulum_hw_bridge.emulation.x5 import EmulatedX5
-    from pendulum_msgs_py.timing import SteadyWallClock
+    from pendulum_msgs_py.contract.timing import SteadyWallClock
 
     stopped: list[int] = []
     for number in (signal.SIGINT, signal.SIGTERM):

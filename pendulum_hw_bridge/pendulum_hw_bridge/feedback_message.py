@@ -10,7 +10,7 @@ from __future__ import annotations
 import struct
 
 from pendulum_hw_bridge.actuator import FEEDBACK_QUANTITIES, Feedback
-from pendulum_msgs_py.values import NANOSECONDS
+from pendulum_msgs_py.contract.values import NANOSECONDS
 
 __all__ = ["QUANTITIES", "encode_feedback"]
 

@@ -9,8 +9,8 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from pendulum_hw_bridge.procedures import HandMotion, Phase
-from pendulum_msgs_py.trajectory import Trajectory, TrajectoryPoint
-from pendulum_msgs_py.values import NANOSECONDS, JointSample
+from pendulum_msgs_py.contract.trajectory import Trajectory, TrajectoryPoint
+from pendulum_msgs_py.contract.values import NANOSECONDS, JointSample
 
 __all__ = ["HandTrial", "StaircaseTrial", "Trial", "TrialAnswer", "join_phases"]
 

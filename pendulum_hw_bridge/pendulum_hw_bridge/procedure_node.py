@@ -17,8 +17,8 @@ from trajectory_msgs.msg import JointTrajectory
 
 from pendulum_hw_bridge.procedure import HandTrial, StaircaseTrial, Trial
 from pendulum_hw_bridge.procedures import hand_trials, staircase
-from pendulum_msgs_py import names
-from pendulum_msgs_py.cdr import encode_joint_state
+from pendulum_msgs_py.contract import names
+from pendulum_msgs_py.contract.cdr import encode_joint_state
 from pendulum_msgs_py.parameters import ParameterSpec
 from pendulum_msgs_py.ros import qos
 from pendulum_msgs_py.ros.convert import event_message, sample_from_bytes, trajectory_to_message

@@ -13,8 +13,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from pendulum_msgs_py.contract.trajectory import Trajectory, thesis_ramp
 from pendulum_msgs_py.errors import ParameterError
-from pendulum_msgs_py.trajectory import Trajectory, thesis_ramp
 
 __all__ = [
     "HAND_TRIALS",

@@ -12,10 +12,10 @@ from collections import deque
 from dataclasses import dataclass
 
 from pendulum_hw_bridge.actuator import Command, CommandLock, Feedback, LimitState, Strategy, TemperatureState
+from pendulum_msgs_py.contract.values import NANOSECONDS
 from pendulum_msgs_py.dynamics.series_elastic import winding_current, winding_resistance_at
 from pendulum_msgs_py.errors import ParameterError
-from pendulum_msgs_py.plant_parameters import SeriesElasticParameters
-from pendulum_msgs_py.values import NANOSECONDS
+from pendulum_msgs_py.plants.plant_parameters import SeriesElasticParameters
 
 __all__ = ["FAULTS", "Fault", "SafetyLimits", "SafetyMonitor"]
 

@@ -5,10 +5,10 @@ from __future__ import annotations
 import threading
 from collections.abc import Callable
 
-from pendulum_msgs_py.commands import Refusal
-from pendulum_msgs_py.supervisor import Drive, Input, Mode, PlantLimits, PlantSupervisor
-from pendulum_msgs_py.trajectory import Trajectory
-from pendulum_msgs_py.values import JointCommand, JointSample
+from pendulum_msgs_py.contract.commands import Refusal
+from pendulum_msgs_py.contract.supervisor import Drive, Input, Mode, PlantLimits, PlantSupervisor
+from pendulum_msgs_py.contract.trajectory import Trajectory
+from pendulum_msgs_py.contract.values import JointCommand, JointSample
 
 __all__ = ["SharedSupervisor"]
 

@@ -25,8 +25,8 @@ from pendulum_hw_bridge.emulation.parameters import load_emulator
 from pendulum_hw_bridge.emulation.server import EmulatorServer
 from pendulum_hw_bridge.emulation.x5 import EmulatedX5
 from pendulum_hw_bridge.gains import DEFAULT_GAINS
+from pendulum_msgs_py.contract.timing import SteadyWallClock
 from pendulum_msgs_py.errors import ParameterError
-from pendulum_msgs_py.timing import SteadyWallClock
 
 
 def emulator() -> EmulatorBackend:

@@ -17,9 +17,9 @@ from pendulum_hw_bridge.emulation.x5 import EmulatedX5
 from pendulum_hw_bridge.gains import DEFAULT_GAINS
 from pendulum_hw_bridge.safety import SafetyLimits, SafetyMonitor
 from pendulum_hw_bridge.shared_supervisor import SharedSupervisor
-from pendulum_msgs_py.supervisor import Drive, Input, Mode, PlantLimits
-from pendulum_msgs_py.timing import LoopStatistics
-from pendulum_msgs_py.values import JointCommand, JointSample
+from pendulum_msgs_py.contract.supervisor import Drive, Input, Mode, PlantLimits
+from pendulum_msgs_py.contract.timing import LoopStatistics
+from pendulum_msgs_py.contract.values import JointCommand, JointSample
 
 
 class Running:

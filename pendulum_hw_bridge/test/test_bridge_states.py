@@ -16,10 +16,10 @@ from pendulum_hw_bridge.emulation.x5 import EmulatedX5
 from pendulum_hw_bridge.gains import DEFAULT_GAINS
 from pendulum_hw_bridge.safety import SafetyLimits, SafetyMonitor
 from pendulum_hw_bridge.shared_supervisor import SharedSupervisor
-from pendulum_msgs_py.angles import UPRIGHT, from_upright
-from pendulum_msgs_py.supervisor import Input, Mode, PlantLimits
-from pendulum_msgs_py.trajectory import Trajectory, TrajectoryPoint, thesis_ramp
-from pendulum_msgs_py.values import JointCommand
+from pendulum_msgs_py.contract.angles import UPRIGHT, from_upright
+from pendulum_msgs_py.contract.supervisor import Input, Mode, PlantLimits
+from pendulum_msgs_py.contract.trajectory import Trajectory, TrajectoryPoint, thesis_ramp
+from pendulum_msgs_py.contract.values import JointCommand
 
 SECOND = 1_000_000_000
 

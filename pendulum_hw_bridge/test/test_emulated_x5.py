@@ -16,7 +16,7 @@ from pendulum_hw_bridge.emulation.thermal import ThermalParameters, steady_rise
 from pendulum_hw_bridge.emulation.x5 import EmulatedX5
 from pendulum_hw_bridge.gains import DEFAULT_GAINS
 from pendulum_msgs_py.errors import ParameterError
-from pendulum_msgs_py.plant_parameters import load_plant
+from pendulum_msgs_py.plants.plant_parameters import load_plant
 
 SECOND = 1_000_000_000
 

@@ -16,8 +16,8 @@ from pendulum_hw_bridge.emulation.parameters import load_emulator
 from pendulum_hw_bridge.emulation.x5 import EmulatedX5
 from pendulum_hw_bridge.procedure import StaircaseTrial
 from pendulum_hw_bridge.procedures import HandMotion, hand_trials, staircase, staircase_angles
+from pendulum_msgs_py.contract.values import JointSample
 from pendulum_msgs_py.errors import ParameterError
-from pendulum_msgs_py.values import JointSample
 
 SECOND = 1e9
 

@@ -170,7 +170,7 @@ def test_a_bag_is_replayed_and_one_that_is_no_recording_is_refused(tmp_path: Pat
     from rosbags.rosbag2 import StoragePlugin, Writer
     from rosbags.typesys import Stores, get_typestore
 
-    from pendulum_msgs_py.cdr import encode_joint_state
+    from pendulum_msgs_py.contract.cdr import encode_joint_state
 
     store = get_typestore(Stores.ROS2_JAZZY)
     with Writer(tmp_path / "bag", version=9, storage_plugin=StoragePlugin.MCAP) as writer:

@@ -4,7 +4,8 @@
     ros2 launch pendulum_lqr bringup.launch.py --show-args
 
 Include it with ``IncludeLaunchDescription``; behind ``PushRosNamespace`` all its nodes and topics move along. Which
-programs belong to a run, and under which names, is said in ``pendulum_msgs_py.graph``, which experiments read too.
+programs belong to a run, and under which names, is said in
+``pendulum_msgs_py.programs.graph``, which experiments read too.
 """
 
 import time
@@ -19,7 +20,7 @@ from launch_ros.actions import Node
 from launch_ros.substitutions import FindPackageShare
 
 from pendulum_lqr.bringup import ARGUMENTS, SIDES, programs
-from pendulum_msgs_py.graph import NodeProgram
+from pendulum_msgs_py.programs.graph import NodeProgram
 
 PLANTS = {"simulator", "bridge"}
 

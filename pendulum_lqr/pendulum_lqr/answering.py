@@ -9,9 +9,9 @@ from collections.abc import Callable, Mapping
 from enum import Enum
 
 from pendulum_lqr.controller import Controller
-from pendulum_msgs_py.angles import from_upright
-from pendulum_msgs_py.timing import RingOfTimes
-from pendulum_msgs_py.values import NANOSECONDS, JointSample
+from pendulum_msgs_py.contract.angles import from_upright
+from pendulum_msgs_py.contract.timing import RingOfTimes
+from pendulum_msgs_py.contract.values import NANOSECONDS, JointSample
 
 __all__ = ["AnswerLoop", "StateRefusal"]
 

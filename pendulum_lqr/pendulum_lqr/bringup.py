@@ -8,9 +8,9 @@ from dataclasses import dataclass
 
 from pendulum_lqr.controller import CONTROLLERS
 from pendulum_lqr.disturbance import DISTURBANCE_SPECS
-from pendulum_msgs_py import graph
 from pendulum_msgs_py.errors import ParameterError
-from pendulum_msgs_py.graph import NodeProgram
+from pendulum_msgs_py.programs import graph
+from pendulum_msgs_py.programs.graph import NodeProgram
 
 __all__ = ["ARGUMENTS", "SIDES", "Argument", "programs"]
 

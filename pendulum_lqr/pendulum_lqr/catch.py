@@ -9,8 +9,8 @@ from functools import lru_cache
 from pendulum_lqr.design import Gain, continuous_lqr
 from pendulum_lqr.model import linearise
 from pendulum_lqr.roa import proven_level
-from pendulum_msgs_py.angles import wrap
-from pendulum_msgs_py.plant_parameters import PlantParameters
+from pendulum_msgs_py.contract.angles import wrap
+from pendulum_msgs_py.plants.plant_parameters import PlantParameters
 
 __all__ = ["Catch", "make_catch"]
 

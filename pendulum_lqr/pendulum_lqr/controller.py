@@ -13,10 +13,10 @@ from difflib import get_close_matches
 from typing import Any, ClassVar, Protocol, cast
 
 from pendulum_lqr.velocity import VELOCITY_ESTIMATORS, VelocityEstimator, make_velocity_estimator
-from pendulum_msgs_py.angles import wrap
+from pendulum_msgs_py.contract.angles import wrap
 from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.parameters import ParameterSpec, validate
-from pendulum_msgs_py.plant_parameters import PlantParameters
+from pendulum_msgs_py.plants.plant_parameters import PlantParameters
 
 __all__ = [
     "COMMON_PARAMETERS",

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 # isort: off
-import pendulum_msgs_py.one_thread  # noqa: F401  # before anything that imports numpy
+import pendulum_msgs_py.programs.one_thread  # noqa: F401  # before anything that imports numpy
 # isort: on
 
 import math
@@ -25,17 +25,17 @@ from pendulum_lqr.controller import (
     controller_class,
     make_controller,
 )
-from pendulum_msgs_py import names
-from pendulum_msgs_py.cdr import encode_joint_state
+from pendulum_msgs_py.contract import names
+from pendulum_msgs_py.contract.cdr import encode_joint_state
+from pendulum_msgs_py.contract.timing import SteadyWallClock
 from pendulum_msgs_py.errors import PendulumError
 from pendulum_msgs_py.parameters import ParameterSpec
-from pendulum_msgs_py.plant_parameters import PlantParameters, load_plant
+from pendulum_msgs_py.plants.plant_parameters import PlantParameters, load_plant
 from pendulum_msgs_py.ros import qos
 from pendulum_msgs_py.ros.convert import diagnostic_status, sample_from_bytes, stamp_to_message
 from pendulum_msgs_py.ros.lifecycle import LifecycleNode
 from pendulum_msgs_py.ros.parameters import NodeParameters
 from pendulum_msgs_py.ros.runner import run_node
-from pendulum_msgs_py.timing import SteadyWallClock
 
 __all__ = ["NODE_SPECS", "ControllerNode", "main"]
 

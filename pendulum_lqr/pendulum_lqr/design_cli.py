@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 # isort: off
-import pendulum_msgs_py.one_thread  # noqa: F401  # before anything that imports numpy
+import pendulum_msgs_py.programs.one_thread  # noqa: F401  # before anything that imports numpy
 # isort: on
 
 import json
@@ -19,11 +19,11 @@ from rich.console import Console
 from pendulum_lqr.analysis import LoopReport, analyse
 from pendulum_lqr.design import Gain, continuous_lqr
 from pendulum_lqr.model import LinearModel, linearise
-from pendulum_msgs_py.angles import UPRIGHT
+from pendulum_msgs_py.contract.angles import UPRIGHT
 from pendulum_msgs_py.errors import ParameterError
-from pendulum_msgs_py.executables import cli_main
-from pendulum_msgs_py.plant_parameters import PRESETS, load_plant
-from pendulum_msgs_py.terminal import WholeTable, make_console
+from pendulum_msgs_py.plants.plant_parameters import PRESETS, load_plant
+from pendulum_msgs_py.programs.executables import cli_main
+from pendulum_msgs_py.programs.terminal import WholeTable, make_console
 
 __all__ = ["THESIS_CHOICE", "THESIS_WEIGHTS", "app", "main"]
 

@@ -14,10 +14,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from pendulum_msgs_py import noise
+from pendulum_msgs_py.contract import noise
+from pendulum_msgs_py.contract.values import NANOSECONDS
 from pendulum_msgs_py.errors import DataError, ParameterError
 from pendulum_msgs_py.parameters import ParameterSpec, validate
-from pendulum_msgs_py.values import NANOSECONDS
 
 __all__ = ["DISTURBANCES", "DISTURBANCE_SPECS", "Disturbance", "from_bag", "make_disturbance", "torques"]
 

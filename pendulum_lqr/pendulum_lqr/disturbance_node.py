@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 # isort: off
-import pendulum_msgs_py.one_thread  # noqa: F401  # before anything that imports numpy
+import pendulum_msgs_py.programs.one_thread  # noqa: F401  # before anything that imports numpy
 # isort: on
 
 import sys
@@ -21,16 +21,16 @@ from std_srvs.srv import Trigger
 
 from pendulum_lqr.disturbance import DISTURBANCE_SPECS, Disturbance, from_bag, make_disturbance
 from pendulum_lqr.disturbing import DisturbanceLoop
-from pendulum_msgs_py import names
-from pendulum_msgs_py.cdr import encode_joint_state
+from pendulum_msgs_py.contract import names
+from pendulum_msgs_py.contract.cdr import encode_joint_state
+from pendulum_msgs_py.contract.timing import SteadyWallClock
+from pendulum_msgs_py.contract.values import NANOSECONDS
 from pendulum_msgs_py.errors import DataError, ParameterError
 from pendulum_msgs_py.parameters import ParameterSpec, read_text
 from pendulum_msgs_py.ros import qos
 from pendulum_msgs_py.ros.convert import diagnostic_status, event_message, sample_from_bytes, stamp_to_message
 from pendulum_msgs_py.ros.parameters import NodeParameters
 from pendulum_msgs_py.ros.runner import run_node
-from pendulum_msgs_py.timing import SteadyWallClock
-from pendulum_msgs_py.values import NANOSECONDS
 
 __all__ = ["NODE_SPECS", "DisturbanceNode", "main"]
 

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from typing import NamedTuple
 
 from pendulum_lqr.disturbance import Disturbance
-from pendulum_msgs_py.values import NANOSECONDS
+from pendulum_msgs_py.contract.values import NANOSECONDS
 
 __all__ = ["DisturbanceAnswer", "DisturbanceLoop"]
 

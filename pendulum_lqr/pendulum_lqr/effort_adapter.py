@@ -11,9 +11,9 @@ import math
 from collections import Counter
 from collections.abc import Sequence
 
+from pendulum_msgs_py.contract.names import JOINT
+from pendulum_msgs_py.contract.values import NANOSECONDS
 from pendulum_msgs_py.errors import DataError
-from pendulum_msgs_py.names import JOINT
-from pendulum_msgs_py.values import NANOSECONDS
 
 __all__ = ["EffortAdapter", "effort_of_array", "effort_of_joint"]
 

@@ -13,15 +13,15 @@ from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64MultiArray
 
 from pendulum_lqr.effort_adapter import EffortAdapter, effort_of_array, effort_of_joint
-from pendulum_msgs_py import names
-from pendulum_msgs_py.cdr import encode_joint_state
+from pendulum_msgs_py.contract import names
+from pendulum_msgs_py.contract.cdr import encode_joint_state
+from pendulum_msgs_py.contract.timing import SteadyWallClock
 from pendulum_msgs_py.errors import DataError
 from pendulum_msgs_py.parameters import ParameterSpec
 from pendulum_msgs_py.ros import qos
 from pendulum_msgs_py.ros.convert import diagnostic_status, sample_from_bytes, stamp_to_message
 from pendulum_msgs_py.ros.parameters import NodeParameters
 from pendulum_msgs_py.ros.runner import run_node
-from pendulum_msgs_py.timing import SteadyWallClock
 
 __all__ = ["NODE_SPECS", "EffortAdapterNode", "main"]
 

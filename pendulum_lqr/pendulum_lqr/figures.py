@@ -20,7 +20,7 @@ from pendulum_lqr.analysis import LoopReport, analyse, closed_loop_poles, loop_t
 from pendulum_lqr.design import Gain
 from pendulum_lqr.model import LinearModel, RigidPlant
 from pendulum_lqr.roa import Region, region_of_attraction, rigid_rollout
-from pendulum_msgs_py.angles import UPRIGHT
+from pendulum_msgs_py.contract.angles import UPRIGHT
 
 __all__ = [
     "bode_figure",

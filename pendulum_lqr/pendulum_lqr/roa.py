@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from pendulum_lqr.design import DesignError, Gain
 from pendulum_lqr.model import RigidPlant
-from pendulum_msgs_py.angles import UPRIGHT, wrap
+from pendulum_msgs_py.contract.angles import UPRIGHT, wrap
 
 __all__ = ["Region", "Rollout", "proven_level", "region_of_attraction", "rigid_rollout", "sublevel_ellipse"]
 

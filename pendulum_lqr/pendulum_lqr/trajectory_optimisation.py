@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pendulum_lqr.design import DesignError
-from pendulum_msgs_py.plant_parameters import PlantParameters
+from pendulum_msgs_py.plants.plant_parameters import PlantParameters
 
 __all__ = ["OptimisedTrajectory", "rigid_dynamics", "swing_up_trajectory"]
 

@@ -13,9 +13,9 @@ import numpy as np
 
 from pendulum_lqr.design import discretise, kalman_gain
 from pendulum_lqr.model import LinearModel, linearise
-from pendulum_msgs_py.angles import wrap
+from pendulum_msgs_py.contract.angles import wrap
 from pendulum_msgs_py.errors import ParameterError
-from pendulum_msgs_py.plant_parameters import PlantParameters
+from pendulum_msgs_py.plants.plant_parameters import PlantParameters
 
 __all__ = [
     "VELOCITY_ESTIMATORS",

@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 
 from pendulum_lqr.controller import Controller
 from pendulum_lqr.disturbance import Disturbance
-from pendulum_msgs_py.angles import from_upright
-from pendulum_msgs_py.plant_parameters import PlantParameters
+from pendulum_msgs_py.contract.angles import from_upright
+from pendulum_msgs_py.plants.plant_parameters import PlantParameters
 
 
 class Run(NamedTuple):

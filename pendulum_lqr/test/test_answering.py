@@ -8,8 +8,8 @@ from hypothesis import strategies as st
 
 from pendulum_lqr.answering import AnswerLoop, StateRefusal
 from pendulum_lqr.controller import BaseController, make_controller
-from pendulum_msgs_py.plant_parameters import load_plant
-from pendulum_msgs_py.values import JointSample
+from pendulum_msgs_py.contract.values import JointSample
+from pendulum_msgs_py.plants.plant_parameters import load_plant
 
 THESIS = load_plant("thesis")
 MS = 1_000_000

@@ -22,7 +22,7 @@ from pendulum_lqr.controller import (
 from pendulum_lqr.controllers.playback import Playback
 from pendulum_lqr.disturbance import make_disturbance
 from pendulum_msgs_py.errors import DataError, ParameterError
-from pendulum_msgs_py.plant_parameters import PlantParameters, load_plant
+from pendulum_msgs_py.plants.plant_parameters import PlantParameters, load_plant
 
 THESIS = load_plant("thesis")
 DFKI = load_plant("dfki")

@@ -5,7 +5,7 @@ import json
 import pytest
 
 from pendulum_lqr.design_cli import main
-from pendulum_msgs_py.plant_parameters import load_plant, write_plant
+from pendulum_msgs_py.plants.plant_parameters import load_plant, write_plant
 
 
 def test_the_table_of_the_thesis_is_printed_to_its_last_digit(capsys):

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from pendulum_lqr.disturbance import DISTURBANCE_SPECS, DISTURBANCES, from_bag, make_disturbance, torques
 from pendulum_lqr.disturbing import DisturbanceLoop
-from pendulum_msgs_py import noise
+from pendulum_msgs_py.contract import noise
 from pendulum_msgs_py.errors import DataError, ParameterError
 
 MS = 1_000_000

@@ -15,7 +15,7 @@ from pendulum_lqr.model import (
     state_derivative,
 )
 from pendulum_msgs_py.errors import ParameterError
-from pendulum_msgs_py.plant_parameters import PlantParameters, load_plant
+from pendulum_msgs_py.plants.plant_parameters import PlantParameters, load_plant
 
 PLANTS = st.builds(
     PlantParameters,

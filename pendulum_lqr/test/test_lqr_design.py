@@ -24,7 +24,7 @@ from pendulum_lqr.design import (
     sampled_cost,
 )
 from pendulum_lqr.model import LinearModel, linearise
-from pendulum_msgs_py.plant_parameters import PlantParameters, load_plant
+from pendulum_msgs_py.plants.plant_parameters import PlantParameters, load_plant
 
 THESIS = load_plant("thesis")
 UPRIGHT = linearise(THESIS)

@@ -17,7 +17,7 @@ from std_msgs.msg import Float64MultiArray, String
 from std_srvs.srv import Trigger
 
 from pendulum_lqr.disturbance import make_disturbance
-from pendulum_msgs_py.cdr import decode_joint_state, encode_joint_state
+from pendulum_msgs_py.contract.cdr import decode_joint_state, encode_joint_state
 from pendulum_msgs_py.ros import qos
 from tests.graph_peer import GraphPeer
 

@@ -8,7 +8,7 @@ import pytest
 from pendulum_lqr.design import DesignError, continuous_lqr
 from pendulum_lqr.model import linearise
 from pendulum_lqr.roa import proven_level, region_of_attraction, rigid_rollout, sublevel_ellipse
-from pendulum_msgs_py.plant_parameters import load_plant
+from pendulum_msgs_py.plants.plant_parameters import load_plant
 
 THESIS = load_plant("thesis")
 DFKI = load_plant("dfki")

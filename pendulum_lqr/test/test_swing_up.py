@@ -12,7 +12,7 @@ import pytest
 from pendulum_lqr.controller import make_controller
 from pendulum_lqr.minimum_time import minimum_time
 from pendulum_lqr.trajectory_optimisation import swing_up_trajectory
-from pendulum_msgs_py.plant_parameters import PlantParameters, load_plant
+from pendulum_msgs_py.plants.plant_parameters import PlantParameters, load_plant
 
 DFKI = load_plant("dfki")
 BENCHMARK = PlantParameters(

@@ -7,9 +7,9 @@ import pytest
 
 from pendulum_lqr.controller import make_controller
 from pendulum_lqr.velocity import VELOCITY_ESTIMATORS, KalmanVelocity, SavitzkyGolay, make_velocity_estimator
-from pendulum_msgs_py.angles import wrap
+from pendulum_msgs_py.contract.angles import wrap
 from pendulum_msgs_py.errors import ParameterError
-from pendulum_msgs_py.plant_parameters import load_plant
+from pendulum_msgs_py.plants.plant_parameters import load_plant
 
 THESIS = load_plant("thesis")
 DFKI = load_plant("dfki")

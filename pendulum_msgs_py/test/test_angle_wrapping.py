@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pendulum_msgs_py.angles import UPRIGHT, from_upright, wrap
+from pendulum_msgs_py.contract.angles import UPRIGHT, from_upright, wrap
 
 _FINITE = st.floats(-1e9, 1e9)
 

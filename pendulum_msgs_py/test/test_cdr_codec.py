@@ -8,10 +8,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pendulum_msgs_py import cdr
-from pendulum_msgs_py.cdr import MAX_SECONDS, decode_joint_state, encode_clock, encode_joint_state
-from pendulum_msgs_py.names import JOINT
-from pendulum_msgs_py.values import NANOSECONDS
+from pendulum_msgs_py.contract import cdr
+from pendulum_msgs_py.contract.cdr import MAX_SECONDS, decode_joint_state, encode_clock, encode_joint_state
+from pendulum_msgs_py.contract.names import JOINT
+from pendulum_msgs_py.contract.values import NANOSECONDS
 
 serialization = pytest.importorskip("rclpy.serialization")
 JointState = pytest.importorskip("sensor_msgs.msg").JointState
@@ -119,7 +119,7 @@ def test_a_name_with_a_nul_inside_is_left_to_the_middleware() -> None:
 
 
 def test_trajectories_travel_to_a_nanosecond() -> None:
-    from pendulum_msgs_py.trajectory import thesis_ramp
+    from pendulum_msgs_py.contract.trajectory import thesis_ramp
 
     ramp = thesis_ramp(0.1, 0.3)
     back = convert.trajectory_from_message(convert.trajectory_to_message(ramp))

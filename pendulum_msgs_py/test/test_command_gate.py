@@ -8,9 +8,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pendulum_msgs_py.commands import COMMANDER_HOLD, CommandGate, Refusal
-from pendulum_msgs_py.names import JOINT
-from pendulum_msgs_py.values import NANOSECONDS, JointCommand
+from pendulum_msgs_py.contract.commands import COMMANDER_HOLD, CommandGate, Refusal
+from pendulum_msgs_py.contract.names import JOINT
+from pendulum_msgs_py.contract.values import NANOSECONDS, JointCommand
 
 _MS = 1_000_000
 _NOW = 1_000 * NANOSECONDS

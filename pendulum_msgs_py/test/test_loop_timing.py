@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pendulum_msgs_py.timing import LoopStatistics, RingOfTimes, SteadyWallClock
+from pendulum_msgs_py.contract.timing import LoopStatistics, RingOfTimes, SteadyWallClock
 
 _MS = 1_000_000
 

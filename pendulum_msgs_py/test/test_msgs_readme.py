@@ -7,11 +7,11 @@ from pathlib import Path
 
 import pytest
 
-from pendulum_msgs_py import names
-from pendulum_msgs_py.commands import Refusal
+from pendulum_msgs_py.contract import names
+from pendulum_msgs_py.contract.commands import Refusal
+from pendulum_msgs_py.contract.supervisor import Mode
 from pendulum_msgs_py.parameters import ParameterSpec, markdown_table
-from pendulum_msgs_py.plant_parameters import DRIVETRAIN_SPECS, PLANT_SPECS, PRESETS
-from pendulum_msgs_py.supervisor import Mode
+from pendulum_msgs_py.plants.plant_parameters import DRIVETRAIN_SPECS, PLANT_SPECS, PRESETS
 
 _README = (Path(__file__).resolve().parents[1] / "README.md").read_text(encoding="utf-8")
 

@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy import stats
 
-from pendulum_msgs_py import noise
+from pendulum_msgs_py.contract import noise
 from pendulum_msgs_py.errors import ParameterError
 
 _SEEDS = st.integers(0, noise.MAX_SEED)

@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from pendulum_msgs_py.errors import ParameterError
-from pendulum_msgs_py.plant_parameters import (
+from pendulum_msgs_py.plants.plant_parameters import (
     DRIVETRAIN_SPECS,
     PLANT_SPECS,
     PRESETS,

@@ -9,8 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pendulum_msgs_py.errors import ParameterError
-from pendulum_msgs_py.trajectory import (
+from pendulum_msgs_py.contract.trajectory import (
     MAX_RAMP_VELOCITY,
     RAMP_INCREMENT,
     RAMP_PERIOD,
@@ -18,6 +17,7 @@ from pendulum_msgs_py.trajectory import (
     from_points,
     thesis_ramp,
 )
+from pendulum_msgs_py.errors import ParameterError
 
 _ANGLES = st.floats(-10.0, 10.0)
 

@@ -11,7 +11,13 @@ import pytest
 import typer
 
 from pendulum_msgs_py.errors import ParameterError
-from pendulum_msgs_py.executables import EXIT_INTERRUPTED, EXIT_USAGE, cli_main, report_error, run_package
+from pendulum_msgs_py.programs.executables import (
+    EXIT_INTERRUPTED,
+    EXIT_USAGE,
+    cli_main,
+    report_error,
+    run_package,
+)
 
 
 @pytest.fixture
@@ -111,7 +117,7 @@ def test_an_error_is_one_sentence(capsys: pytest.CaptureFixture[str]) -> None:
 
 _LONG_OUTPUT = """
 import typer
-from pendulum_msgs_py.executables import cli_main
+from pendulum_msgs_py.programs.executables import cli_main
 app = typer.Typer()
 @app.command()
 def main():
@@ -120,12 +126,12 @@ def main():
 raise SystemExit(cli_main(app, []))
 """
 _LONG_TEXT = """
-from pendulum_msgs_py.executables import print_text
+from pendulum_msgs_py.programs.executables import print_text
 print_text("line\\n" * 200000)
 """
 _SHORT_OUTPUT = """
 import time, typer
-from pendulum_msgs_py.executables import cli_main
+from pendulum_msgs_py.programs.executables import cli_main
 app = typer.Typer()
 @app.command()
 def main():

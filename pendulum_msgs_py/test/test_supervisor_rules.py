@@ -11,8 +11,7 @@ from hypothesis import settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, precondition, rule
 
-from pendulum_msgs_py.errors import ParameterError
-from pendulum_msgs_py.supervisor import (
+from pendulum_msgs_py.contract.supervisor import (
     PUSH_LIMIT_FACTOR,
     Drive,
     DriveKind,
@@ -21,8 +20,9 @@ from pendulum_msgs_py.supervisor import (
     PlantLimits,
     PlantSupervisor,
 )
-from pendulum_msgs_py.trajectory import Trajectory, from_points
-from pendulum_msgs_py.values import NANOSECONDS, JointCommand, JointSample
+from pendulum_msgs_py.contract.trajectory import Trajectory, from_points
+from pendulum_msgs_py.contract.values import NANOSECONDS, JointCommand, JointSample
+from pendulum_msgs_py.errors import ParameterError
 
 _MS = 1_000_000
 _PERIOD_NS = 10 * _MS

@@ -16,10 +16,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from rich.console import Console
 
-from pendulum_msgs_py.terminal import WholeTable, make_console
+from pendulum_msgs_py.programs.terminal import WholeTable, make_console
 
 _PRINT = """
-from pendulum_msgs_py.terminal import WholeTable, make_console
+from pendulum_msgs_py.programs.terminal import WholeTable, make_console
 table = WholeTable("quantity", *(f"column {number}" for number in range(12)))
 table.add_row("damping", *(f"11.{number:05d}" for number in range(12)))
 make_console().print(table)

@@ -5,8 +5,8 @@ Each pendulum has its own parameters, gain, start, seed and noise amplitude::
     u_k = clamp(-K [wrap(theta_k - target), theta_dot_k] + noise(seed, k // hold), effort_limit)
 
 Equations, integrators and noise are those of :class:`pendulum_sim.plant.RigidPlant` and of
-``pendulum_msgs_py.noise``, compiled, so that one pendulum of a batch moves like one on the graph. Memory does not
-depend on the number of steps, unless the trajectories are asked for.
+``pendulum_msgs_py.contract.noise``, compiled, so that one pendulum of a batch moves like one on the graph.
+Memory does not depend on the number of steps, unless the trajectories are asked for.
 """
 
 from __future__ import annotations
@@ -17,10 +17,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from pendulum_msgs_py.angles import UPRIGHT
+from pendulum_msgs_py.contract.angles import UPRIGHT
+from pendulum_msgs_py.contract.noise import stream_key
 from pendulum_msgs_py.errors import ParameterError
-from pendulum_msgs_py.noise import stream_key
-from pendulum_msgs_py.plant_parameters import PlantParameters
+from pendulum_msgs_py.plants.plant_parameters import PlantParameters
 from pendulum_sim.dry_friction import PACKED
 from pendulum_sim.integrators import get_integrator
 from pendulum_sim.plant import check_step, pack

@@ -13,7 +13,7 @@ from typing import Any
 import numba
 import numpy as np
 
-from pendulum_msgs_py import noise
+from pendulum_msgs_py.contract import noise
 from pendulum_sim import vector_math
 from pendulum_sim.compiling import compile_tree, tuple_loader
 from pendulum_sim.dry_friction import PACKED, acceleration_with_friction, actuator_torque, advance_dry

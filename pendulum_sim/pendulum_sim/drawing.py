@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pendulum_msgs_py.angles import from_upright
+from pendulum_msgs_py.contract.angles import from_upright
 from pendulum_msgs_py.errors import ParameterError
 
 os.environ.setdefault("PYGAME_HIDE_SUPPORT_PROMPT", "1")

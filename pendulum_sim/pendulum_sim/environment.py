@@ -19,10 +19,10 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
-from pendulum_msgs_py import noise
-from pendulum_msgs_py.angles import UPRIGHT, from_upright
+from pendulum_msgs_py.contract import noise
+from pendulum_msgs_py.contract.angles import UPRIGHT, from_upright
 from pendulum_msgs_py.errors import ParameterError
-from pendulum_msgs_py.plant_parameters import PlantParameters, load_plant
+from pendulum_msgs_py.plants.plant_parameters import PlantParameters, load_plant
 from pendulum_sim.environment_kernel import is_smooth, lane_table, step_kernel
 from pendulum_sim.integrators import get_integrator
 from pendulum_sim.plant import check_start, check_step, make_plant

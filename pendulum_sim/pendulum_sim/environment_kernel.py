@@ -13,9 +13,9 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from pendulum_msgs_py import noise
-from pendulum_msgs_py.angles import UPRIGHT
-from pendulum_msgs_py.plant_parameters import PlantParameters
+from pendulum_msgs_py.contract import noise
+from pendulum_msgs_py.contract.angles import UPRIGHT
+from pendulum_msgs_py.plants.plant_parameters import PlantParameters
 from pendulum_sim import vector_math
 from pendulum_sim.compiling import compile_tree, tuple_loader
 from pendulum_sim.dry_friction import PACKED, acceleration_with_friction

@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 from numpy.typing import ArrayLike
 
 from pendulum_msgs_py.errors import DataError, ParameterError
-from pendulum_msgs_py.plant_parameters import PlantParameters
+from pendulum_msgs_py.plants.plant_parameters import PlantParameters
 
 __all__ = ["FixedPoint", "fixed_points", "plot_evolution", "plot_overdamped_phase", "save_figure"]
 

@@ -15,14 +15,14 @@ from sensor_msgs.msg import JointState
 from std_msgs.msg import ColorRGBA
 from visualization_msgs.msg import Marker, MarkerArray
 
-from pendulum_msgs_py import names
+from pendulum_msgs_py.contract import names
+from pendulum_msgs_py.contract.values import NANOSECONDS
 from pendulum_msgs_py.parameters import ParameterSpec
 from pendulum_msgs_py.ros import qos
 from pendulum_msgs_py.ros.convert import command_from_bytes, stamp_to_message
 from pendulum_msgs_py.ros.parameters import NodeParameters
 from pendulum_msgs_py.ros.plant_loop import create_wall_timer
 from pendulum_msgs_py.ros.runner import run_node
-from pendulum_msgs_py.values import NANOSECONDS
 
 __all__ = ["SPECS", "MarkersNode", "arc_points", "main"]
 

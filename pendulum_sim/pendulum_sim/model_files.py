@@ -16,11 +16,11 @@ from xml.etree import ElementTree
 
 import typer
 
+from pendulum_msgs_py.contract.names import JOINT, LINK
 from pendulum_msgs_py.dynamics.series_elastic import shorted_winding_damping, winding_resistance_at
 from pendulum_msgs_py.errors import ParameterError
-from pendulum_msgs_py.executables import cli_main
-from pendulum_msgs_py.names import JOINT, LINK
-from pendulum_msgs_py.plant_parameters import PlantParameters, load_plant
+from pendulum_msgs_py.plants.plant_parameters import PlantParameters, load_plant
+from pendulum_msgs_py.programs.executables import cli_main
 from pendulum_sim.ros2_control_tags import add_ros2_control
 
 __all__ = ["LinkShape", "link_shape", "main", "mjcf", "urdf"]

@@ -9,8 +9,8 @@ from typing import Annotated
 
 import typer
 
-from pendulum_msgs_py.executables import cli_main
-from pendulum_msgs_py.plant_parameters import load_plant
+from pendulum_msgs_py.plants.plant_parameters import load_plant
+from pendulum_msgs_py.programs.executables import cli_main
 
 __all__ = ["main"]
 
@@ -31,7 +31,7 @@ def phase_plot(
     Example: python -m pendulum_sim phase_plot --plant thesis --torque 0.5 --output phase.png
     """
     # Imported late: --help should not wait for matplotlib.
-    from pendulum_msgs_py.terminal import WholeTable, make_console
+    from pendulum_msgs_py.programs.terminal import WholeTable, make_console
     from pendulum_sim.figures import fixed_points, plot_overdamped_phase, save_figure
 
     parameters = load_plant(plant)

@@ -15,7 +15,7 @@ from typing import NamedTuple, Protocol
 
 from pendulum_msgs_py.dynamics import rigid_energy
 from pendulum_msgs_py.errors import ParameterError
-from pendulum_msgs_py.plant_parameters import PlantParameters
+from pendulum_msgs_py.plants.plant_parameters import PlantParameters
 from pendulum_sim.dry_friction import PACKED, acceleration_with_friction, actuator_torque, advance_dry
 from pendulum_sim.integrators import Coefficients, PlantTuple, get_integrator
 

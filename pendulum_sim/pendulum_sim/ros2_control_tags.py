@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from xml.etree import ElementTree
 
+from pendulum_msgs_py.contract.names import JOINT, JOINT_STATES
 from pendulum_msgs_py.errors import ParameterError
-from pendulum_msgs_py.names import JOINT, JOINT_STATES
 
 __all__ = ["HARDWARE", "add_ros2_control"]
 

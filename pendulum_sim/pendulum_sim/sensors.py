@@ -13,8 +13,8 @@ from typing import Any
 
 import numpy as np
 
+from pendulum_msgs_py.contract.values import JointSample
 from pendulum_msgs_py.parameters import ParameterSpec, validate
-from pendulum_msgs_py.values import JointSample
 
 __all__ = ["SENSOR_SPECS", "Sensors", "quantise"]
 

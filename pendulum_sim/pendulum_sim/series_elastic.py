@@ -22,7 +22,7 @@ from pendulum_msgs_py.dynamics.series_elastic import (
     winding_resistance_at,
 )
 from pendulum_msgs_py.errors import ParameterError
-from pendulum_msgs_py.plant_parameters import PlantParameters
+from pendulum_msgs_py.plants.plant_parameters import PlantParameters
 from pendulum_sim.dry_friction import actuator_torque
 from pendulum_sim.plant import DelayLine, PlantState, check_start, check_step, period_segments
 

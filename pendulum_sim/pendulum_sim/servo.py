@@ -13,7 +13,7 @@ import math
 from pendulum_msgs_py.dynamics import gravity_torque
 from pendulum_msgs_py.dynamics.series_elastic import shorted_winding_damping
 from pendulum_msgs_py.errors import ParameterError
-from pendulum_msgs_py.plant_parameters import PlantParameters
+from pendulum_msgs_py.plants.plant_parameters import PlantParameters
 
 __all__ = ["PositionServo"]
 

@@ -11,10 +11,13 @@ import numpy as np
 from sensor_msgs.msg import JointState
 from std_srvs.srv import SetBool, Trigger
 
+from pendulum_msgs_py.contract.names import JOINT
+from pendulum_msgs_py.contract.supervisor import Drive, DriveKind, Input, Mode, PlantSupervisor
+from pendulum_msgs_py.contract.timing import LoopStatistics, SteadyWallClock
+from pendulum_msgs_py.contract.values import NANOSECONDS, JointCommand, JointSample
 from pendulum_msgs_py.errors import ParameterError
-from pendulum_msgs_py.names import JOINT
 from pendulum_msgs_py.parameters import ParameterSpec
-from pendulum_msgs_py.plant_parameters import load_plant
+from pendulum_msgs_py.plants.plant_parameters import load_plant
 from pendulum_msgs_py.ros import qos
 from pendulum_msgs_py.ros.convert import sample_from_message
 from pendulum_msgs_py.ros.parameters import NodeParameters
@@ -22,9 +25,6 @@ from pendulum_msgs_py.ros.plant_interface import LIMIT_SPECS, PlantInterface, li
 from pendulum_msgs_py.ros.plant_loop import LOCKSTEP_EPOCH_NS, LOOP_SPECS, LockstepLoop, RealtimeLoop
 from pendulum_msgs_py.ros.polled import PollingNode
 from pendulum_msgs_py.ros.runner import run_node
-from pendulum_msgs_py.supervisor import Drive, DriveKind, Input, Mode, PlantSupervisor
-from pendulum_msgs_py.timing import LoopStatistics, SteadyWallClock
-from pendulum_msgs_py.values import NANOSECONDS, JointCommand, JointSample
 from pendulum_sim.integrators import METHODS
 from pendulum_sim.plant import PlantState, make_plant
 from pendulum_sim.sensors import SENSOR_SPECS, Sensors

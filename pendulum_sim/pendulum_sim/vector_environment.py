@@ -9,10 +9,10 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
-from pendulum_msgs_py import noise
-from pendulum_msgs_py.angles import UPRIGHT, from_upright
+from pendulum_msgs_py.contract import noise
+from pendulum_msgs_py.contract.angles import UPRIGHT, from_upright
 from pendulum_msgs_py.errors import ParameterError
-from pendulum_msgs_py.plant_parameters import PlantParameters, load_plant
+from pendulum_msgs_py.plants.plant_parameters import PlantParameters, load_plant
 from pendulum_sim.environment import (
     EPISODE_STEPS,
     THESIS_Q,

@@ -12,7 +12,8 @@ from rclpy.node import Node
 from sensor_msgs.msg import JointState
 from std_srvs.srv import Trigger
 
-from pendulum_msgs_py import names
+from pendulum_msgs_py.contract import names
+from pendulum_msgs_py.contract.values import NANOSECONDS, JointSample
 from pendulum_msgs_py.errors import ParameterError, PendulumError
 from pendulum_msgs_py.parameters import ParameterSpec
 from pendulum_msgs_py.ros import qos
@@ -20,7 +21,6 @@ from pendulum_msgs_py.ros.convert import command_from_bytes, sample_from_bytes
 from pendulum_msgs_py.ros.parameters import NodeParameters
 from pendulum_msgs_py.ros.plant_loop import create_wall_timer
 from pendulum_msgs_py.ros.runner import run_node
-from pendulum_msgs_py.values import NANOSECONDS, JointSample
 from pendulum_sim.drawing import PendulumPicture, Window, save_gif, save_png
 
 __all__ = ["SPECS", "ViewerNode", "main"]

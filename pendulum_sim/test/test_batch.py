@@ -8,10 +8,10 @@ import tracemalloc
 import numpy as np
 import pytest
 
-from pendulum_msgs_py import noise
-from pendulum_msgs_py.angles import from_upright, wrap
+from pendulum_msgs_py.contract import noise
+from pendulum_msgs_py.contract.angles import from_upright, wrap
 from pendulum_msgs_py.errors import ParameterError
-from pendulum_msgs_py.plant_parameters import PlantParameters, load_plant
+from pendulum_msgs_py.plants.plant_parameters import PlantParameters, load_plant
 from pendulum_sim import vector_math
 from pendulum_sim.batch import simulate_batch
 from pendulum_sim.plant import RigidPlant

@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 from gymnasium.utils.env_checker import check_env
 
-from pendulum_msgs_py import noise
+from pendulum_msgs_py.contract import noise
 from pendulum_msgs_py.errors import ParameterError
-from pendulum_msgs_py.plant_parameters import load_plant
+from pendulum_msgs_py.plants.plant_parameters import load_plant
 from pendulum_sim.environment import ENVIRONMENT_ID, PendulumEnv
 from pendulum_sim.plant import RigidPlant
 from pendulum_sim.vector_environment import PendulumVectorEnv

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from pendulum_msgs_py.errors import DataError, ParameterError
-from pendulum_msgs_py.plant_parameters import load_plant
+from pendulum_msgs_py.plants.plant_parameters import load_plant
 from pendulum_sim.drawing import PendulumPicture, rotation_matrix, save_gif, save_png
 from pendulum_sim.figures import fixed_points, plot_evolution, save_figure
 from pendulum_sim.phase_plot import main

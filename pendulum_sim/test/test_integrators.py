@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
-from pendulum_msgs_py import noise
+from pendulum_msgs_py.contract import noise
 from pendulum_msgs_py.errors import ParameterError
-from pendulum_msgs_py.plant_parameters import PlantParameters, load_plant
+from pendulum_msgs_py.plants.plant_parameters import PlantParameters, load_plant
 from pendulum_sim.integrators import INTEGRATORS, METHODS, get_integrator, phi_functions
 from pendulum_sim.plant import RigidPlant
 

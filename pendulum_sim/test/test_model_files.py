@@ -7,8 +7,8 @@ from xml.etree import ElementTree as XML
 
 import pytest
 
-from pendulum_msgs_py.names import JOINT
-from pendulum_msgs_py.plant_parameters import PRESETS, load_plant
+from pendulum_msgs_py.contract.names import JOINT
+from pendulum_msgs_py.plants.plant_parameters import PRESETS, load_plant
 from pendulum_sim.model_files import link_shape, main, mjcf, urdf
 from pendulum_sim.plant import make_plant
 

@@ -15,7 +15,7 @@ from scipy.special import ellipk
 
 from pendulum_msgs_py.dynamics import rigid_acceleration
 from pendulum_msgs_py.errors import ParameterError
-from pendulum_msgs_py.plant_parameters import PlantParameters, load_plant
+from pendulum_msgs_py.plants.plant_parameters import PlantParameters, load_plant
 from pendulum_sim.dry_friction import acceleration_with_friction
 from pendulum_sim.integrators import METHODS
 from pendulum_sim.plant import RigidPlant, make_plant, pack, period_segments

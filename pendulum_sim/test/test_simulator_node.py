@@ -15,8 +15,8 @@ from diagnostic_msgs.msg import DiagnosticArray
 from sensor_msgs.msg import JointState
 from std_srvs.srv import SetBool, Trigger
 
-from pendulum_msgs_py import names
-from pendulum_msgs_py.plant_parameters import load_plant
+from pendulum_msgs_py.contract import names
+from pendulum_msgs_py.plants.plant_parameters import load_plant
 from pendulum_msgs_py.ros import qos
 from pendulum_msgs_py.ros.convert import stamp_from_message
 from pendulum_sim.plant import RigidPlant

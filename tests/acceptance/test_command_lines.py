@@ -25,8 +25,8 @@ from typing import Any
 import pytest
 import typer.main
 
-from pendulum_msgs_py import completion
 from pendulum_msgs_py.errors import ParameterError
+from pendulum_msgs_py.programs import completion
 from tests.acceptance.test_packaging import PROGRAMS, executables
 from tests.fixtures import PROJECT
 
@@ -209,7 +209,7 @@ def test_the_shell_completes_what_is_typed(shell: str) -> None:
 
 
 def test_another_shell_is_refused_with_a_sentence(capsys: pytest.CaptureFixture[str]) -> None:
-    from pendulum_msgs_py.executables import run_package
+    from pendulum_msgs_py.programs.executables import run_package
 
     with pytest.raises(ParameterError):
         completion.script("tcsh")
@@ -248,7 +248,7 @@ def test_colours_are_left_out_where_nobody_wants_them(tmp_path: Path) -> None:
     assert colour.search(_in_a_terminal(arguments))
     assert not colour.search(_in_a_terminal(arguments, NO_COLOR="1"))
     # Nobody writes colours past the library that knows when not to.
-    sources = [path for folder in ("pendulum_*", "bags") for path in PROJECT.glob(f"{folder}/pendulum_*/**/*.py")]
+    sources = [path for top in ("", "bags/") for path in PROJECT.glob(f"{top}pendulum_*/pendulum_*/**/*.py")]
     assert len(sources) > 100
     raw = re.compile(r"\\033\[|\\x1b\[|\\u001b\[|force_terminal|color_system")
     assert [str(path) for path in sources if raw.search(path.read_text(encoding="utf-8"))] == []

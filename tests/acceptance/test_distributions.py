@@ -1,4 +1,4 @@
-"""Wheels and source archives of the five packages: built without a network, installed into an empty folder, run."""
+"""Wheels and source archives of the six packages: built without a network, installed into an empty folder, run."""
 
 from __future__ import annotations
 
@@ -12,10 +12,17 @@ from pathlib import Path
 
 import pytest
 
-from pendulum_bags.reader import read_bag
+from pendulum_rosbag.reader import read_bag
 from tests.fixtures import PROJECT
 
-FOLDERS = ("pendulum_msgs_py", "pendulum_sim", "pendulum_lqr", "pendulum_hw_bridge", "bags")
+FOLDERS = (
+    "pendulum_msgs_py",
+    "pendulum_sim",
+    "pendulum_lqr",
+    "pendulum_hw_bridge",
+    "bags/pendulum_rosbag",
+    "bags/pendulum_bags",
+)
 
 
 def _run(*command: str | Path, cwd: Path, env: dict[str, str] | None = None) -> str:
@@ -58,19 +65,19 @@ def wheels(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.mark.timeout(300)
-def test_the_five_packages_are_wheels_with_launch_files_and_layouts(wheels: Path) -> None:
-    assert len(list(wheels.glob("*.whl"))) == 5
+def test_the_six_packages_are_wheels_with_launch_files_and_layouts(wheels: Path) -> None:
+    assert len(list(wheels.glob("*.whl"))) == 6
     held = {name for wheel in wheels.glob("*.whl") for name in zipfile.ZipFile(wheel).namelist()}
     for ending in (
         "share/pendulum_lqr/launch/bringup.launch.py",
         "share/pendulum_sim/rviz/pendulum.rviz",
         "share/pendulum_bags/config/foxglove_layout.json",
         "pendulum_bags/console/static/console.js",
-        "pendulum_msgs_py/presets/thesis.yaml",
+        "pendulum_msgs_py/plants/presets/thesis.yaml",
     ):
         assert any(name.endswith(ending) for name in held), ending
     archives = list((wheels.parent / "archives").glob("*.tar.gz"))
-    assert len(archives) == 5
+    assert len(archives) == 6
     for archive in archives:
         with tarfile.open(archive) as content:
             assert any(name.endswith("/package.xml") for name in content.getnames()), archive.name

@@ -12,7 +12,7 @@ from xml.etree import ElementTree
 import pytest
 import yaml
 
-from pendulum_msgs_py import names
+from pendulum_msgs_py.contract import names
 from tests.fixtures import PROJECT
 
 PAGES = sorted(
@@ -75,7 +75,7 @@ def test_the_site_is_built_and_needs_no_other_server() -> None:
 
 
 def test_layouts_show_signals_that_exist() -> None:
-    folder = PROJECT / "bags" / "config"
+    folder = PROJECT / "bags" / "pendulum_bags" / "config"
     known = {names.JOINT_STATES, names.EFFORT_COMMAND, names.DISTURBANCE, names.APPLIED_EFFORT}
     curves = ElementTree.parse(folder / "plotjuggler_layout.xml").getroot().iter("curve")
     plotjuggler = {str(curve.get("name")) for curve in curves}

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from pendulum_bags.reader import read_bag, same_messages
+from pendulum_rosbag.reader import read_bag, same_messages
 from tests.fixtures import PROJECT
 from tests.processes import ProcessGroup
 

@@ -13,7 +13,7 @@ from pathlib import Path
 import psutil
 import pytest
 
-from pendulum_bags.experiment.domain import is_unused
+from pendulum_bags.experiments.domain import is_unused
 from tests.fixtures import PROJECT, wait_for
 from tests.processes import ProcessGroup
 

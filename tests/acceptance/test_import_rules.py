@@ -12,7 +12,14 @@ import pytest
 
 from tests.fixtures import PROJECT
 
-FOLDERS = ["pendulum_msgs_py", "pendulum_sim", "pendulum_lqr", "pendulum_hw_bridge", "bags"]
+FOLDERS = [
+    "pendulum_msgs_py",
+    "pendulum_sim",
+    "pendulum_lqr",
+    "pendulum_hw_bridge",
+    "bags/pendulum_rosbag",
+    "bags/pendulum_bags",
+]
 
 OFFENCES = {
     "a core that imports ROS": (
@@ -39,6 +46,16 @@ OFFENCES = {
         "pendulum_msgs_py/pendulum_msgs_py/offender.py",
         "import pendulum_bags",
         "pendulum_msgs_py.offender -> pendulum_bags",
+    ),
+    "a recorder that imports what reads runs": (
+        "bags/pendulum_rosbag/pendulum_rosbag/offender.py",
+        "import pendulum_bags",
+        "pendulum_rosbag.offender -> pendulum_bags",
+    ),
+    "a recorder that imports the control": (
+        "bags/pendulum_rosbag/pendulum_rosbag/offender.py",
+        "import pendulum_lqr",
+        "pendulum_rosbag.offender -> pendulum_lqr",
     ),
     "a simulator that imports the vendor's library": (
         "pendulum_sim/pendulum_sim/offender.py",

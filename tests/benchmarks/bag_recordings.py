@@ -19,7 +19,7 @@ import psutil
 from mcap.reader import make_reader
 from rosbags.highlevel import AnyReader
 
-from pendulum_bags.reader import Bag, read_bag
+from pendulum_rosbag.reader import Bag, read_bag
 from tests.benchmarks import Row, measured
 
 __all__ = ["kill_rows", "load_rows"]
@@ -31,7 +31,7 @@ _ENVIRONMENT = {"ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST"}
 _PUBLISHER = """
 import sys, time
 import rclpy
-from pendulum_msgs_py.cdr import encode_joint_state
+from pendulum_msgs_py.contract.cdr import encode_joint_state
 from rclpy.qos import QoSProfile
 from sensor_msgs.msg import JointState
 

@@ -6,9 +6,9 @@ import time
 from collections.abc import Iterator
 from pathlib import Path
 
-from pendulum_bags.reader import read_bag
-from pendulum_bags.storage import open_writer
-from pendulum_msgs_py.cdr import encode_joint_state
+from pendulum_msgs_py.contract.cdr import encode_joint_state
+from pendulum_rosbag.reader import read_bag
+from pendulum_rosbag.storage import open_writer
 from tests.benchmarks import Row, measured
 
 __all__ = ["seal_rows"]

@@ -20,10 +20,10 @@ from typing import Any
 
 import numpy as np
 
-from pendulum_bags.reader import read_bag
-from pendulum_bags.storage import open_writer, typestore
-from pendulum_bags.storage.repair import repair_bag
-from pendulum_msgs_py.cdr import encode_joint_state
+from pendulum_msgs_py.contract.cdr import encode_joint_state
+from pendulum_rosbag.reader import read_bag
+from pendulum_rosbag.storage import open_writer, typestore
+from pendulum_rosbag.storage.repair import repair_bag
 from tests.benchmarks import Peer, Row, measured, peer
 from tests.benchmarks.bag_recordings import kill_rows, load_rows
 from tests.benchmarks.bag_seals import seal_rows
@@ -206,9 +206,9 @@ _OUR_MEMORY = (
     + """
 import sys
 from pathlib import Path
-from pendulum_bags.reader import read_bag
-from pendulum_bags.storage import open_writer
-from pendulum_msgs_py.cdr import encode_joint_state
+from pendulum_rosbag.reader import read_bag
+from pendulum_rosbag.storage import open_writer
+from pendulum_msgs_py.contract.cdr import encode_joint_state
 import tempfile
 # A first small bag, so that what is imported late is not counted.
 with tempfile.TemporaryDirectory() as name:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 # isort: off
-import pendulum_msgs_py.one_thread  # noqa: F401  # as the nodes do, before numpy
+import pendulum_msgs_py.programs.one_thread  # noqa: F401  # as the nodes do, before numpy
 # isort: on
 
 import math
@@ -19,8 +19,8 @@ from pendulum_lqr.controllers.playback import Playback
 from pendulum_lqr.design import continuous_lqr
 from pendulum_lqr.model import linearise
 from pendulum_lqr.trajectory_optimisation import swing_up_trajectory
-from pendulum_msgs_py.angles import from_upright
-from pendulum_msgs_py.plant_parameters import PlantParameters, load_plant
+from pendulum_msgs_py.contract.angles import from_upright
+from pendulum_msgs_py.plants.plant_parameters import PlantParameters, load_plant
 from pendulum_sim.plant import make_plant
 from tests.benchmarks import Peer, Row, measured, peer
 

@@ -15,15 +15,15 @@ from typing import Any
 
 import numpy as np
 
-from pendulum_bags.datasets import Recording, read_recording
 from pendulum_bags.identification.model import FitModel, from_plant
 from pendulum_bags.identification.options import Options
 from pendulum_bags.identification.result import identify
 from pendulum_bags.identification.synthetic import multisine, synthetic_recording
 from pendulum_bags.identification.thesis import fit_gravity, fit_inertia_damping
 from pendulum_bags.identification.window_score import free_run, free_run_rms, window_rms
-from pendulum_bags.reader import read_bag, same_messages
-from pendulum_msgs_py.plant_parameters import PlantParameters
+from pendulum_bags.runs.datasets import Recording, read_recording
+from pendulum_msgs_py.plants.plant_parameters import PlantParameters
+from pendulum_rosbag.reader import read_bag, same_messages
 from tests.benchmarks import Peer, Row, measured, peer
 from tests.benchmarks.thesis_trials import hand_recording, staircase_recording
 

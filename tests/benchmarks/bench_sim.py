@@ -9,9 +9,9 @@ from collections.abc import Callable, Iterator
 
 import numpy as np
 
-from pendulum_msgs_py import noise
-from pendulum_msgs_py.angles import from_upright
-from pendulum_msgs_py.plant_parameters import load_plant
+from pendulum_msgs_py.contract import noise
+from pendulum_msgs_py.contract.angles import from_upright
+from pendulum_msgs_py.plants.plant_parameters import load_plant
 from tests.benchmarks import Peer, Row, measured, peer
 
 __all__ = ["rows"]

@@ -17,10 +17,10 @@ from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
-from pendulum_bags.study.bag_table import analyse_bags, find_pieces
-from pendulum_bags.study.chunks import cluster_client
-from pendulum_bags.study.monte_carlo import MonteCarlo, run_chunk, run_monte_carlo
-from pendulum_bags.study.region_map import RegionMap, run_region_map
+from pendulum_bags.analyse.bag_table import analyse_bags, find_pieces
+from pendulum_bags.studies.chunks import cluster_client
+from pendulum_bags.studies.monte_carlo import MonteCarlo, run_chunk, run_monte_carlo
+from pendulum_bags.studies.region_map import RegionMap, run_region_map
 from tests.benchmarks import Row, measured, peer
 from tests.benchmarks.bench_sim import _mujoco_rollout, _numpy_speed
 from tests.faults.delay_margin import find_delay_margin

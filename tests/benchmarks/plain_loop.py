@@ -15,9 +15,9 @@ from rclpy.node import Node
 from rclpy.qos import QoSProfile
 from sensor_msgs.msg import JointState
 
-from pendulum_msgs_py.angles import from_upright
-from pendulum_msgs_py.names import JOINT
-from pendulum_msgs_py.plant_parameters import load_plant
+from pendulum_msgs_py.contract.angles import from_upright
+from pendulum_msgs_py.contract.names import JOINT
+from pendulum_msgs_py.plants.plant_parameters import load_plant
 from pendulum_sim.plant import RigidPlant
 
 

@@ -11,7 +11,7 @@ import psutil
 from diagnostic_msgs.msg import DiagnosticArray
 from std_srvs.srv import SetBool
 
-from pendulum_msgs_py import names
+from pendulum_msgs_py.contract import names
 from pendulum_msgs_py.ros.middleware import set_middleware_defaults
 from tests.graph_peer import GraphPeer
 

@@ -16,7 +16,7 @@ from typing import Any
 
 from rich.text import Text
 
-from pendulum_msgs_py.terminal import WholeTable, make_console
+from pendulum_msgs_py.programs.terminal import WholeTable, make_console
 from tests.benchmarks import Row
 
 __all__ = ["areas", "main", "measure", "merge"]

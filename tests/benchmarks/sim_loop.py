@@ -13,9 +13,9 @@ from pathlib import Path
 
 import psutil
 
-from pendulum_bags.experiment.domain import reserve_domain
-from pendulum_msgs_py import graph
-from pendulum_msgs_py.graph import NodeProgram
+from pendulum_bags.experiments.domain import reserve_domain
+from pendulum_msgs_py.programs import graph
+from pendulum_msgs_py.programs.graph import NodeProgram
 from tests.benchmarks.plant_listener import PlantListener, cpu_time, domain_environment
 from tests.processes import ProcessGroup, RunningProgram
 

@@ -18,10 +18,10 @@ from typing import Annotated
 import numpy as np
 import typer
 
-from pendulum_bags.reader import Bag, read_bag
-from pendulum_msgs_py import names
-from pendulum_msgs_py.cdr import decode_joint_state
-from pendulum_msgs_py.executables import cli_main
+from pendulum_msgs_py.contract import names
+from pendulum_msgs_py.contract.cdr import decode_joint_state
+from pendulum_msgs_py.programs.executables import cli_main
+from pendulum_rosbag.reader import Bag, read_bag
 
 __all__ = ["COMMAND_LIFE", "TorqueRecord", "check_bag"]
 

@@ -22,10 +22,10 @@ from pendulum_hw_bridge.emulation.parameters import load_emulator
 from pendulum_hw_bridge.emulation.x5 import EmulatedX5, LinkState
 from pendulum_hw_bridge.gains import DEFAULT_GAINS
 from pendulum_hw_bridge.safety import SafetyLimits, SafetyMonitor
-from pendulum_msgs_py.angles import UPRIGHT, from_upright
-from pendulum_msgs_py.supervisor import Drive, DriveKind, Input, Mode, PlantLimits, PlantSupervisor
-from pendulum_msgs_py.trajectory import thesis_ramp
-from pendulum_msgs_py.values import JointCommand
+from pendulum_msgs_py.contract.angles import UPRIGHT, from_upright
+from pendulum_msgs_py.contract.supervisor import Drive, DriveKind, Input, Mode, PlantLimits, PlantSupervisor
+from pendulum_msgs_py.contract.trajectory import thesis_ramp
+from pendulum_msgs_py.contract.values import JointCommand
 
 __all__ = ["SCENARIOS", "Reaction", "Rig", "Scenario", "run_scenario"]
 

@@ -14,9 +14,9 @@ from sensor_msgs.msg import JointState
 from std_msgs.msg import Header
 from std_srvs.srv import Trigger
 
-from pendulum_bags.reader import read_bag
+from pendulum_msgs_py.contract.names import JOINT
 from pendulum_msgs_py.errors import BagError
-from pendulum_msgs_py.names import JOINT
+from pendulum_rosbag.reader import read_bag
 from tests.faults.doubles import DOUBLES
 from tests.faults.impostor import IMPOSTORS
 from tests.faults.live import START_TIMEOUT, LiveSystem

@@ -19,26 +19,26 @@ from rclpy.context import Context
 from rclpy.node import Node
 from rosgraph_msgs.msg import Clock
 
-from pendulum_bags.experiment.domain import reserve_domain
-from pendulum_bags.experiment.in_process import simulate
-from pendulum_bags.experiment.lockstep import record_run
-from pendulum_bags.experiment.run_spec import RunSpec
-from pendulum_bags.reader import read_bag
+from pendulum_bags.experiments.domain import reserve_domain
+from pendulum_bags.experiments.in_process import simulate
+from pendulum_bags.experiments.lockstep import record_run
+from pendulum_bags.experiments.run_spec import RunSpec
 from pendulum_lqr.answering import AnswerLoop
 from pendulum_lqr.controller import make_controller
 from pendulum_lqr.disturbance import DISTURBANCE_SPECS, make_disturbance
 from pendulum_lqr.disturbing import DisturbanceLoop
-from pendulum_msgs_py import names
-from pendulum_msgs_py.angles import UPRIGHT, from_upright
+from pendulum_msgs_py.contract import names
+from pendulum_msgs_py.contract.angles import UPRIGHT, from_upright
+from pendulum_msgs_py.contract.supervisor import Drive, Input, PlantSupervisor
+from pendulum_msgs_py.contract.values import NANOSECONDS, JointCommand, JointSample
 from pendulum_msgs_py.errors import FaultError
 from pendulum_msgs_py.parameters import validate
-from pendulum_msgs_py.plant_parameters import load_plant
+from pendulum_msgs_py.plants.plant_parameters import load_plant
 from pendulum_msgs_py.ros import qos
 from pendulum_msgs_py.ros.convert import stamp_to_message
 from pendulum_msgs_py.ros.plant_interface import LIMIT_SPECS, PlantInterface, limits_from_parameters
 from pendulum_msgs_py.ros.plant_loop import LOCKSTEP_EPOCH_NS, LockstepLoop
-from pendulum_msgs_py.supervisor import Drive, Input, PlantSupervisor
-from pendulum_msgs_py.values import NANOSECONDS, JointCommand, JointSample
+from pendulum_rosbag.reader import read_bag
 from pendulum_sim.plant import make_plant
 from tests.faults.live import NAMESPACE, LiveSystem
 from tests.faults.outcome import Outcome, Trial

@@ -22,17 +22,17 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from pendulum_bags.experiment.processes import ProcessSet, start_recorder
-from pendulum_bags.experiment.run_folder import write_json
-from pendulum_bags.reader import read_bag
+from pendulum_bags.experiments.processes import ProcessSet, start_recorder
+from pendulum_bags.runs.run_folder import write_json
 from pendulum_lqr.analysis import delayed_spectral_radius, loop_margins
 from pendulum_lqr.design import continuous_lqr
 from pendulum_lqr.model import linearise
-from pendulum_msgs_py import graph
-from pendulum_msgs_py.angles import UPRIGHT, wrap
+from pendulum_msgs_py.contract.angles import UPRIGHT, wrap
+from pendulum_msgs_py.contract.values import NANOSECONDS
 from pendulum_msgs_py.errors import FaultError
-from pendulum_msgs_py.plant_parameters import PlantParameters, write_plant
-from pendulum_msgs_py.values import NANOSECONDS
+from pendulum_msgs_py.plants.plant_parameters import PlantParameters, write_plant
+from pendulum_msgs_py.programs import graph
+from pendulum_rosbag.reader import read_bag
 from tests.faults.network import (
     PEER_ADDRESS,
     PLANT_ADDRESS,

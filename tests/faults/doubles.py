@@ -11,10 +11,10 @@ from pathlib import Path
 
 import numpy as np
 
-from pendulum_bags.experiment.processes import Child, start_recorder
-from pendulum_bags.reader import read_bag
-from pendulum_msgs_py import names
+from pendulum_bags.experiments.processes import Child, start_recorder
+from pendulum_msgs_py.contract import names
 from pendulum_msgs_py.errors import PendulumError
+from pendulum_rosbag.reader import read_bag
 from tests.faults.bag_property import check_bag
 from tests.faults.live import EFFORT_LIMIT, NAMESPACE, NODES, START_TIMEOUT, LiveSystem
 from tests.faults.outcome import MACHINE_PATIENCE, Fault, Outcome, is_at_rest

@@ -21,8 +21,8 @@ from typing import Annotated, Any
 
 import typer
 
-from pendulum_msgs_py.executables import cli_main
-from pendulum_msgs_py.terminal import WholeTable, make_console
+from pendulum_msgs_py.programs.executables import cli_main
+from pendulum_msgs_py.programs.terminal import WholeTable, make_console
 from tests.faults.parsers import PARSERS, Parser, copy_of, mutate
 
 __all__ = ["HEADROOM", "PATIENCE", "bound_memory", "fuzz_all", "fuzz_one", "too_slow"]

@@ -23,8 +23,8 @@ from typing import Annotated, Any
 import typer
 
 from pendulum_msgs_py.errors import PendulumError
-from pendulum_msgs_py.executables import cli_main
-from pendulum_msgs_py.terminal import WholeTable, make_console
+from pendulum_msgs_py.programs.executables import cli_main
+from pendulum_msgs_py.programs.terminal import WholeTable, make_console
 
 __all__ = ["STORAGES", "fuzz_storage", "watch"]
 
@@ -76,7 +76,7 @@ def _child(storage: str, place: Path, flags: Sequence[str]) -> None:
     """Fuzz one storage until libFuzzer ends this process."""
     sys.path.insert(0, str(ATHERIS))
     atheris: Any = importlib.import_module("atheris")
-    with atheris.instrument_imports(include=["pendulum_bags.reader", "pendulum_bags.storage", "rosbags"]):
+    with atheris.instrument_imports(include=["pendulum_rosbag.reader", "pendulum_rosbag.storage", "rosbags"]):
         for module in ("rosbags.serde", "rosbags.typesys"):
             importlib.import_module(module)
         # Not above: what is imported before is not watched.

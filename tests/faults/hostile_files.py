@@ -16,8 +16,8 @@ from pathlib import Path
 import numpy as np
 import zstandard
 
-from pendulum_bags.storage import mcap_records as rec
-from pendulum_msgs_py.cdr import encode_joint_state
+from pendulum_msgs_py.contract.cdr import encode_joint_state
+from pendulum_rosbag.storage import mcap_records as rec
 from tests.faults.parsers import PARSERS, Parser, make_bag
 
 __all__ = ["HOSTILE", "HostileFile", "outside_reads"]
@@ -48,7 +48,7 @@ class HostileFile:
 
 def outside_reads(folder: Path) -> bool:
     """Tell whether a bag that names files outside of its folder got at one of them."""
-    from pendulum_bags.reader import read_bag
+    from pendulum_rosbag.reader import read_bag
 
     bag = _escaping_bag(folder, "../secret.mcap")
     with read_bag(bag.parent) as opened:

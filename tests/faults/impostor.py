@@ -14,8 +14,8 @@ from dataclasses import dataclass
 
 from sensor_msgs.msg import JointState
 
-from pendulum_msgs_py import names
-from pendulum_msgs_py.cdr import decode_joint_state, encode_joint_state
+from pendulum_msgs_py.contract import names
+from pendulum_msgs_py.contract.cdr import decode_joint_state, encode_joint_state
 from pendulum_msgs_py.ros import qos
 from tests.faults.live import NAMESPACE, START_TIMEOUT, LiveSystem
 from tests.faults.outcome import MAX_TIME_TO_ZERO, Fault, Outcome

@@ -14,12 +14,13 @@ from diagnostic_msgs.msg import DiagnosticArray
 from rclpy.publisher import Publisher
 from sensor_msgs.msg import JointState
 
-from pendulum_bags.experiment.conductor_node import Conductor
-from pendulum_bags.experiment.processes import Child, ProcessSet, ros_environment, start_recorder
-from pendulum_bags.experiment.run_folder import write_json
-from pendulum_msgs_py import graph, names
-from pendulum_msgs_py.cdr import decode_joint_state, encode_joint_state
-from pendulum_msgs_py.graph import NodeProgram
+from pendulum_bags.experiments.conductor_node import Conductor
+from pendulum_bags.experiments.processes import Child, ProcessSet, ros_environment, start_recorder
+from pendulum_bags.runs.run_folder import write_json
+from pendulum_msgs_py.contract import names
+from pendulum_msgs_py.contract.cdr import decode_joint_state, encode_joint_state
+from pendulum_msgs_py.programs import graph
+from pendulum_msgs_py.programs.graph import NodeProgram
 from pendulum_msgs_py.ros import qos
 
 __all__ = ["EFFORT_LIMIT", "NAMESPACE", "NODES", "START_TIMEOUT", "Applied", "LiveSystem"]

@@ -15,11 +15,11 @@ from pathlib import Path
 
 import numpy as np
 
-from pendulum_bags.experiment.processes import ProcessSet, ros_environment, start_recorder
-from pendulum_bags.experiment.run_folder import write_json
-from pendulum_bags.reader import read_bag
-from pendulum_msgs_py import graph
+from pendulum_bags.experiments.processes import ProcessSet, ros_environment, start_recorder
+from pendulum_bags.runs.run_folder import write_json
 from pendulum_msgs_py.errors import FaultError, PendulumError
+from pendulum_msgs_py.programs import graph
+from pendulum_rosbag.reader import read_bag
 from tests.faults.bag_property import COMMAND_LIFE
 from tests.faults.slow_cable import DEVICE, SlowCable
 

@@ -16,20 +16,20 @@ from pathlib import Path
 
 import numpy as np
 
-from pendulum_bags.csv_mapping import read_csv
-from pendulum_bags.datasets import read_servo_log
 from pendulum_bags.identification.result import load_fit_model
-from pendulum_bags.reader import read_bag
-from pendulum_bags.reader.statistics import bag_statistics
-from pendulum_bags.recorder.options import read_metadata
-from pendulum_bags.storage import mcap_records as rec
-from pendulum_bags.storage import open_writer
-from pendulum_bags.study.study_file import load_study
+from pendulum_bags.runs.csv_mapping import read_csv
+from pendulum_bags.runs.datasets import read_servo_log
+from pendulum_bags.studies.study_file import load_study
 from pendulum_hw_bridge.backends.replay import load_feedback
 from pendulum_hw_bridge.gains import DEFAULT_GAINS, load_gains, write_gains
-from pendulum_msgs_py.cdr import encode_joint_state
+from pendulum_msgs_py.contract.cdr import encode_joint_state
 from pendulum_msgs_py.errors import PendulumError
-from pendulum_msgs_py.plant_parameters import PRESETS, load_plant, write_plant
+from pendulum_msgs_py.plants.plant_parameters import PRESETS, load_plant, write_plant
+from pendulum_rosbag.reader import read_bag
+from pendulum_rosbag.reader.statistics import bag_statistics
+from pendulum_rosbag.recorder.options import read_metadata
+from pendulum_rosbag.storage import mcap_records as rec
+from pendulum_rosbag.storage import open_writer
 
 __all__ = ["PARSERS", "Parser", "mutate", "read_whole_bag"]
 

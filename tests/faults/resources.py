@@ -15,13 +15,13 @@ from rclpy.publisher import Publisher
 from sensor_msgs.msg import JointState
 from std_msgs.msg import String
 
-from pendulum_bags.experiment.conductor_node import Conductor, RecorderClient
-from pendulum_bags.experiment.domain import reserve_domain
-from pendulum_bags.experiment.processes import Child, ProcessSet, ros_environment, start_recorder
-from pendulum_bags.experiment.run_folder import write_json
-from pendulum_bags.reader import read_bag
-from pendulum_msgs_py.cdr import encode_joint_state
+from pendulum_bags.experiments.conductor_node import Conductor, RecorderClient
+from pendulum_bags.experiments.domain import reserve_domain
+from pendulum_bags.experiments.processes import Child, ProcessSet, ros_environment, start_recorder
+from pendulum_bags.runs.run_folder import write_json
+from pendulum_msgs_py.contract.cdr import encode_joint_state
 from pendulum_msgs_py.ros import qos
+from pendulum_rosbag.reader import read_bag
 from tests.faults.outcome import Outcome, Trial
 
 __all__ = ["RESOURCE_TRIALS", "recorder_cannot_begin", "recorder_runs_out_of_memory"]

@@ -15,11 +15,11 @@ from typing import Annotated
 import typer
 from rich.progress import Progress, track
 
-from pendulum_bags.experiment.domain import reserve_domain
-from pendulum_bags.experiment.run_folder import write_json
+from pendulum_bags.experiments.domain import reserve_domain
+from pendulum_bags.runs.run_folder import write_json
 from pendulum_msgs_py.errors import FaultError, PendulumError
-from pendulum_msgs_py.executables import EXIT_INTERRUPTED, cli_main
-from pendulum_msgs_py.terminal import WholeTable, make_console
+from pendulum_msgs_py.programs.executables import EXIT_INTERRUPTED, cli_main
+from pendulum_msgs_py.programs.terminal import WholeTable, make_console
 from tests.faults.bag_property import check_bag
 from tests.faults.bridge_rig import SCENARIOS, run_scenario
 from tests.faults.campaign import CAMPAIGN

@@ -10,11 +10,11 @@ from pathlib import Path
 
 import numpy as np
 
-from pendulum_bags.experiment.domain import reserve_domain
-from pendulum_bags.experiment.in_process import simulate
-from pendulum_bags.experiment.run_spec import RunSpec
-from pendulum_bags.reader import read_bag
-from pendulum_msgs_py import names
+from pendulum_bags.experiments.domain import reserve_domain
+from pendulum_bags.experiments.in_process import simulate
+from pendulum_bags.experiments.run_spec import RunSpec
+from pendulum_msgs_py.contract import names
+from pendulum_rosbag.reader import read_bag
 from tests.faults.outcome import Outcome, Trial
 
 __all__ = ["DOMAIN_TRIALS", "run_side_by_side"]

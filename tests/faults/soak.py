@@ -20,16 +20,17 @@ import psutil
 import typer
 from rich.console import Console
 
-from pendulum_bags.experiment.conductor_node import Conductor, PlantClient, RecorderClient
-from pendulum_bags.experiment.domain import reserve_domain
-from pendulum_bags.experiment.processes import Child, ProcessSet, ros_environment, start_recorder
-from pendulum_bags.experiment.run_folder import write_json
-from pendulum_bags.experiment.thesis import LOOP_NICENESS
-from pendulum_bags.reader import Bag, read_bag
-from pendulum_msgs_py import graph, names
-from pendulum_msgs_py.executables import cli_main
-from pendulum_msgs_py.graph import NodeProgram
-from pendulum_msgs_py.terminal import WholeTable, make_console
+from pendulum_bags.experiments.conductor_node import Conductor, PlantClient, RecorderClient
+from pendulum_bags.experiments.domain import reserve_domain
+from pendulum_bags.experiments.processes import Child, ProcessSet, ros_environment, start_recorder
+from pendulum_bags.experiments.thesis import LOOP_NICENESS
+from pendulum_bags.runs.run_folder import write_json
+from pendulum_msgs_py.contract import names
+from pendulum_msgs_py.programs import graph
+from pendulum_msgs_py.programs.executables import cli_main
+from pendulum_msgs_py.programs.graph import NodeProgram
+from pendulum_msgs_py.programs.terminal import WholeTable, make_console
+from pendulum_rosbag.reader import Bag, read_bag
 from tests.faults.bag_property import check_bag
 
 __all__ = ["MAX_GROWTH", "SoakReport", "TopicTally", "soak"]

@@ -10,9 +10,9 @@ from pathlib import Path
 
 import pytest
 
-from pendulum_bags.reader import read_bag
-from pendulum_bags.storage import open_writer
-from pendulum_msgs_py.cdr import encode_joint_state
+from pendulum_msgs_py.contract.cdr import encode_joint_state
+from pendulum_rosbag.reader import read_bag
+from pendulum_rosbag.storage import open_writer
 
 _TOPIC = "/sim/joint_states"
 _START_NS = 1_700_000_000_000_000_000

@@ -7,7 +7,7 @@ from collections.abc import Iterator
 
 import pytest
 
-from pendulum_bags.experiment.domain import reserve_domain
+from pendulum_bags.experiments.domain import reserve_domain
 from tests.faults.bag_property import check_bag
 from tests.faults.campaign import CAMPAIGN
 from tests.faults.live import EFFORT_LIMIT, LiveSystem

@@ -14,7 +14,7 @@ import pytest
 
 from pendulum_lqr.design import continuous_lqr
 from pendulum_lqr.model import linearise
-from pendulum_msgs_py.angles import UPRIGHT
+from pendulum_msgs_py.contract.angles import UPRIGHT
 from pendulum_sim.plant import make_plant
 from tests.faults.bag_property import COMMAND_LIFE, check_bag
 from tests.faults.delay_margin import LIGHT, PERIOD, Q, R, predicted_margin

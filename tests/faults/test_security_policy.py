@@ -9,14 +9,15 @@ from xml.etree import ElementTree
 
 import pytest
 
-from pendulum_bags.console_node import Hub
-from pendulum_bags.experiment.conductor_node import Conductor, PlantClient, RecorderClient
-from pendulum_bags.experiment.domain import reserve_domain
-from pendulum_bags.experiment.processes import ProcessSet, ros_environment, start_recorder
-from pendulum_msgs_py import graph, names
+from pendulum_bags.console.console_node import Hub
+from pendulum_bags.experiments.conductor_node import Conductor, PlantClient, RecorderClient
+from pendulum_bags.experiments.domain import reserve_domain
+from pendulum_bags.experiments.processes import ProcessSet, ros_environment, start_recorder
+from pendulum_msgs_py.contract import names
 from pendulum_msgs_py.errors import FaultError, ParameterError
-from pendulum_msgs_py.graph import NodeProgram
-from pendulum_msgs_py.security import NODES, PLANTS, Permissions, enclaves, granted, policy
+from pendulum_msgs_py.programs import graph
+from pendulum_msgs_py.programs.graph import NodeProgram
+from pendulum_msgs_py.programs.security import NODES, PLANTS, Permissions, enclaves, granted, policy
 from tests.acceptance.test_command_lines import nodes
 
 _RULES = ("publish", "subscribe", "reply", "request")

@@ -10,9 +10,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pendulum_bags.experiment.in_process import simulate
-from pendulum_bags.experiment.run_spec import RunSpec
-from pendulum_bags.reader import read_bag, same_messages
+from pendulum_bags.experiments.in_process import simulate
+from pendulum_bags.experiments.run_spec import RunSpec
+from pendulum_rosbag.reader import read_bag, same_messages
 from tests.processes import ProcessGroup
 
 

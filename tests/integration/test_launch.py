@@ -19,9 +19,9 @@ from pendulum_lqr.controller_node import NODE_SPECS as CONTROLLER_SPECS
 from pendulum_lqr.disturbance import DISTURBANCE_SPECS
 from pendulum_lqr.disturbance_node import NODE_SPECS as DISTURBANCE_NODE_SPECS
 from pendulum_msgs_py.errors import ParameterError
-from pendulum_msgs_py.graph import NodeProgram
 from pendulum_msgs_py.parameters import validate
-from pendulum_msgs_py.plant_parameters import load_plant
+from pendulum_msgs_py.plants.plant_parameters import load_plant
+from pendulum_msgs_py.programs.graph import NodeProgram
 from pendulum_sim import markers_node, model_files, simulator_node, viewer_node
 from tests.fixtures import PROJECT
 

@@ -18,10 +18,10 @@ from sensor_msgs.msg import JointState
 from std_srvs.srv import SetBool, Trigger
 from trajectory_msgs.msg import JointTrajectory
 
-from pendulum_msgs_py.names import JOINT
+from pendulum_msgs_py.contract.names import JOINT
+from pendulum_msgs_py.contract.trajectory import from_points
 from pendulum_msgs_py.ros import qos
 from pendulum_msgs_py.ros.convert import stamp_to_message, trajectory_to_message
-from pendulum_msgs_py.trajectory import from_points
 from tests.graph_peer import GraphPeer
 from tests.processes import ProcessGroup, RunningProgram
 

@@ -11,9 +11,9 @@ import yaml
 from diagnostic_msgs.msg import DiagnosticArray
 from sensor_msgs.msg import JointState
 
-from pendulum_msgs_py import names
+from pendulum_msgs_py.contract import names
 from pendulum_msgs_py.errors import ParameterError
-from pendulum_msgs_py.plant_parameters import load_plant
+from pendulum_msgs_py.plants.plant_parameters import load_plant
 from pendulum_sim.model_files import urdf
 from tests.fixtures import PROJECT
 from tests.graph_peer import GraphPeer

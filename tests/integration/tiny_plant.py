@@ -11,13 +11,13 @@ from collections.abc import Callable
 
 from rclpy.node import Node
 
+from pendulum_msgs_py.contract.supervisor import DriveKind, PlantSupervisor
+from pendulum_msgs_py.contract.timing import SteadyWallClock
+from pendulum_msgs_py.contract.values import JointSample
 from pendulum_msgs_py.parameters import ParameterSpec
 from pendulum_msgs_py.ros.parameters import NodeParameters
 from pendulum_msgs_py.ros.plant_interface import LIMIT_SPECS, PlantInterface, limits_from_parameters
 from pendulum_msgs_py.ros.runner import run_node
-from pendulum_msgs_py.supervisor import DriveKind, PlantSupervisor
-from pendulum_msgs_py.timing import SteadyWallClock
-from pendulum_msgs_py.values import JointSample
 
 SPECS = (
     ParameterSpec("gain", 1.0, "N m/rad", "Stiffness of the position control.", minimum=0.0),

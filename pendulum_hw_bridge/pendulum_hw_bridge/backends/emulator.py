@@ -22,7 +22,7 @@ from pendulum_hw_bridge.clocks import Clock, WallClock
 from pendulum_hw_bridge.emulation.faults import ActuatorFault
 from pendulum_hw_bridge.emulation.x5 import EmulatedX5
 from pendulum_hw_bridge.gains import GainSet
-from pendulum_msgs_py.values import NANOSECONDS
+from pendulum_msgs_py.contract.values import NANOSECONDS
 
 __all__ = ["EmulatorBackend"]
 

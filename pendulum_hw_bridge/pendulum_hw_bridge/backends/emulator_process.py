@@ -21,7 +21,7 @@ from pendulum_hw_bridge.actuator import (
 from pendulum_hw_bridge.clocks import Clock, WallClock
 from pendulum_hw_bridge.emulation import wire
 from pendulum_hw_bridge.gains import GainSet
-from pendulum_msgs_py.values import NANOSECONDS
+from pendulum_msgs_py.contract.values import NANOSECONDS
 
 __all__ = ["EmulatorProcessBackend"]
 

@@ -32,8 +32,8 @@ from pendulum_hw_bridge.actuator import (
 from pendulum_hw_bridge.backends.hebi_discovery import LOOK_TIME, ModuleSelection, discover, select_module
 from pendulum_hw_bridge.clocks import Clock, WallClock
 from pendulum_hw_bridge.gains import DEFAULT_GAINS, GAIN_FIELDS, LOOPS, GainSet, PidGains
+from pendulum_msgs_py.contract.values import NANOSECONDS
 from pendulum_msgs_py.errors import ParameterError
-from pendulum_msgs_py.values import NANOSECONDS
 
 __all__ = ["HebiBackend", "connect_group", "open_lookup"]
 

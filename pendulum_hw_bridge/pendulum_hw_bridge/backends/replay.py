@@ -30,8 +30,8 @@ from pendulum_hw_bridge.actuator import (
 from pendulum_hw_bridge.backends.bag_feedback import read_bag_feedback
 from pendulum_hw_bridge.clocks import Clock, WallClock
 from pendulum_hw_bridge.gains import GainSet
+from pendulum_msgs_py.contract.values import NANOSECONDS
 from pendulum_msgs_py.errors import DataError
-from pendulum_msgs_py.values import NANOSECONDS
 
 __all__ = ["FeedbackRecording", "ReplayBackend", "load_feedback"]
 

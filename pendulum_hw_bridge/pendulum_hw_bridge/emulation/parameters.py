@@ -15,7 +15,12 @@ from pendulum_hw_bridge.emulation.kernel import CONSTANTS
 from pendulum_hw_bridge.emulation.thermal import ThermalParameters, torque_constant_at
 from pendulum_msgs_py.dynamics.series_elastic import shorted_winding_damping, winding_resistance_at
 from pendulum_msgs_py.errors import ParameterError
-from pendulum_msgs_py.plant_parameters import PRESETS, PlantParameters, SeriesElasticParameters, load_plant
+from pendulum_msgs_py.plants.plant_parameters import (
+    PRESETS,
+    PlantParameters,
+    SeriesElasticParameters,
+    load_plant,
+)
 
 __all__ = [
     "EMULATOR_PRESETS",

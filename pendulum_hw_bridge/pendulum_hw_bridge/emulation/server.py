@@ -12,9 +12,9 @@ from pendulum_hw_bridge.actuator import Strategy
 from pendulum_hw_bridge.emulation import wire
 from pendulum_hw_bridge.emulation.faults import ActuatorFault
 from pendulum_hw_bridge.emulation.x5 import EmulatedX5
+from pendulum_msgs_py.contract.timing import SteadyWallClock
+from pendulum_msgs_py.contract.values import NANOSECONDS
 from pendulum_msgs_py.errors import PendulumError
-from pendulum_msgs_py.timing import SteadyWallClock
-from pendulum_msgs_py.values import NANOSECONDS
 
 __all__ = ["EmulatorServer"]
 

@@ -30,9 +30,9 @@ from pendulum_hw_bridge.emulation.firmware import gain_rows, new_loop_memory
 from pendulum_hw_bridge.emulation.parameters import EmulatorParameters
 from pendulum_hw_bridge.emulation.sensing import measure
 from pendulum_hw_bridge.gains import DEFAULT_GAINS, GainSet
+from pendulum_msgs_py.contract.values import NANOSECONDS
 from pendulum_msgs_py.dynamics.series_elastic import spring_deflection
 from pendulum_msgs_py.errors import ParameterError
-from pendulum_msgs_py.values import NANOSECONDS
 
 __all__ = ["EmulatedX5", "HandTorque", "LinkState"]
 

@@ -19,9 +19,9 @@ from pendulum_lqr.design import (
     sampled_cost,
 )
 from pendulum_lqr.model import linearise
-from pendulum_msgs_py.angles import UPRIGHT, wrap
+from pendulum_msgs_py.contract.angles import UPRIGHT, wrap
 from pendulum_msgs_py.parameters import ParameterSpec
-from pendulum_msgs_py.plant_parameters import PlantParameters
+from pendulum_msgs_py.plants.plant_parameters import PlantParameters
 
 __all__ = ["Lqg"]
 

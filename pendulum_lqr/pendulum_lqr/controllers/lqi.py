@@ -9,9 +9,9 @@ from pendulum_lqr.controller import BaseController, Controller
 from pendulum_lqr.controllers.specs import FEEDFORWARD, Q, R
 from pendulum_lqr.design import Gain, integral_lqr
 from pendulum_lqr.model import linearise
-from pendulum_msgs_py.angles import UPRIGHT
+from pendulum_msgs_py.contract.angles import UPRIGHT
 from pendulum_msgs_py.parameters import ParameterSpec
-from pendulum_msgs_py.plant_parameters import PlantParameters
+from pendulum_msgs_py.plants.plant_parameters import PlantParameters
 
 __all__ = ["Lqi"]
 

@@ -14,9 +14,9 @@ from pendulum_lqr.controllers.specs import Q, R
 from pendulum_lqr.design import DesignError
 from pendulum_lqr.model import linearise
 from pendulum_lqr.tuning import PidGains, pid_loop, tune_numerically, ziegler_nichols
-from pendulum_msgs_py.angles import UPRIGHT
+from pendulum_msgs_py.contract.angles import UPRIGHT
 from pendulum_msgs_py.parameters import ParameterSpec
-from pendulum_msgs_py.plant_parameters import PlantParameters
+from pendulum_msgs_py.plants.plant_parameters import PlantParameters
 
 __all__ = ["Pid"]
 

@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike
 from pendulum_lqr.controller import BaseController
 from pendulum_msgs_py.errors import DataError
 from pendulum_msgs_py.parameters import ParameterSpec, read_text
-from pendulum_msgs_py.plant_parameters import PlantParameters
+from pendulum_msgs_py.plants.plant_parameters import PlantParameters
 
 __all__ = ["Playback"]
 

@@ -16,9 +16,9 @@ from pendulum_lqr.controllers.energy_swing_up import EnergySwingUp
 from pendulum_lqr.design import cost_matrices
 from pendulum_lqr.model import LinearModel
 from pendulum_lqr.trajectory_optimisation import OptimisedTrajectory, swing_up_trajectory
-from pendulum_msgs_py.angles import wrap
+from pendulum_msgs_py.contract.angles import wrap
 from pendulum_msgs_py.parameters import ParameterSpec
-from pendulum_msgs_py.plant_parameters import PlantParameters
+from pendulum_msgs_py.plants.plant_parameters import PlantParameters
 
 __all__ = ["Tvlqr"]
 

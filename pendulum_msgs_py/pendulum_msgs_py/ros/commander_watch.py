@@ -7,9 +7,9 @@ from collections import Counter, deque
 
 from rclpy.node import Node
 
-from pendulum_msgs_py import names
-from pendulum_msgs_py.supervisor import Input, PlantSupervisor
-from pendulum_msgs_py.values import JointCommand
+from pendulum_msgs_py.contract import names
+from pendulum_msgs_py.contract.supervisor import Input, PlantSupervisor
+from pendulum_msgs_py.contract.values import JointCommand
 
 __all__ = ["CommanderWatch"]
 

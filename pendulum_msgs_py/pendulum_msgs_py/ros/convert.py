@@ -13,11 +13,11 @@ from sensor_msgs.msg import JointState
 from std_msgs.msg import String
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
-from pendulum_msgs_py.cdr import decode_joint_state
+from pendulum_msgs_py.contract.cdr import decode_joint_state
+from pendulum_msgs_py.contract.names import JOINT
+from pendulum_msgs_py.contract.trajectory import Trajectory, TrajectoryPoint
+from pendulum_msgs_py.contract.values import NANOSECONDS, JointCommand, JointSample
 from pendulum_msgs_py.errors import ParameterError
-from pendulum_msgs_py.names import JOINT
-from pendulum_msgs_py.trajectory import Trajectory, TrajectoryPoint
-from pendulum_msgs_py.values import NANOSECONDS, JointCommand, JointSample
 
 __all__ = [
     "command_from_bytes",

@@ -18,9 +18,12 @@ from std_msgs.msg import String
 from std_srvs.srv import SetBool, Trigger
 from trajectory_msgs.msg import JointTrajectory
 
-from pendulum_msgs_py import names
-from pendulum_msgs_py.cdr import encode_joint_state
-from pendulum_msgs_py.commands import Refusal
+from pendulum_msgs_py.contract import names
+from pendulum_msgs_py.contract.cdr import encode_joint_state
+from pendulum_msgs_py.contract.commands import Refusal
+from pendulum_msgs_py.contract.supervisor import Drive, Input, Mode, PlantLimits, PlantSupervisor
+from pendulum_msgs_py.contract.timing import LoopStatistics
+from pendulum_msgs_py.contract.values import NANOSECONDS, JointCommand, JointSample
 from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.parameters import ParameterSpec
 from pendulum_msgs_py.ros import qos
@@ -34,9 +37,6 @@ from pendulum_msgs_py.ros.convert import (
     trajectory_from_message,
 )
 from pendulum_msgs_py.ros.polled import PolledInput, PollingNode
-from pendulum_msgs_py.supervisor import Drive, Input, Mode, PlantLimits, PlantSupervisor
-from pendulum_msgs_py.timing import LoopStatistics
-from pendulum_msgs_py.values import NANOSECONDS, JointCommand, JointSample
 
 __all__ = ["LIMIT_SPECS", "PlantInterface", "limits_from_parameters"]
 

@@ -11,14 +11,14 @@ from rclpy.node import Node
 from rclpy.timer import Timer
 from rosgraph_msgs.msg import Clock as ClockMessage
 
-from pendulum_msgs_py import names
-from pendulum_msgs_py.cdr import encode_clock
+from pendulum_msgs_py.contract import names
+from pendulum_msgs_py.contract.cdr import encode_clock
+from pendulum_msgs_py.contract.supervisor import Drive, Input, Mode
+from pendulum_msgs_py.contract.timing import LoopStatistics, SteadyWallClock
+from pendulum_msgs_py.contract.values import NANOSECONDS, JointCommand, JointSample
 from pendulum_msgs_py.parameters import ParameterSpec
 from pendulum_msgs_py.ros import qos
 from pendulum_msgs_py.ros.plant_interface import PlantInterface
-from pendulum_msgs_py.supervisor import Drive, Input, Mode
-from pendulum_msgs_py.timing import LoopStatistics, SteadyWallClock
-from pendulum_msgs_py.values import NANOSECONDS, JointCommand, JointSample
 
 __all__ = ["LOCKSTEP_EPOCH_NS", "LOOP_SPECS", "LockstepLoop", "RealtimeLoop", "Stepper", "create_wall_timer"]
 

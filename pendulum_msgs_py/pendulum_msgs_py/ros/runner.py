@@ -29,16 +29,16 @@ from rclpy.node import Node
 from rclpy.signals import SignalHandlerOptions
 from rclpy.task import Future
 
-from pendulum_msgs_py import completion
 from pendulum_msgs_py.errors import ParameterError, PendulumError
-from pendulum_msgs_py.executables import (
+from pendulum_msgs_py.parameters import ParameterSpec
+from pendulum_msgs_py.programs import completion
+from pendulum_msgs_py.programs.executables import (
     EXIT_USAGE,
     print_text,
     report_error,
     report_exhaustion,
     split_ros_arguments,
 )
-from pendulum_msgs_py.parameters import ParameterSpec
 from pendulum_msgs_py.ros.middleware import check_closed, set_middleware_defaults
 
 __all__ = ["Closeable", "Paced", "run_node"]

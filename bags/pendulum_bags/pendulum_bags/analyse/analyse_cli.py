@@ -1,0 +1,97 @@
+"""``analyse``: the same questions to many bags, as a table with a row for each."""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Sequence
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+from rich.console import Console
+
+from pendulum_msgs_py.programs.counted_progress import counted_progress
+from pendulum_msgs_py.programs.executables import cli_main
+from pendulum_msgs_py.programs.terminal import WholeTable, make_console
+
+if TYPE_CHECKING:
+    from pendulum_bags.analyse.bag_table import Table as BagTable
+
+__all__ = ["app", "main"]
+
+app = typer.Typer(add_completion=False, rich_markup_mode=None)
+
+_SHOWN = (
+    "seed", "rate_hz", "rms_error", "max_abs_u", "states_gaps", "answer_p99", "inertia", "damping", "gravity",
+    "outcome", "report",
+)  # fmt: skip
+_MOST_ROWS = 40
+
+
+@app.command(epilog="Example: python -m pendulum_bags analyse bags/examples --ask metrics,timing --out /tmp/analysed")
+def analyse(
+    folders: Annotated[list[Path], typer.Argument(help="Folders with bags below them, or bags.")],
+    ask: Annotated[
+        str, typer.Option(help="Questions: metrics, timing, identify of each plant; compare, report of run folders.")
+    ] = "metrics,timing",
+    out: Annotated[
+        Path, typer.Option("--out", "-o", help="Folder for the tables; an interrupted analysis goes on there.")
+    ] = Path("bags", "runs", "analysed"),
+    workers: Annotated[
+        int, typer.Option(help="Processes of a local Dask cluster; 0: one after the other, in this process.", min=0)
+    ] = 0,
+    scheduler: Annotated[
+        str, typer.Option(help="Dask scheduler, tcp://HOST:PORT; its workers see the bags under the same paths.")
+    ] = "",
+    json_output: Annotated[bool, typer.Option("--json", help="Print the rows as JSON.")] = False,
+) -> None:
+    """Ask many bags the same questions: metrics, timing, identified parameters, equivalence; one table."""
+    from pendulum_bags.analyse.bag_table import analyse_bags, find_pieces
+    from pendulum_bags.studies.chunks import cluster_client
+
+    questions = [name.strip() for name in ask.split(",") if name.strip()]
+    pieces = find_pieces(folders, questions)
+    console = make_console(stderr=json_output, highlight=False)
+    started = time.monotonic()
+    connect = partial(cluster_client, scheduler, workers)
+    with counted_progress(console, "bags", len(pieces), out) as on_progress:
+        table = analyse_bags(out, pieces, questions, connect=connect, on_progress=on_progress)
+    if json_output:
+        print(json.dumps({"bags": table.bags, "runs": table.runs}, indent=2))
+    else:
+        _print(console, table, out, time.monotonic() - started)
+    if table.failed:
+        raise typer.Exit(1)
+
+
+def _print(console: Console, found: BagTable, out: Path, elapsed: float) -> None:
+    for title, file, rows in (("Bags", "bags", found.bags), ("Runs", "runs", found.runs)):
+        if not rows:
+            continue
+        names = [name for name in _SHOWN if any(row.get(name) is not None for row in rows)]
+        table = WholeTable(title=title, title_justify="left")
+        for heading in ("bag", "plant", *names) if file == "bags" else ("run", *names):
+            table.add_column(heading.replace("_", " "), justify="left" if heading in {"bag", "run"} else "right")
+        for row in rows[:_MOST_ROWS]:
+            first = [row["bag"], row["plant"]] if file == "bags" else [row["bag"]]
+            table.add_row(*first, *(_cell(row.get(name)) for name in names))
+        console.print(table)
+        if len(rows) > _MOST_ROWS:
+            console.print(f"... and {len(rows) - _MOST_ROWS} more")
+        for row in rows:
+            if row["error"]:
+                console.print(f"{row['bag']} {row['plant']}: {row['error']}", markup=False)
+        console.print(f"table   {out / file}.csv, with all columns")
+    kept = f", {found.kept} of them answered before" if found.kept else ""
+    console.print(f"({len(found.bags) + len(found.runs)} rows{kept}, {elapsed:.0f} s)")
+
+
+def _cell(value: Any) -> str:
+    return "–" if value is None else f"{value:.4g}" if isinstance(value, float) else str(value)
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run the command line."""
+    return cli_main(app, argv, name="python -m pendulum_bags analyse")

@@ -1,0 +1,339 @@
+"""The same questions to many bags: one row for each plant of each bag, one for each run folder; here or on a cluster.
+
+A question is a function and a line in ``BAG_QUESTIONS`` or ``RUN_QUESTIONS``. Each bag is a piece of its own: what
+has been answered stays when the analysis is interrupted, and is asked again only when the bag has changed.
+"""
+
+from __future__ import annotations
+
+import csv
+import hashlib
+import json
+import math
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import nullcontext
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from pendulum_bags.comparison import compare_folders, read_run
+from pendulum_bags.comparison.metrics import episode_of, metrics_of
+from pendulum_bags.runs.run_data import plant_summary
+from pendulum_bags.runs.run_folder import write_json
+from pendulum_bags.studies.chunks import Connect, carry_out
+from pendulum_msgs_py.contract import names
+from pendulum_msgs_py.contract.angles import UPRIGHT
+from pendulum_msgs_py.errors import BagError, DataError, ParameterError, PendulumError
+from pendulum_rosbag.reader import Bag, read_bag
+from pendulum_rosbag.reader.statistics import bag_statistics
+
+__all__ = ["BAG_QUESTIONS", "QUESTIONS", "RUN_QUESTIONS", "Piece", "Table", "analyse_bags", "find_pieces"]
+
+_ENDINGS = (".mcap", ".db3")
+_LABELS = ("bag", "plant", "error")
+
+Row = dict[str, Any]
+
+
+@dataclass(frozen=True)
+class Piece:
+    """One bag, or one run folder with the bags ``sim`` and ``hw``.
+
+    Attributes:
+        name: Its path below the folder that was given.
+        path: Absolute path.
+        is_run: Whether it is a run folder.
+    """
+
+    name: str
+    path: str
+    is_run: bool
+
+    def fingerprint(self, questions: Sequence[str]) -> str:
+        """Return a hash of what it holds, by sizes and times of its files, and of what is asked."""
+        path = Path(self.path)
+        files = [path] if path.is_file() else sorted(file for file in path.rglob("*") if _is_content(file))
+        seen = [(str(file.relative_to(path)), file.stat().st_size, file.stat().st_mtime_ns) for file in files]
+        content = json.dumps([self.name, self.is_run, list(questions), seen])
+        return hashlib.sha256(content.encode()).hexdigest()[:16]
+
+
+@dataclass(frozen=True)
+class Table:
+    """What was found.
+
+    Attributes:
+        bags: A row for each plant of each bag, in the order of their names.
+        runs: A row for each run folder.
+        kept: How many pieces an earlier call had answered.
+        wall: Time that this call took [s].
+    """
+
+    bags: Sequence[Row]
+    runs: Sequence[Row]
+    kept: int = 0
+    wall: float = field(default=0.0, compare=False)
+
+    @property
+    def failed(self) -> int:
+        """How many rows hold an error."""
+        return sum(bool(row["error"]) for row in (*self.bags, *self.runs))
+
+
+def find_pieces(folders: Sequence[Path], questions: Sequence[str]) -> list[Piece]:
+    """Return every bag, and every run folder where one is asked about, below some folders, ordered by name.
+
+    Raises:
+        BagError: A folder does not exist, or there is no bag in any of them.
+        ParameterError: A question is unknown.
+    """
+    for question in questions:
+        if question not in QUESTIONS:
+            raise ParameterError(f"question is {question!r}; expected one of {', '.join(QUESTIONS)}")
+    found: dict[str, Piece] = {}
+    for folder in folders:
+        if not folder.exists():
+            raise BagError(f"{folder} does not exist; expected a folder of bags, or a bag")
+        for path in _bags_below(folder):
+            name = folder.name if path == folder else str(path.relative_to(folder))
+            if len(folders) > 1 and path != folder:
+                name = f"{folder.name}/{name}"
+            if any(question in BAG_QUESTIONS for question in questions):
+                found[f"{name}:bag"] = Piece(name, str(path.resolve()), False)
+            run = path.parent
+            if path.name == "sim" and (run / "hw").is_dir() and any(q in RUN_QUESTIONS for q in questions):
+                name = str(Path(name).parent) if Path(name).parent != Path() else run.name
+                found[f"{name}:run"] = Piece(name, str(run.resolve()), True)
+    if not found:
+        what = " or ".join(sorted({_wanted(question) for question in questions}))
+        raise BagError(f"{', '.join(map(str, folders))}: no {what} in there")
+    return [found[key] for key in sorted(found)]
+
+
+def analyse_bags(
+    folder: Path,
+    pieces: Sequence[Piece],
+    questions: Sequence[str],
+    *,
+    connect: Connect = nullcontext,
+    on_progress: Callable[[int, int], None] = lambda done, total: None,
+) -> Table:
+    """Ask every piece what has not been answered yet, and write ``bags.csv``, ``runs.csv`` and their JSON.
+
+    Args:
+        folder: Where answers and tables go; with one answer a piece, it is gone on with.
+        pieces: What to ask.
+        questions: Names of ``QUESTIONS``.
+        connect: To a Dask cluster (`cluster_client`) that sees the bags under the same paths; by default one after
+            the other is asked in this process.
+        on_progress: Called with pieces done and in all.
+    """
+    began = time.monotonic()
+    answers = folder / "answers"
+    answers.mkdir(parents=True, exist_ok=True)
+    # What an answer is kept under tells bag and questions, so that a changed bag is asked again.
+    keys = [piece.fingerprint(questions) for piece in pieces]
+    rows = {index: found for index, key in enumerate(keys) if (found := _kept(answers / f"{key}.json")) is not None}
+    kept = len(rows)
+    on_progress(kept, len(pieces))
+    job = (tuple(pieces), tuple(questions), str(folder.resolve()))
+    missing = [index for index in range(len(pieces)) if index not in rows]
+    for index, found in carry_out(_ask, job, missing, connect):
+        write_json(answers / f"{keys[index]}.json", found)
+        rows[index] = found
+        on_progress(len(rows), len(pieces))
+    table = Table(
+        bags=[row for index, piece in enumerate(pieces) if not piece.is_run for row in rows[index]],
+        runs=[row for index, piece in enumerate(pieces) if piece.is_run for row in rows[index]],
+        kept=kept,
+        wall=time.monotonic() - began,
+    )
+    for name, content in (("bags", table.bags), ("runs", table.runs)):
+        if content:
+            _write_table(folder / f"{name}.csv", content)
+            write_json(folder / f"{name}.json", content)
+    return table
+
+
+def _ask(job: tuple[Sequence[Piece], Sequence[str], str], index: int, _threads: int | None) -> list[Row]:
+    """Return the rows of a piece; what cannot be answered is told in the row and stops nobody else."""
+    pieces, questions, out = job
+    piece = pieces[index]
+    if not Path(piece.path).exists():
+        raise BagError(f"{piece.path} is not on this machine; expected the bags under the same path on every worker")
+    if piece.is_run:
+        row: Row = {"bag": piece.name, "plant": "", "error": ""}
+        asked = [RUN_QUESTIONS[question] for question in questions if question in RUN_QUESTIONS]
+        _answer(row, asked, Path(piece.path), Path(out), piece.name)
+        return [row]
+    chosen = [BAG_QUESTIONS[question] for question in questions if question in BAG_QUESTIONS]
+    try:
+        with read_bag(piece.path) as bag:
+            plants = _plants(bag)
+            told = _told(bag)
+    except PendulumError as error:
+        return [{"bag": piece.name, "plant": "", "error": str(error)}]
+    if not plants:
+        return [{"bag": piece.name, "plant": "", "error": f"the bag has no topic that ends in {names.JOINT_STATES}"}]
+    rows = []
+    for plant in plants:
+        row = {"bag": piece.name, "plant": plant, "error": "", **told}
+        _answer(row, chosen, Path(piece.path), plant)
+        rows.append(row)
+    return rows
+
+
+def _answer(row: Row, questions: Sequence[Callable[..., Row]], *arguments: Any) -> None:
+    errors = []
+    for question in questions:
+        try:
+            row.update({name: _plain(value) for name, value in question(*arguments).items()})
+        except (PendulumError, ArithmeticError, np.linalg.LinAlgError) as error:
+            errors.append(str(error) or type(error).__name__)
+    row["error"] = "; ".join(dict.fromkeys(errors))
+
+
+def _metrics(path: Path, plant: str) -> Row:
+    with read_bag(path) as bag:
+        states = bag.array(f"{plant}/{names.JOINT_STATES}")
+        told = bag.metadata.get("pendulum.run")
+    set_point = told.get("set_point", 0.0) if isinstance(told, Mapping) else 0.0
+    try:
+        run = read_run(path, prefix=plant)
+    except DataError:
+        if len(states) < 4:
+            raise
+        # A recording without noise has no window: all of it is what the controller did.
+        run = read_run(path, prefix=plant, start_ns=int(states["stamp_ns"][0]), stop_ns=int(states["stamp_ns"][-1]))
+    goal = UPRIGHT + (float(set_point) if isinstance(set_point, (int, float)) else 0.0)
+    found = plant_summary(run)
+    found["damage"] = "; ".join(found["damage"])
+    return {**found, **metrics_of(episode_of(run.window, goal))}
+
+
+def _timing(path: Path, plant: str) -> Row:
+    with read_bag(path) as bag:
+        found = bag_statistics(bag)
+    states = found.topics[f"{plant}/{names.JOINT_STATES}"]
+    row: Row = {f"states_{name}": getattr(states, name) for name in ("count", "rate", "jitter", "longest")}
+    row |= {f"states_{name}": getattr(states, name) for name in ("gaps", "missing", "clock_jumps")}
+    answered = f"{plant}/{names.EFFORT_COMMAND}"
+    for latency in found.latencies:
+        if latency.answer == answered and latency.source == f"{plant}/{names.JOINT_STATES}":
+            row |= {"answer_median": latency.median, "answer_p99": latency.p99}
+    return row
+
+
+def _identify(path: Path, plant: str) -> Row:
+    from pendulum_bags.identification.result import identify
+    from pendulum_bags.runs.bag_recordings import read_bag_recording
+
+    found = identify([read_bag_recording(path, namespace=plant)], profiles=0).to_dict()
+    row: Row = {"friction": found["friction"], "window_rms": found["training_rms"]}
+    for name in found["fitted"]:
+        row[name] = found["parameters"][name]
+        if name in found["intervals"]:
+            interval = found["intervals"][name]
+            row[f"{name}_low"], row[f"{name}_high"] = interval["low"], interval["high"]
+    return row
+
+
+def _compare(path: Path, _out: Path, _name: str) -> Row:
+    found = compare_folders([path])
+    content = found.to_json()
+    row: Row = {"seed": content["seed"], "outcome": found.verdict.outcome.value, "paired": found.is_paired}
+    for test in found.verdict.tests:
+        row[test.quantity] = test.interval.estimate
+        row[f"{test.quantity} low"], row[f"{test.quantity} high"] = test.interval.low, test.interval.high
+    for plant, figures in content["plants"].items():
+        for key in ("rate_hz", "std_theta", "std_theta_dot", "max_abs_u"):
+            row[f"{plant}_{key}"] = figures.get(key)
+    return row
+
+
+def _report(path: Path, out: Path, name: str) -> Row:
+    from pendulum_bags.report.write import write_report
+
+    target = out / "reports" / name
+    write_report(target, comparison=compare_folders([path]), recordings=[], formats=("png",))
+    return {"report": str(Path("reports", name, "report.html"))}
+
+
+BAG_QUESTIONS: Mapping[str, Callable[[Path, str], Row]] = {
+    "metrics": _metrics,
+    "timing": _timing,
+    "identify": _identify,
+}
+"""What can be asked of a plant in a bag."""
+
+RUN_QUESTIONS: Mapping[str, Callable[[Path, Path, str], Row]] = {"compare": _compare, "report": _report}
+"""What can be asked of a run folder with the bags ``sim`` and ``hw``."""
+
+QUESTIONS = (*BAG_QUESTIONS, *RUN_QUESTIONS)
+
+
+def _bags_below(folder: Path) -> Iterator[Path]:
+    """Yield bags: folders with storage files, and storage files that were given themselves."""
+    if folder.is_file():
+        yield folder
+        return
+    inside = sorted(folder.iterdir())
+    if any(path.is_file() and path.suffix in _ENDINGS for path in inside):
+        yield folder
+        return
+    for path in inside:
+        # Links may lead round in a circle, hidden folders are somebody's scratch.
+        if path.is_dir() and not path.is_symlink() and not path.name.startswith("."):
+            yield from _bags_below(path)
+
+
+def _is_content(path: Path) -> bool:
+    return path.is_file() and (path.suffix in _ENDINGS or path.name == "metadata.yaml")
+
+
+def _wanted(question: str) -> str:
+    return "bag" if question in BAG_QUESTIONS else "run folder with the bags sim and hw"
+
+
+def _plants(bag: Bag) -> list[str]:
+    ending = f"/{names.JOINT_STATES}"
+    return sorted(topic[: -len(ending)] for topic in bag.topics if topic.endswith(ending))
+
+
+def _told(bag: Bag) -> Row:
+    """Return what the bag says of its run, as far as a table has room for it."""
+    run = bag.metadata.get("pendulum.run")
+    if not isinstance(run, Mapping):
+        return {}
+    controller = run.get("controller")
+    kind = controller.get("kind") if isinstance(controller, Mapping) else controller
+    found = {"experiment": run.get("experiment"), "seed": run.get("seed"), "controller": kind}
+    return {name: value for name, value in found.items() if isinstance(value, (str, int, float))}
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, np.generic):
+        value = value.item()
+    if isinstance(value, float) and not math.isfinite(value):
+        return None
+    return value
+
+
+def _kept(path: Path) -> list[Row] | None:
+    try:
+        found = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return None
+    return found if isinstance(found, list) else None
+
+
+def _write_table(path: Path, rows: Sequence[Row]) -> None:
+    columns = list(dict.fromkeys((*_LABELS, *(name for row in rows for name in row))))
+    with path.open("w", newline="", encoding="utf-8") as file:
+        writer = csv.writer(file)
+        writer.writerow(columns)
+        for row in rows:
+            writer.writerow(["" if row.get(name) is None else row[name] for name in columns])

@@ -1,0 +1,25 @@
+"""Comparison of simulation and hardware: the thesis's analysis, the paired one, statistics, spectra, metrics."""
+
+from pendulum_bags.comparison.compare import Comparison, compare, compare_folders, compare_runs
+from pendulum_bags.comparison.equivalence import EquivalenceTest, Margins, Outcome, Verdict
+from pendulum_bags.comparison.pairs import Difference, Pair, interpolated_difference
+from pendulum_bags.runs.run_data import RunData, read_run
+from pendulum_bags.runs.series import Series, Signal
+
+__all__ = [
+    "Comparison",
+    "Difference",
+    "EquivalenceTest",
+    "Margins",
+    "Outcome",
+    "Pair",
+    "RunData",
+    "Series",
+    "Signal",
+    "Verdict",
+    "compare",
+    "compare_folders",
+    "compare_runs",
+    "interpolated_difference",
+    "read_run",
+]

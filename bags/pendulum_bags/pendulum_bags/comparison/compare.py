@@ -1,0 +1,231 @@
+"""Is the simulation good enough? One object with the thesis's analysis, the paired one, and a verdict."""
+
+from __future__ import annotations
+
+import math
+import os
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, TypeAlias
+
+from pendulum_bags.comparison.equivalence import Margins, Verdict, conclude
+from pendulum_bags.comparison.metrics import episode_of, summarise_metrics
+from pendulum_bags.comparison.pairs import (
+    SAME_DISTURBANCE,
+    Difference,
+    Pair,
+    distribution_tests,
+    interpolated_difference,
+    paired_tests,
+    unpaired_tests,
+)
+from pendulum_bags.runs.run_data import RunData, noise_hold_time, plant_summary, read_run
+from pendulum_msgs_py.errors import BagError, DataError
+
+__all__ = ["Comparison", "compare", "compare_folders", "compare_runs"]
+
+MarginArgument: TypeAlias = "Margins | Mapping[str, float] | Sequence[str] | float | None"
+PathArgument: TypeAlias = "str | os.PathLike[str]"
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """The result of comparing simulation and hardware, of one run or several.
+
+    Args:
+        pairs: Simulation and hardware of each run.
+        own: Simulations under the thesis's own protocol (noise of their own); those of the pairs where there are none.
+        thesis: The thesis's difference for the first run.
+        verdict: Verdict on the paired comparison, or on the unpaired one where the disturbances differ.
+        unpaired_verdict: Verdict on the unpaired comparison.
+    """
+
+    pairs: Sequence[Pair]
+    own: Sequence[RunData]
+    thesis: Difference
+    verdict: Verdict
+    unpaired_verdict: Verdict
+
+    @property
+    def is_paired(self) -> bool:
+        """Whether all runs had one disturbance on both plants."""
+        return all(pair.is_paired for pair in self.pairs)
+
+    @property
+    def plants(self) -> dict[str, dict[str, Any]]:
+        """Figures of each plant: means over runs, sums of missed deadlines, the largest torque."""
+        groups = {
+            "sim": [pair.simulation for pair in self.pairs],
+            "hw": [pair.hardware for pair in self.pairs],
+        }
+        if any(all(run is not pair.simulation for pair in self.pairs) for run in self.own):
+            groups["sim_500hz"] = list(self.own)
+        return {name: _pool([plant_summary(run) for run in runs]) for name, runs in groups.items()}
+
+    @property
+    def paired(self) -> dict[str, Any]:
+        """Statistics of the paired difference; only a reason where the disturbances differ."""
+        first = self.pairs[0]
+        if not self.is_paired:
+            return {"reason": self._why_not_paired()}
+        result = first.as_dict()
+        if len(self.pairs) > 1:
+            result["runs"] = [pair.as_dict() for pair in self.pairs]
+        return result
+
+    @property
+    def unpaired(self) -> dict[str, Any]:
+        """Statistics of the thesis's difference and of both distributions."""
+        hold = {"sim": noise_hold_time(self.own[0]), "hw": noise_hold_time(self.pairs[0].hardware)}
+        return {
+            **self.thesis.statistics(),
+            "noise_hold_time": hold,
+            "same_noise": any(run is pair.simulation for run in self.own for pair in self.pairs)
+            and self.is_paired,
+            "distributions": distribution_tests(self.own[0].window, self.pairs[0].hardware.window),
+            "verdict": self.unpaired_verdict.sentence,
+            "tests": [test.as_dict() for test in self.unpaired_verdict.tests],
+        }
+
+    @property
+    def metrics(self) -> list[dict[str, Any]]:
+        """Metrics of the regulation, one row each, simulation and hardware of the first run side by side."""
+        pair = self.pairs[0]
+        episodes = {"sim": episode_of(pair.simulation.window), "hw": episode_of(pair.hardware.window)}
+        return summarise_metrics(episodes)
+
+    def to_json(self) -> dict[str, Any]:
+        """Return everything that a program may want to read; numbers that do not exist are None."""
+        run = self.pairs[0].hardware.metadata.get("pendulum.run", {})
+        told = run if isinstance(run, Mapping) else {}
+        content = {
+            "seed": told.get("seed"),
+            "strategy": told.get("strategy"),
+            "versions": told.get("versions", {}),
+            "git_revision": told.get("git_revision"),
+            "runs": len(self.pairs),
+            "plants": self.plants,
+            "paired": self.paired,
+            "unpaired": self.unpaired,
+            "metrics": self.metrics,
+            "verdict": self.verdict.as_dict(),
+        }
+        result: dict[str, Any] = _finite(content)
+        return result
+
+    def _why_not_paired(self) -> str:
+        pair = next(pair for pair in self.pairs if not pair.is_paired)
+        if pair.clock is None:
+            return "no disturbance was recorded on both plants"
+        return (
+            f"the recorded disturbances differ: their correlation is {pair.clock.correlation:.2f} at best, "
+            f"expected above {SAME_DISTURBANCE}"
+        )
+
+
+def compare(
+    pairs: Sequence[tuple[RunData, RunData]], *, own: Sequence[RunData] = (), margin: MarginArgument = None
+) -> Comparison:
+    """Compare runs that are in memory.
+
+    Args:
+        pairs: (simulation, hardware) of each run, at least one.
+        own: Simulations under the thesis's own protocol.
+        margin: What difference does not matter; see :meth:`Margins.parse`.
+    """
+    if not pairs:
+        raise DataError("nothing to compare: 0 runs; expected at least 1 run with simulation and hardware")
+    margins = Margins.parse(margin)
+    compared = [Pair.of(simulation, hardware) for simulation, hardware in pairs]
+    simulations = list(own) or [pair.simulation for pair in compared]
+    hardware_runs = [pair.hardware for pair in compared]
+    first, second = (_title(run) for run in (compared[0].simulation, compared[0].hardware))
+    unpaired = conclude(unpaired_tests(simulations, hardware_runs, margins), margins, first, second)
+    paired = all(pair.is_paired for pair in compared)
+    verdict = conclude(paired_tests(compared, margins), margins, first, second) if paired else unpaired
+    thesis = interpolated_difference(simulations[0].window, compared[0].hardware.window)
+    return Comparison(compared, simulations, thesis, verdict, unpaired)
+
+
+def compare_runs(
+    sim_bag: PathArgument,
+    hw_bag: PathArgument,
+    *,
+    sim_prefix: str | None = None,
+    hw_prefix: str | None = None,
+    own_protocol: PathArgument | None = None,
+    margin: MarginArgument = None,
+) -> Comparison:
+    """Compare the bag of a simulation with that of hardware, during the noise.
+
+    Args:
+        sim_bag: Bag of the simulation.
+        hw_bag: Bag of the hardware.
+        sim_prefix: Namespace of the simulation's topics; None for that of the bag's only plant.
+        hw_prefix: Namespace of the hardware's topics.
+        own_protocol: Bag of a simulation with noise of its own, for the thesis's analysis.
+        margin: What difference does not matter; see :meth:`Margins.parse`.
+
+    Raises:
+        BagError: A bag cannot be read.
+        DataError: A bag lacks states or noise.
+        ParameterError: A margin is out of domain.
+    """
+    margins = Margins.parse(margin)
+    simulation = read_run(sim_bag, prefix=sim_prefix, label="simulation")
+    hardware = read_run(hw_bag, prefix=hw_prefix, label="hardware")
+    own = [] if own_protocol is None else [read_run(own_protocol, label="simulation, own noise")]
+    return compare([(simulation, hardware)], own=own, margin=margins)
+
+
+def compare_folders(folders: Sequence[PathArgument], *, margin: MarginArgument = None) -> Comparison:
+    """Compare and pool run folders, each with ``sim``, ``hw`` and perhaps ``sim_500hz``.
+
+    Raises:
+        BagError: A folder lacks one of its bags.
+    """
+    margins = Margins.parse(margin)
+    pairs, own = [], []
+    for folder in map(Path, folders):
+        for name in ("sim", "hw"):
+            if not (folder / name).is_dir():
+                raise BagError(f"run folder {folder} has no bag {name}; expected the folders sim and hw")
+        pairs.append(
+            (read_run(folder / "sim", label="simulation"), read_run(folder / "hw", label="hardware"))
+        )
+        if (folder / "sim_500hz").is_dir():
+            own.append(read_run(folder / "sim_500hz", label="simulation, own noise"))
+    return compare(pairs, own=own, margin=margins)
+
+
+def _title(run: RunData) -> str:
+    return run.label
+
+
+def _pool(rows: Sequence[dict[str, Any]]) -> dict[str, Any]:
+    if len(rows) == 1:
+        return dict(rows[0])
+    pooled: dict[str, Any] = {}
+    for key, value in rows[0].items():
+        values = [row[key] for row in rows]
+        if key in {"missed_deadlines", "samples", "damage"}:
+            pooled[key] = sum(values, type(value)())
+        elif key == "max_abs_u":
+            pooled[key] = max(values)
+        elif None in values:
+            pooled[key] = None
+        else:
+            pooled[key] = sum(values) / len(values)
+    return pooled
+
+
+def _finite(value: Any) -> Any:
+    """Return the value with numbers that JSON does not know as None."""
+    if isinstance(value, float):
+        return value if math.isfinite(value) else None
+    if isinstance(value, Mapping):
+        return {key: _finite(item) for key, item in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [_finite(item) for item in value]
+    return value

@@ -1,0 +1,160 @@
+"""``compare``: is the simulation good enough? Tables and a verdict from two bags or from run folders."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from pendulum_msgs_py.errors import DataError
+from pendulum_msgs_py.programs.executables import cli_main
+
+if TYPE_CHECKING:
+    from pendulum_bags.comparison import Comparison
+
+__all__ = ["main"]
+
+app = typer.Typer(add_completion=False, rich_markup_mode=None)
+
+Paths = Annotated[
+    list[Path], typer.Argument(help="Simulation and hardware bag, or run folders with sim and hw.")
+]
+MarginOption = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--margin",
+        help="What difference does not matter: a number in rad for the mean angle, or position=, velocity=, "
+        "spread=, path=; may be given several times.",
+    ),
+]
+
+
+@app.command()
+def compare(
+    paths: Paths,
+    margin: MarginOption = None,
+    out: Annotated[
+        Path | None,
+        typer.Option("--out", "-o", help="Folder for comparison.json and figures; none by default."),
+    ] = None,
+    own_protocol: Annotated[
+        Path | None,
+        typer.Option(help="Bag of a simulation with noise of its own, for the thesis's analysis."),
+    ] = None,
+    sim_prefix: Annotated[str | None, typer.Option(help="Namespace of the simulation's topics.")] = None,
+    hw_prefix: Annotated[str | None, typer.Option(help="Namespace of the hardware's topics.")] = None,
+    json_output: Annotated[bool, typer.Option("--json", help="Print JSON instead of tables.")] = False,
+) -> None:
+    """Compare simulation and hardware under noise: statistics of the difference, equivalence tests, a verdict.
+
+    Example: python -m pendulum_bags compare runs/today/sim runs/today/hw --margin position=0.005 --margin spread=1.2
+    """
+    from pendulum_bags.comparison import Margins, compare_folders, compare_runs
+
+    margins = Margins.parse(margin)
+    if all((path / "sim").is_dir() and (path / "hw").is_dir() for path in paths):
+        result = compare_folders(paths, margin=margins)
+    elif len(paths) == 2:
+        result = compare_runs(
+            paths[0],
+            paths[1],
+            sim_prefix=sim_prefix,
+            hw_prefix=hw_prefix,
+            own_protocol=own_protocol,
+            margin=margins,
+        )
+    else:
+        raise DataError(
+            f"got {len(paths)} paths ({', '.join(map(str, paths))}); "
+            "expected a simulation and a hardware bag, or run folders that hold sim and hw"
+        )
+    content = result.to_json()
+    if out is not None:
+        _write(out, result, content)
+    if json_output:
+        print(json.dumps(content, indent=2, allow_nan=False))
+    else:
+        _print(result, content)
+        if out is not None:
+            print(f"\nwritten: {out / 'comparison.json'} and figures beside it")
+
+
+def _write(out: Path, result: Comparison, content: dict[str, Any]) -> None:
+    from pendulum_bags.figures.catalogue import comparison_figures
+    from pendulum_bags.figures.render_files import write_figures
+    from pendulum_bags.runs.run_folder import write_json
+
+    out.mkdir(parents=True, exist_ok=True)
+    write_json(out / "comparison.json", content)
+    write_figures(comparison_figures(result), out / "figures")
+
+
+def _print(result: Comparison, content: dict[str, Any]) -> None:
+    from pendulum_bags.runs.run_data import timing_warning
+    from pendulum_msgs_py.programs.terminal import WholeTable, make_console
+
+    console = make_console()
+    plants = content["plants"]
+    table = WholeTable(title="Plants during the noise", title_justify="left")
+    for heading in ("", *plants):
+        table.add_column(heading, justify="left" if not heading else "right")
+    for label, key, form in (
+        ("rate \\[Hz]", "rate_hz", ".1f"),
+        ("missed deadlines", "missed_deadlines", ".0f"),
+        ("noise held for \\[s]", "noise_hold_time", ".4f"),
+        ("std of theta \\[rad]", "std_theta", ".5f"),
+        ("std of theta' \\[rad/s]", "std_theta_dot", ".5f"),
+        ("max |u| \\[N m]", "max_abs_u", ".4f"),
+    ):
+        table.add_row(label, *(_number(plant.get(key), form) for plant in plants.values()))
+    console.print(table)
+    blocks = [("paired", content["paired"])] if "position" in content["paired"] else []
+    blocks.append(("unpaired", content["unpaired"]))
+    statistics = WholeTable(title="Hardware minus simulation", title_justify="left")
+    statistics.add_column("")
+    for title, _ in blocks:
+        statistics.add_column(f"{title} \\[rad]", justify="right")
+        statistics.add_column(f"{title} \\[rad/s]", justify="right")
+    for name in content["unpaired"]["position"]:
+        cells = [f"{block[key][name]:.4g}" for _, block in blocks for key in ("position", "velocity")]
+        statistics.add_row(name, *cells)
+    console.print(statistics)
+    if warning := timing_warning(plants):
+        console.print(warning, style="bold red", highlight=False)
+    if result.is_paired:
+        pair = result.pairs[0]
+        delay = pair.response.delay * 1e3
+        console.print(
+            f"Alignment: the disturbances agree at {pair.clock.delay * 1e3:.2f} ms"  # type: ignore[union-attr]
+            f" (correlation {pair.clock.correlation:.3f}); "  # type: ignore[union-attr]
+            f"hardware answers {abs(delay):.2f} ms {'later' if delay >= 0 else 'earlier'} than the simulation."
+        )
+    else:
+        console.print(f"Not paired: {content['paired']['reason']}.")
+    tests = WholeTable(title="Equivalence tests", title_justify="left")
+    for heading in ("quantity", "estimate", "90 % interval", "margin", "result", "add runs"):
+        tests.add_column(heading, justify="left" if heading in {"quantity", "result"} else "right")
+    for test in result.verdict.tests:
+        interval = test.interval
+        tests.add_row(
+            test.quantity + (f" \\[{test.unit}]" if test.unit != "-" else ""),
+            f"{interval.estimate:.3g}",
+            f"{interval.low:.3g} to {interval.high:.3g}",
+            test.margin_text().removeprefix("margin "),
+            test.outcome.value,
+            {None: "no use", 0: ""}.get(test.more_runs, str(test.more_runs)),
+        )
+    console.print(tests)
+    console.print(f"\n[bold]{result.verdict.sentence}[/bold]", highlight=False)
+
+
+def _number(value: float | None, form: str) -> str:
+    return "–" if value is None else format(value, form)
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run the command line."""
+    return cli_main(app, argv, name="python -m pendulum_bags compare")

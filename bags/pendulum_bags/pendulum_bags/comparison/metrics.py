@@ -1,0 +1,181 @@
+"""One table of metrics of a control episode: a new metric is one function and one line in ``METRICS``."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+
+from pendulum_bags.runs.series import Array, Series
+from pendulum_msgs_py.contract.angles import UPRIGHT
+
+__all__ = ["METRICS", "Episode", "Metric", "episode_of", "metrics_of", "summarise_metrics"]
+
+BAND = 0.02
+"""Share of the step that still counts as settled."""
+
+
+@dataclass(frozen=True)
+class Episode:
+    """What a controller did in one run.
+
+    Args:
+        t: Time since the start, shape (n,) [s].
+        error: Angle minus set-point, shape (n,) [rad].
+        velocity: Shape (n,) [rad/s].
+        effort: Torque of the controller, shape (n,) [N m].
+        step: Size of the step that it answers: angle at the start minus set-point [rad]; 0 for regulation.
+    """
+
+    t: Array
+    error: Array
+    velocity: Array
+    effort: Array
+    step: float = 0.0
+
+
+def episode_of(series: Series, set_point: float = UPRIGHT, *, step: bool = False) -> Episode:
+    """Return the episode of a motion; ``step`` takes its first angle as the start of a step to the set-point."""
+    error = series.position - set_point
+    return Episode(
+        series.t - series.t[0], error, series.velocity, series.effort, float(error[0]) if step else 0.0
+    )
+
+
+def _integral(episode: Episode, values: Array) -> float:
+    return float(0.5 * (values[1:] + values[:-1]) @ np.diff(episode.t))
+
+
+def _overshoot(episode: Episode) -> float:
+    """Largest excursion beyond the set-point, as a share of the step."""
+    if episode.step == 0.0:
+        return float("nan")
+    return float(max(0.0, np.max(-episode.error / episode.step)))
+
+
+def _rise_time(episode: Episode) -> float:
+    """Time from 10 to 90 per cent of the step."""
+    if episode.step == 0.0:
+        return float("nan")
+    done = 1.0 - episode.error / episode.step
+    reached = [np.flatnonzero(done >= share) for share in (0.1, 0.9)]
+    if not all(index.size for index in reached):
+        return float("inf")
+    return float(episode.t[reached[1][0]] - episode.t[reached[0][0]])
+
+
+def _settling_time(episode: Episode) -> float:
+    """Time after which the error stays within 2 per cent of the step."""
+    if episode.step == 0.0:
+        return float("nan")
+    outside = np.flatnonzero(np.abs(episode.error) > BAND * abs(episode.step))
+    if not outside.size:
+        return 0.0
+    last = int(outside[-1])
+    return float(episode.t[last + 1]) if last + 1 < episode.t.size else float("inf")
+
+
+def _steady_state_error(episode: Episode) -> float:
+    """Mean error over the last tenth."""
+    return float(episode.error[-max(1, episode.error.size // 10) :].mean())
+
+
+def _rms_error(episode: Episode) -> float:
+    return float(np.sqrt(np.mean(episode.error**2)))
+
+
+def _rms_velocity(episode: Episode) -> float:
+    return float(np.sqrt(np.mean(episode.velocity**2)))
+
+
+def _ise(episode: Episode) -> float:
+    return _integral(episode, episode.error**2)
+
+
+def _iae(episode: Episode) -> float:
+    return _integral(episode, np.abs(episode.error))
+
+
+def _itae(episode: Episode) -> float:
+    return _integral(episode, episode.t * np.abs(episode.error))
+
+
+def _effort_energy(episode: Episode) -> float:
+    """Integral of squared torque: what the winding pays in heat, up to a constant of the motor."""
+    return _integral(episode, episode.effort**2)
+
+
+def _max_effort(episode: Episode) -> float:
+    return float(np.max(np.abs(episode.effort)))
+
+
+def _rms_effort(episode: Episode) -> float:
+    return float(np.sqrt(np.mean(episode.effort**2)))
+
+
+def _work(episode: Episode) -> float:
+    """Mechanical work of the controller's torque; positive where it drives, negative where it brakes."""
+    return _integral(episode, episode.effort * episode.velocity)
+
+
+def _absolute_work(episode: Episode) -> float:
+    return _integral(episode, np.abs(episode.effort * episode.velocity))
+
+
+def _smoothness(episode: Episode) -> float:
+    """Root mean square rate of change of the torque; small is smooth."""
+    return float(np.sqrt(np.mean((np.diff(episode.effort) / np.diff(episode.t)) ** 2)))
+
+
+class Metric(NamedTuple):
+    """A metric: its name, unit, meaning and function; NaN where an episode has no such thing."""
+
+    name: str
+    unit: str
+    meaning: str
+    function: Callable[[Episode], float]
+
+
+METRICS: tuple[Metric, ...] = (
+    Metric("overshoot", "-", "largest excursion beyond the set-point per step", _overshoot),
+    Metric("rise_time", "s", "time from 10 to 90 % of the step", _rise_time),
+    Metric("settling_time", "s", "time after which the error stays within 2 % of the step", _settling_time),
+    Metric("steady_state_error", "rad", "mean error over the last tenth", _steady_state_error),
+    Metric("rms_error", "rad", "root mean square error", _rms_error),
+    Metric("rms_velocity", "rad/s", "root mean square velocity", _rms_velocity),
+    Metric("ise", "rad^2 s", "integral of squared error", _ise),
+    Metric("iae", "rad s", "integral of absolute error", _iae),
+    Metric("itae", "rad s^2", "integral of time times absolute error", _itae),
+    Metric("max_effort", "N m", "largest absolute torque", _max_effort),
+    Metric("rms_effort", "N m", "root mean square torque", _rms_effort),
+    Metric("effort_energy", "N^2 m^2 s", "integral of squared torque", _effort_energy),
+    Metric("work", "J", "mechanical work of the torque", _work),
+    Metric("absolute_work", "J", "integral of absolute mechanical power", _absolute_work),
+    Metric("smoothness", "N m/s", "root mean square rate of change of the torque", _smoothness),
+)
+
+
+def metrics_of(episode: Episode) -> dict[str, float]:
+    """Return every metric of ``METRICS`` that the episode has, by name."""
+    values = {metric.name: float(metric.function(episode)) for metric in METRICS}
+    return {name: value for name, value in values.items() if not np.isnan(value)}
+
+
+def summarise_metrics(episodes: Mapping[str, Episode]) -> list[dict[str, float | str | None]]:
+    """Return one row for each metric, with a column for each episode; for tables and JSON."""
+    values = {name: metrics_of(episode) for name, episode in episodes.items()}
+    rows: list[dict[str, float | str | None]] = []
+    for metric in METRICS:
+        if any(metric.name in found for found in values.values()):
+            row: dict[str, float | str | None] = {
+                "metric": metric.name,
+                "unit": metric.unit,
+                "meaning": metric.meaning,
+            }
+            for name, found in values.items():
+                value = found.get(metric.name, float("nan"))
+                row[name] = value if np.isfinite(value) else None
+            rows.append(row)
+    return rows

@@ -1,0 +1,66 @@
+"""Spectra of two motions and how far one explains the other, frequency by frequency (Welch's method)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy import signal
+
+from pendulum_bags.runs.series import Array, Series, shared_span, uniform_times
+
+__all__ = ["Spectra", "spectra_of"]
+
+
+@dataclass(frozen=True)
+class Spectra:
+    """Power spectral densities and coherence.
+
+    Args:
+        frequency: Shape (n,) [Hz].
+        first, second: One-sided densities of the velocities, shape (n,) [(rad/s)^2/Hz].
+        coherence: Magnitude squared coherence, shape (n,), 0 to 1.
+        threshold: Coherence that independent signals exceed at a given frequency with 5 % probability.
+        segments: Effective number of averaged segments.
+    """
+
+    frequency: Array
+    first: Array
+    second: Array
+    coherence: Array
+    threshold: float
+    segments: float
+
+    @property
+    def coherent_up_to(self) -> float:
+        """Frequency up to which the coherence stays above the threshold [Hz]; 0 where it starts below."""
+        below = np.flatnonzero(self.coherence[1:] <= self.threshold)
+        last = below[0] if below.size else self.frequency.size - 1
+        return float(self.frequency[last])
+
+
+def spectra_of(first: Series, second: Series, segment: float = 1.0) -> Spectra:
+    """Compare the velocities of two motions in frequency.
+
+    Both are brought to the slower one's rate, so that neither is credited with what the other cannot see.
+
+    Args:
+        first: Motion.
+        second: Motion.
+        segment: Length of a segment, halves overlapping [s]; shortened where fewer than four would fit.
+    """
+    start, stop = shared_span(first, second)
+    period = max(first.period, second.period)
+    times = uniform_times(start, stop, period)
+    a, b = (one.interpolated(times).velocity for one in (first, second))
+    size = int(min(round(segment / period), 2 * times.size // 5))
+    size = max(size, 8)
+    rate = 1.0 / period
+    frequency, density_a = signal.welch(a, rate, nperseg=size)
+    _, density_b = signal.welch(b, rate, nperseg=size)
+    _, coherence = signal.coherence(a, b, rate, nperseg=size)
+    count = (times.size - size) // (size - size // 2) + 1
+    # Half-overlapping Hann windows share 1/6 of their power: Welch 1967, Bendat and Piersol section 11.5.
+    effective = count / (1.0 + 2.0 * (1.0 / 6.0) ** 2 * (count - 1) / count) if count > 1 else 1.0
+    threshold = 1.0 - 0.05 ** (1.0 / max(effective - 1.0, 0.1))
+    return Spectra(frequency, density_a, density_b, np.clip(coherence, 0.0, 1.0), threshold, effective)

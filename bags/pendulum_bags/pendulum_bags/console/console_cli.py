@@ -1,0 +1,39 @@
+"""``console``: a web page on which the plants of a ROS domain are seen live, tuned, armed and stopped.
+
+Loads what it needs at low priority, because the loops that it is to show may be running.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import importlib
+import os
+import threading
+from collections.abc import Sequence
+
+__all__ = ["main"]
+
+_NICENESS = 10
+_CONSOLE = "pendulum_bags.console.console_node"
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run the console.
+
+    Args:
+        argv: Arguments; by default those of the process.
+    """
+    # Two seconds of imports kept a loop at 500 Hz waiting for 9 ms. The thread is niced, not the process: a stop that
+    # is pressed later must not wait behind anybody.
+    loading = threading.Thread(target=_load)
+    loading.start()
+    loading.join()
+    return int(importlib.import_module(_CONSOLE).main(list(argv) if argv is not None else None))
+
+
+def _load() -> None:
+    with contextlib.suppress(OSError):
+        os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), _NICENESS)
+    # What fails here fails again in the main thread, which tells it.
+    with contextlib.suppress(Exception):
+        importlib.import_module(_CONSOLE)

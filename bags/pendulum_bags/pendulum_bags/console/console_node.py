@@ -1,0 +1,319 @@
+"""``console``: a web page on which the plants of a ROS domain are seen live, tuned, armed and stopped."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import secrets
+import sys
+import threading
+import time
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Annotated, Any
+
+import rclpy
+import typer
+from diagnostic_msgs.msg import DiagnosticArray
+from rcl_interfaces.msg import Parameter as ParameterMessage
+from rcl_interfaces.srv import SetParameters
+from rclpy.clock import Clock, ClockType
+from rclpy.context import Context
+from rclpy.experimental import EventsExecutor
+from rclpy.parameter import Parameter
+from rclpy.signals import SignalHandlerOptions
+from rclpy.task import Future
+from sensor_msgs.msg import JointState
+from std_msgs.msg import String
+from std_srvs.srv import SetBool, Trigger
+
+from pendulum_bags.console.jobs import Jobs
+from pendulum_bags.console.page import serve
+from pendulum_bags.console.security import is_loopback
+from pendulum_msgs_py.contract import names
+from pendulum_msgs_py.errors import FaultError, ParameterError
+from pendulum_msgs_py.programs.executables import cli_main
+from pendulum_msgs_py.ros import qos
+from pendulum_msgs_py.ros.convert import command_from_bytes, sample_from_bytes, stamp_from_message
+from pendulum_msgs_py.ros.middleware import check_closed, set_middleware_defaults
+from pendulum_msgs_py.ros.polled import PolledInput, PollingNode
+from pendulum_rosbag.recorder.parameter_reader_node import ParameterReader
+
+__all__ = ["Hub", "main"]
+
+_LOOK_PERIOD = 0.3
+_SLICE = 0.2
+_TIMEOUT = 3.0
+"""Longest wait for an answer of a node [s]."""
+_TORQUES = {
+    "command": names.EFFORT_COMMAND,
+    "disturbance": names.DISTURBANCE,
+    "applied": names.APPLIED_EFFORT,
+}
+_STOP_SERVICE = "/e_stop"
+
+
+@dataclass
+class _Plant:
+    """What is known of one plant; ``taps`` are read by whoever draws, not by an executor."""
+
+    namespace: str
+    node: str
+    taps: dict[str, PolledInput]
+    others: list[Any] = field(default_factory=list)
+    values: dict[str, float] = field(default_factory=dict)
+    stamp_ns: int = 0
+    mode: str = ""
+    reason: str = ""
+    mode_stamp_ns: int = 0
+    figures: dict[str, str] = field(default_factory=dict)
+
+
+class Hub:
+    """The console's end of the graph.
+
+    States and torques come at up to 2 kHz and are drawn 60 times a second. Their inputs keep one message and are looked
+    at when a picture is due: what is not drawn costs no Python at all.
+    """
+
+    def __init__(self) -> None:
+        set_middleware_defaults()
+        self._context = Context()
+        rclpy.init(context=self._context, args=[], signal_handler_options=SignalHandlerOptions.NO)
+        self._node = PollingNode("console", context=self._context)
+        check_closed(self._context.get_domain_id())
+        self._lock = threading.Lock()
+        self._plants: dict[str, _Plant] = {}
+        self._clients: dict[str, Any] = {}
+        self._reader = ParameterReader(self._node, lambda _values, _changed: None)
+        self._node.create_subscription(
+            DiagnosticArray, names.DIAGNOSTICS, self._on_diagnostics, qos.DIAGNOSTICS
+        )
+        self._node.create_timer(_LOOK_PERIOD, self._look, clock=Clock(clock_type=ClockType.STEADY_TIME))
+        self._done = Future(executor=None)
+        self._executor = EventsExecutor(context=self._context)
+        self._executor.add_node(self._node)
+        self._thread = threading.Thread(target=self._spin, daemon=True)
+        self._thread.start()
+
+    def close(self) -> None:
+        """Leave the graph."""
+        self._done.set_result(None)
+        self._executor.wake()
+        self._thread.join(2.0)
+        self._executor.shutdown()
+        self._node.destroy_node()
+        rclpy.try_shutdown(context=self._context)
+
+    @property
+    def parameters(self) -> dict[str, dict[str, Any]]:
+        """Parameters of all nodes, kept up to date: node -> name -> value."""
+        return self._reader.values
+
+    def frame(self) -> dict[str, Any]:
+        """Return the newest of everything that is drawn, by namespace."""
+        with self._lock:
+            return {plant.namespace: self._read(plant) for plant in self._plants.values()}
+
+    def plants(self) -> dict[str, str]:
+        """Return the plants that are on the graph: namespace -> full node name."""
+        with self._lock:
+            return {plant.namespace: plant.node for plant in self._plants.values()}
+
+    # --- what a person asks for ----------------------------------------------------------------------------
+
+    async def e_stop(self) -> dict[str, str]:
+        """Latch the e-stop of every plant at once and return what each said."""
+        nodes = self.plants()
+        calls = [self._call(Trigger, f"{node}{_STOP_SERVICE}", Trigger.Request()) for node in nodes.values()]
+        answers = await asyncio.gather(*calls, return_exceptions=True)
+        return {space: _said(answer) for space, answer in zip(nodes, answers, strict=True)}
+
+    async def trigger(self, service: str) -> str:
+        """Call a service without arguments; raise a FaultError with its reason where it refuses."""
+        return _accepted(service, await self._call(Trigger, service, Trigger.Request()))
+
+    async def arm(self, node: str, *, on: bool) -> str:
+        """Arm or disarm a plant; raise a FaultError with its reason where it refuses."""
+        return _accepted(node, await self._call(SetBool, f"{node}/arm", SetBool.Request(data=on)))
+
+    async def set_parameter(self, node: str, name: str, value: Any) -> None:
+        """Set a parameter; raise a FaultError with the node's reason where it refuses."""
+        message: ParameterMessage = Parameter(name, value=value).to_parameter_msg()
+        request = SetParameters.Request(parameters=[message])
+        result = (await self._call(SetParameters, f"{node}/set_parameters", request)).results[0]
+        if not result.successful:
+            raise FaultError(f"{node} refuses {name} = {value}: {result.reason}")
+
+    async def _call(self, kind: Any, service: str, request: Any) -> Any:
+        with self._lock:
+            client = self._clients.get(service)
+            if client is None:
+                client = self._clients[service] = self._node.create_client(kind, service)
+        deadline = time.monotonic() + _TIMEOUT
+        while not client.service_is_ready():
+            if time.monotonic() > deadline:
+                raise FaultError(f"{service} is not there; is its node running?")
+            await asyncio.sleep(0.01)
+        loop = asyncio.get_running_loop()
+        answered: asyncio.Future[Any] = loop.create_future()
+
+        def settle(answer: Any) -> None:
+            if not answered.done():
+                answered.set_result(answer)
+
+        def hand_over(future: Any) -> None:
+            loop.call_soon_threadsafe(settle, future.result())
+
+        client.call_async(request).add_done_callback(hand_over)
+        try:
+            return await asyncio.wait_for(answered, _TIMEOUT)
+        except asyncio.TimeoutError:
+            raise FaultError(f"{service} does not answer within {_TIMEOUT:g} s") from None
+
+    # --- the graph -----------------------------------------------------------------------------------------
+
+    def _spin(self) -> None:
+        while not self._done.done():
+            self._executor.spin_until_future_complete(self._done, _SLICE)
+
+    def _look(self) -> None:
+        """Find plants by their e-stop: who has one is a plant."""
+        self._reader.look()
+        found = {
+            name.removesuffix(_STOP_SERVICE)
+            for name, types in self._node.get_service_names_and_types()
+            if name.endswith(_STOP_SERVICE)
+            and "std_srvs/srv/Trigger" in types
+            # A name stays listed for as long as anybody, we too, has a client of it.
+            and self._node.count_services(name)
+        }
+        with self._lock:
+            known = dict(self._plants)
+        for node in found - known.keys():
+            plant = self._meet(node)
+            with self._lock:
+                self._plants[node] = plant
+        for node in known.keys() - found:
+            with self._lock:
+                gone = self._plants.pop(node)
+                stale = [name for name in self._clients if name.startswith(f"{gone.namespace}/")]
+                clients = [self._clients.pop(name) for name in stale]
+            for tap in gone.taps.values():
+                self._node.destroy_polled_input(tap)
+            for subscription in gone.others:
+                self._node.destroy_subscription(subscription)
+            for client in clients:
+                self._node.destroy_client(client)
+
+    def _meet(self, node: str) -> _Plant:
+        space = node.rpartition("/")[0]
+        topics = {"state": names.JOINT_STATES, **_TORQUES}
+        taps = {
+            key: self._node.create_polled_input(JointState, f"{space}/{topic}", qos.NEWEST_STATE)
+            for key, topic in topics.items()
+        }
+        plant = _Plant(space, node, taps)
+        plant.others.append(
+            self._node.create_subscription(
+                String, f"{space}/{names.EVENTS}", lambda message: _on_event(plant, message), qos.EVENTS
+            )
+        )
+        # Made now: a stop must not wait for a client to find its service.
+        with self._lock:
+            service = f"{node}{_STOP_SERVICE}"
+            self._clients.setdefault(service, self._node.create_client(Trigger, service))
+        return plant
+
+    def _on_diagnostics(self, message: DiagnosticArray) -> None:
+        with self._lock:
+            for status in message.status:
+                plant = self._plants.get(status.name.partition(":")[0])
+                if plant is not None:
+                    plant.figures = {pair.key: pair.value for pair in status.values}
+                    # For who joined late; what was written before the newest event would take it back.
+                    if stamp_from_message(message.header.stamp) > plant.mode_stamp_ns:
+                        plant.mode, plant.reason = plant.figures.get("mode", plant.mode), status.message
+
+    def _read(self, plant: _Plant) -> dict[str, Any]:
+        for key, tap in plant.taps.items():
+            for data, _ in tap.messages():
+                if key != "state":
+                    command = command_from_bytes(data)
+                    plant.values[key] = command.effort if command is not None else 0.0
+                elif (sample := sample_from_bytes(data)) is not None:
+                    plant.values.update(theta=sample.position, theta_dot=sample.velocity, measured=sample.effort)
+                    plant.stamp_ns = sample.stamp_ns
+        return {
+            **plant.values,
+            "stamp_ns": str(plant.stamp_ns),
+            "node": plant.node,
+            "mode": plant.mode,
+            "reason": plant.reason,
+            "mode_ms": plant.mode_stamp_ns / 1e6,
+            "rate": plant.figures.get("rate_hz", ""),
+            "jitter": plant.figures.get("jitter_p99_us", ""),
+        }
+
+
+def _on_event(plant: _Plant, message: String) -> None:
+    try:
+        event = json.loads(message.data)
+    except json.JSONDecodeError:
+        return
+    if isinstance(event, dict) and event.get("name") == "plant_mode":
+        plant.mode, plant.reason = str(event.get("mode", "")), str(event.get("reason", ""))
+        plant.mode_stamp_ns = int(event.get("stamp_ns", 0))
+
+
+def _accepted(who: str, response: Any) -> str:
+    if not response.success:
+        raise FaultError(f"{who} refuses: {response.message}")
+    return str(response.message)
+
+
+def _said(answer: Any) -> str:
+    return str(answer) if isinstance(answer, BaseException) else str(answer.message)
+
+
+app = typer.Typer(add_completion=False, rich_markup_mode=None)
+
+
+@app.command(
+    epilog="Example: python -m pendulum_bags console --port 8090. The ROS domain is that of ROS_DOMAIN_ID."
+)
+def console(
+    host: Annotated[
+        str, typer.Option(help="Address to listen on; beyond this machine a token is needed.")
+    ] = "127.0.0.1",
+    port: Annotated[int, typer.Option(help="Port to listen on.", min=1, max=65535)] = 8090,
+    runs: Annotated[Path, typer.Option(help="Folder of what is recorded or run from the page.")] = Path(
+        "bags/runs"
+    ),
+) -> int:
+    """Serve the console until Ctrl-C."""
+    token = "" if is_loopback(host) else secrets.token_urlsafe(16)
+    if runs.exists() and not runs.is_dir():
+        raise ParameterError(f"runs is {runs}, a file; expected a folder")
+    hub, jobs = Hub(), Jobs(runs.resolve())
+    address = f"http://{'localhost' if is_loopback(host) else host}:{port}/" + (
+        f"?token={token}" if token else ""
+    )
+    try:
+        serve(
+            hub,
+            jobs,
+            host=host,
+            port=port,
+            token=token,
+            ready=lambda: print(f"console at {address}", flush=True),
+        )
+    finally:
+        jobs.close()
+        hub.close()
+    return 0
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Run the console."""
+    return cli_main(app, list(sys.argv[1:] if argv is None else argv), name="python -m pendulum_bags console")

@@ -1,0 +1,19 @@
+"""The programs of this package: name and entry point, read by ``setup.py`` and ``python -m``."""
+
+__all__ = ["EXECUTABLES"]
+
+EXECUTABLES: dict[str, str] = {
+    "record": "pendulum_rosbag.recorder.record_cli:main",
+    "analyse": "pendulum_bags.analyse.analyse_cli:main",
+    "compare": "pendulum_bags.comparison.compare_cli:main",
+    "replay": "pendulum_bags.replay.replay_cli:main",
+    "experiment": "pendulum_bags.experiments.experiment_cli:main",
+    "excite": "pendulum_bags.experiments.excite_cli:main",
+    "identify": "pendulum_bags.identification.identify_cli:main",
+    "report": "pendulum_bags.report.report_cli:main",
+    "export": "pendulum_rosbag.reader.export_cli:main",
+    "play": "pendulum_rosbag.player.player_node:main",
+    "console": "pendulum_bags.console.console_cli:main",
+    "info": "pendulum_rosbag.reader.info_cli:main",
+    "repair": "pendulum_rosbag.storage.repair_cli:main",
+}

@@ -1,0 +1,351 @@
+"""The node that conducts an experiment: it arms plants, moves them, switches controllers and disturbances."""
+
+from __future__ import annotations
+
+import json
+import signal
+import time
+from collections.abc import Callable, Mapping
+from types import FrameType, TracebackType
+from typing import Any, TypeVar
+
+import rclpy
+from lifecycle_msgs.msg import Transition
+from lifecycle_msgs.srv import ChangeState
+from rclpy.client import Client
+from rclpy.context import Context
+from rclpy.experimental import EventsExecutor
+from rclpy.node import Node
+from rclpy.signals import SignalHandlerOptions
+from rclpy.task import Future
+from sensor_msgs.msg import JointState
+from std_msgs.msg import String
+from std_srvs.srv import SetBool, Trigger
+from trajectory_msgs.msg import JointTrajectory
+
+from pendulum_msgs_py.contract import names
+from pendulum_msgs_py.contract.trajectory import Trajectory
+from pendulum_msgs_py.contract.values import JointSample
+from pendulum_msgs_py.errors import FaultError
+from pendulum_msgs_py.ros import qos
+from pendulum_msgs_py.ros.convert import event_message, sample_from_bytes, trajectory_to_message
+from pendulum_msgs_py.ros.middleware import check_closed, set_middleware_defaults
+
+__all__ = ["Conductor", "PlantClient", "RecorderClient"]
+
+_SLICE = 0.05
+_QUIET_POLLS = 3
+_T = TypeVar("_T")
+
+
+class Conductor:
+    """An rclpy context and node of its own, spun only while it waits; Ctrl-C ends any wait at once.
+
+    Args:
+        domain: ROS domain.
+        watch: Called between two slices of waiting; raises to end the experiment (a process has died).
+        on_wait: Called between two slices with nothing to do but show progress.
+    """
+
+    def __init__(
+        self, domain: int, *, watch: Callable[[], None] = lambda: None, on_wait: Callable[[], None] = lambda: None
+    ) -> None:
+        self.domain = domain
+        self.watch = watch
+        self.on_wait = on_wait
+
+    def __enter__(self) -> Conductor:
+        """Join the graph."""
+        self._previous = signal.signal(signal.SIGTERM, _interrupt)
+        set_middleware_defaults()
+        self.context = Context()
+        rclpy.init(
+            context=self.context, domain_id=self.domain, signal_handler_options=SignalHandlerOptions.NO, args=[]
+        )
+        self.node: Node = rclpy.create_node("conductor", context=self.context, start_parameter_services=False)
+        check_closed(self.domain)
+        self._executor = EventsExecutor(context=self.context)
+        self._executor.add_node(self.node)
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        """Leave the graph."""
+        self._executor.shutdown()
+        self.node.destroy_node()
+        rclpy.try_shutdown(context=self.context)
+        signal.signal(signal.SIGTERM, self._previous)
+
+    def spin(self, duration: float) -> None:
+        """Do nothing but listen for a while [s]."""
+        deadline = time.monotonic() + duration
+        while (left := deadline - time.monotonic()) > 0:
+            self._slice(min(_SLICE, left))
+
+    def wait_for(self, what: str, predicate: Callable[[], _T], timeout: float) -> _T:
+        """Wait until a predicate holds and return its value.
+
+        Args:
+            what: What is waited for, for the message.
+            predicate: Asked between slices.
+            timeout: Longest time to wait [s].
+
+        Raises:
+            FaultError: It did not come to hold in time.
+        """
+        deadline = time.monotonic() + timeout
+        while not (value := predicate()):
+            if time.monotonic() > deadline:
+                raise FaultError(f"waited {timeout:g} s for {what}, in vain")
+            self._slice(_SLICE)
+        return value
+
+    def call(self, client: Client, request: Any, what: str, timeout: float = 10.0) -> Any:
+        """Call a service and return its response.
+
+        Raises:
+            FaultError: The service is not there or does not answer in time.
+        """
+        self.wait_for(f"service {client.srv_name}", client.service_is_ready, timeout)
+        future = client.call_async(request)
+        self.wait_for(what, future.done, timeout)
+        return future.result()
+
+    def listen(self, duration: float) -> None:
+        """Handle what arrives within a duration [s], without asking whether all is well."""
+        self._executor.spin_until_future_complete(Future(executor=None), duration)
+
+    def _slice(self, duration: float) -> None:
+        self.listen(duration)
+        self.watch()
+        self.on_wait()
+
+
+class PlantClient:
+    """One plant with its controller and its disturbance, as the conductor sees them.
+
+    Args:
+        conductor: Who conducts.
+        namespace: Namespace of the plant's topics, such as ``/sim``.
+        plant: Name of the plant's node.
+        controller: Name of its controller's node, empty for none.
+        disturbance: Name of its disturbance's node, empty for none.
+        watch: Subscribe to its states now; a plant in lockstep waits for its last listener, which may be this one.
+    """
+
+    def __init__(
+        self,
+        conductor: Conductor,
+        namespace: str,
+        plant: str,
+        *,
+        controller: str = "controller",
+        disturbance: str = "disturbance",
+        watch: bool = True,
+    ) -> None:
+        node = conductor.node
+        self.conductor = conductor
+        self.namespace = namespace
+        self.sample: JointSample | None = None
+        self.samples = 0
+        self.events: list[dict[str, Any]] = []
+        self._arm = node.create_client(SetBool, f"{namespace}/{plant}/arm")
+        self._pause = node.create_client(SetBool, f"{namespace}/{plant}/pause")
+        self._e_stop = node.create_client(Trigger, f"{namespace}/{plant}/e_stop")
+        self._change_state = node.create_client(ChangeState, f"{namespace}/{controller}/change_state")
+        self._start = node.create_client(Trigger, f"{namespace}/{disturbance}/start")
+        self._trajectory = node.create_publisher(
+            JointTrajectory, f"{namespace}/{names.JOINT_TRAJECTORY}", qos.TRAJECTORY
+        )
+        self._events = node.create_publisher(String, f"{namespace}/{names.EVENTS}", qos.EVENTS)
+        node.create_subscription(String, f"{namespace}/{names.EVENTS}", self._on_event, qos.EVENTS)
+        if watch:
+            self.watch()
+
+    def watch(self) -> None:
+        """Subscribe to the plant's states."""
+        self.conductor.node.create_subscription(
+            JointState, f"{self.namespace}/{names.JOINT_STATES}", self._on_state, qos.NEWEST_STATE, raw=True
+        )
+
+    def wait_until_ready(self, timeout: float, *, controller: bool = True, disturbance: bool = True) -> None:
+        """Wait until states flow and all services and the trajectory topic are there."""
+        wait = self.conductor.wait_for
+        wait(f"states on {self.namespace}/{names.JOINT_STATES}", lambda: self.sample is not None, timeout)
+        clients = [self._arm, self._e_stop]
+        clients += [self._change_state] if controller else []
+        clients += [self._start] if disturbance else []
+        for client in clients:
+            wait(f"service {client.srv_name}", client.service_is_ready, timeout)
+        wait(
+            f"a plant on {self.namespace}/{names.JOINT_TRAJECTORY}",
+            lambda: self._trajectory.get_subscription_count() > 0,
+            timeout,
+        )
+
+    def arm(self) -> None:
+        """Arm the plant.
+
+        Raises:
+            FaultError: It refuses; the message has its reason.
+        """
+        response = self.conductor.call(self._arm, SetBool.Request(data=True), f"{self.namespace} to arm")
+        if not response.success:
+            raise FaultError(f"{self.namespace} does not arm: {response.message}")
+
+    def disarm(self) -> None:
+        """Disarm the plant."""
+        self.conductor.call(self._arm, SetBool.Request(data=False), f"{self.namespace} to disarm")
+
+    def call(self, service: str) -> None:
+        """Call a Trigger service of a node beside the plant, such as ``procedure/start``.
+
+        Raises:
+            FaultError: It is not there, or refuses.
+        """
+        client = self.conductor.node.create_client(Trigger, f"{self.namespace}/{service}")
+        response = self.conductor.call(client, Trigger.Request(), f"{self.namespace}/{service}")
+        if not response.success:
+            raise FaultError(f"{self.namespace}/{service} refuses: {response.message}")
+
+    def resume(self, timeout: float) -> None:
+        """Let a paused plant go."""
+        self.conductor.call(self._pause, SetBool.Request(data=False), f"{self.namespace} to go on", timeout)
+
+    def disarm_quietly(self, timeout: float = 1.0) -> None:
+        """Disarm on the way out, where a plant that no longer answers must not keep others from being disarmed."""
+        if not self._arm.service_is_ready():
+            return
+        future = self._arm.call_async(SetBool.Request(data=False))
+        deadline = time.monotonic() + timeout
+        while not future.done() and time.monotonic() < deadline:
+            self.conductor.listen(_SLICE)
+
+    def follow(self, trajectory: Trajectory, phase: str, **details: Any) -> None:
+        """Start a move under position control, and record it as a phase."""
+        self.mark(phase, **details)
+        self._finished_before = len(self.events)
+        self._trajectory.publish(trajectory_to_message(trajectory))
+
+    def is_following(self) -> bool:
+        """Tell whether the plant has taken up the move last asked for; raises as :meth:`trajectory_finished`."""
+        return self.trajectory_finished() or any(
+            event["name"] == "plant_mode" and event.get("mode") == "armed_position"
+            for event in self.events[self._finished_before :]
+        )
+
+    def trajectory_finished(self) -> bool:
+        """Tell whether the move last asked for has ended.
+
+        Raises:
+            FaultError: The plant refused it, or left position control.
+        """
+        for event in self.events[self._finished_before :]:
+            if event["name"] == "trajectory_refused":
+                raise FaultError(f"{self.namespace} refused the trajectory: {event.get('reason')}")
+            if event["name"] == "plant_mode" and event.get("mode") in {"fault", "e_stop", "disarmed"}:
+                raise FaultError(f"{self.namespace} went to {event['mode']}: {event.get('reason')}")
+            if event["name"] == "trajectory_finished":
+                return True
+        return False
+
+    def configure_controller(self) -> None:
+        """Let the controller design itself, so that activating it takes no time."""
+        self._transition(Transition.TRANSITION_CONFIGURE, "configure")
+
+    def switch_controller(self, *, on: bool) -> None:
+        """Activate or deactivate the controller."""
+        if on:
+            self._transition(Transition.TRANSITION_ACTIVATE, "activate")
+        else:
+            self._transition(Transition.TRANSITION_DEACTIVATE, "deactivate")
+
+    def _transition(self, transition: int, what: str) -> None:
+        request = ChangeState.Request(transition=Transition(id=transition))
+        if not self.conductor.call(self._change_state, request, f"{self.namespace} controller to {what}").success:
+            raise FaultError(f"{self.namespace} controller does not {what}; its log says why")
+
+    def start_disturbance(self) -> Future:
+        """Ask the disturbance to start with the next state; returns at once."""
+        return self._start.call_async(Trigger.Request())
+
+    def mark(self, name: str, **details: Any) -> None:
+        """Record a phase change at the plant's newest time."""
+        stamp_ns = self.sample.stamp_ns if self.sample else 0
+        self._events.publish(event_message(stamp_ns, name, **details))
+
+    def has_event(self, name: str) -> Mapping[str, Any] | None:
+        """Return the newest event of a name, or None."""
+        return next((event for event in reversed(self.events) if event["name"] == name), None)
+
+    def check_mode(self) -> None:
+        """Raise a FaultError where the plant has faulted or been stopped."""
+        mode = self.has_event("plant_mode")
+        if mode is not None and mode.get("mode") in {"fault", "e_stop"}:
+            raise FaultError(f"{self.namespace} is in {mode['mode']}: {mode.get('reason')}")
+
+    def _on_event(self, message: String) -> None:
+        try:
+            event = json.loads(message.data)
+        except json.JSONDecodeError:
+            return
+        if isinstance(event, dict) and "name" in event:
+            self.events.append(event)
+
+    def _on_state(self, data: bytes) -> None:
+        sample = sample_from_bytes(data)
+        if sample is not None:
+            self.sample = sample
+            self.samples += 1
+
+
+class RecorderClient:
+    """The recorder of one plant.
+
+    Args:
+        conductor: Who conducts.
+        namespace: Namespace of the plant.
+    """
+
+    def __init__(self, conductor: Conductor, namespace: str) -> None:
+        self._conductor = conductor
+        self._status = conductor.node.create_client(Trigger, f"{namespace}/recorder/status")
+
+    def heard(self) -> set[str]:
+        """Return the topics whose publishers the recorder is connected with."""
+        return set(self._ask().get("matched", []))
+
+    def wait_for_all(self, topic: str, expected: int, timeout: float = 60.0) -> None:
+        """Wait until a topic's messages have arrived, and no more of any other do: a recorder may be seconds behind.
+
+        Args:
+            topic: Name of the topic.
+            expected: Messages that were published on it.
+            timeout: Longest time to wait [s].
+
+        Raises:
+            FaultError: Messages are missing.
+        """
+        counts: dict[str, int] = {}
+        quiet = 0
+        deadline = time.monotonic() + timeout
+        while counts.get(topic, 0) < expected or quiet < _QUIET_POLLS:
+            if time.monotonic() > deadline:
+                raise FaultError(
+                    f"the recorder has {counts.get(topic, 0)} of {expected} messages of {topic} after {timeout:g} s"
+                )
+            self._conductor.spin(_SLICE)
+            before, counts = counts, {
+                name: entry["received"] for name, entry in self._ask().get("topics", {}).items()
+            }
+            quiet = quiet + 1 if counts == before else 0
+
+    def _ask(self) -> dict[str, Any]:
+        response = self._conductor.call(self._status, Trigger.Request(), "the recorder's status", 30.0)
+        status: dict[str, Any] = json.loads(response.message)
+        return status
+
+
+def _interrupt(_number: int, _frame: FrameType | None) -> None:
+    raise KeyboardInterrupt

@@ -1,0 +1,288 @@
+"""Play a designed excitation on a plant: torque through the disturbance node, beside a controller that commands zero.
+
+A plant gives no torque without a controller's answer. Here that is a playback of zero torque, started for the run and
+ended with it: whatever ends the run, no answers come any more and the plant goes to zero torque by its own rules.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from pendulum_bags.experiments.conductor_node import Conductor, PlantClient, RecorderClient
+from pendulum_bags.experiments.domain import check_domain
+from pendulum_bags.experiments.lockstep import record_run
+from pendulum_bags.experiments.processes import ProcessSet, ros_environment, start_recorder
+from pendulum_bags.experiments.run_spec import RunSpec
+from pendulum_bags.runs.run_folder import write_json
+from pendulum_msgs_py.contract import names
+from pendulum_msgs_py.contract.angles import wrap
+from pendulum_msgs_py.errors import BagError, FaultError, ParameterError
+from pendulum_msgs_py.programs import graph
+
+__all__ = ["ExcitationPlay", "play_in_lockstep", "play_on_running_plant"]
+
+_REST = 0.5
+"""Time at rest after the last torque, so that the recording has the end of the motion [s]."""
+_START_TIMEOUT = 60.0
+_FIND_TIMEOUT = 30.0
+_AT_REST_ANGLE = 0.1
+_AT_REST_SPEED = 0.3
+"""What counts as hanging at rest [rad], [rad/s]; a noisy velocity sensor shows up to 0.2 rad/s."""
+_ANGLE_ROOM = 1.2
+_SPEED_ROOM = 1.3
+"""A motion this many times beyond the limits of the design ends the run: the prior plant is not the real one."""
+
+
+@dataclass(frozen=True)
+class ExcitationPlay:
+    """What to play, and within which limits.
+
+    Attributes:
+        file: CSV with the columns time [s] and torque [N m].
+        duration: Length of the excitation [s].
+        period: Of the torque values [s].
+        effort: Limit of the torque [N m].
+        speed: Limit of the joint speed [rad/s].
+        angle: Limit of the distance from hanging down [rad].
+        prediction: What the bag should say of the design: ``predicted`` half widths by parameter, ``kind``, ``plant``.
+    """
+
+    file: Path
+    duration: float
+    period: float
+    effort: float
+    speed: float
+    angle: float
+    prediction: Mapping[str, Any] = field(default_factory=dict)
+
+    def zero_file(self, folder: Path) -> Path:
+        """Write the playback of the controller that commands nothing, and return its path."""
+        folder.mkdir(parents=True, exist_ok=True)
+        path = folder / "zero_torque.csv"
+        path.write_text("time,effort\n0,0\n1,0\n", encoding="utf-8")
+        return path
+
+
+@dataclass(frozen=True)
+class _LockstepRun(RunSpec):
+    """A run in lockstep at the sampling period of the design."""
+
+    sampling: float = 0.01
+    prediction: Mapping[str, Any] = field(default_factory=dict)
+
+    @property
+    def period(self) -> float:
+        """Time between two states [s]."""
+        return self.sampling
+
+    def metadata(self) -> dict[str, Any]:
+        """Return what the bag says about its run, the prediction with it."""
+        return {**super().metadata(), "pendulum.excitation": dict(self.prediction)}
+
+
+def play_in_lockstep(
+    bag: Path,
+    play: ExcitationPlay,
+    *,
+    side: str,
+    plant: str,
+    noise: float,
+    seed: int,
+    domain: int | None = None,
+    on_wait: Callable[[], None] = lambda: None,
+) -> Path:
+    """Start a simulator or an emulated actuator, play on it as fast as it answers, and record.
+
+    Args:
+        bag: Folder of the bag.
+        play: What to play.
+        side: ``sim`` or ``hw``.
+        plant: What the simulator or the emulator is.
+        noise: Standard deviation of the simulated angle sensor [rad]; the emulator has its own.
+        seed: Of the sensors.
+        domain: ROS domain, or None for any free one.
+        on_wait: Called while waiting.
+
+    Raises:
+        BagError: The bag exists.
+        FaultError: The plant faulted, beyond its limits for instance, or a program ended.
+    """
+    if bag.exists():
+        raise BagError(f"bag {bag} exists; expected a new folder")
+    limits: dict[str, Any] = {
+        "effort_limit": float(play.effort),
+        "velocity_limit": _SPEED_ROOM * play.speed,
+        "position_window": [-_ANGLE_ROOM * play.angle, _ANGLE_ROOM * play.angle],
+    }
+    own = {"sensor.position_noise": float(noise)} if side == "sim" else {"feedback_rate": 1.0 / play.period}
+    if side == "hw":
+        limits.pop("velocity_limit")  # the actuator's own is lower than most designs
+    spec = _LockstepRun(
+        side=side,
+        plant=plant,
+        design_plant=plant,
+        controller="playback",
+        controller_parameters={"file": str(play.zero_file(bag.parent / "logs" / bag.name).resolve())},
+        disturbance={"kind": "from_bag", "file": str(play.file.resolve()), "duration": float(play.duration)},
+        theta=0.0,
+        duration=play.period * math.ceil((play.duration + _REST) / play.period),
+        seed=seed,
+        method="auto",
+        plant_parameters={**limits, **own},
+        sampling=play.period,
+        prediction=play.prediction,
+    )
+    return record_run(bag, spec, domain=domain, on_wait=on_wait)
+
+
+def play_on_running_plant(
+    bag: Path,
+    play: ExcitationPlay,
+    namespace: str,
+    *,
+    arm: bool,
+    domain: int | None = None,
+    on_wait: Callable[[], None] = lambda: None,
+) -> Path:
+    """Play on a plant that runs already, in real time, and record.
+
+    Args:
+        bag: Folder of the bag.
+        play: What to play.
+        namespace: Of the plant, such as ``/hw``.
+        arm: Whether to arm a plant that is not; it is disarmed again at the end.
+        domain: ROS domain; by default ``ROS_DOMAIN_ID``, or 0.
+        on_wait: Called while waiting.
+
+    Raises:
+        BagError: The bag exists.
+        FaultError: There is no plant, somebody else commands it, it does not hang at rest, it is not armed, or it left
+            the limits; it is at zero torque when this is raised.
+    """
+    if bag.exists():
+        raise BagError(f"bag {bag} exists; expected a new folder")
+    logs = bag.parent / "logs" / bag.name
+    chosen = check_domain(domain) or 0
+    with (
+        ProcessSet(logs, ros_environment(chosen, logs)) as processes,
+        Conductor(chosen, watch=processes.check, on_wait=on_wait) as conductor,
+    ):
+        node_name = _find_plant(conductor, namespace)
+        _refuse_others(conductor, namespace)
+        plant = PlantClient(
+            conductor, namespace, node_name, controller="zero_torque", disturbance="excitation"
+        )
+        conductor.wait_for(f"a state of {namespace}", lambda: plant.sample is not None, _FIND_TIMEOUT)
+        _require_rest(conductor, plant)
+        armed = _is_armed(plant, may_arm=arm)
+        metadata = logs / "metadata.json"
+        run = {"experiment": "excitation", "namespace": namespace, "plant": node_name, "clock": "realtime"}
+        write_json(metadata, {"pendulum.run": run, "pendulum.excitation": dict(play.prediction)})
+        recorder = start_recorder(processes, bag, namespace, metadata, "mcap")
+        zero = graph.controller(
+            namespace, controller="playback", file=str(play.zero_file(logs).resolve()), period=play.period
+        )
+        signal = graph.disturbance(
+            namespace, kind="from_bag", file=str(play.file.resolve()), duration=float(play.duration)
+        )
+        for program, name in ((zero, "zero_torque"), (signal, "excitation")):
+            processes.start_node(
+                graph.NodeProgram(program.package, program.executable, namespace, name, program.parameters)
+            )
+        plant.wait_until_ready(_START_TIMEOUT)
+        wanted = {
+            f"{namespace}/{topic}" for topic in (names.JOINT_STATES, names.APPLIED_EFFORT, names.DISTURBANCE)
+        }
+        ears = RecorderClient(conductor, namespace)
+        conductor.wait_for("the recorder to hear the plant", lambda: wanted <= ears.heard(), _START_TIMEOUT)
+        try:
+            if not armed:
+                plant.arm()
+            plant.start_disturbance()
+            longest = play.duration + _START_TIMEOUT
+            conductor.wait_for("the end of the excitation", lambda: _watch(plant, play), longest)
+            conductor.spin(_REST)
+        except BaseException:
+            # Beyond its limits, or interrupted: the drive lets go now, not when the programs have ended.
+            plant.disarm_quietly()
+            raise
+        if not armed:
+            plant.disarm_quietly()
+        if processes.finish(recorder) != 0:
+            raise FaultError(recorder.last_words(1))
+    return bag
+
+
+def _find_plant(conductor: Conductor, namespace: str) -> str:
+    topic = f"{namespace}/{names.JOINT_STATES}"
+    node = conductor.node
+    try:
+        conductor.wait_for("", lambda: node.count_publishers(topic) > 0, _FIND_TIMEOUT)
+    except FaultError:
+        raise FaultError(
+            f"no plant publishes {topic} in ROS domain {conductor.domain}; expected one: start it, or use --on sim"
+        ) from None
+    conductor.spin(1.0)  # others on the graph are known a moment later
+    found = sorted({info.node_name for info in node.get_publishers_info_by_topic(topic)})
+    if len(found) != 1:
+        raise FaultError(f"{topic} is published by {', '.join(found)}; expected one plant")
+    return found[0]
+
+
+def _refuse_others(conductor: Conductor, namespace: str) -> None:
+    for name in (names.EFFORT_COMMAND, names.DISTURBANCE):
+        topic = f"{namespace}/{name}"
+        others = sorted(
+            f"{info.node_namespace.rstrip('/')}/{info.node_name}"
+            for info in conductor.node.get_publishers_info_by_topic(topic)
+        )
+        if others:
+            raise FaultError(
+                f"{topic} has a publisher, {', '.join(others)}; expected none: end it before exciting the plant"
+            )
+
+
+def _require_rest(conductor: Conductor, plant: PlantClient) -> None:
+    for _ in range(10):
+        conductor.spin(0.05)
+        sample = plant.sample
+        assert sample is not None
+        angle = wrap(sample.position)
+        # Negated, so that a state that is not a number is refused too.
+        if not (abs(angle) <= _AT_REST_ANGLE and abs(sample.velocity) <= _AT_REST_SPEED):
+            raise FaultError(
+                f"{plant.namespace} is at {angle:.3f} rad and {sample.velocity:.3f} rad/s; expected it hanging at "
+                f"rest, within {_AT_REST_ANGLE} rad and {_AT_REST_SPEED} rad/s"
+            )
+
+
+def _is_armed(plant: PlantClient, *, may_arm: bool) -> bool:
+    mode = plant.has_event("plant_mode")
+    if mode is not None and str(mode.get("mode", "")).startswith("armed"):
+        return True
+    if not may_arm:
+        told = "has not said its mode" if mode is None else f"is {mode.get('mode')}"
+        raise ParameterError(
+            f"{plant.namespace} {told}; expected it armed, or --arm to arm it for the excitation"
+        )
+    return False
+
+
+def _watch(plant: PlantClient, play: ExcitationPlay) -> bool:
+    plant.check_mode()
+    sample = plant.sample
+    assert sample is not None
+    for value, limit, unit in (
+        (wrap(sample.position), _ANGLE_ROOM * play.angle, "rad"),
+        (sample.velocity, _SPEED_ROOM * play.speed, "rad/s"),
+    ):
+        if not abs(value) <= limit:
+            raise FaultError(
+                f"{plant.namespace} is at {value:.3g} {unit}; expected at most {limit:.3g} {unit}: the plant is not "
+                "what the excitation was designed for; it is disarmed"
+            )
+    return plant.has_event("noise_end") is not None

@@ -1,0 +1,170 @@
+"""``python -m pendulum_bags excite``: design an excitation, show what it will tell, and play it."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from pendulum_msgs_py.errors import DataError
+from pendulum_msgs_py.programs.executables import EXIT_INTERRUPTED, cli_main
+
+if TYPE_CHECKING:
+    from pendulum_bags.identification.excitation import Excitation, Limits
+
+__all__ = ["app", "main"]
+
+app = typer.Typer(add_completion=False, rich_markup_mode=None)
+
+
+@app.command()
+def excite(
+    plant: Annotated[str, typer.Option(help="Prior guess: preset or plant file.")] = "dfki",
+    parameters: Annotated[
+        str, typer.Option(help="What to learn, separated by commas.")
+    ] = "inertia,damping,gravity,coulomb_friction",
+    kind: Annotated[str, typer.Option(help="multisine, chirp, prbs, or best of all.")] = "best",
+    duration: Annotated[float, typer.Option(help="[s]")] = 20.0,
+    rate: Annotated[float, typer.Option(help="Samples and torque values per second [Hz].")] = 100.0,
+    max_effort: Annotated[
+        float | None, typer.Option(help="[N m]; by default half the plant's limit.")
+    ] = None,
+    max_speed: Annotated[float, typer.Option(help="[rad/s]")] = 10.0,
+    max_angle: Annotated[float, typer.Option(help="Distance from hanging down [rad].")] = 2.5,
+    noise: Annotated[float, typer.Option(help="Standard deviation of the angle sensor [rad].")] = 1e-3,
+    seed: Annotated[int, typer.Option(help="Of the search.")] = 0,
+    trials: Annotated[int, typer.Option(help="Candidates to try, and again to improve the best.")] = 60,
+    out: Annotated[Path, typer.Option(help="CSV (time, torque) to write.")] = Path("excitation.csv"),
+    play: Annotated[bool, typer.Option(help="Play it when it is designed, and record.")] = False,
+    on: Annotated[
+        str,
+        typer.Option(
+            help="With --play: sim or emulator, started for it and run in lockstep; or running, the plant in "
+            "--namespace."
+        ),
+    ] = "sim",
+    bag: Annotated[
+        Path | None,
+        typer.Option(help="With --play: bag to write; by default the name of --out without .csv."),
+    ] = None,
+    namespace: Annotated[str, typer.Option(help="With --on running: of the plant.")] = "/sim",
+    arm: Annotated[
+        bool, typer.Option(help="With --on running: arm the plant, and disarm it at the end. It will move.")
+    ] = False,
+    domain: Annotated[int | None, typer.Option(help="ROS domain; by default ROS_DOMAIN_ID.")] = None,
+    as_json: Annotated[bool, typer.Option("--json", help="Print the result as JSON.")] = False,
+) -> None:
+    """Design the torque over time that tells most about a plant within limits, starting at rest.
+
+    A played excitation starts and ends at rest, with nobody else commanding the plant, and ends by itself.
+
+    Example: python -m pendulum_bags excite --plant dfki --max-effort 1.5 --max-angle 2 --out excitation.csv --play
+    """
+    from pendulum_bags.identification.excitation import KINDS, Limits, design_excitation
+    from pendulum_bags.identification.model import UNITS
+    from pendulum_msgs_py.plants.plant_parameters import load_plant
+
+    prior = load_plant(plant)
+    limits = Limits(0.5 * prior.effort_limit if max_effort is None else max_effort, max_speed, max_angle)
+    wanted = tuple(name.strip() for name in parameters.split(",") if name.strip())
+    design = design_excitation(
+        prior,
+        limits,
+        parameters=wanted,
+        kinds=KINDS if kind == "best" else (kind,),
+        duration=duration,
+        period=1.0 / rate,
+        noise=noise,
+        seed=seed,
+        trials=trials,
+    )
+    if on not in {"sim", "emulator", "running"}:
+        raise DataError(f"on is {on!r}; expected sim, emulator or running")
+    if max_effort is not None and max_effort > prior.effort_limit:
+        raise DataError(
+            f"max_effort is {max_effort:g} N m; expected at most {prior.effort_limit:g} N m, the plant's limit"
+        )
+    design.write(out)
+    if as_json:
+        content = {
+            "kind": design.kind,
+            "file": str(out),
+            "predicted_half_width": design.predicted,
+            "relative_half_width": design.relative,
+            "peak_effort": float(abs(design.effort).max()),
+            "peak_speed": float(abs(design.velocity).max()),
+            "peak_angle": float(abs(design.position).max()),
+        }
+        typer.echo(json.dumps(content, indent=2))
+    else:
+        from pendulum_msgs_py.programs.terminal import WholeTable, make_console
+
+        console = make_console()
+        table = WholeTable(
+            title=f"{design.kind}, {duration:g} s: predicted 95 % intervals, if the prior plant is true"
+        )
+        for heading in ("parameter", "half width", "relative", "unit"):
+            table.add_column(heading)
+        for name, width in design.predicted.items():
+            table.add_row(name, f"{width:.3g}", f"{100.0 * design.relative[name]:.2g} %", UNITS[name])
+        console.print(table)
+        console.print(
+            f"peaks: {abs(design.effort).max():.3g} N m, {abs(design.velocity).max():.3g} rad/s, "
+            f"{abs(design.position).max():.3g} rad from hanging",
+            highlight=False,
+        )
+        console.print(f"wrote {out}", highlight=False)
+    if play:
+        target = bag or out.with_suffix("")
+        _play(
+            design, limits, out, target, plant, on, namespace, arm=arm, noise=noise, seed=seed, domain=domain
+        )
+        typer.echo(f"played and recorded; next\n  python -m pendulum_bags identify {target}", err=as_json)
+
+
+def _play(
+    design: Excitation,
+    limits: Limits,
+    file: Path,
+    bag: Path,
+    plant: str,
+    on: str,
+    namespace: str,
+    *,
+    arm: bool,
+    noise: float,
+    seed: int,
+    domain: int | None,
+) -> None:
+    from pendulum_bags.experiments.excitation import ExcitationPlay, play_in_lockstep, play_on_running_plant
+
+    period = float(design.time[1] - design.time[0])
+    prediction: dict[str, Any] = {
+        "kind": design.kind,
+        "plant": plant,
+        "predicted": design.predicted,
+        "noise": noise,
+    }
+    duration = period * len(design.time)
+    play = ExcitationPlay(file, duration, period, limits.effort, limits.speed, limits.angle, prediction)
+    try:
+        if on == "running":
+            play_on_running_plant(bag, play, f"/{namespace.strip('/')}", arm=arm, domain=domain)
+        else:
+            side = "sim" if on == "sim" else "hw"
+            play_in_lockstep(bag, play, side=side, plant=plant, noise=noise, seed=seed, domain=domain)
+    except KeyboardInterrupt:
+        typer.echo("interrupted: the torque is zero, all programs have ended", err=True)
+        raise typer.Exit(EXIT_INTERRUPTED) from None
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run the command line and return the exit code."""
+    return cli_main(app, argv, name="python -m pendulum_bags excite")
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

@@ -1,0 +1,239 @@
+"""``experiment``: run an experiment from the first process to the last figure."""
+
+from __future__ import annotations
+
+import json
+import math
+import sys
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+from rich.console import Console
+
+from pendulum_bags.experiments.domain import check_domain
+from pendulum_bags.experiments.progress import PhaseProgress
+from pendulum_bags.experiments.settings import TIME_BESIDE_NOISE, NoiseSettings, RegulationSettings
+from pendulum_bags.experiments.trials_cli import add_commands as add_trial_commands
+from pendulum_bags.runs.run_folder import create_run_folder, discard_if_empty, versions, write_json
+from pendulum_bags.studies.leaderboard_cli import leaderboard
+from pendulum_bags.studies.monte_carlo_cli import monte_carlo
+from pendulum_bags.studies.region_cli import region_of_attraction
+from pendulum_bags.studies.study_cli import add_commands as add_study_commands
+from pendulum_msgs_py.errors import PendulumError
+from pendulum_msgs_py.programs.executables import EXIT_INTERRUPTED, cli_main
+from pendulum_msgs_py.programs.terminal import WholeTable, make_console
+
+__all__ = ["app", "main"]
+
+app = typer.Typer(
+    help="Run an experiment: start the nodes, conduct, record, compare, report.\n\n"
+    "Example: python -m pendulum_bags experiment thesis --seed 7",
+    no_args_is_help=True,
+    rich_markup_mode=None,
+    pretty_exceptions_enable=False,
+    add_completion=False,
+)
+
+Plant = Annotated[
+    str, typer.Option(help="Preset or plant file of the simulated plant, and of the controller's design.")
+]
+Seed = Annotated[int, typer.Option(help="Seed of the noise; one seed is one signal.", min=0)]
+Amplitude = Annotated[float, typer.Option(help="Largest torque of the noise [N m].")]
+HoldTime = Annotated[float, typer.Option(help="Time for which a noise sample is held [s].")]
+Duration = Annotated[float, typer.Option(help="Length of the noise [s].")]
+Controller = Annotated[str, typer.Option(help="Kind of controller.")]
+Q = Annotated[tuple[float, float], typer.Option(help="Diagonal of Q.")]
+R = Annotated[float, typer.Option(help="R.")]
+Storage = Annotated[str, typer.Option(help="Storage of the bags: mcap or sqlite3.")]
+Domain = Annotated[
+    int | None, typer.Option(help="ROS domain; by default ROS_DOMAIN_ID, or the first free one.")
+]
+Strategy = Annotated[str, typer.Option(help="How the actuator turns wanted torque into PWM.")]
+
+
+@app.command()
+def thesis(
+    out: Annotated[
+        Path | None, typer.Option(help="Folder of the run; it must be new. Default: bags/runs/<UTC>_thesis.")
+    ] = None,
+    plant: Plant = "thesis",
+    hardware: Annotated[str, typer.Option(help="emulator, or hebi for the real actuator.")] = "emulator",
+    strategy: Strategy = "direct_pwm",
+    seed: Seed = 1,
+    amplitude: Amplitude = 2.5,
+    hold_time: HoldTime = 0.01,
+    duration: Duration = 5.0,
+    controller: Controller = "lqr",
+    q: Q = (100.0, 0.01),
+    r: R = 0.1,
+    storage: Storage = "mcap",
+    domain: Domain = None,
+    json_output: Annotated[
+        bool, typer.Option("--json", help="Print summary.json instead of the table.")
+    ] = False,
+) -> None:
+    """Regulate the upright pendulum under noise on simulator and hardware, and compare them, as the thesis does.
+
+    Example: python -m pendulum_bags experiment thesis --out /tmp/my_run --seed 7
+    """
+    from pendulum_bags.experiments.thesis import run_thesis
+
+    settings = RegulationSettings(
+        plant=plant,
+        hardware=hardware,
+        effort_strategy=strategy,
+        controller=controller,
+        q=q,
+        r=r,
+        noise=NoiseSettings(seed, amplitude, hold_time, duration),
+        storage=storage,
+    )
+    check_domain(domain)
+    folder = create_run_folder(out, "thesis")
+    console = make_console(stderr=json_output, highlight=False)
+    started = time.monotonic()
+    try:
+        with PhaseProgress(TIME_BESIDE_NOISE + duration, console) as progress:
+            run_thesis(folder, settings, domain, progress)
+            progress.phase("comparing", 5.0)
+            summary = _analyse(folder, settings)
+    except KeyboardInterrupt:
+        kept = "nothing was recorded" if discard_if_empty(folder) else f"what was recorded is in {folder}"
+        console.print(f"interrupted: all programs have ended; {kept}")
+        raise typer.Exit(EXIT_INTERRUPTED) from None
+    except PendulumError:
+        discard_if_empty(folder)
+        raise
+    if json_output:
+        print(json.dumps(summary, indent=2))
+    else:
+        _print_summary(console, summary)
+        if more := summary["verdict"]["more_runs"]:
+            # What decides is how long the noise lasts, in many runs or in one.
+            console.print(f"(or one run with --duration {math.ceil(duration * (1 + more))})")
+    elapsed = time.monotonic() - started
+    console.print(
+        f"\nreport  {folder / 'report.html'}\nbags    {folder / 'sim'}, {folder / 'hw'}\n({elapsed:.0f} s)",
+        soft_wrap=True,
+    )
+
+
+@app.command()
+def lockstep(
+    bag: Annotated[Path, typer.Option(help="Folder of the bag; it must not exist.")],
+    side: Annotated[str, typer.Option(help="sim for the simulator, hw for the emulated hardware.")] = "sim",
+    plant: Plant = "thesis",
+    strategy: Strategy = "direct_pwm",
+    seed: Seed = 1,
+    amplitude: Amplitude = 2.5,
+    hold_time: Annotated[
+        float | None,
+        typer.Option(help="Time for which a noise sample is held [s]; by default the plant's period."),
+    ] = None,
+    duration: Duration = 5.0,
+    controller: Controller = "lqr",
+    q: Q = (100.0, 0.01),
+    r: R = 0.1,
+    storage: Storage = "mcap",
+    domain: Domain = None,
+) -> None:
+    """Record one plant under control and noise, as fast as the loop allows; two runs with one seed are identical.
+
+    Example: python -m pendulum_bags experiment lockstep --bag /tmp/seed_7 --seed 7
+    """
+    from pendulum_bags.experiments.lockstep import run_lockstep
+    from pendulum_msgs_py.errors import ParameterError
+
+    if side not in {"sim", "hw"}:
+        raise ParameterError(f"side is {side!r}; expected sim or hw")
+    settings = RegulationSettings(
+        plant=plant,
+        effort_strategy=strategy,
+        controller=controller,
+        q=q,
+        r=r,
+        noise=NoiseSettings(seed, amplitude, hold_time or (0.002 if side == "sim" else 0.01), duration),
+        storage=storage,
+    )
+    started = time.monotonic()
+    run_lockstep(bag, settings, side=side, domain=domain)
+    elapsed = time.monotonic() - started
+    print(f"{bag}: {duration:g} s simulated in {elapsed:.1f} s, starting the nodes included", file=sys.stderr)
+
+
+add_trial_commands(app)
+add_study_commands(app)
+app.command(name="monte_carlo")(monte_carlo)
+app.command(name="region_of_attraction")(region_of_attraction)
+app.command(name="leaderboard")(leaderboard)
+
+
+@app.command()
+def examples(
+    out: Annotated[Path, typer.Option(help="Folder for the recordings.")] = Path("bags", "examples"),
+) -> None:
+    """Record anew the small recordings that come with the project, in lockstep.
+
+    Example: python -m pendulum_bags experiment examples --out bags/examples
+    """
+    from pendulum_bags.experiments.examples import make_examples
+
+    for bag in make_examples(out):
+        print(bag)
+
+
+def _analyse(folder: Path, settings: RegulationSettings) -> dict[str, Any]:
+    from pendulum_bags.comparison import compare_runs
+    from pendulum_bags.report import write_report
+
+    paired = compare_runs(folder / "sim", folder / "hw", own_protocol=folder / "sim_500hz")
+    summary = {
+        "experiment": "thesis",
+        "seed": settings.noise.seed,
+        "strategy": settings.effort_strategy,
+        "versions": versions(),
+        **paired.to_json(),
+    }
+    write_json(folder / "summary.json", summary)
+    write_report(folder, summary)
+    return summary
+
+
+def _print_summary(console: Console, summary: dict[str, Any]) -> None:
+    from pendulum_bags.runs.run_data import timing_warning
+
+    table = WholeTable(title="Simulation and hardware under the same noise", title_justify="left")
+    table.add_column("")
+    plants = summary["plants"]
+    for name in plants:
+        table.add_column(name, justify="right")
+    rows = (
+        ("rate", "rate_hz", "Hz", ".1f"),
+        ("missed deadlines", "missed_deadlines", "", "d"),
+        ("std of theta", "std_theta", "rad", ".5f"),
+        ("std of theta'", "std_theta_dot", "rad/s", ".5f"),
+        ("max |u|", "max_abs_u", "N m", ".3f"),
+    )
+    for label, key, unit, form in rows:
+        cells = [_cell(plants[name].get(key), form) for name in plants]
+        table.add_row(f"{label} [{unit}]".replace("[", r"\[") if unit else label, *cells)
+    console.print(table)
+    if "sim_500hz" in plants:
+        console.print("(sim_500hz: simulation by the thesis's own protocol, with new noise every 2 ms)")
+    if warning := timing_warning(plants):
+        console.print(warning, style="bold red")
+    console.print(summary["verdict"]["sentence"])
+
+
+def _cell(value: Any, form: str) -> str:
+    if value is None:
+        return "–"
+    return format(int(value) if form == "d" else float(value), form)
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run the command line."""
+    return cli_main(app, argv, name="python -m pendulum_bags experiment")

@@ -1,0 +1,219 @@
+"""Child processes that never outlive the experiment, whatever ends it."""
+
+from __future__ import annotations
+
+import contextlib
+import ctypes
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from types import TracebackType
+
+from pendulum_msgs_py.errors import FaultError
+from pendulum_msgs_py.programs.graph import NodeProgram
+
+__all__ = ["Child", "ProcessSet", "ros_environment", "start_recorder"]
+
+_PR_SET_PDEATHSIG = 1
+_RECORDER_NICENESS = -5
+"""Priority of a recorder, where we may take it: behind those who keep deadlines, ahead of all else on the machine.
+
+Kept waiting for seconds, it finds that publishers have overwritten what it had not taken yet.
+"""
+_PATIENCE = 8.0
+"""Time that a child has to end after SIGINT before it is killed [s]."""
+
+
+@dataclass
+class Child:
+    """One running program."""
+
+    name: str
+    process: subprocess.Popen[bytes]
+    log: Path
+    ends_last: bool = False
+    ends_by_itself: bool = False
+
+    def last_words(self, lines: int = 3) -> str:
+        """Return the end of its output, for messages."""
+        with contextlib.suppress(OSError):
+            text = [line for line in self.log.read_text(errors="replace").splitlines() if line.strip()]
+            return " / ".join(text[-lines:])
+        return ""
+
+
+@dataclass
+class ProcessSet:
+    """The programs of one run; leaving the context ends them all.
+
+    Args:
+        log_folder: One log file per program goes here.
+        environment: Variables to add, such as the ROS domain.
+    """
+
+    log_folder: Path
+    environment: Mapping[str, str]
+    children: list[Child] = field(default_factory=list)
+
+    def __enter__(self) -> ProcessSet:
+        """Make the folder of the logs.
+
+        Raises:
+            FaultError: It cannot be made.
+        """
+        try:
+            self.log_folder.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise FaultError(f"log folder {self.log_folder} cannot be created: {error.strerror}") from error
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        """End every program."""
+        self.stop()
+
+    def start_node(self, program: NodeProgram, *, niceness: int = 0) -> Child:
+        """Start a node."""
+        return self.start(program.full_name.strip("/").replace("/", "_"), program.command(), niceness=niceness)
+
+    def start(
+        self,
+        name: str,
+        command: Sequence[str],
+        *,
+        ends_last: bool = False,
+        ends_by_itself: bool = False,
+        niceness: int = 0,
+        environment: Mapping[str, str] | None = None,
+    ) -> Child:
+        """Start a command in a process group of its own, so that Ctrl-C reaches it through us, in order.
+
+        Args:
+            name: For messages and the log file.
+            command: Program and arguments.
+            ends_last: Keep it until all others have ended: a recorder that hears their last words.
+            ends_by_itself: Ending with code 0 is what it is for.
+            niceness: Scheduling priority to give away, or to take where it is negative and permitted.
+            environment: Variables to add for this one.
+        """
+        parent = os.getpid()
+        libc = ctypes.CDLL(None, use_errno=True)
+
+        def prepare() -> None:
+            # SIGINT: a child of a killed experiment ends as after Ctrl-C, plants at zero torque, bags closed.
+            libc.prctl(_PR_SET_PDEATHSIG, signal.SIGINT)
+            if os.getppid() != parent:
+                os._exit(1)
+            # Taking priority is a privilege; without it the run is as good as the machine is idle.
+            with contextlib.suppress(PermissionError):
+                os.nice(niceness)
+
+        log = self.log_folder / f"{name}.log"
+        with log.open("wb") as sink:
+            process = subprocess.Popen(
+                list(command),
+                stdin=subprocess.DEVNULL,
+                stdout=sink,
+                stderr=subprocess.STDOUT,
+                env={**os.environ, **self.environment, **(environment or {})},
+                start_new_session=True,
+                preexec_fn=prepare,  # noqa: PLW1509  # prctl and nice only; no lock is taken between fork and exec
+            )
+        child = Child(name, process, log, ends_last, ends_by_itself)
+        self.children.append(child)
+        return child
+
+    def check(self) -> None:
+        """Raise a FaultError that names the first program that has ended by itself."""
+        for child in self.children:
+            code = child.process.poll()
+            if code is not None and not (child.ends_by_itself and code == 0):
+                ending = f"was ended by {signal.Signals(-code).name}" if code < 0 else f"ended with code {code}"
+                raise FaultError(f"{child.name} {ending}; its last words: {child.last_words() or 'none'}")
+
+    def finish(self, child: Child, patience: float = _PATIENCE) -> int:
+        """End one program by SIGINT, then by SIGKILL; return its exit code."""
+        self._signal(child, signal.SIGINT)
+        code = self._wait(child, patience)
+        if child in self.children:
+            self.children.remove(child)
+        return code
+
+    def wait(self, child: Child, timeout: float) -> None:
+        """Wait for a program that ends by itself.
+
+        Raises:
+            FaultError: It ends with an error, or not in time.
+        """
+        try:
+            child.process.wait(timeout)
+        except subprocess.TimeoutExpired:
+            raise FaultError(f"{child.name} still runs after {timeout:g} s: {child.last_words()}") from None
+        self.check()
+
+    def stop(self) -> None:
+        """End all programs, recorders last: plants say a last zero torque that should be on record."""
+        for wave in (False, True):
+            children = [child for child in self.children if child.ends_last is wave]
+            for child in children:
+                self._signal(child, signal.SIGINT)
+            for child in children:
+                self._wait(child, _PATIENCE)
+        self.children.clear()
+
+    @staticmethod
+    def _signal(child: Child, number: int) -> None:
+        with contextlib.suppress(ProcessLookupError):
+            if child.process.poll() is None:
+                child.process.send_signal(number)
+
+    @staticmethod
+    def _wait(child: Child, patience: float) -> int:
+        deadline = time.monotonic() + patience
+        while child.process.poll() is None:
+            if time.monotonic() > deadline:
+                with contextlib.suppress(ProcessLookupError):
+                    os.killpg(child.process.pid, signal.SIGKILL)
+                child.process.wait()
+                break
+            with contextlib.suppress(subprocess.TimeoutExpired):
+                child.process.wait(0.05)
+        return int(child.process.returncode)
+
+
+def ros_environment(domain: int, log_folder: Path) -> dict[str, str]:
+    """Return the environment of the programs of a run: its domain; the network they close or open by themselves."""
+    return {
+        "ROS_DOMAIN_ID": str(domain),
+        "ROS_LOG_DIR": str(log_folder / "ros"),
+        "PYTHONUNBUFFERED": "1",
+    }
+
+
+def start_recorder(
+    processes: ProcessSet, bag: Path, namespace: str, metadata: Path, storage: str, *, log_time: str = "receive"
+) -> Child:
+    """Start the recorder of all topics of one plant, as the node ``recorder`` in the plant's namespace.
+
+    Args:
+        processes: Where to start it.
+        bag: Folder of the bag.
+        namespace: Namespace of the plant.
+        metadata: JSON file about the run.
+        storage: ``mcap`` or ``sqlite3``.
+        log_time: ``receive``, or ``header`` for runs whose time is simulated.
+    """
+    command = [sys.executable, "-m", "pendulum_bags", "record", "-o", str(bag)]
+    command += ["--regex", f"^({namespace}/.*|/diagnostics|/clock)$", "--storage", storage]
+    command += ["--metadata", str(metadata), "--log-time", log_time]
+    if log_time == "header":
+        # What is stamped with wall time has no place in a bag whose time is simulated.
+        command += ["--exclude", "^/diagnostics$|/transition_event$"]
+    command += ["--ros-args", "-r", f"__ns:={namespace}"]
+    return processes.start(f"recorder_{bag.name}", command, ends_last=True, niceness=_RECORDER_NICENESS)

@@ -1,0 +1,201 @@
+"""One run as a value: which plant, controller, disturbance, start, seed and clock. Studies are made of these."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
+
+from pendulum_bags.runs.run_folder import git_revision, versions
+from pendulum_lqr.controller import controller_parameters
+from pendulum_lqr.disturbance import DISTURBANCE_SPECS
+from pendulum_msgs_py.contract.angles import UPRIGHT
+from pendulum_msgs_py.errors import ParameterError
+from pendulum_msgs_py.parameters import reject_unknown, validate
+from pendulum_msgs_py.plants.plant_parameters import load_plant
+from pendulum_msgs_py.programs import graph
+from pendulum_msgs_py.programs.graph import NodeProgram
+
+__all__ = ["CLOCKS", "EMULATOR_WATCHDOG", "PERIODS", "SIDES", "RunSpec"]
+
+CLOCKS = ("lockstep", "realtime")
+SIDES = ("sim", "hw")
+EMULATOR_WATCHDOG = 25
+"""Feedback periods that the bridge waits for an emulator, on a machine that does other things too."""
+_AT_REST = 1e-9
+PERIODS = {"sim": 0.002, "hw": 0.01}
+"""Period of the states of each plant, as in the thesis [s]."""
+_OF_THE_NODE = {"duration", "file"}
+"""Parameters of the disturbance that are the node's, not the signal's."""
+
+
+@dataclass(frozen=True)
+class RunSpec:
+    """One run of one plant under one controller and one disturbance.
+
+    Attributes:
+        side: ``sim`` for the simulator, ``hw`` for the emulated hardware.
+        plant: Preset or file of what runs: the simulated plant, or the emulated machine.
+        design_plant: Preset or file that the controller is designed on.
+        strategy: How the actuator turns torque into PWM (``hw``).
+        controller: Kind of controller.
+        controller_parameters: Its parameters.
+        disturbance: Parameters of the disturbance; no parameters for none.
+        theta: Initial angle [rad].
+        set_point: Angle to hold, from upright [rad].
+        duration: Length [s].
+        seed: Seed of the disturbance, and of the sensors of the emulated hardware.
+        method: Integrator of the simulator; Euler as in the thesis.
+        plant_parameters: Further parameters of the plant's node, such as sensor noise.
+        storage: Storage of the bag.
+        clock: ``lockstep`` for as fast as the nodes answer each other, ``realtime`` for the wall's time.
+    """
+
+    side: str = "sim"
+    plant: str = "thesis"
+    design_plant: str = "thesis"
+    strategy: str = "direct_pwm"
+    controller: str = "lqr"
+    controller_parameters: Mapping[str, Any] = field(default_factory=dict)
+    disturbance: Mapping[str, Any] = field(default_factory=dict)
+    theta: float = UPRIGHT
+    set_point: float = 0.0
+    duration: float = 5.0
+    seed: int = 1
+    method: str = "euler"
+    plant_parameters: Mapping[str, Any] = field(default_factory=dict)
+    storage: str = "mcap"
+    clock: str = "lockstep"
+
+    def __post_init__(self) -> None:
+        """Refuse what cannot be run before anything is started."""
+        if self.side not in SIDES:
+            raise ParameterError(f"side is {self.side!r}; expected sim or hw")
+        if self.clock not in CLOCKS:
+            raise ParameterError(f"clock is {self.clock!r}; expected lockstep or realtime")
+        off_rest = min(abs(self.theta), abs(self.theta - UPRIGHT))
+        if self.clock == "realtime" and self.side == "hw" and off_rest > _AT_REST:
+            # Nobody holds it between its start and the moment in which it is armed.
+            raise ParameterError(
+                f"start angle is {self.theta} rad; expected upright or bottom, where a machine in real time is at rest"
+            )
+        for name, value, unit in (("start angle", self.theta, "rad"), ("duration", self.duration, "s")):
+            if not math.isfinite(value):
+                raise ParameterError(f"{name} is {value} {unit}; expected a finite number")
+        if self.duration <= 0.0:
+            raise ParameterError(f"duration is {self.duration} s; expected > 0")
+        if self.side == "sim":
+            load_plant(self.plant)
+        load_plant(self.design_plant)
+        given = {**self.controller_parameters, "set_point": self.set_point}
+        validate(controller_parameters(self.controller), given, where=f"controller {self.controller}")
+        own = {spec.name for spec in DISTURBANCE_SPECS} | _OF_THE_NODE
+        reject_unknown(self.disturbance, own, where="disturbance")
+        signal = {k: v for k, v in self.disturbance.items() if k not in _OF_THE_NODE}
+        validate(DISTURBANCE_SPECS, signal, where="disturbance")
+
+    @property
+    def namespace(self) -> str:
+        """Namespace of the plant."""
+        return f"/{self.side}"
+
+    @property
+    def period(self) -> float:
+        """Time between two states [s]."""
+        return PERIODS[self.side]
+
+    @property
+    def simulated_time(self) -> bool:
+        """Whether time is that of the plant and not that of the wall."""
+        return self.clock == "lockstep"
+
+    @property
+    def steps(self) -> int:
+        """Number of steps of the plant."""
+        return round(self.duration / self.period)
+
+    def disturbance_parameters(self) -> dict[str, Any]:
+        """Return the parameters of the disturbance, the seed of the run among them."""
+        values: dict[str, Any] = {"kind": "uniform", "amplitude": 0.0, "hold_time": 0.01}
+        values.update(self.disturbance)
+        return {**values, "seed": self.seed}
+
+    def plant_program(self, listeners: int) -> NodeProgram:
+        """Return the plant; it takes its first step when the conductor has armed or resumed it, and hears it too.
+
+        Args:
+            listeners: Subscriptions to its states that it waits for.
+        """
+        loop: dict[str, graph.ParameterArgument] = {"clock": self.clock, "plant": _absolute(self.plant)}
+        if self.simulated_time:
+            loop.update(
+                lockstep_inputs=["effort_command", "disturbance"],
+                lockstep_subscribers=listeners,
+                lockstep_duration=float(self.duration),
+            )
+        elif self.side == "hw":
+            loop.update(feedback_watchdog=EMULATOR_WATCHDOG, command_lifetime=0.25)
+        loop.update(self.plant_parameters)
+        if self.side == "hw":
+            # No hardware is armed by a parameter: the conductor does it, before it becomes the last listener.
+            loop.update(initial_position=float(self.theta), seed=self.seed)
+            return graph.bridge("/hw", backend="emulator", effort_strategy=self.strategy, **loop)
+        loop.update(initial_theta=float(self.theta), armed_at_start=True, paused=True)
+        return graph.simulator("/sim", method=self.method, rate_hz=1.0 / self.period, **loop)
+
+    def controller_program(self) -> NodeProgram:
+        """Return the controller."""
+        return graph.controller(
+            self.namespace,
+            **{
+                **self.controller_parameters,
+                "controller": self.controller,
+                "plant": _absolute(self.design_plant),
+                "period": self.period,
+                "set_point": float(self.set_point),
+                "use_sim_time": self.simulated_time,
+            },
+        )
+
+    def disturbance_program(self) -> NodeProgram:
+        """Return the disturbance."""
+        return graph.disturbance(
+            self.namespace, **self.disturbance_parameters(), autostart=True, use_sim_time=self.simulated_time
+        )
+
+    def metadata(self) -> dict[str, Any]:
+        """Return what the bag says about its run."""
+        return {
+            "pendulum.run": {
+                **self.to_json(),
+                "experiment": self.clock,
+                "plant": self.plant if self.side == "sim" else "emulator",
+                "emulated_plant": self.plant if self.side == "hw" else "",
+                "namespace": self.namespace,
+                "disturbance": self.disturbance_parameters(),
+                "controller": {"kind": self.controller, **self.controller_parameters},
+                "versions": versions(),
+                "git_revision": git_revision(),
+            }
+        }
+
+    def to_json(self) -> dict[str, Any]:
+        """Return the run as JSON values; :meth:`from_json` reads them back."""
+        return asdict(self)
+
+    @classmethod
+    def from_json(cls, values: Mapping[str, Any]) -> RunSpec:
+        """Return the run that JSON values describe.
+
+        Raises:
+            ParameterError: A value is unknown or refused.
+        """
+        reject_unknown(values, cls.__dataclass_fields__, where="run")
+        return cls(**values)
+
+
+def _absolute(plant: str) -> str:
+    """Return a preset as it is, and a file so that a node started elsewhere finds it."""
+    return plant if Path(plant).suffix == "" else str(Path(plant).resolve())

@@ -1,0 +1,190 @@
+"""The thesis's experiment: upright on simulator and hardware, LQR under one and the same noise, down again."""
+
+from __future__ import annotations
+
+import sys
+import time
+from collections.abc import Sequence
+from functools import partial
+from pathlib import Path
+
+from pendulum_bags.experiments.conductor_node import Conductor, PlantClient
+from pendulum_bags.experiments.domain import reserve_domain
+from pendulum_bags.experiments.processes import Child, ProcessSet, ros_environment, start_recorder
+from pendulum_bags.experiments.progress import PhaseProgress
+from pendulum_bags.experiments.run_spec import EMULATOR_WATCHDOG
+from pendulum_bags.experiments.settings import RegulationSettings
+from pendulum_bags.runs.run_folder import write_json
+from pendulum_msgs_py.contract.angles import UPRIGHT
+from pendulum_msgs_py.contract.trajectory import thesis_ramp
+from pendulum_msgs_py.errors import FaultError
+from pendulum_msgs_py.programs import graph
+from pendulum_msgs_py.programs.graph import NodeProgram
+
+__all__ = ["run_thesis"]
+
+START_TIMEOUT = 60.0
+"""Longest time for all programs to be up; the first start on a cold machine compiles code [s]."""
+LOOP_NICENESS = -10
+"""Priority of those who keep deadlines over all else on the machine, where we may take it."""
+OWN_PROTOCOL_SEED_STEP = 1_000_000
+"""Added to the seed for the unpaired simulation, whose noise must not be that of the hardware."""
+SETTLE_TIME = 1.0
+"""Time under control before the noise starts [s]."""
+
+
+def run_thesis(folder: Path, settings: RegulationSettings, domain: int | None, progress: PhaseProgress) -> None:
+    """Run the experiment and leave the bags ``sim``, ``hw`` and ``sim_500hz`` in the folder.
+
+    Args:
+        folder: The run's folder.
+        settings: What to run.
+        domain: ROS domain, or None for any free one.
+        progress: Shows where it is.
+
+    Raises:
+        FaultError: A program ended, a plant refused or faulted; everything is at rest again when this is raised.
+    """
+    logs = folder / "logs"
+    with (
+        reserve_domain(domain) as main_domain,
+        ProcessSet(logs, ros_environment(main_domain, logs)) as processes,
+        Conductor(main_domain, watch=processes.check, on_wait=progress.refresh) as conductor,
+    ):
+        progress.phase("starting", 6.0)
+        _refuse_occupied_domain(conductor)
+        _start(processes, folder, settings)
+        sim = PlantClient(conductor, "/sim", "simulator")
+        hw = PlantClient(conductor, "/hw", "bridge")
+        plants = (sim, hw)
+        try:
+            own_protocol = _conduct(conductor, plants, settings, progress, processes, folder)
+        finally:
+            _rest(plants)
+        progress.phase("closing the bags", 2.0)
+        processes.wait(own_protocol, 60.0)
+        processes.stop()
+
+
+def _start(processes: ProcessSet, folder: Path, settings: RegulationSettings) -> None:
+    for name, plant in (("sim", settings.plant), ("hw", settings.hardware)):
+        metadata = folder / "logs" / f"{name}_metadata.json"
+        write_json(metadata, settings.metadata("thesis", plant=plant, namespace=f"/{name}"))
+        start_recorder(processes, folder / name, f"/{name}", metadata, settings.storage)
+    for program in _programs(settings):
+        processes.start_node(program, niceness=LOOP_NICENESS)
+
+
+def _programs(settings: RegulationSettings) -> list[NodeProgram]:
+    # An emulator's feedback is as punctual as this machine, which may be a busy one; a real actuator keeps the default.
+    patience: dict[str, graph.ParameterArgument] = (
+        {"feedback_watchdog": EMULATOR_WATCHDOG, "command_lifetime": 0.25} if settings.hardware == "emulator" else {}
+    )
+    return [
+        graph.simulator("/sim", plant=settings.plant, method=settings.method, clock="realtime"),
+        graph.bridge("/hw", backend=settings.hardware, effort_strategy=settings.effort_strategy, **patience),
+        *(settings.controller_program(namespace, autostart=False) for namespace in ("/sim", "/hw")),
+        *(settings.disturbance_program(namespace, autostart=False) for namespace in ("/sim", "/hw")),
+    ]
+
+
+def _conduct(
+    conductor: Conductor,
+    plants: Sequence[PlantClient],
+    settings: RegulationSettings,
+    progress: PhaseProgress,
+    processes: ProcessSet,
+    folder: Path,
+) -> Child:
+    noise = settings.noise
+    for plant in plants:
+        plant.wait_until_ready(START_TIMEOUT)
+    for plant in plants:
+        plant.configure_controller()
+        plant.arm()
+
+    # The ramp leaves the machine idle: the thesis's own simulation runs meanwhile, in a domain of its own.
+    own_protocol = _start_own_protocol(processes, folder, settings)
+    _wait_for_goal(conductor, plants, _start_move(conductor, plants, UPRIGHT, "ramp_up", progress))
+
+    progress.phase("regulation", SETTLE_TIME)
+    for plant in plants:
+        plant.mark("regulation")
+        plant.switch_controller(on=True)
+    conductor.spin(SETTLE_TIME)
+
+    progress.phase("noise", noise.duration)
+    started = [plant.start_disturbance() for plant in plants]
+    conductor.wait_for("the disturbances to start", lambda: all(future.done() for future in started), 5.0)
+    for plant in plants:
+        conductor.wait_for(
+            f"the end of the noise on {plant.namespace}",
+            partial(_noise_ended, plant),
+            noise.duration + 15.0,
+        )
+
+    durations = _start_move(conductor, plants, 0.0, "ramp_down", progress)
+    # Before the ramp ends: a controller that is still awake then would be handed a pendulum half a turn from upright.
+    for plant in plants:
+        plant.switch_controller(on=False)
+    _wait_for_goal(conductor, plants, durations)
+    for plant in plants:
+        plant.disarm()
+        plant.mark("done")
+    conductor.spin(0.2)
+    return own_protocol
+
+
+def _noise_ended(plant: PlantClient) -> bool:
+    plant.check_mode()
+    return plant.has_event("noise_end") is not None
+
+
+def _start_own_protocol(processes: ProcessSet, folder: Path, settings: RegulationSettings) -> Child:
+    """Start the simulation as the thesis ran it: noise of its own, a new sample every 2 ms."""
+    noise = settings.noise
+    command = [sys.executable, "-m", "pendulum_bags", "experiment", "lockstep", "--bag", str(folder / "sim_500hz")]
+    command += ["--plant", settings.plant, "--controller", settings.controller, "--r", repr(settings.r)]
+    command += ["--q", *map(repr, settings.q), "--seed", str(noise.seed + OWN_PROTOCOL_SEED_STEP)]
+    command += ["--amplitude", repr(noise.amplitude), "--hold-time", "0.002", "--duration", repr(noise.duration)]
+    command += ["--storage", settings.storage]
+    return processes.start("sim_500hz", command, ends_by_itself=True, niceness=10, environment={"ROS_DOMAIN_ID": ""})
+
+
+def _start_move(
+    conductor: Conductor, plants: Sequence[PlantClient], goal: float, phase: str, progress: PhaseProgress
+) -> list[float]:
+    """Start the thesis's ramp on all plants at once; return how long each takes [s]."""
+    ramps = []
+    for plant in plants:
+        assert plant.sample is not None
+        ramps.append(thesis_ramp(plant.sample.position, goal))
+    progress.phase(phase.replace("_", " "), max(ramp.duration for ramp in ramps))
+    for plant, ramp in zip(plants, ramps, strict=True):
+        plant.follow(ramp, phase, goal=goal)
+    for plant in plants:
+        conductor.wait_for(f"{plant.namespace} to follow the {phase.replace('_', ' ')}", plant.is_following, 5.0)
+    return [ramp.duration for ramp in ramps]
+
+
+def _wait_for_goal(conductor: Conductor, plants: Sequence[PlantClient], durations: Sequence[float]) -> None:
+    for plant, duration in zip(plants, durations, strict=True):
+        conductor.wait_for(f"{plant.namespace} to end its move", plant.trajectory_finished, duration + 15.0)
+
+
+def _rest(plants: Sequence[PlantClient]) -> None:
+    """Disarm on every way out; a plant that no longer answers goes to rest by its own rules."""
+    for plant in plants:
+        plant.disarm_quietly()
+
+
+def _refuse_occupied_domain(conductor: Conductor) -> None:
+    deadline = time.monotonic() + 0.5
+    while time.monotonic() < deadline:
+        conductor.spin(0.1)
+    for name, namespace in conductor.node.get_node_names_and_namespaces():
+        if namespace in {"/sim", "/hw"}:
+            raise FaultError(
+                f"ROS domain {conductor.domain} is in use: {namespace}/{name} is already there; "
+                "choose another with --domain"
+            )

@@ -1,0 +1,269 @@
+"""The thesis's two identification experiments: six trials by hand on a table, three staircases against gravity."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+from pendulum_bags.experiments.conductor_node import Conductor, PlantClient
+from pendulum_bags.experiments.domain import reserve_domain
+from pendulum_bags.experiments.lockstep import finish_recording, wait_until_all_hear_each_other
+from pendulum_bags.experiments.processes import ProcessSet, ros_environment, start_recorder
+from pendulum_bags.experiments.progress import PhaseProgress
+from pendulum_bags.experiments.run_spec import EMULATOR_WATCHDOG
+from pendulum_bags.experiments.settings import HARDWARE
+from pendulum_bags.experiments.thesis import LOOP_NICENESS, START_TIMEOUT
+from pendulum_bags.runs.run_folder import git_revision, versions, write_json
+from pendulum_msgs_py.contract import names
+from pendulum_msgs_py.contract.trajectory import RAMP_INCREMENT, RAMP_PERIOD
+from pendulum_msgs_py.errors import FaultError, ParameterError
+from pendulum_msgs_py.programs import graph
+
+__all__ = ["GRAVITY", "INERTIA_DAMPING", "TrialKind", "TrialSettings", "run_trials"]
+
+_SLOWEST = 3.0
+"""Slowest pace at which a trial still counts as alive, wall time per simulated time."""
+_LONGEST_BY_HAND = 600.0
+"""Time after which a trial by hand that nobody ends is given up [s]."""
+_MARGIN = 1.0
+"""Time beyond the steps of the staircase, whose ramps end on whole increments [s]."""
+
+
+@dataclass(frozen=True)
+class TrialKind:
+    """One of the two experiments.
+
+    Attributes:
+        name: As in ``experiment NAME`` and ``identify --experiment NAME``.
+        procedure: What the bridge's procedure plays.
+        trials: How many, as in the thesis.
+        flat: Whether the pendulum lies on a table, without gravity.
+        inputs: Inputs of the plant that answer each state.
+        longest: Time that the simulated hand takes at most [s]; 0 where the settings tell.
+    """
+
+    name: str
+    procedure: str
+    trials: int
+    flat: bool
+    inputs: tuple[str, ...]
+    longest: float = 0.0
+
+
+INERTIA_DAMPING = TrialKind("inertia_damping", "hand", 6, True, (names.EFFORT_COMMAND, names.PUSH), 22.0)
+GRAVITY = TrialKind("gravity", "staircase", 3, False, (names.EFFORT_COMMAND,))
+
+
+@dataclass(frozen=True)
+class TrialSettings:
+    """What to run.
+
+    Attributes:
+        kind: Which experiment.
+        trials: Number of trials.
+        hardware: ``emulator`` or ``hebi``.
+        plant: Plant of the emulator: preset or file with a drivetrain.
+        realtime: Keep the wall's time on the emulator too; a real actuator always does.
+        seed: Seed of the simulated hand, and of sensor noise.
+        step: Height of a step of the staircase [deg].
+        top: Highest angle of the staircase [deg].
+        hold: Time at rest on each step [s].
+        storage: Storage of the bags.
+    """
+
+    kind: TrialKind
+    trials: int
+    hardware: str = "emulator"
+    plant: str = "thesis"
+    realtime: bool = False
+    seed: int = 1
+    step: float = 10.0
+    top: float = 90.0
+    hold: float = 2.0
+    storage: str = "mcap"
+
+    def __post_init__(self) -> None:
+        """Refuse what cannot be run before anything is started."""
+        if self.hardware not in HARDWARE:
+            raise ParameterError(f"hardware is {self.hardware!r}; expected one of {', '.join(HARDWARE)}")
+        if self.trials < 1:
+            raise ParameterError(f"number of trials is {self.trials}; expected >= 1")
+        if self.top / self.step != round(self.top / self.step):
+            raise ParameterError(f"staircase top is {self.top:g} deg; expected a multiple of step, {self.step:g} deg")
+
+    @property
+    def lockstep(self) -> bool:
+        """Whether time is simulated."""
+        return self.hardware == "emulator" and not self.realtime
+
+    @property
+    def by_person(self) -> bool:
+        """Whether a person turns the pendulum."""
+        return self.hardware == "hebi" and self.kind.procedure == "hand"
+
+    @property
+    def expected_duration(self) -> float:
+        """Length of one trial, at most [s]."""
+        if self.kind.procedure == "hand":
+            return self.kind.longest
+        ramp = math.radians(self.step) / RAMP_INCREMENT * RAMP_PERIOD
+        return _MARGIN + 4.0 * self.top / self.step * (self.hold + ramp)
+
+    def plant_program(self, trial: int) -> graph.NodeProgram:
+        """Return the bridge."""
+        parameters: dict[str, graph.ParameterArgument] = {"plant": self.plant, "effort_strategy": "direct_pwm"}
+        if self.hardware == "emulator":
+            # Sensor noise differs from trial to trial, as it would.
+            parameters.update(flat=self.kind.flat, seed=1000 * self.seed + trial)
+            if self.lockstep:
+                # It ends by simulated time, too: when the conductor sees the end depends on how busy the machine is.
+                parameters.update(
+                    clock="lockstep",
+                    lockstep_inputs=list(self.kind.inputs),
+                    lockstep_subscribers=_LISTENERS + 1,
+                    lockstep_duration=self.expected_duration,
+                )
+            else:
+                parameters.update(feedback_watchdog=EMULATOR_WATCHDOG, command_lifetime=0.25)
+        return graph.bridge("/hw", backend=self.hardware, **parameters)
+
+    def procedure_program(self, trial: int) -> graph.NodeProgram:
+        """Return the node that plays a trial."""
+        parameters: dict[str, graph.ParameterArgument] = {
+            "procedure": self.kind.procedure,
+            "trial": trial,
+            "seed": self.seed,
+            "autostart": self.lockstep,
+            "person": self.by_person,
+            "use_sim_time": self.lockstep,
+            "step": float(self.step),
+            "top": float(self.top),
+            "hold": float(self.hold),
+        }
+        return graph.NodeProgram("pendulum_hw_bridge", "procedure", "/hw", parameters=parameters)
+
+
+_LISTENERS = 2
+"""Those who hear the bridge's states beside the conductor: procedure and recorder."""
+
+
+def run_trials(
+    folder: Path,
+    settings: TrialSettings,
+    domain: int | None,
+    progress: PhaseProgress,
+    ask: Callable[[str], None] = lambda _: None,
+) -> list[Path]:
+    """Run all trials, one bag each, and return the bags.
+
+    Args:
+        folder: Folder of the run; bags are ``trial_1``, ``trial_2``, ...
+        settings: What to run.
+        domain: ROS domain, or None for any free one.
+        progress: Shows where it is.
+        ask: Shows a sentence to the person at the pendulum and returns when they have pressed Enter.
+
+    Raises:
+        FaultError: A program ended, or the plant refused or faulted; the drive is at rest when this is raised.
+    """
+    bags = []
+    with reserve_domain(domain) as reserved:
+        for trial in range(1, settings.trials + 1):
+            expected = 4.0 + settings.expected_duration / (10.0 if settings.lockstep else 1.0)
+            progress.phase(f"trial {trial} of {settings.trials}", expected)
+            bags.append(_run_trial(folder, settings, trial, reserved, progress, ask))
+    return bags
+
+
+def _run_trial(
+    folder: Path,
+    settings: TrialSettings,
+    trial: int,
+    domain: int,
+    progress: PhaseProgress,
+    ask: Callable[[str], None],
+) -> Path:
+    bag = folder / f"trial_{trial}"
+    logs = folder / "logs" / bag.name
+    with (
+        ProcessSet(logs, ros_environment(domain, logs)) as processes,
+        Conductor(domain, watch=processes.check, on_wait=progress.refresh) as conductor,
+    ):
+        metadata = logs / "metadata.json"
+        write_json(metadata, _metadata(settings, trial))
+        log_time = "header" if settings.lockstep else "receive"
+        recorder = start_recorder(processes, bag, "/hw", metadata, settings.storage, log_time=log_time)
+        processes.start_node(settings.procedure_program(trial), niceness=LOOP_NICENESS)
+        processes.start_node(settings.plant_program(trial), niceness=LOOP_NICENESS)
+        plant = PlantClient(conductor, "/hw", "bridge", watch=not settings.lockstep)
+        try:
+            wait_until_all_hear_each_other(conductor, "/hw", _topics(settings), clock=settings.lockstep)
+            if settings.by_person:
+                ask(f"Trial {trial} of {settings.trials}: let the pendulum lie still at 0, then press Enter to begin.")
+            plant.arm()
+            if settings.lockstep:
+                plant.watch()
+            else:
+                plant.call("procedure/start")
+            if settings.by_person:
+                ask("Turn it slowly to half a turn and back, in 10 to 20 s; then press Enter.")
+                plant.call("procedure/finish")
+            longest = _LONGEST_BY_HAND if settings.by_person else START_TIMEOUT + _SLOWEST * settings.expected_duration
+            conductor.wait_for(
+                f"the end of trial {trial}", lambda: _has_ended(plant, lockstep=settings.lockstep), longest
+            )
+            if settings.lockstep:
+                finished = plant.has_event("lockstep_finished")
+                assert finished is not None
+                finish_recording(conductor, processes, recorder, plant, 1 + int(finished["steps"]))
+        finally:
+            plant.disarm_quietly()
+        conductor.spin(0.2)
+    return bag
+
+
+def _has_ended(plant: PlantClient, *, lockstep: bool) -> bool:
+    plant.check_mode()
+    if failed := plant.has_event("trial_failed"):
+        raise FaultError(f"{plant.namespace}: {failed.get('reason')}")
+    ended = plant.has_event("trial_end") is not None
+    return ended and (not lockstep or plant.has_event("lockstep_finished") is not None)
+
+
+def _topics(settings: TrialSettings) -> dict[str, int]:
+    """Return how many listen to each topic of a trial, the conductor not counted."""
+    topics = {
+        names.JOINT_STATES: _LISTENERS,
+        names.EFFORT_COMMAND: 2,
+        names.APPLIED_EFFORT: 1,
+        names.EVENTS: 3,
+        "actuator/feedback": 1,
+    }
+    if settings.kind.procedure == "hand":
+        # The real bridge has no such input: nobody but a person pushes a real pendulum.
+        topics[names.PUSH] = 0 if settings.by_person else 2
+    else:
+        topics[names.JOINT_TRAJECTORY] = 2
+    return topics
+
+
+def _metadata(settings: TrialSettings, trial: int) -> dict[str, object]:
+    kind = settings.kind
+    return {
+        "pendulum.run": {
+            "experiment": kind.name,
+            "trial": trial,
+            "trials": settings.trials,
+            "plant": settings.hardware,
+            "emulated_plant": settings.plant if settings.hardware == "emulator" else "",
+            "strategy": "direct_pwm" if kind.procedure == "hand" else "strategy 3 of the firmware",
+            "seed": settings.seed,
+            "flat": kind.flat,
+            "clock": "lockstep" if settings.lockstep else "realtime",
+            "namespace": "/hw",
+            "versions": versions(),
+            "git_revision": git_revision(),
+        }
+    }

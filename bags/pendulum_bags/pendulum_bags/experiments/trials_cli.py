@@ -1,0 +1,132 @@
+"""``experiment inertia_damping`` and ``experiment gravity``: from the first process to the thesis's coefficients."""
+
+from __future__ import annotations
+
+import time
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+from rich.console import Console
+
+from pendulum_bags.experiments.domain import check_domain
+from pendulum_bags.experiments.progress import PhaseProgress
+from pendulum_bags.runs.run_folder import create_run_folder, discard_if_empty
+from pendulum_msgs_py.errors import PendulumError
+from pendulum_msgs_py.programs.executables import EXIT_INTERRUPTED
+from pendulum_msgs_py.programs.terminal import make_console
+
+if TYPE_CHECKING:
+    from pendulum_bags.experiments.trials import TrialSettings
+
+__all__ = ["add_commands"]
+
+Out = Annotated[
+    Path | None, typer.Option(help="Folder of the run; it must be new. Default: bags/runs/<UTC>_<experiment>.")
+]
+Hardware = Annotated[str, typer.Option(help="emulator, or hebi for the real actuator.")]
+Plant = Annotated[str, typer.Option(help="What the emulator is: preset or plant file with a drivetrain.")]
+Realtime = Annotated[bool, typer.Option(help="Keep the wall's time on the emulator too, instead of lockstep.")]
+Seed = Annotated[int, typer.Option(help="Seed of the emulator's sensor noise and of the simulated hand.", min=0)]
+Trials = Annotated[int, typer.Option(help="Number of trials, one bag each.", min=1, max=100)]
+Storage = Annotated[str, typer.Option(help="Storage of the bags: mcap or sqlite3.")]
+Domain = Annotated[int | None, typer.Option(help="ROS domain; by default ROS_DOMAIN_ID, or the first free one.")]
+Json = Annotated[bool, typer.Option("--json", help="Print the regressions as JSON instead of tables.")]
+
+
+def add_commands(app: typer.Typer) -> None:
+    """Add the two experiments to the command line of ``experiment``."""
+    app.command(name="inertia_damping")(inertia_damping)
+    app.command(name="gravity")(gravity)
+
+
+def inertia_damping(
+    out: Out = None,
+    hardware: Hardware = "emulator",
+    plant: Plant = "thesis",
+    realtime: Realtime = False,
+    seed: Seed = 1,
+    trials: Trials = 6,
+    storage: Storage = "mcap",
+    domain: Domain = None,
+    json_output: Json = False,
+) -> None:
+    """Turn the flat pendulum by hand at zero PWM, six times, and regress effort on velocity and acceleration.
+
+    With --hardware hebi, a person turns it, told when by this terminal; on the emulator a simulated hand does.
+
+    Example: python -m pendulum_bags experiment inertia_damping --out /tmp/hand
+    """
+    from pendulum_bags.experiments.trials import INERTIA_DAMPING, TrialSettings
+
+    settings = TrialSettings(INERTIA_DAMPING, trials, hardware, plant, realtime, seed, storage=storage)
+    _run(settings, out, domain, json_output)
+
+
+def gravity(
+    out: Out = None,
+    hardware: Hardware = "emulator",
+    plant: Plant = "thesis",
+    realtime: Realtime = False,
+    seed: Seed = 1,
+    trials: Trials = 3,
+    step: Annotated[float, typer.Option(help="Height of a step [deg].", min=1.0, max=90.0)] = 10.0,
+    top: Annotated[float, typer.Option(help="Highest angle, a multiple of the step [deg].", min=1.0)] = 90.0,
+    hold: Annotated[float, typer.Option(help="Time at rest on each step [s].", min=0.5, max=60.0)] = 2.0,
+    storage: Storage = "mcap",
+    domain: Domain = None,
+    json_output: Json = False,
+) -> None:
+    """Climb a staircase against gravity, 0 to 90 degrees, to -90 and back, and regress effort on sin(theta).
+
+    Example: python -m pendulum_bags experiment gravity --out /tmp/stairs
+    """
+    from pendulum_bags.experiments.trials import GRAVITY, TrialSettings
+
+    settings = TrialSettings(GRAVITY, trials, hardware, plant, realtime, seed, step, top, hold, storage)
+    _run(settings, out, domain, json_output)
+
+
+def _run(settings: TrialSettings, out: Path | None, domain: int | None, json_output: bool) -> None:
+    from pendulum_bags.experiments.trials import run_trials
+    from pendulum_bags.identification import identify_cli
+
+    check_domain(domain)
+    name = settings.kind.name
+    folder = create_run_folder(out, name)
+    console = make_console(stderr=json_output, highlight=False)
+    started = time.monotonic()
+    total = settings.trials * (4.0 + settings.expected_duration / (10.0 if settings.lockstep else 1.0))
+    try:
+        with PhaseProgress(total, console) as progress:
+            bags = run_trials(folder, settings, domain, progress, ask=lambda sentence: _ask(console, sentence))
+    except KeyboardInterrupt:
+        kept = "nothing was recorded" if discard_if_empty(folder) else f"what was recorded until then is in {folder}"
+        console.print(f"interrupted: the drive is off, all programs have ended; {kept}")
+        raise typer.Exit(EXIT_INTERRUPTED) from None
+    except PendulumError:
+        discard_if_empty(folder)
+        raise
+    elapsed = time.monotonic() - started
+    arguments = ["--method", "thesis", "--experiment", name, "--out", str(folder / "identified.json")]
+    code = identify_cli.main([*map(str, bags), *arguments, *(["--json"] if json_output else [])])
+    console.print(
+        f"\nbags    {folder / 'trial_1'} to {folder / f'trial_{len(bags)}'} ({elapsed:.0f} s)\n"
+        f"again   python -m pendulum_bags identify {folder}/trial_* --method thesis --experiment {name}",
+        soft_wrap=True,
+    )
+    if code:
+        raise typer.Exit(code)
+
+
+def _ask(console: Console, sentence: str) -> None:
+    """Show a sentence and wait for Enter; no Enter can come where nobody sits at a terminal.
+
+    Raises:
+        PendulumError: The input has ended.
+    """
+    console.print(sentence)
+    try:
+        input()
+    except EOFError:
+        raise PendulumError("a person is needed for this experiment; expected a terminal to press Enter on") from None

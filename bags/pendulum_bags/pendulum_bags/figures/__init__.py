@@ -1,0 +1,1 @@
+"""Figures, each drawn once: to a file and to a page."""

@@ -1,0 +1,55 @@
+"""What a report is made from."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any
+
+from pendulum_bags.comparison import Comparison
+from pendulum_msgs_py.errors import ParameterError
+from pendulum_msgs_py.plants.plant_parameters import PlantParameters, load_plant
+
+if TYPE_CHECKING:
+    from pendulum_bags.figures.trial_figures import TrialSet
+    from pendulum_bags.replay.input_replay import InputReplay
+
+__all__ = ["ReportData"]
+
+
+@dataclass(frozen=True)
+class ReportData:
+    """Everything that figures and tables draw on.
+
+    Args:
+        comparison: The comparison.
+        summary: Content of ``summary.json``.
+        replays: Real recordings driven through our plant.
+        names: Names of the run folders.
+        trials: The thesis's identification experiments, where they were recorded.
+    """
+
+    comparison: Comparison
+    summary: Mapping[str, Any]
+    replays: Sequence[InputReplay] = ()
+    names: Sequence[str] = ()
+    trials: Sequence[TrialSet] = ()
+    plant: PlantParameters | None = field(init=False)
+
+    def __post_init__(self) -> None:
+        """Find the plant that the run was designed on."""
+        object.__setattr__(self, "plant", self._find_plant())
+
+    @property
+    def run(self) -> Mapping[str, Any]:
+        """Return what the simulation's bag says about its run."""
+        told = self.comparison.pairs[0].simulation.metadata.get("pendulum.run")
+        return told if isinstance(told, Mapping) else {}
+
+    def _find_plant(self) -> PlantParameters | None:
+        name = self.run.get("plant", "thesis")
+        try:
+            return load_plant(str(name))
+        except ParameterError:
+            # The file that the run was made with is gone: figures of the model are left out, and say so.
+            return None

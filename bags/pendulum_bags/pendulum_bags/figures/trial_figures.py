@@ -1,0 +1,240 @@
+"""Figures and tables of the thesis's two identification experiments, where their trials were recorded."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from pendulum_bags.figures.figure import Figure, Panel, Trace, thinned
+from pendulum_bags.figures.numbers import quantity
+from pendulum_bags.identification.thesis import (
+    ThesisResult,
+    fit_gravity,
+    fit_inertia_damping,
+    static_holds,
+    trial_part,
+)
+from pendulum_bags.runs.datasets import Recording, read_recording
+from pendulum_msgs_py.errors import DataError
+
+if TYPE_CHECKING:
+    from pendulum_bags.figures.data import ReportData
+
+__all__ = [
+    "TrialSet",
+    "dynamic_phase",
+    "effort_over_acceleration",
+    "effort_over_sine",
+    "effort_over_time",
+    "effort_over_velocity",
+    "read_trials",
+    "static_phase",
+]
+
+INERTIA = "Experiment 1: inertia and damping"
+GRAVITY = "Experiment 2: gravity"
+UNITS = {"inertia": "kg m²", "damping": "N m s/rad", "gravity": "N m"}
+ROLES = 6
+"""Looks there are for trials; a seventh looks like the first."""
+
+
+@dataclass(frozen=True)
+class TrialSet:
+    """The trials of one experiment and their regression.
+
+    Args:
+        result: Regressions and average.
+        recordings: One for each trial, cut to the trial.
+    """
+
+    result: ThesisResult
+    recordings: Sequence[Recording]
+
+
+def read_trials(folder: str | os.PathLike[str]) -> TrialSet:
+    """Read the bags ``trial_1``, ``trial_2``, ... of a folder and regress them as the thesis does.
+
+    Staircases are told from motions by hand by their holds.
+
+    Raises:
+        BagError: A bag cannot be read.
+        DataError: There is no trial, or one lacks what the regression needs.
+    """
+    bags = sorted(Path(folder).glob("trial_*"), key=lambda bag: (len(bag.name), bag.name))
+    if not bags:
+        raise DataError(f"{folder} has no bags trial_1, trial_2, ...; expected the trials of one experiment")
+    recordings = [_cut(read_recording(bag, effort="measured")) for bag in bags]
+    staircase = all(len(static_holds(recording)) >= 4 for recording in recordings)
+    result = (fit_gravity if staircase else fit_inertia_damping)(recordings)
+    return TrialSet(result, recordings)
+
+
+def _cut(recording: Recording) -> Recording:
+    """Return the trial alone, with the measured effort at the stamps of the states, where it was measured."""
+    part = trial_part(recording)
+    return replace(part, input=np.interp(part.time, part.input_stamps, part.input), input_time=None)
+
+
+def _of_kind(data: ReportData, kind: str) -> TrialSet | None:
+    return next((one for one in data.trials if one.result.kind == kind), None)
+
+
+def _found(trials: TrialSet) -> str:
+    result = trials.result
+    words = [
+        f"{name} {quantity(value, UNITS[name], 4)} ({quantity(result.intervals[name][0])} to "
+        f"{quantity(result.intervals[name][1])})"
+        for name, value in result.average.items()
+    ]
+    return f"{' and '.join(words)}, mean of {len(result.trials)} trials with 95 % interval"
+
+
+def _cloud(trials: TrialSet, column: int, label: str, name: str, title: str) -> Figure:
+    panels = []
+    for number, trial in enumerate(trials.result.trials, start=1):
+        x = trial.regressors[:, column]
+        step = max(1, x.size // 600)
+        ends = np.array([x.min(), x.max()])
+        fit = trial.values[column] * ends
+        points = Trace(x[::step], trial.response[::step], "measured", "hw", "points")
+        panels.append(
+            Panel(
+                label,
+                "effort [N m]",
+                [points, Trace(ends, fit, "its part of the fit", "fit")],
+                title=f"Trial {number}",
+            )
+        )
+    return Figure(
+        name,
+        title,
+        f"The regression gives {_found(trials)}.",
+        panels,
+        stacked=False,
+        section=INERTIA,
+        panel_height=180,
+    )
+
+
+def effort_over_velocity(data: ReportData) -> Figure | str:
+    """Return effort over velocity, trial by trial."""
+    trials = _of_kind(data, "inertia_damping")
+    if trials is None:
+        return "needs the trials of experiment 1"
+    return _cloud(trials, 0, "θ′ [rad/s]", "effort_over_velocity", "Effort over velocity")
+
+
+def effort_over_acceleration(data: ReportData) -> Figure | str:
+    """Return effort over acceleration, trial by trial."""
+    trials = _of_kind(data, "inertia_damping")
+    if trials is None:
+        return "needs the trials of experiment 1"
+    return _cloud(trials, 1, "θ″ [rad/s²]", "effort_over_acceleration", "Effort over acceleration")
+
+
+def effort_over_time(data: ReportData) -> Figure | str:
+    """Return measured and fitted effort over time, trial by trial."""
+    trials = _of_kind(data, "inertia_damping")
+    if trials is None:
+        return "needs the trials of experiment 1"
+    panels = []
+    for number, (trial, recording) in enumerate(
+        zip(trials.result.trials, trials.recordings, strict=True), start=1
+    ):
+        t = recording.time - recording.time[0]
+        traces = [
+            Trace(*thinned(t, trial.response, 1000), "measured", "hw"),
+            Trace(*thinned(t, trial.regressors @ trial.values, 1000), "fitted", "fit"),
+        ]
+        panels.append(Panel("time [s]", "effort [N m]", traces, title=f"Trial {number}"))
+    lowest = min(trial.r_squared for trial in trials.result.trials)
+    sentence = f"The fit explains at least {100.0 * lowest:.2f} % of the squared effort of each trial."
+    return Figure(
+        "trials", "Trials by hand", sentence, panels, stacked=False, section=INERTIA, panel_height=180
+    )
+
+
+def dynamic_phase(data: ReportData) -> Figure | str:
+    """Return position, velocity and effort of the staircases over time."""
+    trials = _of_kind(data, "gravity")
+    if trials is None:
+        return "needs the trials of experiment 2"
+    rows: dict[str, list[Trace]] = {"θ [rad]": [], "θ′ [rad/s]": [], "effort [N m]": []}
+    for i, recording in enumerate(trials.recordings):
+        start, label, role = float(recording.time[0]), f"trial {i + 1}", f"trial {i % ROLES + 1}"
+        rows["θ [rad]"].append(Trace(recording.time - start, recording.position, label, role))
+        if recording.velocity is not None:
+            rows["θ′ [rad/s]"].append(Trace(recording.time - start, recording.velocity, label, role))
+        rows["effort [N m]"].append(Trace(recording.input_stamps - start, recording.input, label, role))
+    panels = [
+        Panel("time since the trial began [s]", label, traces) for label, traces in rows.items() if traces
+    ]
+    reach = [
+        float(np.degrees(value))
+        for one in trials.recordings
+        for value in (one.position.min(), one.position.max())
+    ]
+    sentence = f"The staircases reach from {min(reach):.1f}° to {max(reach):.1f}°, up and back on both sides."
+    return Figure("dynamic_phase", "Dynamic phase", sentence, panels, section=GRAVITY, panel_height=150)
+
+
+def static_phase(data: ReportData) -> Figure | str:
+    """Return the effort of the holds at 10, 90 and -10 degrees, all trials, both ways."""
+    trials = _of_kind(data, "gravity")
+    if trials is None:
+        return "needs the trials of experiment 2"
+    panels = []
+    for degrees in (10.0, 90.0, -10.0):
+        traces = []
+        for i, recording in enumerate(trials.recordings):
+            holds = static_holds(recording)
+            nearest = sorted(holds, key=lambda hold: abs(np.degrees(hold.position) - degrees))[:2]
+            for hold in (hold for hold in nearest if abs(np.degrees(hold.position) - degrees) < 5.0):
+                inside = (recording.input_stamps >= hold.start) & (recording.input_stamps <= hold.stop)
+                t = recording.input_stamps[inside] - hold.start
+                role = f"trial {i % ROLES + 1}" if hold.upward else "reference"
+                traces.append(
+                    Trace(
+                        t,
+                        recording.input[inside],
+                        f"trial {i + 1}, going up" if hold.upward else "coming down",
+                        role,
+                    )
+                )
+        if traces:
+            panels.append(
+                Panel("time in the hold [s]", "effort [N m]", traces, title=f"Hold at {degrees:.0f}°")
+            )
+    if not panels:
+        return "the staircases have no hold at 10, 90 or −10 degrees"
+    hysteresis = trials.result.hysteresis
+    sentence = (
+        f"Going up takes {quantity(hysteresis, 'N m')} more effort than coming down, on average: hysteresis."
+    )
+    return Figure(
+        "static_phase", "Static phase", sentence, panels, stacked=False, section=GRAVITY, panel_height=200
+    )
+
+
+def effort_over_sine(data: ReportData) -> Figure | str:
+    """Return the mean effort of each hold over the sine of its angle, with the fit."""
+    trials = _of_kind(data, "gravity")
+    if trials is None:
+        return "needs the trials of experiment 2"
+    traces = [
+        Trace(trial.regressors[:, 0], trial.response, f"trial {i + 1}", f"trial {i % ROLES + 1}", "points")
+        for i, trial in enumerate(trials.result.trials)
+    ]
+    ends = np.array([-1.0, 1.0])
+    gravity = trials.result.sign * trials.result.average["gravity"]
+    traces.append(Trace(ends, gravity * ends, "mean of the fits", "fit"))
+    panel = Panel("sin θ [−]", "mean effort of a hold [N m]", traces)
+    sentence = f"The regression gives {_found(trials)}."
+    return Figure(
+        "effort_over_sine", "Effort over sin θ, static", sentence, [panel], section=GRAVITY, panel_height=280
+    )

@@ -1,0 +1,213 @@
+"""``python -m pendulum_bags identify``: parameters from recordings."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from pendulum_msgs_py.errors import DataError
+from pendulum_msgs_py.programs.executables import cli_main
+
+if TYPE_CHECKING:
+    from pendulum_bags.identification.result import IdentificationResult
+    from pendulum_bags.identification.thesis import ThesisResult
+    from pendulum_bags.runs.datasets import Recording
+
+__all__ = ["app", "main"]
+
+app = typer.Typer(add_completion=False, rich_markup_mode=None)
+
+
+@app.command()
+def identify(
+    data: Annotated[
+        list[Path], typer.Argument(help="Bags, CSV files or friction-study JSON logs of one pendulum.")
+    ],
+    method: Annotated[
+        str, typer.Option(help="output_error, or thesis (two linear regressions).")
+    ] = "output_error",
+    mapping: Annotated[
+        str | None, typer.Option(help="Mapping file for CSV columns, or pendulum, voltage_40hz.")
+    ] = None,
+    effort: Annotated[
+        str, typer.Option(help="Of a bag: applied (what the plant received) or measured.")
+    ] = "applied",
+    experiment: Annotated[
+        str, typer.Option(help="With --method thesis: inertia_damping or gravity; auto asks the recording.")
+    ] = "auto",
+    skew: Annotated[
+        float | None,
+        typer.Option(
+            help="With --method thesis: longest time between velocity and effort of one sample [s]; by default "
+            "0.0005 for bags, half a sampling period for files."
+        ),
+    ] = None,
+    friction: Annotated[
+        str, typer.Option(help="auto, viscous, coulomb, stribeck, load, stribeck_load, gear_load, ...")
+    ] = "auto",
+    window: Annotated[float | None, typer.Option(help="Length of the shooting windows [s].")] = None,
+    mass: Annotated[float | None, typer.Option(help="Moving mass [kg], to check or fix the scale.")] = None,
+    length: Annotated[float | None, typer.Option(help="Joint axis to centre of mass [m].")] = None,
+    inertia: Annotated[float | None, typer.Option(help="About the joint axis [kg m^2], if known.")] = None,
+    fix_scale: Annotated[bool, typer.Option(help="Take the scale of torque from mass and length.")] = False,
+    held_out: Annotated[
+        list[Path] | None, typer.Option(help="Recordings to score only; may be given more than once.")
+    ] = None,
+    out: Annotated[
+        Path | None, typer.Option(help="Plant file to write (*.yaml), with a .json and figures beside it.")
+    ] = None,
+    name: Annotated[str, typer.Option(help="Name of the plant in that file.")] = "identified",
+    effort_limit: Annotated[float, typer.Option(help="Largest torque of the actuator [N m].")] = 13.0,
+    page: Annotated[bool, typer.Option(help="With --out: write figures and a page too.")] = True,
+    as_json: Annotated[bool, typer.Option("--json", help="Print the result as JSON.")] = False,
+) -> None:
+    """Identify a pendulum from recordings.
+
+    Example: python -m pendulum_bags identify run1.csv run2.csv --mass 0.6 --length 0.5 --out plant.yaml
+    """
+    from pendulum_bags.runs.datasets import read_recording
+
+    if method not in {"output_error", "thesis"}:
+        raise DataError(f"method is {method!r}; expected output_error or thesis")
+    if effort not in {"applied", "measured"}:
+        raise DataError(f"effort is {effort!r}; expected applied or measured")
+    if method == "thesis":
+        recordings = [read_recording(path, mapping, effort="measured") for path in data]
+        _thesis(recordings, experiment, skew, out, page, as_json)
+        return
+    from pendulum_bags.identification.options import Geometry, Options
+    from pendulum_bags.identification.result import identify as run
+
+    options = Options(
+        window=window, friction=friction, geometry=Geometry(mass, length, inertia), fix_scale=fix_scale
+    )
+    recordings = [read_recording(path, mapping, effort=effort) for path in data]
+    others = [read_recording(path, mapping, effort=effort) for path in held_out or []]
+    result = run(recordings, options, held_out=others)
+    if out is not None:
+        result.write(out, name=name, effort_limit=effort_limit)
+        if page:
+            from pendulum_bags.identification.page import write_page
+
+            write_page(result, out.with_suffix(""))
+    if as_json:
+        typer.echo(json.dumps(result.to_dict(), indent=2))
+    else:
+        _print_result(result, out)
+    if result.geometry is not None and result.geometry.contradicts:
+        raise typer.Exit(3)
+
+
+def _thesis(
+    recordings: Sequence[Recording],
+    experiment: str,
+    skew: float | None,
+    out: Path | None,
+    page: bool,
+    as_json: bool,
+) -> None:
+    from pendulum_bags.identification.thesis import fit_gravity, fit_inertia_damping, static_holds
+
+    if experiment not in {"auto", "inertia_damping", "gravity"}:
+        raise DataError(f"experiment is {experiment!r}; expected auto, inertia_damping or gravity")
+    if experiment == "auto":
+        experiment = "gravity" if all(len(static_holds(r)) >= 4 for r in recordings) else "inertia_damping"
+    gravity = experiment == "gravity"
+    result = fit_gravity(recordings) if gravity else fit_inertia_damping(recordings, skew=skew)
+    if out is not None:
+        out.parent.mkdir(parents=True, exist_ok=True)
+        out.with_suffix(".json").write_text(json.dumps(result.to_dict(), indent=2) + "\n", encoding="utf-8")
+        if page:
+            from pendulum_bags.identification.page import write_thesis_page
+
+            write_thesis_page(result, recordings, out.with_suffix(""))
+    if as_json:
+        typer.echo(json.dumps(result.to_dict(), indent=2))
+        return
+    _print_thesis(result)
+
+
+def _print_thesis(result: ThesisResult) -> None:
+    from pendulum_bags.identification.model import UNITS
+    from pendulum_msgs_py.programs.terminal import WholeTable, make_console
+
+    console = make_console()
+    for regression in result.trials:
+        console.print(f"[bold]{regression.trial}[/bold]")
+        print(_narrow(regression.summary))
+    table = WholeTable(title=f"Average over {len(result.trials)} trial{'s' if len(result.trials) != 1 else ''}")
+    for heading in ("coefficient", "value", "95 % interval", "unit"):
+        table.add_column(heading)
+    for key, value in result.average.items():
+        low, high = result.intervals[key]
+        table.add_row(key, f"{value:.5g}", f"{low:.5g} to {high:.5g}", UNITS[key])
+    console.print(table)
+    for sentence in result.sentences:
+        console.print(f"- {sentence}", markup=False, highlight=False)
+
+
+def _narrow(summary: str, width: int = 78) -> str:
+    """Make the head of statsmodels' summary, widened by its labels, as narrow as the rest: blanks of it go."""
+    lines = [line.rstrip() for line in summary.splitlines()]
+    rules = [index for index, line in enumerate(lines) if line and not line.strip("=")]
+    excess = len(lines[rules[0]]) - width if len(rules) > 1 else 0
+    if excess > 0:
+        lines[rules[0]] = "=" * width
+        for index in range(rules[0] + 1, rules[1]):
+            if len(lines[index]) > width:
+                lines[index] = re.sub(rf" {{{excess}}}(?= *\S+$)", "", lines[index], count=1)
+    return "\n".join(lines)
+
+
+def _print_result(result: IdentificationResult, out: Path | None) -> None:
+    from pendulum_bags.identification.model import UNITS
+    from pendulum_msgs_py.programs.terminal import WholeTable, make_console
+
+    console = make_console()
+    table = WholeTable(title=f"Identified by output error, friction {result.fit.chosen.friction}")
+    predicted = result.predicted
+    for heading in ("parameter", "value", "95 % interval", *(["predicted"] if predicted else []), "unit"):
+        table.add_column(heading)
+    for key in (*result.fit.chosen.free, "natural_frequency"):
+        unit = UNITS.get(key, "rad/s")
+        interval = result.uncertainty.intervals.get(key)
+        value = result.model[key] if key in UNITS else result.model.natural_frequency
+        cells = [key, f"{value:.5g}", f"{interval.low:.4g} to {interval.high:.4g}" if interval else "-"]
+        if predicted:
+            cells.append(f"+-{predicted[key]:.2g}" if key in predicted else "-")
+        table.add_row(*cells, unit)
+    console.print(table)
+    models = WholeTable(title="Friction models")
+    for heading in ("model", "held-out rms \\[mrad]", "training rms \\[mrad]", ""):
+        models.add_column(heading)
+    for candidate in result.fit.candidates:
+        held = "-" if candidate.validation is None else f"{1e3 * candidate.validation.rms:.3f}"
+        mark = "chosen" if candidate is result.fit.chosen else ""
+        models.add_row(candidate.friction, held, f"{1e3 * candidate.training_rms:.3f}", mark)
+    console.print(models)
+    for label, score in result.held_out.items():
+        console.print(
+            f"held out {label}: rms {1e3 * score.rms:.3f} mrad, mean absolute {1e3 * score.mean_absolute:.3f} mrad"
+        )
+    for sentence in result.sentences():
+        style = "bold red" if sentence.startswith("CONTRADICTION") else None
+        console.print(f"- {sentence}", style=style, markup=False, highlight=False)
+    if out is not None:
+        console.print(f"wrote {out}", highlight=False)
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run the command line and return the exit code: 0, 2 for an error, 3 for a contradiction with geometry."""
+    # The matrices are small: threads of the linear algebra would only wait for one another.
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+    return cli_main(app, argv, name="python -m pendulum_bags identify")
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

@@ -1,0 +1,191 @@
+"""The fit model: one parameter vector with names, units, bounds, and its relation to plant files."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pendulum_bags.identification.kernel import PARAMETER_NAMES
+from pendulum_msgs_py.errors import DataError
+from pendulum_msgs_py.plants.plant_parameters import PlantParameters
+
+__all__ = [
+    "BOUNDS",
+    "FRICTION_MODELS",
+    "INDEX",
+    "PLANT_FRICTION_MODELS",
+    "SERVO_ONLY",
+    "UNITS",
+    "FitModel",
+    "from_plant",
+    "to_plant",
+]
+
+Array = NDArray[np.float64]
+
+INDEX: Mapping[str, int] = {name: i for i, name in enumerate(PARAMETER_NAMES)}
+"""Position of each parameter in the vector."""
+
+UNITS: Mapping[str, str] = {
+    "inertia": "kg m^2",
+    "damping": "N m s/rad",
+    "gravity": "N m",
+    "coulomb_friction": "N m",
+    "stribeck_excess": "N m",
+    "stribeck_velocity": "rad/s",
+    "load_friction": "-",
+    "torque_offset": "N m",
+    "angle_offset": "rad",
+    "input_gain": "N m per unit of input",
+    "transport_delay": "s",
+    "drive_damping": "N m s/rad",
+    "drive_load_friction": "-",
+    "load_stribeck": "-",
+}
+
+BOUNDS: Mapping[str, tuple[float, float]] = {
+    "inertia": (1e-7, 1e3),
+    "damping": (0.0, 1e4),
+    "gravity": (0.0, 1e4),
+    "coulomb_friction": (0.0, 1e3),
+    "stribeck_excess": (0.0, 1e3),
+    "stribeck_velocity": (0.02, 2.0),
+    "load_friction": (0.0, 0.9),
+    "torque_offset": (-1e3, 1e3),
+    "angle_offset": (-0.5, 0.5),
+    "input_gain": (-1e4, 1e4),
+    "transport_delay": (-0.03, 0.1),
+    "drive_damping": (0.0, 1e3),
+    "drive_load_friction": (0.0, 0.9),
+    "load_stribeck": (0.0, 10.0),
+}
+"""Domain in which each parameter is sought; a delay below 0 means an input stamped late."""
+
+FRICTION_MODELS: Mapping[str, tuple[str, ...]] = {
+    "viscous": (),
+    "coulomb": ("coulomb_friction",),
+    "stribeck": ("coulomb_friction", "stribeck_excess", "stribeck_velocity"),
+    "load": ("coulomb_friction", "load_friction"),
+    "stribeck_load": ("coulomb_friction", "stribeck_excess", "stribeck_velocity", "load_friction"),
+    "gear_load": ("coulomb_friction", "load_friction", "drive_load_friction"),
+    "stribeck_gear_load": (
+        "coulomb_friction",
+        "stribeck_excess",
+        "stribeck_velocity",
+        "load_friction",
+        "drive_load_friction",
+    ),
+    "gear_load_stribeck": (
+        "coulomb_friction",
+        "stribeck_velocity",
+        "load_friction",
+        "drive_load_friction",
+        "load_stribeck",
+    ),
+}
+"""Dry friction that each model adds to the viscous one, simplest first."""
+
+SERVO_ONLY = ("stribeck_gear_load", "gear_load_stribeck")
+"""Models of geared servos that are offered, but not tried, for other drives: seldom determined there."""
+
+PLANT_FRICTION_MODELS = ("viscous", "coulomb", "stribeck", "load", "stribeck_load")
+"""Those that a plant file can hold: its friction knows the load of gravity, not that of the drive."""
+
+_DEFAULTS: Mapping[str, float] = {"inertia": 1.0, "gravity": 1.0, "input_gain": 1.0, "stribeck_velocity": 0.2}
+
+
+@dataclass(frozen=True)
+class FitModel:
+    """Parameter values of the fit model; what drives it says ``input_kind``.
+
+    Args:
+        values: Values by name; what is missing is 0 (1 for inertia, gravity and input gain).
+        input_kind: ``effort`` [N m], ``voltage`` [V] or ``position_goal`` [rad]; see ``datasets.INPUT_KINDS``.
+        friction: Name of the friction model, one of ``FRICTION_MODELS``.
+        duty_gain: For a servo: duty cycle per set-point error and firmware gain [1/rad].
+    """
+
+    values: Mapping[str, float]
+    input_kind: str = "effort"
+    friction: str = "coulomb"
+    duty_gain: float = 0.0
+    vector: Array = field(init=False, repr=False, compare=False)
+
+    def __post_init__(self) -> None:
+        """Build the vector; unknown names are an error."""
+        vector = np.zeros(len(PARAMETER_NAMES))
+        for name, value in {**_DEFAULTS, **self.values}.items():
+            if name not in INDEX:
+                raise DataError(
+                    f"fit model has no parameter {name!r}; expected one of {', '.join(PARAMETER_NAMES)}"
+                )
+            vector[INDEX[name]] = value
+        if not np.all(np.isfinite(vector)) or vector[INDEX["inertia"]] <= 0.0:
+            raise DataError(
+                f"fit model has the values {dict(self.values)}; expected finite numbers and inertia > 0"
+            )
+        vector.setflags(write=False)
+        object.__setattr__(self, "vector", vector)
+
+    def __getitem__(self, name: str) -> float:
+        """Return one value by name."""
+        return float(self.vector[INDEX[name]])
+
+    @property
+    def natural_frequency(self) -> float:
+        """w0 = sqrt(G / J) of small swings [rad/s]."""
+        return float(np.sqrt(max(self["gravity"], 0.0) / self["inertia"]))
+
+    def with_vector(self, vector: Array) -> FitModel:
+        """Return the model with other values."""
+        values = dict(zip(PARAMETER_NAMES, map(float, vector), strict=True))
+        return FitModel(values, self.input_kind, self.friction, self.duty_gain)
+
+
+def from_plant(plant: PlantParameters) -> FitModel:
+    """Return the fit model of a rigid plant; its actuator lag is folded into the delay (first order)."""
+    if plant.drivetrain is not None:
+        raise DataError(
+            f"plant {plant.name!r} is series elastic; the fit model is rigid: expected a plant without drivetrain"
+        )
+    return FitModel(
+        {
+            "inertia": plant.inertia,
+            "damping": plant.damping,
+            "gravity": plant.gravity,
+            "coulomb_friction": plant.coulomb_friction,
+            "stribeck_excess": plant.static_friction - plant.coulomb_friction,
+            "stribeck_velocity": plant.stribeck_velocity,
+            "load_friction": plant.load_friction,
+            "torque_offset": plant.torque_offset,
+            "angle_offset": plant.angle_offset,
+            "transport_delay": plant.transport_delay + plant.actuator_time_constant,
+        },
+        friction="stribeck_load",
+    )
+
+
+def to_plant(model: FitModel, *, name: str = "identified", effort_limit: float = 13.0) -> PlantParameters:
+    """Return the plant that simulator, bridge and controller load.
+
+    For a voltage or a servo, ``effort`` of that plant is the torque behind the input gain, and the damping is
+    that with the drive switched on (back-EMF included). A delay below 0 is a matter of the recording's
+    stamps, not of the plant, and is left out.
+    """
+    return PlantParameters(
+        inertia=model["inertia"],
+        damping=model["damping"] + (model["drive_damping"] if model.input_kind == "position_goal" else 0.0),
+        gravity=model["gravity"],
+        coulomb_friction=model["coulomb_friction"],
+        static_friction=model["coulomb_friction"] + model["stribeck_excess"],
+        stribeck_velocity=model["stribeck_velocity"],
+        load_friction=model["load_friction"],
+        torque_offset=model["torque_offset"],
+        angle_offset=model["angle_offset"],
+        effort_limit=effort_limit,
+        transport_delay=max(model["transport_delay"], 0.0),
+        name=name,
+    )

@@ -1,0 +1,288 @@
+"""Output-error identification: simulate, compare angles, adjust; friction chosen by held-out windows."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pendulum_bags.identification.cross_validation import cross_validate
+from pendulum_bags.identification.model import FRICTION_MODELS, SERVO_ONLY, FitModel
+from pendulum_bags.identification.options import DEFAULTS, Geometry, Options
+from pendulum_bags.identification.problem import Piece, prepare
+from pendulum_bags.identification.selection import Candidate, choose, effective_samples
+from pendulum_bags.identification.solver import Solution, refine, residuals, robust_cost, solve
+from pendulum_bags.identification.starts import first_models, rank
+from pendulum_bags.runs.datasets import Recording
+from pendulum_msgs_py.errors import DataError
+
+__all__ = ["DEFAULTS", "Geometry", "Options", "OutputErrorFit", "fit_output_error"]
+
+Array = NDArray[np.float64]
+
+COARSE = 3.0
+"""Factor on the integration step while searching; the chosen model is fitted to the end without it."""
+
+_FRICTION_STARTS: Mapping[str, tuple[Mapping[str, float], ...]] = {
+    # As shares of the Coulomb friction found before, and velocities in rad/s.
+    "stribeck": tuple({"stribeck_excess": 0.3, "stribeck_velocity": v} for v in (0.1, 1.0)),
+    "load": ({"load_friction": 0.02}, {"load_friction": 0.1}),
+    "gear_load": (
+        {"load_friction": 0.02, "drive_load_friction": 0.02},
+        {"load_friction": 0.1, "drive_load_friction": 0.3},
+    ),
+    "gear_load_stribeck": (
+        {"load_friction": 0.02, "drive_load_friction": 0.02, "load_stribeck": 0.2, "stribeck_velocity": 0.3},
+        {"load_friction": 0.2, "drive_load_friction": 0.3, "load_stribeck": 0.4, "stribeck_velocity": 0.3},
+    ),
+}
+
+
+@dataclass(frozen=True)
+class OutputErrorFit:
+    """The chosen candidate and all others, with the data as cut."""
+
+    chosen: Candidate
+    candidates: tuple[Candidate, ...]
+    pieces: tuple[Piece, ...]
+    scale: float
+    options: Options
+    window: float | None
+    sign_flipped: bool
+
+    @property
+    def model(self) -> FitModel:
+        """The fitted model."""
+        return self.chosen.solution.model
+
+
+def fit_output_error(recordings: Sequence[Recording], options: Options = DEFAULTS) -> OutputErrorFit:
+    """Fit the model to recordings of one and the same pendulum.
+
+    Args:
+        recordings: At least one; all with the same kind of input.
+        options: Choices.
+
+    Raises:
+        DataError: for no data, mixed inputs, or a recording in which nothing moves.
+    """
+    fixed, free = _frame(recordings, options)
+    window = options.window or {"effort": 1.0, "none": 1.0, "voltage": 2.0}.get(fixed.input_kind)
+    pieces = [prepare(recording, window) for recording in recordings]
+    longest = max(recordings, key=lambda r: r.duration)
+    base = (*free, "coulomb_friction")
+    models = first_models(longest, fixed, base, spread=options.multi_start)
+    # Ranked twice: by a loss that can pull from far, and by one that a single pushed window cannot sway.
+    starts = [start for scale in (0.3, 0.03) for start in rank(models, pieces, base, scale=scale, keep=2)]
+    best, scale = _anneal(starts, pieces, base, options.robust)
+    names = [options.friction]
+    if options.friction == "auto":
+        names = [n for n in FRICTION_MODELS if n not in SERVO_ONLY or fixed.input_kind == "position_goal"]
+    free, best = _offsets(best, pieces, free, scale, options)
+    candidates: list[Candidate] = []
+    for name in names:
+        candidates.append(_fit_friction(name, best, pieces, free, scale, candidates, options))
+    first = choose(candidates)
+    chosen = _finish(first, pieces, scale)
+    candidates[candidates.index(first)] = chosen
+    flipped = fixed.input_kind in {"effort", "voltage"} and chosen.solution.model["input_gain"] < 0.0
+    return OutputErrorFit(chosen, tuple(candidates), tuple(pieces), scale, options, window, flipped)
+
+
+def _frame(recordings: Sequence[Recording], options: Options) -> tuple[FitModel, tuple[str, ...]]:
+    """Return what is fixed, and the names of what is fitted apart from dry friction."""
+    if not recordings:
+        raise DataError("there is no recording to identify from; expected at least one")
+    kinds = {recording.input_kind for recording in recordings}
+    if len(kinds) > 1:
+        raise DataError(
+            f"the recordings have different inputs ({', '.join(sorted(kinds))}); expected one kind"
+        )
+    for recording in recordings:
+        if np.ptp(recording.position) < 1e-2:
+            raise DataError(
+                f"{recording.name} moves by {np.ptp(recording.position):.2g} rad only; expected a moving pendulum"
+            )
+    kind = kinds.pop()
+    geometry = options.geometry
+    values: dict[str, float] = {}
+    free = ["damping", "gravity"]
+    duty_gain = 0.0
+    if kind == "position_goal":
+        geometry = geometry if geometry.gravity is not None else _geometry_of(recordings)
+        values.update(
+            gravity=geometry.gravity or 1.0, inertia=geometry.inertia or geometry.least_inertia or 1.0
+        )
+        duty_gain = float(np.median([_duty_gain(recording) for recording in recordings]))
+        # The bob fixes the scale; its arm's zero is an angle, so a torque offset would only double it.
+        free = ["damping", "inertia", "input_gain", "drive_damping"]
+    elif kind == "none" or (kind == "voltage" and not options.fix_scale):
+        values["inertia"] = geometry.inertia or 1.0
+        if kind == "voltage":
+            free.append("input_gain")
+    elif options.fix_scale:
+        values["gravity"] = float(geometry.gravity or 1.0)
+        free = ["damping", "inertia", "input_gain"]
+    else:
+        free.append("inertia")
+    if options.torque_offset and kind in {"effort", "voltage"}:
+        free.append("torque_offset")
+    if options.angle_offset:
+        free.append("angle_offset")
+    if options.delay and kind != "none":
+        free.append("transport_delay")
+    return FitModel(values, kind, "coulomb", duty_gain), tuple(free)
+
+
+def _geometry_of(recordings: Sequence[Recording]) -> Geometry:
+    known = {
+        (float(r.meta["mass"]), float(r.meta["length"]))
+        for r in recordings
+        if {"mass", "length"} <= r.meta.keys()
+    }
+    if len(known) != 1:
+        raise DataError(
+            f"the servo logs name {len(known)} pairs of mass and length; expected one, or --mass and --length"
+        )
+    mass, length = known.pop()
+    return Geometry(mass, length)
+
+
+def _duty_gain(recording: Recording) -> float:
+    """Return duty cycle per set-point error and firmware gain [1/rad], from the servo's own load report."""
+    if "load" not in recording.meta:
+        # P gain / 128 in encoder steps (4096 a turn) to PWM units (885 full), by the servo's control table.
+        return 4096.0 / (2.0 * np.pi) / (128.0 * 885.0)
+    # A part of a log keeps the whole input: the rows of its own samples are wanted.
+    own = np.isin(recording.input_stamps, recording.time)
+    load, error = np.asarray(recording.meta["load"])[own], recording.input[own] - recording.position
+    use = np.abs(load) < 0.8
+    if recording.enabled is not None:
+        use &= recording.enabled[own] > 0.5
+    kp = float(recording.meta.get("kp", 1.0))
+    slopes = load[use][np.abs(error[use]) > 0.03] / error[use][np.abs(error[use]) > 0.03]
+    return float(np.median(slopes) / kp) if slopes.size > 10 else 0.0025
+
+
+def _anneal(
+    starts: Sequence[Solution], pieces: Sequence[Piece], free: Sequence[str], robust: bool
+) -> tuple[Solution, float]:
+    """Return the best fit and the scale of its loss, tightened step by step so that a push by hand loses its pull."""
+    if not robust:
+        finals = [solve(s.model, pieces, free, tolerance=1e-7, coarse=COARSE) for s in starts]
+        return min(finals, key=lambda s: s.cost), np.inf
+    finalists = []
+    for start in starts:
+        for first_scale in (0.3, 0.03):
+            s = solve(
+                start.model, pieces, free, scale=first_scale, tolerance=1e-4, max_iterations=25, coarse=COARSE
+            )
+            finalists.append(
+                solve(
+                    s.model,
+                    pieces,
+                    free,
+                    states=s.states,
+                    scale=0.03,
+                    tolerance=1e-5,
+                    max_iterations=30,
+                    coarse=COARSE,
+                )
+            )
+    best = min(finalists, key=lambda s: s.cost)
+    scale = _robust_scale(best, pieces)
+    polished = solve(best.model, pieces, free, states=best.states, scale=scale, tolerance=1e-7, coarse=COARSE)
+    return polished, scale
+
+
+def _offsets(
+    best: Solution, pieces: Sequence[Piece], free: tuple[str, ...], scale: float, options: Options
+) -> tuple[tuple[str, ...], Solution]:
+    """Return the free parameters without the offsets that the held-out windows do not ask for.
+
+    An offset of torque and one of angle do nearly the same to a swing: together they chase each other's errors.
+    """
+    offsets = [name for name in ("angle_offset", "torque_offset") if name in free]
+    subsets = [
+        tuple(o for o in offsets if o not in left_out) for left_out in ((), *((o,) for o in offsets), offsets)
+    ]
+    candidates = []
+    for kept in dict.fromkeys(subsets):
+        names = tuple(n for n in free if n not in offsets or n in kept)
+        values = {k: v for k, v in best.model.values.items() if k not in offsets or k in kept}
+        start = replace(best, model=FitModel(values, best.model.input_kind, "coulomb", best.model.duty_gain))
+        candidates.append(_fit_friction("coulomb", start, pieces, names, scale, (), options))
+    # An offset that is kept by luck biases all others: the stricter penalty (Schwarz) keeps few of those.
+    chosen = choose(candidates, strict=True)
+    return tuple(n for n in chosen.free if n in free), chosen.solution
+
+
+def _robust_scale(solution: Solution, pieces: Sequence[Piece]) -> float:
+    """Return three robust standard deviations of the residual: the loss leaves good samples quadratic [rad]."""
+    parts = residuals(solution.model, pieces, solution.states)
+    inside = np.concatenate([part[piece.mask()] for part, piece in zip(parts, pieces, strict=True)])
+    spread = 1.4826 * float(np.median(np.abs(inside - np.median(inside))))
+    return max(3.0 * spread, 1e-6)
+
+
+def _fit_friction(
+    name: str,
+    start: Solution,
+    pieces: Sequence[Piece],
+    free: Sequence[str],
+    scale: float,
+    simpler: Sequence[Candidate],
+    options: Options,
+) -> Candidate:
+    """Fit one friction model from the best simpler fits, and cross-validate it."""
+    names = FRICTION_MODELS[name]
+    everything = (*free, *names)
+    begin: list[tuple[FitModel, list[Array]]] = []
+    # A simpler model is contained in this one: starting there, the cost cannot end above it.
+    for previous in (start, *(c.solution for c in simpler if set(FRICTION_MODELS[c.friction]) <= set(names))):
+        model = previous.model
+        values = {k: v for k, v in model.values.items() if k in free or not _is_friction(k) or k in names}
+        plain = FitModel(values, model.input_kind, name, model.duty_gain)
+        begin.append((plain, previous.states))
+    kind = name.replace("stribeck_", "") if name != "stribeck" else name
+    additions = _FRICTION_STARTS.get(kind, ()) + (
+        _FRICTION_STARTS["stribeck"] if name.startswith("stribeck_") else ()
+    )
+    coulomb = max(start.model["coulomb_friction"], 1e-3 * abs(start.model["gravity"]))
+    for addition in additions:
+        values = {**start.model.values, **addition}
+        if "stribeck_excess" in addition:
+            values["stribeck_excess"] = addition["stribeck_excess"] * coulomb
+        else:
+            values["coulomb_friction"] = 0.5 * coulomb
+        begin.append((FitModel(values, start.model.input_kind, name, start.model.duty_gain), start.states))
+    solutions = [
+        solve(m, pieces, everything, states=s, scale=scale, tolerance=1e-7, coarse=COARSE) for m, s in begin
+    ]
+    best = min(solutions, key=lambda s: s.cost)
+    best = replace(best, model=FitModel(best.model.values, best.model.input_kind, name, best.model.duty_gain))
+    parts = residuals(best.model, pieces, best.states)
+    inside = np.concatenate([part[piece.mask()] for part, piece in zip(parts, pieces, strict=True)])
+    validation = cross_validate(best.model, pieces, best.states, everything, scale, count=options.folds)
+    mean_cost = robust_cost(inside, scale) / inside.size
+    rms = float(np.sqrt(np.mean(inside**2)))
+    return Candidate(name, everything, best, rms, validation, mean_cost, effective_samples(parts, pieces))
+
+
+def _is_friction(name: str) -> bool:
+    return any(name in names for names in FRICTION_MODELS.values())
+
+
+def _finish(candidate: Candidate, pieces: Sequence[Piece], scale: float) -> Candidate:
+    """Return the candidate fitted to the end with fine integration steps, single windows tried anew."""
+    found = candidate.solution
+    final = solve(found.model, pieces, candidate.free, states=found.states, scale=scale, tolerance=1e-8)
+    final = refine(final, pieces, candidate.free, scale=scale)
+    model = FitModel(final.model.values, found.model.input_kind, candidate.friction, found.model.duty_gain)
+    parts = residuals(model, pieces, final.states)
+    inside = np.concatenate([part[piece.mask()] for part, piece in zip(parts, pieces, strict=True)])
+    return replace(
+        candidate, solution=replace(final, model=model), training_rms=float(np.sqrt(np.mean(inside**2)))
+    )

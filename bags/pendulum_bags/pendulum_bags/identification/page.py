@@ -1,0 +1,118 @@
+"""One page per identification: measured against simulated, residuals, tables, and the sentences."""
+
+from __future__ import annotations
+
+import base64
+from collections.abc import Mapping, Sequence
+from html import escape
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from pendulum_bags.identification.figures import fit_figures, save, thesis_figures
+from pendulum_bags.identification.model import UNITS
+from pendulum_bags.identification.thesis import ThesisResult
+from pendulum_bags.runs.datasets import Recording
+
+if TYPE_CHECKING:
+    from pendulum_bags.identification.result import IdentificationResult
+
+__all__ = ["write_page", "write_thesis_page"]
+
+_STYLE = """
+body { font: 15px/1.5 system-ui, sans-serif; max-width: 60rem; margin: 2rem auto; padding: 0 1rem; color: #1c1917; }
+table { border-collapse: collapse; margin: 1rem 0; } th, td { padding: .2rem .8rem; text-align: right; }
+th { border-bottom: 1px solid #78716c; } td:first-child, th:first-child { text-align: left; }
+img { max-width: 100%; } .wide { overflow-x: auto; } td { white-space: nowrap; }
+.alarm { color: #b91c1c; font-weight: bold; } pre { font-size: 12px; overflow-x: auto; }
+"""
+
+
+def write_page(result: IdentificationResult, folder: str | Path) -> Path:
+    """Write figures and ``index.html`` of an output-error fit into a folder and return the page's path."""
+    target = Path(folder)
+    figures = save(fit_figures(result), target / "figures")
+    chosen = result.fit.chosen
+    parameters = []
+    for name in (*chosen.free, "natural_frequency"):
+        value = result.model[name] if name in UNITS else result.model.natural_frequency
+        interval = result.uncertainty.intervals.get(name)
+        ends = f"{interval.low:.4g} to {interval.high:.4g}" if interval else "at the edge of its domain"
+        parameters.append((name, f"{value:.5g}", ends, UNITS.get(name, "rad/s")))
+    models = [
+        (
+            c.friction,
+            "-" if c.validation is None else f"{1e3 * c.validation.rms:.3f}",
+            f"{1e3 * c.training_rms:.3f}",
+        )
+        for c in result.fit.candidates
+    ]
+    held = [(n, f"{1e3 * s.rms:.3f}", f"{1e3 * s.mean_absolute:.3f}") for n, s in result.held_out.items()]
+    names = result.uncertainty.names
+    correlation = [
+        (name, *(f"{value:+.2f}" for value in row))
+        for name, row in zip(names, result.uncertainty.correlation, strict=True)
+    ]
+    body = [
+        f"<p>Friction model <b>{escape(chosen.friction)}</b>, {escape(result.created)}.</p>",
+        _sentences(result.sentences()),
+        _table("Parameters", ("parameter", "value", "95 % interval", "unit"), parameters),
+        _table("Friction models", ("model", "held-out rms [mrad]", "training rms [mrad]"), models),
+        _table("Other recordings", ("recording", "rms [mrad]", "mean absolute [mrad]"), held),
+        _table(
+            f"Correlation (condition number {result.uncertainty.condition_number:.2g})",
+            ("", *names),
+            correlation,
+        ),
+        *map(_image, figures),
+    ]
+    return _write(target, "Identification", body)
+
+
+def write_thesis_page(result: ThesisResult, recordings: Sequence[Recording], folder: str | Path) -> Path:
+    """Write figures and ``index.html`` of the two regressions into a folder and return the page's path."""
+    target = Path(folder)
+    figures = save(thesis_figures(result, recordings), target / "figures")
+    rows = [
+        (name, f"{value:.5g}", f"{result.intervals[name][0]:.5g} to {result.intervals[name][1]:.5g}")
+        for name, value in result.average.items()
+    ]
+    body = [
+        _sentences(result.sentences),
+        _table("Average over trials", ("coefficient", "value", "95 % interval"), rows),
+        *(f"<h2>{escape(r.trial)}</h2><pre>{escape(r.summary)}</pre>" for r in result.trials),
+        *map(_image, figures),
+    ]
+    return _write(target, f"Regression: {result.kind.replace('_', ' and ')}", body)
+
+
+def _sentences(sentences: Sequence[str]) -> str:
+    items = []
+    for sentence in sentences:
+        css = ' class="alarm"' if sentence.startswith("CONTRADICTION") else ""
+        items.append(f"<li{css}>{escape(sentence)}</li>")
+    return f"<ul>{''.join(items)}</ul>"
+
+
+def _table(title: str, head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+    if not rows:
+        return ""
+    cells = "".join(f"<th>{escape(h)}</th>" for h in head)
+    lines = "".join("<tr>" + "".join(f"<td>{escape(c)}</td>" for c in row) + "</tr>" for row in rows)
+    return f'<h2>{escape(title)}</h2><div class="wide"><table><tr>{cells}</tr>{lines}</table></div>'
+
+
+def _image(path: Path) -> str:
+    data = base64.b64encode(path.read_bytes()).decode("ascii")
+    return f'<p><img alt="{escape(path.stem)}" src="data:image/png;base64,{data}"></p>'
+
+
+def _write(folder: Path, title: str, body: Sequence[str]) -> Path:
+    parts: Mapping[str, str] = {"title": escape(title), "style": _STYLE, "body": "\n".join(body)}
+    page = (
+        '<!doctype html><html lang="en"><meta charset="utf-8"><meta name="viewport" content="width=device-width">'
+        "<title>{title}</title><style>{style}</style>"
+        "<h1>{title}</h1>{body}</html>\n"
+    ).format(**parts)
+    path = folder / "index.html"
+    path.write_text(page, encoding="utf-8")
+    return path

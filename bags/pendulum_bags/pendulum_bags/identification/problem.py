@@ -1,0 +1,188 @@
+"""Recordings cut into windows and handed to the compiled simulation."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pendulum_bags.identification import kernel
+from pendulum_bags.identification.model import FitModel
+from pendulum_bags.runs.datasets import Recording
+from pendulum_msgs_py.errors import DataError
+
+__all__ = ["Piece", "Simulation", "cut_windows", "longest_step", "prepare"]
+
+Array = NDArray[np.float64]
+_NOTHING = np.zeros((0, 0))
+
+
+@dataclass(frozen=True)
+class Piece:
+    """One recording with its windows, ready to simulate.
+
+    Args:
+        recording: The data.
+        windows: First and one past last sample of each window, shape (w, 2).
+        states: First guess of the initial state of each window, shape (w, 2) [rad, rad/s].
+        integral: Integral of the input up to each of its stamps, shape (m,).
+        enabled: Drive switch at each input stamp, shape (m,).
+    """
+
+    recording: Recording
+    windows: NDArray[np.int64]
+    states: Array
+    integral: Array
+    enabled: Array
+
+    @property
+    def samples(self) -> int:
+        """Number of samples inside the windows."""
+        return int(np.sum(self.windows[:, 1] - self.windows[:, 0]))
+
+    def subset(self, chosen: Sequence[int] | NDArray[np.int64]) -> Piece:
+        """Return the piece with some of its windows."""
+        index = np.asarray(chosen, dtype=int)
+        return Piece(self.recording, self.windows[index], self.states[index], self.integral, self.enabled)
+
+    def mask(self) -> NDArray[np.bool_]:
+        """Return which samples lie in a window, shape (n,)."""
+        inside = np.zeros(self.recording.time.size, dtype=bool)
+        for first, stop in self.windows:
+            inside[first:stop] = True
+        return inside
+
+
+@dataclass(frozen=True)
+class Simulation:
+    """Simulated angle [rad], velocity [rad/s] and d angle / d(parameters, window state); rows as the samples."""
+
+    theta: Array
+    omega: Array
+    jacobian: Array
+
+
+def cut_windows(time: Array, window: float | None, *, minimum: float = 0.5) -> NDArray[np.int64]:
+    """Return windows that follow one another, shape (w, 2); a rest of at least ``minimum`` windows counts as one.
+
+    Args:
+        time: Sample stamps, shape (n,) [s].
+        window: Length [s]; None or longer than the recording gives one window.
+        minimum: Share of a window that a last, shorter one must have.
+    """
+    if window is not None and not window > 0.0:
+        raise DataError(f"window is {window} s; expected > 0")
+    span = float(time[-1] - time[0])
+    if window is None or window >= span:
+        return np.array([[0, time.size]], dtype=np.int64)
+    period = float(np.median(np.diff(time)))
+    starts = time[0] + window * np.arange(math.ceil(span / window + 1e-9))
+    # Half a sample of slack keeps k windows of a run of k window lengths in spite of jitter in the stamps.
+    edges = np.append(np.searchsorted(time, starts - 0.5 * period), time.size)
+    windows = np.stack((edges[:-1], edges[1:]), axis=1)
+    lengths = windows[:, 1] - windows[:, 0]
+    keep = lengths >= 4
+    rest = float(time[-1] - time[windows[-1, 0]]) + period
+    keep[-1] &= rest >= minimum * window
+    if not keep.any():
+        raise DataError(f"window of {window} s holds fewer than 4 samples at a period of {period:.4g} s")
+    return windows[keep].astype(np.int64)
+
+
+def prepare(recording: Recording, window: float | None) -> Piece:
+    """Return the recording with windows and first guesses of their initial states."""
+    windows = cut_windows(recording.time, window)
+    stamps = recording.input_stamps
+    integral = kernel.cumulative_input(stamps, recording.input, recording.hold == "linear")
+    enabled = np.ones(stamps.size) if recording.enabled is None else recording.enabled
+    states = np.array([_first_state(recording, first) for first, _ in windows])
+    return Piece(recording, windows, states, integral, enabled)
+
+
+def _first_state(recording: Recording, first: int) -> tuple[float, float]:
+    """Return angle and velocity at a sample from a parabola through its neighbours on both sides."""
+    reach = max(4, round(0.02 / recording.period))
+    low, high = max(first - reach, 0), min(first + reach + 1, recording.time.size)
+    t = recording.time[low:high] - recording.time[first]
+    degree = min(2, t.size - 1)
+    # polyfit conditions badly on short times in seconds: scale to about 1.
+    scale = max(float(np.max(np.abs(t))), 1e-9)
+    fit = np.polynomial.polynomial.polyfit(t / scale, recording.position[low:high], degree)
+    return float(fit[0]), float(fit[1] / scale)
+
+
+def longest_step(model: FitModel, recording: Recording) -> float:
+    """Return an integration step [s] that leaves the numerical error far below the sensor's.
+
+    The leapfrog's relative frequency error is (w h)^2 / 24; a linear drive stiffness counts like gravity. The
+    exponential damping is exact in velocity, but the angle is its trapezoid: hence the bound by the rate.
+    """
+    inertia = model["inertia"]
+    stiffness = abs(model["gravity"])
+    rate = model["damping"] / inertia
+    if model.input_kind == "position_goal":
+        stiffness += abs(model["input_gain"]) * _supply(recording) * _servo_gain(model, recording)
+        rate += model["drive_damping"] / inertia
+    frequency = math.sqrt(stiffness / inertia) if stiffness > 0.0 else 0.0
+    return float(np.clip(min(0.02 / max(frequency, 1e-3), 0.15 / max(rate, 1e-3)), 1e-4, 0.01))
+
+
+def _supply(recording: Recording) -> float:
+    return float(recording.meta.get("vin", 1.0))
+
+
+def _servo_gain(model: FitModel, recording: Recording) -> float:
+    return model.duty_gain * float(recording.meta.get("kp", 1.0))
+
+
+def simulate(
+    model: FitModel,
+    piece: Piece,
+    states: Array | None = None,
+    free: Sequence[int] | None = None,
+    step: float | None = None,
+) -> Simulation:
+    """Simulate every window of a piece.
+
+    Args:
+        model: Parameters.
+        piece: Data and windows.
+        states: Initial states, shape (w, 2); by default the first guesses.
+        free: Indices of parameters to differentiate; None for no derivatives.
+        step: Longest integration step [s]; by default :func:`longest_step`.
+
+    Returns:
+        The simulation; samples outside the windows are NaN.
+    """
+    recording = piece.recording
+    if recording.input_kind not in (model.input_kind, "none"):
+        raise DataError(
+            f"{recording.name} has the input {recording.input_kind!r}; the model expects {model.input_kind!r}"
+        )
+    size = recording.time.size
+    theta, omega = np.full(size, np.nan), np.full(size, np.nan)
+    columns = np.asarray(free if free is not None else (), dtype=np.int64)
+    jacobian = np.zeros((size, columns.size + 2)) if free is not None else _NOTHING
+    kernel.simulate_windows(
+        np.array(model.vector),
+        columns,
+        piece.windows,
+        np.ascontiguousarray(piece.states if states is None else states),
+        recording.time,
+        recording.input_stamps,
+        recording.input,
+        piece.integral,
+        piece.enabled,
+        recording.hold == "linear",
+        model.input_kind == "position_goal",
+        _servo_gain(model, recording),
+        _supply(recording),
+        longest_step(model, recording) if step is None else step,
+        theta,
+        omega,
+        jacobian,
+    )
+    return Simulation(theta, omega, jacobian)

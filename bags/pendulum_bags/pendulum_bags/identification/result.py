@@ -1,0 +1,321 @@
+"""The outcome of an identification: figures, words, a plant file that everything else loads."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import platform
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from datetime import datetime, timezone
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from threadpoolctl import threadpool_limits
+
+from pendulum_bags.identification.geometry import GeometryCheck, check_geometry
+from pendulum_bags.identification.model import (
+    FRICTION_MODELS,
+    PLANT_FRICTION_MODELS,
+    UNITS,
+    FitModel,
+    to_plant,
+)
+from pendulum_bags.identification.options import DEFAULTS, Options
+from pendulum_bags.identification.output_error import OutputErrorFit, fit_output_error
+from pendulum_bags.identification.residual_tests import ResidualTests, residual_tests
+from pendulum_bags.identification.selection import Candidate
+from pendulum_bags.identification.uncertainty import Uncertainty, assess
+from pendulum_bags.identification.window_score import WindowScore, free_run, window_score
+from pendulum_bags.runs.datasets import INPUT_KINDS, Recording
+from pendulum_msgs_py.errors import DataError
+from pendulum_msgs_py.plants.plant_parameters import PlantParameters, write_plant
+
+__all__ = ["IdentificationResult", "identify", "load_fit_model"]
+
+FORMAT = "pendulum_identification/1"
+
+
+@dataclass(frozen=True)
+class IdentificationResult:
+    """Fit, intervals, tests and scores of one identification.
+
+    Args:
+        fit: Chosen and rejected candidates.
+        uncertainty: Intervals and what cannot be determined.
+        tests: Of the residuals.
+        geometry: Comparison with mass and length, None where they are unknown.
+        held_out: Scores on recordings that took no part in the fit, by name.
+        created: Date, ISO 8601.
+    """
+
+    fit: OutputErrorFit
+    uncertainty: Uncertainty
+    tests: ResidualTests
+    geometry: GeometryCheck | None
+    held_out: Mapping[str, WindowScore]
+    created: str
+
+    @property
+    def model(self) -> FitModel:
+        """The fitted model."""
+        return self.fit.model
+
+    @property
+    def score(self) -> float | None:
+        """Angle error on held-out windows (cross-validation) [rad]; None for a single window."""
+        validation = self.fit.chosen.validation
+        return None if validation is None else validation.rms
+
+    @property
+    def plant_candidate(self) -> Candidate:
+        """The fit that a plant file can hold: the chosen one, or the best without load of the drive."""
+        if self.fit.chosen.friction in PLANT_FRICTION_MODELS:
+            return self.fit.chosen
+        fits = [c for c in self.fit.candidates if c.friction in PLANT_FRICTION_MODELS]
+        return min(fits, key=lambda c: c.score) if fits else self.fit.chosen
+
+    def plant(self, name: str = "identified", effort_limit: float = 13.0) -> PlantParameters:
+        """Return the plant that simulator, bridge and controller load."""
+        return to_plant(self.plant_candidate.solution.model, name=name, effort_limit=effort_limit)
+
+    def sentences(self) -> list[str]:
+        """Return what there is to say about the fit, most important first."""
+        said = list(self.geometry.sentences) if self.geometry is not None else []
+        if self.fit.sign_flipped:
+            said.append(
+                "The recorded effort has the opposite sign of the motion that it causes (an external torque?): the fit "
+                "counts it with sign -1."
+            )
+        said.extend(
+            f"{piece.recording.name}: {piece.recording.meta['repeated_stamps']} samples repeat the stamp before them "
+            "and are left out."
+            for piece in self.fit.pieces
+            if piece.recording.meta.get("repeated_stamps")
+        )
+        if self.score is None:
+            said.append(
+                "There is one window only: no held-out score; give a longer recording or a shorter --window."
+            )
+        return [*said, *self._calibration(), *self.tests.sentences, *self.uncertainty.sentences]
+
+    @property
+    def predicted(self) -> dict[str, float]:
+        """Half widths of the intervals that the design of the excitation predicted; empty for other recordings."""
+        if len(self.fit.pieces) != 1:
+            return {}
+        design = self.fit.pieces[0].recording.meta.get("pendulum.excitation")
+        values = design.get("predicted") if isinstance(design, Mapping) else None
+        if not isinstance(values, Mapping):
+            return {}
+        return {
+            name: float(width)
+            for name, width in values.items()
+            if isinstance(width, (int, float)) and 0.0 < width < np.inf and name in self.uncertainty.intervals
+        }
+
+    def _calibration(self) -> list[str]:
+        ratios = {}
+        for name, width in self.predicted.items():
+            interval = self.uncertainty.intervals[name]
+            ratios[name] = 0.5 * (interval.high - interval.low) / width
+        if not ratios:
+            return []
+        listing = ", ".join(f"{name} {ratio:.2g}" for name, ratio in ratios.items())
+        text = f"Half widths obtained over those that the design of the excitation predicted: {listing}; they are 1 "
+        return [text + "where the prior plant and the sensor noise were true and the model misses nothing."]
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return everything as plain JSON values."""
+        chosen = self.fit.chosen
+        return {
+            "format": FORMAT,
+            "created": self.created,
+            "method": "output_error",
+            "input_kind": self.model.input_kind,
+            "duty_gain": self.model.duty_gain,
+            "friction": chosen.friction,
+            "window": self.fit.window,
+            "held_out_rms": self.score,
+            "training_rms": chosen.training_rms,
+            "natural_frequency": self.model.natural_frequency,
+            "sign_flipped": self.fit.sign_flipped,
+            "parameters": {n: self.model[n] for n in UNITS},
+            "units": dict(UNITS),
+            "fitted": list(chosen.free),
+            "intervals": {
+                n: {"value": i.value, "low": i.low, "high": i.high, "standard_error": i.standard_error}
+                for n, i in self.uncertainty.intervals.items()
+            },
+            "profiles": {n: list(p) for n, p in self.uncertainty.profiles.items()},
+            "covariance": {
+                "names": list(self.uncertainty.names),
+                "matrix": self.uncertainty.covariance.tolist(),
+            },
+            "correlation": self.uncertainty.correlation.tolist(),
+            "condition_number": self.uncertainty.condition_number,
+            "interval_basis": self.uncertainty.basis,
+            "predicted_half_widths": self.predicted,
+            "candidates": [
+                {
+                    "friction": c.friction,
+                    "held_out_rms": None if c.validation is None else c.validation.rms,
+                    "training_rms": c.training_rms,
+                    "parameters": {n: c.solution.model[n] for n in c.free},
+                }
+                for c in self.fit.candidates
+            ],
+            "residuals": {
+                "white": self.tests.white,
+                "white_p": self.tests.white_p,
+                "independent_of_input": self.tests.independent,
+                "worst_cross_correlation": self.tests.worst_cross,
+            },
+            "geometry": None
+            if self.geometry is None
+            else {"contradicts": self.geometry.contradicts, "rows": [list(r) for r in self.geometry.rows]},
+            "held_out": {
+                name: {"window_rms": score.rms, "mean_absolute": score.mean_absolute}
+                for name, score in self.held_out.items()
+            },
+            "sentences": self.sentences(),
+            "data": [_fingerprint(p.recording) for p in self.fit.pieces],
+        }
+
+    def write(self, path: str | Path, *, name: str = "identified", effort_limit: float = 13.0) -> Path:
+        """Write the plant file with intervals and provenance, and everything else as JSON beside it.
+
+        Args:
+            path: Plant file to write, ``*.yaml``; the JSON gets the same name.
+            name: Name of the plant.
+            effort_limit: Of the actuator [N m]; a recording does not tell.
+        """
+        target = Path(path)
+        if target.suffix not in {".yaml", ".yml"}:
+            raise DataError(f"plant file is {target.name!r}; expected a name that ends in .yaml")
+        candidate = self.plant_candidate
+        same = candidate is self.fit.chosen
+        plant = self.plant(name, effort_limit)
+        intervals, remarks = self._file_intervals(plant) if same else ({}, [])
+        torque = self.model.input_kind in {"effort", "position_goal"}
+        remark = "torques are per unit of inertia: the recording does not fix their scale"
+        provenance: dict[str, Any] = {
+            "method": "output error, multiple shooting",
+            "date": self.created,
+            "data": [_fingerprint(p.recording) for p in self.fit.pieces],
+            "friction": candidate.friction,
+            "held_out_rms_rad": candidate.score,
+            "training_rms_rad": candidate.training_rms,
+            "input_gain": candidate.solution.model["input_gain"],
+            "python": platform.python_version(),
+            "remarks": [
+                *([] if torque or self.fit.options.fix_scale else [remark]),
+                *remarks,
+                *self.sentences(),
+            ],
+        }
+        if not same:
+            provenance["remarks"].insert(
+                0,
+                f"the best fit has friction {self.fit.chosen.friction}, which a plant file cannot hold; see the JSON",
+            )
+        write_plant(target, plant, provenance=provenance, intervals=intervals)
+        target.with_suffix(".json").write_text(json.dumps(self.to_dict(), indent=2) + "\n", encoding="utf-8")
+        return target
+
+    def _file_intervals(self, plant: PlantParameters) -> tuple[dict[str, tuple[float, float]], list[str]]:
+        """Return the intervals of what the plant file holds, and remarks on those that are of something else."""
+        intervals: dict[str, tuple[float, float]] = {}
+        remarks = []
+        for field, interval in self.uncertainty.intervals.items():
+            if field not in PlantParameters.__dataclass_fields__:
+                continue
+            value = float(getattr(plant, field))
+            # A delay that may be 0 keeps the part of its interval that a plant can have.
+            low = max(interval.low, 0.0) if field == "transport_delay" else interval.low
+            if low <= value <= interval.high:
+                intervals[field] = (low, interval.high)
+            else:
+                remarks.append(
+                    f"{field} is {value:g} {UNITS[field]} here, and {interval.value:.5g} ({interval.low:.5g} to "
+                    f"{interval.high:.5g}) {UNITS[field]} in the recording: {_DIFFERENCES.get(field, 'see the JSON')}"
+                )
+        return intervals, remarks
+
+
+_DIFFERENCES = {
+    "transport_delay": "an input stamped late, which is no delay of the plant",
+    "damping": "that of the drive, switched on, is added",
+}
+
+
+# BLAS splits long sums by the cores that it finds, and a fit magnifies the last digits: on one core, a recording has
+# the same result on every worker.
+@threadpool_limits.wrap(limits=1, user_api="blas")
+def identify(
+    recordings: Sequence[Recording],
+    options: Options = DEFAULTS,
+    *,
+    held_out: Sequence[Recording] = (),
+    profiles: int = 2,
+) -> IdentificationResult:
+    """Identify a pendulum by output error and judge the result.
+
+    Args:
+        recordings: Data to fit; all of one pendulum, with one kind of input.
+        options: Choices; the defaults serve unseen data.
+        held_out: Recordings to score only.
+        profiles: For how many weak parameters to compute profile intervals.
+    """
+    fit = fit_output_error(recordings, options)
+    tests = residual_tests(fit)
+    uncertainty = assess(fit, tests, profiles=profiles)
+    geometry = check_geometry(fit.model, uncertainty, options.geometry)
+    scores = {}
+    for recording in held_out:
+        if recording.input_kind == "position_goal":
+            scores[recording.name] = free_run(fit.model, recording, fitted=False)
+        else:
+            scores[recording.name] = window_score(fit.model, recording, fit.window)
+    created = datetime.now(timezone.utc).isoformat(timespec="seconds")
+    return IdentificationResult(fit, uncertainty, tests, geometry, scores, created)
+
+
+_LARGEST_VALUE = 1e300
+
+
+def load_fit_model(path: str | Path) -> FitModel:
+    """Return the fit model from the JSON that :meth:`IdentificationResult.write` left beside the plant file."""
+    source = Path(path)
+    try:
+        content = json.loads(source.read_text(encoding="utf-8"))
+    except (OSError, ValueError, RecursionError) as error:
+        raise DataError(f"{source} cannot be read as an identification: {error}") from error
+    if not isinstance(content, dict) or content.get("format") != FORMAT:
+        raise DataError(f"{source} is no identification; expected a JSON file with format {FORMAT!r}")
+    for key in ("parameters", "input_kind", "friction", "duty_gain"):
+        if key not in content:
+            raise DataError(f"{source} has no {key!r}; expected the identification as it was written")
+    values = content["parameters"]
+    if not isinstance(values, dict):
+        raise DataError(f"{source}: 'parameters' is {values!r}; expected numbers by name")
+    for name, value in {**values, "duty_gain": content["duty_gain"]}.items():
+        if isinstance(value, bool) or not isinstance(value, int | float) or not abs(value) <= _LARGEST_VALUE:
+            raise DataError(f"{source}: {name!r} is {str(value)[:40]}; expected a finite number")
+    for key, known in (("input_kind", INPUT_KINDS), ("friction", FRICTION_MODELS)):
+        if not isinstance(content[key], str) or content[key] not in known:
+            raise DataError(f"{source}: {key!r} is {content[key]!r}; expected one of {', '.join(known)}")
+    return FitModel(content["parameters"], content["input_kind"], content["friction"], content["duty_gain"])
+
+
+def _fingerprint(recording: Recording) -> dict[str, Any]:
+    digest = hashlib.sha256()
+    for values in (recording.time, recording.position, recording.input):
+        digest.update(np.ascontiguousarray(values).tobytes())
+    return {
+        "source": str(recording.meta.get("source", "")),
+        "samples": int(recording.time.size),
+        "duration_s": round(recording.duration, 6),
+        "sha256": digest.hexdigest()[:16],
+    }

@@ -1,0 +1,177 @@
+"""Where output-error searches begin: several starts, so that a poor one does not decide.
+
+An equation-error estimate (filtered regression) gives the order of magnitude; it is biased by noise, delay and
+friction, so starts spread around it in inertia, sign and delay, and a short search on few windows ranks them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pendulum_bags.identification.model import FitModel
+from pendulum_bags.identification.problem import Piece
+from pendulum_bags.identification.solver import Solution, solve
+from pendulum_bags.runs.datasets import Recording
+from pendulum_msgs_py.errors import DataError
+
+__all__ = ["equation_error", "first_models", "rank"]
+
+Array = NDArray[np.float64]
+
+
+def equation_error(recording: Recording, *, window: float = 0.2) -> Array:
+    """Return least-squares (J, b, c, G, offset) of J th'' + b th' + c sgn th' + G sin th - offset = u, shape (5,).
+
+    Both sides are multiplied by a bump that vanishes with its derivatives at both ends of a sliding window and
+    integrated by parts: the derivatives fall on the bump, no signal is differentiated, and every regressor
+    passes the same filter.
+
+    Args:
+        recording: Data driven by a torque or a voltage (unit of the result: that of the input).
+        window: Length of the bump [s].
+
+    Source:
+        Shinbrot, Trans. ASME 79, 1957; Preisig and Rippin, Computers chem. Engng 17, 1993 (modulating functions).
+    """
+    time, theta = recording.time, recording.position
+    stamps = recording.input_stamps
+    drive = recording.input if stamps is time else np.interp(time, stamps, recording.input)
+    period = recording.period
+    count = max(7, round(window / period) | 1)
+    if count >= time.size:
+        raise DataError(f"{recording.name} lasts {recording.duration:.3g} s; expected more than {window} s")
+    x = np.linspace(-1.0, 1.0, count + 2)[1:-1]
+    rise = 1.0 - x * x
+    slope = 2.0 / ((count + 1) * period)
+    total = np.sum(rise**4)
+    bump = rise**4 / total
+    bump_1 = -8.0 * x * rise**3 * slope / total
+    bump_2 = (48.0 * x * x * rise**2 - 8.0 * rise**3) * slope**2 / total
+
+    def filtered(values: Array, kernel: Array) -> Array:
+        return np.convolve(values, kernel, mode="valid")
+
+    smooth = np.convolve(np.pad(theta, count // 2, mode="edge"), bump, mode="valid")
+    direction = np.tanh(np.gradient(smooth, time) / 0.1)
+    columns = (
+        filtered(theta, bump_2),
+        filtered(theta, bump_1),
+        filtered(direction, bump),
+        filtered(np.sin(theta), bump),
+        -np.ones(time.size - count + 1),
+    )
+    return np.linalg.lstsq(np.stack(columns, axis=1), filtered(drive, bump), rcond=None)[0]
+
+
+def first_models(
+    recording: Recording, fixed: FitModel, free: Sequence[str], *, spread: bool = True
+) -> list[FitModel]:
+    """Return start models around the equation-error estimate.
+
+    Args:
+        recording: The longest of the recordings.
+        fixed: Values of what is not free (scale, geometry) and input kind.
+        free: Parameters to be fitted.
+        spread: False gives one start only.
+    """
+    period = recording.period
+    delays = (0.0, period, 2.0 * period) if spread and "transport_delay" in free else (0.0,)
+    if fixed.input_kind == "position_goal":
+        return _servo_models(fixed, delays, spread)
+    models: list[FitModel] = []
+    for window in (0.2, 0.4) if spread else (0.3,):
+        estimate = equation_error(recording, window=min(window, 0.2 * recording.duration))
+        models += _around(estimate, recording, fixed, free, delays, spread)
+    return models
+
+
+def _around(
+    estimate: Array,
+    recording: Recording,
+    fixed: FitModel,
+    free: Sequence[str],
+    delays: Sequence[float],
+    spread: bool,
+) -> list[FitModel]:
+    inertia, damping, coulomb, gravity, _ = map(float, estimate)
+    sign = -1.0 if gravity < 0.0 and inertia < 0.0 else 1.0
+    # At standstill or in noise the estimate may be nonsense: the input's torque gives the order of magnitude.
+    torque = float(np.std(recording.input)) or 1.0
+    inertia = max(abs(inertia), 1e-3 * torque)
+    gravity = max(abs(gravity), 1e-2 * torque)
+    damping, coulomb = max(sign * damping, 0.0), max(sign * coulomb, 0.0)
+    scale = 1.0
+    if "input_gain" in free or recording.input_kind == "none":
+        # The scale is fixed elsewhere: by a normalised inertia, or by a known gravity torque.
+        scale = fixed["gravity"] / gravity if "gravity" not in free else fixed["inertia"] / inertia
+    models = []
+    for flip in (sign, -sign) if spread and recording.input_kind != "none" else (sign,):
+        # Feedback through the input biases the scale low; the ratio G / J is firm, so both move together.
+        for factor in (1.0, 2.5, 8.0) if spread else (1.0,):
+            for delay in delays:
+                scaled = 1.0 if "input_gain" in free else factor
+                guess = {
+                    "inertia": scaled * inertia * scale,
+                    "damping": damping * scale,
+                    "gravity": scaled * gravity * scale,
+                    "coulomb_friction": max(coulomb, 1e-3 * gravity) * scale,
+                    "transport_delay": delay,
+                    "input_gain": flip * scale / (factor if "input_gain" in free else 1.0),
+                }
+                values = {**fixed.values, **{name: guess[name] for name in guess if name in free}}
+                if "input_gain" not in free:
+                    values["input_gain"] = flip * abs(fixed["input_gain"])
+                models.append(FitModel(values, fixed.input_kind, "coulomb", fixed.duty_gain))
+    return models
+
+
+def _servo_models(fixed: FitModel, delays: Sequence[float], spread: bool) -> list[FitModel]:
+    # A servo at its set point holds gravity with a fraction of its duty: gain and inertia follow from that.
+    gravity = fixed["gravity"]
+    models = []
+    for gain in (0.2, 0.4, 0.8) if spread else (0.3,):
+        for share in (1.3, 2.0) if spread else (1.5,):
+            for delay in delays[:2]:
+                values = {
+                    **fixed.values,
+                    "inertia": share * fixed["inertia"],
+                    "damping": 0.02 * gravity,
+                    "drive_damping": 0.05 * gravity,
+                    "coulomb_friction": 0.02 * gravity,
+                    "input_gain": gain * gravity,
+                    "transport_delay": delay,
+                }
+                models.append(FitModel(values, fixed.input_kind, "coulomb", fixed.duty_gain))
+    return models
+
+
+def rank(
+    models: Sequence[FitModel],
+    pieces: Sequence[Piece],
+    free: Sequence[str],
+    *,
+    windows: int = 24,
+    keep: int = 3,
+    scale: float = 0.3,
+) -> list[Solution]:
+    """Return the ``keep`` most promising starts after a short search on some of the windows, best first."""
+    total = sum(len(piece.windows) for piece in pieces)
+    stride = max(1, total // windows)
+    few = [piece.subset(range(0, len(piece.windows), stride)) for piece in pieces]
+    trials = [
+        solve(model, few, free, scale=scale, max_iterations=15, tolerance=1e-4, coarse=3.0)
+        for model in models
+    ]
+    trials.sort(key=lambda solution: solution.cost if np.isfinite(solution.cost) else np.inf)
+    chosen: list[Solution] = []
+    for trial in trials:
+        # Starts that ran into the same valley count once.
+        if any(np.isclose(trial.cost, other.cost, rtol=1e-3) for other in chosen):
+            continue
+        chosen.append(trial)
+        if len(chosen) == keep:
+            break
+    return chosen or trials[:1]

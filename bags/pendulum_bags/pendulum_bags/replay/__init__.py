@@ -1,0 +1,1 @@
+"""Plants driven by recorded torque, controllers fed with recorded states."""

@@ -1,0 +1,136 @@
+"""``replay``: drive a plant with recorded torque, or a controller with recorded states, and compare."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from pendulum_msgs_py.programs.executables import cli_main
+
+if TYPE_CHECKING:
+    from pendulum_bags.replay.controller_replay import ControllerReplay
+    from pendulum_bags.replay.input_replay import InputReplay
+
+__all__ = ["main"]
+
+app = typer.Typer(add_completion=False, rich_markup_mode=None)
+
+
+@app.command()
+def replay(
+    recording: Annotated[Path, typer.Argument(help="CSV file of a pendulum, or a bag.")],
+    params: Annotated[
+        str, typer.Option("--params", "-p", help="Plant file, or a preset: thesis, x5_9, dfki.")
+    ] = "",
+    controller: Annotated[
+        str,
+        typer.Option(help="Feed the states to this controller instead; 'recorded' for the one of the bag."),
+    ] = "",
+    set_value: Annotated[
+        list[str] | None,
+        typer.Option("--set", help="Parameter of the controller, such as --set 'q=[100.0, 0.01]'."),
+    ] = None,
+    window: Annotated[
+        float, typer.Option(help="Length of the windows whose initial state is fitted [s].")
+    ] = 1.0,
+    start: Annotated[float | None, typer.Option(help="Leave out what comes before [s].")] = None,
+    stop: Annotated[float | None, typer.Option(help="Leave out what comes after [s].")] = None,
+    mapping: Annotated[str, typer.Option(help="Mapping file of a CSV with other columns or units.")] = "",
+    effort: Annotated[
+        str, typer.Option(help="Torque of a bag: applied (said by the plant) or measured.")
+    ] = "applied",
+    prefix: Annotated[
+        str, typer.Option(help="Namespace of a bag's topics, where it holds several plants: /sim.")
+    ] = "",
+    out: Annotated[
+        Path | None, typer.Option("--out", "-o", help="Folder for figure and replay.json.")
+    ] = None,
+    json_output: Annotated[bool, typer.Option("--json", help="Print JSON instead of tables.")] = False,
+) -> None:
+    """Drive a plant with recorded torque and compare the motion; or a controller with recorded states.
+
+    Example: python -m pendulum_bags replay measured.csv --params dfki
+    """
+    folder = out or Path("bags", "runs", f"replay_{recording.stem}")
+    result: InputReplay | ControllerReplay
+    if controller:
+        from pendulum_bags.replay.controller_replay import parse_values, replay_controller
+
+        result = replay_controller(
+            recording,
+            None if controller == "recorded" else controller,
+            plant=params or None,
+            values=parse_values(set_value or []),
+            prefix=prefix or None,
+        )
+    else:
+        from pendulum_bags.replay.input_replay import replay_recording
+
+        result = replay_recording(
+            recording,
+            params or "thesis",
+            window=window,
+            mapping=mapping or None,
+            effort=effort,
+            start=start,
+            stop=stop,
+            namespace=prefix or None,
+        )
+    content = result.as_dict()
+    files = _write(folder, result, content)
+    if json_output:
+        print(json.dumps(content, indent=2, allow_nan=False))
+        return
+    _print(result, content, chosen=bool(params))
+    print(f"\nfigure  {files[0]}")
+
+
+def _write(folder: Path, result: Any, content: dict[str, Any]) -> list[Path]:
+    from pendulum_bags.figures.render_files import write_figures
+    from pendulum_bags.runs.run_folder import write_json
+
+    files = write_figures([result.figure()], folder)
+    write_json(folder / "replay.json", content)
+    return files
+
+
+def _print(result: InputReplay | ControllerReplay, content: dict[str, Any], *, chosen: bool) -> None:
+    from pendulum_msgs_py.programs.terminal import WholeTable, make_console
+
+    console = make_console()
+    if "horizons" in content:
+        table = WholeTable(title="Error of predictions from measured states, by horizon", title_justify="left")
+        for heading in (
+            "samples",
+            "time [s]".replace("[", r"\["),
+            "rms [rad]".replace("[", r"\["),
+            "predictions",
+        ):
+            table.add_column(heading, justify="right")
+        for row in content["horizons"]:
+            table.add_row(
+                str(row["steps"]), f"{row['time_s']:.4g}", f"{row['rms_rad']:.3g}", str(row["starts"])
+            )
+        console.print(table)
+        console.print(f"plant {content['plant']}" + ("" if chosen else " (--params names another)"), highlight=False)
+        fit, diverges = content["free_run_fit_percent"], content["diverges_at_s"]
+        console.print(
+            f"free run: rms {content['free_run_rms_rad']:.4f} rad, fit {fit:.1f} %, "
+            + ("never diverges" if diverges is None else f"diverges at {diverges:.2f} s")
+        )
+        console.print(
+            f"windows of {content['window_s']:g} s: rms [bold]{content['rms_rad']:.4f} rad[/bold]",
+            highlight=False,
+        )
+        return
+    console.print(f"{content['controller']}: {content['description']}", highlight=False, markup=False)
+    console.print(result.sentence(), highlight=False)
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run the command line."""
+    return cli_main(app, argv, name="python -m pendulum_bags replay")

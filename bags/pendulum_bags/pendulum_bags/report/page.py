@@ -1,0 +1,139 @@
+"""The report as one HTML file that needs nothing else: no network, no folder beside it."""
+
+from __future__ import annotations
+
+import base64
+import gzip
+import json
+from collections.abc import Sequence
+from functools import lru_cache
+from importlib import resources
+from typing import Any
+
+from pendulum_bags.figures.data import ReportData
+from pendulum_bags.figures.figure import Figure
+from pendulum_bags.figures.numbers import quantity
+from pendulum_bags.figures.render_plotly import graphs_of
+from pendulum_bags.report.animation import animation_of
+from pendulum_bags.report.tables import Table, provenance_table
+from pendulum_bags.runs.run_data import timing_warning
+
+__all__ = ["render_page"]
+
+SECTIONS = (
+    "Verdict",
+    "Paired comparison",
+    "Repeated runs",
+    "Plants under noise",
+    "The thesis's analysis",
+    "Dynamic phase",
+    "Timing",
+    "Experiment 1: inertia and damping",
+    "Experiment 2: gravity",
+    "Model",
+    "A real pendulum",
+)
+
+
+def render_page(
+    data: ReportData,
+    figures: Sequence[Figure],
+    tables: Sequence[Table],
+    missing: Sequence[tuple[str, str]],
+    *,
+    title: str,
+    made_at: str,
+) -> str:
+    """Return the HTML text of the report."""
+    import jinja2
+
+    templates = resources.files("pendulum_bags.report").joinpath("templates")
+
+    def read(name: str) -> str:
+        return templates.joinpath(name).read_text(encoding="utf-8")
+
+    environment = jinja2.Environment(
+        loader=jinja2.FunctionLoader(read), autoescape=True, trim_blocks=True, lstrip_blocks=True
+    )
+    sections = []
+    graphs: dict[str, Any] = {}
+    for heading in SECTIONS:
+        items: list[dict[str, Any]] = []
+        for figure in figures:
+            if figure.section == heading:
+                parts = graphs_of(figure)
+                names = [f"{figure.name}-{i}" for i in range(len(parts))]
+                graphs.update(zip(names, parts, strict=True))
+                items.append({"figure": figure, "graphs": names})
+        items += [{"table": table} for table in tables if table.section == heading]
+        if items:
+            sections.append({"title": heading, "anchor": _anchor(heading), "entries": items})
+    verdict = data.comparison.verdict
+    return environment.get_template("report.html.j2").render(
+        title=title,
+        made_at=made_at,
+        verdict=verdict,
+        unpaired=data.comparison.unpaired_verdict,
+        noise_note=_noise_note(data),
+        is_paired=data.comparison.is_paired,
+        timing_warning=timing_warning(data.comparison.plants),
+        facts=_facts(data),
+        sections=sections,
+        missing=missing,
+        provenance=provenance_table(data),
+        animation=_script_json(animation_of(data)),
+        graphs=_script_json(graphs),
+        plotly=_packed_plotly(),
+        style=read("report.css"),
+        script=read("report.js"),
+        diagram=read("block_diagram.svg"),
+    )
+
+
+def _facts(data: ReportData) -> list[tuple[str, str]]:
+    comparison = data.comparison
+    pair = comparison.pairs[0]
+    plants = comparison.plants
+    facts = [
+        ("runs", str(len(comparison.pairs))),
+        ("std of θ, simulation", quantity(plants["sim"]["std_theta"], "rad")),
+        ("std of θ, hardware", quantity(plants["hw"]["std_theta"], "rad")),
+    ]
+    if comparison.is_paired:
+        facts.append(("paths apart (rms)", quantity(float(pair.as_dict()["rms_position"]), "rad")))
+    facts.append(
+        (
+            "hardware answers",
+            f"{abs(1e3 * pair.response.delay):.1f} ms {'later' if pair.response.delay >= 0.0 else 'earlier'}",
+        )
+    )
+    facts.append(("seed", str(data.summary.get("seed", "unknown"))))
+    return facts
+
+
+def _noise_note(data: ReportData) -> str:
+    """Say how long each side held its noise, where that differs: it matters more than the plant."""
+    hold = data.comparison.unpaired["noise_hold_time"]
+    sim, hw = hold["sim"], hold["hw"]
+    if not sim or not hw or abs(sim - hw) < 1e-6:
+        return ""
+    return (
+        f"The simulation by the thesis's own protocol holds each noise sample for {1e3 * sim:.3g} ms, the hardware for "
+        f"{1e3 * hw:.3g} ms; noise that is held longer moves the pendulum more, whatever the plant."
+    )
+
+
+def _anchor(text: str) -> str:
+    return "".join(c if c.isalnum() else "-" for c in text.lower()).strip("-")
+
+
+def _script_json(value: Any) -> str:
+    """Return JSON that may stand inside a script element."""
+    return json.dumps(value, separators=(",", ":"), allow_nan=False).replace("<", "\\u003c")
+
+
+@lru_cache(maxsize=1)
+def _packed_plotly() -> str:
+    """Return plotly.js, gzipped and in base64: a third of its size, and browsers unpack gzip by themselves."""
+    source = resources.files("plotly").joinpath("package_data").joinpath("plotly.min.js").read_bytes()
+    return base64.b64encode(gzip.compress(source, 9, mtime=0)).decode("ascii")

@@ -1,0 +1,101 @@
+"""``report``: a page with a verdict, figures and provenance, from one run folder or from several, pooled."""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from pendulum_msgs_py.errors import BagError
+from pendulum_msgs_py.programs.executables import cli_main
+
+__all__ = ["main"]
+
+app = typer.Typer(add_completion=False, rich_markup_mode=None)
+
+
+@app.command()
+def report(
+    folders: Annotated[
+        list[Path],
+        typer.Argument(help="Run folders (each with sim and hw), or two bags; folders of trials join in."),
+    ],
+    out: Annotated[
+        Path | None,
+        typer.Option("--out", "-o", help="Folder of the report; by default the run folder itself."),
+    ] = None,
+    margin: Annotated[
+        list[str] | None,
+        typer.Option("--margin", help="As for compare: NAME=NUMBER, several times if wanted."),
+    ] = None,
+    recording: Annotated[
+        list[Path] | None,
+        typer.Option(help="Recording of a real pendulum to replay in the report (CSV or bag)."),
+    ] = None,
+    png_only: Annotated[bool, typer.Option("--png-only", help="Leave out the PDF figures.")] = False,
+) -> None:
+    """Write report.html and figures/ for one run, or for several runs pooled.
+
+    Example: python -m pendulum_bags report bags/runs/2026-01-31T12-00-00Z_thesis
+    """
+    from pendulum_bags.comparison import Margins, compare_folders, compare_runs
+    from pendulum_bags.report import write_report
+
+    started = time.monotonic()
+    trials = [folder for folder in folders if (folder / "trial_1").exists()]
+    folders = [folder for folder in folders if folder not in trials]
+    if trials and not folders:
+        raise BagError(
+            f"{trials[0]} holds trials and no run; expected a run folder beside it (identify --page shows trials alone)"
+        )
+    margins = Margins.parse(margin)
+    summary = None
+    if all((folder / "sim").exists() and (folder / "hw").exists() for folder in folders):
+        if not margin and len(folders) == 1:
+            summary = _summary(folders[0])
+        result = compare_folders(folders, margin=margins)
+        target = out or (folders[0] if len(folders) == 1 else _common(folders))
+    elif len(folders) == 2:
+        result = compare_runs(folders[0], folders[1], margin=margins)
+        target = out or _common(folders)
+    else:
+        bad = next(
+            folder for folder in folders if not ((folder / "sim").exists() and (folder / "hw").exists())
+        )
+        raise BagError(f"run folder {bad} has no bags sim and hw; expected run folders, or two bags")
+    page = write_report(
+        target,
+        summary,
+        comparison=result,
+        folders=folders if len(folders) > 1 else (),
+        trials=trials,
+        recordings=recording,
+        formats=("png",) if png_only else ("png", "pdf"),
+    )
+    print(result.verdict.sentence)
+    print(f"report  {page} ({page.stat().st_size / 1e6:.1f} MB, {time.monotonic() - started:.1f} s)")
+    print(f"figures {page.parent / 'figures'}")
+
+
+def _summary(folder: Path) -> dict[str, object] | None:
+    """Return the run's own summary: it knows what was set; a damaged one is no obstacle."""
+    try:
+        content = json.loads((folder / "summary.json").read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return None
+    kept = ("experiment", "seed", "strategy", "versions", "git_revision")
+    return {key: content[key] for key in kept if key in content} if isinstance(content, dict) else None
+
+
+def _common(folders: Sequence[Path]) -> Path:
+    """Return where a report of several goes: ``report`` beside the first."""
+    return folders[0].resolve().parent / "report"
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run the command line."""
+    return cli_main(app, argv, name="python -m pendulum_bags report")

@@ -1,0 +1,327 @@
+"""Tables of the report: plants, statistics of the difference, tests, metrics, eigenvalues, model, provenance."""
+
+from __future__ import annotations
+
+import json
+import math
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from pendulum_bags.figures.data import ReportData
+from pendulum_bags.figures.numbers import quantity
+from pendulum_bags.figures.trial_figures import GRAVITY, INERTIA, UNITS, TrialSet
+from pendulum_lqr.design import continuous_lqr
+from pendulum_lqr.model import linearise, sort_poles
+from pendulum_msgs_py.plants.plant_parameters import PLANT_SPECS
+
+__all__ = ["Table", "make_tables", "provenance_table"]
+
+WEIGHTS = ((1.0, 0.01, 0.1), (1.0, 0.1, 0.1), (100.0, 0.01, 0.1), (100.0, 0.1, 0.1))
+"""q11, q22 and r of the combinations in the thesis."""
+
+
+_NUMERIC = re.compile(r"^[−–±]?[\d.]*(×10[⁻⁰¹²³⁴⁵⁶⁷⁸⁹]+)?$")
+
+
+@dataclass(frozen=True)
+class Table:
+    """A table.
+
+    Args:
+        title: Heading.
+        sentence: What it shows.
+        head: Column headings; the first column holds row names.
+        rows: Cells as text.
+        section: Heading of the section it belongs to.
+    """
+
+    title: str
+    sentence: str
+    head: Sequence[str]
+    rows: Sequence[Sequence[str]]
+    section: str
+
+    @property
+    def numeric(self) -> list[bool]:
+        """Return for each column whether it holds numbers only, which then align to the right."""
+        return [all(_NUMERIC.match(row[i]) for row in self.rows) for i in range(len(self.head))]
+
+
+def make_tables(data: ReportData) -> list[Table]:
+    """Return all tables that the data allow, in the order of the report."""
+    regressions = [table for trials in data.trials for table in _regression(trials)]
+    makers = (_plants, _tests, _paired, _unpaired, _metrics, _eigenvalues, _model)
+    return [table for maker in makers for table in [maker(data)] if table is not None] + regressions
+
+
+_PLANT_NAMES = {"sim": "simulation", "hw": "hardware", "sim_500hz": "simulation, own noise"}
+_PLANT_ROWS = (
+    ("sampling rate [Hz]", "rate_hz", 4),
+    ("missed deadlines", "missed_deadlines", 6),
+    ("noise sample held for [s]", "noise_hold_time", 3),
+    ("std of θ [rad]", "std_theta", 4),
+    ("std of θ′ [rad/s]", "std_theta_dot", 4),
+    ("largest |u| [N m]", "max_abs_u", 4),
+    ("rms of u [N m]", "rms_u", 4),
+    ("samples", "samples", 8),
+    ("effective samples of θ", "effective_samples", 3),
+)
+
+
+def _plants(data: ReportData) -> Table:
+    plants = data.comparison.plants
+    rows = [
+        (label, *(_cell(plant.get(key), digits) for plant in plants.values()))
+        for label, key, digits in _PLANT_ROWS
+    ]
+    sim, hw = plants["sim"], plants["hw"]
+    sentence = (
+        f"Torque stays below {quantity(max(sim['max_abs_u'], hw['max_abs_u']), 'N m')} on both plants; "
+        f"{int(sim['missed_deadlines'])} deadlines were missed in simulation and {int(hw['missed_deadlines'])} on "
+        "hardware."
+    )
+    return Table(
+        "Plants under noise", sentence, ("", *(_PLANT_NAMES[name] for name in plants)), rows, "Verdict"
+    )
+
+
+def _tests(data: ReportData) -> Table:
+    rows = []
+    for test in data.comparison.verdict.tests:
+        interval = test.interval
+        margin = (
+            f"{quantity(test.low)} to {quantity(test.high)}"
+            if math.isfinite(test.low)
+            else f"below {quantity(test.high)}"
+        )
+        more = (
+            "–"
+            if test.more_runs == 0
+            else ("more runs hardly help" if test.more_runs is None else str(test.more_runs))
+        )
+        rows.append(
+            (
+                test.quantity + (f" [{test.unit}]" if test.unit != "-" else ""),
+                quantity(interval.estimate),
+                f"{quantity(interval.low)} to {quantity(interval.high)}",
+                margin,
+                test.outcome.value,
+                quantity(test.smallest_margin),
+                more,
+            )
+        )
+    head = (
+        "quantity",
+        "estimate",
+        "90 % interval",
+        "margin",
+        "result",
+        "smallest margin that would hold",
+        "runs to add",
+    )
+    margins = data.comparison.verdict.margins
+    whose = "were stated" if margins.stated else "are defaults"
+    if margins.stated and margins.defaults:
+        whose += f", but for {', '.join(margins.defaults)}, which are defaults"
+    sentence = (
+        "Two one-sided tests at 5 % each, intervals by block bootstrap. Ratios are hardware per simulation; the path "
+        "distance is the rms distance per standard deviation of the hardware's angle. "
+        f"The margins {whose}."
+    )
+    return Table("Tests against the margins", sentence, head, rows, "Verdict")
+
+
+def _statistics(block: Mapping[str, Any], title: str, sentence: str, section: str) -> Table:
+    names = list(block["position"])
+    rows = [(name, _cell(block["position"][name], 4), _cell(block["velocity"][name], 4)) for name in names]
+    return Table(title, sentence, ("", "Δθ [rad]", "Δθ′ [rad/s]"), rows, section)
+
+
+def _paired(data: ReportData) -> Table | None:
+    block = data.comparison.paired
+    if "position" not in block:
+        return None
+    sentence = (
+        f"Hardware minus simulation under one disturbance, at the slower plant's stamps: "
+        f"rms {quantity(block['rms_position'], 'rad')} and {quantity(block['rms_velocity'], 'rad/s')}."
+    )
+    return _statistics(block, "Statistics of the paired difference", sentence, "Paired comparison")
+
+
+def _unpaired(data: ReportData) -> Table:
+    block = data.comparison.unpaired
+    position, velocity = block["position"], block["velocity"]
+    small = abs(position["mean"]) < 0.01 and abs(velocity["mean"]) < 0.05
+    sentence = (
+        "As the thesis concludes, the mean differences of position and velocity are close to zero "
+        "(below 0.01 rad and 0.05 rad/s)."
+        if small
+        else f"Unlike in the thesis, the means are not close to zero: {quantity(position['mean'], 'rad')} and "
+        f"{quantity(velocity['mean'], 'rad/s')}."
+    )
+    return _statistics(block, "Statistics of the difference", sentence, "The thesis's analysis")
+
+
+def _metrics(data: ReportData) -> Table:
+    rows = [
+        (
+            f"{row['metric'].replace('_', ' ')} [{row['unit'].replace('^2', '²')}]",
+            _cell(row["sim"], 4),
+            _cell(row["hw"], 4),
+            row["meaning"],
+        )
+        for row in data.comparison.metrics
+    ]
+    ratio = {row["metric"]: (row["sim"], row["hw"]) for row in data.comparison.metrics}
+    rough = ratio.get("smoothness", (None, None))
+    sentence = (
+        f"The torque changes at {quantity(rough[0], 'N m/s')} (rms) in simulation and {quantity(rough[1], 'N m/s')} "
+        "on hardware."
+        if rough[0] is not None and rough[1] is not None
+        else "Metrics of the regulation."
+    )
+    return Table(
+        "Metrics of the regulation",
+        sentence,
+        ("metric", "simulation", "hardware", "meaning"),
+        rows,
+        "Paired comparison",
+    )
+
+
+def _eigenvalues(data: ReportData) -> Table | None:
+    if data.plant is None or data.plant.drivetrain is not None:
+        return None
+    model = linearise(data.plant)
+    open_loop = sort_poles(np.linalg.eigvals(model.A).astype(complex))
+    rows = [("none", "–", "–", "–", _poles(open_loop), "–")]
+    for number, (q11, q22, r) in enumerate(WEIGHTS, start=1):
+        gain = continuous_lqr(model, [q11, q22], r)
+        values = (f"{q11:g}", f"{q22:g}", f"{r:g}", _poles(gain.poles), ", ".join(f"{k:.6f}" for k in gain.K))
+        rows.append((str(number), *values))
+    chosen = data.run.get("controller", {})
+    used = next(
+        (
+            n
+            for n, w in enumerate(WEIGHTS, 1)
+            if [*chosen.get("q", ()), chosen.get("r")] == [w[0], w[1], w[2]]
+        ),
+        None,
+    )
+    unstable = float(np.max(open_loop.real))
+    sentence = f"Upright, the plant runs away at {unstable:.6f} 1/s without control; " + (
+        f"this run used combination {used}." if used else "this run used other weights than these."
+    )
+    head = ("#", "q11", "q22", "r", "eigenvalues [1/s]", "K [N m/rad, N m s/rad]")
+    return Table("Eigenvalues of the linearised system", sentence, head, rows, "Model")
+
+
+def _poles(poles: Any) -> str:
+    return ", ".join(
+        f"{pole.real:.6f}".replace("-", "−") if abs(pole.imag) < 1e-12 else f"{pole:.6g}"
+        for pole in np.atleast_1d(poles)
+    )
+
+
+def _model(data: ReportData) -> Table | None:
+    plant = data.plant
+    if plant is None:
+        return None
+    rows = [
+        (spec.name, quantity(getattr(plant, spec.name), "", 6), spec.unit, spec.description)
+        for spec in PLANT_SPECS
+    ]
+    sentence = f"Simulation and design of the controller use the plant {plant.name!r}: M θ″ + b θ′ + G sin θ = u + d."
+    return Table(
+        "Parameters of the model", sentence, ("parameter", "value", "unit", "meaning"), rows, "Model"
+    )
+
+
+def _regression(trials: TrialSet) -> list[Table]:
+    """Return the regression table of an experiment, trial by trial, and its averaged coefficients."""
+    result = trials.result
+    first = result.kind == "inertia_damping"
+    section = INERTIA if first else GRAVITY
+    rows = [
+        (
+            f"trial {number}, {name}",
+            quantity(float(trial.values[i]), "", 5),
+            quantity(float(trial.errors[i])),
+            quantity(float(trial.t[i])),
+            quantity(float(trial.p[i])),
+            quantity(float(trial.intervals[i, 0]), "", 5),
+            quantity(float(trial.intervals[i, 1]), "", 5),
+            f"{trial.r_squared:.5f}",
+        )
+        for number, trial in enumerate(result.trials, start=1)
+        for i, name in enumerate(trial.names)
+    ]
+    head = ("coefficient", "value", "standard error", "t", "p", "95 % from", "to", "R² (uncentred)")
+    averages = [
+        (
+            f"{name} [{UNITS[name]}]",
+            quantity(value, "", 5),
+            *(quantity(end, "", 5) for end in result.intervals[name]),
+        )
+        for name, value in result.average.items()
+    ]
+    number = "1" if first else "2"
+    return [
+        Table(f"Regression of experiment {number}", " ".join(result.sentences), head, rows, section),
+        Table(
+            f"Coefficients of experiment {number}",
+            f"Means over {len(result.trials)} trials, with the intervals of those means.",
+            ("coefficient", "mean", "95 % from", "to"),
+            averages,
+            section,
+        ),
+    ]
+
+
+def provenance_table(data: ReportData) -> Table:
+    """Return where the data come from: bags, seed, strategy, versions, settings."""
+    summary, run = data.summary, data.run
+    rows: list[tuple[str, str]] = [
+        ("seed", str(summary.get("seed", "unknown"))),
+        ("effort strategy", str(summary.get("strategy", "unknown"))),
+        ("revision", str(run.get("git_revision") or summary.get("git_revision") or "unknown")),
+    ]
+    for pair in data.comparison.pairs:
+        for one in (pair.simulation, pair.hardware):
+            plant = one.metadata.get("pendulum.run", {})
+            name = plant.get("plant", "unknown") if isinstance(plant, Mapping) else "unknown"
+            rows.append((f"bag of the {one.label}", f"{_short_path(one.source)} (plant {name})"))
+            rows += [(f"damage of the {one.label}'s bag", text) for text in one.damage]
+    for run_data in data.comparison.own:
+        if all(run_data is not pair.simulation for pair in data.comparison.pairs):
+            rows.append((f"bag of the {run_data.label}", _short_path(run_data.source)))
+    for key in ("controller", "disturbance"):
+        if key in run:
+            rows.append((key, json.dumps(run[key])))
+    versions = summary.get("versions") or run.get("versions") or {}
+    rows += [(f"version of {name}", str(version)) for name, version in versions.items()]
+    return Table(
+        "Provenance",
+        "Everything that is needed to make these figures again.",
+        ("what", "value"),
+        rows,
+        "Provenance",
+    )
+
+
+def _short_path(path: str) -> str:
+    """Return folder and bag: the rest of the path is nobody else's business."""
+    return "/".join(Path(path).parts[-2:])
+
+
+def _cell(value: Any, digits: int) -> str:
+    if value is None:
+        return "–"
+    if isinstance(value, int) or (isinstance(value, float) and value.is_integer() and abs(value) < 1e6):
+        return f"{int(value)}".replace("-", "−")
+    return quantity(float(value), "", digits)

@@ -1,0 +1,132 @@
+"""Write a report: ``report.html`` and the same figures as PNG and PDF."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping, Sequence
+from datetime import datetime, timezone
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from pendulum_bags.figures.catalogue import make_figures
+from pendulum_bags.figures.data import ReportData
+from pendulum_bags.figures.render_files import write_figures
+from pendulum_bags.figures.trial_figures import read_trials
+from pendulum_bags.report.page import render_page
+from pendulum_bags.report.tables import make_tables
+from pendulum_msgs_py.errors import BagError, PendulumError
+
+if TYPE_CHECKING:
+    from pendulum_bags.comparison import Comparison
+    from pendulum_bags.comparison.compare import MarginArgument
+    from pendulum_bags.replay.input_replay import InputReplay
+
+__all__ = ["find_real_recording", "write_report"]
+
+REAL_RECORDING = Path("dfki_torque_limited_simple_pendulum", "ddp_measured.csv")
+
+
+def write_report(
+    run_folder: str | os.PathLike[str],
+    summary: Mapping[str, Any] | None = None,
+    *,
+    comparison: Comparison | None = None,
+    folders: Sequence[str | os.PathLike[str]] = (),
+    trials: Sequence[str | os.PathLike[str]] = (),
+    recordings: Sequence[Path] | None = None,
+    margin: MarginArgument = None,
+    formats: Sequence[str] = ("png", "pdf"),
+) -> Path:
+    """Write ``report.html`` and ``figures/`` into a folder.
+
+    Args:
+        run_folder: Where the report goes; also the run folder (``sim``, ``hw``, perhaps ``sim_500hz``) to read unless
+            ``comparison`` or ``folders`` is given.
+        summary: Content of ``summary.json``; by default that of the comparison.
+        comparison: A comparison that has been made already.
+        folders: Run folders to pool.
+        trials: Folders of the thesis's identification experiments, each with bags ``trial_1``, ``trial_2``, ...
+        recordings: Recordings of real pendulums to replay; by default the one that lies beside the project, if any.
+        margin: What difference does not matter.
+        formats: Formats of the figures.
+
+    Returns:
+        Path of the page.
+
+    Raises:
+        BagError: A bag cannot be read or the folder not be written.
+        DataError: A bag lacks what is needed.
+    """
+    from pendulum_bags.comparison import compare_folders
+
+    out = Path(run_folder)
+    if comparison is None:
+        comparison = compare_folders(
+            list(folders) or [out], margin=_margin_of(summary) if margin is None else margin
+        )
+    content = {**comparison.to_json(), **(summary or {})}
+    found = [find_real_recording()] if recordings is None else list(recordings)
+    replays = [
+        replay
+        for path in found
+        if path is not None
+        for replay in _replay(path, required=recordings is not None)
+    ]
+    names = [Path(folder).name for folder in folders] or [out.resolve().name]
+    data = ReportData(comparison, content, replays, names, [read_trials(path) for path in trials])
+    figures, missing = make_figures(data)
+    page = render_page(
+        data,
+        figures,
+        make_tables(data),
+        missing,
+        title=names[0] if len(names) == 1 else f"{len(names)} runs",
+        made_at=datetime.now(timezone.utc).strftime("%Y-%m-%d %H:%M UTC"),
+    )
+    target = out / "report.html"
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+        partial = out / ".report.html.part"
+        partial.write_text(page, encoding="utf-8")
+        partial.replace(target)
+    except OSError as error:
+        raise BagError(f"report {target} cannot be written: {error.strerror or error}") from error
+    write_figures(figures, out / "figures", formats)
+    return target
+
+
+def find_real_recording() -> Path | None:
+    """Return the recording of a real pendulum that lies beside the project, None where there is none.
+
+    ``PENDULUM_SHARED_DATA`` names the folder of recordings; by default it is looked for as ``shared/data`` beside
+    the folder that holds this checkout.
+    """
+    told = os.environ.get("PENDULUM_SHARED_DATA")
+    places = (
+        [Path(told)]
+        if told
+        else [parent / "shared" / "data" for parent in Path(__file__).resolve().parents[4:6]]
+    )
+    return next((place / REAL_RECORDING for place in places if (place / REAL_RECORDING).is_file()), None)
+
+
+def _replay(path: Path, *, required: bool) -> list[InputReplay]:
+    from pendulum_bags.replay.input_replay import replay_recording
+
+    try:
+        return [replay_recording(path, "dfki")]
+    except PendulumError:
+        # What merely lies beside the project must not cost us the report; what was asked for must.
+        if required:
+            raise
+        return []
+
+
+def _margin_of(summary: Mapping[str, Any] | None) -> MarginArgument:
+    """Return the margins that a summary was made with, so that page and summary agree."""
+    verdict = (summary or {}).get("verdict")
+    margins = verdict.get("margins") if isinstance(verdict, Mapping) else None
+    if not isinstance(margins, Mapping) or not margins.get("stated"):
+        return None
+    left_out = {"stated", "defaults", *margins.get("defaults", ())}
+    return {name: value for name, value in margins.items() if name not in left_out}

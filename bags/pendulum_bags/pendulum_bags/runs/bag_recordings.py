@@ -1,0 +1,96 @@
+"""Recordings out of rosbag2 bags: joint states and what drove them, under whatever namespace they were recorded."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from pendulum_bags.runs.datasets import Recording
+from pendulum_msgs_py.errors import DataError
+from pendulum_rosbag.reader import Bag, read_bag
+
+__all__ = ["phases", "read_bag_recording"]
+
+_NS = 1e-9
+
+
+def read_bag_recording(
+    path: str | Path, *, effort: str = "applied", namespace: str | None = None
+) -> Recording:
+    """Read position and velocity from ``joint_states`` and the input that belongs to them.
+
+    Args:
+        path: Bag folder or storage file.
+        effort: ``applied``: topic ``applied_effort``, held until its next sample; ``measured``: the effort of
+            ``joint_states``, varying linearly.
+        namespace: For a bag with several plants, such as ``/sim``; by default the only one.
+
+    Raises:
+        DataError: for a bag without joint states, several plants and no namespace, or too few samples.
+    """
+    if effort not in {"applied", "measured"}:
+        raise DataError(f"effort is {effort!r}; expected 'applied' or 'measured'")
+    bag = read_bag(path)
+    states_topic = _find(bag, "joint_states", namespace)
+    states = bag.array(states_topic)
+    # A plant in lockstep sends a state again when its answer was missed: the same stamp is the same state.
+    states = states[np.append(True, np.diff(states["stamp_ns"]) != 0)] if states.size else states
+    origin = int(states["stamp_ns"][0]) if states.size else 0
+    time = (states["stamp_ns"] - origin) * _NS
+    meta: dict[str, Any] = {
+        "source": str(path),
+        "topic": states_topic,
+        "start_ns": origin,
+        "effort": effort,
+        "phases": phases(bag, origin),
+        **{key: value for key, value in bag.metadata.items() if key.startswith("pendulum.")},
+    }
+    velocity = None if np.isnan(states["velocity"]).all() else states["velocity"]
+    applied_topic = states_topic.removesuffix("joint_states") + "applied_effort"
+    if effort == "applied" and applied_topic in bag.topics:
+        applied = bag.array(applied_topic)
+        stamps, first = np.unique(applied["stamp_ns"], return_index=True)
+        return Recording(
+            time,
+            states["position"],
+            velocity,
+            applied["effort"][first],
+            hold="zero",
+            input_time=(stamps - origin) * _NS,
+            meta={**meta, "input_topic": applied_topic},
+        )
+    if np.isnan(states["effort"]).all():
+        raise DataError(
+            f"bag {path} has no topic {applied_topic} and no effort in {states_topic}; expected either"
+        )
+    return Recording(
+        time, states["position"], velocity, states["effort"], meta={**meta, "effort": "measured"}
+    )
+
+
+def _find(bag: Bag, name: str, namespace: str | None) -> str:
+    if namespace is not None:
+        topic = f"/{namespace.strip('/')}/{name}".replace("//", "/")
+        if topic not in bag.topics:
+            raise DataError(
+                f"bag {bag.path} has no topic {topic}; it has {', '.join(sorted(bag.topics)) or 'none'}"
+            )
+        return topic
+    found = sorted(topic for topic in bag.topics if topic.rsplit("/", 1)[-1] == name)
+    if len(found) != 1:
+        listing = ", ".join(found or sorted(bag.topics)) or "none"
+        raise DataError(
+            f"bag {bag.path} has {len(found)} topics called {name}; expected one (it has {listing})"
+        )
+    return found[0]
+
+
+def phases(bag: Bag, origin: int) -> list[tuple[float, str, dict[str, Any]]]:
+    """Return the events of a bag as (time since ``origin`` [s], name, content), in order."""
+    return [
+        ((int(event["stamp_ns"]) - origin) * _NS, str(event.get("name", "")), event)
+        for event in bag.events()
+        if "stamp_ns" in event
+    ]

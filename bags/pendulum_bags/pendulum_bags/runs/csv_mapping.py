@@ -1,0 +1,312 @@
+"""CSV files of any column order, unit and sign, by a small mapping file.
+
+Example::
+
+    format: pendulum_columns/1
+    time: {column: time, unit: ms}          # or {period: 0.025, unit: s} where there is no time column
+    position: {column: alpha, unit: deg, sign: -1, offset: 180.0}
+    velocity: {column: alpha_dot, unit: deg/s}
+    input: {column: u, unit: V, hold: zero}
+
+``offset`` has the column's unit and is added before sign and unit are applied: value = sign * (raw + offset).
+The unit of ``input`` says what drives the joint: a torque, a voltage, or an angle (set point of a servo).
+"""
+
+from __future__ import annotations
+
+import csv
+import io
+import math
+from collections.abc import Mapping
+from difflib import get_close_matches
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from pendulum_bags.runs.datasets import Array, Recording, first_of_each_stamp
+from pendulum_msgs_py.errors import DataError
+from pendulum_msgs_py.parameters import load_yaml
+
+__all__ = ["MAPPINGS", "UNITS", "read_csv"]
+
+FORMAT = "pendulum_columns/1"
+
+UNITS: Mapping[str, Mapping[str, float]] = {
+    "time": {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9},
+    "angle": {"rad": 1.0, "deg": math.pi / 180.0, "rev": 2.0 * math.pi},
+    "velocity": {
+        "rad/s": 1.0,
+        "deg/s": math.pi / 180.0,
+        "rev/s": 2.0 * math.pi,
+        "rpm": math.pi / 30.0,
+    },
+    "effort": {"N m": 1.0, "Nm": 1.0, "mN m": 1e-3, "kg cm": 0.0980665},
+    "voltage": {"V": 1.0, "mV": 1e-3},
+}
+"""Factor from each accepted unit to SI, by quantity."""
+
+MAPPINGS: Mapping[str, Mapping[str, Any]] = {
+    "pendulum": {
+        "time": {"column": "time", "unit": "s"},
+        "position": {"column": "position", "unit": "rad"},
+        "velocity": {"column": "velocity", "unit": "rad/s", "optional": True},
+        "input": {"column": ["torque", "effort"], "unit": "N m", "hold": "linear"},
+    },
+    "voltage_40hz": {
+        "time": {"period": 0.025, "unit": "s"},
+        "position": {"column": "th", "unit": "rad"},
+        "input": {"column": "u", "unit": "V", "hold": "zero"},
+    },
+}
+"""Built-in mappings: ``pendulum`` (the default) and ``voltage_40hz`` (a motor-driven disc, no time column)."""
+
+_SECTION_KEYS = {
+    "time": {"column", "unit", "period", "start"},
+    "position": {"column", "unit", "sign", "offset"},
+    "velocity": {"column", "unit", "sign", "offset", "optional"},
+    "input": {"column", "unit", "sign", "offset", "hold"},
+}
+_TOP_KEYS = {"format", "delimiter", "rows", "meta", *_SECTION_KEYS}
+
+
+def read_csv(path: str | Path, mapping: str | Path | Mapping[str, Any] | None = None) -> Recording:
+    """Read a CSV file into a recording.
+
+    Args:
+        path: The file; its first line names the columns, with or without a leading ``#``.
+        mapping: Mapping file, name of one of ``MAPPINGS``, or the mapping itself.
+
+    Raises:
+        DataError: naming file, column, row and what was expected.
+    """
+    source = Path(path)
+    rules, origin = _load_mapping(mapping)
+    delimiter = rules.get("delimiter", ",")
+    if not isinstance(delimiter, str) or len(delimiter) != 1 or delimiter in '\r\n"':
+        raise DataError(f"{origin}: delimiter is {delimiter!r}; expected one character")
+    names, table = _read_table(source, delimiter)
+    first, last = _row_range(rules, len(table), origin)
+    table = table[first:last]
+    given = rules.get("meta") or {}
+    if not isinstance(given, Mapping):
+        raise DataError(f"{origin}: meta is {given!r}; expected names and values")
+    meta = {"source": str(source), "mapping": origin, **given}
+    if first or last < len(table) + first:
+        meta["rows"] = [first, last]
+    time = _time(rules["time"], names, table, source, origin, first)
+    position = _column("position", rules["position"], "angle", names, table, source, origin, first)
+    assert position is not None
+    velocity = None
+    if "velocity" in rules:
+        velocity = _column("velocity", rules["velocity"], "velocity", names, table, source, origin, first)
+    drive, kind, hold = np.zeros_like(time), "none", "linear"
+    if "input" in rules:
+        section = rules["input"]
+        quantity = _quantity_of(section.get("unit"), origin)
+        column = _column("input", section, quantity, names, table, source, origin, first)
+        assert column is not None
+        drive = column
+        kind = {"effort": "effort", "voltage": "voltage", "angle": "position_goal"}[quantity]
+        hold = str(section.get("hold", "linear" if kind == "effort" else "zero"))
+    _check_magnitudes(source, time, position)
+    kept = first_of_each_stamp(time)
+    if not kept.all():
+        meta["repeated_stamps"] = int(np.sum(~kept))
+        time, position, drive = time[kept], position[kept], drive[kept]
+        velocity = None if velocity is None else velocity[kept]
+    return Recording(time, position, velocity, drive, input_kind=kind, hold=hold, meta=meta)
+
+
+def _load_mapping(mapping: str | Path | Mapping[str, Any] | None) -> tuple[Mapping[str, Any], str]:
+    if mapping is None:
+        rules, origin = MAPPINGS["pendulum"], "built-in mapping 'pendulum'"
+    elif isinstance(mapping, Mapping):
+        rules, origin = mapping, "mapping"
+    elif str(mapping) in MAPPINGS:
+        rules, origin = MAPPINGS[str(mapping)], f"built-in mapping {str(mapping)!r}"
+    else:
+        if not Path(mapping).exists():
+            raise DataError(f"mapping {mapping} is neither a file nor one of {', '.join(MAPPINGS)}")
+        rules, origin = load_yaml(Path(mapping)), str(mapping)
+        if rules.get("format") != FORMAT:
+            raise DataError(f"{origin}: format is {rules.get('format')!r}; expected {FORMAT!r}")
+    _reject_unknown(rules, _TOP_KEYS, origin)
+    for name in ("time", "position"):
+        if name not in rules:
+            raise DataError(f"{origin} has no {name!r}; expected e.g. {name}: {{column: {name}, unit: ...}}")
+    for name, keys in _SECTION_KEYS.items():
+        if name in rules:
+            if not isinstance(rules[name], Mapping):
+                raise DataError(f"{origin}: {name} is {rules[name]!r}; expected {{column: ..., unit: ...}}")
+            _reject_unknown(rules[name], keys, f"{origin}: {name}")
+    return rules, origin
+
+
+def _reject_unknown(given: Mapping[str, Any], known: set[str], where: str) -> None:
+    for key in given:
+        if key not in known:
+            near = get_close_matches(str(key), sorted(known), n=1)
+            hint = f"; did you mean {near[0]!r}?" if near else ""
+            raise DataError(f"{where} has an unknown key {key!r}; expected {', '.join(sorted(known))}{hint}")
+
+
+def _read_table(source: Path, delimiter: str) -> tuple[list[str], Array]:
+    try:
+        text = source.read_text(encoding="utf-8-sig")
+    except (OSError, UnicodeDecodeError) as error:
+        raise DataError(f"{source} cannot be read as text: {error}") from error
+    head, _, body = text.partition("\n")
+    try:
+        cells = next(csv.reader([head.lstrip("# ").strip()], delimiter=delimiter), [])
+    except (csv.Error, TypeError) as error:
+        raise DataError(f"{source} begins with a line that is no CSV: {error}") from error
+    names = [name.strip() for name in cells]
+    others = [mark for mark in (";", "\t", ",") if mark != delimiter and mark in head]
+    if len(names) == 1 and others:
+        raise DataError(
+            f"{source} has one column, {names[0][:60]!r}, between {delimiter!r}; expected several: a mapping file with "
+            f"`delimiter: {others[0]!r}` reads it otherwise"
+        )
+    if not names or all(_is_number(name) for name in names):
+        raise DataError(
+            f"{source} begins with {head[:60]!r}; expected a first line with the names of the columns"
+        )
+    if not body.strip():
+        raise DataError(f"{source} has no rows below its header")
+    try:
+        table = np.loadtxt(io.StringIO(body), delimiter=delimiter, ndmin=2)
+    except ValueError as error:
+        raise DataError(f"{source}: {_first_bad_cell(body, names, delimiter) or error}") from error
+    if table.size == 0:
+        raise DataError(f"{source} has no rows below its header")
+    if table.shape[1] != len(names):
+        raise DataError(
+            f"{source} has {table.shape[1]} columns of numbers but {len(names)} names in its header"
+        )
+    return names, table
+
+
+def _first_bad_cell(body: str, names: list[str], delimiter: str) -> str | None:
+    for number, line in enumerate(io.StringIO(body), start=2):
+        try:
+            row = next(csv.reader([line], delimiter=delimiter), [])
+        except csv.Error as error:
+            return f"line {number} is no CSV: {error}"
+        if not row:
+            continue
+        if len(row) != len(names):
+            return f"line {number} has {len(row)} cells; expected {len(names)} ({', '.join(names)})"
+        for name, cell in zip(names, row, strict=True):
+            if not _is_number(cell):
+                return f"line {number}, column {name!r} holds {cell.strip()!r}; expected a number"
+    return None
+
+
+def _is_number(text: str) -> bool:
+    try:
+        float(text)
+    except ValueError:
+        return False
+    return True
+
+
+def _row_range(rules: Mapping[str, Any], count: int, origin: str) -> tuple[int, int]:
+    rows = rules.get("rows", [0, count])
+    valid = isinstance(rows, (list, tuple)) and len(rows) == 2 and all(type(r) is int for r in rows)
+    if not valid or not 0 <= rows[0] < min(rows[1], count):
+        raise DataError(
+            f"{origin}: rows is {rows!r}; expected [first, stop] within the {count} rows of the file"
+        )
+    return int(rows[0]), min(int(rows[1]), count)
+
+
+def _factor(name: str, section: Mapping[str, Any], quantity: str, origin: str) -> float:
+    unit = section.get("unit")
+    if not isinstance(unit, str) or unit not in UNITS[quantity]:
+        raise DataError(f"{origin}: unit of {name} is {unit!r}; expected one of {', '.join(UNITS[quantity])}")
+    return UNITS[quantity][unit]
+
+
+def _quantity_of(unit: Any, origin: str) -> str:
+    for quantity in ("effort", "voltage", "angle"):
+        if isinstance(unit, str) and unit in UNITS[quantity]:
+            return quantity
+    expected = ", ".join(u for quantity in ("effort", "voltage", "angle") for u in UNITS[quantity])
+    raise DataError(f"{origin}: unit of input is {unit!r}; expected one of {expected}")
+
+
+def _column(
+    name: str,
+    section: Mapping[str, Any],
+    quantity: str,
+    names: list[str],
+    table: Array,
+    source: Path,
+    origin: str,
+    first_row: int,
+) -> Array | None:
+    wanted = section.get("column")
+    candidates = wanted if isinstance(wanted, (list, tuple)) else [wanted] if wanted else []
+    if not all(isinstance(candidate, str) for candidate in candidates):
+        raise DataError(f"{origin}: column of {name} is {wanted!r}; expected a name or a list of names")
+    found = next((column for column in candidates if column in names), None)
+    if found is None:
+        # Capital letters are no other quantity, as long as only one column can be meant.
+        wanted_names = {str(candidate).casefold() for candidate in candidates}
+        alike = [column for column in names if column.casefold() in wanted_names]
+        found = alike[0] if len(alike) == 1 else None
+    if found is None:
+        if section.get("optional"):
+            return None
+        raise DataError(
+            f"{source} has no column {' or '.join(map(repr, candidates)) or '(none given)'} for {name} "
+            f"(asked for by {origin}); it has {', '.join(names)}"
+        )
+    factor = _factor(name, section, quantity, origin)
+    sign = section.get("sign", 1)
+    if sign not in (1, -1):
+        raise DataError(f"{origin}: sign of {name} is {sign!r}; expected 1 or -1")
+    raw = table[:, names.index(found)]
+    bad = np.flatnonzero(~np.isfinite(raw))
+    if bad.size:
+        raise DataError(
+            f"{source}: column {found!r} is {raw[bad[0]]} in row {bad[0] + first_row} ({bad.size} such rows); "
+            "expected finite numbers: cut with `rows` or repair the file"
+        )
+    return np.asarray(sign * (raw + _number("offset", section, name, origin)) * factor)
+
+
+def _time(
+    section: Mapping[str, Any], names: list[str], table: Array, source: Path, origin: str, first_row: int
+) -> Array:
+    if "period" in section:
+        period = _number("period", section, "time", origin) * _factor("time", section, "time", origin)
+        if not (math.isfinite(period) and period > 0.0):
+            raise DataError(f"{origin}: period of time is {section['period']!r}; expected > 0")
+        return (np.arange(len(table)) + first_row) * period
+    column = _column("time", section, "time", names, table, source, origin, first_row)
+    assert column is not None
+    return column - _number("start", section, "time", origin)
+
+
+def _number(key: str, section: Mapping[str, Any], name: str, origin: str) -> float:
+    value = section.get(key, 0.0)
+    if isinstance(value, bool) or not isinstance(value, (int, float)) or not abs(value) < 1e300:
+        raise DataError(f"{origin}: {key} of {name} is {value!r}; expected a finite number")
+    return float(value)
+
+
+def _check_magnitudes(source: Path, time: Array, position: Array) -> None:
+    """Refuse time stamps and angles that can hardly be in the unit that the mapping claims."""
+    if time.size > 1:
+        step = float(np.median(np.abs(np.diff(time))))
+        if step >= 1.0:
+            raise DataError(
+                f"{source}: the median time step is {step:.3g} s; expected < 1 s: is the unit ms, us or ns?"
+            )
+    if time.size > 10 and np.max(np.abs(np.diff(position))) > 25.0:
+        largest = float(np.max(np.abs(np.diff(position))))
+        raise DataError(
+            f"{source}: the angle jumps by {largest:.3g} rad between samples; expected rad: is the unit deg?"
+        )

@@ -1,0 +1,302 @@
+"""One way to read measurements of a pendulum: CSV with a mapping file, friction-study JSON logs, rosbag2 bags.
+
+Whatever the source, the result is one :class:`Recording` in SI units with its time stamps as they were
+recorded: irregular sampling is kept, nothing is resampled.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pendulum_msgs_py.errors import DataError
+
+__all__ = [
+    "INPUT_KINDS",
+    "Recording",
+    "check_consistency",
+    "first_of_each_stamp",
+    "read_recording",
+    "read_servo_log",
+]
+
+Array = NDArray[np.float64]
+
+INPUT_KINDS: Mapping[str, str] = {"effort": "N m", "voltage": "V", "position_goal": "rad", "none": "-"}
+"""What drives the pendulum, and its unit. ``position_goal`` is the set point of a servo's own position loop."""
+
+_SERVO_ENTRY_KEYS = ("timestamp", "position", "goal_position", "torque_enable")
+_CONSISTENCY_FACTORS = (
+    ("deg/s instead of rad/s", 180.0 / np.pi),
+    ("rpm instead of rad/s", 30.0 / np.pi),
+    ("rev/s instead of rad/s", 0.5 / np.pi),
+    ("a reversed sign", -1.0),
+)
+
+
+@dataclass(frozen=True)
+class Recording:
+    """A run of one pendulum, measured.
+
+    Args:
+        time: Stamps of position and velocity, strictly increasing, shape (n,) [s].
+        position: Joint angle, 0 hanging down, not wrapped, shape (n,) [rad].
+        velocity: Joint velocity, shape (n,) [rad/s], or None where it was not recorded.
+        input: What drives the joint, shape (n,), or (m,) where ``input_time`` is given; unit by ``input_kind``.
+        input_kind: One of ``INPUT_KINDS``.
+        hold: ``zero`` where the input stays until its next sample (a command), ``linear`` where it varies
+            between samples (a measurement).
+        input_time: Stamps of the input where they differ from ``time``, shape (m,) [s].
+        enabled: Share of the time in which the drive is on, shape of ``input``, 0 or 1; None for always.
+        meta: Provenance and constants of the rig: ``source``, ``mass`` [kg], ``length`` [m], ``kp``, ``vin`` [V].
+
+    Raises:
+        DataError: on stamps that do not increase, on NaN, or on arrays that do not fit together.
+    """
+
+    time: Array
+    position: Array
+    velocity: Array | None
+    input: Array
+    input_kind: str = "effort"
+    hold: str = "linear"
+    input_time: Array | None = None
+    enabled: Array | None = None
+    meta: Mapping[str, Any] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        """Convert to float arrays and check that they fit together."""
+        for name in ("time", "position", "velocity", "input", "input_time", "enabled"):
+            values = getattr(self, name)
+            if values is not None:
+                object.__setattr__(self, name, np.ascontiguousarray(values, dtype=float))
+        if self.input_kind not in INPUT_KINDS:
+            raise DataError(f"input_kind is {self.input_kind!r}; expected one of {', '.join(INPUT_KINDS)}")
+        if self.hold not in {"zero", "linear"}:
+            raise DataError(f"hold is {self.hold!r}; expected 'zero' (a command) or 'linear' (a measurement)")
+        size = self.time.size
+        if size < 3:
+            raise DataError(f"{self.name} has {size} samples; expected at least 3")
+        lengths = {"position": size, "velocity": size, "input": self.input_stamps.size}
+        lengths["enabled"] = lengths["input"]
+        for name, length in lengths.items():
+            values = getattr(self, name)
+            if values is not None and values.shape != (length,):
+                raise DataError(f"{self.name}: {name} has shape {values.shape}; expected ({length},)")
+        for name in ("time", "input_time", "position", "velocity", "input", "enabled"):
+            self._check_finite(name)
+        self._check_increasing("time", self.time)
+        if self.input_time is not None:
+            self._check_increasing("input_time", self.input_time)
+
+    def _check_finite(self, name: str) -> None:
+        values = getattr(self, name)
+        if values is None:
+            return
+        bad = np.flatnonzero(~np.isfinite(values))
+        if bad.size:
+            raise DataError(
+                f"{self.name}: {name} is {values[bad[0]]} in sample {bad[0]} ({bad.size} such samples); "
+                "expected finite numbers: cut the range with `rows` or repair the file"
+            )
+
+    def _check_increasing(self, name: str, stamps: Array) -> None:
+        bad = np.flatnonzero(np.diff(stamps) <= 0.0)
+        if bad.size:
+            i = int(bad[0]) + 1
+            raise DataError(
+                f"{self.name}: {name} goes from {stamps[i - 1]:.6f} s to {stamps[i]:.6f} s in sample {i} "
+                f"({bad.size} such steps); expected strictly increasing stamps"
+            )
+
+    @property
+    def name(self) -> str:
+        """Short name for messages and figures: that of the source file."""
+        return Path(str(self.meta.get("source", "recording"))).name
+
+    @property
+    def input_stamps(self) -> Array:
+        """Stamps of the input [s]."""
+        return self.time if self.input_time is None else self.input_time
+
+    @property
+    def duration(self) -> float:
+        """Time from the first to the last sample [s]."""
+        return float(self.time[-1] - self.time[0])
+
+    @property
+    def period(self) -> float:
+        """Median sampling period [s]."""
+        return float(np.median(np.diff(self.time)))
+
+    def rows(self, start: int, stop: int | None = None) -> Recording:
+        """Return samples ``start`` to ``stop`` (exclusive); the whole input stays, so that a delay can look back."""
+        cut = slice(start, stop)
+        if self.time[cut].size < 3:
+            raise DataError(
+                f"{self.name}: rows {start} to {stop} hold fewer than 3 of {self.time.size} samples"
+            )
+        return replace(
+            self,
+            time=self.time[cut],
+            position=self.position[cut],
+            velocity=None if self.velocity is None else self.velocity[cut],
+            input_time=self.input_stamps,
+            meta={**self.meta, "rows": [start, self.time.size if stop is None else stop]},
+        )
+
+    def between(self, start: float, stop: float) -> Recording:
+        """Return the samples with ``start <= time < stop`` [s]; the whole input stays."""
+        first, last = np.searchsorted(self.time, (start, stop), side="left")
+        return self.rows(int(first), int(last))
+
+
+def first_of_each_stamp(time: Array) -> NDArray[np.bool_]:
+    """Return which samples to keep where a logger wrote some stamps more than once: the first of each, shape (n,)."""
+    return np.append(True, np.diff(time) != 0.0) if time.size else np.zeros(0, dtype=bool)
+
+
+def check_consistency(recording: Recording, *, minimum_travel: float = 0.2) -> Recording:
+    """Return the recording if its velocity is the derivative of its position, else name the likely unit.
+
+    The slope of travelled angle against integrated velocity is 1 in consistent units, 57.3 for degrees taken
+    as radians, and so on. Recordings that hardly move (less than ``minimum_travel`` [rad]) are not judged.
+
+    Raises:
+        DataError: where the slope lies outside 0.5 to 2.
+    """
+    if recording.velocity is None or np.ptp(recording.position) < minimum_travel:
+        return recording
+    step = np.diff(recording.time)
+    travel = 0.5 * (recording.velocity[1:] + recording.velocity[:-1]) * step
+    integrated = np.concatenate(([0.0], np.cumsum(travel)))
+    # Over stretches of about 0.1 s the quantisation of the angle and the noise of the velocity average out.
+    stride = max(1, round(0.1 / recording.period))
+    moved = np.diff(recording.position[::stride])
+    expected = np.diff(integrated[::stride])
+    power = float(moved @ moved)
+    slope = float(expected @ moved) / power if power > 0.0 else 0.0
+    if 0.5 <= slope <= 2.0:
+        return recording
+    likely = ""
+    for text, factor in _CONSISTENCY_FACTORS:
+        if abs(slope / factor - 1.0) < 0.3:
+            likely = f"; this looks like {text} in the velocity"
+        elif factor > 0.0 and abs(slope * factor - 1.0) < 0.3:
+            likely = f"; this looks like {text.split('/s')[0]} instead of rad in the position"
+    raise DataError(
+        f"{recording.name}: the velocity is {slope:.3g} times the derivative of the position; "
+        f"expected 0.5 to 2{likely}: correct `unit` or `sign` in the mapping file"
+    )
+
+
+def read_recording(
+    path: str | Path,
+    mapping: str | Path | Mapping[str, Any] | None = None,
+    *,
+    effort: str = "applied",
+    namespace: str | None = None,
+) -> Recording:
+    """Read a CSV file, a friction-study JSON log or a rosbag2 bag.
+
+    Args:
+        path: ``*.csv`` / ``*.txt``, ``*.json``, or a bag (folder, ``*.mcap`` or ``*.db3``).
+        mapping: For CSV: mapping file, name of a built-in mapping or the mapping itself; by default the
+            columns must be called as in the built-in mapping ``pendulum``.
+        effort: For bags: ``applied`` takes what the plant says it applied (topic ``applied_effort``),
+            ``measured`` the measured joint torque in ``joint_states``.
+        namespace: For bags with several plants, such as ``/sim``.
+
+    Raises:
+        DataError: for missing columns, unsorted time, NaN, wrong units.
+        BagError: for a bag that cannot be read.
+    """
+    source = Path(path)
+    if not source.exists():
+        raise DataError(f"{source} does not exist; expected a CSV file, a JSON log or a bag")
+    suffix = source.suffix.lower()
+    if source.is_dir() or suffix in {".mcap", ".db3"}:
+        from pendulum_bags.runs.bag_recordings import read_bag_recording
+
+        return check_consistency(read_bag_recording(source, effort=effort, namespace=namespace))
+    if suffix == ".json":
+        return check_consistency(read_servo_log(source))
+    if suffix in {".csv", ".txt"}:
+        from pendulum_bags.runs.csv_mapping import read_csv
+
+        return check_consistency(read_csv(source, mapping))
+    raise DataError(
+        f"{source} has the suffix {suffix!r}; expected .csv, .txt, .json, .mcap, .db3 or a bag folder"
+    )
+
+
+def read_servo_log(path: str | Path) -> Recording:
+    """Read a JSON log of the friction study: a position-controlled servo that carries a bob on an arm.
+
+    The set point is the input (``position_goal``), held between entries; ``enabled`` is the torque switch.
+    Constants of the rig (``mass`` [kg], ``length`` [m], ``kp`` [firmware], ``vin`` [V]) and, as ``load`` [-1 to 1],
+    the servo's own report of its duty cycle go to ``meta``.
+
+    Raises:
+        DataError: for a file that is not such a log, naming the key or entry at fault.
+    """
+    source = Path(path)
+    try:
+        content = json.loads(source.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise DataError(f"{source} cannot be read: {error.strerror or error}") from error
+    except (ValueError, RecursionError) as error:
+        raise DataError(f"{source} is not JSON: {error}") from error
+    if (
+        not isinstance(content, dict)
+        or not isinstance(content.get("entries"), list)
+        or not content["entries"]
+    ):
+        raise DataError(f"{source} has no list 'entries'; expected a log of the friction study")
+    entries: list[dict[str, Any]] = content["entries"]
+    wrong = next((i for i, entry in enumerate(entries) if not isinstance(entry, dict)), None)
+    if wrong is not None:
+        raise DataError(f"{source}: entry {wrong} is {entries[wrong]!r}; expected a mapping")
+    columns: dict[str, Array] = {}
+    for key in (*_SERVO_ENTRY_KEYS, "speed", "load", "input_volts", "temp"):
+        missing = [i for i, entry in enumerate(entries) if key not in entry]
+        if not missing:
+            try:
+                columns[key] = np.array([entry[key] for entry in entries], dtype=float)
+            except (TypeError, ValueError, OverflowError) as error:
+                raise DataError(f"{source}: entries[].{key} is not a number everywhere: {error}") from error
+        elif key in _SERVO_ENTRY_KEYS:
+            raise DataError(
+                f"{source}: entry {missing[0]} has no {key!r}; expected {', '.join(_SERVO_ENTRY_KEYS)}"
+            )
+    meta = {key: value for key, value in content.items() if key != "entries"}
+    meta["source"] = str(source)
+    if "load" in columns:
+        # The register is 16 bit two's complement in thousandths of full duty.
+        load = columns["load"]
+        meta["load"] = np.where(load > 32767, load - 65536, load) / 1000.0
+    kept = first_of_each_stamp(columns["timestamp"])
+    if not kept.all():
+        meta["repeated_stamps"] = int(np.sum(~kept))
+        columns = {key: values[kept] for key, values in columns.items()}
+        if "load" in meta:
+            meta["load"] = meta["load"][kept]
+    for key in ("input_volts", "temp"):
+        if key in columns:
+            meta[f"mean_{key}"] = float(columns[key].mean())
+    return Recording(
+        columns["timestamp"],
+        columns["position"],
+        columns.get("speed"),
+        columns["goal_position"],
+        input_kind="position_goal",
+        hold="zero",
+        enabled=columns["torque_enable"],
+        meta=meta,
+    )

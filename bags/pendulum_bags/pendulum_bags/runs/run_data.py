@@ -1,0 +1,289 @@
+"""From a bag to the arrays of one plant during the noise phase."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pendulum_bags.comparison.statistics import effective_size
+from pendulum_bags.runs.series import Series, Signal, unwrap_near_upright
+from pendulum_msgs_py.contract import names
+from pendulum_msgs_py.contract.values import NANOSECONDS
+from pendulum_msgs_py.errors import DataError
+from pendulum_rosbag.reader import Bag, read_bag
+
+__all__ = [
+    "END_EVENT",
+    "START_EVENT",
+    "RunData",
+    "find_prefix",
+    "missed_periods",
+    "plant_summary",
+    "read_run",
+    "timing_warning",
+]
+
+START_EVENT = "noise_start"
+END_EVENT = "noise_end"
+
+
+@dataclass(frozen=True)
+class RunData:
+    """One plant in one run; all times count from the start of the noise.
+
+    Args:
+        label: Name for tables and legends, such as ``sim``.
+        window: Motion during the noise.
+        whole: Motion of the whole recording, ramps included.
+        disturbance: Disturbance torque as commanded, None where none was recorded [N m].
+        applied: Torque that the plant says it applied, None where none was recorded [N m].
+        measured: Measured joint torque over the whole recording, None where states have none [N m].
+        arrival: Intervals between arrivals of states at the recorder during the noise, shape (n - 1,) [s].
+        rate_hz: Sampling rate during the noise [Hz].
+        missed_deadlines: Periods during the noise for which the plant published no state.
+        metadata: What the bag says about its run.
+        events: Events with ``name`` and ``t`` [s].
+        source: The bag.
+        damage: What is wrong with the bag.
+    """
+
+    label: str
+    window: Series
+    whole: Series
+    disturbance: Signal | None
+    applied: Signal | None
+    measured: Signal | None
+    arrival: NDArray[np.float64]
+    rate_hz: float
+    missed_deadlines: int
+    metadata: Mapping[str, Any] = field(default_factory=dict)
+    events: Sequence[Mapping[str, Any]] = ()
+    source: str = ""
+    damage: Sequence[str] = ()
+
+    def event_time(self, name: str) -> float | None:
+        """Return when an event of a name first happened [s], None where it did not."""
+        return next((float(event["t"]) for event in self.events if event["name"] == name), None)
+
+
+def find_prefix(bag: Bag) -> str:
+    """Return the namespace of the one plant of a bag, such as ``/sim``; empty for plain ``/joint_states``.
+
+    Raises:
+        DataError: The bag has no plant, or several.
+    """
+    ending = f"/{names.JOINT_STATES}"
+    found = sorted(topic[: -len(ending)] for topic in bag.topics if topic.endswith(ending))
+    if len(found) == 1:
+        return found[0]
+    if not found:
+        raise DataError(
+            f"bag {bag.path} has no topic that ends in {ending}; it has {', '.join(bag.topics) or 'none'}"
+        )
+    raise DataError(f"bag {bag.path} holds several plants ({', '.join(found)}); choose one by its namespace")
+
+
+def timing_warning(plants: Mapping[str, Mapping[str, Any]]) -> str:
+    """Return a sentence where a plant left out so many states that the run tells more of the machine than of the plant.
+
+    Args:
+        plants: Figures of :func:`plant_summary`, by the plant's name.
+    """
+    words = []
+    for name, plant in plants.items():
+        missed, samples = int(plant["missed_deadlines"]), int(plant["samples"])
+        if missed > _TOLERATED * (missed + samples):
+            share = missed / (missed + samples)
+            words.append(f"{name} missed {missed} of {missed + samples} states ({100.0 * share:.1f} %)")
+    if not words:
+        return ""
+    return f"The machine was too busy for these plants: {', '.join(words)}; end other programs and repeat the run."
+
+
+_TOLERATED = 0.02
+"""Share of states that may be missing before a run is called disturbed."""
+
+
+def missed_periods(stamps_ns: NDArray[np.int64]) -> int:
+    """Return how many periods have no state, from the stamps: a gap of k median periods misses k - 1."""
+    steps = np.diff(stamps_ns)
+    period = float(np.median(steps))
+    return int(np.maximum(np.round(steps / period) - 1.0, 0.0).sum()) if period > 0.0 else 0
+
+
+def read_run(
+    path: str | os.PathLike[str],
+    *,
+    prefix: str | None = None,
+    label: str | None = None,
+    start_ns: int | None = None,
+    stop_ns: int | None = None,
+) -> RunData:
+    """Read one plant's part of a bag.
+
+    Args:
+        path: The bag.
+        prefix: Namespace of the plant's topics; None for that of its only plant.
+        label: Name for tables; by default that of the bag's folder.
+        start_ns: Start of the window by the plant's stamps [ns]; by default the event ``noise_start``, or without
+            one the first sample of the disturbance.
+        stop_ns: End of the window [ns]; by default ``noise_end``, or the last sample of the disturbance.
+
+    Raises:
+        BagError: The bag cannot be read.
+        DataError: It lacks the states or the window.
+    """
+    with read_bag(path) as bag:
+        space = find_prefix(bag) if prefix is None else prefix.rstrip("/")
+        states = _increasing(bag.array(f"{space}/{names.JOINT_STATES}"))
+        if len(states) < 4:
+            raise DataError(f"bag {path} has {len(states)} states; expected at least 4")
+        commands = _optional(bag, f"{space}/{names.EFFORT_COMMAND}")
+        disturbance = _optional(bag, f"{space}/{names.DISTURBANCE}")
+        applied = _optional(bag, f"{space}/{names.APPLIED_EFFORT}")
+        events = [event for event in bag.events() if event["topic"].startswith(f"{space}/")]
+        metadata, damage = dict(bag.metadata), list(bag.damage)
+    start, stop = _window(events, disturbance, str(path), start_ns, stop_ns)
+    name = label or Path(path).stem
+    stamps = states["stamp_ns"]
+    times = (stamps - start) / NANOSECONDS
+    whole = Series(
+        times,
+        unwrap_near_upright(states["position"]),
+        states["velocity"],
+        _answers(stamps, commands, states["effort"]),
+        name,
+    )
+    span = (stop - start) / NANOSECONDS
+    inside = (stamps >= start) & (stamps < stop)
+    window = whole.between(0.0, span)
+    return RunData(
+        label=name,
+        window=window,
+        whole=whole,
+        disturbance=_signal(disturbance, start, stop, f"disturbance on {name}"),
+        applied=_signal(applied, start, stop, f"torque applied to {name}"),
+        measured=_measured(states, times, name),
+        arrival=np.diff(states["log_time_ns"][inside]) / NANOSECONDS,
+        rate_hz=window.rate,
+        missed_deadlines=missed_periods(stamps[inside]),
+        metadata=metadata,
+        events=[{**event, "t": (event["stamp_ns"] - start) / NANOSECONDS} for event in events],
+        source=str(path),
+        damage=damage,
+    )
+
+
+def plant_summary(run: RunData) -> dict[str, Any]:
+    """Return the figures of one plant during the noise, as ``summary.json`` holds them."""
+    window = run.window
+    return {
+        "rate_hz": run.rate_hz,
+        "missed_deadlines": run.missed_deadlines,
+        "std_theta": float(window.position.std(ddof=1)),
+        "std_theta_dot": float(window.velocity.std(ddof=1)),
+        "mean_theta": float(window.position.mean()),
+        "mean_theta_dot": float(window.velocity.mean()),
+        "max_abs_u": float(np.abs(window.effort).max()),
+        "rms_u": float(np.sqrt(np.mean(window.effort**2))),
+        "samples": int(window.t.size),
+        "effective_samples": effective_size(window.position),
+        "duration_s": window.duration,
+        "noise_hold_time": noise_hold_time(run),
+        "damage": list(run.damage),
+    }
+
+
+def noise_hold_time(run: RunData) -> float | None:
+    """Return how long each noise sample was held [s]: what the run says, else what its disturbance shows."""
+    told = run.metadata.get("pendulum.run")
+    if isinstance(told, Mapping) and isinstance(told.get("disturbance"), Mapping):
+        value = told["disturbance"].get("hold_time")
+        if isinstance(value, (int, float)) and value > 0.0:
+            return float(value)
+    if run.disturbance is None or run.disturbance.t.size < 4:
+        return None
+    changes = run.disturbance.t[np.flatnonzero(np.diff(run.disturbance.value)) + 1]
+    return float(np.median(np.diff(changes))) if changes.size > 2 else None
+
+
+def _increasing(array: NDArray[Any]) -> NDArray[Any]:
+    """Return the messages ordered by stamp, each stamp once."""
+    _, first = np.unique(array["stamp_ns"], return_index=True)
+    return array[first]
+
+
+def _optional(bag: Bag, topic: str) -> NDArray[Any] | None:
+    if topic not in bag.topics:
+        return None
+    array = _increasing(bag.array(topic))
+    array = array[np.isfinite(array["effort"])]
+    return array if len(array) else None
+
+
+def _answers(
+    stamps: NDArray[np.int64], commands: NDArray[Any] | None, otherwise: NDArray[Any]
+) -> NDArray[np.float64]:
+    """Return the torque that the controller gave in answer to each state; the newest one where an answer is missing."""
+    if commands is None:
+        # A recording without commands still has the measured torque.
+        return np.nan_to_num(otherwise)
+    index = np.searchsorted(commands["stamp_ns"], stamps, side="right") - 1
+    held = np.where(index >= 0, commands["effort"][np.maximum(index, 0)], 0.0)
+    # Long after the last command nobody commands any more.
+    age = (stamps - commands["stamp_ns"][np.maximum(index, 0)]) / NANOSECONDS
+    return np.where((index >= 0) & (age < 0.1), held, 0.0)
+
+
+def _measured(states: NDArray[Any], times: NDArray[np.float64], name: str) -> Signal | None:
+    known = np.isfinite(states["effort"])
+    return (
+        Signal(times[known], states["effort"][known], f"measured torque of {name}") if known.any() else None
+    )
+
+
+def _signal(array: NDArray[Any] | None, start: int, stop: int, name: str) -> Signal | None:
+    if array is None:
+        return None
+    inside = array[(array["stamp_ns"] >= start) & (array["stamp_ns"] < stop)]
+    if not len(inside):
+        return None
+    return Signal((inside["stamp_ns"] - start) / NANOSECONDS, inside["effort"], name)
+
+
+def _window(
+    events: Sequence[Mapping[str, Any]],
+    disturbance: NDArray[Any] | None,
+    path: str,
+    start_ns: int | None,
+    stop_ns: int | None,
+) -> tuple[int, int]:
+    found = {
+        name: [int(event["stamp_ns"]) for event in events if event["name"] == name]
+        for name in (START_EVENT, END_EVENT)
+    }
+    starts, stops = found[START_EVENT], found[END_EVENT]
+    active = None
+    if disturbance is not None:
+        live = disturbance["stamp_ns"][disturbance["effort"] != 0.0]
+        if len(live):
+            active = int(live[0]), int(live[-1])
+    start = start_ns if start_ns is not None else (starts[-1] if starts else active[0] if active else None)
+    if start is None:
+        raise DataError(
+            f"bag {path} has neither an event {START_EVENT!r} nor a disturbance; "
+            "expected one of them, or a window given by its stamps"
+        )
+    after = [stop for stop in stops if stop > start]
+    stop = stop_ns if stop_ns is not None else (after[0] if after else active[1] if active else None)
+    if stop is None or stop <= start:
+        raise DataError(
+            f"bag {path}: the noise starts at {start} ns and has no end; expected an event {END_EVENT!r}"
+        )
+    return start, stop

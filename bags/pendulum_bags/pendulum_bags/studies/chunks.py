@@ -1,0 +1,231 @@
+"""Work in numbered pieces: here or on a Dask cluster, kept on disk, gone on with after an interruption.
+
+A piece is a pure function of a job and its number, so a result depends neither on the number of workers nor on the
+order in which they finish, and a worker that dies costs time only.
+"""
+
+from __future__ import annotations
+
+import json
+import logging
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import AbstractContextManager, contextmanager, nullcontext
+from pathlib import Path
+from typing import Any, TypeVar
+
+from numpy.typing import NDArray
+
+from pendulum_bags.runs.run_folder import write_json
+from pendulum_msgs_py.errors import BagError, FaultError, ParameterError
+
+__all__ = [
+    "Connect",
+    "carry_out",
+    "chunk_path",
+    "cluster_client",
+    "open_results",
+    "read_columns",
+    "run_chunks",
+    "write_columns",
+]
+
+Job = TypeVar("Job")
+Result = TypeVar("Result")
+Connect = Callable[[], AbstractContextManager[Any]]
+"""Connects to a Dask cluster when there is something to do: gives its client, or None for this process."""
+
+_CONNECT_TIMEOUT = 15.0
+
+
+def carry_out(
+    task: Callable[[Job, int, int | None], Result],
+    job: Job,
+    missing: Iterable[int],
+    connect: Connect = nullcontext,
+) -> Iterator[tuple[int, Result]]:
+    """Yield number and result of each piece, in the order in which they are finished.
+
+    Args:
+        task: Function of a module (a worker imports it) of the job, the number, and how many threads to take, None
+            for all.
+        job: What all pieces have in common; it travels to the workers.
+        missing: Numbers to carry out.
+        connect: To a Dask cluster (`cluster_client`), not called where nothing is missing; by default one after the
+            other is carried out in this process.
+
+    Raises:
+        FaultError: The scheduler cannot be reached, or its workers keep dying.
+    """
+    numbers = list(missing)
+    if not numbers:
+        return
+    with connect() as client:
+        if client is not None:
+            yield from _on_cluster(client, task, job, numbers)
+            return
+        for number in numbers:
+            yield number, task(job, number, None)
+
+
+def run_chunks(
+    folder: Path,
+    task: Callable[[Job, int, int | None], Mapping[str, NDArray[Any]]],
+    job: Job,
+    chunks: int,
+    *,
+    connect: Connect = nullcontext,
+    on_progress: Callable[[int, int], None] = lambda done, total: None,
+) -> None:
+    """Carry out the chunks that are not on disk yet, and write the columns of each to a file of its own.
+
+    Args:
+        folder: Where the files go.
+        task: Returns the columns of a chunk; else as in ``carry_out``, like ``job`` and ``connect``.
+        job: What all chunks have in common.
+        chunks: How many there are.
+        connect: To a Dask cluster.
+        on_progress: Called with chunks done and in all.
+
+    Raises:
+        FaultError: As ``carry_out``.
+    """
+    missing = [index for index in range(chunks) if not chunk_path(folder, index).is_file()]
+    done = chunks - len(missing)
+    on_progress(done, chunks)
+    for index, columns in carry_out(task, job, missing, connect):
+        write_columns(chunk_path(folder, index), columns)
+        done += 1
+        on_progress(done, chunks)
+
+
+def chunk_path(folder: Path, index: int) -> Path:
+    """Return the file of a chunk."""
+    return folder / f"runs_{index:05}.parquet"
+
+
+@contextmanager
+def cluster_client(scheduler: str = "", workers: int = 0) -> Iterator[Any]:
+    """Connect to a Dask scheduler, or start a local cluster of single-threaded processes for as long as it is used.
+
+    Args:
+        scheduler: Its address, ``tcp://HOST:PORT``; empty for none.
+        workers: Processes of a local cluster; 0 for none. With neither, what is yielded is None: this process.
+
+    Raises:
+        ParameterError: Dask cannot be imported.
+        FaultError: The scheduler cannot be reached.
+    """
+    if not scheduler and not workers:
+        yield None
+        return
+    try:
+        from distributed import Client, LocalCluster
+    except ImportError as error:
+        raise ParameterError(f"workers and schedulers need dask.distributed: {error}") from error
+    if scheduler:
+        try:
+            client = Client(scheduler, timeout=_CONNECT_TIMEOUT)
+        except (OSError, ValueError, TypeError) as error:
+            reason = str(error).splitlines()[0] if str(error) else type(error).__name__
+            raise FaultError(
+                f"no Dask scheduler answers at {scheduler!r} within {_CONNECT_TIMEOUT:g} s ({reason}); "
+                "expected tcp://HOST:PORT of a running dask scheduler"
+            ) from error
+        try:
+            yield client
+        finally:
+            client.close()
+        return
+    # What it says of a worker that died and was replaced is for those who run a cluster, not for whom it serves; its
+    # status page takes any free port of this machine alone, so that two clusters do not meet on the usual one.
+    cluster = LocalCluster(
+        n_workers=workers, threads_per_worker=1, dashboard_address="127.0.0.1:0", silence_logs=logging.CRITICAL
+    )
+    try:
+        client = Client(cluster)
+        try:
+            yield client
+        finally:
+            client.close()
+    finally:
+        cluster.close()
+
+
+def _on_cluster(
+    client: Any, task: Callable[[Job, int, int | None], Result], job: Job, numbers: list[int]
+) -> Iterator[tuple[int, Result]]:
+    from distributed import KilledWorker, as_completed
+
+    # Cores belong to the cluster's workers: a piece that took all of them would fight its neighbours.
+    jobs = {client.submit(task, job, number, 1, pure=True): number for number in numbers}
+    try:
+        for future, result in as_completed(jobs, with_results=True):
+            yield jobs[future], result
+            future.release()
+    except KilledWorker as error:
+        raise FaultError(
+            f"workers keep dying: {str(error).splitlines()[0]}; what is done is kept, the same command goes on"
+        ) from error
+    finally:
+        for future in jobs:
+            future.release()
+
+
+def open_results(folder: Path, what: str, fingerprint: str, settings: Mapping[str, Any]) -> None:
+    """Make the folder of results, or check that the one that is there holds results of the same settings.
+
+    Args:
+        folder: Where the results go.
+        what: Their name, for messages.
+        fingerprint: Hash of all that they depend on.
+        settings: For whoever reads the folder.
+
+    Raises:
+        BagError: The folder holds something else.
+    """
+    marker = folder / "settings.json"
+    if marker.is_file():
+        try:
+            found = json.loads(marker.read_text(encoding="utf-8")).get("fingerprint")
+        except (ValueError, AttributeError):
+            found = None
+        if found != fingerprint:
+            raise BagError(f"folder {folder} holds a {what} of other settings; expected a new folder")
+        return
+    if folder.exists() and any(folder.iterdir()):
+        raise BagError(f"folder {folder} is not empty and holds no {what}; expected a new one")
+    folder.mkdir(parents=True, exist_ok=True)
+    write_json(marker, {"fingerprint": fingerprint, "settings": settings})
+
+
+def write_columns(path: Path, columns: Mapping[str, Any]) -> None:
+    """Write columns to a Parquet file, which is there whole or not at all."""
+    arrow, parquet = _arrow()
+    partial = path.with_suffix(".part")
+    parquet.write_table(arrow.table(dict(columns)), partial, compression="zstd")
+    partial.replace(path)
+
+
+def read_columns(path: Path, names: Iterable[str]) -> dict[str, NDArray[Any]]:
+    """Return columns of a Parquet file."""
+    _, parquet = _arrow()
+    try:
+        table = parquet.read_table(path, columns=list(names))
+    except (OSError, ValueError) as error:
+        raise BagError(f"{path} cannot be read ({error}); remove it, and the same command computes it anew") from error
+    return {name: table[name].to_numpy() for name in names}
+
+
+def _arrow() -> tuple[Any, Any]:
+    """Return pyarrow and its Parquet module.
+
+    Raises:
+        ParameterError: It cannot be imported.
+    """
+    try:
+        import pyarrow
+        import pyarrow.parquet
+    except ImportError as error:
+        reason = str(error).splitlines()[0]
+        raise ParameterError(f"Parquet needs pyarrow, which cannot be imported: {reason}") from error
+    return pyarrow, pyarrow.parquet

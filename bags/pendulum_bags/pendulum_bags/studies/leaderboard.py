@@ -1,0 +1,249 @@
+"""Every controller on one board: swing-up and balance on each rigid plant, the public leaderboards' scores, robustness.
+
+A new controller is on the board as soon as it is in ``pendulum_lqr.controller.CONTROLLERS``.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pendulum_bags.experiments.in_process import RunArrays, simulate_plant
+from pendulum_bags.experiments.run_spec import RunSpec
+from pendulum_lqr.controller import CONTROLLERS
+from pendulum_msgs_py.contract.angles import UPRIGHT, wrap
+from pendulum_msgs_py.contract.values import NANOSECONDS
+from pendulum_msgs_py.errors import PendulumError
+from pendulum_msgs_py.plants.plant_parameters import PlantParameters, load_plant
+from pendulum_sim.sensors import Sensors
+
+__all__ = [
+    "COSTS",
+    "EXCLUDED",
+    "HARDWARE",
+    "PERTURBATIONS",
+    "Cost",
+    "Entry",
+    "contenders",
+    "costs_of",
+    "evaluate",
+    "model_errors",
+    "motion_of",
+    "push_trains",
+    "scores",
+]
+
+HARDWARE = "hw"
+"""Name of the emulated machine on the board."""
+
+EXCLUDED = {"playback": "plays a recording of another run"}
+GOAL_ANGLE, GOAL_VELOCITY = 0.1, 0.5
+"""Region that counts as up: angle from upright [rad], velocity [rad/s]."""
+
+PATIENCE = 8.0
+"""Wall time of the plain run beyond which the perturbations, 25 more runs, are left out [s]."""
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Cost:
+    """One cost of a run: weight and norm are those of the public leaderboard.
+
+    Source: reference scores of the dfki underactuated-robotics leaderboards (weights sum to 1).
+    """
+
+    name: str
+    unit: str
+    weight: float
+    norm: float
+
+
+COSTS = (
+    Cost("time", "s", 0.2, 10.0),
+    Cost("max_torque", "N m", 0.1, 2.0),
+    Cost("energy", "J", 0.1, 100.0),
+    Cost("torque_integral", "N m s", 0.1, 20.0),
+    Cost("torque_squared", "N^2 m^2 s", 0.1, 40.0),
+    Cost("smoothness", "N m", 0.2, 4.0),
+    Cost("velocity", "rad^2/s", 0.2, 100.0),
+)
+
+
+@dataclass(frozen=True)
+class Entry:
+    """One line of the board.
+
+    Attributes:
+        plant: Preset.
+        controller: Kind.
+        reason: Why it is not scored; empty where it is.
+        success: Whether it ends up and stays there.
+        costs: By name.
+        scores: By version, v1 to v3.
+        robustness: Share of successes by kind of perturbation.
+        wall: Time that the plain run took [s].
+        motion: Time [s], angle from upright [rad], applied torque [N m], thinned, shape (3, n); for plots.
+    """
+
+    plant: str
+    controller: str
+    reason: str
+    success: bool
+    costs: Mapping[str, float]
+    scores: Mapping[str, float]
+    robustness: Mapping[str, float]
+    wall: float
+    motion: Array
+
+
+def costs_of(arrays: RunArrays) -> tuple[bool, float, dict[str, float]]:
+    """Return success, the share of time spent up, and the costs of a run.
+
+    ``time`` is when the pendulum enters the goal region for good, the length of the run where it never does.
+    """
+    t = (arrays.stamp_ns - arrays.stamp_ns[0]) / NANOSECONDS
+    duration = float(t[-1])
+    up = (np.abs(wrap(arrays.position - UPRIGHT)) < GOAL_ANGLE) & (np.abs(arrays.velocity) < GOAL_VELOCITY)
+    below = np.flatnonzero(~up)
+    entered = 0.0 if not below.size else float(t[min(below[-1] + 1, t.size - 1)])
+    success = bool(up[-1]) and entered < duration
+    tau, dt = arrays.applied, np.diff(t)
+    return success, float(up.mean()), {
+        "time": entered if success else duration,
+        "max_torque": float(np.abs(tau).max()),
+        "energy": float(np.sum(np.abs(tau * arrays.velocity[:-1]) * dt)),
+        "torque_integral": float(np.sum(np.abs(tau) * dt)),
+        "torque_squared": float(np.sum(tau * tau * dt)),
+        "smoothness": float(np.std(np.diff(tau))),
+        "velocity": float(np.sum(arrays.velocity[:-1] ** 2 * dt)),
+    }
+
+
+def scores(success: bool, uptime: float, costs: Mapping[str, float]) -> dict[str, float]:
+    """Return the three versions of the public leaderboards' score; 1 is perfect, v1 may fall below 0.
+
+    v1 = success (1 - sum w x / n); v2 = success (1 - mean tanh(pi x / n)); v3 = time spent up per length of the run.
+    """
+    v1 = 1.0 - sum(cost.weight * costs[cost.name] / cost.norm for cost in COSTS)
+    v2 = 1.0 - float(np.mean([math.tanh(math.pi * costs[cost.name] / cost.norm) for cost in COSTS]))
+    return {"v1": success * v1, "v2": success * v2, "v3": uptime}
+
+
+Variation = tuple[PlantParameters, Mapping[str, Any], Mapping[str, float]]
+"""Plant, disturbance, sensors."""
+
+
+def model_errors(plant: PlantParameters) -> list[PlantParameters]:
+    """Return plants by which a model may be wrong: inertia with gravity, or damping, by 10 and 25 %."""
+    changed = []
+    for share in (0.75, 0.9, 1.1, 1.25):
+        changed.append(replace(plant, inertia=share * plant.inertia, gravity=share * plant.gravity))
+        changed.append(replace(plant, damping=share * plant.damping))
+    return changed
+
+
+def push_trains(plant: PlantParameters) -> list[dict[str, Any]]:
+    """Return disturbances that push, when the pendulum is up, with shares of the largest torque."""
+    return [
+        {"kind": "pulse_train", "amplitude": share * plant.effort_limit, "frequency": 0.4, "pulse_width": 0.1,
+         "start_time": 5.0, "hold_time": 0.0, "duration": 7.0}
+        for share in (0.1, 0.2, 0.4, 0.6)
+    ]  # fmt: skip
+
+
+def _model_error(plant: PlantParameters) -> Sequence[Variation]:
+    return [(one, {}, {}) for one in model_errors(plant)]
+
+
+def _noise(plant: PlantParameters) -> Sequence[Variation]:
+    return [(plant, {}, {"position_noise": a, "velocity_noise": 10.0 * a}) for a in (0.001, 0.003, 0.01, 0.03)]
+
+
+def _delay(plant: PlantParameters) -> Sequence[Variation]:
+    return [(replace(plant, transport_delay=delay), {}, {}) for delay in (0.002, 0.005, 0.01, 0.02, 0.04)]
+
+
+def _torque_response(plant: PlantParameters) -> Sequence[Variation]:
+    return [(replace(plant, actuator_time_constant=lag), {}, {}) for lag in (0.005, 0.01, 0.02, 0.05)]
+
+
+def _pushes(plant: PlantParameters) -> Sequence[Variation]:
+    return [(plant, push, {}) for push in push_trains(plant)]
+
+
+PERTURBATIONS: Mapping[str, Callable[[PlantParameters], Sequence[Variation]]] = {
+    "model_error": _model_error,
+    "noise": _noise,
+    "delay": _delay,
+    "torque_response": _torque_response,
+    "pushes": _pushes,
+}
+"""Kind of perturbation -> the plants, disturbances and sensors that it tries."""
+
+
+def evaluate(
+    plant: str,
+    controller: str,
+    *,
+    parameters: Mapping[str, Any] | None = None,
+    duration: float = 10.0,
+    robustness: bool = True,
+    patience: float = PATIENCE,
+) -> Entry:
+    """Return the line of a controller: from hanging down to upright, on the plant that it was designed for.
+
+    Args:
+        plant: Preset or file of a rigid plant.
+        controller: Kind.
+        parameters: Of the controller; by default those that it comes with.
+        duration: Length of each run [s].
+        robustness: Whether to try the perturbations.
+        patience: Wall time of the plain run beyond which no perturbation is tried [s]; the board then shows a dash.
+    """
+    true = load_plant(plant)
+    # Hanging exactly down is an equilibrium that no torque of an energy controller leaves.
+    spec: dict[str, Any] = {
+        "plant": plant, "design_plant": plant, "controller": controller, "controller_parameters": parameters or {},
+        "theta": 0.01, "duration": duration, "method": "etd4",
+    }  # fmt: skip
+    began = time.perf_counter()
+    try:
+        arrays = simulate_plant(RunSpec(**spec), true)
+    except (PendulumError, ArithmeticError) as error:
+        wall = time.perf_counter() - began
+        return Entry(plant, controller, str(error), False, {}, {}, {}, wall, np.empty((3, 0)))
+    success, uptime, costs = costs_of(arrays)
+    wall = time.perf_counter() - began
+    held: dict[str, float] = {}
+    if robustness and success and wall < patience:
+        for name, vary in PERTURBATIONS.items():
+            outcomes = []
+            for changed, disturbance, noise in vary(true):
+                sensors = Sensors(np.random.default_rng(1), **noise)
+                run = RunSpec(**{**spec, "disturbance": dict(disturbance)})
+                try:
+                    outcomes.append(costs_of(simulate_plant(run, changed, sensors))[0])
+                except (PendulumError, ArithmeticError):
+                    outcomes.append(False)
+            held[name] = float(np.mean(outcomes))
+    score = scores(success, uptime, costs)
+    return Entry(plant, controller, "", success, costs, score, held, wall, motion_of(arrays))
+
+
+def motion_of(arrays: RunArrays) -> Array:
+    """Return time, angle from upright and torque of a run, thinned for a plot, shape (3, n)."""
+    step = max(1, len(arrays.applied) // 500)
+    t = (arrays.stamp_ns[:-1] - arrays.stamp_ns[0]) / NANOSECONDS
+    return np.stack([t, wrap(arrays.position[:-1] - UPRIGHT), arrays.applied])[:, ::step]
+
+
+def contenders() -> list[str]:
+    """Return the controllers of the board."""
+    return [name for name in CONTROLLERS if name not in EXCLUDED]

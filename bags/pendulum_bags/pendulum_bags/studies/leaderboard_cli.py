@@ -1,0 +1,93 @@
+"""``experiment leaderboard``: every controller, one board."""
+
+from __future__ import annotations
+
+import json
+import os
+from concurrent.futures import ProcessPoolExecutor
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from pendulum_msgs_py.programs.counted_progress import counting_bar
+from pendulum_msgs_py.programs.executables import EXIT_INTERRUPTED
+from pendulum_msgs_py.programs.terminal import WholeTable, make_console
+
+__all__ = ["leaderboard"]
+
+
+def leaderboard(
+    out: Annotated[Path, typer.Option(help="Folder of the page.")] = Path("bags/runs/leaderboard"),
+    plants: Annotated[
+        str, typer.Option(help="Rigid plants (presets or files) and hw, the emulated X5-9, separated by commas.")
+    ] = "thesis,dfki",
+    controllers: Annotated[str, typer.Option(help="Controllers, separated by commas; empty for all.")] = "",
+    duration: Annotated[float, typer.Option(help="Length of each run [s].", min=1.0)] = 10.0,
+    robustness: Annotated[bool, typer.Option(help="Try model errors, noise, delay, lag and pushes too.")] = True,
+    workers: Annotated[int, typer.Option(help="Runs at once; 0 for one a core.", min=0)] = 0,
+    json_output: Annotated[bool, typer.Option("--json", help="Print the board as JSON.")] = False,
+) -> None:
+    """Score every controller from hanging down to upright: three public scores, costs, robustness, one page.
+
+    On hw each run is four nodes over DDS: about 7 s for the plain run of a controller, 2 min with the perturbations.
+
+    Example: python -m pendulum_bags experiment leaderboard --plants thesis --controllers lqr,pid --no-robustness
+    """
+    from pendulum_bags.runs.run_folder import write_json
+    from pendulum_bags.studies.leaderboard import HARDWARE, contenders, evaluate
+    from pendulum_bags.studies.leaderboard_hardware import evaluate_hardware
+    from pendulum_bags.studies.leaderboard_page import best_sentence, to_json, write_page
+    from pendulum_lqr.controller import controller_class
+    from pendulum_msgs_py.plants.plant_parameters import load_plant
+
+    names = [name.strip() for name in controllers.split(",") if name.strip()] or contenders()
+    machines = [name.strip() for name in plants.split(",") if name.strip()]
+    for name in names:
+        controller_class(name)
+    for name in machines:
+        if name != HARDWARE:
+            load_plant(name)
+    console = make_console(stderr=json_output, highlight=False)
+    entries = []
+    pool = ProcessPoolExecutor(workers or os.cpu_count() or 1)
+    try:
+        with counting_bar(console) as bar:
+            task = bar.add_task("controllers", total=len(names) * len(machines))
+            jobs = [
+                pool.submit(evaluate_hardware, name, duration=duration, robustness=robustness)
+                if machine == HARDWARE
+                else pool.submit(evaluate, machine, name, duration=duration, robustness=robustness)
+                for machine in machines
+                for name in names
+            ]
+            for job in jobs:
+                entries.append(job.result())
+                bar.advance(task)
+    except KeyboardInterrupt:
+        pool.shutdown(wait=False, cancel_futures=True)
+        console.print("interrupted: nothing was written")
+        raise typer.Exit(EXIT_INTERRUPTED) from None
+    pool.shutdown()
+    out.mkdir(parents=True, exist_ok=True)
+    page = write_page(out / "leaderboard.html", entries, duration)
+    write_json(out / "leaderboard.json", to_json(entries))
+    if json_output:
+        print(json.dumps(to_json(entries), indent=2))
+        return
+    table = WholeTable(title="Leaderboard", title_justify="left")
+    for heading in ("plant", "controller", "up", "v1", "v2", "v3", "time \\[s]", "robustness \\[%]"):
+        table.add_column(heading, justify="left" if heading in {"plant", "controller"} else "right")
+    for entry in sorted(entries, key=lambda one: (machines.index(one.plant), -one.scores.get("v2", -1.0))):
+        held = list(entry.robustness.values())
+        table.add_row(
+            entry.plant,
+            entry.controller,
+            "yes" if entry.success else "no",
+            *(f"{entry.scores[name]:.3f}" if entry.scores else "–" for name in ("v1", "v2", "v3")),
+            f"{entry.costs['time']:.2f}" if entry.costs else "–",
+            f"{100.0 * sum(held) / len(held):.0f}" if held else "–",
+        )
+    console.print(table)
+    console.print(best_sentence(entries))
+    console.print(f"page    {page}", soft_wrap=True)

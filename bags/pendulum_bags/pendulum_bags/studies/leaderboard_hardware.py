@@ -1,0 +1,169 @@
+"""The board's lines for the machine: the same nodes over the same DDS as on a real X5-9, here on the emulated one.
+
+Each run is a program of its own in a ROS domain of its own, in lockstep, so that a line is the same whenever it is
+computed. A run in which the bridge faults (too fast, out of its window) is a failure with the bridge's own words.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from pendulum_bags.experiments.in_process import RunArrays
+from pendulum_bags.experiments.run_spec import RunSpec
+from pendulum_bags.studies.leaderboard import (
+    HARDWARE,
+    Entry,
+    costs_of,
+    model_errors,
+    motion_of,
+    push_trains,
+    scores,
+)
+from pendulum_msgs_py.contract import names
+from pendulum_msgs_py.errors import DataError, FaultError, PendulumError
+from pendulum_msgs_py.plants.plant_parameters import load_plant, write_plant
+from pendulum_rosbag.reader import read_bag
+
+__all__ = ["HARDWARE_PERTURBATIONS", "arrays_of_bag", "evaluate_hardware"]
+
+_PLANT = "thesis"
+_STRATEGY = "direct_pwm"
+_LONGEST = 300.0
+
+
+def arrays_of_bag(bag: Path, namespace: str) -> RunArrays:
+    """Return a recorded run as the board's arrays.
+
+    Args:
+        bag: The bag of a run in lockstep.
+        namespace: Of its plant.
+
+    Raises:
+        DataError: States and torques do not belong together.
+    """
+    with read_bag(bag) as opened:
+        states = opened.array(f"{namespace}/{names.JOINT_STATES}")
+        applied = opened.array(f"{namespace}/{names.APPLIED_EFFORT}")
+    stamps, first = np.unique(states["stamp_ns"], return_index=True)
+    states = states[first]
+    common, at, where = np.intersect1d(stamps, applied["stamp_ns"], return_indices=True)
+    if common.size < 10 or common.size < stamps.size - 2:
+        raise DataError(f"bag {bag} has {stamps.size} states and torques for {common.size}; expected one for each")
+    torque = np.zeros(stamps.size)
+    torque[at] = applied["effort"][where]
+    unknown = np.full(stamps.size, np.nan)
+    return RunArrays(
+        stamps, states["position"], states["velocity"], states["effort"], unknown, unknown, torque[:-1]
+    )
+
+
+def _model_error(folder: Path) -> Sequence[Mapping[str, Any]]:
+    # The machine stays; the controller is designed on a wrong model of it.
+    found = []
+    for number, changed in enumerate(model_errors(load_plant(_PLANT))):
+        path = folder / f"design_{number}.yaml"
+        write_plant(path, replace(changed, name=path.stem))
+        found.append({"design_plant": str(path)})
+    return found
+
+
+def _noise(_: Path) -> Sequence[Mapping[str, Any]]:
+    return [{"seed": seed} for seed in (2, 3, 4)]
+
+
+def _torque_response(_: Path) -> Sequence[Mapping[str, Any]]:
+    return [{"strategy": strategy} for strategy in ("direct_pwm_compensated", "effort_loop")]
+
+
+def _pushes(_: Path) -> Sequence[Mapping[str, Any]]:
+    return [{"disturbance": push} for push in push_trains(load_plant(_PLANT))]
+
+
+HARDWARE_PERTURBATIONS: Mapping[str, Callable[[Path], Sequence[Mapping[str, Any]]]] = {
+    "model_error": _model_error,
+    "noise": _noise,
+    "torque_response": _torque_response,
+    "pushes": _pushes,
+}
+"""Kind of perturbation -> what it changes of the run. The machine has a delay of its own; seeds vary its noise."""
+
+
+def evaluate_hardware(
+    controller: str,
+    *,
+    parameters: Mapping[str, Any] | None = None,
+    duration: float = 10.0,
+    robustness: bool = True,
+) -> Entry:
+    """Return the line of a controller on the emulated machine: from hanging down to upright, over DDS.
+
+    Args:
+        controller: Kind.
+        parameters: Of the controller; by default those that it comes with.
+        duration: Length of each run [s].
+        robustness: Whether to try the perturbations.
+    """
+    began = time.perf_counter()
+    try:
+        spec = RunSpec(
+            side="hw",
+            plant=_PLANT,
+            design_plant=_PLANT,
+            strategy=_STRATEGY,
+            controller=controller,
+            controller_parameters=parameters or {},
+            theta=0.01,
+            duration=duration,
+        )
+        arrays = _run(spec)
+    except (PendulumError, ArithmeticError) as error:
+        wall = time.perf_counter() - began
+        return Entry(HARDWARE, controller, str(error), False, {}, {}, {}, wall, np.empty((3, 0)))
+    success, uptime, costs = costs_of(arrays)
+    wall = time.perf_counter() - began
+    held: dict[str, float] = {}
+    if robustness and success:
+        with tempfile.TemporaryDirectory(prefix="pendulum_board_") as folder:
+            for name, vary in HARDWARE_PERTURBATIONS.items():
+                held[name] = float(np.mean([_succeeds(replace(spec, **change)) for change in vary(Path(folder))]))
+    return Entry(
+        HARDWARE, controller, "", success, costs, scores(success, uptime, costs), held, wall, motion_of(arrays)
+    )
+
+
+def _succeeds(spec: RunSpec) -> bool:
+    try:
+        return costs_of(_run(spec))[0]
+    except (PendulumError, ArithmeticError):
+        return False
+
+
+def _run(spec: RunSpec) -> RunArrays:
+    with tempfile.TemporaryDirectory(prefix="pendulum_board_") as folder:
+        place = Path(folder)
+        (place / "spec.json").write_text(json.dumps(spec.to_json()), encoding="utf-8")
+        command = [sys.executable, "-m", "pendulum_bags", "experiment", "run", str(place / "spec.json")]
+        # Without a domain of ours it finds a free one, whoever else runs beside it.
+        environment = {name: value for name, value in os.environ.items() if name != "ROS_DOMAIN_ID"}
+        try:
+            done = subprocess.run(
+                [*command, "--bag", str(place / "bag")], capture_output=True, text=True, timeout=_LONGEST,
+                check=False, env=environment,
+            )  # fmt: skip
+        except subprocess.TimeoutExpired as error:
+            raise FaultError(f"a run on the emulated machine did not end within {_LONGEST:g} s") from error
+        if done.returncode:
+            said = [line for line in done.stderr.splitlines() if line.strip()]
+            raise FaultError((said or [f"the run ended with code {done.returncode}"])[-1].removeprefix("error: "))
+        return arrays_of_bag(place / "bag", spec.namespace)

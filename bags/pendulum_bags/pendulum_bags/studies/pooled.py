@@ -1,0 +1,78 @@
+"""What several runs of a named experiment say together: equivalence over all noises, parameters over all hands."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from rich.console import Console
+from scipy import stats
+
+from pendulum_bags.comparison import compare_folders
+from pendulum_bags.studies.study_file import Study
+from pendulum_msgs_py.errors import DataError
+from pendulum_msgs_py.programs.terminal import WholeTable
+
+__all__ = ["analyse", "print_table"]
+
+UNITS = {"inertia": "kg m^2", "damping": "N m s/rad", "gravity": "N m"}
+
+
+def analyse(folder: Path, study: Study, records: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+    """Return the pooled comparison of the thesis's experiments, or the parameters of all identification experiments.
+
+    Args:
+        folder: Of the study.
+        study: The study.
+        records: Of its runs; those that failed are left out.
+    """
+    done = {int(record["number"]) for record in records if record["status"] == "done"}
+    runs = [(run, folder / "runs" / run.name / "run") for run in study.runs if run.number in done]
+    if study.experiment == "thesis":
+        return {"comparison": compare_folders([place for _, place in runs]).to_json()}
+    rows = []
+    for run, place in runs:
+        path = place / "identified.json"
+        try:
+            found = json.loads(path.read_text(encoding="utf-8"))
+            values, intervals = dict(found["average"]), dict(found["intervals"])
+        except (OSError, ValueError, KeyError, TypeError) as error:
+            raise DataError(f"{path} holds no identification: {error}") from error
+        rows.append({"seed": run.labels["seed"], "values": values, "intervals": intervals})
+    pooled = {name: _mean([row["values"][name] for row in rows]) for name in rows[0]["values"]} if rows else {}
+    return {"identified": rows, "pooled": pooled}
+
+
+def print_table(console: Console, result: Mapping[str, Any]) -> None:
+    """Print what :func:`analyse` found."""
+    if "comparison" in result:
+        content = result["comparison"]
+        pooled = "1 run" if content["runs"] == 1 else f"{content['runs']} runs pooled"
+        console.print(f"{pooled}: {content['verdict']['sentence']}")
+        return
+    table = WholeTable(title="Identified, 95 % interval over trials", title_justify="left")
+    table.add_column("seed", justify="right")
+    for name in result["pooled"]:
+        table.add_column(f"{name} \\[{UNITS.get(name, '')}]", justify="right")
+    for row in result["identified"]:
+        cells = [
+            f"{row['values'][name]:.4g} ({row['intervals'][name][0]:.4g} to {row['intervals'][name][1]:.4g})"
+            for name in result["pooled"]
+        ]
+        table.add_row(str(row["seed"]), *cells)
+    if len(result["identified"]) > 1:
+        pooled = result["pooled"].values()
+        table.add_row("all", *(f"{one['mean']:.4g} ({one['low']:.4g} to {one['high']:.4g})" for one in pooled))
+    console.print(table)
+
+
+def _mean(values: Sequence[float]) -> dict[str, float | None]:
+    """Return mean and 95 % interval of runs that differ in their seed (Student's t)."""
+    mean = float(np.mean(values))
+    if len(values) < 2:
+        return {"mean": mean, "low": None, "high": None}
+    half = float(stats.t.ppf(0.975, len(values) - 1) * np.std(values, ddof=1) / np.sqrt(len(values)))
+    return {"mean": mean, "low": mean - half, "high": mean + half}

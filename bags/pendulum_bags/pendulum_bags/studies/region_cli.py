@@ -1,0 +1,77 @@
+"""``experiment region_of_attraction``: from which starts does the loop reach upright, under the torque limit?"""
+
+from __future__ import annotations
+
+import json
+import time
+from functools import partial
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from pendulum_msgs_py.programs.counted_progress import counted_progress
+from pendulum_msgs_py.programs.terminal import make_console
+
+__all__ = ["region_of_attraction"]
+
+
+def region_of_attraction(
+    out: Annotated[
+        Path | None,
+        typer.Option(help="Folder; an interrupted map is gone on with. Default: bags/runs/region_of_attraction."),
+    ] = None,
+    plant: Annotated[str, typer.Option(help="Preset or plant file; the controller is designed on it.")] = "thesis",
+    uncertainty: Annotated[
+        str, typer.Option(help="identified (covariance of the plant file), or shares: inertia=0.3,damping=0.05.")
+    ] = "inertia=0.3,damping=0.05,gravity=0.05",
+    plants: Annotated[int, typer.Option(help="Plants tried at each start; 1 for the believed one.", min=1)] = 100,
+    effort_limit: Annotated[
+        float, typer.Option(help="Torque limit of the loop [N m]; 0 for the plant's own.", min=0.0)
+    ] = 0.0,
+    points: Annotated[int, typer.Option(help="Points along each axis of the grid.", min=3)] = 61,
+    angle_span: Annotated[float, typer.Option(help="Half width of the grid about upright [rad].")] = 3.141592653589793,
+    velocity_span: Annotated[float, typer.Option(help="Half width of the grid in velocity [rad/s].")] = 10.0,
+    duration: Annotated[float, typer.Option(help="Length of each run [s].")] = 8.0,
+    q: Annotated[tuple[float, float], typer.Option(help="Diagonal of Q.")] = (100.0, 0.01),
+    r: Annotated[float, typer.Option(help="R.")] = 0.1,
+    seed: Annotated[int, typer.Option(help="Seed of the plants.", min=0)] = 1,
+    scheduler: Annotated[str, typer.Option(help="Dask scheduler, tcp://HOST:PORT.")] = "",
+    workers: Annotated[int, typer.Option(help="Processes of a local Dask cluster; 0 for none.", min=0)] = 0,
+    json_output: Annotated[bool, typer.Option("--json", help="Print the result as JSON.")] = False,
+) -> None:
+    """Map the starts from which the LQR reaches upright under a torque limit, over everything not known of the plant.
+
+    Example: python -m pendulum_bags experiment region_of_attraction --plant dfki --plants 20 --out /tmp/region
+    """
+    from pendulum_bags.studies.chunks import cluster_client
+    from pendulum_bags.studies.region_figure import region_sentence, write_region_figure
+    from pendulum_bags.studies.region_map import RegionMap, run_region_map
+    from pendulum_bags.studies.uncertain import parse_uncertainty
+
+    settings = RegionMap(
+        plant=plant,
+        uncertainty=parse_uncertainty(uncertainty, plant),
+        plants=plants,
+        q=q,
+        r=r,
+        effort_limit=effort_limit,
+        points=points,
+        angle_span=angle_span,
+        velocity_span=velocity_span,
+        duration=duration,
+        seed=seed,
+    )
+    folder = out or Path("bags", "runs", "region_of_attraction")
+    console = make_console(stderr=json_output, highlight=False)
+    started = time.monotonic()
+    connect = partial(cluster_client, scheduler, workers)
+    with counted_progress(console, "chunks", settings.chunks, folder) as on_progress:
+        result = run_region_map(folder, settings, connect=connect, on_progress=on_progress)
+    picture = write_region_figure(folder / "region.png", result)
+    if json_output:
+        print(json.dumps(result.to_json(), indent=2))
+        return
+    console.print(region_sentence(result))
+    elapsed = time.monotonic() - started
+    console.print(f"\npicture {picture}\nmap     {folder / 'map.parquet'}\n({elapsed:.0f} s)", soft_wrap=True)

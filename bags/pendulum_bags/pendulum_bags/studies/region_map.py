@@ -1,0 +1,322 @@
+"""From which starts is upright reached under the torque limit, over all that is not known of the plant?
+
+A grid of starts (theta, theta'), run for many plants through the batch engine; chunk by chunk as the Monte Carlo is,
+so that neither the number of workers nor an interruption changes a bit. Plant 0 is the one that is believed in. The
+ellipse of the linear analysis, proven for that plant, belongs inside.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import math
+from collections.abc import Callable
+from contextlib import nullcontext
+from dataclasses import asdict, dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pendulum_bags.runs.run_folder import write_json
+from pendulum_bags.studies.chunks import (
+    Connect,
+    chunk_path,
+    open_results,
+    read_columns,
+    run_chunks,
+    write_columns,
+)
+from pendulum_bags.studies.uncertain import VARIED, Uncertainty, batch_variations
+from pendulum_lqr.design import Gain, continuous_lqr
+from pendulum_lqr.model import linearise
+from pendulum_lqr.roa import proven_level, sublevel_ellipse
+from pendulum_msgs_py.contract.angles import UPRIGHT, wrap
+from pendulum_msgs_py.errors import ParameterError
+from pendulum_msgs_py.plants.plant_parameters import PlantParameters, load_plant
+from pendulum_sim.batch import simulate_batch
+
+__all__ = ["COLUMNS", "RegionMap", "RegionResult", "run_region_map"]
+
+COLUMNS = ("plant", *VARIED, "theta_0", "theta_dot_0", "theta_end", "theta_dot_end", "attracted")
+"""Columns of the Parquet files of the runs; SI units, ``plant`` counts the plants from 0."""
+MAP_COLUMNS = ("theta_0", "theta_dot_0", "plants", "attracted", "share", "attracted_believed", "turned")
+
+_RUNS_OF_CHUNK = 50_000
+_TWO_PI = 2.0 * math.pi
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class RegionMap:
+    """What to map.
+
+    Attributes:
+        plant: Preset or file of the plant that is believed in; the controller is designed on it.
+        uncertainty: How far its parameters are known.
+        plants: Plants at each start, the believed one first; 1 leaves the uncertainty out.
+        q: Diagonal of Q.
+        r: R.
+        effort_limit: Torque limit [N m]; 0 for the plant's own.
+        points: Points along each axis of the grid; an odd number has upright at rest among them.
+        angle_span: Half width of the grid about upright [rad].
+        velocity_span: Its half width in velocity [rad/s].
+        duration: Of each run [s].
+        dt: Period of the loop [s].
+        method: Integrator.
+        tolerance: Angle from upright [rad] and velocity [rad/s] at the end below which upright is reached.
+        seed: Seed of the plants.
+    """
+
+    plant: str = "thesis"
+    uncertainty: Uncertainty = field(
+        default_factory=lambda: Uncertainty({"inertia": 0.3, "damping": 0.05, "gravity": 0.05})
+    )
+    plants: int = 100
+    q: tuple[float, float] = (100.0, 0.01)
+    r: float = 0.1
+    effort_limit: float = 0.0
+    points: int = 61
+    angle_span: float = math.pi
+    velocity_span: float = 10.0
+    duration: float = 8.0
+    dt: float = 0.002
+    method: str = "etd2"
+    tolerance: tuple[float, float] = (0.1, 0.2)
+    seed: int = 1
+
+    def __post_init__(self) -> None:
+        """Refuse what cannot be run."""
+        for name, value, unit, low, high in (
+            ("plants", self.plants, "", 1, 1_000_000),
+            ("points", self.points, "", 3, 2001),
+            ("seed", self.seed, "", 0, 2**63 - 1),
+            ("angle_span", self.angle_span, " rad", 1e-6, math.pi),
+            ("velocity_span", self.velocity_span, " rad/s", 1e-6, 1e4),
+            ("duration", self.duration, " s", self.dt, 1e4),
+            ("effort_limit", self.effort_limit, " N m", 0.0, 1e9),
+        ):
+            if not low <= value <= high:
+                raise ParameterError(f"{name} is {value}{unit}; expected {low:g} to {high:g}{unit}")
+
+    @property
+    def plants_of_chunk(self) -> int:
+        """Plants in a chunk; part of the result's definition."""
+        return max(1, _RUNS_OF_CHUNK // self.points**2)
+
+    @property
+    def chunks(self) -> int:
+        """How many chunks there are."""
+        return -(-self.plants // self.plants_of_chunk)
+
+    def grid(self) -> tuple[Array, Array]:
+        """Return start angles [rad] and velocities [rad/s], shape (points,) each."""
+        return (
+            UPRIGHT + np.linspace(-self.angle_span, self.angle_span, self.points),
+            np.linspace(-self.velocity_span, self.velocity_span, self.points),
+        )
+
+    def believed(self) -> PlantParameters:
+        """Return the plant with the torque limit of the loop.
+
+        Raises:
+            ParameterError: The plant is no rigid one.
+        """
+        plant = load_plant(self.plant)
+        if plant.drivetrain is not None:
+            raise ParameterError(f"plant {self.plant!r} is series elastic; expected a rigid one")
+        return replace(plant, effort_limit=self.effort_limit or plant.effort_limit)
+
+    def gain(self) -> Gain:
+        """Return the LQR gain."""
+        return continuous_lqr(linearise(self.believed(), UPRIGHT), self.q, self.r)
+
+    def fingerprint(self) -> str:
+        """Return a hash of all that the result depends on."""
+        content = json.dumps([asdict(self), asdict(self.believed())], sort_keys=True)
+        return hashlib.sha256(content.encode()).hexdigest()[:16]
+
+
+@dataclass(frozen=True)
+class RegionResult:
+    """The map.
+
+    Attributes:
+        settings: What was mapped.
+        limit: Torque limit [N m].
+        theta: Start angles, shape (n,) [rad].
+        theta_dot: Start velocities, shape (n,) [rad/s].
+        share: Share of the plants that reach upright, shape (n velocities, n angles).
+        believed: Whether the plant that is believed in does, same shape.
+        turned: Share of the plants that reach it after going round, same shape.
+        moving: Share of all runs that neither reached upright nor rest: a longer duration may decide them.
+        level: c of the ellipse x' S x <= c, proven for the believed plant without dry friction.
+        ellipse: Its boundary: angle from upright [rad], velocity [rad/s], shape (k, 2).
+        counterexamples: Starts inside the ellipse from which the believed plant does not reach upright; 0 is right.
+        share_in_ellipse: Share of all runs from inside the ellipse that reach upright; NaN without such a start.
+    """
+
+    settings: RegionMap
+    limit: float
+    theta: Array
+    theta_dot: Array
+    share: Array
+    believed: NDArray[np.bool_]
+    turned: Array
+    moving: float
+    level: float
+    ellipse: Array
+    counterexamples: int
+    share_in_ellipse: float
+
+    @property
+    def area(self) -> float:
+        """Area of the starts from which at least half of the plants reach upright, within the grid [rad^2/s]."""
+        return float(np.count_nonzero(self.share >= 0.5)) * self._cell
+
+    @property
+    def certain_area(self) -> float:
+        """Area of the starts from which every plant reaches upright, within the grid [rad^2/s]."""
+        return float(np.count_nonzero(self.share == 1.0)) * self._cell
+
+    @property
+    def _cell(self) -> float:
+        return float((self.theta[1] - self.theta[0]) * (self.theta_dot[1] - self.theta_dot[0]))
+
+    def to_json(self) -> dict[str, Any]:
+        """Return the figures as JSON values; the map itself is in the Parquet file."""
+        return {
+            "settings": asdict(self.settings),
+            "runs": self.settings.plants * self.share.size,
+            "effort_limit": self.limit,
+            "area": self.area,
+            "certain_area": self.certain_area,
+            "believed_area": float(np.count_nonzero(self.believed)) * self._cell,
+            "proven_level": self.level,
+            "counterexamples": self.counterexamples,
+            "share_in_ellipse": self.share_in_ellipse if math.isfinite(self.share_in_ellipse) else None,
+            "still_moving": self.moving,
+        }
+
+
+def run_region_map(
+    folder: Path,
+    settings: RegionMap,
+    *,
+    connect: Connect = nullcontext,
+    on_progress: Callable[[int, int], None] = lambda done, total: None,
+) -> RegionResult:
+    """Run what is not on disk yet, one Parquet file for each chunk, and write the map and its figures.
+
+    Args:
+        folder: Where the files go; a folder of the same settings is gone on with.
+        settings: What to map.
+        connect: To a Dask cluster (`cluster_client`); by default in this process, on all cores.
+        on_progress: Called with chunks done and in all.
+
+    Raises:
+        BagError: The folder holds something else.
+    """
+    job = (settings, settings.believed(), tuple(float(value) for value in settings.gain().K))
+    open_results(folder, "map", settings.fingerprint(), asdict(settings))
+    run_chunks(folder, _run_chunk, job, settings.chunks, connect=connect, on_progress=on_progress)
+    result = _summarise(folder, settings)
+    write_columns(folder / "map.parquet", _map_columns(result))
+    write_json(folder / "region.json", result.to_json())
+    return result
+
+
+def _run_chunk(
+    job: tuple[RegionMap, PlantParameters, tuple[float, ...]], index: int, threads: int | None
+) -> dict[str, NDArray[Any]]:
+    settings, plant, gain = job
+    first = index * settings.plants_of_chunk
+    count = min(settings.plants_of_chunk, settings.plants - first)
+    generator = np.random.Generator(np.random.Philox(key=[settings.seed, index]))
+    drawn = settings.uncertainty.draw(plant, count, generator)
+    if first == 0:
+        for name in VARIED:
+            drawn[name][0] = getattr(plant, name)
+    angles, velocities = settings.grid()
+    theta_dot, theta = (axis.ravel() for axis in np.meshgrid(velocities, angles, indexing="ij"))
+    every = {name: np.repeat(values, theta.size) for name, values in drawn.items()}
+    starts, speeds = np.tile(theta, count), np.tile(theta_dot, count)
+    result = simulate_batch(
+        plant,
+        variations=batch_variations(plant, every),
+        steps=max(1, round(settings.duration / settings.dt)),
+        dt=settings.dt,
+        method=settings.method,
+        theta=starts,
+        theta_dot=speeds,
+        gain=gain,
+        threads=threads,
+    )
+    near = (np.abs(wrap(result.theta - UPRIGHT)) < settings.tolerance[0]) & (
+        np.abs(result.theta_dot) < settings.tolerance[1]
+    )
+    columns: dict[str, NDArray[Any]] = {
+        "plant": np.repeat(np.arange(first, first + count, dtype=np.int32), theta.size),
+        **every,
+        "theta_0": starts,
+        "theta_dot_0": speeds,
+        "theta_end": result.theta,
+        "theta_dot_end": result.theta_dot,
+        "attracted": near,
+    }
+    return {name: columns[name] for name in COLUMNS}
+
+
+def _summarise(folder: Path, settings: RegionMap) -> RegionResult:
+    shape = (settings.points, settings.points)
+    hits, rounds = np.zeros(shape, dtype=np.int64), np.zeros(shape, dtype=np.int64)
+    believed = np.zeros(shape, dtype=np.bool_)
+    moving = 0
+    for index in range(settings.chunks):
+        columns = read_columns(chunk_path(folder, index), ("attracted", "theta_end", "theta_dot_end"))
+        attracted = columns["attracted"].reshape(-1, *shape)
+        turns = np.round((columns["theta_end"].reshape(-1, *shape) - UPRIGHT) / _TWO_PI)
+        hits += attracted.sum(axis=0)
+        rounds += (attracted & (turns != 0.0)).sum(axis=0)
+        velocity = np.abs(columns["theta_dot_end"].reshape(-1, *shape))
+        # Written so that a run which is not a number any more counts as moving.
+        moving += int((~attracted & ~(velocity < settings.tolerance[1])).sum())
+        if index == 0:
+            believed = attracted[0]
+    plant, gain = settings.believed(), settings.gain()
+    level = proven_level(plant, gain, plant.effort_limit)
+    theta, theta_dot = settings.grid()
+    x, v = np.meshgrid(theta - UPRIGHT, theta_dot)
+    S = gain.S
+    inside = S[0, 0] * x * x + 2.0 * S[0, 1] * x * v + S[1, 1] * v * v <= level
+    return RegionResult(
+        settings=settings,
+        limit=plant.effort_limit,
+        theta=theta,
+        theta_dot=theta_dot,
+        share=hits / settings.plants,
+        believed=believed,
+        turned=rounds / settings.plants,
+        moving=moving / (settings.plants * settings.points**2),
+        level=level,
+        ellipse=sublevel_ellipse(S, level),
+        counterexamples=int(np.count_nonzero(inside & ~believed)),
+        share_in_ellipse=float(hits[inside].sum() / (settings.plants * inside.sum())) if inside.any() else math.nan,
+    )
+
+
+def _map_columns(result: RegionResult) -> dict[str, NDArray[Any]]:
+    theta, theta_dot = np.meshgrid(result.theta, result.theta_dot)
+    plants = result.settings.plants
+    columns: dict[str, NDArray[Any]] = {
+        "theta_0": theta.ravel(),
+        "theta_dot_0": theta_dot.ravel(),
+        "plants": np.full(theta.size, plants, dtype=np.int64),
+        "attracted": np.rint(result.share * plants).astype(np.int64).ravel(),
+        "share": result.share.ravel(),
+        "attracted_believed": result.believed.ravel(),
+        "turned": result.turned.ravel(),
+    }
+    return {name: columns[name] for name in MAP_COLUMNS}

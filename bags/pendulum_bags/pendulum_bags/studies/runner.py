@@ -1,0 +1,248 @@
+"""Carry out a study: runs in parallel, each in a ROS domain of its own; resumed where it stopped."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import sys
+import time
+from collections.abc import Callable
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from pendulum_bags.experiments.processes import Child, ProcessSet
+from pendulum_bags.runs.run_folder import write_json
+from pendulum_bags.studies.study_file import Study, StudyRun
+from pendulum_msgs_py.errors import BagError, PendulumError
+
+__all__ = ["StudyProgress", "default_workers", "open_study_folder", "read_record", "run_study"]
+
+_POLL = 0.05
+_LONGEST_FACTOR = 20.0
+_LONGEST_EXTRA = 120.0
+"""A run is given up after its expected time this often, and this much longer [s]."""
+
+
+@dataclass
+class StudyProgress:
+    """Where a study is.
+
+    Attributes:
+        total: Runs in the matrix.
+        done: Runs finished, those of earlier calls among them.
+        failed: Runs that failed.
+        skipped: Runs that were there already.
+        remaining: Expected wall time until the end [s].
+        running: Names of the runs that are under way.
+    """
+
+    total: int
+    done: int = 0
+    failed: int = 0
+    skipped: int = 0
+    remaining: float = 0.0
+    running: list[str] = field(default_factory=list)
+
+
+def default_workers(study: Study) -> int:
+    """Return how many runs to carry out at once: one where they keep the wall's time, else one for two cores."""
+    return 1 if study.realtime else max(1, (os.cpu_count() or 2) // 2)
+
+
+def open_study_folder(folder: Path, study: Study) -> None:
+    """Make the folder of a study, or check that the one that is there holds the same study.
+
+    Raises:
+        BagError: The folder holds something else, or another study.
+    """
+    kept = folder / "study.yaml"
+    if kept.is_file():
+        fingerprints = json.loads((folder / "matrix.json").read_text(encoding="utf-8"))
+        if fingerprints != _matrix(study):
+            raise BagError(
+                f"folder {folder} holds runs of another study, or of another version of this one; expected a new folder"
+            )
+        return
+    if folder.exists() and any(folder.iterdir()):
+        raise BagError(f"folder {folder} is not empty and holds no study; expected a new one")
+    folder.mkdir(parents=True, exist_ok=True)
+    write_json(folder / "matrix.json", _matrix(study))
+    kept.write_text(study.text, encoding="utf-8")
+
+
+def read_record(folder: Path, run: StudyRun) -> dict[str, Any] | None:
+    """Return what is known about a run that has ended, well or not; None for one that has not."""
+    path = folder / "runs" / run.name / "run.json"
+    if not path.is_file():
+        return None
+    record: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
+    return record
+
+
+def run_study(
+    folder: Path,
+    study: Study,
+    *,
+    workers: int,
+    retry_failed: bool = False,
+    on_progress: Callable[[StudyProgress], None] = lambda _: None,
+) -> StudyProgress:
+    """Carry out all runs of a study that have not been carried out.
+
+    Args:
+        folder: As :func:`open_study_folder` made it.
+        study: The study.
+        workers: Runs at once.
+        retry_failed: Carry out again those that failed; else they stay failed.
+        on_progress: Called several times a second.
+
+    Returns:
+        Where the study is at the end.
+    """
+    progress = StudyProgress(len(study.runs))
+    waiting: list[StudyRun] = []
+    for run in study.runs:
+        record = read_record(folder, run)
+        if record is None or (record["status"] == "failed" and retry_failed):
+            waiting.append(run)
+            continue
+        progress.done += 1
+        progress.skipped += 1
+        progress.failed += record["status"] == "failed"
+    pace = _Pace(waiting, workers)
+    running: list[_Running] = []
+    # Runs in one process hold the interpreter, but only for tenths of a second; nodes are processes of their own.
+    with ProcessSet(folder / "logs", {}) as processes, ThreadPoolExecutor(1) as threads:
+        try:
+            while waiting or running:
+                while waiting and len(running) < workers:
+                    running.append(_start(folder, waiting.pop(0), processes, threads))
+                time.sleep(_POLL)
+                for item in list(running):
+                    outcome = item.outcome(processes)
+                    if outcome is None:
+                        continue
+                    running.remove(item)
+                    progress.done += 1
+                    progress.failed += bool(outcome)
+                    pace.learn(item.run, time.monotonic() - item.started)
+                    _record(item, outcome)
+                progress.running = [item.run.name for item in running]
+                progress.remaining = pace.remaining(waiting, [(item.run, item.started) for item in running])
+                on_progress(progress)
+        except BaseException:
+            threads.shutdown(wait=False, cancel_futures=True)
+            raise
+    return progress
+
+
+@dataclass
+class _Running:
+    """A run under way: a child process, or a job of a thread."""
+
+    run: StudyRun
+    folder: Path
+    started: float
+    attempts: int
+    child: Child | None = None
+    job: Future[None] | None = None
+
+    def outcome(self, processes: ProcessSet) -> str | None:
+        """Return None while it runs, an empty string when it went well, else why it failed."""
+        if self.job is not None:
+            if not self.job.done():
+                return None
+            error = self.job.exception()
+            return "" if error is None else f"{error}" or type(error).__name__
+        assert self.child is not None
+        code = self.child.process.poll()
+        if code is None:
+            allowed = _LONGEST_EXTRA + _LONGEST_FACTOR * self.run.seconds
+            if time.monotonic() - self.started < allowed:
+                return None
+            processes.finish(self.child, 20.0)
+            return f"did not end within {allowed:.0f} s: {self.child.last_words()}"
+        if self.child in processes.children:
+            processes.children.remove(self.child)
+        return "" if code == 0 else self.child.last_words() or f"ended with code {code}"
+
+
+def _start(folder: Path, run: StudyRun, processes: ProcessSet, threads: ThreadPoolExecutor) -> _Running:
+    place = folder / "runs" / run.name
+    before = read_record(folder, run)
+    # What is there without a record is half a run; with one, a failed run that is retried.
+    shutil.rmtree(place, ignore_errors=True)
+    place.mkdir(parents=True)
+    item = _Running(run, place, time.monotonic(), 1 + (before or {}).get("attempts", 0))
+    if run.spec is not None:
+        write_json(place / "spec.json", run.spec.to_json())
+    if run.engine == "process":
+        item.job = threads.submit(_simulate, run, place)
+        return item
+    command = [sys.executable, "-m", "pendulum_bags", "experiment"]
+    if run.spec is None:
+        command += [*run.arguments, "--out", str(place / "run")]
+    else:
+        command += ["run", str(place / "spec.json"), "--bag", str(place / "bag")]
+    # Each finds a free domain: one that is set in our environment would be the same for all.
+    environment = {"ROS_DOMAIN_ID": ""}
+    item.child = processes.start(run.name, command, ends_by_itself=True, environment=environment)
+    return item
+
+
+def _simulate(run: StudyRun, place: Path) -> None:
+    import numpy as np
+
+    from pendulum_bags.experiments.in_process import simulate
+
+    assert run.spec is not None
+    arrays = simulate(run.spec)
+    np.savez_compressed(place / "run.npz", **vars(arrays))
+
+
+def _record(item: _Running, failure: str) -> None:
+    from pendulum_bags.studies.results import run_metrics
+
+    run = item.run
+    record: dict[str, Any] = {
+        "number": run.number,
+        "labels": dict(run.labels),
+        "fingerprint": run.fingerprint(),
+        "engine": run.engine,
+        "attempts": item.attempts,
+        "wall_s": round(time.monotonic() - item.started, 3),
+        "simulated_s": run.spec.duration if run.spec else None,
+    }
+    if not failure and run.spec is not None:
+        try:
+            record["metrics"] = run_metrics(item.folder, run.spec)
+        except PendulumError as error:
+            failure = f"recorded, but cannot be read: {error}"
+    record.update(status="failed" if failure else "done", reason=failure)
+    write_json(item.folder / "run.json", record)
+
+
+class _Pace:
+    """Expected remaining time, corrected by how long runs really took."""
+
+    def __init__(self, runs: list[StudyRun], workers: int) -> None:
+        self._workers = max(1, min(workers, len(runs) or 1))
+        self._expected = self._taken = 0.0
+
+    def learn(self, run: StudyRun, seconds: float) -> None:
+        self._expected += run.seconds
+        self._taken += seconds
+
+    def remaining(self, waiting: list[StudyRun], running: list[tuple[StudyRun, float]]) -> float:
+        factor = self._taken / self._expected if self._expected else 1.0
+        now = time.monotonic()
+        left = factor * sum(run.seconds for run in waiting)
+        left += sum(max(0.0, factor * run.seconds - (now - started)) for run, started in running)
+        return left / self._workers
+
+
+def _matrix(study: Study) -> dict[str, str]:
+    return {run.name: run.fingerprint() for run in study.runs}

@@ -1,0 +1,304 @@
+"""``experiment study`` and the studies that have a name: from a file to a table."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+from rich.console import Console
+from rich.progress import TextColumn
+
+from pendulum_msgs_py.errors import FaultError, ParameterError
+from pendulum_msgs_py.programs.counted_progress import counting_bar, resumable
+from pendulum_msgs_py.programs.terminal import WholeTable, make_console
+
+if TYPE_CHECKING:
+    from pendulum_bags.studies.results import Group
+    from pendulum_bags.studies.study_file import Study
+
+__all__ = ["add_commands"]
+
+Out = Annotated[
+    Path | None,
+    typer.Option(help="Folder of the study; an interrupted study goes on there. Default: bags/runs/<name>."),
+]
+Workers = Annotated[
+    int,
+    typer.Option(help="Runs at once, each in a ROS domain of its own; 0: one for two cores.", min=0, max=256),
+]
+Retry = Annotated[bool, typer.Option("--retry-failed", help="Carry out again the runs that failed.")]
+DryRun = Annotated[
+    bool, typer.Option("--dry-run", help="Show matrix, time and disk that it needs; run nothing.")
+]
+Seeds = Annotated[int, typer.Option(help="Number of seeds in place of the file's; 0 keeps those.", min=0)]
+Json = Annotated[bool, typer.Option("--json", help="Print the result as JSON instead of tables.")]
+
+_SHOWN = (
+    "rms_error",
+    "settling_time",
+    "overshoot",
+    "ise",
+    "itae",
+    "max_effort",
+    "effort_energy",
+    "smoothness",
+    "success",
+)
+
+
+def add_commands(app: typer.Typer) -> None:
+    """Add the studies to the command line of ``experiment``."""
+    app.command(name="study")(study)
+    app.command(name="run", hidden=True)(run)
+    for name, command in (
+        ("strategies", strategies),
+        ("pid_vs_lqr", pid_vs_lqr),
+        ("random_start", random_start),
+    ):
+        app.command(name=name)(command)
+
+
+def study(
+    file: Annotated[str, typer.Argument(help="Study file (YAML), or the name of a shipped study.")],
+    out: Out = None,
+    workers: Workers = 0,
+    seeds: Seeds = 0,
+    retry_failed: Retry = False,
+    dry_run: DryRun = False,
+    json_output: Json = False,
+) -> None:
+    """Carry out a study: plants x controllers x disturbances x set-points x starts x seeds.
+
+    Shipped: thesis, pid_vs_lqr, strategies, inertia_damping, gravity, random_start.
+
+    Example: python -m pendulum_bags experiment study random_start --out /tmp/random --workers 2
+    """
+    _study(file, out, workers, seeds, retry_failed, dry_run, json_output)
+
+
+def strategies(
+    out: Out = None,
+    workers: Workers = 0,
+    retry_failed: Retry = False,
+    dry_run: DryRun = False,
+    json_output: Json = False,
+) -> None:
+    """Show how the actuator's strategy changes the plant that one and the same LQR sees.
+
+    Example: python -m pendulum_bags experiment strategies --out /tmp/strategies
+    """
+    _study("strategies", out, workers, 0, retry_failed, dry_run, json_output)
+
+
+def pid_vs_lqr(
+    out: Out = None,
+    workers: Workers = 0,
+    seeds: Seeds = 0,
+    retry_failed: Retry = False,
+    dry_run: DryRun = False,
+    json_output: Json = False,
+) -> None:
+    """Compare PID and LQR on simulation and hardware under the same noise and the same step, over 20 seeds.
+
+    Example: python -m pendulum_bags experiment pid_vs_lqr --out /tmp/pid_vs_lqr --workers 2
+    """
+    _study("pid_vs_lqr", out, workers, seeds, retry_failed, dry_run, json_output)
+
+
+def random_start(
+    out: Out = None,
+    workers: Workers = 0,
+    seeds: Seeds = 0,
+    retry_failed: Retry = False,
+    dry_run: DryRun = False,
+    json_output: Json = False,
+) -> None:
+    """Regulate from random starts on simulation and hardware, the thesis's future work.
+
+    Example: python -m pendulum_bags experiment random_start --out /tmp/random --seeds 5
+    """
+    _study("random_start", out, workers, seeds, retry_failed, dry_run, json_output)
+
+
+def run(
+    spec: Annotated[Path, typer.Argument(help="JSON file with one run.")],
+    bag: Annotated[Path, typer.Option(help="Folder of the bag; it must not exist.")],
+) -> None:
+    """Carry out one run of a study; its programs start each other this way.
+
+    Example: python -m pendulum_bags experiment run run.json --bag /tmp/bag
+    """
+    from pendulum_bags.experiments.lockstep import record_run
+    from pendulum_bags.experiments.run_spec import RunSpec
+
+    try:
+        values = json.loads(spec.read_text(encoding="utf-8"))
+    except (OSError, ValueError) as error:
+        raise ParameterError(f"run file {spec} cannot be read: {error}") from error
+    record_run(bag, RunSpec.from_json(values))
+
+
+def _study(
+    source: str,
+    out: Path | None,
+    workers: int,
+    seeds: int,
+    retry_failed: bool,
+    dry_run: bool,
+    json_output: bool,
+) -> None:
+    from pendulum_bags.studies.results import collect, write_table
+    from pendulum_bags.studies.runner import StudyProgress, default_workers, open_study_folder, run_study
+    from pendulum_bags.studies.study_file import load_study
+
+    found = load_study(source, seeds=range(1, seeds + 1) if seeds else None)
+    workers = workers or default_workers(found)
+    if found.realtime and workers > 1:
+        raise ParameterError(
+            f"workers is {workers}; expected 1: runs in real time must not share the machine"
+        )
+    console = make_console(stderr=json_output, highlight=False)
+    if dry_run:
+        _print_matrix(console, found, workers)
+        return
+    folder = out or Path("bags", "runs", found.name)
+    open_study_folder(folder, found)
+    told = -1
+
+    def show(progress: StudyProgress) -> None:
+        nonlocal told
+        bar.update(task, completed=progress.done, remaining=_duration(progress.remaining))
+        if not console.is_terminal and progress.done != told:
+            told = progress.done
+            failed = f", {progress.failed} failed" if progress.failed else ""
+            console.print(
+                f"{progress.done} of {progress.total} runs{failed}, {_duration(progress.remaining)} left"
+            )
+
+    with resumable(console, folder), counting_bar(console, TextColumn("{task.fields[remaining]} left")) as bar:
+        task = bar.add_task(found.name, total=len(found.runs), remaining="")
+        end = run_study(folder, found, workers=workers, retry_failed=retry_failed, on_progress=show)
+    records = collect(folder, found)
+    write_table(folder / "runs.csv", records)
+    for record in records:
+        if record["status"] == "failed":
+            console.print(f"run {record['number']} failed: {record['reason']}", markup=False)
+    if end.failed == end.total:
+        raise FaultError(f"all {end.total} runs failed; {folder}/runs holds their logs")
+    result = _analyse(folder, found, records)
+    if json_output:
+        print(json.dumps(result, indent=2))
+    else:
+        _print_result(console, found, folder, result, records)
+    if end.failed:
+        console.print(f"{end.failed} of {end.total} runs failed; --retry-failed carries them out again")
+        raise typer.Exit(1)
+
+
+def _analyse(folder: Path, found: Study, records: Sequence[dict[str, Any]]) -> dict[str, Any]:
+    from pendulum_bags.runs.run_folder import write_json
+    from pendulum_bags.studies import pid_vs_lqr as pid_analysis
+    from pendulum_bags.studies import pooled
+    from pendulum_bags.studies import strategies as strategies_analysis
+    from pendulum_bags.studies.results import group_runs, groups_to_json
+
+    result: dict[str, Any] = {"study": found.name, "runs": len(records)}
+    if found.experiment == "run":
+        result["groups"] = groups_to_json(group_runs(records))
+    else:
+        result["pooled"] = pooled.analyse(folder, found, records)
+    if found.analysis == "strategies":
+        result["strategies"] = strategies_analysis.analyse(folder, found)
+    elif found.analysis == "pid_vs_lqr":
+        result["pid_vs_lqr"] = pid_analysis.analyse(folder, found, records)
+    write_json(folder / "results.json", result)
+    return result
+
+
+def _print_matrix(console: Console, found: Study, workers: int) -> None:
+    console.print(f"{found.name}: {found.description}" if found.description else found.name, markup=False)
+    table = WholeTable()
+    for heading in ("axis", "values"):
+        table.add_column(heading)
+    for axis in ("plant", "controller", "disturbance", "set_point", "start", "seed", "repeat"):
+        values = list(dict.fromkeys(_label(run.labels[axis]) for run in found.runs))
+        if values == [""]:
+            continue  # this experiment has no such axis
+        text = ", ".join(values[:8]) + (f", ... ({len(values)})" if len(values) > 8 else "")
+        table.add_row(axis, text)
+    console.print(table)
+    seconds = sum(run.seconds for run in found.runs) / max(1, min(workers, len(found.runs)))
+    size = sum(run.bytes for run in found.runs) / 1e6
+    runs = "1 run" if len(found.runs) == 1 else f"{len(found.runs)} runs"
+    console.print(
+        f"{runs}, about {_duration(seconds)} with {workers} at once, about {size:.0f} MB on disk"
+    )
+
+
+def _print_result(
+    console: Console, found: Study, folder: Path, result: dict[str, Any], records: Sequence[dict[str, Any]]
+) -> None:
+    from pendulum_bags.studies import pid_vs_lqr as pid_analysis
+    from pendulum_bags.studies import pooled
+    from pendulum_bags.studies import strategies as strategies_analysis
+    from pendulum_bags.studies.results import group_runs
+
+    if found.analysis == "strategies":
+        strategies_analysis.print_table(console, result["strategies"])
+    elif found.analysis == "pid_vs_lqr":
+        pid_analysis.print_table(console, result["pid_vs_lqr"])
+    elif found.experiment == "run":
+        _print_groups(console, group_runs(records))
+    else:
+        pooled.print_table(console, result["pooled"])
+    wall = sum(record["wall_s"] for record in records)
+    simulated = sum(record["simulated_s"] or 0.0 for record in records)
+    told = f", {simulated:.0f} s simulated" if simulated else ""
+    console.print(
+        f"\nstudy   {folder}\ntable   {folder / 'runs.csv'}\n({len(records)} runs, {wall:.0f} s of runs{told})",
+        soft_wrap=True,
+    )
+
+
+def _print_groups(console: Console, groups: Sequence[Group]) -> None:
+    table = WholeTable(title="Mean over seeds, 95 % interval", title_justify="left")
+    table.add_column("")
+    for group in groups:
+        table.add_column(
+            "\n".join(str(group.labels[axis]) for axis in ("plant", "controller", "disturbance", "start"))
+        )
+    table.add_row(
+        "runs",
+        *(f"{len(group.seeds)}" + (f" ({group.failed} failed)" if group.failed else "") for group in groups),
+    )
+    for metric in _SHOWN:
+        if any(metric in group.values for group in groups):
+            table.add_row(metric, *(_cell(group, metric) for group in groups))
+    console.print(table)
+
+
+def _cell(group: Group, metric: str) -> str:
+    if metric not in group.values:
+        return "–"
+    mean, low, high = group.mean(metric)
+    never = sum(not math.isfinite(value) for value in group.values[metric])
+    if math.isnan(mean):
+        return "never"
+    interval = "" if math.isnan(low) else f"\n{low:.4g} to {high:.4g}"
+    return f"{mean:.4g}{interval}" + (f"\nnever in {never}" if never else "")
+
+
+def _label(value: Any) -> str:
+    return f"{value:.4g}" if isinstance(value, float) else str(value)
+
+
+def _duration(seconds: float) -> str:
+    minutes, rest = divmod(round(seconds), 60)
+    hours, minutes = divmod(minutes, 60)
+    return (
+        f"{hours} h {minutes:02} min" if hours else f"{minutes} min {rest:02} s" if minutes else f"{rest} s"
+    )

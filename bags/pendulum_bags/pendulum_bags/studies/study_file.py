@@ -1,0 +1,350 @@
+"""A study as a file: axes of plants, controllers, disturbances, set-points, starts and seeds, and their product."""
+
+from __future__ import annotations
+
+import hashlib
+import itertools
+import json
+import math
+from collections.abc import Mapping, Sequence, Sized
+from dataclasses import dataclass, field
+from importlib import resources
+from pathlib import Path
+from typing import Any
+
+from pendulum_bags.experiments.run_spec import CLOCKS, PERIODS, RunSpec
+from pendulum_bags.experiments.settings import TIME_BESIDE_NOISE
+from pendulum_bags.studies.located import LocatedMapping
+from pendulum_msgs_py.contract import noise
+from pendulum_msgs_py.contract.angles import UPRIGHT
+from pendulum_msgs_py.errors import ParameterError
+
+__all__ = ["ANALYSES", "EXPERIMENTS", "Study", "StudyRun", "load_study", "shipped_studies"]
+
+FORMAT = "pendulum_study/1"
+EXPERIMENTS = ("run", "thesis", "inertia_damping", "gravity")
+ANALYSES = ("metrics", "strategies", "pid_vs_lqr", "none")
+STARTS = {"upright": UPRIGHT, "bottom": 0.0}
+_KEYS = (
+    "format", "name", "description", "experiment", "analysis", "clock", "duration", "plants", "controllers",
+    "disturbances", "set_points", "starts", "seeds", "repeats", "trials",
+)  # fmt: skip
+_PLANT_KEYS = ("side", "plant", "design_plant", "strategy", "method", "engine", "parameters", "hardware")
+_MAX_RUNS = 100_000
+_LARGEST = 1e300  # whole numbers in YAML have no end
+
+# Measured on two cores; an estimate for --dry-run, not a promise.
+_NODE_START = 5.0
+_SECONDS_PER_STEP = 1.5e-3
+_BYTES_PER_STEP = {"sim": 600, "hw": 1300}
+_BYTES_PER_RUN = 60_000
+_THESIS_BYTES = 25_000_000
+_TRIAL_SECONDS = {"inertia_damping": 7.0, "gravity": 17.0}
+_TRIAL_BYTES = {"inertia_damping": 2_500_000, "gravity": 14_000_000}
+
+
+@dataclass(frozen=True)
+class StudyRun:
+    """One cell of a study's matrix.
+
+    Attributes:
+        number: From 1, in the order of the file.
+        labels: Name on each axis: plant, controller, disturbance, set_point, start, seed, repeat.
+        spec: The run, for ``experiment: run``.
+        engine: ``nodes`` over DDS, or ``process``: the same pieces in one process.
+        arguments: For other experiments: what follows ``python -m pendulum_bags experiment``, but ``--out``.
+        seconds: Expected wall time [s].
+        bytes: Expected size on disk.
+    """
+
+    number: int
+    labels: Mapping[str, Any]
+    spec: RunSpec | None
+    engine: str
+    arguments: tuple[str, ...]
+    seconds: float
+    bytes: int
+
+    @property
+    def name(self) -> str:
+        """Name of the run's folder: its number and what tells it from others."""
+        labels = [self.labels[axis] for axis in ("plant", "controller", "disturbance", "start")]
+        parts = [f"{label:.4g}" if isinstance(label, float) else str(label) for label in labels]
+        return "_".join([f"{self.number:05}", *(p for p in parts if p), f"seed{self.labels['seed']}"])
+
+    def fingerprint(self) -> str:
+        """Return a short hash of all that the run is made of."""
+        spec = self.spec.to_json() if self.spec else None
+        content = {"spec": spec, "arguments": self.arguments, "engine": self.engine}
+        return hashlib.sha256(json.dumps(content, sort_keys=True, default=str).encode()).hexdigest()[:16]
+
+
+@dataclass(frozen=True)
+class Study:
+    """A study.
+
+    Attributes:
+        name: Its name.
+        description: What it asks, one sentence.
+        experiment: What each cell is: ``run`` in lockstep, or one of the experiments with a name.
+        analysis: What is made of the runs.
+        runs: The matrix.
+        text: The file, as it is kept beside the results.
+        clock: ``lockstep``, as fast as possible, or ``realtime``.
+    """
+
+    name: str
+    description: str
+    experiment: str
+    analysis: str
+    runs: tuple[StudyRun, ...]
+    text: str = field(repr=False, default="")
+    clock: str = "lockstep"
+
+    @property
+    def realtime(self) -> bool:
+        """Whether runs keep the wall's time, so that no two of them may share the machine."""
+        return self.clock == "realtime"
+
+
+def shipped_studies() -> dict[str, Path]:
+    """Return the studies that come with the package, by name."""
+    folder = resources.files("pendulum_bags.studies") / "files"
+    paths = [Path(str(path)) for path in folder.iterdir() if path.name.endswith(".yaml")]
+    return {path.stem: path for path in sorted(paths)}
+
+
+def load_study(source: str | Path, *, seeds: Sequence[int] | None = None) -> Study:
+    """Read a study file, or one of the shipped studies by name.
+
+    Args:
+        source: Path, or name of a shipped study.
+        seeds: Seeds to use in place of the file's.
+
+    Raises:
+        ParameterError: The file is refused; the message has file and line.
+    """
+    shipped = shipped_studies()
+    path = Path(source)
+    if str(source) in shipped and not path.exists():
+        path = shipped[str(source)]
+    elif not path.suffix and not path.exists():
+        raise ParameterError(
+            f"study is {str(source)!r}; expected a file, or one of {', '.join(sorted(shipped))}"
+        )
+    file = LocatedMapping.load(path, "study file")
+    file.reject_unknown(_KEYS)
+    if file.get("format", str, None, repr(FORMAT)) != FORMAT:
+        file.fail(f"format is {file.values['format']!r}; expected {FORMAT!r}", "format")
+    experiment = _choice(file, "experiment", EXPERIMENTS, "run")
+    clock = _choice(file, "clock", CLOCKS, "realtime" if experiment == "thesis" else "lockstep")
+    if experiment == "thesis" and clock != "realtime":
+        file.fail("clock is 'lockstep'; expected realtime, the thesis's experiment knows no other", "clock")
+    analysis = _choice(file, "analysis", ANALYSES, "metrics" if experiment == "run" else "none")
+    values = list(seeds) if seeds is not None else _seeds(file)
+    repeats = file.get("repeats", int, 1, "a whole number >= 1")
+    if not 1 <= repeats <= _MAX_RUNS:
+        file.fail(f"repeats is {repeats}; expected >= 1 and <= {_MAX_RUNS}", "repeats")
+    make = _plain_runs if experiment == "run" else _named_runs
+    runs = tuple(make(file, experiment, clock, values, repeats))
+    return Study(
+        file.get("name", str, None, "a name"),
+        file.get("description", str, "", "a sentence"),
+        experiment,
+        analysis,
+        runs,
+        path.read_text(encoding="utf-8"),
+        clock,
+    )
+
+
+def _plain_runs(file: LocatedMapping, _: str, clock: str, seeds: Sequence[int], repeats: int) -> list[StudyRun]:
+    duration = _duration(file)
+    plants, controllers = _axis(file, "plants"), _axis(file, "controllers")
+    disturbances = _axis(file, "disturbances", {"none": {}})
+    set_points = file.get("set_points", list, [0.0], "a list of angles from upright [rad]")
+    starts = file.get("starts", list, ["upright"], "a list of upright, bottom, random or angles [rad]")
+    for index, start in enumerate(starts):
+        if start not in (*STARTS, "random") and not _is_number(start):
+            file.fail(
+                f"start is {start!r}; expected upright, bottom, random or an angle [rad]", "starts", index
+            )
+    for index, value in enumerate(set_points):
+        if not _is_number(value):
+            file.fail(f"set-point is {value!r}; expected an angle from upright [rad]", "set_points", index)
+    axes = (plants, controllers, disturbances, set_points, starts, seeds, range(1, repeats + 1))
+    _limit_runs(file, axes)
+    runs = []
+    for number, (plant, controller, disturbance, set_point, start, seed, repeat) in enumerate(
+        itertools.product(*axes), start=1
+    ):
+        settings = plants[plant].values
+        parameters = dict(controllers[controller].values)
+        kind = parameters.pop("kind", controller)
+        try:
+            spec = RunSpec(
+                side=settings.get("side", "sim"),
+                plant=settings.get("plant", "thesis"),
+                design_plant=settings.get("design_plant", "thesis"),
+                strategy=settings.get("strategy", "direct_pwm"),
+                method=settings.get("method", "euler"),
+                plant_parameters=settings.get("parameters", {}),
+                controller=kind,
+                controller_parameters=parameters,
+                disturbance=dict(disturbances[disturbance].values),
+                theta=_start_angle(start, seed),
+                set_point=float(set_point),
+                duration=duration,
+                seed=seed,
+                clock=clock,
+            )
+        except ParameterError as error:
+            where = next(
+                (("controllers", controller) for word in ("controller",) if str(error).startswith(word)),
+                ("disturbances", disturbance) if str(error).startswith("disturbance") else ("plants", plant),
+            )
+            file.fail(str(error), *where)
+        engine = settings.get("engine", "nodes")
+        if engine not in ("nodes", "process") or (engine == "process" and spec.side != "sim"):
+            plants[plant].fail(
+                f"engine is {engine!r}; expected nodes, or process for a plain simulator", "engine"
+            )
+        if engine == "process" and (settings.get("parameters") or clock == "realtime"):
+            plants[plant].fail(
+                "engine is 'process'; expected nodes for a plant with parameters of its own, and in real time", "engine"
+            )
+        labels = {
+            "plant": plant, "controller": controller, "disturbance": disturbance, "set_point": float(set_point),
+            "start": start, "seed": seed, "repeat": repeat,
+        }  # fmt: skip
+        steps = duration / PERIODS[spec.side]
+        seconds = 0.05 + 8e-5 * steps if engine == "process" else _NODE_START + _SECONDS_PER_STEP * steps
+        if clock == "realtime":
+            seconds = _NODE_START + duration
+        size = 56 * steps if engine == "process" else _BYTES_PER_RUN + _BYTES_PER_STEP[spec.side] * steps
+        runs.append(StudyRun(number, labels, spec, engine, (), seconds, round(size)))
+    return runs
+
+
+def _limit_runs(file: LocatedMapping, axes: Sequence[Sized]) -> None:
+    count = math.prod(len(axis) for axis in axes)
+    if count > _MAX_RUNS:
+        file.fail(f"the matrix has {count} runs; expected at most {_MAX_RUNS}")
+
+
+def _named_runs(
+    file: LocatedMapping, experiment: str, clock: str, seeds: Sequence[int], repeats: int
+) -> list[StudyRun]:
+    plants = _axis(file, "plants", {"thesis": {}})
+    runs = []
+    if experiment == "thesis":
+        controllers = _axis(file, "controllers", {"lqr": {}})
+        disturbances = _axis(file, "disturbances", {"uniform": {}})
+    else:
+        controllers, disturbances = (
+            {"": LocatedMapping({}, file.path, {})},
+            {"": LocatedMapping({}, file.path, {})},
+        )
+    trials = file.get("trials", int, 6 if experiment == "inertia_damping" else 3, "a whole number >= 1")
+    axes = (plants, controllers, disturbances, seeds, range(1, repeats + 1))
+    _limit_runs(file, axes)
+    for number, (plant, controller, disturbance, seed, repeat) in enumerate(
+        itertools.product(*axes), start=1
+    ):
+        settings = plants[plant].values
+        arguments = [experiment, "--seed", str(seed), "--hardware", str(settings.get("hardware", "emulator"))]
+        arguments += ["--plant", str(settings.get("plant", "thesis"))]
+        if experiment == "thesis":
+            arguments += ["--strategy", str(settings.get("strategy", "direct_pwm"))]
+            arguments += _thesis_arguments(controllers[controller], controller, disturbances[disturbance])
+            duration = _duration(file)
+            arguments += ["--duration", repr(duration)]
+            seconds, size = TIME_BESIDE_NOISE + duration, _THESIS_BYTES
+        else:
+            arguments += ["--trials", str(trials), *(["--realtime"] if clock == "realtime" else [])]
+            seconds, size = trials * _TRIAL_SECONDS[experiment], trials * _TRIAL_BYTES[experiment]
+        labels = {
+            "plant": plant, "controller": controller, "disturbance": disturbance, "set_point": 0.0, "start": "",
+            "seed": seed, "repeat": repeat,
+        }  # fmt: skip
+        runs.append(StudyRun(number, labels, None, "nodes", tuple(arguments), seconds, size))
+    return runs
+
+
+def _thesis_arguments(controller: LocatedMapping, name: str, disturbance: LocatedMapping) -> list[str]:
+    controller.reject_unknown(("kind", "q", "r"))
+    disturbance.reject_unknown(("kind", "amplitude", "hold_time"))
+    kind = disturbance.values.get("kind", "uniform")
+    if kind != "uniform":
+        disturbance.fail(f"kind is {kind!r}; expected uniform, in the thesis's experiment", "kind")
+    arguments = ["--controller", str(controller.values.get("kind", name))]
+    if "q" in controller.values:
+        q = controller.get("q", list, None, "two numbers")
+        if len(q) != 2 or not all(_is_number(value) for value in q):
+            controller.fail(f"q is {q!r}; expected two numbers", "q")
+        arguments += ["--q", *(repr(float(value)) for value in q)]
+    for key, source in (("r", controller), ("amplitude", disturbance), ("hold_time", disturbance)):
+        if key in source.values:
+            value = source.get(key, (int, float), None, "a number")
+            if not _is_number(value):
+                source.fail(f"{key} is {value!r}; expected a number", key)
+            value = float(value)
+            arguments += [f"--{key.replace('_', '-')}", repr(value)]
+    return arguments
+
+
+def _axis(
+    file: LocatedMapping, key: str, default: Mapping[str, Any] | None = None
+) -> dict[str, LocatedMapping]:
+    entries = file.mapping(key, default)
+    if not entries.values:
+        file.fail(f"{key} is empty; expected at least one name", key)
+    found = {name: entries.mapping(name, {}) for name in entries.values}
+    if key == "plants":
+        for entry in found.values():
+            entry.reject_unknown(_PLANT_KEYS)
+    return found
+
+
+def _seeds(file: LocatedMapping) -> list[int]:
+    value = file.get("seeds", (list, dict), [1], "a list of whole numbers, or {first: 1, count: 20}")
+    if isinstance(value, dict):
+        entry = file.mapping("seeds")
+        entry.reject_unknown(("first", "count"))
+        first = entry.get("first", int, 1, "a whole number >= 0")
+        count = entry.get("count", int, None, "a whole number >= 1")
+        if not 1 <= count <= _MAX_RUNS:
+            entry.fail(f"count is {count}; expected 1 to {_MAX_RUNS}", "count")
+        value = list(range(first, first + count))
+    if not value or not all(
+        isinstance(seed, int) and not isinstance(seed, bool) and seed >= 0 for seed in value
+    ):
+        file.fail(f"seeds are {value!r}; expected at least one whole number >= 0", "seeds")
+    if len(set(value)) != len(value):
+        file.fail("a seed is given twice; use repeats to run one again", "seeds")
+    return value
+
+
+def _choice(file: LocatedMapping, key: str, choices: Sequence[str], default: str) -> str:
+    value = file.get(key, str, default, f"one of {', '.join(choices)}")
+    if value not in choices:
+        file.fail(f"{key} is {value!r}; expected one of {', '.join(choices)}", key)
+    return str(value)
+
+
+def _start_angle(start: Any, seed: int) -> float:
+    if start == "random":
+        # A stream of its own: the same number must not be the start and the first sample of the noise.
+        return float(noise.uniform(seed, 2**40, math.pi))
+    return STARTS[start] if isinstance(start, str) else float(start)
+
+
+def _duration(file: LocatedMapping) -> float:
+    value = file.get("duration", (int, float), 5.0, "a number of seconds")
+    if not _is_number(value):
+        file.fail(f"duration is {value!r}; expected a finite number of seconds", "duration")
+    return float(value)
+
+
+def _is_number(value: Any) -> bool:
+    return isinstance(value, (int, float)) and not isinstance(value, bool) and abs(value) < _LARGEST

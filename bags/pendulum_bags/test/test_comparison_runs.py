@@ -1,0 +1,197 @@
+"""Comparison of recorded runs, from bags to verdict."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+from scipy.interpolate import CubicSpline
+
+from pendulum_bags.comparison import Outcome, compare_folders, compare_runs, read_run
+from pendulum_bags.comparison.compare_cli import main
+from pendulum_bags.runs.run_data import missed_periods, timing_warning
+from pendulum_msgs_py.contract.cdr import encode_joint_state
+from pendulum_msgs_py.errors import BagError, DataError
+from pendulum_rosbag.storage import open_writer
+from tests.synthetic_runs import regulate, run_metadata, write_bag, write_run_folder
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_run_folder(tmp_path_factory.mktemp("runs") / "first", seed=1)
+
+
+def test_figures_of_a_plant_are_those_of_its_arrays(folder: Path) -> None:
+    columns = regulate(rate=100.0, seed=1, hardware=True)
+    plant = compare_folders([folder]).plants["hw"]
+    assert plant["std_theta"] == pytest.approx(columns["position"].std(ddof=1), rel=1e-12)
+    assert plant["std_theta_dot"] == pytest.approx(columns["velocity"].std(ddof=1), rel=1e-12)
+    assert plant["max_abs_u"] == np.abs(columns["command"]).max()
+    assert plant["rate_hz"] == pytest.approx(100.0)
+    assert plant["missed_deadlines"] == 0
+    assert plant["noise_hold_time"] == 0.01
+
+
+def test_unpaired_statistics_are_those_of_the_thesis(folder: Path) -> None:
+    """Cubic interpolation by scipy at the simulation's stamps, difference, description by pandas."""
+    sim = regulate(rate=500.0, seed=1_000_001, hold_time=0.002)
+    hw = regulate(rate=100.0, seed=1, hardware=True)
+    times = sim["t"][sim["t"] <= hw["t"][-1] + 1e-9]
+    spline = CubicSpline(hw["t"], hw["position"])(times)
+    expected = pd.Series(spline - sim["position"][: times.size]).describe()
+    found = compare_folders([folder]).unpaired["position"]
+    np.testing.assert_allclose(list(found.values()), expected.to_numpy(), rtol=1e-6, atol=1e-12)
+
+
+def test_runs_under_one_noise_are_paired_and_close(folder: Path) -> None:
+    comparison = compare_runs(folder / "sim", folder / "hw", sim_prefix="/sim", hw_prefix="/hw")
+    assert comparison.is_paired
+    paired = comparison.paired
+    assert paired["position"]["count"] == 500
+    assert paired["disturbance_alignment"]["correlation"] == pytest.approx(1.0)
+    assert paired["path"] < 0.2
+    assert 0.0 < paired["response_alignment"]["delay_s"] < 0.006  # 4 ms of delay, seen through the plant
+    assert paired["aligned"]["rms_position"] < paired["rms_position"]
+
+
+def test_noise_held_for_another_time_is_no_pair_and_the_spread_shows_it(folder: Path) -> None:
+    comparison = compare_runs(folder / "sim_500hz", folder / "hw")
+    assert not comparison.is_paired
+    assert "the recorded disturbances differ" in comparison.paired["reason"]
+    assert comparison.verdict.outcome is Outcome.DIFFERENT
+    assert "spread of angle" in comparison.verdict.sentence
+
+
+def test_content_is_json_with_the_fields_that_a_summary_promises(folder: Path) -> None:
+    content = compare_folders([folder], margin=0.01).to_json()
+    text = json.dumps(content, allow_nan=False)
+    again = json.loads(text)
+    for plant in ("sim", "hw"):
+        for key in ("rate_hz", "missed_deadlines", "std_theta", "std_theta_dot", "max_abs_u"):
+            assert isinstance(again["plants"][plant][key], (int, float))
+    for block in ("paired", "unpaired"):
+        for key in ("position", "velocity"):
+            assert list(again[block][key]) == ["count", "mean", "std", "min", "25%", "50%", "75%", "max"]
+    assert again["seed"] == 1
+    assert again["strategy"] == "direct_pwm"
+    assert again["versions"]
+    assert again["verdict"]["margins"]["stated"] is True
+
+
+def test_a_difference_in_the_plant_is_found(tmp_path: Path) -> None:
+    folder = write_run_folder(tmp_path / "stiff", ramps=False, changes={"damping": 25.0})
+    verdict = compare_folders([folder]).verdict
+    assert verdict.outcome is Outcome.DIFFERENT
+    assert "spread of velocity" in verdict.sentence
+
+
+def test_pooled_runs_narrow_the_intervals(folder: Path, tmp_path: Path) -> None:
+    folders = [folder, *(write_run_folder(tmp_path / str(seed), seed, ramps=False) for seed in (2, 3, 4))]
+    one, four = compare_folders(folders[:1]), compare_folders(folders)
+    widths = [
+        [test.interval.high - test.interval.low for test in result.unpaired_verdict.tests] for result in (one, four)
+    ]
+    assert np.median(np.array(widths[1]) / np.array(widths[0])) < 0.8
+    content = four.to_json()
+    assert content["runs"] == 4
+    assert len(content["paired"]["runs"]) == 4
+    assert content["plants"]["hw"]["samples"] == 2000
+
+
+def test_states_that_are_missing_count_as_missed_deadlines() -> None:
+    stamps = np.array([0, 2, 4, 10, 12, 14, 16, 20]) * 1_000_000
+    assert missed_periods(stamps) == 3
+
+
+def test_a_run_that_lost_many_states_is_told_apart_from_a_sound_one(folder: Path) -> None:
+    plants = compare_folders([folder]).plants
+    assert timing_warning(plants) == ""
+    disturbed = {**plants, "sim": {**plants["sim"], "samples": 2384, "missed_deadlines": 116}}
+    assert "sim missed 116 of 2500 states (4.6 %); end other programs" in timing_warning(disturbed)
+
+
+def test_without_events_the_window_is_that_of_the_disturbance(tmp_path: Path) -> None:
+    columns = regulate(rate=100.0, seed=5)
+    with open_writer(tmp_path / "bag") as bag:
+        for topic in ("joint_states", "disturbance"):
+            bag.add_topic(f"/hw/{topic}", "sensor_msgs/msg/JointState")
+        for i in range(600):
+            k = min(max(i - 50, 0), 499)
+            state = {"position": columns["position"][k], "velocity": columns["velocity"][k], "effort": 0.0}
+            bag.write("/hw/joint_states", 10_000_000 * i, encode_joint_state(10_000_000 * i, **state))
+            effort = columns["disturbance"][k] if 50 <= i < 550 else 0.0
+            bag.write("/hw/disturbance", 10_000_000 * i, encode_joint_state(10_000_000 * i, effort=effort))
+    run = read_run(tmp_path / "bag")
+    assert run.window.t[0] == pytest.approx(0.0)
+    assert run.window.duration == pytest.approx(4.98, abs=0.011)
+
+
+def test_a_bag_without_noise_is_refused_in_one_sentence(tmp_path: Path) -> None:
+    with open_writer(tmp_path / "bag") as bag:
+        bag.add_topic("/sim/joint_states", "sensor_msgs/msg/JointState")
+        for i in range(10):
+            bag.write("/sim/joint_states", i, encode_joint_state(i * 1000, position=0.0, velocity=0.0, effort=0.0))
+    with pytest.raises(DataError, match="has neither an event 'noise_start' nor a disturbance"):
+        read_run(tmp_path / "bag")
+
+
+def test_a_bag_of_two_plants_asks_which(tmp_path: Path) -> None:
+    with open_writer(tmp_path / "bag") as bag:
+        for name in ("/sim/joint_states", "/hw/joint_states"):
+            bag.add_topic(name, "sensor_msgs/msg/JointState")
+            bag.write(name, 1, encode_joint_state(1, position=0.0, velocity=0.0, effort=0.0))
+    with pytest.raises(DataError, match=r"holds several plants \(/hw, /sim\); choose one by its namespace"):
+        read_run(tmp_path / "bag")
+
+
+def test_a_run_folder_without_a_bag_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "run" / "sim").mkdir(parents=True)
+    with pytest.raises(BagError, match="has no bag hw; expected the folders sim and hw"):
+        compare_folders([tmp_path / "run"])
+
+
+# -- command line ------------------------------------------------------------------------------------------------
+
+
+def test_command_prints_json_and_writes_files(folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    arguments = [str(folder / "sim"), str(folder / "hw"), "--margin", "position=0.01", "--json", "-o", str(tmp_path)]
+    assert main(arguments) == 0
+    printed = json.loads(capsys.readouterr().out)
+    assert printed == json.loads((tmp_path / "comparison.json").read_text())
+    assert (tmp_path / "figures" / "equivalence.pdf").stat().st_size > 1000
+    assert printed["verdict"]["outcome"] == "equivalent"
+
+
+def test_command_prints_the_verdict_last(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main([str(folder)]) == 0
+    lines = capsys.readouterr().out.strip()
+    assert "Simulation and hardware are equivalent" in " ".join(lines.split())[-200:]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["nowhere", "nowhere"], "nowhere"),
+        (["one"], "got 1 paths"),
+        (["a", "b", "--margin", "wide=1"], "margin has no 'wide'"),
+    ],
+)
+def test_command_refuses_in_one_sentence(
+    arguments: list[str], message: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(arguments) == 2
+    error = capsys.readouterr().err
+    assert error.startswith("error: ")
+    assert message in error
+    assert "Traceback" not in error
+
+
+def test_metadata_of_a_run_names_its_hold_time(tmp_path: Path) -> None:
+    columns = regulate(rate=100.0, seed=3, duration=1.0)
+    write_bag(tmp_path / "bag", columns, "/hw", metadata=run_metadata(3, 0.01), ramps=False)
+    run = read_run(tmp_path / "bag", label="hardware")
+    assert run.metadata["pendulum.run"]["disturbance"]["hold_time"] == 0.01
+    assert run.label == "hardware"

@@ -1,0 +1,163 @@
+"""Input replay and controller replay."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from pendulum_bags.identification.window_score import window_rms
+from pendulum_bags.replay.controller_replay import replay_controller
+from pendulum_bags.replay.input_replay import fit_percent, replay_input, replay_recording
+from pendulum_bags.replay.replay_cli import main
+from pendulum_bags.runs.datasets import Recording
+from pendulum_msgs_py.errors import DataError
+from pendulum_msgs_py.plants.plant_parameters import load_plant
+from pendulum_sim.plant import make_plant
+from tests.synthetic_runs import regulate, run_metadata, write_bag
+
+DFKI = Path("dfki_torque_limited_simple_pendulum")
+
+
+def swinging(plant_name: str = "dfki", *, duration: float = 4.0, period: float = 0.002) -> Recording:
+    """Return a noiseless recording of a plant that is pushed by a sine."""
+    plant = make_plant(load_plant(plant_name), period)
+    plant.reset(0.3, 0.0)
+    t = period * np.arange(round(duration / period))
+    torque = 0.8 * np.sin(2.0 * np.pi * 0.7 * t)
+    states = []
+    for value in torque.tolist():
+        states.append((plant.state.theta, plant.state.theta_dot))
+        plant.step(value)
+    position, velocity = np.array(states).T
+    return Recording(t, position, velocity, torque, hold="zero", meta={"source": "swinging"})
+
+
+def test_a_plant_follows_its_own_recording() -> None:
+    result = replay_input(swinging(), load_plant("dfki"))
+    assert result.rms < 1e-4
+    assert result.free_run_rms < 2e-3
+    assert result.fit > 99.0
+    assert result.diverges_at is None
+    assert "never" in result.sentence()
+
+
+def test_a_series_elastic_plant_can_be_replayed_too() -> None:
+    recording = swinging("x5_9", duration=1.0)
+    result = replay_input(recording, load_plant("x5_9"), window=0.5)
+    assert not result.from_fitted_state
+    assert result.by_window.size == 2
+    assert result.rms < 0.02
+
+
+def test_error_grows_with_the_horizon_under_wrong_parameters() -> None:
+    result = replay_input(swinging(), load_plant("dfki").with_values(gravity=4.0))
+    rms = [one.rms for one in result.horizons]
+    assert result.horizons[0].steps == 1
+    assert result.horizons[-1].time == pytest.approx(1.0)
+    assert rms[-1] > 10.0 * rms[0]
+    assert result.diverges_at is not None
+    assert result.diverges_at < 4.0
+
+
+def test_a_torque_beyond_the_models_limit_still_pushes() -> None:
+    recording = swinging()
+    weak = load_plant("dfki").with_values(effort_limit=0.1)
+    assert replay_input(recording, weak).free_run_rms < 2e-3
+
+
+def test_fit_is_100_for_equal_and_0_for_the_mean() -> None:
+    values = np.sin(np.linspace(0.0, 9.0, 200))
+    assert fit_percent(values, values) == 100.0
+    assert fit_percent(values, np.full_like(values, values.mean())) == pytest.approx(0.0, abs=1e-12)
+
+
+def test_other_inputs_than_torque_are_refused() -> None:
+    t = np.linspace(0.0, 1.0, 50)
+    recording = Recording(t, t, None, t, input_kind="voltage")
+    with pytest.raises(DataError, match="has the input 'voltage'; expected 'effort'"):
+        replay_input(recording, load_plant("dfki"))
+
+
+def test_a_window_of_no_length_is_refused() -> None:
+    with pytest.raises(DataError, match=r"window is 0\.0 s; expected > 0"):
+        replay_input(swinging(duration=0.5), load_plant("dfki"), window=0.0)
+
+
+def test_a_real_pendulum_is_followed_as_well_as_its_geometry_allows(shared_data: Path) -> None:
+    result = replay_recording(shared_data / DFKI / "ddp_measured.csv", "dfki")
+    assert result.rms == pytest.approx(0.038, rel=0.10)
+    from pendulum_bags.runs.datasets import read_recording
+
+    recording = read_recording(shared_data / DFKI / "ddp_measured.csv")
+    assert result.rms == window_rms(load_plant("dfki"), recording)
+
+
+def test_command_shows_a_real_pendulum_in_one_figure(
+    shared_data: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    recording = str(shared_data / DFKI / "ddp_measured.csv")
+    assert main([recording, "--params", "dfki", "-o", str(tmp_path)]) == 0
+    assert "windows of 1 s: rms 0.03" in capsys.readouterr().out
+    assert (tmp_path / "replay.png").stat().st_size > 10_000
+    assert json.loads((tmp_path / "replay.json").read_text())["rms_rad"] == pytest.approx(0.038, rel=0.1)
+
+
+def test_command_refuses_bad_files_and_writes_nothing(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    bad = tmp_path / "bad.csv"
+    bad.write_text("time,position,velocity,torque\n0,0,0,0\n1,nan,0,0\n2,0,0,0\n")
+    assert main([str(bad), "--params", "dfki", "-o", str(tmp_path / "out")]) == 2
+    assert "'position' is nan" in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()
+    assert main([str(tmp_path / "missing.csv"), "--params", "dfki"]) == 2
+    assert "does not exist" in capsys.readouterr().err
+    assert main([str(bad), "--params", "nothing"]) == 2
+
+
+def test_command_takes_the_plant_of_a_bag_that_is_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    bag = write_bag(tmp_path / "bag", regulate(rate=100.0, seed=3, duration=2.0), "/sim", ramps=False)
+    arguments = [str(bag), "-o", str(tmp_path / "out")]
+    assert main([*arguments, "--prefix", "/sim"]) == 0
+    assert "plant thesis (--params names another)" in capsys.readouterr().out
+    assert main([*arguments, "--prefix", "/hw"]) == 2
+    assert "has no topic /hw/joint_states; it has" in capsys.readouterr().err
+
+
+# -- controllers -------------------------------------------------------------------------------------------------
+
+
+def test_the_recorded_controller_answers_as_it_did(tmp_path: Path) -> None:
+    columns = regulate(rate=100.0, seed=3, duration=2.0)
+    bag = write_bag(tmp_path / "bag", columns, "/sim", metadata=run_metadata(3), ramps=False)
+    result = replay_controller(bag)
+    assert result.controller == "lqr"
+    assert "K = [33.345265, 0.158993]" in result.description
+    # The recording was made with the gain of the table, rounded to six digits.
+    assert np.abs(result.difference).max() < 1e-6
+    assert result.t.size == 200
+    assert result.unanswered == 0
+
+
+def test_another_controller_answers_otherwise(tmp_path: Path) -> None:
+    columns = regulate(rate=100.0, seed=3, duration=2.0)
+    bag = write_bag(tmp_path / "bag", columns, "/sim", metadata=run_metadata(3), ramps=False)
+    result = replay_controller(bag, "lqr", plant="thesis", values={"q": [1.0, 0.01]})
+    assert np.abs(result.difference).max() > 0.01
+    assert "differ by up to" in result.sentence()
+
+
+def test_a_recording_that_does_not_name_its_controller_asks_for_one(tmp_path: Path) -> None:
+    bag = write_bag(tmp_path / "bag", regulate(rate=100.0, seed=3, duration=1.0), "/sim", ramps=False)
+    with pytest.raises(DataError, match="does not say which controller made it"):
+        replay_controller(bag)
+
+
+def test_command_replays_a_controller(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    columns = regulate(rate=100.0, seed=3, duration=2.0)
+    bag = write_bag(tmp_path / "bag", columns, "/sim", metadata=run_metadata(3), ramps=False)
+    arguments = [str(bag), "--controller", "lqr", "--set", "q=[1.0, 0.01]", "-o", str(tmp_path / "out"), "--json"]
+    assert main(arguments) == 0
+    assert json.loads(capsys.readouterr().out)["commands"] == 200
+    assert (tmp_path / "out" / "controller_replay.png").exists()

@@ -1,0 +1,226 @@
+"""The report: figures told once, files, and a page that needs nothing else."""
+
+from __future__ import annotations
+
+import json
+import re
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from pendulum_bags.comparison import Comparison, compare_folders
+from pendulum_bags.figures.catalogue import comparison_figures, make_figures
+from pendulum_bags.figures.data import ReportData
+from pendulum_bags.figures.figure import ROLES, thinned
+from pendulum_bags.figures.numbers import quantity, ratio_in_words
+from pendulum_bags.figures.render_plotly import graphs_of
+from pendulum_bags.report import FIGURES, write_report
+from pendulum_bags.report.report_cli import main
+from pendulum_bags.report.tables import make_tables, provenance_table
+from pendulum_msgs_py.contract.cdr import encode_joint_state
+from pendulum_rosbag.storage import open_writer
+from tests.synthetic_runs import write_run_folder
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_run_folder(tmp_path_factory.mktemp("report") / "first", seed=1)
+
+
+@pytest.fixture(scope="module")
+def comparison(folder: Path) -> Comparison:
+    return compare_folders([folder])
+
+
+@pytest.fixture(scope="module")
+def page(folder: Path, comparison: Comparison) -> Path:
+    told = {"seed": 7, "strategy": "</script>"}
+    return write_report(folder, told, comparison=comparison, recordings=[], formats=["png"])
+
+
+def test_every_figure_has_units_a_sentence_from_the_data_and_known_roles(comparison: Comparison) -> None:
+    figures = comparison_figures(comparison)
+    assert len(figures) >= 14
+    for figure in figures:
+        assert re.search(r"\d", figure.sentence), figure.name
+        assert "nan" not in figure.sentence.lower().split()
+        for panel in figure.panels:
+            assert panel.traces, figure.name
+            numbered = [panel.x_label] if panel.y_ticks else [panel.x_label, panel.y_label]
+            for label in numbered:
+                assert re.search(r"\[.+\]|in margins|run", label), f"{figure.name}: {label}"
+            assert {trace.role for trace in panel.traces} <= set(ROLES)
+
+
+def test_curves_in_one_panel_differ_in_more_than_colour(comparison: Comparison) -> None:
+    for figure in comparison_figures(comparison):
+        for panel in figure.panels:
+            looks = {}
+            for trace in panel.traces:
+                style = ROLES[trace.role]
+                mark = style.marker if trace.kind in {"points", "interval"} else (style.dash, style.width)
+                looks.setdefault((trace.kind, mark), set()).add(trace.label)
+            assert all(len(labels) == 1 for labels in looks.values()), (figure.name, looks)
+
+
+def test_a_figure_that_the_data_do_not_allow_says_why(comparison: Comparison) -> None:
+    made, missing = make_figures(ReportData(comparison, comparison.to_json()))
+    assert len(made) + len(missing) == len(FIGURES)
+    assert dict(missing)["All runs"] == "needs at least two runs"
+
+
+def test_page_is_complete_in_itself_and_small(page: Path) -> None:
+    text = page.read_text(encoding="utf-8")
+    assert page.stat().st_size < 5_000_000
+    assert not re.search(r"(?:src|href)=\"(?:https?:)?//", text)
+    assert "@import" not in text
+    assert "url(" not in text.split("</style>")[0]
+    for heading in ("Paired comparison", "Provenance", "Equivalence tests", "Eigenvalues of the linearised system"):
+        assert heading in text
+    assert "2.687959" in text
+
+
+def test_page_escapes_what_it_is_told(page: Path) -> None:
+    text = page.read_text(encoding="utf-8")
+    assert "&lt;/script&gt;" in text
+    assert text.count("</script>") == 4
+
+
+def test_plots_of_the_page_are_those_of_the_files(page: Path, comparison: Comparison) -> None:
+    text = page.read_text(encoding="utf-8")
+    found = re.search(r'id="graphs">(.*?)</script>', text, re.DOTALL)
+    assert found
+    graphs = json.loads(found.group(1))
+    names = {figure.name for figure in comparison_figures(comparison)}
+    assert {name.rsplit("-", 1)[0] for name in graphs} == names
+    assert {path.stem for path in (page.parent / "figures").glob("*.png")} == names
+
+
+def test_plotly_graphs_hold_the_numbers(comparison: Comparison) -> None:
+    figure = next(figure for figure in comparison_figures(comparison) if figure.name == "both_together")
+    graph = graphs_of(figure)[0]
+    assert len(graph["data"]) == 6
+    assert graph["layout"]["xaxis3"]["title"]["text"] == "time since the noise began [s]"
+    assert [trace["showlegend"] for trace in graph["data"]] == [True, True, False, False, False, False]
+
+
+def test_tables_have_a_cell_for_every_heading(comparison: Comparison) -> None:
+    data = ReportData(comparison, comparison.to_json())
+    tables = [*make_tables(data), provenance_table(data)]
+    assert len(tables) == 8
+    for table in tables:
+        assert table.rows
+        assert all(len(row) == len(table.head) for row in table.rows), table.title
+
+
+def test_thinning_keeps_ends_and_extremes() -> None:
+    x = np.linspace(0.0, 1.0, 100_000)
+    y = np.sin(200.0 * x)
+    y[54_321] = 7.0
+    fewer_x, fewer_y = thinned(x, y, 2000)
+    assert fewer_x.size < 2100
+    assert fewer_y.max() == 7.0
+    assert (fewer_x[0], fewer_x[-1]) == (0.0, 1.0)
+    assert np.all(np.diff(fewer_x) > 0.0)
+
+
+@pytest.mark.parametrize(
+    ("value", "text"),
+    [
+        (0.0, "0 rad"),
+        (0.00546, "0.00546 rad"),
+        (-6.7e-6, "−6.70×10⁻⁶ rad"),
+        (1234567.0, "1.23×10⁶ rad"),
+        (1234.0, "1234 rad"),
+        (float("nan"), "–"),
+    ],
+)
+def test_quantities_are_written_for_readers(value: float, text: str) -> None:
+    assert quantity(value, "rad") == text
+
+
+def test_ratios_are_said_in_words() -> None:
+    assert ratio_in_words(1.001) == "equal within half a per cent"
+    assert ratio_in_words(1.1) == "10 % larger"
+    assert ratio_in_words(0.5) == "50 % smaller"
+    assert ratio_in_words(2.2) == "2.2 times as large"
+
+
+def test_several_runs_are_pooled_into_one_report(
+    folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    second = write_run_folder(tmp_path / "second", seed=2, ramps=False)
+    assert main([str(folder), str(second), "-o", str(tmp_path / "pooled"), "--png-only"]) == 0
+    assert "report" in capsys.readouterr().out
+    assert (tmp_path / "pooled" / "figures" / "pooled_runs.png").exists()
+    assert "2 runs" in (tmp_path / "pooled" / "report.html").read_text(encoding="utf-8")
+
+
+def test_two_bags_make_a_report_too(folder: Path, tmp_path: Path) -> None:
+    shutil.copytree(folder / "sim", tmp_path / "a")
+    shutil.copytree(folder / "hw", tmp_path / "b")
+    assert main([str(tmp_path / "a"), str(tmp_path / "b"), "--png-only"]) == 0
+    assert (tmp_path / "report" / "report.html").exists()
+
+
+def test_a_folder_that_is_no_run_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main([str(tmp_path)]) == 2
+    assert "has no bags sim and hw" in capsys.readouterr().err
+
+
+# -- the thesis's identification experiments -------------------------------------------------------------------
+
+
+def write_trial(path: Path, t: np.ndarray, position: np.ndarray, effort: np.ndarray) -> None:
+    velocity = np.gradient(position, t)
+    with open_writer(path) as bag:
+        bag.add_topic("/hw/joint_states", "sensor_msgs/msg/JointState")
+        bag.add_topic("/hw/events", "std_msgs/msg/String")
+        for name, time in (("trial_start", t[0]), ("trial_end", t[-1] + 0.01)):
+            stamp = round((10.0 + time) * 1e9)
+            content = json.dumps({"stamp_ns": stamp, "name": name}).encode() + b"\0"
+            bag.write("/hw/events", stamp, b"\0\1\0\0" + len(content).to_bytes(4, "little") + content)
+        for time, angle, speed, torque in zip(t, position, velocity, effort, strict=True):
+            stamp = round((10.0 + time) * 1e9)
+            data = encode_joint_state(stamp, position=angle, velocity=speed, effort=torque)
+            bag.write("/hw/joint_states", stamp, data)
+
+
+def hand_trials(folder: Path) -> Path:
+    t = np.arange(0.0, 6.0, 0.01)
+    for number in (1, 2):
+        position = 0.5 * np.pi * (1.0 - np.cos(2.0 * np.pi * t / 6.0)) + 0.02 * number * np.sin(9.0 * t)
+        velocity = np.gradient(position, t)
+        write_trial(folder / f"trial_{number}", t, position, -11.77 * velocity - 0.055 * np.gradient(velocity, t))
+    return folder
+
+
+def staircase_trials(folder: Path) -> Path:
+    steps = np.radians([0, 10, 20, 30, 40, 50, 60, 70, 80, 90, 60, 30, 10, 0, -10, -40, -70, -90, -40, -10, 0])
+    t = np.arange(0.0, 2.0 * steps.size, 0.01)
+    share = np.clip((t % 2.0) / 0.8, 0.0, 1.0)
+    index = (t // 2.0).astype(int)
+    position = np.r_[0.0, steps][index] * (1.0 - share) + steps[index] * share
+    noise = 0.01 * np.random.default_rng(0).standard_normal(t.size)
+    way = 0.03 * np.sign(np.gradient(np.abs(steps)))[index] * np.sign(position)
+    write_trial(folder / "trial_1", t, position, 1.678 * np.sin(position) + way + noise)
+    return folder
+
+
+def test_identification_experiments_join_the_report(folder: Path, tmp_path: Path) -> None:
+    trials = [str(hand_trials(tmp_path / "table")), str(staircase_trials(tmp_path / "staircase"))]
+    assert main([str(folder), *trials, "-o", str(tmp_path / "out"), "--png-only"]) == 0
+    text = (tmp_path / "out" / "report.html").read_text(encoding="utf-8")
+    assert re.search(r"damping 11\.77 N m s/rad", text)
+    assert re.search(r"gravity 1\.6[678]\d* N m", text)
+    for name in ("effort_over_velocity", "effort_over_acceleration", "trials", "dynamic_phase", "static_phase"):
+        assert (tmp_path / "out" / "figures" / f"{name}.png").exists()
+    for title in ("Regression of experiment 1", "Coefficients of experiment 2"):
+        assert title in text
+
+
+def test_trials_alone_point_to_the_command_that_shows_them(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main([str(hand_trials(tmp_path / "table"))]) == 2
+    assert "holds trials and no run" in capsys.readouterr().err

@@ -1,0 +1,101 @@
+"""Study files: what they accept, what they refuse and where, and the matrix that they make."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from pendulum_bags.studies.study_file import load_study, shipped_studies
+from pendulum_msgs_py.errors import ParameterError
+
+HEAD = "format: pendulum_study/1\nname: small\n"
+BODY = "plants:\n  sim: {}\ncontrollers:\n  lqr: {}\n"
+
+
+def study_file(folder: Path, text: str) -> Path:
+    path = folder / "study.yaml"
+    path.write_text(text, encoding="utf-8")
+    return path
+
+
+def test_every_shipped_study_is_valid_and_says_what_it_needs() -> None:
+    assert set(shipped_studies()) >= {
+        "thesis", "pid_vs_lqr", "strategies", "inertia_damping", "gravity", "random_start",
+    }  # fmt: skip
+    for name in shipped_studies():
+        study = load_study(name)
+        assert study.name == name
+        assert study.description
+        assert all(run.seconds > 0.0 and run.bytes > 0 for run in study.runs)
+        assert len({run.name for run in study.runs}) == len(study.runs)
+
+
+def test_matrix_is_the_product_of_all_axes_in_their_order(tmp_path: Path) -> None:
+    text = HEAD + (
+        "plants:\n  a: {}\n  b: {side: hw}\ncontrollers:\n  lqr: {}\n  pid: {}\n"
+        "set_points: [0.0, 0.1]\nstarts: [upright, bottom]\nseeds: {first: 4, count: 3}\nrepeats: 2\n"
+    )
+    runs = load_study(study_file(tmp_path, text)).runs
+    assert len(runs) == 2 * 2 * 2 * 2 * 3 * 2
+    assert [run.labels["seed"] for run in runs[:6]] == [4, 4, 5, 5, 6, 6]
+    assert runs[-1].spec is not None
+    assert (runs[-1].spec.side, runs[-1].spec.controller, runs[-1].spec.theta) == ("hw", "pid", 0.0)
+
+
+def test_random_starts_follow_the_seed_alone(tmp_path: Path) -> None:
+    first = load_study(study_file(tmp_path, HEAD + BODY + "starts: [random]\nseeds: [1, 2, 3]\n")).runs
+    other = load_study(study_file(tmp_path, HEAD + BODY + "starts: [random]\nseeds: [3]\n")).runs
+    angles = [run.spec.theta for run in first if run.spec]
+    assert len(set(angles)) == 3
+    assert other[0].spec is not None
+    assert other[0].spec.theta == angles[2]
+
+
+@pytest.mark.parametrize(
+    ("text", "line", "says"),
+    [
+        (HEAD + "plant:\n  sim: {}\n" + BODY, 3, "did you mean 'plants'"),
+        ("format: pendulum_study/9\nname: x\n" + BODY, 1, "expected 'pendulum_study/1'"),
+        (HEAD + "plants:\n  sim: {sidee: hw}\ncontrollers:\n  lqr: {}\n", 4, "did you mean 'side'"),
+        (HEAD + "plants:\n  sim: {}\ncontrollers:\n  lqr: {q: [1.0, 0.1], rr: 0.1}\n", 6, "unknown parameter 'rr'"),
+        (HEAD + BODY + "disturbances:\n  noise: {amplitud: 1.0}\n", 8, "did you mean 'amplitude'"),
+        (HEAD + BODY + "starts: [upright, sideways]\n", 7, "'sideways'"),
+        (HEAD + BODY + "seeds: [1, 1]\n", 7, "given twice"),
+        (HEAD + BODY + "seeds: {first: 1}\n", 7, "count is missing"),
+        (HEAD + BODY + "duration: long\n", 7, "expected a number of seconds"),
+        (HEAD + BODY + "repeats: 0\n", 7, "expected >= 1"),
+        (HEAD + "plants:\n  sim: {side: hw, engine: process}\ncontrollers:\n  lqr: {}\n", 4, "plain simulator"),
+        (HEAD + BODY + "clock: fast\n", 7, "expected one of lockstep, realtime"),
+        (HEAD + "clock: realtime\nplants:\n  sim: {engine: process}\ncontrollers:\n  lqr: {}\n", 5, "in real time"),
+        (HEAD + "clock: realtime\nplants:\n  h: {side: hw}\ncontrollers:\n  lqr: {}\nstarts: [1.0]\n", 5, "at rest"),
+        (HEAD + "experiment: thesis\nclock: lockstep\n", 4, "expected realtime"),
+    ],
+)
+def test_a_mistake_is_refused_with_its_line(tmp_path: Path, text: str, line: int, says: str) -> None:
+    path = study_file(tmp_path, text)
+    with pytest.raises(ParameterError, match=r"study\.yaml") as caught:
+        load_study(path)
+    message = str(caught.value)
+    assert message.startswith(f"{path}:{line}: ")
+    assert says in message
+
+
+def test_unknown_study_lists_those_there_are() -> None:
+    with pytest.raises(ParameterError, match="pid_vs_lqr"):
+        load_study("pid_vs_lqg")
+
+
+def test_a_study_says_whether_it_keeps_the_time_of_the_wall(tmp_path: Path) -> None:
+    study = load_study(study_file(tmp_path, HEAD + BODY + "clock: realtime\n"))
+    assert study.realtime
+    (run,) = study.runs
+    assert run.spec is not None
+    program = run.spec.plant_program(4)
+    assert program.parameters["clock"] == "realtime"
+    assert not any(name.startswith("lockstep") for name in program.parameters)
+    assert run.spec.controller_program().parameters["use_sim_time"] is False
+    named = load_study(study_file(tmp_path, HEAD + "experiment: gravity\nclock: realtime\n"))
+    assert named.runs[0].arguments[-1] == "--realtime"
+    assert not load_study("gravity").realtime
+    assert load_study("thesis").realtime

@@ -1,0 +1,162 @@
+"""Monte Carlo: chunks are pure functions, whoever computes them; probabilities and replays are right."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+from contextlib import nullcontext
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from pendulum_bags.analyse.bag_table import analyse_bags, find_pieces
+from pendulum_bags.studies.chunks import cluster_client
+from pendulum_bags.studies.monte_carlo import (
+    MonteCarlo,
+    draw_chunk,
+    replay,
+    run_chunk,
+    run_monte_carlo,
+    sobol,
+)
+from pendulum_bags.studies.uncertain import Uncertainty, parse_uncertainty, uncertainty_of
+from pendulum_msgs_py.errors import BagError, ParameterError
+from tests.fixtures import wait_for
+
+EXAMPLES = Path(__file__).parents[2] / "examples"
+SMALL = MonteCarlo(runs=700, chunk=300, duration=0.4)
+
+def has_arrow() -> bool:
+    try:
+        import pyarrow  # noqa: F401
+    except ImportError:
+        return False
+    return True
+
+
+arrow = pytest.mark.skipif(not has_arrow(), reason="pyarrow cannot be imported with this numpy")
+
+
+def test_a_chunk_depends_on_settings_and_index_alone() -> None:
+    first, again = run_chunk(SMALL, 1), run_chunk(SMALL, 1, threads=1)
+    for name, values in first.items():
+        assert np.array_equal(values, again[name]), name
+    assert len(run_chunk(SMALL, 2)["max_theta"]) == 100
+
+
+def test_parameters_scatter_as_told_and_stay_positive() -> None:
+    drawn = draw_chunk(replace(SMALL, runs=200_000, chunk=200_000), 0)
+    assert drawn["damping"].mean() == pytest.approx(11.77, rel=1e-3)
+    assert drawn["damping"].std() == pytest.approx(0.05 * 11.77, rel=1e-2)
+    assert drawn["inertia"].min() > 0.0
+
+
+def test_one_run_replayed_alone_is_the_run_of_the_batch() -> None:
+    columns = run_chunk(SMALL, 1)
+    row, motion = replay(SMALL, 300 + 17)
+    assert row["max_theta"] == columns["max_theta"][17]
+    assert row["theta_end"] == columns["theta_end"][17]
+    assert np.abs(motion[:, 0] - np.pi).max() == pytest.approx(row["max_theta"], abs=1e-15)
+
+
+@arrow
+def test_an_interrupted_monte_carlo_goes_on_and_workers_change_no_bit(tmp_path: Path) -> None:
+    def stop(done: int, _total: int) -> None:
+        if done == 1:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        run_monte_carlo(tmp_path / "one", SMALL, on_progress=stop)
+    one = run_monte_carlo(tmp_path / "one", SMALL)
+    other = run_monte_carlo(tmp_path / "other", SMALL)
+    assert one == other
+    for file in (tmp_path / "one").glob("*.parquet"):
+        assert file.read_bytes() == (tmp_path / "other" / file.name).read_bytes()
+    low, high = one["probability_interval"]
+    assert low <= one["probability_inside"] <= high
+    with pytest.raises(BagError, match="other settings"):
+        run_monte_carlo(tmp_path / "one", replace(SMALL, seed=2))
+
+
+@arrow
+@pytest.mark.timeout(180)
+def test_a_cluster_that_loses_a_worker_mid_run_gives_the_same_bits(tmp_path: Path) -> None:
+    pytest.importorskip("distributed")
+    settings = replace(SMALL, chunk=50)
+    here = run_monte_carlo(tmp_path / "here", settings)
+    with cluster_client(workers=2) as client:
+        connect = partial(nullcontext, client)
+        before = set(client.run(os.getpid).values())
+        victim = max(before)
+
+        def kill(done: int, _total: int) -> None:
+            if done == 1:
+                os.kill(victim, signal.SIGKILL)
+
+        cluster = run_monte_carlo(tmp_path / "cluster", settings, connect=connect, on_progress=kill)
+        wait_for(lambda: len(client.scheduler_info()["workers"]) == 2, 30, "the cluster to replace its worker")
+        after = set(client.run(os.getpid).values())
+        pieces = find_pieces([EXAMPLES], ["metrics"])
+        bags = analyse_bags(tmp_path / "bags_there", pieces, ["metrics"], connect=connect)
+    assert analyse_bags(tmp_path / "bags_here", pieces, ["metrics"]) == bags
+    assert bags.failed == 0
+    for name in ("bags.csv", "bags.json"):
+        assert (tmp_path / "bags_there" / name).read_bytes() == (tmp_path / "bags_here" / name).read_bytes()
+    assert victim not in after
+    assert here == cluster
+    for file in (tmp_path / "here").glob("*.parquet"):
+        assert file.read_bytes() == (tmp_path / "cluster" / file.name).read_bytes()
+
+
+def test_sobol_indices_see_that_noise_rules_and_damping_comes_next() -> None:
+    found = sobol(replace(SMALL, duration=1.0, uncertainty=Uncertainty({"damping": 0.2, "gravity": 0.05})), base=256)
+    total = {entry["factor"]: entry["total"] for entry in found["indices"]}
+    assert total["noise"] > total["damping"] > total["gravity"]
+
+
+IDENTIFIED = (
+    "format: pendulum_plant/1\nname: found\nparameters:\n"
+    "  inertia: {value: 0.05, unit: kg m^2, interval: [0.0402, 0.0598]}\n"
+    "  damping: {value: 10.0, unit: N m s/rad, interval: [9.8, 10.2]}\n  gravity: {value: 1.6, unit: N m}\n"
+)
+
+
+def test_uncertainty_comes_from_the_intervals_where_an_identification_left_no_covariance(tmp_path: Path) -> None:
+    file = tmp_path / "plant.yaml"
+    file.write_text(IDENTIFIED, encoding="utf-8")
+    found = uncertainty_of(str(file))
+    assert found.shares == {"inertia": pytest.approx(0.1, rel=1e-4), "damping": pytest.approx(0.0102, rel=1e-3)}
+    assert not found.correlation
+    with pytest.raises(ParameterError, match="preset"):
+        uncertainty_of("thesis")
+
+
+def test_plants_are_drawn_with_the_covariance_of_the_identification(tmp_path: Path) -> None:
+    file = tmp_path / "plant.yaml"
+    file.write_text(IDENTIFIED, encoding="utf-8")
+    # Standard deviations of 0.005 kg m^2 and 0.1 N m s/rad, correlation -0.8; a third parameter stands between.
+    matrix = [[2.5e-5, 0.0, -4e-4], [0.0, 1.0, 0.0], [-4e-4, 0.0, 1e-2]]
+    told = {"covariance": {"names": ["inertia", "load_friction", "damping"], "matrix": matrix}}
+    file.with_suffix(".json").write_text(json.dumps(told), encoding="utf-8")
+    found = parse_uncertainty("identified", str(file))
+    assert found.shares == pytest.approx({"inertia": 0.1, "damping": 0.01})
+    drawn = draw_chunk(MonteCarlo(plant=str(file), uncertainty=found, runs=200_000, chunk=200_000), 0)
+    sample = np.cov(drawn["inertia"], drawn["damping"])
+    assert sample == pytest.approx(np.array([[2.5e-5, -4e-4], [-4e-4, 1e-2]]), rel=0.02)
+    assert (drawn["gravity"] == 1.6).all()
+    file.with_suffix(".json").write_text("{}", encoding="utf-8")
+    with pytest.raises(ParameterError, match="no covariance of inertia, damping"):
+        uncertainty_of(str(file))
+
+
+def test_an_uncertainty_that_makes_no_distribution_is_refused() -> None:
+    with pytest.raises(ParameterError, match="expected one of inertia, damping, gravity"):
+        Uncertainty({"mass": 0.1})
+    with pytest.raises(ParameterError, match="not positive definite"):
+        Uncertainty({"inertia": 0.1, "damping": 0.1}, [[1.0, 1.5], [1.5, 1.0]])
+    with pytest.raises(ParameterError, match="'damping'; expected identified"):
+        parse_uncertainty("damping", "thesis")

@@ -1,0 +1,1 @@
+"""Bags published again, with their clock."""

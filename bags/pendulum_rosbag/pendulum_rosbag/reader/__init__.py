@@ -1,0 +1,17 @@
+"""Reading bags: any rosbag2 folder or storage file to numpy arrays."""
+
+from pendulum_rosbag.reader.bag import Bag, StoredMessage, TopicInfo, read_bag, read_bags
+from pendulum_rosbag.reader.joint_state import FIELDS, canonical
+from pendulum_rosbag.reader.same import Difference, same_messages
+
+__all__ = [
+    "FIELDS",
+    "Bag",
+    "Difference",
+    "StoredMessage",
+    "TopicInfo",
+    "canonical",
+    "read_bag",
+    "read_bags",
+    "same_messages",
+]

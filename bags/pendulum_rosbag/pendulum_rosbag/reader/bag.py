@@ -1,0 +1,358 @@
+"""A bag as arrays: lazy by topic, limited to a time span if wanted, the same for every storage and every recorder."""
+
+from __future__ import annotations
+
+import io
+import json
+import os
+from collections.abc import Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from pendulum_msgs_py.errors import BagError, DataError
+from pendulum_rosbag.reader.batches import Batch, Int64, Source, Stream
+from pendulum_rosbag.reader.decompression import decompress_bounded
+from pendulum_rosbag.reader.joint_state import JointStateParser
+from pendulum_rosbag.reader.open_source import BagFolder, open_folder, open_sources
+
+__all__ = ["Bag", "StoredMessage", "TopicInfo", "read_bag", "read_bags"]
+
+_JOINT_STATE = "sensor_msgs/msg/JointState"
+_STRING = "std_msgs/msg/String"
+
+
+@dataclass(frozen=True, slots=True)
+class TopicInfo:
+    """A topic of a bag.
+
+    Args:
+        name: Full name.
+        type: Message type, such as ``sensor_msgs/msg/JointState``.
+        count: Messages in the bag (of the whole bag, also when a time span was asked for).
+        hash: Type description hash, empty when the bag does not tell.
+        qos: Offered QoS profiles as the YAML text of the bag.
+        definition: Message definition text, empty when the bag has none.
+    """
+
+    name: str
+    type: str
+    count: int
+    hash: str = ""
+    qos: str = ""
+    definition: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class StoredMessage:
+    """A message of any type: its log time [ns] and its fields as an object of rosbags."""
+
+    log_time_ns: int
+    message: Any
+
+
+@dataclass(slots=True)
+class _Topic:
+    info: TopicInfo
+    streams: list[tuple[Source, Stream]] = field(default_factory=list)
+
+
+class Bag(Mapping[str, Any]):
+    """A bag that is open for reading; made by :func:`read_bag`.
+
+    ``bag[topic]`` is a structured array with the columns ``log_time_ns``, ``stamp_ns`` [ns], ``position`` [rad],
+    ``velocity`` [rad/s], ``effort`` [N m] (NaN where the message has none) and, when any message has one,
+    ``frame_id``, ordered by log time, for topics of one-joint ``sensor_msgs/JointState``; for any other topic a list
+    of :class:`StoredMessage`. Topics are read when they are asked for, and kept.
+
+    Attributes:
+        path: Where the bag is.
+        topics: Topic name -> :class:`TopicInfo`.
+        metadata: Run metadata (``custom_data``), values parsed where they are JSON.
+        damage: What is wrong with the bag, one sentence per file; empty for a healthy one.
+    """
+
+    def __init__(
+        self,
+        folder: BagFolder,
+        sources: Sequence[Source],
+        topics: Sequence[str] | None,
+        start: int | None,
+        stop: int | None,
+    ) -> None:
+        self.path = folder.path
+        self.storage = folder.storage
+        self.metadata: dict[str, Any] = {key: _parsed(value) for key, value in folder.custom_data.items()}
+        self.damage = [
+            *folder.damage,
+            *(f"{source.path.name}: {source.damage}" for source in sources if source.damage),
+        ]
+        self._sources = list(sources)
+        self._span = (start, stop)
+        self._message_compression = folder.message_compression
+        self._topics = _group(sources, folder.topic_hashes)
+        if topics is not None:
+            missing = [topic for topic in topics if topic not in self._topics]
+            if missing:
+                raise DataError(
+                    f"bag {self.path} has no topic {missing[0]}; it has {', '.join(sorted(self._topics)) or 'none'}"
+                )
+            self._topics = {topic: self._topics[topic] for topic in topics}
+        self._arrays: dict[str, npt.NDArray[Any] | list[StoredMessage]] = {}
+
+    @property
+    def topics(self) -> dict[str, TopicInfo]:
+        """Topic name -> type, number of messages and what else the bag tells."""
+        return {name: topic.info for name, topic in self._topics.items()}
+
+    @property
+    def start_ns(self) -> int:
+        """Log time of the first message of the whole bag [ns]."""
+        return min((source.start_ns for source in self._sources if source.stop_ns), default=0)
+
+    @property
+    def stop_ns(self) -> int:
+        """Log time of the last message of the whole bag [ns]."""
+        return max((source.stop_ns for source in self._sources), default=0)
+
+    def __getitem__(self, topic: str) -> Any:
+        if topic not in self._topics:
+            raise DataError(
+                f"bag {self.path} has no topic {topic}; it has {', '.join(sorted(self._topics)) or 'none'}"
+            )
+        if topic not in self._arrays:
+            self._load([topic])
+        return self._arrays[topic]
+
+    def __contains__(self, topic: object) -> bool:
+        # (the mapping's own would read the topic, and expects a KeyError)
+        return topic in self._topics
+
+    def get(self, topic: str, default: Any = None) -> Any:
+        """Return a topic as ``bag[topic]`` does, or a default where the bag has none of that name."""
+        return self[topic] if topic in self._topics else default
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._topics)
+
+    def __len__(self) -> int:
+        return len(self._topics)
+
+    def array(self, topic: str) -> npt.NDArray[Any]:
+        """Return a topic of one-joint JointState as an array.
+
+        Raises:
+            DataError: The topic is missing, or its messages are something else.
+        """
+        values = self[topic]
+        if not isinstance(values, np.ndarray):
+            raise DataError(
+                f"topic {topic} of bag {self.path} holds {self._topics[topic].info.type}; "
+                "expected sensor_msgs/msg/JointState of one joint"
+            )
+        return values
+
+    def load(self) -> Bag:
+        """Read all topics now, in one pass over the files, and return the bag."""
+        self._load([topic for topic in self._topics if topic not in self._arrays])
+        return self
+
+    def raw(self, topic: str) -> list[tuple[int, bytes]]:
+        """Return all messages of a topic as (log time [ns], CDR bytes), ordered by log time."""
+        if topic not in self._topics:
+            return self[topic]  # raises
+        rows = [row for batch in self._batches({topic})[topic] for row in batch.payloads()]
+        if self._message_compression:
+            name = f"{self.path}: topic {topic}"
+            rows = [(time, decompress_bounded(io.BytesIO(data), name)) for time, data in rows]
+        rows.sort(key=lambda row: row[0])
+        return rows
+
+    def log_times(self, topic: str) -> Int64:
+        """Return the log times of a topic in ascending order [ns], shape (n,), without reading its messages."""
+        if topic not in self._topics:
+            return self[topic]["log_time_ns"]  # raises
+        times = [batch.times for batch in self._batches({topic})[topic]]
+        return np.sort(np.concatenate(times)) if times else np.empty(0, np.int64)
+
+    def messages(self, topic: str) -> list[StoredMessage]:
+        """Return all messages of a topic as objects, whatever their type.
+
+        Raises:
+            DataError: Neither the bag nor ROS 2 Jazzy knows the message type, or a message is damaged.
+        """
+        from pendulum_rosbag.reader.decode import decoder_for
+
+        rows = self.raw(topic)
+        decode = decoder_for(self._topics[topic].info)
+        return [StoredMessage(time, decode(data)) for time, data in rows]
+
+    def events(self) -> list[dict[str, Any]]:
+        """Return what was noted on the ``events`` topics, in order of time.
+
+        Each event has ``stamp_ns``, ``name``, ``topic``, ``log_time_ns`` and whatever its author added. A text that
+        is no JSON object becomes an event with that text as its name.
+        """
+        events = []
+        for name, topic in self._topics.items():
+            if topic.info.type != _STRING or name.rsplit("/", 1)[-1] != "events":
+                continue
+            for time, data in self.raw(name):
+                size = int.from_bytes(data[4:8], "little")
+                text = data[8 : 8 + size].split(b"\0")[0].decode("utf-8", "replace")
+                parsed = _parsed(text)
+                event = parsed if isinstance(parsed, dict) else {"name": text}
+                events.append({"stamp_ns": time, "name": "", **event, "topic": name, "log_time_ns": time})
+        for event in events:
+            if not isinstance(event["stamp_ns"], int):
+                event["stamp_ns"] = event["log_time_ns"]  # anybody may write there
+        events.sort(key=lambda event: (event["stamp_ns"], event["log_time_ns"]))
+        return events
+
+    def close(self) -> None:
+        """Release the files; arrays that were read remain."""
+        for source in self._sources:
+            source.close()
+        self._sources.clear()
+
+    def __enter__(self) -> Bag:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def __repr__(self) -> str:
+        return f"<Bag {self.path} with {sum(topic.info.count for topic in self._topics.values())} messages>"
+
+    # -- parts -------------------------------------------------------------------------------------------------
+
+    def _batches(self, topics: set[str]) -> dict[str, list[Batch]]:
+        """Collect the batches of some topics over all files in order."""
+        found: dict[str, list[Batch]] = {topic: [] for topic in topics}
+        for source, wanted in self._wanted(topics):
+            for batch in source.batches(set(wanted), *self._span):
+                found[wanted[batch.channel]].append(batch)
+        return found
+
+    def _wanted(self, topics: set[str]) -> Iterator[tuple[Source, dict[int, str]]]:
+        for source in self._sources:
+            wanted = {
+                stream.channel: name
+                for name in topics
+                for owner, stream in self._topics[name].streams
+                if owner is source
+            }
+            if wanted:
+                yield source, wanted
+
+    def _load(self, topics: Sequence[str]) -> None:
+        fixed = [topic for topic in topics if self._is_fixed(topic)]
+        if len(fixed) == 1 and any(source.compressed for source in self._sources):
+            # A chunk that is decompressed for one topic serves the others too.
+            fixed += [
+                t for t in self._topics if t not in fixed and t not in self._arrays and self._is_fixed(t)
+            ]
+        arrays = self._read_fixed(fixed) if fixed else {}
+        for topic in dict.fromkeys([*topics, *arrays]):
+            array = arrays.get(topic)
+            self._arrays[topic] = self.messages(topic) if array is None else array
+
+    def _is_fixed(self, topic: str) -> bool:
+        entry = self._topics[topic]
+        plain = all(stream.serialization == "cdr" for _, stream in entry.streams)
+        return entry.info.type == _JOINT_STATE and plain and not self._message_compression
+
+    def _read_fixed(self, topics: Sequence[str]) -> dict[str, npt.NDArray[Any] | None]:
+        parsers = {topic: JointStateParser(self._topics[topic].info.count) for topic in topics}
+        for source, wanted in self._wanted(set(topics)):
+            for batch in source.batches(set(wanted), *self._span):
+                parsers[wanted[batch.channel]].add(batch)
+        return {topic: parser.result() for topic, parser in parsers.items()}
+
+
+def read_bag(
+    path: str | os.PathLike[str],
+    topics: Sequence[str] | None = None,
+    start: int | None = None,
+    stop: int | None = None,
+) -> Bag:
+    """Open a bag for reading.
+
+    Args:
+        path: A rosbag2 folder, or a single ``.mcap`` or ``.db3`` file. Bags of any recorder are read; a bag whose
+            recorder died is read as far as it is whole (``bag.damage`` tells).
+        topics: Topics to offer; by default all.
+        start: Log time of the first message wanted [ns]; by default from the beginning.
+        stop: Log time before which the last message lies [ns]; by default to the end.
+
+    Raises:
+        BagError: There is no bag, or nothing of it can be read.
+        DataError: A topic was asked for that the bag does not have.
+
+    Example:
+        >>> bag = read_bag("runs/today/sim")
+        >>> states = bag["/sim/joint_states"]
+        >>> states["position"].mean()
+    """
+    folder = open_folder(Path(path))
+    return Bag(folder, open_sources(folder), topics, start, stop)
+
+
+def read_bags(
+    paths: Sequence[str | os.PathLike[str]],
+    topics: Sequence[str] | None = None,
+    start: int | None = None,
+    stop: int | None = None,
+    *,
+    workers: int | None = None,
+) -> list[Bag]:
+    """Read many bags in parallel, all topics of each, and return them in the order of their paths.
+
+    Args:
+        paths: Bags, as for :func:`read_bag`.
+        topics: Topics to read; by default all.
+        start: Log time of the first message wanted [ns].
+        stop: Log time before which the last message lies [ns].
+        workers: Threads; by default one per processor (copying and decompressing run outside the interpreter's lock).
+    """
+    with ThreadPoolExecutor(workers or os.cpu_count() or 1) as pool:
+        return list(pool.map(lambda path: read_bag(path, topics, start, stop).load(), paths))
+
+
+def _group(sources: Sequence[Source], hashes: Mapping[str, str]) -> dict[str, _Topic]:
+    grouped: dict[str, list[tuple[Source, Stream]]] = {}
+    for source in sources:
+        for stream in source.streams:
+            grouped.setdefault(stream.topic, []).append((source, stream))
+    topics = {}
+    for name, streams in sorted(grouped.items()):
+        types = {stream.type for _, stream in streams}
+        if len(types) > 1:
+            raise BagError(
+                f"topic {name} has the types {', '.join(sorted(types))}; expected one type for each topic"
+            )
+        first = next((stream for _, stream in streams if stream.definition), streams[0][1])
+        info = TopicInfo(
+            name,
+            first.type,
+            sum(stream.count for _, stream in streams),
+            first.hash or hashes.get(name, ""),
+            first.qos,
+            first.definition,
+        )
+        topics[name] = _Topic(info, streams)
+    return topics
+
+
+def _parsed(text: Any) -> Any:
+    """Return JSON text as the value that it stands for; any other text as it is."""
+    if not isinstance(text, str) or text[:1] not in '{["-0123456789tfn':
+        return text
+    try:
+        return json.loads(text)
+    except (ValueError, RecursionError):
+        return text

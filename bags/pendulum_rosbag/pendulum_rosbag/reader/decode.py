@@ -1,0 +1,120 @@
+"""Messages of any type as objects, by rosbags, with the definitions that the bag itself carries."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import lru_cache
+from typing import TYPE_CHECKING, Any
+
+from pendulum_msgs_py.errors import DataError
+from pendulum_rosbag.storage.message_types import typestore
+
+if TYPE_CHECKING:
+    from rosbags.typesys.store import Typestore
+
+    from pendulum_rosbag.reader.bag import TopicInfo
+
+__all__ = ["decoder_for", "store_for"]
+
+_MAX_DEFINITION = 1 << 18
+_MAX_VALUES = 1 << 20
+_MAX_DEPTH = 40
+
+
+def store_for(info: TopicInfo) -> Typestore:
+    """Return a type store that knows a topic's type as its bag defines it.
+
+    What a bag defines holds for its own topics only: a store that all bags share would let one bag say how the next
+    one is read. The types of ROS 2 Jazzy stand in for what the bag does not define.
+
+    Raises:
+        DataError: The definition cannot be read, or neither it nor ROS 2 has the type.
+    """
+    shared = typestore()
+    try:
+        store = _defined(info.type, info.definition) if info.definition else shared
+    except Exception as error:  # rosbags raises its own and parser errors
+        if info.type in shared.fielddefs:
+            return shared  # in a language that rosbags does not read, such as IDL in other clothes
+        reason = " ".join(str(error).split())[:200]
+        raise DataError(
+            f"topic {info.name}: the definition of {info.type} is not readable: {reason}"
+        ) from error
+    if info.type not in store.fielddefs:
+        raise DataError(
+            f"topic {info.name} has type {info.type}; expected a type that the bag or ROS 2 defines"
+        )
+    return store
+
+
+@lru_cache(maxsize=64)
+def _defined(name: str, definition: str) -> Typestore:
+    """Return the store of one definition: by its text, so that equal topics of many bags share the work."""
+    from rosbags.typesys import get_types_from_msg
+    from rosbags.typesys.store import Typestore
+
+    if len(definition) > _MAX_DEFINITION:
+        raise DataError(f"it has {len(definition)} letters; expected at most {_MAX_DEFINITION}")
+    shared = typestore()
+    types = get_types_from_msg(definition, name)
+    if all(shared.fielddefs.get(kind) == fields for kind, fields in types.items()):
+        return shared
+    known: dict[str, Any] = {**shared.fielddefs, **types}
+    for kind in types:
+        if _values(kind, known, {}) > _MAX_VALUES:
+            raise DataError(f"{kind} holds more than {_MAX_VALUES} values; expected no more")
+    store = Typestore()
+    store.register(types)
+    for kind in shared.fielddefs.keys() - types.keys():
+        store.fielddefs[kind], store.types[kind] = shared.fielddefs[kind], shared.types[kind]
+    return store
+
+
+def _values(kind: str, known: dict[str, Any], counted: dict[str, int], depth: int = 0) -> int:
+    """Return how many values a message has at least, all arrays of fixed length written out.
+
+    A line of text can define more of them than a machine has memory for, or a type that holds itself.
+    """
+    from rosbags.interfaces import Nodetype
+
+    if depth > _MAX_DEPTH:
+        raise DataError(f"{kind} is nested deeper than {_MAX_DEPTH} levels, or holds itself")
+    if kind not in counted:
+        if kind not in known:
+            raise DataError(f"{kind} is not defined")
+        total = 0
+        for _, (node, detail) in known[kind][1]:
+            is_list = node in {Nodetype.ARRAY, Nodetype.SEQUENCE}
+            (inner, of), length = detail if is_list else ((node, detail), 1)
+            values = _values(of, known, counted, depth + 1) if inner == Nodetype.NAME else 1
+            # Numbers of an array are read as one; everything else in it is written out.
+            written_out = inner == Nodetype.NAME or of[0] in {"string", "wstring"}
+            total += values * (length if node == Nodetype.ARRAY and written_out else 1)
+        counted[kind] = total
+    return counted[kind]
+
+
+def decoder_for(info: TopicInfo) -> Callable[[bytes], Any]:
+    """Return a function from CDR bytes to an object of a topic's type.
+
+    Raises:
+        DataError: Nobody knows the type; or, when the function is called, a message is damaged.
+    """
+    store = store_for(info)
+    kind = store.get_msgdef(info.type)
+
+    def decode(data: bytes) -> Any:
+        try:
+            parse = kind.deserialize_cdr_le if data[1] & 1 else kind.deserialize_cdr_be
+            # rclpy's serialiser leaves up to twelve meaningless bytes behind a message, which rosbags' own
+            # entry point takes for an error: what counts is that all fields are there.
+            message, end = parse(memoryview(data)[4:], 0, kind.cls, store)
+            if end + 4 > len(data):
+                raise ValueError("it is cut off")
+        except Exception as error:  # a damaged message fails in many ways
+            raise DataError(
+                f"topic {info.name}: a message of {len(data)} bytes is no {info.type}: {error}"
+            ) from error
+        return message
+
+    return decode

@@ -1,0 +1,401 @@
+"""One-joint ``sensor_msgs/JointState`` messages from CDR bytes to arrays, thousands at a time.
+
+CDR aligns every value to its own size, counted from the end of the four bytes of encapsulation. For one joint the
+layout is therefore fixed by two string lengths and by which of position, velocity and effort are present::
+
+    encapsulation[4]  sec i32  nanosec u32  frame_id: u32 n, n bytes   names: u32 1, u32 m, m bytes
+    position: u32 0|1, (f64)   velocity: u32 0|1, (f64)   effort: u32 0|1, (f64)
+
+Messages of one topic nearly always share one layout. It is taken from the first of them; every message is then
+checked against every constant byte of it (padding excepted: rclpy leaves it uninitialised), those that fit are
+copied out column by column, and the rest is tried with the layout of the first that did not fit.
+"""
+
+from __future__ import annotations
+
+import struct
+from dataclasses import dataclass, field
+from functools import lru_cache
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from pendulum_rosbag.reader.batches import MCAP_HEAD, Batch, Int64
+from pendulum_rosbag.storage.mcap_records import MESSAGE
+
+__all__ = ["FIELDS", "JointStateParser", "Layout", "Trimmer", "canonical", "layout_of"]
+
+FIELDS = np.dtype(
+    [("log_time_ns", "<i8"), ("stamp_ns", "<i8"), ("position", "<f8"), ("velocity", "<f8"), ("effort", "<f8")]
+)
+"""Columns of the arrays: times [ns], position [rad], velocity [rad/s], effort [N m]; absent values are NaN."""
+
+_BLOCK = 8192  # messages parsed at once: their bytes stay in the cache
+_MAX_EXPECTED = (
+    1 << 22
+)  # messages that memory is taken for before they are seen: a damaged file may claim any number
+_MAX_COPY = 1 << 26  # bytes of messages that are copied at once
+_MAX_FRAME = 255  # bytes of a frame id that are kept: no name in ROS is longer
+_LAYOUTS = 16  # layouts tried in one batch before a topic counts as not fixed
+
+
+@dataclass(frozen=True, slots=True)
+class Layout:
+    """Where the fields stand in a message; offsets count from the first byte of encapsulation.
+
+    Args:
+        size: Bytes up to the last field (a serialiser may append some that mean nothing).
+        frame: Start and length of the frame id without its terminating zero.
+        values: Offset of position, velocity and effort; -1 when absent.
+        constants: (offset, bytes) that every message of this layout has.
+    """
+
+    size: int
+    frame: tuple[int, int]
+    values: tuple[int, int, int]
+    constants: tuple[tuple[int, bytes], ...]
+
+
+def layout_of(data: bytes) -> Layout | None:
+    """Return the layout of a one-joint JointState, ``None`` when the bytes are something else."""
+    try:
+        if data[:2] != b"\x00\x01":  # little-endian CDR
+            return None
+        (frame_size,) = struct.unpack_from("<I", data, 12)
+        if not 1 <= frame_size <= len(data) or data[15 + frame_size] != 0:
+            return None
+        constants = [(0, data[:2]), (12, data[12:16])]
+        at = _align(16 + frame_size, 4)
+        names, name_size = struct.unpack_from("<II", data, at)
+        if names != 1 or not 1 <= name_size <= len(data) or at + 8 + name_size > len(data):
+            return None
+        constants.append((at, data[at : at + 8 + name_size]))
+        at += 8 + name_size
+        values = []
+        for _ in range(3):
+            at = _align(at, 4)
+            (count,) = struct.unpack_from("<I", data, at)
+            if count > 1:
+                return None
+            constants.append((at, data[at : at + 4]))
+            at += 4
+            if count:
+                at = _align(at, 8)
+                values.append(at)
+                at += 8
+            else:
+                values.append(-1)
+    except (struct.error, IndexError):
+        return None
+    if at > len(data):
+        return None
+    # The zero that ends the frame id is as constant as its length.
+    constants.append((15 + frame_size, b"\x00"))
+    position, velocity, effort = values
+    return Layout(at, (16, frame_size - 1), (position, velocity, effort), tuple(constants))
+
+
+def _align(at: int, size: int) -> int:
+    return at + (4 - at) % size
+
+
+def canonical(data: bytes) -> bytes:
+    """Return a one-joint JointState with zeroed padding and nothing behind its last field; others unchanged.
+
+    rclpy leaves padding uninitialised, so equal messages may differ in their bytes.
+    """
+    layout = layout_of(data)
+    if layout is None:
+        return data
+    clean = bytearray(layout.size)
+    spans = [(4, 16), (layout.frame[0], layout.frame[0] + layout.frame[1])]
+    spans += [(start, start + len(content)) for start, content in layout.constants]
+    spans += [(start, start + 8) for start in layout.values if start >= 0]
+    for start, stop in spans:
+        clean[start:stop] = data[start:stop]
+    return bytes(clean)
+
+
+class Trimmer:
+    """Cuts off what rclpy's serialiser leaves behind one-joint JointStates of one topic.
+
+    Up to twelve bytes that mean nothing; readers such as rosbags refuse such messages. Other bytes pass unchanged.
+    """
+
+    def __init__(self) -> None:
+        self._layouts: list[Layout] = []
+
+    def __call__(self, data: bytes) -> bytes:
+        """Return the message without what is behind it."""
+        for layout in self._layouts:
+            if all(data[start : start + len(content)] == content for start, content in layout.constants):
+                return data if len(data) <= layout.size else data[: layout.size]
+        layout_found = layout_of(data)
+        if layout_found is None:
+            return data
+        self._layouts = [*self._layouts[-_LAYOUTS:], layout_found]
+        return data[: layout_found.size]
+
+
+# -- arrays ------------------------------------------------------------------------------------------------------
+
+
+def _words(offset: int, content: bytes) -> list[tuple[int, str, int]]:
+    """Cut constant bytes into integers, so that each check is one comparison of a column."""
+    pieces = []
+    while content:
+        size = next(size for size in (8, 4, 2, 1) if size <= len(content))
+        pieces.append((offset, f"<u{size}", int.from_bytes(content[:size], "little")))
+        offset += size
+        content = content[size:]
+    return pieces
+
+
+@dataclass(frozen=True, slots=True)
+class _Plan:
+    """A layout as a numpy record type over the bytes of one message (and, in MCAP, of its record head)."""
+
+    item: np.dtype[Any]
+    checks: tuple[tuple[str, Any], ...]
+    least_length: int
+
+
+@lru_cache(maxsize=256)
+def _plan(layout: Layout, head: int, channel: int) -> _Plan:
+    names, formats, offsets = [], [], []
+    checks = []
+
+    def column(name: str, kind: str, offset: int) -> None:
+        names.append(name)
+        formats.append(kind)
+        offsets.append(offset)
+
+    if head:
+        column("opcode", "u1", 0)
+        column("length", "<u8", 1)
+        column("channel", "<u2", 9)
+        column("log_time", "<i8", 15)
+        checks += [("opcode", np.uint8(MESSAGE)), ("channel", np.uint16(channel))]
+    column("sec", "<i4", head + 4)
+    column("nanosec", "<u4", head + 8)
+    start, size = layout.frame
+    if size:
+        column("frame", f"S{min(size, _MAX_FRAME)}", head + start)
+    for name, offset in zip(("position", "velocity", "effort"), layout.values, strict=True):
+        if offset >= 0:
+            column(name, "<f8", head + offset)
+    for offset, content in layout.constants:
+        for place, kind, value in _words(offset, content):
+            name = f"constant_{place}"
+            column(name, kind, head + place)
+            checks.append((name, np.dtype(kind).type(value)))
+    item = np.dtype({"names": names, "formats": formats, "offsets": offsets, "itemsize": head + layout.size})
+    return _Plan(item, tuple(checks), layout.size + 22)
+
+
+@dataclass(slots=True)
+class _Columns:
+    """The array under construction, and the frame ids beside it (kept short while they do not change)."""
+
+    array: npt.NDArray[Any]
+    at: int = 0
+    frames: list[tuple[Any, int, Any]] = field(default_factory=list)
+
+
+class JointStateParser:
+    """Collects the messages of one topic.
+
+    Args:
+        count: Number of messages to expect (the result has the number there is).
+    """
+
+    def __init__(self, count: int) -> None:
+        self._columns = _Columns(np.empty(min(count, _MAX_EXPECTED), FIELDS))
+        self._fixed = True
+
+    def add(self, batch: Batch) -> None:
+        """Parse more messages; once one is no one-joint JointState, the rest is passed over."""
+        if not self._fixed:
+            return
+        columns = self._columns
+        needed = columns.at + len(batch.offsets)
+        if needed > len(columns.array):
+            spare = np.empty(max(needed, 2 * len(columns.array)) - len(columns.array), FIELDS)
+            columns.array = np.concatenate([columns.array, spare])
+        self._fixed = _parse_batch(batch, columns)
+
+    def result(self) -> npt.NDArray[Any] | None:
+        """Return the messages ordered by log time.
+
+        Returns:
+            Structured array with the columns :data:`FIELDS`, and ``frame_id`` when any message has one; ``None``
+            when a message is no one-joint JointState in little-endian CDR.
+        """
+        return _ordered(_with_frames(self._columns)) if self._fixed else None
+
+
+def _parse_batch(batch: Batch, columns: _Columns) -> bool:
+    layouts: list[Layout] = []
+    for begin in range(0, len(batch.offsets), _BLOCK):
+        block = slice(begin, begin + _BLOCK)
+        sizes = None if batch.sizes is None else batch.sizes[block]
+        if not _parse_block(batch, batch.offsets[block], batch.times[block], sizes, columns, layouts):
+            return False
+    return True
+
+
+def _parse_block(
+    batch: Batch,
+    offsets: Int64,
+    times: Int64,
+    sizes: Int64 | None,
+    columns: _Columns,
+    layouts: list[Layout],
+) -> bool:
+    out = columns.array[columns.at : columns.at + len(offsets)]
+    out["log_time_ns"] = times
+    left: Int64 | None = None  # rows that no layout has fitted yet; None for all
+    tried = 0
+    while left is None or len(left):
+        if tried == len(layouts):
+            first = 0 if left is None else int(left[0])
+            layout = layout_of(
+                _message(batch, int(offsets[first]), None if sizes is None else int(sizes[first]))
+            )
+            if layout is None or layout in layouts or tried >= _LAYOUTS:
+                return False
+            layouts.append(layout)
+        layout = layouts[tried]
+        tried += 1
+        rows = _fit(batch, layout, offsets, times, sizes, left, out, columns)
+        if rows is None:
+            break
+        left = rows
+    columns.at += len(offsets)
+    return True
+
+
+def _fit(
+    batch: Batch,
+    layout: Layout,
+    offsets: Int64,
+    times: Int64,
+    sizes: Int64 | None,
+    left: Int64 | None,
+    out: npt.NDArray[Any],
+    columns: _Columns,
+) -> Int64 | None:
+    """Copy out the rows that have a layout; return those that have not, ``None`` for none."""
+    plan = _plan(layout, batch.head, batch.channel)
+    size = plan.item.itemsize
+    if left is not None:
+        offsets, times = offsets[left], times[left]
+        sizes = None if sizes is None else sizes[left]
+    places = len(batch.buffer) - size + 1
+    inside = offsets < places
+    if places <= 0 or not inside.all():
+        # Too near to the end of the buffer for this layout: not of this layout.
+        rows = np.arange(len(out)) if left is None else left
+        if places <= 0 or not inside.any():
+            return rows
+        sizes = None if sizes is None else sizes[inside]
+        rest = _fit_items(
+            batch, plan, offsets[inside], times[inside], sizes, rows[inside], out, columns, layout
+        )
+        return np.sort(np.concatenate([rows[~inside], rest])) if rest is not None else rows[~inside]
+    return _fit_items(batch, plan, offsets, times, sizes, left, out, columns, layout)
+
+
+def _fit_items(
+    batch: Batch,
+    plan: _Plan,
+    offsets: Int64,
+    times: Int64,
+    sizes: Int64 | None,
+    left: Int64 | None,
+    out: npt.NDArray[Any],
+    columns: _Columns,
+    layout: Layout,
+) -> Int64 | None:
+    size = plan.item.itemsize
+    if len(offsets) > 1 and len(offsets) * size > _MAX_COPY:
+        # Long frame ids: halves, so that the copy stays small whatever the messages claim.
+        rows = np.arange(len(out)) if left is None else left
+        rests = [
+            _fit_items(
+                batch, plan, offsets[part], times[part], None if sizes is None else sizes[part], rows[part], out,
+                columns, layout,
+            )
+            for part in (slice(None, len(offsets) // 2), slice(len(offsets) // 2, None))
+        ]  # fmt: skip
+        found = [rest for rest in rests if rest is not None]
+        return np.concatenate(found) if found else None
+    # Every byte of the buffer as the possible start of a message: taking rows of it copies messages, nothing else.
+    anywhere: npt.NDArray[Any] = np.ndarray(
+        (len(batch.buffer) - size + 1,),
+        f"V{size}",
+        batch.buffer.data,
+        strides=(1,),
+    )
+    items = anywhere[offsets].view(plan.item)
+    fits = items["length"] >= plan.least_length if sizes is None else sizes >= layout.size
+    if sizes is None:
+        fits &= items["log_time"] == times
+    for name, value in plan.checks:
+        fits &= items[name] == value
+    if fits.all():
+        _copy_columns(items, layout, out if left is None else left, out, columns)
+        return None
+    rows = np.arange(len(out)) if left is None else left
+    if fits.any():
+        _copy_columns(items[fits], layout, rows[fits], out, columns)
+    return rows[~fits]
+
+
+def _copy_columns(
+    items: npt.NDArray[Any], layout: Layout, where: Any, out: npt.NDArray[Any], columns: _Columns
+) -> None:
+    whole = where is out
+    rows = slice(None) if whole else where
+    out["stamp_ns"][rows] = items["sec"].astype(np.int64) * 1_000_000_000 + items["nanosec"]
+    for name, offset in zip(("position", "velocity", "effort"), layout.values, strict=True):
+        out[name][rows] = items[name] if offset >= 0 else np.nan
+    if layout.frame[1]:
+        frames = items["frame"]
+        constant = bool((frames == frames[0]).all())
+        kept = frames[:1].copy() if constant else frames.copy()
+        columns.frames.append((columns.at, len(out), kept) if whole else (columns.at + where, -1, kept))
+
+
+def _with_frames(columns: _Columns) -> npt.NDArray[Any]:
+    array = columns.array[: columns.at]
+    if not columns.frames:
+        return array
+    texts = [np.char.decode(kept, "utf-8", "replace") for _, _, kept in columns.frames]
+    width = max(text.dtype.itemsize // 4 for text in texts)
+    wide = np.empty(
+        len(array), [*((name, FIELDS[name]) for name in FIELDS.names or ()), ("frame_id", f"<U{width}")]
+    )
+    for name in FIELDS.names or ():
+        wide[name] = array[name]
+    wide["frame_id"] = ""
+    for (place, length, _), text in zip(columns.frames, texts, strict=True):
+        rows: Any = slice(place, place + length) if length >= 0 else place
+        wide["frame_id"][rows] = text
+    return wide
+
+
+def _ordered(array: npt.NDArray[Any]) -> npt.NDArray[Any]:
+    times = array["log_time_ns"]
+    if len(times) > 1 and bool((times[1:] < times[:-1]).any()):
+        return array[np.argsort(times, kind="stable")]
+    return array
+
+
+def _message(batch: Batch, offset: int, size: int | None) -> bytes:
+    view = batch.buffer.data
+    if size is None:
+        size = int.from_bytes(view[offset + 1 : offset + 9], "little") - 22
+        offset += MCAP_HEAD
+    return bytes(view[offset : offset + max(size, 0)])

@@ -1,0 +1,82 @@
+"""Chunks of an MCAP file as a reader knows them, and the texts in its records."""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from pendulum_rosbag.reader.batches import Bytes
+from pendulum_rosbag.storage import mcap_records as rec
+
+__all__ = ["Chunk", "keep_staged", "read_text", "read_text_map"]
+
+_HEAD = rec.RECORD_HEAD_SIZE
+_LARGEST_FILLER = 8192
+_MOST_STAGED = 64 << 20
+
+
+@dataclass(slots=True)
+class Chunk:
+    """One chunk: where its records stand in a buffer, and where its message indexes do (channel -> offset)."""
+
+    buffer: Bytes
+    start_ns: int
+    stop_ns: int
+    data_start: int
+    data_size: int
+    raw_size: int
+    compression: str
+    indexes: dict[int, int] = field(default_factory=dict)
+
+
+def keep_staged(buffer: Bytes, chunks: Sequence[Chunk]) -> None:
+    """Copy the chunks behind the unused room of a file that our recorder has not closed.
+
+    A recorder that still runs writes others over them some megabytes later, or cuts them off when it ends.
+    """
+    in_order = sorted(chunks, key=lambda chunk: chunk.data_start)
+    end = 0
+    for position, chunk in enumerate(in_order):
+        if chunk.data_start - end > _LARGEST_FILLER:
+            staged = in_order[position:]
+            break
+        end = max(_index_end(buffer, chunk), chunk.data_start + chunk.data_size)
+    else:
+        return
+    start = staged[0].data_start
+    stop = max(_index_end(buffer, chunk) for chunk in staged)
+    if stop - start > _MOST_STAGED:
+        return  # not written by our recorder, whatever it says
+    copy = np.array(buffer[start:stop])
+    for chunk in staged:
+        chunk.buffer = copy
+        chunk.data_start -= start
+        chunk.indexes = {channel: at - start for channel, at in chunk.indexes.items()}
+
+
+def _index_end(buffer: Bytes, chunk: Chunk) -> int:
+    at = max(chunk.indexes.values())
+    return at + _HEAD + int(rec.RECORD_HEAD.unpack(bytes(buffer[at : at + _HEAD]))[1])
+
+
+def read_text(content: bytes, at: int) -> tuple[str, int]:
+    """Return the text at some byte of a record, and where it ends."""
+    (size,) = struct.unpack_from("<I", content, at)
+    end = at + 4 + size
+    if end > len(content):
+        raise struct.error("text beyond the end of its record")
+    return content[at + 4 : end].decode(), end
+
+
+def read_text_map(content: bytes, at: int) -> dict[str, str]:
+    """Return the map of texts at some byte of a record."""
+    (size,) = struct.unpack_from("<I", content, at)
+    end, at = at + 4 + size, at + 4
+    items = {}
+    while at < end:
+        key, at = read_text(content, at)
+        items[key], at = read_text(content, at)
+    return items

@@ -1,0 +1,407 @@
+"""Reading MCAP files by their message indexes, and without them when the file is damaged."""
+
+from __future__ import annotations
+
+import contextlib
+import mmap
+import struct
+import zlib
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from pendulum_msgs_py.errors import BagError
+from pendulum_rosbag.reader.batches import MCAP_HEAD, Batch, Bytes, Int64, Stream
+from pendulum_rosbag.reader.decompression import decompress
+from pendulum_rosbag.reader.mcap_chunks import Chunk, keep_staged, read_text, read_text_map
+from pendulum_rosbag.storage import mcap_records as rec
+
+__all__ = ["McapSource"]
+
+_HEAD = rec.RECORD_HEAD_SIZE
+_FOOTER_REGION = rec.FOOTER_SIZE + len(rec.MAGIC)
+_CHUNK_FIELDS = struct.Struct("<QQQII")
+_GROUP_SIZE = 1 << 20  # decompressed bytes that are parsed at once
+_INDEX_HEAD = np.dtype(
+    {
+        "names": ["opcode", "length", "channel", "size"],
+        "formats": ["u1", "<u8", "<u2", "<u4"],
+        "offsets": [0, 1, 9, 11],
+        "itemsize": 15,
+    }
+)
+_INDEX_ENTRY = np.dtype([("time", "<i8"), ("offset", "<i8")])
+_Table = dict[int, list[tuple[int, int]]]
+
+
+class _DamagedError(Exception):
+    """The file is not what its footer, index or records claim."""
+
+
+class _NoIndexError(Exception):
+    """The file has no index, as the format allows: its records must be walked through."""
+
+
+class McapSource:
+    """One MCAP file, read through a memory map.
+
+    A file with a footer is read by its index. A file without one (its writer died), or with an index that does not
+    fit the file, is scanned from the start; then ``damage`` says what was found. ``unclosed`` is true for a file of
+    our recorder that is complete but was not closed.
+
+    Args:
+        path: The file.
+        data: Its content, when it is not a plain file (a decompressed copy).
+
+    Raises:
+        BagError: The file cannot be opened or is no MCAP file at all.
+    """
+
+    def __init__(self, path: Path, data: bytes | None = None) -> None:
+        self.path = path
+        self.damage = ""
+        self.unclosed = False
+        self.metadata: dict[str, dict[str, str]] = {}
+        self._map: mmap.mmap | None = None
+        self.buffer: Bytes = self._open(data)
+        if bytes(self.buffer[:8]) != rec.MAGIC:
+            self.close()
+            raise BagError(f"{path} does not begin as an MCAP file; expected the bytes {rec.MAGIC!r}")
+        self._schemas: dict[int, tuple[str, str, str]] = {}
+        self._channels: dict[int, tuple[int, str, str, dict[str, str]]] = {}
+        self.chunks: list[Chunk] = []
+        # Only after a scan: (time, offset) of messages outside of chunks by channel, and inside of each chunk.
+        self._loose: _Table = {}
+        self._scanned: list[_Table] = []
+        self._counts: dict[int, int] = {}
+        self.start_ns = 0
+        self.stop_ns = 0
+        try:
+            self._read_summary()
+        except _NoIndexError:
+            self._scan("")
+        except (_DamagedError, struct.error, ValueError, KeyError, OverflowError, IndexError) as error:
+            self._scan(str(error) or type(error).__name__)
+        self.compressed = any(chunk.compression for chunk in self.chunks)
+        self.streams = [self._stream(channel) for channel in sorted(self._channels)]
+
+    def close(self) -> None:
+        """Release the memory map once no array refers to it any more."""
+        self.buffer = np.empty(0, np.uint8)
+        if self._map is not None:
+            with contextlib.suppress(BufferError):  # an array still looks into it; it goes with that array
+                self._map.close()
+            self._map = None
+
+    # -- opening -----------------------------------------------------------------------------------------------
+
+    def _open(self, data: bytes | None) -> Bytes:
+        if data is not None:
+            return np.frombuffer(data, np.uint8)
+        try:
+            with self.path.open("rb") as file:
+                self._map = mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ)
+        except ValueError:
+            raise BagError(f"{self.path} is empty; expected an MCAP file") from None
+        except OSError as error:
+            raise BagError(f"{self.path} cannot be read: {error.strerror or error}") from error
+        return np.frombuffer(self._map, np.uint8)
+
+    def _read_summary(self) -> None:
+        buffer, size = self.buffer, len(self.buffer)
+        footer = size - _FOOTER_REGION
+        if footer < 8 or bytes(buffer[-8:]) != rec.MAGIC:
+            raise _DamagedError("the file has no footer")
+        opcode, length = rec.RECORD_HEAD.unpack(bytes(buffer[footer : footer + _HEAD]))
+        if opcode != rec.FOOTER or length != 20:
+            raise _DamagedError("the footer is not whole")
+        (at,) = struct.unpack("<Q", bytes(buffer[footer + _HEAD : footer + _HEAD + 8]))
+        if at == 0:
+            raise _NoIndexError
+        if not 8 <= at <= footer:
+            raise _DamagedError(f"the footer points to byte {at} of {size}")
+        statistics = False
+        while at < footer:
+            opcode, length = rec.RECORD_HEAD.unpack(bytes(buffer[at : at + _HEAD]))
+            at += _HEAD
+            if at + length > footer:
+                raise _DamagedError(f"a summary record of {length} bytes does not fit the file")
+            if opcode == rec.PADDING:
+                self.unclosed = True  # complete, but its writer did not give back the room to grow
+                break
+            if opcode == rec.SUMMARY_OFFSET:
+                at += length
+                continue
+            statistics |= self._take_summary_record(opcode, bytes(buffer[at : at + length]))
+            at += length
+        if not statistics and not self.chunks:
+            raise _NoIndexError
+        if self.chunks:
+            if not self._counts or any(not chunk.indexes for chunk in self.chunks):
+                raise _NoIndexError
+            if len({chunk.data_start for chunk in self.chunks}) != len(self.chunks):
+                raise _DamagedError("the index names a chunk twice")
+            self.start_ns = min(chunk.start_ns for chunk in self.chunks)
+            self.stop_ns = max(chunk.stop_ns for chunk in self.chunks)
+            if self.unclosed:
+                keep_staged(self.buffer, self.chunks)
+        elif sum(self._counts.values()):
+            raise _NoIndexError  # messages outside of chunks
+
+    def _take_summary_record(self, opcode: int, content: bytes) -> bool:
+        if opcode == rec.CHUNK_INDEX:
+            self.chunks.append(self._chunk_from_index(content))
+        elif opcode == rec.STATISTICS:
+            (size,) = struct.unpack_from("<I", content, 42)
+            for channel, count in struct.iter_unpack("<HQ", content[46 : 46 + size]):
+                self._counts[channel] = count
+            return True
+        elif opcode == rec.METADATA_INDEX:
+            start, length = struct.unpack_from("<QQ", content)
+            if start + length <= len(self.buffer):
+                self._take_description(rec.METADATA, bytes(self.buffer[start + _HEAD : start + length]))
+        else:
+            self._take_description(opcode, content)
+        return False
+
+    def _take_description(self, opcode: int, content: bytes) -> None:
+        if opcode == rec.SCHEMA:
+            (key,) = struct.unpack_from("<H", content)
+            name, at = read_text(content, 2)
+            encoding, at = read_text(content, at)
+            definition, at = read_text(content, at)
+            self._schemas[key] = (name, encoding, definition)
+        elif opcode == rec.CHANNEL:
+            key, schema = struct.unpack_from("<HH", content)
+            topic, at = read_text(content, 4)
+            encoding, at = read_text(content, at)
+            self._channels[key] = (schema, topic, encoding, read_text_map(content, at))
+        elif opcode == rec.METADATA:
+            name, at = read_text(content, 0)
+            self.metadata[name] = read_text_map(content, at)
+
+    def _chunk_from_index(self, content: bytes) -> Chunk:
+        start, stop, offset, _, size = struct.unpack_from("<QQQQI", content)
+        indexes = dict(struct.iter_unpack("<HQ", content[36 : 36 + size]))
+        at = 36 + size + 8
+        compression, at = read_text(content, at)
+        packed, raw = struct.unpack_from("<QQ", content, at)
+        data_start = offset + _HEAD + _CHUNK_FIELDS.size + len(compression) + 8
+        if data_start + packed > len(self.buffer) or any(at >= len(self.buffer) for at in indexes.values()):
+            raise _DamagedError("the index names a chunk beyond the end of the file")
+        if self.buffer[offset] != rec.CHUNK:
+            raise _DamagedError("the index names a chunk where there is none")
+        return Chunk(self.buffer, start, stop, data_start, packed, raw, compression, indexes)
+
+    def _stream(self, channel: int) -> Stream:
+        schema, topic, encoding, metadata = self._channels[channel]
+        name, schema_encoding, definition = self._schemas.get(schema, ("", "", ""))
+        return Stream(
+            channel,
+            topic,
+            name,
+            self._counts.get(channel, 0),
+            definition,
+            schema_encoding,
+            qos=metadata.get("offered_qos_profiles", ""),
+            serialization=encoding,
+        )
+
+    # -- scanning ----------------------------------------------------------------------------------------------
+
+    def _scan(self, damage: str) -> None:
+        """Find all whole records from the start of the file; what is cut off at its end is left out."""
+        self.damage = damage
+        self.chunks.clear()
+        self._counts.clear()
+        self.start_ns, self.stop_ns = 2**63 - 1, 0
+        size = len(self.buffer)
+        view = self.buffer.data
+        at = 8
+        while at + _HEAD <= size:
+            opcode, length = rec.RECORD_HEAD.unpack_from(view, at)
+            body = at + _HEAD
+            if opcode in (rec.DATA_END, rec.FOOTER):
+                break
+            if opcode == 0 or body + length > size:
+                rest = size - at
+                self.damage = self.damage or f"the last {rest} bytes are no whole record"
+                break
+            if opcode == rec.CHUNK:
+                self._scan_chunk(body, length)
+            elif opcode == rec.MESSAGE:
+                if length < 22:
+                    self.damage = self.damage or f"the message at byte {at} is not whole"
+                else:
+                    self._note(view, at, self._loose, at)
+            elif opcode in (rec.SCHEMA, rec.CHANNEL, rec.METADATA):
+                self._try_description(opcode, bytes(view[body : body + length]))
+            at = body + length
+        if not self._counts:
+            self.start_ns = 0
+
+    def _try_description(self, opcode: int, content: bytes) -> None:
+        try:
+            self._take_description(opcode, content)
+        except (struct.error, UnicodeDecodeError):
+            self.damage = self.damage or "a record of a topic is not readable"
+
+    def _scan_chunk(self, body: int, length: int) -> None:
+        view = self.buffer.data
+        try:
+            start, stop, raw_size, crc, text_size = _CHUNK_FIELDS.unpack_from(view, body)
+            compression, at = read_text(bytes(view[body + 28 : body + 32 + text_size]), 0)
+            at += body + 28
+            (packed,) = struct.unpack_from("<Q", view, at)
+            at += 8
+            if at + packed > body + length:
+                raise _DamagedError("chunk")
+            chunk = Chunk(self.buffer, start, stop, at, packed, raw_size, compression)
+            raw = self._raw(chunk)
+            if crc and zlib.crc32(raw.data) != crc:
+                raise _DamagedError("checksum")
+            records = self._records(raw)
+        except (_DamagedError, BagError, struct.error, UnicodeDecodeError):
+            self.damage = self.damage or f"the chunk at byte {body - _HEAD} is not whole"
+            return
+        scanned: _Table = {}
+        for opcode, offset, size in records:
+            if opcode == rec.MESSAGE:
+                self._note(raw, offset, scanned, offset)
+            elif opcode in (rec.SCHEMA, rec.CHANNEL):
+                self._try_description(opcode, bytes(raw[offset + _HEAD : offset + _HEAD + size]))
+        self._scanned.append(scanned)
+        self.chunks.append(chunk)
+
+    @staticmethod
+    def _records(raw: Any) -> list[tuple[int, int, int]]:
+        found = []
+        at, size = 0, len(raw)
+        view = memoryview(raw)
+        while at + _HEAD <= size:
+            opcode, length = rec.RECORD_HEAD.unpack_from(view, at)
+            if at + _HEAD + length > size or (opcode == rec.MESSAGE and length < 22):
+                raise _DamagedError("a record does not fit its chunk")
+            found.append((opcode, at, length))
+            at += _HEAD + length
+        return found
+
+    def _note(self, raw: Any, offset: int, into: _Table, position: int) -> None:
+        channel, _, time = struct.unpack_from("<HIq", raw, offset + _HEAD)
+        into.setdefault(channel, []).append((time, position))
+        self._counts[channel] = self._counts.get(channel, 0) + 1
+        self.start_ns = min(self.start_ns, time)
+        self.stop_ns = max(self.stop_ns, time)
+
+    # -- reading -----------------------------------------------------------------------------------------------
+
+    def _raw(self, chunk: Chunk) -> Bytes:
+        packed = chunk.buffer[chunk.data_start : chunk.data_start + chunk.data_size]
+        if not chunk.compression:
+            return packed
+        return np.frombuffer(decompress(packed, chunk.compression, chunk.raw_size, str(self.path)), np.uint8)
+
+    def batches(self, channels: set[int], start: int | None, stop: int | None) -> Iterator[Batch]:
+        """Yield all messages of some channels with start <= log time < stop, in the order of the file."""
+        for channel, entries in self._loose.items():
+            if channel in channels:
+                table = np.array(entries, np.int64)
+                yield from self._cut(Batch(channel, self.buffer, table[:, 1], table[:, 0]), start, stop)
+        for buffer, index, members in self._groups(channels, start, stop):
+            for channel in channels:
+                times, offsets = self._entries(channel, index, members)
+                if len(times):
+                    yield from self._cut(Batch(channel, buffer, offsets, times), start, stop)
+
+    def _groups(
+        self, channels: set[int], start: int | None, stop: int | None
+    ) -> Iterator[tuple[Bytes, Bytes, list[tuple[int, int]]]]:
+        """Yield buffers that hold many chunks, and their index, with (number of the chunk, where it begins)."""
+        plain: dict[int, list[tuple[int, int]]] = {}
+        packed: list[tuple[int, int]] = []
+        parts: list[Bytes] = []
+        size = 0
+        index = self.buffer
+        for number, chunk in enumerate(self.chunks):
+            if (start is not None and chunk.stop_ns < start) or (stop is not None and chunk.start_ns >= stop):
+                continue
+            if channels.isdisjoint(self._scanned[number] if self._scanned else chunk.indexes):
+                continue
+            if not chunk.compression:
+                plain.setdefault(id(chunk.buffer), []).append(
+                    (number, chunk.data_start)
+                )  # they lie in the same map
+                continue
+            if packed and (size >= _GROUP_SIZE or index is not chunk.buffer):
+                yield np.concatenate(parts), index, packed
+                packed, parts, size = [], [], 0
+            index = chunk.buffer
+            parts.append(self._raw(chunk))
+            packed.append((number, size))
+            size += chunk.raw_size
+        if packed:
+            yield np.concatenate(parts), index, packed
+        for members in plain.values():
+            buffer = self.chunks[members[0][0]].buffer
+            yield buffer, buffer, members
+
+    def _entries(self, channel: int, index: Bytes, members: list[tuple[int, int]]) -> tuple[Int64, Int64]:
+        """Return log times [ns] and record offsets of a channel's messages in a group of chunks."""
+        if self._scanned:
+            rows = [
+                (time, base + offset)
+                for number, base in members
+                for time, offset in self._scanned[number].get(channel, ())
+            ]
+            table = np.array(rows, np.int64).reshape(-1, 2)
+            return table[:, 0], table[:, 1]
+        places = [
+            (place, base)
+            for number, base in members
+            if (place := self.chunks[number].indexes.get(channel)) is not None
+        ]
+        if not places:
+            return np.empty(0, np.int64), np.empty(0, np.int64)
+        at, base = np.array(places, np.int64).T
+        heads = self._take(index, _INDEX_HEAD, at)
+        if len(np.unique(at)) != len(at):
+            raise BagError(f"{self.path}: two chunks name one message index; try to repair the bag")
+        counts = heads["size"].astype(np.int64) // 16
+        whole = (heads["opcode"] == rec.MESSAGE_INDEX) & (heads["channel"] == channel)
+        whole &= (heads["length"] == heads["size"] + np.uint64(6)) & (at + 15 + 16 * counts <= len(index))
+        if not whole.all():
+            wrong = int(at[~whole][0])
+            raise BagError(
+                f"{self.path}: the message index at byte {wrong} is damaged; try to repair the bag"
+            )
+        first = np.cumsum(counts) - counts
+        rows_at = np.repeat(at + 15 - 16 * first, counts) + 16 * np.arange(int(counts.sum()))
+        table = self._take(index, _INDEX_ENTRY, rows_at)
+        return table["time"], table["offset"] + np.repeat(base, counts)
+
+    def _take(self, buffer: Bytes, item: np.dtype[Any], at: Int64) -> Any:
+        """Return copies of the items that begin at some bytes of a buffer."""
+        places = max(len(buffer) - item.itemsize + 1, 0)
+        if len(at) and not 0 <= int(at.max()) < places:
+            raise BagError(
+                f"{self.path}: a message index lies beyond the end of the file; try to repair the bag"
+            )
+        anywhere: np.ndarray[Any, Any] = np.ndarray((places,), f"V{item.itemsize}", buffer.data, strides=(1,))
+        return anywhere[at].view(item)
+
+    def _cut(self, batch: Batch, start: int | None, stop: int | None) -> Iterator[Batch]:
+        """Limit a batch to a time span and check that its records lie inside the buffer."""
+        if start is not None or stop is not None:
+            keep = np.ones(len(batch.times), bool)
+            if start is not None:
+                keep &= batch.times >= start
+            if stop is not None:
+                keep &= batch.times < stop
+            batch = Batch(batch.channel, batch.buffer, batch.offsets[keep], batch.times[keep])
+        if not len(batch.times):
+            return
+        if int(batch.offsets.min()) < 0 or int(batch.offsets.max()) + MCAP_HEAD > len(batch.buffer):
+            raise BagError(f"{self.path}: a message index points outside of its chunk; try to repair the bag")
+        yield batch

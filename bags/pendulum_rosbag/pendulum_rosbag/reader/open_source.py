@@ -1,0 +1,214 @@
+"""Finding the storage files of a bag, with its ``metadata.yaml`` or without."""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path, PurePath
+from typing import Any
+
+import yaml
+
+from pendulum_msgs_py.errors import BagError
+from pendulum_rosbag.reader.batches import Source
+from pendulum_rosbag.reader.decompression import decompress_bounded
+from pendulum_rosbag.reader.mcap_source import McapSource
+from pendulum_rosbag.reader.sqlite_source import SqliteSource
+from pendulum_rosbag.storage.metadata_file import METADATA_NAME, METADATA_VERSION
+
+__all__ = ["BagFolder", "open_folder", "open_source", "open_sources"]
+
+_ENDINGS = {".mcap": "mcap", ".db3": "sqlite3"}
+_LEAST_ROOM = 1 << 28
+_MAX_RATIO = 100
+"""A file compressed as a whole may hold this many times its size: states shrink to a fifth, bombs to nothing."""
+_MAX_METADATA = 16 << 20
+_MAX_DEPTH = 40
+
+
+@dataclass(slots=True)
+class BagFolder:
+    """What is known of a bag before its storage files are opened."""
+
+    path: Path
+    files: list[Path]
+    storage: str = ""
+    custom_data: dict[str, str] = field(default_factory=dict)
+    topic_hashes: dict[str, str] = field(default_factory=dict)
+    message_compression: bool = False
+    message_count: int | None = None
+    damage: list[str] = field(default_factory=list)
+
+
+def open_folder(path: Path) -> BagFolder:
+    """Read the metadata of a bag and list its storage files.
+
+    Raises:
+        BagError: The path does not exist, or there is no storage file.
+    """
+    if not path.exists():
+        raise BagError(f"bag {path} does not exist")
+    if path.is_file():
+        return BagFolder(path, [path], _ENDINGS.get(_ending(path), ""))
+    folder = BagFolder(path, [])
+    try:
+        text = _read_metadata(path / METADATA_NAME)
+    except FileNotFoundError:
+        folder.damage.append(f"{METADATA_NAME} is missing")
+    except (OSError, UnicodeDecodeError) as error:
+        folder.damage.append(f"{METADATA_NAME} is not readable: {error}")
+    else:
+        _take_metadata(folder, text)
+    try:
+        inside = [file for file in path.iterdir() if _ending(file) in _ENDINGS and file.is_file()]
+    except OSError as error:
+        raise BagError(f"{path} cannot be read as a bag: {error.strerror or error}") from error
+    present = sorted(inside, key=_file_order)
+    present = [file for file in present if not file.name.startswith(".")]
+    listed = [file for file in dict.fromkeys(folder.files) if file.is_file()]
+    if missing := [file.name for file in folder.files if file not in listed]:
+        folder.damage.append(f"listed but missing: {', '.join(missing)}")
+    # A file that is not listed yet was begun by a recorder that died before it could say so.
+    folder.files = listed + [file for file in present if file not in listed]
+    if not folder.files:
+        raise BagError(
+            f"{path} is no bag: it has neither {METADATA_NAME} with its files nor any .mcap or .db3 file"
+        )
+    folder.storage = folder.storage or _ENDINGS[_ending(folder.files[0])]
+    return folder
+
+
+def _read_metadata(path: Path) -> str:
+    if path.exists() and not path.is_file():
+        raise OSError("it is no file")  # a pipe would keep us waiting for ever
+    if path.stat().st_size > _MAX_METADATA:
+        raise OSError(f"it has more than {_MAX_METADATA} bytes")
+    return path.read_text(encoding="utf-8")
+
+
+def _load_yaml(text: str) -> Any:
+    """Return what YAML text says.
+
+    Aliases are refused, which can make gigabytes out of a line, and depth, which overflows the stack of libyaml's
+    composer and with it ends the process.
+    """
+    loader = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
+    depth = 0
+    for event in yaml.parse(text, loader):
+        if isinstance(event, yaml.CollectionStartEvent):
+            depth += 1
+            if depth > _MAX_DEPTH:
+                raise ValueError(f"nested deeper than {_MAX_DEPTH} levels")
+        elif isinstance(event, yaml.CollectionEndEvent):
+            depth -= 1
+        elif isinstance(event, yaml.AliasEvent):
+            raise ValueError("aliases are not allowed")
+    return yaml.load(text, Loader=loader)
+
+
+def _take_metadata(folder: BagFolder, text: str) -> None:
+    try:
+        document = _load_yaml(text)
+        info: dict[str, Any] = document["rosbag2_bagfile_information"]
+        version = int(info["version"])
+        if version > METADATA_VERSION:
+            folder.damage.append(f"metadata version is {version}; expected at most {METADATA_VERSION}")
+        folder.files = [folder.path / PurePath(name).name for name in info["relative_file_paths"]]
+        folder.storage = str(info["storage_identifier"])
+        custom = info.get("custom_data") or {}
+        folder.custom_data = {str(key): str(value) for key, value in custom.items()}
+        for item in info.get("topics_with_message_count", []):
+            topic: Mapping[str, Any] = item["topic_metadata"]
+            folder.topic_hashes[str(topic["name"])] = str(topic.get("type_description_hash", ""))
+        folder.message_count = int(info["message_count"])
+        folder.message_compression = str(info.get("compression_mode") or "").lower() == "message"
+    except (
+        yaml.YAMLError,
+        KeyError,
+        TypeError,
+        ValueError,
+        AttributeError,
+        RecursionError,
+        OverflowError,
+    ) as error:
+        sentence = " ".join(str(error).split())
+        folder.damage.append(f"{METADATA_NAME} is not what a bag has: {sentence or type(error).__name__}")
+
+
+def _ending(file: Path) -> str:
+    return file.with_suffix("").suffix if file.suffix == ".zstd" else file.suffix
+
+
+def _file_order(file: Path) -> tuple[int, str]:
+    """Order ``name_10`` behind ``name_9``."""
+    number = file.name.split(".")[0].rpartition("_")[2]
+    return (int(number) if number.isdigit() else 0, file.name)
+
+
+def open_sources(folder: BagFolder) -> list[Source]:
+    """Open the storage files of a bag; unreadable ones are named in ``damage`` if others can be read.
+
+    Raises:
+        BagError: None of them can be read.
+    """
+    sources: list[Source] = []
+    errors: list[BagError] = []
+    for file in folder.files:
+        try:
+            sources.append(open_source(file))
+        except BagError as error:
+            errors.append(error)
+            folder.damage.append(str(error))
+    if not sources:
+        raise errors[0]
+    if not folder.custom_data:
+        _metadata_from_storage(folder, sources[-1])
+    return sources
+
+
+def open_source(file: Path) -> Source:
+    """Open one storage file by its name; files compressed as a whole (``.zstd``) are decompressed first."""
+    if file.suffix != ".zstd":
+        return (
+            McapSource(file)
+            if file.suffix == ".mcap"
+            else SqliteSource(file)
+            if file.suffix == ".db3"
+            else _unknown(file)
+        )
+    try:
+        with file.open("rb") as packed:
+            data = decompress_bounded(packed, str(file), max(_LEAST_ROOM, _MAX_RATIO * file.stat().st_size))
+    except OSError as error:
+        if isinstance(error, BagError):
+            raise
+        raise BagError(f"{file} cannot be read: {error.strerror or error}") from error
+    if _ending(file) == ".mcap":
+        return McapSource(file, data)
+    folder = tempfile.TemporaryDirectory(prefix="pendulum_rosbag_")
+    copy = Path(folder.name, file.with_suffix("").name)
+    copy.write_bytes(data)
+    source = SqliteSource(copy)
+    source.keep(folder)
+    return source
+
+
+def _unknown(file: Path) -> Source:
+    raise BagError(f"{file} is no storage file of a bag; expected .mcap or .db3")
+
+
+def _metadata_from_storage(folder: BagFolder, source: Source) -> None:
+    """Take run metadata from the storage file, for files that were separated from their folder."""
+    if isinstance(source, McapSource):
+        text = source.metadata.get("rosbag2", {}).get("serialized_metadata", "")
+    else:
+        text = source.custom_metadata() if isinstance(source, SqliteSource) else ""
+    if not text:
+        return
+    try:
+        info = _load_yaml(text)
+        info = info.get("rosbag2_bagfile_information", info)
+        folder.custom_data = {str(key): str(value) for key, value in (info.get("custom_data") or {}).items()}
+    except (yaml.YAMLError, AttributeError, TypeError, ValueError, RecursionError, OverflowError):
+        return

@@ -1,0 +1,194 @@
+"""What a recording's timing looks like: rates, gaps, jitter, latencies, duplicates and clock jumps."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from pendulum_rosbag.reader.bag import Bag
+from pendulum_rosbag.reader.batches import Int64
+
+__all__ = ["BagStatistics", "Latency", "TopicStatistics", "bag_statistics", "time_statistics"]
+
+GAP_FACTOR = 1.5
+"""An interval counts as a gap when it is longer than this many median intervals."""
+BURST_FACTOR = 2.0
+"""Messages without stamps come in bursts when their mean interval is longer than this many median intervals."""
+CLOCK_JUMP = 0.05
+"""A step of the difference between log time and stamp counts as a clock jump from this size [s]."""
+_LEAST_SHARE = 0.5
+_MS = 1e-6  # nanoseconds to milliseconds
+
+
+@dataclass(slots=True)
+class TopicStatistics:
+    """Timing of one topic; times in milliseconds, rates in Hz, NaN where there are too few messages.
+
+    Args:
+        type: Message type.
+        count: Messages.
+        rate: Messages per second between the first and the last.
+        period: Median interval.
+        jitter: Standard deviation of the intervals.
+        period_p99: 99 % of the intervals are at most that long.
+        longest: Longest interval.
+        gaps: Intervals longer than 1.5 median intervals; none where messages come in bursts (see ``time_statistics``).
+        missing: Messages that would fill the gaps at the median interval (a late message leaves none behind).
+        duplicates: Messages that carry the stamp of an earlier one (of the same sender, where they name it).
+        backward: Messages whose stamp lies before that of the message before.
+        clock_jumps: Steps of more than 50 ms in the difference between log time and stamp.
+        age: Median of log time minus stamp.
+        age_p99: 99 % of the messages are at most that old when logged.
+    """
+
+    type: str
+    count: int
+    rate: float = np.nan
+    period: float = np.nan
+    jitter: float = np.nan
+    period_p99: float = np.nan
+    longest: float = np.nan
+    gaps: int = 0
+    missing: int = 0
+    duplicates: int = 0
+    backward: int = 0
+    clock_jumps: int = 0
+    age: float = np.nan
+    age_p99: float = np.nan
+
+
+@dataclass(slots=True)
+class Latency:
+    """Time from a message on one topic to the message on another that carries the same stamp [ms].
+
+    Args:
+        source: Topic of the stamped message.
+        answer: Topic whose messages echo the stamp.
+        matched: Answers that were matched.
+        median: Median time.
+        p99: 99 % of the answers came within that time.
+        longest: Longest time.
+    """
+
+    source: str
+    answer: str
+    matched: int
+    median: float
+    p99: float
+    longest: float
+
+
+@dataclass(slots=True)
+class BagStatistics:
+    """Timing of a whole bag."""
+
+    path: str
+    storage: str
+    duration: float
+    count: int
+    topics: dict[str, TopicStatistics] = field(default_factory=dict)
+    latencies: list[Latency] = field(default_factory=list)
+    events: list[dict[str, Any]] = field(default_factory=list)
+    damage: list[str] = field(default_factory=list)
+
+
+def time_statistics(
+    kind: str, log_times: Int64, stamps: Int64 | None = None, senders: npt.NDArray[Any] | None = None
+) -> TopicStatistics:
+    """Return the timing of one topic.
+
+    Intervals are those between stamps where messages have them (a recorder that reads in batches cannot blur them),
+    else those between log times. Messages without stamps whose mean interval is more than twice the median come in
+    bursts, as events do: they have no period that could leave gaps.
+
+    Args:
+        kind: Message type.
+        log_times: Log times in ascending order [ns], shape (n,).
+        stamps: Stamps of the messages [ns], shape (n,); zeros count as no stamp.
+        senders: Who sent each message, shape (n,), where the messages say so.
+    """
+    result = TopicStatistics(kind, len(log_times))
+    stamped = stamps is not None and len(stamps) > 0 and bool(stamps.any())
+    times = stamps if stamped and stamps is not None else log_times
+    if len(times) == 0:
+        return result
+    if stamped and stamps is not None:
+        _stamp_statistics(result, log_times, stamps, senders)
+    intervals = np.diff(times)
+    ascending = intervals[intervals > 0]
+    if len(ascending) == 0:
+        return result
+    median = float(np.median(ascending))
+    result.rate = len(ascending) / float(ascending.sum()) * 1e9
+    result.period = median * _MS
+    result.jitter = float(np.std(ascending)) * _MS
+    result.period_p99 = float(np.quantile(ascending, 0.99)) * _MS
+    result.longest = float(ascending.max()) * _MS
+    if not stamped and float(np.mean(ascending)) > BURST_FACTOR * median:
+        return result
+    result.gaps = int(np.sum(ascending > GAP_FACTOR * median))
+    # A late message makes a long interval and a short one: together they miss nothing.
+    result.missing = max(int(np.sum(np.rint(ascending / median) - 1)), 0)
+    return result
+
+
+def _stamp_statistics(
+    result: TopicStatistics, log_times: Int64, stamps: Int64, senders: npt.NDArray[Any] | None
+) -> None:
+    if senders is not None:
+        keys = np.rec.fromarrays([stamps, senders])
+        result.duplicates = len(keys) - len(np.unique(keys))
+    else:
+        result.duplicates = len(stamps) - len(np.unique(stamps))
+    result.backward = int(np.sum(np.diff(stamps) < 0))
+    ages = (log_times - stamps) * _MS
+    result.age = float(np.median(ages))
+    result.age_p99 = float(np.quantile(ages, 0.99))
+    result.clock_jumps = int(np.sum(np.abs(np.diff(ages)) > CLOCK_JUMP * 1e3))
+
+
+def _latencies(arrays: dict[str, npt.NDArray[Any]]) -> list[Latency]:
+    """Match stamps between all topics that echo each other."""
+    found = []
+    for source, a in arrays.items():
+        for answer, b in arrays.items():
+            if source == answer or len(a) == 0 or len(b) == 0:
+                continue
+            stamps, first = np.unique(a["stamp_ns"], return_index=True)
+            place = np.minimum(np.searchsorted(stamps, b["stamp_ns"]), len(stamps) - 1)
+            same = stamps[place] == b["stamp_ns"]
+            if same.sum() < max(2, _LEAST_SHARE * len(b)):
+                continue
+            delays = (b["log_time_ns"][same] - a["log_time_ns"][first[place[same]]]) * _MS
+            if np.median(delays) <= 0:
+                continue  # the other direction is the answer (or all log times are the stamps themselves)
+            median, p99 = np.quantile(delays, [0.5, 0.99])
+            found.append(
+                Latency(source, answer, int(same.sum()), float(median), float(p99), float(delays.max()))
+            )
+    return found
+
+
+def bag_statistics(bag: Bag) -> BagStatistics:
+    """Return rates, gaps, jitter, latencies, duplicates and clock jumps of a bag."""
+    total = sum(info.count for info in bag.topics.values())
+    result = BagStatistics(
+        str(bag.path), bag.storage, (bag.stop_ns - bag.start_ns) * 1e-9, total, damage=list(bag.damage)
+    )
+    arrays: dict[str, npt.NDArray[Any]] = {}
+    for name, info in bag.topics.items():
+        values = bag[name] if info.type == "sensor_msgs/msg/JointState" else None
+        if isinstance(values, np.ndarray):
+            arrays[name] = values
+            senders = values["frame_id"] if "frame_id" in (values.dtype.names or ()) else None
+            result.topics[name] = time_statistics(
+                info.type, values["log_time_ns"], values["stamp_ns"], senders
+            )
+        else:
+            result.topics[name] = time_statistics(info.type, bag.log_times(name))
+    result.latencies = _latencies(arrays)
+    result.events = bag.events()
+    return result

@@ -1,0 +1,80 @@
+"""``record``: write topics to a bag that survives anything that happens to the recorder."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from pendulum_msgs_py.errors import BagError
+from pendulum_msgs_py.programs.executables import cli_main
+from pendulum_rosbag.recorder.options import RecorderOptions, read_metadata
+
+__all__ = ["main"]
+
+app = typer.Typer(add_completion=False, rich_markup_mode=None)
+
+
+@app.command(
+    epilog="Example: python -m pendulum_bags record -o runs/today --regex '^/(sim|hw)/' --compression zstd. "
+    "ROS arguments go behind --ros-args."
+)
+def record(
+    context: typer.Context,
+    output: Annotated[Path, typer.Option("-o", "--output", help="Folder of the bag; it must not exist.")],
+    topics: Annotated[
+        list[str] | None, typer.Argument(help="Topics by their full names; by default all.")
+    ] = None,
+    regex: Annotated[str, typer.Option(help="Record topics that match this pattern, too.")] = "",
+    exclude: Annotated[str, typer.Option(help="Leave out topics that match this pattern.")] = "",
+    storage: Annotated[str, typer.Option(help="mcap or sqlite3.")] = "mcap",
+    compression: Annotated[str, typer.Option(help="zstd, or none.")] = "none",
+    max_size: Annotated[float, typer.Option(help="Begin a new file at this size [MB]; 0 for never.")] = 0.0,
+    max_duration: Annotated[
+        float, typer.Option(help="Begin a new file after this time [s]; 0 for never.")
+    ] = 0.0,
+    duration: Annotated[float, typer.Option(help="Stop after this time [s]; 0 for never.")] = 0.0,
+    metadata: Annotated[Path | None, typer.Option(help="JSON object to store with the bag.")] = None,
+    log_time: Annotated[
+        str, typer.Option(help="receive (time of arrival) or header (stamp of the message).")
+    ] = "receive",
+    wait: Annotated[bool, typer.Option("--wait", help="Begin when the service ~/start is called.")] = False,
+) -> int:
+    """Record topics to a rosbag2 folder that is complete and readable at every instant."""
+    options = RecorderOptions(
+        output,
+        tuple(topics or ()),
+        regex,
+        exclude,
+        storage,
+        None if compression in ("", "none") else compression,
+        round(max_size * 1e6),
+        max_duration,
+        duration,
+        read_metadata(metadata),
+        log_time,
+        wait,
+    )
+    if output.exists():
+        raise BagError(f"bag {output} exists already; expected a new folder (bags are never overwritten)")
+
+    from pendulum_msgs_py.ros.runner import run_node
+    from pendulum_rosbag.recorder.recorder_node import SPECS, Recorder
+
+    return run_node(
+        lambda stop: Recorder(options, stop),
+        list(context.obj),
+        program="pendulum_bags record",
+        description="Record topics to a bag.",
+        specs=SPECS,
+    )
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Run the recorder; arguments from ``--ros-args`` on belong to ROS."""
+    return cli_main(app, argv, name="python -m pendulum_bags record", takes_ros_arguments=True)
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

@@ -1,0 +1,147 @@
+"""One subscription of the recorder: how a topic is subscribed to, and what has arrived from it."""
+
+from __future__ import annotations
+
+import importlib
+import time
+from collections.abc import Iterator, Sequence
+from typing import Any
+
+from rclpy.event_handler import QoSSubscriptionEventType
+from rclpy.impl.implementation_singleton import rclpy_implementation
+from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.topic_endpoint_info import TopicEndpointInfo
+
+from pendulum_msgs_py.ros.polled import PollingNode
+from pendulum_rosbag.reader.joint_state import Trimmer
+from pendulum_rosbag.recorder import GapCounter, RecordingSession, stamp_reader
+from pendulum_rosbag.storage import QosProfile
+from pendulum_rosbag.storage.message_types import message_type
+
+__all__ = ["Tap", "wanted_qos"]
+
+DEPTH = 4000
+"""Messages that the middleware holds for us between two visits: four seconds at 1 kHz."""
+SETTLING = 5.0
+"""Time after which a publisher and its subscription know of each other [s].
+
+A publisher that serves others already may be heard as soon as we know it. It sends again what was missed only once it
+knows us, too, which took up to 2 s where recorders had been killed before.
+"""
+
+
+def wanted_qos(publishers: Sequence[TopicEndpointInfo]) -> tuple[bool, bool]:
+    """Return whether all publishers of a topic are reliable, and whether all keep messages for latecomers."""
+    return (
+        all(p.qos_profile.reliability == ReliabilityPolicy.RELIABLE for p in publishers),
+        all(p.qos_profile.durability == DurabilityPolicy.TRANSIENT_LOCAL for p in publishers),
+    )
+
+
+class Tap:
+    """A subscription that is visited, and what is needed to record from it.
+
+    Args:
+        node: The node that subscribes.
+        topic: Full name.
+        publishers: Who offers the topic, with their QoS.
+
+    Raises:
+        ImportError: The type of the messages is not installed.
+
+    Attributes:
+        source: Where its messages come from; the node that made it destroys it after ``close``.
+        announced: The session that knows the topic.
+    """
+
+    def __init__(self, node: PollingNode, topic: str, publishers: Sequence[TopicEndpointInfo]) -> None:
+        name = publishers[0].topic_type
+        type_hash = str(publishers[0].topic_type_hash)
+        self.topic = topic
+        self.type_name = name
+        self.reliable, self.latched = wanted_qos(publishers)
+        self.publishers = len(publishers)
+        self.qos = tuple(_offered(publisher) for publisher in publishers)
+        self.announced: RecordingSession | None = None
+        self.stamp = stamp_reader(name)
+        self.type = message_type(name, type_hash if type_hash.startswith("RIHS") else "")
+        self._trim = Trimmer() if name == "sensor_msgs/msg/JointState" else bytes
+        profile = QoSProfile(
+            depth=DEPTH,
+            reliability=ReliabilityPolicy.RELIABLE if self.reliable else ReliabilityPolicy.BEST_EFFORT,
+            durability=DurabilityPolicy.TRANSIENT_LOCAL if self.latched else DurabilityPolicy.VOLATILE,
+        )
+        self._opened = self._first_opened = time.monotonic()
+        self._told_unmet = 0
+        self.source = node.create_polled_input(_message_class(name), topic, profile)
+        # Taken when it is asked for, not delivered by the executor: it must be as new as the messages.
+        handle = self.source.subscription.handle
+        with handle:
+            self._matched = rclpy_implementation.EventHandle(handle, QoSSubscriptionEventType.RCL_SUBSCRIPTION_MATCHED)
+        self._gaps = GapCounter(self._count_publishers)
+
+    @property
+    def is_settling(self) -> bool:
+        """Whether some publisher may not know of us yet."""
+        return time.monotonic() - self._opened < SETTLING
+
+    def suits(self, publishers: Sequence[TopicEndpointInfo]) -> bool:
+        """Tell whether the subscription can match all these publishers; take note of how many they are."""
+        if len(publishers) > self.publishers:
+            self._opened = time.monotonic()
+        self.publishers = len(publishers)
+        reliable, latched = wanted_qos(publishers)
+        return (reliable or not self.reliable) and (latched or not self.latched)
+
+    def announce(self, session: RecordingSession) -> None:
+        """See that a session knows the topic, before anything of it is told or offered."""
+        if self.announced is not session:
+            session.add_topic(self.topic, self.type, self.qos)
+            self.announced = session
+
+    def take(self) -> Iterator[tuple[int, bytes, int]]:
+        """Yield what has arrived: time of arrival [ns] or 0, CDR bytes, and messages that are missing before it."""
+        see, trim = self._gaps.see, self._trim
+        for data, info in self.source.messages():
+            sequence = info["publication_sequence_number"]
+            yield info["received_timestamp"], trim(data), see(sequence) if sequence else 0
+
+    def unheard(self) -> int:
+        """Return how many messages were sent by publishers that came later before the first that was heard of them.
+
+        Those since the last call; of publishers that were there before the subscription nobody expects the beginning.
+        """
+        late = self._gaps.unmet - self._told_unmet
+        self._told_unmet = self._gaps.unmet
+        return late if time.monotonic() - self._first_opened > SETTLING else 0
+
+    def close(self) -> None:
+        """Let go of the middleware before the source is destroyed."""
+        self._matched.destroy_when_not_in_use()
+
+    def _count_publishers(self) -> tuple[int, int]:
+        with self._matched:
+            status = self._matched.take_event()
+        return (status.total_count, status.current_count) if status else (0, 0)
+
+
+def _message_class(name: str) -> Any:
+    package, _, short = name.split("/")
+    module = importlib.import_module(f"{package}.msg")
+    if not hasattr(module, short):
+        raise ImportError(f"{package}.msg has no {short}")
+    return getattr(module, short)
+
+
+def _offered(publisher: TopicEndpointInfo) -> QosProfile:
+    profile = publisher.qos_profile
+    return QosProfile(
+        history=profile.history.name.lower(),
+        depth=profile.depth,
+        reliability=profile.reliability.name.lower(),
+        durability=profile.durability.name.lower(),
+        deadline_ns=profile.deadline.nanoseconds,
+        lifespan_ns=profile.lifespan.nanoseconds,
+        liveliness=profile.liveliness.name.lower(),
+        lease_ns=profile.liveliness_lease_duration.nanoseconds,
+    )

@@ -1,0 +1,53 @@
+"""Log times from the messages themselves, so that a simulated run has the same log times every time."""
+
+from __future__ import annotations
+
+import json
+import struct
+from collections.abc import Callable
+
+from pendulum_rosbag.storage.message_types import typestore
+
+__all__ = ["LOG_TIMES", "StampReader", "stamp_reader"]
+
+LOG_TIMES = ("receive", "header")
+"""Log time = when the message arrived, or what stamp it carries."""
+
+StampReader = Callable[[bytes], int | None]
+"""From CDR bytes to the stamp [ns], ``None`` when this message has none."""
+
+_LITTLE = struct.Struct("<iI")
+_BIG = struct.Struct(">iI")
+
+
+def stamp_reader(type_name: str) -> StampReader | None:
+    """Return how to find the stamp in messages of a type.
+
+    Types that begin with a ``std_msgs/Header`` or a time have it at their start; a ``std_msgs/String`` has it as
+    ``stamp_ns`` when its text is the JSON of an event. ``None`` for types without a stamp.
+    """
+    if type_name == "std_msgs/msg/String":
+        return _event_stamp
+    definition = typestore().fielddefs.get(type_name)
+    if definition is None or not definition[1]:
+        return None
+    first = str(definition[1][0][1][1])
+    if first in ("std_msgs/msg/Header", "builtin_interfaces/msg/Time"):
+        return _leading_stamp
+    return None
+
+
+def _leading_stamp(data: bytes) -> int | None:
+    if len(data) < 12:
+        return None
+    sec, nanosec = (_LITTLE if data[1] & 1 else _BIG).unpack_from(data, 4)
+    return int(sec) * 1_000_000_000 + int(nanosec)
+
+
+def _event_stamp(data: bytes) -> int | None:
+    if data[8:9] != b"{":
+        return None
+    try:
+        return int(json.loads(data[8:].split(b"\0")[0])["stamp_ns"])
+    except (ValueError, KeyError, TypeError):
+        return None

@@ -1,0 +1,404 @@
+"""Write rosbag2 folders that are complete and readable at every instant."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import threading
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Protocol
+
+from pendulum_msgs_py.errors import BagError, ParameterError
+from pendulum_rosbag.storage.message_types import MessageType, message_type
+from pendulum_rosbag.storage.metadata_file import (
+    FileEntry,
+    MetadataFile,
+    TopicEntry,
+    encode_custom_data,
+    qos_yaml,
+)
+from pendulum_rosbag.storage.qos import QosProfile
+
+__all__ = ["STORAGES", "BagWriter", "open_writer"]
+
+STORAGES = ("mcap", "sqlite3")
+_COMPRESSIONS = (None, "zstd")
+
+
+class _StorageFile(Protocol):
+    """What a storage format offers; see :class:`~pendulum_rosbag.storage.sealed_mcap.SealedMcapFile`."""
+
+    suffix: str
+    path: Path
+
+    @property
+    def count(self) -> int: ...
+    @property
+    def start_ns(self) -> int: ...
+    @property
+    def stop_ns(self) -> int: ...
+    @property
+    def data_size(self) -> int: ...
+    @property
+    def pending_size(self) -> int: ...
+    def add_channel(self, channel_id: int, topic: str, type: MessageType, qos: str) -> None: ...
+    def write(self, channel_id: int, log_time_ns: int, data: bytes) -> None: ...
+    def seal(self) -> None: ...
+    def settle(self) -> None: ...
+    def duplicate(self) -> int: ...
+    def close(self, metadata: str = "") -> None: ...
+    def abandon(self) -> None: ...
+
+
+class BagWriter:
+    """One rosbag2 folder that is being written; made by :func:`open_writer`.
+
+    Messages that were written are in memory until ``seal`` (called by itself when ``chunk_size`` bytes have come
+    together, and by a recorder every fraction of a second); what is sealed survives the death of the process and is
+    readable by any rosbag2 reader without repair. All methods may be called from several threads.
+    """
+
+    def __init__(
+        self,
+        path: Path,
+        *,
+        storage: str,
+        compression: str | None,
+        metadata: Mapping[str, Any] | None,
+        chunk_size: int,
+        max_size: int,
+        max_duration_ns: int,
+        ros_distro: str,
+        file_stem: str,
+    ) -> None:
+        self.path = path
+        self._file_stem = file_stem
+        self.storage = storage
+        self._compression = compression
+        self._chunk_size = chunk_size
+        self._max_size = max_size
+        self._max_duration_ns = max_duration_ns
+        self._custom = encode_custom_data(metadata)
+        self._topics: dict[str, TopicEntry] = {}
+        self._ids: dict[str, int] = {}
+        self._written: dict[str, int] = {}
+        self._files: list[FileEntry] = []
+        self._lock = threading.RLock()
+        self._open = True
+        # The folder appears under its name only when it is whole.
+        self._folder = path.with_name(f".{path.name}.{os.getpid()}.tmp")
+        self._metadata = MetadataFile(self._folder, storage, ros_distro)
+        try:
+            self._folder.mkdir(parents=True)
+            self._file = self._open_file()
+            self._replace_metadata()
+            os.rename(self._folder, path)
+        except OSError as error:
+            shutil.rmtree(self._folder, ignore_errors=True)
+            raise BagError(f"bag {path} cannot be created: {error.strerror or error}") from error
+        self._folder = path
+        self._metadata = MetadataFile(path, storage, ros_distro)
+        self._file.path = path / self._file.path.name
+
+    @property
+    def topics(self) -> dict[str, str]:
+        """Topic name -> message type."""
+        return {name: topic.type.name for name, topic in self._topics.items()}
+
+    @property
+    def written(self) -> dict[str, int]:
+        """Topic name -> messages given to the writer so far."""
+        return dict(self._written)
+
+    @property
+    def sealed(self) -> dict[str, int]:
+        """Topic name -> messages that are safe in the file."""
+        return {name: topic.count for name, topic in self._topics.items()}
+
+    @property
+    def message_count(self) -> int:
+        """Messages given to the writer so far, over all topics."""
+        return sum(self._written.values())
+
+    @property
+    def files(self) -> list[Path]:
+        """Storage files, in order of time."""
+        return [self.path / entry.name for entry in self._files]
+
+    @property
+    def size(self) -> int:
+        """Bytes of data in the current storage file."""
+        return self._file.data_size
+
+    def add_topic(
+        self, name: str, type: str | MessageType, qos: QosProfile | Sequence[QosProfile] | None = None
+    ) -> None:
+        """Announce a topic before its first message; once more with the same type does nothing.
+
+        Args:
+            name: Full topic name, such as ``/sim/joint_states``.
+            type: Message type, such as ``sensor_msgs/msg/JointState``.
+            qos: What its publishers offer; by default reliable, keep last 10.
+
+        Raises:
+            BagError: The topic is in the bag with another type, or the writer is closed.
+        """
+        described = message_type(type) if isinstance(type, str) else type
+        profiles = (
+            (qos,) if isinstance(qos, QosProfile) else tuple(qos) if qos is not None else (QosProfile(),)
+        )
+        with self._lock:
+            self._require_open()
+            known = self._topics.get(name)
+            if known is not None:
+                if known.type.name != described.name:
+                    raise BagError(
+                        f"topic {name} has type {described.name}; the bag holds it as {known.type.name}"
+                    )
+                return
+            self._topics[name] = TopicEntry(name, described, profiles)
+            self._ids[name] = len(self._ids) + 1
+            self._written[name] = 0
+            self._add_channel(name)
+            # The file first: readers refuse a listed topic that has no definition. But before the first message:
+            # they pass over messages of topics that are not listed.
+            self._file.seal()
+            self._note_sealed()
+            self._replace_metadata()
+
+    def write(self, topic: str, log_time_ns: int, data: bytes) -> None:
+        """Add one serialised message.
+
+        Args:
+            topic: A topic that was added.
+            log_time_ns: Time of the message [ns since the epoch, or of the simulation].
+            data: CDR bytes with their four bytes of encapsulation.
+
+        Raises:
+            BagError: The topic was not added, or the writer is closed.
+            OSError: The disk is full or fails; what was sealed remains readable.
+        """
+        with self._lock:
+            try:
+                channel = self._ids[topic]
+            except KeyError:
+                raise self._unknown(topic) from None
+            self._require_open()
+            self._file.write(channel, log_time_ns, data)
+            self._written[topic] += 1
+            if self._file.pending_size >= self._chunk_size:
+                self.seal()
+
+    def write_many(self, items: Iterable[tuple[str, int, bytes]]) -> None:
+        """Add many messages ``(topic, log_time_ns, data)`` under one lock."""
+        with self._lock:
+            self._require_open()
+            file, ids, written = self._file, self._ids, self._written
+            for topic, log_time_ns, data in items:
+                try:
+                    channel = ids[topic]
+                except KeyError:
+                    raise self._unknown(topic) from None
+                file.write(channel, log_time_ns, data)
+                written[topic] += 1
+                if file.pending_size >= self._chunk_size:
+                    self.seal()
+                    file = self._file  # a seal may begin the next file
+
+    def seal(self) -> None:
+        """Make all messages so far visible on disk; they survive the death of the process.
+
+        Raises:
+            OSError: The disk is full or fails; what was sealed before remains readable.
+        """
+        with self._lock:
+            self._require_open()
+            self._seal(self._file.seal)
+
+    def _seal(self, work: Callable[[], None]) -> None:
+        before = self._file.count
+        work()
+        if self._file.count != before:
+            self._note_sealed()
+            self._replace_metadata()
+        if self._is_due():
+            self._split()
+
+    def sync(self) -> None:
+        """Seal, and wait until what was sealed has reached the disk (it survives a power failure).
+
+        Other threads may go on writing meanwhile.
+
+        Raises:
+            OSError: The disk is full or fails; what was sealed before remains readable.
+        """
+        with self._lock:
+            self._require_open()
+            # What waits for the disk is never written again: what has reached it must not be at risk later.
+            self._seal(self._file.settle)
+            descriptor = self._file.duplicate()
+        try:
+            os.fdatasync(descriptor)
+        finally:
+            os.close(descriptor)
+
+    def split(self) -> None:
+        """Go on in a new storage file of the same bag."""
+        with self._lock:
+            self._require_open()
+            self.seal()
+            if self._file.count:
+                self._split()
+
+    def update_metadata(self, metadata: Mapping[str, Any]) -> None:
+        """Add or replace entries of the run metadata (``custom_data``)."""
+        with self._lock:
+            self._custom.update(encode_custom_data(metadata))
+            if self._open:
+                self._replace_metadata()
+
+    def close(self) -> None:
+        """Seal, give back unused room and close; once more does nothing.
+
+        Raises:
+            OSError: The disk is full or fails; what was sealed remains readable.
+        """
+        with self._lock:
+            if not self._open:
+                return
+            self._open = False
+            try:
+                self._close_file()
+            finally:
+                # After the file gave back its unused room there may be space for this again.
+                self._replace_metadata()
+
+    def abandon(self) -> None:
+        """Close without writing anything more, as if the process had died."""
+        with self._lock:
+            self._open = False
+            self._file.abandon()
+
+    def __enter__(self) -> BagWriter:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+    # -- parts -------------------------------------------------------------------------------------------------
+
+    def _require_open(self) -> None:
+        if not self._open:
+            raise BagError(f"bag {self.path} is closed; nothing can be written to it any more")
+
+    def _unknown(self, topic: str) -> BagError:
+        return BagError(f"topic {topic} was not added to bag {self.path} before its first message")
+
+    def _open_file(self) -> _StorageFile:
+        name = f"{self._file_stem}_{len(self._files)}"
+        if self.storage == "mcap":
+            from pendulum_rosbag.storage.sealed_mcap import SealedMcapFile
+
+            file: _StorageFile = SealedMcapFile(self._folder / f"{name}.mcap", compression=self._compression)
+        else:
+            from pendulum_rosbag.storage.sealed_sqlite import SealedSqliteFile
+
+            file = SealedSqliteFile(self._folder / f"{name}.db3")
+        self._files.append(FileEntry(file.path.name))
+        return file
+
+    def _add_channel(self, name: str) -> None:
+        topic = self._topics[name]
+        self._file.add_channel(self._ids[name], name, topic.type, qos_yaml(topic.qos).strip())
+
+    def _note_sealed(self) -> None:
+        entry = self._files[-1]
+        entry.count, entry.start_ns, entry.stop_ns = self._file.count, self._file.start_ns, self._file.stop_ns
+        for name, topic in self._topics.items():
+            topic.count = self._written[name]
+
+    def _replace_metadata(self) -> None:
+        self._metadata.replace(list(self._topics.values()), self._files, self._custom)
+
+    def _is_due(self) -> bool:
+        if not self._file.count:
+            return False
+        by_size = 0 < self._max_size <= self._file.data_size
+        return by_size or 0 < self._max_duration_ns <= self._file.stop_ns - self._file.start_ns
+
+    def _split(self) -> None:
+        self._close_file()
+        self._file = self._open_file()
+        for name in self._topics:
+            self._add_channel(name)
+        self._file.seal()
+        self._replace_metadata()
+
+    def _close_file(self) -> None:
+        text = ""
+        try:
+            self._file.seal()
+            self._note_sealed()
+            text = self._metadata.render(list(self._topics.values()), self._files, self._custom)
+        finally:
+            # rosbag2 stores the content of "rosbag2_bagfile_information" without that key.
+            self._file.close(_without_root(text))
+
+
+def _without_root(text: str) -> str:
+    return "".join(line[2:] + "\n" for line in text.splitlines()[1:])
+
+
+def open_writer(
+    path: str | os.PathLike[str],
+    storage: str = "mcap",
+    compression: str | None = None,
+    metadata: Mapping[str, Any] | None = None,
+    *,
+    chunk_size: int = 1 << 20,
+    max_size: int = 0,
+    max_duration: float = 0.0,
+    ros_distro: str = "jazzy",
+    file_stem: str = "",
+) -> BagWriter:
+    """Create a rosbag2 folder and return its writer.
+
+    Args:
+        path: Folder to create; it must not exist.
+        storage: ``"mcap"`` or ``"sqlite3"``.
+        compression: ``None`` or ``"zstd"`` (MCAP only, chunk by chunk).
+        metadata: Run metadata; values that are not strings are stored as JSON text.
+        chunk_size: Bytes of messages that are sealed together at the latest.
+        max_size: Begin a new storage file at this size [bytes]; 0 for never.
+        max_duration: Begin a new storage file after this time of messages [s]; 0 for never.
+        ros_distro: What ``metadata.yaml`` names as distribution.
+        file_stem: Beginning of the names of storage files; by default the name of the folder.
+
+    Raises:
+        BagError: The folder exists or cannot be created.
+        ParameterError: Unknown storage or compression.
+    """
+    if storage not in STORAGES:
+        raise ParameterError(f"storage is {storage!r}; expected one of {', '.join(STORAGES)}")
+    if compression not in _COMPRESSIONS:
+        raise ParameterError(f"compression is {compression!r}; expected 'zstd' or none")
+    if compression and storage != "mcap":
+        raise ParameterError(f"compression is {compression!r} with storage {storage}; expected storage mcap")
+    folder = Path(path).absolute()
+    if folder.exists():
+        raise BagError(f"bag {folder} exists already; expected a new folder (bags are never overwritten)")
+    return BagWriter(
+        folder,
+        storage=storage,
+        compression=compression,
+        metadata=metadata,
+        chunk_size=chunk_size,
+        max_size=max_size,
+        max_duration_ns=round(max_duration * 1e9),
+        ros_distro=ros_distro,
+        file_stem=file_stem or folder.name,
+    )

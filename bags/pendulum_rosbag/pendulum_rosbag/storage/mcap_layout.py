@@ -1,0 +1,349 @@
+"""Where the parts of an MCAP file stand while it is being written, so that it is complete at every instant.
+
+MCAP readers find everything from the footer at the end of the file, so a file that grows by appending is broken
+whenever its writer dies. Here the file is laid out with room to grow, and the room is a private record that every
+reader skips::
+
+    magic  header | settled chunks | room to grow | staged chunks | summary A | summary B | data end, footer, magic
+                                   ^ settled_end  ^ area.start    ^ area.stop
+
+A chunk is written into room that no reader sees, and the summary that lists it into whichever of the two places the
+footer does not point to, each with a data end right before it, where Foxglove's reader looks for one. Two small writes
+then make it visible: a record head (opcode and length, for readers that go through the file in order) and the footer
+(for readers that use the index).
+
+What is sealed many times a second makes small chunks, and an index that grows with each of them: hours of them would
+cost more to list than to write. So small chunks are only staged. When enough have come together, one large chunk with
+the same messages is written behind the settled ones, still unseen; the footer that lists it and the record head that
+turns unused room into that chunk put it in the place of the staged ones. Whoever reads between these two writes
+finds the same messages on either way. The area of the staged chunks is used again from its start when it is full, so
+that a reader of a growing file has the time of some megabytes to read what it was shown.
+
+When the room is used up, one write far beyond the end moves the end of the file; the bytes between are a hole that
+occupies no disk. ``finish`` puts summary and footer right behind the data and cuts the rest off.
+
+Each of these commits lies within one page of memory, which the kernel copies as a whole: a process that is killed
+between any two instructions leaves the state before or after, never between. (One reader notices the moment at which
+the end of the file moves: that of Foxglove for streams insists on nothing behind the last record. A power failure is
+another matter, because the disk may reorder pages: ``sync`` bounds what it can cost.)
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from pendulum_msgs_py.errors import BagError
+from pendulum_rosbag.storage import mcap_records as rec
+from pendulum_rosbag.storage.mcap_summary import Chunk, McapSummary
+
+__all__ = ["McapLayout"]
+
+_PAGE = 4096
+_DATA_END = rec.record(rec.DATA_END, bytes(4))
+_TAIL_SIZE = len(_DATA_END) + rec.FOOTER_SIZE + len(rec.MAGIC)
+_FIRST_ROOM = 1 << 20
+_LARGEST_ROOM = 16 << 20
+_FIRST_SLOT = 16 * _PAGE
+_LARGEST_GROUP = 1 << 20
+_HEAD = rec.RECORD_HEAD_SIZE
+
+
+@dataclass(slots=True)
+class _Slot:
+    """One of the two places for a summary: from ``start``, ``capacity`` bytes, and what of it stands there."""
+
+    start: int
+    capacity: int
+    described: int = -1
+    settled: int = 0
+    group: int = -1
+    staged: int = 0
+    offsets_start: int = 0
+
+
+@dataclass(frozen=True, slots=True)
+class _Area:
+    """Bytes from ``start`` to ``stop`` for staged chunks."""
+
+    start: int
+    stop: int
+
+
+class McapLayout:
+    """The bytes of one growing MCAP file.
+
+    Args:
+        path: File to create.
+        header: Magic and header record.
+        summary: What the file's summary says; its owner changes it, and calls ``publish``.
+
+    Raises:
+        OSError: The file cannot be created.
+    """
+
+    def __init__(self, path: Path, header: bytes, summary: McapSummary) -> None:
+        self.path = path
+        self.summary = summary
+        self.settled_end = len(header)
+        self._fd = -1
+        self._size = 0
+        self._slots: list[_Slot] = []
+        self._live = 0
+        # Where the padding begins that is the last record before the tail: behind the staged chunks, if there are any.
+        self._chain_end = self.settled_end
+        self._area = self._next_area = _Area(0, 0)
+        self._cursor = 0
+        self._create(header)
+
+    def _create(self, header: bytes) -> None:
+        temporary = self.path.with_name(f".{self.path.name}.tmp")
+        try:
+            self._fd = os.open(temporary, os.O_RDWR | os.O_CREAT | os.O_TRUNC, 0o644)
+            self._size = _FIRST_ROOM + _FIRST_ROOM // 2 + 2 * _FIRST_SLOT
+            self._slots = self._place_slots(_FIRST_SLOT)
+            self._area = self._next_area = _Area(
+                self._slots[0].start - _FIRST_ROOM // 2, self._slots[0].start - len(_DATA_END)
+            )
+            self._cursor = self._area.start
+            self._write(header + rec.padding_head(len(header), self._tail), 0)
+            self._fill_slot(self._slots[0])
+            self._write(self._tail_bytes(self._slots[0]), self._tail)
+            os.rename(temporary, self.path)
+        except OSError:
+            self.abandon()
+            temporary.unlink(missing_ok=True)
+            raise
+
+    # -- what the writer of messages calls ---------------------------------------------------------------------
+
+    @property
+    def is_open(self) -> bool:
+        """Whether the file is still being written."""
+        return self._fd >= 0
+
+    @property
+    def group_limit(self) -> int:
+        """Bytes of messages that are staged before they settle as one chunk (less in a short file)."""
+        return min(_LARGEST_GROUP, (self._area.stop - self._area.start) // 4)
+
+    def can_stage(self, size: int) -> bool:
+        """Tell whether a chunk of some size fits among the staged ones."""
+        if self._chain_end == self.settled_end:
+            self._begin_group()
+        return self._next_stage + size + _PAGE <= self._area.stop
+
+    def can_settle(self, size: int) -> bool:
+        """Tell whether a chunk of some size fits before the staged ones; without those there is always room."""
+        return self._chain_end == self.settled_end or self.settled_end + size + _PAGE <= self._area.start
+
+    def stage(self, chunk: Chunk) -> int:
+        """Write a small chunk and show it to readers in order; return where it begins.
+
+        Raises:
+            OSError: The disk is full or fails; nothing of the chunk is seen.
+        """
+        start = self._next_stage
+        blob, end = self._blob(chunk.parts, start, chunk.size)
+        if self._chain_end == self.settled_end:
+            self._write(blob, start)
+            self._write(rec.padding_head(self.settled_end, start), self.settled_end)
+        else:
+            self._write(blob[_HEAD:], start + _HEAD)
+            self._write(blob[:_HEAD], start)
+        self._chain_end = end
+        return start
+
+    def settle(self, chunk: Chunk) -> int:
+        """Write a large chunk, which holds what is staged, and show it to readers in order instead of that.
+
+        Raises:
+            OSError: The disk is full or fails; what was staged is still there.
+        """
+        if self._chain_end == self.settled_end and self.settled_end + chunk.size + _PAGE > self._area.start:
+            self._grow(chunk.size + _PAGE)
+        start = self.settled_end
+        blob, end = self._blob(chunk.parts, start, chunk.size)
+        self._write(blob[_HEAD:], start + _HEAD)
+        self._write(blob[:_HEAD], start)
+        if self._chain_end != start:
+            self._cursor = self._chain_end
+        if self._area != self._next_area:
+            self._area = self._next_area
+            self._cursor = self._area.start
+        self.settled_end = self._chain_end = end
+        return start
+
+    def publish(self) -> None:
+        """Show the summary as it is now to readers by index.
+
+        Raises:
+            OSError: The disk is full or fails; readers see the summary before.
+        """
+        slot = self._slots[1 - self._live]
+        if not self._fill_slot(slot):
+            self._grow(0)
+            return
+        self._live = 1 - self._live
+        self._write(self._tail_bytes(slot), self._tail)
+
+    def duplicate(self) -> int:
+        """Return a file descriptor of its own, to wait for the disk without keeping the writer waiting."""
+        return os.dup(self._fd)
+
+    def finish(self, records: Sequence[tuple[str, bytes]] = ()) -> None:
+        """Put metadata records (name, bytes), summary and footer behind the data and cut off the unused room.
+
+        Raises:
+            OSError: The disk is full or fails; the file shows what it did.
+        """
+        indexes: list[bytes] = []
+        start = self._chain_end
+        for name, entry in records:
+            self._make_room(start + len(entry) + _PAGE)
+            blob, end = self._blob([entry], start, len(entry))
+            self._write(blob[_HEAD:], start + _HEAD)
+            self._write(blob[:_HEAD], start)
+            indexes.append(rec.metadata_index_record(start, len(entry), name))
+            if self.settled_end == start:
+                self.settled_end = end
+            self._chain_end = start = end
+        summary_start = start + len(_DATA_END)
+        body = b"".join([self.summary.description, self.summary.settled, self.summary.staged])
+        tail, offsets_start = self.summary.tail(summary_start, indexes)
+        content = body + tail
+        footer = rec.footer_record(summary_start, offsets_start, content)
+        whole = _DATA_END + content + footer + rec.MAGIC
+        self._make_room(start + len(whole))
+        self._write(whole[_HEAD:], start + _HEAD)
+        self._write(whole[:_HEAD], start)
+        os.ftruncate(self._fd, start + len(whole))
+
+    def sync(self) -> None:
+        """Wait until the file has reached the disk."""
+        os.fsync(self._fd)
+
+    def abandon(self) -> None:
+        """Close without writing anything more: the file shows what was published."""
+        if self._fd >= 0:
+            os.close(self._fd)
+            self._fd = -1
+
+    # -- parts -------------------------------------------------------------------------------------------------
+
+    @property
+    def _tail(self) -> int:
+        return self._size - _TAIL_SIZE
+
+    @property
+    def _summary_stop(self) -> int:
+        """Where the padding behind a summary ends and the footer begins."""
+        return self._size - rec.FOOTER_SIZE - len(rec.MAGIC)
+
+    @property
+    def _next_stage(self) -> int:
+        return self._cursor if self._chain_end == self.settled_end else self._chain_end
+
+    def _tail_bytes(self, slot: _Slot) -> bytes:
+        return _DATA_END + rec.footer_record(slot.start, slot.offsets_start) + rec.MAGIC
+
+    def _place_slots(self, capacity: int) -> list[_Slot]:
+        top = self._tail // _PAGE * _PAGE
+        return [_Slot(top - 2 * capacity, capacity), _Slot(top - capacity, capacity)]
+
+    def _write(self, data: bytes | bytearray, offset: int) -> None:
+        view = memoryview(data)
+        while view:
+            done = os.pwrite(self._fd, view, offset)
+            view = view[done:]
+            offset += done
+
+    def _blob(self, parts: Sequence[bytes], start: int, size: int) -> tuple[bytes, int]:
+        """Return records for byte ``start`` with the padding up to the tail behind them, and where that begins."""
+        end = start + size
+        filler = b""
+        if end % _PAGE > _PAGE - _HEAD:
+            # The next commit writes nine bytes at ``end``: they must not straddle two pages.
+            target = (end // _PAGE + 1) * _PAGE + _HEAD
+            filler = rec.padding_head(end, target) + bytes(target - end - _HEAD)
+            end = target
+        return b"".join([*parts, filler, rec.padding_head(end, self._tail)]), end
+
+    def _begin_group(self) -> None:
+        """Choose where the next staged chunks go, and see that there is room for the chunk that they will become."""
+        # Messages of 31 bytes and more have index entries of 16 and, one in each chunk, 15 bytes more.
+        if self.settled_end + 2 * self.group_limit + self.group_limit // 64 + 2 * _PAGE > self._area.start:
+            self._grow(0)
+        if self._cursor + (self._area.stop - self._area.start) // 2 > self._area.stop:
+            self._cursor = self._area.start
+
+    def _make_room(self, end: int) -> None:
+        """See that the last records may reach up to byte ``end``."""
+        if self._chain_end == self.settled_end:
+            if end > self._area.start:
+                self._grow(end - self._chain_end)
+        elif end > self._area.stop:
+            raise OSError(28, "No space left on device")  # (only when staged chunks could not be settled)
+
+    def _fill_slot(self, slot: _Slot) -> bool:
+        """Bring a slot up to date; False when it is too small."""
+        summary = self.summary
+        description = summary.description
+        body: bytes | bytearray
+        if slot.described != len(description):
+            # New topics: everything behind them moves.
+            start, body = slot.start, description + summary.settled + summary.staged
+        elif slot.group != summary.group:
+            start = slot.start + slot.described + slot.settled
+            body = summary.settled[slot.settled :] + summary.staged
+        else:
+            start = slot.start + slot.described + slot.settled + slot.staged
+            body = summary.staged[slot.staged :]
+        tail, offsets_start = summary.tail(slot.start)
+        end = start + len(body) + len(tail)
+        # Before a summary stands a data end: that of the next slot is the last thing in this one.
+        if end + _HEAD > slot.start + slot.capacity - len(_DATA_END):
+            return False
+        if slot.described < 0:
+            self._write(_DATA_END, slot.start - len(_DATA_END))
+        self._write(b"".join([body, tail, rec.padding_head(end, self._summary_stop)]), start)
+        slot.described, slot.settled = len(description), len(summary.settled)
+        slot.group, slot.staged = summary.group, len(summary.staged)
+        slot.offsets_start = offsets_start
+        return True
+
+    def _grow(self, needed: int) -> None:
+        """Move the end of the file away, so that ``needed`` bytes of data and larger summaries fit."""
+        capacity = max(_FIRST_SLOT, -(-2 * (self.summary.size + 4 * _PAGE) // _PAGE) * _PAGE)
+        # Summaries are written anew each time, so the room keeps in proportion to them.
+        room = max(min(max(_FIRST_ROOM, self.settled_end), _LARGEST_ROOM), 4 * self.summary.size)
+        staging = min(max(room // 2, self._area.stop - self._area.start), 8 * _LARGEST_GROUP) // _PAGE * _PAGE
+        old_size = self._size
+        self._size += -(-(needed + room + staging + 2 * capacity) // _PAGE) * _PAGE
+        live, keeper = self._slots[self._live], self._slots[1 - self._live]
+        try:
+            # The summary in force, continued by padding up to the new end, in the place that is not in force ...
+            content = os.pread(self._fd, live.offsets_start - live.start, live.start)
+            padding = rec.padding_head(keeper.start + len(content), self._summary_stop)
+            keeper.described = -1
+            self._write(_DATA_END + content + padding, keeper.start - len(_DATA_END))
+            # ... then the end of the file moves there in one write (offsets name absolute places: the copy has none).
+            self._write(_DATA_END + rec.footer_record(keeper.start, 0) + rec.MAGIC, self._tail)
+        except OSError:
+            self._size = old_size
+            raise
+        keeper.offsets_start = keeper.start + len(content)
+        self._live = 1 - self._live
+        # Readers in order learn of the new end, and the summaries move to it.
+        self._write(rec.padding_head(self._chain_end, self._tail), self._chain_end)
+        slots = self._place_slots(capacity)
+        if not self._fill_slot(slots[0]):
+            raise BagError(f"{self.path}: a summary outgrew the {capacity} bytes that were made for it")
+        self._write(self._tail_bytes(slots[0]), self._tail)
+        self._slots, self._live = slots, 0
+        self._next_area = _Area(slots[0].start - staging, slots[0].start - len(_DATA_END))
+        if self._chain_end == self.settled_end:
+            self._area = self._next_area
+            self._cursor = self._area.start

@@ -1,0 +1,178 @@
+"""The summary of an MCAP file that is being written: what a reader needs to know before it reads a message."""
+
+from __future__ import annotations
+
+import struct
+import zlib
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+from pendulum_rosbag.storage import mcap_records as rec
+
+__all__ = ["Chunk", "McapSummary", "build_chunk"]
+
+Compressor = Callable[[bytes], bytes]
+
+
+@dataclass(frozen=True, slots=True)
+class Chunk:
+    """A chunk with its message indexes as bytes, before it is known where they will stand."""
+
+    parts: list[bytes]
+    size: int
+    length: int
+    start_ns: int
+    stop_ns: int
+    index_places: list[tuple[int, int]]
+    compression: str
+    packed_size: int
+    raw_size: int
+
+    def index_record(self, offset: int) -> bytes:
+        """Return the summary's record of this chunk when it begins at byte ``offset`` of the file."""
+        return rec.chunk_index_record(
+            self.start_ns,
+            self.stop_ns,
+            offset,
+            self.length,
+            [(channel, offset + place) for channel, place in self.index_places],
+            self.size - self.length,
+            self.compression,
+            self.packed_size,
+            self.raw_size,
+        )
+
+
+def build_chunk(
+    raw: bytes,
+    indexes: Sequence[tuple[int, bytes]],
+    span: tuple[int, int],
+    compressor: tuple[str, Compressor] | None = None,
+) -> Chunk:
+    """Return a chunk of records.
+
+    Args:
+        raw: Schema, channel and message records, one behind the other.
+        indexes: Channel id and its entries (log time and offset in ``raw``, uint64 each), in the order of the file.
+        span: First and last log time [ns].
+        compressor: Name as the format spells it, and function.
+    """
+    name, packed = (compressor[0], compressor[1](raw)) if compressor else ("", raw)
+    text = name.encode()
+    content_size = 8 + 8 + 8 + 4 + 4 + len(text) + 8 + len(packed)
+    head = rec.RECORD_HEAD.pack(rec.CHUNK, content_size)
+    head += struct.pack("<QQQII", *span, len(raw), zlib.crc32(raw), len(text))
+    parts = [head + text + struct.pack("<Q", len(packed)), packed]
+    length = size = rec.RECORD_HEAD_SIZE + content_size
+    places = []
+    for channel, entries in indexes:
+        places.append((channel, size))
+        entry_head = rec.RECORD_HEAD.pack(rec.MESSAGE_INDEX, 6 + len(entries))
+        parts += [entry_head + struct.pack("<HI", channel, len(entries)), entries]
+        size += len(entry_head) + 6 + len(entries)
+    return Chunk(parts, size, length, *span, places, name, len(packed), len(raw))
+
+
+class McapSummary:
+    """Topics, counts and the index of chunks, kept as the bytes that stand in the file.
+
+    Chunks are *staged* (small, as they were sealed) until one large, *settled* chunk takes their place. The index of
+    the settled ones grows by about 100 bytes per megabyte of messages; that of the staged ones starts again each time.
+    """
+
+    def __init__(self) -> None:
+        self.channels: dict[int, bytes] = {}
+        self.counts: dict[int, int] = {}
+        self.count = 0
+        self.start_ns = 0
+        self.stop_ns = 0
+        self.settled = bytearray()
+        self.staged = bytearray()
+        self.group = 0
+        self._settled_chunks = 0
+        self._staged_chunks = 0
+        self._schemas: list[bytes] = []
+        self._description = b""
+
+    @property
+    def staged_chunks(self) -> int:
+        """Chunks that wait to be settled."""
+        return self._staged_chunks
+
+    @property
+    def schemas(self) -> int:
+        """Message definitions so far; ids are given from 1 on."""
+        return len(self._schemas)
+
+    def add_schema(self, record: bytes) -> None:
+        """Add a message definition."""
+        self._schemas.append(record)
+        self._describe()
+
+    def add_channel(self, channel_id: int, record: bytes) -> None:
+        """Add a topic."""
+        self.channels[channel_id] = record
+        self.counts[channel_id] = 0
+        self._describe()
+
+    def _describe(self) -> None:
+        self._description = b"".join([*self._schemas, *self.channels.values()])
+
+    def add_messages(self, counts: dict[int, int], span: tuple[int, int]) -> None:
+        """Count messages: channel id -> number, with their first and last log time [ns]."""
+        self.start_ns = span[0] if not self.count else min(self.start_ns, span[0])
+        self.stop_ns = max(self.stop_ns, span[1])
+        for channel, number in counts.items():
+            self.counts[channel] += number
+            self.count += number
+
+    def stage(self, record: bytes) -> None:
+        """Add a small chunk to the index."""
+        self.staged += record
+        self._staged_chunks += 1
+
+    def settle(self, record: bytes) -> None:
+        """Add a chunk that holds what the staged ones did, in their place."""
+        self.settled += record
+        self._settled_chunks += 1
+        self.staged.clear()
+        self._staged_chunks = 0
+        self.group += 1
+
+    @property
+    def description(self) -> bytes:
+        """Records of definitions and topics: how each summary begins."""
+        return self._description
+
+    @property
+    def size(self) -> int:
+        """Bytes of all records but those that close the summary."""
+        return len(self._description) + len(self.settled) + len(self.staged)
+
+    def tail(self, start: int, metadata_indexes: Sequence[bytes] = ()) -> tuple[bytes, int]:
+        """Return the records that close a summary which begins at byte ``start``, and where its offsets begin."""
+        statistics = rec.statistics_record(
+            message_count=self.count,
+            schema_count=len(self._schemas),
+            metadata_count=len(metadata_indexes),
+            chunk_count=self._settled_chunks + self._staged_chunks,
+            start_ns=self.start_ns,
+            stop_ns=self.stop_ns,
+            channel_counts=self.counts,
+        )
+        extra = b"".join(metadata_indexes)
+        schemas = sum(map(len, self._schemas))
+        groups = (
+            (rec.SCHEMA, schemas),
+            (rec.CHANNEL, len(self._description) - schemas),
+            (rec.CHUNK_INDEX, len(self.settled) + len(self.staged)),
+            (rec.STATISTICS, len(statistics)),
+            (rec.METADATA_INDEX, len(extra)),
+        )
+        offsets = b""
+        at = start
+        for opcode, length in groups:
+            if length:
+                offsets += rec.summary_offset_record(opcode, at, length)
+                at += length
+        return statistics + extra + offsets, at

@@ -1,0 +1,166 @@
+"""``metadata.yaml`` of a rosbag2 folder (version 9), written so that it is whole at every instant."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from pendulum_rosbag.storage.message_types import MessageType
+from pendulum_rosbag.storage.qos import QosProfile
+
+__all__ = [
+    "METADATA_NAME",
+    "METADATA_VERSION",
+    "FileEntry",
+    "MetadataFile",
+    "TopicEntry",
+    "encode_custom_data",
+    "qos_yaml",
+    "yaml_string",
+]
+
+METADATA_NAME = "metadata.yaml"
+METADATA_VERSION = 9
+
+# YAML allows these only escaped, JSON leaves them as they are.
+_UNPRINTABLE = re.compile("[\x7f-\x9f\u2028\u2029\ud800-\udfff\ufeff\ufffe\uffff]")
+
+
+@dataclass(slots=True)
+class TopicEntry:
+    """A topic of the bag, with the number of its messages."""
+
+    name: str
+    type: MessageType
+    qos: tuple[QosProfile, ...] = ()
+    count: int = 0
+
+
+@dataclass(slots=True)
+class FileEntry:
+    """A storage file of the bag; times in ns since the epoch, ``stop_ns`` of the last message."""
+
+    name: str
+    count: int = 0
+    start_ns: int = 0
+    stop_ns: int = 0
+
+
+def yaml_string(text: str) -> str:
+    """Return a string as a double-quoted YAML scalar that every YAML parser reads back unchanged."""
+    quoted = json.dumps(text, ensure_ascii=False)
+    return _UNPRINTABLE.sub(lambda match: f"\\u{ord(match[0]):04x}", quoted)
+
+
+def encode_custom_data(metadata: Mapping[str, Any] | None) -> dict[str, str]:
+    """Return run metadata as rosbag2 can hold it: strings; anything else becomes JSON text."""
+    return {
+        str(key): value if isinstance(value, str) else json.dumps(value, default=str, sort_keys=True)
+        for key, value in (metadata or {}).items()
+    }
+
+
+def qos_yaml(profiles: Sequence[QosProfile], indent: str = "") -> str:
+    """Return offered QoS profiles as a block-style YAML list (an empty list as ``[]``)."""
+    if not profiles:
+        return f"{indent}[]\n"
+    return "".join(profile.to_yaml(indent) for profile in profiles)
+
+
+class MetadataFile:
+    """Renders and replaces ``metadata.yaml`` of one bag.
+
+    A recorder rewrites the file many times a second, so the text of topics and run metadata is kept and only the
+    numbers are rendered anew.
+
+    Args:
+        folder: Folder of the bag.
+        storage: ``mcap`` or ``sqlite3``.
+        ros_distro: Such as ``jazzy``.
+    """
+
+    def __init__(self, folder: Path, storage: str, ros_distro: str) -> None:
+        self.path = folder / METADATA_NAME
+        # Made once: pathlib interns the parts of each new path, and twenty a second fill the interpreter's table of
+        # strings, which after ten minutes takes a megabyte more.
+        self._temporary = folder / f".{METADATA_NAME}.tmp"
+        self._storage = storage
+        self._ros_distro = ros_distro
+        self._key: tuple[Any, ...] | None = None
+        self._topic_texts: list[str] = []
+        self._custom_text = ""
+
+    def render(
+        self, topics: Sequence[TopicEntry], files: Sequence[FileEntry], custom_data: Mapping[str, str]
+    ) -> str:
+        """Return the text for these topics, storage files (in order of time) and run metadata."""
+        filled = [file for file in files if file.count]
+        start = min((file.start_ns for file in filled), default=0)
+        stop = max((file.stop_ns for file in filled), default=0)
+        key = (tuple((t.name, t.type.name, t.qos) for t in topics), tuple(custom_data.items()))
+        if self._key != key:
+            self._key = key
+            self._topic_texts = [_topic_head(topic) for topic in topics]
+            self._custom_text = _custom_text(custom_data)
+        head = (
+            "rosbag2_bagfile_information:\n"
+            f"  version: {METADATA_VERSION}\n"
+            f"  storage_identifier: {self._storage}\n"
+            f"  duration:\n    nanoseconds: {stop - start}\n"
+            f"  starting_time:\n    nanoseconds_since_epoch: {start}\n"
+            f"  message_count: {sum(topic.count for topic in topics)}\n"
+            f"  topics_with_message_count:{'' if topics else ' []'}\n"
+        )
+        body = "".join(
+            f"{text}      message_count: {topic.count}\n"
+            for text, topic in zip(self._topic_texts, topics, strict=True)
+        )
+        paths = "".join(f"    - {yaml_string(file.name)}\n" for file in files)
+        entries = "".join(
+            f"    - path: {yaml_string(file.name)}\n"
+            f"      starting_time:\n        nanoseconds_since_epoch: {file.start_ns}\n"
+            f"      duration:\n        nanoseconds: {file.stop_ns - file.start_ns}\n"
+            f"      message_count: {file.count}\n"
+            for file in files
+        )
+        return (
+            f"{head}{body}"
+            '  compression_format: ""\n  compression_mode: ""\n'
+            f"  relative_file_paths:\n{paths}  files:\n{entries}"
+            f"{self._custom_text}  ros_distro: {self._ros_distro}\n"
+        )
+
+    def replace(
+        self, topics: Sequence[TopicEntry], files: Sequence[FileEntry], custom_data: Mapping[str, str]
+    ) -> None:
+        """Write the file; a reader, and a kill at any moment, sees the old text or the new one."""
+        try:
+            self._temporary.write_text(self.render(topics, files, custom_data), encoding="utf-8")
+            os.replace(self._temporary, self.path)
+        except OSError:
+            self._temporary.unlink(missing_ok=True)
+            raise
+
+
+def _topic_head(topic: TopicEntry) -> str:
+    qos = f"\n{qos_yaml(topic.qos, ' ' * 10)}" if topic.qos else " []\n"
+    return (
+        "    - topic_metadata:\n"
+        f"        name: {yaml_string(topic.name)}\n"
+        f"        type: {topic.type.name}\n"
+        "        serialization_format: cdr\n"
+        f"        offered_qos_profiles:{qos}"
+        f"        type_description_hash: {yaml_string(topic.type.hash)}\n"
+    )
+
+
+def _custom_text(custom_data: Mapping[str, str]) -> str:
+    if not custom_data:
+        return "  custom_data: ~\n"
+    lines = "".join(f"    {yaml_string(key)}: {yaml_string(value)}\n" for key, value in custom_data.items())
+    return f"  custom_data:\n{lines}"

@@ -1,0 +1,165 @@
+"""Mending bags that a recorder left broken: all messages that are whole go into a new, sound bag."""
+
+from __future__ import annotations
+
+import os
+import shutil
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import yaml
+
+from pendulum_msgs_py.errors import BagError
+from pendulum_rosbag.storage.bag_writer import BagWriter, open_writer
+from pendulum_rosbag.storage.message_types import MessageType, message_type
+from pendulum_rosbag.storage.qos import QosProfile
+
+if TYPE_CHECKING:
+    from pendulum_rosbag.reader.batches import Source, Stream
+
+__all__ = ["RepairReport", "repair_bag"]
+
+
+@dataclass(slots=True)
+class RepairReport:
+    """What a repair found and did.
+
+    Args:
+        path: The sound bag.
+        damage: What was wrong, one sentence each; empty when nothing was.
+        messages: Topic -> number of messages saved.
+        original: Where the broken bag is now; ``None`` when nothing had to be done.
+    """
+
+    path: Path
+    damage: list[str] = field(default_factory=list)
+    messages: dict[str, int] = field(default_factory=dict)
+    original: Path | None = None
+
+    @property
+    def repaired(self) -> bool:
+        """Whether a new bag was written."""
+        return self.original is not None
+
+    def sentence(self) -> str:
+        """Return the report in one sentence."""
+        if not self.repaired:
+            return f"{self.path} is sound: nothing to repair"
+        total = sum(self.messages.values())
+        return f"saved {total} messages of {len(self.messages)} topics to {self.path}; the original is {self.original}"
+
+
+def repair_bag(
+    path: str | os.PathLike[str], output: str | os.PathLike[str] | None = None, *, force: bool = False
+) -> RepairReport:
+    """Write all whole messages of a broken bag to a new one.
+
+    Without ``output`` the new bag takes the place of the broken one, which is kept as ``NAME.broken``; a single
+    storage file gets a folder ``NAME_repaired`` beside it. A sound bag is left alone.
+
+    Args:
+        path: Folder of the bag, or one storage file.
+        output: Folder for the new bag; it must not exist.
+        force: Rewrite a sound bag, too (a bag of small chunks becomes smaller).
+
+    Raises:
+        BagError: There is no bag, nothing of it can be read, or the new one cannot be written.
+    """
+    from pendulum_rosbag.reader.open_source import open_folder, open_sources
+
+    bag = Path(path)
+    folder = open_folder(bag)
+    sources = open_sources(folder)
+    damage = [
+        *folder.damage,
+        *(f"{source.path.name}: {source.damage}" for source in sources if source.damage),
+    ]
+    damage += [f"{source.path.name}: its recorder did not close it" for source in sources if source.unclosed]
+    report = RepairReport(bag, damage)
+    if not damage and not force:
+        _close(sources)
+        return report
+    in_place = output is None and bag.is_dir()
+    target = Path(output) if output is not None else bag.with_name(f"{bag.name.split('.')[0]}_repaired")
+    if in_place:
+        target = bag.with_name(f"{bag.name}.repairing")
+        if target.exists():
+            raise BagError(
+                f"{target} exists already; expected no unfinished repair (remove it to begin again)"
+            )
+    try:
+        compression = (
+            "zstd" if any(source.compressed for source in sources) and folder.storage == "mcap" else None
+        )
+        name = bag.name if in_place else target.name
+        with open_writer(target, folder.storage, compression, folder.custom_data, file_stem=name) as writer:
+            _copy(sources, folder.topic_hashes, folder.message_compression, writer)
+            report.messages = writer.written
+    except BaseException:
+        if in_place:
+            shutil.rmtree(target, ignore_errors=True)
+        raise
+    finally:
+        _close(sources)
+    if in_place:
+        report.original = _free_name(bag.with_name(f"{bag.name}.broken"))
+        os.rename(bag, report.original)
+        os.rename(target, bag)
+    else:
+        report.path, report.original = target, bag
+    return report
+
+
+def _copy(sources: list[Source], hashes: dict[str, str], packed: bool, writer: BagWriter) -> None:
+    unpack = _decompress if packed else bytes
+    for source in sources:
+        streams = {stream.channel: stream for stream in source.streams if stream.serialization == "cdr"}
+        for stream in streams.values():
+            kind = _type_of(stream, hashes.get(stream.topic, ""))
+            writer.add_topic(stream.topic, kind, _profiles(stream.qos))
+        for batch in source.batches(set(streams), None, None):
+            topic = streams[batch.channel].topic
+            writer.write_many((topic, time, unpack(data)) for time, data in batch.payloads())
+
+
+def _decompress(data: bytes) -> bytes:
+    import zstandard
+
+    return zstandard.ZstdDecompressor().decompressobj().decompress(data)
+
+
+def _type_of(stream: Stream, type_hash: str) -> MessageType:
+    if stream.definition:
+        known = stream.hash or type_hash or _known_hash(stream.type)
+        return MessageType(stream.type, stream.definition, known, stream.encoding)
+    return message_type(stream.type, stream.hash or type_hash)
+
+
+def _known_hash(name: str) -> str:
+    try:
+        return message_type(name).hash
+    except BagError:
+        return ""
+
+
+def _profiles(text: str) -> list[QosProfile]:
+    try:
+        items = yaml.safe_load(text) if text else []
+    except yaml.YAMLError:
+        items = []
+    return [QosProfile.from_mapping(item) for item in items or [] if isinstance(item, dict)]
+
+
+def _free_name(path: Path) -> Path:
+    number = 1
+    candidate = path
+    while candidate.exists():
+        number += 1
+        candidate = path.with_name(f"{path.name}{number}")
+    return candidate
+
+
+def _close(sources: list[Source]) -> None:
+    for source in sources:
+        source.close()

@@ -1,0 +1,54 @@
+"""``repair``: mend bags that a recorder left broken."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import sys
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from pendulum_msgs_py.programs.executables import cli_main
+from pendulum_rosbag.storage.repair import repair_bag
+
+__all__ = ["main"]
+
+app = typer.Typer(add_completion=False, rich_markup_mode=None)
+
+
+@app.command(epilog="Example: python -m pendulum_bags repair runs/today/sim")
+def repair(
+    bag: Annotated[Path, typer.Argument(help="Folder of the bag, or one .mcap or .db3 file.")],
+    output: Annotated[
+        Path | None,
+        typer.Option(
+            "-o", "--output", help="Folder for the sound bag; by default it takes the place of BAG."
+        ),
+    ] = None,
+    force: Annotated[bool, typer.Option("--force", help="Rewrite a sound bag, too.")] = False,
+    as_json: Annotated[bool, typer.Option("--json", help="Print the report as JSON.")] = False,
+) -> int:
+    """Save all whole messages of a broken bag to a sound one; the broken one is kept as BAG.broken."""
+    report = repair_bag(bag, output, force=force)
+    if as_json:
+        fields = dataclasses.asdict(report)
+        json.dump(fields, sys.stdout, default=str, indent=2)
+        print()
+        return 0
+    for sentence in report.damage:
+        print(f"found: {sentence}")
+    for topic, count in sorted(report.messages.items()):
+        print(f"{count:10d}  {topic}")
+    print(report.sentence())
+    return 0
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Run the command."""
+    return cli_main(app, argv, name="python -m pendulum_bags repair")
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

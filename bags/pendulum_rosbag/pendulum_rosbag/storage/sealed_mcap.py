@@ -1,0 +1,273 @@
+"""An MCAP file that is complete at every instant, also while it is being written.
+
+How the bytes are laid out for that is told in :mod:`~pendulum_rosbag.storage.mcap_layout`; here messages become chunks.
+"""
+
+from __future__ import annotations
+
+import struct
+from pathlib import Path
+
+import numpy as np
+
+from pendulum_msgs_py.errors import BagError
+from pendulum_rosbag.storage import mcap_records as rec
+from pendulum_rosbag.storage.mcap_layout import McapLayout
+from pendulum_rosbag.storage.mcap_summary import Chunk, Compressor, McapSummary, build_chunk
+from pendulum_rosbag.storage.message_types import MessageType
+
+__all__ = ["SealedMcapFile"]
+
+_LARGEST_NUMBER = 256
+"""Staged chunks that become one at the latest, so that rare messages do not make a long index either."""
+_NO_SPAN = (2**63 - 1, 0)
+
+
+class SealedMcapFile:
+    """Append messages to a new MCAP file; after each ``seal`` they are in the file for every reader.
+
+    What one seal adds is a small chunk. When about a megabyte has come together, those of the small chunks are written
+    again as one, which takes their place: the file ends up as if it had been written in one go, and neither the time
+    of a seal nor the memory of the writer grows with the length of the recording.
+
+    Args:
+        path: File to create.
+        compression: ``None`` or ``"zstd"`` (by chunk).
+        level: Zstd level.
+
+    Raises:
+        BagError: The file exists, or cannot be written.
+    """
+
+    suffix = ".mcap"
+
+    def __init__(self, path: Path, *, compression: str | None = None, level: int = 1) -> None:
+        if path.exists():
+            raise BagError(f"{path} exists already; expected a new file")
+        self.path = path
+        self._compressor = ("zstd", _zstd_compressor(level)) if compression == "zstd" else None
+        self._summary = McapSummary()
+        self._schema_ids: dict[tuple[str, str], int] = {}
+        self._sequences: dict[int, int] = {}
+        # Messages that are not sealed: records, and channel -> [log time, offset, log time, offset, ...].
+        self._pending: list[bytes] = []
+        self._pending_size = 0
+        self._pending_index: dict[int, list[int]] = {}
+        self._pending_span = _NO_SPAN
+        # The same of those that are staged.
+        self._group: list[bytes] = []
+        self._group_size = 0
+        self._group_index: dict[int, list[bytes]] = {}
+        self._group_span = _NO_SPAN
+        self._stale = False
+        self._layout = McapLayout(path, rec.MAGIC + rec.header_record(_library()), self._summary)
+
+    @property
+    def count(self) -> int:
+        """Messages that are sealed."""
+        return self._summary.count
+
+    @property
+    def start_ns(self) -> int:
+        """First log time of the sealed messages [ns]."""
+        return self._summary.start_ns
+
+    @property
+    def stop_ns(self) -> int:
+        """Last log time of the sealed messages [ns]."""
+        return self._summary.stop_ns
+
+    @property
+    def data_size(self) -> int:
+        """Bytes of data so far, sealed or not (the file itself may end later)."""
+        return self._layout.settled_end + self._group_size + self._pending_size
+
+    @property
+    def pending_size(self) -> int:
+        """Bytes of messages that are not sealed yet."""
+        return self._pending_size
+
+    def add_channel(self, channel_id: int, topic: str, type: MessageType, qos: str) -> None:
+        """Describe a topic before its first message (ids from 1; QoS profiles as YAML text)."""
+        key = (type.name, type.definition)
+        schema_id = self._schema_ids.get(key, 0)
+        schema = b""
+        if not schema_id:
+            schema_id = self._schema_ids[key] = self._summary.schemas + 1
+            schema = rec.schema_record(schema_id, type.name, type.encoding, type.definition)
+            self._summary.add_schema(schema)
+        channel = rec.channel_record(channel_id, schema_id, topic, {"offered_qos_profiles": qos})
+        self._summary.add_channel(channel_id, channel)
+        self._sequences[channel_id] = 0
+        # In the chunk too, so that a reader that goes through the file in order knows the topic.
+        self._pending += [schema, channel]
+        self._pending_size += len(schema) + len(channel)
+        self._stale = True
+
+    def write(self, channel_id: int, log_time_ns: int, data: bytes) -> None:
+        """Add one message to the chunk that is being filled."""
+        index = self._pending_index.get(channel_id)
+        if index is None:
+            index = self._pending_index[channel_id] = []
+        index += (log_time_ns, self._pending_size)
+        sequence = self._sequences[channel_id] = self._sequences[channel_id] + 1
+        size = len(data)
+        self._pending += (
+            rec.MESSAGE_HEADER.pack(rec.MESSAGE, size + 22, channel_id, sequence, log_time_ns, log_time_ns),
+            data,
+        )
+        self._pending_size += size + 31
+        start, stop = self._pending_span
+        if log_time_ns < start or log_time_ns > stop:
+            self._pending_span = (min(start, log_time_ns), max(stop, log_time_ns))
+
+    def seal(self) -> None:
+        """Make everything that was written visible to readers of the file.
+
+        Raises:
+            OSError: The disk is full or fails. The file still shows what was sealed before.
+        """
+        if self._pending_index:
+            if self._stale and self._summary.count:
+                self._publish()  # a seal before failed on its way: its chunks must be listed before more come
+            self._seal_pending()
+        if self._stale:
+            self._publish()
+
+    def settle(self) -> None:
+        """Seal, and make one chunk of those that were sealed since the last one.
+
+        Raises:
+            OSError: The disk is full or fails. The file still shows what was sealed.
+        """
+        self.seal()
+        if self._summary.staged_chunks:
+            self._settle_group()
+            self._publish()
+
+    def duplicate(self) -> int:
+        """Return a file descriptor of its own, to wait for the disk with, which the caller closes."""
+        return self._layout.duplicate()
+
+    def close(self, metadata: str = "") -> None:
+        """Seal, put summary and footer behind the data, cut off the unused room and close.
+
+        Args:
+            metadata: Text of ``metadata.yaml``, stored as rosbag2 does for files without their folder.
+        """
+        if not self._layout.is_open:
+            return
+        try:
+            try:
+                self.settle()
+            finally:
+                # Also after a failed seal: on a full disk the unused room is worth giving back.
+                entry = rec.metadata_record("rosbag2", {"serialized_metadata": metadata})
+                self._layout.finish([("rosbag2", entry)] if metadata else [])
+            self._layout.sync()
+        finally:
+            self.abandon()
+
+    def abandon(self) -> None:
+        """Close without writing anything more: the file shows what was sealed."""
+        self._layout.abandon()
+
+    # -- parts -------------------------------------------------------------------------------------------------
+
+    def _seal_pending(self) -> None:
+        layout = self._layout
+        whole = self._group_size + self._pending_size
+        if whole < layout.group_limit and self._summary.staged_chunks < _LARGEST_NUMBER:
+            chunk = self._pending_chunk()
+            if layout.can_stage(chunk.size):
+                record = chunk.index_record(layout.stage(chunk))
+                self._take_pending()
+                self._summary.stage(record)
+                return
+        chunk = self._group_chunk(with_pending=True)
+        if layout.can_settle(chunk.size):
+            record = chunk.index_record(layout.settle(chunk))
+            self._take_pending()
+            self._finish_group(record)
+            return
+        # A message that is too large for the room that was kept for the staged ones: those first, without it.
+        self._settle_group()
+        self._publish()
+        chunk = self._group_chunk(with_pending=True)
+        record = chunk.index_record(layout.settle(chunk))
+        self._take_pending()
+        self._finish_group(record)
+
+    def _settle_group(self) -> None:
+        chunk = self._group_chunk(with_pending=False)
+        self._finish_group(chunk.index_record(self._layout.settle(chunk)))
+
+    def _pending_chunk(self) -> Chunk:
+        indexes = [
+            (channel, struct.pack(f"<{len(entries)}Q", *entries))
+            for channel, entries in self._pending_index.items()
+        ]
+        return build_chunk(b"".join(self._pending), indexes, self._pending_span, self._compressor)
+
+    def _group_chunk(self, *, with_pending: bool) -> Chunk:
+        if not with_pending:
+            parts, span, index = self._group, self._group_span, self._group_index
+        else:
+            parts = self._group + self._pending
+            span = _union(self._group_span, self._pending_span)
+            index = {channel: list(entries) for channel, entries in self._group_index.items()}
+            self._add_entries(index)
+        entries = [(channel, b"".join(items)) for channel, items in index.items()]
+        return build_chunk(b"".join(parts), entries, span, self._compressor)
+
+    def _add_entries(self, index: dict[int, list[bytes]]) -> None:
+        """Add the entries of what is not sealed to an index whose messages come before."""
+        for channel, entries in self._pending_index.items():
+            table = np.array(entries, "<u8")
+            table[1::2] += np.uint64(self._group_size)
+            index.setdefault(channel, []).append(table.tobytes())
+
+    def _take_pending(self) -> None:
+        """Count what has been written as sealed, and keep it for the chunk that its group becomes."""
+        self._add_entries(self._group_index)
+        self._group.append(b"".join(self._pending))
+        self._group_size += self._pending_size
+        self._group_span = _union(self._group_span, self._pending_span)
+        counts = {channel: len(entries) // 2 for channel, entries in self._pending_index.items()}
+        self._summary.add_messages(counts, self._pending_span)
+        self._pending.clear()
+        self._pending_size = 0
+        self._pending_index.clear()
+        self._pending_span = _NO_SPAN
+        self._stale = True
+
+    def _finish_group(self, record: bytes) -> None:
+        self._summary.settle(record)
+        self._group.clear()
+        self._group_size = 0
+        self._group_index.clear()
+        self._group_span = _NO_SPAN
+        self._stale = True
+
+    def _publish(self) -> None:
+        self._layout.publish()
+        self._stale = False
+
+
+def _union(a: tuple[int, int], b: tuple[int, int]) -> tuple[int, int]:
+    return min(a[0], b[0]), max(a[1], b[1])
+
+
+def _zstd_compressor(level: int) -> Compressor:
+    import zstandard
+
+    return zstandard.ZstdCompressor(level=level).compress
+
+
+def _library() -> str:
+    from importlib.metadata import PackageNotFoundError, version
+
+    try:
+        return f"pendulum_rosbag {version('pendulum_rosbag')}"
+    except PackageNotFoundError:
+        return "pendulum_rosbag"

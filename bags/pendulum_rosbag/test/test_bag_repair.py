@@ -1,0 +1,261 @@
+"""Mending what other writers, and broken disks, leave behind."""
+
+from __future__ import annotations
+
+import json
+import random
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+import pytest
+from mcap.reader import make_reader
+from rosbags.highlevel import AnyReader
+from rosbags.rosbag2 import StoragePlugin
+from rosbags.rosbag2 import Writer as RosbagsWriter
+
+from pendulum_msgs_py.contract.cdr import encode_joint_state
+from pendulum_msgs_py.errors import BagError, PendulumError
+from pendulum_rosbag.reader import read_bag, same_messages
+from pendulum_rosbag.storage import open_writer, typestore
+from pendulum_rosbag.storage.repair import repair_bag
+from pendulum_rosbag.storage.repair_cli import main as repair_main
+
+JOINT_STATE = "sensor_msgs/msg/JointState"
+TOPICS = ("/a", "/b", "/c")
+
+
+def state(index: int) -> bytes:
+    return encode_joint_state(index, position=0.5 * index, velocity=1.0, effort=-1.0)
+
+
+def our_bag(path: Path, storage: str, *, close: bool = True) -> Path:
+    writer = open_writer(path, storage, metadata={"seed": 5})
+    for topic in TOPICS:
+        writer.add_topic(topic, JOINT_STATE)
+    for index in range(3000):
+        writer.write(TOPICS[index % 3], index, state(index))
+        if index % 100 == 99:
+            writer.seal()
+    if close:
+        writer.close()
+    else:
+        writer.abandon()
+    return path
+
+
+def rosbags_bag(path: Path, storage: str) -> Path:
+    writer = RosbagsWriter(path, version=9, storage_plugin=StoragePlugin[storage.upper()])
+    with writer:
+        connections: list[Any] = [
+            writer.add_connection(t, JOINT_STATE, typestore=typestore()) for t in TOPICS
+        ]
+        for index in range(30_000 if storage == "mcap" else 3000):
+            writer.write(connections[index % 3], index, state(index))
+    return path
+
+
+def storage_file(bag: Path) -> Path:
+    (file,) = [*bag.glob("*.mcap"), *bag.glob("*.db3")]
+    return file
+
+
+def whole_chunks(file: Path, size: int) -> int:
+    """Count the messages in the chunks of a sound MCAP file that end before some byte."""
+    with file.open("rb") as stream:
+        summary = make_reader(stream).get_summary()
+        assert summary is not None
+        ends = [
+            (c.chunk_start_offset + c.chunk_length, c.message_start_time, c.message_end_time)
+            for c in summary.chunk_indexes
+        ]
+    return sum(last - first + 1 for end, first, last in ends if end <= size)
+
+
+@pytest.mark.parametrize("writer", ["ours", "ours_unclosed", "rosbags"])
+def test_a_truncated_mcap_file_gives_back_all_whole_chunks(tmp_path: Path, writer: str) -> None:
+    if writer == "rosbags":
+        bag = rosbags_bag(tmp_path / "bag", "mcap")
+    else:
+        bag = our_bag(tmp_path / "bag", "mcap", close=writer == "ours")
+    file = storage_file(bag)
+    sound = file.read_bytes()
+    whole = tmp_path / "whole.mcap"
+    whole.write_bytes(sound)
+    rng = random.Random(7)
+    end = len(sound) if writer != "ours_unclosed" else 600_000  # beyond lies room that was never used
+    for number in range(8):
+        size = rng.randrange(200, end)
+        file.write_bytes(sound[:size])
+        expected = whole_chunks(whole, size)
+        output = tmp_path / f"mended{number}"
+        report = repair_bag(bag, output)
+        assert report.repaired
+        assert sum(report.messages.values()) == expected
+        mended = read_bag(output)
+        assert not mended.damage
+        assert sum(len(mended[topic]) for topic in mended.topics if mended.topics[topic].count) == expected
+        if expected:
+            with AnyReader([output]) as reader:
+                assert sum(1 for _ in reader.messages()) == expected
+
+
+@pytest.mark.parametrize("writer", ["ours", "rosbags"])
+def test_a_truncated_sqlite_file_gives_back_the_rows_on_its_pages(tmp_path: Path, writer: str) -> None:
+    bag = (
+        our_bag(tmp_path / "bag", "sqlite3") if writer == "ours" else rosbags_bag(tmp_path / "bag", "sqlite3")
+    )
+    file = storage_file(bag)
+    sound = file.read_bytes()
+    rng = random.Random(9)
+    saved = []
+    for number in range(8):
+        size = rng.randrange(0, len(sound))
+        file.write_bytes(sound[:size])
+        try:
+            report = repair_bag(bag, tmp_path / f"mended{number}")
+        except PendulumError as error:
+            if size >= 120_000:
+                raise AssertionError(f"{size} bytes should be enough to tell the topics") from error
+            continue
+        count = sum(report.messages.values())
+        saved.append(count)
+        # The index over time stands at the end; before it, pages hold about 25 messages each.
+        assert count >= min(3000, (size - 120_000) // 4096 * 20)
+        mended = read_bag(tmp_path / f"mended{number}")
+        assert not mended.damage
+        for topic in mended.topics:
+            assert set(mended[topic]["position"] - 0.5 * mended[topic]["stamp_ns"]) <= {0.0}
+    assert len(saved) >= 3
+
+
+def test_random_damage_never_crashes_the_reader(tmp_path: Path) -> None:
+    rng = random.Random(13)
+    for storage in ("mcap", "sqlite3"):
+        bag = our_bag(tmp_path / storage, storage)
+        file = storage_file(bag)
+        sound = file.read_bytes()
+        for _ in range(25):
+            damaged = bytearray(sound)
+            for _ in range(rng.randrange(1, 30)):
+                damaged[rng.randrange(len(damaged))] = rng.randrange(256)
+            file.write_bytes(damaged)
+            try:
+                opened = read_bag(bag)
+                for topic in opened.topics:
+                    opened.raw(topic)
+                    opened.log_times(topic)
+                opened.load()
+            except PendulumError:
+                continue  # refused in a sentence
+
+
+def test_a_bag_without_footer_and_metadata_is_put_in_place(tmp_path: Path) -> None:
+    """What the MCAP writer of rosbags leaves after a kill: no footer, no metadata.yaml."""
+    bag = rosbags_bag(tmp_path / "bag", "mcap")
+    file = storage_file(bag)
+    expected = whole_chunks(file, file.stat().st_size - 200_000)
+    file.write_bytes(file.read_bytes()[:-200_000])
+    (bag / "metadata.yaml").unlink()
+    report = repair_bag(bag)
+    assert report.path == bag
+    assert report.original == tmp_path / "bag.broken"
+    assert (tmp_path / "bag.broken" / "bag.mcap").exists()
+    assert "metadata.yaml is missing" in report.damage
+    with AnyReader([bag]) as reader:
+        assert sum(1 for _ in reader.messages()) == expected
+    again = repair_bag(bag)
+    assert not again.repaired
+    assert again.sentence() == f"{bag} is sound: nothing to repair"
+
+
+def test_a_hot_journal_is_rolled_back_and_the_bag_stays_untouched(tmp_path: Path) -> None:
+    """A writer that dies in an SQLite transaction leaves a journal beside a torn file."""
+    bag = our_bag(tmp_path / "bag", "sqlite3")
+    file = storage_file(bag)
+    script = (
+        "import os, sqlite3, sys\n"
+        "c = sqlite3.connect(sys.argv[1], isolation_level=None)\n"
+        "c.execute('PRAGMA cache_size = 2')\n"
+        "c.execute('BEGIN')\n"
+        "c.execute('UPDATE messages SET timestamp = 7, data = zeroblob(200)')\n"
+        "print('go', flush=True)\n"
+        "sys.stdin.read()\n"
+    )
+    child = subprocess.Popen(
+        [sys.executable, "-c", script, str(file)], stdin=subprocess.PIPE, stdout=subprocess.PIPE
+    )
+    assert child.stdout is not None
+    assert child.stdout.readline() == b"go\n"
+    child.send_signal(signal.SIGKILL)
+    child.wait()
+    journal = file.with_name(file.name + "-journal")
+    assert journal.stat().st_size
+    before = file.read_bytes()
+    opened = read_bag(bag)
+    assert "bag_0.db3-journal" in opened.damage[0]
+    assert opened["/a"]["stamp_ns"].tolist() == list(range(0, 3000, 3))
+    opened.close()
+    assert file.read_bytes() == before
+    report = repair_bag(bag)
+    assert sum(report.messages.values()) == 3000
+    assert not read_bag(bag).damage
+
+
+def test_a_killed_recording_of_ours_needs_no_repair_but_gets_smaller_by_one(tmp_path: Path) -> None:
+    bag = our_bag(tmp_path / "bag", "mcap", close=False)
+    copy = tmp_path / "copy"
+    shutil.copytree(bag, copy)
+    opened = read_bag(bag)
+    assert not opened.damage
+    assert sum(len(opened[topic]) for topic in opened.topics) == 3000
+    report = repair_bag(copy)
+    assert report.damage == ["bag_0.mcap: its recorder did not close it"]
+    assert same_messages(opened, read_bag(copy))
+    assert storage_file(copy).stat().st_size < storage_file(bag).stat().st_size
+    assert read_bag(copy).metadata == {"seed": 5}
+
+
+def test_a_single_file_gets_a_folder(tmp_path: Path) -> None:
+    bag = our_bag(tmp_path / "bag", "mcap")
+    alone = tmp_path / "alone.mcap"
+    alone.write_bytes(storage_file(bag).read_bytes()[:-5000])
+    report = repair_bag(alone)
+    assert report.path == tmp_path / "alone_repaired"
+    assert read_bag(report.path).topics["/a"].count == 1000
+
+
+def test_the_command_says_what_it_found(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    bag = our_bag(tmp_path / "bag", "mcap")
+    file = storage_file(bag)
+    file.write_bytes(file.read_bytes()[:100_000])
+    assert repair_main([str(bag), "--json", "-o", str(tmp_path / "out")]) == 0
+    report = json.loads(capsys.readouterr().out)
+    assert "no footer" in report["damage"][0]
+    assert repair_main([str(bag)]) == 0
+    assert "saved" in capsys.readouterr().out
+    assert repair_main([str(tmp_path / "nothing")]) == 2
+    assert "does not exist" in capsys.readouterr().err
+    with pytest.raises(BagError, match="exists already"):
+        repair_bag(bag, tmp_path / "out", force=True)
+
+
+def test_a_bag_can_be_read_while_it_is_being_recorded(tmp_path: Path) -> None:
+    bag = tmp_path / "bag"
+    writer = open_writer(bag)
+    writer.add_topic("/a", JOINT_STATE)
+    seen = 0
+    start = time.monotonic()
+    for index in range(400):
+        writer.write("/a", index, state(index))
+        if index % 20 == 19:
+            writer.seal()
+            count = len(read_bag(bag)["/a"])
+            assert count == index + 1 > seen
+            seen = count
+    writer.close()
+    assert time.monotonic() - start < 20

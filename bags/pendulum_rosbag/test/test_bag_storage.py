@@ -1,0 +1,213 @@
+"""Bags on disk: whole at every instant, for every reader, in both storages."""
+
+from __future__ import annotations
+
+import sqlite3
+import struct
+from pathlib import Path
+
+import pytest
+import yaml
+from mcap.reader import make_reader
+from rosbags.highlevel import AnyReader
+
+from pendulum_msgs_py.errors import BagError, ParameterError
+from pendulum_rosbag.reader import read_bag
+from pendulum_rosbag.storage import (
+    QosProfile,
+    message_type,
+    open_writer,
+)
+from tests.bag_readers import JOINT_STATE, STRING, count_everywhere, count_in_order, state, text_message
+
+
+@pytest.mark.parametrize(("storage", "compression"), [("mcap", None), ("mcap", "zstd"), ("sqlite3", None)])
+def test_what_is_sealed_is_in_the_bag_for_every_reader(
+    tmp_path: Path, storage: str, compression: str | None
+) -> None:
+    bag = tmp_path / "bag"
+    writer = open_writer(bag, storage, compression)
+    writer.add_topic("/a", JOINT_STATE)
+    writer.add_topic("/b", JOINT_STATE)
+    for index in range(300):
+        writer.write("/ab"[:1] + "ab"[index % 2], index, state(index))
+        if index in (0, 1, 50, 298):
+            writer.seal()
+            assert set(count_everywhere(bag)) == {index + 1}
+    writer.close()
+    assert set(count_everywhere(bag)) == {300}
+
+
+def test_a_file_outgrows_its_room_and_its_summaries_many_times(tmp_path: Path) -> None:
+    bag = tmp_path / "bag"
+    writer = open_writer(bag)
+    for number in range(10):
+        writer.add_topic(f"/t{number}", JOINT_STATE)
+    total = 0
+    for round_number in range(600):
+        for number in range(10):
+            writer.write(f"/t{number}", total, state(total))
+            total += 1
+        writer.seal()
+        if round_number % 200 == 0:
+            assert set(count_everywhere(bag)) == {total}
+            assert count_in_order(bag) == total
+    size_open = next(bag.glob("*.mcap")).stat().st_size
+    writer.close()
+    assert set(count_everywhere(bag)) == {total}
+    assert next(bag.glob("*.mcap")).stat().st_size < size_open
+
+
+@pytest.mark.parametrize("storage", ["mcap", "sqlite3"])
+def test_a_bag_splits_by_size_and_by_time(tmp_path: Path, storage: str) -> None:
+    for name, limits in (("size", {"max_size": 60_000}), ("time", {"max_duration": 0.5})):
+        bag = tmp_path / name
+        with open_writer(bag, storage, **limits) as writer:
+            writer.add_topic("/a", JOINT_STATE)
+            for index in range(1000):
+                writer.write("/a", index * 2_000_000, state(index))
+                if index % 50 == 49:
+                    writer.seal()
+        assert len(writer.files) > 2
+        with AnyReader([bag]) as reader:
+            assert sum(1 for _ in reader.messages()) == 1000
+        assert read_bag(bag)["/a"]["stamp_ns"].tolist() == [index * 1000 for index in range(1000)]
+        info = yaml.safe_load((bag / "metadata.yaml").read_text())["rosbag2_bagfile_information"]
+        assert sum(file["message_count"] for file in info["files"]) == info["message_count"] == 1000
+
+
+def test_metadata_is_what_rosbag2_writes(tmp_path: Path) -> None:
+    bag = tmp_path / "bag"
+    strange = 'quotes " and \\ and \x7f and \u2028 and : # {"a": [1]}\n'
+    qos = QosProfile(reliability="best_effort", durability="transient_local", deadline_ns=1_500_000_000)
+    with open_writer(bag, metadata={"run": {"seed": 3}, "strange": strange}) as writer:
+        writer.add_topic("/a", JOINT_STATE, qos)
+        writer.write("/a", 5_000, state(1))
+        writer.write("/a", 9_000, state(2))
+        writer.update_metadata({"more": [1, 2]})
+    info = yaml.safe_load((bag / "metadata.yaml").read_text(encoding="utf-8"))["rosbag2_bagfile_information"]
+    assert info["version"] == 9
+    assert info["storage_identifier"] == "mcap"
+    assert info["relative_file_paths"] == ["bag_0.mcap"]
+    assert info["starting_time"] == {"nanoseconds_since_epoch": 5_000}
+    assert info["duration"] == {"nanoseconds": 4_000}
+    topic = info["topics_with_message_count"][0]
+    assert topic["message_count"] == 2
+    assert topic["topic_metadata"]["type_description_hash"] == message_type(JOINT_STATE).hash
+    offered = topic["topic_metadata"]["offered_qos_profiles"][0]
+    assert (offered["reliability"], offered["durability"]) == ("best_effort", "transient_local")
+    assert offered["deadline"] == {"sec": 1, "nsec": 500_000_000}
+    assert info["custom_data"]["strange"] == strange
+    assert read_bag(bag).metadata == {"run": {"seed": 3}, "strange": strange, "more": [1, 2]}
+    with AnyReader([bag]) as reader:
+        assert reader.topics["/a"].msgcount == 2
+    # A file that lost its folder still knows the run.
+    alone = tmp_path / "alone.mcap"
+    alone.write_bytes((bag / "bag_0.mcap").read_bytes())
+    assert read_bag(alone).metadata["run"] == {"seed": 3}
+
+
+def test_mcap_files_carry_profile_schema_and_checksums(tmp_path: Path) -> None:
+    bag = tmp_path / "bag"
+    with open_writer(bag, compression="zstd") as writer:
+        writer.add_topic("/a", JOINT_STATE)
+        writer.write("/a", 1, state(1))
+    with (bag / "bag_0.mcap").open("rb") as stream:
+        reader = make_reader(stream, validate_crcs=True)
+        assert reader.get_header().profile == "ros2"
+        summary = reader.get_summary()
+        assert summary is not None
+        assert summary.statistics is not None
+        assert summary.statistics.message_count == 1
+        (schema,) = summary.schemas.values()
+        assert (schema.name, schema.encoding) == (JOINT_STATE, "ros2msg")
+        assert b"MSG: std_msgs/Header" in schema.data
+        assert [metadata.name for metadata in reader.iter_metadata()] == ["rosbag2"]
+
+
+def test_sqlite_files_have_the_index_that_rosbag2_seeks_by(tmp_path: Path) -> None:
+    bag = tmp_path / "bag"
+    with open_writer(bag, "sqlite3") as writer:
+        writer.add_topic("/a", JOINT_STATE)
+        for index in range(100):
+            writer.write("/a", index, state(index))
+    connection = sqlite3.connect(bag / "bag_0.db3")
+    assert connection.execute("SELECT name FROM sqlite_master WHERE type = 'index'").fetchall() == [
+        ("timestamp_idx",)
+    ]
+    assert connection.execute("SELECT schema_version, ros_distro FROM schema").fetchall() == [(4, "jazzy")]
+    assert "bag_0.db3" in connection.execute("SELECT metadata FROM metadata").fetchone()[0]
+    connection.close()
+
+
+def test_large_messages_continue_on_overflow_pages(tmp_path: Path) -> None:
+    bag = tmp_path / "bag"
+    sizes = [0, 1, 4000, 4030, 4031, 4032, 4040, 4044, 4061, 4100, 8000, 8150, 12_345, 70_000, 300_000]
+    with open_writer(bag, "sqlite3") as writer:
+        writer.add_topic("/s", STRING)
+        for number, size in enumerate(sizes):
+            writer.write("/s", number, text_message("z" * size))
+    assert set(count_everywhere(bag)) == {len(sizes)}
+    assert [len(stored.message.data) for stored in read_bag(bag)["/s"]] == sizes
+
+
+def test_a_bag_is_never_overwritten(tmp_path: Path) -> None:
+    bag = tmp_path / "bag"
+    open_writer(bag).close()
+    with pytest.raises(BagError, match="exists already; expected a new folder"):
+        open_writer(bag)
+
+
+def test_wrong_use_is_refused_in_a_sentence(tmp_path: Path) -> None:
+    with pytest.raises(ParameterError, match="storage is 'rosbag'; expected one of mcap, sqlite3"):
+        open_writer(tmp_path / "a", "rosbag")
+    with pytest.raises(ParameterError, match="expected storage mcap"):
+        open_writer(tmp_path / "a", "sqlite3", "zstd")
+    writer = open_writer(tmp_path / "b")
+    with pytest.raises(BagError, match="/x was not added"):
+        writer.write("/x", 0, b"")
+    writer.add_topic("/x", JOINT_STATE)
+    with pytest.raises(BagError, match="the bag holds it as sensor_msgs/msg/JointState"):
+        writer.add_topic("/x", STRING)
+    with pytest.raises(BagError, match="expected package/msg/Name"):
+        writer.add_topic("/y", "JointState")
+    writer.close()
+    with pytest.raises(BagError, match="is closed"):
+        writer.write("/x", 0, state(0))
+
+
+def test_a_type_that_nobody_knows_is_kept_as_bytes(tmp_path: Path) -> None:
+    bag = tmp_path / "bag"
+    with open_writer(bag) as writer:
+        writer.add_topic("/own", "my_msgs/msg/Thing")
+        writer.write("/own", 7, b"\0\1\0\0\1\2\3\4")
+    opened = read_bag(bag)
+    assert opened.raw("/own") == [(7, b"\0\1\0\0\1\2\3\4")]
+
+
+def test_types_of_a_workspace_are_found_and_carried(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    folder = tmp_path / "install" / "share" / "own_msgs" / "msg"
+    folder.mkdir(parents=True)
+    (folder / "Inner.msg").write_text("float64 value\n")
+    (folder / "Outer.msg").write_text("std_msgs/Header header\nInner[] parts\n")
+    monkeypatch.setenv("AMENT_PREFIX_PATH", str(tmp_path / "install"))
+    kind = message_type("own_msgs/msg/Outer")
+    assert kind.hash.startswith("RIHS01_")
+    assert "MSG: own_msgs/Inner" in kind.definition
+
+
+def test_a_message_index_names_every_message(tmp_path: Path) -> None:
+    bag = tmp_path / "bag"
+    with open_writer(bag) as writer:
+        writer.add_topic("/a", JOINT_STATE)
+        for index in range(10):
+            writer.write("/a", 100 - index, state(index))  # log times may go backwards
+    content = (bag / "bag_0.mcap").read_bytes()
+    with (bag / "bag_0.mcap").open("rb") as stream:
+        summary = make_reader(stream).get_summary()
+    assert summary is not None
+    (chunk,) = summary.chunk_indexes
+    (at,) = chunk.message_index_offsets.values()
+    opcode, _, channel, size = struct.unpack_from("<BQHI", content, at)
+    assert (opcode, channel, size) == (0x07, 1, 160)
+    assert read_bag(bag)["/a"]["log_time_ns"].tolist() == list(range(91, 101))

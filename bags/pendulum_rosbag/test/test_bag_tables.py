@@ -1,0 +1,150 @@
+"""What is told of a bag: timing, latencies, tables, and the commands that print them."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from pendulum_msgs_py.contract.cdr import encode_joint_state
+from pendulum_msgs_py.errors import BagError, ParameterError
+from pendulum_rosbag.reader import read_bag
+from pendulum_rosbag.reader.export_cli import main as export_main
+from pendulum_rosbag.reader.info_cli import main as info_main
+from pendulum_rosbag.reader.statistics import bag_statistics, time_statistics
+from pendulum_rosbag.reader.tables import export_bag, to_pandas
+from pendulum_rosbag.storage import open_writer
+from tests.bag_messages import (
+    JOINT_STATE,
+    STORE,
+    joint_state,
+)
+
+
+def test_timing_finds_gaps_duplicates_and_clock_jumps() -> None:
+    stamps = np.arange(1000, dtype=np.int64) * 2_000_000
+    stamps = np.delete(stamps, [500, 501, 502])
+    stamps[100] = stamps[99]
+    log = stamps + 300_000
+    log[700:] += 200_000_000
+    result = time_statistics(JOINT_STATE, log, stamps)
+    assert result.count == 997
+    assert result.rate == pytest.approx(500, rel=0.01)
+    assert result.period == pytest.approx(2.0)
+    assert result.longest == pytest.approx(8.0)
+    assert result.duplicates == 1
+    assert result.clock_jumps == 1
+    assert result.age == pytest.approx(0.3)
+    assert result.gaps == 2  # three lost messages, and the one whose stamp was doubled
+    assert result.missing == 4
+
+
+def test_a_late_message_is_a_gap_but_none_is_missing() -> None:
+    stamps = np.arange(100, dtype=np.int64) * 2_000_000
+    stamps[50] += 1_500_000
+    result = time_statistics(JOINT_STATE, stamps, stamps)
+    assert (result.gaps, result.missing) == (1, 0)
+
+
+def test_bursts_of_events_leave_no_gaps_but_a_periodic_topic_without_stamps_does() -> None:
+    event = "std_msgs/msg/String"
+    bursts = np.array([0, 1_000, 3_000, 4_000, 2_000_000_000, 2_000_001_000, 2_000_004_000], np.int64)
+    result = time_statistics(event, bursts)
+    assert (result.gaps, result.missing) == (0, 0)
+    assert result.longest == pytest.approx(2000, rel=1e-3)
+    periodic = np.delete(np.arange(100, dtype=np.int64) * 10_000_000, [50, 51])
+    result = time_statistics(event, periodic)
+    assert (result.gaps, result.missing) == (1, 2)
+
+
+def test_latencies_are_matched_by_echoed_stamps(tmp_path: Path) -> None:
+    path = tmp_path / "bag"
+    with open_writer(path) as writer:
+        writer.add_topic("/joint_states", JOINT_STATE)
+        writer.add_topic("/effort_command", JOINT_STATE)
+        for index in range(1, 200):
+            stamp = index * 2_000_000
+            writer.write("/joint_states", stamp + 100_000, encode_joint_state(stamp, position=1.0))
+            writer.write(
+                "/effort_command", stamp + 350_000, encode_joint_state(stamp, frame_id="lqr", effort=1.0)
+            )
+    statistics = bag_statistics(read_bag(path))
+    (latency,) = statistics.latencies
+    assert (latency.source, latency.answer, latency.matched) == ("/joint_states", "/effort_command", 199)
+    assert latency.median == pytest.approx(0.25)
+
+
+def test_tables_have_the_columns_of_the_arrays(tmp_path: Path) -> None:
+    path = tmp_path / "bag"
+    with open_writer(path, metadata={"seed": 1}) as writer:
+        writer.add_topic("/a", JOINT_STATE)
+        writer.add_topic("/many", JOINT_STATE)
+        writer.write("/a", 1, encode_joint_state(1, position=1.5, frame_id="x"))
+        writer.write("/many", 1, joint_state(2, "", ["p", "q"], [1.0, 2.0], [], []))
+    bag = read_bag(path)
+    assert list(to_pandas(bag, "/a").columns) == [
+        "log_time_ns", "stamp_ns", "position", "velocity", "effort", "frame_id",
+    ]  # fmt: skip
+    assert to_pandas(bag, "/many")["position"].tolist() == [[1.0, 2.0]]
+    files = export_bag(bag, tmp_path / "csv", "csv")
+    assert [file.name for file in files] == ["a.csv", "many.csv", "metadata.json"]
+    assert files[0].read_text().splitlines()[1].startswith("1,1,1.5,,")
+    with pytest.raises(ParameterError, match="format is 'xls'; expected one of parquet, csv"):
+        export_bag(bag, tmp_path / "xls", "xls")
+    with pytest.raises(BagError, match="exists already"):
+        export_bag(bag, tmp_path / "csv", "csv")
+
+
+def test_tables_leave_out_the_constants_of_a_type_and_keep_times_whole_without_messages(
+    tmp_path: Path,
+) -> None:
+    path = tmp_path / "bag"
+    status = STORE.types["diagnostic_msgs/msg/DiagnosticStatus"]
+    message = status(level=1, name="n", message="m", hardware_id="h", values=[])
+    with open_writer(path) as writer:
+        writer.add_topic("/status", message.__msgtype__)
+        writer.add_topic("/silent", "std_msgs/msg/String")
+        writer.write("/status", 1, bytes(STORE.serialize_cdr(message, message.__msgtype__)))
+    bag = read_bag(path)
+    assert list(to_pandas(bag, "/status").columns) == [
+        "log_time_ns", "level", "name", "message", "hardware_id", "values",
+    ]  # fmt: skip
+    assert to_pandas(bag, "/silent").dtypes.to_dict() == {"log_time_ns": np.dtype(np.int64)}
+
+
+def test_parquet_reads_back(tmp_path: Path) -> None:
+    pytest.importorskip("pyarrow", exc_type=ImportError)
+    import pandas as pd
+
+    path = tmp_path / "bag"
+    with open_writer(path) as writer:
+        writer.add_topic("/a", JOINT_STATE)
+        for index in range(10):
+            writer.write("/a", index, encode_joint_state(index, position=0.1 * index))
+    (file, _) = export_bag(read_bag(path), tmp_path / "out")
+    assert pd.read_parquet(file)["position"].tolist() == [0.1 * index for index in range(10)]
+
+
+def test_the_commands_print_tables_json_and_sentences(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = tmp_path / "bag"
+    with open_writer(path, metadata={"run": {"seed": 1}}) as writer:
+        writer.add_topic("/a", JOINT_STATE)
+        for index in range(100):
+            writer.write(
+                "/a", 1000 + index * 2_000_000, encode_joint_state(1 + index * 2_000_000, position=0.0)
+            )
+    assert info_main([str(path)]) == 0
+    assert "/a" in (table := capsys.readouterr().out)
+    assert "500.000" in table
+    assert info_main([str(path), "--json"]) == 0
+    document = json.loads(capsys.readouterr().out)
+    assert document["topics"]["/a"]["count"] == 100
+    assert document["metadata"] == {"run": {"seed": 1}}
+    assert export_main([str(path), "-o", str(tmp_path / "out"), "--format", "csv"]) == 0
+    assert capsys.readouterr().out.splitlines()[0].endswith("a.csv")
+    assert info_main([str(tmp_path / "nothing")]) == 2
+    assert "does not exist" in capsys.readouterr().err

@@ -1,0 +1,143 @@
+"""Which commands a plant believes: one gate per input, the same on simulator and hardware.
+
+A command that is not finite, not of one joint, for another joint, stale, from the future, a second answer to one
+state, or from a second commander is refused and counted; the plant acts on the newest one that passed.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from enum import Enum
+
+from pendulum_msgs_py.contract.names import JOINT
+from pendulum_msgs_py.contract.values import NANOSECONDS, JointCommand
+
+__all__ = ["COMMANDER_HOLD", "CommandGate", "Refusal"]
+
+COMMANDER_HOLD = 1.0
+"""Silence after which another commander may take over [s]."""
+
+
+class Refusal(str, Enum):
+    """Why a command was not applied; the value is the key in diagnostics."""
+
+    NOT_ONE_JOINT = "not_one_joint"
+    OTHER_JOINT = "other_joint"
+    NOT_FINITE = "not_finite"
+    TOO_OLD = "too_old"
+    FROM_FUTURE = "from_future"
+    OUT_OF_ORDER = "out_of_order"
+    DUPLICATE = "duplicate"
+    SECOND_COMMANDER = "second_commander"
+
+
+class CommandGate:
+    """Checks the commands of one input and keeps the newest that passed.
+
+    Args:
+        timeout: Age beyond which a command counts for nothing [s], > 0.
+        future_tolerance: How far ahead of the plant's clock a stamp may lie [s].
+        single_commander: Refuse a second source while the first one is alive.
+        joint: The joint that commands must be for; an empty list of names means this one.
+    """
+
+    def __init__(
+        self,
+        timeout: float,
+        *,
+        future_tolerance: float = 0.005,
+        single_commander: bool = True,
+        joint: str = JOINT,
+    ) -> None:
+        self.timeout_ns = round(timeout * NANOSECONDS)
+        self.future_tolerance_ns = round(future_tolerance * NANOSECONDS)
+        self.single_commander = single_commander
+        self.joint = joint
+        self.refused: Counter[Refusal] = Counter()
+        self.accepted = 0
+        self.refused_commander = ""
+        self._newest: JointCommand | None = None
+        self._heard_ns = 0
+        self._holder = ""
+
+    def refuse_malformed(self) -> Refusal:
+        """Count a message that was no command for one joint at all."""
+        self.refused[Refusal.NOT_ONE_JOINT] += 1
+        return Refusal.NOT_ONE_JOINT
+
+    def offer(self, command: JointCommand, now_ns: int) -> Refusal | None:
+        """Take a command if it passes every rule; return why it does not, or None.
+
+        Args:
+            command: The command.
+            now_ns: The plant's clock [ns].
+        """
+        refusal = self._judge(command, now_ns)
+        if refusal is None:
+            self._newest = command
+            self._heard_ns = now_ns
+            self._holder = command.source
+            self.accepted += 1
+        else:
+            self.refused[refusal] += 1
+            if refusal is Refusal.SECOND_COMMANDER:
+                self.refused_commander = command.source
+        return refusal
+
+    def fresh(self, now_ns: int) -> JointCommand | None:
+        """Return the newest command if it is still young enough to act on, else None."""
+        newest = self._newest
+        if newest is None:
+            return None
+        # Measured from the stamp and from the moment of hearing it: a clock that jumps either way only shortens it.
+        age = now_ns - newest.stamp_ns
+        silence = now_ns - self._heard_ns
+        # Heard "later than now" is not only a clock that stepped back: a plant that catches up with periods it missed
+        # decides as of each of them.
+        if age > self.timeout_ns or age < -self.future_tolerance_ns or abs(silence) > self.timeout_ns:
+            return None
+        return newest
+
+    @property
+    def newest_stamp_ns(self) -> int | None:
+        """Stamp of the newest accepted command [ns], or None before the first."""
+        return None if self._newest is None else self._newest.stamp_ns
+
+    @property
+    def commander(self) -> str:
+        """Who sent the newest accepted command."""
+        return self._holder
+
+    def reset(self) -> None:
+        """Forget the last command and its commander (the plant was reset or re-armed); counters stay."""
+        self._newest = None
+        self._holder = ""
+
+    def _judge(self, command: JointCommand, now_ns: int) -> Refusal | None:
+        if len(command.joints) > 1:
+            return Refusal.NOT_ONE_JOINT
+        if command.joints and command.joints[0] != self.joint:
+            return Refusal.OTHER_JOINT
+        if not math.isfinite(command.effort):
+            return Refusal.NOT_FINITE
+        if now_ns - command.stamp_ns > self.timeout_ns:
+            return Refusal.TOO_OLD
+        if command.stamp_ns - now_ns > self.future_tolerance_ns:
+            return Refusal.FROM_FUTURE
+        newest = self._newest
+        # A clock that jumped back leaves a last command "from the future": it no longer orders anything.
+        if newest is None or newest.stamp_ns - now_ns > self.future_tolerance_ns:
+            return None
+        silence = now_ns - self._heard_ns
+        if (
+            self.single_commander
+            and command.source != self._holder
+            and 0 <= silence <= COMMANDER_HOLD * NANOSECONDS
+        ):
+            return Refusal.SECOND_COMMANDER
+        if command.stamp_ns == newest.stamp_ns:
+            return Refusal.DUPLICATE
+        if command.stamp_ns < newest.stamp_ns:
+            return Refusal.OUT_OF_ORDER
+        return None

@@ -1,0 +1,377 @@
+"""What a plant does at each instant: one state machine and one set of rules for simulator and hardware.
+
+::
+
+    DISARMED --arm--> EFFORT <--trajectory / first command after it--> POSITION
+    any armed state --fault--> FAULT --disarm--> DISARMED
+    any state --e-stop--> E_STOP --reset--> DISARMED        (a reset never re-arms)
+
+Pure: time, measurements and messages are arguments, the decision is a value. The plants only carry it out.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+from pendulum_msgs_py.contract.commands import CommandGate, Refusal
+from pendulum_msgs_py.contract.drive import Drive, DriveKind, Input, Mode, PlantLimits
+from pendulum_msgs_py.contract.trajectory import MAX_RAMP_VELOCITY, Trajectory
+from pendulum_msgs_py.contract.values import NANOSECONDS, JointCommand, JointSample
+
+__all__ = ["PUSH_LIMIT_FACTOR", "Drive", "DriveKind", "Input", "Mode", "PlantLimits", "PlantSupervisor"]
+
+PUSH_LIMIT_FACTOR = 10.0
+"""A push on the link is clamped to this multiple of the effort limit: 1e308 N m is finite, but no hand."""
+
+_KEPT_TRANSITIONS = 50
+_LONGEST_STEP_NS = NANOSECONDS // 10
+"""Largest step in time by which one decision moves a trajectory or a fade on [ns]."""
+
+
+@dataclass
+class _Handover:
+    """Fade from the torque before a change of control to the one after it, and of the setpoint likewise."""
+
+    start_ns: int
+    effort: float
+    offset: float = 0.0
+    offset_time: float = 0.0
+
+    def remaining(self, now_ns: int, duration: float) -> float:
+        if duration <= 0.0:
+            return 0.0
+        return min(1.0, max(0.0, 1.0 - (now_ns - self.start_ns) / (duration * NANOSECONDS)))
+
+    def remaining_offset(self, now_ns: int) -> float:
+        return self.offset * self.remaining(now_ns, self.offset_time)
+
+
+@dataclass
+class PlantSupervisor:
+    """State machine, command gates, trajectory and hand-over of one plant.
+
+    Args:
+        limits: The limits to keep.
+        preflight: Called on arming; returns why the plant is not ready, or an empty string.
+    """
+
+    limits: PlantLimits
+    preflight: Callable[[], str] = lambda: ""
+    mode: Mode = Mode.DISARMED
+    reason: str = "not armed yet"
+    starved_periods: int = 0
+    saturated_periods: int = 0
+    transitions: list[tuple[int, Mode, str]] = field(default_factory=list)
+
+    def __post_init__(self) -> None:
+        """Make one gate per input."""
+        timeout = self.limits.command_timeout
+        self.gates = {kind: CommandGate(timeout) for kind in Input}
+        # By name as well: enum hashes its members in Python, which a lookup would pay for at each decision.
+        self._commands = self.gates[Input.EFFORT_COMMAND]
+        self._disturbances = self.gates[Input.DISTURBANCE]
+        self._pushes = self.gates[Input.PUSH]
+        self.commander_conflict = ""
+        self._trajectory: Trajectory | None = None
+        self._trajectory_start_ns = 0
+        self._handover: _Handover | None = None
+        self._applied = 0.0
+        self._last_effort = 0.0
+        self._last_decision_ns: int | None = None
+        self._last_time_ns: int | None = None
+        self._hold_position: float | None = None
+
+    # --- messages ------------------------------------------------------------------------------------------
+
+    def offer(self, kind: Input, command: JointCommand | None, now_ns: int) -> Refusal | None:
+        """Offer a message of an input; None stands for one that was no command of one joint."""
+        gate = self.gates[kind]
+        return gate.refuse_malformed() if command is None else gate.offer(command, now_ns)
+
+    def set_commander_conflict(self, conflict: str) -> None:
+        """Report that several publishers stand behind one name on ``effort_command``, or that they no longer do.
+
+        Commanders with names of their own are told apart message by message; twins are not, and while there are
+        twins nobody's torque is applied.
+        """
+        self.commander_conflict = conflict
+
+    def accept_trajectory(self, trajectory: Trajectory, now_ns: int, sample: JointSample) -> str:
+        """Start to follow a trajectory; return why it is refused, or an empty string."""
+        limits = self.limits
+        if not self.mode.armed:
+            return f"plant is {self.mode.value}; expected it armed before a trajectory"
+        fault = self._measurement_fault(now_ns, sample)
+        if fault:
+            return fault
+        gap = trajectory.start - sample.position
+        if abs(gap) > limits.tracking_error:
+            return (
+                f"trajectory starts at {trajectory.start:.4f} rad, the pendulum is at {sample.position:.4f} rad; "
+                f"expected at most {limits.tracking_error} rad between them"
+            )
+        # The gap is closed while the trajectory already runs, no faster than a ramp would.
+        offset_time = max(limits.handover_time, abs(gap) / MAX_RAMP_VELOCITY)
+        speed = trajectory.max_speed()
+        if offset_time > 0.0:
+            speed += abs(gap) / offset_time
+        if speed > limits.velocity:
+            return f"trajectory asks for {speed:.3f} rad/s; expected at most {limits.velocity} rad/s"
+        positions = [point.position for point in trajectory.points]
+        if min(positions) < limits.position_min or max(positions) > limits.position_max:
+            return (
+                f"trajectory covers {min(positions):.3f} to {max(positions):.3f} rad; expected it inside "
+                f"{limits.position_min} to {limits.position_max} rad"
+            )
+        self._keep_pace(now_ns)
+        self._trajectory = trajectory
+        self._trajectory_start_ns = now_ns
+        self._handover = _Handover(now_ns, self._applied, offset=-gap, offset_time=offset_time)
+        self._enter(Mode.POSITION, "following a trajectory", now_ns)
+        return ""
+
+    # --- transitions ---------------------------------------------------------------------------------------
+
+    def arm(self, now_ns: int, sample: JointSample | None) -> str:
+        """Arm for effort at zero torque; return why not, or an empty string. Arming twice changes nothing."""
+        if self.mode.armed:
+            return ""
+        refusal = self._arm_refusal(now_ns, sample)
+        if refusal:
+            return refusal
+        for gate in self.gates.values():
+            gate.reset()
+        self._handover = None
+        self._trajectory = None
+        self._applied = self._last_effort = 0.0
+        self._last_decision_ns = now_ns
+        self._enter(Mode.EFFORT, "armed", now_ns)
+        return ""
+
+    def disarm(self, now_ns: int, reason: str = "disarmed on request") -> None:
+        """Release the drive; also acknowledges a fault, but never an e-stop."""
+        if self.mode is not Mode.E_STOP:
+            self._release(Mode.DISARMED, reason, now_ns)
+
+    def e_stop(self, now_ns: int, reason: str = "e-stop pressed") -> None:
+        """Latch the e-stop."""
+        self._release(Mode.E_STOP, reason, now_ns)
+
+    def e_stop_reset(self, now_ns: int) -> str:
+        """Leave the e-stop for DISARMED; return why not, or an empty string."""
+        if self.mode is not Mode.E_STOP:
+            return f"plant is {self.mode.value}; expected e_stop"
+        self._release(Mode.DISARMED, "e-stop reset; arm again to go on", now_ns)
+        return ""
+
+    def fault(self, reason: str, now_ns: int) -> None:
+        """Release the drive and stay so until somebody disarms; an e-stop outranks a fault."""
+        if self.mode not in {Mode.E_STOP, Mode.FAULT}:
+            self._release(Mode.FAULT, reason, now_ns)
+
+    # --- decision ------------------------------------------------------------------------------------------
+
+    def decide(self, now_ns: int, sample: JointSample | None) -> Drive:
+        """Return what the plant has to do now.
+
+        Args:
+            now_ns: The plant's clock [ns].
+            sample: Newest measurement, or None before the first.
+        """
+        self._keep_pace(now_ns)
+        push_command = self._pushes.fresh(now_ns)
+        push_limit = PUSH_LIMIT_FACTOR * self.limits.effort
+        push = min(push_limit, max(-push_limit, push_command.effort)) if push_command else 0.0
+        if self.mode.armed:
+            fault = self._measurement_fault(now_ns, sample)
+            if fault:
+                self.fault(fault, now_ns)
+        if not self.mode.armed or sample is None:
+            self._last_effort = 0.0
+            self._last_decision_ns = now_ns
+            return Drive(DriveKind.OFF, push=push)
+        if self.mode is Mode.POSITION:
+            drive = self._decide_position(now_ns, sample, push)
+            if drive is not None:
+                return drive
+        return self._decide_effort(now_ns, push)
+
+    def report_applied(self, effort: float) -> None:
+        """Tell what torque the plant really applied, so that the next hand-over starts from there [N m]."""
+        self._applied = self._clamp(effort)
+
+    @property
+    def trajectory_finished(self) -> bool:
+        """Whether position control holds the goal of a finished trajectory."""
+        return self.mode is Mode.POSITION and self._hold_position is not None
+
+    def has_fresh_command(self, now_ns: int) -> bool:
+        """Whether a controller is answering."""
+        return self._commands.fresh(now_ns) is not None
+
+    # --- inside --------------------------------------------------------------------------------------------
+
+    def _keep_pace(self, now_ns: int) -> None:
+        """Let trajectory and fades wait where the plant itself did not run, or where its clock stepped.
+
+        A process that was stopped for half a second must not find its setpoint half a second further on.
+        """
+        last_ns, self._last_time_ns = self._last_time_ns, now_ns
+        if last_ns is None:
+            return
+        elapsed = now_ns - last_ns
+        lost = elapsed - min(_LONGEST_STEP_NS, max(0, elapsed))
+        if lost:
+            self._trajectory_start_ns += lost
+            if self._handover is not None:
+                self._handover.start_ns += lost
+
+    def _decide_position(self, now_ns: int, sample: JointSample, push: float) -> Drive | None:
+        trajectory = self._trajectory
+        assert trajectory is not None
+        elapsed = (now_ns - self._trajectory_start_ns) / NANOSECONDS
+        position, velocity = trajectory.at(elapsed)
+        handover = self._handover
+        remaining = handover.remaining(now_ns, self.limits.handover_time) if handover else 0.0
+        offset = handover.remaining_offset(now_ns) if handover else 0.0
+        position += offset
+        # Negated, so that a setpoint that is not a number is a fault too.
+        if not abs(sample.position - position) <= self.limits.tracking_error:
+            self.fault(
+                f"pendulum is at {sample.position:.3f} rad, the trajectory at {position:.3f} rad; "
+                f"expected at most {self.limits.tracking_error} rad between them",
+                now_ns,
+            )
+            return Drive(DriveKind.OFF, push=push)
+        if elapsed >= trajectory.duration and offset == 0.0:
+            if self._hold_position is None:
+                self._hold_position = trajectory.goal
+                self.reason = "holding the end of a trajectory"
+            command = self._commands.fresh(now_ns)
+            end_ns = self._trajectory_start_ns + round(trajectory.duration * NANOSECONDS)
+            if command is not None and command.stamp_ns >= end_ns and not self.commander_conflict:
+                jump = abs(self._clamp(command.effort) - self._applied)
+                if not jump <= self.limits.handover_effort:
+                    # A controller for another place: awake at the bottom, one for upright asks for all it has.
+                    self.reason = (
+                        f"holding: {command.source or 'a controller'} asks for {command.effort:.2f} N m, "
+                        f"{jump:.2f} N m from what holds; expected at most {self.limits.handover_effort} N m"
+                    )
+                    return self._hold(handover, remaining, position, velocity, push)
+                self._trajectory = None
+                self._handover = _Handover(now_ns, self._applied)
+                self._last_effort = self._applied
+                self._last_decision_ns = now_ns
+                self._enter(Mode.EFFORT, f"commanded by {command.source or 'an unnamed node'}", now_ns)
+                return None
+        return self._hold(handover, remaining, position, velocity, push)
+
+    def _hold(
+        self, handover: _Handover | None, remaining: float, position: float, velocity: float, push: float
+    ) -> Drive:
+        effort = handover.effort * remaining if handover else 0.0
+        return Drive(
+            DriveKind.POSITION, effort=self._clamp(effort), position=position, velocity=velocity, push=push
+        )
+
+    def _decide_effort(self, now_ns: int, push: float) -> Drive:
+        command = None if self.commander_conflict else self._commands.fresh(now_ns)
+        if command is None:
+            self.starved_periods += 1
+            self._handover = None
+            self._last_effort = 0.0
+            self._last_decision_ns = now_ns
+            self.reason = self.commander_conflict or "no fresh command: zero torque"
+            return Drive(DriveKind.EFFORT, push=push, starved=True)
+        disturbance_command = self._disturbances.fresh(now_ns)
+        disturbance = disturbance_command.effort if disturbance_command else 0.0
+        wanted = self._clamp(command.effort + disturbance)
+        saturated = wanted != command.effort + disturbance
+        effort = wanted
+        if self._handover is not None:
+            remaining = self._handover.remaining(now_ns, self.limits.handover_time)
+            effort = self._clamp(remaining * self._handover.effort + (1.0 - remaining) * wanted)
+            if remaining == 0.0:
+                self._handover = None
+        effort = self._limit_slew(effort, now_ns)
+        self.saturated_periods += saturated
+        self._last_effort = effort
+        self._last_decision_ns = now_ns
+        self.reason = f"commanded by {command.source or 'an unnamed node'}"
+        return Drive(
+            DriveKind.EFFORT,
+            effort=effort,
+            controller=command.effort,
+            disturbance=disturbance,
+            push=push,
+            saturated=saturated,
+        )
+
+    def _limit_slew(self, effort: float, now_ns: int) -> float:
+        if math.isinf(self.limits.slew) or self._last_decision_ns is None:
+            return effort
+        step = self.limits.slew * max(0, now_ns - self._last_decision_ns) / NANOSECONDS
+        return min(self._last_effort + step, max(self._last_effort - step, effort))
+
+    def _clamp(self, effort: float) -> float:
+        if math.isnan(effort):
+            return 0.0
+        return min(self.limits.effort, max(-self.limits.effort, effort))
+
+    def _measurement_fault(self, now_ns: int, sample: JointSample | None) -> str:
+        limits = self.limits
+        if sample is None:
+            return "no measurement"
+        if not sample.is_finite():
+            return f"measurement is not finite: {sample.position} rad, {sample.velocity} rad/s, {sample.effort} N m"
+        age = (now_ns - sample.stamp_ns) / NANOSECONDS
+        if age < -limits.feedback_timeout:
+            # It would look fresh for as long, even if no other ever came.
+            return f"measurement is stamped {-age * 1e3:.0f} ms ahead of the plant's clock"
+        if age > limits.feedback_timeout:
+            return (
+                f"measurement is {age * 1e3:.0f} ms old; expected at most {limits.feedback_timeout * 1e3:.0f} ms: "
+                "is the machine too busy, or the link to the actuator lost?"
+            )
+        if not limits.position_min <= sample.position <= limits.position_max:
+            return (
+                f"position is {sample.position:.3f} rad; expected inside {limits.position_min} to "
+                f"{limits.position_max} rad"
+            )
+        if abs(sample.velocity) > limits.velocity:
+            return f"velocity is {sample.velocity:.3f} rad/s; expected at most {limits.velocity} rad/s"
+        return ""
+
+    def _arm_refusal(self, now_ns: int, sample: JointSample | None) -> str:
+        if self.mode is Mode.E_STOP:
+            return "e-stop is latched; reset it first"
+        if self.mode is Mode.FAULT:
+            return f"fault not acknowledged: {self.reason}; disarm first"
+        if self.commander_conflict:
+            return self.commander_conflict
+        fault = self._measurement_fault(now_ns, sample)
+        if fault:
+            return fault
+        command = self._commands.fresh(now_ns)
+        if command is not None and abs(command.effort) > self.limits.arm_effort:
+            return (
+                f"{command.source or 'a controller'} already commands {command.effort:.3f} N m; "
+                f"expected at most {self.limits.arm_effort} N m while arming"
+            )
+        return self.preflight()
+
+    def _release(self, mode: Mode, reason: str, now_ns: int) -> None:
+        self._trajectory = None
+        self._handover = None
+        self._applied = self._last_effort = 0.0
+        self._enter(mode, reason, now_ns)
+
+    def _enter(self, mode: Mode, reason: str, now_ns: int) -> None:
+        self._hold_position = None
+        if mode is not self.mode:
+            self.transitions.append((now_ns, mode, reason))
+            del self.transitions[:-_KEPT_TRANSITIONS]
+        self.mode = mode
+        self.reason = reason

@@ -1,0 +1,1 @@
+"""Plants as files: parameters with units, and the presets."""

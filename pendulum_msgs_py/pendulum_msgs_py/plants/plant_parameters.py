@@ -1,0 +1,329 @@
+"""Physical parameters of a pendulum: one dataclass, one YAML format, shared by plant, design and identification.
+
+The file gives each value with its unit, so that a file in other units is refused rather than believed::
+
+    format: pendulum_plant/1
+    name: thesis
+    parameters:
+      inertia: {value: 0.055, unit: kg m^2}
+      damping: {value: 11.77, unit: N m s/rad, interval: [11.70, 11.84]}
+      gravity: {value: 1.678, unit: N m}
+    drivetrain: {...}      # only for a series-elastic plant
+    provenance: {...}      # optional: data, method, date
+"""
+
+from __future__ import annotations
+
+import os
+import sys
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, field, replace
+from importlib import resources
+from pathlib import Path
+from typing import Any
+
+from pendulum_msgs_py.errors import ParameterError
+from pendulum_msgs_py.parameters import (
+    ParameterSpec,
+    dump_yaml,
+    load_yaml,
+    reject_unknown,
+    require_mapping,
+)
+
+__all__ = [
+    "DRIVETRAIN_SPECS",
+    "FORMAT",
+    "PLANT_SPECS",
+    "PRESETS",
+    "PlantParameters",
+    "SeriesElasticParameters",
+    "load_plant",
+    "load_plant_file",
+    "write_plant",
+]
+
+FORMAT = "pendulum_plant/1"
+PRESETS = ("thesis", "x5_9", "dfki")
+"""Names of the plant files that come with the package."""
+
+
+def _physical(
+    name: str, default: float, unit: str, description: str, *, positive: bool = False, signed: bool = False
+) -> ParameterSpec:
+    minimum = None if signed else 0.0
+    return ParameterSpec(name, default, unit, description, minimum=minimum, exclusive_minimum=positive)
+
+
+PLANT_SPECS: tuple[ParameterSpec, ...] = (
+    _physical("inertia", 0.055, "kg m^2", "Inertia about the joint, M_c.", positive=True),
+    _physical("damping", 11.77, "N m s/rad", "Viscous friction, b_c."),
+    _physical("gravity", 1.678, "N m", "Gravity coefficient, G_c = m g l_c; 0 for a pendulum that lies flat."),
+    _physical("coulomb_friction", 0.0, "N m", "Dry friction while sliding fast, tau_C."),
+    _physical("static_friction", 0.0, "N m", "Dry friction at which sliding starts, tau_S >= tau_C."),
+    _physical("stribeck_velocity", 0.01, "rad/s", "Velocity over which tau_S falls to tau_C.", positive=True),
+    _physical("load_friction", 0.0, "-", "Dry friction per torque of gravity carried, added to tau_C."),
+    _physical("torque_offset", 0.0, "N m", "Constant torque that the sensor of effort misses.", signed=True),
+    _physical("angle_offset", 0.0, "rad", "Measured angle when hanging at rest.", signed=True),
+    _physical("effort_limit", 13.0, "N m", "Largest torque of the actuator.", positive=True),
+    _physical("actuator_time_constant", 0.0, "s", "First-order lag between command and torque; 0 for none."),
+    _physical("transport_delay", 0.0, "s", "Time between a command and its first effect."),
+)
+
+DRIVETRAIN_SPECS: tuple[ParameterSpec, ...] = (
+    _physical("gear_ratio", 1742.222, "-", "Motor turns per output turn, N.", positive=True),
+    _physical("torque_constant", 6.26e-3, "N m/A", "Torque per winding current at the motor, K_t.", positive=True),
+    _physical("back_emf_constant", 6.241e-3, "V s/rad", "Voltage per motor speed, K_e."),
+    _physical("winding_resistance", 9.99, "ohm", "Winding resistance at 20 degrees Celsius, R.", positive=True),
+    _physical("winding_temperature", 22.0, "degC", "Winding temperature at the start.", signed=True),
+    _physical("resistance_temperature_coefficient", 0.004, "1/K", "Relative change of R per kelvin."),
+    _physical("supply_voltage", 36.0, "V", "Supply voltage, V.", positive=True),
+    _physical("efficiency", 0.65, "-", "Share of motor torque that arrives at the output.", positive=True),
+    _physical("reflected_inertia", 0.19, "kg m^2", "Rotor inertia seen at the output, J_r N^2.", positive=True),
+    _physical("motor_damping", 1.4, "N m s/rad", "Viscous friction of motor and gears at the output, b_v."),
+    _physical("motor_coulomb_friction", 0.3, "N m", "Dry friction of motor and gears at the output, tau_C."),
+    _physical("motor_static_friction", 0.39, "N m", "Dry friction at which the motor starts to slide, tau_S."),
+    _physical("motor_stribeck_velocity", 0.01, "rad/s", "Velocity over which tau_S falls to tau_C.", positive=True),
+    _physical("stiffness", 100.0, "N m/rad", "Spring stiffness at small deflection, k.", positive=True),
+    _physical("stiffness_hardening", 0.0, "N m/rad^3", "Growth of the stiffness with the deflection squared."),
+    _physical("hysteresis_torque", 0.05, "N m", "Half width of the spring's hysteresis loop, tau_h."),
+    _physical("hysteresis_deflection", 2e-4, "rad", "Deflection over which the loop turns round.", positive=True),
+)
+
+
+@dataclass(frozen=True)
+class SeriesElasticParameters:
+    """Motor, gear train and spring of a series-elastic actuator; units and meaning in ``DRIVETRAIN_SPECS``.
+
+    Source: HEBI X5-9 datasheet values; friction and hysteresis from public logs of X5 actuators.
+    """
+
+    gear_ratio: float = 1742.222
+    torque_constant: float = 6.26e-3
+    back_emf_constant: float = 6.241e-3
+    winding_resistance: float = 9.99
+    winding_temperature: float = 22.0
+    resistance_temperature_coefficient: float = 0.004
+    supply_voltage: float = 36.0
+    efficiency: float = 0.65
+    reflected_inertia: float = 0.19
+    motor_damping: float = 1.4
+    motor_coulomb_friction: float = 0.3
+    motor_static_friction: float = 0.39
+    motor_stribeck_velocity: float = 0.01
+    stiffness: float = 100.0
+    stiffness_hardening: float = 0.0
+    hysteresis_torque: float = 0.05
+    hysteresis_deflection: float = 2e-4
+
+    def __post_init__(self) -> None:
+        """Check every value; a static friction below the sliding one would feed energy in."""
+        _check_fields(self, DRIVETRAIN_SPECS)
+        if self.motor_static_friction < self.motor_coulomb_friction:
+            raise ParameterError(
+                f"motor_static_friction is {self.motor_static_friction} N m; "
+                f"expected >= motor_coulomb_friction = {self.motor_coulomb_friction} N m"
+            )
+
+
+@dataclass(frozen=True)
+class PlantParameters:
+    """Parameters of M_c theta'' + b_c theta' + friction + G_c sin(theta) = u + d; see ``PLANT_SPECS`` for units.
+
+    ``static_friction`` may be left out (None) and is then the Coulomb friction.
+    """
+
+    inertia: float
+    damping: float
+    gravity: float
+    coulomb_friction: float = 0.0
+    static_friction: float = None  # type: ignore[assignment]  # filled in below
+    stribeck_velocity: float = 0.01
+    load_friction: float = 0.0
+    torque_offset: float = 0.0
+    angle_offset: float = 0.0
+    effort_limit: float = 13.0
+    actuator_time_constant: float = 0.0
+    transport_delay: float = 0.0
+    drivetrain: SeriesElasticParameters | None = None
+    name: str = field(default="unnamed", compare=False)
+
+    def __post_init__(self) -> None:
+        """Check every value and fill in the static friction."""
+        if self.static_friction is None:
+            object.__setattr__(self, "static_friction", self.coulomb_friction)  # type: ignore[unreachable]
+        _check_fields(self, PLANT_SPECS)
+        if self.static_friction < self.coulomb_friction:
+            raise ParameterError(
+                f"static_friction is {self.static_friction} N m; "
+                f"expected >= coulomb_friction = {self.coulomb_friction} N m"
+            )
+
+    def with_values(self, **changes: Any) -> PlantParameters:
+        """Return a copy with some values changed, checked again."""
+        return replace(self, **changes)
+
+
+def load_plant(preset_or_path: str | Path) -> PlantParameters:
+    """Return the parameters of a preset (``thesis``, ``x5_9``, ``dfki``) or of a plant file.
+
+    Raises:
+        ParameterError: No such preset or file, or the file is refused; the message names file and entry.
+    """
+    return load_plant_file(preset_or_path)[0]
+
+
+def load_plant_file(preset_or_path: str | Path) -> tuple[PlantParameters, dict[str, Any]]:
+    """Return the parameters and the file's provenance (intervals included under ``intervals``).
+
+    Raises:
+        ParameterError: as :func:`load_plant`.
+    """
+    path = _resolve(preset_or_path)
+    document = load_yaml(path, "plant file")
+    where = str(path)
+    reject_unknown(document, ("format", "name", "parameters", "drivetrain", "provenance"), where=where)
+    if document.get("format") != FORMAT:
+        raise ParameterError(f"{where}: format is {document.get('format')!r}; expected {FORMAT!r}")
+    if "parameters" not in document:
+        raise ParameterError(f"{where}: parameters is missing; expected a mapping of {_names(PLANT_SPECS)}")
+    values, intervals = _read_quantities(document["parameters"], PLANT_SPECS, f"{where}: parameters")
+    for required in ("inertia", "damping", "gravity"):
+        if required not in values:
+            unit = next(spec.unit for spec in PLANT_SPECS if spec.name == required)
+            raise ParameterError(f"{where}: parameters.{required} is missing; expected a value in {unit}")
+    drivetrain = None
+    if document.get("drivetrain") is not None:
+        drivetrain_values, more = _read_quantities(document["drivetrain"], DRIVETRAIN_SPECS, f"{where}: drivetrain")
+        intervals.update({f"drivetrain.{name}": interval for name, interval in more.items()})
+        drivetrain = _build(SeriesElasticParameters, drivetrain_values, where)
+    name = document.get("name", path.stem)
+    if not isinstance(name, str):
+        raise ParameterError(f"{where}: name is {name!r}; expected text")
+    parameters = _build(PlantParameters, {**values, "drivetrain": drivetrain, "name": name}, where)
+    provenance = dict(require_mapping(document.get("provenance") or {}, f"{where}: provenance"))
+    provenance["intervals"] = intervals
+    return parameters, provenance
+
+
+def write_plant(
+    path: str | Path,
+    parameters: PlantParameters,
+    *,
+    provenance: Mapping[str, Any] | None = None,
+    intervals: Mapping[str, Sequence[float]] | None = None,
+) -> Path:
+    """Write a plant file that :func:`load_plant` reads back to the same values.
+
+    The file appears whole or not at all.
+
+    Args:
+        path: Where to write.
+        parameters: The values.
+        provenance: Data, method, date: plain YAML values.
+        intervals: 95 % interval by parameter name, in the parameter's unit.
+
+    Raises:
+        ParameterError: The file cannot be written.
+    """
+    path = Path(path)
+    document: dict[str, Any] = {
+        "format": FORMAT,
+        "name": parameters.name,
+        "parameters": _quantities(parameters, PLANT_SPECS, intervals or {}),
+    }
+    if parameters.drivetrain is not None:
+        document["drivetrain"] = _quantities(parameters.drivetrain, DRIVETRAIN_SPECS, {})
+    if provenance:
+        document["provenance"] = dict(provenance)
+    text = dump_yaml(document, f"plant file {path}")
+    temporary = path.with_name(f".{path.name}.{os.getpid()}")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        temporary.write_text(text, encoding="utf-8")
+        temporary.replace(path)
+    except (OSError, ValueError) as error:
+        with suppress(OSError, ValueError):
+            temporary.unlink(missing_ok=True)
+        reason = error.strerror if isinstance(error, OSError) else str(error)
+        raise ParameterError(f"plant file {path} cannot be written: {reason}") from error
+    return path
+
+
+def _resolve(preset_or_path: str | Path) -> Path:
+    text = str(preset_or_path)
+    if text in PRESETS:
+        return Path(str(resources.files("pendulum_msgs_py.plants") / "presets" / f"{text}.yaml"))
+    path = Path(text).expanduser()
+    if not path.exists() and "/" not in text and path.suffix == "":
+        raise ParameterError(
+            f"plant is {text!r}; expected one of the presets {', '.join(PRESETS)} or the path of a plant file"
+        )
+    return path
+
+
+def _read_quantities(
+    entries: object, specs: Sequence[ParameterSpec], where: str
+) -> tuple[dict[str, float], dict[str, list[float]]]:
+    mapping = require_mapping(entries, where)
+    table = {spec.name: spec for spec in specs}
+    reject_unknown(mapping, table, where=where)
+    values: dict[str, float] = {}
+    intervals: dict[str, list[float]] = {}
+    for name, entry in mapping.items():
+        spec = table[name]
+        if not isinstance(entry, dict):
+            raise ParameterError(
+                f"{where}.{name} is {entry!r}; expected {{value: NUMBER, unit: {spec.unit}}}"
+            )
+        reject_unknown(entry, ("value", "unit", "interval"), where=f"{where}.{name}")
+        unit = entry.get("unit")
+        if unit != spec.unit:
+            given = "missing" if unit is None else repr(unit)
+            raise ParameterError(f"{where}.{name}: unit is {given}; expected {spec.unit!r}")
+        if "value" not in entry:
+            raise ParameterError(f"{where}.{name}: value is missing; expected a number in {spec.unit}")
+        values[name] = spec.check(entry["value"], where=where)
+        if entry.get("interval") is not None:
+            intervals[name] = _check_interval(entry["interval"], f"{where}.{name}", spec.unit)
+    return values, intervals
+
+
+def _check_interval(interval: object, where: str, unit: str) -> list[float]:
+    if (
+        isinstance(interval, list)
+        and len(interval) == 2
+        and all(type(bound) in {int, float} and abs(bound) <= sys.float_info.max for bound in interval)
+        and interval[0] <= interval[1]
+    ):
+        return [float(bound) for bound in interval]
+    raise ParameterError(f"{where}: interval is {interval!r}; expected [low, high] in {unit}")
+
+
+def _quantities(
+    parameters: object, specs: Sequence[ParameterSpec], intervals: Mapping[str, Sequence[float]]
+) -> dict[str, dict[str, Any]]:
+    quantities: dict[str, dict[str, Any]] = {}
+    for spec in specs:
+        entry: dict[str, Any] = {"value": float(getattr(parameters, spec.name)), "unit": spec.unit}
+        if spec.name in intervals:
+            entry["interval"] = [float(bound) for bound in intervals[spec.name]]
+        quantities[spec.name] = entry
+    return quantities
+
+
+def _build(kind: type[Any], values: Mapping[str, Any], where: str) -> Any:
+    try:
+        return kind(**values)
+    except ParameterError as error:
+        raise ParameterError(f"{where}: {error}") from error
+
+
+def _check_fields(instance: object, specs: Sequence[ParameterSpec]) -> None:
+    for spec in specs:
+        object.__setattr__(instance, spec.name, spec.check(getattr(instance, spec.name)))
+
+
+def _names(specs: Sequence[ParameterSpec]) -> str:
+    return ", ".join(spec.name for spec in specs)

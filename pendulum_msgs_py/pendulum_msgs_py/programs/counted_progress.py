@@ -1,0 +1,70 @@
+"""Progress of work that is counted in pieces and kept piece by piece, in the terminal."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import typer
+from rich.console import Console
+from rich.progress import (
+    BarColumn,
+    MofNCompleteColumn,
+    Progress,
+    ProgressColumn,
+    TextColumn,
+    TimeRemainingColumn,
+)
+
+from pendulum_msgs_py.programs.executables import EXIT_INTERRUPTED
+
+__all__ = ["counted_progress", "counting_bar", "resumable"]
+
+
+def counting_bar(console: Console, *columns: ProgressColumn) -> Progress:
+    """Return a bar that counts pieces and leaves nothing behind; in a file or a pipe it draws nothing.
+
+    Args:
+        console: Where to draw.
+        columns: What stands at its right end.
+    """
+    return Progress(
+        TextColumn("{task.description}"), BarColumn(bar_width=None), MofNCompleteColumn(), *columns,
+        console=console, transient=True, disable=not console.is_terminal,
+    )  # fmt: skip
+
+
+@contextmanager
+def resumable(console: Console, folder: Path) -> Iterator[None]:
+    """Turn Ctrl-C into a sentence that says how the work in a folder is gone on with.
+
+    Raises:
+        typer.Exit: The user interrupted, after the sentence.
+    """
+    try:
+        yield
+    except KeyboardInterrupt:
+        console.print(f"interrupted: the same command with --out {folder} goes on where it stopped", soft_wrap=True)
+        raise typer.Exit(EXIT_INTERRUPTED) from None
+
+
+@contextmanager
+def counted_progress(console: Console, unit: str, total: int, folder: Path) -> Iterator[Callable[[int, int], None]]:
+    """Show a bar with the remaining time while resumable work goes on.
+
+    Args:
+        console: Where to draw.
+        unit: What is counted, as a plural.
+        total: How many there are.
+        folder: Where the work keeps what it has done.
+
+    Yields:
+        What the work calls with pieces done and in all.
+
+    Raises:
+        typer.Exit: The user interrupted.
+    """
+    with resumable(console, folder), counting_bar(console, TimeRemainingColumn()) as bar:
+        task = bar.add_task(unit, total=total)
+        yield lambda done, of: bar.update(task, completed=done, total=of)

@@ -1,0 +1,216 @@
+"""One way to start every program of the project: ``ros2 run PKG EXE``, ``python -m PKG EXE`` and ``install/``.
+
+Each package has a table ``EXECUTABLES`` (name -> ``module:function``) in its ``executables`` module. The console
+scripts of ``setup.py`` and ``python -m`` both read it, so neither can offer what the other lacks.
+"""
+
+from __future__ import annotations
+
+import ast
+import importlib
+import importlib.util
+import os
+import re
+import sys
+from collections.abc import Sequence
+from difflib import get_close_matches
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from pendulum_msgs_py.errors import PendulumError
+from pendulum_msgs_py.programs import completion
+
+if TYPE_CHECKING:
+    import typer
+
+__all__ = [
+    "EXIT_INTERRUPTED",
+    "EXIT_USAGE",
+    "cli_main",
+    "is_exhaustion",
+    "print_text",
+    "report_error",
+    "report_exhaustion",
+    "run_package",
+    "summary",
+]
+
+EXIT_USAGE = 2
+"""Exit code of a program that was asked for something it cannot do."""
+EXIT_INTERRUPTED = 130
+"""Exit code after Ctrl-C, by the shell's convention of 128 + SIGINT."""
+
+
+def run_package(package: str, argv: Sequence[str] | None = None) -> int:
+    """Run ``python -m package EXE ARGS`` and return the exit code.
+
+    Args:
+        package: Import name of the package.
+        argv: Executable name and its arguments; by default those of the process.
+    """
+    importlib.import_module("pendulum_msgs_py.programs.one_thread")
+    arguments = list(sys.argv[1:] if argv is None else argv)
+    table: dict[str, str] = importlib.import_module(f"{package}.executables").EXECUTABLES
+    if completion.asked() and len(arguments) < 2:
+        print_text("\n".join(completion.of_package(table, arguments)))
+        return 0
+    if arguments and arguments[0] == "--completion":
+        try:
+            print_text(completion.script(arguments[1] if len(arguments) > 1 else "bash"))
+        except PendulumError as error:
+            return report_error(error)
+        return 0
+    if not arguments or arguments[0] in {"-h", "--help"}:
+        print_text(_usage(package, table))
+        return 0 if arguments else EXIT_USAGE
+    name, *rest = arguments
+    if name not in table:
+        near = get_close_matches(name, table, n=1)
+        hint = f"; did you mean {near[0]!r}?" if near else ""
+        expected = ", ".join(sorted(table))
+        print(f"error: {package} has no executable {name!r}; expected one of {expected}{hint}", file=sys.stderr)
+        return EXIT_USAGE
+    module_name, function_name = table[name].split(":")
+    try:
+        main = getattr(importlib.import_module(module_name), function_name)
+        return int(main(rest) or 0)
+    except KeyboardInterrupt:
+        # Ctrl-C while the modules are still loading: nothing runs yet that could say so itself.
+        print("interrupted", file=sys.stderr)
+        return EXIT_INTERRUPTED
+    except Exception as error:
+        if code := report_exhaustion(error):
+            return code
+        raise
+
+
+def split_ros_arguments(arguments: Sequence[str]) -> tuple[list[str], list[str]]:
+    """Return a program's own arguments, and those of ROS: from ``--ros-args`` on."""
+    split = arguments.index("--ros-args") if "--ros-args" in arguments else len(arguments)
+    return list(arguments[:split]), list(arguments[split:])
+
+
+def cli_main(
+    app: typer.Typer, argv: Sequence[str] | None = None, *, name: str | None = None, takes_ros_arguments: bool = False
+) -> int:
+    """Run a typer application and return its exit code; our own errors end as one sentence.
+
+    Args:
+        app: The application.
+        argv: Arguments; by default those of the process.
+        name: Program name for the help text, such as ``python -m pendulum_lqr design``.
+        takes_ros_arguments: Arguments from ``--ros-args`` on belong to ROS; the command finds them in ``context.obj``.
+    """
+    # Imported late: a node that has no command line should not pay for typer and rich.
+    import typer.main
+
+    # typer brings a click of its own, which is no other click's: its errors are found through what it exports.
+    usage_error: Any = next(kind for kind in typer.BadParameter.__mro__ if kind.__name__ == "ClickException")
+    command = typer.main.get_command(app)
+    arguments = list(sys.argv[1:] if argv is None else argv)
+    own, ros = split_ros_arguments(arguments) if takes_ros_arguments else (arguments, [])
+    if completion.asked():
+        print_text("\n".join(completion.of_command(command, own)))
+        return 0
+    try:
+        result = command.main(args=own, prog_name=name, standalone_mode=False, obj=ros)
+        # What is still buffered would else meet a broken pipe at exit, where nobody can catch it.
+        sys.stdout.flush()
+    except PendulumError as error:
+        return report_error(error)
+    except (typer.Abort, KeyboardInterrupt):
+        print("interrupted", file=sys.stderr)
+        return EXIT_INTERRUPTED
+    except typer.Exit as stop:
+        return int(stop.exit_code)
+    except usage_error as error:
+        error.show()
+        return int(error.exit_code)
+    except BrokenPipeError:
+        _discard_output()
+        return 0
+    except SystemExit as stop:
+        # click turns a broken pipe into exit code 1, also where it should leave exits to us.
+        if isinstance(stop.__context__, BrokenPipeError):
+            _discard_output()
+            return 0
+        return stop.code if isinstance(stop.code, int) else int(stop.code is not None)
+    if result == EXIT_INTERRUPTED:
+        print("interrupted", file=sys.stderr)
+    return int(result) if isinstance(result, int) else 0
+
+
+def print_text(text: str) -> None:
+    """Print a text; a reader that has gone (``| head``) is no error."""
+    try:
+        print(text, flush=True)
+    except BrokenPipeError:
+        _discard_output()
+
+
+def _discard_output() -> None:
+    """Send what is still buffered nowhere: the reader of our output has gone, nothing is left to say."""
+    with Path(os.devnull).open("w", encoding="utf-8") as nowhere:
+        os.dup2(nowhere.fileno(), sys.stdout.fileno())
+
+
+def report_error(error: BaseException) -> int:
+    """Print an error as one sentence on standard error and return the exit code for it."""
+    print(f"error: {error}", file=sys.stderr, flush=True)
+    return EXIT_USAGE
+
+
+def is_exhaustion(error: BaseException) -> bool:
+    """Tell whether an error says, in one library's words or another's, that memory is exhausted."""
+    return isinstance(error, MemoryError) or any(sign in str(error) for sign in _SIGNS_OF_EXHAUSTION)
+
+
+def report_exhaustion(error: BaseException) -> int:
+    """Say in one sentence that a limit of the process's memory was met, and return exit code 1; 0 for other errors.
+
+    Under a limit it is chance who meets it: Python, the loader of a library, or a library that starts a thread.
+    """
+    if not is_exhaustion(error):
+        return 0
+    text = str(error)
+    first = text.splitlines()[0] if text else "no more could be had"
+    print(f"error: memory is exhausted: {first}", file=sys.stderr, flush=True)
+    return 1
+
+
+_SIGNS_OF_EXHAUSTION = (
+    "failed to map segment",
+    "annot allocate memory",
+    "bad_alloc",
+    "ould not allocate",
+    "pthread_create failed",
+    "can't start new thread",
+)
+
+
+def summary(name: str, target: str) -> str:
+    """Return what a program is for: the first line of its module's docstring, read without importing the module.
+
+    Args:
+        name: The program; where the line speaks of several (```one``: this; ``other``: that``), its part is returned.
+        target: Its entry point, ``module:function``.
+    """
+    try:
+        spec = importlib.util.find_spec(target.partition(":")[0])
+    except (ImportError, ValueError):  # help must not fail for want of a module that nobody runs yet
+        spec = None
+    source = Path(spec.origin).read_text(encoding="utf-8") if spec is not None and spec.origin else ""
+    text = (ast.get_docstring(ast.parse(source)) or "").partition("\n")[0]
+    own = re.search(rf"``{re.escape(name)}``: (.*?)(?:; ``|$)", text)
+    words = own.group(1) if own else text.partition(": ")[2] or text
+    return words[:1].upper() + words[1:].rstrip(".").replace("``", "")
+
+
+def _usage(package: str, table: dict[str, str]) -> str:
+    names = sorted(table)
+    lines = [f"usage: python -m {package} EXECUTABLE [ARGUMENTS]", "", "executables:"]
+    width = max(len(name) for name in names)
+    lines += [f"  {name:<{width}}  {summary(name, table[name])}".rstrip() for name in names]
+    lines += ["", f"example: python -m {package} {names[0]} --help"]
+    lines += [f"completion with the Tab key, in bash or zsh: source <(python -m {package} --completion bash)"]
+    return "\n".join(lines)

@@ -1,0 +1,281 @@
+"""Who may say and hear what: least permissions of each node, and the SROS 2 policy that grants them.
+
+``python -m pendulum_msgs_py.programs.security > policy.xml`` writes the policy of both plants for ``ros2 security``
+(https://design.ros2.org/articles/ros2_access_control_policies.html). What a node needs is stated here once, from the
+names that the nodes themselves use; a test compares it with what the nodes do on a running graph.
+
+The player of recordings has no permissions: it says again whatever a bag holds, and belongs on a domain without plants.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, fields
+from xml.etree import ElementTree
+
+from pendulum_msgs_py.contract import names
+from pendulum_msgs_py.errors import ParameterError
+
+__all__ = ["BESIDE_PLANTS", "NODES", "PLANTS", "Permissions", "enclaves", "granted", "policy"]
+
+_PARAMETERS = (
+    "~/describe_parameters",
+    "~/get_parameter_types",
+    "~/get_parameters",
+    "~/get_type_description",
+    "~/list_parameters",
+    "~/set_parameters",
+    "~/set_parameters_atomically",
+)
+_NO_PARAMETERS = ("~/get_type_description",)
+_LIFECYCLE = (
+    "~/change_state",
+    "~/get_available_states",
+    "~/get_available_transitions",
+    "~/get_state",
+    "~/get_transition_graph",
+)
+_LOGGER = ("~/get_logger_levels", "~/set_logger_levels")
+_EVERY_PUBLISHER = ("/parameter_events", "/rosout")
+_EVERY_SUBSCRIPTION = (names.CLOCK, "/parameter_events")
+_PLANT_SUBSCRIPTIONS = (names.EFFORT_COMMAND, names.DISTURBANCE, names.PUSH, names.JOINT_TRAJECTORY)
+_PLANT_PUBLISHERS = (names.JOINT_STATES, names.APPLIED_EFFORT, names.EVENTS, names.DIAGNOSTICS)
+_PLANT_SERVICES = (names.ARM, names.E_STOP, names.E_STOP_RESET)
+
+
+_PLANT = "{plant}/"
+"""Before the name of a service: that of the plant on each side."""
+_SIDE = "{side}/"
+"""Before a name: on each side."""
+_PROCEDURE = "{procedure}/"
+"""Before the name of a service: that of the procedure, on each side that has one."""
+_ANY = "{any}/"
+"""Before the name of a service: that of every node that has parameters."""
+_RECORDED = "{recorded}"
+"""Every topic that nodes of a side publish there."""
+_READ_PARAMETERS = (_ANY + "list_parameters", _ANY + "get_parameters")
+_WATCHED = (names.APPLIED_EFFORT, names.DISTURBANCE, names.PUSH)
+
+
+@dataclass(frozen=True)
+class Permissions:
+    """What one node may do.
+
+    In :data:`NODES` names are as the node writes them: relative, private (``~/``) or absolute, and with placeholders
+    where a node has to do with several others; :func:`granted` writes them out.
+
+    Attributes:
+        publish: Topics that it may speak on.
+        subscribe: Topics that it may hear.
+        reply: Services that it may offer.
+        request: Services that it may call.
+    """
+
+    publish: tuple[str, ...] = ()
+    subscribe: tuple[str, ...] = ()
+    reply: tuple[str, ...] = ()
+    request: tuple[str, ...] = ()
+
+
+_RECORDER = Permissions(
+    subscribe=(_RECORDED, names.DIAGNOSTICS, names.CLOCK),
+    reply=("~/start", "~/stop", "~/annotate", "~/status"),
+    request=_READ_PARAMETERS,
+)
+
+NODES: dict[str, Permissions] = {
+    "simulator": Permissions(
+        publish=(*_PLANT_PUBLISHERS, names.CLOCK),
+        subscribe=(*_PLANT_SUBSCRIPTIONS, "~/set_state"),
+        reply=(*_PLANT_SERVICES, "~/reset", "~/pause", "~/step"),
+    ),
+    "bridge": Permissions(
+        publish=(
+            *_PLANT_PUBLISHERS,
+            names.CLOCK,
+            "actuator/feedback",
+            "actuator/winding_temperature",
+            "actuator/supply",
+            "~/transition_event",
+        ),
+        subscribe=_PLANT_SUBSCRIPTIONS,
+        reply=(*_PLANT_SERVICES, *_LIFECYCLE),
+    ),
+    "controller": Permissions(
+        publish=(names.EFFORT_COMMAND, names.DIAGNOSTICS, "~/transition_event"),
+        subscribe=(names.JOINT_STATES,),
+        reply=(*_LIFECYCLE, *_LOGGER),
+    ),
+    "effort_controller": Permissions(
+        publish=(names.EFFORT_COMMAND, names.DIAGNOSTICS),
+        subscribe=(names.JOINT_STATES, "~/commands", "joint_commands"),
+    ),
+    "disturbance": Permissions(
+        publish=(names.DISTURBANCE, names.EVENTS, names.DIAGNOSTICS),
+        subscribe=(names.JOINT_STATES,),
+        reply=("~/start", "~/stop", *_LOGGER),
+    ),
+    "procedure": Permissions(
+        publish=(names.EFFORT_COMMAND, names.PUSH, names.JOINT_TRAJECTORY, names.EVENTS),
+        subscribe=(names.JOINT_STATES, names.EVENTS),
+        reply=("~/start", "~/finish"),
+    ),
+    "recorder": _RECORDER,
+    "viewer": Permissions(subscribe=(names.JOINT_STATES, *_WATCHED), reply=("~/snapshot",)),
+    "markers": Permissions(publish=("markers",), subscribe=_WATCHED),
+    "conductor": Permissions(
+        publish=(_SIDE + names.JOINT_TRAJECTORY, _SIDE + names.EVENTS),
+        subscribe=(_SIDE + names.JOINT_STATES, _SIDE + names.EVENTS),
+        request=(
+            *(_PLANT + service for service in ("arm", "e_stop", "pause")),
+            _SIDE + "controller/change_state",
+            _SIDE + "disturbance/start",
+            _SIDE + "recorder/status",
+            _PROCEDURE + "start",
+            _PROCEDURE + "finish",
+        ),
+    ),
+    "console": Permissions(
+        subscribe=(
+            names.DIAGNOSTICS,
+            *(
+                _SIDE + name
+                for name in (
+                    names.EVENTS, names.JOINT_STATES, names.EFFORT_COMMAND, names.DISTURBANCE, names.APPLIED_EFFORT
+                )
+            ),
+        ),
+        request=(
+            *_READ_PARAMETERS,
+            *(_PLANT + service for service in ("arm", "e_stop", "e_stop_reset")),
+            *(_SIDE + service for service in ("disturbance/start", "disturbance/stop")),
+            *(_SIDE + node + "/set_parameters" for node in ("controller", "disturbance")),
+        ),
+    ),
+}
+"""Permissions of the nodes, beyond those of every node (parameters, log, clock)."""
+
+PLANTS = {"/sim": "simulator", "/hw": "bridge"}
+"""Namespace of each side, and its plant."""
+
+BESIDE_PLANTS = {"conductor": "/conductor", "console": "/console", "recorder": "/recorder"}
+"""Nodes that have to do with all sides, in the root namespace, and the enclave of each: that of its process."""
+
+_SIDE_NODES = ("controller", "effort_controller", "disturbance", "recorder", "viewer", "markers")
+_WITH_PLANT = {"bridge": ("procedure",)}
+_WITHOUT_PARAMETERS = {"conductor"}
+
+
+def _resolve(name: str, node: str, namespace: str) -> str:
+    """Return a name in full: ``~/arm`` of ``simulator`` in ``/sim`` is ``/sim/simulator/arm``."""
+    if name.startswith("/"):
+        return name
+    base = namespace.rstrip("/")
+    return f"{base}/{node}/{name[2:]}" if name.startswith("~/") else f"{base}/{name}"
+
+
+def granted(plants: Iterable[tuple[str, str]] = tuple(PLANTS.items())) -> dict[str, Permissions]:
+    """Return what each node may do, in full names: full name of the node -> permissions.
+
+    Args:
+        plants: Namespace and node of each plant.
+
+    Raises:
+        ParameterError: A node is no plant.
+    """
+    sides = dict(plants)
+    if unknown := set(sides.values()) - set(PLANTS.values()):
+        raise ParameterError(f"plant is {min(unknown)}; expected one of {', '.join(PLANTS.values())}")
+    nodes = [
+        (side, node)
+        for side, plant in sides.items()
+        for node in (plant, *_WITH_PLANT.get(plant, ()), *_SIDE_NODES)
+    ]
+    with_parameters = [_resolve(node, "", side) for side, node in nodes]
+    with_parameters += [f"/{node}" for node in BESIDE_PLANTS if node not in _WITHOUT_PARAMETERS]
+
+    spoken: set[str] = set()  # filled with what the nodes publish, before anybody may record it
+
+    def written_out(name: str, node: str, here: str) -> set[str]:
+        around = [here] if here != "/" else list(sides)
+        if name == _RECORDED:
+            return {topic for topic in spoken if any(topic.startswith(_resolve("", "", side)) for side in around)}
+        if name.startswith(_ANY):
+            return {f"{other}/{name.removeprefix(_ANY)}" for other in with_parameters}
+        if name.startswith(_PLANT):
+            return {f"{_resolve(sides[side], '', side)}/{name.removeprefix(_PLANT)}" for side in around}
+        if name.startswith(_PROCEDURE):
+            service = name.removeprefix(_PROCEDURE)
+            return {f"{other}/{service}" for other in with_parameters if other.endswith("/procedure")}
+        if name.startswith(_SIDE):
+            return {_resolve(name.removeprefix(_SIDE), "", side) for side in around}
+        return {_resolve(name, node, here)}
+
+    nodes += [("/", node) for node in BESIDE_PLANTS]
+    for here, node in nodes:
+        spoken |= set().union(*(written_out(name, node, here) for name in NODES[node].publish))
+    spoken -= {names.CLOCK, names.DIAGNOSTICS}
+    answer = {}
+    for here, node in nodes:
+        own = NODES[node]
+        full = Permissions(
+            (*own.publish, *_EVERY_PUBLISHER),
+            (*own.subscribe, *_EVERY_SUBSCRIPTION),
+            (*own.reply, *(_NO_PARAMETERS if node in _WITHOUT_PARAMETERS else _PARAMETERS)),
+            own.request,
+        )
+        entries = {
+            rule.name: set().union(*(written_out(name, node, here) for name in getattr(full, rule.name)))
+            for rule in fields(full)
+        }
+        me = _resolve(node, "", here)
+        # A node does not ask itself for its parameters.
+        entries["request"] = {name for name in entries["request"] if name.rpartition("/")[0] != me}
+        answer[me] = Permissions(**{rule: tuple(sorted(found)) for rule, found in entries.items()})
+    return answer
+
+
+def enclaves(plants: Iterable[tuple[str, str]] = tuple(PLANTS.items())) -> dict[str, dict[str, Permissions]]:
+    """Return the enclaves of all nodes, one for each process: path -> full name of the node -> permissions."""
+    answer: dict[str, dict[str, Permissions]] = {}
+    for full, allowed in granted(plants).items():
+        answer.setdefault(BESIDE_PLANTS.get(full[1:], full), {})[full] = allowed
+    return answer
+
+
+def policy(plants: Iterable[tuple[str, str]] = tuple(PLANTS.items())) -> str:
+    """Return the SROS 2 policy of plants and of all that has to do with them.
+
+    Args:
+        plants: Namespace and node of each plant.
+    """
+    root = ElementTree.Element("policy", version="0.2.0")
+    listed = ElementTree.SubElement(root, "enclaves")
+    for path, nodes in enclaves(plants).items():
+        enclave = ElementTree.SubElement(listed, "enclave", path=path)
+        profiles = ElementTree.SubElement(enclave, "profiles")
+        for full, allowed in nodes.items():
+            namespace, _, node = full.rpartition("/")
+            profile = ElementTree.SubElement(profiles, "profile", ns=namespace or "/", node=node)
+            for kind, rule, entries in (
+                ("topics", "publish", allowed.publish),
+                ("topics", "subscribe", allowed.subscribe),
+                ("services", "reply", allowed.reply),
+                ("services", "request", allowed.request),
+            ):
+                group = ElementTree.SubElement(profile, kind, {rule: "ALLOW"}) if entries else profile
+                for name in entries:
+                    ElementTree.SubElement(group, kind[:-1]).text = name
+    ElementTree.indent(root)
+    return '<?xml version="1.0" encoding="UTF-8"?>\n' + ElementTree.tostring(root, encoding="unicode") + "\n"
+
+
+def main(_: Sequence[str] | None = None) -> int:
+    """Write the policy to the standard output."""
+    sys.stdout.write(policy())
+    return 0
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())
