@@ -1,13 +1,14 @@
 """What a gain does: time constant, damping, margins, and how slowly one may sample.
 
-Margins are those of the loop cut at the plant's input, L(s) = K (s I - A)^-1 B, by python-control.
+Margins are those of the loop cut at the plant's input, L(s) = K (s I - A)^-1 B exp(-s delay), by python-control. A gain
+of two numbers acts on what is measured, K [theta, theta_dot]; one of n numbers on the whole state.
 """
 
 from __future__ import annotations
 
 import math
 import warnings
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -56,8 +57,9 @@ class LoopReport:
     """Everything the design table shows about one gain.
 
     Attributes:
-        K: Gain (theta, theta_dot) [N m/rad, N m s/rad].
-        poles: Closed-loop eigenvalues, slowest first [1/s].
+        K: Gain (theta, theta_dot, ...) [N m/rad, N m s/rad, ...].
+        poles: Closed-loop eigenvalues without the plant's delay, slowest first [1/s].
+        stable: Whether the loop is stable, the plant's delay included.
         time_constant: -1 / (largest real part), inf if unstable [s].
         damping_ratio: Smallest damping ratio of the poles [-]; 1 for real stable ones.
         natural_frequency: Magnitude of the slowest pole [rad/s].
@@ -67,6 +69,7 @@ class LoopReport:
 
     K: tuple[float, ...]
     poles: tuple[complex, ...]
+    stable: bool
     time_constant: float
     damping_ratio: float
     natural_frequency: float
@@ -85,9 +88,9 @@ def closed_loop_poles(model: LinearModel, K: ArrayLike) -> NDArray[np.complex128
 
     Args:
         model: Linear model.
-        K: Gain, shape (2,).
+        K: Gain, shape (2,) or (n,).
     """
-    return sort_poles(np.linalg.eigvals(model.A - model.B @ np.atleast_2d(np.asarray(K, dtype=np.float64))))
+    return sort_poles(np.linalg.eigvals(model.A - model.B @ _on_state(model, K)))
 
 
 def analyse(model: LinearModel, K: ArrayLike | None) -> LoopReport:
@@ -95,7 +98,7 @@ def analyse(model: LinearModel, K: ArrayLike | None) -> LoopReport:
 
     Args:
         model: Linear model.
-        K: Gain, shape (2,).
+        K: Gain, shape (2,) or (n,).
     """
     gain = np.zeros(2) if K is None else np.asarray(K, dtype=np.float64)
     poles = closed_loop_poles(model, gain)
@@ -104,6 +107,7 @@ def analyse(model: LinearModel, K: ArrayLike | None) -> LoopReport:
     return LoopReport(
         K=tuple(float(value) for value in gain),
         poles=tuple(complex(pole) for pole in poles),
+        stable=slowest < 0.0 and (K is None or model.delay == 0.0 or _bears_its_delay(model, gain)),
         time_constant=-1.0 / slowest if slowest < 0.0 else math.inf,
         damping_ratio=float(min(ratios)),
         natural_frequency=float(abs(poles[0])),
@@ -113,39 +117,46 @@ def analyse(model: LinearModel, K: ArrayLike | None) -> LoopReport:
 
 
 def loop_transfer(model: LinearModel, K: ArrayLike, omega: ArrayLike) -> NDArray[np.complex128]:
-    """Return L(j omega) = K (j omega I - A)^-1 B.
+    """Return L(j omega) = K (j omega I - A)^-1 B exp(-j omega delay).
 
     Args:
         model: Linear model.
-        K: Gain, shape (2,).
+        K: Gain, shape (2,) or (n,).
         omega: Angular frequencies, shape (n,) [rad/s].
     """
-    k0, k1 = np.asarray(K, dtype=np.float64)
     s = 1j * np.asarray(omega, dtype=np.float64)
-    b = float(model.B[1, 0])
-    return np.asarray(b * (k0 + k1 * s) / (s * s - model.A[1, 1] * s - model.A[1, 0]), dtype=np.complex128)
+    pencil = s[:, None, None] * np.eye(model.A.shape[0]) - model.A
+    states = np.linalg.solve(pencil, np.broadcast_to(model.B, (s.size, *model.B.shape)))[:, :, 0]
+    loop = (states @ _on_state(model, K)[0]) * np.exp(-s * model.delay)
+    return np.asarray(loop, dtype=np.complex128)
 
 
 def loop_margins(model: LinearModel, K: ArrayLike) -> Margins:
-    """Return the margins of the loop cut at the plant's input.
+    """Return the margins of the loop cut at the plant's input, the plant's delay included.
 
     Args:
         model: Linear model.
-        K: Gain, shape (2,), that stabilises the model.
+        K: Gain, shape (2,) or (n,), that stabilises the model.
     """
     # Imported late: python-control brings matplotlib, which a controller node has no use for.
     import control
 
-    k0, k1 = (float(value) for value in np.asarray(K, dtype=np.float64))
-    b = float(model.B[1, 0])
-    loop = control.tf([b * k1, b * k0], [1.0, -float(model.A[1, 1]), -float(model.A[1, 0])])
+    gain = _on_state(model, K)
+    if model.delay == 0.0:
+        # det(sI - A + B K) = det(sI - A) (1 + L)
+        open_loop = np.poly(model.A)
+        loop = control.tf(np.poly(model.A - model.B @ gain) - open_loop, open_loop)
+    else:
+        # No rational function has a delay: by its frequency response, up to where the loop has long gone.
+        omega = np.logspace(-4, math.log10(_last_frequency(model, gain)), 20_001)
+        loop = control.frd(loop_transfer(model, gain[0], omega), omega, smooth=True)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         gains, phases, _, _, crossovers, _ = control.stability_margins(loop, returnall=True)
     gains = np.asarray(gains, dtype=np.float64)
     # The gain margin at zero frequency: an unstable plant needs some gain at rest, |L(0)| > 1.
-    dc = float(model.A[1, 0])
-    down = [g for g in gains if g < 1.0] + ([dc / (b * k0)] if dc > 0.0 and b * k0 > dc else [])
+    rest = -float((gain @ np.linalg.lstsq(model.A, model.B, rcond=None)[0])[0, 0])
+    down = [g for g in gains if g < 1.0] + ([-1.0 / rest] if rest < -1.0 else [])
     up = [g for g in gains if g > 1.0]
     phases = np.radians(np.asarray(phases, dtype=np.float64))
     crossovers = np.asarray(crossovers, dtype=np.float64)
@@ -154,8 +165,8 @@ def loop_margins(model: LinearModel, K: ArrayLike) -> Margins:
         phase, crossover = float(phases[index]), float(crossovers[index])
     else:
         phase, crossover = math.nan, math.nan
-    grid = np.concatenate([[0.0], np.logspace(-4, 6, 4001)])
-    modulus = float(np.min(np.abs(1.0 + loop_transfer(model, (k0, k1), grid))))
+    grid = np.logspace(-4, 6, 4001)
+    modulus = float(np.min(np.abs(1.0 + loop_transfer(model, gain[0], grid))))
     return Margins(
         gain_up=float(min(up)) if up else math.inf,
         gain_down=float(max(down)) if down else 0.0,
@@ -171,13 +182,13 @@ def delayed_spectral_radius(model: LinearModel, K: ArrayLike, period: float, del
 
     Args:
         model: Linear model.
-        K: Gain on [theta, theta_dot], shape (2,).
+        K: Gain, shape (2,) or (n,).
         period: Sampling period [s].
-        delay: Time from state to torque [s].
+        delay: Time from state to torque, beyond the model's own [s].
     """
     sampled: DiscreteModel = discretise(model, period, delay)
     feedback = np.zeros((1, sampled.A.shape[0]))
-    feedback[0, :2] = np.asarray(K, dtype=np.float64)
+    feedback[:, : model.A.shape[0]] = _on_state(model, K)
     return float(np.max(np.abs(np.linalg.eigvals(sampled.A - sampled.B @ feedback))))
 
 
@@ -186,14 +197,32 @@ def largest_stable_period(model: LinearModel, K: ArrayLike) -> float:
 
     Args:
         model: Linear model.
-        K: Gain on [theta, theta_dot], shape (2,).
+        K: Gain, shape (2,) or (n,).
     """
     return _first_unstable(lambda period: delayed_spectral_radius(model, K, period) < 1.0, model)
 
 
+def _on_state(model: LinearModel, K: ArrayLike) -> NDArray[np.float64]:
+    """Return the gain on the whole state, shape (1, n)."""
+    gain = np.atleast_2d(np.asarray(K, dtype=np.float64))
+    return gain if gain.shape[1] == model.A.shape[0] else np.asarray(gain @ model.C)
+
+
+def _bears_its_delay(model: LinearModel, K: ArrayLike) -> bool:
+    return model.delay < loop_margins(replace(model, delay=0.0), K).delay
+
+
+def _last_frequency(model: LinearModel, gain: NDArray[np.float64]) -> float:
+    """Return a frequency beyond which the loop has fallen below 1/100 [rad/s]."""
+    omega = np.logspace(0, 7, 400)
+    loud = np.abs(loop_transfer(model, gain[0], omega)) > 0.01
+    return float(omega[min(int(np.max(np.nonzero(loud)[0], initial=0)) + 1, omega.size - 1)])
+
+
 def _first_unstable(stable: Any, model: LinearModel) -> float:
     fastest = float(np.max(np.abs(model.poles)))
-    low = 1e-3 / max(fastest, 1e-3)
+    # A delay of very many periods makes very many states, and is hardly sampled any more.
+    low = max(1e-3 / max(fastest, 1e-3), model.delay / 40.0)
     if not stable(low):
         return 0.0
     # Periods are tried in steps of 2 %, so that an unstable band is not jumped over, then refined.

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import scipy.linalg
+import scipy.optimize
 from numpy.typing import ArrayLike, NDArray
 
 from pendulum_lqr.model import LinearModel, sort_poles
@@ -28,6 +29,7 @@ __all__ = [
     "discretise",
     "integral_lqr",
     "kalman_gain",
+    "output_lqr",
     "require_controllable",
     "require_observable",
     "sampled_cost",
@@ -63,10 +65,10 @@ class DiscreteModel:
     """Sampled model ``z[k+1] = A z[k] + B u[k]`` whose state is [x; the inputs still on their way, oldest first].
 
     Attributes:
-        A: Shape (2 + m, 2 + m).
-        B: Shape (2 + m, 1).
+        A: Shape (n + m, n + m).
+        B: Shape (n + m, 1).
         period: Sampling period [s].
-        delay: Time from measuring a state to its torque acting [s].
+        delay: Time from measuring a state to its torque acting, the plant's own included [s].
         pending: m, number of inputs that are still on their way.
     """
 
@@ -121,11 +123,11 @@ def cost_matrices(q: ArrayLike, r: float, size: int = 2) -> tuple[Matrix, Matrix
 
 
 def continuous_lqr(model: LinearModel, q: ArrayLike, r: float) -> Gain:
-    """Return the gain that minimises the integral of x' Q x + u' R u.
+    """Return the gain on the whole state that minimises the integral of x' Q x + u' R u.
 
     Args:
-        model: Linear model.
-        q: Weights of the state [theta, theta_dot]; see :func:`cost_matrices`.
+        model: Linear model; its delay is not counted, the margins say how much of it the loop bears.
+        q: Weights of [theta, theta_dot]; states that are not measured cost nothing. See :func:`cost_matrices`.
         r: Weight of the torque, > 0.
 
     Raises:
@@ -135,32 +137,68 @@ def continuous_lqr(model: LinearModel, q: ArrayLike, r: float) -> Gain:
         Thesis, section 6.1; Anderson and Moore, Optimal Control, 1990, section 3.2.
     """
     Q, R = cost_matrices(q, r)
-    return _care(model.A, model.B, Q, R)
+    return _care(model.A, model.B, model.C.T @ Q @ model.C, R)
+
+
+def output_lqr(model: LinearModel, q: ArrayLike, r: float) -> Gain:
+    """Return the best gain on what is measured, u = -K [theta, theta_dot].
+
+    Where that is the whole state, it is the LQR. Where motor, spring or lag have states of their own, it is the gain
+    that costs least on average over releases of the resting pendulum from all angles and velocities: no gain on two
+    measurements can be optimal for every start, and none has the LQR's guaranteed margins.
+
+    Args:
+        model: Linear model; its delay is not counted.
+        q: Weights of [theta, theta_dot].
+        r: Weight of the torque, > 0.
+
+    Returns:
+        K of shape (2,); S (n, n) gives the cost to go of this gain, x' S x.
+
+    Raises:
+        DesignError: As :func:`continuous_lqr`; or no gain on the measurements stabilises the plant.
+
+    Source:
+        Levine and Athans, On the determination of the optimal constant output feedback gains, IEEE TAC 15(1), 1970.
+    """
+    if not model.hidden:
+        return continuous_lqr(model, q, r)
+    Q, R = cost_matrices(q, r)
+    full = continuous_lqr(model, q, r)
+    return _output_feedback(model.A, model.B, model.C, model.C.T @ Q @ model.C, float(R[0, 0]), full.K, _lift(model))
 
 
 def integral_lqr(model: LinearModel, q: ArrayLike, r: float) -> Gain:
     """Return the LQI gain on [theta, theta_dot, integral of (theta - set-point)], which leaves no offset.
 
+    With states that are not measured it is the best gain on these three, as in :func:`output_lqr`.
+
     Args:
         model: Linear model.
-        q: Weights of the three states, shape (3,) or (3, 3); the third > 0.
+        q: Weights of the three, shape (3,) or (3, 3); the third > 0.
         r: Weight of the torque, > 0.
 
     Raises:
-        DesignError: As :func:`continuous_lqr`; in particular if the integral carries no weight.
+        DesignError: As :func:`output_lqr`; in particular if the integral carries no weight.
     """
     Q, R = cost_matrices(q, r, 3)
     if not Q[2, 2] > 0.0:
         raise DesignError(f"weight of the integral is {Q[2, 2]:g}; expected > 0, or use plain LQR")
-    A = np.zeros((3, 3))
-    A[:2, :2] = model.A
-    A[2, 0] = 1.0
+    n = model.A.shape[0]
+    A = np.zeros((n + 1, n + 1))
+    A[:n, :n] = model.A
+    A[n, 0] = 1.0
     B = np.vstack([model.B, [[0.0]]])
-    return _care(A, B, Q, R)
+    C = scipy.linalg.block_diag(model.C, [[1.0]])
+    full = _care(A, B, C.T @ Q @ C, R)
+    if not model.hidden:
+        return full
+    lift = scipy.linalg.block_diag(_lift(model), [[1.0]])
+    return _output_feedback(A, B, C, C.T @ Q @ C, float(R[0, 0]), full.K, lift)
 
 
 def discretise(model: LinearModel, period: float, delay: float = 0.0) -> DiscreteModel:
-    """Sample the model exactly under zero-order hold with an input delay of any length.
+    """Sample the model exactly under zero-order hold, its delay of any length included.
 
     With delay = (m - 1) period + rest, the torque of sample k acts from rest on in interval k + m - 1, so that m past
     inputs join the state.
@@ -168,7 +206,7 @@ def discretise(model: LinearModel, period: float, delay: float = 0.0) -> Discret
     Args:
         model: Linear model.
         period: Sampling period, > 0 [s].
-        delay: Time from measuring a state to its torque acting, >= 0 [s].
+        delay: Time from measuring a state to the command's arrival at the plant, beyond the model's own, >= 0 [s].
 
     Raises:
         DesignError: Period or delay out of domain.
@@ -180,11 +218,8 @@ def discretise(model: LinearModel, period: float, delay: float = 0.0) -> Discret
         raise DesignError(f"period is {period} s; expected a finite value > 0")
     if not (math.isfinite(delay) and delay >= 0.0):
         raise DesignError(f"delay is {delay} s; expected a finite value >= 0")
-    whole = math.floor(delay / period + 1e-9)
-    rest = max(delay - whole * period, 0.0)
-    if rest < 1e-9 * period:
-        rest = 0.0
-    pending = whole + (1 if rest > 0.0 else 0)
+    delay += model.delay
+    pending, rest = _on_their_way(period, delay)
     # The interval is split where the newer input takes over: older input first, for ``rest``.
     phi_new, gamma_new = _hold(model, period - rest)
     phi_old, gamma_old = _hold(model, rest)
@@ -213,30 +248,27 @@ def discretise(model: LinearModel, period: float, delay: float = 0.0) -> Discret
 def discrete_lqr(model: DiscreteModel, q: ArrayLike, r: float, cross: Matrix | None = None) -> Gain:
     """Return the gain that minimises the sum of x' Q x + 2 x' N u + u' R u over the samples.
 
-    The weights act on [theta, theta_dot]; inputs that are still on their way cost nothing again.
-
     Args:
         model: Sampled model.
-        q: Weights of the state, shape (2,) or (2, 2).
+        q: Weights of the leading states, shape (k,) or (k, k): of [theta, theta_dot], or the whole matrix that
+            :func:`sampled_cost` gives. What follows costs nothing.
         r: Weight of the torque, > 0.
-        cross: N, shape (2, 1), as :func:`sampled_cost` gives it; none by default.
+        cross: N, shape (k, 1), as :func:`sampled_cost` gives it; none by default.
 
     Raises:
         DesignError: As :func:`continuous_lqr`.
     """
-    Q2, R = cost_matrices(q, r)
     size = model.A.shape[0]
-    Q = np.zeros((size, size))
-    Q[:2, :2] = Q2
+    Q, R = _padded_cost(q, r, size)
     N = None
     if cross is not None:
         N = np.zeros((size, 1))
-        N[:2] = cross
+        N[: cross.shape[0]] = cross
     require_controllable(model.A, model.B, discrete=True)
     try:
         S = scipy.linalg.solve_discrete_are(model.A, model.B, Q, R, s=N)
     except (np.linalg.LinAlgError, ValueError) as error:
-        raise DesignError(_no_solution(Q2, r, error)) from error
+        raise DesignError(_no_solution(Q, r, error)) from error
     BS = model.B.T @ S
     K = (BS @ model.A + (0.0 if N is None else N.T)) / float((R + BS @ model.B)[0, 0])
     poles = sort_poles(np.linalg.eigvals(model.A - model.B @ K))
@@ -247,46 +279,71 @@ def discrete_lqr(model: DiscreteModel, q: ArrayLike, r: float, cross: Matrix | N
     return Gain(K[0], S, poles)
 
 
-def sampled_cost(model: LinearModel, q: ArrayLike, r: float, period: float) -> tuple[Matrix, float, Matrix]:
+def sampled_cost(
+    model: LinearModel, q: ArrayLike, r: float, period: float, delay: float = 0.0
+) -> tuple[Matrix, float, Matrix]:
     """Return (Q_d, R_d, N_d), the continuous cost collected over one period of zero-order hold.
 
-    A discrete LQR with these weights minimises the very cost of the continuous LQR, at any sampling period.
+    A discrete LQR with these weights minimises the very cost of the continuous LQR, at any sampling period and delay.
+    A torque that is still on its way costs where it moves the state, in Q_d; its own cost is counted when it is sent.
 
     Args:
-        model: Linear model.
-        q: Continuous weights of the state.
+        model: Linear model with n states.
+        q: Continuous weights of [theta, theta_dot].
         r: Continuous weight of the torque.
         period: Sampling period [s].
+        delay: As in :func:`discretise`, whose m inputs on their way join the state.
+
+    Returns:
+        Q_d of shape (n + m, n + m), R_d, and N_d of shape (n + m, 1).
 
     Source:
-        C. Van Loan, Computing integrals involving the matrix exponential, IEEE TAC 23(3), 1978, theorem 1.
+        C. Van Loan, Computing integrals involving the matrix exponential, IEEE TAC 23(3), 1978, theorem 1;
+        Astrom and Wittenmark, Computer-Controlled Systems, 3rd ed., 1997, section 11.1.
     """
     Q, R = cost_matrices(q, r)
     if not (math.isfinite(period) and period > 0.0):
         raise DesignError(f"period is {period} s; expected a finite value > 0")
-    F = np.zeros((3, 3))
-    F[:2, :2] = model.A
-    F[:2, 2:] = model.B
-    W = np.zeros((3, 3))
-    W[:2, :2] = Q
-    W[2:, 2:] = R
+    pending, rest = _on_their_way(period, delay + model.delay)
+    n = model.A.shape[0]
+    size = n + pending + 1
+    state = np.eye(n, size)
+    total = np.zeros((size, size))
+    # The period in the pieces in which one torque acts: where it is in [state; on their way; new], and for how long.
+    older, newer = (n, min(n + 1, size - 1)) if rest > 0.0 else (n, n)
+    for column, time in ((older, rest), (newer, period - rest)):
+        if time == 0.0:
+            continue
+        start = np.vstack([state, np.eye(size)[column]])
+        total += start.T @ _collected(model, Q, time) @ start
+        phi, gamma = _hold(model, time)
+        state = phi @ state + gamma @ start[n:]
+    total[-1, -1] += float(R[0, 0]) * period
+    total = 0.5 * (total + total.T)
+    return total[:-1, :-1], float(total[-1, -1]), total[:-1, -1:]
+
+
+def _collected(model: LinearModel, Q: Matrix, time: float) -> Matrix:
+    """Return the cost of [x; u] over a time in which u is held, shape (n + 1, n + 1)."""
+    n = model.A.shape[0]
+    F = np.zeros((n + 1, n + 1))
+    F[:n, :n] = model.A
+    F[:n, n:] = model.B
+    W = np.zeros((n + 1, n + 1))
+    W[:n, :n] = model.C.T @ Q @ model.C
     # Long intervals would overflow exp(+214 s): collect over short pieces and add them up.
-    pieces = max(1, math.ceil(float(np.abs(F).sum(axis=1).max()) * period / 2.0))
-    step = period / pieces
-    block = np.zeros((6, 6))
-    block[:3, :3] = -F.T
-    block[:3, 3:] = W
-    block[3:, 3:] = F
+    pieces = max(1, math.ceil(float(np.abs(F).sum(axis=1).max()) * time / 2.0))
+    step = time / pieces
+    block = np.block([[-F.T, W], [np.zeros_like(F), F]])
     exponential = scipy.linalg.expm(block * step)
-    forward = exponential[3:, 3:]
-    piece = forward.T @ exponential[:3, 3:]
-    total = np.zeros((3, 3))
-    transition = np.eye(3)
+    forward = exponential[n + 1 :, n + 1 :]
+    piece = forward.T @ exponential[: n + 1, n + 1 :]
+    total = np.zeros((n + 1, n + 1))
+    transition = np.eye(n + 1)
     for _ in range(pieces):
         total += transition.T @ piece @ transition
         transition = forward @ transition
-    total = 0.5 * (total + total.T)
-    return total[:2, :2], float(total[2, 2]), total[:2, 2:]
+    return total
 
 
 def kalman_gain(A: Matrix, C: Matrix, process: ArrayLike, measurement: ArrayLike) -> KalmanGain:
@@ -362,6 +419,74 @@ def _unreached_mode(A: Matrix, B: Matrix, discrete: bool) -> complex | None:
         if not _decays(pole, discrete) and _deficient(np.hstack([pole * np.eye(A.shape[0]) - A, B])):
             return complex(pole)
     return None
+
+
+def _on_their_way(period: float, delay: float) -> tuple[int, float]:
+    """Return how many inputs a delay keeps on their way, and the broken part of a period in it [s]."""
+    whole = math.floor(delay / period + 1e-9)
+    rest = max(delay - whole * period, 0.0)
+    if rest < 1e-9 * period:
+        rest = 0.0
+    return whole + (1 if rest > 0.0 else 0), rest
+
+
+def _padded_cost(q: ArrayLike, r: float, size: int) -> tuple[Matrix, Matrix]:
+    """Return Q (size, size), zero beyond the states that q names, and R."""
+    given = np.asarray(q, dtype=np.float64)
+    Q2, R = cost_matrices(q, r, given.shape[0] if given.ndim == 2 else 2)
+    Q = np.zeros((size, size))
+    Q[: Q2.shape[0], : Q2.shape[1]] = Q2
+    return Q, R
+
+
+def _lift(model: LinearModel) -> Matrix:
+    """Return the states of a plant at ease at each measured angle and velocity, shape (n, 2): the motor follows."""
+    follows = {"theta": (1.0, 0.0), "theta_dot": (0.0, 1.0), "motor_angle": (1.0, 0.0), "motor_velocity": (0.0, 1.0)}
+    return np.array([follows.get(name, (0.0, 0.0)) for name in model.states])
+
+
+def _output_feedback(
+    A: Matrix, B: Matrix, C: Matrix, Q: Matrix, r: float, full: Matrix, lift: Matrix
+) -> Gain:
+    """Return u = -K C x of least tr(P X0), X0 = lift lift', by quasi-Newton on Levine and Athans' gradient."""
+    start = lift @ lift.T
+
+    def solve(K: Matrix) -> tuple[float, Matrix, Matrix]:
+        closed = A - B @ K[None, :] @ C
+        if float(np.max(np.linalg.eigvals(closed).real)) >= -1e-9:
+            return math.inf, np.zeros_like(K), np.zeros_like(A)
+        P = scipy.linalg.solve_continuous_lyapunov(closed.T, -(Q + r * C.T @ np.outer(K, K) @ C))
+        L = scipy.linalg.solve_continuous_lyapunov(closed, -start)
+        gradient = 2.0 * ((r * K[None, :] @ C - B.T @ P) @ L @ C.T)[0]
+        return float(np.trace(P @ start)), gradient, P
+
+    # What the full gain would do if the hidden states followed; smaller, should it excite what they really do.
+    follow = full @ lift
+    scale = np.maximum(np.abs(follow), 1e-3 * float(np.max(np.abs(follow))))
+    guesses = [f * follow * mask for f in (1.0, 0.7, 0.5, 0.3, 0.2, 0.1) for mask in (1.0, _without_rate(follow))]
+    guess = min(guesses, key=lambda K: solve(K)[0])
+    if not math.isfinite(solve(guess)[0]):
+        raise DesignError(
+            "no gain on angle and velocity found that stabilises the plant, whose other states are not measured; "
+            "expected larger r, smaller q, or lqg, which estimates them"
+        )
+    best, value = guess, solve(guess)[0]
+
+    def objective(relative: Matrix) -> tuple[float, Matrix]:
+        cost, gradient, _ = solve(relative * scale)
+        return cost / value, gradient * scale / value
+
+    for _ in range(3):
+        found = scipy.optimize.minimize(objective, best / scale, jac=True, method="BFGS", options={"gtol": 1e-9})
+        best = found.x * scale
+    _, _, P = solve(best)
+    return Gain(best, P, sort_poles(np.linalg.eigvals(A - B @ best[None, :] @ C)))
+
+
+def _without_rate(gain: Matrix) -> Matrix:
+    mask = np.ones_like(gain)
+    mask[1] = 0.0
+    return mask
 
 
 def _care(A: Matrix, B: Matrix, Q: Matrix, R: Matrix) -> Gain:

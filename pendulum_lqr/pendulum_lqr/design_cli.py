@@ -17,7 +17,7 @@ import typer
 from rich.console import Console
 
 from pendulum_lqr.analysis import LoopReport, analyse
-from pendulum_lqr.design import Gain, continuous_lqr
+from pendulum_lqr.design import Gain, output_lqr
 from pendulum_lqr.model import LinearModel, linearise
 from pendulum_msgs_py.contract.angles import UPRIGHT
 from pendulum_msgs_py.errors import ParameterError
@@ -60,14 +60,17 @@ def design(
 ) -> None:
     """Design LQR gains: eigenvalues, K, time constant, damping, margins and largest stable sampling period.
 
-    Without --q and --r the four combinations of the thesis are designed. Example:
+    The model is that of the plant as simulated: motor, spring and lag have states, and the margins count the delay.
+    K acts on angle and velocity, which are what is measured. Without --q and --r the four combinations of the thesis
+    are designed. Example:
 
         python -m pendulum_lqr design --preset dfki --q 10,1 --q 100,1 --r 1 --figures build/design
     """
     parameters = load_plant(str(plant) if plant is not None else preset)
+    limit = _limit(effort_limit, parameters.effort_limit)
     model = linearise(parameters, theta)
     weights = _weights(q, r)
-    gains = [continuous_lqr(model, diagonal, cost) for diagonal, cost in weights]
+    gains = [output_lqr(model, diagonal, cost) for diagonal, cost in weights]
     reports = [analyse(model, None), *(analyse(model, gain.K) for gain in gains)]
     chosen = _chosen_row(row, len(weights), default=THESIS_CHOICE if not (q or r) else len(weights))
     if as_json:
@@ -76,9 +79,14 @@ def design(
         console = make_console(highlight=False)
         _print(console, parameters.name, model, weights, reports, chosen)
     if figures is not None:
-        limit = effort_limit if effort_limit > 0.0 else parameters.effort_limit
         for path in _save(parameters, model, weights, gains, chosen, limit, figures):
             print(path, file=sys.stderr if as_json else sys.stdout)
+
+
+def _limit(given: float, plants_own: float) -> float:
+    if not (math.isfinite(given) and given >= 0.0):
+        raise ParameterError(f"--effort-limit is {given} N m; expected a finite number > 0, or 0 for the plant's")
+    return given or plants_own
 
 
 def _weights(q: Sequence[str] | None, r: Sequence[float] | None) -> list[tuple[tuple[float, ...], float]]:
@@ -113,10 +121,8 @@ def _print(
     reports: Sequence[LoopReport],
     chosen: int,
 ) -> None:
-    console.print(
-        f"plant {name} at theta = {model.theta:.4f} rad: A = [[0, 1], [{model.A[1, 0]:.2f}, {model.A[1, 1]:.2f}]], "
-        f"B = [0, {model.B[1, 0]:.2f}], u* = {model.effort:.4g} N m"
-    )
+    for line in _plant_lines(name, model):
+        console.print(line)
     table = WholeTable(title="Eigenvalues and gains", title_justify="left", header_style="bold")
     for heading in ("#", "q11", "q22", "r", "eigenvalues \\[1/s]", "computed", "K", "tau \\[s]", "damping"):
         table.add_column(heading, justify="left" if heading.startswith("eig") else "right", no_wrap=True)
@@ -126,7 +132,7 @@ def _print(
     for index, report in enumerate(reports):
         (q11, q22), cost = weights[index - 1] if index else ((math.nan, math.nan), math.nan)
         cells = [f"{value:g}" if index else "\u2013" for value in (q11, q22, cost)]
-        stable = math.isfinite(report.time_constant)
+        stable = math.isfinite(report.time_constant) and report.stable
         table.add_row(
             f"{index}",
             *cells,
@@ -162,10 +168,37 @@ def _print(
     )
 
 
+def _plant_lines(name: str, model: LinearModel) -> list[str]:
+    """Return what the design was made for, in sentences."""
+    at = f"plant {name} at theta = {model.theta:.4f} rad"
+    if not model.hidden:
+        lines = [
+            (
+                f"{at}: A = [[0, 1], [{model.A[1, 0]:.2f}, {model.A[1, 1]:.2f}]], B = [0, {model.B[1, 0]:.2f}], "
+                f"u* = {model.effort:.4g} N m"
+            )
+        ]
+    else:
+        lines = [
+            f"{at}: states {', '.join(model.states)}; u* = {model.effort:.4g} N m",
+            (
+                f"{' and '.join(model.hidden)} not measured: K is the best gain on angle and velocity alone, without "
+                "the margins that an LQR on the whole state guarantees; the controller lqg estimates the rest"
+            ),
+        ]
+    if model.delay > 0.0:
+        lines.append(f"transport delay {model.delay:g} s: counted in margins and periods, not in the eigenvalues")
+    return lines
+
+
 def _poles(poles: Sequence[complex], digits: int) -> str:
-    if all(abs(pole.imag) < 1e-9 for pole in poles):
-        return ", ".join(f"{pole.real:.{digits}f}" for pole in poles)
-    return f"{poles[0].real:.{digits}f} \u00b1 {abs(poles[0].imag):.{digits}f}j"
+    parts = []
+    for pole in poles:
+        if abs(pole.imag) < 1e-9:
+            parts.append(f"{pole.real:.{digits}f}")
+        elif pole.imag > 0.0:
+            parts.append(f"{pole.real:.{digits}f} \u00b1 {pole.imag:.{digits}f}j")
+    return ", ".join(parts)
 
 
 def _period(period: float) -> str:
@@ -188,8 +221,12 @@ def _document(
         "plant": name,
         "theta": model.theta,
         "effort": model.effort,
+        "states": list(model.states),
+        "delay": model.delay,
         "A": model.A.tolist(),
         "B": model.B.tolist(),
+        "C": model.C.tolist(),
+        "E": model.E.tolist(),
         "rows": rows,
     }
 

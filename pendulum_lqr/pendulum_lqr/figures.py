@@ -205,15 +205,14 @@ def step_figure(model: LinearModel, gains: Mapping[str, Array], report: LoopRepo
     figure, (top, bottom) = _figure(2, 5.2)
     horizon = 6.0 * report.time_constant if math.isfinite(report.time_constant) else 5.0
     times = np.linspace(0.0, horizon, 800)
-    inertia = 1.0 / float(model.B[1, 0])
-    lift = float(model.A[1, 0]) * inertia
+    holding = _holding_torque(model)
     for index, (label, K) in enumerate(gains.items()):
         colour = COLOURS[index % len(COLOURS)]
-        A = model.A - model.B @ np.atleast_2d(K)
-        # The holding torque of the new set-point is fed forward: -G (linearised) times the angle.
-        drive = model.B[:, 0] * (float(K[0]) - lift)
-        _, x = scipy.signal.step((A, drive[:, None] * 0.1, np.eye(2), np.zeros((2, 1))), T=times)
-        effort = -(x @ np.asarray(K)) + (float(K[0]) - lift) * 0.1
+        A = model.A - model.B @ np.atleast_2d(K) @ model.C
+        # The holding torque of the new set-point is fed forward, linearised.
+        drive = model.B * (float(K[0]) + holding) * 0.1
+        _, x = scipy.signal.step((A, drive, model.C, np.zeros((2, 1))), T=times)
+        effort = -(x @ np.asarray(K)) + (float(K[0]) + holding) * 0.1
         style = ("-", "--", "-.", ":")[index % 4]
         top.plot(times, x[:, 0], color=colour, linewidth=1.8, linestyle=style, label=label)
         bottom.plot(times, effort, color=colour, linewidth=1.8, linestyle=style)
@@ -226,6 +225,13 @@ def step_figure(model: LinearModel, gains: Mapping[str, Array], report: LoopRepo
     )
     top.legend(frameon=False, fontsize=9, loc="lower right")
     return figure
+
+
+def _holding_torque(model: LinearModel) -> float:
+    """Return the command that holds the pendulum beside the fixed point, per angle [N m/rad]."""
+    n = model.A.shape[0]
+    balance = np.block([[model.A, model.B], [np.eye(1, n), np.zeros((1, 1))]])
+    return float(np.linalg.solve(balance, np.append(np.zeros(n), 1.0))[n])
 
 
 def phase_portrait_figure(plant: RigidPlant, gain: Gain, effort_limit: float, region: Region) -> Figure:
@@ -270,7 +276,7 @@ def design_figures(
     chosen: int,
     effort_limit: float,
 ) -> dict[str, Figure]:
-    """Return all figures of a design table by file name.
+    """Return all figures of a design table by file name; a phase portrait only of a plant with two states.
 
     Args:
         plant: Plant parameters.
@@ -288,7 +294,8 @@ def design_figures(
         "bode": bode_figure(model, gain.K),
         "step_response": step_figure(model, gains, report),
     }
-    if model.theta == UPRIGHT:
+    # Plane and proof are those of two states.
+    if model.theta == UPRIGHT and not model.hidden:
         # Speeds worth showing: those of a free fall, unless damping stops the pendulum long before.
         span = 1.2 * math.sqrt(4.0 * max(plant.gravity, 1e-6) / plant.inertia)
         if plant.damping > 0.0:

@@ -1,25 +1,38 @@
-"""The pendulum linearised about a fixed point.
+"""The linear model of the plant that runs: link, motor, spring and lag as states, the transport delay beside them.
 
-``M_c theta'' + b_c theta' + G_c sin(theta) = u`` with the state x = [theta - theta*, theta'] and the input u - u*,
-where u* = G_c sin(theta*) holds the pendulum at theta*:
+The equations are those of :mod:`pendulum_msgs_py.dynamics`, which the simulator steps too; their derivatives come by
+complex step, exact to rounding. For the rigid pendulum ``M_c theta'' + b_c theta' + G_c sin(theta) = u`` that gives
 
     A = [[0, 1], [-G_c cos(theta*) / M_c, -b_c / M_c]],   B = [0, 1 / M_c]
 
-Only the smooth part of the plant is linearised: dry friction has no derivative at rest, so designs neglect it and the
-nonlinear closed loop, simulated, tells what it costs.
+Only the smooth part of a plant is linearised: dry friction and the hysteresis of a spring have no derivative at rest,
+so that designs neglect them and the nonlinear closed loop, simulated, tells what they cost.
 """
 
 from __future__ import annotations
 
+import cmath
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
-from pendulum_msgs_py.contract.angles import UPRIGHT
+from pendulum_msgs_py.contract.angles import UPRIGHT, wrap
+from pendulum_msgs_py.dynamics.arithmetic import complex_step, in_arithmetic
+from pendulum_msgs_py.dynamics.rigid import rigid_acceleration
+from pendulum_msgs_py.dynamics.series_elastic import (
+    feedforward_pwm,
+    link_acceleration,
+    motor_acceleration,
+    spring_deflection,
+    spring_torque,
+    winding_current,
+    winding_resistance_at,
+)
 from pendulum_msgs_py.errors import ParameterError
+from pendulum_msgs_py.plants.plant_parameters import PlantParameters, SeriesElasticParameters
 
 __all__ = [
     "FixedPoint",
@@ -30,13 +43,14 @@ __all__ = [
     "linearise",
     "overdamped_velocity",
     "state_derivative",
+    "torque_gain",
 ]
 
 Matrix = NDArray[np.float64]
 
 
 class RigidPlant(Protocol):
-    """What a design needs to know of a plant; ``PlantParameters`` has it."""
+    """What a design needs to know of a plant; ``PlantParameters`` has it, and where it has more, that counts too."""
 
     @property
     def inertia(self) -> float:
@@ -53,24 +67,54 @@ class RigidPlant(Protocol):
 
 @dataclass(frozen=True, slots=True)
 class LinearModel:
-    """Linear model ``x' = A x + B (u - effort)`` around ``theta``.
+    """Linear model ``x' = A x + B du(t - delay) + E d``, ``y = C x + D du`` around a fixed point, du = u - effort.
+
+    The first two states are always [theta - theta*, theta_dot], and they are what is measured: C = [I, 0], D = 0.
 
     Attributes:
-        A: State matrix, shape (2, 2) [1/s and mixed].
-        B: Input matrix, shape (2, 1) [1/(kg m^2) in its last row].
+        A: State matrix, shape (n, n) [1/s and mixed].
+        B: Input matrix of the commanded torque, shape (n, 1) [state/(N m s)].
         theta: Angle of the fixed point, 0 hanging down [rad].
-        effort: Torque that holds the fixed point [N m].
+        effort: Commanded torque that holds the fixed point [N m].
+        C: Output matrix, shape (2, n): angle and velocity of the link.
+        D: Feedthrough, shape (2, 1); zeros.
+        E: Input matrix of a torque on the link itself, such as a push, shape (n, 1); without delay.
+        delay: Time between a command and its first effect [s]; not in A.
+        states: Names of the states: theta, theta_dot, then motor_angle and motor_velocity (at the output side of the
+            gears) of a series-elastic plant, then torque, the lagged command, of a plant with a lag.
     """
 
     A: Matrix
     B: Matrix
     theta: float = UPRIGHT
     effort: float = 0.0
+    C: Matrix = field(default=None)  # type: ignore[arg-type]  # filled in below
+    D: Matrix = field(default=None)  # type: ignore[arg-type]
+    E: Matrix = field(default=None)  # type: ignore[arg-type]
+    delay: float = 0.0
+    states: tuple[str, ...] = ("theta", "theta_dot")
+
+    def __post_init__(self) -> None:
+        """Fill in outputs and the link's input, which two states alone determine."""
+        n = self.A.shape[0]
+        if self.C is None:
+            object.__setattr__(self, "C", np.eye(2, n))  # type: ignore[unreachable]
+        if self.D is None:
+            object.__setattr__(self, "D", np.zeros((2, 1)))  # type: ignore[unreachable]
+        if self.E is None:
+            object.__setattr__(self, "E", self.B.copy())  # type: ignore[unreachable]
+        if len(self.states) != n:
+            raise ParameterError(f"states are {', '.join(self.states)}; expected {n} names, one per row of A")
 
     @property
     def poles(self) -> NDArray[np.complex128]:
-        """Open-loop eigenvalues, slowest (largest real part) first, shape (2,) [1/s]."""
+        """Open-loop eigenvalues, slowest (largest real part) first, shape (n,) [1/s]."""
         return sort_poles(np.linalg.eigvals(self.A))
+
+    @property
+    def hidden(self) -> tuple[str, ...]:
+        """Names of the states that are not measured."""
+        return self.states[2:]
 
 
 @dataclass(frozen=True, slots=True)
@@ -78,14 +122,16 @@ class FixedPoint:
     """Angle at which the pendulum rests under a constant torque.
 
     Attributes:
-        theta: Angle, 0 hanging down, in [-pi, pi] [rad].
+        theta: Measured angle, 0 hanging down, in [-pi, pi) [rad].
         effort: The constant torque [N m].
         stable: Whether the pendulum returns to it after a small push; False at a tip of the torque curve too.
+        rate: Rate at which a small deviation grows, the slowest eigenvalue's real part [1/s]; negative for stable.
     """
 
     theta: float
     effort: float
     stable: bool
+    rate: float
 
 
 def sort_poles(poles: NDArray[Any]) -> NDArray[np.complex128]:
@@ -94,39 +140,83 @@ def sort_poles(poles: NDArray[Any]) -> NDArray[np.complex128]:
     return values[np.lexsort((values.imag, -values.real))]
 
 
+def torque_gain(plant: RigidPlant) -> float:
+    """Return the torque at the link per commanded torque, at rest [-]; 1 for a rigid plant.
+
+    A series-elastic actuator without an effort loop answers with R(20 degC) / (R(T) eta) times what is asked for.
+
+    Args:
+        plant: Plant parameters.
+    """
+    drive = _drivetrain(plant)
+    if drive is None:
+        return 1.0
+    pwm = _pwm(1.0, drive)
+    current = winding_current(
+        pwm, 0.0, drive.supply_voltage, drive.back_emf_constant, drive.gear_ratio, _resistance(drive)
+    )
+    return drive.torque_constant * drive.gear_ratio * current
+
+
 def equilibrium_effort(plant: RigidPlant, theta: float) -> float:
-    """Return the torque u* = G_c sin(theta - angle_offset) - torque_offset that holds the pendulum at an angle [N m].
+    """Return the command that holds the pendulum at an angle, (G_c sin(theta - angle_offset) - torque_offset) / gain.
 
     Args:
         plant: Plant parameters.
         theta: Angle, 0 hanging down [rad].
     """
-    # sin(math.pi) is 1.2e-16, not 0: upright must not ask for a torque.
-    angle = theta - float(getattr(plant, "angle_offset", 0.0))
-    lift = 0.0 if angle == UPRIGHT else plant.gravity * math.sin(angle)
-    return lift - float(getattr(plant, "torque_offset", 0.0))
+    return (_weight(plant, theta) - _offset(plant, "torque_offset")) / torque_gain(plant)
 
 
 def linearise(plant: RigidPlant, theta: float = UPRIGHT) -> LinearModel:
-    """Linearise the rigid plant about the fixed point at an angle.
+    """Return the linear model about the fixed point at an angle, of the plant that the simulator runs.
+
+    A rigid plant has two states, a series-elastic one four; a first-order lag (``actuator_time_constant``) adds one.
+    ``transport_delay`` is the model's ``delay``: :func:`pendulum_lqr.design.discretise` and the margins count it.
 
     Args:
-        plant: Plant parameters; dry friction, drivetrain, lag and delay are not part of the linear model.
+        plant: Plant parameters; dry friction and the spring's hysteresis are not part of the linear model.
         theta: Angle of the fixed point, 0 hanging down [rad]; every angle is one, held by the torque ``effort``.
 
     Raises:
         ParameterError: The angle is not finite.
 
     Source:
-        Thesis, section 6.2 "Linearisation about the unstable fixed point".
+        Thesis, section 6.2 "Linearisation about the unstable fixed point"; equations of
+        :mod:`pendulum_msgs_py.dynamics`.
     """
     if not math.isfinite(theta):
         raise ParameterError(f"theta of the fixed point is {theta} rad; expected a finite angle")
-    angle = theta - float(getattr(plant, "angle_offset", 0.0))
-    slope = -1.0 if angle == UPRIGHT else math.cos(angle)
-    A = np.array([[0.0, 1.0], [-plant.gravity * slope / plant.inertia, -plant.damping / plant.inertia]])
-    B = np.array([[0.0], [1.0 / plant.inertia]])
-    return LinearModel(A, B, theta, equilibrium_effort(plant, theta))
+    drive = _drivetrain(plant)
+    lag = _offset(plant, "actuator_time_constant")
+    effort = equilibrium_effort(plant, theta)
+    states: tuple[str, ...] = ("theta", "theta_dot")
+    at: tuple[float, ...] = (theta, 0.0)
+    if drive is not None:
+        states = (*states, "motor_angle", "motor_velocity")
+        carried = _weight(plant, theta) - _offset(plant, "torque_offset")
+        at = (*at, theta + spring_deflection(carried, drive.stiffness, drive.stiffness_hardening), 0.0)
+    if lag > 0.0:
+        states = (*states, "torque")
+        at = (*at, effort)
+    n = len(states)
+
+    def flow(*values: complex) -> tuple[complex, ...]:
+        x, command, push = values[:n], values[n], values[n + 1]
+        torque = x[-1] if lag > 0.0 else command
+        rates = _rigid_flow(plant, x, torque, push) if drive is None else _elastic_flow(plant, drive, x, torque, push)
+        return (*rates, (command - torque) / lag) if lag > 0.0 else rates
+
+    jacobian = np.array(complex_step(flow, (*at, effort, 0.0)))
+    return LinearModel(
+        jacobian[:, :n].copy(),
+        jacobian[:, n : n + 1].copy(),
+        theta,
+        effort,
+        E=jacobian[:, n + 1 :].copy(),
+        delay=_offset(plant, "transport_delay"),
+        states=states,
+    )
 
 
 def state_derivative(plant: RigidPlant, theta: float, theta_dot: float, effort: float) -> tuple[float, float]:
@@ -138,29 +228,44 @@ def state_derivative(plant: RigidPlant, theta: float, theta_dot: float, effort: 
         theta_dot: Velocity [rad/s].
         effort: Torque [N m].
     """
-    offset = float(getattr(plant, "torque_offset", 0.0))
-    angle = theta - float(getattr(plant, "angle_offset", 0.0))
-    torque = effort + offset - plant.damping * theta_dot - plant.gravity * math.sin(angle)
-    return theta_dot, torque / plant.inertia
+    torque = effort + _offset(plant, "torque_offset")
+    angle = theta - _offset(plant, "angle_offset")
+    return theta_dot, rigid_acceleration(
+        angle, theta_dot, torque, plant.inertia, plant.damping, plant.gravity
+    )
 
 
 def fixed_points(plant: RigidPlant, effort: float = 0.0) -> tuple[FixedPoint, ...]:
     """Return the fixed points under a constant torque: two, one at the tip of the torque curve, or none.
 
+    They solve G_c sin(theta - angle_offset) = gain effort + torque_offset; stability is that of the linear model.
+
     Args:
         plant: Plant parameters.
-        effort: Constant torque [N m].
+        effort: Constant commanded torque [N m].
+
+    Raises:
+        ParameterError: The torque is not finite.
     """
+    if not math.isfinite(effort):
+        raise ParameterError(f"torque is {effort} N m; expected a finite number")
     if plant.gravity == 0.0:
         return ()
-    ratio = effort / plant.gravity
+    ratio = (torque_gain(plant) * effort + _offset(plant, "torque_offset")) / plant.gravity
     if abs(ratio) > 1.0:
         return ()
     low = math.asin(ratio)
-    if abs(ratio) == 1.0:
-        return (FixedPoint(low, effort, False),)
-    high = math.copysign(math.pi, low if low != 0.0 else 1.0) - low
-    return (FixedPoint(low, effort, True), FixedPoint(high, effort, False))
+    angles = (low,) if abs(ratio) == 1.0 else (low, math.pi - low)
+    points = []
+    for angle in angles:
+        theta = wrap(angle + _offset(plant, "angle_offset"))
+        if abs(ratio) == 1.0:
+            # Both points meet: what comes from one side is held, from the other it passes.
+            points.append(FixedPoint(theta, effort, stable=False, rate=0.0))
+            continue
+        rate = float(linearise(plant, theta).poles[0].real)
+        points.append(FixedPoint(theta, effort, math.cos(angle) > 0.0, rate))
+    return tuple(points)
 
 
 def overdamped_velocity(
@@ -179,3 +284,66 @@ def overdamped_velocity(
     if not plant.damping > 0.0:
         raise ParameterError(f"damping is {plant.damping} N m s/rad; expected > 0 for the overdamped limit")
     return (effort - plant.gravity * np.sin(theta)) / plant.damping
+
+
+def _rigid_flow(
+    plant: RigidPlant, x: tuple[complex, ...], torque: complex, push: complex
+) -> tuple[complex, ...]:
+    acceleration = in_arithmetic(rigid_acceleration, cmath)
+    net = torque + push + _offset(plant, "torque_offset")
+    angle = x[0] - _offset(plant, "angle_offset")
+    return x[1], acceleration(angle, x[1], net, plant.inertia, plant.damping, plant.gravity)
+
+
+def _elastic_flow(
+    plant: RigidPlant,
+    drive: SeriesElasticParameters,
+    x: tuple[complex, ...],
+    torque: complex,
+    push: complex,
+) -> tuple[complex, ...]:
+    angle, velocity, motor_angle, motor_velocity = x[:4]
+    spring = in_arithmetic(spring_torque, cmath)(
+        motor_angle - angle, 0.0, drive.stiffness, drive.stiffness_hardening, 0.0
+    )
+    current = in_arithmetic(winding_current, cmath)(
+        _pwm(torque, drive), motor_velocity, drive.supply_voltage, drive.back_emf_constant, drive.gear_ratio,
+        _resistance(drive),
+    )  # fmt: skip
+    motor = in_arithmetic(motor_acceleration, cmath)(
+        current, motor_velocity, spring, drive.torque_constant, drive.gear_ratio, drive.motor_damping,
+        drive.reflected_inertia,
+    )  # fmt: skip
+    link = in_arithmetic(link_acceleration, cmath)(
+        angle - _offset(plant, "angle_offset"), velocity, spring, push + _offset(plant, "torque_offset"),
+        plant.inertia, plant.damping, plant.gravity,
+    )  # fmt: skip
+    return velocity, link, motor_velocity, motor
+
+
+def _pwm(torque: Any, drive: SeriesElasticParameters) -> Any:
+    return feedforward_pwm(
+        torque, drive.supply_voltage, drive.torque_constant, drive.gear_ratio, drive.efficiency,
+        drive.winding_resistance,
+    )  # fmt: skip
+
+
+def _resistance(drive: SeriesElasticParameters) -> float:
+    return winding_resistance_at(
+        drive.winding_temperature, drive.winding_resistance, drive.resistance_temperature_coefficient
+    )
+
+
+def _weight(plant: RigidPlant, theta: float) -> float:
+    # sin(math.pi) is 1.2e-16, not 0: upright must not ask for a torque.
+    angle = theta - _offset(plant, "angle_offset")
+    return 0.0 if angle == UPRIGHT else plant.gravity * math.sin(angle)
+
+
+def _drivetrain(plant: RigidPlant) -> SeriesElasticParameters | None:
+    return plant.drivetrain if isinstance(plant, PlantParameters) else None
+
+
+def _offset(plant: RigidPlant, name: str) -> float:
+    """Return a value that only whole plant parameters have; 0 for a bare rigid plant."""
+    return float(getattr(plant, name, 0.0))

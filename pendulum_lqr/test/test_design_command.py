@@ -38,6 +38,34 @@ def test_json_has_every_pair_of_weights(capsys):
     assert document["rows"][1]["largest_period"] == pytest.approx(0.1856, abs=1e-3)
 
 
+def test_the_series_elastic_plant_is_designed_for_as_it_is_simulated(capsys):
+    assert main(["--preset", "x5_9", "--json"]) == 0
+    document = json.loads(capsys.readouterr().out)
+    assert document["states"] == ["theta", "theta_dot", "motor_angle", "motor_velocity"]
+    assert document["rows"][0]["poles"][0] == pytest.approx([0.129009, 0.0], abs=1e-6)
+    for row in document["rows"][1:]:
+        assert row["stable"]
+        assert len(row["K"]) == 2
+        assert max(pole[0] for pole in row["poles"]) < -0.3
+        assert row["margins"]["gain_up"] > 2.0
+
+
+def test_a_plant_with_delay_has_margins_that_count_it(tmp_path, capsys):
+    plant = load_plant("dfki").with_values(transport_delay=0.02, name="late")
+    path = write_plant(tmp_path / "late.yaml", plant)
+    margins = []
+    for name in (str(path), "dfki"):
+        assert main(["--plant", name, "--q", "100,0.01", "--r", "0.1", "--json"]) == 0
+        margins.append(json.loads(capsys.readouterr().out)["rows"][1]["margins"])
+    late, prompt = margins
+    assert late["delay"] == pytest.approx(prompt["delay"] - 0.02, abs=1e-6)
+    assert late["phase"] == pytest.approx(prompt["phase"] - 0.02 * prompt["crossover"], abs=1e-4)
+    assert prompt["gain_up"] is None
+    assert 1.0 < late["gain_up"] < 10.0
+    assert main(["--plant", str(path)]) == 0
+    assert "transport delay 0.02 s: counted in margins and periods" in capsys.readouterr().out
+
+
 def test_a_plant_file_and_another_fixed_point(tmp_path, capsys):
     path = write_plant(tmp_path / "mine.yaml", load_plant("dfki").with_values(name="mine"))
     assert main(["--plant", str(path), "--theta", "0.5", "--q", "1,1", "--json"]) == 0
@@ -64,6 +92,8 @@ def test_the_figures_are_written(tmp_path, capsys):
         (["--q", "1,-1"], "expected no negative weight"),
         (["--r", "0"], "r is 0.0 1/(N m)^2; expected a finite weight > 0"),
         (["--row", "9"], "--row is 9; expected 1 to 4"),
+        (["--effort-limit", "-5"], "--effort-limit is -5.0 N m; expected a finite number > 0"),
+        (["--effort-limit", "nan"], "--effort-limit is nan N m; expected a finite number > 0"),
         (["--theta", "nan"], "theta of the fixed point is nan rad"),
         (["--figures", "/proc/nowhere"], "figures cannot be written to /proc/nowhere"),
     ],

@@ -1,21 +1,27 @@
 """The linearisation against finite differences, fixed points against the equation."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from pendulum_lqr.design import discretise
 from pendulum_lqr.model import (
+    LinearModel,
     equilibrium_effort,
     fixed_points,
     linearise,
     overdamped_velocity,
     state_derivative,
+    torque_gain,
 )
+from pendulum_msgs_py.contract.angles import UPRIGHT
 from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.plants.plant_parameters import PlantParameters, load_plant
+from pendulum_sim.plant import make_plant
 
 PLANTS = st.builds(
     PlantParameters,
@@ -86,3 +92,93 @@ def test_overdamped_velocity_is_zero_at_the_fixed_points_and_needs_damping():
 def test_an_angle_that_is_not_finite_is_refused():
     with pytest.raises(ParameterError, match="theta of the fixed point is nan rad; expected a finite angle"):
         linearise(load_plant("thesis"), math.nan)
+
+
+def _without_dry_friction(plant):
+    if plant.drivetrain is None:
+        return plant.with_values(coulomb_friction=0.0, static_friction=0.0)
+    smooth = replace(
+        plant.drivetrain, motor_coulomb_friction=0.0, motor_static_friction=0.0, hysteresis_torque=0.0
+    )
+    return plant.with_values(drivetrain=smooth)
+
+
+SIMULATED = {
+    "thesis": {},
+    "dfki": {},
+    "x5_9": {},
+    "thesis, lag and delay": {"actuator_time_constant": 0.02, "transport_delay": 0.007},
+    "x5_9, lag, delay and offsets": {
+        "actuator_time_constant": 0.02,
+        "transport_delay": 0.004,
+        "angle_offset": 0.3,
+        "torque_offset": 0.2,
+    },
+}
+
+
+@pytest.mark.parametrize("theta", [UPRIGHT, UPRIGHT - 0.5, 0.3])
+@pytest.mark.parametrize("case", SIMULATED)
+def test_the_linear_model_moves_as_the_simulated_plant_does_under_a_small_torque_on_command_and_link(case, theta):
+    plant = _without_dry_friction(load_plant(case.split(",")[0]).with_values(**SIMULATED[case]))
+    model = linearise(plant, theta)
+    period, steps = 0.002, 100
+    torque = 1e-4 * (1.0 + np.sin(0.1 * np.arange(steps)))
+    push = 5e-5
+
+    def simulate(share):
+        simulated = make_plant(plant, period, substeps=20)
+        simulated.reset(theta)
+        states = [simulated.step(model.effort + share * u, share * push) for u in torque]
+        return np.array([(state.theta, state.theta_dot) for state in states])
+
+    # The difference of two runs: what the plant does by itself, as long as its actuator has no torque yet, falls out.
+    moved = simulate(1.0) - simulate(0.0)
+    sampled = discretise(model, period)
+    by_push = discretise(LinearModel(model.A, model.E, states=model.states), period).B[:, 0] * push
+    z = np.zeros(sampled.A.shape[0])
+    expected = []
+    for u in torque:
+        z = sampled.A @ z + sampled.B[:, 0] * u
+        z[: by_push.size] += by_push
+        expected.append(z[:2])
+    for column, size in enumerate(np.max(np.abs(moved), axis=0)):
+        np.testing.assert_allclose(moved[:, column], np.array(expected)[:, column], rtol=0.0, atol=0.01 * size)
+
+
+def test_the_x5_9_linearised_is_a_slow_pole_behind_the_motor_and_not_a_fast_free_link():
+    model = linearise(load_plant("x5_9"))
+    assert model.states == ("theta", "theta_dot", "motor_angle", "motor_velocity")
+    # Closed form of the slow pole: gravity against all the damping there is, back EMF and bearings, with the inertias.
+    assert model.poles[0].real == pytest.approx(0.129, abs=5e-4)
+    assert model.poles[-1].real == pytest.approx(-63.67, abs=0.01)
+
+
+def test_a_series_elastic_actuator_holds_with_less_than_the_weight_because_it_answers_with_more():
+    plant = load_plant("x5_9")
+    assert torque_gain(plant) == pytest.approx(1.0 / (0.65 * 1.008), rel=1e-12)
+    simulated = make_plant(_without_dry_friction(plant), 0.002)
+    simulated.reset(2.0)
+    for _ in range(500):
+        state = simulated.step(equilibrium_effort(plant, 2.0))
+    assert state.theta == pytest.approx(2.0, abs=1e-4)
+
+
+@settings(deadline=None, max_examples=30)
+@given(
+    st.floats(-0.5, 0.5), st.floats(-0.3, 0.3), st.floats(-0.8, 0.8), st.sampled_from(["thesis", "dfki", "x5_9"])
+)
+def test_the_simulated_plant_rests_at_its_fixed_points_whatever_its_offsets(angle, torque, effort, name):
+    plant = _without_dry_friction(load_plant(name)).with_values(angle_offset=angle, torque_offset=torque)
+    points = fixed_points(plant, effort)
+    assert len(points) == 2
+    for point in points:
+        assert equilibrium_effort(plant, point.theta) == pytest.approx(effort, abs=1e-9)
+        assert (point.rate < 0.0) == point.stable
+        simulated = make_plant(plant, 0.002)
+        simulated.reset(point.theta)
+        for _ in range(5):
+            state = simulated.step(effort)
+        # The spring starts without the offset, and gives way by no more than that.
+        slack = abs(torque) / plant.drivetrain.stiffness if plant.drivetrain else 0.0
+        assert state.theta == pytest.approx(point.theta, abs=slack + 1e-9)

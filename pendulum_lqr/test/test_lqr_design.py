@@ -14,11 +14,13 @@ from hypothesis import strategies as st
 from pendulum_lqr.analysis import analyse, delayed_spectral_radius, largest_stable_period, loop_margins
 from pendulum_lqr.design import (
     DesignError,
+    DiscreteModel,
     continuous_lqr,
     discrete_lqr,
     discretise,
     integral_lqr,
     kalman_gain,
+    output_lqr,
     require_controllable,
     require_observable,
     sampled_cost,
@@ -60,6 +62,88 @@ def test_gain_and_time_constant_of_the_thesis():
     assert round(1.0 / round(-report.poles[0].real, 2), 4) == 0.3717
 
 
+X5_9 = load_plant("x5_9")
+
+
+def test_the_gain_for_a_rigid_plant_and_that_of_the_series_elastic_one_on_the_plant_that_runs():
+    # The rigid link alone, as if there were no drivetrain: unstable on the true plant, whose gain may only shrink.
+    model = linearise(X5_9)
+    rigid = continuous_lqr(linearise(X5_9.with_values(drivetrain=None)), (100.0, 0.01), 0.1)
+    wrong = analyse(model, rigid.K)
+    assert not wrong.stable
+    assert wrong.poles[0].real == pytest.approx(0.3145, abs=1e-3)
+    assert abs(wrong.poles[0].imag) == pytest.approx(46.54, abs=0.01)
+    assert wrong.margins is not None
+    assert wrong.margins.gain_down == pytest.approx(0.898, abs=1e-3)
+    right = analyse(model, output_lqr(model, (100.0, 0.01), 0.1).K)
+    assert right.stable
+    assert right.poles[0].real < -2.0
+
+
+@pytest.mark.parametrize(
+    "plant", [X5_9, THESIS.with_values(actuator_time_constant=0.05), X5_9.with_values(actuator_time_constant=0.01)]
+)
+@pytest.mark.parametrize("weights", [(1.0, 0.01), (100.0, 0.1)])
+def test_the_gain_on_the_measurements_costs_least_of_all_such_gains_and_little_more_than_the_whole_state(
+    plant, weights
+):
+    model = linearise(plant)
+    Q = model.C.T @ np.diag(weights) @ model.C
+
+    def cost(K):
+        row = np.asarray(K)[None, :] @ model.C
+        A = model.A - model.B @ row
+        assert np.max(np.linalg.eigvals(A).real) < 0.0
+        P = scipy.linalg.solve_continuous_lyapunov(A.T, -(Q + 0.1 * row.T @ row))
+        follows = np.eye(model.A.shape[0], 2)
+        for index, name in enumerate(model.states):
+            if name.startswith("motor"):
+                follows[index, index - 2] = 1.0
+        return np.trace(follows.T @ P @ follows), np.trace(follows.T @ full.S @ follows)
+
+    full = continuous_lqr(model, weights, 0.1)
+    gain = output_lqr(model, weights, 0.1)
+    best, bound = cost(gain.K)
+    assert bound <= best < 1.1 * bound
+    for step in ((1e-2, 0.0), (-1e-2, 0.0), (0.0, 1e-2), (0.0, -1e-2)):
+        assert cost(gain.K * (1.0 + np.array(step)))[0] >= best * (1.0 - 1e-9)
+
+
+def test_an_integral_on_the_series_elastic_plant_leaves_no_offset():
+    model = linearise(X5_9)
+    gain = integral_lqr(model, (100.0, 0.01, 100.0), 0.1)
+    assert gain.K.shape == (3,)
+    assert np.max(gain.poles.real) < -0.5
+
+
+@pytest.mark.parametrize("delay", [0.0, 0.004, 0.01, 0.013, 0.03])
+@pytest.mark.parametrize("name", ["thesis", "x5_9"])
+def test_the_sampled_cost_is_the_continuous_one_whatever_the_delay(name, delay):
+    model = linearise(load_plant(name))
+    period, q, r = 0.01, (100.0, 0.5), 0.1
+    Qd, Rd, Nd = sampled_cost(model, q, r, period, delay)
+    sampled = discretise(model, period, delay)
+    n, size = model.A.shape[0], sampled.A.shape[0]
+    rng = np.random.default_rng(3)
+    z, u = rng.standard_normal(size), 0.7
+    # By brute force: the period in 4000 pieces, each with the torque that acts in it.
+    pieces = 4000
+    queue = [*z[n:], u]
+    fine = discretise(model, period / pieces)
+    x, total = z[:n].copy(), r * u * u * period
+    rest = (sampled.pending * period - delay) % period if delay else 0.0
+    switch = (period - rest) % period
+    for k in range(pieces):
+        acting = queue[0] if delay == 0.0 or (k + 0.5) * period / pieces < switch or switch < 1e-12 else queue[1]
+        after = fine.A @ x + fine.B[:, 0] * acting
+        middle = 0.5 * (x + after)
+        total += (q[0] * middle[0] ** 2 + q[1] * middle[1] ** 2) * period / pieces
+        x = after
+    quadratic = z @ Qd @ z + 2.0 * u * float(Nd[:, 0] @ z) + Rd * u * u
+    assert quadratic == pytest.approx(total, rel=1e-4)
+    np.testing.assert_allclose((sampled.A @ z + sampled.B[:, 0] * u)[:n], x, rtol=1e-6, atol=1e-9)
+
+
 def test_double_integrator_has_the_closed_form_gain():
     # x'' = u with Q = diag(1, 0), R = 1: K = [1, sqrt 2]; with Q = I: K = [1, sqrt 3].
     model = LinearModel(np.array([[0.0, 1.0], [0.0, 0.0]]), np.array([[0.0], [1.0]]))
@@ -89,11 +173,11 @@ def test_gain_agrees_with_python_control(plant, q, r):
 def test_scalar_discrete_riccati_equation_has_its_closed_form():
     # Angle alone, x[k+1] = a x[k] + b u[k]: s solves s = q + a^2 s - (a b s)^2 / (r + b^2 s).
     a, b, q, r = 1.1, 0.3, 2.0, 0.5
-    s = scipy.linalg.solve_discrete_are(np.array([[a]]), np.array([[b]]), np.array([[q]]), np.array([[r]]))[
-        0, 0
-    ]
+    gain = discrete_lqr(DiscreteModel(np.array([[a]]), np.array([[b]]), 0.01, 0.0, 0), [[q]], r)
+    s = gain.S[0, 0]
     p = b * b * q - r * (1 - a * a)
     assert s == pytest.approx((p + math.sqrt(p * p + 4 * b * b * q * r)) / (2 * b * b))
+    assert gain.K[0] == pytest.approx(a * b * s / (r + b * b * s))
 
 
 @pytest.mark.parametrize("delay", [0.0, 0.004, 0.01, 0.013, 0.03])

@@ -14,6 +14,7 @@ from pendulum_msgs_py.dynamics import friction_magnitude, gravity_torque
 from pendulum_msgs_py.dynamics.series_elastic import (
     dahl_step,
     dry_friction_step,
+    feedforward_pwm,
     link_acceleration,
     motor_acceleration,
     spring_deflection,
@@ -137,12 +138,10 @@ class SeriesElasticPlant:
         self.dt = dt
         self._delay = DelayLine(parameters.transport_delay, dt)
         self._segments = period_segments(dt, self._delay.fraction, substeps or 1)
-        nominal = winding_resistance_at(
-            20.0, drive.winding_resistance, drive.resistance_temperature_coefficient
-        )
-        self._pwm_per_effort = nominal / (
-            drive.gear_ratio * drive.supply_voltage * drive.torque_constant * drive.efficiency
-        )
+        self._pwm_per_effort = feedforward_pwm(
+            1.0, drive.supply_voltage, drive.torque_constant, drive.gear_ratio, drive.efficiency,
+            drive.winding_resistance,
+        )  # fmt: skip
         self._spring = (drive.stiffness, drive.stiffness_hardening)
         self._steps = 0
         self._torque = 0.0

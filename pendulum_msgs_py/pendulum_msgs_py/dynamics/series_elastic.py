@@ -23,6 +23,7 @@ __all__ = [
     "COPPER_REFERENCE_TEMPERATURE",
     "dahl_step",
     "dry_friction_step",
+    "feedforward_pwm",
     "link_acceleration",
     "motor_acceleration",
     "shorted_winding_damping",
@@ -67,6 +68,30 @@ def winding_current(
         resistance: R at the present temperature [ohm].
     """
     return (pwm * supply_voltage - back_emf_constant * gear_ratio * motor_velocity) / resistance
+
+
+def feedforward_pwm(
+    torque: float,
+    supply_voltage: float,
+    torque_constant: float,
+    gear_ratio: float,
+    efficiency: float,
+    nominal_resistance: float,
+) -> float:
+    """Return the duty that answers a torque command without an effort loop, u = tau R / (N V K_t eta) [-].
+
+    It takes the motor for stalled, its winding for one at 20 degrees Celsius, and asks for 1 / eta more than the
+    output needs.
+
+    Args:
+        torque: Commanded torque tau at the output [N m].
+        supply_voltage: V [V].
+        torque_constant: K_t [N m/A].
+        gear_ratio: N [-].
+        efficiency: eta, share of the motor's torque that is expected at the output [-].
+        nominal_resistance: R at 20 degrees Celsius [ohm].
+    """
+    return torque * nominal_resistance / (gear_ratio * supply_voltage * torque_constant * efficiency)
 
 
 def shorted_winding_damping(

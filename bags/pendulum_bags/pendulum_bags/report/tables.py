@@ -15,7 +15,7 @@ import numpy as np
 from pendulum_bags.figures.data import ReportData
 from pendulum_bags.figures.numbers import quantity
 from pendulum_bags.figures.trial_figures import GRAVITY, INERTIA, UNITS, TrialSet
-from pendulum_lqr.design import continuous_lqr
+from pendulum_lqr.design import output_lqr
 from pendulum_lqr.model import linearise, sort_poles
 from pendulum_msgs_py.plants.plant_parameters import PLANT_SPECS
 
@@ -201,7 +201,7 @@ def _eigenvalues(data: ReportData) -> Table | None:
     open_loop = sort_poles(np.linalg.eigvals(model.A).astype(complex))
     rows = [("none", "–", "–", "–", _poles(open_loop), "–")]
     for number, (q11, q22, r) in enumerate(WEIGHTS, start=1):
-        gain = continuous_lqr(model, [q11, q22], r)
+        gain = output_lqr(model, [q11, q22], r)
         values = (f"{q11:g}", f"{q22:g}", f"{r:g}", _poles(gain.poles), ", ".join(f"{k:.6f}" for k in gain.K))
         rows.append((str(number), *values))
     chosen = data.run.get("controller", {})

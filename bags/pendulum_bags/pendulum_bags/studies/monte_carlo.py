@@ -12,7 +12,7 @@ import math
 import warnings
 from collections.abc import Callable, Mapping
 from contextlib import nullcontext
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from pendulum_bags.runs.run_folder import write_json
 from pendulum_bags.studies.chunks import Connect, chunk_path, open_results, read_columns, run_chunks
 from pendulum_bags.studies.uncertain import VARIED, Uncertainty, batch_variations
-from pendulum_lqr.design import continuous_lqr
+from pendulum_lqr.design import output_lqr
 from pendulum_lqr.model import linearise
 from pendulum_msgs_py.contract.angles import UPRIGHT, wrap
 from pendulum_msgs_py.errors import ParameterError
@@ -295,9 +295,11 @@ def _batch(
     threads: int | None,
     record: bool = False,
 ) -> BatchResult:
-    design = continuous_lqr(linearise(plant, UPRIGHT), settings.q, settings.r)
+    if plant.drivetrain is not None:
+        raise ParameterError(f"plant {plant.name!r} is series elastic; expected a rigid one: the batch has no motor")
+    design = output_lqr(linearise(plant, UPRIGHT), settings.q, settings.r)
     return simulate_batch(
-        replace(plant, drivetrain=None),
+        plant,
         variations=batch_variations(plant, drawn),
         steps=settings.steps,
         dt=settings.dt,

@@ -29,7 +29,7 @@ from pendulum_bags.studies.chunks import (
     write_columns,
 )
 from pendulum_bags.studies.uncertain import VARIED, Uncertainty, batch_variations
-from pendulum_lqr.design import Gain, continuous_lqr
+from pendulum_lqr.design import Gain, output_lqr
 from pendulum_lqr.model import linearise
 from pendulum_lqr.roa import proven_level, sublevel_ellipse
 from pendulum_msgs_py.contract.angles import UPRIGHT, wrap
@@ -131,7 +131,7 @@ class RegionMap:
 
     def gain(self) -> Gain:
         """Return the LQR gain."""
-        return continuous_lqr(linearise(self.believed(), UPRIGHT), self.q, self.r)
+        return output_lqr(linearise(self.believed(), UPRIGHT), self.q, self.r)
 
     def fingerprint(self) -> str:
         """Return a hash of all that the result depends on."""
