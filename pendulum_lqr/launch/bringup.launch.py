@@ -19,7 +19,7 @@ from launch.substitutions import LaunchConfiguration, PathJoinSubstitution
 from launch_ros.actions import Node
 from launch_ros.substitutions import FindPackageShare
 
-from pendulum_lqr.bringup import ARGUMENTS, SIDES, programs
+from pendulum_lqr.bringup import ARGUMENTS, SIDES, parameter_file, programs
 from pendulum_msgs_py.programs.graph import NodeProgram
 
 PLANTS = {"simulator", "bridge"}
@@ -72,7 +72,8 @@ def bring_up(context: LaunchContext) -> list[LaunchDescriptionEntity]:
     """Return the actions for the arguments given."""
     value = {argument.name: LaunchConfiguration(argument.name).perform(context) for argument in ARGUMENTS}
     sides = SIDES[value["plant"]]
-    actions: list[LaunchDescriptionEntity] = [to_action(it, value["params_file"]) for it in programs(value)]
+    parameters = parameter_file(value["params_file"])
+    actions: list[LaunchDescriptionEntity] = [to_action(it, parameters) for it in programs(value)]
     if value["record"] == "true":
         pushed = context.launch_configurations.get("ros_namespace", "").strip("/")
         outer = f"/{pushed}/" if pushed else "/"

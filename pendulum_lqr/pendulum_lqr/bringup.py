@@ -3,21 +3,26 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
+from difflib import get_close_matches
+from pathlib import Path
 
 from pendulum_lqr.controller import CONTROLLERS
 from pendulum_lqr.disturbance import DISTURBANCE_SPECS
 from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.programs import graph
 from pendulum_msgs_py.programs.graph import NodeProgram
+from pendulum_msgs_py.parameters import load_yaml, parameter_sections
 
-__all__ = ["ARGUMENTS", "SIDES", "Argument", "programs"]
+__all__ = ["ARGUMENTS", "SIDES", "Argument", "parameter_file", "programs"]
 
 SIDES = {"sim": ("sim",), "emulator": ("hw",), "hebi": ("hw",), "both": ("sim", "hw")}
 """Plants by the argument ``plant``; each is a namespace too."""
 _KINDS = next(tuple(spec.choices or ()) for spec in DISTURBANCE_SPECS if spec.name == "kind")
 _YES_NO = ("true", "false")
+_NODES = ("simulator", "bridge", "controller", "disturbance", "viewer", "markers", "recorder", "robot_state_publisher")
+"""Names of the nodes that a launch may start, for which a parameter file may have sections."""
 
 
 @dataclass(frozen=True)
@@ -39,6 +44,13 @@ ARGUMENTS: tuple[Argument, ...] = (
         tuple(SIDES),
     ),
     Argument("controller", "lqr", "Controller of each plant.", (*CONTROLLERS, "none")),
+    Argument(
+        "controller_waits",
+        "auto",
+        "Leave the controller inactive until it is activated; auto for a bridge whose pendulum does not start upright, "
+        "since a controller that already asks for torque keeps the bridge from being armed.",
+        ("auto", *_YES_NO),
+    ),
     Argument(
         "disturbance",
         "none",
@@ -73,8 +85,10 @@ def programs(value: Mapping[str, str]) -> list[NodeProgram]:
         value: Values of all ``ARGUMENTS`` by name.
 
     Raises:
-        ParameterError: A number is none.
+        ParameterError: A number is none, or the parameter file is not one that these nodes can read.
     """
+    parameter_file(value["params_file"])
+    waits = _controller_waits(value)
     found: list[NodeProgram] = []
     for side in SIDES[value["plant"]]:
         space = f"/{side}"
@@ -85,7 +99,9 @@ def programs(value: Mapping[str, str]) -> list[NodeProgram]:
             found.append(_bridge(space, value, rate))
         if value["controller"] != "none":
             kind, model = value["controller"], value["model"]
-            found.append(graph.controller(space, controller=kind, plant=model, period=1.0 / rate))
+            found.append(
+                graph.controller(space, controller=kind, plant=model, period=1.0 / rate, autoactivate=not waits[side])
+            )
         if value["disturbance"] != "none":
             found.append(
                 graph.disturbance(
@@ -100,12 +116,49 @@ def programs(value: Mapping[str, str]) -> list[NodeProgram]:
     return found
 
 
+def parameter_file(given: str) -> str:
+    """Return the absolute path of the ROS parameter file that all nodes get; empty where none was given.
+
+    ``launch_ros`` only warns of a file that is not there, and starts the plant without the limits that stand in it; rcl
+    says nothing of a section that no node reads.
+
+    Args:
+        given: Value of the argument ``params_file``.
+
+    Raises:
+        ParameterError: The file cannot be read, holds no parameters, or has a section for a node of no launch.
+    """
+    if not given.strip():
+        return ""
+    path = Path(given.strip()).expanduser().absolute()
+    sections = [pattern for pattern, _ in parameter_sections(load_yaml(path, "params_file"))]
+    if not sections:
+        raise ParameterError(f"params_file {path} has no section with ros__parameters; expected at least one")
+    for pattern in sections:
+        node = pattern.rpartition("/")[2]
+        if node not in {"*", "**", *_NODES}:
+            near = get_close_matches(node, _NODES, n=1)
+            hint = f"did you mean {near[0]!r}?" if near else f"expected one of {', '.join(_NODES)}, or /**"
+            raise ParameterError(f"params_file {path} has a section {pattern!r}, which no node reads; {hint}")
+    return str(path)
+
+
 def _bridge(space: str, value: Mapping[str, str], rate: float) -> NodeProgram:
     if value["plant"] == "hebi":
         # A real pendulum starts where it is.
         return graph.bridge(space, backend="hebi", feedback_rate=rate)
     at = math.pi if value["start"] == "top" else 0.0
     return graph.bridge(space, backend="emulator", feedback_rate=rate, initial_position=at)
+
+
+def _controller_waits(value: Mapping[str, str]) -> dict[str, bool]:
+    """Return for each side whether its controller waits to be activated."""
+    asked = value["controller_waits"]
+    # Hanging, the angle from upright is pi: whatever balances asks for all it has, before anybody has armed the bridge.
+    upright = value["start"] == "top" and value["plant"] != "hebi"
+    return {
+        side: asked == "true" or (asked == "auto" and side == "hw" and not upright) for side in SIDES[value["plant"]]
+    }
 
 
 def _number(value: Mapping[str, str], name: str) -> float:

@@ -57,6 +57,10 @@ NODE_SPECS: tuple[ParameterSpec, ...] = (
         "an effort controller of ros2_control.", choices=("joint_state", "multi_array"), read_only=True,
     ),
     ParameterSpec("autostart", True, "", "Configure and activate at once, without a manager.", read_only=True),
+    ParameterSpec(
+        "autoactivate", True, "", "With autostart: activate too; false configures, and waits inactive for "
+        "~/change_state.", read_only=True,
+    ),
 )  # fmt: skip
 """Parameters of the node itself; those of the chosen controller join them."""
 
@@ -206,6 +210,10 @@ class ControllerNode(LifecycleNode):
     def _autostart(self) -> None:
         if self.trigger_configure() != TransitionCallbackReturn.SUCCESS:
             raise PendulumError("the controller cannot be configured; the log says why")
+        if not self._settings["autoactivate"]:
+            node = self._full_name
+            self.get_logger().info(f"waits inactive; when the plant is armed and where it should be: {node}/change_state")
+            return
         if self.trigger_activate() != TransitionCallbackReturn.SUCCESS:
             raise PendulumError("the controller cannot be activated; the log says why")
 

@@ -137,6 +137,17 @@ def test_the_controller_answers_each_state_once_by_its_stamp_and_ends_with_zero(
     assert plant.commands[-1].stamp_ns > plant.commands[-2].stamp_ns
 
 
+def test_a_controller_that_waits_is_silent_until_it_is_activated(plant, processes):
+    program = processes.start("pendulum_lqr", "controller", *ros("autoactivate:=false", PATIENT))
+    program.wait_for_output(r"waits inactive.*: /sim/controller/change_state", 30)
+    plant.connect()
+    plant.run(5)
+    assert not plant.commands
+    request = ChangeState.Request(transition=Transition(id=Transition.TRANSITION_ACTIVATE))
+    assert plant.call(ChangeState, "controller/change_state", request).success
+    plant.until(lambda: plant.publish() and plant.commands, "the first answer")
+
+
 def test_a_manager_can_hold_the_controller_and_deactivation_sends_zero(plant, processes):
     program = processes.start(
         "pendulum_lqr", "controller", *ros("autostart:=false", "controller:=pd_gravity", PATIENT)

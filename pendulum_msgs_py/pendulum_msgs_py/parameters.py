@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 import re
 import stat
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from difflib import get_close_matches
 from pathlib import Path
@@ -25,6 +25,7 @@ __all__ = [
     "dump_yaml",
     "load_yaml",
     "markdown_table",
+    "parameter_sections",
     "read_text",
     "reject_unknown",
     "require_mapping",
@@ -323,6 +324,20 @@ def load_yaml(path: str | Path, what: str = "file") -> dict[str, Any]:
     finally:
         if loader is not None:
             loader.dispose()
+
+
+def parameter_sections(content: Mapping[str, Any]) -> Iterator[tuple[str, Mapping[str, Any]]]:
+    """Yield the sections of a ROS parameter file: node name or pattern, and parameters; namespaces may be nested."""
+    return _sections(content, "")
+
+
+def _sections(content: Mapping[str, Any], prefix: str) -> Iterator[tuple[str, Mapping[str, Any]]]:
+    for key, value in content.items():
+        if key == "ros__parameters":
+            if isinstance(value, Mapping):
+                yield prefix, value
+        elif isinstance(value, Mapping):
+            yield from _sections(value, f"{prefix}/{key.strip('/')}")
 
 
 def dump_yaml(document: Mapping[str, Any], what: str = "file") -> str:

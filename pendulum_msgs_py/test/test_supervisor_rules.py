@@ -423,7 +423,11 @@ def test_arming_needs_a_fresh_measurement_and_a_command_near_zero() -> None:
     assert "ahead" in supervisor.arm(now, JointSample(now + NANOSECONDS, 0.0, 0.0))
     assert "not finite" in supervisor.arm(now, JointSample(now, math.nan, 0.0))
     supervisor.offer(Input.EFFORT_COMMAND, JointCommand(now, 3.0, "lqr"), now)
-    assert "lqr already commands 3.000 N m" in supervisor.arm(now, fresh)
+    refusal = supervisor.arm(now, fresh)
+    assert "lqr already commands 3.000 N m" in refusal
+    # In this order it can be armed.
+    steps = [refusal.index(step) for step in ("deactivate", ", arm", "joint_trajectory", "then activate")]
+    assert steps == sorted(steps)
     supervisor.set_commander_conflict("two of them")
     assert supervisor.arm(now, fresh) == "two of them"
     supervisor.set_commander_conflict("")

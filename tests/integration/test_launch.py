@@ -13,7 +13,7 @@ import pytest
 import yaml
 
 from pendulum_hw_bridge.bridge_node import SPECS as BRIDGE_SPECS
-from pendulum_lqr.bringup import ARGUMENTS, SIDES, programs
+from pendulum_lqr.bringup import ARGUMENTS, SIDES, parameter_file, programs
 from pendulum_lqr.controller import COMMON_PARAMETERS, controller_parameters
 from pendulum_lqr.controller_node import NODE_SPECS as CONTROLLER_SPECS
 from pendulum_lqr.disturbance import DISTURBANCE_SPECS
@@ -90,6 +90,57 @@ def test_the_parameter_file_fits_the_nodes(file: str) -> None:
         values = {name: value for name, value in content["ros__parameters"].items() if name != "use_sim_time"}
         program = NodeProgram("pendulum_lqr", key.split("/")[-1], parameters=values)
         assert validate(_specs(program), values, where=key)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        (None, "does not exist"),
+        ("", "is empty; expected a mapping"),
+        ("bridge: {effort_limit: 1.0}", "has no section with ros__parameters"),
+        ("/**/brigde: {ros__parameters: {effort_limit: 1.0}}", "which no node reads; did you mean 'bridge'"),
+        ("/hw: {plant: {ros__parameters: {effort_limit: 1.0}}}", "section '/hw/plant', which no node reads"),
+        ("bridge: {ros__parameters: {effort_limit: 1.0, effort_limit: 2.0}}", "key 'effort_limit' is given twice"),
+    ],
+)
+@pytest.mark.parametrize("plant", SIDES)
+def test_a_plant_is_not_started_without_the_limits_that_its_file_should_hold(
+    plant: str, text: str | None, message: str, tmp_path: Path
+) -> None:
+    file = tmp_path / "limits.yaml"
+    if text is not None:
+        file.write_text(text, encoding="utf-8")
+    with pytest.raises(ParameterError, match="limits.yaml") as caught:
+        programs({**DEFAULTS, "plant": plant, "params_file": str(file)})
+    assert message in str(caught.value)
+
+
+@pytest.mark.parametrize("section", ["/**", "/hw/*", "bridge", "/lab/hw/bridge"])
+def test_a_parameter_file_for_a_node_of_the_launch_is_found_from_any_folder(
+    section: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "limits.yaml").write_text(f"{section}: {{ros__parameters: {{effort_limit: 1.0}}}}", encoding="utf-8")
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("HOME", str(tmp_path))
+    assert parameter_file("limits.yaml") == parameter_file("~/limits.yaml") == str(tmp_path / "limits.yaml")
+
+
+@pytest.mark.parametrize(
+    ("given", "waits"),
+    [
+        ({"plant": "sim"}, {"/sim": False}),
+        ({"plant": "both"}, {"/sim": False, "/hw": True}),
+        ({"plant": "emulator", "start": "top"}, {"/hw": False}),
+        ({"plant": "hebi", "start": "top"}, {"/hw": True}),
+        ({"plant": "hebi", "controller_waits": "false"}, {"/hw": False}),
+        ({"plant": "sim", "controller_waits": "true"}, {"/sim": True}),
+    ],
+)
+def test_a_controller_waits_where_its_torque_would_keep_the_bridge_from_being_armed(
+    given: dict[str, str], waits: dict[str, bool]
+) -> None:
+    found = {it.namespace: it for it in programs({**DEFAULTS, **given}) if it.executable == "controller"}
+    assert {space: not it.parameters["autoactivate"] for space, it in found.items()} == waits
 
 
 _PLUGINS = ("Grid", "RobotModel", "MarkerArray", "TF", "MoveCamera", "Measure", "Orbit")

@@ -9,11 +9,10 @@ from itertools import pairwise
 from typing import Any
 
 from pendulum_msgs_py.errors import ParameterError
-from pendulum_msgs_py.parameters import load_yaml
+from pendulum_msgs_py.parameters import load_yaml, parameter_sections
 
 __all__ = ["given_to_every_node", "refuse_near_misses"]
 
-_CONTENT = "ros__parameters"
 _MISSPELT = 0.85
 """Likeness from which a name is a misspelling of ours, not another node's; the names of our own nodes differ more."""
 
@@ -32,7 +31,7 @@ def given_to_every_node(arguments: Sequence[str], node: str) -> set[str]:
         ParameterError: A parameter file holds what ROS reads and this project refuses, such as a key given twice.
     """
     files = [value for flag, value in pairwise(arguments) if flag == "--params-file"]
-    sections = [section for file in files for section in _sections(load_yaml(file, "parameter file"), "")]
+    sections = [section for file in files for section in parameter_sections(load_yaml(file, "parameter file"))]
     to_all: set[str] = set()
     to_us: set[str] = set()
     for pattern, content in sections:
@@ -64,16 +63,6 @@ def refuse_near_misses(names: Iterable[str], known: Iterable[str], *, where: str
                 f"{where}: unknown parameter {name!r} in a section for every node; did you mean {near[0]!r}? "
                 "If it belongs to another node, give it in that node's section"
             )
-
-
-def _sections(content: Mapping[str, Any], prefix: str) -> Iterator[tuple[str, Mapping[str, Any]]]:
-    """Yield the sections of a file; namespaces may be nested."""
-    for key, value in content.items():
-        if key == _CONTENT:
-            if isinstance(value, Mapping):
-                yield prefix, value
-        elif isinstance(value, Mapping):
-            yield from _sections(value, f"{prefix}/{key.strip('/')}")
 
 
 def _flat(content: Mapping[str, Any], prefix: str) -> Iterator[str]:
