@@ -89,7 +89,7 @@ class BridgeNode(LifecycleNode):
     """
 
     def __init__(self, stop: Callable[[], None]) -> None:
-        super().__init__("bridge")
+        super().__init__("bridge", enable_logger_service=True)
         self._stop_runner = stop
         self.failure: Exception | None = None
         self._values = values = NodeParameters(self, SPECS).values

@@ -15,10 +15,6 @@ from pendulum_msgs_py.contract.values import NANOSECONDS, JointSample
 
 __all__ = ["AnswerLoop", "StateRefusal"]
 
-_RESTART_NS = NANOSECONDS
-"""In simulated time, a stamp this far before the newest one means that the simulation began anew [ns]."""
-
-
 class StateRefusal(str, Enum):
     """Why a state was not answered; the value is the key in diagnostics."""
 
@@ -59,16 +55,21 @@ class AnswerLoop:
         self.last_reason = ""
         self.age = RingOfTimes()
         self.compute_time = RingOfTimes()
-        self.newest_stamp_ns: int | None = None
+        self._newest: JointSample | None = None
         self._monotonic = monotonic
         self._timeout_ns = math.inf if simulated_time else state_timeout * NANOSECONDS
         self._start_ns: int | None = None
         self._window = (0, 0, 0)
 
+    @property
+    def newest_stamp_ns(self) -> int | None:
+        """Stamp of the newest state that was answered, or could not be [ns]; None before the first."""
+        return None if self._newest is None else self._newest.stamp_ns
+
     def restart(self) -> None:
         """Forget the past: the next state is the first one."""
         self.controller.reset()
-        self.newest_stamp_ns = None
+        self._newest = None
         self._start_ns = None
         self.last_effort = 0.0
 
@@ -77,33 +78,35 @@ class AnswerLoop:
         controller.carry_over(self.controller)
         self.controller = controller
 
-    def answer(self, sample: JointSample | None, now_ns: int) -> float | None:
+    def answer(self, sample: JointSample | None, now_ns: int, problem: str = "") -> float | None:
         """Return the torque that answers a state, or None where the state is refused [N m].
 
         Args:
             sample: The state; None for a message that carries none of our joint.
             now_ns: Time of arrival on the clock of the stamps [ns]; not used in simulated time.
+            problem: What is wrong with a message that carries no state.
         """
         refusal = self._judge(sample, now_ns)
         if refusal is not None:
             self.refused[refusal] += 1
+            self.last_reason = problem if sample is None else self._problem(refusal, sample, now_ns)
             # A plant in lockstep repeats a state when the answer did not reach it: the same answer again.
             repeated = refusal is StateRefusal.DUPLICATE and self.simulated_time
             return self.last_effort if repeated else None
         assert sample is not None
         if self._start_ns is None:
             self._start_ns = sample.stamp_ns
-        self.newest_stamp_ns = sample.stamp_ns
+        self._newest = sample
         began = self._monotonic()
         x = (from_upright(sample.position), sample.velocity)
+        reason = ""
         try:
             effort = self.controller.command((sample.stamp_ns - self._start_ns) / NANOSECONDS, x)
         except (ArithmeticError, ValueError, RuntimeError) as error:
             # A solver that gives up must not end the node: without an answer the plant's timeout makes it zero.
-            self.last_reason = f"{type(error).__name__}: {error}"
-            effort = math.nan
+            effort, reason = math.nan, f"{type(error).__name__}: {error}"
         if not math.isfinite(effort):
-            self.last_reason = self.last_reason or f"controller answered {effort} N m"
+            self.last_reason = reason or f"controller answered {effort} N m"
             self.refused[StateRefusal.NO_ANSWER] += 1
             return None
         self.compute_time.add(self._monotonic() - began)
@@ -158,15 +161,25 @@ class AnswerLoop:
                 return StateRefusal.STALE
             if age < -self._timeout_ns:
                 return StateRefusal.FROM_FUTURE
-        newest = self.newest_stamp_ns
-        if newest is None:
+        newest = self._newest
+        if newest is None or sample.stamp_ns > newest.stamp_ns:
             return None
-        if sample.stamp_ns == newest:
-            return StateRefusal.DUPLICATE
-        if sample.stamp_ns < newest:
-            if self.simulated_time and newest - sample.stamp_ns >= _RESTART_NS:
-                self.restarts += 1
-                self.restart()
-                return None
-            return StateRefusal.OUT_OF_ORDER
-        return None
+        # Angle and velocity alone: what the torque sensor shows is no part of the state.
+        if self.simulated_time and sample[:3] != newest[:3]:
+            # One writer's messages never overtake each other, so simulated time that goes back, or another state under
+            # the same stamp, is a simulation that began anew, however short the one before it was.
+            self.restarts += 1
+            self.restart()
+            return None
+        return StateRefusal.DUPLICATE if sample.stamp_ns == newest.stamp_ns else StateRefusal.OUT_OF_ORDER
+
+    def _problem(self, refusal: StateRefusal, sample: JointSample, now_ns: int) -> str:
+        age = (now_ns - sample.stamp_ns) / NANOSECONDS
+        limit = f"expected at most {self._timeout_ns / NANOSECONDS:g} s"
+        if refusal is StateRefusal.NOT_FINITE:
+            return f"position is {sample.position} rad, velocity {sample.velocity} rad/s; expected finite numbers"
+        if refusal is StateRefusal.STALE:
+            return f"header.stamp is {age:.6g} s old; {limit}"
+        if refusal is StateRefusal.FROM_FUTURE:
+            return f"header.stamp is {-age:.6g} s ahead of this clock; {limit}"
+        return f"header.stamp is {sample.stamp_ns} ns; the newest was {self.newest_stamp_ns} ns"

@@ -32,7 +32,7 @@ from pendulum_msgs_py.errors import PendulumError
 from pendulum_msgs_py.parameters import ParameterSpec
 from pendulum_msgs_py.plants.plant_parameters import PlantParameters, load_plant
 from pendulum_msgs_py.ros import qos
-from pendulum_msgs_py.ros.convert import diagnostic_status, sample_from_bytes, stamp_to_message
+from pendulum_msgs_py.ros.convert import diagnostic_status, problem_of_state, sample_from_bytes, stamp_to_message
 from pendulum_msgs_py.ros.lifecycle import LifecycleNode
 from pendulum_msgs_py.ros.parameters import NodeParameters
 from pendulum_msgs_py.ros.runner import run_node
@@ -87,7 +87,7 @@ class ControllerNode(LifecycleNode):
         kind = self._choose()
         self._own = {spec.name for spec in NODE_SPECS}
         specs = NODE_SPECS + COMMON_PARAMETERS + controller_class(kind).PARAMETERS
-        self._settings = NodeParameters(self, specs, self._on_change)
+        self._settings = NodeParameters(self, specs, self._design, self._swap)
         self._plant: PlantParameters = load_plant(self._settings["plant"])
         # A bad value at start ends the node with its reason instead of waiting for a transition to fail.
         self._pending: Controller | None = self._design(self._settings.values)
@@ -165,7 +165,7 @@ class ControllerNode(LifecycleNode):
         if not self._active or self._loop is None:
             return
         sample = sample_from_bytes(data)
-        effort = self._loop.answer(sample, self._now())
+        effort = self._loop.answer(sample, self._now(), problem_of_state(data) if sample is None else "")
         if effort is None or sample is None:
             return
         if self._multi_array:
@@ -175,9 +175,8 @@ class ControllerNode(LifecycleNode):
                 encode_joint_state(sample.stamp_ns, frame_id=self._full_name, effort=effort)
             )
 
-    def _on_change(self, values: Mapping[str, Any]) -> None:
-        """Design aside, then swap at once; a design that fails leaves the old gain in force."""
-        controller = self._design(values)
+    def _swap(self, controller: Controller) -> None:
+        """Take over what was designed aside; a design that fails never comes here, and leaves the old gain in force."""
         if self._loop is None:
             self._pending = controller
             return

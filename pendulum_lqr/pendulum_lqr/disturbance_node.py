@@ -61,12 +61,15 @@ class DisturbanceNode(Node):
     def __init__(self, stop: Callable[[], None]) -> None:
         super().__init__("disturbance", enable_logger_service=True)
         self._stop = stop
-        self._settings = NodeParameters(self, DISTURBANCE_SPECS + NODE_SPECS, self._on_change)
+        self._settings = NodeParameters(self, DISTURBANCE_SPECS + NODE_SPECS, self._prepare, self._swap)
         self._now = SteadyWallClock()
         self._full_name = self.get_fully_qualified_name()
         self._simulated_time = bool(self.get_parameter("use_sim_time").value)
         self._loop = DisturbanceLoop(
-            _signal(self._settings.values), self._settings["duration"], simulated_time=self._simulated_time
+            _signal(self._settings.values),
+            self._settings["duration"],
+            simulated_time=self._simulated_time,
+            autostart=self._settings["autostart"],
         )
         self._torque_publisher = self.create_publisher(JointState, names.DISTURBANCE, qos.COMMAND)
         self._event_publisher = self.create_publisher(String, names.EVENTS, qos.EVENTS)
@@ -77,8 +80,6 @@ class DisturbanceNode(Node):
         self.create_service(Trigger, "~/stop", self._on_stop)
         self.create_subscription(JointState, names.JOINT_STATES, self._on_state, qos.NEWEST_STATE, raw=True)
         self.create_timer(_DIAGNOSTICS_PERIOD, self._publish_diagnostics, clock=_steady_clock())
-        if self._settings["autostart"]:
-            self._loop.start()
 
     def close(self) -> None:
         """End with zero torque while the context is still valid."""
@@ -120,13 +121,16 @@ class DisturbanceNode(Node):
         response.message = "ends with zero torque" if response.success else "was not running"
         return response
 
-    def _on_change(self, values: Mapping[str, Any]) -> None:
+    def _prepare(self, values: Mapping[str, Any]) -> tuple[Disturbance, float]:
         signal = _signal(values)
         if self._loop.running:
             raise ParameterError(
                 "the disturbance is running; expected ~/stop before a change, so that a run has one signal"
             )
-        self._loop.replace(signal, values["duration"])
+        return signal, values["duration"]
+
+    def _swap(self, prepared: tuple[Disturbance, float]) -> None:
+        self._loop.replace(*prepared)
 
     # --- pieces --------------------------------------------------------------------------------------------
 

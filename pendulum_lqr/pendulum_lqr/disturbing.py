@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+import statistics
+from collections import deque
 from collections.abc import Mapping
 from typing import NamedTuple
 
@@ -11,7 +13,9 @@ from pendulum_msgs_py.contract.values import NANOSECONDS
 
 __all__ = ["DisturbanceAnswer", "DisturbanceLoop"]
 
-_RESTART_NS = NANOSECONDS
+_INTERVALS = 31
+"""Intervals between states of which the median counts: few enough to follow a plant that was started again at another
+rate, enough that neither states lost on the way nor two that came close together make a difference."""
 
 
 class DisturbanceAnswer(NamedTuple):
@@ -31,10 +35,13 @@ class DisturbanceLoop:
     Args:
         signal: The disturbance.
         duration: How long it acts [s]; 0 until it is stopped.
-        simulated_time: A stamp a second or more before the newest means a new simulation.
+        simulated_time: A stamp before the newest means a new simulation.
+        autostart: Start with the first state, of a new simulation too.
     """
 
-    def __init__(self, signal: Disturbance, duration: float = 0.0, *, simulated_time: bool = False) -> None:
+    def __init__(
+        self, signal: Disturbance, duration: float = 0.0, *, simulated_time: bool = False, autostart: bool = False
+    ) -> None:
         self.newest_stamp_ns: int | None = None
         self.answered = 0
         self.refused = 0
@@ -42,9 +49,10 @@ class DisturbanceLoop:
         self._signal = signal
         self._duration_ns = round(duration * NANOSECONDS)
         self._simulated_time = simulated_time
-        self._armed = False
+        self._autostart = autostart
+        self._armed = autostart
         self._start_ns: int | None = None
-        self._shortest_interval_ns: int | None = None
+        self._intervals_ns: deque[int] = deque(maxlen=_INTERVALS)
         self._window = (0, 0)
         self._ending = False
 
@@ -63,8 +71,8 @@ class DisturbanceLoop:
     def stop(self) -> bool:
         """End with the next state; return False if it was not running."""
         was_running = self.running
-        # The end is an event only where there was a beginning.
-        self._ending = self._start_ns is not None
+        # The end is an event only where there was a beginning, and one that nobody has heard of yet stays to be told.
+        self._ending |= self._start_ns is not None
         self._armed, self._start_ns = False, None
         return was_running
 
@@ -80,24 +88,19 @@ class DisturbanceLoop:
             stamp_ns: Stamp of the state [ns].
         """
         newest = self.newest_stamp_ns
-        if (
-            newest is not None
-            and stamp_ns <= newest
-            and not (self._simulated_time and newest - stamp_ns >= _RESTART_NS)
-        ):
-            self.refused += 1
-            # A plant in lockstep repeats a state when the answer did not reach it: the same answer again.
-            repeated = self._simulated_time and stamp_ns == newest
-            return DisturbanceAnswer(self.last_torque, "") if repeated else None
-        if newest is not None and stamp_ns > newest:
-            interval = stamp_ns - newest
-            # The shortest: a state that was lost on the way must not look like a longer period.
-            known = self._shortest_interval_ns
-            self._shortest_interval_ns = interval if known is None else min(known, interval)
+        if newest is not None and stamp_ns <= newest:
+            if not self._simulated_time or stamp_ns == newest:
+                self.refused += 1
+                # A plant in lockstep repeats a state when the answer did not reach it: the same answer again.
+                return DisturbanceAnswer(self.last_torque, "") if self._simulated_time else None
+            self._begin_anew()
+        elif newest is not None:
+            self._intervals_ns.append(stamp_ns - newest)
         self.newest_stamp_ns = stamp_ns
         self.answered += 1
         event = ""
-        if self._armed:
+        # One event a state: after an end that is still to be told, a new beginning waits for the next state.
+        if self._armed and not self._ending:
             self._armed, self._start_ns = False, stamp_ns
             event = "noise_start"
         torque = 0.0
@@ -107,12 +110,26 @@ class DisturbanceLoop:
                 self._start_ns = None
                 event = "noise_end"
             else:
-                torque = self._signal(elapsed + (self._shortest_interval_ns or 0) // 2)
+                torque = self._signal(elapsed + self._interval_ns // 2)
         elif self._ending:
             event = "noise_end"
         self._ending = False
         self.last_torque = torque
         return DisturbanceAnswer(torque, event)
+
+    @property
+    def _interval_ns(self) -> int:
+        """The interval between states [ns]; 0 before the second one."""
+        return round(statistics.median_low(self._intervals_ns)) if self._intervals_ns else 0
+
+    def _begin_anew(self) -> None:
+        """Forget the plant whose simulation has ended, so that the next one gets what this one got."""
+        armed = self._armed or self._autostart
+        self.stop()
+        self._armed = armed
+        # A beginning says that what was before has ended.
+        self._ending &= not armed
+        self._intervals_ns.clear()
 
     def summary(self, now_ns: int) -> Mapping[str, object]:
         """Return the figures for diagnostics; the rate is that since the last summary.

@@ -66,14 +66,42 @@ def test_answers_have_increasing_stamps_whatever_comes(offsets):
     assert answering.answered + sum(answering.refused.values()) == len(offsets)
 
 
-def test_simulated_time_has_no_age_and_may_start_anew():
+def test_simulated_time_has_no_age_and_a_repeated_state_gets_the_same_answer():
     answering = loop(simulated_time=True)
-    assert answering.answer(sample(5 * SECOND), START) is not None
-    assert answering.answer(sample(5 * SECOND - MS), START) is None
-    assert answering.answer(sample(0), START) is not None
+    first = answering.answer(sample(5 * SECOND), START)
+    assert first == pytest.approx(-3.3663251, abs=1e-6)
+    assert answering.answer(sample(5 * SECOND), START) == first
+    assert (answering.answered, answering.restarts) == (1, 0)
+
+
+@given(
+    st.integers(1, 3000),
+    st.integers(1, 3000),
+    st.floats(-0.05, 0.05),
+)
+@settings(deadline=None, max_examples=30)
+def test_a_simulation_that_begins_anew_is_answered_as_by_a_new_controller(first_steps, start_step, angle):
+    """However short the run before, and wherever in time the new one starts, also at its very first stamp."""
+    answering = AnswerLoop(make_controller("lqi", THESIS, 0.002), 0.05, simulated_time=True)
+    for k in range(min(first_steps, 50)):
+        answering.answer(sample(SECOND + (first_steps + k) * 2 * MS, 0.02), START)
+    newest = answering.newest_stamp_ns
+    begin = min(SECOND + start_step * 2 * MS, newest)
+    fresh = AnswerLoop(make_controller("lqi", THESIS, 0.002), 0.05, simulated_time=True)
+    for k in range(5):
+        state = sample(begin + k * 2 * MS, 0.3 + angle)
+        assert answering.answer(state, START) == fresh.answer(state, START) is not None
     assert answering.restarts == 1
-    # A plant in lockstep repeats a state whose answer was lost, and gets the same answer.
-    assert answering.answer(sample(0), START) == answering.last_effort
+
+
+def test_a_refusal_says_which_field_is_wrong():
+    answering = loop()
+    answering.answer(None, START, "position has 0 values for 1 names; expected one for 'pendulum_joint'")
+    assert answering.last_reason.startswith("position has 0 values")
+    answering.answer(sample(START - 400 * MS), START)
+    assert answering.last_reason == "header.stamp is 0.4 s old; expected at most 0.05 s"
+    answering.answer(sample(START, velocity=math.inf), START)
+    assert "velocity inf rad/s" in answering.last_reason
 
 
 def test_a_controller_that_fails_or_answers_nonsense_gives_no_answer_and_a_reason():

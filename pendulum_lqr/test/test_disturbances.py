@@ -203,18 +203,46 @@ def test_time_counts_from_the_state_that_started_it_even_if_states_are_missed():
     assert loop.answer(200 * MS).torque == noise_signal(70 * MS)
 
 
-@given(st.lists(st.integers(-2 * MS, 2 * MS), min_size=50, max_size=50))
+@given(
+    st.lists(st.integers(-2 * MS, 2 * MS), min_size=50, max_size=50),
+    st.lists(st.integers(0, 49), max_size=6, unique=True),
+    st.lists(st.integers(-12, 40), max_size=3, unique=True),
+)
 @settings(deadline=None)
-def test_jittering_stamps_read_the_same_signal_as_exact_ones(jitter):
+def test_stamps_that_jitter_stall_or_come_in_pairs_read_the_signal_that_exact_ones_read(jitter, lost, short):
     noise_signal = make_disturbance({"seed": 9})
     loop = DisturbanceLoop(noise_signal)
-    for k in range(10):
-        loop.answer(10 * k * MS)
-    loop.start()
     start = 100 * MS
-    got = [loop.answer(start).torque]
-    got += [loop.answer(start + 10 * k * MS + offset).torque for k, offset in enumerate(jitter, start=1)]
-    assert got == [noise_signal(10 * k * MS) for k in range(51)]
+    for k in range(-10, 0):
+        loop.answer(start + 10 * k * MS)
+        if k in short:
+            loop.answer(start + 10 * k * MS + MS // 20)
+    loop.start()
+    got, expected = [loop.answer(start).torque], [noise_signal(0)]
+    for k, offset in enumerate(jitter, start=1):
+        if k in lost:
+            continue
+        stamp = start + 10 * k * MS + offset
+        got.append(loop.answer(stamp).torque)
+        expected.append(noise_signal(10 * k * MS))
+        if k in short:
+            # A state 50 us after another, as after a stall.
+            loop.answer(stamp + MS // 20)
+    assert got == expected
+
+
+def test_one_short_interval_does_not_spoil_the_rest_of_the_life_of_the_node():
+    noise_signal = make_disturbance({"seed": 9})
+    loop = DisturbanceLoop(noise_signal)
+    rng = np.random.default_rng(3)
+    for stamp in (0, MS // 20, *(10 * k * MS for k in range(1, 10))):
+        loop.answer(stamp)
+    loop.start()
+    stamps = 100 * MS + 10 * MS * np.arange(2000)
+    stamps[1:] += rng.normal(0.0, 0.3 * MS, 1999).round().astype(np.int64)
+    got = np.array([loop.answer(int(stamp)).torque for stamp in stamps])
+    wanted = np.array([noise_signal(10 * k * MS) for k in range(2000)])
+    assert np.corrcoef(got, wanted)[0, 1] > 0.9999
 
 
 def test_a_stop_ends_with_one_event_and_zero():
@@ -227,12 +255,46 @@ def test_a_stop_ends_with_one_event_and_zero():
     assert loop.answer(2) == (0.0, "")
 
 
+def test_a_start_right_after_a_stop_tells_the_end_before_the_new_beginning():
+    signal = make_disturbance({"kind": "step", "amplitude": 1.0})
+    loop = DisturbanceLoop(signal)
+    loop.start()
+    loop.answer(0)
+    loop.stop()
+    assert loop.start()
+    answers = [loop.answer(k) for k in range(1, 4)]
+    assert answers == [(0.0, "noise_end"), (1.0, "noise_start"), (1.0, "")]
+
+
 def test_an_answered_or_overtaken_state_gets_no_second_answer():
     loop = DisturbanceLoop(make_disturbance({}))
     assert loop.answer(5) is not None
     assert loop.answer(5) is None
     assert loop.answer(4) is None
     assert loop.refused == 2
-    simulated = DisturbanceLoop(make_disturbance({}), simulated_time=True)
-    simulated.answer(5 * SECOND)
-    assert simulated.answer(0) is not None
+
+
+@pytest.mark.parametrize("duration", [0.004, 0.6, 5.0])
+@pytest.mark.parametrize("kind", ["uniform", "sine"])
+def test_a_simulation_that_begins_anew_gets_what_the_first_one_got(kind, duration):
+    """However short the first one was; in lockstep a refused state would hang it for ever."""
+    loop = DisturbanceLoop(
+        make_disturbance({"kind": kind, "hold_time": 0.0 if kind == "sine" else 0.01}),
+        simulated_time=True,
+        autostart=True,
+    )
+    stamps = [SECOND + 2 * k * MS for k in range(round(duration / 0.002))]
+    first = [loop.answer(stamp) for stamp in stamps]
+    assert [loop.answer(stamp) for stamp in stamps] == first
+    assert first[0].event == "noise_start"
+    assert loop.refused == 0
+
+
+def test_a_disturbance_that_was_started_by_hand_ends_with_its_simulation():
+    loop = DisturbanceLoop(make_disturbance({"kind": "step", "amplitude": 1.0}), simulated_time=True)
+    loop.start()
+    assert [loop.answer(SECOND + k * MS).torque for k in range(3)] == [1.0, 1.0, 1.0]
+    assert loop.answer(SECOND) == (0.0, "noise_end")
+    # Started between the two runs, it begins with the second.
+    loop.start()
+    assert loop.answer(SECOND - MS) == (1.0, "noise_start")

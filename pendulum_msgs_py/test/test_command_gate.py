@@ -50,6 +50,27 @@ def test_each_rule_refuses_and_counts_under_its_own_name(command: JointCommand, 
     assert (gate.fresh(_NOW) is command) == (refusal is None)
 
 
+@pytest.mark.parametrize(
+    ("command", "problem"),
+    [
+        (_command(age_ms=412.0), "header.stamp is 0.412 s before the plant's time; expected at most 0.05 s"),
+        (_command(age_ms=-20.0), "header.stamp is 0.02 s after the plant's time; expected at most 0.005 s"),
+        (_command(effort=math.nan), "effort is nan N m; expected a finite number"),
+        (_command(joints=("elbow",)), f"name is ['elbow']; expected [{JOINT!r}] or none"),
+        (_command(joints=(JOINT, "elbow")), f"name is [{JOINT!r}, 'elbow']; expected [{JOINT!r}] or none"),
+        (_command(age_ms=1.0), "header.stamp is that of the command before; expected one answer to a state"),
+        (_command(age_ms=4.0), "header.stamp is 0.003 s before that of the command before"),
+        (_command(source="pid"), "header.frame_id is 'pid'; 'lqr' commands"),
+    ],
+)
+def test_a_refusal_says_which_field_is_wrong_and_what_was_expected(command: JointCommand, problem: str) -> None:
+    gate = _gate()
+    gate.offer(_command(age_ms=1.0), _NOW)
+    refusal = gate.offer(command, _NOW)
+    assert refusal is not None
+    assert gate.problems == {refusal: problem}
+
+
 def test_a_second_answer_to_one_state_and_an_older_one_are_refused() -> None:
     gate = _gate()
     gate.offer(_command(age_ms=10.0), _NOW)

@@ -56,6 +56,30 @@ def test_before_its_first_point_a_trajectory_rests() -> None:
     assert trajectory.at(1.5) == (0.75, 0.25)
 
 
+@given(_ANGLES, _ANGLES, st.floats(0.05, 20.0))
+def test_a_single_point_is_reached_from_where_the_joint_is_without_a_jump(here: float, goal: float, time: float) -> None:
+    move = from_points([time], [goal], [0.0]).from_position(here, 0.0)
+    assert move.at(0.0) == (pytest.approx(here, abs=1e-12), 0.0)
+    assert move.at(time) == (goal, 0.0)
+    assert move.duration == time
+    # Velocity is the derivative of position, and nowhere above that of half a cosine.
+    peak = 0.5 * math.pi * abs(goal - here) / time
+    assert move.max_speed() <= peak * (1.0 + 1e-9) + 1e-12
+    for before, after in itertools.pairwise(move.points):
+        mean = 0.5 * (before.velocity + after.velocity)
+        assert mean * (after.time - before.time) == pytest.approx(after.position - before.position, rel=0.25, abs=1e-6)
+
+
+def test_where_the_start_is_said_or_near_a_trajectory_stays_as_it_is() -> None:
+    at_once = from_points([0.0], [1.0], [0.0])
+    near = from_points([2.0], [1.0], [0.0])
+    assert at_once.from_position(0.0, 0.3) is at_once
+    assert near.from_position(0.8, 0.3) is near
+    several = from_points([1.0, 2.0], [0.5, 1.0], [0.2, 0.0]).from_position(0.0, 0.3)
+    assert several.at(0.5) == (0.25, 0.1)
+    assert len(several.points) == 3
+
+
 @given(_ANGLES, _ANGLES)
 def test_the_largest_speed_is_at_least_that_of_every_interval(start: float, goal: float) -> None:
     ramp = thesis_ramp(start, goal)

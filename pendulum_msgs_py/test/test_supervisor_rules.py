@@ -384,6 +384,17 @@ def test_the_gap_to_a_trajectory_is_closed_no_faster_than_a_ramp() -> None:
     assert positions[-1] == 0.29
 
 
+def test_a_goal_of_one_point_is_a_move_from_here_as_it_is_to_a_joint_trajectory_controller() -> None:
+    loop = Loop(velocity=2.0)
+    goal = from_points([4.0], [math.pi], [0.0])
+    assert loop.follow(goal) == ""
+    assert loop.drives == []
+    loop.run(0.001)
+    assert abs(loop.drives[-1].position) < 1e-3
+    assert "rad/s" in Loop(velocity=1.0).follow(goal)
+    assert "trajectory covers" in Loop(position_max=3.0, position_min=-3.0).follow(goal)
+
+
 def test_a_gap_counts_for_the_speed_limit() -> None:
     loop = Loop(velocity=0.2)
     assert "rad/s" in loop.follow(_hold(1.0, 0.29))

@@ -87,7 +87,7 @@ class SimulatorNode(PollingNode):
     """
 
     def __init__(self, stop: Callable[[], None]) -> None:
-        super().__init__("simulator")
+        super().__init__("simulator", enable_logger_service=True)
         self._settings = NodeParameters(self, SPECS, self._check_start)
         values = self._settings.values
         parameters = load_plant(values["plant"])

@@ -35,7 +35,7 @@ class TinyPlant(Node):
 
     def __init__(self, stop: Callable[[], None]) -> None:
         super().__init__("tiny_plant")
-        self.parameters = NodeParameters(self, SPECS, self._on_change)
+        self.parameters = NodeParameters(self, SPECS, self._prepare)
         self.clock = SteadyWallClock()
         self.supervisor = PlantSupervisor(limits_from_parameters(self.parameters.values, 5.0))
         self.interface = PlantInterface(self, self.supervisor, self.clock)
@@ -51,7 +51,7 @@ class TinyPlant(Node):
         print("closed", flush=True)
 
     @staticmethod
-    def _on_change(values) -> None:
+    def _prepare(values) -> None:
         from pendulum_msgs_py.errors import ParameterError
 
         if values["gain"] * values["cycles"] > 100.0:

@@ -40,6 +40,10 @@ class CommandGate:
         future_tolerance: How far ahead of the plant's clock a stamp may lie [s].
         single_commander: Refuse a second source while the first one is alive.
         joint: The joint that commands must be for; an empty list of names means this one.
+
+    Attributes:
+        refused: How many were refused, by reason.
+        problems: Of each reason's newest refusal, the field of the message, its value and what was expected.
     """
 
     def __init__(
@@ -55,15 +59,17 @@ class CommandGate:
         self.single_commander = single_commander
         self.joint = joint
         self.refused: Counter[Refusal] = Counter()
+        self.problems: dict[Refusal, str] = {}
         self.accepted = 0
         self.refused_commander = ""
         self._newest: JointCommand | None = None
         self._heard_ns = 0
         self._holder = ""
 
-    def refuse_malformed(self) -> Refusal:
-        """Count a message that was no command for one joint at all."""
+    def refuse_malformed(self, problem: str = "") -> Refusal:
+        """Count a message that was no command for one joint at all, and keep what was wrong with it."""
         self.refused[Refusal.NOT_ONE_JOINT] += 1
+        self.problems[Refusal.NOT_ONE_JOINT] = problem
         return Refusal.NOT_ONE_JOINT
 
     def offer(self, command: JointCommand, now_ns: int) -> Refusal | None:
@@ -81,6 +87,7 @@ class CommandGate:
             self.accepted += 1
         else:
             self.refused[refusal] += 1
+            self.problems[refusal] = self._problem(refusal, command, now_ns)
             if refusal is Refusal.SECOND_COMMANDER:
                 self.refused_commander = command.source
         return refusal
@@ -141,3 +148,20 @@ class CommandGate:
         if command.stamp_ns < newest.stamp_ns:
             return Refusal.OUT_OF_ORDER
         return None
+
+    def _problem(self, refusal: Refusal, command: JointCommand, now_ns: int) -> str:
+        age = (now_ns - command.stamp_ns) / NANOSECONDS
+        newest_ns = self.newest_stamp_ns
+        since = 0.0 if newest_ns is None else (command.stamp_ns - newest_ns) / NANOSECONDS
+        return {
+            Refusal.NOT_ONE_JOINT: f"name is {list(command.joints)}; expected [{self.joint!r}] or none",
+            Refusal.OTHER_JOINT: f"name is {list(command.joints)}; expected [{self.joint!r}] or none",
+            Refusal.NOT_FINITE: f"effort is {command.effort} N m; expected a finite number",
+            Refusal.TOO_OLD: f"header.stamp is {age:.6g} s before the plant's time; expected at most "
+            f"{self.timeout_ns / NANOSECONDS:g} s",
+            Refusal.FROM_FUTURE: f"header.stamp is {-age:.6g} s after the plant's time; expected at most "
+            f"{self.future_tolerance_ns / NANOSECONDS:g} s",
+            Refusal.OUT_OF_ORDER: f"header.stamp is {-since:.6g} s before that of the command before",
+            Refusal.DUPLICATE: "header.stamp is that of the command before; expected one answer to a state",
+            Refusal.SECOND_COMMANDER: f"header.frame_id is {command.source!r}; {self._holder!r} commands",
+        }[refusal]

@@ -85,10 +85,10 @@ class PlantSupervisor:
 
     # --- messages ------------------------------------------------------------------------------------------
 
-    def offer(self, kind: Input, command: JointCommand | None, now_ns: int) -> Refusal | None:
-        """Offer a message of an input; None stands for one that was no command of one joint."""
+    def offer(self, kind: Input, command: JointCommand | None, now_ns: int, problem: str = "") -> Refusal | None:
+        """Offer a message of an input; None stands for one that was no command of one joint, for a problem of its."""
         gate = self.gates[kind]
-        return gate.refuse_malformed() if command is None else gate.offer(command, now_ns)
+        return gate.refuse_malformed(problem) if command is None else gate.offer(command, now_ns)
 
     def set_commander_conflict(self, conflict: str) -> None:
         """Report that several publishers stand behind one name on ``effort_command``, or that they no longer do.
@@ -106,6 +106,7 @@ class PlantSupervisor:
         fault = self._measurement_fault(now_ns, sample)
         if fault:
             return fault
+        trajectory = trajectory.from_position(sample.position, limits.tracking_error)
         gap = trajectory.start - sample.position
         if abs(gap) > limits.tracking_error:
             return (

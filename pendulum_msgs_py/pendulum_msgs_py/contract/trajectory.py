@@ -88,6 +88,36 @@ class Trajectory:
         """Last position [rad]."""
         return self.points[-1].position
 
+    def from_position(self, position: float, tolerance: float) -> Trajectory:
+        """Return the trajectory that leads there from where the joint is, if its first point lies ahead in time.
+
+        That is how ``joint_trajectory_controller`` of ros2_control reads a goal of one point. A single point at rest
+        is reached on half a cosine, so that velocity neither jumps at its start nor at its end; the first of several
+        points, linearly. Who starts at time 0, or within the tolerance, has said all there is to say.
+
+        Args:
+            position: Where the joint is [rad].
+            tolerance: Distance of the first point up to which the trajectory stays as it is [rad].
+        """
+        first = self.points[0]
+        if first.time == 0.0 or abs(first.position - position) <= tolerance:
+            return self
+        start = TrajectoryPoint(0.0, position, 0.0)
+        if len(self.points) > 1 or first.velocity != 0.0:
+            return Trajectory((start, *self.points))
+        steps = min(MAX_RAMP_STEPS, max(2, math.ceil(first.time / RAMP_PERIOD)))
+        distance = first.position - position
+        phases = [math.pi * index / steps for index in range(1, steps)]
+        between = tuple(
+            TrajectoryPoint(
+                first.time * phase / math.pi,
+                position + 0.5 * distance * (1.0 - math.cos(phase)),
+                0.5 * distance * math.pi / first.time * math.sin(phase),
+            )
+            for phase in phases
+        )
+        return Trajectory((start, *between, first))
+
     def max_speed(self) -> float:
         """Return the largest speed asked for, as commanded or as positions imply [rad/s]."""
         speed = max(abs(point.velocity) for point in self.points)

@@ -23,6 +23,8 @@ __all__ = [
     "command_from_bytes",
     "diagnostic_status",
     "event_message",
+    "problem_of_command",
+    "problem_of_state",
     "sample_from_bytes",
     "sample_from_message",
     "seconds_to_duration",
@@ -31,6 +33,9 @@ __all__ = [
     "trajectory_from_message",
     "trajectory_to_message",
 ]
+
+
+_NO_JOINT_STATE = "its bytes are no sensor_msgs/JointState"
 
 
 def stamp_to_message(stamp_ns: int) -> Time:
@@ -78,6 +83,33 @@ def sample_from_message(message: JointState) -> JointSample | None:
         )
     except (ValueError, IndexError):
         return None
+
+
+def problem_of_state(data: bytes) -> str:
+    """Return which field of a serialised JointState keeps it from being a state of our joint, empty where none does."""
+    message = _deserialise(data)
+    if message is None:
+        return _NO_JOINT_STATE
+    names = list(message.name)
+    if JOINT not in names:
+        return f"name is {names}; expected {JOINT!r} among them"
+    for field in ("position", "velocity"):
+        count = len(getattr(message, field))
+        if count <= names.index(JOINT):
+            return f"{field} has {count} values for {len(names)} names; expected one for {JOINT!r}"
+    return ""
+
+
+def problem_of_command(data: bytes) -> str:
+    """Return which field of a serialised JointState keeps it from being a command, empty where none does."""
+    message = _deserialise(data)
+    if message is None:
+        return _NO_JOINT_STATE
+    if len(message.name) > 1:
+        return f"name is {list(message.name)}; expected [{JOINT!r}] or none"
+    if len(message.effort) != 1:
+        return f"effort has {len(message.effort)} values; expected 1"
+    return ""
 
 
 def trajectory_from_message(message: JointTrajectory) -> Trajectory:

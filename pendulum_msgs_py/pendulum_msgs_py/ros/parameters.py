@@ -32,8 +32,10 @@ class NodeParameters:
     Args:
         node: The node.
         specs: The table.
-        on_change: Called with all values, changed ones included, before a change is accepted; what it raises as
-            ParameterError refuses the change, and everything stays as it was.
+        prepare: Called with all values, changed ones included, before a change is accepted; what it raises as
+            ParameterError refuses the change. It must leave everything as it is: somebody else may still refuse.
+        apply: Called once a change is accepted and in force, with what ``prepare`` has returned, or with all values
+            where there is no ``prepare``.
 
     Raises:
         ParameterError: A value given at start is refused, or a parameter was given that the node does not have, unless
@@ -44,15 +46,20 @@ class NodeParameters:
         self,
         node: Node,
         specs: Iterable[ParameterSpec],
-        on_change: Callable[[Mapping[str, Any]], None] | None = None,
+        prepare: Callable[[Mapping[str, Any]], Any] | None = None,
+        apply: Callable[[Any], None] | None = None,
     ) -> None:
         self._specs = {spec.name: spec for spec in specs}
-        self._on_change = on_change
+        self._prepare = prepare
+        self._apply = apply
+        self._prepared: tuple[Any] | None = None
         self.values: dict[str, Any] = {}
         _refuse_unknown(node, self._specs)
         for spec in self._specs.values():
             self.values[spec.name] = self._declare(node, spec)
+        self._simulated_time = bool(node.get_parameter_or("use_sim_time", Parameter("use_sim_time", value=False)).value)
         node.add_on_set_parameters_callback(self._check_change)
+        node.add_post_set_parameters_callback(self._take_over)
 
     def __getitem__(self, name: str) -> Any:
         """Return the value in force."""
@@ -77,19 +84,36 @@ class NodeParameters:
         return spec.check(_plain(parameter.value))
 
     def _check_change(self, parameters: list[Parameter]) -> SetParametersResult:
-        changed = dict(self.values)
+        self._prepared = None
         try:
-            for parameter in parameters:
-                spec = self._specs.get(parameter.name)
-                if spec is None:
-                    continue
-                changed[parameter.name] = spec.check(_plain(parameter.value))
-            if self._on_change is not None and changed != self.values:
-                self._on_change(changed)
+            changed = self._changed(parameters)
+            if self._prepare is not None and changed != self.values:
+                self._prepared = (self._prepare(changed),)
         except ParameterError as error:
             return SetParametersResult(successful=False, reason=str(error))
-        self.values = changed
         return SetParametersResult(successful=True)
+
+    def _take_over(self, parameters: list[Parameter]) -> None:
+        changed = self._changed(parameters)
+        if changed == self.values:
+            return
+        prepared, self._prepared = self._prepared, None
+        self.values = changed
+        if self._apply is not None:
+            self._apply(changed if prepared is None else prepared[0])
+
+    def _changed(self, parameters: list[Parameter]) -> dict[str, Any]:
+        changed = dict(self.values)
+        for parameter in parameters:
+            spec = self._specs.get(parameter.name)
+            if spec is not None:
+                changed[parameter.name] = spec.check(_plain(parameter.value))
+            elif parameter.name == "use_sim_time" and parameter.value != self._simulated_time:
+                raise ParameterError(
+                    f"use_sim_time is {str(self._simulated_time).lower()} since the start of this node, which reads it "
+                    f"once; expected it at start: -p use_sim_time:={str(not self._simulated_time).lower()}"
+                )
+        return changed
 
 
 def _refuse_unknown(node: Node, specs: Mapping[str, ParameterSpec]) -> None:

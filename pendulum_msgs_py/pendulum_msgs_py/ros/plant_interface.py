@@ -32,6 +32,7 @@ from pendulum_msgs_py.ros.convert import (
     command_from_bytes,
     diagnostic_status,
     event_message,
+    problem_of_command,
     stamp_from_message,
     stamp_to_message,
     trajectory_from_message,
@@ -311,6 +312,7 @@ class PlantInterface:
             values[f"{kind.value}.accepted"] = gate.accepted
             for refusal, count in sorted(gate.refused.items()):
                 values[f"{kind.value}.refused.{refusal.value}"] = count
+                values[f"{kind.value}.newest_refused.{refusal.value}"] = gate.problems.get(refusal, "")
         for reason, count in self.refused_trajectories.items():
             values[f"joint_trajectory.refused.{reason}"] = count
         if self.statistics is not None:
@@ -337,7 +339,8 @@ class PlantInterface:
         def receive(data: bytes, arrived_ns: int = 0) -> None:
             self.arrived_ns = arrived_ns
             command = command_from_bytes(data)
-            refusal = supervisor.offer(kind, command, self.clock())
+            problem = problem_of_command(data) if command is None else ""
+            refusal = supervisor.offer(kind, command, self.clock(), problem)
             if refusal is Refusal.DUPLICATE and kind is Input.EFFORT_COMMAND and command is not None:
                 self._commanders.suspect_twins(command, self.clock())
             if refusal is None and kind is Input.EFFORT_COMMAND and command is not None:
@@ -425,7 +428,7 @@ class PlantInterface:
         refused = sum(sum(gate.refused.values()) for gate in gates.values())
         if refused > self._told_refusals:
             details = ", ".join(
-                f"{kind.value} {refusal.value} {count}"
+                f"{kind.value} {refusal.value} {count} ({gate.problems.get(refusal, '')})"
                 for kind, gate in gates.items()
                 for refusal, count in sorted(gate.refused.items())
             )

@@ -122,7 +122,7 @@ class Player(Node):
         self.exit_code = 0
         self._stop = stop
         self._options = options
-        self._settings = NodeParameters(self, SPECS, self._on_parameters)
+        self._settings = NodeParameters(self, SPECS, apply=self._on_parameters)
         bag = read_bag(options.bag, list(options.topics) or None)
         self._times, self._order, self._datas, names = _schedule(bag, options)
         self._outputs = [self._publisher(bag, name) for name in names]

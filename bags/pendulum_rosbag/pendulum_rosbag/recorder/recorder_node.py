@@ -73,7 +73,7 @@ class Recorder(PollingNode):
         self._refused: dict[str, str] = {}
         self._lock = threading.RLock()
         self._events = f"{self.get_fully_qualified_name()}/{EVENTS}"
-        self._settings = NodeParameters(self, SPECS, self._on_parameters)
+        self._settings = NodeParameters(self, SPECS, apply=self._on_parameters)
         self._parameter_reader = ParameterReader(self, self._on_node_parameters)
         if not options.wait:
             self._begin()
