@@ -32,7 +32,12 @@ from pendulum_msgs_py.errors import PendulumError
 from pendulum_msgs_py.parameters import ParameterSpec
 from pendulum_msgs_py.plants.plant_parameters import PlantParameters, load_plant
 from pendulum_msgs_py.ros import qos
-from pendulum_msgs_py.ros.convert import diagnostic_status, problem_of_state, sample_from_bytes, stamp_to_message
+from pendulum_msgs_py.ros.convert import (
+    diagnostic_status,
+    problem_of_state,
+    sample_from_bytes,
+    stamp_to_message,
+)
 from pendulum_msgs_py.ros.lifecycle import LifecycleNode
 from pendulum_msgs_py.ros.parameters import NodeParameters
 from pendulum_msgs_py.ros.runner import run_node
@@ -210,8 +215,9 @@ class ControllerNode(LifecycleNode):
         if self.trigger_configure() != TransitionCallbackReturn.SUCCESS:
             raise PendulumError("the controller cannot be configured; the log says why")
         if not self._settings["autoactivate"]:
-            node = self._full_name
-            self.get_logger().info(f"waits inactive; when the plant is armed and where it should be: {node}/change_state")
+            self.get_logger().info(
+                f"waits inactive; when the plant is armed and where it should be: {self._full_name}/change_state"
+            )
             return
         if self.trigger_activate() != TransitionCallbackReturn.SUCCESS:
             raise PendulumError("the controller cannot be activated; the log says why")

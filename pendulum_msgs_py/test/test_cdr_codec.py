@@ -128,7 +128,7 @@ def _truth(data: bytes) -> JointState | None:
     """What the middleware itself reads, or None where it refuses."""
     try:
         return serialization.deserialize_message(data, JointState)
-    except Exception:  # rclpy raises its C library's error types
+    except Exception:  # noqa: BLE001  # rclpy raises its C library's error types
         return None
 
 

@@ -57,7 +57,7 @@ def test_before_its_first_point_a_trajectory_rests() -> None:
 
 
 @given(_ANGLES, _ANGLES, st.floats(0.05, 20.0))
-def test_a_single_point_is_reached_from_where_the_joint_is_without_a_jump(here: float, goal: float, time: float) -> None:
+def test_a_single_point_is_reached_from_here_without_a_jump(here: float, goal: float, time: float) -> None:
     move = from_points([time], [goal], [0.0]).from_position(here, 0.0)
     assert move.at(0.0) == (pytest.approx(here, abs=1e-12), 0.0)
     assert move.at(time) == (goal, 0.0)

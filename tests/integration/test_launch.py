@@ -110,7 +110,7 @@ def test_a_plant_is_not_started_without_the_limits_that_its_file_should_hold(
     file = tmp_path / "limits.yaml"
     if text is not None:
         file.write_text(text, encoding="utf-8")
-    with pytest.raises(ParameterError, match="limits.yaml") as caught:
+    with pytest.raises(ParameterError, match=r"limits\.yaml") as caught:
         programs({**DEFAULTS, "plant": plant, "params_file": str(file)})
     assert message in str(caught.value)
 

@@ -86,7 +86,7 @@ class PlantSupervisor:
     # --- messages ------------------------------------------------------------------------------------------
 
     def offer(self, kind: Input, command: JointCommand | None, now_ns: int, problem: str = "") -> Refusal | None:
-        """Offer a message of an input; None stands for one that was no command of one joint, for a problem of its."""
+        """Offer a message of an input; None stands for no command of one joint, with its problem."""
         gate = self.gates[kind]
         return gate.refuse_malformed(problem) if command is None else gate.offer(command, now_ns)
 
