@@ -359,8 +359,8 @@ class PlantSupervisor:
         if command is not None and abs(command.effort) > self.limits.arm_effort:
             return (
                 f"{command.source or 'a controller'} already commands {command.effort:.3f} N m; "
-                f"expected at most {self.limits.arm_effort} N m while arming: deactivate the controller, arm, bring the "
-                "pendulum with a joint_trajectory to where the controller balances, then activate it"
+                f"expected at most {self.limits.arm_effort} N m while arming: deactivate the controller, arm, bring "
+                "the pendulum with a joint_trajectory to where the controller balances, then activate it"
             )
         return self.preflight()
 
