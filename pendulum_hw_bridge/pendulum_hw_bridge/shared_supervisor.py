@@ -32,10 +32,10 @@ class SharedSupervisor(PlantSupervisor):
         self._not_prepared = ""
         super().__init__(limits, preflight=lambda: self._not_prepared)
 
-    def offer(self, kind: Input, command: JointCommand | None, now_ns: int) -> Refusal | None:
+    def offer(self, kind: Input, command: JointCommand | None, now_ns: int, problem: str = "") -> Refusal | None:
         """Offer a message of an input."""
         with self._lock:
-            return super().offer(kind, command, now_ns)
+            return super().offer(kind, command, now_ns, problem)
 
     def set_commander_conflict(self, conflict: str) -> None:
         """Report several publishers behind one name."""
