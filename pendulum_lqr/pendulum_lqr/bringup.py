@@ -11,9 +11,9 @@ from pathlib import Path
 from pendulum_lqr.controller import CONTROLLERS
 from pendulum_lqr.disturbance import DISTURBANCE_SPECS
 from pendulum_msgs_py.errors import ParameterError
+from pendulum_msgs_py.parameters import load_yaml, parameter_sections
 from pendulum_msgs_py.programs import graph
 from pendulum_msgs_py.programs.graph import NodeProgram
-from pendulum_msgs_py.parameters import load_yaml, parameter_sections
 
 __all__ = ["ARGUMENTS", "SIDES", "Argument", "parameter_file", "programs"]
 
