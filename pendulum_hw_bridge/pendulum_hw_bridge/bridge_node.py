@@ -23,6 +23,7 @@ from pendulum_hw_bridge.bridge import Bridge, Outcome
 from pendulum_hw_bridge.bridge_parameters import BRIDGE_SPECS
 from pendulum_hw_bridge.clocks import SteppedClock, WallClock
 from pendulum_hw_bridge.feedback_message import encode_feedback
+from pendulum_hw_bridge.lab_node import with_lab_file
 from pendulum_hw_bridge.safety import SafetyMonitor
 from pendulum_hw_bridge.shared_supervisor import SharedSupervisor
 from pendulum_msgs_py.contract.supervisor import Drive, Input
@@ -92,7 +93,7 @@ class BridgeNode(LifecycleNode):
         super().__init__("bridge", enable_logger_service=True)
         self._stop_runner = stop
         self.failure: Exception | None = None
-        self._values = values = NodeParameters(self, SPECS).values
+        self._values = values = NodeParameters(self, with_lab_file(self, SPECS)).values
         self._lockstep = values["clock"] == "lockstep"
         self._period_ns = round(NANOSECONDS / values["feedback_rate"])
         self._statistics = LoopStatistics(self._period_ns)
@@ -385,7 +386,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         from pendulum_hw_bridge.check_cli import main as check
 
         arguments.remove("--check")
-        return check(arguments)
+        # With the mark of ROS's arguments the checklist takes the bridge's own defaults.
+        return check(arguments if "--ros-args" in arguments else [*arguments, "--ros-args"])
     return run_node(
         BridgeNode,
         arguments,

@@ -12,6 +12,7 @@ from pendulum_hw_bridge.bridge import BridgeSettings
 from pendulum_hw_bridge.clocks import Clock
 from pendulum_hw_bridge.effort_mapping import EffortMapping, EffortStrategy
 from pendulum_hw_bridge.gains import DEFAULT_GAINS, GainSet, load_gains
+from pendulum_hw_bridge.lab import LAB_SPEC
 from pendulum_hw_bridge.safety import SafetyLimits
 from pendulum_msgs_py.contract.values import NANOSECONDS
 from pendulum_msgs_py.errors import ParameterError
@@ -41,6 +42,7 @@ def _fixed(name: str, default: Any, unit: str, description: str, **domain: Any) 
 
 
 BRIDGE_SPECS: tuple[ParameterSpec, ...] = (
+    LAB_SPEC,
     _fixed("backend", "emulator", "", "What stands behind the actuator port.", choices=tuple(BACKENDS)),
     _fixed("autostart", True, "", "Configure and activate at once, without a lifecycle manager."),
     _fixed(

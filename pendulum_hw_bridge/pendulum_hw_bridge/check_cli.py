@@ -5,102 +5,126 @@ from __future__ import annotations
 import json
 from collections.abc import Sequence
 from dataclasses import asdict
-from typing import Annotated, Any
+from pathlib import Path
+from typing import Annotated
 
 import typer
 
-from pendulum_hw_bridge.bridge_parameters import (
-    BRIDGE_SPECS,
-    bridge_settings,
-    make_port,
-    plant_of,
-    safety_limits,
-    trajectory_gains,
-)
-from pendulum_hw_bridge.checklist import CheckItem, run_checklist
-from pendulum_hw_bridge.clocks import WallClock
-from pendulum_msgs_py.parameters import validate
+from pendulum_hw_bridge.check_item import Checklist
+from pendulum_hw_bridge.checklist import run_checklist
+from pendulum_hw_bridge.nudge import hand_of
 from pendulum_msgs_py.programs.executables import cli_main
+from pendulum_msgs_py.programs.graph import ParameterArgument
 from pendulum_msgs_py.programs.terminal import WholeTable, make_console
 
 __all__ = ["main"]
 
 EXIT_NOT_READY = 1
 """Exit code where an item of the checklist is not as it should be."""
+EXIT_BUSY = 3
+"""Exit code where this computer was too busy to judge the actuator, and nothing else was wrong."""
 
 app = typer.Typer(add_completion=False, rich_markup_mode=None)
 
 
 @app.command()
 def check(
-    backend: Annotated[str, typer.Option(help="hebi, emulator, emulator_process or replay.")] = "hebi",
-    family: Annotated[
-        str, typer.Option(help="HEBI family; empty for any, if there is only one module.")
-    ] = "",
-    name: Annotated[str, typer.Option(help="HEBI name; empty for any, if there is only one module.")] = "",
-    interface: Annotated[str, typer.Option(help="Network address to look on; empty for all.")] = "",
-    plant: Annotated[str, typer.Option(help="thesis, x5_9, or a plant file with a drivetrain.")] = "thesis",
-    feedback_rate: Annotated[float, typer.Option(help="Feedback records per second [Hz].")] = 100.0,
-    gains_file: Annotated[str, typer.Option(help="HEBI gains file; empty for the defaults.")] = "",
-    emulator_address: Annotated[
-        str, typer.Option(help="HOST:PORT of an emulator process.")
-    ] = "127.0.0.1:17590",
+    context: typer.Context,
+    lab: Annotated[Path | None, typer.Option(help="Lab file; what is given beside it wins.")] = None,
+    backend: Annotated[str | None, typer.Option(help="hebi, emulator, emulator_process or replay.")] = None,
+    family: Annotated[str | None, typer.Option(help="HEBI family; default any, if only one answers.")] = None,
+    name: Annotated[str | None, typer.Option(help="HEBI name; default any, if only one answers.")] = None,
+    serial: Annotated[str | None, typer.Option(help="Serial number of the HEBI module.")] = None,
+    interface: Annotated[str | None, typer.Option(help="Network address to look on; default all.")] = None,
+    plant: Annotated[str | None, typer.Option(help="thesis, x5_9, or a plant file with a drivetrain.")] = None,
+    feedback_rate: Annotated[float | None, typer.Option(help="Feedback records per second [Hz].")] = None,
+    gains_file: Annotated[str | None, typer.Option(help="HEBI gains file; default those of the X5-9.")] = None,
+    emulator_address: Annotated[str | None, typer.Option(help="HOST:PORT of an emulator process.")] = None,
     joint_offset: Annotated[
-        float, typer.Option(help="Joint angle at which the actuator reads zero [rad].")
-    ] = 0.0,
+        float | None, typer.Option(help="Joint angle at which the actuator reads zero [rad].")
+    ] = None,
+    joint_sign: Annotated[
+        int | None, typer.Option(help="1, or -1 where the actuator turns the other way.")
+    ] = None,
+    nudge: Annotated[
+        bool, typer.Option(help="Wait for a hand that turns the link counter-clockwise, to try the sign.")
+    ] = True,
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON instead of a table.")] = False,
 ) -> int:
     """Go through the checklist before arming; the motor gets no torque.
 
-    Example: python -m pendulum_hw_bridge check --backend hebi --family Lab --name Pendulum
+    It is judged by the options that the bridge will use: give it the bridge's own, after --ros-args, or the lab file.
+    The pendulum must hang at rest. Exit code 0 if ready, 1 if not, 3 if this computer was too busy to tell.
+
+    Example: python -m pendulum_hw_bridge check --lab lab.yaml
     """
-    values: dict[str, Any] = validate(
-        BRIDGE_SPECS,
-        {
-            "backend": backend,
-            "family": family,
-            "name": name,
-            "interface": interface,
-            "plant": plant,
-            "feedback_rate": feedback_rate,
-            "gains_file": gains_file,
-            "emulator_address": emulator_address,
-            "joint_offset": joint_offset,
-        },
-    )
-    effort = plant_of(values).effort_limit
-    settings = bridge_settings(values, effort=effort, velocity=1.5, gains=trajectory_gains(values))
+    from pendulum_hw_bridge.check_node import as_the_bridge, bridge_values
+
+    options: dict[str, ParameterArgument | None] = {
+        "lab_file": None if lab is None else str(lab),
+        "backend": backend,
+        "family": family,
+        "name": name,
+        "serial": serial,
+        "interface": interface,
+        "plant": plant,
+        "feedback_rate": feedback_rate,
+        "gains_file": gains_file,
+        "emulator_address": emulator_address,
+        "joint_offset": joint_offset,
+        "joint_sign": joint_sign,
+    }
+    given = {key: value for key, value in options.items() if value is not None}
+    ros_arguments: list[str] = context.obj or []
+    if not ros_arguments and lab is None:
+        given.setdefault("backend", "hebi")
+    bridge = as_the_bridge(bridge_values(ros_arguments, given))
     console = make_console(stderr=True)
-    items = run_checklist(
-        make_port(values, WallClock()),
-        settings,
-        safety_limits(values),
-        window=(-4.0, 4.0),
+    found = run_checklist(
+        bridge.port,
+        bridge.settings,
+        bridge.limits,
+        bridge.plant,
+        window=bridge.window,
+        hand=hand_of(bridge.port, lambda text: console.print(text, style="bold")) if nudge else None,
+        hangs=not bridge.values["flat"],
         progress=(lambda text: None) if as_json else lambda text: console.print(f"{text} ...", style="dim"),
     )
-    ready = all(item.passed for item in items)
     if as_json:
-        print(json.dumps({"ready": ready, "items": [asdict(item) for item in items]}, indent=2))
+        items = [asdict(item) for item in found.items]
+        document = {"ready": found.ready, "host_busy": found.host_busy, "items": items, "figures": found.figures}
+        print(json.dumps(document, indent=2))
     else:
-        _print(items, ready)
-    return 0 if ready else EXIT_NOT_READY
+        _print(found)
+    if found.ready:
+        return 0
+    return EXIT_NOT_READY if found.refused else EXIT_BUSY
 
 
-def _print(items: list[CheckItem], ready: bool) -> None:
+def _print(found: Checklist) -> None:
     table = WholeTable("", "check", "seen", "expected", title="Before arming")
-    for item in items:
-        mark = "[green]ok[/green]" if item.passed else "[bold red]NO[/bold red]"
-        table.add_row(mark, item.name, item.seen, item.expected)
+    marks = {True: "[green]ok[/green]", False: "[bold red]NO[/bold red]", None: "[yellow]?[/yellow]"}
+    for item in found.items:
+        table.add_row(marks[item.passed], item.name, item.seen, item.expected)
     console = make_console()
     console.print(table)
-    if ready:
-        console.print(
-            "Ready. Keep a hand on the motion stop, and nobody in the pendulum's plane.", style="green"
-        )
-    else:
+    for item in found.items:
+        if item.passed is False and item.hint:
+            console.print(f"{item.name}: {item.hint}", style="red", highlight=False, markup=False)
+    if found.ready:
+        console.print("Ready. Keep a hand on the motion stop, and nobody in the pendulum's plane.", style="green")
+        if found.untried:
+            console.print(f"Not tried: {', '.join(found.untried)}.", style="yellow")
+    elif found.refused:
         console.print("Not ready: do not arm before every line is ok.", style="bold red")
+    else:
+        console.print(
+            "This computer is too busy to tell: close other programs and check again. Nothing was found against the "
+            "actuator.",
+            style="bold yellow",
+        )
 
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the checklist."""
-    return cli_main(app, argv, name="python -m pendulum_hw_bridge check")
+    return cli_main(app, argv, name="python -m pendulum_hw_bridge check", takes_ros_arguments=True)

@@ -11,22 +11,16 @@ from hypothesis import strategies as st
 from rclpy.serialization import deserialize_message
 from sensor_msgs.msg import JointState
 
-from pendulum_hw_bridge import check_cli
-from pendulum_hw_bridge.actuator import Command, Feedback, HardwareLimits, Strategy
-from pendulum_hw_bridge.backends.emulator import EmulatorBackend
+from pendulum_hw_bridge.actuator import Command, Feedback, HardwareLimits
 from pendulum_hw_bridge.backends.replay import FeedbackRecording, ReplayBackend, load_feedback
-from pendulum_hw_bridge.bridge import BridgeSettings
 from pendulum_hw_bridge.bridge_parameters import BRIDGE_SPECS, make_port
-from pendulum_hw_bridge.checklist import run_checklist
 from pendulum_hw_bridge.clocks import SteppedClock
 from pendulum_hw_bridge.emulation import wire
-from pendulum_hw_bridge.emulation.faults import ActuatorFault
 from pendulum_hw_bridge.emulation.parameters import load_emulator
 from pendulum_hw_bridge.emulation.server import EmulatorServer
 from pendulum_hw_bridge.emulation.x5 import EmulatedX5
 from pendulum_hw_bridge.feedback_message import QUANTITIES, encode_feedback
 from pendulum_hw_bridge.gains import DEFAULT_GAINS
-from pendulum_hw_bridge.safety import SafetyLimits
 from pendulum_msgs_py.errors import DataError, ParameterError, PendulumError
 from pendulum_msgs_py.parameters import validate
 
@@ -203,52 +197,3 @@ def test_only_the_emulator_can_run_in_lockstep() -> None:
     values = validate(BRIDGE_SPECS, {"backend": "hebi"})
     with pytest.raises(ParameterError, match="expected backend 'emulator'"):
         make_port(values, SteppedClock(), lockstep=True)
-
-
-def checklist(fault: ActuatorFault | None) -> dict[str, bool]:
-    actuator = EmulatedX5(load_emulator("thesis"), seed=1)
-    port = EmulatorBackend(actuator, SteppedClock())
-    if fault is not None:
-        actuator.inject(fault)
-    items = run_checklist(port, BridgeSettings(gains=DEFAULT_GAINS[3]), SafetyLimits(), window=(-4.0, 4.0))
-    assert actuator.strategy is Strategy.OFF
-    return {item.name: item.passed for item in items}
-
-
-def test_a_healthy_actuator_passes_every_line() -> None:
-    lines = checklist(None)
-    assert len(lines) >= 15
-    assert all(lines.values())
-
-
-@pytest.mark.parametrize(
-    ("fault", "line"),
-    [
-        (ActuatorFault.M_STOP, "motion stop is released"),
-        (ActuatorFault.VOLTAGE_LOW, "supply voltage"),
-        (ActuatorFault.WINDING_HOT, "winding temperature"),
-        (ActuatorFault.FEEDBACK_LOST, "feedback flows"),
-        (ActuatorFault.POSITION_NAN, "position, velocity, effort are numbers"),
-        (ActuatorFault.VELOCITY_SPIKE, "pendulum is at rest"),
-        (ActuatorFault.EFFORT_OFFSET, "measured torque is plausible"),
-        (ActuatorFault.OUTSIDE_WINDOW, "angle is inside its window"),
-        (ActuatorFault.LOCKED_BY_OTHER, "no_acknowledgement"),
-        (ActuatorFault.OVER_TEMPERATURE_MOTOR, "firmware's temperature state"),
-    ],
-)
-def test_each_defect_fails_its_own_line(fault: ActuatorFault, line: str) -> None:
-    assert checklist(fault)[line] is False
-
-
-def test_check_prints_json_and_says_by_its_exit_code_whether_to_arm(
-    capsys: pytest.CaptureFixture[str],
-) -> None:
-    code = check_cli.main(["--backend", "emulator", "--json"])
-    printed = json.loads(capsys.readouterr().out)
-    # On the wall clock of a busy machine the emulator's feedback may be as irregular as the machine.
-    defects = {item["name"] for item in printed["items"] if not item["passed"]}
-    assert defects <= {"feedback flows", "feedback is regular"}
-    assert printed["ready"] is (not defects)
-    assert code == (1 if defects else 0)
-    assert check_cli.main(["--backend", "emulater"]) == 2
-    assert "backend is 'emulater'; expected one of" in capsys.readouterr().err

@@ -8,7 +8,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import TypeAlias
 
-__all__ = ["NodeProgram", "ParameterArgument", "bridge", "controller", "disturbance", "simulator"]
+__all__ = ["NodeProgram", "ParameterArgument", "bridge", "controller", "disturbance", "parameter_text", "simulator"]
 
 ParameterArgument: TypeAlias = bool | int | float | str | list[str] | list[float]
 
@@ -49,7 +49,7 @@ class NodeProgram:
         for source, target in self.remappings.items():
             arguments += ["-r", f"{source}:={target}"]
         for name, value in self.parameters.items():
-            arguments += ["-p", f"{name}:={_yaml(value)}"]
+            arguments += ["-p", f"{name}:={parameter_text(value)}"]
         return arguments
 
     def command(self) -> list[str]:
@@ -81,7 +81,7 @@ def disturbance(namespace: str, **parameters: ParameterArgument) -> NodeProgram:
     return NodeProgram("pendulum_lqr", "disturbance", namespace, parameters=parameters)
 
 
-def _yaml(value: ParameterArgument) -> str:
+def parameter_text(value: ParameterArgument) -> str:
     """Write a value so that ROS reads back the same type: text quoted, floats with a point."""
     if isinstance(value, bool):
         return "true" if value else "false"
@@ -90,7 +90,7 @@ def _yaml(value: ParameterArgument) -> str:
         # YAML 1.1 takes 1e-05 for text.
         return text if "." in text or "e" not in text else text.replace("e", ".0e")
     if isinstance(value, list):
-        return "[" + ", ".join(_yaml(element) for element in value) + "]"
+        return "[" + ", ".join(parameter_text(element) for element in value) + "]"
     if isinstance(value, str):
         return "'" + value.replace("'", "''") + "'"
     return str(value)

@@ -1,0 +1,104 @@
+"""What the bridge would be told on the same command line, read as the bridge itself reads it, for the checklist."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import rclpy
+from rclpy.context import Context
+from rclpy.node import Node
+from rclpy.signals import SignalHandlerOptions
+
+from pendulum_hw_bridge import bridge_parameters
+from pendulum_hw_bridge.actuator import ActuatorPort
+from pendulum_hw_bridge.bridge import BridgeSettings
+from pendulum_hw_bridge.bridge_node import SPECS
+from pendulum_hw_bridge.clocks import WallClock
+from pendulum_hw_bridge.lab_node import with_lab_file
+from pendulum_hw_bridge.safety import SafetyLimits
+from pendulum_msgs_py.programs import graph
+from pendulum_msgs_py.errors import ParameterError
+from pendulum_msgs_py.plants.plant_parameters import PlantParameters
+from pendulum_msgs_py.ros.middleware import set_middleware_defaults
+from pendulum_msgs_py.ros.parameters import NodeParameters
+from pendulum_msgs_py.ros.plant_interface import limits_from_parameters
+
+__all__ = ["AsTheBridge", "as_the_bridge", "bridge_values"]
+
+
+@dataclass(frozen=True)
+class AsTheBridge:
+    """What the bridge would make of its parameters.
+
+    Attributes:
+        values: All parameters.
+        port: The actuator, not connected yet.
+        settings: What it would set in the actuator.
+        limits: Limits of its checks of feedback.
+        plant: Drivetrain and link.
+        window: Angles between which the armed plant must stay [rad].
+    """
+
+    values: Mapping[str, Any]
+    port: ActuatorPort
+    settings: BridgeSettings
+    limits: SafetyLimits
+    plant: PlantParameters
+    window: tuple[float, float]
+
+
+def bridge_values(
+    ros_arguments: Sequence[str], given: Mapping[str, graph.ParameterArgument]
+) -> dict[str, Any]:
+    """Return the parameters that the bridge would have.
+
+    Args:
+        ros_arguments: ``--ros-args`` and what follows: parameters, files of parameters, names.
+        given: Further parameters, which win.
+
+    Raises:
+        ParameterError: A parameter, a file or the lab file is refused.
+    """
+    program = graph.bridge("/", **given)
+    arguments = [*ros_arguments, "--ros-args"]
+    for name, value in program.parameters.items():
+        arguments += ["-p", f"{name}:={graph.parameter_text(value)}"]
+    context = Context()
+    try:
+        set_middleware_defaults()
+        rclpy.init(args=arguments, context=context, signal_handler_options=SignalHandlerOptions.NO)
+    except Exception as error:
+        raise ParameterError(f"ROS arguments are not understood: {' '.join(str(error).split())}") from error
+    try:
+        # Nobody talks to it: it only reads, under the bridge's own name, what the bridge would read.
+        node = Node("bridge", context=context, start_parameter_services=False, enable_rosout=False)
+        try:
+            return NodeParameters(node, with_lab_file(node, SPECS)).values
+        finally:
+            node.destroy_node()
+    finally:
+        rclpy.try_shutdown(context=context)
+
+
+def as_the_bridge(values: Mapping[str, Any]) -> AsTheBridge:
+    """Return what the bridge would make of its parameters.
+
+    Raises:
+        ParameterError: They contradict each other.
+    """
+    plant = bridge_parameters.plant_of(values)
+    limits = limits_from_parameters(values, plant.effort_limit)
+    gains = bridge_parameters.trajectory_gains(values)
+    settings = bridge_parameters.bridge_settings(
+        values, effort=limits.effort, velocity=min(limits.velocity, 1.5), gains=gains
+    )
+    return AsTheBridge(
+        values,
+        bridge_parameters.make_port(values, WallClock()),
+        settings,
+        bridge_parameters.safety_limits(values),
+        plant,
+        (limits.position_min, limits.position_max),
+    )

@@ -1,0 +1,104 @@
+"""Which way is counter-clockwise: a hand turns the link a little, and the joint angle has to grow.
+
+No torque is needed, and nothing else tells: a pendulum with mirrored angle and torque obeys the same equation.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Protocol
+
+from pendulum_hw_bridge.actuator import ActuatorPort
+from pendulum_msgs_py.contract.values import NANOSECONDS
+
+__all__ = ["EMULATED_NUDGE", "NUDGE_ANGLE", "EmulatedHand", "Hand", "Person", "hand_of", "watch_nudge"]
+
+NUDGE_ANGLE = 0.1
+"""Turn that counts as a nudge [rad]; six degrees, far above what a touch does."""
+EMULATED_NUDGE = 6.0
+"""Torque of the emulated hand [N m]: half a rad/s against the shorted winding."""
+_PATIENCE = 30.0
+
+
+class Hand(Protocol):
+    """Who turns the link counter-clockwise."""
+
+    def begin(self) -> None:
+        """Begin to turn."""
+
+    def end(self) -> None:
+        """Let go."""
+
+
+@dataclass
+class Person:
+    """A person, who is asked in words.
+
+    Attributes:
+        say: Shows a sentence.
+    """
+
+    say: Callable[[str], None]
+
+    def begin(self) -> None:
+        """Ask for it."""
+        self.say(
+            "The motor gets no torque. Turn the link by hand, slowly, a little COUNTER-CLOCKWISE as you look at it "
+            f"(about 10 degrees), then let go. Waiting for {_PATIENCE:g} s."
+        )
+
+    def end(self) -> None:
+        """Say that it was seen."""
+        self.say("Seen; let go.")
+
+
+@dataclass
+class EmulatedHand:
+    """A torque on the link of an emulated actuator.
+
+    Attributes:
+        push: The emulator's, [N m].
+    """
+
+    push: Callable[[float], None]
+
+    def begin(self) -> None:
+        """Push counter-clockwise."""
+        self.push(EMULATED_NUDGE)
+
+    def end(self) -> None:
+        """Let go."""
+        self.push(0.0)
+
+
+def hand_of(port: ActuatorPort, say: Callable[[str], None]) -> Hand:
+    """Return the emulated hand of an emulator, and a person elsewhere."""
+    push = getattr(port, "push", None)
+    return EmulatedHand(push) if push is not None else Person(say)
+
+
+def watch_nudge(port: ActuatorPort, hand: Hand, *, patience: float = _PATIENCE) -> float:
+    """Return by how far the actuator turned when the hand turned the link counter-clockwise [rad], in its own sign.
+
+    Zero where nothing moved within the patience.
+
+    Args:
+        port: The actuator, with its strategy off.
+        hand: Who turns.
+        patience: Longest time to wait [s].
+    """
+    deadline = port.now_ns() + round(patience * NANOSECONDS)
+    start: float | None = None
+    hand.begin()
+    try:
+        while port.now_ns() < deadline:
+            record = port.read(0.05)
+            if record is None:
+                continue
+            start = record.position if start is None else start
+            if abs(record.position - start) > NUDGE_ANGLE:
+                return record.position - start
+        return 0.0
+    finally:
+        hand.end()
