@@ -18,9 +18,9 @@ from pendulum_hw_bridge.bridge_node import SPECS
 from pendulum_hw_bridge.clocks import WallClock
 from pendulum_hw_bridge.lab_node import with_lab_file
 from pendulum_hw_bridge.safety import SafetyLimits
-from pendulum_msgs_py.programs import graph
 from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.plants.plant_parameters import PlantParameters
+from pendulum_msgs_py.programs import graph
 from pendulum_msgs_py.ros.middleware import set_middleware_defaults
 from pendulum_msgs_py.ros.parameters import NodeParameters
 from pendulum_msgs_py.ros.plant_interface import limits_from_parameters

@@ -28,9 +28,9 @@ from pendulum_hw_bridge.check_rest import rest_items, sign_item
 from pendulum_hw_bridge.check_timing import HostWatch, Punctuality, TimingFigures, measure
 from pendulum_hw_bridge.nudge import Hand
 from pendulum_hw_bridge.safety import SafetyLimits, SafetyMonitor
+from pendulum_msgs_py.contract.values import NANOSECONDS
 from pendulum_msgs_py.errors import PendulumError
 from pendulum_msgs_py.plants.plant_parameters import PlantParameters
-from pendulum_msgs_py.contract.values import NANOSECONDS
 
 __all__ = ["run_checklist"]
 

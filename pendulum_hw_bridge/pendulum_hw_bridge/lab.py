@@ -7,8 +7,8 @@ from pathlib import Path
 from typing import Any
 
 from pendulum_msgs_py.errors import ParameterError
-from pendulum_msgs_py.lab_file import LAB_ENTRIES, load_lab
 from pendulum_msgs_py.parameters import ParameterSpec
+from pendulum_msgs_py.plants.lab_file import LAB_ENTRIES, load_lab
 
 __all__ = ["LAB_SPEC", "check_lab"]
 

@@ -21,8 +21,8 @@ from pendulum_hw_bridge.backends.hebi_discovery import (
 )
 from pendulum_hw_bridge.bridge_parameters import BRIDGE_SPECS
 from pendulum_msgs_py.errors import ParameterError
-from pendulum_msgs_py.lab_file import load_lab
 from pendulum_msgs_py.parameters import validate
+from pendulum_msgs_py.plants.lab_file import load_lab
 from pendulum_msgs_py.programs.executables import cli_main
 from pendulum_msgs_py.programs.terminal import WholeTable, make_console
 

@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from pendulum_msgs_py.errors import ParameterError
-from pendulum_msgs_py.lab_file import LAB_ENTRIES, LabFile, load_lab, write_lab
+from pendulum_msgs_py.plants.lab_file import LAB_ENTRIES, LabFile, load_lab, write_lab
 
 FULL = """\
 format: pendulum_lab/1
