@@ -11,12 +11,12 @@ import numpy as np
 import pytest
 
 from pendulum_bags.comparison import Comparison, compare_folders
-from pendulum_bags.figures.catalogue import comparison_figures, make_figures
-from pendulum_bags.figures.data import ReportData
 from pendulum_bags.figures.figure import ROLES, thinned
 from pendulum_bags.figures.numbers import quantity, ratio_in_words
 from pendulum_bags.figures.render_plotly import graphs_of
 from pendulum_bags.report import FIGURES, write_report
+from pendulum_bags.report.data import ReportData
+from pendulum_bags.report.figures import comparison_figures, make_figures
 from pendulum_bags.report.report_cli import main
 from pendulum_bags.report.tables import make_tables, provenance_table
 from pendulum_msgs_py.contract.cdr import encode_joint_state

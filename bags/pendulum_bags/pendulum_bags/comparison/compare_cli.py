@@ -83,8 +83,8 @@ def compare(
 
 
 def _write(out: Path, result: Comparison, content: dict[str, Any]) -> None:
-    from pendulum_bags.figures.catalogue import comparison_figures
     from pendulum_bags.figures.render_files import write_figures
+    from pendulum_bags.report.figures import comparison_figures
     from pendulum_bags.runs.run_folder import write_json
 
     out.mkdir(parents=True, exist_ok=True)

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from pendulum_bags.figures.data import ReportData
+from pendulum_bags.report.data import ReportData
 from pendulum_bags.runs.series import uniform_times
 
 __all__ = ["animation_of"]

@@ -10,11 +10,11 @@ from functools import lru_cache
 from importlib import resources
 from typing import Any
 
-from pendulum_bags.figures.data import ReportData
 from pendulum_bags.figures.figure import Figure
 from pendulum_bags.figures.numbers import quantity
 from pendulum_bags.figures.render_plotly import graphs_of
 from pendulum_bags.report.animation import animation_of
+from pendulum_bags.report.data import ReportData
 from pendulum_bags.report.tables import Table, provenance_table
 from pendulum_bags.runs.run_data import timing_warning
 

@@ -12,9 +12,10 @@ from typing import Any
 
 import numpy as np
 
-from pendulum_bags.figures.data import ReportData
 from pendulum_bags.figures.numbers import quantity
-from pendulum_bags.figures.trial_figures import GRAVITY, INERTIA, UNITS, TrialSet
+from pendulum_bags.report.data import ReportData
+from pendulum_bags.report.trial_figures import GRAVITY, INERTIA, UNITS
+from pendulum_bags.report.trials import TrialSet
 from pendulum_lqr.design import output_lqr
 from pendulum_lqr.model import linearise, sort_poles
 from pendulum_msgs_py.plants.plant_parameters import PLANT_SPECS

@@ -8,12 +8,12 @@ from datetime import datetime, timezone
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from pendulum_bags.figures.catalogue import make_figures
-from pendulum_bags.figures.data import ReportData
 from pendulum_bags.figures.render_files import write_figures
-from pendulum_bags.figures.trial_figures import read_trials
+from pendulum_bags.report.data import ReportData
+from pendulum_bags.report.figures import make_figures
 from pendulum_bags.report.page import render_page
 from pendulum_bags.report.tables import make_tables
+from pendulum_bags.report.trials import read_trials
 from pendulum_msgs_py.errors import BagError, PendulumError
 
 if TYPE_CHECKING:

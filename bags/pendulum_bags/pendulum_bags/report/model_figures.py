@@ -6,9 +6,9 @@ import math
 
 import numpy as np
 
-from pendulum_bags.figures.data import ReportData
 from pendulum_bags.figures.figure import Figure, Panel, Trace
 from pendulum_bags.figures.numbers import quantity
+from pendulum_bags.report.data import ReportData
 from pendulum_bags.runs.series import Array
 from pendulum_lqr.model import overdamped_velocity
 

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 
 from pendulum_bags.comparison.pairs import Difference
-from pendulum_bags.figures.data import ReportData
 from pendulum_bags.figures.figure import Figure, Kind, Panel, Trace
 from pendulum_bags.figures.numbers import quantity, ratio_in_words
+from pendulum_bags.report.data import ReportData
 from pendulum_bags.runs.run_data import RunData, noise_hold_time
 from pendulum_bags.runs.series import Array, Series
 

@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Callable
 
 from pendulum_bags.comparison import Comparison
-from pendulum_bags.figures import analysis_figures, model_figures, motion_figures, trial_figures
-from pendulum_bags.figures.data import ReportData
 from pendulum_bags.figures.figure import Figure
+from pendulum_bags.report import analysis_figures, model_figures, motion_figures, trial_figures
+from pendulum_bags.report.data import ReportData
 
 __all__ = ["FIGURES", "comparison_figures", "make_figures"]
 
