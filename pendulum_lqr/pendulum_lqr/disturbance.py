@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from pendulum_lqr.multisine import multisine_wave
 from pendulum_msgs_py.contract import noise
 from pendulum_msgs_py.contract.values import NANOSECONDS
 from pendulum_msgs_py.errors import DataError, ParameterError
@@ -27,19 +28,19 @@ DISTURBANCE_SPECS: tuple[ParameterSpec, ...] = (
         "uniform",
         "",
         "Shape of the torque.",
-        choices=("uniform", "gaussian", "sine", "chirp", "prbs", "step", "pulse_train", "from_bag"),
+        choices=("uniform", "gaussian", "sine", "multisine", "chirp", "prbs", "step", "pulse_train", "from_bag"),
     ),
     ParameterSpec("amplitude", 2.5, "N m", "Largest torque; the standard deviation for gaussian."),
     ParameterSpec(
         "hold_time",
         0.01,
         "s",
-        "How long one sample is held; 0 for a sine, chirp, step or pulse train means a smooth signal.",
+        "How long one sample is held; 0 for a sine, multisine, chirp, step or pulse train means a smooth signal.",
         minimum=0.0,
         maximum=3600.0,
     ),
     ParameterSpec(
-        "seed", 1, "-", "Seed of the random kinds; shifts the sequence of prbs.", minimum=0, maximum=2**63 - 1
+        "seed", 1, "-", "Seed of the random kinds and phases; shifts the sequence of prbs.", minimum=0, maximum=2**63 - 1
     ),
     ParameterSpec(
         "bandwidth",
@@ -52,12 +53,17 @@ DISTURBANCE_SPECS: tuple[ParameterSpec, ...] = (
         "frequency",
         1.0,
         "Hz",
-        "Frequency of sine, start of chirp, repetition of pulse_train.",
+        "Frequency of sine, start of chirp, lowest line of multisine, repetition of pulse_train.",
         minimum=0.0,
         exclusive_minimum=True,
     ),
     ParameterSpec(
-        "frequency_end", 10.0, "Hz", "Frequency at the end of a chirp.", minimum=0.0, exclusive_minimum=True
+        "frequency_end",
+        10.0,
+        "Hz",
+        "Frequency at the end of a chirp, highest line of multisine.",
+        minimum=0.0,
+        exclusive_minimum=True,
     ),
     ParameterSpec(
         "sweep_time",
@@ -70,6 +76,15 @@ DISTURBANCE_SPECS: tuple[ParameterSpec, ...] = (
     ParameterSpec(
         "order", 9, "-", "Length of prbs: repeats after 2^order - 1 samples.", minimum=2, maximum=16
     ),
+    ParameterSpec(
+        "signal_period",
+        4.0,
+        "s",
+        "Length of one period of multisine; its lines are odd multiples of 1/signal_period.",
+        minimum=0.0,
+        exclusive_minimum=True,
+    ),
+    ParameterSpec("lines", 40, "-", "Number of lines of multisine, at most.", minimum=1, maximum=10_000),
     ParameterSpec("start_time", 0.0, "s", "Time at which step and pulse_train begin.", minimum=0.0),
     ParameterSpec(
         "pulse_width", 0.1, "s", "Length of each pulse of pulse_train.", minimum=0.0, exclusive_minimum=True
@@ -247,6 +262,12 @@ def _sine(p: Mapping[str, Any], hold_ns: int) -> Disturbance:
     return _held(lambda t: amplitude * math.sin(omega * t), hold_ns)
 
 
+def _multisine(p: Mapping[str, Any], hold_ns: int) -> Disturbance:
+    """Periodic sum of cosines with random phases, whose largest torque is the amplitude."""
+    omega, phases, scale = multisine_wave(p)
+    return _held(lambda t: scale * float(np.cos(omega * t + phases).sum()), hold_ns)
+
+
 def _chirp(p: Mapping[str, Any], hold_ns: int) -> Disturbance:
     """Exponential sweep: equal time in every octave; Farina, AES 108th Convention, 2000, eq. 4."""
     amplitude, low, high, length = p["amplitude"], p["frequency"], p["frequency_end"], p["sweep_time"]
@@ -291,6 +312,7 @@ DISTURBANCES: dict[str, Maker] = {
     "uniform": _uniform,
     "gaussian": _gaussian,
     "sine": _sine,
+    "multisine": _multisine,
     "chirp": _chirp,
     "prbs": _prbs,
     "step": _step,

@@ -10,8 +10,10 @@ from hypothesis import strategies as st
 
 from pendulum_lqr.disturbance import DISTURBANCE_SPECS, DISTURBANCES, from_bag, make_disturbance, torques
 from pendulum_lqr.disturbing import DisturbanceLoop
+from pendulum_lqr.multisine import multisine_harmonics
 from pendulum_msgs_py.contract import noise
 from pendulum_msgs_py.errors import DataError, ParameterError
+from pendulum_msgs_py.parameters import validate
 
 MS = 1_000_000
 SECOND = 1_000_000_000
@@ -298,3 +300,31 @@ def test_a_disturbance_that_was_started_by_hand_ends_with_its_simulation():
     # Started between the two runs, it begins with the second.
     loop.start()
     assert loop.answer(SECOND - MS) == (1.0, "noise_start")
+
+
+# --- multisine -----------------------------------------------------------------------------------------------------
+
+MULTISINE = {"kind": "multisine", "signal_period": 2.0, "frequency": 0.5, "frequency_end": 40.0, "hold_time": 0.0}
+
+
+@pytest.mark.parametrize("seed", [1, 7, 2**40])
+def test_a_multisine_has_power_on_its_lines_alone_repeats_and_peaks_at_its_amplitude(seed):
+    values = {**MULTISINE, "seed": seed, "amplitude": 1.5}
+    raster = torques(make_disturbance(values), np.arange(0, 4 * SECOND, MS))
+    np.testing.assert_allclose(raster[:2000], raster[2000:], atol=1e-12)
+    spectrum = np.abs(np.fft.rfft(raster[:2000]))
+    lines = multisine_harmonics(validate(DISTURBANCE_SPECS, values))
+    assert np.all(lines % 2 == 1)
+    assert (lines[0], lines[-1]) == (1, 79)
+    np.testing.assert_allclose(spectrum[lines], spectrum[lines[0]], rtol=1e-9)
+    assert np.delete(spectrum, lines).max() < 1e-9 * spectrum[lines[0]]
+    assert 1.4 < np.abs(raster).max() <= 1.5
+    # Random phases alone peak at 3 to 4 times the effective value.
+    assert np.abs(raster).max() / raster.std() < 2.9
+
+
+def test_a_multisine_without_a_line_in_its_band_is_refused():
+    with pytest.raises(ParameterError, match=r"no odd multiple of 1/signal_period = 1 Hz lies between 1\.2 and 2\.8 Hz"):
+        make_disturbance({**MULTISINE, "signal_period": 1.0, "frequency": 1.2, "frequency_end": 2.8})
+    with pytest.raises(ParameterError, match="expected >= frequency = 3 Hz"):
+        make_disturbance({**MULTISINE, "frequency": 3.0, "frequency_end": 2.0})

@@ -1,0 +1,129 @@
+"""From recordings to equally spaced samples of excitation, torque, angle and velocity."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.interpolate import CubicSpline
+
+from pendulum_bags.runs.run_data import RunData
+from pendulum_bags.runs.series import Signal, unwrap_near_upright
+from pendulum_bags.experiments.in_process import RunArrays
+from pendulum_msgs_py.errors import DataError
+from pendulum_msgs_py.contract.values import NANOSECONDS
+
+__all__ = ["Record", "record_of_arrays", "record_of_run"]
+
+Array = NDArray[np.float64]
+
+_EXACT = 1e-6
+"""Largest deviation of a stamp from the raster that counts as none, as a share of the period."""
+_LONGEST_GAP = 5.0
+"""Longest hole between states that is bridged, in periods."""
+
+
+@dataclass(frozen=True)
+class Record:
+    """One plant under one excitation, sampled at equal intervals.
+
+    Attributes:
+        label: Of the plant.
+        period: Sampling period [s].
+        excitation: Known torque that was added, shape (n,) [N m].
+        torque: Torque that acted from each sample to the next, the excitation included, shape (n,) [N m].
+        outputs: Angle [rad] and velocity [rad/s] at each sample, shape (2, n).
+        disturbance: Parameters of the excitation; empty where they are not known.
+        facts: What else is known of the run.
+    """
+
+    label: str
+    period: float
+    excitation: Array
+    torque: Array
+    outputs: Array
+    disturbance: Mapping[str, Any] = field(default_factory=dict)
+    facts: Mapping[str, Any] = field(default_factory=dict)
+
+    @property
+    def duration(self) -> float:
+        """Length [s]."""
+        return self.period * self.torque.size
+
+
+def record_of_arrays(arrays: RunArrays, label: str, disturbance: Mapping[str, Any]) -> Record:
+    """Return the record of a run in one process.
+
+    Args:
+        arrays: The run.
+        label: Of the plant.
+        disturbance: Its parameters.
+    """
+    period = float(arrays.stamp_ns[1] - arrays.stamp_ns[0]) / NANOSECONDS
+    outputs = np.stack([unwrap_near_upright(arrays.position)[:-1], arrays.velocity[:-1]])
+    return Record(label, period, arrays.disturbance[:-1], arrays.applied, outputs, dict(disturbance))
+
+
+def record_of_run(run: RunData) -> Record:
+    """Return the record of a recorded plant while its disturbance acted.
+
+    Torques are held from stamp to stamp, so their mean over each interval of the raster is taken; angle and velocity are
+    interpolated where stamps jitter.
+
+    Args:
+        run: The plant's part of a bag.
+
+    Raises:
+        DataError: Disturbance or applied torque were not recorded, or states are missing for long.
+    """
+    for signal, what in ((run.disturbance, "disturbance"), (run.applied, "applied torque")):
+        if signal is None:
+            raise DataError(
+                f"{run.source or run.label} holds no {what} during the noise; expected the topics "
+                "disturbance and applied_effort, so that excitation and response are known"
+            )
+    assert run.disturbance is not None
+    assert run.applied is not None
+    t = run.window.t
+    period = float(np.median(np.diff(t)))
+    # The stamps' nominal period: clocks of plants are given in whole microseconds.
+    period = round(period * 1e5) / 1e5 if abs(round(period * 1e5) / 1e5 - period) < 0.01 * period else period
+    longest = float(np.max(np.diff(t)))
+    if longest > _LONGEST_GAP * period:
+        raise DataError(
+            f"{run.source or run.label} has no state for {longest * 1e3:.0f} ms; expected no hole longer than "
+            f"{_LONGEST_GAP * period * 1e3:.0f} ms ({_LONGEST_GAP:g} periods)"
+        )
+    stop = min(float(t[-1]), float(run.applied.t[-1]) + period)
+    count = int(np.floor((stop - t[0]) / period + 1e-6))
+    raster = t[0] + period * np.arange(count)
+    if t.size >= count and np.max(np.abs(t[:count] - raster)) < _EXACT * period:
+        outputs = np.stack([run.window.position[:count], run.window.velocity[:count]])
+    else:
+        inside = np.minimum(raster, t[-1])
+        outputs = np.stack(
+            [CubicSpline(t, run.window.position)(inside), CubicSpline(t, run.window.velocity)(inside)]
+        )
+    told = run.metadata.get("pendulum.run")
+    disturbance = told.get("disturbance") if isinstance(told, Mapping) else None
+    return Record(
+        run.label,
+        period,
+        _held_mean(run.disturbance, raster, period),
+        _held_mean(run.applied, raster, period),
+        outputs,
+        dict(disturbance) if isinstance(disturbance, Mapping) else {},
+        {"source": run.source, "missed_states": run.missed_deadlines},
+    )
+
+
+def _held_mean(signal: Signal, raster: Array, period: float) -> Array:
+    """Return the mean of a held signal over [t, t + period) for each t of a raster."""
+    # The integral of a held signal is piecewise linear; it starts at the first sample.
+    knots = np.concatenate([signal.t, [max(signal.t[-1], raster[-1] + period) + period]])
+    integral = np.concatenate([[0.0], np.cumsum(signal.value * np.diff(knots))])
+    at = np.interp(np.concatenate([raster, [raster[-1] + period]]), knots, integral)
+    return np.diff(at) / period

@@ -1,0 +1,190 @@
+"""The nu-gap between two plants, the margin of a controller, and which controllers carry over from one to the other.
+
+A plant has one input (torque) and one or more outputs (angle, velocity); all of it works on frequency responses, so that
+a measured plant serves as well as a model. Signals are divided by scales first: a gap has no meaning without units.
+
+    chordal distance   kappa = |sin| of the angle between [1; P1] and [1; P2]
+    margin             rho   = |1 + K P| / (sqrt(1 + |P|^2) sqrt(1 + |K|^2))     (u = -K y)
+    nu-gap             delta = max kappa over frequency, 1 where the winding number condition fails
+    theorem            K stabilises P1 and delta(P1, P2) < b(P1, K) = min rho: K stabilises P2 too; so does it where the
+                       winding number condition holds and kappa < rho at each frequency
+
+Source: Vinnicombe, Frequency domain uncertainty and the graph topology, IEEE TAC 38(9), 1993, theorems 3.1 and 4.3;
+Vinnicombe, Uncertainty and Feedback, Imperial College Press, 2001, sections 2.3 and 3.2.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from pendulum_msgs_py.errors import ParameterError
+
+__all__ = [
+    "DEFAULT_SCALING",
+    "NuGap",
+    "Scaling",
+    "chordal_distance",
+    "loop_distance",
+    "nu_gap",
+    "pointwise_margin",
+    "winding_number",
+]
+
+Array = NDArray[np.float64]
+Complex = NDArray[np.complex128]
+
+
+@dataclass(frozen=True, slots=True)
+class Scaling:
+    """What counts as one unit of each signal: the deviations that the task allows, and the torque it has for them.
+
+    Attributes:
+        angle: [rad].
+        velocity: [rad/s].
+        torque: [N m].
+    """
+
+    angle: float = 0.03
+    velocity: float = 3.0
+    torque: float = 1.0
+
+    def __post_init__(self) -> None:
+        """Refuse scales that divide by nothing."""
+        for name, unit in (("angle", "rad"), ("velocity", "rad/s"), ("torque", "N m")):
+            value = getattr(self, name)
+            if not (np.isfinite(value) and value > 0.0):
+                raise ParameterError(f"scale of {name} is {value} {unit}; expected a finite value > 0")
+
+    def plant(self, response: ArrayLike) -> Complex:
+        """Return a response [rad/(N m); rad/s/(N m)], shape (2, n), in scaled units."""
+        outputs = np.array([[self.angle], [self.velocity]])
+        return np.asarray(response, dtype=np.complex128) * self.torque / outputs
+
+    def controller(self, response: ArrayLike) -> Complex:
+        """Return a feedback [N m/rad; N m s/rad], shape (2, n) or (2, 1), in scaled units."""
+        outputs = np.array([[self.angle], [self.velocity]])
+        return np.asarray(response, dtype=np.complex128) * outputs / self.torque
+
+    def sentence(self) -> str:
+        """Say it in words."""
+        return (
+            f"One unit is {self.angle:g} rad of angle, {self.velocity:g} rad/s of velocity and "
+            f"{self.torque:g} N m of torque: the deviations that the task allows, and the torque it has for them."
+        )
+
+
+DEFAULT_SCALING = Scaling()
+
+
+@dataclass(frozen=True, slots=True)
+class NuGap:
+    """The gap of two plants.
+
+    Attributes:
+        value: 0 (same) to 1 (no controller is safe to carry over).
+        at: Index of the frequency at which it is largest.
+        winding: Whether the winding number condition holds.
+    """
+
+    value: float
+    at: int
+    winding: bool
+
+
+def _rows(response: ArrayLike) -> Complex:
+    return np.atleast_2d(np.asarray(response, dtype=np.complex128))
+
+
+def chordal_distance(first: ArrayLike, second: ArrayLike) -> Array:
+    """Return the chordal distance of two plants at each frequency, shape (n,), 0 to 1.
+
+    Args:
+        first: Scaled response, shape (outputs, n), or (n,) for one output.
+        second: The other one.
+    """
+    a, b = _rows(first), _rows(second)
+    # The wedge product of [1; a] and [1; b] gives the sine without the loss of digits of sqrt(1 - cos^2).
+    square = np.sum(np.abs(a - b) ** 2, axis=0)
+    for i in range(a.shape[0]):
+        for j in range(i + 1, a.shape[0]):
+            square = square + np.abs(a[i] * b[j] - a[j] * b[i]) ** 2
+    sizes = (1.0 + np.sum(np.abs(a) ** 2, axis=0)) * (1.0 + np.sum(np.abs(b) ** 2, axis=0))
+    return np.asarray(np.sqrt(np.clip(square / sizes, 0.0, 1.0)), dtype=np.float64)
+
+
+def pointwise_margin(plant: ArrayLike, controller: ArrayLike) -> Array:
+    """Return rho at each frequency, shape (n,); its minimum is the margin b(P, K) where K stabilises P.
+
+    Args:
+        plant: Scaled response, shape (outputs, n), or (n,) for one output.
+        controller: Scaled feedback, u = -K y, shape (outputs, n) or (outputs, 1).
+    """
+    p, k = _rows(plant), _rows(controller)
+    loop = np.abs(1.0 + np.sum(k * p, axis=0))
+    return np.asarray(
+        loop / np.sqrt((1.0 + np.sum(np.abs(p) ** 2, axis=0)) * (1.0 + np.sum(np.abs(k) ** 2, axis=0))),
+        dtype=np.float64,
+    )
+
+
+def winding_number(curve: ArrayLike) -> int:
+    """Return how often a curve over frequency 0 to infinity (or Nyquist), with its mirror image, goes round 0.
+
+    Counter-clockwise for growing frequency is positive. The curve has to be dense enough not to turn by more than
+    90 degrees between two points, and its ends are taken to go on to the real axis the short way.
+
+    Args:
+        curve: Shape (n,), in order of frequency.
+    """
+    values = np.asarray(curve, dtype=np.complex128)
+    steps = np.angle(values[1:] / values[:-1])
+    # Both ends of a real system are real: what is missing to the axis is the smaller way.
+    low, high = (float(np.angle(value * np.sign(value.real or 1.0))) for value in (values[0], values[-1]))
+    half = float(steps.sum()) + low - high
+    return round(half / np.pi)
+
+
+def nu_gap(first: ArrayLike, second: ArrayLike, *, unstable: tuple[int, int] = (1, 1)) -> NuGap:
+    """Return the nu-gap of two plants from their responses.
+
+    Args:
+        first: Scaled response on a grid from 0 to infinity (or to the Nyquist frequency), shape (outputs, n) or (n,).
+        second: The other one, on the same grid.
+        unstable: Number of unstable poles of each; a pendulum upright has one.
+    """
+    a, b = _rows(first), _rows(second)
+    kappa = chordal_distance(a, b)
+    at = int(np.argmax(kappa))
+    inner = 1.0 + np.sum(np.conj(b) * a, axis=0)
+    # The sign is that of frequency running up the axis: 100/(2s+1) and 100/(2s-1) are 0.02 apart, not 1.
+    holds = bool(np.all(np.abs(inner) > 1e-12)) and winding_number(inner) == unstable[0] - unstable[1]
+    return NuGap(float(kappa[at]) if holds else 1.0, at, holds)
+
+
+def loop_distance(first: ArrayLike, second: ArrayLike, radius: ArrayLike = 0.0) -> Array:
+    """Return, at each frequency, how far a second loop is from the first for the best weight, shape (n,); < 1 is safe.
+
+    The theorem may be used with any weights. With W of the plant and 1/W of the controller, the condition is linear in
+    |W|^2, so that the best weight at a frequency is one of two limits: the loops differ by little beside the return
+    difference (additive), |L2 - L1| < |1 + L1|, or their inverses do, |1 - L1/L2| < |1 + L1|. No other scaling certifies
+    more, and no scale has to be chosen.
+
+    Args:
+        first: Loop K P1, shape (n,), stable.
+        second: Loop K P2, shape (n,).
+        radius: Radius of the confidence disc of the second loop, shape (n,); the worst loop in it counts.
+    """
+    one, two = np.asarray(first, dtype=np.complex128), np.asarray(second, dtype=np.complex128)
+    r = np.broadcast_to(np.asarray(radius, dtype=np.float64), two.shape)
+    room = np.maximum(np.abs(1.0 + one), 1e-300)
+    additive = (np.abs(two - one) + r) / room
+    size = np.abs(two) ** 2 - r**2
+    outside = size > 0.0
+    safe = np.where(outside, size, 1.0)
+    # The inverse of a disc that leaves out 0 is a disc again.
+    centre, spread = np.conj(two) / safe, r / safe
+    inverse = np.where(outside, (np.abs(1.0 - one * centre) + np.abs(one) * spread) / room, np.inf)
+    return np.asarray(np.minimum(additive, inverse), dtype=np.float64)

@@ -1,0 +1,169 @@
+"""A measured frequency response as a value and as a file, with what is known of its errors."""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import stats
+
+from pendulum_msgs_py.errors import DataError, ParameterError
+
+__all__ = ["FORMAT", "MeasuredResponse", "read_response", "write_response"]
+
+FORMAT = "pendulum_frequency_response/1"
+
+Array = NDArray[np.float64]
+Complex = NDArray[np.complex128]
+
+
+@dataclass(frozen=True)
+class MeasuredResponse:
+    """The sampled plant from torque (held over a period) to angle and velocity, measured in closed loop.
+
+    The error at a frequency is circular complex: ``|measured - true|^2 / deviation^2`` follows F(2, 2 (blocks - 1)).
+
+    Attributes:
+        label: Of the plant, such as ``hw``.
+        period: Sampling period [s].
+        frequency: Shape (n,), increasing [Hz].
+        response: Angle and velocity for one newton metre, shape (2, n) [rad/(N m), rad/s/(N m)].
+        deviation: Standard deviation of both, shape (2, n), in their units.
+        coherence: Share of the output's power that the excitation explains, shape (2, n), 0 to 1.
+        sensitivity: Torque at the plant for one newton metre of excitation, 1/(1 + K P), shape (n,).
+        blocks: Number of independent periods (or segments) behind it.
+        distortion: Angle and velocity on lines that were not excited, beside those that were, shape (2,); NaN where that
+            was not measured [-].
+        facts: What else a reader should know: source, excitation, duration, largest angle and torque.
+    """
+
+    label: str
+    period: float
+    frequency: Array
+    response: Complex
+    deviation: Array
+    coherence: Array
+    sensitivity: Complex
+    blocks: float
+    distortion: tuple[float, float] = (float("nan"), float("nan"))
+    facts: Mapping[str, Any] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        """Check shapes."""
+        n = self.frequency.size
+        for name, shape in (
+            ("frequency", (n,)), ("response", (2, n)), ("deviation", (2, n)), ("coherence", (2, n)), ("sensitivity", (n,))
+        ):  # fmt: skip
+            found = getattr(self, name)
+            if found.shape != shape or not np.all(np.isfinite(found)):
+                raise DataError(
+                    f"response of {self.label}: {name} has shape {found.shape}; expected {shape}, finite"
+                )
+        if n == 0 or not (self.period > 0.0 and self.blocks > 1.0 and np.all(np.diff(self.frequency) > 0.0)):
+            raise DataError(
+                f"response of {self.label} has {n} lines, a period of {self.period} s and {self.blocks} blocks; "
+                "expected increasing frequencies, a period > 0 and at least 2 blocks"
+            )
+
+    @property
+    def nyquist(self) -> float:
+        """Half the sampling rate [Hz]."""
+        return 0.5 / self.period
+
+    def radius(self, confidence: float = 0.95, *, joint: bool = True) -> Array:
+        """Return the radius of the confidence disc of each value, shape (2, n).
+
+        Args:
+            confidence: Probability with which the discs hold the true response.
+            joint: Whether all discs together are meant (Bonferroni), or each for itself.
+        """
+        tail = (1.0 - confidence) / (2 * self.frequency.size if joint else 1)
+        quantile = float(stats.f.isf(tail, 2.0, 2.0 * (self.blocks - 1.0)))
+        return np.sqrt(quantile) * self.deviation
+
+    def to_json(self) -> dict[str, Any]:
+        """Return it as JSON values; complex numbers as two lists."""
+        return {
+            "format": FORMAT,
+            "label": self.label,
+            "period": self.period,
+            "blocks": self.blocks,
+            "frequency": self.frequency.tolist(),
+            **{
+                name: {"real": getattr(self, name).real.tolist(), "imag": getattr(self, name).imag.tolist()}
+                for name in ("response", "sensitivity")
+            },
+            "deviation": self.deviation.tolist(),
+            "coherence": self.coherence.tolist(),
+            "distortion": [value if np.isfinite(value) else None for value in self.distortion],
+            "facts": dict(self.facts),
+        }
+
+    @classmethod
+    def from_json(cls, content: Mapping[str, Any]) -> MeasuredResponse:
+        """Return the response that JSON values describe.
+
+        Raises:
+            DataError: They describe none.
+        """
+        if not isinstance(content, Mapping) or content.get("format") != FORMAT:
+            told = content.get("format") if isinstance(content, Mapping) else type(content).__name__
+            raise DataError(f"format is {told!r}; expected {FORMAT!r}")
+        try:
+            first, second = content["distortion"]
+            return cls(
+                str(content["label"]),
+                float(content["period"]),
+                np.array(content["frequency"], dtype=np.float64),
+                _complex(content["response"]),
+                np.array(content["deviation"], dtype=np.float64),
+                np.array(content["coherence"], dtype=np.float64),
+                _complex(content["sensitivity"]),
+                float(content["blocks"]),
+                (np.nan if first is None else float(first), np.nan if second is None else float(second)),
+                dict(content["facts"]),
+            )
+        except (KeyError, TypeError, ValueError) as error:
+            raise DataError(f"the content is no measured response: {error}") from error
+
+
+def _complex(content: Mapping[str, Any]) -> Complex:
+    return np.array(content["real"], dtype=np.float64) + 1j * np.array(content["imag"], dtype=np.float64)
+
+
+def write_response(path: str | os.PathLike[str], response: MeasuredResponse) -> Path:
+    """Write a response to a JSON file and return its path.
+
+    Raises:
+        ParameterError: The file cannot be written.
+    """
+    target = Path(path)
+    try:
+        target.parent.mkdir(parents=True, exist_ok=True)
+        target.write_text(json.dumps(response.to_json(), allow_nan=False) + "\n", encoding="utf-8")
+    except OSError as error:
+        raise ParameterError(f"response {target} cannot be written: {error.strerror or error}") from error
+    return target
+
+
+def read_response(path: str | os.PathLike[str]) -> MeasuredResponse:
+    """Read a response from a JSON file, or ``hw_response.json`` from a run folder.
+
+    Raises:
+        DataError: The file cannot be read or holds no response.
+    """
+    source = Path(path)
+    if source.is_dir():
+        source = source / "hw_response.json"
+    try:
+        return MeasuredResponse.from_json(json.loads(source.read_text(encoding="utf-8")))
+    except OSError as error:
+        raise DataError(f"measured response {source} cannot be read: {error.strerror or error}") from error
+    except (ValueError, DataError) as error:
+        raise DataError(f"measured response {source}: {error}") from error
