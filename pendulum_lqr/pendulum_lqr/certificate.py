@@ -5,10 +5,10 @@ Two certificates, both by Vinnicombe's theorem and both with the upper confidenc
 ``gap``        one number for the machine (the nu-gap in the task's units) below one number for the design, b(P, K)
 ``frequency``  at each frequency, with the weights that certify most (:func:`pendulum_lqr.gap_metric.loop_distance`)
 
-Both speak of the linear machine, on a grid dense enough for lightly damped loops (:mod:`pendulum_lqr.machine_response` says
-how it is made of measured lines). From the highest line to the Nyquist frequency the machine is taken to be smooth, or, where
-lines end well below, to roll off. Both take the machine to have one unstable pole, as a pendulum upright has. Neither speaks
-of saturation, or of dry friction at rest.
+Both speak of the linear machine, on a grid dense enough for lightly damped loops (:mod:`pendulum_lqr.machine_response`
+says how it is made of measured lines). From the highest line to the Nyquist frequency the machine is taken to be
+smooth, or, where lines end well below, to roll off. Both take the machine to have one unstable pole, as a pendulum
+upright has. Neither speaks of saturation, or of dry friction at rest.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from pendulum_lqr.design import discretise
+from pendulum_lqr.analysis import delayed_spectral_radius
 from pendulum_lqr.gap_metric import (
     DEFAULT_SCALING,
     Scaling,
@@ -28,7 +28,8 @@ from pendulum_lqr.gap_metric import (
     pointwise_margin,
 )
 from pendulum_lqr.machine_response import Machine
-from pendulum_lqr.sampled_response import DelayedModel, model_response
+from pendulum_lqr.model import LinearModel
+from pendulum_lqr.sampled_response import model_response
 
 __all__ = ["Certificate", "Certifier", "GapProfile", "compare_machine", "stabilises"]
 
@@ -63,7 +64,7 @@ class GapProfile:
     beyond: float
 
 
-def compare_machine(plant: DelayedModel, machine: Machine, scaling: Scaling = DEFAULT_SCALING) -> GapProfile:
+def compare_machine(plant: LinearModel, machine: Machine, scaling: Scaling = DEFAULT_SCALING) -> GapProfile:
     """Return the gap between a model, sampled as the machine is, and the machine.
 
     Args:
@@ -145,7 +146,7 @@ class Certificate:
         return self.by_gap or self.by_frequency
 
 
-def stabilises(plant: DelayedModel, K: ArrayLike, period: float) -> bool:
+def stabilises(plant: LinearModel, K: ArrayLike, period: float) -> bool:
     """Tell whether a static gain u = -K [theta, theta_dot] stabilises a model that is sampled and held.
 
     Args:
@@ -153,10 +154,7 @@ def stabilises(plant: DelayedModel, K: ArrayLike, period: float) -> bool:
         K: Gain, shape (2,).
         period: Sampling period [s].
     """
-    sampled = discretise(plant.model, period, plant.delay)
-    feedback = np.zeros((1, sampled.A.shape[0]))
-    feedback[0, :2] = np.asarray(K, dtype=np.float64)
-    return bool(np.max(np.abs(np.linalg.eigvals(sampled.A - sampled.B @ feedback))) < 1.0)
+    return delayed_spectral_radius(plant, K, period) < 1.0
 
 
 class Certifier:
@@ -168,7 +166,7 @@ class Certifier:
         scaling: Units of angle, velocity and torque, for the gap.
     """
 
-    def __init__(self, plant: DelayedModel, machine: Machine, scaling: Scaling = DEFAULT_SCALING) -> None:
+    def __init__(self, plant: LinearModel, machine: Machine, scaling: Scaling = DEFAULT_SCALING) -> None:
         self.plant = plant
         self.machine = machine
         self.scaling = scaling
@@ -191,8 +189,8 @@ class Certifier:
         """Return the certificate of any linear controller.
 
         Args:
-            response: u = -K y: response of the controller at the machine's frequencies and period, shape (2, n), or (2, 1)
-                for a gain.
+            response: u = -K y: response of the controller at the machine's frequencies and period, shape (2, n), or
+                (2, 1) for a gain.
             stable: Whether the loop with the model is stable at the machine's period.
         """
         K, machine = np.asarray(response, dtype=np.complex128), self.machine

@@ -40,7 +40,12 @@ DISTURBANCE_SPECS: tuple[ParameterSpec, ...] = (
         maximum=3600.0,
     ),
     ParameterSpec(
-        "seed", 1, "-", "Seed of the random kinds and phases; shifts the sequence of prbs.", minimum=0, maximum=2**63 - 1
+        "seed",
+        1,
+        "-",
+        "Seed of the random kinds and phases; shifts the sequence of prbs.",
+        minimum=0,
+        maximum=2**63 - 1,
     ),
     ParameterSpec(
         "bandwidth",

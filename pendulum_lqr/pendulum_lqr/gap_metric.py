@@ -1,7 +1,8 @@
 """The nu-gap between two plants, the margin of a controller, and which controllers carry over from one to the other.
 
-A plant has one input (torque) and one or more outputs (angle, velocity); all of it works on frequency responses, so that
-a measured plant serves as well as a model. Signals are divided by scales first: a gap has no meaning without units.
+A plant has one input (torque) and one or more outputs (angle, velocity); all of it works on frequency responses, so
+that a measured plant serves as well as a model. Signals are divided by scales first: a gap has no meaning without
+units.
 
     chordal distance   kappa = |sin| of the angle between [1; P1] and [1; P2]
     margin             rho   = |1 + K P| / (sqrt(1 + |P|^2) sqrt(1 + |K|^2))     (u = -K y)
@@ -169,8 +170,8 @@ def loop_distance(first: ArrayLike, second: ArrayLike, radius: ArrayLike = 0.0) 
 
     The theorem may be used with any weights. With W of the plant and 1/W of the controller, the condition is linear in
     |W|^2, so that the best weight at a frequency is one of two limits: the loops differ by little beside the return
-    difference (additive), |L2 - L1| < |1 + L1|, or their inverses do, |1 - L1/L2| < |1 + L1|. No other scaling certifies
-    more, and no scale has to be chosen.
+    difference (additive), |L2 - L1| < |1 + L1|, or their inverses do, |1 - L1/L2| < |1 + L1|. No other scaling
+    certifies more, and no scale has to be chosen.
 
     Args:
         first: Loop K P1, shape (n,), stable.

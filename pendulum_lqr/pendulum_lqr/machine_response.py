@@ -1,13 +1,15 @@
 """A measured machine on a dense grid of frequencies: between its lines, and below the lowest of them.
 
-A plant is smooth between two lines where its closed loop need not be: a loop with little damping turns quickly just where
-it is about to fail. So the plant is interpolated, and loops are judged on the interpolated plant. What is interpolated is
-its inverse, torque for an angle: (-stiffness + inertia, damping times frequency) for a joint, which hardly bends.
+A plant is smooth between two lines where its closed loop need not be: a loop with little damping turns quickly just
+where it is about to fail. So the plant is interpolated, and loops are judged on the interpolated plant. What is
+interpolated is its inverse, torque for an angle: (-stiffness + inertia, damping times frequency) for a joint, which
+hardly bends.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -83,7 +85,7 @@ class Machine:
             angle = 1.0 / values
             disc, hold = error * np.abs(angle) ** 2, omega * measured.period * np.abs(angle)
             inside = np.concatenate([low, inside])
-            # At low frequency the measured velocity is the derivative of the angle, whatever the plant, but for the hold.
+            # At low frequency the measured velocity is the derivative of the angle, but for the hold.
             response = np.hstack([np.vstack([angle, 1j * omega * angle]), response])
             discs = np.hstack([np.vstack([disc, omega * (disc + hold)]), discs])
         return cls(inside, response, discs, measured.period, float(lines[0]), confidence)
@@ -96,7 +98,7 @@ def _between(measured: MeasuredResponse, radius: Array) -> tuple[Array, Complex,
         return lines, measured.response, radius
     pieces = [
         np.geomspace(a, b, max(2, int(np.ceil(np.log(b / a) / np.log(_RATIO))) + 1))[:-1]
-        for a, b in zip(lines[:-1], lines[1:], strict=True)
+        for a, b in pairwise(lines)
     ]
     grid = np.concatenate([*pieces, lines[-1:]])
     inverse = 1.0 / measured.response[0]

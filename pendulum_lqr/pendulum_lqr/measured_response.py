@@ -38,8 +38,8 @@ class MeasuredResponse:
         coherence: Share of the output's power that the excitation explains, shape (2, n), 0 to 1.
         sensitivity: Torque at the plant for one newton metre of excitation, 1/(1 + K P), shape (n,).
         blocks: Number of independent periods (or segments) behind it.
-        distortion: Angle and velocity on lines that were not excited, beside those that were, shape (2,); NaN where that
-            was not measured [-].
+        distortion: Angle and velocity on lines that were not excited, beside those that were, shape (2,); NaN where
+            that was not measured [-].
         facts: What else a reader should know: source, excitation, duration, largest angle and torque.
     """
 
@@ -58,7 +58,8 @@ class MeasuredResponse:
         """Check shapes."""
         n = self.frequency.size
         for name, shape in (
-            ("frequency", (n,)), ("response", (2, n)), ("deviation", (2, n)), ("coherence", (2, n)), ("sensitivity", (n,))
+            ("frequency", (n,)), ("response", (2, n)), ("deviation", (2, n)), ("coherence", (2, n)),
+            ("sensitivity", (n,)),
         ):  # fmt: skip
             found = getattr(self, name)
             if found.shape != shape or not np.all(np.isfinite(found)):

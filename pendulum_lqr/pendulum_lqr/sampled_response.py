@@ -1,86 +1,48 @@
 """The frequency response of a plant as a sampled controller sees it: torque held over a period, states at its ends.
 
-With a zero-order hold the sampled plant P(e^{j w h}) is exact up to the Nyquist frequency; hold (half a period of delay),
-the plant's delay and the images that sampling folds back are all in it. The continuous plant differs from it by all
-these, most near the Nyquist frequency, so responses measured at two rates are comparable only after both were brought
-to one rate, or to none (:func:`brought_to`).
+With a zero-order hold the sampled plant P(e^{j w h}) is exact up to the Nyquist frequency; hold (half a period of
+delay), the plant's delay and the images that sampling folds back are all in it. The continuous plant differs from it
+by all these, most near the Nyquist frequency, so responses measured at two rates are comparable only after both were
+brought to one rate, or to none (:func:`brought_to`).
 """
 
 from __future__ import annotations
-
-from typing import Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from pendulum_lqr.design import discretise
-from pendulum_lqr.model import LinearModel, RigidPlant, linearise
-from pendulum_msgs_py.contract.angles import UPRIGHT
+from pendulum_lqr.model import LinearModel
 
-__all__ = ["DelayedModel", "brought_to", "delayed_model", "model_response"]
+__all__ = ["brought_to", "model_response"]
 
 Array = NDArray[np.float64]
 Complex = NDArray[np.complex128]
 
 
-class DelayedModel(Protocol):
-    """A linear model and the delay of its input."""
-
-    @property
-    def model(self) -> LinearModel:
-        """States begin with angle and velocity."""
-
-    @property
-    def delay(self) -> float:
-        """From torque to its first effect [s]."""
-
-
-class _Delayed:
-    def __init__(self, model: LinearModel, delay: float) -> None:
-        self.model = model
-        self.delay = delay
-
-
-def delayed_model(plant: RigidPlant, theta: float = UPRIGHT) -> DelayedModel:
-    """Return the linear model of a plant about an angle, with its actuator's lag as a state and its delay beside it.
-
-    Args:
-        plant: Plant parameters; dry friction and drivetrain are no part of it.
-        theta: Angle of the fixed point, 0 hanging down [rad].
-    """
-    model = linearise(plant, theta)
-    lag = float(getattr(plant, "actuator_time_constant", 0.0))
-    if lag > 0.0:
-        A = np.zeros((3, 3))
-        A[:2, :2], A[:2, 2:] = model.A, model.B
-        A[2, 2] = -1.0 / lag
-        model = LinearModel(A, np.array([[0.0], [0.0], [1.0 / lag]]), model.theta, model.effort)
-    return _Delayed(model, float(getattr(plant, "transport_delay", 0.0)))
-
-
-def model_response(plant: DelayedModel, frequency: ArrayLike, period: float = 0.0) -> Complex:
+def model_response(model: LinearModel, frequency: ArrayLike, period: float = 0.0) -> Complex:
     """Return the response from torque to angle and velocity, shape (2, n) [rad/(N m), rad/s/(N m)].
 
     Args:
-        plant: The model.
+        model: Linear model, its delay included.
         frequency: Shape (n,) [Hz], up to the Nyquist frequency.
         period: Sampling period under zero-order hold [s]; 0 for the continuous plant.
     """
     omega = 2.0 * np.pi * np.atleast_1d(np.asarray(frequency, dtype=np.float64))
     if period > 0.0:
-        sampled = discretise(plant.model, period, plant.delay)
+        sampled = discretise(model, period)
         A, B, points = sampled.A, sampled.B, np.exp(1j * omega * period)
         factor = np.ones_like(points)
     else:
-        A, B, points = plant.model.A, plant.model.B, 1j * omega
-        factor = np.exp(-1j * omega * plant.delay)
+        A, B, points = model.A, model.B, 1j * omega
+        factor = np.exp(-1j * omega * model.delay)
     pencil = points[:, None, None] * np.eye(A.shape[0]) - A
     states = np.linalg.solve(pencil, np.broadcast_to(B.astype(np.complex128), (omega.size, *B.shape)))
     return np.asarray(states[:, :2, 0].T * factor, dtype=np.complex128)
 
 
 def brought_to(
-    response: ArrayLike, plant: DelayedModel, frequency: ArrayLike, *, measured: float, period: float = 0.0
+    response: ArrayLike, model: LinearModel, frequency: ArrayLike, *, measured: float, period: float = 0.0
 ) -> Complex:
     """Return a response that was measured at one sampling period as it would be at another, by a model's ratio.
 
@@ -88,10 +50,10 @@ def brought_to(
 
     Args:
         response: Measured response, shape (2, n).
-        plant: A model of the plant.
+        model: A model of the plant.
         frequency: Shape (n,) [Hz], below both Nyquist frequencies.
         measured: Sampling period of the measurement [s].
         period: Sampling period wanted [s]; 0 for the continuous plant.
     """
-    ratio = model_response(plant, frequency, period) / model_response(plant, frequency, measured)
+    ratio = model_response(model, frequency, period) / model_response(model, frequency, measured)
     return np.asarray(np.asarray(response, dtype=np.complex128) * ratio, dtype=np.complex128)

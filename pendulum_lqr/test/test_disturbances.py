@@ -324,7 +324,7 @@ def test_a_multisine_has_power_on_its_lines_alone_repeats_and_peaks_at_its_ampli
 
 
 def test_a_multisine_without_a_line_in_its_band_is_refused():
-    with pytest.raises(ParameterError, match=r"no odd multiple of 1/signal_period = 1 Hz lies between 1\.2 and 2\.8 Hz"):
+    with pytest.raises(ParameterError, match=r"no odd multiple of 1/signal_period = 1 Hz lies between 1\.2 and 2\.8"):
         make_disturbance({**MULTISINE, "signal_period": 1.0, "frequency": 1.2, "frequency_end": 2.8})
     with pytest.raises(ParameterError, match="expected >= frequency = 3 Hz"):
         make_disturbance({**MULTISINE, "frequency": 3.0, "frequency_end": 2.0})

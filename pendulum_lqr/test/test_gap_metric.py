@@ -1,4 +1,4 @@
-"""The nu-gap, margins and certificates against closed forms, an optimal controller, and loops that are known to fail."""
+"""The nu-gap, margins and certificates against closed forms, an optimal controller, and loops known to fail."""
 
 import math
 
@@ -19,7 +19,8 @@ from pendulum_lqr.gap_metric import (
 )
 from pendulum_lqr.machine_response import Machine
 from pendulum_lqr.measured_response import MeasuredResponse, read_response, write_response
-from pendulum_lqr.sampled_response import brought_to, delayed_model, model_response
+from pendulum_lqr.model import linearise
+from pendulum_lqr.sampled_response import brought_to, model_response
 from pendulum_msgs_py.errors import DataError, ParameterError
 from pendulum_msgs_py.plants.plant_parameters import PlantParameters, load_plant
 
@@ -71,7 +72,7 @@ def test_the_chordal_distance_is_a_metric_and_never_exceeds_one(values):
 def test_the_optimal_controller_has_the_optimal_margin_and_no_other_has_more():
     # b_opt = 1/sqrt(1 + rho(X Z)) of Glover and McFarlane, 1989, from two Riccati equations.
     scaling = Scaling(0.03, 1e9, 1.0)
-    model = delayed_model(load_plant("dfki")).model
+    model = linearise(load_plant("dfki"))
     A, B, C = model.A, model.B * scaling.torque, np.array([[1.0 / scaling.angle, 0.0]])
     X = scipy.linalg.solve_continuous_are(A, B, C.T @ C, np.eye(1))
     Z = scipy.linalg.solve_continuous_are(A.T, C.T, B @ B.T, np.eye(1))
@@ -83,7 +84,7 @@ def test_the_optimal_controller_has_the_optimal_margin_and_no_other_has_more():
     Ak = A - B @ B.T @ X + Bk @ C
     omega = OMEGA[:3600]
     optimal = np.array([(B.T @ X @ np.linalg.solve(1j * w * np.eye(2) - Ak, Bk))[0, 0] for w in omega])
-    plant = scaling.plant(model_response(delayed_model(load_plant("dfki")), omega / (2.0 * np.pi)))
+    plant = scaling.plant(model_response(linearise(load_plant("dfki")), omega / (2.0 * np.pi)))
     margin = pointwise_margin(plant, np.vstack([-optimal, 0.0 * optimal]))
     assert float(margin.min()) == pytest.approx(best, rel=2e-3)
     # Such a controller makes rho nearly flat; other ones have less somewhere.
@@ -118,7 +119,7 @@ def exact(
 ) -> MeasuredResponse:
     """Return a measurement of a plant whose errors are as good as none."""
     frequency = np.geomspace(0.25, 0.475 / period, lines)
-    response = model_response(delayed_model(plant), frequency, period)
+    response = model_response(linearise(plant), frequency, period)
     n = frequency.size
     return MeasuredResponse(
         "hw",
@@ -133,12 +134,12 @@ def exact(
 
 
 def test_the_sampled_response_is_that_of_a_simulation_sample_by_sample():
-    plant = delayed_model(load_plant("dfki").with_values(transport_delay=0.004, actuator_time_constant=0.003))
+    plant = linearise(load_plant("dfki").with_values(transport_delay=0.004, actuator_time_constant=0.003))
     period, size = 0.01, 500
     # A periodic torque, its steady response by brute force: fine steps of the continuous equations under the hold.
     frequency = np.array([3.0, 17.0, 44.0])
     P = model_response(plant, frequency, period)
-    fine, A, B = 200, plant.model.A, plant.model.B[:, 0]
+    fine, A, B = 200, plant.A, plant.B[:, 0]
     step = period / fine
     phi = scipy.linalg.expm(A * step)
     gamma = np.linalg.solve(A, (phi - np.eye(3)) @ B)
@@ -167,10 +168,10 @@ def test_the_sampled_response_is_that_of_a_simulation_sample_by_sample():
 def test_a_response_can_be_brought_to_another_rate():
     plant, wrong = load_plant("dfki"), load_plant("dfki").with_values(inertia=0.16, damping=0.12)
     frequency = np.geomspace(0.25, 40.0, 30)
-    fast = model_response(delayed_model(plant), frequency, 0.002)
-    slow = model_response(delayed_model(plant), frequency, 0.01)
+    fast = model_response(linearise(plant), frequency, 0.002)
+    slow = model_response(linearise(plant), frequency, 0.01)
     # A model that is 7 % off serves: the change of hold and folding is nearly that of any such plant.
-    moved = brought_to(fast, delayed_model(wrong), frequency, measured=0.002, period=0.01)
+    moved = brought_to(fast, linearise(wrong), frequency, measured=0.002, period=0.01)
     np.testing.assert_allclose(moved, slow, rtol=2e-3)
     assert np.max(np.abs(fast / slow - 1.0)) > 0.5
 
@@ -179,15 +180,15 @@ def test_a_design_is_certified_for_a_close_machine_and_not_for_one_that_it_does_
     base = load_plant("dfki")
     near, far = base.with_values(transport_delay=0.004), base.with_values(transport_delay=0.06)
     K = np.array([20.0, 3.0])
-    assert stabilises(delayed_model(base), K, 0.01)
-    assert not stabilises(delayed_model(far), K, 0.01)
+    assert stabilises(linearise(base), K, 0.01)
+    assert not stabilises(linearise(far), K, 0.01)
     certificates = [
-        Certifier(delayed_model(base), Machine.of(exact(plant))).gain(K) for plant in (base, near, far)
+        Certifier(linearise(base), Machine.of(exact(plant))).gain(K) for plant in (base, near, far)
     ]
     assert [c.certified for c in certificates] == [True, True, False]
     assert certificates[0].distance < certificates[1].distance < 1.0 < certificates[2].distance
     # A gain that does not even hold the pendulum on the model is certified for nothing.
-    weak = Certifier(delayed_model(base), Machine.of(exact(base))).gain([2.0, 3.0])
+    weak = Certifier(linearise(base), Machine.of(exact(base))).gain([2.0, 3.0])
     assert not weak.stable_on_model
     assert not weak.certified
 
@@ -196,15 +197,15 @@ def test_a_gain_that_fails_below_the_lowest_line_is_not_certified():
     # The machine is heavier than the gain can hold; on every measured line its loop looks fine.
     base, heavy = load_plant("dfki"), load_plant("dfki").with_values(gravity=3.5)
     K = np.array([3.3, 8.0])
-    assert stabilises(delayed_model(base), K, 0.01)
-    assert not stabilises(delayed_model(heavy), K, 0.01)
-    assert not Certifier(delayed_model(base), Machine.of(exact(heavy))).gain(K).certified
+    assert stabilises(linearise(base), K, 0.01)
+    assert not stabilises(linearise(heavy), K, 0.01)
+    assert not Certifier(linearise(base), Machine.of(exact(heavy))).gain(K).certified
 
 
 def test_a_measurement_that_tells_little_certifies_little():
     base = load_plant("dfki")
     K = np.array([20.0, 3.0])
-    assert not Certifier(delayed_model(base), Machine.of(exact(base, error=0.3))).gain(K).certified
+    assert not Certifier(linearise(base), Machine.of(exact(base, error=0.3))).gain(K).certified
 
 
 def test_no_certified_gain_fails_on_any_of_many_machines():
@@ -223,10 +224,10 @@ def test_no_certified_gain_fails_on_any_of_many_machines():
             gravity=base.gravity / gain,
             transport_delay=delay,
         )
-        certifier = Certifier(delayed_model(base), Machine.of(exact(plant, lines=28)))
+        certifier = Certifier(linearise(base), Machine.of(exact(plant, lines=28)))
         for _ in range(30):
             K = np.exp([generator.uniform(0.9, 5.0), generator.uniform(-2.0, 2.0)])
-            stable = stabilises(delayed_model(plant), K, 0.01)
+            stable = stabilises(linearise(plant), K, 0.01)
             certified = certifier.gain(K).certified
             counts["certified"] += certified
             counts["stable"] += stable

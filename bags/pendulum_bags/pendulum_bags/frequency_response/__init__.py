@@ -1,1 +1,1 @@
-"""Frequency responses of plants under feedback: estimation, comparison, and the layers of the verdict that rest on them."""
+"""Frequency responses of plants under feedback: estimation, comparison, and the layers of the verdict on them."""

@@ -1,13 +1,14 @@
 """The frequency response of a plant in closed loop, from a known excitation.
 
-Feedback makes the torque depend on the plant's own noise, so that output over torque is biased towards the inverse of the
-controller. The joint input-output estimate is not: both are measured against the excitation r, which noise does not know,
+Feedback makes the torque depend on the plant's own noise, so that output over torque is biased towards the inverse of
+the controller. The joint input-output estimate is not: both are measured against the excitation r, which noise does
+not know,
 
     G = S_yr / S_ur
 
-A periodic excitation is averaged over its periods, without leakage; any other is cut into windowed segments that overlap
-by half. What the blocks do not share is noise, and tells the confidence: ``|G_hat - G|^2 / deviation^2`` follows F(2,
-2 (blocks - 1)).
+A periodic excitation is averaged over its periods, without leakage; any other is cut into windowed segments that
+overlap by half. What the blocks do not share is noise, and tells the confidence: ``|G_hat - G|^2 / deviation^2``
+follows F(2, 2 (blocks - 1)).
 
 Source: Ljung, System Identification, 2nd ed., 1999, section 13.5; Pintelon and Schoukens, System Identification: A
 Frequency Domain Approach, 2nd ed., 2012, sections 2.5 to 2.7 and 4.3 (distortion on lines that were not excited).
@@ -88,8 +89,8 @@ def _periodic(record: Record, length: float, harmonics: NDArray[np.int64]) -> Me
     if blocks < _LEAST_BLOCKS:
         raise DataError(
             f"{record.label} lasts {record.duration:.1f} s, {record.duration / length:.1f} periods of {length:g} s; "
-            f"expected at least {skip + _LEAST_BLOCKS}: {skip} until the transient has died away and {_LEAST_BLOCKS} to "
-            "average"
+            f"expected at least {skip + _LEAST_BLOCKS}: {skip} until the transient has died away and {_LEAST_BLOCKS} "
+            "to average"
         )
     used = harmonics[harmonics <= _TOP * 0.5 * size]
     if not used.size:

@@ -10,11 +10,11 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
 
+from pendulum_bags.experiments.in_process import RunArrays
 from pendulum_bags.runs.run_data import RunData
 from pendulum_bags.runs.series import Signal, unwrap_near_upright
-from pendulum_bags.experiments.in_process import RunArrays
-from pendulum_msgs_py.errors import DataError
 from pendulum_msgs_py.contract.values import NANOSECONDS
+from pendulum_msgs_py.errors import DataError
 
 __all__ = ["Record", "record_of_arrays", "record_of_run"]
 
@@ -70,8 +70,8 @@ def record_of_arrays(arrays: RunArrays, label: str, disturbance: Mapping[str, An
 def record_of_run(run: RunData) -> Record:
     """Return the record of a recorded plant while its disturbance acted.
 
-    Torques are held from stamp to stamp, so their mean over each interval of the raster is taken; angle and velocity are
-    interpolated where stamps jitter.
+    Torques are held from stamp to stamp, so their mean over each interval of the raster is taken; angle and velocity
+    are interpolated where stamps jitter.
 
     Args:
         run: The plant's part of a bag.
