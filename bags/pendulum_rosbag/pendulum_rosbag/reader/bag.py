@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 import json
 import os
 from collections.abc import Iterator, Mapping, Sequence
@@ -16,7 +15,6 @@ import numpy.typing as npt
 
 from pendulum_msgs_py.errors import BagError, DataError
 from pendulum_rosbag.reader.batches import Batch, Int64, Source, Stream
-from pendulum_rosbag.reader.decompression import decompress_bounded
 from pendulum_rosbag.reader.joint_state import JointStateParser
 from pendulum_rosbag.reader.open_source import BagFolder, open_folder, open_sources
 
@@ -93,7 +91,6 @@ class Bag(Mapping[str, Any]):
         ]
         self._sources = list(sources)
         self._span = (start, stop)
-        self._message_compression = folder.message_compression
         self._topics = _group(sources, folder.topic_hashes)
         if topics is not None:
             missing = [topic for topic in topics if topic not in self._topics]
@@ -166,9 +163,6 @@ class Bag(Mapping[str, Any]):
         if topic not in self._topics:
             return self[topic]  # raises
         rows = [row for batch in self._batches({topic})[topic] for row in batch.payloads()]
-        if self._message_compression:
-            name = f"{self.path}: topic {topic}"
-            rows = [(time, decompress_bounded(io.BytesIO(data), name)) for time, data in rows]
         rows.sort(key=lambda row: row[0])
         return rows
 
@@ -264,7 +258,7 @@ class Bag(Mapping[str, Any]):
     def _is_fixed(self, topic: str) -> bool:
         entry = self._topics[topic]
         plain = all(stream.serialization == "cdr" for _, stream in entry.streams)
-        return entry.info.type == _JOINT_STATE and plain and not self._message_compression
+        return entry.info.type == _JOINT_STATE and plain
 
     def _read_fixed(self, topics: Sequence[str]) -> dict[str, npt.NDArray[Any] | None]:
         parsers = {topic: JointStateParser(self._topics[topic].info.count) for topic in topics}

@@ -14,6 +14,7 @@ from pendulum_msgs_py.errors import BagError
 from pendulum_rosbag.reader.batches import Source
 from pendulum_rosbag.reader.decompression import decompress_bounded
 from pendulum_rosbag.reader.mcap_source import McapSource
+from pendulum_rosbag.reader.message_compression import UnpackedSource, holds_packed_messages
 from pendulum_rosbag.reader.sqlite_source import SqliteSource
 from pendulum_rosbag.storage.metadata_file import METADATA_NAME, METADATA_VERSION
 
@@ -36,7 +37,8 @@ class BagFolder:
     storage: str = ""
     custom_data: dict[str, str] = field(default_factory=dict)
     topic_hashes: dict[str, str] = field(default_factory=dict)
-    message_compression: bool = False
+    message_compression: bool | None = None
+    """Whether messages are compressed one by one; ``None`` where nothing says so."""
     message_count: int | None = None
     damage: list[str] = field(default_factory=list)
 
@@ -122,7 +124,7 @@ def _take_metadata(folder: BagFolder, text: str) -> None:
             topic: Mapping[str, Any] = item["topic_metadata"]
             folder.topic_hashes[str(topic["name"])] = str(topic.get("type_description_hash", ""))
         folder.message_count = int(info["message_count"])
-        folder.message_compression = str(info.get("compression_mode") or "").lower() == "message"
+        folder.message_compression = _is_message_compression(info)
     except (
         yaml.YAMLError,
         KeyError,
@@ -134,6 +136,15 @@ def _take_metadata(folder: BagFolder, text: str) -> None:
     ) as error:
         sentence = " ".join(str(error).split())
         folder.damage.append(f"{METADATA_NAME} is not what a bag has: {sentence or type(error).__name__}")
+
+
+def _is_message_compression(info: Mapping[str, Any]) -> bool:
+    if str(info.get("compression_mode") or "").lower() != "message":
+        return False
+    name = str(info.get("compression_format") or "")
+    if name != "zstd":
+        raise BagError(f"messages are compressed by {name!r}; expected zstd, the one format of rosbag2")
+    return True
 
 
 def _ending(file: Path) -> str:
@@ -162,9 +173,11 @@ def open_sources(folder: BagFolder) -> list[Source]:
             folder.damage.append(str(error))
     if not sources:
         raise errors[0]
-    if not folder.custom_data:
+    if not folder.custom_data or folder.message_compression is None:
         _metadata_from_storage(folder, sources[-1])
-    return sources
+    if folder.message_compression is None:
+        folder.message_compression = holds_packed_messages(sources[0])
+    return [UnpackedSource(source) for source in sources] if folder.message_compression else sources
 
 
 def open_source(file: Path) -> Source:
@@ -209,6 +222,9 @@ def _metadata_from_storage(folder: BagFolder, source: Source) -> None:
     try:
         info = _load_yaml(text)
         info = info.get("rosbag2_bagfile_information", info)
-        folder.custom_data = {str(key): str(value) for key, value in (info.get("custom_data") or {}).items()}
+        custom = {str(key): str(value) for key, value in (info.get("custom_data") or {}).items()}
+        folder.custom_data = folder.custom_data or custom
+        if folder.message_compression is None and "compression_mode" in info:
+            folder.message_compression = _is_message_compression(info)
     except (yaml.YAMLError, AttributeError, TypeError, ValueError, RecursionError, OverflowError):
         return

@@ -94,7 +94,7 @@ def repair_bag(
         )
         name = bag.name if in_place else target.name
         with open_writer(target, folder.storage, compression, folder.custom_data, file_stem=name) as writer:
-            _copy(sources, folder.topic_hashes, folder.message_compression, writer)
+            _copy(sources, folder.topic_hashes, writer)
             report.messages = writer.written
     except BaseException:
         if in_place:
@@ -111,8 +111,7 @@ def repair_bag(
     return report
 
 
-def _copy(sources: list[Source], hashes: dict[str, str], packed: bool, writer: BagWriter) -> None:
-    unpack = _decompress if packed else bytes
+def _copy(sources: list[Source], hashes: dict[str, str], writer: BagWriter) -> None:
     for source in sources:
         streams = {stream.channel: stream for stream in source.streams if stream.serialization == "cdr"}
         for stream in streams.values():
@@ -120,13 +119,7 @@ def _copy(sources: list[Source], hashes: dict[str, str], packed: bool, writer: B
             writer.add_topic(stream.topic, kind, _profiles(stream.qos))
         for batch in source.batches(set(streams), None, None):
             topic = streams[batch.channel].topic
-            writer.write_many((topic, time, unpack(data)) for time, data in batch.payloads())
-
-
-def _decompress(data: bytes) -> bytes:
-    import zstandard
-
-    return zstandard.ZstdDecompressor().decompressobj().decompress(data)
+            writer.write_many((topic, time, data) for time, data in batch.payloads())
 
 
 def _type_of(stream: Stream, type_hash: str) -> MessageType:
