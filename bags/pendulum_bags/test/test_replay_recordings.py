@@ -8,13 +8,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from pendulum_bags.identification.identify_cli import main as identify_main
 from pendulum_bags.identification.window_score import window_rms
 from pendulum_bags.replay.controller_replay import replay_controller
 from pendulum_bags.replay.input_replay import fit_percent, replay_input, replay_recording
-from pendulum_bags.replay.replay_cli import main
+from pendulum_bags.replay.replay_cli import main as replay_main
 from pendulum_bags.runs.datasets import Recording
+from pendulum_msgs_py.contract.cdr import encode_joint_state
 from pendulum_msgs_py.errors import DataError
 from pendulum_msgs_py.plants.plant_parameters import load_plant
+from pendulum_rosbag.storage import open_writer
 from pendulum_sim.plant import make_plant
 from tests.synthetic_runs import regulate, run_metadata, write_bag
 
@@ -42,6 +45,27 @@ def test_a_plant_follows_its_own_recording() -> None:
     assert result.fit > 99.0
     assert result.diverges_at is None
     assert "never" in result.sentence()
+
+
+@pytest.mark.parametrize("effort", [[], [None, None]])
+def test_a_bag_whose_torque_was_never_recorded_is_refused_in_a_sentence(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], effort: list[None]
+) -> None:
+    with open_writer(tmp_path / "bag") as writer:
+        for topic in ("/sim/joint_states", "/sim/applied_effort", "/sim/effort_command"):
+            writer.add_topic(topic, "sensor_msgs/msg/JointState")
+        for index in range(100):
+            stamp = index * 10_000_000
+            writer.write("/sim/joint_states", stamp, encode_joint_state(stamp, position=0.1, velocity=0.0, effort=0.0))
+        for stamp, value in enumerate(effort):
+            writer.write("/sim/applied_effort", stamp, encode_joint_state(stamp, position=0.1, effort=value))
+    held = "2 messages, none with an effort" if effort else "no message"
+    for command in (replay_main, identify_main):
+        assert command([str(tmp_path / "bag"), "--out", str(tmp_path / "out")]) == 2
+        told = capsys.readouterr().err
+        assert f"topic /sim/applied_effort of bag {tmp_path / 'bag'} has {held}; expected the torque" in told
+    assert replay_main([str(tmp_path / "bag"), "--controller", "lqr", "--out", str(tmp_path / "out")]) == 2
+    assert "topic /sim/effort_command of bag" in capsys.readouterr().err
 
 
 def test_a_series_elastic_plant_can_be_replayed_too() -> None:
@@ -99,7 +123,7 @@ def test_command_shows_a_real_pendulum_in_one_figure(
     shared_data: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     recording = str(shared_data / DFKI / "ddp_measured.csv")
-    assert main([recording, "--params", "dfki", "-o", str(tmp_path)]) == 0
+    assert replay_main([recording, "--params", "dfki", "-o", str(tmp_path)]) == 0
     assert "windows of 1 s: rms 0.03" in capsys.readouterr().out
     assert (tmp_path / "replay.png").stat().st_size > 10_000
     assert json.loads((tmp_path / "replay.json").read_text())["rms_rad"] == pytest.approx(0.038, rel=0.1)
@@ -108,20 +132,20 @@ def test_command_shows_a_real_pendulum_in_one_figure(
 def test_command_refuses_bad_files_and_writes_nothing(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     bad = tmp_path / "bad.csv"
     bad.write_text("time,position,velocity,torque\n0,0,0,0\n1,nan,0,0\n2,0,0,0\n")
-    assert main([str(bad), "--params", "dfki", "-o", str(tmp_path / "out")]) == 2
+    assert replay_main([str(bad), "--params", "dfki", "-o", str(tmp_path / "out")]) == 2
     assert "'position' is nan" in capsys.readouterr().err
     assert not (tmp_path / "out").exists()
-    assert main([str(tmp_path / "missing.csv"), "--params", "dfki"]) == 2
+    assert replay_main([str(tmp_path / "missing.csv"), "--params", "dfki"]) == 2
     assert "does not exist" in capsys.readouterr().err
-    assert main([str(bad), "--params", "nothing"]) == 2
+    assert replay_main([str(bad), "--params", "nothing"]) == 2
 
 
 def test_command_takes_the_plant_of_a_bag_that_is_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     bag = write_bag(tmp_path / "bag", regulate(rate=100.0, seed=3, duration=2.0), "/sim", ramps=False)
     arguments = [str(bag), "-o", str(tmp_path / "out")]
-    assert main([*arguments, "--prefix", "/sim"]) == 0
+    assert replay_main([*arguments, "--prefix", "/sim"]) == 0
     assert "plant thesis (--params names another)" in capsys.readouterr().out
-    assert main([*arguments, "--prefix", "/hw"]) == 2
+    assert replay_main([*arguments, "--prefix", "/hw"]) == 2
     assert "has no topic /hw/joint_states; it has" in capsys.readouterr().err
 
 
@@ -158,6 +182,6 @@ def test_command_replays_a_controller(tmp_path: Path, capsys: pytest.CaptureFixt
     columns = regulate(rate=100.0, seed=3, duration=2.0)
     bag = write_bag(tmp_path / "bag", columns, "/sim", metadata=run_metadata(3), ramps=False)
     arguments = [str(bag), "--controller", "lqr", "--set", "q=[1.0, 0.01]", "-o", str(tmp_path / "out"), "--json"]
-    assert main(arguments) == 0
+    assert replay_main(arguments) == 0
     assert json.loads(capsys.readouterr().out)["commands"] == 200
     assert (tmp_path / "out" / "controller_replay.png").exists()

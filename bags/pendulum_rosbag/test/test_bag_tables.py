@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 
 from pendulum_msgs_py.contract.cdr import encode_joint_state
-from pendulum_msgs_py.errors import BagError, ParameterError
+from pendulum_msgs_py.errors import BagError, DataError, ParameterError
 from pendulum_rosbag.reader import read_bag
 from pendulum_rosbag.reader.export_cli import main as export_main
 from pendulum_rosbag.reader.info_cli import main as info_main
-from pendulum_rosbag.reader.statistics import bag_statistics, time_statistics
+from pendulum_rosbag.reader.statistics import bag_statistics, clock_jumps, time_statistics
 from pendulum_rosbag.reader.tables import export_bag, to_pandas
 from pendulum_rosbag.storage import open_writer
 from tests.bag_messages import (
@@ -46,6 +46,52 @@ def test_a_late_message_is_a_gap_but_none_is_missing() -> None:
     stamps[50] += 1_500_000
     result = time_statistics(JOINT_STATE, stamps, stamps)
     assert (result.gaps, result.missing) == (1, 0)
+
+
+def test_late_messages_are_no_clock_jumps_whether_one_or_a_queue_of_them() -> None:
+    stamps = np.arange(5000, dtype=np.int64) * 2_000_000
+    late = stamps + 300_000
+    late[1000] += 80_000_000  # one
+    for index in range(2000, 2150):  # a recorder that was held up for 0.3 s, and then took all at once
+        late[index] = max(int(late[index]), int(stamps[2150]))
+    late[-1] += 90_000_000  # the last: nobody can tell
+    assert time_statistics(JOINT_STATE, late, stamps).clock_jumps == 0
+    assert clock_jumps(late, stamps) == []
+    jumping = late + np.where(np.arange(5000) >= 1200, 200_000_000, 0)  # soon after the late one
+    assert clock_jumps(jumping, stamps) == [1200]
+    source_ahead = stamps + np.where(np.arange(5000) >= 1200, 60_000_000, 0)
+    assert clock_jumps(late, source_ahead) == [1200]
+    both = stamps + np.where((np.arange(5000) >= 900) & (np.arange(5000) < 4000), 3_600_000_000_000, 0)
+    assert clock_jumps(late, both) == [900, 4000]
+
+
+def test_joint_states_of_any_kind_are_timed_by_their_stamps(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = tmp_path / "bag"
+    kinds: dict[str, tuple[list[str], list[float]]] = {"/unnamed": ([], [1.0]), "/two": (["p", "q"], [1.0, 2.0])}
+    with open_writer(path) as writer:
+        writer.add_topic("/clock", "rosgraph_msgs/msg/Clock")
+        for topic in kinds:
+            writer.add_topic(topic, JOINT_STATE)
+        for index in range(1, 101):
+            log = index * 10_000_000 + (index % 2) * 4_000_000
+            for topic, (names, values) in kinds.items():
+                writer.write(topic, log, joint_state(index * 10_000_000, "", names, values, [], []))
+            writer.write("/clock", log, b"\0\1\0\0" + index.to_bytes(4, "little") + bytes(4))
+    bag = read_bag(path)
+    statistics = bag_statistics(bag)
+    for topic in kinds:
+        assert statistics.topics[topic].stamped
+        assert statistics.topics[topic].jitter == pytest.approx(0.0)
+        assert statistics.topics[topic].age_p99 == pytest.approx(4.0)
+    assert not statistics.topics["/clock"].stamped
+    with pytest.raises(DataError, match=r"whose joints have no names \(field name is empty, with 1 values\); expected"):
+        bag.array("/unnamed")
+    with pytest.raises(DataError, match=r"of 2 joints \(p, q\); expected"):
+        bag.array("/two")
+    assert info_main([str(path)]) == 0
+    rows = [line.split() for line in capsys.readouterr().out.splitlines()]
+    assert next("stamp" in row for row in rows if "/two" in row)
+    assert next("log" in row for row in rows if "/clock" in row)
 
 
 def test_bursts_of_events_leave_no_gaps_but_a_periodic_topic_without_stamps_does() -> None:

@@ -157,8 +157,8 @@ def replay_controller(
     if plant is None:
         plant = "thesis" if design_plant in {"emulator", "hebi"} else design_plant
     parameters = plant if isinstance(plant, PlantParameters) else load_plant(plant)
-    states = _by_stamp(states)
-    commands = _by_stamp(commands)
+    states = _by_stamp(states, f"{space}/{names.JOINT_STATES} of bag {path}")
+    commands = _by_stamp(commands, f"{space}/{names.EFFORT_COMMAND} of bag {path}")
     first, last = (int(i) for i in np.searchsorted(states["stamp_ns"], commands["stamp_ns"][[0, -1]]))
     states = states[first : last + 1]
     if len(states) < 2:
@@ -189,9 +189,9 @@ def replay_controller(
     )
 
 
-def _by_stamp(array: NDArray[Any]) -> NDArray[Any]:
+def _by_stamp(array: NDArray[Any], topic: str) -> NDArray[Any]:
     if not len(array):
-        raise DataError("a topic has 0 messages; expected states and commands")
+        raise DataError(f"topic {topic} has no message; expected states, and commands that answer them")
     _, first = np.unique(array["stamp_ns"], return_index=True)
     return array[first]
 

@@ -51,6 +51,12 @@ def read_bag_recording(
     applied_topic = states_topic.removesuffix("joint_states") + "applied_effort"
     if effort == "applied" and applied_topic in bag.topics:
         applied = bag.array(applied_topic)
+        if not np.isfinite(applied["effort"]).any():
+            held = "no message" if not applied.size else f"{applied.size} messages, none with an effort"
+            raise DataError(
+                f"topic {applied_topic} of bag {path} has {held}; expected the torque that drove the plant (the measured "
+                "one, in joint_states, is taken instead if you ask for it)"
+            )
         stamps, first = np.unique(applied["stamp_ns"], return_index=True)
         return Recording(
             time,

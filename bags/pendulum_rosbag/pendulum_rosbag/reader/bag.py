@@ -148,7 +148,7 @@ class Bag(Mapping[str, Any]):
         values = self[topic]
         if not isinstance(values, np.ndarray):
             raise DataError(
-                f"topic {topic} of bag {self.path} holds {self._topics[topic].info.type}; "
+                f"topic {topic} of bag {self.path} holds {_held(self._topics[topic].info.type, values)}; "
                 "expected sensor_msgs/msg/JointState of one joint"
             )
         return values
@@ -340,6 +340,22 @@ def _group(sources: Sequence[Source], hashes: Mapping[str, str]) -> dict[str, _T
         )
         topics[name] = _Topic(info, streams)
     return topics
+
+
+def _held(kind: str, stored: Sequence[StoredMessage]) -> str:
+    """Return what a topic holds, in words: of joint states, what makes them unfit."""
+    if kind != _JOINT_STATE:
+        return kind
+    for item in stored:
+        joints = [str(name) for name in item.message.name]
+        sizes = [len(getattr(item.message, column)) for column in ("position", "velocity", "effort")]
+        if not joints:
+            return f"{kind} whose joints have no names (field name is empty, with {max(sizes)} values)"
+        if len(joints) > 1:
+            return f"{kind} of {len(joints)} joints ({', '.join(joints)})"
+        if max(sizes) > 1:
+            return f"{kind} of the joint {joints[0]} with {max(sizes)} values"
+    return f"{kind} in more layouts than can be read (big-endian CDR, or damaged)"
 
 
 def _parsed(text: Any) -> Any:

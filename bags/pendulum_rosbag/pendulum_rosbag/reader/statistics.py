@@ -8,18 +8,26 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from pendulum_rosbag.reader.bag import Bag
+from pendulum_rosbag.reader.bag import Bag, TopicInfo
 from pendulum_rosbag.reader.batches import Int64
+from pendulum_rosbag.recorder.stamps import stamp_reader
 
-__all__ = ["BagStatistics", "Latency", "TopicStatistics", "bag_statistics", "time_statistics"]
+__all__ = [
+    "BagStatistics", "Latency", "TopicStatistics", "bag_statistics", "clock_jumps", "time_statistics",
+]  # fmt: skip
 
 GAP_FACTOR = 1.5
 """An interval counts as a gap when it is longer than this many median intervals."""
 BURST_FACTOR = 2.0
 """Messages without stamps come in bursts when their mean interval is longer than this many median intervals."""
 CLOCK_JUMP = 0.05
-"""A step of the difference between log time and stamp counts as a clock jump from this size [s]."""
+"""A lasting step of the difference between log time and stamp counts as a clock jump from this size [s]."""
+_LASTING = 2.0
+"""How long a step has to last [s]: longer than any pause of a machine, after which messages are late, then on time."""
+_LEAST_AFTER = 5
 _LEAST_SHARE = 0.5
+_TIME_IS_CONTENT = frozenset({"std_msgs/msg/String", "rosgraph_msgs/msg/Clock"})
+"""Types whose stamps say what happened when, not when the message was made: their timing is that of the log."""
 _MS = 1e-6  # nanoseconds to milliseconds
 
 
@@ -39,7 +47,9 @@ class TopicStatistics:
         missing: Messages that would fill the gaps at the median interval (a late message leaves none behind).
         duplicates: Messages that carry the stamp of an earlier one (of the same sender, where they name it).
         backward: Messages whose stamp lies before that of the message before.
-        clock_jumps: Steps of more than 50 ms in the difference between log time and stamp.
+        clock_jumps: Steps of more than 50 ms in the difference between log time and stamp that last, or that no
+            delay explains (see ``clock_jumps``).
+        stamped: Whether the intervals are those between stamps; else between log times.
         age: Median of log time minus stamp.
         age_p99: 99 % of the messages are at most that old when logged.
     """
@@ -56,6 +66,7 @@ class TopicStatistics:
     duplicates: int = 0
     backward: int = 0
     clock_jumps: int = 0
+    stamped: bool = False
     age: float = np.nan
     age_p99: float = np.nan
 
@@ -113,6 +124,7 @@ def time_statistics(
     result = TopicStatistics(kind, len(log_times))
     stamped = stamps is not None and len(stamps) > 0 and bool(stamps.any())
     times = stamps if stamped and stamps is not None else log_times
+    result.stamped = stamped
     if len(times) == 0:
         return result
     if stamped and stamps is not None:
@@ -147,7 +159,39 @@ def _stamp_statistics(
     ages = (log_times - stamps) * _MS
     result.age = float(np.median(ages))
     result.age_p99 = float(np.quantile(ages, 0.99))
-    result.clock_jumps = int(np.sum(np.abs(np.diff(ages)) > CLOCK_JUMP * 1e3))
+    result.clock_jumps = len(clock_jumps(log_times, stamps))
+
+
+def clock_jumps(log_times: Int64, stamps: Int64) -> list[int]:
+    """Return at which messages one of the two clocks jumped, as indices.
+
+    The age of a message (log time minus stamp) is the difference of the clocks plus a delay, which is never negative
+    and now and then small. So it is the *least* age that tells about the clocks: a jump is a step of more than
+    ``CLOCK_JUMP`` upwards that the least age of the next ``_LASTING`` seconds confirms, or one downwards to below the
+    least age of the seconds before. Late messages, one or a queue of them, are none.
+
+    Args:
+        log_times: Log times in ascending order [ns], shape (n,).
+        stamps: Stamps [ns], shape (n,).
+    """
+    ages = (log_times - stamps) * 1e-9
+    steps = np.diff(ages)
+    intervals = np.diff(stamps)
+    ascending = intervals[intervals > 0]
+    reach = max(_LEAST_AFTER, round(_LASTING * 1e9 / float(np.median(ascending)))) if len(ascending) else _LEAST_AFTER
+    found: list[int] = []
+    begin = 0
+    for index in (np.flatnonzero(np.abs(steps) > CLOCK_JUMP) + 1).tolist():
+        before = float(ages[max(begin, index - reach) : index].min())
+        after = ages[index : index + reach]
+        if steps[index - 1] < 0.0:
+            jumped = float(ages[index]) < before - CLOCK_JUMP
+        else:
+            jumped = len(after) >= _LEAST_AFTER and float(after.min()) > before + CLOCK_JUMP
+        if jumped:
+            found.append(index)
+            begin = index
+    return found
 
 
 def _latencies(arrays: dict[str, npt.NDArray[Any]]) -> list[Latency]:
@@ -172,6 +216,17 @@ def _latencies(arrays: dict[str, npt.NDArray[Any]]) -> list[Latency]:
     return found
 
 
+def _times(bag: Bag, info: TopicInfo) -> tuple[Int64, Int64 | None]:
+    """Return log times and stamps of a topic of any type; no stamps where its messages have none."""
+    read = stamp_reader(info.type) if info.type not in _TIME_IS_CONTENT else None
+    if read is None:
+        return bag.log_times(info.name), None
+    rows = bag.raw(info.name)
+    stamps = [read(data) for _, data in rows]
+    log_times = np.array([time for time, _ in rows], np.int64)
+    return log_times, None if None in stamps else np.array(stamps, np.int64)
+
+
 def bag_statistics(bag: Bag) -> BagStatistics:
     """Return rates, gaps, jitter, latencies, duplicates and clock jumps of a bag."""
     total = sum(info.count for info in bag.topics.values())
@@ -188,7 +243,7 @@ def bag_statistics(bag: Bag) -> BagStatistics:
                 info.type, values["log_time_ns"], values["stamp_ns"], senders
             )
         else:
-            result.topics[name] = time_statistics(info.type, bag.log_times(name))
+            result.topics[name] = time_statistics(info.type, *_times(bag, info))
     result.latencies = _latencies(arrays)
     result.events = bag.events()
     return result
