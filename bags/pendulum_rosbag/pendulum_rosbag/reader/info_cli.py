@@ -46,7 +46,8 @@ def _print(statistics: BagStatistics, metadata: dict[str, Any]) -> None:
     for sentence in statistics.damage:
         console.print(f"damaged: {sentence}", style="bold red", highlight=False, soft_wrap=True)
     # One line a topic for the rate, one table for what can be wrong with it.
-    table = WholeTable("topic", "type", "by", title="topics (intervals between stamps, or log times, in ms)", title_justify="left")
+    title = "topics (intervals between stamps, or log times, in ms)"
+    table = WholeTable("topic", "type", "by", title=title, title_justify="left")
     for heading in ("count", "rate [Hz]", "median", "jitter", "p99", "longest", "gaps", "missing"):
         table.add_column(heading, justify="right")
     for name, topic in statistics.topics.items():
