@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import json
 import math
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -76,6 +78,14 @@ def test_series_refuses_stamps_that_go_back_and_values_that_are_not_numbers() ->
         Series(np.arange(4.0), t, np.array([0.0, 1.0, np.nan, 1.0]), t)
 
 
+@pytest.mark.parametrize("rest", [0.0, math.pi])
+def test_a_pendulum_at_either_rest_is_at_that_rest_whatever_its_noise_and_its_turn(rest: float) -> None:
+    for noise in (-1e-6, 0.0, 1e-6):
+        for turn in (-2, 0, 3):
+            angles = np.full(20, rest + noise + 2.0 * math.pi * turn)
+            np.testing.assert_allclose(unwrap_near_upright(angles), rest + noise, atol=1e-9)
+
+
 @settings(deadline=None)
 @given(st.integers(-5, 5), st.floats(-1.0, 1.0))
 def test_angles_come_back_near_upright_whatever_the_turn(turns: int, deviation: float) -> None:
@@ -145,6 +155,21 @@ def test_a_step_that_never_settles_says_so_in_the_table() -> None:
     assert rows["settling_time"] is None
 
 
+@pytest.mark.parametrize("rate", [50.0, 100.0, 500.0, 1000.0])
+def test_smoothness_is_that_of_the_torque_and_not_of_its_sampling(rate: float) -> None:
+    t = np.arange(0.0, 10.0, 1.0 / rate)
+    effort = 2.0 * np.sin(2.0 * math.pi * 1.5 * t)
+    zero = np.zeros_like(t)
+    found = metrics_of(Episode(t, zero, zero, effort))["smoothness"]
+    # rms of u(t + h) - u(t) for a sine of amplitude a: sqrt(2) a |sin(pi f h)|.
+    assert found == pytest.approx(math.sqrt(2.0) * 2.0 * math.sin(math.pi * 1.5 * 0.02) / 0.02, rel=0.01)
+
+
+def test_torque_sampled_too_seldom_has_no_smoothness() -> None:
+    t = np.arange(0.0, 2.0, 0.04)
+    assert "smoothness" not in metrics_of(Episode(t, t, t, t))
+
+
 # -- equivalence -------------------------------------------------------------------------------------------------
 
 
@@ -208,42 +233,60 @@ def test_verdict_is_the_worst_outcome_in_words() -> None:
     good = equivalence_test("mean", "rad", interval(0.0, -0.1, 0.1), -1.0, 1.0)
     bad = equivalence_test("spread", "-", interval(3.0, 2.5, 3.5), 0.8, 1.25, ratio=True)
     open_ = equivalence_test("path", "-", interval(0.9, 0.5, 1.4), -math.inf, 1.0)
-    assert conclude([good], Margins(), "simulation", "hardware").outcome is Outcome.EQUIVALENT
-    undecided = conclude([good, open_], Margins(), "simulation", "hardware")
+    default = Margins.parse()
+    assert conclude([good], default, "simulation", "hardware").outcome is Outcome.EQUIVALENT
+    undecided = conclude([good, open_], default, "simulation", "hardware")
     assert undecided.more_runs == open_.more_runs
     assert f"record {open_.more_runs} more run" in undecided.sentence
-    verdict = conclude([good, open_, bad], Margins(stated=False), "simulation", "hardware")
+    verdict = conclude([good, open_, bad], default, "simulation", "hardware")
     assert verdict.outcome is Outcome.DIFFERENT
     assert "not equivalent within the default margins (none were stated): spread is 3" in verdict.sentence
-    partly = conclude([good], Margins.parse(["position=0.01", "spread=1.5"]), "simulation", "hardware")
-    assert "within the stated margins and, for velocity, path, the default ones, in all" in partly.sentence
-    whole = Margins.parse({"position": 0.01, "velocity": 0.1, "spread": 1.5, "path": 0.5})
+    partly = conclude([good], Margins.parse(["delay=8ms", "band=10"]), "simulation", "hardware")
+    assert "within the stated margins and, for mean_angle, spread_angle" in partly.sentence
+    whole = Margins.parse({name: 1.0 for name in default.as_dict() if name != "stated"})
     assert "within the stated margins, in all" in conclude([good], whole, "simulation", "hardware").sentence
 
 
-@pytest.mark.parametrize(
-    ("stated", "expected"),
-    [
-        (None, Margins(stated=False)),
-        ([], Margins(stated=False)),
-        (0.02, Margins(position=0.02)),
-        (["0.02", "spread=1.5"], Margins(position=0.02, spread=1.5)),
-        ("velocity=0.1,path=0.3", Margins(velocity=0.1, path=0.3)),
-        ({"position": 0.1}, Margins(position=0.1)),
-    ],
-)
-def test_margins_are_read_as_users_write_them(stated: object, expected: Margins) -> None:
-    assert Margins.parse(stated) == expected  # type: ignore[arg-type]
+# -- margins -----------------------------------------------------------------------------------------------------
+
+
+def test_margins_are_read_as_users_write_them(tmp_path: Path) -> None:
+    texts = Margins.parse(["delay=8 ms", "spread_angle=0.2deg", "path_angle=20"])
+    assert texts.delay.si == pytest.approx(0.008)
+    assert (texts.spread_angle.unit, texts.spread_angle.si) == ("deg", pytest.approx(math.radians(0.2)))
+    assert str(texts.path_angle) == "20 %"
+    assert texts.stated == {"delay", "spread_angle", "path_angle"}
+    assert Margins.parse("delay=8ms,spread_angle=0.2 deg,path_angle=20%") == texts
+    assert (
+        Margins.parse({"delay": "8 ms", "spread_angle": {"value": 0.2, "unit": "deg"}, "path_angle": 20})
+        == texts
+    )
+    file = tmp_path / "mine.yaml"
+    file.write_text(
+        "format: pendulum_margins/1\nmargins:\n  delay: {value: 0.008, unit: s}\n"
+        "  spread_angle: {value: 0.2, unit: deg}\n  path_angle: {value: 30, unit: '%'}\n"
+    )
+    both = Margins.of(file, ["path_angle=20 %"])
+    assert both.delay.si == texts.delay.si
+    assert (both.path_angle, both.stated) == (texts.path_angle, texts.stated)
+
+
+def test_margins_come_back_from_a_summary() -> None:
+    stated = Margins.parse(["delay=8ms", "spread_torque=0.1 N m"])
+    again = Margins.from_dict(json.loads(json.dumps(stated.as_dict())))
+    assert (again, again.stated) == (stated, stated.stated)
+    assert not Margins.parse([]).stated
 
 
 @pytest.mark.parametrize(
     ("stated", "message"),
     [
-        (-0.1, "margin position is -0.1 rad; expected a finite number > 0"),
-        ({"spread": 0.9}, "margin spread is 0.9; expected a factor > 1"),
-        ({"angle": 0.9}, "margin has no 'angle'; expected one of position, velocity, spread, path"),
-        (["position=wide"], "margin is 'position=wide'; expected a number in rad, or NAME=NUMBER"),
-        ({"path": math.nan}, "margin path is nan; expected a finite number > 0"),
+        ({"delay": -1}, "margin delay is -1 ms; expected a finite number > 0"),
+        ({"angle": 0.9}, "margin has no 'angle'; expected one of mean_angle, spread_angle"),
+        (["delay=late"], "margin delay is 'late'; expected a number in ms, s"),
+        (["0.02"], "margin is '0.02'; expected NAME=VALUE, such as delay=8ms"),
+        ({"path_angle": math.nan}, "margin path_angle is nan %; expected a finite number > 0"),
+        ({"delay": {"value": 3, "unit": "deg"}}, "margin delay has unit 'deg'; expected one of ms, s"),
     ],
 )
 def test_margins_that_mean_nothing_are_refused(stated: object, message: str) -> None:

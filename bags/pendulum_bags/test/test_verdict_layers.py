@@ -26,7 +26,7 @@ def test_one_layer_that_says_no_makes_it_no_and_what_another_certifies_is_still_
             ),
             result(Layer.SAME_RUN, Mark.NO, reason="the hardware moves 31 % less"),
         ],
-        hardware="the emulated hardware",
+        emulated=True,
     )
     assert answer.mark is Mark.NO
     assert answer.sentence == (

@@ -9,23 +9,17 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeAlias
 
-from pendulum_bags.comparison.equivalence import Margins, Verdict, conclude
+from pendulum_bags.comparison.equivalence import Outcome, Verdict, conclude
+from pendulum_bags.comparison.independence import check_pairs
+from pendulum_bags.comparison.margins import MarginArgument, Margins
 from pendulum_bags.comparison.metrics import episode_of, summarise_metrics
-from pendulum_bags.comparison.pairs import (
-    SAME_DISTURBANCE,
-    Difference,
-    Pair,
-    distribution_tests,
-    interpolated_difference,
-    paired_tests,
-    unpaired_tests,
-)
-from pendulum_bags.runs.run_data import RunData, noise_hold_time, plant_summary, read_run
+from pendulum_bags.comparison.pairs import Difference, Pair, distribution_tests, interpolated_difference
+from pendulum_bags.comparison.same_run import Looks, paired_tests, unpaired_tests
+from pendulum_bags.runs.run_data import RunData, is_emulated, noise_hold_time, plant_summary, read_run
 from pendulum_msgs_py.errors import BagError, DataError
 
 __all__ = ["Comparison", "compare", "compare_folders", "compare_runs"]
 
-MarginArgument: TypeAlias = "Margins | Mapping[str, float] | Sequence[str] | float | None"
 PathArgument: TypeAlias = "str | os.PathLike[str]"
 
 
@@ -39,6 +33,7 @@ class Comparison:
         thesis: The thesis's difference for the first run.
         verdict: Verdict on the paired comparison, or on the unpaired one where the disturbances differ.
         unpaired_verdict: Verdict on the unpaired comparison.
+        looks: How often the data have been looked at.
     """
 
     pairs: Sequence[Pair]
@@ -46,6 +41,17 @@ class Comparison:
     thesis: Difference
     verdict: Verdict
     unpaired_verdict: Verdict
+    looks: Looks = Looks()  # noqa: RUF009 - frozen
+
+    @property
+    def is_emulated(self) -> bool:
+        """Whether an emulator stood in for the hardware, in all runs."""
+        return all(is_emulated(pair.hardware) for pair in self.pairs)
+
+    @property
+    def hardware_name(self) -> str:
+        """What the simulation was compared with, in words."""
+        return "emulated hardware" if self.is_emulated else "hardware"
 
     @property
     def is_paired(self) -> bool:
@@ -105,6 +111,8 @@ class Comparison:
             "versions": told.get("versions", {}),
             "git_revision": told.get("git_revision"),
             "runs": len(self.pairs),
+            "emulated": self.is_emulated,
+            "looks": self.looks.number,
             "plants": self.plants,
             "paired": self.paired,
             "unpaired": self.unpaired,
@@ -115,17 +123,15 @@ class Comparison:
         return result
 
     def _why_not_paired(self) -> str:
-        pair = next(pair for pair in self.pairs if not pair.is_paired)
-        if pair.clock is None:
-            return "no disturbance was recorded on both plants"
-        return (
-            f"the recorded disturbances differ: their correlation is {pair.clock.correlation:.2f} at best, "
-            f"expected above {SAME_DISTURBANCE}"
-        )
+        return next(pair.why_not_paired for pair in self.pairs if not pair.is_paired)
 
 
 def compare(
-    pairs: Sequence[tuple[RunData, RunData]], *, own: Sequence[RunData] = (), margin: MarginArgument = None
+    pairs: Sequence[tuple[RunData, RunData]],
+    *,
+    own: Sequence[RunData] = (),
+    margin: MarginArgument = None,
+    looks: Looks = Looks(),  # noqa: B008 - frozen
 ) -> Comparison:
     """Compare runs that are in memory.
 
@@ -133,19 +139,35 @@ def compare(
         pairs: (simulation, hardware) of each run, at least one.
         own: Simulations under the thesis's own protocol.
         margin: What difference does not matter; see :meth:`Margins.parse`.
+        looks: How often the data have been looked at, where more are recorded until they decide.
+
+    Raises:
+        DataError: There is nothing to compare, or runs are given that must not be pooled.
     """
     if not pairs:
         raise DataError("nothing to compare: 0 runs; expected at least 1 run with simulation and hardware")
+    check_pairs(pairs)
     margins = Margins.parse(margin)
     compared = [Pair.of(simulation, hardware) for simulation, hardware in pairs]
     simulations = list(own) or [pair.simulation for pair in compared]
     hardware_runs = [pair.hardware for pair in compared]
-    first, second = (_title(run) for run in (compared[0].simulation, compared[0].hardware))
-    unpaired = conclude(unpaired_tests(simulations, hardware_runs, margins), margins, first, second)
-    paired = all(pair.is_paired for pair in compared)
-    verdict = conclude(paired_tests(compared, margins), margins, first, second) if paired else unpaired
+    # Lockstep repeats of an emulator differ by their seeds alone; those of a machine may differ by anything.
+    differ = not all(is_emulated(run) for run in hardware_runs)
+    names = "simulation", "hardware" if differ else "emulated hardware"
+    ones, others = ([run.window for run in runs] for runs in (simulations, hardware_runs))
+    unpaired = conclude(
+        unpaired_tests(ones, others, margins, looks=looks, runs_differ=differ), margins, *names
+    )
+    verdict = unpaired
+    if all(pair.is_paired for pair in compared):
+        motions = [pair.motions for pair in compared]
+        tests = paired_tests(motions, margins, looks=looks, runs_differ=differ)
+        verdict = conclude(tests, margins, *names)
+    elif unlike := next((pair.unlike_noise for pair in compared if pair.unlike_noise), ""):
+        sentence = f"Undecided: {unlike}, so that the motions say nothing of the plants."
+        verdict = Verdict(Outcome.UNDECIDED, sentence, unpaired.tests, margins, None)
     thesis = interpolated_difference(simulations[0].window, compared[0].hardware.window)
-    return Comparison(compared, simulations, thesis, verdict, unpaired)
+    return Comparison(compared, simulations, thesis, verdict, unpaired, looks)
 
 
 def compare_runs(
@@ -197,10 +219,6 @@ def compare_folders(folders: Sequence[PathArgument], *, margin: MarginArgument =
         if (folder / "sim_500hz").is_dir():
             own.append(read_run(folder / "sim_500hz", label="simulation, own noise"))
     return compare(pairs, own=own, margin=margins)
-
-
-def _title(run: RunData) -> str:
-    return run.label
 
 
 def _pool(rows: Sequence[dict[str, Any]]) -> dict[str, Any]:

@@ -26,9 +26,12 @@ MarginOption = Annotated[
     list[str] | None,
     typer.Option(
         "--margin",
-        help="What difference does not matter: a number in rad for the mean angle, or position=, velocity=, "
-        "spread=, path=; may be given several times.",
+        help="What difference does not matter, in words of the task: mean_angle=0.3deg, spread_angle=20%, delay=8ms, "
+        "path_angle=0.2deg ...; may be given several times.",
     ),
+]
+MarginsFile = Annotated[
+    Path | None, typer.Option("--margins", help="File of margins, as bags/pendulum_bags/comparison/margins.yaml.")
 ]
 
 
@@ -36,6 +39,7 @@ MarginOption = Annotated[
 def compare(
     paths: Paths,
     margin: MarginOption = None,
+    margins_file: MarginsFile = None,
     out: Annotated[
         Path | None,
         typer.Option("--out", "-o", help="Folder for comparison.json and figures; none by default."),
@@ -50,11 +54,11 @@ def compare(
 ) -> None:
     """Compare simulation and hardware under noise: statistics of the difference, equivalence tests, a verdict.
 
-    Example: python -m pendulum_bags compare runs/today/sim runs/today/hw --margin position=0.005 --margin spread=1.2
+    Example: python -m pendulum_bags compare runs/today/sim runs/today/hw --margin delay=8ms --margin spread_angle=20%
     """
     from pendulum_bags.comparison import Margins, compare_folders, compare_runs
 
-    margins = Margins.parse(margin)
+    margins = Margins.of(margins_file, margin)
     if all((path / "sim").is_dir() and (path / "hw").is_dir() for path in paths):
         result = compare_folders(paths, margin=margins)
     elif len(paths) == 2:
@@ -94,6 +98,9 @@ def _write(out: Path, result: Comparison, content: dict[str, Any]) -> None:
 
 def _print(result: Comparison, content: dict[str, Any]) -> None:
     from pendulum_bags.runs.run_data import timing_warning
+    from pendulum_bags.verdict import sum_up
+    from pendulum_bags.verdict.same_run import same_run_layer
+    from pendulum_bags.verdict.terminal import print_answer
     from pendulum_msgs_py.programs.terminal import WholeTable, make_console
 
     console = make_console()
@@ -134,21 +141,7 @@ def _print(result: Comparison, content: dict[str, Any]) -> None:
         )
     else:
         console.print(f"Not paired: {content['paired']['reason']}.")
-    tests = WholeTable(title="Equivalence tests", title_justify="left")
-    for heading in ("quantity", "estimate", "90 % interval", "margin", "result", "add runs"):
-        tests.add_column(heading, justify="left" if heading in {"quantity", "result"} else "right")
-    for test in result.verdict.tests:
-        interval = test.interval
-        tests.add_row(
-            test.quantity + (f" \\[{test.unit}]" if test.unit != "-" else ""),
-            f"{interval.estimate:.3g}",
-            f"{interval.low:.3g} to {interval.high:.3g}",
-            test.margin_text().removeprefix("margin "),
-            test.outcome.value,
-            {None: "no use", 0: ""}.get(test.more_runs, str(test.more_runs)),
-        )
-    console.print(tests)
-    console.print(f"\n[bold]{result.verdict.sentence}[/bold]", highlight=False)
+    print_answer(console, sum_up([same_run_layer(result)], emulated=result.is_emulated), result.verdict)
 
 
 def _number(value: float | None, form: str) -> str:

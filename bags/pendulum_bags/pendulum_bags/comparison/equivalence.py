@@ -8,20 +8,18 @@ and anything else is undecided, with the number of runs that would probably deci
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 from enum import Enum
 from typing import Any
 
 from scipy import stats
 
+from pendulum_bags.comparison.margins import Margins
 from pendulum_bags.comparison.statistics import Interval
-from pendulum_msgs_py.errors import ParameterError
 
-__all__ = ["EquivalenceTest", "Margins", "Outcome", "Verdict", "conclude", "equivalence_test"]
+__all__ = ["EquivalenceTest", "Outcome", "Verdict", "conclude", "equivalence_test"]
 
-LEVEL = 0.9
-"""Two one-sided tests at 5 % each are one interval of 90 %."""
 POWER = 0.8
 """Probability with which the named number of runs would decide."""
 MOST_RUNS = 10_000
@@ -36,93 +34,13 @@ class Outcome(str, Enum):
 
 
 @dataclass(frozen=True)
-class Margins:
-    """How much difference does not matter.
-
-    Args:
-        position: Difference of the mean angles [rad].
-        velocity: Difference of the mean velocities [rad/s].
-        spread: Factor between standard deviations (of angle, velocity, torque), > 1; 1.25 is the range 0.80 to 1.25
-            of bioequivalence.
-        path: Root mean square distance of the two motions under one disturbance, per standard deviation of the
-            hardware's motion.
-        stated: Whether the user stated them; else they are the program's defaults, and the verdict says so.
-        defaults: Names of margins that a user who stated some of them left at their defaults.
-    """
-
-    position: float = 0.005
-    velocity: float = 0.05
-    spread: float = 1.25
-    path: float = 0.5
-    stated: bool = True
-    defaults: tuple[str, ...] = field(default=(), compare=False)
-
-    def __post_init__(self) -> None:
-        """Refuse what is no margin."""
-        for name, unit in (("position", "rad"), ("velocity", "rad/s"), ("path", "")):
-            value = getattr(self, name)
-            if not (math.isfinite(value) and value > 0.0):
-                raise ParameterError(
-                    f"margin {name} is {value} {unit}".rstrip() + "; expected a finite number > 0"
-                )
-        if not (math.isfinite(self.spread) and self.spread > 1.0):
-            raise ParameterError(f"margin spread is {self.spread}; expected a factor > 1, such as 1.25")
-
-    @classmethod
-    def parse(cls, margin: Margins | Mapping[str, float] | Sequence[str] | float | None) -> Margins:
-        """Return margins from what a user states.
-
-        Args:
-            margin: None for the defaults, a number for the angle [rad], a mapping of names to values, texts such as
-                ``position=0.005``, or margins.
-
-        Raises:
-            ParameterError: An unknown name or a value out of domain.
-        """
-        if margin is None or (not isinstance(margin, (int, float, Margins)) and len(margin) == 0):
-            return cls(stated=False)
-        if isinstance(margin, Margins):
-            return margin
-        if isinstance(margin, (int, float)):
-            margin = {"position": float(margin)}
-        if isinstance(margin, str):
-            margin = margin.split(",")
-        values = dict(margin) if isinstance(margin, Mapping) else dict(_parse_text(text) for text in margin)
-        known = ["position", "velocity", "spread", "path"]
-        for name in values:
-            if name not in known:
-                raise ParameterError(f"margin has no {name!r}; expected one of {', '.join(known)}")
-        numbers: dict[str, Any] = {name: float(value) for name, value in values.items()}
-        return cls(**numbers, defaults=tuple(name for name in known if name not in numbers))
-
-    @property
-    def whose(self) -> str:
-        """Whose margins these are, in words."""
-        if not self.stated:
-            return "the default margins (none were stated)"
-        if not self.defaults:
-            return "the stated margins"
-        return f"the stated margins and, for {', '.join(self.defaults)}, the default ones"
-
-
-def _parse_text(text: str) -> tuple[str, float]:
-    name, sign, value = text.partition("=")
-    if not sign:
-        name, value = "position", text
-    try:
-        return name.strip(), float(value)
-    except ValueError as error:
-        raise ParameterError(f"margin is {text!r}; expected a number in rad, or NAME=NUMBER") from error
-
-
-@dataclass(frozen=True)
 class EquivalenceTest:
     """One quantity against its margin.
 
     Args:
         quantity: What was tested, in words.
         unit: Unit of the figures.
-        interval: Estimate with its 90 % interval.
+        interval: Estimate with its interval; one of 90 % is two one-sided tests at 5 % each.
         low: Lower margin; minus infinity for a one-sided test.
         high: Upper margin.
         outcome: What it shows.
@@ -165,7 +83,7 @@ class EquivalenceTest:
         """Return the result in words."""
         unit = f" {self.unit}" if self.unit not in {"", "-"} else ""
         text = (
-            f"{self.quantity}: {self.interval.estimate:.3g}{unit}, 90 % interval {self.interval.low:.3g} to "
+            f"{self.quantity}: {self.interval.estimate:.3g}{unit}, {self.interval.title} {self.interval.low:.3g} to "
             f"{self.interval.high:.3g}{unit}, {self.margin_text()}{unit}: {self.outcome.value}"
         )
         if self.outcome is Outcome.UNDECIDED:
@@ -194,7 +112,7 @@ def equivalence_test(
     Args:
         quantity: Name in words.
         unit: Unit.
-        interval: Estimate and 90 % interval.
+        interval: Estimate and interval.
         low: Lower margin; minus infinity for one-sided.
         high: Upper margin.
         runs: Runs that the interval rests on.
@@ -214,7 +132,8 @@ def equivalence_test(
     more: int | None = 0
     if outcome is Outcome.UNDECIDED:
         error = max(right - left, 0.0) / (2.0 * float(stats.norm.ppf(0.5 + 0.5 * interval.level)))
-        more = _runs_to_decide(estimate, bottom, top, error, runs)
+        reach = float(stats.norm.ppf(0.5 + 0.5 * interval.level))
+        more = _runs_to_decide(estimate, bottom, top, error, runs, reach)
     return EquivalenceTest(quantity, unit, interval, low, high, outcome, more, smallest)
 
 
@@ -226,22 +145,32 @@ def _logarithm(value: float) -> float:
     return math.log(value) if value > 0.0 else -math.inf
 
 
-def _runs_to_decide(estimate: float, bottom: float, top: float, error: float, runs: int) -> int | None:
+def _runs_to_decide(
+    estimate: float, bottom: float, top: float, error: float, runs: int, reach: float
+) -> int | None:
     """Return how many more runs would decide with the stated power, if the estimate were the truth.
 
     The error falls with the square root of the number of runs.
     """
-    if not (math.isfinite(error) and math.isfinite(estimate)) or _power(estimate, bottom, top, 0.0) < POWER:
+    if (
+        not (math.isfinite(error) and math.isfinite(estimate))
+        or _power(estimate, bottom, top, 0.0, reach) < POWER
+    ):
         return None
     enough = next(
-        (n for n in _doubled(runs) if _power(estimate, bottom, top, error * math.sqrt(runs / n)) >= POWER), 0
+        (
+            n
+            for n in _doubled(runs)
+            if _power(estimate, bottom, top, error * math.sqrt(runs / n), reach) >= POWER
+        ),
+        0,
     )
     if not enough:
         return None
     few = runs
     while enough - few > 1:
         middle = (few + enough) // 2
-        if _power(estimate, bottom, top, error * math.sqrt(runs / middle)) >= POWER:
+        if _power(estimate, bottom, top, error * math.sqrt(runs / middle), reach) >= POWER:
             enough = middle
         else:
             few = middle
@@ -255,12 +184,11 @@ def _doubled(runs: int) -> Iterator[int]:
         more *= 2
 
 
-def _power(estimate: float, bottom: float, top: float, error: float) -> float:
+def _power(estimate: float, bottom: float, top: float, error: float, reach: float) -> float:
     """Return the probability that an interval with some standard error lies on one side of each margin."""
     inside, below, above = (estimate - bottom, top - estimate), bottom - estimate, estimate - top
     if error <= 0.0:
         return float(min(inside) > 0.0 or below > 0.0 or above > 0.0)
-    reach = float(stats.norm.ppf(0.5 + 0.5 * LEVEL))
     equivalent = sum(float(stats.norm.cdf(distance / error - reach)) for distance in inside) - 1.0
     different = sum(float(stats.norm.cdf(distance / error - reach)) for distance in (below, above))
     return max(equivalent, 0.0) + different
@@ -290,7 +218,7 @@ class Verdict:
             "outcome": self.outcome.value,
             "sentence": self.sentence,
             "more_runs": self.more_runs,
-            "margins": asdict(self.margins),
+            "margins": self.margins.as_dict(),
             "tests": [test.as_dict() for test in self.tests],
         }
 
@@ -332,5 +260,5 @@ def _short(test: EquivalenceTest) -> str:
     unit = f" {test.unit}" if test.unit not in {"", "-"} else ""
     return (
         f"{test.quantity} is {test.interval.estimate:.3g}{unit} "
-        f"(90 % interval {test.interval.low:.3g} to {test.interval.high:.3g}; {test.margin_text()})"
+        f"({test.interval.title} {test.interval.low:.3g} to {test.interval.high:.3g}; {test.margin_text()})"
     )

@@ -15,6 +15,8 @@ __all__ = ["METRICS", "Episode", "Metric", "episode_of", "metrics_of", "summaris
 
 BAND = 0.02
 """Share of the step that still counts as settled."""
+CHANGE_TIME = 0.02
+"""Time over which changes of the torque are counted: two periods of the slowest plant [s]."""
 
 
 @dataclass(frozen=True)
@@ -125,8 +127,20 @@ def _absolute_work(episode: Episode) -> float:
 
 
 def _smoothness(episode: Episode) -> float:
-    """Root mean square rate of change of the torque; small is smooth."""
-    return float(np.sqrt(np.mean((np.diff(episode.effort) / np.diff(episode.t)) ** 2)))
+    """Root mean square change of the torque within ``CHANGE_TIME``, per that time; small is smooth.
+
+    A fixed time, not a sample: the change from sample to sample grows with the rate at which a plant is sampled. NaN
+    where the samples are further apart.
+    """
+    t = episode.t
+    if float(np.median(np.diff(t))) > CHANGE_TIME * (1.0 + 1e-6):
+        return float("nan")
+    first = t[t <= t[-1] - CHANGE_TIME + 1e-9]
+    if not first.size:
+        return float("nan")
+    # Half a microsecond later: rounding of stamps must not pick the sample before.
+    index = np.searchsorted(t, first + CHANGE_TIME + 5e-7, side="right") - 1
+    return float(np.sqrt(np.mean((episode.effort[index] - episode.effort[: first.size]) ** 2))) / CHANGE_TIME
 
 
 class Metric(NamedTuple):
@@ -153,7 +167,12 @@ METRICS: tuple[Metric, ...] = (
     Metric("effort_energy", "N^2 m^2 s", "integral of squared torque", _effort_energy),
     Metric("work", "J", "mechanical work of the torque", _work),
     Metric("absolute_work", "J", "integral of absolute mechanical power", _absolute_work),
-    Metric("smoothness", "N m/s", "root mean square rate of change of the torque", _smoothness),
+    Metric(
+        "smoothness",
+        "N m/s",
+        "root mean square change of the torque within 20 ms, per that time",
+        _smoothness,
+    ),
 )
 
 

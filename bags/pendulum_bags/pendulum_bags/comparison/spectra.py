@@ -42,7 +42,8 @@ class Spectra:
 def spectra_of(first: Series, second: Series, segment: float = 1.0) -> Spectra:
     """Compare the velocities of two motions in frequency.
 
-    Both are brought to the slower one's rate, so that neither is credited with what the other cannot see.
+    Each density is estimated at (a multiple of) the rate of its own motion, and told up to half the slower rate. The
+    coherence needs common samples: the faster motion is brought to the slower rate behind an anti-alias filter.
 
     Args:
         first: Motion.
@@ -52,15 +53,24 @@ def spectra_of(first: Series, second: Series, segment: float = 1.0) -> Spectra:
     start, stop = shared_span(first, second)
     period = max(first.period, second.period)
     times = uniform_times(start, stop, period)
-    a, b = (one.interpolated(times).velocity for one in (first, second))
     size = int(min(round(segment / period), 2 * times.size // 5))
     size = max(size, 8)
     rate = 1.0 / period
-    frequency, density_a = signal.welch(a, rate, nperseg=size)
-    _, density_b = signal.welch(b, rate, nperseg=size)
-    _, coherence = signal.coherence(a, b, rate, nperseg=size)
+    densities, slow = [], []
+    for one in (first, second):
+        # A whole number of samples for one of the slower motion: the segments are of one length then.
+        factor = max(1, round(period / one.period))
+        fine = uniform_times(start, stop, period / factor)
+        velocity = one.interpolated(fine).velocity
+        frequency, density = signal.welch(velocity, factor * rate, nperseg=factor * size)
+        densities.append(density[: size // 2 + 1])
+        reduced = signal.resample_poly(velocity - velocity.mean(), 1, factor) if factor > 1 else velocity
+        slow.append(reduced[: times.size])
+    frequency = frequency[: size // 2 + 1]
+    count = min(one.size for one in slow)
+    _, coherence = signal.coherence(slow[0][:count], slow[1][:count], rate, nperseg=size)
     count = (times.size - size) // (size - size // 2) + 1
     # Half-overlapping Hann windows share 1/6 of their power: Welch 1967, Bendat and Piersol section 11.5.
     effective = count / (1.0 + 2.0 * (1.0 / 6.0) ** 2 * (count - 1) / count) if count > 1 else 1.0
     threshold = 1.0 - 0.05 ** (1.0 / max(effective - 1.0, 0.1))
-    return Spectra(frequency, density_a, density_b, np.clip(coherence, 0.0, 1.0), threshold, effective)
+    return Spectra(frequency, densities[0], densities[1], np.clip(coherence, 0.0, 1.0), threshold, effective)

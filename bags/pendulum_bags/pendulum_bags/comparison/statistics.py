@@ -35,6 +35,8 @@ __all__ = [
 RESAMPLES = 2000
 """Bootstrap resamples: the Monte Carlo error of a 5 % quantile is then below half a percent of probability."""
 
+FAR_TAIL = 0.05
+"""Probability beyond an end of an interval down to which it is counted from the resamples."""
 LONGER = 2.0
 """Factor on the block length of the rule; with it, 90 % intervals from some seven effective samples cover 84 %."""
 LEAST_BLOCKS = 5
@@ -121,7 +123,12 @@ def block_length(values: ArrayLike) -> int:
 
 
 def bootstrap_means(
-    runs: Sequence[Array], lengths: Sequence[int], *, resamples: int = RESAMPLES, seed: int = 0
+    runs: Sequence[Array],
+    lengths: Sequence[int],
+    *,
+    resamples: int = RESAMPLES,
+    seed: int = 0,
+    runs_differ: bool = True,
 ) -> tuple[Array, Array]:
     """Resample runs, and blocks within each run, and return the mean of every column.
 
@@ -133,6 +140,7 @@ def bootstrap_means(
         lengths: Block length of each run, in samples.
         resamples: Number of resamples, B.
         seed: Seed of the resampling; the same data give the same interval.
+        runs_differ: Whether runs may differ by more than their seeds; else only blocks are drawn.
 
     Returns:
         Means of the columns over all samples of each resample, shape (B, m); and the same with each run drawn once,
@@ -145,7 +153,7 @@ def bootstrap_means(
         sums[k] = _circular_block_sums(samples, length, resamples, rng)
     sizes = np.array([len(samples) for samples in runs], dtype=float)
     within = np.asarray(sums.sum(axis=0) / sizes.sum())
-    if len(runs) == 1:
+    if len(runs) == 1 or not runs_differ:
         return within, within
     chosen = rng.integers(len(runs), size=(len(runs), resamples))
     # A run that is drawn twice is resampled twice: take its blocks from another resample.
@@ -187,6 +195,11 @@ class Interval(NamedTuple):
     error: float
     blocks: int
 
+    @property
+    def title(self) -> str:
+        """What it is, in words."""
+        return f"{100.0 * self.level:.4g} % interval"
+
     def as_dict(self) -> dict[str, float]:
         """Return the attributes for JSON."""
         return dict(self._asdict())
@@ -201,7 +214,7 @@ class Resampled:
         draws: The same of each resample, shape (B, m).
         within: The same of each resample with every run drawn once, shape (B, m).
         blocks: Independent pieces.
-        runs: Recordings.
+        runs: Recordings that may differ from one another by more than chance; 1 where they differ by their seeds alone.
     """
 
     means: Array
@@ -211,11 +224,20 @@ class Resampled:
     runs: int = 1
 
 
-def resample(runs: Sequence[Array], *, resamples: int = RESAMPLES, seed: int = 0) -> Resampled:
+def resample(
+    runs: Sequence[Array], *, resamples: int = RESAMPLES, seed: int = 0, runs_differ: bool = True
+) -> Resampled:
     """Return the means of all columns over all runs, and the same of every resample.
 
     The block is ``LONGER`` times the longest that any column of a run asks for: the rule balances bias and variance
     of the interval's width, but an interval that is too narrow deceives, and one that varies does not.
+
+    Args:
+        runs: Samples of each run, shape (n_i, m).
+        resamples: Number of resamples, B.
+        seed: Seed of the resampling.
+        runs_differ: Whether runs may differ by more than their seeds, as those of a real machine do; lockstep repeats
+            of an emulator do not, and their blocks are all alike.
     """
     lengths = [
         min(
@@ -228,8 +250,8 @@ def resample(runs: Sequence[Array], *, resamples: int = RESAMPLES, seed: int = 0
     pooled = np.concatenate(runs).mean(axis=0)
     # Sums of large equal numbers would lose what differs between resamples.
     centred = [samples - pooled for samples in runs]
-    draws, within = bootstrap_means(centred, lengths, resamples=resamples, seed=seed)
-    return Resampled(pooled, pooled + draws, pooled + within, blocks, len(runs))
+    draws, within = bootstrap_means(centred, lengths, resamples=resamples, seed=seed, runs_differ=runs_differ)
+    return Resampled(pooled, pooled + draws, pooled + within, blocks, len(runs) if runs_differ else 1)
 
 
 def bootstrap_interval(
@@ -246,23 +268,26 @@ def bootstrap_interval(
     Args:
         resampled: From :func:`resample`.
         statistic: Maps means, shape (..., m), to values, shape (...).
-        level: Probability of the interval, in (0, 1).
+        level: Probability of the interval, in (0, 1). Ends far out are those of 90 % moved by Student's t, since the
+            resamples hold too few values there.
     """
     estimate = float(statistic(resampled.means))
     draws = np.asarray(statistic(resampled.draws), dtype=float)
     tail = 0.5 * (1.0 - level)
-    low, high = np.quantile(draws, (tail, 1.0 - tail))
+    seen = max(tail, FAR_TAIL)
+    low, high = np.quantile(draws, (seen, 1.0 - seen))
     variance, freedom = _variance_of(resampled, statistic, float(draws.var(ddof=1)))
     spread = max(float(draws.std(ddof=1)), 1e-300)
     stretch = (
-        float(stats.t.ppf(1.0 - tail, freedom) / stats.norm.ppf(1.0 - tail)) * math.sqrt(variance) / spread
+        float(stats.t.ppf(1.0 - tail, freedom) / stats.norm.ppf(1.0 - seen)) * math.sqrt(variance) / spread
     )
+    error = math.sqrt(variance)
     return Interval(
         estimate,
         estimate + stretch * min(float(low) - estimate, 0.0),
         estimate + stretch * max(float(high) - estimate, 0.0),
         level,
-        stretch * float(draws.std(ddof=1)),
+        error,
         resampled.blocks,
     )
 

@@ -42,7 +42,7 @@ def equivalence(data: ReportData) -> Figure:
     closest = max(tests, key=lambda test: abs(_relative(test)[0]))
     sentence = (
         f"{verdict.sentence} The quantity nearest to (or farthest beyond) its margin is the {closest.quantity}: "
-        f"{quantity(closest.interval.estimate, closest.unit.replace('-', ''))}, 90 % interval "
+        f"{quantity(closest.interval.estimate, closest.unit.replace('-', ''))}, {closest.interval.title} "
         f"{quantity(closest.interval.low)} to {quantity(closest.interval.high)}, resting on "
         f"{closest.interval.blocks} independent blocks."
     )

@@ -30,7 +30,10 @@ def report(
     ] = None,
     margin: Annotated[
         list[str] | None,
-        typer.Option("--margin", help="As for compare: NAME=NUMBER, several times if wanted."),
+        typer.Option("--margin", help="As for compare: NAME=VALUE, several times if wanted."),
+    ] = None,
+    margins_file: Annotated[
+        Path | None, typer.Option("--margins", help="File of margins, as for compare.")
     ] = None,
     recording: Annotated[
         list[Path] | None,
@@ -52,10 +55,10 @@ def report(
         raise BagError(
             f"{trials[0]} holds trials and no run; expected a run folder beside it (identify --page shows trials alone)"
         )
-    margins = Margins.parse(margin)
+    margins = Margins.of(margins_file, margin)
     summary = None
     if all((folder / "sim").exists() and (folder / "hw").exists() for folder in folders):
-        if not margin and len(folders) == 1:
+        if not margins.stated and len(folders) == 1:
             summary = _summary(folders[0])
         result = compare_folders(folders, margin=margins)
         target = out or (folders[0] if len(folders) == 1 else _common(folders))

@@ -119,21 +119,25 @@ def _tests(data: ReportData) -> Table:
     head = (
         "quantity",
         "estimate",
-        "90 % interval",
+        data.comparison.verdict.tests[0].interval.title,
         "margin",
         "result",
         "smallest margin that would hold",
         "runs to add",
     )
-    margins = data.comparison.verdict.margins
-    whose = "were stated" if margins.stated else "are defaults"
-    if margins.stated and margins.defaults:
-        whose += f", but for {', '.join(margins.defaults)}, which are defaults"
+    verdict = data.comparison.verdict
     sentence = (
-        "Two one-sided tests at 5 % each, intervals by block bootstrap. Ratios are hardware per simulation; the path "
-        "distance is the rms distance per standard deviation of the hardware's angle. "
-        f"The margins {whose}."
+        "Two one-sided tests each, intervals by block bootstrap. Ratios are hardware per simulation; "
+        "distances are root mean "
+        f"squares, per standard deviation of the hardware's motion where they are in %. Held against "
+        f"{verdict.margins.whose}."
     )
+    if data.comparison.looks.number:
+        sentence += (
+            f" The data were looked at {data.comparison.looks.number} times while more were recorded; the "
+            "intervals are wider "
+            "for that, so that the answer errs no more often than one look would."
+        )
     return Table("Tests against the margins", sentence, head, rows, "Verdict")
 
 

@@ -18,7 +18,7 @@ from pendulum_msgs_py.errors import BagError, PendulumError
 
 if TYPE_CHECKING:
     from pendulum_bags.comparison import Comparison
-    from pendulum_bags.comparison.compare import MarginArgument
+    from pendulum_bags.comparison.margins import MarginArgument
     from pendulum_bags.replay.input_replay import InputReplay
 
 __all__ = ["find_real_recording", "write_report"]
@@ -124,9 +124,10 @@ def _replay(path: Path, *, required: bool) -> list[InputReplay]:
 
 def _margin_of(summary: Mapping[str, Any] | None) -> MarginArgument:
     """Return the margins that a summary was made with, so that page and summary agree."""
+    from pendulum_bags.comparison import Margins
+
     verdict = (summary or {}).get("verdict")
     margins = verdict.get("margins") if isinstance(verdict, Mapping) else None
     if not isinstance(margins, Mapping) or not margins.get("stated"):
         return None
-    left_out = {"stated", "defaults", *margins.get("defaults", ())}
-    return {name: value for name, value in margins.items() if name not in left_out}
+    return Margins.from_dict(margins)

@@ -22,6 +22,7 @@ __all__ = [
     "START_EVENT",
     "RunData",
     "find_prefix",
+    "is_emulated",
     "missed_periods",
     "plant_summary",
     "read_run",
@@ -199,6 +200,12 @@ def plant_summary(run: RunData) -> dict[str, Any]:
         "noise_hold_time": noise_hold_time(run),
         "damage": list(run.damage),
     }
+
+
+def is_emulated(run: RunData) -> bool:
+    """Return whether the run says that an emulator stood in for the hardware."""
+    told = run.metadata.get("pendulum.run")
+    return isinstance(told, Mapping) and told.get("plant") == "emulator"
 
 
 def noise_hold_time(run: RunData) -> float | None:

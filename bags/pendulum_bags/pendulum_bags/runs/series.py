@@ -8,7 +8,6 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.interpolate import CubicSpline
 
-from pendulum_msgs_py.contract.angles import UPRIGHT
 from pendulum_msgs_py.errors import DataError
 
 __all__ = ["Array", "Series", "Signal", "shared_span", "uniform_times", "unwrap_near_upright"]
@@ -178,7 +177,10 @@ def uniform_times(start: float, stop: float, period: float) -> Array:
 
 
 def unwrap_near_upright(position: ArrayLike) -> Array:
-    """Return continuous angles, moved by whole turns so that their median lies within a half turn of upright [rad]."""
+    """Return continuous angles, moved by whole turns so that their median lies in [-pi/2, 3 pi/2) [rad].
+
+    Both places of rest, 0 hanging and pi upright, are far inside: two pendulums that hang are not a turn apart.
+    """
     angles = np.unwrap(np.asarray(position, dtype=float))
     turn = 2.0 * np.pi
-    return angles - turn * np.round((np.median(angles) - UPRIGHT) / turn)
+    return angles - turn * np.floor((np.median(angles) + 0.25 * turn) / turn)

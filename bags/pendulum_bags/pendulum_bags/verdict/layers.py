@@ -8,8 +8,9 @@ from __future__ import annotations
 
 import json
 import math
+import re
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import Enum
 from pathlib import Path
 from typing import Any
@@ -22,6 +23,7 @@ __all__ = [
     "Layer",
     "LayerResult",
     "Mark",
+    "name_hardware",
     "not_measured",
     "read_layers",
     "sum_up",
@@ -224,7 +226,7 @@ HOW = {
 """The command that measures each layer."""
 
 
-def sum_up(results: Iterable[LayerResult], *, hardware: str = "hardware") -> Answer:
+def sum_up(results: Iterable[LayerResult], *, emulated: bool = False) -> Answer:
     """Return one answer from the layers that were measured.
 
     One layer that says no makes it no: each asks something that designing needs. It is yes where at least one layer was
@@ -233,7 +235,7 @@ def sum_up(results: Iterable[LayerResult], *, hardware: str = "hardware") -> Ans
 
     Args:
         results: At most one for each layer; the others count as not measured.
-        hardware: What the simulation was compared with, in words, such as ``the emulated hardware``.
+        emulated: Whether an emulator stood in for the hardware; the words then say so.
 
     Raises:
         DataError: A layer was given twice.
@@ -242,7 +244,7 @@ def sum_up(results: Iterable[LayerResult], *, hardware: str = "hardware") -> Ans
     for result in results:
         if result.layer in given:
             raise DataError(f"layer {result.layer.title!r} was given twice; expected each once")
-        given[result.layer] = result
+        given[result.layer] = _named(result, emulated=emulated)
     layers = tuple(given.get(layer) or not_measured(layer, HOW[layer]) for layer in Layer)
     by_mark = {mark: [result for result in layers if result.mark is mark] for mark in Mark}
     measured = [result for result in layers if result.mark is not Mark.NOT_MEASURED]
@@ -264,7 +266,30 @@ def sum_up(results: Iterable[LayerResult], *, hardware: str = "hardware") -> Ans
     # What mends a no comes before what decides, and that before what was left out.
     order = (*by_mark[Mark.NO], *by_mark[Mark.UNDECIDED], *by_mark[Mark.YES], *by_mark[Mark.NOT_MEASURED])
     steps = tuple(dict.fromkeys(step for result in order for step in result.next_steps))
-    return Answer(mark, text.replace("the hardware", hardware), layers, steps)
+    return Answer(mark, text, layers, steps)
+
+
+_HARDWARE = re.compile(r"(?<![-/\w])(?<!emulated )(H|h)ardware\b(?!/)")
+
+
+def name_hardware(text: str, *, emulated: bool) -> str:
+    """Return a text that says ``emulated hardware`` for hardware where an emulator stood in for it."""
+    if not emulated:
+        return text
+    return _HARDWARE.sub(lambda found: "Emulated hardware" if found[1] == "H" else "emulated hardware", text)
+
+
+def _named(result: LayerResult, *, emulated: bool) -> LayerResult:
+    def name(text: str) -> str:
+        return name_hardware(text, emulated=emulated)
+
+    return replace(
+        result,
+        sentence=name(result.sentence),
+        next_steps=tuple(map(name, result.next_steps)),
+        reason=name(result.reason),
+        holds=name(result.holds),
+    )
 
 
 def write_layer(folder: Path, result: LayerResult) -> Path:

@@ -1,0 +1,143 @@
+"""Which runs may be pooled: independent recordings of one and the same experiment, and of nothing else."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from pendulum_bags.runs.run_data import RunData
+from pendulum_msgs_py.errors import DataError
+
+__all__ = ["check_pairs"]
+
+_MUST_AGREE: tuple[tuple[str, str], ...] = (
+    ("controller", "controllers"),
+    ("strategy", "effort strategies"),
+    ("set_point", "set-points"),
+    ("plant", "plants"),
+    ("emulated_plant", "emulated plants"),
+    ("design_plant", "plants of the design"),
+)
+_OF_THE_NOISE = ("kind", "amplitude", "hold_time")
+
+
+def check_pairs(pairs: Sequence[tuple[RunData, RunData]]) -> None:
+    """Refuse pairs of simulation and hardware that must not be compared, or not be pooled.
+
+    Raises:
+        DataError: Simulation and hardware are swapped or had different controllers; one recording, or one seed, is
+            given twice; or runs differ in their controller, disturbance or plant.
+    """
+    for simulation, hardware in pairs:
+        _check_sides(simulation, hardware)
+    if len(pairs) < 2:
+        return
+    for side in (0, 1):
+        runs = [pair[side] for pair in pairs]
+        for i, run in enumerate(runs):
+            for other in runs[:i]:
+                _check_two(other, run)
+    _check_seeds([pair[1] for pair in pairs])
+
+
+def _told(run: RunData) -> Mapping[str, Any]:
+    told = run.metadata.get("pendulum.run")
+    return told if isinstance(told, Mapping) else {}
+
+
+def _check_sides(simulation: RunData, hardware: RunData) -> None:
+    first, second = _told(simulation), _told(hardware)
+    if first.get("namespace") == "/hw" and second.get("namespace") == "/sim":
+        raise DataError(
+            f"{simulation.source} is a recording of hardware and {hardware.source} one of the simulation; "
+            "expected the simulation first"
+        )
+    # A bag may hold both plants, so it is the motion that tells.
+    if (
+        np.array_equal(simulation.window.position, hardware.window.position)
+        and np.ptp(hardware.window.position) > 0.0
+    ):
+        raise DataError(
+            f"{simulation.source} and {hardware.source} hold one and the same recording; expected one of each plant"
+        )
+    ones, others = first.get("controller"), second.get("controller")
+    if ones is not None and others is not None and _plain(ones) != _plain(others):
+        raise DataError(
+            f"simulation and hardware had different controllers ({_text(ones)} in {simulation.source}, "
+            f"{_text(others)} in "
+            f"{hardware.source}); expected one"
+        )
+
+
+def _check_two(one: RunData, other: RunData) -> None:
+    """Refuse two runs of one side that are the same recording, or not of the same kind."""
+    same_place = bool(one.source) and Path(one.source).resolve() == Path(other.source).resolve()
+    a, b = one.window, other.window
+    if same_place or (
+        a.t.size == b.t.size and np.array_equal(a.position, b.position) and np.ptp(a.position) > 0.0
+    ):
+        raise DataError(
+            f"{one.source} and {other.source} hold one and the same recording; expected independent runs to pool"
+        )
+    first, second = _told(one), _told(other)
+    for key, words in _MUST_AGREE:
+        if key in first and key in second and _plain(first[key]) != _plain(second[key]):
+            _refuse(words, first[key], second[key], one, other)
+    noises = [told.get("disturbance") for told in (first, second)]
+    if all(isinstance(noise, Mapping) for noise in noises):
+        for key in _OF_THE_NOISE:
+            before, after = (noise.get(key) if noise else None for noise in noises)
+            if before is not None and after is not None and _plain(before) != _plain(after):
+                _refuse(f"disturbances, in {key.replace('_', ' ')}", before, after, one, other)
+
+
+def _refuse(words: str, first: Any, second: Any, one: RunData, other: RunData) -> None:
+    raise DataError(
+        f"runs with different {words} cannot be pooled: {_text(first)} in {one.source}, {_text(second)} in "
+        f"{other.source}; "
+        "compare them one at a time"
+    )
+
+
+def _check_seeds(runs: Sequence[RunData]) -> None:
+    seen: dict[str, RunData] = {}
+    for run in runs:
+        told = _told(run)
+        seed = told.get("seed")
+        if seed is None:
+            continue
+        # One seed is one signal, whatever its length.
+        if str(seed) in seen:
+            raise DataError(
+                f"{seen[str(seed)].source} and {run.source} have one seed ({seed}), so one and the "
+                "same noise; expected "
+                "independent runs to pool, such as one recorded with another --seed"
+            )
+        seen[str(seed)] = run
+
+
+def _plain(value: Any) -> str:
+    """Return what values have in common that JSON, YAML and Python write differently."""
+    return json.dumps(_numbers(value), sort_keys=True)
+
+
+def _numbers(value: Any) -> Any:
+    if isinstance(value, bool):
+        return value
+    if isinstance(value, (int, float)):
+        return float(value)
+    if isinstance(value, Mapping):
+        return {key: _numbers(item) for key, item in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [_numbers(item) for item in value]
+    return value
+
+
+def _text(value: Any) -> str:
+    if isinstance(value, Mapping):
+        return ", ".join(f"{key} {item}" for key, item in value.items()).replace("kind ", "")
+    return str(value)

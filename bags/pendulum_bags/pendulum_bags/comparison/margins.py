@@ -1,0 +1,213 @@
+"""What difference does not matter: stated by the user in words of the task, in one file."""
+
+from __future__ import annotations
+
+import math
+import os
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, fields, replace
+from functools import lru_cache
+from importlib import resources
+from pathlib import Path
+from typing import Any, TypeAlias
+
+from pendulum_msgs_py.errors import ParameterError
+from pendulum_msgs_py.parameters import load_yaml, reject_unknown, require_mapping
+
+__all__ = ["Margin", "MarginArgument", "Margins"]
+
+FORMAT = "pendulum_margins/1"
+SHARE = "%"
+_FACTORS = {"deg": math.pi / 180.0, "rad": 1.0, "deg/s": math.pi / 180.0, "rad/s": 1.0, "ms": 1e-3, "s": 1.0}
+"""From what a user may write to SI."""
+_UNITS: Mapping[str, tuple[str, ...]] = {
+    "mean_angle": ("deg", "rad"),
+    "spread_angle": (SHARE, "deg", "rad"),
+    "spread_velocity": (SHARE, "deg/s", "rad/s"),
+    "spread_torque": (SHARE, "N m"),
+    "delay": ("ms", "s"),
+    "path_angle": (SHARE, "deg", "rad"),
+    "path_velocity": (SHARE, "deg/s", "rad/s"),
+    "band": ("Hz",),
+}
+"""Units of each entry; the first is the one of a number that comes without."""
+
+
+@dataclass(frozen=True)
+class Margin:
+    """One margin.
+
+    Args:
+        value: As stated, > 0.
+        unit: Its unit; ``%`` for a share of the hardware's own spread.
+    """
+
+    value: float
+    unit: str
+
+    @property
+    def is_share(self) -> bool:
+        """Whether it is a share of the hardware's spread."""
+        return self.unit == SHARE
+
+    @property
+    def si(self) -> float:
+        """Value in SI units; 0.15 for 15 %."""
+        return self.value * (0.01 if self.is_share else _FACTORS.get(self.unit, 1.0))
+
+    def __str__(self) -> str:
+        """Return it as a user would write it."""
+        return f"{self.value:g} {self.unit}"
+
+
+@dataclass(frozen=True)
+class Margins:
+    """How much difference does not matter; a margin that is not given is that of ``margins.yaml`` of the package.
+
+    Args:
+        mean_angle: Difference of the mean angles.
+        spread_angle, spread_velocity, spread_torque: Difference of the standard deviations: in a unit, or as a share,
+            which allows factors from 1 / (1 + share) to 1 + share.
+        delay: By which one plant answers the disturbance later than the other.
+        path_angle, path_velocity: Root mean square distance of the motions under one disturbance.
+        band: Frequency up to which velocities, torques and paths are compared.
+        stated: Names of the margins that the user stated; the others are defaults, and the verdict says so.
+    """
+
+    mean_angle: Margin
+    spread_angle: Margin
+    spread_velocity: Margin
+    spread_torque: Margin
+    delay: Margin
+    path_angle: Margin
+    path_velocity: Margin
+    band: Margin
+    stated: frozenset[str] = field(default=frozenset(), compare=False)
+
+    @classmethod
+    def parse(cls, margin: MarginArgument = None) -> Margins:
+        """Return margins from what a user states.
+
+        Args:
+            margin: None for the defaults, the path of a margins file, a mapping of names to values, texts such as
+                ``mean_angle=0.3``, ``delay=8 ms`` or ``spread_angle=0.2 deg``, or margins.
+
+        Raises:
+            ParameterError: An unknown name, a unit of something else, or a value out of domain.
+        """
+        if isinstance(margin, Margins):
+            return margin
+        stated: dict[str, Margin] = {}
+        if margin is None:
+            pass
+        elif isinstance(margin, Mapping):
+            stated = {name: _margin(name, value) for name, value in margin.items()}
+        elif isinstance(margin, os.PathLike):
+            stated = _read(Path(margin))
+        else:
+            texts = margin.split(",") if isinstance(margin, str) else margin
+            if not isinstance(texts, Sequence):
+                raise ParameterError(f"margin is {margin!r}; expected NAME=VALUE, such as delay=8ms")
+            stated = dict(_parse_text(text) for text in texts)
+        return cls(**{**_defaults(), **stated}, stated=frozenset(stated))
+
+    @classmethod
+    def of(cls, file: Path | None, texts: Sequence[str] | None) -> Margins:
+        """Return the margins of a file, or the defaults, with those changed that stand in texts.
+
+        Args:
+            file: A margins file; None for the defaults.
+            texts: Such as ``delay=8 ms``; they win over the file.
+
+        Raises:
+            ParameterError: As :meth:`parse`.
+        """
+        base = cls.parse(file)
+        stated = dict(_parse_text(text) for text in texts or ())
+        return replace(base, **stated, stated=base.stated | frozenset(stated))
+
+    @property
+    def whose(self) -> str:
+        """Whose margins these are, in words."""
+        if not self.stated:
+            return "the default margins (none were stated)"
+        left = [name for name in _UNITS if name not in self.stated]
+        if not left:
+            return "the stated margins"
+        return f"the stated margins and, for {', '.join(left)}, the default ones"
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return value and unit of each for JSON, and which were stated."""
+        told = {name: getattr(self, name) for name in _UNITS}
+        return {
+            **{name: {"value": one.value, "unit": one.unit} for name, one in told.items()},
+            "stated": sorted(self.stated),
+        }
+
+    @classmethod
+    def from_dict(cls, content: Mapping[str, Any]) -> Margins:
+        """Return margins from what :meth:`as_dict` gave.
+
+        Raises:
+            ParameterError: It is something else.
+        """
+        stated = [name for name in content.get("stated", ()) if name in _UNITS]
+        return cls.parse({name: f"{content[name]['value']} {content[name]['unit']}" for name in stated})
+
+
+MarginArgument: TypeAlias = "Margins | Mapping[str, Any] | Sequence[str] | os.PathLike[str] | None"
+
+
+@lru_cache(maxsize=1)
+def _defaults() -> dict[str, Margin]:
+    with resources.as_file(resources.files("pendulum_bags.comparison").joinpath("margins.yaml")) as path:
+        found = _read(path)
+    assert set(found) == {one.name for one in fields(Margins)} - {"stated"}
+    return found
+
+
+def _read(path: Path) -> dict[str, Margin]:
+    document = load_yaml(path, "margins file")
+    reject_unknown(document, ("format", "margins"), where=str(path))
+    if document.get("format") != FORMAT:
+        raise ParameterError(f"{path}: format is {document.get('format')!r}; expected {FORMAT!r}")
+    entries = require_mapping(document.get("margins"), f"{path}: margins")
+    return {name: _margin(name, entry, f"{path}: ") for name, entry in entries.items()}
+
+
+def _margin(name: str, given: Any, where: str = "") -> Margin:
+    """Return a checked margin from a number, a text with or without unit, or a mapping of value and unit."""
+    if name not in _UNITS:
+        raise ParameterError(f"{where}margin has no {name!r}; expected one of {', '.join(_UNITS)}")
+    unit = ""
+    value = given
+    if isinstance(given, Mapping):
+        reject_unknown(given, ("value", "unit"), where=f"{where}margin {name}")
+        value, unit = given.get("value"), str(given.get("unit", ""))
+    elif isinstance(given, str):
+        number = given.strip()
+        for ending in sorted(_UNITS[name], key=len, reverse=True):
+            if number.endswith(ending):
+                number, unit = number[: -len(ending)].strip(), ending
+                break
+        value = number
+    try:
+        value = float(value)
+    except (TypeError, ValueError) as error:
+        units = ", ".join(_UNITS[name])
+        raise ParameterError(f"{where}margin {name} is {given!r}; expected a number in {units}") from error
+    unit = unit or _UNITS[name][0]
+    if unit not in _UNITS[name]:
+        raise ParameterError(
+            f"{where}margin {name} has unit {unit!r}; expected one of {', '.join(_UNITS[name])}"
+        )
+    if not (math.isfinite(value) and value > 0.0):
+        raise ParameterError(f"{where}margin {name} is {value:g} {unit}; expected a finite number > 0")
+    return Margin(value, unit)
+
+
+def _parse_text(text: str) -> tuple[str, Margin]:
+    name, sign, value = text.partition("=")
+    if not sign:
+        raise ParameterError(f"margin is {text!r}; expected NAME=VALUE, such as delay=8ms")
+    return name.strip(), _margin(name.strip(), value)

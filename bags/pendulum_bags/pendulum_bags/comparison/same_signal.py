@@ -1,0 +1,96 @@
+"""Whether two plants had one disturbance: the same course in time, and the same size."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from scipy import stats
+
+from pendulum_bags.comparison.alignment import LONGEST_LAG, Alignment, align_signals
+from pendulum_bags.runs.series import Signal
+
+__all__ = ["SharedSignal", "compare_signals"]
+
+LEAST_CORRELATION = 0.6
+"""Correlation that one signal keeps although late loops skip and repeat samples of it."""
+CHANCE = 1e-3
+"""Probability with which independent signals may be taken for one."""
+AMPLITUDE = 1.1
+"""Factor between the sizes of what still counts as one signal: skipped samples change it by some per cent."""
+
+
+@dataclass(frozen=True)
+class SharedSignal:
+    """Two recorded disturbances beside each other.
+
+    Args:
+        alignment: Their cross-correlation.
+        amplitude: Root mean square of the second per that of the first.
+        threshold: Correlation from which they count as one: independent signals that change as seldom exceed it with a
+            probability of ``CHANCE``.
+        changes: How often the one that changes less often takes a new value.
+    """
+
+    alignment: Alignment
+    amplitude: float
+    threshold: float
+    changes: int
+
+    @property
+    def is_one(self) -> bool:
+        """Whether they count as one signal."""
+        return not self.reason
+
+    @property
+    def reason(self) -> str:
+        """Why they do not, in words; empty where they do."""
+        found = self.alignment.correlation
+        if found <= self.threshold:
+            return (
+                f"the recorded disturbances differ: their correlation is {found:.2f} at best, "
+                f"expected above {self.threshold:.2f} for signals with {self.changes} changes"
+            )
+        if not 1.0 / AMPLITUDE <= self.amplitude <= AMPLITUDE:
+            return (
+                f"the recorded disturbances differ in size: the hardware's is {self.amplitude:.2f} "
+                "times the simulation's, "
+                f"expected {1.0 / AMPLITUDE:.2f} to {AMPLITUDE:.2f}"
+            )
+        return ""
+
+    def as_dict(self) -> dict[str, float | str]:
+        """Return the figures for JSON."""
+        return {**self.alignment.as_dict(), "amplitude": self.amplitude, "threshold": self.threshold}
+
+
+def compare_signals(first: Signal | None, second: Signal | None, period: float) -> SharedSignal | None:
+    """Compare two recorded disturbances as functions of time since their start; None where one is missing.
+
+    Args:
+        first: The simulation's.
+        second: The hardware's.
+        period: Resolution of the lags [s].
+    """
+    if first is None or second is None or min(first.t.size, second.t.size) < 12:
+        return None
+    alignment = align_signals(first, second, period)
+    sizes = [float(np.sqrt(np.mean(one.value**2))) for one in (first, second)]
+    amplitude = sizes[1] / sizes[0] if sizes[0] > 0.0 else float("inf")
+    changes = min(_changes(first), _changes(second))
+    return SharedSignal(alignment, amplitude, _threshold(changes, float(np.ptp(first.t))), changes)
+
+
+def _changes(held: Signal) -> int:
+    return 1 + int(np.count_nonzero(np.diff(held.value)))
+
+
+def _threshold(changes: int, duration: float) -> float:
+    """Return the correlation that independent signals exceed at any of the lags with a probability of ``CHANCE``."""
+    if changes < 4:
+        return 0.999
+    # Lags within one hold are nearly one and the same trial.
+    trials = 1.0 + 2.0 * LONGEST_LAG * changes / max(duration, 1e-9)
+    t = float(stats.t.isf(CHANCE / trials, changes - 2))
+    return max(LEAST_CORRELATION, t / math.sqrt(changes - 2 + t * t))

@@ -1,0 +1,135 @@
+"""The first layer: what the tests of one run, or of several alike, say in the words of a person."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+from pendulum_bags.comparison import Comparison, EquivalenceTest, Outcome
+from pendulum_bags.verdict.layers import Evidence, Layer, LayerResult, Mark
+
+__all__ = ["in_words", "same_run_layer"]
+
+_MARKS = {Outcome.EQUIVALENT: Mark.YES, Outcome.DIFFERENT: Mark.NO, Outcome.UNDECIDED: Mark.UNDECIDED}
+_MOST_REASONS = 3
+"""Reasons that a sentence names; the table has them all."""
+
+
+def same_run_layer(comparison: Comparison, *, more: str = "") -> LayerResult:
+    """Return the first layer of a comparison.
+
+    Args:
+        comparison: The comparison.
+        more: How to record more where that is what is missing, such as ``make experiment ARGS="--budget 120"``; by
+            default the number of runs is told.
+    """
+    verdict = comparison.verdict
+    tests = verdict.tests
+    evidence = tuple(_evidence(test) for test in tests)
+    mark = _MARKS[verdict.outcome]
+    runs = "this run" if len(comparison.pairs) == 1 else f"these {len(comparison.pairs)} runs"
+    whose = verdict.margins.whose
+    if mark is Mark.YES:
+        reason = f"in {runs} simulation and the hardware move alike within {whose}, in all {len(tests)} tests"
+        steps: Sequence[str] = ()
+    elif mark is Mark.NO:
+        failed = sorted(
+            (test for test in tests if test.outcome is Outcome.DIFFERENT), key=_beyond, reverse=True
+        )
+        told = [in_words(test) for test in _each_once(failed)]
+        left_out = len(told) - _MOST_REASONS
+        reason = "; ".join(told[:_MOST_REASONS]) + (f"; and {left_out} more" if left_out > 0 else "")
+        steps = _remedies(comparison, failed)
+    else:
+        reason = verdict.sentence.removeprefix("Undecided: ").rstrip(".")
+        if comparison.is_paired:
+            open_tests = [test for test in tests if test.outcome is Outcome.UNDECIDED]
+            reason = f"{runs} cannot tell yet in {', '.join(test.quantity for test in open_tests)}"
+        steps = (_what_it_takes(comparison, more),)
+    sentence = f"{reason[0].upper()}{reason[1:]}."
+    return LayerResult(Layer.SAME_RUN, mark, sentence, evidence, steps, reason=reason)
+
+
+def in_words(test: EquivalenceTest) -> str:
+    """Return what a test found as half a sentence."""
+    value = test.interval.estimate
+    if test.quantity == "delay":
+        return f"the hardware answers {abs(value):.3g} {test.unit} {'later' if value >= 0.0 else 'earlier'}"
+    if test.quantity.startswith("mean angle"):
+        return f"the hardware's mean angle is {abs(value):.2g} {test.unit} {'higher' if value >= 0.0 else 'lower'}"
+    if test.quantity.startswith("spread of "):
+        what = test.quantity.removeprefix("spread of ").split(" ", maxsplit=1)[0]
+        if test.unit == "-":
+            size = f"{value:.2g} times as wide" if value >= 2.0 else f"{100.0 * abs(value - 1.0):.2g} % "
+            size = size if value >= 2.0 else size + ("wider" if value >= 1.0 else "narrower")
+        else:
+            size = f"{abs(value):.2g} {test.unit} {'wider' if value >= 0.0 else 'narrower'}"
+        return f"the {what} of the hardware spreads {size}"
+    apart = "% of their spread" if test.unit == "%" else test.unit
+    what = "velocities" if "velocities" in test.quantity else "angles"
+    less = ", the delay taken out" if "less the delay" in test.quantity else ""
+    return f"the {what} are {value:.2g} {apart} apart{less}"
+
+
+def _evidence(test: EquivalenceTest) -> Evidence:
+    unit = "" if test.unit == "-" else test.unit
+    interval = test.interval
+    margin = test.margin_text().removeprefix("margin ")
+    expected = f"below {margin}" if not math.isfinite(test.low) else margin
+    return Evidence(
+        test.quantity,
+        unit,
+        interval.estimate,
+        interval.low,
+        interval.high,
+        f"{expected} {unit}".rstrip(),
+        _MARKS[test.outcome],
+        f"{interval.title}, {interval.blocks} independent blocks",
+    )
+
+
+def _beyond(test: EquivalenceTest) -> float:
+    """Return how many margins an estimate is away."""
+    value = test.interval.estimate
+    if math.isfinite(test.low) and not math.isclose(test.low, -test.high):
+        return abs(math.log(max(value, 1e-9))) / math.log(test.high)
+    return abs(value) / test.high
+
+
+def _each_once(failed: Sequence[EquivalenceTest]) -> list[EquivalenceTest]:
+    """Leave out distances that a delay or a spread, which is told too, explains."""
+    plain = [test for test in failed if not test.quantity.startswith("distance")]
+    return plain or list(failed)
+
+
+def _remedies(comparison: Comparison, failed: Sequence[EquivalenceTest]) -> tuple[str, ...]:
+    steps = []
+    names = {test.quantity for test in failed}
+    shapes = {name for name in names if name != "delay" and not name.startswith("mean")}
+    source = comparison.pairs[0].hardware.source or "RUN/hw"
+    late = next((test for test in failed if test.quantity == "delay"), None)
+    if any(name.startswith("spread") or "less the delay" in name for name in shapes):
+        steps.append(
+            f"Identify the plant from what the hardware did (python -m pendulum_bags identify {source} "
+            "--out plant.yaml), then "
+            "simulate and design with --plant plant.yaml."
+        )
+    elif late is not None:
+        steps.append(
+            f"Give the simulated plant the delay that is missing: transport_delay, "
+            f"{late.interval.estimate:.3g} {late.unit} "
+            "more than now, in its plant file; then measure again with --plant."
+        )
+    if any(name.startswith("mean") for name in names):
+        steps.append("Look for an offset: angle_offset or torque_offset in the plant file, or dry friction.")
+    return tuple(steps)
+
+
+def _what_it_takes(comparison: Comparison, more: str) -> str:
+    if not comparison.is_paired:
+        return "Record both plants under one and the same disturbance (make experiment does)."
+    runs = comparison.verdict.more_runs
+    if runs is None:
+        return "More runs would hardly decide it: a difference sits on its margin; state another margin, or mend it."
+    what = f"about {runs} more run{'s' if runs != 1 else ''} of {comparison.pairs[0].hardware.window.duration:.0f} s"
+    return f"Record {what}" + (f": {more}." if more else ", each with a seed of its own.")

@@ -1,0 +1,69 @@
+"""The answer on the terminal: one sentence, a table of the layers, the tests, and what to do next."""
+
+from __future__ import annotations
+
+from rich.console import Console
+from rich.markup import escape
+from rich.text import Text
+
+from pendulum_bags.comparison import Verdict
+from pendulum_bags.verdict.layers import Answer, Mark
+from pendulum_msgs_py.programs.terminal import WholeTable
+
+__all__ = ["layers_table", "print_answer", "tests_table"]
+
+SIGNS = {
+    Mark.YES: "✓ yes",
+    Mark.NO: "✗ no",
+    Mark.UNDECIDED: "? undecided",
+    Mark.NOT_MEASURED: "– not measured",
+}
+"""Marks that differ in shape and in words, so that colour only helps."""
+_STYLES = {
+    Mark.YES: "bold green",
+    Mark.NO: "bold red",
+    Mark.UNDECIDED: "bold yellow",
+    Mark.NOT_MEASURED: "dim",
+}
+
+
+def layers_table(answer: Answer) -> WholeTable:
+    """Return the table of the layers: question, mark, sentence."""
+    table = WholeTable(title="The layers of the answer", title_justify="left")
+    for heading in ("layer", "question", "answer", "because"):
+        table.add_column(heading, overflow="fold")
+    for number, result in enumerate(answer.layers, start=1):
+        mark = Text(SIGNS[result.mark], _STYLES[result.mark])
+        table.add_row(f"{number} {result.layer.title}", result.layer.question, mark, escape(result.sentence))
+    return table
+
+
+def tests_table(verdict: Verdict) -> WholeTable:
+    """Return the table of the tests of the first layer."""
+    title = verdict.tests[0].interval.title if verdict.tests else "interval"
+    table = WholeTable(title="Tests of the same run: hardware against simulation", title_justify="left")
+    for heading in ("quantity", "estimate", title, "margin", "result"):
+        table.add_column(heading, justify="left" if heading in {"quantity", "result"} else "right")
+    for test in verdict.tests:
+        interval = test.interval
+        unit = "" if test.unit == "-" else f" \\[{test.unit}]"
+        table.add_row(
+            test.quantity + unit,
+            f"{interval.estimate:.3g}",
+            f"{interval.low:.3g} to {interval.high:.3g}",
+            test.margin_text().removeprefix("margin "),
+            test.outcome.value,
+        )
+    return table
+
+
+def print_answer(console: Console, answer: Answer, verdict: Verdict) -> None:
+    """Print tests, layers, the answer in one sentence, and what to do next; the answer is what is read last."""
+    console.print(tests_table(verdict))
+    console.print(layers_table(answer))
+    console.print("\nIs the simulation good enough to design a controller on?")
+    console.print(Text(answer.sentence, _STYLES[answer.mark]), highlight=False)
+    if answer.next_steps:
+        console.print("What to do next:")
+        for step in answer.next_steps:
+            console.print(f"  - {escape(step)}", highlight=False, soft_wrap=True)

@@ -1,0 +1,216 @@
+"""The first layer against plants whose difference is known."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from pendulum_bags.comparison import Comparison, Looks, Margins, Outcome, RunData, Series, Signal, compare
+from pendulum_bags.comparison.same_run import paired_tests
+from pendulum_bags.comparison.spectra import spectra_of
+from pendulum_bags.verdict import Mark
+from pendulum_bags.verdict.same_run import same_run_layer
+from pendulum_msgs_py.errors import DataError
+from tests.plant_pairs import MACHINE, SIMULATED, pair, record
+
+
+def outcomes(comparison: Comparison) -> dict[str, Outcome]:
+    return {test.quantity: test.outcome for test in comparison.verdict.tests}
+
+
+def estimates(comparison: Comparison) -> dict[str, float]:
+    return {test.quantity: test.interval.estimate for test in comparison.verdict.tests}
+
+
+def test_one_plant_sampled_at_another_rate_is_the_same_plant() -> None:
+    found = compare([pair(3)])
+    assert found.verdict.outcome is Outcome.EQUIVALENT
+    assert estimates(found)["spread of velocity (ratio)"] == pytest.approx(1.0, abs=0.025)
+    assert estimates(found)["delay"] == pytest.approx(0.0, abs=0.6)
+
+
+@pytest.mark.parametrize("late", [0.002, 0.005, 0.008, 0.04])
+def test_a_pure_delay_is_measured_and_is_no_difference_in_spread(late: float) -> None:
+    found = compare([pair(5, late=late)])
+    # 40 ms in the loop do change how it moves.
+    assert estimates(found)["delay"] == pytest.approx(1e3 * late, abs=0.8 if late < 0.01 else 4.0)
+    tolerance = 0.05 if late < 0.01 else 0.2
+    assert estimates(found)["spread of velocity (ratio)"] == pytest.approx(1.0, abs=tolerance)
+
+
+def test_the_faster_side_may_be_either() -> None:
+    simulation, hardware = pair(4, late=0.008)
+    exchanged = compare([(hardware, replace(simulation, metadata={}))])
+    assert estimates(exchanged)["delay"] == pytest.approx(-8.0, abs=0.8)
+    assert estimates(exchanged)["spread of velocity (ratio)"] == pytest.approx(
+        1.0 / estimates(compare([(simulation, hardware)]))["spread of velocity (ratio)"], rel=0.01
+    )
+
+
+def changed(run: RunData, **columns: np.ndarray) -> RunData:
+    return replace(run, window=replace(run.window, **columns))
+
+
+def test_every_test_can_fail_alone() -> None:
+    """Motions made for the purpose: each differs in one thing, and the test of that thing finds it."""
+    rng = np.random.default_rng(2)
+    t = np.arange(0.0, 10.0, 0.002)
+    wave = sum(
+        rng.normal() * np.sin(2.0 * math.pi * f * t + rng.uniform(0.0, 6.0))
+        for f in np.arange(0.5, 15.0, 0.23)
+    )
+    wave, other = 0.02 * wave / wave.std(), np.roll(0.02 * wave / wave.std(), 2500)
+    still = Series(t, math.pi + wave, 5.0 * wave, 30.0 * wave)
+
+    def found(**columns: np.ndarray) -> set[str]:
+        tests = paired_tests([(still, replace(still, **columns))], Margins.parse())
+        return {test.quantity for test in tests if test.outcome is Outcome.DIFFERENT}
+
+    assert found() == set()
+    assert found(position=math.pi + wave + 0.01) == {"mean angle difference"}
+    assert found(position=math.pi + 1.3 * wave) == {"spread of angle (ratio)"}
+    assert found(velocity=5.0 * 1.3 * wave) == {"spread of velocity (ratio)"}
+    assert found(effort=30.0 * 1.3 * wave) == {"spread of torque (ratio)"}
+    mixed = 0.8 * wave + 0.6 * other
+    assert found(velocity=5.0 * mixed) >= {"distance of velocities", "distance of velocities less the delay"}
+    assert found(position=math.pi + mixed) >= {"distance of angles", "distance of angles less the delay"}
+    late = replace(still, t=t + 0.02)
+    tests = paired_tests([(still, late)], Margins.parse())
+    assert {test.quantity for test in tests if test.outcome is Outcome.DIFFERENT} == {
+        "delay",
+        "distance of angles",
+        "distance of velocities",
+    }
+
+
+def test_margins_in_units_are_those_of_the_signals() -> None:
+    simulation, hardware = pair(3)
+    stated = ["spread_angle=0.001 deg", "spread_torque=0.5 N m", "path_velocity=10 deg/s"]
+    tests = {test.quantity: test for test in compare([(simulation, hardware)], margin=stated).verdict.tests}
+    wider = hardware.window.position.std() - simulation.window.position.std()
+    assert tests["spread of angle difference"].unit == "deg"
+    assert tests["spread of angle difference"].interval.estimate == pytest.approx(
+        math.degrees(wider), abs=0.004
+    )
+    assert tests["spread of torque difference"].outcome is Outcome.EQUIVALENT
+    assert tests["distance of velocities"].unit == "deg/s"
+
+
+def test_two_pendulums_that_hang_are_not_a_turn_apart() -> None:
+    simulation, hardware = pair(6)
+    down = changed(hardware, position=hardware.window.position + 2.0 * math.pi)
+    assert compare([(simulation, down)]).verdict.outcome is Outcome.EQUIVALENT
+
+
+# -- one disturbance ---------------------------------------------------------------------------------------------
+
+
+def test_noise_twice_as_large_is_not_the_same_noise() -> None:
+    simulation, hardware = pair(7)
+    louder = record(SIMULATED, rate=100.0, seed=7, duration=5.0, amplitude=5.0, label="hardware")
+    found = compare([(simulation, louder)])
+    assert not found.is_paired
+    assert "the hardware's is 2.00 times the simulation's" in found.paired["reason"]
+    assert found.verdict.outcome is Outcome.UNDECIDED
+    assert compare([(simulation, hardware)]).is_paired
+
+
+def test_independent_noise_that_seldom_changes_is_hardly_ever_taken_for_one() -> None:
+    from pendulum_bags.comparison.same_signal import compare_signals
+
+    rng = np.random.default_rng(0)
+    t = np.arange(0.0, 5.0, 0.01)
+    taken = 0
+    for _ in range(150):
+        first, second = (Signal(t, np.repeat(rng.uniform(-2.5, 2.5, 5), 100)) for _ in range(2))
+        shared = compare_signals(first, second, 0.01)
+        assert shared is not None
+        taken += shared.is_one
+        same = compare_signals(first, first, 0.01)
+        assert same is not None
+        assert same.is_one
+    assert taken <= 1
+
+
+# -- pooling -----------------------------------------------------------------------------------------------------
+
+
+def told(run: RunData, **changes: object) -> RunData:
+    return replace(run, metadata={"pendulum.run": {**run.metadata["pendulum.run"], **changes}})
+
+
+def test_one_run_or_one_seed_twice_and_unlike_runs_are_not_pooled(tmp_path: Path) -> None:
+    first, second = pair(1, 1.0), pair(2, 1.0)
+    assert compare([first, second]).pairs[1] is not None
+    with pytest.raises(DataError, match="hold one and the same recording; expected independent runs to pool"):
+        compare([first, first])
+    with pytest.raises(DataError, match=r"have one seed \(1\), so one and the same noise"):
+        compare([first, (told(second[0], seed=1), told(second[1], seed=1))])
+    pid = {"kind": "pid"}
+    lqr = {"kind": "lqr", "q": [100.0, 0.01]}
+    ones = tuple(told(run, controller=lqr) for run in first)
+    others = tuple(told(run, controller=pid) for run in second)
+    with pytest.raises(DataError, match="runs with different controllers cannot be pooled: lqr"):
+        compare([ones, others])  # type: ignore[list-item]
+    with pytest.raises(DataError, match="simulation and hardware had different controllers"):
+        compare([(ones[0], told(first[1], controller=pid))])
+    noise = {"kind": "uniform", "amplitude": 2.5}
+    quiet = tuple(told(run, disturbance=noise) for run in first)
+    loud = tuple(told(run, disturbance={**noise, "amplitude": 5}) for run in second)
+    with pytest.raises(DataError, match=r"different disturbances, in amplitude cannot be pooled: 2\.5"):
+        compare([quiet, loud])  # type: ignore[list-item]
+    # Lists and tuples, whole and broken numbers are one in JSON.
+    assert compare([ones, tuple(told(run, controller={"kind": "lqr", "q": (100, 0.01)}) for run in second)])  # type: ignore[list-item]
+
+
+def test_simulation_and_hardware_the_wrong_way_round_are_refused() -> None:
+    simulation, hardware = pair(1, 1.0)
+    with pytest.raises(DataError, match="expected the simulation first"):
+        compare([(told(hardware, namespace="/hw"), told(simulation, namespace="/sim"))])
+    with pytest.raises(DataError, match="expected one of each plant"):
+        compare([(simulation, simulation)])
+
+
+# -- spectra -----------------------------------------------------------------------------------------------------
+
+
+def test_a_tone_above_the_slower_plants_reach_is_not_folded_into_its_band() -> None:
+    t = np.arange(0.0, 10.0, 0.002)
+    slow = t[::5]
+    rng = np.random.default_rng(1)
+    fast = Series(t, np.zeros_like(t), np.sin(2.0 * np.pi * 70.0 * t), np.zeros_like(t))
+    other = Series(slow, np.zeros_like(slow), 0.01 * rng.standard_normal(slow.size), np.zeros_like(slow))
+    found = spectra_of(fast, other)
+    near = np.abs(found.frequency - 30.0) < 3.0
+    # Folded, the tone would have its whole power of 1/2 there.
+    assert found.first[near].sum() * found.frequency[1] < 1e-4
+    assert found.frequency[-1] == pytest.approx(50.0)
+
+
+# -- words -------------------------------------------------------------------------------------------------------
+
+
+def test_the_layer_says_what_differs_and_what_to_do() -> None:
+    late = same_run_layer(compare([pair(5, late=0.01)]))
+    assert late.mark is Mark.NO
+    assert late.reason.startswith("the hardware answers 10")
+    assert late.reason.split(";")[0].endswith("ms later")
+    assert "transport_delay, 10" in late.next_steps[0]
+    slack = same_run_layer(compare([pair(5, plant=SIMULATED.with_values(damping=2 * 11.77))]))
+    assert "the velocity of the hardware spreads 47 % narrower" in slack.reason
+    assert "identify" in slack.next_steps[0]
+    fine = same_run_layer(compare([pair(5, plant=MACHINE)]))
+    assert fine.mark is Mark.YES
+    assert not fine.next_steps
+
+
+def test_looking_again_widens_the_intervals_so_that_all_looks_together_err_no_more() -> None:
+    spent = sum(1.0 - Looks(number).level for number in range(1, 60))
+    assert spent == pytest.approx(0.1)
+    assert Looks().level == pytest.approx(0.9)
+    once, third = (compare([pair(5)], looks=Looks(number)).verdict.tests[1].interval for number in (0, 3))
+    assert third.high - third.low > 1.3 * (once.high - once.low)
