@@ -12,7 +12,7 @@ from rich.console import Console
 from scipy import stats
 
 from pendulum_bags.comparison import compare_folders
-from pendulum_bags.studies.study_file import Study
+from pendulum_bags.studies.study_file import Study, StudyRun
 from pendulum_msgs_py.errors import DataError
 from pendulum_msgs_py.programs.terminal import WholeTable
 
@@ -32,7 +32,7 @@ def analyse(folder: Path, study: Study, records: Sequence[Mapping[str, Any]]) ->
     done = {int(record["number"]) for record in records if record["status"] == "done"}
     runs = [(run, folder / "runs" / run.name / "run") for run in study.runs if run.number in done]
     if study.experiment == "thesis":
-        return {"comparison": compare_folders([place for _, place in runs]).to_json()}
+        return {"comparisons": [_pool(labels, places) for labels, places in _alike(runs).items()]}
     rows = []
     for run, place in runs:
         path = place / "identified.json"
@@ -46,12 +46,29 @@ def analyse(folder: Path, study: Study, records: Sequence[Mapping[str, Any]]) ->
     return {"identified": rows, "pooled": pooled}
 
 
+def _alike(runs: Sequence[tuple[StudyRun, Path]]) -> dict[tuple[str, ...], list[Path]]:
+    """Return the folders of runs that differ in their seed alone; a seed that was repeated counts once.
+
+    The same noise again is no independent run, and runs of other plants or controllers answer another question.
+    """
+    groups: dict[tuple[str, ...], dict[Any, Path]] = {}
+    for run, place in runs:
+        kind = tuple(str(run.labels[axis]) for axis in ("plant", "controller", "disturbance"))
+        groups.setdefault(kind, {}).setdefault(run.labels["seed"], place)
+    return {kind: list(places.values()) for kind, places in groups.items()}
+
+
+def _pool(of: tuple[str, ...], places: Sequence[Path]) -> dict[str, Any]:
+    return {"of": [name for name in of if name], **compare_folders(places).to_json()}
+
+
 def print_table(console: Console, result: Mapping[str, Any]) -> None:
     """Print what :func:`analyse` found."""
-    if "comparison" in result:
-        content = result["comparison"]
-        pooled = "1 run" if content["runs"] == 1 else f"{content['runs']} runs pooled"
-        console.print(f"{pooled}: {content['verdict']['sentence']}")
+    if "comparisons" in result:
+        for content in result["comparisons"]:
+            pooled = "1 run" if content["runs"] == 1 else f"{content['runs']} runs pooled"
+            told = ", ".join(content["of"])
+            console.print(f"{told}: {pooled}: {content['verdict']['sentence']}", markup=False, highlight=False)
         return
     table = WholeTable(title="Identified, 95 % interval over trials", title_justify="left")
     table.add_column("seed", justify="right")
