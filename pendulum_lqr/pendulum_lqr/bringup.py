@@ -12,6 +12,7 @@ from pendulum_lqr.controller import CONTROLLERS
 from pendulum_lqr.disturbance import DISTURBANCE_SPECS
 from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.parameters import load_yaml, parameter_sections
+from pendulum_msgs_py.plants.lab_file import LabFile, load_lab
 from pendulum_msgs_py.programs import graph
 from pendulum_msgs_py.programs.graph import NodeProgram
 
@@ -42,6 +43,11 @@ ARGUMENTS: tuple[Argument, ...] = (
         "What to bring up: the simulator as /sim, the bridge to the emulated or the real X5-9 as /hw, or simulator "
         "and emulator.",
         tuple(SIDES),
+    ),
+    Argument(
+        "lab",
+        "",
+        "Lab file, for plant:=hebi: which actuator it is, its zero, sign, limits and rate.",
     ),
     Argument("controller", "lqr", "Controller of each plant.", (*CONTROLLERS, "none")),
     Argument(
@@ -93,10 +99,13 @@ def programs(value: Mapping[str, str]) -> list[NodeProgram]:
     for side in SIDES[value["plant"]]:
         space = f"/{side}"
         rate = _number(value, f"{side}_rate")
+        lab = _lab(value)
+        if side == "hw" and lab is not None:
+            rate = float(lab.values.get("feedback_rate", rate))
         if side == "sim":
             found.append(graph.simulator(space, plant=value["model"], rate_hz=rate, start=value["start"]))
         else:
-            found.append(_bridge(space, value, rate))
+            found.append(_bridge(space, value, rate, lab))
         if value["controller"] != "none":
             kind, model = value["controller"], value["model"]
             found.append(
@@ -143,9 +152,27 @@ def parameter_file(given: str) -> str:
     return str(path)
 
 
-def _bridge(space: str, value: Mapping[str, str], rate: float) -> NodeProgram:
+def _lab(value: Mapping[str, str]) -> LabFile | None:
+    if value["plant"] != "hebi":
+        if value["lab"]:
+            raise ParameterError(f"lab is {value['lab']!r} with plant {value['plant']!r}; expected plant:=hebi")
+        return None
+    if not value["lab"]:
+        if value["params_file"]:
+            return None
+        raise ParameterError(
+            "plant is 'hebi' without a lab file; expected lab:=FILE (or params_file:=FILE), which says which actuator "
+            "it is, its zero, sign and limits"
+        )
+    return load_lab(value["lab"])
+
+
+def _bridge(space: str, value: Mapping[str, str], rate: float, lab: LabFile | None) -> NodeProgram:
+    if lab is not None:
+        # A real pendulum starts where it is; nothing arms it but a call of its service.
+        path = str(Path(value["lab"]).expanduser().resolve())
+        return graph.bridge(space, lab_file=path, feedback_rate=rate)
     if value["plant"] == "hebi":
-        # A real pendulum starts where it is.
         return graph.bridge(space, backend="hebi", feedback_rate=rate)
     at = math.pi if value["start"] == "top" else 0.0
     return graph.bridge(space, backend="emulator", feedback_rate=rate, initial_position=at)

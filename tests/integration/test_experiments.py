@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import socket
 import subprocess
 import sys
 from pathlib import Path
@@ -155,3 +156,35 @@ def test_twenty_seeds_reproduce_the_thesis_under_noise(
     assert low < np.median([abs(run.command).max() for run in runs]) < high
     assert np.median([run.position.std() for run in runs]) == pytest.approx(std_theta, rel=0.15)
     assert np.median([run.velocity.std() for run in runs]) == pytest.approx(std_theta_dot, rel=0.05)
+
+
+@pytest.mark.timeout(120)
+def test_a_rehearsal_with_a_lab_file_checks_asks_and_moves_the_machine_of_the_file(
+    domain_id: int, tmp_path: Path, processes: ProcessGroup
+) -> None:
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as free:
+        free.bind(("127.0.0.1", 0))
+        address = f"127.0.0.1:{free.getsockname()[1]}"
+    processes.start("pendulum_hw_bridge", "emulator", "--address", address).wait_for_output("listens on", 60.0)
+    lab = tmp_path / "lab.yaml"
+    lab.write_text(
+        f"format: pendulum_lab/1\nmodule: {{backend: emulator_process, emulator_address: '{address}'}}\n"
+        "limits:\n  effort: {value: 6.0, unit: N m}\n",
+        encoding="utf-8",
+    )
+    command = ["gravity", "--hardware", "hebi", "--lab", lab, "--out", tmp_path / "run", "--trials", "1"]
+    command += ["--step", "10", "--top", "10", "--hold", "0.5"]
+    done = subprocess.run(
+        [sys.executable, "-m", "pendulum_bags", "experiment", *map(str, command)],
+        input="yes\n",
+        capture_output=True,
+        text=True,
+        timeout=100,
+        check=False,
+    )
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert "Type yes to arm" in done.stderr
+    bag = read_bag(tmp_path / "run" / "trial_1")
+    states = bag["/hw/joint_states"]
+    assert np.degrees(states["position"]).max() == pytest.approx(10.0, abs=2.0)
+    assert np.abs(bag["/hw/applied_effort"]["effort"]).max() <= 6.0

@@ -27,6 +27,7 @@ from tests.fixtures import PROJECT
 
 LAUNCH_FILES = sorted(PROJECT.glob("pendulum_*/launch/*.launch.py"))
 DEFAULTS = {argument.name: argument.default for argument in ARGUMENTS}
+LAB = {"lab": str(PROJECT / "pendulum_hw_bridge" / "config" / "lab_example.yaml")}
 
 
 def _specs(program: NodeProgram) -> Any:
@@ -53,7 +54,8 @@ def test_every_choice_starts_nodes_that_know_their_parameters(plant: str) -> Non
         it.name: it.choices for it in ARGUMENTS if it.name in {"controller", "disturbance", "start", "viewer"}
     }
     for combination in itertools.product(*choices.values()):
-        value = {**DEFAULTS, "plant": plant, **dict(zip(choices, combination, strict=True))}
+        lab = LAB if plant == "hebi" else {}
+        value = {**DEFAULTS, **lab, "plant": plant, **dict(zip(choices, combination, strict=True))}
         found = programs(value)
         assert len({program.full_name for program in found}) == len(found)
         for program in found:
@@ -72,9 +74,30 @@ def test_both_plants_differ_by_namespace_only_for_controller_and_disturbance() -
 
 
 def test_a_real_actuator_is_never_told_where_it_stands() -> None:
-    bridge = programs({**DEFAULTS, "plant": "hebi", "start": "top"})[0]
-    assert bridge.parameters["backend"] == "hebi"
-    assert "initial_position" not in bridge.parameters
+    bridge = programs({**DEFAULTS, **LAB, "plant": "hebi", "start": "top"})[0]
+    assert bridge.parameters == {"lab_file": LAB["lab"], "feedback_rate": 100.0}
+
+
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        ({"plant": "hebi"}, "without a lab file; expected lab:=FILE"),
+        ({"plant": "hebi", "lab": "none.yaml"}, "lab file none.yaml does not exist"),
+        ({"plant": "sim", **LAB}, "expected plant:=hebi"),
+    ],
+)
+def test_a_real_actuator_is_brought_up_only_with_the_file_that_says_which(
+    given: dict[str, str], message: str
+) -> None:
+    with pytest.raises(ParameterError, match=message):
+        programs({**DEFAULTS, **given})
+
+
+def test_controller_and_bridge_keep_the_rate_of_the_lab_file(tmp_path: Path) -> None:
+    lab = tmp_path / "lab.yaml"
+    lab.write_text("format: pendulum_lab/1\ndrive:\n  feedback_rate: {value: 200, unit: Hz}\n", encoding="utf-8")
+    found = programs({**DEFAULTS, "plant": "hebi", "lab": str(lab)})
+    assert [it.parameters.get("feedback_rate", it.parameters.get("period")) for it in found] == [200.0, 0.005]
 
 
 @pytest.mark.parametrize(("name", "text"), [("sim_rate", "fast"), ("sim_rate", "-1"), ("seed", "1.5")])
@@ -131,8 +154,8 @@ def test_a_parameter_file_for_a_node_of_the_launch_is_found_from_any_folder(
         ({"plant": "sim"}, {"/sim": False}),
         ({"plant": "both"}, {"/sim": False, "/hw": True}),
         ({"plant": "emulator", "start": "top"}, {"/hw": False}),
-        ({"plant": "hebi", "start": "top"}, {"/hw": True}),
-        ({"plant": "hebi", "controller_waits": "false"}, {"/hw": False}),
+        ({"plant": "hebi", "start": "top", **LAB}, {"/hw": True}),
+        ({"plant": "hebi", "controller_waits": "false", **LAB}, {"/hw": False}),
         ({"plant": "sim", "controller_waits": "true"}, {"/sim": True}),
     ],
 )

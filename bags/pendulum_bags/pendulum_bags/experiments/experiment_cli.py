@@ -14,8 +14,14 @@ import typer
 from rich.console import Console
 
 from pendulum_bags.experiments.domain import check_domain
+from pendulum_bags.experiments.operator import confirm
 from pendulum_bags.experiments.progress import PhaseProgress
-from pendulum_bags.experiments.settings import TIME_BESIDE_NOISE, NoiseSettings, RegulationSettings
+from pendulum_bags.experiments.settings import (
+    SETTLE_TIME,
+    TIME_BESIDE_NOISE,
+    NoiseSettings,
+    RegulationSettings,
+)
 from pendulum_bags.experiments.trials_cli import add_commands as add_trial_commands
 from pendulum_bags.runs.run_folder import create_run_folder, discard_if_empty, versions, write_json
 from pendulum_bags.studies.leaderboard_cli import leaderboard
@@ -52,6 +58,8 @@ Domain = Annotated[
     int | None, typer.Option(help="ROS domain; by default ROS_DOMAIN_ID, or the first free one.")
 ]
 Strategy = Annotated[str, typer.Option(help="How the actuator turns wanted torque into PWM.")]
+Lab = Annotated[Path | None, typer.Option(help="Lab file of the real actuator, for --hardware hebi.")]
+Yes = Annotated[bool, typer.Option("--yes", help="Do not ask before the real machine moves.")]
 
 
 @app.command()
@@ -61,7 +69,12 @@ def thesis(
     ] = None,
     plant: Plant = "thesis",
     hardware: Annotated[str, typer.Option(help="emulator, or hebi for the real actuator.")] = "emulator",
-    strategy: Strategy = "direct_pwm",
+    lab: Lab = None,
+    yes: Yes = False,
+    strategy: Annotated[
+        str | None,
+        typer.Option(help="How the actuator turns wanted torque into PWM; default direct_pwm, or as in the lab file."),
+    ] = None,
     seed: Seed = 1,
     amplitude: Amplitude = 2.5,
     hold_time: HoldTime = 0.01,
@@ -84,14 +97,19 @@ def thesis(
     settings = RegulationSettings(
         plant=plant,
         hardware=hardware,
-        effort_strategy=strategy,
+        effort_strategy=strategy or "",
         controller=controller,
         q=q,
         r=r,
         noise=NoiseSettings(seed, amplitude, hold_time, duration),
         storage=storage,
+        lab="" if lab is None else str(lab),
     )
     check_domain(domain)
+    if (machine := settings.machine) is not None:
+        confirm(
+            machine, settings.bridge_program(), _plan(settings), make_console(stderr=True, highlight=False), yes=yes
+        )
     folder = create_run_folder(out, "thesis")
     console = make_console(stderr=json_output, highlight=False)
     started = time.monotonic()
@@ -185,6 +203,14 @@ def examples(
         print(bag)
 
 
+def _plan(settings: RegulationSettings) -> str:
+    noise = settings.noise
+    return (
+        f"It arms, turns the pendulum upright in about 15 s, balances it for {SETTLE_TIME + noise.duration:g} s under "
+        f"noise of up to {noise.amplitude:g} N m, turns it down again in about 15 s, and disarms."
+    )
+
+
 def _analyse(folder: Path, settings: RegulationSettings) -> dict[str, Any]:
     from pendulum_bags.comparison import compare_runs
     from pendulum_bags.report import write_report
@@ -193,7 +219,7 @@ def _analyse(folder: Path, settings: RegulationSettings) -> dict[str, Any]:
     summary = {
         "experiment": "thesis",
         "seed": settings.noise.seed,
-        "strategy": settings.effort_strategy,
+        "strategy": settings.strategy,
         "versions": versions(),
         **paired.to_json(),
     }

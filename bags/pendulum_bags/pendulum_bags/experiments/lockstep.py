@@ -68,7 +68,7 @@ def run_lockstep(
         side=side,
         plant=settings.plant if side == "sim" else "thesis",
         design_plant=settings.plant,
-        strategy=settings.effort_strategy,
+        strategy=settings.strategy,
         controller=settings.controller,
         controller_parameters={key: value for key, value in tuning.items() if key in {p.name for p in parameters}},
         disturbance={

@@ -18,12 +18,14 @@ from pendulum_msgs_py.plants.plant_parameters import load_plant
 from pendulum_msgs_py.programs import graph
 from pendulum_msgs_py.programs.graph import NodeProgram
 
-__all__ = ["CLOCKS", "EMULATOR_WATCHDOG", "PERIODS", "SIDES", "RunSpec"]
+__all__ = ["CLOCKS", "EMULATOR_LIFETIME", "EMULATOR_WATCHDOG", "PERIODS", "SIDES", "RunSpec"]
 
 CLOCKS = ("lockstep", "realtime")
 SIDES = ("sim", "hw")
 EMULATOR_WATCHDOG = 25
 """Feedback periods that the bridge waits for an emulator, on a machine that does other things too."""
+EMULATOR_LIFETIME = 0.25
+"""Command lifetime of an emulator on such a machine [s]."""
 _AT_REST = 1e-9
 PERIODS = {"sim": 0.002, "hw": 0.01}
 """Period of the states of each plant, as in the thesis [s]."""
@@ -136,7 +138,7 @@ class RunSpec:
                 lockstep_duration=float(self.duration),
             )
         elif self.side == "hw":
-            loop.update(feedback_watchdog=EMULATOR_WATCHDOG, command_lifetime=0.25)
+            loop.update(feedback_watchdog=EMULATOR_WATCHDOG, command_lifetime=EMULATOR_LIFETIME)
         loop.update(self.plant_parameters)
         if self.side == "hw":
             # No hardware is armed by a parameter: the conductor does it, before it becomes the last listener.

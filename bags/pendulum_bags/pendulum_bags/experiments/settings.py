@@ -7,15 +7,20 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
+from pendulum_bags.experiments.operator import RealMachine, real_machine
+from pendulum_bags.experiments.run_spec import EMULATOR_LIFETIME, EMULATOR_WATCHDOG
 from pendulum_bags.runs.run_folder import git_revision, versions
 from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.plants.plant_parameters import load_plant
 from pendulum_msgs_py.programs import graph
 from pendulum_msgs_py.programs.graph import NodeProgram
 
-__all__ = ["HARDWARE", "TIME_BESIDE_NOISE", "NoiseSettings", "RegulationSettings"]
+__all__ = ["HARDWARE", "SETTLE_TIME", "TIME_BESIDE_NOISE", "NoiseSettings", "RegulationSettings"]
 
 HARDWARE = ("emulator", "hebi")
+DEFAULT_STRATEGY = "direct_pwm"
+SETTLE_TIME = 1.0
+"""Time under control before the noise starts [s]."""
 TIME_BESIDE_NOISE = 47.0
 """Wall time of the thesis's experiment without its noise, measured on two cores; 31 s are the ramps [s]."""
 
@@ -55,8 +60,10 @@ class RegulationSettings:
 
     Attributes:
         plant: Preset or file of the simulated plant; the controller is designed on it too.
-        hardware: Backend of the bridge.
+        hardware: ``emulator``, or ``hebi`` for the machine of a lab file.
+        lab: The lab file, for ``hebi``.
         effort_strategy: How the actuator turns wanted torque into PWM; it changes the plant that a controller sees.
+            Empty for that of the lab file, else ``direct_pwm``; read it from :attr:`strategy`.
         controller: Kind of controller.
         q: Diagonal of Q.
         r: R.
@@ -67,19 +74,47 @@ class RegulationSettings:
 
     plant: str = "thesis"
     hardware: str = "emulator"
-    effort_strategy: str = "direct_pwm"
+    effort_strategy: str = ""
     controller: str = "lqr"
     q: tuple[float, float] = (100.0, 0.01)
     r: float = 0.1
     noise: NoiseSettings = NoiseSettings()
     storage: str = "mcap"
     method: str = "euler"
+    lab: str = ""
 
     def __post_init__(self) -> None:
         """Refuse unknown plants and backends before anything is started."""
         load_plant(self.plant)
         if self.hardware not in HARDWARE:
             raise ParameterError(f"hardware is {self.hardware!r}; expected one of {', '.join(HARDWARE)}")
+        real_machine(self.hardware, self.lab)
+
+    @property
+    def machine(self) -> RealMachine | None:
+        """The machine of the lab file; None for the emulator."""
+        return real_machine(self.hardware, self.lab)
+
+    @property
+    def strategy(self) -> str:
+        """How the actuator turns wanted torque into PWM: as given, as the lab file says, or ``direct_pwm``."""
+        machine = self.machine
+        of_lab = machine.lab.values.get("effort_strategy", "") if machine is not None else ""
+        return self.effort_strategy or of_lab or DEFAULT_STRATEGY
+
+    def bridge_program(self) -> NodeProgram:
+        """Return the bridge to the actuator."""
+        # An emulator's feedback is as punctual as this machine, which may be a busy one; a real actuator keeps the
+        # default.
+        patience: dict[str, graph.ParameterArgument] = {
+            "feedback_watchdog": EMULATOR_WATCHDOG,
+            "command_lifetime": EMULATOR_LIFETIME,
+        }
+        machine = self.machine
+        if machine is None:
+            return graph.bridge("/hw", backend=self.hardware, effort_strategy=self.strategy, **patience)
+        told = machine.bridge_parameters(**(patience if machine.emulated else {}))
+        return graph.bridge("/hw", **told, effort_strategy=self.strategy)
 
     def controller_program(self, namespace: str, **changes: graph.ParameterArgument) -> NodeProgram:
         """Return the controller of one of the plants."""
@@ -108,12 +143,13 @@ class RegulationSettings:
         return {
             "pendulum.run": {
                 "experiment": experiment,
-                "strategy": self.effort_strategy,
+                "strategy": self.strategy,
                 "seed": self.noise.seed,
                 "disturbance": {"kind": "uniform", **asdict(self.noise)},
                 "controller": {"kind": self.controller, "q": list(self.q), "r": self.r},
                 "versions": versions(),
                 "git_revision": git_revision(),
+                **({} if (machine := self.machine) is None else {"lab": dict(machine.lab.values)}),
                 **more,
             }
         }

@@ -12,8 +12,7 @@ from pendulum_bags.experiments.conductor_node import Conductor, PlantClient
 from pendulum_bags.experiments.domain import reserve_domain
 from pendulum_bags.experiments.processes import Child, ProcessSet, ros_environment, start_recorder
 from pendulum_bags.experiments.progress import PhaseProgress
-from pendulum_bags.experiments.run_spec import EMULATOR_WATCHDOG
-from pendulum_bags.experiments.settings import RegulationSettings
+from pendulum_bags.experiments.settings import SETTLE_TIME, RegulationSettings
 from pendulum_bags.runs.run_folder import write_json
 from pendulum_msgs_py.contract.angles import UPRIGHT
 from pendulum_msgs_py.contract.trajectory import thesis_ramp
@@ -29,8 +28,6 @@ LOOP_NICENESS = -10
 """Priority of those who keep deadlines over all else on the machine, where we may take it."""
 OWN_PROTOCOL_SEED_STEP = 1_000_000
 """Added to the seed for the unpaired simulation, whose noise must not be that of the hardware."""
-SETTLE_TIME = 1.0
-"""Time under control before the noise starts [s]."""
 
 
 def run_thesis(folder: Path, settings: RegulationSettings, domain: int | None, progress: PhaseProgress) -> None:
@@ -76,13 +73,9 @@ def _start(processes: ProcessSet, folder: Path, settings: RegulationSettings) ->
 
 
 def _programs(settings: RegulationSettings) -> list[NodeProgram]:
-    # An emulator's feedback is as punctual as this machine, which may be a busy one; a real actuator keeps the default.
-    patience: dict[str, graph.ParameterArgument] = (
-        {"feedback_watchdog": EMULATOR_WATCHDOG, "command_lifetime": 0.25} if settings.hardware == "emulator" else {}
-    )
     return [
         graph.simulator("/sim", plant=settings.plant, method=settings.method, clock="realtime"),
-        graph.bridge("/hw", backend=settings.hardware, effort_strategy=settings.effort_strategy, **patience),
+        settings.bridge_program(),
         *(settings.controller_program(namespace, autostart=False) for namespace in ("/sim", "/hw")),
         *(settings.disturbance_program(namespace, autostart=False) for namespace in ("/sim", "/hw")),
     ]

@@ -10,9 +10,10 @@ from pathlib import Path
 from pendulum_bags.experiments.conductor_node import Conductor, PlantClient
 from pendulum_bags.experiments.domain import reserve_domain
 from pendulum_bags.experiments.lockstep import finish_recording, wait_until_all_hear_each_other
+from pendulum_bags.experiments.operator import RealMachine, real_machine
 from pendulum_bags.experiments.processes import ProcessSet, ros_environment, start_recorder
 from pendulum_bags.experiments.progress import PhaseProgress
-from pendulum_bags.experiments.run_spec import EMULATOR_WATCHDOG
+from pendulum_bags.experiments.run_spec import EMULATOR_LIFETIME, EMULATOR_WATCHDOG
 from pendulum_bags.experiments.settings import HARDWARE
 from pendulum_bags.experiments.thesis import LOOP_NICENESS, START_TIMEOUT
 from pendulum_bags.runs.run_folder import git_revision, versions, write_json
@@ -71,6 +72,7 @@ class TrialSettings:
         top: Highest angle of the staircase [deg].
         hold: Time at rest on each step [s].
         storage: Storage of the bags.
+        lab: Lab file of the real actuator, for ``hebi``.
     """
 
     kind: TrialKind
@@ -83,15 +85,22 @@ class TrialSettings:
     top: float = 90.0
     hold: float = 2.0
     storage: str = "mcap"
+    lab: str = ""
 
     def __post_init__(self) -> None:
         """Refuse what cannot be run before anything is started."""
         if self.hardware not in HARDWARE:
             raise ParameterError(f"hardware is {self.hardware!r}; expected one of {', '.join(HARDWARE)}")
+        real_machine(self.hardware, self.lab)
         if self.trials < 1:
             raise ParameterError(f"number of trials is {self.trials}; expected >= 1")
         if self.top / self.step != round(self.top / self.step):
             raise ParameterError(f"staircase top is {self.top:g} deg; expected a multiple of step, {self.step:g} deg")
+
+    @property
+    def machine(self) -> RealMachine | None:
+        """The machine of the lab file; None for the emulator."""
+        return real_machine(self.hardware, self.lab)
 
     @property
     def lockstep(self) -> bool:
@@ -113,6 +122,13 @@ class TrialSettings:
 
     def plant_program(self, trial: int) -> graph.NodeProgram:
         """Return the bridge."""
+        if (machine := self.machine) is not None:
+            patience: dict[str, graph.ParameterArgument] = {
+                "feedback_watchdog": EMULATOR_WATCHDOG,
+                "command_lifetime": EMULATOR_LIFETIME,
+            }
+            told = machine.bridge_parameters(**(patience if machine.emulated else {}))
+            return graph.bridge("/hw", **told, effort_strategy="direct_pwm")
         parameters: dict[str, graph.ParameterArgument] = {"plant": self.plant, "effort_strategy": "direct_pwm"}
         if self.hardware == "emulator":
             # Sensor noise differs from trial to trial, as it would.
@@ -257,6 +273,7 @@ def _metadata(settings: TrialSettings, trial: int) -> dict[str, object]:
             "trial": trial,
             "trials": settings.trials,
             "plant": settings.hardware,
+            **({} if (machine := settings.machine) is None else {"lab": dict(machine.lab.values)}),
             "emulated_plant": settings.plant if settings.hardware == "emulator" else "",
             "strategy": "direct_pwm" if kind.procedure == "hand" else "strategy 3 of the firmware",
             "seed": settings.seed,

@@ -10,6 +10,7 @@ import typer
 from rich.console import Console
 
 from pendulum_bags.experiments.domain import check_domain
+from pendulum_bags.experiments.operator import confirm
 from pendulum_bags.experiments.progress import PhaseProgress
 from pendulum_bags.runs.run_folder import create_run_folder, discard_if_empty
 from pendulum_msgs_py.errors import PendulumError
@@ -25,6 +26,8 @@ Out = Annotated[
     Path | None, typer.Option(help="Folder of the run; it must be new. Default: bags/runs/<UTC>_<experiment>.")
 ]
 Hardware = Annotated[str, typer.Option(help="emulator, or hebi for the real actuator.")]
+Lab = Annotated[Path | None, typer.Option(help="Lab file of the real actuator, for --hardware hebi.")]
+Yes = Annotated[bool, typer.Option("--yes", help="Do not ask before the real machine moves.")]
 Plant = Annotated[str, typer.Option(help="What the emulator is: preset or plant file with a drivetrain.")]
 Realtime = Annotated[bool, typer.Option(help="Keep the wall's time on the emulator too, instead of lockstep.")]
 Seed = Annotated[int, typer.Option(help="Seed of the emulator's sensor noise and of the simulated hand.", min=0)]
@@ -43,6 +46,8 @@ def add_commands(app: typer.Typer) -> None:
 def inertia_damping(
     out: Out = None,
     hardware: Hardware = "emulator",
+    lab: Lab = None,
+    yes: Yes = False,
     plant: Plant = "thesis",
     realtime: Realtime = False,
     seed: Seed = 1,
@@ -59,13 +64,15 @@ def inertia_damping(
     """
     from pendulum_bags.experiments.trials import INERTIA_DAMPING, TrialSettings
 
-    settings = TrialSettings(INERTIA_DAMPING, trials, hardware, plant, realtime, seed, storage=storage)
-    _run(settings, out, domain, json_output)
+    settings = TrialSettings(INERTIA_DAMPING, trials, hardware, plant, realtime, seed, storage=storage, lab=_text(lab))
+    _run(settings, out, domain, json_output, yes=yes)
 
 
 def gravity(
     out: Out = None,
     hardware: Hardware = "emulator",
+    lab: Lab = None,
+    yes: Yes = False,
     plant: Plant = "thesis",
     realtime: Realtime = False,
     seed: Seed = 1,
@@ -83,16 +90,31 @@ def gravity(
     """
     from pendulum_bags.experiments.trials import GRAVITY, TrialSettings
 
-    settings = TrialSettings(GRAVITY, trials, hardware, plant, realtime, seed, step, top, hold, storage)
-    _run(settings, out, domain, json_output)
+    settings = TrialSettings(GRAVITY, trials, hardware, plant, realtime, seed, step, top, hold, storage, _text(lab))
+    _run(settings, out, domain, json_output, yes=yes)
 
 
-def _run(settings: TrialSettings, out: Path | None, domain: int | None, json_output: bool) -> None:
+def _text(lab: Path | None) -> str:
+    return "" if lab is None else str(lab)
+
+
+def _run(
+    settings: TrialSettings, out: Path | None, domain: int | None, json_output: bool, *, yes: bool
+) -> None:
     from pendulum_bags.experiments.trials import run_trials
     from pendulum_bags.identification import identify_cli
 
     check_domain(domain)
     name = settings.kind.name
+    if (machine := settings.machine) is not None:
+        confirm(
+            machine,
+            settings.plant_program(1),
+            _plan(settings),
+            make_console(stderr=True, highlight=False),
+            yes=yes,
+            flat=settings.kind.flat,
+        )
     folder = create_run_folder(out, name)
     console = make_console(stderr=json_output, highlight=False)
     started = time.monotonic()
@@ -117,6 +139,18 @@ def _run(settings: TrialSettings, out: Path | None, domain: int | None, json_out
     )
     if code:
         raise typer.Exit(code)
+
+
+def _plan(settings: TrialSettings) -> str:
+    if settings.by_person:
+        return (
+            f"It arms {settings.trials} times with zero torque; a person turns the link, which lies flat, by hand. "
+            "The motor only brakes."
+        )
+    return (
+        f"It arms {settings.trials} times and follows a staircase of {settings.step:g} degrees to {settings.top:g}, to "
+        f"-{settings.top:g} and back, about {settings.expected_duration:.0f} s each."
+    )
 
 
 def _ask(console: Console, sentence: str) -> None:

@@ -49,7 +49,7 @@ class StudyProgress:
 
 def default_workers(study: Study) -> int:
     """Return how many runs to carry out at once: one where they keep the wall's time, else one for two cores."""
-    return 1 if study.realtime else max(1, (os.cpu_count() or 2) // 2)
+    return 1 if study.realtime or any(run.lab for run in study.runs) else max(1, (os.cpu_count() or 2) // 2)
 
 
 def open_study_folder(folder: Path, study: Study) -> None:
@@ -89,6 +89,7 @@ def run_study(
     workers: int,
     retry_failed: bool = False,
     on_progress: Callable[[StudyProgress], None] = lambda _: None,
+    before_machine: Callable[[StudyRun], None] = lambda _: None,
 ) -> StudyProgress:
     """Carry out all runs of a study that have not been carried out.
 
@@ -98,6 +99,8 @@ def run_study(
         workers: Runs at once.
         retry_failed: Carry out again those that failed; else they stay failed.
         on_progress: Called several times a second.
+        before_machine: Called before each run that moves a real machine; what it raises ends the study, which goes on
+            from there when it is started again.
 
     Returns:
         Where the study is at the end.
@@ -119,6 +122,8 @@ def run_study(
         try:
             while waiting or running:
                 while waiting and len(running) < workers:
+                    if waiting[0].lab:
+                        before_machine(waiting[0])
                     running.append(_start(folder, waiting.pop(0), processes, threads))
                 time.sleep(_POLL)
                 for item in list(running):
@@ -185,6 +190,8 @@ def _start(folder: Path, run: StudyRun, processes: ProcessSet, threads: ThreadPo
     command = [sys.executable, "-m", "pendulum_bags", "experiment"]
     if run.spec is None:
         command += [*run.arguments, "--out", str(place / "run")]
+        # The operator was asked before it was started; it has no terminal to ask on.
+        command += ["--yes"] if run.lab else []
     else:
         command += ["run", str(place / "spec.json"), "--bag", str(place / "bag")]
     # Each finds a free domain: one that is set in our environment would be the same for all.

@@ -18,7 +18,7 @@ from pendulum_msgs_py.programs.terminal import WholeTable, make_console
 
 if TYPE_CHECKING:
     from pendulum_bags.studies.results import Group
-    from pendulum_bags.studies.study_file import Study
+    from pendulum_bags.studies.study_file import Study, StudyRun
 
 __all__ = ["add_commands"]
 
@@ -34,6 +34,7 @@ Retry = Annotated[bool, typer.Option("--retry-failed", help="Carry out again the
 DryRun = Annotated[
     bool, typer.Option("--dry-run", help="Show matrix, time and disk that it needs; run nothing.")
 ]
+Yes = Annotated[bool, typer.Option("--yes", help="Do not ask before each run that moves a real machine.")]
 Seeds = Annotated[int, typer.Option(help="Number of seeds in place of the file's; 0 keeps those.", min=0)]
 Json = Annotated[bool, typer.Option("--json", help="Print the result as JSON instead of tables.")]
 
@@ -69,6 +70,7 @@ def study(
     seeds: Seeds = 0,
     retry_failed: Retry = False,
     dry_run: DryRun = False,
+    yes: Yes = False,
     json_output: Json = False,
 ) -> None:
     """Carry out a study: plants x controllers x disturbances x set-points x starts x seeds.
@@ -77,7 +79,7 @@ def study(
 
     Example: python -m pendulum_bags experiment study random_start --out /tmp/random --workers 2
     """
-    _study(file, out, workers, seeds, retry_failed, dry_run, json_output)
+    _study(file, out, workers, seeds, retry_failed, dry_run, json_output, yes=yes)
 
 
 def strategies(
@@ -150,7 +152,10 @@ def _study(
     retry_failed: bool,
     dry_run: bool,
     json_output: bool,
+    *,
+    yes: bool = False,
 ) -> None:
+    from pendulum_bags.experiments.operator import ask_yes, real_machine
     from pendulum_bags.studies.results import collect, write_table
     from pendulum_bags.studies.runner import StudyProgress, default_workers, open_study_folder, run_study
     from pendulum_bags.studies.study_file import load_study
@@ -179,9 +184,19 @@ def _study(
                 f"{progress.done} of {progress.total} runs{failed}, {_duration(progress.remaining)} left"
             )
 
+    def ask(run: StudyRun) -> None:
+        bar.stop()
+        plan = f"Run {run.number} of {len(found.runs)}, {run.name}: {' '.join(run.arguments)}"
+        machine = real_machine("hebi", run.lab)
+        assert machine is not None
+        ask_yes(machine, plan, make_console(stderr=True, highlight=False), yes=yes)
+        bar.start()
+
+    if any(run.lab for run in found.runs) and workers > 1:
+        raise ParameterError(f"workers is {workers}; expected 1: there is one machine")
     with resumable(console, folder), counting_bar(console, TextColumn("{task.fields[remaining]} left")) as bar:
         task = bar.add_task(found.name, total=len(found.runs), remaining="")
-        end = run_study(folder, found, workers=workers, retry_failed=retry_failed, on_progress=show)
+        end = run_study(folder, found, workers=workers, retry_failed=retry_failed, on_progress=show, before_machine=ask)
     records = collect(folder, found)
     write_table(folder / "runs.csv", records)
     for record in records:

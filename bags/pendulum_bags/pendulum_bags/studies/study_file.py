@@ -29,7 +29,7 @@ _KEYS = (
     "format", "name", "description", "experiment", "analysis", "clock", "duration", "plants", "controllers",
     "disturbances", "set_points", "starts", "seeds", "repeats", "trials",
 )  # fmt: skip
-_PLANT_KEYS = ("side", "plant", "design_plant", "strategy", "method", "engine", "parameters", "hardware")
+_PLANT_KEYS = ("side", "plant", "design_plant", "strategy", "method", "engine", "parameters", "hardware", "lab")
 _MAX_RUNS = 100_000
 _LARGEST = 1e300  # whole numbers in YAML have no end
 
@@ -71,6 +71,12 @@ class StudyRun:
         labels = [self.labels[axis] for axis in ("plant", "controller", "disturbance", "start")]
         parts = [f"{label:.4g}" if isinstance(label, float) else str(label) for label in labels]
         return "_".join([f"{self.number:05}", *(p for p in parts if p), f"seed{self.labels['seed']}"])
+
+    @property
+    def lab(self) -> str:
+        """Lab file of the real machine that the run moves; empty where it moves none."""
+        given = dict(itertools.pairwise(self.arguments))
+        return str(given.get("--lab", "")) if given.get("--hardware") == "hebi" else ""
 
     def fingerprint(self) -> str:
         """Return a short hash of all that the run is made of."""
@@ -252,10 +258,16 @@ def _named_runs(
         itertools.product(*axes), start=1
     ):
         settings = plants[plant].values
+        if settings.get("hardware") == "hebi" and not settings.get("lab"):
+            plants[plant].fail("hardware is 'hebi' without a lab file; expected lab: FILE", "hardware")
         arguments = [experiment, "--seed", str(seed), "--hardware", str(settings.get("hardware", "emulator"))]
+        if settings.get("lab"):
+            # A file beside the study is found from wherever the study is started.
+            arguments += ["--lab", str((file.path.resolve().parent / str(settings["lab"])).resolve())]
         arguments += ["--plant", str(settings.get("plant", "thesis"))]
         if experiment == "thesis":
-            arguments += ["--strategy", str(settings.get("strategy", "direct_pwm"))]
+            if "strategy" in settings or not settings.get("lab"):
+                arguments += ["--strategy", str(settings.get("strategy", "direct_pwm"))]
             arguments += _thesis_arguments(controllers[controller], controller, disturbances[disturbance])
             duration = _duration(file)
             arguments += ["--duration", repr(duration)]

@@ -1,0 +1,149 @@
+"""A real machine moves only after its checklist and an operator's yes."""
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from pendulum_bags.experiments.operator import ask_yes, real_machine
+from pendulum_bags.experiments.settings import RegulationSettings
+from pendulum_bags.experiments.trials import GRAVITY, INERTIA_DAMPING, TrialSettings
+from pendulum_bags.studies.runner import default_workers, open_study_folder, read_record, run_study
+from pendulum_bags.studies.study_file import StudyRun, load_study
+from pendulum_msgs_py.errors import FaultError, ParameterError
+from pendulum_msgs_py.programs.terminal import make_console
+
+LAB = """format: pendulum_lab/1
+module: {backend: emulator_process, emulator_address: '127.0.0.1:9', serial: X5-9-7}
+joint: {sign: -1}
+limits:
+  effort: {value: 2.0, unit: N m}
+drive: {effort_strategy: effort_loop}
+"""
+
+
+@pytest.fixture
+def lab(tmp_path: Path) -> Path:
+    path = tmp_path / "lab.yaml"
+    path.write_text(LAB, encoding="utf-8")
+    return path
+
+
+def experiment(*arguments: str | Path, answer: str = "") -> subprocess.CompletedProcess[str]:
+    command = [sys.executable, "-m", "pendulum_bags", "experiment", *map(str, arguments)]
+    return subprocess.run(command, input=answer, capture_output=True, text=True, timeout=60, check=False)
+
+
+def test_the_bridge_of_a_real_machine_gets_the_lab_file_and_nothing_that_contradicts_it(lab: Path) -> None:
+    settings = RegulationSettings(hardware="hebi", lab=str(lab))
+    assert settings.strategy == "effort_loop"
+    program = settings.bridge_program()
+    # A rehearsal on an emulator has the patience that a busy machine needs.
+    assert program.parameters == {
+        "lab_file": str(lab),
+        "effort_strategy": "effort_loop",
+        "feedback_watchdog": 25,
+        "command_lifetime": 0.25,
+    }
+    lab.write_text(LAB.replace("backend: emulator_process, ", ""), encoding="utf-8")
+    assert settings.bridge_program().parameters == {"lab_file": str(lab), "effort_strategy": "effort_loop"}
+    assert RegulationSettings(hardware="hebi", lab=str(lab), effort_strategy="direct_pwm").strategy == "direct_pwm"
+    run = settings.metadata("thesis")["pendulum.run"]
+    assert run["strategy"] == "effort_loop"
+    assert run["lab"]["joint_sign"] == -1
+    for kind in (GRAVITY, INERTIA_DAMPING):
+        assert TrialSettings(kind, 1, "hebi", lab=str(lab)).plant_program(1).parameters["lab_file"] == str(lab)
+
+
+@pytest.mark.parametrize("name", ["thesis", "gravity", "inertia_damping"])
+def test_a_real_machine_needs_its_lab_file(name: str, tmp_path: Path) -> None:
+    done = experiment(name, "--hardware", "hebi", "--out", tmp_path / "run")
+    assert done.returncode == 2
+    assert "without a lab file; expected --lab FILE" in done.stderr
+    assert not (tmp_path / "run").exists()
+
+
+def test_a_lab_file_for_the_emulator_is_a_mistake(lab: Path) -> None:
+    with pytest.raises(ParameterError, match="expected --hardware hebi"):
+        real_machine("emulator", lab)
+
+
+def test_nothing_is_started_where_the_checklist_is_not_passed(lab: Path, tmp_path: Path) -> None:
+    done = experiment("gravity", "--hardware", "hebi", "--lab", lab, "--yes", "--out", tmp_path / "run")
+    assert done.returncode == 2
+    # Nobody listens on the emulator's address.
+    assert "does not answer" in done.stderr
+    assert "the checklist is not passed" in done.stderr
+    assert "nothing was started" in done.stderr
+    assert "This moves" not in done.stderr
+    assert not (tmp_path / "run").exists()
+
+
+@pytest.mark.parametrize("answer", ["", "no", "y", "yess"])
+def test_any_answer_but_yes_ends_here(lab: Path, answer: str) -> None:
+    machine = real_machine("hebi", lab)
+    assert machine is not None
+    with pytest.raises(FaultError, match="nothing was started"):
+        ask_yes(machine, "It moves.", make_console(), yes=False, read=lambda: answer)
+
+
+def test_the_question_says_which_machine_and_what_it_will_do(lab: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    machine = real_machine("hebi", lab)
+    assert machine is not None
+    ask_yes(machine, "It turns upright.", make_console(), yes=False, read=lambda: " Yes\n")
+    said = " ".join(capsys.readouterr().out.split())
+    for words in ("EMULATED", "X5-9-7", str(lab), "It turns upright.", "2 N m", "motion stop", "Type yes to arm"):
+        assert words in said
+
+    def nobody() -> str:
+        raise EOFError
+
+    with pytest.raises(FaultError, match="nobody is there to say yes; expected a terminal, or --yes"):
+        ask_yes(machine, "It moves.", make_console(), yes=False, read=nobody)
+    ask_yes(machine, "It moves.", make_console(), yes=True, read=nobody)
+
+
+STUDY = """format: pendulum_study/1
+name: real
+experiment: gravity
+clock: realtime
+plants:
+  bench: {hardware: hebi, lab: lab.yaml}
+trials: 1
+seeds: {first: 1, count: 2}
+"""
+
+
+def test_a_study_asks_before_each_run_of_a_real_machine_and_goes_on_where_it_was_stopped(
+    lab: Path, tmp_path: Path
+) -> None:
+    file = tmp_path / "study.yaml"
+    file.write_text(STUDY, encoding="utf-8")
+    study = load_study(file)
+    assert [run.lab for run in study.runs] == [str(lab), str(lab)]
+    assert default_workers(study) == 1
+    folder = tmp_path / "out"
+    open_study_folder(folder, study)
+    asked: list[int] = []
+
+    def answer(run: StudyRun) -> None:
+        asked.append(run.number)
+        if len(asked) == 2:
+            raise FaultError("the answer is 'no'")
+
+    with pytest.raises(FaultError, match="no"):
+        run_study(folder, study, workers=1, before_machine=answer)
+    assert asked == [1, 2]
+    # The first was started, and refused by its checklist: nobody listens there.
+    record = read_record(folder, study.runs[0])
+    assert record is not None
+    assert "does not answer" in record["reason"]
+    assert read_record(folder, study.runs[1]) is None
+
+
+def test_a_study_of_a_real_machine_without_its_file_is_refused(tmp_path: Path) -> None:
+    file = tmp_path / "study.yaml"
+    file.write_text(STUDY.replace(", lab: lab.yaml", ""), encoding="utf-8")
+    with pytest.raises(ParameterError, match="hardware is 'hebi' without a lab file"):
+        load_study(file)
