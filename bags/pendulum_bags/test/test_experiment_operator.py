@@ -1,11 +1,10 @@
 """A real machine moves only after its checklist and an operator's yes."""
 
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
 
+from pendulum_bags.experiments import experiment_cli
 from pendulum_bags.experiments.operator import ask_yes, real_machine
 from pendulum_bags.experiments.settings import RegulationSettings
 from pendulum_bags.experiments.trials import GRAVITY, INERTIA_DAMPING, TrialSettings
@@ -30,11 +29,6 @@ def lab(tmp_path: Path) -> Path:
     return path
 
 
-def experiment(*arguments: str | Path, answer: str = "") -> subprocess.CompletedProcess[str]:
-    command = [sys.executable, "-m", "pendulum_bags", "experiment", *map(str, arguments)]
-    return subprocess.run(command, input=answer, capture_output=True, text=True, timeout=60, check=False)
-
-
 def test_the_bridge_of_a_real_machine_gets_the_lab_file_and_nothing_that_contradicts_it(lab: Path) -> None:
     settings = RegulationSettings(hardware="hebi", lab=str(lab))
     assert settings.strategy == "effort_loop"
@@ -57,10 +51,11 @@ def test_the_bridge_of_a_real_machine_gets_the_lab_file_and_nothing_that_contrad
 
 
 @pytest.mark.parametrize("name", ["thesis", "gravity", "inertia_damping"])
-def test_a_real_machine_needs_its_lab_file(name: str, tmp_path: Path) -> None:
-    done = experiment(name, "--hardware", "hebi", "--out", tmp_path / "run")
-    assert done.returncode == 2
-    assert "without a lab file; expected --lab FILE" in done.stderr
+def test_a_real_machine_needs_its_lab_file(
+    name: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert experiment_cli.main([name, "--hardware", "hebi", "--out", str(tmp_path / "run")]) == 2
+    assert "without a lab file; expected --lab FILE" in capsys.readouterr().err
     assert not (tmp_path / "run").exists()
 
 
@@ -69,14 +64,16 @@ def test_a_lab_file_for_the_emulator_is_a_mistake(lab: Path) -> None:
         real_machine("emulator", lab)
 
 
-def test_nothing_is_started_where_the_checklist_is_not_passed(lab: Path, tmp_path: Path) -> None:
-    done = experiment("gravity", "--hardware", "hebi", "--lab", lab, "--yes", "--out", tmp_path / "run")
-    assert done.returncode == 2
-    # Nobody listens on the emulator's address.
-    assert "does not answer" in done.stderr
-    assert "the checklist is not passed" in done.stderr
-    assert "nothing was started" in done.stderr
-    assert "This moves" not in done.stderr
+def test_nothing_is_started_where_the_checklist_is_not_passed(
+    lab: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    lab.write_text(LAB.replace("emulator_process", "emulator").replace("sign: -1", "zero: {value: 3.0, unit: rad}"))
+    arguments = ["gravity", "--hardware", "hebi", "--lab", str(lab), "--yes", "--out", str(tmp_path / "run")]
+    assert experiment_cli.main(arguments) == 2
+    said = " ".join(capsys.readouterr().err.split())
+    assert "the checklist is not passed: hanging is zero: 3.000 rad (expected 0 within" in said
+    assert "nothing was started" in said
+    assert "This moves" not in said
     assert not (tmp_path / "run").exists()
 
 
@@ -118,6 +115,7 @@ seeds: {first: 1, count: 2}
 def test_a_study_asks_before_each_run_of_a_real_machine_and_goes_on_where_it_was_stopped(
     lab: Path, tmp_path: Path
 ) -> None:
+    lab.write_text(LAB.replace("emulator_process", "replay"), encoding="utf-8")
     file = tmp_path / "study.yaml"
     file.write_text(STUDY, encoding="utf-8")
     study = load_study(file)
@@ -135,10 +133,10 @@ def test_a_study_asks_before_each_run_of_a_real_machine_and_goes_on_where_it_was
     with pytest.raises(FaultError, match="no"):
         run_study(folder, study, workers=1, before_machine=answer)
     assert asked == [1, 2]
-    # The first was started, and refused by its checklist: nobody listens there.
+    # The first was started, and refused by its checklist.
     record = read_record(folder, study.runs[0])
     assert record is not None
-    assert "does not answer" in record["reason"]
+    assert "replay_file is empty" in record["reason"]
     assert read_record(folder, study.runs[1]) is None
 
 

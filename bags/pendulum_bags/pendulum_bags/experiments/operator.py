@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import subprocess
 import sys
 from collections.abc import Callable
@@ -95,7 +96,7 @@ def run_checklist(bridge: NodeProgram, console: Console, *, flat: bool = False) 
     Raises:
         FaultError: It is not passed.
     """
-    command = [sys.executable, "-m", "pendulum_hw_bridge", "check", "--no-nudge", *bridge.ros_arguments()]
+    command = [sys.executable, "-m", "pendulum_hw_bridge", "check", "--json", "--no-nudge", *bridge.ros_arguments()]
     command += ["-p", "flat:=true"] if flat else []
     console.print("checking the machine ...", style="dim")
     try:
@@ -112,12 +113,19 @@ def run_checklist(bridge: NodeProgram, console: Console, *, flat: bool = False) 
         raise FaultError(f"the checklist did not end within {_CHECK_TIMEOUT:g} s; nothing was started") from None
     if done.returncode == 0:
         return
-    console.print(done.stdout, markup=False, highlight=False, soft_wrap=True)
     if done.returncode == _EXIT_BUSY:
         raise FaultError("this computer is too busy to drive the machine; nothing was started")
-    said = [line for line in done.stderr.splitlines() if line.startswith("error: ")]
-    reason = said[-1].removeprefix("error: ") if said else "its lines with NO stand above"
-    raise FaultError(f"the checklist is not passed: {reason}; nothing was started")
+    raise FaultError(f"the checklist is not passed: {_refusals(done.stdout, done.stderr)}; nothing was started")
+
+
+def _refusals(printed: str, said: str) -> str:
+    """Return what speaks against arming: the lines of the checklist that fail, or why there is none."""
+    try:
+        items = json.loads(printed)["items"]
+    except (ValueError, KeyError):
+        return said.strip().splitlines()[-1].removeprefix("error: ") if said.strip() else "it ended without a word"
+    wrong = [item for item in items if item["passed"] is False]
+    return "; ".join(f"{item['name']}: {item['seen']} (expected {item['expected']})" for item in wrong)
 
 
 def ask_yes(
