@@ -7,12 +7,16 @@ import shutil
 from pathlib import Path
 
 import pytest
+import zstandard
 
+from pendulum_bags.analyse import bag_table
 from pendulum_bags.analyse.analyse_cli import main
 from pendulum_bags.analyse.bag_table import analyse_bags, find_pieces
 from pendulum_bags.comparison import compare_runs
 from pendulum_bags.runs.run_data import plant_summary, read_run
 from pendulum_msgs_py.errors import BagError, ParameterError
+from pendulum_rosbag.reader import read_bag
+from pendulum_rosbag.storage import open_writer
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
 
@@ -70,6 +74,74 @@ def test_interrupted_analysis_goes_on_and_a_changed_bag_is_asked_again(runs: Pat
     shutil.copytree(EXAMPLES / "regulation_sim", runs / "wednesday")
     mended = analyse_bags(tmp_path / "out", find_pieces([runs], ["metrics"]), ["metrics"])
     assert (mended.kept, mended.failed) == (4, 0)
+
+
+def test_bags_of_one_name_have_rows_of_their_own(runs: Path, tmp_path: Path) -> None:
+    def rows(*folders: Path) -> dict[str, str]:
+        pieces = find_pieces(list(folders), ["timing"])
+        return {piece.name: str(Path(piece.path).relative_to(runs.resolve())) for piece in pieces}
+
+    assert rows(runs / "monday" / "sim", runs / "tuesday" / "sim") == {
+        "monday/sim": "monday/sim",
+        "tuesday/sim": "tuesday/sim",
+    }
+    shutil.copytree(runs / "monday", runs / "a" / "week" / "monday")
+    shutil.copytree(runs / "monday", runs / "b" / "week" / "monday")
+    assert list(rows(runs / "a" / "week", runs / "b" / "week").values()) == [
+        f"{place}/week/monday/{side}" for place in "ab" for side in ("hw", "sim")
+    ]
+    # One bag that is named twice is one bag.
+    assert list(rows(runs / "monday", runs / "monday" / "sim")) == ["monday/hw", "monday/sim"]
+    assert [piece.name for piece in find_pieces([runs / "a" / "week", runs / "b" / "week"], ["compare"])] == [
+        "a/week/monday",
+        "b/week/monday",
+    ]
+
+
+@pytest.mark.parametrize("ending", [".mcap", ".db3"])
+def test_bags_compressed_as_a_whole_are_asked_too(tmp_path: Path, ending: str) -> None:
+    folder = tmp_path / "runs" / "packed"
+    bag = read_bag(EXAMPLES / "regulation_sim")
+    with open_writer(folder, "mcap" if ending == ".mcap" else "sqlite3") as writer:
+        for topic, info in bag.topics.items():
+            writer.add_topic(topic, info.type)
+            writer.write_many((topic, *row) for row in bag.raw(topic))
+    (file,) = folder.glob(f"*{ending}")
+    file.with_name(f"{file.name}.zstd").write_bytes(zstandard.compress(file.read_bytes()))
+    file.unlink()
+    metadata = folder / "metadata.yaml"
+    metadata.write_text(metadata.read_text().replace(ending, f"{ending}.zstd"))
+    table = analyse_bags(tmp_path / "out", find_pieces([tmp_path / "runs"], ["timing"]), ["timing"])
+    assert [(row["bag"], row["error"], row["states_count"]) for row in table.bags] == [("packed", "", 2501)]
+
+
+def test_a_bag_whose_files_are_gone_and_a_program_that_stumbles_have_rows_that_say_so(
+    runs: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for file in (runs / "monday" / "hw").glob("*.mcap"):
+        file.unlink()
+
+    def stumble(path: Path, plant: str) -> dict[str, object]:
+        if path.parent.name == "tuesday":
+            raise KeyError("noise")
+        return {"fine": 1}
+
+    monkeypatch.setattr(bag_table, "BAG_QUESTIONS", {"timing": stumble})
+    table = analyse_bags(tmp_path / "out", find_pieces([runs / "monday", runs / "tuesday"], ["timing"]), ["timing"])
+    assert [row["bag"] for row in table.bags] == ["monday/hw", "monday/sim", "tuesday/hw", "tuesday/sim"]
+    assert "is no bag" in table.bags[0]["error"]
+    assert table.bags[1]["fine"] == 1
+    assert table.bags[3]["error"] == "KeyError: 'noise'"
+
+
+def test_another_version_of_the_program_asks_again(
+    runs: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pieces = find_pieces([runs / "monday"], ["timing"])
+    analyse_bags(tmp_path / "out", pieces, ["timing"])
+    assert analyse_bags(tmp_path / "out", pieces, ["timing"]).kept == 2
+    monkeypatch.setattr(bag_table, "program_hash", lambda: "another")
+    assert analyse_bags(tmp_path / "out", pieces, ["timing"]).kept == 0
 
 
 def test_what_cannot_be_asked_is_refused(

@@ -10,10 +10,13 @@ import csv
 import hashlib
 import json
 import math
+import os
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass, field
+from functools import cache
+from importlib import resources
 from pathlib import Path
 from typing import Any
 
@@ -28,11 +31,12 @@ from pendulum_msgs_py.contract import names
 from pendulum_msgs_py.contract.angles import UPRIGHT
 from pendulum_msgs_py.errors import BagError, DataError, ParameterError, PendulumError
 from pendulum_rosbag.reader import Bag, read_bag
+from pendulum_rosbag.reader.open_source import is_bag_folder, is_storage_file
 from pendulum_rosbag.reader.statistics import bag_statistics
+from pendulum_rosbag.storage.metadata_file import METADATA_NAME
 
 __all__ = ["BAG_QUESTIONS", "QUESTIONS", "RUN_QUESTIONS", "Piece", "Table", "analyse_bags", "find_pieces"]
 
-_ENDINGS = (".mcap", ".db3")
 _LABELS = ("bag", "plant", "error")
 
 Row = dict[str, Any]
@@ -53,12 +57,23 @@ class Piece:
     is_run: bool
 
     def fingerprint(self, questions: Sequence[str]) -> str:
-        """Return a hash of what it holds, by sizes and times of its files, and of what is asked."""
+        """Return a hash of what it holds, by sizes and times of its files, of what is asked, and of who answers."""
         path = Path(self.path)
         files = [path] if path.is_file() else sorted(file for file in path.rglob("*") if _is_content(file))
         seen = [(str(file.relative_to(path)), file.stat().st_size, file.stat().st_mtime_ns) for file in files]
-        content = json.dumps([self.name, self.is_run, list(questions), seen])
+        content = json.dumps([self.name, self.is_run, list(questions), seen, program_hash()])
         return hashlib.sha256(content.encode()).hexdigest()[:16]
+
+
+@cache
+def program_hash() -> str:
+    """Return a hash of the modules that answers depend on: another version of the program answers anew."""
+    digest = hashlib.sha256()
+    for package in ("pendulum_bags", "pendulum_msgs_py", "pendulum_rosbag", "pendulum_sim"):
+        folder = Path(str(resources.files(package)))
+        for file in sorted(folder.rglob("*.py")):
+            digest.update(str(file.relative_to(folder)).encode() + b"\0" + file.read_bytes())
+    return digest.hexdigest()
 
 
 @dataclass(frozen=True)
@@ -93,24 +108,33 @@ def find_pieces(folders: Sequence[Path], questions: Sequence[str]) -> list[Piece
     for question in questions:
         if question not in QUESTIONS:
             raise ParameterError(f"question is {question!r}; expected one of {', '.join(QUESTIONS)}")
-    found: dict[str, Piece] = {}
+    bags: dict[Path, str] = {}
     for folder in folders:
         if not folder.exists():
             raise BagError(f"{folder} does not exist; expected a folder of bags, or a bag")
         for path in _bags_below(folder):
-            name = folder.name if path == folder else str(path.relative_to(folder))
-            if len(folders) > 1 and path != folder:
-                name = f"{folder.name}/{name}"
-            if any(question in BAG_QUESTIONS for question in questions):
-                found[f"{name}:bag"] = Piece(name, str(path.resolve()), False)
-            run = path.parent
-            if path.name == "sim" and (run / "hw").is_dir() and any(q in RUN_QUESTIONS for q in questions):
-                name = str(Path(name).parent) if Path(name).parent != Path() else run.name
-                found[f"{name}:run"] = Piece(name, str(run.resolve()), True)
+            below = folder.name if path == folder else str(path.relative_to(folder))
+            name = f"{folder.name}/{below}" if len(folders) > 1 and path != folder else below
+            bags.setdefault(path.resolve(), name)
+    found: list[Piece] = []
+    for path, name in _distinct(bags).items():
+        if any(question in BAG_QUESTIONS for question in questions):
+            found.append(Piece(name, str(path), False))
+        run = path.parent
+        if path.name == "sim" and (run / "hw").is_dir() and any(q in RUN_QUESTIONS for q in questions):
+            found.append(Piece(str(Path(name).parent) if len(Path(name).parts) > 1 else run.name, str(run), True))
     if not found:
         what = " or ".join(sorted({_wanted(question) for question in questions}))
         raise BagError(f"{', '.join(map(str, folders))}: no {what} in there")
-    return [found[key] for key in sorted(found)]
+    return sorted(found, key=lambda piece: (piece.name, piece.is_run))
+
+
+def _distinct(bags: Mapping[Path, str]) -> dict[Path, str]:
+    """Return the bags with names that differ: where two have one, all are named from the folder that holds them all."""
+    if len(set(bags.values())) == len(bags):
+        return dict(bags)
+    common = Path(os.path.commonpath([path.parent for path in bags]))
+    return {path: str(path.relative_to(common)) for path in bags}
 
 
 def analyse_bags(
@@ -174,8 +198,8 @@ def _ask(job: tuple[Sequence[Piece], Sequence[str], str], index: int, _threads: 
         with read_bag(piece.path) as bag:
             plants = _plants(bag)
             told = _told(bag)
-    except PendulumError as error:
-        return [{"bag": piece.name, "plant": "", "error": str(error)}]
+    except Exception as error:  # noqa: BLE001  # one bag must not cost the table of a thousand others
+        return [{"bag": piece.name, "plant": "", "error": _sentence(error)}]
     if not plants:
         return [{"bag": piece.name, "plant": "", "error": f"the bag has no topic that ends in {names.JOINT_STATES}"}]
     rows = []
@@ -191,9 +215,16 @@ def _answer(row: Row, questions: Sequence[Callable[..., Row]], *arguments: Any) 
     for question in questions:
         try:
             row.update({name: _plain(value) for name, value in question(*arguments).items()})
-        except (PendulumError, ArithmeticError, np.linalg.LinAlgError) as error:
-            errors.append(str(error) or type(error).__name__)
+        except Exception as error:  # noqa: BLE001  # as above
+            errors.append(_sentence(error))
     row["error"] = "; ".join(dict.fromkeys(errors))
+
+
+def _sentence(error: Exception) -> str:
+    """Return why there is no answer; what the program did not expect is told with its kind."""
+    if isinstance(error, PendulumError):
+        return str(error)
+    return f"{type(error).__name__}: {error}" if str(error) else type(error).__name__
 
 
 def _metrics(path: Path, plant: str) -> Row:
@@ -280,18 +311,17 @@ def _bags_below(folder: Path) -> Iterator[Path]:
     if folder.is_file():
         yield folder
         return
-    inside = sorted(folder.iterdir())
-    if any(path.is_file() and path.suffix in _ENDINGS for path in inside):
+    if is_bag_folder(folder):
         yield folder
         return
-    for path in inside:
+    for path in sorted(folder.iterdir()):
         # Links may lead round in a circle, hidden folders are somebody's scratch.
         if path.is_dir() and not path.is_symlink() and not path.name.startswith("."):
             yield from _bags_below(path)
 
 
 def _is_content(path: Path) -> bool:
-    return path.is_file() and (path.suffix in _ENDINGS or path.name == "metadata.yaml")
+    return is_storage_file(path) or (path.is_file() and path.name == METADATA_NAME)
 
 
 def _wanted(question: str) -> str:

@@ -18,7 +18,7 @@ from pendulum_rosbag.reader.message_compression import UnpackedSource, holds_pac
 from pendulum_rosbag.reader.sqlite_source import SqliteSource
 from pendulum_rosbag.storage.metadata_file import METADATA_NAME, METADATA_VERSION
 
-__all__ = ["BagFolder", "open_folder", "open_source", "open_sources"]
+__all__ = ["BagFolder", "is_bag_folder", "is_storage_file", "open_folder", "open_source", "open_sources"]
 
 _ENDINGS = {".mcap": "mcap", ".db3": "sqlite3"}
 _LEAST_ROOM = 1 << 28
@@ -43,6 +43,21 @@ class BagFolder:
     damage: list[str] = field(default_factory=list)
 
 
+def is_storage_file(path: Path) -> bool:
+    """Tell whether a file is a storage file by its name, compressed as a whole or not."""
+    return _ending(path) in _ENDINGS and not path.name.startswith(".") and path.is_file()
+
+
+def is_bag_folder(path: Path) -> bool:
+    """Tell whether a folder is a bag: it has storage files, or the metadata of some that were lost."""
+    if any(is_storage_file(file) for file in path.iterdir()):
+        return True
+    try:
+        return "rosbag2_bagfile_information" in _read_metadata(path / METADATA_NAME)
+    except (OSError, UnicodeDecodeError):
+        return False
+
+
 def open_folder(path: Path) -> BagFolder:
     """Read the metadata of a bag and list its storage files.
 
@@ -63,11 +78,10 @@ def open_folder(path: Path) -> BagFolder:
     else:
         _take_metadata(folder, text)
     try:
-        inside = [file for file in path.iterdir() if _ending(file) in _ENDINGS and file.is_file()]
+        inside = [file for file in path.iterdir() if is_storage_file(file)]
     except OSError as error:
         raise BagError(f"{path} cannot be read as a bag: {error.strerror or error}") from error
     present = sorted(inside, key=_file_order)
-    present = [file for file in present if not file.name.startswith(".")]
     listed = [file for file in dict.fromkeys(folder.files) if file.is_file()]
     if missing := [file.name for file in folder.files if file not in listed]:
         folder.damage.append(f"listed but missing: {', '.join(missing)}")
