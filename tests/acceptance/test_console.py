@@ -12,11 +12,21 @@ from typing import Any
 import pytest
 
 from pendulum_bags.console.security import refusal
+from tests.faults.console_stops import CHROMIUM, QUIET, STOPS, StopRig
 from tests.fixtures import wait_for
 from tests.processes import ProcessGroup, RunningProgram
 
-CHROMIUM = Path("/usr/bin/chromium")
-QUIET = ["--no-sandbox", "--disable-gpu", "--disable-background-networking", "--disable-component-update"]
+IN_SHORT = (
+    "stop by Enter on the button",
+    "stop by click() as a screen reader sends it",
+    "stop by touch on a second client",
+    "stop while the plant is frozen",
+    "stop while the plant is killed and started anew",
+    "stop while the console's server is frozen",
+    "stop while the console's server is killed and started anew",
+    "stop while the link to the server is cut",
+)
+"""Ways to lose a stop that each run tries once; all of them, 20 times: ``python -m tests.faults.console_stops``."""
 STOP_LIMIT_MS = 100.0
 
 
@@ -134,6 +144,23 @@ def test_two_clients_see_stop_tune_and_meet_a_new_simulator(
     wait_for(lambda: _mode(desk) == "armed_effort", 60, "the new plant")
     before = desk.evaluate("pendulumConsole.plants['/sim'].stamp_ns")
     wait_for(lambda: desk.evaluate("pendulumConsole.plants['/sim'].stamp_ns") != before, 10, "new states")
+
+
+@pytest.mark.timeout(300)
+def test_no_stop_is_lost_whatever_is_frozen_killed_or_cut_off(domain_id: int, tmp_path: Path) -> None:
+    playwright = pytest.importorskip("playwright.sync_api")
+    if not CHROMIUM.is_file():
+        pytest.skip(f"no browser at {CHROMIUM}")
+    with playwright.sync_playwright() as play:
+        rig = StopRig(tmp_path, play)
+        try:
+            for name in IN_SHORT:
+                rig.rearm()
+                outcome = STOPS[name](rig)
+                assert outcome.survived, f"{name}: {outcome.detail}"
+        finally:
+            left = rig.close()
+    assert left == []
 
 
 @pytest.mark.timeout(120)

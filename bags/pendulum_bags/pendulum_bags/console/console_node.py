@@ -30,6 +30,7 @@ from std_srvs.srv import SetBool, Trigger
 from pendulum_bags.console.jobs import Jobs
 from pendulum_bags.console.page import serve
 from pendulum_bags.console.security import is_loopback
+from pendulum_bags.console.stop_order import StopOrder
 from pendulum_msgs_py.contract import names
 from pendulum_msgs_py.errors import FaultError, ParameterError
 from pendulum_msgs_py.programs.executables import cli_main
@@ -51,6 +52,9 @@ _TORQUES = {
     "applied": names.APPLIED_EFFORT,
 }
 _STOP_SERVICE = "/e_stop"
+_STOP_TICK = 0.02
+_STOP_WAIT = 0.4
+"""How long a press waits for the plants' answers before it says who has not answered yet [s]."""
 
 
 @dataclass
@@ -95,9 +99,20 @@ class Hub:
         self._executor.add_node(self._node)
         self._thread = threading.Thread(target=self._spin, daemon=True)
         self._thread.start()
+        self._order = StopOrder()
+        self._order_lock = threading.Lock()
+        self._order_changed = threading.Event()
+        self._stop_clients: dict[str, Any] = {}
+        self._stop_calls: dict[str, list[tuple[float, Any]]] = {}
+        self._leaving = threading.Event()
+        self._stopper = threading.Thread(target=self._keep_stopping, name="stop", daemon=True)
+        self._stopper.start()
 
     def close(self) -> None:
         """Leave the graph."""
+        self._leaving.set()
+        self._order_changed.set()
+        self._stopper.join(2.0)
         self._done.set_result(None)
         self._executor.wake()
         self._thread.join(2.0)
@@ -122,12 +137,85 @@ class Hub:
 
     # --- what a person asks for ----------------------------------------------------------------------------
 
-    async def e_stop(self) -> dict[str, str]:
-        """Latch the e-stop of every plant at once and return what each said."""
-        nodes = self.plants()
-        calls = [self._call(Trigger, f"{node}{_STOP_SERVICE}", Trigger.Request()) for node in nodes.values()]
-        answers = await asyncio.gather(*calls, return_exceptions=True)
-        return {space: _said(answer) for space, answer in zip(nodes, answers, strict=True)}
+    async def e_stop(self) -> dict[str, Any] | None:
+        """Order every plant to stop until a person has seen that it has; return the state of the order."""
+        with self._order_lock:
+            self._order.press(self.plants().values(), time.monotonic())
+        self._order_changed.set()
+        deadline = time.monotonic() + _STOP_WAIT
+        while time.monotonic() < deadline:
+            state = self.stop_state()
+            if state is None or all(row["state"] == "stopped" for row in state["rows"].values()):
+                break
+            await asyncio.sleep(0.01)
+        return self.stop_state()
+
+    def stop_state(self) -> dict[str, Any] | None:
+        """Return what each plant answered to the stop that is in force; None where none is."""
+        with self._order_lock:
+            return self._order.state(time.monotonic())
+
+    def acknowledge_stop(self) -> list[str]:
+        """End the order for the plants that are stopped; return those that do not answer, for which it stays."""
+        with self._order_lock:
+            return self._order.acknowledge(time.monotonic())
+
+    def release_stop(self, node: str) -> None:
+        """Stop asking one plant: its e-stop is reset, or it is given up."""
+        with self._order_lock:
+            self._order.release(node)
+
+    async def reset(self, node: str) -> str:
+        """Reset the e-stop of a plant, which ends the order for it."""
+        self.release_stop(node)
+        return await self.trigger(f"{node}/e_stop_reset")
+
+    def _keep_stopping(self) -> None:
+        """Ask, on a thread of its own: neither the page nor its server's loop can hold a stop up."""
+        while not self._leaving.is_set():
+            with self._order_lock:
+                now = time.monotonic()
+                due = self._order.due(self.plants().values(), now)
+                idle = not self._order.in_force
+            for node in due:
+                self._ask_to_stop(node, now)
+            if idle:
+                self._order_changed.wait()
+                self._order_changed.clear()
+            else:
+                self._leaving.wait(_STOP_TICK)
+
+    def _stop_client(self, node: str) -> Any:
+        with self._lock:
+            client = self._stop_clients.get(node)
+            if client is None:
+                service = f"{node}{_STOP_SERVICE}"
+                client = self._stop_clients[node] = self._node.create_client(Trigger, service)
+            return client
+
+    def _ask_to_stop(self, node: str, now: float) -> None:
+        client = self._stop_client(node)
+        # An answer that takes longer than this is one of a plant that was held up: it has been asked again since.
+        calls = self._stop_calls.setdefault(node, [])
+        for _, call in [entry for entry in calls if now - entry[0] > _TIMEOUT]:
+            client.remove_pending_request(call)
+        calls[:] = [entry for entry in calls if now - entry[0] <= _TIMEOUT and not entry[1].done()]
+        if not client.service_is_ready():
+            with self._order_lock:
+                self._order.problem(node, "out of reach; it is asked as soon as it is back")
+            return
+
+        def take(future: Any) -> None:
+            response = future.result() if future.exception() is None and not future.cancelled() else None
+            with self._order_lock:
+                if response is not None and response.success:
+                    self._order.answer(node, response.message, time.monotonic())
+                elif response is not None:
+                    self._order.problem(node, f"refuses: {response.message}")
+
+        call = client.call_async(Trigger.Request())
+        calls.append((now, call))
+        call.add_done_callback(take)
 
     async def trigger(self, service: str) -> str:
         """Call a service without arguments; raise a FaultError with its reason where it refuses."""
@@ -219,10 +307,8 @@ class Hub:
                 String, f"{space}/{names.EVENTS}", lambda message: _on_event(plant, message), qos.EVENTS
             )
         )
-        # Made now: a stop must not wait for a client to find its service.
-        with self._lock:
-            service = f"{node}{_STOP_SERVICE}"
-            self._clients.setdefault(service, self._node.create_client(Trigger, service))
+        # Made now, and kept: a stop must not wait for a client to find its service.
+        self._stop_client(node)
         return plant
 
     def _on_diagnostics(self, message: DiagnosticArray) -> None:
@@ -270,10 +356,6 @@ def _accepted(who: str, response: Any) -> str:
     if not response.success:
         raise FaultError(f"{who} refuses: {response.message}")
     return str(response.message)
-
-
-def _said(answer: Any) -> str:
-    return str(answer) if isinstance(answer, BaseException) else str(answer.message)
 
 
 app = typer.Typer(add_completion=False, rich_markup_mode=None)

@@ -39,8 +39,20 @@ class Graph(Protocol):
     def plants(self) -> dict[str, str]:
         """Return namespace -> full node name."""
 
-    async def e_stop(self) -> dict[str, str]:
-        """Stop every plant."""
+    async def e_stop(self) -> dict[str, Any] | None:
+        """Order every plant to stop; return what each has answered."""
+
+    def stop_state(self) -> dict[str, Any] | None:
+        """Return the state of the stop that is in force."""
+
+    def acknowledge_stop(self) -> list[str]:
+        """End the stop for the plants that have answered; return those that have not."""
+
+    def release_stop(self, node: str) -> None:
+        """Stop asking one plant."""
+
+    async def reset(self, node: str) -> str:
+        """Reset the e-stop of a plant."""
 
     async def trigger(self, service: str) -> str:
         """Call a service without arguments."""
@@ -86,6 +98,15 @@ def serve(
     async def e_stop() -> JSONResponse:
         return JSONResponse(await graph.e_stop())
 
+    @app.post("/e_stop/acknowledge")
+    async def acknowledge() -> JSONResponse:
+        return JSONResponse({"silent": graph.acknowledge_stop()})
+
+    @app.post("/e_stop/give_up")
+    async def give_up(node: str) -> JSONResponse:
+        graph.release_stop(node)
+        return JSONResponse(graph.stop_state())
+
     @app.websocket("/stream")
     async def stream(socket: WebSocket) -> None:
         await socket.accept()
@@ -93,7 +114,7 @@ def serve(
         try:
             while True:
                 now = time.monotonic()
-                picture = {"t": now, "plants": graph.frame()}
+                picture = {"t": now, "plants": graph.frame(), "stop": graph.stop_state()}
                 await socket.send_text(json.dumps(picture, separators=(",", ":")))
                 # Counted from the last due time: the work does not add to the period, and what was missed is missed.
                 due = max(due + FRAME_PERIOD, now)
@@ -139,9 +160,11 @@ class _Page:
             ui.html('<span id="link" role="status">connecting</span>', sanitize=False)
             # Plain HTML and a request of its own: it works while the rest of the page waits for the server.
             ui.html(
-                '<button id="e_stop" title="Space or Escape">E-STOP<small>Space or Esc</small></button>',
+                '<button id="e_stop" type="button" aria-keyshortcuts="Space Escape Enter"'
+                ' title="Space, Escape or Enter">E-STOP<small>Space, Esc or Enter</small></button>',
                 sanitize=False,
             )
+        ui.html('<div id="alarms" role="alert" aria-live="assertive"></div>', sanitize=False)
         with ui.element("main").classes("grid"):
             with ui.element("section").classes("card"):
                 ui.html('<canvas id="pendulum" aria-label="pendulum"></canvas>', sanitize=False)
@@ -217,7 +240,7 @@ class _Page:
 
     async def _reset(self) -> None:
         for node in self._graph.plants().values():
-            await self._carefully(self._graph.trigger(f"{node}/e_stop_reset"))
+            await self._carefully(self._graph.reset(node))
 
     async def _each(self, service: str) -> None:
         for space in self._graph.plants():

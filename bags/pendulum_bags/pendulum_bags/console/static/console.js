@@ -3,6 +3,9 @@
 (() => {
   const SPAN = 10; // seconds shown
   const COLOURS = ["#1f77b4", "#ff7f0e", "#2ca02c", "#9467bd"];
+  const MODES = {
+    disarmed: "disarmed", armed_effort: "ARMED: follows the controller", armed_position: "ARMED: moves by itself", e_stop: "E-STOP", fault: "FAULT", silent: "SILENT",
+  };
   const ROWS = [
     ["angle from upright [rad]", (p) => Math.atan2(Math.sin(p.theta - Math.PI), Math.cos(p.theta - Math.PI))],
     ["velocity [rad/s]", (p) => p.theta_dot],
@@ -13,34 +16,148 @@
   const state = { plants: {}, series: {}, frames: 0, drawn: 0, connected: false, stopPressed: 0, stopAnswered: 0, fps: 0 };
   window.pendulumConsole = state;
 
-  async function stop() {
-    const button = document.getElementById("e_stop");
-    state.stopPressed = Date.now();
-    button.classList.add("pressed");
+  // --- the stop ---------------------------------------------------------------------------------------------
+  // A press is an order. The page repeats it until the server has taken it, the server until each plant has answered, and what
+  // each answered stands until somebody acknowledges it.
+  const LIMIT = 500; // ms after which a server that does not answer is shown as such
+  const alarms = { sending: null, tries: 0, why: "", order: null, lost: null, notes: [] };
+  state.alarms = alarms;
+
+  async function request(path) {
+    const limit = new AbortController();
+    const timer = setTimeout(() => limit.abort(), LIMIT);
     try {
-      const answer = await fetch("/e_stop", { method: "POST" });
+      const answer = await fetch(path, { method: "POST", signal: limit.signal, keepalive: true });
       if (!answer.ok) throw new Error(await answer.text());
-      state.stopAnswered = Date.now();
+      return await answer.json();
     } catch (error) {
-      state.failure = String(error);
-      say("E-STOP DID NOT REACH THE SERVER: use the hardware's own stop", true);
+      throw error.name === "AbortError" ? new Error("no answer within 0.5 s") : error;
+    } finally {
+      clearTimeout(timer);
     }
-    setTimeout(() => button.classList.remove("pressed"), 400);
+  }
+
+  function stop() {
+    // A touch is a pointerdown and a click: one press.
+    if (Date.now() - state.stopPressed < 50) return;
+    state.stopPressed = Date.now();
+    sessionStorage.setItem("stop", String(state.stopPressed));
+    const button = document.getElementById("e_stop");
+    if (button) { button.classList.add("pressed"); setTimeout(() => button.classList.remove("pressed"), 400); }
+    const first = alarms.sending === null;
+    alarms.sending = state.stopPressed;
+    alarms.tries = 0;
+    showAlarms();
+    if (first) send();
+  }
+
+  async function send() {
+    while (alarms.sending !== null) {
+      const pressed = alarms.sending;
+      alarms.tries += 1;
+      try {
+        alarms.order = await request("/e_stop");
+        state.stopAnswered = Date.now();
+        if (alarms.sending === pressed) { alarms.sending = null; alarms.why = ""; sessionStorage.removeItem("stop"); }
+      } catch (error) {
+        alarms.why = state.failure = String(error.message || error);
+        showAlarms();
+        await new Promise((again) => setTimeout(again, 150));
+      }
+    }
+    showAlarms();
   }
 
   // In the capture phase and wherever the focus is: a stop must not depend on what was clicked last. Space is left to
-  // fields that take text.
+  // fields that take text, Enter to everything that takes it.
   window.addEventListener("keydown", (event) => {
-    const text = event.target instanceof HTMLInputElement && event.target.type !== "range";
-    if (event.code === "Escape" || (event.code === "Space" && !text)) {
+    const target = event.target, inside = (what) => target instanceof Element && target.closest(what);
+    const text = inside("input:not([type=range]), textarea, [contenteditable]");
+    const takesEnter = text || (inside("button, a, select, summary, [role=button], [role=slider]") && !inside("#e_stop"));
+    if (event.code === "Escape" || (event.code === "Space" && !text) || (/^(Numpad)?Enter$/.test(event.code) && !takesEnter)) {
       event.preventDefault();
       event.stopPropagation();
       if (!event.repeat) stop();
     }
   }, true);
-  document.addEventListener("pointerdown", (event) => {
-    if (event.target.closest && event.target.closest("#e_stop")) stop();
-  });
+  // pointerdown is 100 ms earlier than click; click is what screen readers, voice control and scripts send.
+  for (const kind of ["pointerdown", "click"]) {
+    document.addEventListener(kind, (event) => { if (event.target.closest && event.target.closest("#e_stop")) stop(); }, true);
+  }
+  if (sessionStorage.getItem("stop")) { alarms.sending = state.stopPressed = Number(sessionStorage.getItem("stop")); send(); }
+
+  const clock = (time) => new Date(time).toLocaleTimeString();
+  const seconds = (ms) => `${(ms / 1000).toFixed(1)} s`;
+  const spaceOf = (node) => node.slice(0, node.lastIndexOf("/")) || "/";
+
+  // What has to be seen: [class, text, label of its button, what the button does].
+  function pending() {
+    const rows = [];
+    if (alarms.sending !== null && (alarms.tries > 1 || Date.now() - state.stopPressed > LIMIT)) {
+      rows.push(["bad", `E-STOP HAS NOT REACHED THE CONSOLE'S SERVER for ${seconds(Date.now() - state.stopPressed)} (${alarms.why || "no answer"}). ` +
+        "It is repeated. Use the hardware's own stop."]);
+    }
+    if (alarms.lost !== null) {
+      rows.push(["bad", `NO ANSWER FROM THE CONSOLE'S SERVER for ${seconds(performance.now() - alarms.lost)}: what is drawn is old. Use the hardware's own stop.`]);
+    }
+    const order = alarms.order;
+    if (order) {
+      const entries = Object.entries(order.rows), stopped = entries.filter(([, row]) => row.state === "stopped");
+      const all = stopped.length === entries.length;
+      rows.push([all ? "good" : "bad", all
+        ? `STOPPED: ${entries.map(([node, row]) => `${spaceOf(node)} after ${row.after.toFixed(2)} s`).join(", ") || "no plant on the graph yet; each is stopped as it comes"}.`
+        : `STOP ORDERED ${order.since.toFixed(1)} s ago: ${stopped.length} of ${entries.length} plants say that they are stopped.`,
+        entries.length && !stopped.length ? null : "Acknowledge", () => request("/e_stop/acknowledge")]);
+      for (const [node, row] of entries) {
+        if (row.state === "stopped") { if (!all) rows.push(["good", `${spaceOf(node)} is stopped: ${row.text}`]); continue; }
+        rows.push(["bad", `${spaceOf(node)} ${row.state === "asked" ? "HAS NOT ANSWERED" : "NO LONGER ANSWERS"} for ${row.silent_for.toFixed(1)} s` +
+          `${row.text ? ` (${row.text})` : ""}. It is asked again until it does.`, "Give up on it",
+          () => request(`/e_stop/give_up?node=${encodeURIComponent(node)}`)]);
+      }
+    }
+    alarms.notes.forEach((note) => rows.push(["note", note, "Seen", async () => { alarms.notes.splice(alarms.notes.indexOf(note), 1); }]));
+    return rows;
+  }
+
+  let alarmed = "";
+  function showAlarms() {
+    const place = document.getElementById("alarms");
+    if (!place) return;
+    const rows = pending(), buttons = JSON.stringify(rows.map(([kind, , label]) => [kind, label]));
+    // Texts change ten times a second, buttons stay: who is about to press one must find it where it was.
+    if (buttons !== alarmed) {
+      alarmed = buttons;
+      place.replaceChildren(...rows.map(([kind, , label]) => {
+        const line = document.createElement("div");
+        line.className = kind;
+        line.append(document.createElement("span"));
+        if (label) {
+          const button = document.createElement("button");
+          button.type = "button"; button.textContent = label;
+          line.append(button);
+        }
+        return line;
+      }));
+    }
+    rows.forEach(([, text, label, act], row) => {
+      const span = place.children[row].firstChild;
+      if (span.textContent !== text) span.textContent = text;
+      if (label) place.children[row].lastChild.onclick = () => Promise.resolve(act()).catch((error) => { alarms.why = String(error.message); }).then(showAlarms);
+    });
+  }
+
+  function note(text) {
+    alarms.notes.push(`${clock(Date.now())}: ${text}`);
+    if (alarms.notes.length > 5) alarms.notes.shift();
+  }
+
+  // The last picture's age is judged here, not by what the browser draws: a server that is frozen sends nothing, and closes nothing.
+  let heard = performance.now() + 2000; // a page that has just been opened is given time to connect
+  setInterval(() => {
+    const silent = performance.now() - heard;
+    if (silent > LIMIT && alarms.lost === null) alarms.lost = heard;
+    showAlarms();
+  }, 100);
 
   function say(text, bad) {
     const place = document.getElementById("link");
@@ -52,9 +169,12 @@
 
   function connect() {
     const socket = new WebSocket(`${location.protocol === "https:" ? "wss" : "ws"}://${location.host}/stream`);
+    // A server that takes the connection and then says nothing is tried anew, too.
+    const patience = setInterval(() => { if (performance.now() - heard > 3000) { heard = performance.now() - LIMIT - 1; socket.close(); } }, 1000);
     socket.onopen = () => { state.connected = true; behind = Infinity; };
     socket.onmessage = (event) => { take(JSON.parse(event.data)); };
     socket.onclose = () => {
+      clearInterval(patience);
       state.connected = false;
       say("no connection to the console, trying again", true);
       setTimeout(connect, 500);
@@ -67,6 +187,12 @@
 
   function take(message) {
     const now = message.t, frame = message.plants;
+    if (alarms.lost !== null) {
+      note(`the console's server did not answer for ${seconds(performance.now() - alarms.lost)}; it does again`);
+      alarms.lost = null;
+    }
+    heard = performance.now();
+    alarms.order = message.stop;
     behind = Math.min(behind, performance.now() / 1000 - now);
     state.frames += 1;
     for (const [name, plant] of Object.entries(frame)) {
@@ -76,6 +202,7 @@
       if (plant.theta !== undefined && plant.moved === now) series.push([now, ...ROWS.map(([, value]) => value(plant))]);
       while (series.length && series[0][0] < now - SPAN - 1) series.shift();
     }
+    for (const name of Object.keys(state.plants)) if (!(name in frame)) note(`${name || "/"} is gone from the graph (it was ${state.plants[name].mode || "in an unknown state"})`);
     state.plants = frame;
     for (const name of Object.keys(state.series)) if (!(name in frame) && !state.series[name].length) delete state.series[name];
   }
@@ -115,7 +242,9 @@
       if (!plant || plant.theta === undefined) return;
       const colour = COLOURS[index % COLOURS.length];
       const bx = x + length * Math.sin(plant.theta), by = y + length * Math.cos(plant.theta);
-      c.globalAlpha = 0.85;
+      const stale = serverTime() - plant.moved > 0.5;
+      c.globalAlpha = stale ? 0.3 : 0.85;
+      c.setLineDash(stale ? [5, 5] : []);
       c.strokeStyle = c.fillStyle = colour;
       c.lineWidth = 7 - 3 * index;
       c.beginPath(); c.moveTo(x, y); c.lineTo(bx, by); c.stroke();
@@ -128,6 +257,7 @@
         c.beginPath(); c.arc(x, y, radius, -Math.PI / 2, -Math.PI / 2 - turn, turn > 0); c.stroke();
       });
       c.globalAlpha = 1;
+      c.setLineDash([]);
     });
     c.fillStyle = ink("--ink");
     c.beginPath(); c.arc(x, y, 4, 0, 7); c.fill();
@@ -258,10 +388,11 @@
     if (!place) return;
     const shown = names.filter((name) => state.plants[name]).map((name) => {
       const plant = state.plants[name];
-      const silent = now - plant.moved > 1 ? ` · no state for ${(now - plant.moved).toFixed(0)} s` : "";
+      const age = now - plant.moved;
+      if (age > 0.5) return [name, "silent", `no state for ${age.toFixed(0)} s; it said ${plant.mode || "nothing"} before`];
       const rate = plant.rate ? ` · ${Number(plant.rate).toFixed(1)} Hz` : "";
       const jitter = plant.jitter ? ` · jitter ${(Number(plant.jitter) / 1000).toFixed(2)} ms (99 %)` : "";
-      return [name, plant.mode, `${plant.reason.replace(`${plant.mode}: `, "")}${rate}${jitter}${silent}`];
+      return [name, plant.mode, `${plant.reason.replace(`${plant.mode}: `, "")}${rate}${jitter}`];
     });
     if (JSON.stringify(shown) !== described.text) {
       described.text = JSON.stringify(shown);
@@ -270,7 +401,7 @@
         line.dataset.plant = name;
         const dot = document.createElement("i"); dot.style.background = COLOURS[names.indexOf(name) % COLOURS.length];
         const title = document.createElement("b"); title.textContent = name || "/";
-        const badge = document.createElement("span"); badge.className = mode; badge.textContent = ` ${mode} `;
+        const badge = document.createElement("span"); badge.className = mode; badge.textContent = ` ${MODES[mode] || mode} `;
         line.append(dot, title, badge, rest);
         return line;
       }));
@@ -279,15 +410,15 @@
     if (state.connected) say(`${names.length} plant${names.length === 1 ? "" : "s"} · ${state.fps} pictures/s`, false);
   }
 
-  let drawn = 0, counted = performance.now();
+  let taken = 0, counted = performance.now();
   function draw(time) {
     const names = [...new Set([...Object.keys(state.series), ...Object.keys(state.plants)])].sort().reverse();
     const now = serverTime();
     drawPendulum(names);
     drawPlots(names, now);
-    drawn += 1; state.drawn += 1;
+    state.drawn += 1;
     if (time - described.at > 100) { describe(names, now); described.at = time; }
-    if (time - counted > 1000) { state.fps = Math.round(drawn * 1000 / (time - counted)); drawn = 0; counted = time; }
+    if (time - counted > 1000) { state.fps = Math.round((state.frames - taken) * 1000 / (time - counted)); taken = state.frames; counted = time; }
     requestAnimationFrame(draw);
   }
   connect();

@@ -1,0 +1,130 @@
+"""A stop that stays in force: asked of every plant again and again until each has answered and a person has seen it.
+
+A plant may be frozen, restarting or out of reach when the stop is pressed. So a press is no request but an order: every
+plant that is known, or comes while the order stands, is asked until it answers, and goes on being asked, in case it is
+started anew. What each answered stands until somebody acknowledges it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from typing import Any
+
+__all__ = ["ASK_AGAIN", "SILENT_AFTER", "StopOrder"]
+
+ASK_AGAIN = 0.2
+"""Time after which a plant that has not answered is asked again [s]."""
+CONFIRM_AGAIN = 0.5
+"""Time after which a plant that has answered is asked again: it may have been started anew [s]."""
+SILENT_AFTER = 1.5
+"""Age of the newest answer from which on a plant counts as silent [s]."""
+
+
+@dataclass
+class _Row:
+    """What one plant was asked and said; times in seconds of the caller's clock."""
+
+    pressed: float
+    asked: float = float("-inf")
+    answered: float = float("-inf")
+    first_answer: float | None = None
+    text: str = ""
+
+
+class StopOrder:
+    """Whom to ask for a stop, and who has answered. Knows no ROS and no clock."""
+
+    def __init__(self) -> None:
+        self._rows: dict[str, _Row] = {}
+        self._left_alone: set[str] = set()
+        self._pressed: float | None = None
+
+    @property
+    def in_force(self) -> bool:
+        """Whether plants are to be stopped."""
+        return self._pressed is not None
+
+    def press(self, plants: Iterable[str], now: float) -> None:
+        """Order every plant to stop.
+
+        Args:
+            plants: Node names of the plants on the graph; those of an order in force stay in it.
+            now: Time [s].
+        """
+        self._pressed = now
+        self._left_alone.clear()
+        for plant in {*plants, *self._rows}:
+            self._rows[plant] = _Row(now)
+
+    def due(self, plants: Iterable[str], now: float) -> list[str]:
+        """Return the plants to ask now, and note that they were asked.
+
+        Args:
+            plants: Node names of the plants on the graph. Who comes while the order stands is stopped, too.
+            now: Time [s].
+        """
+        if self._pressed is None:
+            return []
+        for plant in plants:
+            if plant not in self._rows and plant not in self._left_alone:
+                self._rows[plant] = _Row(now)
+        found = []
+        for plant, row in self._rows.items():
+            fresh = now - row.answered < SILENT_AFTER
+            if now - row.asked >= (CONFIRM_AGAIN if fresh else ASK_AGAIN):
+                row.asked = now
+                found.append(plant)
+        return found
+
+    def answer(self, plant: str, text: str, now: float) -> None:
+        """Note that a plant said it is stopped."""
+        row = self._rows.get(plant)
+        if row is not None:
+            row.answered, row.text = now, text
+            if row.first_answer is None:
+                row.first_answer = now
+
+    def problem(self, plant: str, text: str) -> None:
+        """Note why a plant cannot be asked, or what else it answered."""
+        row = self._rows.get(plant)
+        if row is not None:
+            row.text = text
+
+    def release(self, plant: str) -> None:
+        """Leave a plant alone, because a person resets its e-stop, or gives it up."""
+        self._rows.pop(plant, None)
+        self._left_alone.add(plant)
+        self._end_without_rows()
+
+    def acknowledge(self, now: float) -> list[str]:
+        """End the order for the plants that say they are stopped; return those that still do not answer."""
+        for plant in [plant for plant, row in self._rows.items() if now - row.answered < SILENT_AFTER]:
+            self.release(plant)
+        self._end_without_rows()
+        return list(self._rows)
+
+    def state(self, now: float) -> dict[str, Any] | None:
+        """Return what a person has to see, None where no stop is in force: seconds since the press, a row a plant.
+
+        A row's ``state`` is ``asked`` (no answer yet), ``stopped`` or ``silent`` (answered once, no longer), its
+        ``after`` the time from the press to the first answer and ``silent_for`` the time without one [s].
+        """
+        if self._pressed is None:
+            return None
+        rows = {}
+        for plant, row in sorted(self._rows.items()):
+            never = row.first_answer is None
+            silent = now - (row.pressed if never else row.answered)
+            rows[plant] = {
+                "state": "asked" if never else "stopped" if silent < SILENT_AFTER else "silent",
+                "after": None if row.first_answer is None else round(row.first_answer - row.pressed, 3),
+                "silent_for": round(silent, 1),
+                "text": row.text,
+            }
+        return {"since": round(now - self._pressed, 1), "rows": rows}
+
+    def _end_without_rows(self) -> None:
+        if not self._rows:
+            self._pressed = None
+            self._left_alone.clear()

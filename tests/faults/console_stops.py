@@ -1,0 +1,330 @@
+"""Stops pressed in a real browser while something is broken: whatever was frozen, killed or cut off, no stop is lost.
+
+A try is judged by the plant's own events, heard by a node that knows nothing of the console. It survives when the plant
+is stopped within ``MAX_DELAY`` of the moment at which the way to it was whole again, and when the page showed in red
+what did not answer.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import socket
+import time
+from collections.abc import Callable
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
+
+from std_msgs.msg import String
+
+from pendulum_msgs_py.ros import qos
+from tests.faults.outcome import Outcome
+from tests.graph_peer import GraphPeer
+from tests.processes import ProcessGroup, RunningProgram
+
+__all__ = ["CHROMIUM", "MAX_DELAY", "QUIET", "STOPS", "StopRig"]
+
+CHROMIUM = Path("/usr/bin/chromium")
+QUIET = ["--no-sandbox", "--disable-gpu", "--disable-background-networking", "--disable-component-update"]
+MAX_DELAY = 5.0
+"""Longest time from a whole way to a stopped plant [s]: a service may have to be found anew, on a busy machine."""
+_HELD = 1.5
+"""How long something is held up while the stop is pressed [s]."""
+
+
+class StopRig:
+    """A simulator, a console, a browser, and a witness on the graph.
+
+    Args:
+        folder: For logs.
+        play: Playwright.
+    """
+
+    def __init__(self, folder: Path, play: Any) -> None:
+        self._processes = ProcessGroup(folder / "logs", folder)
+        self._folder = folder
+        with socket.socket() as probe:
+            probe.bind(("127.0.0.1", 0))
+            self.port = int(probe.getsockname()[1])
+        self.address = f"http://localhost:{self.port}/"
+        self.modes: list[str] = []
+        self.witness = GraphPeer("witness")
+        self.witness.node.create_subscription(String, "/sim/events", self._hear, qos.EVENTS)
+        self.simulator = self.start_simulator()
+        self.console = self.start_console()
+        self.browser = play.chromium.launch(executable_path=str(CHROMIUM), args=QUIET)
+        self.page = self.open()
+
+    def close(self) -> list[str]:
+        """End everything; return what had to be killed."""
+        self.browser.close()
+        self.witness.close()
+        return self._processes.close()
+
+    def start_simulator(self) -> RunningProgram:
+        """Start the plant, which arms itself."""
+        return self._processes.start("pendulum_sim", "simulator", "--ros-args", "-r", "__ns:=/sim")
+
+    def start_console(self) -> RunningProgram:
+        """Start the console on its port."""
+        runs = self._folder / "runs"
+        console = self._processes.start("pendulum_bags", "console", "--port", str(self.port), "--runs", runs)
+        console.wait_for_output(r"console at http://localhost", 60)
+        return console
+
+    def open(self, **options: Any) -> Any:
+        """Open the page and wait until it shows the plant."""
+        page = self.browser.new_page(**({"viewport": {"width": 1280, "height": 860}} | options))
+        page.goto(self.address)
+        page.wait_for_selector("[data-plant='/sim'] .armed_effort, [data-plant='/sim'] .disarmed", timeout=60_000)
+        return page
+
+    def rearm(self) -> None:
+        """Acknowledge what is shown, reset the e-stop and arm, all through the page."""
+        deadline = time.monotonic() + 60.0
+        while self.modes[-1:] != ["armed_effort"] or self.page.locator("#alarms button").count():
+            if time.monotonic() > deadline:
+                shown = self.page.locator("#alarms").inner_text()
+                raise TimeoutError(f"waited 60 s for an armed plant; it is {self.modes[-3:]}, the page shows {shown!r}")
+            # A button may be gone by the time that it is pressed.
+            with suppress(Exception):
+                if self.page.locator("#alarms button").count():
+                    self.page.locator("#alarms button").first.click(timeout=500)
+                elif self.modes[-1:] == ["e_stop"]:
+                    self.page.get_by_role("button", name="Reset e-stop").click(timeout=500)
+                elif self.modes[-1:] in (["disarmed"], ["fault"]):
+                    self.page.get_by_role("button", name="Arm", exact=True).click(timeout=500)
+            self.witness.spin(0.2)
+
+    def until_stopped(self, timeout: float = MAX_DELAY) -> float | None:
+        """Return how long the plant took to say that it is stopped [s]; None where it did not in time."""
+        start = time.monotonic()
+        with suppress(TimeoutError):
+            self.witness.until(lambda: self.modes[-1:] == ["e_stop"], "the e-stop", timeout)
+            return time.monotonic() - start
+        return None
+
+    def sees(self, text: str, timeout_ms: int = 4000, page: Any = None) -> bool:
+        """Tell whether the page comes to show a text among its alarms, in red."""
+        with suppress(Exception):
+            (page or self.page).locator("#alarms .bad", has_text=text).first.wait_for(timeout=timeout_ms)
+            return True
+        return False
+
+    def _hear(self, message: String) -> None:
+        event = json.loads(message.data)
+        if event.get("name") == "plant_mode":
+            self.modes.append(str(event["mode"]))
+
+
+def _judge(rig: StopRig, outcome: Outcome) -> Outcome:
+    delay = rig.until_stopped()
+    outcome.demand(delay is not None, f"the plant is not stopped {MAX_DELAY:g} s later, it is {rig.modes[-3:]}")
+    outcome.time_to_zero = delay
+    # The page says so, too, and nothing wakes armed afterwards.
+    outcome.demand(
+        _soon(lambda: rig.page.locator("#alarms .good").count() > 0, 6.0), "the page does not show the plant's answer"
+    )
+    rig.witness.spin(0.3)
+    outcome.demand(rig.modes[-1:] == ["e_stop"], f"the plant became {rig.modes[-1:]} again")
+    return outcome
+
+
+def _soon(holds: Callable[[], bool], timeout: float) -> bool:
+    deadline = time.monotonic() + timeout
+    while not holds():
+        if time.monotonic() > deadline:
+            return False
+        time.sleep(0.05)
+    return True
+
+
+def _frozen_plant(rig: StopRig) -> Outcome:
+    outcome = Outcome()
+    rig.simulator.send_signal(signal.SIGSTOP)
+    try:
+        rig.page.keyboard.press("Escape")
+        outcome.demand(rig.sees("HAS NOT ANSWERED"), "the page does not say that the plant has not answered")
+        time.sleep(_HELD)
+    finally:
+        rig.simulator.send_signal(signal.SIGCONT)
+    return _judge(rig, outcome)
+
+
+def _killed_plant(rig: StopRig) -> Outcome:
+    outcome = Outcome()
+    rig.simulator.send_signal(signal.SIGKILL)
+    rig.page.keyboard.press("Escape")
+    outcome.demand(rig.sees("HAS NOT ANSWERED"), "the page does not say that the plant has not answered")
+    rig.simulator = rig.start_simulator()
+    rig.simulator.wait_for_output(r"\[INFO\]", 60)
+    return _judge(rig, outcome)
+
+
+def _plant_gone_for_long(rig: StopRig) -> Outcome:
+    outcome = Outcome()
+    rig.simulator.send_signal(signal.SIGKILL)
+    gone = rig.page.locator("#alarms .note", has_text="gone from the graph").first
+    with suppress(Exception):
+        gone.wait_for(timeout=20_000)
+    outcome.demand(gone.count() > 0, "the page does not say that the plant is gone")
+    rig.page.keyboard.press("Escape")
+    rig.simulator = rig.start_simulator()
+    rig.simulator.wait_for_output(r"\[INFO\]", 60)
+    return _judge(rig, outcome)
+
+
+def _frozen_server(rig: StopRig) -> Outcome:
+    outcome = Outcome()
+    rig.console.send_signal(signal.SIGSTOP)
+    try:
+        rig.page.keyboard.press("Space")
+        outcome.demand(rig.sees("HAS NOT REACHED"), "the page does not say that the server has not taken the stop")
+        time.sleep(_HELD)
+        outcome.demand(rig.sees("HAS NOT REACHED", 300), "the page took its words back")
+    finally:
+        rig.console.send_signal(signal.SIGCONT)
+    return _judge(rig, outcome)
+
+
+def _killed_server(rig: StopRig) -> Outcome:
+    outcome = Outcome()
+    rig.console.send_signal(signal.SIGKILL)
+    rig.console.wait(10.0)
+    rig.page.keyboard.press("Space")
+    outcome.demand(rig.sees("HAS NOT REACHED"), "the page does not say that the server has not taken the stop")
+    outcome.demand(rig.sees("NO ANSWER FROM"), "the page does not say that the server is silent")
+    rig.console = rig.start_console()
+    return _judge(rig, outcome)
+
+
+def _cut_link(rig: StopRig) -> Outcome:
+    outcome = Outcome()
+    session = rig.page.context.new_cdp_session(rig.page)
+    session.send("Network.enable")
+    cut = {"offline": True, "latency": 0, "downloadThroughput": 0, "uploadThroughput": 0}
+    session.send("Network.emulateNetworkConditions", cut)
+    try:
+        rig.page.keyboard.press("Escape")
+        outcome.demand(rig.sees("HAS NOT REACHED"), "the page does not say that the server has not taken the stop")
+        time.sleep(_HELD)
+    finally:
+        whole = {"offline": False, "latency": 0, "downloadThroughput": -1, "uploadThroughput": -1}
+        session.send("Network.emulateNetworkConditions", whole)
+    return _judge(rig, outcome)
+
+
+def _two_clients(rig: StopRig) -> Outcome:
+    outcome = Outcome()
+    phone = rig.open(viewport={"width": 390, "height": 844}, has_touch=True)
+    try:
+        phone.locator("#e_stop").tap()
+        _judge(rig, outcome)
+        seen = _soon(lambda: phone.locator("#alarms .good").count() > 0, 3.0)
+        outcome.demand(seen, "the client that pressed does not show the answer")
+    finally:
+        phone.close()
+    return outcome
+
+
+def _page_in_the_background(rig: StopRig) -> Outcome:
+    outcome = Outcome()
+    rig.simulator.send_signal(signal.SIGSTOP)
+    other = rig.browser.new_page()
+    try:
+        rig.page.bring_to_front()
+        rig.page.keyboard.press("Escape")
+        other.bring_to_front()
+        time.sleep(_HELD)
+    finally:
+        rig.simulator.send_signal(signal.SIGCONT)
+    _judge(rig, outcome)
+    other.close()
+    return outcome
+
+
+def _closed_page(rig: StopRig) -> Outcome:
+    outcome = Outcome()
+    other = rig.open()
+    rig.simulator.send_signal(signal.SIGSTOP)
+    try:
+        other.keyboard.press("Escape")
+        outcome.demand(rig.sees("HAS NOT ANSWERED"), "the other client does not see that the plant has not answered")
+        other.close()
+        time.sleep(_HELD)
+    finally:
+        rig.simulator.send_signal(signal.SIGCONT)
+    return _judge(rig, outcome)
+
+
+def _pressed(press: Callable[[Any], object]) -> Callable[[StopRig], Outcome]:
+    def act(rig: StopRig) -> Outcome:
+        press(rig.page)
+        return _judge(rig, Outcome())
+
+    return act
+
+
+def _key_on_the_button(page: Any) -> None:
+    page.locator("#e_stop").focus()
+    page.keyboard.press("Enter")
+
+
+STOPS: dict[str, Callable[[StopRig], Outcome]] = {
+    "stop by mouse": _pressed(lambda page: page.locator("#e_stop").click()),
+    "stop by Space": _pressed(lambda page: page.keyboard.press("Space")),
+    "stop by Escape": _pressed(lambda page: page.keyboard.press("Escape")),
+    "stop by Enter on the button": _pressed(_key_on_the_button),
+    "stop by click() as a screen reader sends it": _pressed(
+        lambda page: page.evaluate("document.getElementById('e_stop').click()")
+    ),
+    "stop by touch on a second client": _two_clients,
+    "stop while the plant is frozen": _frozen_plant,
+    "stop while the plant is killed and started anew": _killed_plant,
+    "stop after the plant was gone for long": _plant_gone_for_long,
+    "stop while the console's server is frozen": _frozen_server,
+    "stop while the console's server is killed and started anew": _killed_server,
+    "stop while the link to the server is cut": _cut_link,
+    "stop, then the page goes to the background, plant frozen": _page_in_the_background,
+    "stop, then the page that pressed is closed, plant frozen": _closed_page,
+}
+"""What is done, by the name that the table gives it."""
+
+
+def main() -> int:
+    """Try each stop several times and print a table: ``python -m tests.faults.console_stops [TRIES] [NAME]``."""
+    import sys
+    import tempfile
+
+    from playwright.sync_api import sync_playwright
+
+    from pendulum_bags.experiments.domain import reserve_domain
+
+    tries = int(sys.argv[1]) if len(sys.argv) > 1 else 20
+    chosen = {name: act for name, act in STOPS.items() if len(sys.argv) < 3 or sys.argv[2] in name}
+    lost = 0
+    with tempfile.TemporaryDirectory() as folder, reserve_domain() as domain, sync_playwright() as play:
+        os.environ["ROS_DOMAIN_ID"] = str(domain)
+        rig = StopRig(Path(folder), play)
+        print("| fault | tried | stops lost | page in the wrong | longest delay [s] | remarks |")
+        print("|---|---|---|---|---|---|")
+        for name, act in chosen.items():
+            outcomes = []
+            for _ in range(tries):
+                rig.rearm()
+                outcomes.append(act(rig))
+            delays = [outcome.time_to_zero for outcome in outcomes if outcome.time_to_zero is not None]
+            missing = tries - len(delays)
+            wrong = sum(not outcome.survived for outcome in outcomes) - missing
+            remarks = "; ".join(sorted({outcome.detail for outcome in outcomes if outcome.detail}))
+            longest = max(delays, default=0.0)
+            print(f"| {name} | {tries} | {missing} | {wrong} | {longest:.2f} | {remarks} |", flush=True)
+            lost += missing + wrong
+        rig.close()
+    return int(lost > 0)
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())
