@@ -11,6 +11,7 @@ Memory does not depend on the number of steps, unless the trajectories are asked
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
@@ -24,6 +25,7 @@ from pendulum_msgs_py.plants.plant_parameters import PlantParameters
 from pendulum_sim.dry_friction import PACKED
 from pendulum_sim.integrators import get_integrator
 from pendulum_sim.plant import check_step, pack
+from pendulum_sim.stability import MOST_GROWTH, check_stability, growth_rate
 
 __all__ = ["BatchResult", "simulate_batch"]
 
@@ -107,22 +109,34 @@ def simulate_batch(
     integrator = get_integrator(method)
     if method == "adaptive":
         raise ParameterError("method is 'adaptive' in a batch; expected a compiled one, such as etd4")
-    if steps < 1 or hold < 1:
-        raise ParameterError(f"steps is {steps} and hold is {hold}; expected both >= 1")
+    _check_whole("steps", steps, 1)
+    _check_whole("hold", hold, 1)
+    if threads is not None:
+        _check_whole("threads", threads, 1)
+    if not math.isfinite(target):
+        raise ParameterError(f"target is {target} rad; expected a finite number")
     plants = [parameters] if isinstance(parameters, PlantParameters) else list(parameters)
     if any(plant.drivetrain is not None for plant in plants):
         raise ParameterError("a batch takes rigid plants; one of these is series elastic")
     gains = np.atleast_2d(np.asarray(gain, dtype=np.float64))
     if gains.ndim != 2 or gains.shape[1] != 2:
         raise ParameterError(f"gain has shape {gains.shape}; expected (2,) or (B, 2)")
+    if not np.isfinite(gains).all():
+        raise ParameterError("gain has a value that is not finite; expected numbers of N m/rad and N m s/rad")
     columns = {
         "theta": _column("theta", theta),
         "theta_dot": _column("theta_dot", theta_dot),
         "amplitude": _column("amplitude", amplitude),
     }
-    seed_list = [int(seed) for seed in np.atleast_1d(np.asarray(seeds, dtype=object))]
+    if columns["amplitude"].min() < 0.0:
+        raise ParameterError(f"amplitude has a value of {columns['amplitude'].min()} N m; expected >= 0")
+    seed_list = list(np.atleast_1d(np.asarray(seeds, dtype=object)))
+    for seed in seed_list:
+        _check_whole("seeds", seed, 0)
     lengths = {name: column.size for name, column in columns.items()}
     varied = {name: _column(name, values) for name, values in (variations or {}).items()}
+    if "coulomb_friction" in varied and "static_friction" not in varied and _static_follows(plants):
+        varied["static_friction"] = varied["coulomb_friction"]
     _check_variations(varied, plants)
     lengths |= {name: column.size for name, column in varied.items()}
     lengths |= {"parameters": len(plants), "gain": len(gains), "seeds": len(seed_list)}
@@ -137,6 +151,7 @@ def simulate_batch(
         packed = np.repeat(packed, size, axis=0)
         for name, column in varied.items():
             packed[:, PACKED.index(name)] = column
+        _check_friction(packed)
         rates = packed[:, 1] / packed[:, 0]
         count = len(integrator.coefficients(float(rates[0]), h))
         by_rate = np.empty((count, size))
@@ -145,6 +160,11 @@ def simulate_batch(
     else:
         rows_of = [integrator.coefficients(float(row[1] / row[0]), h) for row in packed]
         coefficients = np.array(rows_of, dtype=np.float64)
+    growth = growth_rate(integrator, packed[:, 1] / packed[:, 0], packed[:, 2] / packed[:, 0], h, list(coefficients.T))
+    if (worst := int(np.argmax(growth))) >= 0 and growth[worst] > MOST_GROWTH:
+        values = {name: float(packed[worst, PACKED.index(name)]) for name in ("inertia", "damping", "gravity")}
+        # The plant at fault, rebuilt, so that its own check says what is wrong and what would do.
+        check_stability(integrator, plants[min(worst, len(plants) - 1)].with_values(**values), dt, substeps, h)
     limits = np.array([plant.effort_limit for plant in plants])
     delays = np.array([plant.transport_delay for plant in plants])
     smooth = not (delays.any() or packed[:, 4].any() or packed[:, 6].any() or packed[:, 9].any())
@@ -186,6 +206,27 @@ def simulate_batch(
         std_theta_dot=np.sqrt(np.maximum(0.0, rows["sum_vv"] / steps - mean_v**2)),
         trajectories=record_of if record else None,
     )
+
+
+def _check_whole(name: str, value: object, least: int) -> None:
+    if isinstance(value, (bool, np.bool_)) or not isinstance(value, (int, np.integer)) or value < least:
+        raise ParameterError(f"{name} is {value!r}; expected a whole number >= {least}")
+
+
+def _static_follows(plants: Sequence[PlantParameters]) -> bool:
+    """Tell whether static friction is no parameter of its own: where it was left out, it is the Coulomb friction."""
+    return all(plant.static_friction == plant.coulomb_friction for plant in plants)
+
+
+def _check_friction(packed: Array) -> None:
+    coulomb, static = packed[:, PACKED.index("coulomb_friction")], packed[:, PACKED.index("static_friction")]
+    wrong = np.flatnonzero(static < coulomb)
+    if wrong.size:
+        first = wrong[0]
+        raise ParameterError(
+            f"static_friction of pendulum {first} is {static[first]} N m; "
+            f"expected >= coulomb_friction = {coulomb[first]} N m"
+        )
 
 
 def _check_variations(varied: Mapping[str, Array], plants: Sequence[PlantParameters]) -> None:

@@ -21,6 +21,7 @@ from pendulum_sim.compiling import compile_tree, tuple_loader
 from pendulum_sim.dry_friction import PACKED, acceleration_with_friction
 from pendulum_sim.integrators import get_integrator
 from pendulum_sim.plant import pack
+from pendulum_sim.stability import check_stability
 
 __all__ = ["ROWS", "is_smooth", "lane_table", "step_kernel"]
 
@@ -48,8 +49,14 @@ def lane_table(
     q: tuple[float, float],
     r: float,
 ) -> NDArray[np.float64]:
-    """Return the rows for a number of equal pendulums, at rest hanging down, shape (rows, lanes)."""
-    coefficients = get_integrator(method).coefficients(parameters.damping / parameters.inertia, h)
+    """Return the rows for a number of equal pendulums, at rest hanging down, shape (rows, lanes).
+
+    Raises:
+        ParameterError: The method is unstable on this plant at that step.
+    """
+    integrator = get_integrator(method)
+    check_stability(integrator, parameters, h, 1, h)
+    coefficients = integrator.coefficients(parameters.damping / parameters.inertia, h)
     values = (
         *(0.0, 0.0, 0.0, 0.0, amplitude, parameters.effort_limit, *q, r),
         *pack(parameters),

@@ -18,6 +18,7 @@ from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.plants.plant_parameters import PlantParameters
 from pendulum_sim.dry_friction import PACKED, acceleration_with_friction, actuator_torque, advance_dry
 from pendulum_sim.integrators import Coefficients, PlantTuple, get_integrator
+from pendulum_sim.stability import check_stability
 
 __all__ = ["DelayLine", "Plant", "PlantState", "RigidPlant", "make_plant", "pack", "period_segments"]
 
@@ -121,7 +122,7 @@ class RigidPlant:
         substeps: Integration steps in a period, >= 1.
 
     Raises:
-        ParameterError: An argument is outside its domain.
+        ParameterError: An argument is outside its domain, or the method is unstable on this plant at that step.
     """
 
     def __init__(
@@ -144,6 +145,7 @@ class RigidPlant:
             (newer, h, integrator.coefficients(rate, h))
             for newer, h in period_segments(dt, self._delay.fraction, substeps)
         ]
+        check_stability(integrator, parameters, dt, substeps, max(h for _, h, _ in self._segments))
         self._packed = pack(parameters)
         self._limit = parameters.effort_limit
         self._dry = parameters.static_friction > 0.0 or parameters.load_friction > 0.0

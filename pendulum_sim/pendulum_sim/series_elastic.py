@@ -9,6 +9,10 @@ s/rad, which the rigid model of the thesis has as its damping. Equations and sou
 from __future__ import annotations
 
 import math
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
 
 from pendulum_msgs_py.dynamics import friction_magnitude, gravity_torque
 from pendulum_msgs_py.dynamics.series_elastic import (
@@ -26,6 +30,7 @@ from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.plants.plant_parameters import PlantParameters
 from pendulum_sim.dry_friction import actuator_torque
 from pendulum_sim.plant import DelayLine, PlantState, check_start, check_step, period_segments
+from pendulum_sim.stability import MOST_GROWTH, growth_of_map
 
 __all__ = [
     "MAX_SUBSTEP",
@@ -138,6 +143,7 @@ class SeriesElasticPlant:
         self.dt = dt
         self._delay = DelayLine(parameters.transport_delay, dt)
         self._segments = period_segments(dt, self._delay.fraction, substeps or 1)
+        self._check_stability(substeps or 1)
         self._pwm_per_effort = feedforward_pwm(
             1.0, drive.supply_voltage, drive.torque_constant, drive.gear_ratio, drive.efficiency,
             drive.winding_resistance,
@@ -146,6 +152,38 @@ class SeriesElasticPlant:
         self._steps = 0
         self._torque = 0.0
         self.q_m = self.v_m = self.theta = self.theta_dot = self.z = self.effort = 0.0
+
+    def _check_stability(self, substeps: int) -> None:
+        """Refuse steps at which motor and spring blow up, judged without dry friction, which would hide it."""
+        drive = self.parameters.drivetrain
+        assert drive is not None
+        smooth = self.parameters.with_values(
+            coulomb_friction=0.0, static_friction=0.0, load_friction=0.0, angle_offset=0.0,
+            drivetrain=replace(
+                drive, motor_coulomb_friction=0.0, motor_static_friction=0.0, hysteresis_torque=0.0
+            ),
+        )  # fmt: skip
+        packed = pack_series_elastic(smooth)
+        wound = spring_deflection(self.parameters.effort_limit, drive.stiffness, drive.stiffness_hardening)
+
+        def is_stable(h: float) -> bool:
+            def step(x: NDArray[np.float64]) -> NDArray[np.float64]:
+                return np.array(series_elastic_step(*(float(value) for value in x), 0.0, 0.0, 0.0, h, packed)[:4])
+
+            # A hardening spring is stiffest where it is wound up; upright, one pole grows in truth.
+            return all(
+                growth_of_map(step, np.array([angle + deflection, 0.0, angle, 0.0]), h, growing) <= MOST_GROWTH
+                for angle, growing in ((0.0, 0), (math.pi, 1))
+                for deflection in (0.0, wound)
+            )
+
+        longest = max(h for _, h in self._segments)
+        if not is_stable(longest):
+            enough = next((n for n in range(1, 10_000) if is_stable(self.dt / n)), 0)
+            raise ParameterError(
+                f"the step of plant {self.parameters.name!r} is {longest * 1e3:.4g} ms (dt {self.dt * 1e3:.4g} ms, "
+                f"substeps {substeps}), at which motor and spring are unstable; expected substeps >= {enough}"
+            )
 
     @property
     def state(self) -> PlantState:

@@ -43,9 +43,11 @@ def sin(x: float) -> float:
 
 
 def wrap(angle: float) -> float:
-    """Return the equivalent angle in [-pi, pi), bit for bit what lies there already.
+    """Return the equivalent angle in [-pi, pi), bit for bit what lies there already, but for the last ulp before pi.
 
     Args:
         angle: Scalar or array [rad].
     """
-    return angle - _TWO_PI * np.floor((angle + np.pi) / _TWO_PI)
+    turned = angle - _TWO_PI * np.floor((angle + np.pi) / _TWO_PI)
+    # The sum is rounded: just below an odd multiple of pi it may count as the turn above.
+    return np.maximum(turned, -np.pi)

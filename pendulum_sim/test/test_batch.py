@@ -14,6 +14,7 @@ from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.plants.plant_parameters import PlantParameters, load_plant
 from pendulum_sim import vector_math
 from pendulum_sim.batch import simulate_batch
+from pendulum_sim.compiling import compile_tree
 from pendulum_sim.plant import RigidPlant
 
 THESIS_GAIN = (33.345265, 0.158993)
@@ -95,6 +96,29 @@ def test_each_pendulum_has_its_own_parameters_gain_start_seed_and_amplitude() ->
         assert alone.max_effort[0] == together.max_effort[i]
 
 
+@pytest.mark.parametrize("static", [None, [0.05, 0.3, 0.4]])
+def test_a_batch_over_dry_friction_moves_like_plants_of_their_own(static: list[float] | None) -> None:
+    # Where static friction is not said, it is the Coulomb friction, as in a plant file.
+    plain = PlantParameters(inertia=0.055, damping=0.02, gravity=1.678, effort_limit=13.0)
+    coulomb = [0.0, 0.1, 0.3]
+    variations = {"coulomb_friction": coulomb} | ({"static_friction": static} if static else {})
+    together = simulate_batch(plain, variations=variations, steps=500, method="etd2", theta=1.0, hold=1, substeps=1)
+    for i, tau in enumerate(coulomb):
+        single = RigidPlant(
+            PlantParameters(
+                inertia=0.055, damping=0.02, gravity=1.678, effort_limit=13.0, coulomb_friction=tau,
+                static_friction=static[i] if static else None,  # type: ignore[arg-type]
+            ),
+            2e-3,
+            method="etd2",
+        )  # fmt: skip
+        single.reset(1.0)
+        for _ in range(500):
+            single.step(0.0)
+        assert together.theta[i] == pytest.approx(single.theta, abs=1e-12)
+    assert len(set(np.round(together.theta, 6))) == 3
+
+
 def test_results_do_not_depend_on_the_size_of_the_batch_or_the_threads() -> None:
     def run(size: int, threads: int | None) -> np.ndarray:
         return simulate_batch(
@@ -144,8 +168,23 @@ def test_the_polynomial_sine_is_within_4e_16_of_the_true_one() -> None:
         assert abs(Decimal(float(vector_math.sin(float(x)))) - total) < Decimal("4e-16")
 
 
-def test_the_branchless_wrap_equals_that_of_the_vocabulary() -> None:
+def test_the_branchless_wrap_equals_that_of_the_vocabulary_to_the_last_bit_of_its_ends() -> None:
     angles = np.random.default_rng(4).uniform(-40.0, 40.0, 10_000)
+    compiled = compile_tree(vector_math.wrap)
+    edges = [
+        math.nextafter(turns * math.pi + sign * ulps * math.ulp(turns * math.pi or 1e-300), toward)
+        for turns in (-3.0, -1.0, 0.0, 1.0, 3.0, 1001.0)
+        for sign in (-1.0, 1.0)
+        for ulps in (0, 1, 2)
+        for toward in (-math.inf, math.inf, turns * math.pi)
+    ]
+    for angle in edges:
+        for turned in (compiled(angle), float(vector_math.wrap(angle))):
+            assert -math.pi <= turned < math.pi
+            if -math.pi <= angle < math.pi - math.ulp(math.pi):
+                assert turned == angle
+            # To an ulp of where it came from, and the same turn but for that ulp.
+            assert abs(math.remainder(turned - angle, 2.0 * math.pi)) <= 2.0 * math.ulp(max(abs(angle), math.pi))
     assert np.abs(vector_math.wrap(angles) - wrap(angles)).max() < 1e-13
     inside = angles[np.abs(angles) < math.pi]
     assert np.array_equal(vector_math.wrap(inside), inside)
@@ -154,7 +193,20 @@ def test_the_branchless_wrap_equals_that_of_the_vocabulary() -> None:
 @pytest.mark.parametrize(
     ("kwargs", "message"),
     [
-        ({"steps": 0}, "steps is 0 and hold is 1; expected both >= 1"),
+        ({"steps": 0}, "steps is 0; expected a whole number >= 1"),
+        ({"steps": 5, "hold": 1.5}, "hold is 1.5; expected a whole number >= 1"),
+        ({"steps": 5, "seeds": 1.5}, "seeds is 1.5; expected a whole number >= 0"),
+        ({"steps": 5, "seeds": [1, -2]}, "seeds is -2; expected a whole number >= 0"),
+        ({"steps": 5, "seeds": True}, "seeds is True; expected a whole number >= 0"),
+        ({"steps": 5, "threads": -3}, "threads is -3; expected a whole number >= 1"),
+        ({"steps": 5, "gain": (math.nan, 0.0)}, "gain has a value that is not finite"),
+        ({"steps": 5, "gain": (math.inf, 0.0)}, "gain has a value that is not finite"),
+        ({"steps": 5, "target": math.nan}, "target is nan rad; expected a finite number"),
+        ({"steps": 5, "amplitude": [1.0, -1.0]}, "amplitude has a value of -1.0 N m; expected >= 0"),
+        (
+            {"steps": 5, "variations": {"coulomb_friction": [0.1, 0.3], "static_friction": [0.2]}},
+            "static_friction of pendulum 1 is 0.2 N m; expected >= coulomb_friction = 0.3 N m",
+        ),
         ({"steps": 5, "theta": [0.0, 1.0], "seeds": [1, 2, 3]}, "theta has 2 entries; expected 1 or 3"),
         ({"steps": 5, "gain": (1.0, 2.0, 3.0)}, r"gain has shape \(1, 3\); expected \(2,\) or \(B, 2\)"),
         ({"steps": 5, "method": "adaptive"}, "method is 'adaptive' in a batch; expected a compiled one"),
