@@ -168,7 +168,8 @@ class SeriesElasticPlant:
 
         def is_stable(h: float) -> bool:
             def step(x: NDArray[np.float64]) -> NDArray[np.float64]:
-                return np.array(series_elastic_step(*(float(value) for value in x), 0.0, 0.0, 0.0, h, packed)[:4])
+                q_m, v_m, q, v = (float(value) for value in x)
+                return np.array(series_elastic_step(q_m, v_m, q, v, 0.0, 0.0, 0.0, h, packed)[:4])
 
             # A hardening spring is stiffest where it is wound up; upright, one pole grows in truth.
             return all(
