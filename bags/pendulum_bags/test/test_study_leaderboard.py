@@ -12,11 +12,21 @@ import numpy as np
 import pytest
 
 from pendulum_bags.experiments.experiment_cli import main
-from pendulum_bags.experiments.in_process import RunArrays
-from pendulum_bags.studies.leaderboard import COSTS, PERTURBATIONS, contenders, costs_of, evaluate, scores
+from pendulum_bags.experiments.in_process import RunArrays, simulate_plant
+from pendulum_bags.experiments.run_spec import RunSpec
+from pendulum_bags.studies.leaderboard import (
+    COSTS,
+    PERTURBATIONS,
+    contenders,
+    costs_of,
+    evaluate,
+    push_trains,
+    scores,
+)
 from pendulum_bags.studies.leaderboard_hardware import HARDWARE_PERTURBATIONS, arrays_of_bag
 from pendulum_bags.studies.leaderboard_page import write_page
 from pendulum_lqr.controller import CONTROLLERS
+from pendulum_msgs_py.plants.plant_parameters import load_plant
 from pendulum_rosbag.reader import read_bag
 
 BROWSER = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
@@ -50,6 +60,27 @@ def test_costs_of_a_motion_known_in_closed_form() -> None:
         1.0 - np.mean(np.tanh(np.pi * np.array([0.3, 1.0, 0.05, 1.0, 1.0, 0.0, 0.00625])))
     )
     assert found["v3"] == uptime
+
+
+def test_a_pendulum_that_drifts_through_the_top_at_the_end_has_not_been_brought_up() -> None:
+    stamp = np.arange(1001, dtype=np.int64) * 10_000_000
+    still = np.zeros(1001)
+    for seconds, expected in ((0.4, False), (1.2, True)):
+        position = math.pi - 0.1 + 0.2 * np.clip((stamp * 1e-9 - (10.0 - seconds)) / seconds, -10.0, 1.0) - 1e-9
+        velocity = np.full(1001, 0.2 / seconds)
+        arrays = RunArrays(stamp, position, np.minimum(velocity, 0.49), still, still, still, np.zeros(1000))
+        assert costs_of(arrays)[0] is expected
+
+
+@pytest.mark.parametrize("duration", [4.0, 10.0])
+def test_a_run_of_any_length_is_pushed_at_its_half(duration: float) -> None:
+    plant = load_plant("thesis")
+    for push in push_trains(plant, duration):
+        spec = RunSpec(controller="lqr", disturbance=push, duration=duration)
+        torque = simulate_plant(spec, plant).disturbance
+        begins = spec.period * (1 + np.flatnonzero((torque[1:] != 0.0) & (torque[:-1] == 0.0)))
+        assert begins == pytest.approx([0.5 * duration], abs=0.004)
+        assert np.abs(torque).max() == push["amplitude"]
 
 
 def test_weights_of_the_first_version_sum_to_one() -> None:
@@ -89,7 +120,7 @@ def test_a_controller_that_is_added_to_the_table_is_on_the_board(
     assert "mine" in contenders()
     out = tmp_path / "board"
     arguments = ["leaderboard", "--plants", "thesis", "--controllers", "mine,lqr", "--no-robustness"]
-    assert main([*arguments, "--duration", "4", "--workers", "1", "--out", str(out)]) == 0
+    assert main([*arguments, "--duration", "6", "--workers", "1", "--out", str(out)]) == 0
     rows = {row["controller"]: row for row in json.loads((out / "leaderboard.json").read_text(encoding="utf-8"))}
     assert rows["mine"]["success"]
     assert rows["mine"]["scores"]["v2"] != rows["lqr"]["scores"]["v2"]

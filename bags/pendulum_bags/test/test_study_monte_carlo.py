@@ -64,6 +64,25 @@ def test_one_run_replayed_alone_is_the_run_of_the_batch() -> None:
 
 
 @arrow
+@pytest.mark.parametrize("before", [300, 450])
+def test_runs_are_added_to_those_there_are(tmp_path: Path, before: int) -> None:
+    run_monte_carlo(tmp_path / "grown", replace(SMALL, runs=before))
+    kept = (tmp_path / "grown" / "runs_00000.parquet").stat().st_mtime_ns
+    grown = run_monte_carlo(tmp_path / "grown", SMALL)
+    assert (tmp_path / "grown" / "runs_00000.parquet").stat().st_mtime_ns == kept
+    assert grown == run_monte_carlo(tmp_path / "at_once", SMALL)
+    with pytest.raises(BagError, match=f"of 700 runs; expected at most the {before} of this one"):
+        run_monte_carlo(tmp_path / "grown", replace(SMALL, runs=before))
+
+
+def test_a_run_is_the_same_however_many_follow_it() -> None:
+    few, many = draw_chunk(replace(SMALL, runs=310), 1), draw_chunk(SMALL, 1)
+    assert {name: values.tolist() for name, values in few.items()} == {
+        name: values[:10].tolist() for name, values in many.items()
+    }
+
+
+@arrow
 def test_an_interrupted_monte_carlo_goes_on_and_workers_change_no_bit(tmp_path: Path) -> None:
     def stop(done: int, _total: int) -> None:
         if done == 1:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -11,11 +12,19 @@ import pytest
 
 from pendulum_bags.experiments.in_process import simulate
 from pendulum_bags.experiments.run_spec import RunSpec
-from pendulum_bags.studies import pooled, runner
-from pendulum_bags.studies.results import collect, episode_of_run, group_runs, run_metrics
+from pendulum_bags.studies import pid_vs_lqr, pooled, runner
+from pendulum_bags.studies.results import (
+    Group,
+    collect,
+    episode_of_run,
+    group_runs,
+    groups_to_json,
+    run_metrics,
+)
 from pendulum_bags.studies.runner import open_study_folder, read_record, run_study
 from pendulum_bags.studies.study_file import Study, load_study
 from pendulum_msgs_py.errors import BagError, DataError, ParameterError
+from pendulum_msgs_py.plants.plant_parameters import load_plant, write_plant
 
 TEXT = """format: pendulum_study/1
 name: small
@@ -86,6 +95,93 @@ def test_folder_of_another_study_is_refused(tmp_path: Path, study: Study) -> Non
     other.write_text(TEXT.replace("amplitude: 2.5", "amplitude: 1.0"), encoding="utf-8")
     with pytest.raises(BagError, match="another study"):
         open_study_folder(folder, load_study(other))
+
+
+def test_a_study_that_is_given_seeds_and_plants_keeps_what_was_carried_out(tmp_path: Path, study: Study) -> None:
+    folder = tmp_path / "out"
+    run_study(folder, open_study_folder(folder, study), workers=1)
+    before = {run.name: read_record(folder, run) for run in study.runs}
+    grown = tmp_path / "grown.yaml"
+    for text in (
+        TEXT.replace("count: 3", "count: 5"),
+        # A plant before the others: in the order of the file every run has another number now.
+        TEXT.replace("count: 3", "count: 5").replace("  sim: {", "  fine: {engine: process, method: etd4}\n  sim: {"),
+    ):
+        grown.write_text(text, encoding="utf-8")
+        larger = open_study_folder(folder, load_study(grown))
+        end = run_study(folder, larger, workers=1)
+        assert (end.done, end.skipped) == (len(larger.runs), len(before))
+        assert {name: read_record(folder, run) for run in larger.runs if (name := run.name) in before} == before
+        assert sorted(run.number for run in larger.runs) == list(range(1, len(larger.runs) + 1))
+        before = {run.name: read_record(folder, run) for run in larger.runs}
+    groups = group_runs(collect(folder, larger))
+    assert {group.labels["plant"]: sorted(group.seeds) for group in groups} == {
+        "fine": [1, 2, 3, 4, 5],
+        "sim": [1, 2, 3, 4, 5],
+    }
+    with pytest.raises(BagError, match=r"run 4 \(sim_lqr_noise_upright_seed4\) is not in it"):
+        open_study_folder(folder, study)
+
+
+def test_repeats_are_added_too(tmp_path: Path) -> None:
+    path = tmp_path / "small.yaml"
+    path.write_text(TEXT + "repeats: 2\n", encoding="utf-8")
+    folder = tmp_path / "out"
+    first = open_study_folder(folder, load_study(path))
+    path.write_text(TEXT + "repeats: 3\n", encoding="utf-8")
+    second = open_study_folder(folder, load_study(path))
+    numbers = {(run.labels["seed"], run.labels["repeat"]): run.number for run in second.runs}
+    assert {key: numbers[key] for key in ((run.labels["seed"], run.labels["repeat"]) for run in first.runs)} == {
+        (run.labels["seed"], run.labels["repeat"]): run.number for run in first.runs
+    }
+    assert sorted(numbers.values()) == list(range(1, 10))
+
+
+@pytest.mark.parametrize("key", ["plant", "design_plant"])
+def test_a_plant_file_that_changed_makes_another_study(tmp_path: Path, key: str) -> None:
+    plant = tmp_path / "mine.yaml"
+    write_plant(plant, replace(load_plant("thesis"), name="mine"))
+    path = tmp_path / "small.yaml"
+    path.write_text(TEXT.replace("engine: process", f"engine: process, {key}: {plant}"), encoding="utf-8")
+    folder = tmp_path / "out"
+    open_study_folder(folder, load_study(path))
+    open_study_folder(folder, load_study(path))
+    write_plant(plant, replace(load_plant("thesis"), name="mine", inertia=0.06))
+    with pytest.raises(BagError, match="the files that it names included"):
+        open_study_folder(folder, load_study(path))
+
+
+def test_a_share_of_successes_has_an_interval_of_a_share_and_a_failure_is_its_worst() -> None:
+    values = {"success": np.array([1.0, 1.0, 0.0, 1.0, 1.0]), "ise": np.array([1.0, 2.0, 9.0, 1.0, 1.0])}
+    group = Group({}, (11, 12, 13, 14, 15), values, 0)
+    # Wilson's interval of 4 in 5, by hand: (0.8 + 1.9208/5 +- 1.96 sqrt(0.16/5 + 0.9604/25)) / (1 + 3.8416/5).
+    assert group.mean("success") == pytest.approx((0.8, 0.3755, 0.9638), abs=1e-4)
+    assert group.worst("success") == (0.0, 13)
+    assert group.worst("ise") == (9.0, 13)
+    (row,) = groups_to_json([group])
+    assert (row["metrics"]["success"]["worst"], row["metrics"]["success"]["worst_seed"]) == (0.0, 13)
+    all_of_them = Group({}, (1, 2), {"success": np.ones(2)}, 0).mean("success")
+    assert all_of_them[1] < 1.0 == all_of_them[2]
+
+
+def test_pairs_of_controllers_are_of_one_disturbance_and_one_start() -> None:
+    records = []
+    for number, (disturbance, factor) in enumerate((("weak", 2.0), ("strong", 3.0))):
+        for controller in ("pid", "lqr"):
+            for seed in (1, 2, 3):
+                ise = (1.0 + seed + 10.0 * number) * (factor if controller == "lqr" else 1.0)
+                labels = {
+                    "plant": "sim", "controller": controller, "disturbance": disturbance, "set_point": 0.0,
+                    "start": "upright", "seed": seed, "repeat": 1,
+                }  # fmt: skip
+                records.append({"status": "done", "labels": labels, "metrics": dict.fromkeys(pid_vs_lqr.COMPARED, ise)})
+    pairs = pid_vs_lqr._paired(pid_vs_lqr._by_place(records))
+    assert {(pair["plant"], pair["seeds"], round(pair["ratio"], 9)) for pair in pairs} == {
+        ("sim, weak", 3, 2.0),
+        ("sim, strong", 3, 3.0),
+    }
+    alone = [record for record in records if record["labels"]["disturbance"] == "weak"]
+    assert {pair["plant"] for pair in pid_vs_lqr._paired(pid_vs_lqr._by_place(alone))} == {"sim"}
 
 
 def test_groups_have_means_with_intervals_and_the_seed_of_the_worst_case(tmp_path: Path, study: Study) -> None:

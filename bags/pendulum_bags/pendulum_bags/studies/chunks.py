@@ -23,10 +23,12 @@ __all__ = [
     "carry_out",
     "chunk_path",
     "cluster_client",
+    "kept_settings",
     "open_results",
     "read_columns",
     "run_chunks",
     "write_columns",
+    "write_results_marker",
 ]
 
 Job = TypeVar("Job")
@@ -35,6 +37,7 @@ Connect = Callable[[], AbstractContextManager[Any]]
 """Connects to a Dask cluster when there is something to do: gives its client, or None for this process."""
 
 _CONNECT_TIMEOUT = 15.0
+_MARKER = "settings.json"
 
 
 def carry_out(
@@ -183,7 +186,7 @@ def open_results(folder: Path, what: str, fingerprint: str, settings: Mapping[st
     Raises:
         BagError: The folder holds something else.
     """
-    marker = folder / "settings.json"
+    marker = folder / _MARKER
     if marker.is_file():
         try:
             found = json.loads(marker.read_text(encoding="utf-8")).get("fingerprint")
@@ -195,7 +198,21 @@ def open_results(folder: Path, what: str, fingerprint: str, settings: Mapping[st
     if folder.exists() and any(folder.iterdir()):
         raise BagError(f"folder {folder} is not empty and holds no {what}; expected a new one")
     folder.mkdir(parents=True, exist_ok=True)
-    write_json(marker, {"fingerprint": fingerprint, "settings": settings})
+    write_results_marker(folder, fingerprint, settings)
+
+
+def kept_settings(folder: Path, fingerprint: str) -> dict[str, Any]:
+    """Return the settings that a folder of results was made with; none where it has another fingerprint, or none."""
+    try:
+        found = json.loads((folder / _MARKER).read_text(encoding="utf-8"))
+        return dict(found["settings"]) if found["fingerprint"] == fingerprint else {}
+    except (OSError, ValueError, KeyError, TypeError):
+        return {}
+
+
+def write_results_marker(folder: Path, fingerprint: str, settings: Mapping[str, Any]) -> None:
+    """Say in the folder what its results are of."""
+    write_json(folder / _MARKER, {"fingerprint": fingerprint, "settings": settings})
 
 
 def write_columns(path: Path, columns: Mapping[str, Any]) -> None:

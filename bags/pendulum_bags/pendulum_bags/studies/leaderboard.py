@@ -45,6 +45,8 @@ HARDWARE = "hw"
 EXCLUDED = {"playback": "plays a recording of another run"}
 GOAL_ANGLE, GOAL_VELOCITY = 0.1, 0.5
 """Region that counts as up: angle from upright [rad], velocity [rad/s]."""
+HOLD_TIME = 1.0
+"""Time that a run must have been up at its end [s]: longer than falling through the region takes."""
 
 PATIENCE = 8.0
 """Wall time of the plain run beyond which the perturbations, 25 more runs, are left out [s]."""
@@ -84,7 +86,7 @@ class Entry:
         plant: Preset.
         controller: Kind.
         reason: Why it is not scored; empty where it is.
-        success: Whether it ends up and stays there.
+        success: Whether it was up for all of the last second.
         costs: By name.
         scores: By version, v1 to v3.
         robustness: Share of successes by kind of perturbation.
@@ -113,7 +115,7 @@ def costs_of(arrays: RunArrays) -> tuple[bool, float, dict[str, float]]:
     up = (np.abs(wrap(arrays.position - UPRIGHT)) < GOAL_ANGLE) & (np.abs(arrays.velocity) < GOAL_VELOCITY)
     below = np.flatnonzero(~up)
     entered = 0.0 if not below.size else float(t[min(below[-1] + 1, t.size - 1)])
-    success = bool(up[-1]) and entered < duration
+    success = bool(up[-1]) and duration - entered >= HOLD_TIME
     tau, dt = arrays.applied, np.diff(t)
     return success, float(up.mean()), {
         "time": entered if success else duration,
@@ -149,43 +151,46 @@ def model_errors(plant: PlantParameters) -> list[PlantParameters]:
     return changed
 
 
-def push_trains(plant: PlantParameters) -> list[dict[str, Any]]:
-    """Return disturbances that push, when the pendulum is up, with shares of the largest torque."""
+def push_trains(plant: PlantParameters, duration: float) -> list[dict[str, Any]]:
+    """Return disturbances that push once, when the pendulum is up, with shares of the largest torque.
+
+    The push comes after half of a run of ``duration`` [s], so that every run has it, and time to recover.
+    """
     return [
-        {"kind": "pulse_train", "amplitude": share * plant.effort_limit, "frequency": 0.4, "pulse_width": 0.1,
-         "start_time": 5.0, "hold_time": 0.0, "duration": 7.0}
+        {"kind": "pulse_train", "amplitude": share * plant.effort_limit, "frequency": 4.0 / duration,
+         "pulse_width": 0.1, "start_time": 0.5 * duration, "hold_time": 0.0, "duration": 0.7 * duration}
         for share in (0.1, 0.2, 0.4, 0.6)
     ]  # fmt: skip
 
 
-def _model_error(plant: PlantParameters) -> Sequence[Variation]:
+def _model_error(plant: PlantParameters, _duration: float) -> Sequence[Variation]:
     return [(one, {}, {}) for one in model_errors(plant)]
 
 
-def _noise(plant: PlantParameters) -> Sequence[Variation]:
+def _noise(plant: PlantParameters, _duration: float) -> Sequence[Variation]:
     return [(plant, {}, {"position_noise": a, "velocity_noise": 10.0 * a}) for a in (0.001, 0.003, 0.01, 0.03)]
 
 
-def _delay(plant: PlantParameters) -> Sequence[Variation]:
+def _delay(plant: PlantParameters, _duration: float) -> Sequence[Variation]:
     return [(replace(plant, transport_delay=delay), {}, {}) for delay in (0.002, 0.005, 0.01, 0.02, 0.04)]
 
 
-def _torque_response(plant: PlantParameters) -> Sequence[Variation]:
+def _torque_response(plant: PlantParameters, _duration: float) -> Sequence[Variation]:
     return [(replace(plant, actuator_time_constant=lag), {}, {}) for lag in (0.005, 0.01, 0.02, 0.05)]
 
 
-def _pushes(plant: PlantParameters) -> Sequence[Variation]:
-    return [(plant, push, {}) for push in push_trains(plant)]
+def _pushes(plant: PlantParameters, duration: float) -> Sequence[Variation]:
+    return [(plant, push, {}) for push in push_trains(plant, duration)]
 
 
-PERTURBATIONS: Mapping[str, Callable[[PlantParameters], Sequence[Variation]]] = {
+PERTURBATIONS: Mapping[str, Callable[[PlantParameters, float], Sequence[Variation]]] = {
     "model_error": _model_error,
     "noise": _noise,
     "delay": _delay,
     "torque_response": _torque_response,
     "pushes": _pushes,
 }
-"""Kind of perturbation -> the plants, disturbances and sensors that it tries."""
+"""Kind of perturbation -> the plants, disturbances and sensors that it tries, in runs of some length [s]."""
 
 
 def evaluate(
@@ -225,7 +230,7 @@ def evaluate(
     if robustness and success and wall < patience:
         for name, vary in PERTURBATIONS.items():
             outcomes = []
-            for changed, disturbance, noise in vary(true):
+            for changed, disturbance, noise in vary(true, duration):
                 sensors = Sensors(np.random.default_rng(1), **noise)
                 run = RunSpec(**{**spec, "disturbance": dict(disturbance)})
                 try:

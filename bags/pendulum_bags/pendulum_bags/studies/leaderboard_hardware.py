@@ -68,7 +68,7 @@ def arrays_of_bag(bag: Path, namespace: str) -> RunArrays:
     )
 
 
-def _model_error(folder: Path) -> Sequence[Mapping[str, Any]]:
+def _model_error(folder: Path, _duration: float) -> Sequence[Mapping[str, Any]]:
     # The machine stays; the controller is designed on a wrong model of it.
     found = []
     for number, changed in enumerate(model_errors(load_plant(_PLANT))):
@@ -78,19 +78,19 @@ def _model_error(folder: Path) -> Sequence[Mapping[str, Any]]:
     return found
 
 
-def _noise(_: Path) -> Sequence[Mapping[str, Any]]:
+def _noise(_folder: Path, _duration: float) -> Sequence[Mapping[str, Any]]:
     return [{"seed": seed} for seed in (2, 3, 4)]
 
 
-def _torque_response(_: Path) -> Sequence[Mapping[str, Any]]:
+def _torque_response(_folder: Path, _duration: float) -> Sequence[Mapping[str, Any]]:
     return [{"strategy": strategy} for strategy in ("direct_pwm_compensated", "effort_loop")]
 
 
-def _pushes(_: Path) -> Sequence[Mapping[str, Any]]:
-    return [{"disturbance": push} for push in push_trains(load_plant(_PLANT))]
+def _pushes(_folder: Path, duration: float) -> Sequence[Mapping[str, Any]]:
+    return [{"disturbance": push} for push in push_trains(load_plant(_PLANT), duration)]
 
 
-HARDWARE_PERTURBATIONS: Mapping[str, Callable[[Path], Sequence[Mapping[str, Any]]]] = {
+HARDWARE_PERTURBATIONS: Mapping[str, Callable[[Path, float], Sequence[Mapping[str, Any]]]] = {
     "model_error": _model_error,
     "noise": _noise,
     "torque_response": _torque_response,
@@ -136,7 +136,8 @@ def evaluate_hardware(
     if robustness and success:
         with tempfile.TemporaryDirectory(prefix="pendulum_board_") as folder:
             for name, vary in HARDWARE_PERTURBATIONS.items():
-                held[name] = float(np.mean([_succeeds(replace(spec, **change)) for change in vary(Path(folder))]))
+                changes = vary(Path(folder), duration)
+                held[name] = float(np.mean([_succeeds(replace(spec, **change)) for change in changes]))
     return Entry(
         HARDWARE, controller, "", success, costs, scores(success, uptime, costs), held, wall, motion_of(arrays)
     )

@@ -20,12 +20,21 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pendulum_bags.runs.run_folder import write_json
-from pendulum_bags.studies.chunks import Connect, chunk_path, open_results, read_columns, run_chunks
+from pendulum_bags.studies.chunks import (
+    Connect,
+    chunk_path,
+    kept_settings,
+    open_results,
+    read_columns,
+    run_chunks,
+    write_results_marker,
+)
+from pendulum_bags.studies.shares import share_interval
 from pendulum_bags.studies.uncertain import VARIED, Uncertainty, batch_variations
 from pendulum_lqr.design import output_lqr
 from pendulum_lqr.model import linearise
 from pendulum_msgs_py.contract.angles import UPRIGHT, wrap
-from pendulum_msgs_py.errors import ParameterError
+from pendulum_msgs_py.errors import BagError, ParameterError
 from pendulum_msgs_py.plants.plant_parameters import PlantParameters, load_plant
 from pendulum_sim.batch import BatchResult, simulate_batch
 
@@ -107,8 +116,9 @@ class MonteCarlo:
         return -(-self.runs // self.chunk)
 
     def fingerprint(self) -> str:
-        """Return a hash of all that the result depends on."""
-        content = json.dumps([asdict(self), load_plant(self.plant)], sort_keys=True, default=asdict)
+        """Return a hash of all that a run depends on; how many runs there are is not among that."""
+        settings = {name: value for name, value in asdict(self).items() if name != "runs"}
+        content = json.dumps([settings, load_plant(self.plant)], sort_keys=True, default=asdict)
         return hashlib.sha256(content.encode()).hexdigest()[:16]
 
 
@@ -116,6 +126,8 @@ def draw_chunk(
     settings: MonteCarlo, index: int, plant: PlantParameters | None = None
 ) -> dict[str, NDArray[Any]]:
     """Return the plants, starts and noise seeds of a chunk, shape (n,) each.
+
+    A chunk is drawn whole and then cut, so that a run is the same however many follow it.
 
     Args:
         settings: Of the Monte Carlo.
@@ -126,8 +138,9 @@ def draw_chunk(
     count = min(settings.chunk, settings.runs - first)
     generator = np.random.Generator(np.random.Philox(key=[settings.seed, index]))
     drawn: dict[str, NDArray[Any]] = {}
-    drawn.update(settings.uncertainty.draw(plant or load_plant(settings.plant), count, generator))
-    drawn["theta_0"] = UPRIGHT + settings.start * generator.uniform(-1.0, 1.0, count)
+    drawn.update(settings.uncertainty.draw(plant or load_plant(settings.plant), settings.chunk, generator))
+    drawn["theta_0"] = UPRIGHT + settings.start * generator.uniform(-1.0, 1.0, settings.chunk)
+    drawn = {name: values[:count] for name, values in drawn.items()}
     drawn["noise_seed"] = settings.seed * _SEEDS_OF_ONE + first + np.arange(count, dtype=np.int64)
     return drawn
 
@@ -176,20 +189,35 @@ def run_monte_carlo(
     """Run all chunks that are not on disk yet, one Parquet file each, and sum up.
 
     Args:
-        folder: Where the files go; a folder of the same settings is gone on with.
+        folder: Where the files go; a folder of the same settings is gone on with, one of fewer runs is added to.
         settings: What to run.
         connect: To a Dask cluster (`cluster_client`); by default in this process, on all cores.
         on_progress: Called with chunks done and in all.
 
     Raises:
-        BagError: The folder holds something else.
+        BagError: The folder holds something else, or more runs.
     """
+    _add_runs(folder, settings)
     open_results(folder, "Monte Carlo", settings.fingerprint(), asdict(settings))
     job = (settings, load_plant(settings.plant))
     run_chunks(folder, _run_chunk, job, settings.chunks, connect=connect, on_progress=on_progress)
     result = summarise(folder, settings)
     write_json(folder / "monte_carlo.json", result)
     return result
+
+
+def _add_runs(folder: Path, settings: MonteCarlo) -> None:
+    """Let a folder of fewer runs hold more: only a last chunk that was not full has to be carried out again."""
+    kept = kept_settings(folder, settings.fingerprint())
+    before = int(kept.get("runs", settings.runs))
+    if before > settings.runs:
+        raise BagError(
+            f"folder {folder} holds a Monte Carlo of {before} runs; expected at most the {settings.runs} of this one"
+        )
+    if before < settings.runs:
+        if before % settings.chunk:
+            chunk_path(folder, before // settings.chunk).unlink(missing_ok=True)
+        write_results_marker(folder, settings.fingerprint(), asdict(settings))
 
 
 def summarise(folder: Path, settings: MonteCarlo) -> dict[str, Any]:
@@ -204,7 +232,7 @@ def summarise(folder: Path, settings: MonteCarlo) -> dict[str, Any]:
     worst = np.argsort(values["max_theta"], kind="stable")[::-1][:10]
     # Not a number is worse than any number.
     lost = int((~np.isfinite(values["max_theta"])).sum())
-    low, high = _wilson(inside, settings.runs)
+    low, high = share_interval(inside, settings.runs)
     shares = (0.05, 0.5, 0.95, 0.999)
     return {
         "settings": asdict(settings),
@@ -323,12 +351,3 @@ def _columns(drawn: Mapping[str, NDArray[Any]], result: BatchResult) -> dict[str
         "theta_dot_end": result.theta_dot,
     }
     return {name: computed[name] if name in computed else drawn[name] for name in COLUMNS}
-
-
-def _wilson(hits: int, runs: int) -> tuple[float, float]:
-    """Return the 95 % interval of a probability (Wilson, 1927), good at 0 and 1 too."""
-    z = 1.959963984540054
-    share = hits / runs
-    centre = (share + z * z / (2.0 * runs)) / (1.0 + z * z / runs)
-    half = z * math.sqrt(share * (1.0 - share) / runs + z * z / (4.0 * runs * runs)) / (1.0 + z * z / runs)
-    return max(0.0, centre - half), min(1.0, centre + half)

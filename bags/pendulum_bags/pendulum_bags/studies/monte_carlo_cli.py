@@ -19,7 +19,10 @@ __all__ = ["monte_carlo"]
 
 def monte_carlo(
     out: Annotated[
-        Path | None, typer.Option(help="Folder; an interrupted one is gone on with. Default: bags/runs/monte_carlo.")
+        Path | None,
+        typer.Option(
+            help="Folder; an interrupted one is gone on with, more runs are added. Default: bags/runs/monte_carlo."
+        ),
     ] = None,
     plant: Annotated[str, typer.Option(help="Preset or plant file; the controller is designed on it.")] = "thesis",
     uncertainty: Annotated[

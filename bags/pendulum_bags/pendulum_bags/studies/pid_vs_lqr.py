@@ -35,13 +35,14 @@ def analyse(folder: Path, study: Study, records: Sequence[Mapping[str, Any]]) ->
 
     Writes ``figures/pid_vs_lqr_*.png`` and ``.pdf``.
     """
+    records = _by_place(records)
     runs = {run.number: run for run in study.runs}
     responses: dict[tuple[str, str], list[Episode]] = {}
     for record in records:
         if record["status"] == "done":
             run = runs[record["number"]]
             assert run.spec is not None
-            key = (str(run.labels["plant"]), str(run.labels["controller"]))
+            key = (str(record["labels"]["plant"]), str(record["labels"]["controller"]))
             responses.setdefault(key, []).append(episode_of_run(folder / "runs" / run.name, run.spec))
     rows = []
     for group in group_runs(records):
@@ -108,6 +109,30 @@ def _mean_response(episodes: Sequence[Episode]) -> dict[str, Any]:
             for key, value in (("mean", centre[name]), ("low", low), ("high", high))
         }
     return found
+
+
+def _by_place(records: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
+    """Return the records with "plant" naming all that the controllers meet: a test, a mean, a pair is of one such.
+
+    Where the study varies nothing but plant, controller and seed, that is the plant's name.
+    """
+    axes = [
+        axis
+        for axis in ("disturbance", "set_point", "start")
+        if len({str(record["labels"][axis]) for record in records}) > 1
+    ]
+    found = []
+    for record in records:
+        labels = record["labels"]
+        place = ", ".join([str(labels["plant"]), *(_condition(axis, labels[axis]) for axis in axes)])
+        found.append({**record, "labels": {**labels, "plant": place}})
+    return found
+
+
+def _condition(axis: str, value: object) -> str:
+    if axis == "disturbance":
+        return str(value)
+    return f"{axis.replace('_', '-')} {f'{value:g} rad' if isinstance(value, float) else value}"
 
 
 def _paired(records: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:

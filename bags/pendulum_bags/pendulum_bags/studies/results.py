@@ -16,6 +16,7 @@ from scipy import stats
 from pendulum_bags.comparison.metrics import METRICS, Episode, metrics_of
 from pendulum_bags.experiments.run_spec import RunSpec
 from pendulum_bags.studies.runner import read_record
+from pendulum_bags.studies.shares import share_interval
 from pendulum_bags.studies.study_file import Study
 from pendulum_msgs_py.contract.angles import UPRIGHT, wrap
 from pendulum_msgs_py.contract.values import NANOSECONDS
@@ -26,6 +27,8 @@ __all__ = ["Group", "collect", "episode_of_run", "group_runs", "groups_to_json",
 
 SUCCESS_ERROR = 0.1
 """Mean distance from the set-point over the last tenth below which a run has succeeded [rad]."""
+SHARES = frozenset({"success"})
+"""Metrics that are 1 or 0 in each run: their mean is a share, and more is better."""
 _LEAST_STEP = 1e-6
 AXES = ("plant", "controller", "disturbance", "set_point", "start")
 
@@ -49,8 +52,14 @@ class Group:
     failed: int
 
     def mean(self, metric: str) -> tuple[float, float, float]:
-        """Return mean and 95 % interval over the runs (Student's t); NaN where fewer than two are finite."""
+        """Return mean and 95 % interval over the runs: of a number Student's t, of a share Wilson's.
+
+        NaN where nothing is finite, or a number has no interval because fewer than two are.
+        """
         values = self.values[metric]
+        if metric in SHARES:
+            low, high = share_interval(int(values.sum()), values.size)
+            return float(values.mean()), low, high
         finite = values[np.isfinite(values)]
         if finite.size == 0:
             return math.nan, math.nan, math.nan
@@ -61,8 +70,12 @@ class Group:
         return mean, mean - half, mean + half
 
     def worst(self, metric: str) -> tuple[float, int]:
-        """Return the largest absolute value over the runs and its seed, to replay it."""
-        values = np.abs(self.values[metric])
+        """Return the largest absolute value over the runs (of a share, the smallest) and its seed, to replay it."""
+        values = self.values[metric]
+        if metric in SHARES:
+            index = int(np.argmin(values))
+            return float(values[index]), self.seeds[index]
+        values = np.abs(values)
         index = int(np.nanargmax(values))
         return float(values[index]), self.seeds[index]
 

@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 import os
 import shutil
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -52,25 +53,59 @@ def default_workers(study: Study) -> int:
     return 1 if study.realtime or any(run.lab for run in study.runs) else max(1, (os.cpu_count() or 2) // 2)
 
 
-def open_study_folder(folder: Path, study: Study) -> None:
-    """Make the folder of a study, or check that the one that is there holds the same study.
+def open_study_folder(folder: Path, study: Study) -> Study:
+    """Make the folder of a study, or check that the one that is there holds this study, or less of it.
+
+    A study may grow: by seeds, repeats, plants, whatever its file is given. What was carried out keeps its number.
+
+    Returns:
+        The study, with the numbers that its runs have in the folder.
 
     Raises:
-        BagError: The folder holds something else, or another study.
+        BagError: The folder holds something else, or runs that this study does not have.
     """
     kept = folder / "study.yaml"
-    if kept.is_file():
-        fingerprints = json.loads((folder / "matrix.json").read_text(encoding="utf-8"))
-        if fingerprints != _matrix(study):
-            raise BagError(
-                f"folder {folder} holds runs of another study, or of another version of this one; expected a new folder"
-            )
-        return
-    if folder.exists() and any(folder.iterdir()):
-        raise BagError(f"folder {folder} is not empty and holds no study; expected a new one")
-    folder.mkdir(parents=True, exist_ok=True)
+    if not kept.is_file():
+        if folder.exists() and any(folder.iterdir()):
+            raise BagError(f"folder {folder} is not empty and holds no study; expected a new one")
+        folder.mkdir(parents=True, exist_ok=True)
+        _write_study(folder, study)
+        return study
+    known: dict[str, str] = json.loads((folder / "matrix.json").read_text(encoding="utf-8"))
+    found = replace(study, runs=_renumbered(study.runs, known, folder))
+    if _matrix(found) != known:
+        _write_study(folder, found)
+    return found
+
+
+def _write_study(folder: Path, study: Study) -> None:
     write_json(folder / "matrix.json", _matrix(study))
-    kept.write_text(study.text, encoding="utf-8")
+    (folder / "study.yaml").write_text(study.text, encoding="utf-8")
+
+
+def _renumbered(runs: Sequence[StudyRun], known: Mapping[str, str], folder: Path) -> tuple[StudyRun, ...]:
+    """Give runs the numbers under which a folder knows them, and new ones those behind.
+
+    What a run is called but its number, and what it is made of, tell which it is; repeats are told by their order.
+    """
+    numbers: dict[tuple[str, str], list[int]] = {}
+    for name, fingerprint in sorted(known.items()):
+        number, _, rest = name.partition("_")
+        numbers.setdefault((rest, fingerprint), []).append(int(number))
+    following = itertools.count(1 + max((number for group in numbers.values() for number in group), default=0))
+    found = []
+    for run in runs:
+        before = numbers.get((run.name.partition("_")[2], run.fingerprint()), [])
+        found.append(replace(run, number=before.pop(0) if before else next(following)))
+    left = [(number, rest) for (rest, _), group in numbers.items() for number in group]
+    if left:
+        first, rest = min(left)
+        raise BagError(
+            f"folder {folder} holds runs of another study, or of another version of this one: run {first} ({rest}) is "
+            "not in it as it was carried out (the files that it names included); expected the same, more runs, or a "
+            "new folder"
+        )
+    return tuple(found)
 
 
 def read_record(folder: Path, run: StudyRun) -> dict[str, Any] | None:
@@ -95,7 +130,7 @@ def run_study(
 
     Args:
         folder: As :func:`open_study_folder` made it.
-        study: The study.
+        study: The study, as :func:`open_study_folder` returned it.
         workers: Runs at once.
         retry_failed: Carry out again those that failed; else they stay failed.
         on_progress: Called several times a second.

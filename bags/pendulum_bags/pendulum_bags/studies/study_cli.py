@@ -24,7 +24,10 @@ __all__ = ["add_commands"]
 
 Out = Annotated[
     Path | None,
-    typer.Option(help="Folder of the study; an interrupted study goes on there. Default: bags/runs/<name>."),
+    typer.Option(
+        help="Folder of the study; an interrupted study goes on there, and one that was given more seeds or plants "
+        "carries out those. Default: bags/runs/<name>."
+    ),
 ]
 Workers = Annotated[
     int,
@@ -171,7 +174,7 @@ def _study(
         _print_matrix(console, found, workers)
         return
     folder = out or Path("bags", "runs", found.name)
-    open_study_folder(folder, found)
+    found = open_study_folder(folder, found)
     told = -1
 
     def show(progress: StudyProgress) -> None:

@@ -6,8 +6,9 @@ import hashlib
 import itertools
 import json
 import math
-from collections.abc import Mapping, Sequence, Sized
+from collections.abc import Iterator, Mapping, Sequence, Sized
 from dataclasses import dataclass, field
+from functools import lru_cache
 from importlib import resources
 from pathlib import Path
 from typing import Any
@@ -48,7 +49,7 @@ class StudyRun:
     """One cell of a study's matrix.
 
     Attributes:
-        number: From 1, in the order of the file.
+        number: From 1, in the order of the file; runs that a study was given later come behind those it had.
         labels: Name on each axis: plant, controller, disturbance, set_point, start, seed, repeat.
         spec: The run, for ``experiment: run``.
         engine: ``nodes`` over DDS, or ``process``: the same pieces in one process.
@@ -79,9 +80,15 @@ class StudyRun:
         return str(given.get("--lab", "")) if given.get("--hardware") == "hebi" else ""
 
     def fingerprint(self) -> str:
-        """Return a short hash of all that the run is made of."""
+        """Return a short hash of all that the run is made of, the content of the files that it names included."""
         spec = self.spec.to_json() if self.spec else None
-        content = {"spec": spec, "arguments": self.arguments, "engine": self.engine}
+        files = sorted({text for text in _texts([spec, self.arguments]) if Path(text).suffix})
+        content = {
+            "spec": spec,
+            "arguments": self.arguments,
+            "engine": self.engine,
+            "files": {name: found for name in files if (found := _content(name))},
+        }
         return hashlib.sha256(json.dumps(content, sort_keys=True, default=str).encode()).hexdigest()[:16]
 
 
@@ -111,6 +118,31 @@ class Study:
     def realtime(self) -> bool:
         """Whether runs keep the wall's time, so that no two of them may share the machine."""
         return self.clock == "realtime"
+
+
+def _texts(value: Any) -> Iterator[str]:
+    if isinstance(value, str):
+        yield value
+    elif isinstance(value, Mapping):
+        for item in value.values():
+            yield from _texts(item)
+    elif isinstance(value, (list, tuple)):
+        for item in value:
+            yield from _texts(item)
+
+
+def _content(name: str) -> str:
+    """Return a hash of a file's content, nothing where a text is no file."""
+    try:
+        status = Path(name).stat()
+    except (OSError, ValueError):
+        return ""
+    return _hash_of(name, status.st_mtime_ns, status.st_size) if Path(name).is_file() else ""
+
+
+@lru_cache(maxsize=1024)
+def _hash_of(name: str, _mtime_ns: int, _size: int) -> str:
+    return hashlib.sha256(Path(name).read_bytes()).hexdigest()
 
 
 def shipped_studies() -> dict[str, Path]:
