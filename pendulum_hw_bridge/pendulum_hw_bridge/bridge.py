@@ -45,6 +45,7 @@ class BridgeSettings:
         gains: Gains of the loops; None keeps those of the module.
         joint_offset: Joint angle where the actuator reads zero [rad].
         joint_sign: 1, or -1 for an actuator mounted the other way round.
+        effort_tare: Torque that the sensor shows at the joint when nothing pulls [N m].
     """
 
     feedback_rate: float = 100.0
@@ -53,6 +54,7 @@ class BridgeSettings:
     gains: GainSet | None = None
     joint_offset: float = 0.0
     joint_sign: int = 1
+    effort_tare: float = 0.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -261,7 +263,7 @@ class Bridge:
             feedback.stamp_ns,
             sign * feedback.position + self.settings.joint_offset,
             sign * feedback.velocity,
-            sign * feedback.effort,
+            sign * feedback.effort - self.settings.effort_tare,
         )
 
     def _to_actuator(self, drive: Drive, feedback: Feedback) -> Command:

@@ -110,6 +110,14 @@ BRIDGE_SPECS: tuple[ParameterSpec, ...] = (
     ),
     _fixed("gains_file", "", "", "HEBI gains file (XML) for trajectories; empty for the X5-9's defaults."),
     _fixed("joint_offset", 0.0, "rad", "Joint angle at which the actuator reads zero."),
+    _fixed(
+        "effort_tare",
+        0.0,
+        "N m",
+        "Torque that the sensor shows at the joint when nothing pulls; taken off the measured torque.",
+        minimum=-2.0,
+        maximum=2.0,
+    ),
     _fixed("joint_sign", 1, "-", "1, or -1 where the actuator turns the other way.", minimum=-1, maximum=1),
     _fixed(
         "pwm_limit",
@@ -334,6 +342,7 @@ def bridge_settings(
         gains=gains,
         joint_offset=values["joint_offset"],
         joint_sign=values["joint_sign"],
+        effort_tare=values["effort_tare"],
     )
 
 

@@ -29,7 +29,7 @@ def rest_items(
     """Judge angle and torque of a pendulum at rest: it hangs at zero, and carries what hangs at that angle."""
     sign = settings.joint_sign
     angle = sign * float(np.mean([record.position for record in records])) + settings.joint_offset
-    torque = sign * float(np.mean([record.effort for record in records]))
+    torque = sign * float(np.mean([record.effort for record in records])) - settings.effort_tare
     items = [
         CheckItem(
             "angle is inside its window",

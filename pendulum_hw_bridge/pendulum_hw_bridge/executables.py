@@ -7,6 +7,7 @@ EXECUTABLES: dict[str, str] = {
     "check": "pendulum_hw_bridge.check_cli:main",
     "emulator": "pendulum_hw_bridge.emulator_cli:main",
     "emulator_fault": "pendulum_hw_bridge.emulator_cli:fault_main",
+    "lab": "pendulum_hw_bridge.lab_cli:main",
     "procedure": "pendulum_hw_bridge.procedure_node:main",
     "scan": "pendulum_hw_bridge.scan_cli:main",
 }

@@ -22,7 +22,7 @@ _PATIENCE = 30.0
 
 
 class Hand(Protocol):
-    """Who turns the link counter-clockwise."""
+    """Who turns the link."""
 
     def begin(self) -> None:
         """Begin to turn."""
@@ -37,14 +37,16 @@ class Person:
 
     Attributes:
         say: Shows a sentence.
+        way: Which way they shall turn it.
     """
 
     say: Callable[[str], None]
+    way: str = "COUNTER-CLOCKWISE"
 
     def begin(self) -> None:
         """Ask for it."""
         self.say(
-            "The motor gets no torque. Turn the link by hand, slowly, a little COUNTER-CLOCKWISE as you look at it "
+            f"The motor gets no torque. Turn the link by hand, slowly, a little {self.way} as you look at it "
             f"(about 10 degrees), then let go. Waiting for {_PATIENCE:g} s."
         )
 
@@ -59,27 +61,31 @@ class EmulatedHand:
 
     Attributes:
         push: The emulator's, [N m].
+        direction: 1 for counter-clockwise, -1 for clockwise.
     """
 
     push: Callable[[float], None]
+    direction: int = 1
 
     def begin(self) -> None:
-        """Push counter-clockwise."""
-        self.push(EMULATED_NUDGE)
+        """Push."""
+        self.push(self.direction * EMULATED_NUDGE)
 
     def end(self) -> None:
         """Let go."""
         self.push(0.0)
 
 
-def hand_of(port: ActuatorPort, say: Callable[[str], None]) -> Hand:
-    """Return the emulated hand of an emulator, and a person elsewhere."""
+def hand_of(port: ActuatorPort, say: Callable[[str], None], *, clockwise: bool = False) -> Hand:
+    """Return the emulated hand of an emulator, and a person elsewhere, for a turn counter-clockwise or clockwise."""
     push = getattr(port, "push", None)
-    return EmulatedHand(push) if push is not None else Person(say)
+    if push is not None:
+        return EmulatedHand(push, -1 if clockwise else 1)
+    return Person(say, "CLOCKWISE" if clockwise else "COUNTER-CLOCKWISE")
 
 
 def watch_nudge(port: ActuatorPort, hand: Hand, *, patience: float = _PATIENCE) -> float:
-    """Return by how far the actuator turned when the hand turned the link counter-clockwise [rad], in its own sign.
+    """Return by how far the actuator turned when the hand turned the link [rad], in its own sign.
 
     Zero where nothing moved within the patience.
 

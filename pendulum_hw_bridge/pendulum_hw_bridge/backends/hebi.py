@@ -35,7 +35,7 @@ from pendulum_hw_bridge.gains import DEFAULT_GAINS, GAIN_FIELDS, LOOPS, GainSet,
 from pendulum_msgs_py.contract.values import NANOSECONDS
 from pendulum_msgs_py.errors import ParameterError
 
-__all__ = ["HebiBackend", "connect_group", "open_lookup"]
+__all__ = ["HebiBackend", "connect_group", "new_command", "open_lookup"]
 
 _LOOKUP_TIMEOUT = 5.0
 _ACKNOWLEDGE_MS = 200
@@ -111,6 +111,11 @@ def open_lookup(interface: str = "") -> Any:
     """
     hebi = _import_hebi()
     return hebi.Lookup([interface]) if interface else hebi.Lookup()
+
+
+def new_command() -> Any:
+    """Return an empty command of hebi-py for one module."""
+    return _import_hebi().GroupCommand(1)
 
 
 class HebiBackend:

@@ -1,0 +1,311 @@
+"""The guided procedures, on the emulator and with a scripted person; and on hebi-py's own files of settings."""
+
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from pendulum_hw_bridge import guided, lab_cli
+from pendulum_hw_bridge.actuator import ActuatorError, Command, MStopAction, Strategy
+from pendulum_hw_bridge.backends import hebi as backend_module
+from pendulum_hw_bridge.backends.emulator import EmulatorBackend
+from pendulum_hw_bridge.bridge import BridgeSettings
+from pendulum_hw_bridge.clocks import SteppedClock
+from pendulum_hw_bridge.emulation.faults import ActuatorFault
+from pendulum_hw_bridge.emulation.parameters import load_emulator
+from pendulum_hw_bridge.emulation.x5 import EmulatedX5
+from pendulum_hw_bridge.module_files import backup_emulator, backup_group, restore_emulator, restore_group
+from pendulum_hw_bridge.nudge import EmulatedHand
+from pendulum_msgs_py.errors import ParameterError
+from pendulum_msgs_py.plants.lab_file import load_lab
+
+
+class Rig:
+    """An emulated machine mounted somehow, and a person who does what they are told."""
+
+    def __init__(self, plant: str = "thesis", *, position: float = 0.0) -> None:
+        self.parameters = load_emulator(plant)
+        self.actuator = EmulatedX5(self.parameters, seed=3, position=position)
+        self.port = EmulatorBackend(self.actuator, SteppedClock())
+        self.port.connect()
+        self.said: list[str] = []
+        self.driven_before_agreed = False
+        self.agreed = False
+        self.actuator.trace = self._watch
+
+    def _watch(self, link: Any) -> None:
+        self.driven_before_agreed |= not self.agreed and link.pwm != 0.0
+
+    def say(self, text: str) -> None:
+        self.said.append(text)
+
+    def go_on(self, text: str) -> None:
+        # Some time passes until Enter is pressed.
+        self.port.clock.wait_until(self.port.now_ns() + 500_000_000)
+        self.port.read(0.0)
+        self.said.append(text)
+        self.agreed = True
+
+    def hands(self, sign: int = 1) -> tuple[EmulatedHand, EmulatedHand]:
+        return EmulatedHand(self.port.push, sign), EmulatedHand(self.port.push, -sign)
+
+
+# --- zero and sign ----------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("plant", ["thesis", "x5_9"])
+@pytest.mark.parametrize("sign", [1, -1])
+def test_zero_is_the_middle_between_the_rests_and_sign_the_way_of_the_turn(plant: str, sign: int) -> None:
+    rig = Rig(plant)
+    # With the sign -1 the actuator is mounted the other way round: what the person turns counter-clockwise, it counts
+    # down.
+    found = guided.find_zero_and_sign(rig.port, rig, *rig.hands(sign))
+    assert found.sign == sign
+    # Alone, friction holds the link of x5_9 0.2 rad off.
+    assert found.offset == pytest.approx(0.0, abs=0.03)
+    assert not rig.driven_before_agreed
+    assert rig.actuator.strategy is Strategy.OFF
+    assert "no torque" in rig.said[0]
+
+
+@pytest.mark.parametrize("encoder", [1.2, -9.0])
+def test_a_zero_that_was_found_makes_the_hanging_joint_read_zero(
+    monkeypatch: pytest.MonkeyPatch, encoder: float
+) -> None:
+    rig = Rig()
+    read = rig.port.read
+
+    def turned(timeout: float) -> Any:
+        record = read(timeout)
+        return record and record._replace(position=record.position + encoder)
+
+    monkeypatch.setattr(rig.port, "read", turned)
+    found = guided.find_zero_and_sign(rig.port, rig, *rig.hands(-1))
+    assert found.sign * encoder + found.offset == pytest.approx(0.0, abs=0.03)
+
+
+def test_two_turns_the_same_way_or_none_are_told() -> None:
+    rig = Rig()
+    hand, _ = rig.hands()
+    with pytest.raises(ActuatorError, match="both turns went the same way"):
+        guided.find_zero_and_sign(rig.port, rig, hand, hand)
+    with pytest.raises(ActuatorError, match="nothing turned"):
+        guided.find_zero_and_sign(rig.port, rig, EmulatedHand(lambda torque: None), hand)
+
+
+# --- tare -------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("plant", ["thesis", "x5_9"])
+def test_a_healthy_sensor_has_next_to_no_tare(plant: str) -> None:
+    rig = Rig(plant)
+    found = guided.measure_tare(rig.port, BridgeSettings(), rig.parameters.plant, rig)
+    assert found == pytest.approx(0.0, abs=0.1)
+
+
+@pytest.mark.parametrize(("sign", "offset"), [(1, 0.4), (-1, 0.4), (1, -0.7)])
+def test_the_tare_is_what_the_sensor_shows_beyond_what_hangs_there(
+    monkeypatch: pytest.MonkeyPatch, sign: int, offset: float
+) -> None:
+    rig = Rig()
+    read = rig.port.read
+
+    def biased(timeout: float) -> Any:
+        record = read(timeout)
+        return record and record._replace(effort=record.effort + offset)
+
+    monkeypatch.setattr(rig.port, "read", biased)
+    settings = BridgeSettings(joint_sign=sign)
+    assert guided.measure_tare(rig.port, settings, rig.parameters.plant, rig) == pytest.approx(sign * offset, abs=0.02)
+
+
+def test_a_torque_that_something_pulls_with_is_no_tare() -> None:
+    rig = Rig()
+    rig.actuator.inject(ActuatorFault.EFFORT_OFFSET)
+    with pytest.raises(ActuatorError, match="something pulls, or zero is wrong"):
+        guided.measure_tare(rig.port, BridgeSettings(), rig.parameters.plant, rig)
+
+
+# --- proofs -----------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("lifetime", [0.03, 0.05, 0.25])
+def test_the_torque_ends_by_itself_when_nobody_commands(lifetime: float) -> None:
+    rig = Rig()
+    took = guided.prove_lifetime(rig.port, BridgeSettings(command_lifetime=lifetime), rig)
+    assert lifetime - 0.01 <= took <= lifetime + 0.02
+    assert rig.actuator.lifetime_expiries == 1
+    assert not rig.driven_before_agreed
+    assert rig.actuator.strategy is Strategy.OFF
+    assert "THE MOTOR WILL TURN GENTLY" in rig.said[0]
+    assert abs(rig.actuator.link.position) < math.radians(15.0)
+
+
+def test_a_lifetime_that_does_not_end_the_torque_is_told_and_the_motor_is_stopped(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    rig = Rig()
+    # A module that keeps another lifetime than it says.
+    monkeypatch.setattr(rig.port, "set_command_lifetime", lambda lifetime: lifetime)
+    rig.actuator.configure(command_lifetime=5.0)
+    with pytest.raises(ActuatorError, match=r"kept its duty for .* Do not arm this machine"):
+        guided.prove_lifetime(rig.port, BridgeSettings(), rig)
+    assert rig.actuator.strategy is Strategy.OFF
+
+
+def test_the_motion_stop_is_proved_by_pressing_it() -> None:
+    rig = Rig()
+    write, cycles = rig.port.write, iter(range(1000))
+
+    def press_in_the_30th_cycle(command: Command) -> Any:
+        if next(cycles) == 30:
+            rig.actuator.inject(ActuatorFault.M_STOP)
+        return write(command)
+
+    rig.port.write = press_in_the_30th_cycle  # type: ignore[method-assign]
+    assert guided.prove_m_stop(rig.port, BridgeSettings(), rig) <= 0.06
+    assert not rig.driven_before_agreed
+    assert rig.actuator.strategy is Strategy.OFF
+
+
+def test_a_motion_stop_that_nobody_presses_or_that_is_pressed_already_proves_nothing() -> None:
+    rig = Rig()
+    with pytest.raises(ActuatorError, match="was not pressed within 20 s"):
+        guided.prove_m_stop(rig.port, BridgeSettings(), rig)
+    assert rig.actuator.strategy is Strategy.OFF
+    rig.actuator.inject(ActuatorFault.M_STOP)
+    with pytest.raises(ActuatorError, match="is the motion stop pressed already"):
+        guided.prove_m_stop(rig.port, BridgeSettings(), rig)
+
+
+def test_lost_feedback_ends_a_proof_with_the_motor_off() -> None:
+    rig = Rig()
+    rig.actuator.inject(ActuatorFault.FEEDBACK_LOST)
+    with pytest.raises(ActuatorError, match="no feedback for ten periods"):
+        guided.prove_lifetime(rig.port, BridgeSettings(), rig)
+    assert rig.actuator.strategy is Strategy.OFF
+
+
+# --- settings of a module, kept and given back ------------------------------------------------------------------
+
+
+def test_what_an_emulator_was_set_to_is_given_back(tmp_path: Path) -> None:
+    rig = Rig()
+    before = rig.port.connect()
+    backup_emulator(rig.port, tmp_path / "before")
+    rig.port.set_limits(BridgeSettings().limits.__class__(effort=1.0, m_stop=MStopAction.HOLD_POSITION))
+    assert rig.port.connect().limits != before.limits
+    restore_emulator(rig.port, tmp_path / "before")
+    assert rig.port.connect().limits == before.limits
+    assert rig.port.connect().gains == before.gains
+    with pytest.raises(ParameterError, match="is there already; expected a new folder"):
+        backup_emulator(rig.port, tmp_path / "before")
+
+
+class Module:
+    """A group whose module keeps what hebi-py's own command objects say, and tells it through hebi-py's own files."""
+
+    def __init__(self, hebi: Any) -> None:
+        self._hebi = hebi
+        self.state = hebi.GroupCommand(1)
+        self.keeps = self.answers = True
+        self.sent_setpoints = False
+
+    def request_info(self, timeout_ms: int) -> Any:
+        return self.state if self.answers else None
+
+    def send_command_with_acknowledgement(self, command: Any, timeout_ms: int) -> bool:
+        self.sent_setpoints |= bool(np.isfinite([command.position[0], command.velocity[0], command.effort[0]]).any())
+        if self.keeps:
+            for name in ("position_kp", "velocity_kp", "effort_kp", "effort_limit_max", "effort_limit_min"):
+                value = float(getattr(command, name)[0])
+                if not math.isnan(value):
+                    setattr(self.state, name, value)
+            if command.mstop_strategy[0]:
+                self.state.mstop_strategy = ["Disabled", "MotorOff", "HoldPosition"][int(command.mstop_strategy[0])]
+        return True
+
+
+def test_gains_safety_parameters_and_m_stop_action_of_a_module_are_given_back(tmp_path: Path) -> None:
+    hebi = pytest.importorskip("hebi", reason="hebi-py is not installed")
+    module = Module(hebi)
+    module.state.position_kp, module.state.effort_limit_max, module.state.effort_limit_min = 2.5, 7.0, -7.0
+    module.state.mstop_strategy = "HoldPosition"
+    gains, safety = backup_group(module, tmp_path / "before")
+    assert "<kp>2.5" in gains.read_text()
+    assert "motor_hold" in safety.read_text()
+    module.state.position_kp, module.state.effort_limit_max = 1.5, 1.0
+    module.state.mstop_strategy = "MotorOff"
+    restore_group(module, tmp_path / "before", backend_module.new_command)
+    assert module.state.position_kp[0] == 2.5
+    assert module.state.effort_limit_max[0] == 7.0
+    assert int(module.state.mstop_strategy[0]) == 2
+    assert not module.sent_setpoints
+
+    module.state.position_kp = 1.5
+    module.keeps = False
+    with pytest.raises(ActuatorError, match=r"reads back other values than those of .*gains.xml"):
+        restore_group(module, tmp_path / "before", backend_module.new_command)
+    module.answers = False
+    with pytest.raises(ActuatorError, match="did not tell its settings"):
+        backup_group(module, tmp_path / "other")
+    (tmp_path / "before" / "safety.xml").unlink()
+    with pytest.raises(ParameterError, match=r"safety.xml does not exist"):
+        restore_group(module, tmp_path / "before", backend_module.new_command)
+
+
+# --- command line -----------------------------------------------------------------------------------------------
+
+
+def test_a_lab_file_is_written_step_by_step_and_shown(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    lab = str(tmp_path / "lab.yaml")
+    arguments = ["--backend", "emulator_process", "--emulator-address", "127.0.0.1:9"]
+    assert lab_cli.main(["new", lab, *arguments, "--effort", "4", "--supply", "36"]) == 0
+    assert lab_cli.main(["new", lab, *arguments]) == 2
+    assert "is there already" in capsys.readouterr().err
+    assert load_lab(lab).values["voltage_window"] == [30.6, 41.4]
+
+    rig = Rig("thesis")
+    monkeypatch.setattr("pendulum_hw_bridge.bridge_parameters.make_port", lambda *_, **__: rig.port)
+    for step in ("zero", "tare", "prove_lifetime"):
+        assert lab_cli.main([step, lab, "--yes"]) == 0, capsys.readouterr().err
+    values, proofs = load_lab(lab).values, load_lab(lab).proofs
+    assert values["joint_sign"] == 1
+    assert values["joint_offset"] == pytest.approx(0.0, abs=0.03)
+    assert set(proofs) == {"zero", "effort_tare", "command_lifetime"}
+    assert lab_cli.main(["backup", lab, "--out", str(tmp_path / "before")]) == 0
+    assert lab_cli.main(["restore", lab, str(tmp_path / "before"), "--yes"]) == 0
+    assert lab_cli.main(["show", lab]) == 0
+    assert "torque ended" in capsys.readouterr().out
+
+
+def test_a_step_that_fails_or_is_left_keeps_the_lab_file_as_it_was(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    lab = tmp_path / "lab.yaml"
+    lab.write_text("format: pendulum_lab/1\nmodule: {backend: emulator}\n")
+    before = lab.read_text()
+    rig = Rig()
+    rig.actuator.inject(ActuatorFault.EFFORT_OFFSET)
+    monkeypatch.setattr("pendulum_hw_bridge.bridge_parameters.make_port", lambda *_, **__: rig.port)
+    assert lab_cli.main(["tare", str(lab), "--yes"]) == 2
+    assert "something pulls" in capsys.readouterr().err
+
+    def leave(*_: object) -> str:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("builtins.input", leave)
+    assert lab_cli.main(["prove_lifetime", str(lab)]) == 130
+
+    def nobody(*_: object) -> str:
+        raise EOFError
+
+    monkeypatch.setattr("builtins.input", nobody)
+    assert lab_cli.main(["prove_lifetime", str(lab)]) == 2
+    assert "a person is needed" in capsys.readouterr().err
+    assert lab.read_text() == before
+    assert not rig.driven_before_agreed
