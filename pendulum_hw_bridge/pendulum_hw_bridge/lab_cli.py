@@ -247,8 +247,8 @@ def _machine(file: Path) -> Iterator[tuple[ActuatorPort, AsTheBridge]]:
 
 def _group(lab: LabFile) -> Any:
     values = lab.values
-    names = ("family", "name", "mac_address", "serial")
-    wanted = ModuleSelection(*(str(values.get(name, "")) for name in names), str(values.get("module_type", "X5-9")))
+    family, name, mac, serial = (str(values.get(key, "")) for key in ("family", "name", "mac_address", "serial"))
+    wanted = ModuleSelection(family, name, mac, serial, str(values.get("module_type", "X5-9")))
     return hebi.connect_group(wanted, str(values.get("interface", "")))
 
 

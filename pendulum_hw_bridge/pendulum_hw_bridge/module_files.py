@@ -7,6 +7,7 @@ gains in the same format and its limits in JSON.
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -65,6 +66,8 @@ def restore_group(group: Any, folder: Path, make_command: Callable[[], Any]) -> 
             getattr(command, read)(str(folder / name))
         except Exception as error:
             raise ParameterError(f"backup {folder / name} is not understood: {error}") from error
+        # An empty command of hebi-py reads as position 0; said to be none, nothing can be taken for a wish to move.
+        command.position = command.velocity = command.effort = math.nan
         if not any(group.send_command_with_acknowledgement(command, _ANSWER_MS) for _ in range(_ATTEMPTS)):
             raise ActuatorError(
                 "no_acknowledgement", f"HEBI module did not acknowledge {name} within {_ANSWER_MS} ms"
