@@ -25,6 +25,7 @@ from pendulum_lqr.controller import (
     controller_class,
     make_controller,
 )
+from pendulum_lqr.sampling import ASSUMED_PERIOD, PeriodWatch, differs, rate_problem, uses_period
 from pendulum_msgs_py.contract import names
 from pendulum_msgs_py.contract.cdr import encode_joint_state
 from pendulum_msgs_py.contract.timing import SteadyWallClock
@@ -50,8 +51,8 @@ NODE_SPECS: tuple[ParameterSpec, ...] = (
         "plant", "thesis", "", "Plant to design for: thesis, x5_9, dfki or the path of a plant file.", read_only=True
     ),
     ParameterSpec(
-        "period", 0.01, "s", "Sampling period of the loop, which discrete designs and filters need.",
-        minimum=0.0, exclusive_minimum=True, read_only=True,
+        "period", 0.0, "s", "Sampling period of the loop, which discrete designs and filters need; 0 takes it from the "
+        "states.", minimum=0.0, read_only=True,
     ),
     ParameterSpec(
         "state_timeout", 0.05, "s", "Age beyond which a state is refused; not used in simulated time.",
@@ -70,6 +71,8 @@ NODE_SPECS: tuple[ParameterSpec, ...] = (
 """Parameters of the node itself; those of the chosen controller join them."""
 
 _DIAGNOSTICS_PERIOD = 0.5
+_SAME_PERIOD = 0.02
+"""Share by which a measured period may differ from that of the design without another design."""
 _MULTI_ARRAY_TOPIC = "~/commands"
 
 
@@ -94,9 +97,14 @@ class ControllerNode(LifecycleNode):
         specs = NODE_SPECS + COMMON_PARAMETERS + controller_class(kind).PARAMETERS
         self._settings = NodeParameters(self, specs, self._design, self._swap)
         self._plant: PlantParameters = load_plant(self._settings["plant"])
+        self._period = self._settings["period"] or ASSUMED_PERIOD
         # A bad value at start ends the node with its reason instead of waiting for a transition to fail.
         self._pending: Controller | None = self._design(self._settings.values)
         self._simulated_time = bool(self.get_parameter("use_sim_time").value)
+        self._watch = PeriodWatch(exact=self._simulated_time)
+        self._period_known = False
+        self._told_other_rate = False
+        self._refusal = ""
         self._now = SteadyWallClock()
         self._full_name = self.get_fully_qualified_name()
         self._told_refusals = 0
@@ -139,6 +147,8 @@ class ControllerNode(LifecycleNode):
         """Start answering, with nothing remembered from before."""
         if self._loop is None:
             return TransitionCallbackReturn.FAILURE
+        if self._watch.period is not None and not self._settle_period(self._watch.period):
+            return TransitionCallbackReturn.FAILURE
         self._loop.restart()
         self._active = True
         return super().on_activate(state)
@@ -167,9 +177,11 @@ class ControllerNode(LifecycleNode):
     # --- callbacks -----------------------------------------------------------------------------------------
 
     def _on_state(self, data: bytes) -> None:
-        if not self._active or self._loop is None:
-            return
         sample = sample_from_bytes(data)
+        if sample is not None and self._watch.add(sample.stamp_ns):
+            self._period_known = False
+        if not self._active or self._loop is None or not self._may_answer():
+            return
         effort = self._loop.answer(sample, self._now(), problem_of_state(data) if sample is None else "")
         if effort is None or sample is None:
             return
@@ -209,7 +221,56 @@ class ControllerNode(LifecycleNode):
 
     def _design(self, values: Mapping[str, Any]) -> Controller:
         own = {name: value for name, value in values.items() if name not in self._own}
-        return make_controller(values["controller"], self._plant, values["period"], own)
+        return make_controller(values["controller"], self._plant, self._period, own)
+
+    def _design_for(self, period: float) -> None:
+        """Take another period, and design anew where that makes a difference."""
+        before, self._period = self._period, period
+        if self._loop is None or not self._uses_period():
+            return
+        try:
+            self._loop.replace(self._design(self._settings.values))
+        except PendulumError:
+            self._period = before
+            raise
+        self.get_logger().info(f"designed for states every {period:g} s: {self._loop.controller.describe()}")
+
+    def _uses_period(self) -> bool:
+        return uses_period(self._settings["controller"], self._settings["velocity"])
+
+    def _may_answer(self) -> bool:
+        """Tell whether the rate of the states is one that the design is for, as far as it is known."""
+        if self._period_known:
+            return True
+        measured = self._watch.period
+        if measured is not None:
+            if self._settle_period(measured):
+                return True
+            self.trigger_deactivate()
+            return False
+        # What depends on the period and was not told it waits for the first few states. In lockstep there is no
+        # second state without an answer to the first; and whoever has been answering goes on while a plant comes back.
+        waits = self._uses_period() and not self._settings["period"] and not self._simulated_time
+        return not waits or (self._loop is not None and self._loop.answered > 0)
+
+    def _settle_period(self, measured: float) -> bool:
+        """Design for the measured period where none was given; return whether the controller bears it."""
+        values = self._settings.values
+        self._refusal = ""
+        try:
+            if not values["period"] and abs(measured / self._period - 1.0) > _SAME_PERIOD:
+                self._design_for(measured)
+            self._refusal = rate_problem(
+                lambda: self._design(values), values["controller"], self._plant, self._period, measured,
+                uses=self._uses_period(), set_point=values["set_point"],
+            )  # fmt: skip
+        except PendulumError as error:
+            self._refusal = f"states come every {measured:g} s: {error}"
+        if self._refusal:
+            self.get_logger().error(f"not answering: {self._refusal}")
+            return False
+        self._period_known = True
+        return True
 
     def _autostart(self) -> None:
         if self.trigger_configure() != TransitionCallbackReturn.SUCCESS:
@@ -242,11 +303,23 @@ class ControllerNode(LifecycleNode):
             values["gain"] = self._loop.controller.describe()
             values["effort_limit"] = self._loop.controller.effort_limit
             values.update(self._loop.summary(time.monotonic_ns()))
+        measured = self._watch.period
+        values["period"] = self._period
+        values["measured_period"] = math.nan if measured is None else measured
+        other_rate = measured is not None and self._uses_period() and differs(measured, self._period)
+        if self._refusal:
+            level, text = DiagnosticStatus.ERROR, f"not answering: {self._refusal}"
         if self._active:
             rate = values.get("answer_rate_hz")
             answering = isinstance(rate, float) and (rate > 0.0 or math.isnan(rate))
             text = "answering" if answering else "active, no states"
             level = DiagnosticStatus.OK if answering else DiagnosticStatus.WARN
+            if other_rate:
+                level = DiagnosticStatus.WARN
+                text = f"{text}; states come every {measured:g} s, designed for {self._period:g} s"
+                if not self._told_other_rate:
+                    self.get_logger().warning(text)
+            self._told_other_rate = other_rate
         message = DiagnosticArray(
             status=[diagnostic_status(f"{self.get_fully_qualified_name()}: controller", level, text, values)]
         )

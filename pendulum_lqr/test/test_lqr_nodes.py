@@ -7,7 +7,7 @@ import time
 from collections.abc import Iterator
 
 import pytest
-from diagnostic_msgs.msg import DiagnosticArray
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from lifecycle_msgs.msg import Transition
 from lifecycle_msgs.srv import ChangeState
 from rcl_interfaces.srv import SetParameters
@@ -135,6 +135,53 @@ def test_the_controller_answers_each_state_once_by_its_stamp_and_ends_with_zero(
     assert program.wait(15) == 0
     plant.until(lambda: plant.commands[-1].effort == 0.0, "the last zero")
     assert plant.commands[-1].stamp_ns > plant.commands[-2].stamp_ns
+
+
+def test_the_period_is_taken_from_the_states_or_refused_where_the_loop_would_be_unstable(plant, processes):
+    def publish(count: int) -> list[int]:
+        first = time.time_ns()
+        stamps = []
+        for k in range(count):
+            stamps.append(plant.publish(first + 2_000_000 * k, position=math.pi + 0.01, velocity=0.0))
+            plant.spin(0.01)
+        plant.spin(0.3)
+        return stamps
+
+    pid = ("controller:=pid", "plant:=dfki", PATIENT)
+    program = processes.start("pendulum_lqr", "controller", *ros(*pid))
+    plant.connect()
+    stamps = publish(30)
+    program.wait_for_output(r"designed for states every 0\.00\d+ s: kp = ", 10)
+    # The first states only tell the rate.
+    assert plant.commands
+    assert {command.stamp_ns for command in plant.commands} <= set(stamps[9:])
+    told = plant.until(
+        lambda: (d := plant.diagnostics.get("/sim/controller: controller", {})).get("measured_period") != "nan" and d,
+        "the measured period",
+    )
+    assert told["period"] == told["measured_period"]
+    program.send_signal(signal.SIGTERM)
+    assert program.wait(15) == 0
+
+    plant.commands.clear()
+    plant.diagnostics.clear()
+    program = processes.start("pendulum_lqr", "controller", *ros("period:=0.01", *pid))
+    plant.connect()
+    publish(30)
+    program.wait_for_output(r"not answering: period is 0\.01 s, but states come every 0\.00\d+ s", 10)
+    plant.until(lambda: plant.commands and plant.commands[-1].effort == 0.0, "the last zero")
+    count = len(plant.commands)
+    publish(5)
+    assert len(plant.commands) == count
+    plant.until(
+        lambda: (
+            (d := plant.diagnostics.get("/sim/controller: controller", {})).get("level") == DiagnosticStatus.ERROR
+            and "not answering: period is 0.01 s" in d["message"]
+        ),
+        "the refusal in diagnostics",
+    )
+    request = ChangeState.Request(transition=Transition(id=Transition.TRANSITION_ACTIVATE))
+    assert not plant.call(ChangeState, "controller/change_state", request).success
 
 
 def test_a_controller_that_waits_is_silent_until_it_is_activated(plant, processes):

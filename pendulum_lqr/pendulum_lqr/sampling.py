@@ -1,0 +1,155 @@
+"""The rate at which states come, measured, and whether a controller bears it."""
+
+from __future__ import annotations
+
+import math
+import statistics
+from collections import deque
+from collections.abc import Callable
+
+import numpy as np
+
+from pendulum_lqr.controller import Controller
+from pendulum_lqr.design import discretise
+from pendulum_lqr.model import linearise
+from pendulum_msgs_py.contract.angles import UPRIGHT, wrap
+from pendulum_msgs_py.contract.values import NANOSECONDS
+from pendulum_msgs_py.plants.plant_parameters import PlantParameters
+
+__all__ = ["ASSUMED_PERIOD", "PeriodWatch", "differs", "rate_problem", "settles", "uses_period"]
+
+ASSUMED_PERIOD = 0.01
+"""Period of a design whose states nobody has heard yet [s]: that of the thesis's loop."""
+TOLERANCE = 0.2
+"""Share by which the measured period may differ from that of the design: a late state now and then is no other rate."""
+_WINDOW = 15
+_ENOUGH = 9
+_GAP_NS = NANOSECONDS
+_IGNORE_PERIOD = frozenset({"lqr", "pd_gravity", "sliding_mode", "energy_swing_up", "playback"})
+_BALANCING = frozenset({"lqr", "lqi", "lqg", "discrete_lqr", "pid", "pd_gravity", "mpc", "sliding_mode"})
+_FAST_PERIOD = 2e-3
+"""Up to this period a design in continuous time is taken at its word [s]."""
+_RELEASE = 0.01
+_DURATION = 3.0
+_MOST_SAMPLES = 1500
+
+
+class PeriodWatch:
+    """Measures the period of states by their stamps: the median of the last intervals.
+
+    A state that was lost on the way doubles one interval, two states that a stall has brought together shorten one;
+    neither moves the median.
+
+    Args:
+        exact: Stamps are simulated time, where one interval says it all and nothing may wait for more.
+    """
+
+    def __init__(self, *, exact: bool = False) -> None:
+        self._exact = exact
+        self._newest_ns: int | None = None
+        self._intervals_ns: deque[int] = deque(maxlen=1 if exact else _WINDOW)
+
+    def add(self, stamp_ns: int) -> bool:
+        """Take the stamp of a state [ns]; return whether the plant began anew, so that what was measured is void."""
+        newest, self._newest_ns = self._newest_ns, stamp_ns
+        if newest is None or stamp_ns == newest:
+            return False
+        interval = stamp_ns - newest
+        if 0 < interval < _GAP_NS:
+            self._intervals_ns.append(interval)
+            return False
+        self._intervals_ns.clear()
+        return True
+
+    @property
+    def period(self) -> float | None:
+        """The period [s], to three digits; None before it is known."""
+        if len(self._intervals_ns) < (1 if self._exact else _ENOUGH):
+            return None
+        return float(f"{statistics.median(self._intervals_ns) / NANOSECONDS:.3g}")
+
+
+def differs(measured: float, designed: float) -> bool:
+    """Tell whether states come at another rate than a design counts on; both are periods [s]."""
+    return abs(measured / designed - 1.0) > TOLERANCE
+
+
+def uses_period(kind: str, velocity: str = "measured") -> bool:
+    """Tell whether a controller's answers depend on the sampling period that it was designed for.
+
+    Args:
+        kind: Name of the controller; one that is not known here counts as if they did.
+        velocity: Where it takes the velocity from; every estimator depends on it.
+    """
+    return kind not in _IGNORE_PERIOD or velocity != "measured"
+
+
+def settles(controller: Controller, plant: PlantParameters, period: float, set_point: float = 0.0) -> bool:
+    """Tell whether a balancing controller settles on the linear model of its plant when it is asked at a period.
+
+    It is released 0.01 rad beside its set-point, for up to 3 s; dry friction, which would hold it there, is no part of
+    the model.
+
+    Args:
+        controller: The controller; it is used up.
+        plant: The plant that it was designed for.
+        period: Period at which it is asked [s].
+        set_point: Angle to hold, from upright [rad].
+    """
+    model = linearise(plant, UPRIGHT + set_point)
+    sampled = discretise(model, period)
+    state = np.zeros(sampled.A.shape[0])
+    state[0] = _RELEASE
+    samples = int(min(_MOST_SAMPLES, max(200.0, _DURATION / period)))
+    limit = min(controller.effort_limit, plant.effort_limit)
+    late = 0.0
+    for k in range(samples):
+        if not abs(state[0]) < 1.0:
+            return False
+        effort = controller.command(k * period, (wrap(set_point + float(state[0])), float(state[1])))
+        if not math.isfinite(effort):
+            return False
+        state = sampled.A @ state + sampled.B[:, 0] * (min(limit, max(-limit, effort)) - model.effort)
+        if k >= 0.75 * samples:
+            late = max(late, abs(float(state[0])))
+    return late < _RELEASE
+
+
+def rate_problem(
+    make: Callable[[], Controller],
+    kind: str,
+    plant: PlantParameters,
+    designed: float,
+    measured: float,
+    *,
+    uses: bool,
+    set_point: float = 0.0,
+) -> str:
+    """Return why a controller must not answer states that come at another rate than it was designed for, or nothing.
+
+    Refused is what would settle at its own rate and does not at theirs: a controller that never does, such as one of
+    zero torque, is somebody's intention.
+
+    Args:
+        make: Designs the controller.
+        kind: Its name.
+        plant: The plant that it was designed for.
+        designed: Period of the design [s].
+        measured: Period of the states [s].
+        uses: Whether its answers depend on the period, see :func:`uses_period`.
+        set_point: Angle to hold, from upright [rad].
+    """
+    own = designed if uses else _FAST_PERIOD
+    if kind not in _BALANCING or not differs(measured, own) or (not uses and measured < own):
+        return ""
+    if settles(make(), plant, measured, set_point) or not settles(make(), plant, own, set_point):
+        return ""
+    if uses:
+        return (
+            f"period is {designed:g} s, but states come every {measured:g} s, at which {kind} designed for the former "
+            f"does not settle; expected period:={measured:g}, or 0 to take it from the states"
+        )
+    return (
+        f"states come every {measured:g} s, at which {kind} does not settle on plant {plant.name!r}; expected a faster "
+        "plant, or a controller that is designed for its period, such as discrete_lqr"
+    )
