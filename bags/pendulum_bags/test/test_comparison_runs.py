@@ -173,7 +173,7 @@ def test_command_prints_the_verdict_last(folder: Path, capsys: pytest.CaptureFix
     assert question
     assert "distance of velocities less the delay" in table
     assert answer.startswith(" Yes: in this run simulation and the hardware move alike within the default margins")
-    assert "What to do next: - python -m pendulum_bags experiment" in answer
+    assert "What to do next: - Measure “same plant” and “which controllers”: python -m pendulum_bags" in answer
 
 
 @pytest.mark.parametrize(

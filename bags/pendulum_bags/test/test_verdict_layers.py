@@ -41,7 +41,7 @@ def test_yes_needs_all_measured_layers_and_names_those_that_were_not() -> None:
     answer = sum_up([result(Layer.SAME_RUN, Mark.YES), result(Layer.SAME_PLANT, Mark.YES)])
     assert answer.mark is Mark.YES
     assert answer.sentence.endswith("Not measured: “which controllers” and “same choice”.")
-    assert "python -m pendulum_bags experiment ranking" in answer.next_steps
+    assert "Measure “same choice”: python -m pendulum_bags experiment ranking" in answer.next_steps
     assert sum_up([result(layer, Mark.YES) for layer in Layer]).sentence.count("Not measured") == 0
 
 
@@ -52,7 +52,7 @@ def test_undecided_is_neither_and_nothing_measured_is_undecided() -> None:
     )
     nothing = sum_up([])
     assert nothing.mark is Mark.UNDECIDED
-    assert nothing.next_steps[0] == "make experiment"
+    assert nothing.next_steps[0] == "Measure “same run”: make experiment"
 
 
 def test_a_layer_given_twice_is_refused() -> None:

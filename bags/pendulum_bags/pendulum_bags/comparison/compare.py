@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import os
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, TypeAlias
 
@@ -16,6 +16,7 @@ from pendulum_bags.comparison.metrics import episode_of, summarise_metrics
 from pendulum_bags.comparison.pairs import Difference, Pair, distribution_tests, interpolated_difference
 from pendulum_bags.comparison.same_run import Looks, paired_tests, unpaired_tests
 from pendulum_bags.runs.run_data import RunData, is_emulated, noise_hold_time, plant_summary, read_run
+from pendulum_bags.runs.run_folder import pair_folders, read_looks
 from pendulum_msgs_py.errors import BagError, DataError
 
 __all__ = ["Comparison", "compare", "compare_folders", "compare_runs"]
@@ -34,6 +35,7 @@ class Comparison:
         verdict: Verdict on the paired comparison, or on the unpaired one where the disturbances differ.
         unpaired_verdict: Verdict on the unpaired comparison.
         looks: How often the data have been looked at.
+        left_out: What was recorded and does not count, and why, in words.
     """
 
     pairs: Sequence[Pair]
@@ -42,6 +44,7 @@ class Comparison:
     verdict: Verdict
     unpaired_verdict: Verdict
     looks: Looks = Looks()  # noqa: RUF009 - frozen
+    left_out: Sequence[str] = ()
 
     @property
     def is_emulated(self) -> bool:
@@ -113,6 +116,7 @@ class Comparison:
             "runs": len(self.pairs),
             "emulated": self.is_emulated,
             "looks": self.looks.number,
+            "left_out": list(self.left_out),
             "plants": self.plants,
             "paired": self.paired,
             "unpaired": self.unpaired,
@@ -201,24 +205,47 @@ def compare_runs(
     return compare([(simulation, hardware)], own=own, margin=margins)
 
 
-def compare_folders(folders: Sequence[PathArgument], *, margin: MarginArgument = None) -> Comparison:
-    """Compare and pool run folders, each with ``sim``, ``hw`` and perhaps ``sim_500hz``.
+def compare_folders(
+    folders: Sequence[PathArgument], *, margin: MarginArgument = None, looks: Looks | None = None
+) -> Comparison:
+    """Compare and pool run folders, each with ``sim``, ``hw``, and perhaps ``sim_500hz`` and repeats of the run.
+
+    A run in real time that a busy machine disturbed is left out where there are repeats in lockstep, which wait.
+
+    Args:
+        folders: Run folders.
+        margin: What difference does not matter; see :meth:`Margins.parse`.
+        looks: How often the data have been looked at; by default what the folders say.
 
     Raises:
         BagError: A folder lacks one of its bags.
+        DataError: Runs are given that must not be pooled.
     """
     margins = Margins.parse(margin)
-    pairs, own = [], []
+    pairs, own, left_out = [], [], []
     for folder in map(Path, folders):
-        for name in ("sim", "hw"):
-            if not (folder / name).is_dir():
-                raise BagError(f"run folder {folder} has no bag {name}; expected the folders sim and hw")
-        pairs.append(
-            (read_run(folder / "sim", label="simulation"), read_run(folder / "hw", label="hardware"))
-        )
+        places = pair_folders(folder)
+        for place in places:
+            pair = _read_pair(place)
+            busy = [f"{run.label} missed {run.missed_deadlines} states" for run in pair if run.is_disturbed]
+            if place == folder and busy and len(places) > 1:
+                left_out.append(
+                    f"The run in real time does not count, since the machine was too busy ({', '.join(busy)}); it was "
+                    "measured again in lockstep, which waits for everybody."
+                )
+            else:
+                pairs.append(pair)
         if (folder / "sim_500hz").is_dir():
             own.append(read_run(folder / "sim_500hz", label="simulation, own noise"))
-    return compare(pairs, own=own, margin=margins)
+    looked = looks or Looks(max(read_looks(Path(folder)) for folder in folders) if folders else 0)
+    return replace(compare(pairs, own=own, margin=margins, looks=looked), left_out=tuple(left_out))
+
+
+def _read_pair(folder: Path) -> tuple[RunData, RunData]:
+    for name in ("sim", "hw"):
+        if not (folder / name).is_dir():
+            raise BagError(f"run folder {folder} has no bag {name}; expected the folders sim and hw")
+    return read_run(folder / "sim", label="simulation"), read_run(folder / "hw", label="hardware")
 
 
 def _pool(rows: Sequence[dict[str, Any]]) -> dict[str, Any]:

@@ -39,6 +39,8 @@ FAR_TAIL = 0.05
 """Probability beyond an end of an interval down to which it is counted from the resamples."""
 LONGER = 2.0
 """Factor on the block length of the rule; with it, 90 % intervals from some seven effective samples cover 84 %."""
+_AT_ONCE = 2_000_000
+"""Numbers that a resampling holds at once."""
 LEAST_BLOCKS = 5
 """Blocks that a run must at least hold, however correlated it is."""
 
@@ -169,7 +171,12 @@ def _circular_block_sums(samples: Array, length: int, resamples: int, rng: np.ra
     edges = np.concatenate((np.zeros((1, samples.shape[1])), np.cumsum(wrapped, axis=0)))
     whole, rest = divmod(size, length)
     starts = rng.integers(size, size=(resamples, whole))
-    sums = (edges[starts + length] - edges[starts]).sum(axis=1)
+    sums = np.empty((resamples, samples.shape[1]))
+    # Long runs have many blocks: a part of the resamples at a time keeps memory small.
+    step = max(1, _AT_ONCE // (whole * samples.shape[1]))
+    for first in range(0, resamples, step):
+        chosen = starts[first : first + step]
+        sums[first : first + step] = (edges[chosen + length] - edges[chosen]).sum(axis=1)
     if rest:
         last = rng.integers(size, size=resamples)
         sums += edges[last + rest] - edges[last]

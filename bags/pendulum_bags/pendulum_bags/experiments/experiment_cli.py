@@ -3,16 +3,16 @@
 from __future__ import annotations
 
 import json
-import math
 import sys
 import time
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 from rich.console import Console
 
+from pendulum_bags.comparison.compare_cli import MarginOption, MarginsFile
 from pendulum_bags.experiments.domain import check_domain
 from pendulum_bags.experiments.operator import confirm
 from pendulum_bags.experiments.progress import PhaseProgress
@@ -31,6 +31,10 @@ from pendulum_bags.studies.study_cli import add_commands as add_study_commands
 from pendulum_msgs_py.errors import PendulumError
 from pendulum_msgs_py.programs.executables import EXIT_INTERRUPTED, cli_main
 from pendulum_msgs_py.programs.terminal import WholeTable, make_console
+
+if TYPE_CHECKING:
+    from pendulum_bags.comparison import Comparison, Margins
+    from pendulum_bags.verdict import Answer
 
 __all__ = ["app", "main"]
 
@@ -84,14 +88,26 @@ def thesis(
     r: R = 0.1,
     storage: Storage = "mcap",
     domain: Domain = None,
+    margin: MarginOption = None,
+    margins_file: MarginsFile = None,
+    budget: Annotated[
+        float,
+        typer.Option(
+            help="Longest wall time for repeats on the emulator, where the first look does not decide; 0 for none [s].",
+            min=0.0,
+        ),
+    ] = 60.0,
     json_output: Annotated[
         bool, typer.Option("--json", help="Print summary.json instead of the table.")
     ] = False,
 ) -> None:
-    """Regulate the upright pendulum under noise on simulator and hardware, and compare them, as the thesis does.
+    """Regulate the upright pendulum under noise on simulator and hardware: is the simulation good enough?
 
-    Example: python -m pendulum_bags experiment thesis --out /tmp/my_run --seed 7
+    On the emulator it goes on with new noise until the answer is yes or no, or the budget is spent.
+
+    Example: python -m pendulum_bags experiment thesis --out /tmp/my_run --seed 7 --margin delay=8ms
     """
+    from pendulum_bags.comparison import Margins
     from pendulum_bags.experiments.thesis import run_thesis
 
     settings = RegulationSettings(
@@ -105,6 +121,7 @@ def thesis(
         storage=storage,
         lab="" if lab is None else str(lab),
     )
+    margins = Margins.of(margins_file, margin)
     check_domain(domain)
     if (machine := settings.machine) is not None:
         confirm(
@@ -115,9 +132,9 @@ def thesis(
     started = time.monotonic()
     try:
         with PhaseProgress(TIME_BESIDE_NOISE + duration, console) as progress:
-            run_thesis(folder, settings, domain, progress)
-            progress.phase("comparing", 5.0)
-            summary = _analyse(folder, settings)
+            repeat = hardware == "emulator" and budget > 0.0
+            run_thesis(folder, settings, domain, progress, repeat=repeat)
+            comparison, summary = _analyse(folder, settings, margins, budget, progress)
     except KeyboardInterrupt:
         kept = "nothing was recorded" if discard_if_empty(folder) else f"what was recorded is in {folder}"
         console.print(f"interrupted: all programs have ended; {kept}")
@@ -129,9 +146,7 @@ def thesis(
         print(json.dumps(summary, indent=2))
     else:
         _print_summary(console, summary)
-        if more := summary["verdict"]["more_runs"]:
-            # What decides is how long the noise lasts, in many runs or in one.
-            console.print(f"(or one run with --duration {math.ceil(duration * (1 + more))})")
+        _print_answer(console, comparison, budget)
     elapsed = time.monotonic() - started
     console.print(
         f"\nreport  {folder / 'report.html'}\nbags    {folder / 'sim'}, {folder / 'hw'}\n({elapsed:.0f} s)",
@@ -211,31 +226,61 @@ def _plan(settings: RegulationSettings) -> str:
     )
 
 
-def _analyse(folder: Path, settings: RegulationSettings) -> dict[str, Any]:
-    from pendulum_bags.comparison import compare_runs
+def _analyse(
+    folder: Path, settings: RegulationSettings, margins: Margins, budget: float, progress: PhaseProgress
+) -> tuple[Comparison, dict[str, Any]]:
+    from pendulum_bags.experiments.decide import Budget, decide
     from pendulum_bags.report import write_report
 
-    paired = compare_runs(folder / "sim", folder / "hw", own_protocol=folder / "sim_500hz")
+    progress.phase("comparing", 2.0)
+    comparison = decide(
+        folder,
+        settings,
+        margins,
+        Budget(budget),
+        on_look=lambda number, duration: progress.phase(f"undecided: {duration:.0f} s more", 4.0 + 0.25 * duration),
+        on_wait=progress.refresh,
+    )
+    progress.phase("writing the report", 4.0)
     summary = {
         "experiment": "thesis",
         "seed": settings.noise.seed,
         "strategy": settings.strategy,
         "versions": versions(),
-        **paired.to_json(),
+        **comparison.to_json(),
+        "answer": _answer(comparison, budget).to_json(),
     }
     write_json(folder / "summary.json", summary)
-    write_report(folder, summary)
-    return summary
+    write_report(folder, summary, comparison=comparison)
+    return comparison, summary
+
+
+def _answer(comparison: Comparison, budget: float) -> Answer:
+    from pendulum_bags.verdict import sum_up
+    from pendulum_bags.verdict.same_run import same_run_layer
+
+    more = f'make experiment ARGS="--budget {4 * budget:.0f}"' if comparison.is_emulated and budget else ""
+    return sum_up([same_run_layer(comparison, more=more)], emulated=comparison.is_emulated)
+
+
+def _print_answer(console: Console, comparison: Comparison, budget: float) -> None:
+    from pendulum_bags.verdict.terminal import print_answer
+
+    print_answer(console, _answer(comparison, budget), comparison.verdict)
 
 
 def _print_summary(console: Console, summary: dict[str, Any]) -> None:
     from pendulum_bags.runs.run_data import timing_warning
 
-    table = WholeTable(title="Simulation and hardware under the same noise", title_justify="left")
+    emulated = summary["emulated"]
+    title = f"Simulation and {'emulated hardware' if emulated else 'hardware'} under the same noise"
+    if summary["runs"] > 1:
+        title += f", means of {summary['runs']} runs"
+    table = WholeTable(title=title, title_justify="left")
     table.add_column("")
     plants = summary["plants"]
     for name in plants:
-        table.add_column(name, justify="right")
+        table.add_column("hw (emulator)" if name == "hw" and emulated else name, justify="right")
     rows = (
         ("rate", "rate_hz", "Hz", ".1f"),
         ("missed deadlines", "missed_deadlines", "", "d"),
@@ -251,7 +296,8 @@ def _print_summary(console: Console, summary: dict[str, Any]) -> None:
         console.print("(sim_500hz: simulation by the thesis's own protocol, with new noise every 2 ms)")
     if warning := timing_warning(plants):
         console.print(warning, style="bold red")
-    console.print(summary["verdict"]["sentence"])
+    for note in summary["left_out"]:
+        console.print(note, style="yellow")
 
 
 def _cell(value: Any, form: str) -> str:

@@ -18,7 +18,7 @@ from pendulum_msgs_py.contract.angles import UPRIGHT
 from pendulum_msgs_py.contract.values import NANOSECONDS
 from pendulum_msgs_py.errors import BagError, FaultError
 
-__all__ = ["finish_recording", "record_run", "run_lockstep", "wait_until_all_hear_each_other"]
+__all__ = ["finish_recording", "lockstep_spec", "record_run", "run_lockstep", "wait_until_all_hear_each_other"]
 
 _START_TIMEOUT = 60.0
 _LOOP_NICENESS = -10
@@ -61,10 +61,16 @@ def run_lockstep(
         BagError: The bag exists.
         FaultError: A program ended or did not answer.
     """
+    spec = lockstep_spec(settings, side=side, theta=theta)
+    return record_run(bag, spec, domain=domain, on_wait=on_wait)
+
+
+def lockstep_spec(settings: RegulationSettings, *, side: str, theta: float = UPRIGHT) -> RunSpec:
+    """Return one side of the thesis's experiment as a run in lockstep, for as long as the noise lasts."""
     noise = settings.noise
     parameters = controller_parameters(settings.controller)
     tuning = {"q": [float(value) for value in settings.q], "r": float(settings.r)}
-    spec = RunSpec(
+    return RunSpec(
         side=side,
         plant=settings.plant if side == "sim" else "thesis",
         design_plant=settings.plant,
@@ -83,7 +89,6 @@ def run_lockstep(
         method=settings.method,
         storage=settings.storage,
     )
-    return record_run(bag, spec, domain=domain, on_wait=on_wait)
 
 
 def record_run(

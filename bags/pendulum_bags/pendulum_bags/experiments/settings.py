@@ -102,6 +102,11 @@ class RegulationSettings:
         of_lab = machine.lab.values.get("effort_strategy", "") if machine is not None else ""
         return self.effort_strategy or of_lab or DEFAULT_STRATEGY
 
+    @property
+    def hardware_plant(self) -> str:
+        """What a bag names as the hardware's plant: ``emulator``, also for the emulated machine of a lab file."""
+        return "emulator" if self.machine is not None and self.machine.emulated else self.hardware
+
     def bridge_program(self) -> NodeProgram:
         """Return the bridge to the actuator."""
         # An emulator's feedback is as punctual as this machine, which may be a busy one; a real actuator keeps the
@@ -115,6 +120,16 @@ class RegulationSettings:
             return graph.bridge("/hw", backend=self.hardware, effort_strategy=self.strategy, **patience)
         told = machine.bridge_parameters(**(patience if machine.emulated else {}))
         return graph.bridge("/hw", **told, effort_strategy=self.strategy)
+
+    def arguments(self) -> list[str]:
+        """Return these settings as options of ``experiment lockstep``."""
+        noise = self.noise
+        return [
+            *("--plant", self.plant, "--strategy", self.strategy),
+            *("--controller", self.controller, "--q", *map(repr, self.q), "--r", repr(self.r)),
+            *("--seed", str(noise.seed), "--amplitude", repr(noise.amplitude), "--hold-time", repr(noise.hold_time)),
+            *("--duration", repr(noise.duration), "--storage", self.storage),
+        ]
 
     def controller_program(self, namespace: str, **changes: graph.ParameterArgument) -> NodeProgram:
         """Return the controller of one of the plants."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 import sys
 import time
 from collections.abc import Sequence
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
@@ -12,6 +13,7 @@ from pendulum_bags.experiments.conductor_node import Conductor, PlantClient
 from pendulum_bags.experiments.domain import reserve_domain
 from pendulum_bags.experiments.processes import Child, ProcessSet, ros_environment, start_recorder
 from pendulum_bags.experiments.progress import PhaseProgress
+from pendulum_bags.experiments.repeats import repeat_command
 from pendulum_bags.experiments.settings import SETTLE_TIME, RegulationSettings
 from pendulum_bags.runs.run_folder import write_json
 from pendulum_msgs_py.contract.angles import UPRIGHT
@@ -30,7 +32,14 @@ OWN_PROTOCOL_SEED_STEP = 1_000_000
 """Added to the seed for the unpaired simulation, whose noise must not be that of the hardware."""
 
 
-def run_thesis(folder: Path, settings: RegulationSettings, domain: int | None, progress: PhaseProgress) -> None:
+def run_thesis(
+    folder: Path,
+    settings: RegulationSettings,
+    domain: int | None,
+    progress: PhaseProgress,
+    *,
+    repeat: bool = False,
+) -> None:
     """Run the experiment and leave the bags ``sim``, ``hw`` and ``sim_500hz`` in the folder.
 
     Args:
@@ -38,6 +47,7 @@ def run_thesis(folder: Path, settings: RegulationSettings, domain: int | None, p
         settings: What to run.
         domain: ROS domain, or None for any free one.
         progress: Shows where it is.
+        repeat: Record the emulated hardware's side of a first repeat too, while the ramp down leaves the machine idle.
 
     Raises:
         FaultError: A program ended, a plant refused or faulted; everything is at rest again when this is raised.
@@ -55,16 +65,17 @@ def run_thesis(folder: Path, settings: RegulationSettings, domain: int | None, p
         hw = PlantClient(conductor, "/hw", "bridge")
         plants = (sim, hw)
         try:
-            own_protocol = _conduct(conductor, plants, settings, progress, processes, folder)
+            beside = _conduct(conductor, plants, settings, progress, processes, folder, repeat=repeat)
         finally:
             _rest(plants)
         progress.phase("closing the bags", 2.0)
-        processes.wait(own_protocol, 60.0)
+        for child in beside:
+            processes.wait(child, 60.0)
         processes.stop()
 
 
 def _start(processes: ProcessSet, folder: Path, settings: RegulationSettings) -> None:
-    for name, plant in (("sim", settings.plant), ("hw", settings.hardware)):
+    for name, plant in (("sim", settings.plant), ("hw", settings.hardware_plant)):
         metadata = folder / "logs" / f"{name}_metadata.json"
         write_json(metadata, settings.metadata("thesis", plant=plant, namespace=f"/{name}"))
         start_recorder(processes, folder / name, f"/{name}", metadata, settings.storage)
@@ -88,7 +99,9 @@ def _conduct(
     progress: PhaseProgress,
     processes: ProcessSet,
     folder: Path,
-) -> Child:
+    *,
+    repeat: bool,
+) -> list[Child]:
     noise = settings.noise
     for plant in plants:
         plant.wait_until_ready(START_TIMEOUT)
@@ -97,7 +110,7 @@ def _conduct(
         plant.arm()
 
     # The ramp leaves the machine idle: the thesis's own simulation runs meanwhile, in a domain of its own.
-    own_protocol = _start_own_protocol(processes, folder, settings)
+    beside = [_start_own_protocol(processes, folder, settings)]
     _wait_for_goal(conductor, plants, _start_move(conductor, plants, UPRIGHT, "ramp_up", progress))
 
     progress.phase("regulation", SETTLE_TIME)
@@ -117,6 +130,9 @@ def _conduct(
         )
 
     durations = _start_move(conductor, plants, 0.0, "ramp_down", progress)
+    if repeat:
+        # Idle again: the emulated hardware gets new noise, in case that this run alone does not decide.
+        beside.append(_start_beside(processes, "repeat_1", repeat_command(folder, settings, 1)))
     # Before the ramp ends: a controller that is still awake then would be handed a pendulum half a turn from upright.
     for plant in plants:
         plant.switch_controller(on=False)
@@ -125,7 +141,7 @@ def _conduct(
         plant.disarm()
         plant.mark("done")
     conductor.spin(0.2)
-    return own_protocol
+    return beside
 
 
 def _noise_ended(plant: PlantClient) -> bool:
@@ -135,13 +151,14 @@ def _noise_ended(plant: PlantClient) -> bool:
 
 def _start_own_protocol(processes: ProcessSet, folder: Path, settings: RegulationSettings) -> Child:
     """Start the simulation as the thesis ran it: noise of its own, a new sample every 2 ms."""
-    noise = settings.noise
+    noise = replace(settings.noise, seed=settings.noise.seed + OWN_PROTOCOL_SEED_STEP, hold_time=0.002)
     command = [sys.executable, "-m", "pendulum_bags", "experiment", "lockstep", "--bag", str(folder / "sim_500hz")]
-    command += ["--plant", settings.plant, "--controller", settings.controller, "--r", repr(settings.r)]
-    command += ["--q", *map(repr, settings.q), "--seed", str(noise.seed + OWN_PROTOCOL_SEED_STEP)]
-    command += ["--amplitude", repr(noise.amplitude), "--hold-time", "0.002", "--duration", repr(noise.duration)]
-    command += ["--storage", settings.storage]
-    return processes.start("sim_500hz", command, ends_by_itself=True, niceness=10, environment={"ROS_DOMAIN_ID": ""})
+    return _start_beside(processes, "sim_500hz", [*command, *replace(settings, noise=noise).arguments()])
+
+
+def _start_beside(processes: ProcessSet, name: str, command: list[str]) -> Child:
+    """Start what runs while a ramp leaves the machine idle, in a domain of its own and behind all others."""
+    return processes.start(name, command, ends_by_itself=True, niceness=10, environment={"ROS_DOMAIN_ID": ""})
 
 
 def _start_move(

@@ -20,10 +20,12 @@ from pendulum_rosbag.reader import Bag, read_bag
 __all__ = [
     "END_EVENT",
     "START_EVENT",
+    "TOLERATED",
     "RunData",
     "find_prefix",
     "is_emulated",
     "missed_periods",
+    "missed_share",
     "plant_summary",
     "read_run",
     "timing_warning",
@@ -67,6 +69,11 @@ class RunData:
     source: str = ""
     damage: Sequence[str] = ()
 
+    @property
+    def is_disturbed(self) -> bool:
+        """Whether so many states are missing that the run tells more of the machine than of the plant."""
+        return missed_share(self.missed_deadlines, self.window.t.size) > TOLERATED
+
     def event_time(self, name: str) -> float | None:
         """Return when an event of a name first happened [s], None where it did not."""
         return next((float(event["t"]) for event in self.events if event["name"] == name), None)
@@ -95,18 +102,23 @@ def timing_warning(plants: Mapping[str, Mapping[str, Any]]) -> str:
     Args:
         plants: Figures of :func:`plant_summary`, by the plant's name.
     """
-    words = []
-    for name, plant in plants.items():
-        missed, samples = int(plant["missed_deadlines"]), int(plant["samples"])
-        if missed > _TOLERATED * (missed + samples):
-            share = missed / (missed + samples)
-            words.append(f"{name} missed {missed} of {missed + samples} states ({100.0 * share:.1f} %)")
+    words = [
+        f"{name} missed {plant['missed_deadlines']} of {plant['missed_deadlines'] + plant['samples']} states "
+        f"({100.0 * missed_share(plant['missed_deadlines'], plant['samples']):.1f} %)"
+        for name, plant in plants.items()
+        if missed_share(plant["missed_deadlines"], plant["samples"]) > TOLERATED
+    ]
     if not words:
         return ""
     return f"The machine was too busy for these plants: {', '.join(words)}; end other programs and repeat the run."
 
 
-_TOLERATED = 0.02
+def missed_share(missed: int, samples: int) -> float:
+    """Return the share of states that a plant left out."""
+    return missed / max(missed + samples, 1)
+
+
+TOLERATED = 0.02
 """Share of states that may be missing before a run is called disturbed."""
 
 

@@ -14,7 +14,21 @@ from typing import Any
 
 from pendulum_msgs_py.errors import BagError
 
-__all__ = ["create_run_folder", "discard_if_empty", "git_revision", "versions", "write_json"]
+__all__ = [
+    "REPEATS",
+    "create_run_folder",
+    "discard_if_empty",
+    "git_revision",
+    "pair_folders",
+    "read_looks",
+    "versions",
+    "write_json",
+    "write_looks",
+]
+
+REPEATS = "repeats"
+"""Folder within a run folder for repeats of the run with new noise, each with the bags ``sim`` and ``hw``."""
+_LOOKS = "looks.json"
 
 _PACKAGES = (
     "pendulum_msgs_py",
@@ -65,6 +79,25 @@ def discard_if_empty(folder: Path) -> bool:
         return False
     shutil.rmtree(folder, ignore_errors=True)
     return True
+
+
+def pair_folders(folder: Path) -> list[Path]:
+    """Return the folders with the bags ``sim`` and ``hw`` of a run: its own, and those of its repeats in order."""
+    repeats = [place for place in (folder / REPEATS).glob("*") if place.name.isdigit()]
+    return [folder, *sorted(repeats, key=lambda place: int(place.name))]
+
+
+def write_looks(folder: Path, number: int) -> None:
+    """Keep how often the data of a run folder have been looked at while more were recorded."""
+    write_json(folder / _LOOKS, {"looks": number})
+
+
+def read_looks(folder: Path) -> int:
+    """Return how often the data of a run folder have been looked at; 0 for a run that was recorded once."""
+    try:
+        return int(json.loads((folder / _LOOKS).read_text(encoding="utf-8"))["looks"])
+    except (OSError, ValueError, KeyError, TypeError):
+        return 0
 
 
 def versions() -> dict[str, str]:

@@ -300,6 +300,8 @@ def _named_runs(
         if experiment == "thesis":
             if "strategy" in settings or not settings.get("lab"):
                 arguments += ["--strategy", str(settings.get("strategy", "direct_pwm"))]
+            # A study has its seeds: none of its runs is repeated by itself.
+            arguments += ["--budget", "0"]
             arguments += _thesis_arguments(controllers[controller], controller, disturbances[disturbance])
             duration = _duration(file)
             arguments += ["--duration", repr(duration)]

@@ -188,7 +188,7 @@ def not_measured(layer: Layer, how: str) -> LayerResult:
         layer: Which.
         how: The command that measures it.
     """
-    return LayerResult(layer, Mark.NOT_MEASURED, f"Not measured: {how} measures it.", next_steps=(how,))
+    return LayerResult(layer, Mark.NOT_MEASURED, f"Not measured: {how} measures it.", reason=how)
 
 
 @dataclass(frozen=True)
@@ -264,9 +264,12 @@ def sum_up(results: Iterable[LayerResult], *, emulated: bool = False) -> Answer:
         missing = " and ".join(f"“{result.layer.title}”" for result in by_mark[Mark.NOT_MEASURED])
         text += f" Not measured: {missing}."
     # What mends a no comes before what decides, and that before what was left out.
-    order = (*by_mark[Mark.NO], *by_mark[Mark.UNDECIDED], *by_mark[Mark.YES], *by_mark[Mark.NOT_MEASURED])
-    steps = tuple(dict.fromkeys(step for result in order for step in result.next_steps))
-    return Answer(mark, text, layers, steps)
+    order = (*by_mark[Mark.NO], *by_mark[Mark.UNDECIDED], *by_mark[Mark.YES])
+    steps = dict.fromkeys(step for result in order for step in result.next_steps)
+    for how in dict.fromkeys(result.reason for result in by_mark[Mark.NOT_MEASURED]):
+        titles = [f"“{result.layer.title}”" for result in by_mark[Mark.NOT_MEASURED] if result.reason == how]
+        steps[f"Measure {' and '.join(titles)}: {how}"] = None
+    return Answer(mark, text, layers, tuple(steps))
 
 
 _HARDWARE = re.compile(r"(?<![-/\w])(?<!emulated )(H|h)ardware\b(?!/)")

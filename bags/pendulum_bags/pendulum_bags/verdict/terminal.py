@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import textwrap
+
 from rich.console import Console
 from rich.markup import escape
 from rich.text import Text
@@ -19,6 +21,8 @@ SIGNS = {
     Mark.NOT_MEASURED: "– not measured",
 }
 """Marks that differ in shape and in words, so that colour only helps."""
+_WIDTH = 78
+"""Width of the longest column of the layers' table; the others need 40 more."""
 _STYLES = {
     Mark.YES: "bold green",
     Mark.NO: "bold red",
@@ -30,11 +34,13 @@ _STYLES = {
 def layers_table(answer: Answer) -> WholeTable:
     """Return the table of the layers: question, mark, sentence."""
     table = WholeTable(title="The layers of the answer", title_justify="left")
-    for heading in ("layer", "question", "answer", "because"):
-        table.add_column(heading, overflow="fold")
+    for heading in ("layer", "answer", "because"):
+        table.add_column(heading)
     for number, result in enumerate(answer.layers, start=1):
         mark = Text(SIGNS[result.mark], _STYLES[result.mark])
-        table.add_row(f"{number} {result.layer.title}", result.layer.question, mark, escape(result.sentence))
+        because = Text(textwrap.fill(result.layer.question, _WIDTH), "italic")
+        because.append("\n" + textwrap.fill(result.sentence, _WIDTH), "not italic")
+        table.add_row(f"{number} {result.layer.title}", mark, because)
     return table
 
 

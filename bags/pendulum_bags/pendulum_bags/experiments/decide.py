@@ -1,0 +1,76 @@
+"""Look at what was recorded, and record more of it, until it decides or the budget is spent."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+from pendulum_bags.comparison import Comparison, Looks, Margins, Outcome, compare_folders
+from pendulum_bags.experiments.repeats import record_repeat, repeat_folder, repeat_settings
+from pendulum_bags.experiments.settings import RegulationSettings
+from pendulum_bags.runs.run_folder import write_looks
+
+__all__ = ["Budget", "decide"]
+
+
+@dataclass(frozen=True)
+class Budget:
+    """How long an experiment may go on.
+
+    Args:
+        seconds: Wall time for repeats beyond the first look; 0 for one look at one run [s].
+        clock: Monotonic clock [s].
+    """
+
+    seconds: float = 60.0
+    clock: Callable[[], float] = time.monotonic
+
+
+def decide(
+    folder: Path,
+    settings: RegulationSettings,
+    margins: Margins,
+    budget: Budget,
+    *,
+    on_look: Callable[[int, float], None] = lambda number, duration: None,
+    on_wait: Callable[[], None] = lambda: None,
+    record: Callable[..., None] = record_repeat,
+) -> Comparison:
+    """Compare a run folder, and record repeats into it until the comparison is decided.
+
+    Only an emulator is asked for more: a machine moves when its operator wants it to. Each look costs a share of the
+    error that all looks together may make, so that stopping as soon as it is decided errs no more often than one look.
+
+    Args:
+        folder: Folder of the run, recorded; a repeat whose hardware's side lies in there already is used at once.
+        settings: Settings of the run.
+        margins: What difference does not matter.
+        budget: When to give up.
+        on_look: Told the number of a repeat and how much noise it has [s] before it is recorded.
+        on_wait: Called while waiting.
+        record: Records what a repeat lacks.
+    """
+    if settings.hardware != "emulator" or budget.seconds <= 0.0:
+        return compare_folders([folder], margin=margins)
+    started = budget.clock()
+    number = 0
+    while repeat_folder(folder, number + 1).is_dir():
+        number += 1
+        record(folder, settings, number, on_wait=on_wait)
+    look = 1
+    slowest = 0.0
+    while True:
+        write_looks(folder, look)
+        comparison = compare_folders([folder], margin=margins, looks=Looks(look))
+        spent = budget.clock() - started
+        # The next repeat has at most twice the noise of the last one.
+        if comparison.verdict.outcome is not Outcome.UNDECIDED or spent + 1.5 * slowest > budget.seconds:
+            return comparison
+        number += 1
+        look += 1
+        before = budget.clock()
+        on_look(number, repeat_settings(settings, number).noise.duration)
+        record(folder, settings, number, on_wait=on_wait)
+        slowest = budget.clock() - before

@@ -1,0 +1,121 @@
+"""Repeats of the thesis's experiment with new noise, in lockstep: more of the same where the first run cannot decide.
+
+The emulated hardware runs as nodes over DDS, as ever. The simulation runs in this process, which gives the numbers of
+its nodes to the last bit in a tenth of the time; both are kept as bags.
+"""
+
+from __future__ import annotations
+
+import json
+import sys
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from pendulum_bags.experiments.in_process import RunArrays, simulate
+from pendulum_bags.experiments.lockstep import lockstep_spec, run_lockstep
+from pendulum_bags.experiments.run_spec import RunSpec
+from pendulum_bags.experiments.settings import RegulationSettings
+from pendulum_bags.runs.run_data import END_EVENT, START_EVENT
+from pendulum_bags.runs.run_folder import REPEATS
+from pendulum_msgs_py.contract import names
+from pendulum_msgs_py.contract.cdr import encode_joint_state
+from pendulum_rosbag.storage import open_writer
+
+__all__ = ["record_repeat", "record_simulation", "repeat_command", "repeat_folder", "repeat_settings"]
+
+SEED_STEP = 10_000_000
+"""Added to the seed for each repeat, so that the repeats of one seed are not another seed's run."""
+SHORTEST = 20.0
+"""Length of the first repeat, four times the thesis's run: starting the nodes takes longer than the noise [s]."""
+LONGEST = 60.0
+"""Length that no repeat exceeds, so that a run ends soon after its budget [s]."""
+_STATE = "sensor_msgs/msg/JointState"
+_TEXT = "std_msgs/msg/String"
+
+
+def repeat_folder(folder: Path, number: int) -> Path:
+    """Return the folder of a repeat, 1 for the first, with the bags ``sim`` and ``hw``."""
+    return folder / REPEATS / str(number)
+
+
+def repeat_settings(settings: RegulationSettings, number: int) -> RegulationSettings:
+    """Return the settings of a repeat: new noise, and twice as much of it each time."""
+    noise = settings.noise
+    duration = min(LONGEST, max(SHORTEST, noise.duration) * 2.0 ** (number - 1))
+    return replace(settings, noise=replace(noise, seed=noise.seed + SEED_STEP * number, duration=duration))
+
+
+def repeat_command(folder: Path, settings: RegulationSettings, number: int) -> list[str]:
+    """Return the command that records the hardware's side of a repeat by itself."""
+    chosen = repeat_settings(settings, number)
+    return [
+        *(sys.executable, "-m", "pendulum_bags", "experiment", "lockstep"),
+        *("--side", "hw", "--bag", str(repeat_folder(folder, number) / "hw")),
+        *chosen.arguments(),
+    ]
+
+
+def record_repeat(
+    folder: Path, settings: RegulationSettings, number: int, *, on_wait: Callable[[], None] = lambda: None
+) -> None:
+    """Record what a repeat lacks of its two bags.
+
+    Args:
+        folder: Folder of the run.
+        settings: Settings of the run.
+        number: Of the repeat, from 1.
+        on_wait: Called while waiting.
+
+    Raises:
+        BagError: A bag cannot be written.
+        FaultError: A program ended or did not answer.
+    """
+    chosen = repeat_settings(settings, number)
+    place = repeat_folder(folder, number)
+    if not (place / "hw").exists():
+        run_lockstep(place / "hw", chosen, side="hw", on_wait=on_wait)
+    if not (place / "sim").exists():
+        record_simulation(place / "sim", lockstep_spec(chosen, side="sim"))
+
+
+def record_simulation(bag: Path, spec: RunSpec) -> Path:
+    """Simulate a run in this process and write what its recorder would have written; return the bag."""
+    _write(bag, spec, simulate(spec))
+    return bag
+
+
+def _write(bag: Path, spec: RunSpec, run: RunArrays) -> None:
+    metadata = spec.metadata()
+    metadata["pendulum.run"]["engine"] = "in_process"
+    topics = {
+        name: f"{spec.namespace}/{name}"
+        for name in (names.JOINT_STATES, names.EFFORT_COMMAND, names.DISTURBANCE, names.APPLIED_EFFORT)
+    }
+    events = f"{spec.namespace}/{names.EVENTS}"
+    with open_writer(bag, storage=spec.storage, metadata=metadata) as writer:
+        for topic in topics.values():
+            writer.add_topic(topic, _STATE)
+        writer.add_topic(events, _TEXT)
+
+        def event(stamp: int, name: str) -> None:
+            text = json.dumps({"stamp_ns": stamp, "name": name}).encode() + b"\0"
+            writer.write(events, stamp, b"\0\1\0\0" + len(text).to_bytes(4, "little") + text)
+
+        stamps = [int(stamp) for stamp in run.stamp_ns]
+        event(stamps[0], START_EVENT)
+        for i, stamp in enumerate(stamps):
+            position, velocity, effort = (float(one[i]) for one in (run.position, run.velocity, run.effort))
+            state = encode_joint_state(stamp, position=position, velocity=velocity, effort=effort)
+            writer.write(topics[names.JOINT_STATES], stamp, state)
+            for name, values, source in (
+                (names.EFFORT_COMMAND, run.command, "controller"),
+                (names.DISTURBANCE, run.disturbance, "disturbance"),
+                (names.APPLIED_EFFORT, run.applied, ""),
+            ):
+                if i < values.size and np.isfinite(values[i]):
+                    data = encode_joint_state(stamp, frame_id=source, effort=float(values[i]))
+                    writer.write(topics[name], stamp, data)
+        event(stamps[-1], END_EVENT)

@@ -1,0 +1,148 @@
+"""An experiment goes on until it is decided, and stops when its budget is spent."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from pendulum_bags.comparison import Margins, Outcome, compare_folders, read_run
+from pendulum_bags.experiments.decide import Budget, decide
+from pendulum_bags.experiments.in_process import simulate
+from pendulum_bags.experiments.lockstep import lockstep_spec
+from pendulum_bags.experiments.repeats import (
+    record_simulation,
+    repeat_command,
+    repeat_folder,
+    repeat_settings,
+)
+from pendulum_bags.experiments.settings import NoiseSettings, RegulationSettings
+from pendulum_bags.runs.run_folder import read_looks
+from pendulum_bags.verdict.same_run import same_run_layer
+from tests.synthetic_runs import regulate, run_metadata, write_bag
+
+NOISE = NoiseSettings(duration=2.0)
+SETTINGS = RegulationSettings(noise=NOISE)
+
+
+def write_pair(folder: Path, seed: int, duration: float, keep: slice = slice(None), **changes: float) -> None:
+    metadata = run_metadata(seed)
+    for side, rate in (("sim", 500.0), ("hw", 100.0)):
+        columns = regulate(rate=rate, seed=seed, duration=duration, hardware=side == "hw", changes=changes)
+        if side == "sim":
+            columns = {name: values[keep] for name, values in columns.items()}
+        metadata["pendulum.run"]["plant"] = "emulator" if side == "hw" else "thesis"
+        write_bag(folder / side, columns, f"/{side}", metadata=metadata, ramps=False)
+
+
+class Recorder:
+    """Stands in for the nodes alone: it simulates both plants, and takes a made-up time for it."""
+
+    def __init__(self, cost: float, **changes: float) -> None:
+        self.cost = cost
+        self.changes = changes
+        self.now = 0.0
+        self.recorded: list[int] = []
+
+    def __call__(self, folder: Path, settings: RegulationSettings, number: int, **_: Any) -> None:
+        noise = repeat_settings(settings, number).noise
+        write_pair(repeat_folder(folder, number), noise.seed, 4.0 * number, **self.changes)
+        self.recorded.append(number)
+        self.now += self.cost
+
+    def clock(self) -> float:
+        return self.now
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    write_pair(tmp_path / "run", 1, 2.0)
+    return tmp_path / "run"
+
+
+def test_a_run_that_decides_is_not_repeated(folder: Path) -> None:
+    recorder = Recorder(1.0)
+    found = decide(folder, SETTINGS, Margins.parse(), Budget(60.0, recorder.clock), record=recorder)
+    assert found.verdict.outcome is Outcome.EQUIVALENT
+    assert recorder.recorded == []
+    assert read_looks(folder) == 1
+    assert found.verdict.tests[0].interval.level == pytest.approx(0.95)
+
+
+def near(folder: Path, share: float = 0.7) -> Margins:
+    """Return margins that the first run cannot decide, but more can: a share of its interval beyond its estimate."""
+    test = compare_folders([folder]).verdict.tests[1]
+    away = abs(test.interval.estimate - 1.0) + share * (test.interval.high - test.interval.low)
+    return Margins.parse({"spread_angle": 100.0 * away})
+
+
+def test_an_undecided_run_is_repeated_with_new_noise_until_it_is_decided_and_read_back_so(
+    folder: Path,
+) -> None:
+    recorder = Recorder(1.0)
+    margins = near(folder)
+    found = decide(folder, SETTINGS, margins, Budget(1000.0, recorder.clock), record=recorder)
+    assert found.verdict.outcome is not Outcome.UNDECIDED
+    assert recorder.recorded == list(range(1, len(found.pairs)))
+    assert len(recorder.recorded) >= 1
+    assert read_looks(folder) == len(recorder.recorded) + 1
+    again = compare_folders([folder], margin=margins)
+    assert again.to_json()["verdict"] == found.to_json()["verdict"]
+    assert again.looks == found.looks
+
+
+def test_a_spent_budget_leaves_it_undecided_and_says_what_it_would_take(folder: Path) -> None:
+    recorder = Recorder(40.0)
+    found = decide(folder, SETTINGS, near(folder, 0.05), Budget(30.0, recorder.clock), record=recorder)
+    assert recorder.recorded == [1]
+    assert found.verdict.outcome is Outcome.UNDECIDED
+    (step,) = same_run_layer(found, more="make experiment").next_steps
+    assert step.startswith("Record about ")
+    assert "more run" in step
+
+
+def test_no_budget_and_a_real_actuator_mean_one_look(folder: Path) -> None:
+    recorder = Recorder(1.0)
+    margins = near(folder)
+    assert len(decide(folder, SETTINGS, margins, Budget(0.0, recorder.clock), record=recorder).pairs) == 1
+    hebi = RegulationSettings(hardware="hebi", noise=NOISE)
+    assert len(decide(folder, hebi, margins, Budget(60.0, recorder.clock), record=recorder).pairs) == 1
+    assert recorder.recorded == []
+
+
+def test_a_run_that_a_busy_machine_disturbed_is_measured_again_and_left_out(tmp_path: Path) -> None:
+    folder = tmp_path / "run"
+    # The simulator lost every state of a quarter of the run.
+    lost = np.r_[0:500, 750:1000]
+    write_pair(folder, 1, 2.0, keep=lost)
+    recorder = Recorder(1.0)
+    recorder(folder, SETTINGS, 1)
+    found = decide(
+        folder, SETTINGS, Margins.parse(), Budget(60.0, recorder.clock), record=lambda *_, **__: None
+    )
+    assert [pair.hardware.source for pair in found.pairs] == [str(repeat_folder(folder, 1) / "hw")]
+    assert "the machine was too busy (simulation missed 250 states)" in found.left_out[0]
+    assert found.verdict.outcome is Outcome.EQUIVALENT
+
+
+def test_repeats_have_noise_of_their_own_and_twice_as_much_each_time() -> None:
+    chosen = [repeat_settings(SETTINGS, number).noise for number in (1, 2, 3)]
+    assert len({noise.seed for noise in chosen} | {1, 2, 3}) == 6
+    assert [noise.duration for noise in chosen] == [20.0, 40.0, 60.0]
+    command = repeat_command(Path("run"), SETTINGS, 2)
+    assert command[command.index("--seed") + 1] == str(chosen[1].seed)
+    assert command[command.index("--bag") + 1] == "run/repeats/2/hw"
+
+
+def test_a_simulation_in_this_process_is_kept_as_its_recorder_would_keep_it(tmp_path: Path) -> None:
+    spec = lockstep_spec(SETTINGS, side="sim")
+    arrays = simulate(spec)
+    run = read_run(record_simulation(tmp_path / "sim", spec))
+    np.testing.assert_array_equal(run.window.position, arrays.position[:-1])
+    np.testing.assert_array_equal(run.window.effort, arrays.command[:-1])
+    assert run.disturbance is not None
+    np.testing.assert_array_equal(run.disturbance.value, arrays.disturbance[:-1])
+    assert run.metadata["pendulum.run"]["engine"] == "in_process"
+    assert run.missed_deadlines == 0
