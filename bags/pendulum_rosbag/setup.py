@@ -45,13 +45,12 @@ setup(
     description=" ".join(manifest.findtext("description", "").split()),
     license=manifest.findtext("license", ""),
     maintainer=manifest.findtext("maintainer", ""),
-    maintainer_email=manifest.find("maintainer").get("email"),
     packages=find_packages(include=[name, f"{name}.*"]),
     # What the package reads at run time beside its modules: presets, templates, pages; and the typing marker.
     package_data={"": [f"**/*.{ending}" for ending in DATA_ENDINGS] + ["py.typed"]},
     data_files=[
         ("share/ament_index/resource_index/packages", [f"resource/{name}"]),
-        (f"share/{name}", ["package.xml"]),
+        (f"share/{name}", ["package.xml", "LICENSE"]),
         *share_files(name),
     ],
     entry_points={"console_scripts": [f"{program} = {target}" for program, target in executables.items()]},

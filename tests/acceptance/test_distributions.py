@@ -84,6 +84,28 @@ def test_the_six_packages_are_wheels_with_launch_files_and_layouts(wheels: Path)
 
 
 @pytest.mark.timeout(300)
+def test_the_licence_is_in_every_wheel_and_every_source_archive_and_no_dead_address_is(wheels: Path) -> None:
+    licence = (PROJECT / "LICENSE").read_bytes()
+    for archive in (wheels.parent / "archives").glob("*.tar.gz"):
+        with tarfile.open(archive) as content:
+            texts = [
+                m
+                for m in content.getmembers()
+                if m.isfile() and m.name.count("/") == 1 and m.name.endswith("/LICENSE")
+            ]
+            files = [content.extractfile(member) for member in texts]
+            assert [file.read() for file in files if file is not None] == [licence], archive.name
+    for wheel in wheels.glob("*.whl"):
+        with zipfile.ZipFile(wheel) as held:
+            texts = [name for name in held.namelist() if ".dist-info/" in name and name.endswith("/LICENSE")]
+            assert [held.read(name) for name in texts] == [licence], wheel.name
+            (metadata,) = (name for name in held.namelist() if name.endswith(".dist-info/METADATA"))
+            assert b"email:" not in held.read(metadata), wheel.name
+    for folder in FOLDERS:
+        assert (PROJECT / folder / "LICENSE").read_bytes() == licence, folder
+
+
+@pytest.mark.timeout(300)
 def test_what_the_wheels_install_runs_an_experiment(wheels: Path, domain_id: int, tmp_path: Path) -> None:
     place = tmp_path / "place"
     pip = [sys.executable, "-m", "pip", "--disable-pip-version-check", "install", "--no-deps", "--no-index"]
