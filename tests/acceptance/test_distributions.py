@@ -97,8 +97,8 @@ def test_the_licence_is_in_every_wheel_and_every_source_archive_and_no_dead_addr
             assert [file.read() for file in files if file is not None] == [licence], archive.name
     for wheel in wheels.glob("*.whl"):
         with zipfile.ZipFile(wheel) as held:
-            texts = [name for name in held.namelist() if ".dist-info/" in name and name.endswith("/LICENSE")]
-            assert [held.read(name) for name in texts] == [licence], wheel.name
+            names = [name for name in held.namelist() if ".dist-info/" in name and name.endswith("/LICENSE")]
+            assert [held.read(name) for name in names] == [licence], wheel.name
             (metadata,) = (name for name in held.namelist() if name.endswith(".dist-info/METADATA"))
             assert b"email:" not in held.read(metadata), wheel.name
     for folder in FOLDERS:
