@@ -6,6 +6,7 @@ EXECUTABLES: dict[str, str] = {
     "record": "pendulum_rosbag.recorder.record_cli:main",
     "analyse": "pendulum_bags.analyse.analyse_cli:main",
     "compare": "pendulum_bags.comparison.compare_cli:main",
+    "frequency_response": "pendulum_bags.frequency_response.frequency_response_cli:main",
     "replay": "pendulum_bags.replay.replay_cli:main",
     "experiment": "pendulum_bags.experiments.experiment_cli:main",
     "excite": "pendulum_bags.experiments.excite_cli:main",

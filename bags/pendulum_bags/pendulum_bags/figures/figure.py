@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 
 __all__ = ["ROLES", "Figure", "Kind", "Mark", "Panel", "Style", "Trace", "thinned"]
 
-Kind = Literal["line", "step", "points", "interval"]
+Kind = Literal["line", "step", "points", "interval", "band"]
 
 
 @dataclass(frozen=True)
@@ -51,6 +51,10 @@ ROLES: dict[str, Style] = {
     "trial 4": Style("#222222", "dashdot", 1.1, "cross"),
     "trial 5": Style("#cc79a7", "solid", 1.8, "circle"),
     "trial 6": Style("#56b4e9", "dash", 1.8, "square"),
+    "model": Style("#222222", "dot", 1.6, "triangle"),
+    "certified": Style("#009e73", "solid", 1.0, "circle"),
+    "not certified": Style("#e69f00", "solid", 1.0, "triangle"),
+    "not stabilising": Style("#9a9a9a", "solid", 1.0, "cross"),
     "stable": Style("#222222", "solid", 1.0, "circle"),
     "unstable": Style("#222222", "solid", 1.0, "cross"),
 }
@@ -67,8 +71,8 @@ class Trace:
         label: Legend entry; empty for none.
         role: Key of ``ROLES``.
         kind: ``line``, ``step`` (held until the next x), ``points``, or ``interval`` (horizontal, from ``low`` to
-            ``high`` through x).
-        low, high: Ends of intervals, shape (n,).
+            ``high`` through x), or ``band`` (filled between ``low`` and ``high`` above each x).
+        low, high: Ends of intervals or edges of a band, shape (n,).
     """
 
     x: NDArray[np.float64]

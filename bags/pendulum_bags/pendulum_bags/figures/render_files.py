@@ -191,6 +191,9 @@ def _draw_trace(ax: Axes, trace: Trace) -> None:
             label=label,
         )
         return
+    if trace.kind == "band" and trace.low is not None and trace.high is not None:
+        ax.fill_between(trace.x, trace.low, trace.high, color=style.colour, alpha=0.25, linewidth=0.0, label=label)
+        return
     if trace.kind == "step":
         ax.step(
             trace.x,

@@ -196,6 +196,20 @@ def _trace(trace: Trace, suffix: str, first: bool) -> dict[str, Any]:
             "width": 5,
         }
         return {**graph, "mode": "markers", "marker": {**marker, "size": 9}, "error_x": bars}
+    if trace.kind == "band" and trace.low is not None and trace.high is not None:
+        # There and back again: one closed outline, filled.
+        outline = np.concatenate([trace.x, trace.x[::-1]]), np.concatenate([trace.low, trace.high[::-1]])
+        red, green, blue = (int(style.colour[i : i + 2], 16) for i in (1, 3, 5))
+        return {
+            **graph,
+            "x": _packed(outline[0]),
+            "y": _packed(outline[1]),
+            "mode": "lines",
+            "line": {"width": 0},
+            "fill": "toself",
+            "fillcolor": f"rgba({red},{green},{blue},0.25)",
+            "hoverinfo": "skip",
+        }
     line: dict[str, Any] = {"color": style.colour, "dash": style.dash, "width": style.width + 0.2}
     if trace.kind == "step":
         line["shape"] = "hv"

@@ -4,17 +4,19 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
 
 from pendulum_bags.experiments.in_process import RunArrays
-from pendulum_bags.runs.run_data import RunData
 from pendulum_bags.runs.series import Signal, unwrap_near_upright
 from pendulum_msgs_py.contract.values import NANOSECONDS
 from pendulum_msgs_py.errors import DataError
+
+if TYPE_CHECKING:
+    from pendulum_bags.runs.run_data import RunData
 
 __all__ = ["Record", "record_of_arrays", "record_of_run"]
 

@@ -1,0 +1,171 @@
+"""From one or two recordings to responses, difference, certificates, layers of the verdict and figures."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from pendulum_bags.figures.render_files import write_figures
+from pendulum_bags.frequency_response.compare import Difference, compare_responses
+from pendulum_bags.frequency_response.designs import DesignResult, certify_designs
+from pendulum_bags.frequency_response.estimate import estimate
+from pendulum_bags.frequency_response.figures import response_figures
+from pendulum_bags.frequency_response.layers import GAP_MARGIN, same_plant, which_controllers
+from pendulum_bags.frequency_response.record import record_of_run
+from pendulum_bags.runs.run_folder import write_json
+from pendulum_bags.verdict import LayerResult, write_layer
+from pendulum_lqr.certificate import Certifier
+from pendulum_lqr.gap_metric import DEFAULT_SCALING, Scaling
+from pendulum_lqr.machine_response import Machine
+from pendulum_lqr.measured_response import MeasuredResponse, write_response
+from pendulum_lqr.model import LinearModel, linearise
+from pendulum_msgs_py.errors import DataError
+from pendulum_msgs_py.plants.plant_parameters import load_plant
+
+__all__ = ["Analysis", "analyse_responses", "read_responses", "write_analysis"]
+
+
+@dataclass(frozen=True)
+class Analysis:
+    """All that responses tell.
+
+    Attributes:
+        responses: Simulation, hardware, or both.
+        model: Of the plant that designs were made on.
+        plant: Its name.
+        difference: Of simulation and hardware, None for one of them.
+        certifier: Of model and hardware, None without hardware.
+        designs: What was found of each.
+        layers: Layers of the verdict.
+    """
+
+    responses: Sequence[MeasuredResponse]
+    model: LinearModel
+    plant: str
+    difference: Difference | None
+    certifier: Certifier | None
+    designs: Sequence[DesignResult]
+    layers: Sequence[LayerResult]
+
+    def to_json(self) -> dict[str, Any]:
+        """Return the figures as JSON values."""
+        return {
+            "plant": self.plant,
+            "responses": {response.label: response.facts for response in self.responses},
+            "difference": self.difference.to_json() if self.difference else None,
+            "gap_to_model": None
+            if self.certifier is None
+            else {
+                "nu_gap": self.certifier.profile.value,
+                "upper": self.certifier.profile.value_upper,
+                "at_hz": self.certifier.profile.at,
+            },
+            "designs": [design.to_json() for design in self.designs],
+            "layers": [layer.to_json() for layer in self.layers],
+        }
+
+
+def read_responses(paths: Sequence[Path]) -> tuple[list[MeasuredResponse], str]:
+    """Return the measured responses of bags or of a run folder, simulation first, and the plant they were designed on.
+
+    Args:
+        paths: One or two bags, or a folder that holds ``sim`` and ``hw``.
+
+    Raises:
+        BagError: A bag cannot be read.
+        DataError: It holds no excited plant, or both are of one side.
+    """
+    # Late: it needs a reader, which the rest of this room does not.
+    from pendulum_bags.comparison import compare_runs  # noqa: F401
+    from pendulum_bags.runs.run_data import read_run
+
+    if len(paths) == 1 and (paths[0] / "sim").is_dir() and (paths[0] / "hw").is_dir():
+        paths = [paths[0] / "sim", paths[0] / "hw"]
+    if len(paths) not in {1, 2}:
+        raise DataError(
+            f"got {len(paths)} bags; expected one, a simulation and a hardware bag, or a run folder"
+        )
+    runs = [read_run(path) for path in paths]
+    found = []
+    plant = "thesis"
+    for i, run in enumerate(runs):
+        told = run.metadata.get("pendulum.run")
+        facts: Mapping[str, Any] = told if isinstance(told, Mapping) else {}
+        side = str(facts.get("side") or str(facts.get("namespace", "")).strip("/"))
+        label = side if side in {"sim", "hw"} else ("hw" if len(runs) == 1 or i else "sim")
+        plant = str(facts.get("design_plant") or plant)
+        measured = estimate(record_of_run(run))
+        found.append(_labelled(measured, label))
+    if len(found) == 2 and found[0].label == found[1].label:
+        # Two of one kind: the order in which they were given tells which is held against which.
+        found = [_labelled(found[0], "sim"), _labelled(found[1], "hw")]
+    return sorted(found, key=lambda response: response.label, reverse=True), plant
+
+
+def _labelled(measured: MeasuredResponse, label: str) -> MeasuredResponse:
+    return MeasuredResponse.from_json({**measured.to_json(), "label": label})
+
+
+def analyse_responses(
+    responses: Sequence[MeasuredResponse],
+    plant: str,
+    designs: Sequence[str] = (),
+    *,
+    scaling: Scaling = DEFAULT_SCALING,
+    margin: float = GAP_MARGIN,
+) -> Analysis:
+    """Return what responses tell.
+
+    Args:
+        responses: Simulation first.
+        plant: Preset or file of the plant that designs are made on.
+        designs: As :func:`pendulum_bags.frequency_response.designs.certify_designs` reads them.
+        scaling: Units of the gap.
+        margin: Gap between the plants that does not matter.
+    """
+    parameters = load_plant(plant)
+    model = linearise(parameters)
+    by_label = {response.label: response for response in responses}
+    difference = certifier = None
+    results: list[DesignResult] = []
+    layers: list[LayerResult] = []
+    if "sim" in by_label and "hw" in by_label:
+        difference = compare_responses(by_label["sim"], by_label["hw"], model, scaling)
+        layers.append(same_plant(by_label["sim"], by_label["hw"], difference, margin))
+    if "hw" in by_label:
+        certifier = Certifier(model, Machine.of(by_label["hw"]), scaling)
+        results = certify_designs(designs, parameters, model, certifier)
+        layers.append(which_controllers(certifier, results))
+    return Analysis(responses, model, plant, difference, certifier, results, layers)
+
+
+def write_analysis(
+    folder: Path,
+    analysis: Analysis,
+    formats: Sequence[str] = ("png", "pdf"),
+    step: Callable[[str], None] = lambda _: None,
+) -> Path:
+    """Write responses, layers, numbers, figures and a page into a folder; return the page.
+
+    Args:
+        folder: Where to.
+        analysis: What to write.
+        formats: Of the figures.
+        step: Called with what is written next.
+    """
+    from pendulum_bags.frequency_response.page import write_page
+
+    folder.mkdir(parents=True, exist_ok=True)
+    for response in analysis.responses:
+        write_response(folder / f"{response.label}_response.json", response)
+    for layer in analysis.layers:
+        write_layer(folder, layer)
+    write_json(folder / "frequency_response.json", analysis.to_json())
+    step("drawing")
+    figures = response_figures(
+        analysis.responses, analysis.model, analysis.difference, analysis.certifier, analysis.designs
+    )
+    write_figures(figures, folder / "figures", formats)
+    return write_page(folder / "frequency_response.html", analysis, figures)

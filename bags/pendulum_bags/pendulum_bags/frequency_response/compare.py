@@ -1,0 +1,210 @@
+"""Two measured plants, or a plant and a model: where in frequency do they differ, by how much, and how surely?"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import stats
+
+from pendulum_lqr.gap_metric import DEFAULT_SCALING, Scaling, chordal_distance, nu_gap
+from pendulum_lqr.machine_response import Machine
+from pendulum_lqr.measured_response import MeasuredResponse
+from pendulum_lqr.model import LinearModel
+from pendulum_lqr.sampled_response import brought_to
+from pendulum_msgs_py.errors import DataError
+
+__all__ = ["Difference", "Estimate", "compare_responses", "continuous"]
+
+Array = NDArray[np.float64]
+Complex = NDArray[np.complex128]
+
+_LEAST_LINES = 5
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """A number with its 95 % interval."""
+
+    value: float
+    low: float
+    high: float
+
+
+@dataclass(frozen=True)
+class Difference:
+    """What tells two plants apart; both as they are at the second one's sampling period.
+
+    Attributes:
+        frequency: Shape (n,) [Hz].
+        first, second: Responses, shape (2, n) [rad/(N m), rad/s/(N m)].
+        ratio: Second over first by the velocity, shape (n,).
+        ratio_radius: Radius of its 95 % disc, joint over all frequencies, shape (n,).
+        probability: Of a difference at least as large at a line if the plants were the same, shape (2, n).
+        gap: Chordal distance at each frequency, shape (n,).
+        gap_low: Lower joint limit of it, shape (n,).
+        gap_high: Upper one, shape (n,).
+        nu_gap: Largest gap with its joint interval; 1 where the winding number condition fails.
+        gap_at: Frequency of the largest gap [Hz].
+        delay: By which the second answers later than the first [s].
+        gain: Second's answer beside the first's, over the octaves [-].
+        scaling: Units of the gap.
+        confidence: Of all intervals and of ``found``.
+    """
+
+    frequency: Array
+    first: Complex
+    second: Complex
+    ratio: Complex
+    ratio_radius: Array
+    probability: Array
+    gap: Array
+    gap_low: Array
+    gap_high: Array
+    nu_gap: Estimate
+    gap_at: float
+    delay: Estimate
+    gain: Estimate
+    scaling: Scaling
+    confidence: float = 0.95
+
+    @property
+    def found(self) -> bool:
+        """Whether a difference was found anywhere, with an error of at most 5 % over all lines (Bonferroni)."""
+        return bool(self.probability.size * float(self.probability.min()) < 1.0 - self.confidence)
+
+    @property
+    def lines_that_differ(self) -> int:
+        """Number of lines at which angle or velocity differ."""
+        limit = (1.0 - self.confidence) / self.probability.size
+        return int(np.sum(np.any(self.probability < limit, axis=0)))
+
+    def to_json(self) -> dict[str, Any]:
+        """Return the figures as JSON values."""
+        return {
+            "frequency_hz": self.frequency.tolist(),
+            "gap": self.gap.tolist(),
+            "gap_high": self.gap_high.tolist(),
+            "nu_gap": [self.nu_gap.value, self.nu_gap.low, self.nu_gap.high],
+            "gap_at_hz": self.gap_at,
+            "delay_s": [self.delay.value, self.delay.low, self.delay.high],
+            "gain": [self.gain.value, self.gain.low, self.gain.high],
+            "found": self.found,
+            "lines_that_differ": self.lines_that_differ,
+            "scaling": {
+                "angle": self.scaling.angle,
+                "velocity": self.scaling.velocity,
+                "torque": self.scaling.torque,
+            },
+        }
+
+
+def continuous(measured: MeasuredResponse, model: LinearModel) -> Complex:
+    """Return a measured response freed from hold and folding by a model's ratio, shape (2, n)."""
+    return brought_to(measured.response, model, measured.frequency, measured=measured.period)
+
+
+def compare_responses(
+    first: MeasuredResponse, second: MeasuredResponse, model: LinearModel, scaling: Scaling = DEFAULT_SCALING
+) -> Difference:
+    """Return the difference of two measured plants, at the sampling period of the second.
+
+    Args:
+        first: The simulation.
+        second: The hardware.
+        model: A model of either; it brings the first to the second's sampling period.
+        scaling: Units of the gap.
+
+    Raises:
+        DataError: They share too few frequencies.
+    """
+    lines, one, spread_one, two, spread_two = _at_common_lines(first, second)
+    moved = brought_to(one, model, lines, measured=first.period, period=second.period)
+    spread_one = spread_one * np.abs(moved / one)
+    variance = spread_one**2 + spread_two**2
+    # Welch and Satterthwaite: a sum of two estimated variances counts as one with so many degrees of freedom.
+    freedom = variance**2 / (spread_one**4 / (first.blocks - 1.0) + spread_two**4 / (second.blocks - 1.0))
+    probability = stats.f.sf(np.abs(two - moved) ** 2 / variance, 2.0, 2.0 * freedom)
+    tail = 0.05 / probability.size
+    quantile = np.sqrt(stats.f.isf(tail, 2.0, 2.0 * freedom))
+    ratio = two[1] / moved[1]
+    relative = np.sqrt(variance[1]) / np.abs(moved[1])
+    gap, low, high = _gaps(moved, two, quantile * spread_one, quantile * spread_two, scaling)
+    found = nu_gap(scaling.plant(moved), scaling.plant(two))
+    at = int(np.argmax(gap))
+    whole = (
+        Estimate(found.value, float(low.max()), float(high.max()))
+        if found.winding
+        else Estimate(1.0, 1.0, 1.0)
+    )
+    return Difference(
+        lines, moved, two, ratio, quantile[1] * relative, np.asarray(probability, dtype=np.float64), gap, low, high,
+        whole, float(lines[at]), _delay(lines, ratio, relative), _gain(ratio, relative), scaling,
+    )  # fmt: skip
+
+
+def _at_common_lines(
+    first: MeasuredResponse, second: MeasuredResponse
+) -> tuple[Array, Complex, Array, Complex, Array]:
+    """Return frequencies, and response and deviation of both there; the first is interpolated where lines differ."""
+    apart = np.abs(second.frequency[:, None] - first.frequency[None, :])
+    nearest = apart.argmin(axis=1)
+    same = apart[np.arange(second.frequency.size), nearest] < 1e-6 * second.frequency
+    if same.sum() >= _LEAST_LINES:
+        here, there = np.flatnonzero(same), nearest[same]
+        return (
+            second.frequency[here], first.response[:, there], first.deviation[:, there], second.response[:, here],
+            second.deviation[:, here],
+        )  # fmt: skip
+    inside = (second.frequency >= first.frequency[0]) & (second.frequency <= first.frequency[-1])
+    if inside.sum() < _LEAST_LINES or first.frequency.size < _LEAST_LINES:
+        raise DataError(
+            f"{first.label} was measured from {first.frequency[0]:.3g} to {first.frequency[-1]:.3g} Hz and "
+            f"{second.label} from {second.frequency[0]:.3g} to {second.frequency[-1]:.3g} Hz; expected at least "
+            f"{_LEAST_LINES} frequencies in common"
+        )
+    grid, lines = Machine.of(first), second.frequency[inside]
+    response = np.stack([np.interp(lines, grid.frequency, row) for row in grid.response])
+    quantile = float(first.radius().flat[0] / first.deviation.flat[0])
+    spread = np.stack([np.interp(lines, grid.frequency, row) for row in grid.radius]) / quantile
+    return lines, response, spread, second.response[:, inside], second.deviation[:, inside]
+
+
+def _gaps(
+    first: Complex, second: Complex, a: Array, b: Array, scaling: Scaling
+) -> tuple[Array, Array, Array]:
+    """Return the chordal distance with its limits, from the discs of both."""
+    one, two = scaling.plant(first), scaling.plant(second)
+    gap = chordal_distance(one, two)
+    room = np.zeros(gap.size)
+    for centre, discs in ((one, np.abs(scaling.plant(a))), (two, np.abs(scaling.plant(b)))):
+        spread = np.linalg.norm(discs, axis=0)
+        nearest = np.maximum(np.linalg.norm(centre, axis=0) - spread, 0.0)
+        room += np.arcsin(np.minimum(spread / np.sqrt(1.0 + nearest**2), 1.0))
+    angle = np.arcsin(np.clip(gap, 0.0, 1.0))
+    low, high = np.maximum(angle - room, 0.0), np.minimum(angle + room, np.pi / 2.0)
+    return gap, np.sin(low), np.sin(high)
+
+
+def _delay(lines: Array, ratio: Complex, relative: Array) -> Estimate:
+    """Return the slope of the phase of the ratio through 0, weighted; differences of dynamics widen its interval."""
+    omega = 2.0 * np.pi * lines
+    phase = np.unwrap(np.angle(ratio))
+    weight = 1.0 / np.maximum(relative, 1e-6) ** 2
+    slope = -float(np.sum(weight * omega * phase) / np.sum(weight * omega**2))
+    residual = phase + slope * omega
+    misfit = max(1.0, float(np.sum(weight * residual**2)) / max(1, lines.size - 1))
+    half = 1.96 * np.sqrt(misfit / float(np.sum(weight * omega**2)))
+    return Estimate(slope, slope - half, slope + half)
+
+
+def _gain(ratio: Complex, relative: Array) -> Estimate:
+    """Return the weighted mean of the ratio's logarithm, as a factor; differences of dynamics widen its interval."""
+    weight = 1.0 / np.maximum(relative, 1e-6) ** 2
+    logarithm = np.log(np.abs(ratio))
+    mean = float(np.sum(weight * logarithm) / np.sum(weight))
+    misfit = max(1.0, float(np.sum(weight * (logarithm - mean) ** 2)) / max(1, ratio.size - 1))
+    half = 1.96 * np.sqrt(misfit / float(np.sum(weight)))
+    return Estimate(float(np.exp(mean)), float(np.exp(mean - half)), float(np.exp(mean + half)))

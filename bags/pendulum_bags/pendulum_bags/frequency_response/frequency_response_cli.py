@@ -1,0 +1,194 @@
+"""``frequency_response``: measure plants from recordings, compare them, certify designs; and the experiment for it."""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+from rich.console import Console
+
+from pendulum_msgs_py.errors import DataError, PendulumError
+from pendulum_msgs_py.programs.executables import EXIT_INTERRUPTED, cli_main
+from pendulum_msgs_py.programs.terminal import WholeTable, make_console
+
+if TYPE_CHECKING:
+    from pendulum_bags.frequency_response.analyse import Analysis
+
+__all__ = ["experiment", "main"]
+
+app = typer.Typer(add_completion=False, rich_markup_mode=None)
+
+Design = Annotated[
+    list[str] | None,
+    typer.Option(
+        help="Design to certify: 'q=100,0.01 r=0.1', 'k=33,0.2' or a controller's name; may be given again. Default: "
+        "the four combinations of the thesis."
+    ),
+]
+Angle = Annotated[float, typer.Option(help="Angle that the task allows, one unit of the gap [rad].")]
+Velocity = Annotated[float, typer.Option(help="Velocity that the task allows [rad/s].")]
+Torque = Annotated[float, typer.Option(help="Torque that the task has for it [N m].")]
+GapMargin = Annotated[
+    float, typer.Option(help="Gap between the plants that does not matter, 0 to 1.", min=0.0, max=1.0)
+]
+Json = Annotated[bool, typer.Option("--json", help="Print JSON instead of tables.")]
+
+
+@app.command()
+def frequency_response(
+    bags: Annotated[
+        list[Path], typer.Argument(help="A bag, a simulation and a hardware bag, or a run folder with both.")
+    ],
+    out: Annotated[
+        Path | None,
+        typer.Option("--out", "-o", help="Folder for page, figures and measured responses; none by default."),
+    ] = None,
+    plant: Annotated[str, typer.Option(help="Plant of the designs: preset or file; default: that of the bag.")] = "",
+    design: Design = None,
+    angle: Angle = 0.03,
+    velocity: Velocity = 3.0,
+    torque: Torque = 1.0,
+    gap_margin: GapMargin = 0.2,
+    json_output: Json = False,
+) -> None:
+    """Measure a plant's frequency response under feedback, and say which designs are safe to carry over to it.
+
+    Any bag with a known, rich disturbance serves; a multisine tells most. Example:
+
+        python -m pendulum_bags frequency_response bags/runs/today --design "q=100,0.01 r=0.1" --design pid
+    """
+    from pendulum_bags.frequency_response.analyse import analyse_responses, read_responses
+    from pendulum_lqr.gap_metric import Scaling
+
+    scaling = Scaling(angle, velocity, torque)
+    responses, told = read_responses(bags)
+    analysis = analyse_responses(responses, plant or told, design or (), scaling=scaling, margin=gap_margin)
+    _tell(make_console(stderr=json_output, highlight=False), analysis, out, json_output=json_output)
+
+
+def experiment(
+    out: Annotated[
+        Path | None,
+        typer.Option(help="Folder of the run; it must be new. Default: bags/runs/<UTC>_frequency_response."),
+    ] = None,
+    plant: Annotated[str, typer.Option(help="Simulated plant, and plant of the designs: preset or file.")] = "thesis",
+    strategy: Annotated[str, typer.Option(help="How the emulated actuator turns torque into PWM.")] = "direct_pwm",
+    controller: Annotated[str, typer.Option(help="Kind of controller that holds both plants meanwhile.")] = "lqr",
+    realtime: Annotated[bool, typer.Option(help="Keep the wall's time, instead of lockstep.")] = False,
+    amplitude: Annotated[float, typer.Option(help="Largest torque of the multisine [N m].")] = 2.5,
+    signal_period: Annotated[float, typer.Option(help="Length of one period of it [s].")] = 4.0,
+    periods: Annotated[int, typer.Option(help="Periods that are averaged; one more settles.", min=3, max=1000)] = 8,
+    lowest: Annotated[float, typer.Option(help="Lowest frequency [Hz].")] = 0.25,
+    highest: Annotated[float, typer.Option(help="Highest frequency [Hz]; the slower plant's rate is 100.")] = 47.5,
+    lines: Annotated[int, typer.Option(help="Number of frequencies, at most.", min=5, max=1000)] = 48,
+    seed: Annotated[int, typer.Option(help="Seed of the phases.", min=0)] = 1,
+    design: Design = None,
+    angle: Angle = 0.03,
+    velocity: Velocity = 3.0,
+    torque: Torque = 1.0,
+    gap_margin: GapMargin = 0.2,
+    storage: Annotated[str, typer.Option(help="Storage of the bags: mcap or sqlite3.")] = "mcap",
+    domain: Annotated[int | None, typer.Option(help="ROS domain; by default the first free one.")] = None,
+    json_output: Json = False,
+) -> None:
+    """Excite simulator and emulated hardware by one multisine, measure both plants, and certify designs.
+
+    For a real actuator, record any experiment with a rich disturbance and hand its bag to frequency_response.
+
+    Example: python -m pendulum_bags experiment frequency_response --design "q=100,0.01 r=0.1" --design pid
+    """
+    from pendulum_bags.experiments.domain import check_domain
+    from pendulum_bags.experiments.lockstep import record_run
+    from pendulum_bags.experiments.progress import PhaseProgress
+    from pendulum_bags.experiments.run_spec import RunSpec
+    from pendulum_bags.frequency_response.analyse import analyse_responses, read_responses
+    from pendulum_bags.runs.run_folder import create_run_folder, discard_if_empty
+    from pendulum_lqr.gap_metric import Scaling
+
+    scaling = Scaling(angle, velocity, torque)
+    check_domain(domain)
+    disturbance = {
+        "kind": "multisine", "amplitude": amplitude, "signal_period": signal_period, "frequency": lowest,
+        "frequency_end": highest, "lines": lines, "hold_time": 0.01,
+    }  # fmt: skip
+    # Both hold each sample for the slower plant's period: the same torque as a function of time.
+    specs = [
+        RunSpec(
+            side=side,
+            plant=plant if side == "sim" else "thesis",
+            design_plant=plant,
+            strategy=strategy,
+            controller=controller,
+            disturbance=disturbance,
+            duration=signal_period * (periods + 1) + 0.1,
+            seed=seed,
+            storage=storage,
+            clock="realtime" if realtime else "lockstep",
+        )
+        for side in ("sim", "hw")
+    ]
+    folder = create_run_folder(out, "frequency_response")
+    console = make_console(stderr=json_output, highlight=False)
+    started = time.monotonic()
+    shares = (1.0, 1.0) if realtime else (0.35, 0.15)
+    expected = [6.0 + share * spec.duration for spec, share in zip(specs, shares, strict=True)]
+    try:
+        with PhaseProgress(sum(expected) + 12.0, console) as progress:
+            for spec, length in zip(specs, expected, strict=True):
+                progress.phase("simulation" if spec.side == "sim" else "hardware", length)
+                record_run(folder / spec.side, spec, domain=domain, on_wait=progress.refresh)
+            progress.phase("analysing", 12.0)
+            responses, told = read_responses([folder])
+            analysis = analyse_responses(responses, told, design or (), scaling=scaling, margin=gap_margin)
+    except KeyboardInterrupt:
+        kept = "nothing was recorded" if discard_if_empty(folder) else f"what was recorded is in {folder}"
+        console.print(f"interrupted: all programs have ended; {kept}")
+        raise typer.Exit(EXIT_INTERRUPTED) from None
+    except PendulumError:
+        discard_if_empty(folder)
+        raise
+    _tell(console, analysis, folder, json_output=json_output)
+    console.print(f"bags    {folder / 'sim'}, {folder / 'hw'}\n({time.monotonic() - started:.0f} s)", soft_wrap=True)
+
+
+def _tell(console: Console, analysis: Analysis, out: Path | None, *, json_output: bool) -> None:
+    from pendulum_bags.frequency_response.analyse import write_analysis
+    from pendulum_bags.frequency_response.page import design_rows
+
+    page = None
+    if out is not None:
+        if out.exists() and not out.is_dir():
+            raise DataError(f"--out is {out}, a file; expected a folder")
+        page = write_analysis(out, analysis)
+    if json_output:
+        print(json.dumps(analysis.to_json(), indent=2, allow_nan=False))
+        return
+    for response in analysis.responses:
+        facts = response.facts
+        console.print(
+            f"{response.label}: {response.frequency.size} frequencies from {response.frequency[0]:.3g} to "
+            f"{response.frequency[-1]:.3g} Hz, {facts['blocks']} {facts['method']} of {facts['block_length_s']:g} s, "
+            f"largest angle {facts['largest_angle_rad']:.3f} rad, largest torque {facts['largest_torque_nm']:.2f} N m",
+            soft_wrap=True,
+        )
+    for layer in analysis.layers:
+        console.print(f"\n{layer.layer.title}: {layer.mark.value}", style="bold")
+        console.print(layer.sentence)
+    if analysis.designs:
+        table = WholeTable(title="\nDesigns", title_justify="left")
+        for heading in ("row", "design", "margin b", "loop distance", "modulus on hw", "certified"):
+            table.add_column(heading)
+        for row in design_rows(analysis):
+            table.add_row(*row)
+        console.print(table)
+    if page is not None:
+        console.print(f"\npage    {page}\nagain   {out}/hw_response.json for design --machine", soft_wrap=True)
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run the command line."""
+    return cli_main(app, argv, name="python -m pendulum_bags frequency_response")

@@ -1,0 +1,138 @@
+"""Two layers of the verdict from measured responses: is it the same plant, and which controllers carry over?"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from pendulum_bags.frequency_response.compare import Difference
+from pendulum_bags.frequency_response.designs import DesignResult
+from pendulum_bags.verdict import Evidence, Layer, LayerResult, Mark
+from pendulum_lqr.certificate import Certifier
+from pendulum_lqr.measured_response import MeasuredResponse
+
+__all__ = ["GAP_MARGIN", "same_plant", "which_controllers"]
+
+GAP_MARGIN = 0.2
+"""Gap that does not matter: a loop with a margin b(P, K) above it, as an LQR on this plant has, keeps its stability."""
+_WEAK_COHERENCE = 0.5
+_LARGE_TORQUE = 0.98
+
+
+def same_plant(
+    first: MeasuredResponse, second: MeasuredResponse, difference: Difference, margin: float = GAP_MARGIN
+) -> LayerResult:
+    """Return layer 2.
+
+    Args:
+        first: The simulation.
+        second: The hardware.
+        difference: Of the two.
+        margin: Gap that does not matter.
+    """
+    gap = difference.nu_gap
+    mark = Mark.YES if gap.high < margin else Mark.NO if gap.low > margin else Mark.UNDECIDED
+    where = f"largest at {difference.gap_at:.2g} Hz"
+    found = (
+        f"a difference was found at {difference.lines_that_differ} of {difference.frequency.size} frequencies"
+        if difference.found
+        else "no difference was found at any frequency"
+    )
+    sentence = (
+        f"The nu-gap between simulation and hardware is {gap.value:.3f} (95 % interval {gap.low:.3f} to "
+        f"{gap.high:.3f}), {where}; {found}."
+    )
+    delay, gain = difference.delay, difference.gain
+    told = Mark.YES if mark is Mark.YES else Mark.UNDECIDED
+    evidence = [
+        Evidence("nu-gap", "", gap.value, gap.low, gap.high, f"below {margin:g}", mark, difference.scaling.sentence()),
+        Evidence("extra delay of the hardware", "ms", 1e3 * delay.value, 1e3 * delay.low, 1e3 * delay.high, "", told),
+        Evidence("gain of the hardware beside the simulation", "", gain.value, gain.low, gain.high, "", told),
+        Evidence(
+            "frequencies that differ", "", float(difference.lines_that_differ), None, None,
+            f"of {difference.frequency.size}, error 5 % over all", told,
+        ),
+    ]  # fmt: skip
+    for measured, name in ((first, "simulation"), (second, "hardware")):
+        weakest = float(measured.coherence[0].min())
+        note = "" if weakest > _WEAK_COHERENCE else "weak: a larger amplitude or more periods would tell more"
+        evidence.append(Evidence(f"lowest coherence, {name}", "", weakest, mark=told, note=note))
+        if measured.distortion[1] == measured.distortion[1]:
+            evidence.append(
+                Evidence(
+                    f"distortion, {name}",
+                    "%",
+                    100.0 * measured.distortion[1],
+                    mark=told,
+                    note="velocity on lines that were not excited: friction and other nonlinearity",
+                )
+            )
+    steps: tuple[str, ...] = ()
+    if mark is Mark.NO:
+        steps = ("identify delay, gain and friction on the hardware (python -m pendulum_bags identify)",)
+    elif mark is Mark.UNDECIDED:
+        steps = ("measure longer: python -m pendulum_bags experiment frequency_response --periods 40",)
+    reasons = {
+        Mark.YES: f"the plants are {gap.high:.2g} apart at most in the nu-gap",
+        Mark.NO: f"the plants are {gap.value:.2f} apart in the nu-gap, {where}",
+        Mark.UNDECIDED: f"the nu-gap, {gap.low:.2f} to {gap.high:.2f}, is not measured well enough beside {margin:g}",
+    }
+    return LayerResult(Layer.SAME_PLANT, mark, sentence, tuple(evidence), steps, reasons[mark])
+
+
+def which_controllers(certifier: Certifier, designs: Sequence[DesignResult]) -> LayerResult:
+    """Return layer 3: yes where all given designs carry over, no where one does not.
+
+    Args:
+        certifier: Of the model and the measured hardware.
+        designs: Certified or not.
+    """
+    profile = certifier.profile
+    good = [design for design in designs if design.certificate.certified]
+    bad = [design for design in designs if not design.certificate.certified]
+    mark = Mark.YES if designs and not bad else Mark.NO
+    rows = ", ".join(f"row {i}" for i, d in enumerate(designs, 1) if d.certificate.certified)
+    not_rows = ", ".join(f"row {i}" for i, d in enumerate(designs, 1) if not d.certificate.certified)
+    limit = (
+        f"designs with a margin b above {profile.value_upper:.2f} stabilise the hardware too"
+        if profile.value_upper < 1.0
+        else "the gap certifies no design by its margin alone"
+    )
+    verdict = f"of {len(designs)} designs {rows or 'none'}"
+    if bad:
+        verdict += f"; not {not_rows}"
+    evidence = [
+        Evidence(
+            "nu-gap of model and hardware", "", profile.value, None, profile.value_upper, "", mark,
+            f"upper 95 % limit, largest at {profile.at:.2g} Hz",
+        ),
+        *(_row(design, profile.value_upper) for design in designs),
+    ]  # fmt: skip
+    steps = tuple(
+        f"redesign {design.name} with more margin, or identify the hardware and design again"
+        for design in bad
+    )
+    return LayerResult(
+        Layer.WHICH_CONTROLLERS,
+        mark,
+        f"Certified for this hardware: {verdict}; {limit}. Torque limits and friction at rest are outside it.",
+        tuple(evidence),
+        steps,
+        limit if mark is Mark.YES else f"{', '.join(d.name for d in bad)} not certified for the hardware",
+        f"{limit}; {', '.join(d.name for d in good)} certified" if good else "",
+    )
+
+
+def _row(design: DesignResult, limit: float) -> Evidence:
+    found = design.certificate
+    if not found.stable_on_model:
+        how = "does not stabilise the model, sampled as the hardware is"
+    elif found.by_gap:
+        how = "certified by its margin"
+    elif found.by_frequency:
+        how = f"certified frequency by frequency (loop distance {found.distance:.2f}, at {found.at:.2g} Hz)"
+    else:
+        how = f"loop distance {found.distance:.2f} at {found.at:.2g} Hz; expected below 1"
+    return Evidence(
+        f"margin b(P, K), {design.name}", "", found.margin, None, None, f"above {limit:.3f}",
+        Mark.YES if found.certified else Mark.NO, how,
+    )  # fmt: skip
