@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import socket
 import subprocess
 import sys
 from pathlib import Path
@@ -12,7 +13,7 @@ import pytest
 
 from pendulum_msgs_py.errors import FaultError
 from pendulum_msgs_py.ros import middleware
-from pendulum_msgs_py.ros.middleware import check_closed, middleware_defaults
+from pendulum_msgs_py.ros.middleware import check_closed, middleware_defaults, participant_number
 from tests.faults.network import PLANT_ADDRESS, two_machines, why_not
 from tests.fixtures import PROJECT
 from tests.processes import ProcessGroup, RunningProgram
@@ -119,9 +120,58 @@ sys.exit(main(["--ros-args", "-r", "__ns:=/sim"]))
     assert "ROS_AUTOMATIC_DISCOVERY_RANGE=SUBNET" in ended.stderr
 
 
-def test_the_check_is_for_networks_that_nobody_opened(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("FASTRTPS_DEFAULT_PROFILES_FILE", "/mine.xml")
-    check_closed(0)
+@pytest.mark.parametrize(("opened", "refused"), [("", True), ("/mine.xml", False)])
+def test_the_check_is_for_networks_that_nobody_opened(
+    monkeypatch: pytest.MonkeyPatch, domain_id: int, opened: str, refused: bool
+) -> None:
+    port = 7400 + 250 * domain_id + 10
+    monkeypatch.setenv("FASTRTPS_DEFAULT_PROFILES_FILE", opened or str(middleware._LOOPBACK))
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as everywhere:
+        everywhere.bind(("0.0.0.0", port))
+        if refused:
+            with pytest.raises(FaultError, match=f"listens on UDP port {port} of every network"):
+                check_closed(domain_id)
+        else:
+            check_closed(domain_id)
+
+
+def _occupy(domain: int, count: int) -> list[socket.socket]:
+    """Take the ports of so many participants, as they would."""
+    taken = []
+    for offset in range(10, 10 + 2 * count):
+        taken.append(socket.socket(socket.AF_INET, socket.SOCK_DGRAM))
+        taken[-1].bind(("127.0.0.1", 7400 + 250 * domain + offset))
+    return taken
+
+
+@pytest.mark.parametrize(("others", "code"), [(31, 0), (32, 1)])
+def test_a_program_that_would_find_nobody_says_so_and_ends(
+    domain_id: int, processes: ProcessGroup, monkeypatch: pytest.MonkeyPatch, others: int, code: int
+) -> None:
+    for name in _ROS_VARIABLES:
+        monkeypatch.delenv(name, raising=False)
+    taken = _occupy(domain_id, others)
+    try:
+        program = processes.start("pendulum_lqr", "disturbance", "--ros-args", "-r", "__ns:=/sim")
+        if code == 0:
+            program.wait_for_output("ready", 30.0)
+            program.interrupt()
+        assert (program.wait(30.0) == 0) == (code == 0)
+    finally:
+        for each in taken:
+            each.close()
+    if code:
+        assert f"program is number 33 of ROS domain {domain_id} on this machine; expected at most 32" in program.output
+        assert "ROS_DOMAIN_ID" in program.output
+
+
+def test_participants_are_numbered_by_their_ports() -> None:
+    first = 7400 + 250 * 7
+    # Multicast, then pairs.
+    assert participant_number([first, first + 1], 7) == 0
+    assert participant_number([first + 10, first + 11], 7) == 1
+    assert participant_number([first, first + 72, first + 73], 7) == 32
+    assert participant_number([first + 74], 7) == 33
 
 
 _LOOK = """

@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 import os
+import re
 import resource
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 
 from rclpy.utilities import get_rmw_implementation_identifier
 
 from pendulum_msgs_py.errors import FaultError
 
-__all__ = ["check_closed", "middleware_defaults", "set_middleware_defaults"]
+__all__ = ["check_closed", "middleware_defaults", "participant_number", "set_middleware_defaults"]
 
 _RANGE = "ROS_AUTOMATIC_DISCOVERY_RANGE"
 _PROFILES = "FASTRTPS_DEFAULT_PROFILES_FILE"
@@ -22,6 +23,8 @@ _LEAST_MEMORY = 1 << 30
 """Address space in which Fast DDS starts its threads; with less, it ends the process in ways of its own [bytes]."""
 _PORTS_OF_DOMAIN = 250
 _FIRST_PORT = 7400
+_FIRST_UNICAST = 10
+"""Offset of the port on which the first participant of a domain hears of others; each takes two (RTPS 2.3, 9.6.1.1)."""
 
 
 def set_middleware_defaults() -> None:
@@ -86,27 +89,58 @@ def middleware_defaults(environment: Mapping[str, str], middleware: str) -> dict
 
 
 def check_closed(domain: int) -> None:
-    """Check that this process listens to this host alone, where nobody has opened it.
+    """Check that this process listens to this host alone, where nobody has opened it, and can be found there.
 
     Args:
         domain: ROS domain that the process has joined.
 
     Raises:
-        FaultError: The middleware has taken no notice of the profile.
+        FaultError: The middleware has taken no notice of the profile, or more programs have joined the domain than
+            find each other.
     """
     sockets = Path("/proc/self/net/udp")
     if os.environ.get(_PROFILES) != str(_LOOPBACK) or not sockets.is_file():
         return
     ports = range(_FIRST_PORT + _PORTS_OF_DOMAIN * domain, _FIRST_PORT + _PORTS_OF_DOMAIN * (domain + 1))
     own = _open_sockets()
+    joined = []
     for line in sockets.read_text(encoding="ascii").splitlines()[1:]:
         fields = line.split()
         address, port = fields[1].split(":")
-        if int(port, 16) in ports and fields[9] in own and not address.endswith("7F"):
+        if int(port, 16) not in ports or fields[9] not in own:
+            continue
+        joined.append(int(port, 16))
+        if not address.endswith("7F"):
             raise FaultError(
                 f"the middleware listens on UDP port {int(port, 16)} of every network; expected the loopback address "
                 f"alone, as {_LOOPBACK} says (open it with {_RANGE}=SUBNET, if that is meant)"
             )
+
+
+    number, most = participant_number(joined, domain), _most_participants()
+    if number > most:
+        raise FaultError(
+            f"this program is number {number} of ROS domain {domain} on this machine; expected at most {most}, since "
+            "those beyond find nobody: end some of them, or choose another domain (ROS_DOMAIN_ID)"
+        )
+
+
+def participant_number(ports: Iterable[int], domain: int) -> int:
+    """Return which participant of a domain has these UDP ports, counted from 1; 0 for none of its unicast ports.
+
+    Args:
+        ports: Ports that a process listens on.
+        domain: ROS domain.
+    """
+    offsets = [port - _FIRST_PORT - _PORTS_OF_DOMAIN * domain - _FIRST_UNICAST for port in ports]
+    return max((offset // 2 + 1 for offset in offsets if offset >= 0), default=0)
+
+
+def _most_participants() -> int:
+    found = re.search(r"<maxInitialPeersRange>(\d+)<", _LOOPBACK.read_text(encoding="utf-8"))
+    if found is None:
+        raise FaultError(f"{_LOOPBACK} says nothing of maxInitialPeersRange; expected it as it was installed")
+    return int(found.group(1))
 
 
 def _open_sockets() -> set[str]:
