@@ -12,7 +12,6 @@ from pendulum_bags.experiments.run_spec import RunSpec
 from pendulum_bags.experiments.settings import RegulationSettings
 from pendulum_bags.runs.run_data import END_EVENT, START_EVENT
 from pendulum_bags.runs.run_folder import write_json
-from pendulum_lqr.controller import controller_parameters
 from pendulum_msgs_py.contract import names
 from pendulum_msgs_py.contract.angles import UPRIGHT
 from pendulum_msgs_py.contract.values import NANOSECONDS
@@ -68,15 +67,13 @@ def run_lockstep(
 def lockstep_spec(settings: RegulationSettings, *, side: str, theta: float = UPRIGHT) -> RunSpec:
     """Return one side of the thesis's experiment as a run in lockstep, for as long as the noise lasts."""
     noise = settings.noise
-    parameters = controller_parameters(settings.controller)
-    tuning = {"q": [float(value) for value in settings.q], "r": float(settings.r)}
     return RunSpec(
         side=side,
         plant=settings.plant if side == "sim" else "thesis",
         design_plant=settings.plant,
         strategy=settings.strategy,
         controller=settings.controller,
-        controller_parameters={key: value for key, value in tuning.items() if key in {p.name for p in parameters}},
+        controller_parameters=settings.tuning,
         disturbance={
             "kind": "uniform",
             "amplitude": noise.amplitude,

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import math
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import Any
 
 from pendulum_bags.experiments.operator import RealMachine, real_machine
 from pendulum_bags.experiments.run_spec import EMULATOR_LIFETIME, EMULATOR_WATCHDOG
 from pendulum_bags.runs.run_folder import git_revision, versions
+from pendulum_lqr.controller import controller_parameters
 from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.plants.plant_parameters import load_plant
 from pendulum_msgs_py.programs import graph
@@ -89,6 +90,20 @@ class RegulationSettings:
         if self.hardware not in HARDWARE:
             raise ParameterError(f"hardware is {self.hardware!r}; expected one of {', '.join(HARDWARE)}")
         real_machine(self.hardware, self.lab)
+        defaults = {item.name: item.default for item in fields(self)}
+        for name in ("q", "r"):
+            if getattr(self, name) != defaults[name] and name not in self.tuning:
+                raise ParameterError(
+                    f"{name} is {getattr(self, name)} for controller {self.controller!r}, which has no such parameter; "
+                    "expected it left out"
+                )
+
+    @property
+    def tuning(self) -> dict[str, list[float] | float]:
+        """The weights Q and R, as far as the controller has such parameters."""
+        known = {spec.name for spec in controller_parameters(self.controller)}
+        given: dict[str, list[float] | float] = {"q": [float(value) for value in self.q], "r": float(self.r)}
+        return {name: value for name, value in given.items() if name in known}
 
     @property
     def machine(self) -> RealMachine | None:
@@ -134,12 +149,7 @@ class RegulationSettings:
     def controller_program(self, namespace: str, **changes: graph.ParameterArgument) -> NodeProgram:
         """Return the controller of one of the plants."""
         plant = self.plant if Path(self.plant).suffix == "" else str(Path(self.plant).resolve())
-        parameters: dict[str, graph.ParameterArgument] = {
-            "controller": self.controller,
-            "plant": plant,
-            "q": [float(value) for value in self.q],
-            "r": float(self.r),
-        }
+        parameters: dict[str, graph.ParameterArgument] = {"controller": self.controller, "plant": plant, **self.tuning}
         return graph.controller(namespace, **{**parameters, **changes})
 
     def disturbance_program(self, namespace: str, **changes: graph.ParameterArgument) -> NodeProgram:
@@ -161,7 +171,7 @@ class RegulationSettings:
                 "strategy": self.strategy,
                 "seed": self.noise.seed,
                 "disturbance": {"kind": "uniform", **asdict(self.noise)},
-                "controller": {"kind": self.controller, "q": list(self.q), "r": self.r},
+                "controller": {"kind": self.controller, **self.tuning},
                 "versions": versions(),
                 "git_revision": git_revision(),
                 **({} if (machine := self.machine) is None else {"lab": dict(machine.lab.values)}),

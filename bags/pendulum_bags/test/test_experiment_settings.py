@@ -1,0 +1,35 @@
+"""What an experiment starts fits the programs that it starts, whatever the controller."""
+
+from __future__ import annotations
+
+import pytest
+
+from pendulum_bags.experiments.settings import RegulationSettings
+from pendulum_lqr.controller import COMMON_PARAMETERS, CONTROLLERS, controller_parameters
+from pendulum_msgs_py.errors import ParameterError
+from pendulum_msgs_py.parameters import validate
+
+# Not those that need a file or a task of their own to be designed.
+_NODE_OWN = {"controller", "plant", "use_sim_time"}
+
+
+@pytest.mark.parametrize("kind", CONTROLLERS)
+def test_every_controller_is_started_with_parameters_that_it_has(kind: str) -> None:
+    settings = RegulationSettings(controller=kind)
+    given = settings.controller_program("/sim").parameters
+    own = {name: value for name, value in given.items() if name not in _NODE_OWN}
+    specs = {spec.name: spec for spec in (*COMMON_PARAMETERS, *controller_parameters(kind))}
+    checked = validate(specs.values(), own, where=kind)
+    # And with the weights of the experiment where it has weights, as its bag will say.
+    for name, value in {"q": [100.0, 0.01], "r": 0.1}.items():
+        assert (name in own) == (name in specs)
+        assert checked.get(name, value) == value
+    run = settings.metadata("thesis")["pendulum.run"]
+    assert run["controller"] == {"kind": kind, **own}
+
+
+@pytest.mark.parametrize(("name", "value"), [("q", (1.0, 0.01)), ("r", 2.0)])
+def test_weights_for_a_controller_without_them_are_refused_not_ignored(name: str, value: object) -> None:
+    with pytest.raises(ParameterError, match=f"{name} is .* for controller 'pd_gravity', which has no such parameter"):
+        RegulationSettings(controller="pd_gravity", **{name: value})  # type: ignore[arg-type]
+    RegulationSettings(controller="lqi", **{name: value})  # type: ignore[arg-type]
