@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, replace
+from pathlib import Path
 from typing import Any
 
 from pendulum_hw_bridge.actuator import MAX_COMMAND_LIFETIME, ActuatorPort, HardwareLimits, MStopAction
@@ -185,6 +186,7 @@ BRIDGE_SPECS: tuple[ParameterSpec, ...] = (
     _fixed(
         "emulator_address", _DEFAULT_ADDRESS, "", "`emulator_process`: where the emulated actuator listens."
     ),
+    _fixed("hebi_log", "", "", "`hebi`: new .hebilog file that hebi-py writes beside the bag; empty for none."),
     _fixed("replay_file", "", "", "`replay`: feedback to play: a bag folder, an NPZ or a CSV file."),
 )
 """Parameters of the bridge beside those that every plant has."""
@@ -271,6 +273,7 @@ def _make_hebi(values: Mapping[str, Any], clock: Clock) -> ActuatorPort:
         ),
         clock=clock,
         interface=values["interface"],
+        log=Path(values["hebi_log"]) if values["hebi_log"] else None,
         drivetrain=asdict(drivetrain_of(plant_of(values))),
     )
 

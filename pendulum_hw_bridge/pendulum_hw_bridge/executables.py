@@ -5,6 +5,7 @@ __all__ = ["EXECUTABLES"]
 EXECUTABLES: dict[str, str] = {
     "bridge": "pendulum_hw_bridge.bridge_node:main",
     "check": "pendulum_hw_bridge.check_cli:main",
+    "convert": "pendulum_hw_bridge.convert_cli:main",
     "emulator": "pendulum_hw_bridge.emulator_cli:main",
     "emulator_fault": "pendulum_hw_bridge.emulator_cli:fault_main",
     "lab": "pendulum_hw_bridge.lab_cli:main",

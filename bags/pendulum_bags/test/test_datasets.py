@@ -219,5 +219,13 @@ def test_what_does_not_exist_or_has_an_unknown_suffix_is_refused(tmp_path):
     with refused("does not exist"):
         read_recording(tmp_path / "nothing.csv")
     (tmp_path / "data.xyz").write_text("")
-    with refused("expected .csv, .txt, .json, .mcap, .db3 or a bag folder"):
+    with refused("expected .csv, .txt, .json, .hebilog, .mcap, .db3 or a bag folder"):
         read_recording(tmp_path / "data.xyz")
+
+
+def test_a_hebi_log_that_cannot_be_read_is_told_by_the_program_that_reads_it(tmp_path):
+    (tmp_path / "hw.hebilog").write_bytes(b"no log")
+    with refused("is no HEBI log"):
+        read_recording(tmp_path / "hw.hebilog")
+    with refused("expected the lab file of a HEBI log"):
+        read_recording(tmp_path / "hw.hebilog", {"time": {"column": "t"}})

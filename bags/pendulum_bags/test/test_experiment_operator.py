@@ -41,6 +41,10 @@ def test_the_bridge_of_a_real_machine_gets_the_lab_file_and_nothing_that_contrad
         "command_lifetime": 0.25,
     }
     lab.write_text(LAB.replace("backend: emulator_process, ", ""), encoding="utf-8")
+    # The vendor's own log is written beside the bag of a real one.
+    assert settings.bridge_program(lab.parent / "run" / "hw").parameters["hebi_log"] == str(
+        lab.parent / "run" / "hw.hebilog"
+    )
     assert settings.bridge_program().parameters == {"lab_file": str(lab), "effort_strategy": "effort_loop"}
     assert RegulationSettings(hardware="hebi", lab=str(lab), effort_strategy="direct_pwm").strategy == "direct_pwm"
     run = settings.metadata("thesis")["pendulum.run"]

@@ -12,6 +12,7 @@ import io
 import math
 import threading
 from collections.abc import Callable, Mapping
+from pathlib import Path
 from typing import Any
 
 from pendulum_hw_bridge.actuator import (
@@ -30,6 +31,7 @@ from pendulum_hw_bridge.actuator import (
     check_lifetime,
 )
 from pendulum_hw_bridge.backends.hebi_discovery import LOOK_TIME, ModuleSelection, discover, select_module
+from pendulum_hw_bridge.backends.hebi_log import start_log, stop_log
 from pendulum_hw_bridge.clocks import Clock, WallClock
 from pendulum_hw_bridge.gains import DEFAULT_GAINS, GAIN_FIELDS, LOOPS, GainSet, PidGains
 from pendulum_msgs_py.contract.values import NANOSECONDS
@@ -128,6 +130,7 @@ class HebiBackend:
         drivetrain: Constants to report with a run.
         make_group: Returns hebi-py's group; by default the module is looked up on the network.
         imitation: The group is hebi-py's imitation, which has no module to read settings or times back from.
+        log: File to which the library writes all feedback while connected; None for none.
     """
 
     name = "hebi"
@@ -141,10 +144,12 @@ class HebiBackend:
         drivetrain: Mapping[str, float] | None = None,
         make_group: Callable[[], Any] | None = None,
         imitation: bool = False,
+        log: Path | None = None,
     ) -> None:
         self._clock = clock or WallClock()
         self._make_group = make_group or (lambda: connect_group(wanted, interface))
         self._imitation = imitation
+        self._log = log
         self._drivetrain = dict(drivetrain or {})
         self._wanted = wanted
         self._group: Any = None
@@ -176,6 +181,8 @@ class HebiBackend:
                 raise ActuatorError("module_lost", f"HEBI group has {self._group.size} modules; expected 1")
             self._command = self._hebi.GroupCommand(1)
             self._feedback = self._hebi.GroupFeedback(1)
+            if self._log is not None:
+                start_log(self._group, self._log)
         self._own()
         info = self._read_info()
         family, name, serial, firmware = self._wanted.family, self._wanted.name, "", ""
@@ -314,6 +321,8 @@ class HebiBackend:
     def close(self) -> None:
         """Stop, and let the library's thread for this group go."""
         self.stop()
+        if self._log is not None and self._group is not None:
+            stop_log(self._group)
         self._group = self._command = self._feedback = None
         self._owner = None
 

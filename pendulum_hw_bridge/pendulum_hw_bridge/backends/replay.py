@@ -28,6 +28,7 @@ from pendulum_hw_bridge.actuator import (
     check_lifetime,
 )
 from pendulum_hw_bridge.backends.bag_feedback import read_bag_feedback
+from pendulum_hw_bridge.backends.hebi_log import read_hebilog
 from pendulum_hw_bridge.clocks import Clock, WallClock
 from pendulum_hw_bridge.gains import GainSet
 from pendulum_msgs_py.contract.values import NANOSECONDS
@@ -103,7 +104,7 @@ class FeedbackRecording:
 
 
 def load_feedback(path: str | Path) -> FeedbackRecording:
-    """Return the recording in an NPZ file (arrays by name), a CSV file (a header of names), or a rosbag2 folder.
+    """Return the recording in an NPZ file (arrays by name), a CSV file (a header of names), a HEBI log or a bag folder.
 
     From a bag the complete records on ``actuator/feedback`` are taken, else position, velocity and effort on
     ``joint_states``.
@@ -119,6 +120,8 @@ def load_feedback(path: str | Path) -> FeedbackRecording:
             raise DataError(f"{path} has {path.stat().st_size} bytes; expected at most {_LIMIT}")
         if path.suffix == ".npz":
             return FeedbackRecording(_read_npz(path), where=str(path))
+        if path.suffix == ".hebilog":
+            return FeedbackRecording(read_hebilog(path), where=str(path))
         if path.suffix == ".csv":
             return FeedbackRecording(_read_csv(path), where=str(path))
     except OSError as error:
@@ -129,7 +132,7 @@ def load_feedback(path: str | Path) -> FeedbackRecording:
         raise DataError(f"feedback file {path}: {error}") from error
     except csv.Error as error:
         raise DataError(f"feedback file {path} is no CSV file: {error}") from error
-    raise DataError(f"feedback file {path} ends in {path.suffix!r}; expected .npz or .csv")
+    raise DataError(f"feedback file {path} ends in {path.suffix!r}; expected .npz, .csv or .hebilog")
 
 
 def _read_npz(path: Path) -> dict[str, NDArray[np.float64]]:

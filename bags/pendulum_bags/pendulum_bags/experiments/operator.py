@@ -39,6 +39,12 @@ class RealMachine:
         left_open = {name: value for name, value in defaults.items() if name not in self.lab.values}
         return {"lab_file": str(self.path), **left_open}
 
+    def log_parameters(self, bag: Path | None) -> dict[str, ParameterArgument]:
+        """Return what makes hebi-py write its own log beside a bag; nothing for an emulator, which has none."""
+        if bag is None or self.lab.values["backend"] != "hebi":
+            return {}
+        return {"hebi_log": str(bag.resolve().with_suffix(".hebilog"))}
+
     @property
     def emulated(self) -> bool:
         """Whether the lab file names an emulator: a rehearsal."""

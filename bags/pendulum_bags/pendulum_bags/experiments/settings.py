@@ -122,8 +122,8 @@ class RegulationSettings:
         """What a bag names as the hardware's plant: ``emulator``, also for the emulated machine of a lab file."""
         return "emulator" if self.machine is not None and self.machine.emulated else self.hardware
 
-    def bridge_program(self) -> NodeProgram:
-        """Return the bridge to the actuator."""
+    def bridge_program(self, bag: Path | None = None) -> NodeProgram:
+        """Return the bridge to the actuator; a real one's own log is written beside the bag, where there is one."""
         # An emulator's feedback is as punctual as this machine, which may be a busy one; a real actuator keeps the
         # default.
         patience: dict[str, graph.ParameterArgument] = {
@@ -134,7 +134,7 @@ class RegulationSettings:
         if machine is None:
             return graph.bridge("/hw", backend=self.hardware, effort_strategy=self.strategy, **patience)
         told = machine.bridge_parameters(**(patience if machine.emulated else {}))
-        return graph.bridge("/hw", **told, effort_strategy=self.strategy)
+        return graph.bridge("/hw", **told, **machine.log_parameters(bag), effort_strategy=self.strategy)
 
     def arguments(self) -> list[str]:
         """Return these settings as options of ``experiment lockstep``."""

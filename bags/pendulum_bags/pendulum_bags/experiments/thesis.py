@@ -79,14 +79,14 @@ def _start(processes: ProcessSet, folder: Path, settings: RegulationSettings) ->
         metadata = folder / "logs" / f"{name}_metadata.json"
         write_json(metadata, settings.metadata("thesis", plant=plant, namespace=f"/{name}"))
         start_recorder(processes, folder / name, f"/{name}", metadata, settings.storage)
-    for program in _programs(settings):
+    for program in _programs(settings, folder):
         processes.start_node(program, niceness=LOOP_NICENESS)
 
 
-def _programs(settings: RegulationSettings) -> list[NodeProgram]:
+def _programs(settings: RegulationSettings, folder: Path) -> list[NodeProgram]:
     return [
         graph.simulator("/sim", plant=settings.plant, method=settings.method, clock="realtime"),
-        settings.bridge_program(),
+        settings.bridge_program(folder / "hw"),
         *(settings.controller_program(namespace, autostart=False) for namespace in ("/sim", "/hw")),
         *(settings.disturbance_program(namespace, autostart=False) for namespace in ("/sim", "/hw")),
     ]

@@ -120,15 +120,15 @@ class TrialSettings:
         ramp = math.radians(self.step) / RAMP_INCREMENT * RAMP_PERIOD
         return _MARGIN + 4.0 * self.top / self.step * (self.hold + ramp)
 
-    def plant_program(self, trial: int) -> graph.NodeProgram:
-        """Return the bridge."""
+    def plant_program(self, trial: int, bag: Path | None = None) -> graph.NodeProgram:
+        """Return the bridge; a real actuator's own log is written beside the bag, where there is one."""
         if (machine := self.machine) is not None:
             patience: dict[str, graph.ParameterArgument] = {
                 "feedback_watchdog": EMULATOR_WATCHDOG,
                 "command_lifetime": EMULATOR_LIFETIME,
             }
             told = machine.bridge_parameters(**(patience if machine.emulated else {}))
-            return graph.bridge("/hw", **told, effort_strategy="direct_pwm")
+            return graph.bridge("/hw", **told, **machine.log_parameters(bag), effort_strategy="direct_pwm")
         parameters: dict[str, graph.ParameterArgument] = {"plant": self.plant, "effort_strategy": "direct_pwm"}
         if self.hardware == "emulator":
             # Sensor noise differs from trial to trial, as it would.
@@ -212,7 +212,7 @@ def _run_trial(
         log_time = "header" if settings.lockstep else "receive"
         recorder = start_recorder(processes, bag, "/hw", metadata, settings.storage, log_time=log_time)
         processes.start_node(settings.procedure_program(trial), niceness=LOOP_NICENESS)
-        processes.start_node(settings.plant_program(trial), niceness=LOOP_NICENESS)
+        processes.start_node(settings.plant_program(trial, bag), niceness=LOOP_NICENESS)
         plant = PlantClient(conductor, "/hw", "bridge", watch=not settings.lockstep)
         try:
             wait_until_all_hear_each_other(conductor, "/hw", _topics(settings), clock=settings.lockstep)

@@ -27,7 +27,7 @@ app = typer.Typer(add_completion=False, rich_markup_mode=None)
 @app.command()
 def identify(
     data: Annotated[
-        list[Path], typer.Argument(help="Bags, CSV files or friction-study JSON logs of one pendulum.")
+        list[Path], typer.Argument(help="Bags, CSV files, HEBI logs or friction-study JSON logs of one pendulum.")
     ],
     method: Annotated[
         str, typer.Option(help="output_error, or thesis (two linear regressions).")

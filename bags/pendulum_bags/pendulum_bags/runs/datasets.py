@@ -206,8 +206,9 @@ def read_recording(
     """Read a CSV file, a friction-study JSON log or a rosbag2 bag.
 
     Args:
-        path: ``*.csv`` / ``*.txt``, ``*.json``, or a bag (folder, ``*.mcap`` or ``*.db3``).
-        mapping: For CSV: mapping file, name of a built-in mapping or the mapping itself; by default the
+        path: ``*.csv`` / ``*.txt``, ``*.json``, ``*.hebilog``, or a bag (folder, ``*.mcap`` or ``*.db3``).
+        mapping: For a HEBI log the lab file, which says zero, sign and tare. For CSV:
+            mapping file, name of a built-in mapping or the mapping itself; by default the
             columns must be called as in the built-in mapping ``pendulum``.
         effort: For bags: ``applied`` takes what the plant says it applied (topic ``applied_effort``),
             ``measured`` the measured joint torque in ``joint_states``.
@@ -231,8 +232,12 @@ def read_recording(
         from pendulum_bags.runs.csv_mapping import read_csv
 
         return check_consistency(read_csv(source, mapping))
+    if suffix == ".hebilog":
+        from pendulum_bags.runs.hebi_logs import read_hebi_log
+
+        return check_consistency(read_hebi_log(source, mapping))
     raise DataError(
-        f"{source} has the suffix {suffix!r}; expected .csv, .txt, .json, .mcap, .db3 or a bag folder"
+        f"{source} has the suffix {suffix!r}; expected .csv, .txt, .json, .hebilog, .mcap, .db3 or a bag folder"
     )
 
 

@@ -1,0 +1,58 @@
+"""``convert``: a HEBI log as a CSV file in joint coordinates, for ``identify``, ``replay`` and the bridge's replay."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Annotated
+
+import numpy as np
+import typer
+
+from pendulum_hw_bridge.backends.hebi_log import read_hebilog, to_joint
+from pendulum_msgs_py.errors import ParameterError
+from pendulum_msgs_py.plants.lab_file import load_lab
+from pendulum_msgs_py.programs.executables import cli_main
+
+__all__ = ["main"]
+
+app = typer.Typer(add_completion=False, rich_markup_mode=None)
+
+
+@app.command()
+def convert(
+    log: Annotated[Path, typer.Argument(help="The .hebilog file.")],
+    out: Annotated[Path | None, typer.Option(help="CSV file to write. Default: beside the log.")] = None,
+    lab: Annotated[Path | None, typer.Option(help="Lab file, for zero, sign and tare of the joint.")] = None,
+    module: Annotated[int | None, typer.Option(help="Which module of a log of several, from 0.", min=0)] = None,
+) -> None:
+    """Write what a HEBI log holds as CSV: time [s], then all quantities in SI units, joint coordinates.
+
+    Example: python -m pendulum_hw_bridge convert hw.hebilog --lab lab.yaml
+    """
+    quantities = read_hebilog(log, module=module)
+    if lab is not None:
+        values = load_lab(lab).values
+        quantities = to_joint(
+            quantities,
+            zero=values.get("joint_offset", 0.0),
+            sign=values.get("joint_sign", 1),
+            tare=values.get("effort_tare", 0.0),
+        )
+    # A quantity that was never there (a loop that was off, an older firmware) would be a column of nothing.
+    kept = {name: column for name, column in quantities.items() if np.all(np.isfinite(column))}
+    for name in ("position", "velocity", "effort"):
+        if name not in kept:
+            raise ParameterError(f"{log}: {name} is not a number everywhere; expected a log of one running module")
+    target = out or log.with_suffix(".csv")
+    try:
+        table = np.column_stack(list(kept.values()))
+        np.savetxt(target, table, delimiter=",", header=",".join(kept), comments="", fmt="%.9g")
+    except OSError as error:
+        raise ParameterError(f"{target} cannot be written: {error.strerror}") from error
+    print(f"{target}: {len(kept['time'])} records, {kept['time'][-1]:.2f} s, {len(kept) - 1} quantities")
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run the conversion."""
+    return cli_main(app, argv, name="python -m pendulum_hw_bridge convert")
