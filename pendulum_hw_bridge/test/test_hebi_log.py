@@ -1,7 +1,7 @@
 """HEBI's own logs: written beside a bag, read back in joint coordinates, refused by name.
 
-hebi-py does not log its imitation group, and no module is at hand where tests run: what a log yields is made of hebi-py's
-own feedback objects, which the imitation group fills.
+hebi-py does not log its imitation group, and no module is at hand where tests run: what a log yields is made of
+hebi-py's own feedback objects, which the imitation group fills.
 """
 
 from pathlib import Path
