@@ -89,7 +89,7 @@ def _escaping_bag(folder: Path, target: str) -> Path:
 
 
 def _described(topic: str = "/t", kind: str = "sensor_msgs/msg/JointState", definition: str = "") -> bytes:
-    return rec.schema_record(1, kind, "ros2msg", definition) + rec.channel_record(1, 1, topic, {})
+    return rec.schema_record(1, kind, "ros2msg", definition) + rec.channel_record(1, 1, topic, "cdr", {})
 
 
 def _message(data: bytes, time: int = 5) -> bytes:
@@ -139,8 +139,8 @@ def _indexed(entries: int, chunks: int) -> bytes:
     places = [(1, index_at)]
     entry = rec.chunk_index_record(5, 5, at, len(chunk), places, len(index), "", len(records), len(records))
     statistics = rec.statistics_record(
-        message_count=entries, schema_count=1, metadata_count=0, chunk_count=chunks, start_ns=5, stop_ns=5,
-        channel_counts={1: 2**60},
+        message_count=entries, schema_count=1, attachment_count=0, metadata_count=0, chunk_count=chunks, start_ns=5,
+        stop_ns=5, channel_counts={1: 2**60},
     )  # fmt: skip
     summary = _described() + entry * chunks + statistics
     return head + chunk + index + summary + rec.footer_record(summary_at, 0) + rec.MAGIC

@@ -245,7 +245,7 @@ def _bag_of_own_types(folder: Path) -> Path:
     path = folder / "own_types.mcap"
     path.write_bytes(
         rec.MAGIC + rec.header_record("fuzz")
-        + rec.schema_record(1, "own/msg/Whole", "ros2msg", definition) + rec.channel_record(1, 1, "/own", {})
+        + rec.schema_record(1, "own/msg/Whole", "ros2msg", definition) + rec.channel_record(1, 1, "/own", "cdr", {})
         + rec.MESSAGE_HEADER.pack(rec.MESSAGE, 22 + len(data), 1, 0, 5, 5) + data
         + rec.record(rec.DATA_END, bytes(4)) + rec.footer_record(0, 0) + rec.MAGIC
     )  # fmt: skip

@@ -18,7 +18,7 @@ _CDR = b"\0\1\0\0"
 def write_mcap(path: Path, kind: str, definition: str, data: bytes) -> Path:
     """Write one message with a definition of our choice."""
     message = rec.MESSAGE_HEADER.pack(rec.MESSAGE, 22 + len(data), 1, 0, 5, 5) + data
-    content = rec.schema_record(1, kind, "ros2msg", definition) + rec.channel_record(1, 1, "/t", {}) + message
+    content = rec.schema_record(1, kind, "ros2msg", definition) + rec.channel_record(1, 1, "/t", "cdr", {}) + message
     end = rec.record(rec.DATA_END, bytes(4)) + rec.footer_record(0, 0)
     path.write_bytes(rec.MAGIC + rec.header_record("test") + content + end + rec.MAGIC)
     return path

@@ -73,7 +73,21 @@ def test_bags_of_rosbags_read_the_same(
 def test_files_of_the_mcap_library_read_the_same(
     tmp_path: Path, compression: CompressionType, variant: str
 ) -> None:
-    path = tmp_path / "alone.mcap"
+    path = library_file(tmp_path / "alone.mcap", compression, variant)
+    bag = read_bag(path)
+    assert not bag.damage
+    assert_equals_rosbags(bag, path)
+
+
+@pytest.mark.parametrize("variant", ["no_channels", "no_schemas"])
+def test_a_summary_that_leaves_out_topics_hides_no_message(tmp_path: Path, variant: str) -> None:
+    """The format allows that topics, or their types, are told beside the messages only; rosbags reads no such file."""
+    bag = read_bag(library_file(tmp_path / "bare.mcap", CompressionType.ZSTD, variant))
+    assert not bag.damage
+    assert same_messages(bag, read_bag(library_file(tmp_path / "all.mcap", CompressionType.ZSTD, "all")))
+
+
+def library_file(path: Path, compression: CompressionType, variant: str) -> Path:
     messages = mixed_messages(random.Random(5), 300)
     messages.sort(key=lambda item: item[1])
     with path.open("wb") as stream:
@@ -84,8 +98,8 @@ def test_files_of_the_mcap_library_read_the_same(
             use_chunking=variant != "no_chunks",
             use_statistics=variant != "no_summary",
             use_summary_offsets=variant != "no_summary",
-            repeat_channels=variant != "no_summary",
-            repeat_schemas=variant != "no_summary",
+            repeat_channels=variant not in ("no_summary", "no_channels"),
+            repeat_schemas=variant not in ("no_summary", "no_schemas"),
         )
         if variant in ("no_index", "no_summary"):
             writer = McapLibraryWriter(
@@ -100,9 +114,7 @@ def test_files_of_the_mcap_library_read_the_same(
                 channels[topic] = writer.register_channel(topic, "cdr", schema)
             writer.add_message(channels[topic], time, data, time)
         writer.finish()
-    bag = read_bag(path)
-    assert not bag.damage
-    assert_equals_rosbags(bag, path)
+    return path
 
 
 def _no_index() -> Any:

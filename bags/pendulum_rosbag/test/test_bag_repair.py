@@ -6,6 +6,7 @@ import json
 import random
 import shutil
 import signal
+import struct
 import subprocess
 import sys
 import time
@@ -13,17 +14,22 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+import yaml
 from mcap.reader import make_reader
+from mcap.writer import CompressionType
+from mcap.writer import Writer as McapLibraryWriter
 from rosbags.highlevel import AnyReader
 from rosbags.rosbag2 import StoragePlugin
 from rosbags.rosbag2 import Writer as RosbagsWriter
 
 from pendulum_msgs_py.contract.cdr import encode_joint_state
-from pendulum_msgs_py.errors import BagError, PendulumError
+from pendulum_msgs_py.errors import BagError, DataError, PendulumError
 from pendulum_rosbag.reader import read_bag, same_messages
+from pendulum_rosbag.reader.statistics import bag_statistics
 from pendulum_rosbag.storage import open_writer, typestore
 from pendulum_rosbag.storage.repair import repair_bag
 from pendulum_rosbag.storage.repair_cli import main as repair_main
+from tests.mcap_js_reader import McapJs
 
 JOINT_STATE = "sensor_msgs/msg/JointState"
 TOPICS = ("/a", "/b", "/c")
@@ -64,20 +70,25 @@ def storage_file(bag: Path) -> Path:
     return file
 
 
-def whole_chunks(file: Path, size: int) -> int:
-    """Count the messages in the chunks of a sound MCAP file that end before some byte."""
+def whole_messages(file: Path, size: int) -> int:
+    """Count the messages of a sound MCAP file of plain chunks whose records end before some byte."""
+    content = file.read_bytes()
     with file.open("rb") as stream:
         summary = make_reader(stream).get_summary()
         assert summary is not None
-        ends = [
-            (c.chunk_start_offset + c.chunk_length, c.message_start_time, c.message_end_time)
-            for c in summary.chunk_indexes
-        ]
-    return sum(last - first + 1 for end, first, last in ends if end <= size)
+    found = 0
+    for chunk in summary.chunk_indexes:
+        end = chunk.chunk_start_offset + chunk.chunk_length
+        at = end - chunk.compressed_size
+        while at < min(end, size):
+            opcode, length = struct.unpack_from("<BQ", content, at)
+            at += 9 + length
+            found += opcode == 5 and at <= size
+    return found
 
 
 @pytest.mark.parametrize("writer", ["ours", "ours_unclosed", "rosbags"])
-def test_a_truncated_mcap_file_gives_back_all_whole_chunks(tmp_path: Path, writer: str) -> None:
+def test_a_truncated_mcap_file_gives_back_all_whole_messages(tmp_path: Path, writer: str) -> None:
     if writer == "rosbags":
         bag = rosbags_bag(tmp_path / "bag", "mcap")
     else:
@@ -91,7 +102,7 @@ def test_a_truncated_mcap_file_gives_back_all_whole_chunks(tmp_path: Path, write
     for number in range(8):
         size = rng.randrange(200, end)
         file.write_bytes(sound[:size])
-        expected = whole_chunks(whole, size)
+        expected = whole_messages(whole, size)
         output = tmp_path / f"mended{number}"
         report = repair_bag(bag, output)
         assert report.repaired
@@ -102,6 +113,118 @@ def test_a_truncated_mcap_file_gives_back_all_whole_chunks(tmp_path: Path, write
         if expected:
             with AnyReader([output]) as reader:
                 assert sum(1 for _ in reader.messages()) == expected
+
+
+@pytest.mark.parametrize("compression", [CompressionType.ZSTD, CompressionType.LZ4])
+def test_a_compressed_chunk_that_is_cut_off_gives_back_what_its_compression_does(
+    tmp_path: Path, compression: CompressionType
+) -> None:
+    path = tmp_path / "whole.mcap"
+    rng = random.Random(4)
+    with path.open("wb") as stream:
+        writer = McapLibraryWriter(stream, chunk_size=1 << 24, compression=compression)
+        writer.start("ros2", "test")
+        schema = writer.register_schema("std_msgs/msg/String", "ros2msg", b"string data")
+        channel = writer.register_channel("/a", "cdr", schema)
+        for index in range(3000):
+            text = rng.randbytes(200).hex().encode() + b"\0"
+            writer.add_message(channel, index, b"\0\1\0\0" + len(text).to_bytes(4, "little") + text, index)
+        writer.finish()
+    sound = read_bag(path).raw("/a")
+    torn = tmp_path / "torn.mcap"
+    torn.write_bytes(path.read_bytes()[: path.stat().st_size * 2 // 3])
+    found = read_bag(torn)
+    assert found.damage
+    rows = found.raw("/a")
+    assert rows == sound[: len(rows)]
+    assert len(rows) > 1000
+
+
+def foreign_file(path: Path, *, close: bool = True) -> Path:
+    """Write what other programs put into MCAP files beside CDR: JSON, Protobuf, attachments, metadata."""
+    with path.open("wb") as stream:
+        writer = McapLibraryWriter(stream, chunk_size=5000, compression=CompressionType.NONE)
+        writer.start("ros2", "test")
+        state_type = writer.register_schema(JOINT_STATE, "ros2msg", b"")
+        proto = writer.register_schema("foxglove.Log", "protobuf", bytes(range(256)))
+        channels = [
+            writer.register_channel("/a", "cdr", state_type),
+            writer.register_channel("/log", "protobuf", proto),
+            writer.register_channel("/plain", "json", 0),
+        ]
+        writer.add_attachment(7, 6, "calibration.yaml", "text/yaml", b"gain: 2\n")
+        writer.add_metadata("operator", {"name": "A. Nother"})
+        for index in range(300):
+            writer.add_message(channels[0], index, state(index), index)
+            writer.add_message(channels[1], index, bytes((index % 256, 255)), index)
+            writer.add_message(channels[2], index, b'{"n": %d}' % index, index)
+        writer.add_attachment(8, 8, "late.bin", "application/octet-stream", bytes(5000))
+        if close:
+            writer.finish()
+    return path
+
+
+@pytest.mark.parametrize("how", ["sound", "unclosed"])
+def test_what_others_put_into_a_file_is_kept(tmp_path: Path, how: str, request: pytest.FixtureRequest) -> None:
+    path = foreign_file(tmp_path / "foreign.mcap", close=how == "sound")
+    original = read_bag(path)
+    assert bool(original.damage) == (how == "unclosed")
+    report = repair_bag(path, tmp_path / "mended", force=True)
+    assert sorted(report.kept) == ["calibration.yaml", "late.bin", "operator"]
+    assert not report.left_out
+    mended = read_bag(report.path)
+    assert not mended.damage
+    for topic in ("/a", "/log", "/plain"):
+        assert mended.raw(topic) == original.raw(topic)
+        assert len(mended.raw(topic)) >= 250
+    assert bag_statistics(mended).topics["/plain"].count == mended.topics["/plain"].count
+    with pytest.raises(DataError, match="is encoded as 'json'; expected CDR"):
+        mended.messages("/plain")
+    file = storage_file(report.path)
+    with file.open("rb") as stream:
+        reader = make_reader(stream, validate_crcs=True)
+        attachments = {item.name: item.data for item in reader.iter_attachments()}
+        assert attachments == {"calibration.yaml": b"gain: 2\n", "late.bin": bytes(5000)}
+        assert {item.name: item.metadata for item in reader.iter_metadata()}["operator"] == {"name": "A. Nother"}
+        summary = reader.get_summary()
+        assert summary is not None
+        assert summary.statistics is not None
+        assert (summary.statistics.attachment_count, summary.statistics.metadata_count) == (2, 2)
+        encodings = {channel.topic: channel.message_encoding for channel in summary.channels.values()}
+        assert encodings == {"/a": "cdr", "/log": "protobuf", "/plain": "json"}
+        (proto,) = [schema for schema in summary.schemas.values() if schema.name == "foxglove.Log"]
+        assert proto.data == bytes(range(256))
+    listed = yaml.safe_load((report.path / "metadata.yaml").read_text())["rosbag2_bagfile_information"]
+    formats = {
+        item["topic_metadata"]["name"]: item["topic_metadata"]["serialization_format"]
+        for item in listed["topics_with_message_count"]
+    }
+    assert formats == encodings
+    readers: McapJs = request.getfixturevalue("mcap_js")  # last: it skips where there is no Node.js
+    found = readers.read(file)
+    assert sorted(found["byIndex"]["attachments"]) == ["calibration.yaml", "late.bin"]
+    assert found["byIndex"]["count"] == found["inOrder"]["count"] == sum(report.messages.values())
+
+
+def test_a_topic_of_two_types_keeps_the_bag_readable_and_repair_says_what_it_left_out(tmp_path: Path) -> None:
+    path = tmp_path / "two.mcap"
+    with path.open("wb") as stream:
+        writer = McapLibraryWriter(stream, compression=CompressionType.NONE)
+        writer.start("ros2", "test")
+        kinds = [writer.register_schema(name, "ros2msg", b"") for name in (JOINT_STATE, "std_msgs/msg/String")]
+        channels = [writer.register_channel("/a", "cdr", kind) for kind in kinds]
+        other = writer.register_channel("/b", "cdr", kinds[0])
+        for index in range(10):
+            writer.add_message(channels[index == 3], index, state(index), index)
+            writer.add_message(other, index, state(index), index)
+        writer.finish()
+    bag = read_bag(path)
+    assert "topic /a has the types sensor_msgs/msg/JointState, std_msgs/msg/String; expected one" in bag.damage[0]
+    assert len(bag["/b"]) == 10
+    assert len(bag["/a"]) == 9
+    assert len(bag.raw("/a (std_msgs/msg/String)")) == 1
+    report = repair_bag(path, tmp_path / "mended", force=True)
+    assert "LEFT OUT: 1 messages (topic /a has type std_msgs/msg/String" in report.sentence()
 
 
 @pytest.mark.parametrize("writer", ["ours", "rosbags"])
@@ -158,7 +281,7 @@ def test_a_bag_without_footer_and_metadata_is_put_in_place(tmp_path: Path) -> No
     """What the MCAP writer of rosbags leaves after a kill: no footer, no metadata.yaml."""
     bag = rosbags_bag(tmp_path / "bag", "mcap")
     file = storage_file(bag)
-    expected = whole_chunks(file, file.stat().st_size - 200_000)
+    expected = whole_messages(file, file.stat().st_size - 200_000)
     file.write_bytes(file.read_bytes()[:-200_000])
     (bag / "metadata.yaml").unlink()
     report = repair_bag(bag)

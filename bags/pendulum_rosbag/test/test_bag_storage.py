@@ -20,6 +20,9 @@ from pendulum_rosbag.storage import (
 )
 from tests.bag_readers import JOINT_STATE, STRING, count_everywhere, count_in_order, state, text_message
 
+JOINT_STATE_HASH = "RIHS01_a13ee3a330e346c9d87b5aa18d24e11690752bd33a0350f11c5882bc9179260e"
+"""As Jazzy's own discovery reports it."""
+
 
 @pytest.mark.parametrize(("storage", "compression"), [("mcap", None), ("mcap", "zstd"), ("sqlite3", None)])
 def test_what_is_sealed_is_in_the_bag_for_every_reader(
@@ -122,7 +125,11 @@ def test_mcap_files_carry_profile_schema_and_checksums(tmp_path: Path) -> None:
         (schema,) = summary.schemas.values()
         assert (schema.name, schema.encoding) == (JOINT_STATE, "ros2msg")
         assert b"MSG: std_msgs/Header" in schema.data
+        (channel,) = summary.channels.values()
+        assert channel.metadata["topic_type_hash"] == message_type(JOINT_STATE).hash
         assert [metadata.name for metadata in reader.iter_metadata()] == ["rosbag2"]
+    # Also of the file alone, without the metadata of its folder.
+    assert read_bag(bag / "bag_0.mcap").topics["/a"].hash == JOINT_STATE_HASH
 
 
 def test_sqlite_files_have_the_index_that_rosbag2_seeks_by(tmp_path: Path) -> None:

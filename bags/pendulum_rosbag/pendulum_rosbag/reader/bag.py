@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from pendulum_msgs_py.errors import BagError, DataError
+from pendulum_msgs_py.errors import DataError
 from pendulum_rosbag.reader.batches import Batch, Int64, Source, Stream
 from pendulum_rosbag.reader.joint_state import JointStateParser
 from pendulum_rosbag.reader.open_source import BagFolder, open_folder, open_sources
@@ -35,6 +35,7 @@ class TopicInfo:
         hash: Type description hash, empty when the bag does not tell.
         qos: Offered QoS profiles as the YAML text of the bag.
         definition: Message definition text, empty when the bag has none.
+        serialization: How messages are encoded: ``cdr``, or as another writer says.
     """
 
     name: str
@@ -43,6 +44,7 @@ class TopicInfo:
     hash: str = ""
     qos: str = ""
     definition: str = ""
+    serialization: str = "cdr"
 
 
 @dataclass(frozen=True, slots=True)
@@ -91,7 +93,8 @@ class Bag(Mapping[str, Any]):
         ]
         self._sources = list(sources)
         self._span = (start, stop)
-        self._topics = _group(sources, folder.topic_hashes)
+        self._topics, several = _group(sources, folder.topic_hashes)
+        self.damage += several
         if topics is not None:
             missing = [topic for topic in topics if topic not in self._topics]
             if missing:
@@ -182,6 +185,11 @@ class Bag(Mapping[str, Any]):
         from pendulum_rosbag.reader.decode import decoder_for
 
         rows = self.raw(topic)
+        foreign = {stream.serialization for _, stream in self._topics[topic].streams} - {"cdr"}
+        if foreign:
+            raise DataError(
+                f"topic {topic} of bag {self.path} is encoded as {foreign.pop()!r}; expected CDR, as of ROS 2"
+            )
         decode = decoder_for(self._topics[topic].info)
         return [StoredMessage(time, decode(data)) for time, data in rows]
 
@@ -317,29 +325,37 @@ def read_bags(
         return list(pool.map(lambda path: read_bag(path, topics, start, stop).load(), paths))
 
 
-def _group(sources: Sequence[Source], hashes: Mapping[str, str]) -> dict[str, _Topic]:
-    grouped: dict[str, list[tuple[Source, Stream]]] = {}
+def _group(sources: Sequence[Source], hashes: Mapping[str, str]) -> tuple[dict[str, _Topic], list[str]]:
+    """Return the topics by name, and a sentence for each that has several types.
+
+    The type of most messages has the name; others of it are offered as ``NAME (TYPE)``.
+    """
+    grouped: dict[str, dict[str, list[tuple[Source, Stream]]]] = {}
     for source in sources:
         for stream in source.streams:
-            grouped.setdefault(stream.topic, []).append((source, stream))
-    topics = {}
-    for name, streams in sorted(grouped.items()):
-        types = {stream.type for _, stream in streams}
-        if len(types) > 1:
-            raise BagError(
-                f"topic {name} has the types {', '.join(sorted(types))}; expected one type for each topic"
+            grouped.setdefault(stream.topic, {}).setdefault(stream.type, []).append((source, stream))
+    topics: dict[str, _Topic] = {}
+    sentences = []
+    for name, by_type in sorted(grouped.items()):
+        kinds = sorted(by_type, key=lambda kind: -sum(stream.count for _, stream in by_type[kind]))
+        for kind in kinds:
+            offered = name if kind == kinds[0] else f"{name} ({kind})"
+            topics[offered] = _topic(offered, by_type[kind], hashes.get(name, "") if kind == kinds[0] else "")
+        if len(kinds) > 1:
+            others = ", ".join(repr(f"{name} ({kind})") for kind in kinds[1:])
+            sentences.append(
+                f"topic {name} has the types {', '.join(kinds)}; expected one (messages of the others are offered as "
+                f"{others})"
             )
-        first = next((stream for _, stream in streams if stream.definition), streams[0][1])
-        info = TopicInfo(
-            name,
-            first.type,
-            sum(stream.count for _, stream in streams),
-            first.hash or hashes.get(name, ""),
-            first.qos,
-            first.definition,
-        )
-        topics[name] = _Topic(info, streams)
-    return topics
+    return topics, sentences
+
+
+def _topic(name: str, streams: list[tuple[Source, Stream]], type_hash: str) -> _Topic:
+    first = next((stream for _, stream in streams if stream.definition), streams[0][1])
+    count = sum(stream.count for _, stream in streams)
+    hash_told = first.hash or type_hash
+    info = TopicInfo(name, first.type, count, hash_told, first.qos, first.definition, first.serialization)
+    return _Topic(info, streams)
 
 
 def _held(kind: str, stored: Sequence[StoredMessage]) -> str:

@@ -11,6 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from pendulum_msgs_py.errors import BagError
+from pendulum_rosbag.storage.mcap_extras import Attachment, Metadata
 
 __all__ = ["MCAP_HEAD", "Batch", "Bytes", "Int64", "Source", "Stream"]
 
@@ -96,6 +97,10 @@ class Source(Protocol):
 
     def batches(self, channels: set[int], start: int | None, stop: int | None) -> Iterator[Batch]:
         """Yield all messages of some channels with start <= log time < stop, in the order of the file."""
+        ...
+
+    def extras(self) -> list[Attachment | Metadata]:
+        """Return attachments and metadata that others than the recorder put into the file."""
         ...
 
     def close(self) -> None:

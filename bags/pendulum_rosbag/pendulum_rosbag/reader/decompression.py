@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import io
 from typing import BinaryIO
 
 from pendulum_msgs_py.errors import BagError
 from pendulum_rosbag.reader.batches import Bytes
 
-__all__ = ["decompress", "decompress_bounded"]
+__all__ = ["decompress", "decompress_bounded", "decompress_torn"]
 
 _MAX_CHUNK = (
     1 << 28
@@ -46,6 +47,36 @@ def decompress(packed: Bytes, compression: str, size: int, name: str) -> bytes:
     if len(raw) != size:
         raise BagError(f"{name}: a chunk holds {len(raw)} bytes; its head says {size}")
     return raw
+
+
+def decompress_torn(packed: Bytes, compression: str, size: int) -> bytes:
+    """Return the beginning of a chunk whose end was cut off, as far as its compression gives it back.
+
+    Raises:
+        BagError: Unknown compression, a chunk larger than any recorder's, or the bytes are damaged.
+    """
+    if size > _MAX_CHUNK:
+        raise BagError(f"a chunk claims to hold {size} bytes; expected at most {_MAX_CHUNK}")
+    if compression == "zstd":
+        import zstandard
+
+        parts, left = [], size
+        try:
+            with zstandard.ZstdDecompressor().stream_reader(io.BytesIO(packed.tobytes())) as stream:
+                while left > 0 and (part := stream.read(min(left, 1 << 20))):
+                    parts.append(part)
+                    left -= len(part)
+        except zstandard.ZstdError as error:
+            raise BagError(f"a compressed chunk is damaged ({error})") from None
+        return b"".join(parts)
+    if compression == "lz4":
+        import lz4.frame
+
+        try:
+            return bytes(lz4.frame.LZ4FrameDecompressor().decompress(packed.tobytes(), max_length=size))
+        except (RuntimeError, EOFError) as error:
+            raise BagError(f"a compressed chunk is damaged ({error})") from None
+    raise BagError(f"chunk compression is {compression!r}; expected zstd, lz4 or none")
 
 
 def decompress_bounded(packed: BinaryIO, name: str, limit: int = _MAX_CHUNK) -> bytes:

@@ -11,7 +11,7 @@ import numpy as np
 from pendulum_rosbag.reader.batches import Bytes
 from pendulum_rosbag.storage import mcap_records as rec
 
-__all__ = ["Chunk", "keep_staged", "read_text", "read_text_map"]
+__all__ = ["Chunk", "keep_staged", "read_text", "read_text_map", "records_in"]
 
 _HEAD = rec.RECORD_HEAD_SIZE
 _LARGEST_FILLER = 8192
@@ -62,13 +62,27 @@ def _index_end(buffer: Bytes, chunk: Chunk) -> int:
     return at + _HEAD + int(rec.RECORD_HEAD.unpack(bytes(buffer[at : at + _HEAD]))[1])
 
 
-def read_text(content: bytes, at: int) -> tuple[str, int]:
+def records_in(raw: Bytes) -> tuple[list[tuple[int, int, int]], int]:
+    """Return the whole records of a chunk's content, as (opcode, offset, length), and where the last of them ends."""
+    found = []
+    at, size = 0, len(raw)
+    view = raw.data
+    while at + _HEAD <= size:
+        opcode, length = rec.RECORD_HEAD.unpack_from(view, at)
+        if at + _HEAD + length > size or (opcode == rec.MESSAGE and length < 22):
+            break
+        found.append((opcode, at, length))
+        at += _HEAD + length
+    return found, at
+
+
+def read_text(content: bytes, at: int, errors: str = "strict") -> tuple[str, int]:
     """Return the text at some byte of a record, and where it ends."""
     (size,) = struct.unpack_from("<I", content, at)
     end = at + 4 + size
     if end > len(content):
         raise struct.error("text beyond the end of its record")
-    return content[at + 4 : end].decode(), end
+    return content[at + 4 : end].decode(errors=errors), end
 
 
 def read_text_map(content: bytes, at: int) -> dict[str, str]:

@@ -14,9 +14,11 @@ import numpy as np
 
 from pendulum_msgs_py.errors import BagError
 from pendulum_rosbag.reader.batches import MCAP_HEAD, Batch, Bytes, Int64, Stream
-from pendulum_rosbag.reader.decompression import decompress
-from pendulum_rosbag.reader.mcap_chunks import Chunk, keep_staged, read_text, read_text_map
+from pendulum_rosbag.reader.decompression import decompress, decompress_torn
+from pendulum_rosbag.reader.mcap_chunks import Chunk, keep_staged, read_text, read_text_map, records_in
+from pendulum_rosbag.reader.mcap_extras import find_extras
 from pendulum_rosbag.storage import mcap_records as rec
+from pendulum_rosbag.storage.mcap_extras import Attachment, Metadata
 
 __all__ = ["McapSource"]
 
@@ -87,6 +89,10 @@ class McapSource:
         self.compressed = any(chunk.compression for chunk in self.chunks)
         self.streams = [self._stream(channel) for channel in sorted(self._channels)]
 
+    def extras(self) -> list[Attachment | Metadata]:
+        """Return attachments and metadata that others than the recorder put into the file."""
+        return list(find_extras(self.buffer))
+
     def close(self) -> None:
         """Release the memory map once no array refers to it any more."""
         self.buffer = np.empty(0, np.uint8)
@@ -138,6 +144,8 @@ class McapSource:
             at += length
         if not statistics and not self.chunks:
             raise _NoIndexError
+        if not self._describes_all():
+            raise _NoIndexError  # topics are told beside their messages only, as the format allows
         if self.chunks:
             if not self._counts or any(not chunk.indexes for chunk in self.chunks):
                 raise _NoIndexError
@@ -149,6 +157,13 @@ class McapSource:
                 keep_staged(self.buffer, self.chunks)
         elif sum(self._counts.values()):
             raise _NoIndexError  # messages outside of chunks
+
+    def _describes_all(self) -> bool:
+        """Tell whether the summary describes every channel that it names, and every schema that those name."""
+        named = {channel for channel, count in self._counts.items() if count}
+        named.update(*(chunk.indexes for chunk in self.chunks))
+        schemas = {schema for schema, *_ in self._channels.values()} - {0}
+        return named <= self._channels.keys() and schemas <= self._schemas.keys()
 
     def _take_summary_record(self, opcode: int, content: bytes) -> bool:
         if opcode == rec.CHUNK_INDEX:
@@ -171,7 +186,7 @@ class McapSource:
             (key,) = struct.unpack_from("<H", content)
             name, at = read_text(content, 2)
             encoding, at = read_text(content, at)
-            definition, at = read_text(content, at)
+            definition, at = read_text(content, at, "surrogateescape")  # not text in every encoding
             self._schemas[key] = (name, encoding, definition)
         elif opcode == rec.CHANNEL:
             key, schema = struct.unpack_from("<HH", content)
@@ -205,6 +220,7 @@ class McapSource:
             self._counts.get(channel, 0),
             definition,
             schema_encoding,
+            metadata.get("topic_type_hash", ""),
             qos=metadata.get("offered_qos_profiles", ""),
             serialization=encoding,
         )
@@ -228,6 +244,8 @@ class McapSource:
             if opcode == 0 or body + length > size:
                 rest = size - at
                 self.damage = self.damage or f"the last {rest} bytes are no whole record"
+                if opcode == rec.CHUNK:
+                    self._scan_torn_chunk(body)
                 break
             if opcode == rec.CHUNK:
                 self._scan_chunk(body, length)
@@ -249,23 +267,47 @@ class McapSource:
             self.damage = self.damage or "a record of a topic is not readable"
 
     def _scan_chunk(self, body: int, length: int) -> None:
-        view = self.buffer.data
         try:
-            start, stop, raw_size, crc, text_size = _CHUNK_FIELDS.unpack_from(view, body)
-            compression, at = read_text(bytes(view[body + 28 : body + 32 + text_size]), 0)
-            at += body + 28
-            (packed,) = struct.unpack_from("<Q", view, at)
-            at += 8
-            if at + packed > body + length:
+            chunk, crc = self._chunk_at(body)
+            if chunk.data_start + chunk.data_size > body + length:
                 raise _DamagedError("chunk")
-            chunk = Chunk(self.buffer, start, stop, at, packed, raw_size, compression)
             raw = self._raw(chunk)
             if crc and zlib.crc32(raw.data) != crc:
                 raise _DamagedError("checksum")
-            records = self._records(raw)
+            records, end = records_in(raw)
+            if end != len(raw):
+                raise _DamagedError("a record does not fit its chunk")
         except (_DamagedError, BagError, struct.error, UnicodeDecodeError):
             self.damage = self.damage or f"the chunk at byte {body - _HEAD} is not whole"
             return
+        self._take_chunk(chunk, raw, records)
+
+    def _scan_torn_chunk(self, body: int) -> None:
+        """Take the whole records of a chunk whose end was cut off; nothing tells whether they are as they were."""
+        try:
+            chunk, _ = self._chunk_at(body)
+            packed = self.buffer[chunk.data_start :]
+            raw = packed
+            if chunk.compression:
+                content = decompress_torn(packed, chunk.compression, chunk.raw_size)
+                raw = np.frombuffer(content, np.uint8)
+            records, end = records_in(raw)
+        except (BagError, struct.error, UnicodeDecodeError):
+            return
+        # Its bytes as they are now, decompressed: whoever reads messages later must not try to again.
+        whole = Chunk(np.ascontiguousarray(raw[:end]), chunk.start_ns, chunk.stop_ns, 0, end, end, "")
+        self._take_chunk(whole, raw, records)
+
+    def _chunk_at(self, body: int) -> tuple[Chunk, int]:
+        """Return the chunk whose record's content begins at some byte, and its checksum."""
+        view = self.buffer.data
+        start, stop, raw_size, crc, text_size = _CHUNK_FIELDS.unpack_from(view, body)
+        compression, at = read_text(bytes(view[body + 28 : body + 32 + text_size]), 0)
+        at += body + 28
+        (packed,) = struct.unpack_from("<Q", view, at)
+        return Chunk(self.buffer, start, stop, at + 8, packed, raw_size, compression), crc
+
+    def _take_chunk(self, chunk: Chunk, raw: Bytes, records: list[tuple[int, int, int]]) -> None:
         scanned: _Table = {}
         for opcode, offset, size in records:
             if opcode == rec.MESSAGE:
@@ -274,19 +316,6 @@ class McapSource:
                 self._try_description(opcode, bytes(raw[offset + _HEAD : offset + _HEAD + size]))
         self._scanned.append(scanned)
         self.chunks.append(chunk)
-
-    @staticmethod
-    def _records(raw: Any) -> list[tuple[int, int, int]]:
-        found = []
-        at, size = 0, len(raw)
-        view = memoryview(raw)
-        while at + _HEAD <= size:
-            opcode, length = rec.RECORD_HEAD.unpack_from(view, at)
-            if at + _HEAD + length > size or (opcode == rec.MESSAGE and length < 22):
-                raise _DamagedError("a record does not fit its chunk")
-            found.append((opcode, at, length))
-            at += _HEAD + length
-        return found
 
     def _note(self, raw: Any, offset: int, into: _Table, position: int) -> None:
         channel, _, time = struct.unpack_from("<HIq", raw, offset + _HEAD)

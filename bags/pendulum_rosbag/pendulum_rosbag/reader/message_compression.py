@@ -9,6 +9,7 @@ import numpy as np
 
 from pendulum_rosbag.reader.batches import Batch, Source
 from pendulum_rosbag.reader.decompression import decompress_bounded
+from pendulum_rosbag.storage.mcap_extras import Attachment, Metadata
 
 __all__ = ["UnpackedSource", "holds_packed_messages"]
 
@@ -54,6 +55,10 @@ class UnpackedSource:
                     times, parts, size = [], [], 0
             if times:
                 yield _batch(batch.channel, times, parts)
+
+    def extras(self) -> list[Attachment | Metadata]:
+        """Return attachments and metadata of the file."""
+        return self.packed.extras()
 
     def close(self) -> None:
         """Release the file."""

@@ -14,6 +14,7 @@ import numpy as np
 from pendulum_msgs_py.errors import BagError
 from pendulum_rosbag.reader.batches import Batch, Bytes, Stream
 from pendulum_rosbag.reader.sqlite_pages import MessageRows, leaf_pages, message_rows, page_size
+from pendulum_rosbag.storage.mcap_extras import Attachment, Metadata
 
 __all__ = ["SqliteSource"]
 
@@ -78,6 +79,10 @@ class SqliteSource:
         if self._copy is not None:
             self._copy.cleanup()
             self._copy = None
+
+    def extras(self) -> list[Attachment | Metadata]:
+        """Return nothing: a database of rosbag2 has no place for more than messages."""
+        return []
 
     def keep(self, copy: tempfile.TemporaryDirectory[str]) -> None:
         """Take charge of the temporary folder that the file is in."""

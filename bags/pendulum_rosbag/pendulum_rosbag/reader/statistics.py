@@ -218,7 +218,8 @@ def _latencies(arrays: dict[str, npt.NDArray[Any]]) -> list[Latency]:
 
 def _times(bag: Bag, info: TopicInfo) -> tuple[Int64, Int64 | None]:
     """Return log times and stamps of a topic of any type; no stamps where its messages have none."""
-    read = stamp_reader(info.type) if info.type not in _TIME_IS_CONTENT else None
+    readable = info.serialization == "cdr" and info.type not in _TIME_IS_CONTENT
+    read = stamp_reader(info.type) if readable else None
     if read is None:
         return bag.log_times(info.name), None
     rows = bag.raw(info.name)
@@ -235,7 +236,7 @@ def bag_statistics(bag: Bag) -> BagStatistics:
     )
     arrays: dict[str, npt.NDArray[Any]] = {}
     for name, info in bag.topics.items():
-        values = bag[name] if info.type == "sensor_msgs/msg/JointState" else None
+        values = bag[name] if info.type == "sensor_msgs/msg/JointState" and info.serialization == "cdr" else None
         if isinstance(values, np.ndarray):
             arrays[name] = values
             senders = values["frame_id"] if "frame_id" in (values.dtype.names or ()) else None

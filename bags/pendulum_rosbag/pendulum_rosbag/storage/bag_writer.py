@@ -11,6 +11,7 @@ from types import TracebackType
 from typing import Any, Protocol
 
 from pendulum_msgs_py.errors import BagError, ParameterError
+from pendulum_rosbag.storage.mcap_extras import Attachment, Metadata
 from pendulum_rosbag.storage.message_types import MessageType, message_type
 from pendulum_rosbag.storage.metadata_file import (
     FileEntry,
@@ -48,6 +49,7 @@ class _StorageFile(Protocol):
     def seal(self) -> None: ...
     def settle(self) -> None: ...
     def duplicate(self) -> int: ...
+    def keep(self, record: Attachment | Metadata) -> None: ...
     def close(self, metadata: str = "") -> None: ...
     def abandon(self) -> None: ...
 
@@ -157,6 +159,11 @@ class BagWriter:
                     raise BagError(
                         f"topic {name} has type {described.name}; the bag holds it as {known.type.name}"
                     )
+                if known.type.serialization != described.serialization:
+                    raise BagError(
+                        f"topic {name} is encoded as {described.serialization!r}; the bag holds it as "
+                        f"{known.type.serialization!r}"
+                    )
                 return
             self._topics[name] = TopicEntry(name, described, profiles)
             self._ids[name] = len(self._ids) + 1
@@ -206,6 +213,16 @@ class BagWriter:
                 if file.pending_size >= self._chunk_size:
                     self.seal()
                     file = self._file  # a seal may begin the next file
+
+    def keep(self, record: Attachment | Metadata) -> None:
+        """Put an attachment, or metadata of somebody else, into the storage file that is open now (MCAP only).
+
+        Raises:
+            BagError: The storage has no place for it, or the writer is closed.
+        """
+        with self._lock:
+            self._require_open()
+            self._file.keep(record)
 
     def seal(self) -> None:
         """Make all messages so far visible on disk; they survive the death of the process.

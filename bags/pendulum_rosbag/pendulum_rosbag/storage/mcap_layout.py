@@ -37,6 +37,7 @@ from pathlib import Path
 
 from pendulum_msgs_py.errors import BagError
 from pendulum_rosbag.storage import mcap_records as rec
+from pendulum_rosbag.storage.mcap_extras import Attachment, Metadata
 from pendulum_rosbag.storage.mcap_summary import Chunk, McapSummary
 
 __all__ = ["McapLayout"]
@@ -193,20 +194,21 @@ class McapLayout:
         """Return a file descriptor of its own, to wait for the disk without keeping the writer waiting."""
         return os.dup(self._fd)
 
-    def finish(self, records: Sequence[tuple[str, bytes]] = ()) -> None:
-        """Put metadata records (name, bytes), summary and footer behind the data and cut off the unused room.
+    def finish(self, extras: Sequence[Attachment | Metadata] = ()) -> None:
+        """Put attachments, metadata, summary and footer behind the data and cut off the unused room.
 
         Raises:
             OSError: The disk is full or fails; the file shows what it did.
         """
         indexes: list[bytes] = []
         start = self._chain_end
-        for name, entry in records:
+        for extra in extras:
+            entry = extra.record()
             self._make_room(start + len(entry) + _PAGE)
             blob, end = self._blob([entry], start, len(entry))
             self._write(blob[_HEAD:], start + _HEAD)
             self._write(blob[:_HEAD], start)
-            indexes.append(rec.metadata_index_record(start, len(entry), name))
+            indexes.append(extra.index_record(start))
             if self.settled_end == start:
                 self.settled_end = end
             self._chain_end = start = end

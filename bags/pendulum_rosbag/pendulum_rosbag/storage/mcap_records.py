@@ -10,6 +10,8 @@ import zlib
 from collections.abc import Mapping, Sequence
 
 __all__ = [
+    "ATTACHMENT",
+    "ATTACHMENT_INDEX",
     "CHANNEL",
     "CHUNK",
     "CHUNK_INDEX",
@@ -29,6 +31,7 @@ __all__ = [
     "SCHEMA",
     "STATISTICS",
     "SUMMARY_OFFSET",
+    "attachment_index_record",
     "channel_record",
     "chunk_index_record",
     "footer_record",
@@ -44,7 +47,7 @@ __all__ = [
 
 MAGIC = b"\x89MCAP0\r\n"
 HEADER, FOOTER, SCHEMA, CHANNEL, MESSAGE, CHUNK, MESSAGE_INDEX, CHUNK_INDEX = range(0x01, 0x09)
-STATISTICS, METADATA, METADATA_INDEX, SUMMARY_OFFSET, DATA_END = range(0x0B, 0x10)
+ATTACHMENT, ATTACHMENT_INDEX, STATISTICS, METADATA, METADATA_INDEX, SUMMARY_OFFSET, DATA_END = range(0x09, 0x10)
 PADDING = 0x80
 """A private opcode (0x80 to 0xFF are free for applications): every reader skips the record."""
 
@@ -79,13 +82,26 @@ def header_record(library: str) -> bytes:
 
 def schema_record(schema_id: int, name: str, encoding: str, definition: str) -> bytes:
     """Return a message definition under an id of 1 or more."""
-    return record(SCHEMA, struct.pack("<H", schema_id) + _text(name) + _text(encoding) + _text(definition))
+    # (a definition that is no text was read with its bytes escaped)
+    data = definition.encode(errors="surrogateescape")
+    head = struct.pack("<H", schema_id) + _text(name) + _text(encoding) + struct.pack("<I", len(data))
+    return record(SCHEMA, head + data)
 
 
-def channel_record(channel_id: int, schema_id: int, topic: str, metadata: Mapping[str, str]) -> bytes:
-    """Return the description of one topic whose messages are CDR."""
+def channel_record(
+    channel_id: int, schema_id: int, topic: str, message_encoding: str, metadata: Mapping[str, str]
+) -> bytes:
+    """Return the description of one topic, whose messages are encoded in some way, such as ``cdr``."""
     head = struct.pack("<HH", channel_id, schema_id)
-    return record(CHANNEL, head + _text(topic) + _text("cdr") + _text_map(metadata))
+    return record(CHANNEL, head + _text(topic) + _text(message_encoding) + _text_map(metadata))
+
+
+def attachment_index_record(
+    offset: int, length: int, log_time_ns: int, create_time_ns: int, data_size: int, name: str, media_type: str
+) -> bytes:
+    """Return the summary's pointer to an attachment."""
+    head = struct.pack("<QQQQQ", offset, length, log_time_ns, create_time_ns, data_size)
+    return record(ATTACHMENT_INDEX, head + _text(name) + _text(media_type))
 
 
 def metadata_record(name: str, items: Mapping[str, str]) -> bytes:
@@ -102,6 +118,7 @@ def statistics_record(
     *,
     message_count: int,
     schema_count: int,
+    attachment_count: int,
     metadata_count: int,
     chunk_count: int,
     start_ns: int,
@@ -113,7 +130,7 @@ def statistics_record(
         message_count,
         schema_count,
         len(channel_counts),
-        0,
+        attachment_count,
         metadata_count,
         chunk_count,
         start_ns,

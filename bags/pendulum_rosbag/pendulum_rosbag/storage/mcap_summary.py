@@ -149,25 +149,34 @@ class McapSummary:
         """Bytes of all records but those that close the summary."""
         return len(self._description) + len(self.settled) + len(self.staged)
 
-    def tail(self, start: int, metadata_indexes: Sequence[bytes] = ()) -> tuple[bytes, int]:
-        """Return the records that close a summary which begins at byte ``start``, and where its offsets begin."""
+    def tail(self, start: int, indexes: Sequence[bytes] = ()) -> tuple[bytes, int]:
+        """Return the records that close a summary which begins at byte ``start``, and where its offsets begin.
+
+        Args:
+            start: First byte of the summary in the file.
+            indexes: Index records of attachments and metadata.
+        """
+        kinds = {
+            opcode: b"".join(index for index in indexes if index[0] == opcode)
+            for opcode in (rec.ATTACHMENT_INDEX, rec.METADATA_INDEX)
+        }
         statistics = rec.statistics_record(
             message_count=self.count,
             schema_count=len(self._schemas),
-            metadata_count=len(metadata_indexes),
+            attachment_count=sum(index[0] == rec.ATTACHMENT_INDEX for index in indexes),
+            metadata_count=sum(index[0] == rec.METADATA_INDEX for index in indexes),
             chunk_count=self._settled_chunks + self._staged_chunks,
             start_ns=self.start_ns,
             stop_ns=self.stop_ns,
             channel_counts=self.counts,
         )
-        extra = b"".join(metadata_indexes)
         schemas = sum(map(len, self._schemas))
         groups = (
             (rec.SCHEMA, schemas),
             (rec.CHANNEL, len(self._description) - schemas),
             (rec.CHUNK_INDEX, len(self.settled) + len(self.staged)),
             (rec.STATISTICS, len(statistics)),
-            (rec.METADATA_INDEX, len(extra)),
+            *((opcode, len(records)) for opcode, records in kinds.items()),
         )
         offsets = b""
         at = start
@@ -175,4 +184,4 @@ class McapSummary:
             if length:
                 offsets += rec.summary_offset_record(opcode, at, length)
                 at += length
-        return statistics + extra + offsets, at
+        return b"".join([statistics, *kinds.values(), offsets]), at

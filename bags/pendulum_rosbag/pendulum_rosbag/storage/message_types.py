@@ -25,12 +25,14 @@ class MessageType:
         definition: Concatenated ``.msg`` text with all types that it uses; empty when unknown.
         hash: ``RIHS01_...`` type description hash; empty when unknown.
         encoding: Format of the definition: ``ros2msg``, ``ros2idl``, or empty.
+        serialization: How messages are encoded: ``cdr``, as ROS 2 does, or as another writer says (``json``).
     """
 
     name: str
     definition: str = ""
     hash: str = ""
     encoding: str = "ros2msg"
+    serialization: str = "cdr"
 
 
 @cache

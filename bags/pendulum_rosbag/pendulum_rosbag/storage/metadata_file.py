@@ -28,6 +28,8 @@ METADATA_NAME = "metadata.yaml"
 METADATA_VERSION = 9
 
 # YAML allows these only escaped, JSON leaves them as they are.
+_PLAIN = re.compile("cdr|[A-Za-z][A-Za-z0-9_]*(/[A-Za-z0-9_]+)+")
+"""CDR, or a name of a ROS type, which YAML takes for text without quotes."""
 _UNPRINTABLE = re.compile("[\x7f-\x9f\u2028\u2029\ud800-\udfff\ufeff\ufffe\uffff]")
 
 
@@ -149,11 +151,14 @@ class MetadataFile:
 
 def _topic_head(topic: TopicEntry) -> str:
     qos = f"\n{qos_yaml(topic.qos, ' ' * 10)}" if topic.qos else " []\n"
+    kind, serialization = (
+        text if _PLAIN.fullmatch(text) else yaml_string(text) for text in (topic.type.name, topic.type.serialization)
+    )
     return (
         "    - topic_metadata:\n"
         f"        name: {yaml_string(topic.name)}\n"
-        f"        type: {topic.type.name}\n"
-        "        serialization_format: cdr\n"
+        f"        type: {kind}\n"
+        f"        serialization_format: {serialization}\n"
         f"        offered_qos_profiles:{qos}"
         f"        type_description_hash: {yaml_string(topic.type.hash)}\n"
     )

@@ -18,7 +18,7 @@ from pendulum_rosbag.storage.qos import QosProfile
 if TYPE_CHECKING:
     from pendulum_rosbag.reader.batches import Source, Stream
 
-__all__ = ["RepairReport", "repair_bag"]
+__all__ = ["RepairReport", "message_type_of", "profiles_of", "repair_bag"]
 
 
 @dataclass(slots=True)
@@ -30,12 +30,16 @@ class RepairReport:
         damage: What was wrong, one sentence each; empty when nothing was.
         messages: Topic -> number of messages saved.
         original: Where the broken bag is now; ``None`` when nothing had to be done.
+        kept: Attachments and metadata of other writers, by name.
+        left_out: What was not copied, one sentence each.
     """
 
     path: Path
     damage: list[str] = field(default_factory=list)
     messages: dict[str, int] = field(default_factory=dict)
     original: Path | None = None
+    kept: list[str] = field(default_factory=list)
+    left_out: list[str] = field(default_factory=list)
 
     @property
     def repaired(self) -> bool:
@@ -47,7 +51,12 @@ class RepairReport:
         if not self.repaired:
             return f"{self.path} is sound: nothing to repair"
         total = sum(self.messages.values())
-        return f"saved {total} messages of {len(self.messages)} topics to {self.path}; the original is {self.original}"
+        kept = f" and {len(self.kept)} attachments and metadata" if self.kept else ""
+        left_out = f"; LEFT OUT: {'; '.join(self.left_out)}" if self.left_out else ""
+        return (
+            f"saved {total} messages of {len(self.messages)} topics{kept} to {self.path}; the original is "
+            f"{self.original}{left_out}"
+        )
 
 
 def repair_bag(
@@ -94,8 +103,9 @@ def repair_bag(
         )
         name = bag.name if in_place else target.name
         with open_writer(target, folder.storage, compression, folder.custom_data, file_stem=name) as writer:
-            _copy(sources, folder.topic_hashes, writer)
+            report.left_out = _copy(sources, folder.topic_hashes, writer)
             report.messages = writer.written
+            report.kept = [extra.name for source in sources for extra in source.extras()]
     except BaseException:
         if in_place:
             shutil.rmtree(target, ignore_errors=True)
@@ -111,18 +121,32 @@ def repair_bag(
     return report
 
 
-def _copy(sources: list[Source], hashes: dict[str, str], writer: BagWriter) -> None:
+def _copy(sources: list[Source], hashes: dict[str, str], writer: BagWriter) -> list[str]:
+    """Copy everything, and return what could not be, in sentences."""
+    left_out: list[str] = []
     for source in sources:
-        streams = {stream.channel: stream for stream in source.streams if stream.serialization == "cdr"}
-        for stream in streams.values():
-            kind = _type_of(stream, hashes.get(stream.topic, ""))
-            writer.add_topic(stream.topic, kind, _profiles(stream.qos))
+        streams: dict[int, Stream] = {}
+        for stream in source.streams:
+            kind = message_type_of(stream, hashes.get(stream.topic, ""))
+            try:
+                writer.add_topic(stream.topic, kind, profiles_of(stream.qos))
+            except BagError as error:
+                if stream.count:
+                    left_out.append(f"{stream.count} messages ({error})")
+                continue
+            streams[stream.channel] = stream
         for batch in source.batches(set(streams), None, None):
             topic = streams[batch.channel].topic
             writer.write_many((topic, time, data) for time, data in batch.payloads())
+        for extra in source.extras():
+            writer.keep(extra)
+    return left_out
 
 
-def _type_of(stream: Stream, type_hash: str) -> MessageType:
+def message_type_of(stream: Stream, type_hash: str) -> MessageType:
+    """Return the type of a topic as its file describes it, with what is known of it besides."""
+    if stream.serialization != "cdr":
+        return MessageType(stream.type, stream.definition, stream.hash, stream.encoding, stream.serialization)
     if stream.definition:
         known = stream.hash or type_hash or _known_hash(stream.type)
         return MessageType(stream.type, stream.definition, known, stream.encoding)
@@ -136,7 +160,8 @@ def _known_hash(name: str) -> str:
         return ""
 
 
-def _profiles(text: str) -> list[QosProfile]:
+def profiles_of(text: str) -> list[QosProfile]:
+    """Return QoS profiles from the YAML text of a bag; none where it cannot be read."""
     try:
         items = yaml.safe_load(text) if text else []
     except yaml.YAMLError:

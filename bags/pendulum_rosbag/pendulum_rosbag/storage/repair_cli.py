@@ -41,6 +41,8 @@ def repair(
         print(f"found: {sentence}")
     for topic, count in sorted(report.messages.items()):
         print(f"{count:10d}  {topic}")
+    for name in report.kept:
+        print(f"      kept  {name}")
     print(report.sentence())
     return 0
 

@@ -12,6 +12,7 @@ import numpy as np
 
 from pendulum_msgs_py.errors import BagError
 from pendulum_rosbag.storage import mcap_records as rec
+from pendulum_rosbag.storage.mcap_extras import Attachment, Metadata
 from pendulum_rosbag.storage.mcap_layout import McapLayout
 from pendulum_rosbag.storage.mcap_summary import Chunk, Compressor, McapSummary, build_chunk
 from pendulum_rosbag.storage.message_types import MessageType
@@ -60,6 +61,7 @@ class SealedMcapFile:
         self._group_index: dict[int, list[bytes]] = {}
         self._group_span = _NO_SPAN
         self._stale = False
+        self._kept: list[Attachment | Metadata] = []
         self._layout = McapLayout(path, rec.MAGIC + rec.header_record(_library()), self._summary)
 
     @property
@@ -89,14 +91,15 @@ class SealedMcapFile:
 
     def add_channel(self, channel_id: int, topic: str, type: MessageType, qos: str) -> None:
         """Describe a topic before its first message (ids from 1; QoS profiles as YAML text)."""
-        key = (type.name, type.definition)
+        key = (type.name, type.definition)  # neither: messages that describe themselves, such as JSON
         schema_id = self._schema_ids.get(key, 0)
         schema = b""
-        if not schema_id:
+        if not schema_id and any(key):
             schema_id = self._schema_ids[key] = self._summary.schemas + 1
             schema = rec.schema_record(schema_id, type.name, type.encoding, type.definition)
             self._summary.add_schema(schema)
-        channel = rec.channel_record(channel_id, schema_id, topic, {"offered_qos_profiles": qos})
+        described = {"offered_qos_profiles": qos, "topic_type_hash": type.hash}  # the keys of rosbag2
+        channel = rec.channel_record(channel_id, schema_id, topic, type.serialization, described)
         self._summary.add_channel(channel_id, channel)
         self._sequences[channel_id] = 0
         # In the chunk too, so that a reader that goes through the file in order knows the topic.
@@ -120,6 +123,10 @@ class SealedMcapFile:
         start, stop = self._pending_span
         if log_time_ns < start or log_time_ns > stop:
             self._pending_span = (min(start, log_time_ns), max(stop, log_time_ns))
+
+    def keep(self, record: Attachment | Metadata) -> None:
+        """Put an attachment or a metadata record behind the messages when the file is closed."""
+        self._kept.append(record)
 
     def seal(self) -> None:
         """Make everything that was written visible to readers of the file.
@@ -162,8 +169,8 @@ class SealedMcapFile:
                 self.settle()
             finally:
                 # Also after a failed seal: on a full disk the unused room is worth giving back.
-                entry = rec.metadata_record("rosbag2", {"serialized_metadata": metadata})
-                self._layout.finish([("rosbag2", entry)] if metadata else [])
+                told = [Metadata("rosbag2", {"serialized_metadata": metadata})] if metadata else []
+                self._layout.finish([*self._kept, *told])
             self._layout.sync()
         finally:
             self.abandon()

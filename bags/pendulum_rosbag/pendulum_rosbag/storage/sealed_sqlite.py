@@ -21,6 +21,7 @@ from pathlib import Path
 from typing import Any
 
 from pendulum_msgs_py.errors import BagError
+from pendulum_rosbag.storage.mcap_extras import Attachment, Metadata
 from pendulum_rosbag.storage.message_types import MessageType
 
 __all__ = ["SealedSqliteFile"]
@@ -248,7 +249,7 @@ class SealedSqliteFile:
 
     def add_channel(self, channel_id: int, topic: str, type: MessageType, qos: str) -> None:
         """Describe a topic before its first message (ids ascending from 1; QoS profiles as YAML text)."""
-        self._tables["topics"].append(channel_id, _record((None, topic, type.name, "cdr", qos, type.hash)))
+        self._tables["topics"].append(channel_id, _record((None, topic, type.name, type.serialization, qos, type.hash)))
         key = (type.name, type.hash)
         if key not in self._definitions:
             self._definitions.add(key)
@@ -299,6 +300,14 @@ class SealedSqliteFile:
     def duplicate(self) -> int:
         """Return a file descriptor of its own, to wait for the disk with, which the caller closes."""
         return os.dup(self._fd)
+
+    def keep(self, record: Attachment | Metadata) -> None:
+        """Refuse what has no place in a database.
+
+        Raises:
+            BagError: Always.
+        """
+        raise BagError(f"storage sqlite3 has no place for {record.name!r}; expected storage mcap for attachments")
 
     def close(self, metadata: str = "") -> None:
         """Seal, add the index over time that rosbag2 seeks by, and close.
