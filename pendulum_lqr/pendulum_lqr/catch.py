@@ -1,4 +1,4 @@
-"""LQR that takes over near upright, within the region where it is proven to hold under the torque limit."""
+"""LQR that takes over near the set-point, within the region where it is proven to hold under the torque limit."""
 
 from __future__ import annotations
 
@@ -6,10 +6,10 @@ import math
 from collections.abc import Sequence
 from functools import lru_cache
 
-from pendulum_lqr.design import Gain, continuous_lqr
+from pendulum_lqr.design import DesignError, Gain, continuous_lqr
 from pendulum_lqr.model import linearise
 from pendulum_lqr.roa import proven_level
-from pendulum_msgs_py.contract.angles import wrap
+from pendulum_msgs_py.contract.angles import UPRIGHT, wrap
 from pendulum_msgs_py.plants.plant_parameters import PlantParameters
 
 __all__ = ["Catch", "make_catch"]
@@ -18,20 +18,32 @@ _LET_GO = 2.0
 
 
 class Catch:
-    """LQR at upright with hysteresis: takes over inside x' S x <= level, lets go beyond twice the proven level.
+    """LQR at the set-point with hysteresis: takes over inside x' S x <= level, lets go beyond twice the proven level.
 
     Args:
         gain: Gain and Riccati solution.
         level: Level at which it takes over.
         release: Level at which it lets go, larger.
         effort_limit: Largest torque [N m].
+        set_point: Angle from upright [rad].
+        hold: Torque that holds it [N m].
     """
 
-    def __init__(self, gain: Gain, level: float, release: float, effort_limit: float) -> None:
+    def __init__(
+        self,
+        gain: Gain,
+        level: float,
+        release: float,
+        effort_limit: float,
+        set_point: float = 0.0,
+        hold: float = 0.0,
+    ) -> None:
         self.gain = gain
         self.level = level
         self.release = release
         self.effort_limit = effort_limit
+        self.set_point = set_point
+        self.hold = hold
         self.active = False
         self._k0, self._k1 = (float(value) for value in gain.K)
         self._s00, self._s01, self._s11 = (float(gain.S[0, 0]), float(gain.S[0, 1]), float(gain.S[1, 1]))
@@ -41,20 +53,20 @@ class Catch:
         self.active = False
 
     def value(self, angle: float, velocity: float) -> float:
-        """Return x' S x."""
+        """Return x' S x of a deviation from the set-point."""
         return (
             self._s00 * angle * angle + 2.0 * self._s01 * angle * velocity + self._s11 * velocity * velocity
         )
 
     def holds(self, angle: float, velocity: float) -> bool:
         """Tell whether the LQR is in charge at a state, and remember it."""
-        angle = wrap(angle)
+        angle = wrap(angle - self.set_point)
         self.active = self.value(angle, velocity) <= (self.release if self.active else self.level)
         return self.active
 
     def command(self, angle: float, velocity: float) -> float:
         """Return the LQR's torque within the limit [N m]."""
-        effort = -self._k0 * wrap(angle) - self._k1 * velocity
+        effort = self.hold - self._k0 * wrap(angle - self.set_point) - self._k1 * velocity
         return max(-self.effort_limit, min(self.effort_limit, effort))
 
     def describe(self) -> str:
@@ -64,9 +76,14 @@ class Catch:
 
 
 def make_catch(
-    plant: PlantParameters, q: Sequence[float], r: float, effort_limit: float, share: float = 0.9
+    plant: PlantParameters,
+    q: Sequence[float],
+    r: float,
+    effort_limit: float,
+    share: float = 0.9,
+    set_point: float = 0.0,
 ) -> Catch:
-    """Return the catch for a plant under a torque limit.
+    """Return the catch for a plant under a torque limit; lag and delay are not in its proof.
 
     Args:
         plant: Plant parameters.
@@ -74,14 +91,26 @@ def make_catch(
         r: Weight of torque.
         effort_limit: Largest torque [N m].
         share: Share of the proven level in which it takes over.
+        set_point: Angle from upright [rad].
+
+    Raises:
+        DesignError: The set-point takes more torque than there is, or no region around it can be proven.
     """
-    gain, level = _proven(plant, tuple(q), r, effort_limit)
-    return Catch(gain, share * level, _LET_GO * level, effort_limit)
+    gain, level, hold = _proven(plant, tuple(q), r, effort_limit, set_point)
+    return Catch(gain, share * level, _LET_GO * level, effort_limit, set_point, hold)
 
 
 @lru_cache(maxsize=32)
 def _proven(
-    plant: PlantParameters, q: tuple[float, ...], r: float, effort_limit: float
-) -> tuple[Gain, float]:
-    gain = continuous_lqr(linearise(plant), q, r)
-    return gain, proven_level(plant, gain, effort_limit)
+    plant: PlantParameters, q: tuple[float, ...], r: float, effort_limit: float, set_point: float
+) -> tuple[Gain, float, float]:
+    prompt = plant.with_values(actuator_time_constant=0.0, transport_delay=0.0)
+    model = linearise(prompt, UPRIGHT + set_point)
+    gain = continuous_lqr(model, q, r)
+    level = proven_level(prompt, gain, effort_limit, model.theta)
+    if not level > 0.0:
+        raise DesignError(
+            f"no region around the set-point is proven to be caught with catch_q = {list(q)}, catch_r = {r:g} and "
+            f"{effort_limit:g} N m; expected both weights > 0, nearer to the defaults"
+        )
+    return gain, level, model.effort

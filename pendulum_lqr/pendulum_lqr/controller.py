@@ -12,6 +12,7 @@ from collections.abc import Mapping, Sequence
 from difflib import get_close_matches
 from typing import Any, ClassVar, Protocol, cast
 
+from pendulum_lqr.loop_check import require_stable
 from pendulum_lqr.velocity import VELOCITY_ESTIMATORS, VelocityEstimator, make_velocity_estimator
 from pendulum_msgs_py.contract.angles import wrap
 from pendulum_msgs_py.errors import ParameterError
@@ -27,6 +28,7 @@ __all__ = [
     "controller_class",
     "controller_parameters",
     "make_controller",
+    "unwrapped",
 ]
 
 CONTROLLERS: dict[str, str] = {
@@ -92,6 +94,12 @@ class BaseController:
     """One sentence for tables."""
     PARAMETERS: ClassVar[tuple[ParameterSpec, ...]] = ()
     """Parameters of this controller beyond ``COMMON_PARAMETERS``."""
+    SERIES_ELASTIC: ClassVar[bool] = True
+    """Whether its design reckons with motor and spring; others refuse such a plant."""
+    PREDICTS: ClassVar[bool] = False
+    """Whether it predicts the plant from the torques that it sent, and so has to know which one holds."""
+    FEEDBACK: ClassVar[bool] = True
+    """Whether it closes a loop, which has to be stable."""
 
     def __init__(self, effort_limit: float, set_point: float = 0.0) -> None:
         self.effort_limit = effort_limit
@@ -123,6 +131,10 @@ class BaseController:
         return type(self).__name__
 
     def carry_over(self, previous: Controller) -> None:
+        """Take over what the previous controller remembers, wherever its velocity came from."""
+        self.take_over(unwrapped(previous))
+
+    def take_over(self, previous: Controller) -> None:
         """Take over what the previous controller remembers; nothing by default."""
 
     def clamp(self, effort: float) -> float:
@@ -172,9 +184,16 @@ class EstimatedVelocity(BaseController):
             if type(previous.estimator) is type(self.estimator):
                 self.estimator = previous.estimator
             self._last_effort = previous._last_effort
-            self.inner.carry_over(previous.inner)
-        else:
-            self.inner.carry_over(previous)
+        self.inner.carry_over(previous)
+
+
+def unwrapped(controller: Controller) -> Controller:
+    """Return the controller itself, without the estimator that gives it its velocity.
+
+    Args:
+        controller: A controller, wrapped or not.
+    """
+    return controller.inner if isinstance(controller, EstimatedVelocity) else controller
 
 
 def controller_class(name: str) -> type[BaseController]:
@@ -208,7 +227,8 @@ def make_controller(
         values: Parameters by name; others at their default.
 
     Raises:
-        ParameterError: Unknown controller or parameter, a value out of domain, or a design that does not exist.
+        ParameterError: Unknown controller or parameter, a value out of domain, a design that does not exist, or a loop
+            that is unstable on the linear model of the plant at this period, delay included.
     """
     kind = controller_class(name)
     p = validate(COMMON_PARAMETERS + kind.PARAMETERS, values or {})
@@ -217,7 +237,18 @@ def make_controller(
     p["effort_limit"] = (
         min(p["effort_limit"], plant.effort_limit) if p["effort_limit"] > 0.0 else plant.effort_limit
     )
+    if plant.drivetrain is not None and not kind.SERIES_ELASTIC:
+        raise ParameterError(
+            f"{name} knows rigid plants alone, and plant {plant.name!r} is series elastic; expected lqr, lqi, lqg, "
+            "mpc, pid or pd_gravity, or a plant file without a drivetrain"
+        )
     controller: Controller = kind.design(plant, period, p)
     if p["velocity"] != "measured":
         controller = EstimatedVelocity(controller, make_velocity_estimator(p["velocity"], plant, period))
+    if kind.FEEDBACK:
+        checked = controller
+        if not p.get("feedforward", True):
+            # Where a loop rests is one thing, whether it is stable another: the holding torque belongs to the first.
+            checked = kind.design(plant, period, {**p, "feedforward": True})
+        require_stable(name, checked, plant, period, p["set_point"])
     return controller

@@ -18,7 +18,13 @@ from numpy.typing import NDArray
 
 from pendulum_lqr.analysis import LoopReport, analyse, closed_loop_poles, loop_transfer
 from pendulum_lqr.design import Gain
-from pendulum_lqr.model import LinearModel, RigidPlant
+from pendulum_lqr.model import (
+    LinearModel,
+    RigidPlant,
+    equilibrium_effort,
+    low_frequency,
+    state_derivative,
+)
 from pendulum_lqr.roa import Region, region_of_attraction, rigid_rollout
 from pendulum_msgs_py.contract.angles import UPRIGHT
 
@@ -205,7 +211,7 @@ def step_figure(model: LinearModel, gains: Mapping[str, Array], report: LoopRepo
     figure, (top, bottom) = _figure(2, 5.2)
     horizon = 6.0 * report.time_constant if math.isfinite(report.time_constant) else 5.0
     times = np.linspace(0.0, horizon, 800)
-    holding = _holding_torque(model)
+    _, _, holding = low_frequency(model)
     for index, (label, K) in enumerate(gains.items()):
         colour = COLOURS[index % len(COLOURS)]
         A = model.A - model.B @ np.atleast_2d(K) @ model.C
@@ -227,13 +233,6 @@ def step_figure(model: LinearModel, gains: Mapping[str, Array], report: LoopRepo
     return figure
 
 
-def _holding_torque(model: LinearModel) -> float:
-    """Return the command that holds the pendulum beside the fixed point, per angle [N m/rad]."""
-    n = model.A.shape[0]
-    balance = np.block([[model.A, model.B], [np.eye(1, n), np.zeros((1, 1))]])
-    return float(np.linalg.solve(balance, np.append(np.zeros(n), 1.0))[n])
-
-
 def phase_portrait_figure(plant: RigidPlant, gain: Gain, effort_limit: float, region: Region) -> Figure:
     """Return the closed loop's phase portrait, with the sampled and the proven region of attraction.
 
@@ -250,8 +249,10 @@ def phase_portrait_figure(plant: RigidPlant, gain: Gain, effort_limit: float, re
         angles, velocities, region.attracted.astype(float), levels=[0.5, 1.5], colors=["#dbeafe"], zorder=0
     )
     x, v = np.meshgrid(np.linspace(angles[0], angles[-1], 60), np.linspace(velocities[0], velocities[-1], 60))
-    u = np.clip(-gain.K[0] * x - gain.K[1] * v, -effort_limit, effort_limit)
-    acceleration = (u - plant.damping * v - plant.gravity * np.sin(x + UPRIGHT)) / plant.inertia
+    u = np.clip(
+        equilibrium_effort(plant, UPRIGHT) - gain.K[0] * x - gain.K[1] * v, -effort_limit, effort_limit
+    )
+    acceleration = state_derivative(plant, x + UPRIGHT, v, u)[1]
     ax.streamplot(x, v, v, acceleration, color="#94a3b8", linewidth=0.7, density=1.3, arrowsize=0.8, zorder=1)
     ax.plot(region.ellipse[:, 0], region.ellipse[:, 1], color=COLOURS[1], linewidth=2.0, zorder=3)
     ax.plot([0.0], [0.0], "o", color=INK, ms=6, zorder=4)

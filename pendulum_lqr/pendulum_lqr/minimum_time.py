@@ -18,13 +18,15 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from pendulum_lqr.model import acceleration_from_upright
+from pendulum_msgs_py.contract.angles import wrap
 from pendulum_msgs_py.plants.plant_parameters import PlantParameters
 
-__all__ = ["TimeToGo", "minimum_time"]
+__all__ = ["SIGN_VELOCITY", "TimeToGo", "minimum_time"]
 
 Array = NDArray[np.float64]
 
-_SIGN_VELOCITY = 0.05
+SIGN_VELOCITY = 0.05
 """Velocity over which the model of dry friction changes sign [rad/s]; grid cells are about as large."""
 
 
@@ -78,18 +80,20 @@ def minimum_time(
     effort_limit: float,
     target: tuple[Array, float],
     *,
+    centre: float = 0.0,
     angles: int = 240,
     velocities: int = 241,
     velocity_span: float = 0.0,
     step: float = 0.02,
     tolerance: float = 1e-5,
 ) -> TimeToGo:
-    """Return the time to go from every state of a grid to an ellipse around upright.
+    """Return the time to go from every state of a grid to an ellipse around a set-point.
 
     Args:
-        plant: Plant parameters; damping, gravity and dry friction are in the model.
+        plant: Plant parameters; damping, gravity, dry friction and offsets are in the model.
         effort_limit: Torque limit [N m].
         target: (S, c) of the set x' S x <= c.
+        centre: Where the set lies, from upright [rad].
         angles: Grid points around the circle.
         velocities: Grid points in velocity, odd so that rest is one of them.
         velocity_span: Half width in velocity [rad/s]; 0 for 1.3 times the speed of a free fall from upright.
@@ -101,7 +105,8 @@ def minimum_time(
     speed = np.linspace(-span, span, velocities)
     x, v = np.meshgrid(theta, speed, indexing="ij")
     S, level = target
-    inside = S[0, 0] * x * x + 2.0 * S[0, 1] * x * v + S[1, 1] * v * v <= level
+    e = wrap(x - centre)
+    inside = S[0, 0] * e * e + 2.0 * S[0, 1] * e * v + S[1, 1] * v * v <= level
     successors = [_successors(plant, x, v, u, step, span) for u in (-effort_limit, 0.0, effort_limit)]
     discount = math.exp(-step)
     W = np.where(inside, 0.0, 1.0)
@@ -132,9 +137,8 @@ def _successors(
     angle, velocity = x.copy(), v.copy()
 
     def acceleration(angle: Array, velocity: Array) -> Array:
-        dry = plant.coulomb_friction * np.tanh(velocity / _SIGN_VELOCITY)
         return np.asarray(
-            (effort - dry - plant.damping * velocity + plant.gravity * np.sin(angle)) / plant.inertia
+            acceleration_from_upright(plant, angle, velocity, effort, np, sign_velocity=SIGN_VELOCITY)
         )
 
     for _ in range(substeps):

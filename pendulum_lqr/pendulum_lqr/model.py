@@ -14,6 +14,7 @@ from __future__ import annotations
 import cmath
 import math
 from dataclasses import dataclass, field
+from types import ModuleType
 from typing import Any, Protocol
 
 import numpy as np
@@ -38,9 +39,11 @@ __all__ = [
     "FixedPoint",
     "LinearModel",
     "RigidPlant",
+    "acceleration_from_upright",
     "equilibrium_effort",
     "fixed_points",
     "linearise",
+    "low_frequency",
     "overdamped_velocity",
     "state_derivative",
     "torque_gain",
@@ -219,20 +222,65 @@ def linearise(plant: RigidPlant, theta: float = UPRIGHT) -> LinearModel:
     )
 
 
-def state_derivative(plant: RigidPlant, theta: float, theta_dot: float, effort: float) -> tuple[float, float]:
+def low_frequency(model: LinearModel) -> tuple[float, float, float]:
+    """Return (M, b, k) of the second-order plant M x'' + b x' + k x = u that moves alike where motion is slow.
+
+    Exact for a rigid plant; for others the leading terms of 1 / P(s), in units of the commanded torque. Bandwidths and
+    starts of searches come from it, never a claim of stability.
+
+    Args:
+        model: Linear model; its delay is not counted.
+    """
+    n = model.A.shape[0]
+    # theta = x^0 + x^1 s + ... as the answer to the command that moves theta by 1 at s = 0, order by order in s.
+    system = np.block([[model.A, model.B], [np.eye(1, n), np.zeros((1, 1))]])
+    answer = np.linalg.solve(system, np.append(np.zeros(n), 1.0))
+    terms = [float(answer[n])]
+    for _ in range(2):
+        answer = np.linalg.solve(system, np.append(answer[:n], 0.0))
+        terms.append(float(answer[n]))
+    return terms[2], terms[1], terms[0]
+
+
+def state_derivative(plant: RigidPlant, theta: Any, theta_dot: Any, effort: Any) -> tuple[Any, Any]:
     """Return (theta', theta'') of the smooth rigid plant, in [rad/s] and [rad/s^2].
 
     Args:
         plant: Plant parameters.
-        theta: Angle, 0 hanging down [rad].
+        theta: Angle, 0 hanging down, a number or an array [rad].
         theta_dot: Velocity [rad/s].
         effort: Torque [N m].
     """
     torque = effort + _offset(plant, "torque_offset")
     angle = theta - _offset(plant, "angle_offset")
-    return theta_dot, rigid_acceleration(
-        angle, theta_dot, torque, plant.inertia, plant.damping, plant.gravity
-    )
+    equation = in_arithmetic(rigid_acceleration, np)
+    return theta_dot, equation(angle, theta_dot, torque, plant.inertia, plant.damping, plant.gravity)
+
+
+def acceleration_from_upright(
+    plant: PlantParameters,
+    angle: Any,
+    velocity: Any,
+    effort: Any,
+    arithmetic: ModuleType = math,
+    sign_velocity: float = 0.0,
+) -> Any:
+    """Return theta'' of the rigid plant, offsets included, with numbers, arrays or symbols [rad/s^2].
+
+    Args:
+        plant: Plant parameters; lag and delay are not in it.
+        angle: Measured angle from upright [rad].
+        velocity: [rad/s].
+        effort: Torque of the actuator [N m].
+        arithmetic: ``math``, ``numpy`` or ``casadi``, whichever the arguments are made for.
+        sign_velocity: Width over which Coulomb friction changes its sign, as tanh [rad/s]; 0 leaves it out.
+    """
+    torque = effort + plant.torque_offset
+    if sign_velocity > 0.0 and plant.coulomb_friction > 0.0:
+        torque = torque - plant.coulomb_friction * arithmetic.tanh(velocity / sign_velocity)
+    equation = rigid_acceleration if arithmetic is math else in_arithmetic(rigid_acceleration, arithmetic)
+    # sin(theta) = -sin(theta - pi), exactly 0 at upright in this form.
+    return equation(angle - plant.angle_offset, velocity, torque, plant.inertia, plant.damping, -plant.gravity)
 
 
 def fixed_points(plant: RigidPlant, effort: float = 0.0) -> tuple[FixedPoint, ...]:

@@ -3,7 +3,8 @@
 The proven part is a sublevel set of the Riccati solution's Lyapunov function V = x' S x. In the coordinates
 x = rho n(phi) with n' S n = 1, so that V = rho^2,
 
-    V' / rho^2 = 2 n' S [n_1, (-b n_1 + G n_0 sinc(rho n_0) + clamp(-K n, limit / rho)) / M]
+    V' / rho^2 = 2 n' S [n_1, (-b n_1 - G n_0 g(rho n_0) + clamp(-K n, limits / rho)) / M]
+    g(z) = (sin(theta* + z) - sin theta*) / z,   -sinc(z) at upright
 
 is bounded by interval arithmetic over cells of (rho, phi), which are split until every bound is negative. The
 quotient has no singularity at rho = 0, so that the proof covers the whole ellipse and not only its rim.
@@ -21,7 +22,7 @@ import scipy.linalg
 from numpy.typing import NDArray
 
 from pendulum_lqr.design import DesignError, Gain
-from pendulum_lqr.model import RigidPlant
+from pendulum_lqr.model import RigidPlant, equilibrium_effort, state_derivative
 from pendulum_msgs_py.contract.angles import UPRIGHT, wrap
 
 __all__ = ["Region", "Rollout", "proven_level", "region_of_attraction", "rigid_rollout", "sublevel_ellipse"]
@@ -35,6 +36,17 @@ _SPLITS = 14
 _MOST_CELLS = 400_000
 # Rounding of a dozen operations on doubles is far below this share of the terms summed.
 _ROUNDING = 1e-12
+
+
+class _Loop(NamedTuple):
+    """What the proof knows of the plant: the limits are those of the deviation from the holding torque."""
+
+    inertia: float
+    damping: float
+    gravity: float
+    angle: float
+    low: float
+    high: float
 
 
 class _Interval(NamedTuple):
@@ -81,30 +93,52 @@ class Region:
         return int(np.count_nonzero((value <= self.level) & ~self.attracted))
 
 
-def proven_level(plant: RigidPlant, gain: Gain, effort_limit: float) -> float:
-    """Return the largest level found for which {x' S x <= c} is proven to be attracted to upright.
+def proven_level(plant: RigidPlant, gain: Gain, effort_limit: float, theta: float = UPRIGHT) -> float:
+    """Return the largest level found for which {x' S x <= c} is proven to be attracted to a fixed point.
 
-    Dry friction is left out: with it a pendulum comes to rest near upright and not at it.
+    Dry friction is left out: with it a pendulum comes to rest near the fixed point and not at it. So are lag, delay and
+    drivetrain; ``angle_offset`` and ``torque_offset`` count.
 
     Args:
         plant: Plant parameters.
-        gain: LQR gain at upright and its Riccati solution.
+        gain: LQR gain at the fixed point and its Riccati solution.
         effort_limit: Torque limit [N m], > 0.
+        theta: Measured angle of the fixed point, 0 hanging down [rad].
+
+    Returns:
+        c; 0 if nothing is proven.
 
     Raises:
-        DesignError: The limit is not positive.
+        DesignError: The limit is not positive, or not enough to hold the fixed point.
     """
     if not effort_limit > 0.0:
         raise DesignError(f"effort_limit is {effort_limit} N m; expected > 0")
+    hold = equilibrium_effort(plant, theta)
+    if abs(hold) >= effort_limit:
+        raise DesignError(
+            f"holding {theta - UPRIGHT:.4g} rad from upright takes {hold:.4g} N m; expected less than effort_limit = "
+            f"{effort_limit:g} N m"
+        )
     directions = np.linalg.inv(scipy.linalg.cholesky(gain.S, lower=True)).T
+    loop = _Loop(
+        plant.inertia,
+        plant.damping,
+        plant.gravity,
+        theta - float(getattr(plant, "angle_offset", 0.0)),
+        -effort_limit - hold,
+        effort_limit - hold,
+    )
     # The ellipse must not reach around the circle, where the angle wraps.
     reach = math.pi / float(np.linalg.norm(directions[0]))
     low, high = 0.0, reach
-    if _decreases(plant, gain, directions, effort_limit, reach):
+    if _decreases(loop, gain, directions, reach):
         return reach * reach
+    # What is not proven for a thousandth is proven for nothing: a dozen more attempts would take seconds to say so.
+    if not _decreases(loop, gain, directions, 1e-3 * reach):
+        return 0.0
     for _ in range(12):
         middle = 0.5 * (low + high)
-        if _decreases(plant, gain, directions, effort_limit, middle):
+        if _decreases(loop, gain, directions, middle):
             low = middle
         else:
             high = middle
@@ -177,13 +211,14 @@ def rigid_rollout(
         dt: Largest step [s]; shortened where the plant's damping asks for it.
     """
     k0, k1 = (float(value) for value in gain.K)
+    hold = equilibrium_effort(plant, UPRIGHT)
     stiff = (plant.damping + k1) / plant.inertia
     step = min(dt, 1.0 / stiff) if stiff > 0.0 else dt
     steps = math.ceil(duration / step)
 
     def acceleration(x: Array, v: Array) -> Array:
-        u = np.clip(-k0 * wrap(x) - k1 * v, -effort_limit, effort_limit)
-        return np.asarray((u - plant.damping * v - plant.gravity * np.sin(x + UPRIGHT)) / plant.inertia)
+        u = np.clip(hold - k0 * wrap(x) - k1 * v, -effort_limit, effort_limit)
+        return np.asarray(state_derivative(plant, x + UPRIGHT, v, u)[1])
 
     def run(angle: Array, velocity: Array) -> tuple[Array, Array]:
         x, v = np.array(angle, dtype=np.float64), np.array(velocity, dtype=np.float64)
@@ -203,22 +238,23 @@ def rigid_rollout(
     return run
 
 
-def _decreases(plant: RigidPlant, gain: Gain, directions: Array, limit: float, reach: float) -> bool:
+def _decreases(loop: _Loop, gain: Gain, directions: Array, reach: float) -> bool:
     """Tell whether V' < 0 is proven for all 0 <= rho <= reach and all directions."""
-    # x and -x behave alike, so half a turn is enough.
+    # Upright without offsets, x and -x behave alike, so that half a turn is enough.
+    alike = loop.angle == UPRIGHT and loop.low == -loop.high
     rho = np.linspace(0.0, reach, 33)
-    phi = np.linspace(0.0, math.pi, 129)
+    phi = np.linspace(0.0, math.pi, 129) if alike else np.linspace(-math.pi, math.pi, 257)
     r_low, p_low = (grid.ravel() for grid in np.meshgrid(rho[:-1], phi[:-1]))
     r_high, p_high = (grid.ravel() for grid in np.meshgrid(rho[1:], phi[1:]))
     for _ in range(_SPLITS):
-        bound = _rate(plant, gain, directions, limit, _Interval(r_low, r_high), _Interval(p_low, p_high)).high
+        bound = _rate(loop, gain, directions, _Interval(r_low, r_high), _Interval(p_low, p_high)).high
         open_cells = bound >= 0.0
         if not np.any(open_cells):
             return True
         r_low, r_high, p_low, p_high = (edge[open_cells] for edge in (r_low, r_high, p_low, p_high))
         r_middle, p_middle = 0.5 * (r_low + r_high), 0.5 * (p_low + p_high)
         centre = _rate(
-            plant, gain, directions, limit, _Interval(r_middle, r_middle), _Interval(p_middle, p_middle)
+            loop, gain, directions, _Interval(r_middle, r_middle), _Interval(p_middle, p_middle)
         )
         if np.any(centre.low >= 0.0) or 4 * r_low.size > _MOST_CELLS:
             return False
@@ -233,33 +269,35 @@ def _decreases(plant: RigidPlant, gain: Gain, directions: Array, limit: float, r
     return False
 
 
-def _rate(
-    plant: RigidPlant, gain: Gain, directions: Array, limit: float, rho: _Interval, phi: _Interval
-) -> _Interval:
+def _rate(loop: _Loop, gain: Gain, directions: Array, rho: _Interval, phi: _Interval) -> _Interval:
     """Return bounds of V' / rho^2 over cells."""
     n0 = _direction(directions[0], phi)
     n1 = _direction(directions[1], phi)
     s0 = _direction(gain.S[0] @ directions, phi)
     s1 = _direction(gain.S[1] @ directions, phi)
     feedback = _direction(-np.asarray(gain.K) @ directions, phi)
-    with np.errstate(divide="ignore"):
-        # clamp shrinks as rho grows: the widest clamp belongs to the smallest rho.
-        wide = np.where(rho.low > 0.0, limit / np.maximum(rho.low, 1e-300), np.inf)
-        narrow = np.where(rho.high > 0.0, limit / np.maximum(rho.high, 1e-300), np.inf)
-    u_low = np.minimum(np.clip(feedback.low, -wide, wide), np.clip(feedback.low, -narrow, narrow))
-    u_high = np.maximum(np.clip(feedback.high, -wide, wide), np.clip(feedback.high, -narrow, narrow))
+    # clamp shrinks as rho grows: the widest clamp belongs to the smallest rho.
+    wide, narrow = np.maximum(rho.low, 1e-300), np.maximum(rho.high, 1e-300)
+    u_low = np.minimum(
+        np.clip(feedback.low, loop.low / wide, loop.high / wide),
+        np.clip(feedback.low, loop.low / narrow, loop.high / narrow),
+    )
+    u_high = np.maximum(
+        np.clip(feedback.high, loop.low / wide, loop.high / wide),
+        np.clip(feedback.high, loop.low / narrow, loop.high / narrow),
+    )
     # Away from zero the clamp moves both ends towards zero; the two candidates above cover either sign.
-    gravity = _times(n0, _sinc(rho, n0))
+    weight = _times(n0, _weight_quotient(loop.angle, rho, n0))
     torque = _Interval(
-        u_low + plant.gravity * gravity.low - plant.damping * n1.high,
-        u_high + plant.gravity * gravity.high - plant.damping * n1.low,
+        u_low - loop.gravity * weight.high - loop.damping * n1.high,
+        u_high - loop.gravity * weight.low - loop.damping * n1.low,
     )
     first = _times(s0, n1)
     second = _times(s1, torque)
-    size = np.abs(first.low) + np.abs(first.high) + (np.abs(second.low) + np.abs(second.high)) / plant.inertia
+    size = np.abs(first.low) + np.abs(first.high) + (np.abs(second.low) + np.abs(second.high)) / loop.inertia
     return _Interval(
-        2.0 * (first.low + second.low / plant.inertia) - _ROUNDING * size,
-        2.0 * (first.high + second.high / plant.inertia) + _ROUNDING * size,
+        2.0 * (first.low + second.low / loop.inertia) - _ROUNDING * size,
+        2.0 * (first.high + second.high / loop.inertia) + _ROUNDING * size,
     )
 
 
@@ -276,6 +314,21 @@ def _direction(row: Array, phi: _Interval) -> _Interval:
     return _Interval(
         amplitude * np.where(trough, -1.0, smallest) - _ROUNDING * amplitude,
         amplitude * np.where(crest, 1.0, largest) + _ROUNDING * amplitude,
+    )
+
+
+def _weight_quotient(angle: float, rho: _Interval, n0: _Interval) -> _Interval:
+    """Return bounds of (sin(angle + z) - sin(angle)) / z for z = rho n0, |z| <= pi."""
+    if angle == UPRIGHT:
+        sinc = _sinc(rho, n0)
+        return _Interval(-sinc.high, -sinc.low)
+    # cos(angle + z / 2) sinc(z / 2)
+    half = _Interval(
+        angle + 0.5 * np.minimum(rho.low * n0.low, rho.high * n0.low),
+        angle + 0.5 * np.maximum(rho.low * n0.high, rho.high * n0.high),
+    )
+    return _times(
+        _direction(np.array([1.0, 0.0]), half), _sinc(_Interval(0.5 * rho.low, 0.5 * rho.high), n0)
     )
 
 

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pendulum_lqr.design import DesignError
+from pendulum_lqr.model import acceleration_from_upright
 from pendulum_msgs_py.plants.plant_parameters import PlantParameters
 
 __all__ = ["OptimisedTrajectory", "rigid_dynamics", "swing_up_trajectory"]
@@ -24,7 +25,7 @@ _GUESSES = (5.0, 9.0, 13.0)
 
 @dataclass(frozen=True)
 class OptimisedTrajectory:
-    """Trajectory from hanging at rest to upright at rest.
+    """Trajectory from hanging at rest to rest at the set-point.
 
     Attributes:
         times: Shape (n + 1,), equidistant [s].
@@ -38,12 +39,12 @@ class OptimisedTrajectory:
 
     @property
     def duration(self) -> float:
-        """Time from hanging to upright [s]."""
+        """Time from hanging to the set-point [s]."""
         return float(self.times[-1])
 
 
 def rigid_dynamics(plant: PlantParameters, angle: Any, velocity: Any, effort: Any) -> Any:
-    """Return the acceleration as a CasADi expression; dry friction with a smooth sign [rad/s^2].
+    """Return the acceleration as a CasADi expression; dry friction with a smooth sign, offsets included [rad/s^2].
 
     Args:
         plant: Plant parameters.
@@ -51,12 +52,13 @@ def rigid_dynamics(plant: PlantParameters, angle: Any, velocity: Any, effort: An
         velocity: [rad/s].
         effort: [N m].
     """
-    dry = plant.coulomb_friction * casadi.tanh(velocity / _SIGN_VELOCITY) if plant.coulomb_friction else 0.0
-    return (effort - dry - plant.damping * velocity + plant.gravity * casadi.sin(angle)) / plant.inertia
+    return acceleration_from_upright(plant, angle, velocity, effort, casadi, sign_velocity=_SIGN_VELOCITY)
 
 
 @lru_cache(maxsize=16)
-def swing_up_trajectory(plant: PlantParameters, effort_limit: float, nodes: int = 100) -> OptimisedTrajectory:
+def swing_up_trajectory(
+    plant: PlantParameters, effort_limit: float, nodes: int = 100, set_point: float = 0.0
+) -> OptimisedTrajectory:
     """Return the fastest of the locally optimal swing-ups from several guesses, with a light price on torque changes.
 
     Hermite-Simpson collocation with the torque linear between nodes; the guesses swing more or less often.
@@ -65,9 +67,10 @@ def swing_up_trajectory(plant: PlantParameters, effort_limit: float, nodes: int 
         plant: Plant parameters.
         effort_limit: Torque limit of the trajectory [N m]; leave a reserve for the feedback.
         nodes: Number of intervals.
+        set_point: Where it ends, from upright [rad].
 
     Raises:
-        DesignError: No guess leads upright.
+        DesignError: No guess leads there.
 
     Source:
         Kelly, An introduction to trajectory optimization, SIAM Review 59(4), 2017, section 4 and table 1.
@@ -88,8 +91,11 @@ def swing_up_trajectory(plant: PlantParameters, effort_limit: float, nodes: int 
         slope_middle = flow(middle, 0.5 * (U[k] + U[k + 1]))
         opti.subject_to(right == left + h / 6.0 * (slope_left + 4.0 * slope_middle + slope_right))
     opti.subject_to(opti.bounded(-effort_limit, U, effort_limit))
-    opti.subject_to(X[:, 0] == casadi.DM([-math.pi, 0.0]))
-    opti.subject_to(X[:, nodes] == casadi.DM([0.0, 0.0]))
+    # Without a command the pendulum rests where gravity balances the torque offset.
+    balance = plant.torque_offset / plant.gravity if plant.gravity > 0.0 else 0.0
+    start = plant.angle_offset + math.asin(max(-1.0, min(1.0, balance))) - math.pi
+    opti.subject_to(X[:, 0] == casadi.DM([start, 0.0]))
+    opti.subject_to(X[:, nodes] == casadi.DM([set_point, 0.0]))
     opti.subject_to(opti.bounded(0.05, duration, 60.0))
     opti.minimize(duration + 1e-3 * casadi.sumsqr(U[1:] - U[:-1]))
     opti.solver(
@@ -111,7 +117,7 @@ def swing_up_trajectory(plant: PlantParameters, effort_limit: float, nodes: int 
     )
     for swings in _GUESSES:
         opti.set_initial(duration, 1.6 * scale)
-        opti.set_initial(X[0, :], -math.pi + math.pi * s**2 * np.cos((1.0 - s) * swings))
+        opti.set_initial(X[0, :], start + (set_point - start) * s**2 * np.cos((1.0 - s) * swings))
         opti.set_initial(X[1, :], 0.0)
         opti.set_initial(U, effort_limit * np.sign(np.cos((1.0 - s) * swings)))
         try:

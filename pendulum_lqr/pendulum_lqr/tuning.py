@@ -14,7 +14,7 @@ import scipy.optimize
 from numpy.typing import ArrayLike, NDArray
 
 from pendulum_lqr.design import DesignError, cost_matrices, discretise
-from pendulum_lqr.model import LinearModel
+from pendulum_lqr.model import LinearModel, low_frequency
 
 __all__ = ["PidGains", "pid_cost", "pid_loop", "tune_numerically", "ultimate_gain", "ziegler_nichols"]
 
@@ -41,8 +41,8 @@ def pid_loop(
 ) -> tuple[Matrix, Matrix, Matrix]:
     """Return (A, B, F) of the sampled closed loop z[k+1] = A z[k] + B w[k], u[k] = F z[k].
 
-    The state is [angle, velocity, integral, angle at the sample before, filtered derivative at the sample before]; w is
-    a torque that disturbs, held like the controller's.
+    The state is [that of the sampled plant, integral, angle at the sample before, filtered derivative at the sample
+    before]; w is a torque that disturbs, held like the controller's.
 
     Args:
         model: Linear model.
@@ -54,17 +54,19 @@ def pid_loop(
     pole = math.exp(-period / filter_time)
     slope = (1.0 - pole) / period
     # d[k] = pole d[k-1] + slope (e[k] - e[k-1]);  I[k] = I[k-1] + period e[k]
-    derivative = np.array([slope, 0.0, 0.0, -slope, pole])
-    integral = np.array([period, 0.0, 1.0, 0.0, 0.0])
-    F = -(gains.kp * np.eye(5)[0] + gains.ki * integral + gains.kd * derivative)
-    A = np.zeros((5, 5))
-    A[:2, :2] = sampled.A
-    A[:2] += sampled.B @ F[None, :]
-    A[2] = integral
-    A[3, 0] = 1.0
-    A[4] = derivative
-    B = np.zeros((5, 1))
-    B[:2] = sampled.B
+    n = sampled.A.shape[0]
+    derivative, integral = np.zeros(n + 3), np.zeros(n + 3)
+    derivative[[0, n + 1, n + 2]] = slope, -slope, pole
+    integral[[0, n]] = period, 1.0
+    F = -(gains.kp * np.eye(n + 3)[0] + gains.ki * integral + gains.kd * derivative)
+    A = np.zeros((n + 3, n + 3))
+    A[:n, :n] = sampled.A
+    A[:n] += sampled.B @ F[None, :]
+    A[n] = integral
+    A[n + 1, 0] = 1.0
+    A[n + 2] = derivative
+    B = np.zeros((n + 3, 1))
+    B[:n] = sampled.B
     return A, B, F
 
 
@@ -89,13 +91,17 @@ def pid_cost(
     A, B, F = pid_loop(model, gains, period, filter_time)
     if gains.ki <= 0.0 or float(np.max(np.abs(np.linalg.eigvals(A)))) >= 1.0 - 1e-9:
         return math.inf
-    weight = np.zeros((5, 5))
+    size = A.shape[0]
+    weight = np.zeros((size, size))
     weight[:2, :2] = Q
     weight += R[0, 0] * np.outer(F, F)
     S = scipy.linalg.solve_discrete_lyapunov(A.T, weight) * period
     # A derivative that started at rest: the sample before showed the same angle.
-    release = 0.1 * np.array([1.0, 0.0, 0.0, 1.0, 0.0])
-    rest = scipy.linalg.solve(np.eye(5) - A, B[:, 0])
+    release = np.zeros(size)
+    release[[0, size - 2]] = 0.1
+    if "motor_angle" in model.states:
+        release[model.states.index("motor_angle")] = 0.1
+    rest = scipy.linalg.solve(np.eye(size) - A, B[:, 0])
     return float(release @ S @ release + rest @ S @ rest)
 
 
@@ -121,14 +127,14 @@ def tune_numerically(
         value = pid_cost(model, PidGains(*np.exp(logarithms)), period, filter_time, q, r)
         return value if math.isfinite(value) else 1e12
 
-    inertia = 1.0 / float(model.B[1, 0])
-    lift = max(float(model.A[1, 0]) * inertia, 0.0)
+    inertia, own_damping, stiffness = low_frequency(model)
+    lift = max(-stiffness, 0.0)
     starts = []
     for rate in (0.5, 1.0, 2.0, 4.0, 8.0, 16.0):
-        damping = max(-float(model.A[1, 1]) * inertia, 2.0 * inertia * rate)
+        damping = max(own_damping, 2.0 * inertia * rate)
         kp = lift + rate * damping
         # A derivative far below what the plant damps by itself is where the search for an overdamped plant starts.
-        kd = max(damping + float(model.A[1, 1]) * inertia, 1e-3 * damping)
+        kd = max(damping - own_damping, 1e-3 * damping)
         starts.append(np.log([kp, 0.3 * rate * kp, kd]))
     start = min(starts, key=cost)
     best = scipy.optimize.minimize(
@@ -154,14 +160,14 @@ def ultimate_gain(model: LinearModel, period: float) -> tuple[float, float]:
         DesignError: No proportional gain stabilises the plant, or none makes it oscillate.
     """
     sampled = discretise(model, period)
-    inertia = 1.0 / float(model.B[1, 0])
+    size = sampled.A.shape[0]
 
     def poles(gain: float) -> NDArray[np.complex128]:
         return np.asarray(
-            np.linalg.eigvals(sampled.A - sampled.B @ np.array([[gain, 0.0]])), dtype=np.complex128
+            np.linalg.eigvals(sampled.A - gain * sampled.B @ np.eye(1, size)), dtype=np.complex128
         )
 
-    low = max(float(model.A[1, 0]) * inertia, 0.0) * 1.001 + 1e-9
+    low = max(-low_frequency(model)[2], 0.0) * 1.001 + 1e-9
     if np.max(np.abs(poles(low * 1.01))) >= 1.0:
         raise DesignError(
             f"no proportional gain stabilises the loop at a period of {period} s; expected a shorter period"

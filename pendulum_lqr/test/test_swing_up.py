@@ -36,14 +36,17 @@ def test_on_the_benchmarks_own_plant_the_fastest_published_time_is_beaten(simula
     assert run.swing_up_time < 1.45
 
 
-def test_with_1_5_newton_metres_no_controller_can_be_as_fast_as_2_04_s():
-    # Two independent programs agree on the bound: dynamic programming and direct collocation.
+def test_with_1_5_newton_metres_two_programs_find_nothing_as_fast_as_2_04_s():
+    # Dynamic programming searches all states and comes down as its grid gets finer; collocation is exact and local.
     box = np.diag([1.0 / 0.1**2, 1.0 / 0.1**2])
     # The ellipse around the benchmark's box has twice its level: reaching it is easier than reaching the box.
-    table = minimum_time(DFKI, 1.5, (box, 2.0), angles=400, velocities=401)
-    bound = table.time(-math.pi, 0.0)
+    coarse, fine = (
+        minimum_time(DFKI, 1.5, (box, 2.0), angles=n, velocities=n + 1).time(-math.pi, 0.0) for n in (120, 400)
+    )
     exact = swing_up_trajectory(DFKI, 1.5)
-    assert 2.2 < bound < exact.duration
+    assert 2.25 < fine < coarse - 0.02
+    assert coarse < 2.5
+    assert fine == pytest.approx(exact.duration, rel=0.03)
     assert 2.35 < exact.duration < 2.45
     frictionless = swing_up_trajectory(DFKI.with_values(coulomb_friction=0.0, static_friction=0.0), 1.5)
     assert frictionless.duration > 2.04
@@ -73,17 +76,21 @@ def test_the_optimised_trajectory_obeys_the_equation_of_motion_and_its_limits():
     assert abs(angle) < 0.2
 
 
-@pytest.mark.parametrize("name", ["energy_swing_up", "time_optimal", "tvlqr"])
-def test_swing_up_succeeds_from_any_start_and_with_a_wrong_model(name, simulate):
+@pytest.mark.parametrize(
+    ("name", "starts"), [("energy_swing_up", 5), ("time_optimal", 5), ("tvlqr", 5), ("nmpc", 1)]
+)
+def test_swing_up_succeeds_from_any_start_and_with_a_wrong_model(name, starts, simulate):
     controller = make_controller(name, DFKI, 0.01)
     rng = np.random.default_rng(4)
-    for _ in range(5):
+    for _ in range(starts):
         start = rng.uniform([-math.pi, -2 * math.pi], [math.pi, 2 * math.pi])
         run = simulate(DFKI, controller, theta=start[0], theta_dot=start[1], duration=10.0)
         assert run.swing_up_time < 10.0
     for factor in (0.8, 1.2):
         other = DFKI.with_values(inertia=factor * DFKI.inertia, coulomb_friction=0.05, static_friction=0.05)
-        assert simulate(other, controller, theta=0.0, duration=10.0).swing_up_time < 10.0
+        # An answer of nmpc takes milliseconds: half the time has to do.
+        duration = 5.0 if name == "nmpc" else 10.0
+        assert simulate(other, controller, theta=0.0, duration=duration).swing_up_time < duration
 
 
 def test_a_push_out_of_upright_is_answered_by_a_new_swing_up(simulate):

@@ -1,6 +1,7 @@
 """Velocity estimators on signals whose velocity is known."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -10,6 +11,7 @@ from pendulum_lqr.velocity import VELOCITY_ESTIMATORS, KalmanVelocity, SavitzkyG
 from pendulum_msgs_py.contract.angles import wrap
 from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.plants.plant_parameters import load_plant
+from pendulum_sim.plant import make_plant
 
 THESIS = load_plant("thesis")
 DFKI = load_plant("dfki")
@@ -33,8 +35,6 @@ def test_no_estimator_looks_at_the_measured_velocity_once_it_runs(name):
 
 
 def test_kalman_follows_a_swinging_pendulum_better_than_a_difference():
-    from pendulum_sim.plant import make_plant
-
     plant = DFKI.with_values(coulomb_friction=0.0, static_friction=0.0)
     rng = np.random.default_rng(0)
     errors = {}
@@ -80,8 +80,33 @@ def test_lqr_balances_on_every_estimator(name, simulate):
     assert abs(run.angle[-1]) < 1e-3
 
 
-def test_kalman_holds_on_the_stiff_plant_too():
-    assert isinstance(make_velocity_estimator("kalman", THESIS, 0.01), KalmanVelocity)
+@pytest.mark.parametrize(
+    ("name", "changes"),
+    [
+        ("thesis", {}),
+        ("x5_9", {}),
+        ("dfki", {"angle_offset": 0.4, "torque_offset": 0.3}),
+        ("dfki", {"transport_delay": 0.035, "actuator_time_constant": 0.05}),
+        ("x5_9", {"transport_delay": 0.013}),
+    ],
+)
+def test_kalman_gives_the_velocity_of_every_plant_in_a_free_fall_under_torque(name, changes):
+    plant = load_plant(name).with_values(coulomb_friction=0.0, static_friction=0.0, **changes)
+    if plant.drivetrain is not None:
+        smooth = {"motor_coulomb_friction": 0.0, "motor_static_friction": 0.0, "hysteresis_torque": 0.0}
+        plant = plant.with_values(drivetrain=replace(plant.drivetrain, **smooth))
+    # Hardly any torque but the one that it was told of: what it then says comes from its model.
+    estimator = KalmanVelocity(plant, 0.01, position_noise=1e-2, torque_noise=1e-3)
+    simulated = make_plant(plant, 0.01)
+    state = simulated.reset(2.5)
+    effort, errors, speeds = 0.0, [], []
+    for k in range(300):
+        estimate = estimator.update(0.01 * k, wrap(state.theta - math.pi), state.theta_dot, effort)
+        errors.append(estimate - state.theta_dot)
+        speeds.append(state.theta_dot)
+        effort = 1.2 * math.sin(0.05 * k)
+        state = simulated.step(effort)
+    assert np.max(np.abs(errors)) < 0.03 * np.max(np.abs(speeds))
 
 
 def test_an_unknown_estimator_is_refused():

@@ -7,30 +7,40 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from pendulum_lqr.catch import Catch, make_catch
-from pendulum_lqr.controller import BaseController
+from pendulum_lqr.controller import BaseController, Controller
+from pendulum_lqr.design import DesignError
+from pendulum_msgs_py.contract.angles import wrap
 from pendulum_msgs_py.parameters import ParameterSpec
 from pendulum_msgs_py.plants.plant_parameters import PlantParameters
 
 __all__ = ["EnergySwingUp"]
 
+_REST = 0.02
+"""Velocity below which the pendulum may be held by dry friction [rad/s]."""
+
 
 class EnergySwingUp(BaseController):
-    """Pumps energy until upright is within reach, then hands over to an LQR.
+    """Pumps energy until the set-point is within reach, then hands over to an LQR.
 
-    Pumping torque: u = clamp(k (E* (1 + margin) - E) theta_dot + b theta_dot + tau_C sgn(theta_dot)), with
-    E = M theta_dot^2 / 2 + G (1 + cos(theta - pi)) and E* = 2 G. Its first part is passive; the other two put
-    back what friction takes.
+    Pumping torque: u = clamp(k (E* (1 + margin) - E) theta_dot + b theta_dot + tau_C sgn(theta_dot) - tau_0), with
+    E = M theta_dot^2 / 2 + G (1 - cos(theta - theta_0)) and E* that of rest at the set-point; theta_0 and tau_0 are the
+    plant's offsets. Its first part is passive; the other two put back what friction takes. At rest, where no velocity
+    says where to push and dry friction holds more than it takes in motion, it pushes at the limit where gravity pulls.
 
     Args:
         plant: Plant parameters.
         gain: k [s/rad].
         margin: Energy beyond that of upright, as a share of E* [-].
-        catch: LQR with hysteresis.
+        catch: LQR with hysteresis, at its set-point.
         effort_limit: Largest torque [N m].
+
+    Raises:
+        DesignError: Dry friction holds more than the torque limit.
 
     Source: Astrom and Furuta, Swinging up a pendulum by energy control, Automatica 36(2), 2000, eq. 7.
     """
 
+    SERIES_ELASTIC = False
     SUMMARY = "swing-up by energy shaping, caught by LQR with hysteresis"
     PARAMETERS = (
         ParameterSpec("gain", 50.0, "s/rad", "Pumping torque per energy error and velocity.", minimum=0.0,
@@ -46,20 +56,30 @@ class EnergySwingUp(BaseController):
     def __init__(
         self, plant: PlantParameters, gain: float, margin: float, catch: Catch, effort_limit: float
     ) -> None:
-        super().__init__(effort_limit)
+        super().__init__(effort_limit, catch.set_point)
+        if effort_limit <= plant.static_friction + abs(plant.torque_offset):
+            raise DesignError(
+                f"effort_limit is {effort_limit:g} N m; expected more than static friction and torque offset, "
+                f"{plant.static_friction + abs(plant.torque_offset):g} N m, or the pendulum may never move"
+            )
         self.gain = gain
         self.catch = catch
         self._inertia = plant.inertia
         self._gravity = plant.gravity
         self._damping = plant.damping
         self._coulomb = plant.coulomb_friction
+        self._angle_offset = plant.angle_offset
+        self._torque_offset = plant.torque_offset
+        self._target = plant.gravity * (1.0 + math.cos(catch.set_point - plant.angle_offset))
         self._first_margin = margin
         self.reset()
 
     @classmethod
     def design(cls, plant: PlantParameters, period: float, p: Mapping[str, Any]) -> EnergySwingUp:
         """Return the swing-up controller with its catch designed under the torque limit."""
-        catch = make_catch(plant, p["catch_q"], p["catch_r"], p["effort_limit"], p["catch_share"])
+        catch = make_catch(
+            plant, p["catch_q"], p["catch_r"], p["effort_limit"], p["catch_share"], p["set_point"]
+        )
         return cls(plant, p["gain"], p["energy_margin"], catch, p["effort_limit"])
 
     def reset(self) -> None:
@@ -77,15 +97,18 @@ class EnergySwingUp(BaseController):
 
     def pump(self, angle: float, velocity: float) -> float:
         """Return the torque that brings the energy to its target, before the limit [N m]."""
-        if abs(velocity) < 1e-3 and math.cos(angle) < -0.99:
-            # At rest at the bottom no velocity says where to push: start somewhere.
-            return self.effort_limit
+        angle -= self._angle_offset
+        if abs(velocity) < _REST:
+            # Where gravity pulls neither way, at the bottom, either side will do.
+            pull = self._gravity * math.sin(angle) + self._torque_offset
+            return math.copysign(self.effort_limit, pull)
         energy = 0.5 * self._inertia * velocity * velocity + self._gravity * (1.0 + math.cos(angle))
-        friction = self._damping * velocity + math.copysign(self._coulomb, velocity)
-        return self.gain * (2.0 * self._gravity * (1.0 + self._margin) - energy) * velocity + friction
+        friction = self._damping * velocity + math.copysign(self._coulomb, velocity) - self._torque_offset
+        return self.gain * (self._target * (1.0 + self._margin) - energy) * velocity + friction
 
     def _learn(self, angle: float, velocity: float) -> None:
         """Aim lower after passing upright uncaught, higher after turning back before it: the model is never exact."""
+        angle = wrap(angle - self.set_point)
         last_angle, last_velocity = self._last
         self._last = (angle, velocity)
         if abs(angle) > 1.0 or abs(last_angle) > 1.0:
@@ -94,6 +117,12 @@ class EnergySwingUp(BaseController):
             self._margin *= 0.5
         elif velocity * last_velocity < 0.0:
             self._margin = min(1.5 * max(self._margin, 0.0) + 0.01, 1.0)
+
+    def take_over(self, previous: Controller) -> None:
+        """Take over what was learnt, and whether the LQR is in charge."""
+        if isinstance(previous, EnergySwingUp):
+            self._margin, self._last = previous._margin, previous._last
+            self.catch.active = previous.catch.active
 
     def describe(self) -> str:
         """Return gains of both phases."""

@@ -76,7 +76,7 @@ class Lqi(BaseController):
         """Return the gain."""
         return f"K = [{self._k0:.6f}, {self._k1:.6f}, {self._ki:.6f}]"
 
-    def carry_over(self, previous: Controller) -> None:
+    def take_over(self, previous: Controller) -> None:
         """Keep the torque that the integral stands for, though the gain on it has changed."""
         if isinstance(previous, Lqi):
             self.integral = previous.integral * previous._ki / self._ki

@@ -7,7 +7,7 @@ from typing import Any
 
 from pendulum_lqr.controller import BaseController
 from pendulum_lqr.controllers.specs import FEEDFORWARD, Q, R
-from pendulum_lqr.design import Gain, continuous_lqr
+from pendulum_lqr.design import Gain, output_lqr
 from pendulum_lqr.model import linearise
 from pendulum_msgs_py.contract.angles import UPRIGHT
 from pendulum_msgs_py.plants.plant_parameters import PlantParameters
@@ -17,6 +17,8 @@ __all__ = ["Lqr"]
 
 class Lqr(BaseController):
     """Continuous LQR, sampled: the controller of the thesis.
+
+    Where the plant has states that are not measured, K is the best gain on angle and velocity.
 
     Args:
         gain: Gain and Riccati solution.
@@ -40,7 +42,7 @@ class Lqr(BaseController):
         """Return the LQR for the plant linearised at the set-point."""
         model = linearise(plant, UPRIGHT + p["set_point"])
         hold = model.effort if p["feedforward"] else 0.0
-        return cls(continuous_lqr(model, p["q"], p["r"]), p["effort_limit"], p["set_point"], hold)
+        return cls(output_lqr(model, p["q"], p["r"]), p["effort_limit"], p["set_point"], hold)
 
     def command(self, t: float, x: Sequence[float]) -> float:
         """Return the torque [N m]."""

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pendulum_lqr.catch import Catch, make_catch
-from pendulum_lqr.controller import BaseController
+from pendulum_lqr.controller import BaseController, Controller
 from pendulum_lqr.trajectory_optimisation import rigid_dynamics
 from pendulum_msgs_py.parameters import ParameterSpec
 from pendulum_msgs_py.plants.plant_parameters import PlantParameters
@@ -24,7 +24,7 @@ Array = NDArray[np.float64]
 class NonlinearMpc(BaseController):
     """Multiple shooting with RK4 over N steps, warm-started from the last plan; LQR takes over near upright.
 
-    Minimises the sum of h (q0 2 (1 - cos e) + q1 theta_dot^2 + r u^2) and a terminal cost of the same form;
+    Minimises the sum of h (q0 2 (1 - cos e) + q1 theta_dot^2 + r (u - u*)^2) and a terminal cost of the same form;
     2 (1 - cos e) is e^2 near upright and knows no difference between turns.
 
     Args:
@@ -34,6 +34,7 @@ class NonlinearMpc(BaseController):
         catch: LQR with hysteresis.
     """
 
+    SERIES_ELASTIC = False
     SUMMARY = "nonlinear MPC by multiple shooting, swings up and balances"
     PARAMETERS = (
         ParameterSpec("q", [10.0, 0.1], "1/rad^2, s^2/rad^2", "Weights of angle and velocity.", minimum=0.0),
@@ -47,19 +48,19 @@ class NonlinearMpc(BaseController):
     )  # fmt: skip
 
     def __init__(self, plant: PlantParameters, period: float, p: Mapping[str, Any], catch: Catch) -> None:
-        super().__init__(p["effort_limit"])
+        super().__init__(p["effort_limit"], catch.set_point)
         self.catch = catch
         self.period = period
         self.step = float(p["step"])
         self.steps = int(p["steps"])
         self.failures = 0
-        self._solver, self._lower, self._upper = _problem(plant, p)
+        self._solver, self._lower, self._upper = _problem(plant, p, catch.hold)
         self._plan: Array | None = None
 
     @classmethod
     def design(cls, plant: PlantParameters, period: float, p: Mapping[str, Any]) -> NonlinearMpc:
-        """Build the problem; the catch holds upright, so the set-point is 0."""
-        catch = make_catch(plant, p["catch_q"], p["catch_r"], p["effort_limit"])
+        """Build the problem; the catch holds the set-point."""
+        catch = make_catch(plant, p["catch_q"], p["catch_r"], p["effort_limit"], set_point=p["set_point"])
         return cls(plant, period, p, catch)
 
     def reset(self) -> None:
@@ -83,6 +84,11 @@ class NonlinearMpc(BaseController):
             self._plan = guess
         return self.clamp(float(self._plan[2]))
 
+    def take_over(self, previous: Controller) -> None:
+        """Take over whether the LQR is in charge."""
+        if isinstance(previous, NonlinearMpc):
+            self.catch.active = previous.catch.active
+
     def describe(self) -> str:
         """Return horizon and catch."""
         return f"horizon {self.steps} x {self.step:g} s, catch {self.catch.describe()}"
@@ -105,7 +111,7 @@ class NonlinearMpc(BaseController):
         return guess
 
 
-def _problem(plant: PlantParameters, p: Mapping[str, Any]) -> tuple[Any, Array, Array]:
+def _problem(plant: PlantParameters, p: Mapping[str, Any], hold: float) -> tuple[Any, Array, Array]:
     """Return (solver, lower, upper) of the optimisation over [x0, u0, x1, u1, ..., xN]."""
     steps, step, limit = int(p["steps"]), float(p["step"]), float(p["effort_limit"])
     x, u = casadi.MX.sym("x", 2), casadi.MX.sym("u")
@@ -139,7 +145,7 @@ def _problem(plant: PlantParameters, p: Mapping[str, Any]) -> tuple[Any, Array, 
     upper: list[float] = []
     for k in range(steps):
         variables += [X[k], U[k]]
-        cost += step * (state_cost(X[k]) + p["r"] * U[k] ** 2)
+        cost += step * (state_cost(X[k]) + p["r"] * (U[k] - hold) ** 2)
         constraints.append(X[k + 1] - advance(X[k], U[k]))
         if k == 0:
             constraints.append(X[0] - measured)

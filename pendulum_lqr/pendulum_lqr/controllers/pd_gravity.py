@@ -7,6 +7,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from pendulum_lqr.controller import BaseController
+from pendulum_lqr.model import linearise, low_frequency, torque_gain
 from pendulum_msgs_py.parameters import ParameterSpec
 from pendulum_msgs_py.plants.plant_parameters import PlantParameters
 
@@ -14,12 +15,14 @@ __all__ = ["PdGravity"]
 
 
 class PdGravity(BaseController):
-    """u = G_c sin(theta) - k_p (theta - theta*) - k_d theta_dot: holds any angle, upright or not.
+    """u = (G_c sin(theta - angle_offset) - torque_offset) / gain - k_p (theta - theta*) - k_d theta_dot.
+
+    Holds any angle, upright or not; gain is what the actuator gives per torque asked for, 1 for a rigid plant.
 
     Args:
+        plant: Plant parameters.
         kp: Proportional gain [N m/rad].
         kd: Derivative gain [N m s/rad].
-        gravity: G_c [N m].
         effort_limit: Largest torque [N m].
         set_point: Angle from upright [rad].
     """
@@ -33,26 +36,34 @@ class PdGravity(BaseController):
     )  # fmt: skip
 
     def __init__(
-        self, kp: float, kd: float, gravity: float, effort_limit: float, set_point: float = 0.0
+        self, plant: PlantParameters, kp: float, kd: float, effort_limit: float, set_point: float = 0.0
     ) -> None:
         super().__init__(effort_limit, set_point)
         self.kp = kp
         self.kd = kd
-        self.gravity = gravity
+        gain = torque_gain(plant)
+        self._gravity = plant.gravity / gain
+        self._angle_offset = plant.angle_offset
+        self._offset = plant.torque_offset / gain
 
     @classmethod
     def design(cls, plant: PlantParameters, period: float, p: Mapping[str, Any]) -> PdGravity:
-        """Place the slowest pole of M s^2 + (b + k_d) s + k_p at -bandwidth, critically damped if b allows."""
+        """Place the slowest pole of M s^2 + (b + k_d) s + k_p at -bandwidth, critically damped if b allows.
+
+        M and b are those of slow motion, motor and gears included.
+        """
         w = p["bandwidth"]
-        kd = p["kd"] if p["kd"] > 0.0 else max(0.0, 2.0 * plant.inertia * w - plant.damping)
+        inertia, damping, _ = low_frequency(linearise(plant.with_values(gravity=0.0)))
+        kd = p["kd"] if p["kd"] > 0.0 else max(0.0, 2.0 * inertia * w - damping)
         # M w^2 - (b + k_d) w + k_p = 0; where damping is ample the other pole is faster.
-        kp = p["kp"] if p["kp"] > 0.0 else w * (plant.damping + kd) - plant.inertia * w * w
-        return cls(kp, kd, plant.gravity, p["effort_limit"], p["set_point"])
+        kp = p["kp"] if p["kp"] > 0.0 else w * (damping + kd) - inertia * w * w
+        return cls(plant, kp, kd, p["effort_limit"], p["set_point"])
 
     def command(self, t: float, x: Sequence[float]) -> float:
         """Return the torque [N m]."""
         # sin(theta) = -sin(theta - pi)
-        return self.clamp(-self.gravity * math.sin(x[0]) - self.kp * self.error(x[0]) - self.kd * x[1])
+        weight = -self._gravity * math.sin(x[0] - self._angle_offset) - self._offset
+        return self.clamp(weight - self.kp * self.error(x[0]) - self.kd * x[1])
 
     def describe(self) -> str:
         """Return the gains."""

@@ -103,7 +103,7 @@ class Pid(BaseController):
         gains = self.gains
         return f"kp = {gains.kp:.6g} N m/rad, ki = {gains.ki:.6g} N m/(rad s), kd = {gains.kd:.6g} N m s/rad"
 
-    def carry_over(self, previous: Controller) -> None:
+    def take_over(self, previous: Controller) -> None:
         """Take over integral torque and derivative."""
         if isinstance(previous, Pid):
             self._integral_torque = previous._integral_torque

@@ -32,6 +32,7 @@ class Playback(BaseController):
         DataError: Shapes differ, values are not finite, or times do not increase.
     """
 
+    FEEDBACK = False
     SUMMARY = "open loop: plays a recorded torque"
     PARAMETERS = (
         ParameterSpec(

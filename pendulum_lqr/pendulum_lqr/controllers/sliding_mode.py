@@ -16,11 +16,13 @@ __all__ = ["SlidingMode"]
 class SlidingMode(BaseController):
     """Drives s = theta_dot + lambda e, with e = theta - theta*, to zero.
 
-        u = G sin(theta) - b lambda e - M lambda theta_dot - k sat(s / phi)
+        u = G sin(theta - theta_0) - tau_0 - b lambda e - M lambda theta_dot - k sat(s / phi)
 
-    This leaves M s' = -b s - k sat(s / phi) - d: the plant's own damping is kept and not cancelled, because cancelling
+    with the plant's offsets theta_0 and tau_0. This leaves M s' = -b s - k sat(s / phi) + d: the
+    plant's own damping is kept and not cancelled, because cancelling
     b theta_dot through a sampled loop is unstable as soon as the period exceeds 2 M / b (9 ms for the thesis's plant).
-    Any disturbance below k is rejected; inside the layer the switching is smooth, so that it does not chatter.
+    The switching is smooth inside the layer, so that it does not chatter; the price is that a constant torque d below
+    b phi + k is not rejected but leaves e = d / (lambda (b + k / phi)), which may be more than a plain LQR leaves.
 
     Args:
         plant: Plant parameters.
@@ -33,7 +35,8 @@ class SlidingMode(BaseController):
     Source: Slotine and Li, Applied Nonlinear Control, 1991, section 7.2.
     """
 
-    SUMMARY = "sliding mode with a boundary layer: rejects any torque below its gain"
+    SERIES_ELASTIC = False
+    SUMMARY = "sliding mode with a boundary layer: gives way by d / (lambda (b + k / phi)) to a constant torque d"
     PARAMETERS = (
         ParameterSpec(
             "rate", 5.0, "1/s", "Slope of the sliding line, lambda.", minimum=0.0, exclusive_minimum=True
@@ -63,6 +66,8 @@ class SlidingMode(BaseController):
         self.gain = gain
         self.layer = layer
         self._gravity = plant.gravity
+        self._angle_offset = plant.angle_offset
+        self._torque_offset = plant.torque_offset
         self._proportional = plant.damping * rate
         self._derivative = plant.inertia * rate
 
@@ -77,7 +82,8 @@ class SlidingMode(BaseController):
         sliding = (x[1] + self.rate * error) / self.layer
         switch = 1.0 if sliding > 1.0 else (max(sliding, -1.0))
         return self.clamp(
-            -self._gravity * math.sin(x[0])
+            -self._gravity * math.sin(x[0] - self._angle_offset)
+            - self._torque_offset
             - self._proportional * error
             - self._derivative * x[1]
             - self.gain * switch

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pendulum_msgs_py.parameters import ParameterSpec
 
-__all__ = ["FEEDFORWARD", "Q", "R"]
+__all__ = ["DELAY", "FEEDFORWARD", "OFFSET_NOISE", "Q", "R"]
 
 Q = ParameterSpec(
     "q", [100.0, 0.01], "1/rad^2, s^2/rad^2", "Weights of angle and velocity: the diagonal of Q.", minimum=0.0
@@ -16,3 +16,11 @@ FEEDFORWARD = ParameterSpec(
     "",
     "Whether the torque that holds the set-point against gravity is added, G_c sin(theta*).",
 )
+DELAY = ParameterSpec(
+    "delay", 0.0, "s", "Delay from state to torque, beyond the plant's own transport_delay.", minimum=0.0, maximum=1.0
+)
+OFFSET_NOISE = ParameterSpec(
+    "offset_noise", 0.0, "N m/s^0.5",
+    "How fast an unknown constant torque may wander; > 0 observes and cancels it, so that no offset stays.",
+    minimum=0.0,
+)  # fmt: skip

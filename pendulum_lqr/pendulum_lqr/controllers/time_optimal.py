@@ -8,8 +8,9 @@ from functools import lru_cache
 from typing import Any
 
 from pendulum_lqr.catch import Catch, make_catch
-from pendulum_lqr.controller import BaseController
-from pendulum_lqr.minimum_time import TimeToGo, minimum_time
+from pendulum_lqr.controller import BaseController, Controller
+from pendulum_lqr.minimum_time import SIGN_VELOCITY, TimeToGo, minimum_time
+from pendulum_lqr.model import acceleration_from_upright
 from pendulum_msgs_py.parameters import ParameterSpec
 from pendulum_msgs_py.plants.plant_parameters import PlantParameters
 
@@ -27,6 +28,7 @@ class TimeOptimal(BaseController):
         horizon: How far a candidate torque looks ahead [s].
     """
 
+    SERIES_ELASTIC = False
     SUMMARY = "swing-up in minimum time by dynamic programming, caught by LQR"
     PARAMETERS = (
         ParameterSpec("grid", 400, "-", "Grid points in angle and in velocity.", minimum=40, maximum=1000),
@@ -50,7 +52,7 @@ class TimeOptimal(BaseController):
     def __init__(
         self, plant: PlantParameters, table: TimeToGo, catch: Catch, effort_limit: float, horizon: float
     ) -> None:
-        super().__init__(effort_limit)
+        super().__init__(effort_limit, catch.set_point)
         self.table = table
         self.catch = catch
         self.horizon = horizon
@@ -60,9 +62,11 @@ class TimeOptimal(BaseController):
     @classmethod
     def design(cls, plant: PlantParameters, period: float, p: Mapping[str, Any]) -> TimeOptimal:
         """Return the controller; the table takes a second or two and is kept for the next design."""
-        catch = make_catch(plant, p["catch_q"], p["catch_r"], p["effort_limit"], p["catch_share"])
+        catch = make_catch(
+            plant, p["catch_q"], p["catch_r"], p["effort_limit"], p["catch_share"], p["set_point"]
+        )
         table = _table(
-            plant, p["effort_limit"], tuple(p["catch_q"]), p["catch_r"], p["catch_share"], p["grid"]
+            plant, p["effort_limit"], tuple(p["catch_q"]), p["catch_r"], p["catch_share"], p["set_point"], p["grid"]
         )
         return cls(plant, table, catch, p["effort_limit"], max(period, table.step))
 
@@ -85,24 +89,40 @@ class TimeOptimal(BaseController):
         plant = self._plant
         h = self.horizon / self._substeps
         for _ in range(self._substeps):
-            dry = plant.coulomb_friction * math.tanh(velocity / 0.05)
-            acceleration = (
-                effort - dry - plant.damping * velocity + plant.gravity * math.sin(angle)
-            ) / plant.inertia
+            acceleration = acceleration_from_upright(
+                plant, angle, velocity, effort, sign_velocity=SIGN_VELOCITY
+            )
             angle += h * (velocity + 0.5 * h * acceleration)
             velocity += h * acceleration
         return angle, velocity
 
+    def take_over(self, previous: Controller) -> None:
+        """Take over whether the LQR is in charge."""
+        if isinstance(previous, TimeOptimal):
+            self.catch.active = previous.catch.active
+
     def describe(self) -> str:
         """Return the time from hanging at rest, and the catch."""
-        return f"{self.table.time(-math.pi, 0.0):.3f} s from hanging to the catch, {self.catch.describe()}"
+        hanging = self._plant.angle_offset - math.pi
+        return f"{self.table.time(hanging, 0.0):.3f} s from hanging to the catch, {self.catch.describe()}"
 
 
 @lru_cache(maxsize=8)
 def _table(
-    plant: PlantParameters, limit: float, q: tuple[float, ...], r: float, share: float, grid: int
+    plant: PlantParameters,
+    limit: float,
+    q: tuple[float, ...],
+    r: float,
+    share: float,
+    set_point: float,
+    grid: int,
 ) -> TimeToGo:
-    catch = make_catch(plant, q, r, limit, share)
+    catch = make_catch(plant, q, r, limit, share, set_point)
     return minimum_time(
-        plant, limit, (catch.gain.S, catch.level), angles=grid, velocities=grid + 1 - grid % 2
+        plant,
+        limit,
+        (catch.gain.S, catch.level),
+        centre=set_point,
+        angles=grid,
+        velocities=grid + 1 - grid % 2,
     )

@@ -7,16 +7,15 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
-import scipy.linalg
 from numpy.typing import NDArray
 
 from pendulum_lqr.catch import Catch, make_catch
-from pendulum_lqr.controller import BaseController
+from pendulum_lqr.controller import BaseController, Controller
 from pendulum_lqr.controllers.energy_swing_up import EnergySwingUp
-from pendulum_lqr.design import cost_matrices
-from pendulum_lqr.model import LinearModel
+from pendulum_lqr.design import cost_matrices, discretise
+from pendulum_lqr.model import linearise
 from pendulum_lqr.trajectory_optimisation import OptimisedTrajectory, swing_up_trajectory
-from pendulum_msgs_py.contract.angles import wrap
+from pendulum_msgs_py.contract.angles import UPRIGHT, wrap
 from pendulum_msgs_py.parameters import ParameterSpec
 from pendulum_msgs_py.plants.plant_parameters import PlantParameters
 
@@ -34,7 +33,8 @@ _ANGLE_SCALE, _VELOCITY_SCALE = 0.5, 2.0
 class Tvlqr(BaseController):
     """u = u0(t) - K(t) (x - x0(t)) along an optimised swing-up, then LQR.
 
-    The trajectory and its mirror image are tracked from wherever the state is close to one of them; far from both the
+    The trajectory and, for a plant without offsets, its mirror image are tracked from wherever the state is
+    close to one of them; far from both the
     pendulum is pumped by energy until it is close again, so that a wrong start or a push does not end the swing-up.
 
     Args:
@@ -49,6 +49,7 @@ class Tvlqr(BaseController):
     Source: Tedrake, Underactuated Robotics, section 8.2 (finite-horizon LQR along a trajectory).
     """
 
+    SERIES_ELASTIC = False
     SUMMARY = "swing-up along a trajectory by direct collocation, tracked by time-varying LQR"
     PARAMETERS = (
         ParameterSpec(
@@ -73,7 +74,11 @@ class Tvlqr(BaseController):
         pump: EnergySwingUp,
         effort_limit: float,
     ) -> None:
-        super().__init__(effort_limit)
+        super().__init__(effort_limit, catch.set_point)
+        # Gravity knows no left and right; a torque offset, or a set-point beside the top, does.
+        alike = plant.torque_offset == 0.0 and catch.set_point == plant.angle_offset
+        self._signs = (1.0, -1.0) if alike else (1.0,)
+        self._centre = plant.angle_offset
         self.trajectory = trajectory
         self.catch = catch
         self.pump = pump
@@ -85,18 +90,19 @@ class Tvlqr(BaseController):
         )
         # A held sample does best with the torque of the middle of its interval.
         self.efforts = np.interp(times + 0.5 * period, trajectory.times, trajectory.efforts)
-        self.efforts[times >= trajectory.duration] = 0.0
+        self.efforts[times >= trajectory.duration] = catch.hold
         self.gains = _gains(plant, period, self.states, q, r, catch.gain.S)
+        self.states[:, 0] -= self._centre
         self._scaled = self.states / np.array([_ANGLE_SCALE, _VELOCITY_SCALE])
         self.reset()
 
     @classmethod
     def design(cls, plant: PlantParameters, period: float, p: Mapping[str, Any]) -> Tvlqr:
         """Optimise the trajectory (a second or so) and its gains."""
-        limit = p["effort_limit"]
-        trajectory = swing_up_trajectory(plant, limit * (1.0 - p["reserve"]), p["nodes"])
-        catch = make_catch(plant, p["catch_q"], p["catch_r"], limit)
-        pump_catch = make_catch(plant, (30.0, 0.3), 1.0, limit, 1.0)
+        limit, set_point = p["effort_limit"], p["set_point"]
+        catch = make_catch(plant, p["catch_q"], p["catch_r"], limit, set_point=set_point)
+        trajectory = swing_up_trajectory(plant, limit * (1.0 - p["reserve"]), p["nodes"], set_point)
+        pump_catch = make_catch(plant, (30.0, 0.3), 1.0, limit, 1.0, set_point)
         pump = EnergySwingUp(plant, 50.0, 0.1, pump_catch, limit)
         return cls(plant, period, trajectory, p["q"], p["r"], catch, pump, limit)
 
@@ -105,23 +111,26 @@ class Tvlqr(BaseController):
         self.catch.reset()
         self.pump.reset()
         self._index: int | None = None
+        self._joined = (0.0, 0)
         self._sign = 1.0
         self._losses = 0
 
     def command(self, t: float, x: Sequence[float]) -> float:
         """Return the torque [N m]."""
-        angle, velocity = x[0], x[1]
-        if self.catch.holds(angle, velocity):
+        angle, velocity = x[0] - self._centre, x[1]
+        if self.catch.holds(x[0], velocity):
             self._index, self._losses = None, 0
-            return self.catch.command(angle, velocity)
+            return self.catch.command(x[0], velocity)
         if self._index is not None:
-            self._index += 1
+            # By time, not by answers: a state that was not answered does not hold up the trajectory.
+            began, first = self._joined
+            self._index = first + round((t - began) / self.period)
             if self._index >= len(self.efforts) or self._distance(self._index, angle, velocity) > _LOST:
                 self._index = None
                 self._losses += 1
         # A plant that cannot be kept on the trajectory differs from the model; energy asks less of the model.
         if self._index is None and self._losses < _MOST_LOSSES:
-            self._find(angle, velocity)
+            self._find(t, angle, velocity)
         if self._index is None:
             return self.clamp(self.pump.command(t, x))
         k = self._index
@@ -131,6 +140,12 @@ class Tvlqr(BaseController):
         feedback = float(gain[0]) * error + float(gain[1]) * (self._sign * velocity - float(nominal[1]))
         return self.clamp(self._sign * (float(self.efforts[k]) - feedback))
 
+    def take_over(self, previous: Controller) -> None:
+        """Take over whether the LQR is in charge; a trajectory of its own has to be joined anew."""
+        if isinstance(previous, Tvlqr):
+            self.catch.active = previous.catch.active
+            self.pump.take_over(previous.pump)
+
     def describe(self) -> str:
         """Return the trajectory's length and the catch."""
         return f"trajectory of {self.trajectory.duration:.3f} s, catch {self.catch.describe()}"
@@ -139,17 +154,17 @@ class Tvlqr(BaseController):
         error = wrap(self._sign * angle - float(self.states[index, 0])) / _ANGLE_SCALE
         return math.hypot(error, (self._sign * velocity - float(self.states[index, 1])) / _VELOCITY_SCALE)
 
-    def _find(self, angle: float, velocity: float) -> None:
+    def _find(self, t: float, angle: float, velocity: float) -> None:
         """Join the trajectory, or its mirror image, where it passes closest; not at all if that is too far."""
         best = _CLOSE
-        for sign in (1.0, -1.0):
+        for sign in self._signs:
             error = (sign * angle - self.states[:, 0] + math.pi) % (2.0 * math.pi) - math.pi
             distance = np.hypot(error / _ANGLE_SCALE, sign * velocity / _VELOCITY_SCALE - self._scaled[:, 1])
             # The last samples lie within the catch: joining there would follow a trajectory that is over.
             index = int(np.argmin(distance[:-1]))
             if distance[index] < best:
                 best = float(distance[index])
-                self._index, self._sign = index, sign
+                self._index, self._sign, self._joined = index, sign, (t, index)
 
 
 def _gains(
@@ -158,22 +173,13 @@ def _gains(
     """Return the discrete time-varying gains by the backward Riccati recursion, shape (n, 2)."""
     Q, R = cost_matrices(q, r)
     S = terminal
+    prompt = plant.with_values(actuator_time_constant=0.0, transport_delay=0.0)
     gains = np.zeros((len(states), 2))
     for k in range(len(states) - 1, -1, -1):
-        model = _linearised(plant, float(states[k, 0]))
-        block = np.zeros((3, 3))
-        block[:2, :2], block[:2, 2:] = model.A, model.B
-        step = scipy.linalg.expm(block * period)
-        A, B = step[:2, :2], step[:2, 2:]
+        sampled = discretise(linearise(prompt, UPRIGHT + float(states[k, 0])), period)
+        A, B = sampled.A, sampled.B
         K = (B.T @ S @ A) / float((R * period + B.T @ S @ B)[0, 0])
         S = Q * period + A.T @ S @ (A - B @ K)
         S = 0.5 * (S + S.T)
         gains[k] = K[0]
     return gains
-
-
-def _linearised(plant: PlantParameters, angle: float) -> LinearModel:
-    A = np.array(
-        [[0.0, 1.0], [plant.gravity * math.cos(angle) / plant.inertia, -plant.damping / plant.inertia]]
-    )
-    return LinearModel(A, np.array([[0.0], [1.0 / plant.inertia]]))
