@@ -98,6 +98,7 @@ class ControllerNode(LifecycleNode):
         self._settings = NodeParameters(self, specs, self._design, self._swap)
         self._plant: PlantParameters = load_plant(self._settings["plant"])
         self._period = self._settings["period"] or ASSUMED_PERIOD
+        self._period_measured = False
         # A bad value at start ends the node with its reason instead of waiting for a transition to fail.
         self._pending: Controller | None = self._design(self._settings.values)
         self._simulated_time = bool(self.get_parameter("use_sim_time").value)
@@ -221,7 +222,9 @@ class ControllerNode(LifecycleNode):
 
     def _design(self, values: Mapping[str, Any]) -> Controller:
         own = {name: value for name, value in values.items() if name not in self._own}
-        return make_controller(values["controller"], self._plant, self._period, own)
+        # As long as nobody knows the period, nobody can say whether the loop is stable at it.
+        known = bool(values["period"]) or self._period_measured
+        return make_controller(values["controller"], self._plant, self._period, own, checked=known)
 
     def _design_for(self, period: float) -> None:
         """Take another period, and design anew where that makes a difference."""
@@ -258,8 +261,11 @@ class ControllerNode(LifecycleNode):
         values = self._settings.values
         self._refusal = ""
         try:
+            self._period_measured = True
             if not values["period"] and abs(measured / self._period - 1.0) > _SAME_PERIOD:
                 self._design_for(measured)
+            elif not values["period"] and self._uses_period():
+                self._design(values)
             self._refusal = rate_problem(
                 lambda: self._design(values), values["controller"], self._plant, self._period, measured,
                 uses=self._uses_period(), set_point=values["set_point"],

@@ -18,7 +18,7 @@ from pendulum_msgs_py.contract.angles import UPRIGHT
 if TYPE_CHECKING:
     from pendulum_lqr.controller import Controller
 
-__all__ = ["growth", "require_stable"]
+__all__ = ["MOST_GROWTH", "growth", "require_stable"]
 
 _START = 1e-5
 """Deviation from which the loop is released [rad]; a hundred times as much is still far from every limit."""
@@ -27,7 +27,8 @@ _WINDOW = 100
 _WINDOWS = 100
 _DEAD, _FALLEN = 0.2, 100.0 * _START
 """A spread below this share of the largest one has died out; beyond this deviation [rad] it never will."""
-_GROWTH = 1.05
+MOST_GROWTH = 1.05
+"""Growth up to which a loop counts as one that settles."""
 
 
 def growth(controller: Controller, plant: RigidPlant, period: float, set_point: float = 0.0) -> float:
@@ -88,7 +89,7 @@ def require_stable(
     Raises:
         DesignError: The loop grows.
     """
-    if growth(controller, plant, period, set_point) <= _GROWTH:
+    if growth(controller, plant, period, set_point) <= MOST_GROWTH:
         return
     model = linearise(plant, UPRIGHT + set_point)
     late = f", a delay of {model.delay:g} s" if model.delay > 0.0 else ""

@@ -2,17 +2,12 @@
 
 from __future__ import annotations
 
-import math
 import statistics
 from collections import deque
 from collections.abc import Callable
 
-import numpy as np
-
 from pendulum_lqr.controller import Controller
-from pendulum_lqr.design import discretise
-from pendulum_lqr.model import linearise
-from pendulum_msgs_py.contract.angles import UPRIGHT, wrap
+from pendulum_lqr.loop_check import MOST_GROWTH, growth
 from pendulum_msgs_py.contract.values import NANOSECONDS
 from pendulum_msgs_py.plants.plant_parameters import PlantParameters
 
@@ -29,9 +24,6 @@ _IGNORE_PERIOD = frozenset({"lqr", "pd_gravity", "sliding_mode", "energy_swing_u
 _BALANCING = frozenset({"lqr", "lqi", "lqg", "discrete_lqr", "pid", "pd_gravity", "mpc", "sliding_mode"})
 _FAST_PERIOD = 2e-3
 """Up to this period a design in continuous time is taken at its word [s]."""
-_RELEASE = 0.01
-_DURATION = 3.0
-_MOST_SAMPLES = 1500
 
 
 class PeriodWatch:
@@ -87,32 +79,13 @@ def uses_period(kind: str, velocity: str = "measured") -> bool:
 def settles(controller: Controller, plant: PlantParameters, period: float, set_point: float = 0.0) -> bool:
     """Tell whether a balancing controller settles on the linear model of its plant when it is asked at a period.
 
-    It is released 0.01 rad beside its set-point, for up to 3 s; dry friction, which would hold it there, is no part of
-    the model.
-
     Args:
-        controller: The controller; it is used up.
+        controller: The controller; it is reset.
         plant: The plant that it was designed for.
         period: Period at which it is asked [s].
         set_point: Angle to hold, from upright [rad].
     """
-    model = linearise(plant, UPRIGHT + set_point)
-    sampled = discretise(model, period)
-    state = np.zeros(sampled.A.shape[0])
-    state[0] = _RELEASE
-    samples = int(min(_MOST_SAMPLES, max(200.0, _DURATION / period)))
-    limit = min(controller.effort_limit, plant.effort_limit)
-    late = 0.0
-    for k in range(samples):
-        if not abs(state[0]) < 1.0:
-            return False
-        effort = controller.command(k * period, (wrap(set_point + float(state[0])), float(state[1])))
-        if not math.isfinite(effort):
-            return False
-        state = sampled.A @ state + sampled.B[:, 0] * (min(limit, max(-limit, effort)) - model.effort)
-        if k >= 0.75 * samples:
-            late = max(late, abs(float(state[0])))
-    return late < _RELEASE
+    return growth(controller, plant, period, set_point) <= MOST_GROWTH
 
 
 def rate_problem(
