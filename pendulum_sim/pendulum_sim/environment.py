@@ -3,7 +3,7 @@
 Observation: x = [wrap(theta - pi), theta_dot] [rad, rad/s], as controllers see it: 0 is upright.
 Action: torque u [N m], Box of shape (1,), clamped to the effort limit.
 Reward: -(q_1 x_1^2 + q_2 x_2^2 + r u^2) at the state in which the action was chosen.
-Episodes never terminate; they are truncated after 5 s by default.
+Episodes never terminate; they are truncated after 5 s by default, whatever the step.
 
 Importing ``pendulum_sim.environment`` registers it, and so does
 ``gymnasium.make("pendulum_sim.environment:PendulumX59-v0")``.
@@ -12,7 +12,8 @@ Importing ``pendulum_sim.environment`` registers it, and so does
 from __future__ import annotations
 
 import math
-from typing import Any, ClassVar
+from collections.abc import Mapping, Sequence
+from typing import Any
 
 import gymnasium
 import numpy as np
@@ -29,19 +30,23 @@ from pendulum_sim.plant import check_start, check_step, make_plant
 
 __all__ = [
     "ENVIRONMENT_ID",
-    "EPISODE_STEPS",
+    "EPISODE_TIME",
     "STARTS",
     "PendulumEnv",
     "action_space",
     "check_arguments",
+    "check_reset_options",
     "draw_start",
+    "episode_steps",
     "observation_space",
     "register",
 ]
 
 ENVIRONMENT_ID = "PendulumX59-v0"
-EPISODE_STEPS = 2500
-"""Steps after which an episode is truncated: 5 s at 2 ms, the length of the thesis's runs."""
+EPISODE_TIME = 5.0
+"""Time after which an episode is truncated: the length of the thesis's runs [s]."""
+_WINDOW_FPS = 50.0
+"""Pictures a second in a window, which follows real time; a picture of each step would be ten times too many."""
 STARTS = ("bottom", "top", "random")
 THESIS_Q = (100.0, 0.01)
 THESIS_R = 0.1
@@ -63,12 +68,15 @@ class PendulumEnv(gymnasium.Env[Array, Array]):
         r: Weight of the torque.
         render_mode: None, ``human`` or ``rgb_array``.
         screen_size: Width and height of the picture [px].
+        episode_time: Time after which an episode is truncated, inf for never [s]; ``max_episode_steps`` of
+            ``gymnasium.make`` can only make it shorter.
 
     Raises:
         ParameterError: An argument is outside its domain.
     """
 
-    metadata: ClassVar[dict[str, Any]] = {"render_modes": ["human", "rgb_array"], "render_fps": 50}
+    # The class's for 2 ms; each environment has the rate of its own steps, a frame each, so that videos are in time.
+    metadata: dict[str, Any] = {"render_modes": ["human", "rgb_array"], "render_fps": 500}  # noqa: RUF012  # gymnasium's
 
     def __init__(
         self,
@@ -84,14 +92,19 @@ class PendulumEnv(gymnasium.Env[Array, Array]):
         r: float = THESIS_R,
         render_mode: str | None = None,
         screen_size: tuple[int, int] = (600, 600),
+        episode_time: float = EPISODE_TIME,
     ) -> None:
         parameters = plant if isinstance(plant, PlantParameters) else load_plant(plant)
-        check_arguments(dt, substeps, start, disturbance, hold, method)
+        check_arguments(dt, substeps, start, disturbance, hold, method, q, r)
         if render_mode is not None and render_mode not in self.metadata["render_modes"]:
             raise ParameterError(f"render_mode is {render_mode!r}; expected None, human or rgb_array")
         self.parameters = parameters
         self.dt = dt
+        self.metadata = {**self.metadata, "render_fps": max(1, round(1.0 / dt))}
         self.render_mode = render_mode
+        self._steps = 0
+        self._limit = episode_steps(episode_time, dt)
+        self._steps_a_picture = max(1, round(1.0 / (_WINDOW_FPS * dt)))
         self.observation_space = observation_space(parameters, disturbance)
         self.action_space = action_space(parameters)
         self._start = start
@@ -140,9 +153,8 @@ class PendulumEnv(gymnasium.Env[Array, Array]):
         """
         super().reset(seed=seed)
         options = options or {}
-        unknown = set(options) - {"state", "start"}
-        if unknown:
-            raise ParameterError(f"reset option {min(unknown)!r} is unknown; expected state or start")
+        check_reset_options(options, ("state", "start"))
+        self._steps = 0
         state = options.get("state")
         if state is None:
             x = draw_start(options.get("start", self._start), self.np_random, 1)[0]
@@ -170,10 +182,13 @@ class PendulumEnv(gymnasium.Env[Array, Array]):
             action: u, shape (1,) [N m].
 
         Returns:
-            Observation (2,), reward, terminated (never), truncated (never: a wrapper does), and an empty dict.
+            Observation (2,), reward, terminated (never), truncated (when its time is over), and an empty dict.
         """
         if type(action) is not np.ndarray:
             action = np.asarray(action, dtype=np.float32)
+        if action.size != 1:
+            raise ParameterError(f"action has shape {action.shape}; expected (1,)")
+        self._steps += 1
         if self._plant is None:
             observation = np.empty(2)
             self._kernel(
@@ -183,7 +198,7 @@ class PendulumEnv(gymnasium.Env[Array, Array]):
                 self._hold,
                 self._h,
                 self._substeps,
-                action,
+                action if action.ndim == 1 else action.reshape(1),
                 observation,
                 self._rewards,
             )
@@ -191,9 +206,9 @@ class PendulumEnv(gymnasium.Env[Array, Array]):
             if math.isnan(reward):
                 raise ParameterError(f"action is {action} N m; expected a finite number")
             if self.render_mode == "human":
-                self.render()
-            return observation, reward, False, False, {}
-        return self._step_any(float(action[0]))
+                self._show()
+            return observation, reward, False, self._steps >= self._limit, {}
+        return self._step_any(float(action.reshape(-1)[0]))
 
     def _step_any(self, action: float) -> tuple[Array, float, bool, bool, dict[str, Any]]:
         if not math.isfinite(action):
@@ -209,8 +224,14 @@ class PendulumEnv(gymnasium.Env[Array, Array]):
         reward = -(self._q[0] * deviation**2 + self._q[1] * before.theta_dot**2 + self._r * self.effort**2)
         state = self._plant.step(self.effort + disturbance)
         if self.render_mode == "human":
+            self._show()
+        observation = np.array([from_upright(state.theta), state.theta_dot])
+        return observation, reward, False, self._steps >= self._limit, {}
+
+    def _show(self) -> None:
+        """Show a step in the window, where a picture is due."""
+        if self._steps % self._steps_a_picture == 0:
             self.render()
-        return np.array([from_upright(state.theta), state.theta_dot]), reward, False, False, {}
 
     def render(self) -> NDArray[np.uint8] | None:
         """Draw the present state: into a window, or as an array of shape (height, width, 3)."""
@@ -226,7 +247,8 @@ class PendulumEnv(gymnasium.Env[Array, Array]):
         torque = self.effort if self._plant is not None else float(self._w[2])
         time = int(self._counts[0]) * self.dt
         if self.render_mode == "human":
-            self._window.show(self.theta, self.theta_dot, torque, time=time, fps=self.metadata["render_fps"])
+            fps = round(1.0 / (self._steps_a_picture * self.dt))
+            self._window.show(self.theta, self.theta_dot, torque, time=time, fps=fps)
             return None
         self._window.draw(self.theta, self.theta_dot, torque, time=time)
         return self._window.array()
@@ -274,12 +296,40 @@ def register() -> None:
             ENVIRONMENT_ID,
             entry_point="pendulum_sim.environment:PendulumEnv",
             vector_entry_point="pendulum_sim.vector_environment:PendulumVectorEnv",
-            max_episode_steps=EPISODE_STEPS,
         )
 
 
-def check_arguments(dt: float, substeps: int, start: str, disturbance: float, hold: int, method: str) -> None:
+def episode_steps(episode_time: float, dt: float) -> float:
+    """Return after how many steps an episode is over; inf for never."""
+    if not episode_time > 0.0:
+        raise ParameterError(f"episode_time is {episode_time} s; expected > 0")
+    return math.inf if math.isinf(episode_time) else max(1, math.ceil(episode_time / dt - 1e-9))
+
+
+def check_reset_options(options: Mapping[str, Any], known: Sequence[str]) -> None:
+    """Refuse an option that nobody would heed."""
+    unknown = set(options) - set(known)
+    if unknown:
+        expected = f"{', '.join(known[:-1])} or {known[-1]}"
+        raise ParameterError(f"reset option {min(unknown)!r} is unknown; expected {expected}")
+
+
+def check_arguments(
+    dt: float,
+    substeps: int,
+    start: str,
+    disturbance: float,
+    hold: int,
+    method: str,
+    q: Sequence[float],
+    r: float,
+) -> None:
     """Refuse arguments that make no environment."""
+    weights = np.asarray(q, dtype=np.float64)
+    if weights.shape != (2,) or not np.isfinite(weights).all():
+        raise ParameterError(f"q is {q}; expected two finite numbers, the weights of angle and velocity")
+    if not math.isfinite(r):
+        raise ParameterError(f"r is {r}; expected a finite number")
     check_step(dt, substeps)
     if method != "auto":
         get_integrator(method)

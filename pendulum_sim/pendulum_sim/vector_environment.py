@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Any, ClassVar
 
 import numpy as np
+from gymnasium.utils import seeding
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
@@ -14,13 +15,15 @@ from pendulum_msgs_py.contract.angles import UPRIGHT, from_upright
 from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.plants.plant_parameters import PlantParameters, load_plant
 from pendulum_sim.environment import (
-    EPISODE_STEPS,
+    EPISODE_TIME,
     THESIS_Q,
     THESIS_R,
     Array,
     action_space,
     check_arguments,
+    check_reset_options,
     draw_start,
+    episode_steps,
     observation_space,
 )
 from pendulum_sim.environment_kernel import is_smooth, lane_table, step_kernel
@@ -35,7 +38,8 @@ class PendulumVectorEnv(VectorEnv[Array, Array, NDArray[Any]]):
 
     Args:
         num_envs: Pendulums, >= 1.
-        max_episode_steps: Steps after which an episode is truncated; it restarts with the step after that.
+        max_episode_steps: Steps after which an episode is truncated; it restarts with the step after that. None for
+            ``episode_time``.
         plant: As for :class:`PendulumEnv`.
         dt: As for :class:`PendulumEnv`.
         method: As for :class:`PendulumEnv`.
@@ -45,6 +49,7 @@ class PendulumVectorEnv(VectorEnv[Array, Array, NDArray[Any]]):
         hold: As for :class:`PendulumEnv`.
         q: As for :class:`PendulumEnv`.
         r: As for :class:`PendulumEnv`.
+        episode_time: As for :class:`PendulumEnv`.
 
     Raises:
         ParameterError: An argument is outside its domain.
@@ -56,7 +61,7 @@ class PendulumVectorEnv(VectorEnv[Array, Array, NDArray[Any]]):
         self,
         num_envs: int = 1,
         *,
-        max_episode_steps: int = EPISODE_STEPS,
+        max_episode_steps: int | None = None,
         plant: str | PlantParameters = "thesis",
         dt: float = 2e-3,
         method: str = "auto",
@@ -67,10 +72,12 @@ class PendulumVectorEnv(VectorEnv[Array, Array, NDArray[Any]]):
         q: tuple[float, float] = THESIS_Q,
         r: float = THESIS_R,
         render_mode: str | None = None,
+        episode_time: float = EPISODE_TIME,
     ) -> None:
         parameters = plant if isinstance(plant, PlantParameters) else load_plant(plant)
-        check_arguments(dt, substeps, start, disturbance, hold, method)
-        if num_envs < 1 or max_episode_steps < 1:
+        check_arguments(dt, substeps, start, disturbance, hold, method, q, r)
+        last = episode_steps(episode_time, dt) if max_episode_steps is None else max_episode_steps
+        if num_envs < 1 or last < 1:
             raise ParameterError(
                 f"num_envs is {num_envs} and max_episode_steps {max_episode_steps}; expected both >= 1"
             )
@@ -95,7 +102,7 @@ class PendulumVectorEnv(VectorEnv[Array, Array, NDArray[Any]]):
         self._start = start
         self._hold = hold
         self._h, self._substeps = dt / substeps, substeps
-        self._max_steps = max_episode_steps
+        self._max_steps = last
         blocks = -(-num_envs // _LANES)
         table = lane_table(parameters, method, self._h, _LANES, disturbance, q, r)
         self._w = np.repeat(table.reshape(1, -1), blocks, axis=0)
@@ -104,15 +111,55 @@ class PendulumVectorEnv(VectorEnv[Array, Array, NDArray[Any]]):
         self._actions = np.zeros((blocks, _LANES))
         self._kernel = step_kernel(method, _LANES)
         self._done = np.zeros(num_envs, dtype=np.bool_)
+        self._generators: list[np.random.Generator] | None = None
 
     def reset(
         self, *, seed: int | list[int | None] | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Array, dict[str, Any]]:
-        """Start all episodes, or those of ``options["reset_mask"]``; returns observations of shape (N, 2)."""
-        super().reset(seed=seed[0] if isinstance(seed, list) else seed, options=options)
-        mask = (options or {}).get("reset_mask")
-        which = np.arange(self.num_envs) if mask is None else np.flatnonzero(mask)
-        self._restart(which)
+        """Start all episodes, or some.
+
+        Args:
+            seed: One seed for all, whose pendulums then share a generator, or one for each: pendulum i then starts and
+                is disturbed as a single environment reset with that seed; where one is None, it goes on drawing.
+            options: ``start``: one of ``STARTS``; ``state``: starts [x_1, x_2], shape (2,) or (N, 2), in the
+                observation's convention; ``reset_mask``: which to start, shape (N,).
+
+        Returns:
+            Observations, shape (N, 2), and an empty dict.
+
+        Raises:
+            ParameterError: An option is unknown, or has another shape.
+        """
+        options = options or {}
+        check_reset_options(options, ("state", "start", "reset_mask"))
+        n = self.num_envs
+        if isinstance(seed, (list, tuple, np.ndarray)):
+            if len(seed) != n:
+                raise ParameterError(f"seed has {len(seed)} entries; expected one for each of {n} pendulums")
+            before = self._generators
+            self._generators = [
+                before[index]
+                if given is None and before is not None
+                else seeding.np_random(None if given is None else int(given))[0]
+                for index, given in enumerate(seed)
+            ]
+        elif seed is not None:
+            super().reset(seed=seed)
+            self._generators = None
+        mask = np.asarray(options.get("reset_mask", np.ones(n, dtype=np.bool_)))
+        if mask.shape != (n,) or mask.dtype != np.bool_:
+            raise ParameterError(f"reset_mask has shape {mask.shape} of {mask.dtype}; expected ({n},) of bool")
+        which = np.flatnonzero(mask)
+        state = options.get("state")
+        starts = None
+        if state is not None:
+            starts = np.asarray(state, dtype=np.float64)
+            if starts.shape not in {(2,), (n, 2)} or not np.isfinite(starts).all():
+                raise ParameterError(
+                    f"start state has shape {starts.shape}; expected finite numbers of shape (2,) or ({n}, 2)"
+                )
+            starts = np.broadcast_to(starts, (n, 2))[which]
+        self._restart(which, options.get("start", self._start), starts)
         self._done[which] = False
         return self._observe(), {}
 
@@ -126,6 +173,8 @@ class PendulumVectorEnv(VectorEnv[Array, Array, NDArray[Any]]):
             Observations (N, 2), rewards (N,), terminated (N,), truncated (N,), and an empty dict.
         """
         n = self.num_envs
+        if np.size(actions) != n:
+            raise ParameterError(f"actions have shape {np.shape(actions)}; expected ({n}, 1)")
         self._actions.reshape(-1)[:n] = np.reshape(actions, n)
         observations = np.empty((self._w.shape[0], 2 * _LANES))
         rewards = np.empty((self._w.shape[0], _LANES))
@@ -143,16 +192,24 @@ class PendulumVectorEnv(VectorEnv[Array, Array, NDArray[Any]]):
             )
         if restart.size:
             # By gymnasium's rule for NEXT_STEP this step starts their next episodes; its action counts for nothing.
-            self._restart(restart)
+            self._restart(restart, self._start)
             result[restart] = self._observe()[restart]
             reward[restart] = 0.0
         truncated = self._counts.reshape(-1)[:n] >= self._max_steps
         self._done = truncated
         return result, reward, np.zeros(n, dtype=np.bool_), truncated, {}
 
-    def _restart(self, which: NDArray[np.intp]) -> None:
-        starts = draw_start(self._start, self.np_random, which.size)
-        seeds = self.np_random.integers(2**63, size=which.size)
+    def _restart(self, which: NDArray[np.intp], start: str, starts: Array | None = None) -> None:
+        if self._generators is None:
+            drawn = draw_start(start, self.np_random, which.size) if starts is None else starts
+            seeds = self.np_random.integers(2**63, size=which.size)
+        else:
+            # In the order of the single environment: the start, then the noise.
+            own = [self._generators[index] for index in which]
+            each = [draw_start(start, generator, 1)[0] for generator in own] if starts is None else starts
+            drawn = np.reshape(each, (which.size, 2))
+            seeds = np.array([generator.integers(2**63) for generator in own], dtype=np.int64)
+        starts = drawn
         block, lane = which // _LANES, which % _LANES
         self._w[block, lane] = starts[:, 0] + UPRIGHT
         self._w[block, _LANES + lane] = starts[:, 1]

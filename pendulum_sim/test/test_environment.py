@@ -2,17 +2,21 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 import warnings
+from typing import Any
 
 import gymnasium
 import numpy as np
+import pygame
 import pytest
 from gymnasium.utils.env_checker import check_env
 
 from pendulum_msgs_py.contract import noise
 from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.plants.plant_parameters import load_plant
+from pendulum_sim import drawing
 from pendulum_sim.environment import ENVIRONMENT_ID, PendulumEnv
 from pendulum_sim.plant import RigidPlant
 from pendulum_sim.vector_environment import PendulumVectorEnv
@@ -30,13 +34,32 @@ def test_gymnasium_checks_pass_for_every_plant(kwargs: dict) -> None:
     assert [text for text in told if "infinity" not in text and "symmetric and normalized" not in text] == []
 
 
-def test_it_registers_with_module_syntax_and_truncates_after_five_seconds() -> None:
-    env = gymnasium.make(f"pendulum_sim.environment:{ENVIRONMENT_ID}")
-    env.reset(seed=0)
+@pytest.mark.parametrize("dt", [2e-3, 5e-3, 0.01])
+@pytest.mark.parametrize("plant", ["thesis", "x5_9"])
+def test_it_registers_with_module_syntax_and_truncates_after_five_seconds_at_any_step(plant: str, dt: float) -> None:
+    env = gymnasium.make(f"pendulum_sim.environment:{ENVIRONMENT_ID}", dt=dt, plant=plant)
     action = np.zeros(1, dtype=np.float32)
-    flags = [env.step(action)[2:4] for _ in range(2500)]
-    assert flags[-1] == (False, True)
-    assert not any(truncated for _, truncated in flags[:-1])
+    for _ in range(2):
+        env.reset(seed=0)
+        flags = [env.step(action)[2:4] for _ in range(round(5.0 / dt))]
+        assert flags[-1] == (False, True)
+        assert not any(truncated for _, truncated in flags[:-1])
+
+
+def test_who_asks_for_another_length_gets_it() -> None:
+    def length(env: gymnasium.Env) -> int:
+        env.reset(seed=0)
+        steps = (k for k in range(1, 4000) if env.step(np.zeros(1, dtype=np.float32))[3])
+        return next(steps, 0)
+
+    assert length(gymnasium.make(ENVIRONMENT_ID, max_episode_steps=100)) == 100
+    assert length(gymnasium.make(ENVIRONMENT_ID, episode_time=6.0)) == 3000
+    assert length(PendulumEnv(dt=0.01, episode_time=0.3)) == 30
+    assert length(PendulumEnv(episode_time=math.inf)) == 0
+    vector = gymnasium.make_vec(ENVIRONMENT_ID, num_envs=2, vectorization_mode="vector_entry_point", dt=0.01)
+    vector.reset(seed=0)
+    truncated = [vector.step(np.zeros((2, 1)))[3].all() for _ in range(500)]
+    assert truncated == [False] * 499 + [True]
 
 
 def test_observations_are_those_of_the_plant_in_the_controllers_convention() -> None:
@@ -113,9 +136,92 @@ def test_the_vector_environment_equals_single_ones_and_restarts_by_itself() -> N
 
 def test_make_vec_gives_the_compiled_vector_environment() -> None:
     vector = gymnasium.make_vec(ENVIRONMENT_ID, num_envs=4, vectorization_mode="vector_entry_point")
-    x, _ = vector.reset(seed=1, options={"reset_mask": np.ones(4, dtype=bool)})
-    assert x.shape == (4, 2)
+    assert isinstance(vector.unwrapped, PendulumVectorEnv)
     assert vector.action_space.shape == (4, 1)
+
+
+def test_a_mask_starts_those_it_names_and_leaves_the_others_where_they_are() -> None:
+    vector = PendulumVectorEnv(4, start="random")
+    vector.reset(seed=1)
+    for _ in range(30):
+        before, *_ = vector.step(np.full((4, 1), 0.5))
+    mask = np.array([True, False, False, True])
+    x, _ = vector.reset(options={"reset_mask": mask, "state": [0.1, -0.2]})
+    assert x[mask] == pytest.approx(np.array([[0.1, -0.2]] * 2))
+    assert np.array_equal(x[~mask], before[~mask])
+    x, _ = vector.reset(options={"reset_mask": ~mask, "start": "bottom"})
+    assert x[~mask].tolist() == [[-math.pi, 0.0]] * 2
+    assert x[mask] == pytest.approx(np.array([[0.1, -0.2]] * 2))
+
+
+def test_a_list_of_seeds_gives_each_pendulum_its_own_episode() -> None:
+    seeds = [5, 6, 5]
+    vector = PendulumVectorEnv(3, start="random", disturbance=2.0, max_episode_steps=15)
+    x, _ = vector.reset(seed=seeds)
+    singles = [PendulumEnv(start="random", disturbance=2.0) for _ in seeds]
+    for row, env, seed in zip(x, singles, seeds, strict=True):
+        assert row == pytest.approx(env.reset(seed=seed)[0], abs=0.0)
+    for _ in range(15):
+        x, *_ = vector.step(np.full((3, 1), 0.3))
+        rows = np.array([env.step(np.array([0.3], dtype=np.float32))[0] for env in singles])
+        assert x == pytest.approx(rows, abs=1e-8)
+    assert np.array_equal(x[0], x[2])
+    assert not np.array_equal(x[0], x[1])
+    # The episodes after it go on from each pendulum's own generator.
+    x, *_ = vector.step(np.zeros((3, 1)))
+    assert np.array_equal(x[0], x[2])
+    assert x[1] == pytest.approx(singles[1].reset()[0], abs=0.0)
+
+
+@pytest.mark.parametrize(
+    ("seed", "options", "message"),
+    [
+        (None, {"strat": "top"}, "reset option 'strat' is unknown; expected state, start or reset_mask"),
+        (None, {"start": "left"}, "start is 'left'; expected one of bottom, top, random"),
+        (None, {"state": [1.0]}, r"start state has shape \(1,\)"),
+        (None, {"state": [math.nan, 0.0]}, "expected finite numbers"),
+        (None, {"reset_mask": [True]}, r"reset_mask has shape \(1,\) of bool; expected \(3,\) of bool"),
+        (None, {"reset_mask": [0, 1, 2]}, r"expected \(3,\) of bool"),
+        ([1, 2], None, "seed has 2 entries; expected one for each of 3 pendulums"),
+    ],
+)
+def test_a_reset_of_many_refuses_what_it_would_not_heed(seed: object, options: dict | None, message: str) -> None:
+    vector = PendulumVectorEnv(3)
+    with pytest.raises(ParameterError, match=message):
+        vector.reset(seed=seed, options=options)  # type: ignore[arg-type]
+
+
+def test_an_action_of_another_shape_is_refused_and_reads_nothing_beyond_it() -> None:
+    for plant in ("thesis", "x5_9"):
+        env = PendulumEnv(plant)
+        env.reset(seed=0)
+        for action in (np.empty(0, dtype=np.float32), np.zeros(2, dtype=np.float32)):
+            with pytest.raises(ParameterError, match=r"action has shape \(\d,\); expected \(1,\)"):
+                env.step(action)
+        # One number is one torque, in whatever brackets.
+        env.step(np.array(0.5))
+        env.step(np.array([[0.5]]))
+    vector = PendulumVectorEnv(3)
+    vector.reset(seed=0)
+    with pytest.raises(ParameterError, match=r"actions have shape \(2, 1\); expected \(3, 1\)"):
+        vector.step(np.zeros((2, 1)))
+
+
+@pytest.mark.parametrize("kind", [PendulumEnv, PendulumVectorEnv])
+@pytest.mark.parametrize(
+    ("kwargs", "message"),
+    [
+        ({"q": (1.0,)}, r"q is \(1.0,\); expected two finite numbers"),
+        ({"q": (1.0, 2.0, 3.0)}, "expected two finite numbers"),
+        ({"q": (1.0, math.nan)}, "expected two finite numbers"),
+        ({"r": math.inf}, "r is inf; expected a finite number"),
+        ({"episode_time": 0.0}, "episode_time is 0.0 s; expected > 0"),
+        ({"episode_time": math.nan}, "episode_time is nan s; expected > 0"),
+    ],
+)
+def test_weights_and_lengths_that_are_none_are_refused(kind: type, kwargs: dict, message: str) -> None:
+    with pytest.raises(ParameterError, match=message):
+        kind(**kwargs)
 
 
 def test_pictures_have_the_size_asked_for_and_show_the_angle() -> None:
@@ -137,12 +243,37 @@ def test_pictures_have_the_size_asked_for_and_show_the_angle() -> None:
     env.close()
 
 
-def test_a_window_can_be_opened_on_a_virtual_screen(monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize(("dt", "pictures"), [(2e-3, 10), (0.02, 100), (0.1, 100)])
+def test_a_window_follows_real_time_with_at_most_50_pictures_a_second(
+    monkeypatch: pytest.MonkeyPatch, dt: float, pictures: int
+) -> None:
     monkeypatch.setenv("SDL_VIDEODRIVER", "dummy")
-    env = PendulumEnv(render_mode="human", screen_size=(200, 200))
+    shown: list[tuple[float, float, int]] = []
+    show = drawing.Window.show
+
+    def watch(window: drawing.Window, theta: float, theta_dot: float, effort: float, **more: Any) -> None:
+        shown.append((theta, more["time"], more["fps"]))
+        show(window, theta, theta_dot, effort, **{**more, "fps": 0})
+
+    monkeypatch.setattr(drawing.Window, "show", watch)
+    env = PendulumEnv(render_mode="human", screen_size=(200, 200), dt=dt, episode_time=math.inf)
     env.reset(seed=0)
-    env.step(np.array([1.0], dtype=np.float32))
+    for _ in range(100):
+        env.step(np.array([1.0], dtype=np.float32))
+    assert pygame.display.get_surface().get_size() == (200, 200)
     env.close()
+    assert not pygame.display.get_init()
+    # The first is that of the reset; then one for each 20 ms, or for each step where steps are longer.
+    assert len(shown) == 1 + pictures
+    for (theta, time, fps), (later_theta, later, _) in itertools.pairwise(shown):
+        assert later - time == pytest.approx(1.0 / fps)
+        assert later_theta != theta
+
+
+def test_a_video_of_a_frame_each_step_runs_in_real_time() -> None:
+    for dt in (2e-3, 0.01, 0.05):
+        assert PendulumEnv(dt=dt).metadata["render_fps"] == round(1.0 / dt)
+    assert PendulumEnv.metadata["render_fps"] == 500
 
 
 @pytest.mark.parametrize(
