@@ -11,12 +11,18 @@ from numpy.typing import NDArray
 
 from pendulum_bags.identification.model import FitModel
 from pendulum_bags.identification.problem import Piece, simulate
-from pendulum_bags.identification.solver import robust_cost, solve
+from pendulum_bags.identification.solver import Solution, robust_cost, solve
 from pendulum_bags.identification.window_score import fit_states
 
-__all__ = ["CrossValidation", "cross_validate", "folds"]
+__all__ = ["COARSE", "CrossValidation", "cross_validate", "folds"]
 
 Array = NDArray[np.float64]
+
+COARSE = 3.0
+"""Factor on the integration step while searching; the chosen model is fitted to the end without it."""
+
+_SCALED = ("inertia", "damping", "gravity", "coulomb_friction", "stribeck_excess")
+_DRY = ("damping", "coulomb_friction", "stribeck_excess", "load_friction")
 
 
 @dataclass(frozen=True)
@@ -52,6 +58,32 @@ def folds(pieces: Sequence[Piece], count: int = 6) -> list[list[NDArray[np.int64
     ]
 
 
+def _refit(
+    model: FitModel, train: Sequence[Piece], states: Sequence[Array], free: Sequence[str], scale: float
+) -> FitModel:
+    """Return the model fitted to the training part, from the fit on all data and, where that holds it, from others.
+
+    The cost has kinks (a reversal, a standstill): a search that begins on one may find no way off it, and would then
+    hand back what it has learnt from the held-out part. Beside a start that did not get away, others are tried, whose
+    torques or whose friction are scaled: those are the directions that recordings leave open.
+    """
+
+    def search(start: FitModel) -> Solution:
+        return solve(
+            start, train, free, states=states, scale=scale, max_iterations=30, tolerance=1e-6, coarse=COARSE
+        )
+
+    best = search(model)
+    if any(abs(best.model[n] - model[n]) > 1e-4 * max(abs(model[n]), 1e-3) for n in free):
+        return best.model
+    for names, factor in ((_SCALED, 0.8), (_SCALED, 1.25), (_DRY, 0.5), (_DRY, 2.0)):
+        values = {n: v * factor if n in names and n in free else v for n, v in model.values.items()}
+        trial = search(FitModel(values, model.input_kind, model.friction, model.duty_gain))
+        if trial.cost < best.cost:
+            best = trial
+    return best.model
+
+
 def cross_validate(
     model: FitModel,
     pieces: Sequence[Piece],
@@ -85,16 +117,7 @@ def cross_validate(
             if out.size:
                 part = piece.subset(out)
                 test.append(Piece(part.recording, part.windows, state[out], part.integral, part.enabled))
-        fitted = solve(
-            model,
-            train,
-            free,
-            states=train_states,
-            scale=scale,
-            max_iterations=25,
-            tolerance=1e-5,
-            coarse=3.0,
-        ).model
+        fitted = _refit(model, train, train_states, free, scale)
         vectors.append(np.array(fitted.vector))
         total, loss, number = 0.0, 0.0, 0
         for piece in test:

@@ -4,11 +4,14 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from pendulum_bags.identification.model import FitModel
+from pendulum_bags.identification.model import BOUNDS, FitModel
 from pendulum_bags.identification.options import GRAVITY, Geometry
 from pendulum_bags.identification.uncertainty import Uncertainty
 
-__all__ = ["GeometryCheck", "check_geometry"]
+__all__ = ["CONTRADICTION", "GeometryCheck", "check_geometry"]
+
+CONTRADICTION = "CONTRADICTION"
+"""How the sentence begins that identification and geometry exclude each other."""
 
 TOLERANCE = 0.05
 """Relative difference that tape and kitchen scales explain."""
@@ -48,13 +51,15 @@ def check_geometry(model: FitModel, uncertainty: Uncertainty, geometry: Geometry
         rows.append((name, unit, known, value, low, high, agrees))
         if not agrees:
             said.append(
-                f"CONTRADICTION: {name} is {value:.4g} {unit} by identification "
+                f"{CONTRADICTION}: {name} is {value:.4g} {unit} by identification "
                 f"(95 % interval {low:.4g} to {high:.4g}) but {known:.4g} {unit} by geometry, "
-                f"a factor of {value / known:.2f}."
+                f"a factor of {value / known:.2g}."
             )
 
     known_gravity = geometry.gravity
-    if known_gravity is not None and not normalised and "gravity" in uncertainty.intervals:
+    # A gravity at the edge of its domain has no interval, and contradicts all the more.
+    at_edge = model["gravity"] in BOUNDS["gravity"]
+    if known_gravity is not None and not normalised and ("gravity" in uncertainty.intervals or at_edge):
         compare("gravity", "N m", known_gravity, model["gravity"])
     if geometry.inertia is not None and not normalised:
         compare("inertia", "kg m^2", geometry.inertia, model["inertia"])
@@ -67,7 +72,7 @@ def check_geometry(model: FitModel, uncertainty: Uncertainty, geometry: Geometry
         rows.append(("inertia (least)", "kg m^2", least, model["inertia"], low, high, agrees))
         if not agrees:
             said.append(
-                f"CONTRADICTION: inertia is {model['inertia']:.4g} kg m^2 by identification, yet a mass of "
+                f"{CONTRADICTION}: inertia is {model['inertia']:.4g} kg m^2 by identification, yet a mass of "
                 f"{geometry.mass:g} kg at {geometry.length:g} m alone has {least:.4g} kg m^2."
             )
     if geometry.length is not None and geometry.inertia is None:
@@ -75,7 +80,7 @@ def check_geometry(model: FitModel, uncertainty: Uncertainty, geometry: Geometry
         w0 = uncertainty.intervals.get("natural_frequency")
         if w0 is not None and w0.low > fastest * (1.0 + TOLERANCE):
             said.append(
-                f"CONTRADICTION: w0 is {w0.value:.3f} rad/s, but a centre of mass at {geometry.length:g} m "
+                f"{CONTRADICTION}: w0 is {w0.value:.3f} rad/s, but a centre of mass at {geometry.length:g} m "
                 f"cannot swing faster than sqrt(g / l) = {fastest:.3f} rad/s."
             )
     if known_gravity is not None and geometry.inertia is not None:
@@ -84,7 +89,7 @@ def check_geometry(model: FitModel, uncertainty: Uncertainty, geometry: Geometry
         )
     if not rows and not said:
         return None
-    contradicts = any(s.startswith("CONTRADICTION") for s in said)
+    contradicts = any(s.startswith(CONTRADICTION) for s in said)
     if contradicts:
         said.append(
             "Check the unit and calibration of the recorded torque, mass and length; `--fix-scale` takes the scale "

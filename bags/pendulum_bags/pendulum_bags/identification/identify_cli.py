@@ -33,7 +33,15 @@ def identify(
         str, typer.Option(help="output_error, or thesis (two linear regressions).")
     ] = "output_error",
     mapping: Annotated[
-        str | None, typer.Option(help="Mapping file for CSV columns, or pendulum, voltage_40hz.")
+        list[str] | None,
+        typer.Option(
+            help="Mapping file for CSV columns, or pendulum, voltage_40hz, free_swing; once for all recordings, "
+            "or once for each."
+        ),
+    ] = None,
+    hold: Annotated[
+        str | None,
+        typer.Option(help="Input of a CSV between its samples: zero (a held command) or linear (measured)."),
     ] = None,
     effort: Annotated[
         str, typer.Option(help="Of a bag: applied (what the plant received) or measured.")
@@ -78,7 +86,10 @@ def identify(
     if effort not in {"applied", "measured"}:
         raise DataError(f"effort is {effort!r}; expected applied or measured")
     if method == "thesis":
-        recordings = [read_recording(path, mapping, effort="measured") for path in data]
+        recordings = [
+            read_recording(path, rules, effort="measured", hold=hold)
+            for path, rules in zip(data, _mappings(mapping, len(data)), strict=True)
+        ]
         _thesis(recordings, experiment, skew, out, page, as_json)
         return
     from pendulum_bags.identification.options import Geometry, Options
@@ -87,9 +98,14 @@ def identify(
     options = Options(
         window=window, friction=friction, geometry=Geometry(mass, length, inertia), fix_scale=fix_scale
     )
-    recordings = [read_recording(path, mapping, effort=effort) for path in data]
-    others = [read_recording(path, mapping, effort=effort) for path in held_out or []]
-    result = run(recordings, options, held_out=others)
+    paths = [*data, *(held_out or [])]
+    everything = [
+        read_recording(path, rules, effort=effort, hold=hold)
+        for path, rules in zip(paths, _mappings(mapping, len(data), len(paths)), strict=True)
+    ]
+    result = run(everything[: len(data)], options, held_out=everything[len(data) :])
+    if result.refused:
+        out = None
     if out is not None:
         result.write(out, name=name, effort_limit=effort_limit)
         if page:
@@ -100,8 +116,24 @@ def identify(
         typer.echo(json.dumps(result.to_dict(), indent=2))
     else:
         _print_result(result, out)
-    if result.geometry is not None and result.geometry.contradicts:
+    if result.refused or (result.geometry is not None and result.geometry.contradicts):
         raise typer.Exit(3)
+
+
+def _mappings(given: Sequence[str] | None, recordings: int, total: int | None = None) -> list[str | None]:
+    """Return the mapping of each recording, those to score after those to fit."""
+    count = total or recordings
+    if not given:
+        return [None] * count
+    if len(given) == 1:
+        return [given[0]] * count
+    if len(given) not in {recordings, count}:
+        raise DataError(
+            f"--mapping is given {len(given)} times for {recordings} recordings; expected once for all, "
+            "or once for each"
+        )
+    # Those to score are read as the last one, unless each has its own.
+    return [*given, *[given[-1]] * (count - len(given))]
 
 
 def _thesis(
@@ -141,7 +173,9 @@ def _print_thesis(result: ThesisResult) -> None:
     for regression in result.trials:
         console.print(f"[bold]{regression.trial}[/bold]")
         print(_narrow(regression.summary))
-    table = WholeTable(title=f"Average over {len(result.trials)} trial{'s' if len(result.trials) != 1 else ''}")
+    table = WholeTable(
+        title=f"Average over {len(result.trials)} trial{'s' if len(result.trials) != 1 else ''}"
+    )
     for heading in ("coefficient", "value", "95 % interval", "unit"):
         table.add_column(heading)
     for key, value in result.average.items():
@@ -167,6 +201,7 @@ def _narrow(summary: str, width: int = 78) -> str:
 
 def _print_result(result: IdentificationResult, out: Path | None) -> None:
     from pendulum_bags.identification.model import UNITS
+    from pendulum_bags.identification.result import ALARMS
     from pendulum_msgs_py.programs.terminal import WholeTable, make_console
 
     console = make_console()
@@ -196,14 +231,14 @@ def _print_result(result: IdentificationResult, out: Path | None) -> None:
             f"held out {label}: rms {1e3 * score.rms:.3f} mrad, mean absolute {1e3 * score.mean_absolute:.3f} mrad"
         )
     for sentence in result.sentences():
-        style = "bold red" if sentence.startswith("CONTRADICTION") else None
+        style = "bold red" if sentence.startswith(ALARMS) else None
         console.print(f"- {sentence}", style=style, markup=False, highlight=False)
     if out is not None:
         console.print(f"wrote {out}", highlight=False)
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run the command line and return the exit code: 0, 2 for an error, 3 for a contradiction with geometry."""
+    """Run the command line and return the exit code: 0, 2 for an error, 3 for a fit not to be believed."""
     # The matrices are small: threads of the linear algebra would only wait for one another.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     return cli_main(app, argv, name="python -m pendulum_bags identify")

@@ -8,22 +8,23 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from pendulum_bags.identification.cross_validation import cross_validate
+from pendulum_bags.identification.cross_validation import COARSE, cross_validate
 from pendulum_bags.identification.model import FRICTION_MODELS, SERVO_ONLY, FitModel
 from pendulum_bags.identification.options import DEFAULTS, Geometry, Options
 from pendulum_bags.identification.problem import Piece, prepare
+from pendulum_bags.identification.readings import other_reading
 from pendulum_bags.identification.selection import Candidate, choose, effective_samples
 from pendulum_bags.identification.solver import Solution, refine, residuals, robust_cost, solve
 from pendulum_bags.identification.starts import first_models, rank
 from pendulum_bags.runs.datasets import Recording
 from pendulum_msgs_py.errors import DataError
 
-__all__ = ["DEFAULTS", "Geometry", "Options", "OutputErrorFit", "fit_output_error"]
+__all__ = ["DEFAULTS", "OFFSETS", "Geometry", "Options", "OutputErrorFit", "fit_output_error"]
 
 Array = NDArray[np.float64]
 
-COARSE = 3.0
-"""Factor on the integration step while searching; the chosen model is fitted to the end without it."""
+OFFSETS = ("angle_offset", "torque_offset")
+"""What may be left out: zero errors of the angle and of the torque."""
 
 _FRICTION_STARTS: Mapping[str, tuple[Mapping[str, float], ...]] = {
     # As shares of the Coulomb friction found before, and velocities in rad/s.
@@ -42,7 +43,19 @@ _FRICTION_STARTS: Mapping[str, tuple[Mapping[str, float], ...]] = {
 
 @dataclass(frozen=True)
 class OutputErrorFit:
-    """The chosen candidate and all others, with the data as cut."""
+    """The chosen candidate and all others, with the data as cut.
+
+    Args:
+        chosen: The fit that counts.
+        candidates: One for each friction model that was tried, with the chosen offsets.
+        pieces: The recordings with their windows.
+        scale: Of the robust loss [rad].
+        options: Choices.
+        window: Length of the windows [s]; None for whole recordings.
+        sign_flipped: Whether the recorded effort counts with sign -1.
+        offset_candidates: Fits with Coulomb friction, one for each set of offsets that was tried.
+        reading: How the angle seems to be measured, if not in rad from hanging.
+    """
 
     chosen: Candidate
     candidates: tuple[Candidate, ...]
@@ -51,6 +64,8 @@ class OutputErrorFit:
     options: Options
     window: float | None
     sign_flipped: bool
+    offset_candidates: tuple[Candidate, ...] = ()
+    reading: str | None = None
 
     @property
     def model(self) -> FitModel:
@@ -77,10 +92,15 @@ def fit_output_error(recordings: Sequence[Recording], options: Options = DEFAULT
     # Ranked twice: by a loss that can pull from far, and by one that a single pushed window cannot sway.
     starts = [start for scale in (0.3, 0.03) for start in rank(models, pieces, base, scale=scale, keep=2)]
     best, scale = _anneal(starts, pieces, base, options.robust)
+    reading = other_reading(best, pieces, fixed, base, window)
     names = [options.friction]
-    if options.friction == "auto":
+    if reading is not None:
+        # Refused: what follows is only to be shown, not to be believed.
+        options, names = replace(options, angle_offset=False, torque_offset=False, folds=1), ["coulomb"]
+        free = tuple(n for n in free if n not in OFFSETS)
+    elif options.friction == "auto":
         names = [n for n in FRICTION_MODELS if n not in SERVO_ONLY or fixed.input_kind == "position_goal"]
-    free, best = _offsets(best, pieces, free, scale, options)
+    free, best, offsets = _offsets(best, pieces, free, scale, options)
     candidates: list[Candidate] = []
     for name in names:
         candidates.append(_fit_friction(name, best, pieces, free, scale, candidates, options))
@@ -88,7 +108,9 @@ def fit_output_error(recordings: Sequence[Recording], options: Options = DEFAULT
     chosen = _finish(first, pieces, scale)
     candidates[candidates.index(first)] = chosen
     flipped = fixed.input_kind in {"effort", "voltage"} and chosen.solution.model["input_gain"] < 0.0
-    return OutputErrorFit(chosen, tuple(candidates), tuple(pieces), scale, options, window, flipped)
+    return OutputErrorFit(
+        chosen, tuple(candidates), tuple(pieces), scale, options, window, flipped, offsets, reading
+    )
 
 
 def _frame(recordings: Sequence[Recording], options: Options) -> tuple[FitModel, tuple[str, ...]]:
@@ -118,6 +140,9 @@ def _frame(recordings: Sequence[Recording], options: Options) -> tuple[FitModel,
         duty_gain = float(np.median([_duty_gain(recording) for recording in recordings]))
         # The bob fixes the scale; its arm's zero is an angle, so a torque offset would only double it.
         free = ["damping", "inertia", "input_gain", "drive_damping"]
+    elif options.fix_scale and kind == "none":
+        values["gravity"] = float(geometry.gravity or 1.0)
+        free = ["damping", "inertia"]
     elif kind == "none" or (kind == "voltage" and not options.fix_scale):
         values["inertia"] = geometry.inertia or 1.0
         if kind == "voltage":
@@ -199,12 +224,12 @@ def _anneal(
 
 def _offsets(
     best: Solution, pieces: Sequence[Piece], free: tuple[str, ...], scale: float, options: Options
-) -> tuple[tuple[str, ...], Solution]:
+) -> tuple[tuple[str, ...], Solution, tuple[Candidate, ...]]:
     """Return the free parameters without the offsets that the held-out windows do not ask for.
 
     An offset of torque and one of angle do nearly the same to a swing: together they chase each other's errors.
     """
-    offsets = [name for name in ("angle_offset", "torque_offset") if name in free]
+    offsets = [name for name in OFFSETS if name in free]
     subsets = [
         tuple(o for o in offsets if o not in left_out) for left_out in ((), *((o,) for o in offsets), offsets)
     ]
@@ -216,7 +241,7 @@ def _offsets(
         candidates.append(_fit_friction("coulomb", start, pieces, names, scale, (), options))
     # An offset that is kept by luck biases all others: the stricter penalty (Schwarz) keeps few of those.
     chosen = choose(candidates, strict=True)
-    return tuple(n for n in chosen.free if n in free), chosen.solution
+    return tuple(n for n in chosen.free if n in free), chosen.solution, tuple(candidates)
 
 
 def _robust_scale(solution: Solution, pieces: Sequence[Piece]) -> float:
@@ -284,5 +309,8 @@ def _finish(candidate: Candidate, pieces: Sequence[Piece], scale: float) -> Cand
     parts = residuals(model, pieces, final.states)
     inside = np.concatenate([part[piece.mask()] for part, piece in zip(parts, pieces, strict=True)])
     return replace(
-        candidate, solution=replace(final, model=model), training_rms=float(np.sqrt(np.mean(inside**2)))
+        candidate,
+        solution=replace(final, model=model),
+        searched=found,
+        training_rms=float(np.sqrt(np.mean(inside**2))),
     )

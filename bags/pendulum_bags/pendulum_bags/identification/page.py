@@ -86,9 +86,11 @@ def write_thesis_page(result: ThesisResult, recordings: Sequence[Recording], fol
 
 
 def _sentences(sentences: Sequence[str]) -> str:
+    from pendulum_bags.identification.result import ALARMS
+
     items = []
     for sentence in sentences:
-        css = ' class="alarm"' if sentence.startswith("CONTRADICTION") else ""
+        css = ' class="alarm"' if sentence.startswith(ALARMS) else ""
         items.append(f"<li{css}>{escape(sentence)}</li>")
     return f"<ul>{''.join(items)}</ul>"
 

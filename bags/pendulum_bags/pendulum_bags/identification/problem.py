@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from pendulum_bags.identification import kernel
 from pendulum_bags.identification.model import FitModel
-from pendulum_bags.runs.datasets import Recording
+from pendulum_bags.runs.datasets import Recording, gaps
 from pendulum_msgs_py.errors import DataError
 
 __all__ = ["Piece", "Simulation", "cut_windows", "longest_step", "prepare"]
@@ -92,9 +92,36 @@ def cut_windows(time: Array, window: float | None, *, minimum: float = 0.5) -> N
     return windows[keep].astype(np.int64)
 
 
-def prepare(recording: Recording, window: float | None) -> Piece:
-    """Return the recording with windows and first guesses of their initial states."""
-    windows = cut_windows(recording.time, window)
+def _between_gaps(recording: Recording, window: float | None) -> NDArray[np.int64]:
+    """Return windows that no gap of the recording lies in, shape (w, 2)."""
+    found = gaps(recording)
+    if not found:
+        return cut_windows(recording.time, window)
+    since = recording.time - recording.time[0]
+    begins = [0, *(int(np.searchsorted(since, stop - 1e-9)) for _, stop in found)]
+    ends = [*(int(np.searchsorted(since, start + 1e-9)) for start, _ in found), since.size]
+    parts = [
+        first + cut_windows(recording.time[first:stop], window)
+        for first, stop in zip(begins, ends, strict=True)
+        # A stretch too short for a window's two states and something to compare is left out.
+        if stop - first >= 8
+    ]
+    if not parts:
+        raise DataError(
+            f"{recording.name} has {len(found)} gaps and no 8 samples between any two; expected fewer gaps"
+        )
+    return np.concatenate(parts)
+
+
+def prepare(recording: Recording, window: float | None, *, across_gaps: bool = False) -> Piece:
+    """Return the recording with windows and first guesses of their initial states.
+
+    Args:
+        recording: The data.
+        window: Length of the windows [s]; None for all of it, or all between two gaps.
+        across_gaps: Whether windows reach across stretches in which nothing was recorded.
+    """
+    windows = _between_gaps(recording, window) if not across_gaps else cut_windows(recording.time, window)
     stamps = recording.input_stamps
     integral = kernel.cumulative_input(stamps, recording.input, recording.hold == "linear")
     enabled = np.ones(stamps.size) if recording.enabled is None else recording.enabled
@@ -118,7 +145,8 @@ def longest_step(model: FitModel, recording: Recording) -> float:
     """Return an integration step [s] that leaves the numerical error far below the sensor's.
 
     The leapfrog's relative frequency error is (w h)^2 / 24; a linear drive stiffness counts like gravity. The
-    exponential damping is exact in velocity, but the angle is its trapezoid: hence the bound by the rate.
+    exponential damping is exact in velocity, but the angle is its trapezoid: hence the bound by the rate. Friction
+    that falls with speed is taken at the start of a step: its speed may change by a small part of its scale only.
     """
     inertia = model["inertia"]
     stiffness = abs(model["gravity"])
@@ -127,7 +155,10 @@ def longest_step(model: FitModel, recording: Recording) -> float:
         stiffness += abs(model["input_gain"]) * _supply(recording) * _servo_gain(model, recording)
         rate += model["drive_damping"] / inertia
     frequency = math.sqrt(stiffness / inertia) if stiffness > 0.0 else 0.0
-    return float(np.clip(min(0.02 / max(frequency, 1e-3), 0.15 / max(rate, 1e-3)), 1e-4, 0.01))
+    longest = min(0.02 / max(frequency, 1e-3), 0.15 / max(rate, 1e-3))
+    if model["stribeck_excess"] > 0.0 or model["load_stribeck"] > 0.0:
+        longest = min(longest, max(0.05 * model["stribeck_velocity"] / max(frequency**2, 1e-3), 5e-4))
+    return float(np.clip(longest, 1e-4, 0.01))
 
 
 def _supply(recording: Recording) -> float:

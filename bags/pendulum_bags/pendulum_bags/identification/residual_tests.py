@@ -9,13 +9,19 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import stats
 
+from pendulum_bags.identification.missing import missing_torques
 from pendulum_bags.identification.output_error import OutputErrorFit
 from pendulum_bags.identification.problem import Piece
+from pendulum_bags.identification.selection import effective_samples
 from pendulum_bags.identification.solver import residuals
+from pendulum_bags.runs.datasets import distinct_names
 
-__all__ = ["ResidualTests", "residual_tests"]
+__all__ = ["INCOMPLETE", "ResidualTests", "residual_tests"]
 
 Array = NDArray[np.float64]
+
+INCOMPLETE = "MODEL INCOMPLETE"
+"""How the sentence begins that no interval covers what the model lacks."""
 
 
 @dataclass(frozen=True)
@@ -28,11 +34,13 @@ class ResidualTests:
         bound: 99 % bound for each value under independence.
         white: Whether the Ljung-Box test accepts whiteness at 1 %.
         white_p: Its p-value.
-        independent: Whether no cross-correlation with the past input exceeds its Bonferroni bound at 1 %.
+        independent: Whether the residuals depend on no past input, at 1 % over all lags.
         worst_cross: Largest absolute cross-correlation with the past input.
         samples: Number of residuals.
-        outliers: Windows whose rms exceeds five times the median: (recording, start [s], end [s], rms [rad]).
+        outliers: Windows whose rms exceeds five times the median: (recording, start and end from its
+            first sample [s], rms [rad]).
         sentences: The outcome in words.
+        incomplete: Whether they depend on the input or look like a torque: then the model lacks something.
     """
 
     autocorrelation: Array
@@ -45,30 +53,36 @@ class ResidualTests:
     samples: int
     outliers: tuple[tuple[str, float, float, float], ...]
     sentences: tuple[str, ...]
+    incomplete: bool = False
 
 
 def residual_tests(fit: OutputErrorFit, *, lags: int = 25) -> ResidualTests:
     """Test the residuals of a fit, window by window (no product reaches across windows).
+
+    Whether they depend on the input or on the motion is asked by sums over blocks that are longer than the residuals
+    remember: correlated noise alone does not make such a dependence.
 
     Args:
         fit: The fit.
         lags: Largest lag [samples].
 
     Source:
-        Ljung, System Identification, sec. 16.6; Ljung and Box, Biometrika 65, 1978.
+        Ljung, System Identification, sec. 16.6; Ljung and Box, Biometrika 65, 1978; Carlstein, Annals of Statistics
+        14, 1986 (blocks).
     """
     parts = residuals(fit.model, fit.pieces, fit.chosen.solution.states)
     segments, inputs, rms = [], [], []
     labels: list[tuple[str, float, float]] = []
-    for part, piece in zip(parts, fit.pieces, strict=True):
+    names = distinct_names([piece.recording for piece in fit.pieces])
+    for name, part, piece in zip(names, parts, fit.pieces, strict=True):
         drive = _input_at_samples(piece)
+        time = piece.recording.time
         for first, stop in piece.windows:
             r = part[first:stop]
             segments.append(r)
             inputs.append(drive[first:stop])
             rms.append(float(np.sqrt(np.mean(r**2))))
-            time = piece.recording.time
-            labels.append((piece.recording.name, float(time[first]), float(time[stop - 1])))
+            labels.append((name, float(time[first] - time[0]), float(time[stop - 1] - time[0])))
     lags = min(lags, min(len(s) for s in segments) - 2)
     auto = _correlation(segments, segments, lags)[lags:]
     cross = _correlation(inputs, segments, lags)
@@ -80,44 +94,84 @@ def residual_tests(fit: OutputErrorFit, *, lags: int = 25) -> ResidualTests:
         samples * (samples + 2) * float(np.sum((auto[1:] + shift) ** 2 / (samples - np.arange(1, lags + 1))))
     )
     white_p = float(stats.chi2.sf(statistic, lags))
-    past = cross[lags:]
-    # The input is coloured: its own correlation widens the bound of a sum over samples.
-    own = _correlation(inputs, inputs, lags)[lags:]
-    widening = float(np.sqrt(max(1.0 + 2.0 * np.sum(own[1:] * auto[1:]), 1.0)))
-    limit = float(stats.norm.ppf(1.0 - 0.005 / past.size)) / np.sqrt(samples) * widening
-    worst = float(np.max(np.abs(past)))
-    independent = bool(worst <= limit)
+    white = white_p > 0.01
+    memory = samples / effective_samples(parts, fit.pieces)
+    block = int(np.clip(np.ceil(4.0 * memory), 8, max(8, min(len(s) for s in segments) // 2)))
+    worst = float(np.max(np.abs(cross[lags:])))
+    independent = not any(_depends(inputs, segments, lag, block, lags + 1) for lag in range(lags + 1))
+    missing = (
+        ()
+        if fit.pieces[0].recording.input_kind == "position_goal"
+        else missing_torques(fit.model, fit.pieces, parts)
+    )
     middle = float(np.median(rms))
     outliers = tuple(
         (*label, value)
         for label, value in zip(labels, rms, strict=True)
-        if len(rms) > 3 and value > 5.0 * middle
+        if len(rms) > 3 and value > 5.0 * middle > 0.0
     )
-    white = white_p > 0.01
-    sentences = []
-    if white:
-        sentences.append(
-            f"The residuals are white (Ljung-Box p = {white_p:.2f}): the model explains all but noise."
-        )
-    else:
-        sentences.append(
-            f"The residuals are not white (lag-1 correlation {auto[1]:.2f}): the model misses some dynamics, and the "
-            "intervals allow for it."
-        )
-    if not independent:
-        sentences.append(
-            f"The residuals correlate with past input by up to {worst:.2f} (bound {limit:.2f}): part of the response "
-            "to the input is not in the model."
-        )
+    said = _sentences(white, white_p, float(auto[1]) if lags else 0.0, worst, independent, missing)
     for name, start, end, value in outliers:
-        sentences.append(
-            f"{name}, {start:.2f} to {end:.2f} s, fits {value / middle:.0f} times worse than the median window: an "
-            "outside force (a hand?), or a fault of the recording; the robust loss limits its weight."
+        said.append(
+            f"{name}, {start:.2f} to {end:.2f} s after its start, fits {value / middle:.0f} times worse than the "
+            "median window: an outside force (a hand?), or a fault of the recording; the robust loss limits its weight."
         )
     bound = 2.576 / float(np.sqrt(samples))
     return ResidualTests(
-        auto, cross, bound, white, white_p, independent, worst, samples, outliers, tuple(sentences)
+        auto,
+        cross,
+        bound,
+        white,
+        white_p,
+        independent,
+        worst,
+        samples,
+        outliers,
+        tuple(said),
+        incomplete=not independent or bool(missing),
     )
+
+
+def _sentences(
+    white: bool, white_p: float, lag_1: float, worst: float, independent: bool, missing: Sequence[str]
+) -> list[str]:
+    said = []
+    if missing or not independent:
+        of = []
+        if not independent:
+            of.append(f"depends on the past input (correlation up to {worst:.2f})")
+        if missing:
+            of.append(f"looks like {', or '.join(missing[:3])}")
+        said.append(
+            f"{INCOMPLETE}: what the fit leaves over {' and '.join(of)}. The pendulum does something that no candidate "
+            "model has. The parameters stand in for it and may be off by far more than their "
+            "intervals say: an interval covers noise, the choice among the candidates and the scatter between parts of "
+            "the data, never what all candidates lack."
+        )
+    if white:
+        said.append(f"The residuals are white (Ljung-Box p = {white_p:.2f}): noise is all that is left over.")
+    else:
+        said.append(
+            f"The residuals are not white (lag-1 correlation {lag_1:.2f}): the sensor's error is correlated, torques "
+            "act that were not recorded, or the model misses some dynamics. The intervals allow for the first two; no "
+            "interval covers the third."
+        )
+    return said
+
+
+def _depends(signals: Sequence[Array], segments: Sequence[Array], lag: int, block: int, tests: int) -> bool:
+    """Return whether residuals depend on an earlier signal, at 1 % over all ``tests`` (Bonferroni)."""
+    mean = float(np.mean(np.concatenate(signals)))
+    sums = []
+    for signal, segment in zip(signals, segments, strict=True):
+        product = (signal[: signal.size - lag] - mean) * (segment[lag:] - np.mean(segment))
+        edges = np.arange(0, product.size, block)
+        sums.append(np.add.reduceat(product, edges))
+    values = np.concatenate(sums)
+    scale = float(np.sqrt(values @ values))
+    if values.size < 3 or scale <= 0.0:
+        return False
+    return bool(abs(values.sum()) / scale > stats.t.ppf(1.0 - 0.005 / tests, values.size - 1))
 
 
 def _input_at_samples(piece: Piece) -> Array:

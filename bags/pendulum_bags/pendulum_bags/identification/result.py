@@ -6,7 +6,7 @@ import hashlib
 import json
 import platform
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import datetime, timezone
 from pathlib import Path
 from typing import Any
@@ -14,7 +14,8 @@ from typing import Any
 import numpy as np
 from threadpoolctl import threadpool_limits
 
-from pendulum_bags.identification.geometry import GeometryCheck, check_geometry
+from pendulum_bags.identification.explained import REFUSED, Explained, explained
+from pendulum_bags.identification.geometry import CONTRADICTION, GeometryCheck, check_geometry
 from pendulum_bags.identification.model import (
     FRICTION_MODELS,
     PLANT_FRICTION_MODELS,
@@ -24,17 +25,21 @@ from pendulum_bags.identification.model import (
 )
 from pendulum_bags.identification.options import DEFAULTS, Options
 from pendulum_bags.identification.output_error import OutputErrorFit, fit_output_error
-from pendulum_bags.identification.residual_tests import ResidualTests, residual_tests
+from pendulum_bags.identification.problem import Piece
+from pendulum_bags.identification.residual_tests import INCOMPLETE, ResidualTests, residual_tests
 from pendulum_bags.identification.selection import Candidate
-from pendulum_bags.identification.uncertainty import Uncertainty, assess
+from pendulum_bags.identification.uncertainty import Interval, Uncertainty, assess
 from pendulum_bags.identification.window_score import WindowScore, free_run, window_score
-from pendulum_bags.runs.datasets import INPUT_KINDS, Recording
+from pendulum_bags.runs.datasets import INPUT_KINDS, Recording, data_notes, distinct_names
 from pendulum_msgs_py.errors import DataError
 from pendulum_msgs_py.plants.plant_parameters import PlantParameters, write_plant
 
-__all__ = ["IdentificationResult", "identify", "load_fit_model"]
+__all__ = ["ALARMS", "IdentificationResult", "identify", "load_fit_model"]
 
 FORMAT = "pendulum_identification/1"
+
+ALARMS = (CONTRADICTION, REFUSED, INCOMPLETE)
+"""How sentences begin that nobody should overlook."""
 
 
 @dataclass(frozen=True)
@@ -48,6 +53,7 @@ class IdentificationResult:
         geometry: Comparison with mass and length, None where they are unknown.
         held_out: Scores on recordings that took no part in the fit, by name.
         created: Date, ISO 8601.
+        explained: How much of the motion the fit explains.
     """
 
     fit: OutputErrorFit
@@ -56,6 +62,7 @@ class IdentificationResult:
     geometry: GeometryCheck | None
     held_out: Mapping[str, WindowScore]
     created: str
+    explained: Explained
 
     @property
     def model(self) -> FitModel:
@@ -80,25 +87,45 @@ class IdentificationResult:
         """Return the plant that simulator, bridge and controller load."""
         return to_plant(self.plant_candidate.solution.model, name=name, effort_limit=effort_limit)
 
+    @property
+    def refused(self) -> bool:
+        """Whether the fit is no model of the recorded motion: it is written to no plant file."""
+        return self.explained.refusal is not None
+
     def sentences(self) -> list[str]:
         """Return what there is to say about the fit, most important first."""
+        if self.explained.refusal is not None:
+            return [self.explained.refusal, *self._of_the_data()]
         said = list(self.geometry.sentences) if self.geometry is not None else []
+        tests = list(self.tests.sentences)
+        if self.explained.doubt is not None:
+            said.append(self.explained.doubt)
+        if self.tests.incomplete:
+            said.append(tests.pop(0))
+        said.extend(self._of_the_data())
+        if self.score is None:
+            said.append(
+                "There is one window only: no held-out score; give a longer recording or a shorter --window."
+            )
+        return [*said, *self._calibration(), *tests, *self.uncertainty.sentences]
+
+    def _of_the_data(self) -> list[str]:
+        said = [f"{name}: {note}" for name, piece in self._named() for note in data_notes(piece.recording)]
+        said.extend(
+            _held(name, self.uncertainty.intervals["transport_delay"], piece.recording)
+            for name, piece in self._named()
+            if _looks_held(piece.recording, self.uncertainty.intervals.get("transport_delay"))
+        )
         if self.fit.sign_flipped:
             said.append(
                 "The recorded effort has the opposite sign of the motion that it causes (an external torque?): the fit "
                 "counts it with sign -1."
             )
-        said.extend(
-            f"{piece.recording.name}: {piece.recording.meta['repeated_stamps']} samples repeat the stamp before them "
-            "and are left out."
-            for piece in self.fit.pieces
-            if piece.recording.meta.get("repeated_stamps")
-        )
-        if self.score is None:
-            said.append(
-                "There is one window only: no held-out score; give a longer recording or a shorter --window."
-            )
-        return [*said, *self._calibration(), *self.tests.sentences, *self.uncertainty.sentences]
+        return said
+
+    def _named(self) -> list[tuple[str, Piece]]:
+        pieces = self.fit.pieces
+        return list(zip(distinct_names([p.recording for p in pieces]), pieces, strict=True))
 
     @property
     def predicted(self) -> dict[str, float]:
@@ -179,6 +206,13 @@ class IdentificationResult:
                 name: {"window_rms": score.rms, "mean_absolute": score.mean_absolute}
                 for name, score in self.held_out.items()
             },
+            "explained": {
+                "rms": self.explained.rms,
+                "straight_lines_rms": self.explained.lines,
+                "share": self.explained.share,
+                "refused": self.refused,
+            },
+            "incomplete": self.tests.incomplete or self.explained.doubt is not None,
             "sentences": self.sentences(),
             "data": [_fingerprint(p.recording) for p in self.fit.pieces],
         }
@@ -190,7 +224,12 @@ class IdentificationResult:
             path: Plant file to write, ``*.yaml``; the JSON gets the same name.
             name: Name of the plant.
             effort_limit: Of the actuator [N m]; a recording does not tell.
+
+        Raises:
+            DataError: for a fit that is refused, or another suffix.
         """
+        if self.explained.refusal is not None:
+            raise DataError(f"{self.explained.refusal} No plant file is written.")
         target = Path(path)
         if target.suffix not in {".yaml", ".yml"}:
             raise DataError(f"plant file is {target.name!r}; expected a name that ends in .yaml")
@@ -244,6 +283,23 @@ class IdentificationResult:
         return intervals, remarks
 
 
+def _looks_held(recording: Recording, delay: Interval | None) -> bool:
+    """Return whether an input read as straight lines is late by half a sample, as one that is held would be."""
+    if delay is None or recording.hold != "linear" or not recording.meta.get("hold_assumed"):
+        return False
+    half = 0.5 * recording.period
+    return abs(delay.value - half) < 0.2 * half and delay.low > 0.25 * half and delay.high < 1.75 * half
+
+
+def _held(name: str, delay: Interval, recording: Recording) -> str:
+    return (
+        f"{name}: transport_delay is {1e3 * delay.value:.3g} ms, half of the sampling period of "
+        f"{1e3 * recording.period:.3g} ms. The torque was read as a measurement that varies between its samples; if "
+        "it is a command that is held until the next one, this delay is none: say `--hold zero`, or `hold: zero` in a "
+        "mapping file."
+    )
+
+
 _DIFFERENCES = {
     "transport_delay": "an input stamped late, which is no delay of the plant",
     "damping": "that of the drive, switched on, is added",
@@ -268,18 +324,39 @@ def identify(
         held_out: Recordings to score only.
         profiles: For how many weak parameters to compute profile intervals.
     """
+    _check_distinct(recordings, held_out)
+    if recordings and all(r.input_kind == "effort" and not np.any(r.input) for r in recordings):
+        # A column of zeros is no drive: a gain or a delay of it could be anything.
+        recordings = [replace(r, input_kind="none", meta={**r.meta, "no_torque": True}) for r in recordings]
+        held_out = [replace(r, input_kind="none") if not np.any(r.input) else r for r in held_out]
     fit = fit_output_error(recordings, options)
     tests = residual_tests(fit)
-    uncertainty = assess(fit, tests, profiles=profiles)
+    account = explained(fit, tests.outliers)
+    uncertainty = assess(fit, tests, profiles=0 if account.refusal is not None else profiles)
     geometry = check_geometry(fit.model, uncertainty, options.geometry)
     scores = {}
-    for recording in held_out:
+    for name, recording in zip(distinct_names(held_out), held_out, strict=True):
         if recording.input_kind == "position_goal":
-            scores[recording.name] = free_run(fit.model, recording, fitted=False)
+            scores[name] = free_run(fit.model, recording, fitted=False)
         else:
-            scores[recording.name] = window_score(fit.model, recording, fit.window)
+            scores[name] = window_score(fit.model, recording, fit.window)
     created = datetime.now(timezone.utc).isoformat(timespec="seconds")
-    return IdentificationResult(fit, uncertainty, tests, geometry, scores, created)
+    return IdentificationResult(fit, uncertainty, tests, geometry, scores, created, account)
+
+
+def _check_distinct(recordings: Sequence[Recording], held_out: Sequence[Recording]) -> None:
+    """Refuse data that count twice: intervals would be too narrow, a held-out score too good."""
+    prints = [_fingerprint(recording)["sha256"] for recording in (*recordings, *held_out)]
+    names = distinct_names([*recordings, *held_out])
+    for i, own in enumerate(prints):
+        j = prints.index(own)
+        if j == i or j >= len(recordings):
+            continue
+        if i < len(recordings):
+            raise DataError(f"{names[i]} has the same samples as {names[j]}; expected each recording once")
+        raise DataError(
+            f"{names[i]} took part in the fit as {names[j]}; expected another recording to hold out"
+        )
 
 
 _LARGEST_VALUE = 1e300

@@ -13,7 +13,15 @@ from pendulum_bags.identification.model import BOUNDS
 from pendulum_bags.identification.problem import Piece
 from pendulum_bags.identification.solver import Solution
 
-__all__ = ["Candidate", "at_bounds", "choose", "effective_samples", "is_plausible"]
+__all__ = [
+    "Candidate",
+    "admissible",
+    "akaike_weights",
+    "at_bounds",
+    "choose",
+    "effective_samples",
+    "is_plausible",
+]
 
 Array = NDArray[np.float64]
 
@@ -29,6 +37,12 @@ class Candidate:
     validation: CrossValidation | None
     mean_cost: float
     effective: float
+    searched: Solution | None = None
+
+    @property
+    def as_searched(self) -> Solution:
+        """The fit by coarse integration steps, as comparable with the other candidates."""
+        return self.solution if self.searched is None else self.searched
 
     @property
     def score(self) -> float:
@@ -61,29 +75,57 @@ def choose(candidates: Sequence[Candidate], *, strict: bool = False) -> Candidat
     difference (at least 2 %, the accuracy of the fits without a fold, and at most 25 %, since few folds give no
     honest error); among the rest the training data decide by Akaike's criterion on effective samples.
     Static friction beyond three times the sliding one is no friction but an excuse for other faults: left out.
+
+    Args:
+        candidates: At least one.
+        strict: Schwarz's criterion in place of Akaike's.
     """
-    penalty = 2.0
+    criterion = _criterion(candidates, strict=strict)
+    return min(admissible(candidates), key=lambda c: criterion[id(c)])
+
+
+def akaike_weights(candidates: Sequence[Candidate]) -> dict[int, float]:
+    """Return how far the data speak for each candidate, by ``id``; 0 for those that held-out windows rule out.
+
+    Source:
+        Burnham and Anderson, Model Selection and Multimodel Inference, 2002, sec. 2.9.
+    """
+    criterion = _criterion(candidates)
+    among = admissible(candidates)
+    least = min(criterion[id(c)] for c in among)
+    weights = {id(c): 0.0 for c in candidates}
+    weights.update({id(c): float(np.exp(-0.5 * (criterion[id(c)] - least))) for c in among})
+    total = sum(weights.values())
+    return {key: weight / total for key, weight in weights.items()}
+
+
+def _criterion(candidates: Sequence[Candidate], *, strict: bool = False) -> dict[int, float]:
     # One count for all: what a poor model leaves correlated is its own fault, not a lack of data.
     count = max(candidate.effective for candidate in candidates)
-    if strict:
-        penalty = float(np.log(count))
 
-    def criterion(candidate: Candidate) -> float:
-        return float(count * np.log(max(candidate.mean_cost, 1e-18)) + penalty * len(candidate.free))
+    def penalty(free: int) -> float:
+        # With few effective samples a parameter costs more than 2 (Hurvich and Tsai, Biometrika 76, 1989).
+        corrected = 2.0 * free * count / max(count - free - 1.0, 1.0)
+        return max(float(np.log(count)) * free, corrected) if strict else corrected
 
+    return {id(c): float(count * np.log(max(c.mean_cost, 1e-18)) + penalty(len(c.free))) for c in candidates}
+
+
+def admissible(candidates: Sequence[Candidate]) -> list[Candidate]:
+    """Return the candidates that held-out windows do not rule out; see :func:`choose`."""
     if any(candidate.validation is None for candidate in candidates):
-        return min(candidates, key=criterion)
+        return list(candidates)
     candidates = [c for c in candidates if is_plausible(c)] or list(candidates)
     losses = {id(c): c.validation.losses for c in candidates if c.validation is not None}
     best = min(candidates, key=lambda c: float(losses[id(c)].sum()))
     least = float(losses[id(best)].sum())
-    admissible = []
+    found = []
     for candidate in candidates:
         difference = losses[id(candidate)] - losses[id(best)]
         error = float(np.std(difference, ddof=1) * np.sqrt(difference.size)) if difference.size > 1 else 0.0
         if float(difference.sum()) <= np.clip(error, 0.02 * least, 0.25 * least):
-            admissible.append(candidate)
-    return min(admissible, key=criterion)
+            found.append(candidate)
+    return found
 
 
 def is_plausible(candidate: Candidate) -> bool:

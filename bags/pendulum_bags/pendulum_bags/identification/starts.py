@@ -17,7 +17,7 @@ from pendulum_bags.identification.solver import Solution, solve
 from pendulum_bags.runs.datasets import Recording
 from pendulum_msgs_py.errors import DataError
 
-__all__ = ["equation_error", "first_models", "rank"]
+__all__ = ["bumps", "equation_error", "first_models", "rank"]
 
 Array = NDArray[np.float64]
 
@@ -30,7 +30,8 @@ def equation_error(recording: Recording, *, window: float = 0.2) -> Array:
     passes the same filter.
 
     Args:
-        recording: Data driven by a torque or a voltage (unit of the result: that of the input).
+        recording: Data driven by a torque or a voltage (unit of the result: that of the input), or by nothing (per
+            unit of inertia).
         window: Length of the bump [s].
 
     Source:
@@ -43,13 +44,7 @@ def equation_error(recording: Recording, *, window: float = 0.2) -> Array:
     count = max(7, round(window / period) | 1)
     if count >= time.size:
         raise DataError(f"{recording.name} lasts {recording.duration:.3g} s; expected more than {window} s")
-    x = np.linspace(-1.0, 1.0, count + 2)[1:-1]
-    rise = 1.0 - x * x
-    slope = 2.0 / ((count + 1) * period)
-    total = np.sum(rise**4)
-    bump = rise**4 / total
-    bump_1 = -8.0 * x * rise**3 * slope / total
-    bump_2 = (48.0 * x * x * rise**2 - 8.0 * rise**3) * slope**2 / total
+    bump, bump_1, bump_2 = bumps(count, period)
 
     def filtered(values: Array, kernel: Array) -> Array:
         return np.convolve(values, kernel, mode="valid")
@@ -63,7 +58,22 @@ def equation_error(recording: Recording, *, window: float = 0.2) -> Array:
         filtered(np.sin(theta), bump),
         -np.ones(time.size - count + 1),
     )
+    if recording.input_kind == "none":
+        # Nothing drives it: the equation holds per unit of inertia.
+        rest = np.linalg.lstsq(np.stack(columns[1:], axis=1), -columns[0], rcond=None)[0]
+        return np.concatenate(([1.0], rest))
     return np.linalg.lstsq(np.stack(columns, axis=1), filtered(drive, bump), rcond=None)[0]
+
+
+def bumps(count: int, period: float) -> tuple[Array, Array, Array]:
+    """Return a bump (1 - x^2)^4 of unit sum and its first and second derivatives, shape (count,) [1, 1/s, 1/s^2]."""
+    x = np.linspace(-1.0, 1.0, count + 2)[1:-1]
+    rise = 1.0 - x * x
+    slope = 2.0 / ((count + 1) * period)
+    total = np.sum(rise**4)
+    first = -8.0 * x * rise**3 * slope / total
+    second = (48.0 * x * x * rise**2 - 8.0 * rise**3) * slope**2 / total
+    return rise**4 / total, first, second
 
 
 def first_models(

@@ -3,21 +3,24 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy import stats
 
-from pendulum_bags.identification.model import INDEX, FitModel
-from pendulum_bags.identification.output_error import OutputErrorFit
-from pendulum_bags.identification.problem import Piece, longest_step, simulate
+from pendulum_bags.identification.covariance import FREQUENCY, Errors, candidate_errors, least_scale
+from pendulum_bags.identification.model import BOUNDS, INDEX, FitModel
+from pendulum_bags.identification.output_error import OFFSETS, OutputErrorFit
 from pendulum_bags.identification.residual_tests import ResidualTests
-from pendulum_bags.identification.selection import Candidate, at_bounds
+from pendulum_bags.identification.selection import Candidate, akaike_weights
 from pendulum_bags.identification.solver import solve
 from pendulum_bags.identification.wording import Interval, plain_sentences
 
-__all__ = ["Interval", "Uncertainty", "assess", "profile_interval"]
+__all__ = ["Interval", "Uncertainty", "assess", "profile_interval", "unresolved_offset"]
+
+RIVAL = 0.02
+"""Share of the kept offset's Akaike weight from which on the other one counts as its equal (a difference of 8)."""
 
 Array = NDArray[np.float64]
 
@@ -49,21 +52,15 @@ class Uncertainty:
     sentences: tuple[str, ...]
 
 
-@dataclass(frozen=True)
-class _Information:
-    projected: list[Array]
-    residual: list[Array]
-    samples: int
-    states: int
-
-
 def assess(fit: OutputErrorFit, tests: ResidualTests, *, profiles: int = 2) -> Uncertainty:
     """Return intervals and what limits them.
 
     With white residuals the intervals are those of least squares (the window states profiled out), corrected for
-    the robust loss. With correlated residuals the model itself is at fault: then the largest of three errors
-    counts: consistent under serial correlation, clustered by window, and the jackknife over the folds, which
-    also sees how the parameters move from one part of the data to another.
+    the robust loss. With correlated residuals the largest of three errors counts: consistent under serial
+    correlation, clustered by window, and the jackknife over the folds, which also sees how the parameters move from
+    one part of the data to another. The choice among friction models and offsets is part of the error: what the
+    models that the data speak for nearly as well say is counted by their Akaike weights. An error of the model
+    itself (something that no candidate has) is in no interval; the residual tests say where there is one.
 
     Args:
         fit: The fit.
@@ -72,164 +69,133 @@ def assess(fit: OutputErrorFit, tests: ResidualTests, *, profiles: int = 2) -> U
 
     Source:
         Ljung, System Identification, ch. 9; Newey and West, Econometrica 55, 1987; Liang and Zeger, Biometrika
-        73, 1986 (clusters); Efron and Tibshirani, An
-        Introduction to the Bootstrap, ch. 11 (grouped jackknife); Huber, Robust Statistics, sec. 7.6.
+        73, 1986 (clusters); Efron and Tibshirani, An Introduction to the Bootstrap, ch. 11 (grouped jackknife);
+        Huber, Robust Statistics, sec. 7.6; Buckland, Burnham and Augustin, Biometrics 53, 1997 (model choice).
     """
     chosen = fit.chosen
     model = chosen.solution.model
-    names = tuple(n for n in chosen.free if n not in set(at_bounds(chosen)))
-    information = _information(model, fit.pieces, chosen.solution.states, names)
-    white, singular, condition = _white_covariance(information, fit.scale, model, names)
-    # Even white residuals are not alike everywhere: near a reversal the fit bends, and the sandwich sees it.
-    linear, basis = _sandwich(white, information, fit.scale, clusters=not tests.white), "white residuals"
-    covariance = linear
-    freedom = float(information.samples - information.states - len(names))
-    deviation = np.sqrt(np.maximum(np.diag(linear), 0.0))
-    if not tests.white and names:
-        # Along a firm direction the fit is as good as linear, and the sandwich is its error; along a weak one it
-        # is not, and only fits without a part of the data show how far it moves.
-        basis = "correlated residuals and folds"
-        folds = len(chosen.validation.vectors) if chosen.validation is not None else 6
-        freedom = float(folds - 1)
-        before = np.sqrt(np.maximum(np.diag(linear), 1e-300))
-        deviation = np.maximum(before, _jackknife(chosen, names))
-        covariance = linear * np.outer(deviation / before, deviation / before)
+    own = candidate_errors(chosen, fit.pieces, fit.scale, white=tests.white)
+    names = own.names
+    deviation = _with_model_choice(fit, own, white=tests.white)
+    basis = "white residuals" if tests.white else "correlated residuals and folds"
+    folds = len(chosen.validation.vectors) if chosen.validation is not None else 6
+    samples = sum(piece.samples for piece in fit.pieces)
+    states = 2 * sum(len(piece.windows) for piece in fit.pieces)
+    freedom = float(samples - states - len(names)) if tests.white else float(folds - 1)
     quantile = float(stats.t.ppf(0.975, max(freedom, 2.0)))
-    intervals = {}
-    for i, name in enumerate(names):
-        value, half = model[name], quantile * float(deviation[i])
-        floor = 0.0 if _positive(name) else -np.inf
-        intervals[name] = Interval(
-            value, max(value - half, floor), value + half, float(deviation[i]), float(np.sqrt(white[i, i]))
-        )
-    _add_frequency(intervals, model, names, linear, white, quantile)
-    safe = np.where(deviation > 0.0, deviation, 1.0)
+    intervals = {
+        name: _interval(name, model, deviation[name], own.white_deviation[name], quantile)
+        for name in (*names, FREQUENCY)
+        if name in deviation
+    }
+    _widen_by_joint_offsets(intervals, fit, quantile, white=tests.white)
+    ratio = np.array([deviation[n] / max(own.deviation[n], 1e-300) for n in names])
+    covariance = own.covariance * np.outer(ratio, ratio) if names else own.covariance
+    safe = np.array([deviation[n] or 1.0 for n in names])
     correlation = covariance / np.outer(safe, safe)
-    white_deviation = np.sqrt(np.maximum(np.diag(white), 1e-300))
-    inflation = float(np.max(deviation / white_deviation)) if names else 1.0
-    weak = sorted((n for n in names if n in intervals), key=lambda n: -min(intervals[n].relative, 1e6))[
-        :profiles
-    ]
+    inflation = max((deviation[n] / max(own.white_deviation[n], 1e-150) for n in names), default=1.0)
+    signless = [n for n in names if _positive(n)]
+    weak = sorted(signless, key=lambda n: -min(intervals[n].relative, 1e6))[:profiles]
     found = {name: profile_interval(fit, name, inflation=inflation) for name in weak}
-    sentences = plain_sentences(intervals, names, correlation, condition, singular, found, fit)
-    return Uncertainty(
-        intervals, names, covariance, correlation, condition, inflation, basis, found, tuple(sentences)
+    for name, (low, high) in found.items():
+        # One interval for everything: what either way of looking at a weak parameter leaves open.
+        held = intervals[name]
+        intervals[name] = replace(held, low=min(held.low, low), high=max(held.high, high))
+    sentences = plain_sentences(
+        intervals, names, correlation, own.condition, own.singular, fit, unresolved=unresolved_offset(fit)
     )
+    return Uncertainty(
+        intervals, names, covariance, correlation, own.condition, inflation, basis, found, tuple(sentences)
+    )
+
+
+def _interval(name: str, model: FitModel, deviation: float, white: float, quantile: float) -> Interval:
+    if name == FREQUENCY:
+        # A frequency is positive, however uncertain: its logarithm has the symmetric interval.
+        value = model.natural_frequency
+        reach = float(np.exp(min(quantile * deviation / value, 100.0)))
+        return Interval(value, value / reach, value * reach, deviation, white)
+    value, half = model[name], quantile * deviation
+    low, high = BOUNDS[name] if name == "angle_offset" else (0.0 if _positive(name) else -np.inf, np.inf)
+    return Interval(value, max(value - half, low), min(value + half, high), deviation, white)
+
+
+def _widen_by_joint_offsets(
+    intervals: dict[str, Interval], fit: OutputErrorFit, quantile: float, *, white: bool
+) -> None:
+    """Widen the interval of an offset that was kept alone to what a fit of both offsets leaves open.
+
+    Left out is not known to be 0: near one angle either offset does the work of the other.
+    """
+    joint = next((c for c in fit.offset_candidates if set(OFFSETS) <= set(c.free)), None)
+    kept = [name for name in OFFSETS if name in fit.chosen.free]
+    if joint is None or len(kept) != 1 or kept[0] not in intervals:
+        return
+    name, errors = kept[0], candidate_errors(joint, fit.pieces, fit.scale, white=white)
+    if name in errors.deviation:
+        alone, both = (
+            intervals[name],
+            _interval(name, joint.solution.model, errors.deviation[name], 0.0, quantile),
+        )
+        wide = max(alone.standard_error, both.standard_error)
+        intervals[name] = replace(
+            alone, low=min(alone.low, both.low), high=max(alone.high, both.high), standard_error=wide
+        )
+
+
+def _with_model_choice(fit: OutputErrorFit, own: Errors, *, white: bool) -> dict[str, float]:
+    """Return the standard errors of the chosen candidate with those of the choice itself."""
+    base = fit.chosen.as_searched.model
+    averaged = dict.fromkeys(own.deviation, 0.0)
+    for candidate, weight in _weighed(fit.candidates):
+        errors = own
+        if candidate is not fit.chosen:
+            errors = candidate_errors(candidate, fit.pieces, fit.scale, white=white)
+        for name, total in averaged.items():
+            apart = _value(candidate.as_searched.model, name) - _value(base, name)
+            averaged[name] = total + weight * float(np.hypot(errors.deviation.get(name, 0.0), apart))
+    kept = set(OFFSETS) & set(fit.chosen.free)
+    same = next((c.solution.model for c in fit.offset_candidates if set(OFFSETS) & set(c.free) == kept), None)
+    result = {}
+    for name, deviation in own.deviation.items():
+        squares = 0.0
+        # An offset that others put elsewhere is no error of this one: see unresolved_offset.
+        if same is not None and name not in OFFSETS:
+            squares = sum(
+                weight * (_value(c.solution.model, name) - _value(same, name)) ** 2
+                for c, weight in _weighed(fit.offset_candidates)
+            )
+        result[name] = float(np.sqrt(max(deviation, averaged[name]) ** 2 + squares))
+    return result
+
+
+def _weighed(candidates: Sequence[Candidate]) -> list[tuple[Candidate, float]]:
+    if not candidates:
+        return []
+    weights = akaike_weights(candidates)
+    return [(c, weights[id(c)]) for c in candidates if weights[id(c)] > 1e-3]
+
+
+def _value(model: FitModel, name: str) -> float:
+    return model.natural_frequency if name == FREQUENCY else model[name]
+
+
+def unresolved_offset(fit: OutputErrorFit) -> str | None:
+    """Return the offset that was left out although it would have done nearly as well as the one that was kept."""
+    kept = [name for name in OFFSETS if name in fit.chosen.free]
+    if len(kept) != 1:
+        return None
+    weights = akaike_weights(fit.offset_candidates) if fit.offset_candidates else {}
+    other = next(name for name in OFFSETS if name not in kept)
+    share = {
+        name: sum(weights[id(c)] for c in fit.offset_candidates if set(OFFSETS) & set(c.free) == {name})
+        for name in OFFSETS
+    }
+    return other if share[other] > RIVAL * share[kept[0]] else None
 
 
 def _positive(name: str) -> bool:
     return name not in {"torque_offset", "angle_offset", "input_gain", "transport_delay"}
-
-
-def _information(
-    model: FitModel, pieces: Sequence[Piece], states: Sequence[Array], names: Sequence[str]
-) -> _Information:
-    """Return, by window, the sensitivities with the window's initial state projected out, and the residuals."""
-    index = [INDEX[name] for name in names]
-    projected, residual, samples, count = [], [], 0, 0
-    for piece, state in zip(pieces, states, strict=True):
-        result = simulate(model, piece, state, free=index, step=longest_step(model, piece.recording))
-        for first, stop in piece.windows:
-            jacobian = result.jacobian[first:stop]
-            basis, _ = np.linalg.qr(jacobian[:, -2:])
-            sensitivity = jacobian[:, :-2]
-            projected.append(sensitivity - basis @ (basis.T @ sensitivity))
-            residual.append(result.theta[first:stop] - piece.recording.position[first:stop])
-            samples += stop - first
-            count += 2
-    return _Information(projected, residual, samples, count)
-
-
-def _influence(residual: Array, scale: float) -> tuple[Array, Array]:
-    """Return psi(r), the derivative of the loss, and psi'(r)."""
-    if not np.isfinite(scale):
-        return residual, np.ones_like(residual)
-    root = np.sqrt(1.0 + (residual / scale) ** 2)
-    return residual / root, 1.0 / root**3
-
-
-def _white_covariance(
-    information: _Information, scale: float, model: FitModel, names: Sequence[str]
-) -> tuple[Array, Array, float]:
-    """Return the covariance for white residuals, the weakest direction (scaled), and the condition number."""
-    stacked = np.concatenate(information.projected)
-    residual = np.concatenate(information.residual)
-    psi, slope = _influence(residual, scale)
-    freedom = max(information.samples - information.states - len(names), 1)
-    variance = float(psi @ psi) / freedom / float(np.mean(slope)) ** 2
-    size = np.array([max(abs(model[name]), _least_scale(name)) for name in names])
-    _, singular, right = np.linalg.svd(stacked * size, full_matrices=False)
-    condition = float((singular[0] / max(singular[-1], 1e-300)) ** 2) if singular.size else 1.0
-    inverse = (
-        (right.T / np.maximum(singular, 1e-12 * max(singular[0], 1e-300)) ** 2) @ right
-        if singular.size
-        else stacked
-    )
-    return variance * inverse * np.outer(size, size), right[-1] if len(names) else np.zeros(0), condition
-
-
-def _least_scale(name: str) -> float:
-    return {"transport_delay": 1e-3, "angle_offset": 1e-2, "torque_offset": 1e-2}.get(name, 1e-6)
-
-
-def _sandwich(white: Array, information: _Information, scale: float, *, clusters: bool) -> Array:
-    """Return the covariance raised to that of residuals correlated within windows: serially, and as clusters."""
-    if not white.size:
-        return white
-    stacked = np.concatenate(information.projected)
-    _, slopes = _influence(np.concatenate(information.residual), scale)
-    weight = max(float(np.mean(slopes)), 1e-3)
-    bread = np.linalg.pinv(weight * stacked.T @ stacked, rcond=1e-14)
-    serial, cluster = np.zeros_like(bread), np.zeros_like(bread)
-    for sensitivity, residual in zip(information.projected, information.residual, strict=True):
-        psi, _ = _influence(residual, scale)
-        scores = sensitivity * psi[:, None]
-        reach = max(1, len(psi) // 4)
-        # Sums over all stretches of that length weigh the lags as Bartlett does.
-        running = np.cumsum(np.pad(scores, ((reach + 1, reach), (0, 0))), axis=0)
-        blocks = running[reach + 1 :] - running[: -reach - 1]
-        serial += blocks.T @ blocks / (reach + 1)
-        total = scores.sum(axis=0)
-        cluster += np.outer(total, total)
-    count = len(information.projected)
-    errors = [white, bread @ serial @ bread]
-    if clusters and count > 1:
-        errors.append(bread @ cluster @ bread * count / (count - 1))
-    old = np.sqrt(np.maximum(np.diag(white), 1e-300))
-    factor = np.sqrt(np.max([np.maximum(np.diag(e), 0.0) for e in errors], axis=0)) / old
-    return np.asarray(white * np.outer(factor, factor))
-
-
-def _jackknife(chosen: Candidate, names: Sequence[str]) -> Array:
-    """Return the standard errors that the fits without one fold show, shape (k,); zeros where there are none."""
-    validation = chosen.validation
-    if validation is None or len(validation.vectors) < 2:
-        return np.zeros(len(names))
-    vectors = validation.vectors[:, [INDEX[name] for name in names]]
-    count = len(vectors)
-    return np.asarray(np.sqrt((count - 1) / count * np.sum((vectors - vectors.mean(axis=0)) ** 2, axis=0)))
-
-
-def _add_frequency(
-    intervals: dict[str, Interval],
-    model: FitModel,
-    names: Sequence[str],
-    linear: Array,
-    white: Array,
-    quantile: float,
-) -> None:
-    """Add w0 = sqrt(G / J), whose error is far less than those of G and J where the scale is what is weak."""
-    relevant = [name for name in ("gravity", "inertia") if name in names]
-    if not relevant or model["gravity"] <= 0.0:
-        return
-    w0 = model.natural_frequency
-    gradient = np.zeros(len(names))
-    for name in relevant:
-        gradient[list(names).index(name)] = (0.5 if name == "gravity" else -0.5) * w0 / model[name]
-    error = float(np.sqrt(max(float(gradient @ linear @ gradient), 0.0)))
-    white_error = float(np.sqrt(max(float(gradient @ white @ gradient), 0.0)))
-    half = quantile * error
-    intervals["natural_frequency"] = Interval(w0, w0 - half, w0 + half, error, white_error)
 
 
 def profile_interval(fit: OutputErrorFit, name: str, *, inflation: float = 1.0) -> tuple[float, float]:
@@ -248,7 +214,7 @@ def profile_interval(fit: OutputErrorFit, name: str, *, inflation: float = 1.0) 
     others = tuple(n for n in fit.chosen.free if n != name)
     samples = sum(piece.samples for piece in fit.pieces)
     rise = 3.84 * solution.cost / samples * inflation**2
-    unit = max(abs(best[name]), _least_scale(name))
+    unit = max(abs(best[name]), least_scale(name))
     ends = []
     for direction in (-1.0, 1.0):
         low, high, states, start = 0.0, None, solution.states, best

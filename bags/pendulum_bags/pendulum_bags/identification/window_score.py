@@ -97,7 +97,7 @@ def free_run(
         fitted: False takes the first measured angle and velocity as they are.
     """
     fit_model = from_plant(model) if isinstance(model, PlantParameters) else model
-    piece = prepare(recording, None)
+    piece = prepare(recording, None, across_gaps=True)
     states = piece.states.copy()
     if fitted:
         stop = int(np.searchsorted(recording.time, recording.time[0] + settle))

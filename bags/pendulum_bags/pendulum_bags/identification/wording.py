@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from pendulum_bags.identification.model import BOUNDS, UNITS
 from pendulum_bags.identification.output_error import OutputErrorFit
 from pendulum_bags.identification.selection import at_bounds
 
@@ -45,8 +46,9 @@ def plain_sentences(
     correlation: Array,
     condition: float,
     weakest: Array,
-    profiles: Mapping[str, tuple[float, float]],
     fit: OutputErrorFit,
+    *,
+    unresolved: str | None = None,
 ) -> list[str]:
     """Return what the recording cannot determine, in words.
 
@@ -56,21 +58,25 @@ def plain_sentences(
         correlation: shape (k, k).
         condition: Condition number of the information matrix.
         weakest: Direction that the data see least, shape (k,).
-        profiles: Profile intervals of the weak parameters.
         fit: The fit.
+        unresolved: Offset that was left out, though it would have done as well as the one that was kept.
     """
     said = []
     pieces = fit.pieces
     kind = pieces[0].recording.input_kind
-    if kind == "none":
+    if kind == "none" and "inertia" in names:
+        said.append(
+            "The pendulum swings freely: the scale of all torques is that of the given mass and length."
+        )
+    elif kind == "none":
         said.append(
             "The pendulum swings freely: only ratios to the inertia can be determined, not the absolute scale of "
-            "inertia, gravity and friction; give mass and length, or record a run with a known torque."
+            "inertia, gravity and friction; give mass and length with --fix-scale, or record a run with a known torque."
         )
     elif kind == "voltage" and "inertia" not in names:
         said.append(
             "The input is a voltage: all torques are per unit of inertia (inertia is set to "
-            f"{fit.model['inertia']:g} kg m^2); give mass and length to fix the scale."
+            f"{fit.model['inertia']:g} kg m^2); --mass and --length with --fix-scale fix it."
         )
     scale = [n for n in ("inertia", "gravity") if n in intervals]
     frequency = intervals.get("natural_frequency")
@@ -78,8 +84,8 @@ def plain_sentences(
         common = max(intervals[n].relative for n in scale)
         if common > max(3.0 * frequency.relative, 0.02):
             said.append(
-                f"The common scale of inertia and gravity is uncertain by +-{100 * common:.0f} %, their ratio is "
-                f"firm: w0 = {frequency.value:.3f} rad/s +-{100 * frequency.relative:.1f} %. A torque known "
+                f"The common scale of inertia and gravity is uncertain by +-{100 * common:.0f} %, their ratio by "
+                f"less: w0 = {frequency.value:.3f} rad/s +-{100 * frequency.relative:.1f} %. A torque known "
                 "independently, or a known mass and length, would fix the scale."
             )
     delay = intervals.get("transport_delay")
@@ -96,8 +102,6 @@ def plain_sentences(
             text = f"{name} is weakly determined: {interval.value:.3g}, 95 % interval {ends}"
             if interval.low <= 0.0:
                 text += "; the data are compatible with none at all"
-            if name in profiles:
-                text += f" (profile {profiles[name][0]:.3g} to {profiles[name][1]:.3g})"
             said.append(text + ".")
     said.extend(
         f"{names[j]} and {first} are correlated by {correlation[i, j]:+.3f}: the data determine a "
@@ -111,9 +115,38 @@ def plain_sentences(
         said.append(
             f"The condition number is {condition:.1e}: there is a direction that the data do not see, made of {parts}."
         )
-    said.extend(
-        f"{name} ended at the edge of its domain, {fit.model[name]:.3g}: the data want no more of it, and it has "
-        "no interval."
-        for name in at_bounds(fit.chosen)
-    )
+    said.extend(_edge(name, fit) for name in at_bounds(fit.chosen))
+    if unresolved is not None:
+        said.append(_unresolved(unresolved, intervals, fit))
     return said
+
+
+def _edge(name: str, fit: OutputErrorFit) -> str:
+    value, (low, high) = fit.model[name], BOUNDS[name]
+    if value <= low and low == 0.0:
+        why = "the data want none of it"
+    else:
+        why = f"the data want {'less' if value <= low else 'more'} than the {low:g} to {high:g} in which it is sought"
+    return (
+        f"{name} ended at the edge of its domain, {value:.3g} {UNITS[name]}: {why}, and it has no interval."
+    )
+
+
+def _unresolved(dropped: str, intervals: Mapping[str, Interval], fit: OutputErrorFit) -> str:
+    """Return what is known where a torque offset and an angle offset do the same to the motion."""
+    model = fit.model
+    angles = np.concatenate([piece.recording.position[piece.mask()] for piece in fit.pieces])
+    cosine = float(np.mean(np.cos(angles)))
+    total = model["torque_offset"] + model["gravity"] * cosine * model["angle_offset"]
+    kept = "angle_offset" if dropped == "torque_offset" else "torque_offset"
+    interval = intervals.get(kept)
+    reach = (
+        f", though either could hold it (interval {interval.low:.3g} to {interval.high:.3g})"
+        if interval
+        else ""
+    )
+    return (
+        f"torque_offset and angle_offset cannot be told apart: over the angles of this recording both shift the motion "
+        f"alike. Known is their sum as a torque, torque_offset + {cosine:.2f} gravity angle_offset = {total:.3g}; the "
+        f"fit puts all of it into {kept}{reach}. Larger swings, or an angle known to be hanging, would tell."
+    )

@@ -9,7 +9,11 @@ Example::
     input: {column: u, unit: V, hold: zero}
 
 ``offset`` has the column's unit and is added before sign and unit are applied: value = sign * (raw + offset).
-The unit of ``input`` says what drives the joint: a torque, a voltage, or an angle (set point of a servo).
+The unit of ``input`` says what drives the joint: a torque, a voltage, or an angle (set point of a servo). Without
+``input`` the pendulum swings freely. ``hold`` says what the input does between two samples: ``zero`` stays (a
+command), ``linear`` goes straight to the next (a measurement; the default for a torque). ``detrend: constant`` or
+``linear`` takes a mean or a drift from the input of a bad torque sensor. ``skip`` lines before the header, if any,
+are left out. An angle that jumps by whole turns is unwrapped.
 """
 
 from __future__ import annotations
@@ -23,6 +27,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from scipy.signal import detrend as scipy_detrend
 
 from pendulum_bags.runs.datasets import Array, Recording, first_of_each_stamp
 from pendulum_msgs_py.errors import DataError
@@ -58,24 +63,33 @@ MAPPINGS: Mapping[str, Mapping[str, Any]] = {
         "position": {"column": "th", "unit": "rad"},
         "input": {"column": "u", "unit": "V", "hold": "zero"},
     },
+    "free_swing": {
+        "time": {"column": "time", "unit": "s"},
+        "position": {"column": "position", "unit": "rad"},
+        "velocity": {"column": "velocity", "unit": "rad/s", "optional": True},
+    },
 }
-"""Built-in mappings: ``pendulum`` (the default) and ``voltage_40hz`` (a motor-driven disc, no time column)."""
+"""Built-in mappings: ``pendulum`` (the default), ``voltage_40hz`` (a motor-driven disc, no time column), and
+``free_swing`` (no input)."""
 
 _SECTION_KEYS = {
     "time": {"column", "unit", "period", "start"},
     "position": {"column", "unit", "sign", "offset"},
     "velocity": {"column", "unit", "sign", "offset", "optional"},
-    "input": {"column", "unit", "sign", "offset", "hold"},
+    "input": {"column", "unit", "sign", "offset", "hold", "detrend"},
 }
-_TOP_KEYS = {"format", "delimiter", "rows", "meta", *_SECTION_KEYS}
+_TOP_KEYS = {"format", "delimiter", "skip", "rows", "meta", *_SECTION_KEYS}
 
 
-def read_csv(path: str | Path, mapping: str | Path | Mapping[str, Any] | None = None) -> Recording:
+def read_csv(
+    path: str | Path, mapping: str | Path | Mapping[str, Any] | None = None, *, hold: str | None = None
+) -> Recording:
     """Read a CSV file into a recording.
 
     Args:
         path: The file; its first line names the columns, with or without a leading ``#``.
         mapping: Mapping file, name of one of ``MAPPINGS``, or the mapping itself.
+        hold: ``zero`` or ``linear``, in place of what the mapping says of the input.
 
     Raises:
         DataError: naming file, column, row and what was expected.
@@ -85,7 +99,10 @@ def read_csv(path: str | Path, mapping: str | Path | Mapping[str, Any] | None = 
     delimiter = rules.get("delimiter", ",")
     if not isinstance(delimiter, str) or len(delimiter) != 1 or delimiter in '\r\n"':
         raise DataError(f"{origin}: delimiter is {delimiter!r}; expected one character")
-    names, table = _read_table(source, delimiter)
+    skip = rules.get("skip", 0)
+    if type(skip) is not int or skip < 0:
+        raise DataError(f"{origin}: skip is {skip!r}; expected a number of lines before the header, >= 0")
+    names, table = _read_table(source, delimiter, skip)
     first, last = _row_range(rules, len(table), origin)
     table = table[first:last]
     given = rules.get("meta") or {}
@@ -100,22 +117,25 @@ def read_csv(path: str | Path, mapping: str | Path | Mapping[str, Any] | None = 
     velocity = None
     if "velocity" in rules:
         velocity = _column("velocity", rules["velocity"], "velocity", names, table, source, origin, first)
-    drive, kind, hold = np.zeros_like(time), "none", "linear"
+    drive, kind, between = np.zeros_like(time), "none", "linear"
     if "input" in rules:
         section = rules["input"]
         quantity = _quantity_of(section.get("unit"), origin)
         column = _column("input", section, quantity, names, table, source, origin, first)
         assert column is not None
-        drive = column
+        drive = _detrended(column, section.get("detrend"), origin)
         kind = {"effort": "effort", "voltage": "voltage", "angle": "position_goal"}[quantity]
-        hold = str(section.get("hold", "linear" if kind == "effort" else "zero"))
+        between = hold or str(section.get("hold", "linear" if kind == "effort" else "zero"))
+        # Nobody said so of this file: a built-in mapping and a default are guesses.
+        if hold is None and ("hold" not in section or origin.startswith("built-in")):
+            meta["hold_assumed"] = True
     _check_magnitudes(source, time, position)
     kept = first_of_each_stamp(time)
     if not kept.all():
         meta["repeated_stamps"] = int(np.sum(~kept))
         time, position, drive = time[kept], position[kept], drive[kept]
         velocity = None if velocity is None else velocity[kept]
-    return Recording(time, position, velocity, drive, input_kind=kind, hold=hold, meta=meta)
+    return Recording(time, position, velocity, drive, input_kind=kind, hold=between, meta=meta)
 
 
 def _load_mapping(mapping: str | Path | Mapping[str, Any] | None) -> tuple[Mapping[str, Any], str]:
@@ -151,12 +171,23 @@ def _reject_unknown(given: Mapping[str, Any], known: set[str], where: str) -> No
             raise DataError(f"{where} has an unknown key {key!r}; expected {', '.join(sorted(known))}{hint}")
 
 
-def _read_table(source: Path, delimiter: str) -> tuple[list[str], Array]:
+def _detrended(values: Array, detrend: Any, origin: str) -> Array:
+    if detrend is None:
+        return values
+    if detrend not in ("constant", "linear"):
+        raise DataError(f"{origin}: detrend of input is {detrend!r}; expected constant or linear")
+    return np.asarray(scipy_detrend(values, type=detrend))
+
+
+def _read_table(source: Path, delimiter: str, skip: int) -> tuple[list[str], Array]:
     try:
         text = source.read_text(encoding="utf-8-sig")
     except (OSError, UnicodeDecodeError) as error:
         raise DataError(f"{source} cannot be read as text: {error}") from error
-    head, _, body = text.partition("\n")
+    lines = text.split("\n", skip)
+    if len(lines) <= skip:
+        raise DataError(f"{source} has {len(lines)} lines; expected a header after the {skip} lines to skip")
+    head, _, body = lines[skip].partition("\n")
     try:
         cells = next(csv.reader([head.lstrip("# ").strip()], delimiter=delimiter), [])
     except (csv.Error, TypeError) as error:
@@ -170,14 +201,15 @@ def _read_table(source: Path, delimiter: str) -> tuple[list[str], Array]:
         )
     if not names or all(_is_number(name) for name in names):
         raise DataError(
-            f"{source} begins with {head[:60]!r}; expected a first line with the names of the columns"
+            f"{source} begins with {head[:60]!r}; expected a first line with the names of the columns (a mapping file "
+            "with `skip: N` leaves out N lines before it)"
         )
     if not body.strip():
         raise DataError(f"{source} has no rows below its header")
     try:
         table = np.loadtxt(io.StringIO(body), delimiter=delimiter, ndmin=2)
     except ValueError as error:
-        raise DataError(f"{source}: {_first_bad_cell(body, names, delimiter) or error}") from error
+        raise DataError(f"{source}: {_first_bad_cell(body, names, delimiter, skip) or error}") from error
     if table.size == 0:
         raise DataError(f"{source} has no rows below its header")
     if table.shape[1] != len(names):
@@ -187,8 +219,8 @@ def _read_table(source: Path, delimiter: str) -> tuple[list[str], Array]:
     return names, table
 
 
-def _first_bad_cell(body: str, names: list[str], delimiter: str) -> str | None:
-    for number, line in enumerate(io.StringIO(body), start=2):
+def _first_bad_cell(body: str, names: list[str], delimiter: str, skip: int) -> str | None:
+    for number, line in enumerate(io.StringIO(body), start=2 + skip):
         try:
             row = next(csv.reader([line], delimiter=delimiter), [])
         except csv.Error as error:
@@ -262,6 +294,7 @@ def _column(
         raise DataError(
             f"{source} has no column {' or '.join(map(repr, candidates)) or '(none given)'} for {name} "
             f"(asked for by {origin}); it has {', '.join(names)}"
+            + ("; `--mapping free_swing` reads a pendulum that nothing drives" if name == "input" else "")
         )
     factor = _factor(name, section, quantity, origin)
     sign = section.get("sign", 1)

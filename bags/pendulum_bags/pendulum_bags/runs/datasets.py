@@ -7,7 +7,7 @@ recorded: irregular sampling is kept, nothing is resampled.
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -21,15 +21,22 @@ __all__ = [
     "INPUT_KINDS",
     "Recording",
     "check_consistency",
+    "data_notes",
+    "distinct_names",
     "first_of_each_stamp",
+    "gaps",
     "read_recording",
     "read_servo_log",
+    "unwrap",
 ]
 
 Array = NDArray[np.float64]
 
 INPUT_KINDS: Mapping[str, str] = {"effort": "N m", "voltage": "V", "position_goal": "rad", "none": "-"}
 """What drives the pendulum, and its unit. ``position_goal`` is the set point of a servo's own position loop."""
+
+FASTEST = 300.0
+"""Speed that no pendulum on a drive reaches [rad/s]: a faster change of the angle is a jump of the recording."""
 
 _SERVO_ENTRY_KEYS = ("timestamp", "position", "goal_position", "torque_enable")
 _CONSISTENCY_FACTORS = (
@@ -157,6 +164,86 @@ class Recording:
         return self.rows(int(first), int(last))
 
 
+def data_notes(recording: Recording) -> list[str]:
+    """Return what was done to a recording while it was read, in words."""
+    notes = []
+    if recording.meta.get("repeated_stamps"):
+        notes.append(
+            f"{recording.meta['repeated_stamps']} samples repeat the stamp before them and are left out."
+        )
+    if recording.meta.get("unwrapped"):
+        notes.append(
+            f"the angle jumps by a turn {recording.meta['unwrapped']} times: it was wrapped, and is unwrapped here."
+        )
+    if recording.meta.get("no_torque"):
+        notes.append("the recorded torque is 0 throughout: it is taken for a free swing.")
+    notes.extend(
+        f"no samples for {stop - start:.2f} s from {start:.2f} s after its start: no window reaches across."
+        for start, stop in gaps(recording)
+    )
+    return notes
+
+
+def gaps(recording: Recording) -> list[tuple[float, float]]:
+    """Return where neither motion nor input is known: (start, end) from the first sample [s].
+
+    A gap is longer than ten median periods and than 0.1 s, in the stamps of the motion or of the input.
+    """
+    found = []
+    for stamps in {id(s): s for s in (recording.time, recording.input_stamps)}.values():
+        steps = np.diff(stamps)
+        if not steps.size:
+            continue
+        longest = max(10.0 * float(np.median(steps)), 0.1)
+        for i in np.flatnonzero(steps > longest):
+            start, stop = float(stamps[i]), float(stamps[i + 1])
+            if stop > recording.time[0] and start < recording.time[-1]:
+                found.append((start - float(recording.time[0]), stop - float(recording.time[0])))
+    return sorted(found)
+
+
+def unwrap(recording: Recording) -> Recording:
+    """Return the recording with a continuous angle, and how often it jumped by a turn as ``unwrapped`` in ``meta``.
+
+    Raises:
+        DataError: where the angle jumps by something else, faster than any pendulum turns.
+    """
+    position = recording.position
+    jumps = np.abs(np.diff(position)) > np.pi
+    result = recording
+    # Wrapped angles stay within one turn; what leaves it has been counted on, and jumps for another reason.
+    if jumps.any() and np.ptp(position) <= 2.0 * np.pi * 1.01:
+        position = np.unwrap(position)
+        meta = {**recording.meta, "unwrapped": int(jumps.sum())}
+        result = replace(recording, position=position, meta=meta)
+    step = np.abs(np.diff(position))
+    fast = np.flatnonzero((step > 1.0) & (step > FASTEST * np.diff(recording.time)))
+    if fast.size:
+        i = int(fast[0])
+        raise DataError(
+            f"{recording.name}: the angle jumps by {step[i]:.3g} rad in "
+            f"{recording.time[i + 1] - recording.time[i]:.3g} s ({fast.size} such jumps); expected a continuous "
+            "angle in rad: is the unit deg, or the sensor at fault?"
+        )
+    return result
+
+
+def distinct_names(recordings: Sequence[Recording]) -> list[str]:
+    """Return a name for each recording: that of its file, with as many of its folders as tell it from the others."""
+    parts = [Path(str(r.meta.get("source", r.name))).parts or (r.name,) for r in recordings]
+    names = []
+    for i, own in enumerate(parts):
+        others = parts[:i] + parts[i + 1 :]
+        depth = next(
+            (n for n in range(1, len(own)) if all(own[-n:] != other[-n:] for other in others)), len(own)
+        )
+        name = str(Path(*own[-depth:]))
+        twins = [j for j, other in enumerate(parts) if other == own]
+        # Parts of one file, or recordings without one.
+        names.append(name if len(twins) == 1 else f"{own[-1]} ({twins.index(i) + 1})")
+    return names
+
+
 def first_of_each_stamp(time: Array) -> NDArray[np.bool_]:
     """Return which samples to keep where a logger wrote some stamps more than once: the first of each, shape (n,)."""
     return np.append(True, np.diff(time) != 0.0) if time.size else np.zeros(0, dtype=bool)
@@ -202,6 +289,7 @@ def read_recording(
     *,
     effort: str = "applied",
     namespace: str | None = None,
+    hold: str | None = None,
 ) -> Recording:
     """Read a CSV file, a friction-study JSON log or a rosbag2 bag.
 
@@ -213,6 +301,7 @@ def read_recording(
         effort: For bags: ``applied`` takes what the plant says it applied (topic ``applied_effort``),
             ``measured`` the measured joint torque in ``joint_states``.
         namespace: For bags with several plants, such as ``/sim``.
+        hold: For CSV: ``zero`` (a command, held) or ``linear`` (a measurement), in place of the mapping's.
 
     Raises:
         DataError: for missing columns, unsorted time, NaN, wrong units.
@@ -225,17 +314,17 @@ def read_recording(
     if source.is_dir() or suffix in {".mcap", ".db3"}:
         from pendulum_bags.runs.bag_recordings import read_bag_recording
 
-        return check_consistency(read_bag_recording(source, effort=effort, namespace=namespace))
+        return check_consistency(unwrap(read_bag_recording(source, effort=effort, namespace=namespace)))
     if suffix == ".json":
-        return check_consistency(read_servo_log(source))
+        return check_consistency(unwrap(read_servo_log(source)))
     if suffix in {".csv", ".txt"}:
         from pendulum_bags.runs.csv_mapping import read_csv
 
-        return check_consistency(read_csv(source, mapping))
+        return check_consistency(unwrap(read_csv(source, mapping, hold=hold)))
     if suffix == ".hebilog":
         from pendulum_bags.runs.hebi_logs import read_hebi_log
 
-        return check_consistency(read_hebi_log(source, mapping))
+        return check_consistency(unwrap(read_hebi_log(source, mapping)))
     raise DataError(
         f"{source} has the suffix {suffix!r}; expected .csv, .txt, .json, .hebilog, .mcap, .db3 or a bag folder"
     )
