@@ -140,10 +140,8 @@ def test_a_plant_that_no_candidate_can_be_is_said_loudly_to_have_no_honest_inter
     assert result.to_dict()["incomplete"]
 
 
-def test_the_shipped_simulation_by_euler_is_not_said_to_be_known_to_a_quarter_of_a_percent():
-    from pathlib import Path
-
-    folder = Path(__file__).resolve().parents[1] / "examples" / "regulation_sim"
+def test_the_shipped_simulation_by_euler_is_not_said_to_be_known_to_a_quarter_of_a_percent(pytestconfig):
+    folder = pytestconfig.rootpath / "bags" / "examples" / "regulation_sim"
     result = identify([read_recording(folder)], replace(QUICK, friction="viscous"), profiles=0)
     assert result.sentences()[0].startswith(
         "MODEL INCOMPLETE: what the fit leaves over depends on the past input"
