@@ -9,6 +9,7 @@ EXECUTABLES: dict[str, str] = {
     "frequency_response": "pendulum_bags.frequency_response.frequency_response_cli:main",
     "replay": "pendulum_bags.replay.replay_cli:main",
     "experiment": "pendulum_bags.experiments.experiment_cli:main",
+    "move": "pendulum_bags.experiments.move_cli:main",
     "excite": "pendulum_bags.experiments.excite_cli:main",
     "identify": "pendulum_bags.identification.identify_cli:main",
     "report": "pendulum_bags.report.report_cli:main",

@@ -10,8 +10,8 @@ from types import FrameType, TracebackType
 from typing import Any, TypeVar
 
 import rclpy
-from lifecycle_msgs.msg import Transition
-from lifecycle_msgs.srv import ChangeState
+from lifecycle_msgs.msg import State, Transition
+from lifecycle_msgs.srv import ChangeState, GetState
 from rclpy.client import Client
 from rclpy.context import Context
 from rclpy.experimental import EventsExecutor
@@ -24,6 +24,7 @@ from std_srvs.srv import SetBool, Trigger
 from trajectory_msgs.msg import JointTrajectory
 
 from pendulum_msgs_py.contract import names
+from pendulum_msgs_py.contract.drive import Mode
 from pendulum_msgs_py.contract.trajectory import Trajectory
 from pendulum_msgs_py.contract.values import JointSample
 from pendulum_msgs_py.errors import FaultError
@@ -154,6 +155,7 @@ class PlantClient:
         self._pause = node.create_client(SetBool, f"{namespace}/{plant}/pause")
         self._e_stop = node.create_client(Trigger, f"{namespace}/{plant}/e_stop")
         self._change_state = node.create_client(ChangeState, f"{namespace}/{controller}/change_state")
+        self._get_state = node.create_client(GetState, f"{namespace}/{controller}/get_state")
         self._start = node.create_client(Trigger, f"{namespace}/{disturbance}/start")
         self._trajectory = node.create_publisher(
             JointTrajectory, f"{namespace}/{names.JOINT_TRAJECTORY}", qos.TRAJECTORY
@@ -278,6 +280,24 @@ class PlantClient:
     def has_event(self, name: str) -> Mapping[str, Any] | None:
         """Return the newest event of a name, or None."""
         return next((event for event in reversed(self.events) if event["name"] == name), None)
+
+    def newest_mode(self) -> str:
+        """Return the plant's mode, as its newest event says; empty where none was heard."""
+        modes = [str(event.get("mode")) for event in self.events if event["name"] == "plant_mode"]
+        return modes[-1] if modes else ""
+
+    def is_armed(self) -> bool:
+        """Tell whether torque may flow."""
+        return self.newest_mode() in {Mode.EFFORT.value, Mode.POSITION.value}
+
+    def has_controller(self) -> bool:
+        """Tell whether a controller is on the graph."""
+        return bool(self._get_state.service_is_ready() and self._change_state.service_is_ready())
+
+    def controller_is_active(self) -> bool:
+        """Ask the controller's lifecycle."""
+        state = self.conductor.call(self._get_state, GetState.Request(), f"{self.namespace} controller's state")
+        return bool(state.current_state.id == State.PRIMARY_STATE_ACTIVE)
 
     def check_mode(self) -> None:
         """Raise a FaultError where the plant has faulted or been stopped."""

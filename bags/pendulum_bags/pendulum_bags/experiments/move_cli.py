@@ -1,0 +1,117 @@
+"""``python -m pendulum_bags move``: bring a running pendulum upright or down, and say each step before it is taken."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Annotated, Literal
+
+import typer
+
+from pendulum_msgs_py.contract import names
+from pendulum_msgs_py.contract.trajectory import thesis_ramp
+from pendulum_msgs_py.errors import FaultError
+from pendulum_msgs_py.programs.executables import EXIT_INTERRUPTED, cli_main
+
+if TYPE_CHECKING:
+    from pendulum_bags.experiments.conductor_node import Conductor, PlantClient
+
+__all__ = ["app", "main"]
+
+_PATIENCE = 20.0
+"""Longest wait for a node that is to answer [s]."""
+
+app = typer.Typer(add_completion=False, rich_markup_mode=None)
+
+
+@app.command(epilog="Example: python -m pendulum_bags move upright --namespace /sim")
+def move(
+    goal: Annotated[Literal["upright", "down"], typer.Argument(help="Where to.")],
+    namespace: Annotated[str, typer.Option(help="Of the plant.")] = "/sim",
+    control: Annotated[
+        bool, typer.Option(help="upright: let the controller take over at the end. Without it the plant holds.")
+    ] = True,
+    domain: Annotated[int | None, typer.Option(help="ROS domain; by default ROS_DOMAIN_ID.")] = None,
+) -> int:
+    """Move a pendulum under position control along the thesis's ramp: at most 0.3 rad/s.
+
+    The controller is deactivated and the plant armed where that is not so. At the end of `upright` the controller is
+    activated and takes over from position control; at the end of `down` the plant is disarmed. Ctrl-C disarms it.
+    """
+    from pendulum_bags.experiments.conductor_node import Conductor, PlantClient
+    from pendulum_bags.experiments.domain import check_domain
+
+    with Conductor(check_domain(domain) or 0) as conductor:
+        node = _find_plant(conductor, namespace)
+        plant = PlantClient(conductor, namespace, node)
+        plant.wait_until_ready(_PATIENCE, controller=False, disturbance=False)
+        # What is on the graph by then has been met: the plant's own services are no older.
+        conductor.spin(0.5)
+        controlled = plant.has_controller()
+        try:
+            _move(plant, goal, controlled=controlled, control=control)
+        except KeyboardInterrupt:
+            plant.disarm_quietly()
+            print(f"{namespace} is disarmed", flush=True)
+            return EXIT_INTERRUPTED
+        except FaultError:
+            plant.disarm_quietly()
+            raise
+    return 0
+
+
+def _move(plant: PlantClient, goal: str, *, controlled: bool, control: bool) -> None:
+    assert plant.sample is not None
+    where, space = plant.sample.position, plant.namespace
+    # The nearest turn's goal, so that nobody winds a cable up.
+    turns = round((where - (math.pi if goal == "upright" else 0.0)) / (2 * math.pi))
+    end = 2 * math.pi * turns + (math.pi if goal == "upright" else 0.0)
+    ramp = thesis_ramp(where, end)
+    duration = ramp.duration
+    if not plant.is_armed():
+        # From rest a controller would ask for all it has, and the plant would not be armed.
+        if controlled and plant.controller_is_active():
+            print(f"{space}: deactivating the controller", flush=True)
+            plant.switch_controller(on=False)
+        print(f"{space}: arming; it holds where it is", flush=True)
+        plant.arm()
+    print(f"{space}: moving from {where:.2f} to {end:.2f} rad in {duration:.0f} s, at most 0.3 rad/s", flush=True)
+    plant.follow(ramp, f"move_{goal}")
+    wait = plant.conductor.wait_for
+    wait(f"{space} to follow the ramp", plant.is_following, _PATIENCE)
+    # A controller that is awake at the end would take over there; until now it may have held the pendulum.
+    if controlled and plant.controller_is_active():
+        print(f"{space}: under position control; deactivating the controller", flush=True)
+        plant.switch_controller(on=False)
+    wait(f"the end of the move of {space}", plant.trajectory_finished, duration + _PATIENCE)
+    if goal == "down":
+        print(f"{space}: down; disarming", flush=True)
+        plant.disarm()
+    elif controlled and control:
+        print(f"{space}: upright; activating the controller", flush=True)
+        plant.switch_controller(on=True)
+        plant.conductor.spin(0.5)
+        if plant.newest_mode() != "armed_effort":
+            raise FaultError(f"{space} is {plant.newest_mode()}; expected the controller to have taken over")
+        print(f"{space}: the controller holds it", flush=True)
+    else:
+        print(f"{space}: upright; held under position control", flush=True)
+
+
+def _find_plant(conductor: Conductor, namespace: str) -> str:
+    """Return the name of the node in a namespace that has an e-stop: that is a plant."""
+
+    def found() -> list[str]:
+        ends = f"/{names.E_STOP.removeprefix('~/')}"
+        return [
+            name.removeprefix(f"{namespace.rstrip('/')}/").removesuffix(ends)
+            for name, _ in conductor.node.get_service_names_and_types()
+            if name.startswith(f"{namespace.rstrip('/')}/") and name.endswith(ends)
+        ]
+
+    return conductor.wait_for(f"a plant in {namespace}", found, _PATIENCE)[0]
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run the program."""
+    return cli_main(app, argv, name="python -m pendulum_bags move")
