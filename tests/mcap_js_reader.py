@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-import fcntl
 import json
-import os
-import shutil
 import subprocess
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -13,7 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import pytest
+from tests.npm import install_packages
 
 __all__ = ["McapJs", "mcap_js_process"]
 
@@ -45,39 +42,10 @@ class McapJs:
         return answer["byIndex"]["count"], answer["inOrder"]["count"]
 
 
-def _skip(reason: str) -> None:
-    pytest.skip(f"the JavaScript readers of MCAP cannot be had here: {reason}")
-
-
-def _install() -> None:
-    """Install the packages of the lock beside the script, once for all test runs on this checkout."""
-    for program in ("node", "npm"):
-        if shutil.which(program) is None:
-            _skip(f"{program} is not installed")
-    folder = os.open(_FOLDER, os.O_RDONLY)
-    try:
-        fcntl.flock(folder, fcntl.LOCK_EX)
-        mark = _FOLDER / "node_modules" / ".of_lock"
-        lock = (_FOLDER / "package-lock.json").read_text(encoding="utf-8")
-        if mark.is_file() and mark.read_text(encoding="utf-8") == lock:
-            return
-        command = ["npm", "ci", "--ignore-scripts", "--no-audit", "--no-fund", "--silent"]
-        try:
-            done = subprocess.run(command, cwd=_FOLDER, capture_output=True, text=True, timeout=60, check=False)
-        except subprocess.TimeoutExpired:
-            _skip("npm found no registry within 60 s")
-        if done.returncode:
-            reason = (done.stderr or done.stdout).strip().splitlines()
-            _skip(f"npm ci failed ({reason[0] if reason else done.returncode})")
-        mark.write_text(lock, encoding="utf-8")
-    finally:
-        os.close(folder)
-
-
 @contextmanager
 def mcap_js_process() -> Iterator[McapJs]:
     """Start the readers; skip the test where Node.js or its packages cannot be had."""
-    _install()
+    install_packages(_FOLDER, "the JavaScript readers of MCAP")
     process = subprocess.Popen(
         ["node", str(_FOLDER / "read.mjs")], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
     )

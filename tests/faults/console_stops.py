@@ -93,9 +93,9 @@ class StopRig:
                 if self.page.locator("#alarms button").count():
                     self.page.locator("#alarms button").first.click(timeout=500)
                 elif self.modes[-1:] == ["e_stop"]:
-                    self.page.get_by_role("button", name="Reset e-stop").click(timeout=500)
+                    self.page.get_by_role("button", name="Reset e-stop /sim").click(timeout=500)
                 elif self.modes[-1:] in (["disarmed"], ["fault"]):
-                    self.page.get_by_role("button", name="Arm", exact=True).click(timeout=500)
+                    self.page.get_by_role("button", name="Arm /sim", exact=True).click(timeout=500)
             self.witness.spin(0.2)
 
     def until_stopped(self, timeout: float = MAX_DELAY) -> float | None:

@@ -16,7 +16,7 @@ import rclpy
 import typer
 from diagnostic_msgs.msg import DiagnosticArray
 from rcl_interfaces.msg import Parameter as ParameterMessage
-from rcl_interfaces.srv import SetParameters
+from rcl_interfaces.srv import DescribeParameters, SetParameters
 from rclpy.clock import Clock, ClockType
 from rclpy.context import Context
 from rclpy.experimental import EventsExecutor
@@ -27,6 +27,7 @@ from sensor_msgs.msg import JointState
 from std_msgs.msg import String
 from std_srvs.srv import SetBool, Trigger
 
+from pendulum_bags.console.graph import Description
 from pendulum_bags.console.jobs import Jobs
 from pendulum_bags.console.page import serve
 from pendulum_bags.console.security import is_loopback
@@ -89,6 +90,7 @@ class Hub:
         self._lock = threading.Lock()
         self._plants: dict[str, _Plant] = {}
         self._clients: dict[str, Any] = {}
+        self._described: dict[tuple[str, ...], dict[str, Description]] = {}
         self._reader = ParameterReader(self._node, lambda _values, _changed: None)
         self._node.create_subscription(
             DiagnosticArray, names.DIAGNOSTICS, self._on_diagnostics, qos.DIAGNOSTICS
@@ -232,6 +234,19 @@ class Hub:
         result = (await self._call(SetParameters, f"{node}/set_parameters", request)).results[0]
         if not result.successful:
             raise FaultError(f"{node} refuses {name} = {value}: {result.reason}")
+
+    async def describe(self, node: str) -> dict[str, Description]:
+        """Return what a node says of its parameters, asked once for each set of names."""
+        wanted = sorted(self.parameters.get(node, {}))
+        key = (node, *wanted)
+        if key not in self._described:
+            request = DescribeParameters.Request(names=wanted)
+            answer = await self._call(DescribeParameters, f"{node}/describe_parameters", request)
+            self._described[key] = {
+                it.name: Description(it.description, it.additional_constraints, it.read_only)
+                for it in answer.descriptors
+            }
+        return self._described[key]
 
     async def _call(self, kind: Any, service: str, request: Any) -> Any:
         with self._lock:

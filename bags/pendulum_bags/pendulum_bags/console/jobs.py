@@ -26,17 +26,35 @@ class Job:
         folder: What it writes.
         process: The process.
         log: Its output.
+        started: When [s of the monotonic clock].
+        ended: When it was first seen ended; None while it runs.
     """
 
     kind: str
     folder: Path
     process: subprocess.Popen[bytes]
     log: Path
+    started: float
+    ended: float | None = None
 
     @property
     def running(self) -> bool:
         """Whether it still runs."""
         return self.process.poll() is None
+
+    def describe(self) -> str:
+        """Return how it stands: state, time, size of what it wrote, its last words."""
+        running = self.running
+        if not running and self.ended is None:
+            self.ended = time.monotonic()
+        seconds = (self.ended or time.monotonic()) - self.started
+        files = [path for path in self.folder.rglob("*") if path.is_file()] if self.folder.is_dir() else []
+        size = sum(path.stat().st_size for path in files) / 1e6
+        code = self.process.returncode
+        state = "running" if running else "ended" if code == 0 else f"ended with code {code}"
+        wrote = f" · {size:.1f} MB in {self.folder.name}" if files else ""
+        line = self.last_line()
+        return f"{state} · {seconds:.0f} s{wrote}" + (f" · {line}" if line else "")
 
     def last_line(self) -> str:
         """Return the last line of its output."""
@@ -75,6 +93,15 @@ class Jobs:
         environment = {name: value for name, value in os.environ.items() if name != "ROS_DOMAIN_ID"}
         return self._start("experiment", ["experiment", "thesis", "--seed", str(seed)], "--out", environment)
 
+    def move(self, namespace: str, goal: str) -> Job:
+        """Bring a plant upright or down.
+
+        Args:
+            namespace: Of the plant.
+            goal: ``upright`` or ``down``.
+        """
+        return self._start(f"move{namespace}", ["move", goal, "--namespace", namespace], "", os.environ)
+
     def _start(
         self, kind: str, arguments: list[str], option: str, environment: os._Environ[str] | dict[str, str]
     ) -> Job:
@@ -82,15 +109,15 @@ class Jobs:
         if job is not None and job.running:
             raise FaultError(f"{kind} runs already, into {job.folder}; expected it to end first")
         self.runs.mkdir(parents=True, exist_ok=True)
-        folder = self.runs / f"{time.strftime('%Y-%m-%dT%H-%M-%SZ', time.gmtime())}_console_{kind}"
+        folder = self.runs / f"{time.strftime('%Y-%m-%dT%H-%M-%SZ', time.gmtime())}_console_{kind.replace('/', '_')}"
         log = folder.with_suffix(".log")
-        command = [sys.executable, "-m", "pendulum_bags", *arguments, option, str(folder)]
+        command = [sys.executable, "-m", "pendulum_bags", *arguments, *([option, str(folder)] if option else [])]
         with log.open("wb") as sink:
             process = subprocess.Popen(
                 command, stdin=subprocess.DEVNULL, stdout=sink, stderr=subprocess.STDOUT,
                 env=dict(environment), start_new_session=True,
             )  # fmt: skip
-        self._jobs[kind] = Job(kind, folder, process, log)
+        self._jobs[kind] = Job(kind, folder, process, log, time.monotonic())
         return self._jobs[kind]
 
     def stop(self, kind: str) -> str:

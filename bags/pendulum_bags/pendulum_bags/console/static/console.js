@@ -2,7 +2,7 @@
 "use strict";
 (() => {
   const SPAN = 10; // seconds shown
-  const COLOURS = ["#1f77b4", "#ff7f0e", "#2ca02c", "#9467bd"];
+  const COLOURS = ["#1f77b4", "#d95f02", "#2ca02c", "#9467bd"];
   const MODES = {
     disarmed: "disarmed", armed_effort: "ARMED: follows the controller", armed_position: "ARMED: moves by itself", e_stop: "E-STOP", fault: "FAULT", silent: "SILENT",
   };
@@ -248,7 +248,8 @@
       c.strokeStyle = c.fillStyle = colour;
       c.lineWidth = 7 - 3 * index;
       c.beginPath(); c.moveTo(x, y); c.lineTo(bx, by); c.stroke();
-      c.beginPath(); c.arc(bx, by, 13 - 4 * index, 0, 7); c.fill();
+      c.beginPath(); c.arc(bx, by, 13 - 2 * index, 0, 7);
+      if (index) { c.lineWidth = 3; c.stroke(); } else c.fill();
       // Torques as arcs about the axis: 13 N m are three quarters of a turn; applied outside, disturbance inside.
       [[plant.applied, 34 + 14 * index, colour], [plant.disturbance, 27 + 14 * index, ink("--faint")]].forEach(([effort, radius, stroke]) => {
         if (!effort) return;
@@ -293,7 +294,7 @@
       tape.cleared = end + AHEAD;
     }
     for (; tape.cleared < end + AHEAD; tape.cleared += 1) t.clearRect(tape.cleared % tape.ring, 0, 1, tape.canvas.height);
-    names.forEach((name, index) => extend(t, name, COLOURS[index % COLOURS.length], end - columns, perSecond, boxes, ratio));
+    names.forEach((name, index) => extend(t, name, index, end - columns, perSecond, boxes, ratio));
 
     // The ring is cut where it begins: two pieces at most for each box.
     const first = ((end - columns) % tape.ring + tape.ring) % tape.ring, piece = Math.min(columns, tape.ring - first);
@@ -305,6 +306,13 @@
         c.drawImage(tape.canvas, 0, y, columns - piece, tall, left + piece / ratio, y / ratio, (columns - piece) / ratio, tall / ratio);
       }
     }
+    c.strokeStyle = ink("--faint"); c.lineWidth = 0.5;
+    boxes.forEach(([top, bottom], row) => {
+      const [low, high] = tape.ranges[row] || [0, 0];
+      if (!(low < 0 && high > 0)) return;
+      const zero = bottom + low / (high - low) * (bottom - top);
+      c.beginPath(); c.moveTo(left, zero); c.lineTo(right, zero); c.stroke();
+    });
   }
 
   const outside = (value, range) => value !== undefined && range && (value < range[0] || value > range[1]);
@@ -338,13 +346,13 @@
     if (changed) forget();
   }
 
-  function extend(t, name, colour, oldest, perSecond, boxes, ratio) {
+  function extend(t, name, index, oldest, perSecond, boxes, ratio) {
     const series = state.series[name] || [];
     let at = series.length;
     const seen = tape.last[name]?.[0] ?? -Infinity;
     while (at > 0 && series[at - 1][0] > seen) at -= 1;
     if (at === series.length) return;
-    t.strokeStyle = colour; t.lineWidth = 1.3 * ratio;
+    t.strokeStyle = COLOURS[index % COLOURS.length]; t.lineWidth = (index ? 1.8 : 1.3) * ratio;
     ROWS.forEach((_, row) => {
       const [top, bottom] = boxes[row], [low, high] = tape.ranges[row];
       const y = (value) => (bottom - (value - low) / (high - low) * (bottom - top)) * ratio;
@@ -357,6 +365,8 @@
         if (value === undefined || !from || from[row + 1] === undefined || point[0] - from[0] > 0.3) continue;
         const x0 = from[0] * perSecond, x1 = point[0] * perSecond;
         if (x0 < oldest) continue;
+        // The second plant's line is dashed, the third's dotted: told apart without colour.
+        if (index && Math.floor(x0 / (6 * ratio)) % (index + 1) === index) continue;
         const shift = Math.floor(x0 / tape.ring) * tape.ring;
         t.moveTo(x0 - shift, y(from[row + 1])); t.lineTo(x1 - shift, y(value));
         if (x1 - shift >= tape.ring) { t.moveTo(x0 - shift - tape.ring, y(from[row + 1])); t.lineTo(x1 - shift - tape.ring, y(value)); }
@@ -399,7 +409,8 @@
       place.replaceChildren(...shown.map(([name, mode, rest]) => {
         const line = document.createElement("div");
         line.dataset.plant = name;
-        const dot = document.createElement("i"); dot.style.background = COLOURS[names.indexOf(name) % COLOURS.length];
+        const place_ = names.indexOf(name), dot = document.createElement("i");
+        dot.style.borderTopColor = COLOURS[place_ % COLOURS.length]; dot.className = place_ ? "dashed" : "";
         const title = document.createElement("b"); title.textContent = name || "/";
         const badge = document.createElement("span"); badge.className = mode; badge.textContent = ` ${MODES[mode] || mode} `;
         line.append(dot, title, badge, rest);

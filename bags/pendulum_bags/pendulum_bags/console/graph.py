@@ -1,0 +1,56 @@
+"""What the page needs of the ROS graph."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple, Protocol
+
+__all__ = ["Description", "Graph"]
+
+
+class Description(NamedTuple):
+    """What a node says of one of its parameters: text with the unit, domain in words, whether it can be set."""
+
+    text: str
+    domain: str
+    read_only: bool
+
+
+class Graph(Protocol):
+    """What the page needs of the ROS graph."""
+
+    @property
+    def parameters(self) -> dict[str, dict[str, Any]]:
+        """Parameters of all nodes: node -> name -> value."""
+
+    def frame(self) -> dict[str, Any]:
+        """Return the newest of everything that is drawn."""
+
+    def plants(self) -> dict[str, str]:
+        """Return namespace -> full node name."""
+
+    async def e_stop(self) -> dict[str, Any] | None:
+        """Order every plant to stop; return what each has answered."""
+
+    def stop_state(self) -> dict[str, Any] | None:
+        """Return the state of the stop that is in force."""
+
+    def acknowledge_stop(self) -> list[str]:
+        """End the stop for the plants that have answered; return those that have not."""
+
+    def release_stop(self, node: str) -> None:
+        """Stop asking one plant."""
+
+    async def reset(self, node: str) -> str:
+        """Reset the e-stop of a plant."""
+
+    async def trigger(self, service: str) -> str:
+        """Call a service without arguments."""
+
+    async def arm(self, node: str, *, on: bool) -> str:
+        """Arm or disarm a plant."""
+
+    async def set_parameter(self, node: str, name: str, value: Any) -> None:
+        """Set a parameter."""
+
+    async def describe(self, node: str) -> dict[str, Description]:
+        """Return what a node says of its parameters."""

@@ -1,0 +1,205 @@
+"""The console's page: what is seen, and what its buttons do. One object a client."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Awaitable, Callable
+from functools import partial
+from typing import Any
+
+from nicegui import ui
+
+from pendulum_bags.console.graph import Graph
+from pendulum_bags.console.jobs import Jobs
+from pendulum_bags.console.parameter_table import ParameterTable
+from pendulum_msgs_py.errors import PendulumError
+
+__all__ = ["Layout"]
+
+REFRESH_PERIOD = 0.5
+"""Time between two looks at what changes by itself [s]."""
+
+
+class Layout:
+    """The page as one client sees it.
+
+    Args:
+        graph: The ROS graph.
+        jobs: Programs that the page may start.
+    """
+
+    def __init__(self, graph: Graph, jobs: Jobs) -> None:
+        self._graph = graph
+        self._jobs = jobs
+        self._tables = [
+            ParameterTable(graph, "controller", self._carefully),
+            ParameterTable(graph, "disturbance", self._carefully),
+        ]
+        self._job_labels: dict[str, tuple[ui.label, ui.link]] = {}
+        self._cards: dict[str, str] = {}
+
+    def build(self) -> None:
+        """Lay the page out."""
+        ui.add_head_html('<link rel="stylesheet" href="/console/console.css">')
+        ui.add_body_html('<script src="/console/console.js"></script>')
+        with ui.element("header").classes("bar"):
+            ui.html('<h1 class="title">Pendulum console</h1>', sanitize=False)
+            ui.html('<span id="link" role="status">connecting</span>', sanitize=False)
+            # Plain HTML and a request of its own: it works while the rest of the page waits for the server.
+            ui.html(
+                '<button id="e_stop" type="button" aria-keyshortcuts="Space Escape Enter"'
+                ' title="Space, Escape or Enter">E-STOP<small>Space, Esc or Enter</small></button>',
+                sanitize=False,
+            )
+        ui.html('<div id="alarms" role="alert" aria-live="assertive"></div>', sanitize=False)
+        with ui.element("div").classes("grid"):
+            with ui.element("section").classes("card").props('aria-label="Plants"'):
+                ui.html('<canvas id="pendulum" role="img" aria-label="pendulums, drawn live"></canvas>', sanitize=False)
+                ui.html('<div id="plants"></div>', sanitize=False)
+            with ui.element("section").classes("card wide").props('aria-label="Signals"'):
+                ui.html(
+                    '<canvas id="plots" role="img" aria-label="angle, velocity and torques of the last 10 s"></canvas>',
+                    sanitize=False,
+                )
+        self._plants = ui.element("div").classes("cards")
+        with ui.element("div").classes("cards"):
+            with ui.element("section").classes("card wide"):
+                _heading("Controllers")
+                self._tables[0].build()
+            with ui.element("section").classes("card wide"):
+                _heading("Disturbances")
+                self._tables[1].build()
+                with ui.row():
+                    _button("Start noise", lambda: self._each("disturbance/start"), filled=True)
+                    _button("Stop noise", lambda: self._each("disturbance/stop"))
+            with ui.element("section").classes("card"):
+                _heading("Record and compare")
+                self._job_buttons()
+        ui.timer(REFRESH_PERIOD, self._refresh)
+
+    # --- pieces --------------------------------------------------------------------------------------------
+
+    def _plant_card(self, space: str, node: str) -> None:
+        """Buttons for one plant alone."""
+
+        def move_text(goal: str) -> str:
+            end = "the controller takes over" if goal == "upright" else "the plant is disarmed"
+            return (
+                f"{space} will be armed and will move {goal} under position control, at most 0.3 rad/s, for up to 16 s."
+                f" Its controller waits meanwhile. At the end {end}. Keep clear of the pendulum; the e-stop ends it."
+            )
+
+        with ui.element("section").classes("card").props(f'aria-label="{space}" data-card="{space}"'):
+            _heading(space)
+            with ui.row():
+                _button("Arm", lambda: self._one(self._graph.arm(node, on=True)), filled=True, of=space)
+                _button("Disarm", lambda: self._one(self._graph.arm(node, on=False)), of=space)
+                _button("Stop", lambda: self._one(self._graph.trigger(f"{node}/e_stop")), of=space, danger=True)
+                _button("Reset e-stop", lambda: self._one(self._graph.reset(node)), of=space)
+            with ui.row():
+                for goal in ("upright", "down"):
+                    _button(f"Bring {goal} ...", partial(self._ask_to_move, space, goal, move_text(goal)), of=space)
+                _button("Cancel the move", lambda: self._finish(f"move{space}"), of=space)
+            self._job_line(f"move{space}")
+
+    def _job_buttons(self) -> None:
+        with ui.row():
+            _button("Start recording", lambda: self._try(self._jobs.record), filled=True)
+            _button("Stop recording", lambda: self._finish("record"))
+        self._job_line("record")
+        with ui.row():
+            seed = ui.number("Seed", value=1, min=0, step=1, precision=0).props("dense").classes("seed")
+            _button(
+                "Run the experiment",
+                lambda: self._try(lambda: self._jobs.experiment(int(seed.value or 0))),
+                filled=True,
+            )
+            _button("Cancel", lambda: self._finish("experiment"))
+        self._job_line("experiment")
+
+    def _job_line(self, kind: str) -> None:
+        label = ui.label().classes("small").props('role="status"')
+        link = ui.link("Open its report", "#", new_tab=True)
+        link.set_visibility(False)
+        self._job_labels[kind] = (label, link)
+
+    # --- actions -------------------------------------------------------------------------------------------
+
+    async def _carefully(self, work: Awaitable[Any]) -> bool:
+        try:
+            answer = await work
+        except PendulumError as error:
+            ui.notify(str(error), type="negative", multi_line=True, timeout=8000, position="bottom-left")
+            return False
+        if answer:
+            ui.notify(str(answer), type="positive", position="bottom-left", timeout=2500)
+        return True
+
+    async def _one(self, work: Awaitable[Any]) -> None:
+        await self._carefully(work)
+
+    async def _each(self, service: str) -> None:
+        for space in self._graph.plants():
+            await self._carefully(self._graph.trigger(f"{space}/{service}"))
+
+    def _ask_to_move(self, space: str, goal: str, text: str) -> None:
+        self._ask(text, lambda: self._jobs.move(space, goal))
+
+    def _ask(self, text: str, work: Callable[[], object]) -> None:
+        """Say what a button will do, and do it when the person agrees."""
+        with ui.dialog() as dialog, ui.card():
+            ui.label(text)
+            with ui.row():
+
+                def agree() -> None:
+                    dialog.close()
+                    self._try(work)
+
+                _button("Move it", agree, filled=True)
+                _button("Leave it", dialog.close)
+        dialog.open()
+
+    def _try(self, work: Callable[[], object]) -> None:
+        try:
+            work()
+        except PendulumError as error:
+            ui.notify(str(error), type="negative", position="bottom-left")
+
+    async def _finish(self, kind: str) -> None:
+        ui.notify(await asyncio.to_thread(self._jobs.stop, kind), position="bottom-left")
+
+    # --- what changes by itself ----------------------------------------------------------------------------
+
+    async def _refresh(self) -> None:
+        """Show the plants that are there, the values in force, and the jobs."""
+        plants = self._graph.plants()
+        if plants != self._cards:
+            self._cards = dict(plants)
+            for kind in [kind for kind in self._job_labels if kind.startswith("move")]:
+                del self._job_labels[kind]
+            self._plants.clear()
+            with self._plants:
+                for space, node in sorted(plants.items()):
+                    self._plant_card(space, node)
+        for table in self._tables:
+            await table.refresh(sorted(plants))
+        for kind, (label, link) in self._job_labels.items():
+            job = self._jobs[kind]
+            label.text = job.describe() if job is not None else ""
+            report = job is not None and not job.running and (job.folder / "report.html").is_file()
+            link.set_visibility(report)
+            if job is not None and report:
+                link.props(f'href="/runs/{job.folder.name}/report.html"')
+
+
+def _heading(text: str) -> None:
+    ui.html(f"<h2>{text}</h2>", sanitize=False)
+
+
+def _button(
+    text: str, work: Callable[[], Any], *, filled: bool = False, danger: bool = False, of: str = ""
+) -> ui.button:
+    """Make a button whose colours keep the contrast that WCAG AA asks for, and whose name says which plant it moves."""
+    button = ui.button(text, on_click=work, color=None).props("unelevated no-caps")
+    button.classes("filled" if filled else "danger" if danger else "plain")
+    return button.props(f'aria-label="{text} {of}"') if of else button

@@ -1,0 +1,170 @@
+"""Parameters of the same kind of node beside every plant: a row a parameter, a column a plant, differences marked."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Awaitable, Callable, Sequence
+from typing import Any
+
+from nicegui import ui
+
+from pendulum_bags.console.graph import Description, Graph
+from pendulum_msgs_py.errors import FaultError, PendulumError
+
+__all__ = ["ParameterTable", "parse_value", "show_value"]
+
+_HIDDEN = frozenset({"start_type_description_service", "use_sim_time", "autostart", "autoactivate", "command_type"})
+"""Parameters that are no matter of the running experiment."""
+_ALL = "all plants"
+_UNIT = re.compile(r"\[[^]]+\]$")
+
+
+def show_value(value: Any) -> str:
+    """Return a value as a person types it: ``0.1``, ``100, 0.01``, ``true``."""
+    if isinstance(value, bool):
+        return str(value).lower()
+    if isinstance(value, (list, tuple)):
+        return ", ".join(show_value(item) for item in value)
+    return f"{value:.10g}" if isinstance(value, float) else str(value)
+
+
+def parse_value(text: str, like: Any) -> Any:
+    """Return what a person typed, as the type of the value in force.
+
+    Raises:
+        FaultError: It is none of that type.
+    """
+    text = text.strip()
+    try:
+        if isinstance(like, bool):
+            return {"true": True, "false": False}[text.lower()]
+        if isinstance(like, (list, tuple)):
+            kind = like[0] if like else 0.0
+            return [parse_value(part, kind) for part in text.split(",")]
+        return type(like)(text) if isinstance(like, (int, float)) else text
+    except (KeyError, ValueError):
+        kinds = {bool: "true or false", int: "a whole number", float: "a number"}
+        kind = kinds.get(type(like), "a value")
+        raise FaultError(f"{text!r} is not {kind}; expected one like {show_value(like)}") from None
+
+
+class ParameterTable:
+    """The table for one kind of node, such as ``controller``.
+
+    Args:
+        graph: The ROS graph.
+        kind: Name of the node beside each plant.
+        carefully: Awaits work and shows what refuses it.
+    """
+
+    def __init__(self, graph: Graph, kind: str, carefully: Callable[[Awaitable[Any]], Awaitable[bool]]) -> None:
+        self._graph = graph
+        self._kind = kind
+        self._carefully = carefully
+        self._fields: dict[tuple[str, str], ui.input] = {}
+        self._marks: dict[str, ui.element] = {}
+        self._shown: dict[tuple[str, str], Any] = {}
+        self._drawn: Any = None
+
+    def build(self) -> None:
+        """Make the place of the table."""
+        self._place = ui.element("div").classes("parameters")
+
+    async def refresh(self, spaces: Sequence[str]) -> None:
+        """Show the values in force, also when somebody else has set them; draw anew when nodes come or go."""
+        known = {
+            space: values for space in spaces if (values := self._graph.parameters.get(f"{space}/{self._kind}"))
+        }
+        drawn = {space: sorted(values) for space, values in known.items()}
+        if drawn != self._drawn:
+            try:
+                descriptions = {space: await self._graph.describe(f"{space}/{self._kind}") for space in known}
+            except PendulumError:
+                return  # it went while it was asked; the next look asks again
+            self._drawn = drawn
+            self._draw(known, descriptions)
+        for (space, name), field in self._fields.items():
+            value = known.get(space, {}).get(name)
+            if value is not None and self._shown.get((space, name)) != value:
+                self._shown[space, name] = value
+                field.value = show_value(value)
+        for name, mark in self._marks.items():
+            in_force = {show_value(values[name]) for values in known.values() if name in values}
+            mark.set_visibility(len(in_force) > 1)
+
+    def _draw(self, known: dict[str, dict[str, Any]], descriptions: dict[str, dict[str, Description]]) -> None:
+        self._place.clear()
+        self._fields.clear()
+        self._marks.clear()
+        self._shown.clear()
+        names = list(dict.fromkeys(name for values in known.values() for name in values if name not in _HIDDEN))
+        with self._place:
+            if not known:
+                ui.label(f"No {self._kind} in this ROS domain yet.").classes("small")
+                return
+            with ui.element("table"):
+                with ui.element("thead"), ui.element("tr"):
+                    for title in ("parameter", *known, *([_ALL] if len(known) > 1 else [])):
+                        with ui.element("th").props('scope="col"'):
+                            ui.label(title)
+                with ui.element("tbody"):
+                    for name in names:
+                        self._row(name, known, descriptions)
+
+    def _row(
+        self, name: str, known: dict[str, dict[str, Any]], descriptions: dict[str, dict[str, Description]]
+    ) -> None:
+        told = next(found[name] for found in descriptions.values() if name in found)
+        with ui.element("tr"):
+            with ui.element("th").props('scope="row"'):
+                unit = _UNIT.search(told.text)
+                with ui.label(f"{name} {unit.group() if unit else ''}").classes("name"):
+                    ui.tooltip(told.text)
+            for space, values in known.items():
+                with ui.element("td"):
+                    if name not in values:
+                        ui.label("–").props('aria-label="has none"')
+                    elif told.read_only:
+                        ui.label(show_value(values[name]))
+                    else:
+                        self._field(name, space, told)
+            if len(known) > 1:
+                with ui.element("td"):
+                    if not told.read_only:
+                        self._field(name, _ALL, told, list(known))
+                    self._marks[name] = ui.label("≠ differ").classes("differ")
+                    self._marks[name].set_visibility(False)
+
+    def _field(self, name: str, space: str, told: Description, spaces: Sequence[str] = ()) -> None:
+        label = f"{name} of {space}"
+        field = ui.input().props(f'dense outlined aria-label="{label}" data-name="{name}" data-plant-field="{space}"')
+        if told.domain:
+            field.tooltip(told.domain)
+
+        async def take() -> None:
+            for where in spaces or [space]:
+                await self._set(where, name, str(field.value or ""))
+            if spaces:
+                field.value = ""
+
+        field.on("change", take)
+        if not spaces:
+            self._fields[space, name] = field
+
+    async def _set(self, space: str, name: str, text: str) -> None:
+        """Set a parameter; what the node refuses is shown with its reason, and the value in force comes back."""
+        node = f"{space}/{self._kind}"
+        values = self._graph.parameters.get(node, {})
+        if name in values and text:
+            try:
+                value = parse_value(text, values[name])
+            except FaultError as error:
+                await self._carefully(_raise(error))
+            else:
+                await self._carefully(self._graph.set_parameter(node, name, value))
+        # Forgotten, so that the next look shows the value in force: also after an emptied field or a refusal.
+        self._shown.pop((space, name), None)
+
+
+async def _raise(error: Exception) -> None:
+    raise error
