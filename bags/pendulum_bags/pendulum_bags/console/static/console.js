@@ -115,7 +115,8 @@
           () => request(`/e_stop/give_up?node=${encodeURIComponent(node)}`)]);
       }
     }
-    alarms.notes.forEach((note) => rows.push(["note", note, "Seen", async () => { alarms.notes.splice(alarms.notes.indexOf(note), 1); }]));
+    alarms.notes.forEach((one) => rows.push(["note", `${clock(one.at)}: ${one.text}${one.count > 1 ? ` (${one.count} times)` : ""}`, "Seen",
+      async () => { alarms.notes.splice(alarms.notes.indexOf(one), 1); }]));
     return rows;
   }
 
@@ -146,9 +147,11 @@
     });
   }
 
-  function note(text) {
-    alarms.notes.push(`${clock(Date.now())}: ${text}`);
-    if (alarms.notes.length > 5) alarms.notes.shift();
+  function note(text, kind = text) {
+    const same = alarms.notes.find((other) => other.kind === kind);
+    if (same) { same.count += 1; same.text = text; same.at = Date.now(); return; }
+    alarms.notes.push({ kind, text, count: 1, at: Date.now() });
+    if (alarms.notes.length > 4) alarms.notes.shift();
   }
 
   // The last picture's age is judged here, not by what the browser draws: a server that is frozen sends nothing, and closes nothing.
@@ -188,7 +191,7 @@
   function take(message) {
     const now = message.t, frame = message.plants;
     if (alarms.lost !== null) {
-      note(`the console's server did not answer for ${seconds(performance.now() - alarms.lost)}; it does again`);
+      note(`the console's server did not answer for ${seconds(performance.now() - alarms.lost)}; it does again`, "server");
       alarms.lost = null;
     }
     heard = performance.now();
