@@ -13,6 +13,7 @@ import pytest
 
 from pendulum_bags.experiments.in_process import simulate
 from pendulum_bags.experiments.run_spec import RunSpec
+from pendulum_hw_bridge.backends.emulator_process import EmulatorProcessBackend
 from pendulum_rosbag.reader import read_bag, same_messages
 from tests.processes import ProcessGroup
 
@@ -172,6 +173,8 @@ def test_a_rehearsal_with_a_lab_file_checks_asks_and_moves_the_machine_of_the_fi
         "limits:\n  effort: {value: 6.0, unit: N m}\n",
         encoding="utf-8",
     )
+    backend = EmulatorProcessBackend(address)
+    before = backend.connect()
     command = ["gravity", "--hardware", "hebi", "--lab", lab, "--out", tmp_path / "run", "--trials", "1"]
     command += ["--step", "10", "--top", "10", "--hold", "0.5"]
     done = subprocess.run(
@@ -184,6 +187,10 @@ def test_a_rehearsal_with_a_lab_file_checks_asks_and_moves_the_machine_of_the_fi
     )
     assert done.returncode == 0, done.stdout + done.stderr
     assert "Type yes to arm" in done.stderr
+    # What the module was set to is given back.
+    assert before.limits.effort != 6.0
+    assert backend.connect().limits == before.limits
+    backend.close()
     bag = read_bag(tmp_path / "run" / "trial_1")
     states = bag["/hw/joint_states"]
     assert np.degrees(states["position"]).max() == pytest.approx(10.0, abs=2.0)

@@ -14,7 +14,7 @@ from rich.console import Console
 
 from pendulum_bags.comparison.compare_cli import MarginOption, MarginsFile
 from pendulum_bags.experiments.domain import check_domain
-from pendulum_bags.experiments.operator import confirm
+from pendulum_bags.experiments.operator import confirmed
 from pendulum_bags.experiments.progress import PhaseProgress
 from pendulum_bags.experiments.settings import (
     SETTLE_TIME,
@@ -124,25 +124,22 @@ def thesis(
     )
     margins = Margins.of(margins_file, margin)
     check_domain(domain)
-    if (machine := settings.machine) is not None:
-        confirm(
-            machine, settings.bridge_program(), _plan(settings), make_console(stderr=True, highlight=False), yes=yes
-        )
-    folder = create_run_folder(out, "thesis")
     console = make_console(stderr=json_output, highlight=False)
-    started = time.monotonic()
-    try:
-        with PhaseProgress(TIME_BESIDE_NOISE + duration, console) as progress:
-            repeat = hardware == "emulator" and budget > 0.0
-            run_thesis(folder, settings, domain, progress, repeat=repeat)
-            comparison, summary = _analyse(folder, settings, margins, budget, progress)
-    except KeyboardInterrupt:
-        kept = "nothing was recorded" if discard_if_empty(folder) else f"what was recorded is in {folder}"
-        console.print(f"interrupted: all programs have ended; {kept}")
-        raise typer.Exit(EXIT_INTERRUPTED) from None
-    except PendulumError:
-        discard_if_empty(folder)
-        raise
+    with confirmed(settings.machine, settings.bridge_program(), _plan(settings), yes=yes):
+        folder = create_run_folder(out, "thesis")
+        started = time.monotonic()
+        try:
+            with PhaseProgress(TIME_BESIDE_NOISE + duration, console) as progress:
+                repeat = hardware == "emulator" and budget > 0.0
+                run_thesis(folder, settings, domain, progress, repeat=repeat)
+                comparison, summary = _analyse(folder, settings, margins, budget, progress)
+        except KeyboardInterrupt:
+            kept = "nothing was recorded" if discard_if_empty(folder) else f"what was recorded is in {folder}"
+            console.print(f"interrupted: all programs have ended; {kept}")
+            raise typer.Exit(EXIT_INTERRUPTED) from None
+        except PendulumError:
+            discard_if_empty(folder)
+            raise
     if json_output:
         print(json.dumps(summary, indent=2))
     else:

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
+import shutil
 import subprocess
 import sys
-from collections.abc import Callable
+import tempfile
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -14,8 +17,9 @@ from rich.console import Console
 from pendulum_msgs_py.errors import FaultError, ParameterError
 from pendulum_msgs_py.plants.lab_file import LabFile, load_lab
 from pendulum_msgs_py.programs.graph import NodeProgram, ParameterArgument
+from pendulum_msgs_py.programs.terminal import make_console
 
-__all__ = ["RealMachine", "ask_yes", "confirm", "real_machine", "run_checklist"]
+__all__ = ["RealMachine", "ask_yes", "confirmed", "real_machine", "run_checklist"]
 
 _CHECK_TIMEOUT = 120.0
 _EXIT_BUSY = 3
@@ -76,24 +80,73 @@ def real_machine(hardware: str, lab: str | Path | None) -> RealMachine | None:
     return RealMachine(path, load_lab(path))
 
 
-def confirm(
-    machine: RealMachine, bridge: NodeProgram, plan: str, console: Console, *, yes: bool, flat: bool = False
-) -> None:
-    """Go through the checklist with the bridge's own options, say what will move, and ask.
+@contextlib.contextmanager
+def confirmed(
+    machine: RealMachine | None, bridge: NodeProgram, plan: str, *, yes: bool, flat: bool = False
+) -> Iterator[None]:
+    """Keep what the module is set to, go through the checklist, ask the operator; give the settings back at the end.
 
     Args:
-        machine: The machine.
+        machine: The machine; None for the emulator, which needs none of this.
         bridge: The bridge as it will be started.
         plan: What will happen, one sentence or more.
-        console: Where to say it.
         yes: The operator has said yes on the command line.
         flat: Whether the pendulum lies flat.
 
     Raises:
-        FaultError: The checklist is not passed, or the operator does not say yes.
+        FaultError: The settings cannot be read, the checklist is not passed, or the operator does not say yes.
     """
-    run_checklist(bridge, console, flat=flat)
-    ask_yes(machine, plan, console, yes=yes)
+    if machine is None:
+        yield
+        return
+    console = make_console(stderr=True, highlight=False)
+    with _kept_settings(machine, console):
+        run_checklist(bridge, console, flat=flat)
+        ask_yes(machine, plan, console, yes=yes)
+        yield
+
+
+@contextlib.contextmanager
+def _kept_settings(machine: RealMachine, console: Console) -> Iterator[None]:
+    """Keep gains, safety parameters and M-stop action of the module, and give them back on every way out."""
+    folder = Path(tempfile.mkdtemp(prefix="pendulum_module_")) / "before"
+    console.print("keeping the module's settings ...", style="dim")
+    said = _lab("backup", str(machine.path), "--out", str(folder))
+    if said:
+        shutil.rmtree(folder.parent, ignore_errors=True)
+        raise FaultError(f"the module's settings cannot be kept: {said}; nothing was started")
+    try:
+        yield
+    finally:
+        said = _lab("restore", str(machine.path), str(folder), "--yes")
+        if said:
+            # The files stay: they are the only record of how the module was.
+            again = f"python -m pendulum_hw_bridge lab restore {machine.path} {folder}"
+            words = f"the module's settings were not given back ({said}); again: {again}"
+            console.print(words, markup=False, style="red")
+        else:
+            shutil.rmtree(folder.parent, ignore_errors=True)
+
+
+def _lab(*arguments: str) -> str:
+    """Run a procedure of the lab; return why it failed, or an empty string."""
+    command = [sys.executable, "-m", "pendulum_hw_bridge", "lab", *arguments]
+    try:
+        done = subprocess.run(
+            command,
+            stdin=subprocess.DEVNULL,
+            capture_output=True,
+            encoding="utf-8",
+            errors="replace",
+            timeout=_CHECK_TIMEOUT,
+            check=False,
+            # Ctrl-C is for the experiment: what gives the settings back must not die of it.
+            start_new_session=True,
+        )
+    except subprocess.TimeoutExpired:
+        return f"it did not end within {_CHECK_TIMEOUT:g} s"
+    words = done.stderr.strip().splitlines()
+    return "" if done.returncode == 0 else words[-1].removeprefix("error: ") if words else f"code {done.returncode}"
 
 
 def run_checklist(bridge: NodeProgram, console: Console, *, flat: bool = False) -> None:

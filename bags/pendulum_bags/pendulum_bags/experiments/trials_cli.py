@@ -10,7 +10,7 @@ import typer
 from rich.console import Console
 
 from pendulum_bags.experiments.domain import check_domain
-from pendulum_bags.experiments.operator import confirm
+from pendulum_bags.experiments.operator import confirmed
 from pendulum_bags.experiments.progress import PhaseProgress
 from pendulum_bags.runs.run_folder import create_run_folder, discard_if_empty
 from pendulum_msgs_py.errors import PendulumError
@@ -106,29 +106,23 @@ def _run(
 
     check_domain(domain)
     name = settings.kind.name
-    if (machine := settings.machine) is not None:
-        confirm(
-            machine,
-            settings.plant_program(1),
-            _plan(settings),
-            make_console(stderr=True, highlight=False),
-            yes=yes,
-            flat=settings.kind.flat,
-        )
-    folder = create_run_folder(out, name)
     console = make_console(stderr=json_output, highlight=False)
-    started = time.monotonic()
-    total = settings.trials * (4.0 + settings.expected_duration / (10.0 if settings.lockstep else 1.0))
-    try:
-        with PhaseProgress(total, console) as progress:
-            bags = run_trials(folder, settings, domain, progress, ask=lambda sentence: _ask(console, sentence))
-    except KeyboardInterrupt:
-        kept = "nothing was recorded" if discard_if_empty(folder) else f"what was recorded until then is in {folder}"
-        console.print(f"interrupted: the drive is off, all programs have ended; {kept}")
-        raise typer.Exit(EXIT_INTERRUPTED) from None
-    except PendulumError:
-        discard_if_empty(folder)
-        raise
+    program, plan = settings.plant_program(1), _plan(settings)
+    with confirmed(settings.machine, program, plan, yes=yes, flat=settings.kind.flat):
+        folder = create_run_folder(out, name)
+        started = time.monotonic()
+        total = settings.trials * (4.0 + settings.expected_duration / (10.0 if settings.lockstep else 1.0))
+        try:
+            with PhaseProgress(total, console) as progress:
+                bags = run_trials(folder, settings, domain, progress, ask=lambda sentence: _ask(console, sentence))
+        except KeyboardInterrupt:
+            nothing = discard_if_empty(folder)
+            kept = "nothing was recorded" if nothing else f"what was recorded until then is in {folder}"
+            console.print(f"interrupted: the drive is off, all programs have ended; {kept}")
+            raise typer.Exit(EXIT_INTERRUPTED) from None
+        except PendulumError:
+            discard_if_empty(folder)
+            raise
     elapsed = time.monotonic() - started
     arguments = ["--method", "thesis", "--experiment", name, "--out", str(folder / "identified.json")]
     code = identify_cli.main([*map(str, bags), *arguments, *(["--json"] if json_output else [])])
