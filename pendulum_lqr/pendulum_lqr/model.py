@@ -15,24 +15,35 @@ import cmath
 import math
 from dataclasses import dataclass, field
 from types import ModuleType
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from pendulum_msgs_py.contract.angles import UPRIGHT, wrap
+from pendulum_msgs_py.contract.angles import UPRIGHT
 from pendulum_msgs_py.dynamics.arithmetic import complex_step, in_arithmetic
 from pendulum_msgs_py.dynamics.rigid import rigid_acceleration
 from pendulum_msgs_py.dynamics.series_elastic import (
-    feedforward_pwm,
     link_acceleration,
     motor_acceleration,
     spring_deflection,
     spring_torque,
     winding_current,
-    winding_resistance_at,
 )
 from pendulum_msgs_py.errors import ParameterError
+from pendulum_msgs_py.plants.equilibrium import (
+    FixedPoint,
+    RigidPlant,
+    command_pwm,
+    drivetrain_of,
+    equilibrium_effort,
+    fixed_points,
+    held_torque,
+    offset_of,
+    overdamped_velocity,
+    resistance_of,
+    torque_gain,
+)
 from pendulum_msgs_py.plants.plant_parameters import PlantParameters, SeriesElasticParameters
 
 __all__ = [
@@ -50,22 +61,6 @@ __all__ = [
 ]
 
 Matrix = NDArray[np.float64]
-
-
-class RigidPlant(Protocol):
-    """What a design needs to know of a plant; ``PlantParameters`` has it, and where it has more, that counts too."""
-
-    @property
-    def inertia(self) -> float:
-        """M_c [kg m^2]."""
-
-    @property
-    def damping(self) -> float:
-        """b_c [N m s/rad]."""
-
-    @property
-    def gravity(self) -> float:
-        """G_c [N m]."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -120,55 +115,10 @@ class LinearModel:
         return self.states[2:]
 
 
-@dataclass(frozen=True, slots=True)
-class FixedPoint:
-    """Angle at which the pendulum rests under a constant torque.
-
-    Attributes:
-        theta: Measured angle, 0 hanging down, in [-pi, pi) [rad].
-        effort: The constant torque [N m].
-        stable: Whether the pendulum returns to it after a small push; False at a tip of the torque curve too.
-        rate: Rate at which a small deviation grows, the slowest eigenvalue's real part [1/s]; negative for stable.
-    """
-
-    theta: float
-    effort: float
-    stable: bool
-    rate: float
-
-
 def sort_poles(poles: NDArray[Any]) -> NDArray[np.complex128]:
     """Return the poles with the slowest (largest real part) first."""
     values = np.asarray(poles, dtype=np.complex128)
     return values[np.lexsort((values.imag, -values.real))]
-
-
-def torque_gain(plant: RigidPlant) -> float:
-    """Return the torque at the link per commanded torque, at rest [-]; 1 for a rigid plant.
-
-    A series-elastic actuator without an effort loop answers with R(20 degC) / (R(T) eta) times what is asked for.
-
-    Args:
-        plant: Plant parameters.
-    """
-    drive = _drivetrain(plant)
-    if drive is None:
-        return 1.0
-    pwm = _pwm(1.0, drive)
-    current = winding_current(
-        pwm, 0.0, drive.supply_voltage, drive.back_emf_constant, drive.gear_ratio, _resistance(drive)
-    )
-    return drive.torque_constant * drive.gear_ratio * current
-
-
-def equilibrium_effort(plant: RigidPlant, theta: float) -> float:
-    """Return the command that holds the pendulum at an angle, (G_c sin(theta - angle_offset) - torque_offset) / gain.
-
-    Args:
-        plant: Plant parameters.
-        theta: Angle, 0 hanging down [rad].
-    """
-    return (_weight(plant, theta) - _offset(plant, "torque_offset")) / torque_gain(plant)
 
 
 def linearise(plant: RigidPlant, theta: float = UPRIGHT) -> LinearModel:
@@ -190,14 +140,14 @@ def linearise(plant: RigidPlant, theta: float = UPRIGHT) -> LinearModel:
     """
     if not math.isfinite(theta):
         raise ParameterError(f"theta of the fixed point is {theta} rad; expected a finite angle")
-    drive = _drivetrain(plant)
-    lag = _offset(plant, "actuator_time_constant")
+    drive = drivetrain_of(plant)
+    lag = offset_of(plant, "actuator_time_constant")
     effort = equilibrium_effort(plant, theta)
     states: tuple[str, ...] = ("theta", "theta_dot")
     at: tuple[float, ...] = (theta, 0.0)
     if drive is not None:
         states = (*states, "motor_angle", "motor_velocity")
-        carried = _weight(plant, theta) - _offset(plant, "torque_offset")
+        carried = held_torque(plant, theta)
         at = (*at, theta + spring_deflection(carried, drive.stiffness, drive.stiffness_hardening), 0.0)
     if lag > 0.0:
         states = (*states, "torque")
@@ -217,7 +167,7 @@ def linearise(plant: RigidPlant, theta: float = UPRIGHT) -> LinearModel:
         theta,
         effort,
         E=jacobian[:, n + 1 :].copy(),
-        delay=_offset(plant, "transport_delay"),
+        delay=offset_of(plant, "transport_delay"),
         states=states,
     )
 
@@ -251,8 +201,8 @@ def state_derivative(plant: RigidPlant, theta: Any, theta_dot: Any, effort: Any)
         theta_dot: Velocity [rad/s].
         effort: Torque [N m].
     """
-    torque = effort + _offset(plant, "torque_offset")
-    angle = theta - _offset(plant, "angle_offset")
+    torque = effort + offset_of(plant, "torque_offset")
+    angle = theta - offset_of(plant, "angle_offset")
     equation = in_arithmetic(rigid_acceleration, np)
     return theta_dot, equation(angle, theta_dot, torque, plant.inertia, plant.damping, plant.gravity)
 
@@ -283,63 +233,12 @@ def acceleration_from_upright(
     return equation(angle - plant.angle_offset, velocity, torque, plant.inertia, plant.damping, -plant.gravity)
 
 
-def fixed_points(plant: RigidPlant, effort: float = 0.0) -> tuple[FixedPoint, ...]:
-    """Return the fixed points under a constant torque: two, one at the tip of the torque curve, or none.
-
-    They solve G_c sin(theta - angle_offset) = gain effort + torque_offset; stability is that of the linear model.
-
-    Args:
-        plant: Plant parameters.
-        effort: Constant commanded torque [N m].
-
-    Raises:
-        ParameterError: The torque is not finite.
-    """
-    if not math.isfinite(effort):
-        raise ParameterError(f"torque is {effort} N m; expected a finite number")
-    if plant.gravity == 0.0:
-        return ()
-    ratio = (torque_gain(plant) * effort + _offset(plant, "torque_offset")) / plant.gravity
-    if abs(ratio) > 1.0:
-        return ()
-    low = math.asin(ratio)
-    angles = (low,) if abs(ratio) == 1.0 else (low, math.pi - low)
-    points = []
-    for angle in angles:
-        theta = wrap(angle + _offset(plant, "angle_offset"))
-        if abs(ratio) == 1.0:
-            # Both points meet: what comes from one side is held, from the other it passes.
-            points.append(FixedPoint(theta, effort, stable=False, rate=0.0))
-            continue
-        rate = float(linearise(plant, theta).poles[0].real)
-        points.append(FixedPoint(theta, effort, math.cos(angle) > 0.0, rate))
-    return tuple(points)
-
-
-def overdamped_velocity(
-    plant: RigidPlant, theta: NDArray[np.float64], effort: float = 0.0
-) -> NDArray[np.float64]:
-    """Return x' = (u0 - G_c sin x) / b_c, the velocity where damping outweighs inertia [rad/s].
-
-    Args:
-        plant: Plant parameters; damping > 0.
-        theta: Angles, any shape [rad].
-        effort: Constant torque u0 [N m].
-
-    Raises:
-        ParameterError: The plant has no damping, so that the limit does not exist.
-    """
-    if not plant.damping > 0.0:
-        raise ParameterError(f"damping is {plant.damping} N m s/rad; expected > 0 for the overdamped limit")
-    return (effort - plant.gravity * np.sin(theta)) / plant.damping
-
-
 def _rigid_flow(
     plant: RigidPlant, x: tuple[complex, ...], torque: complex, push: complex
 ) -> tuple[complex, ...]:
     acceleration = in_arithmetic(rigid_acceleration, cmath)
-    net = torque + push + _offset(plant, "torque_offset")
-    angle = x[0] - _offset(plant, "angle_offset")
+    net = torque + push + offset_of(plant, "torque_offset")
+    angle = x[0] - offset_of(plant, "angle_offset")
     return x[1], acceleration(angle, x[1], net, plant.inertia, plant.damping, plant.gravity)
 
 
@@ -355,43 +254,15 @@ def _elastic_flow(
         motor_angle - angle, 0.0, drive.stiffness, drive.stiffness_hardening, 0.0
     )
     current = in_arithmetic(winding_current, cmath)(
-        _pwm(torque, drive), motor_velocity, drive.supply_voltage, drive.back_emf_constant, drive.gear_ratio,
-        _resistance(drive),
+        command_pwm(torque, drive), motor_velocity, drive.supply_voltage, drive.back_emf_constant, drive.gear_ratio,
+        resistance_of(drive),
     )  # fmt: skip
     motor = in_arithmetic(motor_acceleration, cmath)(
         current, motor_velocity, spring, drive.torque_constant, drive.gear_ratio, drive.motor_damping,
         drive.reflected_inertia,
     )  # fmt: skip
     link = in_arithmetic(link_acceleration, cmath)(
-        angle - _offset(plant, "angle_offset"), velocity, spring, push + _offset(plant, "torque_offset"),
+        angle - offset_of(plant, "angle_offset"), velocity, spring, push + offset_of(plant, "torque_offset"),
         plant.inertia, plant.damping, plant.gravity,
     )  # fmt: skip
     return velocity, link, motor_velocity, motor
-
-
-def _pwm(torque: Any, drive: SeriesElasticParameters) -> Any:
-    return feedforward_pwm(
-        torque, drive.supply_voltage, drive.torque_constant, drive.gear_ratio, drive.efficiency,
-        drive.winding_resistance,
-    )  # fmt: skip
-
-
-def _resistance(drive: SeriesElasticParameters) -> float:
-    return winding_resistance_at(
-        drive.winding_temperature, drive.winding_resistance, drive.resistance_temperature_coefficient
-    )
-
-
-def _weight(plant: RigidPlant, theta: float) -> float:
-    # sin(math.pi) is 1.2e-16, not 0: upright must not ask for a torque.
-    angle = theta - _offset(plant, "angle_offset")
-    return 0.0 if angle == UPRIGHT else plant.gravity * math.sin(angle)
-
-
-def _drivetrain(plant: RigidPlant) -> SeriesElasticParameters | None:
-    return plant.drivetrain if isinstance(plant, PlantParameters) else None
-
-
-def _offset(plant: RigidPlant, name: str) -> float:
-    """Return a value that only whole plant parameters have; 0 for a bare rigid plant."""
-    return float(getattr(plant, name, 0.0))

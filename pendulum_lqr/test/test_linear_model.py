@@ -174,7 +174,7 @@ def test_the_simulated_plant_rests_at_its_fixed_points_whatever_its_offsets(angl
     assert len(points) == 2
     for point in points:
         assert equilibrium_effort(plant, point.theta) == pytest.approx(effort, abs=1e-9)
-        assert (point.rate < 0.0) == point.stable
+        assert (linearise(plant, point.theta).poles[0].real < 0.0) == point.stable
         simulated = make_plant(plant, 0.002)
         simulated.reset(point.theta)
         for _ in range(5):

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -11,57 +10,47 @@ from matplotlib.figure import Figure
 from numpy.typing import ArrayLike
 
 from pendulum_msgs_py.errors import DataError, ParameterError
+from pendulum_msgs_py.plants.equilibrium import (
+    FixedPoint,
+    fixed_points,
+    is_overdamped,
+    overdamped_velocity,
+    total_damping,
+)
 from pendulum_msgs_py.plants.plant_parameters import PlantParameters
 
-__all__ = ["FixedPoint", "fixed_points", "plot_evolution", "plot_overdamped_phase", "save_figure"]
+__all__ = ["overdamped_points", "plot_evolution", "plot_overdamped_phase", "save_figure"]
 
 _STABLE, _UNSTABLE, _LINE = "#1b7f5c", "#c4472f", "#2b6cb0"
 
 
-@dataclass(frozen=True)
-class FixedPoint:
-    """Where an overdamped pendulum can stay.
-
-    Attributes:
-        theta: Angle [rad].
-        stable: Whether it returns there after a small push.
-        rate: Slope of x' over x, -G cos(theta) / b: negative for stable [1/s].
-    """
-
-    theta: float
-    stable: bool
-    rate: float
-
-
-def fixed_points(parameters: PlantParameters, torque: float = 0.0) -> list[FixedPoint]:
-    """Return the fixed points of b x' + G sin(x) = u_0 in [-pi, pi), by angle; none where |u_0| > G.
+def overdamped_points(parameters: PlantParameters, torque: float = 0.0) -> list[tuple[FixedPoint, float]]:
+    """Return the fixed points of an overdamped plant by angle, each with its rate: the slope of x' over x [1/s].
 
     Args:
         parameters: The plant.
-        torque: Constant torque u_0 [N m].
+        torque: Constant commanded torque u_0 [N m].
 
     Raises:
-        ParameterError: Without damping or gravity there is no such flow.
+        ParameterError: The plant has no gravity, or swings past its rest, so that it has no such flow.
     """
-    damping, gravity = parameters.damping, parameters.gravity
-    if damping <= 0.0 or gravity <= 0.0:
-        raise ParameterError(f"damping is {damping} N m s/rad and gravity {gravity} N m; expected both > 0")
-    ratio = torque / gravity
-    if abs(ratio) > 1.0:
-        return []
-    low = math.asin(ratio)
-    high = math.pi - low
-    angles = {low, high - 2.0 * math.pi if high >= math.pi else high}
-    points = []
-    for theta in sorted(angles):
-        rate = -gravity * math.cos(theta) / damping
-        # At |u_0| = G both points meet: what comes from one side is held, from the other it passes.
-        points.append(FixedPoint(theta + parameters.angle_offset, rate < -1e-12, rate))
-    return points
+    if parameters.gravity <= 0.0:
+        raise ParameterError(f"gravity is {parameters.gravity} N m; expected > 0")
+    if not is_overdamped(parameters):
+        raise ParameterError(
+            f"plant {parameters.name!r} is not overdamped: its damping is {total_damping(parameters):g} N m s/rad, "
+            "expected more than 2 sqrt(M G), as of thesis and x5_9; its phase portrait is drawn by "
+            "python -m pendulum_lqr design --figures"
+        )
+    slope = parameters.gravity / total_damping(parameters)
+    points = sorted(fixed_points(parameters, torque), key=lambda point: point.theta)
+    return [(point, -slope * math.cos(point.theta - parameters.angle_offset)) for point in points]
 
 
 def plot_overdamped_phase(parameters: PlantParameters, torque: float = 0.0) -> Figure:
     """Draw x' = (u_0 - G sin x) / b over x from -2 pi to 2 pi, with its fixed points and the direction of flow.
+
+    Offsets count, and of a series-elastic plant the motor's damping and what it makes of a commanded torque.
 
     Args:
         parameters: The plant.
@@ -70,16 +59,16 @@ def plot_overdamped_phase(parameters: PlantParameters, torque: float = 0.0) -> F
     Source:
         Thesis, phase plot of the overdamped pendulum.
     """
-    points = fixed_points(parameters, torque)
+    points = [point for point, _ in overdamped_points(parameters, torque)]
     figure = Figure(figsize=(8.0, 4.5), layout="constrained")
     axes = figure.add_subplot()
     x = np.linspace(-2.0 * math.pi, 2.0 * math.pi, 801)
-    speed = (torque - parameters.gravity * np.sin(x - parameters.angle_offset)) / parameters.damping
+    speed = overdamped_velocity(parameters, x, torque)
     axes.axhline(0.0, color="0.6", linewidth=0.8)
     axes.plot(x, speed, color=_LINE, linewidth=1.8)
     arrows = np.arange(-1.875 * math.pi, 2.0 * math.pi, 0.25 * math.pi)
-    flow = torque - parameters.gravity * np.sin(arrows - parameters.angle_offset)
-    moving = np.abs(flow) > 0.25 * parameters.gravity
+    flow = overdamped_velocity(parameters, arrows, torque)
+    moving = np.abs(flow) > 0.25 * parameters.gravity / total_damping(parameters)
     for marker, chosen in ((">", moving & (flow > 0.0)), ("<", moving & (flow < 0.0))):
         axes.plot(arrows[chosen], np.zeros(chosen.sum()), marker, color="0.35", markersize=6)
     for kind, colour, fill in ((True, _STABLE, _STABLE), (False, _UNSTABLE, "white")):

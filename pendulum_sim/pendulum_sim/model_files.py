@@ -17,8 +17,8 @@ from xml.etree import ElementTree
 import typer
 
 from pendulum_msgs_py.contract.names import JOINT, LINK
-from pendulum_msgs_py.dynamics.series_elastic import shorted_winding_damping, winding_resistance_at
 from pendulum_msgs_py.errors import ParameterError
+from pendulum_msgs_py.plants.equilibrium import torque_gain, total_damping
 from pendulum_msgs_py.plants.plant_parameters import PlantParameters, load_plant
 from pendulum_msgs_py.programs.executables import cli_main
 from pendulum_sim.ros2_control_tags import add_ros2_control
@@ -69,7 +69,11 @@ def link_shape(parameters: PlantParameters) -> LinkShape:
 
 
 def urdf(parameters: PlantParameters, *, ros2_control: str = "none", namespace: str = "/sim") -> str:
-    """Return the URDF of the link, for RViz and robot_state_publisher; the joint bears the contract's name.
+    """Return the URDF of the link, for RViz, robot_state_publisher and Gazebo; the joint bears the contract's name.
+
+    URDF knows no motor behind a spring. Of a series-elastic plant the joint has the damping and dry friction of link
+    and motor together, as in slow motion; the rotor's inertia joins that of the link.
+    An effort is then that of the motor: ``torque_gain`` times what our plants are commanded.
 
     Args:
         parameters: The plant.
@@ -86,7 +90,8 @@ def urdf(parameters: PlantParameters, *, ros2_control: str = "none", namespace: 
     inertial = _add(link, "inertial")
     _add(inertial, "origin", xyz=f"0 0 {_n(-shape.length)}", rpy="0 0 0")
     _add(inertial, "mass", value=_n(shape.mass))
-    i = _n(shape.inertia)
+    rotor = drive.reflected_inertia if drive is not None else 0.0
+    i = _n(shape.inertia + rotor)
     _add(inertial, "inertia", ixx=i, iyy=i, izz=_n(0.02 * shape.inertia), ixy="0", ixz="0", iyz="0")
     rod = {"radius": _n(_ROD_RADIUS), "length": _n(shape.length)}
     _urdf_visual(link, ("cylinder", rod), f"0 0 {_n(-0.5 * shape.length)}", "0 0 0", "0.6 0.62 0.66 1")
@@ -103,9 +108,13 @@ def urdf(parameters: PlantParameters, *, ros2_control: str = "none", namespace: 
     # The measured angle is angle_offset when the link hangs: the frame is turned back by as much.
     _add(joint, "origin", xyz="0 0 0", rpy=f"0 {_n(parameters.angle_offset)} 0")
     _add(joint, "axis", xyz="0 -1 0")
-    _add(joint, "limit", effort=_n(parameters.effort_limit), velocity=_n(speed))
-    _add(joint, "dynamics", damping=_n(parameters.damping), friction=_n(parameters.coulomb_friction))
-    add_ros2_control(robot, ros2_control, namespace, parameters.effort_limit)
+    # topic_based drives our plants, which take commands; anything else moves the joint itself.
+    gain = 1.0 if ros2_control == "topic_based" else torque_gain(parameters)
+    limit = gain * parameters.effort_limit
+    friction = parameters.coulomb_friction + (drive.motor_coulomb_friction if drive is not None else 0.0)
+    _add(joint, "limit", effort=_n(limit), velocity=_n(speed))
+    _add(joint, "dynamics", damping=_n(total_damping(parameters)), friction=_n(friction))
+    add_ros2_control(robot, ros2_control, namespace, limit)
     return _text(robot)
 
 
@@ -162,17 +171,11 @@ def mjcf(parameters: PlantParameters) -> str:
     )  # fmt: skip
     driven, gain = JOINT, 1.0
     if drive is not None:
-        resistance = winding_resistance_at(
-            drive.winding_temperature, drive.winding_resistance, drive.resistance_temperature_coefficient
-        )
-        back_emf = shorted_winding_damping(
-            drive.torque_constant, drive.back_emf_constant, drive.gear_ratio, resistance
-        )
-        driven, gain = "motor_joint", 1.0 / drive.efficiency
+        driven, gain = "motor_joint", torque_gain(parameters)
         motor = _add(world, "body", name="motor")
         _add(
             motor, "joint", name=driven, type="hinge", axis="0 -1 0", armature=_n(drive.reflected_inertia),
-            damping=_n(drive.motor_damping + back_emf), frictionloss=_n(drive.motor_coulomb_friction),
+            damping=_n(total_damping(parameters) - parameters.damping), frictionloss=_n(drive.motor_coulomb_friction),
         )  # fmt: skip
         _add(motor, "inertial", pos="0 0 0", mass="1e-6", diaginertia="1e-9 1e-9 1e-9")
         tendons = _add(model, "tendon")

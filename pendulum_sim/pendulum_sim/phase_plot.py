@@ -26,25 +26,26 @@ def phase_plot(
     ),
     as_json: Annotated[bool, typer.Option("--json", help="Print the fixed points as JSON.")] = False,
 ) -> None:
-    """Draw x' over x of b x' + G sin(x) = u_0 and list its fixed points.
+    """Draw x' over x of b x' + G sin(x) = u_0 and list its fixed points, for a plant that is overdamped.
 
     Example: python -m pendulum_sim phase_plot --plant thesis --torque 0.5 --output phase.png
     """
     # Imported late: --help should not wait for matplotlib.
     from pendulum_msgs_py.programs.terminal import WholeTable, make_console
-    from pendulum_sim.figures import fixed_points, plot_overdamped_phase, save_figure
+    from pendulum_sim.figures import overdamped_points, plot_overdamped_phase, save_figure
 
     parameters = load_plant(plant)
-    points = fixed_points(parameters, torque)
+    points = overdamped_points(parameters, torque)
     path = save_figure(plot_overdamped_phase(parameters, torque), output)
     if as_json:
-        typer.echo(json.dumps({"figure": str(path), "fixed_points": [asdict(point) for point in points]}))
+        listed = [{**asdict(point), "rate": rate} for point, rate in points]
+        typer.echo(json.dumps({"figure": str(path), "fixed_points": listed}))
         return
     table = WholeTable(title=f"fixed points of {parameters.name}, u_0 = {torque:g} N m")
     for column in ("theta \\[rad]", "stability", "rate \\[1/s]"):
         table.add_column(column, justify="left" if column == "stability" else "right")
-    for point in points:
-        table.add_row(f"{point.theta:.6f}", "stable" if point.stable else "unstable", f"{point.rate:+.6f}")
+    for point, rate in points:
+        table.add_row(f"{point.theta:.6f}", "stable" if point.stable else "unstable", f"{rate:+.6f}")
     console = make_console()
     console.print(table if points else "no fixed point: the torque exceeds gravity, the pendulum turns over")
     console.print(f"figure: {path}", soft_wrap=True)

@@ -59,7 +59,12 @@ def add_ros2_control(robot: ElementTree.Element, hardware: str, namespace: str, 
     for name in ("position", "velocity", "effort"):
         add(joint, "state_interface", name=name)
     if hardware == "gz":
-        # Gazebo lets fall what does not hang on the world.
+        # Gazebo lets fall what does not hang on the world. A link without inertia it leaves out, and with it the joint
+        # that hangs on it.
+        base = next(link for link in robot.iter("link") if link.get("name") == "base_link")
+        inertial = add(base, "inertial")
+        add(inertial, "mass", value="1.0")
+        add(inertial, "inertia", ixx="0.002", iyy="0.002", izz="0.002", ixy="0", ixz="0", iyz="0")
         add(robot, "link", name="world")
         mount = add(robot, "joint", name="world_joint", type="fixed")
         add(mount, "parent", link="world")

@@ -2,7 +2,7 @@
 
 The torque command drives the motor in feed-forward, u = tau R / (N V K_t eta), as the actuator does with
 its effort loop off: what slows the link then is the back EMF of the winding, K_t K_e N^2 / R = 11.8 N m
-s/rad, which the rigid model of the thesis has as its damping. Equations and sources:
+s/rad, beside 1.4 of motor and gears. The efficiency is in the command alone. Equations and sources:
 ``pendulum_msgs_py.dynamics.series_elastic``.
 """
 

@@ -4,37 +4,74 @@ from __future__ import annotations
 
 import json
 import math
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from pendulum_msgs_py.errors import DataError, ParameterError
+from pendulum_msgs_py.plants.equilibrium import overdamped_velocity
 from pendulum_msgs_py.plants.plant_parameters import load_plant
 from pendulum_sim.drawing import PendulumPicture, rotation_matrix, save_gif, save_png
-from pendulum_sim.figures import fixed_points, plot_evolution, save_figure
+from pendulum_sim.figures import overdamped_points, plot_evolution, save_figure
 from pendulum_sim.phase_plot import main
+from pendulum_sim.plant import make_plant
 
 
 def test_the_thesis_has_a_stable_point_below_and_an_unstable_one_above() -> None:
-    points = fixed_points(load_plant("thesis"))
-    assert [(point.theta, point.stable) for point in points] == [(-math.pi, False), (0.0, True)]
+    points = overdamped_points(load_plant("thesis"))
+    assert [(point.theta, point.stable) for point, _ in points] == [(-math.pi, False), (0.0, True)]
     # The slow pole of the linearisation at the top is 0.1425 1/s: the overdamped limit is close.
-    assert points[0].rate == pytest.approx(0.142566, abs=1e-6)
+    assert points[0][1] == pytest.approx(0.142566, abs=1e-6)
 
 
-@pytest.mark.parametrize("torque", [-1.2, 0.3, 1.6])
-def test_fixed_points_balance_torque_and_weight(torque: float) -> None:
-    parameters = load_plant("thesis")
-    points = fixed_points(parameters, torque)
-    assert len(points) == 2
-    assert sum(point.stable for point in points) == 1
-    for point in points:
-        assert parameters.gravity * math.sin(point.theta) == pytest.approx(torque, abs=1e-12)
+@pytest.mark.parametrize("torque", [-1.2, 0.3, 1.0])
+@pytest.mark.parametrize("name", ["thesis", "x5_9"])
+def test_an_overdamped_plant_with_offsets_creeps_as_its_phase_plot_says(name: str, torque: float) -> None:
+    parameters = load_plant(name).with_values(angle_offset=0.3, torque_offset=0.1)
+    if parameters.drivetrain is not None:
+        smooth = {"motor_coulomb_friction": 0.0, "motor_static_friction": 0.0, "hysteresis_torque": 0.0}
+        parameters = parameters.with_values(drivetrain=replace(parameters.drivetrain, **smooth))
+    plant = make_plant(parameters, 0.002)
+    plant.reset(1.0)
+    # Until the spring has come to rest.
+    for _ in range(1000):
+        state = plant.step(torque)
+    expected = float(overdamped_velocity(parameters, np.array([state.theta]), torque)[0])
+    assert state.theta_dot == pytest.approx(expected, rel=0.05, abs=2e-3)
+    for point, rate in overdamped_points(parameters, torque):
+        resting = overdamped_velocity(parameters, np.array([point.theta]), torque)
+        assert float(resting[0]) == pytest.approx(0.0, abs=1e-12)
+        assert (rate < 0.0) == point.stable
 
 
 def test_beyond_the_weight_there_is_no_fixed_point() -> None:
-    assert fixed_points(load_plant("thesis"), 1.7) == []
+    assert overdamped_points(load_plant("thesis"), 1.7) == []
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["--torque", "nan"], "torque is nan N m; expected a finite number"),
+        (["--plant", "dfki"], "plant 'dfki' is not overdamped: its damping is 0.1 N m s/rad"),
+    ],
+)
+def test_phase_plot_refuses_what_has_no_overdamped_limit(
+    arguments: list[str], message: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main([*arguments, "--output", str(tmp_path / "phase.png")]) == 2
+    assert message in capsys.readouterr().err
+    assert not (tmp_path / "phase.png").exists()
+
+
+def test_the_phase_plot_of_the_series_elastic_plant_has_the_rate_of_all_its_damping(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["--plant", "x5_9", "--output", str(tmp_path / "phase.svg"), "--json"]) == 0
+    upright = json.loads(capsys.readouterr().out)["fixed_points"][0]
+    # The slow pole of the whole linear model is 0.1290 1/s.
+    assert upright["rate"] == pytest.approx(1.678 / 13.196, abs=1e-4)
 
 
 def test_phase_plot_writes_a_figure_and_prints_the_points(

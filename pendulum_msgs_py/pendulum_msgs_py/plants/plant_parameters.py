@@ -79,7 +79,7 @@ DRIVETRAIN_SPECS: tuple[ParameterSpec, ...] = (
     _physical("winding_temperature", 22.0, "degC", "Winding temperature at the start.", signed=True),
     _physical("resistance_temperature_coefficient", 0.004, "1/K", "Relative change of R per kelvin."),
     _physical("supply_voltage", 36.0, "V", "Supply voltage, V.", positive=True),
-    _physical("efficiency", 0.65, "-", "Share of motor torque that arrives at the output.", positive=True),
+    _physical("efficiency", 0.65, "-", "Share of motor torque that a command counts on at the output.", positive=True),
     _physical("reflected_inertia", 0.19, "kg m^2", "Rotor inertia seen at the output, J_r N^2.", positive=True),
     _physical("motor_damping", 1.4, "N m s/rad", "Viscous friction of motor and gears at the output, b_v."),
     _physical("motor_coulomb_friction", 0.3, "N m", "Dry friction of motor and gears at the output, tau_C."),
