@@ -17,6 +17,7 @@ import typer
 from rich.console import Console
 
 from pendulum_lqr.analysis import LoopReport, analyse
+from pendulum_lqr.certificate_table import certificate_document, certify_rows, print_certificates
 from pendulum_lqr.design import Gain, output_lqr
 from pendulum_lqr.model import LinearModel, linearise
 from pendulum_msgs_py.contract.angles import UPRIGHT
@@ -56,6 +57,13 @@ def design(
     row: Annotated[
         int, typer.Option(help="Row that the figures show; 0 for the thesis's choice or the last.")
     ] = 0,
+    machine: Annotated[
+        Path | None,
+        typer.Option(
+            help="Measured response of a machine (hw_response.json of experiment frequency_response, or its folder): "
+            "say which rows are certified for it."
+        ),
+    ] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON instead of tables.")] = False,
 ) -> None:
     """Design LQR gains: eigenvalues, K, time constant, damping, margins and largest stable sampling period.
@@ -73,11 +81,17 @@ def design(
     gains = [output_lqr(model, diagonal, cost) for diagonal, cost in weights]
     reports = [analyse(model, None), *(analyse(model, gain.K) for gain in gains)]
     chosen = _chosen_row(row, len(weights), default=THESIS_CHOICE if not (q or r) else len(weights))
+    certified = certify_rows(machine, model, gains) if machine is not None else None
     if as_json:
-        sys.stdout.write(json.dumps(_document(parameters.name, model, weights, reports), indent=2) + "\n")
+        document = _document(parameters.name, model, weights, reports)
+        if certified is not None:
+            document["machine"] = certificate_document(*certified)
+        sys.stdout.write(json.dumps(document, indent=2) + "\n")
     else:
         console = make_console(highlight=False)
         _print(console, parameters.name, model, weights, reports, chosen)
+        if certified is not None:
+            print_certificates(console, *certified, chosen)
     if figures is not None:
         for path in _save(parameters, model, weights, gains, chosen, limit, figures):
             print(path, file=sys.stderr if as_json else sys.stdout)
@@ -85,7 +99,9 @@ def design(
 
 def _limit(given: float, plants_own: float) -> float:
     if not (math.isfinite(given) and given >= 0.0):
-        raise ParameterError(f"--effort-limit is {given} N m; expected a finite number > 0, or 0 for the plant's")
+        raise ParameterError(
+            f"--effort-limit is {given} N m; expected a finite number > 0, or 0 for the plant's"
+        )
     return given or plants_own
 
 
@@ -187,7 +203,9 @@ def _plant_lines(name: str, model: LinearModel) -> list[str]:
             ),
         ]
     if model.delay > 0.0:
-        lines.append(f"transport delay {model.delay:g} s: counted in margins and periods, not in the eigenvalues")
+        lines.append(
+            f"transport delay {model.delay:g} s: counted in margins and periods, not in the eigenvalues"
+        )
     return lines
 
 

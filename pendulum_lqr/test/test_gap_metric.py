@@ -1,5 +1,6 @@
 """The nu-gap, margins and certificates against closed forms, an optimal controller, and loops known to fail."""
 
+import json
 import math
 
 import numpy as np
@@ -9,6 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from pendulum_lqr.certificate import Certifier, stabilises
+from pendulum_lqr.design_cli import main as design
 from pendulum_lqr.gap_metric import (
     Scaling,
     chordal_distance,
@@ -247,6 +249,20 @@ def test_a_response_survives_its_file(tmp_path):
         read_response(tmp_path / "other.json")
     with pytest.raises(DataError, match="cannot be read"):
         read_response(tmp_path / "none.json")
+
+
+def test_design_says_which_rows_are_certified_for_a_machine(tmp_path, capsys):
+    write_response(tmp_path / "hw_response.json", exact(load_plant("dfki").with_values(transport_delay=0.03)))
+    asked = ["--preset", "dfki", "--q", "10,1", "--q", "100000,1", "--r", "1", "--machine", str(tmp_path)]
+    assert design([*asked, "--json"]) == 0
+    rows = json.loads(capsys.readouterr().out)["machine"]["rows"]
+    assert [row["certified"] for row in rows] == [True, False]
+    assert design(asked) == 0
+    text = " ".join(capsys.readouterr().out.split())
+    assert "Certified for this machine" in text
+    assert "dry friction at rest are outside the certificate" in text
+    assert design([*asked, "--theta", "0"]) == 2
+    assert "was measured upright" in " ".join(capsys.readouterr().err.split())
 
 
 def test_scales_of_zero_are_refused():

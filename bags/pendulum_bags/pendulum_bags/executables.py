@@ -7,6 +7,7 @@ EXECUTABLES: dict[str, str] = {
     "analyse": "pendulum_bags.analyse.analyse_cli:main",
     "compare": "pendulum_bags.comparison.compare_cli:main",
     "frequency_response": "pendulum_bags.frequency_response.frequency_response_cli:main",
+    "ranking": "pendulum_bags.ranking.ranking_cli:main",
     "replay": "pendulum_bags.replay.replay_cli:main",
     "experiment": "pendulum_bags.experiments.experiment_cli:main",
     "move": "pendulum_bags.experiments.move_cli:main",

@@ -11,7 +11,7 @@ import numpy as np
 
 from pendulum_lqr.certificate import Certificate, Certifier
 from pendulum_lqr.controller_response import controller_response
-from pendulum_lqr.design import continuous_lqr
+from pendulum_lqr.design import output_lqr
 from pendulum_lqr.design_cli import THESIS_WEIGHTS
 from pendulum_lqr.model import LinearModel
 from pendulum_msgs_py.errors import ParameterError
@@ -78,7 +78,7 @@ def _one(text: str, plant: PlantParameters, model: LinearModel, certifier: Certi
     try:
         if match := _WEIGHTS.fullmatch(text):
             q11, q22, r = (float(part) if part else 0.1 for part in match.groups())
-            K = np.asarray(continuous_lqr(model, (q11, q22), r).K, dtype=np.float64)[:2]
+            K = np.asarray(output_lqr(model, (q11, q22), r).K, dtype=np.float64)[:2]
             name = f"LQR q=({q11:g}, {q22:g}) r={r:g}"
         elif match := _GAIN.fullmatch(text):
             K = np.array([float(part) for part in match.groups()])

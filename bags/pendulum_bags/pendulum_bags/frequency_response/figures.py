@@ -12,7 +12,7 @@ from pendulum_bags.figures.figure import Figure, Mark, Panel, Trace
 from pendulum_bags.frequency_response.compare import Difference, continuous
 from pendulum_bags.frequency_response.designs import DesignResult
 from pendulum_lqr.certificate import Certifier
-from pendulum_lqr.design import DesignError, continuous_lqr
+from pendulum_lqr.design import DesignError, output_lqr
 from pendulum_lqr.measured_response import MeasuredResponse
 from pendulum_lqr.model import LinearModel
 from pendulum_lqr.sampled_response import model_response
@@ -202,7 +202,7 @@ def certified_weights_figure(certifier: Certifier, model: LinearModel) -> Figure
     for a in angle:
         for b in speed:
             try:
-                gain = continuous_lqr(model, (a, b), 1.0)
+                gain = output_lqr(model, (a, b), 1.0)
             except DesignError:
                 continue
             points.append((a, b, _class(certifier, np.asarray(gain.K)[:2])))

@@ -62,6 +62,7 @@ def add_commands(app: typer.Typer) -> None:
         ("strategies", strategies),
         ("pid_vs_lqr", pid_vs_lqr),
         ("random_start", random_start),
+        ("ranking", ranking),
     ):
         app.command(name=name)(command)
 
@@ -78,7 +79,7 @@ def study(
 ) -> None:
     """Carry out a study: plants x controllers x disturbances x set-points x starts x seeds.
 
-    Shipped: thesis, pid_vs_lqr, strategies, inertia_damping, gravity, random_start.
+    Shipped: thesis, pid_vs_lqr, ranking, strategies, inertia_damping, gravity, random_start.
 
     Example: python -m pendulum_bags experiment study random_start --out /tmp/random --workers 2
     """
@@ -127,6 +128,21 @@ def random_start(
     Example: python -m pendulum_bags experiment random_start --out /tmp/random --seeds 5
     """
     _study("random_start", out, workers, seeds, retry_failed, dry_run, json_output)
+
+
+def ranking(
+    out: Out = None,
+    workers: Workers = 0,
+    seeds: Seeds = 0,
+    retry_failed: Retry = False,
+    dry_run: DryRun = False,
+    json_output: Json = False,
+) -> None:
+    """Rank every controller and twenty gains on simulation and hardware: would the simulation have picked right?
+
+    Example: python -m pendulum_bags experiment ranking --out /tmp/ranking --workers 2
+    """
+    _study("ranking", out, workers, seeds, retry_failed, dry_run, json_output)
 
 
 def run(
@@ -233,6 +249,14 @@ def _analyse(folder: Path, found: Study, records: Sequence[dict[str, Any]]) -> d
         result["strategies"] = strategies_analysis.analyse(folder, found)
     elif found.analysis == "pid_vs_lqr":
         result["pid_vs_lqr"] = pid_analysis.analyse(folder, found, records)
+    elif found.analysis == "ranking":
+        from pendulum_bags.ranking.collect import collect_contenders
+        from pendulum_bags.ranking.present import write_ranking
+        from pendulum_bags.ranking.ranking import rank
+
+        ranked = rank(collect_contenders([folder]))
+        write_ranking(folder, ranked)
+        result["ranking"] = ranked.to_json()
     write_json(folder / "results.json", result)
     return result
 
@@ -269,6 +293,13 @@ def _print_result(
         strategies_analysis.print_table(console, result["strategies"])
     elif found.analysis == "pid_vs_lqr":
         pid_analysis.print_table(console, result["pid_vs_lqr"])
+    elif found.analysis == "ranking":
+        from pendulum_bags.ranking.collect import collect_contenders
+        from pendulum_bags.ranking.present import print_ranking
+        from pendulum_bags.ranking.ranking import rank
+
+        print_ranking(console, rank(collect_contenders([folder])))
+        console.print(f"page    {folder / 'ranking.html'}", soft_wrap=True)
     elif found.experiment == "run":
         _print_groups(console, group_runs(records))
     else:

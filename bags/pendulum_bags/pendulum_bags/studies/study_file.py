@@ -24,7 +24,7 @@ __all__ = ["ANALYSES", "EXPERIMENTS", "Study", "StudyRun", "load_study", "shippe
 
 FORMAT = "pendulum_study/1"
 EXPERIMENTS = ("run", "thesis", "inertia_damping", "gravity")
-ANALYSES = ("metrics", "strategies", "pid_vs_lqr", "none")
+ANALYSES = ("metrics", "strategies", "pid_vs_lqr", "ranking", "none")
 STARTS = {"upright": UPRIGHT, "bottom": 0.0}
 _KEYS = (
     "format", "name", "description", "experiment", "analysis", "clock", "duration", "plants", "controllers",

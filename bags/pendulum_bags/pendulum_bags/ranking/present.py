@@ -1,0 +1,188 @@
+"""A ranking as a layer of the verdict, a figure, a page and a table for the terminal."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+from rich.console import Console
+
+from pendulum_bags.figures.figure import Figure, Panel, Trace
+from pendulum_bags.figures.render_files import write_figures
+from pendulum_bags.ranking.ranking import Ranking
+from pendulum_bags.report.layer_page import write_layer_page
+from pendulum_bags.report.tables import Table
+from pendulum_bags.runs.run_folder import write_json
+from pendulum_bags.verdict import Evidence, Layer, LayerResult, Mark, write_layer
+from pendulum_msgs_py.programs.terminal import WholeTable
+
+__all__ = ["REGRET_MARGIN", "print_ranking", "same_choice", "write_ranking"]
+
+REGRET_MARGIN = 0.1
+"""Regret that does not matter, as a share of the hardware's best cost."""
+_SHOWN_PAIRS = 8
+
+
+def same_choice(ranking: Ranking, margin: float = REGRET_MARGIN) -> LayerResult:
+    """Return layer 4: yes where the regret is small, no where it is large, undecided where its runs scatter.
+
+    Args:
+        ranking: The ranking.
+        margin: Regret that does not matter, as a share of the hardware's best cost.
+    """
+    least = ranking.hw[0]
+    share = [value / least for value in (ranking.regret.value, ranking.regret.low, ranking.regret.high)]
+    if share[2] <= margin:
+        mark = Mark.YES
+    elif share[1] > margin or ranking.pick in ranking.failures:
+        mark = Mark.NO
+    else:
+        mark = Mark.UNDECIDED
+    sure = [pair for pair in ranking.wrong if pair.sure]
+    same = "which is the best on the hardware too" if ranking.pick == ranking.best else f"not {ranking.best}"
+    sentence = (
+        f"The simulation picks {ranking.pick}, {same}: a regret of {100.0 * share[0]:.1f} % (95 % interval "
+        f"{100.0 * share[1]:.1f} to {100.0 * share[2]:.1f} %). Costs correlate with {ranking.srcc.value:.3f} "
+        f"({ranking.srcc.low:.3f} to {ranking.srcc.high:.3f}); {len(ranking.wrong)} of {ranking.pairs} pairs are in "
+        f"the wrong order, {len(sure)} of them surely."
+    )
+    if sure:
+        sentence += f" The dearest: {sure[0].picked} before {sure[0].better}, because {sure[0].reason}."
+    unit = "of the cost"
+    evidence = (
+        Evidence(
+            "regret of the simulation's pick", "%", 100.0 * share[0], 100.0 * share[1], 100.0 * share[2],
+            f"at most {100.0 * margin:g} %", mark,
+        ),
+        Evidence("SRCC (Pearson)", "", ranking.srcc.value, ranking.srcc.low, ranking.srcc.high, "", mark),
+        Evidence("rank correlation (Spearman)", "", ranking.spearman, mark=mark),
+        Evidence("MMRV", unit, ranking.mmrv.value, ranking.mmrv.low, ranking.mmrv.high, "", mark),
+        Evidence("pairs surely in the wrong order", "", float(len(sure)), None, None, f"of {ranking.pairs}", mark),
+        *(
+            Evidence("fails on one side only", "", None, mark=Mark.NO, note=name)
+            for name in ranking.failures
+        ),
+    )  # fmt: skip
+    steps = ("record more seeds: --seeds 10",) if mark is Mark.UNDECIDED else ()
+    if mark is Mark.NO:
+        steps = (
+            f"compare the plants in frequency, where {ranking.pick} works: experiment frequency_response",
+        )
+    percent = [100.0 * value for value in share]
+    reason = {
+        Mark.YES: f"the simulation's pick costs at most {percent[2]:.0f} % more on the hardware than the best of "
+        f"{len(ranking.names)}",
+        Mark.NO: f"the simulation would have picked {ranking.pick}, {percent[0]:.0f} % dearer than {ranking.best}",
+        Mark.UNDECIDED: f"the regret of the simulation's pick, {percent[1]:.0f} to {percent[2]:.0f} %, is not measured "
+        "well enough",
+    }[mark]
+    return LayerResult(Layer.SAME_CHOICE, mark, sentence, evidence, steps, reason)
+
+
+def ranking_figure(ranking: Ranking) -> Figure:
+    """Draw the cost on the hardware over that in simulation."""
+    sim, hw = np.array(ranking.sim), np.array(ranking.hw)
+    able = np.isfinite(sim) & np.isfinite(hw)
+    wrong = {name for pair in ranking.wrong if pair.sure for name in (pair.picked, pair.better)}
+    astray = np.array([name in wrong for name in ranking.names]) & able
+    span = np.array([min(sim[able].min(), hw[able].min()), max(sim[able].max(), hw[able].max())])
+    traces = [Trace(span, span, "equal cost", "reference")]
+    for chosen, label, role in (
+        (able & ~astray, "in order", "certified"),
+        (astray, "in a pair surely in the wrong order", "not certified"),
+    ):
+        if chosen.any():
+            traces.append(Trace(sim[chosen], hw[chosen], label, role, "points"))
+    for name, label, role in (
+        (ranking.pick, "simulation's pick", "sim"),
+        (ranking.best, "best on hardware", "stable"),
+    ):
+        at = [i for i, other in enumerate(ranking.names) if other == name and able[i]]
+        traces.append(Trace(sim[at], hw[at], label, role, "points"))
+    failed = int(np.sum(~able))
+    sentence = (
+        f"{int(able.sum())} controllers; SRCC {ranking.srcc.value:.3f}, MMRV {ranking.mmrv.value:.3g}."
+        + (f" {failed} more failed on a side and are not drawn." if failed else "")
+    )  # fmt: skip
+    panel = Panel("cost in simulation [-]", "cost on hardware [-]", traces, x_log=True, y_log=True)
+    return Figure("ranking", "Costs of the controllers on both sides", sentence, [panel], panel_height=360)
+
+
+def ranking_rows(ranking: Ranking) -> list[tuple[str, ...]]:
+    """Return a row for each contender, best on the hardware first: rank and cost on both sides."""
+    order = np.argsort(np.argsort(ranking.sim, kind="stable"), kind="stable")
+    return [
+        (name, str(i + 1), str(int(order[i]) + 1), _cost(hw), _cost(sim))
+        for i, (name, sim, hw) in enumerate(zip(ranking.names, ranking.sim, ranking.hw, strict=True))
+    ]
+
+
+_HEAD = ("controller", "rank on hardware", "rank in simulation", "cost on hardware", "cost in simulation")
+
+
+def _cost(value: float) -> str:
+    return f"{value:.4g}" if np.isfinite(value) else "failed"
+
+
+def _pair_rows(ranking: Ranking) -> list[tuple[str, ...]]:
+    return [
+        (
+            pair.picked,
+            pair.better,
+            f"{pair.sim:.3g}",
+            f"{pair.hw:.3g}",
+            "yes" if pair.sure else "no",
+            pair.reason,
+        )
+        for pair in ranking.wrong[:_SHOWN_PAIRS]
+    ]
+
+
+def write_ranking(folder: Path, ranking: Ranking, formats: Sequence[str] = ("png", "pdf")) -> Path:
+    """Write numbers, layer, figure and page into a folder; return the page."""
+    folder.mkdir(parents=True, exist_ok=True)
+    layer = same_choice(ranking)
+    write_json(folder / "ranking.json", ranking.to_json())
+    write_layer(folder, layer)
+    figures = [ranking_figure(ranking)]
+    write_figures(figures, folder / "figures", formats)
+    tables = [
+        Table(
+            "Controllers",
+            "Cost: mean of q11 e² + q22 v² + r u², that of the thesis's LQR unless other weights were asked for.",
+            _HEAD,
+            ranking_rows(ranking),
+            "",
+        )
+    ]
+    if ranking.wrong:
+        tables.append(
+            Table(
+                "Pairs in the wrong order",
+                f"The {min(_SHOWN_PAIRS, len(ranking.wrong))} dearest of {len(ranking.wrong)}, sure ones first.",
+                ("simulation prefers", "hardware prefers", "better in simulation by", "dearer on hardware by", "sure",
+                 "reason"),
+                _pair_rows(ranking),
+                "",
+            )
+        )  # fmt: skip
+    return write_layer_page(folder / "ranking.html", "Ranking of controllers", [layer], figures, tables)
+
+
+def print_ranking(console: Console, ranking: Ranking) -> None:
+    """Print contenders, wrong pairs and the layer's sentence."""
+    table = WholeTable(title="Costs on both sides", title_justify="left")
+    for i, heading in enumerate(_HEAD):
+        table.add_column(heading, justify="right" if i else "left")
+    for row in ranking_rows(ranking):
+        table.add_row(*row)
+    console.print(table)
+    layer = same_choice(ranking)
+    console.print(f"{layer.layer.title}: {layer.mark.value}", style="bold")
+    console.print(layer.sentence, markup=False)
+    console.print(
+        f"MMRV {ranking.mmrv.value:.3g} (95 % interval {ranking.mmrv.low:.3g} to {ranking.mmrv.high:.3g}), in units of "
+        "the cost.",
+        markup=False,
+    )

@@ -1,0 +1,55 @@
+"""``ranking``: would the simulation have picked the right controller? From any folder of runs."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from pendulum_msgs_py.programs.executables import cli_main
+from pendulum_msgs_py.programs.terminal import make_console
+
+__all__ = ["main"]
+
+app = typer.Typer(add_completion=False, rich_markup_mode=None)
+
+
+@app.command()
+def ranking(
+    folders: Annotated[
+        list[Path],
+        typer.Argument(help="Studies, or folders with bags that say which controller ran on which side."),
+    ],
+    out: Annotated[
+        Path | None, typer.Option("--out", "-o", help="Folder for page, figure and numbers; none by default.")
+    ] = None,
+    weights: Annotated[
+        tuple[float, float, float], typer.Option(help="q11, q22 and r of the cost, mean of q11 e^2 + q22 v^2 + r u^2.")
+    ] = (100.0, 0.01, 0.1),
+    json_output: Annotated[bool, typer.Option("--json", help="Print JSON instead of tables.")] = False,
+) -> None:
+    """Rank controllers on both sides: costs, SRCC, MMRV, regret of the simulation's pick, and pairs ranked wrongly.
+
+    Example: python -m pendulum_bags ranking bags/runs/ranking --out /tmp/ranking
+    """
+    from pendulum_bags.ranking.collect import collect_contenders
+    from pendulum_bags.ranking.present import print_ranking, same_choice, write_ranking
+    from pendulum_bags.ranking.ranking import rank
+
+    found = rank(collect_contenders(folders, weights))
+    page = write_ranking(out, found) if out is not None else None
+    if json_output:
+        print(json.dumps({**found.to_json(), "layer": same_choice(found).to_json()}, indent=2, allow_nan=False))
+        return
+    console = make_console(highlight=False)
+    print_ranking(console, found)
+    if page is not None:
+        console.print(f"\npage    {page}", soft_wrap=True)
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run the command line."""
+    return cli_main(app, argv, name="python -m pendulum_bags ranking")
