@@ -20,7 +20,7 @@ from pendulum_sim.plant import Plant, make_plant
 if TYPE_CHECKING:
     from pendulum_bags.figures.figure import Figure
 
-__all__ = ["HorizonError", "InputReplay", "fit_percent", "replay_input", "replay_recording"]
+__all__ = ["HorizonError", "InputReplay", "fit_percent", "horizon_steps", "replay_input", "replay_recording"]
 
 Array = NDArray[np.float64]
 
@@ -67,6 +67,7 @@ class InputReplay:
         threshold: That tenth [rad].
         horizons: Errors of predictions over growing horizons.
         from_fitted_state: Whether windows and free run start from fitted states rather than smoothed measured ones.
+        driven_by: What drove the plant, in words.
     """
 
     name: str
@@ -85,6 +86,7 @@ class InputReplay:
     threshold: float
     horizons: tuple[HorizonError, ...]
     from_fitted_state: bool
+    driven_by: str = "the measured torque"
 
     def as_dict(self) -> dict[str, Any]:
         """Return the figures for JSON."""
@@ -110,7 +112,7 @@ class InputReplay:
         where = "never" if self.diverges_at is None else f"after {self.diverges_at:.2f} s"
         best, worst = self.by_window.min(), self.by_window.max()
         return (
-            f"Driven by the measured torque of {self.name}, the plant {self.plant.name!r} errs by {self.rms:.4f} rad "
+            f"Driven by {self.driven_by} of {self.name}, the plant {self.plant.name!r} errs by {self.rms:.4f} rad "
             f"rms over windows of {self.window:g} s (best {best:.4f}, worst {worst:.4f}); in free run by "
             f"{self.free_run_rms:.4f} rad (fit {self.fit:.1f} %), and it departs by more than "
             f"{self.threshold:.2f} rad {where}."
@@ -144,6 +146,7 @@ def replay_recording(
     *,
     window: float = 1.0,
     mapping: str | Path | None = None,
+    hold: str | None = None,
     effort: str = "applied",
     start: float | None = None,
     stop: float | None = None,
@@ -156,20 +159,27 @@ def replay_recording(
         plant: Plant file, preset or parameters.
         window: Length of the windows [s].
         mapping: Mapping file of a CSV.
+        hold: Of the input of a CSV, ``zero`` or ``linear``; by default what its mapping says.
         effort: For bags, ``applied`` or ``measured`` torque.
         start: Leave out what comes before, from the beginning of the recording [s].
         stop: Leave out what comes after [s].
         namespace: For bags with several plants, such as ``/sim``.
 
+    A voltage, a set point or a free swing drives the fit that identification left beside the plant file.
+
     Raises:
-        DataError: The recording is damaged or its input is no torque.
+        DataError: The recording is damaged, or nothing here takes its input.
         ParameterError: The plant file is refused.
     """
-    recording = read_recording(path, mapping, effort=effort, namespace=namespace)
+    recording = read_recording(path, mapping, effort=effort, namespace=namespace, hold=hold)
     if start is not None or stop is not None:
         begin = float(recording.time[0])
         last = math.inf if stop is None else begin + stop
         recording = recording.between(begin + (start or 0.0), last)
+    if recording.input_kind != "effort" or (isinstance(plant, str | Path) and Path(plant).suffix == ".json"):
+        from pendulum_bags.replay.fit_replay import replay_fit
+
+        return replay_fit(recording, plant, window=window)
     parameters = plant if isinstance(plant, PlantParameters) else load_plant(plant)
     return replay_input(recording, parameters, window=window)
 
@@ -319,7 +329,12 @@ def _horizons(driven: _Driven, longest: float) -> tuple[HorizonError, ...]:
     error = np.stack(
         [driven.run(int(first), reach) - driven.position[first : first + reach + 1] for first in starts]
     )
-    steps = sorted({k for k in (m * 10**e for e in range(7) for m in (1, 2, 5)) if k < reach} | {reach})
     return tuple(
-        HorizonError(k, k * period, float(np.sqrt(np.mean(error[:, k] ** 2))), starts.size) for k in steps
+        HorizonError(k, k * period, float(np.sqrt(np.mean(error[:, k] ** 2))), starts.size)
+        for k in horizon_steps(reach)
     )
+
+
+def horizon_steps(reach: int) -> list[int]:
+    """Return 1, 2, 5, 10, 20, ... samples up to the longest horizon."""
+    return sorted({k for k in (m * 10**e for e in range(7) for m in (1, 2, 5)) if k < reach} | {reach})

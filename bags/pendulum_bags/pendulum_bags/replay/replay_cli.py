@@ -24,7 +24,10 @@ app = typer.Typer(add_completion=False, rich_markup_mode=None)
 def replay(
     recording: Annotated[Path, typer.Argument(help="CSV file of a pendulum, or a bag.")],
     params: Annotated[
-        str, typer.Option("--params", "-p", help="Plant file, or a preset: thesis, x5_9, dfki.")
+        str,
+        typer.Option(
+            "--params", "-p", help="Plant file (an identified one for a voltage), or a preset: thesis, x5_9, dfki."
+        ),
     ] = "",
     controller: Annotated[
         str,
@@ -40,6 +43,10 @@ def replay(
     start: Annotated[float | None, typer.Option(help="Leave out what comes before [s].")] = None,
     stop: Annotated[float | None, typer.Option(help="Leave out what comes after [s].")] = None,
     mapping: Annotated[str, typer.Option(help="Mapping file of a CSV with other columns or units.")] = "",
+    hold: Annotated[
+        str | None,
+        typer.Option(help="Input of a CSV between its samples: zero (a held command) or linear (measured)."),
+    ] = None,
     effort: Annotated[
         str, typer.Option(help="Torque of a bag: applied (said by the plant) or measured.")
     ] = "applied",
@@ -51,7 +58,7 @@ def replay(
     ] = None,
     json_output: Annotated[bool, typer.Option("--json", help="Print JSON instead of tables.")] = False,
 ) -> None:
-    """Drive a plant with recorded torque and compare the motion; or a controller with recorded states.
+    """Drive a plant with a recorded input and compare the motion; or a controller with recorded states.
 
     Example: python -m pendulum_bags replay measured.csv --params dfki
     """
@@ -75,6 +82,7 @@ def replay(
             params or "thesis",
             window=window,
             mapping=mapping or None,
+            hold=hold,
             effort=effort,
             start=start,
             stop=stop,

@@ -1,0 +1,120 @@
+"""Replay of a voltage, a servo's set point, or nothing, which no plant file takes, through the fit behind it."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from pendulum_bags.identification.model import FitModel, from_plant, to_plant
+from pendulum_bags.identification.problem import Piece, prepare, simulate
+from pendulum_bags.identification.result import load_fit_model
+from pendulum_bags.identification.window_score import free_run, window_score
+from pendulum_bags.replay.input_replay import (
+    DIVERGED,
+    MOST_STARTS,
+    HorizonError,
+    InputReplay,
+    fit_percent,
+    horizon_steps,
+)
+from pendulum_bags.runs.datasets import INPUT_KINDS, Recording
+from pendulum_msgs_py.errors import DataError
+from pendulum_msgs_py.plants.plant_parameters import PlantParameters, load_plant
+
+__all__ = ["replay_fit"]
+
+_WORDS = {
+    "effort": "the measured torque",
+    "voltage": "the voltage",
+    "position_goal": "the set point",
+    "none": "nothing but the start",
+}
+
+
+def replay_fit(
+    recording: Recording, plant: str | Path | PlantParameters, *, window: float = 1.0
+) -> InputReplay:
+    """Drive the fit of an identification with a recording, in windows and in free run.
+
+    Args:
+        recording: Data with any input.
+        plant: Plant file with the JSON of its identification beside it, or that JSON; for a free swing any rigid plant.
+        window: Length of the windows [s], > 0.
+
+    Raises:
+        DataError: The recording has another input than the fit.
+    """
+    if not window > 0.0:
+        raise DataError(f"window is {window} s; expected > 0")
+    model, name = _model_of(recording, plant)
+    servo = model.input_kind == "position_goal"
+    score = window_score(model, recording, window)
+    run = free_run(model, recording, fitted=not servo)
+    error = run.simulated - run.measured
+    threshold = DIVERGED * float(np.ptp(recording.position))
+    beyond = np.flatnonzero(np.abs(error) > threshold)
+    return InputReplay(
+        name=recording.name,
+        plant=replace(to_plant(model), name=name),
+        window=window,
+        rms=score.rms,
+        by_window=score.by_window,
+        window_time=score.time,
+        window_angle=score.simulated,
+        time=run.time,
+        measured=run.measured,
+        free_run=run.simulated,
+        free_run_rms=run.rms,
+        fit=fit_percent(run.measured, run.simulated),
+        diverges_at=float(run.time[beyond[0]] - run.time[0]) if beyond.size else None,
+        threshold=threshold,
+        horizons=_horizons(model, recording, window),
+        from_fitted_state=not servo,
+        driven_by=_WORDS[recording.input_kind],
+    )
+
+
+def _model_of(recording: Recording, plant: str | Path | PlantParameters) -> tuple[FitModel, str]:
+    kind = recording.input_kind
+    if not isinstance(plant, PlantParameters):
+        beside = Path(plant).with_suffix(".json")
+        if Path(plant).suffix in {".yaml", ".yml", ".json"} and beside.is_file():
+            model = load_fit_model(beside)
+            if kind not in {model.input_kind, "none"}:
+                raise DataError(
+                    f"{recording.name} has the input {kind!r} [{INPUT_KINDS[kind]}], {beside} was identified with "
+                    f"{model.input_kind!r} [{INPUT_KINDS[model.input_kind]}]; expected the same"
+                )
+            return model, Path(plant).stem
+        if kind != "none":
+            raise DataError(
+                f"{recording.name} has the input {kind!r} [{INPUT_KINDS[kind]}], and a plant takes 'effort' [N m]; "
+                f"expected {beside}, as `identify --out` writes it beside its plant file, with the gain of that input"
+            )
+    elif kind != "none":
+        raise DataError(f"{recording.name} has the input {kind!r}; expected 'effort' [N m] to drive a plant")
+    parameters = plant if isinstance(plant, PlantParameters) else load_plant(plant)
+    # Nothing drives it: delay and lag of the actuator have nothing to delay.
+    return from_plant(parameters), parameters.name
+
+
+def _horizons(model: FitModel, recording: Recording, longest: float) -> tuple[HorizonError, ...]:
+    """Return errors of predictions from measured states after 1, 2, 5, 10, ... samples."""
+    size = recording.time.size
+    reach = min(max(1, round(longest / recording.period)), size - 1)
+    starts = np.unique(np.linspace(0, size - 1 - reach, MOST_STARTS).astype(int))
+    whole = prepare(recording, None, across_gaps=True)
+    errors = []
+    for first in starts:
+        tail = prepare(recording.rows(int(first)), None, across_gaps=True) if size - first >= 3 else whole
+        window = np.array([[first, first + reach + 1]], dtype=np.int64)
+        piece = Piece(recording, window, tail.states, whole.integral, whole.enabled)
+        part = slice(int(first), int(first) + reach + 1)
+        errors.append(simulate(model, piece).theta[part] - recording.position[part])
+    error = np.stack(errors)
+    return tuple(
+        HorizonError(k, k * recording.period, float(np.sqrt(np.mean(error[:, k] ** 2))), starts.size)
+        for k in horizon_steps(reach)
+    )
