@@ -11,7 +11,7 @@ from pendulum_bags.runs.series import Series, Signal
 from pendulum_msgs_py.contract.angles import UPRIGHT, from_upright
 from pendulum_msgs_py.contract.noise import uniform_array
 from pendulum_msgs_py.plants.plant_parameters import PlantParameters, load_plant
-from pendulum_sim.plant import make_plant
+from pendulum_sim.plants import make_plant
 from pendulum_sim.sensors import Sensors
 
 K = (33.345265, 0.158993)

@@ -44,7 +44,7 @@ def run_closed_loop(
     period: float = 0.01,
     disturbance: Disturbance | None = None,
 ) -> Run:
-    from pendulum_sim.plant import make_plant
+    from pendulum_sim.plants import make_plant
 
     simulated = make_plant(plant, period)
     state = simulated.reset(theta, theta_dot)

@@ -21,7 +21,7 @@ from pendulum_lqr.model import (
 from pendulum_msgs_py.contract.angles import UPRIGHT
 from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.plants.plant_parameters import PlantParameters, load_plant
-from pendulum_sim.plant import make_plant
+from pendulum_sim.plants import make_plant
 
 PLANTS = st.builds(
     PlantParameters,

@@ -11,7 +11,7 @@ from pendulum_lqr.velocity import VELOCITY_ESTIMATORS, KalmanVelocity, SavitzkyG
 from pendulum_msgs_py.contract.angles import wrap
 from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.plants.plant_parameters import load_plant
-from pendulum_sim.plant import make_plant
+from pendulum_sim.plants import make_plant
 
 THESIS = load_plant("thesis")
 DFKI = load_plant("dfki")

@@ -26,7 +26,8 @@ from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.plants.plant_parameters import PlantParameters, load_plant
 from pendulum_sim.environment_kernel import is_smooth, lane_table, step_kernel
 from pendulum_sim.integrators import get_integrator
-from pendulum_sim.plant import check_start, check_step, make_plant
+from pendulum_sim.plant import check_start, check_step
+from pendulum_sim.plants import make_plant
 
 __all__ = [
     "ENVIRONMENT_ID",

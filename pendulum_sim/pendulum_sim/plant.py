@@ -20,7 +20,7 @@ from pendulum_sim.dry_friction import PACKED, acceleration_with_friction, actuat
 from pendulum_sim.integrators import Coefficients, PlantTuple, get_integrator
 from pendulum_sim.stability import check_stability
 
-__all__ = ["DelayLine", "Plant", "PlantState", "RigidPlant", "make_plant", "pack", "period_segments"]
+__all__ = ["DelayLine", "Plant", "PlantState", "RigidPlant", "pack", "period_segments"]
 
 _MAX_DELAY_STEPS = 100_000
 
@@ -233,35 +233,3 @@ def check_start(theta: float, theta_dot: float) -> None:
         raise ParameterError(f"initial theta is {theta} rad; expected a finite number")
     if not math.isfinite(theta_dot):
         raise ParameterError(f"initial theta_dot is {theta_dot} rad/s; expected a finite number")
-
-
-def make_plant(
-    parameters: PlantParameters, dt: float, *, method: str = "auto", substeps: int | None = None
-) -> Plant:
-    """Return the plant that the parameters describe.
-
-    Args:
-        parameters: Parameters, with a drivetrain for a series-elastic plant.
-        dt: Period over which a command is held [s].
-        method: One of ``integrators.METHODS``; ``auto`` is ``etd4`` for a rigid plant and ``semi_implicit``
-            for a series-elastic one, which has no other.
-        substeps: Integration steps in a period; None for 1 (rigid), or as many as 0.25 ms asks for.
-
-    Raises:
-        ParameterError: The method does not go with the plant, or an argument is outside its domain.
-    """
-    if parameters.drivetrain is None:
-        return RigidPlant(
-            parameters,
-            dt,
-            method="etd4" if method == "auto" else method,
-            substeps=1 if substeps is None else substeps,
-        )
-    from pendulum_sim.series_elastic import SeriesElasticPlant
-
-    if method not in {"auto", "semi_implicit"}:
-        raise ParameterError(
-            f"method is {method!r}; expected semi_implicit or auto, since plant {parameters.name!r} "
-            "is series elastic"
-        )
-    return SeriesElasticPlant(parameters, dt, substeps=substeps)

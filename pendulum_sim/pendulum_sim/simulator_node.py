@@ -26,7 +26,8 @@ from pendulum_msgs_py.ros.plant_loop import LOCKSTEP_EPOCH_NS, LOOP_SPECS, Locks
 from pendulum_msgs_py.ros.polled import PollingNode
 from pendulum_msgs_py.ros.runner import run_node
 from pendulum_sim.integrators import METHODS
-from pendulum_sim.plant import PlantState, make_plant
+from pendulum_sim.plant import PlantState
+from pendulum_sim.plants import make_plant
 from pendulum_sim.sensors import SENSOR_SPECS, Sensors
 from pendulum_sim.servo import PositionServo
 

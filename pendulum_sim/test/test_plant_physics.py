@@ -18,7 +18,8 @@ from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.plants.plant_parameters import PlantParameters, load_plant
 from pendulum_sim.dry_friction import acceleration_with_friction
 from pendulum_sim.integrators import METHODS
-from pendulum_sim.plant import RigidPlant, make_plant, pack, period_segments
+from pendulum_sim.plant import RigidPlant, pack, period_segments
+from pendulum_sim.plants import make_plant
 
 _FREE = PlantParameters(inertia=0.15, damping=0.0, gravity=3.0)
 _DRY = PlantParameters(

@@ -13,7 +13,8 @@ from pendulum_msgs_py.plants.plant_parameters import PlantParameters, load_plant
 from pendulum_sim.batch import simulate_batch
 from pendulum_sim.environment import PendulumEnv
 from pendulum_sim.integrators import METHODS, get_integrator
-from pendulum_sim.plant import RigidPlant, make_plant
+from pendulum_sim.plant import RigidPlant
+from pendulum_sim.plants import make_plant
 from pendulum_sim.series_elastic import SeriesElasticPlant
 from pendulum_sim.stability import MOST_GROWTH, growth_rate, stable_substeps
 from pendulum_sim.vector_environment import PendulumVectorEnv

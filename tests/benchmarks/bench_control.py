@@ -21,7 +21,7 @@ from pendulum_lqr.model import linearise
 from pendulum_lqr.trajectory_optimisation import swing_up_trajectory
 from pendulum_msgs_py.contract.angles import from_upright
 from pendulum_msgs_py.plants.plant_parameters import PlantParameters, load_plant
-from pendulum_sim.plant import make_plant
+from pendulum_sim.plants import make_plant
 from tests.benchmarks import Peer, Row, measured, peer
 
 __all__ = ["rows"]

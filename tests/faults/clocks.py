@@ -39,7 +39,7 @@ from pendulum_msgs_py.ros.convert import stamp_to_message
 from pendulum_msgs_py.ros.plant_interface import LIMIT_SPECS, PlantInterface, limits_from_parameters
 from pendulum_msgs_py.ros.plant_loop import LOCKSTEP_EPOCH_NS, LockstepLoop
 from pendulum_rosbag.reader import read_bag
-from pendulum_sim.plant import make_plant
+from pendulum_sim.plants import make_plant
 from tests.faults.live import NAMESPACE, LiveSystem
 from tests.faults.outcome import Outcome, Trial
 

@@ -20,7 +20,7 @@ from pendulum_msgs_py.parameters import validate
 from pendulum_msgs_py.plants.plant_parameters import PlantParameters, load_plant
 from pendulum_msgs_py.ros.plant_interface import LIMIT_SPECS, limits_from_parameters
 from pendulum_msgs_py.ros.plant_loop import LOCKSTEP_EPOCH_NS
-from pendulum_sim.plant import make_plant
+from pendulum_sim.plants import make_plant
 from pendulum_sim.sensors import Sensors
 
 __all__ = ["RunArrays", "simulate", "simulate_plant"]

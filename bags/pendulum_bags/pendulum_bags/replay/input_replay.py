@@ -15,7 +15,8 @@ from pendulum_bags.identification.window_score import window_score
 from pendulum_bags.runs.datasets import Recording, read_recording
 from pendulum_msgs_py.errors import DataError
 from pendulum_msgs_py.plants.plant_parameters import PlantParameters, load_plant
-from pendulum_sim.plant import Plant, make_plant
+from pendulum_sim.plant import Plant
+from pendulum_sim.plants import make_plant
 
 if TYPE_CHECKING:
     from pendulum_bags.figures.figure import Figure

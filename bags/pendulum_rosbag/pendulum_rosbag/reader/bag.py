@@ -17,42 +17,12 @@ from pendulum_msgs_py.errors import DataError
 from pendulum_rosbag.reader.batches import Batch, Int64, Source, Stream
 from pendulum_rosbag.reader.joint_state import JointStateParser
 from pendulum_rosbag.reader.open_source import BagFolder, open_folder, open_sources
+from pendulum_rosbag.reader.topic_info import StoredMessage, TopicInfo
 
-__all__ = ["Bag", "StoredMessage", "TopicInfo", "read_bag", "read_bags"]
+__all__ = ["Bag", "read_bag", "read_bags"]
 
 _JOINT_STATE = "sensor_msgs/msg/JointState"
 _STRING = "std_msgs/msg/String"
-
-
-@dataclass(frozen=True, slots=True)
-class TopicInfo:
-    """A topic of a bag.
-
-    Args:
-        name: Full name.
-        type: Message type, such as ``sensor_msgs/msg/JointState``.
-        count: Messages in the bag (of the whole bag, also when a time span was asked for).
-        hash: Type description hash, empty when the bag does not tell.
-        qos: Offered QoS profiles as the YAML text of the bag.
-        definition: Message definition text, empty when the bag has none.
-        serialization: How messages are encoded: ``cdr``, or as another writer says.
-    """
-
-    name: str
-    type: str
-    count: int
-    hash: str = ""
-    qos: str = ""
-    definition: str = ""
-    serialization: str = "cdr"
-
-
-@dataclass(frozen=True, slots=True)
-class StoredMessage:
-    """A message of any type: its log time [ns] and its fields as an object of rosbags."""
-
-    log_time_ns: int
-    message: Any
 
 
 @dataclass(slots=True)

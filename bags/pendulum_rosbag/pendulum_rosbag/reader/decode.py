@@ -7,12 +7,12 @@ from functools import lru_cache
 from typing import TYPE_CHECKING, Any
 
 from pendulum_msgs_py.errors import DataError
+from pendulum_rosbag.reader.topic_info import TopicInfo
 from pendulum_rosbag.storage.message_types import typestore
 
 if TYPE_CHECKING:
     from rosbags.typesys.store import Typestore
 
-    from pendulum_rosbag.reader.bag import TopicInfo
 
 __all__ = ["decoder_for", "store_for"]
 

@@ -13,7 +13,8 @@ from pendulum_rosbag.reader.decode import decoder_for, store_for
 from pendulum_rosbag.reader.joint_state import canonical
 
 if TYPE_CHECKING:
-    from pendulum_rosbag.reader.bag import Bag, TopicInfo
+    from pendulum_rosbag.reader.bag import Bag
+    from pendulum_rosbag.reader.topic_info import TopicInfo
 
 __all__ = ["Difference", "same_messages"]
 

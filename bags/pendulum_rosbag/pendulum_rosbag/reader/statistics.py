@@ -8,8 +8,9 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from pendulum_rosbag.reader.bag import Bag, TopicInfo
+from pendulum_rosbag.reader.bag import Bag
 from pendulum_rosbag.reader.batches import Int64
+from pendulum_rosbag.reader.topic_info import TopicInfo
 from pendulum_rosbag.recorder.stamps import stamp_reader
 
 __all__ = [
