@@ -33,6 +33,7 @@ __all__ = [
     "TemperatureState",
     "check_command",
     "check_lifetime",
+    "state_name",
 ]
 
 NO_SETPOINT = math.nan
@@ -94,6 +95,14 @@ class CommandLock(IntEnum):
     UNLOCKED = 0
     LOCKED_BY_OTHER = 1
     LOCKED_BY_SENDER = 2
+
+
+def state_name(kind: type[IntEnum], number: int) -> str:
+    """Return the name of a state of the firmware; of one that a newer firmware has added, its number."""
+    try:
+        return kind(number).name
+    except ValueError:
+        return f"{number} (unknown)"
 
 
 class MStopAction(str, Enum):

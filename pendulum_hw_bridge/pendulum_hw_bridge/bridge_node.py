@@ -20,8 +20,10 @@ from pendulum_hw_bridge import bridge_parameters
 from pendulum_hw_bridge.actuator import ActuatorError, Feedback
 from pendulum_hw_bridge.actuator_loop import ActuatorLoop
 from pendulum_hw_bridge.bridge import Bridge, Outcome
+from pendulum_hw_bridge.bridge_consistency import check_consistency
 from pendulum_hw_bridge.bridge_parameters import BRIDGE_SPECS
 from pendulum_hw_bridge.clocks import SteppedClock, WallClock
+from pendulum_hw_bridge.e_stop_server import EStopServer
 from pendulum_hw_bridge.feedback_message import encode_feedback
 from pendulum_hw_bridge.lab_node import with_lab_file
 from pendulum_hw_bridge.safety import SafetyMonitor
@@ -45,6 +47,8 @@ _HARDWARE_DEFAULTS: dict[str, ParameterValue] = {
     "velocity_limit": 1.5,
     "position_window": [-4.0, 4.0],
     "effort_slew_limit": 2000.0,
+    "start_effort_limit": 2.0,
+    "starvation_limit": 30.0,
 }
 """Limits that a simulated plant can do without and a real one cannot."""
 
@@ -115,10 +119,12 @@ class BridgeNode(LifecycleNode):
             if self._lockstep
             else self._wall,
             push=values["backend"].startswith("emulator"),
+            e_stop=False,
             statistics=None if self._lockstep else self._statistics,
             more_diagnostics=self._diagnostics,
             on_command=self._on_command,
         )
+        self._e_stop = EStopServer(self, lambda: self._supervisor.e_stop(self._interface.clock()))
         self._feedback = self.create_publisher(JointState, "actuator/feedback", _FEEDBACK_QOS)
         self._temperature = self.create_publisher(Temperature, "actuator/winding_temperature", _FEEDBACK_QOS)
         self._supply = self.create_publisher(BatteryState, "actuator/supply", _FEEDBACK_QOS)
@@ -135,14 +141,16 @@ class BridgeNode(LifecycleNode):
             )
             self._lockstep_loop.paused = True
         # Made once here as well, so that a refused parameter ends the process with its sentence.
+        check_consistency(values, limits)
+        self._mapping = bridge_parameters.effort_mapping(values, self._plant, self._gains, limits)
         self._settings = bridge_parameters.bridge_settings(
             values,
             effort=limits.effort,
-            velocity=min(limits.velocity, 1.5),
+            velocity=self._mapping.velocity_limit,
             gains=self._gains,
+            window=(limits.position_min, limits.position_max),
         )
-        self._mapping = bridge_parameters.effort_mapping(values, self._plant, self._gains)
-        self._safety = bridge_parameters.safety_limits(values)
+        self._safety = bridge_parameters.safety_limits(values, limits.effort)
         if values["autostart"]:
             self._autostart()
 
@@ -150,8 +158,12 @@ class BridgeNode(LifecycleNode):
         """Disarm, effort zero, strategy off; a last zero torque is published, so that a recording shows it."""
         stamp_ns = self._interface.clock()
         self._interface.safe_stop("bridge ends")
+        bridge = self._bridge
         self.release_actuator()
+        if bridge is not None and bridge.stop_pending:
+            self.get_logger().error(f"{bridge.last_fault}: press the motion stop, cut the supply")
         self._interface.publish_applied(stamp_ns, 0.0)
+        self._e_stop.close()
 
     def release_actuator(self) -> None:
         """Let go of the actuator, on whichever way."""
@@ -365,6 +377,7 @@ class BridgeNode(LifecycleNode):
         if bridge is None or bridge.feedback is None:
             return values
         feedback = bridge.feedback
+        present = bridge.monitor.present
         values.update(
             {
                 "firmware_strategy": int(bridge.port.strategy),
@@ -373,6 +386,7 @@ class BridgeNode(LifecycleNode):
                 "pwm": feedback.pwm_command,
                 "winding_current_a": feedback.winding_current,
                 "last_fault": bridge.last_fault or "none",
+                "present_fault": present.name if present is not None else "none",
             }
         )
         values.update({f"faults.{name}": count for name, count in sorted(bridge.faults.items())})

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, replace
 from pathlib import Path
@@ -14,7 +15,9 @@ from pendulum_hw_bridge.clocks import Clock
 from pendulum_hw_bridge.effort_mapping import EffortMapping, EffortStrategy
 from pendulum_hw_bridge.gains import DEFAULT_GAINS, GainSet, load_gains
 from pendulum_hw_bridge.lab import LAB_SPEC
-from pendulum_hw_bridge.safety import SafetyLimits
+from pendulum_hw_bridge.motor_state import MOTOR_SPEED_LIMIT
+from pendulum_hw_bridge.safety_limits import SafetyLimits
+from pendulum_msgs_py.contract.drive import PlantLimits
 from pendulum_msgs_py.contract.values import NANOSECONDS
 from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.parameters import ParameterSpec
@@ -33,6 +36,8 @@ __all__ = [
 ]
 
 POSITION_LOOP_STRATEGY = 3
+_MEASURED_EFFORT_MARGIN = 1.0
+"""Measured torque beyond the effort limit that is no fault: noise, friction, a light push [N m]."""
 _DEFAULT_ADDRESS = "127.0.0.1:17590"
 _LOCKSTEP_LEAD_NS = 500_000
 """In lockstep, feedback is measured this long before the state that shows it [ns]."""
@@ -159,11 +164,10 @@ BRIDGE_SPECS: tuple[ParameterSpec, ...] = (
     ),
     _fixed(
         "measured_effort_limit",
-        14.0,
+        0.0,
         "N m",
-        "Torque of the spring at which the bridge faults.",
+        "Torque of the spring at which the bridge faults; 0 for 1 N m above the effort limit.",
         minimum=0.0,
-        exclusive_minimum=True,
     ),
     _fixed(
         "winding_current_tolerance",
@@ -305,20 +309,29 @@ def trajectory_gains(values: Mapping[str, Any]) -> GainSet:
     return gains
 
 
-def effort_mapping(values: Mapping[str, Any], plant: PlantParameters, gains: GainSet) -> EffortMapping:
-    """Return the mapping of torque to setpoints."""
+def effort_mapping(
+    values: Mapping[str, Any], plant: PlantParameters, gains: GainSet, limits: PlantLimits
+) -> EffortMapping:
+    """Return the mapping of torque to setpoints, with the limits that it keeps."""
     drivetrain = drivetrain_of(plant)
     return EffortMapping(
         EffortStrategy(values["effort_strategy"]),
         drivetrain,
         efficiency=values["effort_efficiency"] or drivetrain.efficiency,
         compensation=values["back_emf_compensation"],
-        position_gain=gains.position.kp,
+        gains=gains,
+        effort_limit=limits.effort,
+        velocity_limit=min(limits.velocity, MOTOR_SPEED_LIMIT / drivetrain.gear_ratio),
     )
 
 
 def bridge_settings(
-    values: Mapping[str, Any], *, effort: float, velocity: float, gains: GainSet
+    values: Mapping[str, Any],
+    *,
+    effort: float,
+    velocity: float,
+    gains: GainSet,
+    window: tuple[float, float] = (-math.inf, math.inf),
 ) -> BridgeSettings:
     """Return what to set in the actuator.
 
@@ -327,18 +340,22 @@ def bridge_settings(
         effort: Effort limit of the plant [N m].
         velocity: Velocity limit of the plant [rad/s].
         gains: For trajectories.
+        window: Angles between which the joint must stay [rad].
 
     Raises:
         ParameterError: ``joint_sign`` is zero, or a limit is refused.
     """
     if values["joint_sign"] == 0:
         raise ParameterError("joint_sign is 0; expected 1 or -1")
+    ends = sorted(values["joint_sign"] * (angle - values["joint_offset"]) for angle in window)
     return BridgeSettings(
         feedback_rate=values["feedback_rate"],
         command_lifetime=values["command_lifetime"],
         limits=HardwareLimits(
             effort=effort,
             velocity=velocity,
+            position_min=ends[0],
+            position_max=ends[1],
             pwm=values["pwm_limit"],
             m_stop=MStopAction(values["m_stop_action"]),
         ),
@@ -349,8 +366,12 @@ def bridge_settings(
     )
 
 
-def safety_limits(values: Mapping[str, Any]) -> SafetyLimits:
+def safety_limits(values: Mapping[str, Any], effort: float | None = None) -> SafetyLimits:
     """Return the limits of the feedback checks.
+
+    Args:
+        values: Parameters of :data:`BRIDGE_SPECS`.
+        effort: Effort limit of the plant; None for that of the plant file [N m].
 
     Raises:
         ParameterError: ``voltage_window`` is not a window.
@@ -358,11 +379,12 @@ def safety_limits(values: Mapping[str, Any]) -> SafetyLimits:
     window = values["voltage_window"]
     if len(window) != 2:
         raise ParameterError(f"voltage_window has {len(window)} values; expected [low, high] in V")
+    limit = plant_of(values).effort_limit if effort is None else effort
     return SafetyLimits(
         winding_temperature=values["winding_temperature_limit"],
         voltage_min=window[0],
         voltage_max=window[1],
-        measured_effort=values["measured_effort_limit"],
+        measured_effort=values["measured_effort_limit"] or limit + _MEASURED_EFFORT_MARGIN,
         winding_current=values["winding_current_tolerance"],
         feedback_cycles=values["feedback_watchdog"],
     )

@@ -93,8 +93,10 @@ def run_checklist(
         fault = error.fault if isinstance(error, ActuatorError) else "parameter"
         items.append(CheckItem(fault, False, str(error), "no error"))
     finally:
-        port.stop()
-        port.close()
+        try:
+            port.close()
+        except ActuatorError as error:
+            items.append(CheckItem(error.fault, False, str(error), "no error"))
     return found
 
 

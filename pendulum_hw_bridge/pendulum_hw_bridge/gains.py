@@ -15,7 +15,17 @@ from xml.etree import ElementTree
 from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.parameters import read_text, reject_unknown
 
-__all__ = ["DEFAULT_GAINS", "GAIN_FIELDS", "LOOPS", "GainSet", "PidGains", "load_gains", "write_gains"]
+__all__ = [
+    "DEFAULT_GAINS",
+    "GAIN_FIELDS",
+    "LOOPS",
+    "GainSet",
+    "PidGains",
+    "differing_gain",
+    "limit_output",
+    "load_gains",
+    "write_gains",
+]
 
 LOOPS = ("position", "velocity", "effort")
 """The loops of the firmware, in its own order."""
@@ -116,6 +126,24 @@ GAIN_FIELDS = tuple(item.name for item in fields(PidGains))
 """Names of a loop's gains, in the order of the dataclass; also the element names of HEBI's file."""
 
 
+def limit_output(gains: PidGains, output: float) -> PidGains:
+    """Return the gains of a loop whose output lies within +-``output``, or closer where it did before."""
+    return replace(gains, min_output=max(gains.min_output, -output), max_output=min(gains.max_output, output))
+
+
+def differing_gain(reads: GainSet, wanted: GainSet) -> str:
+    """Return which gain reads back as another than wanted, as a sentence, or an empty string.
+
+    A clamp at infinity is none, and is not written; the module keeps single precision.
+    """
+    for loop in LOOPS:
+        for name in GAIN_FIELDS:
+            seen, asked = getattr(reads.loop(loop), name), getattr(wanted.loop(loop), name)
+            if math.isfinite(asked) and not math.isclose(seen, asked, rel_tol=1e-5, abs_tol=1e-7):
+                return f"{loop} gain {name} reads back as {seen:g}; expected {asked:g}"
+    return ""
+
+
 def load_gains(path: str | Path) -> GainSet:
     """Return the gains in a HEBI gains file; gains that it leaves out keep the default of its strategy.
 
@@ -163,7 +191,9 @@ def write_gains(path: str | Path, gains: GainSet) -> Path:
         for name in GAIN_FIELDS:
             value = getattr(gains.loop(loop), name)
             if math.isfinite(value):
-                ElementTree.SubElement(element, name).text = repr(float(value))
+                # hebi-py takes a switch for a whole number, and refuses 1.0.
+                text = str(int(value)) if name == "d_on_error" else repr(float(value))
+                ElementTree.SubElement(element, name).text = text
     ElementTree.indent(root)
     path = Path(path)
     try:

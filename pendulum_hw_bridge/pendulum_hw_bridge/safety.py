@@ -9,42 +9,25 @@ from __future__ import annotations
 import itertools
 import math
 from collections import deque
-from dataclasses import dataclass
 
-from pendulum_hw_bridge.actuator import Command, CommandLock, Feedback, LimitState, Strategy, TemperatureState
+from pendulum_hw_bridge.actuator import (
+    Command,
+    CommandLock,
+    Feedback,
+    LimitState,
+    Strategy,
+    TemperatureState,
+    state_name,
+)
+from pendulum_hw_bridge.fault_table import FAULTS, Fault
+from pendulum_hw_bridge.motor_state import MOTOR_SPEED_LIMIT
+from pendulum_hw_bridge.output_check import OutputCheck
+from pendulum_hw_bridge.safety_limits import SafetyLimits
 from pendulum_msgs_py.contract.values import NANOSECONDS
 from pendulum_msgs_py.dynamics.series_elastic import winding_current, winding_resistance_at
-from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.plants.plant_parameters import SeriesElasticParameters
 
 __all__ = ["FAULTS", "Fault", "SafetyLimits", "SafetyMonitor"]
-
-FAULTS = {
-    "feedback_lost": "no feedback for three cycles",
-    "feedback_frozen": "records come, but their sequence number stands still for three cycles",
-    "feedback_not_finite": "position, velocity or effort is NaN or infinite",
-    "feedback_late": "records are older than three cycles when they arrive",
-    "module_restarted": "the module's own clock or sequence number went back",
-    "position_jump": "position changed by more than its velocity allows",
-    "motion_disagreement": "position and velocity tell different motions over five cycles (a stuck encoder)",
-    "m_stop": "the motion stop is pressed",
-    "over_temperature": "the firmware limits or cuts the output, or the winding is above its limit",
-    "locked_by_other": "another sender holds the module",
-    "voltage": "supply voltage outside its window",
-    "firmware_limit": "a safety limit of the firmware acts",
-    "effort_measured": "measured torque above its limit",
-    "command_not_in_force": "the module acts on something that was not sent",
-    "winding_current": "winding current does not fit PWM, velocity and resistance",
-    "strategy": "the strategy does not read back",
-    "send_failed": "a command could not be sent",
-    "no_acknowledgement": "a setting was not acknowledged",
-    "supervisor": "a limit that every plant has: velocity, position window, trajectory, age of the measurement",
-    "exception": "an error in the bridge itself",
-    "module_lost": "the module is not there, is not the only one that fits, or does not answer",
-    "not_connected": "the actuator is used before it is connected",
-    "not_installed": "hebi-py is not installed",
-}
-"""Faults by name and what each means."""
 
 _COUNT = 3
 _MOTION_CYCLES = 5
@@ -54,60 +37,14 @@ _WRONG_COMMANDS = 2
 """Records that show a wrong setpoint to be a fault: one packet may get lost, two in a row do not on a cable [-]."""
 _WRONG_COMMAND_TIME = 0.008
 """Time for which a wrong setpoint must be in force to be a fault [s]."""
-_CLAMPED_SPEED = 1.35
-"""Speed above which the firmware may take the duty back [rad/s]."""
-
-
-@dataclass(frozen=True)
-class Fault:
-    """One fault: its name in :data:`FAULTS` and a sentence with the values."""
-
-    name: str
-    message: str
-
-
-@dataclass(frozen=True)
-class SafetyLimits:
-    """Limits of the checks.
-
-    Attributes:
-        winding_temperature: Largest winding temperature [degC].
-        voltage_min: [V].
-        voltage_max: [V].
-        measured_effort: Largest torque that the spring may show [N m].
-        position_jump: Largest change of position beyond that of the velocity, in one cycle [rad].
-        position_disagreement: Largest disagreement of position and integrated velocity in five cycles [rad].
-        winding_current: Largest disagreement of the winding current; 0 switches the check off [A].
-        command_tolerance: Largest difference between the setpoint sent and the one in force [rad or N m].
-        pwm_tolerance: The same for a PWM duty; the firmware's steps are 2.4e-4 [-].
-        feedback_cycles: Feedback periods without a record at which it counts as lost [-].
-    """
-
-    winding_temperature: float = 120.0
-    voltage_min: float = 22.0
-    voltage_max: float = 50.0
-    measured_effort: float = 14.0
-    position_jump: float = 0.1
-    position_disagreement: float = 0.01
-    winding_current: float = 0.15
-    command_tolerance: float = 2e-3
-    pwm_tolerance: float = 5e-4
-    feedback_cycles: int = 3
-
-    def __post_init__(self) -> None:
-        """Refuse limits that limit nothing."""
-        for name, unit in (
-            ("winding_temperature", "degC"),
-            ("measured_effort", "N m"),
-            ("position_jump", "rad"),
-            ("position_disagreement", "rad"),
-        ):
-            if not getattr(self, name) > 0.0:
-                raise ParameterError(f"{name} limit is {getattr(self, name)} {unit}; expected > 0")
-        if not self.voltage_min < self.voltage_max:
-            raise ParameterError(
-                f"voltage window is [{self.voltage_min}, {self.voltage_max}] V; expected min < max"
-            )
+_CLAMPED_SHARE = 0.9
+"""Share of the largest speed above which the firmware may take the duty back [-]."""
+_SENSED = ("position", "velocity", "effort", "motor_position", "motor_velocity", "deflection", "winding_current")
+"""Quantities of which at least one differs from record to record, be it by noise."""
+_VOLTAGE_CHANGE = 0.15
+"""Share by which the supply may differ from what it was a moment ago [-]."""
+_VOLTAGE_WEIGHT = 0.02
+"""Weight of a record in what the supply was a moment ago [-]: half a second at 100 Hz."""
 
 
 class SafetyMonitor:
@@ -135,6 +72,15 @@ class SafetyMonitor:
         self._wrong_since_ns = 0
         self._wrong_currents = 0
         self._clock_offset_ns: int | None = None
+        self._clamped_speed = math.inf
+        if drivetrain is not None:
+            self._clamped_speed = _CLAMPED_SHARE * MOTOR_SPEED_LIMIT / drivetrain.gear_ratio
+        self._repeated = 0
+        self._still = 0
+        self._voltage: float | None = None
+        self._wrong_voltages = 0
+        self.output: OutputCheck | None = None
+        self.present: Fault | None = None
 
     @property
     def timeout(self) -> float:
@@ -148,6 +94,8 @@ class SafetyMonitor:
             self._wrong_commands = 0
             self._strategy = strategy
             self._strategy_since_ns = sent_ns
+            if self.output is not None:
+                self.output.reset()
         self._sent.append((sent_ns, command))
 
     def stopped(self) -> None:
@@ -155,13 +103,23 @@ class SafetyMonitor:
         self._sent.clear()
         self._strategy = Strategy.OFF
         self._wrong_commands = self._wrong_currents = 0
+        if self.output is not None:
+            self.output.reset()
 
     def is_new(self, feedback: Feedback) -> bool:
         """Return whether a record is one that was not seen before, and remember when one last was."""
-        fresh = self._last is None or feedback.sequence != self._last.sequence
+        last = self._last
+        fresh = last is None or (
+            feedback.sequence != last.sequence and feedback.hardware_ns != last.hardware_ns
+        )
+        self._repeated = 0 if fresh else self._repeated + 1
         if fresh:
             self._last_new_ns = feedback.stamp_ns
         return fresh
+
+    def age(self, now_ns: int) -> float:
+        """Return the age of the newest record, infinite before the first [s]."""
+        return math.inf if self._last_new_ns is None else (now_ns - self._last_new_ns) / NANOSECONDS
 
     def silence(self, now_ns: int) -> Fault | None:
         """Return the fault of feedback that stays away, or None.
@@ -171,7 +129,13 @@ class SafetyMonitor:
         """
         if self._last_new_ns is None:
             return None
-        age = (now_ns - self._last_new_ns) / NANOSECONDS
+        age = self.age(now_ns)
+        if age > self.timeout and self._repeated:
+            return Fault(
+                "feedback_frozen",
+                f"the same record has come {self._repeated} times in {age * 1e3:.0f} ms; expected a new one within "
+                f"{self.timeout * 1e3:.0f} ms",
+            )
         if age > self.timeout:
             return Fault(
                 "feedback_lost",
@@ -180,16 +144,20 @@ class SafetyMonitor:
         return None
 
     def check(self, feedback: Feedback) -> Fault | None:
-        """Return the first fault that a new record shows, or None."""
+        """Return the first fault that a new record shows, or None; also kept as ``present``."""
         fault = (
             self._check_values(feedback)
             or self._check_continuity(feedback)
+            or self._check_frozen(feedback)
             or self._check_state(feedback)
+            or self._check_voltage(feedback)
             or self._check_motion(feedback)
             or self._check_command(feedback)
+            or self._check_output(feedback)
             or self._check_current(feedback)
         )
         self._last = feedback
+        self.present = fault
         return fault
 
     # --- checks ---------------------------------------------------------------------------------------------
@@ -224,12 +192,24 @@ class SafetyMonitor:
                 )
         return None
 
+    def _check_frozen(self, feedback: Feedback) -> Fault | None:
+        last = self._last
+        same = last is not None and all(getattr(feedback, name) == getattr(last, name) for name in _SENSED)
+        self._still = self._still + 1 if same else 0
+        if self._still < self.limits.feedback_cycles:
+            return None
+        return Fault(
+            "feedback_frozen",
+            f"{self._still + 1} records in a row measure the same to the last digit; expected them to differ, by "
+            "noise at least",
+        )
+
     def _check_state(self, feedback: Feedback) -> Fault | None:
         limits = self.limits
         if feedback.m_stop:
             return Fault("m_stop", "motion stop is pressed; release it, then disarm and arm again")
         if feedback.temperature_state != TemperatureState.NORMAL:
-            state = TemperatureState(feedback.temperature_state).name
+            state = state_name(TemperatureState, feedback.temperature_state)
             return Fault("over_temperature", f"firmware reports temperature state {state}; expected NORMAL")
         if feedback.winding_temperature > limits.winding_temperature:
             return Fault(
@@ -246,7 +226,7 @@ class SafetyMonitor:
             )
         for name in ("position_limit", "velocity_limit", "effort_limit"):
             if getattr(feedback, name) in {LimitState.BELOW, LimitState.ABOVE}:
-                state = LimitState(getattr(feedback, name)).name
+                state = state_name(LimitState, getattr(feedback, name))
                 return Fault("firmware_limit", f"firmware's {name} reads {state}; expected INSIDE")
         if abs(feedback.effort) > limits.measured_effort:
             return Fault(
@@ -254,6 +234,18 @@ class SafetyMonitor:
                 f"measured torque is {feedback.effort:.2f} N m; expected at most {limits.measured_effort:g} N m",
             )
         return None
+
+    def _check_voltage(self, feedback: Feedback) -> Fault | None:
+        """Compare the supply with what it was lately: the mapping of torque to duty depends on it."""
+        usual = feedback.voltage if self._voltage is None else self._voltage
+        self._voltage = usual + _VOLTAGE_WEIGHT * (feedback.voltage - usual)
+        wrong = abs(feedback.voltage - usual) > _VOLTAGE_CHANGE * usual
+        self._wrong_voltages = self._wrong_voltages + 1 if wrong else 0
+        if self._wrong_voltages < 2:
+            return None
+        return Fault(
+            "voltage", f"supply is {feedback.voltage:.1f} V, a moment ago it was {usual:.1f} V; is the cable loose?"
+        )
 
     def _check_motion(self, feedback: Feedback) -> Fault | None:
         last = self._last
@@ -293,18 +285,17 @@ class SafetyMonitor:
             return None
         recent = self._in_force(feedback.stamp_ns)
         if self._strategy is Strategy.DIRECT_PWM:
-            acts, candidates, name = feedback.pwm_command, [command.pwm for command in recent], "PWM"
+            acts, candidates, name = feedback.pwm_command, [_or_zero(command.pwm) for command in recent], "PWM"
         elif math.isfinite(recent[-1].position):
             acts, candidates, name = feedback.position_command, [c.position for c in recent], "position"
         else:
             acts, candidates, name = feedback.effort_command, [c.effort for c in recent], "effort"
         direct = self._strategy is Strategy.DIRECT_PWM
         tolerance = self.limits.pwm_tolerance if direct else self.limits.command_tolerance
-        wanted = [0.0 if math.isnan(candidate) else candidate for candidate in candidates]
-        good = any(abs(acts - candidate) <= tolerance for candidate in wanted)
-        if not good and direct and abs(feedback.velocity) > _CLAMPED_SPEED:
+        good = any(_same(acts, candidate, tolerance) for candidate in candidates)
+        if not good and direct and abs(feedback.velocity) > self._clamped_speed:
             # Near its speed limit the firmware takes the duty back, never up and never round.
-            good = any(min(0.0, candidate) <= acts <= max(0.0, candidate) for candidate in wanted)
+            good = any(min(0.0, candidate) <= acts <= max(0.0, candidate) for candidate in candidates)
         if good:
             self._wrong_commands = 0
             return None
@@ -315,10 +306,17 @@ class SafetyMonitor:
         if self._wrong_commands >= _WRONG_COMMANDS and lasts >= _WRONG_COMMAND_TIME:
             return Fault(
                 "command_not_in_force",
-                f"module acts on {name} {acts:.4f}, sent was {wanted[-1]:.4f}; "
+                f"module acts on {name} {acts:.4f}, sent was {candidates[-1]:.4f}; "
                 "is the strategy another, or does the command not arrive?",
             )
         return None
+
+    def _check_output(self, feedback: Feedback) -> Fault | None:
+        if self.output is None or self._strategy is Strategy.OFF or not self._sent:
+            return None
+        if feedback.stamp_ns - self._strategy_since_ns <= round(self.period * NANOSECONDS):
+            return None
+        return self.output.check(feedback, self._strategy, self._in_force(feedback.stamp_ns))
 
     def _in_force(self, stamp_ns: int) -> list[Command]:
         """Return the commands that a record with this stamp may show: the newest to have arrived, and neighbours."""
@@ -351,3 +349,14 @@ class SafetyMonitor:
                 f"ask for {expected:.3f} A",
             )
         return None
+
+
+def _or_zero(value: float) -> float:
+    return 0.0 if math.isnan(value) else value
+
+
+def _same(acts: float, sent: float, tolerance: float) -> bool:
+    """Whether a loop acts on what was sent; one that was switched off may say so, or report a zero."""
+    if math.isnan(sent):
+        return math.isnan(acts) or acts == 0.0
+    return abs(acts - sent) <= tolerance

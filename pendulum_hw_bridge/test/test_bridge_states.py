@@ -1,7 +1,6 @@
 """The bridge's states, each against each input, and hand-over between them, on the emulated actuator."""
 
 import itertools
-import math
 
 import pytest
 
@@ -14,6 +13,7 @@ from pendulum_hw_bridge.emulation.faults import ActuatorFault
 from pendulum_hw_bridge.emulation.parameters import load_emulator
 from pendulum_hw_bridge.emulation.x5 import EmulatedX5
 from pendulum_hw_bridge.gains import DEFAULT_GAINS
+from pendulum_hw_bridge.motor_state import MotorState
 from pendulum_hw_bridge.safety import SafetyLimits, SafetyMonitor
 from pendulum_hw_bridge.shared_supervisor import SharedSupervisor
 from pendulum_msgs_py.contract.angles import UPRIGHT, from_upright
@@ -152,7 +152,7 @@ def test_arming_sets_and_confirms_the_strategy_first() -> None:
     ("fault", "reason"),
     [
         (ActuatorFault.COMMANDS_LOST, "did not acknowledge"),
-        (ActuatorFault.LOCKED_BY_OTHER, "did not acknowledge"),
+        (ActuatorFault.LOCKED_BY_OTHER, "another sender holds the module"),
         (ActuatorFault.FEEDBACK_LOST, "no new feedback"),
     ],
 )
@@ -229,14 +229,13 @@ def test_joint_offset_and_sign_turn_everything_that_the_joint_sees() -> None:
 
 
 @pytest.mark.parametrize("kind", list(EffortStrategy))
-def test_torque_to_setpoint_and_back(kind: EffortStrategy) -> None:
-    plant = Plant(kind=kind)
-    mapping, feedback = plant.bridge.mapping, plant.bridge.feedback
-    assert feedback is not None
-    moving = feedback._replace(motor_velocity=500.0)
+@pytest.mark.parametrize("voltage", [24.0, 36.0, 48.0])
+def test_torque_to_setpoint_and_back(kind: EffortStrategy, voltage: float) -> None:
+    mapping = Plant(kind=kind).bridge.mapping
+    moving = MotorState(voltage, 0.3)
     for effort in (-5.0, 0.0, 0.3, 9.0):
-        assert mapping.effort_of(mapping.command(effort, moving), moving) == pytest.approx(effort, abs=1e-12)
-    assert not math.isnan(mapping.handover_offset(1.0))
+        assert mapping.effort_of(mapping.command(effort, moving), moving, 0.7) == pytest.approx(effort, abs=1e-12)
+    assert mapping.effort_of(mapping.idle(), moving, 0.7) == 0.0
 
 
 def test_release_never_raises_and_close_may_follow_any_failure() -> None:

@@ -24,9 +24,23 @@ from pendulum_hw_bridge.actuator import (
 )
 from pendulum_hw_bridge.backends import hebi as backend_module
 from pendulum_hw_bridge.backends.hebi import HebiBackend
+from pendulum_hw_bridge.bridge import Bridge, BridgeSettings
+from pendulum_hw_bridge.effort_mapping import EffortMapping, EffortStrategy
+from pendulum_hw_bridge.emulation.parameters import load_emulator
 from pendulum_hw_bridge.gains import DEFAULT_GAINS, GAIN_FIELDS, LOOPS
+from pendulum_hw_bridge.safety import SafetyLimits, SafetyMonitor
+from pendulum_msgs_py.contract.supervisor import Drive, DriveKind, PlantLimits, PlantSupervisor
 
 hebi = pytest.importorskip("hebi", reason="hebi-py is not installed")
+
+
+def holds_strategy(command: Any) -> bool:
+    """Tell whether a command carries a strategy: hebi-py reads "off" and "none given" both as 0."""
+    probe = hebi.GroupCommand(1)
+    probe.control_strategy = 0
+    words = range(3)
+    asked, given = (each.refs[0].message_bitfield_ for each in (probe, command))
+    return all(given[word] & asked[word] == asked[word] for word in words)
 
 
 class Module:
@@ -39,7 +53,8 @@ class Module:
         self.feedback_frequency = 100.0
         self.settings: dict[str, Any] = {"control_strategy": 3}
         self.sent: list[tuple[float, float, float]] = []
-        self.hears = self.acknowledges = self.answers = self.flows = True
+        self.hears = self.acknowledges = self.answers = self.flows = self.keeps = True
+        self.asked = self.patience_ms = 0
         self.time_us = 1_000_000
         self.values: dict[str, float] = {}
         self.states = {
@@ -56,19 +71,23 @@ class Module:
         return self.hears
 
     def send_command_with_acknowledgement(self, command: Any, timeout_ms: int) -> bool:
+        self.asked, self.patience_ms = self.asked + 1, timeout_ms
         if not (self.hears and self.acknowledges):
             return False
         self.send_command(command)
+        if not self.keeps:
+            return True
         names = [f"{loop}_{name}" for loop in LOOPS for name in GAIN_FIELDS]
-        names += ["effort_limit_max", "velocity_limit_max", "position_limit_min", "position_limit_max"]
+        names += [f"{what}_limit_{end}" for what in ("effort", "velocity", "position") for end in ("min", "max")]
         for name in names:
             value = float(getattr(command, name)[0])
             if not math.isnan(value):
                 self.settings[name] = value
-        if command.control_strategy[0] or not self.settings:
+        if holds_strategy(command):
             self.settings["control_strategy"] = int(command.control_strategy[0])
-        if command.mstop_strategy[0]:
-            self.settings["mstop_strategy"] = int(command.mstop_strategy[0])
+        for name in ("mstop_strategy", "min_position_limit_strategy", "max_position_limit_strategy"):
+            if getattr(command, name)[0]:
+                self.settings[name] = int(getattr(command, name)[0])
         return True
 
     def request_info(self, timeout_ms: int) -> Any:
@@ -80,6 +99,8 @@ class Module:
             "serial": "X-1",
             "firmware_revision": "15",
             "mstop_strategy": 1,
+            "min_position_limit_strategy": 0,
+            "max_position_limit_strategy": 0,
         }
         module = self
 
@@ -193,18 +214,108 @@ def test_each_way_of_losing_the_module_has_its_name(
     assert caught.value.fault == fault
 
 
-def test_stop_sends_zero_then_off_even_to_a_module_that_does_not_acknowledge(
-    port: HebiBackend, module: Module
-) -> None:
-    port.set_strategy(Strategy.DIRECT_PWM)
+def test_stop_sends_zero_then_strategy_off_and_hears_it_confirmed(port: HebiBackend, module: Module) -> None:
+    port.set_strategy(Strategy.DIRECT_PWM, Command(pwm=0.2))
     module.sent.clear()
     port.stop()
     assert module.sent[0][2] == 0.0
     assert math.isnan(module.sent[-1][2])
+    assert module.settings["control_strategy"] == Strategy.OFF
+    assert port.strategy is Strategy.OFF
+
+
+def test_a_stop_that_nobody_confirms_is_an_error_and_the_next_one_asks_again(
+    port: HebiBackend, module: Module
+) -> None:
+    port.set_strategy(Strategy.DIRECT_PWM)
     module.acknowledges = False
-    port.set_strategy = None  # type: ignore[method-assign, assignment]
+    for _ in range(2):
+        asked = module.asked
+        with pytest.raises(ActuatorError, match="did not confirm that it is off") as caught:
+            port.stop()
+        assert caught.value.fault == "stop_unacknowledged"
+        assert module.asked - asked == 3
+    # Together no longer than the command lifetime, which ends the torque meanwhile.
+    assert module.patience_ms == 15
+    module.acknowledges = True
     port.stop()
-    port.close()
+    assert module.settings["control_strategy"] == Strategy.OFF
+    module.acknowledges = False
+    with pytest.raises(ActuatorError, match="did not confirm"):
+        port.close()
+    with pytest.raises(ActuatorError, match="not connected"):
+        port.write(Command())
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "message"),
+    [
+        ("effort_limit_min", -9.0, None),
+        ("effort_limit_min", math.nan, "effort limits read back as nan and 4.0"),
+        ("velocity_limit_max", -1.0, "velocity limits read back as"),
+        ("min_position_limit_strategy", 3, "strategies at the position limits read back as"),
+        ("mstop_strategy", 77, None),
+    ],
+)
+def test_limits_that_a_module_keeps_otherwise_are_seen(
+    port: HebiBackend, module: Module, name: str, value: float, message: str | None
+) -> None:
+    limits = HardwareLimits(effort=4.0, velocity=1.0, position_min=-3.0, position_max=3.0)
+    assert port.set_limits(limits) == limits
+    module.settings[name] = value
+    module.keeps = False
+    if message is None:
+        assert port.set_limits(limits) != limits
+    else:
+        with pytest.raises(ActuatorError, match=message):
+            port.set_limits(limits)
+
+
+def test_a_gain_that_a_module_does_not_tell_is_not_taken_for_kept(port: HebiBackend, module: Module) -> None:
+    port.set_gains(DEFAULT_GAINS[3])
+    module.settings["velocity_kp"] = math.nan
+    module.keeps = False
+    with pytest.raises(ActuatorError, match="does not tell its velocity gain kp"):
+        port.set_gains(DEFAULT_GAINS[3])
+
+
+def test_a_strategy_of_a_newer_firmware_is_refused_by_number(port: HebiBackend, module: Module) -> None:
+    module.settings["control_strategy"] = 9
+    assert port.connect().strategy is Strategy.OFF
+    module.keeps = False
+    with pytest.raises(ActuatorError, match=r"strategy reads back as 9; expected DIRECT_PWM \(1\)"):
+        port.set_strategy(Strategy.DIRECT_PWM)
+
+
+def test_a_bridge_drives_a_module_arms_it_and_leaves_it_off(port: HebiBackend, module: Module) -> None:
+    """The whole way of a bridge over this backend: settings, arming, a cycle, release."""
+    drivetrain = load_emulator("thesis").drivetrain
+    mapping = EffortMapping(EffortStrategy.DIRECT_PWM, drivetrain, effort_limit=2.0)
+    supervisor = PlantSupervisor(PlantLimits(effort=2.0))
+    limits = HardwareLimits(effort=2.0, velocity=1.0, position_min=-3.0, position_max=3.0)
+    bridge = Bridge(
+        port,
+        supervisor,
+        mapping,
+        SafetyMonitor(SafetyLimits(winding_current=0.0), 0.01, drivetrain),
+        BridgeSettings(limits=limits),
+    )
+    module.values = {"voltage": 36.0, "velocity": 0.0, "pwm_command": 0.0, "motor_winding_temperature": 25.0}
+    bridge.connect()
+    module.states.update(temperature_state=0)
+    assert bridge.observe(0.1) is not None
+    module.settings.clear()  # without power since: everything is forgotten
+    assert bridge.prepare() == ""
+    assert module.settings["effort_limit_max"] == 2.0
+    assert module.settings["position_limit_min"] == -3.0
+    assert module.settings["control_strategy"] == Strategy.DIRECT_PWM
+    assert 0.0 < module.settings["position_max_output"] < 2.0 * mapping.pwm_per_torque(36.0)
+    assert supervisor.arm(port.now_ns(), bridge.sample) == ""
+    bridge.carry_out(Drive(DriveKind.EFFORT, effort=1.0))
+    assert module.sent[-1][2] == pytest.approx(mapping.pwm_per_torque(36.0), rel=1e-6)
+    bridge.close()
+    assert module.settings["control_strategy"] == Strategy.OFF
+    assert math.isnan(module.sent[-1][2])
 
 
 def test_a_group_of_several_modules_is_refused() -> None:

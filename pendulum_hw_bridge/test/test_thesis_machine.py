@@ -83,7 +83,7 @@ def test_staircase_goes_to_90_degrees_and_back_on_both_sides() -> None:
     assert degrees == [*range(10, 100, 10), *range(80, -10, -10), *range(-10, -100, -10), *range(-80, 10, 10)]
     phases = list(staircase(2, hold=1.5))
     assert [phase.name for phase in phases[:4]] == ["dynamic", "static", "dynamic", "static"]
-    assert max(phase.trajectory.max_speed() for phase in phases) <= 0.3 + 1e-9
+    assert max(phase.trajectory.max_speed for phase in phases) <= 0.3 + 1e-9
     assert all(phase.trial == 2 for phase in phases)
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import math
 
 import pytest
@@ -10,12 +11,17 @@ from hypothesis import strategies as st
 
 from pendulum_msgs_py.contract import cdr
 from pendulum_msgs_py.contract.cdr import MAX_SECONDS, decode_joint_state, encode_clock, encode_joint_state
+from pendulum_msgs_py.contract.cdr_trajectory import decode_joint_trajectory
 from pendulum_msgs_py.contract.names import JOINT
+from pendulum_msgs_py.contract.trajectory import MAX_TRAJECTORY_POINTS, from_points, thesis_ramp
 from pendulum_msgs_py.contract.values import NANOSECONDS
+from pendulum_msgs_py.errors import ParameterError
 
 serialization = pytest.importorskip("rclpy.serialization")
 JointState = pytest.importorskip("sensor_msgs.msg").JointState
 Clock = pytest.importorskip("rosgraph_msgs.msg").Clock
+JointTrajectory = pytest.importorskip("trajectory_msgs.msg").JointTrajectory
+JointTrajectoryPoint = pytest.importorskip("trajectory_msgs.msg").JointTrajectoryPoint
 convert = pytest.importorskip("pendulum_msgs_py.ros.convert")
 
 _STAMPS = st.integers(0, MAX_SECONDS * NANOSECONDS + NANOSECONDS - 1)
@@ -175,12 +181,65 @@ def test_a_name_with_a_nul_inside_is_left_to_the_middleware() -> None:
 
 
 def test_trajectories_travel_to_a_nanosecond() -> None:
-    from pendulum_msgs_py.contract.trajectory import thesis_ramp
-
     ramp = thesis_ramp(0.1, 0.3)
-    back = convert.trajectory_from_message(convert.trajectory_to_message(ramp))
+    data = serialization.serialize_message(convert.trajectory_to_message(ramp, stamp_ns=5 * NANOSECONDS + 7))
+    stamp_ns, back = decode_joint_trajectory(data)
+    assert stamp_ns == 5 * NANOSECONDS + 7
     assert [(p.position, p.velocity) for p in back.points] == [(p.position, p.velocity) for p in ramp.points]
     assert max(abs(a.time - b.time) for a, b in zip(ramp.points, back.points, strict=True)) < 1e-9
+
+
+@given(
+    frame=_NAMES,
+    counts=st.lists(st.tuples(*[st.integers(0, 2)] * 4), min_size=1, max_size=6),
+    joints=st.sampled_from([[JOINT], [], [JOINT, JOINT], ["elbow"]]),
+)
+def test_a_trajectory_is_read_as_the_middleware_reads_it_or_refused(
+    frame: str, counts: list[tuple[int, int, int, int]], joints: list[str]
+) -> None:
+    message = JointTrajectory(joint_names=joints)
+    message.header.frame_id = frame
+    for index, (positions, velocities, accelerations, effort) in enumerate(counts):
+        point = JointTrajectoryPoint(
+            positions=[0.1 * index] * positions,
+            velocities=[0.2] * velocities,
+            accelerations=[0.3] * accelerations,
+            effort=[0.4] * effort,
+        )
+        point.time_from_start.sec, point.time_from_start.nanosec = index, 5
+        message.points.append(point)
+    data = serialization.serialize_message(message)
+    if joints != [JOINT] or any(each[0] != 1 or each[1] > 1 for each in counts):
+        with pytest.raises(ParameterError, match="trajectory"):
+            decode_joint_trajectory(data)
+        return
+    _, back = decode_joint_trajectory(data)
+    assert [point.position for point in back.points] == [0.1 * index for index in range(len(counts))]
+    assert [point.velocity for point in back.points] == [0.2 * each[1] for each in counts]
+    assert [round(point.time * 1e9) for point in back.points] == [n * NANOSECONDS + 5 for n in range(len(counts))]
+
+
+@given(place=st.integers(0, 400), value=st.integers(0, 255), cut=st.integers(0, 300))
+def test_a_damaged_trajectory_is_refused_or_read_but_never_raises_anything_else(
+    place: int, value: int, cut: int
+) -> None:
+    trajectory = from_points([0.0, 1.0, 2.0], [0.0, 0.1, 0.2], [0.0, 0.1, 0.0])
+    data = bytearray(serialization.serialize_message(convert.trajectory_to_message(trajectory)))
+    data[place % len(data)] = value
+    for damaged in (bytes(data), bytes(data[:cut])):
+        with contextlib.suppress(ParameterError):
+            decode_joint_trajectory(damaged)
+
+
+def test_a_trajectory_longer_than_a_plant_takes_is_refused_before_its_points_are_read() -> None:
+    points = MAX_TRAJECTORY_POINTS + 1
+    empty = serialization.serialize_message(JointTrajectory(joint_names=[JOINT]))
+    # The number of points stands where the empty message ends; none follows, so reading one would fail otherwise.
+    place = empty.rindex(JOINT.encode()) + len(JOINT) + 1
+    place += -place % 4
+    data = empty[:place] + points.to_bytes(4, "little")
+    with pytest.raises(ParameterError, match=f"trajectory has {points} points; expected at most {points - 1}"):
+        decode_joint_trajectory(data)
 
 
 @given(

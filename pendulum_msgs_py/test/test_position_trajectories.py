@@ -64,7 +64,7 @@ def test_a_single_point_is_reached_from_here_without_a_jump(here: float, goal: f
     assert move.duration == time
     # Velocity is the derivative of position, and nowhere above that of half a cosine.
     peak = 0.5 * math.pi * abs(goal - here) / time
-    assert move.max_speed() <= peak * (1.0 + 1e-9) + 1e-12
+    assert move.max_speed <= peak * (1.0 + 1e-9) + 1e-12
     for before, after in itertools.pairwise(move.points):
         mean = 0.5 * (before.velocity + after.velocity)
         assert mean * (after.time - before.time) == pytest.approx(after.position - before.position, rel=0.25, abs=1e-6)
@@ -83,7 +83,7 @@ def test_where_the_start_is_said_or_near_a_trajectory_stays_as_it_is() -> None:
 @given(_ANGLES, _ANGLES)
 def test_the_largest_speed_is_at_least_that_of_every_interval(start: float, goal: float) -> None:
     ramp = thesis_ramp(start, goal)
-    assert ramp.max_speed() >= abs(goal - start) / ramp.duration - 1e-9
+    assert ramp.max_speed >= abs(goal - start) / ramp.duration - 1e-9
 
 
 @pytest.mark.parametrize(
@@ -130,4 +130,4 @@ def test_a_ramp_to_where_we_are_is_one_step_at_rest() -> None:
     ramp = thesis_ramp(0.4, 0.4)
     assert isinstance(ramp, Trajectory)
     assert {point.position for point in ramp.points} == {0.4}
-    assert ramp.max_speed() == 0.0
+    assert ramp.max_speed == 0.0

@@ -12,15 +12,14 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from pendulum_hw_bridge.actuator import Strategy
+from pendulum_hw_bridge.actuator import HardwareLimits, Strategy
 from pendulum_hw_bridge.backends.emulator import EmulatorBackend
-from pendulum_hw_bridge.bridge import Bridge, BridgeSettings
+from pendulum_hw_bridge.bridge import Bridge, BridgeSettings, Outcome
 from pendulum_hw_bridge.clocks import SteppedClock
 from pendulum_hw_bridge.effort_mapping import EffortMapping, EffortStrategy
 from pendulum_hw_bridge.emulation.faults import ActuatorFault
 from pendulum_hw_bridge.emulation.parameters import load_emulator
 from pendulum_hw_bridge.emulation.x5 import EmulatedX5, LinkState
-from pendulum_hw_bridge.gains import DEFAULT_GAINS
 from pendulum_hw_bridge.safety import SafetyLimits, SafetyMonitor
 from pendulum_msgs_py.contract.angles import UPRIGHT, from_upright
 from pendulum_msgs_py.contract.supervisor import Drive, DriveKind, Input, Mode, PlantLimits, PlantSupervisor
@@ -45,17 +44,37 @@ class Rig:
         seed: Of sensors, timing and noise.
         moving: Start on a ramp under position control instead of in regulation.
         rate: Feedback rate [Hz].
+        kind: How a torque is made.
+        effort_limit: [N m].
+        voltage: Supply of the emulated actuator; None for the plant file's, which the bridge assumes at first [V].
+        start: Angle at the start [rad]; by default close to upright, or 0.5 on a ramp.
+        goal: End of the ramp [rad]; by default 1.5 rad further.
     """
 
-    def __init__(self, seed: int = 0, *, moving: bool = False, rate: float = 100.0) -> None:
+    def __init__(
+        self,
+        seed: int = 0,
+        *,
+        moving: bool = False,
+        rate: float = 100.0,
+        kind: EffortStrategy = EffortStrategy.DIRECT_PWM,
+        effort_limit: float = 13.0,
+        voltage: float | None = None,
+        start: float | None = None,
+        goal: float | None = None,
+    ) -> None:
         parameters = load_emulator("thesis")
+        drivetrain = parameters.drivetrain
+        if voltage is not None:
+            parameters = parameters.with_drivetrain(supply_voltage=voltage)
         self.clock = SteppedClock(SECOND)
-        start = 0.5 if moving else UPRIGHT + 0.05
+        if start is None:
+            start = 0.5 if moving else UPRIGHT + 0.05
         self.actuator = EmulatedX5(parameters, seed=seed, position=start, start_ns=self.clock.now_ns())
         self.port = EmulatorBackend(self.actuator, self.clock, seed=seed)
         self.period = 1.0 / rate
         limits = PlantLimits(
-            effort=13.0,
+            effort=effort_limit,
             feedback_timeout=max(4.0 * self.period, 0.03),
             velocity=1.5,
             position_min=-4.0,
@@ -63,13 +82,12 @@ class Rig:
             slew=2000.0,
         )
         self.supervisor = PlantSupervisor(limits)
-        drivetrain = parameters.drivetrain
         self.bridge = Bridge(
             self.port,
             self.supervisor,
-            EffortMapping(EffortStrategy.DIRECT_PWM, drivetrain),
-            SafetyMonitor(SafetyLimits(), self.period, drivetrain),
-            BridgeSettings(feedback_rate=rate, gains=DEFAULT_GAINS[3]),
+            EffortMapping(kind, drivetrain, effort_limit=effort_limit),
+            SafetyMonitor(SafetyLimits(measured_effort=effort_limit + 1.0), self.period, drivetrain),
+            BridgeSettings(feedback_rate=rate, limits=HardwareLimits(effort=effort_limit, pwm=0.6)),
         )
         self.random = np.random.Generator(np.random.Philox(key=[seed, 7]))
         self.controlling = self.disturbing = not moving
@@ -79,6 +97,7 @@ class Rig:
         self.send: Callable[[JointCommand], None] = self._send
         self.duties: list[tuple[int, float, float]] = []
         self.largest_commanded = 0.0
+        self.outcomes: list[Outcome] = []
         self.actuator.trace = self._watch
         self.bridge.connect()
         while self.bridge.observe(0.5 * self.period) is None:
@@ -86,10 +105,14 @@ class Rig:
         assert not self.bridge.prepare()
         assert not self.supervisor.arm(self.port.now_ns(), self.bridge.sample)
         if moving:
-            sample = self.bridge.sample
-            assert sample is not None
-            ramp = thesis_ramp(sample.position, sample.position + 1.5)
-            assert not self.supervisor.accept_trajectory(ramp, self.port.now_ns(), sample)
+            assert not self.follow(start + 1.5 if goal is None else goal)
+
+    def follow(self, goal: float) -> str:
+        """Ramp to an angle [rad]; return why not, or an empty string."""
+        sample = self.bridge.sample
+        assert sample is not None
+        ramp = thesis_ramp(sample.position, goal)
+        return self.supervisor.accept_trajectory(ramp, self.port.now_ns(), sample)
 
     def run(self, duration: float) -> None:
         """Let time pass [s]; a bridge that is not alive does nothing any more, the actuator goes on."""
@@ -115,6 +138,7 @@ class Rig:
             self._answer()
             outcome = self.bridge.carry_out(self._decide(), was_armed=armed)
             self.largest_commanded = max(self.largest_commanded, abs(outcome.effort))
+            self.outcomes.append(outcome)
             self.supervisor.report_applied(outcome.effort)
         except Exception as error:  # noqa: BLE001
             self.bridge.fail("exception", str(error))
@@ -255,7 +279,7 @@ def _disarm(rig: Rig) -> None:
 _F = ActuatorFault
 SCENARIOS: tuple[Scenario, ...] = (
     Scenario("feedback lost", _inject(_F.FEEDBACK_LOST), "feedback_lost"),
-    Scenario("feedback frozen", _inject(_F.FEEDBACK_FROZEN), "feedback_lost"),
+    Scenario("feedback frozen", _inject(_F.FEEDBACK_FROZEN), "feedback_frozen"),
     Scenario("feedback at a tenth of its rate", _inject(_F.FEEDBACK_SLOW), "feedback_lost"),
     Scenario("feedback late by 80 ms", _inject(_F.FEEDBACK_LATE), "feedback_lost"),
     Scenario("position not a number", _inject(_F.POSITION_NAN), "feedback_not_finite"),
@@ -318,7 +342,7 @@ def run_scenario(scenario: Scenario, repetition: int) -> Reaction:
     rig.run(_WARM_UP + float(rig.random.uniform(0.0, 0.05)))
     # Feedback and physics stand at the last event; the fault begins between two cycles, wherever that is.
     begin_ns = rig.actuator.now_ns
-    commanded = rig.largest_commanded * rig.bridge.mapping.pwm_per_torque
+    commanded = rig.largest_commanded * rig.bridge.mapping.pwm_per_torque()
     before = max((abs(duty) for _, duty, _ in rig.duties), default=0.0)
     expiries = rig.actuator.lifetime_expiries
     scenario.begin(rig)
@@ -331,7 +355,7 @@ def run_scenario(scenario: Scenario, repetition: int) -> Reaction:
     ceiling = (
         1.0
         if scenario.moving
-        else max(before, rig.largest_commanded * rig.bridge.mapping.pwm_per_torque, commanded)
+        else max(before, rig.largest_commanded * rig.bridge.mapping.pwm_per_torque(), commanded)
     )
     excess = max((abs(duty) for _, duty in after), default=0.0) - ceiling - 3e-4
     return Reaction(
@@ -339,7 +363,7 @@ def run_scenario(scenario: Scenario, repetition: int) -> Reaction:
         _reaction(rig, expiries),
         rig.supervisor.mode.value,
         (max(driven) - begin_ns) / MILLISECOND if driven else 0.0,
-        max(0.0, excess) / rig.bridge.mapping.pwm_per_torque,
+        max(0.0, excess) / rig.bridge.mapping.pwm_per_torque(),
         not any(tail),
     )
 

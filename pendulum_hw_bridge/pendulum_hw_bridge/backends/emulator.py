@@ -149,7 +149,7 @@ class EmulatorBackend:
         self.actuator.push = torque if math.isfinite(torque) else 0.0
 
     def stop(self) -> None:
-        """Effort zero, then strategy off."""
+        """Effort zero, then strategy off; both are lost where the way there is cut."""
         if not self._connected:
             return
         self._catch_up()
@@ -158,14 +158,18 @@ class EmulatorBackend:
             self.actuator.deliver(zero, self.clock.now_ns())
             self._catch_up()
         self._strategy = Strategy.OFF
-        # With the way there cut, nothing arrives: the command lifetime then has to do it.
-        if not self.actuator.faults & _CUT_OFF:
-            self.actuator.configure(strategy=Strategy.OFF)
+        if self.actuator.faults & _CUT_OFF:
+            raise ActuatorError(
+                "stop_unacknowledged", "actuator did not confirm that it is off; the command lifetime ends its torque"
+            )
+        self.actuator.configure(strategy=Strategy.OFF)
 
     def close(self) -> None:
         """Stop and let go."""
-        self.stop()
-        self._connected = False
+        try:
+            self.stop()
+        finally:
+            self._connected = False
 
     def _configure(self, **changes: object) -> None:
         self._require_connection()

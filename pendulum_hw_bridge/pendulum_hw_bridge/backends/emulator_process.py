@@ -28,6 +28,7 @@ __all__ = ["EmulatorProcessBackend"]
 _ACKNOWLEDGE = 0.25
 _ATTEMPTS = 3
 _CONNECT_ATTEMPTS = 40
+_STOP_PATIENCE = 0.015
 _RENEW_NS = NANOSECONDS // 2
 
 
@@ -46,6 +47,7 @@ class EmulatorProcessBackend:
         self._clock = clock or WallClock()
         self._socket: socket.socket | None = None
         self._strategy = Strategy.OFF
+        self._off_confirmed = False
         self._limits = HardwareLimits()
         self._requests = 0
         self._push = 0.0
@@ -143,15 +145,20 @@ class EmulatorProcessBackend:
 
     def stop(self) -> None:
         """Effort zero, then strategy off; the strategy is tried several times, because a packet may be lost."""
-        if self._socket is None:
+        if self._socket is None or (self._strategy is Strategy.OFF and self._off_confirmed):
             return
-        if self._strategy is not Strategy.OFF:
-            zero = Command(pwm=0.0) if self._strategy is Strategy.DIRECT_PWM else Command(effort=0.0)
-            self._strategy = Strategy.OFF
+        direct, self._strategy = self._strategy is Strategy.DIRECT_PWM, Strategy.OFF
+        self._off_confirmed = False
+        try:
+            self._send(wire.encode_command(Command(pwm=0.0) if direct else Command(effort=0.0)))
+        finally:
             try:
-                self._send(wire.encode_command(zero))
-            finally:
-                self._request({"settings": {"strategy": int(Strategy.OFF)}}, patience=0.02)
+                self._request({"settings": {"strategy": int(Strategy.OFF)}}, patience=_STOP_PATIENCE)
+            except ActuatorError as error:
+                raise ActuatorError(
+                    "stop_unacknowledged", f"{error}; the command lifetime ends its torque"
+                ) from error
+        self._off_confirmed = True
 
     def close(self) -> None:
         """Stop and let go."""

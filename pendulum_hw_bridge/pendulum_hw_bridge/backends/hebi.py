@@ -33,7 +33,7 @@ from pendulum_hw_bridge.actuator import (
 from pendulum_hw_bridge.backends.hebi_discovery import LOOK_TIME, ModuleSelection, discover, select_module
 from pendulum_hw_bridge.backends.hebi_log import start_log, stop_log
 from pendulum_hw_bridge.clocks import Clock, WallClock
-from pendulum_hw_bridge.gains import DEFAULT_GAINS, GAIN_FIELDS, LOOPS, GainSet, PidGains
+from pendulum_hw_bridge.gains import GAIN_FIELDS, LOOPS, GainSet, PidGains
 from pendulum_msgs_py.contract.values import NANOSECONDS
 from pendulum_msgs_py.errors import ParameterError
 
@@ -42,11 +42,14 @@ __all__ = ["HebiBackend", "connect_group", "new_command", "open_lookup"]
 _LOOKUP_TIMEOUT = 5.0
 _ACKNOWLEDGE_MS = 200
 _STOP_ATTEMPTS = 3
+_STOP_ACKNOWLEDGE_MS = 15
+"""Ten times the round trip; together the attempts take less than the command lifetime [ms]."""
 _PASCAL_M_STOP = {
     MStopAction.DISABLED: "Disabled",
     MStopAction.MOTOR_OFF: "MotorOff",
     MStopAction.HOLD_POSITION: "HoldPosition",
 }
+_LIMIT_MOTOR_OFF = 2
 _M_STOP_BY_NUMBER = {0: MStopAction.DISABLED, 1: MStopAction.MOTOR_OFF, 2: MStopAction.HOLD_POSITION}
 _FLOATS = {
     "position": "position",
@@ -187,7 +190,9 @@ class HebiBackend:
         info = self._read_info()
         family, name, serial, firmware = self._wanted.family, self._wanted.name, "", ""
         if info is not None:
-            self._strategy = Strategy(int(info.control_strategy[0]))
+            # A strategy that we do not know is not ours; the bridge switches it off before anything else.
+            number = int(info.control_strategy[0])
+            self._strategy = Strategy(number) if number in set(Strategy) else Strategy.OFF
             family, name = str(info.family[0]), str(info.name[0])
             serial, firmware = str(info.serial[0]), str(info.firmware_revision[0])
         return ActuatorInfo(
@@ -251,7 +256,12 @@ class HebiBackend:
         self._set_setpoints(limited, strategy)
         self._acknowledged("strategy")
         info = self._read_info()
-        self._strategy = strategy if info is None else Strategy(int(info.control_strategy[0]))
+        number = int(strategy) if info is None else int(info.control_strategy[0])
+        if number not in set(Strategy):
+            raise ActuatorError(
+                "strategy", f"strategy reads back as {number}; expected {strategy.name} ({int(strategy)})"
+            )
+        self._strategy = Strategy(number)
         return self._strategy
 
     def set_gains(self, gains: GainSet) -> GainSet:
@@ -265,7 +275,7 @@ class HebiBackend:
                     setattr(self._command, f"{loop}_{name}", bool(value) if name == "d_on_error" else value)
         self._acknowledged("gains")
         info = self._read_info()
-        self._gains = gains if info is None else self._gains_of(info, gains.strategy)
+        self._gains = gains if info is None else self._gains_of(info, gains)
         return self._gains
 
     def set_limits(self, limits: HardwareLimits) -> HardwareLimits:
@@ -278,6 +288,7 @@ class HebiBackend:
         if math.isfinite(limits.position_min) and math.isfinite(limits.position_max):
             command.position_limit_min = limits.position_min
             command.position_limit_max = limits.position_max
+            command.min_position_limit_strategy = command.max_position_limit_strategy = "MotorOff"
         command.mstop_strategy = _PASCAL_M_STOP[limits.m_stop]
         self._acknowledged("limits")
         info = self._read_info()
@@ -312,19 +323,25 @@ class HebiBackend:
             self._command.clear()
             self._command.control_strategy = int(Strategy.OFF)
             self._set_setpoints(Command(), Strategy.OFF)
-            if self._group.send_command_with_acknowledgement(self._command, _ACKNOWLEDGE_MS):
+            if self._group.send_command_with_acknowledgement(self._command, _STOP_ACKNOWLEDGE_MS):
                 self._strategy = Strategy.OFF
                 return
-        # Nobody hears us; what drives the motor now ends with the command lifetime.
         self._strategy = Strategy.OFF
+        raise ActuatorError(
+            "stop_unacknowledged",
+            f"HEBI module did not confirm that it is off, asked {_STOP_ATTEMPTS} times; the command lifetime ends its "
+            "torque. Press the motion stop",
+        )
 
     def close(self) -> None:
         """Stop, and let the library's thread for this group go."""
-        self.stop()
-        if self._log is not None and self._group is not None:
-            stop_log(self._group)
-        self._group = self._command = self._feedback = None
-        self._owner = None
+        try:
+            self.stop()
+        finally:
+            if self._log is not None and self._group is not None:
+                stop_log(self._group)
+            self._group = self._command = self._feedback = None
+            self._owner = None
 
     # --- inside ---------------------------------------------------------------------------------------------
 
@@ -381,27 +398,44 @@ class HebiBackend:
     def _limit(self, number: Any) -> int:
         return LimitState.INSIDE if self._imitation else _known(LimitState, number)
 
-    def _gains_of(self, info: Any, strategy: int) -> GainSet:
-        defaults = DEFAULT_GAINS.get(strategy, DEFAULT_GAINS[3])
+    @staticmethod
+    def _gains_of(info: Any, wanted: GainSet) -> GainSet:
+        """Return the gains that a module tells; a clamp that was not written, because it is infinite, is not asked."""
         loops: dict[str, PidGains] = {}
         for loop in LOOPS:
-            read = {name: float(getattr(info, f"{loop}_{name}")[0]) for name in GAIN_FIELDS}
-            known = {name: value for name, value in read.items() if not math.isnan(value)}
-            standard = {name: getattr(defaults.loop(loop), name) for name in GAIN_FIELDS}
-            loops[loop] = PidGains(**{**standard, **known})
-        return GainSet(strategy, **loops)
+            read: dict[str, float] = {}
+            for name in GAIN_FIELDS:
+                asked = float(getattr(wanted.loop(loop), name))
+                read[name] = float(getattr(info, f"{loop}_{name}")[0]) if math.isfinite(asked) else asked
+                if math.isnan(read[name]):
+                    raise ActuatorError("settings", f"HEBI module does not tell its {loop} gain {name}")
+            loops[loop] = PidGains(**read)
+        return GainSet(wanted.strategy, **loops)
 
     @staticmethod
     def _limits_of(info: Any, wanted: HardwareLimits) -> HardwareLimits:
         low, high = float(info.position_limit_min[0]), float(info.position_limit_max[0])
+        ends = [int(info.min_position_limit_strategy[0]), int(info.max_position_limit_strategy[0])]
+        if math.isfinite(wanted.position_max - wanted.position_min) and ends != 2 * [_LIMIT_MOTOR_OFF]:
+            raise ActuatorError(
+                "settings", f"strategies at the position limits read back as {ends}; expected 2 (motor off) for both"
+            )
+        unwritten = not math.isfinite(wanted.position_max - wanted.position_min)
         return HardwareLimits(
-            effort=float(info.effort_limit_max[0]),
-            velocity=float(info.velocity_limit_max[0]),
-            position_min=-math.inf if math.isnan(low) else low,
-            position_max=math.inf if math.isnan(high) else high,
+            effort=_wider(info.effort_limit_min[0], info.effort_limit_max[0], "effort"),
+            velocity=_wider(info.velocity_limit_min[0], info.velocity_limit_max[0], "velocity"),
+            position_min=wanted.position_min if unwritten else low,
+            position_max=wanted.position_max if unwritten else high,
             pwm=wanted.pwm,
             m_stop=_M_STOP_BY_NUMBER.get(int(info.mstop_strategy[0]), MStopAction.DISABLED),
         )
+
+
+def _wider(low: Any, high: Any, what: str) -> float:
+    """Return the larger side of a symmetric limit."""
+    if not (float(low) < 0.0 < float(high)):
+        raise ActuatorError("settings", f"{what} limits read back as {low} and {high}; expected them around zero")
+    return max(-float(low), float(high))
 
 
 def _known(kind: Any, number: Any) -> int:

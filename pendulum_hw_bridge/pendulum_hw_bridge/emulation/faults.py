@@ -26,6 +26,7 @@ class ActuatorFault(str, Enum):
     VELOCITY_SPIKE = "velocity_spike"  # velocity reads 5 rad/s
     EFFORT_OFFSET = "effort_offset"  # spring encoder slips: effort reads 15 N m too much
     PWM_STUCK = "pwm_stuck"  # the duty stays where it is, whatever the setpoint, until the strategy goes off
+    PWM_RUNAWAY = "pwm_runaway"  # the duty goes to its end, until the strategy goes off
     WINDING_OPEN = "winding_open"  # a motor phase breaks: PWM without current
     COMMANDS_LOST = "commands_lost"  # network cable pulled on the way there
     LOCKED_BY_OTHER = "locked_by_other"  # somebody else's Scope holds the module

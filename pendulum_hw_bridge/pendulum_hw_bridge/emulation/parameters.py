@@ -13,6 +13,7 @@ from pendulum_hw_bridge.actuator import HardwareLimits
 from pendulum_hw_bridge.emulation.firmware import Array
 from pendulum_hw_bridge.emulation.kernel import CONSTANTS
 from pendulum_hw_bridge.emulation.thermal import ThermalParameters, torque_constant_at
+from pendulum_hw_bridge.motor_state import MOTOR_SPEED_LIMIT
 from pendulum_msgs_py.dynamics.series_elastic import shorted_winding_damping, winding_resistance_at
 from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.plants.plant_parameters import (
@@ -25,7 +26,6 @@ from pendulum_msgs_py.plants.plant_parameters import (
 __all__ = [
     "EMULATOR_PRESETS",
     "FIRMWARE_EFFICIENCY",
-    "FIRMWARE_VELOCITY_CLAMP",
     "SPEED_CONSTANT_RPM",
     "EmulatorParameters",
     "SensorParameters",
@@ -33,8 +33,6 @@ __all__ = [
     "load_emulator",
 ]
 
-FIRMWARE_VELOCITY_CLAMP = 1.5027
-"""Speed at which the firmware takes the drive back: 25 000 motor rpm at N = 1742.222 [rad/s]."""
 FIRMWARE_EFFICIENCY = 0.65
 """Efficiency that the firmware's feed-forward of torque assumes [-]."""
 SPEED_CONSTANT_RPM = 1530.0
@@ -194,7 +192,7 @@ class EmulatorParameters:
             "critical_winding": thermal.critical_winding,
             "effort_normaliser": effort_normaliser,
             "velocity_normaliser": drive.gear_ratio / (speed_constant * drive.supply_voltage),
-            "velocity_clamp": FIRMWARE_VELOCITY_CLAMP,
+            "velocity_clamp": MOTOR_SPEED_LIMIT / drive.gear_ratio,
             "effort_clamp": min(limits.effort, self.plant.effort_limit),
             "position_min": max(limits.position_min, -1e9),
             "position_max": min(limits.position_max, 1e9),

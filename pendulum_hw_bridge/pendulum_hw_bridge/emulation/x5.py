@@ -29,7 +29,7 @@ from pendulum_hw_bridge.emulation.faults import ActuatorFault, distort
 from pendulum_hw_bridge.emulation.firmware import gain_rows, new_loop_memory
 from pendulum_hw_bridge.emulation.parameters import EmulatorParameters
 from pendulum_hw_bridge.emulation.sensing import measure
-from pendulum_hw_bridge.gains import DEFAULT_GAINS, GainSet
+from pendulum_hw_bridge.gains import DEFAULT_GAINS, GainSet, PidGains
 from pendulum_msgs_py.contract.values import NANOSECONDS
 from pendulum_msgs_py.dynamics.series_elastic import spring_deflection
 from pendulum_msgs_py.errors import ParameterError
@@ -41,7 +41,9 @@ HandTorque = Callable[[float, float, float], float]
 
 _HAND_STEPS = 4
 _FAULT_VOLTAGE = {ActuatorFault.VOLTAGE_LOW: 18.0, ActuatorFault.VOLTAGE_HIGH: 52.0}
+_STUCK = {ActuatorFault.PWM_STUCK, ActuatorFault.PWM_RUNAWAY}
 _STUCK_PWM = 0.05
+_NO_GAINS = GainSet(3, PidGains(), PidGains(), PidGains())
 _SLOW_FEEDBACK = 10
 _LATE_NS = 80_000_000
 _OTHER_SENDER = -1
@@ -199,8 +201,13 @@ class EmulatedX5:
         self._frozen = self._last
         self._fault_sequence = self._sequence
         if fault is ActuatorFault.MODULE_REBOOT:
-            self.strategy = Strategy.OFF
-            self._end_command()
+            # What was never saved in the module is lost: limits, gains, what the motion stop does. Lifetime and rate
+            # live in the host's library, which sends them with each packet.
+            self.configure(
+                strategy=Strategy.OFF,
+                gains=DEFAULT_GAINS[3],
+                limits=HardwareLimits(effort=self.parameters.plant.effort_limit),
+            )
             self._clock_offset_ns = -self.now_ns
             self._sequence = 0
         elif fault is ActuatorFault.STRATEGY_CHANGED:
@@ -209,8 +216,10 @@ class EmulatedX5:
             )
         elif fault is ActuatorFault.PWM_STUCK:
             self._stuck_pwm = float(self._state[8]) or _STUCK_PWM
+        elif fault is ActuatorFault.PWM_RUNAWAY:
+            self._stuck_pwm = math.copysign(1.0, float(self._state[8]))
         elif fault is ActuatorFault.GAINS_LOST:
-            self._rows = np.zeros_like(self._rows)
+            self._rows = gain_rows(_NO_GAINS)
         self._refresh()
 
     def clear_faults(self) -> None:
@@ -286,7 +295,7 @@ class EmulatedX5:
                 seconds = self._steps * kernel.STEP
                 torque += self.hand(seconds, float(self._state[2]), float(self._state[3]))
             setpoints, strategy = self._setpoints, self.strategy
-            if ActuatorFault.PWM_STUCK in self.faults and strategy is not Strategy.OFF:
+            if self.faults & _STUCK and strategy is not Strategy.OFF:
                 setpoints, strategy = np.array([math.nan, math.nan, self._stuck_pwm]), Strategy.DIRECT_PWM
             kernel.advance(
                 self._state,

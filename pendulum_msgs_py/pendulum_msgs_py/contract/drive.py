@@ -56,7 +56,8 @@ class Drive(NamedTuple):
         disturbance: The disturbance's share [N m].
         push: Torque on the link itself [N m]; applied whatever the kind, as a hand would.
         saturated: The sum was clamped.
-        starved: Armed for effort, but without a fresh command: zero torque.
+        starved: Armed for effort, but without a fresh command of somebody who may command: zero torque.
+        handover: Under position control, the share of the hand-over from effort that is still to go, 1 to 0 [-].
     """
 
     kind: DriveKind
@@ -68,6 +69,7 @@ class Drive(NamedTuple):
     push: float = 0.0
     saturated: bool = False
     starved: bool = False
+    handover: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -86,6 +88,8 @@ class PlantLimits:
         tracking_error: Distance from the trajectory at which the plant faults [rad].
         arm_effort: Largest command that may be waiting when the plant is armed [N m].
         handover_effort: Largest distance of a command from the torque that holds, for it to take over [N m].
+        start_effort: Largest torque with which a commander may begin where nobody commands [N m].
+        starvation: Time without a command after which a plant that is armed for effort disarms [s].
     """
 
     effort: float
@@ -99,6 +103,8 @@ class PlantLimits:
     tracking_error: float = 0.3
     arm_effort: float = 0.5
     handover_effort: float = 2.0
+    start_effort: float = math.inf
+    starvation: float = math.inf
 
     def __post_init__(self) -> None:
         """Refuse limits that limit nothing or everything; NaN, which compares false, would do the first."""
@@ -106,7 +112,13 @@ class PlantLimits:
             raise ParameterError(f"effort_limit is {self.effort} N m; expected a finite number > 0")
         if not (math.isfinite(self.command_timeout) and self.command_timeout > 0.0):
             raise ParameterError(f"command_timeout is {self.command_timeout} s; expected a finite number > 0")
-        for name, unit in (("feedback_timeout", "s"), ("velocity", "rad/s"), ("slew", "N m/s")):
+        for name, unit in (
+            ("feedback_timeout", "s"),
+            ("velocity", "rad/s"),
+            ("slew", "N m/s"),
+            ("start_effort", "N m"),
+            ("starvation", "s"),
+        ):
             if not getattr(self, name) > 0.0:
                 raise ParameterError(f"{name} is {getattr(self, name)} {unit}; expected > 0")
         for name, unit in (("handover_time", "s"), ("arm_effort", "N m")):

@@ -15,7 +15,7 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass, field
 
-from pendulum_msgs_py.contract.commands import CommandGate, Refusal
+from pendulum_msgs_py.contract.commands import COMMANDER_HOLD, CommandGate, Refusal
 from pendulum_msgs_py.contract.drive import Drive, DriveKind, Input, Mode, PlantLimits
 from pendulum_msgs_py.contract.trajectory import MAX_RAMP_VELOCITY, Trajectory
 from pendulum_msgs_py.contract.values import NANOSECONDS, JointCommand, JointSample
@@ -82,6 +82,8 @@ class PlantSupervisor:
         self._last_decision_ns: int | None = None
         self._last_time_ns: int | None = None
         self._hold_position: float | None = None
+        self._commanding: str | None = None
+        self._commanded_ns = 0
 
     # --- messages ------------------------------------------------------------------------------------------
 
@@ -115,21 +117,21 @@ class PlantSupervisor:
             )
         # The gap is closed while the trajectory already runs, no faster than a ramp would.
         offset_time = max(limits.handover_time, abs(gap) / MAX_RAMP_VELOCITY)
-        speed = trajectory.max_speed()
+        speed = trajectory.max_speed
         if offset_time > 0.0:
             speed += abs(gap) / offset_time
         if speed > limits.velocity:
             return f"trajectory asks for {speed:.3f} rad/s; expected at most {limits.velocity} rad/s"
-        positions = [point.position for point in trajectory.points]
-        if min(positions) < limits.position_min or max(positions) > limits.position_max:
+        if trajectory.lowest < limits.position_min or trajectory.highest > limits.position_max:
             return (
-                f"trajectory covers {min(positions):.3f} to {max(positions):.3f} rad; expected it inside "
+                f"trajectory covers {trajectory.lowest:.3f} to {trajectory.highest:.3f} rad; expected it inside "
                 f"{limits.position_min} to {limits.position_max} rad"
             )
         self._keep_pace(now_ns)
         self._trajectory = trajectory
         self._trajectory_start_ns = now_ns
         self._handover = _Handover(now_ns, self._applied, offset=-gap, offset_time=offset_time)
+        self._commanding = None
         self._enter(Mode.POSITION, "following a trajectory", now_ns)
         return ""
 
@@ -147,7 +149,8 @@ class PlantSupervisor:
         self._handover = None
         self._trajectory = None
         self._applied = self._last_effort = 0.0
-        self._last_decision_ns = now_ns
+        self._last_decision_ns = self._commanded_ns = now_ns
+        self._commanding = None
         self._enter(Mode.EFFORT, "armed", now_ns)
         return ""
 
@@ -208,10 +211,6 @@ class PlantSupervisor:
         """Whether position control holds the goal of a finished trajectory."""
         return self.mode is Mode.POSITION and self._hold_position is not None
 
-    def has_fresh_command(self, now_ns: int) -> bool:
-        """Whether a controller is answering."""
-        return self._commands.fresh(now_ns) is not None
-
     # --- inside --------------------------------------------------------------------------------------------
 
     def _keep_pace(self, now_ns: int) -> None:
@@ -264,7 +263,8 @@ class PlantSupervisor:
                 self._trajectory = None
                 self._handover = _Handover(now_ns, self._applied)
                 self._last_effort = self._applied
-                self._last_decision_ns = now_ns
+                self._last_decision_ns = self._commanded_ns = now_ns
+                self._commanding = command.source
                 self._enter(Mode.EFFORT, f"commanded by {command.source or 'an unnamed node'}", now_ns)
                 return None
         return self._hold(handover, remaining, position, velocity, push)
@@ -273,19 +273,17 @@ class PlantSupervisor:
         self, handover: _Handover | None, remaining: float, position: float, velocity: float, push: float
     ) -> Drive:
         effort = handover.effort * remaining if handover else 0.0
-        return Drive(
-            DriveKind.POSITION, effort=self._clamp(effort), position=position, velocity=velocity, push=push
-        )
+        effort = self._clamp(effort)
+        return Drive(DriveKind.POSITION, effort, position, velocity, push=push, handover=remaining)
 
     def _decide_effort(self, now_ns: int, push: float) -> Drive:
         command = None if self.commander_conflict else self._commands.fresh(now_ns)
-        if command is None:
-            self.starved_periods += 1
-            self._handover = None
-            self._last_effort = 0.0
-            self._last_decision_ns = now_ns
-            self.reason = self.commander_conflict or "no fresh command: zero torque"
-            return Drive(DriveKind.EFFORT, push=push, starved=True)
+        refusal = self.commander_conflict or "no fresh command: zero torque"
+        if command is not None:
+            refusal = self._begin_refusal(command, now_ns)
+        if command is None or refusal:
+            return self._starve(refusal, now_ns, push)
+        self._commanding, self._commanded_ns = command.source, now_ns
         disturbance_command = self._disturbances.fresh(now_ns)
         disturbance = disturbance_command.effort if disturbance_command else 0.0
         wanted = self._clamp(command.effort + disturbance)
@@ -309,6 +307,29 @@ class PlantSupervisor:
             push=push,
             saturated=saturated,
         )
+
+    def _begin_refusal(self, command: JointCommand, now_ns: int) -> str:
+        """Return why a commander may not begin, or an empty string; one that commands already may ask for anything."""
+        lapsed = now_ns - self._commanded_ns > COMMANDER_HOLD * NANOSECONDS
+        begun = self._commanding == command.source and not lapsed
+        if begun or abs(command.effort) <= self.limits.start_effort:
+            return ""
+        return (
+            f"zero torque: {command.source or 'a controller'} asks for {command.effort:.2f} N m; "
+            f"expected at most {self.limits.start_effort} N m to begin"
+        )
+
+    def _starve(self, reason: str, now_ns: int, push: float) -> Drive:
+        silence = (now_ns - self._commanded_ns) / NANOSECONDS
+        if silence > self.limits.starvation:
+            self.disarm(now_ns, f"disarmed: no command for {silence:.1f} s ({reason})")
+            return Drive(DriveKind.OFF, push=push)
+        self.starved_periods += 1
+        self._handover = None
+        self._last_effort = 0.0
+        self._last_decision_ns = now_ns
+        self.reason = reason
+        return Drive(DriveKind.EFFORT, push=push, starved=True)
 
     def _limit_slew(self, effort: float, now_ns: int) -> float:
         if math.isinf(self.limits.slew) or self._last_decision_ns is None:

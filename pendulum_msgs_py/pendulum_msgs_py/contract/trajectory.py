@@ -5,7 +5,7 @@ from __future__ import annotations
 import bisect
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 from pendulum_msgs_py.errors import ParameterError
 
@@ -13,6 +13,7 @@ __all__ = [
     "MAX_POSITION",
     "MAX_RAMP_STEPS",
     "MAX_RAMP_VELOCITY",
+    "MAX_TRAJECTORY_POINTS",
     "RAMP_INCREMENT",
     "RAMP_PERIOD",
     "Trajectory",
@@ -31,6 +32,8 @@ MAX_POSITION = 1e6
 """Largest position of a trajectory [rad]; beyond it, differences of positions lose their meaning."""
 MAX_RAMP_STEPS = 1_000_000
 """Longest ramp: 2.8 h at 100 Hz. A slip in a unit should not fill the memory."""
+MAX_TRAJECTORY_POINTS = 20_000
+"""Most points that a plant takes in one message: 200 s at 100 Hz. Reading more would keep it from better things."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,12 +51,21 @@ class Trajectory:
 
     Linear, not cubic, because the thesis commands position and velocity as two separate curves (a linear ramp and
     a half sine that is no derivative of it) and a spline through both would be neither.
+
+    Attributes:
+        points: The points.
+        lowest: Smallest position [rad].
+        highest: Largest position [rad].
+        max_speed: Largest speed asked for, as commanded or as positions imply [rad/s].
     """
 
     points: tuple[TrajectoryPoint, ...]
+    lowest: float = field(init=False, repr=False, compare=False)
+    highest: float = field(init=False, repr=False, compare=False)
+    max_speed: float = field(init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:
-        """Refuse what no position controller should be asked to follow."""
+        """Refuse what no position controller should be asked to follow; note what a plant will ask at once."""
         if not self.points:
             raise ParameterError("trajectory has 0 points; expected at least one")
         previous = -math.inf
@@ -72,6 +84,12 @@ class Trajectory:
                     f"expected >= 0 s and later than {previous} s"
                 )
             previous = point.time
+        positions = [point.position for point in self.points]
+        speed = max(abs(point.velocity) for point in self.points)
+        for before, after in zip(self.points, self.points[1:], strict=False):
+            speed = max(speed, abs(after.position - before.position) / (after.time - before.time))
+        for name, value in (("lowest", min(positions)), ("highest", max(positions)), ("max_speed", speed)):
+            object.__setattr__(self, name, value)
 
     @property
     def duration(self) -> float:
@@ -105,7 +123,7 @@ class Trajectory:
         start = TrajectoryPoint(0.0, position, 0.0)
         if len(self.points) > 1 or first.velocity != 0.0:
             return Trajectory((start, *self.points))
-        steps = min(MAX_RAMP_STEPS, max(2, math.ceil(first.time / RAMP_PERIOD)))
+        steps = min(MAX_TRAJECTORY_POINTS, max(2, math.ceil(first.time / RAMP_PERIOD)))
         distance = first.position - position
         phases = [math.pi * index / steps for index in range(1, steps)]
         between = tuple(
@@ -117,13 +135,6 @@ class Trajectory:
             for phase in phases
         )
         return Trajectory((start, *between, first))
-
-    def max_speed(self) -> float:
-        """Return the largest speed asked for, as commanded or as positions imply [rad/s]."""
-        speed = max(abs(point.velocity) for point in self.points)
-        for before, after in zip(self.points, self.points[1:], strict=False):
-            speed = max(speed, abs(after.position - before.position) / (after.time - before.time))
-        return speed
 
     def at(self, time: float) -> tuple[float, float]:
         """Return position [rad] and velocity [rad/s] at a time from the start [s]; at rest before and after."""

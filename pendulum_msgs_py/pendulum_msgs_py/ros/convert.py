@@ -15,9 +15,8 @@ from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
 from pendulum_msgs_py.contract.cdr import decode_joint_state
 from pendulum_msgs_py.contract.names import JOINT
-from pendulum_msgs_py.contract.trajectory import Trajectory, TrajectoryPoint
+from pendulum_msgs_py.contract.trajectory import Trajectory
 from pendulum_msgs_py.contract.values import NANOSECONDS, JointCommand, JointSample
-from pendulum_msgs_py.errors import ParameterError
 
 __all__ = [
     "command_from_bytes",
@@ -30,7 +29,6 @@ __all__ = [
     "seconds_to_duration",
     "stamp_from_message",
     "stamp_to_message",
-    "trajectory_from_message",
     "trajectory_to_message",
 ]
 
@@ -110,27 +108,6 @@ def problem_of_command(data: bytes) -> str:
     if len(message.effort) != 1:
         return f"effort has {len(message.effort)} values; expected 1"
     return ""
-
-
-def trajectory_from_message(message: JointTrajectory) -> Trajectory:
-    """Return the trajectory of our joint.
-
-    Raises:
-        ParameterError: It is for another joint, or a point lacks its position.
-    """
-    if list(message.joint_names) != [JOINT]:
-        raise ParameterError(f"trajectory is for joints {list(message.joint_names)}; expected [{JOINT!r}]")
-    points = []
-    for index, point in enumerate(message.points):
-        if len(point.positions) != 1 or len(point.velocities) > 1:
-            raise ParameterError(
-                f"trajectory point {index} has {len(point.positions)} positions and {len(point.velocities)} "
-                "velocities; expected 1 position and at most 1 velocity"
-            )
-        time = point.time_from_start.sec + point.time_from_start.nanosec / NANOSECONDS
-        velocity = point.velocities[0] if len(point.velocities) else 0.0
-        points.append(TrajectoryPoint(time, point.positions[0], velocity))
-    return Trajectory(tuple(points))
 
 
 def trajectory_to_message(trajectory: Trajectory, stamp_ns: int = 0) -> JointTrajectory:

@@ -20,6 +20,7 @@ from trajectory_msgs.msg import JointTrajectory
 
 from pendulum_msgs_py.contract import names
 from pendulum_msgs_py.contract.cdr import encode_joint_state
+from pendulum_msgs_py.contract.cdr_trajectory import decode_joint_trajectory
 from pendulum_msgs_py.contract.commands import Refusal
 from pendulum_msgs_py.contract.supervisor import Drive, Input, Mode, PlantLimits, PlantSupervisor
 from pendulum_msgs_py.contract.timing import LoopStatistics
@@ -33,9 +34,7 @@ from pendulum_msgs_py.ros.convert import (
     diagnostic_status,
     event_message,
     problem_of_command,
-    stamp_from_message,
     stamp_to_message,
-    trajectory_from_message,
 )
 from pendulum_msgs_py.ros.polled import PolledInput, PollingNode
 
@@ -105,6 +104,22 @@ LIMIT_SPECS: tuple[ParameterSpec, ...] = (
         read_only=True,
     ),
     ParameterSpec(
+        "start_effort_limit",
+        0.0,
+        "N m",
+        "Largest torque with which a commander may begin where nobody commands; 0 for none.",
+        minimum=0.0,
+        read_only=True,
+    ),
+    ParameterSpec(
+        "starvation_limit",
+        0.0,
+        "s",
+        "Time without a command after which a plant that is armed for effort disarms; 0 for never.",
+        minimum=0.0,
+        read_only=True,
+    ),
+    ParameterSpec(
         "tracking_error_limit",
         0.3,
         "rad",
@@ -157,6 +172,8 @@ def limits_from_parameters(
         handover_time=number("handover_time"),
         tracking_error=number("tracking_error_limit"),
         handover_effort=number("handover_effort_limit"),
+        start_effort=number("start_effort_limit") or unlimited,
+        starvation=number("starvation_limit") or unlimited,
     )
 
 
@@ -172,6 +189,7 @@ class PlantInterface:
         supervisor: Its rules and state.
         clock: The plant's time [ns]: wall clock or simulated.
         push: Whether the plant can take a torque on the link itself.
+        e_stop: Whether the e-stop is served here; else the plant serves it, on a path that nothing else can block.
         polled: Whether torque inputs wait for :meth:`take_inputs` instead of waking the node; it is a
             :class:`PollingNode` then.
         statistics: The loop's figures, shown in diagnostics.
@@ -191,6 +209,7 @@ class PlantInterface:
         clock: Callable[[], int],
         *,
         push: bool = True,
+        e_stop: bool = True,
         polled: bool = False,
         statistics: LoopStatistics | None = None,
         more_diagnostics: Callable[[], Mapping[str, object]] = dict,
@@ -230,9 +249,12 @@ class PlantInterface:
                 self._inputs[kind] = node.create_subscription(
                     JointState, kind.value, receive, qos.COMMAND_INPUT, raw=True
                 )
-        node.create_subscription(JointTrajectory, names.JOINT_TRAJECTORY, self._on_trajectory, qos.TRAJECTORY)
+        node.create_subscription(
+            JointTrajectory, names.JOINT_TRAJECTORY, self._on_trajectory, qos.TRAJECTORY, raw=True
+        )
         node.create_service(SetBool, names.ARM, self._on_arm)
-        node.create_service(Trigger, names.E_STOP, self._on_e_stop)
+        if e_stop:
+            node.create_service(Trigger, names.E_STOP, self._on_e_stop)
         node.create_service(Trigger, names.E_STOP_RESET, self._on_e_stop_reset)
         # Steady time: it must go on where simulated time stands still, or where the system clock is set back.
         self._housekeeping = node.create_timer(
@@ -350,12 +372,11 @@ class PlantInterface:
 
         return receive
 
-    def _on_trajectory(self, message: JointTrajectory) -> None:
+    def _on_trajectory(self, data: bytes) -> None:
         try:
-            trajectory = trajectory_from_message(message)
+            stamp_ns, trajectory = decode_joint_trajectory(data)
             if self.sample is None:
                 raise ParameterError("no measurement yet")
-            stamp_ns = stamp_from_message(message.header.stamp)
             age = (self.clock() - stamp_ns) / NANOSECONDS
             if stamp_ns != 0 and abs(age) > TRAJECTORY_AGE_LIMIT:
                 raise ParameterError(
