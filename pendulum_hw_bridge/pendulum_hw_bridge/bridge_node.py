@@ -23,7 +23,7 @@ from pendulum_hw_bridge.bridge import Bridge, Outcome
 from pendulum_hw_bridge.bridge_consistency import check_consistency
 from pendulum_hw_bridge.bridge_parameters import BRIDGE_SPECS
 from pendulum_hw_bridge.clocks import SteppedClock, WallClock
-from pendulum_hw_bridge.e_stop_server import EStopServer
+from pendulum_hw_bridge.e_stop_node import EStopServer
 from pendulum_hw_bridge.feedback_message import encode_feedback
 from pendulum_hw_bridge.lab_node import with_lab_file
 from pendulum_hw_bridge.safety import SafetyMonitor

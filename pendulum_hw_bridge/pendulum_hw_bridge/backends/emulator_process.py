@@ -47,7 +47,7 @@ class EmulatorProcessBackend:
         self._clock = clock or WallClock()
         self._socket: socket.socket | None = None
         self._strategy = Strategy.OFF
-        self._off_confirmed = False
+        self._off_confirmed = True
         self._limits = HardwareLimits()
         self._requests = 0
         self._push = 0.0
