@@ -124,7 +124,6 @@ class BridgeNode(LifecycleNode):
             more_diagnostics=self._diagnostics,
             on_command=self._on_command,
         )
-        self._e_stop = EStopServer(self, lambda: self._supervisor.e_stop(self._interface.clock()))
         self._feedback = self.create_publisher(JointState, "actuator/feedback", _FEEDBACK_QOS)
         self._temperature = self.create_publisher(Temperature, "actuator/winding_temperature", _FEEDBACK_QOS)
         self._supply = self.create_publisher(BatteryState, "actuator/supply", _FEEDBACK_QOS)
@@ -151,8 +150,14 @@ class BridgeNode(LifecycleNode):
             window=(limits.position_min, limits.position_max),
         )
         self._safety = bridge_parameters.safety_limits(values, limits.effort)
+        self._e_stop = EStopServer(self, lambda: self._supervisor.e_stop(self._interface.clock()))
         if values["autostart"]:
-            self._autostart()
+            try:
+                self._autostart()
+            except BaseException:
+                # A node that was not made is not closed either, and a thread that spins ends no process cleanly.
+                self._e_stop.close()
+                raise
 
     def close(self) -> None:
         """Disarm, effort zero, strategy off; a last zero torque is published, so that a recording shows it."""

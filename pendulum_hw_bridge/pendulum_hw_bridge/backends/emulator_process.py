@@ -110,6 +110,8 @@ class EmulatorProcessBackend:
     def set_strategy(self, strategy: Strategy, command: Command | None = None) -> Strategy:
         """Change the strategy, then send first setpoints."""
         limited = None if command is None else check_command(command, strategy, self._limits)[0]
+        # Asked for is as good as set, until off is confirmed: the acknowledgement may be what is lost.
+        self._off_confirmed = False
         self._strategy = Strategy(self._request({"settings": {"strategy": int(strategy)}})["strategy"])
         if limited is not None and self._strategy is strategy:
             self._send(wire.encode_command(limited))
