@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from pendulum_bags.comparison import Comparison, compare_folders
-from pendulum_bags.figures.figure import ROLES, thinned
+from pendulum_bags.figures.figure import ROLES, Figure, Panel, thinned
 from pendulum_bags.figures.numbers import quantity, ratio_in_words
 from pendulum_bags.figures.render_plotly import graphs_of
 from pendulum_bags.report import FIGURES, write_report
@@ -19,6 +19,8 @@ from pendulum_bags.report.data import ReportData
 from pendulum_bags.report.figures import comparison_figures, make_figures
 from pendulum_bags.report.report_cli import main
 from pendulum_bags.report.tables import make_tables, provenance_table
+from pendulum_bags.report.wording import name_in
+from pendulum_bags.verdict import Evidence, Layer, LayerResult, Mark, write_layer
 from pendulum_msgs_py.contract.cdr import encode_joint_state
 from pendulum_rosbag.storage import open_writer
 from tests.synthetic_runs import write_run_folder
@@ -77,7 +79,12 @@ def test_page_is_complete_in_itself_and_small(page: Path) -> None:
     assert not re.search(r"(?:src|href)=\"(?:https?:)?//", text)
     assert "@import" not in text
     assert "url(" not in text.split("</style>")[0]
-    for heading in ("Paired comparison", "Provenance", "Equivalence tests", "Eigenvalues of the linearised system"):
+    for heading in (
+        "Paired comparison",
+        "Provenance",
+        "Equivalence tests",
+        "Eigenvalues of the linearised system",
+    ):
         assert heading in text
     assert "2.687959" in text
 
@@ -193,12 +200,16 @@ def hand_trials(folder: Path) -> Path:
     for number in (1, 2):
         position = 0.5 * np.pi * (1.0 - np.cos(2.0 * np.pi * t / 6.0)) + 0.02 * number * np.sin(9.0 * t)
         velocity = np.gradient(position, t)
-        write_trial(folder / f"trial_{number}", t, position, -11.77 * velocity - 0.055 * np.gradient(velocity, t))
+        write_trial(
+            folder / f"trial_{number}", t, position, -11.77 * velocity - 0.055 * np.gradient(velocity, t)
+        )
     return folder
 
 
 def staircase_trials(folder: Path) -> Path:
-    steps = np.radians([0, 10, 20, 30, 40, 50, 60, 70, 80, 90, 60, 30, 10, 0, -10, -40, -70, -90, -40, -10, 0])
+    steps = np.radians(
+        [0, 10, 20, 30, 40, 50, 60, 70, 80, 90, 60, 30, 10, 0, -10, -40, -70, -90, -40, -10, 0]
+    )
     t = np.arange(0.0, 2.0 * steps.size, 0.01)
     share = np.clip((t % 2.0) / 0.8, 0.0, 1.0)
     index = (t // 2.0).astype(int)
@@ -215,12 +226,59 @@ def test_identification_experiments_join_the_report(folder: Path, tmp_path: Path
     text = (tmp_path / "out" / "report.html").read_text(encoding="utf-8")
     assert re.search(r"damping 11\.77 N m s/rad", text)
     assert re.search(r"gravity 1\.6[678]\d* N m", text)
-    for name in ("effort_over_velocity", "effort_over_acceleration", "trials", "dynamic_phase", "static_phase"):
+    for name in (
+        "effort_over_velocity",
+        "effort_over_acceleration",
+        "trials",
+        "dynamic_phase",
+        "static_phase",
+    ):
         assert (tmp_path / "out" / "figures" / f"{name}.png").exists()
     for title in ("Regression of experiment 1", "Coefficients of experiment 2"):
         assert title in text
 
 
-def test_trials_alone_point_to_the_command_that_shows_them(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_trials_alone_point_to_the_command_that_shows_them(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     assert main([str(hand_trials(tmp_path / "table"))]) == 2
     assert "holds trials and no run" in capsys.readouterr().err
+
+
+def test_page_begins_with_the_answer_its_layers_and_what_to_do_next(page: Path) -> None:
+    text = page.read_text(encoding="utf-8")
+    top = text.split("<nav")[0]
+    assert "Yes: in this run simulation and the hardware move alike" in top
+    found = [
+        top.index(title) for title in ("1 same run", "2 same plant", "3 which controllers", "4 same choice")
+    ]
+    assert found == sorted(found)
+    assert top.index("What to do next") > top.index("4 same choice")
+
+
+def test_layers_that_a_run_folder_keeps_are_in_its_report(comparison: Comparison, tmp_path: Path) -> None:
+    row = Evidence("nu-gap", "", 0.31, 0.28, 0.35, "below 0.2", Mark.NO)
+    kept = LayerResult(
+        Layer.SAME_PLANT, Mark.NO, "The gap is 0.31.", (row,), reason="the hardware is 0.31 away"
+    )
+    write_layer(tmp_path, kept)
+    text = write_report(tmp_path, comparison=comparison, recordings=[], formats=[]).read_text(
+        encoding="utf-8"
+    )
+    assert "No: the hardware is 0.31 away." in text
+    assert "Evidence: same plant" in text
+    assert "0.28 to 0.35" in text
+
+
+def test_every_text_of_a_report_says_that_the_hardware_was_emulated() -> None:
+    figure = Figure(
+        "hardware", "Hardware", "On the hardware, u.", [Panel("hardware [s]", "", [])], section="Verdict"
+    )
+    named = name_in(figure, emulated=True)
+    assert (named.title, named.sentence) == ("Emulated hardware", "On the emulated hardware, u.")
+    assert named.panels[0].x_label == "emulated hardware [s]"
+    assert name_in(named, emulated=True).sentence == named.sentence
+    assert name_in(figure, emulated=False) is figure
+    assert name_in("python -m pendulum_bags experiment thesis --hardware hebi", emulated=True).endswith(
+        "--hardware hebi"
+    )

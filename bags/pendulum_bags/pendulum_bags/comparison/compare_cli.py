@@ -14,6 +14,7 @@ from pendulum_msgs_py.programs.executables import cli_main
 
 if TYPE_CHECKING:
     from pendulum_bags.comparison import Comparison
+    from pendulum_bags.verdict import Answer
 
 __all__ = ["main"]
 
@@ -57,6 +58,7 @@ def compare(
     Example: python -m pendulum_bags compare runs/today/sim runs/today/hw --margin delay=8ms --margin spread_angle=20%
     """
     from pendulum_bags.comparison import Margins, compare_folders, compare_runs
+    from pendulum_bags.verdict.answer import answer_of
 
     margins = Margins.of(margins_file, margin)
     if all((path / "sim").is_dir() and (path / "hw").is_dir() for path in paths):
@@ -75,13 +77,14 @@ def compare(
             f"got {len(paths)} paths ({', '.join(map(str, paths))}); "
             "expected a simulation and a hardware bag, or run folders that hold sim and hw"
         )
-    content = result.to_json()
+    answer = answer_of(result, paths[0] if len(paths) == 1 else None)
+    content = {**result.to_json(), "answer": answer.to_json()}
     if out is not None:
         _write(out, result, content)
     if json_output:
         print(json.dumps(content, indent=2, allow_nan=False))
     else:
-        _print(result, content)
+        _print(result, answer, content)
         if out is not None:
             print(f"\nwritten: {out / 'comparison.json'} and figures beside it")
 
@@ -96,10 +99,8 @@ def _write(out: Path, result: Comparison, content: dict[str, Any]) -> None:
     write_figures(comparison_figures(result), out / "figures")
 
 
-def _print(result: Comparison, content: dict[str, Any]) -> None:
+def _print(result: Comparison, answer: Answer, content: dict[str, Any]) -> None:
     from pendulum_bags.runs.run_data import timing_warning
-    from pendulum_bags.verdict import sum_up
-    from pendulum_bags.verdict.same_run import same_run_layer
     from pendulum_bags.verdict.terminal import print_answer
     from pendulum_msgs_py.programs.terminal import WholeTable, make_console
 
@@ -141,7 +142,9 @@ def _print(result: Comparison, content: dict[str, Any]) -> None:
         )
     else:
         console.print(f"Not paired: {content['paired']['reason']}.")
-    print_answer(console, sum_up([same_run_layer(result)], emulated=result.is_emulated), result.verdict)
+    for note in result.left_out:
+        console.print(note, style="yellow", highlight=False)
+    print_answer(console, answer, result.verdict)
 
 
 def _number(value: float | None, form: str) -> str:

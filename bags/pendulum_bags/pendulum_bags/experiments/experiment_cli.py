@@ -110,6 +110,7 @@ def thesis(
     """
     from pendulum_bags.comparison import Margins
     from pendulum_bags.experiments.thesis import run_thesis
+    from pendulum_bags.verdict.terminal import print_answer
 
     settings = RegulationSettings(
         plant=plant,
@@ -132,7 +133,7 @@ def thesis(
             with PhaseProgress(TIME_BESIDE_NOISE + duration, console) as progress:
                 repeat = hardware == "emulator" and budget > 0.0
                 run_thesis(folder, settings, domain, progress, repeat=repeat)
-                comparison, summary = _analyse(folder, settings, margins, budget, progress)
+                comparison, answer, summary = _analyse(folder, settings, margins, budget, progress)
         except KeyboardInterrupt:
             kept = "nothing was recorded" if discard_if_empty(folder) else f"what was recorded is in {folder}"
             console.print(f"interrupted: all programs have ended; {kept}")
@@ -144,7 +145,7 @@ def thesis(
         print(json.dumps(summary, indent=2))
     else:
         _print_summary(console, summary)
-        _print_answer(console, comparison, budget)
+        print_answer(console, answer, comparison.verdict)
     elapsed = time.monotonic() - started
     console.print(
         f"\nreport  {folder / 'report.html'}\nbags    {folder / 'sim'}, {folder / 'hw'}\n({elapsed:.0f} s)",
@@ -227,9 +228,10 @@ def _plan(settings: RegulationSettings) -> str:
 
 def _analyse(
     folder: Path, settings: RegulationSettings, margins: Margins, budget: float, progress: PhaseProgress
-) -> tuple[Comparison, dict[str, Any]]:
+) -> tuple[Comparison, Answer, dict[str, Any]]:
     from pendulum_bags.experiments.decide import Budget, decide
     from pendulum_bags.report import write_report
+    from pendulum_bags.verdict.answer import answer_of
 
     progress.phase("comparing", 2.0)
     comparison = decide(
@@ -240,6 +242,7 @@ def _analyse(
         on_look=lambda number, duration: progress.phase(f"undecided: {duration:.0f} s more", 4.0 + 0.25 * duration),
         on_wait=progress.refresh,
     )
+    answer = answer_of(comparison, more=_how_to_go_on(comparison, budget))
     progress.phase("writing the report", 4.0)
     summary = {
         "experiment": "thesis",
@@ -247,25 +250,15 @@ def _analyse(
         "strategy": settings.strategy,
         "versions": versions(),
         **comparison.to_json(),
-        "answer": _answer(comparison, budget).to_json(),
+        "answer": answer.to_json(),
     }
     write_json(folder / "summary.json", summary)
-    write_report(folder, summary, comparison=comparison)
-    return comparison, summary
+    write_report(folder, summary, comparison=comparison, answer=answer)
+    return comparison, answer, summary
 
 
-def _answer(comparison: Comparison, budget: float) -> Answer:
-    from pendulum_bags.verdict import sum_up
-    from pendulum_bags.verdict.same_run import same_run_layer
-
-    more = f'make experiment ARGS="--budget {4 * budget:.0f}"' if comparison.is_emulated and budget else ""
-    return sum_up([same_run_layer(comparison, more=more)], emulated=comparison.is_emulated)
-
-
-def _print_answer(console: Console, comparison: Comparison, budget: float) -> None:
-    from pendulum_bags.verdict.terminal import print_answer
-
-    print_answer(console, _answer(comparison, budget), comparison.verdict)
+def _how_to_go_on(comparison: Comparison, budget: float) -> str:
+    return f'make experiment ARGS="--budget {4 * budget:.0f}"' if comparison.is_emulated and budget else ""
 
 
 def _print_summary(console: Console, summary: dict[str, Any]) -> None:

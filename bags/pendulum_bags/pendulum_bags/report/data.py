@@ -9,6 +9,8 @@ from typing import Any
 from pendulum_bags.comparison import Comparison
 from pendulum_bags.replay.input_replay import InputReplay
 from pendulum_bags.report.trials import TrialSet
+from pendulum_bags.verdict import Answer
+from pendulum_bags.verdict.answer import answer_of
 from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.plants.plant_parameters import PlantParameters, load_plant
 
@@ -25,6 +27,7 @@ class ReportData:
         replays: Real recordings driven through our plant.
         names: Names of the run folders.
         trials: The thesis's identification experiments, where they were recorded.
+        answer: The sum of all layers that were measured; by default of the comparison alone.
     """
 
     comparison: Comparison
@@ -32,10 +35,13 @@ class ReportData:
     replays: Sequence[InputReplay] = ()
     names: Sequence[str] = ()
     trials: Sequence[TrialSet] = ()
+    answer: Answer = None  # type: ignore[assignment]  # filled in below
     plant: PlantParameters | None = field(init=False)
 
     def __post_init__(self) -> None:
-        """Find the plant that the run was designed on."""
+        """Find the plant that the run was designed on, and the answer."""
+        if self.answer is None:
+            object.__setattr__(self, "answer", answer_of(self.comparison))  # type: ignore[unreachable]
         object.__setattr__(self, "plant", self._find_plant())
 
     @property

@@ -16,7 +16,9 @@ from pendulum_bags.figures.render_plotly import graphs_of
 from pendulum_bags.report.animation import animation_of
 from pendulum_bags.report.data import ReportData
 from pendulum_bags.report.tables import Table, provenance_table
+from pendulum_bags.report.wording import name_in
 from pendulum_bags.runs.run_data import timing_warning
+from pendulum_bags.verdict.terminal import SIGNS
 
 __all__ = ["render_page"]
 
@@ -68,16 +70,19 @@ def render_page(
         items += [{"table": table} for table in tables if table.section == heading]
         if items:
             sections.append({"title": heading, "anchor": _anchor(heading), "entries": items})
-    verdict = data.comparison.verdict
+    emulated = data.comparison.is_emulated
     return environment.get_template("report.html.j2").render(
         title=title,
         made_at=made_at,
-        verdict=verdict,
-        unpaired=data.comparison.unpaired_verdict,
-        noise_note=_noise_note(data),
+        answer=data.answer,
+        signs=SIGNS,
+        left_out=data.comparison.left_out,
+        unpaired=data.comparison.unpaired_verdict.sentence,
+        hardware=data.comparison.hardware_name,
+        noise_note=name_in(_noise_note(data), emulated=emulated),
         is_paired=data.comparison.is_paired,
         timing_warning=timing_warning(data.comparison.plants),
-        facts=_facts(data),
+        facts=name_in(_facts(data), emulated=emulated),
         sections=sections,
         missing=missing,
         provenance=provenance_table(data),

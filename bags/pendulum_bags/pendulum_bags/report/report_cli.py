@@ -47,6 +47,7 @@ def report(
     """
     from pendulum_bags.comparison import Margins, compare_folders, compare_runs
     from pendulum_bags.report import write_report
+    from pendulum_bags.verdict.answer import answer_of
 
     started = time.monotonic()
     trials = [folder for folder in folders if (folder / "trial_1").exists()]
@@ -79,7 +80,8 @@ def report(
         recordings=recording,
         formats=("png",) if png_only else ("png", "pdf"),
     )
-    print(result.verdict.sentence)
+    answer = answer_of(result, folders[0] if len(folders) == 1 else None)
+    print(answer.sentence)
     print(f"report  {page} ({page.stat().st_size / 1e6:.1f} MB, {time.monotonic() - started:.1f} s)")
     print(f"figures {page.parent / 'figures'}")
 

@@ -16,6 +16,7 @@ from pendulum_bags.figures.numbers import quantity
 from pendulum_bags.report.data import ReportData
 from pendulum_bags.report.trial_figures import GRAVITY, INERTIA, UNITS
 from pendulum_bags.report.trials import TrialSet
+from pendulum_bags.verdict import Layer, LayerResult, Mark
 from pendulum_lqr.design import output_lqr
 from pendulum_lqr.model import linearise, sort_poles
 from pendulum_msgs_py.plants.plant_parameters import PLANT_SPECS
@@ -57,7 +58,26 @@ def make_tables(data: ReportData) -> list[Table]:
     """Return all tables that the data allow, in the order of the report."""
     regressions = [table for trials in data.trials for table in _regression(trials)]
     makers = (_plants, _tests, _paired, _unpaired, _metrics, _eigenvalues, _model)
-    return [table for maker in makers for table in [maker(data)] if table is not None] + regressions
+    layers = [_evidence(result) for result in data.answer.layers if _is_further(result)]
+    return [table for maker in makers for table in [maker(data)] if table is not None] + layers + regressions
+
+
+def _is_further(result: LayerResult) -> bool:
+    """Tell whether a layer was measured beside the tests of the run, which have a table of their own."""
+    return result.layer is not Layer.SAME_RUN and result.mark is not Mark.NOT_MEASURED and bool(result.evidence)
+
+
+def _evidence(result: LayerResult) -> Table:
+    """Return what a layer rests on."""
+    rows = []
+    for row in result.evidence:
+        ends = ("–" if end is None else quantity(end) for end in (row.low, row.high))
+        interval = "–" if row.low is None and row.high is None else " to ".join(ends)
+        name = row.quantity + (f" [{row.unit}]" if row.unit else "")
+        estimate = "–" if row.estimate is None else quantity(row.estimate)
+        rows.append((name, estimate, interval, row.expected or "–", row.mark.value if row.expected else "–", row.note))
+    head = ("quantity", "estimate", "interval", "expected", "result", "note")
+    return Table(f"Evidence: {result.layer.title}", result.sentence, head, rows, "Verdict")
 
 
 _PLANT_NAMES = {"sim": "simulation", "hw": "hardware", "sim_500hz": "simulation, own noise"}

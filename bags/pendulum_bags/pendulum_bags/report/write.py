@@ -14,12 +14,15 @@ from pendulum_bags.report.figures import make_figures
 from pendulum_bags.report.page import render_page
 from pendulum_bags.report.tables import make_tables
 from pendulum_bags.report.trials import read_trials
+from pendulum_bags.report.wording import name_in
+from pendulum_bags.verdict.answer import answer_of
 from pendulum_msgs_py.errors import BagError, PendulumError
 
 if TYPE_CHECKING:
     from pendulum_bags.comparison import Comparison
     from pendulum_bags.comparison.margins import MarginArgument
     from pendulum_bags.replay.input_replay import InputReplay
+    from pendulum_bags.verdict import Answer
 
 __all__ = ["find_real_recording", "write_report"]
 
@@ -36,6 +39,7 @@ def write_report(
     recordings: Sequence[Path] | None = None,
     margin: MarginArgument = None,
     formats: Sequence[str] = ("png", "pdf"),
+    answer: Answer | None = None,
 ) -> Path:
     """Write ``report.html`` and ``figures/`` into a folder.
 
@@ -49,6 +53,7 @@ def write_report(
         recordings: Recordings of real pendulums to replay; by default the one that lies beside the project, if any.
         margin: What difference does not matter.
         formats: Formats of the figures.
+        answer: The sum of all layers; by default of the comparison and of what the run folder keeps.
 
     Returns:
         Path of the page.
@@ -73,12 +78,15 @@ def write_report(
         for replay in _replay(path, required=recordings is not None)
     ]
     names = [Path(folder).name for folder in folders] or [out.resolve().name]
-    data = ReportData(comparison, content, replays, names, [read_trials(path) for path in trials])
-    figures, missing = make_figures(data)
+    kept = out if not folders else Path(folders[0]) if len(folders) == 1 else None
+    answer = answer or answer_of(comparison, kept)
+    data = ReportData(comparison, content, replays, names, [read_trials(path) for path in trials], answer)
+    made, missing = make_figures(data)
+    figures = [name_in(figure, emulated=comparison.is_emulated) for figure in made]
     page = render_page(
         data,
         figures,
-        make_tables(data),
+        [name_in(table, emulated=comparison.is_emulated) for table in make_tables(data)],
         missing,
         title=names[0] if len(names) == 1 else f"{len(names)} runs",
         made_at=datetime.now(timezone.utc).strftime("%Y-%m-%d %H:%M UTC"),

@@ -257,7 +257,7 @@ def sum_up(results: Iterable[LayerResult], *, emulated: bool = False) -> Answer:
     else:
         mark = Mark.YES
         text = f"Yes: {_reasons(by_mark[mark])}."
-    holds = [result.holds for result in layers if result.holds and result.mark is Mark.YES]
+    holds = [result.holds for result in layers if result.holds]
     if holds and mark is not Mark.YES:
         text += f" What holds: {'; '.join(holds)}."
     if mark is Mark.YES and by_mark[Mark.NOT_MEASURED]:

@@ -122,7 +122,7 @@
     let started = null;
     seek.max = last;
     element("animation-text").textContent =
-      `Simulation (solid, round bob) and hardware (dashed, square bob) about upright, deviations enlarged ${tracks.factor.toFixed(0)} times.`;
+      `Simulation (solid, round bob) and ${document.getElementById('animation').dataset.hardware} (dashed, square bob) about upright, deviations enlarged ${tracks.factor.toFixed(0)} times.`;
 
     const link = (angle, colour, dash, square) => {
       const x0 = canvas.width / 2;

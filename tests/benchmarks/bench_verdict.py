@@ -1,0 +1,163 @@
+"""How often the answer errs, on plants whose difference is known: what ``make experiment`` may promise."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from functools import partial
+from typing import Any, NamedTuple
+
+from pendulum_bags.comparison import Looks, Margins, Outcome
+from pendulum_bags.comparison.equivalence import EquivalenceTest
+from pendulum_bags.comparison.same_run import paired_tests
+from pendulum_bags.runs.series import Series
+from tests.benchmarks import Row, measured
+from tests.plant_pairs import SIMULATED, pair
+
+AT_MARGIN = 300
+"""Trials of a machine that lies on every margin at once: 15 false answers of 300 are 5 %."""
+TRIALS = 100
+"""Trials of each difference that must be found, and of none."""
+FIRST_LOOKS = (5.0, 10.0, 20.0)
+"""Lengths of the runs behind each further look, short so that the intervals rest on little [s]."""
+DEFAULT_LOOKS = (25.0, 40.0, 60.0)
+"""The same of ``make experiment``: the run and the repeat that the first look has, and two repeats [s]."""
+
+FRICTION = SIMULATED.with_values(damping=2.0 * SIMULATED.damping)
+DRY = dict.fromkeys(("coulomb_friction", "static_friction"), 0.3)
+DIFFERENCES: dict[str, dict[str, Any]] = {
+    "10 ms of delay": {"late": 0.010},
+    "20 % more gain": {"gain": 1.2},
+    "20 % less gain": {"gain": 0.8},
+    "twice the friction": {"plant": FRICTION},
+    "an X5-9's dry friction, 0.3 N m, not simulated": {"plant": SIMULATED.with_values(**DRY)},
+}
+ON_THE_MARGIN: dict[str, Any] = {
+    "late": 0.004,
+    "gain": 1.1,
+    "plant": SIMULATED.with_values(torque_offset=0.05, coulomb_friction=0.05, static_friction=0.05),
+}
+"""A machine that differs a little in everything; the margins are set to just that much."""
+
+
+class Trial(NamedTuple):
+    """What each test said first, by quantity, and after how much noise the whole was decided [s]."""
+
+    outcomes: dict[str, Outcome]
+    whole: Outcome
+    seconds: float
+
+
+def run_trial(
+    seed: int,
+    hardware: dict[str, Any],
+    stated: dict[str, str],
+    lengths: Sequence[float],
+    *,
+    each: bool = False,
+) -> Trial:
+    """Carry out one experiment: look, and record more while it is undecided.
+
+    Args:
+        seed: Makes all noise.
+        hardware: In what the machine differs.
+        stated: Margins.
+        lengths: Of the runs behind each look [s].
+        each: Go on until each test is decided, not only the answer.
+    """
+    margins = Margins.parse(stated)
+    pairs: list[tuple[Series, Series]] = []
+    first: dict[str, Outcome] = {}
+    whole = Outcome.UNDECIDED
+    seconds = 0.0
+    for look, length in enumerate(lengths, start=1):
+        simulation, machine = pair(1000 * seed + look, length, **hardware)
+        pairs.append((simulation.window, machine.window))
+        seconds += length
+        tests = paired_tests(pairs, margins, looks=Looks(look), runs_differ=False)
+        for test in tests:
+            if first.get(test.quantity, Outcome.UNDECIDED) is Outcome.UNDECIDED:
+                first[test.quantity] = test.outcome
+        whole = outcome_of(tests)
+        if Outcome.UNDECIDED not in first.values() or (whole is not Outcome.UNDECIDED and not each):
+            break
+    return Trial(first, whole, seconds)
+
+
+def outcome_of(tests: Sequence[EquivalenceTest]) -> Outcome:
+    """Return the outcome of all tests together."""
+    outcomes = {test.outcome for test in tests}
+    if Outcome.DIFFERENT in outcomes:
+        return Outcome.DIFFERENT
+    return Outcome.UNDECIDED if Outcome.UNDECIDED in outcomes else Outcome.EQUIVALENT
+
+
+def margins_at(hardware: dict[str, Any], duration: float = 600.0) -> dict[str, str]:
+    """Return margins on which a machine lies exactly, from one long run."""
+    simulation, machine = pair(7, duration, **hardware)
+    tests = paired_tests([(simulation.window, machine.window)], Margins.parse())
+    found = {test.quantity: test.interval.estimate for test in tests}
+    stated = {
+        f"spread_{what}": f"{100.0 * (max(found[name], 1.0 / found[name]) - 1.0)} %"
+        for what in ("angle", "velocity", "torque")
+        for name in [f"spread of {what} (ratio)"]
+    }
+    stated["mean_angle"] = f"{abs(found['mean angle difference'])} deg"
+    stated["delay"] = f"{abs(found['delay'])} ms"
+    stated["path_angle"] = f"{found['distance of angles']} %"
+    stated["path_velocity"] = f"{found['distance of velocities']} %"
+    return stated
+
+
+def repeat(function: Callable[[int], Trial], trials: int) -> list[Trial]:
+    """Carry out trials with seeds 1, 2, ... on all cores."""
+    with ProcessPoolExecutor(os.cpu_count()) as pool:
+        return list(pool.map(function, range(1, trials + 1), chunksize=4))
+
+
+def rows() -> Iterator[Row]:
+    """Yield false answers at each margin, and how often differences are found and equal plants are told equal."""
+    stated = margins_at(ON_THE_MARGIN)
+    trials = repeat(
+        partial(run_trial, hardware=ON_THE_MARGIN, stated=stated, lengths=FIRST_LOOKS, each=True), AT_MARGIN
+    )
+    # Distances less the delay have the margins of those with it, beyond which they do not lie.
+    for quantity in [name for name in trials[0].outcomes if "less the delay" not in name]:
+        wrong = sum(trial.outcomes[quantity] is Outcome.EQUIVALENT for trial in trials)
+        yield measured(
+            f"same run: “equivalent” although on the margin, {quantity}, {AT_MARGIN} trials of up to 3 looks",
+            float(wrong),
+            "trials",
+            at_most=0.05 * AT_MARGIN,
+        )
+    wrong = sum(trial.whole is Outcome.EQUIVALENT for trial in trials)
+    yield measured(
+        f"same run: “yes” for a machine on the margins, {AT_MARGIN} trials",
+        float(wrong),
+        "trials",
+        at_most=0.05 * AT_MARGIN,
+    )
+    for what, hardware in DIFFERENCES.items():
+        found = repeat(partial(run_trial, hardware=hardware, stated={}, lengths=DEFAULT_LOOKS), TRIALS)
+        right = sum(trial.whole is Outcome.DIFFERENT for trial in found)
+        yield measured(
+            f"same run: “no” for {what}, {TRIALS} default runs",
+            float(right),
+            "runs",
+            at_least=0.95 * TRIALS,
+            note=_noise(found),
+        )
+    found = repeat(partial(run_trial, hardware={}, stated={}, lengths=DEFAULT_LOOKS), TRIALS)
+    right = sum(trial.whole is Outcome.EQUIVALENT for trial in found)
+    yield measured(
+        f"same run: “yes” for the same plant at 100 Hz with an actuator's sensors, {TRIALS} default runs",
+        float(right),
+        "runs",
+        at_least=0.95 * TRIALS,
+        note=_noise(found),
+    )
+
+
+def _noise(trials: Sequence[Trial]) -> str:
+    return f"after {sum(trial.seconds for trial in trials) / len(trials):.0f} s of noise in the mean"
