@@ -71,7 +71,9 @@ class StudyRun:
         """Name of the run's folder: its number and what tells it from others."""
         labels = [self.labels[axis] for axis in ("plant", "controller", "disturbance", "start")]
         parts = [f"{label:.4g}" if isinstance(label, float) else str(label) for label in labels]
-        return "_".join([f"{self.number:05}", *(p for p in parts if p), f"seed{self.labels['seed']}"])
+        name = "_".join([f"{self.number:05}", *(p for p in parts if p), f"seed{self.labels['seed']}"])
+        # A label may be any text; a folder's name may not.
+        return name.replace("/", "-")
 
     @property
     def lab(self) -> str:
