@@ -36,7 +36,8 @@ def reference() -> str:
         "# Reference\n\nGenerated from the code: what stands here is what the programs read.\n\n## Programs\n"
     ]
     for package in PACKAGES:
-        for name, target in importlib.import_module(f"{package}.executables").EXECUTABLES.items():
+        tables = importlib.import_module(f"{package}.executables")
+        for name, target in {**tables.EXECUTABLES, **getattr(tables, "COMMANDS", {})}.items():
             parts.append(f"- `python -m {package} {name}`: {summary(name, target)}.")
     parts.append("\n## Parameters of the nodes\n")
     for name, module, tables in NODES:

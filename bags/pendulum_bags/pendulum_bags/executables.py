@@ -1,6 +1,6 @@
 """The programs of this package: name and entry point, read by ``setup.py`` and ``python -m``."""
 
-__all__ = ["EXECUTABLES"]
+__all__ = ["COMMANDS", "EXECUTABLES"]
 
 EXECUTABLES: dict[str, str] = {
     "record": "pendulum_rosbag.recorder.record_cli:main",
@@ -20,3 +20,11 @@ EXECUTABLES: dict[str, str] = {
     "info": "pendulum_rosbag.reader.info_cli:main",
     "repair": "pendulum_rosbag.storage.repair_cli:main",
 }
+
+COMMANDS: dict[str, str] = {
+    "convert": "pendulum_rosbag.convert.convert_cli:convert_main",
+    "merge": "pendulum_rosbag.convert.convert_cli:merge_main",
+    "cut": "pendulum_rosbag.convert.convert_cli:cut_main",
+    "filter": "pendulum_rosbag.convert.convert_cli:filter_main",
+}
+"""Offered by ``python -m`` only: as programs of an environment they would hide others of the same name (``cut``)."""

@@ -1,7 +1,8 @@
 """One way to start every program of the project: ``ros2 run PKG EXE``, ``python -m PKG EXE`` and ``install/``.
 
 Each package has a table ``EXECUTABLES`` (name -> ``module:function``) in its ``executables`` module. The console
-scripts of ``setup.py`` and ``python -m`` both read it, so neither can offer what the other lacks.
+scripts of ``setup.py`` and ``python -m`` both read it. What would hide a program of the system is in a second table,
+``COMMANDS``, for ``python -m`` alone.
 """
 
 from __future__ import annotations
@@ -50,7 +51,8 @@ def run_package(package: str, argv: Sequence[str] | None = None) -> int:
     """
     importlib.import_module("pendulum_msgs_py.programs.one_thread")
     arguments = list(sys.argv[1:] if argv is None else argv)
-    table: dict[str, str] = importlib.import_module(f"{package}.executables").EXECUTABLES
+    tables = importlib.import_module(f"{package}.executables")
+    table: dict[str, str] = {**tables.EXECUTABLES, **getattr(tables, "COMMANDS", {})}
     if completion.asked() and len(arguments) < 2:
         print_text("\n".join(completion.of_package(table, arguments)))
         return 0

@@ -1,0 +1,1 @@
+"""Bags made of bags: in another storage, of several, of a time span, of some topics."""

@@ -1,0 +1,280 @@
+"""Copy messages of one or several bags to a new one, in order of log time."""
+
+from __future__ import annotations
+
+import itertools
+import json
+import math
+import os
+import re
+import shutil
+import tempfile
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+from pendulum_msgs_py.errors import BagError, DataError, ParameterError
+from pendulum_rosbag.reader.batches import Source
+from pendulum_rosbag.reader.open_source import BagFolder, open_folder, open_sources
+from pendulum_rosbag.storage.bag_writer import BagWriter, open_writer
+from pendulum_rosbag.storage.message_types import MessageType
+from pendulum_rosbag.storage.repair import message_type_of, profiles_of
+
+__all__ = ["Choice", "RewriteReport", "rewrite"]
+
+_WINDOW_BYTES = 64 << 20
+"""Bytes of storage files that are sorted at once; what they hold may be five times as much."""
+_ROS1 = ".bag"
+
+
+@dataclass(frozen=True)
+class Choice:
+    """Which messages to copy.
+
+    Args:
+        topics: Full names; with ``regex`` empty, too, all topics.
+        regex: Pattern that a topic may match instead of being listed.
+        exclude: Pattern of topics to leave out.
+        start_ns: First log time [ns]; ``None`` for the beginning.
+        stop_ns: Log time before which the last message lies [ns]; ``None`` for the end.
+
+    Raises:
+        ParameterError: A pattern is none, or the span is empty.
+    """
+
+    topics: tuple[str, ...] = ()
+    regex: str = ""
+    exclude: str = ""
+    start_ns: int | None = None
+    stop_ns: int | None = None
+
+    def __post_init__(self) -> None:
+        for name, pattern in (("regex", self.regex), ("exclude", self.exclude)):
+            try:
+                re.compile(pattern)
+            except re.error as error:
+                raise ParameterError(f"{name} is {pattern!r}; expected a regular expression ({error})") from None
+        if self.start_ns is not None and self.stop_ns is not None and self.start_ns >= self.stop_ns:
+            length = (self.stop_ns - self.start_ns) * 1e-9
+            raise ParameterError(f"the span from start to stop is {length:g} s long; expected more than 0 s")
+
+    def wants(self, topic: str) -> bool:
+        """Tell whether a topic is to be copied."""
+        if self.exclude and re.search(self.exclude, topic):
+            return False
+        if self.topics or self.regex:
+            return topic in self.topics or bool(self.regex and re.search(self.regex, topic))
+        return True
+
+
+@dataclass(slots=True)
+class RewriteReport:
+    """What was copied.
+
+    Args:
+        path: The new bag.
+        messages: Topic -> number of messages.
+        damage: What was wrong with the bags that were read, one sentence each.
+        left_out: What was asked for and has no place in the new bag, one sentence each.
+    """
+
+    path: Path
+    messages: dict[str, int] = field(default_factory=dict)
+    damage: list[str] = field(default_factory=list)
+    left_out: list[str] = field(default_factory=list)
+
+    def sentence(self) -> str:
+        """Return the report in one sentence."""
+        text = f"wrote {sum(self.messages.values())} messages of {len(self.messages)} topics to {self.path}"
+        return text + (f"; LEFT OUT: {'; '.join(self.left_out)}" if self.left_out else "")
+
+
+@dataclass(frozen=True)
+class _Input:
+    """A bag that is open for reading."""
+
+    path: Path
+    folder: BagFolder
+    sources: Sequence[Source]
+
+
+def rewrite(
+    paths: Sequence[str | os.PathLike[str]],
+    output: str | os.PathLike[str],
+    choice: Choice | None = None,
+    *,
+    storage: str = "",
+    compression: str | None = "",
+    max_size: int = 0,
+    max_duration: float = 0.0,
+    on_progress: Callable[[float], None] = lambda share: None,
+) -> RewriteReport:
+    """Write messages of bags to a new one, ordered by log time; topics, QoS, types, metadata and attachments with them.
+
+    Args:
+        paths: Bags: rosbag2 folders, ``.mcap`` and ``.db3`` files, ROS 1 ``.bag`` files.
+        output: Folder of the new bag; it must not exist.
+        choice: Which messages; by default all.
+        storage: ``mcap`` or ``sqlite3``; empty for that of the first bag.
+        compression: ``None``, ``zstd``, or empty for what the bags have.
+        max_size: Begin a new storage file at this size [bytes]; 0 for never.
+        max_duration: Begin a new storage file after this time of messages [s]; 0 for never.
+        on_progress: Called with the share that is done, 0 to 1.
+
+    Raises:
+        BagError: A bag cannot be read, two have a topic of one name with different types, or the new one cannot be
+            written.
+        DataError: A topic that was named is in none of them, or no message is left.
+        ParameterError: Unknown storage or compression.
+    """
+    choice = choice or Choice()
+    with ExitStack() as stack:
+        inputs = [_open(Path(path), stack) for path in paths]
+        storage = storage or inputs[0].folder.storage or "mcap"
+        if compression == "":
+            packed = any(source.compressed for one in inputs for source in one.sources)
+            compression = "zstd" if packed and storage == "mcap" else None
+        _require_topics(inputs, choice)
+        report = RewriteReport(Path(output))
+        for one in inputs:
+            damage = (*one.folder.damage, *(f"{s.path.name}: {s.damage}" for s in one.sources if s.damage))
+            report.damage += [f"{one.path}: {sentence}" for sentence in damage]
+        metadata = _metadata(inputs, choice)
+        writer = open_writer(output, storage, compression, metadata, max_size=max_size, max_duration=max_duration)
+        try:
+            with writer:
+                _copy(inputs, choice, writer, report, on_progress)
+            if not sum(writer.written.values()):
+                raise DataError(f"{', '.join(map(str, paths))}: no message is among what was chosen; expected some")
+        except BaseException:
+            shutil.rmtree(output, ignore_errors=True)
+            raise
+        report.messages = writer.written
+    return report
+
+
+def _open(path: Path, stack: ExitStack) -> _Input:
+    place = path
+    if path.suffix == _ROS1 and path.is_file():
+        place = _from_ros1(path, Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="pendulum_rosbag_"))))
+    folder = open_folder(place)
+    sources = open_sources(folder)
+    for source in sources:
+        stack.callback(source.close)
+    return _Input(path, folder, sources)
+
+
+def _from_ros1(path: Path, scratch: Path) -> Path:
+    """Return a rosbag2 folder with what a ROS 1 bag holds, its messages serialised anew as ROS 2 does."""
+    from rosbags.convert import ConverterError, convert
+
+    target = scratch / path.stem
+    try:
+        convert([path], target, "mcap", 9, None, "none", None, None, (), (), (), ())
+    except ConverterError as error:
+        raise BagError(f"ROS 1 bag {path} cannot be converted: {error}") from error
+    return target
+
+
+def _require_topics(inputs: Sequence[_Input], choice: Choice) -> None:
+    found = {stream.topic for one in inputs for source in one.sources for stream in source.streams}
+    missing = [topic for topic in choice.topics if topic not in found]
+    if missing:
+        bags = ", ".join(str(one.path) for one in inputs)
+        raise DataError(f"{bags}: no topic {missing[0]}; expected one of {', '.join(sorted(found)) or 'none'}")
+
+
+def _metadata(inputs: Sequence[_Input], choice: Choice) -> dict[str, Any]:
+    """Return the run metadata: what all bags agree on, and of several the whole of each by the name of its bag."""
+    span = {name: value for name, value in (("start_ns", choice.start_ns), ("stop_ns", choice.stop_ns)) if value}
+    origin = {"pendulum.origin": [{"bag": str(one.path), **span} for one in inputs]}
+    first, *others = (one.folder.custom_data for one in inputs)
+    if not others:
+        return {**first, **origin}
+    agreed = {key: value for key, value in first.items() if all(other.get(key) == value for other in others)}
+    names = [one.path.name for one in inputs]
+    if len(set(names)) < len(names):
+        names = [str(one.path) for one in inputs]
+    merged = {
+        name: {key: _parsed(value) for key, value in one.folder.custom_data.items()}
+        for name, one in zip(names, inputs, strict=True)
+    }
+    return {**agreed, "pendulum.merged": merged, **origin}
+
+
+def _parsed(text: str) -> Any:
+    try:
+        return json.loads(text)
+    except ValueError:
+        return text
+
+
+def _copy(
+    inputs: Sequence[_Input],
+    choice: Choice,
+    writer: BagWriter,
+    report: RewriteReport,
+    on_progress: Callable[[float], None],
+) -> None:
+    chosen: list[tuple[Source, dict[int, str]]] = []
+    for one in inputs:
+        for source in one.sources:
+            streams = [stream for stream in source.streams if choice.wants(stream.topic)]
+            for stream in streams:
+                kind = _storable(message_type_of(stream, one.folder.topic_hashes.get(stream.topic, "")), writer)
+                try:
+                    writer.add_topic(stream.topic, kind, profiles_of(stream.qos))
+                except BagError as error:
+                    raise BagError(f"{one.path}: {error}; leave one of them out, or rename it") from error
+            chosen.append((source, {stream.channel: stream.topic for stream in streams}))
+            _keep_extras(source, writer, report)
+    windows = list(_windows([source for source, _ in chosen], choice))
+    for number, (start, stop) in enumerate(windows, start=1):
+        rows: list[tuple[int, str, bytes]] = []
+        for source, topics in chosen:
+            for batch in source.batches(set(topics), start, stop) if topics else ():
+                topic = topics[batch.channel]
+                rows += [(time, topic, data) for time, data in batch.payloads()]
+        rows.sort(key=lambda row: row[0])  # (stable: what was written first comes first)
+        writer.write_many((topic, time, data) for time, topic, data in rows)
+        on_progress(number / len(windows))
+
+
+def _storable(kind: MessageType, writer: BagWriter) -> MessageType:
+    """Return a type as a storage can hold it: a database has no place for a definition that is no text."""
+    is_text = kind.definition.encode(errors="ignore").decode() == kind.definition
+    return kind if is_text or writer.storage == "mcap" else replace(kind, definition="")
+
+
+def _keep_extras(source: Source, writer: BagWriter, report: RewriteReport) -> None:
+    for extra in source.extras():
+        try:
+            writer.keep(extra)
+        except BagError as error:
+            report.left_out.append(str(error))
+
+
+def _windows(sources: Sequence[Source], choice: Choice) -> Iterator[tuple[int, int]]:
+    """Yield spans of log time [ns], first included and last not, that hold about as much as is sorted at once."""
+    filled = [source for source in sources if any(stream.count for stream in source.streams)]
+    if not filled:
+        return
+    start = min(source.start_ns for source in filled)
+    stop = max(source.stop_ns for source in filled) + 1
+    start = start if choice.start_ns is None else max(start, choice.start_ns)
+    stop = stop if choice.stop_ns is None else min(stop, choice.stop_ns)
+    if start >= stop:
+        return
+    size = sum(_size(source) for source in filled)
+    count = min(max(1, math.ceil(size / _WINDOW_BYTES)), stop - start)
+    edges = [start + (stop - start) * number // count for number in range(count + 1)]
+    yield from itertools.pairwise(edges)
+
+
+def _size(source: Source) -> int:
+    try:
+        return source.path.stat().st_size
+    except OSError:  # a decompressed copy of a file
+        return _WINDOW_BYTES
