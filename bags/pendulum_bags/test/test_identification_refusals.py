@@ -312,6 +312,34 @@ def test_each_recording_may_have_a_mapping_of_its_own(tmp_path, capsys):
     assert "--mapping is given 3 times for 2 recordings" in capsys.readouterr().err
 
 
+@pytest.mark.parametrize("name", ["angle_offset", "torque_offset"])
+def test_each_recording_may_have_a_zero_of_its_own(name):
+    plants = [replace(TRUTH, **{name: value}) for value in (0.05, -0.03)]
+    pair = [run(seed, seconds=4.0, plant=plant) for seed, plant in enumerate(plants, 1)]
+    result = identify(pair, QUICK, profiles=0)
+    zeros = result.fit.zeros
+    assert zeros is not None
+    assert zeros.name == name
+    assert zeros.values == pytest.approx([0.04, -0.04], abs=2e-3)
+    assert result.explained.rms == pytest.approx(1e-3, rel=0.1)
+    assert result.model["gravity"] == pytest.approx(1.5, rel=5e-3)
+    assert result.model[name] == pytest.approx(0.01, abs=2e-3)
+    assert any("a zero of its own" in sentence for sentence in result.sentences())
+    # The file names the data as they were read.
+    alone = [identify([one], QUICK, profiles=0).to_dict()["data"][0] for one in pair]
+    assert result.to_dict()["data"] == alone
+
+
+def test_recordings_of_one_zero_keep_it_and_another_one_to_score_is_said_to_be_elsewhere():
+    other = run(3, seconds=4.0, plant=replace(TRUTH, angle_offset=0.05))
+    result = identify([run(1, seconds=4.0), run(2, seconds=4.0)], QUICK, profiles=0, held_out=[other])
+    assert result.fit.zeros is None
+    offset, rms = result.moved_zeros["synthetic"]
+    assert offset == pytest.approx(0.05, abs=2e-3)
+    assert rms == pytest.approx(1e-3, rel=0.1)
+    assert any("its zero lies +0.0" in sentence for sentence in result.sentences())
+
+
 def test_a_file_without_a_torque_says_how_a_free_swing_is_read(tmp_path):
     swing = run(8, amplitude=0.0, start=(1.5, 0.0))
     path = tmp_path / "swing.csv"

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from pendulum_bags.identification.cross_validation import COARSE, cross_validate
 from pendulum_bags.identification.model import FRICTION_MODELS, SERVO_ONLY, FitModel
 from pendulum_bags.identification.options import DEFAULTS, Geometry, Options
+from pendulum_bags.identification.own_zeros import OwnZeros, align
 from pendulum_bags.identification.problem import Piece, prepare
 from pendulum_bags.identification.readings import other_reading
 from pendulum_bags.identification.selection import Candidate, choose, effective_samples
@@ -55,6 +56,8 @@ class OutputErrorFit:
         sign_flipped: Whether the recorded effort counts with sign -1.
         offset_candidates: Fits with Coulomb friction, one for each set of offsets that was tried.
         reading: How the angle seems to be measured, if not in rad from hanging.
+        zeros: Offsets of the recordings beside their mean, where they differ; ``pieces`` are without them.
+        recordings: As they were read.
     """
 
     chosen: Candidate
@@ -66,6 +69,8 @@ class OutputErrorFit:
     sign_flipped: bool
     offset_candidates: tuple[Candidate, ...] = ()
     reading: str | None = None
+    zeros: OwnZeros | None = None
+    recordings: tuple[Recording, ...] = ()
 
     @property
     def model(self) -> FitModel:
@@ -92,6 +97,10 @@ def fit_output_error(recordings: Sequence[Recording], options: Options = DEFAULT
     # Ranked twice: by a loss that can pull from far, and by one that a single pushed window cannot sway.
     starts = [start for scale in (0.3, 0.03) for start in rank(models, pieces, base, scale=scale, keep=2)]
     best, scale = _anneal(starts, pieces, base, options.robust)
+    best, pieces, zeros = align(best, pieces, base, window, scale, coarse=COARSE)
+    if zeros is not None:
+        scale = _robust_scale(best, pieces)
+        best = solve(best.model, pieces, base, states=best.states, scale=scale, tolerance=1e-7, coarse=COARSE)
     reading = other_reading(best, pieces, fixed, base, window)
     names = [options.friction]
     if reading is not None:
@@ -109,7 +118,17 @@ def fit_output_error(recordings: Sequence[Recording], options: Options = DEFAULT
     candidates[candidates.index(first)] = chosen
     flipped = fixed.input_kind in {"effort", "voltage"} and chosen.solution.model["input_gain"] < 0.0
     return OutputErrorFit(
-        chosen, tuple(candidates), tuple(pieces), scale, options, window, flipped, offsets, reading
+        chosen,
+        tuple(candidates),
+        tuple(pieces),
+        scale,
+        options,
+        window,
+        flipped,
+        offset_candidates=offsets,
+        reading=reading,
+        zeros=zeros,
+        recordings=tuple(recordings),
     )
 
 

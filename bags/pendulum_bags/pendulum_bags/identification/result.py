@@ -6,7 +6,7 @@ import hashlib
 import json
 import platform
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from datetime import datetime, timezone
 from pathlib import Path
 from typing import Any
@@ -25,9 +25,10 @@ from pendulum_bags.identification.model import (
 )
 from pendulum_bags.identification.options import DEFAULTS, Options
 from pendulum_bags.identification.output_error import OutputErrorFit, fit_output_error
-from pendulum_bags.identification.problem import Piece
+from pendulum_bags.identification.problem import Piece, prepare
 from pendulum_bags.identification.residual_tests import INCOMPLETE, ResidualTests, residual_tests
 from pendulum_bags.identification.selection import Candidate
+from pendulum_bags.identification.solver import solve
 from pendulum_bags.identification.uncertainty import Interval, Uncertainty, assess
 from pendulum_bags.identification.window_score import WindowScore, free_run, window_score
 from pendulum_bags.runs.datasets import INPUT_KINDS, Recording, data_notes, distinct_names
@@ -54,6 +55,7 @@ class IdentificationResult:
         held_out: Scores on recordings that took no part in the fit, by name.
         created: Date, ISO 8601.
         explained: How much of the motion the fit explains.
+        moved_zeros: Held-out recordings whose zero lies elsewhere: by how much [rad], and their rms with it [rad].
     """
 
     fit: OutputErrorFit
@@ -63,6 +65,7 @@ class IdentificationResult:
     held_out: Mapping[str, WindowScore]
     created: str
     explained: Explained
+    moved_zeros: Mapping[str, tuple[float, float]] = field(default_factory=dict)
 
     @property
     def model(self) -> FitModel:
@@ -103,6 +106,11 @@ class IdentificationResult:
         if self.tests.incomplete:
             said.append(tests.pop(0))
         said.extend(self._of_the_data())
+        said.extend(
+            f"Held out, {name}: its zero lies {offset:+.4f} rad from that of the fit (homing?); with a zero of its "
+            f"own the parameters miss it by {1e3 * own:.3g} mrad."
+            for name, (offset, own) in self.moved_zeros.items()
+        )
         if self.score is None:
             said.append(
                 "There is one window only: no held-out score; give a longer recording or a shorter --window."
@@ -116,6 +124,15 @@ class IdentificationResult:
             for name, piece in self._named()
             if _looks_held(piece.recording, self.uncertainty.intervals.get("transport_delay"))
         )
+        zeros = self.fit.zeros
+        if zeros is not None:
+            listing = ", ".join(
+                f"{name} {value:+.4f}" for (name, _), value in zip(self._named(), zeros.values, strict=True)
+            )
+            said.append(
+                f"Each recording has a zero of its own (homing, or the tare of the torque): {zeros.name} is {listing} "
+                f"{UNITS[zeros.name]} beside the common one, which is their mean."
+            )
         if self.fit.sign_flipped:
             said.append(
                 "The recorded effort has the opposite sign of the motion that it causes (an external torque?): the fit "
@@ -168,6 +185,9 @@ class IdentificationResult:
             "training_rms": chosen.training_rms,
             "natural_frequency": self.model.natural_frequency,
             "sign_flipped": self.fit.sign_flipped,
+            "own_zeros": None
+            if self.fit.zeros is None
+            else {"name": self.fit.zeros.name, "values": self.fit.zeros.values.tolist()},
             "parameters": {n: self.model[n] for n in UNITS},
             "units": dict(UNITS),
             "fitted": list(chosen.free),
@@ -214,7 +234,7 @@ class IdentificationResult:
             },
             "incomplete": self.tests.incomplete or self.explained.doubt is not None,
             "sentences": self.sentences(),
-            "data": [_fingerprint(p.recording) for p in self.fit.pieces],
+            "data": [_fingerprint(recording) for recording in self.fit.recordings],
         }
 
     def write(self, path: str | Path, *, name: str = "identified", effort_limit: float = 13.0) -> Path:
@@ -242,7 +262,7 @@ class IdentificationResult:
         provenance: dict[str, Any] = {
             "method": "output error, multiple shooting",
             "date": self.created,
-            "data": [_fingerprint(p.recording) for p in self.fit.pieces],
+            "data": [_fingerprint(recording) for recording in self.fit.recordings],
             "friction": candidate.friction,
             "held_out_rms_rad": candidate.score,
             "training_rms_rad": candidate.training_rms,
@@ -267,18 +287,18 @@ class IdentificationResult:
         """Return the intervals of what the plant file holds, and remarks on those that are of something else."""
         intervals: dict[str, tuple[float, float]] = {}
         remarks = []
-        for field, interval in self.uncertainty.intervals.items():
-            if field not in PlantParameters.__dataclass_fields__:
+        for name, interval in self.uncertainty.intervals.items():
+            if name not in PlantParameters.__dataclass_fields__:
                 continue
-            value = float(getattr(plant, field))
+            value = float(getattr(plant, name))
             # A delay that may be 0 keeps the part of its interval that a plant can have.
-            low = max(interval.low, 0.0) if field == "transport_delay" else interval.low
+            low = max(interval.low, 0.0) if name == "transport_delay" else interval.low
             if low <= value <= interval.high:
-                intervals[field] = (low, interval.high)
+                intervals[name] = (low, interval.high)
             else:
                 remarks.append(
-                    f"{field} is {value:g} {UNITS[field]} here, and {interval.value:.5g} ({interval.low:.5g} to "
-                    f"{interval.high:.5g}) {UNITS[field]} in the recording: {_DIFFERENCES.get(field, 'see the JSON')}"
+                    f"{name} is {value:g} {UNITS[name]} here, and {interval.value:.5g} ({interval.low:.5g} to "
+                    f"{interval.high:.5g}) {UNITS[name]} in the recording: {_DIFFERENCES.get(name, 'see the JSON')}"
                 )
         return intervals, remarks
 
@@ -341,7 +361,22 @@ def identify(
         else:
             scores[name] = window_score(fit.model, recording, fit.window)
     created = datetime.now(timezone.utc).isoformat(timespec="seconds")
-    return IdentificationResult(fit, uncertainty, tests, geometry, scores, created, account)
+    moved = {
+        name: found
+        for name, recording in zip(scores, held_out, strict=True)
+        if (found := _moved_zero(fit, recording, scores[name].rms)) is not None
+    }
+    return IdentificationResult(fit, uncertainty, tests, geometry, scores, created, account, moved)
+
+
+def _moved_zero(fit: OutputErrorFit, recording: Recording, rms: float) -> tuple[float, float] | None:
+    """Return how far the zero of a recording lies from that of the fit [rad] and its rms with it, if that is better."""
+    if recording.input_kind == "position_goal":
+        return None
+    piece = prepare(recording, fit.window)
+    found = solve(fit.model, [piece], ("angle_offset",), scale=fit.scale, tolerance=1e-5, max_iterations=20)
+    own = window_score(found.model, recording, fit.window).rms
+    return (found.model["angle_offset"] - fit.model["angle_offset"], own) if own < 0.8 * rms else None
 
 
 def _check_distinct(recordings: Sequence[Recording], held_out: Sequence[Recording]) -> None:
