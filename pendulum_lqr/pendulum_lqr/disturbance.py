@@ -97,6 +97,8 @@ DISTURBANCE_SPECS: tuple[ParameterSpec, ...] = (
 )
 """Parameters of every kind; each kind reads those that it needs."""
 
+_MOST_BANDWIDTH = 0.25
+"""Bandwidth of coloured noise per rate of its samples, up to which its -3 dB point lies where it should [-]."""
 _RANDOM_KINDS = frozenset({"uniform", "gaussian", "prbs"})
 
 # Taps (1-based) of maximum-length shift registers; P. Alfke, Xilinx XAPP 052, 1996, table 3.
@@ -199,6 +201,12 @@ def _gaussian(p: Mapping[str, Any], hold_ns: int) -> Disturbance:
     """
     amplitude, seed, bandwidth = p["amplitude"], p["seed"], p["bandwidth"]
     weights = [1.0]
+    if bandwidth * hold_ns > _MOST_BANDWIDTH * NANOSECONDS:
+        raise ParameterError(
+            f"bandwidth is {bandwidth:g} Hz with hold_time {hold_ns / NANOSECONDS:g} s, whose samples would be white; "
+            f"expected at most {_MOST_BANDWIDTH}/hold_time = {_MOST_BANDWIDTH * NANOSECONDS / hold_ns:g} Hz, or 0 for "
+            "white noise"
+        )
     if bandwidth > 0.0:
         sigma = math.sqrt(math.log(2.0)) / (2.0 * math.pi * bandwidth) * NANOSECONDS / hold_ns
         reach = math.ceil(4.0 * sigma)
@@ -252,6 +260,15 @@ def _prbs(p: Mapping[str, Any], hold_ns: int) -> Disturbance:
     return torque
 
 
+def _require_sampled(name: str, frequency: float, hold_ns: int) -> None:
+    """Refuse a frequency that samples held so long show as another one, or as nothing at all (Shannon's limit)."""
+    if 2.0 * frequency * hold_ns >= NANOSECONDS:
+        raise ParameterError(
+            f"{name} is {frequency:g} Hz with hold_time {hold_ns / NANOSECONDS:g} s, whose samples would show another "
+            f"frequency; expected less than 0.5/hold_time = {0.5 * NANOSECONDS / hold_ns:g} Hz, or hold_time 0"
+        )
+
+
 def _held(signal: Callable[[float], float], hold_ns: int) -> Disturbance:
     def torque(time_ns: int) -> float:
         if time_ns < 0:
@@ -264,18 +281,22 @@ def _held(signal: Callable[[float], float], hold_ns: int) -> Disturbance:
 def _sine(p: Mapping[str, Any], hold_ns: int) -> Disturbance:
     """Sine that starts at zero."""
     amplitude, omega = p["amplitude"], 2.0 * math.pi * p["frequency"]
+    _require_sampled("frequency", p["frequency"], hold_ns)
     return _held(lambda t: amplitude * math.sin(omega * t), hold_ns)
 
 
 def _multisine(p: Mapping[str, Any], hold_ns: int) -> Disturbance:
     """Periodic sum of cosines with random phases, whose largest torque is the amplitude."""
     omega, phases, scale = multisine_wave(p)
+    _require_sampled("highest line", float(np.max(omega)) / (2.0 * math.pi), hold_ns)
     return _held(lambda t: scale * float(np.cos(omega * t + phases).sum()), hold_ns)
 
 
 def _chirp(p: Mapping[str, Any], hold_ns: int) -> Disturbance:
     """Exponential sweep: equal time in every octave; Farina, AES 108th Convention, 2000, eq. 4."""
     amplitude, low, high, length = p["amplitude"], p["frequency"], p["frequency_end"], p["sweep_time"]
+    _require_sampled("frequency", low, hold_ns)
+    _require_sampled("frequency_end", high, hold_ns)
     rate = math.log(high / low) / length
     scale = 2.0 * math.pi * low
 
@@ -298,6 +319,12 @@ def _pulse_train(p: Mapping[str, Any], hold_ns: int) -> Disturbance:
     amplitude, start, width, period = p["amplitude"], p["start_time"], p["pulse_width"], 1.0 / p["frequency"]
     if width > period:
         raise ParameterError(f"pulse_width is {width} s; expected at most 1/frequency = {period:g} s")
+
+    if width * NANOSECONDS < hold_ns:
+        raise ParameterError(
+            f"pulse_width is {width:g} s with hold_time {hold_ns / NANOSECONDS:g} s, between whose samples a pulse may "
+            "fall; expected at least hold_time, or hold_time 0"
+        )
 
     def signal(t: float) -> float:
         if t < start:

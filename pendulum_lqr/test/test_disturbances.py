@@ -67,6 +67,23 @@ def test_gaussian_has_its_deviation_and_its_bandwidth():
     assert power[frequencies > 40.0].mean() < 1e-3 * level
 
 
+@pytest.mark.parametrize("share", [0.1, 0.25])
+def test_the_bandwidth_of_gaussian_noise_is_its_3_db_point_up_to_the_largest_that_is_taken(share):
+    values = torques(
+        make_disturbance({"kind": "gaussian", "bandwidth": 100.0 * share}), np.arange(10000) * 10 * MS
+    )
+    frequencies, power = scipy.signal.welch(values, fs=1.0, nperseg=512)
+    level = power[(frequencies > 0.004) & (frequencies < 0.3 * share)].mean()
+    at_cut = power[np.abs(frequencies - share) < 0.1 * share].mean()
+    assert at_cut / level == pytest.approx(0.5, abs=0.12)
+
+
+def test_a_sine_keeps_its_amplitude_up_to_the_largest_frequency_that_is_taken():
+    for frequency in (1.0, 20.0, 49.0):
+        values = torques(make_disturbance({"kind": "sine", "frequency": frequency}), np.arange(1000) * 10 * MS)
+        assert values.std() == pytest.approx(2.5 / math.sqrt(2.0), rel=0.01)
+
+
 def test_gaussian_without_bandwidth_is_white_and_one_too_narrow_is_refused():
     values = torques(make_disturbance({"kind": "gaussian", "bandwidth": 0.0}), np.arange(5000) * 10 * MS)
     assert abs(np.corrcoef(values[1:], values[:-1])[0, 1]) < 0.05
@@ -169,6 +186,13 @@ def test_a_bad_recording_is_refused(times, values, message):
         ({"kind": "pulse_train", "pulse_width": 2.0}, "expected at most 1/frequency = 1 s"),
         ({"kind": "brown"}, "kind is 'brown'; expected one of uniform"),
         ({"amplitude": math.inf}, "expected a finite number"),
+        ({"kind": "gaussian", "bandwidth": 40.0}, "would be white; expected at most 0.25/hold_time = 25 Hz"),
+        ({"kind": "sine", "frequency": 100.0}, "frequency is 100 Hz .* expected less than 0.5/hold_time = 50 Hz"),
+        ({"kind": "sine", "frequency": 50.0}, "expected less than 0.5/hold_time = 50 Hz, or hold_time 0"),
+        ({"kind": "chirp", "frequency_end": 60.0}, "frequency_end is 60 Hz with hold_time 0.01 s"),
+        ({"kind": "chirp", "frequency": 60.0, "frequency_end": 1.0}, "frequency is 60 Hz with hold_time 0.01 s"),
+        ({"kind": "multisine", "frequency_end": 60.0, "lines": 500}, "highest line is 59.75 Hz with hold_time 0.01 s"),
+        ({"kind": "pulse_train", "pulse_width": 0.005}, "between whose samples a pulse may"),
     ],
 )
 def test_a_bad_disturbance_is_refused_with_its_reason(values, message):
