@@ -4,6 +4,7 @@
 """
 
 import ast
+import sys
 from pathlib import Path
 from xml.etree import ElementTree
 
@@ -36,6 +37,10 @@ def share_files(name: str) -> list[tuple[str, list[str]]]:
     return [(f"share/{name}/{folder}", names) for folder, names in files if names]
 
 
+# For ``ros2 run`` colcon puts programs into a folder of the package; pip puts them where all commands are,
+# and must not put ``record``, ``play`` or ``info`` before those of others.
+PREFIX = "pendulum-" if {"bdist_wheel", "dist_info", "editable_wheel"} & set(sys.argv) else ""
+
 manifest = ElementTree.parse("package.xml")
 name = manifest.findtext("name", "")
 executables = read_executables(Path(name, "executables.py"))
@@ -53,6 +58,6 @@ setup(
         (f"share/{name}", ["package.xml", "LICENSE"]),
         *share_files(name),
     ],
-    entry_points={"console_scripts": [f"{program} = {target}" for program, target in executables.items()]},
+    entry_points={"console_scripts": [f"{PREFIX}{program} = {target}" for program, target in executables.items()]},
     zip_safe=False,
 )

@@ -124,6 +124,7 @@ class BridgeNode(LifecycleNode):
             more_diagnostics=self._diagnostics,
             on_command=self._on_command,
         )
+        self._interface.hardware_id = f"X5-9, {values['backend']}"
         self._feedback = self.create_publisher(JointState, "actuator/feedback", _FEEDBACK_QOS)
         self._temperature = self.create_publisher(Temperature, "actuator/winding_temperature", _FEEDBACK_QOS)
         self._supply = self.create_publisher(BatteryState, "actuator/supply", _FEEDBACK_QOS)

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pendulum_msgs_py.contract.timing import LoopStatistics, RingOfTimes, SteadyWallClock
+from pendulum_msgs_py.contract.timing import LoopStatistics, RingOfTimes, SteadyWallClock, Throttle
 
 _MS = 1_000_000
 
@@ -54,3 +54,18 @@ def test_rate_jitter_overruns_and_latency_are_what_happened() -> None:
     assert summary["command_latency_p50_us"] == 300.0
     # The rate is that since the last summary; nothing ran since.
     assert statistics.summary(2000 * _MS)["rate_hz"] == 0.0
+
+
+def test_of_many_lines_one_a_second_is_told_and_none_is_forgotten() -> None:
+    throttle = Throttle(1.0)
+    told = [throttle.ask(0.05 * k) for k in range(100)]
+    # Twenty a second for five seconds.
+    assert [k for k, left_out in enumerate(told) if left_out is not None] == [0, 20, 40, 60, 80]
+    assert [told[k] for k in (0, 20, 40, 60, 80)] == [0, 19, 19, 19, 19]
+    # How it ended is told once the time of the last line is over.
+    assert throttle.flush(4.99) == 0
+    assert throttle.flush(5.1) == 19
+    assert throttle.flush(9.0) == 0
+    # What is new is told at once.
+    assert throttle.ask(5.2) is None
+    assert throttle.ask(5.3, urgent=True) == 1

@@ -117,6 +117,7 @@ class SimulatorNode(PollingNode):
             more_diagnostics=self._diagnostics,
             on_command=self._on_command,
         )
+        self._interface.hardware_id = f"simulated {parameters.name}"
         if self._lockstep:
             self._loop: Any = LockstepLoop(
                 self._interface,

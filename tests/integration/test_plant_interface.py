@@ -221,6 +221,20 @@ def test_a_trajectory_is_followed_and_handed_over(plant: RunningProgram, peer: P
     peer.until(lambda: peer.diagnostics.get("joint_trajectory.refused.invalid") == "2", "the third refusal")
 
 
+def test_commands_that_come_too_slowly_do_not_flood_the_log(plant: RunningProgram, peer: Peer) -> None:
+    assert peer.arm().success
+    peer.stream(0.4)
+    peer.until(lambda: peer.applied[-1].effort[0] == 0.4, "the controller's torque")
+    peer.answer = None
+    for _ in range(25):
+        # 10 Hz, and commands count for 50 ms: each starts the plant and starves it.
+        peer.command.publish(peer.message(0.4))
+        peer.spin(0.1)
+    lines = [line for line in plant.output.splitlines() if "armed_effort: " in line]
+    assert len(lines) <= 10
+    plant.wait_for_output(r"\d+ changes since the last line: do commands come more slowly than every 0\.05 s\?", 5.0)
+
+
 def test_parameters_change_at_run_time_or_say_why_not(plant: RunningProgram, peer: Peer) -> None:
     def set_parameter(name: str, **value: object) -> tuple[bool, str]:
         parameter = Parameter(name=name, value=ParameterValue(**value))

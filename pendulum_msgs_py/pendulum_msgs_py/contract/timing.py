@@ -10,7 +10,7 @@ import numpy as np
 
 from pendulum_msgs_py.contract.values import NANOSECONDS
 
-__all__ = ["LoopStatistics", "RingOfTimes", "SteadyWallClock"]
+__all__ = ["LoopStatistics", "RingOfTimes", "SteadyWallClock", "Throttle"]
 
 
 class SteadyWallClock:
@@ -63,6 +63,37 @@ class RingOfTimes:
         ranks = [round((kept.size - 1) * percent / 100.0) for percent in percents]
         ordered = np.partition(kept, ranks)
         return [float(ordered[rank]) / 1e3 for rank in ranks]
+
+
+class Throttle:
+    """Lets one of many lines through in a time, and counts those that it left out.
+
+    Args:
+        interval: Least time between two lines [s].
+    """
+
+    def __init__(self, interval: float) -> None:
+        self._interval = interval
+        self._last = float("-inf")
+        self._left_out = 0
+
+    def ask(self, now: float, *, urgent: bool = False) -> int | None:
+        """Return how many lines were left out before this one, or None where it is left out too.
+
+        Args:
+            now: Time on a steady clock [s].
+            urgent: Let it through whatever was before.
+        """
+        if now - self._last < self._interval and not urgent:
+            self._left_out += 1
+            return None
+        self._last = now
+        left_out, self._left_out = self._left_out, 0
+        return left_out
+
+    def flush(self, now: float) -> int:
+        """Return how many lines were left out once their time is over, so that the last state can be told; else 0."""
+        return 0 if not self._left_out or now - self._last < self._interval else self.ask(now) or 0
 
 
 class LoopStatistics:

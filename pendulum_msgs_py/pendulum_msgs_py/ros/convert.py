@@ -136,10 +136,21 @@ def event_message(stamp_ns: int, name: str, **details: Any) -> String:
     return String(data=json.dumps({"stamp_ns": stamp_ns, "name": name, **details}, sort_keys=True))
 
 
-def diagnostic_status(name: str, level: bytes, message: str, values: Mapping[str, object]) -> DiagnosticStatus:
-    """Return a diagnostic status; numbers are written with as many digits as a reader needs."""
+def diagnostic_status(
+    name: str, level: bytes, message: str, values: Mapping[str, object], *, hardware_id: str = "none"
+) -> DiagnosticStatus:
+    """Return a diagnostic status; numbers are written with as many digits as a reader needs.
+
+    Args:
+        name: What is told of, such as ``/sim/simulator: plant``.
+        level: A constant of the message.
+        message: How it is, in words.
+        values: Figures by name.
+        hardware_id: Which device it is about; ``none`` for a program, as diagnostic_updater says.
+    """
     return DiagnosticStatus(
         name=name,
+        hardware_id=hardware_id,
         level=level,
         message=message,
         values=[KeyValue(key=key, value=_format(value)) for key, value in values.items()],

@@ -23,7 +23,7 @@ from pendulum_msgs_py.contract.cdr import encode_joint_state
 from pendulum_msgs_py.contract.cdr_trajectory import decode_joint_trajectory
 from pendulum_msgs_py.contract.commands import Refusal
 from pendulum_msgs_py.contract.supervisor import Drive, Input, Mode, PlantLimits, PlantSupervisor
-from pendulum_msgs_py.contract.timing import LoopStatistics
+from pendulum_msgs_py.contract.timing import LoopStatistics, Throttle
 from pendulum_msgs_py.contract.values import NANOSECONDS, JointCommand, JointSample
 from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.parameters import ParameterSpec
@@ -42,6 +42,8 @@ __all__ = ["LIMIT_SPECS", "PlantInterface", "limits_from_parameters"]
 
 DIAGNOSTICS_PERIOD = 0.5
 """Time between two diagnostics [s]."""
+_LEAST_BETWEEN_LINES = 1.0
+"""Time between two lines of the log about one mode [s]."""
 TRAJECTORY_AGE_LIMIT = 1.0
 """Largest distance of a trajectory's stamp from the plant's time [s]: an old wish should not move a machine."""
 
@@ -199,6 +201,7 @@ class PlantInterface:
     Attributes:
         sample: Newest state that was published.
         published_ns: System time at which it was, in which DDS notes arrivals too [ns].
+        hardware_id: Which device this is, for diagnostics.
         arrived_ns: System time at which the message being handled reached this process, for polled inputs [ns].
     """
 
@@ -223,9 +226,11 @@ class PlantInterface:
         self.published_ns = 0
         self.arrived_ns = 0
         self.on_command = on_command
+        self.hardware_id = "none"
         self.refused_trajectories: Counter[str] = Counter()
         self._more_diagnostics = more_diagnostics
         self._told_mode: tuple[Mode, bool, bool] | None = None
+        self._mode_lines = Throttle(_LEAST_BETWEEN_LINES)
         self._told_refusals = 0
         self._commanders = CommanderWatch(node, supervisor)
         self._seconds_at_check = 0
@@ -347,6 +352,7 @@ class PlantInterface:
                     self._level(),
                     f"{supervisor.mode.value}: {supervisor.reason}",
                     values,
+                    hardware_id=self.hardware_id,
                 )
             ]
         )
@@ -427,14 +433,24 @@ class PlantInterface:
         self._second_commander = seconds > self._seconds_at_check
         self._seconds_at_check = seconds
         self._tell_refusals()
+        self._tell_mode_again()
         self.publish_diagnostics()
 
     def _tell(self, drive: Drive) -> None:
         supervisor = self.supervisor
         logger = self.node.get_logger()
         text = f"{supervisor.mode.value}: {supervisor.reason}"
-        if supervisor.mode in {Mode.FAULT, Mode.E_STOP}:
+        same_mode = self._told_mode is not None and self._told_mode[0] is supervisor.mode
+        # Commands that come more slowly than they age start and starve the plant with each of them.
+        left_out = self._mode_lines.ask(time.monotonic(), urgent=not same_mode)
+        timeout = supervisor.limits.command_timeout
+        if left_out is None:
+            pass
+        elif supervisor.mode in {Mode.FAULT, Mode.E_STOP}:
             logger.error(text)
+        elif left_out:
+            many = f"{left_out} changes since the last line: do commands come more slowly than every {timeout:g} s?"
+            logger.warning(f"{text}; {many}")  # noqa: G004  # ROS's logger formats nothing
         elif drive.starved and self._told_mode is not None:
             logger.warning(text)
         else:
@@ -455,6 +471,14 @@ class PlantInterface:
             )
             self.node.get_logger().warning(f"commands refused so far: {details}")
             self._told_refusals = refused
+
+    def _tell_mode_again(self) -> None:
+        """Say how it ended where lines were left out."""
+        left_out = self._mode_lines.flush(time.monotonic())
+        if left_out:
+            supervisor = self.supervisor
+            text = f"{supervisor.mode.value}: {supervisor.reason}"
+            self.node.get_logger().info(f"{text}; {left_out} changes since the last line")
 
     def _level(self) -> bytes:
         mode = self.supervisor.mode
