@@ -16,7 +16,7 @@ from tests.processes import ProcessGroup
 PAGES = sorted(
     path
     for path in PROJECT.rglob("*.md")
-    if not {".venv", "build", "install", "runs"} & set(path.relative_to(PROJECT).parts)
+    if not {".venv", "build", "install", "node_modules", "runs"} & set(path.relative_to(PROJECT).parts)
 )
 NODES = {"simulator", "bridge", "controller", "disturbance", "effort_adapter", "record"}
 TESTED_ELSEWHERE = {

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import csv
 import json
 from pathlib import Path
 
@@ -141,6 +142,44 @@ def test_tables_have_the_columns_of_the_arrays(tmp_path: Path) -> None:
         export_bag(bag, tmp_path / "xls", "xls")
     with pytest.raises(BagError, match="exists already"):
         export_bag(bag, tmp_path / "csv", "csv")
+
+
+def multi_joint_bag(path: Path) -> Path:
+    """Write states of two joints with a hole, and messages whose lists are all empty."""
+    array = STORE.types["diagnostic_msgs/msg/DiagnosticArray"]
+    header, time = STORE.types["std_msgs/msg/Header"], STORE.types["builtin_interfaces/msg/Time"]
+    empty = array(header(time(1, 2), ""), [])
+    with open_writer(path) as writer:
+        writer.add_topic("/many", JOINT_STATE)
+        writer.add_topic("/diagnostics", array.__msgtype__)
+        writer.write("/many", 1, joint_state(2, "", ["p", "q"], [1.0, float("nan")], [], []))
+        writer.write("/diagnostics", 1, bytes(STORE.serialize_cdr(empty, array.__msgtype__)))
+    return path
+
+
+def test_lists_in_csv_are_json_that_every_parser_reads(tmp_path: Path) -> None:
+    bag = read_bag(multi_joint_bag(tmp_path / "bag"))
+    export_bag(bag, tmp_path / "csv", "csv")
+    with (tmp_path / "csv" / "many.csv").open(encoding="utf-8") as file:
+        (row,) = csv.DictReader(file)
+
+    def refuse(text: str) -> None:
+        raise AssertionError(f"{text} is no JSON")
+
+    assert json.loads(row["position"], parse_constant=refuse) == [1.0, None]
+    assert json.loads(row["velocity"], parse_constant=refuse) == []
+
+
+def test_lists_that_are_all_empty_keep_their_type_in_parquet(tmp_path: Path) -> None:
+    parquet = pytest.importorskip("pyarrow.parquet", reason="pyarrow cannot be imported with this numpy")
+    bag = read_bag(multi_joint_bag(tmp_path / "bag"))
+    export_bag(bag, tmp_path / "out")
+    many = parquet.read_schema(tmp_path / "out" / "many.parquet")
+    kinds = {name: str(many.field(name).type.value_type) for name in ("name", "position", "velocity", "effort")}
+    assert kinds == {"name": "string", "position": "double", "velocity": "double", "effort": "double"}
+    status = parquet.read_schema(tmp_path / "out" / "diagnostics.parquet").field("status").type
+    assert "null" not in str(status)
+    assert {"level", "name", "values"} <= {field.name for field in status.value_type}
 
 
 def test_tables_leave_out_the_constants_of_a_type_and_keep_times_whole_without_messages(

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import math
+from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -11,13 +13,18 @@ import numpy as np
 
 from pendulum_msgs_py.errors import BagError, ParameterError
 from pendulum_rosbag.reader.bag import Bag
+from pendulum_rosbag.reader.decode import store_for
+from pendulum_rosbag.reader.topic_info import TopicInfo
 
 if TYPE_CHECKING:
     import pandas as pd
+    from rosbags.typesys.store import Typestore
 
 __all__ = ["FORMATS", "export_bag", "to_pandas"]
 
 FORMATS = ("parquet", "csv")
+_ARROW_NAMES = {"bool": "bool_", "byte": "uint8", "char": "uint8", "octet": "uint8", "wstring": "string"}
+"""Names of ROS's types at Arrow, where they differ."""
 
 
 def to_pandas(bag: Bag, topic: str) -> pd.DataFrame:
@@ -70,10 +77,10 @@ def export_bag(bag: Bag, folder: Path, format: str = "parquet") -> list[Path]:
             if format == "csv":
                 for name in table.columns:
                     if table[name].map(lambda value: isinstance(value, list)).any():
-                        table[name] = table[name].map(json.dumps)
+                        table[name] = table[name].map(_json)
                 table.to_csv(path, index=False)
             else:
-                table.to_parquet(path, index=False)
+                _write_parquet(path, table, bag.topics[topic])
             files.append(path)
         path = folder / "metadata.json"
         path.write_text(json.dumps(bag.metadata, indent=2, sort_keys=True) + "\n", encoding="utf-8")
@@ -81,6 +88,65 @@ def export_bag(bag: Bag, folder: Path, format: str = "parquet") -> list[Path]:
     except OSError as error:
         raise BagError(f"{folder} cannot be written: {error.strerror or error}") from error
     return files
+
+
+def _json(value: Any) -> str:
+    """Return a list as JSON, which knows neither NaN nor infinity: those become null."""
+    return json.dumps(_finite(value), allow_nan=False)
+
+
+def _finite(value: Any) -> Any:
+    if isinstance(value, float) and not math.isfinite(value):
+        return None
+    if isinstance(value, dict):
+        return {key: _finite(item) for key, item in value.items()}
+    return [_finite(item) for item in value] if isinstance(value, list) else value
+
+
+def _write_parquet(path: Path, table: pd.DataFrame, info: TopicInfo) -> None:
+    """Write a table whose lists have the type of their field also where all of them are empty."""
+    import pyarrow as pa
+    import pyarrow.parquet
+
+    arrow = pa.Table.from_pandas(table, preserve_index=False)
+    if any(_is_untyped(column.type) for column in arrow.schema):
+        types = dict(_arrow_fields(info.type, store_for(info)))
+        for index, column in enumerate(arrow.schema):
+            if _is_untyped(column.type):
+                values = pa.array(table[column.name].tolist(), types[column.name])
+                arrow = arrow.set_column(index, column.name, values)
+    pyarrow.parquet.write_table(arrow, path)
+
+
+def _is_untyped(kind: Any) -> bool:
+    import pyarrow as pa
+
+    if pa.types.is_list(kind):
+        return _is_untyped(kind.value_type)
+    if pa.types.is_struct(kind):
+        return any(_is_untyped(kind.field(index).type) for index in range(kind.num_fields))
+    return bool(pa.types.is_null(kind))
+
+
+def _arrow_fields(kind: str, store: Typestore, prefix: str = "") -> Iterator[tuple[str, Any]]:
+    """Yield the columns of a message type and their Arrow types, nested fields joined by dots as in the tables."""
+    import pyarrow as pa
+    from rosbags.interfaces import Nodetype
+
+    def item(node: Any, detail: Any) -> Any:
+        if node == Nodetype.NAME:
+            return pa.struct(list(_arrow_fields(detail, store)))
+        name = _ARROW_NAMES.get(detail[0], detail[0])
+        return getattr(pa, name)()
+
+    fields: list[tuple[str, tuple[Any, Any]]] = [*store.fielddefs[kind][1]]
+    for name, (node, detail) in fields:
+        if node == Nodetype.NAME:
+            yield from _arrow_fields(detail, store, f"{prefix}{name}.")
+        elif node in {Nodetype.ARRAY, Nodetype.SEQUENCE}:
+            yield f"{prefix}{name}", pa.list_(item(*detail[0]))
+        else:
+            yield f"{prefix}{name}", item(node, detail)
 
 
 def _require_pyarrow() -> None:
