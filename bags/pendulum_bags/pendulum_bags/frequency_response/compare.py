@@ -16,11 +16,15 @@ from pendulum_lqr.model import LinearModel
 from pendulum_lqr.sampled_response import brought_to
 from pendulum_msgs_py.errors import DataError
 
-__all__ = ["Difference", "Estimate", "compare_responses", "continuous"]
+__all__ = ["SMALLEST", "Difference", "Estimate", "compare_responses", "continuous"]
 
 Array = NDArray[np.float64]
 Complex = NDArray[np.complex128]
 
+SMALLEST = 0.1
+"""Difference that counts, as a share of the response: 0.9 dB, where a sound design has 6 dB of gain margin. Smaller
+ones are often real and never matter: an encoder's step that falls alike in every period, friction under a slightly
+other motion."""
 _LEAST_LINES = 5
 
 
@@ -42,7 +46,8 @@ class Difference:
         first, second: Responses, shape (2, n) [rad/(N m), rad/s/(N m)].
         ratio: Second over first by the velocity, shape (n,).
         ratio_radius: Radius of its 95 % disc, joint over all frequencies, shape (n,).
-        probability: Of a difference at least as large at a line if the plants were the same, shape (2, n).
+        probability: Of a difference at least as large at a line if the plants differed by no more than ``SMALLEST``,
+            shape (2, n).
         gap: Chordal distance at each frequency, shape (n,).
         gap_low: Lower joint limit of it, shape (n,).
         gap_high: Upper one, shape (n,).
@@ -72,7 +77,7 @@ class Difference:
 
     @property
     def found(self) -> bool:
-        """Whether a difference was found anywhere, with an error of at most 5 % over all lines (Bonferroni)."""
+        """Whether one that counts was found anywhere, with an error of at most 5 % over all lines (Bonferroni)."""
         return bool(self.probability.size * float(self.probability.min()) < 1.0 - self.confidence)
 
     @property
@@ -126,7 +131,8 @@ def compare_responses(
     variance = spread_one**2 + spread_two**2
     # Welch and Satterthwaite: a sum of two estimated variances counts as one with so many degrees of freedom.
     freedom = variance**2 / (spread_one**4 / (first.blocks - 1.0) + spread_two**4 / (second.blocks - 1.0))
-    probability = stats.f.sf(np.abs(two - moved) ** 2 / variance, 2.0, 2.0 * freedom)
+    excess = np.maximum(np.abs(two - moved) - SMALLEST * np.abs(moved), 0.0)
+    probability = stats.f.sf(excess**2 / variance, 2.0, 2.0 * freedom)
     tail = 0.05 / probability.size
     quantile = np.sqrt(stats.f.isf(tail, 2.0, 2.0 * freedom))
     ratio = two[1] / moved[1]

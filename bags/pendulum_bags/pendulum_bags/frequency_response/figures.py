@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pendulum_bags.figures.figure import Figure, Mark, Panel, Trace
-from pendulum_bags.frequency_response.compare import Difference, continuous
+from pendulum_bags.frequency_response.compare import SMALLEST, Difference, continuous
 from pendulum_bags.frequency_response.designs import DesignResult
 from pendulum_lqr.certificate import Certifier
 from pendulum_lqr.design import DesignError, output_lqr
@@ -92,13 +92,13 @@ def _bode(responses: Sequence[MeasuredResponse], model: LinearModel, difference:
 def difference_sentence(difference: Difference) -> str:
     """Say where two plants differ."""
     if not difference.found:
-        return "No difference between simulation and hardware was found at any frequency."
+        return f"No difference above {100.0 * SMALLEST:g} % was found between simulation and hardware."
     n, total = difference.lines_that_differ, difference.frequency.size
     delay, gain = difference.delay, difference.gain
     return (
-        f"They differ at {n} of {total} frequencies, most at {difference.gap_at:.2g} Hz; over all, the hardware "
-        f"answers {abs(delay.value) * 1e3:.2f} ms {'later' if delay.value >= 0.0 else 'earlier'} and "
-        f"{gain.value:.3g} times as strongly."
+        f"They differ by more than {100.0 * SMALLEST:g} % at {n} of {total} frequencies; the gap is largest at "
+        f"{difference.gap_at:.2g} Hz. Over all, the hardware answers {abs(delay.value) * 1e3:.2f} ms "
+        f"{'later' if delay.value >= 0.0 else 'earlier'} and {gain.value:.3g} times as strongly."
     )
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from pendulum_bags.frequency_response.compare import Difference
+from pendulum_bags.frequency_response.compare import SMALLEST, Difference
 from pendulum_bags.frequency_response.designs import DesignResult
 from pendulum_bags.verdict import Evidence, Layer, LayerResult, Mark
 from pendulum_lqr.certificate import Certifier
@@ -32,10 +32,11 @@ def same_plant(
     gap = difference.nu_gap
     mark = Mark.YES if gap.high < margin else Mark.NO if gap.low > margin else Mark.UNDECIDED
     where = f"largest at {difference.gap_at:.2g} Hz"
+    total = difference.frequency.size
     found = (
-        f"a difference was found at {difference.lines_that_differ} of {difference.frequency.size} frequencies"
+        f"a difference above {100.0 * SMALLEST:g} % was found at {difference.lines_that_differ} of {total} frequencies"
         if difference.found
-        else "no difference was found at any frequency"
+        else f"no difference above {100.0 * SMALLEST:g} % was found at any frequency"
     )
     sentence = (
         f"The nu-gap between simulation and hardware is {gap.value:.3f} (95 % interval {gap.low:.3f} to "
@@ -48,8 +49,8 @@ def same_plant(
         Evidence("extra delay of the hardware", "ms", 1e3 * delay.value, 1e3 * delay.low, 1e3 * delay.high, "", told),
         Evidence("gain of the hardware beside the simulation", "", gain.value, gain.low, gain.high, "", told),
         Evidence(
-            "frequencies that differ", "", float(difference.lines_that_differ), None, None,
-            f"of {difference.frequency.size}, error 5 % over all", told,
+            f"frequencies that differ by more than {100.0 * SMALLEST:g} %", "", float(difference.lines_that_differ),
+            None, None, f"of {total}, error 5 % over all", told,
         ),
     ]  # fmt: skip
     for measured, name in ((first, "simulation"), (second, "hardware")):
