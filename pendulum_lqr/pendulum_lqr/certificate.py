@@ -18,7 +18,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from pendulum_lqr.analysis import delayed_spectral_radius
+from pendulum_lqr.design import DiscreteModel, discretise
 from pendulum_lqr.gap_metric import (
     DEFAULT_SCALING,
     Scaling,
@@ -31,7 +31,7 @@ from pendulum_lqr.machine_response import Machine
 from pendulum_lqr.model import LinearModel
 from pendulum_lqr.sampled_response import model_response
 
-__all__ = ["Certificate", "Certifier", "GapProfile", "compare_machine", "stabilises"]
+__all__ = ["Certificate", "Certifier", "GapProfile", "compare_machine", "is_stable", "stabilises"]
 
 Array = NDArray[np.float64]
 Complex = NDArray[np.complex128]
@@ -154,7 +154,19 @@ def stabilises(plant: LinearModel, K: ArrayLike, period: float) -> bool:
         K: Gain, shape (2,).
         period: Sampling period [s].
     """
-    return delayed_spectral_radius(plant, K, period) < 1.0
+    return is_stable(discretise(plant, period), K)
+
+
+def is_stable(sampled: DiscreteModel, K: ArrayLike) -> bool:
+    """Tell whether a static gain stabilises a sampled model.
+
+    Args:
+        sampled: The model; its first two states are angle and velocity.
+        K: Gain, shape (2,).
+    """
+    feedback = np.zeros((1, sampled.A.shape[0]))
+    feedback[0, :2] = np.asarray(K, dtype=np.float64)
+    return bool(np.max(np.abs(np.linalg.eigvals(sampled.A - sampled.B @ feedback))) < 1.0)
 
 
 class Certifier:
@@ -172,6 +184,7 @@ class Certifier:
         self.scaling = scaling
         self.profile = compare_machine(plant, machine, scaling)
         self._model = model_response(plant, machine.frequency, machine.period)
+        self._sampled = discretise(plant, machine.period)
         top = 0.5 / machine.period
         whole = np.concatenate([[0.0], np.geomspace(1e-3, top * (1.0 - 1e-9), 400)])
         self._whole = scaling.plant(model_response(plant, whole, machine.period))
@@ -182,7 +195,7 @@ class Certifier:
         Args:
             K: Shape (2,) [N m/rad, N m s/rad].
         """
-        stable = stabilises(self.plant, K, self.machine.period)
+        stable = is_stable(self._sampled, K)
         return self.feedback(np.asarray(K, dtype=np.complex128).reshape(2, 1), stable=stable)
 
     def feedback(self, response: ArrayLike, *, stable: bool) -> Certificate:
