@@ -57,6 +57,14 @@ class Comparison:
         return "emulated hardware" if self.is_emulated else "hardware"
 
     @property
+    def delay(self) -> float:
+        """By how much the hardware answers later: that of the test, else where the velocities correlate most [s]."""
+        tested = next((test for test in self.verdict.tests if test.quantity == "delay"), None)
+        if tested is None:
+            return self.pairs[0].delay
+        return tested.interval.estimate * (1e-3 if tested.unit == "ms" else 1.0)
+
+    @property
     def is_paired(self) -> bool:
         """Whether all runs had one disturbance on both plants."""
         return all(pair.is_paired for pair in self.pairs)
@@ -227,7 +235,11 @@ def compare_folders(
         places = pair_folders(folder)
         for place in places:
             pair = _read_pair(place)
-            busy = [f"{run.label} missed {run.missed_deadlines} states" for run in pair if run.is_disturbed]
+            busy = [
+                f"{'emulated ' * is_emulated(run)}{run.label} missed {run.missed_deadlines} states"
+                for run in pair
+                if run.is_disturbed
+            ]
             if place == folder and busy and len(places) > 1:
                 left_out.append(
                     f"The run in real time does not count, since the machine was too busy ({', '.join(busy)}); it was "

@@ -134,11 +134,12 @@ def _print(result: Comparison, answer: Answer, content: dict[str, Any]) -> None:
         console.print(warning, style="bold red", highlight=False)
     if result.is_paired:
         pair = result.pairs[0]
-        delay = pair.response.delay * 1e3
+        delay = result.delay * 1e3
+        late = "later" if delay >= 0 else "earlier"
         console.print(
             f"Alignment: the disturbances agree at {pair.clock.delay * 1e3:.2f} ms"  # type: ignore[union-attr]
             f" (correlation {pair.clock.correlation:.3f}); "  # type: ignore[union-attr]
-            f"hardware answers {abs(delay):.2f} ms {'later' if delay >= 0 else 'earlier'} than the simulation."
+            f"{result.hardware_name} answers {abs(delay):.2f} ms {late} than the simulation."
         )
     else:
         console.print(f"Not paired: {content['paired']['reason']}.")

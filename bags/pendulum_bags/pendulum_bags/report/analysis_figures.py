@@ -104,6 +104,9 @@ def alignment(data: ReportData) -> Figure:
         f"{'later' if response.delay >= 0.0 else 'earlier'}, with correlation {response.correlation:.3f} there and "
         f"{response.correlation_at_zero:.3f} as recorded."
     )
+    if data.comparison.is_paired:
+        delay = 1e3 * data.comparison.delay
+        sentence += f" Seen at one phase of the noise, as the test of the delay sees it, it is {delay:.2f} ms."
     return Figure(
         "alignment",
         "Alignment of clocks and delay",

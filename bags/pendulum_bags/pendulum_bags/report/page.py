@@ -18,6 +18,7 @@ from pendulum_bags.report.data import ReportData
 from pendulum_bags.report.tables import Table, provenance_table
 from pendulum_bags.report.wording import name_in
 from pendulum_bags.runs.run_data import timing_warning
+from pendulum_bags.verdict import Answer
 from pendulum_bags.verdict.terminal import SIGNS
 
 __all__ = ["render_page"]
@@ -75,6 +76,7 @@ def render_page(
         title=title,
         made_at=made_at,
         answer=data.answer,
+        sentence=_without_mark(data.answer),
         signs=SIGNS,
         left_out=data.comparison.left_out,
         unpaired=data.comparison.unpaired_verdict.sentence,
@@ -106,14 +108,16 @@ def _facts(data: ReportData) -> list[tuple[str, str]]:
     ]
     if comparison.is_paired:
         facts.append(("paths apart (rms)", quantity(float(pair.as_dict()["rms_position"]), "rad")))
-    facts.append(
-        (
-            "hardware answers",
-            f"{abs(1e3 * pair.response.delay):.1f} ms {'later' if pair.response.delay >= 0.0 else 'earlier'}",
-        )
-    )
+    delay = 1e3 * comparison.delay
+    facts.append(("hardware answers", f"{abs(delay):.1f} ms {'later' if delay >= 0.0 else 'earlier'}"))
     facts.append(("seed", str(data.summary.get("seed", "unknown"))))
     return facts
+
+
+def _without_mark(answer: Answer) -> str:
+    """Return the answer's sentence without the mark that stands above it."""
+    text = answer.sentence.removeprefix(f"{answer.mark.value.capitalize()}: ")
+    return text[0].upper() + text[1:]
 
 
 def _noise_note(data: ReportData) -> str:

@@ -152,11 +152,11 @@ def _tests(data: ReportData) -> Table:
         f"squares, per standard deviation of the hardware's motion where they are in %. Held against "
         f"{verdict.margins.whose}."
     )
-    if data.comparison.looks.number:
+    if looks := data.comparison.looks.number:
+        often = "once" if looks == 1 else f"{looks} times"
         sentence += (
-            f" The data were looked at {data.comparison.looks.number} times while more were recorded; the "
-            "intervals are wider "
-            "for that, so that the answer errs no more often than one look would."
+            f" The data were looked at {often}, and might have been again, while more were recorded; the intervals are "
+            "wider for that, so that the answer errs no more often than one look would."
         )
     return Table("Tests against the margins", sentence, head, rows, "Verdict")
 
