@@ -25,7 +25,7 @@ from pendulum_hw_bridge.motor_state import MotorWatch
 from pendulum_hw_bridge.output_check import OutputCheck
 from pendulum_hw_bridge.safety import SafetyMonitor
 from pendulum_hw_bridge.settings import write_settings
-from pendulum_msgs_py.contract.supervisor import Drive, DriveKind, PlantSupervisor
+from pendulum_msgs_py.contract.supervisor import Drive, DriveKind, Mode, PlantSupervisor
 from pendulum_msgs_py.contract.values import NANOSECONDS, JointSample
 from pendulum_msgs_py.errors import PendulumError
 
@@ -302,9 +302,11 @@ class Bridge:
     def _rest(self, drive: Drive, was_armed: bool) -> Outcome:
         fault = ""
         now = self.port.now_ns()
-        if was_armed and self.supervisor.mode.value == "fault":
+        if was_armed and self.supervisor.mode is Mode.FAULT:
             fault = self.last_fault = self._note("supervisor")
-        ends = self._driving and (now > self._prepared_until_ns or fault or was_armed)
+        # Prepared for arming it may wait, but not behind an e-stop.
+        waits = now <= self._prepared_until_ns and self.supervisor.mode is Mode.DISARMED
+        ends = self._driving and (was_armed or not waits)
         if ends or (self._stop_again_ns is not None and now >= self._stop_again_ns):
             self.release()
         return Outcome(drive, 0.0, fault=fault)

@@ -1,0 +1,94 @@
+"""The e-stop of the bridge answers whatever else is said to the node, as another process sees it over DDS."""
+
+from __future__ import annotations
+
+import signal
+import time
+from collections.abc import Iterator
+
+import pytest
+from sensor_msgs.msg import JointState
+from std_srvs.srv import SetBool, Trigger
+from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
+
+from pendulum_msgs_py.contract.names import JOINT
+from pendulum_msgs_py.ros import qos
+from tests.integration.test_bridge_processes import Lab
+from tests.processes import ProcessGroup
+
+POINTS = 200_000
+LATEST = 2.0
+"""Far more than the answer takes, even on a busy machine; reading the points in one call takes 6 s [s]."""
+
+
+@pytest.fixture
+def lab(processes: ProcessGroup, domain_id: int) -> Iterator[Lab]:
+    laboratory = Lab(processes)
+    yield laboratory
+    laboratory.close()
+
+
+def press(lab: Lab) -> float:
+    """Press the e-stop; return how long its answer took [s]."""
+    client = lab.node.create_client(Trigger, "bridge/e_stop")
+    lab.until(client.service_is_ready, "the e-stop")
+    begin = time.monotonic()
+    future = client.call_async(Trigger.Request())
+    lab.until(future.done, "the answer of the e-stop")
+    assert future.result().success
+    return time.monotonic() - begin
+
+
+def armed(lab: Lab) -> None:
+    lab.bridge("feedback_watchdog:=50")
+    lab.until(lambda: lab.states, "states", 60.0)
+    response = lab.call(SetBool, "bridge/arm", SetBool.Request(data=True))
+    assert response.success, response.message
+
+
+def test_a_trajectory_of_200_000_points_keeps_neither_e_stop_nor_states(lab: Lab) -> None:
+    armed(lab)
+    publisher = lab.node.create_publisher(JointTrajectory, "joint_trajectory", qos.TRAJECTORY)
+    lab.until(publisher.get_subscription_count, "the bridge")
+    message = JointTrajectory(joint_names=[JOINT])
+    message.points = [JointTrajectoryPoint(positions=[0.0]) for _ in range(POINTS)]
+    publisher.publish(message)
+    waited = press(lab)
+    print(f"e-stop answered after {1e3 * waited:.1f} ms")
+    assert waited < LATEST
+    assert lab.truth.status()["strategy"] == 0
+    refused = lab.call(SetBool, "bridge/arm", SetBool.Request(data=True))
+    assert "e-stop is latched" in refused.message
+
+
+def test_the_e_stop_answers_while_the_bridge_waits_for_a_module_that_does_not_answer(lab: Lab) -> None:
+    lab.bridge()
+    lab.until(lambda: lab.states, "states", 60.0)
+    arm = lab.node.create_client(SetBool, "bridge/arm")
+    lab.until(arm.service_is_ready, "the service")
+    lab.emulator.send_signal(signal.SIGSTOP)
+    try:
+        arming = arm.call_async(SetBool.Request(data=True))
+        waited = press(lab)
+        assert waited < LATEST
+    finally:
+        lab.emulator.send_signal(signal.SIGCONT)
+    lab.until(arming.done, "the answer to arming")
+    assert not arming.result().success
+    assert not lab.call(SetBool, "bridge/arm", SetBool.Request(data=True)).success
+    assert lab.truth.status()["strategy"] == 0
+
+
+def test_the_e_stop_answers_in_a_flood_of_commands_and_trajectories(lab: Lab) -> None:
+    armed(lab)
+    commands = lab.node.create_publisher(JointState, "effort_command", qos.COMMAND)
+    trajectories = lab.node.create_publisher(JointTrajectory, "joint_trajectory", qos.TRAJECTORY)
+    lab.until(lambda: commands.get_subscription_count() and trajectories.get_subscription_count(), "the bridge")
+    move = JointTrajectory(joint_names=[JOINT])
+    move.points = [JointTrajectoryPoint(positions=[0.0]) for _ in range(2000)]
+    for _ in range(20):
+        for _ in range(200):
+            commands.publish(JointState(name=[JOINT], effort=[1.0]))
+        trajectories.publish(move)
+    assert press(lab) < LATEST
+    assert lab.truth.status()["strategy"] == 0
