@@ -124,6 +124,16 @@ def test_gains_file_comes_back_as_it_was_written(tmp_path: Path) -> None:
         assert load_gains(write_gains(tmp_path / f"{strategy}.xml", gains)) == gains
 
 
+def test_hebi_py_reads_the_gains_that_we_write(tmp_path: Path) -> None:
+    hebi = pytest.importorskip("hebi", reason="hebi-py is not installed")
+    for strategy, gains in DEFAULT_GAINS.items():
+        command = hebi.GroupCommand(1)
+        command.read_gains(str(write_gains(tmp_path / f"{strategy}.xml", gains)))
+        assert command.control_strategy[0] == strategy
+        assert command.position_kp[0] == pytest.approx(gains.position.kp)
+        assert bool(command.velocity_d_on_error[0]) is bool(gains.velocity.d_on_error)
+
+
 def test_a_file_of_hebi_py_itself_is_read(tmp_path: Path) -> None:
     hebi = pytest.importorskip("hebi", reason="hebi-py is not installed")
     command = hebi.GroupCommand(1)

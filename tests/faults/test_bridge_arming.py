@@ -236,7 +236,7 @@ def test_a_state_of_a_newer_firmware_never_ends_in_an_exception(state: str) -> N
 
     def unknown(timeout: float) -> Feedback | None:
         record = read(timeout)
-        return None if record is None else record._replace(**{state: 77})
+        return None if record is None else record._replace(**{state: 77})  # type: ignore[arg-type]
 
     rig.port.read = unknown  # type: ignore[method-assign]
     rig.run(0.1)

@@ -1,0 +1,89 @@
+"""Parameters that are wrong together are refused by name, before anything moves."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import pytest
+
+from pendulum_hw_bridge.bridge_consistency import check_consistency
+from pendulum_hw_bridge.bridge_parameters import BRIDGE_SPECS, bridge_settings, safety_limits, trajectory_gains
+from pendulum_msgs_py.contract.drive import PlantLimits
+from pendulum_msgs_py.errors import ParameterError
+from pendulum_msgs_py.parameters import validate
+
+LIMITS: dict[str, float] = {
+    "effort": 13.0,
+    "velocity": 1.5,
+    "position_min": -4.0,
+    "position_max": 4.0,
+    "slew": 2000.0,
+    "start_effort": 2.0,
+    "starvation": 30.0,
+}
+
+
+def check(limits: dict[str, float] | None = None, **values: Any) -> None:
+    check_consistency(validate(BRIDGE_SPECS, values), PlantLimits(**{**LIMITS, **(limits or {})}))
+
+
+@pytest.mark.parametrize("backend", ["emulator", "hebi"])
+def test_the_defaults_fit_together(backend: str) -> None:
+    check(backend=backend)
+
+
+@pytest.mark.parametrize(
+    ("values", "message"),
+    [
+        ({"feedback_rate": 19.0}, "feedback_rate is 19 Hz; expected at least 20 Hz"),
+        ({"feedback_rate": 25.0, "feedback_watchdog": 26}, "feedback_watchdog is 26 periods"),
+        ({"command_lifetime": 0.019}, "command_lifetime is 0.019 s; expected at least two periods, 0.02 s"),
+        ({"backend": "hebi", "command_lifetime": 0.11}, "command_lifetime is 0.11 s; expected at most 0.1 s"),
+        ({"backend": "hebi", "feedback_watchdog": 11}, "feedback_watchdog is 11 periods, 0.11 s; expected at most 10"),
+    ],
+)
+def test_times_that_let_a_fault_act_too_long_are_refused(values: dict[str, Any], message: str) -> None:
+    with pytest.raises(ParameterError, match=message):
+        check(**values)
+
+
+@pytest.mark.parametrize(
+    ("backend", "timeout"), [("emulator", 1e9), ("emulator", 1.1), ("emulator", 0.009), ("hebi", 0.11)]
+)
+def test_a_command_counts_for_a_cycle_at_least_and_never_for_long(backend: str, timeout: float) -> None:
+    with pytest.raises(ParameterError, match="command_timeout is"):
+        check({"command_timeout": timeout}, backend=backend)
+
+
+@pytest.mark.parametrize(
+    ("name", "limit"),
+    [
+        ("velocity_limit", {"velocity": math.inf}),
+        ("effort_slew_limit", {"slew": math.inf}),
+        ("start_effort_limit", {"start_effort": math.inf}),
+        ("starvation_limit", {"starvation": math.inf}),
+        ("position_window", {"position_max": math.inf}),
+    ],
+)
+def test_a_real_machine_needs_every_limit(name: str, limit: dict[str, float]) -> None:
+    check(limit, backend="emulator")
+    with pytest.raises(ParameterError, match=f"{name} is none"):
+        check(limit, backend="hebi")
+
+
+@pytest.mark.parametrize(
+    ("sign", "offset", "ends"), [(1, 0.0, (-3.0, 4.0)), (1, 0.5, (-3.5, 3.5)), (-1, 0.5, (-3.5, 3.5))]
+)
+def test_the_firmware_gets_the_window_in_its_own_angle(sign: int, offset: float, ends: tuple[float, float]) -> None:
+    values = validate(BRIDGE_SPECS, {"joint_sign": sign, "joint_offset": offset})
+    settings = bridge_settings(
+        values, effort=1.0, velocity=1.0, gains=trajectory_gains(values), window=(-3.0, 4.0)
+    )
+    assert (settings.limits.position_min, settings.limits.position_max) == ends
+
+
+def test_measured_torque_is_limited_with_the_effort_limit() -> None:
+    assert safety_limits(validate(BRIDGE_SPECS, {}), 1.0).measured_effort == 2.0
+    assert safety_limits(validate(BRIDGE_SPECS, {})).measured_effort == 14.0
+    assert safety_limits(validate(BRIDGE_SPECS, {"measured_effort_limit": 3.0}), 1.0).measured_effort == 3.0
