@@ -8,7 +8,12 @@ from typing import Any
 import pytest
 
 from pendulum_hw_bridge.bridge_consistency import check_consistency
-from pendulum_hw_bridge.bridge_parameters import BRIDGE_SPECS, bridge_settings, safety_limits, trajectory_gains
+from pendulum_hw_bridge.bridge_parameters import (
+    BRIDGE_SPECS,
+    bridge_settings,
+    safety_limits,
+    trajectory_gains,
+)
 from pendulum_msgs_py.contract.drive import PlantLimits
 from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.parameters import validate
