@@ -20,6 +20,7 @@ from pendulum_bags.report.figures import comparison_figures, make_figures
 from pendulum_bags.report.report_cli import main
 from pendulum_bags.report.tables import make_tables, provenance_table
 from pendulum_bags.report.wording import name_in
+from pendulum_bags.report.write import _title
 from pendulum_bags.verdict import Evidence, Layer, LayerResult, Mark, write_layer
 from pendulum_msgs_py.contract.cdr import encode_joint_state
 from pendulum_rosbag.storage import open_writer
@@ -169,7 +170,16 @@ def test_two_bags_make_a_report_too(folder: Path, tmp_path: Path) -> None:
     shutil.copytree(folder / "sim", tmp_path / "a")
     shutil.copytree(folder / "hw", tmp_path / "b")
     assert main([str(tmp_path / "a"), str(tmp_path / "b"), "--png-only"]) == 0
-    assert (tmp_path / "report" / "report.html").exists()
+    page = (tmp_path / "report" / "report.html").read_text(encoding="utf-8")
+    assert "<title>a and b" in page
+    assert "2 runs" not in page
+    # Somebody's recording that happens to lie on this machine is not theirs.
+    assert not (tmp_path / "report" / "figures" / "replay.png").exists()
+
+
+def test_two_bags_of_one_name_are_told_apart_in_the_title() -> None:
+    assert _title([Path("/x/mon/sim"), Path("/x/tue/sim")], 1) == "mon/sim and tue/sim"
+    assert _title([Path("/x/mon"), Path("/x/tue")], 2) == "2 runs"
 
 
 def test_a_folder_that_is_no_run_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

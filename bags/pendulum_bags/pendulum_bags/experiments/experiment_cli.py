@@ -253,7 +253,7 @@ def _analyse(
         "answer": answer.to_json(),
     }
     write_json(folder / "summary.json", summary)
-    write_report(folder, summary, comparison=comparison, answer=answer)
+    write_report(folder, summary, comparison=comparison, recordings=None, answer=answer)
     return comparison, answer, summary
 
 

@@ -77,7 +77,7 @@ def report(
         comparison=result,
         folders=folders if len(folders) > 1 else (),
         trials=trials,
-        recordings=recording,
+        recordings=recording or (),
         formats=("png",) if png_only else ("png", "pdf"),
     )
     answer = answer_of(result, folders[0] if len(folders) == 1 else None)

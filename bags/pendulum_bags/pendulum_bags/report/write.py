@@ -36,7 +36,7 @@ def write_report(
     comparison: Comparison | None = None,
     folders: Sequence[str | os.PathLike[str]] = (),
     trials: Sequence[str | os.PathLike[str]] = (),
-    recordings: Sequence[Path] | None = None,
+    recordings: Sequence[Path] | None = (),
     margin: MarginArgument = None,
     formats: Sequence[str] = ("png", "pdf"),
     answer: Answer | None = None,
@@ -50,7 +50,8 @@ def write_report(
         comparison: A comparison that has been made already.
         folders: Run folders to pool.
         trials: Folders of the thesis's identification experiments, each with bags ``trial_1``, ``trial_2``, ...
-        recordings: Recordings of real pendulums to replay; by default the one that lies beside the project, if any.
+        recordings: Recordings of real pendulums to replay; ``None`` for the one that lies beside the project, if any:
+            the project's own experiment shows that one, a report of other runs only what was asked for.
         margin: What difference does not matter.
         formats: Formats of the figures.
         answer: The sum of all layers; by default of the comparison and of what the run folder keeps.
@@ -88,7 +89,7 @@ def write_report(
         figures,
         [name_in(table, emulated=comparison.is_emulated) for table in make_tables(data)],
         missing,
-        title=names[0] if len(names) == 1 else f"{len(names)} runs",
+        title=_title([Path(folder) for folder in folders] or [out], len(comparison.pairs)),
         made_at=datetime.now(timezone.utc).strftime("%Y-%m-%d %H:%M UTC"),
     )
     target = out / "report.html"
@@ -101,6 +102,16 @@ def write_report(
         raise BagError(f"report {target} cannot be written: {error.strerror or error}") from error
     write_figures(figures, out / "figures", formats)
     return target
+
+
+def _title(folders: Sequence[Path], runs: int) -> str:
+    """Return what a page is about: a run, the two bags of one, or how many runs."""
+    if runs > 1:
+        return f"{runs} runs"
+    names = [folder.resolve().name for folder in folders]
+    if len(set(names)) < len(names):
+        names = [f"{folder.resolve().parent.name}/{name}" for folder, name in zip(folders, names, strict=True)]
+    return " and ".join(names)
 
 
 def find_real_recording() -> Path | None:
