@@ -2,11 +2,12 @@
 
 import json
 import math
+import socket
 from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import example, given
 from hypothesis import strategies as st
 from rclpy.serialization import deserialize_message
 from sensor_msgs.msg import JointState
@@ -46,12 +47,30 @@ def test_feedback_and_commands_come_through_the_wire_unchanged() -> None:
 
 
 @given(st.binary(max_size=300), st.sampled_from([b"", wire.COMMAND, wire.FEEDBACK, wire.REQUEST, wire.REPLY]))
-def test_no_packet_of_a_stranger_raises(tail: bytes, head: bytes) -> None:
+@example(wire.encode_command(Command(position=1.0))[len(wire.COMMAND) :], wire.COMMAND)
+@example(wire.encode_command(Command(position=math.inf))[len(wire.COMMAND) :], wire.COMMAND)
+@example(wire.encode_feedback(a_record())[len(wire.FEEDBACK) :], wire.FEEDBACK)
+@example(b'{"push": 1.0}', wire.REQUEST)
+@example(b"[1]", wire.REQUEST)
+def test_a_packet_is_read_in_full_or_not_at_all(tail: bytes, head: bytes) -> None:
     packet = head + tail
-    wire.kind_of(packet)
-    wire.decode_command(packet)
-    wire.decode_feedback(packet)
-    wire.decode_json(packet)
+    sizes = [len(wire.encode_command(Command())), len(wire.encode_feedback(a_record()))]
+    command = wire.decode_command(packet)
+    assert command is None or len(packet) == sizes[0]
+    if command is not None:
+        setpoints = (command.position, command.velocity, command.effort, command.pwm)
+        assert not any(math.isinf(value) for value in setpoints)
+        assert str(wire.decode_command(wire.encode_command(command))) == str(command)
+    else:
+        assert len(packet) != sizes[0] or b"\xf0\x7f" in packet or b"\xf0\xff" in packet
+    feedback = wire.decode_feedback(packet)
+    assert (feedback is not None) == (len(packet) == sizes[1])
+    value = wire.decode_json(packet)
+    assert isinstance(value, dict)
+    if value:
+        assert json.loads(packet[len(wire.REQUEST) :]) == value or "NaN" in str(packet)
+    if head:
+        assert wire.kind_of(packet) == head
 
 
 SERVED = EmulatorServer(EmulatedX5(load_emulator("thesis")), ("127.0.0.1", 0), lambda: 0)
@@ -75,8 +94,17 @@ SERVED = EmulatorServer(EmulatedX5(load_emulator("thesis")), ("127.0.0.1", 0), l
         ).map(lambda value: wire.REQUEST + json.dumps(value).encode()),
     )
 )
-def test_no_request_of_a_stranger_brings_the_emulator_down(packet: bytes) -> None:
-    SERVED._receive(packet, ("127.0.0.1", 9), 0)
+def test_after_any_request_of_a_stranger_the_emulator_answers_and_stays_finite(packet: bytes) -> None:
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as friend:
+        friend.bind(("127.0.0.1", 0))
+        friend.settimeout(5.0)
+        SERVED._receive(packet, ("127.0.0.1", 9), 0)
+        assert math.isfinite(SERVED.actuator.push)
+        SERVED._receive(wire.encode_json(wire.REQUEST, {"id": 7, "push": 0.25}), friend.getsockname(), 0)
+        reply = wire.decode_json(friend.recv(65536))
+    assert reply["id"] == 7
+    assert not reply.get("error")
+    assert SERVED.actuator.push == 0.25
     SERVED.actuator.push = 0.0
 
 

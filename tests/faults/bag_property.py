@@ -20,6 +20,7 @@ import typer
 
 from pendulum_msgs_py.contract import names
 from pendulum_msgs_py.contract.cdr import decode_joint_state
+from pendulum_msgs_py.errors import DataError
 from pendulum_msgs_py.programs.executables import cli_main
 from pendulum_rosbag.reader import Bag, read_bag
 
@@ -75,6 +76,8 @@ def check_bag(path: Path, *, limit: float, allowance: float = 0.0) -> list[Torqu
     with read_bag(path) as bag:
         ending = f"/{names.APPLIED_EFFORT}"
         plants = [topic[: -len(ending)] for topic in bag.topics if topic.endswith(ending)]
+        if not plants:
+            raise DataError(f"{path} has no topic {names.APPLIED_EFFORT}; expected one for each plant")
         return [_check_plant(bag, plant, limit, allowance) for plant in plants]
 
 

@@ -28,6 +28,16 @@ def test_running_system_survives(system: LiveSystem, fault: Fault) -> None:
 
 
 def test_every_bag_of_the_campaign_keeps_the_rule_of_the_last_command(system: LiveSystem) -> None:
-    for bag in sorted(system.folder.glob("bag_*")):
-        for record in check_bag(bag, limit=EFFORT_LIMIT, allowance=MACHINE_PATIENCE):
-            assert record.violations == (), f"{bag.name}: {record}"
+    if not list(system.folder.glob("bag_*")):  # run alone: the faults above have recorded none
+        fault = next(fault for fault in CAMPAIGN if fault.short)
+        assert try_fault(system, fault, random.Random(fault.name)).survived
+    records = {
+        bag.name: check_bag(bag, limit=EFFORT_LIMIT, allowance=MACHINE_PATIENCE)
+        for bag in sorted(system.folder.glob("bag_*"))
+    }
+    assert records
+    assert any(record.judged > 0 for plants in records.values() for record in plants)
+    for name, plants in records.items():
+        assert plants, f"{name} has no torque"
+        for record in plants:
+            assert record.violations == (), f"{name}: {record}"
