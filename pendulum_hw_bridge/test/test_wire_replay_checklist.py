@@ -94,6 +94,11 @@ SERVED = EmulatorServer(EmulatedX5(load_emulator("thesis")), ("127.0.0.1", 0), l
         ).map(lambda value: wire.REQUEST + json.dumps(value).encode()),
     )
 )
+@example(wire.REQUEST + b'{"push": Infinity}')
+@example(wire.REQUEST + b'{"push": NaN}')
+@example(wire.REQUEST + b'{"push": 1e400}')
+@example(wire.REQUEST + b'{"settings": {"strategy": Infinity}}')
+@example(wire.REQUEST + b'{"settings": {"strategy": 3, "command_lifetime": Infinity}}')
 def test_after_any_request_of_a_stranger_the_emulator_answers_and_stays_finite(packet: bytes) -> None:
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as friend:
         friend.bind(("127.0.0.1", 0))

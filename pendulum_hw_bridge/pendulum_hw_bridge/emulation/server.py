@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import select
 import socket
 from collections.abc import Callable
@@ -14,7 +15,7 @@ from pendulum_hw_bridge.emulation.faults import ActuatorFault
 from pendulum_hw_bridge.emulation.x5 import EmulatedX5
 from pendulum_msgs_py.contract.timing import SteadyWallClock
 from pendulum_msgs_py.contract.values import NANOSECONDS
-from pendulum_msgs_py.errors import PendulumError
+from pendulum_msgs_py.errors import ParameterError, PendulumError
 
 __all__ = ["EmulatorServer"]
 
@@ -124,12 +125,15 @@ class EmulatorServer:
             if settings is not None:
                 self._configure(settings)
             if "push" in request:
-                self.actuator.push = float(request["push"])
+                push = float(request["push"])
+                if not math.isfinite(push):
+                    raise ParameterError(f"push is {push} N m; expected a finite number")
+                self.actuator.push = push
             for name in request.get("inject", []):
                 self.actuator.inject(ActuatorFault(name))
             if request.get("clear_faults"):
                 self.actuator.clear_faults()
-        except (PendulumError, TypeError, ValueError, KeyError) as error:
+        except (PendulumError, ArithmeticError, TypeError, ValueError, KeyError) as error:
             reply["error"] = str(error)
         reply.update(self._status())
         self._send(wire.encode_json(wire.REPLY, reply), sender)
