@@ -180,17 +180,13 @@ def test_a_torque_of_zeros_is_taken_for_a_free_swing():
 
 
 def test_a_recording_that_rests_most_of_the_time_is_judged_without_a_division_by_zero(known):
-    rest = np.zeros(1600)
-    time = np.concatenate((known.time[:600], 3.0 + 0.005 * np.arange(1600)))
-    effort = np.concatenate((known.input[:600], rest))
-    recording = synthetic_recording(
-        TRUTH, effort, 0.005, np.random.default_rng(0), noise=0.0, resolution=0.05
-    )
-    still = replace(recording, time=time)
+    moving = known.time < 1.95
+    still = replace(known, position=np.where(moving, known.position, 0.0), input=np.where(moving, known.input, 0.0))
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         result = identify([still], QUICK, profiles=0)
-    assert np.isfinite(result.model["gravity"])
+    # What moves is the measure: rest, which fits to the last digit, makes no motion an outside force.
+    assert len(result.tests.outliers) < 2
 
 
 def test_held_out_recordings_of_one_name_have_a_score_each(known):

@@ -264,6 +264,7 @@ def _identify(path: Path, plant: str) -> Row:
 
     found = identify([read_bag_recording(path, namespace=plant)], profiles=0).to_dict()
     row: Row = {"friction": found["friction"], "window_rms": found["training_rms"]}
+    row |= {"refused": found["explained"]["refused"], "model_incomplete": found["incomplete"]}
     for name in found["fitted"]:
         row[name] = found["parameters"][name]
         if name in found["intervals"]:
