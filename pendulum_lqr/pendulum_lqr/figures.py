@@ -301,7 +301,8 @@ def design_figures(
         span = 1.2 * math.sqrt(4.0 * max(plant.gravity, 1e-6) / plant.inertia)
         if plant.damping > 0.0:
             span = min(span, 3.0 * effort_limit / plant.damping)
-        duration = min(max(10.0 * report.time_constant, 4.0), 30.0)
+        # At its limit the torque no longer hurries what the plant does by itself: its own slow pole sets the time.
+        duration = min(max(10.0 * report.time_constant, 10.0 / max(float(model.poles[0].real), 1e-6), 4.0), 100.0)
         region = region_of_attraction(
             plant,
             gain,

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from pendulum_lqr.design import DesignError, continuous_lqr
+from pendulum_lqr.figures import design_figures
 from pendulum_lqr.model import linearise
 from pendulum_lqr.roa import proven_level, region_of_attraction, rigid_rollout, sublevel_ellipse
 from pendulum_msgs_py.plants.plant_parameters import load_plant
@@ -69,6 +70,18 @@ def test_a_limit_of_zero_is_refused():
     gain = continuous_lqr(linearise(DFKI), (10.0, 1.0), 1.0)
     with pytest.raises(DesignError, match=r"effort_limit is 0\.0 N m; expected > 0"):
         proven_level(DFKI, gain, 0.0)
+
+
+def test_a_weak_motor_on_the_overdamped_plant_reaches_as_far_as_its_torque_holds_the_weight():
+    # Without speed worth the name, 1 N m wins wherever it exceeds G sin(theta): up to asin(1 / 1.678) = 0.638 rad.
+    gain = continuous_lqr(linearise(THESIS), (100.0, 0.01), 0.1)
+    figure = design_figures(THESIS, linearise(THESIS), [("row", gain)], 0, 1.0)["phase_portrait"]
+    text = " ".join(label.get_text() for label in figure.axes[0].get_legend().get_texts())
+    assert "torque limit 1 N m" in text
+    edge = math.asin(1.0 / THESIS.gravity)
+    angles = np.array([0.5 * edge, edge - 0.01, edge + 0.01, 2.0 * edge])
+    end, _ = rigid_rollout(THESIS, gain, 1.0, 70.0)(angles, np.zeros(4))
+    assert (np.abs(end) < 0.05).tolist() == [True, True, False, False]
 
 
 def test_sampling_through_the_batch_engine_of_the_simulator_contains_the_proven_set():
