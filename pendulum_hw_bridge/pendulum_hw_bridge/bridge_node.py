@@ -23,12 +23,14 @@ from pendulum_hw_bridge.bridge import Bridge, Outcome
 from pendulum_hw_bridge.bridge_consistency import check_consistency
 from pendulum_hw_bridge.bridge_parameters import BRIDGE_SPECS
 from pendulum_hw_bridge.clocks import SteppedClock, WallClock
+from pendulum_hw_bridge.derating import Derating
+from pendulum_hw_bridge.e_stop_input_node import EStopInputServer
 from pendulum_hw_bridge.e_stop_node import EStopServer
 from pendulum_hw_bridge.feedback_message import encode_feedback
 from pendulum_hw_bridge.lab_node import with_lab_file
 from pendulum_hw_bridge.safety import SafetyMonitor
 from pendulum_hw_bridge.shared_supervisor import SharedSupervisor
-from pendulum_msgs_py.contract.supervisor import Drive, Input
+from pendulum_msgs_py.contract.supervisor import Drive, DriveKind, Input, Mode
 from pendulum_msgs_py.contract.timing import LoopStatistics, SteadyWallClock
 from pendulum_msgs_py.contract.values import NANOSECONDS, JointCommand, JointSample
 from pendulum_msgs_py.errors import PendulumError
@@ -125,6 +127,7 @@ class BridgeNode(LifecycleNode):
             on_command=self._on_command,
         )
         self._interface.hardware_id = f"X5-9, {values['backend']}"
+        self._e_stop_input: EStopInputServer | None = None
         self._feedback = self.create_publisher(JointState, "actuator/feedback", _FEEDBACK_QOS)
         self._temperature = self.create_publisher(Temperature, "actuator/winding_temperature", _FEEDBACK_QOS)
         self._supply = self.create_publisher(BatteryState, "actuator/supply", _FEEDBACK_QOS)
@@ -151,13 +154,21 @@ class BridgeNode(LifecycleNode):
             window=(limits.position_min, limits.position_max),
         )
         self._safety = bridge_parameters.safety_limits(values, limits.effort)
+        self._derating = Derating(values["derating_temperature"], values["winding_temperature_limit"])
         self._e_stop = EStopServer(self, lambda: self._supervisor.e_stop(self._interface.clock()))
+        if values["e_stop_input_timeout"] > 0.0:
+            self._e_stop_input = EStopInputServer(
+                self,
+                values["e_stop_input_timeout"],
+                lambda reason: self._supervisor.e_stop(self._interface.clock(), reason),
+                lambda: self._supervisor.mode is Mode.E_STOP,
+            )
         if values["autostart"]:
             try:
                 self._autostart()
             except BaseException:
                 # A node that was not made is not closed either, and a thread that spins ends no process cleanly.
-                self._e_stop.close()
+                self._close_e_stops()
                 raise
 
     def close(self) -> None:
@@ -169,7 +180,12 @@ class BridgeNode(LifecycleNode):
         if bridge is not None and bridge.stop_pending:
             self.get_logger().error(f"{bridge.last_fault}: press the motion stop, cut the supply")
         self._interface.publish_applied(stamp_ns, 0.0)
+        self._close_e_stops()
+
+    def _close_e_stops(self) -> None:
         self._e_stop.close()
+        if self._e_stop_input is not None:
+            self._e_stop_input.close()
 
     def release_actuator(self) -> None:
         """Let go of the actuator, on whichever way."""
@@ -203,7 +219,7 @@ class BridgeNode(LifecycleNode):
                 bridge,
                 self._statistics,
                 on_state=self._on_state,
-                decide=self._interface.decide,
+                decide=lambda: self._derated(self._interface.decide()),
                 on_outcome=self._on_outcome,
                 answer_window=values["answer_window"],
                 report=self.get_logger().error,
@@ -291,6 +307,8 @@ class BridgeNode(LifecycleNode):
     # --- arming --------------------------------------------------------------------------------------------
 
     def _prepare(self) -> str:
+        if self._e_stop_input is not None and (reason := self._e_stop_input.reason):
+            return reason
         if not self._active or self._bridge is None:
             return "bridge is not active; configure and activate it first"
         try:
@@ -324,9 +342,17 @@ class BridgeNode(LifecycleNode):
         """Carry out a decision, let simulated time pass until a stamp, and return what is measured then."""
         bridge = self._bridge
         assert bridge is not None
-        outcome = bridge.carry_out(drive, was_armed=self._supervisor.mode.armed)
+        outcome = bridge.carry_out(self._derated(drive), was_armed=self._supervisor.mode.armed)
         self._port_clock.wait_until(stamp_ns)
         return self._observe_now(stamp_ns), outcome.effort
+
+    def _derated(self, drive: Drive) -> Drive:
+        """Return a decision with its torque within what the winding's temperature leaves of the limit."""
+        feedback = None if self._bridge is None else self._bridge.feedback
+        if feedback is None or drive.kind is not DriveKind.EFFORT:
+            return drive
+        effort = self._derating.clamp(drive.effort, self._supervisor.limits.effort, feedback.winding_temperature)
+        return drive if effort == drive.effort else drive._replace(effort=effort)
 
     def _observe_now(self, stamp_ns: int) -> JointSample | None:
         bridge = self._bridge
@@ -388,6 +414,7 @@ class BridgeNode(LifecycleNode):
             {
                 "firmware_strategy": int(bridge.port.strategy),
                 "winding_temperature_degc": feedback.winding_temperature,
+                "torque_share_left": self._derating.share(feedback.winding_temperature),
                 "voltage_v": feedback.voltage,
                 "pwm": feedback.pwm_command,
                 "winding_current_a": feedback.winding_current,

@@ -151,6 +151,14 @@ BRIDGE_SPECS: tuple[ParameterSpec, ...] = (
         exclusive_minimum=True,
     ),
     _fixed(
+        "derating_temperature",
+        105.0,
+        "degC",
+        "Winding temperature from which the torque limit of effort control falls, to none at the cut-off; 0 for never.",
+        minimum=0.0,
+        maximum=155.0,
+    ),
+    _fixed(
         "feedback_watchdog",
         3,
         "-",
@@ -189,6 +197,15 @@ BRIDGE_SPECS: tuple[ParameterSpec, ...] = (
     _fixed("flat", False, "", "Emulator: the pendulum lies flat on a table, without gravity."),
     _fixed(
         "emulator_address", _DEFAULT_ADDRESS, "", "`emulator_process`: where the emulated actuator listens."
+    ),
+    _fixed(
+        "e_stop_input_timeout",
+        0.0,
+        "s",
+        "With a hardware button or joystick as e-stop: silence of `e_stop_input` that latches it as a press does; 0 "
+        "for no such input.",
+        minimum=0.0,
+        maximum=10.0,
     ),
     _fixed("hebi_log", "", "", "`hebi`: new .hebilog file that hebi-py writes beside the bag; empty for none."),
     _fixed("replay_file", "", "", "`replay`: feedback to play: a bag folder, an NPZ or a CSV file."),

@@ -14,6 +14,7 @@ from rclpy.signals import SignalHandlerOptions
 from pendulum_hw_bridge import bridge_parameters
 from pendulum_hw_bridge.actuator import ActuatorPort
 from pendulum_hw_bridge.bridge import BridgeSettings
+from pendulum_hw_bridge.bridge_consistency import check_consistency
 from pendulum_hw_bridge.bridge_node import SPECS
 from pendulum_hw_bridge.clocks import WallClock
 from pendulum_hw_bridge.lab_node import with_lab_file
@@ -90,15 +91,18 @@ def as_the_bridge(values: Mapping[str, Any]) -> AsTheBridge:
     """
     plant = bridge_parameters.plant_of(values)
     limits = limits_from_parameters(values, plant.effort_limit)
+    check_consistency(values, limits)
     gains = bridge_parameters.trajectory_gains(values)
+    mapping = bridge_parameters.effort_mapping(values, plant, gains, limits)
+    window = (limits.position_min, limits.position_max)
     settings = bridge_parameters.bridge_settings(
-        values, effort=limits.effort, velocity=min(limits.velocity, 1.5), gains=gains
+        values, effort=limits.effort, velocity=mapping.velocity_limit, gains=gains, window=window
     )
     return AsTheBridge(
         values,
         bridge_parameters.make_port(values, WallClock()),
         settings,
-        bridge_parameters.safety_limits(values),
+        bridge_parameters.safety_limits(values, limits.effort),
         plant,
-        (limits.position_min, limits.position_max),
+        window,
     )

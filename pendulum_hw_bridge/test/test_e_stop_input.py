@@ -1,0 +1,31 @@
+"""What a button has to say, and how often, for the plant to go on."""
+
+import pytest
+
+from pendulum_hw_bridge.e_stop_input import EStopInput
+
+MS = 1_000_000
+
+
+def test_a_button_that_was_never_heard_stops() -> None:
+    assert EStopInput(0.5).reason(10**12) == "e-stop button was never heard"
+
+
+def test_a_press_stops_until_it_is_released() -> None:
+    button = EStopInput(0.5)
+    button.hear(pressed=False, now_ns=0)
+    assert button.reason(100 * MS) == ""
+    button.hear(pressed=True, now_ns=200 * MS)
+    assert button.reason(200 * MS) == "e-stop button is pressed"
+    button.hear(pressed=False, now_ns=300 * MS)
+    assert button.reason(300 * MS) == ""
+
+
+@pytest.mark.parametrize(("silence", "stops"), [(499, False), (500, False), (501, True), (60_000, True)])
+def test_silence_stops_as_a_press_does(silence: int, stops: bool) -> None:
+    button = EStopInput(0.5)
+    button.hear(pressed=False, now_ns=7 * MS)
+    reason = button.reason((7 + silence) * MS)
+    assert bool(reason) is stops
+    if stops:
+        assert reason == f"e-stop button is silent for {silence} ms"
