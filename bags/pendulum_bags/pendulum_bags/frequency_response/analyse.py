@@ -7,6 +7,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from threadpoolctl import threadpool_limits
+
 from pendulum_bags.figures.render_files import write_figures
 from pendulum_bags.frequency_response.compare import Difference, compare_responses
 from pendulum_bags.frequency_response.designs import DesignResult, certify_designs
@@ -164,8 +166,10 @@ def write_analysis(
         write_layer(folder, layer)
     write_json(folder / "frequency_response.json", analysis.to_json())
     step("drawing")
-    figures = response_figures(
-        analysis.responses, analysis.model, analysis.difference, analysis.certifier, analysis.designs
-    )
+    # Thousands of small matrices: threads of the linear algebra would only get into each other's way.
+    with threadpool_limits(1):
+        figures = response_figures(
+            analysis.responses, analysis.model, analysis.difference, analysis.certifier, analysis.designs
+        )
     write_figures(figures, folder / "figures", formats)
     return write_page(folder / "frequency_response.html", analysis, figures)

@@ -79,8 +79,9 @@ def _bode(responses: Sequence[MeasuredResponse], model: LinearModel, difference:
         Panel("frequency [Hz]", "velocity per torque\n[rad/s/(N m)]", rows[2], x_log=True, y_log=True),
     ]
     lowest, highest = responses[0].frequency[0], responses[-1].frequency[-1]
+    count = " and ".join(dict.fromkeys(str(r.frequency.size) for r in responses))
     sentence = (
-        f"Measured at {', '.join(str(r.frequency.size) for r in responses)} frequencies from {lowest:.2g} to "
+        f"Measured at {count} frequencies from {lowest:.2g} to "
         f"{highest:.3g} Hz; bands hold the true response with 95 % probability, all frequencies together. Hold and "
         "folding of sampling were taken out by the model's ratio."
     )

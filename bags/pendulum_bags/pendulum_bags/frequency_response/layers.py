@@ -46,11 +46,14 @@ def same_plant(
     told = Mark.YES if mark is Mark.YES else Mark.UNDECIDED
     evidence = [
         Evidence("nu-gap", "", gap.value, gap.low, gap.high, f"below {margin:g}", mark, difference.scaling.sentence()),
-        Evidence("extra delay of the hardware", "ms", 1e3 * delay.value, 1e3 * delay.low, 1e3 * delay.high, "", told),
+        Evidence(
+            "extra delay of the hardware", "ms", 1e3 * delay.value, 1e3 * delay.low, 1e3 * delay.high, "", told,
+            "slope of the phase over all frequencies; lag and spring count too",
+        ),
         Evidence("gain of the hardware beside the simulation", "", gain.value, gain.low, gain.high, "", told),
         Evidence(
             f"frequencies that differ by more than {100.0 * SMALLEST:g} %", "", float(difference.lines_that_differ),
-            None, None, f"of {total}, error 5 % over all", told,
+            None, None, "", told, f"of {total}; error 5 % over all",
         ),
     ]  # fmt: skip
     for measured, name in ((first, "simulation"), (second, "hardware")):
