@@ -102,6 +102,18 @@ def test_the_intervals_hold_the_truth_of_many_campaigns():
     assert held >= 20
 
 
+def test_a_noise_that_all_contenders_share_does_not_blur_the_choice():
+    # Seeds differ by far more than the contenders do, but by the same for all: the pick is sure.
+    seeds = np.array([1.0, 2.0, 5.0])
+    contenders = [
+        Contender(name, *(np.column_stack([share * seeds, np.zeros((3, 2))]) for _ in range(2)))
+        for name, share in (("a", 1.0), ("b", 1.05), ("c", 1.2))
+    ]
+    found = rank(contenders)
+    assert found.regret.high == 0.0
+    assert same_choice(found).mark is Mark.YES
+
+
 def test_runs_of_a_study_and_a_folder_are_collected(tmp_path, capsys):
     metrics = {"ise": 0.01, "rms_velocity": 0.1, "effort_energy": 2.0, "success": 1.0}
     for side, factor in (("sim", 1.0), ("hw", 1.2)):

@@ -216,16 +216,20 @@ def _pearson(sim: Array, hw: Array) -> Interval:
 def _resampled(contenders: Sequence[Contender], generator: np.random.Generator) -> Array:
     """Return MMRV and regret of many resamplings, shape (replicates, 2).
 
-    The runs of each contender are drawn again, and for MMRV the contenders too: another set of them would give another.
+    Seeds are drawn again, the same for all contenders that ran under as many, since they share their disturbances; for
+    MMRV the contenders too: another set of them would give another.
     """
     costs = {}
+    draws: dict[int, NDArray[np.int64]] = {}
     for side in ("sim", "hw"):
         columns = []
         for one in contenders:
             rows = (one.sim if side == "sim" else one.hw).sum(axis=1)
             if not np.isfinite(one.cost(side)):
                 rows = np.array([np.inf])
-            columns.append(rows[generator.integers(rows.size, size=(_REPLICATES, rows.size))].mean(axis=1))
+            if rows.size not in draws:
+                draws[rows.size] = generator.integers(rows.size, size=(_REPLICATES, rows.size))
+            columns.append(rows[draws[rows.size]].mean(axis=1))
         costs[side] = np.array([_capped(row) for row in np.stack(columns, axis=1)])
     sim, hw = costs["sim"], costs["hw"]
     picked = hw[np.arange(_REPLICATES), np.argmin(sim, axis=1)]
