@@ -466,6 +466,64 @@ def test_a_topic_whose_beginning_was_missed_is_announced_before_that_is_told(
         rclpy.shutdown()
 
 
+def test_what_is_missed_while_a_topic_is_subscribed_to_anew_is_told(
+    tmp_path: Path, domain_id: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A publisher that offers less joins: its topic is subscribed to anew, while the others go on publishing."""
+    rclpy.init(domain_id=domain_id)
+    source = recorder = None
+    sent = 0
+    try:
+        source = rclpy.create_node("source")
+        steady = source.create_publisher(Float64, "/shared", qos.STATE)
+
+        def publish(count: int) -> None:
+            nonlocal sent
+            for _ in range(count):
+                steady.publish(Float64(data=float(sent)))
+                sent += 1
+
+        recorder = Recorder(RecorderOptions(tmp_path / "run", ("/shared",)), lambda: None)
+        wait_for(lambda: recorder._discover() or steady.get_subscription_count(), 30.0, "the recorder to subscribe")
+        session = recorder._session
+        assert session is not None
+
+        def received() -> int:
+            return session.counts()["/shared"].received if "/shared" in session.counts() else 0
+
+        publish(20)
+        wait_for(lambda: received() == 20, 30.0, "the first messages")
+        destroy = recorder.destroy_polled_input
+
+        def destroy_and_go_on(input: Any) -> None:
+            destroy(input)
+            publish(7)
+
+        monkeypatch.setattr(recorder, "destroy_polled_input", destroy_and_go_on)
+        best_effort = QoSProfile(depth=9, reliability=ReliabilityPolicy.BEST_EFFORT)
+        sloppy = source.create_publisher(Float64, "/shared", best_effort)
+        wait_for(lambda: recorder._discover() or sent > 20, 30.0, "the recorder to subscribe anew")
+        both = lambda: sloppy.get_subscription_count() and steady.get_subscription_count()  # noqa: E731
+        wait_for(both, 30.0, "both to be matched")
+
+        def all_told() -> bool:
+            publish(1)
+            time.sleep(0.002)
+            count = session.counts()["/shared"]
+            return count.early + count.missing > 0
+
+        wait_for(all_told, 30.0, "the gap to be told")
+        recorder.close()
+        (report,) = recorder.reports
+        count = report.topics["/shared"]
+        assert (count.early + count.missing, count.received) == (7, sent - 7)
+    finally:
+        for each in (recorder, source):
+            if each is not None:
+                each.destroy_node()
+        rclpy.shutdown()
+
+
 def test_kill_9_loses_at_most_a_fifth_of_a_second(
     tmp_path: Path, node: Node, processes: ProcessGroup
 ) -> None:

@@ -54,6 +54,11 @@ class GapCounter:
         self._departed = 0
         self._doubts: dict[int, _Doubt] = {}
 
+    def go_on_from(self, before: GapCounter) -> None:
+        """Know the publishers that another subscription to the topic has heard, by their last numbers."""
+        self._last = list(before._last)
+        self._heard = len(before._last)
+
     def see(self, sequence: int) -> int:
         """Take note of a sample, by its number at its publisher, and return how many are found to be missing."""
         last = self._last

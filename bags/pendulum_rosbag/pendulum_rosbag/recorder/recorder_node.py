@@ -279,7 +279,7 @@ class Recorder(PollingNode):
             self.destroy_polled_input(tap.source)
         with self._lock:
             try:
-                self._taps[topic] = Tap(self, topic, publishers)
+                self._taps[topic] = Tap(self, topic, publishers, tap)
             except ImportError:
                 self._refuse(topic, f"its type {publishers[0].topic_type} cannot be imported")
                 return

@@ -45,6 +45,7 @@ class Tap:
         node: The node that subscribes.
         topic: Full name.
         publishers: Who offers the topic, with their QoS.
+        before: The subscription that this one takes the place of; what is missed between them is counted, too.
 
     Raises:
         ImportError: The type of the messages is not installed.
@@ -54,7 +55,9 @@ class Tap:
         announced: The session that knows the topic.
     """
 
-    def __init__(self, node: PollingNode, topic: str, publishers: Sequence[TopicEndpointInfo]) -> None:
+    def __init__(
+        self, node: PollingNode, topic: str, publishers: Sequence[TopicEndpointInfo], before: Tap | None = None
+    ) -> None:
         name = publishers[0].topic_type
         type_hash = str(publishers[0].topic_type_hash)
         self.topic = topic
@@ -79,6 +82,8 @@ class Tap:
         with handle:
             self._matched = rclpy_implementation.EventHandle(handle, QoSSubscriptionEventType.RCL_SUBSCRIPTION_MATCHED)
         self._gaps = GapCounter(self._count_publishers)
+        if before is not None:
+            self._gaps.go_on_from(before._gaps)
 
     @property
     def is_settling(self) -> bool:
