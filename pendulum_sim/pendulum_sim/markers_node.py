@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 
+from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import Point
 from rclpy.node import Node
 from sensor_msgs.msg import JointState
@@ -16,13 +17,13 @@ from std_msgs.msg import ColorRGBA
 from visualization_msgs.msg import Marker, MarkerArray
 
 from pendulum_msgs_py.contract import names
-from pendulum_msgs_py.contract.values import NANOSECONDS
 from pendulum_msgs_py.parameters import ParameterSpec
 from pendulum_msgs_py.ros import qos
-from pendulum_msgs_py.ros.convert import command_from_bytes, stamp_to_message
+from pendulum_msgs_py.ros.convert import command_from_bytes, plant_mode, stamp_to_message
 from pendulum_msgs_py.ros.parameters import NodeParameters
 from pendulum_msgs_py.ros.plant_loop import create_wall_timer
 from pendulum_msgs_py.ros.runner import run_node
+from pendulum_sim.shown_torques import SHOWN_TOPICS, ShownTorques
 
 __all__ = ["SPECS", "MarkersNode", "arc_points", "main"]
 
@@ -38,8 +39,6 @@ SPECS: tuple[ParameterSpec, ...] = (
 
 _FULL_ARC = 1.5 * math.pi
 _STEPS = 48
-_STALE_NS = NANOSECONDS // 2
-"""Age at which a torque is no longer drawn, by the clock of the newest one."""
 _ARCS = {
     names.APPLIED_EFFORT: (0, 1.0, (0.13, 0.47, 0.71)),
     names.DISTURBANCE: (1, 1.3, (0.89, 0.47, 0.10)),
@@ -84,9 +83,10 @@ class MarkersNode(Node):
     def __init__(self, stop: Callable[[], None]) -> None:
         super().__init__("markers")
         self._settings = NodeParameters(self, SPECS)
-        self._torques: dict[str, tuple[int, float]] = {}
+        self._torques = ShownTorques()
         self._publisher = self.create_publisher(MarkerArray, "markers", qos.TRAJECTORY)
-        for topic in _ARCS:
+        self.create_subscription(DiagnosticArray, names.DIAGNOSTICS, self._on_diagnostics, qos.DIAGNOSTICS)
+        for topic in SHOWN_TOPICS:
             self.create_subscription(JointState, topic, self._receiver(topic), qos.NEWEST_STATE, raw=True)
         create_wall_timer(self, 1.0 / self._settings["rate"], self._publish)
 
@@ -94,20 +94,21 @@ class MarkersNode(Node):
         def receive(data: bytes) -> None:
             command = command_from_bytes(data)
             if command is not None and math.isfinite(command.effort):
-                self._torques[topic] = (command.stamp_ns, command.effort)
+                self._torques.note(topic, command.stamp_ns, command.effort)
 
         return receive
 
+    def _on_diagnostics(self, message: DiagnosticArray) -> None:
+        self._torques.mode = plant_mode(message, self.get_namespace()) or self._torques.mode
+
     def _publish(self) -> None:
-        newest = max((stamp for stamp, _ in self._torques.values()), default=0)
+        newest = self._torques.newest_ns
         self._publisher.publish(MarkerArray(markers=[self._marker(topic, newest) for topic in _ARCS]))
 
     def _marker(self, topic: str, newest_ns: int) -> Marker:
         number, factor, (red, green, blue) = _ARCS[topic]
-        stamp_ns, effort = self._torques.get(topic, (0, 0.0))
-        points = []
-        if newest_ns - stamp_ns < _STALE_NS:
-            points = arc_points(effort, self._settings["effort_scale"], factor * self._settings["radius"])
+        effort = self._torques.acting(topic, newest_ns)
+        points = arc_points(effort, self._settings["effort_scale"], factor * self._settings["radius"])
         marker = Marker(ns=topic, id=number, type=Marker.LINE_STRIP)
         marker.header.frame_id = self._settings["frame"]
         marker.header.stamp = stamp_to_message(newest_ns)

@@ -7,6 +7,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import numpy as np
+from diagnostic_msgs.msg import DiagnosticArray
 from numpy.typing import NDArray
 from rclpy.node import Node
 from sensor_msgs.msg import JointState
@@ -17,11 +18,12 @@ from pendulum_msgs_py.contract.values import NANOSECONDS, JointSample
 from pendulum_msgs_py.errors import ParameterError, PendulumError
 from pendulum_msgs_py.parameters import ParameterSpec
 from pendulum_msgs_py.ros import qos
-from pendulum_msgs_py.ros.convert import command_from_bytes, sample_from_bytes
+from pendulum_msgs_py.ros.convert import command_from_bytes, plant_mode, sample_from_bytes
 from pendulum_msgs_py.ros.parameters import NodeParameters
 from pendulum_msgs_py.ros.plant_loop import create_wall_timer
 from pendulum_msgs_py.ros.runner import run_node
 from pendulum_sim.drawing import PendulumPicture, Window, save_gif, save_png
+from pendulum_sim.shown_torques import SHOWN_TOPICS, ShownTorques
 
 __all__ = ["SPECS", "ViewerNode", "main"]
 
@@ -68,8 +70,6 @@ SPECS: tuple[ParameterSpec, ...] = (
     ),
     ParameterSpec("duration", 0.0, "s", "Time after which to end; 0 for never.", minimum=0.0, read_only=True),
 )
-_STALE = 0.5
-"""Age at which a torque is no longer drawn, by the clock of the states [s]."""
 
 
 class ViewerNode(Node):
@@ -95,13 +95,14 @@ class ViewerNode(Node):
         self._window = Window(self._picture, title) if values["window"] else None
         self._sample: JointSample | None = None
         self._start_ns: int | None = None
-        self._torques: dict[str, tuple[int, float]] = {}
+        self._torques = ShownTorques()
         self._drawn = 0
         self._every = max(1, round(values["fps"] / values["gif_fps"]))
         kept = max(1, round(values["gif_duration"] * values["fps"] / self._every)) if values["gif"] else 1
         self._frames: deque[NDArray[np.uint8]] = deque(maxlen=kept)
         self.create_subscription(JointState, names.JOINT_STATES, self._on_state, qos.NEWEST_STATE, raw=True)
-        for topic in (names.APPLIED_EFFORT, names.DISTURBANCE, names.PUSH):
+        self.create_subscription(DiagnosticArray, names.DIAGNOSTICS, self._on_diagnostics, qos.DIAGNOSTICS)
+        for topic in SHOWN_TOPICS:
             self.create_subscription(JointState, topic, self._receiver(topic), qos.NEWEST_STATE, raw=True)
         self.create_service(Trigger, "~/snapshot", self._on_snapshot)
         create_wall_timer(self, 1.0 / values["fps"], self._on_timer)
@@ -134,9 +135,12 @@ class ViewerNode(Node):
         def receive(data: bytes) -> None:
             command = command_from_bytes(data)
             if command is not None and np.isfinite(command.effort):
-                self._torques[topic] = (command.stamp_ns, command.effort)
+                self._torques.note(topic, command.stamp_ns, command.effort)
 
         return receive
+
+    def _on_diagnostics(self, message: DiagnosticArray) -> None:
+        self._torques.mode = plant_mode(message, self.get_namespace()) or self._torques.mode
 
     def _on_timer(self) -> None:
         self._draw()
@@ -158,10 +162,6 @@ class ViewerNode(Node):
 
     # --- picture -------------------------------------------------------------------------------------------
 
-    def _torque(self, topic: str, now_ns: int) -> float:
-        stamp_ns, effort = self._torques.get(topic, (0, 0.0))
-        return effort if abs(now_ns - stamp_ns) < _STALE * NANOSECONDS else 0.0
-
     def _draw(self) -> None:
         sample = self._sample
         if sample is None:
@@ -169,8 +169,8 @@ class ViewerNode(Node):
             time = None
         else:
             time, note = (sample.stamp_ns - (self._start_ns or 0)) / NANOSECONDS, self._topic
-        applied = self._torque(names.APPLIED_EFFORT, sample.stamp_ns)
-        disturbance = self._torque(names.DISTURBANCE, sample.stamp_ns) + self._torque(
+        applied = self._torques.acting(names.APPLIED_EFFORT, sample.stamp_ns)
+        disturbance = self._torques.acting(names.DISTURBANCE, sample.stamp_ns) + self._torque(
             names.PUSH, sample.stamp_ns
         )
         if self._window is not None:

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from builtin_interfaces.msg import Duration, Time
-from diagnostic_msgs.msg import DiagnosticStatus, KeyValue
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from rclpy.serialization import deserialize_message
 from sensor_msgs.msg import JointState
 from std_msgs.msg import String
@@ -22,6 +22,7 @@ __all__ = [
     "command_from_bytes",
     "diagnostic_status",
     "event_message",
+    "plant_mode",
     "problem_of_command",
     "problem_of_state",
     "sample_from_bytes",
@@ -155,6 +156,16 @@ def diagnostic_status(
         message=message,
         values=[KeyValue(key=key, value=_format(value)) for key, value in values.items()],
     )
+
+
+def plant_mode(message: DiagnosticArray, namespace: str) -> str:
+    """Return the mode that the plant in a namespace tells in its diagnostics, or nothing where it is not among them."""
+    prefix = namespace.rstrip("/") + "/"
+    for status in message.status:
+        name, _, what = status.name.partition(": ")
+        if what == "plant" and name.startswith(prefix) and "/" not in name[len(prefix) :]:
+            return next((pair.value for pair in status.values if pair.key == "mode"), "")
+    return ""
 
 
 def _format(value: object) -> str:

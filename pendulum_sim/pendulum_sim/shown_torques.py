@@ -1,0 +1,55 @@
+"""Which torques a picture of a plant shows: those that act on it, not those that somebody asks for."""
+
+from __future__ import annotations
+
+from pendulum_msgs_py.contract import names
+from pendulum_msgs_py.contract.drive import Mode
+from pendulum_msgs_py.contract.values import NANOSECONDS
+
+__all__ = ["SHOWN_TOPICS", "ShownTorques"]
+
+SHOWN_TOPICS = (names.APPLIED_EFFORT, names.EFFORT_COMMAND, names.DISTURBANCE, names.PUSH)
+"""Topics whose torques :class:`ShownTorques` wants to be told."""
+_STALE_NS = NANOSECONDS // 2
+"""Age at which a torque is no longer drawn, by the clock of the states [ns]."""
+_TOGETHER_NS = NANOSECONDS // 20
+"""Largest distance of the stamps of a command and a disturbance that act together: commands age in this time [ns]."""
+
+
+class ShownTorques:
+    """The newest torques of one plant, and which of them act."""
+
+    def __init__(self) -> None:
+        self.mode = ""
+        self._newest: dict[str, tuple[int, float]] = {}
+
+    def note(self, topic: str, stamp_ns: int, effort: float) -> None:
+        """Take a torque of one of ``SHOWN_TOPICS`` [N m], with its stamp [ns]."""
+        self._newest[topic] = (stamp_ns, effort)
+
+    @property
+    def newest_ns(self) -> int:
+        """Newest stamp of all [ns]; 0 before the first."""
+        return max((stamp for stamp, _ in self._newest.values()), default=0)
+
+    def acting(self, topic: str, now_ns: int) -> float:
+        """Return the torque of a topic that acts on the plant, 0 for none [N m].
+
+        A disturbance is added by the plant to a controller's fresh command, under torque control alone, and the limit
+        may take some of it away: what acts of it is what the applied torque differs from the command by.
+
+        Args:
+            topic: ``applied_effort``, ``disturbance`` or ``push``.
+            now_ns: Time by the clock of the states [ns].
+        """
+        stamp_ns, effort = self._newest.get(topic, (0, 0.0))
+        if topic not in self._newest or abs(now_ns - stamp_ns) >= _STALE_NS:
+            return 0.0
+        if topic != names.DISTURBANCE:
+            return effort
+        applied_ns, applied = self._newest.get(names.APPLIED_EFFORT, (0, 0.0))
+        command_ns, command = self._newest.get(names.EFFORT_COMMAND, (0, 0.0))
+        together = max(applied_ns, command_ns, stamp_ns) - min(applied_ns, command_ns, stamp_ns) <= _TOGETHER_NS
+        if not together or applied == 0.0 or self.mode not in {"", Mode.EFFORT.value}:
+            return 0.0
+        return max(min(0.0, effort), min(max(0.0, effort), applied - command))
