@@ -23,7 +23,7 @@ from tests.benchmarks.identification_truths import OUTSIDE, TRUTHS, covered, out
 
 
 def test_intervals_of_the_default_path_hold_the_truth():
-    """The short form of the benchmark, which counts 200 seeds."""
+    """The short form of the benchmark, which counts over more seeds and kinds."""
     hits = {}
     for name in ("white noise", "torque noise", "both offsets near one angle"):
         truth = TRUTHS[name]
