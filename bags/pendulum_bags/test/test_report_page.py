@@ -22,6 +22,7 @@ from pendulum_bags.report.tables import make_tables, provenance_table
 from pendulum_bags.report.wording import name_in
 from pendulum_bags.report.write import _title
 from pendulum_bags.verdict import Evidence, Layer, LayerResult, Mark, write_layer
+from pendulum_bags.verdict.answer import answer_of
 from pendulum_msgs_py.contract.cdr import encode_joint_state
 from pendulum_rosbag.storage import open_writer
 from tests.synthetic_runs import write_run_folder
@@ -258,7 +259,8 @@ def test_trials_alone_point_to_the_command_that_shows_them(
 def test_page_begins_with_the_answer_its_layers_and_what_to_do_next(page: Path) -> None:
     text = page.read_text(encoding="utf-8")
     top = text.split("<nav")[0]
-    assert "Yes: in this run simulation and the hardware move alike" in top
+    assert "</span>Yes</p>" in top
+    assert "In this run simulation and the hardware move alike" in top
     found = [
         top.index(title) for title in ("1 same run", "2 same plant", "3 which controllers", "4 same choice")
     ]
@@ -275,9 +277,15 @@ def test_layers_that_a_run_folder_keeps_are_in_its_report(comparison: Comparison
     text = write_report(tmp_path, comparison=comparison, recordings=[], formats=[]).read_text(
         encoding="utf-8"
     )
-    assert "No: the hardware is 0.31 away." in text
+    assert "</span>No</p>" in text
+    assert "<p>The hardware is 0.31 away." in text
     assert "Evidence: same plant" in text
     assert "0.28 to 0.35" in text
+    other = tmp_path / "other"
+    ranked = LayerResult(Layer.SAME_CHOICE, Mark.YES, "It would.", holds="the simulation's pick is the hardware's")
+    write_layer(other, ranked)
+    answer = answer_of(comparison, [tmp_path, other])
+    assert answer.sentence.endswith("What holds: the simulation's pick is the hardware's.")
 
 
 def test_every_text_of_a_report_says_that_the_hardware_was_emulated() -> None:

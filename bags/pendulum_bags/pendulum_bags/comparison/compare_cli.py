@@ -35,12 +35,20 @@ MarginsFile = Annotated[
     Path | None, typer.Option("--margins", help="File of margins, as bags/pendulum_bags/comparison/margins.yaml.")
 ]
 
+LayersOption = Annotated[
+    list[Path] | None,
+    typer.Option(
+        "--layers", help="Folder of a frequency_response or ranking experiment; several times if wanted."
+    ),
+]
+
 
 @app.command()
 def compare(
     paths: Paths,
     margin: MarginOption = None,
     margins_file: MarginsFile = None,
+    layers: LayersOption = None,
     out: Annotated[
         Path | None,
         typer.Option("--out", "-o", help="Folder for comparison.json and figures; none by default."),
@@ -77,7 +85,7 @@ def compare(
             f"got {len(paths)} paths ({', '.join(map(str, paths))}); "
             "expected a simulation and a hardware bag, or run folders that hold sim and hw"
         )
-    answer = answer_of(result, paths[0] if len(paths) == 1 else None)
+    answer = answer_of(result, [*(paths if len(paths) == 1 else ()), *(layers or ())])
     content = {**result.to_json(), "answer": answer.to_json()}
     if out is not None:
         _write(out, result, content)

@@ -11,36 +11,18 @@ from typing import Any
 from pendulum_bags.figures.figure import Figure
 from pendulum_bags.figures.render_plotly import graphs_of
 from pendulum_bags.report.page import _packed_plotly, _script_json
-from pendulum_bags.report.tables import Table
+from pendulum_bags.report.tables import Table, evidence_table
 from pendulum_bags.verdict import LayerResult, Mark
 from pendulum_msgs_py.errors import BagError
 
-__all__ = ["evidence_table", "write_layer_page"]
+__all__ = ["write_layer_page"]
 
 _OUTCOMES = {
-    Mark.YES.value: "equivalent",
-    Mark.NO.value: "not-equivalent",
+    Mark.YES.value: "yes",
+    Mark.NO.value: "no",
     Mark.UNDECIDED.value: "undecided",
     Mark.NOT_MEASURED.value: "undecided",
 }
-
-
-def evidence_table(layer: LayerResult) -> Table:
-    """Return the evidence of a layer as a table."""
-    rows = [
-        (
-            row.quantity,
-            _number(row.estimate),
-            "" if row.low is None and row.high is None else f"{_number(row.low)} to {_number(row.high)}",
-            row.unit,
-            row.expected,
-            row.mark.value if row.expected else "",
-            row.note,
-        )
-        for row in layer.evidence
-    ]
-    head = ("quantity", "estimate", "95 % interval", "unit", "expected", "holds", "note")
-    return Table(f"Evidence: {layer.layer.title}", layer.layer.question, head, rows, "")
 
 
 def write_layer_page(
@@ -99,7 +81,3 @@ def write_layer_page(
     except OSError as error:
         raise BagError(f"page {path} cannot be written: {error.strerror or error}") from error
     return path
-
-
-def _number(value: float | None) -> str:
-    return "–" if value is None else f"{value:.4g}"

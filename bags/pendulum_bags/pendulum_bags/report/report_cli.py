@@ -10,6 +10,7 @@ from typing import Annotated
 
 import typer
 
+from pendulum_bags.comparison.compare_cli import LayersOption
 from pendulum_msgs_py.errors import BagError
 from pendulum_msgs_py.programs.executables import cli_main
 
@@ -35,6 +36,7 @@ def report(
     margins_file: Annotated[
         Path | None, typer.Option("--margins", help="File of margins, as for compare.")
     ] = None,
+    layers: LayersOption = None,
     recording: Annotated[
         list[Path] | None,
         typer.Option(help="Recording of a real pendulum to replay in the report (CSV or bag)."),
@@ -47,6 +49,7 @@ def report(
     """
     from pendulum_bags.comparison import Margins, compare_folders, compare_runs
     from pendulum_bags.report import write_report
+    from pendulum_bags.report.write import margin_of
     from pendulum_bags.verdict.answer import answer_of
 
     started = time.monotonic()
@@ -61,6 +64,8 @@ def report(
     if all((folder / "sim").exists() and (folder / "hw").exists() for folder in folders):
         if not margins.stated and len(folders) == 1:
             summary = _summary(folders[0])
+            # What the run was judged by when it was recorded.
+            margins = Margins.parse(margin_of(summary))
         result = compare_folders(folders, margin=margins)
         target = out or (folders[0] if len(folders) == 1 else _common(folders))
     elif len(folders) == 2:
@@ -71,16 +76,17 @@ def report(
             folder for folder in folders if not ((folder / "sim").exists() and (folder / "hw").exists())
         )
         raise BagError(f"run folder {bad} has no bags sim and hw; expected run folders, or two bags")
+    answer = answer_of(result, [*(folders if len(folders) == 1 else ()), *(layers or ())])
     page = write_report(
         target,
-        summary,
+        {key: value for key, value in (summary or {}).items() if key != "verdict"},
         comparison=result,
         folders=folders if len(folders) > 1 else (),
         trials=trials,
         recordings=recording or (),
         formats=("png",) if png_only else ("png", "pdf"),
+        answer=answer,
     )
-    answer = answer_of(result, folders[0] if len(folders) == 1 else None)
     print(answer.sentence)
     print(f"report  {page} ({page.stat().st_size / 1e6:.1f} MB, {time.monotonic() - started:.1f} s)")
     print(f"figures {page.parent / 'figures'}")
@@ -92,7 +98,7 @@ def _summary(folder: Path) -> dict[str, object] | None:
         content = json.loads((folder / "summary.json").read_text(encoding="utf-8"))
     except (OSError, ValueError):
         return None
-    kept = ("experiment", "seed", "strategy", "versions", "git_revision")
+    kept = ("experiment", "seed", "strategy", "versions", "git_revision", "verdict")
     return {key: content[key] for key in kept if key in content} if isinstance(content, dict) else None
 
 

@@ -21,7 +21,7 @@ from pendulum_lqr.design import output_lqr
 from pendulum_lqr.model import linearise, sort_poles
 from pendulum_msgs_py.plants.plant_parameters import PLANT_SPECS
 
-__all__ = ["Table", "make_tables", "provenance_table"]
+__all__ = ["Table", "evidence_table", "make_tables", "provenance_table"]
 
 WEIGHTS = ((1.0, 0.01, 0.1), (1.0, 0.1, 0.1), (100.0, 0.01, 0.1), (100.0, 0.1, 0.1))
 """q11, q22 and r of the combinations in the thesis."""
@@ -58,7 +58,7 @@ def make_tables(data: ReportData) -> list[Table]:
     """Return all tables that the data allow, in the order of the report."""
     regressions = [table for trials in data.trials for table in _regression(trials)]
     makers = (_plants, _tests, _paired, _unpaired, _metrics, _eigenvalues, _model)
-    layers = [_evidence(result) for result in data.answer.layers if _is_further(result)]
+    layers = [evidence_table(result) for result in data.answer.layers if _is_further(result)]
     return [table for maker in makers for table in [maker(data)] if table is not None] + layers + regressions
 
 
@@ -67,8 +67,8 @@ def _is_further(result: LayerResult) -> bool:
     return result.layer is not Layer.SAME_RUN and result.mark is not Mark.NOT_MEASURED and bool(result.evidence)
 
 
-def _evidence(result: LayerResult) -> Table:
-    """Return what a layer rests on."""
+def evidence_table(result: LayerResult) -> Table:
+    """Return what a layer of the answer rests on."""
     rows = []
     for row in result.evidence:
         ends = ("–" if end is None else quantity(end) for end in (row.low, row.high))

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from pendulum_bags.replay.input_replay import InputReplay
     from pendulum_bags.verdict import Answer
 
-__all__ = ["find_real_recording", "write_report"]
+__all__ = ["find_real_recording", "margin_of", "write_report"]
 
 REAL_RECORDING = Path("dfki_torque_limited_simple_pendulum", "ddp_measured.csv")
 
@@ -68,7 +68,7 @@ def write_report(
     out = Path(run_folder)
     if comparison is None:
         comparison = compare_folders(
-            list(folders) or [out], margin=_margin_of(summary) if margin is None else margin
+            list(folders) or [out], margin=margin_of(summary) if margin is None else margin
         )
     content = {**comparison.to_json(), **(summary or {})}
     found = [find_real_recording()] if recordings is None else list(recordings)
@@ -79,7 +79,7 @@ def write_report(
         for replay in _replay(path, required=recordings is not None)
     ]
     names = [Path(folder).name for folder in folders] or [out.resolve().name]
-    kept = out if not folders else Path(folders[0]) if len(folders) == 1 else None
+    kept = [Path(folder) for folder in folders] if len(folders) == 1 else [] if folders else [out]
     answer = answer or answer_of(comparison, kept)
     data = ReportData(comparison, content, replays, names, [read_trials(path) for path in trials], answer)
     made, missing = make_figures(data)
@@ -141,7 +141,7 @@ def _replay(path: Path, *, required: bool) -> list[InputReplay]:
         return []
 
 
-def _margin_of(summary: Mapping[str, Any] | None) -> MarginArgument:
+def margin_of(summary: Mapping[str, Any] | None) -> MarginArgument:
     """Return the margins that a summary was made with, so that page and summary agree."""
     from pendulum_bags.comparison import Margins
 
