@@ -130,6 +130,7 @@ class Certificate:
         at: Frequency of it [Hz].
         worst_modulus: Smallest distance of any loop within the confidence discs from -1, the machine's own modulus
             margin with 95 % confidence; 0 where a disc reaches it.
+        possible: Whether at each frequency some plant within the confidence disc has a loop distance below 1.
     """
 
     stable_on_model: bool
@@ -139,6 +140,12 @@ class Certificate:
     distance: float
     at: float
     worst_modulus: float
+    possible: bool = False
+
+    @property
+    def undecided(self) -> bool:
+        """Whether the measurement's error alone keeps it from being certified: a longer one may do it."""
+        return self.possible and not self.certified
 
     @property
     def certified(self) -> bool:
@@ -217,14 +224,18 @@ class Certifier:
         settled = machine.up_to_nyquist or bool(
             (np.abs(second[-1]) + radius[-1] < 1.0) and (np.abs(first[-1]) < 1.0)
         )
+        nearest = np.maximum(np.abs(second - first) - radius, 0.0) / np.maximum(np.abs(1.0 + first), 1e-300)
+        nearest = np.minimum(nearest, loop_distance(first, second))
+        alike = stable and settled and _same_winding(first, second)
         return Certificate(
             stable,
             margin,
             stable and self.profile.value_upper < margin,
-            stable and bool(distance[at] < 1.0) and settled and _same_winding(first, second),
+            alike and bool(distance[at] < 1.0),
             float(distance[at]),
             float(machine.frequency[at]),
             float(max(0.0, np.min(np.abs(1.0 + second) - radius))),
+            stable and bool(np.max(nearest) < 1.0),
         )
 
 

@@ -60,7 +60,7 @@ def print_certificates(console: Console, certifier: Certifier, found: Sequence[C
             f"{one.margin:.3f}",
             f"{one.distance:.3f} at {one.at:.2g} Hz" if one.stable_on_model else "unstable on the model",
             f"{one.worst_modulus:.3f}",
-            f"yes, {how}" if one.certified else "no",
+            f"yes, {how}" if one.certified else "measure longer" if one.undecided else "no",
             style="bold cyan" if index == chosen else "",
         )
     console.print(table)

@@ -93,7 +93,8 @@ def which_controllers(certifier: Certifier, designs: Sequence[DesignResult]) -> 
     profile = certifier.profile
     good = [design for design in designs if design.certificate.certified]
     bad = [design for design in designs if not design.certificate.certified]
-    mark = Mark.YES if designs and not bad else Mark.NO
+    unsure = bool(bad) and all(design.certificate.undecided for design in bad)
+    mark = Mark.YES if designs and not bad else Mark.UNDECIDED if unsure else Mark.NO
     rows = ", ".join(f"row {i}" for i, d in enumerate(designs, 1) if d.certificate.certified)
     not_rows = ", ".join(f"row {i}" for i, d in enumerate(designs, 1) if not d.certificate.certified)
     limit = (
@@ -114,7 +115,10 @@ def which_controllers(certifier: Certifier, designs: Sequence[DesignResult]) -> 
     steps = tuple(
         f"redesign {design.name} with more margin, or identify the hardware and design again"
         for design in bad
+        if not design.certificate.undecided
     )
+    if any(design.certificate.undecided for design in bad):
+        steps += ("measure longer: python -m pendulum_bags experiment frequency_response --periods 40",)
     return LayerResult(
         Layer.WHICH_CONTROLLERS,
         mark,
@@ -134,9 +138,11 @@ def _row(design: DesignResult, limit: float) -> Evidence:
         how = "certified by its margin"
     elif found.by_frequency:
         how = f"certified frequency by frequency (loop distance {found.distance:.2f}, at {found.at:.2g} Hz)"
+    elif found.undecided:
+        how = f"loop distance {found.distance:.2f} at {found.at:.2g} Hz with the measurement's error, below 1 without"
     else:
         how = f"loop distance {found.distance:.2f} at {found.at:.2g} Hz; expected below 1"
     return Evidence(
         f"margin b(P, K), {design.name}", "", found.margin, None, None, f"above {limit:.3f}",
-        Mark.YES if found.certified else Mark.NO, how,
+        Mark.YES if found.certified else Mark.UNDECIDED if found.undecided else Mark.NO, how,
     )  # fmt: skip

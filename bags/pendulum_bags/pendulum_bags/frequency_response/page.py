@@ -35,6 +35,8 @@ def design_rows(analysis: Analysis) -> list[tuple[str, ...]]:
     for number, design in enumerate(analysis.designs, 1):
         found = design.certificate
         how = "by its margin" if found.by_gap else "by frequency" if found.by_frequency else "no"
+        if found.undecided:
+            how = "undecided: measure longer"
         rows.append(
             (
                 str(number),

@@ -26,6 +26,8 @@ _EXACT = 1e-6
 """Largest deviation of a stamp from the raster that counts as none, as a share of the period."""
 _LONGEST_GAP = 5.0
 """Longest hole between states that is bridged, in periods."""
+_SHORT_GAP = 0.05
+"""Hole that is always bridged: what it spoils of one period shows as noise [s]."""
 
 
 @dataclass(frozen=True)
@@ -94,10 +96,11 @@ def record_of_run(run: RunData) -> Record:
     # The stamps' nominal period: clocks of plants are given in whole microseconds.
     period = round(period * 1e5) / 1e5 if abs(round(period * 1e5) / 1e5 - period) < 0.01 * period else period
     longest = float(np.max(np.diff(t)))
-    if longest > _LONGEST_GAP * period:
+    bridged = max(_LONGEST_GAP * period, _SHORT_GAP)
+    if longest > bridged:
         raise DataError(
             f"{run.source or run.label} has no state for {longest * 1e3:.0f} ms; expected no hole longer than "
-            f"{_LONGEST_GAP * period * 1e3:.0f} ms ({_LONGEST_GAP:g} periods)"
+            f"{bridged * 1e3:.0f} ms"
         )
     stop = min(float(t[-1]), float(run.applied.t[-1]) + period)
     count = int(np.floor((stop - t[0]) / period + 1e-6))

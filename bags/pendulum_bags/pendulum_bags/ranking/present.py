@@ -95,8 +95,8 @@ def ranking_figure(ranking: Ranking) -> Figure:
         if chosen.any():
             traces.append(Trace(sim[chosen], hw[chosen], label, role, "points"))
     for name, label, role in (
-        (ranking.pick, "simulation's pick", "sim"),
-        (ranking.best, "best on hardware", "stable"),
+        (ranking.pick, "simulation's pick", "own alone"),
+        (ranking.best, "best on hardware", "unstable"),
     ):
         at = [i for i, other in enumerate(ranking.names) if other == name and able[i]]
         traces.append(Trace(sim[at], hw[at], label, role, "points"))
