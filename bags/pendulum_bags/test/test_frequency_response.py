@@ -13,7 +13,9 @@ from pendulum_bags.frequency_response.analyse import analyse_responses, write_an
 from pendulum_bags.frequency_response.compare import compare_responses, continuous
 from pendulum_bags.frequency_response.estimate import estimate
 from pendulum_bags.frequency_response.frequency_response_cli import main
-from pendulum_bags.frequency_response.record import Record, record_of_arrays
+from pendulum_bags.frequency_response.record import Record, record_of_arrays, record_of_run
+from pendulum_bags.runs.run_data import RunData
+from pendulum_bags.runs.series import Series, Signal
 from pendulum_bags.verdict import Layer, Mark
 from pendulum_lqr.controller_response import controller_response
 from pendulum_lqr.measured_response import MeasuredResponse
@@ -173,6 +175,25 @@ def test_the_command_reads_bags_of_any_noise(capsys):
 def test_a_design_that_is_none_is_refused(measured, text, message):
     with pytest.raises(ParameterError, match=message):
         analyse_responses([measured["hw"]], "thesis", [text])
+
+
+def test_stamps_that_jitter_and_skip_are_brought_to_the_nominal_raster():
+    generator = np.random.default_rng(4)
+    t = np.delete(0.01 * np.arange(2000) + generator.normal(0.0, 7e-4, 2000), [500, 501, 900])
+    angle = np.pi + 0.01 * np.sin(2.0 * np.pi * 3.0 * t)
+    torque = np.where(t < 10.0, 1.0, -1.0)
+    series = Series(t, angle, 0.0 * t, torque)
+    run = RunData(
+        "hw", series, series, Signal(t, torque), Signal(t, torque), None, np.diff(t), 100.0, 3,
+        metadata={"pendulum.run": {"disturbance": MULTISINE}},
+    )  # fmt: skip
+    found = record_of_run(run)
+    assert found.period == 0.01
+    raster = t[0] + 0.01 * np.arange(found.torque.size)
+    np.testing.assert_allclose(found.outputs[0], np.pi + 0.01 * np.sin(2.0 * np.pi * 3.0 * raster), atol=2e-4)
+    # A held torque keeps its mean: the one step that holds the edge shares it.
+    assert np.mean(found.torque) == pytest.approx(np.mean(np.where(raster < 10.0, 1.0, -1.0)), abs=2e-3)
+    assert np.count_nonzero(np.abs(found.torque) < 0.999) <= 1
 
 
 def test_what_cannot_be_measured_is_refused(measured):

@@ -92,9 +92,7 @@ def record_of_run(run: RunData) -> Record:
     assert run.disturbance is not None
     assert run.applied is not None
     t = run.window.t
-    period = float(np.median(np.diff(t)))
-    # The stamps' nominal period: clocks of plants are given in whole microseconds.
-    period = round(period * 1e5) / 1e5 if abs(round(period * 1e5) / 1e5 - period) < 0.01 * period else period
+    period = _nominal_period(t)
     longest = float(np.max(np.diff(t)))
     bridged = max(_LONGEST_GAP * period, _SHORT_GAP)
     if longest > bridged:
@@ -123,6 +121,14 @@ def record_of_run(run: RunData) -> Record:
         dict(disturbance) if isinstance(disturbance, Mapping) else {},
         {"source": run.source, "missed_states": run.missed_deadlines},
     )
+
+
+def _nominal_period(t: Array) -> float:
+    """Return the period of stamps that jitter: their mean step without holes, rounded to 0.1 ms where that is it."""
+    steps = np.diff(t)
+    mean = float(np.mean(steps[steps < 1.5 * np.median(steps)]))
+    nominal = round(mean * 1e4) / 1e4
+    return nominal if abs(nominal - mean) < 0.003 * mean else mean
 
 
 def _held_mean(signal: Signal, raster: Array, period: float) -> Array:
