@@ -1,0 +1,63 @@
+"""Which rules are broken, and which tests have to notice: the safety rules of both plants, without DDS."""
+
+from __future__ import annotations
+
+import importlib
+import inspect
+from collections.abc import Iterator
+from dataclasses import dataclass
+from types import FunctionType
+from typing import Any
+
+__all__ = ["TARGETS", "Target", "functions_of"]
+
+_RULES = ("pendulum_msgs_py/test/test_supervisor_rules.py", "pendulum_msgs_py/test/test_command_gate.py")
+_BRIDGE = "pendulum_hw_bridge/test"
+
+
+@dataclass(frozen=True)
+class Target:
+    """Functions of one module, and the tests that watch them.
+
+    Attributes:
+        module: Where they are.
+        names: Functions and methods by qualified name; a class stands for all of its methods.
+        tests: Files, those that notice most first.
+    """
+
+    module: str
+    names: tuple[str, ...]
+    tests: tuple[str, ...]
+
+
+TARGETS: tuple[Target, ...] = (
+    Target("pendulum_msgs_py.contract.supervisor", ("PlantSupervisor",), _RULES),
+    Target("pendulum_msgs_py.contract.commands", ("CommandGate",), tuple(reversed(_RULES))),
+    Target("pendulum_msgs_py.contract.drive", ("PlantLimits", "Drive"), _RULES),
+)
+
+
+def functions_of(target: Target) -> Iterator[tuple[str, FunctionType]]:
+    """Yield the functions of a target by their qualified names.
+
+    Raises:
+        LookupError: A name is not there any more.
+    """
+    module = importlib.import_module(target.module)
+    for name in target.names:
+        found: Any = module
+        for part in name.split("."):
+            if not hasattr(found, part):
+                raise LookupError(f"{target.module} has no {name}; expected the functions that targets.py lists")
+            found = inspect.getattr_static(found, part)
+        if inspect.isclass(found):
+            for part, member in vars(found).items():
+                yield from _function(f"{name}.{part}", member, target.module)
+        else:
+            yield from _function(name, found, target.module)
+
+
+def _function(name: str, member: Any, module: str) -> Iterator[tuple[str, FunctionType]]:
+    inner = getattr(member, "fget", None) or getattr(member, "__func__", None) or member
+    if isinstance(inner, FunctionType) and inner.__module__ == module and not inner.__qualname__.startswith("__create"):
+        yield name, inner
