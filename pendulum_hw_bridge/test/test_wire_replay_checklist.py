@@ -189,7 +189,7 @@ def test_a_wrong_recording_is_refused_with_its_place(tmp_path: Path, text: str, 
         load_feedback(tmp_path / "missing.csv")
     other = tmp_path / "run.txt"
     other.write_text(text)
-    with pytest.raises(DataError, match=r"expected \.npz or \.csv"):
+    with pytest.raises(DataError, match=r"expected \.npz, \.csv or \.hebilog"):
         load_feedback(other)
 
 

@@ -148,3 +148,13 @@ def test_what_is_fresh_is_always_finite_and_young_by_stamp_and_by_hearing(
                 # A plant that catches up with missed periods decides as of times before it heard the command.
                 assert -50 * _MS <= later - heard <= 50 * _MS
     assert gate.accepted + sum(gate.refused.values()) == len(events)
+
+
+@pytest.mark.parametrize("step_ms", [-100.0, -60.0, 60.0, 1000.0])
+def test_a_command_that_has_grown_old_stays_old_whatever_the_clock_does_then(step_ms: float) -> None:
+    gate = _gate()
+    assert gate.offer(_command(), _NOW) is None
+    assert gate.fresh(_NOW + round(step_ms * _MS)) is None
+    assert all(gate.fresh(_NOW + 5 * step * _MS) is None for step in range(-20, 20))
+    assert gate.offer(_command(age_ms=-10.0), _NOW + 10 * _MS) is None
+    assert gate.fresh(_NOW + 11 * _MS) is not None, "a new command is believed again"

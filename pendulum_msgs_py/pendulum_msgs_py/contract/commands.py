@@ -65,6 +65,7 @@ class CommandGate:
         self._newest: JointCommand | None = None
         self._heard_ns = 0
         self._holder = ""
+        self._expired = False
 
     def refuse_malformed(self, problem: str = "") -> Refusal:
         """Count a message that was no command for one joint at all, and keep what was wrong with it."""
@@ -83,6 +84,7 @@ class CommandGate:
         if refusal is None:
             self._newest = command
             self._heard_ns = now_ns
+            self._expired = False
             self._holder = command.source
             self.accepted += 1
         else:
@@ -100,11 +102,11 @@ class CommandGate:
         # Measured from the stamp and from the moment of hearing it: a clock that jumps either way only shortens it.
         age = now_ns - newest.stamp_ns
         silence = now_ns - self._heard_ns
-        # Heard "later than now" is not only a clock that stepped back: a plant that catches up with periods it missed
-        # decides as of each of them.
-        if age > self.timeout_ns or age < -self.future_tolerance_ns or abs(silence) > self.timeout_ns:
-            return None
-        return newest
+        # What has grown old stays old, whatever the clock does then: a torque does not return without a command.
+        self._expired = self._expired or age > self.timeout_ns or abs(silence) > self.timeout_ns
+        # Heard a little "later than now" is not only a clock that stepped back: a plant that catches up with periods
+        # it missed decides as of each of them.
+        return None if self._expired or age < -self.future_tolerance_ns else newest
 
     @property
     def newest_stamp_ns(self) -> int | None:
