@@ -16,7 +16,7 @@ from pendulum_msgs_py.plants.plant_parameters import load_plant
 from pendulum_sim.drawing import PendulumPicture, rotation_matrix, save_gif, save_png
 from pendulum_sim.figures import overdamped_points, plot_evolution, save_figure
 from pendulum_sim.phase_plot import main
-from pendulum_sim.plant import make_plant
+from pendulum_sim.plants import make_plant
 
 
 def test_the_thesis_has_a_stable_point_below_and_an_unstable_one_above() -> None:
