@@ -20,7 +20,8 @@ from pendulum_bags.identification.options import Options
 from pendulum_bags.identification.result import identify
 from pendulum_bags.identification.thesis import fit_gravity, fit_inertia_damping
 from pendulum_bags.identification.window_score import free_run, free_run_rms, window_rms
-from pendulum_bags.runs.datasets import Recording, read_recording
+from pendulum_bags.runs.datasets import Recording
+from pendulum_bags.runs.read_recording import read_recording
 from pendulum_rosbag.reader import read_bag, same_messages
 from tests.benchmarks import Peer, Row, measured, peer
 from tests.benchmarks.identification_truths import OUTSIDE, TRUTHS, covered, outside

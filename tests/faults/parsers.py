@@ -18,7 +18,7 @@ import numpy as np
 
 from pendulum_bags.identification.result import load_fit_model
 from pendulum_bags.runs.csv_mapping import read_csv
-from pendulum_bags.runs.datasets import read_servo_log
+from pendulum_bags.runs.read_recording import read_servo_log
 from pendulum_bags.studies.study_file import load_study
 from pendulum_hw_bridge.backends.replay import load_feedback
 from pendulum_hw_bridge.gains import DEFAULT_GAINS, load_gains, write_gains

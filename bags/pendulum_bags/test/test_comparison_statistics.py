@@ -11,10 +11,10 @@ from pendulum_bags.comparison.statistics import (
     block_length,
     bootstrap_interval,
     describe,
-    effective_size,
     kolmogorov_smirnov,
     resample,
 )
+from pendulum_bags.runs.correlation import effective_size
 from pendulum_msgs_py.errors import DataError
 
 

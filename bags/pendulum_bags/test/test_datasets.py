@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 
 from pendulum_bags.runs.csv_mapping import read_csv
-from pendulum_bags.runs.datasets import Recording, read_recording
+from pendulum_bags.runs.datasets import Recording
+from pendulum_bags.runs.read_recording import read_recording
 from pendulum_msgs_py.errors import DataError
 
 TIME = np.arange(0.0, 2.0, 0.01)

@@ -17,7 +17,7 @@ from pendulum_bags.identification.solver import solve
 from pendulum_bags.identification.synthetic import synthetic_recording
 from pendulum_bags.identification.uncertainty import unresolved_offset
 from pendulum_bags.identification.window_score import window_rms
-from pendulum_bags.runs.datasets import read_recording
+from pendulum_bags.runs.read_recording import read_recording
 from pendulum_msgs_py.plants.plant_parameters import PlantParameters
 from tests.benchmarks.identification_truths import OUTSIDE, TRUTHS, covered, outside
 

@@ -163,7 +163,7 @@ def test_plant_and_fit_model_are_two_ways_to_write_the_same():
 
 
 def test_the_score_of_the_geometry_on_the_real_swing_up_is_the_published_one(shared_data):
-    from pendulum_bags.runs.datasets import read_recording
+    from pendulum_bags.runs.read_recording import read_recording
 
     recording = read_recording(shared_data / "dfki_torque_limited_simple_pendulum" / "ddp_measured.csv")
     plant = PlantParameters(inertia=0.1495, damping=0.1, gravity=0.3055 * 9.81, coulomb_friction=0.093)

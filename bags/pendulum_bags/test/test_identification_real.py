@@ -6,7 +6,7 @@ import pytest
 from pendulum_bags.identification.options import Options
 from pendulum_bags.identification.result import identify
 from pendulum_bags.identification.window_score import free_run, free_run_rms, window_rms
-from pendulum_bags.runs.datasets import read_recording
+from pendulum_bags.runs.read_recording import read_recording
 
 
 @pytest.fixture(scope="module")

@@ -13,7 +13,8 @@ from pendulum_bags.identification.options import Geometry, Options
 from pendulum_bags.identification.problem import prepare
 from pendulum_bags.identification.result import identify
 from pendulum_bags.identification.synthetic import multisine, synthetic_recording
-from pendulum_bags.runs.datasets import Recording, distinct_names, read_recording
+from pendulum_bags.runs.datasets import Recording, distinct_names
+from pendulum_bags.runs.read_recording import read_recording
 from pendulum_msgs_py.errors import DataError
 from pendulum_msgs_py.plants.plant_parameters import PlantParameters
 

@@ -11,8 +11,9 @@ import pytest
 from pendulum_bags.identification.identify_cli import main as identify_main
 from pendulum_bags.identification.window_score import window_rms
 from pendulum_bags.replay.controller_replay import replay_controller
-from pendulum_bags.replay.input_replay import fit_percent, replay_input, replay_recording
+from pendulum_bags.replay.input_replay import replay_input, replay_recording
 from pendulum_bags.replay.replay_cli import main as replay_main
+from pendulum_bags.replay.result import fit_percent
 from pendulum_bags.runs.datasets import Recording
 from pendulum_msgs_py.contract.cdr import encode_joint_state
 from pendulum_msgs_py.errors import DataError
@@ -113,7 +114,7 @@ def test_a_window_of_no_length_is_refused() -> None:
 def test_a_real_pendulum_is_followed_as_well_as_its_geometry_allows(shared_data: Path) -> None:
     result = replay_recording(shared_data / DFKI / "ddp_measured.csv", "dfki")
     assert result.rms == pytest.approx(0.038, rel=0.10)
-    from pendulum_bags.runs.datasets import read_recording
+    from pendulum_bags.runs.read_recording import read_recording
 
     recording = read_recording(shared_data / DFKI / "ddp_measured.csv")
     assert result.rms == window_rms(load_plant("dfki"), recording)

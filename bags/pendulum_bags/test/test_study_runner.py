@@ -13,6 +13,7 @@ import pytest
 from pendulum_bags.experiments.in_process import simulate
 from pendulum_bags.experiments.run_spec import RunSpec
 from pendulum_bags.studies import pid_vs_lqr, pooled, runner
+from pendulum_bags.studies.records import read_record
 from pendulum_bags.studies.results import (
     Group,
     collect,
@@ -21,7 +22,7 @@ from pendulum_bags.studies.results import (
     groups_to_json,
     run_metrics,
 )
-from pendulum_bags.studies.runner import open_study_folder, read_record, run_study
+from pendulum_bags.studies.runner import open_study_folder, run_study
 from pendulum_bags.studies.study_file import Study, load_study
 from pendulum_msgs_py.errors import BagError, DataError, ParameterError
 from pendulum_msgs_py.plants.plant_parameters import load_plant, write_plant

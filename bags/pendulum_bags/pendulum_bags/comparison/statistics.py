@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy import stats
 
+from pendulum_bags.runs.correlation import autocorrelation, effective_size
 from pendulum_bags.runs.series import Array
 from pendulum_msgs_py.errors import DataError
 
@@ -21,12 +22,10 @@ __all__ = [
     "Interval",
     "KolmogorovSmirnov",
     "Resampled",
-    "autocorrelation",
     "block_length",
     "bootstrap_interval",
     "bootstrap_means",
     "describe",
-    "effective_size",
     "kolmogorov_smirnov",
     "quantile_pairs",
     "resample",
@@ -65,33 +64,6 @@ def describe(values: ArrayLike) -> dict[str, float]:
         "75%": float(third),
         "max": float(high),
     }
-
-
-def autocorrelation(values: ArrayLike) -> Array:
-    """Return the autocorrelation at lags 0 to n - 1 (biased estimate, which is positive definite), shape (n,)."""
-    samples = np.asarray(values, dtype=float)
-    centred = samples - samples.mean()
-    size = samples.size
-    spectrum = np.fft.rfft(centred, 2 * size)
-    covariance = np.fft.irfft(np.abs(spectrum) ** 2, 2 * size)[:size]
-    if covariance[0] <= 0.0:
-        return np.concatenate(([1.0], np.zeros(size - 1)))
-    result: Array = covariance / covariance[0]
-    return result
-
-
-def effective_size(values: ArrayLike) -> float:
-    """Return how many independent samples have the same variance of the mean: n / (1 + 2 sum of rho).
-
-    The sum ends where a pair of neighbouring autocorrelations stops being positive (Geyer, Statistical Science 7,
-    1992, section 3.3), so that the noise of far lags does not enter.
-    """
-    rho = autocorrelation(values)
-    size = rho.size
-    pairs = rho[1 : 1 + 2 * ((size - 1) // 2)].reshape(-1, 2).sum(axis=1)
-    ends = np.flatnonzero(pairs <= 0.0)
-    total = pairs[: ends[0] if ends.size else pairs.size].sum()
-    return float(np.clip(size / (1.0 + 2.0 * total), 1.0, size))
 
 
 def block_length(values: ArrayLike) -> int:

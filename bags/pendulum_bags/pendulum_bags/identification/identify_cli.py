@@ -79,7 +79,7 @@ def identify(
 
     Example: python -m pendulum_bags identify run1.csv run2.csv --mass 0.6 --length 0.5 --out plant.yaml
     """
-    from pendulum_bags.runs.datasets import read_recording
+    from pendulum_bags.runs.read_recording import read_recording
 
     if method not in {"output_error", "thesis"}:
         raise DataError(f"method is {method!r}; expected output_error or thesis")

@@ -11,7 +11,7 @@ from pendulum_bags.identification.model import FitModel, from_plant, to_plant
 from pendulum_bags.identification.problem import Piece, prepare, simulate
 from pendulum_bags.identification.result import load_fit_model
 from pendulum_bags.identification.window_score import free_run, window_score
-from pendulum_bags.replay.input_replay import (
+from pendulum_bags.replay.result import (
     DIVERGED,
     MOST_STARTS,
     HorizonError,

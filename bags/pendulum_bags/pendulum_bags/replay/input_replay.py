@@ -5,140 +5,34 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.signal import savgol_filter
 
 from pendulum_bags.identification.window_score import window_score
-from pendulum_bags.runs.datasets import Recording, read_recording
+from pendulum_bags.replay.fit_replay import replay_fit
+from pendulum_bags.replay.result import (
+    DIVERGED,
+    MOST_STARTS,
+    HorizonError,
+    InputReplay,
+    fit_percent,
+    horizon_steps,
+)
+from pendulum_bags.runs.datasets import Recording
+from pendulum_bags.runs.read_recording import read_recording
 from pendulum_msgs_py.errors import DataError
 from pendulum_msgs_py.plants.plant_parameters import PlantParameters, load_plant
 from pendulum_sim.plant import Plant
 from pendulum_sim.plants import make_plant
 
-if TYPE_CHECKING:
-    from pendulum_bags.figures.figure import Figure
-
-__all__ = ["HorizonError", "InputReplay", "fit_percent", "horizon_steps", "replay_input", "replay_recording"]
+__all__ = [ "replay_input", "replay_recording"]
 
 Array = NDArray[np.float64]
 
 SMOOTHING = 0.02
 """Half width of the parabola that gives the measured state at a sample [s]: quantised angles have no velocity."""
-MOST_STARTS = 60
-"""Starts of k-step predictions: enough for a smooth curve, spread over the recording."""
-DIVERGED = 0.1
-"""Share of the measured range beyond which a free run counts as diverged."""
-
-
-@dataclass(frozen=True)
-class HorizonError:
-    """Error of predictions over a horizon, from measured states.
-
-    Args:
-        steps: Horizon in samples, 1 for one-step.
-        time: The same [s].
-        rms: Root mean square angle error at its end [rad].
-        starts: Number of predictions.
-    """
-
-    steps: int
-    time: float
-    rms: float
-    starts: int
-
-
-@dataclass(frozen=True)
-class InputReplay:
-    """A plant driven by a recorded input, beside what was measured.
-
-    Args:
-        name: Name of the recording.
-        plant: Parameters of the model.
-        window: Length of the windows [s].
-        rms: Angle error over windows whose initial states are fitted [rad].
-        by_window: The same of each window, shape (w,) [rad].
-        window_time, window_angle: Simulated angle in windows, shape (n,) [s], [rad].
-        time, measured, free_run: Measured angle, and simulated from the first state alone, shape (n,) [s], [rad].
-        free_run_rms: Angle error of the free run [rad].
-        fit: Fit of the free run [%]: 100 is perfect, 0 is as good as the mean.
-        diverges_at: Time at which the free run first errs by a tenth of the measured range [s]; None if never.
-        threshold: That tenth [rad].
-        horizons: Errors of predictions over growing horizons.
-        from_fitted_state: Whether windows and free run start from fitted states rather than smoothed measured ones.
-        driven_by: What drove the plant, in words.
-    """
-
-    name: str
-    plant: PlantParameters
-    window: float
-    rms: float
-    by_window: Array
-    window_time: Array
-    window_angle: Array
-    time: Array
-    measured: Array
-    free_run: Array
-    free_run_rms: float
-    fit: float
-    diverges_at: float | None
-    threshold: float
-    horizons: tuple[HorizonError, ...]
-    from_fitted_state: bool
-    driven_by: str = "the measured torque"
-
-    def as_dict(self) -> dict[str, Any]:
-        """Return the figures for JSON."""
-        return {
-            "recording": self.name,
-            "plant": self.plant.name,
-            "window_s": self.window,
-            "rms_rad": self.rms,
-            "rms_by_window_rad": self.by_window.tolist(),
-            "free_run_rms_rad": self.free_run_rms,
-            "free_run_fit_percent": self.fit,
-            "diverges_at_s": self.diverges_at,
-            "divergence_threshold_rad": self.threshold,
-            "one_step_rms_rad": self.horizons[0].rms if self.horizons else None,
-            "horizons": [
-                {"steps": one.steps, "time_s": one.time, "rms_rad": one.rms, "starts": one.starts}
-                for one in self.horizons
-            ],
-        }
-
-    def sentence(self) -> str:
-        """Return the result in words."""
-        where = "never" if self.diverges_at is None else f"after {self.diverges_at:.2f} s"
-        best, worst = self.by_window.min(), self.by_window.max()
-        return (
-            f"Driven by {self.driven_by} of {self.name}, the plant {self.plant.name!r} errs by {self.rms:.4f} rad "
-            f"rms over windows of {self.window:g} s (best {best:.4f}, worst {worst:.4f}); in free run by "
-            f"{self.free_run_rms:.4f} rad (fit {self.fit:.1f} %), and it departs by more than "
-            f"{self.threshold:.2f} rad {where}."
-        )
-
-    def figure(self) -> Figure:
-        """Return measured and simulated angle in one figure, and the error of the windows."""
-        from pendulum_bags.figures.figure import Figure, Panel, Trace
-
-        error = self.window_angle - np.interp(self.window_time, self.time, self.measured)
-        time = "time [s]"
-        panels = [
-            Panel(
-                time,
-                "θ [rad]",
-                [
-                    Trace(self.time, self.measured, "measured", "difference"),
-                    Trace(self.window_time, self.window_angle, f"simulated, {self.window:g} s windows", "hw"),
-                    Trace(self.time, self.free_run, "simulated, free run", "own"),
-                ],
-            ),
-            Panel(time, "error in windows [rad]", [Trace(self.window_time, error, "", "difference")]),
-        ]
-        title = f"Replay of a real pendulum: {self.name}"
-        return Figure("replay", title, self.sentence(), panels, section="A real pendulum", panel_height=220)
 
 
 def replay_recording(
@@ -156,7 +50,7 @@ def replay_recording(
     """Read a recording (CSV or bag) and drive a plant with its torque.
 
     Args:
-        path: Recording, as for :func:`pendulum_bags.runs.datasets.read_recording`.
+        path: Recording, as for :func:`pendulum_bags.runs.read_recording.read_recording`.
         plant: Plant file, preset or parameters.
         window: Length of the windows [s].
         mapping: Mapping file of a CSV.
@@ -178,8 +72,6 @@ def replay_recording(
         last = math.inf if stop is None else begin + stop
         recording = recording.between(begin + (start or 0.0), last)
     if recording.input_kind != "effort" or (isinstance(plant, str | Path) and Path(plant).suffix == ".json"):
-        from pendulum_bags.replay.fit_replay import replay_fit
-
         return replay_fit(recording, plant, window=window)
     parameters = plant if isinstance(plant, PlantParameters) else load_plant(plant)
     return replay_input(recording, parameters, window=window)
@@ -239,12 +131,6 @@ def replay_input(recording: Recording, parameters: PlantParameters, *, window: f
         horizons=_horizons(driven, window),
         from_fitted_state=parameters.drivetrain is None,
     )
-
-
-def fit_percent(measured: Array, simulated: Array) -> float:
-    """Return 100 (1 - |y - y_hat| / |y - mean(y)|) [%]. Source: Ljung, System Identification, 1999, section 16.4."""
-    spread = float(np.linalg.norm(measured - measured.mean()))
-    return 100.0 * (1.0 - float(np.linalg.norm(measured - simulated)) / spread) if spread > 0.0 else math.nan
 
 
 @dataclass(frozen=True)
@@ -336,6 +222,3 @@ def _horizons(driven: _Driven, longest: float) -> tuple[HorizonError, ...]:
     )
 
 
-def horizon_steps(reach: int) -> list[int]:
-    """Return 1, 2, 5, 10, 20, ... samples up to the longest horizon."""
-    return sorted({k for k in (m * 10**e for e in range(7) for m in (1, 2, 5)) if k < reach} | {reach})

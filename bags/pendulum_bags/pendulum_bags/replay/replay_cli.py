@@ -13,7 +13,7 @@ from pendulum_msgs_py.programs.executables import cli_main
 
 if TYPE_CHECKING:
     from pendulum_bags.replay.controller_replay import ControllerReplay
-    from pendulum_bags.replay.input_replay import InputReplay
+    from pendulum_bags.replay.result import InputReplay
 
 __all__ = ["main"]
 

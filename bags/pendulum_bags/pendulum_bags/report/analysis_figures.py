@@ -8,10 +8,11 @@ from collections.abc import Callable
 import numpy as np
 
 from pendulum_bags.comparison.equivalence import EquivalenceTest
-from pendulum_bags.comparison.statistics import effective_size, kolmogorov_smirnov, quantile_pairs
+from pendulum_bags.comparison.statistics import kolmogorov_smirnov, quantile_pairs
 from pendulum_bags.figures.figure import Figure, Mark, Panel, Trace
 from pendulum_bags.figures.numbers import quantity, ratio_in_words
 from pendulum_bags.report.data import ReportData
+from pendulum_bags.runs.correlation import effective_size
 from pendulum_bags.runs.series import Array, Series
 
 __all__ = ["alignment", "distributions", "effort", "equivalence", "pooled_runs", "spectra", "timing"]

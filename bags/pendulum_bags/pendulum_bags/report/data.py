@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from pendulum_bags.comparison import Comparison
-from pendulum_bags.replay.input_replay import InputReplay
+from pendulum_bags.replay.result import InputReplay
 from pendulum_bags.report.trials import TrialSet
 from pendulum_bags.verdict import Answer
 from pendulum_bags.verdict.answer import answer_of

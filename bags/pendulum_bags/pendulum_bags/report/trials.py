@@ -16,7 +16,8 @@ from pendulum_bags.identification.thesis import (
     static_holds,
     trial_part,
 )
-from pendulum_bags.runs.datasets import Recording, read_recording
+from pendulum_bags.runs.datasets import Recording
+from pendulum_bags.runs.read_recording import read_recording
 from pendulum_msgs_py.errors import DataError
 
 __all__ = ["TrialSet", "read_trials"]

@@ -21,7 +21,7 @@ from pendulum_msgs_py.errors import BagError, PendulumError
 if TYPE_CHECKING:
     from pendulum_bags.comparison import Comparison
     from pendulum_bags.comparison.margins import MarginArgument
-    from pendulum_bags.replay.input_replay import InputReplay
+    from pendulum_bags.replay.result import InputReplay
     from pendulum_bags.verdict import Answer
 
 __all__ = ["find_real_recording", "margin_of", "write_report"]

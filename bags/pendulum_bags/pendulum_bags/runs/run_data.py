@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from pendulum_bags.runs.correlation import effective_size
 from pendulum_bags.runs.series import Series, Signal, unwrap_near_upright
 from pendulum_msgs_py.contract import names
 from pendulum_msgs_py.contract.values import NANOSECONDS
@@ -194,8 +195,6 @@ def read_run(
 
 def plant_summary(run: RunData) -> dict[str, Any]:
     """Return the figures of one plant during the noise, as ``summary.json`` holds them."""
-    from pendulum_bags.comparison.statistics import effective_size  # which stands on runs itself
-
     window = run.window
     return {
         "rate_hz": run.rate_hz,

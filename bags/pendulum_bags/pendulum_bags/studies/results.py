@@ -15,7 +15,7 @@ from scipy import stats
 
 from pendulum_bags.comparison.metrics import METRICS, Episode, metrics_of
 from pendulum_bags.experiments.run_spec import RunSpec
-from pendulum_bags.studies.runner import read_record
+from pendulum_bags.studies.records import read_record
 from pendulum_bags.studies.shares import share_interval
 from pendulum_bags.studies.study_file import Study
 from pendulum_msgs_py.contract.angles import UPRIGHT, wrap

@@ -16,10 +16,12 @@ from typing import Any
 
 from pendulum_bags.experiments.processes import Child, ProcessSet
 from pendulum_bags.runs.run_folder import write_json
+from pendulum_bags.studies.records import read_record
+from pendulum_bags.studies.results import run_metrics
 from pendulum_bags.studies.study_file import Study, StudyRun
 from pendulum_msgs_py.errors import BagError, PendulumError
 
-__all__ = ["StudyProgress", "default_workers", "open_study_folder", "read_record", "run_study"]
+__all__ = ["StudyProgress", "default_workers", "open_study_folder", "run_study"]
 
 _POLL = 0.05
 _LONGEST_FACTOR = 20.0
@@ -106,15 +108,6 @@ def _renumbered(runs: Sequence[StudyRun], known: Mapping[str, str], folder: Path
             "new folder"
         )
     return tuple(found)
-
-
-def read_record(folder: Path, run: StudyRun) -> dict[str, Any] | None:
-    """Return what is known about a run that has ended, well or not; None for one that has not."""
-    path = folder / "runs" / run.name / "run.json"
-    if not path.is_file():
-        return None
-    record: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
-    return record
 
 
 def run_study(
@@ -246,8 +239,6 @@ def _simulate(run: StudyRun, place: Path) -> None:
 
 
 def _record(item: _Running, failure: str) -> None:
-    from pendulum_bags.studies.results import run_metrics
-
     run = item.run
     record: dict[str, Any] = {
         "number": run.number,

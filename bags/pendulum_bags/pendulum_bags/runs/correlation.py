@@ -1,0 +1,37 @@
+"""How much independent information correlated samples hold."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from pendulum_bags.runs.series import Array
+
+__all__ = ["autocorrelation", "effective_size"]
+
+
+def autocorrelation(values: ArrayLike) -> Array:
+    """Return the autocorrelation at lags 0 to n - 1 (biased estimate, which is positive definite), shape (n,)."""
+    samples = np.asarray(values, dtype=float)
+    centred = samples - samples.mean()
+    size = samples.size
+    spectrum = np.fft.rfft(centred, 2 * size)
+    covariance = np.fft.irfft(np.abs(spectrum) ** 2, 2 * size)[:size]
+    if covariance[0] <= 0.0:
+        return np.concatenate(([1.0], np.zeros(size - 1)))
+    result: Array = covariance / covariance[0]
+    return result
+
+
+def effective_size(values: ArrayLike) -> float:
+    """Return how many independent samples have the same variance of the mean: n / (1 + 2 sum of rho).
+
+    The sum ends where a pair of neighbouring autocorrelations stops being positive (Geyer, Statistical Science 7,
+    1992, section 3.3), so that the noise of far lags does not enter.
+    """
+    rho = autocorrelation(values)
+    size = rho.size
+    pairs = rho[1 : 1 + 2 * ((size - 1) // 2)].reshape(-1, 2).sum(axis=1)
+    ends = np.flatnonzero(pairs <= 0.0)
+    total = pairs[: ends[0] if ends.size else pairs.size].sum()
+    return float(np.clip(size / (1.0 + 2.0 * total), 1.0, size))
