@@ -45,7 +45,7 @@ experiment: $(VENV)/.linked # Run the thesis's experiment on simulator and emula
 	@$(PY) -m pendulum_bags experiment thesis $(if $(OUT),--out "$(OUT)") $(ARGS)
 
 test: $(VENV)/.linked # Run every test (ARGS="-k name" chooses)
-	@$(PY) -m pytest $(ARGS)
+	@$(PY) -m tests.suite $(ARGS)
 
 bench: $(VENV)/.linked $(VENV)/.peers # Measure beside the peers, print a table, write build/bench.json (ONLY=area ARGS=...)
 	@PYTHONPATH="$(CURDIR)/$(VENV)/peers$${PYTHONPATH:+:$$PYTHONPATH}" $(PY) -m tests.benchmarks.run $(if $(ONLY),--only "$(ONLY)") $(ARGS)
