@@ -8,7 +8,7 @@ from collections import Counter
 from collections.abc import Callable, Mapping
 from enum import Enum
 
-from pendulum_lqr.controller import Controller
+from pendulum_lqr.interface import Controller
 from pendulum_msgs_py.contract.angles import from_upright
 from pendulum_msgs_py.contract.timing import RingOfTimes
 from pendulum_msgs_py.contract.values import NANOSECONDS, JointSample

@@ -10,8 +10,9 @@ import importlib
 import math
 from collections.abc import Mapping, Sequence
 from difflib import get_close_matches
-from typing import Any, ClassVar, Protocol, cast
+from typing import Any, ClassVar, cast
 
+from pendulum_lqr.interface import Controller
 from pendulum_lqr.loop_check import require_stable
 from pendulum_lqr.velocity import VELOCITY_ESTIMATORS, VelocityEstimator, make_velocity_estimator
 from pendulum_msgs_py.contract.angles import wrap
@@ -23,7 +24,6 @@ __all__ = [
     "COMMON_PARAMETERS",
     "CONTROLLERS",
     "BaseController",
-    "Controller",
     "EstimatedVelocity",
     "controller_class",
     "controller_parameters",
@@ -62,29 +62,6 @@ COMMON_PARAMETERS: tuple[ParameterSpec, ...] = (
     ),
 )
 """Parameters that every controller has."""
-
-
-class Controller(Protocol):
-    """What turns states into torques."""
-
-    effort_limit: float
-
-    def reset(self) -> None:
-        """Forget everything: integrals, filters, phases."""
-
-    def command(self, t: float, x: Sequence[float]) -> float:
-        """Return the torque [N m] that answers a state.
-
-        Args:
-            t: Time of the state since the controller was started [s]; it increases from call to call.
-            x: [wrap(theta - pi) [rad], theta_dot [rad/s]].
-        """
-
-    def describe(self) -> str:
-        """Return gains and figures in one line, for the log."""
-
-    def carry_over(self, previous: Controller) -> None:
-        """Take over integrals and filters from the controller that this one replaces, so that torque does not jump."""
 
 
 class BaseController:

@@ -18,13 +18,8 @@ from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64MultiArray
 
 from pendulum_lqr.answering import AnswerLoop
-from pendulum_lqr.controller import (
-    COMMON_PARAMETERS,
-    CONTROLLERS,
-    Controller,
-    controller_class,
-    make_controller,
-)
+from pendulum_lqr.controller import COMMON_PARAMETERS, CONTROLLERS, controller_class, make_controller
+from pendulum_lqr.interface import Controller
 from pendulum_lqr.sampling import ASSUMED_PERIOD, PeriodWatch, differs, rate_problem, uses_period
 from pendulum_msgs_py.contract import names
 from pendulum_msgs_py.contract.cdr import encode_joint_state

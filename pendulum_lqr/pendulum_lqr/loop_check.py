@@ -16,7 +16,7 @@ from pendulum_lqr.model import RigidPlant, linearise
 from pendulum_msgs_py.contract.angles import UPRIGHT
 
 if TYPE_CHECKING:
-    from pendulum_lqr.controller import Controller
+    from pendulum_lqr.interface import Controller
 
 __all__ = ["MOST_GROWTH", "growth", "require_stable"]
 

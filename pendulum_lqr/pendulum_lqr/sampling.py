@@ -6,7 +6,7 @@ import statistics
 from collections import deque
 from collections.abc import Callable
 
-from pendulum_lqr.controller import Controller
+from pendulum_lqr.interface import Controller
 from pendulum_lqr.loop_check import MOST_GROWTH, growth
 from pendulum_msgs_py.contract.values import NANOSECONDS
 from pendulum_msgs_py.plants.plant_parameters import PlantParameters

@@ -14,9 +14,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pendulum_lqr.controller import CONTROLLERS, Controller, make_controller
+from pendulum_lqr.controller import CONTROLLERS, make_controller
 from pendulum_lqr.controllers.playback import Playback
 from pendulum_lqr.design import continuous_lqr
+from pendulum_lqr.interface import Controller
 from pendulum_lqr.model import linearise
 from pendulum_lqr.trajectory_optimisation import swing_up_trajectory
 from pendulum_msgs_py.contract.angles import from_upright

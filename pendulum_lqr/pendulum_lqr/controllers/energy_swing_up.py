@@ -7,8 +7,9 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from pendulum_lqr.catch import Catch, make_catch
-from pendulum_lqr.controller import BaseController, Controller
+from pendulum_lqr.controller import BaseController
 from pendulum_lqr.design import DesignError
+from pendulum_lqr.interface import Controller
 from pendulum_msgs_py.contract.angles import wrap
 from pendulum_msgs_py.parameters import ParameterSpec
 from pendulum_msgs_py.plants.plant_parameters import PlantParameters

@@ -5,9 +5,10 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from pendulum_lqr.controller import BaseController, Controller
+from pendulum_lqr.controller import BaseController
 from pendulum_lqr.controllers.specs import DELAY, FEEDFORWARD, OFFSET_NOISE, Q, R
 from pendulum_lqr.design import Gain, discrete_lqr, discretise, sampled_cost
+from pendulum_lqr.interface import Controller
 from pendulum_lqr.model import linearise
 from pendulum_lqr.observer import Observer
 from pendulum_msgs_py.contract.angles import UPRIGHT

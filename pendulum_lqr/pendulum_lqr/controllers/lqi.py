@@ -5,9 +5,10 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from pendulum_lqr.controller import BaseController, Controller
+from pendulum_lqr.controller import BaseController
 from pendulum_lqr.controllers.specs import FEEDFORWARD, Q, R
 from pendulum_lqr.design import Gain, integral_lqr
+from pendulum_lqr.interface import Controller
 from pendulum_lqr.model import linearise
 from pendulum_msgs_py.contract.angles import UPRIGHT
 from pendulum_msgs_py.parameters import ParameterSpec

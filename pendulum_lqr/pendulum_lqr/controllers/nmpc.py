@@ -11,7 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pendulum_lqr.catch import Catch, make_catch
-from pendulum_lqr.controller import BaseController, Controller
+from pendulum_lqr.controller import BaseController
+from pendulum_lqr.interface import Controller
 from pendulum_lqr.trajectory_optimisation import rigid_dynamics
 from pendulum_msgs_py.parameters import ParameterSpec
 from pendulum_msgs_py.plants.plant_parameters import PlantParameters

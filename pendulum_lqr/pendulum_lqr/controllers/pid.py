@@ -9,9 +9,10 @@ from typing import Any
 
 import numpy as np
 
-from pendulum_lqr.controller import BaseController, Controller
+from pendulum_lqr.controller import BaseController
 from pendulum_lqr.controllers.specs import Q, R
 from pendulum_lqr.design import DesignError
+from pendulum_lqr.interface import Controller
 from pendulum_lqr.model import linearise
 from pendulum_lqr.tuning import PidGains, pid_loop, tune_numerically, ziegler_nichols
 from pendulum_msgs_py.contract.angles import UPRIGHT

@@ -8,7 +8,8 @@ from functools import lru_cache
 from typing import Any
 
 from pendulum_lqr.catch import Catch, make_catch
-from pendulum_lqr.controller import BaseController, Controller
+from pendulum_lqr.controller import BaseController
+from pendulum_lqr.interface import Controller
 from pendulum_lqr.minimum_time import SIGN_VELOCITY, TimeToGo, minimum_time
 from pendulum_lqr.model import acceleration_from_upright
 from pendulum_msgs_py.parameters import ParameterSpec
