@@ -169,6 +169,8 @@ class Bridge:
     def release(self) -> None:
         """Effort zero, then strategy off; never raises. A module that does not confirm it is asked again."""
         self._strategy = Strategy.OFF
+        # No torque is in force any more: the next hand-over must not begin with that of an earlier drive.
+        self._effort = self._handover_left = 0.0
         self.monitor.stopped()
         try:
             self.port.stop()
@@ -245,6 +247,11 @@ class Bridge:
             return Outcome(Drive(DriveKind.OFF, push=drive.push), 0.0, fault="host_stalled")
         if drive.kind is DriveKind.OFF or self.feedback is None:
             return self._rest(drive, was_armed)
+        if not self._driving:
+            # Released between preparing and arming: settings may be lost, and a fault passed unseen.
+            why = f": {self.last_fault}" if self.last_fault else ""
+            self.fail("not_prepared", f"drive was released before it was armed{why}; disarm, then arm again")
+            return Outcome(Drive(DriveKind.OFF, push=drive.push), 0.0, fault="not_prepared")
         self._prepared_until_ns = 0
         try:
             applied = self._send(*self._setpoints(drive, self.feedback))
@@ -349,7 +356,9 @@ class Bridge:
         self._dither = -self._dither
         velocity = sign * drive.velocity
         return TRAJECTORY_STRATEGY, Command(
-            position=sign * (drive.position - self.settings.joint_offset) + drive.handover * offset + self._dither,
+            position=sign * (drive.position - self.settings.joint_offset)
+            + drive.handover * offset
+            + self._dither,
             velocity=velocity + drive.handover * (speed - velocity),
         )
 

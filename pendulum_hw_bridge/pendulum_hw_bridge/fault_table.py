@@ -33,6 +33,7 @@ FAULTS = {
     "supervisor": "a limit that every plant has: velocity, position window, trajectory, age of the measurement",
     "exception": "an error in the bridge itself",
     "module_lost": "the module is not there, is not the only one that fits, or does not answer",
+    "not_prepared": "the drive was released between preparing and arming; arm again",
     "not_connected": "the actuator is used before it is connected",
     "not_installed": "hebi-py is not installed",
 }

@@ -13,6 +13,7 @@ from pendulum_hw_bridge.effort_mapping import EffortStrategy
 from pendulum_hw_bridge.emulation.faults import ActuatorFault
 from pendulum_hw_bridge.gains import GainSet
 from pendulum_msgs_py.contract.supervisor import Mode
+from pendulum_msgs_py.contract.values import JointCommand
 from tests.faults.bridge_rig import MILLISECOND, Rig
 
 KINDS = pytest.mark.parametrize("kind", list(EffortStrategy), ids=lambda kind: kind.value)
@@ -73,7 +74,9 @@ def test_a_fault_that_comes_while_settings_are_written_keeps_from_arming() -> No
 
 
 @KINDS
-def test_a_module_that_was_without_power_gets_all_settings_again_when_it_is_armed(kind: EffortStrategy) -> None:
+def test_a_module_that_was_without_power_gets_all_settings_again_when_it_is_armed(
+    kind: EffortStrategy,
+) -> None:
     rig = disarmed(kind)
     before = rig.actuator.limits, rig.actuator.gains
     rig.actuator.inject(ActuatorFault.MODULE_REBOOT)
@@ -169,7 +172,12 @@ def test_a_broken_output_or_link_ends_torque_in_every_strategy_and_phase(
 ) -> None:
     expected = {
         ActuatorFault.PWM_STUCK: {"command_not_in_force", "output_disagreement", "motor_effort"},
-        ActuatorFault.PWM_RUNAWAY: {"command_not_in_force", "output_disagreement", "motor_effort", "supervisor"},
+        ActuatorFault.PWM_RUNAWAY: {
+            "command_not_in_force",
+            "output_disagreement",
+            "motor_effort",
+            "supervisor",
+        },
         ActuatorFault.STRATEGY_CHANGED: {"command_not_in_force", "output_disagreement", "motor_effort"},
         ActuatorFault.MODULE_REBOOT: {"module_restarted"},
         ActuatorFault.FEEDBACK_LOST: {"feedback_lost"},
@@ -228,7 +236,9 @@ def test_records_that_count_on_but_measure_nothing_new_are_frozen() -> None:
     assert rig.bridge.last_fault in {"feedback_frozen", "command_not_in_force"}
 
 
-@pytest.mark.parametrize("state", ["temperature_state", "lock", "position_limit", "velocity_limit", "effort_limit"])
+@pytest.mark.parametrize(
+    "state", ["temperature_state", "lock", "position_limit", "velocity_limit", "effort_limit"]
+)
 def test_a_state_of_a_newer_firmware_never_ends_in_an_exception(state: str) -> None:
     rig = Rig()
     rig.run(0.3)
@@ -251,4 +261,66 @@ def test_an_e_stop_while_a_plant_is_prepared_but_not_armed_switches_off_at_once(
     assert int(rig.actuator.strategy) != 0
     rig.supervisor.e_stop(rig.port.now_ns())
     rig.run(0.02)
+    assert int(rig.actuator.strategy) == 0
+
+
+@KINDS
+def test_nothing_of_the_torque_before_an_e_stop_is_in_the_trajectory_after_it(kind: EffortStrategy) -> None:
+    rig = Rig(kind=kind, start=0.0)
+    place = rig.actuator.link.position
+    rig.actuator.hand = lambda time, position, velocity: -2000.0 * (position - place) - 8.0 * velocity
+    rig.disturbing = False
+    rig.send = lambda answer: rig._send(JointCommand(answer.stamp_ns, 8.0, "controller"))
+    rig.run(0.3)
+    assert rig.outcomes[-1].effort > 5.0
+    rig.controlling = False
+    rig.supervisor.e_stop(rig.port.now_ns())
+    rig.run(0.2)
+    rig.actuator.hand = lambda time, position, velocity: 0.0
+    rig.run(1.0)
+    assert not rig.supervisor.e_stop_reset(rig.port.now_ns())
+    assert not rig.bridge.prepare()
+    assert not rig.supervisor.arm(rig.port.now_ns(), rig.bridge.sample)
+    begin_ns = rig.clock.now_ns()
+    # At once, before a cycle of effort control has told the bridge that no torque is in force.
+    sample = rig.bridge.sample
+    assert sample is not None
+    assert not rig.follow(sample.position)
+    rig.run(0.2)
+    duties = [abs(duty) for time, duty, _ in rig.duties if time > begin_ns]
+    assert max(duties, default=0.0) / rig.bridge.mapping.pwm_per_torque() < 0.5
+
+
+@KINDS
+@pytest.mark.parametrize(
+    "fault", [ActuatorFault.MODULE_REBOOT, ActuatorFault.M_STOP], ids=lambda fault: fault.value
+)
+def test_a_fault_between_preparing_and_arming_keeps_from_driving(
+    kind: EffortStrategy, fault: ActuatorFault
+) -> None:
+    rig = disarmed(kind)
+    before = rig.actuator.limits, rig.actuator.gains
+    assert not rig.bridge.prepare()
+    rig.actuator.inject(fault)
+    # One record, and sooner than the watchdog of the bridge's own pauses.
+    rig.run(0.012)
+    rig.actuator.clear_faults()
+    assert not rig.supervisor.arm(rig.port.now_ns(), rig.bridge.sample)
+    rig.run(0.02)
+    assert rig.supervisor.mode is Mode.FAULT
+    assert rig.bridge.last_fault == "not_prepared"
+    assert int(rig.actuator.strategy) == 0
+    rig.supervisor.disarm(rig.port.now_ns())
+    assert not rig.bridge.prepare()
+    assert (rig.actuator.limits, rig.actuator.gains) == before
+
+
+def test_a_preparation_that_has_lapsed_is_none() -> None:
+    rig = disarmed()
+    assert not rig.bridge.prepare()
+    rig.run(1.1)
+    assert not rig.supervisor.arm(rig.port.now_ns(), rig.bridge.sample)
+    rig.run(0.05)
+    assert rig.supervisor.mode is Mode.FAULT
+    assert "not_prepared" in rig.supervisor.reason
     assert int(rig.actuator.strategy) == 0
