@@ -14,6 +14,7 @@ from pendulum_msgs_py.programs.executables import cli_main
 
 if TYPE_CHECKING:
     from pendulum_bags.comparison import Comparison
+    from pendulum_bags.frequency_response.designs import DesignResult
     from pendulum_bags.verdict import Answer
 
 __all__ = ["main"]
@@ -35,6 +36,22 @@ MarginsFile = Annotated[
     Path | None, typer.Option("--margins", help="File of margins, as bags/pendulum_bags/comparison/margins.yaml.")
 ]
 
+DesignOption = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--design",
+        help="Design whose certificate for the measured machine is wanted: 'q=100,0.01 r=0.1', 'k=33,0.2' or a "
+        "controller's name; several times if wanted. By default those that were certified when it was measured.",
+    ),
+]
+MachineOption = Annotated[
+    Path | None,
+    typer.Option(
+        "--machine",
+        help="Measured response of the hardware (hw_response.json of experiment frequency_response, or its folder); "
+        "by default that of the run folder or of --layers.",
+    ),
+]
 LayersOption = Annotated[
     list[Path] | None,
     typer.Option(
@@ -49,6 +66,8 @@ def compare(
     margin: MarginOption = None,
     margins_file: MarginsFile = None,
     layers: LayersOption = None,
+    machine: MachineOption = None,
+    design: DesignOption = None,
     out: Annotated[
         Path | None,
         typer.Option("--out", "-o", help="Folder for comparison.json and figures; none by default."),
@@ -63,9 +82,12 @@ def compare(
 ) -> None:
     """Compare simulation and hardware under noise: statistics of the difference, equivalence tests, a verdict.
 
+    Where the hardware's frequency response was measured, it also lists which designs carry over.
+
     Example: python -m pendulum_bags compare runs/today/sim runs/today/hw --margin delay=8ms --margin spread_angle=20%
     """
     from pendulum_bags.comparison import Margins, compare_folders, compare_runs
+    from pendulum_bags.frequency_response.carry_over import carry_over, layers_of
     from pendulum_bags.verdict.answer import answer_of
 
     margins = Margins.of(margins_file, margin)
@@ -85,14 +107,18 @@ def compare(
             f"got {len(paths)} paths ({', '.join(map(str, paths))}); "
             "expected a simulation and a hardware bag, or run folders that hold sim and hw"
         )
-    answer = answer_of(result, [*(paths if len(paths) == 1 else ()), *(layers or ())])
+    kept = [*(paths if len(paths) == 1 else ()), *(layers or ())]
+    certified = carry_over(result, kept, machine, design or ())
+    answer = answer_of(result, kept, anew=layers_of(certified))
     content = {**result.to_json(), "answer": answer.to_json()}
+    if certified is not None:
+        content["designs"] = [one.to_json() for one in certified.designs]
     if out is not None:
         _write(out, result, content)
     if json_output:
         print(json.dumps(content, indent=2, allow_nan=False))
     else:
-        _print(result, answer, content)
+        _print(result, answer, content, certified.designs if certified else ())
         if out is not None:
             print(f"\nwritten: {out / 'comparison.json'} and figures beside it")
 
@@ -107,7 +133,10 @@ def _write(out: Path, result: Comparison, content: dict[str, Any]) -> None:
     write_figures(comparison_figures(result), out / "figures")
 
 
-def _print(result: Comparison, answer: Answer, content: dict[str, Any]) -> None:
+def _print(
+    result: Comparison, answer: Answer, content: dict[str, Any], designs: Sequence[DesignResult]
+) -> None:
+    from pendulum_bags.frequency_response.designs_table import designs_table
     from pendulum_bags.runs.run_data import timing_warning
     from pendulum_bags.verdict.terminal import print_answer
     from pendulum_msgs_py.programs.terminal import WholeTable, make_console
@@ -153,7 +182,9 @@ def _print(result: Comparison, answer: Answer, content: dict[str, Any]) -> None:
         console.print(f"Not paired: {content['paired']['reason']}.")
     for note in result.left_out:
         console.print(note, style="yellow", highlight=False)
-    print_answer(console, answer, result.verdict)
+    if designs:
+        console.print(designs_table(designs))
+    print_answer(console, answer, result.verdict, emulated=result.is_emulated)
 
 
 def _number(value: float | None, form: str) -> str:

@@ -78,6 +78,11 @@ class Jobs:
         """Return the newest program of a kind."""
         return self._jobs.get(kind)
 
+    def newest(self, page: str) -> Path | None:
+        """Return the run folder, of all those here, whose page of a name was written last; None where none has one."""
+        found = [path for path in self.runs.glob(f"*/{page}") if path.is_file()]
+        return max(found, key=lambda path: path.stat().st_mtime).parent if found else None
+
     def record(self) -> Job:
         """Start recording all plants, and what belongs to them, into one bag."""
         arguments = ["record", "--exclude", "^/(parameter_events|rosout)$"]

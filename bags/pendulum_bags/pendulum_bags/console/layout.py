@@ -115,6 +115,8 @@ class Layout:
                 filled=True,
             )
             _button("Cancel", lambda: self._finish("experiment"))
+            self._certified = ui.link("Open the certified gains", "#", new_tab=True)
+            self._certified.set_visibility(False)
         self._job_line("experiment")
 
     def _job_line(self, kind: str) -> None:
@@ -183,6 +185,10 @@ class Layout:
                     self._plant_card(space, node)
         for table in self._tables:
             await table.refresh(sorted(plants))
+        measured = self._jobs.newest("frequency_response.html")
+        self._certified.set_visibility(measured is not None)
+        if measured is not None:
+            self._certified.props(f'href="/runs/{measured.name}/frequency_response.html#certified_gains"')
         for kind, (label, link) in self._job_labels.items():
             job = self._jobs[kind]
             label.text = job.describe() if job is not None else ""

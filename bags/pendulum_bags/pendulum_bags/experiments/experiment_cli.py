@@ -145,7 +145,7 @@ def thesis(
         print(json.dumps(summary, indent=2))
     else:
         _print_summary(console, summary)
-        print_answer(console, answer, comparison.verdict)
+        print_answer(console, answer, comparison.verdict, emulated=comparison.is_emulated)
     elapsed = time.monotonic() - started
     console.print(
         f"\nreport  {folder / 'report.html'}\nbags    {folder / 'sim'}, {folder / 'hw'}\n({elapsed:.0f} s)",

@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from threadpoolctl import threadpool_limits
 
 from pendulum_bags.figures.render_files import write_figures
 from pendulum_bags.frequency_response.compare import Difference, compare_responses
-from pendulum_bags.frequency_response.designs import DesignResult, certify_designs
+from pendulum_bags.frequency_response.designs import DesignResult, certify_designs, design_text
 from pendulum_bags.frequency_response.estimate import estimate
 from pendulum_bags.frequency_response.figures import response_figures
 from pendulum_bags.frequency_response.layers import GAP_MARGIN, same_plant, which_controllers
@@ -21,12 +22,25 @@ from pendulum_bags.verdict import LayerResult, write_layer
 from pendulum_lqr.certificate import Certifier
 from pendulum_lqr.gap_metric import DEFAULT_SCALING, Scaling
 from pendulum_lqr.machine_response import Machine
-from pendulum_lqr.measured_response import MeasuredResponse, write_response
+from pendulum_lqr.measured_response import MeasuredResponse, read_response, write_response
 from pendulum_lqr.model import LinearModel, linearise
 from pendulum_msgs_py.errors import DataError
 from pendulum_msgs_py.plants.plant_parameters import load_plant
 
-__all__ = ["Analysis", "analyse_responses", "read_responses", "write_analysis"]
+__all__ = [
+    "Analysis",
+    "analyse_machine",
+    "analyse_responses",
+    "find_machine",
+    "read_responses",
+    "write_analysis",
+]
+
+
+MACHINE = "hw_response.json"
+"""File in which a run folder keeps the measured response of its hardware."""
+NUMBERS = "frequency_response.json"
+"""File in which it keeps what was found."""
 
 
 @dataclass(frozen=True)
@@ -41,6 +55,7 @@ class Analysis:
         certifier: Of model and hardware, None without hardware.
         designs: What was found of each.
         layers: Layers of the verdict.
+        scaling: Units of the gap.
     """
 
     responses: Sequence[MeasuredResponse]
@@ -50,11 +65,13 @@ class Analysis:
     certifier: Certifier | None
     designs: Sequence[DesignResult]
     layers: Sequence[LayerResult]
+    scaling: Scaling = DEFAULT_SCALING
 
     def to_json(self) -> dict[str, Any]:
         """Return the figures as JSON values."""
         return {
             "plant": self.plant,
+            "scaling": asdict(self.scaling),
             "responses": {response.label: response.facts for response in self.responses},
             "difference": self.difference.to_json() if self.difference else None,
             "gap_to_model": None
@@ -140,7 +157,47 @@ def analyse_responses(
         certifier = Certifier(model, Machine.of(by_label["hw"]), scaling)
         results = certify_designs(designs, parameters, model, certifier)
         layers.append(which_controllers(certifier, results))
-    return Analysis(responses, model, plant, difference, certifier, results, layers)
+    return Analysis(responses, model, plant, difference, certifier, results, layers, scaling)
+
+
+def find_machine(folders: Sequence[Path]) -> Path | None:
+    """Return the first folder that keeps the measured response of a machine, None where none does."""
+    return next((folder for folder in folders if (folder / MACHINE).is_file()), None)
+
+
+def analyse_machine(machine: Path, plant: str, designs: Sequence[str] = ()) -> Analysis:
+    """Return which designs carry over to a machine that was measured before.
+
+    Args:
+        machine: Measured response, or the folder that keeps it.
+        plant: Preset or file of the plant that designs are made on.
+        designs: As :func:`pendulum_bags.frequency_response.designs.certify_designs` reads them; by default those that
+            were certified when it was measured, and else the four combinations of the thesis.
+
+    Raises:
+        DataError: The file holds no response.
+        ParameterError: A text is no design.
+    """
+    measured = replace(read_response(machine), label="hw")
+    kept = _kept(machine)
+    return analyse_responses([measured], plant, designs or kept.designs, scaling=kept.scaling)
+
+
+class _Kept(NamedTuple):
+    """With what a machine was judged when it was measured."""
+
+    designs: Sequence[str] = ()
+    scaling: Scaling = DEFAULT_SCALING
+
+
+def _kept(machine: Path) -> _Kept:
+    """Return what lies beside a measured response; defaults where nothing does."""
+    path = (machine if machine.is_dir() else machine.parent) / NUMBERS
+    try:
+        content = json.loads(path.read_text(encoding="utf-8"))
+        return _Kept([design_text(one["name"]) for one in content["designs"]], Scaling(**content["scaling"]))
+    except (OSError, ValueError, KeyError, TypeError):
+        return _Kept()
 
 
 def write_analysis(
@@ -164,7 +221,7 @@ def write_analysis(
         write_response(folder / f"{response.label}_response.json", response)
     for layer in analysis.layers:
         write_layer(folder, layer)
-    write_json(folder / "frequency_response.json", analysis.to_json())
+    write_json(folder / NUMBERS, analysis.to_json())
     step("drawing")
     # Thousands of small matrices: threads of the linear algebra would only get into each other's way.
     with threadpool_limits(1):

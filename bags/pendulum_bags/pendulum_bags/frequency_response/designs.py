@@ -17,7 +17,7 @@ from pendulum_lqr.model import LinearModel
 from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.plants.plant_parameters import PlantParameters
 
-__all__ = ["DesignResult", "certify_designs"]
+__all__ = ["DesignResult", "certify_designs", "design_rows", "design_text"]
 
 _NUMBER = r"[-+0-9.eE]+"
 _WEIGHTS = re.compile(rf"q=({_NUMBER}),({_NUMBER})(?:[ ;]+r=({_NUMBER}))?")
@@ -72,6 +72,32 @@ def certify_designs(
     """
     asked = list(texts) or [f"q={q[0]:g},{q[1]:g} r={r:g}" for q, r in THESIS_WEIGHTS]
     return [_one(text.strip(), plant, model, certifier) for text in asked]
+
+
+def design_rows(designs: Sequence[DesignResult]) -> list[tuple[str, ...]]:
+    """Return the table of designs as text: row, design, margin, loop distance, modulus on the hardware, certified."""
+    rows: list[tuple[str, ...]] = []
+    for number, design in enumerate(designs, 1):
+        found = design.certificate
+        how = "by its margin" if found.by_gap else "by frequency" if found.by_frequency else "no"
+        if found.undecided:
+            how = "undecided: measure longer"
+        rows.append(
+            (
+                str(number),
+                design.name,
+                f"{found.margin:.3f}",
+                f"{found.distance:.2f} at {found.at:.2g} Hz" if found.stable_on_model else "unstable on the model",
+                f"{found.worst_modulus:.2f}",
+                f"yes, {how}" if found.certified else how,
+            )
+        )
+    return rows
+
+
+def design_text(name: str) -> str:
+    """Return the text that :func:`certify_designs` reads for a design of a name in a table."""
+    return re.sub(r"^K=", "k=", re.sub(r"\(([^()]+), ([^()]+)\)", r"\1,\2", name.removeprefix("LQR ")))
 
 
 def _one(text: str, plant: PlantParameters, model: LinearModel, certifier: Certifier) -> DesignResult:

@@ -17,7 +17,7 @@ from pendulum_lqr.measured_response import MeasuredResponse
 from pendulum_lqr.model import LinearModel
 from pendulum_lqr.sampled_response import model_response
 
-__all__ = ["certified_gains_figure", "certified_weights_figure", "response_figures"]
+__all__ = ["certified_gains_figure", "certified_weights_figure", "gap_figure", "response_figures"]
 
 Array = NDArray[np.float64]
 
@@ -48,7 +48,7 @@ def response_figures(
     """
     figures = [_bode(responses, model, difference), _quality(responses)]
     if certifier is not None:
-        figures.append(_gap(certifier, difference, designs))
+        figures.append(gap_figure(certifier, difference, designs))
         figures += [_nyquist(certifier, design) for design in designs[:1] if design.K is not None]
         figures += [certified_weights_figure(certifier, model), certified_gains_figure(certifier, designs)]
     return figures
@@ -133,7 +133,8 @@ def _quality(responses: Sequence[MeasuredResponse]) -> Figure:
     )
 
 
-def _gap(certifier: Certifier, difference: Difference | None, designs: Sequence[DesignResult]) -> Figure:
+def gap_figure(certifier: Certifier, difference: Difference | None, designs: Sequence[DesignResult]) -> Figure:
+    """Draw the gap per frequency beside the margins of designs."""
     profile = certifier.profile
     shown = profile.frequency > 0.0
     x = profile.frequency[shown]

@@ -13,7 +13,7 @@ from rich.console import Console
 
 from pendulum_msgs_py.errors import DataError, PendulumError
 from pendulum_msgs_py.programs.executables import EXIT_INTERRUPTED, cli_main
-from pendulum_msgs_py.programs.terminal import WholeTable, make_console
+from pendulum_msgs_py.programs.terminal import make_console
 
 if TYPE_CHECKING:
     from pendulum_bags.frequency_response.analyse import Analysis
@@ -157,7 +157,7 @@ def experiment(
 
 def _tell(console: Console, analysis: Analysis, out: Path | None, *, json_output: bool) -> None:
     from pendulum_bags.frequency_response.analyse import write_analysis
-    from pendulum_bags.frequency_response.page import design_rows
+    from pendulum_bags.frequency_response.designs_table import designs_table
 
     page = None
     if out is not None:
@@ -179,12 +179,7 @@ def _tell(console: Console, analysis: Analysis, out: Path | None, *, json_output
         console.print(f"\n{layer.layer.title}: {layer.mark.value}", style="bold")
         console.print(layer.sentence)
     if analysis.designs:
-        table = WholeTable(title="\nDesigns", title_justify="left")
-        for heading in ("row", "design", "margin b", "loop distance", "modulus on hw", "certified"):
-            table.add_column(heading)
-        for row in design_rows(analysis):
-            table.add_row(*row)
-        console.print(table)
+        console.print(designs_table(analysis.designs))
     if page is not None:
         console.print(f"\npage    {page}\nagain   {out}/hw_response.json for design --machine", soft_wrap=True)
 

@@ -7,13 +7,14 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from pendulum_bags.figures.figure import Figure
+from pendulum_bags.frequency_response.designs import design_rows
 from pendulum_bags.report.layer_page import write_layer_page
 from pendulum_bags.report.tables import Table
 
 if TYPE_CHECKING:
     from pendulum_bags.frequency_response.analyse import Analysis
 
-__all__ = ["ASSUMPTIONS", "design_rows", "write_page"]
+__all__ = ["ASSUMPTIONS", "write_page"]
 
 _THEOREM = (
     "The certificate is Vinnicombe's theorem with the upper 95 % limit of the measurement. It speaks of the linear "
@@ -29,27 +30,6 @@ ASSUMPTIONS = (_THEOREM, _LIMITS)
 """What the certificate rests on, and where it ends."""
 
 
-def design_rows(analysis: Analysis) -> list[tuple[str, ...]]:
-    """Return the table of designs as text: row, design, margin, loop distance, modulus on the hardware, certified."""
-    rows: list[tuple[str, ...]] = []
-    for number, design in enumerate(analysis.designs, 1):
-        found = design.certificate
-        how = "by its margin" if found.by_gap else "by frequency" if found.by_frequency else "no"
-        if found.undecided:
-            how = "undecided: measure longer"
-        rows.append(
-            (
-                str(number),
-                design.name,
-                f"{found.margin:.3f}",
-                f"{found.distance:.2f} at {found.at:.2g} Hz" if found.stable_on_model else "unstable on the model",
-                f"{found.worst_modulus:.2f}",
-                f"yes, {how}" if found.certified else how,
-            )
-        )
-    return rows
-
-
 def write_page(path: Path, analysis: Analysis, figures: Sequence[Figure]) -> Path:
     """Write the page and return its path."""
     tables = []
@@ -61,7 +41,7 @@ def write_page(path: Path, analysis: Analysis, figures: Sequence[Figure]) -> Pat
                 "or loop distance below "
                 "1 at every frequency.",
                 ("row", "design", "margin b(P, K)", "loop distance", "modulus margin on the hardware", "certified"),
-                design_rows(analysis),
+                design_rows(analysis.designs),
                 "",
             )
         )

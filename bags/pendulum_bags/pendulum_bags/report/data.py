@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from pendulum_bags.comparison import Comparison
 from pendulum_bags.replay.result import InputReplay
@@ -13,6 +13,9 @@ from pendulum_bags.verdict import Answer
 from pendulum_bags.verdict.answer import answer_of
 from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.plants.plant_parameters import PlantParameters, load_plant
+
+if TYPE_CHECKING:
+    from pendulum_bags.frequency_response.analyse import Analysis
 
 __all__ = ["ReportData"]
 
@@ -28,6 +31,7 @@ class ReportData:
         names: Names of the run folders.
         trials: The thesis's identification experiments, where they were recorded.
         answer: The sum of all layers that were measured; by default of the comparison alone.
+        certified: Which designs carry over to the hardware, where its frequency response was measured.
     """
 
     comparison: Comparison
@@ -36,6 +40,7 @@ class ReportData:
     names: Sequence[str] = ()
     trials: Sequence[TrialSet] = ()
     answer: Answer = None  # type: ignore[assignment]  # filled in below
+    certified: Analysis | None = None
     plant: PlantParameters | None = field(init=False)
 
     def __post_init__(self) -> None:

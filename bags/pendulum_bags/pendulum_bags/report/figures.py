@@ -6,7 +6,13 @@ from collections.abc import Callable
 
 from pendulum_bags.comparison import Comparison
 from pendulum_bags.figures.figure import Figure
-from pendulum_bags.report import analysis_figures, model_figures, motion_figures, trial_figures
+from pendulum_bags.report import (
+    analysis_figures,
+    certified_figures,
+    model_figures,
+    motion_figures,
+    trial_figures,
+)
 from pendulum_bags.report.data import ReportData
 
 __all__ = ["FIGURES", "comparison_figures", "make_figures"]
@@ -15,6 +21,9 @@ Maker = Callable[[ReportData], Figure | str]
 
 FIGURES: tuple[tuple[str, Maker], ...] = (
     ("Equivalence tests", analysis_figures.equivalence),
+    ("Gap per frequency", certified_figures.gap),
+    ("Gains that carry over", certified_figures.gains),
+    ("LQR weights that carry over", certified_figures.weights),
     ("Simulation and hardware together", motion_figures.both_together),
     ("Torque and noise", motion_figures.torque_and_noise),
     ("Difference under the same noise", motion_figures.paired_difference),

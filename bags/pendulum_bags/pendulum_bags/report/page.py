@@ -25,6 +25,7 @@ __all__ = ["render_page"]
 
 SECTIONS = (
     "Verdict",
+    "Frequency response",
     "Paired comparison",
     "Repeated runs",
     "Plants under noise",

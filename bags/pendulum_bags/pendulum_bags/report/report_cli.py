@@ -10,7 +10,7 @@ from typing import Annotated
 
 import typer
 
-from pendulum_bags.comparison.compare_cli import LayersOption
+from pendulum_bags.comparison.compare_cli import DesignOption, LayersOption, MachineOption
 from pendulum_msgs_py.errors import BagError
 from pendulum_msgs_py.programs.executables import cli_main
 
@@ -37,6 +37,8 @@ def report(
         Path | None, typer.Option("--margins", help="File of margins, as for compare.")
     ] = None,
     layers: LayersOption = None,
+    machine: MachineOption = None,
+    design: DesignOption = None,
     recording: Annotated[
         list[Path] | None,
         typer.Option(help="Recording of a real pendulum to replay in the report (CSV or bag)."),
@@ -48,6 +50,7 @@ def report(
     Example: python -m pendulum_bags report bags/runs/2026-01-31T12-00-00Z_thesis
     """
     from pendulum_bags.comparison import Margins, compare_folders, compare_runs
+    from pendulum_bags.frequency_response.carry_over import carry_over, layers_of
     from pendulum_bags.report import write_report
     from pendulum_bags.report.write import margin_of
     from pendulum_bags.verdict.answer import answer_of
@@ -76,7 +79,9 @@ def report(
             folder for folder in folders if not ((folder / "sim").exists() and (folder / "hw").exists())
         )
         raise BagError(f"run folder {bad} has no bags sim and hw; expected run folders, or two bags")
-    answer = answer_of(result, [*(folders if len(folders) == 1 else ()), *(layers or ())])
+    kept = [*(folders if len(folders) == 1 else ()), *(layers or ())]
+    certified = carry_over(result, kept, machine, design or ())
+    answer = answer_of(result, kept, anew=layers_of(certified))
     page = write_report(
         target,
         {key: value for key, value in (summary or {}).items() if key != "verdict"},
@@ -86,6 +91,7 @@ def report(
         recordings=recording or (),
         formats=("png",) if png_only else ("png", "pdf"),
         answer=answer,
+        certified=certified,
     )
     print(answer.sentence)
     print(f"report  {page} ({page.stat().st_size / 1e6:.1f} MB, {time.monotonic() - started:.1f} s)")

@@ -21,6 +21,7 @@ from pendulum_msgs_py.errors import BagError, PendulumError
 if TYPE_CHECKING:
     from pendulum_bags.comparison import Comparison
     from pendulum_bags.comparison.margins import MarginArgument
+    from pendulum_bags.frequency_response.analyse import Analysis
     from pendulum_bags.replay.result import InputReplay
     from pendulum_bags.verdict import Answer
 
@@ -40,6 +41,7 @@ def write_report(
     margin: MarginArgument = None,
     formats: Sequence[str] = ("png", "pdf"),
     answer: Answer | None = None,
+    certified: Analysis | None = None,
 ) -> Path:
     """Write ``report.html`` and ``figures/`` into a folder.
 
@@ -55,6 +57,7 @@ def write_report(
         margin: What difference does not matter.
         formats: Formats of the figures.
         answer: The sum of all layers; by default of the comparison and of what the run folder keeps.
+        certified: Which designs carry over to the measured machine; by default as the run folder's response says.
 
     Returns:
         Path of the page.
@@ -64,6 +67,7 @@ def write_report(
         DataError: A bag lacks what is needed.
     """
     from pendulum_bags.comparison import compare_folders
+    from pendulum_bags.frequency_response.carry_over import carry_over, layers_of
 
     out = Path(run_folder)
     if comparison is None:
@@ -80,8 +84,10 @@ def write_report(
     ]
     names = [Path(folder).name for folder in folders] or [out.resolve().name]
     kept = [Path(folder) for folder in folders] if len(folders) == 1 else [] if folders else [out]
-    answer = answer or answer_of(comparison, kept)
-    data = ReportData(comparison, content, replays, names, [read_trials(path) for path in trials], answer)
+    certified = certified or carry_over(comparison, kept)
+    answer = answer or answer_of(comparison, kept, anew=layers_of(certified))
+    known = [read_trials(path) for path in trials]
+    data = ReportData(comparison, content, replays, names, known, answer, certified)
     made, missing = make_figures(data)
     figures = [name_in(figure, emulated=comparison.is_emulated) for figure in made]
     page = render_page(

@@ -6,22 +6,30 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from pendulum_bags.comparison import Comparison
-from pendulum_bags.verdict.layers import Answer, Layer, read_layers, sum_up
+from pendulum_bags.verdict.layers import Answer, Layer, LayerResult, read_layers, sum_up
 from pendulum_bags.verdict.same_run import same_run_layer
 
 __all__ = ["answer_of"]
 
 
-def answer_of(comparison: Comparison, folders: Sequence[Path] = (), *, more: str = "") -> Answer:
+def answer_of(
+    comparison: Comparison,
+    folders: Sequence[Path] = (),
+    *,
+    more: str = "",
+    anew: Sequence[LayerResult] = (),
+) -> Answer:
     """Return the answer of a comparison.
 
     Args:
         comparison: The first layer.
         folders: Folders in which further layers may be kept: of the run, or of experiments that measured them.
         more: How to record more, where that is what is missing.
+        anew: Layers that were judged anew, and stand for those that the folders keep.
 
     Raises:
         DataError: A kept layer cannot be read, or is kept in two of the folders.
     """
-    others = [one for folder in folders for one in read_layers(folder) if one.layer is not Layer.SAME_RUN]
-    return sum_up([same_run_layer(comparison, more=more), *others], emulated=comparison.is_emulated)
+    known = {Layer.SAME_RUN, *(one.layer for one in anew)}
+    others = [one for folder in folders for one in read_layers(folder) if one.layer not in known]
+    return sum_up([same_run_layer(comparison, more=more), *anew, *others], emulated=comparison.is_emulated)

@@ -9,7 +9,7 @@ from rich.markup import escape
 from rich.text import Text
 
 from pendulum_bags.comparison import Verdict
-from pendulum_bags.verdict.layers import Answer, Mark
+from pendulum_bags.verdict.layers import Answer, Mark, name_hardware
 from pendulum_msgs_py.programs.terminal import WholeTable
 
 __all__ = ["layers_table", "print_answer", "tests_table"]
@@ -44,10 +44,11 @@ def layers_table(answer: Answer) -> WholeTable:
     return table
 
 
-def tests_table(verdict: Verdict) -> WholeTable:
+def tests_table(verdict: Verdict, *, emulated: bool) -> WholeTable:
     """Return the table of the tests of the first layer."""
     title = verdict.tests[0].interval.title if verdict.tests else "interval"
-    table = WholeTable(title="Tests of the same run: hardware against simulation", title_justify="left")
+    what = name_hardware("Tests of the same run: hardware against simulation", emulated=emulated)
+    table = WholeTable(title=what, title_justify="left")
     for heading in ("quantity", "estimate", title, "margin", "result"):
         table.add_column(heading, justify="left" if heading in {"quantity", "result"} else "right")
     for test in verdict.tests:
@@ -63,9 +64,9 @@ def tests_table(verdict: Verdict) -> WholeTable:
     return table
 
 
-def print_answer(console: Console, answer: Answer, verdict: Verdict) -> None:
+def print_answer(console: Console, answer: Answer, verdict: Verdict, *, emulated: bool = False) -> None:
     """Print tests, layers, the answer in one sentence, and what to do next; the answer is what is read last."""
-    console.print(tests_table(verdict))
+    console.print(tests_table(verdict, emulated=emulated))
     console.print(layers_table(answer))
     console.print("\nIs the simulation good enough to design a controller on?")
     console.print(Text(answer.sentence, _STYLES[answer.mark]), highlight=False)

@@ -1,0 +1,50 @@
+"""Which designs carry over to the machine of a comparison, where its frequency response was measured."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+from pendulum_bags.comparison import Comparison
+from pendulum_bags.frequency_response.analyse import Analysis, analyse_machine, find_machine
+from pendulum_bags.verdict import Layer, LayerResult
+from pendulum_msgs_py.errors import DataError
+
+__all__ = ["carry_over", "layers_of"]
+
+
+def carry_over(
+    comparison: Comparison, folders: Sequence[Path], machine: Path | None = None, designs: Sequence[str] = ()
+) -> Analysis | None:
+    """Return what is known of designs on the machine of a comparison, made on the plant that was simulated.
+
+    Args:
+        comparison: The comparison.
+        folders: Folders that may keep a measured response; the first that does counts.
+        machine: Measured response, or the folder that keeps it, before all others.
+        designs: As :func:`pendulum_bags.frequency_response.designs.certify_designs` reads them.
+
+    Returns:
+        The certificates, None where no response was measured.
+
+    Raises:
+        DataError: Designs are given and no response, or it cannot be read.
+        ParameterError: A text is no design.
+    """
+    place = machine or find_machine(folders)
+    if place is None:
+        if designs:
+            told = ", ".join(map(str, folders)) or "no folder"
+            raise DataError(
+                f"--design needs the measured response of the machine, and {told} keeps none; expected --machine or "
+                "--layers with the folder of python -m pendulum_bags experiment frequency_response"
+            )
+        return None
+    told_run = comparison.pairs[0].simulation.metadata.get("pendulum.run")
+    facts: Mapping[str, object] = told_run if isinstance(told_run, Mapping) else {}
+    return analyse_machine(place, str(facts.get("plant") or "thesis"), designs)
+
+
+def layers_of(analysis: Analysis | None) -> list[LayerResult]:
+    """Return the layer of the verdict that certificates give, none without them."""
+    return [one for one in (analysis.layers if analysis else ()) if one.layer is Layer.WHICH_CONTROLLERS]
