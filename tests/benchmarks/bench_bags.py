@@ -22,8 +22,8 @@ import numpy as np
 
 from pendulum_msgs_py.contract.cdr import encode_joint_state
 from pendulum_rosbag.reader import read_bag
+from pendulum_rosbag.repair.repair import repair_bag
 from pendulum_rosbag.storage import open_writer, typestore
-from pendulum_rosbag.storage.repair import repair_bag
 from tests.benchmarks import Peer, Row, measured, peer
 from tests.benchmarks.bag_recordings import kill_rows, load_rows
 from tests.benchmarks.bag_seals import seal_rows

@@ -18,7 +18,7 @@ EXECUTABLES: dict[str, str] = {
     "play": "pendulum_rosbag.player.player_node:main",
     "console": "pendulum_bags.console.console_cli:main",
     "info": "pendulum_rosbag.reader.info_cli:main",
-    "repair": "pendulum_rosbag.storage.repair_cli:main",
+    "repair": "pendulum_rosbag.repair.repair_cli:main",
 }
 
 COMMANDS: dict[str, str] = {

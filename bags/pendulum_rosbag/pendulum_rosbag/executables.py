@@ -7,7 +7,7 @@ EXECUTABLES: dict[str, str] = {
     "play": "pendulum_rosbag.player.player_node:main",
     "info": "pendulum_rosbag.reader.info_cli:main",
     "export": "pendulum_rosbag.reader.export_cli:main",
-    "repair": "pendulum_rosbag.storage.repair_cli:main",
+    "repair": "pendulum_rosbag.repair.repair_cli:main",
 }
 
 COMMANDS: dict[str, str] = {

@@ -26,9 +26,9 @@ from pendulum_msgs_py.contract.cdr import encode_joint_state
 from pendulum_msgs_py.errors import BagError, DataError, PendulumError
 from pendulum_rosbag.reader import read_bag, same_messages
 from pendulum_rosbag.reader.statistics import bag_statistics
+from pendulum_rosbag.repair.repair import repair_bag
+from pendulum_rosbag.repair.repair_cli import main as repair_main
 from pendulum_rosbag.storage import open_writer, typestore
-from pendulum_rosbag.storage.repair import repair_bag
-from pendulum_rosbag.storage.repair_cli import main as repair_main
 from tests.mcap_js_reader import McapJs
 
 JOINT_STATE = "sensor_msgs/msg/JointState"

@@ -11,7 +11,7 @@ import numpy.typing as npt
 from pendulum_rosbag.reader.bag import Bag
 from pendulum_rosbag.reader.batches import Int64
 from pendulum_rosbag.reader.topic_info import TopicInfo
-from pendulum_rosbag.recorder.stamps import stamp_reader
+from pendulum_rosbag.storage.stamps import stamp_reader
 
 __all__ = [
     "BagStatistics", "Latency", "TopicStatistics", "bag_statistics", "clock_jumps", "time_statistics",

@@ -2,7 +2,7 @@
 
 from pendulum_rosbag.recorder.gaps import GapCounter
 from pendulum_rosbag.recorder.session import RecordingSession, SessionReport, TopicCount
-from pendulum_rosbag.recorder.stamps import LOG_TIMES, StampReader, stamp_reader
+from pendulum_rosbag.storage.stamps import LOG_TIMES, StampReader, stamp_reader
 
 __all__ = [
     "LOG_TIMES",

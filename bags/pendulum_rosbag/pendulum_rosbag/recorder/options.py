@@ -10,8 +10,8 @@ from pathlib import Path
 from typing import Any
 
 from pendulum_msgs_py.errors import ParameterError
-from pendulum_rosbag.recorder.stamps import LOG_TIMES
 from pendulum_rosbag.storage import STORAGES
+from pendulum_rosbag.storage.stamps import LOG_TIMES
 
 __all__ = ["RecorderOptions", "read_metadata"]
 

@@ -11,7 +11,7 @@ from typing import Annotated
 import typer
 
 from pendulum_msgs_py.programs.executables import cli_main
-from pendulum_rosbag.storage.repair import repair_bag
+from pendulum_rosbag.repair.repair import repair_bag
 
 __all__ = ["main"]
 

@@ -1,0 +1,1 @@
+"""Bags that another recorder left broken, made sound."""
