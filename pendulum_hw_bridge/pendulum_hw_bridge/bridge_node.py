@@ -155,12 +155,12 @@ class BridgeNode(LifecycleNode):
         )
         self._safety = bridge_parameters.safety_limits(values, limits.effort)
         self._derating = Derating(values["derating_temperature"], values["winding_temperature_limit"])
-        self._e_stop = EStopServer(self, lambda: self._supervisor.e_stop(self._interface.clock()))
+        self._e_stop = EStopServer(self, self._latch)
         if values["e_stop_input_timeout"] > 0.0:
             self._e_stop_input = EStopInputServer(
                 self,
                 values["e_stop_input_timeout"],
-                lambda reason: self._supervisor.e_stop(self._interface.clock(), reason),
+                self._latch,
                 lambda: self._supervisor.mode is Mode.E_STOP,
             )
         if values["autostart"]:
@@ -181,6 +181,9 @@ class BridgeNode(LifecycleNode):
             self.get_logger().error(f"{bridge.last_fault}: press the motion stop, cut the supply")
         self._interface.publish_applied(stamp_ns, 0.0)
         self._close_e_stops()
+
+    def _latch(self, reason: str) -> None:
+        self._supervisor.e_stop(self._interface.clock(), reason)
 
     def _close_e_stops(self) -> None:
         self._e_stop.close()

@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
-import threading
 import time
 from collections.abc import Callable
 
-from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
+from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from std_msgs.msg import Bool
 
 from pendulum_hw_bridge.e_stop_input import EStopInput
+from pendulum_hw_bridge.e_stop_thread_node import EStopThread
 
 __all__ = ["TOPIC", "EStopInputServer"]
 
@@ -19,7 +19,8 @@ TOPIC = "e_stop_input"
 """``std_msgs/Bool``, relative to the plant: true is pressed, false says "not pressed" and has to come all the time."""
 _LOOKS = 4
 """Looks at the silence within its limit [-]."""
-_JOIN = 2.0
+_WAITING = 100
+"""Messages that may wait for the thread: with one, the release that follows a press would take its place [-]."""
 
 
 class EStopInputServer:
@@ -37,22 +38,14 @@ class EStopInputServer:
     ) -> None:
         self._input = EStopInput(timeout)
         self._press, self._latched = press, latched
-        # Without the process's remaps: they were for the owner, whose names are resolved here already.
-        self._node = Node(
-            f"{owner.get_name()}_e_stop_input",
-            context=owner.context,
-            namespace=owner.get_namespace(),
-            use_global_arguments=False,
-            enable_rosout=False,
-            start_parameter_services=False,
-        )
+        self._thread = EStopThread(owner, "e_stop_input", press)
+        node = self._thread.node
         # Best effort: it hears every publisher, and a late message of a button is worth nothing.
-        qos = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)
-        self._node.create_subscription(Bool, owner.resolve_topic_name(TOPIC), self._on_message, qos)
-        self._node.create_timer(timeout / _LOOKS, self._look)
-        self._executor = SingleThreadedExecutor(context=owner.context)
-        self._executor.add_node(self._node)
-        self._thread = threading.Thread(target=self._spin, name="e_stop_input", daemon=True)
+        qos = QoSProfile(depth=_WAITING, reliability=ReliabilityPolicy.BEST_EFFORT)
+        node.create_subscription(Bool, owner.resolve_topic_name(TOPIC), self._on_message, qos)
+        # Steady time: it must go on where the system clock is set back.
+        steady = Clock(clock_type=ClockType.STEADY_TIME)
+        node.create_timer(timeout / _LOOKS, self._look, clock=steady)
         self._thread.start()
 
     @property
@@ -62,22 +55,15 @@ class EStopInputServer:
 
     def close(self) -> None:
         """Stop to listen."""
-        self._executor.shutdown()
-        self._thread.join(_JOIN)
-        self._node.destroy_node()
+        self._thread.close()
 
     def _on_message(self, message: Bool) -> None:
         self._input.hear(pressed=bool(message.data), now_ns=time.monotonic_ns())
-        if message.data:
-            self._look()
+        # Latched here: by the next look the button may be released again.
+        if message.data and not self._latched():
+            self._press("e-stop button is pressed")
 
     def _look(self) -> None:
         reason = self.reason
         if reason and not self._latched():
             self._press(reason)
-
-    def _spin(self) -> None:
-        try:
-            self._executor.spin()
-        except ExternalShutdownException:
-            return

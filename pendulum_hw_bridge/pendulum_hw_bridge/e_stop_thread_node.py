@@ -1,0 +1,78 @@
+"""A node with an executor and a thread of its own for an e-stop; an error in it is a press, and does not end it."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable
+
+from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
+from rclpy.node import Node
+
+__all__ = ["EStopThread"]
+
+_JOIN = 2.0
+_PAUSE = 0.01
+"""Time after an error before the thread serves again [s]."""
+
+
+class EStopThread:
+    """A node beside another one, served by a thread that does nothing else.
+
+    Args:
+        owner: The node whose e-stop it serves.
+        suffix: Of the node's and the thread's name.
+        press: Latches the e-stop, with the reason; called in the thread, must be quick and wait for nobody.
+
+    Attributes:
+        node: The node; give it what it has to serve, then :meth:`start`.
+    """
+
+    def __init__(self, owner: Node, suffix: str, press: Callable[[str], None]) -> None:
+        self._press = press
+        # Without the process's remaps: they were for the owner, whose names are resolved there already.
+        self.node = Node(
+            f"{owner.get_name()}_{suffix}",
+            context=owner.context,
+            namespace=owner.get_namespace(),
+            use_global_arguments=False,
+            enable_rosout=False,
+            start_parameter_services=False,
+        )
+        self._executor = SingleThreadedExecutor(context=owner.context)
+        self._executor.add_node(self.node)
+        self._closing = threading.Event()
+        self._thread = threading.Thread(target=self._run, name=suffix, daemon=True)
+
+    def start(self) -> None:
+        """Begin to serve."""
+        self._thread.start()
+
+    def close(self) -> None:
+        """Stop to serve."""
+        self._closing.set()
+        self._executor.shutdown()
+        self._thread.join(_JOIN)
+        self.node.destroy_node()
+
+    def _run(self) -> None:
+        while not self._closing.is_set():
+            try:
+                self._executor.spin()
+            except ExternalShutdownException:
+                return
+            # An answer that cannot be sent raises as well: whoever waits for this e-stop must still find it.
+            except Exception as error:  # noqa: BLE001
+                self._fail(error)
+                self._closing.wait(_PAUSE)
+            else:
+                return
+
+    def _fail(self, error: Exception) -> None:
+        if self._closing.is_set():
+            return
+        reason = f"e-stop itself failed: {type(error).__name__}: {error}"
+        self.node.get_logger().error(reason)
+        try:
+            self._press(reason)
+        except Exception as second:  # noqa: BLE001
+            self.node.get_logger().error(f"e-stop could not be latched: {type(second).__name__}: {second}")

@@ -1,0 +1,127 @@
+"""The threads of the e-stop and of its button: no error, clock or quick release takes them away."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable, Iterator
+
+import pytest
+import rclpy
+from rclpy.clock import ClockType
+from rclpy.context import Context
+from rclpy.executors import SingleThreadedExecutor
+from rclpy.node import Node
+from std_msgs.msg import Bool
+from std_srvs.srv import Trigger
+
+from pendulum_hw_bridge.e_stop_input_node import TOPIC, EStopInputServer
+from pendulum_hw_bridge.e_stop_node import EStopServer
+
+DEADLINE = 20.0
+
+
+class Desk:
+    """A plant's node, a person's node, and what was latched."""
+
+    def __init__(self, domain: int) -> None:
+        self.context = Context()
+        rclpy.init(context=self.context, domain_id=domain)
+        self.owner = Node("plant", context=self.context)
+        self.person = Node("person", context=self.context)
+        self.reasons: list[str] = []
+        self.broken = False
+        self.servers: list[EStopServer | EStopInputServer] = []
+        self._executor = SingleThreadedExecutor(context=self.context)
+        self._executor.add_node(self.person)
+
+    def press(self, reason: str) -> None:
+        if self.broken:
+            self.broken = False
+            raise RuntimeError("a middleware that fails once")
+        self.reasons.append(reason)
+
+    def until(self, condition: Callable[[], object], what: str) -> None:
+        deadline = time.monotonic() + DEADLINE
+        while not condition():
+            assert time.monotonic() < deadline, f"no {what}"
+            self._executor.spin_once(timeout_sec=0.01)
+
+    def close(self) -> None:
+        for server in self.servers:
+            server.close()
+        self._executor.shutdown()
+        self.person.destroy_node()
+        self.owner.destroy_node()
+        rclpy.shutdown(context=self.context)
+
+
+@pytest.fixture
+def desk(domain_id: int) -> Iterator[Desk]:
+    made = Desk(domain_id)
+    yield made
+    made.close()
+
+
+def test_an_error_in_the_e_stop_is_a_press_and_the_next_press_is_answered(desk: Desk) -> None:
+    desk.servers.append(EStopServer(desk.owner, desk.press))
+    client = desk.person.create_client(Trigger, "plant/e_stop")
+    desk.until(client.service_is_ready, "e-stop")
+    desk.broken = True
+    client.call_async(Trigger.Request())
+    desk.until(lambda: desk.reasons, "press of an e-stop that failed")
+    assert desk.reasons == ["e-stop itself failed: RuntimeError: a middleware that fails once"]
+    answer = client.call_async(Trigger.Request())
+    desk.until(answer.done, "answer of the e-stop after an error")
+    assert answer.result().success
+    assert desk.reasons[1:] == ["e-stop pressed"]
+
+
+def test_a_press_counts_though_the_release_came_before_it_was_read(desk: Desk) -> None:
+    server = EStopInputServer(desk.owner, 60.0, desk.press, lambda: bool(desk.reasons))
+    desk.servers.append(server)
+    held, heard = threading.Lock(), threading.Event()
+    hear = server._input.hear
+
+    def slow(*, pressed: bool, now_ns: int) -> None:
+        heard.set()
+        with held:
+            hear(pressed=pressed, now_ns=now_ns)
+
+    server._input.hear = slow  # type: ignore[method-assign]
+    button = desk.person.create_publisher(Bool, TOPIC, 10)
+    desk.until(button.get_subscription_count, "listener of the button")
+    with held:
+        # The thread is busy with the first message while the button is pressed and released.
+        while not heard.is_set():
+            button.publish(Bool(data=False))
+            desk.until(lambda: heard.wait(0.01) or True, "message")
+        for pressed in [True, False, False]:
+            button.publish(Bool(data=pressed))
+        sent = time.monotonic() + 0.3
+        desk.until(lambda: time.monotonic() > sent, "time for three messages to arrive")
+    desk.until(lambda: desk.reasons, "press of the button")
+    assert desk.reasons == ["e-stop button is pressed"]
+
+
+def test_an_error_of_the_button_is_a_press_and_silence_is_noticed_after_it(desk: Desk) -> None:
+    desk.broken = True
+    desk.servers.append(EStopInputServer(desk.owner, 0.2, desk.press, lambda: False))
+    desk.until(lambda: any("never heard" in reason for reason in desk.reasons), "press by silence")
+    assert desk.reasons[0].startswith("e-stop itself failed")
+
+
+def test_silence_of_the_button_is_measured_by_a_clock_that_nobody_sets(
+    desk: Desk, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    clocks = []
+    create_timer = Node.create_timer
+
+    def watched(node: Node, *arguments: object, **named: object) -> object:
+        timer = create_timer(node, *arguments, **named)
+        clocks.append(timer.clock.clock_type)
+        return timer
+
+    monkeypatch.setattr(Node, "create_timer", watched)
+    desk.servers.append(EStopInputServer(desk.owner, 1.0, desk.press, lambda: False))
+    assert clocks == [ClockType.STEADY_TIME]
