@@ -180,7 +180,12 @@ class Hub:
                 due = self._order.due(self.plants().values(), now)
                 idle = not self._order.in_force
             for node in due:
-                self._ask_to_stop(node, now)
+                try:
+                    self._ask_to_stop(node, now)
+                # What is wrong with one plant's service must not end the stop of all others.
+                except Exception as error:  # noqa: BLE001
+                    with self._order_lock:
+                        self._order.problem(node, f"cannot be asked: {type(error).__name__}: {error}")
             if idle:
                 self._order_changed.wait()
                 self._order_changed.clear()
@@ -278,7 +283,11 @@ class Hub:
 
     def _spin(self) -> None:
         while not self._done.done():
-            self._executor.spin_until_future_complete(self._done, _SLICE)
+            try:
+                self._executor.spin_until_future_complete(self._done, _SLICE)
+            # A callback that broke over one message must not keep the answers to a stop away.
+            except Exception as error:  # noqa: BLE001
+                self._node.get_logger().error(f"{type(error).__name__}: {error}", throttle_duration_sec=1.0)
 
     def _look(self) -> None:
         """Find plants by their e-stop: who has one is a plant."""
@@ -362,9 +371,12 @@ def _on_event(plant: _Plant, message: String) -> None:
         event = json.loads(message.data)
     except json.JSONDecodeError:
         return
-    if isinstance(event, dict) and event.get("name") == "plant_mode":
+    if not isinstance(event, dict) or event.get("name") != "plant_mode":
+        return
+    stamp_ns = event.get("stamp_ns", 0)
+    if isinstance(stamp_ns, int):
         plant.mode, plant.reason = str(event.get("mode", "")), str(event.get("reason", ""))
-        plant.mode_stamp_ns = int(event.get("stamp_ns", 0))
+        plant.mode_stamp_ns = stamp_ns
 
 
 def _accepted(who: str, response: Any) -> str:

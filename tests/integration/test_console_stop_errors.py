@@ -1,0 +1,95 @@
+"""The console's stop outlives errors: of one plant's service, and of what plants say."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import time
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import pytest
+from std_msgs.msg import String
+from std_srvs.srv import Trigger
+
+from pendulum_bags.console.console_node import Hub
+from pendulum_msgs_py.ros import qos
+from tests.graph_peer import GraphPeer
+
+FIRST, SECOND = "/first/plant", "/second/plant"
+DEADLINE = 20.0
+
+
+class Lab:
+    """Two plants that can only be stopped, and a console."""
+
+    def __init__(self) -> None:
+        self.peer = GraphPeer("plants")
+        self.stopped: list[str] = []
+        for plant in (FIRST, SECOND):
+            self.peer.node.create_service(Trigger, f"{plant}/e_stop", self._stop(plant))
+        self.events = self.peer.node.create_publisher(String, "/first/events", qos.EVENTS)
+        self.hub = Hub()
+        self.until(lambda: len(self.hub.plants()) == 2, "plants")
+
+    def _stop(self, plant: str) -> Callable[..., Trigger.Response]:
+        def stop(_: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+            self.stopped.append(plant)
+            response.success = True
+            return response
+
+        return stop
+
+    def until(self, condition: Callable[[], object], what: str) -> None:
+        self.peer.until(condition, what, DEADLINE)
+
+    def state(self, plant: str) -> str:
+        order = self.hub.stop_state()
+        return "" if order is None else str(order["rows"][plant]["state"])
+
+    def close(self) -> None:
+        self.hub.close()
+        self.peer.close()
+
+
+@pytest.fixture
+def lab(domain_id: int) -> Iterator[Lab]:
+    made = Lab()
+    yield made
+    made.close()
+
+
+def test_a_plant_whose_service_breaks_keeps_no_other_from_being_stopped(
+    lab: Lab, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    find = lab.hub._stop_client
+    broken = [True]
+
+    def client_of(node: str) -> Any:
+        if node == FIRST and broken:
+            raise RuntimeError("client of a service that is gone")
+        return find(node)
+
+    monkeypatch.setattr(lab.hub, "_stop_client", client_of)
+    asyncio.run(lab.hub.e_stop())
+    lab.until(lambda: lab.state(SECOND) == "stopped", "stop of the other plant")
+    order = lab.hub.stop_state()
+    assert order is not None
+    assert order["rows"][FIRST]["state"] == "asked"
+    assert "client of a service that is gone" in order["rows"][FIRST]["text"]
+    broken.clear()
+    lab.until(lambda: lab.state(FIRST) == "stopped", "stop of a plant that is whole again")
+
+
+def test_an_event_that_makes_no_sense_keeps_no_answer_to_a_stop_away(lab: Lab) -> None:
+    lab.until(lab.events.get_subscription_count, "console that hears events")
+    for stamp in ("yesterday", None, [1]):
+        lab.events.publish(
+            String(data=json.dumps({"name": "plant_mode", "mode": "nonsense", "stamp_ns": stamp}))
+        )
+    lab.events.publish(
+        String(data=json.dumps({"name": "plant_mode", "mode": "disarmed", "stamp_ns": time.time_ns()}))
+    )
+    lab.until(lambda: lab.hub.frame()["/first"]["mode"] == "disarmed", "event after it")
+    asyncio.run(lab.hub.e_stop())
+    lab.until(lambda: lab.state(FIRST) == lab.state(SECOND) == "stopped", "answers of both plants")
