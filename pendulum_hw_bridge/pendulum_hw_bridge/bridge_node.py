@@ -35,6 +35,7 @@ from pendulum_msgs_py.contract.timing import LoopStatistics, SteadyWallClock
 from pendulum_msgs_py.contract.values import NANOSECONDS, JointCommand, JointSample
 from pendulum_msgs_py.errors import PendulumError
 from pendulum_msgs_py.parameters import ParameterSpec, ParameterValue
+from pendulum_msgs_py.plants.plant_differences import PLANT_PARAMETERS, describe_plants
 from pendulum_msgs_py.ros import qos
 from pendulum_msgs_py.ros.convert import stamp_to_message
 from pendulum_msgs_py.ros.lifecycle import LifecycleNode
@@ -108,6 +109,7 @@ class BridgeNode(LifecycleNode):
         self._loop: ActuatorLoop | None = None
         self._bridge: Bridge | None = None
         self._plant = bridge_parameters.plant_of(values)
+        self._told_plants = describe_plants(bridge_parameters.told_plants(values))
         self._gains = bridge_parameters.trajectory_gains(values)
         # A cycle more than the monitor has, which names the fault; this one is behind it.
         patience = (values["feedback_watchdog"] + 1) * self._period_ns / NANOSECONDS
@@ -404,6 +406,7 @@ class BridgeNode(LifecycleNode):
         bridge = self._bridge
         values: dict[str, object] = {
             "active": self._active,
+            PLANT_PARAMETERS: self._told_plants,
             "backend": self._values["backend"],
             "effort_strategy": self._values["effort_strategy"],
         }

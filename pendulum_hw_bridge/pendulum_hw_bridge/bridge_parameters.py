@@ -21,7 +21,12 @@ from pendulum_msgs_py.contract.drive import PlantLimits
 from pendulum_msgs_py.contract.values import NANOSECONDS
 from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.parameters import ParameterSpec
-from pendulum_msgs_py.plants.plant_parameters import PlantParameters, SeriesElasticParameters
+from pendulum_msgs_py.plants.plant_parameters import (
+    PRESETS,
+    PlantParameters,
+    SeriesElasticParameters,
+    load_plant,
+)
 
 __all__ = [
     "BRIDGE_SPECS",
@@ -32,6 +37,7 @@ __all__ = [
     "make_port",
     "plant_of",
     "safety_limits",
+    "told_plants",
     "trajectory_gains",
 ]
 
@@ -222,6 +228,24 @@ def plant_of(values: Mapping[str, Any]) -> PlantParameters:
     from pendulum_hw_bridge.emulation.parameters import load_emulator
 
     return load_emulator(values["plant"]).plant
+
+
+def told_plants(values: Mapping[str, Any]) -> list[PlantParameters]:
+    """Return what the plant behind the bridge is known to be; empty where nobody says.
+
+    An emulator in this process is what it emulates: the machine ``thesis`` also the rigid plant that the thesis's
+    experiments on it give. Any other actuator is what a plant file says; a preset is none of its measurements.
+
+    Raises:
+        ParameterError: as :func:`plant_of`.
+    """
+    emulated = values["backend"] == "emulator"
+    if not emulated and values["plant"] in PRESETS:
+        return []
+    plants = [plant_of(values)]
+    if values["plant"] == "thesis":
+        plants.append(load_plant("thesis"))
+    return [plant.with_values(gravity=0.0) for plant in plants] if emulated and values["flat"] else plants
 
 
 def drivetrain_of(plant: PlantParameters) -> SeriesElasticParameters:

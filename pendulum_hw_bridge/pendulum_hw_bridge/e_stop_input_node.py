@@ -12,11 +12,10 @@ from std_msgs.msg import Bool
 
 from pendulum_hw_bridge.e_stop_input import EStopInput
 from pendulum_hw_bridge.e_stop_thread_node import EStopThread
+from pendulum_msgs_py.contract import names
 
-__all__ = ["TOPIC", "EStopInputServer"]
+__all__ = ["EStopInputServer"]
 
-TOPIC = "e_stop_input"
-"""``std_msgs/Bool``, relative to the plant: true is pressed, false says "not pressed" and has to come all the time."""
 _LOOKS = 4
 """Looks at the silence within its limit [-]."""
 _WAITING = 100
@@ -42,7 +41,7 @@ class EStopInputServer:
         node = self._thread.node
         # Best effort: it hears every publisher, and a late message of a button is worth nothing.
         qos = QoSProfile(depth=_WAITING, reliability=ReliabilityPolicy.BEST_EFFORT)
-        node.create_subscription(Bool, owner.resolve_topic_name(TOPIC), self._on_message, qos)
+        node.create_subscription(Bool, owner.resolve_topic_name(names.E_STOP_INPUT), self._on_message, qos)
         # Steady time: it must go on where the system clock is set back.
         steady = Clock(clock_type=ClockType.STEADY_TIME)
         node.create_timer(timeout / _LOOKS, self._look, clock=steady)

@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -10,7 +11,7 @@ from scipy import stats
 from pendulum_hw_bridge.actuator import Command, Strategy
 from pendulum_hw_bridge.backends.emulator import EmulatorBackend
 from pendulum_hw_bridge.bridge_parameters import BRIDGE_SPECS as SPECS
-from pendulum_hw_bridge.bridge_parameters import make_port
+from pendulum_hw_bridge.bridge_parameters import make_port, told_plants
 from pendulum_hw_bridge.clocks import SteppedClock
 from pendulum_hw_bridge.emulation.parameters import load_emulator
 from pendulum_hw_bridge.emulation.x5 import EmulatedX5
@@ -18,6 +19,9 @@ from pendulum_hw_bridge.procedure import StaircaseTrial
 from pendulum_hw_bridge.procedures import HandMotion, hand_trials, staircase, staircase_angles
 from pendulum_msgs_py.contract.values import JointSample
 from pendulum_msgs_py.errors import ParameterError
+from pendulum_msgs_py.parameters import validate
+from pendulum_msgs_py.plants.plant_differences import plant_mismatch
+from pendulum_msgs_py.plants.plant_parameters import load_plant, write_plant
 
 SECOND = 1e9
 
@@ -142,3 +146,21 @@ def test_hand_trials_depend_on_seed_and_number_alone_and_alternate() -> None:
         hand_trials(0, trials=0)
     with pytest.raises(ParameterError, match="multiple of step"):
         staircase_angles(7.0, 90.0)
+
+
+@pytest.mark.parametrize(("plant", "designed"), [("thesis", "thesis"), ("x5_9", "x5_9")])
+def test_a_controller_for_the_preset_that_is_emulated_is_for_the_plant_that_runs(plant: str, designed: str) -> None:
+    told = told_plants(validate(SPECS, {"plant": plant}))
+    assert plant_mismatch(load_plant(designed), told) == ""
+    assert plant_mismatch(load_emulator(plant).plant, told) == ""
+    assert "runs" in plant_mismatch(load_plant("dfki"), told)
+    flat = told_plants(validate(SPECS, {"plant": plant, "flat": True}))
+    assert "gravity" in plant_mismatch(load_plant(designed), flat)
+
+
+@pytest.mark.parametrize("backend", ["hebi", "emulator_process", "replay"])
+def test_what_is_behind_the_bridge_is_unknown_unless_a_plant_file_says_it(backend: str, tmp_path: Path) -> None:
+    assert told_plants(validate(SPECS, {"plant": "thesis", "backend": backend})) == []
+    path = write_plant(tmp_path / "mine.yaml", load_plant("x5_9").with_values(damping=1.0, name="mine"))
+    (told,) = told_plants(validate(SPECS, {"plant": str(path), "backend": backend}))
+    assert (told.name, told.damping) == ("mine", 1.0)

@@ -36,7 +36,9 @@ from pendulum_msgs_py.ros.convert import (
 )
 from pendulum_msgs_py.ros.lifecycle import LifecycleNode
 from pendulum_msgs_py.ros.parameters import NodeParameters
+from pendulum_msgs_py.ros.polled import PollingNode
 from pendulum_msgs_py.ros.runner import run_node
+from pendulum_msgs_py.ros.running_plant import RunningPlant
 
 __all__ = ["NODE_SPECS", "ControllerNode", "main"]
 
@@ -71,7 +73,7 @@ _SAME_PERIOD = 0.02
 _MULTI_ARRAY_TOPIC = "~/commands"
 
 
-class ControllerNode(LifecycleNode):
+class ControllerNode(LifecycleNode, PollingNode):
     """Lifecycle node around a controller.
 
     Unconfigured: parameters are known. Inactive: the gain is designed and printed, states are heard and not answered.
@@ -115,6 +117,7 @@ class ControllerNode(LifecycleNode):
             DiagnosticArray, names.DIAGNOSTICS, qos.DIAGNOSTICS
         )
         self.create_subscription(JointState, names.JOINT_STATES, self._on_state, qos.NEWEST_STATE, raw=True)
+        self._running_plant = RunningPlant(self, self._plant)
         # Wall time on purpose: diagnostics must come even where simulated time stands still.
         self.create_timer(_DIAGNOSTICS_PERIOD, self._on_timer, clock=_steady_clock())
         if self._settings["autostart"]:
@@ -197,6 +200,7 @@ class ControllerNode(LifecycleNode):
         self.get_logger().info(f"changed while running: {controller.describe()}")
 
     def _on_timer(self) -> None:
+        self._running_plant.look()
         self._publish_diagnostics()
         if self._loop is None:
             return
@@ -321,6 +325,9 @@ class ControllerNode(LifecycleNode):
                 if not self._told_other_rate:
                     self.get_logger().warning(text)
             self._told_other_rate = other_rate
+        if self._running_plant.mismatch:
+            level = max(level, DiagnosticStatus.WARN)
+            text = f"{text}; {self._running_plant.mismatch}"
         message = DiagnosticArray(
             status=[diagnostic_status(f"{self.get_fully_qualified_name()}: controller", level, text, values)]
         )

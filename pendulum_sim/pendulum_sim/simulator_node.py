@@ -17,6 +17,7 @@ from pendulum_msgs_py.contract.timing import LoopStatistics, SteadyWallClock
 from pendulum_msgs_py.contract.values import NANOSECONDS, JointCommand, JointSample
 from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.parameters import ParameterSpec
+from pendulum_msgs_py.plants.plant_differences import PLANT_PARAMETERS, describe_plants
 from pendulum_msgs_py.plants.plant_parameters import load_plant
 from pendulum_msgs_py.ros import qos
 from pendulum_msgs_py.ros.convert import sample_from_message
@@ -94,6 +95,7 @@ class SimulatorNode(PollingNode):
         parameters = load_plant(values["plant"])
         period_ns = round(NANOSECONDS / values["rate_hz"])
         self._dt = period_ns / NANOSECONDS
+        self._told_plant = describe_plants([parameters])
         self._plant = make_plant(
             parameters, self._dt, method=values["method"], substeps=values["substeps"] or None
         )
@@ -252,6 +254,7 @@ class SimulatorNode(PollingNode):
         values = self._settings.values
         figures: dict[str, object] = {
             "plant": values["plant"],
+            PLANT_PARAMETERS: self._told_plant,
             "method": values["method"],
             "clock": values["clock"],
             "paused": self._loop.paused,

@@ -15,8 +15,9 @@ from rclpy.node import Node
 from std_msgs.msg import Bool
 from std_srvs.srv import Trigger
 
-from pendulum_hw_bridge.e_stop_input_node import TOPIC, EStopInputServer
+from pendulum_hw_bridge.e_stop_input_node import EStopInputServer
 from pendulum_hw_bridge.e_stop_node import EStopServer
+from pendulum_msgs_py.contract import names
 
 DEADLINE = 20.0
 
@@ -89,7 +90,7 @@ def test_a_press_counts_though_the_release_came_before_it_was_read(desk: Desk) -
             hear(pressed=pressed, now_ns=now_ns)
 
     server._input.hear = slow  # type: ignore[method-assign]
-    button = desk.person.create_publisher(Bool, TOPIC, 10)
+    button = desk.person.create_publisher(Bool, names.E_STOP_INPUT, 10)
     desk.until(button.get_subscription_count, "listener of the button")
     with held:
         # The thread is busy with the first message while the button is pressed and released.

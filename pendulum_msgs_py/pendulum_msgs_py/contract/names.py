@@ -11,6 +11,7 @@ __all__ = [
     "EFFORT_COMMAND",
     "EVENTS",
     "E_STOP",
+    "E_STOP_INPUT",
     "E_STOP_RESET",
     "JOINT",
     "JOINT_STATES",
@@ -30,6 +31,8 @@ JOINT_TRAJECTORY = "joint_trajectory"
 PUSH = "push"
 APPLIED_EFFORT = "applied_effort"
 EVENTS = "events"
+E_STOP_INPUT = "e_stop_input"
+"""``std_msgs/Bool``: true is pressed, false says "not pressed" and has to come all the time."""
 
 # Absolute names, by ROS convention.
 DIAGNOSTICS = "/diagnostics"

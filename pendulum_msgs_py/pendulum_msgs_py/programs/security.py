@@ -37,7 +37,8 @@ _LIFECYCLE = (
     "~/get_transition_graph",
 )
 _LOGGER = ("~/get_logger_levels", "~/set_logger_levels")
-_EVERY_PUBLISHER = ("/parameter_events", "/rosout")
+_SILENT_PUBLISHER = ("/parameter_events",)
+_EVERY_PUBLISHER = (*_SILENT_PUBLISHER, "/rosout")
 _EVERY_SUBSCRIPTION = (names.CLOCK, "/parameter_events")
 _PLANT_SUBSCRIPTIONS = (names.EFFORT_COMMAND, names.DISTURBANCE, names.PUSH, names.JOINT_TRAJECTORY)
 _PLANT_PUBLISHERS = (names.JOINT_STATES, names.APPLIED_EFFORT, names.EVENTS, names.DIAGNOSTICS)
@@ -100,11 +101,13 @@ NODES: dict[str, Permissions] = {
             "~/transition_event",
         ),
         subscribe=_PLANT_SUBSCRIPTIONS,
-        reply=(*_PLANT_SERVICES, *_LIFECYCLE),
+        reply=(names.ARM, names.E_STOP_RESET, *_LIFECYCLE),
     ),
+    "bridge_e_stop": Permissions(reply=(_PLANT + "e_stop",)),
+    "bridge_e_stop_input": Permissions(subscribe=(names.E_STOP_INPUT,)),
     "controller": Permissions(
         publish=(names.EFFORT_COMMAND, names.DIAGNOSTICS, "~/transition_event"),
-        subscribe=(names.JOINT_STATES,),
+        subscribe=(names.JOINT_STATES, names.DIAGNOSTICS),
         reply=(*_LIFECYCLE, *_LOGGER),
     ),
     "effort_controller": Permissions(
@@ -122,8 +125,8 @@ NODES: dict[str, Permissions] = {
         reply=("~/start", "~/finish"),
     ),
     "recorder": _RECORDER,
-    "viewer": Permissions(subscribe=(names.JOINT_STATES, *_WATCHED), reply=("~/snapshot",)),
-    "markers": Permissions(publish=("markers",), subscribe=_WATCHED),
+    "viewer": Permissions(subscribe=(names.JOINT_STATES, names.DIAGNOSTICS, *_WATCHED), reply=("~/snapshot",)),
+    "markers": Permissions(publish=("markers",), subscribe=(names.DIAGNOSTICS, *_WATCHED)),
     "conductor": Permissions(
         publish=(_SIDE + names.JOINT_TRAJECTORY, _SIDE + names.EVENTS),
         subscribe=(_SIDE + names.JOINT_STATES, _SIDE + names.EVENTS),
@@ -163,8 +166,10 @@ BESIDE_PLANTS = {"conductor": "/conductor", "console": "/console", "recorder": "
 """Nodes that have to do with all sides, in the root namespace, and the enclave of each: that of its process."""
 
 _SIDE_NODES = ("controller", "effort_controller", "disturbance", "recorder", "viewer", "markers")
-_WITH_PLANT = {"bridge": ("procedure",)}
-_WITHOUT_PARAMETERS = {"conductor"}
+_IN_PROCESS = {"bridge_e_stop": "bridge", "bridge_e_stop_input": "bridge"}
+"""Nodes that run in the process of another, whose enclave is theirs too; they have no log of their own."""
+_WITH_PLANT = {"bridge": ("procedure", *_IN_PROCESS)}
+_WITHOUT_PARAMETERS = {"conductor", *_IN_PROCESS}
 
 
 def _resolve(name: str, node: str, namespace: str) -> str:
@@ -192,7 +197,7 @@ def granted(plants: Iterable[tuple[str, str]] = tuple(PLANTS.items())) -> dict[s
         for side, plant in sides.items()
         for node in (plant, *_WITH_PLANT.get(plant, ()), *_SIDE_NODES)
     ]
-    with_parameters = [_resolve(node, "", side) for side, node in nodes]
+    with_parameters = [_resolve(node, "", side) for side, node in nodes if node not in _WITHOUT_PARAMETERS]
     with_parameters += [f"/{node}" for node in BESIDE_PLANTS if node not in _WITHOUT_PARAMETERS]
 
     spoken: set[str] = set()  # filled with what the nodes publish, before anybody may record it
@@ -220,7 +225,7 @@ def granted(plants: Iterable[tuple[str, str]] = tuple(PLANTS.items())) -> dict[s
     for here, node in nodes:
         own = NODES[node]
         full = Permissions(
-            (*own.publish, *_EVERY_PUBLISHER),
+            (*own.publish, *(_SILENT_PUBLISHER if node in _IN_PROCESS else _EVERY_PUBLISHER)),
             (*own.subscribe, *_EVERY_SUBSCRIPTION),
             (*own.reply, *(_NO_PARAMETERS if node in _WITHOUT_PARAMETERS else _PARAMETERS)),
             own.request,
@@ -240,7 +245,9 @@ def enclaves(plants: Iterable[tuple[str, str]] = tuple(PLANTS.items())) -> dict[
     """Return the enclaves of all nodes, one for each process: path -> full name of the node -> permissions."""
     answer: dict[str, dict[str, Permissions]] = {}
     for full, allowed in granted(plants).items():
-        answer.setdefault(BESIDE_PLANTS.get(full[1:], full), {})[full] = allowed
+        space, _, node = full.rpartition("/")
+        path = f"{space}/{_IN_PROCESS.get(node, node)}"
+        answer.setdefault(BESIDE_PLANTS.get(path[1:], path), {})[full] = allowed
     return answer
 
 

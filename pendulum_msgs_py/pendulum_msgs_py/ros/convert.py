@@ -23,6 +23,7 @@ __all__ = [
     "diagnostic_status",
     "event_message",
     "plant_mode",
+    "plant_value",
     "problem_of_command",
     "problem_of_state",
     "sample_from_bytes",
@@ -160,11 +161,16 @@ def diagnostic_status(
 
 def plant_mode(message: DiagnosticArray, namespace: str) -> str:
     """Return the mode that the plant in a namespace tells in its diagnostics, or nothing where it is not among them."""
+    return plant_value(message, namespace, "mode")
+
+
+def plant_value(message: DiagnosticArray, namespace: str, key: str) -> str:
+    """Return a value that the plant in a namespace tells in its diagnostics, or nothing where it is not among them."""
     prefix = namespace.rstrip("/") + "/"
     for status in message.status:
         name, _, what = status.name.partition(": ")
         if what == "plant" and name.startswith(prefix) and "/" not in name[len(prefix) :]:
-            return next((pair.value for pair in status.values if pair.key == "mode"), "")
+            return next((pair.value for pair in status.values if pair.key == key), "")
     return ""
 
 

@@ -8,7 +8,6 @@ inputs every few milliseconds, a page when a picture is due.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
-from typing import Any
 
 from rclpy.node import Node
 from rclpy.qos import QoSProfile
@@ -51,11 +50,12 @@ class PolledInput:
 
 
 class PollingNode(Node):
-    """A node that can have polled inputs besides the subscriptions that an executor attends to."""
+    """A node that can have polled inputs besides the subscriptions that an executor attends to.
 
-    def __init__(self, name: str, **options: Any) -> None:
-        self._polled: set[Subscription] = set()
-        super().__init__(name, **options)
+    Without ``__init__``, since rclpy's lifecycle node, which it may be joined with, calls that of ``Node`` directly.
+    """
+
+    _polled: frozenset[Subscription] = frozenset()
 
     @property
     def subscriptions(self) -> Iterator[Subscription]:
@@ -65,13 +65,13 @@ class PollingNode(Node):
     def create_polled_input(self, message_type: type, topic: str, profile: QoSProfile) -> PolledInput:
         """Return an input that no executor is woken for."""
         subscription = self.create_subscription(message_type, topic, _never_called, profile, raw=True)
-        self._polled.add(subscription)
+        self._polled |= {subscription}
         return PolledInput(subscription, profile.depth)
 
     def destroy_polled_input(self, polled: PolledInput) -> None:
         """Let go of an input."""
         self.destroy_subscription(polled.subscription)
-        self._polled.discard(polled.subscription)
+        self._polled -= {polled.subscription}
 
 
 def _never_called(_data: bytes) -> None:
