@@ -245,11 +245,12 @@ def _analyse(
     answer = answer_of(comparison, more=_how_to_go_on(comparison, budget))
     progress.phase("writing the report", 4.0)
     summary = {
+        **comparison.to_json(),
+        # Of the whole: where the first run does not count, those of the comparison are a repeat's.
         "experiment": "thesis",
         "seed": settings.noise.seed,
         "strategy": settings.strategy,
         "versions": versions(),
-        **comparison.to_json(),
         "answer": answer.to_json(),
     }
     write_json(folder / "summary.json", summary)

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from pendulum_bags.comparison.metrics import episode_of, metrics_of
 from pendulum_bags.ranking.ranking import Contender, contenders_of
-from pendulum_bags.runs.run_data import read_run
+from pendulum_bags.runs.run_data import is_emulated, read_run
 from pendulum_msgs_py.errors import DataError, PendulumError
 
 __all__ = ["WEIGHTS", "collect_contenders", "cost_parts"]
@@ -50,20 +50,23 @@ def collect_contenders(folders: Sequence[Path], weights: Sequence[float] = WEIGH
         DataError: There are no runs.
     """
     costs: dict[str, dict[str, list[tuple[int, Array | None]]]] = {}
+    real: set[str] = set()
     count = 0
     for folder in folders:
         if not folder.is_dir():
             raise DataError(f"{folder} is no folder; expected one with runs")
-        for name, side, seed, parts in _runs(folder, weights):
+        for name, side, seed, parts, emulated in _runs(folder, weights):
+            if not emulated:
+                real.add(name)
             costs.setdefault(name, {"sim": [], "hw": []})[side].append((seed, parts))
             count += 1
     if not count:
         told = ", ".join(map(str, folders))
         raise DataError(f"{told} holds no runs; expected a study, or bags that say which controller ran on which side")
-    return contenders_of(costs)
+    return contenders_of(costs, real)
 
 
-def _runs(folder: Path, weights: Sequence[float]) -> Iterator[tuple[str, str, int, Array | None]]:
+def _runs(folder: Path, weights: Sequence[float]) -> Iterator[tuple[str, str, int, Array | None, bool]]:
     studied: set[Path] = set()
     for record in sorted(folder.rglob("run.json")):
         specification = record.with_name("spec.json")
@@ -74,14 +77,14 @@ def _runs(folder: Path, weights: Sequence[float]) -> Iterator[tuple[str, str, in
         parts = None
         if told.get("status") == "done" and told.get("metrics", {}).get("success"):
             parts = cost_parts(told["metrics"], float(spec["duration"]), weights)
-        yield str(told["labels"]["controller"]), str(spec["side"]), int(spec["seed"]), parts
+        yield str(told["labels"]["controller"]), str(spec["side"]), int(spec["seed"]), parts, True
     for metadata in sorted(folder.rglob("metadata.yaml")):
         bag = metadata.parent
         if not any(parent in studied for parent in bag.resolve().parents):
             yield from _bag(bag, weights)
 
 
-def _bag(bag: Path, weights: Sequence[float]) -> Iterator[tuple[str, str, int, Array | None]]:
+def _bag(bag: Path, weights: Sequence[float]) -> Iterator[tuple[str, str, int, Array | None, bool]]:
     try:
         run = read_run(bag)
     except PendulumError:
@@ -96,7 +99,7 @@ def _bag(bag: Path, weights: Sequence[float]) -> Iterator[tuple[str, str, int, A
     episode = episode_of(run.window)
     fallen = bool(np.max(np.abs(episode.error)) > _FALLEN)
     parts = None if fallen else cost_parts(metrics_of(episode), float(episode.t[-1]), weights)
-    yield _name(told["controller"]), side, int(told.get("seed") or 0), parts
+    yield _name(told["controller"]), side, int(told.get("seed") or 0), parts, side == "sim" or is_emulated(run)
 
 
 def _name(controller: Mapping[str, Any]) -> str:

@@ -12,7 +12,7 @@ Source: Kadian et al., Sim2Real Predictivity, IEEE RA-L 5(4), 2020 (SRCC); Li et
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
 
@@ -40,6 +40,8 @@ class Contender:
         name: Its name.
         sim, hw: Parts of the cost, one row for each run (by seed), shape (runs, 3); no rows for a side that failed.
         sim_failed, hw_failed: How many runs failed on each side.
+        sim_seeds, hw_seeds: Seeds of the rows; none where they are not known.
+        emulated: Whether an emulator stood in for the hardware, in all runs.
     """
 
     name: str
@@ -47,6 +49,9 @@ class Contender:
     hw: Array
     sim_failed: int = 0
     hw_failed: int = 0
+    sim_seeds: tuple[int, ...] = ()
+    hw_seeds: tuple[int, ...] = ()
+    emulated: bool = True
 
     def cost(self, side: str) -> float:
         """Return the mean cost on a side; infinity where a run failed there."""
@@ -263,11 +268,14 @@ def _pair(picked: Contender, better: Contender, sim: float, hw: float) -> WrongP
     return WrongPair(picked.name, better.name, sim, hw, sure, reason)
 
 
-def contenders_of(costs: Mapping[str, Mapping[str, Sequence[tuple[int, Array | None]]]]) -> list[Contender]:
+def contenders_of(
+    costs: Mapping[str, Mapping[str, Sequence[tuple[int, Array | None]]]], real: Collection[str] = ()
+) -> list[Contender]:
     """Return the contenders that have runs on both sides.
 
     Args:
         costs: Name -> side (``sim``, ``hw``) -> (seed, parts of the cost, or None for a run that failed).
+        real: Names that have runs on real hardware.
     """
     found = []
     for name, sides in costs.items():
@@ -275,10 +283,16 @@ def contenders_of(costs: Mapping[str, Mapping[str, Sequence[tuple[int, Array | N
             continue
         rows: dict[str, Array] = {}
         failed: dict[str, int] = {}
+        seeds: dict[str, tuple[int, ...]] = {}
         for side in ("sim", "hw"):
             runs = sorted(sides[side], key=lambda run: run[0])
             kept = [parts for _, parts in runs if parts is not None]
             rows[side] = np.array(kept, dtype=np.float64).reshape(-1, len(PARTS))
             failed[side] = len(runs) - len(kept)
-        found.append(Contender(name, rows["sim"], rows["hw"], failed["sim"], failed["hw"]))
+            seeds[side] = tuple(seed for seed, parts in runs if parts is not None)
+        found.append(
+            Contender(
+                name, rows["sim"], rows["hw"], failed["sim"], failed["hw"], seeds["sim"], seeds["hw"], name not in real
+            )
+        )
     return found

@@ -29,6 +29,13 @@ def ranking(
     weights: Annotated[
         tuple[float, float, float], typer.Option(help="q11, q22 and r of the cost, mean of q11 e^2 + q22 v^2 + r u^2.")
     ] = (100.0, 0.01, 0.1),
+    use_simulation: Annotated[
+        bool | None,
+        typer.Option(
+            help="Narrow the intervals of the costs on hardware by simulated runs under the same and under further "
+            "seeds; by default where real hardware ran.",
+        ),
+    ] = None,
     json_output: Annotated[bool, typer.Option("--json", help="Print JSON instead of tables.")] = False,
 ) -> None:
     """Rank controllers on both sides: costs, SRCC, MMRV, regret of the simulation's pick, and pairs ranked wrongly.
@@ -36,16 +43,25 @@ def ranking(
     Example: python -m pendulum_bags ranking bags/runs/ranking --out /tmp/ranking
     """
     from pendulum_bags.ranking.collect import collect_contenders
+    from pendulum_bags.ranking.fewer_runs import narrow_all, print_narrowed
     from pendulum_bags.ranking.present import print_ranking, same_choice, write_ranking
     from pendulum_bags.ranking.ranking import rank
 
-    found = rank(collect_contenders(folders, weights))
+    contenders = collect_contenders(folders, weights)
+    found = rank(contenders)
+    use = any(not one.emulated for one in contenders) if use_simulation is None else use_simulation
+    narrowed = narrow_all(contenders) if use else {}
     page = write_ranking(out, found) if out is not None else None
     if json_output:
-        print(json.dumps({**found.to_json(), "layer": same_choice(found).to_json()}, indent=2, allow_nan=False))
+        content = {**found.to_json(), "layer": same_choice(found).to_json()}
+        if use:
+            content["narrowed"] = {name: one.to_json() for name, one in narrowed.items()}
+        print(json.dumps(content, indent=2, allow_nan=False))
         return
     console = make_console(highlight=False)
     print_ranking(console, found)
+    if use:
+        print_narrowed(console, narrowed)
     if page is not None:
         console.print(f"\npage    {page}", soft_wrap=True)
 
