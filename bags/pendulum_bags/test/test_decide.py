@@ -10,6 +10,7 @@ import pytest
 
 from pendulum_bags.comparison import Margins, Outcome, compare_folders, read_run
 from pendulum_bags.experiments.decide import Budget, decide
+from pendulum_bags.experiments.experiment_cli import _summary
 from pendulum_bags.experiments.in_process import simulate
 from pendulum_bags.experiments.lockstep import lockstep_spec
 from pendulum_bags.experiments.repeats import (
@@ -20,6 +21,7 @@ from pendulum_bags.experiments.repeats import (
 )
 from pendulum_bags.experiments.settings import NoiseSettings, RegulationSettings
 from pendulum_bags.runs.run_folder import read_looks
+from pendulum_bags.verdict.answer import answer_of
 from pendulum_bags.verdict.same_run import same_run_layer
 from tests.synthetic_runs import regulate, run_metadata, write_bag
 
@@ -126,6 +128,10 @@ def test_a_run_that_a_busy_machine_disturbed_is_measured_again_and_left_out(tmp_
     )
     assert [pair.hardware.source for pair in found.pairs] == [str(repeat_folder(folder, 1) / "hw")]
     assert "the machine was too busy (simulation missed 250 states)" in found.left_out[0]
+    # The seed that was asked for makes the run again, not that of the repeat.
+    told = _summary(SETTINGS, found, answer_of(found))
+    assert found.to_json()["seed"] != SETTINGS.noise.seed
+    assert told["seed"] == SETTINGS.noise.seed
     assert found.verdict.outcome is Outcome.EQUIVALENT
 
 

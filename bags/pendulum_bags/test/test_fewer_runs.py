@@ -40,11 +40,11 @@ def test_seeds_tell_which_runs_are_pairs_and_a_repeated_one_counts_once() -> Non
 
     seeds = (1, 2, 3, 4, 5, 6, 7)
     sim = [1.0, 2.0, 1.5, 3.0, 2.5, 1.2, 2.8]
-    one = Contender("lqr", rows(sim), rows([2.1, 3.0, 5.9, 3.1, 3.1]), 0, 0, seeds, (1, 3, 4, 2, 2))
+    one = Contender("lqr", rows(sim), rows([2.1, 3.0, 5.9, 3.1, 3.3, 5.2]), 0, 0, seeds, (1, 3, 4, 2, 2, 5))
     found = narrow_all([one])["lqr"]
-    expected = narrow([2.1, 3.1, 3.0, 5.9], [1.0, 2.0, 1.5, 3.0], [2.5, 1.2, 2.8])
+    expected = narrow([2.1, 3.2, 3.0, 5.9, 5.2], [1.0, 2.0, 1.5, 3.0, 2.5], [1.2, 2.8])
     assert found.to_json() == expected.to_json()
-    assert found.pairs == 4
+    assert found.pairs == 5
     assert narrow_all([Contender("lqr", one.sim, one.hw)]) == {}
     with pytest.raises(DataError, match="got 3 hardware and 3 simulated runs"):
         narrow([1.0, 2.0, 3.0], [1.0, 2.0, 3.0], [1.0])

