@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import json
 import time
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -118,7 +119,9 @@ def new(
 
 
 @app.command()
-def show(file: File) -> None:
+def show(
+    file: File, as_json: Annotated[bool, typer.Option("--json", help="Print JSON instead of tables.")] = False
+) -> None:
     """Check a lab file as the bridge does, and show it with what was proved.
 
     Example: python -m pendulum_hw_bridge lab show lab.yaml
@@ -127,6 +130,9 @@ def show(file: File) -> None:
 
     values = bridge_values([], {"lab_file": str(file)})
     lab = load_lab(file)
+    if as_json:
+        print(json.dumps({"parameters": {name: values[name] for name in lab.values}, "proofs": lab.proofs}, indent=2))
+        return
     table = WholeTable("parameter", "value", title=f"{file}: {lab.name or lab.describe()}")
     for name in lab.values:
         table.add_row(name, str(values[name]))

@@ -170,9 +170,7 @@ class ViewerNode(Node):
         else:
             time, note = (sample.stamp_ns - (self._start_ns or 0)) / NANOSECONDS, self._topic
         applied = self._torques.acting(names.APPLIED_EFFORT, sample.stamp_ns)
-        disturbance = self._torques.acting(names.DISTURBANCE, sample.stamp_ns) + self._torque(
-            names.PUSH, sample.stamp_ns
-        )
+        disturbance = sum(self._torques.acting(topic, sample.stamp_ns) for topic in (names.DISTURBANCE, names.PUSH))
         if self._window is not None:
             self._window.show(
                 sample.position, sample.velocity, applied, disturbance=disturbance, time=time, note=note

@@ -44,7 +44,7 @@ convert_app, merge_app, cut_app, filter_app = (
 
 
 @convert_app.command(
-    epilog="Example: python -m pendulum_bags convert runs/today/sim -o /tmp/sim --storage sqlite3"
+    epilog="Example: python -m pendulum_rosbag convert runs/today/sim -o /tmp/sim --storage sqlite3"
 )
 def convert(
     bag: AnySource,
@@ -62,7 +62,7 @@ def convert(
     _run([bag], output, None, storage, compression, as_json, round(max_size * 1e6), max_duration)
 
 
-@merge_app.command(epilog="Example: python -m pendulum_bags merge runs/today/sim runs/today/hw -o /tmp/both")
+@merge_app.command(epilog="Example: python -m pendulum_rosbag merge runs/today/sim runs/today/hw -o /tmp/both")
 def merge(
     bags: Annotated[list[Path], typer.Argument(help="Bags, as for convert.")],
     output: Output,
@@ -77,7 +77,7 @@ def merge(
 
 
 @cut_app.command(
-    epilog="Example: python -m pendulum_bags cut runs/today/sim -o /tmp/noise --from-event noise_start "
+    epilog="Example: python -m pendulum_rosbag cut runs/today/sim -o /tmp/noise --from-event noise_start "
     "--to-event noise_end"
 )
 def cut(
@@ -114,7 +114,7 @@ def cut(
 
 
 @filter_app.command(
-    epilog="Example: python -m pendulum_bags filter runs/today/sim -o /tmp/states -t /sim/joint_states "
+    epilog="Example: python -m pendulum_rosbag filter runs/today/sim -o /tmp/states -t /sim/joint_states "
     "--regex '/events$'"
 )
 def filter_topics(
@@ -182,19 +182,19 @@ def _run(
 
 def convert_main(argv: list[str] | None = None) -> int:
     """Run ``convert``."""
-    return cli_main(convert_app, argv, name="python -m pendulum_bags convert")
+    return cli_main(convert_app, argv, name="python -m pendulum_rosbag convert")
 
 
 def merge_main(argv: list[str] | None = None) -> int:
     """Run ``merge``."""
-    return cli_main(merge_app, argv, name="python -m pendulum_bags merge")
+    return cli_main(merge_app, argv, name="python -m pendulum_rosbag merge")
 
 
 def cut_main(argv: list[str] | None = None) -> int:
     """Run ``cut``."""
-    return cli_main(cut_app, argv, name="python -m pendulum_bags cut")
+    return cli_main(cut_app, argv, name="python -m pendulum_rosbag cut")
 
 
 def filter_main(argv: list[str] | None = None) -> int:
     """Run ``filter``."""
-    return cli_main(filter_app, argv, name="python -m pendulum_bags filter")
+    return cli_main(filter_app, argv, name="python -m pendulum_rosbag filter")

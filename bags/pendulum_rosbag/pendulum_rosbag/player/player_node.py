@@ -270,7 +270,7 @@ app = typer.Typer(add_completion=False, rich_markup_mode=None)
 
 
 @app.command(
-    epilog="Example: python -m pendulum_bags play runs/today/sim -t /sim/joint_states --remap "
+    epilog="Example: python -m pendulum_rosbag play runs/today/sim -t /sim/joint_states --remap "
     "/sim/joint_states:=/joint_states --rate 0.5. ROS arguments go behind --ros-args."
 )
 def play(
@@ -313,7 +313,7 @@ def play(
     return run_node(
         lambda stop: Player(options, stop),
         list(ros),
-        program="pendulum_bags play",
+        program="pendulum_rosbag play",
         description="Publish the topics of a bag again.",
         specs=SPECS,
     )
@@ -321,7 +321,7 @@ def play(
 
 def main(argv: list[str] | None = None) -> int:
     """Run the player; arguments from ``--ros-args`` on belong to ROS."""
-    return cli_main(app, argv, name="python -m pendulum_bags play", takes_ros_arguments=True)
+    return cli_main(app, argv, name="python -m pendulum_rosbag play", takes_ros_arguments=True)
 
 
 if __name__ == "__main__":

@@ -16,7 +16,7 @@ __all__ = ["main"]
 app = typer.Typer(add_completion=False, rich_markup_mode=None)
 
 
-@app.command(epilog="Example: python -m pendulum_bags export runs/today/sim -o today_sim --format csv")
+@app.command(epilog="Example: python -m pendulum_rosbag export runs/today/sim -o today_sim --format csv")
 def export(
     bag: Annotated[Path, typer.Argument(help="Folder of the bag, or one .mcap or .db3 file.")],
     output: Annotated[Path, typer.Option("-o", "--output", help="Folder to create.")],
@@ -33,7 +33,7 @@ def export(
 
 def main(argv: list[str] | None = None) -> int:
     """Run the command."""
-    return cli_main(app, argv, name="python -m pendulum_bags export")
+    return cli_main(app, argv, name="python -m pendulum_rosbag export")
 
 
 if __name__ == "__main__":

@@ -20,7 +20,7 @@ __all__ = ["main"]
 app = typer.Typer(add_completion=False, rich_markup_mode=None)
 
 
-@app.command(epilog="Example: python -m pendulum_bags info runs/today/sim --json")
+@app.command(epilog="Example: python -m pendulum_rosbag info runs/today/sim --json")
 def info(
     bag: Annotated[Path, typer.Argument(help="Folder of the bag, or one .mcap or .db3 file.")],
     as_json: Annotated[bool, typer.Option("--json", help="Print everything as JSON.")] = False,
@@ -116,7 +116,7 @@ def _without_nan(value: Any) -> Any:
 
 def main(argv: list[str] | None = None) -> int:
     """Run the command."""
-    return cli_main(app, argv, name="python -m pendulum_bags info")
+    return cli_main(app, argv, name="python -m pendulum_rosbag info")
 
 
 if __name__ == "__main__":

@@ -17,7 +17,7 @@ app = typer.Typer(add_completion=False, rich_markup_mode=None)
 
 
 @app.command(
-    epilog="Example: python -m pendulum_bags record -o runs/today --regex '^/(sim|hw)/' --compression zstd. "
+    epilog="Example: python -m pendulum_rosbag record -o runs/today --regex '^/(sim|hw)/' --compression zstd. "
     "ROS arguments go behind --ros-args."
 )
 def record(
@@ -65,7 +65,7 @@ def record(
     return run_node(
         lambda stop: Recorder(options, stop),
         list(context.obj),
-        program="pendulum_bags record",
+        program="pendulum_rosbag record",
         description="Record topics to a bag.",
         specs=SPECS,
     )
@@ -73,7 +73,7 @@ def record(
 
 def main(argv: list[str] | None = None) -> int:
     """Run the recorder; arguments from ``--ros-args`` on belong to ROS."""
-    return cli_main(app, argv, name="python -m pendulum_bags record", takes_ros_arguments=True)
+    return cli_main(app, argv, name="python -m pendulum_rosbag record", takes_ros_arguments=True)
 
 
 if __name__ == "__main__":

@@ -18,7 +18,7 @@ __all__ = ["main"]
 app = typer.Typer(add_completion=False, rich_markup_mode=None)
 
 
-@app.command(epilog="Example: python -m pendulum_bags repair runs/today/sim")
+@app.command(epilog="Example: python -m pendulum_rosbag repair runs/today/sim")
 def repair(
     bag: Annotated[Path, typer.Argument(help="Folder of the bag, or one .mcap or .db3 file.")],
     output: Annotated[
@@ -49,7 +49,7 @@ def repair(
 
 def main(argv: list[str] | None = None) -> int:
     """Run the command."""
-    return cli_main(app, argv, name="python -m pendulum_bags repair")
+    return cli_main(app, argv, name="python -m pendulum_rosbag repair")
 
 
 if __name__ == "__main__":
