@@ -179,3 +179,8 @@ def test_an_uncertainty_that_makes_no_distribution_is_refused() -> None:
         Uncertainty({"inertia": 0.1, "damping": 0.1}, [[1.0, 1.5], [1.5, 1.0]])
     with pytest.raises(ParameterError, match="'damping'; expected identified"):
         parse_uncertainty("damping", "thesis")
+
+
+def test_a_series_elastic_plant_is_refused_since_the_batch_has_no_motor() -> None:
+    with pytest.raises(ParameterError, match=r"plant 'x5_9' is series elastic; expected a rigid one"):
+        run_chunk(replace(SMALL, plant="x5_9"), 0)
