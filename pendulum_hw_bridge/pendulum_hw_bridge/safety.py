@@ -71,6 +71,7 @@ class SafetyMonitor:
         self._wrong_commands = 0
         self._wrong_since_ns = 0
         self._wrong_currents = 0
+        self._unknown_temperatures = 0
         self._clock_offset_ns: int | None = None
         self._clamped_speed = math.inf
         if drivetrain is not None:
@@ -216,6 +217,14 @@ class SafetyMonitor:
                 "over_temperature",
                 f"winding is at {feedback.winding_temperature:.0f} degC; "
                 f"expected at most {limits.winding_temperature:.0f} degC",
+            )
+        # Compares false with its limit, and takes no torque away.
+        known = math.isfinite(feedback.winding_temperature)
+        self._unknown_temperatures = 0 if known else self._unknown_temperatures + 1
+        if self._unknown_temperatures >= _COUNT:
+            return Fault(
+                "over_temperature",
+                f"winding temperature reads {feedback.winding_temperature} degC in {_COUNT} records; expected a number",
             )
         if feedback.lock == CommandLock.LOCKED_BY_OTHER:
             return Fault("locked_by_other", "another sender holds the module; close Scope or other programs")

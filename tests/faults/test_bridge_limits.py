@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from dataclasses import replace
 
 import pytest
 
@@ -236,3 +237,20 @@ def test_a_moving_pendulum_passes_to_position_control_without_a_jump(kind: Effor
     before = equivalents[0]
     assert rig.supervisor.mode is Mode.POSITION
     assert max(abs(each - before) for each in equivalents) < 2.5
+
+
+@pytest.mark.parametrize("reading", [math.nan, -math.inf, math.inf])
+def test_a_winding_temperature_that_is_no_number_is_a_fault_though_the_current_is_not_checked(reading: float) -> None:
+    rig = Rig()
+    rig.bridge.monitor.limits = replace(rig.bridge.monitor.limits, winding_current=0.0)
+    rig.run(0.3)
+    read = rig.port.read
+
+    def spoilt(timeout: float) -> Feedback | None:
+        record = read(timeout)
+        return None if record is None else record._replace(winding_temperature=reading)
+
+    rig.port.read = spoilt  # type: ignore[method-assign]
+    rig.run(0.06)
+    assert rig.supervisor.mode is Mode.FAULT
+    assert rig.bridge.last_fault == "over_temperature"
