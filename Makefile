@@ -11,7 +11,7 @@ PIP := $(PY) -m pip --disable-pip-version-check --no-input --quiet --quiet
 # Everything that decides what an editable install looks like; the modules themselves are read in place.
 LINKED := $(foreach p,$(PACKAGES),$(wildcard $(p)/setup.py $(p)/setup.cfg $(p)/package.xml $(p)/*/executables.py))
 
-.PHONY: help venv experiment test bench lint types imports build faults lock audit docs clean
+.PHONY: help venv experiment test bench lint types imports build faults mutants lock audit docs clean
 
 help: # Print the targets, one line each
 	@awk -F ':[^#]*# ' '/^[a-z]+:[^#=]*# / {printf "make %-11s %s\n", $$1, $$2}' Makefile
@@ -71,6 +71,9 @@ build: $(VENV)/.linked # Build the packages with colcon into install/, as for ro
 
 faults: $(VENV)/.linked # Attack the running system, count what it stood, print a table (the long form of tests/faults)
 	@$(PY) -m tests.faults.run $(ARGS)
+
+mutants: $(VENV)/.linked # Break the safety rules in every small way; fail if no test notices one (build/mutants.md)
+	@$(PY) -m tests.mutants.run $(ARGS)
 
 # The lock covers CPython 3.10 to 3.12 at once. The peers of the benchmarks are locked on the same versions, less what
 # the lock has already.

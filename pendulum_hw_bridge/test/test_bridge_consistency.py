@@ -54,6 +54,26 @@ def test_times_that_let_a_fault_act_too_long_are_refused(values: dict[str, Any],
 
 
 @pytest.mark.parametrize(
+    "values",
+    [
+        {"feedback_rate": 20.0, "command_lifetime": 0.1},
+        {"feedback_rate": 25.0, "feedback_watchdog": 25, "command_lifetime": 0.1},
+        {"command_lifetime": 0.02},
+        {"command_lifetime": 0.03},
+        {"backend": "hebi", "command_lifetime": 0.1},
+        {"backend": "hebi", "feedback_watchdog": 10},
+    ],
+)
+def test_times_of_just_the_limit_are_taken(values: dict[str, Any]) -> None:
+    check(**values)
+
+
+@pytest.mark.parametrize(("backend", "timeout"), [("emulator", 0.01), ("emulator", 1.0), ("hebi", 0.1)])
+def test_a_command_may_count_for_one_cycle_or_for_the_longest_time(backend: str, timeout: float) -> None:
+    check({"command_timeout": timeout}, backend=backend)
+
+
+@pytest.mark.parametrize(
     ("backend", "timeout"), [("emulator", 1e9), ("emulator", 1.1), ("emulator", 0.009), ("hebi", 0.11)]
 )
 def test_a_command_counts_for_a_cycle_at_least_and_never_for_long(backend: str, timeout: float) -> None:
@@ -69,6 +89,8 @@ def test_a_command_counts_for_a_cycle_at_least_and_never_for_long(backend: str, 
         ("start_effort_limit", {"start_effort": math.inf}),
         ("starvation_limit", {"starvation": math.inf}),
         ("position_window", {"position_max": math.inf}),
+        ("position_window", {"position_min": -math.inf}),
+        ("position_window", {"position_min": -math.inf, "position_max": math.inf}),
     ],
 )
 def test_a_real_machine_needs_every_limit(name: str, limit: dict[str, float]) -> None:

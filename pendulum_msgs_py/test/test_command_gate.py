@@ -158,3 +158,25 @@ def test_a_command_that_has_grown_old_stays_old_whatever_the_clock_does_then(ste
     assert all(gate.fresh(_NOW + 5 * step * _MS) is None for step in range(-20, 20))
     assert gate.offer(_command(age_ms=-10.0), _NOW + 10 * _MS) is None
     assert gate.fresh(_NOW + 11 * _MS) is not None, "a new command is believed again"
+
+
+def test_a_gate_begins_with_nobody_and_is_with_nobody_after_a_reset() -> None:
+    gate = _gate()
+    assert gate.commander == ""
+    assert gate.refused_commander == ""
+    gate.offer(_command(), _NOW)
+    assert gate.commander == "lqr"
+    gate.reset()
+    assert gate.commander == ""
+
+
+def test_a_message_that_is_no_command_is_refused_with_what_was_wrong_in_it() -> None:
+    gate = _gate()
+    assert gate.refuse_malformed("effort has 2 values; expected 1") is Refusal.NOT_ONE_JOINT
+    assert gate.problems == {Refusal.NOT_ONE_JOINT: "effort has 2 values; expected 1"}
+
+
+def test_a_command_as_far_ahead_as_allowed_still_orders_what_comes_after_it() -> None:
+    gate = _gate()
+    gate.offer(_command(age_ms=-5.0), _NOW)
+    assert gate.offer(_command(age_ms=-4.0), _NOW) is Refusal.OUT_OF_ORDER

@@ -6,7 +6,8 @@ import ast
 import copy
 import inspect
 import textwrap
-from collections.abc import Callable, Iterator
+from collections import Counter
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from types import CodeType, FunctionType
 from typing import Any
@@ -91,12 +92,16 @@ def mutants_of(function: FunctionType, name: str) -> Iterator[Mutant]:
     if not isinstance(tree.body[0], (ast.FunctionDef, ast.AsyncFunctionDef)):
         return  # made by a decorator, such as a dataclass's __init__
     seen = {function.__code__.co_code}
+    told_before: Counter[tuple[int, str]] = Counter()
     for number, _ in enumerate(_changes(tree)):
         broken = copy.deepcopy(tree)
         line, change = next(told() for index, told in enumerate(_changes(broken)) if index == number)
         code = _code_of(broken, function, first)
         if code is None or (code.co_code in seen and code.co_consts == function.__code__.co_consts):
             continue
+        told_before[line, change] += 1
+        count = told_before[line, change]
+        change += f" (number {count} of the line)" if count > 1 else ""
         yield Mutant(name, first + line - 1, change, lines[line - 1].strip(), code)
 
 
@@ -111,7 +116,10 @@ def _changes(tree: ast.Module) -> Iterator[Callable[[], tuple[int, str]]]:
         for node in _walk(statement):
             yield from _of_expression(node)
             yield from _of_block(node)
-    yield from _of_list(top.body, docstring)
+    block = top.body
+    # At its end a function returns nothing by itself.
+    nothing = isinstance(block[-1], ast.Return) and getattr(block[-1].value, "value", 0) in {None, ""}
+    yield from _of_list(block[:-1] if nothing else block, docstring, block)
 
 
 def _walk(node: ast.AST) -> Iterator[ast.AST]:
@@ -154,12 +162,14 @@ def _of_block(node: ast.AST) -> Iterator[Callable[[], tuple[int, str]]]:
     for name in ("body", "orelse", "finalbody", "handlers"):
         block = getattr(node, name, None)
         if isinstance(block, list) and block and isinstance(block[0], ast.stmt):
-            yield from _of_list(block, None)
+            yield from _of_list(block, None, block)
 
 
-def _of_list(block: list[ast.stmt], docstring: ast.stmt | None) -> Iterator[Callable[[], tuple[int, str]]]:
-    """Leave statements out: an early return, a raise, a reset, a call."""
-    for index, statement in enumerate(block):
+def _of_list(
+    statements: Sequence[ast.stmt], docstring: ast.stmt | None, block: list[ast.stmt]
+) -> Iterator[Callable[[], tuple[int, str]]]:
+    """Leave statements out of a block: an early return, a raise, a reset, a call."""
+    for index, statement in enumerate(statements):
         if statement is docstring:
             continue
         what = {
@@ -172,9 +182,10 @@ def _of_list(block: list[ast.stmt], docstring: ast.stmt | None) -> Iterator[Call
             ast.Break: "break",
             ast.Delete: "del",
         }.get(type(statement))
-        # Without a local variable a function fails with a NameError, which any test notices: a reset is left out.
+        # Without a local variable a function fails with a NameError, which any test notices. What is left out is a
+        # reset, and a local variable that is made anew from itself, as by a clamp.
         is_local = isinstance(statement, ast.Assign) and all(
-            isinstance(it, (ast.Name, ast.Tuple)) for it in statement.targets
+            isinstance(it, (ast.Name, ast.Tuple)) and not _reads(statement.value, it) for it in statement.targets
         )
         if what is None or is_local:
             continue
@@ -185,6 +196,12 @@ def _of_list(block: list[ast.stmt], docstring: ast.stmt | None) -> Iterator[Call
             return line, f"the {told} is left out"
 
         yield leave_out
+
+
+def _reads(value: ast.expr, target: ast.expr) -> bool:
+    """Whether a value is made from a variable that it then takes the place of."""
+    read = {node.id for node in ast.walk(value) if isinstance(node, ast.Name)}
+    return any(isinstance(node, ast.Name) and node.id in read for node in ast.walk(target))
 
 
 def _set(node: Any, field: str, value: Any, told: str) -> Callable[[], tuple[int, str]]:

@@ -3,30 +3,24 @@
 from __future__ import annotations
 
 import os
-import signal
 import sys
-import time
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
-import pytest
 import typer
 import yaml
-from rich.progress import Progress
+from rich.progress import Progress, TaskID
 
 from pendulum_bags.runs.run_folder import write_json
 from pendulum_msgs_py.programs.executables import cli_main
 from pendulum_msgs_py.programs.terminal import WholeTable, make_console
 from tests.mutants.operators import Mutant, mutants_of
-from tests.mutants.targets import TARGETS, Target, functions_of
+from tests.mutants.session import TargetError, try_mutants
+from tests.mutants.targets import TARGETS, functions_of
 
 _EQUIVALENT = Path(__file__).with_name("equivalent.yaml")
-_PYTEST = ("-x", "-q", "--no-header", "-p", "no:cacheprovider", "-p", "no:randomly", "--timeout=60")
-_PATIENCE = 90.0
-"""Longest time for the tests of one mutant [s]; a mutant that keeps them longer is noticed."""
-
 app = typer.Typer(add_completion=False, rich_markup_mode=None)
 
 
@@ -61,12 +55,9 @@ def mutants(
             found = [mutant for name, function in functions_of(target) for mutant in mutants_of(function, name)]
             row = Row(target.module.removeprefix("pendulum_"), len(found))
             rows.append(row)
-            task = progress.add_task(row.module, total=len(found) + 1)
-            if not _run(target, None, wait=True):
-                print(f"error: the tests of {target.module} fail without a mutant; mend them first", file=sys.stderr)
-                return 2
-            progress.advance(task)
-            for mutant, noticed in _try_all(target, found, workers):
+            task = progress.add_task(row.module, total=len(found))
+
+            def note(mutant: Mutant, noticed: bool, row: Row = row, task: TaskID = task) -> None:
                 progress.advance(task)
                 if noticed:
                     row.killed += 1
@@ -78,6 +69,12 @@ def mutants(
                 else:
                     row.survived += 1
                     survivors.append(mutant)
+
+            try:
+                try_mutants(target, found, workers, note)
+            except TargetError as error:
+                print(f"error: {error}", file=sys.stderr)
+                return 2
     table = WholeTable("rules", "mutants", "killed", "equivalent", "survived")
     for row in rows:
         table.add_row(row.module, *(str(value) for value in (row.mutants, row.killed, row.equivalent, row.survived)))
@@ -88,49 +85,6 @@ def mutants(
         print("no longer there, strike them off equivalent.yaml: " + "; ".join(gone), file=sys.stderr)
     _write(out, rows, survivors, {key: reasons[key] for key in sorted(used)})
     return int(bool(survivors))
-
-
-def _try_all(target: Target, found: Sequence[Mutant], workers: int) -> list[tuple[Mutant, bool]]:
-    """Run the tests on each mutant in a child of this process, which has everything loaded already."""
-    running: dict[int, tuple[Mutant, float]] = {}
-    done: list[tuple[Mutant, bool]] = []
-    waiting = list(found)
-    while waiting or running:
-        while waiting and len(running) < workers:
-            mutant = waiting.pop(0)
-            running[_run(target, mutant)] = (mutant, time.monotonic())
-        pid, status = os.waitpid(-1, os.WNOHANG)
-        if pid in running:
-            done.append((running.pop(pid)[0], os.waitstatus_to_exitcode(status) != 0))
-            continue
-        for late in [pid for pid, (_, start) in running.items() if time.monotonic() - start > _PATIENCE]:
-            os.killpg(late, signal.SIGKILL)
-        time.sleep(0.005)
-    return done
-
-
-def _run(target: Target, mutant: Mutant | None, *, wait: bool = False) -> int:
-    """Fork, put the mutant in place, and run the tests; return the child, or with ``wait`` whether they pass."""
-    sys.stdout.flush()
-    sys.stderr.flush()
-    child = os.fork()
-    if child == 0:
-        os.setpgid(0, 0)
-        silence = os.open(os.devnull, os.O_WRONLY)
-        os.dup2(silence, 1)
-        os.dup2(silence, 2)
-        code = 3
-        try:
-            if mutant is not None:
-                dict(functions_of(target))[mutant.function].__code__ = mutant.code
-            # The same examples for every mutant, so that one that is noticed once is noticed always.
-            os.environ["HYPOTHESIS_SEED"] = "0"
-            code = int(pytest.main([*_PYTEST, "--hypothesis-seed=0", *target.tests]))
-        finally:
-            os._exit(code)
-    if wait:
-        return int(os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == 0)
-    return child
 
 
 def _write(out: Path, rows: Sequence[Row], survivors: Sequence[Mutant], equivalent: dict[str, str]) -> None:

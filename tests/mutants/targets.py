@@ -1,4 +1,7 @@
-"""Which rules are broken, and which tests have to notice: the safety rules of both plants, without DDS."""
+"""Which rules are broken, and which tests have to notice: the safety rules of both plants, without DDS.
+
+Not here yet: safety monitor, output check, effort mapping, bridge and HEBI backend.
+"""
 
 from __future__ import annotations
 
@@ -11,7 +14,12 @@ from typing import Any
 
 __all__ = ["TARGETS", "Target", "functions_of"]
 
-_RULES = ("pendulum_msgs_py/test/test_supervisor_rules.py", "pendulum_msgs_py/test/test_command_gate.py")
+_RULES = (
+    "pendulum_msgs_py/test/test_supervisor_rules.py",
+    "pendulum_msgs_py/test/test_supervisor_begin.py",
+    "pendulum_msgs_py/test/test_supervisor_edges.py",
+    "pendulum_msgs_py/test/test_command_gate.py",
+)
 _BRIDGE = "pendulum_hw_bridge/test"
 
 
@@ -22,18 +30,37 @@ class Target:
     Attributes:
         module: Where they are.
         names: Functions and methods by qualified name; a class stands for all of its methods.
-        tests: Files, those that notice most first.
+        tests: Files; of these, the tests that reach a function run, the quickest first.
+        choose: Expression of pytest's ``-k`` that chooses among them; empty for all.
     """
 
     module: str
     names: tuple[str, ...]
     tests: tuple[str, ...]
+    choose: str = ""
 
 
 TARGETS: tuple[Target, ...] = (
-    Target("pendulum_msgs_py.contract.supervisor", ("PlantSupervisor",), _RULES),
-    Target("pendulum_msgs_py.contract.commands", ("CommandGate",), tuple(reversed(_RULES))),
-    Target("pendulum_msgs_py.contract.drive", ("PlantLimits", "Drive"), _RULES),
+    Target("pendulum_msgs_py.contract.supervisor", ("PlantSupervisor", "_Handover"), _RULES),
+    Target("pendulum_msgs_py.contract.commands", ("CommandGate",), _RULES),
+    Target("pendulum_msgs_py.contract.drive", ("PlantLimits", "Mode"), _RULES),
+    Target(
+        "pendulum_hw_bridge.settings",
+        ("write_settings", "_expect"),
+        (f"{_BRIDGE}/test_settings_read_back.py",),
+    ),
+    Target(
+        "pendulum_hw_bridge.shared_supervisor",
+        ("SharedSupervisor",),
+        (f"{_BRIDGE}/test_settings_read_back.py", f"{_BRIDGE}/test_bridge_states.py"),
+    ),
+    Target(
+        "pendulum_hw_bridge.bridge_consistency",
+        ("check_consistency", "_check_hardware"),
+        (f"{_BRIDGE}/test_bridge_consistency.py",),
+    ),
+    Target("pendulum_hw_bridge.derating", ("Derating",), (f"{_BRIDGE}/test_derating.py",)),
+    Target("pendulum_hw_bridge.e_stop_input", ("EStopInput",), (f"{_BRIDGE}/test_e_stop_input.py",)),
 )
 
 

@@ -1,0 +1,366 @@
+"""The edges of a plant's rules: what holds exactly at a limit, just beyond it, on either side, and after a reset."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+
+from pendulum_msgs_py.contract.supervisor import Drive, DriveKind, Input, Mode, PlantLimits, PlantSupervisor
+from pendulum_msgs_py.contract.trajectory import Trajectory, from_points
+from pendulum_msgs_py.contract.values import NANOSECONDS, JointCommand, JointSample
+from pendulum_msgs_py.errors import ParameterError
+
+_MS = 1_000_000
+
+
+class Plant:
+    """A plant at 1 kHz that stays where it is."""
+
+    def __init__(self, **limits: float) -> None:
+        self.now = 1000 * NANOSECONDS
+        self.position = 0.0
+        self.servo = 0.0
+        usual = {"effort": 5.0, "feedback_timeout": 0.03, "handover_effort": math.inf}
+        self.supervisor = PlantSupervisor(PlantLimits(**{**usual, **limits}))
+        assert self.supervisor.arm(self.now, self.sample()) == ""
+
+    def sample(self, *, late_ns: int = 0, velocity: float = 0.0) -> JointSample:
+        return JointSample(self.now - late_ns, self.position, velocity, 0.0)
+
+    def decide(self) -> Drive:
+        drive = self.supervisor.decide(self.now, self.sample())
+        self.supervisor.report_applied(
+            drive.effort + (self.servo if drive.kind is DriveKind.POSITION else 0.0)
+        )
+        return drive
+
+    def offer(self, effort: float, kind: Input = Input.EFFORT_COMMAND) -> None:
+        self.supervisor.offer(kind, JointCommand(self.now, effort, "lqr"), self.now)
+
+    def run(self, milliseconds: int, command: float | None = None) -> Drive:
+        drive = Drive(DriveKind.OFF)
+        for _ in range(milliseconds):
+            self.now += _MS
+            if command is not None:
+                self.offer(command)
+            drive = self.decide()
+        return drive
+
+    def follow(self, trajectory: Trajectory) -> None:
+        assert self.supervisor.accept_trajectory(trajectory, self.now, self.sample()) == ""
+
+
+def _hold(duration: float = 0.1, position: float = 0.0) -> Trajectory:
+    return from_points([0.0, duration], [position, position], [0.0, 0.0])
+
+
+# --- measurements ----------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("late_ms", [30, 10, 0, -10, -30])
+def test_a_measurement_as_old_as_the_limit_is_believed_and_one_as_far_ahead(late_ms: int) -> None:
+    plant = Plant()
+    drive = plant.supervisor.decide(plant.now, plant.sample(late_ns=late_ms * _MS))
+    assert drive.kind is DriveKind.EFFORT
+
+
+@pytest.mark.parametrize("late_ns", [30 * _MS + 1, -30 * _MS - 1])
+def test_a_measurement_older_or_further_ahead_than_the_limit_ends_torque(late_ns: int) -> None:
+    plant = Plant()
+    assert plant.supervisor.decide(plant.now, plant.sample(late_ns=late_ns)).kind is DriveKind.OFF
+    assert plant.supervisor.mode is Mode.FAULT
+
+
+@pytest.mark.parametrize(("position", "ends"), [(1.0, False), (1.001, True), (-2.0, False), (-2.001, True)])
+def test_leaving_the_position_window_ends_torque(position: float, ends: bool) -> None:
+    plant = Plant(position_min=-2.0, position_max=1.0)
+    plant.position = position
+    assert (plant.run(1, 1.0).effort == 0.0) == ends
+    assert (plant.supervisor.mode is Mode.FAULT) == ends
+
+
+@pytest.mark.parametrize(("velocity", "ends"), [(8.0, False), (8.001, True), (-8.0, False), (-8.001, True)])
+def test_turning_faster_than_the_limit_ends_torque(velocity: float, ends: bool) -> None:
+    plant = Plant(velocity=8.0)
+    plant.supervisor.decide(plant.now, plant.sample(velocity=velocity))
+    assert (plant.supervisor.mode is Mode.FAULT) == ends
+
+
+# --- arming and release ----------------------------------------------------------------------------------------
+
+
+def test_a_command_of_just_the_arming_limit_may_wait() -> None:
+    plant = Plant(arm_effort=0.5)
+    plant.supervisor.disarm(plant.now)
+    plant.offer(-0.5)
+    assert plant.supervisor.arm(plant.now, plant.sample()) == ""
+
+
+def test_arming_what_is_armed_changes_nothing() -> None:
+    plant = Plant()
+    plant.follow(_hold(1.0))
+    assert plant.supervisor.arm(plant.now, plant.sample()) == ""
+    assert plant.run(1).kind is DriveKind.POSITION
+
+
+def test_a_command_that_waited_while_the_plant_was_armed_makes_no_torque() -> None:
+    plant = Plant(arm_effort=0.5)
+    plant.supervisor.disarm(plant.now)
+    plant.offer(0.4)
+    assert plant.supervisor.arm(plant.now, plant.sample()) == ""
+    assert plant.run(1).effort == 0.0
+
+
+def test_a_torque_that_is_reported_after_the_release_starts_no_fade_when_armed_again() -> None:
+    plant = Plant()
+    plant.supervisor.disarm(plant.now)
+    plant.supervisor.report_applied(3.0)
+    assert plant.supervisor.arm(plant.now, plant.sample()) == ""
+    plant.follow(_hold())
+    assert plant.run(1).effort == 0.0
+
+
+def test_each_change_of_mode_is_kept_with_time_and_reason_and_the_newest_fifty() -> None:
+    plant = Plant()
+    supervisor = plant.supervisor
+    supervisor.disarm(plant.now, "enough")
+    assert supervisor.transitions == [(plant.now, Mode.EFFORT, "armed"), (plant.now, Mode.DISARMED, "enough")]
+    supervisor.disarm(plant.now, "once more")
+    assert len(supervisor.transitions) == 2
+    for number in range(60):
+        supervisor.e_stop(plant.now, f"press {number}")
+        supervisor.e_stop_reset(plant.now)
+    assert len(supervisor.transitions) == 50
+    assert supervisor.transitions[-2][2] == "press 59"
+
+
+# --- effort ----------------------------------------------------------------------------------------------------
+
+
+def test_without_a_push_there_is_none() -> None:
+    assert Plant().run(1).push == 0.0
+
+
+def test_a_sum_within_the_limit_is_not_saturated_and_one_beyond_it_is_counted() -> None:
+    plant = Plant()
+    for command, disturbance, saturated in ((1.0, 1.0, False), (4.0, 1.0, False), (4.0, 1.5, True)):
+        plant.now += _MS
+        plant.offer(disturbance, Input.DISTURBANCE)
+        plant.offer(command)
+        drive = plant.decide()
+        assert drive.saturated == saturated
+        assert drive.effort == min(5.0, command + disturbance)
+    assert plant.supervisor.saturated_periods == 1
+    assert plant.supervisor.reason == "commanded by lqr"
+
+
+def test_each_period_without_a_command_is_counted() -> None:
+    plant = Plant()
+    plant.run(7)
+    assert plant.supervisor.starved_periods == 7
+
+
+def test_torque_rises_and_falls_at_the_slew_limit_and_not_without_time() -> None:
+    plant = Plant(slew=10.0)
+    assert plant.run(10, 5.0).effort == pytest.approx(0.1)
+    assert plant.decide().effort == plant.decide().effort
+    assert plant.run(20, -5.0).effort == pytest.approx(-0.1)
+
+
+def test_after_a_silence_torque_rises_from_zero_again() -> None:
+    plant = Plant(slew=10.0)
+    assert plant.run(100, 1.0).effort == pytest.approx(1.0)
+    assert plant.run(60).starved
+    assert plant.run(1, 1.0).effort == pytest.approx(0.01)
+
+
+def test_a_commander_may_go_on_after_a_silence_of_just_the_hold() -> None:
+    def after(pause_ns: int) -> float:
+        plant = Plant(start_effort=2.0)
+        plant.run(1, 1.0)
+        plant.now += pause_ns
+        plant.offer(4.0)
+        return plant.decide().effort
+
+    assert after(NANOSECONDS) == 4.0
+    assert after(NANOSECONDS + 1) == 0.0
+
+
+# --- trajectories ----------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("side", [1.0, -1.0])
+def test_being_as_far_from_the_trajectory_as_allowed_is_no_fault_and_further_is(side: float) -> None:
+    plant = Plant(tracking_error=0.25)
+    plant.follow(_hold(1.0))
+    plant.position = side * 0.25
+    assert plant.run(1).kind is DriveKind.POSITION
+    plant.position = side * 0.2501
+    assert plant.run(1).kind is DriveKind.OFF
+    assert plant.supervisor.mode is Mode.FAULT
+
+
+def test_a_trajectory_is_finished_at_its_end_not_before_and_not_when_another_follows() -> None:
+    plant = Plant()
+    assert not plant.supervisor.trajectory_finished
+    plant.follow(_hold(0.1))
+    plant.run(99)
+    assert not plant.supervisor.trajectory_finished
+    plant.run(1)
+    assert plant.supervisor.trajectory_finished
+    assert plant.supervisor.reason == "holding the end of a trajectory"
+    plant.follow(_hold(0.1))
+    assert not plant.supervisor.trajectory_finished
+    plant.supervisor.disarm(plant.now)
+    assert not plant.supervisor.trajectory_finished
+
+
+def test_a_trajectory_is_not_finished_while_the_gap_at_its_start_is_closed() -> None:
+    plant = Plant()
+    plant.follow(_hold(0.01, 0.29))
+    plant.position = 0.1
+    plant.run(100, 0.0)
+    assert plant.supervisor.mode is Mode.POSITION
+    assert not plant.supervisor.trajectory_finished
+
+
+def test_time_that_stands_still_moves_no_setpoint() -> None:
+    plant = Plant()
+    plant.follow(from_points([0.0, 1.0], [0.0, 0.3], [0.0, 0.0]))
+    position = plant.run(200).position
+    assert [plant.decide().position for _ in range(3)] == 3 * [position]
+
+
+def test_a_fade_waits_while_the_plant_was_stopped() -> None:
+    plant = Plant(handover_time=1.0)
+    plant.run(1, 4.0)
+    plant.follow(_hold(10.0))
+    assert plant.run(200).effort == pytest.approx(0.8 * 4.0)
+    plant.now += 5 * NANOSECONDS
+    # As far as the longest step, a tenth of a second, takes it.
+    assert plant.decide().effort == pytest.approx(0.7 * 4.0)
+
+
+@pytest.mark.parametrize("side", [1.0, -1.0])
+def test_a_trajectory_may_start_as_far_from_the_pendulum_as_the_tracking_error_and_no_further(side: float) -> None:
+    plant = Plant(tracking_error=0.25)
+    far = _hold(1.0, side * 0.2501)
+    refusal = plant.supervisor.accept_trajectory(far, plant.now, plant.sample())
+    assert refusal.startswith(f"trajectory starts at {side * 0.2501:.4f} rad")
+    plant.follow(_hold(1.0, side * 0.25))
+
+
+@pytest.mark.parametrize("side", [1.0, -1.0])
+@pytest.mark.parametrize(
+    ("handover_time", "speed"),
+    # Over a long hand-over the gap has all that time; over a short one it is closed as fast as a ramp may be.
+    [(1.0, 0.25), (0.5, 0.3)],
+)
+def test_closing_the_gap_counts_for_the_speed_on_either_side(side: float, handover_time: float, speed: float) -> None:
+    gap = _hold(1.0, side * 0.25)
+    slow = Plant(handover_time=handover_time, velocity=speed - 1e-3)
+    assert "rad/s; expected at most" in slow.supervisor.accept_trajectory(gap, slow.now, slow.sample())
+    Plant(handover_time=handover_time, velocity=speed + 1e-9).follow(gap)
+
+
+def test_a_trajectory_of_just_the_largest_speed_is_followed() -> None:
+    Plant(handover_time=1.0, velocity=0.25).follow(_hold(1.0, 0.25))
+
+
+@pytest.mark.parametrize(("position", "inside"), [(1.0, True), (1.01, False), (-2.0, True), (-2.01, False)])
+def test_a_trajectory_may_touch_the_ends_of_the_window_and_not_pass_them(
+    position: float,
+    inside: bool,
+) -> None:
+    plant = Plant(position_min=-2.0, position_max=1.0)
+    plant.position = max(-2.0, min(1.0, position))
+    refusal = plant.supervisor.accept_trajectory(_hold(1.0, position), plant.now, plant.sample())
+    assert (refusal == "") == inside
+
+
+# --- hand-over -------------------------------------------------------------------------------------------------
+
+
+def test_a_command_stamped_just_at_the_end_takes_over_and_one_before_it_does_not() -> None:
+    plant = Plant()
+    plant.follow(_hold(0.1))
+    plant.run(99, 3.0)
+    plant.run(10)
+    assert plant.supervisor.mode is Mode.POSITION
+    plant = Plant()
+    plant.follow(_hold(0.1))
+    drive = plant.run(100, 3.0)
+    assert plant.supervisor.mode is Mode.EFFORT
+    assert drive.kind is DriveKind.EFFORT
+
+
+def test_a_command_as_far_from_what_holds_as_allowed_takes_over() -> None:
+    plant = Plant(handover_effort=2.0)
+    plant.follow(_hold(0.1))
+    plant.run(150, 2.001)
+    assert plant.supervisor.mode is Mode.POSITION
+    plant.run(1, 2.0)
+    assert plant.supervisor.mode is Mode.EFFORT
+
+
+def test_who_took_over_with_more_than_a_beginner_may_ask_goes_on() -> None:
+    plant = Plant(start_effort=0.5)
+    plant.follow(_hold(0.1))
+    assert plant.run(300, 1.5).effort == 1.5
+
+
+def test_without_a_hand_over_time_torque_is_at_once_what_is_asked_for() -> None:
+    plant = Plant(handover_time=0.0)
+    plant.servo = 1.7
+    plant.follow(_hold(0.1))
+    assert plant.run(100, -3.0).effort == -3.0
+
+
+def test_the_slew_limit_begins_at_the_torque_that_held() -> None:
+    plant = Plant(handover_time=0.0, slew=10.0)
+    plant.servo = 1.7
+    plant.follow(_hold(0.1))
+    assert plant.run(100, -3.0).effort == pytest.approx(1.7)
+    assert plant.run(1, -3.0).effort == pytest.approx(1.69)
+
+
+def test_a_fade_that_a_silence_ended_does_not_come_back() -> None:
+    plant = Plant(handover_time=1.0)
+    plant.servo = 1.7
+    plant.follow(_hold(0.1))
+    assert plant.run(110, 3.0).effort == pytest.approx(1.7, abs=0.05)
+    assert plant.run(60).starved
+    assert plant.run(1, 3.0).effort == 3.0
+
+
+# --- limits ----------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    "limits",
+    [
+        {"effort": 0.0},
+        {"command_timeout": 0.0},
+        {"handover_effort": 0.0},
+        {"tracking_error": 0.0},
+        {"position_min": 1.0, "position_max": 1.0},
+    ],
+)
+def test_a_limit_of_nothing_at_all_is_refused(limits: dict[str, float]) -> None:
+    with pytest.raises(ParameterError, match="expected"):
+        PlantLimits(**{"effort": 5.0, **limits})
+
+
+@pytest.mark.parametrize(
+    "limits",
+    [
+        {"effort": 0.5},
+        {"handover_effort": 0.5},
+        {"tracking_error": 0.1},
+        {"velocity": 0.5, "slew": 0.5, "start_effort": 0.5, "starvation": 0.5, "feedback_timeout": 0.5},
+        {"handover_time": 0.0, "arm_effort": 0.0},
+    ],
+)
+def test_a_small_limit_is_one(limits: dict[str, float]) -> None:
+    assert PlantLimits(**{"effort": 5.0, **limits})
