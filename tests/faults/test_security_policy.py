@@ -57,7 +57,7 @@ async def _drive(hub: Hub) -> None:
     for space, node in hub.plants().items():
         await hub.trigger(f"{space}/disturbance/start")
         await hub.trigger(f"{space}/disturbance/stop")
-        await hub.trigger(f"{node}/e_stop_reset")
+        await hub.reset(node)
         await hub.arm(node, on=False)
         await hub.set_parameter(f"{space}/controller", "r", 1.0)
         await hub.set_parameter(f"{space}/disturbance", "amplitude", 1.0)
