@@ -1,6 +1,7 @@
 """Fixtures for every test of the repository, beside a package or under ``tests/``: one definition for all."""
 
 import importlib
+import os
 
 pytest_plugins = ["tests.fixtures"]
 
@@ -16,3 +17,7 @@ for _package in (
     "pendulum_bags",
 ):
     importlib.import_module(_package)
+
+# xdist tells its workers the width of the terminal in which nobody reads them; tables are whole without one.
+if "PYTEST_XDIST_WORKER" in os.environ:
+    os.environ.pop("COLUMNS", None)
