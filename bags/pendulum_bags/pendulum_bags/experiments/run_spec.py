@@ -22,9 +22,9 @@ __all__ = ["CLOCKS", "EMULATOR_LIFETIME", "EMULATOR_WATCHDOG", "PERIODS", "SIDES
 
 CLOCKS = ("lockstep", "realtime")
 SIDES = ("sim", "hw")
-EMULATOR_WATCHDOG = 25
+EMULATOR_WATCHDOG = 50
 """Feedback periods that the bridge waits for an emulator, on a machine that does other things too."""
-EMULATOR_LIFETIME = 0.25
+EMULATOR_LIFETIME = 0.5
 """Command lifetime of an emulator on such a machine [s]."""
 _AT_REST = 1e-9
 PERIODS = {"sim": 0.002, "hw": 0.01}

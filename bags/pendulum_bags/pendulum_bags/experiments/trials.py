@@ -142,7 +142,7 @@ class TrialSettings:
                     lockstep_duration=self.expected_duration,
                 )
             else:
-                parameters.update(feedback_watchdog=EMULATOR_WATCHDOG, command_lifetime=0.25)
+                parameters.update(feedback_watchdog=EMULATOR_WATCHDOG, command_lifetime=EMULATOR_LIFETIME)
         return graph.bridge("/hw", backend=self.hardware, **parameters)
 
     def procedure_program(self, trial: int) -> graph.NodeProgram:
