@@ -56,7 +56,7 @@ _ANY = "{any}/"
 _RECORDED = "{recorded}"
 """Every topic that nodes of a side publish there."""
 _READ_PARAMETERS = (_ANY + "list_parameters", _ANY + "get_parameters")
-_WATCHED = (names.APPLIED_EFFORT, names.DISTURBANCE, names.PUSH)
+_WATCHED = (names.APPLIED_EFFORT, names.EFFORT_COMMAND, names.DISTURBANCE, names.PUSH)
 
 
 @dataclass(frozen=True)
@@ -89,7 +89,7 @@ NODES: dict[str, Permissions] = {
     "simulator": Permissions(
         publish=(*_PLANT_PUBLISHERS, names.CLOCK),
         subscribe=(*_PLANT_SUBSCRIPTIONS, "~/set_state"),
-        reply=(*_PLANT_SERVICES, "~/reset", "~/pause", "~/step"),
+        reply=(*_PLANT_SERVICES, "~/reset", "~/pause", "~/step", *_LOGGER),
     ),
     "bridge": Permissions(
         publish=(
@@ -101,7 +101,7 @@ NODES: dict[str, Permissions] = {
             "~/transition_event",
         ),
         subscribe=_PLANT_SUBSCRIPTIONS,
-        reply=(names.ARM, names.E_STOP_RESET, *_LIFECYCLE),
+        reply=(names.ARM, names.E_STOP_RESET, *_LIFECYCLE, *_LOGGER),
     ),
     "bridge_e_stop": Permissions(reply=(_PLANT + "e_stop",)),
     "bridge_e_stop_input": Permissions(subscribe=(names.E_STOP_INPUT,)),
@@ -133,6 +133,7 @@ NODES: dict[str, Permissions] = {
         request=(
             *(_PLANT + service for service in ("arm", "e_stop", "pause")),
             _SIDE + "controller/change_state",
+            _SIDE + "controller/get_state",
             _SIDE + "disturbance/start",
             _SIDE + "recorder/status",
             _PROCEDURE + "start",
