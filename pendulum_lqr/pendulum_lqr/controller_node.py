@@ -34,6 +34,7 @@ from pendulum_msgs_py.ros.convert import (
     sample_from_bytes,
     stamp_to_message,
 )
+from pendulum_msgs_py.ros.first_answer import FirstAnswer
 from pendulum_msgs_py.ros.lifecycle import LifecycleNode
 from pendulum_msgs_py.ros.parameters import NodeParameters
 from pendulum_msgs_py.ros.polled import PollingNode
@@ -113,6 +114,7 @@ class ControllerNode(LifecycleNode, PollingNode):
             )
         else:
             self._command_publisher = self.create_publisher(JointState, names.EFFORT_COMMAND, qos.COMMAND)
+        self._first_answer = FirstAnswer(self, self._command_publisher)
         self._diagnostics_publisher = self.create_publisher(
             DiagnosticArray, names.DIAGNOSTICS, qos.DIAGNOSTICS
         )
@@ -176,6 +178,8 @@ class ControllerNode(LifecycleNode, PollingNode):
     # --- callbacks -----------------------------------------------------------------------------------------
 
     def _on_state(self, data: bytes) -> None:
+        if self._simulated_time and self._active and not self._first_answer.may_go():
+            return
         sample = sample_from_bytes(data)
         if sample is not None and self._watch.add(sample.stamp_ns):
             self._period_known = False

@@ -29,6 +29,7 @@ from pendulum_msgs_py.errors import DataError, ParameterError
 from pendulum_msgs_py.parameters import ParameterSpec, read_text
 from pendulum_msgs_py.ros import qos
 from pendulum_msgs_py.ros.convert import diagnostic_status, event_message, sample_from_bytes, stamp_to_message
+from pendulum_msgs_py.ros.first_answer import FirstAnswer
 from pendulum_msgs_py.ros.parameters import NodeParameters
 from pendulum_msgs_py.ros.runner import run_node
 
@@ -72,6 +73,7 @@ class DisturbanceNode(Node):
             autostart=self._settings["autostart"],
         )
         self._torque_publisher = self.create_publisher(JointState, names.DISTURBANCE, qos.COMMAND)
+        self._first_answer = FirstAnswer(self, self._torque_publisher)
         self._event_publisher = self.create_publisher(String, names.EVENTS, qos.EVENTS)
         self._diagnostics_publisher = self.create_publisher(
             DiagnosticArray, names.DIAGNOSTICS, qos.DIAGNOSTICS
@@ -98,7 +100,7 @@ class DisturbanceNode(Node):
 
     def _on_state(self, data: bytes) -> None:
         sample = sample_from_bytes(data)
-        if sample is None:
+        if sample is None or (self._simulated_time and not self._first_answer.may_go()):
             return
         answer = self._loop.answer(sample.stamp_ns)
         if answer is None:

@@ -226,4 +226,4 @@ def wait_until_all_hear_each_other(
     recorded |= {names.CLOCK} if clock else set()
     conductor.wait_for("the recorder to hear all topics", lambda: recorded <= recorder.heard(), _START_TIMEOUT)
     # What one side of a match knows, the other side knows a moment later.
-    conductor.spin(0.1)
+    conductor.spin(0.5)
