@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import importlib
+import io
 import os
+import posixpath
+import re
 import shutil
 import subprocess
 import sys
@@ -23,6 +26,66 @@ NODES = (
     ("play", "pendulum_rosbag.player.player_node", ("SPECS",)),
 )
 """Node, module, its tables of parameters."""
+_CODE = re.compile(r"(^```.*?^```$)", re.MULTILINE | re.DOTALL)
+_LINK = re.compile(r"(?<!!)\[([^\[\]]+)\]\(([^()\s]+)\)")
+_MATHS = re.compile(r"\A```math\n(.*?)\n```\Z", re.DOTALL)
+
+
+def drawn(formula: str) -> str:
+    """Return a formula as an image that is part of the page: nothing is fetched, and it takes the colour of the text.
+
+    On GitHub the same block (a fence called ``math``) is set by MathJax.
+
+    Args:
+        formula: LaTeX, in the part of it that matplotlib's mathtext knows.
+
+    Returns:
+        HTML.
+    """
+    from matplotlib import mathtext, rc_context
+
+    buffer = io.BytesIO()
+    with rc_context({"mathtext.fontset": "cm", "svg.fonttype": "path", "font.size": 14}):
+        mathtext.math_to_image(f"${formula}$", buffer, format="svg")
+    image = buffer.getvalue().decode()
+    image = re.sub(r"<metadata>.*?</metadata>|<!--.*?-->", "", image[image.index("<svg") :], flags=re.DOTALL)
+    # The background would hide the page's own, and black glyphs are not seen on a dark one.
+    image = re.sub(r'<g id="patch_1">.*?</g>', "", image, count=1, flags=re.DOTALL)
+    image = image.replace("<svg ", '<svg fill="currentColor" aria-hidden="true" ', 1)
+    label = formula.replace("&", "&amp;").replace('"', "&quot;").replace("<", "&lt;")
+    # One line without blanks at its ends: Markdown takes it as it is.
+    image = " ".join(image.split())
+    return f'<div class="formula" role="img" aria-label="{label}">{image}</div>'
+
+
+def for_the_site(text: str, page: str, gathered: set[str]) -> str:
+    """Return a page with its formulas drawn, and with the names of files where it links to what is not on the site.
+
+    Args:
+        text: Markdown.
+        page: The page's path in the repository.
+        gathered: Paths of the files that are on the site.
+
+    Returns:
+        Markdown.
+    """
+
+    def named(link: re.Match[str]) -> str:
+        label, target = link.group(1), link.group(2).partition("#")[0]
+        path = posixpath.normpath(posixpath.join(posixpath.dirname(page), target))
+        if not target or ":" in target or path in gathered:
+            return link.group(0)
+        plain = label.strip("`")
+        return f"`{path}`" if path.endswith(plain) or plain.endswith(path) else f"{label} (`{path}`)"
+
+    parts = _CODE.split(text)
+    for i, part in enumerate(parts):
+        maths = _MATHS.match(part)
+        if maths:
+            parts[i] = drawn(maths.group(1))
+        elif i % 2 == 0:
+            parts[i] = _LINK.sub(named, part)
+    return "".join(parts)
 
 
 def reference() -> str:
@@ -78,14 +141,19 @@ def main() -> int:
     for name in listed:
         target = GATHERED / name
         target.parent.mkdir(parents=True, exist_ok=True)
-        shutil.copyfile(PROJECT / name, target)
+        if name.endswith(".md"):
+            text = (PROJECT / name).read_text(encoding="utf-8")
+            target.write_text(for_the_site(text, name, {*listed, "reference.md"}), encoding="utf-8")
+        else:
+            shutil.copyfile(PROJECT / name, target)
+    shutil.copyfile(PROJECT / ".docs" / "formula.css", GATHERED / "formula.css")
     (GATHERED / "reference.md").write_text(reference(), encoding="utf-8")
     configuration = str(PROJECT / ".docs" / "mkdocs.yml")
     command = [sys.executable, "-m", "mkdocs", "build", "--quiet", "--strict", "--config-file", configuration]
     environment = {**os.environ, "NO_MKDOCS_2_WARNING": "1"}
     code = subprocess.run(command, cwd=PROJECT, env=environment, check=False).returncode
     if code == 0:
-        print("the site is build/site/index.html")
+        print("the site is build/site/index.html (its search needs a server: python -m http.server -d build/site)")
     return code
 
 

@@ -7,6 +7,7 @@ import os
 import re
 import subprocess
 from pathlib import Path
+from urllib.parse import unquote, urlsplit
 from xml.etree import ElementTree
 
 import pytest
@@ -24,6 +25,7 @@ PAGES = sorted(
 _LINK = re.compile(r"\]\(([^)#\s]+)[^)]*\)")
 _IN_ORDER = re.compile(r"^<!-- run in order -->\n```console\n(.*?)^```", re.MULTILINE | re.DOTALL)
 _ELSEWHERE = re.compile(r"<(?:script|img|link|iframe)\b[^>]*\b(?:src|href)=\"?(https?:|//)[^>]*>")
+_TARGET = re.compile(r'(?:href|src)="([^"]*)"')
 CHAINS = [page for page in PAGES if _IN_ORDER.search(page.read_text(encoding="utf-8"))]
 
 
@@ -51,6 +53,14 @@ def test_commands_that_build_on_each_other_run(page: Path, domain_id: int, tmp_p
             assert done.returncode == 0, f"{line}\n{done.stdout}\n{done.stderr}"
 
 
+def _dead_links(page: Path) -> list[str]:
+    """Return what a page of the site points at and a browser that opens it from the disk would not find."""
+    links = {urlsplit(link) for link in _TARGET.findall(page.read_text(encoding="utf-8"))}
+    # The page for what is not found is served by a server alone, whose root its links name.
+    local = [it for it in links if not it.scheme and not it.netloc and it.path and page.name != "404.html"]
+    return [it.path for it in local if not (page.parent / unquote(it.path)).resolve().is_file()]
+
+
 @pytest.mark.timeout(180)
 def test_the_site_is_built_and_needs_no_other_server() -> None:
     done = subprocess.run(
@@ -69,7 +79,9 @@ def test_the_site_is_built_and_needs_no_other_server() -> None:
         found = _ELSEWHERE.search(page.read_text(encoding="utf-8"))
         # The address of the page itself, for search engines, is no request.
         assert found is None or 'rel="canonical"' in found.group(0), f"{page}: {found and found.group(0)}"
-    text = (site / "reference" / "index.html").read_text(encoding="utf-8")
+    dead = [f"{page.relative_to(site)}: {link}" for page in pages for link in _dead_links(page)]
+    assert dead == []
+    text = (site / "reference.html").read_text(encoding="utf-8")
     for word in ("handover_effort_limit", "energy_swing_up", "bringup.launch.py", "pendulum_bags console"):
         assert word in text
 
