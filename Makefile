@@ -11,7 +11,7 @@ PIP := $(PY) -m pip --disable-pip-version-check --no-input --quiet --quiet
 # Everything that decides what an editable install looks like; the modules themselves are read in place.
 LINKED := $(foreach p,$(PACKAGES),$(wildcard $(p)/setup.py $(p)/setup.cfg $(p)/package.xml $(p)/*/executables.py))
 
-.PHONY: help venv experiment test bench lint types imports build faults mutants lock audit docs clean
+.PHONY: help venv experiment test bench lint format types imports build faults mutants lock audit docs clean
 
 help: # Print the targets, one line each
 	@awk -F ':[^#]*# ' '/^[a-z]+:[^#=]*# / {printf "make %-11s %s\n", $$1, $$2}' Makefile
@@ -57,8 +57,12 @@ $(VENV)/.peers: requirements-bench.txt | $(VENV)/.locked
 	@if $(PIP) install --prefer-binary --no-deps --require-hashes --target $(VENV)/peers -r requirements-bench.txt; then touch $@; \
 	else echo "note: some peers could not be installed; their rows will say so" >&2; fi
 
-lint: $(VENV)/.linked # Check style with ruff
+lint: $(VENV)/.linked # Check style and format with ruff
 	@$(PY) -m ruff check $(ARGS)
+	@$(PY) -m ruff format --check || { echo "make format does it" >&2; exit 1; }
+
+format: $(VENV)/.linked # Format every file with ruff
+	@$(PY) -m ruff format
 
 types: $(VENV)/.linked # Check types with mypy
 	@$(PY) -m mypy $(ARGS)

@@ -95,9 +95,7 @@ def reference() -> str:
     from pendulum_msgs_py.parameters import markdown_table
     from pendulum_msgs_py.programs.executables import summary
 
-    parts = [
-        "# Reference\n\nGenerated from the code: what stands here is what the programs read.\n\n## Programs\n"
-    ]
+    parts = ["# Reference\n\nGenerated from the code: what stands here is what the programs read.\n\n## Programs\n"]
     for package in PACKAGES:
         tables = importlib.import_module(f"{package}.executables")
         for name, target in {**tables.EXECUTABLES, **getattr(tables, "COMMANDS", {})}.items():
@@ -112,9 +110,7 @@ def reference() -> str:
         own = controller_class(name)
         table = markdown_table(own.PARAMETERS) if own.PARAMETERS else "No parameters of its own."
         parts.append(f"### {name}\n\n{own.SUMMARY}.\n\n{table}\n")
-    parts.append(
-        "## Arguments of `bringup.launch.py`\n\n| argument | default | choices | meaning |\n|---|---|---|---|"
-    )
+    parts.append("## Arguments of `bringup.launch.py`\n\n| argument | default | choices | meaning |\n|---|---|---|---|")
     parts += [
         f"| `{it.name}` | `{it.default or chr(34) * 2}` | {', '.join(it.choices) or 'any'} | {it.description} |"
         for it in ARGUMENTS

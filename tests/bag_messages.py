@@ -20,9 +20,7 @@ JOINT_STATE = "sensor_msgs/msg/JointState"
 STORE = typestore()
 
 
-def joint_state(
-    stamp_ns: int, frame: str, names: list[str], *values: list[float], trailing: bytes = b""
-) -> bytes:
+def joint_state(stamp_ns: int, frame: str, names: list[str], *values: list[float], trailing: bytes = b"") -> bytes:
     """Serialise with rosbags, an implementation that is not ours."""
     kind = STORE.types
     header = kind["std_msgs/msg/Header"](
@@ -58,13 +56,9 @@ def mixed_messages(rng: random.Random, count: int) -> list[tuple[str, int, bytes
         stamp = 1_700_000_000_000_000_000 + index * 1_000_000
         kind = rng.randrange(3)
         if kind == 0:
-            data = joint_state(
-                stamp, "", ["pendulum_joint"], [rng.gauss(0, 1)], [rng.gauss(0, 1)], [rng.gauss(0, 1)]
-            )
+            data = joint_state(stamp, "", ["pendulum_joint"], [rng.gauss(0, 1)], [rng.gauss(0, 1)], [rng.gauss(0, 1)])
         elif kind == 1:
-            data = joint_state(
-                stamp, rng.choice(["lqr", "energy_shaping"]), ["pendulum_joint"], [], [], [0.5 * index]
-            )
+            data = joint_state(stamp, rng.choice(["lqr", "energy_shaping"]), ["pendulum_joint"], [], [], [0.5 * index])
         else:
             data = joint_state(stamp, "", ["pendulum_joint"], [], [], [rng.uniform(-2.5, 2.5)])
         topic = ("/sim/joint_states", "/sim/effort_command", "/sim/disturbance")[kind]
@@ -77,9 +71,7 @@ def assert_equals_rosbags(bag: Bag, path: Path) -> None:
     expected: dict[str, list[tuple[int, Any]]] = {}
     with AnyReader([path]) as reader:
         for connection, time, data in reader.messages():
-            expected.setdefault(connection.topic, []).append(
-                (time, reader.deserialize(data, connection.msgtype))
-            )
+            expected.setdefault(connection.topic, []).append((time, reader.deserialize(data, connection.msgtype)))
     assert {topic for topic in bag.topics if bag.topics[topic].count} == set(expected)
     for topic, messages in expected.items():
         array = bag.array(topic)

@@ -49,6 +49,4 @@ def count_everywhere(bag: Path) -> tuple[int, ...]:
 def count_in_order(bag: Path) -> int:
     """Count the messages of an MCAP file as a reader does that goes through it from the start."""
     with next(bag.glob("*.mcap")).open("rb") as stream:
-        return sum(
-            1 for _ in NonSeekingReader(stream, validate_crcs=True).iter_messages(log_time_order=False)
-        )
+        return sum(1 for _ in NonSeekingReader(stream, validate_crcs=True).iter_messages(log_time_order=False))

@@ -107,9 +107,7 @@ def write_bag(
             event(-lead.duration - 1.0, "ramp_up")
             for t in np.arange(0.0, lead.duration, period):
                 position, velocity = lead.at(t)
-                state(
-                    t - lead.duration - 1.0, position, velocity, 1.678 * np.sin(position) + 11.77 * velocity
-                )
+                state(t - lead.duration - 1.0, position, velocity, 1.678 * np.sin(position) + 11.77 * velocity)
             event(-1.0, "regulation")
             for t in np.arange(-1.0, -period / 2, period):
                 state(t, UPRIGHT, 0.0, 0.0)

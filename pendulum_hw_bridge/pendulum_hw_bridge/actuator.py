@@ -377,17 +377,11 @@ def check_command(command: Command, strategy: Strategy, limits: HardwareLimits) 
         ("pwm", "of the supply"),
     ):
         if math.isinf(getattr(command, name)):
-            raise ParameterError(
-                f"{name} setpoint is {getattr(command, name)} {unit}; expected a finite number"
-            )
+            raise ParameterError(f"{name} setpoint is {getattr(command, name)} {unit}; expected a finite number")
     direct = strategy is Strategy.DIRECT_PWM
     if not direct and not math.isnan(command.pwm):
-        raise ParameterError(
-            f"pwm setpoint under strategy {strategy.name}; expected one under DIRECT_PWM only"
-        )
-    if direct and not (
-        math.isnan(command.effort) and math.isnan(command.position) and math.isnan(command.velocity)
-    ):
+        raise ParameterError(f"pwm setpoint under strategy {strategy.name}; expected one under DIRECT_PWM only")
+    if direct and not (math.isnan(command.effort) and math.isnan(command.position) and math.isnan(command.velocity)):
         raise ParameterError("position, velocity or effort setpoint under DIRECT_PWM; expected pwm only")
     limited = Command(
         position=_clip(command.position, limits.position_min, limits.position_max),

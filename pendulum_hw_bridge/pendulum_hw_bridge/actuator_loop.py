@@ -187,9 +187,7 @@ class ActuatorLoop:
             return
         now = self.bridge.port.now_ns()
         expected = {
-            kind
-            for kind in (Input.EFFORT_COMMAND, Input.DISTURBANCE)
-            if supervisor.gates[kind].fresh(now) is not None
+            kind for kind in (Input.EFFORT_COMMAND, Input.DISTURBANCE) if supervisor.gates[kind].fresh(now) is not None
         }
         deadline = self._window
         with self._answers:

@@ -347,18 +347,14 @@ class Bridge:
             return mapping.strategy, mapping.command(sign * drive.effort, self._motor.state)
         if drive.handover > self._handover_left:
             # The torque in force passes on with the speed that the link has: neither the setpoints' nor zero.
-            self._handover = mapping.handover(
-                self._effort, feedback.pwm_command, feedback.velocity, self._motor.state
-            )
+            self._handover = mapping.handover(self._effort, feedback.pwm_command, feedback.velocity, self._motor.state)
         self._handover_left = drive.handover
         offset, speed = self._handover
         # A duty that stands still while a setpoint moves is stuck: even in hold the setpoint moves, by less than shows.
         self._dither = -self._dither
         velocity = sign * drive.velocity
         return TRAJECTORY_STRATEGY, Command(
-            position=sign * (drive.position - self.settings.joint_offset)
-            + drive.handover * offset
-            + self._dither,
+            position=sign * (drive.position - self.settings.joint_offset) + drive.handover * offset + self._dither,
             velocity=velocity + drive.handover * (speed - velocity),
         )
 

@@ -58,10 +58,7 @@ _HARDWARE_DEFAULTS: dict[str, ParameterValue] = {
 SPECS: tuple[ParameterSpec, ...] = (
     *BRIDGE_SPECS,
     *LOOP_SPECS,
-    *(
-        dataclasses.replace(spec, default=_HARDWARE_DEFAULTS.get(spec.name, spec.default))
-        for spec in LIMIT_SPECS
-    ),
+    *(dataclasses.replace(spec, default=_HARDWARE_DEFAULTS.get(spec.name, spec.default)) for spec in LIMIT_SPECS),
 )
 """All parameters of the node."""
 

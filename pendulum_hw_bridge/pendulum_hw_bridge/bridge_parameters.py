@@ -173,9 +173,7 @@ BRIDGE_SPECS: tuple[ParameterSpec, ...] = (
         minimum=2,
         maximum=50,
     ),
-    _fixed(
-        "voltage_window", [22.0, 50.0], "V", "Supply voltages between which the bridge drives, [low, high]."
-    ),
+    _fixed("voltage_window", [22.0, 50.0], "V", "Supply voltages between which the bridge drives, [low, high]."),
     _fixed(
         "measured_effort_limit",
         0.0,
@@ -201,9 +199,7 @@ BRIDGE_SPECS: tuple[ParameterSpec, ...] = (
     _fixed("initial_position", 0.0, "rad", "Emulator: where the pendulum is at the start, at rest."),
     _fixed("seed", 0, "-", "Emulator: seed of sensor noise and timing jitter.", minimum=0),
     _fixed("flat", False, "", "Emulator: the pendulum lies flat on a table, without gravity."),
-    _fixed(
-        "emulator_address", _DEFAULT_ADDRESS, "", "`emulator_process`: where the emulated actuator listens."
-    ),
+    _fixed("emulator_address", _DEFAULT_ADDRESS, "", "`emulator_process`: where the emulated actuator listens."),
     _fixed(
         "e_stop_input_timeout",
         0.0,
@@ -296,9 +292,7 @@ def _make_emulator(values: Mapping[str, Any], clock: Clock, lockstep: bool) -> A
         parameters = replace(parameters, timing=quiet)
         period_ns = round(NANOSECONDS / values["feedback_rate"])
         start_ns -= period_ns + min(_LOCKSTEP_LEAD_NS, period_ns // 2)
-    actuator = EmulatedX5(
-        parameters, seed=values["seed"], position=values["initial_position"], start_ns=start_ns
-    )
+    actuator = EmulatedX5(parameters, seed=values["seed"], position=values["initial_position"], start_ns=start_ns)
     return EmulatorBackend(actuator, clock, seed=values["seed"])
 
 

@@ -43,9 +43,7 @@ def check(
     joint_offset: Annotated[
         float | None, typer.Option(help="Joint angle at which the actuator reads zero [rad].")
     ] = None,
-    joint_sign: Annotated[
-        int | None, typer.Option(help="1, or -1 where the actuator turns the other way.")
-    ] = None,
+    joint_sign: Annotated[int | None, typer.Option(help="1, or -1 where the actuator turns the other way.")] = None,
     nudge: Annotated[
         bool, typer.Option(help="Wait for a hand that turns the link counter-clockwise, to try the sign.")
     ] = True,

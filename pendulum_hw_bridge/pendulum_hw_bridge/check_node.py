@@ -50,9 +50,7 @@ class AsTheBridge:
     window: tuple[float, float]
 
 
-def bridge_values(
-    ros_arguments: Sequence[str], given: Mapping[str, graph.ParameterArgument]
-) -> dict[str, Any]:
+def bridge_values(ros_arguments: Sequence[str], given: Mapping[str, graph.ParameterArgument]) -> dict[str, Any]:
     """Return the parameters that the bridge would have.
 
     Args:

@@ -45,7 +45,6 @@ _PUNCTUAL = (0.25, 1.0)
 _ACKNOWLEDGEMENTS = 20
 
 
-
 def run_checklist(
     port: ActuatorPort,
     settings: BridgeSettings,
@@ -124,9 +123,7 @@ def _settings(port: ActuatorPort, settings: BridgeSettings) -> list[CheckItem]:
     ]
     if settings.gains is not None:
         gains = port.set_gains(settings.gains)
-        items.append(
-            _equal("position gain reads back", gains.position.kp, settings.gains.position.kp, "1/rad")
-        )
+        items.append(_equal("position gain reads back", gains.position.kp, settings.gains.position.kp, "1/rad"))
     off = port.set_strategy(Strategy.OFF)
     items.append(CheckItem("strategy off reads back", off is Strategy.OFF, off.name, "OFF"))
     return items
@@ -262,9 +259,7 @@ def _monitor(
 def _state(records: list[Feedback], limits: SafetyLimits) -> list[CheckItem]:
     last = records[-1]
     finite = all(
-        math.isfinite(value)
-        for record in records
-        for value in (record.position, record.velocity, record.effort)
+        math.isfinite(value) for record in records for value in (record.position, record.velocity, record.effort)
     )
     speed = max(abs(record.velocity) for record in records)
     return [
@@ -274,12 +269,8 @@ def _state(records: list[Feedback], limits: SafetyLimits) -> list[CheckItem]:
             "all finite" if finite else "not all",
             "all finite",
         ),
-        CheckItem(
-            "pendulum is at rest", speed <= _AT_REST, f"{speed:.3f} rad/s", f"at most {_AT_REST:g} rad/s"
-        ),
-        CheckItem(
-            "motion stop is released", not last.m_stop, "pressed" if last.m_stop else "released", "released"
-        ),
+        CheckItem("pendulum is at rest", speed <= _AT_REST, f"{speed:.3f} rad/s", f"at most {_AT_REST:g} rad/s"),
+        CheckItem("motion stop is released", not last.m_stop, "pressed" if last.m_stop else "released", "released"),
         CheckItem(
             "nobody else commands",
             last.lock != CommandLock.LOCKED_BY_OTHER,
@@ -319,6 +310,4 @@ def _name(kind: type[IntEnum], number: int) -> str:
 
 
 def _equal(name: str, seen: float, wanted: float, unit: str) -> CheckItem:
-    return CheckItem(
-        name, abs(seen - wanted) <= 1e-3 * max(1.0, abs(wanted)), f"{seen:g} {unit}", f"{wanted:g} {unit}"
-    )
+    return CheckItem(name, abs(seen - wanted) <= 1e-3 * max(1.0, abs(wanted)), f"{seen:g} {unit}", f"{wanted:g} {unit}")

@@ -32,9 +32,7 @@ class EStopInputServer:
         latched: Tells whether it is latched already.
     """
 
-    def __init__(
-        self, owner: Node, timeout: float, press: Callable[[str], None], latched: Callable[[], bool]
-    ) -> None:
+    def __init__(self, owner: Node, timeout: float, press: Callable[[str], None], latched: Callable[[], bool]) -> None:
         self._input = EStopInput(timeout)
         self._press, self._latched = press, latched
         self._thread = EStopThread(owner, "e_stop_input", press)

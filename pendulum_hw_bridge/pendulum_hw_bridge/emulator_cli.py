@@ -59,9 +59,7 @@ def emulator(
 
 @fault_app.command()
 def emulator_fault(
-    faults: Annotated[
-        list[str] | None, typer.Argument(help="Names of faults to begin; none lists them.")
-    ] = None,
+    faults: Annotated[list[str] | None, typer.Argument(help="Names of faults to begin; none lists them.")] = None,
     clear: Annotated[bool, typer.Option("--clear", help="End all faults first.")] = False,
     address: Annotated[str, typer.Option(help="HOST:PORT of the emulator.")] = _ADDRESS,
     as_json: Annotated[bool, typer.Option("--json", help="Print the list, or what is in force, as JSON.")] = False,

@@ -108,9 +108,7 @@ def find_zero_and_sign(port: ActuatorPort, dialogue: Dialogue, hand: Hand, other
     return found
 
 
-def measure_tare(
-    port: ActuatorPort, settings: BridgeSettings, plant: PlantParameters, dialogue: Dialogue
-) -> float:
+def measure_tare(port: ActuatorPort, settings: BridgeSettings, plant: PlantParameters, dialogue: Dialogue) -> float:
     """Return what the torque sensor shows beyond what hangs there, in joint coordinates [N m].
 
     Args:

@@ -33,9 +33,7 @@ def check_lab(path: str | Path, specs: Iterable[ParameterSpec]) -> dict[str, Any
         ParameterError: The file is refused, or a value lies outside what its parameter allows; names file and entry.
     """
     table = {spec.name: spec for spec in specs}
-    places = {
-        e.parameter: f"{section}.{name}" for section, es in LAB_ENTRIES.items() for name, e in es.items()
-    }
+    places = {e.parameter: f"{section}.{name}" for section, es in LAB_ENTRIES.items() for name, e in es.items()}
     values = {}
     for name, value in load_lab(path).values.items():
         if name not in table:

@@ -35,7 +35,4 @@ def with_lab_file(node: Node, specs: Iterable[ParameterSpec]) -> list[ParameterS
             node.get_logger().warning(
                 f"{name} is {overrides[name].value!r} as given, not {values[name]!r} as in the lab file"
             )
-    return [
-        dataclasses.replace(spec, default=values[spec.name]) if spec.name in values else spec
-        for spec in table
-    ]
+    return [dataclasses.replace(spec, default=values[spec.name]) if spec.name in values else spec for spec in table]

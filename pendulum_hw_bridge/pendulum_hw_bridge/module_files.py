@@ -69,9 +69,7 @@ def restore_group(group: Any, folder: Path, make_command: Callable[[], Any]) -> 
         # An empty command of hebi-py reads as position 0; said to be none, nothing can be taken for a wish to move.
         command.position = command.velocity = command.effort = math.nan
         if not any(group.send_command_with_acknowledgement(command, _ANSWER_MS) for _ in range(_ATTEMPTS)):
-            raise ActuatorError(
-                "no_acknowledgement", f"HEBI module did not acknowledge {name} within {_ANSWER_MS} ms"
-            )
+            raise ActuatorError("no_acknowledgement", f"HEBI module did not acknowledge {name} within {_ANSWER_MS} ms")
     info = _info(group)
     for name, write in ((GAINS, "write_gains"), (SAFETY, "write_safety_params")):
         now = folder / f".now_{name}"

@@ -146,6 +146,4 @@ def _output(gains: PidGains, target: float, measured: float, normaliser: float) 
 
 
 def _memoryless(gains: GainSet) -> bool:
-    return all(
-        loop.ki == loop.kd == loop.dead_zone == loop.punch == 0.0 for loop in (gains.position, gains.velocity)
-    )
+    return all(loop.ki == loop.kd == loop.dead_zone == loop.punch == 0.0 for loop in (gains.position, gains.velocity))

@@ -138,9 +138,7 @@ class StaircaseTrial(Trial):
         name, mode = content.get("name"), content.get("mode")
         if name == "plant_mode" and mode == "armed_position":
             self._follows_since_ns = int(content["stamp_ns"])
-        elif name == "trajectory_refused" or (
-            name == "plant_mode" and mode in {"fault", "e_stop", "disarmed"}
-        ):
+        elif name == "trajectory_refused" or (name == "plant_mode" and mode in {"fault", "e_stop", "disarmed"}):
             self.finished = True
             return f"the plant does not follow the staircase: {content.get('reason')}"
         return ""

@@ -28,9 +28,7 @@ from pendulum_msgs_py.ros.runner import run_node
 __all__ = ["SPECS", "ProcedureNode", "main"]
 
 SPECS: tuple[ParameterSpec, ...] = (
-    ParameterSpec(
-        "procedure", "hand", "", "Which experiment.", choices=("hand", "staircase"), read_only=True
-    ),
+    ParameterSpec("procedure", "hand", "", "Which experiment.", choices=("hand", "staircase"), read_only=True),
     ParameterSpec("trial", 1, "-", "Number of the trial.", minimum=1, maximum=1000, read_only=True),
     ParameterSpec("seed", 1, "-", "`hand`: seed of strokes and tremor.", minimum=0, read_only=True),
     ParameterSpec(
@@ -40,18 +38,12 @@ SPECS: tuple[ParameterSpec, ...] = (
         "`hand`: a person turns the link; this node only holds the drive at zero torque, until `~/finish`.",
         read_only=True,
     ),
-    ParameterSpec(
-        "step", 10.0, "deg", "`staircase`: height of a step.", minimum=1.0, maximum=90.0, read_only=True
-    ),
-    ParameterSpec(
-        "top", 90.0, "deg", "`staircase`: highest angle.", minimum=1.0, maximum=170.0, read_only=True
-    ),
+    ParameterSpec("step", 10.0, "deg", "`staircase`: height of a step.", minimum=1.0, maximum=90.0, read_only=True),
+    ParameterSpec("top", 90.0, "deg", "`staircase`: highest angle.", minimum=1.0, maximum=170.0, read_only=True),
     ParameterSpec(
         "hold", 2.0, "s", "`staircase`: time at rest on each step.", minimum=0.5, maximum=60.0, read_only=True
     ),
-    ParameterSpec(
-        "autostart", False, "", "Start with the first state, without a call of ~/start.", read_only=True
-    ),
+    ParameterSpec("autostart", False, "", "Start with the first state, without a call of ~/start.", read_only=True),
 )
 """All parameters of the node."""
 
@@ -120,9 +112,7 @@ class ProcedureNode(Node):
         assert self._newest_ns is not None
         for publisher, torque in zip((self._push, self._effort), self._answer, strict=True):
             if torque is not None:
-                publisher.publish(
-                    encode_joint_state(self._newest_ns, frame_id=self._full_name, effort=torque)
-                )
+                publisher.publish(encode_joint_state(self._newest_ns, frame_id=self._full_name, effort=torque))
 
     def _on_event(self, message: String) -> None:
         failure = self._trial.hear(message.data)

@@ -154,9 +154,7 @@ def staircase_angles(step: float = 10.0, top: float = 90.0) -> tuple[float, ...]
     """
     count = round(top / step) if step > 0.0 else 0
     if count < 1 or abs(count * step - top) > 1e-9 * top:
-        raise ParameterError(
-            f"staircase step is {step} deg and top {top} deg; expected top a multiple of step > 0"
-        )
+        raise ParameterError(f"staircase step is {step} deg and top {top} deg; expected top a multiple of step > 0")
     half = [*range(1, count + 1), *range(count - 1, -1, -1)]
     return tuple(math.radians(sign * step * index) for sign in (1.0, -1.0) for index in half)
 

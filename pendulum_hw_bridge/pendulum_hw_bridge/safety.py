@@ -56,9 +56,7 @@ class SafetyMonitor:
         drivetrain: Constants for the check of the winding current, or None.
     """
 
-    def __init__(
-        self, limits: SafetyLimits, period: float, drivetrain: SeriesElasticParameters | None = None
-    ) -> None:
+    def __init__(self, limits: SafetyLimits, period: float, drivetrain: SeriesElasticParameters | None = None) -> None:
         self.limits = limits
         self.period = period
         self.drivetrain = drivetrain
@@ -110,9 +108,7 @@ class SafetyMonitor:
     def is_new(self, feedback: Feedback) -> bool:
         """Return whether a record is one that was not seen before, and remember when one last was."""
         last = self._last
-        fresh = last is None or (
-            feedback.sequence != last.sequence and feedback.hardware_ns != last.hardware_ns
-        )
+        fresh = last is None or (feedback.sequence != last.sequence and feedback.hardware_ns != last.hardware_ns)
         self._repeated = 0 if fresh else self._repeated + 1
         if fresh:
             self._last_new_ns = feedback.stamp_ns

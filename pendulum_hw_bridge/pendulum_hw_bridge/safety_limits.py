@@ -48,6 +48,4 @@ class SafetyLimits:
             if not getattr(self, name) > 0.0:
                 raise ParameterError(f"{name} limit is {getattr(self, name)} {unit}; expected > 0")
         if not self.voltage_min < self.voltage_max:
-            raise ParameterError(
-                f"voltage window is [{self.voltage_min}, {self.voltage_max}] V; expected min < max"
-            )
+            raise ParameterError(f"voltage window is [{self.voltage_min}, {self.voltage_max}] V; expected min < max")

@@ -63,11 +63,7 @@ def scan(
         "emulator_address": emulator_address,
     }
     known = {spec.name for spec in BRIDGE_SPECS}
-    of_file = (
-        {k: v for k, v in load_lab(lab).values.items() if k in known}
-        if lab is not None
-        else {"backend": "hebi"}
-    )
+    of_file = {k: v for k, v in load_lab(lab).values.items() if k in known} if lab is not None else {"backend": "hebi"}
     values = validate(BRIDGE_SPECS, {**of_file, **{k: v for k, v in given.items() if v is not None}})
     console = make_console(stderr=True)
     if not as_json:
@@ -97,9 +93,7 @@ def _modules(values: dict[str, Any], look_time: float) -> list[ModuleRecord]:
     if values["backend"] == "hebi":
         return discover(hebi.open_lookup(values["interface"]), look_time=look_time, patience=look_time)
     if values["backend"] != "emulator_process":
-        raise ParameterError(
-            f"backend is {values['backend']!r}; expected hebi or emulator_process, which can be found"
-        )
+        raise ParameterError(f"backend is {values['backend']!r}; expected hebi or emulator_process, which can be found")
     from pendulum_hw_bridge.backends.emulator_process import EmulatorProcessBackend
 
     port = EmulatorProcessBackend(values["emulator_address"])

@@ -175,9 +175,7 @@ def test_stop_ends_with_strategy_off_and_may_be_called_at_any_time(port: Actuato
 
 
 def test_limits_and_commands_are_checked_in_one_place() -> None:
-    limited, changed = check_command(
-        Command(position=9.0), Strategy.PARALLEL_PWM, HardwareLimits(position_max=4.0)
-    )
+    limited, changed = check_command(Command(position=9.0), Strategy.PARALLEL_PWM, HardwareLimits(position_max=4.0))
     assert (limited.position, changed) == (4.0, True)
     with pytest.raises(ParameterError, match=r"effort limit is 0.0 N m; expected a finite number > 0"):
         HardwareLimits(effort=0.0)

@@ -104,9 +104,7 @@ def test_a_real_machine_needs_every_limit(name: str, limit: dict[str, float]) ->
 )
 def test_the_firmware_gets_the_window_in_its_own_angle(sign: int, offset: float, ends: tuple[float, float]) -> None:
     values = validate(BRIDGE_SPECS, {"joint_sign": sign, "joint_offset": offset})
-    settings = bridge_settings(
-        values, effort=1.0, velocity=1.0, gains=trajectory_gains(values), window=(-3.0, 4.0)
-    )
+    settings = bridge_settings(values, effort=1.0, velocity=1.0, gains=trajectory_gains(values), window=(-3.0, 4.0))
     assert (settings.limits.position_min, settings.limits.position_max) == ends
 
 

@@ -32,9 +32,7 @@ class Plant:
         clock = SteppedClock(SECOND)
         self.actuator = EmulatedX5(parameters, seed=1, position=position, start_ns=SECOND)
         self.port = EmulatorBackend(self.actuator, clock)
-        limits = PlantLimits(
-            effort=13.0, feedback_timeout=0.04, velocity=1.5, position_min=-4.0, position_max=4.0
-        )
+        limits = PlantLimits(effort=13.0, feedback_timeout=0.04, velocity=1.5, position_min=-4.0, position_max=4.0)
         self.supervisor = SharedSupervisor(limits, self._prepare, self._withdraw)
         self.bridge = Bridge(
             self.port,
@@ -76,9 +74,7 @@ class Plant:
     def follow(self, goal: float) -> str:
         sample = self.bridge.sample
         assert sample is not None
-        return self.supervisor.accept_trajectory(
-            thesis_ramp(sample.position, goal), self.port.now_ns(), sample
-        )
+        return self.supervisor.accept_trajectory(thesis_ramp(sample.position, goal), self.port.now_ns(), sample)
 
     @property
     def mode(self) -> Mode:

@@ -188,9 +188,7 @@ def test_check_prints_json_and_says_by_its_exit_code_whether_to_arm(
     assert {"rate_hz", "lost", "way_p99_s", "acknowledgement_median_s"} <= printed["figures"].keys()
 
 
-def test_check_is_judged_by_the_options_of_the_bridge(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_check_is_judged_by_the_options_of_the_bridge(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     lab = tmp_path / "lab.yaml"
     lab.write_text(
         "format: pendulum_lab/1\nmodule: {backend: emulator}\n"

@@ -90,9 +90,7 @@ def test_compiled_and_interpreted_steps_are_the_same(strategy: Strategy) -> None
         state[2] = 0.3
         constants = parameters.constants(HardwareLimits(), 36.0, enabled=True)
         setpoints = (
-            np.array([math.nan, math.nan, 0.2])
-            if strategy is Strategy.DIRECT_PWM
-            else np.array([0.5, 0.1, 0.4])
+            np.array([math.nan, math.nan, 0.2]) if strategy is Strategy.DIRECT_PWM else np.array([0.5, 0.1, 0.4])
         )
         gains = DEFAULT_GAINS[max(1, int(strategy))]
         step(state, constants, gain_rows(gains), new_loop_memory(), setpoints, int(strategy), 0.7, 0, 400)
@@ -133,9 +131,7 @@ def test_torque_at_standstill_is_the_feed_forwards() -> None:
     duty = 2.4e-4 * 1000
     actuator.deliver(Command(pwm=duty), 0)
     actuator.advance_to(kernel.STEP_NS)
-    expected = (
-        duty * drive.supply_voltage * drive.torque_constant * drive.gear_ratio / drive.winding_resistance
-    )
+    expected = duty * drive.supply_voltage * drive.torque_constant * drive.gear_ratio / drive.winding_resistance
     # 22 degC: copper is 0.8 % up, magnets 0.07 % down.
     assert actuator.link.motor_torque == pytest.approx(expected, rel=0.02)
 
@@ -206,18 +202,14 @@ def test_feedback_has_the_measured_rate_jitter_and_steps() -> None:
 
 
 def test_motor_warms_to_what_its_thermal_resistances_say() -> None:
-    thermal = ThermalParameters(
-        winding_capacity=0.02, housing_capacity=0.02, body_capacity=0.02, ambient=22.0
-    )
+    thermal = ThermalParameters(winding_capacity=0.02, housing_capacity=0.02, body_capacity=0.02, ambient=22.0)
     parameters = replace(load_emulator("x5_9"), thermal=thermal, flat=True)
     locked = replace(parameters, plant=replace(parameters.plant, inertia=1e9))
     actuator = EmulatedX5(locked)
     actuator.configure(strategy=Strategy.DIRECT_PWM, command_lifetime=5.0)
     actuator.deliver(Command(pwm=0.1), 0)
     actuator.advance_to(4 * SECOND)
-    current = actuator.link.motor_torque / (
-        parameters.drivetrain.torque_constant * parameters.drivetrain.gear_ratio
-    )
+    current = actuator.link.motor_torque / (parameters.drivetrain.torque_constant * parameters.drivetrain.gear_ratio)
     winding = actuator.link.winding_temperature
     resistance = parameters.drivetrain.winding_resistance * (1.0 + 0.004 * (winding - 20.0))
     rise, _, _ = steady_rise(current**2 * resistance, thermal)

@@ -114,9 +114,7 @@ class Module:
         if not self.flows:
             return None
         self.time_us += 10_000
-        quantities = {
-            theirs: np.array([self.values.get(theirs, 0.5)]) for theirs in backend_module._FLOATS.values()
-        }
+        quantities = {theirs: np.array([self.values.get(theirs, 0.5)]) for theirs in backend_module._FLOATS.values()}
         times = {"receive_time_us": self.time_us, "hardware_transmit_time_us": self.time_us + 7}
         return SimpleNamespace(
             **quantities, **{name: np.array([value]) for name, value in {**times, **self.states}.items()}
@@ -224,9 +222,7 @@ def test_stop_sends_zero_then_strategy_off_and_hears_it_confirmed(port: HebiBack
     assert port.strategy is Strategy.OFF
 
 
-def test_a_stop_that_nobody_confirms_is_an_error_and_the_next_one_asks_again(
-    port: HebiBackend, module: Module
-) -> None:
+def test_a_stop_that_nobody_confirms_is_an_error_and_the_next_one_asks_again(port: HebiBackend, module: Module) -> None:
     port.set_strategy(Strategy.DIRECT_PWM)
     module.acknowledges = False
     for _ in range(2):
@@ -322,4 +318,3 @@ def test_a_group_of_several_modules_is_refused() -> None:
     backend = HebiBackend(make_group=lambda: hebi.util.create_imitation_group(2), imitation=True)
     with pytest.raises(ActuatorError, match="HEBI group has 2 modules; expected 1"):
         backend.connect()
-

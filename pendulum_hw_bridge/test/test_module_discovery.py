@@ -76,9 +76,7 @@ def test_each_module_is_told_with_all_that_tells_it_from_others() -> None:
 def test_a_twin_that_answers_later_is_seen_before_a_choice_is_made() -> None:
     seen = look(module(1), module(2), at_once=False)
     assert len(seen) == 2
-    with pytest.raises(
-        ActuatorError, match=r"Lab/Pendulum is not the only one: .*X5-01.*X5-02.*choose by serial"
-    ):
+    with pytest.raises(ActuatorError, match=r"Lab/Pendulum is not the only one: .*X5-01.*X5-02.*choose by serial"):
         select_module(seen, ModuleSelection("Lab", "Pendulum"), seconds=2.0)
 
 

@@ -80,13 +80,9 @@ SERVED = EmulatorServer(EmulatedX5(load_emulator("thesis")), ("127.0.0.1", 0), l
     st.one_of(
         st.binary(max_size=60).map(lambda tail: wire.COMMAND + tail),
         st.recursive(
-            st.one_of(
-                st.none(), st.booleans(), st.integers(-5, 5), st.floats(allow_nan=False), st.text(max_size=5)
-            ),
+            st.one_of(st.none(), st.booleans(), st.integers(-5, 5), st.floats(allow_nan=False), st.text(max_size=5)),
             lambda inner: st.dictionaries(
-                st.sampled_from(
-                    ["settings", "strategy", "gains", "limits", "push", "inject", "command_lifetime"]
-                ),
+                st.sampled_from(["settings", "strategy", "gains", "limits", "push", "inject", "command_lifetime"]),
                 inner,
                 max_size=3,
             ),

@@ -15,6 +15,7 @@ from pendulum_msgs_py.contract.values import NANOSECONDS, JointSample
 
 __all__ = ["AnswerLoop", "StateRefusal"]
 
+
 class StateRefusal(str, Enum):
     """Why a state was not answered; the value is the key in diagnostics."""
 

@@ -73,9 +73,7 @@ ARGUMENTS: tuple[Argument, ...] = (
     Argument("start", "bottom", "Where a simulated or emulated pendulum starts.", ("bottom", "top")),
     Argument("sim_rate", "500.0", "Rate of the simulator [Hz]."),
     Argument("hw_rate", "100.0", "Rate of the bridge [Hz]."),
-    Argument(
-        "params_file", "", "ROS parameter file for all nodes, such as config/lqr_thesis.yaml of pendulum_lqr."
-    ),
+    Argument("params_file", "", "ROS parameter file for all nodes, such as config/lqr_thesis.yaml of pendulum_lqr."),
     Argument("record", "false", "Record each plant to a bag of its own.", _YES_NO),
     Argument("bag", "", "Folder of the bags; runs/<date and time> when empty."),
     Argument("viewer", "false", "Open a window that draws each plant.", _YES_NO),

@@ -54,9 +54,7 @@ class Catch:
 
     def value(self, angle: float, velocity: float) -> float:
         """Return x' S x of a deviation from the set-point."""
-        return (
-            self._s00 * angle * angle + 2.0 * self._s01 * angle * velocity + self._s11 * velocity * velocity
-        )
+        return self._s00 * angle * angle + 2.0 * self._s01 * angle * velocity + self._s11 * velocity * velocity
 
     def holds(self, angle: float, velocity: float) -> bool:
         """Tell whether the LQR is in charge at a state, and remember it."""

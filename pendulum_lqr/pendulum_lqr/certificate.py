@@ -221,9 +221,7 @@ class Certifier:
         plant = self._whole if K.shape[1] == 1 else self.scaling.plant(self._model)
         margin = float(np.min(pointwise_margin(plant, self.scaling.controller(K)))) if stable else 0.0
         # Where much lies beyond the highest line, only a small loop is known to stay away from -1 there.
-        settled = machine.up_to_nyquist or bool(
-            (np.abs(second[-1]) + radius[-1] < 1.0) and (np.abs(first[-1]) < 1.0)
-        )
+        settled = machine.up_to_nyquist or bool((np.abs(second[-1]) + radius[-1] < 1.0) and (np.abs(first[-1]) < 1.0))
         nearest = np.maximum(np.abs(second - first) - radius, 0.0) / np.maximum(np.abs(1.0 + first), 1e-300)
         nearest = np.minimum(nearest, loop_distance(first, second))
         alike = stable and settled and _same_winding(first, second)

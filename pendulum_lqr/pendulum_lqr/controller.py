@@ -57,9 +57,7 @@ COMMON_PARAMETERS: tuple[ParameterSpec, ...] = (
         "Largest torque of the controller; 0 for the plant's own limit.",
         minimum=0.0,
     ),
-    ParameterSpec(
-        "velocity", "measured", "", "Where the velocity comes from.", choices=tuple(VELOCITY_ESTIMATORS)
-    ),
+    ParameterSpec("velocity", "measured", "", "Where the velocity comes from.", choices=tuple(VELOCITY_ESTIMATORS)),
 )
 """Parameters that every controller has."""
 
@@ -218,9 +216,7 @@ def make_controller(
     p = validate(COMMON_PARAMETERS + kind.PARAMETERS, values or {})
     if not (math.isfinite(period) and period > 0.0):
         raise ParameterError(f"period is {period} s; expected a finite value > 0")
-    p["effort_limit"] = (
-        min(p["effort_limit"], plant.effort_limit) if p["effort_limit"] > 0.0 else plant.effort_limit
-    )
+    p["effort_limit"] = min(p["effort_limit"], plant.effort_limit) if p["effort_limit"] > 0.0 else plant.effort_limit
     if plant.drivetrain is not None and not kind.SERIES_ELASTIC:
         raise ParameterError(
             f"{name} knows rigid plants alone, and plant {plant.name!r} is series elastic; expected lqr, lqi, lqg, "

@@ -109,15 +109,11 @@ class ControllerNode(LifecycleNode, PollingNode):
         self._told_refusals = 0
         self._multi_array = self._settings["command_type"] == "multi_array"
         if self._multi_array:
-            self._command_publisher = self.create_publisher(
-                Float64MultiArray, _MULTI_ARRAY_TOPIC, qos.COMMAND
-            )
+            self._command_publisher = self.create_publisher(Float64MultiArray, _MULTI_ARRAY_TOPIC, qos.COMMAND)
         else:
             self._command_publisher = self.create_publisher(JointState, names.EFFORT_COMMAND, qos.COMMAND)
         self._first_answer = FirstAnswer(self, self._command_publisher)
-        self._diagnostics_publisher = self.create_publisher(
-            DiagnosticArray, names.DIAGNOSTICS, qos.DIAGNOSTICS
-        )
+        self._diagnostics_publisher = self.create_publisher(DiagnosticArray, names.DIAGNOSTICS, qos.DIAGNOSTICS)
         self.create_subscription(JointState, names.JOINT_STATES, self._on_state, qos.NEWEST_STATE, raw=True)
         self._running_plant = RunningPlant(self, self._plant)
         # Wall time on purpose: diagnostics must come even where simulated time stands still.
@@ -135,9 +131,7 @@ class ControllerNode(LifecycleNode, PollingNode):
             self.get_logger().error(f"cannot configure: {error}")
             return TransitionCallbackReturn.FAILURE
         self._pending = None
-        self._loop = AnswerLoop(
-            controller, self._settings["state_timeout"], simulated_time=self._simulated_time
-        )
+        self._loop = AnswerLoop(controller, self._settings["state_timeout"], simulated_time=self._simulated_time)
         self.get_logger().info(
             f"{self._settings['controller']} for plant {self._plant.name}: {controller.describe()}, "
             f"limit {controller.effort_limit:g} N m"

@@ -35,9 +35,7 @@ _ANGLE, _VELOCITY = 1e-4, 1e-2
 _FALLEN = 0.5
 
 
-def controller_response(
-    name: str, plant: PlantParameters, frequency: ArrayLike, period: float
-) -> tuple[Complex, bool]:
+def controller_response(name: str, plant: PlantParameters, frequency: ArrayLike, period: float) -> tuple[Complex, bool]:
     """Return K at some frequencies, shape (2, n) [N m/rad, N m s/rad], and whether the loop with the model is stable.
 
     Args:

@@ -107,9 +107,7 @@ def cost_matrices(q: ArrayLike, r: float, size: int = 2) -> tuple[Matrix, Matrix
     if weights.shape == (size,):
         weights = np.diag(weights)
     if weights.shape != (size, size):
-        raise DesignError(
-            f"q has the shape {weights.shape}; expected ({size},) for a diagonal or ({size}, {size})"
-        )
+        raise DesignError(f"q has the shape {weights.shape}; expected ({size},) for a diagonal or ({size}, {size})")
     if not np.all(np.isfinite(weights)):
         raise DesignError(f"q is {_plain(q)}; expected finite weights")
     if not np.allclose(weights, weights.T, rtol=1e-12, atol=0.0):
@@ -273,9 +271,7 @@ def discrete_lqr(model: DiscreteModel, q: ArrayLike, r: float, cross: Matrix | N
     K = (BS @ model.A + (0.0 if N is None else N.T)) / float((R + BS @ model.B)[0, 0])
     poles = sort_poles(np.linalg.eigvals(model.A - model.B @ K))
     if np.max(np.abs(poles)) >= 1.0:
-        raise DesignError(
-            f"closed loop has poles {poles} on or outside the unit circle; expected smaller weights"
-        )
+        raise DesignError(f"closed loop has poles {poles} on or outside the unit circle; expected smaller weights")
     return Gain(K[0], S, poles)
 
 
@@ -364,9 +360,7 @@ def kalman_gain(A: Matrix, C: Matrix, process: ArrayLike, measurement: ArrayLike
     V = np.atleast_2d(np.asarray(measurement, dtype=np.float64))
     for name, covariance in (("process", W), ("measurement", V)):
         if not np.all(np.isfinite(covariance)) or float(np.linalg.eigvalsh(covariance)[0]) < -1e-15:
-            raise DesignError(
-                f"{name} noise covariance is {covariance.tolist()}; expected finite, not negative"
-            )
+            raise DesignError(f"{name} noise covariance is {covariance.tolist()}; expected finite, not negative")
     if not float(np.linalg.eigvalsh(V)[0]) > 0.0:
         raise DesignError(f"measurement noise covariance is {V.tolist()}; expected every variance > 0")
     require_observable(A, C, discrete=True)
@@ -445,9 +439,7 @@ def _lift(model: LinearModel) -> Matrix:
     return np.array([follows.get(name, (0.0, 0.0)) for name in model.states])
 
 
-def _output_feedback(
-    A: Matrix, B: Matrix, C: Matrix, Q: Matrix, r: float, full: Matrix, lift: Matrix
-) -> Gain:
+def _output_feedback(A: Matrix, B: Matrix, C: Matrix, Q: Matrix, r: float, full: Matrix, lift: Matrix) -> Gain:
     """Return u = -K C x of least tr(P X0), X0 = lift lift', by quasi-Newton on Levine and Athans' gradient."""
     start = lift @ lift.T
 

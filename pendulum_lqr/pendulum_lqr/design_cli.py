@@ -48,15 +48,11 @@ def design(
     q: Annotated[
         list[str] | None, typer.Option(help="Diagonal of Q, as 100,0.01; may be given again for more rows.")
     ] = None,
-    r: Annotated[
-        list[float] | None, typer.Option(help="R; may be given again. Every Q meets every R.")
-    ] = None,
+    r: Annotated[list[float] | None, typer.Option(help="R; may be given again. Every Q meets every R.")] = None,
     theta: Annotated[float, typer.Option(help="Angle of the fixed point, 0 hanging down [rad].")] = UPRIGHT,
     effort_limit: Annotated[float, typer.Option(help="Torque limit [N m]; 0 for the plant's.")] = 0.0,
     figures: Annotated[Path | None, typer.Option(help="Folder for the figures (PNG).")] = None,
-    row: Annotated[
-        int, typer.Option(help="Row that the figures show; 0 for the thesis's choice or the last.")
-    ] = 0,
+    row: Annotated[int, typer.Option(help="Row that the figures show; 0 for the thesis's choice or the last.")] = 0,
     machine: Annotated[
         Path | None,
         typer.Option(
@@ -99,9 +95,7 @@ def design(
 
 def _limit(given: float, plants_own: float) -> float:
     if not (math.isfinite(given) and given >= 0.0):
-        raise ParameterError(
-            f"--effort-limit is {given} N m; expected a finite number > 0, or 0 for the plant's"
-        )
+        raise ParameterError(f"--effort-limit is {given} N m; expected a finite number > 0, or 0 for the plant's")
     return given or plants_own
 
 
@@ -203,9 +197,7 @@ def _plant_lines(name: str, model: LinearModel) -> list[str]:
             ),
         ]
     if model.delay > 0.0:
-        lines.append(
-            f"transport delay {model.delay:g} s: counted in margins and periods, not in the eigenvalues"
-        )
+        lines.append(f"transport delay {model.delay:g} s: counted in margins and periods, not in the eigenvalues")
     return lines
 
 

@@ -78,9 +78,7 @@ DISTURBANCE_SPECS: tuple[ParameterSpec, ...] = (
         minimum=0.0,
         exclusive_minimum=True,
     ),
-    ParameterSpec(
-        "order", 9, "-", "Length of prbs: repeats after 2^order - 1 samples.", minimum=2, maximum=16
-    ),
+    ParameterSpec("order", 9, "-", "Length of prbs: repeats after 2^order - 1 samples.", minimum=2, maximum=16),
     ParameterSpec(
         "signal_period",
         4.0,
@@ -91,9 +89,7 @@ DISTURBANCE_SPECS: tuple[ParameterSpec, ...] = (
     ),
     ParameterSpec("lines", 40, "-", "Number of lines of multisine, at most.", minimum=1, maximum=10_000),
     ParameterSpec("start_time", 0.0, "s", "Time at which step and pulse_train begin.", minimum=0.0),
-    ParameterSpec(
-        "pulse_width", 0.1, "s", "Length of each pulse of pulse_train.", minimum=0.0, exclusive_minimum=True
-    ),
+    ParameterSpec("pulse_width", 0.1, "s", "Length of each pulse of pulse_train.", minimum=0.0, exclusive_minimum=True),
 )
 """Parameters of every kind; each kind reads those that it needs."""
 
@@ -215,10 +211,7 @@ def _gaussian(p: Mapping[str, Any], hold_ns: int) -> Disturbance:
                 f"bandwidth is {bandwidth} Hz with hold_time {hold_ns / NANOSECONDS} s; expected a longer hold_time, "
                 "of at least 1/20000 of the correlation time"
             )
-        shape = [
-            math.exp(-0.5 * (k / sigma) ** 2) if sigma > 0.0 else float(k == 0)
-            for k in range(-reach, reach + 1)
-        ]
+        shape = [math.exp(-0.5 * (k / sigma) ** 2) if sigma > 0.0 else float(k == 0) for k in range(-reach, reach + 1)]
         energy = math.sqrt(sum(value * value for value in shape))
         weights = [value / energy for value in shape]
 
@@ -226,9 +219,7 @@ def _gaussian(p: Mapping[str, Any], hold_ns: int) -> Disturbance:
         if time_ns < 0:
             return 0.0
         index = time_ns // hold_ns
-        return amplitude * sum(
-            weight * _normal(seed, index + offset) for offset, weight in enumerate(weights)
-        )
+        return amplitude * sum(weight * _normal(seed, index + offset) for offset, weight in enumerate(weights))
 
     return torque
 

@@ -75,9 +75,7 @@ class DisturbanceNode(Node):
         self._torque_publisher = self.create_publisher(JointState, names.DISTURBANCE, qos.COMMAND)
         self._first_answer = FirstAnswer(self, self._torque_publisher)
         self._event_publisher = self.create_publisher(String, names.EVENTS, qos.EVENTS)
-        self._diagnostics_publisher = self.create_publisher(
-            DiagnosticArray, names.DIAGNOSTICS, qos.DIAGNOSTICS
-        )
+        self._diagnostics_publisher = self.create_publisher(DiagnosticArray, names.DIAGNOSTICS, qos.DIAGNOSTICS)
         self.create_service(Trigger, "~/start", self._on_start)
         self.create_service(Trigger, "~/stop", self._on_stop)
         self.create_subscription(JointState, names.JOINT_STATES, self._on_state, qos.NEWEST_STATE, raw=True)
@@ -167,17 +165,13 @@ def _signal(values: Mapping[str, Any]) -> Disturbance:
 
 def _read_recording(file: str) -> Disturbance:
     if not file:
-        raise ParameterError(
-            "kind is 'from_bag' without a file; expected -p file:=PATH of a CSV with time and torque"
-        )
+        raise ParameterError("kind is 'from_bag' without a file; expected -p file:=PATH of a CSV with time and torque")
     rows = read_text(Path(file).expanduser(), "recorded disturbance", limit=200_000_000).splitlines()[1:]
     try:
         table = np.array([[float(cell) for cell in row.split(",")[:2]] for row in rows if row.strip()])
         times, torques = table[:, 0], table[:, 1]
     except (ValueError, IndexError) as error:
-        raise DataError(
-            f"recorded disturbance {file}: {error}; expected the columns time [s], torque [N m]"
-        ) from error
+        raise DataError(f"recorded disturbance {file}: {error}; expected the columns time [s], torque [N m]") from error
     return from_bag(np.round(times * NANOSECONDS).astype(np.int64), torques)
 
 

@@ -142,9 +142,7 @@ def root_locus_figure(model: LinearModel, K: Array) -> Figure:
     factors = np.concatenate([[0.0], np.logspace(-3, math.log10(3.0), 1500)])
     branches = np.array([closed_loop_poles(model, factor * np.asarray(K)) for factor in factors])
     _s_plane(ax, branches.ravel(), _spread(model.poles))
-    ax.plot(
-        branches.real.ravel(), branches.imag.ravel(), ".", color=COLOURS[0], ms=3, label="0 < k < 3", zorder=3
-    )
+    ax.plot(branches.real.ravel(), branches.imag.ravel(), ".", color=COLOURS[0], ms=3, label="0 < k < 3", zorder=3)
     for factor, marker, text in ((0.0, "o", "k = 0: no feedback"), (1.0, "x", "k = 1: the design")):
         poles = closed_loop_poles(model, factor * np.asarray(K))
         ax.plot(poles.real, poles.imag, marker, color=INK, mfc="white", ms=9, mew=2, label=text, zorder=5)
@@ -226,9 +224,7 @@ def step_figure(model: LinearModel, gains: Mapping[str, Array], report: LoopRepo
     top.set_ylabel("angle [rad]")
     bottom.set_ylabel("torque [N m]")
     bottom.set_xlabel("time [s]")
-    top.set_title(
-        "Step of the set-point by 0.1 rad (linear model, gravity fed forward)", loc="left", fontweight="bold"
-    )
+    top.set_title("Step of the set-point by 0.1 rad (linear model, gravity fed forward)", loc="left", fontweight="bold")
     top.legend(frameon=False, fontsize=9, loc="lower right")
     return figure
 
@@ -245,20 +241,14 @@ def phase_portrait_figure(plant: RigidPlant, gain: Gain, effort_limit: float, re
     figure, (ax,) = _figure(height=5.2)
     ax.grid(visible=False)
     angles, velocities = region.angles, region.velocities
-    ax.contourf(
-        angles, velocities, region.attracted.astype(float), levels=[0.5, 1.5], colors=["#dbeafe"], zorder=0
-    )
+    ax.contourf(angles, velocities, region.attracted.astype(float), levels=[0.5, 1.5], colors=["#dbeafe"], zorder=0)
     x, v = np.meshgrid(np.linspace(angles[0], angles[-1], 60), np.linspace(velocities[0], velocities[-1], 60))
-    u = np.clip(
-        equilibrium_effort(plant, UPRIGHT) - gain.K[0] * x - gain.K[1] * v, -effort_limit, effort_limit
-    )
+    u = np.clip(equilibrium_effort(plant, UPRIGHT) - gain.K[0] * x - gain.K[1] * v, -effort_limit, effort_limit)
     acceleration = state_derivative(plant, x + UPRIGHT, v, u)[1]
     ax.streamplot(x, v, v, acceleration, color="#94a3b8", linewidth=0.7, density=1.3, arrowsize=0.8, zorder=1)
     ax.plot(region.ellipse[:, 0], region.ellipse[:, 1], color=COLOURS[1], linewidth=2.0, zorder=3)
     ax.plot([0.0], [0.0], "o", color=INK, ms=6, zorder=4)
-    ax.fill_between(
-        [], [], color="#dbeafe", label=f"attracted, by simulation (torque limit {effort_limit:g} N m)"
-    )
+    ax.fill_between([], [], color="#dbeafe", label=f"attracted, by simulation (torque limit {effort_limit:g} N m)")
     ax.plot([], [], color=COLOURS[1], linewidth=2.0, label=f"proven: x'Sx \u2264 {region.level:.4g}")
     ax.plot([], [], "o", color=INK, ms=6, label="upright")
     ax.set_xlim(angles[0], angles[-1])

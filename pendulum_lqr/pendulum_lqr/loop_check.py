@@ -74,9 +74,7 @@ def growth(controller: Controller, plant: RigidPlant, period: float, set_point: 
     return spreads[-1] / spreads[-2]
 
 
-def require_stable(
-    name: str, controller: Controller, plant: RigidPlant, period: float, set_point: float = 0.0
-) -> None:
+def require_stable(name: str, controller: Controller, plant: RigidPlant, period: float, set_point: float = 0.0) -> None:
     """Refuse a controller whose loop with its own plant is unstable.
 
     Args:

@@ -97,8 +97,7 @@ def _between(measured: MeasuredResponse, radius: Array) -> tuple[Array, Complex,
     if lines.size < 5:
         return lines, measured.response, radius
     pieces = [
-        np.geomspace(a, b, max(2, int(np.ceil(np.log(b / a) / np.log(_RATIO))) + 1))[:-1]
-        for a, b in pairwise(lines)
+        np.geomspace(a, b, max(2, int(np.ceil(np.log(b / a) / np.log(_RATIO))) + 1))[:-1] for a, b in pairwise(lines)
     ]
     grid = np.concatenate([*pieces, lines[-1:]])
     inverse = 1.0 / measured.response[0]

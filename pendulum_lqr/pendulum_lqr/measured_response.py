@@ -63,9 +63,7 @@ class MeasuredResponse:
         ):  # fmt: skip
             found = getattr(self, name)
             if found.shape != shape or not np.all(np.isfinite(found)):
-                raise DataError(
-                    f"response of {self.label}: {name} has shape {found.shape}; expected {shape}, finite"
-                )
+                raise DataError(f"response of {self.label}: {name} has shape {found.shape}; expected {shape}, finite")
         if n == 0 or not (self.period > 0.0 and self.blocks > 1.0 and np.all(np.diff(self.frequency) > 0.0)):
             raise DataError(
                 f"response of {self.label} has {n} lines, a period of {self.period} s and {self.blocks} blocks; "

@@ -137,9 +137,7 @@ def _successors(
     angle, velocity = x.copy(), v.copy()
 
     def acceleration(angle: Array, velocity: Array) -> Array:
-        return np.asarray(
-            acceleration_from_upright(plant, angle, velocity, effort, np, sign_velocity=SIGN_VELOCITY)
-        )
+        return np.asarray(acceleration_from_upright(plant, angle, velocity, effort, np, sign_velocity=SIGN_VELOCITY))
 
     for _ in range(substeps):
         middle = velocity + 0.5 * h * acceleration(angle, velocity)

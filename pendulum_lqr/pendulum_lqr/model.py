@@ -233,9 +233,7 @@ def acceleration_from_upright(
     return equation(angle - plant.angle_offset, velocity, torque, plant.inertia, plant.damping, -plant.gravity)
 
 
-def _rigid_flow(
-    plant: RigidPlant, x: tuple[complex, ...], torque: complex, push: complex
-) -> tuple[complex, ...]:
+def _rigid_flow(plant: RigidPlant, x: tuple[complex, ...], torque: complex, push: complex) -> tuple[complex, ...]:
     acceleration = in_arithmetic(rigid_acceleration, cmath)
     net = torque + push + offset_of(plant, "torque_offset")
     angle = x[0] - offset_of(plant, "angle_offset")

@@ -139,5 +139,3 @@ class Observer:
         """Return the filter's gain."""
         rows = "; ".join(", ".join(f"{value:.6f}" for value in row) for row in self.gain.L.T)
         return f"L = [{rows}]"
-
-

@@ -155,9 +155,7 @@ def sublevel_ellipse(S: Array, level: float, points: int = 361) -> Array:
     """
     directions = np.linalg.inv(scipy.linalg.cholesky(S, lower=True)).T
     phi = np.linspace(0.0, 2.0 * math.pi, points)
-    return np.asarray(
-        math.sqrt(level) * (directions @ np.vstack([np.cos(phi), np.sin(phi)])).T, dtype=np.float64
-    )
+    return np.asarray(math.sqrt(level) * (directions @ np.vstack([np.cos(phi), np.sin(phi)])).T, dtype=np.float64)
 
 
 def region_of_attraction(
@@ -191,9 +189,7 @@ def region_of_attraction(
         np.abs(end_velocity) < tolerance[1]
     )
     level = proven_level(plant, gain, effort_limit)
-    return Region(
-        angles, velocities, arrived.reshape(x.shape), level, sublevel_ellipse(gain.S, level), gain.S
-    )
+    return Region(angles, velocities, arrived.reshape(x.shape), level, sublevel_ellipse(gain.S, level), gain.S)
 
 
 def rigid_rollout(plant: RigidPlant, gain: Gain, effort_limit: float, duration: float = 8.0) -> Rollout:
@@ -257,9 +253,7 @@ def _decreases(loop: _Loop, gain: Gain, directions: Array, reach: float) -> bool
             return True
         r_low, r_high, p_low, p_high = (edge[open_cells] for edge in (r_low, r_high, p_low, p_high))
         r_middle, p_middle = 0.5 * (r_low + r_high), 0.5 * (p_low + p_high)
-        centre = _rate(
-            loop, gain, directions, _Interval(r_middle, r_middle), _Interval(p_middle, p_middle)
-        )
+        centre = _rate(loop, gain, directions, _Interval(r_middle, r_middle), _Interval(p_middle, p_middle))
         if np.any(centre.low >= 0.0) or 4 * r_low.size > _MOST_CELLS:
             return False
         r_low, r_high = (
@@ -331,9 +325,7 @@ def _weight_quotient(angle: float, rho: _Interval, n0: _Interval) -> _Interval:
         angle + 0.5 * np.minimum(rho.low * n0.low, rho.high * n0.low),
         angle + 0.5 * np.maximum(rho.low * n0.high, rho.high * n0.high),
     )
-    return _times(
-        _direction(np.array([1.0, 0.0]), half), _sinc(_Interval(0.5 * rho.low, 0.5 * rho.high), n0)
-    )
+    return _times(_direction(np.array([1.0, 0.0]), half), _sinc(_Interval(0.5 * rho.low, 0.5 * rho.high), n0))
 
 
 def _sinc(rho: _Interval, n0: _Interval) -> _Interval:
@@ -341,9 +333,7 @@ def _sinc(rho: _Interval, n0: _Interval) -> _Interval:
     largest = rho.high * np.maximum(np.abs(n0.low), np.abs(n0.high))
     smallest = rho.low * np.where(n0.low * n0.high <= 0.0, 0.0, np.minimum(np.abs(n0.low), np.abs(n0.high)))
     # np.sinc(x) is sin(pi x) / (pi x).
-    return _Interval(
-        np.sinc(np.minimum(largest, math.pi) / math.pi), np.sinc(np.minimum(smallest, math.pi) / math.pi)
-    )
+    return _Interval(np.sinc(np.minimum(largest, math.pi) / math.pi), np.sinc(np.minimum(smallest, math.pi) / math.pi))
 
 
 def _times(a: _Interval, b: _Interval) -> _Interval:

@@ -36,9 +36,7 @@ class PidGains:
     kd: float
 
 
-def pid_loop(
-    model: LinearModel, gains: PidGains, period: float, filter_time: float
-) -> tuple[Matrix, Matrix, Matrix]:
+def pid_loop(model: LinearModel, gains: PidGains, period: float, filter_time: float) -> tuple[Matrix, Matrix, Matrix]:
     """Return (A, B, F) of the sampled closed loop z[k+1] = A z[k] + B w[k], u[k] = F z[k].
 
     The state is [that of the sampled plant, integral, angle at the sample before, filtered derivative at the sample
@@ -70,9 +68,7 @@ def pid_loop(
     return A, B, F
 
 
-def pid_cost(
-    model: LinearModel, gains: PidGains, period: float, filter_time: float, q: ArrayLike, r: float
-) -> float:
+def pid_cost(model: LinearModel, gains: PidGains, period: float, filter_time: float, q: ArrayLike, r: float) -> float:
     """Return the LQR cost of a PID loop, summed over a release from 0.1 rad and the onset of 1 N m; inf if unstable.
 
     Both parts count x' Q x + R (u - u_end)^2 per second, where u_end is the torque that remains: without it any
@@ -105,9 +101,7 @@ def pid_cost(
     return float(release @ S @ release + rest @ S @ rest)
 
 
-def tune_numerically(
-    model: LinearModel, period: float, filter_time: float, q: ArrayLike, r: float
-) -> PidGains:
+def tune_numerically(model: LinearModel, period: float, filter_time: float, q: ArrayLike, r: float) -> PidGains:
     """Return the gains of least :func:`pid_cost`, by Nelder and Mead on their logarithms from several starts.
 
     Args:
@@ -141,9 +135,7 @@ def tune_numerically(
         cost, start, method="Nelder-Mead", options={"xatol": 1e-4, "fatol": 1e-9, "maxiter": 1000}
     )
     if best.fun >= 1e12:
-        raise DesignError(
-            f"no stable PID found at a period of {period} s; expected a shorter period or a slower plant"
-        )
+        raise DesignError(f"no stable PID found at a period of {period} s; expected a shorter period or a slower plant")
     return PidGains(*(float(value) for value in np.exp(best.x)))
 
 
@@ -163,9 +155,7 @@ def ultimate_gain(model: LinearModel, period: float) -> tuple[float, float]:
     size = sampled.A.shape[0]
 
     def poles(gain: float) -> NDArray[np.complex128]:
-        return np.asarray(
-            np.linalg.eigvals(sampled.A - gain * sampled.B @ np.eye(1, size)), dtype=np.complex128
-        )
+        return np.asarray(np.linalg.eigvals(sampled.A - gain * sampled.B @ np.eye(1, size)), dtype=np.complex128)
 
     low = max(-low_frequency(model)[2], 0.0) * 1.001 + 1e-9
     if np.max(np.abs(poles(low * 1.01))) >= 1.0:
@@ -176,9 +166,7 @@ def ultimate_gain(model: LinearModel, period: float) -> tuple[float, float]:
     while np.max(np.abs(poles(high))) < 1.0:
         high *= 1.05
         if high > 1e9:
-            raise DesignError(
-                "no proportional gain makes the loop oscillate; expected numerical tuning instead"
-            )
+            raise DesignError("no proportional gain makes the loop oscillate; expected numerical tuning instead")
     low = high / 1.05
     for _ in range(60):
         middle = 0.5 * (low + high)

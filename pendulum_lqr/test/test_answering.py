@@ -138,9 +138,7 @@ def test_diagnostics_tell_rate_saturation_age_and_compute_time():
     answering = loop()
     answering.summary(SECOND)
     for k in range(10):
-        answering.answer(
-            sample(START + k * 10 * MS, angle=1.0 if k < 4 else 0.0), START + k * 10 * MS + 2 * MS
-        )
+        answering.answer(sample(START + k * 10 * MS, angle=1.0 if k < 4 else 0.0), START + k * 10 * MS + 2 * MS)
     told = answering.summary(SECOND + 100 * MS)
     assert told["answer_rate_hz"] == pytest.approx(100.0)
     assert told["saturation_share"] == pytest.approx(0.4)

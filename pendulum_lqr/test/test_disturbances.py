@@ -43,9 +43,7 @@ def test_a_random_sample_is_held_for_the_hold_time(seed, elapsed_ns, hold_time):
 
 
 def test_uniform_fills_its_interval_and_is_white():
-    values = torques(
-        make_disturbance({"seed": 2, "amplitude": 2.5, "hold_time": 0.002}), np.arange(20000) * 2 * MS
-    )
+    values = torques(make_disturbance({"seed": 2, "amplitude": 2.5, "hold_time": 0.002}), np.arange(20000) * 2 * MS)
     assert -2.5 <= values.min() < -2.49
     assert 2.49 < values.max() < 2.5
     assert values.std() == pytest.approx(2.5 / math.sqrt(3.0), rel=0.02)
@@ -54,9 +52,7 @@ def test_uniform_fills_its_interval_and_is_white():
 
 def test_gaussian_has_its_deviation_and_its_bandwidth():
     values = torques(
-        make_disturbance(
-            {"kind": "gaussian", "seed": 2, "amplitude": 0.7, "hold_time": 0.005, "bandwidth": 10.0}
-        ),
+        make_disturbance({"kind": "gaussian", "seed": 2, "amplitude": 0.7, "hold_time": 0.005, "bandwidth": 10.0}),
         np.arange(12000) * 5 * MS,
     )
     assert values.std() == pytest.approx(0.7, rel=0.05)
@@ -69,9 +65,7 @@ def test_gaussian_has_its_deviation_and_its_bandwidth():
 
 @pytest.mark.parametrize("share", [0.1, 0.25])
 def test_the_bandwidth_of_gaussian_noise_is_its_3_db_point_up_to_the_largest_that_is_taken(share):
-    values = torques(
-        make_disturbance({"kind": "gaussian", "bandwidth": 100.0 * share}), np.arange(10000) * 10 * MS
-    )
+    values = torques(make_disturbance({"kind": "gaussian", "bandwidth": 100.0 * share}), np.arange(10000) * 10 * MS)
     frequencies, power = scipy.signal.welch(values, fs=1.0, nperseg=512)
     level = power[(frequencies > 0.004) & (frequencies < 0.3 * share)].mean()
     at_cut = power[np.abs(frequencies - share) < 0.1 * share].mean()

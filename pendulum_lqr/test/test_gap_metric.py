@@ -110,15 +110,11 @@ def test_the_loop_distance_is_the_best_of_all_weights():
     assert 0.2 < safe.mean() < 0.8
     # A disc counts with its worst loop.
     radius = 0.2
-    worst = np.max(
-        [loop_distance(one, two + radius * np.exp(1j * a)) for a in np.linspace(0, 2 * np.pi, 400)], axis=0
-    )
+    worst = np.max([loop_distance(one, two + radius * np.exp(1j * a)) for a in np.linspace(0, 2 * np.pi, 400)], axis=0)
     assert np.all(loop_distance(one, two, radius) >= worst - 1e-3)
 
 
-def exact(
-    plant: PlantParameters, period: float = 0.01, lines: int = 60, error: float = 1e-3
-) -> MeasuredResponse:
+def exact(plant: PlantParameters, period: float = 0.01, lines: int = 60, error: float = 1e-3) -> MeasuredResponse:
     """Return a measurement of a plant whose errors are as good as none."""
     frequency = np.geomspace(0.25, 0.475 / period, lines)
     response = model_response(linearise(plant), frequency, period)
@@ -184,9 +180,7 @@ def test_a_design_is_certified_for_a_close_machine_and_not_for_one_that_it_does_
     K = np.array([20.0, 3.0])
     assert stabilises(linearise(base), K, 0.01)
     assert not stabilises(linearise(far), K, 0.01)
-    certificates = [
-        Certifier(linearise(base), Machine.of(exact(plant))).gain(K) for plant in (base, near, far)
-    ]
+    certificates = [Certifier(linearise(base), Machine.of(exact(plant))).gain(K) for plant in (base, near, far)]
     assert [c.certified for c in certificates] == [True, True, False]
     assert certificates[0].distance < certificates[1].distance < 1.0 < certificates[2].distance
     # A gain that does not even hold the pendulum on the model is certified for nothing.

@@ -97,9 +97,7 @@ def test_an_angle_that_is_not_finite_is_refused():
 def _without_dry_friction(plant):
     if plant.drivetrain is None:
         return plant.with_values(coulomb_friction=0.0, static_friction=0.0)
-    smooth = replace(
-        plant.drivetrain, motor_coulomb_friction=0.0, motor_static_friction=0.0, hysteresis_torque=0.0
-    )
+    smooth = replace(plant.drivetrain, motor_coulomb_friction=0.0, motor_static_friction=0.0, hysteresis_torque=0.0)
     return plant.with_values(drivetrain=smooth)
 
 
@@ -165,9 +163,7 @@ def test_a_series_elastic_actuator_holds_with_less_than_the_weight_because_it_an
 
 
 @settings(deadline=None, max_examples=30)
-@given(
-    st.floats(-0.5, 0.5), st.floats(-0.3, 0.3), st.floats(-0.8, 0.8), st.sampled_from(["thesis", "dfki", "x5_9"])
-)
+@given(st.floats(-0.5, 0.5), st.floats(-0.3, 0.3), st.floats(-0.8, 0.8), st.sampled_from(["thesis", "dfki", "x5_9"]))
 def test_the_simulated_plant_rests_at_its_fixed_points_whatever_its_offsets(angle, torque, effort, name):
     plant = _without_dry_friction(load_plant(name)).with_values(angle_offset=angle, torque_offset=torque)
     points = fixed_points(plant, effort)

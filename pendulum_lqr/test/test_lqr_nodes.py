@@ -39,12 +39,8 @@ class FakePlant(GraphPeer):
         self.events: list[dict] = []
         self.diagnostics: dict[str, dict] = {}
         subscribe = self.node.create_subscription
-        subscribe(
-            JointState, "effort_command", lambda m: self.commands.append(decode_joint_state(m)), 10, raw=True
-        )
-        subscribe(
-            JointState, "disturbance", lambda m: self.disturbances.append(decode_joint_state(m)), 10, raw=True
-        )
+        subscribe(JointState, "effort_command", lambda m: self.commands.append(decode_joint_state(m)), 10, raw=True)
+        subscribe(JointState, "disturbance", lambda m: self.disturbances.append(decode_joint_state(m)), 10, raw=True)
         subscribe(Float64MultiArray, "controller/commands", lambda m: self.arrays.extend(m.data), 10)
         subscribe(String, "events", lambda m: self.events.append(json.loads(m.data)), qos.EVENTS)
         subscribe(DiagnosticArray, "/diagnostics", self._on_diagnostics, 10)
@@ -114,9 +110,7 @@ def test_the_controller_answers_each_state_once_by_its_stamp_and_ends_with_zero(
         plant.spin(0.3)
     assert len(plant.commands) == count
     told = plant.until(
-        lambda: (
-            (d := plant.diagnostics.get("/sim/controller: controller", {})).get("refused.not_finite") and d
-        ),
+        lambda: (d := plant.diagnostics.get("/sim/controller: controller", {})).get("refused.not_finite") and d,
         "diagnostics of the refusals",
     )
     assert (told["refused.stale"], told["refused.not_finite"]) == ("1", "1")
@@ -196,9 +190,7 @@ def test_a_controller_that_waits_is_silent_until_it_is_activated(plant, processe
 
 
 def test_a_manager_can_hold_the_controller_and_deactivation_sends_zero(plant, processes):
-    program = processes.start(
-        "pendulum_lqr", "controller", *ros("autostart:=false", "controller:=pd_gravity", PATIENT)
-    )
+    program = processes.start("pendulum_lqr", "controller", *ros("autostart:=false", "controller:=pd_gravity", PATIENT))
     plant.connect()
     plant.run(5)
     assert not plant.commands

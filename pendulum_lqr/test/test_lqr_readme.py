@@ -43,10 +43,7 @@ def test_refusals_of_states_are_explained():
         "from_future": "from the future",
     }
     for refusal in StateRefusal:
-        assert (
-            words.get(refusal.value, refusal.value.replace("_", " ")) in README
-            or "no_answer" in refusal.value
-        )
+        assert words.get(refusal.value, refusal.value.replace("_", " ")) in README or "no_answer" in refusal.value
 
 
 def test_the_example_of_the_readme_runs():

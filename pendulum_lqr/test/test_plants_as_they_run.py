@@ -64,9 +64,7 @@ def test_a_delay_that_makes_plain_feedback_unstable_is_reckoned_with(name, simul
 
 @pytest.mark.parametrize("name", ["lqg", "mpc", "discrete_lqr"])
 def test_a_lag_is_a_state_and_not_forgotten(name, simulate):
-    lagging = DFKI.with_values(
-        actuator_time_constant=0.1, effort_limit=10.0, coulomb_friction=0.0, static_friction=0.0
-    )
+    lagging = DFKI.with_values(actuator_time_constant=0.1, effort_limit=10.0, coulomb_friction=0.0, static_friction=0.0)
     run = simulate(lagging, make_controller(name, lagging, 0.01), theta=UPRIGHT + 0.05, duration=5.0)
     assert np.max(np.abs(run.angle[-100:])) < 1e-3
     believed = make_controller(name, lagging.with_values(actuator_time_constant=0.0), 0.01)

@@ -107,8 +107,6 @@ def test_sampling_through_the_batch_engine_of_the_simulator_contains_the_proven_
     assert 0.0 < region.proven_area < region.area
     assert region.attracted[20, 20]
     assert not region.attracted[20, 0]
-    own = region_of_attraction(
-        smooth, gain, 1.5, rigid_rollout(smooth, gain, 1.5, 6.0), velocity_span=10.0, points=41
-    )
+    own = region_of_attraction(smooth, gain, 1.5, rigid_rollout(smooth, gain, 1.5, 6.0), velocity_span=10.0, points=41)
     # Two integrators, one region: only cells on its rim may differ.
     assert np.mean(own.attracted != region.attracted) < 0.01

@@ -76,9 +76,7 @@ def test_the_optimised_trajectory_obeys_the_equation_of_motion_and_its_limits():
     assert abs(angle) < 0.2
 
 
-@pytest.mark.parametrize(
-    ("name", "starts"), [("energy_swing_up", 5), ("time_optimal", 5), ("tvlqr", 5), ("nmpc", 1)]
-)
+@pytest.mark.parametrize(("name", "starts"), [("energy_swing_up", 5), ("time_optimal", 5), ("tvlqr", 5), ("nmpc", 1)])
 def test_swing_up_succeeds_from_any_start_and_with_a_wrong_model(name, starts, simulate):
     controller = make_controller(name, DFKI, 0.01)
     rng = np.random.default_rng(4)

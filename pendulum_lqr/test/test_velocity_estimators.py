@@ -110,7 +110,5 @@ def test_kalman_gives_the_velocity_of_every_plant_in_a_free_fall_under_torque(na
 
 
 def test_an_unknown_estimator_is_refused():
-    with pytest.raises(
-        ParameterError, match="velocity is 'magic'; expected one of measured, filtered_difference"
-    ):
+    with pytest.raises(ParameterError, match="velocity is 'magic'; expected one of measured, filtered_difference"):
         make_velocity_estimator("magic", THESIS, 0.01)

@@ -135,9 +135,7 @@ class ParameterSpec:
         return ParameterError(f"{prefix}{self.name} is {value!r}{unit}; {expectation}")
 
 
-def validate(
-    specs: Iterable[ParameterSpec], values: Mapping[str, object], *, where: str = ""
-) -> dict[str, Any]:
+def validate(specs: Iterable[ParameterSpec], values: Mapping[str, object], *, where: str = "") -> dict[str, Any]:
     """Return all parameters of a table, given values checked, others at their default.
 
     Raises:
@@ -146,8 +144,7 @@ def validate(
     table = {spec.name: spec for spec in specs}
     reject_unknown(values, table, where=where)
     return {
-        name: spec.check(values[name], where=where) if name in values else spec.default
-        for name, spec in table.items()
+        name: spec.check(values[name], where=where) if name in values else spec.default for name, spec in table.items()
     }
 
 
@@ -249,13 +246,9 @@ class _StrictLoader(yaml.SafeLoader):
             try:
                 repeated = key in seen
             except TypeError as error:
-                raise yaml.MarkedYAMLError(
-                    problem="a key must be text", problem_mark=key_node.start_mark
-                ) from error
+                raise yaml.MarkedYAMLError(problem="a key must be text", problem_mark=key_node.start_mark) from error
             if repeated:
-                raise yaml.MarkedYAMLError(
-                    problem=f"key {key!r} is given twice", problem_mark=key_node.start_mark
-                )
+                raise yaml.MarkedYAMLError(problem=f"key {key!r} is given twice", problem_mark=key_node.start_mark)
             seen.add(key)
         return super().construct_mapping(node, deep)
 
@@ -375,7 +368,6 @@ def markdown_table(specs: Iterable[ParameterSpec]) -> str:
             default = '""'
         fixed = " Read-only." if spec.read_only else ""
         rows.append(
-            f"| `{spec.name}` | `{default}` | {spec.unit or '–'} | {spec.domain or 'any'} "
-            f"| {spec.description}{fixed} |"
+            f"| `{spec.name}` | `{default}` | {spec.unit or '–'} | {spec.domain or 'any'} | {spec.description}{fixed} |"
         )
     return "\n".join(rows) + "\n"

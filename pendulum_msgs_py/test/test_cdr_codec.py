@@ -41,9 +41,7 @@ def _message(stamp_ns: int, frame: str, joint: str, *quantities: float | None) -
 def test_the_middleware_reads_what_we_write(
     stamp: int, frame: str, joint: str, position: float | None, velocity: float | None, effort: float | None
 ) -> None:
-    data = encode_joint_state(
-        stamp, frame_id=frame, joint=joint, position=position, velocity=velocity, effort=effort
-    )
+    data = encode_joint_state(stamp, frame_id=frame, joint=joint, position=position, velocity=velocity, effort=effort)
     message = serialization.deserialize_message(data, JointState)
     assert message == _message(stamp, frame, joint, position, velocity, effort)
     assert decode_joint_state(data) == (stamp, frame, joint, position, velocity, effort)

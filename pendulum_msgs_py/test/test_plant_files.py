@@ -47,9 +47,7 @@ _PLANTS = st.builds(
 
 
 @given(_PLANTS)
-def test_a_plant_is_read_back_to_the_last_bit(
-    tmp_path_factory: pytest.TempPathFactory, plant: PlantParameters
-) -> None:
+def test_a_plant_is_read_back_to_the_last_bit(tmp_path_factory: pytest.TempPathFactory, plant: PlantParameters) -> None:
     path = tmp_path_factory.getbasetemp() / "plant.yaml"
     assert write_plant(path, plant) == path
     assert load_plant(path) == plant
@@ -130,9 +128,7 @@ parameters:
         ("name: test", "drivetrain: {stiffness: {value: 0, unit: N m/rad}}", "expected > 0"),
     ],
 )
-def test_a_file_is_refused_with_file_entry_value_and_unit(
-    tmp_path: Path, old: str, new: str, message: str
-) -> None:
+def test_a_file_is_refused_with_file_entry_value_and_unit(tmp_path: Path, old: str, new: str, message: str) -> None:
     path = tmp_path / "plant.yaml"
     path.write_text(_GOOD, encoding="utf-8")
     assert load_plant(path).inertia == 0.055

@@ -54,9 +54,7 @@ def test_help_lists_the_programs(package: Callable[..., None], capsys: pytest.Ca
     assert "  design\n  node\n" in capsys.readouterr().out
 
 
-def test_an_unknown_program_names_the_nearest(
-    package: Callable[..., None], capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_an_unknown_program_names_the_nearest(package: Callable[..., None], capsys: pytest.CaptureFixture[str]) -> None:
     package(lambda _: 0)
     assert run_package("arm", ["nod"]) == EXIT_USAGE
     error = capsys.readouterr().err

@@ -40,9 +40,7 @@ def test_a_change_that_somebody_else_refuses_is_not_applied(peer: GraphPeer) -> 
     settings = NodeParameters(node, _SPECS, _prepare, applied.append)
     # ROS asks the callbacks in the reverse order of their registration: this one is asked after ours.
     ours = node._on_set_parameters_callbacks.pop(0)
-    node.add_on_set_parameters_callback(
-        lambda _: SetParametersResult(successful=not someone_refuses, reason="not now")
-    )
+    node.add_on_set_parameters_callback(lambda _: SetParametersResult(successful=not someone_refuses, reason="not now"))
     node._on_set_parameters_callbacks.insert(0, ours)
 
     def change(**values: object) -> bool:

@@ -30,9 +30,7 @@ class Plant:
         for _ in range(round(100 * seconds)):
             self.now += 10 * _MS
             if command is not None:
-                self.supervisor.offer(
-                    Input.EFFORT_COMMAND, JointCommand(self.now, command, source), self.now
-                )
+                self.supervisor.offer(Input.EFFORT_COMMAND, JointCommand(self.now, command, source), self.now)
             drives.append(self.supervisor.decide(self.now, self.sample()))
             self.supervisor.report_applied(drives[-1].effort)
         return drives

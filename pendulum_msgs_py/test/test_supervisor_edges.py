@@ -30,9 +30,7 @@ class Plant:
 
     def decide(self) -> Drive:
         drive = self.supervisor.decide(self.now, self.sample())
-        self.supervisor.report_applied(
-            drive.effort + (self.servo if drive.kind is DriveKind.POSITION else 0.0)
-        )
+        self.supervisor.report_applied(drive.effort + (self.servo if drive.kind is DriveKind.POSITION else 0.0))
         return drive
 
     def offer(self, effort: float, kind: Input = Input.EFFORT_COMMAND) -> None:

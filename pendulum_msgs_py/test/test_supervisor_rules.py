@@ -120,9 +120,7 @@ class PlantRules(RuleBasedStateMachine):
     @rule(effort=_USUAL, duration=st.sampled_from([0.01, 0.05, 0.2]))
     def move_and_come_back(self, effort: float, duration: float) -> None:
         self._measure(0.1, 0.0)
-        self.supervisor.accept_trajectory(
-            from_points([0.0, duration], [0.1, 0.1], [0.0, 0.0]), self.now, self.sample
-        )
+        self.supervisor.accept_trajectory(from_points([0.0, duration], [0.1, 0.1], [0.0, 0.0]), self.now, self.sample)
         self.run_with_a_controller(effort, 0.0, 8)
 
     @rule(position=_ANY, velocity=_ANY, effort=_ANY)
@@ -282,9 +280,7 @@ class Loop:
         for _ in range(round(seconds * 1000)):
             self.now += _MS
             if command is not None:
-                self.supervisor.offer(
-                    Input.EFFORT_COMMAND, JointCommand(self.now, command, source), self.now
-                )
+                self.supervisor.offer(Input.EFFORT_COMMAND, JointCommand(self.now, command, source), self.now)
             drive = self.supervisor.decide(self.now, self.sample())
             effort = drive.effort + self.servo if drive.kind is DriveKind.POSITION else drive.effort
             self.supervisor.report_applied(effort)

@@ -245,9 +245,7 @@ def _check_variations(varied: Mapping[str, Array], plants: Sequence[PlantParamet
 def _column(name: str, values: ArrayLike) -> Array:
     column = np.atleast_1d(np.asarray(values, dtype=np.float64))
     if column.ndim != 1 or not np.all(np.isfinite(column)):
-        raise ParameterError(
-            f"{name} has shape {column.shape}; expected finite numbers, one or one per pendulum"
-        )
+        raise ParameterError(f"{name} has shape {column.shape}; expected finite numbers, one or one per pendulum")
     return column
 
 

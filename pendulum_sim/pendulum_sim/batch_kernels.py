@@ -193,9 +193,7 @@ def general_kernel(method: str) -> Any:
                 c = c_0 if part == 0 else c_1
                 for _ in range(counts[part]):
                     if dry:
-                        x, v = advance(
-                            step, coefficients_of, acceleration, x, v, torque, command, 0.0, h, c, plant
-                        )
+                        x, v = advance(step, coefficients_of, acceleration, x, v, torque, command, 0.0, h, c, plant)
                         torque = lagged(torque, command, h, lag)
                     else:
                         torque_0 = torque if lag > 0.0 else command

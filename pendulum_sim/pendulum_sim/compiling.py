@@ -44,9 +44,7 @@ def compile_tree(function: Callable[..., Any], *, vector: bool = False) -> Any:
                 scope[name] = compile_tree(value, vector=vector)
             elif vector and isinstance(value, ModuleType) and value is math:
                 scope[name] = _vector_module
-        copy = FunctionType(
-            function.__code__, scope, function.__name__, function.__defaults__, function.__closure__
-        )
+        copy = FunctionType(function.__code__, scope, function.__name__, function.__defaults__, function.__closure__)
         # Contraction (a fused multiply-add) changes the last bit at most; nothing else of fastmath is allowed.
         _cache[key] = numba.njit(copy, fastmath={"contract"}, error_model="numpy", forceinline=vector)
     return _cache[key]

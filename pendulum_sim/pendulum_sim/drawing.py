@@ -66,9 +66,7 @@ class PendulumPicture:
         import pygame
 
         if len(size) != 2 or not all(_MIN_SIZE <= int(side) <= _MAX_SIZE for side in size):
-            raise ParameterError(
-                f"screen size is {size} px; expected two numbers from {_MIN_SIZE} to {_MAX_SIZE}"
-            )
+            raise ParameterError(f"screen size is {size} px; expected two numbers from {_MIN_SIZE} to {_MAX_SIZE}")
         self.size = (int(size[0]), int(size[1]))
         self._pygame = pygame
         pygame.font.init()
@@ -152,9 +150,7 @@ class PendulumPicture:
         half = 0.028 * length
         outline = np.array([[-half, 0.0], [half, 0.0], [half, -length], [-half, -length]])
         draw.polygon(self._canvas, _LINK, self._to_screen(outline, theta, origin))
-        draw.circle(
-            self._canvas, _BOB, self._to_screen(np.array([[0.0, -length]]), theta, origin)[0], 0.1 * length
-        )
+        draw.circle(self._canvas, _BOB, self._to_screen(np.array([[0.0, -length]]), theta, origin)[0], 0.1 * length)
         draw.circle(self._canvas, _INK, origin, 0.055 * length)
         draw.circle(self._canvas, _BACKGROUND, origin, 0.022 * length)
 

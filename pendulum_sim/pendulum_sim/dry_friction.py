@@ -64,9 +64,7 @@ def acceleration_with_friction(
     friction = 0.0
     if direction != 0.0:
         carried = load * abs(gravity_torque(angle, gravity))
-        friction = direction * friction_magnitude(
-            theta_dot, coulomb + carried, static + carried, stribeck_velocity
-        )
+        friction = direction * friction_magnitude(theta_dot, coulomb + carried, static + carried, stribeck_velocity)
     return rigid_acceleration(angle, theta_dot, torque + offset - friction, inertia, damping, gravity)
 
 

@@ -126,9 +126,7 @@ class PendulumEnv(gymnasium.Env[Array, Array]):
             self._w = lane_table(parameters, method, self._h, 1, self._amplitude, q, r).reshape(-1)
             self._kernel = step_kernel(method, 1)
         else:
-            self._plant = make_plant(
-                parameters, dt, method=method, substeps=substeps if substeps > 1 else None
-            )
+            self._plant = make_plant(parameters, dt, method=method, substeps=substeps if substeps > 1 else None)
 
     @property
     def theta(self) -> float:
@@ -140,9 +138,7 @@ class PendulumEnv(gymnasium.Env[Array, Array]):
         """Velocity [rad/s]."""
         return float(self._w[1] if self._plant is None else self._plant.state.theta_dot)
 
-    def reset(
-        self, *, seed: int | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[Array, dict[str, Any]]:
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Array, dict[str, Any]]:
         """Start an episode.
 
         Args:

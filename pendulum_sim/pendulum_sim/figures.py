@@ -72,17 +72,10 @@ def plot_overdamped_phase(parameters: PlantParameters, torque: float = 0.0) -> F
     for marker, chosen in ((">", moving & (flow > 0.0)), ("<", moving & (flow < 0.0))):
         axes.plot(arrows[chosen], np.zeros(chosen.sum()), marker, color="0.35", markersize=6)
     for kind, colour, fill in ((True, _STABLE, _STABLE), (False, _UNSTABLE, "white")):
-        angles = [
-            point.theta + turn
-            for point in points
-            if point.stable is kind
-            for turn in (-math.tau, 0.0, math.tau)
-        ]
+        angles = [point.theta + turn for point in points if point.stable is kind for turn in (-math.tau, 0.0, math.tau)]
         inside = [angle for angle in angles if abs(angle) <= 2.0 * math.pi + 1e-9]
         label = "stable fixed point" if kind else "unstable fixed point"
-        axes.plot(
-            inside, np.zeros(len(inside)), "o", markersize=10, color=colour, markerfacecolor=fill, label=label
-        )
+        axes.plot(inside, np.zeros(len(inside)), "o", markersize=10, color=colour, markerfacecolor=fill, label=label)
     axes.set_xticks([k * math.pi for k in range(-2, 3)], [r"$-2\pi$", r"$-\pi$", "0", r"$\pi$", r"$2\pi$"])
     axes.set_xlim(-2.05 * math.pi, 2.05 * math.pi)
     axes.set_xlabel(r"$\theta$ [rad]")

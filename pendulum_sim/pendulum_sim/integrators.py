@@ -274,9 +274,7 @@ INTEGRATORS: Mapping[str, Integrator] = {
     integrator.name: integrator
     for integrator in (
         Integrator("euler", 1, euler_step, no_coefficients, "Explicit Euler, as the thesis integrates."),
-        Integrator(
-            "semi_implicit", 1, semi_implicit_step, no_coefficients, "Semi-implicit Euler, implicit damping."
-        ),
+        Integrator("semi_implicit", 1, semi_implicit_step, no_coefficients, "Semi-implicit Euler, implicit damping."),
         Integrator("rk4", 4, rk4_step, no_coefficients, "Classical Runge-Kutta of order four."),
         Integrator("etd2", 2, etd2_step, etd2_coefficients, "Exponential midpoint rule, exact linear part."),
         Integrator("etd4", 4, etd4_step, etd4_coefficients, "Exponential Runge-Kutta of order four."),

@@ -21,9 +21,7 @@ app = typer.Typer(add_completion=False, rich_markup_mode=None)
 def phase_plot(
     plant: Annotated[str, typer.Option(help="Preset or path of a plant file.")] = "thesis",
     torque: Annotated[float, typer.Option(help="Constant torque u_0 [N m].")] = 0.0,
-    output: Annotated[Path, typer.Option(help="Figure to write (.png, .svg, .pdf).")] = Path(
-        "phase_plot.png"
-    ),
+    output: Annotated[Path, typer.Option(help="Figure to write (.png, .svg, .pdf).")] = Path("phase_plot.png"),
     as_json: Annotated[bool, typer.Option("--json", help="Print the fixed points as JSON.")] = False,
 ) -> None:
     """Draw x' over x of b x' + G sin(x) = u_0 and list its fixed points, for a plant that is overdamped.

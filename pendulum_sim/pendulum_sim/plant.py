@@ -125,13 +125,9 @@ class RigidPlant:
         ParameterError: An argument is outside its domain, or the method is unstable on this plant at that step.
     """
 
-    def __init__(
-        self, parameters: PlantParameters, dt: float, *, method: str = "etd4", substeps: int = 1
-    ) -> None:
+    def __init__(self, parameters: PlantParameters, dt: float, *, method: str = "etd4", substeps: int = 1) -> None:
         if parameters.drivetrain is not None:
-            raise ParameterError(
-                f"plant {parameters.name!r} is series elastic; expected a rigid one: use make_plant"
-            )
+            raise ParameterError(f"plant {parameters.name!r} is series elastic; expected a rigid one: use make_plant")
         check_step(dt, substeps)
         integrator = get_integrator(method)
         self.parameters = parameters

@@ -10,9 +10,7 @@ from pendulum_sim.series_elastic import SeriesElasticPlant
 __all__ = ["make_plant"]
 
 
-def make_plant(
-    parameters: PlantParameters, dt: float, *, method: str = "auto", substeps: int | None = None
-) -> Plant:
+def make_plant(parameters: PlantParameters, dt: float, *, method: str = "auto", substeps: int | None = None) -> Plant:
     """Return the plant that the parameters describe.
 
     Args:
@@ -34,7 +32,6 @@ def make_plant(
         )
     if method not in {"auto", "semi_implicit"}:
         raise ParameterError(
-            f"method is {method!r}; expected semi_implicit or auto, since plant {parameters.name!r} "
-            "is series elastic"
+            f"method is {method!r}; expected semi_implicit or auto, since plant {parameters.name!r} is series elastic"
         )
     return SeriesElasticPlant(parameters, dt, substeps=substeps)

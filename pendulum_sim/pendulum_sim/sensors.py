@@ -22,22 +22,15 @@ _QUANTITIES = (("position", "rad"), ("velocity", "rad/s"), ("effort", "N m"))
 
 SENSOR_SPECS: tuple[ParameterSpec, ...] = (
     *(
-        ParameterSpec(
-            f"{name}_step", 0.0, unit, f"Step to which the {name} is rounded; 0 for none.", minimum=0.0
-        )
+        ParameterSpec(f"{name}_step", 0.0, unit, f"Step to which the {name} is rounded; 0 for none.", minimum=0.0)
         for name, unit in _QUANTITIES
     ),
     *(
         ParameterSpec(f"{name}_noise", 0.0, unit, f"Standard deviation of noise on the {name}.", minimum=0.0)
         for name, unit in _QUANTITIES
     ),
-    *(
-        ParameterSpec(f"{name}_bias", 0.0, unit, f"Constant error of the {name}.")
-        for name, unit in _QUANTITIES
-    ),
-    ParameterSpec(
-        "jitter", 0.0, "s", "Standard deviation of the sampling instant about its stamp.", minimum=0.0
-    ),
+    *(ParameterSpec(f"{name}_bias", 0.0, unit, f"Constant error of the {name}.") for name, unit in _QUANTITIES),
+    ParameterSpec("jitter", 0.0, "s", "Standard deviation of the sampling instant about its stamp.", minimum=0.0),
     ParameterSpec("drop_rate", 0.0, "-", "Share of samples that never arrive.", minimum=0.0, maximum=1.0),
 )
 """Parameters of the sensors; a node declares them with the prefix ``sensor.``."""

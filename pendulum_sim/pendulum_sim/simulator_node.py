@@ -37,9 +37,7 @@ __all__ = ["SPECS", "SimulatorNode", "main"]
 _SENSOR_PREFIX = "sensor."
 
 SPECS: tuple[ParameterSpec, ...] = (
-    ParameterSpec(
-        "plant", "thesis", "", "Preset (thesis, x5_9, dfki) or path of a plant file.", read_only=True
-    ),
+    ParameterSpec("plant", "thesis", "", "Preset (thesis, x5_9, dfki) or path of a plant file.", read_only=True),
     ParameterSpec(
         "method",
         "auto",
@@ -48,9 +46,7 @@ SPECS: tuple[ParameterSpec, ...] = (
         choices=("auto", *METHODS),
         read_only=True,
     ),
-    ParameterSpec(
-        "rate_hz", 500.0, "Hz", "Rate of states and commands.", minimum=50.0, maximum=2000.0, read_only=True
-    ),
+    ParameterSpec("rate_hz", 500.0, "Hz", "Rate of states and commands.", minimum=50.0, maximum=2000.0, read_only=True),
     ParameterSpec(
         "substeps",
         0,
@@ -69,12 +65,8 @@ SPECS: tuple[ParameterSpec, ...] = (
     ParameterSpec("initial_theta", 0.0, "rad", "Angle at a given start; 0 hangs down, pi is upright."),
     ParameterSpec("initial_theta_dot", 0.0, "rad/s", "Velocity at a given start."),
     ParameterSpec("seed", 0, "-", "Seed of random starts and of the sensors.", minimum=0, read_only=True),
-    ParameterSpec(
-        "armed_at_start", True, "", "Arm without being asked; nothing real moves here.", read_only=True
-    ),
-    ParameterSpec(
-        "paused", False, "", "Start paused, until ~/pause or ~/step says otherwise.", read_only=True
-    ),
+    ParameterSpec("armed_at_start", True, "", "Arm without being asked; nothing real moves here.", read_only=True),
+    ParameterSpec("paused", False, "", "Start paused, until ~/pause or ~/step says otherwise.", read_only=True),
     *LOOP_SPECS,
     *LIMIT_SPECS,
     *(replace(spec, name=_SENSOR_PREFIX + spec.name, read_only=True) for spec in SENSOR_SPECS),
@@ -96,9 +88,7 @@ class SimulatorNode(PollingNode):
         period_ns = round(NANOSECONDS / values["rate_hz"])
         self._dt = period_ns / NANOSECONDS
         self._told_plant = describe_plants([parameters])
-        self._plant = make_plant(
-            parameters, self._dt, method=values["method"], substeps=values["substeps"] or None
-        )
+        self._plant = make_plant(parameters, self._dt, method=values["method"], substeps=values["substeps"] or None)
         self._servo = PositionServo(parameters, self._dt)
         starts, sensor_noise = np.random.default_rng(values["seed"]).spawn(2)
         self._starts = starts
@@ -163,9 +153,7 @@ class SimulatorNode(PollingNode):
         effort = drive.effort
         if drive.kind is DriveKind.POSITION:
             # The servo knows the weight it carries, so the hand-over's feed-forward would count it twice.
-            wanted = self._servo.effort(
-                self._state.theta, self._state.theta_dot, drive.position, drive.velocity
-            )
+            wanted = self._servo.effort(self._state.theta, self._state.theta_dot, drive.position, drive.velocity)
             limit = self._supervisor.limits.effort
             effort = min(limit, max(-limit, wanted))
         self._state = self._plant.step(effort, drive.push)

@@ -82,9 +82,7 @@ class PendulumVectorEnv(VectorEnv[Array, Array, NDArray[Any]]):
                 f"num_envs is {num_envs} and max_episode_steps {max_episode_steps}; expected both >= 1"
             )
         if render_mode is not None:
-            raise ParameterError(
-                f"render_mode is {render_mode!r}; expected None: draw one PendulumEnv instead"
-            )
+            raise ParameterError(f"render_mode is {render_mode!r}; expected None: draw one PendulumEnv instead")
         if not is_smooth(parameters):
             raise ParameterError(
                 f"plant {parameters.name!r} has dry friction, lag, delay or a drivetrain; expected none of them here: "
@@ -187,9 +185,7 @@ class PendulumVectorEnv(VectorEnv[Array, Array, NDArray[Any]]):
         result = observations.reshape(-1, 2)[:n]
         reward = rewards.reshape(-1)[:n]
         if not np.isfinite(reward).all():
-            raise ParameterError(
-                f"action {int(np.argmin(np.isfinite(reward)))} is not a finite number of N m"
-            )
+            raise ParameterError(f"action {int(np.argmin(np.isfinite(reward)))} is not a finite number of N m")
         if restart.size:
             # By gymnasium's rule for NEXT_STEP this step starts their next episodes; its action counts for nothing.
             self._restart(restart, self._start)

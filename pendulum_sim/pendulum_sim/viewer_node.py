@@ -28,9 +28,7 @@ from pendulum_sim.shown_torques import SHOWN_TOPICS, ShownTorques
 __all__ = ["SPECS", "ViewerNode", "main"]
 
 SPECS: tuple[ParameterSpec, ...] = (
-    ParameterSpec(
-        "window", True, "", "Open a window; without one, PNG and GIF are still written.", read_only=True
-    ),
+    ParameterSpec("window", True, "", "Open a window; without one, PNG and GIF are still written.", read_only=True),
     ParameterSpec("width", 600, "px", "Width of the picture.", minimum=120, maximum=4096, read_only=True),
     ParameterSpec("height", 600, "px", "Height of the picture.", minimum=120, maximum=4096, read_only=True),
     ParameterSpec("fps", 30.0, "Hz", "Pictures per second.", minimum=1.0, maximum=120.0, read_only=True),
@@ -43,12 +41,8 @@ SPECS: tuple[ParameterSpec, ...] = (
         exclusive_minimum=True,
         read_only=True,
     ),
-    ParameterSpec(
-        "trail", 60, "-", "Positions that the trail shows.", minimum=1, maximum=1000, read_only=True
-    ),
-    ParameterSpec(
-        "png", "", "", "File for a picture at the end and on ~/snapshot; empty for none.", read_only=True
-    ),
+    ParameterSpec("trail", 60, "-", "Positions that the trail shows.", minimum=1, maximum=1000, read_only=True),
+    ParameterSpec("png", "", "", "File for a picture at the end and on ~/snapshot; empty for none.", read_only=True),
     ParameterSpec(
         "gif",
         "",
@@ -65,9 +59,7 @@ SPECS: tuple[ParameterSpec, ...] = (
         maximum=50.0,
         read_only=True,
     ),
-    ParameterSpec(
-        "gif_duration", 8.0, "s", "Length of the animation.", minimum=0.1, maximum=60.0, read_only=True
-    ),
+    ParameterSpec("gif_duration", 8.0, "s", "Length of the animation.", minimum=0.1, maximum=60.0, read_only=True),
     ParameterSpec("duration", 0.0, "s", "Time after which to end; 0 for never.", minimum=0.0, read_only=True),
 )
 
@@ -172,13 +164,9 @@ class ViewerNode(Node):
         applied = self._torques.acting(names.APPLIED_EFFORT, sample.stamp_ns)
         disturbance = sum(self._torques.acting(topic, sample.stamp_ns) for topic in (names.DISTURBANCE, names.PUSH))
         if self._window is not None:
-            self._window.show(
-                sample.position, sample.velocity, applied, disturbance=disturbance, time=time, note=note
-            )
+            self._window.show(sample.position, sample.velocity, applied, disturbance=disturbance, time=time, note=note)
         else:
-            self._picture.draw(
-                sample.position, sample.velocity, applied, disturbance=disturbance, time=time, note=note
-            )
+            self._picture.draw(sample.position, sample.velocity, applied, disturbance=disturbance, time=time, note=note)
 
 
 def main(argv: Sequence[str] | None = None) -> int:

@@ -138,9 +138,7 @@ def test_results_do_not_depend_on_the_size_of_the_batch_or_the_threads() -> None
 def test_memory_does_not_grow_with_the_number_of_steps() -> None:
     def peak(steps: int) -> int:
         tracemalloc.start()
-        simulate_batch(
-            load_plant("thesis"), steps=steps, gain=THESIS_GAIN, seeds=np.arange(512), amplitude=2.5
-        )
+        simulate_batch(load_plant("thesis"), steps=steps, gain=THESIS_GAIN, seeds=np.arange(512), amplitude=2.5)
         _, highest = tracemalloc.get_traced_memory()
         tracemalloc.stop()
         return highest
@@ -153,9 +151,7 @@ def test_memory_does_not_grow_with_the_number_of_steps() -> None:
 def test_the_polynomial_sine_is_within_4e_16_of_the_true_one() -> None:
     from decimal import Decimal, getcontext
 
-    dense = np.concatenate(
-        [np.linspace(-7.0, 7.0, 400_001), np.random.default_rng(1).uniform(-1e4, 1e4, 200_000)]
-    )
+    dense = np.concatenate([np.linspace(-7.0, 7.0, 400_001), np.random.default_rng(1).uniform(-1e4, 1e4, 200_000)])
     # The library's own error of half a unit in the last place is part of the difference.
     assert np.abs(vector_math.sin(dense) - np.sin(dense)).max() < 4e-16
     getcontext().prec = 60

@@ -73,9 +73,7 @@ def test_observations_are_those_of_the_plant_in_the_controllers_convention() -> 
         disturbance = 2.5 * noise.unit_interval(noise.scramble(key, k // 5))
         action = np.array([u])
         x, reward, terminated, truncated, _ = env.step(action)
-        expected_reward = -(
-            100.0 * (state.theta - math.pi) ** 2 + 0.01 * state.theta_dot**2 + 0.1 * action[0] ** 2
-        )
+        expected_reward = -(100.0 * (state.theta - math.pi) ** 2 + 0.01 * state.theta_dot**2 + 0.1 * action[0] ** 2)
         assert reward == pytest.approx(expected_reward, abs=1e-12)
         state = twin.step(u + disturbance)
         assert x == pytest.approx([state.theta - math.pi, state.theta_dot], abs=1e-12)

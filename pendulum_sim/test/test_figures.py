@@ -74,9 +74,7 @@ def test_the_phase_plot_of_the_series_elastic_plant_has_the_rate_of_all_its_damp
     assert upright["rate"] == pytest.approx(1.678 / 13.196, abs=1e-4)
 
 
-def test_phase_plot_writes_a_figure_and_prints_the_points(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_phase_plot_writes_a_figure_and_prints_the_points(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     figure = tmp_path / "phase.svg"
     assert main(["--torque", "0.5", "--output", str(figure), "--json"]) == 0
     printed = json.loads(capsys.readouterr().out)
@@ -117,7 +115,5 @@ def test_pictures_become_png_and_gif_that_can_be_read_again(tmp_path: Path) -> N
 
 
 def test_a_screen_size_that_makes_no_picture_is_refused() -> None:
-    with pytest.raises(
-        ParameterError, match=r"screen size is \(10, 99999\) px; expected two numbers from 120 to 4096"
-    ):
+    with pytest.raises(ParameterError, match=r"screen size is \(10, 99999\) px; expected two numbers from 120 to 4096"):
         PendulumPicture((10, 99999), 13.0)

@@ -13,12 +13,8 @@ from pendulum_sim import simulator_node, viewer_node
 README = Path(__file__).parents[1] / "README.md"
 
 
-@pytest.mark.parametrize(
-    ("node", "specs"), [("simulator", simulator_node.SPECS), ("viewer", viewer_node.SPECS)]
-)
+@pytest.mark.parametrize(("node", "specs"), [("simulator", simulator_node.SPECS), ("viewer", viewer_node.SPECS)])
 def test_the_readme_has_the_parameters_of_the_node(node: str, specs: tuple) -> None:
-    match = re.search(
-        rf"<!-- parameters: {node} -->\n(.*?)<!-- end -->", README.read_text(encoding="utf-8"), re.DOTALL
-    )
+    match = re.search(rf"<!-- parameters: {node} -->\n(.*?)<!-- end -->", README.read_text(encoding="utf-8"), re.DOTALL)
     assert match is not None
     assert match[1] == markdown_table(specs), f"replace the table by:\n{markdown_table(specs)}"

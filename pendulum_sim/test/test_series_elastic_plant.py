@@ -19,9 +19,7 @@ def test_back_emf_alone_makes_the_damping_of_the_thesis() -> None:
     drive = load_plant("x5_9").drivetrain
     assert drive is not None
     resistance = winding_resistance_at(22.0, drive.winding_resistance, 0.004)
-    damping = shorted_winding_damping(
-        drive.torque_constant, drive.back_emf_constant, drive.gear_ratio, resistance
-    )
+    damping = shorted_winding_damping(drive.torque_constant, drive.back_emf_constant, drive.gear_ratio, resistance)
     assert damping == pytest.approx(11.77, abs=0.01)
 
 
@@ -79,9 +77,7 @@ def test_without_losses_it_moves_like_the_rigid_plant_with_the_same_damping() ->
         drive.torque_constant, drive.back_emf_constant, drive.gear_ratio, drive.winding_resistance
     )
     rigid = RigidPlant(
-        parameters.with_values(
-            drivetrain=None, damping=damping, inertia=parameters.inertia + drive.reflected_inertia
-        ),
+        parameters.with_values(drivetrain=None, damping=damping, inertia=parameters.inertia + drive.reflected_inertia),
         2e-3,
     )
     elastic.reset(1.5)
@@ -93,9 +89,7 @@ def test_without_losses_it_moves_like_the_rigid_plant_with_the_same_damping() ->
 
 
 @pytest.mark.parametrize(("name", "bound"), [("thesis", 2e-3), ("x5_9", 8e-3)])
-def test_the_servo_follows_a_ramp_to_upright_and_back_and_reports_a_bounded_effort(
-    name: str, bound: float
-) -> None:
+def test_the_servo_follows_a_ramp_to_upright_and_back_and_reports_a_bounded_effort(name: str, bound: float) -> None:
     parameters = load_plant(name)
     plant = make_plant(parameters, 2e-3)
     servo = PositionServo(parameters, 2e-3)

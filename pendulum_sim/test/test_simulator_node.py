@@ -124,10 +124,7 @@ def test_two_lockstep_runs_with_one_seed_give_the_same_messages(peer: Peer, proc
         )  # fmt: skip
         peer.until(lambda: "1.4" in f"{_newest(peer):.3f}", "the end of the run")
         runs.append(
-            [
-                (stamp_from_message(s.header.stamp), s.position[0], s.velocity[0], s.effort[0])
-                for s in peer.states
-            ]
+            [(stamp_from_message(s.header.stamp), s.position[0], s.velocity[0], s.effort[0]) for s in peer.states]
         )
         program.send_signal(signal.SIGINT)
         assert program.wait(10.0) == 0
@@ -148,9 +145,7 @@ def test_bad_parameters_end_with_one_sentence(processes, domain_id: int, tmp_pat
         assert "Traceback" not in program.output
 
 
-def test_the_viewer_writes_picture_and_animation_without_a_screen(
-    processes, domain_id: int, tmp_path: Path
-) -> None:
+def test_the_viewer_writes_picture_and_animation_without_a_screen(processes, domain_id: int, tmp_path: Path) -> None:
     from PIL import Image
 
     _start(processes, "rate_hz:=100.0", "initial_theta:=2.0")

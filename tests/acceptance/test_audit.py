@@ -95,9 +95,7 @@ def test_an_export_is_asked_without_a_network(tmp_path: Path, capsys: pytest.Cap
     export = database(tmp_path, advisory("jinja2", {"introduced": "0"}, {"fixed": "2.10.1"}))
     assert main([str(lock), "--advisories", str(export), "--json"]) == 1
     told = json.loads(capsys.readouterr().out)
-    assert told["findings"] == [
-        {"package": "jinja2", "version": "2.10", "advisory": "PYSEC-1", "fixed_in": "2.10.1"}
-    ]
+    assert told["findings"] == [{"package": "jinja2", "version": "2.10", "advisory": "PYSEC-1", "fixed_in": "2.10.1"}]
     lock.write_text("jinja2==3.1\n", encoding="utf-8")
     assert main([str(lock), "--advisories", str(export)]) == 0
     export.write_bytes(b"no zip")

@@ -126,9 +126,7 @@ def test_two_clients_see_stop_tune_and_meet_a_new_simulator(
     for _ in range(5):
         desk.keyboard.press("Space")
         wait_for(lambda: _mode(desk) == "e_stop", 5, "the e-stop")
-        delays.append(
-            float(desk.evaluate("pendulumConsole.plants['/sim'].mode_ms - pendulumConsole.stopPressed"))
-        )
+        delays.append(float(desk.evaluate("pendulumConsole.plants['/sim'].mode_ms - pendulumConsole.stopPressed")))
         wait_for(lambda: _mode(phone) == "e_stop", 5, "the other client to see it")
         desk.get_by_role("button", name="Reset e-stop /sim").click()
         wait_for(lambda: _mode(desk) == "disarmed", 10, "the reset")
@@ -140,9 +138,7 @@ def test_two_clients_see_stop_tune_and_meet_a_new_simulator(
     # The node goes and comes back; the page goes on with the new one.
     simulator.interrupt()
     assert simulator.wait(20) == 0
-    wait_for(
-        lambda: desk.evaluate("Object.keys(pendulumConsole.plants).length") == 0, 30, "the plant to be gone"
-    )
+    wait_for(lambda: desk.evaluate("Object.keys(pendulumConsole.plants).length") == 0, 30, "the plant to be gone")
     processes.start("pendulum_sim", "simulator", "--ros-args", "-r", "__ns:=/sim", "-p", "start:=top")
     wait_for(lambda: _mode(desk) == "armed_effort", 60, "the new plant")
     before = desk.evaluate("pendulumConsole.plants['/sim'].stamp_ns")
@@ -188,9 +184,7 @@ def test_no_stop_is_lost_whatever_is_frozen_killed_or_cut_off(domain_id: int, tm
 
 @pytest.mark.timeout(120)
 def test_a_foreign_page_cannot_press_the_button(address: str) -> None:
-    request = urllib.request.Request(
-        address + "e_stop", method="POST", headers={"Origin": "http://evil.example"}
-    )
+    request = urllib.request.Request(address + "e_stop", method="POST", headers={"Origin": "http://evil.example"})
     with pytest.raises(urllib.error.HTTPError) as caught:
         urllib.request.urlopen(request, timeout=10)
     assert caught.value.code == 403

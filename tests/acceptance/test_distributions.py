@@ -89,9 +89,7 @@ def test_the_licence_is_in_every_wheel_and_every_source_archive_and_no_dead_addr
     for archive in (wheels.parent / "archives").glob("*.tar.gz"):
         with tarfile.open(archive) as content:
             texts = [
-                m
-                for m in content.getmembers()
-                if m.isfile() and m.name.count("/") == 1 and m.name.endswith("/LICENSE")
+                m for m in content.getmembers() if m.isfile() and m.name.count("/") == 1 and m.name.endswith("/LICENSE")
             ]
             files = [content.extractfile(member) for member in texts]
             assert [file.read() for file in files if file is not None] == [licence], archive.name
@@ -111,9 +109,7 @@ def test_what_the_wheels_install_runs_an_experiment(wheels: Path, domain_id: int
     pip = [sys.executable, "-m", "pip", "--disable-pip-version-check", "install", "--no-deps", "--no-index"]
     _run(*pip, "--target", place, *sorted(wheels.glob("*.whl")), cwd=tmp_path)
     env = {"PYTHONPATH": str(place)}
-    where = _run(
-        sys.executable, "-c", "import pendulum_bags; print(pendulum_bags.__file__)", cwd=tmp_path, env=env
-    )
+    where = _run(sys.executable, "-c", "import pendulum_bags; print(pendulum_bags.__file__)", cwd=tmp_path, env=env)
     assert Path(where.strip()).is_relative_to(place)
 
     command: list[str | Path] = ["experiment", "lockstep", "--bag", tmp_path / "bag", "--duration", "0.5"]
@@ -124,8 +120,6 @@ def test_what_the_wheels_install_runs_an_experiment(wheels: Path, domain_id: int
 @pytest.mark.parametrize("module", ["pendulum_lqr", "pendulum_bags"])
 def test_colours_respect_no_color(module: str, tmp_path: Path) -> None:
     command = {"pendulum_lqr": ["design"], "pendulum_bags": ["compare", "--help"]}[module]
-    text = _run(
-        sys.executable, "-m", module, *command, cwd=tmp_path, env={"NO_COLOR": "1", "FORCE_COLOR": "1"}
-    )
+    text = _run(sys.executable, "-m", module, *command, cwd=tmp_path, env={"NO_COLOR": "1", "FORCE_COLOR": "1"})
     # Bold and the like are no colours; 30 to 49 and 90 to 107 are.
     assert not any(f"\x1b[{code}m" in text for code in (*range(30, 50), *range(90, 108)))

@@ -32,9 +32,7 @@ CHAINS = [page for page in PAGES if _IN_ORDER.search(page.read_text(encoding="ut
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(PROJECT)))
 def test_links_of_a_page_lead_somewhere(page: Path) -> None:
     text = re.sub(r"```.*?```", "", page.read_text(encoding="utf-8"), flags=re.DOTALL)
-    targets = [
-        target for target in _LINK.findall(text) if "://" not in target and not target.startswith("mailto:")
-    ]
+    targets = [target for target in _LINK.findall(text) if "://" not in target and not target.startswith("mailto:")]
     assert [target for target in targets if not (page.parent / target).exists()] == []
 
 

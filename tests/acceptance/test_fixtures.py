@@ -88,6 +88,4 @@ def test_a_process_that_outlives_its_starter_is_killed_and_told(tmp_path: Path) 
     program.wait(10.0)
     (complaint,) = group.close()
     assert complaint.startswith(f"pid {child} outlived its starter")
-    wait_for(
-        lambda: not psutil.pid_exists(child) or psutil.Process(child).status() == "zombie", 5.0, "its end"
-    )
+    wait_for(lambda: not psutil.pid_exists(child) or psutil.Process(child).status() == "zombie", 5.0, "its end")

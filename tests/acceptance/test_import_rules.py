@@ -75,9 +75,7 @@ def lint_imports(root: Path) -> subprocess.CompletedProcess[str]:
 def copy(tmp_path: Path) -> Path:
     """Copy the packages and the rules, to be spoilt."""
     for folder in FOLDERS:
-        shutil.copytree(
-            PROJECT / folder, tmp_path / folder, ignore=shutil.ignore_patterns("__pycache__", "runs")
-        )
+        shutil.copytree(PROJECT / folder, tmp_path / folder, ignore=shutil.ignore_patterns("__pycache__", "runs"))
     (tmp_path / "tests").mkdir()
     for name in ("pyproject.toml", "tests/__init__.py", "tests/import_rules.py"):
         shutil.copyfile(PROJECT / name, tmp_path / name)

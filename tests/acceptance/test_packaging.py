@@ -52,9 +52,7 @@ def install(tmp_path_factory: pytest.TempPathFactory) -> Path:
         str(base / "install"),
     ]
     done = subprocess.run(command, cwd=base, capture_output=True, text=True, check=False, timeout=110)
-    assert done.returncode == 0, (
-        f"colcon build ended with code {done.returncode}:\n{done.stdout}\n{done.stderr}"
-    )
+    assert done.returncode == 0, f"colcon build ended with code {done.returncode}:\n{done.stdout}\n{done.stderr}"
     assert "6 packages finished" in done.stderr + done.stdout
     return base / "install"
 
@@ -63,9 +61,7 @@ def install(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_a_built_package_is_in_the_ament_index_with_its_manifest(install: Path, package: str) -> None:
     share = install / package / "share"
     assert (share / "ament_index" / "resource_index" / "packages" / package).is_file()
-    assert (share / package / "package.xml").read_bytes() == (
-        PROJECT / FOLDERS[package] / "package.xml"
-    ).read_bytes()
+    assert (share / package / "package.xml").read_bytes() == (PROJECT / FOLDERS[package] / "package.xml").read_bytes()
     # Written by the ament build only: colcon's plain Python build, its silent fallback, has no such hook.
     assert "AMENT_PREFIX_PATH" in (share / package / "hook" / "ament_prefix_path.sh").read_text()
 
@@ -75,11 +71,7 @@ def test_a_built_package_carries_every_file_that_its_modules_read(install: Path,
     source = PROJECT / FOLDERS[package] / package
     (built,) = (install / package / "lib").glob(f"python*/site-packages/{package}")
     of = {
-        root: {
-            path.relative_to(root)
-            for path in root.rglob("*")
-            if path.is_file() and "__pycache__" not in path.parts
-        }
+        root: {path.relative_to(root) for path in root.rglob("*") if path.is_file() and "__pycache__" not in path.parts}
         for root in (source, built)
     }
     assert of[source] == of[built]
@@ -96,9 +88,7 @@ def test_every_program_stands_where_ros2_run_looks_for_it_and_answers_help(insta
         if not os.access(path, os.X_OK):
             return f"{package} {program}: {path} is missing or not executable"
         command = [str(path), "--help"]
-        done = subprocess.run(
-            command, capture_output=True, text=True, check=False, timeout=60, env=environment
-        )
+        done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=60, env=environment)
         if done.returncode != 0 or "usage" not in done.stdout.lower():
             tail = (done.stdout + done.stderr)[-600:]
             return f"{package} {program} --help ended with code {done.returncode}: {tail}"

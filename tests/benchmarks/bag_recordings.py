@@ -62,9 +62,7 @@ def _environment(domain: int) -> dict[str, str]:
     return {**os.environ, **_ENVIRONMENT, "ROS_DOMAIN_ID": str(domain)}
 
 
-def _publisher(
-    domain: int, topics: int, rate: float, duration: float, depth: int = 1000
-) -> subprocess.Popen[str]:
+def _publisher(domain: int, topics: int, rate: float, duration: float, depth: int = 1000) -> subprocess.Popen[str]:
     return subprocess.Popen(
         [sys.executable, "-c", _PUBLISHER, str(topics), str(rate), str(duration), str(depth)],
         stdout=subprocess.PIPE,
@@ -187,9 +185,7 @@ def load_rows(folder: Path, duration: float) -> Iterator[Row]:
     work = f"record 10 topics at 500 Hz for {duration:g} s"
     yield measured(f"{work}: lost of {sent}", lost, "", at_most=0.0)
     yield measured(f"{work}: processor", 100.0 * share, "% of a core", at_most=15.0)
-    yield measured(
-        f"{work}: growth of the resident set", growth, "MB", at_most=8.0, note="after the first 5 s"
-    )
+    yield measured(f"{work}: growth of the resident set", growth, "MB", at_most=8.0, note="after the first 5 s")
     best = 0.0
     for number, rate in enumerate((10_000.0, 20_000.0, 30_000.0)):
         sent, lost, _, _ = _run(folder / f"ceiling{number}", 48, 1, rate, 5.0, depth=2000)

@@ -43,12 +43,8 @@ def seal_rows(folder: Path, hours: float) -> Iterator[Row]:
     assert len(read_bag(folder / "seals")["/a"]) == seals
     (first_time, first_bytes), (last_time, last_bytes) = costs[0], costs[-1]
     what = f"a seal at the end of {hours:g} h beside one at its start"
-    yield measured(
-        f"{what}: bytes written", last_bytes / first_bytes, "x", at_most=1.5, note=f"{last_bytes:.0f} bytes"
-    )
-    yield measured(
-        f"{what}: time", last_time / first_time, "x", at_most=2.0, note=f"{1e6 * last_time:.0f} us"
-    )
+    yield measured(f"{what}: bytes written", last_bytes / first_bytes, "x", at_most=1.5, note=f"{last_bytes:.0f} bytes")
+    yield measured(f"{what}: time", last_time / first_time, "x", at_most=2.0, note=f"{1e6 * last_time:.0f} us")
     growth = (memory - begin_memory) / 1e6 / (0.95 * hours)
     yield measured("growth of the resident set of a writer, per hour", growth, "MB", at_most=2.0)
 

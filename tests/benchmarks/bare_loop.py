@@ -36,9 +36,7 @@ def main() -> None:
     else:
         answer = encode_joint_state(0, frame_id="/controller", effort=1.0)
         commands = node.create_publisher(JointState, "effort_command", _profile(10))
-        node.create_subscription(
-            JointState, "joint_states", lambda _: commands.publish(answer), _profile(1), raw=True
-        )
+        node.create_subscription(JointState, "joint_states", lambda _: commands.publish(answer), _profile(1), raw=True)
     executor = EventsExecutor()
     executor.add_node(node)
     never = Future(executor=None)

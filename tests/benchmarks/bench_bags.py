@@ -89,9 +89,7 @@ def _reading(folder: Path, messages: list[tuple[str, int, bytes]]) -> Iterator[R
         _check(path, expected)
         ours = COUNT / _median_time(partial(_load, path), 7)
         what = f"read {COUNT:.0e} JointState of 3 topics, {storage}{' ' + compression if compression else ''}"
-        yield measured(
-            what, ours, "1/s", peer=Peer("rosbags AnyReader", anyreader), at_least_times_peer=target
-        )
+        yield measured(what, ours, "1/s", peer=Peer("rosbags AnyReader", anyreader), at_least_times_peer=target)
         if storage == "mcap":
             theirs = peer("baglab with its C++ backend", partial(_in_process, _BAGLAB, path))
             factor = None if compression else 10.0
@@ -278,9 +276,7 @@ def _writing(folder: Path, messages: list[tuple[str, int, bytes]]) -> Iterator[R
             from rosbags.rosbag2 import StoragePlugin, Writer
 
             with Writer(path, version=9, storage_plugin=StoragePlugin[storage.upper()]) as writer:
-                connections = {
-                    t: writer.add_connection(t, JOINT_STATE, typestore=typestore()) for t in TOPICS
-                }
+                connections = {t: writer.add_connection(t, JOINT_STATE, typestore=typestore()) for t in TOPICS}
                 for topic, log_time, data in messages:
                     writer.write(connections[topic], log_time, data)
 
@@ -312,22 +308,17 @@ def _writing(folder: Path, messages: list[tuple[str, int, bytes]]) -> Iterator[R
 
     for storage in ("mcap", "sqlite3"):
         theirs = peer(f"rosbags {storage}", partial(_rate_of, rate, rosbags, storage))
-        yield measured(
-            f"write {COUNT:.0e} messages, {storage}", rate(ours(storage, COUNT)), "1/s", peer=theirs
-        )
+        yield measured(f"write {COUNT:.0e} messages, {storage}", rate(ours(storage, COUNT)), "1/s", peer=theirs)
         yield measured(
             f"write {storage}, sealed every 500 messages",
             rate(ours(storage, 500)),
             "1/s",
             peer=theirs,
-            note="the peer seals once, at its end"
-            + ("" if storage == "mcap" else "; our time includes the index"),
+            note="the peer seals once, at its end" + ("" if storage == "mcap" else "; our time includes the index"),
         )
         if storage == "mcap":
             library = peer("mcap", lambda: rate(mcap_library))
-            yield measured(
-                f"write {COUNT:.0e} messages, mcap", rate(ours(storage, COUNT)), "1/s", peer=library
-            )
+            yield measured(f"write {COUNT:.0e} messages, mcap", rate(ours(storage, COUNT)), "1/s", peer=library)
 
 
 # -- truncation --------------------------------------------------------------------------------------------------
@@ -376,9 +367,7 @@ def _truncation(folder: Path) -> Iterator[Row]:
         with file.open("rb") as stream:
             summary = make_reader(stream).get_summary()
         assert summary is not None
-        chunks = [
-            (c.chunk_start_offset + c.chunk_length, c.message_end_time + 1) for c in summary.chunk_indexes
-        ]
+        chunks = [(c.chunk_start_offset + c.chunk_length, c.message_end_time + 1) for c in summary.chunk_indexes]
         good = 0
         for _ in range(TRUNCATIONS):
             size = rng.randrange(100, len(sound))

@@ -91,9 +91,7 @@ def _hand_trial(index: int) -> tuple[float, float]:
     from pendulum_hw_bridge.procedures import hand_trials
 
     motion = hand_trials(1)[index]
-    port = EmulatorBackend(
-        EmulatedX5(replace(load_emulator("thesis"), flat=True), seed=index), SteppedClock()
-    )
+    port = EmulatorBackend(EmulatedX5(replace(load_emulator("thesis"), flat=True), seed=index), SteppedClock())
     port.connect()
     port.set_strategy(Strategy.DIRECT_PWM)
     records = []
@@ -151,9 +149,7 @@ def _faults() -> Iterator[Row]:
             row = measured(what, slowest, "ms", at_most=60.0, note=note)
             yield replace(row, holds=bool(row.holds) and good and stays)
         else:
-            yield Row(
-                what=f"fault: {scenario.name}, regulation goes on", target="goes on", holds=good, note=note
-            )
+            yield Row(what=f"fault: {scenario.name}, regulation goes on", target="goes on", holds=good, note=note)
 
 
 def _loop() -> Iterator[Row]:
@@ -165,9 +161,7 @@ def _loop() -> Iterator[Row]:
         yield measured(f"{what}: rate", figures.rate, "Hz", at_least=0.99 * rate, less_is_better=False)
         note = f"p99 {figures.jitter_p99:.0f} us, largest {figures.jitter_max:.0f} us; "
         note += "the actuator's own is 5 to 10 % of the period"
-        yield measured(
-            f"{what}: jitter of the states, p50", figures.jitter_p50, "us", note=note, less_is_better=True
-        )
+        yield measured(f"{what}: jitter of the states, p50", figures.jitter_p50, "us", note=note, less_is_better=True)
         yield measured(
             f"{what}: round trip p50",
             figures.latency_p50,

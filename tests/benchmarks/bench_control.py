@@ -176,9 +176,7 @@ def _swing_up_time(plant: PlantParameters, name: str) -> float:
     return float(PERIOD * np.argmax(there))
 
 
-def _succeeds(
-    plant: PlantParameters, controller: Controller, theta: float, theta_dot: float, kick: Any = None
-) -> bool:
+def _succeeds(plant: PlantParameters, controller: Controller, theta: float, theta_dot: float, kick: Any = None) -> bool:
     angle, velocity, _ = _run(plant, controller, theta, 1000, theta_dot, kick)
     return bool(np.any((np.abs(angle) < 0.1) & (np.abs(velocity) < 0.1)))
 

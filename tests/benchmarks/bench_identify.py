@@ -273,8 +273,7 @@ def published_error(parameters: Mapping[str, float], log: Recording, *, duty_gai
             share = math.exp(-(abs(dq / parameters["dtheta_stribeck"]) ** parameters["alpha"]))
             rise = get("friction_stribeck", 0.0)
             rise += abs(
-                bias * get("load_friction_external_stribeck", 0.0)
-                - motor * get("load_friction_motor_stribeck", 0.0)
+                bias * get("load_friction_external_stribeck", 0.0) - motor * get("load_friction_motor_stribeck", 0.0)
             )
             if bias * motor < 0.0:
                 quadratic = (
@@ -372,8 +371,6 @@ def _busy_machine() -> Row:
                     burner.kill()
                     burner.wait()
             bags.append(read_bag(out / "trial_1"))
-        same = same_messages(
-            bags[0], bags[1], topics=[topic for topic in bags[0].topics if "recorder" not in topic]
-        )
+        same = same_messages(bags[0], bags[1], topics=[topic for topic in bags[0].topics if "recorder" not in topic])
         what = "one trial in lockstep on an idle and on a busy machine: the same bag"
         return Row(what=what, target="equal messages", holds=bool(same), note=str(same))

@@ -118,13 +118,9 @@ def _environments() -> Iterator[Row]:
 
     ours = _env_speed("PendulumX59-v0")
     theirs = peer("Gymnasium Pendulum-v1", lambda: _env_speed("Pendulum-v1"))
-    yield measured(
-        "env.step, as gymnasium.make returns it", ours, "steps/s", peer=theirs, at_least_times_peer=4.0
-    )
+    yield measured("env.step, as gymnasium.make returns it", ours, "steps/s", peer=theirs, at_least_times_peer=4.0)
     yield measured("env.step", ours, "steps/s", peer=peer("mujoco from Python", _mujoco_single))
-    vector = _vector_speed(
-        gymnasium.make_vec("PendulumX59-v0", num_envs=1024, vectorization_mode="vector_entry_point")
-    )
+    vector = _vector_speed(gymnasium.make_vec("PendulumX59-v0", num_envs=1024, vectorization_mode="vector_entry_point"))
     envpool = peer("envpool", _envpool_speed)
     if envpool.value is None:
         yield measured(
@@ -136,9 +132,7 @@ def _environments() -> Iterator[Row]:
             note="target: 10 x the 1.6e6 that envpool reached on two such cores",
         )
     else:
-        yield measured(
-            "vectorised environment of 1024", vector, "steps/s", peer=envpool, at_least_times_peer=10.0
-        )
+        yield measured("vectorised environment of 1024", vector, "steps/s", peer=envpool, at_least_times_peer=10.0)
     sync = peer(
         "Gymnasium SyncVectorEnv",
         lambda: _vector_speed(gymnasium.make_vec("Pendulum-v1", num_envs=1024, vectorization_mode="sync"), 3),
@@ -223,14 +217,10 @@ def _node() -> Iterator[Row]:
             yield measured(f"{what}: memory", figures.memory, "MB", at_most=100.0)
             yield measured(f"{what}: growth of memory", max(0.0, figures.growth), "MB", at_most=1.0)
     speed = lockstep_speed(60.0)
-    yield measured(
-        "node, lockstep 2 ms, controller and disturbance as processes", speed, "x real time", at_least=6.0
-    )
+    yield measured("node, lockstep 2 ms, controller and disturbance as processes", speed, "x real time", at_least=6.0)
 
 
-def _best(
-    work_function: Callable[[], None], *, work: float, warm_up: Callable[[], None] | None = None
-) -> float:
+def _best(work_function: Callable[[], None], *, work: float, warm_up: Callable[[], None] | None = None) -> float:
     """Return the best rate of five runs, after one that nobody counts: other load only ever slows down."""
     (warm_up or work_function)()
     best = 0.0

@@ -79,9 +79,7 @@ def measure(
         method="etd4",
     )
     sensors = Sensors(np.random.default_rng(2 * seed + (side == "sim")), **SENSORS)
-    return estimate(
-        record_of_arrays(simulate_plant(spec, plant, sensors), side, spec.disturbance_parameters())
-    )
+    return estimate(record_of_arrays(simulate_plant(spec, plant, sensors), side, spec.disturbance_parameters()))
 
 
 # --- certificates
@@ -106,9 +104,7 @@ def certify_pairs(pairs: Iterable[int] = range(PAIRS), gains: int = GAINS) -> Co
     counts = Counts()
     for number in pairs:
         generator = np.random.default_rng([11, number])
-        preset, weights, amplitude = (("thesis", {}, 2.5), ("dfki", {"q": [100.0, 1.0], "r": 1.0}, 1.2))[
-            number % 2
-        ]
+        preset, weights, amplitude = (("thesis", {}, 2.5), ("dfki", {"q": [100.0, 1.0], "r": 1.0}, 1.2))[number % 2]
         base = load_plant(preset).with_values(coulomb_friction=0.0, static_friction=0.0, effort_limit=13.0)
         machine = _other(base, generator)
         found = measure(machine, seed=number, design=preset, amplitude=amplitude, gains=weights)
@@ -117,9 +113,7 @@ def certify_pairs(pairs: Iterable[int] = range(PAIRS), gains: int = GAINS) -> Co
         certifier = Certifier(nominal, Machine.of(found))
         loops = model_response(true, np.concatenate([[0.0], np.geomspace(1e-3, 49.999, 1500)]), PERIOD)
         for _ in range(gains):
-            K = np.array([base.gravity, 1.0]) * np.exp(
-                [generator.uniform(-0.2, 4.0), generator.uniform(-4.0, 2.0)]
-            )
+            K = np.array([base.gravity, 1.0]) * np.exp([generator.uniform(-0.2, 4.0), generator.uniform(-4.0, 2.0)])
             _count(counts, certifier, sampled, K, loops)
     return counts
 
@@ -194,9 +188,7 @@ def _simulated(seed: int, *, friction: bool) -> MeasuredResponse:
     return measure(FRICTION if friction else load_plant("thesis"), side="sim", seed=seed)
 
 
-def differences(
-    machine: PlantParameters, trials: int = TRIALS, *, friction: bool = False
-) -> list[Difference]:
+def differences(machine: PlantParameters, trials: int = TRIALS, *, friction: bool = False) -> list[Difference]:
     """Return the differences that default runs find between the simulation and a machine."""
     model = linearise(load_plant("thesis"))
     return [
@@ -253,18 +245,12 @@ def margin_rows(trials: int = TRIALS) -> Iterator[Row]:
     frequency = estimate_lines()
 
     def gap(gain: float) -> float:
-        machine = base.with_values(
-            **{name: getattr(base, name) / gain for name in ("inertia", "damping", "gravity")}
-        )
-        one, two = (
-            DEFAULT_SCALING.plant(model_response(linearise(p), frequency, PERIOD)) for p in (base, machine)
-        )
+        machine = base.with_values(**{name: getattr(base, name) / gain for name in ("inertia", "damping", "gravity")})
+        one, two = (DEFAULT_SCALING.plant(model_response(linearise(p), frequency, PERIOD)) for p in (base, machine))
         return nu_gap(one, two).value - GAP_MARGIN
 
     gain = float(brentq(gap, 1.05, 6.0))
-    machine = base.with_values(
-        **{name: getattr(base, name) / gain for name in ("inertia", "damping", "gravity")}
-    )
+    machine = base.with_values(**{name: getattr(base, name) / gain for name in ("inertia", "damping", "gravity")})
     yes = 0
     for seed in range(trials):
         one, two = _simulated(seed, friction=False), measure(machine, seed=seed)

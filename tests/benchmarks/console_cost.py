@@ -138,9 +138,7 @@ def _console(group: ProcessGroup, environment: dict[str, str], runs: Path) -> tu
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         port = probe.getsockname()[1]
-    console = group.start(
-        "pendulum_bags", "console", "--port", str(port), "--runs", runs, env=environment
-    )
+    console = group.start("pendulum_bags", "console", "--port", str(port), "--runs", runs, env=environment)
     console.wait_for_output(r"console at http://localhost", _START_TIMEOUT)
     return console, f"localhost:{port}"
 

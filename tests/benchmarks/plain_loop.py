@@ -38,9 +38,7 @@ class Plant(Node):
 
     def on_timer(self) -> None:
         state = self.plant.step(self.effort)
-        message = JointState(
-            name=[JOINT], position=[state.theta], velocity=[state.theta_dot], effort=[state.effort]
-        )
+        message = JointState(name=[JOINT], position=[state.theta], velocity=[state.theta_dot], effort=[state.effort])
         message.header.stamp = self.get_clock().now().to_msg()
         self.publisher.publish(message)
 

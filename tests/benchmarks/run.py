@@ -55,9 +55,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Measure, print, store; 1 when an area failed, or, with ``--strict``, when a target was not reached."""
     known = areas()
     parser = argparse.ArgumentParser(prog="make bench", description=__doc__)
-    parser.add_argument(
-        "--only", metavar="AREA", action="append", help=f"one of {', '.join(known) or '(none yet)'}"
-    )
+    parser.add_argument("--only", metavar="AREA", action="append", help=f"one of {', '.join(known) or '(none yet)'}")
     parser.add_argument("--strict", action="store_true", help="exit with 1 when a target is not reached")
     parser.add_argument("--json", action="store_true", help="print the rows as JSON instead of a table")
     arguments = parser.parse_args(argv)

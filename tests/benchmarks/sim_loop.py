@@ -48,9 +48,7 @@ class LoopFigures:
     growth: float
 
 
-def realtime_figures(
-    duration: float, *, rate: float = 1000.0, cores: Sequence[int] | None = None
-) -> LoopFigures:
+def realtime_figures(duration: float, *, rate: float = 1000.0, cores: Sequence[int] | None = None) -> LoopFigures:
     """Run simulator and controller in real time and return what they cost.
 
     Args:
@@ -164,9 +162,7 @@ def lockstep_speed(duration: float, *, rate: float = 500.0) -> float:
 
 
 def _start(group: ProcessGroup, domain: int, program: NodeProgram) -> RunningProgram:
-    return group.start(
-        program.package, program.executable, *program.ros_arguments(), env=domain_environment(domain)
-    )
+    return group.start(program.package, program.executable, *program.ros_arguments(), env=domain_environment(domain))
 
 
 def _pin(process: psutil.Process, cores: Sequence[int]) -> None:

@@ -97,9 +97,7 @@ def _check_plant(bag: Bag, plant: str, limit: float, allowance: float) -> Torque
     command = _last_before(times, _log_times(bag, plant, names.EFFORT_COMMAND))
     # A disturbance or a push is a command, too: each ends by itself after its life.
     others = (names.DISTURBANCE, names.PUSH)
-    latest = np.maximum.reduce(
-        [command, *(_last_before(times, _log_times(bag, plant, name)) for name in others)]
-    )
+    latest = np.maximum.reduce([command, *(_last_before(times, _log_times(bag, plant, name)) for name in others)])
     stamps = applied["stamp_ns"]
     answered = np.maximum.reduce(
         [_last_before(stamps, _stamps(bag, plant, name)) for name in (names.EFFORT_COMMAND, *others)]

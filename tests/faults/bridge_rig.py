@@ -296,9 +296,7 @@ SCENARIOS: tuple[Scenario, ...] = (
     Scenario("commands lost on the way", _inject(_F.COMMANDS_LOST), "command_not_in_force"),
     Scenario("command cannot be sent", _inject(_F.SEND_FAILED), "send_failed"),
     Scenario("module held by another sender", _inject(_F.LOCKED_BY_OTHER), "locked_by_other"),
-    Scenario(
-        "module changes its strategy", _inject(_F.STRATEGY_CHANGED), "command_not_in_force", own_torque=True
-    ),
+    Scenario("module changes its strategy", _inject(_F.STRATEGY_CHANGED), "command_not_in_force", own_torque=True),
     Scenario("module restarts", _inject(_F.MODULE_REBOOT), "module_restarted"),
     Scenario("motion stop pressed", _inject(_F.M_STOP), "m_stop"),
     Scenario("motor too hot for the firmware", _inject(_F.OVER_TEMPERATURE_MOTOR), "over_temperature"),
@@ -353,9 +351,7 @@ def run_scenario(scenario: Scenario, repetition: int) -> Reaction:
     tail = [duty for time, duty in after if time > begin_ns + 200 * MILLISECOND]
     # On a ramp the firmware's own position loop makes the duty: what it does to hold the ramp was commanded.
     ceiling = (
-        1.0
-        if scenario.moving
-        else max(before, rig.largest_commanded * rig.bridge.mapping.pwm_per_torque(), commanded)
+        1.0 if scenario.moving else max(before, rig.largest_commanded * rig.bridge.mapping.pwm_per_torque(), commanded)
     )
     excess = max((abs(duty) for _, duty in after), default=0.0) - ceiling - 3e-4
     return Reaction(

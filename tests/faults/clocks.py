@@ -192,9 +192,7 @@ def simulate_hours(hours: float, rate_hz: float = 50.0) -> Outcome:
     node = Node("day", context=context, namespace="/day", start_parameter_services=False)
     try:
         parameters = load_plant("thesis")
-        supervisor = PlantSupervisor(
-            limits_from_parameters(dict(validate(LIMIT_SPECS, {})), parameters.effort_limit)
-        )
+        supervisor = PlantSupervisor(limits_from_parameters(dict(validate(LIMIT_SPECS, {})), parameters.effort_limit))
         plant = make_plant(parameters, period_ns / NANOSECONDS)
         plant.reset(UPRIGHT, 0.0)
         positions = np.empty(steps)
@@ -204,9 +202,7 @@ def simulate_hours(hours: float, rate_hz: float = 50.0) -> Outcome:
             return JointSample(stamp_ns, state.theta, state.theta_dot, state.effort), drive.effort
 
         interface = PlantInterface(node, supervisor, lambda: loop.now_ns)
-        loop = LockstepLoop(
-            interface, step, period_ns, [Input.EFFORT_COMMAND, Input.DISTURBANCE], publish_clock=False
-        )
+        loop = LockstepLoop(interface, step, period_ns, [Input.EFFORT_COMMAND, Input.DISTURBANCE], publish_clock=False)
         interface.publish_state(JointSample(LOCKSTEP_EPOCH_NS, UPRIGHT, 0.0, 0.0))
         supervisor.arm(LOCKSTEP_EPOCH_NS, interface.sample)
         controller = AnswerLoop(

@@ -58,9 +58,7 @@ class _Impostor:
         return bool(self._publisher.get_subscription_count() >= _LISTENERS)
 
     def send(self, stamp_ns: int, effort: float = _EFFORT) -> None:
-        self._publisher.publish(
-            encode_joint_state(stamp_ns, frame_id=f"{NAMESPACE}/controller", effort=effort)
-        )
+        self._publisher.publish(encode_joint_state(stamp_ns, frame_id=f"{NAMESPACE}/controller", effort=effort))
 
     def punctual(self, stamp_ns: int) -> None:
         self.valid_ns = max(self.valid_ns, stamp_ns)

@@ -240,9 +240,7 @@ class LiveSystem:
             rate: Messages per second; None as fast as possible.
         """
         publisher = self.publisher(topic)
-        self.wait_for(
-            f"the plant to hear the probe on {topic}", lambda: publisher.get_subscription_count() > 0, 10.0
-        )
+        self.wait_for(f"the plant to hear the probe on {topic}", lambda: publisher.get_subscription_count() > 0, 10.0)
         sent = 0
         started = time.monotonic()
         for message in messages:

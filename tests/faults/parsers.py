@@ -237,7 +237,7 @@ def _bag_of_own_types(folder: Path) -> Path:
     """Write an MCAP file whose message is of a type that only the file defines."""
     separator = "\n" + "=" * 80 + "\n"
     definition = (
-        "# a comment\nint32 LIMIT=3\nown/Part[2] parts\nown/Part[<=3] more\nfloat64[3] numbers\nstring<=9 text \"t\"\n"
+        '# a comment\nint32 LIMIT=3\nown/Part[2] parts\nown/Part[<=3] more\nfloat64[3] numbers\nstring<=9 text "t"\n'
         f"builtin_interfaces/Time at\n{separator}MSG: own/Part\nuint8 a\nbool[] flags\n"
         f"{separator}MSG: builtin_interfaces/Time\nint32 sec\nuint32 nanosec\n"
     )

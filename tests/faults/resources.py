@@ -179,9 +179,7 @@ def recorder_loses_its_folder(folder: Path) -> Outcome:
                 _publish_state(conductor, publisher)
             # A recorder that had no reason to look at its folder finds out at its end.
             code = processes.finish(child, _TIMEOUT)
-        _demand_sentence(
-            outcome, "recorder", code, child.last_words(6), "operation not permitted", "permission denied"
-        )
+        _demand_sentence(outcome, "recorder", code, child.last_words(6), "operation not permitted", "permission denied")
         kept = _states_in(bag)
         outcome.demand(kept >= sealed >= _ENOUGH, f"{kept} states in the bag, {sealed} were sealed")
         outcome.detail = outcome.detail or child.last_words(1)[-80:]

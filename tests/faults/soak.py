@@ -171,9 +171,7 @@ def _start(processes: ProcessSet, conductor: Conductor, folder: Path) -> list[Ch
     for namespace in ("/sim", "/hw"):
         metadata = folder / f"metadata_{namespace[1:]}.json"
         write_json(metadata, {"pendulum.run": {"experiment": "soak"}})
-        recorders.append(
-            start_recorder(processes, folder / f"bag_{namespace[1:]}", namespace, metadata, "mcap")
-        )
+        recorders.append(start_recorder(processes, folder / f"bag_{namespace[1:]}", namespace, metadata, "mcap"))
     for program in _programs():
         # As in an experiment: who keeps deadlines goes first, who only shows goes last.
         shows = program.executable in {"viewer", "markers"}
@@ -300,9 +298,7 @@ def _judge_timing(report: SoakReport, bag: Bag, duration: float) -> None:
         for status in stored.message.status:
             if status.name == "/sim/simulator: plant":
                 values = {pair.key: pair.value for pair in status.values}
-                own.append(
-                    (stored.log_time_ns, float(values["jitter_p50_us"]), float(values["jitter_p99_us"]))
-                )
+                own.append((stored.log_time_ns, float(values["jitter_p50_us"]), float(values["jitter_p99_us"])))
     table = np.array(own, dtype=float)
     jitter = [
         [float(np.median(table[(table[:, 0] >= low) & (table[:, 0] < high), column])) for column in (1, 2)]

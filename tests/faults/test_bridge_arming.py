@@ -46,9 +46,7 @@ def disarmed(kind: EffortStrategy = EffortStrategy.DIRECT_PWM) -> Rig:
         (ActuatorFault.FEEDBACK_FROZEN, "feedback_frozen"),
     ],
 )
-def test_arming_is_refused_with_a_fault_that_is_there(
-    kind: EffortStrategy, fault: ActuatorFault, name: str
-) -> None:
+def test_arming_is_refused_with_a_fault_that_is_there(kind: EffortStrategy, fault: ActuatorFault, name: str) -> None:
     rig = disarmed(kind)
     rig.actuator.inject(fault)
     rig.run(0.1)
@@ -225,9 +223,7 @@ def test_records_that_count_on_but_measure_nothing_new_are_frozen() -> None:
             return None
         first.append(record)
         kept = first[0]
-        return kept._replace(
-            stamp_ns=record.stamp_ns, hardware_ns=record.hardware_ns, sequence=record.sequence
-        )
+        return kept._replace(stamp_ns=record.stamp_ns, hardware_ns=record.hardware_ns, sequence=record.sequence)
 
     rig.port.read = repeated  # type: ignore[method-assign]
     rig.run(0.06)
@@ -236,9 +232,7 @@ def test_records_that_count_on_but_measure_nothing_new_are_frozen() -> None:
     assert rig.bridge.last_fault in {"feedback_frozen", "command_not_in_force"}
 
 
-@pytest.mark.parametrize(
-    "state", ["temperature_state", "lock", "position_limit", "velocity_limit", "effort_limit"]
-)
+@pytest.mark.parametrize("state", ["temperature_state", "lock", "position_limit", "velocity_limit", "effort_limit"])
 def test_a_state_of_a_newer_firmware_never_ends_in_an_exception(state: str) -> None:
     rig = Rig()
     rig.run(0.3)
@@ -292,12 +286,8 @@ def test_nothing_of_the_torque_before_an_e_stop_is_in_the_trajectory_after_it(ki
 
 
 @KINDS
-@pytest.mark.parametrize(
-    "fault", [ActuatorFault.MODULE_REBOOT, ActuatorFault.M_STOP], ids=lambda fault: fault.value
-)
-def test_a_fault_between_preparing_and_arming_keeps_from_driving(
-    kind: EffortStrategy, fault: ActuatorFault
-) -> None:
+@pytest.mark.parametrize("fault", [ActuatorFault.MODULE_REBOOT, ActuatorFault.M_STOP], ids=lambda fault: fault.value)
+def test_a_fault_between_preparing_and_arming_keeps_from_driving(kind: EffortStrategy, fault: ActuatorFault) -> None:
     rig = disarmed(kind)
     before = rig.actuator.limits, rig.actuator.gains
     assert not rig.bridge.prepare()

@@ -102,9 +102,7 @@ WRONG_RECORDS: dict[str, Callable[[Feedback], Feedback]] = {
     "motor_velocity": lambda record: record._replace(motor_velocity=1e5),
     "motor_velocity_backwards": lambda record: record._replace(motor_velocity=-1e5),
     "motor_position": lambda record: record._replace(motor_position=record.motor_position + 1e4),
-    "motor_both": lambda record: record._replace(
-        motor_velocity=5e3, motor_position=record.motor_position + 50.0
-    ),
+    "motor_both": lambda record: record._replace(motor_velocity=5e3, motor_position=record.motor_position + 50.0),
     "voltage_low": lambda record: record._replace(voltage=22.5),
     "voltage_tiny": lambda record: record._replace(voltage=1e-9),
     "voltage_nan": lambda record: record._replace(voltage=math.nan),
@@ -118,9 +116,7 @@ WRONG_RECORDS: dict[str, Callable[[Feedback], Feedback]] = {
 @KINDS
 @pytest.mark.parametrize("phase", ["effort", "position"])
 @pytest.mark.parametrize("wrong", list(WRONG_RECORDS))
-def test_one_wrong_record_makes_no_torque_beyond_the_limit(
-    kind: EffortStrategy, phase: str, wrong: str
-) -> None:
+def test_one_wrong_record_makes_no_torque_beyond_the_limit(kind: EffortStrategy, phase: str, wrong: str) -> None:
     rig = Rig(kind=kind, moving=phase == "position", effort_limit=2.0, start=0.0, goal=0.3)
     block(rig)
     if phase == "effort":

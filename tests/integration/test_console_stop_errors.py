@@ -84,12 +84,8 @@ def test_a_plant_whose_service_breaks_keeps_no_other_from_being_stopped(
 def test_an_event_that_makes_no_sense_keeps_no_answer_to_a_stop_away(lab: Lab) -> None:
     lab.until(lab.events.get_subscription_count, "console that hears events")
     for stamp in ("yesterday", None, [1]):
-        lab.events.publish(
-            String(data=json.dumps({"name": "plant_mode", "mode": "nonsense", "stamp_ns": stamp}))
-        )
-    lab.events.publish(
-        String(data=json.dumps({"name": "plant_mode", "mode": "disarmed", "stamp_ns": time.time_ns()}))
-    )
+        lab.events.publish(String(data=json.dumps({"name": "plant_mode", "mode": "nonsense", "stamp_ns": stamp})))
+    lab.events.publish(String(data=json.dumps({"name": "plant_mode", "mode": "disarmed", "stamp_ns": time.time_ns()})))
     lab.until(lambda: lab.hub.frame()["/first"]["mode"] == "disarmed", "event after it")
     asyncio.run(lab.hub.e_stop())
     lab.until(lambda: lab.state(FIRST) == lab.state(SECOND) == "stopped", "answers of both plants")

@@ -50,9 +50,7 @@ def test_there_are_launch_files() -> None:
 
 @pytest.mark.parametrize("plant", SIDES)
 def test_every_choice_starts_nodes_that_know_their_parameters(plant: str) -> None:
-    choices = {
-        it.name: it.choices for it in ARGUMENTS if it.name in {"controller", "disturbance", "start", "viewer"}
-    }
+    choices = {it.name: it.choices for it in ARGUMENTS if it.name in {"controller", "disturbance", "start", "viewer"}}
     lab = LAB if plant == "hebi" else {}
     # The lab file is read anew each time: a few combinations of all do.
     for combination in itertools.islice(itertools.product(*choices.values()), 0, None, 7 if lab else 1):
@@ -87,9 +85,7 @@ def test_a_real_actuator_is_never_told_where_it_stands() -> None:
         ({"plant": "sim", **LAB}, "expected plant:=hebi"),
     ],
 )
-def test_a_real_actuator_is_brought_up_only_with_the_file_that_says_which(
-    given: dict[str, str], message: str
-) -> None:
+def test_a_real_actuator_is_brought_up_only_with_the_file_that_says_which(given: dict[str, str], message: str) -> None:
     with pytest.raises(ParameterError, match=message):
         programs({**DEFAULTS, **given})
 
@@ -187,15 +183,12 @@ def test_rviz_is_asked_for_plugins_that_it_has() -> None:
 def test_rviz_shows_what_is_published() -> None:
     configuration = yaml.safe_load((PROJECT / "pendulum_sim/rviz/pendulum.rviz").read_text(encoding="utf-8"))
     displays = configuration["Visualization Manager"]["Displays"]
-    topics = {
-        display[key]["Value"]
-        for display in displays
-        for key in ("Topic", "Description Topic")
-        if key in display
-    }
+    topics = {display[key]["Value"] for display in displays for key in ("Topic", "Description Topic") if key in display}
     assert topics == {
         # Relative, so that a namespace around the launch moves them along with the plants.
-        f"{side}/{topic}" for side in ("sim", "hw") for topic in ("markers", "robot_description")
+        f"{side}/{topic}"
+        for side in ("sim", "hw")
+        for topic in ("markers", "robot_description")
     }
 
 

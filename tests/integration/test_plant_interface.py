@@ -80,9 +80,7 @@ class Peer(GraphPeer):
         return message
 
     def stream(self, effort: float, frame: str = "lqr") -> None:
-        self.answer = lambda state: self.command.publish(
-            self.message(effort, stamp=state.header.stamp, frame=frame)
-        )
+        self.answer = lambda state: self.command.publish(self.message(effort, stamp=state.header.stamp, frame=frame))
 
 
 @pytest.fixture

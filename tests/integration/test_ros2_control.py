@@ -83,9 +83,7 @@ def test_hardware_of_ros2_control_moves_our_plant_and_a_second_commander_nobody(
     processes: ProcessGroup, watcher: Watcher
 ) -> None:
     processes.start("pendulum_sim", "simulator", *IN_SIM, *PATIENT)
-    adapter = processes.start(
-        "pendulum_lqr", "effort_adapter", *IN_SIM, *PATIENT, "-p", "command_type:=joint_state"
-    )
+    adapter = processes.start("pendulum_lqr", "effort_adapter", *IN_SIM, *PATIENT, "-p", "command_type:=joint_state")
     adapter.wait_for_output("ready", 40.0)
     publishers = [watcher.node.create_publisher(JointState, "/sim/joint_commands", 1)]
     command = JointState(name=["gripper", names.JOINT], effort=[9.0, 1.25])

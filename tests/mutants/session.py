@@ -52,9 +52,7 @@ class Baseline:
     reached: dict[str, list[int]]
 
 
-def try_mutants(
-    target: Target, found: Sequence[Mutant], workers: int, note: Callable[[Mutant, bool], None]
-) -> None:
+def try_mutants(target: Target, found: Sequence[Mutant], workers: int, note: Callable[[Mutant, bool], None]) -> None:
     """Run the tests on each mutant.
 
     Args:

@@ -134,9 +134,7 @@ def test_a_bag_whose_files_are_gone_and_a_program_that_stumbles_have_rows_that_s
     assert table.bags[3]["error"] == "KeyError: 'noise'"
 
 
-def test_another_version_of_the_program_asks_again(
-    runs: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_another_version_of_the_program_asks_again(runs: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     pieces = find_pieces([runs / "monday"], ["timing"])
     analyse_bags(tmp_path / "out", pieces, ["timing"])
     assert analyse_bags(tmp_path / "out", pieces, ["timing"]).kept == 2
@@ -144,9 +142,7 @@ def test_another_version_of_the_program_asks_again(
     assert analyse_bags(tmp_path / "out", pieces, ["timing"]).kept == 0
 
 
-def test_what_cannot_be_asked_is_refused(
-    runs: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_what_cannot_be_asked_is_refused(runs: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(ParameterError, match="expected one of metrics, timing, identify, compare, report"):
         find_pieces([runs], ["matrix"])
     with pytest.raises(BagError, match="no run folder with the bags sim and hw in there"):

@@ -212,9 +212,7 @@ def test_the_named_number_of_runs_decides_about_as_often_as_promised(truth: floa
     """With n more runs the interval is narrower by sqrt; 80 % of the estimates then lead to a decision."""
     rng = np.random.default_rng(0)
     error, margin = 1.0, 1.0
-    first = equivalence_test(
-        "x", "", interval(truth, truth - 1.645 * error, truth + 1.645 * error), -margin, margin
-    )
+    first = equivalence_test("x", "", interval(truth, truth - 1.645 * error, truth + 1.645 * error), -margin, margin)
     assert first.more_runs is not None
     total = 1 + first.more_runs
     estimates = truth + error / math.sqrt(total) * rng.standard_normal(4000)
@@ -257,10 +255,7 @@ def test_margins_are_read_as_users_write_them(tmp_path: Path) -> None:
     assert str(texts.path_angle) == "20 %"
     assert texts.stated == {"delay", "spread_angle", "path_angle"}
     assert Margins.parse("delay=8ms,spread_angle=0.2 deg,path_angle=20%") == texts
-    assert (
-        Margins.parse({"delay": "8 ms", "spread_angle": {"value": 0.2, "unit": "deg"}, "path_angle": 20})
-        == texts
-    )
+    assert Margins.parse({"delay": "8 ms", "spread_angle": {"value": 0.2, "unit": "deg"}, "path_angle": 20}) == texts
     file = tmp_path / "mine.yaml"
     file.write_text(
         "format: pendulum_margins/1\nmargins:\n  delay: {value: 0.008, unit: s}\n"

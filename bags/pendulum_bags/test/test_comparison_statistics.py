@@ -58,9 +58,7 @@ def test_interval_of_a_mean_covers_the_truth_as_often_as_it_says_in_spite_of_cor
     trials = 150
     for seed in range(trials):
         values = autoregressive(500, 0.9, seed)
-        interval = bootstrap_interval(
-            resample([values[:, None]], resamples=400, seed=seed), lambda m: m[..., 0]
-        )
+        interval = bootstrap_interval(resample([values[:, None]], resamples=400, seed=seed), lambda m: m[..., 0])
         covered += interval.low <= 0.0 <= interval.high
         naive += abs(values.mean()) <= 1.645 * values.std() / np.sqrt(values.size)
     # 90 % is meant; the binomial error of 150 trials is 2.5 %. Counting samples instead of blocks gives about a third.

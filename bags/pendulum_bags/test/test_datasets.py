@@ -36,9 +36,7 @@ def test_a_csv_with_the_usual_names_needs_no_mapping(tmp_path):
 
 
 def test_a_mapping_file_turns_units_signs_and_offsets_into_si(tmp_path):
-    path = write(
-        tmp_path / "run.csv", "ms,deg,dps,mv", 1e3 * TIME, 180.0 - np.degrees(ANGLE), -np.degrees(SPEED), TIME
-    )
+    path = write(tmp_path / "run.csv", "ms,deg,dps,mv", 1e3 * TIME, 180.0 - np.degrees(ANGLE), -np.degrees(SPEED), TIME)
     mapping = tmp_path / "map.yaml"
     mapping.write_text(
         "format: pendulum_columns/1\n"

@@ -123,9 +123,7 @@ def test_a_run_that_a_busy_machine_disturbed_is_measured_again_and_left_out(tmp_
     write_pair(folder, 1, 2.0, keep=lost)
     recorder = Recorder(1.0)
     recorder(folder, SETTINGS, 1)
-    found = decide(
-        folder, SETTINGS, Margins.parse(), Budget(60.0, recorder.clock), record=lambda *_, **__: None
-    )
+    found = decide(folder, SETTINGS, Margins.parse(), Budget(60.0, recorder.clock), record=lambda *_, **__: None)
     assert [pair.hardware.source for pair in found.pairs] == [str(repeat_folder(folder, 1) / "hw")]
     assert "the machine was too busy (simulation missed 250 states)" in found.left_out[0]
     # The seed that was asked for makes the run again, not that of the repeat.

@@ -6,6 +6,7 @@ import pytest
 
 from pendulum_bags.experiments import experiment_cli
 from pendulum_bags.experiments.operator import ask_yes, real_machine
+from pendulum_bags.experiments.run_spec import EMULATOR_LIFETIME, EMULATOR_WATCHDOG
 from pendulum_bags.experiments.settings import RegulationSettings
 from pendulum_bags.experiments.trials import GRAVITY, INERTIA_DAMPING, TrialSettings
 from pendulum_bags.studies.records import read_record
@@ -38,8 +39,8 @@ def test_the_bridge_of_a_real_machine_gets_the_lab_file_and_nothing_that_contrad
     assert program.parameters == {
         "lab_file": str(lab),
         "effort_strategy": "effort_loop",
-        "feedback_watchdog": 25,
-        "command_lifetime": 0.25,
+        "feedback_watchdog": EMULATOR_WATCHDOG,
+        "command_lifetime": EMULATOR_LIFETIME,
     }
     lab.write_text(LAB.replace("backend: emulator_process, ", ""), encoding="utf-8")
     # The vendor's own log is written beside the bag of a real one.
@@ -56,9 +57,7 @@ def test_the_bridge_of_a_real_machine_gets_the_lab_file_and_nothing_that_contrad
 
 
 @pytest.mark.parametrize("name", ["thesis", "gravity", "inertia_damping"])
-def test_a_real_machine_needs_its_lab_file(
-    name: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_real_machine_needs_its_lab_file(name: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert experiment_cli.main([name, "--hardware", "hebi", "--out", str(tmp_path / "run")]) == 2
     assert "without a lab file; expected --lab FILE" in capsys.readouterr().err
     assert not (tmp_path / "run").exists()

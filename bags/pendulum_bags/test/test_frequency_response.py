@@ -81,17 +81,13 @@ def test_the_discs_hold_the_true_response_and_are_no_larger_than_they_need_be():
 def test_output_over_torque_is_biased_by_feedback_and_the_joint_estimate_is_not():
     # Noise as large as the motion: the controller answers it, and the torque knows it.
     periods = 60
-    noisy = record(
-        THESIS, noise={"position_noise": 8e-3, "velocity_noise": 0.0}, periods=periods, amplitude=0.5
-    )
+    noisy = record(THESIS, noise={"position_noise": 8e-3, "velocity_noise": 0.0}, periods=periods, amplitude=0.5)
     joint = estimate(noisy)
     true = model_response(linearise(THESIS), joint.frequency, joint.period)
     u, y = noisy.torque[400:], noisy.outputs[0, 400:]
     spectra = [np.fft.rfft((x - x.mean()).reshape(periods, 400), axis=1) for x in (u, y)]
     lines = np.round(joint.frequency * 4.0).astype(int)
-    naive = (np.sum(spectra[1] * np.conj(spectra[0]), axis=0) / np.sum(np.abs(spectra[0]) ** 2, axis=0))[
-        lines
-    ]
+    naive = (np.sum(spectra[1] * np.conj(spectra[0]), axis=0) / np.sum(np.abs(spectra[0]) ** 2, axis=0))[lines]
     high = joint.frequency > 10.0
     biased, unbiased = (abs(np.mean((found - true[0])[high])) for found in (naive, joint.response[0]))
     assert biased > 3.0 * unbiased

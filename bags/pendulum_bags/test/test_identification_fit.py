@@ -27,9 +27,7 @@ def run(seed=0, plant=TRUTH, seconds=6.0, noise=1e-3, amplitude=1.2):
     rng = np.random.default_rng(seed)
     time = np.arange(0.0, seconds, 0.005)
     effort = multisine(time, amplitude, rng) if amplitude else np.zeros_like(time)
-    return synthetic_recording(
-        plant, effort, 0.005, rng, noise=noise, start=(0.0, 0.0) if amplitude else (1.5, 0.0)
-    )
+    return synthetic_recording(plant, effort, 0.005, rng, noise=noise, start=(0.0, 0.0) if amplitude else (1.5, 0.0))
 
 
 @pytest.fixture(scope="module")
@@ -71,9 +69,7 @@ def test_intervals_cover_the_truth():
 
 def test_a_reversed_sign_is_found_and_said():
     recording = run(5)
-    turned = Recording(
-        recording.time, recording.position, None, -recording.input, hold="zero", meta=recording.meta
-    )
+    turned = Recording(recording.time, recording.position, None, -recording.input, hold="zero", meta=recording.meta)
     result = identify([turned], Options(friction="coulomb"), profiles=0)
     assert result.fit.sign_flipped
     assert result.model["gravity"] == pytest.approx(TRUTH.gravity, rel=1e-2)
@@ -93,9 +89,7 @@ def test_a_window_with_a_push_by_hand_does_not_move_the_fit_and_is_named():
 
 def test_a_free_swing_says_that_the_scale_cannot_be_determined():
     recording = run(8, amplitude=0.0)
-    free = Recording(
-        recording.time, recording.position, None, recording.input, input_kind="none", hold="zero"
-    )
+    free = Recording(recording.time, recording.position, None, recording.input, input_kind="none", hold="zero")
     result = identify([free], Options(friction="coulomb"), profiles=0)
     assert result.model.natural_frequency == pytest.approx(np.sqrt(30.0), rel=1e-2)
     assert any("not the absolute scale" in sentence for sentence in result.sentences())
@@ -113,15 +107,11 @@ def test_a_voltage_input_normalises_the_inertia():
 
 
 def test_a_wrong_geometry_is_contradicted_and_a_right_one_is_not(found):
-    wrong = identify(
-        [run()], Options(friction="coulomb", multi_start=False, geometry=Geometry(0.1, 0.5)), profiles=0
-    )
+    wrong = identify([run()], Options(friction="coulomb", multi_start=False, geometry=Geometry(0.1, 0.5)), profiles=0)
     assert wrong.geometry is not None
     assert wrong.geometry.contradicts
     assert wrong.sentences()[0].startswith("CONTRADICTION: gravity is 1.5")
-    right = identify(
-        [run()], Options(friction="coulomb", geometry=Geometry(1.5 / 9.80665 / 0.15, 0.15)), profiles=0
-    )
+    right = identify([run()], Options(friction="coulomb", geometry=Geometry(1.5 / 9.80665 / 0.15, 0.15)), profiles=0)
     assert right.geometry is not None
     assert not right.geometry.contradicts
 

@@ -172,9 +172,7 @@ def test_a_weak_parameter_has_one_interval_everywhere(tmp_path):
 def test_a_parameter_at_its_upper_edge_is_not_said_to_be_wanted_less():
     recording = TRUTHS["white noise"].recording(4)
     moved = replace(recording, position=recording.position + 0.56)
-    result = identify(
-        [moved], Options(friction="coulomb", multi_start=False, torque_offset=False), profiles=0
-    )
+    result = identify([moved], Options(friction="coulomb", multi_start=False, torque_offset=False), profiles=0)
     said = [s for s in result.sentences() if s.startswith("angle_offset ended at the edge")]
     assert said
     assert "the data want more than the -0.5 to 0.5" in said[0]

@@ -57,9 +57,7 @@ def test_the_integrator_is_of_second_order():
     model = from_plant(PlantParameters(inertia=0.05, damping=0.03, gravity=1.5))
     start = np.array([[0.0, 0.0]])
     fine = simulate(model, piece, start, step=1e-4).theta
-    errors = [
-        np.max(np.abs(simulate(model, piece, start, step=h).theta - fine)) for h in (5e-3, 2.5e-3, 1.25e-3)
-    ]
+    errors = [np.max(np.abs(simulate(model, piece, start, step=h).theta - fine)) for h in (5e-3, 2.5e-3, 1.25e-3)]
     slopes = np.diff(np.log2(errors))
     np.testing.assert_allclose(slopes, -2.0, atol=0.15)
 

@@ -92,12 +92,8 @@ def test_an_input_that_has_nothing_to_do_with_the_motion_is_refused():
     rng = np.random.default_rng(6)
     time = np.arange(0.0, 4.0, 0.02)
     angle = 0.5 * sum(np.sin(2.0 * np.pi * f * time + rng.uniform(0.0, 6.0)) for f in (1.3, 2.9, 4.7, 6.1))
-    result = identify(
-        [Recording(time, angle, None, multisine(time, 1.2, rng), hold="zero")], QUICK, profiles=0
-    )
-    assert result.sentences()[0].startswith(
-        "REFUSED: the model explains next to nothing. It misses the angle by"
-    )
+    result = identify([Recording(time, angle, None, multisine(time, 1.2, rng), hold="zero")], QUICK, profiles=0)
+    assert result.sentences()[0].startswith("REFUSED: the model explains next to nothing. It misses the angle by")
 
 
 def test_a_good_fit_is_not_refused_however_its_windows_are_cut(known):
@@ -134,9 +130,7 @@ def test_a_plant_that_no_candidate_can_be_is_said_loudly_to_have_no_honest_inter
     position = np.array(angles) + 1e-3 * rng.standard_normal(time.size)
     result = identify([Recording(time, position, None, effort, hold="zero")], QUICK, profiles=0)
     said = result.sentences()
-    assert said[0].startswith(
-        "MODEL INCOMPLETE: what the fit leaves over looks like a drag that grows with the square"
-    )
+    assert said[0].startswith("MODEL INCOMPLETE: what the fit leaves over looks like a drag that grows with the square")
     assert not any("the intervals allow for it" in sentence for sentence in said)
     assert result.to_dict()["incomplete"]
 
@@ -144,9 +138,7 @@ def test_a_plant_that_no_candidate_can_be_is_said_loudly_to_have_no_honest_inter
 def test_the_shipped_simulation_by_euler_is_not_said_to_be_known_to_a_quarter_of_a_percent(pytestconfig):
     folder = pytestconfig.rootpath / "bags" / "examples" / "regulation_sim"
     result = identify([read_recording(folder)], replace(QUICK, friction="viscous"), profiles=0)
-    assert result.sentences()[0].startswith(
-        "MODEL INCOMPLETE: what the fit leaves over depends on the past input"
-    )
+    assert result.sentences()[0].startswith("MODEL INCOMPLETE: what the fit leaves over depends on the past input")
 
 
 def test_a_gravity_of_nothing_contradicts_a_known_mass_and_length(known):
@@ -154,9 +146,7 @@ def test_a_gravity_of_nothing_contradicts_a_known_mass_and_length(known):
     turned = result.model.with_vector(
         np.where(result.model.vector == result.model["gravity"], 0.0, result.model.vector)
     )
-    intervals = {
-        k: v for k, v in result.uncertainty.intervals.items() if k not in {"gravity", "natural_frequency"}
-    }
+    intervals = {k: v for k, v in result.uncertainty.intervals.items() if k not in {"gravity", "natural_frequency"}}
     check = check_geometry(turned, replace(result.uncertainty, intervals=intervals), Geometry(1.0, 0.15))
     assert check is not None
     assert check.contradicts
@@ -192,8 +182,7 @@ def test_a_recording_that_rests_most_of_the_time_is_judged_without_a_division_by
 
 def test_held_out_recordings_of_one_name_have_a_score_each(known):
     others = [
-        replace(run(seed), meta={"source": f"{day}/run.csv"})
-        for seed, day in ((1, "mon"), (2, "tue"), (3, "wed"))
+        replace(run(seed), meta={"source": f"{day}/run.csv"}) for seed, day in ((1, "mon"), (2, "tue"), (3, "wed"))
     ]
     result = identify([known], QUICK, profiles=0, held_out=others)
     assert list(result.held_out) == ["mon/run.csv", "tue/run.csv", "wed/run.csv"]
@@ -243,9 +232,7 @@ def test_no_window_reaches_across_a_gap_and_the_gap_is_said(known):
         assert np.max(np.diff(cut.time[first:stop])) < 0.01
     result = identify([cut], QUICK, profiles=0)
     assert result.model["gravity"] == pytest.approx(1.5, rel=2e-3)
-    assert any(
-        "no samples for 0.41 s from 2.29 s after its start" in sentence for sentence in result.sentences()
-    )
+    assert any("no samples for 0.41 s from 2.29 s after its start" in sentence for sentence in result.sentences())
     # The stream of the input may have the gap while the motion goes on.
     lossy = replace(known, input=known.input[keep], input_time=known.time[keep])
     piece = prepare(lossy, 1.0)

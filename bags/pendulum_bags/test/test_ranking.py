@@ -33,9 +33,9 @@ def contender(name: str, sim: float, hw: float, scatter: float = 0.01, runs: int
 def test_mmrv_is_its_definition(costs):
     sim, hw = (np.array(column) for column in zip(*costs, strict=True))
     n = len(costs)
-    expected = sum(
-        max(abs(hw[i] - hw[j]) * ((sim[i] > sim[j]) != (hw[i] > hw[j])) for j in range(n)) for i in range(n)
-    ) / n
+    expected = (
+        sum(max(abs(hw[i] - hw[j]) * ((sim[i] > sim[j]) != (hw[i] > hw[j])) for j in range(n)) for i in range(n)) / n
+    )
     assert mmrv(sim, hw) == pytest.approx(expected)
     assert mmrv(hw, hw) == 0.0
 
@@ -50,9 +50,7 @@ def test_a_simulation_that_orders_all_is_told_so():
 
 
 def test_the_wrong_pair_is_named_with_its_reason_and_its_price():
-    found = rank(
-        [contender("stiff", 1.0, 4.0, part=2), contender("soft", 2.0, 2.0), contender("slack", 6.0, 6.5)]
-    )
+    found = rank([contender("stiff", 1.0, 4.0, part=2), contender("soft", 2.0, 2.0), contender("slack", 6.0, 6.5)])
     (pair,) = found.wrong
     assert (pair.picked, pair.better, pair.sure) == ("stiff", "soft", True)
     assert pair.sim == pytest.approx(1.0)
@@ -70,9 +68,7 @@ def test_the_wrong_pair_is_named_with_its_reason_and_its_price():
 def test_a_pair_within_the_scatter_of_its_runs_is_not_called_wrong_for_sure():
     generator = np.random.default_rng(3)
     close = [contender("a", 1.0, 1.01), contender("b", 1.01, 1.0), contender("c", 3.0, 3.0)]
-    noisy = [
-        Contender(one.name, one.sim, one.hw * generator.uniform(0.7, 1.3, size=(4, 1))) for one in close
-    ]
+    noisy = [Contender(one.name, one.sim, one.hw * generator.uniform(0.7, 1.3, size=(4, 1))) for one in close]
     assert not any(pair.sure for pair in rank(noisy).wrong)
 
 

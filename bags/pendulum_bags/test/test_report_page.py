@@ -211,16 +211,12 @@ def hand_trials(folder: Path) -> Path:
     for number in (1, 2):
         position = 0.5 * np.pi * (1.0 - np.cos(2.0 * np.pi * t / 6.0)) + 0.02 * number * np.sin(9.0 * t)
         velocity = np.gradient(position, t)
-        write_trial(
-            folder / f"trial_{number}", t, position, -11.77 * velocity - 0.055 * np.gradient(velocity, t)
-        )
+        write_trial(folder / f"trial_{number}", t, position, -11.77 * velocity - 0.055 * np.gradient(velocity, t))
     return folder
 
 
 def staircase_trials(folder: Path) -> Path:
-    steps = np.radians(
-        [0, 10, 20, 30, 40, 50, 60, 70, 80, 90, 60, 30, 10, 0, -10, -40, -70, -90, -40, -10, 0]
-    )
+    steps = np.radians([0, 10, 20, 30, 40, 50, 60, 70, 80, 90, 60, 30, 10, 0, -10, -40, -70, -90, -40, -10, 0])
     t = np.arange(0.0, 2.0 * steps.size, 0.01)
     share = np.clip((t % 2.0) / 0.8, 0.0, 1.0)
     index = (t // 2.0).astype(int)
@@ -249,9 +245,7 @@ def test_identification_experiments_join_the_report(folder: Path, tmp_path: Path
         assert title in text
 
 
-def test_trials_alone_point_to_the_command_that_shows_them(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_trials_alone_point_to_the_command_that_shows_them(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main([str(hand_trials(tmp_path / "table"))]) == 2
     assert "holds trials and no run" in capsys.readouterr().err
 
@@ -261,22 +255,16 @@ def test_page_begins_with_the_answer_its_layers_and_what_to_do_next(page: Path) 
     top = text.split("<nav")[0]
     assert "</span>Yes</p>" in top
     assert "In this run simulation and the hardware move alike" in top
-    found = [
-        top.index(title) for title in ("1 same run", "2 same plant", "3 which controllers", "4 same choice")
-    ]
+    found = [top.index(title) for title in ("1 same run", "2 same plant", "3 which controllers", "4 same choice")]
     assert found == sorted(found)
     assert top.index("What to do next") > top.index("4 same choice")
 
 
 def test_layers_that_a_run_folder_keeps_are_in_its_report(comparison: Comparison, tmp_path: Path) -> None:
     row = Evidence("nu-gap", "", 0.31, 0.28, 0.35, "below 0.2", Mark.NO)
-    kept = LayerResult(
-        Layer.SAME_PLANT, Mark.NO, "The gap is 0.31.", (row,), reason="the hardware is 0.31 away"
-    )
+    kept = LayerResult(Layer.SAME_PLANT, Mark.NO, "The gap is 0.31.", (row,), reason="the hardware is 0.31 away")
     write_layer(tmp_path, kept)
-    text = write_report(tmp_path, comparison=comparison, recordings=[], formats=[]).read_text(
-        encoding="utf-8"
-    )
+    text = write_report(tmp_path, comparison=comparison, recordings=[], formats=[]).read_text(encoding="utf-8")
     assert "</span>No</p>" in text
     assert "<p>The hardware is 0.31 away." in text
     assert "Evidence: same plant" in text
@@ -289,9 +277,7 @@ def test_layers_that_a_run_folder_keeps_are_in_its_report(comparison: Comparison
 
 
 def test_every_text_of_a_report_says_that_the_hardware_was_emulated() -> None:
-    figure = Figure(
-        "hardware", "Hardware", "On the hardware, u.", [Panel("hardware [s]", "", [])], section="Verdict"
-    )
+    figure = Figure("hardware", "Hardware", "On the hardware, u.", [Panel("hardware [s]", "", [])], section="Verdict")
     named = name_in(figure, emulated=True)
     assert (named.title, named.sentence) == ("Emulated hardware", "On the emulated hardware, u.")
     assert named.panels[0].x_label == "emulated hardware [s]"

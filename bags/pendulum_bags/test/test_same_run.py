@@ -60,10 +60,7 @@ def test_every_test_can_fail_alone() -> None:
     """Motions made for the purpose: each differs in one thing, and the test of that thing finds it."""
     rng = np.random.default_rng(2)
     t = np.arange(0.0, 10.0, 0.002)
-    wave = sum(
-        rng.normal() * np.sin(2.0 * math.pi * f * t + rng.uniform(0.0, 6.0))
-        for f in np.arange(0.5, 15.0, 0.23)
-    )
+    wave = sum(rng.normal() * np.sin(2.0 * math.pi * f * t + rng.uniform(0.0, 6.0)) for f in np.arange(0.5, 15.0, 0.23))
     wave, other = 0.02 * wave / wave.std(), np.roll(0.02 * wave / wave.std(), 2500)
     still = Series(t, math.pi + wave, 5.0 * wave, 30.0 * wave)
 
@@ -94,9 +91,7 @@ def test_margins_in_units_are_those_of_the_signals() -> None:
     tests = {test.quantity: test for test in compare([(simulation, hardware)], margin=stated).verdict.tests}
     wider = hardware.window.position.std() - simulation.window.position.std()
     assert tests["spread of angle difference"].unit == "deg"
-    assert tests["spread of angle difference"].interval.estimate == pytest.approx(
-        math.degrees(wider), abs=0.004
-    )
+    assert tests["spread of angle difference"].interval.estimate == pytest.approx(math.degrees(wider), abs=0.004)
     assert tests["spread of torque difference"].outcome is Outcome.EQUIVALENT
     assert tests["distance of velocities"].unit == "deg/s"
 

@@ -30,6 +30,7 @@ from tests.fixtures import wait_for
 EXAMPLES = Path(__file__).parents[2] / "examples"
 SMALL = MonteCarlo(runs=700, chunk=300, duration=0.4)
 
+
 def has_arrow() -> bool:
     try:
         import pyarrow  # noqa: F401

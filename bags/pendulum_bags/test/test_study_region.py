@@ -21,6 +21,7 @@ from pendulum_msgs_py.plants.plant_parameters import PlantParameters, write_plan
 
 pytest.importorskip("pyarrow")
 
+
 @pytest.fixture(scope="module")
 def weak(tmp_path_factory: pytest.TempPathFactory) -> RegionMap:
     """Return a map of a light pendulum whose motor cannot hold it level: from most starts it falls."""

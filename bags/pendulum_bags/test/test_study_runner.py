@@ -264,13 +264,9 @@ def test_only_runs_that_differ_in_their_seed_alone_are_pooled_and_a_repeated_see
         place.parent.mkdir(parents=True)
         place.symlink_to(made[run.labels["seed"]])
     # Both runs of the last seed under the second controller failed.
-    failed = {
-        run.number for run in noises.runs if (run.labels["controller"], run.labels["seed"]) == ("soft", 2)
-    }
+    failed = {run.number for run in noises.runs if (run.labels["controller"], run.labels["seed"]) == ("soft", 2)}
     assert len(failed) == 2
-    records = [
-        {"number": run.number, "status": "failed" if run.number in failed else "done"} for run in noises.runs
-    ]
+    records = [{"number": run.number, "status": "failed" if run.number in failed else "done"} for run in noises.runs]
     result = pooled.analyse(tmp_path, noises, records)
     told = {content["of"][1]: content["runs"] for content in result["comparisons"]}
     assert told == {"lqr": 2, "soft": 1}

@@ -46,10 +46,7 @@ def test_yes_needs_all_measured_layers_and_names_those_that_were_not() -> None:
 
 
 def test_undecided_is_neither_and_nothing_measured_is_undecided() -> None:
-    assert (
-        sum_up([result(Layer.SAME_RUN, Mark.YES), result(Layer.SAME_PLANT, Mark.UNDECIDED)]).mark
-        is Mark.UNDECIDED
-    )
+    assert sum_up([result(Layer.SAME_RUN, Mark.YES), result(Layer.SAME_PLANT, Mark.UNDECIDED)]).mark is Mark.UNDECIDED
     nothing = sum_up([])
     assert nothing.mark is Mark.UNDECIDED
     assert nothing.next_steps[0] == "Measure “same run”: make experiment"

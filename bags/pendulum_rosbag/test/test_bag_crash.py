@@ -146,9 +146,7 @@ def test_small_chunks_become_large_ones_unseen(
             writer.write(
                 topic,
                 total,
-                b"\0\1\0\0"
-                + total.to_bytes(8, "little")
-                + (rng.randbytes(size // 2) + bytes(size - size // 2)),
+                b"\0\1\0\0" + total.to_bytes(8, "little") + (rng.randbytes(size // 2) + bytes(size - size // 2)),
             )
             total += 1
         if round_number % 13 == 12:
@@ -160,9 +158,7 @@ def test_small_chunks_become_large_ones_unseen(
         ends.append(writer._file._layout._size)  # type: ignore[attr-defined]
     writer.close()
     check()
-    assert len(set(ends)) > (
-        1 if compression else 2
-    )  # the end of the file moved, also while chunks were staged
+    assert len(set(ends)) > (1 if compression else 2)  # the end of the file moved, also while chunks were staged
     assert moments > (80 if compression else 150)
     with (bag / "bag_0.mcap").open("rb") as stream:
         summary = make_reader(stream).get_summary()

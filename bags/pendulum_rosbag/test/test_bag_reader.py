@@ -70,9 +70,7 @@ def test_bags_of_rosbags_read_the_same(
 
 @pytest.mark.parametrize("compression", list(CompressionType))
 @pytest.mark.parametrize("variant", ["all", "no_index", "no_chunks", "no_summary"])
-def test_files_of_the_mcap_library_read_the_same(
-    tmp_path: Path, compression: CompressionType, variant: str
-) -> None:
+def test_files_of_the_mcap_library_read_the_same(tmp_path: Path, compression: CompressionType, variant: str) -> None:
     path = library_file(tmp_path / "alone.mcap", compression, variant)
     bag = read_bag(path)
     assert not bag.damage

@@ -146,16 +146,11 @@ def test_messages_before_the_subscription_was_complete_are_told_and_are_no_loss(
     session.note_early("/a", 905)
     report = session.close()
     assert report.lost == 0
-    assert (
-        "nothing lost; published before the subscription was complete, and not recorded: /a 905"
-        in report.sentence()
-    )
+    assert "nothing lost; published before the subscription was complete, and not recorded: /a 905" in report.sentence()
     assert read_bag(tmp_path / "bag").metadata["pendulum.recorder.counts"]["/a"]["early"] == 905
 
 
-def test_a_disk_that_fails_ends_the_session_in_a_sentence(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_disk_that_fails_ends_the_session_in_a_sentence(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     writer = open_writer(tmp_path / "bag")
     reasons: list[str] = []
     session = RecordingSession(writer, seal_interval=0.02, on_failure=reasons.append)
@@ -242,9 +237,7 @@ def test_topics_are_chosen_by_name_pattern_and_exclusion() -> None:
     assert [some.wants(topic) for topic in ("/a", "/b", "/sim/x", "/sim/push")] == [True, False, True, False]
 
 
-def test_an_existing_folder_is_refused_with_exit_code_2(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_an_existing_folder_is_refused_with_exit_code_2(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert record_main(["-o", str(tmp_path)]) == 2
     assert "exists already; expected a new folder" in capsys.readouterr().err
 
@@ -287,9 +280,7 @@ def wait_until_received(node: Node, **numbers: int) -> dict[str, Any]:
     def received() -> dict[str, Any]:
         status: dict[str, Any] = json.loads(call(node, "/recorder/status").message)
         topics = {name.strip("/").replace("/", "_"): counts for name, counts in status["topics"].items()}
-        whole = all(
-            topics.get(name, {"received": 0})["received"] >= number for name, number in numbers.items()
-        )
+        whole = all(topics.get(name, {"received": 0})["received"] >= number for name, number in numbers.items())
         return status if whole else {}
 
     return wait_for(received, 60.0, f"the recorder to receive {numbers}", period=0.05)
@@ -303,25 +294,19 @@ def wait_until_matched(*publishers: object) -> None:
     )
 
 
-def test_a_recording_holds_everything_and_says_so(
-    tmp_path: Path, node: Node, processes: ProcessGroup
-) -> None:
+def test_a_recording_holds_everything_and_says_so(tmp_path: Path, node: Node, processes: ProcessGroup) -> None:
     bag = tmp_path / "run"
     metadata = tmp_path / "metadata.json"
     metadata.write_text(json.dumps({"pendulum.run": {"seed": 42}}))
     node.declare_parameter("gain", [1.5, 2.0])
     fast = node.create_publisher(JointState, "/sim/joint_states", qos.STATE)
     plain = node.create_publisher(JointState, "/sim/effort_command", qos.COMMAND)
-    sloppy = node.create_publisher(
-        Float64, "/sloppy", QoSProfile(depth=5, reliability=ReliabilityPolicy.BEST_EFFORT)
-    )
+    sloppy = node.create_publisher(Float64, "/sloppy", QoSProfile(depth=5, reliability=ReliabilityPolicy.BEST_EFFORT))
     events = node.create_publisher(String, "/sim/events", qos.EVENTS)
     events.publish(event_message(5, "ramp_up"))  # before the recorder is there
     shared = [node.create_publisher(Float64, "/shared", qos.STATE) for _ in range(2)]
     for index in range(40):
-        shared[index % 4 == 3].publish(
-            Float64(data=-1.0)
-        )  # the one is at number 30 when it is met, the other at 10
+        shared[index % 4 == 3].publish(Float64(data=-1.0))  # the one is at number 30 when it is met, the other at 10
     recording = processes.start(
         "pendulum_bags", "record", "-o", bag, "--metadata", metadata, "--exclude", "parameter_events|rosout"
     )
@@ -524,9 +509,7 @@ def test_what_is_missed_while_a_topic_is_subscribed_to_anew_is_told(
         rclpy.shutdown()
 
 
-def test_kill_9_loses_at_most_a_fifth_of_a_second(
-    tmp_path: Path, node: Node, processes: ProcessGroup
-) -> None:
+def test_kill_9_loses_at_most_a_fifth_of_a_second(tmp_path: Path, node: Node, processes: ProcessGroup) -> None:
     rng = random.Random(21)
     for number in range(3):
         bag = tmp_path / f"run{number}"
@@ -569,9 +552,7 @@ def test_a_bag_is_played_as_it_was_recorded(tmp_path: Path, node: Node, processe
         writer.add_topic("/sim/events", STRING)
         for index in range(200):
             time_ns = 5_000_000_000 + index * 5_000_000
-            writer.write(
-                "/sim/joint_states", time_ns, encode_joint_state(time_ns, position=0.1 * index, velocity=0.0)
-            )
+            writer.write("/sim/joint_states", time_ns, encode_joint_state(time_ns, position=0.1 * index, velocity=0.0))
         text = b'{"name": "hold"}\0'
         writer.write("/sim/events", 5_500_000_000, b"\0\1\0\0" + len(text).to_bytes(4, "little") + text)
     copy = tmp_path / "copy"

@@ -57,9 +57,7 @@ def our_bag(path: Path, storage: str, *, close: bool = True) -> Path:
 def rosbags_bag(path: Path, storage: str) -> Path:
     writer = RosbagsWriter(path, version=9, storage_plugin=StoragePlugin[storage.upper()])
     with writer:
-        connections: list[Any] = [
-            writer.add_connection(t, JOINT_STATE, typestore=typestore()) for t in TOPICS
-        ]
+        connections: list[Any] = [writer.add_connection(t, JOINT_STATE, typestore=typestore()) for t in TOPICS]
         for index in range(30_000 if storage == "mcap" else 3000):
             writer.write(connections[index % 3], index, state(index))
     return path
@@ -229,9 +227,7 @@ def test_a_topic_of_two_types_keeps_the_bag_readable_and_repair_says_what_it_lef
 
 @pytest.mark.parametrize("writer", ["ours", "rosbags"])
 def test_a_truncated_sqlite_file_gives_back_the_rows_on_its_pages(tmp_path: Path, writer: str) -> None:
-    bag = (
-        our_bag(tmp_path / "bag", "sqlite3") if writer == "ours" else rosbags_bag(tmp_path / "bag", "sqlite3")
-    )
+    bag = our_bag(tmp_path / "bag", "sqlite3") if writer == "ours" else rosbags_bag(tmp_path / "bag", "sqlite3")
     file = storage_file(bag)
     sound = file.read_bytes()
     rng = random.Random(9)
@@ -321,9 +317,7 @@ def test_a_hot_journal_is_rolled_back_and_the_bag_stays_untouched(tmp_path: Path
         "print('go', flush=True)\n"
         "sys.stdin.read()\n"
     )
-    child = subprocess.Popen(
-        [sys.executable, "-c", script, str(file)], stdin=subprocess.PIPE, stdout=subprocess.PIPE
-    )
+    child = subprocess.Popen([sys.executable, "-c", script, str(file)], stdin=subprocess.PIPE, stdout=subprocess.PIPE)
     assert child.stdout is not None
     assert child.stdout.readline() == b"go\n"
     child.send_signal(signal.SIGKILL)

@@ -25,9 +25,7 @@ JOINT_STATE_HASH = "RIHS01_a13ee3a330e346c9d87b5aa18d24e11690752bd33a0350f11c588
 
 
 @pytest.mark.parametrize(("storage", "compression"), [("mcap", None), ("mcap", "zstd"), ("sqlite3", None)])
-def test_what_is_sealed_is_in_the_bag_for_every_reader(
-    tmp_path: Path, storage: str, compression: str | None
-) -> None:
+def test_what_is_sealed_is_in_the_bag_for_every_reader(tmp_path: Path, storage: str, compression: str | None) -> None:
     bag = tmp_path / "bag"
     writer = open_writer(bag, storage, compression)
     writer.add_topic("/a", JOINT_STATE)
@@ -139,9 +137,7 @@ def test_sqlite_files_have_the_index_that_rosbag2_seeks_by(tmp_path: Path) -> No
         for index in range(100):
             writer.write("/a", index, state(index))
     connection = sqlite3.connect(bag / "bag_0.db3")
-    assert connection.execute("SELECT name FROM sqlite_master WHERE type = 'index'").fetchall() == [
-        ("timestamp_idx",)
-    ]
+    assert connection.execute("SELECT name FROM sqlite_master WHERE type = 'index'").fetchall() == [("timestamp_idx",)]
     assert connection.execute("SELECT schema_version, ros_distro FROM schema").fetchall() == [(4, "jazzy")]
     assert "bag_0.db3" in connection.execute("SELECT metadata FROM metadata").fetchone()[0]
     connection.close()

@@ -114,9 +114,7 @@ def test_latencies_are_matched_by_echoed_stamps(tmp_path: Path) -> None:
         for index in range(1, 200):
             stamp = index * 2_000_000
             writer.write("/joint_states", stamp + 100_000, encode_joint_state(stamp, position=1.0))
-            writer.write(
-                "/effort_command", stamp + 350_000, encode_joint_state(stamp, frame_id="lqr", effort=1.0)
-            )
+            writer.write("/effort_command", stamp + 350_000, encode_joint_state(stamp, frame_id="lqr", effort=1.0))
     statistics = bag_statistics(read_bag(path))
     (latency,) = statistics.latencies
     assert (latency.source, latency.answer, latency.matched) == ("/joint_states", "/effort_command", 199)
@@ -212,16 +210,12 @@ def test_parquet_reads_back(tmp_path: Path) -> None:
     assert pd.read_parquet(file)["position"].tolist() == [0.1 * index for index in range(10)]
 
 
-def test_the_commands_print_tables_json_and_sentences(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_the_commands_print_tables_json_and_sentences(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     path = tmp_path / "bag"
     with open_writer(path, metadata={"run": {"seed": 1}}) as writer:
         writer.add_topic("/a", JOINT_STATE)
         for index in range(100):
-            writer.write(
-                "/a", 1000 + index * 2_000_000, encode_joint_state(1 + index * 2_000_000, position=0.0)
-            )
+            writer.write("/a", 1000 + index * 2_000_000, encode_joint_state(1 + index * 2_000_000, position=0.0))
     assert info_main([str(path)]) == 0
     assert "/a" in (table := capsys.readouterr().out)
     assert "500.000" in table

@@ -105,9 +105,7 @@ def _columns(folder: Path) -> dict[str, list[float]]:
             for name, value in values.items():
                 columns.setdefault(name, []).append(float(value))
     if not columns:
-        raise DataError(
-            f"bag {folder} has no feedback; expected messages on actuator/feedback or joint_states"
-        )
+        raise DataError(f"bag {folder} has no feedback; expected messages on actuator/feedback or joint_states")
     return columns
 
 

@@ -119,9 +119,7 @@ class EmulatorProcessBackend:
 
     def set_gains(self, gains: GainSet) -> GainSet:
         """Set the gains of all loops."""
-        return wire.gains_from_json(
-            self._request({"settings": {"gains": wire.gains_to_json(gains)}})["gains"]
-        )
+        return wire.gains_from_json(self._request({"settings": {"gains": wire.gains_to_json(gains)}})["gains"])
 
     def set_limits(self, limits: HardwareLimits) -> HardwareLimits:
         """Set the firmware's limits."""
@@ -157,9 +155,7 @@ class EmulatorProcessBackend:
             try:
                 self._request({"settings": {"strategy": int(Strategy.OFF)}}, patience=_STOP_PATIENCE)
             except ActuatorError as error:
-                raise ActuatorError(
-                    "stop_unacknowledged", f"{error}; the command lifetime ends its torque"
-                ) from error
+                raise ActuatorError("stop_unacknowledged", f"{error}; the command lifetime ends its torque") from error
         self._off_confirmed = True
 
     def close(self) -> None:

@@ -111,9 +111,7 @@ def discover(
     return sorted(records, key=lambda record: (record.family, record.name, record.mac_address))
 
 
-def select_module(
-    modules: Sequence[ModuleRecord], wanted: ModuleSelection, *, seconds: float
-) -> ModuleRecord:
+def select_module(modules: Sequence[ModuleRecord], wanted: ModuleSelection, *, seconds: float) -> ModuleRecord:
     """Return the one module that is meant.
 
     Args:
@@ -128,9 +126,7 @@ def select_module(
     fitting = [module for module in modules if wanted.names(module)]
     alive = [module for module in fitting if not module.stale]
     if fitting and not alive:
-        raise ActuatorError(
-            "module_lost", f"HEBI module {fitting[0]} was seen but is silent now; is its supply on?"
-        )
+        raise ActuatorError("module_lost", f"HEBI module {fitting[0]} was seen but is silent now; is its supply on?")
     if not alive:
         raise ActuatorError(
             "module_lost", f"no HEBI module {wanted} answered within {seconds:g} s; modules seen: {listed}"

@@ -75,9 +75,7 @@ class FeedbackRecording:
             raise DataError(f"{where}: 0 records; expected at least 1")
         time = arrays.pop("time")
         if not np.all(np.isfinite(time)) or np.any(np.diff(time) <= 0.0):
-            raise DataError(
-                f"{where}: time does not increase from record to record; expected seconds in order"
-            )
+            raise DataError(f"{where}: time does not increase from record to record; expected seconds in order")
         self.time_ns = np.rint((time - time[0]) * NANOSECONDS).astype(np.int64)
         self.columns = arrays
         self.size = size
@@ -98,9 +96,7 @@ class FeedbackRecording:
         """
         values = {name: _DEFAULTS.get(name, math.nan) for name in FEEDBACK_QUANTITIES}
         values.update({name: float(column[index]) for name, column in self.columns.items()})
-        return Feedback._make(
-            (stamp_ns, stamp_ns, index + 1, *(values[name] for name in FEEDBACK_QUANTITIES), *_FLAGS)
-        )
+        return Feedback._make((stamp_ns, stamp_ns, index + 1, *(values[name] for name in FEEDBACK_QUANTITIES), *_FLAGS))
 
 
 def load_feedback(path: str | Path) -> FeedbackRecording:
@@ -164,9 +160,7 @@ def _read_csv(path: Path) -> dict[str, list[float]]:
                 try:
                     columns[name].append(float(text))
                 except ValueError as error:
-                    raise DataError(
-                        f"{path}:{reader.line_num}: {name} is {text!r}; expected a number"
-                    ) from error
+                    raise DataError(f"{path}:{reader.line_num}: {name} is {text!r}; expected a number") from error
     return columns
 
 
@@ -181,9 +175,7 @@ class ReplayBackend:
 
     name = "replay"
 
-    def __init__(
-        self, recording: FeedbackRecording, clock: Clock | None = None, *, loop: bool = False
-    ) -> None:
+    def __init__(self, recording: FeedbackRecording, clock: Clock | None = None, *, loop: bool = False) -> None:
         self.recording = recording
         self._clock = clock or WallClock()
         self._loop = loop

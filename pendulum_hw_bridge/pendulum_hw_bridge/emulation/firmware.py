@@ -152,9 +152,7 @@ def control_pwm(
         pwm = 0.0 if math.isnan(setpoints[EFFORT]) else setpoints[EFFORT]
     elif strategy in (2, 4):
         from_position = pid_step(gains, memory, POSITION, setpoints[POSITION], position, 0.0, period)
-        from_velocity = pid_step(
-            gains, memory, VELOCITY, setpoints[VELOCITY], velocity, velocity_normaliser, period
-        )
+        from_velocity = pid_step(gains, memory, VELOCITY, setpoints[VELOCITY], velocity, velocity_normaliser, period)
         all_off = math.isnan(setpoints[EFFORT]) and math.isnan(setpoints[POSITION])
         if strategy == 2:
             all_off = all_off and math.isnan(setpoints[VELOCITY])

@@ -138,9 +138,7 @@ class EmulatorParameters:
             torque_constant_at(temperature, drive.torque_constant, beta),
             torque_constant_at(temperature, drive.back_emf_constant, beta),
             drive.gear_ratio,
-            winding_resistance_at(
-                temperature, drive.winding_resistance, drive.resistance_temperature_coefficient
-            ),
+            winding_resistance_at(temperature, drive.winding_resistance, drive.resistance_temperature_coefficient),
         )
 
     def constants(self, limits: HardwareLimits, supply_voltage: float, enabled: bool) -> Array:

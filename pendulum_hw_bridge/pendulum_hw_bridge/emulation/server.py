@@ -39,9 +39,7 @@ class EmulatorServer:
         PendulumError: The address is in use or not ours.
     """
 
-    def __init__(
-        self, actuator: EmulatedX5, address: Address, clock: Callable[[], int] | None = None
-    ) -> None:
+    def __init__(self, actuator: EmulatedX5, address: Address, clock: Callable[[], int] | None = None) -> None:
         self.actuator = actuator
         self._clock = clock or SteadyWallClock()
         self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
@@ -49,9 +47,7 @@ class EmulatorServer:
             self._socket.bind(address)
         except OSError as error:
             self._socket.close()
-            raise PendulumError(
-                f"emulator cannot listen on {address[0]}:{address[1]}: {error.strerror}"
-            ) from error
+            raise PendulumError(f"emulator cannot listen on {address[0]}:{address[1]}: {error.strerror}") from error
         self._socket.setblocking(False)
         self._listeners: dict[Address, int] = {}
         self.refused_packets = 0

@@ -98,11 +98,7 @@ def decode_json(packet: bytes) -> dict[str, Any]:
 def gains_to_json(gains: GainSet) -> dict[str, Any]:
     """Return gains as JSON; a clamp at infinity is left out."""
     loops = {
-        loop: {
-            name: value
-            for name in GAIN_FIELDS
-            if math.isfinite(value := float(getattr(gains.loop(loop), name)))
-        }
+        loop: {name: value for name in GAIN_FIELDS if math.isfinite(value := float(getattr(gains.loop(loop), name)))}
         for loop in LOOPS
     }
     return {"strategy": gains.strategy, **loops}

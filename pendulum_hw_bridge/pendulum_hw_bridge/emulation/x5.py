@@ -211,9 +211,7 @@ class EmulatedX5:
             self._clock_offset_ns = -self.now_ns
             self._sequence = 0
         elif fault is ActuatorFault.STRATEGY_CHANGED:
-            self.strategy = (
-                Strategy.PARALLEL_PWM if self.strategy is Strategy.DIRECT_PWM else Strategy.DIRECT_PWM
-            )
+            self.strategy = Strategy.PARALLEL_PWM if self.strategy is Strategy.DIRECT_PWM else Strategy.DIRECT_PWM
         elif fault is ActuatorFault.PWM_STUCK:
             self._stuck_pwm = float(self._state[8]) or _STUCK_PWM
         elif fault is ActuatorFault.PWM_RUNAWAY:
@@ -330,9 +328,7 @@ class EmulatedX5:
             nominal = round(NANOSECONDS * period)
             # Jitter around a regular raster: a late record does not make all later ones late.
             self._raster_ns = (self._raster_ns if self._samples > 1 else time_ns) + nominal
-            self._next_sample_ns = max(
-                self._raster_ns + round(NANOSECONDS * jitter), time_ns + kernel.STEP_NS
-            )
+            self._next_sample_ns = max(self._raster_ns + round(NANOSECONDS * jitter), time_ns + kernel.STEP_NS)
 
     def _receive(self, command: Command, time_ns: int, sender: int) -> None:
         if ActuatorFault.COMMANDS_LOST in self.faults:

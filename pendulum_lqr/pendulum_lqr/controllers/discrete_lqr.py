@@ -76,17 +76,13 @@ class DiscreteLqr(BaseController):
             )
         delay = p["delay"] + plant.transport_delay
         if delay > _MOST_PENDING * period:
-            raise DesignError(
-                f"delay is {delay} s at a period of {period} s; expected at most {_MOST_PENDING} periods"
-            )
+            raise DesignError(f"delay is {delay} s at a period of {period} s; expected at most {_MOST_PENDING} periods")
         sampled = discretise(model, period, p["delay"])
         if p["cost"] == "sum":
             gain = discrete_lqr(sampled, p["q"], p["r"])
         else:
             gain = discrete_lqr(sampled, *sampled_cost(model, p["q"], p["r"], period, p["delay"]))
-        return cls(
-            sampled, gain, model.effort, p["effort_limit"], p["set_point"], feedforward=p["feedforward"]
-        )
+        return cls(sampled, gain, model.effort, p["effort_limit"], p["set_point"], feedforward=p["feedforward"])
 
     def reset(self) -> None:
         """Start with no torque in the lag and none on its way."""

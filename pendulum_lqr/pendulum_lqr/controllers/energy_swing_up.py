@@ -54,9 +54,7 @@ class EnergySwingUp(BaseController):
                       minimum=0.0, maximum=1.0, exclusive_minimum=True),
     )  # fmt: skip
 
-    def __init__(
-        self, plant: PlantParameters, gain: float, margin: float, catch: Catch, effort_limit: float
-    ) -> None:
+    def __init__(self, plant: PlantParameters, gain: float, margin: float, catch: Catch, effort_limit: float) -> None:
         super().__init__(effort_limit, catch.set_point)
         if effort_limit <= plant.static_friction + abs(plant.torque_offset):
             raise DesignError(
@@ -78,9 +76,7 @@ class EnergySwingUp(BaseController):
     @classmethod
     def design(cls, plant: PlantParameters, period: float, p: Mapping[str, Any]) -> EnergySwingUp:
         """Return the swing-up controller with its catch designed under the torque limit."""
-        catch = make_catch(
-            plant, p["catch_q"], p["catch_r"], p["effort_limit"], p["catch_share"], p["set_point"]
-        )
+        catch = make_catch(plant, p["catch_q"], p["catch_r"], p["effort_limit"], p["catch_share"], p["set_point"])
         return cls(plant, p["gain"], p["energy_margin"], catch, p["effort_limit"])
 
     def reset(self) -> None:

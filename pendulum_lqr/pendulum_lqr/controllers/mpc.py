@@ -51,9 +51,7 @@ class LinearMpc(BaseController):
         Q,
         R,
         ParameterSpec("horizon", 20, "-", "Samples of the horizon.", minimum=1, maximum=200),
-        ParameterSpec(
-            "angle_limit", 0.5, "rad", "Largest deviation from the set-point; 0 for none.", minimum=0.0
-        ),
+        ParameterSpec("angle_limit", 0.5, "rad", "Largest deviation from the set-point; 0 for none.", minimum=0.0),
         ParameterSpec("velocity_limit", 0.0, "rad/s", "Largest velocity; 0 for none.", minimum=0.0),
         OFFSET_NOISE,
         DELAY,

@@ -60,9 +60,7 @@ class Pid(BaseController):
         self._slope = (1.0 - self._pole) / period
         integral_time = gains.kp / gains.ki if gains.ki > 0.0 else math.inf
         derivative_time = gains.kd / gains.kp if gains.kp > 0.0 else 0.0
-        tracking_time = (
-            max(math.sqrt(integral_time * derivative_time), period) if gains.ki > 0.0 else math.inf
-        )
+        tracking_time = max(math.sqrt(integral_time * derivative_time), period) if gains.ki > 0.0 else math.inf
         self._tracking = period / tracking_time
         self.reset()
 
@@ -72,9 +70,7 @@ class Pid(BaseController):
         if p["tuning"] == "manual":
             gains = PidGains(p["kp"], p["ki"], p["kd"])
         else:
-            gains = _tune(
-                plant, period, p["set_point"], p["tuning"], p["derivative_filter"], tuple(p["q"]), p["r"]
-            )
+            gains = _tune(plant, period, p["set_point"], p["tuning"], p["derivative_filter"], tuple(p["q"]), p["r"])
         return cls(gains, period, p["derivative_filter"], p["effort_limit"], p["set_point"])
 
     def reset(self) -> None:

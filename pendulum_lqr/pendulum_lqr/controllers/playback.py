@@ -35,9 +35,7 @@ class Playback(BaseController):
     FEEDBACK = False
     SUMMARY = "open loop: plays a recorded torque"
     PARAMETERS = (
-        ParameterSpec(
-            "file", "", "", "CSV file with a header line and the columns time [s] and effort [N m]."
-        ),
+        ParameterSpec("file", "", "", "CSV file with a header line and the columns time [s] and effort [N m]."),
     )
 
     def __init__(self, times: ArrayLike, efforts: ArrayLike, effort_limit: float) -> None:
@@ -45,9 +43,7 @@ class Playback(BaseController):
         t = np.asarray(times, dtype=np.float64)
         u = np.asarray(efforts, dtype=np.float64)
         if t.ndim != 1 or t.shape != u.shape or t.size < 2:
-            raise DataError(
-                f"playback has times {t.shape} and torques {u.shape}; expected equal (n,) with n >= 2"
-            )
+            raise DataError(f"playback has times {t.shape} and torques {u.shape}; expected equal (n,) with n >= 2")
         if not (np.all(np.isfinite(t)) and np.all(np.isfinite(u))):
             raise DataError("playback holds a time or a torque that is not finite")
         if np.any(np.diff(t) <= 0.0):
@@ -61,9 +57,7 @@ class Playback(BaseController):
     def design(cls, plant: PlantParameters, period: float, p: Mapping[str, Any]) -> Playback:
         """Return the playback of the parameter ``file``."""
         if not p["file"]:
-            raise DataError(
-                "file is empty; expected the path of a CSV with the columns time [s] and effort [N m]"
-            )
+            raise DataError("file is empty; expected the path of a CSV with the columns time [s] and effort [N m]")
         path = Path(p["file"]).expanduser()
         rows = read_text(path, "playback file", limit=_LARGEST_FILE).splitlines()[1:]
         values: list[tuple[float, float]] = []

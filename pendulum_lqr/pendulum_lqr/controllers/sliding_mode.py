@@ -38,9 +38,7 @@ class SlidingMode(BaseController):
     SERIES_ELASTIC = False
     SUMMARY = "sliding mode with a boundary layer: gives way by d / (lambda (b + k / phi)) to a constant torque d"
     PARAMETERS = (
-        ParameterSpec(
-            "rate", 5.0, "1/s", "Slope of the sliding line, lambda.", minimum=0.0, exclusive_minimum=True
-        ),
+        ParameterSpec("rate", 5.0, "1/s", "Slope of the sliding line, lambda.", minimum=0.0, exclusive_minimum=True),
         ParameterSpec("gain", 1.0, "N m", "Switching torque, k.", minimum=0.0),
         ParameterSpec(
             "layer",

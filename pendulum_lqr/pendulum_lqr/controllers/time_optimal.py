@@ -33,12 +33,8 @@ class TimeOptimal(BaseController):
     SUMMARY = "swing-up in minimum time by dynamic programming, caught by LQR"
     PARAMETERS = (
         ParameterSpec("grid", 400, "-", "Grid points in angle and in velocity.", minimum=40, maximum=1000),
-        ParameterSpec(
-            "catch_q", [100.0, 1.0], "1/rad^2, s^2/rad^2", "Weights of the LQR that catches.", minimum=0.0
-        ),
-        ParameterSpec(
-            "catch_r", 0.1, "1/(N m)^2", "Its weight of torque.", minimum=0.0, exclusive_minimum=True
-        ),
+        ParameterSpec("catch_q", [100.0, 1.0], "1/rad^2, s^2/rad^2", "Weights of the LQR that catches.", minimum=0.0),
+        ParameterSpec("catch_r", 0.1, "1/(N m)^2", "Its weight of torque.", minimum=0.0, exclusive_minimum=True),
         ParameterSpec(
             "catch_share",
             0.9,
@@ -63,9 +59,7 @@ class TimeOptimal(BaseController):
     @classmethod
     def design(cls, plant: PlantParameters, period: float, p: Mapping[str, Any]) -> TimeOptimal:
         """Return the controller; the table takes a second or two and is kept for the next design."""
-        catch = make_catch(
-            plant, p["catch_q"], p["catch_r"], p["effort_limit"], p["catch_share"], p["set_point"]
-        )
+        catch = make_catch(plant, p["catch_q"], p["catch_r"], p["effort_limit"], p["catch_share"], p["set_point"])
         table = _table(
             plant, p["effort_limit"], tuple(p["catch_q"]), p["catch_r"], p["catch_share"], p["set_point"], p["grid"]
         )
@@ -90,9 +84,7 @@ class TimeOptimal(BaseController):
         plant = self._plant
         h = self.horizon / self._substeps
         for _ in range(self._substeps):
-            acceleration = acceleration_from_upright(
-                plant, angle, velocity, effort, sign_velocity=SIGN_VELOCITY
-            )
+            acceleration = acceleration_from_upright(plant, angle, velocity, effort, sign_velocity=SIGN_VELOCITY)
             angle += h * (velocity + 0.5 * h * acceleration)
             velocity += h * acceleration
         return angle, velocity

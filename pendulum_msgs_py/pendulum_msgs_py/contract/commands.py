@@ -139,11 +139,7 @@ class CommandGate:
         if newest is None or newest.stamp_ns - now_ns > self.future_tolerance_ns:
             return None
         silence = now_ns - self._heard_ns
-        if (
-            self.single_commander
-            and command.source != self._holder
-            and 0 <= silence <= COMMANDER_HOLD * NANOSECONDS
-        ):
+        if self.single_commander and command.source != self._holder and 0 <= silence <= COMMANDER_HOLD * NANOSECONDS:
             return Refusal.SECOND_COMMANDER
         if command.stamp_ns == newest.stamp_ns:
             return Refusal.DUPLICATE

@@ -70,9 +70,7 @@ class Trajectory:
             raise ParameterError("trajectory has 0 points; expected at least one")
         previous = -math.inf
         for index, point in enumerate(self.points):
-            if not (
-                math.isfinite(point.time) and math.isfinite(point.position) and math.isfinite(point.velocity)
-            ):
+            if not (math.isfinite(point.time) and math.isfinite(point.position) and math.isfinite(point.velocity)):
                 raise ParameterError(f"trajectory point {index} is {point}; expected finite numbers")
             if abs(point.position) > MAX_POSITION:
                 raise ParameterError(
@@ -80,8 +78,7 @@ class Trajectory:
                 )
             if point.time < 0.0 or point.time <= previous:
                 raise ParameterError(
-                    f"trajectory point {index} is at {point.time} s; "
-                    f"expected >= 0 s and later than {previous} s"
+                    f"trajectory point {index} is at {point.time} s; expected >= 0 s and later than {previous} s"
                 )
             previous = point.time
         positions = [point.position for point in self.points]
@@ -210,9 +207,7 @@ def thesis_ramp(
     )
 
 
-def from_points(
-    times: Sequence[float], positions: Sequence[float], velocities: Sequence[float]
-) -> Trajectory:
+def from_points(times: Sequence[float], positions: Sequence[float], velocities: Sequence[float]) -> Trajectory:
     """Return a trajectory from sequences of one length: times [s], positions [rad], velocities [rad/s]."""
     if not len(times) == len(positions) == len(velocities):
         raise ParameterError(

@@ -122,9 +122,7 @@ def spring_torque(
         hardening: k_3 [N m/rad^3]; 0 for a linear spring.
         hysteresis_torque: tau_h, half width of the loop [N m].
     """
-    return (
-        stiffness + hardening * deflection * deflection
-    ) * deflection + hysteresis_torque * hysteresis_state
+    return (stiffness + hardening * deflection * deflection) * deflection + hysteresis_torque * hysteresis_state
 
 
 def spring_stiffness(deflection: float, stiffness: float, hardening: float) -> float:
@@ -193,9 +191,7 @@ def motor_acceleration(
         motor_damping: b_v [N m s/rad].
         reflected_inertia: J = J_r N^2 [kg m^2].
     """
-    return (
-        torque_constant * gear_ratio * current - motor_damping * motor_velocity - spring
-    ) / reflected_inertia
+    return (torque_constant * gear_ratio * current - motor_damping * motor_velocity - spring) / reflected_inertia
 
 
 def dry_friction_step(velocity: float, friction: float, inertia: float, dt: float) -> float:

@@ -190,9 +190,7 @@ def fixed_points(plant: RigidPlant, effort: float = 0.0) -> tuple[FixedPoint, ..
     )
 
 
-def overdamped_velocity(
-    plant: RigidPlant, theta: NDArray[np.float64], effort: float = 0.0
-) -> NDArray[np.float64]:
+def overdamped_velocity(plant: RigidPlant, theta: NDArray[np.float64], effort: float = 0.0) -> NDArray[np.float64]:
     """Return x' = (gain u_0 + tau_0 - G_c sin(x - theta_0)) / b, the velocity where damping outweighs inertia [rad/s].
 
     Args:

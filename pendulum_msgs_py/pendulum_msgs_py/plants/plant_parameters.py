@@ -274,9 +274,7 @@ def _read_quantities(
     for name, entry in mapping.items():
         spec = table[name]
         if not isinstance(entry, dict):
-            raise ParameterError(
-                f"{where}.{name} is {entry!r}; expected {{value: NUMBER, unit: {spec.unit}}}"
-            )
+            raise ParameterError(f"{where}.{name} is {entry!r}; expected {{value: NUMBER, unit: {spec.unit}}}")
         reject_unknown(entry, ("value", "unit", "interval"), where=f"{where}.{name}")
         unit = entry.get("unit")
         if unit != spec.unit:

@@ -146,7 +146,11 @@ NODES: dict[str, Permissions] = {
             *(
                 _SIDE + name
                 for name in (
-                    names.EVENTS, names.JOINT_STATES, names.EFFORT_COMMAND, names.DISTURBANCE, names.APPLIED_EFFORT
+                    names.EVENTS,
+                    names.JOINT_STATES,
+                    names.EFFORT_COMMAND,
+                    names.DISTURBANCE,
+                    names.APPLIED_EFFORT,
                 )
             ),
         ),
@@ -194,9 +198,7 @@ def granted(plants: Iterable[tuple[str, str]] = tuple(PLANTS.items())) -> dict[s
     if unknown := set(sides.values()) - set(PLANTS.values()):
         raise ParameterError(f"plant is {min(unknown)}; expected one of {', '.join(PLANTS.values())}")
     nodes = [
-        (side, node)
-        for side, plant in sides.items()
-        for node in (plant, *_WITH_PLANT.get(plant, ()), *_SIDE_NODES)
+        (side, node) for side, plant in sides.items() for node in (plant, *_WITH_PLANT.get(plant, ()), *_SIDE_NODES)
     ]
     with_parameters = [_resolve(node, "", side) for side, node in nodes if node not in _WITHOUT_PARAMETERS]
     with_parameters += [f"/{node}" for node in BESIDE_PLANTS if node not in _WITHOUT_PARAMETERS]

@@ -63,9 +63,7 @@ class WholeTable(Table):
         cells = []
         for index, width in zip(block, widths, strict=True):
             column = self.columns[index]
-            part.add_column(
-                column.header, justify=column.justify, style=column.style, width=width, overflow="fold"
-            )
+            part.add_column(column.header, justify=column.justify, style=column.style, width=width, overflow="fold")
             cells.append(list(column.cells))
         for row, content in zip(self.rows, zip(*cells, strict=True), strict=True):
             part.add_row(*content, style=row.style, end_section=row.end_section)

@@ -111,6 +111,4 @@ class CommanderWatch:
         plants = self._node.count_publishers(self._states)
         if plants < 2:
             return ""
-        return (
-            f"{plants} plants on {self._states}, and commands answer another's states; expected one: zero torque"
-        )
+        return f"{plants} plants on {self._states}, and commands answer another's states; expected one: zero torque"

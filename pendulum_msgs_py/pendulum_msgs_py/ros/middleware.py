@@ -116,7 +116,6 @@ def check_closed(domain: int) -> None:
                 f"alone, as {_LOOPBACK} says (open it with {_RANGE}=SUBNET, if that is meant)"
             )
 
-
     number, most = participant_number(joined, domain), _most_participants()
     if number > most:
         raise FaultError(

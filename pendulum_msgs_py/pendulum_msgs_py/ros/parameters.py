@@ -124,9 +124,7 @@ def _refuse_unknown(node: Node, specs: Mapping[str, ParameterSpec]) -> None:
     given = [
         name
         for name in node._parameter_overrides
-        if name not in _PARAMETERS_OF_ROS
-        and not name.startswith(_PREFIXES_OF_ROS)
-        and not node.has_parameter(name)
+        if name not in _PARAMETERS_OF_ROS and not name.startswith(_PREFIXES_OF_ROS) and not node.has_parameter(name)
     ]
     unknown = [name for name in given if name not in specs]
     if not unknown:
@@ -176,7 +174,5 @@ def _descriptor(spec: ParameterSpec) -> ParameterDescriptor:
                 FloatingPointRange(from_value=float(spec.minimum), to_value=float(spec.maximum))
             ]
         elif isinstance(spec.default, int) and not isinstance(spec.default, bool):
-            descriptor.integer_range = [
-                IntegerRange(from_value=int(spec.minimum), to_value=int(spec.maximum), step=1)
-            ]
+            descriptor.integer_range = [IntegerRange(from_value=int(spec.minimum), to_value=int(spec.maximum), step=1)]
     return descriptor

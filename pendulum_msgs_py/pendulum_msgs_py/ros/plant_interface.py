@@ -254,9 +254,7 @@ class PlantInterface:
                 self._inputs[kind] = node.create_subscription(
                     JointState, kind.value, receive, qos.COMMAND_INPUT, raw=True
                 )
-        node.create_subscription(
-            JointTrajectory, names.JOINT_TRAJECTORY, self._on_trajectory, qos.TRAJECTORY, raw=True
-        )
+        node.create_subscription(JointTrajectory, names.JOINT_TRAJECTORY, self._on_trajectory, qos.TRAJECTORY, raw=True)
         node.create_service(SetBool, names.ARM, self._on_arm)
         if e_stop:
             node.create_service(Trigger, names.E_STOP, self._on_e_stop)

@@ -23,9 +23,7 @@ def _profile(
     durability: DurabilityPolicy = DurabilityPolicy.VOLATILE,
     reliability: ReliabilityPolicy = ReliabilityPolicy.RELIABLE,
 ) -> QoSProfile:
-    return QoSProfile(
-        depth=depth, history=HistoryPolicy.KEEP_LAST, reliability=reliability, durability=durability
-    )
+    return QoSProfile(depth=depth, history=HistoryPolicy.KEEP_LAST, reliability=reliability, durability=durability)
 
 
 _KEPT = 2000

@@ -52,9 +52,7 @@ class SlowClock:
     def filtered(self, values: Array) -> Array:
         """Return values at the stamps, shape (n, ...), without what lies above the band; gaps are filled linearly."""
         if self._even.size != self._index.size:
-            left = np.clip(
-                np.searchsorted(self._index, self._even, side="right") - 1, 0, self._index.size - 2
-            )
+            left = np.clip(np.searchsorted(self._index, self._even, side="right") - 1, 0, self._index.size - 2)
             share = (self._even - self._index[left]) / (self._index[left + 1] - self._index[left])
             share = share.reshape(-1, *(1,) * (values.ndim - 1))
             values = (1.0 - share) * values[left] + share * values[left + 1]

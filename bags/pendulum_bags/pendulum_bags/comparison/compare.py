@@ -98,8 +98,7 @@ class Comparison:
         return {
             **self.thesis.statistics(),
             "noise_hold_time": hold,
-            "same_noise": any(run is pair.simulation for run in self.own for pair in self.pairs)
-            and self.is_paired,
+            "same_noise": any(run is pair.simulation for run in self.own for pair in self.pairs) and self.is_paired,
             "distributions": distribution_tests(self.own[0].window, self.pairs[0].hardware.window),
             "verdict": self.unpaired_verdict.sentence,
             "tests": [test.as_dict() for test in self.unpaired_verdict.tests],
@@ -167,9 +166,7 @@ def compare(
     differ = not all(is_emulated(run) for run in hardware_runs)
     names = "simulation", "hardware" if differ else "emulated hardware"
     ones, others = ([run.window for run in runs] for runs in (simulations, hardware_runs))
-    unpaired = conclude(
-        unpaired_tests(ones, others, margins, looks=looks, runs_differ=differ), margins, *names
-    )
+    unpaired = conclude(unpaired_tests(ones, others, margins, looks=looks, runs_differ=differ), margins, *names)
     verdict = unpaired
     if all(pair.is_paired for pair in compared):
         motions = [pair.motions for pair in compared]

@@ -21,9 +21,7 @@ __all__ = ["main"]
 
 app = typer.Typer(add_completion=False, rich_markup_mode=None)
 
-Paths = Annotated[
-    list[Path], typer.Argument(help="Simulation and hardware bag, or run folders with sim and hw.")
-]
+Paths = Annotated[list[Path], typer.Argument(help="Simulation and hardware bag, or run folders with sim and hw.")]
 MarginOption = Annotated[
     list[str] | None,
     typer.Option(
@@ -54,9 +52,7 @@ MachineOption = Annotated[
 ]
 LayersOption = Annotated[
     list[Path] | None,
-    typer.Option(
-        "--layers", help="Folder of a frequency_response or ranking experiment; several times if wanted."
-    ),
+    typer.Option("--layers", help="Folder of a frequency_response or ranking experiment; several times if wanted."),
 ]
 
 
@@ -133,9 +129,7 @@ def _write(out: Path, result: Comparison, content: dict[str, Any]) -> None:
     write_figures(comparison_figures(result), out / "figures")
 
 
-def _print(
-    result: Comparison, answer: Answer, content: dict[str, Any], designs: Sequence[DesignResult]
-) -> None:
+def _print(result: Comparison, answer: Answer, content: dict[str, Any], designs: Sequence[DesignResult]) -> None:
     from pendulum_bags.frequency_response.designs_table import designs_table
     from pendulum_bags.runs.run_data import timing_warning
     from pendulum_bags.verdict.terminal import print_answer

@@ -145,24 +145,15 @@ def _logarithm(value: float) -> float:
     return math.log(value) if value > 0.0 else -math.inf
 
 
-def _runs_to_decide(
-    estimate: float, bottom: float, top: float, error: float, runs: int, reach: float
-) -> int | None:
+def _runs_to_decide(estimate: float, bottom: float, top: float, error: float, runs: int, reach: float) -> int | None:
     """Return how many more runs would decide with the stated power, if the estimate were the truth.
 
     The error falls with the square root of the number of runs.
     """
-    if (
-        not (math.isfinite(error) and math.isfinite(estimate))
-        or _power(estimate, bottom, top, 0.0, reach) < POWER
-    ):
+    if not (math.isfinite(error) and math.isfinite(estimate)) or _power(estimate, bottom, top, 0.0, reach) < POWER:
         return None
     enough = next(
-        (
-            n
-            for n in _doubled(runs)
-            if _power(estimate, bottom, top, error * math.sqrt(runs / n), reach) >= POWER
-        ),
+        (n for n in _doubled(runs) if _power(estimate, bottom, top, error * math.sqrt(runs / n), reach) >= POWER),
         0,
     )
     if not enough:
@@ -247,9 +238,7 @@ def conclude(tests: Sequence[EquivalenceTest], margins: Margins, first: str, sec
         counts = [test.more_runs for test in undecided]
         more = None if None in counts else max(count or 0 for count in counts)
         what = ", ".join(test.quantity for test in undecided)
-        text = (
-            f"Undecided whether {first} and {second} are equivalent within {whose} in {what}: {_more(more)}."
-        )
+        text = f"Undecided whether {first} and {second} are equivalent within {whose} in {what}: {_more(more)}."
     else:
         outcome = Outcome.EQUIVALENT
         text = f"{first} and {second} are equivalent within {whose}, in all {len(tests)} tests."

@@ -57,10 +57,7 @@ def _check_sides(simulation: RunData, hardware: RunData) -> None:
             "expected the simulation first"
         )
     # A bag may hold both plants, so it is the motion that tells.
-    if (
-        np.array_equal(simulation.window.position, hardware.window.position)
-        and np.ptp(hardware.window.position) > 0.0
-    ):
+    if np.array_equal(simulation.window.position, hardware.window.position) and np.ptp(hardware.window.position) > 0.0:
         raise DataError(
             f"{simulation.source} and {hardware.source} hold one and the same recording; expected one of each plant"
         )
@@ -77,9 +74,7 @@ def _check_two(one: RunData, other: RunData) -> None:
     """Refuse two runs of one side that are the same recording, or not of the same kind."""
     same_place = bool(one.source) and Path(one.source).resolve() == Path(other.source).resolve()
     a, b = one.window, other.window
-    if same_place or (
-        a.t.size == b.t.size and np.array_equal(a.position, b.position) and np.ptp(a.position) > 0.0
-    ):
+    if same_place or (a.t.size == b.t.size and np.array_equal(a.position, b.position) and np.ptp(a.position) > 0.0):
         raise DataError(
             f"{one.source} and {other.source} hold one and the same recording; expected independent runs to pool"
         )

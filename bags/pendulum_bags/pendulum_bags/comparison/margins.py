@@ -198,9 +198,7 @@ def _margin(name: str, given: Any, where: str = "") -> Margin:
         raise ParameterError(f"{where}margin {name} is {given!r}; expected a number in {units}") from error
     unit = unit or _UNITS[name][0]
     if unit not in _UNITS[name]:
-        raise ParameterError(
-            f"{where}margin {name} has unit {unit!r}; expected one of {', '.join(_UNITS[name])}"
-        )
+        raise ParameterError(f"{where}margin {name} has unit {unit!r}; expected one of {', '.join(_UNITS[name])}")
     if not (math.isfinite(value) and value > 0.0):
         raise ParameterError(f"{where}margin {name} is {value:g} {unit}; expected a finite number > 0")
     return Margin(value, unit)

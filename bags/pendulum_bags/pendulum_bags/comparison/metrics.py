@@ -41,9 +41,7 @@ class Episode:
 def episode_of(series: Series, set_point: float = UPRIGHT, *, step: bool = False) -> Episode:
     """Return the episode of a motion; ``step`` takes its first angle as the start of a step to the set-point."""
     error = series.position - set_point
-    return Episode(
-        series.t - series.t[0], error, series.velocity, series.effort, float(error[0]) if step else 0.0
-    )
+    return Episode(series.t - series.t[0], error, series.velocity, series.effort, float(error[0]) if step else 0.0)
 
 
 def _integral(episode: Episode, values: Array) -> float:

@@ -159,9 +159,7 @@ def _turned(hardware: RunData, simulation: RunData) -> RunData:
     offset = turn * round(apart / turn)
     if offset == 0.0:
         return hardware
-    window, whole = (
-        replace(one, position=one.position - offset) for one in (hardware.window, hardware.whole)
-    )
+    window, whole = (replace(one, position=one.position - offset) for one in (hardware.window, hardware.whole))
     return replace(hardware, window=window, whole=whole)
 
 

@@ -137,9 +137,7 @@ def unpaired_tests(
     )
     count = sides[0].means.size
     kind = _Kind(looks, min(len(simulations), len(hardware)))
-    mean = _mean_test(
-        joined, lambda means: np.asarray(means[..., count] - means[..., 0]), margins.mean_angle, kind
-    )
+    mean = _mean_test(joined, lambda means: np.asarray(means[..., count] - means[..., 0]), margins.mean_angle, kind)
     return [mean, *_spread_tests(joined, 0, count, margins, kind)]
 
 
@@ -181,9 +179,7 @@ class _Seen:
         Where the simulation is the slower one, it is the hardware's that moves, the other way; the sides are exchanged.
         """
         times = self.clock.times
-        moving, still = (
-            (self.hardware, self.simulation) if self.is_slower else (self.simulation, self.hardware)
-        )
+        moving, still = (self.hardware, self.simulation) if self.is_slower else (self.simulation, self.hardware)
         grid = times[:, None] + (1.0 if self.is_slower else -1.0) * lags[None, :]
         values = CubicSpline(moving.t, moving.velocity)(np.clip(grid, moving.t[0], moving.t[-1]))
         own = CubicSpline(still.t, still.velocity)(times)[:, None]
@@ -237,9 +233,7 @@ def _lag(means: Array) -> Array:
     mislead: where the slower plant samples as the noise changes, it falls faster on one side than on the other.
     """
     first = _LIKENESS
-    alike = _likeness(
-        means[..., first : first + _LAGS.size], means[..., first + _LAGS.size : first + 2 * _LAGS.size]
-    )
+    alike = _likeness(means[..., first : first + _LAGS.size], means[..., first + _LAGS.size : first + 2 * _LAGS.size])
     best = np.clip(np.argmax(alike, axis=-1), 1, _LAGS.size - 2)
     x = [_LAGS[best + i] for i in (-1, 0, 1)]
     y = [np.take_along_axis(alike, (best + i)[..., None], axis=-1)[..., 0] for i in (-1, 0, 1)]
@@ -254,9 +248,7 @@ def _lag(means: Array) -> Array:
 def _mean_test(resampled: Resampled, statistic: Statistic, margin: Margin, kind: _Kind) -> EquivalenceTest:
     scale = _UNITS[margin.unit]
     interval = bootstrap_interval(resampled, lambda means: scale * statistic(means), level=kind.looks.level)
-    return equivalence_test(
-        "mean angle difference", margin.unit, interval, -margin.value, margin.value, runs=kind.runs
-    )
+    return equivalence_test("mean angle difference", margin.unit, interval, -margin.value, margin.value, runs=kind.runs)
 
 
 def _spread_tests(
@@ -266,9 +258,7 @@ def _spread_tests(
     tests = []
     for index, what in enumerate(_QUANTITIES):
         margin: Margin = getattr(margins, f"spread_{what}")
-        tests.append(
-            _spread_test(resampled, simulation + 2 * index, hardware + 2 * index, what, margin, kind)
-        )
+        tests.append(_spread_test(resampled, simulation + 2 * index, hardware + 2 * index, what, margin, kind))
     return tests
 
 
@@ -283,15 +273,11 @@ def _spread_test(
             level=level,
         )
         top = 1.0 + margin.si
-        return equivalence_test(
-            f"spread of {what} (ratio)", "-", interval, 1.0 / top, top, runs=kind.runs, ratio=True
-        )
+        return equivalence_test(f"spread of {what} (ratio)", "-", interval, 1.0 / top, top, runs=kind.runs, ratio=True)
     scale = _UNITS[margin.unit]
     interval = bootstrap_interval(
         resampled,
-        lambda means: np.asarray(
-            scale * (np.sqrt(_variance(means, above)) - np.sqrt(_variance(means, below)))
-        ),
+        lambda means: np.asarray(scale * (np.sqrt(_variance(means, above)) - np.sqrt(_variance(means, below)))),
         level=level,
     )
     return equivalence_test(

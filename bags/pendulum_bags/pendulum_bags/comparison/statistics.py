@@ -233,9 +233,7 @@ def resample(
     return Resampled(pooled, pooled + draws, pooled + within, blocks, len(runs) if runs_differ else 1)
 
 
-def bootstrap_interval(
-    resampled: Resampled, statistic: Callable[[Array], Array], *, level: float = 0.9
-) -> Interval:
+def bootstrap_interval(resampled: Resampled, statistic: Callable[[Array], Array], *, level: float = 0.9) -> Interval:
     """Return a statistic of column means with its percentile interval.
 
     Few blocks make bootstrap intervals too short, for two reasons known from means of few values: the spread is
@@ -257,9 +255,7 @@ def bootstrap_interval(
     low, high = np.quantile(draws, (seen, 1.0 - seen))
     variance, freedom = _variance_of(resampled, statistic, float(draws.var(ddof=1)))
     spread = max(float(draws.std(ddof=1)), 1e-300)
-    stretch = (
-        float(stats.t.ppf(1.0 - tail, freedom) / stats.norm.ppf(1.0 - seen)) * math.sqrt(variance) / spread
-    )
+    stretch = float(stats.t.ppf(1.0 - tail, freedom) / stats.norm.ppf(1.0 - seen)) * math.sqrt(variance) / spread
     error = math.sqrt(variance)
     return Interval(
         estimate,
@@ -271,9 +267,7 @@ def bootstrap_interval(
     )
 
 
-def _variance_of(
-    resampled: Resampled, statistic: Callable[[Array], Array], total: float
-) -> tuple[float, float]:
+def _variance_of(resampled: Resampled, statistic: Callable[[Array], Array], total: float) -> tuple[float, float]:
     """Return the unbiased variance of a statistic and its degrees of freedom.
 
     Drawing R runs, and blocks in them, gives the variance V (R - 1) / R + W, where V is that of the statistic and W the
@@ -283,9 +277,7 @@ def _variance_of(
     blocks = max(resampled.blocks, runs + 2)
     if runs == 1:
         return total * blocks / (blocks - 1), blocks - 1
-    within = (
-        float(np.var(np.asarray(statistic(resampled.within), dtype=float), ddof=1)) * blocks / (blocks - runs)
-    )
+    within = float(np.var(np.asarray(statistic(resampled.within), dtype=float), ddof=1)) * blocks / (blocks - runs)
     between = max((total - within) * runs / (runs - 1) - within, 0.0)
     variance = between + within
     if variance <= 0.0:
@@ -313,9 +305,7 @@ def kolmogorov_smirnov(first: ArrayLike, second: ArrayLike) -> KolmogorovSmirnov
     """Compare two samples of correlated values; the p-value uses effective sample sizes."""
     a, b = np.sort(np.asarray(first, dtype=float)), np.sort(np.asarray(second, dtype=float))
     values = np.concatenate((a, b))
-    difference = (
-        np.searchsorted(a, values, side="right") / a.size - np.searchsorted(b, values, side="right") / b.size
-    )
+    difference = np.searchsorted(a, values, side="right") / a.size - np.searchsorted(b, values, side="right") / b.size
     index = int(np.argmax(np.abs(difference)))
     distance = float(abs(difference[index]))
     sizes = effective_size(first), effective_size(second)

@@ -92,9 +92,7 @@ class Hub:
         self._clients: dict[str, Any] = {}
         self._described: dict[tuple[str, ...], dict[str, Description]] = {}
         self._reader = ParameterReader(self._node, lambda _values, _changed: None)
-        self._node.create_subscription(
-            DiagnosticArray, names.DIAGNOSTICS, self._on_diagnostics, qos.DIAGNOSTICS
-        )
+        self._node.create_subscription(DiagnosticArray, names.DIAGNOSTICS, self._on_diagnostics, qos.DIAGNOSTICS)
         self._node.create_timer(_LOOK_PERIOD, self._look, clock=Clock(clock_type=ClockType.STEADY_TIME))
         self._done = Future(executor=None)
         self._executor = EventsExecutor(context=self._context)
@@ -388,26 +386,20 @@ def _accepted(who: str, response: Any) -> str:
 app = typer.Typer(add_completion=False, rich_markup_mode=None)
 
 
-@app.command(
-    epilog="Example: python -m pendulum_bags console --port 8090. The ROS domain is that of ROS_DOMAIN_ID."
-)
+@app.command(epilog="Example: python -m pendulum_bags console --port 8090. The ROS domain is that of ROS_DOMAIN_ID.")
 def console(
     host: Annotated[
         str, typer.Option(help="Address to listen on; beyond this machine a token is needed.")
     ] = "127.0.0.1",
     port: Annotated[int, typer.Option(help="Port to listen on.", min=1, max=65535)] = 8090,
-    runs: Annotated[Path, typer.Option(help="Folder of what is recorded or run from the page.")] = Path(
-        "bags/runs"
-    ),
+    runs: Annotated[Path, typer.Option(help="Folder of what is recorded or run from the page.")] = Path("bags/runs"),
 ) -> int:
     """Serve the console until Ctrl-C."""
     token = "" if is_loopback(host) else secrets.token_urlsafe(16)
     if runs.exists() and not runs.is_dir():
         raise ParameterError(f"runs is {runs}, a file; expected a folder")
     hub, jobs = Hub(), Jobs(runs.resolve())
-    address = f"http://{'localhost' if is_loopback(host) else host}:{port}/" + (
-        f"?token={token}" if token else ""
-    )
+    address = f"http://{'localhost' if is_loopback(host) else host}:{port}/" + (f"?token={token}" if token else "")
     try:
         serve(
             hub,

@@ -72,9 +72,7 @@ class ParameterTable:
 
     async def refresh(self, spaces: Sequence[str]) -> None:
         """Show the values in force, also when somebody else has set them; draw anew when nodes come or go."""
-        known = {
-            space: values for space in spaces if (values := self._graph.parameters.get(f"{space}/{self._kind}"))
-        }
+        known = {space: values for space in spaces if (values := self._graph.parameters.get(f"{space}/{self._kind}"))}
         drawn = {space: sorted(values) for space, values in known.items()}
         if drawn != self._drawn:
             try:

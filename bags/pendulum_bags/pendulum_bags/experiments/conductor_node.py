@@ -60,9 +60,7 @@ class Conductor:
         self._previous = signal.signal(signal.SIGTERM, _interrupt)
         set_middleware_defaults()
         self.context = Context()
-        rclpy.init(
-            context=self.context, domain_id=self.domain, signal_handler_options=SignalHandlerOptions.NO, args=[]
-        )
+        rclpy.init(context=self.context, domain_id=self.domain, signal_handler_options=SignalHandlerOptions.NO, args=[])
         self.node: Node = rclpy.create_node("conductor", context=self.context, start_parameter_services=False)
         check_closed(self.domain)
         self._executor = EventsExecutor(context=self.context)
@@ -356,9 +354,7 @@ class RecorderClient:
                     f"the recorder has {counts.get(topic, 0)} of {expected} messages of {topic} after {timeout:g} s"
                 )
             self._conductor.spin(_SLICE)
-            before, counts = counts, {
-                name: entry["received"] for name, entry in self._ask().get("topics", {}).items()
-            }
+            before, counts = counts, {name: entry["received"] for name, entry in self._ask().get("topics", {}).items()}
             quiet = quiet + 1 if counts == before else 0
 
     def _ask(self) -> dict[str, Any]:

@@ -173,9 +173,7 @@ def play_on_running_plant(
     ):
         node_name = _find_plant(conductor, namespace)
         _refuse_others(conductor, namespace)
-        plant = PlantClient(
-            conductor, namespace, node_name, controller="zero_torque", disturbance="excitation"
-        )
+        plant = PlantClient(conductor, namespace, node_name, controller="zero_torque", disturbance="excitation")
         conductor.wait_for(f"a state of {namespace}", lambda: plant.sample is not None, _FIND_TIMEOUT)
         _require_rest(conductor, plant)
         armed = _is_armed(plant, may_arm=arm)
@@ -194,9 +192,7 @@ def play_on_running_plant(
                 graph.NodeProgram(program.package, program.executable, namespace, name, program.parameters)
             )
         plant.wait_until_ready(_START_TIMEOUT)
-        wanted = {
-            f"{namespace}/{topic}" for topic in (names.JOINT_STATES, names.APPLIED_EFFORT, names.DISTURBANCE)
-        }
+        wanted = {f"{namespace}/{topic}" for topic in (names.JOINT_STATES, names.APPLIED_EFFORT, names.DISTURBANCE)}
         ears = RecorderClient(conductor, namespace)
         conductor.wait_for("the recorder to hear the plant", lambda: wanted <= ears.heard(), _START_TIMEOUT)
         try:
@@ -266,9 +262,7 @@ def _is_armed(plant: PlantClient, *, may_arm: bool) -> bool:
         return True
     if not may_arm:
         told = "has not said its mode" if mode is None else f"is {mode.get('mode')}"
-        raise ParameterError(
-            f"{plant.namespace} {told}; expected it armed, or --arm to arm it for the excitation"
-        )
+        raise ParameterError(f"{plant.namespace} {told}; expected it armed, or --arm to arm it for the excitation")
     return False
 
 

@@ -29,9 +29,7 @@ def excite(
     kind: Annotated[str, typer.Option(help="multisine, chirp, prbs, or best of all.")] = "best",
     duration: Annotated[float, typer.Option(help="[s]")] = 20.0,
     rate: Annotated[float, typer.Option(help="Samples and torque values per second [Hz].")] = 100.0,
-    max_effort: Annotated[
-        float | None, typer.Option(help="[N m]; by default half the plant's limit.")
-    ] = None,
+    max_effort: Annotated[float | None, typer.Option(help="[N m]; by default half the plant's limit.")] = None,
     max_speed: Annotated[float, typer.Option(help="[rad/s]")] = 10.0,
     max_angle: Annotated[float, typer.Option(help="Distance from hanging down [rad].")] = 2.5,
     noise: Annotated[float, typer.Option(help="Standard deviation of the angle sensor [rad].")] = 1e-3,
@@ -103,9 +101,7 @@ def excite(
         from pendulum_msgs_py.programs.terminal import WholeTable, make_console
 
         console = make_console()
-        table = WholeTable(
-            title=f"{design.kind}, {duration:g} s: predicted 95 % intervals, if the prior plant is true"
-        )
+        table = WholeTable(title=f"{design.kind}, {duration:g} s: predicted 95 % intervals, if the prior plant is true")
         for heading in ("parameter", "half width", "relative", "unit"):
             table.add_column(heading)
         for name, width in design.predicted.items():
@@ -119,9 +115,7 @@ def excite(
         console.print(f"wrote {out}", highlight=False)
     if play:
         target = bag or out.with_suffix("")
-        _play(
-            design, limits, out, target, plant, on, namespace, arm=arm, noise=noise, seed=seed, domain=domain
-        )
+        _play(design, limits, out, target, plant, on, namespace, arm=arm, noise=noise, seed=seed, domain=domain)
         typer.echo(f"played and recorded; next\n  python -m pendulum_bags identify {target}", err=as_json)
 
 

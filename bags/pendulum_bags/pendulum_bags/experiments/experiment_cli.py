@@ -59,9 +59,7 @@ Controller = Annotated[str, typer.Option(help="Kind of controller.")]
 Q = Annotated[tuple[float, float], typer.Option(help="Diagonal of Q.")]
 R = Annotated[float, typer.Option(help="R.")]
 Storage = Annotated[str, typer.Option(help="Storage of the bags: mcap or sqlite3.")]
-Domain = Annotated[
-    int | None, typer.Option(help="ROS domain; by default ROS_DOMAIN_ID, or the first free one.")
-]
+Domain = Annotated[int | None, typer.Option(help="ROS domain; by default ROS_DOMAIN_ID, or the first free one.")]
 Strategy = Annotated[str, typer.Option(help="How the actuator turns wanted torque into PWM.")]
 Lab = Annotated[Path | None, typer.Option(help="Lab file of the real actuator, for --hardware hebi.")]
 Yes = Annotated[bool, typer.Option("--yes", help="Do not ask before the real machine moves.")]
@@ -98,9 +96,7 @@ def thesis(
             min=0.0,
         ),
     ] = 60.0,
-    json_output: Annotated[
-        bool, typer.Option("--json", help="Print summary.json instead of the table.")
-    ] = False,
+    json_output: Annotated[bool, typer.Option("--json", help="Print summary.json instead of the table.")] = False,
 ) -> None:
     """Regulate the upright pendulum under noise on simulator and hardware: is the simulation good enough?
 

@@ -141,9 +141,7 @@ def record_run(
     return bag
 
 
-def _keep_time(
-    conductor: Conductor, plant: PlantClient, spec: RunSpec, processes: ProcessSet, recorder: Child
-) -> None:
+def _keep_time(conductor: Conductor, plant: PlantClient, spec: RunSpec, processes: ProcessSet, recorder: Child) -> None:
     """Let a run in real time go, wait for its length by the plant's clock, and put the plant to rest."""
     plant.watch()
     try:

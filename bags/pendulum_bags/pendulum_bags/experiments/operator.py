@@ -215,8 +215,6 @@ def ask_yes(
     try:
         answer = read()
     except EOFError:
-        raise FaultError(
-            "nobody is there to say yes; expected a terminal, or --yes; nothing was started"
-        ) from None
+        raise FaultError("nobody is there to say yes; expected a terminal, or --yes; nothing was started") from None
     if answer.strip().lower() != YES:
         raise FaultError(f"the answer is {answer.strip()!r}; expected {YES!r}; nothing was started")

@@ -98,9 +98,7 @@ def _text(lab: Path | None) -> str:
     return "" if lab is None else str(lab)
 
 
-def _run(
-    settings: TrialSettings, out: Path | None, domain: int | None, json_output: bool, *, yes: bool
-) -> None:
+def _run(settings: TrialSettings, out: Path | None, domain: int | None, json_output: bool, *, yes: bool) -> None:
     from pendulum_bags.experiments.trials import run_trials
     from pendulum_bags.identification import identify_cli
 

@@ -165,8 +165,6 @@ def thinned(x: ArrayLike, y: ArrayLike, most: int = 3000) -> tuple[NDArray[np.fl
     size = xs.size // bins
     whole = ys[: bins * size].reshape(bins, size)
     rows = np.arange(bins)[:, None] * size
-    keep = np.sort(
-        np.concatenate((rows + whole.argmin(axis=1)[:, None], rows + whole.argmax(axis=1)[:, None]), axis=1)
-    )
+    keep = np.sort(np.concatenate((rows + whole.argmin(axis=1)[:, None], rows + whole.argmax(axis=1)[:, None]), axis=1))
     index = np.unique(np.concatenate(([0], keep.ravel(), np.arange(bins * size, xs.size), [xs.size - 1])))
     return xs[index], ys[index]

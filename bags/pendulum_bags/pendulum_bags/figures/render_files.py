@@ -41,9 +41,7 @@ _WIDTH = 6.6
 _RESOLUTION = 150
 
 
-def write_figures(
-    figures: Sequence[Figure], folder: Path, formats: Sequence[str] = ("png", "pdf")
-) -> list[Path]:
+def write_figures(figures: Sequence[Figure], folder: Path, formats: Sequence[str] = ("png", "pdf")) -> list[Path]:
     """Draw figures into a folder, which is made; existing files of the same names are replaced.
 
     Args:
@@ -174,9 +172,7 @@ def _draw_trace(ax: Axes, trace: Trace) -> None:
     label = trace.label or "_nolegend_"
     marker: Any = _MARKERS[style.marker]
     if trace.kind == "points":
-        ax.plot(
-            trace.x, trace.y, linestyle="none", marker=marker, markersize=3.2, color=style.colour, label=label
-        )
+        ax.plot(trace.x, trace.y, linestyle="none", marker=marker, markersize=3.2, color=style.colour, label=label)
         return
     if trace.kind == "interval" and trace.low is not None and trace.high is not None:
         spread = [trace.x - trace.low, trace.high - trace.x]

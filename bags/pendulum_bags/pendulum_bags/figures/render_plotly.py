@@ -36,10 +36,7 @@ def _graph(figure: Figure, panels: list[Panel]) -> dict[str, Any]:
     layout: dict[str, Any] = {
         "font": _FONT,
         "margin": {"l": 64, "r": 14, "t": 54 if titled else 34, "b": 48},
-        "height": 84
-        + figure.panel_height * count
-        + (40 if not figure.stacked else 0)
-        + (20 if titled else 0),
+        "height": 84 + figure.panel_height * count + (40 if not figure.stacked else 0) + (20 if titled else 0),
         "paper_bgcolor": "rgba(0,0,0,0)",
         "plot_bgcolor": "#fff",
         "hovermode": "x" if figure.stacked else "closest",
@@ -91,16 +88,12 @@ def _graph(figure: Figure, panels: list[Panel]) -> dict[str, Any]:
             if log:
                 target.update(_log_ticks([getattr(trace, letter) for trace in panel.traces]))
         if panel.y_ticks:
-            y_axis.update(
-                tickmode="array", tickvals=list(range(len(panel.y_ticks))), ticktext=list(panel.y_ticks)
-            )
+            y_axis.update(tickmode="array", tickvals=list(range(len(panel.y_ticks))), ticktext=list(panel.y_ticks))
         if panel.square:
             y_axis["scaleanchor"] = f"x{suffix}"
         layout[f"xaxis{suffix}"], layout[f"yaxis{suffix}"] = x_axis, y_axis
         if panel.title:
-            layout["annotations"].append(
-                _note(panel.title, 0.0, top, "paper", "paper", "left", "bottom", size=13)
-            )
+            layout["annotations"].append(_note(panel.title, 0.0, top, "paper", "paper", "left", "bottom", size=13))
         for trace in panel.traces:
             data.append(_trace(trace, suffix, trace.label not in named))
             named.add(trace.label)

@@ -103,9 +103,7 @@ def read_responses(paths: Sequence[Path]) -> tuple[list[MeasuredResponse], str]:
     if len(paths) == 1 and (paths[0] / "sim").is_dir() and (paths[0] / "hw").is_dir():
         paths = [paths[0] / "sim", paths[0] / "hw"]
     if len(paths) not in {1, 2}:
-        raise DataError(
-            f"got {len(paths)} bags; expected one, a simulation and a hardware bag, or a run folder"
-        )
+        raise DataError(f"got {len(paths)} bags; expected one, a simulation and a hardware bag, or a run folder")
     runs = [read_run(path) for path in paths]
     found = []
     plant = "thesis"

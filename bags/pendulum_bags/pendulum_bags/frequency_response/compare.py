@@ -140,20 +140,14 @@ def compare_responses(
     gap, low, high = _gaps(moved, two, quantile * spread_one, quantile * spread_two, scaling)
     found = nu_gap(scaling.plant(moved), scaling.plant(two))
     at = int(np.argmax(gap))
-    whole = (
-        Estimate(found.value, float(low.max()), float(high.max()))
-        if found.winding
-        else Estimate(1.0, 1.0, 1.0)
-    )
+    whole = Estimate(found.value, float(low.max()), float(high.max())) if found.winding else Estimate(1.0, 1.0, 1.0)
     return Difference(
         lines, moved, two, ratio, quantile[1] * relative, np.asarray(probability, dtype=np.float64), gap, low, high,
         whole, float(lines[at]), _delay(lines, ratio, relative), _gain(ratio, relative), scaling,
     )  # fmt: skip
 
 
-def _at_common_lines(
-    first: MeasuredResponse, second: MeasuredResponse
-) -> tuple[Array, Complex, Array, Complex, Array]:
+def _at_common_lines(first: MeasuredResponse, second: MeasuredResponse) -> tuple[Array, Complex, Array, Complex, Array]:
     """Return frequencies, and response and deviation of both there; the first is interpolated where lines differ."""
     apart = np.abs(second.frequency[:, None] - first.frequency[None, :])
     nearest = apart.argmin(axis=1)
@@ -178,9 +172,7 @@ def _at_common_lines(
     return lines, response, spread, second.response[:, inside], second.deviation[:, inside]
 
 
-def _gaps(
-    first: Complex, second: Complex, a: Array, b: Array, scaling: Scaling
-) -> tuple[Array, Array, Array]:
+def _gaps(first: Complex, second: Complex, a: Array, b: Array, scaling: Scaling) -> tuple[Array, Array, Array]:
     """Return the chordal distance with its limits, from the discs of both."""
     one, two = scaling.plant(first), scaling.plant(second)
     gap = chordal_distance(one, two)

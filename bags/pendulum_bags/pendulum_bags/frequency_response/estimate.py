@@ -94,9 +94,7 @@ def _periodic(record: Record, length: float, harmonics: NDArray[np.int64]) -> Me
         )
     used = harmonics[harmonics <= _TOP * 0.5 * size]
     if not used.size:
-        raise DataError(
-            f"{record.label}: no excited line lies below the Nyquist frequency {0.5 / record.period:g} Hz"
-        )
+        raise DataError(f"{record.label}: no excited line lies below the Nyquist frequency {0.5 / record.period:g} Hz")
 
     def spectra(values: Array) -> Complex:
         # The last whole periods: a run in real time may start late into its first.
@@ -138,18 +136,12 @@ def _segments(record: Record) -> MeasuredResponse:
     lines = np.arange(2, int(_TOP * half), 2)
     lines = lines[power[lines] > _WEAK**2 * power.max()]
     if not lines.size:
-        raise DataError(
-            f"{record.label}: the disturbance has no power below {0.5 * _TOP / record.period:g} Hz"
-        )
-    result = _joint(
-        record, lines / (size * record.period), r[:, lines], u[:, lines], y[:, :, lines], effective
-    )
+        raise DataError(f"{record.label}: the disturbance has no power below {0.5 * _TOP / record.period:g} Hz")
+    result = _joint(record, lines / (size * record.period), r[:, lines], u[:, lines], y[:, :, lines], effective)
     return _with(result, record, count, size * record.period, (np.nan, np.nan))
 
 
-def _joint(
-    record: Record, frequency: Array, r: Complex, u: Complex, y: Complex, blocks: float
-) -> MeasuredResponse:
+def _joint(record: Record, frequency: Array, r: Complex, u: Complex, y: Complex, blocks: float) -> MeasuredResponse:
     """Return the joint input-output estimate from the spectra of blocks, shapes (blocks, n) and (2, blocks, n)."""
     cross_ur = np.sum(u * np.conj(r), axis=0)
     cross_yr = np.sum(y * np.conj(r)[None], axis=1)

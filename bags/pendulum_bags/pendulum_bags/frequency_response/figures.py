@@ -125,12 +125,8 @@ def _quality(responses: Sequence[MeasuredResponse]) -> Figure:
         Panel("frequency [Hz]", "95 % radius\n[% of the response]", precision, x_log=True, y_log=True),
     ]
     weakest = min(float(r.coherence[0].min()) for r in responses)
-    sentence = (
-        f"The lowest coherence is {weakest:.3f}: the share of the angle's power that the excitation explains."
-    )
-    return Figure(
-        "response_quality", "How well it was measured", sentence, panels, section=SECTION, panel_height=150
-    )
+    sentence = f"The lowest coherence is {weakest:.3f}: the share of the angle's power that the excitation explains."
+    return Figure("response_quality", "How well it was measured", sentence, panels, section=SECTION, panel_height=150)
 
 
 def gap_figure(certifier: Certifier, difference: Difference | None, designs: Sequence[DesignResult]) -> Figure:
@@ -143,18 +139,14 @@ def gap_figure(certifier: Certifier, difference: Difference | None, designs: Seq
         Trace(x, profile.gap[shown], "model and hardware", "model"),
     ]
     if difference is not None:
-        traces.append(
-            Trace(difference.frequency, difference.gap_high, "simulation and hardware, upper limit", "sim")
-        )
+        traces.append(Trace(difference.frequency, difference.gap_high, "simulation and hardware, upper limit", "sim"))
     marks = [
         Mark(design.certificate.margin, "y", f"{design.name}: b = {design.certificate.margin:.2f}")
         for design in designs
         if design.certificate.stable_on_model
     ]
     # Labels on top of each other say nothing: the smallest and the largest margin serve.
-    marks = (
-        [min(marks, key=lambda m: m.value), max(marks, key=lambda m: m.value)] if len(marks) > 2 else marks
-    )
+    marks = [min(marks, key=lambda m: m.value), max(marks, key=lambda m: m.value)] if len(marks) > 2 else marks
     passing = sum(design.certificate.by_gap for design in designs)
     sentence = (
         f"The nu-gap between model and hardware is {profile.value:.3f}, at most {profile.value_upper:.3f} with 95 % "
@@ -216,9 +208,7 @@ def certified_weights_figure(certifier: Certifier, model: LinearModel) -> Figure
 
 def certified_gains_figure(certifier: Certifier, designs: Sequence[DesignResult]) -> Figure:
     """Draw which gains of u = -kp theta - kd theta_dot are certified, and where the designs lie."""
-    stiffness = (
-        max(float(abs(certifier.plant.A[1, 0] / certifier.plant.B[1, 0])), 1e-3) if _rigid(certifier) else 1.0
-    )
+    stiffness = max(float(abs(certifier.plant.A[1, 0] / certifier.plant.B[1, 0])), 1e-3) if _rigid(certifier) else 1.0
     known = [design.K for design in designs if design.K is not None]
     low = 0.5 * min([stiffness, *(K[0] for K in known)])
     high = 20.0 * max([stiffness, *(K[0] for K in known)])

@@ -107,9 +107,7 @@ def record_of_run(run: RunData) -> Record:
         outputs = np.stack([run.window.position[:count], run.window.velocity[:count]])
     else:
         inside = np.minimum(raster, t[-1])
-        outputs = np.stack(
-            [CubicSpline(t, run.window.position)(inside), CubicSpline(t, run.window.velocity)(inside)]
-        )
+        outputs = np.stack([CubicSpline(t, run.window.position)(inside), CubicSpline(t, run.window.velocity)(inside)])
     told = run.metadata.get("pendulum.run")
     disturbance = told.get("disturbance") if isinstance(told, Mapping) else None
     return Record(

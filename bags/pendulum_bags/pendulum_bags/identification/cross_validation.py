@@ -53,9 +53,7 @@ def folds(pieces: Sequence[Piece], count: int = 6) -> list[list[NDArray[np.int64
         return []
     blocks = np.array_split(np.arange(sum(sizes)), number)
     starts = np.concatenate(([0], np.cumsum(sizes)))
-    return [
-        [block[(block >= a) & (block < b)] - a for a, b in itertools.pairwise(starts)] for block in blocks
-    ]
+    return [[block[(block >= a) & (block < b)] - a for a, b in itertools.pairwise(starts)] for block in blocks]
 
 
 def _refit(
@@ -69,9 +67,7 @@ def _refit(
     """
 
     def search(start: FitModel) -> Solution:
-        return solve(
-            start, train, free, states=states, scale=scale, max_iterations=30, tolerance=1e-6, coarse=COARSE
-        )
+        return solve(start, train, free, states=states, scale=scale, max_iterations=30, tolerance=1e-6, coarse=COARSE)
 
     best = search(model)
     if any(abs(best.model[n] - model[n]) > 1e-4 * max(abs(model[n]), 1e-3) for n in free):
@@ -122,10 +118,7 @@ def cross_validate(
         total, loss, number = 0.0, 0.0, 0
         for piece in test:
             mask = piece.mask()
-            error = (
-                simulate(fitted, piece, fit_states(fitted, piece)).theta[mask]
-                - piece.recording.position[mask]
-            )
+            error = simulate(fitted, piece, fit_states(fitted, piece)).theta[mask] - piece.recording.position[mask]
             total += float(error @ error)
             loss += robust_cost(error, scale)
             number += error.size

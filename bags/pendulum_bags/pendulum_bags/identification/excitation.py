@@ -175,9 +175,7 @@ def _shape(kind: str, time: Array, genes: Array, plant: PlantParameters) -> Arra
     own = np.sqrt(max(plant.gravity, 1e-9) / plant.inertia) / (2.0 * np.pi)
     rate = plant.damping / plant.inertia / (2.0 * np.pi)
     # Up to above resonance, or to the corner of an overdamped plant, but not where nothing answers.
-    top = float(
-        np.clip((1.0 + 4.0 * genes[0]) * max(own, min(rate, 2.0), 0.2), 0.5, 0.2 / (time[1] - time[0]))
-    )
+    top = float(np.clip((1.0 + 4.0 * genes[0]) * max(own, min(rate, 2.0), 0.2), 0.5, 0.2 / (time[1] - time[0])))
     bottom = max(1.0 / duration, 0.1 * own * (0.2 + genes[1]))
     if kind == "multisine":
         frequency = np.unique(np.round(np.geomspace(bottom, top, 10) * duration)) / duration
@@ -221,9 +219,7 @@ def _windowed(problem: _Problem, effort: Array, theta: Array, omega: Array, free
 
 def _keeps(problem: _Problem, shape: Array) -> bool:
     theta, omega, _ = _simulated(problem, problem.limits.effort * shape, None)
-    return bool(
-        np.max(np.abs(theta)) <= problem.limits.angle and np.max(np.abs(omega)) <= problem.limits.speed
-    )
+    return bool(np.max(np.abs(theta)) <= problem.limits.angle and np.max(np.abs(omega)) <= problem.limits.speed)
 
 
 def _judge(problem: _Problem, kind: str, shape: Array) -> Excitation:

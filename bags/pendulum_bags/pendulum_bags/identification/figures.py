@@ -24,9 +24,7 @@ MEASURED, SIMULATED = "#444444", "#c2410c"
 def fit_figures(result: IdentificationResult) -> dict[str, Figure]:
     """Return the figures of an output-error fit: by recording, residual tests, friction models."""
     figures: dict[str, Figure] = {}
-    for i, (piece, state) in enumerate(
-        zip(result.fit.pieces, result.fit.chosen.solution.states, strict=True)
-    ):
+    for i, (piece, state) in enumerate(zip(result.fit.pieces, result.fit.chosen.solution.states, strict=True)):
         recording = piece.recording
         simulated = simulate(result.model, piece, state)
         figure = Figure(figsize=(9.0, 5.2), layout="constrained")
@@ -39,9 +37,7 @@ def fit_figures(result: IdentificationResult) -> dict[str, Figure]:
         top.set_ylabel("angle [rad]")
         top.legend(loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=2, frameon=False)
         top.set_title(recording.name)
-        middle.plot(
-            recording.time, 1e3 * (simulated.theta - recording.position), color=SIMULATED, linewidth=0.7
-        )
+        middle.plot(recording.time, 1e3 * (simulated.theta - recording.position), color=SIMULATED, linewidth=0.7)
         middle.axhline(0.0, color="black", linewidth=0.5)
         middle.set_ylabel("residual [mrad]")
         low.plot(recording.input_stamps, recording.input, color=MEASURED, linewidth=0.7)
@@ -81,9 +77,7 @@ def _candidate_figure(result: IdentificationResult) -> Figure:
         color=MEASURED,
         label="training",
     )
-    axes.bar(
-        place + 0.2, [1e3 * c.score for c in result.fit.candidates], 0.4, color=SIMULATED, label="held out"
-    )
+    axes.bar(place + 0.2, [1e3 * c.score for c in result.fit.candidates], 0.4, color=SIMULATED, label="held out")
     axes.set_xticks(place, [f"{n} (chosen)" if n == result.fit.chosen.friction else n for n in names])
     axes.set_ylabel("angle rms [mrad]")
     axes.legend()
@@ -150,9 +144,7 @@ def _gravity_figures(result: ThesisResult, recordings: Sequence[Recording]) -> d
             for hold in nearest:
                 inside = (recording.input_stamps >= hold.start) & (recording.input_stamps <= hold.stop)
                 style = "-" if hold.upward else "--"
-                axes.plot(
-                    recording.input_stamps[inside] - hold.start, recording.input[inside], style, linewidth=0.7
-                )
+                axes.plot(recording.input_stamps[inside] - hold.start, recording.input[inside], style, linewidth=0.7)
         axes.set_title(f"hold at {degrees:.0f} deg (dashed: coming down)", fontsize=8)
         axes.set_xlabel("time in the hold [s]")
     chosen[0].set_ylabel("effort [N m]")

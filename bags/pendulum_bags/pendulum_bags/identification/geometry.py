@@ -84,9 +84,7 @@ def check_geometry(model: FitModel, uncertainty: Uncertainty, geometry: Geometry
                 f"cannot swing faster than sqrt(g / l) = {fastest:.3f} rad/s."
             )
     if known_gravity is not None and geometry.inertia is not None:
-        compare(
-            "natural_frequency", "rad/s", (known_gravity / geometry.inertia) ** 0.5, model.natural_frequency
-        )
+        compare("natural_frequency", "rad/s", (known_gravity / geometry.inertia) ** 0.5, model.natural_frequency)
     if not rows and not said:
         return None
     contradicts = any(s.startswith(CONTRADICTION) for s in said)
@@ -97,7 +95,5 @@ def check_geometry(model: FitModel, uncertainty: Uncertainty, geometry: Geometry
         )
     else:
         ratios = ", ".join(f"{name} {value / known:.2f}" for name, _, known, value, *_ in rows)
-        said.append(
-            f"Identification and geometry agree within their intervals (identified over geometry: {ratios})."
-        )
+        said.append(f"Identification and geometry agree within their intervals (identified over geometry: {ratios}).")
     return GeometryCheck(tuple(rows), tuple(said), contradicts)

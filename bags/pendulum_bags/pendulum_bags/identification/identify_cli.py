@@ -29,9 +29,7 @@ def identify(
     data: Annotated[
         list[Path], typer.Argument(help="Bags, CSV files, HEBI logs or friction-study JSON logs of one pendulum.")
     ],
-    method: Annotated[
-        str, typer.Option(help="output_error, or thesis (two linear regressions).")
-    ] = "output_error",
+    method: Annotated[str, typer.Option(help="output_error, or thesis (two linear regressions).")] = "output_error",
     mapping: Annotated[
         list[str] | None,
         typer.Option(
@@ -43,9 +41,7 @@ def identify(
         str | None,
         typer.Option(help="Input of a CSV between its samples: zero (a held command) or linear (measured)."),
     ] = None,
-    effort: Annotated[
-        str, typer.Option(help="Of a bag: applied (what the plant received) or measured.")
-    ] = "applied",
+    effort: Annotated[str, typer.Option(help="Of a bag: applied (what the plant received) or measured.")] = "applied",
     experiment: Annotated[
         str, typer.Option(help="With --method thesis: inertia_damping or gravity; auto asks the recording.")
     ] = "auto",
@@ -95,9 +91,7 @@ def identify(
     from pendulum_bags.identification.options import Geometry, Options
     from pendulum_bags.identification.result import identify as run
 
-    options = Options(
-        window=window, friction=friction, geometry=Geometry(mass, length, inertia), fix_scale=fix_scale
-    )
+    options = Options(window=window, friction=friction, geometry=Geometry(mass, length, inertia), fix_scale=fix_scale)
     paths = [*data, *(held_out or [])]
     everything = [
         read_recording(path, rules, effort=effort, hold=hold)
@@ -173,9 +167,7 @@ def _print_thesis(result: ThesisResult) -> None:
     for regression in result.trials:
         console.print(f"[bold]{regression.trial}[/bold]")
         print(_narrow(regression.summary))
-    table = WholeTable(
-        title=f"Average over {len(result.trials)} trial{'s' if len(result.trials) != 1 else ''}"
-    )
+    table = WholeTable(title=f"Average over {len(result.trials)} trial{'s' if len(result.trials) != 1 else ''}")
     for heading in ("coefficient", "value", "95 % interval", "unit"):
         table.add_column(heading)
     for key, value in result.average.items():

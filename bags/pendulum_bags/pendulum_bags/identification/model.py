@@ -119,14 +119,10 @@ class FitModel:
         vector = np.zeros(len(PARAMETER_NAMES))
         for name, value in {**_DEFAULTS, **self.values}.items():
             if name not in INDEX:
-                raise DataError(
-                    f"fit model has no parameter {name!r}; expected one of {', '.join(PARAMETER_NAMES)}"
-                )
+                raise DataError(f"fit model has no parameter {name!r}; expected one of {', '.join(PARAMETER_NAMES)}")
             vector[INDEX[name]] = value
         if not np.all(np.isfinite(vector)) or vector[INDEX["inertia"]] <= 0.0:
-            raise DataError(
-                f"fit model has the values {dict(self.values)}; expected finite numbers and inertia > 0"
-            )
+            raise DataError(f"fit model has the values {dict(self.values)}; expected finite numbers and inertia > 0")
         vector.setflags(write=False)
         object.__setattr__(self, "vector", vector)
 

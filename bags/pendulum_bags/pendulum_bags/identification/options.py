@@ -79,13 +79,9 @@ class Options:
         if self.window is not None and not (np.isfinite(self.window) and self.window > 0.0):
             raise DataError(f"window is {self.window} s; expected > 0")
         if self.friction != "auto" and self.friction not in FRICTION_MODELS:
-            raise DataError(
-                f"friction is {self.friction!r}; expected auto or one of {', '.join(FRICTION_MODELS)}"
-            )
+            raise DataError(f"friction is {self.friction!r}; expected auto or one of {', '.join(FRICTION_MODELS)}")
         if self.fix_scale and self.geometry.gravity is None:
-            raise DataError(
-                "the scale is to be fixed by geometry, but mass or length is missing; expected both"
-            )
+            raise DataError("the scale is to be fixed by geometry, but mass or length is missing; expected both")
 
 
 DEFAULTS = Options()

@@ -138,9 +138,7 @@ def _frame(recordings: Sequence[Recording], options: Options) -> tuple[FitModel,
         raise DataError("there is no recording to identify from; expected at least one")
     kinds = {recording.input_kind for recording in recordings}
     if len(kinds) > 1:
-        raise DataError(
-            f"the recordings have different inputs ({', '.join(sorted(kinds))}); expected one kind"
-        )
+        raise DataError(f"the recordings have different inputs ({', '.join(sorted(kinds))}); expected one kind")
     for recording in recordings:
         if np.ptp(recording.position) < 1e-2:
             raise DataError(
@@ -153,9 +151,7 @@ def _frame(recordings: Sequence[Recording], options: Options) -> tuple[FitModel,
     duty_gain = 0.0
     if kind == "position_goal":
         geometry = geometry if geometry.gravity is not None else _geometry_of(recordings)
-        values.update(
-            gravity=geometry.gravity or 1.0, inertia=geometry.inertia or geometry.least_inertia or 1.0
-        )
+        values.update(gravity=geometry.gravity or 1.0, inertia=geometry.inertia or geometry.least_inertia or 1.0)
         duty_gain = float(np.median([_duty_gain(recording) for recording in recordings]))
         # The bob fixes the scale; its arm's zero is an angle, so a torque offset would only double it.
         free = ["damping", "inertia", "input_gain", "drive_damping"]
@@ -182,9 +178,7 @@ def _frame(recordings: Sequence[Recording], options: Options) -> tuple[FitModel,
 
 def _geometry_of(recordings: Sequence[Recording]) -> Geometry:
     known = {
-        (float(r.meta["mass"]), float(r.meta["length"]))
-        for r in recordings
-        if {"mass", "length"} <= r.meta.keys()
+        (float(r.meta["mass"]), float(r.meta["length"])) for r in recordings if {"mass", "length"} <= r.meta.keys()
     }
     if len(known) != 1:
         raise DataError(
@@ -220,9 +214,7 @@ def _anneal(
     finalists = []
     for start in starts:
         for first_scale in (0.3, 0.03):
-            s = solve(
-                start.model, pieces, free, scale=first_scale, tolerance=1e-4, max_iterations=25, coarse=COARSE
-            )
+            s = solve(start.model, pieces, free, scale=first_scale, tolerance=1e-4, max_iterations=25, coarse=COARSE)
             finalists.append(
                 solve(
                     s.model,
@@ -249,9 +241,7 @@ def _offsets(
     An offset of torque and one of angle do nearly the same to a swing: together they chase each other's errors.
     """
     offsets = [name for name in OFFSETS if name in free]
-    subsets = [
-        tuple(o for o in offsets if o not in left_out) for left_out in ((), *((o,) for o in offsets), offsets)
-    ]
+    subsets = [tuple(o for o in offsets if o not in left_out) for left_out in ((), *((o,) for o in offsets), offsets)]
     candidates = []
     for kept in dict.fromkeys(subsets):
         names = tuple(n for n in free if n not in offsets or n in kept)
@@ -291,9 +281,7 @@ def _fit_friction(
         plain = FitModel(values, model.input_kind, name, model.duty_gain)
         begin.append((plain, previous.states))
     kind = name.replace("stribeck_", "") if name != "stribeck" else name
-    additions = _FRICTION_STARTS.get(kind, ()) + (
-        _FRICTION_STARTS["stribeck"] if name.startswith("stribeck_") else ()
-    )
+    additions = _FRICTION_STARTS.get(kind, ()) + (_FRICTION_STARTS["stribeck"] if name.startswith("stribeck_") else ())
     coulomb = max(start.model["coulomb_friction"], 1e-3 * abs(start.model["gravity"]))
     for addition in additions:
         values = {**start.model.values, **addition}
@@ -302,9 +290,7 @@ def _fit_friction(
         else:
             values["coulomb_friction"] = 0.5 * coulomb
         begin.append((FitModel(values, start.model.input_kind, name, start.model.duty_gain), start.states))
-    solutions = [
-        solve(m, pieces, everything, states=s, scale=scale, tolerance=1e-7, coarse=COARSE) for m, s in begin
-    ]
+    solutions = [solve(m, pieces, everything, states=s, scale=scale, tolerance=1e-7, coarse=COARSE) for m, s in begin]
     best = min(solutions, key=lambda s: s.cost)
     best = replace(best, model=FitModel(best.model.values, best.model.input_kind, name, best.model.duty_gain))
     parts = residuals(best.model, pieces, best.states)

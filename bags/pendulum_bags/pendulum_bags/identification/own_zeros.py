@@ -93,9 +93,7 @@ def align(
                 one.states[0] - np.array([value, 0.0]) * (name == "angle_offset")
                 for one, value in zip(single, own, strict=True)
             ]
-            solution = solve(
-                solution.model, moved, free, states=states, scale=scale, tolerance=1e-6, coarse=coarse
-            )
+            solution = solve(solution.model, moved, free, states=states, scale=scale, tolerance=1e-6, coarse=coarse)
             if float(np.max(np.abs(own))) < SETTLED:
                 break
         if best is None or solution.cost < best[0].cost:

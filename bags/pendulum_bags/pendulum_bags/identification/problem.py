@@ -107,9 +107,7 @@ def _between_gaps(recording: Recording, window: float | None) -> NDArray[np.int6
         if stop - first >= 8
     ]
     if not parts:
-        raise DataError(
-            f"{recording.name} has {len(found)} gaps and no 8 samples between any two; expected fewer gaps"
-        )
+        raise DataError(f"{recording.name} has {len(found)} gaps and no 8 samples between any two; expected fewer gaps")
     return np.concatenate(parts)
 
 

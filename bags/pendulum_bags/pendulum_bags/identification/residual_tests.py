@@ -90,9 +90,7 @@ def residual_tests(fit: OutputErrorFit, *, lags: int = 25) -> ResidualTests:
     states = 2 * len(segments)
     # The fitted window states and parameters take degrees of freedom, which shows as a small negative correlation.
     shift = (states + len(fit.chosen.free)) / samples
-    statistic = (
-        samples * (samples + 2) * float(np.sum((auto[1:] + shift) ** 2 / (samples - np.arange(1, lags + 1))))
-    )
+    statistic = samples * (samples + 2) * float(np.sum((auto[1:] + shift) ** 2 / (samples - np.arange(1, lags + 1))))
     white_p = float(stats.chi2.sf(statistic, lags))
     white = white_p > 0.01
     memory = samples / effective_samples(parts, fit.pieces)
@@ -100,17 +98,13 @@ def residual_tests(fit: OutputErrorFit, *, lags: int = 25) -> ResidualTests:
     worst = float(np.max(np.abs(cross[lags:])))
     independent = not any(_depends(inputs, segments, lag, block, lags + 1) for lag in range(lags + 1))
     missing = (
-        ()
-        if fit.pieces[0].recording.input_kind == "position_goal"
-        else missing_torques(fit.model, fit.pieces, parts)
+        () if fit.pieces[0].recording.input_kind == "position_goal" else missing_torques(fit.model, fit.pieces, parts)
     )
     # Windows at rest fit to the last digit, and would make every motion stand out.
     moving = [value for value in rms if value > 1e-6 * max(rms)]
     middle = float(np.median(moving)) if moving else 0.0
     outliers = tuple(
-        (*label, value)
-        for label, value in zip(labels, rms, strict=True)
-        if len(rms) > 3 and value > 5.0 * middle > 0.0
+        (*label, value) for label, value in zip(labels, rms, strict=True) if len(rms) > 3 and value > 5.0 * middle > 0.0
     )
     said = _sentences(white, white_p, float(auto[1]) if lags else 0.0, worst, independent, missing)
     for name, start, end, value in outliers:

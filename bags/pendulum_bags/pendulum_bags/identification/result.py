@@ -112,9 +112,7 @@ class IdentificationResult:
             for name, (offset, own) in self.moved_zeros.items()
         )
         if self.score is None:
-            said.append(
-                "There is one window only: no held-out score; give a longer recording or a shorter --window."
-            )
+            said.append("There is one window only: no held-out score; give a longer recording or a shorter --window.")
         return [*said, *self._calibration(), *tests, *self.uncertainty.sentences]
 
     def _of_the_data(self) -> list[str]:
@@ -389,9 +387,7 @@ def _check_distinct(recordings: Sequence[Recording], held_out: Sequence[Recordin
             continue
         if i < len(recordings):
             raise DataError(f"{names[i]} has the same samples as {names[j]}; expected each recording once")
-        raise DataError(
-            f"{names[i]} took part in the fit as {names[j]}; expected another recording to hold out"
-        )
+        raise DataError(f"{names[i]} took part in the fit as {names[j]}; expected another recording to hold out")
 
 
 _LARGEST_VALUE = 1e300

@@ -76,9 +76,7 @@ def bumps(count: int, period: float) -> tuple[Array, Array, Array]:
     return rise**4 / total, first, second
 
 
-def first_models(
-    recording: Recording, fixed: FitModel, free: Sequence[str], *, spread: bool = True
-) -> list[FitModel]:
+def first_models(recording: Recording, fixed: FitModel, free: Sequence[str], *, spread: bool = True) -> list[FitModel]:
     """Return start models around the equation-error estimate.
 
     Args:
@@ -171,10 +169,7 @@ def rank(
     total = sum(len(piece.windows) for piece in pieces)
     stride = max(1, total // windows)
     few = [piece.subset(range(0, len(piece.windows), stride)) for piece in pieces]
-    trials = [
-        solve(model, few, free, scale=scale, max_iterations=15, tolerance=1e-4, coarse=3.0)
-        for model in models
-    ]
+    trials = [solve(model, few, free, scale=scale, max_iterations=15, tolerance=1e-4, coarse=3.0) for model in models]
     trials.sort(key=lambda solution: solution.cost if np.isfinite(solution.cost) else np.inf)
     chosen: list[Solution] = []
     for trial in trials:

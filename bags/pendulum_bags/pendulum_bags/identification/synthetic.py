@@ -25,9 +25,7 @@ _friction = njit(cache=True)(friction_magnitude)
 
 
 @njit(cache=True)
-def _integrate(
-    effort: Array, period: float, substeps: int, delay: float, state: Array, plant: Array
-) -> Array:
+def _integrate(effort: Array, period: float, substeps: int, delay: float, state: Array, plant: Array) -> Array:
     inertia, damping, gravity, coulomb, static, stribeck, load, offset, angle = plant
     h = period / substeps
     theta, omega = state[0], state[1]
@@ -54,9 +52,7 @@ def _integrate(
     return out
 
 
-def multisine(
-    time: Array, amplitude: float, rng: np.random.Generator, *, tones: int = 8, top: float = 3.0
-) -> Array:
+def multisine(time: Array, amplitude: float, rng: np.random.Generator, *, tones: int = 8, top: float = 3.0) -> Array:
     """Return a sum of sines of random phase between 0.2 Hz and ``top`` [Hz], peak ``amplitude``; shape of ``time``."""
     frequency = np.geomspace(0.2, top, tones)
     phase = rng.uniform(0.0, 2.0 * np.pi, tones)

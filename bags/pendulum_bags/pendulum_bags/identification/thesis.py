@@ -252,9 +252,7 @@ def static_holds(recording: Recording, *, speed: float = 0.02, least: float = 0.
             continue
         position = float(recording.position[inside].mean())
         last = holds[-1].position if holds else (float(before[0]) if before.size else position)
-        holds.append(
-            StaticHold(position, float(effort.mean()), float(start), float(stop), abs(position) > abs(last))
-        )
+        holds.append(StaticHold(position, float(effort.mean()), float(start), float(stop), abs(position) > abs(last)))
     return holds
 
 
@@ -298,13 +296,9 @@ def fit_gravity(recordings: Sequence[Recording]) -> ThesisResult:
 
 def _require_effort(recording: Recording) -> None:
     if recording.input_kind != "effort":
-        raise DataError(
-            f"{recording.name} has the input {recording.input_kind!r}; the regressions need an effort"
-        )
+        raise DataError(f"{recording.name} has the input {recording.input_kind!r}; the regressions need an effort")
     if recording.input_time is not None and recording.meta.get("effort") == "applied":
-        raise DataError(
-            f"{recording.name} was read with applied effort; the regressions need the measured one"
-        )
+        raise DataError(f"{recording.name} was read with applied effort; the regressions need the measured one")
 
 
 def _average(trials: Sequence[Regression]) -> tuple[dict[str, float], dict[str, tuple[float, float]], int]:

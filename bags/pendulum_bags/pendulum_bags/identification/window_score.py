@@ -45,9 +45,7 @@ class WindowScore:
     states: Array
 
 
-def window_score(
-    model: FitModel | PlantParameters, recording: Recording, window: float | None = 1.0
-) -> WindowScore:
+def window_score(model: FitModel | PlantParameters, recording: Recording, window: float | None = 1.0) -> WindowScore:
     """Simulate a recording in windows, the initial state of each fitted to it, and measure the angle error.
 
     Windows of length ``window`` follow one another from the first sample; a rest of at least half a window is
@@ -101,9 +99,7 @@ def free_run(
     states = piece.states.copy()
     if fitted:
         stop = int(np.searchsorted(recording.time, recording.time[0] + settle))
-        head = Piece(
-            recording, np.array([[0, max(stop, 4)]], dtype=np.int64), states, piece.integral, piece.enabled
-        )
+        head = Piece(recording, np.array([[0, max(stop, 4)]], dtype=np.int64), states, piece.integral, piece.enabled)
         states = solve(fit_model, [head], (), max_iterations=40).states[0]
     elif recording.velocity is not None:
         states[0] = recording.position[0], recording.velocity[0]

@@ -65,9 +65,7 @@ def plain_sentences(
     pieces = fit.pieces
     kind = pieces[0].recording.input_kind
     if kind == "none" and "inertia" in names:
-        said.append(
-            "The pendulum swings freely: the scale of all torques is that of the given mass and length."
-        )
+        said.append("The pendulum swings freely: the scale of all torques is that of the given mass and length.")
     elif kind == "none":
         said.append(
             "The pendulum swings freely: only ratios to the inertia can be determined, not the absolute scale of "
@@ -127,9 +125,7 @@ def _edge(name: str, fit: OutputErrorFit) -> str:
         why = "the data want none of it"
     else:
         why = f"the data want {'less' if value <= low else 'more'} than the {low:g} to {high:g} in which it is sought"
-    return (
-        f"{name} ended at the edge of its domain, {value:.3g} {UNITS[name]}: {why}, and it has no interval."
-    )
+    return f"{name} ended at the edge of its domain, {value:.3g} {UNITS[name]}: {why}, and it has no interval."
 
 
 def _unresolved(dropped: str, intervals: Mapping[str, Interval], fit: OutputErrorFit) -> str:
@@ -140,11 +136,7 @@ def _unresolved(dropped: str, intervals: Mapping[str, Interval], fit: OutputErro
     total = model["torque_offset"] + model["gravity"] * cosine * model["angle_offset"]
     kept = "angle_offset" if dropped == "torque_offset" else "torque_offset"
     interval = intervals.get(kept)
-    reach = (
-        f", though either could hold it (interval {interval.low:.3g} to {interval.high:.3g})"
-        if interval
-        else ""
-    )
+    reach = f", though either could hold it (interval {interval.low:.3g} to {interval.high:.3g})" if interval else ""
     return (
         f"torque_offset and angle_offset cannot be told apart: over the angles of this recording both shift the motion "
         f"alike. Known is their sum as a torque, torque_offset + {cosine:.2f} gravity angle_offset = {total:.3g}; the "

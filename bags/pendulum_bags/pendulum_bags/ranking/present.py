@@ -66,9 +66,7 @@ def same_choice(ranking: Ranking, margin: float = REGRET_MARGIN) -> LayerResult:
     )  # fmt: skip
     steps = ("record more seeds: --seeds 10",) if mark is Mark.UNDECIDED else ()
     if mark is Mark.NO:
-        steps = (
-            f"compare the plants in frequency, where {ranking.pick} works: experiment frequency_response",
-        )
+        steps = (f"compare the plants in frequency, where {ranking.pick} works: experiment frequency_response",)
     percent = [100.0 * value for value in share]
     reason = {
         Mark.YES: f"the simulation's pick costs at most {percent[2]:.0f} % more on the hardware than the best of "

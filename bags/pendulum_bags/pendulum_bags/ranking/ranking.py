@@ -162,9 +162,7 @@ def rank(contenders: Sequence[Contender], generator: np.random.Generator | None 
         DataError: There are too few, or none succeeds on both sides.
     """
     if len(contenders) < _LEAST:
-        raise DataError(
-            f"got {len(contenders)} controllers with runs on both sides; expected at least {_LEAST}"
-        )
+        raise DataError(f"got {len(contenders)} controllers with runs on both sides; expected at least {_LEAST}")
     generator = generator or np.random.default_rng(0)
     raw = {side: np.array([one.cost(side) for one in contenders]) for side in ("sim", "hw")}
     able = np.isfinite(raw["sim"]) & np.isfinite(raw["hw"])
@@ -192,11 +190,7 @@ def rank(contenders: Sequence[Contender], generator: np.random.Generator | None 
         contenders[int(order[0])].name,
         sorted(wrong, key=lambda pair: (not pair.sure, -pair.hw)),
         len(contenders) * (len(contenders) - 1) // 2,
-        [
-            one.name
-            for one, s, h in zip(contenders, raw["sim"], raw["hw"], strict=True)
-            if np.isinf(s) != np.isinf(h)
-        ],
+        [one.name for one, s, h in zip(contenders, raw["sim"], raw["hw"], strict=True) if np.isinf(s) != np.isinf(h)],
     )
 
 
@@ -209,9 +203,7 @@ def _capped(costs: Array) -> Array:
 
 def _pearson(sim: Array, hw: Array) -> Interval:
     if sim.size < 4 or np.ptp(sim) == 0.0 or np.ptp(hw) == 0.0:
-        value = (
-            float(np.corrcoef(sim, hw)[0, 1]) if sim.size > 1 and np.ptp(sim) and np.ptp(hw) else float("nan")
-        )
+        value = float(np.corrcoef(sim, hw)[0, 1]) if sim.size > 1 and np.ptp(sim) and np.ptp(hw) else float("nan")
         return Interval(value, float("nan"), float("nan"))
     found = stats.pearsonr(sim, hw)
     low, high = found.confidence_interval(0.95)

@@ -99,9 +99,7 @@ class ControllerReplay:
             ),
             Panel(time, "difference [N m]", [Trace(self.t, self.difference, "", "difference", "step")]),
         ]
-        return Figure(
-            "controller_replay", f"Replay of the controller {self.controller}", self.sentence(), panels
-        )
+        return Figure("controller_replay", f"Replay of the controller {self.controller}", self.sentence(), panels)
 
 
 def recorded_controller(metadata: Mapping[str, Any]) -> tuple[str, dict[str, Any], str]:
@@ -113,9 +111,7 @@ def recorded_controller(metadata: Mapping[str, Any]) -> tuple[str, dict[str, Any
     run = metadata.get("pendulum.run")
     told = run.get("controller") if isinstance(run, Mapping) else None
     if not isinstance(run, Mapping) or not isinstance(told, Mapping) or "kind" not in told:
-        raise DataError(
-            "the bag does not say which controller made it; expected pendulum.run.controller, or name one"
-        )
+        raise DataError("the bag does not say which controller made it; expected pendulum.run.controller, or name one")
     name = str(told["kind"])
     known = {spec.name for spec in controller_parameters(name)}
     values = {key: value for key, value in told.items() if key in known}
@@ -171,9 +167,7 @@ def replay_controller(
     answers = np.array(
         [
             law.command(time, (angle, velocity))
-            for time, angle, velocity in zip(
-                t.tolist(), angles.tolist(), states["velocity"].tolist(), strict=True
-            )
+            for time, angle, velocity in zip(t.tolist(), angles.tolist(), states["velocity"].tolist(), strict=True)
         ]
     )
     _, mine, theirs = np.intersect1d(states["stamp_ns"], commands["stamp_ns"], return_indices=True)

@@ -33,9 +33,7 @@ _WORDS = {
 }
 
 
-def replay_fit(
-    recording: Recording, plant: str | Path | PlantParameters, *, window: float = 1.0
-) -> InputReplay:
+def replay_fit(recording: Recording, plant: str | Path | PlantParameters, *, window: float = 1.0) -> InputReplay:
     """Drive the fit of an identification with a recording, in windows and in free run.
 
     Args:

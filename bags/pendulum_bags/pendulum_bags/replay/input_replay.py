@@ -27,7 +27,7 @@ from pendulum_msgs_py.plants.plant_parameters import PlantParameters, load_plant
 from pendulum_sim.plant import Plant
 from pendulum_sim.plants import make_plant
 
-__all__ = [ "replay_input", "replay_recording"]
+__all__ = ["replay_input", "replay_recording"]
 
 Array = NDArray[np.float64]
 
@@ -105,9 +105,7 @@ def replay_input(recording: Recording, parameters: PlantParameters, *, window: f
         start = tuple(score.states[0])
     else:
         window_time, window_angle, by_window = _windows(driven, window)
-        rms = float(
-            np.sqrt(np.mean((window_angle - np.interp(window_time, driven.time, driven.position)) ** 2))
-        )
+        rms = float(np.sqrt(np.mean((window_angle - np.interp(window_time, driven.time, driven.position)) ** 2)))
         start = (float(driven.position[0]), float(driven.velocity[0]))
     free = driven.run(0, driven.time.size - 1, (float(start[0]), float(start[1])))
     error = free - driven.position
@@ -213,12 +211,8 @@ def _horizons(driven: _Driven, longest: float) -> tuple[HorizonError, ...]:
     period = float(driven.time[1] - driven.time[0])
     reach = min(max(1, round(longest / period)), driven.time.size - 1)
     starts = np.unique(np.linspace(0, driven.time.size - 1 - reach, MOST_STARTS).astype(int))
-    error = np.stack(
-        [driven.run(int(first), reach) - driven.position[first : first + reach + 1] for first in starts]
-    )
+    error = np.stack([driven.run(int(first), reach) - driven.position[first : first + reach + 1] for first in starts])
     return tuple(
         HorizonError(k, k * period, float(np.sqrt(np.mean(error[:, k] ** 2))), starts.size)
         for k in horizon_steps(reach)
     )
-
-

@@ -37,9 +37,7 @@ def replay(
         list[str] | None,
         typer.Option("--set", help="Parameter of the controller, such as --set 'q=[100.0, 0.01]'."),
     ] = None,
-    window: Annotated[
-        float, typer.Option(help="Length of the windows whose initial state is fitted [s].")
-    ] = 1.0,
+    window: Annotated[float, typer.Option(help="Length of the windows whose initial state is fitted [s].")] = 1.0,
     start: Annotated[float | None, typer.Option(help="Leave out what comes before [s].")] = None,
     stop: Annotated[float | None, typer.Option(help="Leave out what comes after [s].")] = None,
     mapping: Annotated[str, typer.Option(help="Mapping file of a CSV with other columns or units.")] = "",
@@ -47,15 +45,9 @@ def replay(
         str | None,
         typer.Option(help="Input of a CSV between its samples: zero (a held command) or linear (measured)."),
     ] = None,
-    effort: Annotated[
-        str, typer.Option(help="Torque of a bag: applied (said by the plant) or measured.")
-    ] = "applied",
-    prefix: Annotated[
-        str, typer.Option(help="Namespace of a bag's topics, where it holds several plants: /sim.")
-    ] = "",
-    out: Annotated[
-        Path | None, typer.Option("--out", "-o", help="Folder for figure and replay.json.")
-    ] = None,
+    effort: Annotated[str, typer.Option(help="Torque of a bag: applied (said by the plant) or measured.")] = "applied",
+    prefix: Annotated[str, typer.Option(help="Namespace of a bag's topics, where it holds several plants: /sim.")] = "",
+    out: Annotated[Path | None, typer.Option("--out", "-o", help="Folder for figure and replay.json.")] = None,
     json_output: Annotated[bool, typer.Option("--json", help="Print JSON instead of tables.")] = False,
 ) -> None:
     """Drive a plant with a recorded input and compare the motion; or a controller with recorded states.
@@ -120,9 +112,7 @@ def _print(result: InputReplay | ControllerReplay, content: dict[str, Any], *, c
         ):
             table.add_column(heading, justify="right")
         for row in content["horizons"]:
-            table.add_row(
-                str(row["steps"]), f"{row['time_s']:.4g}", f"{row['rms_rad']:.3g}", str(row["starts"])
-            )
+            table.add_row(str(row["steps"]), f"{row['time_s']:.4g}", f"{row['rms_rad']:.3g}", str(row["starts"]))
         console.print(table)
         console.print(f"plant {content['plant']}" + ("" if chosen else " (--params names another)"), highlight=False)
         fit, diverges = content["free_run_fit_percent"], content["diverges_at_s"]

@@ -124,9 +124,7 @@ def spectra(data: ReportData) -> Figure:
     result = pair.spectra
     inside = slice(1, None)
     frequency = result.frequency[inside]
-    power = [
-        float(np.sum(one[inside]) * (frequency[1] - frequency[0])) for one in (result.first, result.second)
-    ]
+    power = [float(np.sum(one[inside]) * (frequency[1] - frequency[0])) for one in (result.first, result.second)]
     panels = [
         Panel(
             "frequency [Hz]",
@@ -225,13 +223,10 @@ def effort(data: ReportData) -> Figure:
     runs = [("simulation", "sim", pair.simulation.window), ("hardware", "hw", pair.hardware.window)]
     heat = [(label, role, series.t, _cumulative(series, series.effort**2)) for label, role, series in runs]
     work = [
-        (label, role, series.t, _cumulative(series, series.effort * series.velocity))
-        for label, role, series in runs
+        (label, role, series.t, _cumulative(series, series.effort * series.velocity)) for label, role, series in runs
     ]
     panels = [
-        Panel(
-            "time since the noise began [s]", text, [Trace(t, y, label, role) for label, role, t, y in curves]
-        )
+        Panel("time since the noise began [s]", text, [Trace(t, y, label, role) for label, role, t, y in curves])
         for text, curves in (("∫u² dt [N² m² s]", heat), ("∫u θ′ dt [J]", work))
     ]
     ratio = float(heat[1][3][-1] / heat[0][3][-1]) if heat[0][3][-1] > 0.0 else float("nan")
@@ -241,9 +236,7 @@ def effort(data: ReportData) -> Figure:
         f"{ratio_in_words(ratio)} than in simulation; it {sign} the hardware "
         f"({quantity(float(work[1][3][-1]), 'J')})."
     ).replace("equal within half a per cent than", "within half a per cent of what it spends")
-    return Figure(
-        "effort", "Effort and energy", sentence, panels, section="Paired comparison", panel_height=150
-    )
+    return Figure("effort", "Effort and energy", sentence, panels, section="Paired comparison", panel_height=150)
 
 
 def _cumulative(series: Series, values: Array) -> Array:
@@ -257,9 +250,7 @@ def timing(data: ReportData) -> Figure:
     panels, words = [], []
     for label, role, run in (("simulation", "sim", pair.simulation), ("hardware", "hw", pair.hardware)):
         stamped, arrived = 1e3 * np.diff(run.window.t), 1e3 * run.arrival
-        traces = (
-            [Trace(*_distribution(arrived), "arrival at the recorder", role, "step")] if arrived.size else []
-        )
+        traces = [Trace(*_distribution(arrived), "arrival at the recorder", role, "step")] if arrived.size else []
         traces.append(Trace(*_distribution(stamped), "stamps", "difference", "step"))
         panels.append(Panel("interval [ms]", "share below [−]", traces, title=label.capitalize()))
         late = float(np.quantile(arrived, 0.99)) if arrived.size else float("nan")
@@ -269,9 +260,7 @@ def timing(data: ReportData) -> Figure:
             f"99 % of the intervals at the recorder below {late:.1f} ms"
         )
     sentence = f"During the noise: {'; '.join(words)}."
-    return Figure(
-        "timing", "Timing of the states", sentence, panels, stacked=False, section="Timing", panel_height=200
-    )
+    return Figure("timing", "Timing of the states", sentence, panels, stacked=False, section="Timing", panel_height=200)
 
 
 _OF_EACH_RUN: tuple[tuple[str, str, Callable[[Array], float]], ...] = (
@@ -291,9 +280,7 @@ def pooled_runs(data: ReportData) -> Figure | str:
     panels = []
     for unit, name, function in _OF_EACH_RUN:
         traces = [
-            Trace(
-                number, np.array([function(getattr(run.window, name)) for run in runs]), label, role, "points"
-            )
+            Trace(number, np.array([function(getattr(run.window, name)) for run in runs]), label, role, "points")
             for label, role, runs in (
                 ("simulation", "sim", [pair.simulation for pair in pairs]),
                 ("hardware", "hw", [pair.hardware for pair in pairs]),
@@ -306,6 +293,4 @@ def pooled_runs(data: ReportData) -> Figure | str:
         f"Over {len(pairs)} runs the spread of the hardware's angle lies between {quantity(min(spreads), 'rad')} and "
         f"{quantity(max(spreads), 'rad')}; together they hold {total:.0f} effective samples of it."
     )
-    return Figure(
-        "pooled_runs", "All runs", sentence, panels, stacked=False, section="Repeated runs", panel_height=200
-    )
+    return Figure("pooled_runs", "All runs", sentence, panels, stacked=False, section="Repeated runs", panel_height=200)

@@ -36,9 +36,7 @@ def overdamped_phase(data: ReportData) -> Figure | str:
         "shifts both."
     )
     panel = Panel("θ [rad]", "θ′ [rad/s]", traces)
-    return Figure(
-        "overdamped_phase", "Overdamped phase plot", sentence, [panel], section="Model", panel_height=260
-    )
+    return Figure("overdamped_phase", "Overdamped phase plot", sentence, [panel], section="Model", panel_height=260)
 
 
 def _fit(theta: Array, velocity: Array, torque: Array) -> tuple[Array, float]:
@@ -86,9 +84,7 @@ def gravity_fit(data: ReportData) -> Figure | str:
     if not panels:
         return "needs ramps with measured torque"
     gives = "; ".join(words)
-    sentence = (
-        f"Least squares of the measured torque on sin θ, θ′ and a constant over the way up gives {gives}."
-    )
+    sentence = f"Least squares of the measured torque on sin θ, θ′ and a constant over the way up gives {gives}."
     return Figure(
         "gravity_fit",
         "Torque over sin θ",

@@ -58,9 +58,7 @@ def simulation_under_noise(data: ReportData) -> Figure:
     run = data.comparison.own[0]
     own = run is not data.comparison.pairs[0].simulation
     title = "Simulation under noise" + (", by the thesis's own protocol" if own else "")
-    return _under_noise(
-        run, "own alone" if own else "sim", "simulation_under_noise", title, "Plants under noise"
-    )
+    return _under_noise(run, "own alone" if own else "sim", "simulation_under_noise", title, "Plants under noise")
 
 
 def hardware_under_noise(data: ReportData) -> Figure:
@@ -74,9 +72,7 @@ def both_together(data: ReportData) -> Figure:
     pair = data.comparison.pairs[0]
     sim, hw = pair.simulation.window, pair.hardware.window
     ratio = float(hw.position.std() / sim.position.std())
-    fit = 100.0 * (
-        1.0 - float(np.sqrt(np.mean(pair.difference.position**2)) / pair.difference.hardware.position.std())
-    )
+    fit = 100.0 * (1.0 - float(np.sqrt(np.mean(pair.difference.position**2)) / pair.difference.hardware.position.std()))
     shared = "the same noise" if pair.is_paired else "noise of their own"
     follows = f", and the simulated angle fits the measured one to {fit:.0f} %" if pair.is_paired else ""
     sentence = (
@@ -129,9 +125,7 @@ def torque_and_noise(data: ReportData) -> Figure | str:
         f"Below, the noise is scaled by {factor:.3g}."
     )
     panels = [
-        Panel(
-            TIME, TORQUE, [Trace(noise.t, noise.value, "noise d", "noise", "step"), *used], title="Unscaled"
-        ),
+        Panel(TIME, TORQUE, [Trace(noise.t, noise.value, "noise d", "noise", "step"), *used], title="Unscaled"),
         Panel(
             TIME,
             TORQUE,
@@ -264,8 +258,7 @@ def ramps(data: ReportData) -> Figure | str:
     for way, parts in moves.items():
         for text, name in (("θ [rad]", "position"), (VELOCITY, "velocity")):
             traces = [
-                Trace(series.t - start, getattr(series, name), label, role)
-                for label, role, series, start in parts
+                Trace(series.t - start, getattr(series, name), label, role) for label, role, series, start in parts
             ]
             if traces:
                 panels.append(
@@ -276,14 +269,9 @@ def ramps(data: ReportData) -> Figure | str:
                         title=f"{text[:2].strip()} {way}",
                     )
                 )
-    speeds = {
-        label: float(np.median(np.abs(series.velocity)))
-        for label, _, series, _ in moves["up"] or moves["down"]
-    }
+    speeds = {label: float(np.median(np.abs(series.velocity))) for label, _, series, _ in moves["up"] or moves["down"]}
     spans = [series.duration for parts in moves.values() for *_, series, _ in parts]
-    last = [
-        f"{label} {quantity(float(series.position[-1]), 'rad', 5)}" for label, _, series, _ in moves["up"]
-    ]
+    last = [f"{label} {quantity(float(series.position[-1]), 'rad', 5)}" for label, _, series, _ in moves["up"]]
     reached = f" The way up ends at {' and '.join(last)}." if last else ""
     typical = " and ".join(f"{quantity(speed, 'rad/s')} ({label})" for label, speed in speeds.items())
     sentence = f"A ramp takes {max(spans):.1f} s; the median speed is {typical}.{reached}"

@@ -33,9 +33,7 @@ def report(
         list[str] | None,
         typer.Option("--margin", help="As for compare: NAME=VALUE, several times if wanted."),
     ] = None,
-    margins_file: Annotated[
-        Path | None, typer.Option("--margins", help="File of margins, as for compare.")
-    ] = None,
+    margins_file: Annotated[Path | None, typer.Option("--margins", help="File of margins, as for compare.")] = None,
     layers: LayersOption = None,
     machine: MachineOption = None,
     design: DesignOption = None,
@@ -75,9 +73,7 @@ def report(
         result = compare_runs(folders[0], folders[1], margin=margins)
         target = out or _common(folders)
     else:
-        bad = next(
-            folder for folder in folders if not ((folder / "sim").exists() and (folder / "hw").exists())
-        )
+        bad = next(folder for folder in folders if not ((folder / "sim").exists() and (folder / "hw").exists()))
         raise BagError(f"run folder {bad} has no bags sim and hw; expected run folders, or two bags")
     kept = [*(folders if len(folders) == 1 else ()), *(layers or ())]
     certified = carry_over(result, kept, machine, design or ())

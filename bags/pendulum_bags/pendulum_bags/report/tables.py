@@ -97,8 +97,7 @@ _PLANT_ROWS = (
 def _plants(data: ReportData) -> Table:
     plants = data.comparison.plants
     rows = [
-        (label, *(_cell(plant.get(key), digits) for plant in plants.values()))
-        for label, key, digits in _PLANT_ROWS
+        (label, *(_cell(plant.get(key), digits) for plant in plants.values())) for label, key, digits in _PLANT_ROWS
     ]
     sim, hw = plants["sim"], plants["hw"]
     sentence = (
@@ -106,9 +105,7 @@ def _plants(data: ReportData) -> Table:
         f"{int(sim['missed_deadlines'])} deadlines were missed in simulation and {int(hw['missed_deadlines'])} on "
         "hardware."
     )
-    return Table(
-        "Plants under noise", sentence, ("", *(_PLANT_NAMES[name] for name in plants)), rows, "Verdict"
-    )
+    return Table("Plants under noise", sentence, ("", *(_PLANT_NAMES[name] for name in plants)), rows, "Verdict")
 
 
 def _tests(data: ReportData) -> Table:
@@ -121,9 +118,7 @@ def _tests(data: ReportData) -> Table:
             else f"below {quantity(test.high)}"
         )
         more = (
-            "–"
-            if test.more_runs == 0
-            else ("more runs hardly help" if test.more_runs is None else str(test.more_runs))
+            "–" if test.more_runs == 0 else ("more runs hardly help" if test.more_runs is None else str(test.more_runs))
         )
         rows.append(
             (
@@ -231,11 +226,7 @@ def _eigenvalues(data: ReportData) -> Table | None:
         rows.append((str(number), *values))
     chosen = data.run.get("controller", {})
     used = next(
-        (
-            n
-            for n, w in enumerate(WEIGHTS, 1)
-            if [*chosen.get("q", ()), chosen.get("r")] == [w[0], w[1], w[2]]
-        ),
+        (n for n, w in enumerate(WEIGHTS, 1) if [*chosen.get("q", ()), chosen.get("r")] == [w[0], w[1], w[2]]),
         None,
     )
     unstable = float(np.max(open_loop.real))
@@ -258,13 +249,10 @@ def _model(data: ReportData) -> Table | None:
     if plant is None:
         return None
     rows = [
-        (spec.name, quantity(getattr(plant, spec.name), "", 6), spec.unit, spec.description)
-        for spec in PLANT_SPECS
+        (spec.name, quantity(getattr(plant, spec.name), "", 6), spec.unit, spec.description) for spec in PLANT_SPECS
     ]
     sentence = f"Simulation and design of the controller use the plant {plant.name!r}: M θ″ + b θ′ + G sin θ = u + d."
-    return Table(
-        "Parameters of the model", sentence, ("parameter", "value", "unit", "meaning"), rows, "Model"
-    )
+    return Table("Parameters of the model", sentence, ("parameter", "value", "unit", "meaning"), rows, "Model")
 
 
 def _regression(trials: TrialSet) -> list[Table]:

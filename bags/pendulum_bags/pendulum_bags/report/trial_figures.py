@@ -91,9 +91,7 @@ def effort_over_time(data: ReportData) -> Figure | str:
     if trials is None:
         return "needs the trials of experiment 1"
     panels = []
-    for number, (trial, recording) in enumerate(
-        zip(trials.result.trials, trials.recordings, strict=True), start=1
-    ):
+    for number, (trial, recording) in enumerate(zip(trials.result.trials, trials.recordings, strict=True), start=1):
         t = recording.time - recording.time[0]
         traces = [
             Trace(*thinned(t, trial.response, 1000), "measured", "hw"),
@@ -102,9 +100,7 @@ def effort_over_time(data: ReportData) -> Figure | str:
         panels.append(Panel("time [s]", "effort [N m]", traces, title=f"Trial {number}"))
     lowest = min(trial.r_squared for trial in trials.result.trials)
     sentence = f"The fit explains at least {100.0 * lowest:.2f} % of the squared effort of each trial."
-    return Figure(
-        "trials", "Trials by hand", sentence, panels, stacked=False, section=INERTIA, panel_height=180
-    )
+    return Figure("trials", "Trials by hand", sentence, panels, stacked=False, section=INERTIA, panel_height=180)
 
 
 def dynamic_phase(data: ReportData) -> Figure | str:
@@ -119,13 +115,9 @@ def dynamic_phase(data: ReportData) -> Figure | str:
         if recording.velocity is not None:
             rows["θ′ [rad/s]"].append(Trace(recording.time - start, recording.velocity, label, role))
         rows["effort [N m]"].append(Trace(recording.input_stamps - start, recording.input, label, role))
-    panels = [
-        Panel("time since the trial began [s]", label, traces) for label, traces in rows.items() if traces
-    ]
+    panels = [Panel("time since the trial began [s]", label, traces) for label, traces in rows.items() if traces]
     reach = [
-        float(np.degrees(value))
-        for one in trials.recordings
-        for value in (one.position.min(), one.position.max())
+        float(np.degrees(value)) for one in trials.recordings for value in (one.position.min(), one.position.max())
     ]
     sentence = f"The staircases reach from {min(reach):.1f}° to {max(reach):.1f}°, up and back on both sides."
     return Figure("dynamic_phase", "Dynamic phase", sentence, panels, section=GRAVITY, panel_height=150)
@@ -155,18 +147,12 @@ def static_phase(data: ReportData) -> Figure | str:
                     )
                 )
         if traces:
-            panels.append(
-                Panel("time in the hold [s]", "effort [N m]", traces, title=f"Hold at {degrees:.0f}°")
-            )
+            panels.append(Panel("time in the hold [s]", "effort [N m]", traces, title=f"Hold at {degrees:.0f}°"))
     if not panels:
         return "the staircases have no hold at 10, 90 or −10 degrees"
     hysteresis = trials.result.hysteresis
-    sentence = (
-        f"Going up takes {quantity(hysteresis, 'N m')} more effort than coming down, on average: hysteresis."
-    )
-    return Figure(
-        "static_phase", "Static phase", sentence, panels, stacked=False, section=GRAVITY, panel_height=200
-    )
+    sentence = f"Going up takes {quantity(hysteresis, 'N m')} more effort than coming down, on average: hysteresis."
+    return Figure("static_phase", "Static phase", sentence, panels, stacked=False, section=GRAVITY, panel_height=200)
 
 
 def effort_over_sine(data: ReportData) -> Figure | str:
@@ -183,6 +169,4 @@ def effort_over_sine(data: ReportData) -> Figure | str:
     traces.append(Trace(ends, gravity * ends, "mean of the fits", "fit"))
     panel = Panel("sin θ [−]", "mean effort of a hold [N m]", traces)
     sentence = f"The regression gives {_found(trials)}."
-    return Figure(
-        "effort_over_sine", "Effort over sin θ, static", sentence, [panel], section=GRAVITY, panel_height=280
-    )
+    return Figure("effort_over_sine", "Effort over sin θ, static", sentence, [panel], section=GRAVITY, panel_height=280)

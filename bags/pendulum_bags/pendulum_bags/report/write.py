@@ -71,16 +71,11 @@ def write_report(
 
     out = Path(run_folder)
     if comparison is None:
-        comparison = compare_folders(
-            list(folders) or [out], margin=margin_of(summary) if margin is None else margin
-        )
+        comparison = compare_folders(list(folders) or [out], margin=margin_of(summary) if margin is None else margin)
     content = {**comparison.to_json(), **(summary or {})}
     found = [find_real_recording()] if recordings is None else list(recordings)
     replays = [
-        replay
-        for path in found
-        if path is not None
-        for replay in _replay(path, required=recordings is not None)
+        replay for path in found if path is not None for replay in _replay(path, required=recordings is not None)
     ]
     names = [Path(folder).name for folder in folders] or [out.resolve().name]
     kept = [Path(folder) for folder in folders] if len(folders) == 1 else [] if folders else [out]
@@ -127,11 +122,7 @@ def find_real_recording() -> Path | None:
     the folder that holds this checkout.
     """
     told = os.environ.get("PENDULUM_SHARED_DATA")
-    places = (
-        [Path(told)]
-        if told
-        else [parent / "shared" / "data" for parent in Path(__file__).resolve().parents[4:6]]
-    )
+    places = [Path(told)] if told else [parent / "shared" / "data" for parent in Path(__file__).resolve().parents[4:6]]
     return next((place / REAL_RECORDING for place in places if (place / REAL_RECORDING).is_file()), None)
 
 

@@ -16,9 +16,7 @@ __all__ = ["phases", "read_bag_recording"]
 _NS = 1e-9
 
 
-def read_bag_recording(
-    path: str | Path, *, effort: str = "applied", namespace: str | None = None
-) -> Recording:
+def read_bag_recording(path: str | Path, *, effort: str = "applied", namespace: str | None = None) -> Recording:
     """Read position and velocity from ``joint_states`` and the input that belongs to them.
 
     Args:
@@ -68,28 +66,20 @@ def read_bag_recording(
             meta={**meta, "input_topic": applied_topic},
         )
     if np.isnan(states["effort"]).all():
-        raise DataError(
-            f"bag {path} has no topic {applied_topic} and no effort in {states_topic}; expected either"
-        )
-    return Recording(
-        time, states["position"], velocity, states["effort"], meta={**meta, "effort": "measured"}
-    )
+        raise DataError(f"bag {path} has no topic {applied_topic} and no effort in {states_topic}; expected either")
+    return Recording(time, states["position"], velocity, states["effort"], meta={**meta, "effort": "measured"})
 
 
 def _find(bag: Bag, name: str, namespace: str | None) -> str:
     if namespace is not None:
         topic = f"/{namespace.strip('/')}/{name}".replace("//", "/")
         if topic not in bag.topics:
-            raise DataError(
-                f"bag {bag.path} has no topic {topic}; it has {', '.join(sorted(bag.topics)) or 'none'}"
-            )
+            raise DataError(f"bag {bag.path} has no topic {topic}; it has {', '.join(sorted(bag.topics)) or 'none'}")
         return topic
     found = sorted(topic for topic in bag.topics if topic.rsplit("/", 1)[-1] == name)
     if len(found) != 1:
         listing = ", ".join(found or sorted(bag.topics)) or "none"
-        raise DataError(
-            f"bag {bag.path} has {len(found)} topics called {name}; expected one (it has {listing})"
-        )
+        raise DataError(f"bag {bag.path} has {len(found)} topics called {name}; expected one (it has {listing})")
     return found[0]
 
 

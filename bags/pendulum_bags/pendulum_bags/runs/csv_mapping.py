@@ -213,9 +213,7 @@ def _read_table(source: Path, delimiter: str, skip: int) -> tuple[list[str], Arr
     if table.size == 0:
         raise DataError(f"{source} has no rows below its header")
     if table.shape[1] != len(names):
-        raise DataError(
-            f"{source} has {table.shape[1]} columns of numbers but {len(names)} names in its header"
-        )
+        raise DataError(f"{source} has {table.shape[1]} columns of numbers but {len(names)} names in its header")
     return names, table
 
 
@@ -247,9 +245,7 @@ def _row_range(rules: Mapping[str, Any], count: int, origin: str) -> tuple[int, 
     rows = rules.get("rows", [0, count])
     valid = isinstance(rows, (list, tuple)) and len(rows) == 2 and all(type(r) is int for r in rows)
     if not valid or not 0 <= rows[0] < min(rows[1], count):
-        raise DataError(
-            f"{origin}: rows is {rows!r}; expected [first, stop] within the {count} rows of the file"
-        )
+        raise DataError(f"{origin}: rows is {rows!r}; expected [first, stop] within the {count} rows of the file")
     return int(rows[0]), min(int(rows[1]), count)
 
 

@@ -142,9 +142,7 @@ class Recording:
         """Return samples ``start`` to ``stop`` (exclusive); the whole input stays, so that a delay can look back."""
         cut = slice(start, stop)
         if self.time[cut].size < 3:
-            raise DataError(
-                f"{self.name}: rows {start} to {stop} hold fewer than 3 of {self.time.size} samples"
-            )
+            raise DataError(f"{self.name}: rows {start} to {stop} hold fewer than 3 of {self.time.size} samples")
         return replace(
             self,
             time=self.time[cut],
@@ -164,9 +162,7 @@ def data_notes(recording: Recording) -> list[str]:
     """Return what was done to a recording while it was read, in words."""
     notes = []
     if recording.meta.get("repeated_stamps"):
-        notes.append(
-            f"{recording.meta['repeated_stamps']} samples repeat the stamp before them and are left out."
-        )
+        notes.append(f"{recording.meta['repeated_stamps']} samples repeat the stamp before them and are left out.")
     if recording.meta.get("unwrapped"):
         notes.append(
             f"the angle jumps by a turn {recording.meta['unwrapped']} times: it was wrapped, and is unwrapped here."
@@ -230,9 +226,7 @@ def distinct_names(recordings: Sequence[Recording]) -> list[str]:
     names = []
     for i, own in enumerate(parts):
         others = parts[:i] + parts[i + 1 :]
-        depth = next(
-            (n for n in range(1, len(own)) if all(own[-n:] != other[-n:] for other in others)), len(own)
-        )
+        depth = next((n for n in range(1, len(own)) if all(own[-n:] != other[-n:] for other in others)), len(own))
         name = str(Path(*own[-depth:]))
         twins = [j for j, other in enumerate(parts) if other == own]
         # Parts of one file, or recordings without one.
@@ -277,5 +271,3 @@ def check_consistency(recording: Recording, *, minimum_travel: float = 0.2) -> R
         f"{recording.name}: the velocity is {slope:.3g} times the derivative of the position; "
         f"expected 0.5 to 2{likely}: correct `unit` or `sign` in the mapping file"
     )
-
-

@@ -78,11 +78,7 @@ def read_servo_log(path: str | Path) -> Recording:
         raise DataError(f"{source} cannot be read: {error.strerror or error}") from error
     except (ValueError, RecursionError) as error:
         raise DataError(f"{source} is not JSON: {error}") from error
-    if (
-        not isinstance(content, dict)
-        or not isinstance(content.get("entries"), list)
-        or not content["entries"]
-    ):
+    if not isinstance(content, dict) or not isinstance(content.get("entries"), list) or not content["entries"]:
         raise DataError(f"{source} has no list 'entries'; expected a log of the friction study")
     entries: list[dict[str, Any]] = content["entries"]
     wrong = next((i for i, entry in enumerate(entries) if not isinstance(entry, dict)), None)
@@ -97,9 +93,7 @@ def read_servo_log(path: str | Path) -> Recording:
             except (TypeError, ValueError, OverflowError) as error:
                 raise DataError(f"{source}: entries[].{key} is not a number everywhere: {error}") from error
         elif key in _SERVO_ENTRY_KEYS:
-            raise DataError(
-                f"{source}: entry {missing[0]} has no {key!r}; expected {', '.join(_SERVO_ENTRY_KEYS)}"
-            )
+            raise DataError(f"{source}: entry {missing[0]} has no {key!r}; expected {', '.join(_SERVO_ENTRY_KEYS)}")
     meta = {key: value for key, value in content.items() if key != "entries"}
     meta["source"] = str(source)
     if "load" in columns:

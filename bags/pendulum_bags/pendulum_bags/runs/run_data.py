@@ -91,9 +91,7 @@ def find_prefix(bag: Bag) -> str:
     if len(found) == 1:
         return found[0]
     if not found:
-        raise DataError(
-            f"bag {bag.path} has no topic that ends in {ending}; it has {', '.join(bag.topics) or 'none'}"
-        )
+        raise DataError(f"bag {bag.path} has no topic that ends in {ending}; it has {', '.join(bag.topics) or 'none'}")
     raise DataError(f"bag {bag.path} holds several plants ({', '.join(found)}); choose one by its namespace")
 
 
@@ -246,9 +244,7 @@ def _optional(bag: Bag, topic: str) -> NDArray[Any] | None:
     return array if len(array) else None
 
 
-def _answers(
-    stamps: NDArray[np.int64], commands: NDArray[Any] | None, otherwise: NDArray[Any]
-) -> NDArray[np.float64]:
+def _answers(stamps: NDArray[np.int64], commands: NDArray[Any] | None, otherwise: NDArray[Any]) -> NDArray[np.float64]:
     """Return the torque that the controller gave in answer to each state; the newest one where an answer is missing."""
     if commands is None:
         # A recording without commands still has the measured torque.
@@ -262,9 +258,7 @@ def _answers(
 
 def _measured(states: NDArray[Any], times: NDArray[np.float64], name: str) -> Signal | None:
     known = np.isfinite(states["effort"])
-    return (
-        Signal(times[known], states["effort"][known], f"measured torque of {name}") if known.any() else None
-    )
+    return Signal(times[known], states["effort"][known], f"measured torque of {name}") if known.any() else None
 
 
 def _signal(array: NDArray[Any] | None, start: int, stop: int, name: str) -> Signal | None:
@@ -284,8 +278,7 @@ def _window(
     stop_ns: int | None,
 ) -> tuple[int, int]:
     found = {
-        name: [int(event["stamp_ns"]) for event in events if event["name"] == name]
-        for name in (START_EVENT, END_EVENT)
+        name: [int(event["stamp_ns"]) for event in events if event["name"] == name] for name in (START_EVENT, END_EVENT)
     }
     starts, stops = found[START_EVENT], found[END_EVENT]
     active = None
@@ -302,7 +295,5 @@ def _window(
     after = [stop for stop in stops if stop > start]
     stop = stop_ns if stop_ns is not None else (after[0] if after else active[1] if active else None)
     if stop is None or stop <= start:
-        raise DataError(
-            f"bag {path}: the noise starts at {start} ns and has no end; expected an event {END_EVENT!r}"
-        )
+        raise DataError(f"bag {path}: the noise starts at {start} ns and has no end; expected an event {END_EVENT!r}")
     return start, stop

@@ -63,9 +63,7 @@ class Signal:
         """Return the samples with ``start <= t < stop`` [s]."""
         first, last = np.searchsorted(self.t, (start, stop), side="left")
         if first == last:
-            raise DataError(
-                f"{self.name} has no sample between {start:.3f} s and {stop:.3f} s; expected at least 1"
-            )
+            raise DataError(f"{self.name} has no sample between {start:.3f} s and {stop:.3f} s; expected at least 1")
         return Signal(self.t[first:last], self.value[first:last], self.name)
 
     def held_at(self, times: ArrayLike) -> Array:

@@ -117,15 +117,19 @@ def costs_of(arrays: RunArrays) -> tuple[bool, float, dict[str, float]]:
     entered = 0.0 if not below.size else float(t[min(below[-1] + 1, t.size - 1)])
     success = bool(up[-1]) and duration - entered >= HOLD_TIME
     tau, dt = arrays.applied, np.diff(t)
-    return success, float(up.mean()), {
-        "time": entered if success else duration,
-        "max_torque": float(np.abs(tau).max()),
-        "energy": float(np.sum(np.abs(tau * arrays.velocity[:-1]) * dt)),
-        "torque_integral": float(np.sum(np.abs(tau) * dt)),
-        "torque_squared": float(np.sum(tau * tau * dt)),
-        "smoothness": float(np.std(np.diff(tau))),
-        "velocity": float(np.sum(arrays.velocity[:-1] ** 2 * dt)),
-    }
+    return (
+        success,
+        float(up.mean()),
+        {
+            "time": entered if success else duration,
+            "max_torque": float(np.abs(tau).max()),
+            "energy": float(np.sum(np.abs(tau * arrays.velocity[:-1]) * dt)),
+            "torque_integral": float(np.sum(np.abs(tau) * dt)),
+            "torque_squared": float(np.sum(tau * tau * dt)),
+            "smoothness": float(np.std(np.diff(tau))),
+            "velocity": float(np.sum(arrays.velocity[:-1] ** 2 * dt)),
+        },
+    )
 
 
 def scores(success: bool, uptime: float, costs: Mapping[str, float]) -> dict[str, float]:

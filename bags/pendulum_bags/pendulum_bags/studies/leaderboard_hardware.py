@@ -63,9 +63,7 @@ def arrays_of_bag(bag: Path, namespace: str) -> RunArrays:
     torque = np.zeros(stamps.size)
     torque[at] = applied["effort"][where]
     unknown = np.full(stamps.size, np.nan)
-    return RunArrays(
-        stamps, states["position"], states["velocity"], states["effort"], unknown, unknown, torque[:-1]
-    )
+    return RunArrays(stamps, states["position"], states["velocity"], states["effort"], unknown, unknown, torque[:-1])
 
 
 def _model_error(folder: Path, _duration: float) -> Sequence[Mapping[str, Any]]:

@@ -27,9 +27,7 @@ class LocatedMapping:
         trail: Where this mapping lies in the file.
     """
 
-    def __init__(
-        self, values: Mapping[str, Any], path: Path, lines: Mapping[Trail, int], trail: Trail = ()
-    ) -> None:
+    def __init__(self, values: Mapping[str, Any], path: Path, lines: Mapping[Trail, int], trail: Trail = ()) -> None:
         self.values = values
         self.path = path
         self._lines = lines

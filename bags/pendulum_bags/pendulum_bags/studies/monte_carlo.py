@@ -122,9 +122,7 @@ class MonteCarlo:
         return hashlib.sha256(content.encode()).hexdigest()[:16]
 
 
-def draw_chunk(
-    settings: MonteCarlo, index: int, plant: PlantParameters | None = None
-) -> dict[str, NDArray[Any]]:
+def draw_chunk(settings: MonteCarlo, index: int, plant: PlantParameters | None = None) -> dict[str, NDArray[Any]]:
     """Return the plants, starts and noise seeds of a chunk, shape (n,) each.
 
     A chunk is drawn whole and then cut, so that a run is the same however many follow it.
@@ -150,9 +148,7 @@ def run_chunk(settings: MonteCarlo, index: int, threads: int | None = None) -> d
     return _run_chunk((settings, load_plant(settings.plant)), index, threads)
 
 
-def _run_chunk(
-    job: tuple[MonteCarlo, PlantParameters], index: int, threads: int | None
-) -> dict[str, NDArray[Any]]:
+def _run_chunk(job: tuple[MonteCarlo, PlantParameters], index: int, threads: int | None) -> dict[str, NDArray[Any]]:
     # The plant travels with the job: its file need not be where a worker runs.
     settings, plant = job
     return _simulate(settings, plant, draw_chunk(settings, index, plant), threads)

@@ -225,9 +225,7 @@ def _figures(
             high=np.array([pair["high"] for pair in pairs]),
         )
         ticks = [pair["metric"] for pair in pairs]
-        panels.append(
-            Panel("ratio [-]", "", [trace], [Mark(1.0, "x")], title=plant, y_ticks=ticks, x_log=True)
-        )
+        panels.append(Panel("ratio [-]", "", [trace], [Mark(1.0, "x")], title=plant, y_ticks=ticks, x_log=True))
     if panels:
         title = "One controller's metrics in units of the other's"
         figures.append(Figure("pid_vs_lqr_ratio", title, " ".join(said), panels, section="pid_vs_lqr"))

@@ -34,9 +34,7 @@ Workers = Annotated[
     typer.Option(help="Runs at once, each in a ROS domain of its own; 0: one for two cores.", min=0, max=256),
 ]
 Retry = Annotated[bool, typer.Option("--retry-failed", help="Carry out again the runs that failed.")]
-DryRun = Annotated[
-    bool, typer.Option("--dry-run", help="Show matrix, time and disk that it needs; run nothing.")
-]
+DryRun = Annotated[bool, typer.Option("--dry-run", help="Show matrix, time and disk that it needs; run nothing.")]
 Yes = Annotated[bool, typer.Option("--yes", help="Do not ask before each run that moves a real machine.")]
 Seeds = Annotated[int, typer.Option(help="Number of seeds in place of the file's; 0 keeps those.", min=0)]
 Json = Annotated[bool, typer.Option("--json", help="Print the result as JSON instead of tables.")]
@@ -182,9 +180,7 @@ def _study(
     found = load_study(source, seeds=range(1, seeds + 1) if seeds else None)
     workers = workers or default_workers(found)
     if found.realtime and workers > 1:
-        raise ParameterError(
-            f"workers is {workers}; expected 1: runs in real time must not share the machine"
-        )
+        raise ParameterError(f"workers is {workers}; expected 1: runs in real time must not share the machine")
     console = make_console(stderr=json_output, highlight=False)
     if dry_run:
         _print_matrix(console, found, workers)
@@ -199,9 +195,7 @@ def _study(
         if not console.is_terminal and progress.done != told:
             told = progress.done
             failed = f", {progress.failed} failed" if progress.failed else ""
-            console.print(
-                f"{progress.done} of {progress.total} runs{failed}, {_duration(progress.remaining)} left"
-            )
+            console.print(f"{progress.done} of {progress.total} runs{failed}, {_duration(progress.remaining)} left")
 
     def ask(run: StudyRun) -> None:
         bar.stop()
@@ -276,9 +270,7 @@ def _print_matrix(console: Console, found: Study, workers: int) -> None:
     seconds = sum(run.seconds for run in found.runs) / max(1, min(workers, len(found.runs)))
     size = sum(run.bytes for run in found.runs) / 1e6
     runs = "1 run" if len(found.runs) == 1 else f"{len(found.runs)} runs"
-    console.print(
-        f"{runs}, about {_duration(seconds)} with {workers} at once, about {size:.0f} MB on disk"
-    )
+    console.print(f"{runs}, about {_duration(seconds)} with {workers} at once, about {size:.0f} MB on disk")
 
 
 def _print_result(
@@ -317,9 +309,7 @@ def _print_groups(console: Console, groups: Sequence[Group]) -> None:
     table = WholeTable(title="Mean over seeds, 95 % interval", title_justify="left")
     table.add_column("")
     for group in groups:
-        table.add_column(
-            "\n".join(str(group.labels[axis]) for axis in ("plant", "controller", "disturbance", "start"))
-        )
+        table.add_column("\n".join(str(group.labels[axis]) for axis in ("plant", "controller", "disturbance", "start")))
     table.add_row(
         "runs",
         *(f"{len(group.seeds)}" + (f" ({group.failed} failed)" if group.failed else "") for group in groups),
@@ -348,6 +338,4 @@ def _label(value: Any) -> str:
 def _duration(seconds: float) -> str:
     minutes, rest = divmod(round(seconds), 60)
     hours, minutes = divmod(minutes, 60)
-    return (
-        f"{hours} h {minutes:02} min" if hours else f"{minutes} min {rest:02} s" if minutes else f"{rest} s"
-    )
+    return f"{hours} h {minutes:02} min" if hours else f"{minutes} min {rest:02} s" if minutes else f"{rest} s"

@@ -169,9 +169,7 @@ def load_study(source: str | Path, *, seeds: Sequence[int] | None = None) -> Stu
     if str(source) in shipped and not path.exists():
         path = shipped[str(source)]
     elif not path.suffix and not path.exists():
-        raise ParameterError(
-            f"study is {str(source)!r}; expected a file, or one of {', '.join(sorted(shipped))}"
-        )
+        raise ParameterError(f"study is {str(source)!r}; expected a file, or one of {', '.join(sorted(shipped))}")
     file = LocatedMapping.load(path, "study file")
     file.reject_unknown(_KEYS)
     if file.get("format", str, None, repr(FORMAT)) != FORMAT:
@@ -206,9 +204,7 @@ def _plain_runs(file: LocatedMapping, _: str, clock: str, seeds: Sequence[int], 
     starts = file.get("starts", list, ["upright"], "a list of upright, bottom, random or angles [rad]")
     for index, start in enumerate(starts):
         if start not in (*STARTS, "random") and not _is_number(start):
-            file.fail(
-                f"start is {start!r}; expected upright, bottom, random or an angle [rad]", "starts", index
-            )
+            file.fail(f"start is {start!r}; expected upright, bottom, random or an angle [rad]", "starts", index)
     for index, value in enumerate(set_points):
         if not _is_number(value):
             file.fail(f"set-point is {value!r}; expected an angle from upright [rad]", "set_points", index)
@@ -246,9 +242,7 @@ def _plain_runs(file: LocatedMapping, _: str, clock: str, seeds: Sequence[int], 
             file.fail(str(error), *where)
         engine = settings.get("engine", "nodes")
         if engine not in ("nodes", "process") or (engine == "process" and spec.side != "sim"):
-            plants[plant].fail(
-                f"engine is {engine!r}; expected nodes, or process for a plain simulator", "engine"
-            )
+            plants[plant].fail(f"engine is {engine!r}; expected nodes, or process for a plain simulator", "engine")
         if engine == "process" and (settings.get("parameters") or clock == "realtime"):
             plants[plant].fail(
                 "engine is 'process'; expected nodes for a plant with parameters of its own, and in real time", "engine"
@@ -288,9 +282,7 @@ def _named_runs(
     trials = file.get("trials", int, 6 if experiment == "inertia_damping" else 3, "a whole number >= 1")
     axes = (plants, controllers, disturbances, seeds, range(1, repeats + 1))
     _limit_runs(file, axes)
-    for number, (plant, controller, disturbance, seed, repeat) in enumerate(
-        itertools.product(*axes), start=1
-    ):
+    for number, (plant, controller, disturbance, seed, repeat) in enumerate(itertools.product(*axes), start=1):
         settings = plants[plant].values
         if settings.get("hardware") == "hebi" and not settings.get("lab"):
             plants[plant].fail("hardware is 'hebi' without a lab file; expected lab: FILE", "hardware")
@@ -341,9 +333,7 @@ def _thesis_arguments(controller: LocatedMapping, name: str, disturbance: Locate
     return arguments
 
 
-def _axis(
-    file: LocatedMapping, key: str, default: Mapping[str, Any] | None = None
-) -> dict[str, LocatedMapping]:
+def _axis(file: LocatedMapping, key: str, default: Mapping[str, Any] | None = None) -> dict[str, LocatedMapping]:
     entries = file.mapping(key, default)
     if not entries.values:
         file.fail(f"{key} is empty; expected at least one name", key)
@@ -364,9 +354,7 @@ def _seeds(file: LocatedMapping) -> list[int]:
         if not 1 <= count <= _MAX_RUNS:
             entry.fail(f"count is {count}; expected 1 to {_MAX_RUNS}", "count")
         value = list(range(first, first + count))
-    if not value or not all(
-        isinstance(seed, int) and not isinstance(seed, bool) and seed >= 0 for seed in value
-    ):
+    if not value or not all(isinstance(seed, int) and not isinstance(seed, bool) and seed >= 0 for seed in value):
         file.fail(f"seeds are {value!r}; expected at least one whole number >= 0", "seeds")
     if len(set(value)) != len(value):
         file.fail("a seed is given twice; use repeats to run one again", "seeds")

@@ -33,9 +33,7 @@ def same_run_layer(comparison: Comparison, *, more: str = "") -> LayerResult:
         reason = f"in {runs} simulation and the hardware move alike within {whose}, in all {len(tests)} tests"
         steps: Sequence[str] = ()
     elif mark is Mark.NO:
-        failed = sorted(
-            (test for test in tests if test.outcome is Outcome.DIFFERENT), key=_beyond, reverse=True
-        )
+        failed = sorted((test for test in tests if test.outcome is Outcome.DIFFERENT), key=_beyond, reverse=True)
         told = [in_words(test) for test in _each_once(failed)]
         left_out = len(told) - _MOST_REASONS
         reason = "; ".join(told[:_MOST_REASONS]) + (f"; and {left_out} more" if left_out > 0 else "")

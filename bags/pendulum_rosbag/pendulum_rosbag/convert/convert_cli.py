@@ -27,9 +27,7 @@ __all__ = ["convert_main", "cut_main", "filter_main", "merge_main"]
 _STEPS = 1000
 
 Source = Annotated[Path, typer.Argument(help="Folder of the bag, or one .mcap or .db3 file.")]
-AnySource = Annotated[
-    Path, typer.Argument(help="Folder of the bag, or one .mcap, .db3 or ROS 1 .bag file.")
-]
+AnySource = Annotated[Path, typer.Argument(help="Folder of the bag, or one .mcap, .db3 or ROS 1 .bag file.")]
 Output = Annotated[Path, typer.Option("-o", "--output", help="Folder of the new bag; it must not exist.")]
 Storage = Annotated[str, typer.Option(help="mcap or sqlite3; by default that of the bag.")]
 Compression = Annotated[str, typer.Option(help="zstd or none; by default what the bag has.")]
@@ -43,9 +41,7 @@ convert_app, merge_app, cut_app, filter_app = (
 )
 
 
-@convert_app.command(
-    epilog="Example: python -m pendulum_rosbag convert runs/today/sim -o /tmp/sim --storage sqlite3"
-)
+@convert_app.command(epilog="Example: python -m pendulum_rosbag convert runs/today/sim -o /tmp/sim --storage sqlite3")
 def convert(
     bag: AnySource,
     output: Output,

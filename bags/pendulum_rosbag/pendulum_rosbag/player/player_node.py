@@ -41,9 +41,7 @@ SPECS = (
         minimum=0.0,
         exclusive_minimum=True,
     ),
-    ParameterSpec(
-        "clock_rate", 100.0, "Hz", "Messages on /clock a second of wall time; 0 for none.", minimum=0.0
-    ),
+    ParameterSpec("clock_rate", 100.0, "Hz", "Messages on /clock a second of wall time; 0 for none.", minimum=0.0),
 )
 _LONGEST_WAIT = 0.05  # so that pause, stop and a new rate are noticed soon [s]
 _DEPTH = 1000
@@ -96,9 +94,7 @@ class _Timeline:
         """Return how long to wait until some recorded time [s]."""
         return _LONGEST_WAIT if self._paused else (recorded_ns - self.now()) / self._rate * 1e-9
 
-    def change(
-        self, *, rate: float | None = None, paused: bool | None = None, jump_to: int | None = None
-    ) -> None:
+    def change(self, *, rate: float | None = None, paused: bool | None = None, jump_to: int | None = None) -> None:
         """Go on from here at another rate, pause, or go on from another recorded time."""
         self._anchor = (time.monotonic_ns(), self.now() if jump_to is None else jump_to)
         self._rate = self._rate if rate is None else rate
@@ -276,22 +272,14 @@ app = typer.Typer(add_completion=False, rich_markup_mode=None)
 def play(
     context: typer.Context,
     bag: Annotated[Path, typer.Argument(help="Folder of the bag, or one .mcap or .db3 file.")],
-    topics: Annotated[
-        list[str] | None, typer.Option("-t", "--topic", help="Topic to play; by default all.")
-    ] = None,
+    topics: Annotated[list[str] | None, typer.Option("-t", "--topic", help="Topic to play; by default all.")] = None,
     rate: Annotated[float, typer.Option("-r", "--rate", help="Speed relative to the recording.")] = 1.0,
-    remap: Annotated[
-        list[str] | None, typer.Option(help="RECORDED:=NEW to publish under another name.")
-    ] = None,
+    remap: Annotated[list[str] | None, typer.Option(help="RECORDED:=NEW to publish under another name.")] = None,
     start: Annotated[float, typer.Option(help="Begin that long after the beginning of the bag [s].")] = 0.0,
     duration: Annotated[float, typer.Option(help="Play that much of the recording [s]; 0 for all.")] = 0.0,
     loop: Annotated[bool, typer.Option("--loop", help="Begin again at the end.")] = False,
-    wait: Annotated[
-        float, typer.Option(help="Wait at most that long for a subscriber on every topic [s].")
-    ] = 2.0,
-    paused: Annotated[
-        bool, typer.Option("--paused", help="Begin when ~/pause is called with false.")
-    ] = False,
+    wait: Annotated[float, typer.Option(help="Wait at most that long for a subscriber on every topic [s].")] = 2.0,
+    paused: Annotated[bool, typer.Option("--paused", help="Begin when ~/pause is called with false.")] = False,
     clock_rate: Annotated[float, typer.Option(help="Messages on /clock a second; 0 for none.")] = 100.0,
 ) -> int:
     """Publish the topics of a bag again, at recorded times, with /clock."""

@@ -91,9 +91,7 @@ class Bag(Mapping[str, Any]):
 
     def __getitem__(self, topic: str) -> Any:
         if topic not in self._topics:
-            raise DataError(
-                f"bag {self.path} has no topic {topic}; it has {', '.join(sorted(self._topics)) or 'none'}"
-            )
+            raise DataError(f"bag {self.path} has no topic {topic}; it has {', '.join(sorted(self._topics)) or 'none'}")
         if topic not in self._arrays:
             self._load([topic])
         return self._arrays[topic]
@@ -225,9 +223,7 @@ class Bag(Mapping[str, Any]):
         fixed = [topic for topic in topics if self._is_fixed(topic)]
         if len(fixed) == 1 and any(source.compressed for source in self._sources):
             # A chunk that is decompressed for one topic serves the others too.
-            fixed += [
-                t for t in self._topics if t not in fixed and t not in self._arrays and self._is_fixed(t)
-            ]
+            fixed += [t for t in self._topics if t not in fixed and t not in self._arrays and self._is_fixed(t)]
         arrays = self._read_fixed(fixed) if fixed else {}
         for topic in dict.fromkeys([*topics, *arrays]):
             array = arrays.get(topic)

@@ -53,9 +53,7 @@ class Batch:
         # damaged, or a bomb that names one large message a million times.
         left = len(view)
         if self.sizes is not None:
-            for time, start, size in zip(
-                self.times.tolist(), self.offsets.tolist(), self.sizes.tolist(), strict=True
-            ):
+            for time, start, size in zip(self.times.tolist(), self.offsets.tolist(), self.sizes.tolist(), strict=True):
                 left -= size
                 if left < 0:
                     raise BagError(_OVERLAP)

@@ -37,13 +37,9 @@ def store_for(info: TopicInfo) -> Typestore:
         if info.type in shared.fielddefs:
             return shared  # in a language that rosbags does not read, such as IDL in other clothes
         reason = " ".join(str(error).split())[:200]
-        raise DataError(
-            f"topic {info.name}: the definition of {info.type} is not readable: {reason}"
-        ) from error
+        raise DataError(f"topic {info.name}: the definition of {info.type} is not readable: {reason}") from error
     if info.type not in store.fielddefs:
-        raise DataError(
-            f"topic {info.name} has type {info.type}; expected a type that the bag or ROS 2 defines"
-        )
+        raise DataError(f"topic {info.name} has type {info.type}; expected a type that the bag or ROS 2 defines")
     return store
 
 
@@ -112,9 +108,7 @@ def decoder_for(info: TopicInfo) -> Callable[[bytes], Any]:
             if end + 4 > len(data):
                 raise ValueError("it is cut off")
         except Exception as error:  # a damaged message fails in many ways
-            raise DataError(
-                f"topic {info.name}: a message of {len(data)} bytes is no {info.type}: {error}"
-            ) from error
+            raise DataError(f"topic {info.name}: a message of {len(data)} bytes is no {info.type}: {error}") from error
         return message
 
     return decode

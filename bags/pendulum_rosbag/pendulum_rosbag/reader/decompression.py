@@ -10,9 +10,7 @@ from pendulum_rosbag.reader.batches import Bytes
 
 __all__ = ["decompress", "decompress_bounded", "decompress_torn"]
 
-_MAX_CHUNK = (
-    1 << 28
-)  # decompressed bytes of one chunk: recorders write chunks of about 1 MB, bombs larger ones
+_MAX_CHUNK = 1 << 28  # decompressed bytes of one chunk: recorders write chunks of about 1 MB, bombs larger ones
 
 
 def decompress(packed: Bytes, compression: str, size: int, name: str) -> bytes:

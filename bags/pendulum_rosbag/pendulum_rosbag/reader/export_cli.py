@@ -20,9 +20,7 @@ app = typer.Typer(add_completion=False, rich_markup_mode=None)
 def export(
     bag: Annotated[Path, typer.Argument(help="Folder of the bag, or one .mcap or .db3 file.")],
     output: Annotated[Path, typer.Option("-o", "--output", help="Folder to create.")],
-    topics: Annotated[
-        list[str] | None, typer.Option("-t", "--topic", help="Topic to export; by default all.")
-    ] = None,
+    topics: Annotated[list[str] | None, typer.Option("-t", "--topic", help="Topic to export; by default all.")] = None,
     format: Annotated[str, typer.Option(help="parquet or csv.")] = "parquet",
 ) -> int:
     """Write each topic of a bag to a table of its own (SI units, times in nanoseconds)."""

@@ -68,14 +68,10 @@ def _print(statistics: BagStatistics, metadata: dict[str, Any]) -> None:
             table.add_column(heading, justify="right")
         for name, topic in stamped.items():
             counts = (topic.duplicates, topic.backward, topic.clock_jumps)
-            table.add_row(
-                name, _number(topic.age), _number(topic.age_p99), *(_alarm(count) for count in counts)
-            )
+            table.add_row(name, _number(topic.age), _number(topic.age_p99), *(_alarm(count) for count in counts))
         console.print(table)
     if statistics.latencies:
-        table = WholeTable(
-            "from", "to the answer on", title="latencies (by equal stamps, in ms)", title_justify="left"
-        )
+        table = WholeTable("from", "to the answer on", title="latencies (by equal stamps, in ms)", title_justify="left")
         for heading in ("matched", "median", "p99", "longest"):
             table.add_column(heading, justify="right")
         for latency in statistics.latencies:

@@ -32,9 +32,7 @@ FIELDS = np.dtype(
 """Columns of the arrays: times [ns], position [rad], velocity [rad/s], effort [N m]; absent values are NaN."""
 
 _BLOCK = 8192  # messages parsed at once: their bytes stay in the cache
-_MAX_EXPECTED = (
-    1 << 22
-)  # messages that memory is taken for before they are seen: a damaged file may claim any number
+_MAX_EXPECTED = 1 << 22  # messages that memory is taken for before they are seen: a damaged file may claim any number
 _MAX_COPY = 1 << 26  # bytes of messages that are copied at once
 _MAX_FRAME = 255  # bytes of a frame id that are kept: no name in ROS is longer
 _LAYOUTS = 16  # layouts tried in one batch before a topic counts as not fixed
@@ -260,9 +258,7 @@ def _parse_block(
     while left is None or len(left):
         if tried == len(layouts):
             first = 0 if left is None else int(left[0])
-            layout = layout_of(
-                _message(batch, int(offsets[first]), None if sizes is None else int(sizes[first]))
-            )
+            layout = layout_of(_message(batch, int(offsets[first]), None if sizes is None else int(sizes[first])))
             if layout is None or layout in layouts or tried >= _LAYOUTS:
                 return False
             layouts.append(layout)
@@ -300,9 +296,7 @@ def _fit(
         if places <= 0 or not inside.any():
             return rows
         sizes = None if sizes is None else sizes[inside]
-        rest = _fit_items(
-            batch, plan, offsets[inside], times[inside], sizes, rows[inside], out, columns, layout
-        )
+        rest = _fit_items(batch, plan, offsets[inside], times[inside], sizes, rows[inside], out, columns, layout)
         return np.sort(np.concatenate([rows[~inside], rest])) if rest is not None else rows[~inside]
     return _fit_items(batch, plan, offsets, times, sizes, left, out, columns, layout)
 
@@ -374,9 +368,7 @@ def _with_frames(columns: _Columns) -> npt.NDArray[Any]:
         return array
     texts = [np.char.decode(kept, "utf-8", "replace") for _, _, kept in columns.frames]
     width = max(text.dtype.itemsize // 4 for text in texts)
-    wide = np.empty(
-        len(array), [*((name, FIELDS[name]) for name in FIELDS.names or ()), ("frame_id", f"<U{width}")]
-    )
+    wide = np.empty(len(array), [*((name, FIELDS[name]) for name in FIELDS.names or ()), ("frame_id", f"<U{width}")])
     for name in FIELDS.names or ():
         wide[name] = array[name]
     wide["frame_id"] = ""

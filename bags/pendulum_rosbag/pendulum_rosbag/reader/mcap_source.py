@@ -359,9 +359,7 @@ class McapSource:
             if channels.isdisjoint(self._scanned[number] if self._scanned else chunk.indexes):
                 continue
             if not chunk.compression:
-                plain.setdefault(id(chunk.buffer), []).append(
-                    (number, chunk.data_start)
-                )  # they lie in the same map
+                plain.setdefault(id(chunk.buffer), []).append((number, chunk.data_start))  # they lie in the same map
                 continue
             if packed and (size >= _GROUP_SIZE or index is not chunk.buffer):
                 yield np.concatenate(parts), index, packed
@@ -387,9 +385,7 @@ class McapSource:
             table = np.array(rows, np.int64).reshape(-1, 2)
             return table[:, 0], table[:, 1]
         places = [
-            (place, base)
-            for number, base in members
-            if (place := self.chunks[number].indexes.get(channel)) is not None
+            (place, base) for number, base in members if (place := self.chunks[number].indexes.get(channel)) is not None
         ]
         if not places:
             return np.empty(0, np.int64), np.empty(0, np.int64)
@@ -402,9 +398,7 @@ class McapSource:
         whole &= (heads["length"] == heads["size"] + np.uint64(6)) & (at + 15 + 16 * counts <= len(index))
         if not whole.all():
             wrong = int(at[~whole][0])
-            raise BagError(
-                f"{self.path}: the message index at byte {wrong} is damaged; try to repair the bag"
-            )
+            raise BagError(f"{self.path}: the message index at byte {wrong} is damaged; try to repair the bag")
         first = np.cumsum(counts) - counts
         rows_at = np.repeat(at + 15 - 16 * first, counts) + 16 * np.arange(int(counts.sum()))
         table = self._take(index, _INDEX_ENTRY, rows_at)
@@ -414,9 +408,7 @@ class McapSource:
         """Return copies of the items that begin at some bytes of a buffer."""
         places = max(len(buffer) - item.itemsize + 1, 0)
         if len(at) and not 0 <= int(at.max()) < places:
-            raise BagError(
-                f"{self.path}: a message index lies beyond the end of the file; try to repair the bag"
-            )
+            raise BagError(f"{self.path}: a message index lies beyond the end of the file; try to repair the bag")
         anywhere: np.ndarray[Any, Any] = np.ndarray((places,), f"V{item.itemsize}", buffer.data, strides=(1,))
         return anywhere[at].view(item)
 

@@ -88,9 +88,7 @@ def open_folder(path: Path) -> BagFolder:
     # A file that is not listed yet was begun by a recorder that died before it could say so.
     folder.files = listed + [file for file in present if file not in listed]
     if not folder.files:
-        raise BagError(
-            f"{path} is no bag: it has neither {METADATA_NAME} with its files nor any .mcap or .db3 file"
-        )
+        raise BagError(f"{path} is no bag: it has neither {METADATA_NAME} with its files nor any .mcap or .db3 file")
     folder.storage = folder.storage or _ENDINGS[_ending(folder.files[0])]
     return folder
 

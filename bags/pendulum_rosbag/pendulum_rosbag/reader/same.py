@@ -45,9 +45,7 @@ class Difference:
         return f"{sum(self.compared.values())} messages on {len(self.compared)} topics are equal"
 
 
-def same_messages(
-    bag_a: Bag, bag_b: Bag, topics: Sequence[str] | None = None, *, log_times: bool = True
-) -> Difference:
+def same_messages(bag_a: Bag, bag_b: Bag, topics: Sequence[str] | None = None, *, log_times: bool = True) -> Difference:
     """Compare two bags topic by topic and message by message, each topic in order of log time.
 
     Padding, and bytes behind a message, do not count: rclpy leaves both uninitialised. Messages of a type that
@@ -108,9 +106,7 @@ def _first_difference(
         a, b = _ordered(a, clean), _ordered(b, clean)
     for number, ((time_a, data_a), (time_b, data_b)) in enumerate(zip(a, b, strict=False)):
         if log_times and time_a != time_b:
-            return (
-                f"{topic} message {number} has log time {time_a} ns in one bag and {time_b} ns in the other"
-            )
+            return f"{topic} message {number} has log time {time_a} ns in one bag and {time_b} ns in the other"
         if data_a != data_b and clean(data_a) != clean(data_b):
             return f"{topic} message {number} at {time_a} ns differs"
     if len(a) != len(b):

@@ -58,9 +58,7 @@ class SqliteSource:
             if left_over:
                 self._open_copy(left_over)
             else:
-                self._connection = sqlite3.connect(
-                    f"{path.absolute().as_uri()}?mode=ro&immutable=1", uri=True
-                )
+                self._connection = sqlite3.connect(f"{path.absolute().as_uri()}?mode=ro&immutable=1", uri=True)
                 self._rows = self._read_pages()
             self.streams = self._read_streams()
         except _UNREADABLE as error:
@@ -198,9 +196,7 @@ class SqliteSource:
             if not isinstance(item["id"], int) or not all(
                 isinstance(item[name], str) for name in present if name != "id"
             ):
-                raise BagError(
-                    f"{self.path}: topic {item.get('name')!r} is described by values that are no text"
-                )
+                raise BagError(f"{self.path}: topic {item.get('name')!r} is described by values that are no text")
             encoding, text = definitions.get(item["type"], ("", ""))
             streams.append(
                 Stream(
@@ -238,9 +234,7 @@ class SqliteSource:
                     wanted = (block.topics == channel) & inside
                     mine = np.flatnonzero(wanted & block.local)
                     if len(mine):
-                        yield Batch(
-                            channel, self._buffer, block.offsets[mine], block.times[mine], block.sizes[mine]
-                        )
+                        yield Batch(channel, self._buffer, block.offsets[mine], block.times[mine], block.sizes[mine])
                     # Large messages go on elsewhere in the file: SQLite puts them together.
                     for row_id in block.row_ids[wanted & ~block.local].tolist():
                         query = "SELECT topic_id, timestamp, data FROM messages WHERE id = ?"

@@ -211,9 +211,7 @@ def _latencies(arrays: dict[str, npt.NDArray[Any]]) -> list[Latency]:
             if np.median(delays) <= 0:
                 continue  # the other direction is the answer (or all log times are the stamps themselves)
             median, p99 = np.quantile(delays, [0.5, 0.99])
-            found.append(
-                Latency(source, answer, int(same.sum()), float(median), float(p99), float(delays.max()))
-            )
+            found.append(Latency(source, answer, int(same.sum()), float(median), float(p99), float(delays.max())))
     return found
 
 
@@ -241,9 +239,7 @@ def bag_statistics(bag: Bag) -> BagStatistics:
         if isinstance(values, np.ndarray):
             arrays[name] = values
             senders = values["frame_id"] if "frame_id" in (values.dtype.names or ()) else None
-            result.topics[name] = time_statistics(
-                info.type, values["log_time_ns"], values["stamp_ns"], senders
-            )
+            result.topics[name] = time_statistics(info.type, values["log_time_ns"], values["stamp_ns"], senders)
         else:
             result.topics[name] = time_statistics(info.type, *_times(bag, info))
     result.latencies = _latencies(arrays)

@@ -69,9 +69,7 @@ class RecorderOptions:
             try:
                 re.compile(pattern)
             except re.error as error:
-                raise ParameterError(
-                    f"{name} is {pattern!r}; expected a regular expression ({error})"
-                ) from None
+                raise ParameterError(f"{name} is {pattern!r}; expected a regular expression ({error})") from None
 
     def wants(self, topic: str) -> bool:
         """Tell whether a topic is to be recorded."""

@@ -36,9 +36,7 @@ class ParameterReader:
         self._known: set[str] = {node.get_fully_qualified_name()}
         self._clients: list[Client] = []
         self._finished: list[Client] = []
-        node.create_subscription(
-            ParameterEvent, "/parameter_events", self._on_event, qos_profile_parameter_events
-        )
+        node.create_subscription(ParameterEvent, "/parameter_events", self._on_event, qos_profile_parameter_events)
 
     def look(self) -> None:
         """Look for new nodes, and ask those whose services have appeared."""

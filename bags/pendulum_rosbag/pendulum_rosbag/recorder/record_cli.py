@@ -23,17 +23,13 @@ app = typer.Typer(add_completion=False, rich_markup_mode=None)
 def record(
     context: typer.Context,
     output: Annotated[Path, typer.Option("-o", "--output", help="Folder of the bag; it must not exist.")],
-    topics: Annotated[
-        list[str] | None, typer.Argument(help="Topics by their full names; by default all.")
-    ] = None,
+    topics: Annotated[list[str] | None, typer.Argument(help="Topics by their full names; by default all.")] = None,
     regex: Annotated[str, typer.Option(help="Record topics that match this pattern, too.")] = "",
     exclude: Annotated[str, typer.Option(help="Leave out topics that match this pattern.")] = "",
     storage: Annotated[str, typer.Option(help="mcap or sqlite3.")] = "mcap",
     compression: Annotated[str, typer.Option(help="zstd, or none.")] = "none",
     max_size: Annotated[float, typer.Option(help="Begin a new file at this size [MB]; 0 for never.")] = 0.0,
-    max_duration: Annotated[
-        float, typer.Option(help="Begin a new file after this time [s]; 0 for never.")
-    ] = 0.0,
+    max_duration: Annotated[float, typer.Option(help="Begin a new file after this time [s]; 0 for never.")] = 0.0,
     duration: Annotated[float, typer.Option(help="Stop after this time [s]; 0 for never.")] = 0.0,
     metadata: Annotated[Path | None, typer.Option(help="JSON object to store with the bag.")] = None,
     log_time: Annotated[

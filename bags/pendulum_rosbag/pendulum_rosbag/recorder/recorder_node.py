@@ -203,9 +203,7 @@ class Recorder(PollingNode):
         if unheard:
             self._tell_early(tap, session, unheard)
 
-    def _offer(
-        self, tap: Tap, session: RecordingSession, items: Sequence[tuple[int, bytes]], missing: int = 0
-    ) -> None:
+    def _offer(self, tap: Tap, session: RecordingSession, items: Sequence[tuple[int, bytes]], missing: int = 0) -> None:
         tap.announce(session)
         if missing and tap.is_settling:
             self._tell_early(tap, session, missing)

@@ -94,13 +94,9 @@ def repair_bag(
     if in_place:
         target = bag.with_name(f"{bag.name}.repairing")
         if target.exists():
-            raise BagError(
-                f"{target} exists already; expected no unfinished repair (remove it to begin again)"
-            )
+            raise BagError(f"{target} exists already; expected no unfinished repair (remove it to begin again)")
     try:
-        compression = (
-            "zstd" if any(source.compressed for source in sources) and folder.storage == "mcap" else None
-        )
+        compression = "zstd" if any(source.compressed for source in sources) and folder.storage == "mcap" else None
         name = bag.name if in_place else target.name
         with open_writer(target, folder.storage, compression, folder.custom_data, file_stem=name) as writer:
             report.left_out = _copy(sources, folder.topic_hashes, writer)

@@ -23,9 +23,7 @@ def repair(
     bag: Annotated[Path, typer.Argument(help="Folder of the bag, or one .mcap or .db3 file.")],
     output: Annotated[
         Path | None,
-        typer.Option(
-            "-o", "--output", help="Folder for the sound bag; by default it takes the place of BAG."
-        ),
+        typer.Option("-o", "--output", help="Folder for the sound bag; by default it takes the place of BAG."),
     ] = None,
     force: Annotated[bool, typer.Option("--force", help="Rewrite a sound bag, too.")] = False,
     as_json: Annotated[bool, typer.Option("--json", help="Print the report as JSON.")] = False,

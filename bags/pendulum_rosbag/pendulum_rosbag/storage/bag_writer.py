@@ -148,17 +148,13 @@ class BagWriter:
             BagError: The topic is in the bag with another type, or the writer is closed.
         """
         described = message_type(type) if isinstance(type, str) else type
-        profiles = (
-            (qos,) if isinstance(qos, QosProfile) else tuple(qos) if qos is not None else (QosProfile(),)
-        )
+        profiles = (qos,) if isinstance(qos, QosProfile) else tuple(qos) if qos is not None else (QosProfile(),)
         with self._lock:
             self._require_open()
             known = self._topics.get(name)
             if known is not None:
                 if known.type.name != described.name:
-                    raise BagError(
-                        f"topic {name} has type {described.name}; the bag holds it as {known.type.name}"
-                    )
+                    raise BagError(f"topic {name} has type {described.name}; the bag holds it as {known.type.name}")
                 if known.type.serialization != described.serialization:
                     raise BagError(
                         f"topic {name} is encoded as {described.serialization!r}; the bag holds it as "

@@ -97,9 +97,7 @@ class MetadataFile:
         self._topic_texts: list[str] = []
         self._custom_text = ""
 
-    def render(
-        self, topics: Sequence[TopicEntry], files: Sequence[FileEntry], custom_data: Mapping[str, str]
-    ) -> str:
+    def render(self, topics: Sequence[TopicEntry], files: Sequence[FileEntry], custom_data: Mapping[str, str]) -> str:
         """Return the text for these topics, storage files (in order of time) and run metadata."""
         filled = [file for file in files if file.count]
         start = min((file.start_ns for file in filled), default=0)
@@ -119,8 +117,7 @@ class MetadataFile:
             f"  topics_with_message_count:{'' if topics else ' []'}\n"
         )
         body = "".join(
-            f"{text}      message_count: {topic.count}\n"
-            for text, topic in zip(self._topic_texts, topics, strict=True)
+            f"{text}      message_count: {topic.count}\n" for text, topic in zip(self._topic_texts, topics, strict=True)
         )
         paths = "".join(f"    - {yaml_string(file.name)}\n" for file in files)
         entries = "".join(
@@ -137,9 +134,7 @@ class MetadataFile:
             f"{self._custom_text}  ros_distro: {self._ros_distro}\n"
         )
 
-    def replace(
-        self, topics: Sequence[TopicEntry], files: Sequence[FileEntry], custom_data: Mapping[str, str]
-    ) -> None:
+    def replace(self, topics: Sequence[TopicEntry], files: Sequence[FileEntry], custom_data: Mapping[str, str]) -> None:
         """Write the file; a reader, and a kill at any moment, sees the old text or the new one."""
         try:
             self._temporary.write_text(self.render(topics, files, custom_data), encoding="utf-8")

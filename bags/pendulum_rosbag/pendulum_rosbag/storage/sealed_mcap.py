@@ -211,8 +211,7 @@ class SealedMcapFile:
 
     def _pending_chunk(self) -> Chunk:
         indexes = [
-            (channel, struct.pack(f"<{len(entries)}Q", *entries))
-            for channel, entries in self._pending_index.items()
+            (channel, struct.pack(f"<{len(entries)}Q", *entries)) for channel, entries in self._pending_index.items()
         ]
         return build_chunk(b"".join(self._pending), indexes, self._pending_span, self._compressor)
 

@@ -346,9 +346,7 @@ class SealedSqliteFile:
         pages.waiting[self._trunks[hidden]] = trunk.ljust(PAGE, b"\0")
         self._write_runs()
         if os.fstat(self._fd).st_size < pages.count * PAGE:
-            os.ftruncate(
-                self._fd, pages.count * PAGE
-            )  # places that were not used yet belong to the file, too
+            os.ftruncate(self._fd, pages.count * PAGE)  # places that were not used yet belong to the file, too
         self._write(self._first_page(self._trunks[hidden], len(free) + 1), 0)
         self._commits += 1
         for table in tables:
