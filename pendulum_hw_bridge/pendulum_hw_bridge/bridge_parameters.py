@@ -13,6 +13,7 @@ from pendulum_hw_bridge.backends import BACKENDS
 from pendulum_hw_bridge.bridge import BridgeSettings
 from pendulum_hw_bridge.clocks import Clock
 from pendulum_hw_bridge.effort_mapping import EffortMapping, EffortStrategy
+from pendulum_hw_bridge.emulation import EMULATOR_PRESET_NAMES
 from pendulum_hw_bridge.gains import DEFAULT_GAINS, GainSet, load_gains
 from pendulum_hw_bridge.lab import LAB_SPEC
 from pendulum_hw_bridge.motor_state import MOTOR_SPEED_LIMIT
@@ -61,8 +62,8 @@ BRIDGE_SPECS: tuple[ParameterSpec, ...] = (
         "plant",
         "thesis",
         "",
-        "Drivetrain and link: `thesis` or `x5_9`, or a plant file with a drivetrain; what the emulator is, and for "
-        "`hebi` the constants of the effort mapping.",
+        f"Drivetrain and link: {EMULATOR_PRESET_NAMES}, or a plant file with a drivetrain; what the emulator is, and "
+        "for `hebi` the constants of the effort mapping.",
     ),
     _fixed("family", "", "", "HEBI family of the actuator; empty for any, if there is only one."),
     _fixed("name", "", "", "HEBI name of the actuator; empty for any, if there is only one."),

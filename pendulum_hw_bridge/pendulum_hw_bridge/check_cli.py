@@ -12,6 +12,7 @@ import typer
 
 from pendulum_hw_bridge.check_item import Checklist
 from pendulum_hw_bridge.checklist import run_checklist
+from pendulum_hw_bridge.emulation import EMULATOR_PRESET_NAMES
 from pendulum_hw_bridge.nudge import hand_of
 from pendulum_msgs_py.programs.executables import cli_main
 from pendulum_msgs_py.programs.graph import ParameterArgument
@@ -36,7 +37,9 @@ def check(
     name: Annotated[str | None, typer.Option(help="HEBI name; default any, if only one answers.")] = None,
     serial: Annotated[str | None, typer.Option(help="Serial number of the HEBI module.")] = None,
     interface: Annotated[str | None, typer.Option(help="Network address to look on; default all.")] = None,
-    plant: Annotated[str | None, typer.Option(help="thesis, x5_9, or a plant file with a drivetrain.")] = None,
+    plant: Annotated[
+        str | None, typer.Option(help=f"{EMULATOR_PRESET_NAMES}, or a plant file with a drivetrain.")
+    ] = None,
     feedback_rate: Annotated[float | None, typer.Option(help="Feedback records per second [Hz].")] = None,
     gains_file: Annotated[str | None, typer.Option(help="HEBI gains file; default those of the X5-9.")] = None,
     emulator_address: Annotated[str | None, typer.Option(help="HOST:PORT of an emulator process.")] = None,

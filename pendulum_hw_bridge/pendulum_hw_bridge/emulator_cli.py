@@ -10,6 +10,7 @@ from typing import Annotated
 
 import typer
 
+from pendulum_hw_bridge.emulation import EMULATOR_PRESET_NAMES
 from pendulum_hw_bridge.emulation.faults import ActuatorFault
 from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.programs.executables import cli_main
@@ -26,7 +27,7 @@ fault_app = typer.Typer(add_completion=False, rich_markup_mode=None)
 @app.command()
 def emulator(
     address: Annotated[str, typer.Option(help="HOST:PORT to listen on (UDP).")] = _ADDRESS,
-    plant: Annotated[str, typer.Option(help="thesis, x5_9, or a plant file with a drivetrain.")] = "thesis",
+    plant: Annotated[str, typer.Option(help=f"{EMULATOR_PRESET_NAMES}, or a plant file with a drivetrain.")] = "thesis",
     position: Annotated[float, typer.Option(help="Where the pendulum is at the start [rad].")] = 0.0,
     seed: Annotated[int, typer.Option(min=0, help="Seed of sensor noise and timing jitter.")] = 0,
     flat: Annotated[bool, typer.Option(help="The pendulum lies flat: no gravity.")] = False,

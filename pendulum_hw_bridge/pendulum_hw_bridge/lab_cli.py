@@ -15,6 +15,7 @@ from pendulum_hw_bridge import guided, module_files
 from pendulum_hw_bridge.actuator import ActuatorPort
 from pendulum_hw_bridge.backends import hebi
 from pendulum_hw_bridge.backends.hebi_discovery import LOOK_TIME, ModuleSelection, discover, select_module
+from pendulum_hw_bridge.emulation import EMULATOR_PRESET_NAMES
 from pendulum_hw_bridge.nudge import hand_of
 from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.plants.lab_file import LabFile, load_lab, write_lab
@@ -72,7 +73,7 @@ def new(
     serial: Annotated[str, typer.Option(help="Serial number of the module.")] = "",
     module_type: Annotated[str, typer.Option(help="Type that it must be of; empty for any.")] = "X5-9",
     emulator_address: Annotated[str, typer.Option(help="HOST:PORT of an emulator.")] = "127.0.0.1:17590",
-    plant: Annotated[str, typer.Option(help="thesis, x5_9, or a plant file with a drivetrain.")] = "thesis",
+    plant: Annotated[str, typer.Option(help=f"{EMULATOR_PRESET_NAMES}, or a plant file with a drivetrain.")] = "thesis",
     effort: Annotated[float, typer.Option(help="Largest torque [N m].", min=0.01)] = 5.0,
     supply: Annotated[float, typer.Option(help="Voltage of the supply [V].", min=18.0, max=52.0)] = 36.0,
 ) -> None:

@@ -13,6 +13,7 @@ from pendulum_lqr.disturbance import DISTURBANCE_SPECS
 from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.parameters import load_yaml, parameter_sections
 from pendulum_msgs_py.plants.lab_file import LabFile, load_lab
+from pendulum_msgs_py.plants.plant_parameters import PRESET_NAMES
 from pendulum_msgs_py.programs import graph
 from pendulum_msgs_py.programs.graph import NodeProgram
 
@@ -68,7 +69,7 @@ ARGUMENTS: tuple[Argument, ...] = (
     Argument(
         "model",
         "thesis",
-        "Preset (thesis, x5_9, dfki) or plant file: what is simulated and what the controller is designed for.",
+        f"Preset ({PRESET_NAMES}) or plant file: what is simulated and what the controller is designed for.",
     ),
     Argument("start", "bottom", "Where a simulated or emulated pendulum starts.", ("bottom", "top")),
     Argument("sim_rate", "500.0", "Rate of the simulator [Hz]."),

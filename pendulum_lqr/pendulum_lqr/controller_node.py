@@ -26,7 +26,7 @@ from pendulum_msgs_py.contract.cdr import encode_joint_state
 from pendulum_msgs_py.contract.timing import SteadyWallClock
 from pendulum_msgs_py.errors import PendulumError
 from pendulum_msgs_py.parameters import ParameterSpec
-from pendulum_msgs_py.plants.plant_parameters import PlantParameters, load_plant
+from pendulum_msgs_py.plants.plant_parameters import PRESET_NAMES, PlantParameters, load_plant
 from pendulum_msgs_py.ros import qos
 from pendulum_msgs_py.ros.convert import (
     diagnostic_status,
@@ -46,7 +46,7 @@ __all__ = ["NODE_SPECS", "ControllerNode", "main"]
 NODE_SPECS: tuple[ParameterSpec, ...] = (
     ParameterSpec("controller", "lqr", "", "Which controller.", choices=tuple(CONTROLLERS), read_only=True),
     ParameterSpec(
-        "plant", "thesis", "", "Plant to design for: thesis, x5_9, dfki or the path of a plant file.", read_only=True
+        "plant", "thesis", "", f"Plant to design for: {PRESET_NAMES} or the path of a plant file.", read_only=True
     ),
     ParameterSpec(
         "period", 0.0, "s", "Sampling period of the loop, which discrete designs and filters need; 0 takes it from the "

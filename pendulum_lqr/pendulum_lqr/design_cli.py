@@ -22,7 +22,7 @@ from pendulum_lqr.design import Gain, output_lqr
 from pendulum_lqr.model import LinearModel, linearise
 from pendulum_msgs_py.contract.angles import UPRIGHT
 from pendulum_msgs_py.errors import ParameterError
-from pendulum_msgs_py.plants.plant_parameters import PRESETS, load_plant
+from pendulum_msgs_py.plants.plant_parameters import PRESET_NAMES, load_plant
 from pendulum_msgs_py.programs.executables import cli_main
 from pendulum_msgs_py.programs.terminal import WholeTable, make_console
 
@@ -43,7 +43,7 @@ app = typer.Typer(add_completion=False, rich_markup_mode=None)
 
 @app.command()
 def design(
-    preset: Annotated[str, typer.Option(help=f"Plant: {', '.join(PRESETS)}.")] = "thesis",
+    preset: Annotated[str, typer.Option(help=f"Plant: {PRESET_NAMES}.")] = "thesis",
     plant: Annotated[Path | None, typer.Option(help="Plant file, instead of a preset.")] = None,
     q: Annotated[
         list[str] | None, typer.Option(help="Diagonal of Q, as 100,0.01; may be given again for more rows.")

@@ -148,7 +148,7 @@ def test_friction_that_feeds_energy_in_is_refused() -> None:
 
 
 def test_an_unknown_preset_names_the_known_ones() -> None:
-    with pytest.raises(ParameterError, match=r"plant is 'thesi'; expected one of the presets thesis, x5_9, dfki"):
+    with pytest.raises(ParameterError, match=r"plant is 'thesi'; expected one of the presets thesis, dfki, x5_9"):
         load_plant("thesi")
 
 

@@ -14,7 +14,7 @@ from launch.substitutions import LaunchConfiguration
 from launch_ros.actions import Node
 from launch_ros.substitutions import FindPackageShare
 
-from pendulum_msgs_py.plants.plant_parameters import load_plant
+from pendulum_msgs_py.plants.plant_parameters import PRESET_NAMES, load_plant
 from pendulum_sim.model_files import urdf
 
 
@@ -23,7 +23,7 @@ def arguments() -> list[DeclareLaunchArgument]:
     return [
         DeclareLaunchArgument("plant_namespace", default_value="sim", description="Namespace of the plant to show."),
         DeclareLaunchArgument(
-            "model", default_value="thesis", description="Preset (thesis, x5_9, dfki) or plant file that is drawn."
+            "model", default_value="thesis", description=f"Preset ({PRESET_NAMES}) or plant file that is drawn."
         ),
         DeclareLaunchArgument("y", default_value="0.0", description="Where the plant stands on the y axis [m]."),
         DeclareLaunchArgument(

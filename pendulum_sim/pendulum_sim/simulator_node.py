@@ -18,7 +18,7 @@ from pendulum_msgs_py.contract.values import NANOSECONDS, JointCommand, JointSam
 from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.parameters import ParameterSpec
 from pendulum_msgs_py.plants.plant_differences import PLANT_PARAMETERS, describe_plants
-from pendulum_msgs_py.plants.plant_parameters import load_plant
+from pendulum_msgs_py.plants.plant_parameters import PRESET_NAMES, load_plant
 from pendulum_msgs_py.ros import qos
 from pendulum_msgs_py.ros.convert import sample_from_message
 from pendulum_msgs_py.ros.parameters import NodeParameters
@@ -37,7 +37,7 @@ __all__ = ["SPECS", "SimulatorNode", "main"]
 _SENSOR_PREFIX = "sensor."
 
 SPECS: tuple[ParameterSpec, ...] = (
-    ParameterSpec("plant", "thesis", "", "Preset (thesis, x5_9, dfki) or path of a plant file.", read_only=True),
+    ParameterSpec("plant", "thesis", "", f"Preset ({PRESET_NAMES}) or path of a plant file.", read_only=True),
     ParameterSpec(
         "method",
         "auto",

@@ -24,7 +24,7 @@ from pendulum_hw_bridge.backends.replay import load_feedback
 from pendulum_hw_bridge.gains import DEFAULT_GAINS, load_gains, write_gains
 from pendulum_msgs_py.contract.cdr import encode_joint_state
 from pendulum_msgs_py.errors import PendulumError
-from pendulum_msgs_py.plants.plant_parameters import PRESETS, load_plant, write_plant
+from pendulum_msgs_py.plants.plant_parameters import load_plant, write_plant
 from pendulum_rosbag.reader import read_bag
 from pendulum_rosbag.reader.statistics import bag_statistics
 from pendulum_rosbag.recorder.options import read_metadata
@@ -158,7 +158,7 @@ def _text_file(name: str, text: str) -> Callable[[Path], Path]:
 
 
 def _plant(folder: Path) -> Path:
-    return write_plant(folder / "plant.yaml", load_plant(PRESETS[1]), provenance={"method": "fit", "samples": 100})
+    return write_plant(folder / "plant.yaml", load_plant("x5_9"), provenance={"method": "fit", "samples": 100})
 
 
 def _study(folder: Path) -> Path:

@@ -20,7 +20,7 @@ from pendulum_lqr.disturbance import DISTURBANCE_SPECS
 from pendulum_lqr.disturbance_node import NODE_SPECS as DISTURBANCE_NODE_SPECS
 from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.parameters import validate
-from pendulum_msgs_py.plants.plant_parameters import load_plant
+from pendulum_msgs_py.plants.plant_parameters import PRESETS, load_plant
 from pendulum_msgs_py.programs.graph import NodeProgram
 from pendulum_sim import markers_node, model_files, simulator_node, viewer_node
 from tests.fixtures import PROJECT
@@ -192,7 +192,7 @@ def test_rviz_shows_what_is_published() -> None:
     }
 
 
-@pytest.mark.parametrize("model", ["thesis", "x5_9", "dfki"])
+@pytest.mark.parametrize("model", PRESETS)
 def test_the_urdf_of_every_preset_has_the_joint_of_the_contract(model: str) -> None:
     robot = ElementTree.fromstring(model_files.urdf(load_plant(model)))
     joint = robot.find("joint")

@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from pendulum_hw_bridge.actuator import HardwareLimits
+from pendulum_hw_bridge.emulation import EMULATOR_PRESET_NAMES, EMULATOR_PRESETS
 from pendulum_hw_bridge.emulation.firmware import Array
 from pendulum_hw_bridge.emulation.kernel import CONSTANTS
 from pendulum_hw_bridge.emulation.thermal import ThermalParameters, torque_constant_at
@@ -24,7 +25,6 @@ from pendulum_msgs_py.plants.plant_parameters import (
 )
 
 __all__ = [
-    "EMULATOR_PRESETS",
     "FIRMWARE_EFFICIENCY",
     "SPEED_CONSTANT_RPM",
     "EmulatorParameters",
@@ -37,8 +37,6 @@ FIRMWARE_EFFICIENCY = 0.65
 """Efficiency that the firmware's feed-forward of torque assumes [-]."""
 SPEED_CONSTANT_RPM = 1530.0
 """Motor speed constant K_v that the firmware's feed-forward of velocity assumes [rpm/V]."""
-EMULATOR_PRESETS = ("thesis", "x5_9")
-"""Plant presets that the emulator can be: the thesis's machine, and an X5-9 with datasheet friction."""
 
 
 @dataclass(frozen=True)
@@ -114,7 +112,7 @@ class EmulatorParameters:
         if self.plant.drivetrain is None:
             raise ParameterError(
                 f"plant {self.plant.name!r} has no drivetrain; expected one with motor, gears and spring, such as "
-                f"the presets {', '.join(EMULATOR_PRESETS)}"
+                f"the presets {EMULATOR_PRESET_NAMES}"
             )
 
     @property
@@ -202,7 +200,7 @@ class EmulatorParameters:
 
 
 def load_emulator(plant: str | Path = "thesis", *, heating: bool = False) -> EmulatorParameters:
-    """Return the emulator of a preset (``thesis``, ``x5_9``) or of a plant file with a drivetrain.
+    """Return the emulator of a preset (one of ``EMULATOR_PRESETS``) or of a plant file with a drivetrain.
 
     ``thesis`` is the machine on which the thesis's experiments give its M_c, b_c and G_c; as a rigid plant, without
     drivetrain, the preset of the same name is what those experiments found.
@@ -216,7 +214,7 @@ def load_emulator(plant: str | Path = "thesis", *, heating: bool = False) -> Emu
     else:
         if str(plant) in PRESETS and str(plant) not in EMULATOR_PRESETS:
             raise ParameterError(
-                f"emulated plant is {str(plant)!r}, a rigid one; expected one of {', '.join(EMULATOR_PRESETS)} "
+                f"emulated plant is {str(plant)!r}, a rigid one; expected one of {EMULATOR_PRESET_NAMES} "
                 "or the path of a plant file with a drivetrain"
             )
         parameters = load_plant(plant)

@@ -37,6 +37,8 @@ __all__ = [
     "FORMAT",
     "PLANT_SPECS",
     "PRESETS",
+    "PRESET_NAMES",
+    "SERIES_ELASTIC_PRESETS",
     "PlantParameters",
     "SeriesElasticParameters",
     "load_plant",
@@ -45,8 +47,17 @@ __all__ = [
 ]
 
 FORMAT = "pendulum_plant/1"
-PRESETS = ("thesis", "x5_9", "dfki")
-"""Names of the plant files that come with the package."""
+_PRESET_FOLDER = Path(str(resources.files("pendulum_msgs_py.plants") / "presets"))
+PRESETS = tuple(
+    sorted((file.stem for file in _PRESET_FOLDER.glob("*.yaml")), key=lambda name: (name != "thesis", name))
+)
+"""Names of the plant files that come with the package; a file in their folder is a preset, the default comes first."""
+PRESET_NAMES = ", ".join(PRESETS)
+"""The same for help texts."""
+SERIES_ELASTIC_PRESETS = tuple(
+    name for name in PRESETS if "\ndrivetrain:" in (_PRESET_FOLDER / f"{name}.yaml").read_text(encoding="utf-8")
+)
+"""Those of them that have motor, gears and spring."""
 
 
 def _physical(
@@ -166,7 +177,7 @@ class PlantParameters:
 
 
 def load_plant(preset_or_path: str | Path) -> PlantParameters:
-    """Return the parameters of a preset (``thesis``, ``x5_9``, ``dfki``) or of a plant file.
+    """Return the parameters of a preset (one of ``PRESETS``) or of a plant file.
 
     Raises:
         ParameterError: No such preset or file, or the file is refused; the message names file and entry.
@@ -254,11 +265,11 @@ def write_plant(
 def _resolve(preset_or_path: str | Path) -> Path:
     text = str(preset_or_path)
     if text in PRESETS:
-        return Path(str(resources.files("pendulum_msgs_py.plants") / "presets" / f"{text}.yaml"))
+        return _PRESET_FOLDER / f"{text}.yaml"
     path = Path(text).expanduser()
     if not path.exists() and "/" not in text and path.suffix == "":
         raise ParameterError(
-            f"plant is {text!r}; expected one of the presets {', '.join(PRESETS)} or the path of a plant file"
+            f"plant is {text!r}; expected one of the presets {PRESET_NAMES} or the path of a plant file"
         )
     return path
 

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from pendulum_msgs_py.plants.plant_parameters import PRESET_NAMES
 from pendulum_msgs_py.programs.executables import cli_main
 
 if TYPE_CHECKING:
@@ -26,7 +27,7 @@ def replay(
     params: Annotated[
         str,
         typer.Option(
-            "--params", "-p", help="Plant file (an identified one for a voltage), or a preset: thesis, x5_9, dfki."
+            "--params", "-p", help=f"Plant file (an identified one for a voltage), or a preset: {PRESET_NAMES}."
         ),
     ] = "",
     controller: Annotated[
