@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pendulum_bags.identification import kernel
+from pendulum_bags.identification.arrowhead import eliminate, find_states
 from pendulum_bags.identification.kernel import PARAMETER_NAMES
 from pendulum_bags.identification.model import BOUNDS, INDEX, FitModel
 from pendulum_bags.identification.problem import Piece, longest_step, simulate
@@ -94,6 +95,7 @@ def solve(
     # The steps must not change within one fit, or the cost would jump with them.
     steps = [coarse * longest_step(best, piece.recording) for piece in pieces]
     masks = [piece.mask() for piece in pieces]
+    ends = np.cumsum([len(piece.windows) for piece in pieces])[:-1]
     typical = _typical_scales(index)
     damping, cost, iterations, converged = 1e-4, np.inf, 0, False
     blocks = None
@@ -117,7 +119,7 @@ def solve(
             damping *= 4.0
             continue
         candidate = model.with_vector(trial)
-        x_trial = [a + b for a, b in zip(x, d_x, strict=True)]
+        x_trial = [a + b for a, b in zip(x, np.split(d_x, ends), strict=True)]
         new_cost = 0.0
         for piece, state, h, mask in zip(pieces, x_trial, steps, masks, strict=True):
             r = simulate(candidate, piece, state, step=h).theta[mask] - piece.recording.position[mask]
@@ -185,6 +187,17 @@ def _typical_scales(index: NDArray[np.int64]) -> Array:
     return np.array([typical.get(PARAMETER_NAMES[i], 1.0) for i in index])
 
 
+@dataclass(frozen=True)
+class _Blocks:
+    """The arrowhead: parameters (k), states of all windows of all pieces (w, 2), what couples them, gradients."""
+
+    h_pp: Array
+    h_px: Array
+    h_xx: Array
+    g_p: Array
+    g_x: Array
+
+
 def _linearise(
     model: FitModel,
     pieces: Sequence[Piece],
@@ -193,68 +206,58 @@ def _linearise(
     scale: float,
     steps: Sequence[float],
     masks: Sequence[NDArray[np.bool_]],
-) -> tuple[float, tuple[Array, list[Array], list[Array], Array, list[Array]]]:
-    k = index.size
-    h_pp, g_p = np.zeros((k, k)), np.zeros(k)
-    h_px: list[Array] = []
-    h_xx: list[Array] = []
-    g_x: list[Array] = []
-    cost = 0.0
+) -> tuple[float, _Blocks]:
+    k, windows = index.size, sum(len(piece.windows) for piece in pieces)
+    blocks = _Blocks(
+        np.zeros((k, k)), np.zeros((windows, k, 2)), np.zeros((windows, 2, 2)), np.zeros(k), np.zeros((windows, 2))
+    )
+    cost, begin = 0.0, 0
     for piece, state, h, mask in zip(pieces, states, steps, masks, strict=True):
         result = simulate(model, piece, state, free=index.tolist(), step=h)
         residual = result.theta - piece.recording.position
         inside = residual[mask]
         if not (np.all(np.isfinite(inside)) and np.all(np.isfinite(result.jacobian))):
-            return np.inf, (h_pp, h_px, h_xx, g_p, g_x)
+            return np.inf, blocks
         cost += robust_cost(inside, scale)
         weight = np.ones_like(residual)
         if np.isfinite(scale):
             weight = 1.0 / np.sqrt(1.0 + (residual / scale) ** 2)
-        count = len(piece.windows)
-        blocks = np.zeros((count, k, 2)), np.zeros((count, 2, 2)), np.zeros((count, 2))
+        own = slice(begin, begin + len(piece.windows))
+        begin = own.stop
         kernel.normal_blocks(
-            result.jacobian, residual, weight, piece.windows, h_pp, blocks[0], blocks[1], g_p, blocks[2]
+            result.jacobian,
+            residual,
+            weight,
+            piece.windows,
+            blocks.h_pp,
+            blocks.h_px[own],
+            blocks.h_xx[own],
+            blocks.g_p,
+            blocks.g_x[own],
         )
-        h_px.append(blocks[0])
-        h_xx.append(blocks[1])
-        g_x.append(blocks[2])
-    return cost, (h_pp, h_px, h_xx, g_p, g_x)
+    return cost, blocks
 
 
 def _damped_step(
-    blocks: tuple[Array, list[Array], list[Array], Array, list[Array]],
-    values: Array,
-    low: Array,
-    high: Array,
-    damping: float,
-    typical: Array,
-) -> tuple[Array, list[Array], float] | None:
+    blocks: _Blocks, values: Array, low: Array, high: Array, damping: float, typical: Array
+) -> tuple[Array, Array, float] | None:
     """Return the step of parameters and states and the decrease it predicts, or None if the system is singular."""
-    h_pp, h_px, h_xx, g_p, g_x = blocks
-    k = g_p.size
-    eye = np.eye(2)
-    inverses, reduced, gradient = [], h_pp.copy(), g_p.copy()
-    for px, xx, gx in zip(h_px, h_xx, g_x, strict=True):
-        diagonal = np.einsum("nii->ni", xx)
-        damped = xx + damping * eye * (diagonal[:, :, None] + 1e-12)
-        inverse = np.linalg.inv(damped)
-        inverses.append(inverse)
-        reduced -= np.einsum("nai,nij,nbj->ab", px, inverse, px)
-        gradient -= np.einsum("nai,nij,nj->a", px, inverse, gx)
+    k = blocks.g_p.size
+    reduced, gradient, inverses = eliminate(
+        blocks.h_pp, blocks.h_px, blocks.h_xx, blocks.g_p, blocks.g_x, damping
+    )
     d_p = np.zeros(k)
     if k:
-        floor = 1e-12 * max(float(np.max(np.diag(h_pp))), 1e-30)
-        diagonal = damping * (np.maximum(np.diag(h_pp), 0.0) + floor / typical**2)
-        system = reduced + np.diag(diagonal)
+        own = np.diag(blocks.h_pp)
+        floor = 1e-12 * max(float(own.max()), 1e-30)
+        system = reduced + np.diag(damping * (np.maximum(own, 0.0) + floor / typical**2))
         active = np.zeros(k, dtype=bool)
         for _ in range(k + 1):
             idle = np.flatnonzero(~active)
             if not idle.size:
                 break
             try:
-                step = np.linalg.solve(
-                    system[np.ix_(idle, idle)], -(gradient + system @ np.where(active, d_p, 0.0))[idle]
-                )
+                step = np.linalg.solve(system[idle[:, None], idle], -(gradient + system @ np.where(active, d_p, 0.0))[idle])
             except np.linalg.LinAlgError:
                 return None
             d_p[idle] = step
@@ -264,12 +267,5 @@ def _damped_step(
             # Parameters that would leave their domain stop at its edge; the others solve again around them.
             d_p[outside] = np.clip(values + d_p, low, high)[outside] - values[outside]
             active |= outside
-    d_x = []
-    predicted = -2.0 * float(g_p @ d_p) - float(d_p @ h_pp @ d_p)
-    for px, xx, gx, inverse in zip(h_px, h_xx, g_x, inverses, strict=True):
-        right = -(gx + np.einsum("nai,a->ni", px, d_p))
-        step_x = np.einsum("nij,nj->ni", inverse, right)
-        d_x.append(step_x)
-        predicted -= float(np.sum(2.0 * gx * step_x) + np.einsum("ni,nij,nj->", step_x, xx, step_x))
-        predicted -= 2.0 * float(np.einsum("a,nai,ni->", d_p, px, step_x))
-    return d_p, d_x, predicted
+    d_x, decrease = find_states(blocks.h_px, blocks.h_xx, blocks.g_x, inverses, d_p)
+    return d_p, d_x, decrease - 2.0 * float(blocks.g_p @ d_p) - float(d_p @ blocks.h_pp @ d_p)
