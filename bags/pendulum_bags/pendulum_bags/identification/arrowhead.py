@@ -52,9 +52,7 @@ def eliminate(
 
 
 @njit(cache=True)
-def find_states(
-    h_px: Array, h_xx: Array, g_x: Array, inverses: Array, d_p: Array
-) -> tuple[Array, float]:
+def find_states(h_px: Array, h_xx: Array, g_x: Array, inverses: Array, d_p: Array) -> tuple[Array, float]:
     """Return the step of the states (w, 2) that belongs to one of the parameters, and the decrease it adds.
 
     Args:

@@ -243,9 +243,7 @@ def _damped_step(
 ) -> tuple[Array, Array, float] | None:
     """Return the step of parameters and states and the decrease it predicts, or None if the system is singular."""
     k = blocks.g_p.size
-    reduced, gradient, inverses = eliminate(
-        blocks.h_pp, blocks.h_px, blocks.h_xx, blocks.g_p, blocks.g_x, damping
-    )
+    reduced, gradient, inverses = eliminate(blocks.h_pp, blocks.h_px, blocks.h_xx, blocks.g_p, blocks.g_x, damping)
     d_p = np.zeros(k)
     if k:
         own = np.diag(blocks.h_pp)
@@ -257,7 +255,9 @@ def _damped_step(
             if not idle.size:
                 break
             try:
-                step = np.linalg.solve(system[idle[:, None], idle], -(gradient + system @ np.where(active, d_p, 0.0))[idle])
+                step = np.linalg.solve(
+                    system[idle[:, None], idle], -(gradient + system @ np.where(active, d_p, 0.0))[idle]
+                )
             except np.linalg.LinAlgError:
                 return None
             d_p[idle] = step
