@@ -3,6 +3,8 @@
 import importlib
 import os
 
+from hypothesis import settings
+
 pytest_plugins = ["tests.fixtures"]
 
 # pytest names a test module after its path, `pendulum_sim.test.test_x`, and would take the repository's folder for the
@@ -21,3 +23,9 @@ for _package in (
 # xdist tells its workers the width of the terminal in which nobody reads them; tables are whole without one.
 if "PYTEST_XDIST_WORKER" in os.environ:
     os.environ.pop("COLUMNS", None)
+
+# The same examples each time, so that a failure belongs to the change at hand; `--hypothesis-profile=explore` looks for
+# new ones. No deadline: on a busy machine it measures the neighbours.
+settings.register_profile("repeatable", derandomize=True, deadline=None)
+settings.register_profile("explore", max_examples=1000, deadline=None)
+settings.load_profile("repeatable")

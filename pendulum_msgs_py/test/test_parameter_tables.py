@@ -108,7 +108,8 @@ def test_a_value_passes_where_its_domain_has_it_and_raises_our_error_everywhere_
                 spec.check(value)
             continue
         checked = spec.check(value)
-        assert checked == value
+        # Beyond 2**53 not every integer is a float.
+        assert checked == (float(value) if isinstance(spec.default, float) else value)  # type: ignore[arg-type]
         assert type(checked) is type(spec.default)
 
 
