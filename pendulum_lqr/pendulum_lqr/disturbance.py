@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -20,82 +20,18 @@ from pendulum_msgs_py.contract.values import NANOSECONDS
 from pendulum_msgs_py.errors import DataError, ParameterError
 from pendulum_msgs_py.parameters import ParameterSpec, validate
 
-__all__ = ["DISTURBANCES", "DISTURBANCE_SPECS", "Disturbance", "from_bag", "make_disturbance", "torques"]
-
-DISTURBANCE_SPECS: tuple[ParameterSpec, ...] = (
-    ParameterSpec(
-        "kind",
-        "uniform",
-        "",
-        "Shape of the torque.",
-        choices=("uniform", "gaussian", "sine", "multisine", "chirp", "prbs", "step", "pulse_train", "from_bag"),
-    ),
-    ParameterSpec("amplitude", 2.5, "N m", "Largest torque; the standard deviation for gaussian."),
-    ParameterSpec(
-        "hold_time",
-        0.01,
-        "s",
-        "How long one sample is held; 0 for a sine, multisine, chirp, step or pulse train means a smooth signal.",
-        minimum=0.0,
-        maximum=3600.0,
-    ),
-    ParameterSpec(
-        "seed",
-        1,
-        "-",
-        "Seed of the random kinds and phases; shifts the sequence of prbs.",
-        minimum=0,
-        maximum=2**63 - 1,
-    ),
-    ParameterSpec(
-        "bandwidth",
-        10.0,
-        "Hz",
-        "Cut-off (-3 dB) of gaussian; 0 for white from sample to sample.",
-        minimum=0.0,
-    ),
-    ParameterSpec(
-        "frequency",
-        1.0,
-        "Hz",
-        "Frequency of sine, start of chirp, lowest line of multisine, repetition of pulse_train.",
-        minimum=0.0,
-        exclusive_minimum=True,
-    ),
-    ParameterSpec(
-        "frequency_end",
-        10.0,
-        "Hz",
-        "Frequency at the end of a chirp, highest line of multisine.",
-        minimum=0.0,
-        exclusive_minimum=True,
-    ),
-    ParameterSpec(
-        "sweep_time",
-        10.0,
-        "s",
-        "Length of one chirp; it then starts again.",
-        minimum=0.0,
-        exclusive_minimum=True,
-    ),
-    ParameterSpec("order", 9, "-", "Length of prbs: repeats after 2^order - 1 samples.", minimum=2, maximum=16),
-    ParameterSpec(
-        "signal_period",
-        4.0,
-        "s",
-        "Length of one period of multisine; its lines are odd multiples of 1/signal_period.",
-        minimum=0.0,
-        exclusive_minimum=True,
-    ),
-    ParameterSpec("lines", 40, "-", "Number of lines of multisine, at most.", minimum=1, maximum=10_000),
-    ParameterSpec("start_time", 0.0, "s", "Time at which step and pulse_train begin.", minimum=0.0),
-    ParameterSpec("pulse_width", 0.1, "s", "Length of each pulse of pulse_train.", minimum=0.0, exclusive_minimum=True),
-)
-"""Parameters of every kind; each kind reads those that it needs."""
+__all__ = [
+    "DISTURBANCES",
+    "DISTURBANCE_SPECS",
+    "Disturbance",
+    "DisturbanceKind",
+    "from_bag",
+    "make_disturbance",
+    "torques",
+]
 
 _MOST_BANDWIDTH = 0.25
 """Bandwidth of coloured noise per rate of its samples, up to which its -3 dB point lies where it should [-]."""
-_RANDOM_KINDS = frozenset({"uniform", "gaussian", "prbs"})
 
 # Taps (1-based) of maximum-length shift registers; P. Alfke, Xilinx XAPP 052, 1996, table 3.
 _TAPS: dict[int, tuple[int, ...]] = {
@@ -119,17 +55,17 @@ def make_disturbance(values: Mapping[str, object], recorded: Disturbance | None 
         ParameterError: A value is refused, or ``from_bag`` lacks its recording.
     """
     parameters = validate(DISTURBANCE_SPECS, values)
-    kind = parameters["kind"]
-    if kind in _RANDOM_KINDS and not parameters["hold_time"] > 0.0:
-        raise ParameterError(f"hold_time is 0 s; expected > 0 for the random kind {kind}")
-    if kind == "from_bag":
+    if parameters["kind"] == "from_bag":
         if recorded is None:
             raise ParameterError("kind is 'from_bag' without a recording; expected a recorded disturbance")
         return recorded
+    kind = DISTURBANCES[parameters["kind"]]
+    if kind.random and not parameters["hold_time"] > 0.0:
+        raise ParameterError(f"hold_time is 0 s; expected > 0 for the random kind {parameters['kind']}")
     hold_ns = round(parameters["hold_time"] * NANOSECONDS)
     if parameters["hold_time"] > 0.0 and hold_ns < 1:
         raise ParameterError(f"hold_time is {parameters['hold_time']} s; expected 0 or at least 1e-9 s")
-    return DISTURBANCES[kind](parameters, hold_ns)
+    return kind.make(parameters, hold_ns)
 
 
 def torques(disturbance: Disturbance, elapsed_ns: ArrayLike) -> NDArray[np.float64]:
@@ -329,16 +265,100 @@ def _pulse_train(p: Mapping[str, Any], hold_ns: int) -> Disturbance:
     return _held(signal, hold_ns)
 
 
-Maker = Callable[[Mapping[str, Any], int], Disturbance]
+class DisturbanceKind(NamedTuple):
+    """A kind of disturbance.
 
-DISTURBANCES: dict[str, Maker] = {
-    "uniform": _uniform,
-    "gaussian": _gaussian,
-    "sine": _sine,
-    "multisine": _multisine,
-    "chirp": _chirp,
-    "prbs": _prbs,
-    "step": _step,
-    "pulse_train": _pulse_train,
+    Attributes:
+        make: From the checked parameters and the hold time [ns] to the torque.
+        random: Whether it is a sequence of samples, and so needs a hold time.
+        parameters: Those that it alone has.
+    """
+
+    make: Callable[[Mapping[str, Any], int], Disturbance]
+    random: bool = False
+    parameters: tuple[ParameterSpec, ...] = ()
+
+
+DISTURBANCES: dict[str, DisturbanceKind] = {
+    "uniform": DisturbanceKind(_uniform, random=True),
+    "gaussian": DisturbanceKind(_gaussian, random=True),
+    "sine": DisturbanceKind(_sine),
+    "multisine": DisturbanceKind(_multisine),
+    "chirp": DisturbanceKind(_chirp),
+    "prbs": DisturbanceKind(_prbs, random=True),
+    "step": DisturbanceKind(_step),
+    "pulse_train": DisturbanceKind(_pulse_train),
 }
 """Kinds that follow from parameters alone; ``from_bag`` needs a recording and is made by :func:`from_bag`."""
+
+DISTURBANCE_SPECS: tuple[ParameterSpec, ...] = (
+    ParameterSpec(
+        "kind",
+        "uniform",
+        "",
+        "Shape of the torque.",
+        choices=(*DISTURBANCES, "from_bag"),
+    ),
+    ParameterSpec("amplitude", 2.5, "N m", "Largest torque; the standard deviation for gaussian."),
+    ParameterSpec(
+        "hold_time",
+        0.01,
+        "s",
+        "How long one sample is held; 0 for a sine, multisine, chirp, step or pulse train means a smooth signal.",
+        minimum=0.0,
+        maximum=3600.0,
+    ),
+    ParameterSpec(
+        "seed",
+        1,
+        "-",
+        "Seed of the random kinds and phases; shifts the sequence of prbs.",
+        minimum=0,
+        maximum=2**63 - 1,
+    ),
+    ParameterSpec(
+        "bandwidth",
+        10.0,
+        "Hz",
+        "Cut-off (-3 dB) of gaussian; 0 for white from sample to sample.",
+        minimum=0.0,
+    ),
+    ParameterSpec(
+        "frequency",
+        1.0,
+        "Hz",
+        "Frequency of sine, start of chirp, lowest line of multisine, repetition of pulse_train.",
+        minimum=0.0,
+        exclusive_minimum=True,
+    ),
+    ParameterSpec(
+        "frequency_end",
+        10.0,
+        "Hz",
+        "Frequency at the end of a chirp, highest line of multisine.",
+        minimum=0.0,
+        exclusive_minimum=True,
+    ),
+    ParameterSpec(
+        "sweep_time",
+        10.0,
+        "s",
+        "Length of one chirp; it then starts again.",
+        minimum=0.0,
+        exclusive_minimum=True,
+    ),
+    ParameterSpec("order", 9, "-", "Length of prbs: repeats after 2^order - 1 samples.", minimum=2, maximum=16),
+    ParameterSpec(
+        "signal_period",
+        4.0,
+        "s",
+        "Length of one period of multisine; its lines are odd multiples of 1/signal_period.",
+        minimum=0.0,
+        exclusive_minimum=True,
+    ),
+    ParameterSpec("lines", 40, "-", "Number of lines of multisine, at most.", minimum=1, maximum=10_000),
+    ParameterSpec("start_time", 0.0, "s", "Time at which step and pulse_train begin.", minimum=0.0),
+    ParameterSpec("pulse_width", 0.1, "s", "Length of each pulse of pulse_train.", minimum=0.0, exclusive_minimum=True),
+    *(spec for kind in DISTURBANCES.values() for spec in kind.parameters),
+)
+"""Parameters of every kind; each kind reads those that it needs."""
