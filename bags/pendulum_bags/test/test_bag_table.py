@@ -12,6 +12,7 @@ import zstandard
 from pendulum_bags.analyse import bag_table
 from pendulum_bags.analyse.analyse_cli import main
 from pendulum_bags.analyse.bag_table import analyse_bags, find_pieces
+from pendulum_bags.analyse.questions import timing
 from pendulum_bags.comparison import compare_runs
 from pendulum_bags.runs.run_data import plant_summary, read_run
 from pendulum_msgs_py.errors import BagError, ParameterError
@@ -126,7 +127,7 @@ def test_a_bag_whose_files_are_gone_and_a_program_that_stumbles_have_rows_that_s
             raise KeyError("noise")
         return {"fine": 1}
 
-    monkeypatch.setattr(bag_table, "BAG_QUESTIONS", {"timing": stumble})
+    monkeypatch.setattr(timing, "answer", stumble)
     table = analyse_bags(tmp_path / "out", find_pieces([runs / "monday", runs / "tuesday"], ["timing"]), ["timing"])
     assert [row["bag"] for row in table.bags] == ["monday/hw", "monday/sim", "tuesday/hw", "tuesday/sim"]
     assert "is no bag" in table.bags[0]["error"]

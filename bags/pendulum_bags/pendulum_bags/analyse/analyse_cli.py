@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 from rich.console import Console
 
+from pendulum_bags.analyse.questions import QUESTIONS
 from pendulum_msgs_py.programs.counted_progress import counted_progress
 from pendulum_msgs_py.programs.executables import cli_main
 from pendulum_msgs_py.programs.terminal import WholeTable, make_console
@@ -30,11 +31,16 @@ _SHOWN = (
 _MOST_ROWS = 40
 
 
+def _named(*, of_runs: bool) -> str:
+    return ", ".join(name for name, question in QUESTIONS.items() if question.of_runs is of_runs)
+
+
 @app.command(epilog="Example: python -m pendulum_bags analyse bags/examples --ask metrics,timing --out /tmp/analysed")
 def analyse(
     folders: Annotated[list[Path], typer.Argument(help="Folders with bags below them, or bags.")],
     ask: Annotated[
-        str, typer.Option(help="Questions: metrics, timing, identify of each plant; compare, report of run folders.")
+        str,
+        typer.Option(help=f"Questions: {_named(of_runs=False)} of each plant; {_named(of_runs=True)} of run folders."),
     ] = "metrics,timing",
     out: Annotated[
         Path, typer.Option("--out", "-o", help="Folder for the tables; an interrupted analysis goes on there.")

@@ -1,6 +1,6 @@
 """The same questions to many bags: one row for each plant of each bag, one for each run folder; here or on a cluster.
 
-A question is a function and a line in ``BAG_QUESTIONS`` or ``RUN_QUESTIONS``. Each bag is a piece of its own: what
+What can be asked stands in :data:`~pendulum_bags.analyse.questions.QUESTIONS`. Each bag is a piece of its own: what
 has been answered stays when the analysis is interrupted, and is asked again only when the bag has changed.
 """
 
@@ -22,20 +22,16 @@ from typing import Any
 
 import numpy as np
 
-from pendulum_bags.comparison import compare_folders, read_run
-from pendulum_bags.comparison.metrics import episode_of, metrics_of
-from pendulum_bags.runs.run_data import plant_summary
+from pendulum_bags.analyse.questions import QUESTIONS
 from pendulum_bags.runs.run_folder import write_json
 from pendulum_bags.studies.chunks import Connect, carry_out
 from pendulum_msgs_py.contract import names
-from pendulum_msgs_py.contract.angles import UPRIGHT
-from pendulum_msgs_py.errors import BagError, DataError, ParameterError, PendulumError
+from pendulum_msgs_py.errors import BagError, ParameterError, PendulumError
 from pendulum_rosbag.reader import Bag, read_bag
 from pendulum_rosbag.reader.open_source import is_bag_folder, is_storage_file
-from pendulum_rosbag.reader.statistics import bag_statistics
 from pendulum_rosbag.storage.metadata_file import METADATA_NAME
 
-__all__ = ["BAG_QUESTIONS", "QUESTIONS", "RUN_QUESTIONS", "Piece", "Table", "analyse_bags", "find_pieces"]
+__all__ = ["Piece", "Table", "analyse_bags", "find_pieces"]
 
 _LABELS = ("bag", "plant", "error")
 
@@ -118,10 +114,10 @@ def find_pieces(folders: Sequence[Path], questions: Sequence[str]) -> list[Piece
             bags.setdefault(path.resolve(), name)
     found: list[Piece] = []
     for path, name in _distinct(bags).items():
-        if any(question in BAG_QUESTIONS for question in questions):
+        if any(not QUESTIONS[question].of_runs for question in questions):
             found.append(Piece(name, str(path), False))
         run = path.parent
-        if path.name == "sim" and (run / "hw").is_dir() and any(q in RUN_QUESTIONS for q in questions):
+        if path.name == "sim" and (run / "hw").is_dir() and any(QUESTIONS[question].of_runs for question in questions):
             found.append(Piece(str(Path(name).parent) if len(Path(name).parts) > 1 else run.name, str(run), True))
     if not found:
         what = " or ".join(sorted({_wanted(question) for question in questions}))
@@ -190,10 +186,10 @@ def _ask(job: tuple[Sequence[Piece], Sequence[str], str], index: int, _threads: 
         raise BagError(f"{piece.path} is not on this machine; expected the bags under the same path on every worker")
     if piece.is_run:
         row: Row = {"bag": piece.name, "plant": "", "error": ""}
-        asked = [RUN_QUESTIONS[question] for question in questions if question in RUN_QUESTIONS]
+        asked = [QUESTIONS[question].answer for question in questions if QUESTIONS[question].of_runs]
         _answer(row, asked, Path(piece.path), Path(out), piece.name)
         return [row]
-    chosen = [BAG_QUESTIONS[question] for question in questions if question in BAG_QUESTIONS]
+    chosen = [QUESTIONS[question].answer for question in questions if not QUESTIONS[question].of_runs]
     try:
         with read_bag(piece.path) as bag:
             plants = _plants(bag)
@@ -227,86 +223,6 @@ def _sentence(error: Exception) -> str:
     return f"{type(error).__name__}: {error}" if str(error) else type(error).__name__
 
 
-def _metrics(path: Path, plant: str) -> Row:
-    with read_bag(path) as bag:
-        states = bag.array(f"{plant}/{names.JOINT_STATES}")
-        told = bag.metadata.get("pendulum.run")
-    set_point = told.get("set_point", 0.0) if isinstance(told, Mapping) else 0.0
-    try:
-        run = read_run(path, prefix=plant)
-    except DataError:
-        if len(states) < 4:
-            raise
-        # A recording without noise has no window: all of it is what the controller did.
-        run = read_run(path, prefix=plant, start_ns=int(states["stamp_ns"][0]), stop_ns=int(states["stamp_ns"][-1]))
-    goal = UPRIGHT + (float(set_point) if isinstance(set_point, (int, float)) else 0.0)
-    found = plant_summary(run)
-    found["damage"] = "; ".join(found["damage"])
-    return {**found, **metrics_of(episode_of(run.window, goal))}
-
-
-def _timing(path: Path, plant: str) -> Row:
-    with read_bag(path) as bag:
-        found = bag_statistics(bag)
-    states = found.topics[f"{plant}/{names.JOINT_STATES}"]
-    row: Row = {f"states_{name}": getattr(states, name) for name in ("count", "rate", "jitter", "longest")}
-    row |= {f"states_{name}": getattr(states, name) for name in ("gaps", "missing", "clock_jumps")}
-    answered = f"{plant}/{names.EFFORT_COMMAND}"
-    for latency in found.latencies:
-        if latency.answer == answered and latency.source == f"{plant}/{names.JOINT_STATES}":
-            row |= {"answer_median": latency.median, "answer_p99": latency.p99}
-    return row
-
-
-def _identify(path: Path, plant: str) -> Row:
-    from pendulum_bags.identification.result import identify
-    from pendulum_bags.runs.bag_recordings import read_bag_recording
-
-    found = identify([read_bag_recording(path, namespace=plant)], profiles=0).to_dict()
-    row: Row = {"friction": found["friction"], "window_rms": found["training_rms"]}
-    row |= {"refused": found["explained"]["refused"], "model_incomplete": found["incomplete"]}
-    for name in found["fitted"]:
-        row[name] = found["parameters"][name]
-        if name in found["intervals"]:
-            interval = found["intervals"][name]
-            row[f"{name}_low"], row[f"{name}_high"] = interval["low"], interval["high"]
-    return row
-
-
-def _compare(path: Path, _out: Path, _name: str) -> Row:
-    found = compare_folders([path])
-    content = found.to_json()
-    row: Row = {"seed": content["seed"], "outcome": found.verdict.outcome.value, "paired": found.is_paired}
-    for test in found.verdict.tests:
-        row[test.quantity] = test.interval.estimate
-        row[f"{test.quantity} low"], row[f"{test.quantity} high"] = test.interval.low, test.interval.high
-    for plant, figures in content["plants"].items():
-        for key in ("rate_hz", "std_theta", "std_theta_dot", "max_abs_u"):
-            row[f"{plant}_{key}"] = figures.get(key)
-    return row
-
-
-def _report(path: Path, out: Path, name: str) -> Row:
-    from pendulum_bags.report.write import write_report
-
-    target = out / "reports" / name
-    write_report(target, comparison=compare_folders([path]), recordings=[], formats=("png",))
-    return {"report": str(Path("reports", name, "report.html"))}
-
-
-BAG_QUESTIONS: Mapping[str, Callable[[Path, str], Row]] = {
-    "metrics": _metrics,
-    "timing": _timing,
-    "identify": _identify,
-}
-"""What can be asked of a plant in a bag."""
-
-RUN_QUESTIONS: Mapping[str, Callable[[Path, Path, str], Row]] = {"compare": _compare, "report": _report}
-"""What can be asked of a run folder with the bags ``sim`` and ``hw``."""
-
-QUESTIONS = (*BAG_QUESTIONS, *RUN_QUESTIONS)
-
-
 def _bags_below(folder: Path) -> Iterator[Path]:
     """Yield bags: folders with storage files, and storage files that were given themselves."""
     if folder.is_file():
@@ -326,7 +242,7 @@ def _is_content(path: Path) -> bool:
 
 
 def _wanted(question: str) -> str:
-    return "bag" if question in BAG_QUESTIONS else "run folder with the bags sim and hw"
+    return "run folder with the bags sim and hw" if QUESTIONS[question].of_runs else "bag"
 
 
 def _plants(bag: Bag) -> list[str]:

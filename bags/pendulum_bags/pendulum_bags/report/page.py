@@ -37,6 +37,7 @@ SECTIONS = (
     "Model",
     "A real pendulum",
 )
+"""Order of the sections; one that only a figure or table names comes after these."""
 
 
 def render_page(
@@ -61,7 +62,7 @@ def render_page(
     )
     sections = []
     graphs: dict[str, Any] = {}
-    for heading in SECTIONS:
+    for heading in dict.fromkeys((*SECTIONS, *(item.section for item in (*figures, *tables)))):
         items: list[dict[str, Any]] = []
         for figure in figures:
             if figure.section == heading:

@@ -1,0 +1,24 @@
+"""Parameters of the plant, identified from one bag."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from pendulum_bags.identification.result import identify
+from pendulum_bags.runs.bag_recordings import read_bag_recording
+
+__all__ = ["answer"]
+
+
+def answer(path: Path, plant: str) -> dict[str, Any]:
+    """Return identified parameters with intervals of a plant in a bag, by name."""
+    found = identify([read_bag_recording(path, namespace=plant)], profiles=0).to_dict()
+    row: dict[str, Any] = {"friction": found["friction"], "window_rms": found["training_rms"]}
+    row |= {"refused": found["explained"]["refused"], "model_incomplete": found["incomplete"]}
+    for name in found["fitted"]:
+        row[name] = found["parameters"][name]
+        if name in found["intervals"]:
+            interval = found["intervals"][name]
+            row[f"{name}_low"], row[f"{name}_high"] = interval["low"], interval["high"]
+    return row
