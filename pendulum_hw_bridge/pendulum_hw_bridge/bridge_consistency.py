@@ -6,6 +6,7 @@ import math
 from collections.abc import Mapping
 from typing import Any
 
+from pendulum_hw_bridge.backends import BACKENDS
 from pendulum_msgs_py.contract.drive import PlantLimits
 from pendulum_msgs_py.errors import ParameterError
 
@@ -29,7 +30,7 @@ def check_consistency(values: Mapping[str, Any], limits: PlantLimits) -> None:
     Raises:
         ParameterError: Names the parameter, its value and what the others allow.
     """
-    rate, hardware = values["feedback_rate"], values["backend"] == "hebi"
+    rate, hardware = values["feedback_rate"], BACKENDS[values["backend"]].is_machine
     period = 1.0 / rate
     if rate < _LEAST_RATE:
         raise ParameterError(f"feedback_rate is {rate:g} Hz; expected at least {_LEAST_RATE:g} Hz")
@@ -56,10 +57,10 @@ def check_consistency(values: Mapping[str, Any], limits: PlantLimits) -> None:
             f"command_timeout is {limits.command_timeout:g} s; expected {period:g} to {slowest:g} s {where}"
         )
     if hardware:
-        _check_hardware(limits)
+        _check_hardware(values["backend"], limits)
 
 
-def _check_hardware(limits: PlantLimits) -> None:
+def _check_hardware(backend: str, limits: PlantLimits) -> None:
     for name, value in (
         ("velocity_limit", limits.velocity),
         ("effort_slew_limit", limits.slew),
@@ -68,4 +69,4 @@ def _check_hardware(limits: PlantLimits) -> None:
         ("position_window", limits.position_max - limits.position_min),
     ):
         if math.isinf(value):
-            raise ParameterError(f"{name} is none; expected one with backend 'hebi'")
+            raise ParameterError(f"{name} is none; expected one with backend {backend!r}")

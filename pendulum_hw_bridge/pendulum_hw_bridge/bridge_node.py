@@ -19,6 +19,7 @@ from sensor_msgs.msg import BatteryState, JointState, Temperature
 from pendulum_hw_bridge import bridge_parameters
 from pendulum_hw_bridge.actuator import ActuatorError, Feedback
 from pendulum_hw_bridge.actuator_loop import ActuatorLoop
+from pendulum_hw_bridge.backends import BACKENDS
 from pendulum_hw_bridge.bridge import Bridge, Outcome
 from pendulum_hw_bridge.bridge_consistency import check_consistency
 from pendulum_hw_bridge.bridge_parameters import BRIDGE_SPECS
@@ -119,7 +120,7 @@ class BridgeNode(LifecycleNode):
             (lambda: self._lockstep_loop.now_ns if self._lockstep_loop else LOCKSTEP_EPOCH_NS)
             if self._lockstep
             else self._wall,
-            push=values["backend"].startswith("emulator"),
+            push=BACKENDS[values["backend"]].is_emulated,
             e_stop=False,
             statistics=None if self._lockstep else self._statistics,
             more_diagnostics=self._diagnostics,

@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
-from dataclasses import asdict, replace
-from pathlib import Path
+from collections.abc import Mapping
 from typing import Any
 
 from pendulum_hw_bridge.actuator import MAX_COMMAND_LIFETIME, ActuatorPort, HardwareLimits, MStopAction
@@ -19,7 +17,6 @@ from pendulum_hw_bridge.lab import LAB_SPEC
 from pendulum_hw_bridge.motor_state import MOTOR_SPEED_LIMIT
 from pendulum_hw_bridge.safety_limits import SafetyLimits
 from pendulum_msgs_py.contract.drive import PlantLimits
-from pendulum_msgs_py.contract.values import NANOSECONDS
 from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.parameters import ParameterSpec
 from pendulum_msgs_py.plants.plant_parameters import (
@@ -45,9 +42,6 @@ __all__ = [
 POSITION_LOOP_STRATEGY = 3
 _MEASURED_EFFORT_MARGIN = 1.0
 """Measured torque beyond the effort limit that is no fault: noise, friction, a light push [N m]."""
-_DEFAULT_ADDRESS = "127.0.0.1:17590"
-_LOCKSTEP_LEAD_NS = 500_000
-"""In lockstep, feedback is measured this long before the state that shows it [ns]."""
 
 
 def _fixed(name: str, default: Any, unit: str, description: str, **domain: Any) -> ParameterSpec:
@@ -200,7 +194,6 @@ BRIDGE_SPECS: tuple[ParameterSpec, ...] = (
     _fixed("initial_position", 0.0, "rad", "Emulator: where the pendulum is at the start, at rest."),
     _fixed("seed", 0, "-", "Emulator: seed of sensor noise and timing jitter.", minimum=0),
     _fixed("flat", False, "", "Emulator: the pendulum lies flat on a table, without gravity."),
-    _fixed("emulator_address", _DEFAULT_ADDRESS, "", "`emulator_process`: where the emulated actuator listens."),
     _fixed(
         "e_stop_input_timeout",
         0.0,
@@ -210,8 +203,7 @@ BRIDGE_SPECS: tuple[ParameterSpec, ...] = (
         minimum=0.0,
         maximum=10.0,
     ),
-    _fixed("hebi_log", "", "", "`hebi`: new .hebilog file that hebi-py writes beside the bag; empty for none."),
-    _fixed("replay_file", "", "", "`replay`: feedback to play: a bag folder, an NPZ or a CSV file."),
+    *(spec for backend in BACKENDS.values() for spec in backend.parameters),
 )
 """Parameters of the bridge beside those that every plant has."""
 
@@ -236,7 +228,7 @@ def told_plants(values: Mapping[str, Any]) -> list[PlantParameters]:
     Raises:
         ParameterError: as :func:`plant_of`.
     """
-    emulated = values["backend"] == "emulator"
+    emulated = BACKENDS[values["backend"]].in_process
     if not emulated and values["plant"] in PRESETS:
         return []
     plants = [plant_of(values)]
@@ -263,69 +255,12 @@ def make_port(values: Mapping[str, Any], clock: Clock, *, lockstep: bool = False
     Raises:
         ParameterError: A parameter of the backend is refused.
     """
-    name = values["backend"]
-    if lockstep and name != "emulator":
+    backend = BACKENDS[values["backend"]]
+    if lockstep and not backend.in_process:
         raise ParameterError(
-            f"clock is 'lockstep' with backend {name!r}; expected backend 'emulator': others keep time"
+            f"clock is 'lockstep' with backend {values['backend']!r}; expected backend 'emulator': others keep time"
         )
-    if name == "emulator":
-        return _make_emulator(values, clock, lockstep)
-    makers: dict[str, Callable[[], ActuatorPort]] = {
-        "emulator_process": lambda: _make_emulator_process(values, clock),
-        "hebi": lambda: _make_hebi(values, clock),
-        "replay": lambda: _make_replay(values, clock),
-    }
-    return makers[name]()
-
-
-def _make_emulator(values: Mapping[str, Any], clock: Clock, lockstep: bool) -> ActuatorPort:
-    from pendulum_hw_bridge.backends.emulator import EmulatorBackend
-    from pendulum_hw_bridge.emulation.parameters import TimingParameters, load_emulator
-    from pendulum_hw_bridge.emulation.x5 import EmulatedX5
-
-    parameters = replace(load_emulator(values["plant"]), flat=values["flat"])
-    start_ns = clock.now_ns()
-    if lockstep:
-        # At this rate from the start: one that is set later begins a new raster, without the lead.
-        quiet = replace(
-            TimingParameters(), feedback_rate=values["feedback_rate"], feedback_jitter=0.0, delay_jitter=0.0
-        )
-        parameters = replace(parameters, timing=quiet)
-        period_ns = round(NANOSECONDS / values["feedback_rate"])
-        start_ns -= period_ns + min(_LOCKSTEP_LEAD_NS, period_ns // 2)
-    actuator = EmulatedX5(parameters, seed=values["seed"], position=values["initial_position"], start_ns=start_ns)
-    return EmulatorBackend(actuator, clock, seed=values["seed"])
-
-
-def _make_emulator_process(values: Mapping[str, Any], clock: Clock) -> ActuatorPort:
-    from pendulum_hw_bridge.backends.emulator_process import EmulatorProcessBackend
-
-    return EmulatorProcessBackend(values["emulator_address"], clock)
-
-
-def _make_hebi(values: Mapping[str, Any], clock: Clock) -> ActuatorPort:
-    from pendulum_hw_bridge.backends.hebi import HebiBackend
-    from pendulum_hw_bridge.backends.hebi_discovery import ModuleSelection
-
-    return HebiBackend(
-        ModuleSelection(
-            values["family"], values["name"], values["mac_address"], values["serial"], values["module_type"]
-        ),
-        clock=clock,
-        interface=values["interface"],
-        log=Path(values["hebi_log"]) if values["hebi_log"] else None,
-        drivetrain=asdict(drivetrain_of(plant_of(values))),
-    )
-
-
-def _make_replay(values: Mapping[str, Any], clock: Clock) -> ActuatorPort:
-    from pendulum_hw_bridge.backends.replay import ReplayBackend, load_feedback
-
-    if not values["replay_file"]:
-        raise ParameterError(
-            "replay_file is empty; expected a bag folder, NPZ or CSV file of feedback for backend 'replay'"
-        )
-    return ReplayBackend(load_feedback(values["replay_file"]), clock)
+    return backend.make(values, clock, lockstep=lockstep)
 
 
 def trajectory_gains(values: Mapping[str, Any]) -> GainSet:

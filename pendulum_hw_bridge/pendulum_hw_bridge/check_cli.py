@@ -10,6 +10,7 @@ from typing import Annotated
 
 import typer
 
+from pendulum_hw_bridge.backends import BACKENDS
 from pendulum_hw_bridge.check_item import Checklist
 from pendulum_hw_bridge.checklist import run_checklist
 from pendulum_hw_bridge.emulation import EMULATOR_PRESET_NAMES
@@ -32,7 +33,7 @@ app = typer.Typer(add_completion=False, rich_markup_mode=None)
 def check(
     context: typer.Context,
     lab: Annotated[Path | None, typer.Option(help="Lab file; what is given beside it wins.")] = None,
-    backend: Annotated[str | None, typer.Option(help="hebi, emulator, emulator_process or replay.")] = None,
+    backend: Annotated[str | None, typer.Option(help=f"One of {', '.join(BACKENDS)}.")] = None,
     family: Annotated[str | None, typer.Option(help="HEBI family; default any, if only one answers.")] = None,
     name: Annotated[str | None, typer.Option(help="HEBI name; default any, if only one answers.")] = None,
     serial: Annotated[str | None, typer.Option(help="Serial number of the HEBI module.")] = None,

@@ -1,9 +1,78 @@
-"""Backends of the actuator port; each is one module and one line in :data:`pendulum_hw_bridge.backends.BACKENDS`."""
+"""Backends of the actuator port; each is one module and one line in :data:`BACKENDS`."""
 
-BACKENDS = {
-    "emulator": "pendulum_hw_bridge.backends.emulator:EmulatorBackend",
-    "emulator_process": "pendulum_hw_bridge.backends.emulator_process:EmulatorProcessBackend",
-    "hebi": "pendulum_hw_bridge.backends.hebi:HebiBackend",
-    "replay": "pendulum_hw_bridge.backends.replay:ReplayBackend",
+from __future__ import annotations
+
+import importlib
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+from pendulum_msgs_py.parameters import ParameterSpec
+
+if TYPE_CHECKING:
+    from pendulum_hw_bridge.actuator import ActuatorPort
+    from pendulum_hw_bridge.clocks import Clock
+
+__all__ = ["BACKENDS", "Backend"]
+
+
+class Backend(NamedTuple):
+    """A backend.
+
+    Attributes:
+        target: ``module:class``, imported when it is chosen; the class method ``from_parameters(values, clock,
+            lockstep=...)`` makes one, not connected yet.
+        parameters: Parameters of the bridge that it alone reads.
+        is_machine: Whether something moves that can hurt: the bridge's own limits are then the strict ones.
+        is_emulated: Whether a pendulum is emulated, which can be pushed.
+        in_process: Whether that is done in this process: it is what the parameters say, and knows simulated time.
+    """
+
+    target: str
+    parameters: tuple[ParameterSpec, ...] = ()
+    is_machine: bool = True
+    is_emulated: bool = False
+    in_process: bool = False
+
+    def make(self, values: Mapping[str, Any], clock: Clock, *, lockstep: bool = False) -> ActuatorPort:
+        """Return the port that parameters describe, not connected yet.
+
+        Args:
+            values: Parameters of the bridge.
+            clock: Host clock.
+            lockstep: Whether time is simulated: feedback then comes without jitter, just before each state.
+
+        Raises:
+            ParameterError: A parameter of the backend is refused.
+        """
+        module, name = self.target.split(":")
+        port: ActuatorPort = getattr(importlib.import_module(module), name).from_parameters(
+            values, clock, lockstep=lockstep
+        )
+        return port
+
+
+def _fixed(name: str, default: str, description: str) -> tuple[ParameterSpec, ...]:
+    return (ParameterSpec(name, default, "", description, read_only=True),)
+
+
+BACKENDS: dict[str, Backend] = {
+    "emulator": Backend(
+        "pendulum_hw_bridge.backends.emulator:EmulatorBackend", is_machine=False, is_emulated=True, in_process=True
+    ),
+    "emulator_process": Backend(
+        "pendulum_hw_bridge.backends.emulator_process:EmulatorProcessBackend",
+        _fixed("emulator_address", "127.0.0.1:17590", "`emulator_process`: where the emulated actuator listens."),
+        is_machine=False,
+        is_emulated=True,
+    ),
+    "hebi": Backend(
+        "pendulum_hw_bridge.backends.hebi:HebiBackend",
+        _fixed("hebi_log", "", "`hebi`: new .hebilog file that hebi-py writes beside the bag; empty for none."),
+    ),
+    "replay": Backend(
+        "pendulum_hw_bridge.backends.replay:ReplayBackend",
+        _fixed("replay_file", "", "`replay`: feedback to play: a bag folder, an NPZ or a CSV file."),
+        is_machine=False,
+    ),
 }
-"""Backend name -> ``module:class``."""
+"""Backends by name."""

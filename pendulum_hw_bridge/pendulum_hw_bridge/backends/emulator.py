@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import math
-from dataclasses import asdict
+from collections.abc import Mapping
+from dataclasses import asdict, replace
+from typing import Any
 
 import numpy as np
 
@@ -20,6 +22,7 @@ from pendulum_hw_bridge.actuator import (
 )
 from pendulum_hw_bridge.clocks import Clock, WallClock
 from pendulum_hw_bridge.emulation.faults import ActuatorFault
+from pendulum_hw_bridge.emulation.parameters import TimingParameters, load_emulator
 from pendulum_hw_bridge.emulation.x5 import EmulatedX5
 from pendulum_hw_bridge.gains import GainSet
 from pendulum_msgs_py.contract.values import NANOSECONDS
@@ -28,6 +31,8 @@ __all__ = ["EmulatorBackend"]
 
 _CUT_OFF = {ActuatorFault.COMMANDS_LOST, ActuatorFault.SEND_FAILED, ActuatorFault.LOCKED_BY_OTHER}
 """Faults in which settings do not reach the actuator either."""
+_LOCKSTEP_LEAD_NS = 500_000
+"""In lockstep, feedback is measured this long before the state that shows it [ns]."""
 
 
 class EmulatorBackend:
@@ -48,6 +53,22 @@ class EmulatorBackend:
         self._feedback_delay_ns = round(actuator.parameters.timing.feedback_delay * NANOSECONDS)
         self._connected = False
         self._strategy = Strategy.OFF
+
+    @classmethod
+    def from_parameters(cls, values: Mapping[str, Any], clock: Clock, *, lockstep: bool = False) -> EmulatorBackend:
+        """Return the emulator that the bridge's parameters describe; in lockstep, one that keeps time exactly."""
+        parameters = replace(load_emulator(values["plant"]), flat=values["flat"])
+        start_ns = clock.now_ns()
+        if lockstep:
+            # At this rate from the start: one that is set later begins a new raster, without the lead.
+            quiet = replace(
+                TimingParameters(), feedback_rate=values["feedback_rate"], feedback_jitter=0.0, delay_jitter=0.0
+            )
+            parameters = replace(parameters, timing=quiet)
+            period_ns = round(NANOSECONDS / values["feedback_rate"])
+            start_ns -= period_ns + min(_LOCKSTEP_LEAD_NS, period_ns // 2)
+        actuator = EmulatedX5(parameters, seed=values["seed"], position=values["initial_position"], start_ns=start_ns)
+        return cls(actuator, clock, seed=values["seed"])
 
     @property
     def strategy(self) -> Strategy:

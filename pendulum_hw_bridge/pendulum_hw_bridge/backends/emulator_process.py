@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import select
 import socket
+from collections.abc import Mapping
 from typing import Any
 
 from pendulum_hw_bridge.actuator import (
@@ -53,6 +54,11 @@ class EmulatorProcessBackend:
         self._push = 0.0
         self._newest: Feedback | None = None
         self._renewed_ns = 0
+
+    @classmethod
+    def from_parameters(cls, values: Mapping[str, Any], clock: Clock, **_: Any) -> EmulatorProcessBackend:
+        """Return the port of the emulator that listens where the bridge's parameters say."""
+        return cls(values["emulator_address"], clock)
 
     @property
     def strategy(self) -> Strategy:

@@ -12,6 +12,7 @@ import io
 import math
 import threading
 from collections.abc import Callable, Mapping
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -33,6 +34,7 @@ from pendulum_hw_bridge.actuator import (
 from pendulum_hw_bridge.backends.hebi_discovery import LOOK_TIME, ModuleSelection, discover, select_module
 from pendulum_hw_bridge.backends.hebi_log import start_log, stop_log
 from pendulum_hw_bridge.clocks import Clock, WallClock
+from pendulum_hw_bridge.emulation.parameters import load_emulator
 from pendulum_hw_bridge.gains import GAIN_FIELDS, LOOPS, GainSet, PidGains
 from pendulum_msgs_py.contract.values import NANOSECONDS
 from pendulum_msgs_py.errors import ParameterError
@@ -166,6 +168,19 @@ class HebiBackend:
         self._counter = 0
         self._last_receive_us = -1
         self._next_ns = 0
+
+    @classmethod
+    def from_parameters(cls, values: Mapping[str, Any], clock: Clock, **_: Any) -> HebiBackend:
+        """Return the port of the module that the bridge's parameters name, with the constants of its plant file."""
+        return cls(
+            ModuleSelection(
+                values["family"], values["name"], values["mac_address"], values["serial"], values["module_type"]
+            ),
+            clock=clock,
+            interface=values["interface"],
+            log=Path(values["hebi_log"]) if values["hebi_log"] else None,
+            drivetrain=asdict(load_emulator(values["plant"]).drivetrain),
+        )
 
     # --- port -----------------------------------------------------------------------------------------------
 

@@ -11,6 +11,7 @@ import zipfile
 import zlib
 from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -32,7 +33,7 @@ from pendulum_hw_bridge.backends.hebi_log import read_hebilog
 from pendulum_hw_bridge.clocks import Clock, WallClock
 from pendulum_hw_bridge.gains import GainSet
 from pendulum_msgs_py.contract.values import NANOSECONDS
-from pendulum_msgs_py.errors import DataError
+from pendulum_msgs_py.errors import DataError, ParameterError
 
 __all__ = ["FeedbackRecording", "ReplayBackend", "load_feedback"]
 
@@ -187,6 +188,15 @@ class ReplayBackend:
         self._lifetime = 0.25
         self._rate = recording.rate
         self._gains: GainSet | None = None
+
+    @classmethod
+    def from_parameters(cls, values: Mapping[str, Any], clock: Clock, **_: Any) -> ReplayBackend:
+        """Return the port of the recording that the bridge's parameters name."""
+        if not values["replay_file"]:
+            raise ParameterError(
+                "replay_file is empty; expected a bag folder, NPZ or CSV file of feedback for backend 'replay'"
+            )
+        return cls(load_feedback(values["replay_file"]), clock)
 
     @property
     def strategy(self) -> Strategy:

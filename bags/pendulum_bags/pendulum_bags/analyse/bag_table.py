@@ -206,7 +206,7 @@ def _ask(job: tuple[Sequence[Piece], Sequence[str], str], index: int, _threads: 
     return rows
 
 
-def _answer(row: Row, questions: Sequence[Callable[..., Row]], *arguments: Any) -> None:
+def _answer(row: Row, questions: Sequence[Callable[..., Mapping[str, Any]]], *arguments: Any) -> None:
     errors = []
     for question in questions:
         try:

@@ -62,7 +62,8 @@ def render_page(
     )
     sections = []
     graphs: dict[str, Any] = {}
-    for heading in dict.fromkeys((*SECTIONS, *(item.section for item in (*figures, *tables)))):
+    named = [figure.section for figure in figures] + [table.section for table in tables]
+    for heading in dict.fromkeys((*SECTIONS, *named)):
         items: list[dict[str, Any]] = []
         for figure in figures:
             if figure.section == heading:
