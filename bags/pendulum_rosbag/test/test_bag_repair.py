@@ -279,9 +279,10 @@ def test_random_damage_is_refused_or_told_and_what_is_read_was_written(tmp_path:
         assert "\n" not in sentence
         if sentence or told:
             continue
-        # Silent, it may hand over a message with a byte changed in it, but loses none and makes none up.
+        # Silent, a database may hand over a message with a byte changed in it (it has no checksums), but loses none and
+        # makes none up; an MCAP file hands over what was written.
         assert {topic: len(found) for topic, found in rows.items()} == dict.fromkeys(TOPICS, 1000)
-        assert sum(len(rows[topic] - written[topic]) for topic in TOPICS) <= changes
+        assert sum(len(rows[topic] - written[topic]) for topic in TOPICS) <= (changes if storage == "sqlite3" else 0)
     assert outcomes == {True, False}
 
 

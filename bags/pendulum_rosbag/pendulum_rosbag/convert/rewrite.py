@@ -160,7 +160,7 @@ def _open(path: Path, stack: ExitStack) -> _Input:
     if path.suffix == _ROS1 and path.is_file():
         place = _from_ros1(path, Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="pendulum_rosbag_"))))
     folder = open_folder(place)
-    sources = open_sources(folder)
+    sources = open_sources(folder, verify=True)
     for source in sources:
         stack.callback(source.close)
     return _Input(path, folder, sources)

@@ -141,7 +141,10 @@ class Bag(Mapping[str, Any]):
         """Return the log times of a topic in ascending order [ns], shape (n,), without reading its messages."""
         if topic not in self._topics:
             return self[topic]["log_time_ns"]  # raises
-        times = [batch.times for batch in self._batches({topic})[topic]]
+        batches = self._batches({topic})[topic]
+        for batch in batches:
+            batch.check_heads()
+        times = [batch.times for batch in batches]
         return np.sort(np.concatenate(times)) if times else np.empty(0, np.int64)
 
     def messages(self, topic: str) -> list[StoredMessage]:
@@ -247,6 +250,8 @@ def read_bag(
     topics: Sequence[str] | None = None,
     start: int | None = None,
     stop: int | None = None,
+    *,
+    verify: bool | None = None,
 ) -> Bag:
     """Open a bag for reading.
 
@@ -256,6 +261,9 @@ def read_bag(
         topics: Topics to offer; by default all.
         start: Log time of the first message wanted [ns]; by default from the beginning.
         stop: Log time before which the last message lies [ns]; by default to the end.
+        verify: Checksums of an MCAP file. By default those of what is read are compared beside reading, and a damaged
+            chunk is refused then. ``True`` compares all of them now and leaves damaged chunks out (``bag.damage``
+            tells), as is always done where a recorder died; ``False`` compares none.
 
     Raises:
         BagError: There is no bag, or nothing of it can be read.
@@ -267,7 +275,7 @@ def read_bag(
         >>> states["position"].mean()
     """
     folder = open_folder(Path(path))
-    return Bag(folder, open_sources(folder), topics, start, stop)
+    return Bag(folder, open_sources(folder, verify=verify), topics, start, stop)
 
 
 def read_bags(

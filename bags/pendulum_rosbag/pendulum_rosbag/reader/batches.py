@@ -5,13 +5,14 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 import numpy.typing as npt
 
 from pendulum_msgs_py.errors import BagError
 from pendulum_rosbag.storage.mcap_extras import Attachment, Metadata
+from pendulum_rosbag.storage.mcap_records import MESSAGE
 
 __all__ = ["MCAP_HEAD", "Batch", "Bytes", "Int64", "Source", "Stream"]
 
@@ -20,6 +21,9 @@ Int64 = npt.NDArray[np.int64]
 
 MCAP_HEAD = 31
 """Bytes of an MCAP message record before the message itself: opcode, length, channel, sequence, two times."""
+_HEAD = np.dtype(
+    {"names": ["opcode", "channel", "time"], "formats": ["u1", "<u2", "<i8"], "offsets": [0, 9, 15], "itemsize": 23}
+)
 _OVERLAP = "the bag names messages that overlap each other; try to repair it"
 
 
@@ -46,8 +50,28 @@ class Batch:
         """Bytes between an offset and the first byte of its message."""
         return MCAP_HEAD if self.sizes is None else 0
 
+    def check_heads(self) -> None:
+        """Hold the message index of an MCAP file, which no checksum covers, against the messages themselves.
+
+        Raises:
+            BagError: A message has another channel or log time than the index says.
+        """
+        if self.sizes is not None:
+            return
+        places = max(len(self.buffer) - _HEAD.itemsize + 1, 0)
+        anywhere: np.ndarray[Any, Any] = np.ndarray((places,), f"V{_HEAD.itemsize}", self.buffer.data, strides=(1,))
+        heads = anywhere[self.offsets].view(_HEAD)
+        same = (heads["opcode"] == MESSAGE) & (heads["channel"] == self.channel) & (heads["time"] == self.times)
+        if not same.all():
+            wrong = int(np.argmin(same))
+            raise BagError(
+                f"the message index names a message of channel {self.channel} at {self.times[wrong] * 1e-9:.3f} s where "
+                "there is none; try to repair the bag"
+            )
+
     def payloads(self) -> Iterator[tuple[int, bytes]]:
         """Yield (log time [ns], message bytes) one by one."""
+        self.check_heads()
         view = self.buffer.data
         # Messages do not overlap, so together they are no larger than the buffer; an index that says otherwise is
         # damaged, or a bomb that names one large message a million times.

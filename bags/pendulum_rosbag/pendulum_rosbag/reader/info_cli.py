@@ -26,7 +26,7 @@ def info(
     as_json: Annotated[bool, typer.Option("--json", help="Print everything as JSON.")] = False,
 ) -> int:
     """Print rates, gaps, jitter, latencies between topics, duplicates and clock jumps of a bag."""
-    opened = read_bag(bag)
+    opened = read_bag(bag, verify=True)
     statistics = bag_statistics(opened)
     if as_json:
         document = dataclasses.asdict(statistics) | {"metadata": opened.metadata}

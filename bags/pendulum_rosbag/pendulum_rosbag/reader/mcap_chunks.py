@@ -30,6 +30,10 @@ class Chunk:
     raw_size: int
     compression: str
     indexes: dict[int, int] = field(default_factory=dict)
+    crc: int = 0
+    """Checksum of the content before compression; 0 where its writer made none."""
+    offset: int = 0
+    """Byte of the file at which the chunk's record begins."""
 
 
 def keep_staged(buffer: Bytes, chunks: Sequence[Chunk]) -> None:

@@ -15,8 +15,10 @@ import numpy as np
 from pendulum_msgs_py.errors import BagError
 from pendulum_rosbag.reader.batches import MCAP_HEAD, Batch, Bytes, Int64, Stream
 from pendulum_rosbag.reader.decompression import decompress, decompress_torn
+from pendulum_rosbag.reader.checksums import Checksums
 from pendulum_rosbag.reader.mcap_chunks import Chunk, keep_staged, read_text, read_text_map, records_in
 from pendulum_rosbag.reader.mcap_extras import find_extras
+from pendulum_rosbag.reader.mcap_index import indexed_messages
 from pendulum_rosbag.storage import mcap_records as rec
 from pendulum_rosbag.storage.mcap_extras import Attachment, Metadata
 
@@ -26,15 +28,6 @@ _HEAD = rec.RECORD_HEAD_SIZE
 _FOOTER_REGION = rec.FOOTER_SIZE + len(rec.MAGIC)
 _CHUNK_FIELDS = struct.Struct("<QQQII")
 _GROUP_SIZE = 1 << 20  # decompressed bytes that are parsed at once
-_INDEX_HEAD = np.dtype(
-    {
-        "names": ["opcode", "length", "channel", "size"],
-        "formats": ["u1", "<u8", "<u2", "<u4"],
-        "offsets": [0, 1, 9, 11],
-        "itemsize": 15,
-    }
-)
-_INDEX_ENTRY = np.dtype([("time", "<i8"), ("offset", "<i8")])
 _Table = dict[int, list[tuple[int, int]]]
 
 
@@ -56,13 +49,17 @@ class McapSource:
     Args:
         path: The file.
         data: Its content, when it is not a plain file (a decompressed copy).
+        verify: Checksums: ``None`` to compare those of the chunks that are read (of all at once where the file was not
+            closed), ``True`` for all at once; chunks that are damaged are then left out. ``False`` for none.
 
     Raises:
         BagError: The file cannot be opened or is no MCAP file at all.
     """
 
-    def __init__(self, path: Path, data: bytes | None = None) -> None:
+    def __init__(self, path: Path, data: bytes | None = None, *, verify: bool | None = None) -> None:
         self.path = path
+        self._verify = verify
+        self._checksums = Checksums(path, enabled=verify is not False)
         self.damage = ""
         self.unclosed = False
         self.metadata: dict[str, dict[str, str]] = {}
@@ -86,6 +83,11 @@ class McapSource:
             self._scan("")
         except (_DamagedError, struct.error, ValueError, KeyError, OverflowError, IndexError) as error:
             self._scan(str(error) or type(error).__name__)
+        if (verify or (self.unclosed and verify is None)) and not self._scanned:
+            try:
+                self._leave_out_damaged()
+            except (_DamagedError, BagError) as error:
+                self._scan(str(error))
         self.compressed = any(chunk.compression for chunk in self.chunks)
         self.streams = [self._stream(channel) for channel in sorted(self._channels)]
 
@@ -128,6 +130,9 @@ class McapSource:
             raise _NoIndexError
         if not 8 <= at <= footer:
             raise _DamagedError(f"the footer points to byte {at} of {size}")
+        (crc,) = struct.unpack("<I", bytes(buffer[footer + _HEAD + 16 : footer + _HEAD + 20]))
+        if crc and self._verify is not False and zlib.crc32(buffer[at : footer + _HEAD + 16].data) != crc:
+            raise _DamagedError(f"the summary at byte {at} does not have its checksum")
         statistics = False
         while at < footer:
             opcode, length = rec.RECORD_HEAD.unpack(bytes(buffer[at : at + _HEAD]))
@@ -208,7 +213,8 @@ class McapSource:
             raise _DamagedError("the index names a chunk beyond the end of the file")
         if self.buffer[offset] != rec.CHUNK:
             raise _DamagedError("the index names a chunk where there is none")
-        return Chunk(self.buffer, start, stop, data_start, packed, raw, compression, indexes)
+        (crc,) = struct.unpack("<I", bytes(self.buffer[offset + _HEAD + 24 : offset + _HEAD + 28]))
+        return Chunk(self.buffer, start, stop, data_start, packed, raw, compression, indexes, crc, offset)
 
     def _stream(self, channel: int) -> Stream:
         schema, topic, encoding, metadata = self._channels[channel]
@@ -305,7 +311,7 @@ class McapSource:
         compression, at = read_text(bytes(view[body + 28 : body + 32 + text_size]), 0)
         at += body + 28
         (packed,) = struct.unpack_from("<Q", view, at)
-        return Chunk(self.buffer, start, stop, at + 8, packed, raw_size, compression), crc
+        return Chunk(self.buffer, start, stop, at + 8, packed, raw_size, compression, offset=body - _HEAD), crc
 
     def _take_chunk(self, chunk: Chunk, raw: Bytes, records: list[tuple[int, int, int]]) -> None:
         scanned: _Table = {}
@@ -324,6 +330,41 @@ class McapSource:
         self.start_ns = min(self.start_ns, time)
         self.stop_ns = max(self.stop_ns, time)
 
+    # -- checksums ---------------------------------------------------------------------------------------------
+
+    def _leave_out_damaged(self) -> None:
+        """Compare checksums and message indexes of all chunks, and leave out those whose content was not written so.
+
+        Raises:
+            _DamagedError, BagError: A message index is damaged; the chunks themselves must be walked through.
+        """
+        kept: list[Chunk] = []
+        lost: dict[int, int] = {}
+        for number, chunk in enumerate(self.chunks):
+            entries = {channel: self._entries(channel, chunk.buffer, [(number, 0)]) for channel in chunk.indexes}
+            try:
+                raw = self._raw(chunk)
+                whole = not chunk.crc or zlib.crc32(raw.data) == chunk.crc
+            except BagError:
+                whole = False
+            if not whole:
+                self.damage = self.damage or f"the chunk at byte {chunk.offset} does not have its checksum"
+                for channel, (times, _) in entries.items():
+                    lost[channel] = lost.get(channel, 0) + len(times)
+                continue
+            for channel, (times, offsets) in entries.items():
+                for batch in self._cut(Batch(channel, raw, offsets, times), None, None):
+                    batch.check_heads()
+            kept.append(chunk)
+        bad = len(self.chunks) - len(kept)
+        if bad:
+            others = f", nor do {bad - 1} others" if bad > 1 else ""
+            self.damage += f"{others}; {sum(lost.values())} messages are left out"
+            self._counts = {channel: max(count - lost.get(channel, 0), 0) for channel, count in self._counts.items()}
+            self.chunks = kept
+            self.start_ns = min((chunk.start_ns for chunk in kept), default=0)
+            self.stop_ns = max((chunk.stop_ns for chunk in kept), default=0)
+
     # -- reading -----------------------------------------------------------------------------------------------
 
     def _raw(self, chunk: Chunk) -> Bytes:
@@ -338,14 +379,15 @@ class McapSource:
             if channel in channels:
                 table = np.array(entries, np.int64)
                 yield from self._cut(Batch(channel, self.buffer, table[:, 1], table[:, 0]), start, stop)
-        for buffer, index, members in self._groups(channels, start, stop):
-            for channel in channels:
-                times, offsets = self._entries(channel, index, members)
-                if len(times):
+        with self._checksums as checksums:
+            for buffer, index, members in self._groups(channels, start, stop, checksums):
+                for channel in channels:
+                    times, offsets = self._entries(channel, index, members)
                     yield from self._cut(Batch(channel, buffer, offsets, times), start, stop)
+            checksums.finish()
 
     def _groups(
-        self, channels: set[int], start: int | None, stop: int | None
+        self, channels: set[int], start: int | None, stop: int | None, checksums: Checksums
     ) -> Iterator[tuple[Bytes, Bytes, list[tuple[int, int]]]]:
         """Yield buffers that hold many chunks, and their index, with (number of the chunk, where it begins)."""
         plain: dict[int, list[tuple[int, int]]] = {}
@@ -359,6 +401,7 @@ class McapSource:
             if channels.isdisjoint(self._scanned[number] if self._scanned else chunk.indexes):
                 continue
             if not chunk.compression:
+                checksums.compare(chunk, self._raw(chunk))
                 plain.setdefault(id(chunk.buffer), []).append((number, chunk.data_start))  # they lie in the same map
                 continue
             if packed and (size >= _GROUP_SIZE or index is not chunk.buffer):
@@ -366,6 +409,7 @@ class McapSource:
                 packed, parts, size = [], [], 0
             index = chunk.buffer
             parts.append(self._raw(chunk))
+            checksums.compare(chunk, parts[-1])
             packed.append((number, size))
             size += chunk.raw_size
         if packed:
@@ -387,30 +431,7 @@ class McapSource:
         places = [
             (place, base) for number, base in members if (place := self.chunks[number].indexes.get(channel)) is not None
         ]
-        if not places:
-            return np.empty(0, np.int64), np.empty(0, np.int64)
-        at, base = np.array(places, np.int64).T
-        heads = self._take(index, _INDEX_HEAD, at)
-        if len(np.unique(at)) != len(at):
-            raise BagError(f"{self.path}: two chunks name one message index; try to repair the bag")
-        counts = heads["size"].astype(np.int64) // 16
-        whole = (heads["opcode"] == rec.MESSAGE_INDEX) & (heads["channel"] == channel)
-        whole &= (heads["length"] == heads["size"] + np.uint64(6)) & (at + 15 + 16 * counts <= len(index))
-        if not whole.all():
-            wrong = int(at[~whole][0])
-            raise BagError(f"{self.path}: the message index at byte {wrong} is damaged; try to repair the bag")
-        first = np.cumsum(counts) - counts
-        rows_at = np.repeat(at + 15 - 16 * first, counts) + 16 * np.arange(int(counts.sum()))
-        table = self._take(index, _INDEX_ENTRY, rows_at)
-        return table["time"], table["offset"] + np.repeat(base, counts)
-
-    def _take(self, buffer: Bytes, item: np.dtype[Any], at: Int64) -> Any:
-        """Return copies of the items that begin at some bytes of a buffer."""
-        places = max(len(buffer) - item.itemsize + 1, 0)
-        if len(at) and not 0 <= int(at.max()) < places:
-            raise BagError(f"{self.path}: a message index lies beyond the end of the file; try to repair the bag")
-        anywhere: np.ndarray[Any, Any] = np.ndarray((places,), f"V{item.itemsize}", buffer.data, strides=(1,))
-        return anywhere[at].view(item)
+        return indexed_messages(self.path, channel, index, places)
 
     def _cut(self, batch: Batch, start: int | None, stop: int | None) -> Iterator[Batch]:
         """Limit a batch to a time span and check that its records lie inside the buffer."""

@@ -169,8 +169,12 @@ def _file_order(file: Path) -> tuple[int, str]:
     return (int(number) if number.isdigit() else 0, file.name)
 
 
-def open_sources(folder: BagFolder) -> list[Source]:
+def open_sources(folder: BagFolder, *, verify: bool | None = None) -> list[Source]:
     """Open the storage files of a bag; unreadable ones are named in ``damage`` if others can be read.
+
+    Args:
+        folder: The bag.
+        verify: Which checksums to compare; see :class:`McapSource`.
 
     Raises:
         BagError: None of them can be read.
@@ -179,7 +183,7 @@ def open_sources(folder: BagFolder) -> list[Source]:
     errors: list[BagError] = []
     for file in folder.files:
         try:
-            sources.append(open_source(file))
+            sources.append(open_source(file, verify=verify))
         except BagError as error:
             errors.append(error)
             folder.damage.append(str(error))
@@ -192,11 +196,11 @@ def open_sources(folder: BagFolder) -> list[Source]:
     return [UnpackedSource(source) for source in sources] if folder.message_compression else sources
 
 
-def open_source(file: Path) -> Source:
+def open_source(file: Path, *, verify: bool | None = None) -> Source:
     """Open one storage file by its name; files compressed as a whole (``.zstd``) are decompressed first."""
     if file.suffix != ".zstd":
         return (
-            McapSource(file)
+            McapSource(file, verify=verify)
             if file.suffix == ".mcap"
             else SqliteSource(file)
             if file.suffix == ".db3"
@@ -210,7 +214,7 @@ def open_source(file: Path) -> Source:
             raise
         raise BagError(f"{file} cannot be read: {error.strerror or error}") from error
     if _ending(file) == ".mcap":
-        return McapSource(file, data)
+        return McapSource(file, data, verify=verify)
     folder = tempfile.TemporaryDirectory(prefix="pendulum_rosbag_")
     copy = Path(folder.name, file.with_suffix("").name)
     copy.write_bytes(data)

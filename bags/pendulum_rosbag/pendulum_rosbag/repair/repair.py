@@ -79,7 +79,7 @@ def repair_bag(
 
     bag = Path(path)
     folder = open_folder(bag)
-    sources = open_sources(folder)
+    sources = open_sources(folder, verify=True)
     damage = [
         *folder.damage,
         *(f"{source.path.name}: {source.damage}" for source in sources if source.damage),

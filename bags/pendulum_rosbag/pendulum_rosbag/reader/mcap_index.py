@@ -1,0 +1,66 @@
+"""Message indexes of an MCAP file: log times and places of the messages of many chunks at once."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from pendulum_msgs_py.errors import BagError
+from pendulum_rosbag.reader.batches import Bytes, Int64
+from pendulum_rosbag.storage import mcap_records as rec
+
+__all__ = ["indexed_messages"]
+
+_INDEX_HEAD = np.dtype(
+    {
+        "names": ["opcode", "length", "channel", "size"],
+        "formats": ["u1", "<u8", "<u2", "<u4"],
+        "offsets": [0, 1, 9, 11],
+        "itemsize": 15,
+    }
+)
+_INDEX_ENTRY = np.dtype([("time", "<i8"), ("offset", "<i8")])
+
+
+def indexed_messages(
+    path: Path, channel: int, index: Bytes, places: Sequence[tuple[int, int]]
+) -> tuple[Int64, Int64]:
+    """Return log times [ns] and record offsets of a channel's messages.
+
+    Args:
+        path: The file, for its errors.
+        channel: Channel id.
+        index: Bytes that hold the message indexes, shape (n,).
+        places: Where each index begins in them, and what to add to its offsets.
+
+    Raises:
+        BagError: An index is damaged.
+    """
+    if not places:
+        return np.empty(0, np.int64), np.empty(0, np.int64)
+    at, base = np.array(places, np.int64).T
+    heads = _take(path, index, _INDEX_HEAD, at)
+    if len(np.unique(at)) != len(at):
+        raise BagError(f"{path}: two chunks name one message index; try to repair the bag")
+    counts = heads["size"].astype(np.int64) // 16
+    whole = (heads["opcode"] == rec.MESSAGE_INDEX) & (heads["channel"] == channel)
+    whole &= (heads["length"] == heads["size"] + np.uint64(6)) & (at + 15 + 16 * counts <= len(index))
+    if not whole.all():
+        wrong = int(at[~whole][0])
+        raise BagError(f"{path}: the message index at byte {wrong} is damaged; try to repair the bag")
+    first = np.cumsum(counts) - counts
+    rows_at = np.repeat(at + 15 - 16 * first, counts) + 16 * np.arange(int(counts.sum()))
+    table = _take(path, index, _INDEX_ENTRY, rows_at)
+    return table["time"], table["offset"] + np.repeat(base, counts)
+
+
+def _take(path: Path, buffer: Bytes, item: np.dtype[Any], at: Int64) -> Any:
+    """Return copies of the items that begin at some bytes of a buffer."""
+    places = max(len(buffer) - item.itemsize + 1, 0)
+    if len(at) and not 0 <= int(at.max()) < places:
+        raise BagError(f"{path}: a message index lies beyond the end of the file; try to repair the bag")
+    anywhere: np.ndarray[Any, Any] = np.ndarray((places,), f"V{item.itemsize}", buffer.data, strides=(1,))
+    return anywhere[at].view(item)

@@ -1,0 +1,150 @@
+"""A byte that a disk changed in an MCAP file is told, wherever it lies; it is never handed over as if it were data."""
+
+from __future__ import annotations
+
+import struct
+from pathlib import Path
+
+import pytest
+
+from pendulum_msgs_py.contract.cdr import encode_joint_state
+from pendulum_msgs_py.errors import BagError
+from pendulum_rosbag.convert.rewrite import rewrite
+from pendulum_rosbag.reader import read_bag
+from pendulum_rosbag.reader.info_cli import main as info_main
+from pendulum_rosbag.reader.mcap_source import McapSource
+from pendulum_rosbag.repair.repair import repair_bag
+from pendulum_rosbag.storage import open_writer
+
+JOINT_STATE = "sensor_msgs/msg/JointState"
+TOPICS = ("/a", "/b", "/c")
+COUNT = 30_000
+
+
+@pytest.fixture(scope="module", params=[None, "zstd"], ids=["plain", "zstd"])
+def sound(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A closed bag of several chunks."""
+    return write(tmp_path_factory.mktemp("sound") / "bag", request.param)
+
+
+def write(path: Path, compression: str | None, *, close: bool = True, count: int = COUNT) -> Path:
+    writer = open_writer(path, "mcap", compression)
+    for topic in TOPICS:
+        writer.add_topic(topic, JOINT_STATE)
+    for index in range(count):
+        writer.write(TOPICS[index % 3], 1_000_000 * index, encode_joint_state(index, position=0.5 * index))
+        if index % 3000 == 2999:
+            writer.seal()
+    if close:
+        writer.close()
+    else:
+        writer.abandon()
+    return path
+
+
+def with_flip(bag: Path, target: Path, at: int) -> Path:
+    """Copy a bag with one bit of one byte of its file turned over."""
+    target.mkdir()
+    for file in bag.iterdir():
+        content = bytearray(file.read_bytes())
+        if file.suffix == ".mcap":
+            content[at] ^= 0x10
+        (target / file.name).write_bytes(content)
+    return target
+
+
+def inside(bag: Path) -> int:
+    """Return a byte of the file in the second chunk: of a position where the chunk is plain."""
+    source = source_of(bag)
+    chunk = source.chunks[1]
+    if chunk.compression:
+        return chunk.data_start + chunk.data_size // 2
+    start = read_bag(bag, start=chunk.start_ns)["/a"]["position"][100]
+    return bytes(source.buffer).index(struct.pack("<d", start), chunk.data_start)
+
+
+def source_of(bag: Path) -> McapSource:
+    (file,) = bag.glob("*.mcap")
+    return McapSource(file)
+
+
+def test_a_changed_byte_of_a_message_is_refused_with_file_and_place(sound: Path, tmp_path: Path) -> None:
+    chunk = source_of(sound).chunks[1]
+    bag = with_flip(sound, tmp_path / "flipped", inside(sound))
+    for read in (lambda b: b["/a"], lambda b: b.raw("/b"), lambda b: b.messages("/c"), lambda b: b.load()):
+        with pytest.raises(BagError) as told:
+            read(read_bag(bag))
+        assert f"{bag.name}/bag_0.mcap" in str(told.value)
+        assert "\n" not in str(told.value)
+    if not chunk.compression:
+        assert f"the chunk at byte {chunk.offset} is damaged (checksum " in str(told.value)
+        unread = read_bag(bag, verify=False)
+        assert [len(unread[topic]) for topic in TOPICS] == [COUNT // 3] * 3, "whoever wants the rest can have it"
+    # What was read before the damage, and a span that does not touch it, are as they were.
+    before = read_bag(bag, stop=chunk.start_ns)["/a"]
+    assert len(before)
+    assert before.tobytes() == read_bag(sound, stop=chunk.start_ns)["/a"].tobytes()
+
+
+def test_info_convert_and_repair_leave_the_damaged_chunk_out_and_say_so(
+    sound: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    chunk = source_of(sound).chunks[1]
+    bag = with_flip(sound, tmp_path / "flipped", inside(sound))
+    lost = sum(len(read_bag(sound, start=chunk.start_ns, stop=chunk.stop_ns + 1).raw(topic)) for topic in TOPICS)
+    sentence = f"bag_0.mcap: the chunk at byte {chunk.offset} does not have its checksum; {lost} messages are left out"
+    whole = read_bag(bag, verify=True)
+    assert whole.damage == [sentence]
+    assert sum(topic.count for topic in whole.topics.values()) == COUNT - lost
+    assert sum(len(whole[topic]) for topic in TOPICS) == COUNT - lost
+    assert info_main([str(bag)]) == 0
+    assert sentence in capsys.readouterr().out
+    converted = rewrite([bag], tmp_path / "converted")
+    assert converted.damage == [f"{bag}: {sentence}"]
+    repaired = repair_bag(bag, tmp_path / "repaired")
+    assert repaired.damage == [sentence]
+    for report in (converted, repaired):
+        found = read_bag(report.path)
+        assert not found.damage
+        for topic in TOPICS:
+            rows = read_bag(sound).raw(topic)
+            assert found.raw(topic) == [row for row in rows if not chunk.start_ns <= row[0] <= chunk.stop_ns]
+
+
+def test_a_changed_message_index_is_refused_and_repair_loses_nothing(sound: Path, tmp_path: Path) -> None:
+    """No checksum covers an index; each entry (log time, offset) must name a message of that time."""
+    chunk = source_of(sound).chunks[1]
+    entry = next(iter(chunk.indexes.values())) + 15
+    for number, place in enumerate((entry, entry + 8)):
+        bag = with_flip(sound, tmp_path / f"flipped{number}", place)
+        with pytest.raises(BagError, match="try to repair"):
+            read_bag(bag).raw("/a")
+        with pytest.raises(BagError, match="try to repair"):
+            read_bag(bag).log_times("/a")
+        repaired = repair_bag(bag, tmp_path / f"repaired{number}")
+        assert "message index" in repaired.damage[0]
+        assert {topic: read_bag(repaired.path).raw(topic) for topic in TOPICS} == {
+            topic: read_bag(sound).raw(topic) for topic in TOPICS
+        }
+
+
+def test_a_changed_summary_is_told_and_the_chunks_are_found_without_it(sound: Path, tmp_path: Path) -> None:
+    (file,) = sound.glob("*.mcap")
+    summary = int.from_bytes(file.read_bytes()[-28:-20], "little")
+    content = file.read_bytes()
+    topic = content.index(b"/b", summary)
+    bag = with_flip(sound, tmp_path / "flipped", topic + 1)
+    opened = read_bag(bag)
+    assert opened.damage == [f"bag_0.mcap: the summary at byte {summary} does not have its checksum"]
+    assert {name: len(opened[name]) for name in TOPICS} == dict.fromkeys(TOPICS, COUNT // 3)
+
+
+def test_chunks_of_a_file_that_was_not_closed_are_compared_when_it_is_opened(tmp_path: Path) -> None:
+    """Who lost power may have lost pages: what is whole is offered, the rest is named."""
+    bag = write(tmp_path / "bag", None, close=False, count=6000)
+    chunk = source_of(bag).chunks[0]
+    flipped = with_flip(bag, tmp_path / "flipped", chunk.data_start + 1000)
+    opened = read_bag(flipped)
+    assert opened.damage[-1].startswith(f"bag_0.mcap: the chunk at byte {chunk.offset} does not have its checksum; ")
+    assert 0 < sum(len(opened[topic]) for topic in TOPICS) < 6000
+    assert read_bag(bag).load().damage == read_bag(bag, verify=False).damage, "a sound one has no more damage than that"
