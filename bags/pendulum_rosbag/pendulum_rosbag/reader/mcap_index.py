@@ -25,9 +25,7 @@ _INDEX_HEAD = np.dtype(
 _INDEX_ENTRY = np.dtype([("time", "<i8"), ("offset", "<i8")])
 
 
-def indexed_messages(
-    path: Path, channel: int, index: Bytes, places: Sequence[tuple[int, int]]
-) -> tuple[Int64, Int64]:
+def indexed_messages(path: Path, channel: int, index: Bytes, places: Sequence[tuple[int, int]]) -> tuple[Int64, Int64]:
     """Return log times [ns] and record offsets of a channel's messages.
 
     Args:

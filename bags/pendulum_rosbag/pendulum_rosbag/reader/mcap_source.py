@@ -14,8 +14,8 @@ import numpy as np
 
 from pendulum_msgs_py.errors import BagError
 from pendulum_rosbag.reader.batches import MCAP_HEAD, Batch, Bytes, Int64, Stream
-from pendulum_rosbag.reader.decompression import decompress, decompress_torn
 from pendulum_rosbag.reader.checksums import Checksums
+from pendulum_rosbag.reader.decompression import decompress, decompress_torn
 from pendulum_rosbag.reader.mcap_chunks import Chunk, keep_staged, read_text, read_text_map, records_in
 from pendulum_rosbag.reader.mcap_extras import find_extras
 from pendulum_rosbag.reader.mcap_index import indexed_messages
