@@ -65,7 +65,7 @@ class Batch:
         if not same.all():
             wrong = int(np.argmin(same))
             raise BagError(
-                f"the message index names a message of channel {self.channel} at {self.times[wrong] * 1e-9:.3f} s " 
+                f"the message index names a message of channel {self.channel} at {self.times[wrong] * 1e-9:.3f} s "
                 "where there is none; try to repair the bag"
             )
 
