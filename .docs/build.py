@@ -19,7 +19,7 @@ NODES = (
     ("simulator", "pendulum_sim.simulator_node", ("SPECS",)),
     ("viewer", "pendulum_sim.viewer_node", ("SPECS",)),
     ("markers", "pendulum_sim.markers_node", ("SPECS",)),
-    ("bridge", "pendulum_hw_bridge.bridge_node", ("SPECS",)),
+    ("bridge", "pendulum_hw_bridge.node_specs", ("SPECS",)),
     ("disturbance", "pendulum_lqr.disturbance_node", ("DISTURBANCE_SPECS", "NODE_SPECS")),
     ("effort_adapter", "pendulum_lqr.effort_adapter_node", ("NODE_SPECS",)),
     ("recorder", "pendulum_rosbag.recorder.recorder_node", ("SPECS",)),

@@ -1,4 +1,4 @@
-"""The import rule that import-linter has no word for: only thin shells may touch ROS.
+"""The import rules that import-linter has no word for: only thin shells may touch ROS, and no import goes in a circle.
 
 A module is a shell when its name matches one of the patterns in ``pyproject.toml``; every other module is
 pure core. The core may import neither a ROS package nor a shell, so that it runs, and is tested, where no
@@ -12,7 +12,7 @@ from fnmatch import fnmatch
 from grimp import ImportGraph
 from importlinter import Contract, ContractCheck, fields, output
 
-__all__ = ["RosShellsContract"]
+__all__ = ["NoCirclesContract", "RosShellsContract"]
 
 
 class RosShellsContract(Contract):
@@ -44,6 +44,38 @@ class RosShellsContract(Contract):
         for importer, _, line, text in check.metadata["offences"]:
             output.print_error(f"{importer}, line {line}: {text}", bold=False)
         output.print_error("expected: ROS and its shells imported by *_node modules and ros subpackages only")
+
+
+class NoCirclesContract(Contract):
+    """Forbid imports in a circle between modules, those in functions and for types among them."""
+
+    type_name = "no_circles"
+
+    known = fields.SetField(subfield=fields.StringField(), required=False, default=set())
+
+    def check(self, graph: ImportGraph, verbose: bool) -> ContractCheck:
+        """Leave out, again and again, every module that imports nothing of the rest; what stays is on a circle."""
+        left = {module for module in graph.modules if not graph.is_module_squashed(module)}
+        for sides in (graph.find_modules_directly_imported_by, graph.find_modules_that_directly_import):
+            while gone := {module for module in left if not sides(module) & left - {module}}:
+                left -= gone
+        left = {module for module in left if not _matches(module, self.known)}
+        return ContractCheck(kept=not left, metadata={"circle": self._imports_within(graph, left)})
+
+    @staticmethod
+    def _imports_within(graph: ImportGraph, left: set[str]) -> list[str]:
+        return [
+            f"{importer}, line {detail['line_number']}: {detail['line_contents']}"
+            for importer in sorted(left)
+            for imported in sorted(graph.find_modules_directly_imported_by(importer) & left)
+            for detail in graph.get_import_details(importer=importer, imported=imported)
+        ]
+
+    def render_broken_contract(self, check: ContractCheck) -> None:
+        """Name each import that is part of a circle, or on the way from one to another."""
+        for line in check.metadata["circle"]:
+            output.print_error(line, bold=False)
+        output.print_error("expected: imports that go one way; move what both need into a module of its own")
 
 
 def _matches(module: str, patterns: set[str]) -> bool:

@@ -7,7 +7,7 @@ off.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 from pendulum_hw_bridge.actuator import (
     ActuatorError,
@@ -16,49 +16,24 @@ from pendulum_hw_bridge.actuator import (
     Applied,
     Command,
     Feedback,
-    HardwareLimits,
     Strategy,
 )
 from pendulum_hw_bridge.effort_mapping import EffortMapping
-from pendulum_hw_bridge.gains import GainSet
 from pendulum_hw_bridge.motor_state import MotorWatch
 from pendulum_hw_bridge.output_check import OutputCheck
 from pendulum_hw_bridge.safety import SafetyMonitor
-from pendulum_hw_bridge.settings import write_settings
+from pendulum_hw_bridge.settings import BridgeSettings, write_settings
 from pendulum_msgs_py.contract.supervisor import Drive, DriveKind, Mode, PlantSupervisor
 from pendulum_msgs_py.contract.values import NANOSECONDS, JointSample
 from pendulum_msgs_py.errors import PendulumError
 
-__all__ = ["TRAJECTORY_STRATEGY", "Bridge", "BridgeSettings", "Outcome"]
+__all__ = ["TRAJECTORY_STRATEGY", "Bridge", "Outcome"]
 
 TRAJECTORY_STRATEGY = Strategy.PARALLEL_PWM
 """Strategy under which trajectories are followed (3, as in the thesis)."""
 _PREPARED_NS = NANOSECONDS
 _STOP_AGAIN_NS = NANOSECONDS // 10
 """Time between two requests to a module that did not confirm that it is off [ns]."""
-
-
-@dataclass(frozen=True)
-class BridgeSettings:
-    """What the bridge sets in the actuator when it connects and each time it arms.
-
-    Attributes:
-        feedback_rate: [Hz].
-        command_lifetime: [s]; a killed bridge drives for this long and no longer.
-        limits: Limits of the firmware.
-        gains: Gains of the loops, before they are limited.
-        joint_offset: Joint angle where the actuator reads zero [rad].
-        joint_sign: 1, or -1 for an actuator mounted the other way round.
-        effort_tare: Torque that the sensor shows at the joint when nothing pulls [N m].
-    """
-
-    feedback_rate: float = 100.0
-    command_lifetime: float = 0.05
-    limits: HardwareLimits = field(default_factory=HardwareLimits)
-    gains: GainSet | None = None
-    joint_offset: float = 0.0
-    joint_sign: int = 1
-    effort_tare: float = 0.0
 
 
 @dataclass(frozen=True, slots=True)

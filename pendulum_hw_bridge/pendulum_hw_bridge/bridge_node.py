@@ -7,7 +7,6 @@ and then strategy off.
 
 from __future__ import annotations
 
-import dataclasses
 import functools
 import sys
 from collections.abc import Callable, Mapping, Sequence
@@ -22,46 +21,30 @@ from pendulum_hw_bridge.actuator_loop import ActuatorLoop
 from pendulum_hw_bridge.backends import BACKENDS
 from pendulum_hw_bridge.bridge import Bridge, Outcome
 from pendulum_hw_bridge.bridge_consistency import check_consistency
-from pendulum_hw_bridge.bridge_parameters import BRIDGE_SPECS
 from pendulum_hw_bridge.clocks import SteppedClock, WallClock
 from pendulum_hw_bridge.derating import Derating
 from pendulum_hw_bridge.e_stop_input_node import EStopInputServer
 from pendulum_hw_bridge.e_stop_node import EStopServer
 from pendulum_hw_bridge.feedback_message import encode_feedback
 from pendulum_hw_bridge.lab_node import with_lab_file
+from pendulum_hw_bridge.node_specs import SPECS
 from pendulum_hw_bridge.safety import SafetyMonitor
 from pendulum_hw_bridge.shared_supervisor import SharedSupervisor
+from pendulum_msgs_py.contract.plant_specs import LOCKSTEP_EPOCH_NS, limits_from_parameters
 from pendulum_msgs_py.contract.supervisor import Drive, DriveKind, Input, Mode
 from pendulum_msgs_py.contract.timing import LoopStatistics, SteadyWallClock
 from pendulum_msgs_py.contract.values import NANOSECONDS, JointCommand, JointSample
 from pendulum_msgs_py.errors import PendulumError
-from pendulum_msgs_py.parameters import ParameterSpec, ParameterValue
 from pendulum_msgs_py.plants.plant_differences import PLANT_PARAMETERS, describe_plants
 from pendulum_msgs_py.ros import qos
 from pendulum_msgs_py.ros.convert import stamp_to_message
 from pendulum_msgs_py.ros.lifecycle import LifecycleNode
 from pendulum_msgs_py.ros.parameters import NodeParameters
-from pendulum_msgs_py.ros.plant_interface import LIMIT_SPECS, PlantInterface, limits_from_parameters
-from pendulum_msgs_py.ros.plant_loop import LOCKSTEP_EPOCH_NS, LOOP_SPECS, LockstepLoop, create_wall_timer
+from pendulum_msgs_py.ros.plant_interface import PlantInterface
+from pendulum_msgs_py.ros.plant_loop import LockstepLoop, create_wall_timer
 from pendulum_msgs_py.ros.runner import run_node
 
-__all__ = ["SPECS", "BridgeNode", "main"]
-
-_HARDWARE_DEFAULTS: dict[str, ParameterValue] = {
-    "velocity_limit": 1.5,
-    "position_window": [-4.0, 4.0],
-    "effort_slew_limit": 2000.0,
-    "start_effort_limit": 2.0,
-    "starvation_limit": 30.0,
-}
-"""Limits that a simulated plant can do without and a real one cannot."""
-
-SPECS: tuple[ParameterSpec, ...] = (
-    *BRIDGE_SPECS,
-    *LOOP_SPECS,
-    *(dataclasses.replace(spec, default=_HARDWARE_DEFAULTS.get(spec.name, spec.default)) for spec in LIMIT_SPECS),
-)
-"""All parameters of the node."""
+__all__ = ["BridgeNode", "main"]
 
 _SLOW_PERIOD = 0.5
 _FEEDBACK_QOS = qos.STATE

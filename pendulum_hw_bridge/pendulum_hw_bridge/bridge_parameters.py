@@ -8,7 +8,6 @@ from typing import Any
 
 from pendulum_hw_bridge.actuator import MAX_COMMAND_LIFETIME, ActuatorPort, HardwareLimits, MStopAction
 from pendulum_hw_bridge.backends import BACKENDS
-from pendulum_hw_bridge.bridge import BridgeSettings
 from pendulum_hw_bridge.clocks import Clock
 from pendulum_hw_bridge.effort_mapping import EffortMapping, EffortStrategy
 from pendulum_hw_bridge.emulation import EMULATOR_PRESET_NAMES
@@ -16,6 +15,7 @@ from pendulum_hw_bridge.gains import DEFAULT_GAINS, GainSet, load_gains
 from pendulum_hw_bridge.lab import LAB_SPEC
 from pendulum_hw_bridge.motor_state import MOTOR_SPEED_LIMIT
 from pendulum_hw_bridge.safety_limits import SafetyLimits
+from pendulum_hw_bridge.settings import BridgeSettings
 from pendulum_msgs_py.contract.drive import PlantLimits
 from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.parameters import ParameterSpec

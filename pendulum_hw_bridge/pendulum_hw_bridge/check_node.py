@@ -13,18 +13,18 @@ from rclpy.signals import SignalHandlerOptions
 
 from pendulum_hw_bridge import bridge_parameters
 from pendulum_hw_bridge.actuator import ActuatorPort
-from pendulum_hw_bridge.bridge import BridgeSettings
 from pendulum_hw_bridge.bridge_consistency import check_consistency
-from pendulum_hw_bridge.bridge_node import SPECS
 from pendulum_hw_bridge.clocks import WallClock
 from pendulum_hw_bridge.lab_node import with_lab_file
+from pendulum_hw_bridge.node_specs import SPECS
 from pendulum_hw_bridge.safety import SafetyLimits
+from pendulum_hw_bridge.settings import BridgeSettings
+from pendulum_msgs_py.contract.plant_specs import limits_from_parameters
 from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.plants.plant_parameters import PlantParameters
 from pendulum_msgs_py.programs import graph
 from pendulum_msgs_py.ros.middleware import set_middleware_defaults
 from pendulum_msgs_py.ros.parameters import NodeParameters
-from pendulum_msgs_py.ros.plant_interface import limits_from_parameters
 
 __all__ = ["AsTheBridge", "as_the_bridge", "bridge_values"]
 

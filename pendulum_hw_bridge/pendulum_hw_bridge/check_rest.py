@@ -8,9 +8,9 @@ from collections.abc import Callable, Sequence
 import numpy as np
 
 from pendulum_hw_bridge.actuator import ActuatorPort, Feedback
-from pendulum_hw_bridge.bridge import BridgeSettings
 from pendulum_hw_bridge.check_item import CheckItem
 from pendulum_hw_bridge.nudge import NUDGE_ANGLE, Hand, watch_nudge
+from pendulum_hw_bridge.settings import BridgeSettings
 from pendulum_msgs_py.plants.plant_parameters import PlantParameters
 
 __all__ = ["rest_items", "sign_item"]

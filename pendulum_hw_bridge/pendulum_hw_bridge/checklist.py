@@ -22,12 +22,12 @@ from pendulum_hw_bridge.actuator import (
     Strategy,
     TemperatureState,
 )
-from pendulum_hw_bridge.bridge import BridgeSettings
 from pendulum_hw_bridge.check_item import HOST_ITEM, CheckItem, Checklist
 from pendulum_hw_bridge.check_rest import rest_items, sign_item
 from pendulum_hw_bridge.check_timing import HostWatch, Punctuality, TimingFigures, measure
 from pendulum_hw_bridge.nudge import Hand
 from pendulum_hw_bridge.safety import SafetyLimits, SafetyMonitor
+from pendulum_hw_bridge.settings import BridgeSettings
 from pendulum_msgs_py.contract.values import NANOSECONDS
 from pendulum_msgs_py.errors import PendulumError
 from pendulum_msgs_py.plants.plant_parameters import PlantParameters

@@ -13,8 +13,8 @@ from typing import Protocol
 import numpy as np
 
 from pendulum_hw_bridge.actuator import ActuatorError, ActuatorPort, Command, Feedback, Strategy
-from pendulum_hw_bridge.bridge import BridgeSettings
 from pendulum_hw_bridge.nudge import Hand, watch_nudge
+from pendulum_hw_bridge.settings import BridgeSettings
 from pendulum_msgs_py.contract.values import NANOSECONDS
 from pendulum_msgs_py.plants.plant_parameters import PlantParameters
 

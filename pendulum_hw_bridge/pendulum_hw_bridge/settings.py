@@ -3,15 +3,35 @@
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING
+from dataclasses import dataclass, field
 
-from pendulum_hw_bridge.actuator import ActuatorError, ActuatorPort, check_lifetime
+from pendulum_hw_bridge.actuator import ActuatorError, ActuatorPort, HardwareLimits, check_lifetime
 from pendulum_hw_bridge.gains import GainSet, differing_gain
 
-if TYPE_CHECKING:
-    from pendulum_hw_bridge.bridge import BridgeSettings
+__all__ = ["BridgeSettings", "write_settings"]
 
-__all__ = ["write_settings"]
+
+@dataclass(frozen=True)
+class BridgeSettings:
+    """What the bridge sets in the actuator when it connects and each time it arms.
+
+    Attributes:
+        feedback_rate: [Hz].
+        command_lifetime: [s]; a killed bridge drives for this long and no longer.
+        limits: Limits of the firmware.
+        gains: Gains of the loops, before they are limited.
+        joint_offset: Joint angle where the actuator reads zero [rad].
+        joint_sign: 1, or -1 for an actuator mounted the other way round.
+        effort_tare: Torque that the sensor shows at the joint when nothing pulls [N m].
+    """
+
+    feedback_rate: float = 100.0
+    command_lifetime: float = 0.05
+    limits: HardwareLimits = field(default_factory=HardwareLimits)
+    gains: GainSet | None = None
+    joint_offset: float = 0.0
+    joint_sign: int = 1
+    effort_tare: float = 0.0
 
 
 def write_settings(port: ActuatorPort, settings: BridgeSettings, gains: GainSet) -> None:

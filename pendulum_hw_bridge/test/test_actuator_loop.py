@@ -9,13 +9,14 @@ import pytest
 from pendulum_hw_bridge.actuator import ActuatorError, Feedback, Strategy
 from pendulum_hw_bridge.actuator_loop import ActuatorLoop
 from pendulum_hw_bridge.backends.emulator import EmulatorBackend
-from pendulum_hw_bridge.bridge import Bridge, BridgeSettings, Outcome
+from pendulum_hw_bridge.bridge import Bridge, Outcome
 from pendulum_hw_bridge.clocks import WallClock
 from pendulum_hw_bridge.effort_mapping import EffortMapping, EffortStrategy
 from pendulum_hw_bridge.emulation.parameters import load_emulator
 from pendulum_hw_bridge.emulation.x5 import EmulatedX5
 from pendulum_hw_bridge.gains import DEFAULT_GAINS
 from pendulum_hw_bridge.safety import SafetyLimits, SafetyMonitor
+from pendulum_hw_bridge.settings import BridgeSettings
 from pendulum_hw_bridge.shared_supervisor import SharedSupervisor
 from pendulum_msgs_py.contract.supervisor import Drive, Input, Mode, PlantLimits
 from pendulum_msgs_py.contract.timing import LoopStatistics

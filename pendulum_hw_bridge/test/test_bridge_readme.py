@@ -6,7 +6,7 @@ import re
 from pathlib import Path
 
 from pendulum_hw_bridge.actuator import FEEDBACK_QUANTITIES
-from pendulum_hw_bridge.bridge_node import SPECS
+from pendulum_hw_bridge.node_specs import SPECS
 from pendulum_hw_bridge.safety import FAULTS
 from pendulum_msgs_py.parameters import markdown_table
 

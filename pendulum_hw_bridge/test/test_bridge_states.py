@@ -6,7 +6,7 @@ import pytest
 
 from pendulum_hw_bridge.actuator import ActuatorError, Strategy
 from pendulum_hw_bridge.backends.emulator import EmulatorBackend
-from pendulum_hw_bridge.bridge import Bridge, BridgeSettings
+from pendulum_hw_bridge.bridge import Bridge
 from pendulum_hw_bridge.clocks import SteppedClock
 from pendulum_hw_bridge.effort_mapping import EffortMapping, EffortStrategy
 from pendulum_hw_bridge.emulation.faults import ActuatorFault
@@ -15,6 +15,7 @@ from pendulum_hw_bridge.emulation.x5 import EmulatedX5
 from pendulum_hw_bridge.gains import DEFAULT_GAINS
 from pendulum_hw_bridge.motor_state import MotorState
 from pendulum_hw_bridge.safety import SafetyLimits, SafetyMonitor
+from pendulum_hw_bridge.settings import BridgeSettings
 from pendulum_hw_bridge.shared_supervisor import SharedSupervisor
 from pendulum_msgs_py.contract.angles import UPRIGHT, from_upright
 from pendulum_msgs_py.contract.supervisor import Input, Mode, PlantLimits

@@ -11,7 +11,6 @@ import pytest
 from pendulum_hw_bridge import bridge_node, check_cli
 from pendulum_hw_bridge.actuator import Feedback, Strategy
 from pendulum_hw_bridge.backends.emulator import EmulatorBackend
-from pendulum_hw_bridge.bridge import BridgeSettings
 from pendulum_hw_bridge.check_item import HOST_ITEM, Checklist
 from pendulum_hw_bridge.checklist import run_checklist
 from pendulum_hw_bridge.clocks import SteppedClock
@@ -21,6 +20,7 @@ from pendulum_hw_bridge.emulation.x5 import EmulatedX5
 from pendulum_hw_bridge.gains import DEFAULT_GAINS
 from pendulum_hw_bridge.nudge import hand_of
 from pendulum_hw_bridge.safety import SafetyLimits
+from pendulum_hw_bridge.settings import BridgeSettings
 
 SETTINGS = BridgeSettings(gains=DEFAULT_GAINS[3])
 

@@ -11,13 +11,13 @@ from pendulum_hw_bridge import guided, lab_cli
 from pendulum_hw_bridge.actuator import ActuatorError, Command, MStopAction, Strategy
 from pendulum_hw_bridge.backends import hebi as backend_module
 from pendulum_hw_bridge.backends.emulator import EmulatorBackend
-from pendulum_hw_bridge.bridge import BridgeSettings
 from pendulum_hw_bridge.clocks import SteppedClock
 from pendulum_hw_bridge.emulation.faults import ActuatorFault
 from pendulum_hw_bridge.emulation.parameters import load_emulator
 from pendulum_hw_bridge.emulation.x5 import EmulatedX5
 from pendulum_hw_bridge.module_files import backup_emulator, backup_group, restore_emulator, restore_group
 from pendulum_hw_bridge.nudge import EmulatedHand
+from pendulum_hw_bridge.settings import BridgeSettings
 from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.plants.lab_file import load_lab
 

@@ -24,11 +24,12 @@ from pendulum_hw_bridge.actuator import (
 )
 from pendulum_hw_bridge.backends import hebi as backend_module
 from pendulum_hw_bridge.backends.hebi import HebiBackend
-from pendulum_hw_bridge.bridge import Bridge, BridgeSettings
+from pendulum_hw_bridge.bridge import Bridge
 from pendulum_hw_bridge.effort_mapping import EffortMapping, EffortStrategy
 from pendulum_hw_bridge.emulation.parameters import load_emulator
 from pendulum_hw_bridge.gains import DEFAULT_GAINS, GAIN_FIELDS, LOOPS
 from pendulum_hw_bridge.safety import SafetyLimits, SafetyMonitor
+from pendulum_hw_bridge.settings import BridgeSettings
 from pendulum_msgs_py.contract.supervisor import Drive, DriveKind, PlantLimits, PlantSupervisor
 
 hebi = pytest.importorskip("hebi", reason="hebi-py is not installed")

@@ -29,8 +29,7 @@ def test_the_tables_of_plant_files_are_those_of_the_code(name: str, specs: tuple
 
 def test_the_tables_of_a_plant_node_are_those_of_the_code() -> None:
     pytest.importorskip("rclpy")
-    from pendulum_msgs_py.ros.plant_interface import LIMIT_SPECS
-    from pendulum_msgs_py.ros.plant_loop import LOOP_SPECS
+    from pendulum_msgs_py.contract.plant_specs import LIMIT_SPECS, LOOP_SPECS
 
     assert _table("limits") == markdown_table(LIMIT_SPECS)
     assert _table("loop") == markdown_table(LOOP_SPECS)

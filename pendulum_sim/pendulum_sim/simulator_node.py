@@ -12,6 +12,7 @@ from sensor_msgs.msg import JointState
 from std_srvs.srv import SetBool, Trigger
 
 from pendulum_msgs_py.contract.names import JOINT
+from pendulum_msgs_py.contract.plant_specs import LIMIT_SPECS, LOCKSTEP_EPOCH_NS, LOOP_SPECS, limits_from_parameters
 from pendulum_msgs_py.contract.supervisor import Drive, DriveKind, Input, Mode, PlantSupervisor
 from pendulum_msgs_py.contract.timing import LoopStatistics, SteadyWallClock
 from pendulum_msgs_py.contract.values import NANOSECONDS, JointCommand, JointSample
@@ -22,8 +23,8 @@ from pendulum_msgs_py.plants.plant_parameters import PRESET_NAMES, load_plant
 from pendulum_msgs_py.ros import qos
 from pendulum_msgs_py.ros.convert import sample_from_message
 from pendulum_msgs_py.ros.parameters import NodeParameters
-from pendulum_msgs_py.ros.plant_interface import LIMIT_SPECS, PlantInterface, limits_from_parameters
-from pendulum_msgs_py.ros.plant_loop import LOCKSTEP_EPOCH_NS, LOOP_SPECS, LockstepLoop, RealtimeLoop
+from pendulum_msgs_py.ros.plant_interface import PlantInterface
+from pendulum_msgs_py.ros.plant_loop import LockstepLoop, RealtimeLoop
 from pendulum_msgs_py.ros.polled import PollingNode
 from pendulum_msgs_py.ros.runner import run_node
 from pendulum_sim.integrators import METHODS

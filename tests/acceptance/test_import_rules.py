@@ -57,6 +57,11 @@ OFFENCES = {
         "import pendulum_lqr",
         "pendulum_rosbag.offender -> pendulum_lqr",
     ),
+    "a module that imports itself through another": (
+        "pendulum_msgs_py/pendulum_msgs_py/errors.py",
+        "def late():\n    from pendulum_msgs_py import parameters",
+        "pendulum_msgs_py.errors, line 2: from pendulum_msgs_py import parameters",
+    ),
     "a simulator that imports the vendor's library": (
         "pendulum_sim/pendulum_sim/offender.py",
         "import hebi",

@@ -14,13 +14,14 @@ import numpy as np
 
 from pendulum_hw_bridge.actuator import HardwareLimits, Strategy
 from pendulum_hw_bridge.backends.emulator import EmulatorBackend
-from pendulum_hw_bridge.bridge import Bridge, BridgeSettings, Outcome
+from pendulum_hw_bridge.bridge import Bridge, Outcome
 from pendulum_hw_bridge.clocks import SteppedClock
 from pendulum_hw_bridge.effort_mapping import EffortMapping, EffortStrategy
 from pendulum_hw_bridge.emulation.faults import ActuatorFault
 from pendulum_hw_bridge.emulation.parameters import load_emulator
 from pendulum_hw_bridge.emulation.x5 import EmulatedX5, LinkState
 from pendulum_hw_bridge.safety import SafetyLimits, SafetyMonitor
+from pendulum_hw_bridge.settings import BridgeSettings
 from pendulum_msgs_py.contract.angles import UPRIGHT, from_upright
 from pendulum_msgs_py.contract.supervisor import Drive, DriveKind, Input, Mode, PlantLimits, PlantSupervisor
 from pendulum_msgs_py.contract.trajectory import thesis_ramp

@@ -29,6 +29,7 @@ from pendulum_lqr.disturbance import DISTURBANCE_SPECS, make_disturbance
 from pendulum_lqr.disturbing import DisturbanceLoop
 from pendulum_msgs_py.contract import names
 from pendulum_msgs_py.contract.angles import UPRIGHT, from_upright
+from pendulum_msgs_py.contract.plant_specs import LIMIT_SPECS, LOCKSTEP_EPOCH_NS, limits_from_parameters
 from pendulum_msgs_py.contract.supervisor import Drive, Input, PlantSupervisor
 from pendulum_msgs_py.contract.values import NANOSECONDS, JointCommand, JointSample
 from pendulum_msgs_py.errors import FaultError
@@ -36,8 +37,8 @@ from pendulum_msgs_py.parameters import validate
 from pendulum_msgs_py.plants.plant_parameters import load_plant
 from pendulum_msgs_py.ros import qos
 from pendulum_msgs_py.ros.convert import stamp_to_message
-from pendulum_msgs_py.ros.plant_interface import LIMIT_SPECS, PlantInterface, limits_from_parameters
-from pendulum_msgs_py.ros.plant_loop import LOCKSTEP_EPOCH_NS, LockstepLoop
+from pendulum_msgs_py.ros.plant_interface import PlantInterface
+from pendulum_msgs_py.ros.plant_loop import LockstepLoop
 from pendulum_rosbag.reader import read_bag
 from pendulum_sim.plants import make_plant
 from tests.faults.live import NAMESPACE, LiveSystem

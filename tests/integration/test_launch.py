@@ -12,7 +12,7 @@ from xml.etree import ElementTree
 import pytest
 import yaml
 
-from pendulum_hw_bridge.bridge_node import SPECS as BRIDGE_SPECS
+from pendulum_hw_bridge.node_specs import SPECS as BRIDGE_SPECS
 from pendulum_lqr.bringup import ARGUMENTS, SIDES, parameter_file, programs
 from pendulum_lqr.controller import COMMON_PARAMETERS, controller_parameters
 from pendulum_lqr.controller_node import NODE_SPECS as CONTROLLER_SPECS

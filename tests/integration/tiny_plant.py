@@ -11,12 +11,13 @@ from collections.abc import Callable
 
 from rclpy.node import Node
 
+from pendulum_msgs_py.contract.plant_specs import LIMIT_SPECS, limits_from_parameters
 from pendulum_msgs_py.contract.supervisor import DriveKind, PlantSupervisor
 from pendulum_msgs_py.contract.timing import SteadyWallClock
 from pendulum_msgs_py.contract.values import JointSample
 from pendulum_msgs_py.parameters import ParameterSpec
 from pendulum_msgs_py.ros.parameters import NodeParameters
-from pendulum_msgs_py.ros.plant_interface import LIMIT_SPECS, PlantInterface, limits_from_parameters
+from pendulum_msgs_py.ros.plant_interface import PlantInterface
 from pendulum_msgs_py.ros.runner import run_node
 
 SPECS = (

@@ -13,52 +13,14 @@ from rosgraph_msgs.msg import Clock as ClockMessage
 
 from pendulum_msgs_py.contract import names
 from pendulum_msgs_py.contract.cdr import encode_clock
+from pendulum_msgs_py.contract.plant_specs import LOCKSTEP_EPOCH_NS
 from pendulum_msgs_py.contract.supervisor import Drive, Input, Mode
 from pendulum_msgs_py.contract.timing import LoopStatistics, SteadyWallClock
 from pendulum_msgs_py.contract.values import NANOSECONDS, JointCommand, JointSample
-from pendulum_msgs_py.parameters import ParameterSpec
 from pendulum_msgs_py.ros import qos
 from pendulum_msgs_py.ros.plant_interface import PlantInterface
 
-__all__ = ["LOCKSTEP_EPOCH_NS", "LOOP_SPECS", "LockstepLoop", "RealtimeLoop", "Stepper", "create_wall_timer"]
-
-LOCKSTEP_EPOCH_NS = NANOSECONDS
-"""Stamp of the first state in lockstep [ns]; a stamp of zero means "no time" to ROS tools."""
-
-LOOP_SPECS: tuple[ParameterSpec, ...] = (
-    ParameterSpec(
-        "clock",
-        "realtime",
-        "",
-        "Absolute deadlines of wall time, or step only when all expected answers to a state have come.",
-        choices=("realtime", "lockstep"),
-        read_only=True,
-    ),
-    ParameterSpec(
-        "lockstep_inputs",
-        ["effort_command"],
-        "",
-        "Inputs that must answer a state before the next step, in lockstep.",
-        choices=tuple(kind.value for kind in Input),
-        read_only=True,
-    ),
-    ParameterSpec(
-        "lockstep_subscribers",
-        1,
-        "-",
-        "Subscriptions to joint_states that must be there before the first state, in lockstep.",
-        minimum=0,
-        read_only=True,
-    ),
-    ParameterSpec(
-        "lockstep_duration",
-        0.0,
-        "s",
-        "Simulated time after which the plant stops stepping and says so, in lockstep; 0 for never.",
-        minimum=0.0,
-        read_only=True,
-    ),
-)
+__all__ = ["LockstepLoop", "RealtimeLoop", "Stepper", "create_wall_timer"]
 
 
 class Stepper(Protocol):

@@ -13,13 +13,12 @@ from pendulum_lqr.answering import AnswerLoop
 from pendulum_lqr.controller import make_controller
 from pendulum_lqr.disturbance import DISTURBANCE_SPECS, make_disturbance
 from pendulum_lqr.disturbing import DisturbanceLoop
+from pendulum_msgs_py.contract.plant_specs import LIMIT_SPECS, LOCKSTEP_EPOCH_NS, limits_from_parameters
 from pendulum_msgs_py.contract.supervisor import Input, PlantSupervisor
 from pendulum_msgs_py.contract.values import NANOSECONDS, JointCommand
 from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.parameters import validate
 from pendulum_msgs_py.plants.plant_parameters import PlantParameters, load_plant
-from pendulum_msgs_py.ros.plant_interface import LIMIT_SPECS, limits_from_parameters
-from pendulum_msgs_py.ros.plant_loop import LOCKSTEP_EPOCH_NS
 from pendulum_sim.plants import make_plant
 from pendulum_sim.sensors import Sensors
 

@@ -1,0 +1,181 @@
+"""Parameters that every plant has, whatever it is: the limits that it keeps, and how its loop runs."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+from pendulum_msgs_py.contract.drive import Input, PlantLimits
+from pendulum_msgs_py.contract.values import NANOSECONDS
+from pendulum_msgs_py.errors import ParameterError
+from pendulum_msgs_py.parameters import ParameterSpec
+
+__all__ = ["LIMIT_SPECS", "LOCKSTEP_EPOCH_NS", "LOOP_SPECS", "limits_from_parameters"]
+
+LOCKSTEP_EPOCH_NS = NANOSECONDS
+"""Stamp of the first state in lockstep [ns]; a stamp of zero means "no time" to ROS tools."""
+
+LOOP_SPECS: tuple[ParameterSpec, ...] = (
+    ParameterSpec(
+        "clock",
+        "realtime",
+        "",
+        "Absolute deadlines of wall time, or step only when all expected answers to a state have come.",
+        choices=("realtime", "lockstep"),
+        read_only=True,
+    ),
+    ParameterSpec(
+        "lockstep_inputs",
+        ["effort_command"],
+        "",
+        "Inputs that must answer a state before the next step, in lockstep.",
+        choices=tuple(kind.value for kind in Input),
+        read_only=True,
+    ),
+    ParameterSpec(
+        "lockstep_subscribers",
+        1,
+        "-",
+        "Subscriptions to joint_states that must be there before the first state, in lockstep.",
+        minimum=0,
+        read_only=True,
+    ),
+    ParameterSpec(
+        "lockstep_duration",
+        0.0,
+        "s",
+        "Simulated time after which the plant stops stepping and says so, in lockstep; 0 for never.",
+        minimum=0.0,
+        read_only=True,
+    ),
+)
+
+LIMIT_SPECS: tuple[ParameterSpec, ...] = (
+    ParameterSpec(
+        "effort_limit",
+        0.0,
+        "N m",
+        "Largest torque after the sum of controller and disturbance; 0 takes that of the plant file.",
+        minimum=0.0,
+        read_only=True,
+    ),
+    ParameterSpec(
+        "command_timeout",
+        0.05,
+        "s",
+        "Age at which a command counts for nothing and the torque goes to zero.",
+        minimum=0.0,
+        exclusive_minimum=True,
+        read_only=True,
+    ),
+    ParameterSpec(
+        "velocity_limit",
+        0.0,
+        "rad/s",
+        "Speed at which the armed plant faults, and the largest of a trajectory; 0 for none.",
+        minimum=0.0,
+        read_only=True,
+    ),
+    ParameterSpec(
+        "position_window",
+        [0.0, 0.0],
+        "rad",
+        "Angles between which the armed plant must stay, [low, high]; equal for no window.",
+        read_only=True,
+    ),
+    ParameterSpec(
+        "effort_slew_limit",
+        0.0,
+        "N m/s",
+        "Largest rate of change of the torque; 0 for none.",
+        minimum=0.0,
+        read_only=True,
+    ),
+    ParameterSpec(
+        "handover_time",
+        0.1,
+        "s",
+        "Time over which torque passes between position and effort control.",
+        minimum=0.0,
+        read_only=True,
+    ),
+    ParameterSpec(
+        "handover_effort_limit",
+        2.0,
+        "N m",
+        "A command takes over from position control only if it is this close to the torque that holds.",
+        minimum=0.0,
+        exclusive_minimum=True,
+        read_only=True,
+    ),
+    ParameterSpec(
+        "start_effort_limit",
+        0.0,
+        "N m",
+        "Largest torque with which a commander may begin where nobody commands; 0 for none.",
+        minimum=0.0,
+        read_only=True,
+    ),
+    ParameterSpec(
+        "starvation_limit",
+        0.0,
+        "s",
+        "Time without a command after which a plant that is armed for effort disarms; 0 for never.",
+        minimum=0.0,
+        read_only=True,
+    ),
+    ParameterSpec(
+        "tracking_error_limit",
+        0.3,
+        "rad",
+        "Distance from a trajectory at which the plant faults.",
+        minimum=0.0,
+        exclusive_minimum=True,
+        read_only=True,
+    ),
+)
+
+
+def limits_from_parameters(
+    values: Mapping[str, object], plant_effort_limit: float, *, feedback_timeout: float = float("inf")
+) -> PlantLimits:
+    """Return the limits that the parameters of ``LIMIT_SPECS`` describe.
+
+    Args:
+        values: Parameter values by name.
+        plant_effort_limit: Effort limit of the plant file [N m]; the parameter can only lower it.
+        feedback_timeout: Age of a measurement that faults an armed plant [s].
+
+    Raises:
+        ParameterError: They contradict each other or the plant.
+    """
+
+    def number(name: str) -> float:
+        value = values[name]
+        assert isinstance(value, float)
+        return value
+
+    window = values["position_window"]
+    assert isinstance(window, list)
+    if len(window) != 2:
+        raise ParameterError(f"position_window has {len(window)} values; expected [low, high] in rad")
+    if number("effort_limit") > plant_effort_limit:
+        raise ParameterError(
+            f"effort_limit is {number('effort_limit')} N m; expected at most {plant_effort_limit} N m, "
+            "the limit of the plant file"
+        )
+    unlimited = float("inf")
+    bounded = window[0] != window[1]
+    return PlantLimits(
+        effort=number("effort_limit") or plant_effort_limit,
+        command_timeout=number("command_timeout"),
+        feedback_timeout=feedback_timeout,
+        velocity=number("velocity_limit") or unlimited,
+        position_min=window[0] if bounded else -unlimited,
+        position_max=window[1] if bounded else unlimited,
+        slew=number("effort_slew_limit") or unlimited,
+        handover_time=number("handover_time"),
+        tracking_error=number("tracking_error_limit"),
+        handover_effort=number("handover_effort_limit"),
+        start_effort=number("start_effort_limit") or unlimited,
+        starvation=number("starvation_limit") or unlimited,
+    )
