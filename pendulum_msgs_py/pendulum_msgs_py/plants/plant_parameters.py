@@ -18,10 +18,10 @@ import os
 import sys
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from importlib import resources
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, NamedTuple, get_type_hints
 
 from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.parameters import (
@@ -40,6 +40,7 @@ __all__ = [
     "PRESET_NAMES",
     "SERIES_ELASTIC_PRESETS",
     "PlantParameters",
+    "Quantity",
     "SeriesElasticParameters",
     "load_plant",
     "load_plant_file",
@@ -60,73 +61,68 @@ SERIES_ELASTIC_PRESETS = tuple(
 """Those of them that have motor, gears and spring."""
 
 
-def _physical(
-    name: str, default: float, unit: str, description: str, *, positive: bool = False, signed: bool = False
-) -> ParameterSpec:
-    minimum = None if signed else 0.0
-    return ParameterSpec(name, default, unit, description, minimum=minimum, exclusive_minimum=positive)
+class Quantity(NamedTuple):
+    """What a physical parameter is; it annotates the field that holds one, whose default is that of plant files too.
 
+    Attributes:
+        unit: SI unit, ``-`` where it has none.
+        description: What it means, one sentence.
+        positive: Zero is refused.
+        signed: Below zero is allowed.
+        example: Shown as the default where a value must be given.
+    """
 
-PLANT_SPECS: tuple[ParameterSpec, ...] = (
-    _physical("inertia", 0.055, "kg m^2", "Inertia about the joint, M_c.", positive=True),
-    _physical("damping", 11.77, "N m s/rad", "Viscous friction, b_c."),
-    _physical("gravity", 1.678, "N m", "Gravity coefficient, G_c = m g l_c; 0 for a pendulum that lies flat."),
-    _physical("coulomb_friction", 0.0, "N m", "Dry friction while sliding fast, tau_C."),
-    _physical("static_friction", 0.0, "N m", "Dry friction at which sliding starts, tau_S >= tau_C."),
-    _physical("stribeck_velocity", 0.01, "rad/s", "Velocity over which tau_S falls to tau_C.", positive=True),
-    _physical("load_friction", 0.0, "-", "Dry friction per torque of gravity carried, added to tau_C."),
-    _physical("torque_offset", 0.0, "N m", "Constant torque that the sensor of effort misses.", signed=True),
-    _physical("angle_offset", 0.0, "rad", "Measured angle when hanging at rest.", signed=True),
-    _physical("effort_limit", 13.0, "N m", "Largest torque of the actuator.", positive=True),
-    _physical("actuator_time_constant", 0.0, "s", "First-order lag between command and torque; 0 for none."),
-    _physical("transport_delay", 0.0, "s", "Time between a command and its first effect."),
-)
-
-DRIVETRAIN_SPECS: tuple[ParameterSpec, ...] = (
-    _physical("gear_ratio", 1742.222, "-", "Motor turns per output turn, N.", positive=True),
-    _physical("torque_constant", 6.26e-3, "N m/A", "Torque per winding current at the motor, K_t.", positive=True),
-    _physical("back_emf_constant", 6.241e-3, "V s/rad", "Voltage per motor speed, K_e."),
-    _physical("winding_resistance", 9.99, "ohm", "Winding resistance at 20 degrees Celsius, R.", positive=True),
-    _physical("winding_temperature", 22.0, "degC", "Winding temperature at the start.", signed=True),
-    _physical("resistance_temperature_coefficient", 0.004, "1/K", "Relative change of R per kelvin."),
-    _physical("supply_voltage", 36.0, "V", "Supply voltage, V.", positive=True),
-    _physical("efficiency", 0.65, "-", "Share of motor torque that a command counts on at the output.", positive=True),
-    _physical("reflected_inertia", 0.19, "kg m^2", "Rotor inertia seen at the output, J_r N^2.", positive=True),
-    _physical("motor_damping", 1.4, "N m s/rad", "Viscous friction of motor and gears at the output, b_v."),
-    _physical("motor_coulomb_friction", 0.3, "N m", "Dry friction of motor and gears at the output, tau_C."),
-    _physical("motor_static_friction", 0.39, "N m", "Dry friction at which the motor starts to slide, tau_S."),
-    _physical("motor_stribeck_velocity", 0.01, "rad/s", "Velocity over which tau_S falls to tau_C.", positive=True),
-    _physical("stiffness", 100.0, "N m/rad", "Spring stiffness at small deflection, k.", positive=True),
-    _physical("stiffness_hardening", 0.0, "N m/rad^3", "Growth of the stiffness with the deflection squared."),
-    _physical("hysteresis_torque", 0.05, "N m", "Half width of the spring's hysteresis loop, tau_h."),
-    _physical("hysteresis_deflection", 2e-4, "rad", "Deflection over which the loop turns round.", positive=True),
-)
+    unit: str
+    description: str
+    positive: bool = False
+    signed: bool = False
+    example: float = 0.0
 
 
 @dataclass(frozen=True)
 class SeriesElasticParameters:
-    """Motor, gear train and spring of a series-elastic actuator; units and meaning in ``DRIVETRAIN_SPECS``.
+    """Motor, gear train and spring of a series-elastic actuator.
 
     Source: HEBI X5-9 datasheet values; friction and hysteresis from public logs of X5 actuators.
     """
 
-    gear_ratio: float = 1742.222
-    torque_constant: float = 6.26e-3
-    back_emf_constant: float = 6.241e-3
-    winding_resistance: float = 9.99
-    winding_temperature: float = 22.0
-    resistance_temperature_coefficient: float = 0.004
-    supply_voltage: float = 36.0
-    efficiency: float = 0.65
-    reflected_inertia: float = 0.19
-    motor_damping: float = 1.4
-    motor_coulomb_friction: float = 0.3
-    motor_static_friction: float = 0.39
-    motor_stribeck_velocity: float = 0.01
-    stiffness: float = 100.0
-    stiffness_hardening: float = 0.0
-    hysteresis_torque: float = 0.05
-    hysteresis_deflection: float = 2e-4
+    gear_ratio: Annotated[float, Quantity("-", "Motor turns per output turn, N.", positive=True)] = 1742.222
+    torque_constant: Annotated[
+        float, Quantity("N m/A", "Torque per winding current at the motor, K_t.", positive=True)
+    ] = 6.26e-3
+    back_emf_constant: Annotated[float, Quantity("V s/rad", "Voltage per motor speed, K_e.")] = 6.241e-3
+    winding_resistance: Annotated[
+        float, Quantity("ohm", "Winding resistance at 20 degrees Celsius, R.", positive=True)
+    ] = 9.99
+    winding_temperature: Annotated[float, Quantity("degC", "Winding temperature at the start.", signed=True)] = 22.0
+    resistance_temperature_coefficient: Annotated[float, Quantity("1/K", "Relative change of R per kelvin.")] = 0.004
+    supply_voltage: Annotated[float, Quantity("V", "Supply voltage, V.", positive=True)] = 36.0
+    efficiency: Annotated[
+        float, Quantity("-", "Share of motor torque that a command counts on at the output.", positive=True)
+    ] = 0.65
+    reflected_inertia: Annotated[
+        float, Quantity("kg m^2", "Rotor inertia seen at the output, J_r N^2.", positive=True)
+    ] = 0.19
+    motor_damping: Annotated[
+        float, Quantity("N m s/rad", "Viscous friction of motor and gears at the output, b_v.")
+    ] = 1.4
+    motor_coulomb_friction: Annotated[
+        float, Quantity("N m", "Dry friction of motor and gears at the output, tau_C.")
+    ] = 0.3
+    motor_static_friction: Annotated[
+        float, Quantity("N m", "Dry friction at which the motor starts to slide, tau_S.")
+    ] = 0.39
+    motor_stribeck_velocity: Annotated[
+        float, Quantity("rad/s", "Velocity over which tau_S falls to tau_C.", positive=True)
+    ] = 0.01
+    stiffness: Annotated[float, Quantity("N m/rad", "Spring stiffness at small deflection, k.", positive=True)] = 100.0
+    stiffness_hardening: Annotated[
+        float, Quantity("N m/rad^3", "Growth of the stiffness with the deflection squared.")
+    ] = 0.0
+    hysteresis_torque: Annotated[float, Quantity("N m", "Half width of the spring's hysteresis loop, tau_h.")] = 0.05
+    hysteresis_deflection: Annotated[
+        float, Quantity("rad", "Deflection over which the loop turns round.", positive=True)
+    ] = 2e-4
 
     def __post_init__(self) -> None:
         """Check every value; a static friction below the sliding one would feed energy in."""
@@ -140,23 +136,31 @@ class SeriesElasticParameters:
 
 @dataclass(frozen=True)
 class PlantParameters:
-    """Parameters of M_c theta'' + b_c theta' + friction + G_c sin(theta) = u + d; see ``PLANT_SPECS`` for units.
+    """Parameters of M_c theta'' + b_c theta' + friction + G_c sin(theta) = u + d.
 
     ``static_friction`` may be left out (None) and is then the Coulomb friction.
     """
 
-    inertia: float
-    damping: float
-    gravity: float
-    coulomb_friction: float = 0.0
-    static_friction: float = None  # type: ignore[assignment]  # filled in below
-    stribeck_velocity: float = 0.01
-    load_friction: float = 0.0
-    torque_offset: float = 0.0
-    angle_offset: float = 0.0
-    effort_limit: float = 13.0
-    actuator_time_constant: float = 0.0
-    transport_delay: float = 0.0
+    inertia: Annotated[float, Quantity("kg m^2", "Inertia about the joint, M_c.", positive=True, example=0.055)]
+    damping: Annotated[float, Quantity("N m s/rad", "Viscous friction, b_c.", example=11.77)]
+    gravity: Annotated[
+        float, Quantity("N m", "Gravity coefficient, G_c = m g l_c; 0 for a pendulum that lies flat.", example=1.678)
+    ]
+    coulomb_friction: Annotated[float, Quantity("N m", "Dry friction while sliding fast, tau_C.")] = 0.0
+    static_friction: Annotated[float, Quantity("N m", "Dry friction at which sliding starts, tau_S >= tau_C.")] = None  # type: ignore[assignment]  # filled in below
+    stribeck_velocity: Annotated[
+        float, Quantity("rad/s", "Velocity over which tau_S falls to tau_C.", positive=True)
+    ] = 0.01
+    load_friction: Annotated[float, Quantity("-", "Dry friction per torque of gravity carried, added to tau_C.")] = 0.0
+    torque_offset: Annotated[
+        float, Quantity("N m", "Constant torque that the sensor of effort misses.", signed=True)
+    ] = 0.0
+    angle_offset: Annotated[float, Quantity("rad", "Measured angle when hanging at rest.", signed=True)] = 0.0
+    effort_limit: Annotated[float, Quantity("N m", "Largest torque of the actuator.", positive=True)] = 13.0
+    actuator_time_constant: Annotated[
+        float, Quantity("s", "First-order lag between command and torque; 0 for none.")
+    ] = 0.0
+    transport_delay: Annotated[float, Quantity("s", "Time between a command and its first effect.")] = 0.0
     drivetrain: SeriesElasticParameters | None = None
     name: str = field(default="unnamed", compare=False)
 
@@ -174,6 +178,29 @@ class PlantParameters:
     def with_values(self, **changes: Any) -> PlantParameters:
         """Return a copy with some values changed, checked again."""
         return replace(self, **changes)
+
+
+def _specs(kind: type[Any]) -> tuple[ParameterSpec, ...]:
+    """Return the table of a dataclass's quantities: name and default are the field's, the rest its annotation's."""
+    found = []
+    hints = get_type_hints(kind, include_extras=True)
+    for entry in fields(kind):
+        for quantity in getattr(hints[entry.name], "__metadata__", ()):
+            default = entry.default if isinstance(entry.default, float) else quantity.example
+            minimum = None if quantity.signed else 0.0
+            found.append(
+                ParameterSpec(
+                    entry.name, default, quantity.unit, quantity.description,
+                    minimum=minimum, exclusive_minimum=quantity.positive,
+                )
+            )  # fmt: skip
+    return tuple(found)
+
+
+DRIVETRAIN_SPECS = _specs(SeriesElasticParameters)
+"""Quantities of a plant file's section ``drivetrain``."""
+PLANT_SPECS = _specs(PlantParameters)
+"""Quantities of a plant file's section ``parameters``."""
 
 
 def load_plant(preset_or_path: str | Path) -> PlantParameters:
