@@ -90,7 +90,6 @@ class SafetyMonitor:
         """Take note of what was sent, to compare with what the module then acts on."""
         if strategy is not self._strategy:
             self._sent.clear()
-            self._wrong_commands = 0
             self._strategy = strategy
             self._strategy_since_ns = sent_ns
             if self.output is not None:
@@ -99,11 +98,8 @@ class SafetyMonitor:
 
     def stopped(self) -> None:
         """Take note that nothing is commanded any more."""
-        self._sent.clear()
         self._strategy = Strategy.OFF
-        self._wrong_commands = self._wrong_currents = 0
-        if self.output is not None:
-            self.output.reset()
+        self._wrong_currents = 0
 
     def is_new(self, feedback: Feedback) -> bool:
         """Return whether a record is one that was not seen before, and remember when one last was."""
@@ -254,9 +250,9 @@ class SafetyMonitor:
 
     def _check_motion(self, feedback: Feedback) -> Fault | None:
         last = self._last
-        if last is not None and math.isfinite(last.position):
+        if last is not None and math.isfinite(last.position) and math.isfinite(last.velocity):
             elapsed = (feedback.hardware_ns - last.hardware_ns) / NANOSECONDS
-            if 0.0 < elapsed < 2.0 * self.timeout:
+            if elapsed < 2.0 * self.timeout:
                 expected = 0.5 * (feedback.velocity + last.velocity) * elapsed
                 jump = feedback.position - last.position - expected
                 if abs(jump) > self.limits.position_jump:
@@ -285,7 +281,7 @@ class SafetyMonitor:
     def _check_command(self, feedback: Feedback) -> Fault | None:
         """Compare what the module acts on with what was sent lately."""
         settled = feedback.stamp_ns - self._strategy_since_ns > self.timeout * NANOSECONDS
-        if self._strategy is Strategy.OFF or not self._sent or not settled:
+        if self._strategy is Strategy.OFF or not settled:
             self._wrong_commands = 0
             return None
         recent = self._in_force(feedback.stamp_ns)
@@ -317,7 +313,7 @@ class SafetyMonitor:
         return None
 
     def _check_output(self, feedback: Feedback) -> Fault | None:
-        if self.output is None or self._strategy is Strategy.OFF or not self._sent:
+        if self.output is None or self._strategy is Strategy.OFF:
             return None
         if feedback.stamp_ns - self._strategy_since_ns <= round(self.period * NANOSECONDS):
             return None

@@ -1,6 +1,6 @@
 """Which rules are broken, and which tests have to notice: the safety rules of both plants, without DDS.
 
-Not here yet: safety monitor, output check, effort mapping, bridge and HEBI backend.
+Not here yet: output check, effort mapping, bridge, HEBI backend and the watch for two commanders.
 """
 
 from __future__ import annotations
@@ -59,6 +59,12 @@ TARGETS: tuple[Target, ...] = (
         ("check_consistency", "_check_hardware"),
         (f"{_BRIDGE}/test_bridge_consistency.py",),
     ),
+    Target(
+        "pendulum_hw_bridge.safety",
+        ("SafetyMonitor", "_or_zero", "_same"),
+        (f"{_BRIDGE}/test_safety_monitor.py",),
+    ),
+    Target("pendulum_hw_bridge.motor_state", ("MotorWatch",), (f"{_BRIDGE}/test_motor_state.py",)),
     Target("pendulum_hw_bridge.derating", ("Derating",), (f"{_BRIDGE}/test_derating.py",)),
     Target("pendulum_hw_bridge.e_stop_input", ("EStopInput",), (f"{_BRIDGE}/test_e_stop_input.py",)),
 )
