@@ -18,7 +18,9 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass
 
-__all__ = ["Peer", "Row", "measured", "peer"]
+from scipy import stats
+
+__all__ = ["Peer", "Row", "counted", "measured", "peer"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -136,4 +138,36 @@ def measured(
         target=", ".join(targets),
         holds=holds,
         note="; ".join(text for text in (note, peer.note if peer else "") if text),
+    )
+
+
+def counted(
+    what: str,
+    count: int,
+    trials: int,
+    *,
+    at_least: float | None = None,
+    at_most: float | None = None,
+    note: str = "",
+) -> Row:
+    """Return the row of a share of trials, with its counts and its interval in the note.
+
+    Args:
+        what: What was counted, in which trials.
+        count: How many trials had it.
+        trials: How many there were.
+        at_least: Smallest share that is good enough [%].
+        at_most: Largest share that is good enough [%].
+        note: Anything that a reader must know.
+    """
+    # Clopper and Pearson's, which never covers less than it says.
+    interval = stats.binomtest(count, trials).proportion_ci(0.95, method="exact")
+    counts = f"{count} of {trials}, 95 % interval {100.0 * interval.low:.1f} to {100.0 * interval.high:.1f} %"
+    return measured(
+        what,
+        100.0 * count / trials,
+        "%",
+        at_least=at_least,
+        at_most=at_most,
+        note="; ".join(text for text in (counts, note) if text),
     )

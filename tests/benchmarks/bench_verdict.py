@@ -12,12 +12,12 @@ from pendulum_bags.comparison import Looks, Margins, Outcome
 from pendulum_bags.comparison.equivalence import EquivalenceTest
 from pendulum_bags.comparison.same_run import paired_tests
 from pendulum_bags.runs.series import Series
-from tests.benchmarks import Row, measured
+from tests.benchmarks import Row, counted
 from tests.plant_pairs import SIMULATED, pair
 
 AT_MARGIN = 300
 """Trials of a machine that lies on every margin at once: 15 false answers of 300 are 5 %."""
-TRIALS = 100
+TRIALS = 300
 """Trials of each difference that must be found, and of none."""
 FIRST_LOOKS = (5.0, 10.0, 20.0)
 """Lengths of the runs behind each further look, short so that the intervals rest on little [s]."""
@@ -58,6 +58,7 @@ def run_trial(
     lengths: Sequence[float],
     *,
     each: bool = False,
+    compiled: bool = False,
 ) -> Trial:
     """Carry out one experiment: look, and record more while it is undecided.
 
@@ -67,6 +68,7 @@ def run_trial(
         stated: Margins.
         lengths: Of the runs behind each look [s].
         each: Go on until each test is decided, not only the answer.
+        compiled: Simulate by compiled loops, which pays for many trials.
     """
     margins = Margins.parse(stated)
     pairs: list[tuple[Series, Series]] = []
@@ -74,7 +76,7 @@ def run_trial(
     whole = Outcome.UNDECIDED
     seconds = 0.0
     for look, length in enumerate(lengths, start=1):
-        simulation, machine = pair(1000 * seed + look, length, **hardware)
+        simulation, machine = pair(1000 * seed + look, length, compiled=compiled, **hardware)
         pairs.append((simulation.window, machine.window))
         seconds += length
         tests = paired_tests(pairs, margins, looks=Looks(look), runs_differ=False)
@@ -95,16 +97,19 @@ def outcome_of(tests: Sequence[EquivalenceTest]) -> Outcome:
     return Outcome.UNDECIDED if Outcome.UNDECIDED in outcomes else Outcome.EQUIVALENT
 
 
-def margins_at(hardware: dict[str, Any], duration: float = 600.0, *, less_delay: bool = False) -> dict[str, str]:
+def margins_at(
+    hardware: dict[str, Any], duration: float = 600.0, *, less_delay: bool = False, compiled: bool = False
+) -> dict[str, str]:
     """Return margins on which a machine lies exactly, from one long run.
 
     Args:
         hardware: In what the machine differs.
         duration: Of the run [s].
         less_delay: Whether the distances are those with the delay taken out, which have the same margins.
+        compiled: Simulate by compiled loops.
     """
     less = LESS_DELAY if less_delay else ""
-    simulation, machine = pair(7, duration, **hardware)
+    simulation, machine = pair(7, duration, compiled=compiled, **hardware)
     tests = paired_tests([(simulation.window, machine.window)], Margins.parse())
     found = {test.quantity: test.interval.estimate for test in tests}
     stated = {
@@ -127,9 +132,10 @@ def repeat(function: Callable[[int], Trial], trials: int) -> list[Trial]:
 
 def rows() -> Iterator[Row]:
     """Yield false answers at each margin, and how often differences are found and equal plants are told equal."""
-    stated = margins_at(ON_THE_MARGIN)
+    stated = margins_at(ON_THE_MARGIN, compiled=True)
     trials = repeat(
-        partial(run_trial, hardware=ON_THE_MARGIN, stated=stated, lengths=FIRST_LOOKS, each=True), AT_MARGIN
+        partial(run_trial, hardware=ON_THE_MARGIN, stated=stated, lengths=FIRST_LOOKS, each=True, compiled=True),
+        AT_MARGIN,
     )
     # Distances less the delay have the margins of those with it, far within which they lie: they need margins of their
     # own, beyond which the others lie.
@@ -137,45 +143,42 @@ def rows() -> Iterator[Row]:
         partial(
             run_trial,
             hardware=ON_THE_MARGIN,
-            stated=margins_at(ON_THE_MARGIN, less_delay=True),
+            stated=margins_at(ON_THE_MARGIN, less_delay=True, compiled=True),
             lengths=FIRST_LOOKS,
             each=True,
+            compiled=True,
         ),
         AT_MARGIN,
     )
     for quantity in trials[0].outcomes:
         at_margin = closer if quantity.endswith(LESS_DELAY) else trials
-        wrong = sum(trial.outcomes[quantity] is Outcome.EQUIVALENT for trial in at_margin)
-        yield measured(
-            f"same run: “equivalent” although on the margin, {quantity}, {AT_MARGIN} trials of up to 3 looks",
-            float(wrong),
-            "trials",
-            at_most=0.05 * AT_MARGIN,
+        yield counted(
+            f"same run: “equivalent” within 3 looks although on the margin, {quantity}",
+            sum(trial.outcomes[quantity] is Outcome.EQUIVALENT for trial in at_margin),
+            AT_MARGIN,
+            at_most=5.0,
         )
-    wrong = sum(trial.whole is Outcome.EQUIVALENT for trial in trials)
-    yield measured(
-        f"same run: “yes” for a machine on the margins, {AT_MARGIN} trials",
-        float(wrong),
-        "trials",
-        at_most=0.05 * AT_MARGIN,
+    yield counted(
+        "same run: “yes” for a machine on the margins",
+        sum(trial.whole is Outcome.EQUIVALENT for trial in trials),
+        AT_MARGIN,
+        at_most=5.0,
     )
     for what, hardware in DIFFERENCES.items():
-        found = repeat(partial(run_trial, hardware=hardware, stated={}, lengths=DEFAULT_LOOKS), TRIALS)
-        right = sum(trial.whole is Outcome.DIFFERENT for trial in found)
-        yield measured(
-            f"same run: “no” for {what}, {TRIALS} default runs",
-            float(right),
-            "runs",
-            at_least=0.95 * TRIALS,
+        found = repeat(partial(run_trial, hardware=hardware, stated={}, lengths=DEFAULT_LOOKS, compiled=True), TRIALS)
+        yield counted(
+            f"same run: “no” for {what}, default runs",
+            sum(trial.whole is Outcome.DIFFERENT for trial in found),
+            TRIALS,
+            at_least=95.0,
             note=_noise(found),
         )
-    found = repeat(partial(run_trial, hardware={}, stated={}, lengths=DEFAULT_LOOKS), TRIALS)
-    right = sum(trial.whole is Outcome.EQUIVALENT for trial in found)
-    yield measured(
-        f"same run: “yes” for the same plant at 100 Hz with an actuator's sensors, {TRIALS} default runs",
-        float(right),
-        "runs",
-        at_least=0.95 * TRIALS,
+    found = repeat(partial(run_trial, hardware={}, stated={}, lengths=DEFAULT_LOOKS, compiled=True), TRIALS)
+    yield counted(
+        "same run: “yes” for the same plant at 100 Hz with an actuator's sensors, default runs",
+        sum(trial.whole is Outcome.EQUIVALENT for trial in found),
+        TRIALS,
+        at_least=95.0,
         note=_noise(found),
     )
 

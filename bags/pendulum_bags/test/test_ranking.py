@@ -110,6 +110,34 @@ def test_a_noise_that_all_contenders_share_does_not_blur_the_choice():
     assert same_choice(found).mark is Mark.YES
 
 
+def campaign(generator: np.random.Generator, runs: int, scatter: float = 0.06) -> list[Contender]:
+    """Return runs of contenders of which the simulation's pick costs exactly a tenth more than the best."""
+    costs = {"picked": (1.0, 1.1), "best": (1.1, 1.0), "other": (1.5, 1.4), "last": (3.0, 2.5)}
+    return [
+        Contender(
+            name,
+            *(np.column_stack([cost * generator.normal(1.0, scatter, runs), np.zeros((runs, 2))]) for cost in pair),
+        )
+        for name, pair in costs.items()
+    ]
+
+
+def test_three_runs_on_the_margin_are_seldom_called_the_same_choice():
+    generator = np.random.default_rng(3)
+    wrong = sum(same_choice(rank(campaign(generator, 3), generator)).mark is Mark.YES for _ in range(60))
+    assert wrong <= 0.05 * 60
+
+
+def test_one_run_of_each_decides_nothing():
+    found = rank(campaign(np.random.default_rng(1), 1))
+    layer = same_choice(found)
+    assert layer.mark is Mark.UNDECIDED
+    assert "no interval: each controller ran once" in layer.sentence
+    assert layer.next_steps == ("record more seeds: --seeds 10",)
+    assert found.to_json()["regret"]["high"] is None
+    json.dumps(layer.to_json(), allow_nan=False)
+
+
 def test_runs_of_a_study_and_a_folder_are_collected(tmp_path, capsys):
     metrics = {"ise": 0.01, "rms_velocity": 0.1, "effort_energy": 2.0, "success": 1.0}
     for side, factor in (("sim", 1.0), ("hw", 1.2)):

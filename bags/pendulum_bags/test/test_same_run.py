@@ -226,3 +226,14 @@ def test_a_machine_on_the_margins_is_seldom_called_equivalent_however_often_one_
 @pytest.mark.parametrize("what", DIFFERENCES)
 def test_a_difference_that_matters_is_found_in_a_default_run(what: str) -> None:
     assert run_trial(1, DIFFERENCES[what], {}, DEFAULT_LOOKS).whole is Outcome.DIFFERENT
+
+
+def test_the_compiled_pairs_of_the_benchmarks_are_the_interpreted_ones() -> None:
+    hardware = {"late": 0.004, "gain": 1.1, "plant": MACHINE.with_values(torque_offset=0.05)}
+    for plain, compiled in zip(pair(3, 1.0, **hardware), pair(3, 1.0, compiled=True, **hardware), strict=True):
+        for name in ("t", "position", "velocity", "effort"):
+            expected = getattr(plain.window, name)
+            np.testing.assert_allclose(getattr(compiled.window, name), expected, rtol=1e-9, atol=1e-9)
+        assert compiled.disturbance is not None
+        assert plain.disturbance is not None
+        np.testing.assert_array_equal(compiled.disturbance.value, plain.disturbance.value)

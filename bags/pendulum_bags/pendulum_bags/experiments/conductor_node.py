@@ -32,11 +32,27 @@ from pendulum_msgs_py.ros import qos
 from pendulum_msgs_py.ros.convert import event_message, sample_from_bytes, trajectory_to_message
 from pendulum_msgs_py.ros.middleware import check_closed, set_middleware_defaults
 
-__all__ = ["Conductor", "PlantClient", "RecorderClient"]
+__all__ = ["Conductor", "PlantClient", "PlantStoppedError", "RecorderClient"]
 
 _SLICE = 0.05
 _QUIET_POLLS = 3
 _T = TypeVar("_T")
+
+
+class PlantStoppedError(FaultError):
+    """A plant gave up torque by itself: a fault, an e-stop, or no command for long.
+
+    Args:
+        namespace: Of the plant.
+        mode: In which it is: ``fault``, ``e_stop`` or ``disarmed``.
+        reason: Why, in its own words; a fault of the bridge begins with its name.
+    """
+
+    def __init__(self, namespace: str, mode: str, reason: str) -> None:
+        super().__init__(f"{namespace} went to {mode}: {reason}")
+        self.namespace = namespace
+        self.mode = mode
+        self.reason = reason
 
 
 class Conductor:
@@ -239,13 +255,14 @@ class PlantClient:
         """Tell whether the move last asked for has ended.
 
         Raises:
-            FaultError: The plant refused it, or left position control.
+            PlantStoppedError: The plant faulted, or was stopped or disarmed.
+            FaultError: It refused the move.
         """
         for event in self.events[self._finished_before :]:
             if event["name"] == "trajectory_refused":
                 raise FaultError(f"{self.namespace} refused the trajectory: {event.get('reason')}")
             if event["name"] == "plant_mode" and event.get("mode") in {"fault", "e_stop", "disarmed"}:
-                raise FaultError(f"{self.namespace} went to {event['mode']}: {event.get('reason')}")
+                raise PlantStoppedError(self.namespace, str(event["mode"]), str(event.get("reason")))
             if event["name"] == "trajectory_finished":
                 return True
         return False
@@ -298,10 +315,10 @@ class PlantClient:
         return bool(state.current_state.id == State.PRIMARY_STATE_ACTIVE)
 
     def check_mode(self) -> None:
-        """Raise a FaultError where the plant has faulted or been stopped."""
+        """Raise a PlantStoppedError where the plant has faulted or been stopped."""
         mode = self.has_event("plant_mode")
         if mode is not None and mode.get("mode") in {"fault", "e_stop"}:
-            raise FaultError(f"{self.namespace} is in {mode['mode']}: {mode.get('reason')}")
+            raise PlantStoppedError(self.namespace, str(mode["mode"]), str(mode.get("reason")))
 
     def _on_event(self, message: String) -> None:
         try:

@@ -6,6 +6,7 @@ import json
 import sys
 import time
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -105,6 +106,7 @@ def thesis(
     Example: python -m pendulum_bags experiment thesis --out /tmp/my_run --seed 7 --margin delay=8ms
     """
     from pendulum_bags.comparison import Margins
+    from pendulum_bags.experiments.stalls import run_undisturbed
     from pendulum_bags.experiments.thesis import run_thesis
     from pendulum_bags.verdict.terminal import print_answer
 
@@ -127,8 +129,14 @@ def thesis(
         started = time.monotonic()
         try:
             with PhaseProgress(TIME_BESIDE_NOISE + duration, console) as progress:
-                repeat = hardware == "emulator" and budget > 0.0
-                run_thesis(folder, settings, domain, progress, repeat=repeat)
+                run_undisturbed(
+                    partial(
+                        run_thesis, folder, settings, domain, progress, repeat=hardware == "emulator" and budget > 0.0
+                    ),
+                    folder,
+                    emulated=settings.hardware_plant == "emulator",
+                    tell=progress.start_again,
+                )
                 comparison, answer, summary = _analyse(folder, settings, margins, budget, progress)
         except KeyboardInterrupt:
             kept = "nothing was recorded" if discard_if_empty(folder) else f"what was recorded is in {folder}"

@@ -55,6 +55,12 @@ class PhaseProgress:
         if not self._console.is_terminal:
             self._console.print(f"{name} ({expected:.0f} s)", highlight=False)
 
+    def start_again(self, why: str) -> None:
+        """Begin anew, and say why."""
+        self._console.print(why, style="yellow", highlight=False, markup=False, soft_wrap=True)
+        self._done = self._length = 0.0
+        self._bar.reset(self._task)
+
     def refresh(self) -> None:
         """Move the bar with time, never past the end of the phase."""
         elapsed = min(time.monotonic() - self._started, self._length)

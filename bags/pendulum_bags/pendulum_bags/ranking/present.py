@@ -25,14 +25,15 @@ _SHOWN_PAIRS = 8
 
 
 def same_choice(ranking: Ranking, margin: float = REGRET_MARGIN) -> LayerResult:
-    """Return layer 4: yes where the regret is small, no where it is large, undecided where its runs scatter.
+    """Return layer 4: yes where the regret is small, no where it is large, undecided where its runs scatter or are few.
 
     Args:
         ranking: The ranking.
         margin: Regret that does not matter, as a share of the hardware's best cost.
     """
-    least = ranking.hw[0]
-    share = [value / least for value in (ranking.regret.value, ranking.regret.low, ranking.regret.high)]
+    regret = ranking.regret_share
+    share = [regret.value, regret.low, regret.high]
+    measured = np.isfinite(regret.high)
     if share[2] <= margin:
         mark = Mark.YES
     elif share[1] > margin or ranking.pick in ranking.failures:
@@ -41,9 +42,13 @@ def same_choice(ranking: Ranking, margin: float = REGRET_MARGIN) -> LayerResult:
         mark = Mark.UNDECIDED
     sure = [pair for pair in ranking.wrong if pair.sure]
     same = "which is the best on the hardware too" if ranking.pick == ranking.best else f"not {ranking.best}"
+    interval = (
+        f"95 % interval {100.0 * share[1]:.1f} to {100.0 * share[2]:.1f} %"
+        if measured
+        else "no interval: each controller ran once"
+    )
     sentence = (
-        f"The simulation picks {ranking.pick}, {same}: a regret of {100.0 * share[0]:.1f} % (95 % interval "
-        f"{100.0 * share[1]:.1f} to {100.0 * share[2]:.1f} %). Costs correlate with {ranking.srcc.value:.3f} "
+        f"The simulation picks {ranking.pick}, {same}: a regret of {100.0 * share[0]:.1f} % ({interval}). Costs correlate with {ranking.srcc.value:.3f} "
         f"({ranking.srcc.low:.3f} to {ranking.srcc.high:.3f}); {len(ranking.wrong)} of {ranking.pairs} pairs are in "
         f"the wrong order, {len(sure)} of them surely."
     )
@@ -73,7 +78,9 @@ def same_choice(ranking: Ranking, margin: float = REGRET_MARGIN) -> LayerResult:
         f"{len(ranking.names)}",
         Mark.NO: f"the simulation would have picked {ranking.pick}, {percent[0]:.0f} % dearer than {ranking.best}",
         Mark.UNDECIDED: f"the regret of the simulation's pick, {percent[1]:.0f} to {percent[2]:.0f} %, is not measured "
-        "well enough",
+        "well enough"
+        if measured
+        else "the regret of the simulation's pick was measured once only",
     }[mark]
     return LayerResult(Layer.SAME_CHOICE, mark, sentence, evidence, steps, reason)
 

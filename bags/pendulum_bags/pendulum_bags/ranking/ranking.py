@@ -104,7 +104,8 @@ class Ranking:
         srcc: Pearson's correlation of those that succeed on both sides.
         spearman: Correlation of the ranks of all, failures last.
         mmrv: Mean maximum rank violation, in units of the cost; a failure costs as much as the worst that succeeds.
-        regret: Of the simulation's pick, in units of the cost.
+        regret: Of the simulation's pick, in units of the cost; its ends are NaN where no run was repeated.
+        regret_share: The same as a share of the best's cost.
         pick: The simulation's best.
         best: The hardware's best.
         wrong: Pairs in the wrong order, dearest first.
@@ -119,6 +120,7 @@ class Ranking:
     spearman: float
     mmrv: Interval
     regret: Interval
+    regret_share: Interval
     pick: str
     best: str
     wrong: Sequence[WrongPair]
@@ -177,15 +179,18 @@ def rank(contenders: Sequence[Contender], generator: np.random.Generator | None 
         for j in range(len(contenders))
         if sim[i] < sim[j] and hw[i] > hw[j]
     ]
-    low, high = np.percentile(_resampled(contenders, generator), [2.5, 97.5], axis=0)
+    low, high = np.percentile(_violations(contenders, generator), [2.5, 97.5])
+    share = _regret(contenders, pick, hw)
+    regret = Interval(float(hw[pick] - hw.min()), *(float(hw.min()) * end for end in (share.low, share.high)))
     return Ranking(
         [contenders[i].name for i in order],
         [float(raw["sim"][i]) for i in order],
         [float(raw["hw"][i]) for i in order],
         _pearson(raw["sim"][able], raw["hw"][able]),
         float(stats.spearmanr(sim, hw).statistic),
-        Interval(mmrv(sim, hw), float(low[0]), float(high[0])),
-        Interval(float(hw[pick] - hw.min()), float(low[1]), float(high[1])),
+        Interval(mmrv(sim, hw), float(low), float(high)),
+        regret,
+        share,
         contenders[pick].name,
         contenders[int(order[0])].name,
         sorted(wrong, key=lambda pair: (not pair.sure, -pair.hw)),
@@ -210,11 +215,48 @@ def _pearson(sim: Array, hw: Array) -> Interval:
     return Interval(float(found.statistic), float(low), float(high))
 
 
-def _resampled(contenders: Sequence[Contender], generator: np.random.Generator) -> Array:
-    """Return MMRV and regret of many resamplings, shape (replicates, 2).
+def _regret(contenders: Sequence[Contender], pick: int, hw: Array) -> Interval:
+    """Return the regret of a pick as a share of the best's cost, with its 95 % interval.
 
-    Seeds are drawn again, the same for all contenders that ran under as many, since they share their disturbances; for
-    MMRV the contenders too: another set of them would give another.
+    The regret is the largest of the pick's shares over all others. Its upper limit is the largest of their upper
+    limits by Student's t over the runs: the true best is among them, so that no correction is due. The lower limit is
+    the largest of the lower ones, corrected for their number (Bonferroni). Resampled runs would not do: three of which
+    all lie low know nothing of what lies higher.
+    """
+    chosen = contenders[pick]
+    value = float(hw[pick] / hw.min()) - 1.0 if hw.min() > 0.0 else 0.0
+    others = [one.hw.sum(axis=1) for i, one in enumerate(contenders) if i != pick and np.isfinite(one.cost("hw"))]
+    if not np.isfinite(chosen.cost("hw")) or not others:
+        return Interval(value, value, value)
+    own = chosen.hw.sum(axis=1)
+    # The logarithm of the ratio of means, linear in the deviations of the runs from them: runs scatter by shares.
+    ratio = np.array([np.log(own.mean() / other.mean()) for other in others])
+    limits = np.array([_limits(own / own.mean(), other / other.mean(), len(others)) for other in others])
+    low, high = np.maximum(np.expm1((ratio[:, None] + limits).max(axis=0)), 0.0)
+    return Interval(value, float(low), float(high))
+
+
+def _limits(own: Array, other: Array, comparisons: int) -> tuple[float, float]:
+    """Return by how much a difference of means may be lower, with correction for comparisons, and higher; NaN of one."""
+    if min(own.size, other.size) < 2:
+        return float("nan"), float("nan")
+    if own.size == other.size:
+        # Runs under one seed share their disturbance.
+        deviation, freedom = float(np.std(own - other, ddof=1)) / np.sqrt(own.size), own.size - 1.0
+    else:
+        parts = np.array([np.var(own, ddof=1) / own.size, np.var(other, ddof=1) / other.size])
+        deviation = float(np.sqrt(parts.sum()))
+        # Welch and Satterthwaite.
+        freedom = float(parts.sum() ** 2 / max(1e-300, np.sum(parts**2 / (np.array([own.size, other.size]) - 1.0))))
+    low, high = (float(stats.t.isf(tail, freedom)) for tail in (0.025 / comparisons, 0.025))
+    return -low * deviation, high * deviation
+
+
+def _violations(contenders: Sequence[Contender], generator: np.random.Generator) -> Array:
+    """Return the MMRV of many resamplings, shape (replicates,).
+
+    Seeds are drawn again, the same for all contenders that ran under as many, since they share their disturbances, and
+    the contenders too: another set of them would give another.
     """
     costs = {}
     draws: dict[int, NDArray[np.int64]] = {}
@@ -228,11 +270,8 @@ def _resampled(contenders: Sequence[Contender], generator: np.random.Generator) 
                 draws[rows.size] = generator.integers(rows.size, size=(_REPLICATES, rows.size))
             columns.append(rows[draws[rows.size]].mean(axis=1))
         costs[side] = np.array([_capped(row) for row in np.stack(columns, axis=1)])
-    sim, hw = costs["sim"], costs["hw"]
-    picked = hw[np.arange(_REPLICATES), np.argmin(sim, axis=1)]
-    chosen = generator.integers(len(contenders), size=sim.shape)
-    violations = _mmrv(np.take_along_axis(sim, chosen, axis=1), np.take_along_axis(hw, chosen, axis=1))
-    return np.stack([violations, picked - hw.min(axis=1)], axis=1)
+    chosen = generator.integers(len(contenders), size=costs["sim"].shape)
+    return _mmrv(*(np.take_along_axis(costs[side], chosen, axis=1) for side in ("sim", "hw")))
 
 
 def _pair(picked: Contender, better: Contender, sim: float, hw: float) -> WrongPair:

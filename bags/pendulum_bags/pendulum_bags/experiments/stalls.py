@@ -1,0 +1,80 @@
+"""A run that a stalled machine broke off is no result: it is told, and measured again a few times.
+
+An emulator is as punctual as the machine that it runs on. Where that stands still for longer than the bridge waits, the
+bridge faults, as it must: it cannot know that nobody can be hurt. A real machine is never started again by itself.
+"""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+
+from pendulum_bags.experiments.conductor_node import PlantStoppedError
+from pendulum_bags.runs.run_folder import REPEATS
+from pendulum_msgs_py.errors import FaultError
+
+__all__ = ["ATTEMPTS", "is_stall", "run_undisturbed"]
+
+ATTEMPTS = 3
+"""Times that a run is carried out at most."""
+STALLS = ("host_stalled", "feedback_lost", "feedback_late")
+"""Faults of the bridge that an emulator, whose feedback this machine makes, has where the machine stands still."""
+STARVED = ("no command for", "no fresh command")
+"""What a plant says whose controller stood still."""
+_LOGS = "logs"
+
+
+def is_stall(error: FaultError) -> bool:
+    """Tell whether a plant that is no real machine stopped since this machine stood still."""
+    if not isinstance(error, PlantStoppedError):
+        return False
+    name = error.reason.split(":", maxsplit=1)[0]
+    return name in STALLS or any(part in error.reason for part in STARVED)
+
+
+def run_undisturbed(
+    run: Callable[[], None],
+    folder: Path,
+    *,
+    emulated: bool,
+    tell: Callable[[str], None],
+    attempts: int = ATTEMPTS,
+) -> None:
+    """Carry out a run, and again where the machine stalled.
+
+    Args:
+        run: Records into the folder.
+        folder: The run's folder; what a stalled run left there is removed, but for its logs.
+        emulated: Whether the hardware is emulated; a real machine moves when its operator wants it to.
+        tell: Told what happened, one sentence.
+        attempts: Times that it is carried out at most.
+
+    Raises:
+        FaultError: It failed for another reason, or the machine stalled each time.
+    """
+    for attempt in range(1, attempts + 1):
+        try:
+            run()
+        except FaultError as error:
+            if not emulated or not is_stall(error):
+                raise
+            if attempt == attempts:
+                raise FaultError(
+                    f"this machine stood still in each of {attempts} runs, the last time so that {error}; close what "
+                    "else runs on it, and measure again"
+                ) from error
+            tell(f"This machine stood still ({error}); measuring again, run {attempt + 1} of at most {attempts}.")
+            _clear(folder, attempt)
+        else:
+            return
+
+
+def _clear(folder: Path, attempt: int) -> None:
+    """Remove the bags of a run that broke off; its logs stay, under the run's number."""
+    for bag in ("sim", "hw", "sim_500hz", REPEATS):
+        shutil.rmtree(folder / bag, ignore_errors=True)
+    logs = folder / _LOGS
+    if logs.is_dir():
+        kept = folder / f"{_LOGS}_stalled_{attempt}"
+        logs.rename(kept)
