@@ -4,10 +4,13 @@ from __future__ import annotations
 
 import pytest
 
+from pendulum_bags.experiments.run_spec import RunSpec
 from pendulum_bags.experiments.settings import RegulationSettings
 from pendulum_lqr.controller import COMMON_PARAMETERS, CONTROLLERS, controller_parameters
 from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.parameters import validate
+from pendulum_msgs_py.plants.plant_parameters import load_plant
+from pendulum_sim.plants import make_plant
 
 # Not those that need a file or a task of their own to be designed.
 _NODE_OWN = {"controller", "plant", "use_sim_time"}
@@ -33,3 +36,10 @@ def test_weights_for_a_controller_without_them_are_refused_not_ignored(name: str
     with pytest.raises(ParameterError, match=f"{name} is .* for controller 'pd_gravity', which has no such parameter"):
         RegulationSettings(controller="pd_gravity", **{name: value})  # type: ignore[arg-type]
     RegulationSettings(controller="lqi", **{name: value})  # type: ignore[arg-type]
+
+
+def test_a_plant_with_motor_and_spring_is_not_stepped_by_the_thesis_s_integrator() -> None:
+    # Its simulator refused to start: the plant of the emulated actuator could not be simulated beside it.
+    assert RegulationSettings().method == RunSpec().method == "euler"
+    for settings in (RegulationSettings(plant="x5_9"), RunSpec(plant="x5_9")):
+        assert make_plant(load_plant("x5_9"), 0.002, method=settings.method).state.theta == 0.0

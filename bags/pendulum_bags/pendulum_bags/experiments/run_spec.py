@@ -18,7 +18,16 @@ from pendulum_msgs_py.plants.plant_parameters import load_plant
 from pendulum_msgs_py.programs import graph
 from pendulum_msgs_py.programs.graph import NodeProgram
 
-__all__ = ["CLOCKS", "EMULATOR_LIFETIME", "EMULATOR_WATCHDOG", "PERIODS", "SIDES", "RunSpec"]
+__all__ = [
+    "CLOCKS",
+    "EMULATOR_LIFETIME",
+    "EMULATOR_WATCHDOG",
+    "PERIODS",
+    "SIDES",
+    "THESIS_METHOD",
+    "RunSpec",
+    "integrator_of",
+]
 
 CLOCKS = ("lockstep", "realtime")
 SIDES = ("sim", "hw")
@@ -27,6 +36,8 @@ EMULATOR_WATCHDOG = 50
 EMULATOR_LIFETIME = 0.5
 """Command lifetime of an emulator on such a machine [s]."""
 _AT_REST = 1e-9
+THESIS_METHOD = "euler"
+"""Integrator of the thesis's simulation, for rigid plants."""
 PERIODS = {"sim": 0.002, "hw": 0.01}
 """Period of the states of each plant, as in the thesis [s]."""
 _OF_THE_NODE = {"duration", "file"}
@@ -49,7 +60,7 @@ class RunSpec:
         set_point: Angle to hold, from upright [rad].
         duration: Length [s].
         seed: Seed of the disturbance, and of the sensors of the emulated hardware.
-        method: Integrator of the simulator; Euler as in the thesis.
+        method: Integrator of the simulator; Euler as in the thesis, which a plant with motor and spring has not.
         plant_parameters: Further parameters of the plant's node, such as sensor noise.
         storage: Storage of the bag.
         clock: ``lockstep`` for as fast as the nodes answer each other, ``realtime`` for the wall's time.
@@ -66,7 +77,7 @@ class RunSpec:
     set_point: float = 0.0
     duration: float = 5.0
     seed: int = 1
-    method: str = "euler"
+    method: str = THESIS_METHOD
     plant_parameters: Mapping[str, Any] = field(default_factory=dict)
     storage: str = "mcap"
     clock: str = "lockstep"
@@ -89,7 +100,7 @@ class RunSpec:
         if self.duration <= 0.0:
             raise ParameterError(f"duration is {self.duration} s; expected > 0")
         if self.side == "sim":
-            load_plant(self.plant)
+            object.__setattr__(self, "method", integrator_of(self.plant, self.method))
         load_plant(self.design_plant)
         given = {**self.controller_parameters, "set_point": self.set_point}
         validate(controller_parameters(self.controller), given, where=f"controller {self.controller}")
@@ -196,6 +207,16 @@ class RunSpec:
         """
         reject_unknown(values, cls.__dataclass_fields__, where="run")
         return cls(**values)
+
+
+def integrator_of(plant: str, method: str) -> str:
+    """Return the integrator for a preset or plant file: that of the thesis cannot step a motor on a spring.
+
+    Raises:
+        ParameterError: The plant is unknown.
+    """
+    elastic = load_plant(plant).drivetrain is not None
+    return "auto" if elastic and method == THESIS_METHOD else method
 
 
 def _absolute(plant: str) -> str:

@@ -8,11 +8,10 @@ from pathlib import Path
 from typing import Any
 
 from pendulum_bags.experiments.operator import RealMachine, real_machine
-from pendulum_bags.experiments.run_spec import EMULATOR_LIFETIME, EMULATOR_WATCHDOG
+from pendulum_bags.experiments.run_spec import EMULATOR_LIFETIME, EMULATOR_WATCHDOG, THESIS_METHOD, integrator_of
 from pendulum_bags.runs.run_folder import git_revision, versions
 from pendulum_lqr.controller import controller_parameters
 from pendulum_msgs_py.errors import ParameterError
-from pendulum_msgs_py.plants.plant_parameters import load_plant
 from pendulum_msgs_py.programs import graph
 from pendulum_msgs_py.programs.graph import NodeProgram
 
@@ -70,7 +69,7 @@ class RegulationSettings:
         r: R.
         noise: The disturbance.
         storage: Storage of the bags.
-        method: Integrator of the simulator; Euler as in the thesis.
+        method: Integrator of the simulator; Euler as in the thesis, which a plant with motor and spring has not.
     """
 
     plant: str = "thesis"
@@ -81,12 +80,12 @@ class RegulationSettings:
     r: float = 0.1
     noise: NoiseSettings = NoiseSettings()
     storage: str = "mcap"
-    method: str = "euler"
+    method: str = THESIS_METHOD
     lab: str = ""
 
     def __post_init__(self) -> None:
         """Refuse unknown plants and backends before anything is started."""
-        load_plant(self.plant)
+        object.__setattr__(self, "method", integrator_of(self.plant, self.method))
         if self.hardware not in HARDWARE:
             raise ParameterError(f"hardware is {self.hardware!r}; expected one of {', '.join(HARDWARE)}")
         real_machine(self.hardware, self.lab)

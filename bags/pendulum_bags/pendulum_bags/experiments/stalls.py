@@ -20,8 +20,8 @@ ATTEMPTS = 3
 """Times that a run is carried out at most."""
 STALLS = ("host_stalled", "feedback_lost", "feedback_late")
 """Faults of the bridge that an emulator, whose feedback this machine makes, has where the machine stands still."""
-STARVED = ("no command for", "no fresh command")
-"""What a plant says whose controller stood still."""
+SAID = ("is the machine too busy", "no command for", "no fresh command")
+"""What a plant says whose states are too old, and one whose controller stood still."""
 _LOGS = "logs"
 
 
@@ -30,7 +30,7 @@ def is_stall(error: FaultError) -> bool:
     if not isinstance(error, PlantStoppedError):
         return False
     name = error.reason.split(":", maxsplit=1)[0]
-    return name in STALLS or any(part in error.reason for part in STARVED)
+    return name in STALLS or any(part in error.reason for part in SAID)
 
 
 def run_undisturbed(
