@@ -49,8 +49,8 @@ def same_choice(ranking: Ranking, margin: float = REGRET_MARGIN) -> LayerResult:
     )
     sentence = (
         f"The simulation picks {ranking.pick}, {same}: a regret of {100.0 * share[0]:.1f} % ({interval}). "
-        f"Costs correlate with {ranking.srcc.value:.3f} ({ranking.srcc.low:.3f} to {ranking.srcc.high:.3f}); {len(ranking.wrong)} of {ranking.pairs} pairs are in "
-        f"the wrong order, {len(sure)} of them surely."
+        f"Costs correlate with {ranking.srcc.value:.3f} ({ranking.srcc.low:.3f} to {ranking.srcc.high:.3f}); "
+        f"{len(ranking.wrong)} of {ranking.pairs} pairs are in the wrong order, {len(sure)} of them surely."
     )
     if sure:
         sentence += f" The dearest: {sure[0].picked} before {sure[0].better}, because {sure[0].reason}."

@@ -237,7 +237,7 @@ def _regret(contenders: Sequence[Contender], pick: int, hw: Array) -> Interval:
 
 
 def _limits(own: Array, other: Array, comparisons: int) -> tuple[float, float]:
-    """Return by how much a difference of means may be lower (corrected for comparisons), and higher; NaN for one run."""
+    """Return by how much a difference of means may be lower (corrected for comparisons), and higher; NaN of one."""
     if min(own.size, other.size) < 2:
         return float("nan"), float("nan")
     if own.size == other.size:
