@@ -17,7 +17,7 @@ from tests.plant_pairs import SIMULATED, pair
 
 AT_MARGIN = 300
 """Trials of a machine that lies on every margin at once: 15 false answers of 300 are 5 %."""
-TRIALS = 300
+TRIALS = 100
 """Trials of each difference that must be found, and of none."""
 FIRST_LOOKS = (5.0, 10.0, 20.0)
 """Lengths of the runs behind each further look, short so that the intervals rest on little [s]."""
