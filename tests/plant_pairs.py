@@ -152,7 +152,7 @@ def _kernel() -> Any:
     advance = compile_tree(advance_dry)
 
     @numba.njit(error_model="numpy")
-    def run(  # type: ignore[no-untyped-def]
+    def run(
         plant, limit, count, per_state, held, noise, seen, step, gain, late, rows
     ):  # fmt: skip
         c = coefficients_of(plant[1] / plant[0], STEP)
