@@ -18,7 +18,6 @@ from pendulum_msgs_py.errors import ParameterError
 
 __all__ = [
     "HAND_TRIALS",
-    "STAIRCASE_TRIALS",
     "HandMotion",
     "Phase",
     "hand_trials",
@@ -28,8 +27,6 @@ __all__ = [
 
 HAND_TRIALS = 6
 """Trials of experiment 1."""
-STAIRCASE_TRIALS = 3
-"""Trials of experiment 2."""
 
 _HAND_FEEL = 11.8
 """Torque that the hand has learnt to give for a velocity [N m s/rad]."""

@@ -70,11 +70,6 @@ class MeasuredResponse:
                 "expected increasing frequencies, a period > 0 and at least 2 blocks"
             )
 
-    @property
-    def nyquist(self) -> float:
-        """Half the sampling rate [Hz]."""
-        return 0.5 / self.period
-
     def radius(self, confidence: float = 0.95, *, joint: bool = True) -> Array:
         """Return the radius of the confidence disc of each value, shape (2, n).
 

@@ -80,11 +80,6 @@ class Region:
         cell = (self.angles[1] - self.angles[0]) * (self.velocities[1] - self.velocities[0])
         return float(np.count_nonzero(self.attracted) * cell)
 
-    @property
-    def proven_area(self) -> float:
-        """Area of the proven ellipse, pi c / sqrt(det S) [rad^2/s]."""
-        return math.pi * self.level / math.sqrt(float(np.linalg.det(self.S)))
-
     def counterexamples(self) -> int:
         """Return how many samples in the proven set were not attracted: 0, or proof or sampling is wrong."""
         x, v = np.meshgrid(self.angles, self.velocities)

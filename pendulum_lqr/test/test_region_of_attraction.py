@@ -104,7 +104,8 @@ def test_sampling_through_the_batch_engine_of_the_simulator_contains_the_proven_
 
     region = region_of_attraction(smooth, gain, 1.5, rollout, velocity_span=10.0, points=41)
     assert region.counterexamples() == 0
-    assert 0.0 < region.proven_area < region.area
+    proven = math.pi * region.level / math.sqrt(np.linalg.det(region.S))
+    assert 0.0 < proven < region.area
     assert region.attracted[20, 20]
     assert not region.attracted[20, 0]
     own = region_of_attraction(smooth, gain, 1.5, rigid_rollout(smooth, gain, 1.5, 6.0), velocity_span=10.0, points=41)

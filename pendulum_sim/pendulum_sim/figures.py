@@ -7,9 +7,8 @@ from pathlib import Path
 
 import numpy as np
 from matplotlib.figure import Figure
-from numpy.typing import ArrayLike
 
-from pendulum_msgs_py.errors import DataError, ParameterError
+from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.plants.equilibrium import (
     FixedPoint,
     fixed_points,
@@ -19,7 +18,7 @@ from pendulum_msgs_py.plants.equilibrium import (
 )
 from pendulum_msgs_py.plants.plant_parameters import PlantParameters
 
-__all__ = ["overdamped_points", "plot_evolution", "plot_overdamped_phase", "save_figure"]
+__all__ = ["overdamped_points", "plot_overdamped_phase", "save_figure"]
 
 _STABLE, _UNSTABLE, _LINE = "#1b7f5c", "#c4472f", "#2b6cb0"
 
@@ -83,60 +82,6 @@ def plot_overdamped_phase(parameters: PlantParameters, torque: float = 0.0) -> F
     axes.set_title(rf"Overdamped pendulum, $b\,\dot\theta + G\,\sin\theta = u_0$, $u_0$ = {torque:g} N m")
     if points:
         figure.legend(loc="outside lower center", ncols=2, frameon=False)
-    return figure
-
-
-def plot_evolution(
-    times: ArrayLike,
-    states: ArrayLike,
-    efforts: ArrayLike | None = None,
-    disturbances: ArrayLike | None = None,
-    *,
-    title: str = "",
-) -> Figure:
-    """Draw how the state of a run evolves: angle, velocity and, if given, torques.
-
-    Args:
-        times: Shape (N,) [s].
-        states: x = [theta, theta_dot] in whatever convention, shape (N, 2) [rad, rad/s].
-        efforts: Torque of the controller, shape (N,) [N m].
-        disturbances: Torque of the disturbance, shape (N,) [N m].
-        title: Title of the figure.
-
-    Raises:
-        DataError: The shapes do not go together.
-    """
-    t, x = np.asarray(times, dtype=float), np.asarray(states, dtype=float)
-    if t.ndim != 1 or x.shape != (t.size, 2):
-        raise DataError(f"times have shape {t.shape} and states {x.shape}; expected (N,) and (N, 2)")
-    torques = [
-        (np.asarray(values, dtype=float), label, colour)
-        for values, label, colour in (
-            (disturbances, "disturbance", "#dc8c14"),
-            (efforts, "controller", _LINE),
-        )
-        if values is not None
-    ]
-    for values, label, _ in torques:
-        if values.shape != t.shape:
-            raise DataError(f"torques of the {label} have shape {values.shape}; expected {t.shape}")
-    rows = 3 if torques else 2
-    figure = Figure(figsize=(8.0, 2.2 * rows), layout="constrained")
-    axes = figure.subplots(rows, 1, sharex=True)
-    axes[0].plot(t, x[:, 0], color=_LINE, linewidth=1.2)
-    axes[0].set_ylabel(r"$\theta$ [rad]")
-    axes[1].plot(t, x[:, 1], color=_STABLE, linewidth=1.2)
-    axes[1].set_ylabel(r"$\dot\theta$ [rad/s]")
-    if torques:
-        for values, label, colour in torques:
-            axes[2].plot(t, values, color=colour, linewidth=1.0, label=label)
-        axes[2].set_ylabel("torque [N m]")
-        axes[2].legend(loc="upper right")
-    axes[-1].set_xlabel("time [s]")
-    for axis in axes:
-        axis.grid(alpha=0.3)
-    if title:
-        figure.suptitle(title)
     return figure
 
 

@@ -10,11 +10,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pendulum_msgs_py.errors import DataError, ParameterError
+from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.plants.equilibrium import overdamped_velocity
 from pendulum_msgs_py.plants.plant_parameters import load_plant
 from pendulum_sim.drawing import PendulumPicture, rotation_matrix, save_gif, save_png
-from pendulum_sim.figures import overdamped_points, plot_evolution, save_figure
+from pendulum_sim.figures import overdamped_points
 from pendulum_sim.phase_plot import main
 from pendulum_sim.plants import make_plant
 
@@ -82,15 +82,6 @@ def test_phase_plot_writes_a_figure_and_prints_the_points(tmp_path: Path, capsys
     assert figure.stat().st_size > 1000
     assert main(["--output", str(tmp_path / "phase.bmp")]) == 2
     assert "ends in '.bmp'; expected .png, .svg or .pdf" in capsys.readouterr().err
-
-
-def test_the_evolution_of_a_run_is_drawn_with_its_torques(tmp_path: Path) -> None:
-    t = np.linspace(0.0, 1.0, 50)
-    figure = plot_evolution(t, np.stack([np.sin(t), np.cos(t)], axis=1), efforts=t, disturbances=-t)
-    assert len(figure.axes) == 3
-    assert save_figure(figure, tmp_path / "run.png").stat().st_size > 1000
-    with pytest.raises(DataError, match=r"expected \(N,\) and \(N, 2\)"):
-        plot_evolution(t, np.zeros((3, 2)))
 
 
 def test_the_rotation_matrix_turns_counter_clockwise() -> None:

@@ -11,9 +11,9 @@ from scipy.signal import lfilter
 
 from pendulum_bags.identification.model import from_plant
 from pendulum_bags.identification.result import IdentificationResult
-from pendulum_bags.identification.synthetic import multisine, synthetic_recording
 from pendulum_bags.runs.datasets import Recording
 from pendulum_msgs_py.plants.plant_parameters import PlantParameters
+from tests.synthetic_recordings import multisine, synthetic_recording
 
 __all__ = ["OUTSIDE", "PLANT", "TRUTHS", "Truth", "covered", "outside"]
 

@@ -14,12 +14,12 @@ from pendulum_bags.identification.output_error import fit_output_error
 from pendulum_bags.identification.result import identify
 from pendulum_bags.identification.selection import akaike_weights, choose
 from pendulum_bags.identification.solver import solve
-from pendulum_bags.identification.synthetic import synthetic_recording
 from pendulum_bags.identification.uncertainty import unresolved_offset
 from pendulum_bags.identification.window_score import window_rms
 from pendulum_bags.runs.read_recording import read_recording
 from pendulum_msgs_py.plants.plant_parameters import PlantParameters
 from tests.benchmarks.identification_truths import OUTSIDE, TRUTHS, covered, outside
+from tests.synthetic_recordings import synthetic_recording
 
 
 def test_intervals_of_the_default_path_hold_the_truth():

@@ -6,11 +6,11 @@ import pytest
 from pendulum_bags.identification.kernel import PARAMETER_NAMES
 from pendulum_bags.identification.model import FitModel, from_plant, to_plant
 from pendulum_bags.identification.problem import cut_windows, prepare, simulate
-from pendulum_bags.identification.synthetic import multisine, synthetic_recording
 from pendulum_bags.identification.window_score import free_run_rms, window_rms, window_score
 from pendulum_bags.runs.datasets import Recording
 from pendulum_msgs_py.errors import DataError
 from pendulum_msgs_py.plants.plant_parameters import PlantParameters
+from tests.synthetic_recordings import multisine, synthetic_recording
 
 PLANT = PlantParameters(
     inertia=0.05,

@@ -45,7 +45,6 @@ _COMMAND = struct.Struct("<4d")
 _INTEGERS = 3
 _FLAGS = 6
 _FEEDBACK = struct.Struct(f"<{_INTEGERS}q{len(Feedback._fields) - _INTEGERS - _FLAGS}d{_FLAGS}b")
-_INFINITE = ("min_target", "max_target")
 
 
 def kind_of(packet: bytes) -> bytes:

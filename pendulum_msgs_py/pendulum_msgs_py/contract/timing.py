@@ -30,10 +30,6 @@ class SteadyWallClock:
         """Return the time [ns]."""
         return self._monotonic() + self._offset
 
-    def to_monotonic(self, stamp_ns: int) -> int:
-        """Return the monotonic time at which this clock shows a stamp [ns]."""
-        return stamp_ns - self._offset
-
 
 class RingOfTimes:
     """The last N durations, kept without allocation; percentiles are computed when somebody asks."""

@@ -6,10 +6,9 @@ there is no second copy of an equation anywhere. They use ``math`` only and neve
 
 from pendulum_msgs_py.dynamics.rigid import (
     friction_magnitude,
-    friction_torque,
     gravity_torque,
     rigid_acceleration,
     rigid_energy,
 )
 
-__all__ = ["friction_magnitude", "friction_torque", "gravity_torque", "rigid_acceleration", "rigid_energy"]
+__all__ = ["friction_magnitude", "gravity_torque", "rigid_acceleration", "rigid_energy"]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 
-__all__ = ["friction_magnitude", "friction_torque", "gravity_torque", "rigid_acceleration", "rigid_energy"]
+__all__ = ["friction_magnitude", "gravity_torque", "rigid_acceleration", "rigid_energy"]
 
 
 def gravity_torque(theta: float, gravity: float) -> float:
@@ -52,18 +52,6 @@ def friction_magnitude(speed: float, coulomb: float, static: float, stribeck_vel
         return coulomb
     ratio = speed / stribeck_velocity
     return coulomb + (static - coulomb) * math.exp(-ratio * ratio)
-
-
-def friction_torque(theta_dot: float, coulomb: float, static: float, stribeck_velocity: float) -> float:
-    """Return the dry friction that opposes sliding; 0 at rest, where stiction is a matter of balance [N m].
-
-    Args: as in :func:`friction_magnitude`.
-    """
-    if theta_dot > 0.0:
-        return friction_magnitude(theta_dot, coulomb, static, stribeck_velocity)
-    if theta_dot < 0.0:
-        return -friction_magnitude(theta_dot, coulomb, static, stribeck_velocity)
-    return 0.0
 
 
 def rigid_energy(theta: float, theta_dot: float, inertia: float, gravity: float) -> float:

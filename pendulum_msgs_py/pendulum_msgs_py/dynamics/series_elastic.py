@@ -20,7 +20,6 @@ from __future__ import annotations
 import math
 
 __all__ = [
-    "COPPER_REFERENCE_TEMPERATURE",
     "dahl_step",
     "dry_friction_step",
     "feedforward_pwm",
@@ -28,14 +27,10 @@ __all__ = [
     "motor_acceleration",
     "shorted_winding_damping",
     "spring_deflection",
-    "spring_stiffness",
     "spring_torque",
     "winding_current",
     "winding_resistance_at",
 ]
-
-COPPER_REFERENCE_TEMPERATURE = 20.0
-"""Temperature at which datasheets give a winding's resistance [degC]."""
 
 
 def winding_resistance_at(temperature: float, resistance: float, coefficient: float) -> float:
@@ -123,14 +118,6 @@ def spring_torque(
         hysteresis_torque: tau_h, half width of the loop [N m].
     """
     return (stiffness + hardening * deflection * deflection) * deflection + hysteresis_torque * hysteresis_state
-
-
-def spring_stiffness(deflection: float, stiffness: float, hardening: float) -> float:
-    """Return the tangent stiffness of the spring, k + 3 k_3 delta^2 [N m/rad].
-
-    Args: as in :func:`spring_torque`.
-    """
-    return stiffness + 3.0 * hardening * deflection * deflection
 
 
 def spring_deflection(torque: float, stiffness: float, hardening: float) -> float:

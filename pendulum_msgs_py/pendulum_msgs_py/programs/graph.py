@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shlex
 import sys
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -55,10 +54,6 @@ class NodeProgram:
     def command(self) -> list[str]:
         """Return the command that starts it with this interpreter."""
         return [sys.executable, "-m", self.package, self.executable, *self.ros_arguments()]
-
-    def command_line(self) -> str:
-        """Return the command as a user would type it, for messages and records."""
-        return shlex.join(["python", "-m", self.package, self.executable, *self.ros_arguments()])
 
 
 def simulator(namespace: str, **parameters: ParameterArgument) -> NodeProgram:

@@ -15,7 +15,6 @@ __all__ = ["GAP_MARGIN", "same_plant", "which_controllers"]
 GAP_MARGIN = 0.2
 """Gap that does not matter: a loop with a margin b(P, K) above it, as an LQR on this plant has, keeps its stability."""
 _WEAK_COHERENCE = 0.5
-_LARGE_TORQUE = 0.98
 
 
 def same_plant(
