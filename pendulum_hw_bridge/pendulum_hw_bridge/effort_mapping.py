@@ -145,13 +145,12 @@ class EffortMapping:
         emf = self.back_emf_pwm(1.0, motor.voltage) if self.kind is not EffortStrategy.DIRECT_PWM else 0.0
         low, high = max(-1.0, -duty + emf * motor.lowest), min(1.0, duty + emf * motor.highest)
         # A speed costs duty. Given in advance, a blocked link would get it as torque: only so much more than there is.
-        room = motor.highest if command.velocity > 0.0 else -motor.lowest
-        room += self._start_velocity(motor.voltage)
+        start = self._start_velocity(motor.voltage)
         return replace(
             command,
             effort=_clip(command.effort, -limit, limit),
             pwm=_clip(command.pwm, low, high),
-            velocity=_clip(command.velocity, -room, room),
+            velocity=_clip(command.velocity, motor.lowest - start, motor.highest + start),
         )
 
     def limited_gains(self, voltage: float) -> GainSet:

@@ -78,7 +78,7 @@ class OutputCheck:
             return self._effort_fault("not known") if self._too_much >= _WRONG else None
         still, moving = mapping.motor_effort(pwm, 0.0, voltage), mapping.motor_effort(pwm, velocity, voltage)
         # A motor that is turned against its will brakes, whatever the duty: that torque is the turner's.
-        effort = min(abs(still), abs(moving)) if still * moving > 0.0 else 0.0
+        effort = max(min(still, moving), -max(still, moving))
         factor, margin = _EFFORT_MARGIN
         self._too_much = self._too_much + 1 if effort > factor * mapping.effort_limit + margin else 0
         return self._effort_fault(f"{effort:.1f} N m") if self._too_much >= 2 else None
@@ -92,15 +92,14 @@ class OutputCheck:
         pwm = feedback.pwm_command
         # The firmware may normalise its feed-forward of velocity with the nominal voltage or with the present one.
         voltages = (self.mapping.drivetrain.supply_voltage, feedback.voltage)
-        wanted = [self._expected(c, feedback, voltage) for c in candidates for voltage in voltages]
-        commands = [c for c in candidates for _ in voltages]
-        agrees = [self._agrees(feedback, *pair) for pair in zip(commands, wanted, strict=True)]
-        self._wrong.append(not any(agrees))
-        self._duties.append((pwm, wanted[0]))
-        text = f"duty is {pwm:.4f}; setpoints and gains ask for {wanted[0]:.4f}"
+        wanted = [(c, self._expected(c, feedback, voltage)) for c in candidates for voltage in voltages]
+        self._wrong.append(not any(self._agrees(feedback, command, duty) for command, duty in wanted))
+        _, likeliest = wanted[0]
+        self._duties.append((pwm, likeliest))
+        text = f"duty is {pwm:.4f}; setpoints and gains ask for {likeliest:.4f}"
         if sum(self._wrong) >= _WRONG:
             return Fault("output_disagreement", f"{text}: stuck, runaway, other gains or another strategy?")
-        duties, asked = zip(*self._duties, strict=True)
+        duties, asked = [duty for duty, _ in self._duties], [duty for _, duty in self._duties]
         still = len(duties) == _RECORDS and min(duties) == max(duties)
         threshold = _STILL
         if math.isfinite(candidates[0].effort):

@@ -1,6 +1,6 @@
 """Which rules are broken, and which tests have to notice: the safety rules of both plants, without DDS.
 
-Not here yet: output check, effort mapping, bridge, HEBI backend and the watch for two commanders.
+Not here yet: bridge and HEBI backend.
 """
 
 from __future__ import annotations
@@ -65,6 +65,21 @@ TARGETS: tuple[Target, ...] = (
         (f"{_BRIDGE}/test_safety_monitor.py",),
     ),
     Target("pendulum_hw_bridge.motor_state", ("MotorWatch",), (f"{_BRIDGE}/test_motor_state.py",)),
+    Target(
+        "pendulum_hw_bridge.output_check",
+        ("OutputCheck", "_output", "_memoryless"),
+        (f"{_BRIDGE}/test_output_check.py",),
+    ),
+    Target(
+        "pendulum_hw_bridge.effort_mapping",
+        ("EffortMapping", "_clip"),
+        (f"{_BRIDGE}/test_effort_mapping.py",),
+    ),
+    Target(
+        "pendulum_msgs_py.ros.commander_watch",
+        ("CommanderWatch",),
+        ("pendulum_msgs_py/test/test_commander_watch.py",),
+    ),
     Target("pendulum_hw_bridge.derating", ("Derating",), (f"{_BRIDGE}/test_derating.py",)),
     Target("pendulum_hw_bridge.e_stop_input", ("EStopInput",), (f"{_BRIDGE}/test_e_stop_input.py",)),
 )
