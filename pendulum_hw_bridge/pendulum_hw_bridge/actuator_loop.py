@@ -68,8 +68,7 @@ class ActuatorLoop:
         self._closing = threading.Event()
         self._job_waiting = threading.Event()
         self._last_state_ns: int | None = None
-        self._thread = threading.Thread(target=self._run, name="actuator", daemon=True)
-        self._thread.start()
+        self._thread = self._start()
 
     # --- from other threads ---------------------------------------------------------------------------------
 
@@ -115,6 +114,11 @@ class ActuatorLoop:
 
     # --- in the thread --------------------------------------------------------------------------------------
 
+    def _start(self) -> threading.Thread:
+        thread = threading.Thread(target=self._run, name="actuator", daemon=True)
+        thread.start()
+        return thread
+
     def _run(self) -> None:
         try:
             while not self._closing.is_set():
@@ -148,7 +152,10 @@ class ActuatorLoop:
             self.bridge.fail("exception", f"{type(error).__name__}: {error}")
             self.bridge.release()
             self._report(f"cycle of the actuator failed: {type(error).__name__}: {error}")
-            self._closing.wait(self._period)
+            self._pause()
+
+    def _pause(self) -> None:
+        self._closing.wait(self._period)
 
     def _cycle(self) -> None:
         bridge = self.bridge

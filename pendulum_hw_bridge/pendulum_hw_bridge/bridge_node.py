@@ -21,7 +21,7 @@ from pendulum_hw_bridge.actuator_loop import ActuatorLoop
 from pendulum_hw_bridge.backends import BACKENDS
 from pendulum_hw_bridge.bridge import Bridge, Outcome
 from pendulum_hw_bridge.bridge_consistency import check_consistency
-from pendulum_hw_bridge.clocks import SteppedClock, WallClock
+from pendulum_hw_bridge.clocks import Clock, SteppedClock, WallClock
 from pendulum_hw_bridge.derating import Derating
 from pendulum_hw_bridge.e_stop_input_node import EStopInputServer
 from pendulum_hw_bridge.e_stop_node import EStopServer
@@ -32,7 +32,7 @@ from pendulum_hw_bridge.safety import SafetyMonitor
 from pendulum_hw_bridge.shared_supervisor import SharedSupervisor
 from pendulum_msgs_py.contract.plant_specs import LOCKSTEP_EPOCH_NS, limits_from_parameters
 from pendulum_msgs_py.contract.supervisor import Drive, DriveKind, Input, Mode
-from pendulum_msgs_py.contract.timing import LoopStatistics, SteadyWallClock
+from pendulum_msgs_py.contract.timing import LoopStatistics
 from pendulum_msgs_py.contract.values import NANOSECONDS, JointCommand, JointSample
 from pendulum_msgs_py.errors import PendulumError
 from pendulum_msgs_py.plants.plant_differences import PLANT_PARAMETERS, describe_plants
@@ -75,17 +75,21 @@ class BridgeNode(LifecycleNode):
 
     Args:
         stop: Asks the runner to end the process.
+        options: Further arguments of a node, such as ``parameter_overrides``.
     """
 
-    def __init__(self, stop: Callable[[], None]) -> None:
-        super().__init__("bridge", enable_logger_service=True)
+    loop_type = ActuatorLoop
+    """What turns the bridge's cycles in real time."""
+
+    def __init__(self, stop: Callable[[], None], **options: Any) -> None:
+        super().__init__("bridge", enable_logger_service=True, **options)
         self._stop_runner = stop
         self.failure: Exception | None = None
         self._values = values = NodeParameters(self, with_lab_file(self, SPECS)).values
         self._lockstep = values["clock"] == "lockstep"
         self._period_ns = round(NANOSECONDS / values["feedback_rate"])
         self._statistics = LoopStatistics(self._period_ns)
-        self._wall = SteadyWallClock()
+        self._port_clock = self._make_clock()
         self._active = False
         self._loop: ActuatorLoop | None = None
         self._bridge: Bridge | None = None
@@ -102,7 +106,7 @@ class BridgeNode(LifecycleNode):
             self._supervisor,
             (lambda: self._lockstep_loop.now_ns if self._lockstep_loop else LOCKSTEP_EPOCH_NS)
             if self._lockstep
-            else self._wall,
+            else self._port_clock.now_ns,
             push=BACKENDS[values["backend"]].is_emulated,
             e_stop=False,
             statistics=None if self._lockstep else self._statistics,
@@ -189,19 +193,22 @@ class BridgeNode(LifecycleNode):
         """Let the lockstep loop do what is due; return when it wants to be called again [s], None in real time."""
         return None if self._lockstep_loop is None else self._lockstep_loop.run_due()
 
+    def _make_clock(self) -> Clock:
+        return WallClock()
+
     # --- lifecycle -----------------------------------------------------------------------------------------
 
     @_logged
     def on_configure(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Connect the actuator; every setting must read back."""
         values = self._values
-        clock = SteppedClock(LOCKSTEP_EPOCH_NS) if self._lockstep else WallClock(self._wall)
-        self._port_clock = clock
-        port = bridge_parameters.make_port(values, clock, lockstep=self._lockstep)
+        if self._lockstep:
+            self._port_clock = SteppedClock(LOCKSTEP_EPOCH_NS)
+        port = bridge_parameters.make_port(values, self._port_clock, lockstep=self._lockstep)
         monitor = SafetyMonitor(self._safety, self._period_ns / NANOSECONDS, self._plant.drivetrain)
         self._bridge = bridge = Bridge(port, self._supervisor, self._mapping, monitor, self._settings)
         if not self._lockstep:
-            self._loop = ActuatorLoop(
+            self._loop = self.loop_type(
                 bridge,
                 self._statistics,
                 on_state=self._on_state,

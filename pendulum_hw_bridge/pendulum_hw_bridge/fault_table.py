@@ -14,7 +14,7 @@ FAULTS = {
     "host_stalled": "the bridge itself did not run for three cycles: a busy or halted machine",
     "module_restarted": "the module's own clock or sequence number went back: it has lost its settings",
     "position_jump": "position changed by more than its velocity allows",
-    "motion_disagreement": "position and velocity tell different motions over five cycles (a stuck encoder)",
+    "motion_disagreement": "position and velocity tell different motions over a fifth of a second (a stuck encoder)",
     "m_stop": "the motion stop is pressed",
     "over_temperature": "the firmware limits or cuts the output, or the winding is above its limit",
     "locked_by_other": "another sender holds the module",

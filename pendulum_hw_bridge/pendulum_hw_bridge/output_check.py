@@ -16,6 +16,7 @@ from pendulum_hw_bridge.effort_mapping import EffortMapping
 from pendulum_hw_bridge.fault_table import Fault
 from pendulum_hw_bridge.gains import GainSet, PidGains
 from pendulum_hw_bridge.motor_state import MOTOR_SPEED_LIMIT
+from pendulum_msgs_py.contract.values import NANOSECONDS
 
 __all__ = ["OutputCheck"]
 
@@ -30,6 +31,8 @@ _STILL = 5e-4
 """Change of what is asked for at which a duty that does not change at all is stuck; its steps are 2.4e-4 [-]."""
 _STILL_EFFORT = 0.02
 """The same under the torque loop: noise of the measured torque moves what is asked for [-]."""
+_OPPOSED_TIME = 0.008
+"""Time for which a duty that stands still may be the opposite of what is asked for [s]."""
 _EFFORT_MARGIN = (1.1, 0.5)
 """A motor's torque is too much above this multiple of the limit and so much more [-, N m]."""
 _NEAR_SPEED_LIMIT = 0.9
@@ -51,12 +54,14 @@ class OutputCheck:
         self._wrong: deque[bool] = deque(maxlen=_RECORDS)
         self._duties: deque[tuple[float, float]] = deque(maxlen=_RECORDS)
         self._too_much = 0
+        self._opposed_since_ns: int | None = None
 
     def reset(self) -> None:
         """Forget earlier records: another strategy begins, or none."""
         self._wrong.clear()
         self._duties.clear()
         self._too_much = 0
+        self._opposed_since_ns = None
 
     def check(self, feedback: Feedback, strategy: Strategy, candidates: Sequence[Command]) -> Fault | None:
         """Return the fault that the duty of a record shows, or None.
@@ -102,13 +107,28 @@ class OutputCheck:
         duties, asked = [duty for duty, _ in self._duties], [duty for _, duty in self._duties]
         still = len(duties) == _RECORDS and min(duties) == max(duties)
         threshold = _STILL
-        if math.isfinite(candidates[0].effort):
+        # Of any: a record may still show the torque loop that the newest setpoints switched off.
+        if any(math.isfinite(candidate.effort) for candidate in candidates):
             loop = self.gains.effort
             clamped = not loop.min_output + _STILL < pwm < loop.max_output - _STILL
             threshold = math.inf if clamped else _STILL_EFFORT
+        if self._opposes(feedback, wanted[0], still):
+            return Fault("output_disagreement", f"{text}, the other way, and has not moved: is it stuck?")
         if still and _memoryless(self.gains) and max(asked) - min(asked) > threshold:
             return Fault("output_disagreement", f"{text}, but it has not moved for {_RECORDS} records: is it stuck?")
         return None
+
+    def _opposes(self, feedback: Feedback, wanted: float, still: bool) -> bool:
+        """Whether a duty that stands still has been the opposite of what is asked for, for too long."""
+        opposed = (
+            still and feedback.pwm_command * wanted < 0.0 and min(abs(feedback.pwm_command), abs(wanted)) > _TOLERANCE
+        )
+        if not opposed:
+            self._opposed_since_ns = None
+        elif self._opposed_since_ns is None:
+            self._opposed_since_ns = feedback.stamp_ns
+        since = self._opposed_since_ns
+        return since is not None and feedback.stamp_ns - since >= _OPPOSED_TIME * NANOSECONDS
 
     def _agrees(self, feedback: Feedback, command: Command, wanted: float) -> bool:
         gains, pwm = self.gains, feedback.pwm_command

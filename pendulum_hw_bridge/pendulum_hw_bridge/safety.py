@@ -6,7 +6,6 @@ here stand those that only an actuator has. Pure: one record in, named faults ou
 
 from __future__ import annotations
 
-import itertools
 import math
 from collections import deque
 
@@ -30,9 +29,14 @@ from pendulum_msgs_py.plants.plant_parameters import SeriesElasticParameters
 __all__ = ["FAULTS", "Fault", "SafetyLimits", "SafetyMonitor"]
 
 _COUNT = 3
-_MOTION_CYCLES = 5
+_MOTION_TIME = 0.2
+"""Time over which position and velocity are compared: even a slow ramp moves further than they may differ [s]."""
+_CURRENT_TIME = 0.5
+"""Time within which wrong winding currents count together [s]."""
 _WAY = 1e-3
 """Longest that a command takes to arrive, as a rule [s]."""
+_CURRENT_SHARE = 0.2
+"""Share of an expected winding current by which it may differ beside its tolerance [-]."""
 _WRONG_COMMANDS = 2
 """Records that show a wrong setpoint to be a fault: one packet may get lost, two in a row do not on a cable [-]."""
 _WRONG_COMMAND_TIME = 0.008
@@ -62,13 +66,15 @@ class SafetyMonitor:
         self.drivetrain = drivetrain
         self._last: Feedback | None = None
         self._last_new_ns: int | None = None
-        self._motion: deque[tuple[int, float, float]] = deque(maxlen=_MOTION_CYCLES + 1)
+        self._motion: deque[tuple[float, float]] = deque(maxlen=round(_MOTION_TIME / period) + 1)
         self._sent: deque[tuple[int, Command]] = deque(maxlen=16)
+        self._travelled = 0.0
         self._strategy = Strategy.OFF
         self._strategy_since_ns = 0
         self._wrong_commands = 0
         self._wrong_since_ns = 0
         self._wrong_currents = 0
+        self._wrong_current_ns = 0
         self._unknown_temperatures = 0
         self._clock_offset_ns: int | None = None
         self._clamped_speed = math.inf
@@ -250,31 +256,29 @@ class SafetyMonitor:
 
     def _check_motion(self, feedback: Feedback) -> Fault | None:
         last = self._last
-        if last is not None and math.isfinite(last.position) and math.isfinite(last.velocity):
-            elapsed = (feedback.hardware_ns - last.hardware_ns) / NANOSECONDS
-            if elapsed < 2.0 * self.timeout:
-                expected = 0.5 * (feedback.velocity + last.velocity) * elapsed
-                jump = feedback.position - last.position - expected
-                if abs(jump) > self.limits.position_jump:
-                    return Fault(
-                        "position_jump",
-                        f"position jumped by {jump:.3f} rad in {elapsed * 1e3:.0f} ms; "
-                        f"expected at most {self.limits.position_jump:g} rad beside the velocity",
-                    )
-        self._motion.append((feedback.hardware_ns, feedback.position, feedback.velocity))
-        if len(self._motion) <= _MOTION_CYCLES:
-            return None
-        points = list(self._motion)
-        travelled = sum(
-            0.5 * (after[2] + before[2]) * (after[0] - before[0]) / NANOSECONDS
-            for before, after in itertools.pairwise(points)
-        )
-        gap = travelled - (points[-1][1] - points[0][1])
-        if abs(gap) > self.limits.position_disagreement:
+        elapsed = math.inf if last is None else (feedback.hardware_ns - last.hardware_ns) / NANOSECONDS
+        expected = math.nan if last is None else 0.5 * (feedback.velocity + last.velocity) * elapsed
+        if last is None or not (elapsed < 2.0 * self.timeout and math.isfinite(expected + last.position)):
+            # What happened in between is not known: the comparison begins anew.
+            self._motion.clear()
+            expected = 0.0
+        else:
+            jump = feedback.position - last.position - expected
+            if abs(jump) > self.limits.position_jump:
+                return Fault(
+                    "position_jump",
+                    f"position jumped by {jump:.3f} rad in {elapsed * 1e3:.0f} ms; "
+                    f"expected at most {self.limits.position_jump:g} rad beside the velocity",
+                )
+        self._travelled += expected
+        self._motion.append((self._travelled, feedback.position))
+        travelled = self._travelled - self._motion[0][0]
+        moved = feedback.position - self._motion[0][1]
+        if abs(travelled - moved) > self.limits.position_disagreement:
             return Fault(
                 "motion_disagreement",
-                f"velocity says {travelled:.4f} rad, position {points[-1][1] - points[0][1]:.4f} rad in "
-                f"{_MOTION_CYCLES} cycles; expected them within {self.limits.position_disagreement:g} rad",
+                f"velocity says {travelled:.4f} rad, position {moved:.4f} rad in {_MOTION_TIME:g} s; "
+                f"expected them within {self.limits.position_disagreement:g} rad",
             )
         return None
 
@@ -341,8 +345,14 @@ class SafetyMonitor:
             drive.gear_ratio,
             resistance,
         )
-        wrong = not abs(feedback.winding_current - expected) <= tolerance + 0.2 * abs(expected)
-        self._wrong_currents = self._wrong_currents + 1 if wrong else 0
+        wrong = not abs(feedback.winding_current - expected) <= tolerance + _CURRENT_SHARE * abs(expected)
+        # So little is asked for that no current at all would do as well: such a record neither accuses nor excuses.
+        tells = abs(expected) > tolerance / (1.0 - _CURRENT_SHARE)
+        lapsed = feedback.stamp_ns - self._wrong_current_ns > _CURRENT_TIME * NANOSECONDS
+        if wrong and (lapsed or not self._wrong_currents):
+            self._wrong_currents, self._wrong_current_ns = 0, feedback.stamp_ns
+        if wrong or tells:
+            self._wrong_currents = self._wrong_currents + 1 if wrong else 0
         if self._wrong_currents >= _COUNT:
             return Fault(
                 "winding_current",

@@ -19,7 +19,7 @@ class SafetyLimits:
         voltage_max: [V].
         measured_effort: Largest torque that the spring may show [N m].
         position_jump: Largest change of position beyond that of the velocity, in one cycle [rad].
-        position_disagreement: Largest disagreement of position and integrated velocity in five cycles [rad].
+        position_disagreement: Largest disagreement of position and integrated velocity in a fifth of a second [rad].
         winding_current: Largest disagreement of the winding current; 0 switches the check off [A].
         command_tolerance: Largest difference between the setpoint sent and the one in force [rad or N m].
         pwm_tolerance: The same for a PWM duty; the firmware's steps are 2.4e-4 [-].

@@ -1,41 +1,83 @@
-"""A bridge on the emulated actuator in simulated time, and every fault that it must survive.
+"""A bridge on the emulated actuator in simulated time: the bridge's own loop, turned by hand.
 
-Each scenario starts in regulation at the top (LQR under noise) or on a ramp under position control, lets one fault
-begin at a random instant, and watches the duty at the motor itself, which no sensor of the bridge sees.
+A controller regulates at the top (LQR under noise), or the bridge follows a ramp. What the motor does is watched at the
+motor itself, which no sensor of the bridge sees.
 """
 
 from __future__ import annotations
 
-import math
+import threading
 from collections.abc import Callable
-from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
-from pendulum_hw_bridge.actuator import HardwareLimits, Strategy
+from pendulum_hw_bridge.actuator import HardwareLimits
+from pendulum_hw_bridge.actuator_loop import ActuatorLoop
 from pendulum_hw_bridge.backends.emulator import EmulatorBackend
 from pendulum_hw_bridge.bridge import Bridge, Outcome
 from pendulum_hw_bridge.clocks import SteppedClock
 from pendulum_hw_bridge.effort_mapping import EffortMapping, EffortStrategy
-from pendulum_hw_bridge.emulation.faults import ActuatorFault
 from pendulum_hw_bridge.emulation.parameters import load_emulator
 from pendulum_hw_bridge.emulation.x5 import EmulatedX5, LinkState
 from pendulum_hw_bridge.safety import SafetyLimits, SafetyMonitor
 from pendulum_hw_bridge.settings import BridgeSettings
 from pendulum_msgs_py.contract.angles import UPRIGHT, from_upright
-from pendulum_msgs_py.contract.supervisor import Drive, DriveKind, Input, Mode, PlantLimits, PlantSupervisor
+from pendulum_msgs_py.contract.supervisor import Input, PlantLimits, PlantSupervisor
+from pendulum_msgs_py.contract.timing import LoopStatistics
 from pendulum_msgs_py.contract.trajectory import thesis_ramp
 from pendulum_msgs_py.contract.values import JointCommand
 
-__all__ = ["SCENARIOS", "Reaction", "Rig", "Scenario", "run_scenario"]
+__all__ = ["MILLISECOND", "SECOND", "Rig", "SteppedLoop"]
 
 MILLISECOND = 1_000_000
 SECOND = 1_000_000_000
 _K = (33.345265, 0.158993)
 _NOISE = 2.5
-_WARM_UP = 0.4
-_WATCH = 0.4
 _ANSWER_DELAY_NS = MILLISECOND
+_COMMAND_LIFE_NS = 50 * MILLISECOND
+
+
+class SteppedLoop(ActuatorLoop):
+    """The bridge's loop without a thread of its own, in simulated time: ``turn`` is what the thread does over and over.
+
+    Attributes:
+        answer: Called where the thread waits for answers to a state.
+        outcomes: What was done, cycle by cycle.
+    """
+
+    def __init__(self, bridge: Bridge, *arguments: Any, **options: Any) -> None:
+        self.answer: Callable[[], None] = lambda: None
+        self.outcomes: list[Outcome] = []
+        super().__init__(bridge, *arguments, **{**options, "answer_window": 0.0})
+
+    def turn(self) -> None:
+        """Run the jobs that wait, then one cycle."""
+        self._run_jobs()
+        self._guarded_cycle()
+
+    def close(self) -> None:
+        """Release the actuator and let it go, as the thread does on its way out."""
+        self.bridge.close()
+
+    def _start(self) -> threading.Thread:
+        return threading.current_thread()
+
+    def _pause(self) -> None:
+        self._wait(round(self._period * SECOND))
+
+    def _wait(self, duration_ns: int) -> None:
+        clock = self.bridge.port.clock  # type: ignore[attr-defined]  # the emulator's port has one
+        clock.wait_until(clock.now_ns() + duration_ns)
+
+    def _wait_for_answers(self, stamp_ns: int) -> None:
+        self.answer()
+        super()._wait_for_answers(stamp_ns)
+
+    def _decide_and_act(self) -> Outcome:
+        outcome = super()._decide_and_act()
+        self.outcomes.append(outcome)
+        return outcome
 
 
 class Rig:
@@ -52,6 +94,12 @@ class Rig:
         goal: End of the ramp [rad]; by default 1.5 rad further.
     """
 
+    loop: SteppedLoop
+    bridge: Bridge
+    supervisor: PlantSupervisor
+    port: EmulatorBackend
+    actuator: EmulatedX5
+
     def __init__(
         self,
         seed: int = 0,
@@ -64,16 +112,41 @@ class Rig:
         start: float | None = None,
         goal: float | None = None,
     ) -> None:
+        self.clock = SteppedClock(SECOND)
+        self.period = 1.0 / rate
+        self.effort_limit = effort_limit
+        if start is None:
+            start = 0.5 if moving else UPRIGHT + 0.05
+        self.random = np.random.Generator(np.random.Philox(key=[seed, 7]))
+        self.controlling = self.disturbing = not moving
+        self.alive = True
+        self.closed = False
+        self.break_cycle: Callable[[], None] = lambda: None
+        self.send: Callable[[JointCommand], None] = self._send
+        self.duties: list[tuple[int, float, float]] = []
+        self.positions: list[float] = []
+        self.asked: list[tuple[int, float]] = []
+        self._last_asked = (-SECOND, 0.0)
+        self._build(kind, seed, start, voltage)
+        self.actuator.trace = self._watch
+        while self.bridge.feedback is None:
+            self.loop.turn()
+        refusal = self.arm()
+        assert not refusal, refusal
+        self.loop.answer = self._answer
+        if moving:
+            refusal = self.follow(start + 1.5 if goal is None else goal)
+            assert not refusal, refusal
+
+    def _build(self, kind: EffortStrategy, seed: int, start: float, voltage: float | None) -> None:
+        """Make actuator, supervisor, bridge and loop."""
         parameters = load_emulator("thesis")
         drivetrain = parameters.drivetrain
         if voltage is not None:
             parameters = parameters.with_drivetrain(supply_voltage=voltage)
-        self.clock = SteppedClock(SECOND)
-        if start is None:
-            start = 0.5 if moving else UPRIGHT + 0.05
+        effort_limit = self.effort_limit
         self.actuator = EmulatedX5(parameters, seed=seed, position=start, start_ns=self.clock.now_ns())
         self.port = EmulatorBackend(self.actuator, self.clock, seed=seed)
-        self.period = 1.0 / rate
         limits = PlantLimits(
             effort=effort_limit,
             feedback_timeout=max(4.0 * self.period, 0.03),
@@ -88,25 +161,40 @@ class Rig:
             self.supervisor,
             EffortMapping(kind, drivetrain, effort_limit=effort_limit),
             SafetyMonitor(SafetyLimits(measured_effort=effort_limit + 1.0), self.period, drivetrain),
-            BridgeSettings(feedback_rate=rate, limits=HardwareLimits(effort=effort_limit, pwm=0.6)),
+            BridgeSettings(feedback_rate=1.0 / self.period, limits=HardwareLimits(effort=effort_limit, pwm=0.6)),
         )
-        self.random = np.random.Generator(np.random.Philox(key=[seed, 7]))
-        self.controlling = self.disturbing = not moving
-        self.alive = True
-        self.closed = False
-        self.break_cycle: Callable[[], None] = lambda: None
-        self.send: Callable[[JointCommand], None] = self._send
-        self.duties: list[tuple[int, float, float]] = []
-        self.largest_commanded = 0.0
-        self.outcomes: list[Outcome] = []
-        self.actuator.trace = self._watch
         self.bridge.connect()
-        while self.bridge.observe(0.5 * self.period) is None:
-            pass
-        assert not self.bridge.prepare()
-        assert not self.supervisor.arm(self.port.now_ns(), self.bridge.sample)
-        if moving:
-            assert not self.follow(start + 1.5 if goal is None else goal)
+        self.loop = SteppedLoop(
+            self.bridge,
+            LoopStatistics(round(self.period * SECOND)),
+            on_state=lambda sample, feedback: None,
+            decide=lambda: self.supervisor.decide(self.port.now_ns(), self.bridge.sample),
+            on_outcome=lambda stamp_ns, outcome: self.supervisor.report_applied(outcome.effort),
+        )
+
+    @property
+    def outcomes(self) -> list[Outcome]:
+        """What the bridge did, cycle by cycle."""
+        return self.loop.outcomes
+
+    # --- what a person does ---------------------------------------------------------------------------------
+
+    def arm(self) -> str:
+        """Arm; return why not, or an empty string."""
+        return self.bridge.prepare() or self.supervisor.arm(self.port.now_ns(), self.bridge.sample)
+
+    def disarm(self) -> None:
+        """Disarm."""
+        self.supervisor.disarm(self.port.now_ns())
+
+    def e_stop(self) -> None:
+        """Press the e-stop."""
+        self.supervisor.e_stop(self.port.now_ns())
+
+    def close(self) -> None:
+        """End the bridge as a signal does."""
+        self.bridge.close()
+        self.alive, self.closed = False, True
 
     def follow(self, goal: float) -> str:
         """Ramp to an angle [rad]; return why not, or an empty string."""
@@ -114,6 +202,8 @@ class Rig:
         assert sample is not None
         ramp = thesis_ramp(sample.position, goal)
         return self.supervisor.accept_trajectory(ramp, self.port.now_ns(), sample)
+
+    # --- time -----------------------------------------------------------------------------------------------
 
     def run(self, duration: float) -> None:
         """Let time pass [s]; a bridge that is not alive does nothing any more, the actuator goes on."""
@@ -123,33 +213,10 @@ class Rig:
                 self.clock.wait_until(end)
                 self.actuator.advance_to(end)
                 return
-            self._cycle()
-
-    def _cycle(self) -> None:
-        """One turn of the actuator's thread, with its guard around it."""
-        try:
-            feedback = self.bridge.observe(0.005)
-            armed = self.supervisor.mode.armed
-            if feedback is None:
-                drive = self._decide()
-                if drive.kind is DriveKind.OFF or drive.starved:
-                    self.bridge.carry_out(drive, was_armed=armed)
-                return
-            self.break_cycle()
-            self._answer()
-            outcome = self.bridge.carry_out(self._decide(), was_armed=armed)
-            self.largest_commanded = max(self.largest_commanded, abs(outcome.effort))
-            self.outcomes.append(outcome)
-            self.supervisor.report_applied(outcome.effort)
-        except Exception as error:  # noqa: BLE001
-            self.bridge.fail("exception", str(error))
-            self.bridge.release()
-            self.clock.wait_until(self.clock.now_ns() + round(self.period * SECOND))
-
-    def _decide(self) -> Drive:
-        return self.supervisor.decide(self.port.now_ns(), self.bridge.sample)
+            self.loop.turn()
 
     def _answer(self) -> None:
+        self.break_cycle()
         sample = self.bridge.sample
         assert sample is not None
         if self.controlling or self.disturbing:
@@ -157,225 +224,26 @@ class Rig:
         if self.controlling:
             effort = -_K[0] * from_upright(sample.position) - _K[1] * sample.velocity
             self.send(JointCommand(sample.stamp_ns, effort, "controller"))
+        noise = 0.0
         if self.disturbing:
             noise = float(self.random.uniform(-_NOISE, _NOISE))
-            command = JointCommand(sample.stamp_ns, noise, "disturbance")
-            self.supervisor.offer(Input.DISTURBANCE, command, self.port.now_ns())
+            self.disturb(JointCommand(sample.stamp_ns, noise, "disturbance"))
+        now = self.port.now_ns()
+        if self.controlling:
+            # What a controller asks for that sees the truth, whatever the bridge tells it.
+            link = self.actuator.link
+            self._last_asked = now, -_K[0] * from_upright(link.position) - _K[1] * link.velocity
+        if now - self._last_asked[0] <= _COMMAND_LIFE_NS:
+            self.asked.append((now, self._last_asked[1] + noise))
 
     def _send(self, command: JointCommand) -> None:
+        """Let a commander's torque reach the bridge."""
         self.supervisor.offer(Input.EFFORT_COMMAND, command, self.port.now_ns())
+
+    def disturb(self, command: JointCommand) -> None:
+        """Let a disturbance reach the bridge."""
+        self.supervisor.offer(Input.DISTURBANCE, command, self.port.now_ns())
 
     def _watch(self, link: LinkState) -> None:
         self.duties.append((link.time_ns, link.pwm, link.motor_torque))
-
-
-@dataclass(frozen=True)
-class Scenario:
-    """One fault.
-
-    Attributes:
-        name: Name of the fault.
-        begin: Lets it begin.
-        expected: Name of the bridge's fault, or of another reaction: ``starved``, ``refused``, ``off``, ``lifetime``.
-        moving: Takes place on a ramp under position control.
-        zero: Whether torque must go to zero; else regulation goes on.
-        own_torque: The module itself makes torque that nobody asked for, until it is switched off.
-    """
-
-    name: str
-    begin: Callable[[Rig], None]
-    expected: str
-    moving: bool = False
-    zero: bool = True
-    own_torque: bool = False
-
-
-@dataclass(frozen=True)
-class Reaction:
-    """What a scenario came to.
-
-    Attributes:
-        name: Fault.
-        reaction: The bridge's fault or other reaction, as it was.
-        mode: State of the plant afterwards.
-        time_to_zero_ms: From the beginning of the fault to the last instant with a duty on the motor [ms].
-        uncommanded: Largest duty beyond what was commanded, in equivalent torque [N m].
-        stays_zero: Whether the duty stayed zero to the end.
-    """
-
-    name: str
-    reaction: str
-    mode: str
-    time_to_zero_ms: float
-    uncommanded: float
-    stays_zero: bool
-
-
-def _inject(fault: ActuatorFault) -> Callable[[Rig], None]:
-    return lambda rig: rig.actuator.inject(fault)
-
-
-def _lose_controller(rig: Rig) -> None:
-    rig.controlling = False
-
-
-def _lose_controller_and_disturbance(rig: Rig) -> None:
-    rig.controlling = rig.disturbing = False
-
-
-def _lose_disturbance(rig: Rig) -> None:
-    rig.disturbing = False
-
-
-def _kill(rig: Rig) -> None:
-    rig.alive = False
-
-
-def _close(rig: Rig) -> None:
-    rig.bridge.close()
-    rig.alive = False
-    rig.closed = True
-
-
-def _raise(rig: Rig) -> None:
-    def fail() -> None:
-        raise RuntimeError("a bug in a callback")
-
-    rig.break_cycle = fail
-
-
-def _freeze_stamps(rig: Rig) -> None:
-    stamp = rig.bridge.sample.stamp_ns if rig.bridge.sample else 0
-    offer = rig._send
-    rig.send = lambda command: offer(JointCommand(stamp, command.effort, command.source))
-
-
-def _not_a_number(rig: Rig) -> None:
-    offer = rig._send
-    rig.send = lambda command: offer(JointCommand(command.stamp_ns, math.nan, command.source))
-
-
-def _second_commander(rig: Rig) -> None:
-    offer = rig._send
-
-    def both(command: JointCommand) -> None:
-        offer(command)
-        offer(JointCommand(command.stamp_ns + 1, 9.0, "intruder"))
-
-    rig.send = both
-
-
-def _twin_commanders(rig: Rig) -> None:
-    rig.supervisor.set_commander_conflict("2 commanders named /controller; expected one: zero torque")
-
-
-def _press_e_stop(rig: Rig) -> None:
-    rig.supervisor.e_stop(rig.port.now_ns())
-
-
-def _disarm(rig: Rig) -> None:
-    rig.supervisor.disarm(rig.port.now_ns())
-
-
-_F = ActuatorFault
-SCENARIOS: tuple[Scenario, ...] = (
-    Scenario("feedback lost", _inject(_F.FEEDBACK_LOST), "feedback_lost"),
-    Scenario("feedback frozen", _inject(_F.FEEDBACK_FROZEN), "feedback_frozen"),
-    Scenario("feedback at a tenth of its rate", _inject(_F.FEEDBACK_SLOW), "feedback_lost"),
-    Scenario("feedback late by 80 ms", _inject(_F.FEEDBACK_LATE), "feedback_lost"),
-    Scenario("position not a number", _inject(_F.POSITION_NAN), "feedback_not_finite"),
-    Scenario("velocity not a number", _inject(_F.VELOCITY_NAN), "feedback_not_finite"),
-    Scenario("effort not a number", _inject(_F.EFFORT_NAN), "feedback_not_finite"),
-    Scenario("output encoder frozen", _inject(_F.POSITION_FROZEN), "motion_disagreement", moving=True),
-    Scenario("output encoder slips", _inject(_F.POSITION_JUMP), "position_jump"),
-    Scenario("velocity reads 5 rad/s", _inject(_F.VELOCITY_SPIKE), "motion_disagreement"),
-    Scenario("link turns too fast", _inject(_F.OVERSPEED), "supervisor"),
-    Scenario("position outside its window", _inject(_F.OUTSIDE_WINDOW), "position_jump"),
-    Scenario("effort sensor slips", _inject(_F.EFFORT_OFFSET), "effort_measured"),
-    Scenario("output stage stuck", _inject(_F.PWM_STUCK), "command_not_in_force"),
-    Scenario("motor phase broken", _inject(_F.WINDING_OPEN), "winding_current", moving=True),
-    Scenario("commands lost on the way", _inject(_F.COMMANDS_LOST), "command_not_in_force"),
-    Scenario("command cannot be sent", _inject(_F.SEND_FAILED), "send_failed"),
-    Scenario("module held by another sender", _inject(_F.LOCKED_BY_OTHER), "locked_by_other"),
-    Scenario("module changes its strategy", _inject(_F.STRATEGY_CHANGED), "command_not_in_force", own_torque=True),
-    Scenario("module restarts", _inject(_F.MODULE_REBOOT), "module_restarted"),
-    Scenario("motion stop pressed", _inject(_F.M_STOP), "m_stop"),
-    Scenario("motor too hot for the firmware", _inject(_F.OVER_TEMPERATURE_MOTOR), "over_temperature"),
-    Scenario("board too hot for the firmware", _inject(_F.OVER_TEMPERATURE_BOARD), "over_temperature"),
-    Scenario("firmware limits by temperature", _inject(_F.TEMPERATURE_CRITICAL), "over_temperature"),
-    Scenario("winding above its limit", _inject(_F.WINDING_HOT), "over_temperature"),
-    Scenario("supply sags to 18 V", _inject(_F.VOLTAGE_LOW), "voltage"),
-    Scenario("supply rises to 52 V", _inject(_F.VOLTAGE_HIGH), "voltage"),
-    Scenario("firmware's position limit", _inject(_F.POSITION_LIMIT), "firmware_limit"),
-    Scenario("firmware's velocity limit", _inject(_F.VELOCITY_LIMIT), "firmware_limit"),
-    Scenario("firmware's effort limit", _inject(_F.EFFORT_LIMIT), "firmware_limit"),
-    Scenario("controller lost", _lose_controller, "starved"),
-    Scenario("controller and disturbance lost", _lose_controller_and_disturbance, "starved"),
-    Scenario("disturbance lost", _lose_disturbance, "goes on", zero=False),
-    Scenario("command not a number", _not_a_number, "starved"),
-    Scenario("controller repeats an old answer", _freeze_stamps, "starved"),
-    Scenario("second commander", _second_commander, "goes on", zero=False),
-    Scenario("two commanders of one name", _twin_commanders, "starved"),
-    Scenario("e-stop", _press_e_stop, "e_stop"),
-    Scenario("disarmed while driving", _disarm, "disarmed"),
-    Scenario("exception in the cycle", _raise, "exception"),
-    Scenario("bridge ends (SIGINT, SIGTERM)", _close, "closed"),
-    Scenario("bridge killed (SIGKILL)", _kill, "lifetime"),
-    Scenario("bridge killed on a ramp", _kill, "lifetime", moving=True),
-    Scenario("feedback lost on a ramp", _inject(_F.FEEDBACK_LOST), "feedback_lost", moving=True),
-    Scenario("motion stop pressed on a ramp", _inject(_F.M_STOP), "m_stop", moving=True),
-)
-"""All faults, in the order of the table."""
-
-
-def run_scenario(scenario: Scenario, repetition: int) -> Reaction:
-    """Run one scenario once and return what happened.
-
-    Args:
-        scenario: Which.
-        repetition: Seeds noise, timing and the instant of the fault.
-    """
-    rig = Rig(seed=1000 + repetition, moving=scenario.moving)
-    if scenario.moving:
-        rig.run(2.0)
-    rig.run(_WARM_UP + float(rig.random.uniform(0.0, 0.05)))
-    # Feedback and physics stand at the last event; the fault begins between two cycles, wherever that is.
-    begin_ns = rig.actuator.now_ns
-    commanded = rig.largest_commanded * rig.bridge.mapping.pwm_per_torque()
-    before = max((abs(duty) for _, duty, _ in rig.duties), default=0.0)
-    expiries = rig.actuator.lifetime_expiries
-    scenario.begin(rig)
-    rig.run(_WATCH)
-    rig.actuator.advance_to(rig.clock.now_ns())
-    after = [(time, duty) for time, duty, _ in rig.duties if time > begin_ns]
-    driven = [time for time, duty in after if duty != 0.0]
-    tail = [duty for time, duty in after if time > begin_ns + 200 * MILLISECOND]
-    # On a ramp the firmware's own position loop makes the duty: what it does to hold the ramp was commanded.
-    ceiling = (
-        1.0 if scenario.moving else max(before, rig.largest_commanded * rig.bridge.mapping.pwm_per_torque(), commanded)
-    )
-    excess = max((abs(duty) for _, duty in after), default=0.0) - ceiling - 3e-4
-    return Reaction(
-        scenario.name,
-        _reaction(rig, expiries),
-        rig.supervisor.mode.value,
-        (max(driven) - begin_ns) / MILLISECOND if driven else 0.0,
-        max(0.0, excess) / rig.bridge.mapping.pwm_per_torque(),
-        not any(tail),
-    )
-
-
-def _reaction(rig: Rig, expiries: int) -> str:
-    mode = rig.supervisor.mode
-    if not rig.alive:
-        if rig.closed:
-            assert rig.actuator.strategy is Strategy.OFF
-            return "closed"
-        return "lifetime" if rig.actuator.lifetime_expiries > expiries else "none"
-    if mode is Mode.FAULT:
-        return next(iter(rig.bridge.faults), "none")
-    if mode is Mode.EFFORT:
-        starved = rig.supervisor.decide(rig.port.now_ns(), rig.bridge.sample).starved
-        return "starved" if starved else "goes on"
-    assert rig.actuator.strategy is Strategy.OFF
-    return mode.value
+        self.positions.append(link.position)

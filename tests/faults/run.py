@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
-from rich.progress import Progress, track
+from rich.progress import Progress
 
 from pendulum_bags.experiments.domain import reserve_domain
 from pendulum_bags.runs.run_folder import write_json
@@ -21,7 +21,7 @@ from pendulum_msgs_py.errors import FaultError, PendulumError
 from pendulum_msgs_py.programs.executables import EXIT_INTERRUPTED, cli_main
 from pendulum_msgs_py.programs.terminal import WholeTable, make_console
 from tests.faults.bag_property import check_bag
-from tests.faults.bridge_rig import SCENARIOS, run_scenario
+from tests.faults.bridge_table import Cell, bridge_cells, bridge_markdown
 from tests.faults.campaign import CAMPAIGN
 from tests.faults.clocks import CLOCK_TRIALS
 from tests.faults.delay_margin import LOSSES, survive_loss
@@ -63,7 +63,8 @@ class Row:
         """Return what stands below ``_HEADINGS``."""
         lost = "–" if self.lost_s is None else f"{self.lost_s:.3f} s"
         to_zero = "–" if self.time_to_zero_s is None else f"{self.time_to_zero_s * 1e3:.0f} ms"
-        return self.fault, str(self.tried), str(self.survived), lost, to_zero, " ".join(self.remarks.split())
+        counts = (str(self.tried), str(self.survived)) if self.tried else ("not tried", "–")
+        return self.fault, *counts, lost, to_zero, " ".join(self.remarks.split())
 
 
 @app.command(epilog="Example: python -m tests.faults.run --repetitions 3 --seed 7")
@@ -71,7 +72,7 @@ def campaign(
     repetitions: Annotated[int, typer.Option(help="How often each fault is tried.", min=1)] = 5,
     seed: Annotated[int, typer.Option(help="Seed of the moments at which faults come.")] = 1,
     minutes: Annotated[float, typer.Option(help="How long each parser is attacked [min].", min=0.0)] = 1.0,
-    only: Annotated[str, typer.Option(help="Try only the faults of running systems whose names match.")] = "",
+    only: Annotated[str, typer.Option(help="Try only the faults whose names match.")] = "",
     keep: Annotated[Path | None, typer.Option(help="New folder that keeps logs and bags.")] = None,
     out: Annotated[Path, typer.Option(help="Where the rows go after each fault; Markdown beside it.")] = Path(
         "build", "faults.json"
@@ -81,13 +82,14 @@ def campaign(
     """Attack the running system and count what it stood."""
     out.parent.mkdir(parents=True, exist_ok=True)
     rows: list[Row] = []
+    cells: list[Cell] = []
     interrupted = False
     try:
-        for row in _rows(repetitions, seed, minutes, only, keep):
+        for row in _rows(repetitions, seed, minutes, only, keep, cells):
             rows.append(row)
             # What was tried for an hour is kept, whatever ends the next hour.
             write_json(out, [asdict(each) for each in rows])
-            out.with_suffix(".md").write_text(_markdown(rows), encoding="utf-8")
+            out.with_suffix(".md").write_text(_markdown(rows, cells), encoding="utf-8")
             sys.stderr.write(f"{row.fault}: {row.survived} of {row.tried}\n")
     except KeyboardInterrupt:
         interrupted = True
@@ -97,13 +99,24 @@ def campaign(
         make_console().print(_table(rows))
     if interrupted:
         return EXIT_INTERRUPTED
-    return 0 if all(row.tried == row.survived for row in rows) else 1
+    # What could not be tried has not survived either.
+    return 0 if rows and all(row.tried == row.survived > 0 for row in rows) else 1
 
 
-def _rows(repetitions: int, seed: int, minutes: float, only: str, keep: Path | None) -> Iterator[Row]:
-    """Try everything, the dearest last."""
-    if not only:
-        yield from _bridge_rows(max(repetitions, 20))
+def _rows(
+    repetitions: int, seed: int, minutes: float, only: str, keep: Path | None, cells: list[Cell]
+) -> Iterator[Row]:
+    """Try everything, the dearest last; faults of the actuator are noted in ``cells`` too."""
+    for cell in bridge_cells(max(repetitions, 20), only):
+        cells.append(cell)
+        told = "; ".join((", ".join(cell.reactions), *cell.complaints[:1]))
+        yield Row(
+            f"actuator, {cell.case}: {cell.fault} (simulated time)",
+            cell.tried,
+            cell.survived,
+            time_to_zero_s=None if cell.time_to_zero_ms is None else cell.time_to_zero_ms * 1e-3,
+            remarks=f"{told}; {cell.beyond_limit:.1f} N m beyond the limit" if cell.beyond_limit else told,
+        )
     wanted = [fault for fault in CAMPAIGN if not only or re.search(only, fault.name)]
     if wanted:
         yield from _live_rows(wanted, repetitions, seed, keep)
@@ -123,28 +136,12 @@ def _table(rows: Sequence[Row]) -> WholeTable:
     return table
 
 
-def _markdown(rows: Sequence[Row]) -> str:
-    lines = [_HEADINGS, ("---",) * len(_HEADINGS), *(row.cells() for row in rows)]
-    return "".join(f"| {' | '.join(cell.replace('|', chr(92) + '|') for cell in line)} |\n" for line in lines)
-
-
-def _bridge_rows(repetitions: int) -> Iterator[Row]:
-    for scenario in track(SCENARIOS, "faults of the actuator", transient=True, disable=not sys.stdout.isatty()):
-        reactions = [run_scenario(scenario, repetition) for repetition in range(repetitions)]
-        times = [reaction.time_to_zero_ms * 1e-3 for reaction in reactions]
-        survived = [
-            reaction.reaction == scenario.expected
-            and (not scenario.zero or (reaction.stays_zero and reaction.time_to_zero_ms <= MAX_TIME_TO_ZERO * 1e3))
-            and (scenario.own_torque or reaction.uncommanded == 0.0)
-            for reaction in reactions
-        ]
-        yield Row(
-            f"actuator: {scenario.name}",
-            len(reactions),
-            sum(survived),
-            time_to_zero_s=max(times) if scenario.zero else None,
-            remarks=reactions[0].reaction,
-        )
+def _markdown(rows: Sequence[Row], cells: Sequence[Cell]) -> str:
+    others = (row.cells() for row in rows if not row.fault.startswith("actuator, "))
+    lines = [_HEADINGS, ("---",) * len(_HEADINGS), *others]
+    return bridge_markdown(cells) + "".join(
+        f"| {' | '.join(cell.replace('|', chr(92) + '|') for cell in line)} |\n" for line in lines
+    )
 
 
 def _live_rows(faults: Sequence[Fault], repetitions: int, seed: int, keep: Path | None) -> Iterator[Row]:

@@ -252,7 +252,8 @@ class PlantSupervisor:
             command = self._commands.fresh(now_ns)
             end_ns = self._trajectory_start_ns + round(trajectory.duration * NANOSECONDS)
             if command is not None and command.stamp_ns >= end_ns and not self.commander_conflict:
-                jump = abs(self._clamp(command.effort) - self._applied)
+                # What it asks for, not what the limit leaves of it: with a low limit all would look near.
+                jump = abs(command.effort - self._applied)
                 if not jump <= self.limits.handover_effort:
                     # A controller for another place: awake at the bottom, one for upright asks for all it has.
                     self.reason = (
