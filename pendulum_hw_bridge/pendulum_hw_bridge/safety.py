@@ -353,7 +353,7 @@ class SafetyMonitor:
             self._wrong_currents, self._wrong_current_ns = 0, feedback.stamp_ns
         if wrong or tells:
             self._wrong_currents = self._wrong_currents + 1 if wrong else 0
-        if self._wrong_currents >= _COUNT:
+        if wrong and self._wrong_currents >= _COUNT:
             return Fault(
                 "winding_current",
                 f"winding current is {feedback.winding_current:.3f} A; PWM {feedback.pwm_command:.3f} and velocity "

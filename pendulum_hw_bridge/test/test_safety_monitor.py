@@ -246,14 +246,24 @@ def test_after_a_pause_of_twice_the_timeout_a_position_is_no_jump() -> None:
 
 @pytest.mark.parametrize("sign", [1.0, -1.0])
 @pytest.mark.parametrize(("gap", "fault"), [(0.25, ""), (0.251, "motion_disagreement")])
-def test_velocity_and_position_over_five_cycles_may_differ_by_so_much(sign: float, gap: float, fault: str) -> None:
+def test_velocity_and_position_over_a_fifth_of_a_second_may_differ_by_so_much(
+    sign: float, gap: float, fault: str
+) -> None:
     watched = Watched(position_jump=10.0, position_disagreement=0.25)
-    # Four rad/s, with the halves of the first and the last: 20 periods in five.
-    for number in range(5):
-        assert not watched.see(position=sign * (number > 0) * (20 * PERIOD + gap), velocity=sign * 4.0)
-    assert watched.see(position=sign * (20 * PERIOD + gap), velocity=sign * 4.0) == fault
-    # What is six cycles ago counts no more.
-    assert not watched.see(position=sign * (20 * PERIOD + gap), velocity=sign * -24.0)
+    assert not watched.see(velocity=sign * 4.0)
+    # Thirteen periods of a 64th of a second; what is further back counts no more.
+    for number in range(1, 16):
+        seen = watched.see(position=sign * (4.0 * number * PERIOD + gap), velocity=sign * 4.0)
+        assert seen == (fault if number <= 13 else "")
+
+
+def test_after_a_pause_or_a_velocity_that_is_no_number_a_motion_is_compared_anew() -> None:
+    watched = Watched(position_jump=10.0, position_disagreement=0.25)
+    assert not watched.see()
+    assert not watched.see(2 * TIMEOUT, position=1.0)
+    assert watched.see(position=1.0, velocity=math.nan) == "feedback_not_finite"
+    assert not watched.see(position=2.0)
+    assert watched.see(position=2.26) == "motion_disagreement"
 
 
 def test_the_velocities_of_a_motion_count_with_the_time_between_their_records() -> None:
@@ -475,9 +485,10 @@ def test_the_third_winding_current_that_does_not_fit_duty_and_speed_is_a_fault(s
     assert [see(9.0), see(9.0), see(9.0)] == ["", "", "winding_current"]
     for current in (0.25, -0.25):
         assert not any(see(current) for _ in range(5))
-    assert [see(0.26), see(0.26), see(0.0)] == ["", "", ""]
+    assert not see(4.0, 0.5)
+    assert [see(0.26), see(0.26), see(4.0, 0.5)] == ["", "", ""]
     for current in (0.26, -0.26, math.nan):
-        assert [see(current), see(current), see(current), see(0.0)] == ["", "", "winding_current", ""]
+        assert [see(current), see(current), see(current), see(4.0, 0.5)] == ["", "", "winding_current", ""]
     # Half the duty of 32 V on 4 ohm: 4 A, of which a fifth may be an error of the resistance.
     assert not any(see(current, 0.5) for current in (5.0, 5.0, 5.0, 3.0, 3.0, 3.0))
     assert [see(5.1, 0.5) for _ in range(3)] == ["", "", "winding_current"]
@@ -485,6 +496,29 @@ def test_the_third_winding_current_that_does_not_fit_duty_and_speed_is_a_fault(s
     # A motor at 8 rad/s, 4 at the output: 4 V, one ampere less.
     assert not any(see(3.0, 0.5, motor_velocity=sign * 8.0) for _ in range(3))
     assert [see(4.0, 0.5, motor_velocity=sign * 8.0) for _ in range(3)] == ["", "", "winding_current"]
+
+
+@pytest.mark.parametrize(("duty", "third"), [(0.0390625, "winding_current"), (0.0391, ""), (-0.0391, "")])
+def test_a_record_that_asks_for_next_to_no_current_excuses_no_wrong_one(duty: float, third: str) -> None:
+    watched = Watched(DRIVETRAIN, winding_current=0.25)
+
+    def see(current: float, after: float = 0.0) -> str:
+        return watched.see(pwm_command=after, winding_current=current, voltage=32.0)
+
+    # Up to 0.3125 A, a record without any current could not be told from a good one.
+    assert [see(0.5), see(8.0 * duty, duty), see(0.5), see(8.0 * duty, duty), see(0.5)] == ["", "", "", "", third]
+
+
+@pytest.mark.parametrize(("pause_ns", "third"), [(500 * MILLISECOND, "winding_current"), (500 * MILLISECOND + 1, "")])
+def test_wrong_currents_count_together_for_half_a_second(pause_ns: int, third: str) -> None:
+    watched = Watched(DRIVETRAIN, winding_current=0.25)
+    wrong = {"pwm_command": 0.0, "winding_current": 0.5, "voltage": 32.0}
+    assert not watched.see(**wrong)
+    assert not watched.see(STEP, **wrong)
+    assert watched.see(pause_ns - STEP, **wrong) == third
+    # What counts anew counts from here.
+    assert not third or not watched.see(pwm_command=0.5, winding_current=4.0, voltage=32.0)
+    assert [watched.see(**wrong) for _ in range(2)] == ["", "winding_current" if not third else ""]
 
 
 @pytest.mark.parametrize(
