@@ -11,7 +11,7 @@ PIP := $(PY) -m pip --disable-pip-version-check --no-input --quiet --quiet
 # Everything that decides what an editable install looks like; the modules themselves are read in place.
 LINKED := $(foreach p,$(PACKAGES),$(wildcard $(p)/setup.py $(p)/setup.cfg $(p)/package.xml $(p)/*/executables.py))
 
-.PHONY: help venv experiment test bench lint format types imports build faults mutants lock audit docs clean
+.PHONY: help venv experiment course test bench lint format types imports build faults mutants lock audit docs clean
 
 help: # Print the targets, one line each
 	@awk -F ':[^#]*# ' '/^[a-z]+:[^#=]*# / {printf "make %-11s %s\n", $$1, $$2}' Makefile
@@ -43,6 +43,9 @@ $(VENV)/.linked: $(VENV)/.locked $(LINKED)
 
 experiment: $(VENV)/.linked # Run the thesis's experiment on simulator and emulated hardware, and compare them (OUT=DIR ARGS=...)
 	@$(PY) -m pendulum_bags experiment thesis $(if $(OUT),--out "$(OUT)") $(ARGS)
+
+course: $(VENV)/.linked # Make six exercises with a hidden plant from a seed (SEED=2027 OUT=build/course)
+	@$(PY) -m pendulum_bags course make $(if $(SEED),--seed "$(SEED)") $(if $(OUT),--out "$(OUT)")
 
 test: $(VENV)/.linked # Run every test (ARGS="-k name" chooses)
 	@$(PY) -m tests.suite $(ARGS)

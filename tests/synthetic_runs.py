@@ -7,7 +7,7 @@ clock are missing. "Hardware" is the same plant with dry friction, a delay, coar
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -127,6 +127,31 @@ def write_bag(
                 position, velocity = down.at(t)
                 state(end + t, position, velocity, 1.678 * np.sin(position) + 11.77 * velocity)
             event(end + down.duration, "done")
+    return path
+
+
+def write_events_and_torque(
+    path: Path,
+    prefix: str,
+    events: Sequence[tuple[float, str, Mapping[str, Any]]],
+    torque: Callable[[float], float],
+    length: float,
+) -> Path:
+    """Write a recording at 100 Hz of a plant at rest: events as (time, name, what it says), and the torque applied."""
+    with open_writer(path) as bag:
+        for topic in ("joint_states", "applied_effort"):
+            bag.add_topic(f"{prefix}/{topic}", STATE)
+        bag.add_topic(f"{prefix}/events", TEXT)
+        for t, name, told in events:
+            stamp = EPOCH_NS + round(t * 1e9)
+            text = json.dumps({"stamp_ns": stamp, "name": name, **told}).encode() + b"\0"
+            bag.write(f"{prefix}/events", stamp, b"\0\1\0\0" + len(text).to_bytes(4, "little") + text)
+        for t in np.arange(0.0, length, 0.01):
+            stamp = EPOCH_NS + round(t * 1e9)
+            state = encode_joint_state(stamp, position=0.0, velocity=0.0, effort=0.0)
+            bag.write(f"{prefix}/joint_states", stamp, state)
+            applied = encode_joint_state(stamp, frame_id="", effort=torque(float(t)))
+            bag.write(f"{prefix}/applied_effort", stamp, applied)
     return path
 
 

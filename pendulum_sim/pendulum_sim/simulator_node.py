@@ -19,7 +19,8 @@ from pendulum_msgs_py.contract.values import NANOSECONDS, JointCommand, JointSam
 from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.parameters import ParameterSpec
 from pendulum_msgs_py.plants.plant_differences import PLANT_PARAMETERS, describe_plants
-from pendulum_msgs_py.plants.plant_parameters import PRESET_NAMES, load_plant
+from pendulum_msgs_py.plants.plant_parameters import PRESET_NAMES
+from pendulum_msgs_py.plants.sealed_plant import load_plant_to_run
 from pendulum_msgs_py.ros import qos
 from pendulum_msgs_py.ros.convert import sample_from_message
 from pendulum_msgs_py.ros.parameters import NodeParameters
@@ -85,10 +86,10 @@ class SimulatorNode(PollingNode):
         super().__init__("simulator", enable_logger_service=True)
         self._settings = NodeParameters(self, SPECS, self._check_start)
         values = self._settings.values
-        parameters = load_plant(values["plant"])
+        parameters, sealed = load_plant_to_run(values["plant"])
         period_ns = round(NANOSECONDS / values["rate_hz"])
         self._dt = period_ns / NANOSECONDS
-        self._told_plant = describe_plants([parameters])
+        self._told_plant = describe_plants([] if sealed else [parameters])
         self._plant = make_plant(parameters, self._dt, method=values["method"], substeps=values["substeps"] or None)
         self._servo = PositionServo(parameters, self._dt)
         starts, sensor_noise = np.random.default_rng(values["seed"]).spawn(2)

@@ -38,16 +38,22 @@ __all__ = [
     "PLANT_SPECS",
     "PRESETS",
     "PRESET_NAMES",
+    "SEALED_FORMAT",
     "SERIES_ELASTIC_PRESETS",
     "PlantParameters",
     "Quantity",
     "SeriesElasticParameters",
     "load_plant",
     "load_plant_file",
+    "plant_document",
+    "read_plant_document",
+    "resolve_plant",
     "write_plant",
 ]
 
 FORMAT = "pendulum_plant/1"
+SEALED_FORMAT = "pendulum_plant_sealed/1"
+"""Format of a plant file that only simulators read; see :mod:`pendulum_msgs_py.plants.sealed_plant`."""
 _PRESET_FOLDER = Path(str(resources.files("pendulum_msgs_py.plants") / "presets"))
 PRESETS = tuple(
     sorted((file.stem for file in _PRESET_FOLDER.glob("*.yaml")), key=lambda name: (name != "thesis", name))
@@ -218,8 +224,26 @@ def load_plant_file(preset_or_path: str | Path) -> tuple[PlantParameters, dict[s
     Raises:
         ParameterError: as :func:`load_plant`.
     """
-    path = _resolve(preset_or_path)
+    path = resolve_plant(preset_or_path)
     document = load_yaml(path, "plant file")
+    if document.get("format") == SEALED_FORMAT:
+        raise ParameterError(
+            f"plant file {path} is sealed for an exercise, and only a simulator runs it; "
+            "expected a plant that you identified"
+        )
+    return read_plant_document(document, path)
+
+
+def read_plant_document(document: Mapping[str, Any], path: Path) -> tuple[PlantParameters, dict[str, Any]]:
+    """Return the parameters and the provenance of the content of a plant file.
+
+    Args:
+        document: The content.
+        path: The file, for messages and as a name.
+
+    Raises:
+        ParameterError: as :func:`load_plant`.
+    """
     where = str(path)
     reject_unknown(document, ("format", "name", "parameters", "drivetrain", "provenance"), where=where)
     if document.get("format") != FORMAT:
@@ -266,13 +290,7 @@ def write_plant(
         ParameterError: The file cannot be written.
     """
     path = Path(path)
-    document: dict[str, Any] = {
-        "format": FORMAT,
-        "name": parameters.name,
-        "parameters": _quantities(parameters, PLANT_SPECS, intervals or {}),
-    }
-    if parameters.drivetrain is not None:
-        document["drivetrain"] = _quantities(parameters.drivetrain, DRIVETRAIN_SPECS, {})
+    document = plant_document(parameters, intervals)
     if provenance:
         document["provenance"] = dict(provenance)
     text = dump_yaml(document, f"plant file {path}")
@@ -289,7 +307,22 @@ def write_plant(
     return path
 
 
-def _resolve(preset_or_path: str | Path) -> Path:
+def plant_document(
+    parameters: PlantParameters, intervals: Mapping[str, Sequence[float]] | None = None
+) -> dict[str, Any]:
+    """Return the content of a plant file with some parameters, each with its unit and, where given, its interval."""
+    document: dict[str, Any] = {
+        "format": FORMAT,
+        "name": parameters.name,
+        "parameters": _quantities(parameters, PLANT_SPECS, intervals or {}),
+    }
+    if parameters.drivetrain is not None:
+        document["drivetrain"] = _quantities(parameters.drivetrain, DRIVETRAIN_SPECS, {})
+    return document
+
+
+def resolve_plant(preset_or_path: str | Path) -> Path:
+    """Return the file of a preset, or the path itself; a word that is neither is refused."""
     text = str(preset_or_path)
     if text in PRESETS:
         return _PRESET_FOLDER / f"{text}.yaml"

@@ -92,6 +92,7 @@ def play_in_lockstep(
     plant: str,
     noise: float,
     seed: int,
+    design_plant: str = "",
     domain: int | None = None,
     on_wait: Callable[[], None] = lambda: None,
 ) -> Path:
@@ -104,6 +105,7 @@ def play_in_lockstep(
         plant: What the simulator or the emulator is.
         noise: Standard deviation of the simulated angle sensor [rad]; the emulator has its own.
         seed: Of the sensors.
+        design_plant: What the excitation was designed for; by default what is played on.
         domain: ROS domain, or None for any free one.
         on_wait: Called while waiting.
 
@@ -124,7 +126,7 @@ def play_in_lockstep(
     spec = _LockstepRun(
         side=side,
         plant=plant,
-        design_plant=plant,
+        design_plant=design_plant or plant,
         controller="playback",
         controller_parameters={"file": str(play.zero_file(bag.parent / "logs" / bag.name).resolve())},
         disturbance={"kind": "from_bag", "file": str(play.file.resolve()), "duration": float(play.duration)},

@@ -44,6 +44,10 @@ def excite(
             "--namespace."
         ),
     ] = "sim",
+    simulate: Annotated[
+        str,
+        typer.Option(help="With --on sim: the plant that is simulated, a sealed one too; by default the prior guess."),
+    ] = "",
     bag: Annotated[
         Path | None,
         typer.Option(help="With --play: bag to write; by default the name of --out without .csv."),
@@ -85,6 +89,8 @@ def excite(
         raise DataError(
             f"max_effort is {max_effort:g} N m; expected at most {prior.effort_limit:g} N m, the plant's limit"
         )
+    if simulate and (not play or on != "sim"):
+        raise DataError("simulate names a plant; expected it beside --play and --on sim, which simulates one")
     design.write(out)
     if as_json:
         content = {
@@ -115,7 +121,10 @@ def excite(
         console.print(f"wrote {out}", highlight=False)
     if play:
         target = bag or out.with_suffix("")
-        _play(design, limits, out, target, plant, on, namespace, arm=arm, noise=noise, seed=seed, domain=domain)
+        _play(
+            design, limits, out, target, plant, on, namespace, simulate,
+            arm=arm, noise=noise, seed=seed, domain=domain,
+        )  # fmt: skip
         typer.echo(f"played and recorded; next\n  python -m pendulum_bags identify {target}", err=as_json)
 
 
@@ -127,6 +136,7 @@ def _play(
     plant: str,
     on: str,
     namespace: str,
+    simulated: str,
     *,
     arm: bool,
     noise: float,
@@ -149,7 +159,10 @@ def _play(
             play_on_running_plant(bag, play, f"/{namespace.strip('/')}", arm=arm, domain=domain)
         else:
             side = "sim" if on == "sim" else "hw"
-            play_in_lockstep(bag, play, side=side, plant=plant, noise=noise, seed=seed, domain=domain)
+            true = simulated or plant
+            play_in_lockstep(
+                bag, play, side=side, plant=true, design_plant=plant, noise=noise, seed=seed, domain=domain
+            )
     except KeyboardInterrupt:
         typer.echo("interrupted: the torque is zero, all programs have ended", err=True)
         raise typer.Exit(EXIT_INTERRUPTED) from None

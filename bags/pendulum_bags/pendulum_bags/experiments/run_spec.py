@@ -15,6 +15,7 @@ from pendulum_msgs_py.contract.angles import UPRIGHT
 from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.parameters import reject_unknown, validate
 from pendulum_msgs_py.plants.plant_parameters import load_plant
+from pendulum_msgs_py.plants.sealed_plant import load_plant_to_run
 from pendulum_msgs_py.programs import graph
 from pendulum_msgs_py.programs.graph import NodeProgram
 
@@ -215,7 +216,7 @@ def integrator_of(plant: str, method: str) -> str:
     Raises:
         ParameterError: The plant is unknown.
     """
-    elastic = load_plant(plant).drivetrain is not None
+    elastic = load_plant_to_run(plant)[0].drivetrain is not None
     return "auto" if elastic and method == THESIS_METHOD else method
 
 

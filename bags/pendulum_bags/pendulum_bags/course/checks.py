@@ -1,0 +1,266 @@
+"""Right or wrong: the answer to each exercise, computed anew from the project's own model, analysis and emulator."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from pendulum_bags.course.tasks import Tasks
+from pendulum_bags.runs.run_data import find_prefix
+from pendulum_lqr.analysis import closed_loop_poles, delayed_spectral_radius, loop_margins
+from pendulum_lqr.design import continuous_lqr, discretise
+from pendulum_lqr.model import LinearModel, linearise
+from pendulum_msgs_py.contract import names
+from pendulum_msgs_py.contract.values import NANOSECONDS
+from pendulum_msgs_py.errors import DataError, ParameterError
+from pendulum_msgs_py.plants.plant_parameters import PLANT_SPECS, PlantParameters, load_plant
+from pendulum_rosbag.reader import read_bag
+
+__all__ = [
+    "PLANT_TOLERANCES",
+    "WEIGHTS",
+    "Judgement",
+    "check_delay",
+    "check_fault",
+    "check_gains",
+    "check_noise",
+    "check_plant",
+    "critical_delay",
+    "noise_ratio",
+    "std_under_held_noise",
+    "time_constant",
+]
+
+WEIGHTS = (100.0, 0.01)
+"""Q of every loop whose R alone is told."""
+PERIOD = {"sim": 0.002, "hw": 0.01}
+PLANT_TOLERANCES = {"inertia": 0.03, "gravity": 0.03, "damping": 0.15, "coulomb_friction": 0.15}
+"""Share by which each parameter of the hidden plant may be off."""
+_TIME_TOLERANCE = 0.05
+_DELAY_TOLERANCE = 0.05
+_RATIO_TOLERANCE = 0.08
+_STOPPED_WITHIN = 0.06
+"""Time from the bridge's fault to zero torque [s], as its README promises."""
+_WATCHED = 0.5
+"""How long the recording must go on after the fault, to show that the torque stays away [s]."""
+
+
+@dataclass(frozen=True)
+class Judgement:
+    """Whether an answer is right, and a sentence that says why.
+
+    Attributes:
+        right: Whether it is.
+        reason: A sentence, with numbers and units; it does not give the answer away.
+    """
+
+    right: bool
+    reason: str
+
+    def __str__(self) -> str:
+        """Return the judgement in words."""
+        return f"{'right' if self.right else 'wrong'}: {self.reason}"
+
+
+def check_gains(tasks: Tasks, q: tuple[float, float], r: float) -> Judgement:
+    """Judge the weights of an LQR on the thesis's plant by the time constant of its loop.
+
+    Args:
+        tasks: The tasks.
+        q: Diagonal of Q [1/rad^2, s^2/rad^2].
+        r: R [1/(N m)^2].
+
+    Raises:
+        DesignError: The weights make no design.
+    """
+    found = time_constant(q, r)
+    asked = tasks.time_constant
+    near = abs(found / asked - 1.0) <= _TIME_TOLERANCE
+    return Judgement(
+        near, f"this loop has a time constant of {found:.3g} s; asked is {asked:g} s within {_TIME_TOLERANCE:.0%}"
+    )
+
+
+def check_plant(truth: PlantParameters, found: PlantParameters) -> Judgement:
+    """Judge an identified plant by the hidden one, without telling the hidden one.
+
+    Args:
+        truth: The hidden plant.
+        found: What the student identified.
+    """
+    units = {spec.name: spec.unit for spec in PLANT_SPECS}
+    off = [
+        name
+        for name, share in PLANT_TOLERANCES.items()
+        if abs(getattr(found, name) / getattr(truth, name) - 1.0) > share
+    ]
+    limits = ", ".join(f"{name} {share:.0%}" for name, share in PLANT_TOLERANCES.items())
+    if not off:
+        return Judgement(True, f"every parameter is as near to the hidden one as is asked ({limits})")
+    words = ", ".join(f"{name} ({getattr(found, name):.4g} {units[name]})" for name in off)
+    good = [name for name in PLANT_TOLERANCES if name not in off]
+    kept = f"; near enough: {', '.join(good)}" if good else ""
+    return Judgement(False, f"too far from the hidden plant: {words}{kept}; asked is {limits}")
+
+
+def check_delay(tasks: Tasks, delay: float) -> Judgement:
+    """Judge a delay at which the loop at 100 Hz becomes unstable.
+
+    Args:
+        tasks: The tasks.
+        delay: The answer [s].
+    """
+    _require_positive("delay", delay, "s")
+    edge = critical_delay(tasks)
+    stands = "still stands" if delay < edge else "has fallen"
+    right = abs(delay / edge - 1.0) <= _DELAY_TOLERANCE
+    side = f"at the edge, within {_DELAY_TOLERANCE:.0%}" if right else f"not at the edge: with it the loop {stands}"
+    return Judgement(right, f"a delay of {delay:g} s is {side}")
+
+
+def check_noise(tasks: Tasks, ratio: float, cause: str) -> Judgement:
+    """Judge by how much noise that is held longer moves the pendulum more, and the explanation chosen.
+
+    Args:
+        tasks: The tasks.
+        ratio: Standard deviation of theta with the longer hold, over that with 2 ms [-].
+        cause: a, b, c or d.
+
+    Raises:
+        ParameterError: The cause is another letter.
+    """
+    _require_positive("ratio", ratio, "")
+    letters = "abcd"[: len(tasks.causes)]
+    if len(cause) != 1 or cause not in letters:
+        raise ParameterError(f"cause is {cause!r}; expected one of {', '.join(letters)}")
+    near = abs(ratio / noise_ratio(tasks) - 1.0) <= _RATIO_TOLERANCE
+    explained = tasks.causes[letters.index(cause)] == "power"
+    words = (
+        f"the ratio {ratio:g} is {'near enough' if near else f'off by more than {_RATIO_TOLERANCE:.0%}'}, and {cause} "
+        f"{'explains it' if explained else 'does not explain it'}"
+    )
+    return Judgement(near and explained, words)
+
+
+def check_fault(tasks: Tasks, bag: Path) -> Judgement:
+    """Judge a recording of the bridge in which it was driven into the fault that is asked for.
+
+    Args:
+        tasks: The tasks.
+        bag: The recording.
+
+    Raises:
+        BagError: The recording cannot be read.
+        DataError: It has no plant, or no torque.
+    """
+    with read_bag(bag) as content:
+        space = find_prefix(content)
+        events = [event for event in content.events() if event["topic"].startswith(f"{space}/")]
+        topic = f"{space}/{names.APPLIED_EFFORT}"
+        if topic not in content.topics:
+            raise DataError(f"bag {bag} has no topic {topic}; expected it, since it shows the torque")
+        applied = content.array(topic)
+    modes = [event for event in events if event["name"] == "plant_mode"]
+    index = next((i for i, event in enumerate(modes) if event.get("mode") == "fault"), None)
+    if index is None:
+        seen = ", ".join(str(event.get("mode")) for event in modes) or "none"
+        return Judgement(False, f"the bridge never went into fault; its states were: {seen}")
+    reason = str(modes[index].get("reason", ""))
+    if not any(str(event.get("mode", "")).startswith("armed") for event in modes[:index]):
+        return Judgement(False, f"the bridge was not armed before its fault ({reason}); arm it, and break it then")
+    if not reason.startswith(tasks.fault):
+        return Judgement(False, f"the fault is {reason!r}; asked is {tasks.fault}")
+    since = (applied["stamp_ns"] - int(modes[index]["stamp_ns"])) / NANOSECONDS
+    rearmed = next((e for e in modes[index:] if str(e.get("mode", "")).startswith("armed")), None)
+    until = math.inf if rearmed is None else (rearmed["stamp_ns"] - modes[index]["stamp_ns"]) / NANOSECONDS
+    later = (since > _STOPPED_WITHIN) & (since < until)
+    if not later.any() or float(since[later].max()) < _WATCHED:
+        return Judgement(False, f"the recording ends too early; let it go on for {_WATCHED:g} s after the fault")
+    worst = float(np.max(np.abs(applied["effort"][later])))
+    if worst > 0.0:
+        return Judgement(False, f"{worst:.3g} N m acted later than {1e3 * _STOPPED_WITHIN:.0f} ms after the fault")
+    return Judgement(True, f"{reason}; from {1e3 * _STOPPED_WITHIN:.0f} ms after it no torque acted")
+
+
+def time_constant(q: tuple[float, float], r: float) -> float:
+    """Return the time constant of an LQR's loop around the thesis's plant [s].
+
+    Args:
+        q: Diagonal of Q [1/rad^2, s^2/rad^2].
+        r: R [1/(N m)^2].
+
+    Raises:
+        DesignError: The weights make no design.
+    """
+    model = _thesis_model()
+    return float(-1.0 / closed_loop_poles(model, continuous_lqr(model, list(q), r).K).real.max())
+
+
+@lru_cache(maxsize=8)
+def critical_delay(tasks: Tasks) -> float:
+    """Return the delay at which the sampled loop at 100 Hz becomes unstable [s]."""
+    model, gain = _thesis_model(), _gain(tasks.delay_weight)
+    # Continuous control bears a little more; every step costs the eigenvalues of a loop with that many delays.
+    low, high = 0.5 * (margin := loop_margins(model, gain).delay), 1.1 * margin
+    for _ in range(10):
+        middle = 0.5 * (low + high)
+        stable = delayed_spectral_radius(model, gain, PERIOD["hw"], middle) < 1.0
+        low, high = (middle, high) if stable else (low, middle)
+    return 0.5 * (low + high)
+
+
+def noise_ratio(tasks: Tasks) -> float:
+    """Return the standard deviation of theta under noise of the longer hold, over that under noise held for 2 ms."""
+    long = std_under_held_noise(tasks.hold_time)
+    return long / std_under_held_noise(PERIOD["sim"])
+
+
+def std_under_held_noise(hold_time: float, amplitude: float = 2.5) -> float:
+    """Return the standard deviation of theta of the thesis's loop under uniform noise, for a run without end.
+
+    The covariance at the moments at which the noise changes solves P = A P A' + B B' var; between them it is carried
+    on, and averaged.
+
+    Args:
+        hold_time: How long each sample of the noise is held, a multiple of 2 ms [s].
+        amplitude: Largest torque of the noise [N m].
+
+    Returns:
+        Standard deviation [rad].
+    """
+    import scipy.linalg
+
+    period = PERIOD["sim"]
+    sampled = discretise(_thesis_model(), period)
+    closed = sampled.A - sampled.B @ np.atleast_2d(_gain(0.1))
+    variance = amplitude**2 / 3.0
+    steps = round(hold_time / period)
+    powers = [np.eye(2)]
+    inputs = [np.zeros((2, 1))]
+    for _ in range(steps):
+        powers.append(closed @ powers[-1])
+        inputs.append(closed @ inputs[-1] + sampled.B)
+    last = inputs[-1]
+    P = scipy.linalg.solve_discrete_lyapunov(powers[-1], variance * last @ last.T)
+    between = [
+        (power @ P @ power.T + variance * b @ b.T)[0, 0] for power, b in zip(powers[1:], inputs[1:], strict=True)
+    ]
+    return float(np.sqrt(np.mean(between)))
+
+
+def _thesis_model() -> LinearModel:
+    return linearise(load_plant("thesis"))
+
+
+def _gain(r: float) -> Any:
+    return continuous_lqr(_thesis_model(), list(WEIGHTS), r).K
+
+
+def _require_positive(name: str, value: float, unit: str) -> None:
+    if not (math.isfinite(value) and value > 0.0):
+        raise ParameterError(f"{name} is {value:g} {unit}".rstrip() + "; expected > 0")

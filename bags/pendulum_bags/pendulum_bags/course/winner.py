@@ -1,0 +1,76 @@
+"""Which of two controllers wins on the emulated machine: both are run there, under one noise, and judged by theta."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from pathlib import Path
+
+from pendulum_bags.course.checks import WEIGHTS, Judgement
+from pendulum_bags.course.tasks import Tasks
+from pendulum_bags.experiments.lockstep import record_run
+from pendulum_bags.experiments.run_spec import RunSpec
+from pendulum_bags.runs.run_data import read_run
+from pendulum_msgs_py.errors import FaultError, ParameterError
+
+__all__ = ["check_winner", "spread_on_machine"]
+
+_FAULTED = "is in fault"
+DURATION = 5.0
+"""Length of each run [s]."""
+
+
+def check_winner(tasks: Tasks, name: str, folder: Path, on_run: Callable[[str], None] = lambda name: None) -> Judgement:
+    """Run both controllers on the emulated machine, and judge which was said to win.
+
+    Args:
+        tasks: The tasks.
+        name: a or b.
+        folder: For the recordings.
+        on_run: Called with the name of each controller before it runs.
+
+    Raises:
+        ParameterError: The name is another.
+        FaultError: A program ended or did not answer.
+    """
+    weights = {"a": tasks.controller_a, "b": tasks.controller_b}
+    if name not in weights:
+        raise ParameterError(f"winner is {name!r}; expected a or b")
+    spreads = {}
+    for letter, r in weights.items():
+        on_run(letter)
+        spreads[letter] = spread_on_machine(folder / letter, r, tasks.noise_seed)
+    best = min(spreads, key=spreads.__getitem__)
+    told = ", ".join(
+        f"{letter.upper()} {f'leaves {value:.3g} rad' if math.isfinite(value) else 'drives the bridge into a fault'}"
+        for letter, value in spreads.items()
+    )
+    return Judgement(name == best, f"on the emulated machine {told} (standard deviation of theta)")
+
+
+def spread_on_machine(bag: Path, r: float, seed: int) -> float:
+    """Return the standard deviation of theta that an LQR leaves on the emulated machine under noise of 2.5 N m [rad].
+
+    It is inf where the bridge faults, which counts as a loss.
+
+    Args:
+        bag: Folder of the recording.
+        r: R of the LQR [1/(N m)^2].
+        seed: Of the noise.
+    """
+    spec = RunSpec(
+        side="hw",
+        controller="lqr",
+        controller_parameters={"q": list(WEIGHTS), "r": r},
+        disturbance={"kind": "uniform", "amplitude": 2.5, "hold_time": 0.01, "duration": DURATION},
+        duration=DURATION,
+        seed=seed,
+    )
+    try:
+        recorded = record_run(bag, spec)
+    except FaultError as error:
+        # The bridge's own fault is an answer; that a program did not start is none.
+        if _FAULTED in str(error):
+            return math.inf
+        raise
+    return float(read_run(recorded).window.position.std(ddof=1))
