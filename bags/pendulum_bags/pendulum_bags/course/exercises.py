@@ -49,7 +49,8 @@ theta grow (within 8 %)? And why?
 ## 5. Predict the winner
 Two LQRs for the plant `thesis`, both with Q = diag({q[0]:g}, {q[1]:g}): **A** with R = {controller_a:g}, **B** with
 R = {controller_b:g}. In simulation the smaller R wins. Which of them leaves the smaller standard deviation of theta *on
-the machine*, at 100 Hz, under noise of 2.5 N m? Predict before you measure. The check runs both on the emulated machine.
+the machine*, at 100 Hz, under noise of 2.5 N m? Predict before you measure. The check runs both on the
+emulated machine.
 
     python -m pendulum_bags course check winner a --course {course}
 
