@@ -1,0 +1,262 @@
+"""What a stranger adds, with one file or function and one line each, is there at once: in help, tables and runs."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from pendulum_rosbag.reader import read_bag
+from tests.fixtures import PROJECT
+from tests.synthetic_runs import write_run_folder
+
+PACKAGES = (
+    "pendulum_msgs_py/pendulum_msgs_py",
+    "pendulum_sim/pendulum_sim",
+    "pendulum_lqr/pendulum_lqr",
+    "pendulum_hw_bridge/pendulum_hw_bridge",
+    "bags/pendulum_rosbag/pendulum_rosbag",
+    "bags/pendulum_bags/pendulum_bags",
+)
+
+FILES = {
+    "pendulum_lqr/controllers/springy.py": """
+from pendulum_lqr.controller import BaseController
+from pendulum_msgs_py.parameters import ParameterSpec
+
+
+class Springy(BaseController):
+    SUMMARY = "A spring and nothing else."
+    PARAMETERS = (ParameterSpec("spring", 30.0, "N m/rad", "How hard it pulls.", minimum=0.0),)
+
+    def __init__(self, spring, effort_limit, set_point):
+        super().__init__(effort_limit, set_point)
+        self.spring = spring
+
+    @classmethod
+    def design(cls, plant, period, p):
+        return cls(p["spring"], p["effort_limit"], p["set_point"])
+
+    def command(self, t, x):
+        return self.clamp(-self.spring * self.error(x[0]))
+""",
+    "pendulum_msgs_py/plants/presets/heavy.yaml": """
+format: pendulum_plant/1
+name: heavy
+parameters:
+  inertia: {value: 0.2, unit: kg m^2}
+  damping: {value: 8.0, unit: N m s/rad}
+  gravity: {value: 4.0, unit: N m}
+""",
+    "pendulum_hw_bridge/backends/toy.py": """
+from pendulum_hw_bridge.backends.emulator import EmulatorBackend
+
+
+class ToyBackend(EmulatorBackend):
+    name = "toy"
+""",
+    "pendulum_bags/analyse/questions/length.py": """
+from pendulum_rosbag.reader import read_bag
+
+
+def answer(path, plant):
+    with read_bag(path) as bag:
+        return {"states": len(bag.array(f"{plant}/joint_states"))}
+""",
+}
+"""Files of a stranger, beside ours."""
+
+FUNCTIONS = {
+    "pendulum_lqr/disturbance.py": (
+        "DISTURBANCES",
+        """
+def _square_wave(p, hold_ns):
+    period = 1e9 / p["frequency"]
+    return lambda t: 0.0 if t < 0 else p["amplitude"] if t % period < p["duty"] * period else -p["amplitude"]
+""",
+    ),
+    "pendulum_bags/comparison/metrics.py": (
+        "METRICS",
+        """
+def _crossings(episode):
+    return float(sum(a * b < 0.0 for a, b in zip(episode.error, episode.error[1:])))
+""",
+    ),
+    "pendulum_bags/report/figures.py": (
+        "FIGURES",
+        """
+def first_figure(data):
+    import numpy as np
+    from pendulum_bags.figures.figure import Figure, Panel, Trace
+
+    panel = Panel("time [s]", "runs [-]", [Trace(np.zeros(2), np.ones(2), "runs", "sim")])
+    return Figure("first", "A first figure", f"Made of {len(data.names)} runs.", [panel], section="A new section")
+""",
+    ),
+}
+"""Functions of a stranger: the file, the table that they stand before, the function."""
+
+LINES = {
+    "pendulum_lqr/controller.py": ("CONTROLLERS", '"springy": "pendulum_lqr.controllers.springy:Springy",'),
+    "pendulum_hw_bridge/backends/__init__.py": (
+        "BACKENDS",
+        '"toy": Backend("pendulum_hw_bridge.backends.toy:ToyBackend", _fixed("colour", "red", "`toy`: its colour.")),',
+    ),
+    "pendulum_bags/analyse/questions/__init__.py": (
+        "QUESTIONS",
+        '"length": Question("pendulum_bags.analyse.questions.length"),',
+    ),
+    "pendulum_lqr/disturbance.py": (
+        "DISTURBANCES",
+        '"square_wave": DisturbanceKind(_square_wave, parameters=(ParameterSpec("duty", 0.5, "-", "Its share."),)),',
+    ),
+    "pendulum_bags/comparison/metrics.py": ("METRICS", 'Metric("crossings", "-", "changes of sign", _crossings),'),
+    "pendulum_bags/report/figures.py": ("FIGURES", '("A first figure", first_figure),'),
+}
+"""The line that each adds to a table; a preset needs none."""
+
+LOOK = """
+import contextlib, io, json, sys
+from pathlib import Path
+
+from pendulum_bags.analyse.analyse_cli import main as analyse
+from pendulum_bags.comparison import compare_folders
+from pendulum_bags.comparison.metrics import Episode, metrics_of
+from pendulum_bags.experiments.in_process import simulate
+from pendulum_bags.experiments.run_spec import RunSpec
+from pendulum_bags.report import write_report
+from pendulum_hw_bridge.bridge_node import main as bridge
+from pendulum_hw_bridge.bridge_consistency import check_consistency
+from pendulum_hw_bridge.bridge_parameters import make_port
+from pendulum_hw_bridge.clocks import SteppedClock
+from pendulum_hw_bridge.node_specs import SPECS
+from pendulum_lqr.controller import controller_parameters
+from pendulum_lqr.controller_node import main as controller
+from pendulum_lqr.disturbance import DISTURBANCE_SPECS
+from pendulum_lqr.disturbance_node import main as disturbance
+from pendulum_msgs_py.contract.drive import PlantLimits
+from pendulum_msgs_py.errors import PendulumError
+from pendulum_msgs_py.parameters import markdown_table, validate
+from pendulum_sim.simulator_node import main as simulator
+
+bag, run, out = sys.argv[1:]
+
+
+def said(main, *arguments):
+    text = io.StringIO()
+    with contextlib.redirect_stdout(text), contextlib.suppress(SystemExit):
+        main(list(arguments))
+    return " ".join(text.getvalue().split())
+
+
+def refused(call, *arguments):
+    try:
+        call(*arguments)
+    except PendulumError as error:
+        return str(error)
+    return ""
+
+
+spec = RunSpec(
+    plant="heavy", design_plant="heavy", controller="springy", duration=1.0,
+    disturbance={"kind": "square_wave", "duty": 0.25, "frequency": 2.0, "amplitude": 1.5},
+)
+arrays = simulate(spec)
+values = {**validate(SPECS, {"backend": "toy", "starvation_limit": 5.0}), "clock": "realtime"}
+page = write_report(out, comparison=compare_folders([run]), recordings=[], formats=()).read_text()
+print(json.dumps({
+    "help": {
+        "controller": said(controller, "--help"), "disturbance": said(disturbance, "--help"),
+        "simulator": said(simulator, "--help"), "bridge": said(bridge, "--help"), "analyse": said(analyse, "--help"),
+    },
+    "tables": {
+        "controller": markdown_table(controller_parameters("springy")),
+        "disturbance": markdown_table(DISTURBANCE_SPECS), "bridge": markdown_table(SPECS),
+    },
+    "command": arrays.command.tolist(),
+    "position": arrays.position.tolist(),
+    "torques": sorted(set(arrays.disturbance.tolist())),
+    "backend": make_port(values, SteppedClock()).connect().backend,
+    "slack": refused(check_consistency, values | {"command_lifetime": 0.5}, PlantLimits(13.0)),
+    "metrics": metrics_of(Episode(arrays.stamp_ns * 1e-9, arrays.position - 3.2, arrays.position, arrays.effort)),
+    "answers": json.loads(said(analyse, bag, "--ask", "length", "--json", "--out", out)),
+    "page": page[page.index("</style>"):][-4_000_000:],
+}))
+"""
+
+
+@pytest.fixture(scope="module")
+def seen(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
+    """Return what a copy of the packages with one of each shows; all are asked at once, since imports take seconds."""
+    folder = tmp_path_factory.mktemp("plug_ins")
+    for package in PACKAGES:
+        shutil.copytree(PROJECT / package, folder / Path(package).name, ignore=shutil.ignore_patterns("__pycache__"))
+    for name, text in FILES.items():
+        (folder / name).write_text(text.lstrip(), encoding="utf-8")
+    for name, (table, function) in FUNCTIONS.items():
+        _edit(folder / name, rf"^{table}\b", lambda found, function=function: f"{function}\n\n{found.group()}")
+    for name, (table, line) in LINES.items():
+        _edit(folder / name, rf"^{table}\b.*= [{{(]\n", lambda found, line=line: f"{found.group()}    {line}\n")
+    write_run_folder(folder / "run", seed=1)
+    command = [sys.executable, "-c", LOOK, str(folder / "run" / "sim"), str(folder / "run"), str(folder / "out")]
+    environment = {**os.environ, "PYTHONPATH": str(folder)}
+    done = subprocess.run(command, cwd=folder, env=environment, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    states = len(read_bag(folder / "run" / "sim").array("/sim/joint_states"))
+    return {**json.loads(done.stdout), "states": states}
+
+
+def _edit(path: Path, pattern: str, replace: Any) -> None:
+    text, count = re.subn(pattern, replace, path.read_text(encoding="utf-8"), count=1, flags=re.MULTILINE)
+    assert count == 1, (path, pattern)
+    path.write_text(text, encoding="utf-8")
+
+
+def test_a_new_controller_has_its_parameters_and_controls(seen: dict[str, Any]) -> None:
+    assert "springy" in seen["help"]["controller"]
+    assert "| `spring` | `30.0` | N m/rad | >= 0 | How hard it pulls. |" in seen["tables"]["controller"]
+    expected = [30.0 * (3.141592653589793 - angle) for angle in seen["position"]]
+    assert seen["command"] == pytest.approx(expected)
+
+
+def test_a_new_preset_is_listed_and_runs(seen: dict[str, Any]) -> None:
+    for program in ("controller", "simulator"):
+        assert re.search(r"\bheavy\b", seen["help"][program]), program
+    # From rest upright, 1.5 N m on 0.2 kg m^2 for the first step of 2 ms that any torque acts in.
+    start, moved = seen["position"][1:3]
+    assert (moved - start) / 0.002**2 == pytest.approx(1.5 / 0.2, rel=1e-3)
+
+
+def test_a_new_disturbance_has_its_parameters_and_pushes(seen: dict[str, Any]) -> None:
+    assert "square_wave" in seen["help"]["disturbance"]
+    assert "duty" in seen["help"]["disturbance"]
+    assert "| `duty` | `0.5` | - | any | Its share. |" in seen["tables"]["disturbance"]
+    assert seen["torques"] == [-1.5, 1.5]
+
+
+def test_a_new_backend_has_its_parameters_connects_and_keeps_the_limits_of_a_machine(seen: dict[str, Any]) -> None:
+    assert re.search(r"\btoy\b", seen["help"]["bridge"])
+    assert "| `colour` | `red` | – | any | `toy`: its colour. Read-only. |" in seen["tables"]["bridge"]
+    assert seen["backend"] == "toy"
+    assert "so long a dead bridge drives" in seen["slack"]
+
+
+def test_a_new_question_is_listed_and_answered(seen: dict[str, Any]) -> None:
+    assert re.search(r"\blength\b", seen["help"]["analyse"])
+    assert [row["states"] for row in seen["answers"]["bags"]] == [seen["states"]]
+
+
+def test_a_new_metric_is_measured(seen: dict[str, Any]) -> None:
+    assert seen["metrics"]["crossings"] >= 0.0
+
+
+def test_a_new_figure_is_drawn_in_a_section_of_its_own(seen: dict[str, Any]) -> None:
+    assert "A new section" in seen["page"]
+    assert "Made of 1 runs." in seen["page"]
