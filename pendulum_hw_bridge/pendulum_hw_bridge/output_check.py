@@ -112,7 +112,7 @@ class OutputCheck:
             loop = self.gains.effort
             clamped = not loop.min_output + _STILL < pwm < loop.max_output - _STILL
             threshold = math.inf if clamped else _STILL_EFFORT
-        if self._opposes(feedback, wanted[0], still):
+        if self._opposes(feedback, likeliest, still):
             return Fault("output_disagreement", f"{text}, the other way, and has not moved: is it stuck?")
         if still and _memoryless(self.gains) and max(asked) - min(asked) > threshold:
             return Fault("output_disagreement", f"{text}, but it has not moved for {_RECORDS} records: is it stuck?")
