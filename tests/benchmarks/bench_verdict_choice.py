@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import solve_discrete_lyapunov
 from scipy.optimize import brentq
+from threadpoolctl import threadpool_limits
 
 from pendulum_bags.ranking.present import REGRET_MARGIN, same_choice
 from pendulum_bags.ranking.ranking import Contender, rank
@@ -32,6 +33,12 @@ Array = NDArray[np.float64]
 
 def rows() -> Iterator[Row]:
     """Yield the rows of this area."""
+    # Matrices are small: threads of the linear algebra would only get into each other's way.
+    with threadpool_limits(1):
+        yield _at_margin()
+
+
+def _at_margin() -> Row:
     sim, hw = load_plant("thesis"), machine_at_margin()
     sim_cost, hw_cost = expected_costs(sim), expected_costs(hw)
     truth = hw_cost / hw_cost.min() - 1.0
@@ -50,7 +57,7 @@ def rows() -> Iterator[Row]:
         if truth[int(found.pick)] >= REGRET_MARGIN - 1e-6:
             on_margin += 1
             yes += same_choice(found).mark is Mark.YES
-    yield counted(
+    return counted(
         f"layer 4 at its margin: a pick {100.0 * REGRET_MARGIN:g} % dearer than the best of {len(GAINS)} gains, "
         f"{SEEDS} runs of each, is called the same choice",
         yes,

@@ -34,6 +34,15 @@ def runs(tmp_path: Path) -> Path:
     return folder
 
 
+def test_a_repeat_belongs_to_its_run_and_is_no_run_of_its_own(runs: Path, tmp_path: Path) -> None:
+    for side in ("sim", "hw"):
+        shutil.copytree(EXAMPLES / f"regulation_{side}", runs / "monday" / "repeats" / "1" / side)
+        # A folder of that name that belongs to no run is one.
+        shutil.copytree(EXAMPLES / f"regulation_{side}", runs / "other" / "repeats" / "1" / side)
+    found = [piece.name for piece in find_pieces([runs], ["compare"])]
+    assert found == ["monday", "other/repeats/1", "tuesday"]
+
+
 def test_rows_hold_what_the_single_commands_say(runs: Path, tmp_path: Path) -> None:
     questions = ["metrics", "timing", "compare"]
     table = analyse_bags(tmp_path / "out", find_pieces([runs], questions), questions)

@@ -23,7 +23,7 @@ from typing import Any
 import numpy as np
 
 from pendulum_bags.analyse.questions import QUESTIONS
-from pendulum_bags.runs.run_folder import write_json
+from pendulum_bags.runs.run_folder import is_repeat, write_json
 from pendulum_bags.studies.chunks import Connect, carry_out
 from pendulum_msgs_py.contract import names
 from pendulum_msgs_py.errors import BagError, ParameterError, PendulumError
@@ -117,7 +117,8 @@ def find_pieces(folders: Sequence[Path], questions: Sequence[str]) -> list[Piece
         if any(not QUESTIONS[question].of_runs for question in questions):
             found.append(Piece(name, str(path), False))
         run = path.parent
-        if path.name == "sim" and (run / "hw").is_dir() and any(QUESTIONS[question].of_runs for question in questions):
+        asked = any(QUESTIONS[question].of_runs for question in questions)
+        if asked and path.name == "sim" and (run / "hw").is_dir() and not is_repeat(run):
             found.append(Piece(str(Path(name).parent) if len(Path(name).parts) > 1 else run.name, str(run), True))
     if not found:
         what = " or ".join(sorted({_wanted(question) for question in questions}))

@@ -9,6 +9,7 @@ from typing import Any
 
 from nicegui import ui
 
+from pendulum_bags.console.certified import CertifiedDesigns
 from pendulum_bags.console.graph import Graph
 from pendulum_bags.console.jobs import Jobs
 from pendulum_bags.console.parameter_table import ParameterTable
@@ -35,6 +36,7 @@ class Layout:
             ParameterTable(graph, "controller", self._carefully),
             ParameterTable(graph, "disturbance", self._carefully),
         ]
+        self._certified = CertifiedDesigns(jobs)
         self._job_labels: dict[str, tuple[ui.label, ui.link]] = {}
         self._cards: dict[str, str] = {}
 
@@ -115,9 +117,8 @@ class Layout:
                 filled=True,
             )
             _button("Cancel", lambda: self._finish("experiment"))
-            self._certified = ui.link("Open the certified gains", "#", new_tab=True)
-            self._certified.set_visibility(False)
         self._job_line("experiment")
+        self._certified.build()
 
     def _job_line(self, kind: str) -> None:
         label = ui.label().classes("small").props('role="status"')
@@ -185,10 +186,7 @@ class Layout:
                     self._plant_card(space, node)
         for table in self._tables:
             await table.refresh(sorted(plants))
-        measured = self._jobs.newest("frequency_response.html")
-        self._certified.set_visibility(measured is not None)
-        if measured is not None:
-            self._certified.props(f'href="/runs/{measured.name}/frequency_response.html#certified_gains"')
+        self._certified.refresh()
         for kind, (label, link) in self._job_labels.items():
             job = self._jobs[kind]
             label.text = job.describe() if job is not None else ""

@@ -4,31 +4,32 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
 from threadpoolctl import threadpool_limits
 
 from pendulum_bags.figures.render_files import write_figures
-from pendulum_bags.frequency_response.compare import Difference, compare_responses
+from pendulum_bags.frequency_response.compare import compare_responses
 from pendulum_bags.frequency_response.designs import DesignResult, certify_designs, design_text
 from pendulum_bags.frequency_response.estimate import estimate
 from pendulum_bags.frequency_response.figures import response_figures
 from pendulum_bags.frequency_response.layers import GAP_MARGIN, same_plant, which_controllers
+from pendulum_bags.frequency_response.page import write_page
 from pendulum_bags.frequency_response.record import record_of_run
+from pendulum_bags.frequency_response.result import Analysis
 from pendulum_bags.runs.run_folder import write_json
 from pendulum_bags.verdict import LayerResult, write_layer
 from pendulum_lqr.certificate import Certifier
 from pendulum_lqr.gap_metric import DEFAULT_SCALING, Scaling
 from pendulum_lqr.machine_response import Machine
 from pendulum_lqr.measured_response import MeasuredResponse, read_response, write_response
-from pendulum_lqr.model import LinearModel, linearise
+from pendulum_lqr.model import linearise
 from pendulum_msgs_py.errors import DataError
 from pendulum_msgs_py.plants.plant_parameters import load_plant
 
 __all__ = [
-    "Analysis",
     "analyse_machine",
     "analyse_responses",
     "find_machine",
@@ -41,49 +42,6 @@ MACHINE = "hw_response.json"
 """File in which a run folder keeps the measured response of its hardware."""
 NUMBERS = "frequency_response.json"
 """File in which it keeps what was found."""
-
-
-@dataclass(frozen=True)
-class Analysis:
-    """All that responses tell.
-
-    Attributes:
-        responses: Simulation, hardware, or both.
-        model: Of the plant that designs were made on.
-        plant: Its name.
-        difference: Of simulation and hardware, None for one of them.
-        certifier: Of model and hardware, None without hardware.
-        designs: What was found of each.
-        layers: Layers of the verdict.
-        scaling: Units of the gap.
-    """
-
-    responses: Sequence[MeasuredResponse]
-    model: LinearModel
-    plant: str
-    difference: Difference | None
-    certifier: Certifier | None
-    designs: Sequence[DesignResult]
-    layers: Sequence[LayerResult]
-    scaling: Scaling = DEFAULT_SCALING
-
-    def to_json(self) -> dict[str, Any]:
-        """Return the figures as JSON values."""
-        return {
-            "plant": self.plant,
-            "scaling": asdict(self.scaling),
-            "responses": {response.label: response.facts for response in self.responses},
-            "difference": self.difference.to_json() if self.difference else None,
-            "gap_to_model": None
-            if self.certifier is None
-            else {
-                "nu_gap": self.certifier.profile.value,
-                "upper": self.certifier.profile.value_upper,
-                "at_hz": self.certifier.profile.at,
-            },
-            "designs": [design.to_json() for design in self.designs],
-            "layers": [layer.to_json() for layer in self.layers],
-        }
 
 
 def read_responses(paths: Sequence[Path]) -> tuple[list[MeasuredResponse], str]:
@@ -212,8 +170,6 @@ def write_analysis(
         formats: Of the figures.
         step: Called with what is written next.
     """
-    from pendulum_bags.frequency_response.page import write_page
-
     folder.mkdir(parents=True, exist_ok=True)
     for response in analysis.responses:
         write_response(folder / f"{response.label}_response.json", response)

@@ -6,7 +6,8 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from pendulum_bags.comparison import Comparison
-from pendulum_bags.frequency_response.analyse import Analysis, analyse_machine, find_machine
+from pendulum_bags.frequency_response.analyse import analyse_machine, find_machine
+from pendulum_bags.frequency_response.result import Analysis
 from pendulum_bags.verdict import Layer, LayerResult
 from pendulum_msgs_py.errors import DataError
 

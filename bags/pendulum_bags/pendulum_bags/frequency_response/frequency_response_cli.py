@@ -16,7 +16,7 @@ from pendulum_msgs_py.programs.executables import EXIT_INTERRUPTED, cli_main
 from pendulum_msgs_py.programs.terminal import make_console
 
 if TYPE_CHECKING:
-    from pendulum_bags.frequency_response.analyse import Analysis
+    from pendulum_bags.frequency_response.result import Analysis
 
 __all__ = ["experiment", "main"]
 

@@ -4,15 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from pendulum_bags.figures.figure import Figure
+from pendulum_bags.figures.table import Table
 from pendulum_bags.frequency_response.designs import design_rows
+from pendulum_bags.frequency_response.result import Analysis
 from pendulum_bags.report.layer_page import write_layer_page
-from pendulum_bags.report.tables import Table
-
-if TYPE_CHECKING:
-    from pendulum_bags.frequency_response.analyse import Analysis
 
 __all__ = ["ASSUMPTIONS", "write_page"]
 

@@ -4,18 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from pendulum_bags.comparison import Comparison
+from pendulum_bags.frequency_response.result import Analysis
 from pendulum_bags.replay.result import InputReplay
 from pendulum_bags.report.trials import TrialSet
 from pendulum_bags.verdict import Answer
 from pendulum_bags.verdict.answer import answer_of
 from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.plants.plant_parameters import PlantParameters, load_plant
-
-if TYPE_CHECKING:
-    from pendulum_bags.frequency_response.analyse import Analysis
 
 __all__ = ["ReportData"]
 

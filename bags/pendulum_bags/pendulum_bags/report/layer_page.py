@@ -8,11 +8,12 @@ from importlib import resources
 from pathlib import Path
 from typing import Any
 
+from pendulum_bags.figures.embed import packed_plotly, script_json
 from pendulum_bags.figures.figure import Figure
 from pendulum_bags.figures.render_plotly import graphs_of
-from pendulum_bags.report.page import _packed_plotly, _script_json
-from pendulum_bags.report.tables import Table, evidence_table
+from pendulum_bags.figures.table import Table
 from pendulum_bags.verdict import LayerResult, Mark
+from pendulum_bags.verdict.evidence import evidence_table
 from pendulum_msgs_py.errors import BagError
 
 __all__ = ["write_layer_page"]
@@ -71,8 +72,8 @@ def write_layer_page(
         entries=entries,
         notes=notes,
         made_at=datetime.now(timezone.utc).strftime("%Y-%m-%d %H:%M UTC"),
-        graphs=_script_json(graphs),
-        plotly=_packed_plotly(),
+        graphs=script_json(graphs),
+        plotly=packed_plotly(),
         style=read("report.css"),
         script=read("report.js"),
     )

@@ -2,20 +2,18 @@
 
 from __future__ import annotations
 
-import base64
-import gzip
-import json
 from collections.abc import Sequence
-from functools import lru_cache
 from importlib import resources
 from typing import Any
 
+from pendulum_bags.figures.embed import packed_plotly, script_json
 from pendulum_bags.figures.figure import Figure
 from pendulum_bags.figures.numbers import quantity
 from pendulum_bags.figures.render_plotly import graphs_of
+from pendulum_bags.figures.table import Table
 from pendulum_bags.report.animation import animation_of
 from pendulum_bags.report.data import ReportData
-from pendulum_bags.report.tables import Table, provenance_table
+from pendulum_bags.report.tables import provenance_table
 from pendulum_bags.report.wording import name_in
 from pendulum_bags.runs.run_data import timing_warning
 from pendulum_bags.verdict import Answer
@@ -91,9 +89,9 @@ def render_page(
         sections=sections,
         missing=missing,
         provenance=provenance_table(data),
-        animation=_script_json(animation_of(data)),
-        graphs=_script_json(graphs),
-        plotly=_packed_plotly(),
+        animation=script_json(animation_of(data)),
+        graphs=script_json(graphs),
+        plotly=packed_plotly(),
         style=read("report.css"),
         script=read("report.js"),
         diagram=read("block_diagram.svg"),
@@ -137,15 +135,3 @@ def _noise_note(data: ReportData) -> str:
 
 def _anchor(text: str) -> str:
     return "".join(c if c.isalnum() else "-" for c in text.lower()).strip("-")
-
-
-def _script_json(value: Any) -> str:
-    """Return JSON that may stand inside a script element."""
-    return json.dumps(value, separators=(",", ":"), allow_nan=False).replace("<", "\\u003c")
-
-
-@lru_cache(maxsize=1)
-def _packed_plotly() -> str:
-    """Return plotly.js, gzipped and in base64: a third of its size, and browsers unpack gzip by themselves."""
-    source = resources.files("plotly").joinpath("package_data").joinpath("plotly.min.js").read_bytes()
-    return base64.b64encode(gzip.compress(source, 9, mtime=0)).decode("ascii")

@@ -4,54 +4,27 @@ from __future__ import annotations
 
 import json
 import math
-import re
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from pendulum_bags.figures.numbers import quantity
+from pendulum_bags.figures.table import Table
 from pendulum_bags.report.data import ReportData
 from pendulum_bags.report.trial_figures import GRAVITY, INERTIA, UNITS
 from pendulum_bags.report.trials import TrialSet
 from pendulum_bags.verdict import Layer, LayerResult, Mark
+from pendulum_bags.verdict.evidence import evidence_table
 from pendulum_lqr.design import output_lqr
 from pendulum_lqr.model import linearise, sort_poles
 from pendulum_msgs_py.plants.plant_parameters import PLANT_SPECS
 
-__all__ = ["Table", "evidence_table", "make_tables", "provenance_table"]
+__all__ = ["make_tables", "provenance_table"]
 
 WEIGHTS = ((1.0, 0.01, 0.1), (1.0, 0.1, 0.1), (100.0, 0.01, 0.1), (100.0, 0.1, 0.1))
 """q11, q22 and r of the combinations in the thesis."""
-
-
-_NUMERIC = re.compile(r"^[−–±]?[\d.]*(×10[⁻⁰¹²³⁴⁵⁶⁷⁸⁹]+)?$")
-
-
-@dataclass(frozen=True)
-class Table:
-    """A table.
-
-    Args:
-        title: Heading.
-        sentence: What it shows.
-        head: Column headings; the first column holds row names.
-        rows: Cells as text.
-        section: Heading of the section it belongs to.
-    """
-
-    title: str
-    sentence: str
-    head: Sequence[str]
-    rows: Sequence[Sequence[str]]
-    section: str
-
-    @property
-    def numeric(self) -> list[bool]:
-        """Return for each column whether it holds numbers only, which then align to the right."""
-        return [all(_NUMERIC.match(row[i]) for row in self.rows) for i in range(len(self.head))]
 
 
 def make_tables(data: ReportData) -> list[Table]:
@@ -65,19 +38,6 @@ def make_tables(data: ReportData) -> list[Table]:
 def _is_further(result: LayerResult) -> bool:
     """Tell whether a layer was measured beside the tests of the run, which have a table of their own."""
     return result.layer is not Layer.SAME_RUN and result.mark is not Mark.NOT_MEASURED and bool(result.evidence)
-
-
-def evidence_table(result: LayerResult) -> Table:
-    """Return what a layer of the answer rests on."""
-    rows = []
-    for row in result.evidence:
-        ends = ("–" if end is None else quantity(end) for end in (row.low, row.high))
-        interval = "–" if row.low is None and row.high is None else " to ".join(ends)
-        name = row.quantity + (f" [{row.unit}]" if row.unit else "")
-        estimate = "–" if row.estimate is None else quantity(row.estimate)
-        rows.append((name, estimate, interval, row.expected or "–", row.mark.value if row.expected else "–", row.note))
-    head = ("quantity", "estimate", "interval", "expected", "result", "note")
-    return Table(f"Evidence: {result.layer.title}", result.sentence, head, rows, "Verdict")
 
 
 _PLANT_NAMES = {"sim": "simulation", "hw": "hardware", "sim_500hz": "simulation, own noise"}

@@ -21,7 +21,7 @@ from pendulum_msgs_py.errors import BagError, PendulumError
 if TYPE_CHECKING:
     from pendulum_bags.comparison import Comparison
     from pendulum_bags.comparison.margins import MarginArgument
-    from pendulum_bags.frequency_response.analyse import Analysis
+    from pendulum_bags.frequency_response.result import Analysis
     from pendulum_bags.replay.result import InputReplay
     from pendulum_bags.verdict import Answer
 

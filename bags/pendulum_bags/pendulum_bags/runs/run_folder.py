@@ -19,6 +19,7 @@ __all__ = [
     "create_run_folder",
     "discard_if_empty",
     "git_revision",
+    "is_repeat",
     "pair_folders",
     "read_looks",
     "versions",
@@ -85,6 +86,12 @@ def pair_folders(folder: Path) -> list[Path]:
     """Return the folders with the bags ``sim`` and ``hw`` of a run: its own, and those of its repeats in order."""
     repeats = [place for place in (folder / REPEATS).glob("*") if place.name.isdigit()]
     return [folder, *sorted(repeats, key=lambda place: int(place.name))]
+
+
+def is_repeat(folder: Path) -> bool:
+    """Tell whether a folder with the bags ``sim`` and ``hw`` is a repeat of the run folder that holds it."""
+    run = folder.parent.parent
+    return folder.parent.name == REPEATS and folder.name.isdigit() and (run / "sim").is_dir() and (run / "hw").is_dir()
 
 
 def write_looks(folder: Path, number: int) -> None:

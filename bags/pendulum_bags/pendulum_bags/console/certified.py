@@ -1,0 +1,71 @@
+"""The console's pictures of the designs that carry over to the machine that was measured last."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from nicegui import ui
+
+from pendulum_bags.console.jobs import Jobs
+from pendulum_bags.verdict import Layer, read_layers
+from pendulum_msgs_py.errors import DataError
+
+__all__ = ["CertifiedDesigns"]
+
+PAGE = "frequency_response.html"
+_KINDS = "certified for the measured machine, stabilising the model only, or neither"
+PICTURES = {
+    "certified_weights.png": f"Map of LQR weights, q11/r and q22/r: {_KINDS}",
+    "certified_gains.png": f"Map of gains, kp and kd: {_KINDS}; the designs are marked",
+}
+"""File in the folder of figures, and what it shows to whom cannot see it."""
+
+
+class CertifiedDesigns:
+    """Maps of certified LQR weights and gains, with the layer's sentence and a link to the page.
+
+    Args:
+        jobs: Knows the folder of runs.
+    """
+
+    def __init__(self, jobs: Jobs) -> None:
+        self._jobs = jobs
+        self._shown: tuple[Path, float] | None = None
+
+    def build(self) -> None:
+        """Lay it out, without pictures as long as nothing was measured."""
+        with ui.element("div").classes("certified") as self._place:
+            ui.html("<h3>Designs that carry over</h3>", sanitize=False)
+            self._sentence = ui.label().classes("small")
+            self._row = ui.element("div").classes("pictures")
+            self._link = ui.link("Open the page of the measurement", "#", new_tab=True)
+        self._place.set_visibility(False)
+
+    def refresh(self) -> None:
+        """Show what was measured last."""
+        folder = self._jobs.newest(PAGE)
+        self._place.set_visibility(folder is not None)
+        if folder is None:
+            return
+        version = (folder / PAGE).stat().st_mtime
+        if self._shown == (folder, version):
+            return
+        self._shown = folder, version
+        self._sentence.text = _sentence(folder)
+        self._link.props(f'href="/runs/{folder.name}/{PAGE}#certified_gains"')
+        self._row.clear()
+        with self._row:
+            for name, text in PICTURES.items():
+                if (folder / "figures" / name).is_file():
+                    # The time keeps a browser from showing an older measurement under the same name.
+                    source = f"/runs/{folder.name}/figures/{name}?{version:.0f}"
+                    ui.element("img").props(f'src="{source}" alt="{text}" loading="lazy"')
+
+
+def _sentence(folder: Path) -> str:
+    """Return what the layer says, empty where the folder keeps none."""
+    try:
+        found = read_layers(folder)
+    except DataError as error:
+        return str(error)
+    return next((one.sentence for one in found if one.layer is Layer.WHICH_CONTROLLERS), "")

@@ -1,0 +1,60 @@
+"""All that measured frequency responses tell."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from typing import Any
+
+from pendulum_bags.frequency_response.compare import Difference
+from pendulum_bags.frequency_response.designs import DesignResult
+from pendulum_bags.verdict import LayerResult
+from pendulum_lqr.certificate import Certifier
+from pendulum_lqr.gap_metric import DEFAULT_SCALING, Scaling
+from pendulum_lqr.measured_response import MeasuredResponse
+from pendulum_lqr.model import LinearModel
+
+__all__ = ["Analysis"]
+
+
+@dataclass(frozen=True)
+class Analysis:
+    """All that responses tell.
+
+    Attributes:
+        responses: Simulation, hardware, or both.
+        model: Of the plant that designs were made on.
+        plant: Its name.
+        difference: Of simulation and hardware, None for one of them.
+        certifier: Of model and hardware, None without hardware.
+        designs: What was found of each.
+        layers: Layers of the verdict.
+        scaling: Units of the gap.
+    """
+
+    responses: Sequence[MeasuredResponse]
+    model: LinearModel
+    plant: str
+    difference: Difference | None
+    certifier: Certifier | None
+    designs: Sequence[DesignResult]
+    layers: Sequence[LayerResult]
+    scaling: Scaling = DEFAULT_SCALING
+
+    def to_json(self) -> dict[str, Any]:
+        """Return the figures as JSON values."""
+        return {
+            "plant": self.plant,
+            "scaling": asdict(self.scaling),
+            "responses": {response.label: response.facts for response in self.responses},
+            "difference": self.difference.to_json() if self.difference else None,
+            "gap_to_model": None
+            if self.certifier is None
+            else {
+                "nu_gap": self.certifier.profile.value,
+                "upper": self.certifier.profile.value_upper,
+                "at_hz": self.certifier.profile.at,
+            },
+            "designs": [design.to_json() for design in self.designs],
+            "layers": [layer.to_json() for layer in self.layers],
+        }
