@@ -41,8 +41,9 @@ from pendulum_msgs_py.ros.convert import stamp_to_message
 from pendulum_msgs_py.ros.lifecycle import LifecycleNode
 from pendulum_msgs_py.ros.parameters import NodeParameters
 from pendulum_msgs_py.ros.plant_interface import PlantInterface
-from pendulum_msgs_py.ros.plant_loop import LockstepLoop, create_wall_timer
+from pendulum_msgs_py.ros.plant_loop import LockstepLoop
 from pendulum_msgs_py.ros.runner import run_node
+from pendulum_msgs_py.ros.timers import create_wall_timer
 
 __all__ = ["BridgeNode", "main"]
 

@@ -9,6 +9,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from pendulum_hw_bridge.procedures import HandMotion, Phase
+from pendulum_msgs_py.contract import names
 from pendulum_msgs_py.contract.trajectory import Trajectory, TrajectoryPoint
 from pendulum_msgs_py.contract.values import NANOSECONDS, JointSample
 
@@ -93,11 +94,11 @@ class HandTrial(Trial):
             who = "a person" if motion is None else "simulated"
             direction = 0 if motion is None else motion.direction
             details = {"trial": self.number, "procedure": "hand", "hand": who, "direction": direction}
-            events.append((self.start_ns, "trial_start", details))
+            events.append((self.start_ns, names.Event.TRIAL_START, details))
         time = (sample.stamp_ns - self.start_ns) / NANOSECONDS
         if self._asked_to_finish or (motion is not None and time >= motion.duration):
             self.finished = True
-            events.append((sample.stamp_ns, "trial_end", {"trial": self.number}))
+            events.append((sample.stamp_ns, names.Event.TRIAL_END, {"trial": self.number}))
             return TrialAnswer(push=push, events=events)
         if motion is not None:
             push = motion.torque(time, sample.position, sample.velocity)
@@ -136,9 +137,11 @@ class StaircaseTrial(Trial):
         if not self.started or self.finished or not isinstance(content, dict):
             return ""
         name, mode = content.get("name"), content.get("mode")
-        if name == "plant_mode" and mode == "armed_position":
+        if name == names.Event.PLANT_MODE and mode == "armed_position":
             self._follows_since_ns = int(content["stamp_ns"])
-        elif name == "trajectory_refused" or (name == "plant_mode" and mode in {"fault", "e_stop", "disarmed"}):
+        elif name == names.Event.TRAJECTORY_REFUSED or (
+            name == names.Event.PLANT_MODE and mode in {"fault", "e_stop", "disarmed"}
+        ):
             self.finished = True
             return f"the plant does not follow the staircase: {content.get('reason')}"
         return ""
@@ -153,7 +156,7 @@ class StaircaseTrial(Trial):
         if self._asked:
             self._asked = False
             details = {"trial": self.number, "procedure": "staircase"}
-            events.append((self.start_ns, "trial_start", details))
+            events.append((self.start_ns, names.Event.TRIAL_START, details))
         if self._follows_since_ns is None:
             return TrialAnswer(effort=None, events=events)
         while self._next < len(self._phases):
@@ -167,7 +170,7 @@ class StaircaseTrial(Trial):
         end_ns = self._follows_since_ns + round(self.trajectory.duration * NANOSECONDS)
         if self._asked_to_finish or sample.stamp_ns >= end_ns:
             self.finished = True
-            events.append((min(end_ns, sample.stamp_ns), "trial_end", {"trial": self.number}))
+            events.append((min(end_ns, sample.stamp_ns), names.Event.TRIAL_END, {"trial": self.number}))
             return TrialAnswer(effort=self._last_effort, events=events)
         return TrialAnswer(effort=None, events=events)
 

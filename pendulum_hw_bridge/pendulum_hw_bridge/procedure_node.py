@@ -19,6 +19,7 @@ from pendulum_hw_bridge.procedure import HandTrial, StaircaseTrial, Trial
 from pendulum_hw_bridge.procedures import hand_trials, staircase
 from pendulum_msgs_py.contract import names
 from pendulum_msgs_py.contract.cdr import encode_joint_state
+from pendulum_msgs_py.contract.names import Event
 from pendulum_msgs_py.parameters import ParameterSpec
 from pendulum_msgs_py.ros import qos
 from pendulum_msgs_py.ros.convert import event_message, sample_from_bytes, trajectory_to_message
@@ -118,7 +119,7 @@ class ProcedureNode(Node):
         failure = self._trial.hear(message.data)
         if failure and self._newest_ns is not None:
             self.get_logger().error(failure)
-            self._events.publish(event_message(self._newest_ns, "trial_failed", reason=failure))
+            self._events.publish(event_message(self._newest_ns, Event.TRIAL_FAILED, reason=failure))
 
     def _on_start(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         response.success = not self._trial.started

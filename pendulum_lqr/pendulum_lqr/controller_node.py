@@ -12,7 +12,7 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
-from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
+from diagnostic_msgs.msg import DiagnosticStatus
 from rclpy.lifecycle import LifecycleState, TransitionCallbackReturn
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64MultiArray
@@ -29,17 +29,17 @@ from pendulum_msgs_py.parameters import ParameterSpec
 from pendulum_msgs_py.plants.plant_parameters import PRESET_NAMES, PlantParameters, load_plant
 from pendulum_msgs_py.ros import qos
 from pendulum_msgs_py.ros.convert import (
-    diagnostic_status,
     problem_of_state,
     sample_from_bytes,
-    stamp_to_message,
 )
+from pendulum_msgs_py.ros.diagnostics import DIAGNOSTICS_PERIOD, Diagnostics
 from pendulum_msgs_py.ros.first_answer import FirstAnswer
 from pendulum_msgs_py.ros.lifecycle import LifecycleNode
 from pendulum_msgs_py.ros.parameters import NodeParameters
 from pendulum_msgs_py.ros.polled import PollingNode
 from pendulum_msgs_py.ros.runner import run_node
 from pendulum_msgs_py.ros.running_plant import RunningPlant
+from pendulum_msgs_py.ros.timers import create_wall_timer
 
 __all__ = ["NODE_SPECS", "ControllerNode", "main"]
 
@@ -68,7 +68,6 @@ NODE_SPECS: tuple[ParameterSpec, ...] = (
 )  # fmt: skip
 """Parameters of the node itself; those of the chosen controller join them."""
 
-_DIAGNOSTICS_PERIOD = 0.5
 _SAME_PERIOD = 0.02
 """Share by which a measured period may differ from that of the design without another design."""
 _MULTI_ARRAY_TOPIC = "~/commands"
@@ -113,11 +112,11 @@ class ControllerNode(LifecycleNode, PollingNode):
         else:
             self._command_publisher = self.create_publisher(JointState, names.EFFORT_COMMAND, qos.COMMAND)
         self._first_answer = FirstAnswer(self, self._command_publisher)
-        self._diagnostics_publisher = self.create_publisher(DiagnosticArray, names.DIAGNOSTICS, qos.DIAGNOSTICS)
+        self._diagnostics = Diagnostics(self, "controller")
         self.create_subscription(JointState, names.JOINT_STATES, self._on_state, qos.NEWEST_STATE, raw=True)
         self._running_plant = RunningPlant(self, self._plant)
         # Wall time on purpose: diagnostics must come even where simulated time stands still.
-        self.create_timer(_DIAGNOSTICS_PERIOD, self._on_timer, clock=_steady_clock())
+        create_wall_timer(self, DIAGNOSTICS_PERIOD, self._on_timer)
         if self._settings["autostart"]:
             self._autostart()
 
@@ -326,17 +325,7 @@ class ControllerNode(LifecycleNode, PollingNode):
         if self._running_plant.mismatch:
             level = max(level, DiagnosticStatus.WARN)
             text = f"{text}; {self._running_plant.mismatch}"
-        message = DiagnosticArray(
-            status=[diagnostic_status(f"{self.get_fully_qualified_name()}: controller", level, text, values)]
-        )
-        message.header.stamp = stamp_to_message(self._now())
-        self._diagnostics_publisher.publish(message)
-
-
-def _steady_clock() -> Any:
-    from rclpy.clock import Clock, ClockType
-
-    return Clock(clock_type=ClockType.STEADY_TIME)
+        self._diagnostics.publish(self._now(), level, text, values)
 
 
 def main(argv: Sequence[str] | None = None) -> int:

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
+from diagnostic_msgs.msg import DiagnosticStatus
 from rclpy.node import Node
 from sensor_msgs.msg import JointState
 from std_msgs.msg import String
@@ -23,15 +23,18 @@ from pendulum_lqr.disturbance import DISTURBANCE_SPECS, Disturbance, from_bag, m
 from pendulum_lqr.disturbing import DisturbanceLoop
 from pendulum_msgs_py.contract import names
 from pendulum_msgs_py.contract.cdr import encode_joint_state
+from pendulum_msgs_py.contract.names import Event
 from pendulum_msgs_py.contract.timing import SteadyWallClock
 from pendulum_msgs_py.contract.values import NANOSECONDS
 from pendulum_msgs_py.errors import DataError, ParameterError
 from pendulum_msgs_py.parameters import ParameterSpec, read_text
 from pendulum_msgs_py.ros import qos
-from pendulum_msgs_py.ros.convert import diagnostic_status, event_message, sample_from_bytes, stamp_to_message
+from pendulum_msgs_py.ros.convert import event_message, sample_from_bytes
+from pendulum_msgs_py.ros.diagnostics import DIAGNOSTICS_PERIOD, Diagnostics
 from pendulum_msgs_py.ros.first_answer import FirstAnswer
 from pendulum_msgs_py.ros.parameters import NodeParameters
 from pendulum_msgs_py.ros.runner import run_node
+from pendulum_msgs_py.ros.timers import create_wall_timer
 
 __all__ = ["NODE_SPECS", "DisturbanceNode", "main"]
 
@@ -44,8 +47,6 @@ NODE_SPECS: tuple[ParameterSpec, ...] = (
     ),
 )  # fmt: skip
 """Parameters of the node itself, next to those of the signal."""
-
-_DIAGNOSTICS_PERIOD = 0.5
 
 
 class DisturbanceNode(Node):
@@ -75,16 +76,16 @@ class DisturbanceNode(Node):
         self._torque_publisher = self.create_publisher(JointState, names.DISTURBANCE, qos.COMMAND)
         self._first_answer = FirstAnswer(self, self._torque_publisher)
         self._event_publisher = self.create_publisher(String, names.EVENTS, qos.EVENTS)
-        self._diagnostics_publisher = self.create_publisher(DiagnosticArray, names.DIAGNOSTICS, qos.DIAGNOSTICS)
+        self._diagnostics = Diagnostics(self, "disturbance")
         self.create_service(Trigger, "~/start", self._on_start)
         self.create_service(Trigger, "~/stop", self._on_stop)
         self.create_subscription(JointState, names.JOINT_STATES, self._on_state, qos.NEWEST_STATE, raw=True)
-        self.create_timer(_DIAGNOSTICS_PERIOD, self._publish_diagnostics, clock=_steady_clock())
+        create_wall_timer(self, DIAGNOSTICS_PERIOD, self._publish_diagnostics)
 
     def close(self) -> None:
         """End with zero torque while the context is still valid."""
         if self._loop.running:
-            self._tell("noise_end", self._loop.newest_stamp_ns or self._now(), reason="stopped by a signal")
+            self._tell(Event.NOISE_END, self._loop.newest_stamp_ns or self._now(), reason="stopped by a signal")
         newest = self._loop.newest_stamp_ns
         after = 0 if newest is None else newest + 1
         if newest is not None:
@@ -145,16 +146,7 @@ class DisturbanceNode(Node):
         values: dict[str, object] = {spec.name: self._settings[spec.name] for spec in DISTURBANCE_SPECS}
         values.update(self._loop.summary(time.monotonic_ns()))
         text = "disturbing" if self._loop.running else "zero torque"
-        name = f"{self.get_fully_qualified_name()}: disturbance"
-        message = DiagnosticArray(status=[diagnostic_status(name, DiagnosticStatus.OK, text, values)])
-        message.header.stamp = stamp_to_message(self._now())
-        self._diagnostics_publisher.publish(message)
-
-
-def _steady_clock() -> Any:
-    from rclpy.clock import Clock, ClockType
-
-    return Clock(clock_type=ClockType.STEADY_TIME)
+        self._diagnostics.publish(self._now(), DiagnosticStatus.OK, text, values)
 
 
 def _signal(values: Mapping[str, Any]) -> Disturbance:

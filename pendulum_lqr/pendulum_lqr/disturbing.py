@@ -9,6 +9,7 @@ from collections.abc import Mapping
 from typing import NamedTuple
 
 from pendulum_lqr.disturbance import Disturbance
+from pendulum_msgs_py.contract.names import Event
 from pendulum_msgs_py.contract.values import NANOSECONDS
 
 __all__ = ["DisturbanceAnswer", "DisturbanceLoop"]
@@ -102,17 +103,17 @@ class DisturbanceLoop:
         # One event a state: after an end that is still to be told, a new beginning waits for the next state.
         if self._armed and not self._ending:
             self._armed, self._start_ns = False, stamp_ns
-            event = "noise_start"
+            event = Event.NOISE_START
         torque = 0.0
         if self._start_ns is not None:
             elapsed = stamp_ns - self._start_ns
             if elapsed < 0 or (self._duration_ns and elapsed >= self._duration_ns):
                 self._start_ns = None
-                event = "noise_end"
+                event = Event.NOISE_END
             else:
                 torque = self._signal(elapsed + self._interval_ns // 2)
         elif self._ending:
-            event = "noise_end"
+            event = Event.NOISE_END
         self._ending = False
         self.last_torque = torque
         return DisturbanceAnswer(torque, event)

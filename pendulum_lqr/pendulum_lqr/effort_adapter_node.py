@@ -6,8 +6,7 @@ import sys
 import time
 from collections.abc import Callable, Sequence
 
-from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
-from rclpy.clock import Clock, ClockType
+from diagnostic_msgs.msg import DiagnosticStatus
 from rclpy.node import Node
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64MultiArray
@@ -19,9 +18,11 @@ from pendulum_msgs_py.contract.timing import SteadyWallClock
 from pendulum_msgs_py.errors import DataError
 from pendulum_msgs_py.parameters import ParameterSpec
 from pendulum_msgs_py.ros import qos
-from pendulum_msgs_py.ros.convert import diagnostic_status, sample_from_bytes, stamp_to_message
+from pendulum_msgs_py.ros.convert import sample_from_bytes
+from pendulum_msgs_py.ros.diagnostics import DIAGNOSTICS_PERIOD, Diagnostics
 from pendulum_msgs_py.ros.parameters import NodeParameters
 from pendulum_msgs_py.ros.runner import run_node
+from pendulum_msgs_py.ros.timers import create_wall_timer
 
 __all__ = ["NODE_SPECS", "EffortAdapterNode", "main"]
 
@@ -40,7 +41,6 @@ NODE_SPECS: tuple[ParameterSpec, ...] = (
 
 _ARRAY_TOPIC = "~/commands"
 _JOINT_TOPIC = "joint_commands"
-_DIAGNOSTICS_PERIOD = 0.5
 _COUNTS = ("commands", "answers", "replaced", "too_old", "refused")
 
 
@@ -63,7 +63,7 @@ class EffortAdapterNode(Node):
         self._reason = ""
         self._simulated_time = bool(self.get_parameter("use_sim_time").value)
         self._publisher = self.create_publisher(JointState, names.EFFORT_COMMAND, qos.COMMAND)
-        self._diagnostics = self.create_publisher(DiagnosticArray, names.DIAGNOSTICS, qos.DIAGNOSTICS)
+        self._diagnostics = Diagnostics(self, "effort adapter")
         self.create_subscription(JointState, names.JOINT_STATES, self._on_state, qos.NEWEST_STATE, raw=True)
         if self._settings["command_type"] == "multi_array":
             self._topic = _ARRAY_TOPIC
@@ -71,7 +71,7 @@ class EffortAdapterNode(Node):
         else:
             self._topic = _JOINT_TOPIC
             self.create_subscription(JointState, self._topic, self._on_joints, qos.COMMAND_INPUT)
-        self.create_timer(_DIAGNOSTICS_PERIOD, self._look, clock=Clock(clock_type=ClockType.STEADY_TIME))
+        create_wall_timer(self, DIAGNOSTICS_PERIOD, self._look)
 
     def close(self) -> None:
         """End with zero torque while the context is still valid."""
@@ -123,10 +123,7 @@ class EffortAdapterNode(Node):
         counts = {name: self._adapter.counts[name] for name in _COUNTS}
         level = DiagnosticStatus.WARN if self._reason else DiagnosticStatus.OK
         text = self._reason or ("passing commands on" if counts["answers"] else "no command yet")
-        name = f"{self._full_name}: effort adapter"
-        message = DiagnosticArray(status=[diagnostic_status(name, level, text, counts)])
-        message.header.stamp = stamp_to_message(self._now())
-        self._diagnostics.publish(message)
+        self._diagnostics.publish(self._now(), level, text, counts)
 
 
 def main(argv: Sequence[str] | None = None) -> int:

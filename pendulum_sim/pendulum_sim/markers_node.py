@@ -21,8 +21,8 @@ from pendulum_msgs_py.parameters import ParameterSpec
 from pendulum_msgs_py.ros import qos
 from pendulum_msgs_py.ros.convert import command_from_bytes, plant_mode, stamp_to_message
 from pendulum_msgs_py.ros.parameters import NodeParameters
-from pendulum_msgs_py.ros.plant_loop import create_wall_timer
 from pendulum_msgs_py.ros.runner import run_node
+from pendulum_msgs_py.ros.timers import create_wall_timer
 from pendulum_sim.shown_torques import SHOWN_TOPICS, ShownTorques
 
 __all__ = ["SPECS", "MarkersNode", "arc_points", "main"]

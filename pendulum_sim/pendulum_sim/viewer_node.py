@@ -20,8 +20,8 @@ from pendulum_msgs_py.parameters import ParameterSpec
 from pendulum_msgs_py.ros import qos
 from pendulum_msgs_py.ros.convert import command_from_bytes, plant_mode, sample_from_bytes
 from pendulum_msgs_py.ros.parameters import NodeParameters
-from pendulum_msgs_py.ros.plant_loop import create_wall_timer
 from pendulum_msgs_py.ros.runner import run_node
+from pendulum_msgs_py.ros.timers import create_wall_timer
 from pendulum_sim.drawing import PendulumPicture, Window, save_gif, save_png
 from pendulum_sim.shown_torques import SHOWN_TOPICS, ShownTorques
 

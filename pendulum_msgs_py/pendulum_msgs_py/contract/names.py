@@ -18,6 +18,7 @@ __all__ = [
     "JOINT_TRAJECTORY",
     "LINK",
     "PUSH",
+    "Event",
 ]
 
 JOINT = "pendulum_joint"
@@ -42,3 +43,17 @@ CLOCK = "/clock"
 ARM = "~/arm"
 E_STOP = "~/e_stop"
 E_STOP_RESET = "~/e_stop_reset"
+
+
+class Event:
+    """Names of what is told on ``events``; their details stand in the README."""
+
+    PLANT_MODE = "plant_mode"
+    TRAJECTORY_REFUSED = "trajectory_refused"
+    TRAJECTORY_FINISHED = "trajectory_finished"
+    LOCKSTEP_FINISHED = "lockstep_finished"
+    NOISE_START = "noise_start"
+    NOISE_END = "noise_end"
+    TRIAL_START = "trial_start"
+    TRIAL_END = "trial_end"
+    TRIAL_FAILED = "trial_failed"

@@ -10,8 +10,7 @@ from collections import Counter
 from collections.abc import Callable, Mapping
 from typing import Protocol
 
-from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
-from rclpy.clock import Clock, ClockType
+from diagnostic_msgs.msg import DiagnosticStatus
 from rclpy.node import Node
 from sensor_msgs.msg import JointState
 from std_msgs.msg import String
@@ -22,6 +21,7 @@ from pendulum_msgs_py.contract import names
 from pendulum_msgs_py.contract.cdr import encode_joint_state
 from pendulum_msgs_py.contract.cdr_trajectory import decode_joint_trajectory
 from pendulum_msgs_py.contract.commands import Refusal
+from pendulum_msgs_py.contract.names import Event
 from pendulum_msgs_py.contract.supervisor import Drive, Input, Mode, PlantSupervisor
 from pendulum_msgs_py.contract.timing import LoopStatistics, Throttle
 from pendulum_msgs_py.contract.values import NANOSECONDS, JointCommand, JointSample
@@ -30,17 +30,15 @@ from pendulum_msgs_py.ros import qos
 from pendulum_msgs_py.ros.commander_watch import CommanderWatch
 from pendulum_msgs_py.ros.convert import (
     command_from_bytes,
-    diagnostic_status,
     event_message,
     problem_of_command,
-    stamp_to_message,
 )
+from pendulum_msgs_py.ros.diagnostics import DIAGNOSTICS_PERIOD, Diagnostics
 from pendulum_msgs_py.ros.polled import PolledInput, PollingNode
+from pendulum_msgs_py.ros.timers import create_wall_timer
 
 __all__ = ["PlantInterface"]
 
-DIAGNOSTICS_PERIOD = 0.5
-"""Time between two diagnostics [s]."""
 _LEAST_BETWEEN_LINES = 1.0
 """Time between two lines of the log about one mode [s]."""
 TRAJECTORY_AGE_LIMIT = 1.0
@@ -107,7 +105,7 @@ class PlantInterface:
         self._states = node.create_publisher(JointState, names.JOINT_STATES, qos.STATE)
         self._applied = node.create_publisher(JointState, names.APPLIED_EFFORT, qos.STATE)
         self._events = node.create_publisher(String, names.EVENTS, qos.EVENTS)
-        self._diagnostics = node.create_publisher(DiagnosticArray, names.DIAGNOSTICS, qos.DIAGNOSTICS)
+        self._diagnostics = Diagnostics(node, "plant")
         inputs = [Input.EFFORT_COMMAND, Input.DISTURBANCE] + ([Input.PUSH] if push else [])
         self._polled: list[tuple[PolledInput, Callable[..., None]]] = []
         self._inputs = {}
@@ -128,9 +126,7 @@ class PlantInterface:
             node.create_service(Trigger, names.E_STOP, self._on_e_stop)
         node.create_service(Trigger, names.E_STOP_RESET, self._on_e_stop_reset)
         # Steady time: it must go on where simulated time stands still, or where the system clock is set back.
-        self._housekeeping = node.create_timer(
-            DIAGNOSTICS_PERIOD, self._on_housekeeping, clock=Clock(clock_type=ClockType.STEADY_TIME)
-        )
+        create_wall_timer(node, DIAGNOSTICS_PERIOD, self._on_housekeeping)
 
     # --- the plant's loop calls these ----------------------------------------------------------------------
 
@@ -186,7 +182,7 @@ class PlantInterface:
         """Disarm, say so in diagnostics; the plant then applies zero torque and publishes that, to be heard too."""
         self.supervisor.disarm(self.clock(), reason)
         self.publish_diagnostics()
-        self._diagnostics.wait_for_all_acked(qos.LAST_WORDS)
+        self._diagnostics.publisher.wait_for_all_acked(qos.LAST_WORDS)
         self._stopping = True
 
     def publish_diagnostics(self) -> None:
@@ -211,19 +207,8 @@ class PlantInterface:
         if self.statistics is not None:
             values.update(self.statistics.summary(self.clock()))
         values.update(self._more_diagnostics())
-        message = DiagnosticArray(
-            status=[
-                diagnostic_status(
-                    f"{self.node.get_fully_qualified_name()}: plant",
-                    self._level(),
-                    f"{supervisor.mode.value}: {supervisor.reason}",
-                    values,
-                    hardware_id=self.hardware_id,
-                )
-            ]
-        )
-        message.header.stamp = stamp_to_message(self.clock())
-        self._diagnostics.publish(message)
+        text = f"{supervisor.mode.value}: {supervisor.reason}"
+        self._diagnostics.publish(self.clock(), self._level(), text, values, hardware_id=self.hardware_id)
 
     # --- callbacks -----------------------------------------------------------------------------------------
 
@@ -262,7 +247,7 @@ class PlantInterface:
             kind = self.supervisor.mode.value if not self.supervisor.mode.armed else "invalid"
             self.refused_trajectories[kind] += 1
             self.node.get_logger().error(f"joint_trajectory refused: {error}")
-            self.publish_event("trajectory_refused", reason=str(error))
+            self.publish_event(Event.TRAJECTORY_REFUSED, reason=str(error))
             return
         self.node.get_logger().info(
             f"following a trajectory from {trajectory.start:.3f} to {trajectory.goal:.3f} rad in "
@@ -322,9 +307,9 @@ class PlantInterface:
         else:
             logger.info(text)
         if supervisor.trajectory_finished:
-            self.publish_event("trajectory_finished", reason=supervisor.reason)
+            self.publish_event(Event.TRAJECTORY_FINISHED, reason=supervisor.reason)
         else:
-            self.publish_event("plant_mode", mode=supervisor.mode.value, reason=supervisor.reason)
+            self.publish_event(Event.PLANT_MODE, mode=supervisor.mode.value, reason=supervisor.reason)
 
     def _tell_refusals(self) -> None:
         gates = {kind: self.supervisor.gates[kind] for kind in self._inputs}

@@ -3,16 +3,14 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Protocol
 
-from rclpy.clock import Clock, ClockType
-from rclpy.node import Node
-from rclpy.timer import Timer
 from rosgraph_msgs.msg import Clock as ClockMessage
 
 from pendulum_msgs_py.contract import names
 from pendulum_msgs_py.contract.cdr import encode_clock
+from pendulum_msgs_py.contract.names import Event
 from pendulum_msgs_py.contract.plant_specs import LOCKSTEP_EPOCH_NS
 from pendulum_msgs_py.contract.supervisor import Drive, Input, Mode
 from pendulum_msgs_py.contract.timing import LoopStatistics, SteadyWallClock
@@ -20,7 +18,7 @@ from pendulum_msgs_py.contract.values import NANOSECONDS, JointCommand, JointSam
 from pendulum_msgs_py.ros import qos
 from pendulum_msgs_py.ros.plant_interface import PlantInterface
 
-__all__ = ["LockstepLoop", "RealtimeLoop", "Stepper", "create_wall_timer"]
+__all__ = ["LockstepLoop", "RealtimeLoop", "Stepper"]
 
 
 class Stepper(Protocol):
@@ -31,11 +29,6 @@ class Stepper(Protocol):
 
         None stands for a measurement that was lost: nothing is published, time goes on.
         """
-
-
-def create_wall_timer(node: Node, period: float, callback: Callable[[], None]) -> Timer:
-    """Return a timer of steady time, deaf to simulated time and to steps of the system clock."""
-    return node.create_timer(period, callback, clock=Clock(clock_type=ClockType.STEADY_TIME))
 
 
 class RealtimeLoop:
@@ -197,7 +190,7 @@ class LockstepLoop:
             interface.publish_applied(before_ns, applied)
         if self.finished and not self._told_finished:
             self._told_finished = True
-            interface.publish_event("lockstep_finished", steps=self.steps)
+            interface.publish_event(Event.LOCKSTEP_FINISHED, steps=self.steps)
 
     def step_once(self) -> None:
         """Take one step while paused."""

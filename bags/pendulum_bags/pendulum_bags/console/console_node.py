@@ -33,6 +33,7 @@ from pendulum_bags.console.page import serve
 from pendulum_bags.console.security import is_loopback
 from pendulum_bags.console.stop_order import StopOrder
 from pendulum_msgs_py.contract import names
+from pendulum_msgs_py.contract.names import Event
 from pendulum_msgs_py.errors import FaultError, ParameterError
 from pendulum_msgs_py.programs.executables import cli_main
 from pendulum_msgs_py.ros import qos
@@ -369,7 +370,7 @@ def _on_event(plant: _Plant, message: String) -> None:
         event = json.loads(message.data)
     except json.JSONDecodeError:
         return
-    if not isinstance(event, dict) or event.get("name") != "plant_mode":
+    if not isinstance(event, dict) or event.get("name") != Event.PLANT_MODE:
         return
     stamp_ns = event.get("stamp_ns", 0)
     if isinstance(stamp_ns, int):

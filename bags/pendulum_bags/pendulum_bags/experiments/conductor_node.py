@@ -25,6 +25,7 @@ from trajectory_msgs.msg import JointTrajectory
 
 from pendulum_msgs_py.contract import names
 from pendulum_msgs_py.contract.drive import Mode
+from pendulum_msgs_py.contract.names import Event
 from pendulum_msgs_py.contract.trajectory import Trajectory
 from pendulum_msgs_py.contract.values import JointSample
 from pendulum_msgs_py.errors import FaultError
@@ -247,7 +248,7 @@ class PlantClient:
     def is_following(self) -> bool:
         """Tell whether the plant has taken up the move last asked for; raises as :meth:`trajectory_finished`."""
         return self.trajectory_finished() or any(
-            event["name"] == "plant_mode" and event.get("mode") == "armed_position"
+            event["name"] == Event.PLANT_MODE and event.get("mode") == "armed_position"
             for event in self.events[self._finished_before :]
         )
 
@@ -259,11 +260,11 @@ class PlantClient:
             FaultError: It refused the move.
         """
         for event in self.events[self._finished_before :]:
-            if event["name"] == "trajectory_refused":
+            if event["name"] == Event.TRAJECTORY_REFUSED:
                 raise FaultError(f"{self.namespace} refused the trajectory: {event.get('reason')}")
-            if event["name"] == "plant_mode" and event.get("mode") in {"fault", "e_stop", "disarmed"}:
+            if event["name"] == Event.PLANT_MODE and event.get("mode") in {"fault", "e_stop", "disarmed"}:
                 raise PlantStoppedError(self.namespace, str(event["mode"]), str(event.get("reason")))
-            if event["name"] == "trajectory_finished":
+            if event["name"] == Event.TRAJECTORY_FINISHED:
                 return True
         return False
 
@@ -298,7 +299,7 @@ class PlantClient:
 
     def newest_mode(self) -> str:
         """Return the plant's mode, as its newest event says; empty where none was heard."""
-        modes = [str(event.get("mode")) for event in self.events if event["name"] == "plant_mode"]
+        modes = [str(event.get("mode")) for event in self.events if event["name"] == Event.PLANT_MODE]
         return modes[-1] if modes else ""
 
     def is_armed(self) -> bool:
@@ -316,7 +317,7 @@ class PlantClient:
 
     def check_mode(self) -> None:
         """Raise a PlantStoppedError where the plant has faulted or been stopped."""
-        mode = self.has_event("plant_mode")
+        mode = self.has_event(Event.PLANT_MODE)
         if mode is not None and mode.get("mode") in {"fault", "e_stop"}:
             raise PlantStoppedError(self.namespace, str(mode["mode"]), str(mode.get("reason")))
 

@@ -20,6 +20,7 @@ from pendulum_bags.experiments.run_spec import RunSpec
 from pendulum_bags.runs.run_folder import write_json
 from pendulum_msgs_py.contract import names
 from pendulum_msgs_py.contract.angles import wrap
+from pendulum_msgs_py.contract.names import Event
 from pendulum_msgs_py.errors import BagError, FaultError, ParameterError
 from pendulum_msgs_py.programs import graph
 
@@ -259,7 +260,7 @@ def _require_rest(conductor: Conductor, plant: PlantClient) -> None:
 
 
 def _is_armed(plant: PlantClient, *, may_arm: bool) -> bool:
-    mode = plant.has_event("plant_mode")
+    mode = plant.has_event(Event.PLANT_MODE)
     if mode is not None and str(mode.get("mode", "")).startswith("armed"):
         return True
     if not may_arm:
@@ -281,4 +282,4 @@ def _watch(plant: PlantClient, play: ExcitationPlay) -> bool:
                 f"{plant.namespace} is at {value:.3g} {unit}; expected at most {limit:.3g} {unit}: the plant is not "
                 "what the excitation was designed for; it is disarmed"
             )
-    return plant.has_event("noise_end") is not None
+    return plant.has_event(Event.NOISE_END) is not None

@@ -14,6 +14,7 @@ from pendulum_bags.runs.run_data import END_EVENT, START_EVENT
 from pendulum_bags.runs.run_folder import write_json
 from pendulum_msgs_py.contract import names
 from pendulum_msgs_py.contract.angles import UPRIGHT
+from pendulum_msgs_py.contract.names import Event
 from pendulum_msgs_py.contract.values import NANOSECONDS
 from pendulum_msgs_py.errors import BagError, FaultError
 
@@ -171,7 +172,7 @@ def _has_reached(plant: PlantClient, end_ns: int) -> bool:
 
 def _is_finished(plant: PlantClient) -> bool:
     plant.check_mode()
-    return plant.has_event("lockstep_finished") is not None
+    return plant.has_event(Event.LOCKSTEP_FINISHED) is not None
 
 
 def finish_recording(

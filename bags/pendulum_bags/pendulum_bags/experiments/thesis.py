@@ -17,6 +17,7 @@ from pendulum_bags.experiments.repeats import repeat_command
 from pendulum_bags.experiments.settings import SETTLE_TIME, RegulationSettings
 from pendulum_bags.runs.run_folder import write_json
 from pendulum_msgs_py.contract.angles import UPRIGHT
+from pendulum_msgs_py.contract.names import Event
 from pendulum_msgs_py.contract.trajectory import thesis_ramp
 from pendulum_msgs_py.errors import FaultError
 from pendulum_msgs_py.programs import graph
@@ -146,7 +147,7 @@ def _conduct(
 
 def _noise_ended(plant: PlantClient) -> bool:
     plant.check_mode()
-    return plant.has_event("noise_end") is not None
+    return plant.has_event(Event.NOISE_END) is not None
 
 
 def _start_own_protocol(processes: ProcessSet, folder: Path, settings: RegulationSettings) -> Child:

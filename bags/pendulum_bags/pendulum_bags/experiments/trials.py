@@ -18,6 +18,7 @@ from pendulum_bags.experiments.settings import HARDWARE
 from pendulum_bags.experiments.thesis import LOOP_NICENESS, START_TIMEOUT
 from pendulum_bags.runs.run_folder import git_revision, versions, write_json
 from pendulum_msgs_py.contract import names
+from pendulum_msgs_py.contract.names import Event
 from pendulum_msgs_py.contract.trajectory import RAMP_INCREMENT, RAMP_PERIOD
 from pendulum_msgs_py.errors import FaultError, ParameterError
 from pendulum_msgs_py.programs import graph
@@ -231,7 +232,7 @@ def _run_trial(
                 f"the end of trial {trial}", lambda: _has_ended(plant, lockstep=settings.lockstep), longest
             )
             if settings.lockstep:
-                finished = plant.has_event("lockstep_finished")
+                finished = plant.has_event(Event.LOCKSTEP_FINISHED)
                 assert finished is not None
                 finish_recording(conductor, processes, recorder, plant, 1 + int(finished["steps"]))
         finally:
@@ -242,10 +243,10 @@ def _run_trial(
 
 def _has_ended(plant: PlantClient, *, lockstep: bool) -> bool:
     plant.check_mode()
-    if failed := plant.has_event("trial_failed"):
+    if failed := plant.has_event(Event.TRIAL_FAILED):
         raise FaultError(f"{plant.namespace}: {failed.get('reason')}")
-    ended = plant.has_event("trial_end") is not None
-    return ended and (not lockstep or plant.has_event("lockstep_finished") is not None)
+    ended = plant.has_event(Event.TRIAL_END) is not None
+    return ended and (not lockstep or plant.has_event(Event.LOCKSTEP_FINISHED) is not None)
 
 
 def _topics(settings: TrialSettings) -> dict[str, int]:

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from pendulum_bags.runs.correlation import effective_size
 from pendulum_bags.runs.series import Series, Signal, unwrap_near_upright
 from pendulum_msgs_py.contract import names
+from pendulum_msgs_py.contract.names import Event
 from pendulum_msgs_py.contract.values import NANOSECONDS
 from pendulum_msgs_py.errors import DataError
 from pendulum_rosbag.reader import Bag, read_bag
@@ -32,8 +33,8 @@ __all__ = [
     "timing_warning",
 ]
 
-START_EVENT = "noise_start"
-END_EVENT = "noise_end"
+START_EVENT = Event.NOISE_START
+END_EVENT = Event.NOISE_END
 
 
 @dataclass(frozen=True)

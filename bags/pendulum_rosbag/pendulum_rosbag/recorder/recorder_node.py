@@ -10,7 +10,6 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
-from rclpy.clock import Clock, ClockType
 from rclpy.topic_endpoint_info import TopicEndpointInfo
 from std_srvs.srv import Trigger
 
@@ -20,6 +19,7 @@ from pendulum_msgs_py.parameters import ParameterSpec
 from pendulum_msgs_py.ros.convert import event_message
 from pendulum_msgs_py.ros.parameters import NodeParameters
 from pendulum_msgs_py.ros.polled import PollingNode
+from pendulum_msgs_py.ros.timers import create_wall_timer
 from pendulum_rosbag import __version__
 from pendulum_rosbag.recorder import RecordingSession, SessionReport
 from pendulum_rosbag.recorder.options import RecorderOptions
@@ -83,7 +83,7 @@ class Recorder(PollingNode):
         self.create_service(Trigger, "~/status", self._on_status)
         self._discover()
         # Steady time: topics are looked for also where the system clock is set back, or simulated time stands still.
-        self.create_timer(DISCOVERY_PERIOD, self._discover, clock=Clock(clock_type=ClockType.STEADY_TIME))
+        create_wall_timer(self, DISCOVERY_PERIOD, self._discover)
         self._leave = threading.Event()
         self._poller = threading.Thread(target=self._poll, name="bag intake", daemon=True)
         self._poller.start()
