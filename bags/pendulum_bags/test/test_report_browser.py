@@ -85,3 +85,25 @@ def test_page_is_whole_and_usable(page: Any) -> None:
     page.keyboard.press("Enter")
     assert page.locator("#play").inner_text() == "Play"
     assert page.messages == []
+
+
+@pytest.mark.parametrize("scripts", [True, False], ids=["with scripts", "without scripts"])
+def test_paper_shows_every_figure_as_a_picture(browser: Any, tmp_path: Path, scripts: bool) -> None:
+    folder = write_run_folder(tmp_path / "run", seed=1)
+    printed = write_report(folder, recordings=[], formats=["png"])
+    assert printed.stat().st_size < 5_000_000
+    context = browser.new_context(offline=True, java_script_enabled=scripts)
+    page = context.new_page()
+    page.goto(printed.resolve().as_uri())
+    # At once, as a browser that prints from the command line does: before any plot is drawn.
+    page.emulate_media(media="print")
+    figures = page.locator("figure:has(.graphs)")
+    assert figures.count() >= 12
+    for index in range(figures.count()):
+        picture = figures.nth(index).locator("img.paper")
+        box = picture.bounding_box()
+        assert box is not None
+        assert box["width"] > 300
+        assert box["height"] > 100
+        assert figures.nth(index).locator(".graphs").is_hidden()
+    context.close()

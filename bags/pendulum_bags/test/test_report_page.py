@@ -6,9 +6,11 @@ import json
 import re
 import shutil
 from pathlib import Path
+from xml.etree import ElementTree
 
 import numpy as np
 import pytest
+import yaml
 
 from pendulum_bags.comparison import Comparison, compare_folders
 from pendulum_bags.figures.figure import ROLES, Figure, Panel, thinned
@@ -25,6 +27,7 @@ from pendulum_bags.verdict import Evidence, Layer, LayerResult, Mark, write_laye
 from pendulum_bags.verdict.answer import answer_of
 from pendulum_msgs_py.contract.cdr import encode_joint_state
 from pendulum_rosbag.storage import open_writer
+from tests.fixtures import PROJECT
 from tests.synthetic_runs import write_run_folder
 
 
@@ -286,3 +289,12 @@ def test_every_text_of_a_report_says_that_the_hardware_was_emulated() -> None:
     assert name_in("python -m pendulum_bags experiment thesis --hardware hebi", emulated=True).endswith(
         "--hardware hebi"
     )
+
+
+def test_provenance_names_plant_and_citation_and_the_file_at_the_root_agrees(comparison: Comparison) -> None:
+    rows = dict(provenance_table(ReportData(comparison, {"versions": {"pendulum_bags": "0.1.0"}})).rows)
+    assert rows["plant of the design"].startswith("thesis: inertia 0.055 kg m^2, damping 11.77 N m s/rad, gravity 1.6")
+    told = yaml.safe_load((PROJECT / "CITATION.cff").read_text(encoding="utf-8"))
+    assert rows["cite as"].startswith(f"{told['authors'][0]['name']}: {told['title']}, version {told['version']}, git ")
+    manifest = ElementTree.parse(PROJECT / "bags" / "pendulum_bags" / "package.xml").getroot()
+    assert told["version"] == manifest.findtext("version")

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import base64
+from collections.abc import Mapping, Sequence
 from importlib import resources
 from typing import Any
 
@@ -46,8 +47,19 @@ def render_page(
     *,
     title: str,
     made_at: str,
+    pictures: Mapping[str, bytes] | None = None,
 ) -> str:
-    """Return the HTML text of the report."""
+    """Return the HTML text of the report.
+
+    Args:
+        data: What it is made from.
+        figures: Figures, drawn on the page by a script.
+        tables: Tables.
+        missing: Figures that the data do not allow, each with the reason.
+        title: What the page is about.
+        made_at: When it was made.
+        pictures: The figures as PNG by name, for paper and for readers without scripts.
+    """
     import jinja2
 
     templates = resources.files("pendulum_bags.report").joinpath("templates")
@@ -60,6 +72,7 @@ def render_page(
     )
     sections = []
     graphs: dict[str, Any] = {}
+    packed = {name: base64.b64encode(content).decode("ascii") for name, content in (pictures or {}).items()}
     named = [figure.section for figure in figures] + [table.section for table in tables]
     for heading in dict.fromkeys((*SECTIONS, *named)):
         items: list[dict[str, Any]] = []
@@ -68,7 +81,7 @@ def render_page(
                 parts = graphs_of(figure)
                 names = [f"{figure.name}-{i}" for i in range(len(parts))]
                 graphs.update(zip(names, parts, strict=True))
-                items.append({"figure": figure, "graphs": names})
+                items.append({"figure": figure, "graphs": names, "picture": packed.get(figure.name)})
         items += [{"table": table} for table in tables if table.section == heading]
         if items:
             sections.append({"title": heading, "anchor": _anchor(heading), "entries": items})

@@ -19,9 +19,9 @@ from pendulum_bags.verdict import Layer, LayerResult, Mark
 from pendulum_bags.verdict.evidence import evidence_table
 from pendulum_lqr.design import output_lqr
 from pendulum_lqr.model import linearise, sort_poles
-from pendulum_msgs_py.plants.plant_parameters import PLANT_SPECS
+from pendulum_msgs_py.plants.plant_parameters import PLANT_SPECS, PlantParameters
 
-__all__ = ["make_tables", "provenance_table"]
+__all__ = ["citation", "make_tables", "provenance_table"]
 
 WEIGHTS = ((1.0, 0.01, 0.1), (1.0, 0.1, 0.1), (100.0, 0.01, 0.1), (100.0, 0.1, 0.1))
 """q11, q22 and r of the combinations in the thesis."""
@@ -276,15 +276,38 @@ def provenance_table(data: ReportData) -> Table:
     for key in ("controller", "disturbance"):
         if key in run:
             rows.append((key, json.dumps(run[key])))
+    if data.plant is not None:
+        rows.append(("plant of the design", _plant_in_words(data.plant)))
     versions = summary.get("versions") or run.get("versions") or {}
+    rows.append(("cite as", citation(str(versions.get("pendulum_bags", "")), rows[2][1])))
     rows += [(f"version of {name}", str(version)) for name, version in versions.items()]
     return Table(
         "Provenance",
-        "Everything that is needed to make these figures again.",
+        "Everything that is needed to make these figures again: seeds, parameters, versions and the git revision of the "
+        "run (+changes: edits were not committed).",
         ("what", "value"),
         rows,
         "Provenance",
     )
+
+
+_CITED = "Pendulum maintainers: Pendulum: is your simulation good enough to design a controller on?"
+
+
+def citation(version: str, revision: str) -> str:
+    """Return how to cite the software that made a report, as CITATION.cff at the project's root says it."""
+    told = f", version {version}" if version else ""
+    return f"{_CITED}{told}, git {revision}."
+
+
+def _plant_in_words(plant: PlantParameters) -> str:
+    """Return the parameters of a plant that are not zero, with units."""
+    told = [
+        f"{spec.name} {quantity(float(value), '' if spec.unit == '-' else spec.unit, 5)}"
+        for spec in PLANT_SPECS
+        if (value := getattr(plant, spec.name)) != 0.0
+    ]
+    return f"{plant.name}: {', '.join(told)}"
 
 
 def _short_path(path: str) -> str:
