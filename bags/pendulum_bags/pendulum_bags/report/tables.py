@@ -283,8 +283,8 @@ def provenance_table(data: ReportData) -> Table:
     rows += [(f"version of {name}", str(version)) for name, version in versions.items()]
     return Table(
         "Provenance",
-        "Everything that is needed to make these figures again: seeds, parameters, versions and the git revision of the "
-        "run (+changes: edits were not committed).",
+        "Everything that is needed to make these figures again: seeds, parameters, versions and the git revision of "
+        "the run (+changes: edits were not committed).",
         ("what", "value"),
         rows,
         "Provenance",
