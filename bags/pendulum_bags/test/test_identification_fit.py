@@ -10,7 +10,7 @@ from threadpoolctl import threadpool_limits
 
 from pendulum_bags.identification import identify_cli
 from pendulum_bags.identification.excitation import Limits, design_excitation
-from pendulum_bags.identification.options import Geometry, Options
+from pendulum_bags.identification.options import Geometry, Options, default_window
 from pendulum_bags.identification.result import identify, load_fit_model
 from pendulum_bags.identification.uncertainty import profile_interval
 from pendulum_bags.runs.datasets import Recording
@@ -104,6 +104,21 @@ def test_a_voltage_input_normalises_the_inertia():
     assert result.model["inertia"] == 1.0
     assert result.model["input_gain"] == pytest.approx(0.4 / TRUTH.inertia, rel=2e-2)
     assert result.model.natural_frequency == pytest.approx(np.sqrt(30.0), rel=5e-3)
+
+
+@pytest.mark.parametrize(
+    ("kind", "seconds", "window"),
+    [
+        ("voltage", 6.0, 2.0),
+        ("voltage", 60.0, 5.0),
+        ("voltage", 375.0, 10.0),
+        ("effort", 375.0, 1.0),
+        ("none", 10.0, 1.0),
+        ("position_goal", 10.0, None),
+    ],
+)
+def test_windows_are_long_where_a_drive_damps_and_enough_are_left(kind, seconds, window):
+    assert default_window(kind, seconds) == window
 
 
 def test_a_wrong_geometry_is_contradicted_and_a_right_one_is_not(found):

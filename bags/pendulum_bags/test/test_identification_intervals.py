@@ -37,6 +37,18 @@ def test_intervals_of_the_default_path_hold_the_truth():
     assert min(shares["torque_offset"], shares["angle_offset"]) >= 0.6
 
 
+def test_a_damping_without_dry_friction_beside_it_owns_that_there_may_be_some():
+    """Held-out windows leave Coulomb friction out of a noisy recording; the damping then does its work too."""
+    truth = TRUTHS["torque noise"]
+    result = identify([truth.recording(63)], profiles=0)
+    assert result.fit.chosen.friction == "viscous"
+    damping = result.uncertainty.intervals["damping"]
+    assert damping.low < truth.plant.damping < damping.high
+    # The plant without dry friction would move otherwise: the interval of a damping that had been told so is narrow.
+    told = identify([truth.recording(63)], Options(friction="viscous"), profiles=0).uncertainty.intervals["damping"]
+    assert told.standard_error < 0.3 * damping.standard_error
+
+
 def _jackknife_of_frequency(result):
     vectors = result.fit.chosen.validation.vectors
     w0 = np.sqrt(vectors[:, INDEX["gravity"]] / vectors[:, INDEX["inertia"]])

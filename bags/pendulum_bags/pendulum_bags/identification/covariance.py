@@ -73,6 +73,13 @@ def candidate_errors(
     plain, singular, condition = _white_covariance(information, scale, model, names)
     # Even white residuals are not alike everywhere: near a reversal the fit bends, and the sandwich sees it.
     linear = _sandwich(plain, information, scale, clusters=not white)
+    # A friction that ended at 0 is not known to be 0: what it could take over from the others widens those.
+    beside = tuple(n for n in ("damping", "coulomb_friction") if n in edges and model[n] <= 0.0)
+    if beside and names:
+        information = _information(model, pieces, candidate.solution.states, (*names, *beside))
+        wide, _, _ = _white_covariance(information, scale, model, (*names, *beside))
+        linear = _sandwich(wide, information, scale, clusters=not white)[: len(names), : len(names)]
+        plain = wide[: len(names), : len(names)]
     before = np.sqrt(np.maximum(np.diag(linear), 1e-300))
     after = before
     if not white and names:

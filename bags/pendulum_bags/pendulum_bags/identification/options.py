@@ -9,7 +9,7 @@ import numpy as np
 from pendulum_bags.identification.model import FRICTION_MODELS
 from pendulum_msgs_py.errors import DataError
 
-__all__ = ["DEFAULTS", "GRAVITY", "Geometry", "Options"]
+__all__ = ["DEFAULTS", "GRAVITY", "Geometry", "Options", "default_window"]
 
 GRAVITY = 9.80665
 """Standard acceleration of free fall [m/s^2]."""
@@ -52,8 +52,7 @@ class Options:
     """Choices of a fit; the defaults are meant to serve unseen data.
 
     Args:
-        window: Length of the shooting windows [s]; None: 1 s for a torque, 2 s for a voltage, the whole
-            recording for a servo, whose position loop keeps a long simulation from drifting away.
+        window: Length of the shooting windows [s]; None: that of :func:`default_window`.
         friction: ``auto`` or one of ``FRICTION_MODELS``.
         geometry: Known mass, length, inertia.
         fix_scale: Whether a known m g l fixes the scale of torque (else it is only checked against).
@@ -86,3 +85,19 @@ class Options:
 
 DEFAULTS = Options()
 """Everything found unaided."""
+
+
+def default_window(input_kind: str, seconds: float) -> float | None:
+    """Return the length of the shooting windows [s], None for whole recordings.
+
+    Long windows show slow errors (offsets, drag), short ones keep a simulation near the truth from which friction and
+    a wrong start carry it away. A torque gets 1 s. A voltage, whose back-EMF damps what is wrong at first, gets 10 s
+    where there are twelve of them, and not less than 2 s. The position loop of a servo keeps all of a recording near.
+
+    Args:
+        input_kind: One of ``datasets.INPUT_KINDS``.
+        seconds: Duration of all recordings together [s].
+    """
+    if input_kind == "voltage":
+        return min(max(seconds / 12.0, 2.0), 10.0)
+    return None if input_kind == "position_goal" else 1.0

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from pendulum_bags.identification.cross_validation import COARSE, cross_validate
 from pendulum_bags.identification.model import FRICTION_MODELS, SERVO_ONLY, FitModel
-from pendulum_bags.identification.options import DEFAULTS, Geometry, Options
+from pendulum_bags.identification.options import DEFAULTS, Geometry, Options, default_window
 from pendulum_bags.identification.own_zeros import OwnZeros, align
 from pendulum_bags.identification.problem import Piece, prepare
 from pendulum_bags.identification.readings import other_reading
@@ -89,7 +89,7 @@ def fit_output_error(recordings: Sequence[Recording], options: Options = DEFAULT
         DataError: for no data, mixed inputs, or a recording in which nothing moves.
     """
     fixed, free = _frame(recordings, options)
-    window = options.window or {"effort": 1.0, "none": 1.0, "voltage": 2.0}.get(fixed.input_kind)
+    window = options.window or default_window(fixed.input_kind, sum(recording.duration for recording in recordings))
     pieces = [prepare(recording, window) for recording in recordings]
     longest = max(recordings, key=lambda r: r.duration)
     base = (*free, "coulomb_friction")
