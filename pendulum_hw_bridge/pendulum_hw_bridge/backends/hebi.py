@@ -194,13 +194,15 @@ class HebiBackend:
         if self._group is None:
             self._hebi = _import_hebi()
             self._owner = threading.get_ident()
-            self._group = self._make_group()
-            if self._group.size != 1:
-                raise ActuatorError("module_lost", f"HEBI group has {self._group.size} modules; expected 1")
+            group = self._make_group()
+            if group.size != 1:
+                raise ActuatorError("module_lost", f"HEBI group has {group.size} modules; expected 1")
             self._command = self._hebi.GroupCommand(1)
             self._feedback = self._hebi.GroupFeedback(1)
             if self._log is not None:
-                start_log(self._group, self._log)
+                start_log(group, self._log)
+            # Only now: a group that was refused must not count as connected the next time.
+            self._group = group
         self._own()
         info = self._read_info()
         family, name, serial, firmware = self._wanted.family, self._wanted.name, "", ""
@@ -300,7 +302,7 @@ class HebiBackend:
         command.clear()
         command.effort_limit_min, command.effort_limit_max = -limits.effort, limits.effort
         command.velocity_limit_min, command.velocity_limit_max = -limits.velocity, limits.velocity
-        if math.isfinite(limits.position_min) and math.isfinite(limits.position_max):
+        if _has_window(limits):
             command.position_limit_min = limits.position_min
             command.position_limit_max = limits.position_max
             command.min_position_limit_strategy = command.max_position_limit_strategy = "MotorOff"
@@ -356,7 +358,6 @@ class HebiBackend:
             if self._log is not None and self._group is not None:
                 stop_log(self._group)
             self._group = self._command = self._feedback = None
-            self._owner = None
 
     # --- inside ---------------------------------------------------------------------------------------------
 
@@ -431,19 +432,24 @@ class HebiBackend:
     def _limits_of(info: Any, wanted: HardwareLimits) -> HardwareLimits:
         low, high = float(info.position_limit_min[0]), float(info.position_limit_max[0])
         ends = [int(info.min_position_limit_strategy[0]), int(info.max_position_limit_strategy[0])]
-        if math.isfinite(wanted.position_max - wanted.position_min) and ends != 2 * [_LIMIT_MOTOR_OFF]:
+        windowed = _has_window(wanted)
+        if windowed and ends != 2 * [_LIMIT_MOTOR_OFF]:
             raise ActuatorError(
                 "settings", f"strategies at the position limits read back as {ends}; expected 2 (motor off) for both"
             )
-        unwritten = not math.isfinite(wanted.position_max - wanted.position_min)
         return HardwareLimits(
             effort=_wider(info.effort_limit_min[0], info.effort_limit_max[0], "effort"),
             velocity=_wider(info.velocity_limit_min[0], info.velocity_limit_max[0], "velocity"),
-            position_min=wanted.position_min if unwritten else low,
-            position_max=wanted.position_max if unwritten else high,
+            position_min=low if windowed else wanted.position_min,
+            position_max=high if windowed else wanted.position_max,
             pwm=wanted.pwm,
             m_stop=_M_STOP_BY_NUMBER.get(int(info.mstop_strategy[0]), MStopAction.DISABLED),
         )
+
+
+def _has_window(limits: HardwareLimits) -> bool:
+    """Whether limits have a window of position; one with an open end is not written."""
+    return math.isfinite(limits.position_min) and math.isfinite(limits.position_max)
 
 
 def _wider(low: Any, high: Any, what: str) -> float:
