@@ -51,15 +51,12 @@ class NoCirclesContract(Contract):
 
     type_name = "no_circles"
 
-    known = fields.SetField(subfield=fields.StringField(), required=False, default=set())
-
     def check(self, graph: ImportGraph, verbose: bool) -> ContractCheck:
         """Leave out, again and again, every module that imports nothing of the rest; what stays is on a circle."""
         left = {module for module in graph.modules if not graph.is_module_squashed(module)}
         for sides in (graph.find_modules_directly_imported_by, graph.find_modules_that_directly_import):
             while gone := {module for module in left if not sides(module) & left - {module}}:
                 left -= gone
-        left = {module for module in left if not _matches(module, self.known)}
         return ContractCheck(kept=not left, metadata={"circle": self._imports_within(graph, left)})
 
     @staticmethod

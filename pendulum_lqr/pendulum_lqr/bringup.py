@@ -5,13 +5,12 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
-from difflib import get_close_matches
 from pathlib import Path
 
 from pendulum_lqr.controller import CONTROLLERS
 from pendulum_lqr.disturbance import DISTURBANCE_SPECS
 from pendulum_msgs_py.errors import ParameterError
-from pendulum_msgs_py.parameters import load_yaml, parameter_sections
+from pendulum_msgs_py.parameters import load_yaml, parameter_sections, suggestion
 from pendulum_msgs_py.plants.lab_file import LabFile, load_lab
 from pendulum_msgs_py.plants.plant_parameters import PRESET_NAMES
 from pendulum_msgs_py.programs import graph
@@ -145,8 +144,7 @@ def parameter_file(given: str) -> str:
     for pattern in sections:
         node = pattern.rpartition("/")[2]
         if node not in {"*", "**", *_NODES}:
-            near = get_close_matches(node, _NODES, n=1)
-            hint = f"did you mean {near[0]!r}?" if near else f"expected one of {', '.join(_NODES)}, or /**"
+            hint = suggestion(node, (*_NODES, "/**"))
             raise ParameterError(f"params_file {path} has a section {pattern!r}, which no node reads; {hint}")
     return str(path)
 

@@ -9,7 +9,6 @@ from __future__ import annotations
 import importlib
 import math
 from collections.abc import Mapping, Sequence
-from difflib import get_close_matches
 from typing import Any, ClassVar, cast
 
 from pendulum_lqr.interface import Controller
@@ -17,7 +16,7 @@ from pendulum_lqr.loop_check import require_stable
 from pendulum_lqr.velocity import VELOCITY_ESTIMATORS, VelocityEstimator, make_velocity_estimator
 from pendulum_msgs_py.contract.angles import wrap
 from pendulum_msgs_py.errors import ParameterError
-from pendulum_msgs_py.parameters import ParameterSpec, validate
+from pendulum_msgs_py.parameters import ParameterSpec, suggestion, validate
 from pendulum_msgs_py.plants.plant_parameters import PlantParameters
 
 __all__ = [
@@ -178,9 +177,7 @@ def controller_class(name: str) -> type[BaseController]:
         ParameterError: No such controller; the message lists those there are.
     """
     if not isinstance(name, str) or name not in CONTROLLERS:  # a file may say 7
-        near = get_close_matches(str(name), CONTROLLERS, n=1)
-        hint = f"; did you mean {near[0]!r}?" if near else f"; expected one of {', '.join(CONTROLLERS)}"
-        raise ParameterError(f"controller is {name!r}{hint}")
+        raise ParameterError(f"controller is {name!r}; {suggestion(name, CONTROLLERS)}")
     module, kind = CONTROLLERS[name].split(":")
     return cast("type[BaseController]", getattr(importlib.import_module(module), kind))
 

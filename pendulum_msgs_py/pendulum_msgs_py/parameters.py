@@ -29,6 +29,7 @@ __all__ = [
     "read_text",
     "reject_unknown",
     "require_mapping",
+    "suggestion",
     "validate",
 ]
 
@@ -153,10 +154,15 @@ def reject_unknown(values: Mapping[str, object], known: Iterable[str], *, where:
     known = list(known)
     for name in values:
         if name not in known:
-            near = get_close_matches(str(name), known, n=1)
-            hint = f"; did you mean {near[0]!r}?" if near else f"; expected one of {', '.join(known)}"
             prefix = f"{where}: " if where else ""
-            raise ParameterError(f"{prefix}unknown parameter {name!r}{hint}")
+            raise ParameterError(f"{prefix}unknown parameter {name!r}; {suggestion(name, known)}")
+
+
+def suggestion(name: object, known: Iterable[str]) -> str:
+    """Return what may have been meant by a name that is not known, or else all that are, for the end of a message."""
+    known = list(known)
+    near = get_close_matches(str(name), known, n=1)
+    return f"did you mean {near[0]!r}?" if near else f"expected one of {', '.join(known)}"
 
 
 def require_mapping(value: object, what: str) -> dict[str, Any]:

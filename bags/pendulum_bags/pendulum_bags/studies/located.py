@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from difflib import get_close_matches
 from pathlib import Path
 from typing import Any, NoReturn
 
 import yaml
 
 from pendulum_msgs_py.errors import ParameterError
-from pendulum_msgs_py.parameters import load_yaml, read_text
+from pendulum_msgs_py.parameters import load_yaml, read_text, suggestion
 
 __all__ = ["LocatedMapping"]
 
@@ -57,9 +56,7 @@ class LocatedMapping:
         known = list(known)
         for key in self.values:
             if key not in known:
-                near = get_close_matches(str(key), known, n=1)
-                hint = f"; did you mean {near[0]!r}?" if near else f"; expected one of {', '.join(known)}"
-                self.fail(f"unknown key {key!r}{hint}", key)
+                self.fail(f"unknown key {key!r}; {suggestion(key, known)}", key)
 
     def get(self, key: str, kind: type | tuple[type, ...], default: Any, expected: str) -> Any:
         """Return a value of a type, or the default where it is not given; a missing value without default fails."""
