@@ -14,8 +14,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from pendulum_lqr.design import DiscreteModel, discretise
 from pendulum_lqr.model import LinearModel, sort_poles
+from pendulum_lqr.sampled_design import DiscreteModel, discretise
 
 __all__ = [
     "LoopReport",

@@ -18,7 +18,6 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from pendulum_lqr.design import DiscreteModel, discretise
 from pendulum_lqr.gap_metric import (
     DEFAULT_SCALING,
     Scaling,
@@ -29,6 +28,7 @@ from pendulum_lqr.gap_metric import (
 )
 from pendulum_lqr.machine_response import Machine
 from pendulum_lqr.model import LinearModel
+from pendulum_lqr.sampled_design import DiscreteModel, discretise
 from pendulum_lqr.sampled_response import model_response
 
 __all__ = ["Certificate", "Certifier", "GapProfile", "compare_machine", "is_stable", "stabilises"]

@@ -13,9 +13,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from pendulum_lqr.controller import make_controller
-from pendulum_lqr.design import DiscreteModel, discretise
 from pendulum_lqr.interface import Controller
 from pendulum_lqr.model import linearise
+from pendulum_lqr.sampled_design import DiscreteModel, discretise
 from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.plants.plant_parameters import PlantParameters
 

@@ -1,4 +1,4 @@
-"""Optimal gains: continuous and discrete LQR, LQI, Kalman filter, and what refuses to be designed.
+"""Optimal gains in continuous time: LQR, LQI, output feedback; the Kalman filter; and what refuses to be designed.
 
 Riccati equations are solved by scipy. python-control enters only where margins and plots are asked for
 (:mod:`pendulum_lqr.analysis`), because it brings matplotlib with it, and a controller on a robot should start without.
@@ -20,19 +20,16 @@ from pendulum_msgs_py.errors import ParameterError
 
 __all__ = [
     "DesignError",
-    "DiscreteModel",
     "Gain",
     "KalmanGain",
     "continuous_lqr",
     "cost_matrices",
-    "discrete_lqr",
-    "discretise",
     "integral_lqr",
     "kalman_gain",
+    "no_solution",
     "output_lqr",
     "require_controllable",
     "require_observable",
-    "sampled_cost",
 ]
 
 Matrix = NDArray[np.float64]
@@ -58,25 +55,6 @@ class Gain:
     K: Matrix
     S: Matrix
     poles: NDArray[np.complex128]
-
-
-@dataclass(frozen=True, slots=True)
-class DiscreteModel:
-    """Sampled model ``z[k+1] = A z[k] + B u[k]`` whose state is [x; the inputs still on their way, oldest first].
-
-    Attributes:
-        A: Shape (n + m, n + m).
-        B: Shape (n + m, 1).
-        period: Sampling period [s].
-        delay: Time from measuring a state to its torque acting, the plant's own included [s].
-        pending: m, number of inputs that are still on their way.
-    """
-
-    A: Matrix
-    B: Matrix
-    period: float
-    delay: float
-    pending: int
 
 
 @dataclass(frozen=True, slots=True)
@@ -195,153 +173,6 @@ def integral_lqr(model: LinearModel, q: ArrayLike, r: float) -> Gain:
     return _output_feedback(A, B, C, C.T @ Q @ C, float(R[0, 0]), full.K, lift)
 
 
-def discretise(model: LinearModel, period: float, delay: float = 0.0) -> DiscreteModel:
-    """Sample the model exactly under zero-order hold, its delay of any length included.
-
-    With delay = (m - 1) period + rest, the torque of sample k acts from rest on in interval k + m - 1, so that m past
-    inputs join the state.
-
-    Args:
-        model: Linear model.
-        period: Sampling period, > 0 [s].
-        delay: Time from measuring a state to the command's arrival at the plant, beyond the model's own, >= 0 [s].
-
-    Raises:
-        DesignError: Period or delay out of domain.
-
-    Source:
-        Astrom and Wittenmark, Computer-Controlled Systems, 3rd ed., 1997, section 3.2 (eq. 3.11 to 3.17).
-    """
-    if not (math.isfinite(period) and period > 0.0):
-        raise DesignError(f"period is {period} s; expected a finite value > 0")
-    if not (math.isfinite(delay) and delay >= 0.0):
-        raise DesignError(f"delay is {delay} s; expected a finite value >= 0")
-    delay += model.delay
-    pending, rest = _on_their_way(period, delay)
-    # The interval is split where the newer input takes over: older input first, for ``rest``.
-    phi_new, gamma_new = _hold(model, period - rest)
-    phi_old, gamma_old = _hold(model, rest)
-    n = model.A.shape[0]
-    size = n + pending
-    A = np.zeros((size, size))
-    B = np.zeros((size, 1))
-    A[:n, :n] = phi_new @ phi_old
-    if pending == 0:
-        B[:n] = gamma_new
-        return DiscreteModel(A, B, period, delay, 0)
-    for row in range(pending - 1):
-        A[n + row, n + row + 1] = 1.0
-    B[-1, 0] = 1.0
-    if rest > 0.0:
-        A[:n, n : n + 1] = phi_new @ gamma_old
-        if pending > 1:
-            A[:n, n + 1 : n + 2] = gamma_new
-        else:
-            B[:n] = gamma_new
-    else:
-        A[:n, n : n + 1] = gamma_new
-    return DiscreteModel(A, B, period, delay, pending)
-
-
-def discrete_lqr(model: DiscreteModel, q: ArrayLike, r: float, cross: Matrix | None = None) -> Gain:
-    """Return the gain that minimises the sum of x' Q x + 2 x' N u + u' R u over the samples.
-
-    Args:
-        model: Sampled model.
-        q: Weights of the leading states, shape (k,) or (k, k): of [theta, theta_dot], or the whole matrix that
-            :func:`sampled_cost` gives. What follows costs nothing.
-        r: Weight of the torque, > 0.
-        cross: N, shape (k, 1), as :func:`sampled_cost` gives it; none by default.
-
-    Raises:
-        DesignError: As :func:`continuous_lqr`.
-    """
-    size = model.A.shape[0]
-    Q, R = _padded_cost(q, r, size)
-    N = None
-    if cross is not None:
-        N = np.zeros((size, 1))
-        N[: cross.shape[0]] = cross
-    require_controllable(model.A, model.B, discrete=True)
-    try:
-        S = scipy.linalg.solve_discrete_are(model.A, model.B, Q, R, s=N)
-    except (np.linalg.LinAlgError, ValueError) as error:
-        raise DesignError(_no_solution(Q, r, error)) from error
-    BS = model.B.T @ S
-    K = (BS @ model.A + (0.0 if N is None else N.T)) / float((R + BS @ model.B)[0, 0])
-    poles = sort_poles(np.linalg.eigvals(model.A - model.B @ K))
-    if np.max(np.abs(poles)) >= 1.0:
-        raise DesignError(f"closed loop has poles {poles} on or outside the unit circle; expected smaller weights")
-    return Gain(K[0], S, poles)
-
-
-def sampled_cost(
-    model: LinearModel, q: ArrayLike, r: float, period: float, delay: float = 0.0
-) -> tuple[Matrix, float, Matrix]:
-    """Return (Q_d, R_d, N_d), the continuous cost collected over one period of zero-order hold.
-
-    A discrete LQR with these weights minimises the very cost of the continuous LQR, at any sampling period and delay.
-    A torque that is still on its way costs where it moves the state, in Q_d; its own cost is counted when it is sent.
-
-    Args:
-        model: Linear model with n states.
-        q: Continuous weights of [theta, theta_dot].
-        r: Continuous weight of the torque.
-        period: Sampling period [s].
-        delay: As in :func:`discretise`, whose m inputs on their way join the state.
-
-    Returns:
-        Q_d of shape (n + m, n + m), R_d, and N_d of shape (n + m, 1).
-
-    Source:
-        C. Van Loan, Computing integrals involving the matrix exponential, IEEE TAC 23(3), 1978, theorem 1;
-        Astrom and Wittenmark, Computer-Controlled Systems, 3rd ed., 1997, section 11.1.
-    """
-    Q, R = cost_matrices(q, r)
-    if not (math.isfinite(period) and period > 0.0):
-        raise DesignError(f"period is {period} s; expected a finite value > 0")
-    pending, rest = _on_their_way(period, delay + model.delay)
-    n = model.A.shape[0]
-    size = n + pending + 1
-    state = np.eye(n, size)
-    total = np.zeros((size, size))
-    # The period in the pieces in which one torque acts: where it is in [state; on their way; new], and for how long.
-    older, newer = (n, min(n + 1, size - 1)) if rest > 0.0 else (n, n)
-    for column, time in ((older, rest), (newer, period - rest)):
-        if time == 0.0:
-            continue
-        start = np.vstack([state, np.eye(size)[column]])
-        total += start.T @ _collected(model, Q, time) @ start
-        phi, gamma = _hold(model, time)
-        state = phi @ state + gamma @ start[n:]
-    total[-1, -1] += float(R[0, 0]) * period
-    total = 0.5 * (total + total.T)
-    return total[:-1, :-1], float(total[-1, -1]), total[:-1, -1:]
-
-
-def _collected(model: LinearModel, Q: Matrix, time: float) -> Matrix:
-    """Return the cost of [x; u] over a time in which u is held, shape (n + 1, n + 1)."""
-    n = model.A.shape[0]
-    F = np.zeros((n + 1, n + 1))
-    F[:n, :n] = model.A
-    F[:n, n:] = model.B
-    W = np.zeros((n + 1, n + 1))
-    W[:n, :n] = model.C.T @ Q @ model.C
-    # Long intervals would overflow exp(+214 s): collect over short pieces and add them up.
-    pieces = max(1, math.ceil(float(np.abs(F).sum(axis=1).max()) * time / 2.0))
-    step = time / pieces
-    block = np.block([[-F.T, W], [np.zeros_like(F), F]])
-    exponential = scipy.linalg.expm(block * step)
-    forward = exponential[n + 1 :, n + 1 :]
-    piece = forward.T @ exponential[: n + 1, n + 1 :]
-    total = np.zeros((n + 1, n + 1))
-    transition = np.eye(n + 1)
-    for _ in range(pieces):
-        total += transition.T @ piece @ transition
-        transition = forward @ transition
-    return total
-
-
 def kalman_gain(A: Matrix, C: Matrix, process: ArrayLike, measurement: ArrayLike) -> KalmanGain:
     """Return the stationary Kalman filter of ``x[k+1] = A x[k] + w``, ``y[k] = C x[k] + v``.
 
@@ -415,24 +246,6 @@ def _unreached_mode(A: Matrix, B: Matrix, discrete: bool) -> complex | None:
     return None
 
 
-def _on_their_way(period: float, delay: float) -> tuple[int, float]:
-    """Return how many inputs a delay keeps on their way, and the broken part of a period in it [s]."""
-    whole = math.floor(delay / period + 1e-9)
-    rest = max(delay - whole * period, 0.0)
-    if rest < 1e-9 * period:
-        rest = 0.0
-    return whole + (1 if rest > 0.0 else 0), rest
-
-
-def _padded_cost(q: ArrayLike, r: float, size: int) -> tuple[Matrix, Matrix]:
-    """Return Q (size, size), zero beyond the states that q names, and R."""
-    given = np.asarray(q, dtype=np.float64)
-    Q2, R = cost_matrices(q, r, given.shape[0] if given.ndim == 2 else 2)
-    Q = np.zeros((size, size))
-    Q[: Q2.shape[0], : Q2.shape[1]] = Q2
-    return Q, R
-
-
 def _lift(model: LinearModel) -> Matrix:
     """Return the states of a plant at ease at each measured angle and velocity, shape (n, 2): the motor follows."""
     follows = {"theta": (1.0, 0.0), "theta_dot": (0.0, 1.0), "motor_angle": (1.0, 0.0), "motor_velocity": (0.0, 1.0)}
@@ -486,26 +299,17 @@ def _care(A: Matrix, B: Matrix, Q: Matrix, R: Matrix) -> Gain:
     try:
         S = scipy.linalg.solve_continuous_are(A, B, Q, R)
     except (np.linalg.LinAlgError, ValueError) as error:
-        raise DesignError(_no_solution(Q, float(R[0, 0]), error)) from error
+        raise DesignError(no_solution(Q, float(R[0, 0]), error)) from error
     K = B.T @ S / R[0, 0]
     poles = sort_poles(np.linalg.eigvals(A - B @ K))
     if np.max(poles.real) >= 0.0:
-        raise DesignError(_no_solution(Q, float(R[0, 0]), "the closed loop is not stable"))
+        raise DesignError(no_solution(Q, float(R[0, 0]), "the closed loop is not stable"))
     return Gain(K[0], S, poles)
 
 
-def _no_solution(Q: Matrix, r: float, reason: object) -> str:
+def no_solution(Q: Matrix, r: float, reason: object) -> str:
+    """Return why weights q and r give no gain, as one sentence."""
     return f"no stabilising gain for q = {_plain(Q)}, r = {r:g}: {reason}; expected weights that see every slow mode"
-
-
-def _hold(model: LinearModel, time: float) -> tuple[Matrix, Matrix]:
-    """Return exp(A t) and the integral of exp(A s) B over [0, t]."""
-    n, m = model.B.shape
-    block = np.zeros((n + m, n + m))
-    block[:n, :n] = model.A
-    block[:n, n:] = model.B
-    exponential = scipy.linalg.expm(block * time)
-    return exponential[:n, :n], exponential[:n, n:]
 
 
 def _decays(pole: complex, discrete: bool) -> bool:

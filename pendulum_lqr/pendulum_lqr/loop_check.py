@@ -11,8 +11,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from pendulum_lqr.design import DesignError, discretise
+from pendulum_lqr.design import DesignError
 from pendulum_lqr.model import RigidPlant, linearise
+from pendulum_lqr.sampled_design import discretise
 from pendulum_msgs_py.contract.angles import UPRIGHT
 
 if TYPE_CHECKING:

@@ -14,8 +14,9 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from pendulum_lqr.design import discretise, kalman_gain
+from pendulum_lqr.design import kalman_gain
 from pendulum_lqr.model import LinearModel
+from pendulum_lqr.sampled_design import discretise
 from pendulum_msgs_py.contract.angles import wrap
 
 __all__ = ["Observer"]

@@ -11,8 +11,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from pendulum_lqr.design import discretise
 from pendulum_lqr.model import LinearModel
+from pendulum_lqr.sampled_design import discretise
 
 __all__ = ["brought_to", "model_response"]
 

@@ -13,8 +13,9 @@ import scipy.linalg
 import scipy.optimize
 from numpy.typing import ArrayLike, NDArray
 
-from pendulum_lqr.design import DesignError, cost_matrices, discretise
+from pendulum_lqr.design import DesignError, cost_matrices
 from pendulum_lqr.model import LinearModel, low_frequency
+from pendulum_lqr.sampled_design import discretise
 
 __all__ = ["PidGains", "pid_cost", "pid_loop", "tune_numerically", "ultimate_gain", "ziegler_nichols"]
 

@@ -14,8 +14,9 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from pendulum_lqr.design import discretise, kalman_gain
+from pendulum_lqr.design import kalman_gain
 from pendulum_lqr.model import LinearModel, linearise
+from pendulum_lqr.sampled_design import discretise
 from pendulum_msgs_py.contract.angles import wrap
 from pendulum_msgs_py.dynamics.series_elastic import spring_deflection
 from pendulum_msgs_py.errors import ParameterError

@@ -8,7 +8,6 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pendulum_lqr.design import discretise
 from pendulum_lqr.model import (
     LinearModel,
     equilibrium_effort,
@@ -18,6 +17,7 @@ from pendulum_lqr.model import (
     state_derivative,
     torque_gain,
 )
+from pendulum_lqr.sampled_design import discretise
 from pendulum_msgs_py.contract.angles import UPRIGHT
 from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.plants.plant_parameters import PlantParameters, load_plant

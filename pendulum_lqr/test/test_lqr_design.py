@@ -14,18 +14,15 @@ from hypothesis import strategies as st
 from pendulum_lqr.analysis import analyse, delayed_spectral_radius, largest_stable_period, loop_margins
 from pendulum_lqr.design import (
     DesignError,
-    DiscreteModel,
     continuous_lqr,
-    discrete_lqr,
-    discretise,
     integral_lqr,
     kalman_gain,
     output_lqr,
     require_controllable,
     require_observable,
-    sampled_cost,
 )
 from pendulum_lqr.model import LinearModel, linearise
+from pendulum_lqr.sampled_design import DiscreteModel, discrete_lqr, discretise, sampled_cost
 from pendulum_msgs_py.plants.plant_parameters import PlantParameters, load_plant
 
 THESIS = load_plant("thesis")

@@ -8,9 +8,10 @@ from typing import Any
 
 from pendulum_lqr.controller import BaseController
 from pendulum_lqr.controllers.specs import DELAY, FEEDFORWARD, Q, R
-from pendulum_lqr.design import DesignError, DiscreteModel, Gain, discrete_lqr, discretise, sampled_cost
+from pendulum_lqr.design import DesignError, Gain
 from pendulum_lqr.interface import Controller
 from pendulum_lqr.model import linearise
+from pendulum_lqr.sampled_design import DiscreteModel, discrete_lqr, discretise, sampled_cost
 from pendulum_msgs_py.contract.angles import UPRIGHT
 from pendulum_msgs_py.parameters import ParameterSpec
 from pendulum_msgs_py.plants.plant_parameters import PlantParameters

@@ -12,9 +12,10 @@ from numpy.typing import NDArray
 from pendulum_lqr.catch import Catch, make_catch
 from pendulum_lqr.controller import BaseController
 from pendulum_lqr.controllers.energy_swing_up import EnergySwingUp
-from pendulum_lqr.design import cost_matrices, discretise
+from pendulum_lqr.design import cost_matrices
 from pendulum_lqr.interface import Controller
 from pendulum_lqr.model import linearise
+from pendulum_lqr.sampled_design import discretise
 from pendulum_lqr.trajectory_optimisation import OptimisedTrajectory, swing_up_trajectory
 from pendulum_msgs_py.contract.angles import UPRIGHT, wrap
 from pendulum_msgs_py.parameters import ParameterSpec
