@@ -125,7 +125,7 @@ def linearise(plant: RigidPlant, theta: float = UPRIGHT) -> LinearModel:
     """Return the linear model about the fixed point at an angle, of the plant that the simulator runs.
 
     A rigid plant has two states, a series-elastic one four; a first-order lag (``actuator_time_constant``) adds one.
-    ``transport_delay`` is the model's ``delay``: :func:`pendulum_lqr.sampled_design.discretise` and the margins count it.
+    ``transport_delay`` is the model's ``delay``: :func:`~pendulum_lqr.sampled_design.discretise` and margins count it.
 
     Args:
         plant: Plant parameters; dry friction and the spring's hysteresis are not part of the linear model.
