@@ -66,6 +66,10 @@ def test_compare_lists_the_designs_that_were_certified_when_the_machine_was_meas
     assert layers["which_controllers"]["mark"] == "no"
     assert layers["same_choice"]["mark"] == "not measured"
     assert "K=(400, 0.1) not certified for the" in found["answer"]["sentence"]
+    # A no about the motion beside a certificate: each says what it is about.
+    assert found["answer"]["sentence"].endswith(
+        "certified to be stable there, which tells nothing of how closely it moves as simulated."
+    )
 
 
 def test_compare_certifies_the_designs_that_it_is_given(

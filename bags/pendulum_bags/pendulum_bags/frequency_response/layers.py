@@ -125,7 +125,10 @@ def which_controllers(certifier: Certifier, designs: Sequence[DesignResult]) -> 
         tuple(evidence),
         steps,
         limit if mark is Mark.YES else f"{', '.join(d.name for d in bad)} not certified for the hardware",
-        f"{limit}; {', '.join(d.name for d in good)} certified" if good else "",
+        f"{limit}; {', '.join(d.name for d in good)} certified to be stable there, which tells nothing of how "
+        "closely it moves as simulated"
+        if good
+        else "",
     )
 
 
