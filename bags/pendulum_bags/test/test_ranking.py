@@ -138,6 +138,14 @@ def test_one_run_of_each_decides_nothing():
     json.dumps(layer.to_json(), allow_nan=False)
 
 
+def test_a_contender_that_ran_once_does_not_take_the_interval_from_all():
+    contenders = campaign(np.random.default_rng(1), 6)
+    last = contenders[-1]
+    found = rank([*contenders[:-1], Contender(last.name, last.sim, last.hw[:1])])
+    assert 0.0 < found.regret_share.high < 1.0
+    assert "95 % interval" in same_choice(found).sentence
+
+
 def test_runs_of_a_study_and_a_folder_are_collected(tmp_path, capsys):
     metrics = {"ise": 0.01, "rms_velocity": 0.1, "effort_energy": 2.0, "success": 1.0}
     for side, factor in (("sim", 1.0), ("hw", 1.2)):

@@ -238,11 +238,16 @@ def _regret(contenders: Sequence[Contender], pick: int, hw: Array) -> Interval:
 
 def _limits(own: Array, other: Array, comparisons: int) -> tuple[float, float]:
     """Return by how much a difference of means may be lower (corrected for comparisons), and higher; NaN of one."""
-    if min(own.size, other.size) < 2:
+    repeated = [one for one in (own, other) if one.size > 1]
+    if not repeated:
         return float("nan"), float("nan")
     if own.size == other.size:
         # Runs under one seed share their disturbance.
         deviation, freedom = float(np.std(own - other, ddof=1)) / np.sqrt(own.size), own.size - 1.0
+    elif len(repeated) == 1:
+        # The one that ran once is taken to scatter like the other.
+        deviation = float(np.std(repeated[0], ddof=1)) * np.sqrt(1.0 + 1.0 / repeated[0].size)
+        freedom = repeated[0].size - 1.0
     else:
         parts = np.array([np.var(own, ddof=1) / own.size, np.var(other, ddof=1) / other.size])
         deviation = float(np.sqrt(parts.sum()))
