@@ -21,6 +21,7 @@ __all__ = ["main"]
 _KEEPS_TIME = (
     "tests/acceptance/test_console.py",
     "tests/acceptance/test_experiment.py",
+    "tests/faults/test_bridge_faults.py",
     "tests/faults/test_disk_faults.py",
     "tests/faults/test_live_faults.py",
     "tests/faults/test_network_faults.py",
