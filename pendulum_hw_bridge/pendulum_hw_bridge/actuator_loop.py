@@ -126,6 +126,7 @@ class ActuatorLoop:
                 if self.active:
                     self._guarded_cycle()
                 else:
+                    self.bridge.insist()
                     self._job_waiting.wait(_IDLE)
         finally:
             self.bridge.close()

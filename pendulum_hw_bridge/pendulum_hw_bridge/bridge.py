@@ -158,6 +158,11 @@ class Bridge:
         else:
             self._stop_again_ns = None
 
+    def insist(self) -> None:
+        """Ask a module again that has not confirmed that it is off; never raises."""
+        if self._stop_again_ns is not None and self.port.now_ns() >= self._stop_again_ns:
+            self.release()
+
     def close(self) -> None:
         """Release and let go of the actuator; never raises."""
         self.supervisor.disarm(self.port.now_ns(), "bridge closes")
@@ -289,8 +294,9 @@ class Bridge:
         # Prepared for arming it may wait, but not behind an e-stop.
         waits = now <= self._prepared_until_ns and self.supervisor.mode is Mode.DISARMED
         ends = self._driving and (was_armed or not waits)
-        if ends or (self._stop_again_ns is not None and now >= self._stop_again_ns):
+        if ends:
             self.release()
+        self.insist()
         return Outcome(drive, 0.0, fault=fault)
 
     def _present_fault(self) -> str:

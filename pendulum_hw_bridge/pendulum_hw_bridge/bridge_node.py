@@ -163,10 +163,7 @@ class BridgeNode(LifecycleNode):
         """Disarm, effort zero, strategy off; a last zero torque is published, so that a recording shows it."""
         stamp_ns = self._interface.clock()
         self._interface.safe_stop("bridge ends")
-        bridge = self._bridge
         self.release_actuator()
-        if bridge is not None and bridge.stop_pending:
-            self.get_logger().error(f"{bridge.last_fault}: press the motion stop, cut the supply")
         self._interface.publish_applied(stamp_ns, 0.0)
         self._close_e_stops()
 
@@ -187,6 +184,7 @@ class BridgeNode(LifecycleNode):
             self._loop.close()
         elif self._bridge is not None:
             self._bridge.close()
+        self._tell_pending_stop()
         self._loop = None
         self._bridge = None
 
@@ -296,7 +294,12 @@ class BridgeNode(LifecycleNode):
             self._loop.active = False
         if self._bridge is not None:
             self._call(self._bridge.release)
+            self._tell_pending_stop()
         self._interface.publish_diagnostics()
+
+    def _tell_pending_stop(self) -> None:
+        if self._bridge is not None and self._bridge.stop_pending:
+            self.get_logger().error(f"{self._bridge.last_fault}: press the motion stop, cut the supply")
 
     # --- arming --------------------------------------------------------------------------------------------
 

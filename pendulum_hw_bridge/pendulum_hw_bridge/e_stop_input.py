@@ -21,6 +21,12 @@ class EStopInput:
         self._lock = threading.Lock()
         self._pressed = False
         self._heard_ns: int | None = None
+        self._publishers = 1
+
+    def count(self, publishers: int) -> None:
+        """Take note of how many publish on the topic: of two, one would hide that the other is silent."""
+        with self._lock:
+            self._publishers = publishers
 
     def hear(self, *, pressed: bool, now_ns: int) -> None:
         """Take note of a message.
@@ -43,5 +49,7 @@ class EStopInput:
                 return "e-stop button was never heard"
             if self._pressed:
                 return "e-stop button is pressed"
+            if self._publishers > 1:
+                return f"{self._publishers} publish for the e-stop button; expected one, whose silence can be told"
             silent = (now_ns - self._heard_ns) / NANOSECONDS
             return f"e-stop button is silent for {1e3 * silent:.0f} ms" if silent > self.timeout else ""

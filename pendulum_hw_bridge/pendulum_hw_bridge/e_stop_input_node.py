@@ -39,7 +39,8 @@ class EStopInputServer:
         node = self._thread.node
         # Best effort: it hears every publisher, and a late message of a button is worth nothing.
         qos = QoSProfile(depth=_WAITING, reliability=ReliabilityPolicy.BEST_EFFORT)
-        node.create_subscription(Bool, owner.resolve_topic_name(names.E_STOP_INPUT), self._on_message, qos)
+        self._topic = owner.resolve_topic_name(names.E_STOP_INPUT)
+        node.create_subscription(Bool, self._topic, self._on_message, qos)
         # Steady time: it must go on where the system clock is set back.
         steady = Clock(clock_type=ClockType.STEADY_TIME)
         node.create_timer(timeout / _LOOKS, self._look, clock=steady)
@@ -48,6 +49,7 @@ class EStopInputServer:
     @property
     def reason(self) -> str:
         """Why the plant must be stopped, or an empty string."""
+        self._input.count(self._thread.node.count_publishers(self._topic))
         return self._input.reason(time.monotonic_ns())
 
     def close(self) -> None:

@@ -12,6 +12,7 @@ from pendulum_hw_bridge.backends.emulator import EmulatorBackend
 from pendulum_hw_bridge.bridge import Bridge, Outcome
 from pendulum_hw_bridge.clocks import WallClock
 from pendulum_hw_bridge.effort_mapping import EffortMapping, EffortStrategy
+from pendulum_hw_bridge.emulation.faults import ActuatorFault
 from pendulum_hw_bridge.emulation.parameters import load_emulator
 from pendulum_hw_bridge.emulation.x5 import EmulatedX5
 from pendulum_hw_bridge.gains import DEFAULT_GAINS
@@ -154,3 +155,15 @@ def test_closing_releases_the_drive_and_a_closed_loop_takes_no_jobs(running: Run
     assert running.actuator.strategy is Strategy.OFF
     with pytest.raises(ActuatorError, match="actuator thread has ended"):
         running.loop.call(lambda: None)
+
+
+def test_a_stop_that_was_not_confirmed_is_asked_for_again_though_the_loop_is_not_active(running: Running) -> None:
+    running.arm()
+    running.actuator.inject(ActuatorFault.COMMANDS_LOST)
+    running.loop.active = False
+    running.supervisor.disarm(running.port.now_ns())
+    running.loop.call(running.bridge.release)
+    assert running.bridge.stop_pending
+    running.loop.call(running.actuator.clear_faults)
+    running.until(lambda: not running.bridge.stop_pending, "the stop to be confirmed")
+    assert running.actuator.strategy is Strategy.OFF

@@ -29,3 +29,17 @@ def test_silence_stops_as_a_press_does(silence: int, stops: bool) -> None:
     assert bool(reason) is stops
     if stops:
         assert reason == f"e-stop button is silent for {silence} ms"
+
+
+def test_two_who_publish_for_one_button_stop_whatever_they_say_and_a_press_is_told_first() -> None:
+    button = EStopInput(0.5)
+    button.hear(pressed=False, now_ns=0)
+    button.count(2)
+    assert button.reason(0) == "2 publish for the e-stop button; expected one, whose silence can be told"
+    button.hear(pressed=True, now_ns=0)
+    assert button.reason(0) == "e-stop button is pressed"
+    button.hear(pressed=False, now_ns=0)
+    button.count(1)
+    assert button.reason(0) == ""
+    button.count(0)
+    assert button.reason(0) == ""

@@ -25,6 +25,7 @@ from pendulum_hw_bridge.actuator import (
 from pendulum_hw_bridge.backends import hebi as backend_module
 from pendulum_hw_bridge.backends.hebi import HebiBackend
 from pendulum_hw_bridge.bridge import Bridge
+from pendulum_hw_bridge.clocks import SteppedClock
 from pendulum_hw_bridge.effort_mapping import EffortMapping, EffortStrategy
 from pendulum_hw_bridge.emulation.parameters import load_emulator
 from pendulum_hw_bridge.gains import DEFAULT_GAINS, GAIN_FIELDS, LOOPS
@@ -284,8 +285,19 @@ def test_a_strategy_of_a_newer_firmware_is_refused_by_number(port: HebiBackend, 
         port.set_strategy(Strategy.DIRECT_PWM)
 
 
-def test_a_bridge_drives_a_module_arms_it_and_leaves_it_off(port: HebiBackend, module: Module) -> None:
+def test_a_bridge_drives_a_module_arms_it_and_leaves_it_off(module: Module) -> None:
     """The whole way of a bridge over this backend: settings, arming, a cycle, release."""
+    # Time passes with the module's records alone, however long this machine takes.
+    clock = SteppedClock(1_000_000_000)
+    next_feedback = module.get_next_feedback
+
+    def get_next_feedback(timeout_ms: float, reuse: Any) -> Any:
+        clock.wait_until(clock.now_ns() + 10_000_000)
+        return next_feedback(timeout_ms, reuse)
+
+    module.get_next_feedback = get_next_feedback  # type: ignore[method-assign]
+    port = HebiBackend(make_group=lambda: module, clock=clock)
+    port.connect()
     drivetrain = load_emulator("thesis").drivetrain
     mapping = EffortMapping(EffortStrategy.DIRECT_PWM, drivetrain, effort_limit=2.0)
     supervisor = PlantSupervisor(PlantLimits(effort=2.0))

@@ -6,15 +6,19 @@ import math
 from collections.abc import Iterator
 
 import pytest
+from builtin_interfaces.msg import Duration
+from rclpy.serialization import serialize_message
+from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
 from pendulum_bags.experiments.domain import reserve_domain
 from pendulum_hw_bridge.effort_mapping import EffortStrategy
 from pendulum_hw_bridge.emulation.faults import ActuatorFault
+from pendulum_msgs_py.contract import names
 from pendulum_msgs_py.contract.supervisor import Mode
 from pendulum_msgs_py.contract.values import JointCommand
 from tests.faults.bridge_rig import Rig
 from tests.faults.bridge_scenarios import CASES, SCENARIOS, Case, Scenario, run_scenario
-from tests.faults.node_rig import ros_of_its_own
+from tests.faults.node_rig import NodeRig, ros_of_its_own
 
 
 def _tries() -> Iterator[tuple[Scenario, Case]]:
@@ -127,6 +131,25 @@ def test_an_encoder_that_is_stuck_at_rest_drives_nothing_and_is_found_when_the_l
     rig.actuator.hand = lambda time, position, velocity: 1.0
     rig.run(0.3)
     assert rig.bridge.last_fault == "motion_disagreement"
+
+
+@pytest.mark.parametrize(
+    ("early_ns", "mode"), [(1_000_000, Mode.EFFORT), (-1, Mode.POSITION), (3600 * 10**9, Mode.POSITION)]
+)
+def test_a_trajectory_that_waited_while_the_plant_armed_is_refused(early_ns: int, mode: Mode) -> None:
+    rig = NodeRig(start=0.0)
+    try:
+        rig.controlling = rig.disturbing = False
+        interface = rig.node._interface
+        move = JointTrajectory(joint_names=[names.JOINT])
+        move.points = [JointTrajectoryPoint(positions=[0.0], time_from_start=Duration(sec=1))]
+        # A stamp of an hour ago is that of a system clock which was set back since.
+        interface._on_trajectory(serialize_message(move), {"received_timestamp": interface._armed_ns - early_ns})
+        rig.run(0.1)
+        assert rig.supervisor.mode is mode
+        assert interface.refused_trajectories.total() == (mode is Mode.EFFORT)
+    finally:
+        rig.end()
 
 
 def test_the_same_seed_gives_the_same_reaction_bit_by_bit() -> None:

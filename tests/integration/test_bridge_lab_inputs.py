@@ -63,6 +63,12 @@ class Bench(GraphPeer):
         self.call(Trigger, "bridge/e_stop_reset", Trigger.Request())
 
 
+def stops(bench: Bench) -> str:
+    """Reset the e-stop, and return why the bridge does not arm."""
+    bench.reset()
+    return bench.arm()
+
+
 @pytest.mark.timeout(120)
 def test_a_button_latches_when_it_is_pressed_or_falls_silent_and_a_warm_motor_gets_less_torque(
     processes: ProcessGroup, domain_id: int
@@ -96,5 +102,12 @@ def test_a_button_latches_when_it_is_pressed_or_falls_silent_and_a_warm_motor_ge
         bench.until(lambda: bench.mode == "e_stop", "silence to latch")
         assert "is silent for" in bench.reasons[-1]
         assert "e-stop" in bench.arm()
+
+        # A second publisher would hide that the first is silent.
+        bench.button = False
+        second = bench.node.create_publisher(Bool, "e_stop_input", 1)
+        bench.until(lambda: "2 publish for the e-stop button" in stops(bench), "the second publisher to be noticed")
+        bench.node.destroy_publisher(second)
+        bench.until(lambda: stops(bench) == "", "the bridge to arm with one again")
     finally:
         bench.close()

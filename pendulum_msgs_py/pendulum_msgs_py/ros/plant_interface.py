@@ -41,6 +41,8 @@ __all__ = ["PlantInterface"]
 
 _LEAST_BETWEEN_LINES = 1.0
 """Time between two lines of the log about one mode [s]."""
+_WAITED_NS = 10 * NANOSECONDS
+"""Longest time for which a message may wait while a plant arms [ns]; more is a system clock that was set back."""
 TRAJECTORY_AGE_LIMIT = 1.0
 """Largest distance of a trajectory's stamp from the plant's time [s]: an old wish should not move a machine."""
 
@@ -90,6 +92,7 @@ class PlantInterface:
         self.statistics = statistics
         self.sample: JointSample | None = None
         self.published_ns = 0
+        self._armed_ns = 0
         self.arrived_ns = 0
         self.on_command = on_command
         self.hardware_id = "none"
@@ -229,8 +232,10 @@ class PlantInterface:
 
         return receive
 
-    def _on_trajectory(self, data: bytes) -> None:
+    def _on_trajectory(self, data: bytes, info: Mapping[str, int]) -> None:
         try:
+            if self.supervisor.mode.armed and 0 < self._armed_ns - info["received_timestamp"] < _WAITED_NS:
+                raise ParameterError("it came before the plant was armed; expected it after: send it again")
             stamp_ns, trajectory = decode_joint_trajectory(data)
             if self.sample is None:
                 raise ParameterError("no measurement yet")
@@ -257,7 +262,11 @@ class PlantInterface:
     def _on_arm(self, request: SetBool.Request, response: SetBool.Response) -> SetBool.Response:
         if request.data:
             self._commanders.check()
+            was_armed = self.supervisor.mode.armed
             refusal = self.supervisor.arm(self.clock(), self.sample)
+            if not was_armed:
+                # Arming takes its time; what waited in the meantime was not meant for an armed plant.
+                self._armed_ns = time.time_ns()
             response.success, response.message = not refusal, refusal or self.supervisor.mode.value
         else:
             self.supervisor.disarm(self.clock())
