@@ -1,9 +1,12 @@
-"""``simulator``: the plant behind the contract that simulator and hardware share."""
+"""``simulator``: the plant behind the contract that simulator and hardware share; ``mujoco``: a MuJoCo model there."""
 
 from __future__ import annotations
 
 import math
+import os
+import time
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import replace
 from typing import Any
 
@@ -16,11 +19,10 @@ from pendulum_msgs_py.contract.plant_specs import LIMIT_SPECS, LOCKSTEP_EPOCH_NS
 from pendulum_msgs_py.contract.supervisor import Drive, DriveKind, Input, Mode, PlantSupervisor
 from pendulum_msgs_py.contract.timing import LoopStatistics, SteadyWallClock
 from pendulum_msgs_py.contract.values import NANOSECONDS, JointCommand, JointSample
-from pendulum_msgs_py.errors import ParameterError
+from pendulum_msgs_py.errors import FaultError, ParameterError
 from pendulum_msgs_py.parameters import ParameterSpec
 from pendulum_msgs_py.plants.plant_differences import PLANT_PARAMETERS, describe_plants
-from pendulum_msgs_py.plants.plant_parameters import PRESET_NAMES
-from pendulum_msgs_py.plants.sealed_plant import load_plant_to_run
+from pendulum_msgs_py.programs.executables import report_error
 from pendulum_msgs_py.ros import qos
 from pendulum_msgs_py.ros.convert import sample_from_message
 from pendulum_msgs_py.ros.parameters import NodeParameters
@@ -28,35 +30,19 @@ from pendulum_msgs_py.ros.plant_interface import PlantInterface
 from pendulum_msgs_py.ros.plant_loop import LockstepLoop, RealtimeLoop
 from pendulum_msgs_py.ros.polled import PollingNode
 from pendulum_msgs_py.ros.runner import run_node
-from pendulum_sim.integrators import METHODS
+from pendulum_sim.engines import MUJOCO, OWN, Engine
+from pendulum_sim.guarded_plant import PaceWatch, StallWatch
 from pendulum_sim.plant import PlantState
-from pendulum_sim.plants import make_plant
 from pendulum_sim.sensors import SENSOR_SPECS, Sensors
 from pendulum_sim.servo import PositionServo
 
-__all__ = ["SPECS", "SimulatorNode", "main"]
+__all__ = ["MUJOCO_SPECS", "SPECS", "SimulatorNode", "main", "main_mujoco"]
 
 _SENSOR_PREFIX = "sensor."
+_LEAST_PERIODS = 2.0
+"""Age in periods that a command may reach at least."""
 
-SPECS: tuple[ParameterSpec, ...] = (
-    ParameterSpec("plant", "thesis", "", f"Preset ({PRESET_NAMES}) or path of a plant file.", read_only=True),
-    ParameterSpec(
-        "method",
-        "auto",
-        "",
-        "Integrator; auto is etd4 for a rigid plant, semi_implicit for a series-elastic one.",
-        choices=("auto", *METHODS),
-        read_only=True,
-    ),
-    ParameterSpec("rate_hz", 500.0, "Hz", "Rate of states and commands.", minimum=50.0, maximum=2000.0, read_only=True),
-    ParameterSpec(
-        "substeps",
-        0,
-        "-",
-        "Integration steps in a period; 0 chooses by the plant.",
-        minimum=0,
-        read_only=True,
-    ),
+_SHARED_SPECS: tuple[ParameterSpec, ...] = (
     ParameterSpec(
         "start",
         "given",
@@ -74,33 +60,46 @@ SPECS: tuple[ParameterSpec, ...] = (
     *(replace(spec, name=_SENSOR_PREFIX + spec.name, read_only=True) for spec in SENSOR_SPECS),
 )
 
+SPECS: tuple[ParameterSpec, ...] = (*OWN.specs, *_SHARED_SPECS)
+MUJOCO_SPECS: tuple[ParameterSpec, ...] = (*MUJOCO.specs, *_SHARED_SPECS)
+
 
 class SimulatorNode(PollingNode):
-    """A simulated pendulum as a plant.
+    """A simulated pendulum as a plant. Whatever simulates it, the node has the name of the role.
 
     Args:
         stop: Asks the runner to end the process.
+        engine: What simulates.
     """
 
-    def __init__(self, stop: Callable[[], None]) -> None:
+    def __init__(self, stop: Callable[[], None], engine: Engine = OWN) -> None:
         super().__init__("simulator", enable_logger_service=True)
-        self._settings = NodeParameters(self, SPECS, self._check_start)
+        self._settings = NodeParameters(self, (*engine.specs, *_SHARED_SPECS), self._check_start)
         values = self._settings.values
-        parameters, sealed = load_plant_to_run(values["plant"])
-        period_ns = round(NANOSECONDS / values["rate_hz"])
-        self._dt = period_ns / NANOSECONDS
-        self._told_plant = describe_plants([] if sealed else [parameters])
-        self._plant = make_plant(parameters, self._dt, method=values["method"], substeps=values["substeps"] or None)
+        self._simulation = engine.make(values)
+        self._plant = self._simulation.plant
+        parameters = self._plant.parameters
+        self._dt = self._plant.dt
+        period_ns = round(self._dt * NANOSECONDS)
+        self._told_plant = describe_plants([] if self._simulation.sealed else [parameters])
         self._servo = PositionServo(parameters, self._dt)
+        self._failure = ""
         starts, sensor_noise = np.random.default_rng(values["seed"]).spawn(2)
         self._starts = starts
         self._sensors = Sensors(
             sensor_noise, **{spec.name: values[_SENSOR_PREFIX + spec.name] for spec in SENSOR_SPECS}
         )
         self._statistics = LoopStatistics(period_ns)
-        self._supervisor = PlantSupervisor(limits_from_parameters(values, parameters.effort_limit))
+        limits = limits_from_parameters(values, parameters.effort_limit)
+        # Where a file's timestep makes periods as long as that, each command would be too old when it is applied.
+        limits = replace(limits, command_timeout=max(limits.command_timeout, _LEAST_PERIODS * self._dt))
+        self._supervisor = PlantSupervisor(limits, preflight=self._preflight)
         self._lockstep = values["clock"] == "lockstep"
-        wall = SteadyWallClock()
+        self._wall = wall = SteadyWallClock()
+        self._pace = PaceWatch(self._dt) if engine.foreign and not self._lockstep else None
+        self._stall: AbstractContextManager[object] = nullcontext()
+        if engine.foreign:
+            self._stall = StallWatch(values["step_timeout"], self._end_stalled)
         self._state: PlantState = self._plant.state
         self._interface = PlantInterface(
             self,
@@ -136,8 +135,10 @@ class SimulatorNode(PollingNode):
         self.create_service(SetBool, "~/pause", self._on_pause)
         self.create_service(Trigger, "~/step", self._on_step)
         self.get_logger().info(
-            f"plant {parameters.name!r}, {values['method']}, {values['rate_hz']:g} Hz, {values['clock']}"
+            f"plant {parameters.name!r}, {self._simulation.method}, {1.0 / self._dt:g} Hz, {values['clock']}"
         )
+        for remark in self._simulation.remarks:
+            self.get_logger().info(remark)
 
     def close(self) -> None:
         """Stop the plant: a last zero torque is published, so that a recording shows it."""
@@ -152,16 +153,56 @@ class SimulatorNode(PollingNode):
         return due
 
     def _advance(self, drive: Drive, stamp_ns: int) -> tuple[JointSample | None, float]:
+        if self._failure:
+            return None, 0.0
         effort = drive.effort
         if drive.kind is DriveKind.POSITION:
             # The servo knows the weight it carries, so the hand-over's feed-forward would count it twice.
             wanted = self._servo.effort(self._state.theta, self._state.theta_dot, drive.position, drive.velocity)
             limit = self._supervisor.limits.effort
             effort = min(limit, max(-limit, wanted))
-        self._state = self._plant.step(effort, drive.push)
+        try:
+            problem = self._step(effort, drive.push, stamp_ns)
+        except FaultError as error:
+            problem = str(error)
+        if problem:
+            self._fail(problem)
+            return None, 0.0
         # In real time this is the deadline, not the moment at which Python got there.
         self._stamp_ns = stamp_ns
         return self._measure(), effort
+
+    def _step(self, effort: float, push: float, stamp_ns: int) -> str:
+        """Step the plant; return why it cannot go on though it came back, or nothing."""
+        pace = self._pace
+        if pace is None:
+            with self._stall:
+                self._state = self._plant.step(effort, push)
+            return ""
+        begun = time.monotonic()
+        with self._stall:
+            self._state = self._plant.step(effort, push)
+        return pace.problem(time.monotonic() - begun, (self._wall() - stamp_ns) / NANOSECONDS)
+
+    def _fail(self, reason: str) -> None:
+        """Stop where the simulation has failed, say so, and let nobody arm it before it was reset."""
+        self._failure = reason
+        self._loop.halted = True
+        self._supervisor.fault(reason, self._interface.clock())
+        self._interface.decide()
+
+    def _preflight(self) -> str:
+        return f"{self._failure}; reset it first" if self._failure else ""
+
+    def _end_stalled(self) -> None:
+        """End the process from outside of the step that does not come back: it holds the only thread of the node."""
+        name, timeout = self._simulation.name, self._settings.values["step_timeout"]
+        reason = f"a step of simulation {name} did not come back within {timeout:g} s"
+        self._supervisor.fault(reason, self._interface.clock())
+        self._interface.publish_diagnostics()
+        self._interface.publish_applied(self._stamp_ns, 0.0)
+        report_error(FaultError(reason))
+        os._exit(1)
 
     def _measure(self) -> JointSample | None:
         state = self._state
@@ -178,7 +219,8 @@ class SimulatorNode(PollingNode):
     # --- services and parameters ---------------------------------------------------------------------------
 
     def _restart(self, theta: float, theta_dot: float) -> None:
-        self._state = self._plant.reset(theta, theta_dot)
+        with self._stall:
+            self._state = self._plant.reset(theta, theta_dot)
         state = self._state
         # The first measurement is exact: arming and trajectories need one, and a sensor may drop it.
         self._interface.sample = self._measure() or JointSample(
@@ -220,7 +262,12 @@ class SimulatorNode(PollingNode):
     def _reset(self, theta: float, theta_dot: float) -> str:
         if self._supervisor.mode is Mode.POSITION:
             return "a trajectory is being followed; disarm first"
-        self._restart(theta, theta_dot)
+        try:
+            self._restart(theta, theta_dot)
+        except FaultError as error:
+            return str(error)
+        self._failure = ""
+        self._loop.halted = False
         for gate in self._supervisor.gates.values():
             gate.reset()
         self._interface.publish_event("reset", theta=theta, theta_dot=theta_dot)
@@ -243,9 +290,9 @@ class SimulatorNode(PollingNode):
     def _diagnostics(self) -> Mapping[str, object]:
         values = self._settings.values
         figures: dict[str, object] = {
-            "plant": values["plant"],
+            "plant": self._simulation.name,
             PLANT_PARAMETERS: self._told_plant,
-            "method": values["method"],
+            "method": self._simulation.method,
             "clock": values["clock"],
             "paused": self._loop.paused,
             "samples_dropped": self._sensors.dropped,
@@ -257,11 +304,20 @@ class SimulatorNode(PollingNode):
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the simulator."""
+    return _run(OWN, argv)
+
+
+def main_mujoco(argv: Sequence[str] | None = None) -> int:
+    """Run a MuJoCo model in the simulator's place."""
+    return _run(MUJOCO, argv)
+
+
+def _run(engine: Engine, argv: Sequence[str] | None) -> int:
     return run_node(
-        SimulatorNode,
+        lambda stop: SimulatorNode(stop, engine),
         argv,
-        program="pendulum_sim simulator",
-        description="Simulated pendulum behind the interface that simulator and hardware share.",
-        specs=SPECS,
-        example="python -m pendulum_sim simulator --ros-args -r __ns:=/sim -p plant:=x5_9",
+        program=f"pendulum_sim {engine.program}",
+        description=engine.description,
+        specs=(*engine.specs, *_SHARED_SPECS),
+        example=engine.example,
     )

@@ -8,12 +8,15 @@ from pathlib import Path
 import pytest
 
 from pendulum_msgs_py.parameters import markdown_table
-from pendulum_sim import simulator_node, viewer_node
+from pendulum_sim import engines, simulator_node, viewer_node
 
 README = Path(__file__).parents[1] / "README.md"
 
 
-@pytest.mark.parametrize(("node", "specs"), [("simulator", simulator_node.SPECS), ("viewer", viewer_node.SPECS)])
+@pytest.mark.parametrize(
+    ("node", "specs"),
+    [("simulator", simulator_node.SPECS), ("mujoco", engines.MUJOCO.specs), ("viewer", viewer_node.SPECS)],
+)
 def test_the_readme_has_the_parameters_of_the_node(node: str, specs: tuple) -> None:
     match = re.search(rf"<!-- parameters: {node} -->\n(.*?)<!-- end -->", README.read_text(encoding="utf-8"), re.DOTALL)
     assert match is not None

@@ -94,16 +94,55 @@ def _start(processes: ProcessGroup, *arguments: str) -> RunningProgram:
     return processes.start_command([sys.executable, str(_PLANT), *arguments], name="tiny_plant")
 
 
-@pytest.fixture
-def plant(processes: ProcessGroup, peer: Peer) -> RunningProgram:
-    program = _start(processes)
+def _start_mujoco(processes: ProcessGroup, folder: Path) -> RunningProgram:
+    """Start a model file that nobody wrote for us, under the tiny plant's name and limit."""
+    model = folder / "lab.xml"
+    model.write_text(_MODEL, encoding="utf-8")
+    arguments = (
+        "-r",
+        "__node:=tiny_plant",
+        "-p",
+        f"model:={model}",
+        "-p",
+        "rate_hz:=100.0",
+        "-p",
+        "armed_at_start:=false",
+    )
+    return processes.start("pendulum_sim", "mujoco", "--ros-args", *arguments)
+
+
+_MODEL = """
+<mujoco model="lab">
+  <option timestep="0.005"/>
+  <worldbody>
+    <body name="pole"><joint name="hinge" axis="0 1 0" damping="2"/><geom size="0.05" pos="0 0 0.3" mass="0.3"/></body>
+  </worldbody>
+  <actuator><motor joint="hinge" ctrlrange="-5 5" ctrllimited="true"/></actuator>
+</mujoco>
+"""
+
+
+def _await(peer: Peer, program: RunningProgram) -> RunningProgram:
     peer.until(
         lambda: peer.states and peer.diagnostics and peer.command.get_subscription_count() == 1, "the plant", 20.0
     )
     return program
 
 
-def test_services_walk_through_the_states_and_a_reset_never_re_arms(plant: RunningProgram, peer: Peer) -> None:
+@pytest.fixture
+def plant(processes: ProcessGroup, peer: Peer) -> RunningProgram:
+    return _await(peer, _start(processes))
+
+
+@pytest.fixture(params=["tiny_plant", "mujoco"])
+def any_plant(request: pytest.FixtureRequest, processes: ProcessGroup, peer: Peer, tmp_path: Path) -> RunningProgram:
+    if request.param == "tiny_plant":
+        return _await(peer, _start(processes))
+    pytest.importorskip("mujoco")
+    return _await(peer, _start_mujoco(processes, tmp_path))
+
+
+def test_services_walk_through_the_states_and_a_reset_never_re_arms(any_plant: RunningProgram, peer: Peer) -> None:
     assert peer.diagnostics["mode"] == "disarmed"
     assert peer.arm().success
     assert peer.call(Trigger, "tiny_plant/e_stop", Trigger.Request()).success
@@ -123,7 +162,7 @@ def test_services_walk_through_the_states_and_a_reset_never_re_arms(plant: Runni
     assert peer.arm().success
 
 
-def test_every_refusal_is_counted_under_its_name_and_moves_nothing(plant: RunningProgram, peer: Peer) -> None:
+def test_every_refusal_is_counted_under_its_name_and_moves_nothing(any_plant: RunningProgram, peer: Peer) -> None:
     assert peer.arm().success
     peer.spin(0.1)
     stamp = peer.states[-1].header.stamp
@@ -142,7 +181,7 @@ def test_every_refusal_is_counted_under_its_name_and_moves_nothing(plant: Runnin
     assert all(message.effort[0] == 0.0 for message in peer.applied)
 
 
-def test_a_second_commander_is_refused_named_and_reported(plant: RunningProgram, peer: Peer) -> None:
+def test_a_second_commander_is_refused_named_and_reported(any_plant: RunningProgram, peer: Peer) -> None:
     assert peer.arm().success
     peer.stream(1.0)
     peer.until(lambda: peer.applied[-1].effort[0] == 1.0, "the first commander's torque")
@@ -180,7 +219,7 @@ def test_twins_behind_one_frame_id_get_no_torque(plant: RunningProgram, peer: Pe
     peer.until(lambda: peer.applied[-1].effort[0] == 1.0, "torque after the twin has gone")
 
 
-def test_torque_is_the_clamped_sum_and_ends_with_the_commands(plant: RunningProgram, peer: Peer) -> None:
+def test_torque_is_the_clamped_sum_and_ends_with_the_commands(any_plant: RunningProgram, peer: Peer) -> None:
     assert peer.arm().success
 
     def both(state: JointState) -> None:
@@ -200,7 +239,7 @@ def test_torque_is_the_clamped_sum_and_ends_with_the_commands(plant: RunningProg
     peer.until(lambda: peer.applied[-1].effort[0] == 2.0, "recovery by itself")
 
 
-def test_a_trajectory_is_followed_and_handed_over(plant: RunningProgram, peer: Peer) -> None:
+def test_a_trajectory_is_followed_and_handed_over(any_plant: RunningProgram, peer: Peer) -> None:
     move = trajectory_to_message(from_points([0.0, 0.3], [0.0, 0.05], [0.0, 0.0]))
     peer.trajectory.publish(move)
     peer.until(lambda: peer.diagnostics.get("joint_trajectory.refused.disarmed") == "1", "the refusal")

@@ -47,6 +47,7 @@ __all__ = [
     "load_plant_file",
     "plant_document",
     "read_plant_document",
+    "read_quantities",
     "resolve_plant",
     "write_plant",
 ]
@@ -250,14 +251,14 @@ def read_plant_document(document: Mapping[str, Any], path: Path) -> tuple[PlantP
         raise ParameterError(f"{where}: format is {document.get('format')!r}; expected {FORMAT!r}")
     if "parameters" not in document:
         raise ParameterError(f"{where}: parameters is missing; expected a mapping of {_names(PLANT_SPECS)}")
-    values, intervals = _read_quantities(document["parameters"], PLANT_SPECS, f"{where}: parameters")
+    values, intervals = read_quantities(document["parameters"], PLANT_SPECS, f"{where}: parameters")
     for required in ("inertia", "damping", "gravity"):
         if required not in values:
             unit = next(spec.unit for spec in PLANT_SPECS if spec.name == required)
             raise ParameterError(f"{where}: parameters.{required} is missing; expected a value in {unit}")
     drivetrain = None
     if document.get("drivetrain") is not None:
-        drivetrain_values, more = _read_quantities(document["drivetrain"], DRIVETRAIN_SPECS, f"{where}: drivetrain")
+        drivetrain_values, more = read_quantities(document["drivetrain"], DRIVETRAIN_SPECS, f"{where}: drivetrain")
         intervals.update({f"drivetrain.{name}": interval for name, interval in more.items()})
         drivetrain = _build(SeriesElasticParameters, drivetrain_values, where)
     name = document.get("name", path.stem)
@@ -334,9 +335,19 @@ def resolve_plant(preset_or_path: str | Path) -> Path:
     return path
 
 
-def _read_quantities(
+def read_quantities(
     entries: object, specs: Sequence[ParameterSpec], where: str
 ) -> tuple[dict[str, float], dict[str, list[float]]]:
+    """Return values and intervals by name of entries written ``{value: NUMBER, unit: UNIT}``, as in a plant file.
+
+    Args:
+        entries: What a YAML file holds.
+        specs: The quantities that there may be.
+        where: Prefix of messages.
+
+    Raises:
+        ParameterError: An entry is unknown, without its unit, or refused.
+    """
     mapping = require_mapping(entries, where)
     table = {spec.name: spec for spec in specs}
     reject_unknown(mapping, table, where=where)

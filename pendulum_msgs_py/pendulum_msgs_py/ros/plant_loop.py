@@ -43,6 +43,10 @@ class RealtimeLoop:
         step: Steps the plant.
         statistics: Gets the loop's figures.
         clock: Wall time.
+
+    Attributes:
+        paused: Somebody wants the plant to wait.
+        halted: The plant has no next state; it says so itself, in a step.
     """
 
     def __init__(
@@ -54,6 +58,7 @@ class RealtimeLoop:
         self._clock = clock
         self._deadline_ns = clock() + statistics.period_ns
         self.paused = False
+        self.halted = False
 
     def run_due(self) -> float:
         """Do what is due; return the time until the next deadline [s]."""
@@ -61,7 +66,7 @@ class RealtimeLoop:
         if now >= self._deadline_ns:
             self._interface.take_inputs()
             period = self._statistics.period_ns
-            if self.paused:
+            if self.paused or self.halted:
                 self._deadline_ns = now
             else:
                 self._run(now, period)
@@ -71,7 +76,7 @@ class RealtimeLoop:
 
     def _run(self, now: int, period: int) -> None:
         self._statistics.cycle(now, self._deadline_ns)
-        while now - self._deadline_ns >= period:
+        while now - self._deadline_ns >= period and not self.halted:
             self._advance(publish=False)
             self._deadline_ns += period
         self._advance()
@@ -109,6 +114,10 @@ class LockstepLoop:
         subscribers: Subscriptions to states that must be there before the first one.
         duration: Simulated time after which to stop [s]; 0 for never.
         publish_clock: Whether this plant owns ``/clock``.
+
+    Attributes:
+        paused: Somebody wants the plant to wait.
+        halted: The plant has no next state; it says so itself, in a step.
     """
 
     def __init__(
@@ -137,6 +146,7 @@ class LockstepLoop:
         self.started = False
         self.finished = False
         self.paused = False
+        self.halted = False
         self._clock_publisher = (
             interface.node.create_publisher(ClockMessage, names.CLOCK, qos.CLOCK) if publish_clock else None
         )
@@ -177,7 +187,7 @@ class LockstepLoop:
         interface = self._interface
         sample = None
         # A measurement that was lost has nobody to answer it: the plant goes on under its last decision's rules.
-        while sample is None and not self.finished:
+        while sample is None and not self.finished and not self.halted:
             before_ns = self.now_ns
             drive = interface.decide()
             self.now_ns += self._period_ns
@@ -209,7 +219,7 @@ class LockstepLoop:
         return self._interface.supervisor.mode is Mode.EFFORT and not self._inputs <= self._answered
 
     def _look(self) -> None:
-        if self.finished or self.paused:
+        if self.finished or self.paused or self.halted:
             return
         if not self.started:
             self._try_start()

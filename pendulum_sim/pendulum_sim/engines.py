@@ -1,0 +1,145 @@
+"""The simulations that the simulator's node can run: ours, or somebody else's."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from pendulum_msgs_py.contract.values import NANOSECONDS
+from pendulum_msgs_py.errors import ParameterError
+from pendulum_msgs_py.parameters import ParameterSpec
+from pendulum_msgs_py.plants.plant_parameters import PRESET_NAMES
+from pendulum_msgs_py.plants.sealed_plant import load_plant_to_run
+from pendulum_sim.guarded_plant import GuardedPlant
+from pendulum_sim.integrators import METHODS
+from pendulum_sim.mujoco_plant import MujocoMapping, load_mujoco_mapping, load_mujoco_plant
+from pendulum_sim.plant import Plant
+from pendulum_sim.plants import make_plant
+
+__all__ = ["MUJOCO", "OWN", "Engine", "Simulation"]
+
+
+class Simulation(NamedTuple):
+    """A simulation, ready to run.
+
+    Attributes:
+        plant: What is stepped, once in a period.
+        name: Preset, file or identifier that was asked for.
+        method: How it is integrated, in words.
+        remarks: What the user should know of what was chosen, one line each.
+        sealed: Whether its parameters are nobody's business.
+    """
+
+    plant: Plant
+    name: str
+    method: str
+    remarks: tuple[str, ...] = ()
+    sealed: bool = False
+
+
+@dataclass(frozen=True)
+class Engine:
+    """One way to simulate a pendulum.
+
+    Attributes:
+        program: Name of the executable.
+        description: What it does, one sentence.
+        specs: The parameters that are its own.
+        make: Makes the simulation that the values of its parameters describe.
+        foreign: Whether somebody else wrote it: nothing it returns is believed, and its steps are timed.
+        example: A command line.
+    """
+
+    program: str
+    description: str
+    specs: tuple[ParameterSpec, ...]
+    make: Callable[[Mapping[str, Any]], Simulation]
+    foreign: bool
+    example: str
+
+
+_RATE = ParameterSpec(
+    "rate_hz", 500.0, "Hz", "Rate of states and commands.", minimum=50.0, maximum=2000.0, read_only=True
+)
+_FOREIGN_SPECS = (
+    ParameterSpec(
+        "step_timeout",
+        2.0,
+        "s",
+        "Time that one step of the simulation may take; one that takes longer ends the program.",
+        minimum=0.1,
+        read_only=True,
+    ),
+)
+
+
+def _make_own(values: Mapping[str, Any]) -> Simulation:
+    dt = round(NANOSECONDS / values["rate_hz"]) / NANOSECONDS
+    parameters, sealed = load_plant_to_run(values["plant"])
+    plant = make_plant(parameters, dt, method=values["method"], substeps=values["substeps"] or None)
+    return Simulation(plant, values["plant"], values["method"], sealed=sealed)
+
+
+def _make_mujoco(values: Mapping[str, Any]) -> Simulation:
+    model, mapping = values["model"], values["mapping"]
+    if not model:
+        raise ParameterError("model is missing; expected -p model:=FILE, an MJCF or URDF file")
+    plant = load_mujoco_plant(
+        model,
+        load_mujoco_mapping(mapping) if mapping else MujocoMapping(),
+        rate_hz=values["rate_hz"],
+        effort_limit=values["effort_limit"],
+    )
+    return Simulation(GuardedPlant(plant, Path(model).name), model, plant.description, tuple(plant.remarks))
+
+
+OWN = Engine(
+    program="simulator",
+    description="Simulated pendulum behind the interface that simulator and hardware share.",
+    specs=(
+        ParameterSpec("plant", "thesis", "", f"Preset ({PRESET_NAMES}) or path of a plant file.", read_only=True),
+        ParameterSpec(
+            "method",
+            "auto",
+            "",
+            "Integrator; auto is etd4 for a rigid plant, semi_implicit for a series-elastic one.",
+            choices=("auto", *METHODS),
+            read_only=True,
+        ),
+        _RATE,
+        ParameterSpec(
+            "substeps",
+            0,
+            "-",
+            "Integration steps in a period; 0 chooses by the plant.",
+            minimum=0,
+            read_only=True,
+        ),
+    ),
+    make=_make_own,
+    foreign=False,
+    example="python -m pendulum_sim simulator --ros-args -r __ns:=/sim -p plant:=x5_9",
+)
+
+MUJOCO = Engine(
+    program="mujoco",
+    description="A hinge of a MuJoCo model (MJCF or URDF) behind the interface that simulator and hardware share.",
+    specs=(
+        ParameterSpec("model", "", "", "MJCF or URDF file.", read_only=True),
+        ParameterSpec(
+            "mapping", "", "", "Mapping file: joint, actuator, sign, zero, limit; empty for none.", read_only=True
+        ),
+        replace(
+            _RATE,
+            default=0.0,
+            minimum=0.0,
+            description="Rate of states and commands; 0 for 500, or one of the file's timestep where that is longer.",
+        ),
+        *_FOREIGN_SPECS,
+    ),
+    make=_make_mujoco,
+    foreign=True,
+    example="python -m pendulum_sim mujoco --ros-args -r __ns:=/sim -p model:=pendulum.xml",
+)

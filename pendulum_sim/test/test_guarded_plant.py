@@ -1,0 +1,76 @@
+"""What goes wrong with a simulation of others is a fault with a sentence."""
+
+from __future__ import annotations
+
+import math
+import threading
+import time
+
+import pytest
+
+from pendulum_msgs_py.errors import FaultError
+from pendulum_msgs_py.plants.plant_parameters import load_plant
+from pendulum_sim.guarded_plant import GuardedPlant, PaceWatch, StallWatch
+from pendulum_sim.plant import PlantState, RigidPlant
+
+
+class Broken(RigidPlant):
+    """A plant that does something odd in its next step."""
+
+    odd: object = None
+
+    def step(self, effort: float, push: float = 0.0) -> PlantState:
+        if isinstance(self.odd, Exception):
+            raise self.odd
+        return PlantState(0.5, *self.odd)  # type: ignore[misc]
+
+
+@pytest.mark.parametrize(
+    ("odd", "sentence"),
+    [
+        (ValueError("shapes\n (2,) and (3,)"), r"simulation lab failed in step: ValueError: shapes \(2,\) and \(3,\)"),
+        (KeyError(), "simulation lab failed in step: KeyError"),
+        (
+            (math.nan, 0.0, 0.0),
+            "simulation lab is at nan rad, 0.0 rad/s, 0.0 N m after 0.500 s; expected finite numbers",
+        ),
+        ((0.0, math.inf, 0.0), "is at 0.0 rad, inf rad/s"),
+        (FaultError("it is gone"), "simulation lab: it is gone"),
+    ],
+)
+def test_nothing_but_a_fault_gets_out(odd: object, sentence: str) -> None:
+    plant = Broken(load_plant("thesis"), 0.002)
+    plant.odd = odd
+    with pytest.raises(FaultError, match=sentence):
+        GuardedPlant(plant, "lab").step(0.0)
+
+
+def test_a_sound_plant_passes_unchanged() -> None:
+    one, other = (RigidPlant(load_plant("thesis"), 0.002) for _ in range(2))
+    guarded = GuardedPlant(one, "lab")
+    assert guarded.reset(1.0) == other.reset(1.0)
+    assert guarded.step(0.3, 0.1) == other.step(0.3, 0.1) == guarded.state
+
+
+def test_slow_steps_are_told_from_one_pause() -> None:
+    paused = PaceWatch(0.002)
+    for _ in range(300):
+        assert paused.problem(0.001, 0.0) == ""
+    assert paused.problem(10.0, 10.0) == ""
+    slow = PaceWatch(0.002)
+    told = [slow.problem(0.005, 0.003 * i) for i in range(300)]
+    assert not any(told[:167])
+    assert "needs 4.8 ms for a period of 2 ms and is 0.5 s behind" in told[167]
+
+
+def test_a_step_that_does_not_come_back_is_noticed_and_a_quick_one_is_not() -> None:
+    stalled = threading.Event()
+    watch = StallWatch(0.1, stalled.set)
+    for _ in range(100):
+        with watch:
+            time.sleep(0.002)
+    assert not stalled.is_set()
+    with watch:
+        assert stalled.wait(10.0)
+    unused = StallWatch(0.1, stalled.clear)
+    unused.close()

@@ -1,0 +1,131 @@
+"""Simulations that others wrote, in the simulator's place over real DDS: what goes wrong in them is a fault."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from diagnostic_msgs.msg import DiagnosticArray
+from sensor_msgs.msg import JointState
+from std_srvs.srv import SetBool, Trigger
+
+from pendulum_msgs_py.contract import names
+from pendulum_msgs_py.plants.plant_parameters import load_plant
+from pendulum_msgs_py.ros import qos
+from pendulum_msgs_py.ros.convert import stamp_from_message
+from pendulum_sim.model_files import mjcf
+from tests.graph_peer import GraphPeer
+from tests.processes import ProcessGroup, RunningProgram
+
+pytest.importorskip("mujoco")
+
+
+class Peer(GraphPeer):
+    """Controller, listener and client of one simulator."""
+
+    def __init__(self) -> None:
+        super().__init__("peer")
+        self.states: list[JointState] = []
+        self.applied: list[float] = []
+        self.diagnostics: dict[str, str] = {}
+        self.torque = 0.0
+        self._commands = self.node.create_publisher(JointState, names.EFFORT_COMMAND, qos.COMMAND)
+        self.node.create_subscription(JointState, names.JOINT_STATES, self._on_state, qos.STATE)
+        self.node.create_subscription(
+            JointState, names.APPLIED_EFFORT, lambda message: self.applied.append(message.effort[0]), qos.STATE
+        )
+        self.node.create_subscription(DiagnosticArray, names.DIAGNOSTICS, self._on_diagnostics, 10)
+
+    def _on_state(self, message: JointState) -> None:
+        self.states.append(message)
+        answer = JointState(name=[names.JOINT], effort=[self.torque - 0.5 * message.velocity[0]])
+        answer.header.stamp, answer.header.frame_id = message.header.stamp, "peer"
+        self._commands.publish(answer)
+
+    def _on_diagnostics(self, message: DiagnosticArray) -> None:
+        for status in message.status:
+            self.diagnostics = {pair.key: pair.value for pair in status.values}
+
+    def known(self) -> str:
+        return f"; diagnostics {self.diagnostics}"
+
+    def ask(self, service: str) -> Trigger.Response:
+        return self.call(Trigger, f"simulator/{service}", Trigger.Request())
+
+    def arm(self, on: bool) -> SetBool.Response:
+        return self.call(SetBool, "simulator/arm", SetBool.Request(data=on))
+
+
+@pytest.fixture
+def peer(domain_id: int) -> Iterator[Peer]:
+    peer = Peer()
+    yield peer
+    peer.close()
+
+
+def start(processes: ProcessGroup, program: str, *parameters: str) -> RunningProgram:
+    arguments = [item for parameter in parameters for item in ("-p", parameter)]
+    return processes.start("pendulum_sim", program, "--ros-args", *arguments)
+
+
+def test_two_lockstep_runs_of_a_model_file_give_the_same_messages(
+    peer: Peer, processes: ProcessGroup, tmp_path: Path
+) -> None:
+    model = tmp_path / "thesis.xml"
+    model.write_text(mjcf(load_plant("thesis")), encoding="utf-8")
+    peer.torque = 1.0
+    runs = []
+    for _ in range(2):
+        peer.states.clear()
+        program = start(
+            processes, "mujoco", f"model:={model}", "clock:=lockstep", "lockstep_duration:=0.3", "start:=random",
+            "seed:=4", "sensor.position_noise:=0.001",
+        )  # fmt: skip
+        peer.until(
+            lambda: peer.states and stamp_from_message(peer.states[-1].header.stamp) >= 1.3e9, "the end of the run"
+        )
+        runs.append([(s.position[0], s.velocity[0], s.effort[0]) for s in peer.states])
+        program.interrupt()
+        assert program.wait(10.0) == 0
+        peer.until(lambda: peer.node.count_publishers(names.JOINT_STATES) == 0, "the plant to leave")
+    assert len(runs[0]) == 151
+    assert runs[0] == runs[1]
+
+
+@pytest.mark.parametrize("clock", ["realtime", "lockstep"])
+def test_a_model_that_blows_up_faults_with_a_sentence_until_it_is_reset(
+    peer: Peer, processes: ProcessGroup, tmp_path: Path, clock: str
+) -> None:
+    model = tmp_path / "light.xml"
+    # Explicit damping of 50 N m s/rad on 0.001 kg m^2 at 20 ms: unstable, as a wrong unit in a file makes it.
+    model.write_text(
+        '<mujoco><option timestep="0.02" integrator="RK4"/><worldbody><body><joint name="hinge" damping="50"/>'
+        '<inertial pos="0 0 -0.1" mass="0.1" diaginertia="1e-4 1e-4 1e-4"/></body></worldbody>'
+        '<actuator><motor joint="hinge" ctrlrange="-5 5" ctrllimited="true"/></actuator></mujoco>',
+        encoding="utf-8",
+    )
+    peer.torque = 1.0
+    program = start(processes, "mujoco", f"model:={model}", f"clock:={clock}")
+    program.wait_for_output("is a timestep of 20 ms too long", 30.0)
+    peer.until(lambda: peer.diagnostics.get("mode") == "fault", "the fault")
+    assert "simulation light.xml: MuJoCo met a value that is not finite or too large" in peer.diagnostics["reason"]
+    peer.until(lambda: peer.applied[-1] == 0.0, "zero torque")
+    assert peer.arm(False).success
+    refused = peer.arm(True)
+    assert not refused.success
+    assert refused.message.endswith("reset it first")
+    count = len(peer.states)
+    assert peer.ask("reset").success
+    peer.until(lambda: len(peer.states) > count, "states after the reset")
+    program.interrupt()
+    assert program.wait(10.0) == 0
+
+
+def test_a_model_that_is_refused_ends_with_one_sentence(
+    processes: ProcessGroup, domain_id: int, tmp_path: Path
+) -> None:
+    program = start(processes, "mujoco", f"model:={tmp_path / 'none.xml'}")
+    assert program.wait(30.0) == 2
+    assert "none.xml does not exist; expected an MJCF or URDF file" in program.output
+    assert "Traceback" not in program.output
