@@ -13,12 +13,13 @@ from pendulum_msgs_py.parameters import ParameterSpec
 from pendulum_msgs_py.plants.plant_parameters import PRESET_NAMES
 from pendulum_msgs_py.plants.sealed_plant import load_plant_to_run
 from pendulum_sim.guarded_plant import GuardedPlant
+from pendulum_sim.gymnasium_plant import load_adapter, load_gymnasium_plant
 from pendulum_sim.integrators import METHODS
 from pendulum_sim.mujoco_plant import MujocoMapping, load_mujoco_mapping, load_mujoco_plant
 from pendulum_sim.plant import Plant
 from pendulum_sim.plants import make_plant
 
-__all__ = ["MUJOCO", "OWN", "Engine", "Simulation"]
+__all__ = ["GYMNASIUM", "MUJOCO", "OWN", "Engine", "Simulation", "find_engine", "open_simulation"]
 
 
 class Simulation(NamedTuple):
@@ -95,6 +96,16 @@ def _make_mujoco(values: Mapping[str, Any]) -> Simulation:
     return Simulation(GuardedPlant(plant, Path(model).name), model, plant.description, tuple(plant.remarks))
 
 
+def _make_gymnasium(values: Mapping[str, Any]) -> Simulation:
+    env, mapping = values["env"], values["mapping"]
+    if not env:
+        raise ParameterError("env is missing; expected -p env:=ID, such as Pendulum-v1")
+    plant = load_gymnasium_plant(
+        env, load_adapter(mapping) if mapping else None, seed=values["seed"], effort_limit=values["effort_limit"]
+    )
+    return Simulation(GuardedPlant(plant, env), env, plant.description, tuple(plant.remarks))
+
+
 OWN = Engine(
     program="simulator",
     description="Simulated pendulum behind the interface that simulator and hardware share.",
@@ -143,3 +154,49 @@ MUJOCO = Engine(
     foreign=True,
     example="python -m pendulum_sim mujoco --ros-args -r __ns:=/sim -p model:=pendulum.xml",
 )
+
+GYMNASIUM = Engine(
+    program="gymnasium",
+    description="An environment of Gymnasium behind the interface that simulator and hardware share.",
+    specs=(
+        ParameterSpec("env", "", "", "Identifier, such as Pendulum-v1 or my_module:MyPendulum-v0.", read_only=True),
+        ParameterSpec(
+            "mapping",
+            "",
+            "",
+            "Adapter file: what is angle, velocity, torque, start; empty for a known environment.",
+            read_only=True,
+        ),
+        *_FOREIGN_SPECS,
+    ),
+    make=_make_gymnasium,
+    foreign=True,
+    example="python -m pendulum_sim gymnasium --ros-args -r __ns:=/sim -p env:=Pendulum-v1",
+)
+_GYMNASIUM_PREFIX = "gymnasium:"
+
+
+def find_engine(simulation: str) -> tuple[Engine, dict[str, str]]:
+    """Return who runs a simulation of others, and the parameters that name it.
+
+    Args:
+        simulation: Path of a model file, or ``gymnasium:ID``.
+    """
+    if simulation.startswith(_GYMNASIUM_PREFIX):
+        return GYMNASIUM, {"env": simulation.removeprefix(_GYMNASIUM_PREFIX)}
+    return MUJOCO, {"model": str(Path(simulation).expanduser().resolve())}
+
+
+def open_simulation(simulation: str, mapping: str = "") -> Simulation:
+    """Return a simulation of others in this process, as its node would run it.
+
+    Args:
+        simulation: As in :func:`find_engine`.
+        mapping: Path of its mapping file; empty for none.
+
+    Raises:
+        ParameterError: It is refused.
+    """
+    engine, named = find_engine(simulation)
+    defaults = {spec.name: spec.default for spec in engine.specs}
+    return engine.make({**defaults, "seed": 0, "effort_limit": 0.0, **named, "mapping": mapping})

@@ -15,7 +15,12 @@ README = Path(__file__).parents[1] / "README.md"
 
 @pytest.mark.parametrize(
     ("node", "specs"),
-    [("simulator", simulator_node.SPECS), ("mujoco", engines.MUJOCO.specs), ("viewer", viewer_node.SPECS)],
+    [
+        ("simulator", simulator_node.SPECS),
+        ("mujoco", engines.MUJOCO.specs),
+        ("gymnasium", engines.GYMNASIUM.specs),
+        ("viewer", viewer_node.SPECS),
+    ],
 )
 def test_the_readme_has_the_parameters_of_the_node(node: str, specs: tuple) -> None:
     match = re.search(rf"<!-- parameters: {node} -->\n(.*?)<!-- end -->", README.read_text(encoding="utf-8"), re.DOTALL)

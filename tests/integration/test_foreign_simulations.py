@@ -107,9 +107,9 @@ def test_a_model_that_blows_up_faults_with_a_sentence_until_it_is_reset(
     )
     peer.torque = 1.0
     program = start(processes, "mujoco", f"model:={model}", f"clock:={clock}")
-    program.wait_for_output("is a timestep of 20 ms too long", 30.0)
     peer.until(lambda: peer.diagnostics.get("mode") == "fault", "the fault")
     assert "simulation light.xml: MuJoCo met a value that is not finite or too large" in peer.diagnostics["reason"]
+    program.wait_for_output("is a timestep of 20 ms too long", 5.0)
     peer.until(lambda: peer.applied[-1] == 0.0, "zero torque")
     assert peer.arm(False).success
     refused = peer.arm(True)
@@ -129,3 +129,71 @@ def test_a_model_that_is_refused_ends_with_one_sentence(
     assert program.wait(30.0) == 2
     assert "none.xml does not exist; expected an MJCF or URDF file" in program.output
     assert "Traceback" not in program.output
+
+
+_STUCK = """
+import time
+import gymnasium
+from gymnasium.envs.classic_control.pendulum import PendulumEnv
+
+
+class Stuck(PendulumEnv):
+    count = 0
+
+    def step(self, action):
+        self.count += 1
+        if self.count > {count}:
+            {what}
+        return super().step(action)
+
+
+gymnasium.register("{name}", entry_point=Stuck)
+"""
+_ADAPTER = """
+format: pendulum_simulation/1
+angle: {index: 0, zero: 3.141592653589793}
+velocity: {index: 1}
+torque: {index: 0}
+read: state
+start: state
+period: dt
+effort_limit: max_torque
+"""
+
+
+def _environment(folder: Path, what: str) -> tuple[str, ...]:
+    """Write an environment that does something odd after some steps; return the parameters that choose it."""
+    # The first 64 steps try it out.
+    (folder / "lab_envs.py").write_text(_STUCK.format(what=what, name="Lab-v0", count=100), encoding="utf-8")
+    adapter = folder / "adapter.yaml"
+    adapter.write_text(_ADAPTER, encoding="utf-8")
+    return "env:=lab_envs:Lab-v0", f"mapping:={adapter}"
+
+
+def test_an_environment_that_stalls_ends_with_zero_torque_and_one_sentence(
+    peer: Peer, processes: ProcessGroup, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    chosen = _environment(tmp_path, "time.sleep(1000)")
+    monkeypatch.setenv("PYTHONPATH", str(tmp_path))
+    peer.torque = 0.5
+    program = start(processes, "gymnasium", *chosen, "step_timeout:=0.5")
+    peer.until(lambda: program.returncode is not None, "the end of the program")
+    assert program.returncode == 1
+    assert "error: a step of simulation lab_envs:Lab-v0 did not come back within 0.5 s" in program.output
+    peer.until(lambda: peer.applied[-1] == 0.0, "zero torque", 5.0)
+    assert max(peer.applied) > 0.0
+
+
+def test_an_environment_that_fails_is_a_fault_with_its_error(
+    peer: Peer, processes: ProcessGroup, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    chosen = _environment(tmp_path, "raise ValueError('the licence has expired')")
+    monkeypatch.setenv("PYTHONPATH", str(tmp_path))
+    program = start(processes, "gymnasium", *chosen)
+    peer.until(lambda: peer.diagnostics.get("mode") == "fault", "the fault")
+    assert (
+        peer.diagnostics["reason"] == "simulation lab_envs:Lab-v0 failed in step: ValueError: the licence has expired"
+    )
+    assert peer.states[-1].header.stamp.sec > 0
+    program.interrupt()
+    assert program.wait(10.0) == 0

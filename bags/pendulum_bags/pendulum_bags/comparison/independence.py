@@ -4,13 +4,16 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from pendulum_bags.runs.run_data import RunData
-from pendulum_msgs_py.errors import DataError
+from pendulum_msgs_py.errors import DataError, ParameterError
+from pendulum_msgs_py.plants.plant_differences import describe_plants
+from pendulum_msgs_py.plants.plant_parameters import load_plant
 
 __all__ = ["check_pairs"]
 
@@ -21,7 +24,9 @@ _MUST_AGREE: tuple[tuple[str, str], ...] = (
     ("plant", "plants"),
     ("emulated_plant", "emulated plants"),
     ("design_plant", "plants of the design"),
+    ("simulation", "simulations"),
 )
+_PLANTS = ("plant", "emulated_plant", "design_plant")
 _OF_THE_NOISE = ("kind", "amplitude", "hold_time")
 
 
@@ -80,7 +85,7 @@ def _check_two(one: RunData, other: RunData) -> None:
         )
     first, second = _told(one), _told(other)
     for key, words in _MUST_AGREE:
-        if key in first and key in second and _plain(first[key]) != _plain(second[key]):
+        if key in first and key in second and _value(key, first[key]) != _value(key, second[key]):
             _refuse(words, first[key], second[key], one, other)
     noises = [told.get("disturbance") for told in (first, second)]
     if all(isinstance(noise, Mapping) for noise in noises):
@@ -113,6 +118,14 @@ def _check_seeds(runs: Sequence[RunData]) -> None:
                 "independent runs to pool, such as one recorded with another --seed"
             )
         seen[str(seed)] = run
+
+
+def _value(key: str, value: Any) -> str:
+    """Return what two runs must have in common: of a plant file what it says, not where it lies."""
+    if key in _PLANTS and isinstance(value, str):
+        with suppress(ParameterError):
+            return describe_plants([load_plant(value)])
+    return _plain(value)
 
 
 def _plain(value: Any) -> str:

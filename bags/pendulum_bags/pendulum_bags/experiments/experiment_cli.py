@@ -6,6 +6,7 @@ import json
 import sys
 import time
 from collections.abc import Sequence
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -52,6 +53,12 @@ app = typer.Typer(
 Plant = Annotated[
     str, typer.Option(help="Preset or plant file of the simulated plant, and of the controller's design.")
 ]
+Simulation = Annotated[
+    str, typer.Option(help="In the simulator's place: a model file (MJCF or URDF, run by MuJoCo), or gymnasium:ID.")
+]
+Mapping = Annotated[
+    Path | None, typer.Option(help="Mapping file of that simulation: joint, actuator, sign, zero, limit.")
+]
 Seed = Annotated[int, typer.Option(help="Seed of the noise; one seed is one signal.", min=0)]
 Amplitude = Annotated[float, typer.Option(help="Largest torque of the noise [N m].")]
 HoldTime = Annotated[float, typer.Option(help="Time for which a noise sample is held [s].")]
@@ -71,7 +78,15 @@ def thesis(
     out: Annotated[
         Path | None, typer.Option(help="Folder of the run; it must be new. Default: bags/runs/<UTC>_thesis.")
     ] = None,
-    plant: Plant = "thesis",
+    plant: Annotated[
+        str | None,
+        typer.Option(
+            help="Preset or plant file of the simulated plant, and of the controller's design; default thesis, or with "
+            "--simulation the equation read off it."
+        ),
+    ] = None,
+    simulation: Simulation = "",
+    mapping: Mapping = None,
     hardware: Annotated[str, typer.Option(help="emulator, or hebi for the real actuator.")] = "emulator",
     lab: Lab = None,
     yes: Yes = False,
@@ -111,7 +126,9 @@ def thesis(
     from pendulum_bags.verdict.terminal import print_answer
 
     settings = RegulationSettings(
-        plant=plant,
+        plant=plant or "thesis",
+        simulation=simulation,
+        mapping="" if mapping is None else str(mapping),
         hardware=hardware,
         effort_strategy=strategy or "",
         controller=controller,
@@ -126,6 +143,9 @@ def thesis(
     console = make_console(stderr=json_output, highlight=False)
     with confirmed(settings.machine, settings.bridge_program(), _plan(settings), yes=yes):
         folder = create_run_folder(out, "thesis")
+        if (foreign := settings.foreign) is not None:
+            equation = foreign.write_equation(folder)
+            settings = settings if plant else replace(settings, plant=str(equation))
         started = time.monotonic()
         try:
             with PhaseProgress(TIME_BESIDE_NOISE + duration, console) as progress:
@@ -162,6 +182,8 @@ def lockstep(
     bag: Annotated[Path, typer.Option(help="Folder of the bag; it must not exist.")],
     side: Annotated[str, typer.Option(help="sim for the simulator, hw for the emulated hardware.")] = "sim",
     plant: Plant = "thesis",
+    simulation: Simulation = "",
+    mapping: Mapping = None,
     strategy: Strategy = "direct_pwm",
     seed: Seed = 1,
     amplitude: Amplitude = 2.5,
@@ -187,6 +209,8 @@ def lockstep(
         raise ParameterError(f"side is {side!r}; expected sim or hw")
     settings = RegulationSettings(
         plant=plant,
+        simulation=simulation,
+        mapping="" if mapping is None else str(mapping),
         effort_strategy=strategy,
         controller=controller,
         q=q,

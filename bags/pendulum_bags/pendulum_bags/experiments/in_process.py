@@ -19,6 +19,7 @@ from pendulum_msgs_py.contract.values import NANOSECONDS, JointCommand
 from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.parameters import validate
 from pendulum_msgs_py.plants.plant_parameters import PlantParameters, load_plant
+from pendulum_sim.plant import Plant
 from pendulum_sim.plants import make_plant
 from pendulum_sim.sensors import Sensors
 
@@ -58,6 +59,8 @@ def simulate(spec: RunSpec) -> RunArrays:
     """
     if spec.side != "sim" or spec.plant_parameters:
         raise ParameterError("a run in one process is of the plain simulator; others run as nodes")
+    if (foreign := spec.foreign) is not None:
+        return _simulate(spec, foreign.open(), Sensors())
     return simulate_plant(spec, load_plant(spec.plant))
 
 
@@ -69,9 +72,13 @@ def simulate_plant(spec: RunSpec, parameters: PlantParameters, sensors: Sensors 
         parameters: The plant.
         sensors: What the controller sees; None for the truth. They must not drop samples.
     """
+    dt = round(NANOSECONDS * spec.period) / NANOSECONDS
+    return _simulate(spec, make_plant(parameters, dt, method=spec.method), sensors or Sensors())
+
+
+def _simulate(spec: RunSpec, plant: Plant, sensors: Sensors) -> RunArrays:
     period_ns = round(NANOSECONDS * spec.period)
-    sensors = sensors or Sensors()
-    plant = make_plant(parameters, period_ns / NANOSECONDS, method=spec.method)
+    parameters = plant.parameters
     limits: dict[str, Any] = validate(LIMIT_SPECS, {})
     supervisor = PlantSupervisor(limits_from_parameters(limits, parameters.effort_limit))
     values = {**spec.controller_parameters, "set_point": spec.set_point}

@@ -86,6 +86,8 @@ def lockstep_spec(settings: RegulationSettings, *, side: str, theta: float = UPR
         seed=noise.seed,
         method=settings.method,
         storage=settings.storage,
+        simulation=settings.simulation if side == "sim" else "",
+        mapping=settings.mapping if side == "sim" else "",
     )
 
 

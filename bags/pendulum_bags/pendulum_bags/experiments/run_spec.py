@@ -8,6 +8,7 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
+from pendulum_bags.experiments.simulation import ForeignSimulation
 from pendulum_bags.runs.run_folder import git_revision, versions
 from pendulum_lqr.controller import controller_parameters
 from pendulum_lqr.disturbance import DISTURBANCE_SPECS
@@ -65,6 +66,8 @@ class RunSpec:
         plant_parameters: Further parameters of the plant's node, such as sensor noise.
         storage: Storage of the bag.
         clock: ``lockstep`` for as fast as the nodes answer each other, ``realtime`` for the wall's time.
+        simulation: A simulation of others that runs in the place of ``plant``, a model file or ``gymnasium:ID``; empty for ours.
+        mapping: Its mapping file; empty for none.
     """
 
     side: str = "sim"
@@ -82,6 +85,8 @@ class RunSpec:
     plant_parameters: Mapping[str, Any] = field(default_factory=dict)
     storage: str = "mcap"
     clock: str = "lockstep"
+    simulation: str = ""
+    mapping: str = ""
 
     def __post_init__(self) -> None:
         """Refuse what cannot be run before anything is started."""
@@ -100,7 +105,9 @@ class RunSpec:
                 raise ParameterError(f"{name} is {value} {unit}; expected a finite number")
         if self.duration <= 0.0:
             raise ParameterError(f"duration is {self.duration} s; expected > 0")
-        if self.side == "sim":
+        if (foreign := self.foreign) is not None:
+            _ = foreign.parameters
+        elif self.side == "sim":
             object.__setattr__(self, "method", integrator_of(self.plant, self.method))
         load_plant(self.design_plant)
         given = {**self.controller_parameters, "set_point": self.set_point}
@@ -118,7 +125,13 @@ class RunSpec:
     @property
     def period(self) -> float:
         """Time between two states [s]."""
-        return PERIODS[self.side]
+        foreign = self.foreign
+        return PERIODS[self.side] if foreign is None else foreign.period
+
+    @property
+    def foreign(self) -> ForeignSimulation | None:
+        """The simulation of others; None where ours or the emulated hardware runs."""
+        return ForeignSimulation(self.simulation, self.mapping) if self.simulation and self.side == "sim" else None
 
     @property
     def simulated_time(self) -> bool:
@@ -142,7 +155,7 @@ class RunSpec:
         Args:
             listeners: Subscriptions to its states that it waits for.
         """
-        loop: dict[str, graph.ParameterArgument] = {"clock": self.clock, "plant": _absolute(self.plant)}
+        loop: dict[str, graph.ParameterArgument] = {"clock": self.clock}
         if self.simulated_time:
             loop.update(
                 lockstep_inputs=["effort_command", "disturbance"],
@@ -152,11 +165,16 @@ class RunSpec:
         elif self.side == "hw":
             loop.update(feedback_watchdog=EMULATOR_WATCHDOG, command_lifetime=EMULATOR_LIFETIME)
         loop.update(self.plant_parameters)
+        foreign = self.foreign
+        if foreign is None:
+            loop.setdefault("plant", _absolute(self.plant))
         if self.side == "hw":
             # No hardware is armed by a parameter: the conductor does it, before it becomes the last listener.
             loop.update(initial_position=float(self.theta), seed=self.seed)
             return graph.bridge("/hw", backend="emulator", effort_strategy=self.strategy, **loop)
         loop.update(initial_theta=float(self.theta), armed_at_start=True, paused=True)
+        if foreign is not None:
+            return foreign.program("/sim", **loop)
         return graph.simulator("/sim", method=self.method, rate_hz=1.0 / self.period, **loop)
 
     def controller_program(self) -> NodeProgram:
@@ -181,12 +199,16 @@ class RunSpec:
 
     def metadata(self) -> dict[str, Any]:
         """Return what the bag says about its run."""
+        values = self.to_json()
+        # Told by what it is, not by the path that it was started from.
+        del values["simulation"], values["mapping"]
         return {
             "pendulum.run": {
-                **self.to_json(),
+                **values,
                 "experiment": self.clock,
                 "plant": self.plant if self.side == "sim" else "emulator",
                 "emulated_plant": self.plant if self.side == "hw" else "",
+                **({} if (foreign := self.foreign) is None else {"simulation": foreign.to_json()}),
                 "namespace": self.namespace,
                 "disturbance": self.disturbance_parameters(),
                 "controller": {"kind": self.controller, **self.controller_parameters},

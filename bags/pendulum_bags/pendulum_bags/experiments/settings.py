@@ -9,6 +9,7 @@ from typing import Any
 
 from pendulum_bags.experiments.operator import RealMachine, real_machine
 from pendulum_bags.experiments.run_spec import EMULATOR_LIFETIME, EMULATOR_WATCHDOG, THESIS_METHOD, integrator_of
+from pendulum_bags.experiments.simulation import ForeignSimulation
 from pendulum_bags.runs.run_folder import git_revision, versions
 from pendulum_lqr.controller import controller_parameters
 from pendulum_msgs_py.errors import ParameterError
@@ -70,6 +71,8 @@ class RegulationSettings:
         noise: The disturbance.
         storage: Storage of the bags.
         method: Integrator of the simulator; Euler as in the thesis, which a plant with motor and spring has not.
+        simulation: A simulation of others in our simulator's place, a model file or ``gymnasium:ID``; empty for ours.
+        mapping: Its mapping file; empty for none.
     """
 
     plant: str = "thesis"
@@ -82,6 +85,8 @@ class RegulationSettings:
     storage: str = "mcap"
     method: str = THESIS_METHOD
     lab: str = ""
+    simulation: str = ""
+    mapping: str = ""
 
     def __post_init__(self) -> None:
         """Refuse unknown plants and backends before anything is started."""
@@ -89,6 +94,10 @@ class RegulationSettings:
         if self.hardware not in HARDWARE:
             raise ParameterError(f"hardware is {self.hardware!r}; expected one of {', '.join(HARDWARE)}")
         real_machine(self.hardware, self.lab)
+        if (foreign := self.foreign) is not None:
+            foreign.check(self.noise.hold_time)
+        elif self.mapping:
+            raise ParameterError(f"mapping is {self.mapping} without a simulation; expected --simulation too")
         defaults = {item.name: item.default for item in fields(self)}
         for name in ("q", "r"):
             if getattr(self, name) != defaults[name] and name not in self.tuning:
@@ -103,6 +112,11 @@ class RegulationSettings:
         known = {spec.name for spec in controller_parameters(self.controller)}
         given: dict[str, list[float] | float] = {"q": [float(value) for value in self.q], "r": float(self.r)}
         return {name: value for name, value in given.items() if name in known}
+
+    @property
+    def foreign(self) -> ForeignSimulation | None:
+        """The simulation of others; None for ours."""
+        return ForeignSimulation(self.simulation, self.mapping) if self.simulation else None
 
     @property
     def machine(self) -> RealMachine | None:
@@ -120,6 +134,12 @@ class RegulationSettings:
     def hardware_plant(self) -> str:
         """What a bag names as the hardware's plant: ``emulator``, also for the emulated machine of a lab file."""
         return "emulator" if self.machine is not None and self.machine.emulated else self.hardware
+
+    def simulator_program(self) -> NodeProgram:
+        """Return the simulation, ours or that of others, in real time."""
+        if (foreign := self.foreign) is not None:
+            return foreign.program("/sim", clock="realtime")
+        return graph.simulator("/sim", plant=self.plant, method=self.method, clock="realtime")
 
     def bridge_program(self, bag: Path | None = None) -> NodeProgram:
         """Return the bridge to the actuator; a real one's own log is written beside the bag, where there is one."""
@@ -143,6 +163,8 @@ class RegulationSettings:
             *("--controller", self.controller, "--q", *map(repr, self.q), "--r", repr(self.r)),
             *("--seed", str(noise.seed), "--amplitude", repr(noise.amplitude), "--hold-time", repr(noise.hold_time)),
             *("--duration", repr(noise.duration), "--storage", self.storage),
+            *(("--simulation", self.simulation) if self.simulation else ()),
+            *(("--mapping", self.mapping) if self.mapping else ()),
         ]
 
     def controller_program(self, namespace: str, **changes: graph.ParameterArgument) -> NodeProgram:
@@ -173,6 +195,7 @@ class RegulationSettings:
                 "controller": {"kind": self.controller, **self.tuning},
                 "versions": versions(),
                 "git_revision": git_revision(),
+                **({} if (foreign := self.foreign) is None else {"simulation": foreign.to_json()}),
                 **({} if (machine := self.machine) is None else {"lab": dict(machine.lab.values)}),
                 **more,
             }

@@ -20,7 +20,6 @@ from pendulum_msgs_py.contract.angles import UPRIGHT
 from pendulum_msgs_py.contract.names import Event
 from pendulum_msgs_py.contract.trajectory import thesis_ramp
 from pendulum_msgs_py.errors import FaultError
-from pendulum_msgs_py.programs import graph
 from pendulum_msgs_py.programs.graph import NodeProgram
 
 __all__ = ["run_thesis"]
@@ -86,7 +85,7 @@ def _start(processes: ProcessSet, folder: Path, settings: RegulationSettings) ->
 
 def _programs(settings: RegulationSettings, folder: Path) -> list[NodeProgram]:
     return [
-        graph.simulator("/sim", plant=settings.plant, method=settings.method, clock="realtime"),
+        settings.simulator_program(),
         settings.bridge_program(folder / "hw"),
         *(settings.controller_program(namespace, autostart=False) for namespace in ("/sim", "/hw")),
         *(settings.disturbance_program(namespace, autostart=False) for namespace in ("/sim", "/hw")),
@@ -152,7 +151,9 @@ def _noise_ended(plant: PlantClient) -> bool:
 
 def _start_own_protocol(processes: ProcessSet, folder: Path, settings: RegulationSettings) -> Child:
     """Start the simulation as the thesis ran it: noise of its own, a new sample every 2 ms."""
-    noise = replace(settings.noise, seed=settings.noise.seed + OWN_PROTOCOL_SEED_STEP, hold_time=0.002)
+    foreign = settings.foreign
+    hold_time = 0.002 if foreign is None else max(0.002, foreign.period)
+    noise = replace(settings.noise, seed=settings.noise.seed + OWN_PROTOCOL_SEED_STEP, hold_time=hold_time)
     command = [sys.executable, "-m", "pendulum_bags", "experiment", "lockstep", "--bag", str(folder / "sim_500hz")]
     return _start_beside(processes, "sim_500hz", [*command, *replace(settings, noise=noise).arguments()])
 

@@ -1,0 +1,105 @@
+"""A model file of others as the simulation of an experiment: what is refused, what it runs, what its bags say."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from pendulum_bags.comparison.independence import check_pairs
+from pendulum_bags.experiments.in_process import simulate
+from pendulum_bags.experiments.lockstep import lockstep_spec
+from pendulum_bags.experiments.settings import NoiseSettings, RegulationSettings
+from pendulum_msgs_py.errors import DataError, ParameterError
+from pendulum_msgs_py.plants.plant_differences import plant_differences
+from pendulum_msgs_py.plants.plant_parameters import load_plant
+from pendulum_sim.model_files import mjcf
+
+pytest.importorskip("mujoco")
+
+SHORT = NoiseSettings(duration=1.0)
+
+
+@pytest.fixture
+def model(tmp_path: Path) -> Path:
+    path = tmp_path / "own.xml"
+    path.write_text(mjcf(load_plant("thesis")), encoding="utf-8")
+    return path
+
+
+def test_the_controller_is_designed_on_what_the_model_says(model: Path, tmp_path: Path) -> None:
+    foreign = RegulationSettings(simulation=str(model)).foreign
+    assert foreign is not None
+    assert plant_differences(load_plant(foreign.write_equation(tmp_path)), load_plant("thesis")) == ()
+
+
+def test_a_model_with_our_parameters_moves_like_our_simulation(model: Path) -> None:
+    ours = simulate(lockstep_spec(RegulationSettings(noise=SHORT, method="etd4"), side="sim"))
+    theirs = simulate(lockstep_spec(RegulationSettings(noise=SHORT, simulation=str(model)), side="sim"))
+    assert np.array_equal(theirs.disturbance, ours.disturbance)
+    assert np.max(np.abs(theirs.position - ours.position)) < 0.1 * np.std(ours.position)
+
+
+def test_the_node_has_our_simulators_name_and_absolute_paths(model: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(model.parent)
+    settings = RegulationSettings(noise=SHORT, simulation=model.name)
+    program = settings.simulator_program()
+    assert (program.full_name, program.executable) == ("/sim/simulator", "mujoco")
+    assert program.parameters == {"model": str(model), "clock": "realtime"}
+    in_lockstep = lockstep_spec(settings, side="sim").plant_program(4)
+    assert in_lockstep.full_name == "/sim/simulator"
+    assert "plant" not in in_lockstep.parameters
+    assert lockstep_spec(settings, side="hw").foreign is None
+    assert settings.arguments()[-2:] == ["--simulation", model.name]
+
+
+@pytest.mark.parametrize(
+    ("model_text", "sentence"),
+    [
+        (("-13.0 13.0", "-1.0 1.0"), r"gives at most 1 N m, its weight takes up to 1.678 N m: .* actuator: none"),
+        (
+            ('timestep="0.002"', 'timestep="0.02"'),
+            r"has a period of 20 ms, the noise changes every 10 ms; expected timestep",
+        ),
+    ],
+)
+def test_a_model_that_cannot_take_part_is_refused_before_anything_starts(
+    model: Path, model_text: tuple[str, str], sentence: str
+) -> None:
+    text = model.read_text(encoding="utf-8")
+    assert model_text[0] in text
+    model.write_text(text.replace(*model_text), encoding="utf-8")
+    with pytest.raises(ParameterError, match=sentence):
+        RegulationSettings(simulation=str(model))
+
+
+def test_a_mapping_without_a_simulation_is_refused() -> None:
+    with pytest.raises(ParameterError, match=r"mapping is lab\.yaml without a simulation"):
+        RegulationSettings(mapping="lab.yaml")
+
+
+def _recording(name: str, metadata: dict[str, Any]) -> SimpleNamespace:
+    """Return of a recording what pooling looks at."""
+    window = SimpleNamespace(t=np.arange(5.0), position=np.random.default_rng(list(name.encode())).random(5))
+    return SimpleNamespace(source=name, metadata=metadata, window=window)
+
+
+def test_runs_with_one_plant_file_in_two_places_are_pooled_and_other_simulations_are_not(
+    model: Path, tmp_path: Path
+) -> None:
+    settings = RegulationSettings(simulation=str(model))
+    foreign = settings.foreign
+    assert foreign is not None
+    pairs = []
+    for seed in (1, 2):
+        plant = foreign.write_equation(tmp_path / str(seed))
+        told = replace(settings, plant=str(plant), noise=NoiseSettings(seed=seed)).metadata("thesis", plant=str(plant))
+        pairs.append([_recording(f"{side}_{seed}", told) for side in ("sim", "hw")])
+    check_pairs(pairs)  # type: ignore[arg-type]
+    pairs[1][0].metadata["pendulum.run"]["simulation"]["name"] = "other.xml"
+    with pytest.raises(DataError, match="runs with different simulations cannot be pooled"):
+        check_pairs(pairs)  # type: ignore[arg-type]
