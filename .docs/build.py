@@ -17,6 +17,7 @@ GATHERED = PROJECT / "build" / "docs"
 PACKAGES = ("pendulum_sim", "pendulum_hw_bridge", "pendulum_lqr", "pendulum_rosbag", "pendulum_bags")
 NODES = (
     ("simulator", "pendulum_sim.simulator_node", ("SPECS",)),
+    ("adopt", "pendulum_sim.adopt_node", ("SPECS",)),
     ("viewer", "pendulum_sim.viewer_node", ("SPECS",)),
     ("markers", "pendulum_sim.markers_node", ("SPECS",)),
     ("bridge", "pendulum_hw_bridge.node_specs", ("SPECS",)),

@@ -6,6 +6,7 @@ EXECUTABLES: dict[str, str] = {
     "simulator": "pendulum_sim.simulator_node:main",
     "mujoco": "pendulum_sim.simulator_node:main_mujoco",
     "gymnasium": "pendulum_sim.simulator_node:main_gymnasium",
+    "adopt": "pendulum_sim.adopt_node:main",
     "viewer": "pendulum_sim.viewer_node:main",
     "markers": "pendulum_sim.markers_node:main",
     "phase_plot": "pendulum_sim.phase_plot:main",

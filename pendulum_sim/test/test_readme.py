@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from pendulum_msgs_py.parameters import markdown_table
-from pendulum_sim import engines, simulator_node, viewer_node
+from pendulum_sim import adopt_node, engines, simulator_node, viewer_node
 
 README = Path(__file__).parents[1] / "README.md"
 
@@ -19,6 +19,7 @@ README = Path(__file__).parents[1] / "README.md"
         ("simulator", simulator_node.SPECS),
         ("mujoco", engines.MUJOCO.specs),
         ("gymnasium", engines.GYMNASIUM.specs),
+        ("adopt", adopt_node.SPECS),
         ("viewer", viewer_node.SPECS),
     ],
 )

@@ -10,13 +10,15 @@ from typing import Any
 import numpy as np
 import pytest
 
+from pendulum_bags.comparison import Outcome, compare_runs
 from pendulum_bags.comparison.independence import check_pairs
 from pendulum_bags.experiments.in_process import simulate
 from pendulum_bags.experiments.lockstep import lockstep_spec
+from pendulum_bags.experiments.repeats import record_simulation
 from pendulum_bags.experiments.settings import NoiseSettings, RegulationSettings
 from pendulum_msgs_py.errors import DataError, ParameterError
 from pendulum_msgs_py.plants.plant_differences import plant_differences
-from pendulum_msgs_py.plants.plant_parameters import load_plant
+from pendulum_msgs_py.plants.plant_parameters import load_plant, write_plant
 from pendulum_sim.model_files import mjcf
 
 pytest.importorskip("mujoco")
@@ -42,6 +44,20 @@ def test_a_model_with_our_parameters_moves_like_our_simulation(model: Path) -> N
     theirs = simulate(lockstep_spec(RegulationSettings(noise=SHORT, simulation=str(model)), side="sim"))
     assert np.array_equal(theirs.disturbance, ours.disturbance)
     assert np.max(np.abs(theirs.position - ours.position)) < 0.1 * np.std(ours.position)
+
+
+@pytest.mark.parametrize("kind", ["mujoco", "gymnasium"])
+def test_two_simulations_of_one_plant_are_equivalent_and_of_two_plants_are_not(
+    model: Path, tmp_path: Path, kind: str
+) -> None:
+    noise = NoiseSettings(duration=10.0)
+    theirs = RegulationSettings(noise=noise, simulation=str(model) if kind == "mujoco" else "gymnasium:PendulumX59-v0")
+    record_simulation(tmp_path / "theirs", lockstep_spec(theirs, side="sim"))
+    for damping, outcome in ((11.77, Outcome.EQUIVALENT), (6.0, Outcome.NOT_EQUIVALENT)):
+        plant = write_plant(tmp_path / f"{damping}.yaml", load_plant("thesis").with_values(damping=damping))
+        spec = replace(lockstep_spec(RegulationSettings(noise=noise, method="etd4"), side="sim"), plant=str(plant))
+        ours = record_simulation(tmp_path / f"ours_{damping}", spec)
+        assert compare_runs(tmp_path / "theirs", ours).verdict.outcome is outcome
 
 
 def test_the_node_has_our_simulators_name_and_absolute_paths(model: Path, monkeypatch: pytest.MonkeyPatch) -> None:

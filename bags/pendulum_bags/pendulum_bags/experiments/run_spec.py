@@ -66,7 +66,7 @@ class RunSpec:
         plant_parameters: Further parameters of the plant's node, such as sensor noise.
         storage: Storage of the bag.
         clock: ``lockstep`` for as fast as the nodes answer each other, ``realtime`` for the wall's time.
-        simulation: A simulation of others that runs in the place of ``plant``, a model file or ``gymnasium:ID``; empty for ours.
+        simulation: A simulation of others in the place of ``plant``, a model file or ``gymnasium:ID``; empty for ours.
         mapping: Its mapping file; empty for none.
     """
 

@@ -1,0 +1,198 @@
+"""A plain node of others behind our rules: adopted, driven, e-stopped, killed, and with an intruder at its efforts."""
+
+from __future__ import annotations
+
+import math
+import signal
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from diagnostic_msgs.msg import DiagnosticArray
+from sensor_msgs.msg import JointState
+from std_msgs.msg import Float64MultiArray
+from std_srvs.srv import SetBool, Trigger
+from trajectory_msgs.msg import JointTrajectory
+
+from pendulum_msgs_py.contract import names
+from pendulum_msgs_py.contract.trajectory import from_points
+from pendulum_msgs_py.ros import qos
+from pendulum_msgs_py.ros.convert import stamp_from_message, trajectory_to_message
+from tests.graph_peer import GraphPeer
+from tests.processes import ProcessGroup, RunningProgram
+
+ROBOT = Path(__file__).with_name("plain_plant.py")
+EFFORTS = "/robot/effort_controller/commands"
+
+
+class Peer(GraphPeer):
+    """Controller and listener in the adopted plant's namespace; hears what the robot is sent, too."""
+
+    def __init__(self) -> None:
+        super().__init__("peer", namespace="/sim")
+        self.states: list[JointState] = []
+        self.sent: list[float] = []
+        self.diagnostics: dict[str, str] = {}
+        self.torque: float | None = None
+        self._commands = self.node.create_publisher(JointState, names.EFFORT_COMMAND, qos.COMMAND)
+        self.moves = self.node.create_publisher(JointTrajectory, names.JOINT_TRAJECTORY, qos.TRAJECTORY)
+        self.node.create_subscription(JointState, names.JOINT_STATES, self._on_state, qos.STATE)
+        self.node.create_subscription(Float64MultiArray, EFFORTS, lambda message: self.sent.append(message.data[1]), 10)
+        self.node.create_subscription(DiagnosticArray, names.DIAGNOSTICS, self._on_diagnostics, 10)
+
+    def _on_state(self, message: JointState) -> None:
+        self.states.append(message)
+        if self.torque is not None:
+            answer = JointState(name=[names.JOINT], effort=[self.torque])
+            answer.header.stamp, answer.header.frame_id = message.header.stamp, "peer"
+            self._commands.publish(answer)
+
+    def _on_diagnostics(self, message: DiagnosticArray) -> None:
+        for status in message.status:
+            self.diagnostics = {pair.key: pair.value for pair in status.values}
+
+    def known(self) -> str:
+        return f"; diagnostics {self.diagnostics}, sent {self.sent[-3:]}"
+
+    def ask(self, service: str) -> Trigger.Response:
+        return self.call(Trigger, f"simulator/{service}", Trigger.Request())
+
+    def arm(self, on: bool = True) -> SetBool.Response:
+        return self.call(SetBool, "simulator/arm", SetBool.Request(data=on))
+
+
+@pytest.fixture
+def peer(domain_id: int) -> Iterator[Peer]:
+    peer = Peer()
+    yield peer
+    peer.close()
+
+
+@pytest.fixture
+def robot(processes: ProcessGroup, peer: Peer) -> RunningProgram:
+    return processes.start_command([sys.executable, str(ROBOT)], name="robot")
+
+
+@pytest.fixture
+def adopter(processes: ProcessGroup, peer: Peer, robot: RunningProgram) -> RunningProgram:
+    told = {
+        "states": "/robot/joint_states", "commands": EFFORTS, "joint": "shoulder", "command_index": 1,
+        "command_size": 2, "sign": -1, "zero": -math.pi / 2.0, "state_timeout": 0.5,
+    }  # fmt: skip
+    arguments = [item for name, value in told.items() for item in ("-p", f"{name}:={value}")]
+    program = processes.start("pendulum_sim", "adopt", "--ros-args", "-r", "__ns:=/sim", *arguments)
+    peer.until(lambda: peer.states and peer.sent and peer.diagnostics.get("mode"), "the adopted plant")
+    return program
+
+
+def test_it_is_stamped_armed_driven_limited_moved_and_stopped(adopter: RunningProgram, peer: Peer) -> None:
+    first = peer.states[0]
+    assert (list(first.name), first.position[0]) == ([names.JOINT], pytest.approx(0.0, abs=1e-6))
+    assert stamp_from_message(first.header.stamp) > 1e18
+    # Commands before arming move nothing.
+    peer.torque = 1.0
+    peer.until(lambda: int(peer.diagnostics.get("effort_command.accepted", 0)) > 20, "commands")
+    assert set(peer.sent) == {0.0}
+    peer.torque = None
+    peer.spin(0.2)
+    assert peer.arm().success
+
+    peer.torque = 0.5
+    # Our counter-clockwise is their other way round.
+    peer.until(lambda: peer.sent[-1] == -0.5, "torque")
+    peer.until(lambda: peer.states[-1].position[0] > 0.01, "a move counter-clockwise")
+    peer.torque = 99.0
+    peer.until(lambda: peer.sent[-1] == -13.0, "the limit")
+    peer.torque = None
+    peer.until(lambda: peer.sent[-1] == 0.0, "zero torque without commands")
+
+    start = peer.states[-1].position[0]
+    peer.moves.publish(trajectory_to_message(from_points([0.0, 1.5], [start, 2.2], [0.0, 0.0])))
+    peer.until(lambda: "holding" in peer.diagnostics["reason"], "the end of the move")
+    # Past a right angle, where theirs wraps.
+    assert peer.states[-1].position[0] == pytest.approx(2.2, abs=0.05)
+    assert peer.ask("e_stop").success
+    peer.until(lambda: peer.sent[-1] == 0.0, "zero torque after the e-stop")
+    count = len(peer.sent)
+    peer.torque = 1.0
+    peer.until(lambda: len(peer.sent) > count + 30, "more efforts")
+    assert set(peer.sent[count:]) == {0.0}
+    assert not peer.arm().success
+
+
+def test_a_robot_that_dies_is_a_fault_and_a_new_one_gets_no_torque_by_itself(
+    adopter: RunningProgram, robot: RunningProgram, peer: Peer, processes: ProcessGroup
+) -> None:
+    assert peer.arm().success
+    peer.torque = 0.5
+    peer.until(lambda: peer.sent[-1] == -0.5, "torque")
+    robot.send_signal(signal.SIGKILL)
+    peer.until(lambda: peer.diagnostics["mode"] == "fault", "the fault")
+    assert "ms old; expected at most 500 ms" in peer.diagnostics["reason"]
+    peer.until(lambda: peer.sent[-1] == 0.0, "zero torque")
+    states, count = len(peer.states), len(peer.sent)
+    processes.start_command([sys.executable, str(ROBOT)], name="robot again")
+    peer.until(lambda: len(peer.states) > states + 30, "states of the new one")
+    assert set(peer.sent[count:]) == {0.0}
+    adopter.interrupt()
+    peer.until(lambda: adopter.returncode is not None, "the end")
+    assert adopter.returncode == 0
+
+
+def test_the_end_of_the_adopter_leaves_no_torque_behind(adopter: RunningProgram, peer: Peer) -> None:
+    assert peer.arm().success
+    peer.torque = 0.5
+    peer.until(lambda: peer.sent[-1] == -0.5, "torque")
+    adopter.send_signal(signal.SIGTERM)
+    peer.until(lambda: adopter.returncode is not None, "the end")
+    assert peer.sent[-1] == 0.0
+
+
+def test_somebody_else_at_its_efforts_is_refused_and_faults(adopter: RunningProgram, peer: Peer) -> None:
+    assert peer.arm().success
+    intruder = peer.node.create_publisher(Float64MultiArray, EFFORTS, 10)
+    peer.until(lambda: peer.diagnostics["mode"] == "fault", "the fault")
+    assert peer.diagnostics["reason"].startswith("1 other publishers on /robot/effort_controller/commands")
+    assert peer.arm(False).success
+    assert "expected none" in peer.arm().message
+    peer.node.destroy_publisher(intruder)
+    peer.until(lambda: peer.arm().success, "it to be armed again")
+
+
+def test_states_that_are_not_finite_or_of_another_joint_are_refused(processes: ProcessGroup, peer: Peer) -> None:
+    robot = peer.node.create_publisher(JointState, "/robot/joint_states", 10)
+    peer.node.create_subscription(Float64MultiArray, EFFORTS, lambda message: None, 10)
+    arguments = ("-p", "states:=/robot/joint_states", "-p", f"commands:={EFFORTS}", "-p", "state_timeout:=2.0")
+    processes.start(
+        "pendulum_sim",
+        "adopt",
+        "--ros-args",
+        "-r",
+        "__ns:=/sim",
+        *arguments,
+        "-p",
+        "command_size:=2",
+        "-p",
+        "joint:=hip",
+    )
+
+    def speak(name: str, position: float, velocity: tuple[float, ...] = (0.0,)) -> None:
+        robot.publish(JointState(name=[name], position=[position], velocity=velocity))
+
+    def sound() -> bool:
+        speak("hip", 0.1)
+        return bool(peer.states)
+
+    peer.until(sound, "a state")
+    for name, position, velocity in (("knee", 0.0, (0.0,)), ("hip", 0.0, ())):
+        count = len(peer.states)
+        speak(name, position, velocity)
+        speak("hip", 0.1)
+        peer.until(lambda before=count: len(peer.states) > before, "the next sound state")  # type: ignore[misc]
+        assert peer.states[-1].position[0] == 0.1
+    assert peer.arm().success
+    speak("hip", math.nan)
+    peer.until(lambda: peer.diagnostics.get("mode") == "fault", "the fault")
+    assert peer.diagnostics["reason"] == "its state is not finite: nan rad, 0.0 rad/s"
+    assert all(math.isfinite(state.position[0]) for state in peer.states)
