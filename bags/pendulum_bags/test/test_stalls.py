@@ -49,7 +49,7 @@ def test_a_machine_that_stalls_each_time_is_an_error_after_three_runs(tmp_path: 
     [
         (STALL, False),
         (PlantStoppedError("/hw", "e_stop", "e-stop pressed"), True),
-        (PlantStoppedError("/hw", "fault", "motion_disagreement: a stuck encoder"), True),
+        (PlantStoppedError("/hw", "fault", "winding_current: 3 A do not fit a duty of 0"), True),
         (FaultError("hw_bridge ended with code 2"), True),
     ],
     ids=["real machine", "e-stop", "another fault", "dead program"],
@@ -68,6 +68,7 @@ def test_what_is_no_stall_of_an_emulator_ends_the_experiment_at_once(
         "measurement is 944 ms old; expected at most 510 ms: is the machine too busy, or the link lost?",
         "feedback_lost: no feedback for 520 ms",
         "feedback_late: record is 600 ms old",
+        "motion_disagreement: velocity says 0.0199 rad, position 0.0093 rad in 0.2 s; expected them within 0.01 rad",
         "disarmed: no command for 30.0 s (no fresh command: zero torque)",
     ],
 )

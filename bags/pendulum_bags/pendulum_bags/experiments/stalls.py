@@ -18,8 +18,9 @@ __all__ = ["ATTEMPTS", "is_stall", "run_undisturbed"]
 
 ATTEMPTS = 3
 """Times that a run is carried out at most."""
-STALLS = ("host_stalled", "feedback_lost", "feedback_late")
-"""Faults of the bridge that an emulator, whose feedback this machine makes, has where the machine stands still."""
+STALLS = ("host_stalled", "feedback_lost", "feedback_late", "motion_disagreement")
+"""Faults of the bridge that an emulator, whose feedback this machine makes, has where the machine stands still: between
+records that are far apart position and velocity tell different motions."""
 SAID = ("is the machine too busy", "no command for", "no fresh command")
 """What a plant says whose states are too old, and one whose controller stood still."""
 _LOGS = "logs"
