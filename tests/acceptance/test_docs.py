@@ -6,6 +6,8 @@ import json
 import os
 import re
 import subprocess
+import sys
+import textwrap
 from pathlib import Path
 from urllib.parse import unquote, urlsplit
 from xml.etree import ElementTree
@@ -105,3 +107,48 @@ def test_the_controller_manager_is_told_our_joint() -> None:
     path = PROJECT / "pendulum_lqr" / "config" / "ros2_control_controllers.yaml"
     content = yaml.safe_load(path.read_text(encoding="utf-8"))
     assert content["effort_controller"]["ros__parameters"]["joints"] == [names.JOINT]
+
+
+_FENCE = re.compile(r"^( *)```(\w*)\n(.*?)^\1```", re.MULTILINE | re.DOTALL)
+_MARK = re.compile(
+    r"not run|run by|run it|run these|run what they do|asks for a module|full jazzy|answers as seen", re.IGNORECASE
+)
+_HEADING = re.compile(r"^#+ ", re.MULTILINE)
+
+
+def _blocks(kind: str) -> list[tuple[Path, re.Match[str], str]]:
+    """Return the fenced blocks of a kind with their page and the section of the page that they stand in."""
+    found = []
+    for page in PAGES:
+        text = page.read_text(encoding="utf-8")
+        # A comment within a block is no heading.
+        plain = _FENCE.sub(lambda block: "~" * len(block.group(0)), text)
+        starts = [0, *(it.start() for it in _HEADING.finditer(plain)), len(text)]
+        for block in _FENCE.finditer(text):
+            first = max(start for start in starts if start <= block.start())
+            last = min(start for start in starts if start > block.start())
+            if block.group(2) == kind:
+                found.append((page, block, text[first:last]))
+    return found
+
+
+def test_commands_that_are_not_run_here_say_so() -> None:
+    silent = []
+    for page, block, section in _blocks("console"):
+        text = page.read_text(encoding="utf-8")
+        runs_here = text[: block.start()].endswith("<!-- run in order -->\n")
+        commands = [line for line in block.group(3).splitlines() if line.startswith("$ ")]
+        needs_ros = all("ros2 " in line for line in commands)
+        if not runs_here and not needs_ros and not _MARK.search(section):
+            silent.append(f"{page.relative_to(PROJECT)}: {commands[0] if commands else block.group(3)[:60]}")
+    assert silent == []
+
+
+PYTHON = [(page, block.group(3)) for page, block, _ in _blocks("python") if "launch_ros" not in block.group(3)]
+
+
+@pytest.mark.parametrize(("page", "code"), PYTHON, ids=[str(page.relative_to(PROJECT)) for page, _ in PYTHON])
+def test_python_of_a_page_runs_as_it_stands(page: Path, code: str, tmp_path: Path) -> None:
+    command = [sys.executable, "-c", textwrap.dedent(code)]
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=60, check=False)
+    assert done.returncode == 0, f"{page}\n{code}\n{done.stderr}"

@@ -1,0 +1,38 @@
+"""The course where it needs running plants: a sealed one is played on and identified; both controllers run."""
+
+from __future__ import annotations
+
+import re
+import shlex
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from tests.fixtures import PROJECT
+
+PAGE = PROJECT / "bags" / "pendulum_bags" / "docs" / "course_answers.md"
+
+
+def _run(line: str, folder: Path) -> subprocess.CompletedProcess[str]:
+    words = shlex.split(line)
+    assert words[0] == "python"
+    return subprocess.run(
+        [sys.executable, *words[1:]], cwd=folder, capture_output=True, text=True, timeout=120, check=False
+    )
+
+
+@pytest.mark.timeout(240)
+def test_the_answers_page_identifies_the_hidden_plant_and_names_the_winner(domain_id: int, tmp_path: Path) -> None:
+    made = _run("python -m pendulum_bags course make --seed 1 --out course", tmp_path)
+    assert made.returncode == 0, made.stderr
+    blocks = re.findall(r"^```console\n(.*?)^```", PAGE.read_text(encoding="utf-8"), re.MULTILINE | re.DOTALL)
+    for line in blocks[-1].splitlines():
+        if line.startswith("$ "):
+            # Fewer candidates than by default: the page's excitation is good enough.
+            done = _run(line[2:] + (" --trials 20" if " excite " in line else ""), tmp_path)
+            assert done.returncode == 0, f"{line}\n{done.stdout}\n{done.stderr}"
+    assert done.stdout.startswith("right: every parameter")
+    judged = _run("python -m pendulum_bags course check winner b --course course", tmp_path)
+    assert (judged.returncode, judged.stdout.split(":")[0]) == (0, "right"), judged.stdout + judged.stderr
