@@ -8,7 +8,7 @@ import yaml
 
 from pendulum_bags.identification.covariance import FREQUENCY
 from pendulum_bags.identification.cross_validation import cross_validate, folds
-from pendulum_bags.identification.model import INDEX, from_plant
+from pendulum_bags.identification.model import FRICTION_MODELS, INDEX, from_plant
 from pendulum_bags.identification.options import Options
 from pendulum_bags.identification.output_error import fit_output_error
 from pendulum_bags.identification.result import identify
@@ -47,6 +47,15 @@ def test_a_damping_without_dry_friction_beside_it_owns_that_there_may_be_some():
     # The plant without dry friction would move otherwise: the interval of a damping that had been told so is narrow.
     told = identify([truth.recording(63)], Options(friction="viscous"), profiles=0).uncertainty.intervals["damping"]
     assert told.standard_error < 0.3 * damping.standard_error
+
+
+def test_a_friction_model_never_fits_worse_than_one_that_it_contains():
+    """A search by long steps went where short ones do not follow: nine times the error of the model inside it."""
+    fit = fit_output_error([TRUTHS["torque noise"].recording(18)], Options(folds=2))
+    for larger in fit.candidates:
+        for inner in fit.candidates:
+            if set(FRICTION_MODELS[inner.friction]) <= set(FRICTION_MODELS[larger.friction]):
+                assert larger.mean_cost <= 1.001 * inner.mean_cost, (larger.friction, inner.friction)
 
 
 def _jackknife_of_frequency(result):

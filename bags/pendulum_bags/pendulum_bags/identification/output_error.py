@@ -111,8 +111,11 @@ def fit_output_error(recordings: Sequence[Recording], options: Options = DEFAULT
         names = [n for n in FRICTION_MODELS if n not in SERVO_ONLY or fixed.input_kind == "position_goal"]
     free, best, offsets = _offsets(best, pieces, free, scale, options)
     candidates: list[Candidate] = []
+    inner: list[Candidate] = []
+    if names[0] != "viscous":  # friction by name: what every other one contains is tried before it all the same
+        inner = [_fit_friction("viscous", best, pieces, free, scale, (), replace(options, folds=1))]
     for name in names:
-        candidates.append(_fit_friction(name, best, pieces, free, scale, candidates, options))
+        candidates.append(_fit_friction(name, best, pieces, free, scale, [*inner, *candidates], options))
     first = choose(candidates)
     chosen = _finish(first, pieces, scale)
     candidates[candidates.index(first)] = chosen
@@ -280,6 +283,7 @@ def _fit_friction(
         values = {k: v for k, v in model.values.items() if k in free or not _is_friction(k) or k in names}
         plain = FitModel(values, model.input_kind, name, model.duty_gain)
         begin.append((plain, previous.states))
+    contained = len(begin)
     kind = name.replace("stribeck_", "") if name != "stribeck" else name
     additions = _FRICTION_STARTS.get(kind, ()) + (_FRICTION_STARTS["stribeck"] if name.startswith("stribeck_") else ())
     coulomb = max(start.model["coulomb_friction"], 1e-3 * abs(start.model["gravity"]))
@@ -291,14 +295,24 @@ def _fit_friction(
             values["coulomb_friction"] = 0.5 * coulomb
         begin.append((FitModel(values, start.model.input_kind, name, start.model.duty_gain), start.states))
     solutions = [solve(m, pieces, everything, states=s, scale=scale, tolerance=1e-7, coarse=COARSE) for m, s in begin]
-    best = min(solutions, key=lambda s: s.cost)
+    # Long steps may have found what short ones do not confirm: those decide, between finds and starts too.
+    solutions += [Solution(m, s, np.inf, converged=False, iterations=0) for m, s in begin[:contained]]
+    insides = [_inside(s, pieces) for s in solutions]
+    costs = [robust_cost(inside, scale) for inside in insides]
+    number = int(np.argmin(np.nan_to_num(costs, nan=np.inf)))
+    best, inside = replace(solutions[number], cost=costs[number]), insides[number]
     best = replace(best, model=FitModel(best.model.values, best.model.input_kind, name, best.model.duty_gain))
     parts = residuals(best.model, pieces, best.states)
-    inside = np.concatenate([part[piece.mask()] for part, piece in zip(parts, pieces, strict=True)])
     validation = cross_validate(best.model, pieces, best.states, everything, scale, count=options.folds)
     mean_cost = robust_cost(inside, scale) / inside.size
     rms = float(np.sqrt(np.mean(inside**2)))
     return Candidate(name, everything, best, rms, validation, mean_cost, effective_samples(parts, pieces))
+
+
+def _inside(solution: Solution, pieces: Sequence[Piece]) -> Array:
+    """Return the residuals of all windows, by the steps of an answer, shape (n,) [rad]."""
+    parts = residuals(solution.model, pieces, solution.states)
+    return np.concatenate([part[piece.mask()] for part, piece in zip(parts, pieces, strict=True)])
 
 
 def _is_friction(name: str) -> bool:
