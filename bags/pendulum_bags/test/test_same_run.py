@@ -15,6 +15,7 @@ from pendulum_bags.comparison.spectra import spectra_of
 from pendulum_bags.verdict import Mark
 from pendulum_bags.verdict.same_run import same_run_layer
 from pendulum_msgs_py.errors import DataError
+from pendulum_msgs_py.plants.plant_parameters import PlantParameters
 from tests.benchmarks.bench_verdict import DEFAULT_LOOKS, DIFFERENCES, ON_THE_MARGIN, margins_at, run_trial
 from tests.plant_pairs import MACHINE, SIMULATED, pair, record
 
@@ -202,6 +203,15 @@ def test_the_layer_says_what_differs_and_what_to_do() -> None:
     fine = same_run_layer(compare([pair(5, plant=MACHINE)]))
     assert fine.mark is Mark.YES
     assert not fine.next_steps
+
+
+@pytest.mark.parametrize("plant", [MACHINE, SIMULATED.with_values(damping=2 * 11.77)])
+def test_what_to_do_about_a_simulation_of_others_is_done_in_it(plant: PlantParameters) -> None:
+    simulation, hardware = pair(5, plant=plant, late=0.01)
+    foreign = replace(simulation, metadata={"pendulum.run": {"simulation": {"name": "lab.xml"}}})
+    for run, named in ((foreign, True), (simulation, False)):
+        (step,) = same_run_layer(compare([(run, hardware)])).next_steps
+        assert ("lab.xml" in step, "--plant" in step) == (named, not named)
 
 
 def test_looking_again_widens_the_intervals_so_that_all_looks_together_err_no_more() -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 from pendulum_bags.comparison import Comparison, EquivalenceTest, Outcome
 from pendulum_bags.verdict.layers import Evidence, Layer, LayerResult, Mark
@@ -106,11 +106,17 @@ def _remedies(comparison: Comparison, failed: Sequence[EquivalenceTest]) -> tupl
     shapes = {name for name in names if name != "delay" and not name.startswith("mean")}
     source = comparison.pairs[0].hardware.source or "RUN/hw"
     late = next((test for test in failed if test.quantity == "delay"), None)
+    foreign = _foreign_simulation(comparison)
     if any(name.startswith("spread") or "less the delay" in name for name in shapes):
         steps.append(
             f"Identify the plant from what the hardware did (python -m pendulum_bags identify {source} "
             "--out plant.yaml), then "
-            "simulate and design with --plant plant.yaml."
+            + (f"carry its values over to {foreign}." if foreign else "simulate and design with --plant plant.yaml.")
+        )
+    elif late is not None and foreign:
+        # No plant file of ours reaches into it.
+        steps.append(
+            f"Give {foreign} the delay that is missing, {late.interval.estimate:.3g} {late.unit}; measure again."
         )
     elif late is not None:
         steps.append(
@@ -121,6 +127,13 @@ def _remedies(comparison: Comparison, failed: Sequence[EquivalenceTest]) -> tupl
     if any(name.startswith("mean") for name in names):
         steps.append("Look for an offset: angle_offset or torque_offset in the plant file, or dry friction.")
     return tuple(steps)
+
+
+def _foreign_simulation(comparison: Comparison) -> str:
+    """Return the name of the simulation where it is not ours, else nothing."""
+    told = comparison.pairs[0].simulation.metadata.get("pendulum.run")
+    simulation = told.get("simulation") if isinstance(told, Mapping) else None
+    return str(simulation.get("name", "")) if isinstance(simulation, Mapping) else ""
 
 
 def _what_it_takes(comparison: Comparison, more: str) -> str:
