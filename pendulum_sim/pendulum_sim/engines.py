@@ -15,7 +15,8 @@ from pendulum_msgs_py.plants.sealed_plant import load_plant_to_run
 from pendulum_sim.guarded_plant import GuardedPlant
 from pendulum_sim.gymnasium_plant import load_adapter, load_gymnasium_plant
 from pendulum_sim.integrators import METHODS
-from pendulum_sim.mujoco_plant import MujocoMapping, load_mujoco_mapping, load_mujoco_plant
+from pendulum_sim.mujoco_mapping import MujocoMapping, load_mujoco_mapping
+from pendulum_sim.mujoco_plant import load_mujoco_plant
 from pendulum_sim.plant import Plant
 from pendulum_sim.plants import make_plant
 

@@ -30,7 +30,7 @@ from pendulum_msgs_py.contract.angles import wrap
 from pendulum_msgs_py.errors import FaultError, ParameterError
 from pendulum_msgs_py.parameters import load_yaml, reject_unknown, require_mapping
 from pendulum_msgs_py.plants.plant_parameters import PlantParameters, load_plant
-from pendulum_sim.mujoco_plant import FORMAT
+from pendulum_sim.mujoco_mapping import FORMAT
 from pendulum_sim.plant import PlantState, check_start
 
 __all__ = ["KNOWN", "GymnasiumPlant", "load_adapter", "load_gymnasium_plant"]

@@ -11,7 +11,8 @@ import pytest
 from pendulum_msgs_py.errors import FaultError, ParameterError
 from pendulum_msgs_py.plants.plant_parameters import PlantParameters, load_plant
 from pendulum_sim.model_files import mjcf, urdf
-from pendulum_sim.mujoco_plant import MujocoMapping, MujocoPlant, load_mujoco_mapping, load_mujoco_plant
+from pendulum_sim.mujoco_mapping import MujocoMapping, load_mujoco_mapping
+from pendulum_sim.mujoco_plant import MujocoPlant, load_mujoco_plant
 from pendulum_sim.plant import RigidPlant
 from pendulum_sim.plants import make_plant
 
