@@ -1,6 +1,6 @@
 """The mapping file of a MuJoCo model: what the model file does not say in our terms.
 
-Every entry may be left out::
+Every entry but the format may be left out::
 
     format: pendulum_simulation/1
     joint: hinge                            # the only hinge, or pendulum_joint, by default
