@@ -110,8 +110,8 @@ def test_a_voltage_input_normalises_the_inertia():
     ("kind", "seconds", "window"),
     [
         ("voltage", 6.0, 2.0),
-        ("voltage", 60.0, 5.0),
-        ("voltage", 375.0, 10.0),
+        ("voltage", 48.0, 4.0),
+        ("voltage", 375.0, 5.0),
         ("effort", 375.0, 1.0),
         ("none", 10.0, 1.0),
         ("position_goal", 10.0, None),
