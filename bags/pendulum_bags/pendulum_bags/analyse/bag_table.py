@@ -24,6 +24,7 @@ import numpy as np
 
 from pendulum_bags.analyse.questions import QUESTIONS
 from pendulum_bags.runs.run_folder import is_repeat, write_json
+from pendulum_bags.runs.run_record import run_record
 from pendulum_bags.studies.chunks import Connect, carry_out
 from pendulum_msgs_py.contract import names
 from pendulum_msgs_py.errors import BagError, ParameterError, PendulumError
@@ -253,9 +254,7 @@ def _plants(bag: Bag) -> list[str]:
 
 def _told(bag: Bag) -> Row:
     """Return what the bag says of its run, as far as a table has room for it."""
-    run = bag.metadata.get("pendulum.run")
-    if not isinstance(run, Mapping):
-        return {}
+    run = run_record(bag.metadata)
     controller = run.get("controller")
     kind = controller.get("kind") if isinstance(controller, Mapping) else controller
     found = {"experiment": run.get("experiment"), "seed": run.get("seed"), "controller": kind}

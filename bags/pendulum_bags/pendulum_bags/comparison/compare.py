@@ -17,6 +17,7 @@ from pendulum_bags.comparison.pairs import Difference, Pair, distribution_tests,
 from pendulum_bags.comparison.same_run import Looks, paired_tests, unpaired_tests
 from pendulum_bags.runs.run_data import RunData, is_emulated, noise_hold_time, plant_summary, read_run
 from pendulum_bags.runs.run_folder import pair_folders, read_looks
+from pendulum_bags.runs.run_record import run_record
 from pendulum_msgs_py.errors import BagError, DataError
 
 __all__ = ["Comparison", "compare", "compare_folders", "compare_runs"]
@@ -113,8 +114,7 @@ class Comparison:
 
     def to_json(self) -> dict[str, Any]:
         """Return everything that a program may want to read; numbers that do not exist are None."""
-        run = self.pairs[0].hardware.metadata.get("pendulum.run", {})
-        told = run if isinstance(run, Mapping) else {}
+        told = run_record(self.pairs[0].hardware.metadata)
         content = {
             "seed": told.get("seed"),
             "strategy": told.get("strategy"),

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from pendulum_bags.runs.run_data import RunData
+from pendulum_bags.runs.run_record import run_record
 from pendulum_msgs_py.errors import DataError, ParameterError
 from pendulum_msgs_py.plants.plant_differences import describe_plants
 from pendulum_msgs_py.plants.plant_parameters import load_plant
@@ -49,13 +50,8 @@ def check_pairs(pairs: Sequence[tuple[RunData, RunData]]) -> None:
     _check_seeds([pair[1] for pair in pairs])
 
 
-def _told(run: RunData) -> Mapping[str, Any]:
-    told = run.metadata.get("pendulum.run")
-    return told if isinstance(told, Mapping) else {}
-
-
 def _check_sides(simulation: RunData, hardware: RunData) -> None:
-    first, second = _told(simulation), _told(hardware)
+    first, second = run_record(simulation.metadata), run_record(hardware.metadata)
     if first.get("namespace") == "/hw" and second.get("namespace") == "/sim":
         raise DataError(
             f"{simulation.source} is a recording of hardware and {hardware.source} one of the simulation; "
@@ -83,7 +79,7 @@ def _check_two(one: RunData, other: RunData) -> None:
         raise DataError(
             f"{one.source} and {other.source} hold one and the same recording; expected independent runs to pool"
         )
-    first, second = _told(one), _told(other)
+    first, second = run_record(one.metadata), run_record(other.metadata)
     for key, words in _MUST_AGREE:
         if key in first and key in second and _value(key, first[key]) != _value(key, second[key]):
             _refuse(words, first[key], second[key], one, other)
@@ -106,7 +102,7 @@ def _refuse(words: str, first: Any, second: Any, one: RunData, other: RunData) -
 def _check_seeds(runs: Sequence[RunData]) -> None:
     seen: dict[str, RunData] = {}
     for run in runs:
-        told = _told(run)
+        told = run_record(run.metadata)
         seed = told.get("seed")
         if seed is None:
             continue

@@ -18,6 +18,7 @@ from pendulum_bags.experiments.lockstep import record_run
 from pendulum_bags.experiments.processes import ProcessSet, ros_environment, start_recorder
 from pendulum_bags.experiments.run_spec import RunSpec
 from pendulum_bags.runs.run_folder import write_json
+from pendulum_bags.runs.run_record import RUN_RECORD
 from pendulum_msgs_py.contract import names
 from pendulum_msgs_py.contract.angles import wrap
 from pendulum_msgs_py.contract.names import Event
@@ -182,7 +183,7 @@ def play_on_running_plant(
         armed = _is_armed(plant, may_arm=arm)
         metadata = logs / "metadata.json"
         run = {"experiment": "excitation", "namespace": namespace, "plant": node_name, "clock": "realtime"}
-        write_json(metadata, {"pendulum.run": run, "pendulum.excitation": dict(play.prediction)})
+        write_json(metadata, {RUN_RECORD: run, "pendulum.excitation": dict(play.prediction)})
         recorder = start_recorder(processes, bag, namespace, metadata, "mcap")
         zero = graph.controller(
             namespace, controller="playback", file=str(play.zero_file(logs).resolve()), period=play.period

@@ -20,6 +20,7 @@ from pendulum_bags.experiments.run_spec import RunSpec
 from pendulum_bags.experiments.settings import RegulationSettings
 from pendulum_bags.runs.run_data import END_EVENT, START_EVENT
 from pendulum_bags.runs.run_folder import REPEATS
+from pendulum_bags.runs.run_record import RUN_RECORD
 from pendulum_msgs_py.contract import names
 from pendulum_msgs_py.contract.cdr import encode_joint_state
 from pendulum_rosbag.storage import open_writer
@@ -89,7 +90,7 @@ def record_simulation(bag: Path, spec: RunSpec) -> Path:
 
 def _write(bag: Path, spec: RunSpec, run: RunArrays) -> None:
     metadata = spec.metadata()
-    metadata["pendulum.run"]["engine"] = "in_process"
+    metadata[RUN_RECORD]["engine"] = "in_process"
     topics = {
         name: f"{spec.namespace}/{name}"
         for name in (names.JOINT_STATES, names.EFFORT_COMMAND, names.DISTURBANCE, names.APPLIED_EFFORT)

@@ -10,6 +10,7 @@ from typing import Any
 
 from pendulum_bags.experiments.simulation import ForeignSimulation
 from pendulum_bags.runs.run_folder import git_revision, versions
+from pendulum_bags.runs.run_record import RUN_RECORD
 from pendulum_lqr.controller import controller_parameters
 from pendulum_lqr.disturbance import DISTURBANCE_SPECS
 from pendulum_msgs_py.contract.angles import UPRIGHT
@@ -203,7 +204,7 @@ class RunSpec:
         # Told by what it is, not by the path that it was started from.
         del values["simulation"], values["mapping"]
         return {
-            "pendulum.run": {
+            RUN_RECORD: {
                 **values,
                 "experiment": self.clock,
                 "plant": self.plant if self.side == "sim" else "emulator",

@@ -11,6 +11,7 @@ from pendulum_bags.experiments.operator import RealMachine, real_machine
 from pendulum_bags.experiments.run_spec import EMULATOR_LIFETIME, EMULATOR_WATCHDOG, THESIS_METHOD, integrator_of
 from pendulum_bags.experiments.simulation import ForeignSimulation
 from pendulum_bags.runs.run_folder import git_revision, versions
+from pendulum_bags.runs.run_record import RUN_RECORD
 from pendulum_lqr.controller import controller_parameters
 from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.programs import graph
@@ -187,7 +188,7 @@ class RegulationSettings:
     def metadata(self, experiment: str, **more: Any) -> dict[str, Any]:
         """Return what a bag says about its run."""
         return {
-            "pendulum.run": {
+            RUN_RECORD: {
                 "experiment": experiment,
                 "strategy": self.strategy,
                 "seed": self.noise.seed,

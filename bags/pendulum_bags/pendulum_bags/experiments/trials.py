@@ -17,6 +17,7 @@ from pendulum_bags.experiments.run_spec import EMULATOR_LIFETIME, EMULATOR_WATCH
 from pendulum_bags.experiments.settings import HARDWARE
 from pendulum_bags.experiments.thesis import LOOP_NICENESS, START_TIMEOUT
 from pendulum_bags.runs.run_folder import git_revision, versions, write_json
+from pendulum_bags.runs.run_record import RUN_RECORD
 from pendulum_msgs_py.contract import names
 from pendulum_msgs_py.contract.names import Event
 from pendulum_msgs_py.contract.trajectory import RAMP_INCREMENT, RAMP_PERIOD
@@ -269,7 +270,7 @@ def _topics(settings: TrialSettings) -> dict[str, int]:
 def _metadata(settings: TrialSettings, trial: int) -> dict[str, object]:
     kind = settings.kind
     return {
-        "pendulum.run": {
+        RUN_RECORD: {
             "experiment": kind.name,
             "trial": trial,
             "trials": settings.trials,

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 from threadpoolctl import threadpool_limits
 
@@ -20,6 +20,7 @@ from pendulum_bags.frequency_response.page import write_page
 from pendulum_bags.frequency_response.record import record_of_run
 from pendulum_bags.frequency_response.result import Analysis
 from pendulum_bags.runs.run_folder import write_json
+from pendulum_bags.runs.run_record import run_record
 from pendulum_bags.verdict import LayerResult, write_layer
 from pendulum_lqr.certificate import Certifier
 from pendulum_lqr.gap_metric import DEFAULT_SCALING, Scaling
@@ -66,8 +67,7 @@ def read_responses(paths: Sequence[Path]) -> tuple[list[MeasuredResponse], str]:
     found = []
     plant = "thesis"
     for i, run in enumerate(runs):
-        told = run.metadata.get("pendulum.run")
-        facts: Mapping[str, Any] = told if isinstance(told, Mapping) else {}
+        facts = run_record(run.metadata)
         side = str(facts.get("side") or str(facts.get("namespace", "")).strip("/"))
         label = side if side in {"sim", "hw"} else ("hw" if len(runs) == 1 or i else "sim")
         plant = str(facts.get("design_plant") or plant)

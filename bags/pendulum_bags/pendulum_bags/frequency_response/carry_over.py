@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 
 from pendulum_bags.comparison import Comparison
 from pendulum_bags.frequency_response.analyse import analyse_machine, find_machine
 from pendulum_bags.frequency_response.result import Analysis
+from pendulum_bags.runs.run_record import run_record
 from pendulum_bags.verdict import Layer, LayerResult
 from pendulum_msgs_py.errors import DataError
 
@@ -41,8 +42,7 @@ def carry_over(
                 "--layers with the folder of python -m pendulum_bags experiment frequency_response"
             )
         return None
-    told_run = comparison.pairs[0].simulation.metadata.get("pendulum.run")
-    facts: Mapping[str, object] = told_run if isinstance(told_run, Mapping) else {}
+    facts = run_record(comparison.pairs[0].simulation.metadata)
     return analyse_machine(place, str(facts.get("plant") or "thesis"), designs)
 
 

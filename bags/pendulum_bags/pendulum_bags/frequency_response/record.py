@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
 
 from pendulum_bags.experiments.in_process import RunArrays
+from pendulum_bags.runs.run_record import run_record
 from pendulum_bags.runs.series import Signal, unwrap_near_upright
 from pendulum_msgs_py.contract.values import NANOSECONDS
 from pendulum_msgs_py.errors import DataError
@@ -108,8 +109,7 @@ def record_of_run(run: RunData) -> Record:
     else:
         inside = np.minimum(raster, t[-1])
         outputs = np.stack([CubicSpline(t, run.window.position)(inside), CubicSpline(t, run.window.velocity)(inside)])
-    told = run.metadata.get("pendulum.run")
-    disturbance = told.get("disturbance") if isinstance(told, Mapping) else None
+    disturbance = run_record(run.metadata).get("disturbance")
     return Record(
         run.label,
         period,

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from pendulum_bags.comparison.metrics import episode_of, metrics_of
 from pendulum_bags.ranking.ranking import Contender, contenders_of
 from pendulum_bags.runs.run_data import is_emulated, read_run
+from pendulum_bags.runs.run_record import run_record
 from pendulum_msgs_py.errors import DataError, PendulumError
 
 __all__ = ["WEIGHTS", "collect_contenders", "cost_parts"]
@@ -90,8 +91,8 @@ def _bag(bag: Path, weights: Sequence[float]) -> Iterator[tuple[str, str, int, A
     except PendulumError:
         # A folder may hold recordings of other things.
         return
-    told = run.metadata.get("pendulum.run")
-    if not isinstance(told, Mapping) or not isinstance(told.get("controller"), Mapping):
+    told = run_record(run.metadata)
+    if not isinstance(told.get("controller"), Mapping):
         return
     side = str(told.get("side") or str(told.get("namespace", "")).strip("/"))
     if side not in {"sim", "hw"}:

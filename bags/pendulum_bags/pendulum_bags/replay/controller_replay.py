@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pendulum_bags.runs.run_data import find_prefix
+from pendulum_bags.runs.run_record import run_record
 from pendulum_lqr.controller import controller_parameters, make_controller
 from pendulum_msgs_py.contract import names
 from pendulum_msgs_py.contract.angles import from_upright
@@ -108,9 +109,9 @@ def recorded_controller(metadata: Mapping[str, Any]) -> tuple[str, dict[str, Any
     Raises:
         DataError: The bag does not tell.
     """
-    run = metadata.get("pendulum.run")
-    told = run.get("controller") if isinstance(run, Mapping) else None
-    if not isinstance(run, Mapping) or not isinstance(told, Mapping) or "kind" not in told:
+    run = run_record(metadata)
+    told = run.get("controller")
+    if not isinstance(told, Mapping) or "kind" not in told:
         raise DataError("the bag does not say which controller made it; expected pendulum.run.controller, or name one")
     name = str(told["kind"])
     known = {spec.name for spec in controller_parameters(name)}

@@ -10,6 +10,7 @@ from pendulum_bags.comparison import Comparison
 from pendulum_bags.frequency_response.result import Analysis
 from pendulum_bags.replay.result import InputReplay
 from pendulum_bags.report.trials import TrialSet
+from pendulum_bags.runs.run_record import run_record
 from pendulum_bags.verdict import Answer
 from pendulum_bags.verdict.answer import answer_of
 from pendulum_msgs_py.errors import ParameterError
@@ -50,8 +51,7 @@ class ReportData:
     @property
     def run(self) -> Mapping[str, Any]:
         """Return what the simulation's bag says about its run."""
-        told = self.comparison.pairs[0].simulation.metadata.get("pendulum.run")
-        return told if isinstance(told, Mapping) else {}
+        return run_record(self.comparison.pairs[0].simulation.metadata)
 
     def _find_plant(self) -> PlantParameters | None:
         name = self.run.get("plant", "thesis")

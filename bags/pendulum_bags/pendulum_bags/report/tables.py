@@ -15,6 +15,7 @@ from pendulum_bags.figures.table import Table
 from pendulum_bags.report.data import ReportData
 from pendulum_bags.report.trial_figures import GRAVITY, INERTIA, UNITS
 from pendulum_bags.report.trials import TrialSet
+from pendulum_bags.runs.run_record import run_record
 from pendulum_bags.verdict import Layer, LayerResult, Mark
 from pendulum_bags.verdict.evidence import evidence_table
 from pendulum_lqr.design import output_lqr
@@ -266,8 +267,7 @@ def provenance_table(data: ReportData) -> Table:
     ]
     for pair in data.comparison.pairs:
         for one in (pair.simulation, pair.hardware):
-            plant = one.metadata.get("pendulum.run", {})
-            name = plant.get("plant", "unknown") if isinstance(plant, Mapping) else "unknown"
+            name = run_record(one.metadata).get("plant", "unknown")
             rows.append((f"bag of the {one.label}", f"{_short_path(one.source)} (plant {name})"))
             rows += [(f"damage of the {one.label}'s bag", text) for text in one.damage]
     for run_data in data.comparison.own:

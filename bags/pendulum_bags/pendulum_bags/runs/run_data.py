@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pendulum_bags.runs.correlation import effective_size
+from pendulum_bags.runs.run_record import run_record
 from pendulum_bags.runs.series import Series, Signal, unwrap_near_upright
 from pendulum_msgs_py.contract import names
 from pendulum_msgs_py.contract.names import Event
@@ -214,15 +215,14 @@ def plant_summary(run: RunData) -> dict[str, Any]:
 
 def is_emulated(run: RunData) -> bool:
     """Return whether the run says that an emulator stood in for the hardware."""
-    told = run.metadata.get("pendulum.run")
-    return isinstance(told, Mapping) and told.get("plant") == "emulator"
+    return run_record(run.metadata).get("plant") == "emulator"
 
 
 def noise_hold_time(run: RunData) -> float | None:
     """Return how long each noise sample was held [s]: what the run says, else what its disturbance shows."""
-    told = run.metadata.get("pendulum.run")
-    if isinstance(told, Mapping) and isinstance(told.get("disturbance"), Mapping):
-        value = told["disturbance"].get("hold_time")
+    told = run_record(run.metadata).get("disturbance")
+    if isinstance(told, Mapping):
+        value = told.get("hold_time")
         if isinstance(value, (int, float)) and value > 0.0:
             return float(value)
     if run.disturbance is None or run.disturbance.t.size < 4:

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 from pendulum_bags.comparison import read_run
 from pendulum_bags.comparison.metrics import episode_of, metrics_of
 from pendulum_bags.runs.run_data import plant_summary
+from pendulum_bags.runs.run_record import run_record
 from pendulum_msgs_py.contract import names
 from pendulum_msgs_py.contract.angles import UPRIGHT
 from pendulum_msgs_py.errors import DataError
@@ -21,8 +21,7 @@ def answer(path: Path, plant: str) -> dict[str, Any]:
     """Return spread, damage and metrics of a plant in a bag, by name."""
     with read_bag(path) as bag:
         states = bag.array(f"{plant}/{names.JOINT_STATES}")
-        told = bag.metadata.get("pendulum.run")
-    set_point = told.get("set_point", 0.0) if isinstance(told, Mapping) else 0.0
+        set_point = run_record(bag.metadata).get("set_point", 0.0)
     try:
         run = read_run(path, prefix=plant)
     except DataError:

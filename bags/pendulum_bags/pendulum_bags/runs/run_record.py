@@ -1,0 +1,21 @@
+"""What a bag says of the run that it holds: who controlled what plant, under which disturbance and seed."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+__all__ = ["RUN_RECORD", "run_record"]
+
+RUN_RECORD = "pendulum.run"
+"""Name of the record among a bag's metadata; ``RunSpec`` and the settings of experiments write it."""
+
+
+def run_record(metadata: Mapping[str, Any]) -> Mapping[str, Any]:
+    """Return the record of the run, empty where a bag has none, or something else under that name.
+
+    Args:
+        metadata: Metadata of the bag, by name.
+    """
+    found = metadata.get(RUN_RECORD)
+    return found if isinstance(found, Mapping) else {}
