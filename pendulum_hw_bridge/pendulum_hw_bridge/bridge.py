@@ -137,8 +137,7 @@ class Bridge:
         if refusal or not self._driving:
             self.release()
             return refusal or f"released again: {self.last_fault}"
-        self._turn_ns = self.port.now_ns()
-        self._prepared_until_ns = self._turn_ns + _PREPARED_NS
+        self._prepared_until_ns = self.port.now_ns() + _PREPARED_NS
         return ""
 
     def release(self) -> None:
@@ -277,14 +276,14 @@ class Bridge:
         """Take note that the bridge runs; while it drives, a pause as long as the watchdog's is a fault."""
         last, self._turn_ns = self._turn_ns, self.port.now_ns()
         pause = 0.0 if last is None else (self._turn_ns - last) / NANOSECONDS
-        if pause <= self.monitor.timeout:
-            return True
-        self.fail(
-            "host_stalled",
-            f"bridge did not run for {pause * 1e3:.0f} ms; expected at most {self.monitor.timeout * 1e3:.0f} ms: "
-            "is the machine too busy?",
-        )
-        return False
+        stalled = pause > self.monitor.timeout
+        if stalled:
+            self.fail(
+                "host_stalled",
+                f"bridge did not run for {pause * 1e3:.0f} ms; expected at most {self.monitor.timeout * 1e3:.0f} ms: "
+                "is the machine too busy?",
+            )
+        return not stalled
 
     def _rest(self, drive: Drive, was_armed: bool) -> Outcome:
         fault = ""

@@ -1,7 +1,4 @@
-"""Which rules are broken, and which tests have to notice: the safety rules of both plants, without DDS.
-
-Not here yet: the bridge's cycle.
-"""
+"""Which rules are broken, and which tests have to notice: the safety rules of both plants, without DDS."""
 
 from __future__ import annotations
 
@@ -86,6 +83,7 @@ TARGETS: tuple[Target, ...] = (
         (f"{_BRIDGE}/test_hebi_backend.py", f"{_BRIDGE}/test_hebi_rules.py"),
         choose="not test_a_bridge_drives_a_module",
     ),
+    Target("pendulum_hw_bridge.bridge", ("Bridge",), (f"{_BRIDGE}/test_bridge_cycle.py",)),
     Target("pendulum_hw_bridge.derating", ("Derating",), (f"{_BRIDGE}/test_derating.py",)),
     Target("pendulum_hw_bridge.e_stop_input", ("EStopInput",), (f"{_BRIDGE}/test_e_stop_input.py",)),
 )
