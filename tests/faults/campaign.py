@@ -140,8 +140,12 @@ def _kill_recorder(system: LiveSystem, generator: random.Random) -> Outcome:
 
 def _malformed(topic: str) -> Callable[[LiveSystem, random.Random], Outcome]:
     def act(system: LiveSystem, generator: random.Random) -> Outcome:
+        before = sum(system.refused(topic).values())
         system.attack(topic, itertools.islice(_strange_messages(generator), 300), rate=1000.0)
+        system.listen(0.6)
         outcome = Outcome()
+        counted = sum(system.refused(topic).values()) - before
+        outcome.demand(counted > 0, f"none of 300 strange messages on {topic} was counted as refused")
         _demand_rate(outcome, system)
         return outcome
 
@@ -150,10 +154,13 @@ def _malformed(topic: str) -> Callable[[LiveSystem, random.Random], Outcome]:
 
 def _flood(topic: str) -> Callable[[LiveSystem, random.Random], Outcome]:
     def act(system: LiveSystem, _: random.Random) -> Outcome:
-        before = system.memory("simulator")
+        before, strangers = system.memory("simulator"), system.refused(topic).get("second_commander", 0)
         started = time.monotonic()
         sent = system.attack(topic, itertools.islice(system.flood(100.0), 20_000))
         outcome = Outcome(detail=f"{sent / (time.monotonic() - started) / 1000:.1f} kHz")
+        system.listen(0.6)
+        counted = system.refused(topic).get("second_commander", 0) - strangers
+        outcome.demand(counted > 0, "no command of the stranger was counted as that of a second commander")
         grown = system.memory("simulator") - before
         outcome.demand(grown < 10.0, f"the plant grew by {grown:.1f} MB; expected less than 10 MB")
         _demand_rate(outcome, system)

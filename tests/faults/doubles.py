@@ -77,9 +77,17 @@ def _twin_controller(system: LiveSystem, _: random.Random) -> Outcome:
 def _second_controller(system: LiveSystem, _: random.Random) -> Outcome:
     program = system.program("controller", q=[1.0, 0.01])
     second = system.processes.start_node(type(program)(**{**vars(program), "name": "usurper"}))
-    system.listen(4.0)
+    refused = system.refused().get("second_commander", 0)
+    # Seen by the plant's own words, which come twice a second: that it was heard, and refused.
+    system.wait_for(
+        "the plant to refuse the second controller",
+        lambda: system.refused().get("second_commander", 0) > refused + 100,
+        START_TIMEOUT,
+    )
     outcome = Outcome()
     outcome.demand(system.torque_flows(), "the first controller lost the plant to the second")
+    commander = system.commander()
+    outcome.demand(commander == f"{NAMESPACE}/controller", f"{commander} commands; expected the first controller")
     system.processes.finish(second)
     return outcome
 

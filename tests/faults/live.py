@@ -275,8 +275,12 @@ class LiveSystem:
             self.diagnostics[status.name] = {pair.key: pair.value for pair in status.values}
             self.diagnosed[status.name] = time.monotonic()
 
-    def refused(self) -> dict[str, int]:
-        """Return how many commands the plant has refused so far, by reason, as its newest diagnostics say."""
+    def commander(self) -> str:
+        """Return who commands the plant, as its newest diagnostics say."""
+        return self.diagnostics.get(f"{NAMESPACE}/simulator: plant", {}).get("commander", "")
+
+    def refused(self, topic: str = names.EFFORT_COMMAND) -> dict[str, int]:
+        """Return how many messages on an input the plant has refused so far, by reason, as its diagnostics say."""
         values = self.diagnostics.get(f"{NAMESPACE}/simulator: plant", {})
-        prefix = f"{names.EFFORT_COMMAND}.refused."
+        prefix = f"{topic}.refused."
         return {key[len(prefix) :]: int(value) for key, value in values.items() if key.startswith(prefix)}
