@@ -283,3 +283,50 @@ def test_under_the_torque_loop_a_duty_is_stuck_when_more_than_noise_asks_it_to_m
         assert faults(duty, *large) == ["", "", "", "output_disagreement"]
     for duty in (0.5, 0.5 - 5e-4, -0.25, -0.25 + 5e-4, 0.51, -0.26):
         assert faults(duty, *large) == [""] * 4
+
+
+# --- opposed ---------------------------------------------------------------------------------------------------
+
+
+class Opposed(Checked):
+    """A torque loop of which the duty stands still."""
+
+    def __init__(self) -> None:
+        super().__init__(replace(GAINS, effort=PidGains(kp=0.25)))
+
+    def at(self, time_ms: float, pwm: float, asked: float) -> str:
+        """Show a record with such a duty, of which the torque loop asks for another."""
+        return self.see(pwm, Command(effort=0.0), Command(), effort=-4.0 * asked, stamp_ns=round(1e6 * time_ms))
+
+
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+def test_a_duty_that_stands_still_against_what_is_asked_for_is_stuck_after_8_ms(sign: float) -> None:
+    checked = Opposed()
+    # It stands still from the fourth record on.
+    for time_ms in (0, 1, 2, 3, 10.999999):
+        assert checked.at(time_ms, sign * 0.1, sign * -0.0175) == ""
+    assert checked.at(11, sign * 0.1, sign * -0.0175) == "output_disagreement"
+    # A record in between that asks for nothing begins anew.
+    assert checked.at(12, sign * 0.1, 0.0) == ""
+    for time_ms in (13, 20.999999):
+        assert checked.at(time_ms, sign * 0.1, sign * -0.0175) == ""
+    assert checked.at(21, sign * 0.1, sign * -0.0175) == "output_disagreement"
+    # So does another strategy.
+    checked.check.reset()
+    for time_ms in (22, 23, 24, 25, 32.999999):
+        assert checked.at(time_ms, sign * 0.1, sign * -0.0175) == ""
+    assert checked.at(33, sign * 0.1, sign * -0.0175) == "output_disagreement"
+
+
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+@pytest.mark.parametrize(("pwm", "asked"), [(0.1, 0.1), (0.1, -0.0149), (0.0149, -0.1), (0.015, -0.1), (0.1, 0.0)])
+def test_a_duty_with_what_is_asked_for_or_one_too_small_to_tell_is_not_stuck(
+    sign: float, pwm: float, asked: float
+) -> None:
+    checked = Opposed()
+    assert not any(checked.at(5 * number, sign * pwm, sign * asked) for number in range(9))
+
+
+def test_a_torque_loop_that_was_just_switched_off_is_still_one() -> None:
+    checked = Opposed()
+    assert not any(checked.at(number, 0.1, 0.019 * (number % 2)) for number in range(9))

@@ -531,6 +531,13 @@ def test_without_constants_limit_or_duty_the_winding_current_is_not_judged(
     assert not any(watched.see(pwm_command=duty, winding_current=50.0) for _ in range(5))
 
 
+def test_wrong_currents_count_from_none_on_whatever_the_clock() -> None:
+    watched = Watched(DRIVETRAIN, winding_current=0.25)
+    watched.now_ns = 0
+    faults = [watched.see(pwm_command=0.5, winding_current=9.0, voltage=32.0) for _ in range(3)]
+    assert faults == ["", "", "winding_current"]
+
+
 def test_a_warm_winding_takes_less_current() -> None:
     drivetrain = replace(DRIVETRAIN, resistance_temperature_coefficient=0.0625)
     watched = Watched(drivetrain, winding_current=0.25)
