@@ -32,6 +32,12 @@ def report(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="module")
+def printable(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = write_run_folder(tmp_path_factory.mktemp("paper") / "run", seed=1)
+    return write_report(folder, recordings=[], formats=["png"])
+
+
+@pytest.fixture(scope="module")
 def browser() -> Iterator[Any]:
     playwright = pytest.importorskip("playwright.sync_api")
     with playwright.sync_playwright() as running:
@@ -88,13 +94,11 @@ def test_page_is_whole_and_usable(page: Any) -> None:
 
 
 @pytest.mark.parametrize("scripts", [True, False], ids=["with scripts", "without scripts"])
-def test_paper_shows_every_figure_as_a_picture(browser: Any, tmp_path: Path, scripts: bool) -> None:
-    folder = write_run_folder(tmp_path / "run", seed=1)
-    printed = write_report(folder, recordings=[], formats=["png"])
-    assert printed.stat().st_size < 5_000_000
+def test_paper_shows_every_figure_as_a_picture(browser: Any, printable: Path, scripts: bool) -> None:
+    assert printable.stat().st_size < 5_000_000
     context = browser.new_context(offline=True, java_script_enabled=scripts)
     page = context.new_page()
-    page.goto(printed.resolve().as_uri())
+    page.goto(printable.resolve().as_uri())
     # At once, as a browser that prints from the command line does: before any plot is drawn.
     page.emulate_media(media="print")
     figures = page.locator("figure:has(.graphs)")

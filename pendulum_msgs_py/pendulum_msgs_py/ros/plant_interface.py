@@ -123,7 +123,9 @@ class PlantInterface:
                 self._inputs[kind] = node.create_subscription(
                     JointState, kind.value, receive, qos.COMMAND_INPUT, raw=True
                 )
-        node.create_subscription(JointTrajectory, names.JOINT_TRAJECTORY, self._on_trajectory, qos.TRAJECTORY, raw=True)
+        self._trajectories = node.create_subscription(
+            JointTrajectory, names.JOINT_TRAJECTORY, self._receive_trajectory, qos.TRAJECTORY, raw=True
+        )
         node.create_service(SetBool, names.ARM, self._on_arm)
         if e_stop:
             node.create_service(Trigger, names.E_STOP, self._on_e_stop)
@@ -232,6 +234,17 @@ class PlantInterface:
 
         return receive
 
+    def _receive_trajectory(self, data: bytes) -> None:
+        # The events executor of rclpy 7.1 ends with a SystemError where a callback asks for the time of arrival too.
+        # What waited while the plant armed was taken by then (`_on_arm`); this came later.
+        self._on_trajectory(data, {"received_timestamp": time.time_ns()})
+
+    def _take_waiting_trajectories(self) -> None:
+        handle = self._trajectories.handle
+        with handle:
+            while (taken := handle.take_message(JointTrajectory, True)) is not None:
+                self._on_trajectory(taken[0], taken[1])
+
     def _on_trajectory(self, data: bytes, info: Mapping[str, int]) -> None:
         try:
             if self.supervisor.mode.armed and 0 < self._armed_ns - info["received_timestamp"] < _WAITED_NS:
@@ -267,6 +280,7 @@ class PlantInterface:
             if not was_armed:
                 # Arming takes its time; what waited in the meantime was not meant for an armed plant.
                 self._armed_ns = time.time_ns()
+                self._take_waiting_trajectories()
             response.success, response.message = not refusal, refusal or self.supervisor.mode.value
         else:
             self.supervisor.disarm(self.clock())
