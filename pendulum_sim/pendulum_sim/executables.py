@@ -4,8 +4,8 @@ __all__ = ["EXECUTABLES"]
 
 EXECUTABLES: dict[str, str] = {
     "simulator": "pendulum_sim.simulator_node:main",
-    "mujoco": "pendulum_sim.simulator_node:main_mujoco",
-    "gymnasium": "pendulum_sim.simulator_node:main_gymnasium",
+    "mujoco": "pendulum_sim.mujoco_node:main",
+    "gymnasium": "pendulum_sim.gymnasium_node:main",
     "adopt": "pendulum_sim.adopt_node:main",
     "viewer": "pendulum_sim.viewer_node:main",
     "markers": "pendulum_sim.markers_node:main",

@@ -1,4 +1,4 @@
-"""``simulator``: the plant behind the contract; ``mujoco``: a MuJoCo model there; ``gymnasium``: an environment."""
+"""``simulator``: the plant behind the contract that simulator and hardware share."""
 
 from __future__ import annotations
 
@@ -30,13 +30,13 @@ from pendulum_msgs_py.ros.plant_interface import PlantInterface
 from pendulum_msgs_py.ros.plant_loop import LockstepLoop, RealtimeLoop
 from pendulum_msgs_py.ros.polled import PollingNode
 from pendulum_msgs_py.ros.runner import run_node
-from pendulum_sim.engines import GYMNASIUM, MUJOCO, OWN, Engine
+from pendulum_sim.engines import OWN, Engine
 from pendulum_sim.guarded_plant import PaceWatch, StallWatch
 from pendulum_sim.plant import PlantState
 from pendulum_sim.sensors import SENSOR_SPECS, Sensors
 from pendulum_sim.servo import PositionServo
 
-__all__ = ["SPECS", "SimulatorNode", "main", "main_gymnasium", "main_mujoco"]
+__all__ = ["SPECS", "SimulatorNode", "main", "run_engine"]
 
 _SENSOR_PREFIX = "sensor."
 _LEAST_PERIODS = 2.0
@@ -303,20 +303,11 @@ class SimulatorNode(PollingNode):
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the simulator."""
-    return _run(OWN, argv)
+    return run_engine(OWN, argv)
 
 
-def main_mujoco(argv: Sequence[str] | None = None) -> int:
-    """Run a MuJoCo model in the simulator's place."""
-    return _run(MUJOCO, argv)
-
-
-def main_gymnasium(argv: Sequence[str] | None = None) -> int:
-    """Run an environment of Gymnasium in the simulator's place."""
-    return _run(GYMNASIUM, argv)
-
-
-def _run(engine: Engine, argv: Sequence[str] | None) -> int:
+def run_engine(engine: Engine, argv: Sequence[str] | None = None) -> int:
+    """Run the node with an engine; return the exit code."""
     return run_node(
         lambda stop: SimulatorNode(stop, engine),
         argv,

@@ -35,6 +35,7 @@ class Peer(GraphPeer):
         self.sent: list[float] = []
         self.diagnostics: dict[str, str] = {}
         self.torque: float | None = None
+        self.program: RunningProgram | None = None
         self._commands = self.node.create_publisher(JointState, names.EFFORT_COMMAND, qos.COMMAND)
         self.moves = self.node.create_publisher(JointTrajectory, names.JOINT_TRAJECTORY, qos.TRAJECTORY)
         self.node.create_subscription(JointState, names.JOINT_STATES, self._on_state, qos.STATE)
@@ -53,7 +54,8 @@ class Peer(GraphPeer):
             self.diagnostics = {pair.key: pair.value for pair in status.values}
 
     def known(self) -> str:
-        return f"; diagnostics {self.diagnostics}, sent {self.sent[-3:]}"
+        said = "" if self.program is None else f"; it said:\n{self.program.output[-2000:]}"
+        return f"; diagnostics {self.diagnostics}, sent {self.sent[-3:]}{said}"
 
     def ask(self, service: str) -> Trigger.Response:
         return self.call(Trigger, f"simulator/{service}", Trigger.Request())
@@ -82,6 +84,7 @@ def adopter(processes: ProcessGroup, peer: Peer, robot: RunningProgram) -> Runni
     }  # fmt: skip
     arguments = [item for name, value in told.items() for item in ("-p", f"{name}:={value}")]
     program = processes.start("pendulum_sim", "adopt", "--ros-args", "-r", "__ns:=/sim", *arguments)
+    peer.program = program
     peer.until(lambda: peer.states and peer.sent and peer.diagnostics.get("mode"), "the adopted plant")
     return program
 

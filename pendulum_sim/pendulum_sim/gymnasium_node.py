@@ -1,0 +1,15 @@
+"""``gymnasium``: an environment of Gymnasium in the simulator's place, behind the same contract."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from pendulum_sim.engines import GYMNASIUM
+from pendulum_sim.simulator_node import run_engine
+
+__all__ = ["main"]
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run an environment of Gymnasium in the simulator's place."""
+    return run_engine(GYMNASIUM, argv)
