@@ -11,6 +11,7 @@ from dataclasses import replace
 from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
 from rclpy.qos import HistoryPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.serialization import deserialize_message
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64MultiArray
 
@@ -104,7 +105,8 @@ class AdoptNode(Node):
         )
         self._interface.hardware_id = f"adopted {values['states']}"
         self._commands = self.create_publisher(Float64MultiArray, values["commands"], 10)
-        self.create_subscription(JointState, values["states"], self._on_state, _HEARD)
+        # As bytes: a message that cannot be read must not end the node that holds the e-stop.
+        self.create_subscription(JointState, values["states"], self._on_state, _HEARD, raw=True)
         # Where states stop, nothing else would say so and take the torque away.
         self.create_timer(
             0.25 * values["state_timeout"], self._on_silence, clock=Clock(clock_type=ClockType.STEADY_TIME)
@@ -120,8 +122,13 @@ class AdoptNode(Node):
         if self._interface.sample is not None:
             self._interface.publish_applied(self._interface.sample.stamp_ns, 0.0)
 
-    def _on_state(self, message: JointState) -> None:
+    def _on_state(self, data: bytes) -> None:
         now_ns = self._clock_ns()
+        try:
+            message = deserialize_message(data, JointState)
+        except Exception as error:  # noqa: BLE001  # what the middleware raises has no common base
+            self._refuse(f"a state cannot be read: {error}")
+            return
         sample = self._sample(message, now_ns)
         if sample is None:
             return
