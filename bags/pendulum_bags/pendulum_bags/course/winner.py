@@ -15,7 +15,7 @@ from pendulum_msgs_py.errors import FaultError, ParameterError
 
 __all__ = ["check_winner", "spread_on_machine"]
 
-_FAULTED = "is in fault"
+_FAULTED = " fault: "
 DURATION = 5.0
 """Length of each run [s]."""
 
