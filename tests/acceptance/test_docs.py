@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import re
+import shlex
 import subprocess
 import sys
 import textwrap
@@ -17,6 +18,7 @@ import yaml
 
 from pendulum_msgs_py.contract import names
 from tests.fixtures import PROJECT
+from tests.processes import ProcessGroup
 
 PAGES = sorted(
     PROJECT / name
@@ -28,6 +30,11 @@ _LINK = re.compile(r"\]\(([^)#\s]+)[^)]*\)")
 _IN_ORDER = re.compile(r"^<!-- run in order -->\n```console\n(.*?)^```", re.MULTILINE | re.DOTALL)
 _ELSEWHERE = re.compile(r"<(?:script|img|link|iframe)\b[^>]*\b(?:src|href)=\"?(https?:|//)[^>]*>")
 _TARGET = re.compile(r'(?:href|src)="([^"]*)"')
+_TOGETHER = re.compile(
+    r"^<!-- start together -->\n```console\n(.*?)^```.*?^<!-- and then -->\n```console\n(.*?)^```",
+    re.MULTILINE | re.DOTALL,
+)
+TOGETHER = [page for page in PAGES if _TOGETHER.search(page.read_text(encoding="utf-8"))]
 CHAINS = [page for page in PAGES if _IN_ORDER.search(page.read_text(encoding="utf-8"))]
 
 
@@ -51,6 +58,28 @@ def test_commands_that_build_on_each_other_run(page: Path, domain_id: int, tmp_p
                 check=False,
             )  # fmt: skip
             assert done.returncode == 0, f"{line}\n{done.stdout}\n{done.stderr}"
+
+
+@pytest.mark.parametrize("page", TOGETHER, ids=lambda page: str(page.relative_to(PROJECT)))
+def test_programs_that_a_page_starts_together_leave_what_it_looks_at_then(
+    page: Path, processes: ProcessGroup, domain_id: int, tmp_path: Path
+) -> None:
+    """The last of them is a disturbance with a duration; the recorder is ended first."""
+    together, then = _TOGETHER.findall(page.read_text(encoding="utf-8"))[0]
+    recorders, others = [], []
+    for line in together.splitlines():
+        words = shlex.split(line.removeprefix("$ "))
+        program = processes.start(words[2], words[3], *words[4:], cwd=tmp_path)
+        program.wait_for_output(r"\[INFO\].*ready", 60)
+        (recorders if words[3] == "record" else others).append(program)
+    others[-1].wait_for_output("noise_end", 60)
+    for program in [*recorders, *others]:
+        program.interrupt()
+        assert program.wait(20) == 0, program.output
+    for line in then.splitlines():
+        words = shlex.split(line.removeprefix("$ "))
+        done = subprocess.run([sys.executable, *words[1:]], cwd=tmp_path, capture_output=True, text=True, check=False)
+        assert done.returncode == 0, f"{line}\n{done.stdout}\n{done.stderr}"
 
 
 def _dead_links(page: Path) -> list[str]:
@@ -136,7 +165,9 @@ def test_commands_that_are_not_run_here_say_so() -> None:
     silent = []
     for page, block, section in _blocks("console"):
         text = page.read_text(encoding="utf-8")
-        runs_here = text[: block.start()].endswith("<!-- run in order -->\n")
+        runs_here = text[: block.start()].endswith(
+            ("<!-- run in order -->\n", "<!-- start together -->\n", "<!-- and then -->\n")
+        )
         commands = [line for line in block.group(3).splitlines() if line.startswith("$ ")]
         needs_ros = all("ros2 " in line for line in commands)
         if not runs_here and not needs_ros and not _MARK.search(section):

@@ -18,7 +18,7 @@ PAGES = sorted(
     for path in PROJECT.rglob("*.md")
     if not {".venv", "build", "install", "node_modules", "runs"} & set(path.relative_to(PROJECT).parts)
 )
-NODES = {"simulator", "bridge", "controller", "disturbance", "effort_adapter", "record"}
+NODES = {"simulator", "gymnasium", "adopt", "bridge", "controller", "disturbance", "effort_adapter"}
 TESTED_ELSEWHERE = {
     "make experiment": "tests/acceptance/test_experiment.py",
     "make test": "this very run",

@@ -129,4 +129,5 @@ def test_no_sequence_of_events_loses_a_plant_that_has_not_answered(steps: list[t
         state = order.state(now)
         shown = set(state["rows"]) if state else set()
         assert owed <= shown
-    assert owed <= set(order.due([], now + ASK_AGAIN))
+    # A sum of floats may fall short by a rounding.
+    assert owed <= set(order.due([], now + ASK_AGAIN + 1e-9))
