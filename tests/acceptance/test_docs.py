@@ -18,7 +18,7 @@ import yaml
 
 from pendulum_msgs_py.contract import names
 from tests.fixtures import PROJECT
-from tests.processes import ProcessGroup
+from tests.processes import ProcessGroup, RunningProgram
 
 PAGES = sorted(
     PROJECT / name
@@ -66,7 +66,8 @@ def test_programs_that_a_page_starts_together_leave_what_it_looks_at_then(
 ) -> None:
     """The last of them is a disturbance with a duration; the recorder is ended first."""
     together, then = _TOGETHER.findall(page.read_text(encoding="utf-8"))[0]
-    recorders, others = [], []
+    recorders: list[RunningProgram] = []
+    others: list[RunningProgram] = []
     for line in together.splitlines():
         words = shlex.split(line.removeprefix("$ "))
         program = processes.start(words[2], words[3], *words[4:], cwd=tmp_path)
