@@ -18,7 +18,6 @@ from sensor_msgs.msg import BatteryState, JointState, Temperature
 from pendulum_hw_bridge import bridge_parameters
 from pendulum_hw_bridge.actuator import ActuatorError, Feedback
 from pendulum_hw_bridge.actuator_loop import ActuatorLoop
-from pendulum_hw_bridge.backends import BACKENDS
 from pendulum_hw_bridge.bridge import Bridge, Outcome
 from pendulum_hw_bridge.bridge_consistency import check_consistency
 from pendulum_hw_bridge.clocks import Clock, SteppedClock, WallClock
@@ -35,6 +34,7 @@ from pendulum_msgs_py.contract.supervisor import Drive, DriveKind, Input, Mode
 from pendulum_msgs_py.contract.timing import LoopStatistics
 from pendulum_msgs_py.contract.values import NANOSECONDS, JointCommand, JointSample
 from pendulum_msgs_py.errors import PendulumError
+from pendulum_msgs_py.plants.lab_file import EMULATED_BACKENDS
 from pendulum_msgs_py.plants.plant_differences import PLANT_PARAMETERS, describe_plants
 from pendulum_msgs_py.ros import qos
 from pendulum_msgs_py.ros.convert import stamp_to_message
@@ -108,7 +108,7 @@ class BridgeNode(LifecycleNode):
             (lambda: self._lockstep_loop.now_ns if self._lockstep_loop else LOCKSTEP_EPOCH_NS)
             if self._lockstep
             else self._port_clock.now_ns,
-            push=BACKENDS[values["backend"]].is_emulated,
+            push=values["backend"] in EMULATED_BACKENDS,
             e_stop=False,
             statistics=None if self._lockstep else self._statistics,
             more_diagnostics=self._diagnostics,

@@ -7,6 +7,7 @@ from typing import Any
 
 import pytest
 
+from pendulum_hw_bridge.backends import BACKENDS
 from pendulum_hw_bridge.bridge_consistency import check_consistency
 from pendulum_hw_bridge.bridge_parameters import (
     BRIDGE_SPECS,
@@ -17,6 +18,7 @@ from pendulum_hw_bridge.bridge_parameters import (
 from pendulum_msgs_py.contract.drive import PlantLimits
 from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.parameters import validate
+from pendulum_msgs_py.plants.lab_file import EMULATED_BACKENDS
 
 LIMITS: dict[str, float] = {
     "effort": 13.0,
@@ -36,6 +38,11 @@ def check(limits: dict[str, float] | None = None, **values: Any) -> None:
 @pytest.mark.parametrize("backend", ["emulator", "hebi"])
 def test_the_defaults_fit_together(backend: str) -> None:
     check(backend=backend)
+
+
+def test_no_backend_that_can_hurt_is_taken_for_an_emulator() -> None:
+    assert EMULATED_BACKENDS <= BACKENDS.keys()
+    assert not [name for name in EMULATED_BACKENDS if BACKENDS[name].is_machine]
 
 
 @pytest.mark.parametrize(

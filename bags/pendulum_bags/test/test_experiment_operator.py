@@ -56,6 +56,22 @@ def test_the_bridge_of_a_real_machine_gets_the_lab_file_and_nothing_that_contrad
         assert TrialSettings(kind, 1, "hebi", lab=str(lab)).plant_program(1).parameters["lab_file"] == str(lab)
 
 
+def test_a_backend_that_nobody_knows_is_a_real_machine_whatever_its_name(
+    lab: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    # A rig of somebody's own that moves, behind a backend of its own.
+    lab.write_text(LAB.replace("emulator_process", "emulator_rig"), encoding="utf-8")
+    settings = RegulationSettings(hardware="hebi", lab=str(lab))
+    machine = settings.machine
+    assert machine is not None
+    # A run on it is never started again by itself, its bag names a machine, and its watchdogs stay the strict ones.
+    assert not machine.emulated
+    assert settings.hardware_plant == "hebi"
+    assert "feedback_watchdog" not in settings.bridge_program().parameters
+    ask_yes(machine, "It moves.", make_console(), yes=True)
+    assert "This moves a REAL machine" in capsys.readouterr().out
+
+
 @pytest.mark.parametrize("name", ["thesis", "gravity", "inertia_damping"])
 def test_a_real_machine_needs_its_lab_file(name: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert experiment_cli.main([name, "--hardware", "hebi", "--out", str(tmp_path / "run")]) == 2

@@ -23,14 +23,12 @@ class Backend(NamedTuple):
             lockstep=...)`` makes one, not connected yet.
         parameters: Parameters of the bridge that it alone reads.
         is_machine: Whether something moves that can hurt: the bridge's own limits are then the strict ones.
-        is_emulated: Whether a pendulum is emulated, which can be pushed.
         in_process: Whether that is done in this process: it is what the parameters say, and knows simulated time.
     """
 
     target: str
     parameters: tuple[ParameterSpec, ...] = ()
     is_machine: bool = True
-    is_emulated: bool = False
     in_process: bool = False
 
     def make(self, values: Mapping[str, Any], clock: Clock, *, lockstep: bool = False) -> ActuatorPort:
@@ -57,13 +55,12 @@ def _fixed(name: str, default: str, description: str) -> tuple[ParameterSpec, ..
 
 BACKENDS: dict[str, Backend] = {
     "emulator": Backend(
-        "pendulum_hw_bridge.backends.emulator:EmulatorBackend", is_machine=False, is_emulated=True, in_process=True
+        "pendulum_hw_bridge.backends.emulator:EmulatorBackend", is_machine=False, in_process=True
     ),
     "emulator_process": Backend(
         "pendulum_hw_bridge.backends.emulator_process:EmulatorProcessBackend",
         _fixed("emulator_address", "127.0.0.1:17590", "`emulator_process`: where the emulated actuator listens."),
         is_machine=False,
-        is_emulated=True,
     ),
     "hebi": Backend(
         "pendulum_hw_bridge.backends.hebi:HebiBackend",
@@ -75,4 +72,4 @@ BACKENDS: dict[str, Backend] = {
         is_machine=False,
     ),
 }
-"""Backends by name."""
+"""Backends by name; which of them emulate a pendulum says ``EMULATED_BACKENDS``, since experiments ask that too."""

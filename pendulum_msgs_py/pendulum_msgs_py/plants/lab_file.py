@@ -29,9 +29,12 @@ from typing import Any
 from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.parameters import dump_yaml, load_yaml, reject_unknown, require_mapping
 
-__all__ = ["FORMAT", "LAB_ENTRIES", "LabEntry", "LabFile", "load_lab", "write_lab"]
+__all__ = ["EMULATED_BACKENDS", "FORMAT", "LAB_ENTRIES", "LabEntry", "LabFile", "load_lab", "write_lab"]
 
 FORMAT = "pendulum_lab/1"
+EMULATED_BACKENDS = frozenset({"emulator", "emulator_process"})
+"""Backends of the bridge behind which a pendulum is emulated: it may be pushed, and started again with nobody asked.
+Any other name is a machine, since what is taken for an emulator by mistake moves by itself."""
 _HEADER = """\
 # Lab file: read by bridge, check, scan, lab, launch files and `experiment --hardware hebi --lab FILE`.
 # The guided procedures of `python -m pendulum_hw_bridge lab` rewrite it; remarks of your own go under `notes`.

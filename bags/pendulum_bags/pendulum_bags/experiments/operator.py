@@ -15,7 +15,7 @@ from pathlib import Path
 from rich.console import Console
 
 from pendulum_msgs_py.errors import FaultError, ParameterError
-from pendulum_msgs_py.plants.lab_file import LabFile, load_lab
+from pendulum_msgs_py.plants.lab_file import EMULATED_BACKENDS, LabFile, load_lab
 from pendulum_msgs_py.programs.graph import NodeProgram, ParameterArgument
 from pendulum_msgs_py.programs.terminal import make_console
 
@@ -52,7 +52,7 @@ class RealMachine:
     @property
     def emulated(self) -> bool:
         """Whether the lab file names an emulator: a rehearsal."""
-        return str(self.lab.values["backend"]).startswith("emulator")
+        return self.lab.values["backend"] in EMULATED_BACKENDS
 
     @property
     def effort_limit(self) -> str:
