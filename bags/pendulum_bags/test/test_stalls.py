@@ -7,9 +7,17 @@ from pathlib import Path
 
 import pytest
 
+from pendulum_bags.comparison import compare_folders
 from pendulum_bags.experiments.conductor_node import PlantStoppedError
+from pendulum_bags.experiments.experiment_cli import _print_summary, _summary
+from pendulum_bags.experiments.settings import RegulationSettings
 from pendulum_bags.experiments.stalls import ATTEMPTS, is_stall, run_undisturbed
+from pendulum_bags.report import write_report
+from pendulum_bags.runs.run_folder import create_run_folder, discard_if_empty, read_stalls
+from pendulum_bags.verdict.answer import answer_of
 from pendulum_msgs_py.errors import FaultError
+from pendulum_msgs_py.programs.terminal import make_console
+from tests.synthetic_runs import write_run_folder
 
 STALL = PlantStoppedError("/hw", "fault", "host_stalled: bridge did not run for 610 ms; expected at most 500 ms")
 
@@ -18,7 +26,8 @@ def failing(folder: Path, errors: list[FaultError | None]) -> Callable[[], None]
     """Return a run that leaves bags and logs, and fails with each of these errors in turn."""
 
     def run() -> None:
-        for place in ("sim", "hw", "logs", "repeats/1/hw"):
+        for place in ("sim", "hw", "sim_500hz", "logs", "repeats/1/hw"):
+            # Each is made anew: what a run that broke off has left would be in the way.
             (folder / place).mkdir(parents=True)
         (folder / "logs" / "hw_bridge.log").write_text("host_stalled", encoding="utf-8")
         error = errors.pop(0)
@@ -32,7 +41,9 @@ def test_a_stalled_run_is_told_and_carried_out_again_in_a_clean_folder(tmp_path:
     said: list[str] = []
     run_undisturbed(failing(tmp_path, [STALL, None]), tmp_path, emulated=True, tell=said.append)
     assert said == [f"This machine stood still ({STALL}); measuring again, run 2 of at most 3."]
-    assert sorted(place.name for place in tmp_path.iterdir()) == ["hw", "logs", "logs_stalled_1", "repeats", "sim"]
+    left = ["hw", "logs", "logs_stalled_1", "repeats", "sim", "sim_500hz", "stalls.json"]
+    assert sorted(place.name for place in tmp_path.iterdir()) == left
+    assert read_stalls(tmp_path) == [{"reason": str(STALL), "logs": "logs_stalled_1"}]
 
 
 def test_a_machine_that_stalls_each_time_is_an_error_after_three_runs(tmp_path: Path) -> None:
@@ -42,6 +53,52 @@ def test_a_machine_that_stalls_each_time_is_an_error_after_three_runs(tmp_path: 
     ):
         run_undisturbed(failing(tmp_path, errors), tmp_path, emulated=True, tell=lambda _: None)
     assert len(errors) == 1
+    assert [stall["logs"] for stall in read_stalls(tmp_path)] == ["logs_stalled_1", "logs_stalled_2", "logs"]
+
+
+@pytest.mark.parametrize("error", [KeyboardInterrupt(), FaultError("hw_bridge ended with code 2")])
+def test_what_a_stalled_run_left_outlives_an_end_of_the_next_one_that_records_nothing(
+    tmp_path: Path, error: BaseException
+) -> None:
+    folder = create_run_folder(tmp_path / "run", "thesis")
+    first = failing(folder, [STALL])
+
+    def run() -> None:
+        if read_stalls(folder):
+            raise error
+        first()
+
+    with pytest.raises(type(error)):
+        run_undisturbed(run, folder, emulated=True, tell=lambda _: None)
+    assert not discard_if_empty(folder)
+    assert (folder / "logs_stalled_1" / "hw_bridge.log").read_text(encoding="utf-8") == "host_stalled"
+    assert discard_if_empty(create_run_folder(tmp_path / "other", "thesis"))
+
+
+def test_runs_that_broke_off_are_told_by_the_comparison_the_terminal_and_the_report(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    folder = tmp_path / "run"
+    reason = "motion_disagreement: velocity says 0.0199 rad, position 0.0093 rad in 0.2 s"
+    errors = [PlantStoppedError("/hw", "fault", reason), None]
+
+    def run() -> None:
+        error = errors.pop(0)
+        if error is not None:
+            raise error
+        write_run_folder(folder, ramps=False)
+
+    folder.mkdir()
+    run_undisturbed(run, folder, emulated=True, tell=lambda _: None)
+    comparison = compare_folders([folder])
+    summary = _summary(RegulationSettings(), comparison, answer_of(comparison))
+    assert summary["stalls"] == [{"run": "run", "reason": f"/hw went to fault: {reason}", "logs": ""}]
+    _print_summary(make_console(highlight=False), summary)
+    page = write_report(folder, summary, comparison=comparison, recordings=[], formats=[]).read_text(encoding="utf-8")
+    for told in (capsys.readouterr().out, page):
+        words = " ".join(told.split())
+        assert "1 run broke off before this one and does not count" in words
+        assert reason in words
 
 
 @pytest.mark.parametrize(

@@ -54,9 +54,7 @@ def _fixed(name: str, default: str, description: str) -> tuple[ParameterSpec, ..
 
 
 BACKENDS: dict[str, Backend] = {
-    "emulator": Backend(
-        "pendulum_hw_bridge.backends.emulator:EmulatorBackend", is_machine=False, in_process=True
-    ),
+    "emulator": Backend("pendulum_hw_bridge.backends.emulator:EmulatorBackend", is_machine=False, in_process=True),
     "emulator_process": Backend(
         "pendulum_hw_bridge.backends.emulator_process:EmulatorProcessBackend",
         _fixed("emulator_address", "127.0.0.1:17590", "`emulator_process`: where the emulated actuator listens."),

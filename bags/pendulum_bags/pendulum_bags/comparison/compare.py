@@ -16,7 +16,7 @@ from pendulum_bags.comparison.metrics import episode_of, summarise_metrics
 from pendulum_bags.comparison.pairs import Difference, Pair, distribution_tests, interpolated_difference
 from pendulum_bags.comparison.same_run import Looks, paired_tests, unpaired_tests
 from pendulum_bags.runs.run_data import RunData, is_emulated, noise_hold_time, plant_summary, read_run
-from pendulum_bags.runs.run_folder import pair_folders, read_looks
+from pendulum_bags.runs.run_folder import pair_folders, read_looks, read_stalls
 from pendulum_bags.runs.run_record import run_record
 from pendulum_msgs_py.errors import BagError, DataError
 
@@ -37,6 +37,7 @@ class Comparison:
         unpaired_verdict: Verdict on the unpaired comparison.
         looks: How often the data have been looked at.
         left_out: What was recorded and does not count, and why, in words.
+        stalls: Run folder, reason and logs of each run that a stalled machine broke off before the one that counts.
     """
 
     pairs: Sequence[Pair]
@@ -46,6 +47,7 @@ class Comparison:
     unpaired_verdict: Verdict
     looks: Looks = Looks()  # noqa: RUF009 - frozen
     left_out: Sequence[str] = ()
+    stalls: Sequence[Mapping[str, str]] = ()
 
     @property
     def is_emulated(self) -> bool:
@@ -124,6 +126,7 @@ class Comparison:
             "emulated": self.is_emulated,
             "looks": self.looks.number,
             "left_out": list(self.left_out),
+            "stalls": [dict(stall) for stall in self.stalls],
             "plants": self.plants,
             "paired": self.paired,
             "unpaired": self.unpaired,
@@ -227,8 +230,11 @@ def compare_folders(
         DataError: Runs are given that must not be pooled.
     """
     margins = Margins.parse(margin)
-    pairs, own, left_out = [], [], []
+    pairs, own, left_out, stalls = [], [], [], []
     for folder in map(Path, folders):
+        if broken := read_stalls(folder):
+            stalls += [{"run": folder.resolve().name, **stall} for stall in broken]
+            left_out.append(_in_words(broken))
         places = pair_folders(folder)
         for place in places:
             pair = _read_pair(place)
@@ -247,7 +253,17 @@ def compare_folders(
         if (folder / "sim_500hz").is_dir():
             own.append(read_run(folder / "sim_500hz", label="simulation, own noise"))
     looked = looks or Looks(max(read_looks(Path(folder)) for folder in folders) if folders else 0)
-    return replace(compare(pairs, own=own, margin=margins, looks=looked), left_out=tuple(left_out))
+    return replace(compare(pairs, own=own, margin=margins, looks=looked), left_out=tuple(left_out), stalls=stalls)
+
+
+def _in_words(stalls: Sequence[Mapping[str, str]]) -> str:
+    """Say that runs were broken off, and why: a fault of the bridge's own may look the same."""
+    told = "; ".join(stall["reason"] + (f" (logs: {stall['logs']})" if stall["logs"] else "") for stall in stalls)
+    if len(stalls) == 1:
+        return f"1 run broke off before this one and does not count, taken for a standstill of this machine: {told}."
+    return (
+        f"{len(stalls)} runs broke off before this one and do not count, taken for standstills of this machine: {told}."
+    )
 
 
 def _read_pair(folder: Path) -> tuple[RunData, RunData]:

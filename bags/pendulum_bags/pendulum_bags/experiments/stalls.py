@@ -1,4 +1,4 @@
-"""A run that a stalled machine broke off is no result: it is told, and measured again a few times.
+"""A run that a stalled machine broke off is no result: it is told, kept on record, and measured again a few times.
 
 An emulator is as punctual as the machine that it runs on. Where that stands still for longer than the bridge waits, the
 bridge faults, as it must: it cannot know that nobody can be hurt. A real machine is never started again by itself.
@@ -11,7 +11,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 from pendulum_bags.experiments.conductor_node import PlantStoppedError
-from pendulum_bags.runs.run_folder import REPEATS
+from pendulum_bags.runs.run_folder import REPEATS, write_stall
 from pendulum_msgs_py.errors import FaultError
 
 __all__ = ["ATTEMPTS", "is_stall", "run_undisturbed"]
@@ -46,7 +46,7 @@ def run_undisturbed(
 
     Args:
         run: Records into the folder.
-        folder: The run's folder; what a stalled run left there is removed, but for its logs.
+        folder: The run's folder; of a stalled run there remain its logs and its reason, which the result tells.
         emulated: Whether the hardware is emulated; a real machine moves when its operator wants it to.
         tell: Told what happened, one sentence.
         attempts: Times that it is carried out at most.
@@ -60,7 +60,10 @@ def run_undisturbed(
         except FaultError as error:
             if not emulated or not is_stall(error):
                 raise
-            if attempt == attempts:
+            last = attempt == attempts
+            # Before anything is removed: a fault of the bridge's own that looks like a stall must not be selected away.
+            write_stall(folder, str(error), "" if not (folder / _LOGS).is_dir() else _LOGS if last else _kept(attempt))
+            if last:
                 raise FaultError(
                     f"this machine stood still in each of {attempts} runs, the last time so that {error}; close what "
                     "else runs on it, and measure again"
@@ -77,5 +80,8 @@ def _clear(folder: Path, attempt: int) -> None:
         shutil.rmtree(folder / bag, ignore_errors=True)
     logs = folder / _LOGS
     if logs.is_dir():
-        kept = folder / f"{_LOGS}_stalled_{attempt}"
-        logs.rename(kept)
+        logs.rename(folder / _kept(attempt))
+
+
+def _kept(attempt: int) -> str:
+    return f"{_LOGS}_stalled_{attempt}"

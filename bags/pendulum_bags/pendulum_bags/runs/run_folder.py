@@ -22,14 +22,17 @@ __all__ = [
     "is_repeat",
     "pair_folders",
     "read_looks",
+    "read_stalls",
     "versions",
     "write_json",
     "write_looks",
+    "write_stall",
 ]
 
 REPEATS = "repeats"
 """Folder within a run folder for repeats of the run with new noise, each with the bags ``sim`` and ``hw``."""
 _LOOKS = "looks.json"
+_STALLS = "stalls.json"
 
 _PACKAGES = (
     "pendulum_msgs_py",
@@ -75,8 +78,11 @@ def create_run_folder(out: Path | None, experiment: str) -> Path:
 
 
 def discard_if_empty(folder: Path) -> bool:
-    """Remove a run's folder in which no bag has been begun; tell whether it was removed."""
-    if any(folder.glob("*/metadata.yaml")):
+    """Remove a run's folder in which no bag has been begun; tell whether it was removed.
+
+    A run that broke off has taken its bags with it: its reason and its logs are a record too.
+    """
+    if any(folder.glob("*/metadata.yaml")) or (folder / _STALLS).exists():
         return False
     shutil.rmtree(folder, ignore_errors=True)
     return True
@@ -105,6 +111,29 @@ def read_looks(folder: Path) -> int:
         return int(json.loads((folder / _LOOKS).read_text(encoding="utf-8"))["looks"])
     except (OSError, ValueError, KeyError, TypeError):
         return 0
+
+
+def write_stall(folder: Path, reason: str, logs: str) -> None:
+    """Add a run that a stalled machine broke off to what a run folder tells of itself.
+
+    Args:
+        folder: The run's folder.
+        reason: Why it broke off, in words.
+        logs: Folder of its logs within the run's folder; empty for none.
+    """
+    write_json(folder / _STALLS, {"stalls": [*read_stalls(folder), {"reason": reason, "logs": logs}]})
+
+
+def read_stalls(folder: Path) -> list[dict[str, str]]:
+    """Return reason and logs of each run that broke off before the one that a run folder holds, in order."""
+    try:
+        stalls = json.loads((folder / _STALLS).read_text(encoding="utf-8"))["stalls"]
+        return [{key: str(stall[key]) for key in ("reason", "logs")} for stall in stalls]
+    except FileNotFoundError:
+        return []
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        # A damaged record must not look like a run without any.
+        return [{"reason": f"{_STALLS} cannot be read ({type(error).__name__})", "logs": ""}]
 
 
 def versions() -> dict[str, str]:
