@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import struct
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -10,9 +11,10 @@ import numpy as np
 
 from pendulum_msgs_py.errors import BagError
 from pendulum_rosbag.reader.batches import Bytes, Int64
+from pendulum_rosbag.reader.mcap_chunks import Chunk
 from pendulum_rosbag.storage import mcap_records as rec
 
-__all__ = ["indexed_messages"]
+__all__ = ["indexed_counts", "indexed_messages"]
 
 _INDEX_HEAD = np.dtype(
     {
@@ -22,7 +24,25 @@ _INDEX_HEAD = np.dtype(
         "itemsize": 15,
     }
 )
+_HEAD = struct.Struct("<BQHI")
 _INDEX_ENTRY = np.dtype([("time", "<i8"), ("offset", "<i8")])
+
+
+def indexed_counts(chunks: Sequence[Chunk]) -> dict[int, int]:
+    """Return how many messages the message indexes of some chunks name: channel id -> number.
+
+    Only the heads of the indexes are read, so that it costs next to nothing to ask when a file is opened.
+
+    Raises:
+        struct.error: An index lies beyond the end of the file.
+    """
+    counts: dict[int, int] = {}
+    for chunk in chunks:
+        view = chunk.buffer.data
+        for channel, at in chunk.indexes.items():
+            *_, size = _HEAD.unpack_from(view, at)
+            counts[channel] = counts.get(channel, 0) + size // 16
+    return counts
 
 
 def indexed_messages(path: Path, channel: int, index: Bytes, places: Sequence[tuple[int, int]]) -> tuple[Int64, Int64]:
@@ -52,7 +72,11 @@ def indexed_messages(path: Path, channel: int, index: Bytes, places: Sequence[tu
     first = np.cumsum(counts) - counts
     rows_at = np.repeat(at + 15 - 16 * first, counts) + 16 * np.arange(int(counts.sum()))
     table = _take(path, index, _INDEX_ENTRY, rows_at)
-    return table["time"], table["offset"] + np.repeat(base, counts)
+    offsets = table["offset"] + np.repeat(base, counts)
+    # In nearly every file they ascend.
+    if not (offsets[1:] > offsets[:-1]).all() and len(np.unique(offsets)) != len(offsets):
+        raise BagError(f"{path}: a message index names a message twice; try to repair the bag")
+    return table["time"], offsets
 
 
 def _take(path: Path, buffer: Bytes, item: np.dtype[Any], at: Int64) -> Any:

@@ -18,7 +18,7 @@ from pendulum_rosbag.reader.checksums import Checksums
 from pendulum_rosbag.reader.decompression import decompress, decompress_torn
 from pendulum_rosbag.reader.mcap_chunks import Chunk, keep_staged, read_text, read_text_map, records_in
 from pendulum_rosbag.reader.mcap_extras import find_extras
-from pendulum_rosbag.reader.mcap_index import indexed_messages
+from pendulum_rosbag.reader.mcap_index import indexed_counts, indexed_messages
 from pendulum_rosbag.storage import mcap_records as rec
 from pendulum_rosbag.storage.mcap_extras import Attachment, Metadata
 
@@ -87,7 +87,7 @@ class McapSource:
             try:
                 self._leave_out_damaged()
             except (_DamagedError, BagError) as error:
-                self._scan(str(error))
+                self._scan(str(error).removeprefix(f"{path}: "))  # (whoever tells the damage names the file)
         self.compressed = any(chunk.compression for chunk in self.chunks)
         self.streams = [self._stream(channel) for channel in sorted(self._channels)]
 
@@ -160,6 +160,7 @@ class McapSource:
             self.stop_ns = max(chunk.stop_ns for chunk in self.chunks)
             if self.unclosed:
                 keep_staged(self.buffer, self.chunks)
+            self._compare_counts()
         elif sum(self._counts.values()):
             raise _NoIndexError  # messages outside of chunks
 
@@ -169,6 +170,19 @@ class McapSource:
         named.update(*(chunk.indexes for chunk in self.chunks))
         schemas = {schema for schema, *_ in self._channels.values()} - {0}
         return named <= self._channels.keys() and schemas <= self._schemas.keys()
+
+    def _compare_counts(self) -> None:
+        """Hold what the message indexes name, which no checksum covers, against the counts of the file.
+
+        Raises:
+            _DamagedError: They name more or fewer messages.
+        """
+        named = indexed_counts(self.chunks)
+        for channel in sorted(named.keys() | self._counts.keys()):
+            found, count = named.get(channel, 0), self._counts.get(channel, 0)
+            if found != count:
+                topic = self._channels[channel][1]
+                raise _DamagedError(f"the message indexes name {found} messages on {topic}; the summary says {count}")
 
     def _take_summary_record(self, opcode: int, content: bytes) -> bool:
         if opcode == rec.CHUNK_INDEX:

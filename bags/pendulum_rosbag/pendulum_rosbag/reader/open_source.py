@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import tempfile
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path, PurePath
 from typing import Any
@@ -39,7 +39,8 @@ class BagFolder:
     topic_hashes: dict[str, str] = field(default_factory=dict)
     message_compression: bool | None = None
     """Whether messages are compressed one by one; ``None`` where nothing says so."""
-    message_count: int | None = None
+    topic_counts: dict[str, int] = field(default_factory=dict)
+    """Messages by topic, as its metadata has it; empty where nothing says so."""
     damage: list[str] = field(default_factory=list)
 
 
@@ -135,7 +136,7 @@ def _take_metadata(folder: BagFolder, text: str) -> None:
         for item in info.get("topics_with_message_count", []):
             topic: Mapping[str, Any] = item["topic_metadata"]
             folder.topic_hashes[str(topic["name"])] = str(topic.get("type_description_hash", ""))
-        folder.message_count = int(info["message_count"])
+        folder.topic_counts = _counts_by_topic(info)
         folder.message_compression = _is_message_compression(info)
     except (
         yaml.YAMLError,
@@ -148,6 +149,34 @@ def _take_metadata(folder: BagFolder, text: str) -> None:
     ) as error:
         sentence = " ".join(str(error).split())
         folder.damage.append(f"{METADATA_NAME} is not what a bag has: {sentence or type(error).__name__}")
+
+
+def _counts_by_topic(info: Mapping[str, Any]) -> dict[str, int]:
+    counts: dict[str, int] = {}
+    for item in info.get("topics_with_message_count") or []:
+        name = str(item["topic_metadata"]["name"])
+        counts[name] = counts.get(name, 0) + int(item.get("message_count", 0))
+    return counts
+
+
+def _missing_messages(folder: BagFolder, sources: Sequence[Source]) -> list[str]:
+    """Return a sentence for each topic of which fewer messages are there than the metadata names.
+
+    More may be there: the metadata of a bag that is being recorded, or whose recorder died, is older than its files.
+    Where files are damaged or missing, it has been told already that messages are.
+    """
+    if folder.damage or any(source.damage for source in sources):
+        return []
+    found: dict[str, int] = {}
+    for source in sources:
+        for stream in source.streams:
+            found[stream.topic] = found.get(stream.topic, 0) + stream.count
+    return [
+        f"{METADATA_NAME if folder.path.is_dir() else 'its metadata'} names {count} messages on {topic}; "
+        f"{found.get(topic, 0)} are there"
+        for topic, count in folder.topic_counts.items()
+        if found.get(topic, 0) < count
+    ]
 
 
 def _is_message_compression(info: Mapping[str, Any]) -> bool:
@@ -191,6 +220,7 @@ def open_sources(folder: BagFolder, *, verify: bool | None = None) -> list[Sourc
         raise errors[0]
     if not folder.custom_data or folder.message_compression is None:
         _metadata_from_storage(folder, sources[-1])
+    folder.damage += _missing_messages(folder, sources)
     if folder.message_compression is None:
         folder.message_compression = holds_packed_messages(sources[0])
     return [UnpackedSource(source) for source in sources] if folder.message_compression else sources
@@ -242,5 +272,7 @@ def _metadata_from_storage(folder: BagFolder, source: Source) -> None:
         folder.custom_data = folder.custom_data or custom
         if folder.message_compression is None and "compression_mode" in info:
             folder.message_compression = _is_message_compression(info)
-    except (yaml.YAMLError, AttributeError, TypeError, ValueError, RecursionError, OverflowError):
+        if folder.path.is_file() and len(info.get("relative_file_paths") or []) == 1:
+            folder.topic_counts = _counts_by_topic(info)
+    except (yaml.YAMLError, AttributeError, KeyError, TypeError, ValueError, RecursionError, OverflowError):
         return

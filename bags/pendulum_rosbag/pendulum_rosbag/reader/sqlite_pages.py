@@ -34,6 +34,7 @@ class MessageRows:
         offsets: Where the message bytes begin in the file, shape (n,).
         sizes: Bytes of each message, shape (n,).
         local: Whether all of them stand on the page (large messages continue on overflow pages), shape (n,).
+        left_out: Number of cells on these pages that are no such rows.
     """
 
     row_ids: Int64
@@ -42,6 +43,7 @@ class MessageRows:
     offsets: Int64
     sizes: Int64
     local: np.ndarray[tuple[int], np.dtype[np.bool_]]
+    left_out: int = 0
 
 
 def page_size(buffer: Bytes) -> int:
@@ -136,7 +138,7 @@ def _rows(buffer: Bytes, size: int, usable: int, leaves: Int64) -> MessageRows:
     keep = np.flatnonzero(good)
     topics = _integers(buffer, values[keep], topic_type[keep])
     times = _integers(buffer, (values + topic_size)[keep], time_type[keep])
-    return MessageRows(row_ids[keep], topics, times, offsets[keep], sizes[keep], local[keep])
+    return MessageRows(row_ids[keep], topics, times, offsets[keep], sizes[keep], local[keep], total - len(keep))
 
 
 def _varints(buffer: Bytes, at: Int64) -> tuple[Int64, Int64]:

@@ -143,7 +143,10 @@ class SqliteSource:
         leaves = leaf_pages(self._buffer, size, root) if size else None
         if leaves is None:
             return None
-        return list(message_rows(self._buffer, size, leaves))
+        blocks = list(message_rows(self._buffer, size, leaves))
+        if left_out := sum(block.left_out for block in blocks):
+            self.damage = f"{left_out} rows of the table of messages are damaged and left out"
+        return blocks
 
     def _counts(self) -> dict[int, int]:
         """Return the number of messages by topic id, and note the time span of the file."""
