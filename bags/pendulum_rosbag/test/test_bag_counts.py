@@ -118,7 +118,9 @@ def test_a_row_that_is_no_message_any_more_is_told(tmp_path: Path, alone: bool) 
 
 
 @pytest.mark.parametrize("alone", [False, True], ids=["folder", "file"])
-@pytest.mark.parametrize("change", ["DELETE FROM messages WHERE id = 5", "UPDATE messages SET topic_id = 2 WHERE id = 5"])
+@pytest.mark.parametrize(
+    "change", ["DELETE FROM messages WHERE id = 5", "UPDATE messages SET topic_id = 2 WHERE id = 5"]
+)
 def test_fewer_messages_than_the_metadata_names_are_told(tmp_path: Path, change: str, alone: bool) -> None:
     bag = write(tmp_path / "bag", "sqlite3")
     connection = sqlite3.connect(file_of(bag))
