@@ -28,6 +28,7 @@ from pendulum_msgs_py.contract.supervisor import Input
 from pendulum_msgs_py.contract.trajectory import thesis_ramp
 from pendulum_msgs_py.contract.values import JointCommand
 from pendulum_msgs_py.ros import qos
+from pendulum_msgs_py.ros.commander_watch import CHECK_PERIOD_NS
 from tests.faults.bridge_rig import Rig, SteppedLoop
 
 __all__ = ["NodeRig", "ros_of_its_own"]
@@ -118,11 +119,14 @@ class NodeRig(Rig):
             twin = rclpy.create_node("controller", enable_rosout=False, start_parameter_services=False)
             twin.create_publisher(JointState, names.EFFORT_COMMAND, qos.COMMAND)
             self.twins.append(twin)
-        # The graph keeps wall time.
+        # The graph keeps wall time, and tells of a publisher before it tells of whom it is.
         deadline = time.monotonic() + 10.0
-        while self.node.count_publishers(names.EFFORT_COMMAND) < 2:
+        topic = self.node.resolve_topic_name(names.EFFORT_COMMAND)
+        while [info.node_name for info in self.node.get_publishers_info_by_topic(topic)] != ["controller"] * 2:
             assert time.monotonic() < deadline, "the twins were not discovered"
             time.sleep(0.001)
+        # So does the pause between two looks at it, which is over for a plant that has run for as long as this one has.
+        time.sleep(1e-9 * CHECK_PERIOD_NS)
 
     def _ask_to_arm(self, wanted: bool) -> str:
         answer = self.node._interface._on_arm(SetBool.Request(data=wanted), SetBool.Response())

@@ -11,9 +11,9 @@ from pendulum_msgs_py.contract import names
 from pendulum_msgs_py.contract.supervisor import Input, PlantSupervisor
 from pendulum_msgs_py.contract.values import JointCommand
 
-__all__ = ["CommanderWatch"]
+__all__ = ["CHECK_PERIOD_NS", "CommanderWatch"]
 
-_CHECK_PERIOD_NS = 50_000_000
+CHECK_PERIOD_NS = 50_000_000
 """Least time between two looks at the graph after a message gave reason for one [ns]."""
 _HOLD_NS = 1_000_000_000
 """Time after the last contradiction at which commands are believed again [ns]."""
@@ -78,7 +78,7 @@ class CommanderWatch:
         self._supervisor.set_commander_conflict(conflict)
 
     def _check_soon(self, now: int) -> None:
-        if now - self._checked_ns >= _CHECK_PERIOD_NS:
+        if now - self._checked_ns >= CHECK_PERIOD_NS:
             self.check()
 
     def _two_commanders(self, now: int) -> str:
