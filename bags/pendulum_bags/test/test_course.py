@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import re
 from dataclasses import replace
 from pathlib import Path
@@ -85,6 +86,23 @@ def test_each_drawn_course_can_be_solved_and_needs_work(seed: int) -> None:
     assert tasks.fault in FAULTS
 
 
+def test_every_multiple_of_2_ms_up_to_a_tenth_of_a_second_can_be_asked_for(tmp_path: Path) -> None:
+    path = tmp_path / "course.yaml"
+    for count in range(1, 51):
+        write_tasks(path, replace(draw_tasks(5), hold_time=0.002 * count))
+        assert checks.noise_ratio(read_tasks(path)) > 0.5
+
+
+def test_an_answer_is_not_judged_by_a_plant_that_nobody_sealed(
+    course: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    found = course.parent / "found.yaml"
+    write_plant(found, load_plant("dfki"))
+    write_plant(course / "hidden.yaml", load_plant("dfki"))
+    assert main(["check", "plant", str(found), "--course", str(course)]) == 2
+    assert "is not sealed; expected it as the course wrote it" in capsys.readouterr().err
+
+
 def test_a_parameter_that_is_too_far_is_named_and_the_hidden_one_is_not() -> None:
     truth = draw_plant(3)
     found = checks.check_plant(truth, truth.with_values(gravity=1.1 * truth.gravity))
@@ -105,6 +123,13 @@ def test_tasks_are_read_as_they_were_written_and_nonsense_is_refused(tmp_path: P
     assert read_tasks(path) == tasks
     for bad, words in (
         (replace(tasks, hold_time=-1.0), "hold_time is -1.0; expected a number > 0"),
+        (replace(tasks, hold_time=0.0005), "hold_time is 0.0005 s; expected a multiple of 0.002 s up to 0.1 s"),
+        (replace(tasks, hold_time=0.005), "hold_time is 0.005 s; expected a multiple of 0.002 s up to 0.1 s"),
+        (replace(tasks, hold_time=1e6), "hold_time is 1000000.0 s; expected a multiple of 0.002 s up to 0.1 s"),
+        (replace(tasks, delay_weight=1e300), "delay_weight is 1e+300 1/(N m)^2; expected 0.001 to 1"),
+        (replace(tasks, time_constant=1e9), "time_constant is 1000000000.0 s; expected 0.05 to 5"),
+        (replace(tasks, controller_a=1e-12), "controller_a is 1e-12 1/(N m)^2; expected 1e-05 to 0.1"),
+        (replace(tasks, noise_seed=1.5), "noise_seed is 1.5; expected a whole number"),
         (replace(tasks, fault="gremlin"), "fault is 'gremlin'; expected one of"),
         (replace(tasks, causes=("power",)), "causes is"),
     ):
@@ -131,9 +156,18 @@ def test_a_check_says_right_or_wrong_by_its_exit_code_too(course: Path, capsys: 
 ARMED = [(0.0, "plant_mode", {"mode": "armed_position", "reason": ""})]
 
 
-def _broken(path: Path, reason: str, torque_after: float, *, length: float = 2.0, armed: bool = True) -> Path:
+def _broken(
+    path: Path,
+    reason: str,
+    torque_after: float,
+    *,
+    length: float = 2.0,
+    armed: bool = True,
+    rearmed: float | None = None,
+) -> Path:
     """Write a recording: armed, a fault at 1 s, and a torque from 50 ms after it on."""
     events = [*(ARMED if armed else []), (1.0, "plant_mode", {"mode": "fault", "reason": reason})]
+    events += [] if rearmed is None else [(rearmed, "plant_mode", {"mode": "armed_effort", "reason": ""})]
     return write_events_and_torque(path, "/hw", events, lambda t: 0.5 if t < 1.05 else torque_after, length)
 
 
@@ -146,6 +180,10 @@ def test_a_safely_broken_bridge_is_right_and_every_other_way_is_wrong(tmp_path: 
         (_broken(tmp_path / "driven", words, 0.4), False, "0.4 N m acted later than 60 ms"),
         (_broken(tmp_path / "short", words, 0.0, length=1.2), False, "ends too early"),
         (_broken(tmp_path / "asleep", words, 0.0, armed=False), False, "was not armed before"),
+        (_broken(tmp_path / "unknown", words, math.nan), False, "is not a number"),
+        (_broken(tmp_path / "longer", "m_stop_other: a button", 0.0), False, "asked is m_stop"),
+        (_broken(tmp_path / "rearmed", words, 0.0, rearmed=1.2), False, "was armed again 0.2 s after the fault; leave"),
+        (_broken(tmp_path / "rearmed later", words, 0.0, rearmed=1.7), True, "no torque acted"),
     )
     for bag, right, reason in cases:
         found = checks.check_fault(tasks, bag)

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from pendulum_bags.course.tasks import Tasks
+from pendulum_bags.course.tasks import HOLD_STEP, Tasks
 from pendulum_bags.runs.run_data import find_prefix
 from pendulum_lqr.analysis import closed_loop_poles, delayed_spectral_radius, loop_margins
 from pendulum_lqr.design import continuous_lqr
@@ -39,7 +39,7 @@ __all__ = [
 
 WEIGHTS = (100.0, 0.01)
 """Q of every loop whose R alone is told."""
-PERIOD = {"sim": 0.002, "hw": 0.01}
+PERIOD = {"sim": HOLD_STEP, "hw": 0.01}
 PLANT_TOLERANCES = {"inertia": 0.03, "gravity": 0.03, "damping": 0.15, "coulomb_friction": 0.15}
 """Share by which each parameter of the hidden plant may be off."""
 _TIME_TOLERANCE = 0.05
@@ -174,15 +174,20 @@ def check_fault(tasks: Tasks, bag: Path) -> Judgement:
     reason = str(modes[index].get("reason", ""))
     if not any(str(event.get("mode", "")).startswith("armed") for event in modes[:index]):
         return Judgement(False, f"the bridge was not armed before its fault ({reason}); arm it, and break it then")
-    if not reason.startswith(tasks.fault):
+    if reason.split(":", maxsplit=1)[0] != tasks.fault:
         return Judgement(False, f"the fault is {reason!r}; asked is {tasks.fault}")
     since = (applied["stamp_ns"] - int(modes[index]["stamp_ns"])) / NANOSECONDS
     rearmed = next((e for e in modes[index:] if str(e.get("mode", "")).startswith("armed")), None)
     until = math.inf if rearmed is None else (rearmed["stamp_ns"] - modes[index]["stamp_ns"]) / NANOSECONDS
+    if until < _WATCHED:
+        words = f"the bridge was armed again {until:.2g} s after the fault; leave it in fault for {_WATCHED:g} s"
+        return Judgement(False, words)
     later = (since > _STOPPED_WITHIN) & (since < until)
     if not later.any() or float(since[later].max()) < _WATCHED:
         return Judgement(False, f"the recording ends too early; let it go on for {_WATCHED:g} s after the fault")
     worst = float(np.max(np.abs(applied["effort"][later])))
+    if not math.isfinite(worst):
+        return Judgement(False, f"the torque later than {1e3 * _STOPPED_WITHIN:.0f} ms after the fault is not a number")
     if worst > 0.0:
         return Judgement(False, f"{worst:.3g} N m acted later than {1e3 * _STOPPED_WITHIN:.0f} ms after the fault")
     return Judgement(True, f"{reason}; from {1e3 * _STOPPED_WITHIN:.0f} ms after it no torque acted")

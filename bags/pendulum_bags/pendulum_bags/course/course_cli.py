@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from pendulum_msgs_py.errors import BagError
+from pendulum_msgs_py.errors import BagError, ParameterError
 from pendulum_msgs_py.programs.executables import EXIT_INTERRUPTED, cli_main
 
 if TYPE_CHECKING:
@@ -123,7 +123,10 @@ def plant(
     from pendulum_msgs_py.plants.sealed_plant import load_plant_to_run
 
     _tasks(course)
-    truth, _ = load_plant_to_run(course / "hidden.yaml")
+    hidden = course / "hidden.yaml"
+    truth, sealed = load_plant_to_run(hidden)
+    if not sealed:
+        raise ParameterError(f"plant file {hidden} is not sealed; expected it as the course wrote it")
     return _told(check_plant(truth, load_plant(file)), as_json=as_json)
 
 

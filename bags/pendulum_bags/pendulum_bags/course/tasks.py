@@ -12,7 +12,7 @@ from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.parameters import dump_yaml, load_yaml, reject_unknown
 from pendulum_msgs_py.plants.plant_parameters import PlantParameters, load_plant
 
-__all__ = ["CAUSES", "FAULTS", "FORMAT", "Tasks", "draw_plant", "draw_tasks", "read_tasks", "write_tasks"]
+__all__ = ["CAUSES", "FAULTS", "FORMAT", "HOLD_STEP", "Tasks", "draw_plant", "draw_tasks", "read_tasks", "write_tasks"]
 
 FORMAT = "pendulum_course/1"
 FAULTS = {
@@ -34,6 +34,17 @@ CAUSES = {
 _KEPT_FROM_THESIS = 0.05
 """The first exercise asks for no time constant this near to that of the thesis, which the pages give away [s]."""
 _THESIS_TIME_CONSTANT = 0.372
+_LIMITS = {
+    "time_constant": (0.05, 5.0, "s"),
+    "delay_weight": (0.001, 1.0, "1/(N m)^2"),
+    "hold_time": (0.002, 0.1, "s"),
+    "controller_a": (1e-5, 0.1, "1/(N m)^2"),
+    "controller_b": (1e-5, 0.1, "1/(N m)^2"),
+    "noise_seed": (1, 10**9, ""),
+}
+"""Range and unit of each number, wider than what is drawn: with these every exercise has an answer."""
+HOLD_STEP = 0.002
+"""What a hold time is a multiple of: the period of the simulation [s]."""
 _HARD = ((5e-5, 8e-5), (8e-4, 2e-3))
 """Ranges of R of the two controllers of the fifth exercise: one that is too quick for the machine, one that is not."""
 
@@ -119,16 +130,24 @@ def read_tasks(path: Path) -> Tasks:
     if missing:
         raise ParameterError(f"{path}: {missing[0]} is missing; expected the file as the course wrote it")
     values = {name: content[name] for name in names}
-    numbers = ("time_constant", "delay_weight", "hold_time", "controller_a", "controller_b", "noise_seed")
-    for name in numbers:
-        if type(values[name]) not in {int, float} or not 0.0 < values[name] < float("inf"):
-            raise ParameterError(f"{path}: {name} is {values[name]!r}; expected a number > 0")
+    for name, (low, high, unit) in _LIMITS.items():
+        value = values[name]
+        if type(value) not in {int, float} or not 0.0 < value < float("inf"):
+            raise ParameterError(f"{path}: {name} is {value!r}; expected a number > 0")
+        said = f"{path}: {name} is {value!r} {unit}".rstrip()
+        if name == "hold_time":
+            if not low <= value <= high or abs(value / HOLD_STEP - round(value / HOLD_STEP)) > 1e-6:
+                raise ParameterError(f"{said}; expected a multiple of {HOLD_STEP:g} s up to {high:g} s")
+        elif not low <= value <= high:
+            raise ParameterError(f"{said}; expected {low:g} to {high:g}")
+    if type(values["noise_seed"]) is not int:
+        raise ParameterError(f"{path}: noise_seed is {values['noise_seed']!r}; expected a whole number")
     causes = values["causes"]
     if not isinstance(causes, list) or sorted(map(str, causes)) != sorted(CAUSES):
         raise ParameterError(f"{path}: causes is {causes!r}; expected {', '.join(sorted(CAUSES))} in some order")
     if values["fault"] not in FAULTS:
         raise ParameterError(f"{path}: fault is {values['fault']!r}; expected one of {', '.join(FAULTS)}")
-    return Tasks(**{**values, "causes": tuple(causes), "noise_seed": int(values["noise_seed"])})
+    return Tasks(**{**values, "causes": tuple(causes)})
 
 
 def _two_digits(value: float) -> float:
