@@ -11,8 +11,9 @@ from scipy.linalg import solve_discrete_lyapunov
 from scipy.optimize import brentq
 from threadpoolctl import threadpool_limits
 
+from pendulum_bags.ranking.contender import Contender
 from pendulum_bags.ranking.present import REGRET_MARGIN, same_choice
-from pendulum_bags.ranking.ranking import Contender, rank
+from pendulum_bags.ranking.ranking import rank
 from pendulum_bags.verdict import Mark
 from pendulum_lqr.model import linearise
 from pendulum_lqr.sampled_design import discretise
@@ -52,7 +53,7 @@ def _at_margin() -> Row:
         seeds = range(SEEDS * trial, SEEDS * (trial + 1))
         parts = [simulated_parts(plant, seeds, sensors=side) for side, plant in enumerate((sim, hw))]
         contenders = [
-            Contender(f"{i}", *(side[i] for side in parts))
+            Contender(f"{i}", *(side[i] for side in parts), sim_seeds=tuple(seeds), hw_seeds=tuple(seeds))
             for i in range(len(GAINS))
             if np.isfinite(hw_cost[i]) and np.isfinite(sim_cost[i])
         ]

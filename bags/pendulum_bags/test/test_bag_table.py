@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import re
 import shutil
 from pathlib import Path
 
@@ -150,6 +151,26 @@ def test_another_version_of_the_program_asks_again(runs: Path, tmp_path: Path, m
     assert analyse_bags(tmp_path / "out", pieces, ["timing"]).kept == 2
     monkeypatch.setattr(bag_table, "program_hash", lambda: "another")
     assert analyse_bags(tmp_path / "out", pieces, ["timing"]).kept == 0
+
+
+def test_answers_are_kept_by_all_packages_that_they_depend_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    source = Path(bag_table.__file__).parents[1]
+    imported = {
+        name
+        for file in source.rglob("*.py")
+        for name in re.findall(r"^\s*(?:from|import) (pendulum_\w+)", file.read_text(encoding="utf-8"), re.MULTILINE)
+    }
+    assert imported <= set(bag_table.ANSWERING)
+    for package in bag_table.ANSWERING:
+        (tmp_path / package).mkdir()
+    monkeypatch.setattr(bag_table.resources, "files", lambda package: tmp_path / package)
+    seen = [bag_table.program_hash.__wrapped__()]
+    for changed in ("pendulum_lqr/design.py", "pendulum_bags/margins.yaml", "pendulum_sim/design.py"):
+        (tmp_path / changed).write_text("x")
+        seen.append(bag_table.program_hash.__wrapped__())
+    assert len(set(seen)) == 4
+    (tmp_path / "pendulum_lqr" / "design.pyc").write_bytes(b"x")
+    assert bag_table.program_hash.__wrapped__() == seen[-1]
 
 
 def test_what_cannot_be_asked_is_refused(runs: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -6,8 +6,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from pendulum_bags.ranking.contender import Contender
 from pendulum_bags.ranking.fewer_runs import narrow, narrow_all
-from pendulum_bags.ranking.ranking import Contender
 from pendulum_bags.ranking.ranking_cli import main
 from pendulum_msgs_py.errors import DataError
 

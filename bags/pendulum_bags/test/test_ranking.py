@@ -1,19 +1,27 @@
 """Rankings against their definitions, and what is said of pairs in the wrong order."""
 
 import json
+import math
+from collections.abc import Sequence
+from pathlib import Path
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy import stats
 
 from pendulum_bags.experiments.run_spec import RunSpec
 from pendulum_bags.ranking.collect import collect_contenders, cost_parts
+from pendulum_bags.ranking.contender import Contender, compared_runs, contenders_of
 from pendulum_bags.ranking.present import same_choice, write_ranking
-from pendulum_bags.ranking.ranking import Contender, contenders_of, mmrv, rank
+from pendulum_bags.ranking.ranking import Ranking, mmrv, rank
 from pendulum_bags.ranking.ranking_cli import main
 from pendulum_bags.verdict import Layer, Mark
-from pendulum_msgs_py.errors import DataError
+from pendulum_msgs_py.errors import DataError, ParameterError
+from pendulum_rosbag.reader.mcap_source import McapSource
+from pendulum_rosbag.storage import open_writer
+from tests.synthetic_runs import regulate, run_metadata, write_bag, write_events_and_torque
 
 COSTS = st.lists(st.tuples(st.floats(0.1, 10.0), st.floats(0.1, 10.0)), min_size=3, max_size=8)
 
@@ -82,6 +90,61 @@ def test_a_controller_that_fails_on_the_hardware_alone_is_the_dearest_pick():
     json.dumps(found.to_json(), allow_nan=False)
 
 
+@pytest.mark.parametrize("fell", [1, 3])
+def test_a_pick_that_falls_on_the_hardware_is_a_no_however_near_the_others_are(fell, tmp_path):
+    wild = contender("wild", 0.8, 1.0)
+    wild = Contender("wild", wild.sim, wild.hw[: 3 - fell], 0, fell)
+    others = [contender(name, cost, cost) for name, cost in (("a", 1.0), ("b", 1.01), ("c", 1.02))]
+    found = rank([wild, *others])
+    layer = same_choice(found)
+    assert layer.mark is Mark.NO
+    assert layer.sentence.startswith(f"The simulation picks wild, which fails on the hardware in {fell} of 3 runs.")
+    assert layer.reason.endswith(f"picked wild, which fails on the hardware in {fell} of 3 runs")
+    assert layer.evidence[0].estimate is None
+    assert found.to_json()["regret_share"] == {"value": None, "low": None, "high": None}
+    json.dumps(layer.to_json(), allow_nan=False)
+    text = write_ranking(tmp_path, found, formats=("png",)).read_text(encoding="utf-8")
+    assert f"fails on the hardware in {fell} of 3 runs" in text
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
+@pytest.mark.parametrize("side", ["sim", "hw"])
+def test_a_cost_that_is_no_number_is_refused_and_not_taken_for_a_failure(value, side):
+    costs = {name: {at: [(7, np.ones(3)), (4, np.ones(3))] for at in ("sim", "hw")} for name in ("a", "b", "c")}
+    costs["b"][side][0] = (7, np.array([1.0, value, 1.0]))
+    with pytest.raises(DataError, match=rf"the cost of b on {side} under seed 7 is angle 1, velocity {value:g}, torq"):
+        rank(contenders_of(costs))
+    bare = [contender(name, 1.0, 1.0) for name in "abc"]
+    getattr(bare[2], side)[1, 0] = value
+    with pytest.raises(DataError, match=rf"the cost of c on {side} in run 2 of 4 is angle"):
+        rank(bare)
+
+
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize("runs", [1, 4])
+def test_a_best_that_costs_nothing_makes_any_other_pick_a_no(runs, tmp_path):
+    idle = Contender("idle", np.full((runs, 3), 2.0), np.zeros((runs, 3)))
+    others = [contender("picked", 2.0, 2.05, runs=runs), contender("last", 3.0, 3.0, runs=runs)]
+    layer = same_choice(found := rank([idle, *others]))
+    assert (found.pick, found.best, found.regret_share.low) == ("picked", "idle", np.inf)
+    assert layer.mark is Mark.NO
+    assert "not idle: a regret without bound, since idle costs nothing on the hardware" in layer.sentence
+    assert layer.reason.endswith("picked picked, though idle costs nothing on the hardware")
+    json.dumps([found.to_json(), layer.to_json()], allow_nan=False)
+    write_ranking(tmp_path, found, formats=("png",))
+
+
+@pytest.mark.filterwarnings("error")
+def test_a_pick_that_costs_nothing_has_no_regret():
+    others = [contender("a", 2.0, 2.0), contender("b", 3.0, 3.0)]
+    found = rank([Contender("idle", np.zeros((4, 3)), np.zeros((4, 3))), *others])
+    assert (found.regret.value, found.regret.high) == (0.0, 0.0)
+    assert same_choice(found).mark is Mark.YES
+    once = same_choice(rank([Contender("idle", np.zeros((4, 3)), np.zeros((1, 3))), *others]))
+    assert once.mark is Mark.UNDECIDED
+    assert "no interval: idle ran once on the hardware" in once.sentence
+
+
 def test_the_intervals_hold_the_truth_of_many_campaigns():
     generator = np.random.default_rng(0)
     true_sim = np.linspace(1.0, 4.0, 8)
@@ -102,7 +165,7 @@ def test_a_noise_that_all_contenders_share_does_not_blur_the_choice():
     # Seeds differ by far more than the contenders do, but by the same for all: the pick is sure.
     seeds = np.array([1.0, 2.0, 5.0])
     contenders = [
-        Contender(name, *(np.column_stack([share * seeds, np.zeros((3, 2))]) for _ in range(2)))
+        Contender(name, *(np.column_stack([share * seeds, np.zeros((3, 2))]) for _ in range(2)), hw_seeds=(1, 2, 3))
         for name, share in (("a", 1.0), ("b", 1.05), ("c", 1.2))
     ]
     found = rank(contenders)
@@ -144,6 +207,155 @@ def test_a_contender_that_ran_once_does_not_take_the_interval_from_all():
     found = rank([*contenders[:-1], Contender(last.name, last.sim, last.hw[:1])])
     assert 0.0 < found.regret_share.high < 1.0
     assert "95 % interval" in same_choice(found).sentence
+
+
+def test_it_says_who_ran_once_where_that_takes_the_interval():
+    contenders = campaign(np.random.default_rng(1), 6)
+    once = [Contender(one.name, one.sim, one.hw[:1]) for one in contenders]
+    layer = same_choice(rank([once[0], contenders[1], contenders[2], once[3]]))
+    assert layer.mark is Mark.UNDECIDED
+    assert "no interval: picked, the pick, ran once on the hardware, and so did last)" in layer.sentence
+    assert layer.reason.endswith("has no interval: picked, the pick, ran once on the hardware, and so did last")
+
+
+def costing(name: str, sim: float, hw: Sequence[float], seeds: Sequence[int] = ()) -> Contender:
+    """Return a contender with given costs on the hardware."""
+    rows = [np.column_stack([costs, np.zeros((len(costs), 2))]) for costs in ([sim, sim], hw)]
+    return Contender(name, *rows, hw_seeds=tuple(seeds))
+
+
+PICKED, BEST = [1.30, 1.10, 1.24, 1.16, 1.20], [1.02, 0.95, 1.03]
+FAR = [costing("far", 5.0, [50.0, 51.0]), costing("farther", 6.0, [60.0, 61.0])]
+"""Contenders that cost so much more on the hardware that the pick's regret is against the best alone."""
+
+
+def limits(found: Ranking) -> tuple[float, float]:
+    """Return the ends of the regret, as logarithms of ratios."""
+    return math.log1p(found.regret_share.low), math.log1p(found.regret_share.high)
+
+
+def test_the_limits_of_independent_runs_are_those_of_welch():
+    found = rank([costing("picked", 1.0, PICKED), costing("best", 2.0, BEST), *FAR])
+    own, other = (np.array(costs) / np.mean(costs) for costs in (PICKED, BEST))
+    test = stats.ttest_ind(own, other, equal_var=False)
+    ratio = math.log(np.mean(PICKED) / np.mean(BEST))
+    # Three others: the lower limit is corrected for three comparisons, the upper one for none.
+    expected = test.confidence_interval(1.0 - 0.05 / 3.0).low, test.confidence_interval(0.95).high
+    assert limits(found) == pytest.approx([ratio + end for end in expected], rel=1e-9)
+
+
+def test_the_limits_of_pairs_are_those_of_their_differences():
+    seeds = (3, 1, 9)
+    picked = [1.60, 1.40, 1.55]
+    found = rank([costing("picked", 1.0, picked, seeds), costing("best", 2.0, BEST, seeds), *FAR])
+    own, other = (np.array(costs) / np.mean(costs) for costs in (picked, BEST))
+    test = stats.ttest_rel(own, other)
+    ratio = math.log(np.mean(picked) / np.mean(BEST))
+    expected = test.confidence_interval(1.0 - 0.05 / 3.0).low, test.confidence_interval(0.95).high
+    assert limits(found) == pytest.approx([ratio + end for end in expected], rel=1e-9)
+
+
+def test_a_pick_that_ran_once_is_predicted_from_the_scatter_of_the_other():
+    found = rank([costing("picked", 1.0, [1.5]), costing("best", 2.0, BEST), *FAR])
+    scatter = np.std(np.array(BEST) / np.mean(BEST), ddof=1)
+    # A new run and the mean of n: the variances of both count, 1 + 1/n (prediction interval).
+    deviation = scatter * math.sqrt(1.0 + 1.0 / 3.0)
+    ratio = math.log(1.5 / np.mean(BEST))
+    expected = [ratio - stats.t.ppf(1.0 - 0.025 / 3.0, 2) * deviation, ratio + stats.t.ppf(0.975, 2) * deviation]
+    assert limits(found) == pytest.approx(expected, rel=1e-9)
+
+
+def test_runs_are_pairs_by_their_seeds_and_not_by_their_number():
+    noise = {1: 1.0, 2: 2.0, 3: 5.0, 4: 3.0, 5: 9.0}
+    a = costing("a", 1.0, [noise[seed] for seed in (1, 2, 3)], (1, 2, 3))
+    shared = costing("b", 2.0, [1.05 * noise[seed] for seed in (1, 2, 3, 4)], (1, 2, 3, 4))
+    others = costing("b", 2.0, [1.05 * noise[seed] for seed in (3, 4, 5)], (3, 4, 5))
+    far = [costing("c", 3.0, [90.0, 91.0]), costing("d", 4.0, [90.0, 91.0])]
+    # Four runs and three share three seeds, under which a is better each time.
+    assert rank([a, shared, *far]).regret_share.high == 0.0
+    # As many runs under other seeds are no pairs: the noise of the seeds hides who is better.
+    assert rank([a, others, *far]).regret_share.high > 0.5
+    for seeds, sure in (((1, 2, 3, 4), True), ((3, 4, 5), False)):
+        dearer = [noise[seed] + 0.5 + 0.01 * seed for seed in seeds]
+        (pair,) = rank([a, costing("b", 0.1, dearer, seeds), *far]).wrong
+        assert (pair.picked, pair.sure) == ("b", sure)
+
+
+def test_a_seed_that_was_repeated_counts_once():
+    own = costing("a", 1.0, [1.0, 3.0, 2.5], (1, 1, 2))
+    other = costing("b", 2.0, [4.0, 2.0], (2, 1))
+    first, second, paired = compared_runs(own, other)
+    assert paired
+    np.testing.assert_allclose(first, [2.0, 2.5])
+    np.testing.assert_allclose(second, [2.0, 4.0])
+
+
+@pytest.fixture
+def recorded(tmp_path: Path) -> Path:
+    """Return a folder of bags in which ``lqr`` fell under seed 2 on the hardware, and a bag of something else."""
+    for name in ("lqr", "pid", "lqi"):
+        for side in ("sim", "hw"):
+            for seed in (1, 2):
+                metadata = run_metadata(seed)
+                metadata["pendulum.run"].update(controller={"kind": name}, side=side)
+                columns = regulate(rate=100, seed=seed, duration=0.5, hardware=side == "hw")
+                if (name, side, seed) == ("lqr", "hw", 2):
+                    columns["position"] += 1.0
+                write_bag(tmp_path / f"{name}_{side}_{seed}", columns, f"/{side}", metadata=metadata, ramps=False)
+    write_events_and_torque(tmp_path / "other", "/hw", [], lambda _t: 0.0, 0.1)
+    return tmp_path
+
+
+def test_a_damaged_recording_is_named_and_not_left_out(recorded, capsys):
+    fallen = {one.name: one.hw_failed for one in collect_contenders([recorded])}
+    assert fallen == {"lqr": 1, "pid": 0, "lqi": 0}
+    (file,) = (recorded / "lqr_hw_2").glob("*.mcap")
+    chunk = McapSource(file).chunks[0]
+    content = bytearray(file.read_bytes())
+    content[chunk.data_start + chunk.data_size - 3] ^= 1
+    file.write_bytes(content)
+    assert main([str(recorded)]) == 2
+    told = " ".join(capsys.readouterr().err.split())
+    assert "1 of 12 recordings cannot be ranked" in told
+    assert "lqr_hw_2" in told
+    assert "is damaged" in told
+    # A run of which nothing but its record is left.
+    metadata = run_metadata(3)
+    metadata["pendulum.run"].update(controller={"kind": "lqr"}, side="hw")
+    with open_writer(recorded / "empty", metadata=metadata) as bag:
+        bag.add_topic("/hw/joint_states", "sensor_msgs/msg/JointState")
+    # A recorder that was killed: the end is missing, and with it perhaps the fall.
+    (file,) = (recorded / "pid_hw_1").glob("*.mcap")
+    file.write_bytes(file.read_bytes()[:-200])
+    (file.parent / "metadata.yaml").unlink()
+    with pytest.raises(DataError, match=r"3 of 13 recordings cannot be ranked, .*empty has 0 states.*pid_hw_1"):
+        collect_contenders([recorded])
+
+
+def test_a_recording_whose_angle_is_no_number_is_no_success(recorded):
+    metadata = run_metadata(5)
+    metadata["pendulum.run"].update(controller={"kind": "lqr"}, side="hw")
+    columns = regulate(rate=100, seed=5, duration=0.5, hardware=True)
+    columns["position"][20] = np.nan
+    write_bag(recorded / "blind", columns, "/hw", metadata=metadata, ramps=False)
+    with pytest.raises(DataError, match=r"1 of 13 recordings .*blind: position is nan"):
+        collect_contenders([recorded])
+
+
+def test_weights_that_are_no_weights_are_refused(tmp_path):
+    with pytest.raises(ParameterError, match="weights are 100, nan, -1; expected finite ones >= 0"):
+        collect_contenders([tmp_path], (100.0, float("nan"), -1.0))
+
+
+def test_a_record_of_a_study_that_cannot_be_read_is_named(tmp_path):
+    metrics = {"ise": None, "rms_velocity": 1.0, "effort_energy": 1.0, "success": 1.0}
+    nothing = {"status": "done", "labels": {"controller": "lqr"}, "metrics": metrics}
+    for number, content in (("1", "{"), ("2", '{"status": "done"}'), ("3", json.dumps(nothing))):
+        (tmp_path / number).mkdir()
+        (tmp_path / number / "spec.json").write_text(json.dumps(RunSpec(side="hw", seed=1).to_json()))
+        (tmp_path / number / "run.json").write_text(content)
+    with pytest.raises(DataError, match=r"3 of 3 recordings .*the cost of lqr on hw under seed 1 is no finite number"):
+        collect_contenders([tmp_path])
 
 
 def test_runs_of_a_study_and_a_folder_are_collected(tmp_path, capsys):

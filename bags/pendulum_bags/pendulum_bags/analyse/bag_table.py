@@ -12,7 +12,7 @@ import json
 import math
 import os
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass, field
 from functools import cache
@@ -23,13 +23,14 @@ from typing import Any
 import numpy as np
 
 from pendulum_bags.analyse.questions import QUESTIONS
+from pendulum_bags.runs.find_bags import bags_below
 from pendulum_bags.runs.run_folder import is_repeat, write_json
 from pendulum_bags.runs.run_record import run_record
 from pendulum_bags.studies.chunks import Connect, carry_out
 from pendulum_msgs_py.contract import names
 from pendulum_msgs_py.errors import BagError, ParameterError, PendulumError
 from pendulum_rosbag.reader import Bag, read_bag
-from pendulum_rosbag.reader.open_source import is_bag_folder, is_storage_file
+from pendulum_rosbag.reader.open_source import is_storage_file
 from pendulum_rosbag.storage.metadata_file import METADATA_NAME
 
 __all__ = ["Piece", "Table", "analyse_bags", "find_pieces"]
@@ -62,14 +63,19 @@ class Piece:
         return hashlib.sha256(content.encode()).hexdigest()[:16]
 
 
+ANSWERING = ("pendulum_bags", "pendulum_lqr", "pendulum_msgs_py", "pendulum_rosbag", "pendulum_sim")
+"""Packages of the project that answers depend on."""
+
+
 @cache
 def program_hash() -> str:
-    """Return a hash of the modules that answers depend on: another version of the program answers anew."""
+    """Return a hash of the files that answers depend on: another version of the program answers anew."""
     digest = hashlib.sha256()
-    for package in ("pendulum_bags", "pendulum_msgs_py", "pendulum_rosbag", "pendulum_sim"):
+    for package in ANSWERING:
         folder = Path(str(resources.files(package)))
-        for file in sorted(folder.rglob("*.py")):
-            digest.update(str(file.relative_to(folder)).encode() + b"\0" + file.read_bytes())
+        # Margins and presets of plants are no modules.
+        for file in sorted(file for file in folder.rglob("*") if file.is_file() and file.suffix != ".pyc"):
+            digest.update(f"{package}/{file.relative_to(folder)}".encode() + b"\0" + file.read_bytes())
     return digest.hexdigest()
 
 
@@ -109,7 +115,7 @@ def find_pieces(folders: Sequence[Path], questions: Sequence[str]) -> list[Piece
     for folder in folders:
         if not folder.exists():
             raise BagError(f"{folder} does not exist; expected a folder of bags, or a bag")
-        for path in _bags_below(folder):
+        for path in bags_below(folder):
             below = folder.name if path == folder else str(path.relative_to(folder))
             name = f"{folder.name}/{below}" if len(folders) > 1 and path != folder else below
             bags.setdefault(path.resolve(), name)
@@ -223,20 +229,6 @@ def _sentence(error: Exception) -> str:
     if isinstance(error, PendulumError):
         return str(error)
     return f"{type(error).__name__}: {error}" if str(error) else type(error).__name__
-
-
-def _bags_below(folder: Path) -> Iterator[Path]:
-    """Yield bags: folders with storage files, and storage files that were given themselves."""
-    if folder.is_file():
-        yield folder
-        return
-    if is_bag_folder(folder):
-        yield folder
-        return
-    for path in sorted(folder.iterdir()):
-        # Links may lead round in a circle, hidden folders are somebody's scratch.
-        if path.is_dir() and not path.is_symlink() and not path.name.startswith("."):
-            yield from _bags_below(path)
 
 
 def _is_content(path: Path) -> bool:

@@ -3,18 +3,21 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator, Mapping, Sequence
+import math
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pendulum_bags.comparison.metrics import episode_of, metrics_of
-from pendulum_bags.ranking.ranking import Contender, contenders_of
+from pendulum_bags.ranking.contender import Contender, contenders_of
+from pendulum_bags.runs.find_bags import bags_below
 from pendulum_bags.runs.run_data import is_emulated, read_run
 from pendulum_bags.runs.run_record import run_record
-from pendulum_msgs_py.errors import DataError, PendulumError
+from pendulum_msgs_py.errors import DataError, ParameterError, PendulumError
+from pendulum_rosbag.reader import read_bag
 
 __all__ = ["WEIGHTS", "collect_contenders", "cost_parts"]
 
@@ -22,6 +25,7 @@ Array = NDArray[np.float64]
 
 WEIGHTS = (100.0, 0.01, 0.1)
 """q11 [1/rad^2], q22 [s^2/rad^2] and r [1/(N m)^2] of the thesis's choice: the cost that its LQR minimises."""
+_NAMED = 5
 _FALLEN = 0.5
 """Largest angle from the set-point at which a run still counts as a success [rad]."""
 
@@ -33,11 +37,17 @@ def cost_parts(metrics: Mapping[str, float | None], duration: float, weights: Se
         metrics: Of :mod:`pendulum_bags.comparison.metrics`: ``ise``, ``rms_velocity`` and ``effort_energy``.
         duration: Length of the run [s].
         weights: q11, q22 and r.
+
+    Raises:
+        DataError: One of them is no finite number.
     """
     ise, velocity, energy = (metrics[name] for name in ("ise", "rms_velocity", "effort_energy"))
     if ise is None or velocity is None or energy is None:
         raise DataError("a run has no finite cost")
-    return np.array([weights[0] * ise / duration, weights[1] * velocity**2, weights[2] * energy / duration])
+    parts = np.array([weights[0] * ise / duration, weights[1] * velocity**2, weights[2] * energy / duration])
+    if not np.all(np.isfinite(parts)):
+        raise DataError("a run has no finite cost")
+    return parts
 
 
 def collect_contenders(folders: Sequence[Path], weights: Sequence[float] = WEIGHTS) -> list[Contender]:
@@ -48,59 +58,111 @@ def collect_contenders(folders: Sequence[Path], weights: Sequence[float] = WEIGH
         weights: q11, q22 and r of the cost.
 
     Raises:
-        DataError: There are no runs.
+        DataError: There are no runs, or a recording that may be one is damaged: it may be the run that fell.
+        ParameterError: A weight is negative or no number.
     """
-    costs: dict[str, dict[str, list[tuple[int, Array | None]]]] = {}
-    real: set[str] = set()
-    count = 0
+    if not all(math.isfinite(weight) and weight >= 0.0 for weight in weights):
+        raise ParameterError(f"weights are {', '.join(f'{weight:g}' for weight in weights)}; expected finite ones >= 0")
+    runs: list[_Run] = []
+    unread: list[str] = []
     for folder in folders:
         if not folder.is_dir():
             raise DataError(f"{folder} is no folder; expected one with runs")
-        for name, side, seed, parts, emulated in _runs(folder, weights):
-            if not emulated:
-                real.add(name)
-            costs.setdefault(name, {"sim": [], "hw": []})[side].append((seed, parts))
-            count += 1
-    if not count:
+        _collect(folder, weights, runs, unread)
+    if unread:
+        more = f"; and {len(unread) - _NAMED} more" if len(unread) > _NAMED else ""
+        raise DataError(
+            f"{len(unread)} of {len(runs) + len(unread)} recordings cannot be ranked, and a run that is left out may "
+            f"be one that fell: {'; '.join(unread[:_NAMED])}{more}. Repair them (python -m pendulum_rosbag repair "
+            "BAG), or move them out of the folder"
+        )
+    if not runs:
         told = ", ".join(map(str, folders))
         raise DataError(f"{told} holds no runs; expected a study, or bags that say which controller ran on which side")
-    return contenders_of(costs, real)
+    costs: dict[str, dict[str, list[tuple[int, Array | None]]]] = {}
+    for run in runs:
+        costs.setdefault(run.name, {"sim": [], "hw": []})[run.side].append((run.seed, run.parts))
+    return contenders_of(costs, {run.name for run in runs if not run.emulated})
 
 
-def _runs(folder: Path, weights: Sequence[float]) -> Iterator[tuple[str, str, int, Array | None, bool]]:
+class _Run(NamedTuple):
+    """One run: parts of its cost, or None where it failed."""
+
+    name: str
+    side: str
+    seed: int
+    parts: Array | None
+    emulated: bool
+
+
+def _collect(folder: Path, weights: Sequence[float], runs: list[_Run], unread: list[str]) -> None:
+    """Append the runs below a folder, and a sentence for each recording that may be one and cannot be read."""
     studied: set[Path] = set()
     for record in sorted(folder.rglob("run.json")):
-        specification = record.with_name("spec.json")
-        if not specification.is_file():
+        if not record.with_name("spec.json").is_file():
             continue
         studied.add(record.parent.resolve())
-        told, spec = (json.loads(path.read_text(encoding="utf-8")) for path in (record, specification))
-        parts = None
-        if told.get("status") == "done" and told.get("metrics", {}).get("success"):
-            parts = cost_parts(told["metrics"], float(spec["duration"]), weights)
-        yield str(told["labels"]["controller"]), str(spec["side"]), int(spec["seed"]), parts, True
-    for metadata in sorted(folder.rglob("metadata.yaml")):
-        bag = metadata.parent
-        if not any(parent in studied for parent in bag.resolve().parents):
-            yield from _bag(bag, weights)
+        try:
+            runs.append(_studied_run(record, weights))
+        except (PendulumError, OSError, ValueError, KeyError, TypeError, AttributeError) as error:
+            unread.append(f"{record} ({_why(error)})")
+    for bag in bags_below(folder):
+        if any(parent in studied for parent in (bag.resolve(), *bag.resolve().parents)):
+            continue
+        try:
+            found = _recorded_run(bag, weights)
+        except PendulumError as error:
+            unread.append(_why(error) if str(bag) in str(error) else f"{bag} ({_why(error)})")
+        else:
+            runs += [] if found is None else [found]
 
 
-def _bag(bag: Path, weights: Sequence[float]) -> Iterator[tuple[str, str, int, Array | None, bool]]:
+def _why(error: Exception) -> str:
+    return str(error) if isinstance(error, (PendulumError, OSError)) else f"{type(error).__name__}: {error}"
+
+
+def _studied_run(record: Path, weights: Sequence[float]) -> _Run:
+    told, spec = (json.loads(path.read_text(encoding="utf-8")) for path in (record, record.with_name("spec.json")))
+    name, side, seed = str(told["labels"]["controller"]), str(spec["side"]), int(spec["seed"])
+    parts = None
+    if told.get("status") == "done" and told.get("metrics", {}).get("success"):
+        parts = _parts(told["metrics"], float(spec["duration"]), weights, f"{name} on {side} under seed {seed}")
+    return _Run(name, side, seed, parts, True)
+
+
+def _parts(metrics: Mapping[str, float | None], duration: float, weights: Sequence[float], who: str) -> Array:
     try:
-        run = read_run(bag)
-    except PendulumError:
-        # A folder may hold recordings of other things.
-        return
-    told = run_record(run.metadata)
-    if not isinstance(told.get("controller"), Mapping):
-        return
+        return cost_parts(metrics, duration, weights)
+    except DataError as error:
+        raise DataError(
+            f"the cost of {who} is no finite number; expected finite angles, velocities and torques"
+        ) from error
+
+
+def _recorded_run(bag: Path, weights: Sequence[float]) -> _Run | None:
+    """Return the run that a bag holds, None for a sound one that names no controller and side.
+
+    Raises:
+        BagError: The bag cannot be read.
+        DataError: It is damaged, or its run is not whole.
+    """
+    with read_bag(bag) as opened:
+        told, damage = run_record(opened.metadata), list(opened.damage)
+    if damage:
+        # What is lost may be the record of the run, or the moment in which it fell.
+        raise DataError(f"bag {bag} is damaged: {', '.join(damage)}")
     side = str(told.get("side") or str(told.get("namespace", "")).strip("/"))
-    if side not in {"sim", "hw"}:
-        return
+    if not isinstance(told.get("controller"), Mapping) or side not in {"sim", "hw"}:
+        return None
+    run = read_run(bag)
+    name, seed = _name(told["controller"]), int(told.get("seed") or 0)
     episode = episode_of(run.window)
-    fallen = bool(np.max(np.abs(episode.error)) > _FALLEN)
-    parts = None if fallen else cost_parts(metrics_of(episode), float(episode.t[-1]), weights)
-    yield _name(told["controller"]), side, int(told.get("seed") or 0), parts, side == "sim" or is_emulated(run)
+    parts = None
+    # (no comparison with a number is true of NaN)
+    if not np.max(np.abs(episode.error)) > _FALLEN:
+        who = f"{name} on {side} under seed {seed}"
+        parts = _parts(metrics_of(episode), float(episode.t[-1]), weights, who)
+    return _Run(name, side, seed, parts, side == "sim" or is_emulated(run))
 
 
 def _name(controller: Mapping[str, Any]) -> str:

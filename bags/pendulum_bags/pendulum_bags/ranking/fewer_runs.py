@@ -24,7 +24,7 @@ from numpy.typing import ArrayLike
 from rich.console import Console
 from scipy import stats
 
-from pendulum_bags.ranking.ranking import Contender, Interval
+from pendulum_bags.ranking.contender import Contender, Interval
 from pendulum_msgs_py.errors import DataError
 from pendulum_msgs_py.programs.terminal import WholeTable
 

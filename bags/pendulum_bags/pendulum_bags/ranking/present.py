@@ -25,7 +25,9 @@ _SHOWN_PAIRS = 8
 
 
 def same_choice(ranking: Ranking, margin: float = REGRET_MARGIN) -> LayerResult:
-    """Return layer 4: yes where the regret is small, no where it is large, undecided where its runs scatter or are few.
+    """Return layer 4: yes where the regret is small, no where large, undecided where its runs scatter or are few.
+
+    A pick that fails on the hardware in any run is a no, whatever it costs.
 
     Args:
         ranking: The ranking.
@@ -33,32 +35,32 @@ def same_choice(ranking: Ranking, margin: float = REGRET_MARGIN) -> LayerResult:
     """
     regret = ranking.regret_share
     share = [regret.value, regret.low, regret.high]
-    measured = np.isfinite(regret.high)
-    if share[2] <= margin:
-        mark = Mark.YES
-    elif share[1] > margin or ranking.pick in ranking.failures:
+    fails = ""
+    if ranking.pick_failed:
+        fails = f"which fails on the hardware in {ranking.pick_failed} of {ranking.pick_runs} runs"
+    if fails or share[1] > margin:
         mark = Mark.NO
+    elif share[2] <= margin:
+        mark = Mark.YES
     else:
         mark = Mark.UNDECIDED
     sure = [pair for pair in ranking.wrong if pair.sure]
-    same = "which is the best on the hardware too" if ranking.pick == ranking.best else f"not {ranking.best}"
-    interval = (
-        f"95 % interval {100.0 * share[1]:.1f} to {100.0 * share[2]:.1f} %"
-        if measured
-        else "no interval: each controller ran once"
-    )
+    srcc = f"{ranking.srcc.value:.3f}" if np.isfinite(ranking.srcc.value) else "nothing that can be told"
+    if np.isfinite(ranking.srcc.low):
+        srcc += f" ({ranking.srcc.low:.3f} to {ranking.srcc.high:.3f})"
     sentence = (
-        f"The simulation picks {ranking.pick}, {same}: a regret of {100.0 * share[0]:.1f} % ({interval}). "
-        f"Costs correlate with {ranking.srcc.value:.3f} ({ranking.srcc.low:.3f} to {ranking.srcc.high:.3f}); "
+        f"The simulation picks {ranking.pick}, {fails or _regret_words(ranking)}. Costs correlate with {srcc}; "
         f"{len(ranking.wrong)} of {ranking.pairs} pairs are in the wrong order, {len(sure)} of them surely."
     )
     if sure:
         sentence += f" The dearest: {sure[0].picked} before {sure[0].better}, because {sure[0].reason}."
     unit = "of the cost"
+    ends = [100.0 * end if np.isfinite(end) else None for end in share]
+    note = fails.removeprefix("which ") or ranking.no_interval or _unbounded(ranking)
     evidence = (
         Evidence(
-            "regret of the simulation's pick", "%", 100.0 * share[0], 100.0 * share[1], 100.0 * share[2],
-            f"at most {100.0 * margin:g} %", mark,
+            "regret of the simulation's pick", "%", ends[0], ends[1], ends[2],
+            f"at most {100.0 * margin:g} %", mark, note,
         ),
         Evidence("SRCC (Pearson)", "", ranking.srcc.value, ranking.srcc.low, ranking.srcc.high, "", mark),
         Evidence("rank correlation (Spearman)", "", ranking.spearman, mark=mark),
@@ -73,16 +75,35 @@ def same_choice(ranking: Ranking, margin: float = REGRET_MARGIN) -> LayerResult:
     if mark is Mark.NO:
         steps = (f"compare the plants in frequency, where {ranking.pick} works: experiment frequency_response",)
     percent = [100.0 * value for value in share]
+    dearer = f"{percent[0]:.0f} % dearer than {ranking.best}"
+    if np.isinf(share[0]):
+        dearer = fails or f"though {_unbounded(ranking)}"
     reason = {
         Mark.YES: f"the simulation's pick costs at most {percent[2]:.0f} % more on the hardware than the best of "
         f"{len(ranking.names)}",
-        Mark.NO: f"the simulation would have picked {ranking.pick}, {percent[0]:.0f} % dearer than {ranking.best}",
-        Mark.UNDECIDED: f"the regret of the simulation's pick, {percent[1]:.0f} to {percent[2]:.0f} %, is not measured "
-        "well enough"
-        if measured
-        else "the regret of the simulation's pick was measured once only",
+        Mark.NO: f"the simulation would have picked {ranking.pick}, {dearer}",
+        Mark.UNDECIDED: f"the regret of the simulation's pick has no interval: {ranking.no_interval}"
+        if ranking.no_interval
+        else f"the regret of the simulation's pick, {percent[1]:.0f} to {percent[2]:.0f} %, is not measured well "
+        "enough",
     }[mark]
     return LayerResult(Layer.SAME_CHOICE, mark, sentence, evidence, steps, reason)
+
+
+def _regret_words(ranking: Ranking) -> str:
+    share = ranking.regret_share
+    same = "which is the best on the hardware too" if ranking.pick == ranking.best else f"not {ranking.best}"
+    if np.isinf(share.value):
+        return f"{same}: a regret without bound, since {_unbounded(ranking)}"
+    interval = f"95 % interval {100.0 * share.low:.1f} to {100.0 * share.high:.1f} %"
+    if ranking.no_interval:
+        interval = f"no interval: {ranking.no_interval}"
+    return f"{same}: a regret of {100.0 * share.value:.1f} % ({interval})"
+
+
+def _unbounded(ranking: Ranking) -> str:
+    """Return why a share of the best's cost is infinite, empty where it is not."""
+    return f"{ranking.best} costs nothing on the hardware" if np.isinf(ranking.regret_share.value) else ""
 
 
 def ranking_figure(ranking: Ranking) -> Figure:
@@ -135,8 +156,8 @@ def _pair_rows(ranking: Ranking) -> list[tuple[str, ...]]:
         (
             pair.picked,
             pair.better,
-            f"{pair.sim:.3g}",
-            f"{pair.hw:.3g}",
+            f"{pair.sim:.3g}" if np.isfinite(pair.sim) else "the other fails",
+            f"{pair.hw:.3g}" if np.isfinite(pair.hw) else "fails",
             "yes" if pair.sure else "no",
             pair.reason,
         )

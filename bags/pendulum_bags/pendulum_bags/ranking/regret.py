@@ -1,0 +1,90 @@
+"""What the simulation's pick costs more on the hardware than the best, as a share of the best's cost."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import stats
+
+from pendulum_bags.ranking.contender import Contender, Interval, compared_runs
+
+__all__ = ["regret_share"]
+
+Array = NDArray[np.float64]
+
+_NAMED = 3
+
+
+def regret_share(contenders: Sequence[Contender], pick: int) -> tuple[Interval, str]:
+    """Return the regret of a pick as a share of the best's cost with its 95 % interval, and why there is none.
+
+    The regret is the largest of the pick's shares over all others. Its upper limit is the largest of their upper
+    limits by Student's t over the runs: the true best is among them, so that no correction is due. The lower limit is
+    the largest of the lower ones, corrected for their number (Bonferroni). Resampled runs would not do: three of which
+    all lie low know nothing of what lies higher.
+
+    A pick that fails on the hardware has an infinite regret, and so has one that costs something where another costs
+    nothing. The ends are NaN, with a reason, where neither the pick nor another was repeated.
+
+    Args:
+        contenders: All, one more than the pick at least without a failure on the hardware.
+        pick: Index of the simulation's pick.
+    """
+    chosen = contenders[pick]
+    if not math.isfinite(chosen.cost("hw")):
+        return Interval(math.inf, math.inf, math.inf), ""
+    others = [one for i, one in enumerate(contenders) if i != pick and math.isfinite(one.cost("hw"))]
+    own, least = chosen.cost("hw"), min(one.cost("hw") for one in others)
+    if own <= 0.0:
+        # Runs scatter by shares: of nothing there is none. One run is one run all the same.
+        end = 0.0 if len(chosen.hw) > 1 else math.nan
+        return Interval(0.0, end, end), "" if end == 0.0 else f"{chosen.name} ran once on the hardware"
+    if least <= 0.0:
+        return Interval(math.inf, math.inf, math.inf), ""
+    value = max(0.0, own / least - 1.0)
+    limits = np.array([_limits(chosen, one, len(others)) for one in others])
+    if np.isnan(limits).any():
+        return Interval(value, math.nan, math.nan), _ran_once(chosen, others)
+    low, high = np.maximum(np.expm1(limits.max(axis=0)), 0.0)
+    # Where some runs have no partner under their seed, the means of all and those of the pairs differ.
+    return Interval(value, float(min(low, value)), float(max(high, value))), ""
+
+
+def _ran_once(chosen: Contender, others: Sequence[Contender]) -> str:
+    once = [one.name for one in others if len(one.hw) == 1]
+    if len(once) == len(others):
+        return "each controller ran once on the hardware"
+    named = ", ".join(once[:_NAMED]) + (f" and {len(once) - _NAMED} more" if len(once) > _NAMED else "")
+    return f"{chosen.name}, the pick, ran once on the hardware, and so did {named}"
+
+
+def _limits(chosen: Contender, another: Contender, comparisons: int) -> tuple[float, float]:
+    """Return the limits of the logarithm of two mean costs' ratio, the lower corrected for comparisons; NaN of one run.
+
+    The logarithm of the ratio of means is taken as linear in the deviations of the runs from them: runs scatter by
+    shares.
+    """
+    own, other, paired = compared_runs(chosen, another)
+    if paired and not (own.mean() > 0.0 and other.mean() > 0.0):
+        own, other, paired = chosen.hw.sum(axis=1), another.hw.sum(axis=1), False
+    ratio = float(np.log(own.mean() / other.mean()))
+    own, other = own / own.mean(), other / other.mean()
+    repeated = [one for one in (own, other) if one.size > 1]
+    if not repeated:
+        return math.nan, math.nan
+    if paired:
+        deviation, freedom = float(np.std(own - other, ddof=1)) / math.sqrt(own.size), own.size - 1.0
+    elif len(repeated) == 1:
+        # The one that ran once is taken to scatter like the other.
+        deviation = float(np.std(repeated[0], ddof=1)) * math.sqrt(1.0 + 1.0 / repeated[0].size)
+        freedom = repeated[0].size - 1.0
+    else:
+        parts = np.array([np.var(own, ddof=1) / own.size, np.var(other, ddof=1) / other.size])
+        deviation = float(np.sqrt(parts.sum()))
+        # Welch and Satterthwaite.
+        freedom = float(parts.sum() ** 2 / max(1e-300, np.sum(parts**2 / (np.array([own.size, other.size]) - 1.0))))
+    low, high = (float(stats.t.isf(tail, freedom)) for tail in (0.025 / comparisons, 0.025))
+    return ratio - low * deviation, ratio + high * deviation

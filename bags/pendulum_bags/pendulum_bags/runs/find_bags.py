@@ -1,0 +1,24 @@
+"""Finding every bag below a folder."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+from pendulum_rosbag.reader.open_source import is_bag_folder
+
+__all__ = ["bags_below"]
+
+
+def bags_below(folder: Path) -> Iterator[Path]:
+    """Yield bags: folders with storage files, and storage files that were given themselves."""
+    if folder.is_file():
+        yield folder
+        return
+    if is_bag_folder(folder):
+        yield folder
+        return
+    for path in sorted(folder.iterdir()):
+        # Links may lead round in a circle, hidden folders are somebody's scratch.
+        if path.is_dir() and not path.is_symlink() and not path.name.startswith("."):
+            yield from bags_below(path)
