@@ -53,7 +53,7 @@ def _at_margin() -> Row:
         seeds = range(SEEDS * trial, SEEDS * (trial + 1))
         parts = [simulated_parts(plant, seeds, sensors=side) for side, plant in enumerate((sim, hw))]
         contenders = [
-            Contender(f"{i}", *(side[i] for side in parts), sim_seeds=tuple(seeds), hw_seeds=tuple(seeds))
+            Contender(f"{i}", parts[0][i], parts[1][i], sim_seeds=tuple(seeds), hw_seeds=tuple(seeds))
             for i in range(len(GAINS))
             if np.isfinite(hw_cost[i]) and np.isfinite(sim_cost[i])
         ]

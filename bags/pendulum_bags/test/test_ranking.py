@@ -20,6 +20,7 @@ from pendulum_bags.ranking.ranking_cli import main
 from pendulum_bags.verdict import Layer, Mark
 from pendulum_msgs_py.errors import DataError, ParameterError
 from pendulum_rosbag.reader.mcap_source import McapSource
+from pendulum_rosbag.repair.repair import repair_bag
 from pendulum_rosbag.storage import open_writer
 from tests.synthetic_runs import regulate, run_metadata, write_bag, write_events_and_torque
 
@@ -319,6 +320,11 @@ def test_a_damaged_recording_is_named_and_not_left_out(recorded, capsys):
     assert "1 of 12 recordings cannot be ranked" in told
     assert "lqr_hw_2" in told
     assert "is damaged" in told
+    # What a repair could not save is no success either; the broken bag that it keeps is no second run.
+    repair_bag(recorded / "lqr_hw_2")
+    assert (recorded / "lqr_hw_2.broken").is_dir()
+    with pytest.raises(DataError, match=r"1 of 12 recordings cannot be ranked, .*lqr_hw_2 has 0 states"):
+        collect_contenders([recorded])
     # A run of which nothing but its record is left.
     metadata = run_metadata(3)
     metadata["pendulum.run"].update(controller={"kind": "lqr"}, side="hw")

@@ -107,7 +107,9 @@ def _collect(folder: Path, weights: Sequence[float], runs: list[_Run], unread: l
         except (PendulumError, OSError, ValueError, KeyError, TypeError, AttributeError) as error:
             unread.append(f"{record} ({_why(error)})")
     for bag in bags_below(folder):
-        if any(parent in studied for parent in (bag.resolve(), *bag.resolve().parents)):
+        # What repair keeps as BAG.broken has its whole messages in BAG.
+        repaired = ".broken" in bag.name and bag.with_name(bag.name.split(".broken")[0]).exists()
+        if repaired or any(parent in studied for parent in (bag.resolve(), *bag.resolve().parents)):
             continue
         try:
             found = _recorded_run(bag, weights)
