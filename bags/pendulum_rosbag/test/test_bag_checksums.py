@@ -14,6 +14,7 @@ from pendulum_rosbag.reader import read_bag
 from pendulum_rosbag.reader.info_cli import main as info_main
 from pendulum_rosbag.reader.mcap_source import McapSource
 from pendulum_rosbag.repair.repair import repair_bag
+from pendulum_rosbag.storage import mcap_records as rec
 from pendulum_rosbag.storage import open_writer
 
 JOINT_STATE = "sensor_msgs/msg/JointState"
@@ -148,3 +149,69 @@ def test_chunks_of_a_file_that_was_not_closed_are_compared_when_it_is_opened(tmp
     assert opened.damage[-1].startswith(f"bag_0.mcap: the chunk at byte {chunk.offset} does not have its checksum; ")
     assert 0 < sum(len(opened[topic]) for topic in TOPICS) < 6000
     assert read_bag(bag).load().damage == read_bag(bag, verify=False).damage, "a sound one has no more damage than that"
+
+
+def test_a_changed_summary_of_a_file_that_was_not_closed_is_told(tmp_path: Path) -> None:
+    """Any byte of it: a name, a type, a count, a time."""
+    bag = tmp_path / "bag"
+    writer = open_writer(bag)
+    for topic in TOPICS:
+        writer.add_topic(topic, JOINT_STATE)
+    for index in range(30):
+        writer.write(TOPICS[index % 3], index, encode_joint_state(index))
+        if index % 10 == 9:
+            writer.seal()
+    writer.abandon()
+    (file,) = bag.glob("*.mcap")
+    content = file.read_bytes()
+    summary = int.from_bytes(content[-28:-20], "little")
+    whole = {topic: read_bag(bag).raw(topic) for topic in TOPICS}
+    end = summary
+    while content[end] != rec.PADDING:
+        end += 9 + int.from_bytes(content[end + 1 : end + 9], "little")
+    assert 500 < end - summary < 10_000
+    silent = []
+    for at in range(summary, end, 17):
+        flipped = bytearray(content)
+        flipped[at] ^= 0x01
+        file.write_bytes(flipped)
+        opened = read_bag(bag)
+        if not opened.damage:
+            silent.append(at)
+        assert {topic: opened.raw(topic) for topic in opened.topics} == whole, "the chunks still hold everything"
+    assert silent == []
+
+
+def test_a_summary_that_the_recorder_replaces_while_it_is_read_is_read_again(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    writer = open_writer(tmp_path / "bag")
+    writer.add_topic("/a", JOINT_STATE)
+    total = 0
+
+    def record() -> None:
+        nonlocal total
+        for _ in range(10):
+            writer.write("/a", total, encode_joint_state(total))
+            total += 1
+        writer.seal()
+
+    record()
+    take = McapSource._take_summary_record
+    going = True
+
+    def slowly(source: McapSource, opcode: int, content: bytes) -> bool:
+        nonlocal going
+        if going and opcode == rec.CHUNK_INDEX:
+            going = False
+            for _ in range(2):  # (there are two places for it)
+                record()
+                writer.sync()
+        return take(source, opcode, content)
+
+    monkeypatch.setattr(McapSource, "_take_summary_record", slowly)
+    with read_bag(tmp_path / "bag") as opened:
+        assert opened.damage == []
+        assert opened["/a"]["stamp_ns"].tolist() == list(range(len(opened["/a"])))
+        assert len(opened["/a"]) == opened.topics["/a"].count > 10
+    writer.close()

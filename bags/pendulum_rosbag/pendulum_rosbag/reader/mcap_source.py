@@ -26,6 +26,9 @@ __all__ = ["McapSource"]
 
 _HEAD = rec.RECORD_HEAD_SIZE
 _FOOTER_REGION = rec.FOOTER_SIZE + len(rec.MAGIC)
+_NOT_CLOSED = rec.record(rec.DATA_END, bytes(4))
+"""What stands right before the footer of a file that our recorder has not closed."""
+_TRIES = 5
 _CHUNK_FIELDS = struct.Struct("<QQQII")
 _GROUP_SIZE = 1 << 20  # decompressed bytes that are parsed at once
 _Table = dict[int, list[tuple[int, int]]]
@@ -33,6 +36,9 @@ _Table = dict[int, list[tuple[int, int]]]
 
 class _DamagedError(Exception):
     """The file is not what its footer, index or records claim."""
+
+
+_UNREADABLE = (_DamagedError, struct.error, ValueError, KeyError, OverflowError, IndexError)
 
 
 class _NoIndexError(Exception):
@@ -81,7 +87,7 @@ class McapSource:
             self._read_summary()
         except _NoIndexError:
             self._scan("")
-        except (_DamagedError, struct.error, ValueError, KeyError, OverflowError, IndexError) as error:
+        except _UNREADABLE as error:
             self._scan(str(error) or type(error).__name__)
         if (verify or (self.unclosed and verify is None)) and not self._scanned:
             try:
@@ -118,6 +124,20 @@ class McapSource:
         return np.frombuffer(self._map, np.uint8)
 
     def _read_summary(self) -> None:
+        """Read the summary; once more where a recorder that goes on has shown another one meanwhile."""
+        for again in reversed(range(_TRIES)):
+            shown = bytes(self.buffer[-_FOOTER_REGION:])
+            try:
+                self._take_summary()
+                return
+            except _UNREADABLE:
+                if not again or bytes(self.buffer[-_FOOTER_REGION:]) == shown:
+                    raise
+            self.unclosed = False
+            for known in (self._schemas, self._channels, self.chunks, self._counts, self.metadata):
+                known.clear()
+
+    def _take_summary(self) -> None:
         buffer, size = self.buffer, len(self.buffer)
         footer = size - _FOOTER_REGION
         if footer < 8 or bytes(buffer[-8:]) != rec.MAGIC:
@@ -133,6 +153,8 @@ class McapSource:
         (crc,) = struct.unpack("<I", bytes(buffer[footer + _HEAD + 16 : footer + _HEAD + 20]))
         if crc and self._verify is not False and zlib.crc32(buffer[at : footer + _HEAD + 16].data) != crc:
             raise _DamagedError(f"the summary at byte {at} does not have its checksum")
+        start = at
+        grows = not crc and bytes(buffer[footer - len(_NOT_CLOSED) : footer]) == _NOT_CLOSED
         statistics = False
         while at < footer:
             opcode, length = rec.RECORD_HEAD.unpack(bytes(buffer[at : at + _HEAD]))
@@ -142,11 +164,17 @@ class McapSource:
             if opcode == rec.PADDING:
                 self.unclosed = True  # complete, but its writer did not give back the room to grow
                 break
-            if opcode == rec.SUMMARY_OFFSET:
+            if opcode == rec.SUMMARY_CHECKSUM and grows and self._verify is not False:
+                content = bytes(buffer[at : at + length])
+                if content != struct.pack("<I", zlib.crc32(buffer[start : at - _HEAD].data)):
+                    raise _DamagedError(f"the summary at byte {start} does not have its checksum")
+            if opcode in (rec.SUMMARY_OFFSET, rec.SUMMARY_CHECKSUM):
                 at += length
                 continue
             statistics |= self._take_summary_record(opcode, bytes(buffer[at : at + length]))
             at += length
+        if grows and not self.unclosed:
+            raise _DamagedError(f"the summary at byte {start} is not whole")
         if not statistics and not self.chunks:
             raise _NoIndexError
         if not self._describes_all():

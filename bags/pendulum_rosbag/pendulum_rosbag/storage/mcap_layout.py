@@ -8,9 +8,10 @@ reader skips::
                                    ^ settled_end  ^ area.start    ^ area.stop
 
 A chunk is written into room that no reader sees, and the summary that lists it into whichever of the two places the
-footer does not point to, each with a data end right before it, where Foxglove's reader looks for one. Two small writes
-then make it visible: a record head (opcode and length, for readers that go through the file in order) and the footer
-(for readers that use the index).
+footer does not point to, each with a data end right before it, where Foxglove's reader looks for one, and a private
+record with its checksum at its end (that of the footer would have to cover the place that is written next). Two small
+writes then make it visible: a record head (opcode and length, for readers that go through the file in order) and the
+footer (for readers that use the index).
 
 What is sealed many times a second makes small chunks, and an index that grows with each of them: hours of them would
 cost more to list than to write. So small chunks are only staged. When enough have come together, one large chunk with
@@ -31,6 +32,7 @@ another matter, because the disk may reorder pages: ``sync`` bounds what it can 
 from __future__ import annotations
 
 import os
+import zlib
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -304,6 +306,7 @@ class McapLayout:
             start = slot.start + slot.described + slot.settled + slot.staged
             body = summary.staged[slot.staged :]
         tail, offsets_start = summary.tail(slot.start)
+        tail += summary.checksum_record(tail)
         end = start + len(body) + len(tail)
         # Before a summary stands a data end: that of the next slot is the last thing in this one.
         if end + _HEAD > slot.start + slot.capacity - len(_DATA_END):
@@ -328,9 +331,10 @@ class McapLayout:
         try:
             # The summary in force, continued by padding up to the new end, in the place that is not in force ...
             content = os.pread(self._fd, live.offsets_start - live.start, live.start)
-            padding = rec.padding_head(keeper.start + len(content), self._summary_stop)
+            checksum = rec.summary_checksum_record(zlib.crc32(content))
+            padding = rec.padding_head(keeper.start + len(content) + len(checksum), self._summary_stop)
             keeper.described = -1
-            self._write(_DATA_END + content + padding, keeper.start - len(_DATA_END))
+            self._write(_DATA_END + content + checksum + padding, keeper.start - len(_DATA_END))
             # ... then the end of the file moves there in one write (offsets name absolute places: the copy has none).
             self._write(_DATA_END + rec.footer_record(keeper.start, 0) + rec.MAGIC, self._tail)
         except OSError:

@@ -30,6 +30,7 @@ __all__ = [
     "RECORD_HEAD_SIZE",
     "SCHEMA",
     "STATISTICS",
+    "SUMMARY_CHECKSUM",
     "SUMMARY_OFFSET",
     "attachment_index_record",
     "channel_record",
@@ -42,6 +43,7 @@ __all__ = [
     "record",
     "schema_record",
     "statistics_record",
+    "summary_checksum_record",
     "summary_offset_record",
 ]
 
@@ -50,6 +52,8 @@ HEADER, FOOTER, SCHEMA, CHANNEL, MESSAGE, CHUNK, MESSAGE_INDEX, CHUNK_INDEX = ra
 ATTACHMENT, ATTACHMENT_INDEX, STATISTICS, METADATA, METADATA_INDEX, SUMMARY_OFFSET, DATA_END = range(0x09, 0x10)
 PADDING = 0x80
 """A private opcode (0x80 to 0xFF are free for applications): every reader skips the record."""
+SUMMARY_CHECKSUM = 0x81
+"""Private, too: the checksum of the records before it, back to where a summary begins."""
 
 RECORD_HEAD = struct.Struct("<BQ")
 RECORD_HEAD_SIZE = RECORD_HEAD.size
@@ -143,6 +147,14 @@ def statistics_record(
 def summary_offset_record(opcode: int, start: int, length: int) -> bytes:
     """Return where the summary's records of one kind stand."""
     return record(SUMMARY_OFFSET, struct.pack("<BQQ", opcode, start, length))
+
+
+def summary_checksum_record(crc: int) -> bytes:
+    """Return the checksum of a summary in a file that grows.
+
+    That of a footer covers everything up to the footer: there, what the writer is about to show next.
+    """
+    return record(SUMMARY_CHECKSUM, struct.pack("<I", crc))
 
 
 def footer_record(summary_start: int, summary_offset_start: int, summary: bytes | None = None) -> bytes:

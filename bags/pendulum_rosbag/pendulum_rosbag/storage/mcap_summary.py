@@ -93,6 +93,9 @@ class McapSummary:
         self._staged_chunks = 0
         self._schemas: list[bytes] = []
         self._description = b""
+        # Checksums of description and settled chunks, and of these and the staged ones: continued, never made anew.
+        self._settled_crc = 0
+        self._staged_crc = 0
 
     @property
     def staged_chunks(self) -> int:
@@ -117,6 +120,8 @@ class McapSummary:
 
     def _describe(self) -> None:
         self._description = b"".join([*self._schemas, *self.channels.values()])
+        self._settled_crc = zlib.crc32(self.settled, zlib.crc32(self._description))
+        self._staged_crc = zlib.crc32(self.staged, self._settled_crc)
 
     def add_messages(self, counts: dict[int, int], span: tuple[int, int]) -> None:
         """Count messages: channel id -> number, with their first and last log time [ns]."""
@@ -129,11 +134,13 @@ class McapSummary:
     def stage(self, record: bytes) -> None:
         """Add a small chunk to the index."""
         self.staged += record
+        self._staged_crc = zlib.crc32(record, self._staged_crc)
         self._staged_chunks += 1
 
     def settle(self, record: bytes) -> None:
         """Add a chunk that holds what the staged ones did, in their place."""
         self.settled += record
+        self._settled_crc = self._staged_crc = zlib.crc32(record, self._settled_crc)
         self._settled_chunks += 1
         self.staged.clear()
         self._staged_chunks = 0
@@ -148,6 +155,10 @@ class McapSummary:
     def size(self) -> int:
         """Bytes of all records but those that close the summary."""
         return len(self._description) + len(self.settled) + len(self.staged)
+
+    def checksum_record(self, tail: bytes) -> bytes:
+        """Return the record that ends a summary in a file that grows: the checksum of the whole with this tail."""
+        return rec.summary_checksum_record(zlib.crc32(tail, self._staged_crc))
 
     def tail(self, start: int, indexes: Sequence[bytes] = ()) -> tuple[bytes, int]:
         """Return the records that close a summary which begins at byte ``start``, and where its offsets begin.
