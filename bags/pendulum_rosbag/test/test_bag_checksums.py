@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import struct
+import threading
 from pathlib import Path
 
 import pytest
@@ -215,3 +216,52 @@ def test_a_summary_that_the_recorder_replaces_while_it_is_read_is_read_again(
         assert opened["/a"]["stamp_ns"].tolist() == list(range(len(opened["/a"])))
         assert len(opened["/a"]) == opened.topics["/a"].count > 10
     writer.close()
+
+
+def test_damage_is_told_each_time_that_it_is_read(sound: Path, tmp_path: Path) -> None:
+    opened = read_bag(with_flip(sound, tmp_path / "flipped", inside(sound)))
+    for _ in range(2):
+        for topic in TOPICS:
+            with pytest.raises(BagError):
+                opened.raw(topic)
+
+
+def test_two_passes_over_a_file_at_a_time_both_find_the_damage(tmp_path: Path) -> None:
+    bag = write(tmp_path / "bag", None)
+    source = source_of(with_flip(bag, tmp_path / "flipped", inside(bag)))
+    first, second = (source.batches({stream.channel}, None, None) for stream in source.streams[:2])
+    next(first)
+    next(second)
+    second.close()  # type: ignore[attr-defined]  # (a generator)
+    with pytest.raises(BagError, match=r"the chunk at byte \d+ is damaged"):
+        list(first)
+
+
+def test_a_pass_that_is_held_open_ends_with_its_file_and_so_does_its_thread(tmp_path: Path) -> None:
+    source = source_of(write(tmp_path / "bag", None))
+    before = set(threading.enumerate())
+    going = source.batches({source.streams[0].channel}, None, None)
+    next(going)
+    (thread,) = set(threading.enumerate()) - before
+    source.close()
+    assert not thread.is_alive()
+    with pytest.raises(BagError, match=r"bag_0\.mcap was closed while it was being read"):
+        list(going)
+
+
+def test_an_index_that_names_what_is_not_there_is_told_with_file_chunk_topic_and_time(
+    sound: Path, tmp_path: Path
+) -> None:
+    chunk = source_of(sound).chunks[1]
+    time = read_bag(sound, start=chunk.start_ns).log_times("/b")[0]
+    bag = with_flip(sound, tmp_path / "flipped", chunk.indexes[source_of(sound).streams[1].channel] + 15 + 8)
+    sentence = (
+        f"{bag}/bag_0.mcap: the message index of the chunk at byte {chunk.offset}, topic /b, names a message at "
+        f"{time * 1e-9:.3f} s where there is none; try to repair the bag"
+    )
+    for read in (lambda b: b["/b"], lambda b: b.raw("/b"), lambda b: b.log_times("/b")):
+        for span in ({}, {"start": chunk.start_ns, "stop": chunk.stop_ns}):
+            with pytest.raises(BagError) as told:
+                read(read_bag(bag, **span))
+            assert str(told.value) == sentence
+    assert repair_bag(bag, tmp_path / "repaired").damage == [sentence.removeprefix(f"{bag}/")]

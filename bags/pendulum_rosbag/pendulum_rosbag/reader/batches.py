@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol
@@ -27,6 +27,10 @@ _HEAD = np.dtype(
 _OVERLAP = "the bag names messages that overlap each other; try to repair it"
 
 
+def _unknown_origin(time_ns: int, offset: int) -> str:
+    return "the message index"
+
+
 @dataclass(slots=True)
 class Batch:
     """Messages of one channel of a storage file.
@@ -37,6 +41,7 @@ class Batch:
         offsets: Where each message (SQLite) or each message record (MCAP) begins in ``buffer``, shape (k,).
         times: Log time of each message [ns], shape (k,).
         sizes: Bytes of each message, shape (k,); ``None`` for MCAP, whose records carry their length.
+        origin: Says of a message (by its log time [ns] and offset) which index names it, for errors.
     """
 
     channel: int
@@ -44,6 +49,7 @@ class Batch:
     offsets: Int64
     times: Int64
     sizes: Int64 | None = None
+    origin: Callable[[int, int], str] = _unknown_origin
 
     @property
     def head(self) -> int:
@@ -64,9 +70,10 @@ class Batch:
         same = (heads["opcode"] == MESSAGE) & (heads["channel"] == self.channel) & (heads["time"] == self.times)
         if not same.all():
             wrong = int(np.argmin(same))
+            time, offset = int(self.times[wrong]), int(self.offsets[wrong])
             raise BagError(
-                f"the message index names a message of channel {self.channel} at {self.times[wrong] * 1e-9:.3f} s "
-                "where there is none; try to repair the bag"
+                f"{self.origin(time, offset)} names a message at {time * 1e-9:.3f} s where there is none; "
+                "try to repair the bag"
             )
 
     def payloads(self) -> Iterator[tuple[int, bytes]]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import zlib
+from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
 from types import TracebackType
@@ -11,13 +12,11 @@ from pendulum_msgs_py.errors import BagError
 from pendulum_rosbag.reader.batches import Bytes
 from pendulum_rosbag.reader.mcap_chunks import Chunk
 
-__all__ = ["Checksums"]
+__all__ = ["Checksums", "Comparison"]
 
 
 class Checksums:
-    """Checksums of the chunks of one file, compared in a thread of their own while the reader goes on.
-
-    Each chunk is compared once, however many topics are read from it.
+    """Which chunks of one file are known to be sound: each is compared once, however many topics are read from it.
 
     Args:
         path: The file.
@@ -25,24 +24,62 @@ class Checksums:
     """
 
     def __init__(self, path: Path, *, enabled: bool) -> None:
-        self._path = path
-        self._enabled = enabled
-        self._sound: set[int] = set()
+        self.path = path
+        self.enabled = enabled
+        self.sound: set[int] = set()
+        """Bytes of the file at which sound chunks begin."""
+        self._running: set[Comparison] = set()
+
+    def begin(self) -> Comparison:
+        """Return what compares the chunks of one pass over the file; several may go on at a time."""
+        comparison = Comparison(self, self._running.discard)
+        self._running.add(comparison)
+        return comparison
+
+    def close(self) -> None:
+        """End all passes that go on, and their threads."""
+        for comparison in list(self._running):
+            comparison.end()
+
+
+class Comparison:
+    """Checksums of the chunks of one pass over a file, compared in a thread of their own while the reader goes on.
+
+    Args:
+        file: What is known of the file.
+        on_end: Called with this comparison when it ends.
+    """
+
+    def __init__(self, file: Checksums, on_end: Callable[[Comparison], None]) -> None:
+        self._file = file
+        self._on_end = on_end
         self._begun: list[tuple[Chunk, Future[int]]] = []
         self._pool: ThreadPoolExecutor | None = None
+        self._ended = False
 
-    def __enter__(self) -> Checksums:
+    def __enter__(self) -> Comparison:
         return self
 
     def __exit__(self, kind: type[BaseException] | None, value: BaseException | None, at: TracebackType | None) -> None:
+        self.end()
+
+    def end(self) -> None:
+        """End the thread; what was not compared by then never is."""
+        self._ended = True
         if self._pool is not None:
             self._pool.shutdown(cancel_futures=True)
             self._pool = None
         self._begun.clear()
+        self._on_end(self)
 
     def compare(self, chunk: Chunk, raw: Bytes) -> None:
-        """Begin to compare the checksum of a chunk's content."""
-        if not self._enabled or not chunk.crc or chunk.offset in self._sound:
+        """Begin to compare the checksum of a chunk's content.
+
+        Raises:
+            BagError: The file was closed meanwhile.
+        """
+        self._require_going()
+        if not self._file.enabled or not chunk.crc or chunk.offset in self._file.sound:
             return
         if self._pool is None:
             self._pool = ThreadPoolExecutor(1, "checksums")  # (zlib works outside the interpreter's lock)
@@ -52,12 +89,17 @@ class Checksums:
         """Wait for what was begun.
 
         Raises:
-            BagError: The content of a chunk is not what was written.
+            BagError: The content of a chunk is not what was written, or the file was closed meanwhile.
         """
+        self._require_going()
         for chunk, crc in self._begun:
             if crc.result() != chunk.crc:
                 raise BagError(
-                    f"{self._path}: the chunk at byte {chunk.offset} is damaged (checksum {crc.result():08x}; expected "
-                    f"{chunk.crc:08x}); repair the bag, which saves all others"
+                    f"{self._file.path}: the chunk at byte {chunk.offset} is damaged (checksum {crc.result():08x}; "
+                    f"expected {chunk.crc:08x}); repair the bag, which saves all others"
                 )
-            self._sound.add(chunk.offset)
+            self._file.sound.add(chunk.offset)
+
+    def _require_going(self) -> None:
+        if self._ended:
+            raise BagError(f"{self._file.path} was closed while it was being read")

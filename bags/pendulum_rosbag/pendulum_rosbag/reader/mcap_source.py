@@ -6,7 +6,9 @@ import contextlib
 import mmap
 import struct
 import zlib
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +16,7 @@ import numpy as np
 
 from pendulum_msgs_py.errors import BagError
 from pendulum_rosbag.reader.batches import MCAP_HEAD, Batch, Bytes, Int64, Stream
-from pendulum_rosbag.reader.checksums import Checksums
+from pendulum_rosbag.reader.checksums import Checksums, Comparison
 from pendulum_rosbag.reader.decompression import decompress, decompress_torn
 from pendulum_rosbag.reader.mcap_chunks import Chunk, keep_staged, read_text, read_text_map, records_in
 from pendulum_rosbag.reader.mcap_extras import find_extras
@@ -102,7 +104,8 @@ class McapSource:
         return list(find_extras(self.buffer))
 
     def close(self) -> None:
-        """Release the memory map once no array refers to it any more."""
+        """Release the memory map once no array refers to it any more, and end what still reads."""
+        self._checksums.close()
         self.buffer = np.empty(0, np.uint8)
         if self._map is not None:
             with contextlib.suppress(BufferError):  # an array still looks into it; it goes with that array
@@ -395,7 +398,8 @@ class McapSource:
                     lost[channel] = lost.get(channel, 0) + len(times)
                 continue
             for channel, (times, offsets) in entries.items():
-                for batch in self._cut(Batch(channel, raw, offsets, times), None, None):
+                origin = partial(self._origin, channel, chunk.buffer, [(number, 0)])
+                for batch in self._cut(Batch(channel, raw, offsets, times, origin=origin), None, None):
                     batch.check_heads()
             kept.append(chunk)
         bad = len(self.chunks) - len(kept)
@@ -421,15 +425,16 @@ class McapSource:
             if channel in channels:
                 table = np.array(entries, np.int64)
                 yield from self._cut(Batch(channel, self.buffer, table[:, 1], table[:, 0]), start, stop)
-        with self._checksums as checksums:
+        with self._checksums.begin() as checksums:
             for buffer, index, members in self._groups(channels, start, stop, checksums):
                 for channel in channels:
                     times, offsets = self._entries(channel, index, members)
-                    yield from self._cut(Batch(channel, buffer, offsets, times), start, stop)
+                    origin = partial(self._origin, channel, index, members)
+                    yield from self._cut(Batch(channel, buffer, offsets, times, origin=origin), start, stop)
             checksums.finish()
 
     def _groups(
-        self, channels: set[int], start: int | None, stop: int | None, checksums: Checksums
+        self, channels: set[int], start: int | None, stop: int | None, checksums: Comparison
     ) -> Iterator[tuple[Bytes, Bytes, list[tuple[int, int]]]]:
         """Yield buffers that hold many chunks, and their index, with (number of the chunk, where it begins)."""
         plain: dict[int, list[tuple[int, int]]] = {}
@@ -475,6 +480,18 @@ class McapSource:
         ]
         return indexed_messages(self.path, channel, index, places)
 
+    def _origin(
+        self, channel: int, index: Bytes, members: Sequence[tuple[int, int]], time_ns: int, offset: int
+    ) -> str:
+        """Say which message index names a message of a group of chunks, by its log time [ns] and offset."""
+        place = ""
+        for number, base in members:
+            times, offsets = self._entries(channel, index, [(number, base)])
+            if bool(((times == time_ns) & (offsets == offset)).any()):
+                place = f" of the chunk at byte {self.chunks[number].offset}"
+                break
+        return f"{self.path}: the message index{place}, topic {self._channels[channel][1]},"
+
     def _cut(self, batch: Batch, start: int | None, stop: int | None) -> Iterator[Batch]:
         """Limit a batch to a time span and check that its records lie inside the buffer."""
         if start is not None or stop is not None:
@@ -483,7 +500,7 @@ class McapSource:
                 keep &= batch.times >= start
             if stop is not None:
                 keep &= batch.times < stop
-            batch = Batch(batch.channel, batch.buffer, batch.offsets[keep], batch.times[keep])
+            batch = replace(batch, offsets=batch.offsets[keep], times=batch.times[keep])
         if not len(batch.times):
             return
         if int(batch.offsets.min()) < 0 or int(batch.offsets.max()) + MCAP_HEAD > len(batch.buffer):
