@@ -27,7 +27,7 @@ _HEAD = np.dtype(
 _OVERLAP = "the bag names messages that overlap each other; try to repair it"
 
 
-def _unknown_origin(time_ns: int, offset: int) -> str:
+def _unknown_origin(*_: int) -> str:
     return "the message index"
 
 

@@ -480,9 +480,7 @@ class McapSource:
         ]
         return indexed_messages(self.path, channel, index, places)
 
-    def _origin(
-        self, channel: int, index: Bytes, members: Sequence[tuple[int, int]], time_ns: int, offset: int
-    ) -> str:
+    def _origin(self, channel: int, index: Bytes, members: Sequence[tuple[int, int]], time_ns: int, offset: int) -> str:
         """Say which message index names a message of a group of chunks, by its log time [ns] and offset."""
         place = ""
         for number, base in members:
