@@ -3,16 +3,19 @@
 from __future__ import annotations
 
 import json
+import re
 import socket
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 import numpy as np
+import psutil
 import pytest
 
 from pendulum_bags.experiments.in_process import simulate
-from pendulum_bags.experiments.run_spec import RunSpec
+from pendulum_bags.experiments.run_spec import EMULATOR_LIFETIME, RunSpec
 from pendulum_hw_bridge.backends.emulator_process import EmulatorProcessBackend
 from pendulum_rosbag.reader import read_bag, same_messages
 from tests.processes import ProcessGroup
@@ -81,6 +84,47 @@ def test_the_two_experiments_of_the_thesis_give_back_its_coefficients(tmp_path: 
     quantities = bag["/hw/actuator/feedback"][0].message.name
     recorded = {"position", "velocity", "effort", "position_command", "velocity_command", "effort_command"}
     assert recorded | {"pwm_command", "motor_current", "winding_current"} <= set(quantities)
+
+
+@pytest.mark.timeout(240)
+def test_a_run_whose_bridge_stood_still_is_measured_again_and_the_result_says_so(
+    processes: ProcessGroup, tmp_path: Path
+) -> None:
+    # Two runs of the thesis's experiment, whose ramps are as long as they are: nothing shorter has a regulation.
+    folder = tmp_path / "run"
+    program = processes.start(
+        *("pendulum_bags", "experiment", "thesis", "--out", str(folder), "--duration", "1", "--budget", "0")
+    )
+    program.wait_for_output(r"^regulation \(1 s\)", 120)
+    (bridge,) = [
+        child
+        for child in psutil.Process(program.pid).children(recursive=True)
+        if {"pendulum_hw_bridge", "bridge"} <= set(child.cmdline())
+    ]
+    # The stimulus: twice as long as an emulator's bridge may stand still.
+    bridge.suspend()
+    time.sleep(2.0 * EMULATOR_LIFETIME)
+    bridge.resume()
+
+    said = program.wait_for_output(r"^This machine stood still \((.*)\); measuring again, run 2 of at most 3\.$", 30)
+    assert program.wait(150) == 0, program.output
+    reason = said[1]
+    assert reason.startswith("/hw went to fault: ")
+
+    # A busy machine may have stood still once more by itself.
+    stalls = json.loads((folder / "summary.json").read_text(encoding="utf-8"))["stalls"]
+    assert stalls[0] == {"run": "run", "reason": reason, "logs": "logs_stalled_1"}
+    assert len(re.findall(r"^regulation \(1 s\)", program.output, re.MULTILINE)) > 1
+    told = re.compile(r"broke off before this one and do(es)? not count")
+    assert told.search(" ".join(program.output.split()))
+    assert told.search((folder / "report.html").read_text(encoding="utf-8"))
+    assert (folder / "logs_stalled_1" / "hw_bridge.log").is_file()
+    # What counts is the last run alone, whole and at zero torque in the end.
+    bag = read_bag(folder / "hw")
+    modes = [event.get("mode") for event in bag.events() if event["name"] == "plant_mode"]
+    assert "fault" not in modes
+    assert bag["/hw/applied_effort"]["effort"][-1] == 0.0
+    assert processes.leftovers() == []
 
 
 @pytest.mark.timeout(180)

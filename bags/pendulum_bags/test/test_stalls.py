@@ -79,7 +79,7 @@ def test_runs_that_broke_off_are_told_by_the_comparison_the_terminal_and_the_rep
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     folder = tmp_path / "run"
-    reason = "motion_disagreement: velocity says 0.0199 rad, position 0.0093 rad in 0.2 s"
+    reason = "motion_disagreement: velocity says 0.0199 rad, position 0.0093 rad in 0.2 s [rad]"
     errors = [PlantStoppedError("/hw", "fault", reason), None]
 
     def run() -> None:

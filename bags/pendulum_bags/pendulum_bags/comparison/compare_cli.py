@@ -175,7 +175,7 @@ def _print(result: Comparison, answer: Answer, content: dict[str, Any], designs:
     else:
         console.print(f"Not paired: {content['paired']['reason']}.")
     for note in result.left_out:
-        console.print(note, style="yellow", highlight=False)
+        console.print(note, style="yellow", highlight=False, markup=False)
     if designs:
         console.print(designs_table(designs))
     print_answer(console, answer, result.verdict, emulated=result.is_emulated)

@@ -322,7 +322,7 @@ def _print_summary(console: Console, summary: dict[str, Any]) -> None:
     if warning := timing_warning(plants):
         console.print(warning, style="bold red")
     for note in summary["left_out"]:
-        console.print(note, style="yellow")
+        console.print(note, style="yellow", markup=False)
 
 
 def _cell(value: Any, form: str) -> str:
