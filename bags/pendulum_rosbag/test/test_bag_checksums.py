@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import json
 import struct
 import threading
 from pathlib import Path
 
 import pytest
+from mcap.writer import CompressionType
+from mcap.writer import Writer as McapLibraryWriter
 
 from pendulum_msgs_py.contract.cdr import encode_joint_state
 from pendulum_msgs_py.errors import BagError
@@ -265,3 +268,36 @@ def test_an_index_that_names_what_is_not_there_is_told_with_file_chunk_topic_and
                 read(read_bag(bag, **span))
             assert str(told.value) == sentence
     assert repair_bag(bag, tmp_path / "repaired").damage == [sentence.removeprefix(f"{bag}/")]
+
+
+def test_info_notes_what_no_checksum_covers(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    def library_file(name: str, **how: bool) -> Path:
+        with (tmp_path / name).open("wb") as stream:
+            writer = McapLibraryWriter(stream, chunk_size=1000, compression=CompressionType.ZSTD, **how)
+            writer.start("ros2", "test")
+            channel = writer.register_channel("/a", "cdr", writer.register_schema(JOINT_STATE, "ros2msg", b""))
+            for index in range(60):
+                writer.add_message(channel, index, encode_joint_state(index), index)
+            writer.finish()
+        return tmp_path / name
+
+    with open_writer(tmp_path / "sqlite", "sqlite3") as writer:
+        writer.add_topic("/a", JOINT_STATE)
+        writer.write("/a", 1, encode_joint_state(1))
+    end = ", so bytes that changed in messages cannot be told"
+    bare = library_file("bare.mcap", enable_crcs=False)
+    chunks = len(McapSource(bare).chunks)
+    assert chunks > 3
+    for bag, notes in (
+        (bare, [f"bare.mcap: {chunks} of {chunks} chunks have no checksum{end}"]),
+        (library_file("loose.mcap", use_chunking=False), [f"loose.mcap: messages outside of chunks have no checksum{end}"]),
+        (tmp_path / "sqlite", [f"sqlite_0.db3: a database has no checksums{end}"]),
+        (library_file("sound.mcap"), []),
+        (library_file("scanned.mcap", use_statistics=False), []),
+        (write(tmp_path / "ours", None, close=False, count=3000), []),
+    ):
+        assert info_main([str(bag)]) == 0
+        printed = capsys.readouterr().out.splitlines()
+        assert [line for line in printed if line.startswith(("note", "damaged"))] == [f"note: {note}" for note in notes]
+        assert info_main([str(bag), "--json"]) == 0
+        assert json.loads(capsys.readouterr().out)["notes"] == notes

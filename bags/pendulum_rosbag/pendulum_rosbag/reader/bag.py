@@ -44,6 +44,7 @@ class Bag(Mapping[str, Any]):
         topics: Topic name -> :class:`TopicInfo`.
         metadata: Run metadata (``custom_data``), values parsed where they are JSON.
         damage: What is wrong with the bag, one sentence per file; empty for a healthy one.
+        notes: What reading cannot find out, one sentence per file that has no checksums.
     """
 
     def __init__(
@@ -60,6 +61,11 @@ class Bag(Mapping[str, Any]):
         self.damage = [
             *folder.damage,
             *(f"{source.path.name}: {source.damage}" for source in sources if source.damage),
+        ]
+        self.notes = [
+            f"{source.path.name}: {source.unchecked}, so bytes that changed in messages cannot be told"
+            for source in sources
+            if source.unchecked
         ]
         self._sources = list(sources)
         self._span = (start, stop)

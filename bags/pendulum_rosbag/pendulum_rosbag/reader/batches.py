@@ -123,6 +123,7 @@ class Source(Protocol):
     stop_ns: int
     damage: str
     unclosed: bool
+    unchecked: str
 
     def batches(self, channels: set[int], start: int | None, stop: int | None) -> Iterator[Batch]:
         """Yield all messages of some channels with start <= log time < stop, in the order of the file."""

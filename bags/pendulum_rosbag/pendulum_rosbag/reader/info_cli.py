@@ -29,14 +29,14 @@ def info(
     opened = read_bag(bag, verify=True)
     statistics = bag_statistics(opened)
     if as_json:
-        document = dataclasses.asdict(statistics) | {"metadata": opened.metadata}
+        document = dataclasses.asdict(statistics) | {"metadata": opened.metadata, "notes": opened.notes}
         print(json.dumps(_without_nan(document), indent=2))
         return 0
-    _print(statistics, opened.metadata)
+    _print(statistics, opened.metadata, opened.notes)
     return 0
 
 
-def _print(statistics: BagStatistics, metadata: dict[str, Any]) -> None:
+def _print(statistics: BagStatistics, metadata: dict[str, Any], notes: list[str]) -> None:
     console = make_console()
     console.print(
         f"{statistics.path} ({statistics.storage}): {statistics.count} messages in {statistics.duration:.3f} s",
@@ -45,6 +45,8 @@ def _print(statistics: BagStatistics, metadata: dict[str, Any]) -> None:
     )
     for sentence in statistics.damage:
         console.print(f"damaged: {sentence}", style="bold red", highlight=False, soft_wrap=True)
+    for sentence in notes:
+        console.print(f"note: {sentence}", highlight=False, soft_wrap=True, markup=False)
     # One line a topic for the rate, one table for what can be wrong with it.
     title = "topics (intervals between stamps, or log times, in ms)"
     table = WholeTable("topic", "type", "by", title=title, title_justify="left")

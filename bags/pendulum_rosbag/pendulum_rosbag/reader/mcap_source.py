@@ -98,6 +98,14 @@ class McapSource:
                 self._scan(str(error).removeprefix(f"{path}: "))  # (whoever tells the damage names the file)
         self.compressed = any(chunk.compression for chunk in self.chunks)
         self.streams = [self._stream(channel) for channel in sorted(self._channels)]
+        self.unchecked = self._without_checksums()
+
+    def _without_checksums(self) -> str:
+        """Return what of the file no checksum covers, in words; empty where all of it has one."""
+        bare = sum(not chunk.crc for chunk in self.chunks)
+        if self._loose:
+            return "messages outside of chunks have no checksum"
+        return f"{bare} of {len(self.chunks)} chunks have no checksum" if bare else ""
 
     def extras(self) -> list[Attachment | Metadata]:
         """Return attachments and metadata that others than the recorder put into the file."""
@@ -328,6 +336,8 @@ class McapSource:
             records, end = records_in(raw)
             if end != len(raw):
                 raise _DamagedError("a record does not fit its chunk")
+            chunk.crc = crc
+            self._checksums.sound.add(chunk.offset)
         except (_DamagedError, BagError, struct.error, UnicodeDecodeError):
             self.damage = self.damage or f"the chunk at byte {body - _HEAD} is not whole"
             return

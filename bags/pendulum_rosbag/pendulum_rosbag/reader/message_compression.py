@@ -35,6 +35,7 @@ class UnpackedSource:
         self.stop_ns = packed.stop_ns
         self.damage = packed.damage
         self.unclosed = packed.unclosed
+        self.unchecked = packed.unchecked
 
     def batches(self, channels: set[int], start: int | None, stop: int | None) -> Iterator[Batch]:
         """Yield all messages of some channels with start <= log time < stop, in the order of the file.

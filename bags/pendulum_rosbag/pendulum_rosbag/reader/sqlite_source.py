@@ -40,6 +40,7 @@ class SqliteSource:
 
     compressed = False
     unclosed = False
+    unchecked = "a database has no checksums"
 
     def __init__(self, path: Path) -> None:
         self.path = path
