@@ -290,7 +290,10 @@ def test_info_notes_what_no_checksum_covers(tmp_path: Path, capsys: pytest.Captu
     assert chunks > 3
     for bag, notes in (
         (bare, [f"bare.mcap: {chunks} of {chunks} chunks have no checksum{end}"]),
-        (library_file("loose.mcap", use_chunking=False), [f"loose.mcap: messages outside of chunks have no checksum{end}"]),
+        (
+            library_file("loose.mcap", use_chunking=False),
+            [f"loose.mcap: messages outside of chunks have no checksum{end}"],
+        ),
         (tmp_path / "sqlite", [f"sqlite_0.db3: a database has no checksums{end}"]),
         (library_file("sound.mcap"), []),
         (library_file("scanned.mcap", use_statistics=False), []),
