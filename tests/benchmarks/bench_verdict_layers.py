@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import subprocess
 import sys
 import tempfile
@@ -358,7 +359,12 @@ def ranking_rows(seeds: int = 2) -> Iterator[Row]:
     )
     yield measured(
         f"{what}: regret of the simulation's pick",
-        100.0 * regret["value"] / found["hw"][0],
+        # A pick that fails on the hardware costs more than any number.
+        100.0 * (math.inf if regret["value"] is None else regret["value"] / found["hw"][0]),
         "% of the best",
-        note=f"{regret['low']:.3g} to {regret['high']:.3g}; picks {found['pick']}, best is {found['best']}",
+        note=f"{_number(regret['low'])} to {_number(regret['high'])}; picks {found['pick']}, best is {found['best']}",
     )
+
+
+def _number(value: float | None) -> str:
+    return "unknown" if value is None else f"{value:.3g}"
