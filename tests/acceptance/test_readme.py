@@ -66,7 +66,8 @@ def test_command_of_a_page_runs(
     root = tmp_path / "root"
     root.mkdir()
     for entry in PROJECT.iterdir():
-        (root / entry.name).symlink_to(entry)
+        if entry.name != "build":
+            (root / entry.name).symlink_to(entry)
     done = subprocess.run(
         command, shell=True, cwd=root, env=environment, capture_output=True, text=True, timeout=150, check=False
     )
