@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import random
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -12,9 +13,17 @@ from rosbags.highlevel import AnyReader
 
 from pendulum_rosbag.reader import Bag, canonical
 from pendulum_rosbag.reader.joint_state import layout_of
-from pendulum_rosbag.storage import typestore
+from pendulum_rosbag.storage import open_writer, typestore
 
-__all__ = ["JOINT_STATE", "STORE", "as_rclpy_leaves_it", "assert_equals_rosbags", "joint_state", "mixed_messages"]
+__all__ = [
+    "JOINT_STATE",
+    "STORE",
+    "as_rclpy_leaves_it",
+    "assert_equals_rosbags",
+    "joint_state",
+    "mixed_messages",
+    "write_bag",
+]
 
 JOINT_STATE = "sensor_msgs/msg/JointState"
 STORE = typestore()
@@ -86,3 +95,42 @@ def assert_equals_rosbags(bag: Bag, path: Path) -> None:
             assert array["frame_id"].tolist() == frames
         else:
             assert "frame_id" not in (array.dtype.names or ())
+
+
+def write_bag(
+    path: Path,
+    messages: Iterable[tuple[str, int, bytes]],
+    storage: str = "mcap",
+    compression: str | None = None,
+    metadata: Mapping[str, Any] | None = None,
+    *,
+    seal_every: int,
+    close: bool = True,
+) -> Path:
+    """Write joint states with our writer, sealed after every so many; closed, or left as a killed recorder leaves it.
+
+    Args:
+        path: Folder of the bag.
+        messages: Topic, log time [ns] and CDR of each.
+        storage: ``mcap`` or ``sqlite3``.
+        compression: Of the storage.
+        metadata: By name.
+        seal_every: Messages between two seals.
+        close: Whether the bag is closed.
+
+    Returns:
+        The folder.
+    """
+    written = list(messages)
+    writer = open_writer(path, storage, compression, metadata)
+    for topic in sorted({topic for topic, _, _ in written}):
+        writer.add_topic(topic, JOINT_STATE)
+    for number, message in enumerate(written, start=1):
+        writer.write(*message)
+        if number % seal_every == 0:
+            writer.seal()
+    if close:
+        writer.close()
+    else:
+        writer.abandon()
+    return path

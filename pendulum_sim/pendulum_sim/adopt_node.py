@@ -6,7 +6,6 @@ import math
 import time
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
 
 from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
@@ -94,8 +93,12 @@ class AdoptNode(Node):
         late = plant.transport_delay + _LATENESS * values["period"]
         self._servo = PositionServo(plant.with_values(transport_delay=late), values["period"])
         self._clock_ns = SteadyWallClock()
-        limits = limits_from_parameters(values, plant.effort_limit, feedback_timeout=values["state_timeout"])
-        limits = replace(limits, command_timeout=max(limits.command_timeout, _LATENESS * values["period"]))
+        limits = limits_from_parameters(
+            values,
+            plant.effort_limit,
+            feedback_timeout=values["state_timeout"],
+            least_command_timeout=_LATENESS * values["period"],
+        )
         self._supervisor = PlantSupervisor(limits, preflight=self._preflight)
         self._odd: Counter[str] = Counter()
         self._lines = Throttle(1.0)
@@ -147,9 +150,8 @@ class AdoptNode(Node):
     def _answer(self, drive: Drive, sample: JointSample | None) -> None:
         effort = drive.effort
         if drive.kind is DriveKind.POSITION and sample is not None:
-            wanted = self._servo.effort(sample.position, sample.velocity, drive.position, drive.velocity)
             limit = self._supervisor.limits.effort
-            effort = min(limit, max(-limit, wanted))
+            effort = self._servo.effort(sample.position, sample.velocity, drive.position, drive.velocity, limit=limit)
         others = self.count_publishers(self._settings.values["commands"]) - 1
         if others > 0 and self._supervisor.mode.armed:
             self._supervisor.fault(self._not_alone(others), self._clock_ns())

@@ -56,7 +56,9 @@ class PositionServo:
         self._gain = gain
         self._parameters = parameters
 
-    def effort(self, theta: float, theta_dot: float, position: float, velocity: float) -> float:
+    def effort(
+        self, theta: float, theta_dot: float, position: float, velocity: float, *, limit: float = math.inf
+    ) -> float:
         """Return the torque that follows a reference [N m].
 
         Args:
@@ -64,6 +66,7 @@ class PositionServo:
             theta_dot: Velocity [rad/s].
             position: Wanted angle [rad].
             velocity: Wanted velocity [rad/s].
+            limit: Largest torque that is allowed, where it is lower than the plant's own [N m].
         """
         parameters = self._parameters
         weight = gravity_torque(theta - parameters.angle_offset, parameters.gravity)
@@ -73,5 +76,5 @@ class PositionServo:
             + self._stiffness * (position - theta)
             + self._damping * (velocity - theta_dot)
         )
-        limit = parameters.effort_limit
+        limit = min(limit, parameters.effort_limit)
         return min(limit, max(-limit, wanted))

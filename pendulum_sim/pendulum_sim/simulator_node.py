@@ -89,9 +89,9 @@ class SimulatorNode(PollingNode):
             sensor_noise, **{spec.name: values[_SENSOR_PREFIX + spec.name] for spec in SENSOR_SPECS}
         )
         self._statistics = LoopStatistics(period_ns)
-        limits = limits_from_parameters(values, parameters.effort_limit)
         # Where a file's timestep makes periods as long as that, each command would be too old when it is applied.
-        limits = replace(limits, command_timeout=max(limits.command_timeout, _LEAST_PERIODS * self._dt))
+        least = _LEAST_PERIODS * self._dt
+        limits = limits_from_parameters(values, parameters.effort_limit, least_command_timeout=least)
         self._supervisor = PlantSupervisor(limits, preflight=self._preflight)
         self._lockstep = values["clock"] == "lockstep"
         self._wall = wall = SteadyWallClock()
@@ -157,9 +157,8 @@ class SimulatorNode(PollingNode):
         effort = drive.effort
         if drive.kind is DriveKind.POSITION:
             # The servo knows the weight it carries, so the hand-over's feed-forward would count it twice.
-            wanted = self._servo.effort(self._state.theta, self._state.theta_dot, drive.position, drive.velocity)
-            limit = self._supervisor.limits.effort
-            effort = min(limit, max(-limit, wanted))
+            state, limit = self._state, self._supervisor.limits.effort
+            effort = self._servo.effort(state.theta, state.theta_dot, drive.position, drive.velocity, limit=limit)
         try:
             problem = self._step(effort, drive.push, stamp_ns)
         except FaultError as error:

@@ -9,59 +9,34 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from diagnostic_msgs.msg import DiagnosticArray
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64MultiArray
-from std_srvs.srv import SetBool, Trigger
 from trajectory_msgs.msg import JointTrajectory
 
 from pendulum_msgs_py.contract import names
 from pendulum_msgs_py.contract.trajectory import from_points
 from pendulum_msgs_py.ros import qos
 from pendulum_msgs_py.ros.convert import stamp_from_message, trajectory_to_message
-from tests.graph_peer import GraphPeer
+from tests.plant_peer import PlantPeer
 from tests.processes import ProcessGroup, RunningProgram
 
 ROBOT = Path(__file__).with_name("plain_plant.py")
 EFFORTS = "/robot/effort_controller/commands"
 
 
-class Peer(GraphPeer):
+class Peer(PlantPeer):
     """Controller and listener in the adopted plant's namespace; hears what the robot is sent, too."""
 
     def __init__(self) -> None:
-        super().__init__("peer", namespace="/sim")
-        self.states: list[JointState] = []
+        super().__init__("/sim")
         self.sent: list[float] = []
-        self.diagnostics: dict[str, str] = {}
-        self.torque: float | None = None
         self.program: RunningProgram | None = None
-        self._commands = self.node.create_publisher(JointState, names.EFFORT_COMMAND, qos.COMMAND)
         self.moves = self.node.create_publisher(JointTrajectory, names.JOINT_TRAJECTORY, qos.TRAJECTORY)
-        self.node.create_subscription(JointState, names.JOINT_STATES, self._on_state, qos.STATE)
         self.node.create_subscription(Float64MultiArray, EFFORTS, lambda message: self.sent.append(message.data[1]), 10)
-        self.node.create_subscription(DiagnosticArray, names.DIAGNOSTICS, self._on_diagnostics, 10)
-
-    def _on_state(self, message: JointState) -> None:
-        self.states.append(message)
-        if self.torque is not None:
-            answer = JointState(name=[names.JOINT], effort=[self.torque])
-            answer.header.stamp, answer.header.frame_id = message.header.stamp, "peer"
-            self._commands.publish(answer)
-
-    def _on_diagnostics(self, message: DiagnosticArray) -> None:
-        for status in message.status:
-            self.diagnostics = {pair.key: pair.value for pair in status.values}
 
     def known(self) -> str:
         said = "" if self.program is None else f"; it said:\n{self.program.output[-2000:]}"
-        return f"; diagnostics {self.diagnostics}, sent {self.sent[-3:]}{said}"
-
-    def ask(self, service: str) -> Trigger.Response:
-        return self.call(Trigger, f"simulator/{service}", Trigger.Request())
-
-    def arm(self, on: bool = True) -> SetBool.Response:
-        return self.call(SetBool, "simulator/arm", SetBool.Request(data=on))
+        return f"{super().known()}, sent {self.sent[-3:]}{said}"
 
 
 @pytest.fixture

@@ -6,55 +6,28 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from diagnostic_msgs.msg import DiagnosticArray
 from sensor_msgs.msg import JointState
-from std_srvs.srv import SetBool, Trigger
 
 from pendulum_msgs_py.contract import names
 from pendulum_msgs_py.plants.plant_parameters import load_plant
 from pendulum_msgs_py.ros import qos
 from pendulum_msgs_py.ros.convert import stamp_from_message
 from pendulum_sim.model_files import mjcf
-from tests.graph_peer import GraphPeer
+from tests.plant_peer import PlantPeer
 from tests.processes import ProcessGroup, RunningProgram
 
 pytest.importorskip("mujoco")
 
 
-class Peer(GraphPeer):
-    """Controller, listener and client of one simulator."""
+class Peer(PlantPeer):
+    """Controller, listener and client of one simulator; hears the torques that it applies, too."""
 
     def __init__(self) -> None:
-        super().__init__("peer")
-        self.states: list[JointState] = []
+        super().__init__(torque=0.0)
         self.applied: list[float] = []
-        self.diagnostics: dict[str, str] = {}
-        self.torque = 0.0
-        self._commands = self.node.create_publisher(JointState, names.EFFORT_COMMAND, qos.COMMAND)
-        self.node.create_subscription(JointState, names.JOINT_STATES, self._on_state, qos.STATE)
         self.node.create_subscription(
             JointState, names.APPLIED_EFFORT, lambda message: self.applied.append(message.effort[0]), qos.STATE
         )
-        self.node.create_subscription(DiagnosticArray, names.DIAGNOSTICS, self._on_diagnostics, 10)
-
-    def _on_state(self, message: JointState) -> None:
-        self.states.append(message)
-        answer = JointState(name=[names.JOINT], effort=[self.torque])
-        answer.header.stamp, answer.header.frame_id = message.header.stamp, "peer"
-        self._commands.publish(answer)
-
-    def _on_diagnostics(self, message: DiagnosticArray) -> None:
-        for status in message.status:
-            self.diagnostics = {pair.key: pair.value for pair in status.values}
-
-    def known(self) -> str:
-        return f"; diagnostics {self.diagnostics}"
-
-    def ask(self, service: str) -> Trigger.Response:
-        return self.call(Trigger, f"simulator/{service}", Trigger.Request())
-
-    def arm(self, on: bool) -> SetBool.Response:
-        return self.call(SetBool, "simulator/arm", SetBool.Request(data=on))
 
 
 @pytest.fixture

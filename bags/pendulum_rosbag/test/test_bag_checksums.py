@@ -20,8 +20,8 @@ from pendulum_rosbag.reader.mcap_source import McapSource
 from pendulum_rosbag.repair.repair import repair_bag
 from pendulum_rosbag.storage import mcap_records as rec
 from pendulum_rosbag.storage import open_writer
+from tests.bag_messages import JOINT_STATE, write_bag
 
-JOINT_STATE = "sensor_msgs/msg/JointState"
 TOPICS = ("/a", "/b", "/c")
 COUNT = 30_000
 
@@ -33,18 +33,11 @@ def sound(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFacto
 
 
 def write(path: Path, compression: str | None, *, close: bool = True, count: int = COUNT) -> Path:
-    writer = open_writer(path, "mcap", compression)
-    for topic in TOPICS:
-        writer.add_topic(topic, JOINT_STATE)
-    for index in range(count):
-        writer.write(TOPICS[index % 3], 1_000_000 * index, encode_joint_state(index, position=0.5 * index))
-        if index % 3000 == 2999:
-            writer.seal()
-    if close:
-        writer.close()
-    else:
-        writer.abandon()
-    return path
+    states = (
+        (TOPICS[index % 3], 1_000_000 * index, encode_joint_state(index, position=0.5 * index))
+        for index in range(count)
+    )
+    return write_bag(path, states, compression=compression, seal_every=3000, close=close)
 
 
 def with_flip(bag: Path, target: Path, at: int) -> Path:
@@ -157,15 +150,8 @@ def test_chunks_of_a_file_that_was_not_closed_are_compared_when_it_is_opened(tmp
 
 def test_a_changed_summary_of_a_file_that_was_not_closed_is_told(tmp_path: Path) -> None:
     """Any byte of it: a name, a type, a count, a time."""
-    bag = tmp_path / "bag"
-    writer = open_writer(bag)
-    for topic in TOPICS:
-        writer.add_topic(topic, JOINT_STATE)
-    for index in range(30):
-        writer.write(TOPICS[index % 3], index, encode_joint_state(index))
-        if index % 10 == 9:
-            writer.seal()
-    writer.abandon()
+    states = ((TOPICS[index % 3], index, encode_joint_state(index)) for index in range(30))
+    bag = write_bag(tmp_path / "bag", states, seal_every=10, close=False)
     (file,) = bag.glob("*.mcap")
     content = file.read_bytes()
     summary = int.from_bytes(content[-28:-20], "little")

@@ -17,26 +17,19 @@ from pendulum_rosbag.reader import read_bag
 from pendulum_rosbag.reader.mcap_source import McapSource
 from pendulum_rosbag.repair.repair import repair_bag
 from pendulum_rosbag.storage import open_writer
+from tests.bag_messages import JOINT_STATE, write_bag
 
-JOINT_STATE = "sensor_msgs/msg/JointState"
 TOPICS = ("/a", "/b")
 COUNT = 60
 """Messages of each topic."""
 
 
 def write(path: Path, storage: str = "mcap", compression: str | None = None, *, close: bool = True) -> Path:
-    writer = open_writer(path, storage, compression)
-    for topic in TOPICS:
-        writer.add_topic(topic, JOINT_STATE)
-    for index in range(2 * COUNT):
-        writer.write(TOPICS[index % 2], 10**9 + 1000 * index, encode_joint_state(index, position=0.5 * index))
-        if index % 40 == 39:
-            writer.seal()
-    if close:
-        writer.close()
-    else:
-        writer.abandon()
-    return path
+    states = (
+        (TOPICS[index % 2], 10**9 + 1000 * index, encode_joint_state(index, position=0.5 * index))
+        for index in range(2 * COUNT)
+    )
+    return write_bag(path, states, storage, compression, seal_every=40, close=close)
 
 
 def rows(bag: Path, **how: bool) -> dict[str, list[tuple[int, bytes]]]:

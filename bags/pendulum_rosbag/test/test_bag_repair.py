@@ -29,9 +29,9 @@ from pendulum_rosbag.reader.statistics import bag_statistics
 from pendulum_rosbag.repair.repair import repair_bag
 from pendulum_rosbag.repair.repair_cli import main as repair_main
 from pendulum_rosbag.storage import open_writer, typestore
+from tests.bag_messages import JOINT_STATE, write_bag
 from tests.mcap_js_reader import McapJs
 
-JOINT_STATE = "sensor_msgs/msg/JointState"
 TOPICS = ("/a", "/b", "/c")
 
 
@@ -40,18 +40,8 @@ def state(index: int) -> bytes:
 
 
 def our_bag(path: Path, storage: str, *, close: bool = True) -> Path:
-    writer = open_writer(path, storage, metadata={"seed": 5})
-    for topic in TOPICS:
-        writer.add_topic(topic, JOINT_STATE)
-    for index in range(3000):
-        writer.write(TOPICS[index % 3], index, state(index))
-        if index % 100 == 99:
-            writer.seal()
-    if close:
-        writer.close()
-    else:
-        writer.abandon()
-    return path
+    states = ((TOPICS[index % 3], index, state(index)) for index in range(3000))
+    return write_bag(path, states, storage, metadata={"seed": 5}, seal_every=100, close=close)
 
 
 def rosbags_bag(path: Path, storage: str) -> Path:

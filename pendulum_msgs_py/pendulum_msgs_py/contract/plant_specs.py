@@ -136,7 +136,11 @@ LIMIT_SPECS: tuple[ParameterSpec, ...] = (
 
 
 def limits_from_parameters(
-    values: Mapping[str, object], plant_effort_limit: float, *, feedback_timeout: float = float("inf")
+    values: Mapping[str, object],
+    plant_effort_limit: float,
+    *,
+    feedback_timeout: float = float("inf"),
+    least_command_timeout: float = 0.0,
 ) -> PlantLimits:
     """Return the limits that the parameters of ``LIMIT_SPECS`` describe.
 
@@ -144,6 +148,7 @@ def limits_from_parameters(
         values: Parameter values by name.
         plant_effort_limit: Effort limit of the plant file [N m]; the parameter can only lower it.
         feedback_timeout: Age of a measurement that faults an armed plant [s].
+        least_command_timeout: The shortest that the plant's own period allows; a shorter one is raised to it [s].
 
     Raises:
         ParameterError: They contradict each other or the plant.
@@ -167,7 +172,7 @@ def limits_from_parameters(
     bounded = window[0] != window[1]
     return PlantLimits(
         effort=number("effort_limit") or plant_effort_limit,
-        command_timeout=number("command_timeout"),
+        command_timeout=max(number("command_timeout"), least_command_timeout),
         feedback_timeout=feedback_timeout,
         velocity=number("velocity_limit") or unlimited,
         position_min=window[0] if bounded else -unlimited,

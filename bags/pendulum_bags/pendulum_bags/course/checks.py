@@ -166,7 +166,7 @@ def check_fault(tasks: Tasks, bag: Path) -> Judgement:
         if topic not in content.topics:
             raise DataError(f"bag {bag} has no topic {topic}; expected it, since it shows the torque")
         applied = content.array(topic)
-    modes = [event for event in events if event["name"] == "plant_mode"]
+    modes = [event for event in events if event["name"] == names.Event.PLANT_MODE]
     index = next((i for i, event in enumerate(modes) if event.get("mode") == "fault"), None)
     if index is None:
         seen = ", ".join(str(event.get("mode")) for event in modes) or "none"

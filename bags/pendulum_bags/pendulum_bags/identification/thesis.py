@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from scipy import stats
 
 from pendulum_bags.runs.datasets import Recording
+from pendulum_msgs_py.contract.names import Event
 from pendulum_msgs_py.errors import DataError
 
 __all__ = [
@@ -37,7 +38,7 @@ RECORD_SKEW = 0.5e-3
 """Time between two quantities of one record of an actuator: half a cycle of its firmware, which runs at 1 kHz [s]."""
 
 _HOLD_EVENTS = ("static", "hold")
-_TRIAL_EVENTS = ("trial_start", "trial_end")
+_TRIAL_EVENTS = (Event.TRIAL_START, Event.TRIAL_END)
 
 
 @dataclass(frozen=True)
@@ -329,8 +330,8 @@ def _share(regression: Regression) -> float:
 def trial_part(recording: Recording) -> Recording:
     """Return what lies between the events ``trial_start`` and ``trial_end``; all of it without such events."""
     times = {name: time for time, name, _ in recording.meta.get("phases") or [] if name in _TRIAL_EVENTS}
-    start = times.get("trial_start", float(recording.time[0]))
-    stop = times.get("trial_end", float(recording.time[-1]) + 1.0)
+    start = times.get(Event.TRIAL_START, float(recording.time[0]))
+    stop = times.get(Event.TRIAL_END, float(recording.time[-1]) + 1.0)
     return recording.between(start, stop) if times else recording
 
 
