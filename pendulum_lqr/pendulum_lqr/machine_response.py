@@ -12,8 +12,8 @@ from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy.interpolate import CubicSpline
 
 from pendulum_lqr.measured_response import MeasuredResponse
 
@@ -105,12 +105,12 @@ def _between(measured: MeasuredResponse, radius: Array) -> tuple[Array, Complex,
     relative = radius / np.abs(measured.response)
     values, errors = [], []
     for curve in (inverse, ratio):
-        spline = CubicSpline(lines, curve)(grid)
+        spline = scipy.interpolate.CubicSpline(lines, curve)(grid)
         values.append(spline)
         left_out = np.zeros(lines.size)
         for i in range(1, lines.size - 1):
             others = np.delete(np.arange(lines.size), i)
-            left_out[i] = abs(CubicSpline(lines[others], curve[others])(lines[i]) / curve[i] - 1.0)
+            left_out[i] = abs(scipy.interpolate.CubicSpline(lines[others], curve[others])(lines[i]) / curve[i] - 1.0)
         left_out[0], left_out[-1] = left_out[1], left_out[-2]
         errors.append(_LEFT_OUT * left_out)
     on_line = np.isin(grid, lines)

@@ -10,8 +10,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy import stats
 
 from pendulum_msgs_py.errors import DataError, ParameterError
 
@@ -78,7 +78,7 @@ class MeasuredResponse:
             joint: Whether all discs together are meant (Bonferroni), or each for itself.
         """
         tail = (1.0 - confidence) / (2 * self.frequency.size if joint else 1)
-        quantile = float(stats.f.isf(tail, 2.0, 2.0 * (self.blocks - 1.0)))
+        quantile = float(scipy.stats.f.isf(tail, 2.0, 2.0 * (self.blocks - 1.0)))
         return np.sqrt(quantile) * self.deviation
 
     def to_json(self) -> dict[str, Any]:

@@ -9,8 +9,7 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-import scipy.linalg
-import scipy.optimize
+import scipy
 from numpy.typing import ArrayLike, NDArray
 
 from pendulum_lqr.design import DesignError, cost_matrices

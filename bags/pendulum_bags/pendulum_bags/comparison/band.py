@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
-from scipy import signal
-from scipy.interpolate import CubicSpline
+import scipy
 
 from pendulum_bags.runs.series import Array, Series, uniform_times
 from pendulum_msgs_py.errors import DataError
@@ -56,7 +55,7 @@ class SlowClock:
             share = (self._even - self._index[left]) / (self._index[left + 1] - self._index[left])
             share = share.reshape(-1, *(1,) * (values.ndim - 1))
             values = (1.0 - share) * values[left] + share * values[left + 1]
-        return np.asarray(signal.sosfiltfilt(self._sections, values, axis=0, padlen=self._reach))
+        return np.asarray(scipy.signal.sosfiltfilt(self._sections, values, axis=0, padlen=self._reach))
 
 
 class BandLimited:
@@ -80,8 +79,8 @@ class BandLimited:
         reach = min(times.size - 1, int(np.ceil(3.0 * rate / band)))
         even = series.interpolated(times)
         columns = np.stack([even.position, even.velocity, even.effort], axis=1)
-        filtered = signal.sosfiltfilt(sections, columns, axis=0, padlen=reach)
-        self._curve = CubicSpline(times, filtered, axis=0)
+        filtered = scipy.signal.sosfiltfilt(sections, columns, axis=0, padlen=reach)
+        self._curve = scipy.interpolate.CubicSpline(times, filtered, axis=0)
         self._ends = float(times[0]), float(times[-1])
 
     def at(self, times: Array) -> tuple[Array, Array, Array]:
@@ -93,4 +92,4 @@ class BandLimited:
 def _sections(band: float, rate: float, name: str) -> Array:
     if not 0.0 < band < 0.5 * rate:
         raise DataError(f"{name} has {rate:.4g} Hz; expected more than {2.0 * band:g} Hz for its band")
-    return np.asarray(signal.butter(_ORDER, band, fs=rate, output="sos"))
+    return np.asarray(scipy.signal.butter(_ORDER, band, fs=rate, output="sos"))

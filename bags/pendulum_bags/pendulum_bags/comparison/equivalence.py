@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from enum import Enum
 from typing import Any
 
-from scipy import stats
+import scipy
 
 from pendulum_bags.comparison.margins import Margins
 from pendulum_bags.comparison.statistics import Interval
@@ -131,8 +131,8 @@ def equivalence_test(
     smallest = math.exp(farthest) if ratio else farthest
     more: int | None = 0
     if outcome is Outcome.UNDECIDED:
-        error = max(right - left, 0.0) / (2.0 * float(stats.norm.ppf(0.5 + 0.5 * interval.level)))
-        reach = float(stats.norm.ppf(0.5 + 0.5 * interval.level))
+        error = max(right - left, 0.0) / (2.0 * float(scipy.stats.norm.ppf(0.5 + 0.5 * interval.level)))
+        reach = float(scipy.stats.norm.ppf(0.5 + 0.5 * interval.level))
         more = _runs_to_decide(estimate, bottom, top, error, runs, reach)
     return EquivalenceTest(quantity, unit, interval, low, high, outcome, more, smallest)
 
@@ -180,8 +180,8 @@ def _power(estimate: float, bottom: float, top: float, error: float, reach: floa
     inside, below, above = (estimate - bottom, top - estimate), bottom - estimate, estimate - top
     if error <= 0.0:
         return float(min(inside) > 0.0 or below > 0.0 or above > 0.0)
-    equivalent = sum(float(stats.norm.cdf(distance / error - reach)) for distance in inside) - 1.0
-    different = sum(float(stats.norm.cdf(distance / error - reach)) for distance in (below, above))
+    equivalent = sum(float(scipy.stats.norm.cdf(distance / error - reach)) for distance in inside) - 1.0
+    different = sum(float(scipy.stats.norm.cdf(distance / error - reach)) for distance in (below, above))
     return max(equivalent, 0.0) + different
 
 

@@ -12,7 +12,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.interpolate import CubicSpline
+import scipy
 
 from pendulum_bags.comparison.band import BandLimited, SlowClock, common_band
 from pendulum_bags.comparison.equivalence import EquivalenceTest, equivalence_test
@@ -181,8 +181,8 @@ class _Seen:
         times = self.clock.times
         moving, still = (self.hardware, self.simulation) if self.is_slower else (self.simulation, self.hardware)
         grid = times[:, None] + (1.0 if self.is_slower else -1.0) * lags[None, :]
-        values = CubicSpline(moving.t, moving.velocity)(np.clip(grid, moving.t[0], moving.t[-1]))
-        own = CubicSpline(still.t, still.velocity)(times)[:, None]
+        values = scipy.interpolate.CubicSpline(moving.t, moving.velocity)(np.clip(grid, moving.t[0], moving.t[-1]))
+        own = scipy.interpolate.CubicSpline(still.t, still.velocity)(times)[:, None]
         return self.clock.filtered(values), self.clock.filtered(own)
 
     def columns(self, delay: float) -> Array:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy import signal
+import scipy
 
 from pendulum_bags.runs.series import Array, Series, shared_span, uniform_times
 
@@ -62,13 +62,13 @@ def spectra_of(first: Series, second: Series, segment: float = 1.0) -> Spectra:
         factor = max(1, round(period / one.period))
         fine = uniform_times(start, stop, period / factor)
         velocity = one.interpolated(fine).velocity
-        frequency, density = signal.welch(velocity, factor * rate, nperseg=factor * size)
+        frequency, density = scipy.signal.welch(velocity, factor * rate, nperseg=factor * size)
         densities.append(density[: size // 2 + 1])
-        reduced = signal.resample_poly(velocity - velocity.mean(), 1, factor) if factor > 1 else velocity
+        reduced = scipy.signal.resample_poly(velocity - velocity.mean(), 1, factor) if factor > 1 else velocity
         slow.append(reduced[: times.size])
     frequency = frequency[: size // 2 + 1]
     count = min(one.size for one in slow)
-    _, coherence = signal.coherence(slow[0][:count], slow[1][:count], rate, nperseg=size)
+    _, coherence = scipy.signal.coherence(slow[0][:count], slow[1][:count], rate, nperseg=size)
     count = (times.size - size) // (size - size // 2) + 1
     # Half-overlapping Hann windows share 1/6 of their power: Welch 1967, Bendat and Piersol section 11.5.
     effective = count / (1.0 + 2.0 * (1.0 / 6.0) ** 2 * (count - 1) / count) if count > 1 else 1.0

@@ -11,8 +11,8 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
+import scipy
 from numpy.typing import ArrayLike
-from scipy import stats
 
 from pendulum_bags.runs.correlation import autocorrelation, effective_size
 from pendulum_bags.runs.series import Array
@@ -255,7 +255,9 @@ def bootstrap_interval(resampled: Resampled, statistic: Callable[[Array], Array]
     low, high = np.quantile(draws, (seen, 1.0 - seen))
     variance, freedom = _variance_of(resampled, statistic, float(draws.var(ddof=1)))
     spread = max(float(draws.std(ddof=1)), 1e-300)
-    stretch = float(stats.t.ppf(1.0 - tail, freedom) / stats.norm.ppf(1.0 - seen)) * math.sqrt(variance) / spread
+    stretch = (
+        float(scipy.stats.t.ppf(1.0 - tail, freedom) / scipy.stats.norm.ppf(1.0 - seen)) * math.sqrt(variance) / spread
+    )
     error = math.sqrt(variance)
     return Interval(
         estimate,
@@ -311,7 +313,7 @@ def kolmogorov_smirnov(first: ArrayLike, second: ArrayLike) -> KolmogorovSmirnov
     sizes = effective_size(first), effective_size(second)
     root = math.sqrt(sizes[0] * sizes[1] / (sizes[0] + sizes[1]))
     # Stephens, JRSS B 32, 1970: this argument makes the asymptotic law good for small samples too.
-    p_value = float(stats.kstwobign.sf((root + 0.12 + 0.11 / root) * distance))
+    p_value = float(scipy.stats.kstwobign.sf((root + 0.12 + 0.11 / root) * distance))
     return KolmogorovSmirnov(distance, float(values[index]), sizes, p_value)
 
 

@@ -6,8 +6,8 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy import stats
 
 from pendulum_lqr.gap_metric import DEFAULT_SCALING, Scaling, chordal_distance, nu_gap
 from pendulum_lqr.machine_response import Machine
@@ -132,9 +132,9 @@ def compare_responses(
     # Welch and Satterthwaite: a sum of two estimated variances counts as one with so many degrees of freedom.
     freedom = variance**2 / (spread_one**4 / (first.blocks - 1.0) + spread_two**4 / (second.blocks - 1.0))
     excess = np.maximum(np.abs(two - moved) - SMALLEST * np.abs(moved), 0.0)
-    probability = stats.f.sf(excess**2 / variance, 2.0, 2.0 * freedom)
+    probability = scipy.stats.f.sf(excess**2 / variance, 2.0, 2.0 * freedom)
     tail = 0.05 / probability.size
-    quantile = np.sqrt(stats.f.isf(tail, 2.0, 2.0 * freedom))
+    quantile = np.sqrt(scipy.stats.f.isf(tail, 2.0, 2.0 * freedom))
     ratio = two[1] / moved[1]
     relative = np.sqrt(variance[1]) / np.abs(moved[1])
     gap, low, high = _gaps(moved, two, quantile * spread_one, quantile * spread_two, scaling)

@@ -7,8 +7,8 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy.interpolate import CubicSpline
 
 from pendulum_bags.experiments.in_process import RunArrays
 from pendulum_bags.runs.run_record import run_record
@@ -108,7 +108,12 @@ def record_of_run(run: RunData) -> Record:
         outputs = np.stack([run.window.position[:count], run.window.velocity[:count]])
     else:
         inside = np.minimum(raster, t[-1])
-        outputs = np.stack([CubicSpline(t, run.window.position)(inside), CubicSpline(t, run.window.velocity)(inside)])
+        outputs = np.stack(
+            [
+                scipy.interpolate.CubicSpline(t, run.window.position)(inside),
+                scipy.interpolate.CubicSpline(t, run.window.velocity)(inside),
+            ]
+        )
     disturbance = run_record(run.metadata).get("disturbance")
     return Record(
         run.label,

@@ -13,8 +13,8 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy import stats
 
 from pendulum_bags.runs.datasets import Recording
 from pendulum_msgs_py.contract.names import Event
@@ -316,7 +316,7 @@ def _average(trials: Sequence[Regression]) -> tuple[dict[str, float], dict[str, 
         if len(trials) > 1:
             # The trials' scatter sees what a regression's own error does not: correlated residuals, other hands.
             scatter = float(column.std(ddof=1) / np.sqrt(len(trials)))
-            half = max(half, float(stats.t.ppf(0.975, len(trials) - 1)) * scatter)
+            half = max(half, float(scipy.stats.t.ppf(0.975, len(trials) - 1)) * scatter)
         intervals[name] = (average[name] - half, average[name] + half)
     return average, intervals, sign
 

@@ -20,9 +20,9 @@ from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
+import scipy
 from numpy.typing import ArrayLike
 from rich.console import Console
-from scipy import stats
 
 from pendulum_bags.ranking.contender import Contender, Interval
 from pendulum_msgs_py.errors import DataError
@@ -84,7 +84,7 @@ def narrow(hardware: ArrayLike, simulation: ArrayLike, further: ArrayLike, level
         )
     tail = 0.5 + 0.5 * level
     mean = float(h.mean())
-    half = float(stats.t.ppf(tail, n - 1) * h.std(ddof=1) / math.sqrt(n))
+    half = float(scipy.stats.t.ppf(tail, n - 1) * h.std(ddof=1) / math.sqrt(n))
     alone = Interval(mean, mean - half, mean + half)
     every = np.concatenate([s, more])
     around = s - s.mean()
@@ -99,7 +99,7 @@ def narrow(hardware: ArrayLike, simulation: ArrayLike, further: ArrayLike, level
     variance = noise + rest
     freedom = variance**2 / (noise**2 / (n - 2) + rest**2 / (every.size - 1))
     value = mean + slope * shift
-    half = float(stats.t.ppf(tail, freedom)) * math.sqrt(variance)
+    half = float(scipy.stats.t.ppf(tail, freedom)) * math.sqrt(variance)
     together = Interval(value, value - half, value + half)
     return Narrowed(alone, together, n, more.size, float(np.corrcoef(h, s)[0, 1]))
 

@@ -18,8 +18,8 @@ from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy import stats
 
 from pendulum_bags.ranking.contender import PARTS, Contender, Interval, compared_runs, refuse_no_number
 from pendulum_bags.ranking.regret import regret_share
@@ -157,7 +157,7 @@ def rank(contenders: Sequence[Contender], generator: np.random.Generator | None 
         [float(raw["sim"][i]) for i in order],
         [float(raw["hw"][i]) for i in order],
         _pearson(raw["sim"][able], raw["hw"][able]),
-        float(stats.spearmanr(sim, hw).statistic),
+        float(scipy.stats.spearmanr(sim, hw).statistic),
         Interval(mmrv(sim, hw), float(low), float(high)),
         regret,
         share,
@@ -183,7 +183,7 @@ def _pearson(sim: Array, hw: Array) -> Interval:
     if sim.size < 4 or np.ptp(sim) == 0.0 or np.ptp(hw) == 0.0:
         value = float(np.corrcoef(sim, hw)[0, 1]) if sim.size > 1 and np.ptp(sim) and np.ptp(hw) else float("nan")
         return Interval(value, float("nan"), float("nan"))
-    found = stats.pearsonr(sim, hw)
+    found = scipy.stats.pearsonr(sim, hw)
     low, high = found.confidence_interval(0.95)
     return Interval(float(found.statistic), float(low), float(high))
 
@@ -220,7 +220,7 @@ def _pair(picked: Contender, better: Contender, sim: float, hw: float) -> WrongP
     a, b, paired = compared_runs(picked, better)
     sure = False
     if a.size > 1 and b.size > 1:
-        test = stats.ttest_rel(a, b) if paired else stats.ttest_ind(a, b, equal_var=False)
+        test = scipy.stats.ttest_rel(a, b) if paired else scipy.stats.ttest_ind(a, b, equal_var=False)
         sure = bool(test.pvalue < 0.05 and a.mean() > b.mean())
     change = (picked.parts("hw") - better.parts("hw")) - (picked.parts("sim") - better.parts("sim"))
     part = int(np.argmax(change))

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy.signal import savgol_filter
 
 from pendulum_bags.identification.window_score import window_score
 from pendulum_bags.replay.fit_replay import replay_fit
@@ -158,8 +158,8 @@ class _Driven:
         position = np.interp(time, recording.time, recording.position)
         reach = min(max(2, round(SMOOTHING / period)), (count - 1) // 2)
         width = 2 * reach + 1
-        smooth = savgol_filter(position, width, 2)
-        velocity = savgol_filter(position, width, 2, deriv=1, delta=period)
+        smooth = scipy.signal.savgol_filter(position, width, 2)
+        velocity = scipy.signal.savgol_filter(position, width, 2, deriv=1, delta=period)
         torque = _mean_input(recording, time)
         # Measured torque was applied, whatever the model's actuator could give.
         limit = max(parameters.effort_limit, 1.001 * float(np.abs(torque).max()))

@@ -27,7 +27,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from scipy.signal import detrend as scipy_detrend
+import scipy
 
 from pendulum_bags.runs.datasets import Array, Recording, first_of_each_stamp
 from pendulum_msgs_py.errors import DataError
@@ -176,7 +176,7 @@ def _detrended(values: Array, detrend: Any, origin: str) -> Array:
         return values
     if detrend not in ("constant", "linear"):
         raise DataError(f"{origin}: detrend of input is {detrend!r}; expected constant or linear")
-    return np.asarray(scipy_detrend(values, type=detrend))
+    return np.asarray(scipy.signal.detrend(values, type=detrend))
 
 
 def _read_table(source: Path, delimiter: str, skip: int) -> tuple[list[str], Array]:

@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+import scipy
 from numpy.typing import ArrayLike, NDArray
-from scipy.interpolate import CubicSpline
 
 from pendulum_msgs_py.errors import DataError
 
@@ -147,8 +147,8 @@ class Series:
                 f"{self.name} spans {self.t[0]:.6f} s to {self.t[-1]:.6f} s and is asked for "
                 f"{times[0]:.6f} s to {times[-1]:.6f} s; expected times inside its span"
             )
-        position = CubicSpline(self.t, self.position)(times)
-        velocity = CubicSpline(self.t, self.velocity)(times)
+        position = scipy.interpolate.CubicSpline(self.t, self.position)(times)
+        velocity = scipy.interpolate.CubicSpline(self.t, self.velocity)(times)
         effort = Signal(self.t, self.effort, self.name).held_at(times)
         return Series(times, position, velocity, effort, self.name)
 

@@ -8,9 +8,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
 from rich.console import Console
-from scipy import stats
 
 from pendulum_bags.comparison.metrics import METRICS, Episode, metrics_of
 from pendulum_bags.figures.figure import Figure, Mark, Panel, Trace
@@ -155,7 +155,7 @@ def _paired(records: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
             continue
         for name in COMPARED:
             ratio = np.log([second[seed][name] / first[seed][name] for seed in common])
-            half = float(stats.t.ppf(0.975, len(common) - 1) * ratio.std(ddof=1) / math.sqrt(len(common)))
+            half = float(scipy.stats.t.ppf(0.975, len(common) - 1) * ratio.std(ddof=1) / math.sqrt(len(common)))
             mean = float(ratio.mean())
             found.append(
                 {

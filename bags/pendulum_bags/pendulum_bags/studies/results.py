@@ -10,8 +10,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy import stats
 
 from pendulum_bags.comparison.metrics import METRICS, Episode, metrics_of
 from pendulum_bags.experiments.run_spec import RunSpec
@@ -66,7 +66,7 @@ class Group:
         mean = float(finite.mean())
         if finite.size < 2:
             return mean, math.nan, math.nan
-        half = float(stats.t.ppf(0.975, finite.size - 1) * finite.std(ddof=1) / math.sqrt(finite.size))
+        half = float(scipy.stats.t.ppf(0.975, finite.size - 1) * finite.std(ddof=1) / math.sqrt(finite.size))
         return mean, mean - half, mean + half
 
     def worst(self, metric: str) -> tuple[float, int]:
