@@ -24,6 +24,7 @@ _cache: dict[tuple[Any, bool], Any] = {}
 # What compiled code finds under the name ``math``; its attributes must be compiled themselves.
 _vector_module = ModuleType("vector_math_compiled")
 _vector_module.sin = numba.njit(vector_math.sin, fastmath={"contract"}, forceinline=True)  # type: ignore[attr-defined]
+_vector_module.cos = numba.njit(vector_math.cos, fastmath={"contract"}, forceinline=True)  # type: ignore[attr-defined]
 _vector_module.exp = math.exp  # type: ignore[attr-defined]
 
 

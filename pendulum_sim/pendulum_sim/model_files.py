@@ -8,7 +8,6 @@ counter-clockwise for who looks along +y.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
@@ -18,10 +17,14 @@ import typer
 
 from pendulum_msgs_py.contract.names import JOINT, LINK
 from pendulum_msgs_py.errors import ParameterError
+from pendulum_msgs_py.parameters import load_yaml
 from pendulum_msgs_py.plants.equilibrium import torque_gain, total_damping
-from pendulum_msgs_py.plants.plant_parameters import PlantParameters, load_plant
+from pendulum_msgs_py.plants.mechanism_parameters import load_mechanism
+from pendulum_msgs_py.plants.plant_parameters import MECHANISM_FORMAT, PlantParameters, load_plant, resolve_plant
 from pendulum_msgs_py.programs.executables import cli_main
+from pendulum_sim.mechanism_files import mechanism_mjcf, mechanism_urdf
 from pendulum_sim.ros2_control_tags import add_ros2_control
+from pendulum_sim.xml_files import add, document_text, number, safe_name
 
 __all__ = ["LinkShape", "link_shape", "main", "mjcf", "urdf"]
 
@@ -83,39 +86,39 @@ def urdf(parameters: PlantParameters, *, ros2_control: str = "none", namespace: 
     shape = link_shape(parameters)
     drive = parameters.drivetrain
     speed = 100.0 if drive is None else drive.supply_voltage / (drive.back_emf_constant * drive.gear_ratio)
-    robot = ElementTree.Element("robot", name=_safe_name(parameters.name))
-    base = _add(robot, "link", name="base_link")
-    _urdf_visual(base, ("box", {"size": "0.06 0.1 0.06"}), f"0 {_n(0.06)} 0", "0 0 0", "0.25 0.25 0.28 1")
-    link = _add(robot, "link", name=LINK)
-    inertial = _add(link, "inertial")
-    _add(inertial, "origin", xyz=f"0 0 {_n(-shape.length)}", rpy="0 0 0")
-    _add(inertial, "mass", value=_n(shape.mass))
+    robot = ElementTree.Element("robot", name=safe_name(parameters.name))
+    base = add(robot, "link", name="base_link")
+    _urdf_visual(base, ("box", {"size": "0.06 0.1 0.06"}), f"0 {number(0.06)} 0", "0 0 0", "0.25 0.25 0.28 1")
+    link = add(robot, "link", name=LINK)
+    inertial = add(link, "inertial")
+    add(inertial, "origin", xyz=f"0 0 {number(-shape.length)}", rpy="0 0 0")
+    add(inertial, "mass", value=number(shape.mass))
     rotor = drive.reflected_inertia if drive is not None else 0.0
-    i = _n(shape.inertia + rotor)
-    _add(inertial, "inertia", ixx=i, iyy=i, izz=_n(0.02 * shape.inertia), ixy="0", ixz="0", iyz="0")
-    rod = {"radius": _n(_ROD_RADIUS), "length": _n(shape.length)}
-    _urdf_visual(link, ("cylinder", rod), f"0 0 {_n(-0.5 * shape.length)}", "0 0 0", "0.6 0.62 0.66 1")
+    i = number(shape.inertia + rotor)
+    add(inertial, "inertia", ixx=i, iyy=i, izz=number(0.02 * shape.inertia), ixy="0", ixz="0", iyz="0")
+    rod = {"radius": number(_ROD_RADIUS), "length": number(shape.length)}
+    _urdf_visual(link, ("cylinder", rod), f"0 0 {number(-0.5 * shape.length)}", "0 0 0", "0.6 0.62 0.66 1")
     _urdf_visual(
         link,
-        ("sphere", {"radius": _n(shape.bob_radius)}),
-        f"0 0 {_n(-shape.length)}",
+        ("sphere", {"radius": number(shape.bob_radius)}),
+        f"0 0 {number(-shape.length)}",
         "0 0 0",
         "0.85 0.3 0.2 1",
     )
-    joint = _add(robot, "joint", name=JOINT, type="continuous")
-    _add(joint, "parent", link="base_link")
-    _add(joint, "child", link=LINK)
+    joint = add(robot, "joint", name=JOINT, type="continuous")
+    add(joint, "parent", link="base_link")
+    add(joint, "child", link=LINK)
     # The measured angle is angle_offset when the link hangs: the frame is turned back by as much.
-    _add(joint, "origin", xyz="0 0 0", rpy=f"0 {_n(parameters.angle_offset)} 0")
-    _add(joint, "axis", xyz="0 -1 0")
+    add(joint, "origin", xyz="0 0 0", rpy=f"0 {number(parameters.angle_offset)} 0")
+    add(joint, "axis", xyz="0 -1 0")
     # topic_based drives our plants, which take commands; anything else moves the joint itself.
     gain = 1.0 if ros2_control == "topic_based" else torque_gain(parameters)
     limit = gain * parameters.effort_limit
     friction = parameters.coulomb_friction + (drive.motor_coulomb_friction if drive is not None else 0.0)
-    _add(joint, "limit", effort=_n(limit), velocity=_n(speed))
-    _add(joint, "dynamics", damping=_n(total_damping(parameters)), friction=_n(friction))
+    add(joint, "limit", effort=number(limit), velocity=number(speed))
+    add(joint, "dynamics", damping=number(total_damping(parameters)), friction=number(friction))
     add_ros2_control(robot, ros2_control, namespace, limit)
-    return _text(robot)
+    return document_text(robot)
 
 
 def mjcf(parameters: PlantParameters) -> str:
@@ -129,113 +132,95 @@ def mjcf(parameters: PlantParameters) -> str:
     """
     shape = link_shape(parameters)
     drive = parameters.drivetrain
-    model = ElementTree.Element("mujoco", model=_safe_name(parameters.name))
-    _add(model, "compiler", angle="radian", autolimits="true")
+    model = ElementTree.Element("mujoco", model=safe_name(parameters.name))
+    add(model, "compiler", angle="radian", autolimits="true")
     flat = parameters.gravity == 0.0
-    _add(
+    add(
         model,
         "option",
-        gravity="0 0 0" if flat else f"0 0 {_n(-STANDARD_GRAVITY)}",
+        gravity="0 0 0" if flat else f"0 0 {number(-STANDARD_GRAVITY)}",
         timestep="0.002" if drive is None else "0.00025",
         integrator="implicitfast",
     )
-    world = _add(model, "worldbody")
-    _add(world, "light", pos="0 -1 1.5", dir="0 0.5 -1")
-    _add(world, "camera", name="side", pos=f"0 {_n(-4.0 * shape.length)} 0", xyaxes="1 0 0 0 0 1")
-    link = _add(world, "body", name=LINK)
-    _add(
+    world = add(model, "worldbody")
+    add(world, "light", pos="0 -1 1.5", dir="0 0.5 -1")
+    add(world, "camera", name="side", pos=f"0 {number(-4.0 * shape.length)} 0", xyaxes="1 0 0 0 0 1")
+    link = add(world, "body", name=LINK)
+    add(
         link,
         "joint",
         name=JOINT,
         type="hinge",
         axis="0 -1 0",
-        ref=_n(parameters.angle_offset),
-        damping=_n(parameters.damping),
-        frictionloss=_n(parameters.coulomb_friction),
+        ref=number(parameters.angle_offset),
+        damping=number(parameters.damping),
+        frictionloss=number(parameters.coulomb_friction),
     )
-    _add(
+    add(
         link,
         "inertial",
-        pos=f"0 0 {_n(-shape.length)}",
-        mass=_n(shape.mass),
-        diaginertia=f"{_n(shape.inertia)} {_n(shape.inertia)} {_n(0.02 * shape.inertia)}",
+        pos=f"0 0 {number(-shape.length)}",
+        mass=number(shape.mass),
+        diaginertia=f"{number(shape.inertia)} {number(shape.inertia)} {number(0.02 * shape.inertia)}",
     )
     appearance = {"contype": "0", "conaffinity": "0"}
-    _add(
-        link, "geom", type="capsule", fromto=f"0 0 0 0 0 {_n(-shape.length)}", size=_n(_ROD_RADIUS),
+    add(
+        link, "geom", type="capsule", fromto=f"0 0 0 0 0 {number(-shape.length)}", size=number(_ROD_RADIUS),
         rgba="0.6 0.62 0.66 1", attributes=appearance,
     )  # fmt: skip
-    _add(
-        link, "geom", type="sphere", pos=f"0 0 {_n(-shape.length)}", size=_n(shape.bob_radius),
+    add(
+        link, "geom", type="sphere", pos=f"0 0 {number(-shape.length)}", size=number(shape.bob_radius),
         rgba="0.85 0.3 0.2 1", attributes=appearance,
     )  # fmt: skip
     driven, gain = JOINT, 1.0
     if drive is not None:
         driven, gain = "motor_joint", torque_gain(parameters)
-        motor = _add(world, "body", name="motor")
-        _add(
-            motor, "joint", name=driven, type="hinge", axis="0 -1 0", armature=_n(drive.reflected_inertia),
-            damping=_n(total_damping(parameters) - parameters.damping), frictionloss=_n(drive.motor_coulomb_friction),
+        motor = add(world, "body", name="motor")
+        add(
+            motor, "joint", name=driven, type="hinge", axis="0 -1 0", armature=number(drive.reflected_inertia),
+            damping=number(total_damping(parameters) - parameters.damping),
+            frictionloss=number(drive.motor_coulomb_friction),
         )  # fmt: skip
-        _add(motor, "inertial", pos="0 0 0", mass="1e-6", diaginertia="1e-9 1e-9 1e-9")
-        tendons = _add(model, "tendon")
-        spring = _add(
+        add(motor, "inertial", pos="0 0 0", mass="1e-6", diaginertia="1e-9 1e-9 1e-9")
+        tendons = add(model, "tendon")
+        spring = add(
             tendons,
             "fixed",
             name="spring",
-            stiffness=_n(drive.stiffness),
-            springlength=_n(-parameters.angle_offset),
+            stiffness=number(drive.stiffness),
+            springlength=number(-parameters.angle_offset),
         )
-        _add(spring, "joint", joint=driven, coef="1")
-        _add(spring, "joint", joint=JOINT, coef="-1")
-    actuators = _add(model, "actuator")
-    limit = f"{_n(-parameters.effort_limit)} {_n(parameters.effort_limit)}"
+        add(spring, "joint", joint=driven, coef="1")
+        add(spring, "joint", joint=JOINT, coef="-1")
+    actuators = add(model, "actuator")
+    limit = f"{number(-parameters.effort_limit)} {number(parameters.effort_limit)}"
     lag = (
-        {"dyntype": "filterexact", "dynprm": _n(parameters.actuator_time_constant)}
+        {"dyntype": "filterexact", "dynprm": number(parameters.actuator_time_constant)}
         if parameters.actuator_time_constant > 0.0
         else {}
     )
-    _add(
+    add(
         actuators,
         "general",
         name="effort",
         joint=driven,
         ctrlrange=limit,
-        gainprm=_n(gain),
+        gainprm=number(gain),
         biastype="none",
         attributes=lag,
     )
-    return _text(model)
+    return document_text(model)
 
 
 def _urdf_visual(
     link: ElementTree.Element, geometry: tuple[str, dict[str, str]], xyz: str, rpy: str, rgba: str
 ) -> None:
     shape, sizes = geometry
-    visual = _add(link, "visual")
-    _add(visual, "origin", xyz=xyz, rpy=rpy)
-    _add(_add(visual, "geometry"), shape, sizes)
-    material = _add(visual, "material", name=f"{shape}_colour")
-    _add(material, "color", rgba=rgba)
-
-
-def _add(
-    parent: ElementTree.Element, tag: str, attributes: Mapping[str, str] | None = None, **more: str
-) -> ElementTree.Element:
-    return ElementTree.SubElement(parent, tag, {**(attributes or {}), **more})
-
-
-def _n(value: float) -> str:
-    return repr(float(value))
-
-
-def _safe_name(name: str) -> str:
-    return "".join(c if c.isalnum() or c in "_-" else "_" for c in name) or "pendulum"
-
-
-def _text(root: ElementTree.Element) -> str:
-    ElementTree.indent(root)
-    return '<?xml version="1.0"?>\n' + ElementTree.tostring(root, encoding="unicode") + "\n"
+    visual = add(link, "visual")
+    add(visual, "origin", xyz=xyz, rpy=rpy)
+    add(add(visual, "geometry"), shape, sizes)
+    material = add(visual, "material", name=f"{shape}_colour")
+    add(material, "color", rgba=rgba)
 
 
 app = typer.Typer(add_completion=False, rich_markup_mode=None)
@@ -259,8 +244,16 @@ def export(
         raise ParameterError(f"format is {kind!r}; expected urdf or mjcf")
     if kind == "mjcf" and ros2_control != "none":
         raise ParameterError(f"ros2_control is {ros2_control!r} for mjcf; expected --format urdf, MuJoCo knows none")
-    parameters = load_plant(plant)
-    text = mjcf(parameters) if kind == "mjcf" else urdf(parameters, ros2_control=ros2_control, namespace=namespace)
+    if load_yaml(resolve_plant(plant), "plant file").get("format") == MECHANISM_FORMAT:
+        if ros2_control != "none":
+            raise ParameterError(
+                f"ros2_control is {ros2_control!r} for {plant!r}; expected a plant of one joint with it"
+            )
+        mechanism = load_mechanism(plant)
+        text = mechanism_mjcf(mechanism) if kind == "mjcf" else mechanism_urdf(mechanism)
+    else:
+        parameters = load_plant(plant)
+        text = mjcf(parameters) if kind == "mjcf" else urdf(parameters, ros2_control=ros2_control, namespace=namespace)
     if output is None:
         typer.echo(text, nl=False)
         return

@@ -14,6 +14,7 @@ from typing import Any
 
 __all__ = ["complex_step", "in_arithmetic"]
 
+_EQUATIONS = ("pendulum_msgs_py.dynamics", "pendulum_msgs_py.mechanisms")
 _STEP = 2.0**-64
 """Imaginary step; its square is lost in any sum, and a power of two scales without rounding."""
 
@@ -23,7 +24,7 @@ def in_arithmetic(function: Callable[..., Any], arithmetic: ModuleType) -> Calla
     """Return an equation of this package, and what it calls, with another module in the place of ``math``.
 
     Args:
-        function: A plain function of :mod:`pendulum_msgs_py.dynamics`.
+        function: A plain function of :mod:`pendulum_msgs_py.dynamics` or :mod:`pendulum_msgs_py.mechanisms`.
         arithmetic: ``cmath``, ``numpy``, ``casadi``, or another module with ``sin``, ``cos`` and ``exp``.
     """
     assert isinstance(function, FunctionType)
@@ -32,7 +33,7 @@ def in_arithmetic(function: Callable[..., Any], arithmetic: ModuleType) -> Calla
         value = scope.get(name)
         if value is math:
             scope[name] = arithmetic
-        elif isinstance(value, FunctionType) and value.__module__.startswith("pendulum_msgs_py.dynamics"):
+        elif isinstance(value, FunctionType) and value.__module__.startswith(_EQUATIONS):
             scope[name] = in_arithmetic(value, arithmetic)
     return FunctionType(function.__code__, scope, function.__name__, function.__defaults__, function.__closure__)
 

@@ -35,6 +35,8 @@ from pendulum_msgs_py.parameters import (
 __all__ = [
     "DRIVETRAIN_SPECS",
     "FORMAT",
+    "MECHANISM_FORMAT",
+    "MECHANISM_PRESETS",
     "PLANT_SPECS",
     "PRESETS",
     "PRESET_NAMES",
@@ -49,22 +51,29 @@ __all__ = [
     "read_plant_document",
     "read_quantities",
     "resolve_plant",
+    "save_document",
     "write_plant",
 ]
 
 FORMAT = "pendulum_plant/1"
+MECHANISM_FORMAT = "pendulum_plant/2"
+"""Format of a plant file of several joints; see :mod:`pendulum_msgs_py.plants.mechanism_parameters`."""
 SEALED_FORMAT = "pendulum_plant_sealed/1"
 """Format of a plant file that only simulators read; see :mod:`pendulum_msgs_py.plants.sealed_plant`."""
 _PRESET_FOLDER = Path(str(resources.files("pendulum_msgs_py.plants") / "presets"))
-PRESETS = tuple(
-    sorted((file.stem for file in _PRESET_FOLDER.glob("*.yaml")), key=lambda name: (name != "thesis", name))
+_PRESET_TEXTS = {
+    file.stem: file.read_text(encoding="utf-8")
+    for file in sorted(_PRESET_FOLDER.glob("*.yaml"), key=lambda file: (file.stem != "thesis", file.stem))
+}
+MECHANISM_PRESETS = tuple(
+    name for name, text in _PRESET_TEXTS.items() if f"\nformat: {MECHANISM_FORMAT}" in f"\n{text}"
 )
-"""Names of the plant files that come with the package; a file in their folder is a preset, the default comes first."""
+"""Names of the plant files of several joints that come with the package."""
+PRESETS = tuple(name for name in _PRESET_TEXTS if name not in MECHANISM_PRESETS)
+"""Names of the plant files of one joint; a file in their folder is a preset, the default comes first."""
 PRESET_NAMES = ", ".join(PRESETS)
 """The same for help texts."""
-SERIES_ELASTIC_PRESETS = tuple(
-    name for name in PRESETS if "\ndrivetrain:" in (_PRESET_FOLDER / f"{name}.yaml").read_text(encoding="utf-8")
-)
+SERIES_ELASTIC_PRESETS = tuple(name for name in PRESETS if "\ndrivetrain:" in _PRESET_TEXTS[name])
 """Those of them that have motor, gears and spring."""
 
 
@@ -232,6 +241,11 @@ def load_plant_file(preset_or_path: str | Path) -> tuple[PlantParameters, dict[s
             f"plant file {path} is sealed for an exercise, and only a simulator runs it; "
             "expected a plant that you identified"
         )
+    if document.get("format") == MECHANISM_FORMAT:
+        raise ParameterError(
+            f"plant file {path} describes a mechanism ({document.get('model')}); expected a plant of one joint here, "
+            f"as {PRESET_NAMES}"
+        )
     return read_plant_document(document, path)
 
 
@@ -290,10 +304,19 @@ def write_plant(
     Raises:
         ParameterError: The file cannot be written.
     """
-    path = Path(path)
     document = plant_document(parameters, intervals)
     if provenance:
         document["provenance"] = dict(provenance)
+    return save_document(path, document)
+
+
+def save_document(path: str | Path, document: Mapping[str, Any]) -> Path:
+    """Write the content of a plant file; the file appears whole or not at all.
+
+    Raises:
+        ParameterError: The file cannot be written.
+    """
+    path = Path(path)
     text = dump_yaml(document, f"plant file {path}")
     temporary = path.with_name(f".{path.name}.{os.getpid()}")
     try:
@@ -325,12 +348,13 @@ def plant_document(
 def resolve_plant(preset_or_path: str | Path) -> Path:
     """Return the file of a preset, or the path itself; a word that is neither is refused."""
     text = str(preset_or_path)
-    if text in PRESETS:
+    if text in PRESETS or text in MECHANISM_PRESETS:
         return _PRESET_FOLDER / f"{text}.yaml"
     path = Path(text).expanduser()
     if not path.exists() and "/" not in text and path.suffix == "":
         raise ParameterError(
-            f"plant is {text!r}; expected one of the presets {PRESET_NAMES} or the path of a plant file"
+            f"plant is {text!r}; expected one of the presets {PRESET_NAMES} (one joint), "
+            f"{', '.join(MECHANISM_PRESETS)} (several) or the path of a plant file"
         )
     return path
 

@@ -1,0 +1,120 @@
+"""Joints and the coordinates that they make: what wraps, where upright is, and which joints have a motor."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from pendulum_msgs_py.contract.angles import wrap
+from pendulum_msgs_py.errors import ParameterError
+
+__all__ = ["Coordinates", "Joint", "Vector"]
+
+Vector = tuple[float, ...]
+"""One number per joint, in the order of the model."""
+
+
+@dataclass(frozen=True)
+class Joint:
+    """One joint of a mechanism.
+
+    Attributes:
+        name: Its name, in messages too.
+        unit: Unit of its position: ``rad``, or ``m`` for one that slides.
+        turns: Whether a whole turn leads back to the same place, so that deviations wrap.
+        goal: Its position where the mechanism is upright [rad or m].
+    """
+
+    name: str
+    unit: str = "rad"
+    turns: bool = True
+    goal: float = 0.0
+
+    def __post_init__(self) -> None:
+        """Refuse a unit that no joint has, and one that slides and turns."""
+        if self.unit not in {"rad", "m"} or (self.unit == "m" and self.turns):
+            raise ParameterError(
+                f"joint {self.name!r} has the unit {self.unit!r}, turns {self.turns}; expected rad, or m without turns"
+            )
+
+    @property
+    def velocity_unit(self) -> str:
+        """Unit of its velocity."""
+        return f"{self.unit}/s"
+
+    @property
+    def effort_unit(self) -> str:
+        """Unit of what a motor or friction gives there: a torque, or a force."""
+        return "N m" if self.unit == "rad" else "N"
+
+    @property
+    def damping_unit(self) -> str:
+        """Unit of viscous friction."""
+        return "N m s/rad" if self.unit == "rad" else "N s/m"
+
+
+@dataclass(frozen=True)
+class Coordinates:
+    """Joints in the model's order, and which of them are driven.
+
+    Attributes:
+        joints: All joints, n of them.
+        driven: Indices of those with an actuator, ascending, m of them.
+    """
+
+    joints: tuple[Joint, ...]
+    driven: tuple[int, ...]
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of all joints, as in ``joint_states``."""
+        return tuple(joint.name for joint in self.joints)
+
+    @property
+    def driven_names(self) -> tuple[str, ...]:
+        """Names of the driven joints, as in ``effort_command``."""
+        return tuple(self.joints[index].name for index in self.driven)
+
+    @property
+    def goal(self) -> Vector:
+        """The upright position [rad or m]."""
+        return tuple(joint.goal for joint in self.joints)
+
+    def deviation(self, position: Sequence[float], goal: Sequence[float] | None = None) -> Vector:
+        """Return position minus goal; only what turns is wrapped, to [-pi, pi) [rad or m].
+
+        Args:
+            position: n positions [rad or m].
+            goal: n positions; None for upright.
+        """
+        wanted = self.goal if goal is None else goal
+        return tuple(
+            wrap(q - g) if joint.turns else q - g for joint, q, g in zip(self.joints, position, wanted, strict=True)
+        )
+
+    def features(self, position: Sequence[float]) -> Vector:
+        """Return (sin, cos) of each joint that turns and the position of each that slides, for learning.
+
+        Args:
+            position: n positions [rad or m].
+        """
+        values: list[float] = []
+        for joint, q in zip(self.joints, position, strict=True):
+            values += [math.sin(q), math.cos(q)] if joint.turns else [q]
+        return tuple(values)
+
+    def spread(self, effort: Sequence[float]) -> Vector:
+        """Return m efforts of the driven joints as n, zero at passive joints [N m or N].
+
+        Raises:
+            ParameterError: There are more or fewer than m.
+        """
+        if len(effort) != len(self.driven):
+            raise ParameterError(
+                f"effort has {len(effort)} values; expected {len(self.driven)}, for {', '.join(self.driven_names)}"
+            )
+        values = [0.0] * len(self.joints)
+        for index, value in zip(self.driven, effort, strict=True):
+            values[index] = value
+        return tuple(values)

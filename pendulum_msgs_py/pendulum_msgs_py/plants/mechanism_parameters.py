@@ -1,0 +1,487 @@
+"""Plants of several joints: a mechanism with numbers, friction and actuators.
+
+The format ``pendulum_plant/2`` names the mechanism and its joints; an ``actuator:`` block makes a joint driven::
+
+    format: pendulum_plant/2
+    name: acrobot
+    model: double_pendulum
+    parameters:
+      mass_1: {value: 0.523, unit: kg}
+    joints:
+      shoulder: {damping: {value: 0.001, unit: N m s/rad}}
+      elbow:
+        coulomb_friction: {value: 0.12, unit: N m}
+        actuator: {effort_limit: {value: 6.0, unit: N m}}
+
+``pendulum_plant/1``, the format of one joint, is read as the mechanism ``pendulum``.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from itertools import product
+from pathlib import Path
+from typing import Any
+
+from pendulum_msgs_py.errors import ParameterError
+from pendulum_msgs_py.joints import Coordinates, Joint, Vector
+from pendulum_msgs_py.mechanisms import MECHANISMS, Mechanism
+from pendulum_msgs_py.parameters import ParameterSpec, load_yaml, reject_unknown, require_mapping, suggestion
+from pendulum_msgs_py.plants.plant_parameters import (
+    FORMAT,
+    MECHANISM_FORMAT,
+    MECHANISM_PRESETS,
+    PlantParameters,
+    read_plant_document,
+    read_quantities,
+    resolve_plant,
+    save_document,
+)
+
+__all__ = [
+    "MECHANISM_FORMAT",
+    "MECHANISM_PRESETS",
+    "Actuator",
+    "JointParameters",
+    "MechanismParameters",
+    "actuator_specs",
+    "joint_specs",
+    "load_mechanism",
+    "load_mechanism_file",
+    "mechanism_from_pendulum",
+    "write_mechanism",
+]
+
+_ANGLES = 16
+"""Angles of each turning joint at which the mass matrix must be positive definite."""
+
+
+@dataclass(frozen=True)
+class Actuator:
+    """The motor of one joint.
+
+    Attributes:
+        effort_limit: Largest torque or force, > 0 [N m or N].
+        time_constant: First-order lag between command and effort; 0 for none [s].
+        transport_delay: Time between a command and its first effect [s].
+    """
+
+    effort_limit: float
+    time_constant: float = 0.0
+    transport_delay: float = 0.0
+
+
+@dataclass(frozen=True)
+class JointParameters:
+    """Friction, ends of travel and actuator of one joint.
+
+    Attributes:
+        damping: Viscous friction [N m s/rad or N s/m].
+        coulomb_friction: Dry friction while sliding fast [N m or N].
+        static_friction: Dry friction at which sliding starts; None for the same [N m or N].
+        stribeck_velocity: Velocity over which the one falls to the other [rad/s or m/s].
+        lower_stop: Lowest position, where an end stop holds; None for none [rad or m].
+        upper_stop: Highest position [rad or m].
+        actuator: The motor; None for a passive joint.
+    """
+
+    damping: float = 0.0
+    coulomb_friction: float = 0.0
+    static_friction: float | None = None
+    stribeck_velocity: float = 0.01
+    lower_stop: float | None = None
+    upper_stop: float | None = None
+    actuator: Actuator | None = None
+
+    @property
+    def breakaway(self) -> float:
+        """Dry friction at which sliding starts [N m or N]."""
+        return self.coulomb_friction if self.static_friction is None else self.static_friction
+
+
+def joint_specs(joint: Joint) -> tuple[ParameterSpec, ...]:
+    """Return the table of what a plant file may say of a joint, in its units."""
+    effort = joint.effort_unit
+    return (
+        ParameterSpec("damping", 0.0, joint.damping_unit, "Viscous friction.", minimum=0.0),
+        ParameterSpec("coulomb_friction", 0.0, effort, "Dry friction while sliding fast.", minimum=0.0),
+        ParameterSpec("static_friction", 0.0, effort, "Dry friction at which sliding starts.", minimum=0.0),
+        ParameterSpec(
+            "stribeck_velocity", 0.01, joint.velocity_unit, "Velocity over which the static friction falls to Coulomb.",
+            minimum=0.0, exclusive_minimum=True,
+        ),
+        ParameterSpec("lower_stop", 0.0, joint.unit, "Lowest position, at an end stop."),
+        ParameterSpec("upper_stop", 0.0, joint.unit, "Highest position, at an end stop."),
+    )  # fmt: skip
+
+
+def actuator_specs(joint: Joint) -> tuple[ParameterSpec, ...]:
+    """Return the table of what a plant file may say of a joint's actuator, in its units."""
+    return (
+        ParameterSpec(
+            "effort_limit", 1.0, joint.effort_unit, "Largest effort of the actuator.",
+            minimum=0.0, exclusive_minimum=True,
+        ),
+        ParameterSpec("time_constant", 0.0, "s", "First-order lag between command and effort.", minimum=0.0),
+        ParameterSpec("transport_delay", 0.0, "s", "Time between a command and its first effect.", minimum=0.0),
+    )  # fmt: skip
+
+
+@dataclass(frozen=True)
+class MechanismParameters:
+    """A plant of n joints: a mechanism, its numbers, and what each joint has.
+
+    Attributes:
+        mechanism: Equations and joints.
+        values: Values of ``mechanism.parameters``, in their order.
+        joints: One entry per joint, in the order of the model.
+        name: Name of the plant.
+
+    Raises:
+        ParameterError: A value is outside its domain, or the masses give no positive inertia at some position.
+    """
+
+    mechanism: Mechanism
+    values: Vector
+    joints: tuple[JointParameters, ...]
+    name: str = field(default="unnamed", compare=False)
+
+    def __post_init__(self) -> None:
+        """Check every value."""
+        specs = self.mechanism.parameters
+        if len(self.values) != len(specs) or len(self.joints) != len(self.mechanism.joints):
+            raise ParameterError(
+                f"{self.mechanism.name} has {len(self.values)} values and {len(self.joints)} joints; "
+                f"expected {len(specs)} and {len(self.mechanism.joints)}"
+            )
+        checked = tuple(spec.check(value) for spec, value in zip(specs, self.values, strict=True))
+        object.__setattr__(self, "values", checked)
+        for joint, own in zip(self.mechanism.joints, self.joints, strict=True):
+            _check_joint(joint, own)
+        self._check_mass()
+
+    def _check_mass(self) -> None:
+        turns = [2.0 * math.pi * index / _ANGLES for index in range(_ANGLES)]
+        for q in product(*((turns if joint.turns else [0.0]) for joint in self.mechanism.joints)):
+            if not _positive_definite(self.mechanism.mass(q, self.packed)):
+                at = ", ".join(
+                    f"{joint.name} = {value:.3g} {joint.unit}"
+                    for joint, value in zip(self.mechanism.joints, q, strict=True)
+                )
+                raise ParameterError(
+                    f"the masses and inertias of {self.name!r} give no positive inertia at {at}; expected an inertia "
+                    "about the joint that its mass and centre can have, at least mass * centre^2"
+                )
+
+    @cached_property
+    def coordinates(self) -> Coordinates:
+        """Joints, and which of them are driven."""
+        driven = tuple(index for index, joint in enumerate(self.joints) if joint.actuator is not None)
+        return Coordinates(self.mechanism.joints, driven)
+
+    @cached_property
+    def packed(self) -> Vector:
+        """The ``p`` of the mechanism's functions: values, then the damping of each joint."""
+        return (*self.values, *(joint.damping for joint in self.joints))
+
+    @property
+    def actuators(self) -> tuple[Actuator, ...]:
+        """Actuators of the driven joints, in the model's order."""
+        return tuple(joint.actuator for joint in self.joints if joint.actuator is not None)
+
+    @property
+    def effort_limits(self) -> Vector:
+        """Largest effort of each driven joint [N m or N]."""
+        return tuple(actuator.effort_limit for actuator in self.actuators)
+
+    @property
+    def has_dry_friction(self) -> bool:
+        """Whether any joint has dry friction."""
+        return any(joint.breakaway > 0.0 for joint in self.joints)
+
+    def value(self, name: str) -> float:
+        """Return a parameter by the name that :meth:`with_values` takes.
+
+        Raises:
+            ParameterError: There is none of that name, or it is not given.
+        """
+        for spec, value in zip(self.mechanism.parameters, self.values, strict=True):
+            if spec.name == name:
+                return value
+        joint, _, key = name.partition(".")
+        own = self.joints[self._joint_index(joint, name)]
+        found = getattr(own.actuator, key, None) if hasattr(Actuator, key) or key == "effort_limit" else None
+        found = getattr(own, key, None) if found is None else found
+        if not isinstance(found, float):
+            raise ParameterError(f"{name!r} is not given for plant {self.name!r}; expected {self._expected_names()}")
+        return found
+
+    def with_values(self, changes: Mapping[str, float]) -> MechanismParameters:
+        """Return a copy with some values changed, checked again.
+
+        Args:
+            changes: Values by name: ``mass_1``, ``elbow.damping``, ``elbow.coulomb_friction``, ``elbow.effort_limit``.
+
+        Raises:
+            ParameterError: A name is unknown, a joint is passive, or a value is outside its domain.
+        """
+        values = list(self.values)
+        joints = list(self.joints)
+        names = [spec.name for spec in self.mechanism.parameters]
+        for name, value in changes.items():
+            if name in names:
+                values[names.index(name)] = value
+                continue
+            joint, _, key = name.partition(".")
+            index = self._joint_index(joint, name)
+            own = joints[index]
+            if key in {spec.name for spec in joint_specs(self.mechanism.joints[index])}:
+                joints[index] = replace(own, **{key: value})
+            elif own.actuator is not None and key in {spec.name for spec in actuator_specs(Joint(joint))}:
+                joints[index] = replace(own, actuator=replace(own.actuator, **{key: value}))
+            else:
+                raise ParameterError(f"unknown parameter {name!r}; expected {self._expected_names()}")
+        return replace(self, values=tuple(values), joints=tuple(joints))
+
+    def without_friction(self) -> MechanismParameters:
+        """Return the same plant without damping and dry friction."""
+        joints = tuple(replace(joint, damping=0.0, coulomb_friction=0.0, static_friction=None) for joint in self.joints)
+        return replace(self, joints=joints)
+
+    def acceleration(self, position: Vector, velocity: Vector, torque: Vector) -> Vector:
+        """Return q'' under generalised forces at all n joints, dry friction apart [rad/s^2 or m/s^2].
+
+        Args:
+            position: q, n values [rad or m].
+            velocity: q', n values.
+            torque: n values [N m or N]; ``coordinates.spread`` makes them of those of the driven joints.
+        """
+        result: Vector = self.mechanism.forward(position, velocity, torque, self.packed)
+        return result
+
+    def energy(self, position: Vector, velocity: Vector) -> float:
+        """Return kinetic and potential energy, 0 at rest hanging down [J]."""
+        rows = self.mechanism.mass(position, self.packed)
+        kinetic = sum(
+            a * m * b for a, row in zip(velocity, rows, strict=True) for m, b in zip(row, velocity, strict=True)
+        )
+        return float(0.5 * kinetic + self.mechanism.potential(position, self.packed))
+
+    def _joint_index(self, joint: str, name: str) -> int:
+        names = self.coordinates.names
+        if joint not in names:
+            raise ParameterError(f"unknown parameter {name!r}; expected {self._expected_names()}")
+        return names.index(joint)
+
+    def _expected_names(self) -> str:
+        own = ", ".join(spec.name for spec in self.mechanism.parameters)
+        joints = " or ".join(self.coordinates.names)
+        return f"one of {own}, or JOINT.damping and the like with JOINT {joints}"
+
+
+def load_mechanism(preset_or_path: str | Path) -> MechanismParameters:
+    """Return the plant of a preset or of a plant file, of one joint or more.
+
+    Raises:
+        ParameterError: No such preset or file, or the file is refused; the message names file and entry.
+    """
+    return load_mechanism_file(preset_or_path)[0]
+
+
+def load_mechanism_file(preset_or_path: str | Path) -> tuple[MechanismParameters, dict[str, Any]]:
+    """Return the plant and the file's provenance (intervals included under ``intervals``).
+
+    Raises:
+        ParameterError: as :func:`load_mechanism`.
+    """
+    path = resolve_plant(preset_or_path)
+    document = load_yaml(path, "plant file")
+    if document.get("format") not in {FORMAT, MECHANISM_FORMAT}:
+        raise ParameterError(
+            f"{path}: format is {document.get('format')!r}; expected {FORMAT!r} or {MECHANISM_FORMAT!r}"
+        )
+    if document["format"] == FORMAT:
+        parameters, provenance = read_plant_document(document, path)
+        return mechanism_from_pendulum(parameters), provenance
+    return _read_document(document, path)
+
+
+def mechanism_from_pendulum(parameters: PlantParameters) -> MechanismParameters:
+    """Return a rigid plant of one joint as a plant of the mechanism ``pendulum``.
+
+    Raises:
+        ParameterError: The plant has what no mechanism has yet: a drivetrain, friction that grows with the load, an
+            offset of angle or torque.
+    """
+    name = parameters.name
+    if parameters.drivetrain is not None:
+        raise ParameterError(f"plant {name!r} is series elastic; expected a rigid one to be read as a mechanism")
+    for key, unit in (("load_friction", "-"), ("torque_offset", "N m"), ("angle_offset", "rad")):
+        value = getattr(parameters, key)
+        if value != 0.0:
+            told = f"{value} {unit}" if unit != "-" else f"{value}"
+            raise ParameterError(f"{key} of plant {name!r} is {told}; expected 0 to be read as a mechanism")
+    static = parameters.static_friction
+    joint = JointParameters(
+        damping=parameters.damping,
+        coulomb_friction=parameters.coulomb_friction,
+        static_friction=None if static == parameters.coulomb_friction else static,
+        stribeck_velocity=parameters.stribeck_velocity,
+        actuator=Actuator(parameters.effort_limit, parameters.actuator_time_constant, parameters.transport_delay),
+    )
+    return MechanismParameters(MECHANISMS["pendulum"], (parameters.inertia, parameters.gravity), (joint,), name)
+
+
+def write_mechanism(
+    path: str | Path,
+    parameters: MechanismParameters,
+    *,
+    provenance: Mapping[str, Any] | None = None,
+    intervals: Mapping[str, Sequence[float]] | None = None,
+) -> Path:
+    """Write a plant file that :func:`load_mechanism` reads back to the same values; it appears whole or not at all.
+
+    Args:
+        path: Where to write.
+        parameters: The plant.
+        provenance: Data, method, date: plain YAML values.
+        intervals: 95 % interval by name, as ``mass_1`` or ``elbow.damping``, in the parameter's unit.
+
+    Raises:
+        ParameterError: The file cannot be written.
+    """
+    known = dict(intervals or {})
+
+    def entry(name: str, value: float, unit: str) -> dict[str, Any]:
+        bounds = {"interval": [float(bound) for bound in known[name]]} if name in known else {}
+        return {"value": float(value), "unit": unit, **bounds}
+
+    mechanism = parameters.mechanism
+    joints: dict[str, Any] = {}
+    for joint, own in zip(mechanism.joints, parameters.joints, strict=True):
+        content: dict[str, Any] = {
+            spec.name: entry(f"{joint.name}.{spec.name}", value, spec.unit)
+            for spec in joint_specs(joint)
+            if (value := getattr(own, spec.name)) is not None
+        }
+        if own.actuator is not None:
+            content["actuator"] = {
+                spec.name: entry(f"{joint.name}.{spec.name}", getattr(own.actuator, spec.name), spec.unit)
+                for spec in actuator_specs(joint)
+            }
+        joints[joint.name] = content
+    document: dict[str, Any] = {
+        "format": MECHANISM_FORMAT,
+        "name": parameters.name,
+        "model": mechanism.name,
+        "parameters": {
+            spec.name: entry(spec.name, value, spec.unit)
+            for spec, value in zip(mechanism.parameters, parameters.values, strict=True)
+        },
+        "joints": joints,
+    }
+    if provenance:
+        document["provenance"] = dict(provenance)
+    return save_document(path, document)
+
+
+def _read_document(document: Mapping[str, Any], path: Path) -> tuple[MechanismParameters, dict[str, Any]]:
+    where = str(path)
+    reject_unknown(document, ("format", "name", "model", "parameters", "joints", "provenance"), where=where)
+    model = document.get("model")
+    if model not in MECHANISMS:
+        given = "missing" if model is None else repr(model)
+        raise ParameterError(f"{where}: model is {given}; {suggestion(model, MECHANISMS)}")
+    mechanism = MECHANISMS[model]
+    given_values, intervals = read_quantities(
+        document.get("parameters") or {}, mechanism.parameters, f"{where}: parameters"
+    )
+    for spec in mechanism.parameters:
+        # Those that have a natural value may be left out; a mass or a length has none.
+        if spec.name not in given_values and spec.name not in {"gravity", "rotor_inertia", "gear_ratio"}:
+            raise ParameterError(f"{where}: parameters.{spec.name} is missing; expected a value in {spec.unit}")
+    values = tuple(given_values.get(spec.name, spec.default) for spec in mechanism.parameters)
+    entries = require_mapping(document.get("joints"), f"{where}: joints")
+    names = [joint.name for joint in mechanism.joints]
+    for name in entries:
+        if name not in names:
+            raise ParameterError(
+                f"{where}: joints has {name!r}; expected {', '.join(names)}, the joints of {mechanism.name}"
+            )
+    missing = [name for name in names if name not in entries]
+    if missing:
+        raise ParameterError(
+            f"{where}: joints.{missing[0]} is missing; expected an entry for each of {', '.join(names)}"
+        )
+    if list(entries) != names:
+        raise ParameterError(
+            f"{where}: joints are {', '.join(entries)}; expected them in the order of {mechanism.name}: "
+            f"{', '.join(names)}"
+        )
+    joints = []
+    for joint in mechanism.joints:
+        own, more = _read_joint(joint, entries[joint.name], f"{where}: joints.{joint.name}")
+        joints.append(own)
+        intervals.update({f"{joint.name}.{key}": interval for key, interval in more.items()})
+    name = document.get("name", path.stem)
+    if not isinstance(name, str):
+        raise ParameterError(f"{where}: name is {name!r}; expected text")
+    try:
+        parameters = MechanismParameters(mechanism, values, tuple(joints), name)
+    except ParameterError as error:
+        raise ParameterError(f"{where}: {error}") from error
+    provenance = dict(require_mapping(document.get("provenance") or {}, f"{where}: provenance"))
+    provenance["intervals"] = intervals
+    return parameters, provenance
+
+
+def _read_joint(joint: Joint, entry: object, where: str) -> tuple[JointParameters, dict[str, list[float]]]:
+    content = dict(require_mapping(entry if entry is not None else {}, where))
+    has_actuator = "actuator" in content
+    block = content.pop("actuator", None)
+    reject_unknown(content, (*(spec.name for spec in joint_specs(joint)), "actuator"), where=where)
+    values, intervals = read_quantities(content, joint_specs(joint), where)
+    actuator = None
+    if has_actuator:
+        drive, more = read_quantities(block, actuator_specs(joint), f"{where}.actuator")
+        if "effort_limit" not in drive:
+            raise ParameterError(f"{where}.actuator.effort_limit is missing; expected a value in {joint.effort_unit}")
+        actuator = Actuator(**drive)
+        intervals.update(more)
+    return JointParameters(**values, actuator=actuator), intervals
+
+
+def _check_joint(joint: Joint, own: JointParameters) -> None:
+    for spec in joint_specs(joint):
+        value = getattr(own, spec.name)
+        if value is not None:
+            spec.check(value, where=joint.name)
+    if own.actuator is not None:
+        for spec in actuator_specs(joint):
+            spec.check(getattr(own.actuator, spec.name), where=f"{joint.name}.actuator")
+    if own.breakaway < own.coulomb_friction:
+        unit = joint.effort_unit
+        raise ParameterError(
+            f"{joint.name}: static_friction is {own.static_friction} {unit}; "
+            f"expected >= coulomb_friction = {own.coulomb_friction} {unit}"
+        )
+    low, high = own.lower_stop, own.upper_stop
+    if low is not None and high is not None and not low < high:
+        raise ParameterError(f"{joint.name}: lower_stop is {low} {joint.unit}; expected < upper_stop = {high}")
+
+
+def _positive_definite(rows: Sequence[Sequence[float]]) -> bool:
+    """Tell whether a small symmetric matrix is positive definite, by the pivots of Gauss's elimination."""
+    matrix = [list(row) for row in rows]
+    for k, pivot_row in enumerate(matrix):
+        pivot = pivot_row[k]
+        if not pivot > 1e-12 * abs(rows[k][k]):
+            return False
+        for row in matrix[k + 1 :]:
+            factor = row[k] / pivot
+            for j in range(k, len(row)):
+                row[j] -= factor * pivot_row[j]
+    return True
