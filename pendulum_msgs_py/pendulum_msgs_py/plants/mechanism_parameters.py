@@ -230,6 +230,7 @@ class MechanismParameters:
         """
         values = list(self.values)
         joints = list(self.joints)
+        change: dict[str, Any]
         names = [spec.name for spec in self.mechanism.parameters]
         for name, value in changes.items():
             if name in names:
@@ -239,7 +240,8 @@ class MechanismParameters:
             index = self._joint_index(joint, name)
             own = joints[index]
             if key in {spec.name for spec in joint_specs(self.mechanism.joints[index])}:
-                joints[index] = replace(own, **{key: value})
+                change = {key: value}
+                joints[index] = replace(own, **change)
             elif own.actuator is not None and key in {spec.name for spec in actuator_specs(Joint(joint))}:
                 joints[index] = replace(own, actuator=replace(own.actuator, **{key: value}))
             else:
@@ -403,7 +405,8 @@ def _read_document(document: Mapping[str, Any], path: Path) -> tuple[MechanismPa
         # Those that have a natural value may be left out; a mass or a length has none.
         if spec.name not in given_values and spec.name not in {"gravity", "rotor_inertia", "gear_ratio"}:
             raise ParameterError(f"{where}: parameters.{spec.name} is missing; expected a value in {spec.unit}")
-    values = tuple(given_values.get(spec.name, spec.default) for spec in mechanism.parameters)
+    defaults: dict[str, Any] = {spec.name: spec.default for spec in mechanism.parameters}
+    values = tuple(float(value) for value in {**defaults, **given_values}.values())
     entries = require_mapping(document.get("joints"), f"{where}: joints")
     names = [joint.name for joint in mechanism.joints]
     for name in entries:
