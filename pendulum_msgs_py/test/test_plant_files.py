@@ -165,3 +165,15 @@ def test_with_values_checks_again() -> None:
     with pytest.raises(ParameterError, match=r"damping is -1\.0"):
         load_plant("thesis").with_values(damping=-1.0)
     assert math.isclose(load_plant("thesis").with_values(damping=2).damping, 2.0)
+
+
+def test_static_friction_follows_the_coulomb_friction_unless_it_is_its_own():
+    """A changed Coulomb friction left the old static one behind: a plant that sticks five times as hard."""
+    plain = PlantParameters(0.05, 0.03, 1.5, coulomb_friction=0.05)
+    for value in (0.01, 0.2, 0.0):
+        assert plain.with_values(coulomb_friction=value).static_friction == value
+    assert plain.with_values(coulomb_friction=0.01, static_friction=0.05).static_friction == 0.05
+    sticks = plain.with_values(static_friction=0.09)
+    assert sticks.with_values(coulomb_friction=0.04).static_friction == 0.09
+    with pytest.raises(ParameterError, match=r"static_friction is 0.09 N m; expected >= coulomb_friction"):
+        sticks.with_values(coulomb_friction=0.1)

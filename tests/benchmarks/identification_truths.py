@@ -79,12 +79,12 @@ TRUTHS: Mapping[str, Truth] = {
     "coarse encoder": Truth(noise=0.0, resolution=2.0 * np.pi / 8192),
     "coloured noise": Truth(noise=1e-4, coloured=2e-3),
     "torque noise": Truth(noise=5e-4, torque=0.03),
-    "both offsets": Truth(replace(PLANT, torque_offset=0.03)),
+    "both offsets": Truth(PLANT.with_values(torque_offset=0.03)),
     "both offsets near one angle": Truth(
-        replace(PLANT, torque_offset=-0.03, angle_offset=0.03, coulomb_friction=0.01), amplitude=0.3
+        PLANT.with_values(torque_offset=-0.03, angle_offset=0.03, coulomb_friction=0.01), amplitude=0.3
     ),
-    "Stribeck friction": Truth(replace(PLANT, static_friction=0.09, stribeck_velocity=0.3)),
-    "friction by load": Truth(replace(PLANT, load_friction=0.04)),
+    "Stribeck friction": Truth(PLANT.with_values(static_friction=0.09, stribeck_velocity=0.3)),
+    "friction by load": Truth(PLANT.with_values(load_friction=0.04)),
 }
 """By name; the truth of each is among the candidates of `identify`."""
 

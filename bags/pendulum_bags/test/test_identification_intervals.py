@@ -49,6 +49,21 @@ def test_a_damping_without_dry_friction_beside_it_owns_that_there_may_be_some():
     assert told.standard_error < 0.3 * damping.standard_error
 
 
+def test_a_static_friction_that_was_left_out_though_the_data_speak_for_it_is_said_loudly():
+    """Five times the sliding friction: no candidate may have it, and gravity was off by 3 % in silence."""
+    near = TRUTHS["both offsets near one angle"]
+    options = Options(folds=2, multi_start=False)
+    sticks = replace(near, plant=near.plant.with_values(static_friction=0.05))
+    result = identify([sticks.recording(12)], options, profiles=0)
+    assert result.to_dict()["incomplete"]
+    assert result.sentences()[0].startswith("MODEL INCOMPLETE: a static friction of 0.04")
+    assert "`--friction stribeck`" in result.sentences()[0]
+    slides = identify([near.recording(12)], options, profiles=0)
+    assert not slides.to_dict()["incomplete"], slides.sentences()
+    told = identify([sticks.recording(12)], replace(options, friction="stribeck"), profiles=0)
+    assert not told.to_dict()["incomplete"], told.sentences()
+
+
 def test_a_friction_model_never_fits_worse_than_one_that_it_contains():
     """A search by long steps went where short ones do not follow: nine times the error of the model inside it."""
     fit = fit_output_error([TRUTHS["torque noise"].recording(18)], Options(folds=2))

@@ -192,7 +192,12 @@ class PlantParameters:
             )
 
     def with_values(self, **changes: Any) -> PlantParameters:
-        """Return a copy with some values changed, checked again."""
+        """Return a copy with some values changed, checked again.
+
+        A static friction that is the Coulomb friction follows it: nobody asked for a plant that sticks harder.
+        """
+        if "coulomb_friction" in changes and self.static_friction == self.coulomb_friction:
+            changes = {"static_friction": None, **changes}
         return replace(self, **changes)
 
 

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from pendulum_bags.identification.missing import missing_torques
 from pendulum_bags.identification.output_error import OutputErrorFit
 from pendulum_bags.identification.problem import Piece
-from pendulum_bags.identification.selection import effective_samples
+from pendulum_bags.identification.selection import effective_samples, implausible_rival
 from pendulum_bags.identification.solver import residuals
 from pendulum_bags.runs.datasets import distinct_names
 
@@ -40,7 +40,8 @@ class ResidualTests:
         outliers: Windows whose rms exceeds five times the median: (recording, start and end from its
             first sample [s], rms [rad]).
         sentences: The outcome in words.
-        incomplete: Whether they depend on the input or look like a torque: then the model lacks something.
+        incomplete: Whether they depend on the input, look like a torque, or ask for a friction that was left out:
+            then the model lacks something, and the first sentence says what.
     """
 
     autocorrelation: Array
@@ -107,6 +108,9 @@ def residual_tests(fit: OutputErrorFit, *, lags: int = 25) -> ResidualTests:
         (*label, value) for label, value in zip(labels, rms, strict=True) if len(rms) > 3 and value > 5.0 * middle > 0.0
     )
     said = _sentences(white, white_p, float(auto[1]) if lags else 0.0, worst, independent, missing)
+    left_out = _left_out(fit)
+    if left_out is not None:
+        said.insert(0, left_out)
     for name, start, end, value in outliers:
         said.append(
             f"{name}, {start:.2f} to {end:.2f} s after its start, fits {value / middle:.0f} times worse than the "
@@ -124,7 +128,7 @@ def residual_tests(fit: OutputErrorFit, *, lags: int = 25) -> ResidualTests:
         samples,
         outliers,
         tuple(said),
-        incomplete=not independent or bool(missing),
+        incomplete=not independent or bool(missing) or left_out is not None,
     )
 
 
@@ -153,6 +157,22 @@ def _sentences(
             "interval covers the third."
         )
     return said
+
+
+def _left_out(fit: OutputErrorFit) -> str | None:
+    """Return that a friction was left out as implausible which the data clearly speak for, or None."""
+    rival = implausible_rival(fit.candidates, fit.chosen)
+    if rival is None:
+        return None
+    sliding, excess = (rival.as_searched.model[name] for name in ("coulomb_friction", "stribeck_excess"))
+    times = f", {1.0 + excess / sliding:.1f} times the sliding one" if sliding > 1e-3 * excess else " and none sliding"
+    return (
+        f"{INCOMPLETE}: a static friction of {sliding + excess:.3g} N m{times}, would fit far better "
+        f"({1e3 * rival.training_rms:.3g} mrad in place of {1e3 * fit.chosen.training_rms:.3g} mrad), but more than "
+        "three times is seldom friction and mostly stands in for something else (play, a cogging torque, a cable). It "
+        "was not taken, and the other parameters may be off by far more than their intervals say. If the joint does "
+        f"stick so hard, say `--friction {rival.friction}`."
+    )
 
 
 def _depends(signals: Sequence[Array], segments: Sequence[Array], lag: int, block: int, tests: int) -> bool:

@@ -20,10 +20,14 @@ __all__ = [
     "at_bounds",
     "choose",
     "effective_samples",
+    "implausible_rival",
     "is_plausible",
 ]
 
 Array = NDArray[np.float64]
+
+_CLEARLY = 20.0
+"""Lead in the information criterion (a weight of e^-10 for the other) that noise and luck do not explain."""
 
 
 @dataclass(frozen=True)
@@ -132,6 +136,24 @@ def is_plausible(candidate: Candidate) -> bool:
     """Return whether static friction is at most three times the sliding one."""
     model = candidate.solution.model
     return model["stribeck_excess"] <= 2.0 * model["coulomb_friction"] + 1e-9
+
+
+def implausible_rival(candidates: Sequence[Candidate], chosen: Candidate) -> Candidate | None:
+    """Return the candidate left out for its static friction that the data clearly speak for, or None.
+
+    What was chosen in its place has to stand in for it, and no interval of that counts the error.
+
+    Args:
+        candidates: All friction models that were tried.
+        chosen: The one taken.
+    """
+    rivals = [candidate for candidate in candidates if not is_plausible(candidate)]
+    if not rivals or not is_plausible(chosen):
+        return None
+    criterion = _criterion(candidates)
+    best = min(rivals, key=lambda c: criterion[id(c)])
+    own = criterion.get(id(chosen), np.inf)
+    return best if criterion[id(best)] < own - _CLEARLY else None
 
 
 def at_bounds(candidate: Candidate) -> list[str]:
