@@ -27,14 +27,15 @@ _BLOCK = re.compile(r"^```sh\n(.*?)^```", re.MULTILINE | re.DOTALL)
 
 
 def _commands() -> list[tuple[str, str]]:
-    found = []
+    found: dict[str, str] = {}
+    # What several pages say runs once.
     for page in PAGES:
         for block in _BLOCK.findall(page.read_text(encoding="utf-8")):
             for line in block.replace("\\\n", " ").splitlines():
                 command = line.split(" #")[0].strip()
                 if command:
-                    found.append((str(page.relative_to(PROJECT)), command))
-    return found
+                    found.setdefault(command, str(page.relative_to(PROJECT)))
+    return [(page, command) for command, page in found.items()]
 
 
 COMMANDS = _commands()
