@@ -19,10 +19,12 @@ from rich.console import Console
 from pendulum_lqr.analysis import LoopReport, analyse
 from pendulum_lqr.certificate_table import certificate_document, certify_rows, print_certificates
 from pendulum_lqr.design import Gain, output_lqr
+from pendulum_lqr.mechanism_design import design_mechanism
 from pendulum_lqr.model import LinearModel, linearise
 from pendulum_msgs_py.contract.angles import UPRIGHT
 from pendulum_msgs_py.errors import ParameterError
-from pendulum_msgs_py.plants.plant_parameters import PRESET_NAMES, load_plant
+from pendulum_msgs_py.plants.mechanism_parameters import load_mechanism
+from pendulum_msgs_py.plants.plant_parameters import MECHANISM_PRESETS, PRESET_NAMES, is_mechanism, load_plant
 from pendulum_msgs_py.programs.executables import cli_main
 from pendulum_msgs_py.programs.terminal import WholeTable, make_console
 
@@ -43,7 +45,9 @@ app = typer.Typer(add_completion=False, rich_markup_mode=None)
 
 @app.command()
 def design(
-    preset: Annotated[str, typer.Option(help=f"Plant: {PRESET_NAMES}.")] = "thesis",
+    preset: Annotated[
+        str, typer.Option(help=f"Plant: {PRESET_NAMES}; of several joints: {', '.join(MECHANISM_PRESETS)}.")
+    ] = "thesis",
     plant: Annotated[Path | None, typer.Option(help="Plant file, instead of a preset.")] = None,
     q: Annotated[
         list[str] | None, typer.Option(help="Diagonal of Q, as 100,0.01; may be given again for more rows.")
@@ -69,8 +73,21 @@ def design(
     are designed. Example:
 
         python -m pendulum_lqr design --preset dfki --q 10,1 --q 100,1 --r 1 --figures build/design
+
+    Of a plant of several joints Q has a weight for each joint and then for each velocity:
+
+        python -m pendulum_lqr design --preset cart_pole --q 10,100,1,1 --r 0.1
     """
-    parameters = load_plant(str(plant) if plant is not None else preset)
+    chosen_plant = str(plant) if plant is not None else preset
+    if is_mechanism(chosen_plant):
+        if figures is not None or machine is not None or theta != UPRIGHT or effort_limit or row:
+            raise ParameterError(
+                f"plant {chosen_plant!r} has several joints; expected --q, --r and --json alone: figures, --machine, "
+                "--theta, --effort-limit and --row are for one joint"
+            )
+        design_mechanism(load_mechanism(chosen_plant), q, r, as_json=as_json)
+        return
+    parameters = load_plant(chosen_plant)
     limit = _limit(effort_limit, parameters.effort_limit)
     model = linearise(parameters, theta)
     weights = _weights(q, r)

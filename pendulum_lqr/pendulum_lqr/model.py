@@ -31,6 +31,7 @@ from pendulum_msgs_py.dynamics.series_elastic import (
     winding_current,
 )
 from pendulum_msgs_py.errors import ParameterError
+from pendulum_msgs_py.joints import Vector
 from pendulum_msgs_py.plants.equilibrium import (
     FixedPoint,
     RigidPlant,
@@ -67,7 +68,8 @@ Matrix = NDArray[np.float64]
 class LinearModel:
     """Linear model ``x' = A x + B du(t - delay) + E d``, ``y = C x + D du`` around a fixed point, du = u - effort.
 
-    The first two states are always [theta - theta*, theta_dot], and they are what is measured: C = [I, 0], D = 0.
+    Of one joint the first two states are always [theta - theta*, theta_dot], and they are what is measured:
+    C = [I, 0], D = 0.
 
     Attributes:
         A: State matrix, shape (n, n) [1/s and mixed].
@@ -79,7 +81,10 @@ class LinearModel:
         E: Input matrix of a torque on the link itself, such as a push, shape (n, 1); without delay.
         delay: Time between a command and its first effect [s]; not in A.
         states: Names of the states: theta, theta_dot, then motor_angle and motor_velocity (at the output side of the
-            gears) of a series-elastic plant, then torque, the lagged command, of a plant with a lag.
+            gears) of a series-elastic plant, then torque, the lagged command, of a plant with a lag. Of a plant of
+            several joints (:mod:`~pendulum_lqr.mechanism_model`) the joints, then their velocities.
+        position: Of several joints, the fixed point, n values [rad or m]; ``theta`` is then the last.
+        efforts: Of several joints, the m efforts that hold it [N m or N]; ``effort`` is then the first.
     """
 
     A: Matrix
@@ -91,6 +96,8 @@ class LinearModel:
     E: Matrix = field(default=None)  # type: ignore[arg-type]
     delay: float = 0.0
     states: tuple[str, ...] = ("theta", "theta_dot")
+    position: Vector = ()
+    efforts: Vector = ()
 
     def __post_init__(self) -> None:
         """Fill in outputs and the link's input, which two states alone determine."""
@@ -112,7 +119,7 @@ class LinearModel:
     @property
     def hidden(self) -> tuple[str, ...]:
         """Names of the states that are not measured."""
-        return self.states[2:]
+        return self.states[self.C.shape[0] :]
 
 
 def sort_poles(poles: NDArray[Any]) -> NDArray[np.complex128]:

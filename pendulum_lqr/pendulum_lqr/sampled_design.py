@@ -124,7 +124,7 @@ def sampled_cost(
 
     Args:
         model: Linear model with n states.
-        q: Continuous weights of [theta, theta_dot].
+        q: Continuous weights of what is measured, [theta, theta_dot] of one joint.
         r: Continuous weight of the torque.
         period: Sampling period [s].
         delay: As in :func:`discretise`, whose m inputs on their way join the state.
@@ -136,7 +136,7 @@ def sampled_cost(
         C. Van Loan, Computing integrals involving the matrix exponential, IEEE TAC 23(3), 1978, theorem 1;
         Astrom and Wittenmark, Computer-Controlled Systems, 3rd ed., 1997, section 11.1.
     """
-    Q, R = cost_matrices(q, r)
+    Q, R = cost_matrices(q, r, model.C.shape[0])
     if not (math.isfinite(period) and period > 0.0):
         raise DesignError(f"period is {period} s; expected a finite value > 0")
     pending, rest = _on_their_way(period, delay + model.delay)

@@ -17,10 +17,9 @@ import typer
 
 from pendulum_msgs_py.contract.names import JOINT, LINK
 from pendulum_msgs_py.errors import ParameterError
-from pendulum_msgs_py.parameters import load_yaml
 from pendulum_msgs_py.plants.equilibrium import torque_gain, total_damping
 from pendulum_msgs_py.plants.mechanism_parameters import load_mechanism
-from pendulum_msgs_py.plants.plant_parameters import MECHANISM_FORMAT, PlantParameters, load_plant, resolve_plant
+from pendulum_msgs_py.plants.plant_parameters import PlantParameters, is_mechanism, load_plant
 from pendulum_msgs_py.programs.executables import cli_main
 from pendulum_sim.mechanism_files import mechanism_mjcf, mechanism_urdf
 from pendulum_sim.ros2_control_tags import add_ros2_control
@@ -244,7 +243,7 @@ def export(
         raise ParameterError(f"format is {kind!r}; expected urdf or mjcf")
     if kind == "mjcf" and ros2_control != "none":
         raise ParameterError(f"ros2_control is {ros2_control!r} for mjcf; expected --format urdf, MuJoCo knows none")
-    if load_yaml(resolve_plant(plant), "plant file").get("format") == MECHANISM_FORMAT:
+    if is_mechanism(plant):
         if ros2_control != "none":
             raise ParameterError(
                 f"ros2_control is {ros2_control!r} for {plant!r}; expected a plant of one joint with it"

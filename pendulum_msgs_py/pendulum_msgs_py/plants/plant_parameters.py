@@ -45,6 +45,7 @@ __all__ = [
     "PlantParameters",
     "Quantity",
     "SeriesElasticParameters",
+    "is_mechanism",
     "load_plant",
     "load_plant_file",
     "plant_document",
@@ -362,6 +363,15 @@ def resolve_plant(preset_or_path: str | Path) -> Path:
             f"{', '.join(MECHANISM_PRESETS)} (several) or the path of a plant file"
         )
     return path
+
+
+def is_mechanism(preset_or_path: str | Path) -> bool:
+    """Tell whether a preset or plant file is one of several joints.
+
+    Raises:
+        ParameterError: No such preset or file.
+    """
+    return load_yaml(resolve_plant(preset_or_path), "plant file").get("format") == MECHANISM_FORMAT
 
 
 def read_quantities(
