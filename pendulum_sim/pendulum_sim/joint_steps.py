@@ -1,0 +1,320 @@
+"""Steps of a mechanism with true stiction and end stops: pure functions on tuples, interpreted or compiled by numba.
+
+Between events each joint slides in one direction, is held, or is free, and the equations are smooth: Runge-Kutta of
+order four keeps its order. A velocity that crosses zero and a position that reaches an end stop are located inside the
+step. A resting joint is held while the effort that holds it lies within its dry friction (and, at an end stop, whatever
+presses it there); it is then exactly at rest, and the other joints move as if it were welded. A stop takes the whole
+velocity of its joint (a plastic impact), and the others get their share of the impulse through the mass matrix.
+
+It is the one-joint plant's rule (:mod:`pendulum_sim.dry_friction`) for several joints.
+
+Sources: D. Karnopp, "Computer simulation of stick-slip friction in mechanical dynamic systems", 1985, events located;
+F. Pfeiffer and C. Glocker, Multibody Dynamics with Unilateral Contacts, 1996, section 8 (impacts).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+from pendulum_msgs_py.dynamics import friction_magnitude
+from pendulum_msgs_py.errors import ParameterError
+from pendulum_msgs_py.plants.mechanism_parameters import MechanismParameters
+from pendulum_sim.dry_friction import actuator_torque
+
+__all__ = ["JOINT_FUNCTIONS", "JointTable", "advance_joints", "joint_functions", "pack_joints", "rk4_joints"]
+
+JointTable = tuple[tuple[float, ...], ...]
+"""Rows of one number per joint: Coulomb and static friction, Stribeck velocity, lower and upper stop, lag."""
+
+_MAX_EVENTS = 12
+_MAX_ROOT_STEPS = 60
+_FAR = 1e300
+
+
+def along_1(q: Any, h: Any, v: Any) -> Any:
+    """Return q + h v, of one joint."""
+    return (q[0] + h * v[0],)
+
+
+def along_2(q: Any, h: Any, v: Any) -> Any:
+    """Return q + h v, of two joints."""
+    return q[0] + h * v[0], q[1] + h * v[1]
+
+
+def put_1(_values: Any, _index: int, value: Any) -> Any:
+    """Return values with one of them replaced, of one joint."""
+    return (value,)
+
+
+def put_2(values: Any, index: int, value: Any) -> Any:
+    """Return values with one of them replaced, of two joints."""
+    return (value, values[1]) if index == 0 else (values[0], value)
+
+
+def lag_1(torque: Any, command: Any, elapsed: float, constants: Any) -> Any:
+    """Return the effort of a lagging actuator after some time, of one joint."""
+    return (actuator_torque(torque[0], command[0], elapsed, constants[0]),)
+
+
+def lag_2(torque: Any, command: Any, elapsed: float, constants: Any) -> Any:
+    """Return the efforts of lagging actuators after some time, of two joints."""
+    return (
+        actuator_torque(torque[0], command[0], elapsed, constants[0]),
+        actuator_torque(torque[1], command[1], elapsed, constants[1]),
+    )
+
+
+JOINT_FUNCTIONS: dict[int, tuple[Callable[..., Any], ...]] = {1: (along_1, put_1, lag_1), 2: (along_2, put_2, lag_2)}
+"""By number of joints, what loops over tuples would do: compiled code wants it written out."""
+
+
+def joint_functions(count: int) -> tuple[Callable[..., Any], ...]:
+    """Return (along, put, lag) for a number of joints.
+
+    Raises:
+        ParameterError: Nobody has written them for so many.
+    """
+    if count not in JOINT_FUNCTIONS:
+        raise ParameterError(f"a mechanism of {count} joints is not stepped yet; expected 1 or 2")
+    return JOINT_FUNCTIONS[count]
+
+
+def pack_joints(parameters: MechanismParameters) -> JointTable:
+    """Return what the joints of a plant have, in the order that the functions here take it."""
+    joints = parameters.joints
+    return (
+        tuple(joint.coulomb_friction for joint in joints),
+        tuple(joint.breakaway for joint in joints),
+        tuple(joint.stribeck_velocity for joint in joints),
+        tuple(-_FAR if joint.lower_stop is None else joint.lower_stop for joint in joints),
+        tuple(_FAR if joint.upper_stop is None else joint.upper_stop for joint in joints),
+        tuple(0.0 if joint.actuator is None else joint.actuator.time_constant for joint in joints),
+    )
+
+
+def rk4_joints(
+    forward: Any, along: Any, q: Any, v: Any, torque_0: Any, torque_mid: Any, torque_1: Any, h: float, p: Any
+) -> Any:
+    """Return (q, v) after a step h of the smooth equations, by the classical Runge-Kutta method of order four.
+
+    Args:
+        forward: The mechanism's equation.
+        along: Of :func:`joint_functions`.
+        q: Positions [rad or m].
+        v: Velocities.
+        torque_0: Efforts at the start of the step, of all joints [N m or N].
+        torque_mid: In its middle.
+        torque_1: At its end.
+        h: Step [s].
+        p: The mechanism's parameters.
+    """
+    half = 0.5 * h
+    a_1 = forward(q, v, torque_0, p)
+    v_2 = along(v, half, a_1)
+    a_2 = forward(along(q, half, v), v_2, torque_mid, p)
+    v_3 = along(v, half, a_2)
+    a_3 = forward(along(q, half, v_2), v_3, torque_mid, p)
+    v_4 = along(v, h, a_3)
+    a_4 = forward(along(q, h, v_3), v_4, torque_1, p)
+    sixth, third = h / 6.0, h / 3.0
+    return (
+        along(along(along(along(q, sixth, v), third, v_2), third, v_3), sixth, v_4),
+        along(along(along(along(v, sixth, a_1), third, a_2), third, a_3), sixth, a_4),
+    )
+
+
+def _loaded(put: Any, v: Any, torque: Any, direction: Any, table: Any) -> Any:
+    """Return the efforts less the dry friction of what slides."""
+    for i in range(len(torque)):
+        if direction[i] != 0.0:
+            friction = friction_magnitude(v[i], table[0][i], table[1][i], table[2][i])
+            torque = put(torque, i, torque[i] - direction[i] * friction)
+    return torque
+
+
+def _constrained(
+    forward: Any, along: Any, put: Any, q: Any, v: Any, torque: Any, direction: Any, held: Any, p: Any, table: Any
+) -> Any:
+    """Return q'' with friction against ``direction``, and exactly 0 at held joints."""
+    tau = _loaded(put, v, torque, direction, table)
+    a = forward(q, v, tau, p)
+    count = 0
+    last = 0
+    for i in range(len(a)):
+        if held[i] > 0.0:
+            count += 1
+            last = i
+    if count == len(a):
+        return along(a, -1.0, a)
+    if count == 1:
+        # The acceleration is a straight line of the effort: one more point of it tells which effort holds.
+        more = forward(q, v, put(tau, last, tau[last] + 1.0), p)
+        column = along(more, -1.0, a)
+        a = put(along(a, -a[last] / column[last], column), last, 0.0)
+    return a
+
+
+def _step(
+    forward: Any, along: Any, put: Any, lag: Any, q: Any, v: Any, torque: Any, command: Any, push: Any, begin: float,
+    h: float, direction: Any, held: Any, p: Any, table: Any,
+) -> Any:  # fmt: skip
+    """Return (q, v) after h with the joints in one mode; ``begin`` is the time since the effort was ``torque``."""
+    half = 0.5 * h
+    constants = table[5]
+    t_0 = along(lag(torque, command, begin, constants), 1.0, push)
+    t_m = along(lag(torque, command, begin + half, constants), 1.0, push)
+    t_1 = along(lag(torque, command, begin + h, constants), 1.0, push)
+    a_1 = _constrained(forward, along, put, q, v, t_0, direction, held, p, table)
+    v_2 = along(v, half, a_1)
+    a_2 = _constrained(forward, along, put, along(q, half, v), v_2, t_m, direction, held, p, table)
+    v_3 = along(v, half, a_2)
+    a_3 = _constrained(forward, along, put, along(q, half, v_2), v_3, t_m, direction, held, p, table)
+    v_4 = along(v, h, a_3)
+    a_4 = _constrained(forward, along, put, along(q, h, v_3), v_4, t_1, direction, held, p, table)
+    sixth, third = h / 6.0, h / 3.0
+    return (
+        along(along(along(along(q, sixth, v), third, v_2), third, v_3), sixth, v_4),
+        along(along(along(along(v, sixth, a_1), third, a_2), third, a_3), sixth, a_4),
+    )
+
+
+def _modes(forward: Any, along: Any, put: Any, q: Any, v: Any, torque: Any, p: Any, table: Any) -> Any:
+    """Return (direction, held) of each joint: which way friction acts on it, and 1 where it is held at rest."""
+    n = len(q)
+    direction = along(v, -1.0, v)
+    held = direction
+    rest = 0
+    for i in range(n):
+        if v[i] != 0.0:
+            if table[1][i] > 0.0:
+                direction = put(direction, i, 1.0 if v[i] > 0.0 else -1.0)
+        elif table[1][i] > 0.0 or q[i] <= table[3][i] or q[i] >= table[4][i]:
+            held = put(held, i, 1.0)
+            rest += 1
+    # Let go of whatever cannot be held, one joint at a time, the one that is pulled hardest beyond its friction first.
+    for _ in range(n):
+        if rest == 0:
+            break
+        worst, excess, way = -1, 0.0, 0.0
+        for i in range(n):
+            if held[i] > 0.0:
+                # What holds joint i, given that the other held joints stay: the effort that takes its acceleration.
+                free = put(held, i, 0.0)
+                loose = _constrained(forward, along, put, q, v, torque, direction, free, p, table)
+                pulled = _constrained(
+                    forward, along, put, q, v, put(torque, i, torque[i] + 1.0), direction, free, p, table
+                )
+                needed = loose[i] / (pulled[i] - loose[i])
+                limit = table[1][i]
+                over = abs(needed) - limit
+                if (needed > 0.0 and q[i] >= table[4][i]) or (needed < 0.0 and q[i] <= table[3][i]):
+                    over = -1.0
+                if over > excess:
+                    worst, excess, way = i, over, 1.0 if needed > 0.0 else -1.0
+        if worst < 0:
+            break
+        held = put(held, worst, 0.0)
+        rest -= 1
+        if table[1][worst] > 0.0:
+            direction = put(direction, worst, way)
+    return direction, held
+
+
+def _passed(kind: int, i: int, q: Any, v: Any, direction: Any, table: Any) -> float:
+    """Return an event's function, > 0 before it: 0 velocity crosses zero, 1 and 2 lower and upper stop."""
+    if kind == 0:
+        return float(v[i] * direction[i])
+    if kind == 1:
+        return float(q[i] - table[3][i])
+    return float(table[4][i] - q[i])
+
+
+def advance_joints(
+    forward: Any, along: Any, put: Any, lag: Any, q: Any, v: Any, torque: Any, command: Any, push: Any, h: float,
+    p: Any, table: Any,
+) -> Any:  # fmt: skip
+    """Return (q, v) after h, sticking, slipping and hitting stops as often as that takes.
+
+    Args:
+        forward: The mechanism's equation.
+        along: Of :func:`joint_functions`.
+        put: Of the same.
+        lag: Of the same.
+        q: Positions [rad or m].
+        v: Velocities.
+        torque: Efforts of the actuators at the start, 0 at passive joints [N m or N].
+        command: Commanded efforts during the step.
+        push: Efforts on the joints themselves.
+        h: Step [s].
+        p: The mechanism's parameters.
+        table: What the joints have, of :func:`pack_joints`.
+    """
+    left = h
+    n = len(q)
+    for _ in range(_MAX_EVENTS):
+        begin = h - left
+        now = along(lag(torque, command, begin, table[5]), 1.0, push)
+        direction, held = _modes(forward, along, put, q, v, now, p, table)
+        q_1, v_1 = _step(
+            forward, along, put, lag, q, v, torque, command, push, begin, left, direction, held, p, table
+        )  # fmt: skip
+        for i in range(n):
+            if v[i] == 0.0 and direction[i] != 0.0 and v_1[i] * direction[i] < 0.0:
+                # It broke away and came back within the step: keep it where it is.
+                held = put(held, i, 1.0)
+                direction = put(direction, i, 0.0)
+                q_1, v_1 = _step(
+                    forward, along, put, lag, q, v, torque, command, push, begin, left, direction, held, p, table
+                )  # fmt: skip
+        first, joint, which = left, -1, 0
+        for i in range(n):
+            for kind in range(3):
+                if held[i] > 0.0 or (kind == 0 and direction[i] == 0.0):
+                    continue
+                if _passed(kind, i, q_1, v_1, direction, table) >= 0.0:
+                    continue
+                low, g_low = 0.0, _passed(kind, i, q, v, direction, table)
+                high, g_high = left, _passed(kind, i, q_1, v_1, direction, table)
+                root, side = 0.0 if g_low <= 0.0 else left, 0
+                for _ in range(_MAX_ROOT_STEPS):
+                    if g_low <= 0.0 or high - low <= 1e-15 * h:
+                        break
+                    root = (low * g_high - high * g_low) / (g_high - g_low)
+                    if not low < root < high:
+                        break
+                    q_r, v_r = _step(
+                        forward, along, put, lag, q, v, torque, command, push, begin, root, direction, held, p, table
+                    )  # fmt: skip
+                    g = _passed(kind, i, q_r, v_r, direction, table)
+                    if abs(g) <= 1e-15:
+                        break
+                    if g > 0.0:
+                        low, g_low = root, g
+                        if side == 1:
+                            g_high *= 0.5
+                        side = 1
+                    else:
+                        high, g_high = root, g
+                        if side == -1:
+                            g_low *= 0.5
+                        side = -1
+                if joint < 0 or root < first:
+                    first, joint, which = root, i, kind
+        if joint < 0:
+            return q_1, v_1
+        q, v = _step(
+            forward, along, put, lag, q, v, torque, command, push, begin, first, direction, held, p, table
+        )  # fmt: skip
+        if which > 0:
+            q = put(q, joint, table[3][joint] if which == 1 else table[4][joint])
+            # A plastic impact: the impulse that takes this joint's velocity moves those that are not held, too.
+            a = _constrained(forward, along, put, q, v, now, direction, held, p, table)
+            more = _constrained(forward, along, put, q, v, put(now, joint, now[joint] + 1.0), direction, held, p, table)
+            column = along(more, -1.0, a)
+            v = along(v, -v[joint] / column[joint], column)
+        v = put(v, joint, 0.0)
+        left -= first
+        if left <= 1e-12 * h:
+            return q, v
+    return q, v
