@@ -136,8 +136,13 @@ def write_events_and_torque(
     events: Sequence[tuple[float, str, Mapping[str, Any]]],
     torque: Callable[[float], float],
     length: float,
+    *,
+    leave_out: Callable[[str, float], bool] = lambda topic, t: False,
 ) -> Path:
-    """Write a recording at 100 Hz of a plant at rest: events as (time, name, what it says), and the torque applied."""
+    """Write a recording at 100 Hz of a plant at rest: events as (time, name, what it says), and the torque applied.
+
+    Messages of a topic at a time [s] for which ``leave_out`` holds are missing.
+    """
     with open_writer(path) as bag:
         for topic in ("joint_states", "applied_effort"):
             bag.add_topic(f"{prefix}/{topic}", STATE)
@@ -149,9 +154,10 @@ def write_events_and_torque(
         for t in np.arange(0.0, length, 0.01):
             stamp = EPOCH_NS + round(t * 1e9)
             state = encode_joint_state(stamp, position=0.0, velocity=0.0, effort=0.0)
-            bag.write(f"{prefix}/joint_states", stamp, state)
             applied = encode_joint_state(stamp, frame_id="", effort=torque(float(t)))
-            bag.write(f"{prefix}/applied_effort", stamp, applied)
+            for topic, data in (("joint_states", state), ("applied_effort", applied)):
+                if not leave_out(topic, float(t)):
+                    bag.write(f"{prefix}/{topic}", stamp, data)
     return path
 
 

@@ -1,24 +1,31 @@
 """Stops pressed in a real browser while something is broken: whatever was frozen, killed or cut off, no stop is lost.
 
-A try is judged by the plant's own events, heard by a node that knows nothing of the console. It survives when the plant
-is stopped within ``MAX_DELAY`` of the moment at which the way to it was whole again, and when the page showed in red
-what did not answer.
+The plant is driven by a constant torque. A try is judged by the plant's own events and torques, heard by a node that
+knows nothing of the console. It survives when the plant is stopped, and its torque zero for good, within ``MAX_DELAY``
+of the press, or of the moment at which the way to the plant was whole again, and when the page showed in red what did
+not answer.
 """
 
 from __future__ import annotations
 
+import argparse
 import json
 import os
 import signal
 import socket
+import statistics
+import tempfile
+import threading
 import time
 from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
+from sensor_msgs.msg import JointState
 from std_msgs.msg import String
 
+from pendulum_msgs_py.contract import names
 from pendulum_msgs_py.ros import qos
 from tests.faults.outcome import Outcome
 from tests.graph_peer import GraphPeer
@@ -30,12 +37,16 @@ CHROMIUM = Path("/usr/bin/chromium")
 QUIET = ["--no-sandbox", "--disable-gpu", "--disable-background-networking", "--disable-component-update"]
 MAX_DELAY = 5.0
 """Longest time from a whole way to a stopped plant [s]: a service may have to be found anew, on a busy machine."""
+_TORQUE = 0.5
+"""What drives the plant while it is armed [N m]."""
 _HELD = 1.5
 """How long something is held up while the stop is pressed [s]."""
+_AFTER = 0.3
+"""How long the torque must stay zero after the page has shown the plant's answer [s]."""
 
 
 class StopRig:
-    """A simulator, a console, a browser, and a witness on the graph.
+    """A simulator under constant torque, a console, a browser, and a witness on the graph.
 
     Args:
         folder: For logs.
@@ -50,8 +61,18 @@ class StopRig:
             self.port = int(probe.getsockname()[1])
         self.address = f"http://localhost:{self.port}/"
         self.modes: list[str] = []
-        self.witness = GraphPeer("witness")
-        self.witness.node.create_subscription(String, "/sim/events", self._hear, qos.EVENTS)
+        self.torques: list[tuple[float, float]] = []
+        """When each applied torque was heard [s], and the torque [N m]: a plant that was frozen stamps late."""
+        self._witness = GraphPeer("witness")
+        self._witness.node.create_subscription(String, "/sim/events", self._hear, qos.EVENTS)
+        self._witness.node.create_subscription(JointState, f"/sim/{names.APPLIED_EFFORT}", self._feel, qos.STATE)
+        self._drive = self._witness.node.create_publisher(JointState, f"/sim/{names.EFFORT_COMMAND}", qos.COMMAND)
+        self._witness.node.create_subscription(
+            JointState, f"/sim/{names.JOINT_STATES}", self._command, qos.NEWEST_STATE
+        )
+        self._closing = threading.Event()
+        self._listener = threading.Thread(target=self._listen, name="witness")
+        self._listener.start()
         self.simulator = self.start_simulator()
         self.console = self.start_console()
         self.browser = play.chromium.launch(executable_path=str(CHROMIUM), args=QUIET)
@@ -60,7 +81,9 @@ class StopRig:
     def close(self) -> list[str]:
         """End everything; return what had to be killed."""
         self.browser.close()
-        self.witness.close()
+        self._closing.set()
+        self._listener.join()
+        self._witness.close()
         return self._processes.close()
 
     def start_simulator(self) -> RunningProgram:
@@ -82,12 +105,12 @@ class StopRig:
         return page
 
     def rearm(self) -> None:
-        """Acknowledge what is shown, reset the e-stop and arm, all through the page."""
+        """Acknowledge what is shown, reset the e-stop and arm, all through the page, until torque drives the plant."""
         deadline = time.monotonic() + 60.0
-        while self.modes[-1:] != ["armed_effort"] or self.page.locator("#alarms button").count():
+        while not (self.is_driven() and self.page.locator("#alarms button").count() == 0):
             if time.monotonic() > deadline:
                 shown = self.page.locator("#alarms").inner_text()
-                raise TimeoutError(f"waited 60 s for an armed plant; it is {self.modes[-3:]}, the page shows {shown!r}")
+                raise TimeoutError(f"waited 60 s for a driven plant; it is {self.modes[-3:]}, the page shows {shown!r}")
             # A button may be gone by the time that it is pressed.
             with suppress(Exception):
                 if self.page.locator("#alarms button").count():
@@ -96,15 +119,23 @@ class StopRig:
                     self.page.get_by_role("button", name="Reset e-stop /sim").click(timeout=500)
                 elif self.modes[-1:] in (["disarmed"], ["fault"]):
                     self.page.get_by_role("button", name="Arm /sim", exact=True).click(timeout=500)
-            self.witness.spin(0.2)
+            time.sleep(0.1)
 
-    def until_stopped(self, timeout: float = MAX_DELAY) -> float | None:
-        """Return how long the plant took to say that it is stopped [s]; None where it did not in time."""
-        start = time.monotonic()
-        with suppress(TimeoutError):
-            self.witness.until(lambda: self.modes[-1:] == ["e_stop"], "the e-stop", timeout)
-            return time.monotonic() - start
-        return None
+    def is_driven(self) -> bool:
+        """Tell whether torque acts on the plant now."""
+        heard, torque = self.torques[-1] if self.torques else (0.0, 0.0)
+        return self.modes[-1:] == ["armed_effort"] and torque != 0.0 and time.monotonic() - heard < 0.2
+
+    def until_stopped(self, timeout: float = MAX_DELAY) -> bool:
+        """Wait until the plant says that it is stopped; tell whether it did in time."""
+        return _soon(lambda: self.modes[-1:] == ["e_stop"], timeout)
+
+    def time_to_zero(self, since: float) -> float | None:
+        """Return the time from a moment until the torque was zero for good [s]; None if it is not."""
+        torques = list(self.torques)
+        driven = max((heard for heard, torque in torques if torque != 0.0), default=0.0)
+        zero = next((heard for heard, torque in torques if heard > max(driven, since) and torque == 0.0), None)
+        return None if zero is None else zero - since
 
     def sees(self, text: str, timeout_ms: int = 4000, page: Any = None) -> bool:
         """Tell whether the page comes to show a text among its alarms, in red."""
@@ -113,22 +144,35 @@ class StopRig:
             return True
         return False
 
+    def _listen(self) -> None:
+        while not self._closing.is_set():
+            self._witness.spin_once(0.1)
+
+    def _command(self, state: JointState) -> None:
+        command = JointState(effort=[_TORQUE])
+        command.header.stamp = state.header.stamp
+        command.header.frame_id = "witness"
+        self._drive.publish(command)
+
+    def _feel(self, message: JointState) -> None:
+        self.torques.append((time.monotonic(), message.effort[0]))
+
     def _hear(self, message: String) -> None:
         event = json.loads(message.data)
         if event.get("name") == "plant_mode":
             self.modes.append(str(event["mode"]))
 
 
-def _judge(rig: StopRig, outcome: Outcome) -> Outcome:
-    delay = rig.until_stopped()
-    outcome.demand(delay is not None, f"the plant is not stopped {MAX_DELAY:g} s later, it is {rig.modes[-3:]}")
-    outcome.time_to_zero = delay
-    # The page says so, too, and nothing wakes armed afterwards.
+def _judge(rig: StopRig, outcome: Outcome, since: float) -> Outcome:
+    outcome.demand(rig.until_stopped(), f"the plant is not stopped {MAX_DELAY:g} s later, it is {rig.modes[-3:]}")
+    # The page says so, too, and nothing wakes armed or moves afterwards.
     outcome.demand(
         _soon(lambda: rig.page.locator("#alarms .good").count() > 0, 6.0), "the page does not show the plant's answer"
     )
-    rig.witness.spin(0.3)
+    time.sleep(_AFTER)
     outcome.demand(rig.modes[-1:] == ["e_stop"], f"the plant became {rig.modes[-1:]} again")
+    outcome.time_to_zero = rig.time_to_zero(since)
+    outcome.demand(outcome.time_to_zero is not None, "torque still acts")
     return outcome
 
 
@@ -149,8 +193,9 @@ def _frozen_plant(rig: StopRig) -> Outcome:
         outcome.demand(rig.sees("HAS NOT ANSWERED"), "the page does not say that the plant has not answered")
         time.sleep(_HELD)
     finally:
+        since = time.monotonic()
         rig.simulator.send_signal(signal.SIGCONT)
-    return _judge(rig, outcome)
+    return _judge(rig, outcome, since)
 
 
 def _killed_plant(rig: StopRig) -> Outcome:
@@ -160,7 +205,7 @@ def _killed_plant(rig: StopRig) -> Outcome:
     outcome.demand(rig.sees("HAS NOT ANSWERED"), "the page does not say that the plant has not answered")
     rig.simulator = rig.start_simulator()
     rig.simulator.wait_for_output(r"\[INFO\]", 60)
-    return _judge(rig, outcome)
+    return _judge(rig, outcome, time.monotonic())
 
 
 def _plant_gone_for_long(rig: StopRig) -> Outcome:
@@ -173,7 +218,7 @@ def _plant_gone_for_long(rig: StopRig) -> Outcome:
     rig.page.keyboard.press("Escape")
     rig.simulator = rig.start_simulator()
     rig.simulator.wait_for_output(r"\[INFO\]", 60)
-    return _judge(rig, outcome)
+    return _judge(rig, outcome, time.monotonic())
 
 
 def _frozen_server(rig: StopRig) -> Outcome:
@@ -185,8 +230,9 @@ def _frozen_server(rig: StopRig) -> Outcome:
         time.sleep(_HELD)
         outcome.demand(rig.sees("HAS NOT REACHED", 300), "the page took its words back")
     finally:
+        since = time.monotonic()
         rig.console.send_signal(signal.SIGCONT)
-    return _judge(rig, outcome)
+    return _judge(rig, outcome, since)
 
 
 def _killed_server(rig: StopRig) -> Outcome:
@@ -197,7 +243,7 @@ def _killed_server(rig: StopRig) -> Outcome:
     outcome.demand(rig.sees("HAS NOT REACHED"), "the page does not say that the server has not taken the stop")
     outcome.demand(rig.sees("NO ANSWER FROM"), "the page does not say that the server is silent")
     rig.console = rig.start_console()
-    return _judge(rig, outcome)
+    return _judge(rig, outcome, time.monotonic())
 
 
 def _cut_link(rig: StopRig) -> Outcome:
@@ -212,16 +258,18 @@ def _cut_link(rig: StopRig) -> Outcome:
         time.sleep(_HELD)
     finally:
         whole = {"offline": False, "latency": 0, "downloadThroughput": -1, "uploadThroughput": -1}
+        since = time.monotonic()
         session.send("Network.emulateNetworkConditions", whole)
-    return _judge(rig, outcome)
+    return _judge(rig, outcome, since)
 
 
 def _two_clients(rig: StopRig) -> Outcome:
     outcome = Outcome()
     phone = rig.open(viewport={"width": 390, "height": 844}, has_touch=True)
     try:
+        since = time.monotonic()
         phone.locator("#e_stop").tap()
-        _judge(rig, outcome)
+        _judge(rig, outcome, since)
         seen = _soon(lambda: phone.locator("#alarms .good").count() > 0, 3.0)
         outcome.demand(seen, "the client that pressed does not show the answer")
     finally:
@@ -239,8 +287,9 @@ def _page_in_the_background(rig: StopRig) -> Outcome:
         other.bring_to_front()
         time.sleep(_HELD)
     finally:
+        since = time.monotonic()
         rig.simulator.send_signal(signal.SIGCONT)
-    _judge(rig, outcome)
+    _judge(rig, outcome, since)
     other.close()
     return outcome
 
@@ -255,14 +304,16 @@ def _closed_page(rig: StopRig) -> Outcome:
         other.close()
         time.sleep(_HELD)
     finally:
+        since = time.monotonic()
         rig.simulator.send_signal(signal.SIGCONT)
-    return _judge(rig, outcome)
+    return _judge(rig, outcome, since)
 
 
 def _pressed(press: Callable[[Any], object]) -> Callable[[StopRig], Outcome]:
     def act(rig: StopRig) -> Outcome:
+        since = time.monotonic()
         press(rig.page)
-        return _judge(rig, Outcome())
+        return _judge(rig, Outcome(), since)
 
     return act
 
@@ -294,36 +345,51 @@ STOPS: dict[str, Callable[[StopRig], Outcome]] = {
 
 
 def main() -> int:
-    """Try each stop several times and print a table: ``python -m tests.faults.console_stops [TRIES] [NAME]``."""
-    import sys
-    import tempfile
-
+    """Try each stop several times and print a table; return 1 where one was lost or the page in the wrong."""
     from playwright.sync_api import sync_playwright
 
     from pendulum_bags.experiments.domain import reserve_domain
 
-    tries = int(sys.argv[1]) if len(sys.argv) > 1 else 20
-    chosen = {name: act for name, act in STOPS.items() if len(sys.argv) < 3 or sys.argv[2] in name}
-    lost = 0
+    parser = argparse.ArgumentParser(
+        prog="python -m tests.faults.console_stops",
+        description=main.__doc__,
+        epilog="Example: python -m tests.faults.console_stops 20 frozen",
+    )
+    parser.add_argument("tries", nargs="?", type=int, default=20, help="how often each way is tried")
+    parser.add_argument("name", nargs="?", default="", help="only the ways whose names have this in them")
+    parser.add_argument("--list", action="store_true", help="print the names of the ways and end")
+    options = parser.parse_args()
+    chosen = {name: act for name, act in STOPS.items() if options.name in name}
+    if options.list or not chosen:
+        print("\n".join(STOPS))
+        return int(not options.list)
+    failed = 0
     with tempfile.TemporaryDirectory() as folder, reserve_domain() as domain, sync_playwright() as play:
         os.environ["ROS_DOMAIN_ID"] = str(domain)
         rig = StopRig(Path(folder), play)
-        print("| fault | tried | stops lost | page in the wrong | longest delay [s] | remarks |")
-        print("|---|---|---|---|---|---|")
-        for name, act in chosen.items():
-            outcomes = []
-            for _ in range(tries):
-                rig.rearm()
-                outcomes.append(act(rig))
-            delays = [outcome.time_to_zero for outcome in outcomes if outcome.time_to_zero is not None]
-            missing = tries - len(delays)
-            wrong = sum(not outcome.survived for outcome in outcomes) - missing
-            remarks = "; ".join(sorted({outcome.detail for outcome in outcomes if outcome.detail}))
-            longest = max(delays, default=0.0)
-            print(f"| {name} | {tries} | {missing} | {wrong} | {longest:.2f} | {remarks} |", flush=True)
-            lost += missing + wrong
-        rig.close()
-    return int(lost > 0)
+        try:
+            print("| stop | presses | lost | page in the wrong | median [s] | longest [s] | remarks |")
+            print("|---|---|---|---|---|---|---|")
+            for name, act in chosen.items():
+                failed += _row(rig, name, act, options.tries)
+        finally:
+            rig.close()
+    return int(failed > 0)
+
+
+def _row(rig: StopRig, name: str, act: Callable[[StopRig], Outcome], tries: int) -> int:
+    outcomes = []
+    for _ in range(tries):
+        rig.rearm()
+        outcomes.append(act(rig))
+    times = [outcome.time_to_zero for outcome in outcomes if outcome.time_to_zero is not None]
+    lost = tries - len(times)
+    wrong = sum(not outcome.survived for outcome in outcomes) - lost
+    remarks = "; ".join(sorted({outcome.detail for outcome in outcomes if outcome.detail}))
+    median = statistics.median(times) if times else float("nan")
+    longest = max(times, default=float("nan"))
+    print(f"| {name} | {tries} | {lost} | {wrong} | {median:.2f} | {longest:.2f} | {remarks} |", flush=True)
+    return lost + wrong
 
 
 if __name__ == "__main__":

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 import re
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -190,3 +191,25 @@ def test_a_safely_broken_bridge_is_right_and_every_other_way_is_wrong(tmp_path: 
         assert (found.right, reason in found.reason) == (right, True), found
     healthy = write_events_and_torque(tmp_path / "healthy", "/hw", ARMED, lambda t: 0.5, 2.0)
     assert "never went into fault; its states were: armed_position" in checks.check_fault(tasks, healthy).reason
+
+
+@pytest.mark.parametrize(
+    ("leave_out", "reason"),
+    [
+        (
+            lambda topic, t: topic == "applied_effort" and 1.06 < t < 1.085,
+            "states near the fault have no torque beside",
+        ),
+        (lambda topic, t: 1.06 < t < 1.2, "no torque is told for 140 ms near the fault"),
+        (lambda topic, t: round(100 * t) % 4 != 0, "only 25 torques a second"),
+    ],
+    ids=["torques alone", "a piece", "three of four"],
+)
+def test_a_recording_that_was_thinned_out_proves_nothing(
+    tmp_path: Path, leave_out: Callable[[str, float], bool], reason: str
+) -> None:
+    tasks = replace(draw_tasks(1), fault="m_stop")
+    events = [*ARMED, (1.0, "plant_mode", {"mode": "fault", "reason": "m_stop: pressed"})]
+    bag = write_events_and_torque(tmp_path / "bag", "/hw", events, lambda t: 0.0, 2.0, leave_out=leave_out)
+    found = checks.check_fault(tasks, bag)
+    assert (found.right, reason in found.reason) == (False, True), found

@@ -49,6 +49,10 @@ _STOPPED_WITHIN = 0.06
 """Time from the bridge's fault to zero torque [s], as its README promises."""
 _WATCHED = 0.5
 """How long the recording must go on after the fault, to show that the torque stays away [s]."""
+_LONGEST_GAP = 0.05
+"""Longest time without a torque in the recording around the fault [s]; a bridge at 100 Hz tells one each 10 ms."""
+_LEAST_RATE = 50.0
+"""Fewest torques a second [Hz]: half of the bridge's."""
 
 
 @dataclass(frozen=True)
@@ -166,6 +170,7 @@ def check_fault(tasks: Tasks, bag: Path) -> Judgement:
         if topic not in content.topics:
             raise DataError(f"bag {bag} has no topic {topic}; expected it, since it shows the torque")
         applied = content.array(topic)
+        states = content.array(f"{space}/{names.JOINT_STATES}")["stamp_ns"]
     modes = [event for event in events if event["name"] == names.Event.PLANT_MODE]
     index = next((i for i, event in enumerate(modes) if event.get("mode") == "fault"), None)
     if index is None:
@@ -185,12 +190,38 @@ def check_fault(tasks: Tasks, bag: Path) -> Judgement:
     later = (since > _STOPPED_WITHIN) & (since < until)
     if not later.any() or float(since[later].max()) < _WATCHED:
         return Judgement(False, f"the recording ends too early; let it go on for {_WATCHED:g} s after the fault")
+    untold = np.setdiff1d(states, applied["stamp_ns"])
+    if lacking := _what_is_missing(since, (untold - int(modes[index]["stamp_ns"])) / NANOSECONDS, until):
+        return Judgement(False, f"{lacking}; record all of {topic}, and thin nothing out")
     worst = float(np.max(np.abs(applied["effort"][later])))
     if not math.isfinite(worst):
         return Judgement(False, f"the torque later than {1e3 * _STOPPED_WITHIN:.0f} ms after the fault is not a number")
     if worst > 0.0:
         return Judgement(False, f"{worst:.3g} N m acted later than {1e3 * _STOPPED_WITHIN:.0f} ms after the fault")
     return Judgement(True, f"{reason}; from {1e3 * _STOPPED_WITHIN:.0f} ms after it no torque acted")
+
+
+def _what_is_missing(since: Any, untold: Any, until: float) -> str:
+    """Return which torques a recording lacks around a fault, empty for none: what it leaves out may have acted.
+
+    Args:
+        since: Times of the torques after the fault [s].
+        untold: Times of the states that have no torque [s].
+        until: Time at which the bridge was armed again [s].
+    """
+    start, end = -_STOPPED_WITHIN, min(until, _WATCHED)
+    watched = np.sort(since[(since > start) & (since <= end)])
+    lacking = int(np.count_nonzero((untold > start) & (untold <= end)))
+    if lacking:
+        return f"{lacking} states near the fault have no torque beside them"
+    longest = float(np.max(np.diff(watched, prepend=start, append=end)))
+    if longest > _LONGEST_GAP:
+        allowed = f"expected one at least every {1e3 * _LONGEST_GAP:.0f} ms"
+        return f"no torque is told for {1e3 * longest:.0f} ms near the fault; {allowed}"
+    rate = len(watched) / (end - start)
+    if rate < _LEAST_RATE:
+        return f"only {rate:.0f} torques a second are told near the fault; expected at least {_LEAST_RATE:.0f}"
+    return ""
 
 
 def time_constant(q: tuple[float, float], r: float) -> float:
