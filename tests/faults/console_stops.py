@@ -26,6 +26,7 @@ from sensor_msgs.msg import JointState
 from std_msgs.msg import String
 
 from pendulum_msgs_py.contract import names
+from pendulum_msgs_py.contract.cdr import decode_joint_state, encode_joint_state
 from pendulum_msgs_py.ros import qos
 from tests.faults.outcome import Outcome
 from tests.graph_peer import GraphPeer
@@ -65,10 +66,11 @@ class StopRig:
         """When each applied torque was heard [s], and the torque [N m]: a plant that was frozen stamps late."""
         self._witness = GraphPeer("witness")
         self._witness.node.create_subscription(String, "/sim/events", self._hear, qos.EVENTS)
-        self._witness.node.create_subscription(JointState, f"/sim/{names.APPLIED_EFFORT}", self._feel, qos.STATE)
+        applied = f"/sim/{names.APPLIED_EFFORT}"
+        self._witness.node.create_subscription(JointState, applied, self._feel, qos.STATE, raw=True)
         self._drive = self._witness.node.create_publisher(JointState, f"/sim/{names.EFFORT_COMMAND}", qos.COMMAND)
         self._witness.node.create_subscription(
-            JointState, f"/sim/{names.JOINT_STATES}", self._command, qos.NEWEST_STATE
+            JointState, f"/sim/{names.JOINT_STATES}", self._command, qos.NEWEST_STATE, raw=True
         )
         self._closing = threading.Event()
         self._listener = threading.Thread(target=self._listen, name="witness")
@@ -88,7 +90,9 @@ class StopRig:
 
     def start_simulator(self) -> RunningProgram:
         """Start the plant, which arms itself."""
-        return self._processes.start("pendulum_sim", "simulator", "--ros-args", "-r", "__ns:=/sim")
+        return self._processes.start(
+            "pendulum_sim", "simulator", "--ros-args", "-r", "__ns:=/sim", "-p", "rate_hz:=100.0"
+        )
 
     def start_console(self) -> RunningProgram:
         """Start the console on its port."""
@@ -148,14 +152,14 @@ class StopRig:
         while not self._closing.is_set():
             self._witness.spin_once(0.1)
 
-    def _command(self, state: JointState) -> None:
-        command = JointState(effort=[_TORQUE])
-        command.header.stamp = state.header.stamp
-        command.header.frame_id = "witness"
-        self._drive.publish(command)
+    def _command(self, data: bytes) -> None:
+        if (state := decode_joint_state(data)) is not None:
+            self._drive.publish(encode_joint_state(state.stamp_ns, frame_id="witness", effort=_TORQUE))
 
-    def _feel(self, message: JointState) -> None:
-        self.torques.append((time.monotonic(), message.effort[0]))
+    def _feel(self, data: bytes) -> None:
+        applied = decode_joint_state(data)
+        if applied is not None and applied.effort is not None:
+            self.torques.append((time.monotonic(), applied.effort))
 
     def _hear(self, message: String) -> None:
         event = json.loads(message.data)
@@ -169,6 +173,7 @@ def _judge(rig: StopRig, outcome: Outcome, since: float) -> Outcome:
     outcome.demand(
         _soon(lambda: rig.page.locator("#alarms .good").count() > 0, 6.0), "the page does not show the plant's answer"
     )
+    _soon(lambda: rig.time_to_zero(since) is not None, MAX_DELAY)
     time.sleep(_AFTER)
     outcome.demand(rig.modes[-1:] == ["e_stop"], f"the plant became {rig.modes[-1:]} again")
     outcome.time_to_zero = rig.time_to_zero(since)

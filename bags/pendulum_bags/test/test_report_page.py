@@ -21,6 +21,7 @@ from pendulum_bags.report.data import ReportData
 from pendulum_bags.report.figures import comparison_figures, make_figures
 from pendulum_bags.report.report_cli import main
 from pendulum_bags.report.tables import make_tables, provenance_table
+from pendulum_bags.report.terms import Terms
 from pendulum_bags.report.wording import name_in
 from pendulum_bags.report.write import _title
 from pendulum_bags.verdict import Evidence, Layer, LayerResult, Mark, write_layer
@@ -92,6 +93,37 @@ def test_page_is_complete_in_itself_and_small(page: Path) -> None:
     ):
         assert heading in text
     assert "2.687959" in text
+
+
+def test_every_term_that_the_page_links_has_its_sentence_and_every_command_is_set_as_code(page: Path) -> None:
+    text = page.read_text(encoding="utf-8").split('<script type="application/json"')[0]
+    linked = set(re.findall(r'class="term" href="#(term-[a-z-]+)"', text))
+    assert {"term-margin", "term-delay", "term-std", "term-ks", "term-bootstrap", "term-mean-end"} <= linked
+    assert linked == set(re.findall(r'<div id="(term-[a-z-]+)"><dt>', text))
+    assert "steady state" not in text  # nothing settles under noise
+    assert "python -m" in text
+    assert not re.search(r"(?<!<code>)python -m", text)
+    assert "kg m²" in text
+    assert not re.search(r"\^\d|>1/s|\[1/s\]", text)
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        ("Not measured yet; to measure it: python -m a_b x.", "python -m pendulum_bags experiment ranking"),
+        ("Identify (python -m a_b x), then simulate with --plant plant.yaml.", "python -m a_b x"),
+    ],
+)
+def test_a_command_ends_where_its_sentence_goes_on(text: str, expected: str) -> None:
+    text = text.replace("a_b x", "pendulum_bags experiment ranking")
+    expected = expected.replace("a_b x", "pendulum_bags experiment ranking")
+    assert f"<code>{expected}</code>" in Terms().mark(text)
+
+
+def test_the_longest_name_of_a_term_wins_and_text_stays_text() -> None:
+    marked = Terms().mark("<b> is not equivalent within the default margins")
+    assert marked.startswith('&lt;b&gt; is <a class="term" href="#term-equivalent">not equivalent</a>')
+    assert "standard deviation" not in Terms().mark("stdout")
 
 
 def test_page_escapes_what_it_is_told(page: Path) -> None:
@@ -293,7 +325,7 @@ def test_every_text_of_a_report_says_that_the_hardware_was_emulated() -> None:
 
 def test_provenance_names_plant_and_citation_and_the_file_at_the_root_agrees(comparison: Comparison) -> None:
     rows = dict(provenance_table(ReportData(comparison, {"versions": {"pendulum_bags": "0.1.0"}})).rows)
-    assert rows["plant of the design"].startswith("thesis: inertia 0.055 kg m^2, damping 11.77 N m s/rad, gravity 1.6")
+    assert rows["plant of the design"].startswith("thesis: inertia 0.055 kg m², damping 11.77 N m s/rad, gravity 1.6")
     told = yaml.safe_load((PROJECT / "CITATION.cff").read_text(encoding="utf-8"))
     assert rows["cite as"].startswith(f"{told['authors'][0]['name']}: {told['title']}, version {told['version']}, git ")
     manifest = ElementTree.parse(PROJECT / "bags" / "pendulum_bags" / "package.xml").getroot()

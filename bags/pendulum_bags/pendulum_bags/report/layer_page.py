@@ -12,6 +12,7 @@ from pendulum_bags.figures.embed import packed_plotly, script_json
 from pendulum_bags.figures.figure import Figure
 from pendulum_bags.figures.render_plotly import graphs_of
 from pendulum_bags.figures.table import Table
+from pendulum_bags.report.terms import Terms
 from pendulum_bags.verdict import LayerResult, Mark
 from pendulum_bags.verdict.evidence import evidence_table
 from pendulum_msgs_py.errors import BagError
@@ -57,6 +58,8 @@ def write_layer_page(
     environment = jinja2.Environment(
         loader=jinja2.FunctionLoader(read), autoescape=True, trim_blocks=True, lstrip_blocks=True
     )
+    terms = Terms()
+    environment.filters["marked"] = terms.mark
     graphs: dict[str, Any] = {}
     entries = []
     for figure in figures:
@@ -71,6 +74,7 @@ def write_layer_page(
         tables=[*(evidence_table(layer) for layer in layers), *tables],
         entries=entries,
         notes=notes,
+        terms=terms,
         made_at=datetime.now(timezone.utc).strftime("%Y-%m-%d %H:%M UTC"),
         graphs=script_json(graphs),
         plotly=packed_plotly(),

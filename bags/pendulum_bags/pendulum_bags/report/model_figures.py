@@ -32,7 +32,7 @@ def overdamped_phase(data: ReportData) -> Figure | str:
     slope = plant.gravity / plant.damping
     sentence = (
         f"Without torque the overdamped pendulum rests at 0 (stable) and at π (unstable), from where it falls with a "
-        f"rate of {quantity(slope, '1/s')}; a constant torque below G = {quantity(plant.gravity, 'N m', 4)} only "
+        f"rate of {quantity(slope, 's⁻¹')}; a constant torque below G = {quantity(plant.gravity, 'N m', 4)} only "
         "shifts both."
     )
     panel = Panel("θ [rad]", "θ′ [rad/s]", traces)

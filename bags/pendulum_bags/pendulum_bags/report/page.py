@@ -15,6 +15,7 @@ from pendulum_bags.figures.table import Table
 from pendulum_bags.report.animation import animation_of
 from pendulum_bags.report.data import ReportData
 from pendulum_bags.report.tables import provenance_table
+from pendulum_bags.report.terms import Terms
 from pendulum_bags.report.wording import name_in
 from pendulum_bags.runs.run_data import timing_warning
 from pendulum_bags.verdict import Answer
@@ -70,6 +71,8 @@ def render_page(
     environment = jinja2.Environment(
         loader=jinja2.FunctionLoader(read), autoescape=True, trim_blocks=True, lstrip_blocks=True
     )
+    terms = Terms()
+    environment.filters["marked"] = terms.mark
     sections = []
     graphs: dict[str, Any] = {}
     packed = {name: base64.b64encode(content).decode("ascii") for name, content in (pictures or {}).items()}
@@ -88,6 +91,8 @@ def render_page(
     emulated = data.comparison.is_emulated
     return environment.get_template("report.html.j2").render(
         title=title,
+        emulated=emulated,
+        terms=terms,
         made_at=made_at,
         answer=data.answer,
         sentence=_without_mark(data.answer),
@@ -123,7 +128,8 @@ def _facts(data: ReportData) -> list[tuple[str, str]]:
     if comparison.is_paired:
         facts.append(("paths apart (rms)", quantity(float(pair.as_dict()["rms_position"]), "rad")))
     delay = 1e3 * comparison.delay
-    facts.append(("hardware answers", f"{abs(delay):.1f} ms {'later' if delay >= 0.0 else 'earlier'}"))
+    when = "later" if delay >= 0.0 else "earlier"
+    facts.append(("hardware answers", f"{abs(delay):.1f} ms {when} than the simulation"))
     facts.append(("seed", str(data.summary.get("seed", "unknown"))))
     return facts
 

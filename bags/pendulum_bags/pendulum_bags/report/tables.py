@@ -149,9 +149,10 @@ def _unpaired(data: ReportData) -> Table:
 
 
 def _metrics(data: ReportData) -> Table:
+    noisy = data.run.get("disturbance", {}).get("kind") in _RANDOM
     rows = [
         (
-            f"{row['metric'].replace('_', ' ')} [{row['unit'].replace('^2', '²')}]",
+            f"{_metric_name(row['metric'], noisy=noisy)} [{row['unit'].replace('^2', '²')}]",
             _cell(row["sim"], 4),
             _cell(row["hw"], 4),
             row["meaning"],
@@ -175,6 +176,14 @@ def _metrics(data: ReportData) -> Table:
     )
 
 
+_RANDOM = ("uniform", "gaussian", "multisine", "prbs", "from_bag")
+
+
+def _metric_name(metric: str, *, noisy: bool) -> str:
+    """Return a metric's name in words; under noise nothing settles, so nothing is called steady."""
+    return "mean error at the end" if noisy and metric == "steady_state_error" else metric.replace("_", " ")
+
+
 def _eigenvalues(data: ReportData) -> Table | None:
     if data.plant is None or data.plant.drivetrain is not None:
         return None
@@ -191,10 +200,10 @@ def _eigenvalues(data: ReportData) -> Table | None:
         None,
     )
     unstable = float(np.max(open_loop.real))
-    sentence = f"Upright, the plant runs away at {unstable:.6f} 1/s without control; " + (
+    sentence = f"Upright, the plant runs away at {unstable:.6f} s⁻¹ without control; " + (
         f"this run used combination {used}." if used else "this run used other weights than these."
     )
-    head = ("#", "q11", "q22", "r", "eigenvalues [1/s]", "K [N m/rad, N m s/rad]")
+    head = ("#", "Q₁₁ [rad⁻²]", "Q₂₂ [s² rad⁻²]", "R [(N m)⁻²]", "eigenvalues [s⁻¹]", "K [N m/rad, N m s/rad]")
     return Table("Eigenvalues of the linearised system", sentence, head, rows, "Model")
 
 
@@ -210,7 +219,8 @@ def _model(data: ReportData) -> Table | None:
     if plant is None:
         return None
     rows = [
-        (spec.name, quantity(getattr(plant, spec.name), "", 6), spec.unit, spec.description) for spec in PLANT_SPECS
+        (spec.name, quantity(getattr(plant, spec.name), "", 6), _typeset(spec.unit), _typeset(spec.description))
+        for spec in PLANT_SPECS
     ]
     sentence = f"Simulation and design of the controller use the plant {plant.name!r}: M θ″ + b θ′ + G sin θ = u + d."
     return Table("Parameters of the model", sentence, ("parameter", "value", "unit", "meaning"), rows, "Model")
@@ -303,11 +313,21 @@ def citation(version: str, revision: str) -> str:
 def _plant_in_words(plant: PlantParameters) -> str:
     """Return the parameters of a plant that are not zero, with units."""
     told = [
-        f"{spec.name} {quantity(float(value), '' if spec.unit == '-' else spec.unit, 5)}"
+        f"{spec.name} {quantity(float(value), '' if spec.unit == '-' else _typeset(spec.unit), 5)}"
         for spec in PLANT_SPECS
         if (value := getattr(plant, spec.name)) != 0.0
     ]
     return f"{plant.name}: {', '.join(told)}"
+
+
+_TYPESET = {"^2": "²", ">=": "≥", "theta'": "θ′", "theta": "θ", "tau_C": "τ_C", "tau_S": "τ_S", "1/s": "s⁻¹"}
+
+
+def _typeset(text: str) -> str:
+    """Return a unit or a meaning as it is printed, not as a terminal shows it."""
+    for plain, printed in _TYPESET.items():
+        text = text.replace(plain, printed)
+    return "–" if text == "-" else text
 
 
 def _short_path(path: str) -> str:

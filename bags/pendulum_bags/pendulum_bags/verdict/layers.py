@@ -188,7 +188,7 @@ def not_measured(layer: Layer, how: str) -> LayerResult:
         layer: Which.
         how: The command that measures it.
     """
-    return LayerResult(layer, Mark.NOT_MEASURED, f"Not measured: {how} measures it.", reason=how)
+    return LayerResult(layer, Mark.NOT_MEASURED, f"Not measured yet; to measure it: {how}.", reason=how)
 
 
 @dataclass(frozen=True)

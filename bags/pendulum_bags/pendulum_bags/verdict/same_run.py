@@ -12,7 +12,7 @@ __all__ = ["in_words", "same_run_layer"]
 
 _MARKS = {Outcome.EQUIVALENT: Mark.YES, Outcome.DIFFERENT: Mark.NO, Outcome.UNDECIDED: Mark.UNDECIDED}
 _MOST_REASONS = 3
-"""Reasons that a sentence names; the table has them all."""
+"""Reasons that a sentence tells with their size; it names the rest, and the table has them all."""
 
 
 def same_run_layer(comparison: Comparison, *, more: str = "") -> LayerResult:
@@ -34,9 +34,10 @@ def same_run_layer(comparison: Comparison, *, more: str = "") -> LayerResult:
         steps: Sequence[str] = ()
     elif mark is Mark.NO:
         failed = sorted((test for test in tests if test.outcome is Outcome.DIFFERENT), key=_beyond, reverse=True)
-        told = [in_words(test) for test in _each_once(failed)]
-        left_out = len(told) - _MOST_REASONS
-        reason = "; ".join(told[:_MOST_REASONS]) + (f"; and {left_out} more" if left_out > 0 else "")
+        told = _each_once(failed)
+        beside = ", ".join(test.quantity for test in told[_MOST_REASONS:])
+        reason = "; ".join(in_words(test) for test in told[:_MOST_REASONS])
+        reason += f"; also beyond its margin: {beside}" if beside else ""
         steps = _remedies(comparison, failed)
     else:
         reason = verdict.sentence.removeprefix("Undecided: ").rstrip(".")
@@ -52,7 +53,8 @@ def in_words(test: EquivalenceTest) -> str:
     """Return what a test found as half a sentence."""
     value = test.interval.estimate
     if test.quantity == "delay":
-        return f"the hardware answers {abs(value):.3g} {test.unit} {'later' if value >= 0.0 else 'earlier'}"
+        when = "later" if value >= 0.0 else "earlier"
+        return f"the hardware answers {abs(value):.3g} {test.unit} {when} than the simulation"
     if test.quantity.startswith("mean angle"):
         return f"the hardware's mean angle is {abs(value):.2g} {test.unit} {'higher' if value >= 0.0 else 'lower'}"
     if test.quantity.startswith("spread of "):

@@ -82,7 +82,8 @@
       for (const [name, axis] of Object.entries(layout)) {
         if (axis && axis.range) place.firstRanges[name] = axis.range.slice();
       }
-      await Plotly.newPlot(place, data, layout, config);
+      // On a phone the tool bar would lie on the legend, and fingers scroll.
+      await Plotly.newPlot(place, data, layout, { ...config, displayModeBar: window.innerWidth < 700 ? false : "hover" });
       place.addEventListener("keydown", (event) => {
         const action = keys[event.key];
         if (!action || event.ctrlKey || event.metaKey || event.altKey) return;
