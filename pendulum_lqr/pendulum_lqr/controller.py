@@ -44,6 +44,7 @@ CONTROLLERS: dict[str, str] = {
     "nmpc": "pendulum_lqr.controllers.nmpc:NonlinearMpc",
     "sliding_mode": "pendulum_lqr.controllers.sliding_mode:SlidingMode",
     "playback": "pendulum_lqr.controllers.playback:Playback",
+    "policy": "pendulum_lqr.controllers.policy:LearnedPolicy",
 }
 """Name -> ``module:class``; modules are imported when asked for, so that LQR does not pay for CasADi."""
 
@@ -62,7 +63,13 @@ COMMON_PARAMETERS: tuple[ParameterSpec, ...] = (
 
 
 class BaseController:
-    """What most controllers share: a limit, a set-point, and nothing to remember."""
+    """What most controllers share: a limit, a set-point, and nothing to remember.
+
+    Attributes:
+        effort_limit: Largest torque [N m].
+        set_point: Angle to hold, from upright [rad].
+        notice: What the user has to be told while it runs; empty for nothing.
+    """
 
     SUMMARY: ClassVar[str] = ""
     """One sentence for tables."""
@@ -73,9 +80,10 @@ class BaseController:
     PREDICTS: ClassVar[bool] = False
     """Whether it predicts the plant from the torques that it sent, and so has to know which one holds."""
     FEEDBACK: ClassVar[bool] = True
-    """Whether it closes a loop, which has to be stable."""
+    """Whether it closes a loop whose linear model has to be stable."""
 
     def __init__(self, effort_limit: float, set_point: float = 0.0) -> None:
+        self.notice = ""
         self.effort_limit = effort_limit
         self.set_point = set_point
 
@@ -92,6 +100,17 @@ class BaseController:
             ParameterError: The values do not make a controller for this plant.
         """
         raise NotImplementedError(f"{cls.__name__}.design")
+
+    def check(self, plant: PlantParameters, period: float) -> None:
+        """Refuse a period at which states come and for which this controller is not; any period by default.
+
+        Args:
+            plant: Plant parameters.
+            period: Period of the states [s].
+
+        Raises:
+            ParameterError: It is not for this period.
+        """
 
     def reset(self) -> None:
         """Forget everything."""
@@ -219,7 +238,10 @@ def make_controller(
             f"{name} knows rigid plants alone, and plant {plant.name!r} is series elastic; expected lqr, lqi, lqg, "
             "mpc, pid or pd_gravity, or a plant file without a drivetrain"
         )
-    controller: Controller = kind.design(plant, period, p)
+    designed = kind.design(plant, period, p)
+    if checked:
+        designed.check(plant, period)
+    controller: Controller = designed
     if p["velocity"] != "measured":
         controller = EstimatedVelocity(controller, make_velocity_estimator(p["velocity"], plant, period))
     if checked and kind.FEEDBACK and p.get("tuning") != "manual":

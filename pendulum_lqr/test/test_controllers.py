@@ -20,8 +20,10 @@ from pendulum_lqr.controller import (
 )
 from pendulum_lqr.controllers.playback import Playback
 from pendulum_lqr.disturbance import make_disturbance
+from pendulum_lqr.policy_file import write_policy
 from pendulum_msgs_py.errors import DataError, ParameterError
 from pendulum_msgs_py.plants.plant_parameters import PlantParameters, load_plant
+from tests.policies import random_policy
 
 THESIS = load_plant("thesis")
 DFKI = load_plant("dfki")
@@ -39,6 +41,8 @@ def playback_file(tmp_path_factory):
 def design(name, plant, playback_file, period=0.01, **values):
     if name == "playback":
         values["file"] = str(playback_file)
+    if name == "policy":
+        values["policy"] = str(write_policy(playback_file.with_name("policy.npz"), random_policy(plant)))
     return make_controller(name, plant, period, values)
 
 

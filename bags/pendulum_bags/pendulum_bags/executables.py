@@ -23,6 +23,7 @@ EXECUTABLES: dict[str, str] = {
 
 COMMANDS: dict[str, str] = {
     "course": "pendulum_bags.course.course_cli:main",
+    "train": "pendulum_bags.learning.train_cli:main",
     "convert": "pendulum_rosbag.convert.convert_cli:convert_main",
     "merge": "pendulum_rosbag.convert.convert_cli:merge_main",
     "cut": "pendulum_rosbag.convert.convert_cli:cut_main",

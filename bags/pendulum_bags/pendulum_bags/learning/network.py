@@ -1,0 +1,104 @@
+"""Dense networks that learn: forward, backward, and Adam, in numpy and single precision."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from itertools import pairwise
+
+import numpy as np
+from numpy.typing import NDArray
+
+__all__ = ["Adam", "Mlp"]
+
+Floats = NDArray[np.float32]
+
+
+class Mlp:
+    """Dense layers with tanh between them and a linear last one.
+
+    Args:
+        sizes: Values that go in, widths of the hidden layers, values that come out.
+        generator: Draws the first weights.
+        last: Factor on the first weights of the last layer.
+    """
+
+    def __init__(self, sizes: Sequence[int], generator: np.random.Generator, last: float = 1.0) -> None:
+        self.parameters: list[Floats] = []
+        count = len(sizes) - 1
+        for k, (before, after) in enumerate(pairwise(sizes)):
+            scale = (last if k == count - 1 else 1.0) / math.sqrt(before)
+            self.parameters.append((scale * generator.standard_normal((before, after))).astype(np.float32))
+            self.parameters.append(np.zeros(after, dtype=np.float32))
+        self._inputs: list[Floats] = []
+
+    def forward(self, x: Floats) -> Floats:
+        """Return the output for inputs of shape (n, in), shape (n, out), and keep what :meth:`backward` needs."""
+        self._inputs = []
+        last = len(self.parameters) - 2
+        for k in range(0, last + 2, 2):
+            self._inputs.append(x)
+            x = x @ self.parameters[k]
+            x += self.parameters[k + 1]
+            if k < last:
+                np.tanh(x, out=x)
+        return x
+
+    def backward(self, slope: Floats) -> list[Floats]:
+        """Return the derivatives of a loss by the parameters.
+
+        Args:
+            slope: Its derivative by the last output, shape (n, out).
+        """
+        gradients: list[Floats] = []
+        for k in range(len(self.parameters) - 2, -1, -2):
+            x = self._inputs[k // 2]
+            gradients += [slope.sum(axis=0), x.T @ slope]
+            if k:
+                slope = (slope @ self.parameters[k].T) * (np.float32(1.0) - x * x)
+        return gradients[::-1]
+
+
+class Adam:
+    """Adam with a bound on the length of the gradient.
+
+    Args:
+        parameters: What it changes, in place.
+        longest: Length to which a longer gradient is cut [-].
+
+    Source: Kingma and Ba, Adam: a method for stochastic optimization, 2015, algorithm 1.
+    """
+
+    def __init__(self, parameters: Sequence[Floats], longest: float = 1.0) -> None:
+        self.parameters = parameters
+        self.longest = longest
+        self.count = 0
+        self.first = [np.zeros_like(each) for each in parameters]
+        self.second = [np.zeros_like(each) for each in parameters]
+
+    def step(self, gradients: Sequence[Floats], rate: float) -> None:
+        """Take a step of a length given by the learning rate."""
+        length = math.sqrt(sum(float(np.sum(np.square(each, dtype=np.float64))) for each in gradients))
+        cut = min(1.0, self.longest / (length + 1e-12))
+        self.count += 1
+        size = rate * math.sqrt(1.0 - 0.999**self.count) / (1.0 - 0.9**self.count)
+        for k, gradient in enumerate(gradients):
+            g, m, v = gradient * np.float32(cut), self.first[k], self.second[k]
+            np.add(m, np.float32(0.1) * (g - m), out=m)
+            np.add(v, np.float32(0.001) * (g * g - v), out=v)
+            value = self.parameters[k]
+            np.subtract(value, np.float32(size) * m / (np.sqrt(v) + np.float32(1e-7)), out=value)
+
+    def state(self) -> dict[str, NDArray[np.generic]]:
+        """Return what a checkpoint keeps."""
+        kept: dict[str, NDArray[np.generic]] = {"count": np.array(self.count)}
+        for k, (m, v) in enumerate(zip(self.first, self.second, strict=True)):
+            kept[f"first_{k}"], kept[f"second_{k}"] = m, v
+        return kept
+
+    def restore(self, kept: Mapping[str, NDArray[np.generic]]) -> None:
+        """Go on from a checkpoint."""
+        self.count = int(kept["count"])
+        for k in range(len(self.parameters)):
+            self.first[k][...] = kept[f"first_{k}"]
+            self.second[k][...] = kept[f"second_{k}"]

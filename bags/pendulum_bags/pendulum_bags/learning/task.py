@@ -1,0 +1,86 @@
+"""What a policy is trained to do, and on which plants, delays, noise and kicks: the settings that make it transfer."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
+
+from pendulum_msgs_py.errors import ParameterError
+from pendulum_msgs_py.plants.plant_parameters import PlantParameters
+
+__all__ = ["VARIED", "SwingUpTask", "ranges_of"]
+
+VARIED = ("inertia", "damping", "gravity", "coulomb_friction")
+"""Parameters that differ from episode to episode; static friction keeps its ratio to Coulomb friction."""
+
+
+@dataclass(frozen=True)
+class SwingUpTask:
+    """Swing up from anywhere and hold upright.
+
+    Attributes:
+        period: Time between two answers [s].
+        share: Half width of the range of each parameter, as a share of its value; a plant file's interval, where it
+            is wider, counts instead [-].
+        delay: Longest mean delay from state to torque; each episode draws one from 0 to this [s].
+        jitter: Standard deviation of the delay from answer to answer [s].
+        angle_noise: Standard deviation of measured angles [rad].
+        velocity_noise: Standard deviation of measured velocities [rad/s].
+        offset: Largest error of the zero angle [rad], and of the torque as a share of the limit [-].
+        kick: Largest torque on the link, as a share of the torque limit; a kick lasts 50 ms [-].
+        kick_rate: Kicks a second.
+        rate_time: Time in which the torque may go from one limit to the other [s].
+        history: Samples that the policy sees.
+        episode: Length of an episode [s].
+    """
+
+    period: float = 0.01
+    share: float = 0.25
+    delay: float = 0.008
+    jitter: float = 0.001
+    angle_noise: float = 1e-3
+    velocity_noise: float = 0.03
+    offset: float = 0.01
+    kick: float = 0.7
+    kick_rate: float = 0.5
+    rate_time: float = 0.05
+    history: int = 3
+    episode: float = 6.0
+
+    def __post_init__(self) -> None:
+        """Refuse what cannot be trained on."""
+        for name, value in asdict(self).items():
+            if not math.isfinite(value) or value < 0.0 or (value == 0.0 and name in {"period", "rate_time", "episode"}):
+                raise ParameterError(f"{name} is {value}; expected a finite number >= 0 (> 0 for times)")
+        if not 1 <= self.history <= 50:
+            raise ParameterError(f"history is {self.history}; expected 1 to 50 samples")
+        if self.share >= 1.0:
+            raise ParameterError(f"share is {self.share}; expected less than 1")
+        if self.delay + 4.0 * self.jitter > 2.0 * self.period:
+            raise ParameterError(
+                f"delay is {self.delay} s with a jitter of {self.jitter} s; expected two periods, "
+                f"{2.0 * self.period:g} s, at most"
+            )
+
+
+def ranges_of(
+    plant: PlantParameters, share: float, intervals: Mapping[str, Sequence[float]]
+) -> dict[str, tuple[float, float]]:
+    """Return lowest and highest value of each parameter that differs in training, static friction among them.
+
+    Args:
+        plant: The plant at the centre.
+        share: Half width as a share of the value [-].
+        intervals: Those of the plant file, by name.
+    """
+    found = {}
+    for name in VARIED:
+        value = float(getattr(plant, name))
+        low, high = intervals.get(name, (value, value))
+        found[name] = (max(0.0, min(low, (1.0 - share) * value)), max(high, (1.0 + share) * value))
+    ratio = plant.static_friction / plant.coulomb_friction if plant.coulomb_friction else 0.0
+    if ratio:
+        low, high = found["coulomb_friction"]
+        found["static_friction"] = (ratio * low, ratio * high)
+    return {name: pair for name, pair in found.items() if pair[0] < pair[1]}

@@ -1,0 +1,131 @@
+"""``train``: from an identified plant to a policy file."""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+from rich.progress import TextColumn, TimeRemainingColumn
+
+from pendulum_msgs_py.errors import ParameterError
+from pendulum_msgs_py.programs.counted_progress import counting_bar
+from pendulum_msgs_py.programs.executables import EXIT_INTERRUPTED, cli_main
+from pendulum_msgs_py.programs.terminal import make_console
+
+if TYPE_CHECKING:
+    from pendulum_bags.learning.training import Training
+
+__all__ = ["main"]
+
+app = typer.Typer(add_completion=False, rich_markup_mode=None)
+
+
+@app.command()
+def train(
+    out: Annotated[Path, typer.Option("--out", "-o", help="Policy file (.npz); it must be new.")],
+    plant: Annotated[
+        str, typer.Option(help="Preset or plant file; intervals in the file widen what is trained on.")
+    ] = "dfki",
+    task: Annotated[
+        str, typer.Option(help="swing_up: swing up and hold upright; pendulum_v1: Gymnasium's Pendulum-v1.")
+    ] = "swing_up",
+    seed: Annotated[int, typer.Option(help="Seed; one seed is one file.", min=0)] = 1,
+    updates: Annotated[int, typer.Option(help="Updates of the policy; 0 for as many as the task takes.", min=0)] = 0,
+    share: Annotated[float, typer.Option(help="Half width of the range of each parameter, as a share.")] = 0.25,
+    delay: Annotated[float, typer.Option(help="Longest mean delay from state to torque [s].")] = 0.008,
+    jitter: Annotated[float, typer.Option(help="Standard deviation of the delay from answer to answer [s].")] = 0.001,
+    angle_noise: Annotated[float, typer.Option(help="Standard deviation of measured angles [rad].")] = 1e-3,
+    velocity_noise: Annotated[float, typer.Option(help="Standard deviation of measured velocities [rad/s].")] = 0.03,
+    kick: Annotated[float, typer.Option(help="Largest kick, as a share of the torque limit.")] = 0.7,
+    period: Annotated[float, typer.Option(help="Time between two answers [s].")] = 0.01,
+    history: Annotated[int, typer.Option(help="Samples that the policy sees.")] = 3,
+    hidden: Annotated[tuple[int, int], typer.Option(help="Widths of the hidden layers.")] = (64, 64),
+    json_output: Annotated[bool, typer.Option("--json", help="Print what was measured as JSON.")] = False,
+) -> None:
+    """Train a policy for a plant: on plants, delays, noise and kicks drawn anew for each episode.
+
+    An interrupted training goes on with the same command; its checkpoint lies beside the policy file.
+
+    Example: python -m pendulum_bags train --plant dfki --out build/dfki.npz
+    """
+    from pendulum_bags.learning.task import SwingUpTask
+    from pendulum_bags.learning.training import checkpoint_path
+    from pendulum_bags.learning.training import train as train_policy
+
+    if out.exists():
+        raise ParameterError(f"policy file {out} exists; expected a new one")
+    if min(hidden) < 1 or max(hidden) > 512:
+        raise ParameterError(f"hidden is {hidden[0]} {hidden[1]}; expected widths of 1 to 512")
+    swing_up = SwingUpTask(
+        period=period, share=share, delay=delay, jitter=jitter, angle_noise=angle_noise,
+        velocity_noise=velocity_noise, kick=kick, history=history,
+    )  # fmt: skip
+    settings = _settings(task, plant, seed, updates, swing_up, hidden)
+    console = make_console(stderr=json_output, highlight=False)
+    began = time.monotonic()
+    try:
+        with counting_bar(console, TextColumn("{task.fields[told]}"), TimeRemainingColumn()) as bar:
+            shown = bar.add_task("updates", total=settings.updates, told="compiling")
+
+            def on_update(done: int, measured: Mapping[str, float]) -> None:
+                bar.update(shown, completed=done, told=f"reward {measured['reward']:+.4f}")
+
+            def on_trial(done: int, of: int) -> None:
+                bar.update(shown, description="trials", completed=done, total=of, told="")
+
+            policy, curves = train_policy(settings, out, on_update=on_update, on_trial=on_trial)
+    except KeyboardInterrupt:
+        kept = checkpoint_path(out)
+        there = f"the same command goes on from {kept}" if kept.exists() else "nothing was written"
+        console.print(f"interrupted: {there}", soft_wrap=True)
+        raise typer.Exit(EXIT_INTERRUPTED) from None
+    from pendulum_bags.learning.curves import write_curves
+
+    figure = write_curves(out, settings, curves)
+    measured: Mapping[str, Any] = policy.provenance["evaluation"]
+    if json_output:
+        print(json.dumps({"policy": str(out), "steps": settings.steps, **measured}, indent=2))
+        return
+    console.print(_sentence(measured))
+    console.print(f"policy  {out}\ncurves  {figure}\n({time.monotonic() - began:.0f} s)", soft_wrap=True)
+
+
+def _settings(task: str, plant: str, seed: int, updates: int, swing_up: Any, hidden: tuple[int, int]) -> Training:
+    from pendulum_bags.learning.ppo import PpoSettings
+    from pendulum_bags.learning.training import Training
+    from pendulum_msgs_py.plants.plant_parameters import load_plant_file
+
+    if task == "pendulum_v1":
+        # Few and long steps: an episode has 200, and is all but over after the swing-up.
+        ppo = PpoSettings(hidden=hidden, discount=0.95, epochs=8, batches=8)
+        settings = Training(task=task, swing_up=swing_up, ppo=ppo, environments=256, updates=80, seed=seed)
+    else:
+        parameters, provenance = load_plant_file(plant)
+        settings = Training(
+            task=task, plant=parameters, intervals=provenance["intervals"], swing_up=swing_up,
+            ppo=PpoSettings(hidden=hidden), seed=seed,
+        )  # fmt: skip
+    return replace(settings, updates=updates) if updates else settings
+
+
+def _sentence(measured: Mapping[str, Any]) -> str:
+    if "return_mean" in measured:
+        return (
+            f"Pendulum-v1: return {measured['return_mean']:.1f} (standard deviation {measured['return_std']:.1f}) over "
+            f"{measured['episodes']} episodes"
+        )
+    time_up = measured["median_time"]
+    told = f"{measured['up']} of {measured['trials']} trials end upright"
+    told += f", after {time_up:.2f} s in the median" if time_up is not None else ""
+    gave_up = measured["gave_up"]
+    return f"{told}; {gave_up} left the states that training visited" if gave_up else told
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run the command line."""
+    return cli_main(app, argv, name="python -m pendulum_bags train")

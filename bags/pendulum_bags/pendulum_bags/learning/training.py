@@ -1,0 +1,237 @@
+"""A training from its settings to a policy file: one seed, one file; what is interrupted goes on where it stopped."""
+
+from __future__ import annotations
+
+import io
+import json
+import math
+import os
+from collections.abc import Callable, Mapping
+from contextlib import suppress
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import threadpoolctl
+from numpy.typing import NDArray
+
+from pendulum_bags.learning.environment import SwingUp, velocity_scale
+from pendulum_bags.learning.evaluation import gymnasium_return, measured_success, trials_of
+from pendulum_bags.learning.pendulum_v1 import PLANT, STEP, PendulumV1
+from pendulum_bags.learning.ppo import Ppo, PpoSettings
+from pendulum_bags.learning.task import SwingUpTask, ranges_of
+from pendulum_bags.runs.run_folder import git_revision, versions
+from pendulum_lqr.policy import Network, Policy
+from pendulum_lqr.policy_file import write_policy
+from pendulum_msgs_py.contract.names import JOINT
+from pendulum_msgs_py.errors import DataError, ParameterError
+from pendulum_msgs_py.plants.plant_differences import describe_plants
+from pendulum_msgs_py.plants.plant_parameters import PlantParameters
+
+__all__ = ["EPISODES", "TASKS", "TRIALS", "Training", "checkpoint_path", "train"]
+
+TASKS = ("swing_up", "pendulum_v1")
+_CHECKPOINT_EVERY = 10
+_LARGEST_CHECKPOINT = 500_000_000
+TRIALS, EPISODES = 60, 100
+"""How many runs judge a finished policy."""
+_EVALUATION_SEED = 10_000
+_SPEED_MARGIN = 1.1
+"""The box of velocities is this much wider than what training visited."""
+
+
+@dataclass(frozen=True)
+class Training:
+    """What is trained.
+
+    Attributes:
+        task: One of ``TASKS``.
+        plant: The plant at the centre.
+        intervals: Intervals of its parameters, as a plant file gives them.
+        swing_up: What differs from episode to episode, for ``swing_up``.
+        ppo: How it learns.
+        environments: Pendulums at once.
+        updates: Updates of the policy.
+        seed: Seed of everything.
+    """
+
+    task: str = "swing_up"
+    plant: PlantParameters = PLANT
+    intervals: Mapping[str, Any] = field(default_factory=dict)
+    swing_up: SwingUpTask = field(default_factory=SwingUpTask)
+    ppo: PpoSettings = field(default_factory=PpoSettings)
+    environments: int = 512
+    updates: int = 240
+    seed: int = 1
+
+    def __post_init__(self) -> None:
+        """Refuse what cannot be trained."""
+        if self.task not in TASKS:
+            raise ParameterError(f"task is {self.task!r}; expected one of {', '.join(TASKS)}")
+        for name in ("environments", "updates"):
+            if getattr(self, name) < 1:
+                raise ParameterError(f"{name} is {getattr(self, name)}; expected >= 1")
+        if self.seed < 0:
+            raise ParameterError(f"seed is {self.seed}; expected >= 0")
+
+    @property
+    def ranges(self) -> dict[str, tuple[float, float]]:
+        """Lowest and highest value of each parameter that differs."""
+        return ranges_of(self.plant, self.swing_up.share, self.intervals) if self.task == "swing_up" else {}
+
+    @property
+    def steps(self) -> int:
+        """Steps of the environment in all."""
+        return self.environments * self.ppo.horizon * self.updates
+
+    def to_json(self) -> dict[str, Any]:
+        """Return the settings as JSON values."""
+        swing_up = asdict(self.swing_up) if self.task == "swing_up" else {}
+        return {
+            "task": self.task, "plant": json.loads(describe_plants([self.plant]))[0], "ranges": self.ranges,
+            "swing_up": swing_up, "ppo": asdict(self.ppo), "environments": self.environments,
+            "updates": self.updates, "seed": self.seed,
+        }  # fmt: skip
+
+
+def checkpoint_path(out: Path) -> Path:
+    """Return where the checkpoint of a training lies."""
+    return out.with_name(f"{out.stem}.checkpoint.npz")
+
+
+def train(
+    settings: Training,
+    out: Path,
+    *,
+    on_update: Callable[[int, Mapping[str, float]], None] | None = None,
+    on_trial: Callable[[int, int], None] | None = None,
+) -> tuple[Policy, NDArray[np.float64]]:
+    """Train, or go on where a checkpoint stopped, and write the policy file.
+
+    Args:
+        settings: What is trained.
+        out: The policy file.
+        on_update: Called with updates done and what was measured.
+        on_trial: Called with trials done and in all, after the last update.
+
+    Returns:
+        The policy, and its curves: steps, mean reward, divergence and spread, one row an update, shape (n, 4).
+
+    Raises:
+        ParameterError: A checkpoint of other settings is in the way.
+        DataError: The file or the checkpoint cannot be written or read.
+        FaultError: The training diverged; the checkpoint before stays.
+    """
+    # One thread, so that sums are added in one order on any number of cores.
+    with threadpoolctl.threadpool_limits(1):
+        generator = np.random.default_rng(settings.seed)
+        environment = _environment(settings, generator)
+        learner = Ppo(environment, settings.ppo, generator)
+        curves: list[list[float]] = []
+        checkpoint = checkpoint_path(out)
+        told = json.dumps(settings.to_json(), sort_keys=True)
+        fastest = 0.0
+        if checkpoint.exists():
+            curves, fastest = _restore(checkpoint, told, learner, generator)
+            if on_update is not None:
+                on_update(len(curves), {"reward": curves[-1][1]})
+        for number in range(len(curves), settings.updates):
+            measured = learner.update(1.0 - number / settings.updates)
+            if isinstance(environment, SwingUp):
+                fastest = max(fastest, float(np.abs(environment.motion[:, 1]).max()))
+            steps = float((number + 1) * settings.environments * settings.ppo.horizon)
+            curves.append([steps, measured["reward"], measured["divergence"], measured["spread"]])
+            if on_update is not None:
+                on_update(number + 1, measured)
+            if (number + 1) % _CHECKPOINT_EVERY == 0 or number + 1 == settings.updates:
+                _keep(checkpoint, told, learner, generator, curves, fastest)
+        policy = _policy(settings, learner, fastest, {})
+        policy = _policy(settings, learner, fastest, _evaluate(settings, policy, on_trial))
+        write_policy(out, policy)
+    with suppress(OSError):
+        checkpoint.unlink()
+    return policy, np.array(curves)
+
+
+def _environment(settings: Training, generator: np.random.Generator) -> SwingUp | PendulumV1:
+    if settings.task == "pendulum_v1":
+        return PendulumV1(settings.environments, generator)
+    return SwingUp(settings.environments, settings.plant, settings.ranges, settings.swing_up, generator)
+
+
+def _evaluate(settings: Training, policy: Policy, on_trial: Callable[[int, int], None] | None) -> dict[str, Any]:
+    if settings.task == "pendulum_v1":
+        mean, spread = gymnasium_return(policy, EPISODES, _EVALUATION_SEED)
+        return {"episodes": EPISODES, "return_mean": mean, "return_std": spread}
+    return measured_success(policy, trials_of(policy, settings.swing_up, TRIALS, _EVALUATION_SEED), on_trial)
+
+
+def _policy(settings: Training, learner: Ppo, fastest: float, evaluation: Mapping[str, Any]) -> Policy:
+    parameters = learner.actor.parameters
+    network = Network(
+        tuple(np.ascontiguousarray(each.T) for each in parameters[::2]), tuple(each.copy() for each in parameters[1::2])
+    )
+    provenance = {
+        "training": settings.to_json(), "steps": settings.steps, "evaluation": dict(evaluation),
+        "versions": versions(), "git_revision": git_revision(),
+    }  # fmt: skip
+    plant, task = settings.plant, settings.swing_up
+    common: dict[str, Any] = {
+        "network": network, "task": settings.task, "joints": (JOINT,), "plant": plant,
+        "ranges": settings.ranges, "effort_limit": (plant.effort_limit,), "angle_box": (math.pi,),
+        "provenance": provenance, "name": f"{plant.name} {settings.task} seed {settings.seed}",
+    }  # fmt: skip
+    if settings.task == "pendulum_v1":
+        return Policy(
+            **common, period=STEP, effort_rate=(math.inf,), velocity_scale=(8.0,), velocity_box=(8.001,),
+            signals=("cos", "sin", "velocity"),
+        )  # fmt: skip
+    return Policy(
+        **common, period=task.period, effort_rate=(2.0 * plant.effort_limit / task.rate_time,),
+        velocity_scale=(velocity_scale(plant),), velocity_box=(_SPEED_MARGIN * fastest,), history=task.history,
+    )  # fmt: skip
+
+
+def _keep(
+    path: Path, told: str, learner: Ppo, generator: np.random.Generator, curves: list[list[float]], fastest: float
+) -> None:
+    arrays: dict[str, NDArray[Any]] = {f"learner/{name}": each for name, each in learner.state().items()}
+    arrays |= {f"environment/{name}": each for name, each in learner.environment.state().items()}
+    words = {"settings": told, "generator": json.dumps(generator.bit_generator.state)}
+    arrays |= {name: np.frombuffer(text.encode(), dtype=np.uint8) for name, text in words.items()}
+    buffer = io.BytesIO()
+    np.savez(buffer, curves=np.array(curves), fastest=np.array(fastest), **arrays)
+    temporary = path.with_name(f".{path.name}.{os.getpid()}")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        temporary.write_bytes(buffer.getvalue())
+        temporary.replace(path)
+    except OSError as error:
+        with suppress(OSError):
+            temporary.unlink(missing_ok=True)
+        raise DataError(f"checkpoint {path} cannot be written: {error.strerror}; the one before it stays") from error
+
+
+def _restore(path: Path, told: str, learner: Ppo, generator: np.random.Generator) -> tuple[list[list[float]], float]:
+    """Go on from a checkpoint; return the curves so far and the fastest motion [rad/s]."""
+    try:
+        if path.stat().st_size > _LARGEST_CHECKPOINT:
+            raise DataError(f"checkpoint {path} has more than {_LARGEST_CHECKPOINT} bytes; expected one of ours")
+        with np.load(path, allow_pickle=False) as kept:
+            if kept["settings"].tobytes().decode() != told:
+                raise ParameterError(
+                    f"checkpoint {path} is of a training with other settings; expected the same ones, another --out, "
+                    "or the checkpoint removed"
+                )
+            learner.restore({key[8:]: kept[key] for key in kept.files if key.startswith("learner/")})
+            learner.environment.restore({key[12:]: kept[key] for key in kept.files if key.startswith("environment/")})
+            generator.bit_generator.state = json.loads(kept["generator"].tobytes().decode())
+            curves: list[list[float]] = kept["curves"].tolist()
+            return curves, float(kept["fastest"])
+    except (ParameterError, DataError):
+        raise
+    except Exception as error:
+        raise DataError(
+            f"checkpoint {path} cannot be read ({type(error).__name__}); expected one of ours, or none"
+        ) from error

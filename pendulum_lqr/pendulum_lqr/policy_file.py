@@ -1,0 +1,328 @@
+"""Policies on disk: one ``.npz`` whose content is checked in full before any of it is used.
+
+A zip archive of arrays: ``header`` (JSON as bytes), ``weight_k`` and ``bias_k`` of each layer, and
+``test_observations`` with ``test_actions``, computed again on loading, so that another arithmetic or a damaged
+file shows. Nothing in it is executed: arrays of numbers alone, no pickles. Sizes are bounded before anything is read.
+"""
+
+from __future__ import annotations
+
+import io
+import json
+import math
+import os
+import stat
+import zipfile
+import zlib
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
+from pathlib import Path
+from typing import Any, NoReturn
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pendulum_lqr.policy import MODEL, Network, Policy, fingerprint
+from pendulum_msgs_py.errors import DataError, PendulumError
+from pendulum_msgs_py.plants.plant_differences import describe_plants, read_plants
+
+__all__ = ["FORMAT", "LARGEST_FILE", "dumps_policy", "load_policy", "loads_policy", "write_policy"]
+
+FORMAT = "pendulum_policy/1"
+LARGEST_FILE = 4_000_000
+"""Largest file accepted, and largest sum of its arrays [bytes]: a network of 64 x 64 takes 20 thousand."""
+_LARGEST_HEADER = 100_000
+_MOST_LAYERS = 8
+_TEST_VECTORS = 16
+_TOLERANCE = 1e-4
+"""How far a recomputed test vector may be off: other processors add in another order [-]."""
+_VECTORS = ("effort_limit", "effort_rate", "velocity_scale", "angle_box", "velocity_box")
+_KEYS = {
+    "format", "model", "name", "task", "joints", "period", "plant", "fingerprint", "ranges", *_VECTORS, "signals",
+    "history", "activation", "output", "layers", "provenance",
+}  # fmt: skip
+
+
+def write_policy(path: str | Path, policy: Policy) -> Path:
+    """Write a policy file; it appears whole or not at all.
+
+    Raises:
+        DataError: The file cannot be written.
+    """
+    path = Path(path)
+    content = dumps_policy(policy)
+    temporary = path.with_name(f".{path.name}.{os.getpid()}")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        temporary.write_bytes(content)
+        temporary.replace(path)
+    except (OSError, ValueError) as error:
+        with suppress(OSError, ValueError):
+            temporary.unlink(missing_ok=True)
+        reason = error.strerror if isinstance(error, OSError) else str(error)
+        raise DataError(f"policy file {path} cannot be written: {reason}") from error
+    return path
+
+
+def dumps_policy(policy: Policy) -> bytes:
+    """Return the content of a policy file; equal policies give equal bytes."""
+    network = policy.network
+    vectors = np.random.default_rng(0).uniform(-1.0, 1.0, (_TEST_VECTORS, network.sizes[0])).astype(np.float32)
+    arrays: dict[str, NDArray[Any]] = {"header": np.frombuffer(_header(policy).encode(), dtype=np.uint8)}
+    for k, (weight, bias) in enumerate(zip(network.weights, network.biases, strict=True)):
+        arrays[f"weight_{k}"] = np.ascontiguousarray(weight, dtype=np.float32)
+        arrays[f"bias_{k}"] = np.ascontiguousarray(bias, dtype=np.float32)
+    arrays["test_observations"] = vectors
+    arrays["test_actions"] = network.answer(vectors)
+    buffer = io.BytesIO()
+    with zipfile.ZipFile(buffer, "w", zipfile.ZIP_STORED) as archive:
+        for name, array in arrays.items():
+            entry = io.BytesIO()
+            np.lib.format.write_array(entry, array, version=(1, 0), allow_pickle=False)
+            # A fixed date: the bytes depend on the policy alone.
+            archive.writestr(zipfile.ZipInfo(f"{name}.npy", (1980, 1, 1, 0, 0, 0)), entry.getvalue())
+    content = buffer.getvalue()
+    if len(content) > LARGEST_FILE:
+        raise DataError(f"policy {policy.name!r} takes {len(content)} bytes; expected at most {LARGEST_FILE}")
+    return content
+
+
+def load_policy(path: str | Path) -> Policy:
+    """Return the policy of a file.
+
+    Raises:
+        DataError: The file is missing, too large, no policy, damaged, or of a version that computes otherwise.
+    """
+    path = Path(path).expanduser()
+    where = f"policy file {path}"
+    try:
+        status = path.stat()
+        if not stat.S_ISREG(status.st_mode):
+            kind = "a folder" if stat.S_ISDIR(status.st_mode) else "a device or a pipe"
+            raise DataError(f"{where} is {kind}; expected a file")
+        if status.st_size > LARGEST_FILE:
+            raise DataError(f"{where} has {status.st_size} bytes; expected at most {LARGEST_FILE}")
+        with path.open("rb") as file:
+            content = file.read(LARGEST_FILE + 1)
+    except FileNotFoundError as error:
+        raise DataError(f"{where} does not exist") from error
+    except (OSError, ValueError) as error:
+        if isinstance(error, DataError):
+            raise
+        reason = error.strerror if isinstance(error, OSError) else str(error)
+        raise DataError(f"{where} cannot be read: {reason}") from error
+    return loads_policy(content, where)
+
+
+def loads_policy(content: bytes, where: str = "policy") -> Policy:
+    """Return the policy of a file's content.
+
+    Args:
+        content: The bytes.
+        where: What it is, for messages.
+
+    Raises:
+        DataError: as :func:`load_policy`.
+    """
+    try:
+        arrays = _read_arrays(content)
+        header = _read_header(arrays.pop("header"))
+        tests = arrays.pop("test_observations"), arrays.pop("test_actions")
+        policy = _build(header, arrays)
+        _recompute(policy.network, *tests)
+    except PendulumError as error:
+        raise DataError(f"{where} is refused: {error}") from error
+    return policy
+
+
+def _header(policy: Policy) -> str:
+    network = policy.network
+    header = {
+        "format": FORMAT,
+        "model": MODEL,
+        "name": policy.name,
+        "task": policy.task,
+        "joints": list(policy.joints),
+        "period": policy.period,
+        "plant": json.loads(describe_plants([policy.plant]))[0],
+        "fingerprint": fingerprint(policy.plant),
+        "ranges": {name: list(pair) for name, pair in policy.ranges.items()},
+        # JSON has no infinity: no bound on the rate is null.
+        **{name: [v if math.isfinite(v) else None for v in getattr(policy, name)] for name in _VECTORS},
+        "signals": list(policy.signals),
+        "history": policy.history,
+        "activation": network.activation,
+        "output": network.output,
+        "layers": list(network.sizes),
+        "provenance": dict(policy.provenance),
+    }
+    try:
+        text = json.dumps(header, allow_nan=False, sort_keys=True)
+    except (TypeError, ValueError, RecursionError) as error:
+        raise DataError(f"provenance of policy {policy.name!r} holds what JSON has no word for: {error}") from error
+    if len(text) > _LARGEST_HEADER:
+        raise DataError(f"header of policy {policy.name!r} has {len(text)} bytes; expected at most {_LARGEST_HEADER}")
+    return text
+
+
+def _read_arrays(content: bytes) -> dict[str, NDArray[Any]]:
+    """Return the arrays of an archive, whose names and sizes are checked before it is unpacked."""
+    if len(content) > LARGEST_FILE:
+        raise DataError(f"it has {len(content)} bytes; expected at most {LARGEST_FILE}")
+    arrays = {}
+    try:
+        with zipfile.ZipFile(io.BytesIO(content)) as archive:
+            entries = archive.infolist()
+            names = [entry.filename.removesuffix(".npy") for entry in entries]
+            layers = sum(name.startswith("weight_") for name in names)
+            expected = {"header", "test_observations", "test_actions"}
+            expected |= {f"{kind}_{k}" for kind in ("weight", "bias") for k in range(layers)}
+            if len(names) != len(set(names)) or set(names) != expected or not 1 <= layers <= _MOST_LAYERS:
+                raise DataError(f"it holds {_shown(names)}; expected header, weight_k, bias_k and test vectors")
+            total = sum(entry.file_size for entry in entries)
+            if total > LARGEST_FILE:
+                raise DataError(f"its arrays take {total} bytes; expected at most {LARGEST_FILE}")
+            for name, entry in zip(names, entries, strict=True):
+                with archive.open(entry) as file:
+                    # What the directory says of the size is not believed either.
+                    data = file.read(entry.file_size + 1)
+                arrays[name] = _read_array(name, data, np.uint8 if name == "header" else np.float32)
+    except DataError:
+        raise
+    except (zipfile.BadZipFile, zlib.error, OSError, ValueError, NotImplementedError, RuntimeError, EOFError) as error:
+        raise DataError(f"it is no whole .npz archive ({_sentence(error)})") from error
+    return arrays
+
+
+def _read_array(name: str, data: bytes, kind: type[np.generic]) -> NDArray[Any]:
+    """Return one array; its shape is compared with the bytes that there are before memory is taken for it."""
+    stream = io.BytesIO(data)
+    try:
+        version = np.lib.format.read_magic(stream)
+        if version != (1, 0):
+            raise DataError(f"array {name} has version {version} of the format; expected (1, 0)")
+        shape, fortran, dtype = np.lib.format.read_array_header_1_0(stream)
+    except (ValueError, TypeError, SyntaxError, RecursionError, MemoryError) as error:
+        if isinstance(error, DataError):
+            raise
+        raise DataError(f"array {name} has no header that numpy reads ({_sentence(error)})") from error
+    if dtype != np.dtype(kind) or fortran:
+        raise DataError(f"array {name} holds {dtype}; expected {np.dtype(kind)} in C order")
+    left = len(data) - stream.tell()
+    if any(type(size) is not int or size < 0 for size in shape) or math.prod(shape) * dtype.itemsize != left:
+        raise DataError(f"array {name} of shape {_shown(shape)} has {left} bytes; expected as many as its shape says")
+    return np.frombuffer(data, dtype=kind, offset=stream.tell()).reshape(shape)
+
+
+def _read_header(raw: NDArray[Any]) -> dict[str, Any]:
+    if raw.size > _LARGEST_HEADER:
+        raise DataError(f"header has {raw.size} bytes; expected at most {_LARGEST_HEADER}")
+    try:
+        header = json.loads(raw.tobytes().decode(), parse_constant=_refuse_constant, object_pairs_hook=_once)
+    except DataError:
+        raise
+    except (ValueError, RecursionError) as error:
+        raise DataError(f"header is no JSON ({_sentence(error)})") from error
+    if not isinstance(header, dict):
+        raise DataError(f"header is a {type(header).__name__}; expected a mapping")
+    for key, wanted in (("format", FORMAT), ("model", MODEL)):
+        if header.get(key) != wanted:
+            raise DataError(f"{key} is {_shown(header.get(key))}; expected {wanted!r}")
+    if set(header) != _KEYS:
+        wrong = min(set(header) ^ _KEYS)
+        raise DataError(f"header {'lacks' if wrong in _KEYS else 'has the unknown key'} {_shown(wrong)}")
+    return header
+
+
+def _build(header: Mapping[str, Any], arrays: Mapping[str, NDArray[Any]]) -> Policy:
+    layers = range(sum(name.startswith("weight_") for name in arrays))
+    network = Network(
+        tuple(arrays[f"weight_{k}"] for k in layers),
+        tuple(arrays[f"bias_{k}"] for k in layers),
+        activation=_text(header, "activation"),
+        output=_text(header, "output"),
+    )
+    if header["layers"] != list(network.sizes):
+        raise DataError(f"layers are {_shown(header['layers'])}; the weights say {list(network.sizes)}")
+    plant = read_plants(json.dumps([header["plant"]]))[0]
+    if header["fingerprint"] != fingerprint(plant):
+        raise DataError(f"fingerprint is {_shown(header['fingerprint'])}; its plant has {fingerprint(plant)}")
+    if type(header["history"]) is not int:
+        raise DataError(f"history is {_shown(header['history'])}; expected a whole number")
+    ranges, provenance = header["ranges"], header["provenance"]
+    if not isinstance(ranges, dict) or not isinstance(provenance, dict):
+        raise DataError("ranges or provenance is no mapping")
+    pairs = {name: _numbers(pair, f"range of {name}", "") for name, pair in ranges.items()}
+    if any(len(pair) != 2 for pair in pairs.values()):
+        raise DataError(f"ranges are {_shown(ranges)}; expected [low, high] for each")
+    vectors = {name: _numbers(header[name], name, name) for name in _VECTORS}
+    return Policy(
+        network=network,
+        name=_text(header, "name"),
+        task=_text(header, "task"),
+        joints=_texts(header, "joints"),
+        period=_numbers([header["period"]], "period", "")[0],
+        plant=plant,
+        ranges={name: (pair[0], pair[1]) for name, pair in pairs.items()},
+        signals=_texts(header, "signals"),
+        history=header["history"],
+        provenance=provenance,
+        **vectors,
+    )
+
+
+def _recompute(network: Network, observations: NDArray[Any], actions: NDArray[Any]) -> None:
+    sizes = network.sizes
+    if observations.ndim != 2 or not observations.size or observations.shape[1] != sizes[0]:
+        raise DataError(f"test_observations has shape {observations.shape}; expected (k, {sizes[0]}) with k > 0")
+    if actions.shape != (len(observations), sizes[-1]):
+        raise DataError(f"test_actions has shape {actions.shape}; expected ({len(observations)}, {sizes[-1]})")
+    error = float(np.max(np.abs(network.answer(observations) - actions), initial=0.0))
+    if not error <= _TOLERANCE:
+        raise DataError(f"its test vectors come out wrong by {error:.3g}; expected at most {_TOLERANCE:g}")
+
+
+def _refuse_constant(word: str) -> NoReturn:
+    raise DataError(f"header holds {word}; expected finite numbers")
+
+
+def _once(pairs: Sequence[tuple[str, Any]]) -> dict[str, Any]:
+    found = dict(pairs)
+    if len(found) != len(pairs):
+        raise DataError("header has a key that is given twice")
+    return found
+
+
+def _numbers(values: Any, what: str, name: str) -> tuple[float, ...]:
+    """Return finite numbers; for the rate of the torque, null is infinity."""
+    if isinstance(values, list):
+        free = name == "effort_rate"
+        given = [math.inf if value is None and free else value for value in values]
+        good = [type(value) in {int, float} and (abs(value) < 1e300 or (free and value == math.inf)) for value in given]
+        if all(good):
+            return tuple(float(value) for value in given)
+    raise DataError(f"{what} is {_shown(values)}; expected finite numbers")
+
+
+def _text(header: Mapping[str, Any], key: str) -> str:
+    value = header[key]
+    if not isinstance(value, str) or not value.isprintable() or len(value) > 200:
+        raise DataError(f"{key} is {_shown(value)}; expected a line of text")
+    return value
+
+
+def _texts(header: Mapping[str, Any], key: str) -> tuple[str, ...]:
+    values = header[key]
+    if not isinstance(values, list):
+        raise DataError(f"{key} is {_shown(values)}; expected a list")
+    return tuple(_text({key: value}, key) for value in values)
+
+
+def _shown(value: Any) -> str:
+    text = repr(value)
+    return text if len(text) <= 100 else f"{text[:97]}..."
+
+
+def _sentence(error: BaseException) -> str:
+    text = " ".join(str(error).split()) or type(error).__name__
+    return text if len(text) <= 160 else f"{text[:157]}..."
