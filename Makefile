@@ -31,7 +31,9 @@ $(VENV)/.made:
 # The lock is complete, so pip has nothing to resolve: faster, and the same on every version of pip.
 $(VENV)/.locked: requirements.txt | $(VENV)/.made
 	@echo "installing $$(grep -c == requirements.txt) locked packages into $(VENV) (some minutes the first time)"
-	@$(PIP) install --prefer-binary --no-deps --require-hashes -r requirements.txt
+	@$(PIP) install --prefer-binary --no-deps --require-hashes -r requirements.txt || { \
+	  echo "error: the locked packages could not be installed; pip says why above. The first time needs the network (or a mirror that pip is" \
+	  "told of, PIP_INDEX_URL) and some GB of disk. What pip has fetched it keeps: make the same target again." >&2; exit 1; }
 	@touch $@
 
 # Compatible mode writes plain path entries. Those alone win over the folders of the repository that bear the packages'

@@ -6,6 +6,7 @@ import importlib
 import importlib.util
 import os
 import re
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -195,3 +196,27 @@ def test_the_list_of_programs_says_what_each_is_for(package: str, program: str) 
     assert "``" not in text
     lines = {summary(name, target) for name, target in executables(package).items()}
     assert len(lines) == len(executables(package))
+
+
+def test_packages_that_cannot_be_had_are_told_in_a_sentence_and_tried_again(tmp_path: Path) -> None:
+    shutil.copy(PROJECT / "Makefile", tmp_path)
+    (tmp_path / "requirements.txt").write_text("numpy==1.26.4\n", encoding="utf-8")
+    environment = {name: value for name, value in os.environ.items() if not name.startswith("MAKE")}
+    (tmp_path / ".venv").mkdir()
+    (tmp_path / ".venv" / ".made").touch()
+    for _ in range(2):
+        # A pip that fails stands for one that has no network: what it says, and that nothing is taken for done.
+        made = subprocess.run(
+            ["make", "venv", "PIP=false"],
+            cwd=tmp_path,
+            capture_output=True,
+            text=True,
+            check=False,
+            timeout=20,
+            env=environment,
+        )
+        assert made.returncode != 0
+        assert "installing 1 locked packages" in made.stdout
+        assert "could not be installed" in made.stderr
+        assert "network" in made.stderr
+    assert not (tmp_path / ".venv" / ".locked").exists()
