@@ -15,9 +15,9 @@ from typing import Any
 
 import numpy as np
 
+from pendulum_bags.identification.identify import identify
 from pendulum_bags.identification.model import FitModel
 from pendulum_bags.identification.options import Options
-from pendulum_bags.identification.result import identify
 from pendulum_bags.identification.thesis import fit_gravity, fit_inertia_damping
 from pendulum_bags.identification.window_score import free_run, free_run_rms, window_rms
 from pendulum_bags.runs.datasets import Recording

@@ -10,8 +10,9 @@ from threadpoolctl import threadpool_limits
 
 from pendulum_bags.identification import identify_cli
 from pendulum_bags.identification.excitation import Limits, design_excitation
+from pendulum_bags.identification.identify import identify
 from pendulum_bags.identification.options import Geometry, Options, default_window
-from pendulum_bags.identification.result import identify, load_fit_model
+from pendulum_bags.identification.result import load_fit_model
 from pendulum_bags.identification.uncertainty import profile_interval
 from pendulum_bags.runs.datasets import Recording
 from pendulum_msgs_py.errors import DataError

@@ -8,10 +8,10 @@ import yaml
 
 from pendulum_bags.identification.covariance import FREQUENCY
 from pendulum_bags.identification.cross_validation import cross_validate, folds
+from pendulum_bags.identification.identify import identify
 from pendulum_bags.identification.model import FRICTION_MODELS, INDEX, from_plant
 from pendulum_bags.identification.options import Options
 from pendulum_bags.identification.output_error import fit_output_error
-from pendulum_bags.identification.result import identify
 from pendulum_bags.identification.selection import akaike_weights, choose
 from pendulum_bags.identification.solver import solve
 from pendulum_bags.identification.uncertainty import unresolved_offset

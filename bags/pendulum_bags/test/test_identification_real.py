@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
+from pendulum_bags.identification.identify import identify
 from pendulum_bags.identification.options import Options
-from pendulum_bags.identification.result import identify
 from pendulum_bags.identification.window_score import free_run, free_run_rms, window_rms
 from pendulum_bags.runs.read_recording import read_recording
 

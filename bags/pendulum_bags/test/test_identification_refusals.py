@@ -9,9 +9,9 @@ import pytest
 
 from pendulum_bags.identification import identify_cli
 from pendulum_bags.identification.geometry import check_geometry
+from pendulum_bags.identification.identify import identify
 from pendulum_bags.identification.options import Geometry, Options
 from pendulum_bags.identification.problem import prepare
-from pendulum_bags.identification.result import identify
 from pendulum_bags.runs.datasets import Recording, distinct_names
 from pendulum_bags.runs.read_recording import read_recording
 from pendulum_msgs_py.errors import DataError

@@ -88,8 +88,8 @@ def identify(
         ]
         _thesis(recordings, experiment, skew, out, page, as_json)
         return
+    from pendulum_bags.identification.identify import identify as run
     from pendulum_bags.identification.options import Geometry, Options
-    from pendulum_bags.identification.result import identify as run
 
     options = Options(window=window, friction=friction, geometry=Geometry(mass, length, inertia), fix_scale=fix_scale)
     paths = [*data, *(held_out or [])]

@@ -5,17 +5,15 @@ from __future__ import annotations
 import hashlib
 import json
 import platform
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
-from datetime import datetime, timezone
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from threadpoolctl import threadpool_limits
 
-from pendulum_bags.identification.explained import REFUSED, Explained, explained
-from pendulum_bags.identification.geometry import CONTRADICTION, GeometryCheck, check_geometry
+from pendulum_bags.identification.explained import REFUSED, Explained
+from pendulum_bags.identification.geometry import CONTRADICTION, GeometryCheck
 from pendulum_bags.identification.model import (
     FRICTION_MODELS,
     PLANT_FRICTION_MODELS,
@@ -23,19 +21,17 @@ from pendulum_bags.identification.model import (
     FitModel,
     to_plant,
 )
-from pendulum_bags.identification.options import DEFAULTS, Options
-from pendulum_bags.identification.output_error import OutputErrorFit, fit_output_error
-from pendulum_bags.identification.problem import Piece, prepare
-from pendulum_bags.identification.residual_tests import INCOMPLETE, ResidualTests, residual_tests
+from pendulum_bags.identification.output_error import OutputErrorFit
+from pendulum_bags.identification.problem import Piece
+from pendulum_bags.identification.residual_tests import INCOMPLETE, ResidualTests
 from pendulum_bags.identification.selection import Candidate
-from pendulum_bags.identification.solver import solve
-from pendulum_bags.identification.uncertainty import Interval, Uncertainty, assess
-from pendulum_bags.identification.window_score import WindowScore, free_run, window_score
+from pendulum_bags.identification.uncertainty import Interval, Uncertainty
+from pendulum_bags.identification.window_score import WindowScore
 from pendulum_bags.runs.datasets import INPUT_KINDS, Recording, data_notes, distinct_names
 from pendulum_msgs_py.errors import DataError
 from pendulum_msgs_py.plants.plant_parameters import PlantParameters, write_plant
 
-__all__ = ["ALARMS", "IdentificationResult", "identify", "load_fit_model"]
+__all__ = ["ALARMS", "IdentificationResult", "fingerprint", "load_fit_model"]
 
 FORMAT = "pendulum_identification/1"
 
@@ -232,7 +228,7 @@ class IdentificationResult:
             },
             "incomplete": self.tests.incomplete or self.explained.doubt is not None,
             "sentences": self.sentences(),
-            "data": [_fingerprint(recording) for recording in self.fit.recordings],
+            "data": [fingerprint(recording) for recording in self.fit.recordings],
         }
 
     def write(self, path: str | Path, *, name: str = "identified", effort_limit: float = 13.0) -> Path:
@@ -260,7 +256,7 @@ class IdentificationResult:
         provenance: dict[str, Any] = {
             "method": "output error, multiple shooting",
             "date": self.created,
-            "data": [_fingerprint(recording) for recording in self.fit.recordings],
+            "data": [fingerprint(recording) for recording in self.fit.recordings],
             "friction": candidate.friction,
             "held_out_rms_rad": candidate.score,
             "training_rms_rad": candidate.training_rms,
@@ -324,72 +320,6 @@ _DIFFERENCES = {
 }
 
 
-# BLAS splits long sums by the cores that it finds, and a fit magnifies the last digits: on one core, a recording has
-# the same result on every worker.
-@threadpool_limits.wrap(limits=1, user_api="blas")
-def identify(
-    recordings: Sequence[Recording],
-    options: Options = DEFAULTS,
-    *,
-    held_out: Sequence[Recording] = (),
-    profiles: int = 2,
-) -> IdentificationResult:
-    """Identify a pendulum by output error and judge the result.
-
-    Args:
-        recordings: Data to fit; all of one pendulum, with one kind of input.
-        options: Choices; the defaults serve unseen data.
-        held_out: Recordings to score only.
-        profiles: For how many weak parameters to compute profile intervals.
-    """
-    _check_distinct(recordings, held_out)
-    if recordings and all(r.input_kind == "effort" and not np.any(r.input) for r in recordings):
-        # A column of zeros is no drive: a gain or a delay of it could be anything.
-        recordings = [replace(r, input_kind="none", meta={**r.meta, "no_torque": True}) for r in recordings]
-        held_out = [replace(r, input_kind="none") if not np.any(r.input) else r for r in held_out]
-    fit = fit_output_error(recordings, options)
-    tests = residual_tests(fit)
-    account = explained(fit, tests.outliers)
-    uncertainty = assess(fit, tests, profiles=0 if account.refusal is not None else profiles)
-    geometry = check_geometry(fit.model, uncertainty, options.geometry)
-    scores = {}
-    for name, recording in zip(distinct_names(held_out), held_out, strict=True):
-        if recording.input_kind == "position_goal":
-            scores[name] = free_run(fit.model, recording, fitted=False)
-        else:
-            scores[name] = window_score(fit.model, recording, fit.window)
-    created = datetime.now(timezone.utc).isoformat(timespec="seconds")
-    moved = {
-        name: found
-        for name, recording in zip(scores, held_out, strict=True)
-        if (found := _moved_zero(fit, recording, scores[name].rms)) is not None
-    }
-    return IdentificationResult(fit, uncertainty, tests, geometry, scores, created, account, moved)
-
-
-def _moved_zero(fit: OutputErrorFit, recording: Recording, rms: float) -> tuple[float, float] | None:
-    """Return how far the zero of a recording lies from that of the fit [rad] and its rms with it, if that is better."""
-    if recording.input_kind == "position_goal":
-        return None
-    piece = prepare(recording, fit.window)
-    found = solve(fit.model, [piece], ("angle_offset",), scale=fit.scale, tolerance=1e-5, max_iterations=20)
-    own = window_score(found.model, recording, fit.window).rms
-    return (found.model["angle_offset"] - fit.model["angle_offset"], own) if own < 0.8 * rms else None
-
-
-def _check_distinct(recordings: Sequence[Recording], held_out: Sequence[Recording]) -> None:
-    """Refuse data that count twice: intervals would be too narrow, a held-out score too good."""
-    prints = [_fingerprint(recording)["sha256"] for recording in (*recordings, *held_out)]
-    names = distinct_names([*recordings, *held_out])
-    for i, own in enumerate(prints):
-        j = prints.index(own)
-        if j == i or j >= len(recordings):
-            continue
-        if i < len(recordings):
-            raise DataError(f"{names[i]} has the same samples as {names[j]}; expected each recording once")
-        raise DataError(f"{names[i]} took part in the fit as {names[j]}; expected another recording to hold out")
-
-
 _LARGEST_VALUE = 1e300
 
 
@@ -417,7 +347,8 @@ def load_fit_model(path: str | Path) -> FitModel:
     return FitModel(content["parameters"], content["input_kind"], content["friction"], content["duty_gain"])
 
 
-def _fingerprint(recording: Recording) -> dict[str, Any]:
+def fingerprint(recording: Recording) -> dict[str, Any]:
+    """Return what a recording is known by: source, samples, duration [s] and a hash of its samples."""
     digest = hashlib.sha256()
     for values in (recording.time, recording.position, recording.input):
         digest.update(np.ascontiguousarray(values).tobytes())

@@ -89,8 +89,8 @@ def commanded_recording(bag_folder: Path, spec: RunSpec) -> Recording:
 
 def apparent_plant(recording: Recording) -> dict[str, Any]:
     """Return damping, inertia and delay of the rigid plant that explains a motion best, with 95 % intervals."""
+    from pendulum_bags.identification.identify import identify
     from pendulum_bags.identification.output_error import Options
-    from pendulum_bags.identification.result import identify
 
     options = Options(friction="viscous", angle_offset=False, torque_offset=True, multi_start=False)
     result = identify([recording], options)

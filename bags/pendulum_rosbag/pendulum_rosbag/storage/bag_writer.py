@@ -8,7 +8,7 @@ import threading
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from types import TracebackType
-from typing import Any, Protocol
+from typing import Any
 
 from pendulum_msgs_py.errors import BagError, ParameterError
 from pendulum_rosbag.storage.mcap_extras import Attachment, Metadata
@@ -21,37 +21,12 @@ from pendulum_rosbag.storage.metadata_file import (
     qos_yaml,
 )
 from pendulum_rosbag.storage.qos import QosProfile
+from pendulum_rosbag.storage.storage_file import StorageFile
 
 __all__ = ["STORAGES", "BagWriter", "open_writer"]
 
 STORAGES = ("mcap", "sqlite3")
 _COMPRESSIONS = (None, "zstd")
-
-
-class _StorageFile(Protocol):
-    """What a storage format offers; see :class:`~pendulum_rosbag.storage.sealed_mcap.SealedMcapFile`."""
-
-    suffix: str
-    path: Path
-
-    @property
-    def count(self) -> int: ...
-    @property
-    def start_ns(self) -> int: ...
-    @property
-    def stop_ns(self) -> int: ...
-    @property
-    def data_size(self) -> int: ...
-    @property
-    def pending_size(self) -> int: ...
-    def add_channel(self, channel_id: int, topic: str, type: MessageType, qos: str) -> None: ...
-    def write(self, channel_id: int, log_time_ns: int, data: bytes) -> None: ...
-    def seal(self) -> None: ...
-    def settle(self) -> None: ...
-    def duplicate(self) -> int: ...
-    def keep(self, record: Attachment | Metadata) -> None: ...
-    def close(self, metadata: str = "") -> None: ...
-    def abandon(self) -> None: ...
 
 
 class BagWriter:
@@ -311,12 +286,12 @@ class BagWriter:
     def _unknown(self, topic: str) -> BagError:
         return BagError(f"topic {topic} was not added to bag {self.path} before its first message")
 
-    def _open_file(self) -> _StorageFile:
+    def _open_file(self) -> StorageFile:
         name = f"{self._file_stem}_{len(self._files)}"
         if self.storage == "mcap":
             from pendulum_rosbag.storage.sealed_mcap import SealedMcapFile
 
-            file: _StorageFile = SealedMcapFile(self._folder / f"{name}.mcap", compression=self._compression)
+            file: StorageFile = SealedMcapFile(self._folder / f"{name}.mcap", compression=self._compression)
         else:
             from pendulum_rosbag.storage.sealed_sqlite import SealedSqliteFile
 

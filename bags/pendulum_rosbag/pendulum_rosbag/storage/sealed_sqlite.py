@@ -18,19 +18,14 @@ import shutil
 import sqlite3
 import struct
 from pathlib import Path
-from typing import Any
 
 from pendulum_msgs_py.errors import BagError
 from pendulum_rosbag.storage.mcap_extras import Attachment, Metadata
 from pendulum_rosbag.storage.message_types import MessageType
+from pendulum_rosbag.storage.sqlite_pages import PAGE, Pages, Table, record, tree_page, varint
 
 __all__ = ["SealedSqliteFile"]
 
-PAGE = 4096
-_LEAF_ROOM = PAGE - 8
-_INTERIOR_ROOM = PAGE - 12
-_LARGEST_LOCAL = PAGE - 35
-_SMALLEST_LOCAL = (PAGE - 12) * 32 // 255 - 23
 _SQLITE_VERSION = 3_045_001
 
 _TABLES = {
@@ -46,155 +41,6 @@ _TABLES = {
 }
 _SCHEMA_VERSION = 4
 _INDEX = "CREATE INDEX timestamp_idx ON messages (timestamp ASC)"
-
-
-def _varint(value: int) -> bytes:
-    """Return a big-endian variable-length integer as SQLite writes it (0 <= value < 2**56)."""
-    if value < 0x80:
-        return bytes((value,))
-    groups = [value & 0x7F]
-    value >>= 7
-    while value:
-        groups.append(value & 0x7F | 0x80)
-        value >>= 7
-    return bytes(reversed(groups))
-
-
-def _record(values: tuple[Any, ...]) -> bytes:
-    """Return a table row: ``None``, integers and texts."""
-    types, body = b"", b""
-    for value in values:
-        if value is None:
-            types += _varint(0)
-        elif isinstance(value, int):
-            types += _varint(6)
-            body += struct.pack(">q", value)
-        else:
-            data = str(value).encode()
-            types += _varint(2 * len(data) + 13)
-            body += data
-    return _varint(len(types) + 1) + types + body  # (headers stay below 127 bytes: few columns)
-
-
-class _Pages:
-    """Numbers and contents of pages that wait for the next commit."""
-
-    def __init__(self) -> None:
-        self.count = 1
-        self.waiting: dict[int, bytes] = {}
-
-    def new(self) -> int:
-        self.count += 1
-        return self.count
-
-
-class _Table:
-    """A table that only grows, with ascending row ids."""
-
-    def __init__(self, pages: _Pages) -> None:
-        self._pages = pages
-        self._cells: list[bytes] = []
-        self._room = _LEAF_ROOM
-        self._last_id = 0
-        # Per level above the leaves: (page of a finished child, its largest row id).
-        self._levels: list[list[tuple[int, int]]] = []
-        self._rooms: list[int] = []
-        self._places: list[tuple[int, int]] = []
-        self._shown = 0
-        self._changed = True
-        self.root = 0
-
-    def append(self, row_id: int, payload: bytes) -> None:
-        """Add a row behind all others."""
-        size = len(payload)
-        if size <= _LARGEST_LOCAL:
-            cell = _varint(size) + _varint(row_id) + payload
-        else:
-            cell = self._overflowing(row_id, payload)
-        if len(cell) + 2 > self._room:
-            page = self._pages.new()
-            self._pages.waiting[page] = _leaf(self._cells)
-            self._add_child(0, page, self._last_id)
-            self._cells = []
-            self._room = _LEAF_ROOM
-        self._cells.append(cell)
-        self._room -= len(cell) + 2
-        self._last_id = row_id
-        self._changed = True
-
-    def _overflowing(self, row_id: int, payload: bytes) -> bytes:
-        size = len(payload)
-        local = _SMALLEST_LOCAL + (size - _SMALLEST_LOCAL) % (PAGE - 4)
-        if local > _LARGEST_LOCAL:
-            local = _SMALLEST_LOCAL
-        starts = range(local, size, PAGE - 4)
-        numbers = [self._pages.new() for _ in starts]
-        for start, number, following in zip(starts, numbers, [*numbers[1:], 0], strict=True):
-            part = struct.pack(">I", following) + payload[start : start + PAGE - 4]
-            self._pages.waiting[number] = part.ljust(PAGE, b"\0")
-        return _varint(size) + _varint(row_id) + payload[:local] + struct.pack(">I", numbers[0])
-
-    def _add_child(self, level: int, page: int, key: int) -> None:
-        if level == len(self._levels):
-            self._levels.append([])
-            self._rooms.append(_INTERIOR_ROOM)
-        needed = 4 + len(_varint(key)) + 2
-        if needed > self._rooms[level]:
-            # A node is finished only when the next child comes, so that the last one is never empty.
-            *children, (last, last_key) = self._levels[level]
-            finished = self._pages.new()
-            self._pages.waiting[finished] = _interior(children, last)
-            self._levels[level] = []
-            self._rooms[level] = _INTERIOR_ROOM
-            self._add_child(level + 1, finished, last_key)
-        self._levels[level].append((page, key))
-        self._rooms[level] -= needed
-
-    def place(self) -> None:
-        """Lay out the pages that are not full yet in the places that the file does not show."""
-        if not self._changed:
-            return
-        while len(self._places) <= len(self._levels):
-            self._places.append((self._pages.new(), self._pages.new()))
-        hidden = 1 - self._shown
-        page = self._places[0][hidden]
-        self._pages.waiting[page] = _leaf(self._cells)
-        for level, children in enumerate(self._levels, 1):
-            below, page = page, self._places[level][hidden]
-            self._pages.waiting[page] = _interior(children, below)
-        self.root = page
-
-    def confirm(self) -> None:
-        """Take note that the file shows what was placed; a commit that failed is tried in the same places."""
-        if self._changed:
-            self._shown = 1 - self._shown
-            self._changed = False
-
-    def unused(self) -> list[int]:
-        """Return the places that the file will not show once what was placed is committed."""
-        free = self._shown if self._changed else 1 - self._shown
-        return [pair[free] for pair in self._places]
-
-
-def _leaf(cells: list[bytes]) -> bytes:
-    return _page(struct.pack(">BHHHB", 0x0D, 0, len(cells), 0, 0), cells, PAGE)
-
-
-def _interior(children: list[tuple[int, int]], last: int) -> bytes:
-    cells = [struct.pack(">I", page) + _varint(key) for page, key in children]
-    return _page(struct.pack(">BHHHBI", 0x05, 0, len(cells), 0, 0, last), cells, PAGE)
-
-
-def _page(head: bytes, cells: list[bytes], size: int) -> bytes:
-    """Lay out a b-tree page: head, pointers in order, free space, contents from the end backwards."""
-    at = PAGE
-    pointers = []
-    for cell in cells:
-        at -= len(cell)
-        pointers.append(at)
-    body = head[:5] + struct.pack(">H", at) + head[7:] + struct.pack(f">{len(cells)}H", *pointers)
-    contents = b"".join(reversed(cells))
-    return body + bytes(size - len(body) - len(contents)) + contents
 
 
 class SealedSqliteFile:
@@ -220,13 +66,13 @@ class SealedSqliteFile:
         self._pending_size = 0
         self._pending_span = (2**63 - 1, 0)
         self._commits = 0
-        self._pages = _Pages()
-        self._tables = {name: _Table(self._pages) for name in _TABLES}
+        self._pages = Pages()
+        self._tables = {name: Table(self._pages) for name in _TABLES}
         self._trunks = (self._pages.new(), self._pages.new())
         self._definitions: set[tuple[str, str]] = set()
         self._heads: dict[tuple[int, int], bytes] = {}
         self._stale = True
-        self._tables["schema"].append(_SCHEMA_VERSION, _record((None, ros_distro)))
+        self._tables["schema"].append(_SCHEMA_VERSION, record((None, ros_distro)))
         temporary = path.with_name(f".{path.name}.tmp")
         self._fd = os.open(temporary, os.O_RDWR | os.O_CREAT | os.O_TRUNC, 0o644)
         try:
@@ -249,12 +95,12 @@ class SealedSqliteFile:
 
     def add_channel(self, channel_id: int, topic: str, type: MessageType, qos: str) -> None:
         """Describe a topic before its first message (ids ascending from 1; QoS profiles as YAML text)."""
-        self._tables["topics"].append(channel_id, _record((None, topic, type.name, type.serialization, qos, type.hash)))
+        self._tables["topics"].append(channel_id, record((None, topic, type.name, type.serialization, qos, type.hash)))
         key = (type.name, type.hash)
         if key not in self._definitions:
             self._definitions.add(key)
             row = (None, type.name, type.encoding, type.definition, type.hash)
-            self._tables["message_definitions"].append(len(self._definitions), _record(row))
+            self._tables["message_definitions"].append(len(self._definitions), record(row))
         self._stale = True
 
     def write(self, channel_id: int, log_time_ns: int, data: bytes) -> None:
@@ -263,7 +109,7 @@ class SealedSqliteFile:
         head = self._heads.get((channel_id, size))
         if head is None:
             # Columns: id (NULL, it is the row id), topic_id (32 bit), timestamp (64 bit), data (blob).
-            types = b"\x00\x04\x06" + _varint(2 * size + 12)
+            types = b"\x00\x04\x06" + varint(2 * size + 12)
             head = bytes((len(types) + 1,)) + types + struct.pack(">i", channel_id)
             if len(self._heads) < 4096:
                 self._heads[channel_id, size] = head
@@ -319,7 +165,7 @@ class SealedSqliteFile:
             return
         try:
             if metadata:
-                self._tables["metadata"].append(1, _record((None, 9, metadata)))
+                self._tables["metadata"].append(1, record((None, 9, metadata)))
                 self._stale = True
             self.seal()
             os.fsync(self._fd)
@@ -395,9 +241,9 @@ class SealedSqliteFile:
         )
         cells = []
         for number, (name, sql) in enumerate(_TABLES.items(), 1):
-            payload = _record(("table", name, name, self._tables[name].root, sql))
-            cells.append(_varint(len(payload)) + _varint(number) + payload)
-        return header + _page(struct.pack(">BHHHB", 0x0D, 0, len(cells), 0, 0), cells, PAGE - len(header))
+            payload = record(("table", name, name, self._tables[name].root, sql))
+            cells.append(varint(len(payload)) + varint(number) + payload)
+        return header + tree_page(struct.pack(">BHHHB", 0x0D, 0, len(cells), 0, 0), cells, PAGE - len(header))
 
     def _write(self, data: bytes, offset: int) -> None:
         view = memoryview(data)

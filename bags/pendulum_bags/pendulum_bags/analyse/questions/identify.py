@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from pendulum_bags.identification.result import identify
+from pendulum_bags.identification.identify import identify
 from pendulum_bags.runs.bag_recordings import read_bag_recording
 
 __all__ = ["answer"]
