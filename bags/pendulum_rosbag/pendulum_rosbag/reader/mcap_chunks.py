@@ -5,17 +5,34 @@ from __future__ import annotations
 import struct
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from pathlib import Path
 
 import numpy as np
 
 from pendulum_rosbag.reader.batches import Bytes
+from pendulum_rosbag.reader.decompression import decompress
 from pendulum_rosbag.storage import mcap_records as rec
 
-__all__ = ["Chunk", "keep_staged", "read_text", "read_text_map", "records_in"]
+__all__ = [
+    "CHUNK_FIELDS",
+    "Chunk",
+    "DamagedError",
+    "keep_staged",
+    "raw_content",
+    "read_text",
+    "read_text_map",
+    "records_in",
+]
 
 _HEAD = rec.RECORD_HEAD_SIZE
 _LARGEST_FILLER = 8192
 _MOST_STAGED = 64 << 20
+CHUNK_FIELDS = struct.Struct("<QQQII")
+"""Head of a chunk: first and last log time [ns], size and checksum of the content, length of the compression's name."""
+
+
+class DamagedError(Exception):
+    """The file is not what its footer, index or records claim."""
 
 
 @dataclass(slots=True)
@@ -34,6 +51,18 @@ class Chunk:
     """Checksum of the content before compression; 0 where its writer made none."""
     offset: int = 0
     """Byte of the file at which the chunk's record begins."""
+
+
+def raw_content(chunk: Chunk, path: Path) -> Bytes:
+    """Return the records of a chunk, decompressed.
+
+    Raises:
+        BagError: They cannot be decompressed; names the file.
+    """
+    packed = chunk.buffer[chunk.data_start : chunk.data_start + chunk.data_size]
+    if not chunk.compression:
+        return packed
+    return np.frombuffer(decompress(packed, chunk.compression, chunk.raw_size, str(path)), np.uint8)
 
 
 def keep_staged(buffer: Bytes, chunks: Sequence[Chunk]) -> None:

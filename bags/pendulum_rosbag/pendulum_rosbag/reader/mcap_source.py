@@ -10,17 +10,17 @@ from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from pendulum_msgs_py.errors import BagError
-from pendulum_rosbag.reader.batches import MCAP_HEAD, Batch, Bytes, Int64, Stream
+from pendulum_rosbag.reader.batches import MCAP_HEAD, Batch, Bytes, Int64
 from pendulum_rosbag.reader.checksums import Checksums, Comparison
-from pendulum_rosbag.reader.decompression import decompress, decompress_torn
-from pendulum_rosbag.reader.mcap_chunks import Chunk, keep_staged, read_text, read_text_map, records_in
+from pendulum_rosbag.reader.mcap_chunks import CHUNK_FIELDS, Chunk, DamagedError, keep_staged, raw_content, read_text
 from pendulum_rosbag.reader.mcap_extras import find_extras
 from pendulum_rosbag.reader.mcap_index import indexed_counts, indexed_messages
+from pendulum_rosbag.reader.mcap_scan import McapScan, MessageTable
+from pendulum_rosbag.reader.mcap_topics import McapTopics
 from pendulum_rosbag.storage import mcap_records as rec
 from pendulum_rosbag.storage.mcap_extras import Attachment, Metadata
 
@@ -31,16 +31,10 @@ _FOOTER_REGION = rec.FOOTER_SIZE + len(rec.MAGIC)
 _NOT_CLOSED = rec.record(rec.DATA_END, bytes(4))
 """What stands right before the footer of a file that our recorder has not closed."""
 _TRIES = 5
-_CHUNK_FIELDS = struct.Struct("<QQQII")
 _GROUP_SIZE = 1 << 20  # decompressed bytes that are parsed at once
-_Table = dict[int, list[tuple[int, int]]]
 
 
-class _DamagedError(Exception):
-    """The file is not what its footer, index or records claim."""
-
-
-_UNREADABLE = (_DamagedError, struct.error, ValueError, KeyError, OverflowError, IndexError)
+_UNREADABLE = (DamagedError, struct.error, ValueError, KeyError, OverflowError, IndexError)
 
 
 class _NoIndexError(Exception):
@@ -70,18 +64,17 @@ class McapSource:
         self._checksums = Checksums(path, enabled=verify is not False)
         self.damage = ""
         self.unclosed = False
-        self.metadata: dict[str, dict[str, str]] = {}
         self._map: mmap.mmap | None = None
         self.buffer: Bytes = self._open(data)
         if bytes(self.buffer[:8]) != rec.MAGIC:
             self.close()
             raise BagError(f"{path} does not begin as an MCAP file; expected the bytes {rec.MAGIC!r}")
-        self._schemas: dict[int, tuple[str, str, str]] = {}
-        self._channels: dict[int, tuple[int, str, str, dict[str, str]]] = {}
+        self._topics = McapTopics()
+        self.metadata = self._topics.metadata
         self.chunks: list[Chunk] = []
         # Only after a scan: (time, offset) of messages outside of chunks by channel, and inside of each chunk.
-        self._loose: _Table = {}
-        self._scanned: list[_Table] = []
+        self._loose: MessageTable = {}
+        self._scanned: list[MessageTable] = []
         self._counts: dict[int, int] = {}
         self.start_ns = 0
         self.stop_ns = 0
@@ -94,10 +87,12 @@ class McapSource:
         if (verify or (self.unclosed and verify is None)) and not self._scanned:
             try:
                 self._leave_out_damaged()
-            except (_DamagedError, BagError) as error:
+            except (DamagedError, BagError) as error:
                 self._scan(str(error).removeprefix(f"{path}: "))  # (whoever tells the damage names the file)
         self.compressed = any(chunk.compression for chunk in self.chunks)
-        self.streams = [self._stream(channel) for channel in sorted(self._channels)]
+        self.streams = [
+            self._topics.stream(channel, self._counts.get(channel, 0)) for channel in sorted(self._topics.channels)
+        ]
         self.unchecked = self._without_checksums()
 
     def _without_checksums(self) -> str:
@@ -145,25 +140,25 @@ class McapSource:
                 if not again or bytes(self.buffer[-_FOOTER_REGION:]) == shown:
                     raise
             self.unclosed = False
-            for known in (self._schemas, self._channels, self.chunks, self._counts, self.metadata):
+            for known in (self._topics, self.chunks, self._counts):
                 known.clear()
 
     def _take_summary(self) -> None:
         buffer, size = self.buffer, len(self.buffer)
         footer = size - _FOOTER_REGION
         if footer < 8 or bytes(buffer[-8:]) != rec.MAGIC:
-            raise _DamagedError("the file has no footer")
+            raise DamagedError("the file has no footer")
         opcode, length = rec.RECORD_HEAD.unpack(bytes(buffer[footer : footer + _HEAD]))
         if opcode != rec.FOOTER or length != 20:
-            raise _DamagedError("the footer is not whole")
+            raise DamagedError("the footer is not whole")
         (at,) = struct.unpack("<Q", bytes(buffer[footer + _HEAD : footer + _HEAD + 8]))
         if at == 0:
             raise _NoIndexError
         if not 8 <= at <= footer:
-            raise _DamagedError(f"the footer points to byte {at} of {size}")
+            raise DamagedError(f"the footer points to byte {at} of {size}")
         (crc,) = struct.unpack("<I", bytes(buffer[footer + _HEAD + 16 : footer + _HEAD + 20]))
         if crc and self._verify is not False and zlib.crc32(buffer[at : footer + _HEAD + 16].data) != crc:
-            raise _DamagedError(f"the summary at byte {at} does not have its checksum")
+            raise DamagedError(f"the summary at byte {at} does not have its checksum")
         start = at
         grows = not crc and bytes(buffer[footer - len(_NOT_CLOSED) : footer]) == _NOT_CLOSED
         statistics = False
@@ -171,21 +166,21 @@ class McapSource:
             opcode, length = rec.RECORD_HEAD.unpack(bytes(buffer[at : at + _HEAD]))
             at += _HEAD
             if at + length > footer:
-                raise _DamagedError(f"a summary record of {length} bytes does not fit the file")
+                raise DamagedError(f"a summary record of {length} bytes does not fit the file")
             if opcode == rec.PADDING:
                 self.unclosed = True  # complete, but its writer did not give back the room to grow
                 break
             if opcode == rec.SUMMARY_CHECKSUM and grows and self._verify is not False:
                 content = bytes(buffer[at : at + length])
                 if content != struct.pack("<I", zlib.crc32(buffer[start : at - _HEAD].data)):
-                    raise _DamagedError(f"the summary at byte {start} does not have its checksum")
+                    raise DamagedError(f"the summary at byte {start} does not have its checksum")
             if opcode in (rec.SUMMARY_OFFSET, rec.SUMMARY_CHECKSUM):
                 at += length
                 continue
             statistics |= self._take_summary_record(opcode, bytes(buffer[at : at + length]))
             at += length
         if grows and not self.unclosed:
-            raise _DamagedError(f"the summary at byte {start} is not whole")
+            raise DamagedError(f"the summary at byte {start} is not whole")
         if not statistics and not self.chunks:
             raise _NoIndexError
         if not self._describes_all():
@@ -194,7 +189,7 @@ class McapSource:
             if not self._counts or any(not chunk.indexes for chunk in self.chunks):
                 raise _NoIndexError
             if len({chunk.data_start for chunk in self.chunks}) != len(self.chunks):
-                raise _DamagedError("the index names a chunk twice")
+                raise DamagedError("the index names a chunk twice")
             self.start_ns = min(chunk.start_ns for chunk in self.chunks)
             self.stop_ns = max(chunk.stop_ns for chunk in self.chunks)
             if self.unclosed:
@@ -207,21 +202,20 @@ class McapSource:
         """Tell whether the summary describes every channel that it names, and every schema that those name."""
         named = {channel for channel, count in self._counts.items() if count}
         named.update(*(chunk.indexes for chunk in self.chunks))
-        schemas = {schema for schema, *_ in self._channels.values()} - {0}
-        return named <= self._channels.keys() and schemas <= self._schemas.keys()
+        return self._topics.describe_all(named)
 
     def _compare_counts(self) -> None:
         """Hold what the message indexes name, which no checksum covers, against the counts of the file.
 
         Raises:
-            _DamagedError: They name more or fewer messages.
+            DamagedError: They name more or fewer messages.
         """
         named = indexed_counts(self.chunks)
         for channel in sorted(named.keys() | self._counts.keys()):
             found, count = named.get(channel, 0), self._counts.get(channel, 0)
             if found != count:
-                topic = self._channels[channel][1]
-                raise _DamagedError(f"the message indexes name {found} messages on {topic}; the summary says {count}")
+                topic = self._topics.channels[channel][1]
+                raise DamagedError(f"the message indexes name {found} messages on {topic}; the summary says {count}")
 
     def _take_summary_record(self, opcode: int, content: bytes) -> bool:
         if opcode == rec.CHUNK_INDEX:
@@ -234,26 +228,10 @@ class McapSource:
         elif opcode == rec.METADATA_INDEX:
             start, length = struct.unpack_from("<QQ", content)
             if start + length <= len(self.buffer):
-                self._take_description(rec.METADATA, bytes(self.buffer[start + _HEAD : start + length]))
+                self._topics.take(rec.METADATA, bytes(self.buffer[start + _HEAD : start + length]))
         else:
-            self._take_description(opcode, content)
+            self._topics.take(opcode, content)
         return False
-
-    def _take_description(self, opcode: int, content: bytes) -> None:
-        if opcode == rec.SCHEMA:
-            (key,) = struct.unpack_from("<H", content)
-            name, at = read_text(content, 2)
-            encoding, at = read_text(content, at)
-            definition, at = read_text(content, at, "surrogateescape")  # not text in every encoding
-            self._schemas[key] = (name, encoding, definition)
-        elif opcode == rec.CHANNEL:
-            key, schema = struct.unpack_from("<HH", content)
-            topic, at = read_text(content, 4)
-            encoding, at = read_text(content, at)
-            self._channels[key] = (schema, topic, encoding, read_text_map(content, at))
-        elif opcode == rec.METADATA:
-            name, at = read_text(content, 0)
-            self.metadata[name] = read_text_map(content, at)
 
     def _chunk_from_index(self, content: bytes) -> Chunk:
         start, stop, offset, _, size = struct.unpack_from("<QQQQI", content)
@@ -261,129 +239,20 @@ class McapSource:
         at = 36 + size + 8
         compression, at = read_text(content, at)
         packed, raw = struct.unpack_from("<QQ", content, at)
-        data_start = offset + _HEAD + _CHUNK_FIELDS.size + len(compression) + 8
+        data_start = offset + _HEAD + CHUNK_FIELDS.size + len(compression) + 8
         if data_start + packed > len(self.buffer) or any(at >= len(self.buffer) for at in indexes.values()):
-            raise _DamagedError("the index names a chunk beyond the end of the file")
+            raise DamagedError("the index names a chunk beyond the end of the file")
         if self.buffer[offset] != rec.CHUNK:
-            raise _DamagedError("the index names a chunk where there is none")
+            raise DamagedError("the index names a chunk where there is none")
         (crc,) = struct.unpack("<I", bytes(self.buffer[offset + _HEAD + 24 : offset + _HEAD + 28]))
         return Chunk(self.buffer, start, stop, data_start, packed, raw, compression, indexes, crc, offset)
 
-    def _stream(self, channel: int) -> Stream:
-        schema, topic, encoding, metadata = self._channels[channel]
-        name, schema_encoding, definition = self._schemas.get(schema, ("", "", ""))
-        return Stream(
-            channel,
-            topic,
-            name,
-            self._counts.get(channel, 0),
-            definition,
-            schema_encoding,
-            metadata.get("topic_type_hash", ""),
-            qos=metadata.get("offered_qos_profiles", ""),
-            serialization=encoding,
-        )
-
-    # -- scanning ----------------------------------------------------------------------------------------------
-
     def _scan(self, damage: str) -> None:
-        """Find all whole records from the start of the file; what is cut off at its end is left out."""
-        self.damage = damage
-        self.chunks.clear()
-        self._counts.clear()
-        self.start_ns, self.stop_ns = 2**63 - 1, 0
-        size = len(self.buffer)
-        view = self.buffer.data
-        at = 8
-        while at + _HEAD <= size:
-            opcode, length = rec.RECORD_HEAD.unpack_from(view, at)
-            body = at + _HEAD
-            if opcode in (rec.DATA_END, rec.FOOTER):
-                break
-            if opcode == 0 or body + length > size:
-                rest = size - at
-                self.damage = self.damage or f"the last {rest} bytes are no whole record"
-                if opcode == rec.CHUNK:
-                    self._scan_torn_chunk(body)
-                break
-            if opcode == rec.CHUNK:
-                self._scan_chunk(body, length)
-            elif opcode == rec.MESSAGE:
-                if length < 22:
-                    self.damage = self.damage or f"the message at byte {at} is not whole"
-                else:
-                    self._note(view, at, self._loose, at)
-            elif opcode in (rec.SCHEMA, rec.CHANNEL, rec.METADATA):
-                self._try_description(opcode, bytes(view[body : body + length]))
-            at = body + length
-        if not self._counts:
-            self.start_ns = 0
-
-    def _try_description(self, opcode: int, content: bytes) -> None:
-        try:
-            self._take_description(opcode, content)
-        except (struct.error, UnicodeDecodeError):
-            self.damage = self.damage or "a record of a topic is not readable"
-
-    def _scan_chunk(self, body: int, length: int) -> None:
-        try:
-            chunk, crc = self._chunk_at(body)
-            if chunk.data_start + chunk.data_size > body + length:
-                raise _DamagedError("chunk")
-            raw = self._raw(chunk)
-            if crc and zlib.crc32(raw.data) != crc:
-                raise _DamagedError("checksum")
-            records, end = records_in(raw)
-            if end != len(raw):
-                raise _DamagedError("a record does not fit its chunk")
-            chunk.crc = crc
-            self._checksums.sound.add(chunk.offset)
-        except (_DamagedError, BagError, struct.error, UnicodeDecodeError):
-            self.damage = self.damage or f"the chunk at byte {body - _HEAD} is not whole"
-            return
-        self._take_chunk(chunk, raw, records)
-
-    def _scan_torn_chunk(self, body: int) -> None:
-        """Take the whole records of a chunk whose end was cut off; nothing tells whether they are as they were."""
-        try:
-            chunk, _ = self._chunk_at(body)
-            packed = self.buffer[chunk.data_start :]
-            raw = packed
-            if chunk.compression:
-                content = decompress_torn(packed, chunk.compression, chunk.raw_size)
-                raw = np.frombuffer(content, np.uint8)
-            records, end = records_in(raw)
-        except (BagError, struct.error, UnicodeDecodeError):
-            return
-        # Its bytes as they are now, decompressed: whoever reads messages later must not try to again.
-        whole = Chunk(np.ascontiguousarray(raw[:end]), chunk.start_ns, chunk.stop_ns, 0, end, end, "")
-        self._take_chunk(whole, raw, records)
-
-    def _chunk_at(self, body: int) -> tuple[Chunk, int]:
-        """Return the chunk whose record's content begins at some byte, and its checksum."""
-        view = self.buffer.data
-        start, stop, raw_size, crc, text_size = _CHUNK_FIELDS.unpack_from(view, body)
-        compression, at = read_text(bytes(view[body + 28 : body + 32 + text_size]), 0)
-        at += body + 28
-        (packed,) = struct.unpack_from("<Q", view, at)
-        return Chunk(self.buffer, start, stop, at + 8, packed, raw_size, compression, offset=body - _HEAD), crc
-
-    def _take_chunk(self, chunk: Chunk, raw: Bytes, records: list[tuple[int, int, int]]) -> None:
-        scanned: _Table = {}
-        for opcode, offset, size in records:
-            if opcode == rec.MESSAGE:
-                self._note(raw, offset, scanned, offset)
-            elif opcode in (rec.SCHEMA, rec.CHANNEL):
-                self._try_description(opcode, bytes(raw[offset + _HEAD : offset + _HEAD + size]))
-        self._scanned.append(scanned)
-        self.chunks.append(chunk)
-
-    def _note(self, raw: Any, offset: int, into: _Table, position: int) -> None:
-        channel, _, time = struct.unpack_from("<HIq", raw, offset + _HEAD)
-        into.setdefault(channel, []).append((time, position))
-        self._counts[channel] = self._counts.get(channel, 0) + 1
-        self.start_ns = min(self.start_ns, time)
-        self.stop_ns = max(self.stop_ns, time)
+        """Take what a walk through the file finds in the place of what the index says."""
+        found = McapScan(self.buffer, self.path, self._topics, self._checksums.sound, damage)
+        self.damage = found.damage
+        self.chunks, self._scanned, self._loose = found.chunks, found.scanned, found.loose
+        self._counts, self.start_ns, self.stop_ns = found.counts, found.start_ns, found.stop_ns
 
     # -- checksums ---------------------------------------------------------------------------------------------
 
@@ -391,14 +260,14 @@ class McapSource:
         """Compare checksums and message indexes of all chunks, and leave out those whose content was not written so.
 
         Raises:
-            _DamagedError, BagError: A message index is damaged; the chunks themselves must be walked through.
+            DamagedError, BagError: A message index is damaged; the chunks themselves must be walked through.
         """
         kept: list[Chunk] = []
         lost: dict[int, int] = {}
         for number, chunk in enumerate(self.chunks):
             entries = {channel: self._entries(channel, chunk.buffer, [(number, 0)]) for channel in chunk.indexes}
             try:
-                raw = self._raw(chunk)
+                raw = raw_content(chunk, self.path)
                 whole = not chunk.crc or zlib.crc32(raw.data) == chunk.crc
             except BagError:
                 whole = False
@@ -422,12 +291,6 @@ class McapSource:
             self.stop_ns = max((chunk.stop_ns for chunk in kept), default=0)
 
     # -- reading -----------------------------------------------------------------------------------------------
-
-    def _raw(self, chunk: Chunk) -> Bytes:
-        packed = chunk.buffer[chunk.data_start : chunk.data_start + chunk.data_size]
-        if not chunk.compression:
-            return packed
-        return np.frombuffer(decompress(packed, chunk.compression, chunk.raw_size, str(self.path)), np.uint8)
 
     def batches(self, channels: set[int], start: int | None, stop: int | None) -> Iterator[Batch]:
         """Yield all messages of some channels with start <= log time < stop, in the order of the file."""
@@ -458,14 +321,14 @@ class McapSource:
             if channels.isdisjoint(self._scanned[number] if self._scanned else chunk.indexes):
                 continue
             if not chunk.compression:
-                checksums.compare(chunk, self._raw(chunk))
+                checksums.compare(chunk, raw_content(chunk, self.path))
                 plain.setdefault(id(chunk.buffer), []).append((number, chunk.data_start))  # they lie in the same map
                 continue
             if packed and (size >= _GROUP_SIZE or index is not chunk.buffer):
                 yield np.concatenate(parts), index, packed
                 packed, parts, size = [], [], 0
             index = chunk.buffer
-            parts.append(self._raw(chunk))
+            parts.append(raw_content(chunk, self.path))
             checksums.compare(chunk, parts[-1])
             packed.append((number, size))
             size += chunk.raw_size
@@ -498,7 +361,7 @@ class McapSource:
             if bool(((times == time_ns) & (offsets == offset)).any()):
                 place = f" of the chunk at byte {self.chunks[number].offset}"
                 break
-        return f"{self.path}: the message index{place}, topic {self._channels[channel][1]},"
+        return f"{self.path}: the message index{place}, topic {self._topics.channels[channel][1]},"
 
     def _cut(self, batch: Batch, start: int | None, stop: int | None) -> Iterator[Batch]:
         """Limit a batch to a time span and check that its records lie inside the buffer."""

@@ -1,0 +1,75 @@
+"""What an MCAP file says of its topics: schemas, channels, metadata."""
+
+from __future__ import annotations
+
+import struct
+
+from pendulum_rosbag.reader.batches import Stream
+from pendulum_rosbag.reader.mcap_chunks import read_text, read_text_map
+from pendulum_rosbag.storage import mcap_records as rec
+
+__all__ = ["McapTopics"]
+
+
+class McapTopics:
+    """Descriptions as they are met in a summary, or between the messages.
+
+    Attributes:
+        schemas: Name, encoding and definition of each schema, by its number.
+        channels: Schema, topic, encoding and metadata of each channel, by its number.
+        metadata: Metadata records by name.
+    """
+
+    def __init__(self) -> None:
+        self.schemas: dict[int, tuple[str, str, str]] = {}
+        self.channels: dict[int, tuple[int, str, str, dict[str, str]]] = {}
+        self.metadata: dict[str, dict[str, str]] = {}
+
+    def clear(self) -> None:
+        """Forget everything."""
+        for known in (self.schemas, self.channels, self.metadata):
+            known.clear()
+
+    def take(self, opcode: int, content: bytes) -> None:
+        """Take the content of a record: schema, channel or metadata; what is none of them describes nothing.
+
+        Raises:
+            struct.error, UnicodeDecodeError: It is not whole.
+        """
+        if opcode == rec.SCHEMA:
+            (key,) = struct.unpack_from("<H", content)
+            name, at = read_text(content, 2)
+            encoding, at = read_text(content, at)
+            definition, at = read_text(content, at, "surrogateescape")  # not text in every encoding
+            self.schemas[key] = (name, encoding, definition)
+        elif opcode == rec.CHANNEL:
+            key, schema = struct.unpack_from("<HH", content)
+            topic, at = read_text(content, 4)
+            encoding, at = read_text(content, at)
+            self.channels[key] = (schema, topic, encoding, read_text_map(content, at))
+        elif opcode == rec.METADATA:
+            name, at = read_text(content, 0)
+            self.metadata[name] = read_text_map(content, at)
+
+    def describe_all(self, named: set[int]) -> bool:
+        """Tell whether every channel of a set is described, and every schema that the channels name."""
+        return (
+            named <= self.channels.keys()
+            and {schema for schema, *_ in self.channels.values()} - {0} <= self.schemas.keys()
+        )
+
+    def stream(self, channel: int, count: int) -> Stream:
+        """Return what a channel is known by, with the number of its messages."""
+        schema, topic, encoding, metadata = self.channels[channel]
+        name, schema_encoding, definition = self.schemas.get(schema, ("", "", ""))
+        return Stream(
+            channel,
+            topic,
+            name,
+            count,
+            definition,
+            schema_encoding,
+            metadata.get("topic_type_hash", ""),
+            qos=metadata.get("offered_qos_profiles", ""),
+            serialization=encoding,
+        )
