@@ -8,10 +8,12 @@ from __future__ import annotations
 
 import math
 import warnings
+from collections.abc import Callable
 from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 import numpy as np
+import scipy.optimize
 from numpy.typing import ArrayLike, NDArray
 
 from pendulum_lqr.model import LinearModel, sort_poles
@@ -27,6 +29,8 @@ __all__ = [
     "loop_margins",
     "loop_transfer",
 ]
+
+Array = NDArray[np.float64]
 
 _PERIOD_LIMIT = 1e3
 
@@ -138,28 +142,12 @@ def loop_margins(model: LinearModel, K: ArrayLike) -> Margins:
         model: Linear model.
         K: Gain, shape (2,) or (n,), that stabilises the model.
     """
-    # Imported late: python-control brings matplotlib, which a controller node has no use for.
-    import control
-
     gain = _on_state(model, K)
-    if model.delay == 0.0:
-        # det(sI - A + B K) = det(sI - A) (1 + L)
-        open_loop = np.poly(model.A)
-        loop = control.tf(np.poly(model.A - model.B @ gain) - open_loop, open_loop)
-    else:
-        # No rational function has a delay: by its frequency response, up to where the loop has long gone.
-        omega = np.logspace(-4, math.log10(_last_frequency(model, gain)), 20_001)
-        loop = control.frd(loop_transfer(model, gain[0], omega), omega, smooth=True)
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        gains, phases, _, _, crossovers, _ = control.stability_margins(loop, returnall=True)
-    gains = np.asarray(gains, dtype=np.float64)
+    gains, phases, crossovers = (_rational_crossings if model.delay == 0.0 else _delayed_crossings)(model, gain)
     # The gain margin at zero frequency: an unstable plant needs some gain at rest, |L(0)| > 1.
     rest = -float((gain @ np.linalg.lstsq(model.A, model.B, rcond=None)[0])[0, 0])
     down = [g for g in gains if g < 1.0] + ([-1.0 / rest] if rest < -1.0 else [])
     up = [g for g in gains if g > 1.0]
-    phases = np.radians(np.asarray(phases, dtype=np.float64))
-    crossovers = np.asarray(crossovers, dtype=np.float64)
     if phases.size:
         index = int(np.argmin(np.abs(phases)))
         phase, crossover = float(phases[index]), float(crossovers[index])
@@ -175,6 +163,47 @@ def loop_margins(model: LinearModel, K: ArrayLike) -> Margins:
         delay=_delay_margin(phases, crossovers),
         modulus=modulus,
     )
+
+
+def _rational_crossings(model: LinearModel, gain: Array) -> tuple[Array, Array, Array]:
+    """Return gain margins [-], phase margins [rad] and their frequencies [rad/s] of a loop without delay."""
+    # Imported late: python-control brings matplotlib, which a controller node has no use for.
+    import control
+
+    # det(sI - A + B K) = det(sI - A) (1 + L)
+    open_loop = np.poly(model.A)
+    loop = control.tf(np.poly(model.A - model.B @ gain) - open_loop, open_loop)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        gains, phases, _, _, crossovers, _ = control.stability_margins(loop, returnall=True)
+    return np.asarray(gains, float), np.radians(np.asarray(phases, float)), np.asarray(crossovers, float)
+
+
+def _delayed_crossings(model: LinearModel, gain: Array) -> tuple[Array, Array, Array]:
+    """Return the same of a loop with delay, whose transfer function is not rational.
+
+    The crossings are bracketed on a grid up to where the loop has long gone, and refined one by one: python-control
+    would lay a spline through the grid, which takes a thousand times as long.
+    """
+    omega = np.logspace(-4, math.log10(_last_frequency(model, gain)), 20_001)
+    loop = loop_transfer(model, gain[0], omega)
+
+    def refined(values: Array, of: Callable[[complex], float], keep: NDArray[np.bool_]) -> Array:
+        edges = np.flatnonzero((values[:-1] * values[1:] < 0.0) & keep)
+        return np.array(
+            [
+                scipy.optimize.brentq(lambda w: of(complex(loop_transfer(model, gain[0], [w])[0])), *omega[i : i + 2])
+                for i in edges
+            ]
+        )
+
+    everywhere = np.ones(omega.size - 1, dtype=bool)
+    crossovers = refined(np.abs(loop) - 1.0, lambda value: abs(value) - 1.0, everywhere)
+    negative = (loop.real[:-1] < 0.0) & (loop.real[1:] < 0.0)
+    turns = refined(loop.imag, lambda value: value.imag, negative)
+    phases = np.angle(-loop_transfer(model, gain[0], crossovers)) if crossovers.size else crossovers
+    gains = 1.0 / np.abs(loop_transfer(model, gain[0], turns)) if turns.size else turns
+    return gains, phases, crossovers
 
 
 def delayed_spectral_radius(model: LinearModel, K: ArrayLike, period: float, delay: float = 0.0) -> float:

@@ -34,6 +34,7 @@ CONTROLLERS: dict[str, str] = {
     "lqr": "pendulum_lqr.controllers.lqr:Lqr",
     "lqi": "pendulum_lqr.controllers.lqi:Lqi",
     "lqg": "pendulum_lqr.controllers.lqg:Lqg",
+    "lqr_friction": "pendulum_lqr.controllers.lqr_friction:LqrFriction",
     "discrete_lqr": "pendulum_lqr.controllers.discrete_lqr:DiscreteLqr",
     "pid": "pendulum_lqr.controllers.pid:Pid",
     "pd_gravity": "pendulum_lqr.controllers.pd_gravity:PdGravity",
@@ -236,7 +237,7 @@ def make_controller(
     if plant.drivetrain is not None and not kind.SERIES_ELASTIC:
         raise ParameterError(
             f"{name} knows rigid plants alone, and plant {plant.name!r} is series elastic; expected lqr, lqi, lqg, "
-            "mpc, pid or pd_gravity, or a plant file without a drivetrain"
+            "lqr_friction, mpc, pid or pd_gravity, or a plant file without a drivetrain"
         )
     designed = kind.design(plant, period, p)
     if checked:

@@ -19,8 +19,11 @@ from rich.console import Console
 from pendulum_lqr.analysis import LoopReport, analyse
 from pendulum_lqr.certificate_table import certificate_document, certify_rows, print_certificates
 from pendulum_lqr.design import Gain, output_lqr
+from pendulum_lqr.design_tables import print_time_figures, print_worst_cases
 from pendulum_lqr.mechanism_design import design_mechanism
 from pendulum_lqr.model import LinearModel, linearise
+from pendulum_lqr.parameter_box import UNCERTAIN, parse_box, worst_case
+from pendulum_lqr.time_figures import time_figures
 from pendulum_msgs_py.contract.angles import UPRIGHT
 from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.plants.mechanism_parameters import load_mechanism
@@ -64,9 +67,16 @@ def design(
             "say which rows are certified for it."
         ),
     ] = None,
+    uncertainty: Annotated[
+        list[str] | None,
+        typer.Option(
+            help="Worst margins over plants that are possible: inertia=10%, or transport_delay=0:0.01 (lowest and "
+            f"highest value); may be given again ({', '.join(UNCERTAIN)}). Or identified: intervals of the plant file."
+        ),
+    ] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON instead of tables.")] = False,
 ) -> None:
-    """Design LQR gains: eigenvalues, K, time constant, damping, margins and largest stable sampling period.
+    """Design LQR gains: eigenvalues, K, margins, largest stable sampling period, figures in time, worst case.
 
     The model is that of the plant as simulated: motor, spring and lag have states, and the margins count the delay.
     K acts on angle and velocity, which are what is measured. Without --q and --r the four combinations of the thesis
@@ -74,16 +84,18 @@ def design(
 
         python -m pendulum_lqr design --preset dfki --q 10,1 --q 100,1 --r 1 --figures build/design
 
+        python -m pendulum_lqr design --plant identified.yaml --uncertainty identified
+
     Of a plant of several joints Q has a weight for each joint and then for each velocity:
 
         python -m pendulum_lqr design --preset cart_pole --q 10,100,1,1 --r 0.1
     """
     chosen_plant = str(plant) if plant is not None else preset
     if is_mechanism(chosen_plant):
-        if figures is not None or machine is not None or theta != UPRIGHT or effort_limit or row:
+        if figures is not None or machine is not None or theta != UPRIGHT or effort_limit or row or uncertainty:
             raise ParameterError(
                 f"plant {chosen_plant!r} has several joints; expected --q, --r and --json alone: figures, --machine, "
-                "--theta, --effort-limit and --row are for one joint"
+                "--uncertainty, --theta, --effort-limit and --row are for one joint"
             )
         design_mechanism(load_mechanism(chosen_plant), q, r, as_json=as_json)
         return
@@ -95,14 +107,30 @@ def design(
     reports = [analyse(model, None), *(analyse(model, gain.K) for gain in gains)]
     chosen = _chosen_row(row, len(weights), default=THESIS_CHOICE if not (q or r) else len(weights))
     certified = certify_rows(machine, model, gains) if machine is not None else None
+    in_time = [time_figures(model, gain.K, parameters) for gain in gains]
+    box = parse_box(uncertainty, parameters, plant) if uncertainty else None
+    worst = []
+    if box is not None:
+        possible = box.plants(parameters)
+        print(f"asking {len(possible)} plants with {len(gains)} gains ...", file=sys.stderr)
+        worst = [worst_case(possible, gain.K, theta, tuple(box.bounds)) for gain in gains]
     if as_json:
         document = _document(parameters.name, model, weights, reports)
+        for line, figure in zip(document["rows"][1:], in_time, strict=True):
+            line["time"] = None if figure is None else figure.to_dict()
+        if box is not None:
+            document["uncertainty"] = {"source": box.source, "bounds": {n: list(b) for n, b in box.bounds.items()}}
+            for line, case in zip(document["rows"][1:], worst, strict=True):
+                line["worst_case"] = case.to_dict()
         if certified is not None:
             document["machine"] = certificate_document(*certified)
         sys.stdout.write(json.dumps(document, indent=2) + "\n")
     else:
         console = make_console(highlight=False)
         _print(console, parameters.name, model, weights, reports, chosen)
+        print_time_figures(console, in_time, chosen, limit)
+        if box is not None:
+            print_worst_cases(console, box, worst, chosen)
         if certified is not None:
             print_certificates(console, *certified, chosen)
     if figures is not None:

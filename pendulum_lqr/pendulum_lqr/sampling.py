@@ -21,7 +21,9 @@ _WINDOW = 15
 _ENOUGH = 9
 _GAP_NS = NANOSECONDS
 _IGNORE_PERIOD = frozenset({"lqr", "pd_gravity", "sliding_mode", "energy_swing_up", "playback"})
-_BALANCING = frozenset({"lqr", "lqi", "lqg", "discrete_lqr", "pid", "pd_gravity", "mpc", "sliding_mode"})
+_BALANCING = frozenset(
+    {"lqr", "lqi", "lqg", "lqr_friction", "discrete_lqr", "pid", "pd_gravity", "mpc", "sliding_mode"}
+)
 _FAST_PERIOD = 2e-3
 """Up to this period a design in continuous time is taken at its word [s]."""
 

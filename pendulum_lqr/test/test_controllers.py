@@ -27,7 +27,7 @@ from tests.policies import random_policy
 
 THESIS = load_plant("thesis")
 DFKI = load_plant("dfki")
-BALANCING = ("lqr", "lqi", "lqg", "discrete_lqr", "pid", "pd_gravity", "mpc", "sliding_mode")
+BALANCING = ("lqr", "lqi", "lqg", "lqr_friction", "discrete_lqr", "pid", "pd_gravity", "mpc", "sliding_mode")
 SWINGING = ("energy_swing_up", "time_optimal", "tvlqr", "nmpc")
 
 

@@ -17,7 +17,7 @@ THESIS = load_plant("thesis")
 DFKI = load_plant("dfki")
 X5_9 = load_plant("x5_9")
 LATE = X5_9.with_values(transport_delay=0.013, actuator_time_constant=0.02)
-ELASTIC = ("lqr", "lqi", "lqg", "mpc", "pid", "pd_gravity")
+ELASTIC = ("lqr", "lqi", "lqg", "lqr_friction", "mpc", "pid", "pd_gravity")
 RIGID_ONLY = ("discrete_lqr", "sliding_mode", "energy_swing_up", "time_optimal", "tvlqr", "nmpc")
 STICKS = 0.39 / 1.526
 """Command that the dry friction of the X5-9's motor swallows [N m]."""

@@ -1,0 +1,149 @@
+"""LQR that pays for dry friction: the friction of the way back to the set-point is fed forward, with a smooth sign."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from pendulum_lqr.analysis import delayed_spectral_radius
+from pendulum_lqr.controller import BaseController
+from pendulum_lqr.controllers.specs import FEEDFORWARD, Q, R
+from pendulum_lqr.design import DesignError, Gain, output_lqr
+from pendulum_lqr.model import LinearModel, linearise, torque_gain
+from pendulum_msgs_py.contract.angles import UPRIGHT
+from pendulum_msgs_py.parameters import ParameterSpec
+from pendulum_msgs_py.plants.plant_parameters import PlantParameters
+
+__all__ = ["LqrFriction"]
+
+_RESERVE = 2.0
+"""Factor by which the steepest gain may still grow before the sampled loop is unstable, where it is chosen here."""
+_STEEPEST = 20.0
+"""Most times the angle's gain is raised near the set-point: beyond that, noise of the angle fills the torque."""
+_LARGEST = 0.5
+"""Most of the torque limit that friction may be fed forward with."""
+
+
+class LqrFriction(BaseController):
+    """u = u* - K (x - x*) - c tanh((theta - theta*) / w), with c below the friction that the plant has.
+
+    Back to the set-point the pendulum moves against its deviation: the smooth sign is that of the way, not that of
+    the measured velocity, whose noise it would make a torque of, and which is 0 where friction holds. Near the
+    set-point the compensation is a stiffer spring, c / w; the loop has to be stable for every spring from none to that
+    one at the rate at which it runs, friction or no friction, so that less friction than was identified cannot make it
+    hunt (sector condition for a static nonlinearity, by describing function).
+
+    Args:
+        gain: Gain and Riccati solution.
+        friction: c, torque fed forward far from the set-point [N m].
+        width: w, deviation over which it changes its sign [rad].
+        effort_limit: Largest torque [N m].
+        set_point: Angle from upright [rad].
+        hold: Torque at the set-point, u* [N m].
+
+    Source:
+        Armstrong-Helouvry, Dupont, Canudas de Wit, Automatica 30(7), 1994, section 5.4 (compensation of friction, and
+        limit cycles by too much of it); Khalil, Nonlinear Systems, 3rd ed., 2002, section 7.2 (describing function).
+    """
+
+    SUMMARY = "LQR with most of the dry friction fed forward by a smooth sign: rests nearer to the set-point"
+    PARAMETERS = (
+        Q,
+        R,
+        FEEDFORWARD,
+        ParameterSpec("share", 0.8, "-", "Share of the plant's Coulomb friction that is fed forward.", minimum=0.0,
+                      maximum=0.95),
+        ParameterSpec("width", 0.0, "rad", "Deviation over which its sign changes; 0 for as little as the loop bears "
+                      "with a gain margin of 2.", minimum=0.0),
+    )  # fmt: skip
+
+    def __init__(
+        self,
+        gain: Gain,
+        friction: float,
+        width: float,
+        effort_limit: float,
+        set_point: float = 0.0,
+        hold: float = 0.0,
+    ) -> None:
+        super().__init__(effort_limit, set_point)
+        self.gain = gain
+        self.friction = friction
+        self.width = width
+        self.hold = hold
+        self._k0, self._k1 = (float(value) for value in gain.K)
+
+    @classmethod
+    def design(cls, plant: PlantParameters, period: float, p: Mapping[str, Any]) -> LqrFriction:
+        """Return the controller for the plant linearised at the set-point."""
+        model = linearise(plant, UPRIGHT + p["set_point"])
+        gain = output_lqr(model, p["q"], p["r"])
+        friction = p["share"] * _friction(plant, model.theta)
+        if friction > _LARGEST * p["effort_limit"]:
+            raise DesignError(
+                f"friction to compensate is {friction:.3g} N m, more than half of the effort_limit of "
+                f"{p['effort_limit']:g} N m; expected a smaller share, or a plant with less friction"
+            )
+        width = _width(model, gain, friction, period, p["width"]) if friction > 0.0 else math.inf
+        hold = model.effort if p["feedforward"] else 0.0
+        return cls(gain, friction, width, p["effort_limit"], p["set_point"], hold)
+
+    def command(self, t: float, x: Sequence[float]) -> float:
+        """Return the torque [N m]."""
+        error = self.error(x[0])
+        against = self.friction * math.tanh(error / self.width)
+        return self.clamp(self.hold - self._k0 * error - self._k1 * x[1] - against)
+
+    def describe(self) -> str:
+        """Return gain, what is compensated, and what to watch for."""
+        text = f"K = [{self._k0:.6f}, {self._k1:.6f}]"
+        if self.friction == 0.0:
+            return f"{text}, no dry friction to compensate"
+        return (
+            f"{text}, {self.friction:.4g} N m of dry friction fed forward over {self.width:.3g} rad; a limit cycle "
+            "means play, more delay or less friction than the plant file says: lower share or widen width"
+        )
+
+
+def _friction(plant: PlantParameters, theta: float) -> float:
+    """Return the commanded torque that sliding friction takes at an angle [N m]."""
+    drive = plant.drivetrain
+    weight = abs(plant.gravity * math.sin(theta - plant.angle_offset))
+    link = plant.coulomb_friction + plant.load_friction * weight
+    return (link + (drive.motor_coulomb_friction if drive is not None else 0.0)) / torque_gain(plant)
+
+
+def _width(model: LinearModel, gain: Gain, friction: float, period: float, given: float) -> float:
+    """Return the width of the sign, checked for stability from no compensation to the steepest [rad]."""
+    stiffness = float(gain.K[0])
+    if given > 0.0:
+        steepest = friction / given
+        if not _bears(model, gain, period, steepest):
+            raise DesignError(
+                f"width is {given:g} rad: near the set-point {friction:.3g} N m over it make a spring of "
+                f"{steepest:.4g} N m/rad beside the gain of {stiffness:.4g} N m/rad, and the loop is unstable with a "
+                f"period of {period:g} s; expected a larger width or a smaller share"
+            )
+        return given
+    added = (_STEEPEST - 1.0) * stiffness
+    while added > 1e-3 * stiffness:
+        # The reserve is one of the whole gain on the angle: what is added, and what was there.
+        if _bears(model, gain, period, _RESERVE * (stiffness + added) - stiffness):
+            return friction / added
+        added *= 0.8
+    raise DesignError(
+        f"with a period of {period:g} s the loop bears no compensation of friction with a gain margin of {_RESERVE:g}; "
+        "expected a shorter period, smaller gains (larger r), or lqr"
+    )
+
+
+def _bears(model: LinearModel, gain: Gain, period: float, added: float) -> bool:
+    """Return whether the sampled loop is stable with every spring from none to the one added [N m/rad]."""
+    for extra in np.linspace(0.0, added, 24):
+        K = np.array([gain.K[0] + extra, gain.K[1]])
+        if delayed_spectral_radius(model, K, period) >= 1.0:
+            return False
+    return True

@@ -1,0 +1,96 @@
+"""Further tables of ``design``: the closed loop in time, and the worst case over what is not known of the plant."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+
+from rich.console import Console
+
+from pendulum_lqr.parameter_box import ParameterBox, WorstCase
+from pendulum_lqr.time_figures import TimeFigures
+from pendulum_msgs_py.plants.plant_parameters import PLANT_SPECS
+from pendulum_msgs_py.programs.terminal import WholeTable
+
+__all__ = ["print_time_figures", "print_worst_cases"]
+
+_UNITS = {spec.name: spec.unit for spec in PLANT_SPECS}
+
+
+def print_time_figures(console: Console, found: Sequence[TimeFigures | None], chosen: int, limit: float) -> None:
+    """Print one line a row, and from which step on the chosen one meets the torque limit.
+
+    Args:
+        console: Where.
+        found: One for each row, from row 1; None for a loop that does not settle.
+        chosen: Row that is marked.
+        limit: Of the torque [N m].
+    """
+    table = WholeTable(title="In time (linear, delay included)", title_justify="left", header_style="bold")
+    headings = ("#", "rise \\[s]", "settling \\[s]", "overshoot", "torque \\[N m/rad]", "push rests \\[rad/(N m)]")
+    for heading in (*headings, "push peak \\[rad/(N m)]", "friction holds \\[rad]"):
+        table.add_column(heading, justify="right")
+    for index, one in enumerate(found, start=1):
+        if one is None:
+            cells = ["unstable", *["\u2013"] * 6]
+        else:
+            cells = [f"{one.rise_time:.3f}", f"{one.settling_time:.3f}", f"{100.0 * one.overshoot:.1f} %"]
+            cells += [f"{one.step_torque:.4g}", f"{one.push_rest:.4g}", f"{one.push_peak:.4g}"]
+            cells.append("none" if one.friction_band == 0.0 else f"{one.friction_band:.4g}")
+        table.add_row(f"{index}", *cells, style="bold cyan" if index == chosen else "")
+    console.print(table)
+    one = found[chosen - 1]
+    if one is None:
+        return
+    console.print(
+        f"combination {chosen}: a step of the set-point beyond {limit / one.step_torque:.3g} rad asks for more than "
+        f"the {limit:g} N m of the torque limit"
+        + (
+            f"; dry friction may hold it {one.friction_band:.3g} rad off (lqr_friction and lqi come nearer)"
+            if one.friction_band > 0.0
+            else ""
+        )
+    )
+
+
+def print_worst_cases(console: Console, box: ParameterBox, found: Sequence[WorstCase], chosen: int) -> None:
+    """Print one line a row: the worst of each margin over all plants, and which plant is the worst.
+
+    Args:
+        console: Where.
+        box: Of the plants.
+        found: One for each row, from row 1.
+        chosen: Row that is marked.
+    """
+    title = f"Worst case over {found[0].plants} plants ({box.source})"
+    table = WholeTable(title=title, title_justify="left", header_style="bold")
+    for heading in ("#", "not held", "gain up", "gain down", "phase margin", "delay margin", "modulus", "worst at"):
+        table.add_column(heading, justify="left" if heading == "worst at" else "right")
+    for index, one in enumerate(found, start=1):
+        margins = one.margins
+        cells = ["\u2013"] * 5
+        if margins is not None and not one.unstable:
+            cells = [
+                "any" if math.isinf(margins.gain_up) else f"{margins.gain_up:.3f}",
+                f"{margins.gain_down:.4f}",
+                f"{math.degrees(margins.phase):.2f}\u00b0",
+                f"{margins.delay:.4f} s" if math.isfinite(margins.delay) else "any",
+                f"{margins.modulus:.3f}",
+            ]
+        held = f"{one.unstable}" if one.unstable else "none"
+        table.add_row(f"{index}", held, *cells, _place(one.where), style="bold cyan" if index == chosen else "")
+    console.print(table)
+    ranges = ", ".join(f"{name} {low:.4g} to {high:.4g} {_UNITS[name]}" for name, (low, high) in box.bounds.items())
+    one = found[chosen - 1]
+    if one.unstable:
+        console.print(
+            f"combination {chosen} is NOT safe over {ranges}: it does not hold {one.unstable} of {one.plants} plants, "
+            f"such as {_place(one.where)}",
+            style="bold red",
+        )
+    else:
+        console.print(f"combination {chosen} holds every one of {one.plants} plants over {ranges}")
+
+
+def _place(where: Mapping[str, float]) -> str:
+    return ", ".join(f"{name} {value:.4g} {_UNITS[name]}" for name, value in where.items())
