@@ -251,7 +251,7 @@ def test_a_stop_that_nobody_confirms_is_an_error_and_the_next_one_asks_again(por
         ("effort_limit_min", -9.0, None),
         ("effort_limit_min", math.nan, "effort limits read back as nan and 4.0"),
         ("velocity_limit_max", -1.0, "velocity limits read back as"),
-        ("min_position_limit_strategy", 3, "strategies at the position limits read back as"),
+        ("min_position_limit_strategy", 3, "strategy at the min position limit reads back as 3"),
         ("mstop_strategy", 77, None),
     ],
 )

@@ -357,17 +357,25 @@ def test_a_feedback_rate_is_above_0_and_up_to_1000_hz() -> None:
     assert group.feedback_frequency == 1000.0
 
 
-def test_a_position_window_is_written_and_read_back_if_both_ends_are_finite() -> None:
+@pytest.mark.parametrize("low", [-3.0, -math.inf])
+@pytest.mark.parametrize("high", [2.0, math.inf])
+def test_each_end_of_a_position_window_that_is_not_open_is_written_and_read_back(low: float, high: float) -> None:
     port, _ = port_on(group := Group(**{**LIMITS_READ, "position_limit_min": -2.5, "position_limit_max": 1.5}))
-    read = port.set_limits(WINDOW)
-    assert (read.position_min, read.position_max) == (-2.5, 1.5)
-    group.info.update(min_position_limit_strategy=0)
-    for low, high in ((-math.inf, 2.0), (-3.0, math.inf), (-math.inf, math.inf)):
-        read = port.set_limits(replace(WINDOW, position_min=low, position_max=high))
-        assert (read.position_min, read.position_max) == (low, high)
-        assert given(group.sent[-1]) == {
-            f"{what}_limit_{end}" for what in ("effort", "velocity") for end in ("min", "max")
-        }
+    read = port.set_limits(replace(WINDOW, position_min=low, position_max=high))
+    ends = {end for end, angle in (("min", low), ("max", high)) if math.isfinite(angle)}
+    assert (read.position_min, read.position_max) == (-2.5 if "min" in ends else low, 1.5 if "max" in ends else high)
+    assert given(group.sent[-1]) == {
+        f"{what}_limit_{end}" for what in ("effort", "velocity") for end in ("min", "max")
+    } | {f"position_limit_{end}" for end in ends}
+    # An end at which the module does not switch off is no limit; at an open one nobody asks.
+    for end in ("min", "max"):
+        group.info.update({f"{each}_position_limit_strategy": 2 for each in ("min", "max")})
+        group.info[f"{end}_position_limit_strategy"] = 0
+        if end in ends:
+            with pytest.raises(ActuatorError, match=f"strategy at the {end} position limit reads back as 0"):
+                port.set_limits(replace(WINDOW, position_min=low, position_max=high))
+        else:
+            port.set_limits(replace(WINDOW, position_min=low, position_max=high))
 
 
 @pytest.mark.parametrize("name", ["effort_limit_min", "effort_limit_max", "velocity_limit_min", "velocity_limit_max"])

@@ -79,7 +79,13 @@ TARGETS: tuple[Target, ...] = (
     ),
     Target(
         "pendulum_hw_bridge.backends.hebi",
-        ("HebiBackend", "_has_window", "_wider", "_known", "connect_group"),
+        ("HebiBackend", "_known", "connect_group"),
+        (f"{_BRIDGE}/test_hebi_backend.py", f"{_BRIDGE}/test_hebi_rules.py"),
+        choose="not test_a_bridge_drives_a_module",
+    ),
+    Target(
+        "pendulum_hw_bridge.backends.hebi_settings",
+        ("fill_gains", "gains_of", "fill_limits", "limits_of", "_window", "_wider"),
         (f"{_BRIDGE}/test_hebi_backend.py", f"{_BRIDGE}/test_hebi_rules.py"),
         choose="not test_a_bridge_drives_a_module",
     ),

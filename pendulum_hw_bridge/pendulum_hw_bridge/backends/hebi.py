@@ -25,7 +25,6 @@ from pendulum_hw_bridge.actuator import (
     Feedback,
     HardwareLimits,
     LimitState,
-    MStopAction,
     Strategy,
     TemperatureState,
     check_command,
@@ -33,9 +32,10 @@ from pendulum_hw_bridge.actuator import (
 )
 from pendulum_hw_bridge.backends.hebi_discovery import LOOK_TIME, ModuleSelection, discover, select_module
 from pendulum_hw_bridge.backends.hebi_log import start_log, stop_log
+from pendulum_hw_bridge.backends.hebi_settings import fill_gains, fill_limits, gains_of, limits_of
 from pendulum_hw_bridge.clocks import Clock, WallClock
 from pendulum_hw_bridge.emulation.parameters import load_emulator
-from pendulum_hw_bridge.gains import GAIN_FIELDS, LOOPS, GainSet, PidGains
+from pendulum_hw_bridge.gains import GainSet
 from pendulum_msgs_py.contract.values import NANOSECONDS
 from pendulum_msgs_py.errors import ParameterError
 
@@ -46,13 +46,6 @@ _ACKNOWLEDGE_MS = 200
 _STOP_ATTEMPTS = 3
 _STOP_ACKNOWLEDGE_MS = 15
 """Ten times the round trip; together the attempts take less than the command lifetime [ms]."""
-_PASCAL_M_STOP = {
-    MStopAction.DISABLED: "Disabled",
-    MStopAction.MOTOR_OFF: "MotorOff",
-    MStopAction.HOLD_POSITION: "HoldPosition",
-}
-_LIMIT_MOTOR_OFF = 2
-_M_STOP_BY_NUMBER = {0: MStopAction.DISABLED, 1: MStopAction.MOTOR_OFF, 2: MStopAction.HOLD_POSITION}
 _FLOATS = {
     "position": "position",
     "velocity": "velocity",
@@ -285,31 +278,20 @@ class HebiBackend:
         """Set the gains of all loops and read them back."""
         self._own()
         self._command.clear()
-        for loop in LOOPS:
-            for name in GAIN_FIELDS:
-                value = getattr(gains.loop(loop), name)
-                if math.isfinite(value):
-                    setattr(self._command, f"{loop}_{name}", bool(value) if name == "d_on_error" else value)
+        fill_gains(self._command, gains)
         self._acknowledged("gains")
         info = self._read_info()
-        self._gains = gains if info is None else self._gains_of(info, gains)
+        self._gains = gains if info is None else gains_of(info, gains)
         return self._gains
 
     def set_limits(self, limits: HardwareLimits) -> HardwareLimits:
         """Set the module's safety parameters and read them back."""
         self._own()
-        command = self._command
-        command.clear()
-        command.effort_limit_min, command.effort_limit_max = -limits.effort, limits.effort
-        command.velocity_limit_min, command.velocity_limit_max = -limits.velocity, limits.velocity
-        if _has_window(limits):
-            command.position_limit_min = limits.position_min
-            command.position_limit_max = limits.position_max
-            command.min_position_limit_strategy = command.max_position_limit_strategy = "MotorOff"
-        command.mstop_strategy = _PASCAL_M_STOP[limits.m_stop]
+        self._command.clear()
+        fill_limits(self._command, limits)
         self._acknowledged("limits")
         info = self._read_info()
-        self._limits = limits if info is None else self._limits_of(info, limits)
+        self._limits = limits if info is None else limits_of(info, limits)
         return self._limits
 
     def set_command_lifetime(self, lifetime: float) -> float:
@@ -413,50 +395,6 @@ class HebiBackend:
 
     def _limit(self, number: Any) -> int:
         return LimitState.INSIDE if self._imitation else _known(LimitState, number)
-
-    @staticmethod
-    def _gains_of(info: Any, wanted: GainSet) -> GainSet:
-        """Return the gains that a module tells; a clamp that was not written, because it is infinite, is not asked."""
-        loops: dict[str, PidGains] = {}
-        for loop in LOOPS:
-            read: dict[str, float] = {}
-            for name in GAIN_FIELDS:
-                asked = float(getattr(wanted.loop(loop), name))
-                read[name] = float(getattr(info, f"{loop}_{name}")[0]) if math.isfinite(asked) else asked
-                if math.isnan(read[name]):
-                    raise ActuatorError("settings", f"HEBI module does not tell its {loop} gain {name}")
-            loops[loop] = PidGains(**read)
-        return GainSet(wanted.strategy, **loops)
-
-    @staticmethod
-    def _limits_of(info: Any, wanted: HardwareLimits) -> HardwareLimits:
-        low, high = float(info.position_limit_min[0]), float(info.position_limit_max[0])
-        ends = [int(info.min_position_limit_strategy[0]), int(info.max_position_limit_strategy[0])]
-        windowed = _has_window(wanted)
-        if windowed and ends != 2 * [_LIMIT_MOTOR_OFF]:
-            raise ActuatorError(
-                "settings", f"strategies at the position limits read back as {ends}; expected 2 (motor off) for both"
-            )
-        return HardwareLimits(
-            effort=_wider(info.effort_limit_min[0], info.effort_limit_max[0], "effort"),
-            velocity=_wider(info.velocity_limit_min[0], info.velocity_limit_max[0], "velocity"),
-            position_min=low if windowed else wanted.position_min,
-            position_max=high if windowed else wanted.position_max,
-            pwm=wanted.pwm,
-            m_stop=_M_STOP_BY_NUMBER.get(int(info.mstop_strategy[0]), MStopAction.DISABLED),
-        )
-
-
-def _has_window(limits: HardwareLimits) -> bool:
-    """Whether limits have a window of position; one with an open end is not written."""
-    return math.isfinite(limits.position_min) and math.isfinite(limits.position_max)
-
-
-def _wider(low: Any, high: Any, what: str) -> float:
-    """Return the larger side of a symmetric limit."""
-    if not (float(low) < 0.0 < float(high)):
-        raise ActuatorError("settings", f"{what} limits read back as {low} and {high}; expected them around zero")
-    return max(-float(low), float(high))
 
 
 def _known(kind: Any, number: Any) -> int:

@@ -1,0 +1,96 @@
+"""Settings of a HEBI module as hebi-py's fields: what is written, and what a module tells of it.
+
+Every function takes hebi-py's command or info for one module; nothing is sent here.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+from pendulum_hw_bridge.actuator import ActuatorError, HardwareLimits, MStopAction
+from pendulum_hw_bridge.gains import GAIN_FIELDS, LOOPS, GainSet, PidGains
+
+__all__ = ["fill_gains", "fill_limits", "gains_of", "limits_of"]
+
+_PASCAL_M_STOP = {
+    MStopAction.DISABLED: "Disabled",
+    MStopAction.MOTOR_OFF: "MotorOff",
+    MStopAction.HOLD_POSITION: "HoldPosition",
+}
+_LIMIT_MOTOR_OFF = 2
+_M_STOP_BY_NUMBER = {0: MStopAction.DISABLED, 1: MStopAction.MOTOR_OFF, 2: MStopAction.HOLD_POSITION}
+
+
+def fill_gains(command: Any, gains: GainSet) -> None:
+    """Put the gains of all loops into a command; a clamp that is infinite is none and stays out."""
+    for loop in LOOPS:
+        for name in GAIN_FIELDS:
+            value = getattr(gains.loop(loop), name)
+            if math.isfinite(value):
+                setattr(command, f"{loop}_{name}", bool(value) if name == "d_on_error" else value)
+
+
+def gains_of(info: Any, wanted: GainSet) -> GainSet:
+    """Return the gains that a module tells; a clamp that was not written, because it is infinite, is not asked.
+
+    Raises:
+        ActuatorError: The module does not tell one.
+    """
+    loops: dict[str, PidGains] = {}
+    for loop in LOOPS:
+        read: dict[str, float] = {}
+        for name in GAIN_FIELDS:
+            asked = float(getattr(wanted.loop(loop), name))
+            read[name] = float(getattr(info, f"{loop}_{name}")[0]) if math.isfinite(asked) else asked
+            if math.isnan(read[name]):
+                raise ActuatorError("settings", f"HEBI module does not tell its {loop} gain {name}")
+        loops[loop] = PidGains(**read)
+    return GainSet(wanted.strategy, **loops)
+
+
+def fill_limits(command: Any, limits: HardwareLimits) -> None:
+    """Put the safety parameters into a command; an end of the position window that is open stays out."""
+    command.effort_limit_min, command.effort_limit_max = -limits.effort, limits.effort
+    command.velocity_limit_min, command.velocity_limit_max = -limits.velocity, limits.velocity
+    for end, angle in _window(limits).items():
+        setattr(command, f"position_limit_{end}", angle)
+        setattr(command, f"{end}_position_limit_strategy", "MotorOff")
+    command.mstop_strategy = _PASCAL_M_STOP[limits.m_stop]
+
+
+def limits_of(info: Any, wanted: HardwareLimits) -> HardwareLimits:
+    """Return the safety parameters that a module tells; an end of the position window that is open is not asked.
+
+    Raises:
+        ActuatorError: It tells none, or switches no motor off at an end of the window.
+    """
+    ends = {"min": wanted.position_min, "max": wanted.position_max}
+    for end in _window(wanted):
+        strategy = int(getattr(info, f"{end}_position_limit_strategy")[0])
+        if strategy != _LIMIT_MOTOR_OFF:
+            raise ActuatorError(
+                "settings", f"strategy at the {end} position limit reads back as {strategy}; expected 2 (motor off)"
+            )
+        ends[end] = float(getattr(info, f"position_limit_{end}")[0])
+    return HardwareLimits(
+        effort=_wider(info.effort_limit_min[0], info.effort_limit_max[0], "effort"),
+        velocity=_wider(info.velocity_limit_min[0], info.velocity_limit_max[0], "velocity"),
+        position_min=ends["min"],
+        position_max=ends["max"],
+        pwm=wanted.pwm,
+        m_stop=_M_STOP_BY_NUMBER.get(int(info.mstop_strategy[0]), MStopAction.DISABLED),
+    )
+
+
+def _window(limits: HardwareLimits) -> dict[str, float]:
+    """Return the ends of the position window that are not open [rad]."""
+    ends = {"min": limits.position_min, "max": limits.position_max}
+    return {end: angle for end, angle in ends.items() if math.isfinite(angle)}
+
+
+def _wider(low: Any, high: Any, what: str) -> float:
+    """Return the larger side of a symmetric limit."""
+    if not (float(low) < 0.0 < float(high)):
+        raise ActuatorError("settings", f"{what} limits read back as {low} and {high}; expected them around zero")
+    return max(-float(low), float(high))
