@@ -31,6 +31,8 @@ __all__ = ["FAULTS", "Fault", "SafetyLimits", "SafetyMonitor"]
 _COUNT = 3
 _MOTION_TIME = 0.2
 """Time over which position and velocity are compared: even a slow ramp moves further than they may differ [s]."""
+_GAP = 1.6
+"""Periods between two records with none missing, at most: each may come 0.3 of one early or late [-]."""
 _CURRENT_TIME = 0.5
 """Time within which wrong winding currents count together [s]."""
 _WAY = 1e-3
@@ -77,9 +79,10 @@ class SafetyMonitor:
         self._wrong_current_ns = 0
         self._unknown_temperatures = 0
         self._clock_offset_ns: int | None = None
-        self._clamped_speed = math.inf
+        self._clamped_speed, self._unseen_speed = math.inf, 0.0
         if drivetrain is not None:
-            self._clamped_speed = _CLAMPED_SHARE * MOTOR_SPEED_LIMIT / drivetrain.gear_ratio
+            self._unseen_speed = MOTOR_SPEED_LIMIT / drivetrain.gear_ratio
+            self._clamped_speed = _CLAMPED_SHARE * self._unseen_speed
         self._repeated = 0
         self._still = 0
         self._voltage: float | None = None
@@ -263,12 +266,16 @@ class SafetyMonitor:
             self._motion.clear()
             expected = 0.0
         else:
-            jump = feedback.position - last.position - expected
-            if abs(jump) > self.limits.position_jump:
+            jump, allowed = feedback.position - last.position - expected, self.limits.position_jump
+            if elapsed > _GAP * self.period:
+                # Records are missing, and what the velocity was meanwhile is not known.
+                allowed += self._unseen_speed * (elapsed - self.period)
+                expected += jump
+            if abs(jump) > allowed:
                 return Fault(
                     "position_jump",
                     f"position jumped by {jump:.3f} rad in {elapsed * 1e3:.0f} ms; "
-                    f"expected at most {self.limits.position_jump:g} rad beside the velocity",
+                    f"expected at most {allowed:.3g} rad beside the velocity",
                 )
         self._travelled += expected
         self._motion.append((self._travelled, feedback.position))

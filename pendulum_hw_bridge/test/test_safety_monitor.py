@@ -11,6 +11,7 @@ import pytest
 from pendulum_hw_bridge.actuator import Command, CommandLock, LimitState, Strategy, TemperatureState
 from pendulum_hw_bridge.effort_mapping import EffortMapping, EffortStrategy
 from pendulum_hw_bridge.fault_table import FAULTS
+from pendulum_hw_bridge.motor_state import MOTOR_SPEED_LIMIT
 from pendulum_hw_bridge.output_check import OutputCheck
 from pendulum_hw_bridge.safety import SafetyLimits, SafetyMonitor
 from pendulum_msgs_py.plants.plant_parameters import SeriesElasticParameters
@@ -270,11 +271,41 @@ def test_the_velocities_of_a_motion_count_with_the_time_between_their_records() 
     watched = Watched(position_jump=10.0, position_disagreement=0.001)
     position, last = 0.0, 0.0
     for number in range(30):
-        velocity, cycles = math.sin(number), 1 + number % 3
+        velocity, periods = math.sin(number), 1.0 + 0.25 * (number % 3)
         if number:
-            position += 0.5 * (velocity + last) * cycles * PERIOD
-        assert not watched.see(cycles * STEP, position=position, velocity=velocity)
+            position += 0.5 * (velocity + last) * periods * PERIOD
+        assert not watched.see(round(periods * STEP), position=position, velocity=velocity)
         last = velocity
+
+
+def test_motion_between_records_of_which_some_are_missing_is_not_compared() -> None:
+    for after_ns, fault in ((8 * STEP // 5, "motion_disagreement"), (8 * STEP // 5 + 1, "")):
+        watched = Watched(position_jump=10.0, position_disagreement=0.05)
+        # It turned to and fro while nobody looked, and stands still whenever somebody does.
+        found = {watched.see(after_ns, position=0.02 * number) for number in range(12)}
+        assert fault in found
+        assert found <= {"", fault}
+
+
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+def test_a_stuck_encoder_is_found_between_the_gaps(sign: float) -> None:
+    watched = Watched(position_jump=10.0, position_disagreement=0.09)
+    # One radian a second: after each gap of two periods comes one record that counts, of a 64th of a radian.
+    found = [watched.see(STEP * (1 + number % 2), velocity=sign) for number in range(13)]
+    assert found == [*([""] * 12), "motion_disagreement"]
+
+
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+def test_where_records_are_missing_a_link_may_have_turned_as_fast_as_the_motor_can(sign: float) -> None:
+    # 2 rad/s at the output, for the two of three periods of which nothing is known: 0.0625 rad.
+    drivetrain = replace(DRIVETRAIN, gear_ratio=MOTOR_SPEED_LIMIT / 2.0)
+    for position, fault in ((0.1875, ""), (0.188, "position_jump")):
+        watched = Watched(drivetrain, position_jump=0.125)
+        assert not watched.see()
+        assert watched.see(3 * STEP, position=sign * position) == fault
+    watched = Watched(drivetrain, position_jump=0.125)
+    assert not watched.see()
+    assert watched.see(8 * STEP // 5, position=sign * 0.126) == "position_jump"
 
 
 # --- what the module acts on -----------------------------------------------------------------------------------
