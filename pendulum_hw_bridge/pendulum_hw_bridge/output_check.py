@@ -109,7 +109,10 @@ class OutputCheck:
         # Of any: a record may still show the torque loop that the newest setpoints switched off.
         if any(math.isfinite(candidate.effort) for candidate in candidates):
             loop = self.gains.effort
-            clamped = not loop.min_output + _STILL < pwm < loop.max_output - _STILL
+            # A setpoint that steps throws the derivative against the clamp for a cycle, from wherever the output was;
+            # what its low-pass leaves of that is the same each time.
+            thrown = 2.0 * loop.output_lowpass - 1.0
+            clamped = not thrown * loop.min_output + _STILL < pwm < thrown * loop.max_output - _STILL
             threshold = math.inf if clamped else _STILL_EFFORT
         if self._opposes(feedback, likeliest, still):
             return Fault("output_disagreement", f"{text}, the other way, and has not moved: is it stuck?")

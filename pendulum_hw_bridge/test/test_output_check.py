@@ -285,6 +285,20 @@ def test_under_the_torque_loop_a_duty_is_stuck_when_more_than_noise_asks_it_to_m
         assert faults(duty, *large) == [""] * 4
 
 
+def test_what_the_low_pass_leaves_of_an_output_at_its_clamp_is_no_stuck_duty() -> None:
+    # Setpoints that step throw the output from clamp to clamp: three quarters of one and a quarter of the other.
+    gains = replace(GAINS, effort=PidGains(kp=0.25, min_output=-0.25, max_output=0.5, output_lowpass=0.75))
+
+    def faults(duty: float) -> list[str]:
+        checked = Checked(gains)
+        return [checked.see(duty, Command(effort=0.0), effort=0.1 * (number % 2)) for number in range(4)]
+
+    for duty in (0.5, 0.25, 0.2496, -0.25, -0.125, -0.1246):
+        assert faults(duty) == [""] * 4
+    for duty in (0.2494, -0.1244):
+        assert faults(duty) == ["", "", "", "output_disagreement"]
+
+
 # --- opposed ---------------------------------------------------------------------------------------------------
 
 
