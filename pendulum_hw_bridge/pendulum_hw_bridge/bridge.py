@@ -19,6 +19,7 @@ from pendulum_hw_bridge.actuator import (
     Strategy,
 )
 from pendulum_hw_bridge.effort_mapping import EffortMapping
+from pendulum_hw_bridge.fault_table import Fault
 from pendulum_hw_bridge.motor_state import MotorWatch
 from pendulum_hw_bridge.output_check import OutputCheck
 from pendulum_hw_bridge.safety import SafetyMonitor
@@ -202,8 +203,8 @@ class Bridge:
         self.sample = self._to_sample(feedback)
         if fault is not None and self._awake:
             self.fail(fault.name, fault.message)
-        elif fault is not None and fault.name == "module_restarted":
-            self._note(fault.name)
+        elif fault is not None:
+            self._understand(fault)
         return feedback
 
     def act(self) -> Outcome:
@@ -271,6 +272,16 @@ class Bridge:
     @property
     def _awake(self) -> bool:
         return self._driving or self.supervisor.mode.armed
+
+    def _understand(self, fault: Fault) -> None:
+        """Take note of what a record shows of a module at rest, which may be why it went there."""
+        if fault.name == "module_restarted":
+            self._note(fault.name)
+        elif fault.name == "feedback_late" and self.last_fault == "feedback_lost":
+            # Until it came, nobody could tell late from lost.
+            self.last_fault = self._note(fault.name)
+            if self.supervisor.mode is Mode.FAULT:
+                self.supervisor.reason = f"{fault.name}: {fault.message}"
 
     def _turn(self) -> bool:
         """Take note that the bridge runs; while it drives, a pause as long as the watchdog's is a fault."""

@@ -477,6 +477,41 @@ def test_feedback_that_stays_away_ends_an_armed_drive_and_is_none_at_rest() -> N
     assert rig.supervisor.mode is Mode.FAULT
 
 
+def test_feedback_that_seemed_lost_and_comes_late_is_told_so_once_in_the_fault_state_only() -> None:
+    def late(rig: Rig) -> None:
+        rig.port.time_ns += TIMEOUT + 2 * STEP
+        rig.port.records.append(rig.record(hardware_ns=rig.port.time_ns - TIMEOUT - MILLISECOND))
+        rig.bridge.observe(0.01)
+
+    rig = Rig().armed()
+    rig.port.takes["read"] = TIMEOUT // 2
+    for _ in range(3):
+        rig.bridge.observe(0.01)
+    rig.port.takes.clear()
+    assert rig.bridge.last_fault == "feedback_lost"
+    assert rig.supervisor.reason.startswith("feedback_lost: ")
+    # What came in time is no news.
+    assert rig.see() is not None
+    assert rig.bridge.last_fault == "feedback_lost"
+    for _ in range(2):
+        late(rig)
+        assert rig.bridge.last_fault == "feedback_late"
+        assert rig.supervisor.reason.startswith("feedback_late: feedback is 48 ms late")
+        assert rig.bridge.faults == {"feedback_lost": 1, "feedback_late": 1}
+    # Acknowledged, the plant is disarmed for the reason that it was.
+    rig = Rig().armed()
+    rig.bridge.fail("feedback_lost", "gone")
+    rig.supervisor.disarm(rig.port.time_ns, "acknowledged")
+    late(rig)
+    assert (rig.bridge.last_fault, rig.supervisor.reason) == ("feedback_late", "acknowledged")
+    # A late record after another fault explains nothing.
+    rig = Rig().armed()
+    rig.bridge.fail("m_stop", "pressed")
+    late(rig)
+    assert (rig.bridge.last_fault, rig.supervisor.reason) == ("m_stop", "m_stop: pressed")
+    assert rig.bridge.faults == {"m_stop": 1}
+
+
 def test_a_port_that_fails_to_read_is_a_fault_by_its_name() -> None:
     rig = Rig().armed()
     rig.port.fails["read"] = ActuatorError("module_lost", "gone")

@@ -231,7 +231,7 @@ SCENARIOS: tuple[Scenario, ...] = (
     Scenario("feedback lost", _inject(_F.FEEDBACK_LOST), ("feedback_lost",)),
     Scenario("feedback frozen", _inject(_F.FEEDBACK_FROZEN), ("feedback_frozen",)),
     Scenario("feedback at a tenth of its rate", _inject(_F.FEEDBACK_SLOW), ("feedback_lost",)),
-    Scenario("feedback late by 80 ms", _inject(_F.FEEDBACK_LATE), ("feedback_lost",)),
+    Scenario("feedback late by 80 ms", _inject(_F.FEEDBACK_LATE), ("feedback_late",)),
     Scenario("position not a number", _inject(_F.POSITION_NAN), ("feedback_not_finite",)),
     Scenario("velocity not a number", _inject(_F.VELOCITY_NAN), ("feedback_not_finite",)),
     Scenario("effort not a number", _inject(_F.EFFORT_NAN), ("feedback_not_finite",)),
@@ -398,7 +398,7 @@ def _reaction(rig: Rig, expiries: int) -> str:
             return "closed"
         return "lifetime" if rig.actuator.lifetime_expiries > expiries else "none"
     if mode is Mode.FAULT:
-        return next(iter(rig.bridge.faults), "none")
+        return rig.bridge.last_fault or "none"
     if mode is Mode.POSITION:
         return "goes on"
     if mode is Mode.EFFORT:
