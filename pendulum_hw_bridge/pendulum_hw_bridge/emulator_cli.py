@@ -5,7 +5,9 @@ from __future__ import annotations
 import json
 import signal
 from collections.abc import Sequence
+from contextlib import nullcontext
 from dataclasses import replace
+from pathlib import Path
 from typing import Annotated
 
 import typer
@@ -32,6 +34,9 @@ def emulator(
     seed: Annotated[int, typer.Option(min=0, help="Seed of sensor noise and timing jitter.")] = 0,
     flat: Annotated[bool, typer.Option(help="The pendulum lies flat: no gravity.")] = False,
     heating: Annotated[bool, typer.Option(help="Let the motor of the preset thesis warm up too.")] = False,
+    truth: Annotated[
+        Path | None, typer.Option(help="New CSV file for what link and motor really do, each millisecond.")
+    ] = None,
 ) -> None:
     """Serve an emulated X5-9 that goes on when the bridge ends, as a real one does.
 
@@ -40,6 +45,7 @@ def emulator(
     from pendulum_hw_bridge.emulation import wire
     from pendulum_hw_bridge.emulation.parameters import load_emulator
     from pendulum_hw_bridge.emulation.server import EmulatorServer
+    from pendulum_hw_bridge.emulation.truth_log import TruthLog
     from pendulum_hw_bridge.emulation.x5 import EmulatedX5
     from pendulum_msgs_py.contract.timing import SteadyWallClock
 
@@ -54,7 +60,10 @@ def emulator(
     server = EmulatorServer(actuator, wire.parse_address(address), clock)
     host, port = server.address
     print(f"emulated X5-9 ({parameters.plant.name}) listens on {host}:{port}", flush=True)
-    server.serve(lambda: not stopped)
+    with nullcontext() if truth is None else TruthLog(truth) as log:
+        if log is not None:
+            actuator.trace = log.note
+        server.serve(lambda: not stopped)
     print("emulated X5-9 ends", flush=True)
 
 

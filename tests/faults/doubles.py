@@ -10,23 +10,25 @@ from functools import partial
 from pathlib import Path
 
 import numpy as np
+from std_srvs.srv import SetBool
 
 from pendulum_bags.experiments.processes import Child, start_recorder
 from pendulum_msgs_py.contract import names
 from pendulum_msgs_py.errors import PendulumError
 from pendulum_rosbag.reader import read_bag
 from tests.faults.bag_property import check_bag
-from tests.faults.live import EFFORT_LIMIT, NAMESPACE, NODES, START_TIMEOUT, LiveSystem
-from tests.faults.outcome import MACHINE_PATIENCE, Fault, Outcome, is_at_rest
+from tests.faults.live import EFFORT_LIMIT, NODES, START_TIMEOUT, LiveSystem
+from tests.faults.outcome import MACHINE_PATIENCE, Fault, Outcome
+from tests.faults.plants import BRIDGE, SIMULATOR
 
 __all__ = ["DOUBLES", "FIVE_NODES", "ORDERS", "start_in_order"]
 
+_NOTICED = 1.0
+"""Time within which a plant must have noticed two nodes behind one name [s]: it looks twice a second."""
 FIVE_NODES = (*NODES, "viewer")
 ORDERS: tuple[tuple[str, ...], ...] = tuple(itertools.permutations(FIVE_NODES))
 """All 120 orders in which five nodes can start."""
 _PERIOD_NS = 2_000_000
-_STATES = f"{NAMESPACE}/{names.JOINT_STATES}"
-_APPLIED = f"{NAMESPACE}/{names.APPLIED_EFFORT}"
 
 
 # --- two plants, two controllers -------------------------------------------------------------------------------
@@ -62,14 +64,32 @@ def _twin_plant(name: str) -> Fault:
         return outcome
 
     kind = "one name" if name == "simulator" else "two names"
-    return Fault(f"two simulators under {kind}", act, short=name == "simulator")
+    return Fault(f"two simulators under {kind}", act, short=name == "simulator", plants=(SIMULATOR,))
 
 
 def _twin_controller(system: LiveSystem, _: random.Random) -> Outcome:
     outcome = Outcome()
     twin = system.processes.start_node(system.program("controller", q=[1.0, 0.01]))
-    system.wait_for("twins to be noticed", partial(is_at_rest, system), START_TIMEOUT)
-    outcome.detail = "twins: zero torque while both are there"
+    topic = f"{system.plant.namespace}/{names.EFFORT_COMMAND}"
+
+    def both_are_there() -> bool:
+        infos = system.conductor.node.get_publishers_info_by_topic(topic)
+        return [info.node_name for info in infos].count("controller") == 2
+
+    system.wait_for("the twin to be on the graph", both_are_there, START_TIMEOUT)
+    seen_ns = time.time_ns()
+    system.listen(_NOTICED + 1.5)
+    alive = twin.process.poll() is None
+    until_ns = system.driven_until_ns(seen_ns)
+    rest = (time.time_ns() - until_ns) * 1e-9
+    outcome.demand(alive and both_are_there(), "the twin ended by itself")
+    # From then on none at all: one command in between that acts is one that nobody can attribute.
+    outcome.demand(
+        (until_ns - seen_ns) * 1e-9 <= _NOTICED,
+        f"torque {(until_ns - seen_ns) * 1e-9:.2f} s after both were on the graph; expected none after {_NOTICED:g} s",
+    )
+    outcome.detail = outcome.detail or f"zero torque {(until_ns - seen_ns) * 1e-9:.2f} s after both were there"
+    outcome.demand(rest > 1.0, f"at rest for the last {rest:.1f} s only; expected more than 1 s")
     system.processes.finish(twin)
     return outcome
 
@@ -81,14 +101,31 @@ def _second_controller(system: LiveSystem, _: random.Random) -> Outcome:
     # Seen by the plant's own words, which come twice a second: that it was heard, and refused.
     system.wait_for(
         "the plant to refuse the second controller",
-        lambda: system.refused().get("second_commander", 0) > refused + 100,
+        lambda: system.refused().get("second_commander", 0) > refused + 0.2 * system.plant.rate,
         START_TIMEOUT,
     )
     outcome = Outcome()
     outcome.demand(system.torque_flows(), "the first controller lost the plant to the second")
-    commander = system.commander()
-    outcome.demand(commander == f"{NAMESPACE}/controller", f"{commander} commands; expected the first controller")
+    commander, first = system.commander(), f"{system.plant.namespace}/controller"
+    outcome.demand(commander == first, f"{commander} commands; expected the first controller")
     system.processes.finish(second)
+    return outcome
+
+
+def _second_bridge(system: LiveSystem, _: random.Random) -> Outcome:
+    """Let a second bridge take the same module, and be armed where it can be: nobody asks it for torque."""
+    program = system.program("bridge")
+    second = system.processes.start_node(type(program)(**{**vars(program), "namespace": "/other"}))
+    client = system.conductor.node.create_client(SetBool, "/other/bridge/arm")
+    system.wait_for("the second bridge", client.service_is_ready, START_TIMEOUT)
+    answer = system.conductor.call(client, SetBool.Request(data=True), "the answer to arming", START_TIMEOUT)
+    system.listen(1.0)
+    outcome = Outcome()
+    code = system.processes.finish(second)
+    outcome.demand(code == 0, f"the second bridge ended with code {code}: {second.last_words(1)}")
+    system.conductor.node.destroy_client(client)
+    first = "goes on" if system.torque_flows() else f"{system.mode()}"
+    outcome.detail = outcome.detail or f"second {'armed' if answer.success else 'refused'}, first {first}"
     return outcome
 
 
@@ -96,13 +133,14 @@ def _second_controller(system: LiveSystem, _: random.Random) -> Outcome:
 
 
 def _second_recorder(system: LiveSystem, bag: Path) -> Child:
-    return start_recorder(system.processes, bag, NAMESPACE, system.folder / "metadata.json", "mcap")
+    return start_recorder(system.processes, bag, system.plant.namespace, system.folder / "metadata.json", "mcap")
 
 
-def _stamps(bag: Path) -> list[int]:
+def _stamps(system: LiveSystem, bag: Path) -> list[int]:
+    topic = f"{system.plant.namespace}/{names.JOINT_STATES}"
     try:
-        with read_bag(bag, [_STATES]) as opened:
-            return [int(stamp) for stamp in opened.array(_STATES)["stamp_ns"]]
+        with read_bag(bag, [topic]) as opened:
+            return [int(stamp) for stamp in opened.array(topic)["stamp_ns"]]
     except PendulumError:  # not yet there
         return []
 
@@ -110,14 +148,14 @@ def _stamps(bag: Path) -> list[int]:
 def _two_recorders(system: LiveSystem, generator: random.Random) -> Outcome:
     bag = system.folder / f"second_{generator.randrange(10**9)}"
     second = _second_recorder(system, bag)
-    system.wait_for("the second recorder", lambda: bool(_stamps(bag)), START_TIMEOUT)
+    system.wait_for("the second recorder", lambda: bool(_stamps(system, bag)), START_TIMEOUT)
     system.listen(1.0)
     code = system.processes.finish(second)
     outcome = Outcome()
     outcome.demand(code == 0, f"the second recorder ended with code {code}: {second.last_words(1)}")
-    own = _stamps(bag)
-    system.wait_for("the first bag to have it all", lambda: _stamps(system.bag)[-1] >= own[-1], 10.0)
-    missing = set(own) - set(_stamps(system.bag))
+    own = _stamps(system, bag)
+    system.wait_for("the first bag to have it all", lambda: _stamps(system, system.bag)[-1] >= own[-1], 10.0)
+    missing = set(own) - set(_stamps(system, system.bag))
     outcome.demand(not missing, f"{len(missing)} states of the second bag are not in the first")
     outcome.demand(len(set(own)) == len(own) > 100, f"{len(own)} states in the second bag, some twice")
     outcome.detail = outcome.detail or f"{len(own)} states in both"
@@ -132,8 +170,8 @@ def _two_recorders_in_one_folder(system: LiveSystem, _: random.Random) -> Outcom
     outcome = Outcome()
     code, words = second.process.returncode, second.last_words(1)
     outcome.demand(code == 2 and "exists" in words, f"the second recorder ended with code {code}: {words}")
-    before = len(_stamps(system.bag))
-    system.wait_for("the first recorder to go on", lambda: len(_stamps(system.bag)) > before, 10.0)
+    before = len(_stamps(system, system.bag))
+    system.wait_for("the first recorder to go on", lambda: len(_stamps(system, system.bag)) > before, 10.0)
     return outcome
 
 
@@ -141,13 +179,14 @@ def _two_recorders_in_one_folder(system: LiveSystem, _: random.Random) -> Outcom
 
 
 def _restart_all(system: LiveSystem, generator: random.Random) -> Outcome:
-    order = generator.sample(NODES, len(NODES))
+    nodes = system.plant.nodes
+    order = generator.sample(nodes, len(nodes))
     for name in order:
         system.kill(name, generator.choice((signal.SIGKILL, signal.SIGINT, signal.SIGTERM)))
         system.listen(generator.uniform(0.0, 0.3))
         system.start(name)
     began = time.monotonic()
-    system.wait_for("torque to flow again", system.torque_flows, START_TIMEOUT)
+    system.bring_back("torque to flow again")
     return Outcome(detail=f"torque {time.monotonic() - began:.1f} s after the last start ({', '.join(order)})")
 
 
@@ -175,7 +214,7 @@ def start_in_order(system: LiveSystem, order: tuple[str, ...], *, one_by_one: bo
     system.wait_for("torque to flow", system.torque_flows, START_TIMEOUT)
     early = [applied for applied in system.applied[heard:] if applied.when < controlled and applied.effort != 0.0]
     outcome.demand(not early, f"{len(early)} torques before there was a controller")
-    system.wait_for("the torque to be recorded", partial(_has_torque, system.bag), START_TIMEOUT)
+    system.wait_for("the torque to be recorded", partial(_has_torque, system), START_TIMEOUT)
     died = set(order) - set(system.alive())
     outcome.demand(not died, f"{', '.join(sorted(died))} died")
     for record in check_bag(system.bag, limit=EFFORT_LIMIT, allowance=MACHINE_PATIENCE):
@@ -185,10 +224,11 @@ def start_in_order(system: LiveSystem, order: tuple[str, ...], *, one_by_one: bo
     return outcome
 
 
-def _has_torque(bag: Path) -> bool:
+def _has_torque(system: LiveSystem) -> bool:
+    topic = f"{system.plant.namespace}/{names.APPLIED_EFFORT}"
     try:
-        with read_bag(bag, [_APPLIED]) as opened:
-            return bool(np.any(opened.array(_APPLIED)["effort"] != 0.0))
+        with read_bag(system.bag, [topic]) as opened:
+            return bool(np.any(opened.array(topic)["effort"] != 0.0))
     except PendulumError:  # not yet there
         return False
 
@@ -223,12 +263,13 @@ def _back_to_four(system: LiveSystem, _: random.Random) -> Outcome:
 DOUBLES: tuple[Fault, ...] = (
     _twin_plant("simulator"),
     _twin_plant("impostor"),
-    Fault("two controllers under one name", _twin_controller),
+    Fault("two controllers under one name", _twin_controller, short=True, own_torque=True),
     Fault("two controllers under two names", _second_controller, short=True),
-    Fault("two recorders into two folders", _two_recorders, short=True),
-    Fault("two recorders into one folder", _two_recorders_in_one_folder),
+    Fault("two bridges on one module", _second_bridge, plants=(BRIDGE,)),
+    Fault("two recorders into two folders", _two_recorders, short=True, plants=(SIMULATOR,)),
+    Fault("two recorders into one folder", _two_recorders_in_one_folder, plants=(SIMULATOR,)),
     Fault("every node killed and started again, in any order", _restart_all),
-    Fault("five nodes started all at once, in any order", _random_orders, short=True),
-    Fault("five nodes started one by one, in all 120 orders", _EveryOrder(), tries=len(ORDERS)),
-    Fault("viewer: SIGINT", _back_to_four, tries=1),
+    Fault("five nodes started all at once, in any order", _random_orders, short=True, plants=(SIMULATOR,)),
+    Fault("five nodes started one by one, in all 120 orders", _EveryOrder(), tries=len(ORDERS), plants=(SIMULATOR,)),
+    Fault("viewer: SIGINT", _back_to_four, tries=1, plants=(SIMULATOR,)),
 )

@@ -2,35 +2,42 @@
 
 from __future__ import annotations
 
-import math
 import os
 import signal
+import sys
 import time
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from diagnostic_msgs.msg import DiagnosticArray
 from rclpy.publisher import Publisher
 from sensor_msgs.msg import JointState
+from std_srvs.srv import SetBool
 
 from pendulum_bags.experiments.conductor_node import Conductor
 from pendulum_bags.experiments.processes import Child, ProcessSet, ros_environment, start_recorder
 from pendulum_bags.runs.run_folder import write_json
 from pendulum_msgs_py.contract import names
 from pendulum_msgs_py.contract.cdr import decode_joint_state, encode_joint_state
+from pendulum_msgs_py.errors import FaultError
 from pendulum_msgs_py.programs import graph
 from pendulum_msgs_py.programs.graph import NodeProgram
 from pendulum_msgs_py.ros import qos
+from tests.faults.motor import NO_TORQUE, Asked, Drive, ModuleTruth, beyond_asked
+from tests.faults.plants import EFFORT_LIMIT, SIMULATOR, Plant
+from tests.udp_address import free_udp_address
 
-__all__ = ["EFFORT_LIMIT", "NAMESPACE", "NODES", "START_TIMEOUT", "Applied", "LiveSystem"]
+__all__ = ["EFFORT_LIMIT", "MODULE", "NAMESPACE", "NODES", "START_TIMEOUT", "Applied", "LiveSystem"]
 
-EFFORT_LIMIT = 5.0
-"""Limit given to the plant under attack, below what an angry controller asks for [N m]."""
 START_TIMEOUT = 60.0
-NAMESPACE = "/sim"
-NODES = ("recorder", "simulator", "controller", "disturbance")
-"""The nodes of the system, in the order in which they usually start."""
+NAMESPACE = SIMULATOR.namespace
+NODES = SIMULATOR.nodes
+"""The nodes of the simulator's system, in the order in which they usually start."""
+MODULE = "emulator"
+"""Name of the process behind a plant that has a module."""
+_KEPT_NS = 120_000_000_000
+"""How long what the motor did is kept [ns]."""
 
 
 class Applied(NamedTuple):
@@ -48,20 +55,22 @@ class Applied(NamedTuple):
 
 
 class LiveSystem:
-    """Simulator, controller, disturbance and recorder as processes, upright under noise; and a probe among them.
+    """Plant, controller, disturbance and recorder as processes, upright under noise; and a probe among them.
 
-    The probe hears commands and applied torque, so it knows how long torque outlives the last command.
+    The probe hears commands and knows what the motor does, so it knows how long torque outlives the last command.
 
     Args:
         folder: For logs and the bag.
         domain: ROS domain of the system's own.
-        order: The nodes to start, in this order; none of them is waited for.
+        plant: Which plant is attacked.
+        order: The nodes to start, in this order; none of them is waited for. By default all of the plant's.
         environment: Variables to add for the nodes.
         parameters: ROS parameters to add for a node, by its name.
 
     Attributes:
         applied: Every torque that the plant said it applied.
         commands: When the controller's commands were heard, on the probe's monotonic clock [s].
+        asked: What controller and disturbance asked for, by the name of their topic.
         diagnostics: Newest key-value pairs by name of the status, such as ``/sim/simulator: plant``.
         diagnosed: When each status was heard last, on the probe's monotonic clock [s].
     """
@@ -70,22 +79,30 @@ class LiveSystem:
         self,
         folder: Path,
         domain: int,
+        plant: Plant = SIMULATOR,
         *,
-        order: Sequence[str] = NODES,
+        order: tuple[str, ...] | None = None,
         environment: Mapping[str, str] | None = None,
         parameters: Mapping[str, Mapping[str, graph.ParameterArgument]] | None = None,
     ) -> None:
         self.folder = folder
         self.domain = domain
+        self.plant = plant
         self.children: dict[str, Child] = {}
         self.applied: list[Applied] = []
         self.commands: list[float] = []
+        self.asked: dict[str, list[Asked]] = {names.EFFORT_COMMAND: [], names.DISTURBANCE: []}
         self.diagnostics: dict[str, dict[str, str]] = {}
         self.diagnosed: dict[str, float] = {}
-        self._order = order
+        self._order = plant.nodes if order is None else order
         self._environment = environment or {}
         self._parameters = parameters or {}
         self._bags = 0
+        self._modules = 0
+        self._truth: ModuleTruth | None = None
+        self._drives: list[Drive] = []
+        self._taken = 0
+        self._address = free_udp_address() if plant.has_module else ""
 
     def __enter__(self) -> LiveSystem:
         """Start everything and wait until torque flows."""
@@ -94,22 +111,22 @@ class LiveSystem:
         self.processes.__enter__()
         self.conductor = Conductor(self.domain)
         self.conductor.__enter__()
-        node = self.conductor.node
+        node, namespace = self.conductor.node, self.plant.namespace
         node.create_subscription(
-            JointState, f"{NAMESPACE}/{names.APPLIED_EFFORT}", self._on_applied, qos.STATE, raw=True
+            JointState, f"{namespace}/{names.APPLIED_EFFORT}", self._on_applied, qos.STATE, raw=True
         )
-        node.create_subscription(
-            JointState,
-            f"{NAMESPACE}/{names.EFFORT_COMMAND}",
-            self._on_command,
-            qos.COMMAND,
-            raw=True,
-        )
+        for topic, name in ((names.EFFORT_COMMAND, "controller"), (names.DISTURBANCE, "disturbance")):
+            node.create_subscription(
+                JointState, f"{namespace}/{topic}", self._listener(topic, f"{namespace}/{name}"), qos.COMMAND, raw=True
+            )
         node.create_subscription(DiagnosticArray, names.DIAGNOSTICS, self._on_diagnostics, qos.DIAGNOSTICS)
+        self._arming = node.create_client(SetBool, self.service(names.ARM))
+        if self.plant.has_module and self._order:
+            self.start(MODULE)
         for name in self._order:
             self.start(name)
         if self._order:
-            self.wait_for("torque to flow", self.torque_flows, START_TIMEOUT)
+            self.bring_back("torque to flow")
         return self
 
     def __exit__(self, *_: object) -> None:
@@ -128,22 +145,40 @@ class LiveSystem:
             self._bags += 1
             metadata = self.folder / "metadata.json"
             write_json(metadata, {"pendulum.run": {"experiment": "faults"}})
-            child = start_recorder(self.processes, self.bag, NAMESPACE, metadata, "mcap")
+            child = start_recorder(self.processes, self.bag, self.plant.namespace, metadata, "mcap")
+        elif name == MODULE:
+            child = self._start_module()
         else:
             child = self.processes.start_node(self.program(name, **{**self._parameters.get(name, {}), **changes}))
         self.children[name] = child
         return child
 
-    @staticmethod
-    def program(name: str, **changes: graph.ParameterArgument) -> NodeProgram:
+    def program(self, name: str, **changes: graph.ParameterArgument) -> NodeProgram:
         """Return the description of one of the nodes."""
-        if name == "simulator":
-            return graph.simulator(NAMESPACE, initial_theta=math.pi, effort_limit=EFFORT_LIMIT, **changes)
+        namespace = self.plant.namespace
+        if name == self.plant.name:
+            return self.plant.program(self._address, **changes)
         if name == "controller":
-            return graph.controller(NAMESPACE, **changes)
+            return graph.controller(namespace, **changes)
         if name == "viewer":
-            return NodeProgram("pendulum_sim", "viewer", NAMESPACE, parameters={"window": False, "fps": 5.0, **changes})
-        return graph.disturbance(NAMESPACE, autostart=True, hold_time=0.01, **changes)
+            return NodeProgram("pendulum_sim", "viewer", namespace, parameters={"window": False, "fps": 5.0, **changes})
+        return graph.disturbance(namespace, autostart=True, hold_time=0.01, **changes)
+
+    def service(self, name: str) -> str:
+        """Return the full name of one of the plant's services, such as ``~/arm``."""
+        return name.replace("~", f"{self.plant.namespace}/{self.plant.name}", 1)
+
+    def _start_module(self) -> Child:
+        """Start the emulated actuator upright, so that a controller asks for little while it is armed."""
+        # What the one before did to its end.
+        self.drives()
+        self._modules += 1
+        path = self.folder / f"truth_{self._modules}.csv"
+        command = [sys.executable, "-m", "pendulum_hw_bridge", "emulator", "--address", self._address]
+        command += ["--position", "3.1416", "--truth", str(path)]
+        child = self.processes.start(f"emulator_{self._modules}", command)
+        self._truth = ModuleTruth(path)
+        return child
 
     @property
     def bag(self) -> Path:
@@ -173,7 +208,7 @@ class LiveSystem:
 
     def is_on_graph(self, name: str) -> bool:
         """Tell whether a node of this name has been discovered."""
-        return (name, NAMESPACE) in self.conductor.node.get_node_names_and_namespaces()
+        return (name, self.plant.namespace) in self.conductor.node.get_node_names_and_namespaces()
 
     def alive(self) -> list[str]:
         """Return the names of the nodes that run."""
@@ -206,19 +241,84 @@ class LiveSystem:
         return bool(self.commands) and time.monotonic() - self.commands[-1] < 0.05
 
     def time_to_zero(self, patience: float = 1.0) -> float:
-        """Return the time from the last command to the first zero torque after it [s]; inf where it did not come."""
+        """Listen for a while; return the time from the last command to the end of all torque [s].
+
+        By the motor's own clock, from the stamp of the state that the last command answers: no busy machine adds to it.
+        """
         self.listen(patience)
-        if not self.commands:
-            return math.inf
-        last = self.commands[-1]
-        after = [applied for applied in self.applied if applied.when > last]
-        # The torque must stay zero: find the last one that was not.
-        driven = [applied.when for applied in after if applied.effort != 0.0]
-        return (driven[-1] if driven else last) - last if after and after[-1].effort == 0.0 else math.inf
+        asked = self.asked[names.EFFORT_COMMAND]
+        last_ns = asked[-1].stamp_ns if asked else 0
+        return max(0.0, (self.driven_until_ns(last_ns) - last_ns) * 1e-9)
 
     def largest_torque(self) -> float:
-        """Return the largest torque that was ever applied [N m]."""
-        return max((abs(applied.effort) for applied in self.applied), default=0.0)
+        """Return the largest torque with which the motor drove lately [N m]."""
+        return max((abs(drive.torque) for drive in self.drives()), default=0.0)
+
+    # --- the motor -----------------------------------------------------------------------------------------
+
+    def drives(self) -> list[Drive]:
+        """Return what the motor did in the last two minutes, by its own clock."""
+        if self._truth is not None:
+            self._drives += self._truth.read()
+        else:
+            self._drives += [Drive(applied.stamp_ns, applied.effort) for applied in self.applied[self._taken :]]
+            self._taken = len(self.applied)
+        if self._drives and self._drives[-1].time_ns - self._drives[0].time_ns > 2 * _KEPT_NS:
+            self._drives = [one for one in self._drives if one.time_ns > self._drives[-1].time_ns - _KEPT_NS]
+        return self._drives
+
+    def driven_until_ns(self, since_ns: int) -> int:
+        """Return when the motor drove last after an instant, or that instant [ns]."""
+        step_ns = 0 if self.plant.has_module else round(self.plant.period * 1e9)
+        driven = (one.time_ns + step_ns for one in self.drives() if abs(one.torque) > NO_TORQUE)
+        return max([since_ns, *(time_ns for time_ns in driven if time_ns > since_ns)])
+
+    def beyond_asked(self, since_ns: int) -> Drive:
+        """Return by how much the motor drove beyond what was rightfully asked for since an instant [ns, N m]."""
+        drives = [one for one in self.drives() if one.time_ns >= since_ns]
+        commands, disturbances = (sorted(self.asked[topic]) for topic in (names.EFFORT_COMMAND, names.DISTURBANCE))
+        return beyond_asked(drives, commands, disturbances, EFFORT_LIMIT)
+
+    # --- what a person does ---------------------------------------------------------------------------------
+
+    def mode(self) -> str:
+        """Return in which mode the plant is, as its newest diagnostics say."""
+        return self.diagnostics.get(f"{self.plant.namespace}/{self.plant.name}: plant", {}).get("mode", "")
+
+    def arm(self, on: bool = True) -> str:
+        """Arm or disarm; return why not, or an empty string."""
+        answer: Any = self.conductor.call(self._arming, SetBool.Request(data=on), "the answer to arming", START_TIMEOUT)
+        return "" if answer.success else str(answer.message)
+
+    def bring_back(self, what: str) -> None:
+        """Wait until torque flows; a plant that was armed once and gave up is armed again, as a person would.
+
+        Raises:
+            FaultError: It does not come back.
+        """
+        deadline = time.monotonic() + START_TIMEOUT
+        refusal = ""
+        while not self.torque_flows():
+            if time.monotonic() > deadline:
+                raise FaultError(f"waited {START_TIMEOUT:g} s for {what}, in vain; {refusal or self.mode()}")
+            if self.plant.has_module and self._arming.service_is_ready() and (refusal := self.arm()):
+                self.arm(False)
+                refusal = self.arm()
+                if "already commands" in refusal:
+                    self._begin_upright()
+            self.listen(0.5)
+
+    def _begin_upright(self) -> None:
+        """Put the pendulum upright where it has fallen so far that the controller asks for much at once."""
+        commanding = [name for name in ("controller", "disturbance") if name in self.children]
+        for name in commanding:
+            self.processes.finish(self.children.pop(name))
+        self.kill(MODULE)
+        self.start(MODULE)
+        self.arm(False)
+        self.wait_for("the module to be armed", lambda: not self.arm(), START_TIMEOUT)
+        for name in commanding:
+            self.start(name)
 
     def rate(self, duration: float = 1.0) -> float:
         """Listen for a while and return how many torques a second were applied [Hz]."""
@@ -229,7 +329,7 @@ class LiveSystem:
 
     def publisher(self, topic: str) -> Publisher:
         """Return a publisher of the probe's on one of the plant's inputs."""
-        return self.conductor.node.create_publisher(JointState, f"{NAMESPACE}/{topic}", qos.COMMAND)
+        return self.conductor.node.create_publisher(JointState, f"{self.plant.namespace}/{topic}", qos.COMMAND)
 
     def attack(self, topic: str, messages: Iterable[JointState | bytes], *, rate: float | None = None) -> int:
         """Publish messages on an input and return how many were sent.
@@ -265,10 +365,17 @@ class LiveSystem:
         if fields is not None and fields.effort is not None:
             self.applied.append(Applied(time.monotonic(), fields.effort, fields.stamp_ns))
 
-    def _on_command(self, data: bytes) -> None:
-        fields = decode_joint_state(data)
-        if fields is not None and fields.frame_id == f"{NAMESPACE}/controller":
-            self.commands.append(time.monotonic())
+    def _listener(self, topic: str, frame: str) -> Callable[[bytes], None]:
+        """Return what takes note of the messages of the one who may ask for torque on a topic."""
+
+        def listen(data: bytes) -> None:
+            fields = decode_joint_state(data)
+            if fields is not None and fields.frame_id == frame and fields.effort is not None:
+                self.asked[topic].append(Asked(fields.stamp_ns, fields.effort))
+                if topic == names.EFFORT_COMMAND:
+                    self.commands.append(time.monotonic())
+
+        return listen
 
     def _on_diagnostics(self, message: DiagnosticArray) -> None:
         for status in message.status:
@@ -277,10 +384,10 @@ class LiveSystem:
 
     def commander(self) -> str:
         """Return who commands the plant, as its newest diagnostics say."""
-        return self.diagnostics.get(f"{NAMESPACE}/simulator: plant", {}).get("commander", "")
+        return self.diagnostics.get(f"{self.plant.namespace}/{self.plant.name}: plant", {}).get("commander", "")
 
     def refused(self, topic: str = names.EFFORT_COMMAND) -> dict[str, int]:
         """Return how many messages on an input the plant has refused so far, by reason, as its diagnostics say."""
-        values = self.diagnostics.get(f"{NAMESPACE}/simulator: plant", {})
+        values = self.diagnostics.get(f"{self.plant.namespace}/{self.plant.name}: plant", {})
         prefix = f"{topic}.refused."
         return {key[len(prefix) :]: int(value) for key, value in values.items() if key.startswith(prefix)}

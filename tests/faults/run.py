@@ -29,6 +29,7 @@ from tests.faults.fuzz import fuzz_all
 from tests.faults.live import EFFORT_LIMIT, LiveSystem
 from tests.faults.network import cut_cable, why_not
 from tests.faults.outcome import MACHINE_PATIENCE, MAX_TIME_TO_ZERO, Fault, Outcome, Trial, try_fault
+from tests.faults.plants import PLANTS, Plant
 from tests.faults.resources import RESOURCE_TRIALS
 from tests.faults.side_by_side import DOMAIN_TRIALS
 
@@ -117,9 +118,11 @@ def _rows(
             time_to_zero_s=None if cell.time_to_zero_ms is None else cell.time_to_zero_ms * 1e-3,
             remarks=f"{told}; {cell.beyond_limit:.1f} N m beyond the limit" if cell.beyond_limit else told,
         )
-    wanted = [fault for fault in CAMPAIGN if not only or re.search(only, fault.name)]
-    if wanted:
-        yield from _live_rows(wanted, repetitions, seed, keep)
+    for plant in PLANTS:
+        faults = [fault for fault in CAMPAIGN if plant in fault.plants]
+        wanted = [fault for fault in faults if not only or re.search(only, f"{plant.name}: {fault.name}")]
+        if wanted:
+            yield from _live_rows(plant, wanted, repetitions, seed, keep)
     for trial in _TRIALS:
         if not only or re.search(only, trial.name):
             yield _trial_row(trial, seed, keep)
@@ -144,12 +147,13 @@ def _markdown(rows: Sequence[Row], cells: Sequence[Cell]) -> str:
     )
 
 
-def _live_rows(faults: Sequence[Fault], repetitions: int, seed: int, keep: Path | None) -> Iterator[Row]:
+def _live_rows(plant: Plant, faults: Sequence[Fault], repetitions: int, seed: int, keep: Path | None) -> Iterator[Row]:
+    """Try faults of a running plant, one system for all of them."""
     generator = random.Random(seed)
     with reserve_domain() as domain, tempfile.TemporaryDirectory(prefix="pendulum_faults_") as temporary:
-        folder = keep or Path(temporary)
+        folder = (keep or Path(temporary)) / plant.name
         with (
-            LiveSystem(folder, domain) as system,
+            LiveSystem(folder, domain, plant) as system,
             Progress(transient=True, disable=not sys.stdout.isatty()) as progress,
         ):
             task = progress.add_task("", total=sum(fault.tries or repetitions for fault in faults))
@@ -159,9 +163,9 @@ def _live_rows(faults: Sequence[Fault], repetitions: int, seed: int, keep: Path 
                     progress.update(task, description=fault.name)
                     outcomes.append(_try(system, fault, generator))
                     progress.advance(task)
-                yield _row(fault.name, outcomes)
+                yield _row(f"{plant.name}: {fault.name}", outcomes)
         # Now that the last bag is closed, too: what came late to its recorder is in it, or counted.
-        yield _property_row(folder)
+        yield _property_row(plant, folder)
 
 
 def _trial_row(trial: Trial, seed: int, keep: Path | None) -> Row:
@@ -180,7 +184,7 @@ def _trial_row(trial: Trial, seed: int, keep: Path | None) -> Row:
     return _row(trial.name, [outcome])
 
 
-def _property_row(folder: Path) -> Row:
+def _property_row(plant: Plant, folder: Path) -> Row:
     """Judge every bag that was recorded on the way by the rule of the last command."""
     outcomes = []
     longest = 0.0
@@ -195,7 +199,7 @@ def _property_row(folder: Path) -> Row:
                 longest = max(longest, record.longest)
                 outcome.demand(not record.violations, f"{bag.name}: {'; '.join(record.violations)}")
         outcomes.append(outcome)
-    row = _row("every bag of these: bounded torque, none without a command", outcomes)
+    row = _row(f"{plant.name}: every bag of these: bounded torque, none without a command", outcomes)
     return replace(row, time_to_zero_s=longest)
 
 

@@ -12,24 +12,29 @@ from tests.faults.bag_property import check_bag
 from tests.faults.campaign import CAMPAIGN
 from tests.faults.live import EFFORT_LIMIT, LiveSystem
 from tests.faults.outcome import MACHINE_PATIENCE, Fault, try_fault
+from tests.faults.plants import PLANTS
 
 
 @pytest.fixture(scope="module")
-def system(tmp_path_factory: pytest.TempPathFactory) -> Iterator[LiveSystem]:
-    with reserve_domain() as domain, LiveSystem(tmp_path_factory.mktemp("live"), domain) as running:
+def system(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Iterator[LiveSystem]:
+    with reserve_domain() as domain, LiveSystem(tmp_path_factory.mktemp("live"), domain, request.param) as running:
         yield running
 
 
+_SHORT = [(plant, fault) for plant in PLANTS for fault in CAMPAIGN if fault.short and plant in fault.plants]
+
+
 @pytest.mark.timeout(150)
-@pytest.mark.parametrize("fault", [fault for fault in CAMPAIGN if fault.short], ids=lambda fault: fault.name)
+@pytest.mark.parametrize(("system", "fault"), _SHORT, ids=lambda each: each.name, indirect=["system"], scope="module")
 def test_running_system_survives(system: LiveSystem, fault: Fault) -> None:
     outcome = try_fault(system, fault, random.Random(fault.name))
     assert outcome.survived, outcome.detail
 
 
+@pytest.mark.parametrize("system", PLANTS, ids=lambda plant: plant.name, indirect=True, scope="module")
 def test_every_bag_of_the_campaign_keeps_the_rule_of_the_last_command(system: LiveSystem) -> None:
     if not list(system.folder.glob("bag_*")):  # run alone: the faults above have recorded none
-        fault = next(fault for fault in CAMPAIGN if fault.short)
+        fault = next(fault for plant, fault in _SHORT if plant is system.plant)
         assert try_fault(system, fault, random.Random(fault.name)).survived
     records = {
         bag.name: check_bag(bag, limit=EFFORT_LIMIT, allowance=MACHINE_PATIENCE)

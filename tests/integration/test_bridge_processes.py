@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import signal
-import socket
 import time
 from collections.abc import Iterator
 
@@ -19,6 +18,7 @@ from pendulum_msgs_py.ros import qos
 from pendulum_msgs_py.ros.convert import stamp_from_message
 from tests.graph_peer import GraphPeer
 from tests.processes import ProcessGroup, RunningProgram
+from tests.udp_address import free_udp_address
 
 UPRIGHT_ISH = "3.15"
 """So close that a controller asks for little when it begins, even if it takes its time to start [rad]."""
@@ -29,11 +29,8 @@ class Lab(GraphPeer):
 
     def __init__(self, processes: ProcessGroup) -> None:
         super().__init__("observer")
-        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
-            probe.bind(("127.0.0.1", 0))
-            port = probe.getsockname()[1]
         self.processes = processes
-        self.address = f"127.0.0.1:{port}"
+        self.address = free_udp_address()
         self.emulator = processes.start(
             "pendulum_hw_bridge", "emulator", "--address", self.address, "--position", UPRIGHT_ISH
         )

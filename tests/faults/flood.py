@@ -1,0 +1,79 @@
+"""Sends messages or requests to a plant as fast as it can: ``python -m tests.faults.flood /hw bridge calls``."""
+
+from __future__ import annotations
+
+import signal
+import sys
+import time
+from collections.abc import Callable
+
+import rclpy
+from rcl_interfaces.msg import Parameter, ParameterValue
+from rcl_interfaces.srv import SetParameters
+from rclpy.node import Node
+from rclpy.signals import SignalHandlerOptions
+from sensor_msgs.msg import JointState
+from std_srvs.srv import Trigger
+from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
+
+from pendulum_msgs_py.contract import names
+from pendulum_msgs_py.contract.cdr import encode_joint_state
+from pendulum_msgs_py.ros import qos
+from pendulum_msgs_py.ros.middleware import set_middleware_defaults
+
+_POINTS = 2000
+_BATCH = 50
+
+
+def _commands(node: Node, namespace: str, _: str) -> Callable[[], None]:
+    publisher = node.create_publisher(JointState, f"{namespace}/{names.EFFORT_COMMAND}", qos.COMMAND)
+    return lambda: publisher.publish(encode_joint_state(time.time_ns(), frame_id="/stranger", effort=100.0))
+
+
+def _trajectories(node: Node, namespace: str, _: str) -> Callable[[], None]:
+    publisher = node.create_publisher(JointTrajectory, f"{namespace}/{names.JOINT_TRAJECTORY}", qos.TRAJECTORY)
+    message = JointTrajectory(joint_names=[names.JOINT])
+    message.points = [JointTrajectoryPoint(positions=[0.0]) for _ in range(_POINTS)]
+    return lambda: publisher.publish(message)
+
+
+def _parameters(node: Node, namespace: str, plant: str) -> Callable[[], None]:
+    client = node.create_client(SetParameters, f"{namespace}/{plant}/set_parameters")
+    client.wait_for_service(20.0)
+    value = ParameterValue(type=3, double_value=1.0)
+    request = SetParameters.Request(parameters=[Parameter(name=f"unknown_{i}", value=value) for i in range(20)])
+    return lambda: client.remove_pending_request(client.call_async(request))
+
+
+def _calls(node: Node, namespace: str, plant: str) -> Callable[[], None]:
+    client = node.create_client(Trigger, names.E_STOP_RESET.replace("~", f"{namespace}/{plant}"))
+    client.wait_for_service(20.0)
+    return lambda: client.remove_pending_request(client.call_async(Trigger.Request()))
+
+
+_KINDS = {"commands": _commands, "trajectories": _trajectories, "parameters": _parameters, "calls": _calls}
+
+
+def main(namespace: str, plant: str, kind: str) -> int:
+    """Flood until SIGINT."""
+    stopped: list[int] = []
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, lambda received, frame: stopped.append(received))
+    set_middleware_defaults()
+    rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
+    node = rclpy.create_node("stranger")
+    send = _KINDS[kind](node, namespace, plant)
+    sent, started = 0, time.monotonic()
+    print("flooding", flush=True)
+    while not stopped:
+        for _ in range(_BATCH):
+            send()
+        sent += _BATCH
+    print(f"sent {sent / (time.monotonic() - started):.0f} a second", flush=True)
+    node.destroy_node()
+    rclpy.try_shutdown()
+    return 0
+
+
+if __name__ == "__main__":
+    raise SystemExit(main(*sys.argv[1:]))
