@@ -20,6 +20,7 @@ import typer
 
 from pendulum_msgs_py.contract import names
 from pendulum_msgs_py.contract.cdr import decode_joint_state
+from pendulum_msgs_py.contract.values import NANOSECONDS
 from pendulum_msgs_py.errors import DataError
 from pendulum_msgs_py.programs.executables import cli_main
 from pendulum_rosbag.reader import Bag, read_bag
@@ -60,9 +61,11 @@ def check_bag(path: Path, *, limit: float, allowance: float = 0.0) -> list[Torqu
     """Check the torque of every plant in a bag.
 
     Under position control (from a trajectory to the next torque command) the plant makes its own torque: there only
-    the limit is checked. A torque is excused by a command that is recent in log times, which are of one clock, or in
-    stamps, which are of the plant's: a message that had to be sent again comes late in the one, a stranger's clock
-    shows in the other.
+    the limit is checked. Else a torque is excused by a command that a plant may believe and by nothing else: of the
+    plant's own controller (or, where there is none of that name, of who commanded first), for this joint, finite, not
+    from the future and not too old when it came. It must be recent in log times, which are of one clock, or in stamps,
+    which are of the plant's: a message that had to be sent again comes late in the one, and a bag of two machines has
+    two clocks. A disturbance or a push alone excuses nothing.
 
     Args:
         path: The bag.
@@ -94,25 +97,25 @@ def _check_plant(bag: Bag, plant: str, limit: float, allowance: float) -> Torque
     if largest > limit:
         violations.append(f"torque reached {largest:.4g} N m; expected at most {limit:g} N m")
     period = float(np.median(np.diff(times))) * 1e-9 if len(times) > 1 else 0.0
-    command = _last_before(times, _log_times(bag, plant, names.EFFORT_COMMAND))
-    # A disturbance or a push is a command, too: each ends by itself after its life.
-    others = (names.DISTURBANCE, names.PUSH)
-    latest = np.maximum.reduce([command, *(_last_before(times, _log_times(bag, plant, name)) for name in others)])
     stamps = applied["stamp_ns"]
-    answered = np.maximum.reduce(
-        [_last_before(stamps, _stamps(bag, plant, name)) for name in (names.EFFORT_COMMAND, *others)]
-    )
+    logged, answers = _commands(bag, plant)
+    # What the plant's clock said when the command came.
+    then = np.maximum(_last_before(logged, times, stamps), stamps[0])
+    tolerance = round((COMMAND_LIFE + period + allowance) * NANOSECONDS)
+    believed = answers - then <= tolerance
+    command = _last_before(times, logged[believed & (then - answers <= tolerance)])
+    answered = _last_before(stamps, np.sort(answers[believed]))
     trajectory = _last_before(times, _log_times(bag, plant, names.JOINT_TRAJECTORY))
-    judged = (command > trajectory) & (command > 0)
+    judged = (_last_before(times, logged) > trajectory) & (len(logged) > 0)
     # From the state with this stamp on, a torque acts for a period.
-    age = np.minimum((times - latest) * 1e-9, (stamps - answered) * 1e-9 + period)
+    age = np.minimum((times - command) * 1e-9, (stamps - answered) * 1e-9 + period)
     driven = judged & (efforts != 0.0)
     longest = float(np.max(age[driven], initial=0.0))
     allowed = COMMAND_LIFE + period + allowance
     counts = bag.metadata.get("pendulum.recorder.counts", {})
 
     def counted(kind: str) -> int:
-        return sum(counts.get(f"{plant}/{name}", {}).get(kind, 0) for name in (names.EFFORT_COMMAND, *others))
+        return int(counts.get(f"{plant}/{names.EFFORT_COMMAND}", {}).get(kind, 0))
 
     missing = counted("lost")
     # A command that the recorder heard of too late explains the torque after one state.
@@ -128,21 +131,29 @@ def _log_times(bag: Bag, plant: str, topic: str) -> np.ndarray:
     return bag.log_times(name) if name in bag else np.empty(0, np.int64)
 
 
-def _stamps(bag: Bag, plant: str, topic: str) -> np.ndarray:
-    name = f"{plant}/{topic}"
-    if name not in bag:
-        return np.empty(0, np.int64)
+def _commands(bag: Bag, plant: str) -> tuple[np.ndarray, np.ndarray]:
+    """Return log times and stamps of the commands of the one who may command [ns]."""
+    name = f"{plant}/{names.EFFORT_COMMAND}"
+    found: dict[str, list[tuple[int, int]]] = {}
     # One by one: among the commands there may be the strange messages of a fault, which no plant acts on.
-    commands = [decode_joint_state(data) for _, data in bag.raw(name)]
-    return np.sort(np.array([fields.stamp_ns for fields in commands if fields is not None], np.int64))
+    for log_ns, data in bag.raw(name) if name in bag else ():
+        fields = decode_joint_state(data)
+        if fields is None or fields.joint not in {"", names.JOINT}:
+            continue
+        if fields.effort is not None and math.isfinite(fields.effort):
+            found.setdefault(fields.frame_id, []).append((log_ns, fields.stamp_ns))
+    own = f"{plant}/controller"
+    commander = own if own in found else next(iter(found), own)
+    rows = np.array(found.get(commander, []), np.int64).reshape(-1, 2)
+    return rows[:, 0], rows[:, 1]
 
 
-def _last_before(times: np.ndarray, events: np.ndarray) -> np.ndarray:
-    """Return for each time the last event at or before it [ns], 0 where there is none."""
+def _last_before(times: np.ndarray, events: np.ndarray, values: np.ndarray | None = None) -> np.ndarray:
+    """Return for each time the last event at or before it, or its value [ns]; 0 where there is none."""
     if len(events) == 0:
         return np.zeros(len(times), np.int64)
     place = np.searchsorted(events, times, side="right")
-    return np.where(place > 0, events[np.maximum(place - 1, 0)], 0)
+    return np.where(place > 0, (events if values is None else values)[np.maximum(place - 1, 0)], 0)
 
 
 @app.command(epilog="Example: python -m tests.faults.bag_property --limit 13 bags/examples/regulation_sim")
