@@ -11,6 +11,7 @@ import rclpy
 from rcl_interfaces.msg import Parameter, ParameterValue
 from rcl_interfaces.srv import SetParameters
 from rclpy.node import Node
+from rclpy.serialization import serialize_message
 from rclpy.signals import SignalHandlerOptions
 from sensor_msgs.msg import JointState
 from std_srvs.srv import Trigger
@@ -21,20 +22,21 @@ from pendulum_msgs_py.contract.cdr import encode_joint_state
 from pendulum_msgs_py.ros import qos
 from pendulum_msgs_py.ros.middleware import set_middleware_defaults
 
-_POINTS = 2000
-_BATCH = 50
-
 
 def _commands(node: Node, namespace: str, _: str) -> Callable[[], None]:
     publisher = node.create_publisher(JointState, f"{namespace}/{names.EFFORT_COMMAND}", qos.COMMAND)
     return lambda: publisher.publish(encode_joint_state(time.time_ns(), frame_id="/stranger", effort=100.0))
 
 
-def _trajectories(node: Node, namespace: str, _: str) -> Callable[[], None]:
-    publisher = node.create_publisher(JointTrajectory, f"{namespace}/{names.JOINT_TRAJECTORY}", qos.TRAJECTORY)
-    message = JointTrajectory(joint_names=[names.JOINT])
-    message.points = [JointTrajectoryPoint(positions=[0.0]) for _ in range(_POINTS)]
-    return lambda: publisher.publish(message)
+def _trajectories(points: int) -> Callable[[Node, str, str], Callable[[], None]]:
+    def make(node: Node, namespace: str, _: str) -> Callable[[], None]:
+        publisher = node.create_publisher(JointTrajectory, f"{namespace}/{names.JOINT_TRAJECTORY}", qos.TRAJECTORY)
+        message = JointTrajectory(joint_names=[names.JOINT])
+        message.points = [JointTrajectoryPoint(positions=[0.0]) for _ in range(points)]
+        data = serialize_message(message)
+        return lambda: publisher.publish(data)
+
+    return make
 
 
 def _parameters(node: Node, namespace: str, plant: str) -> Callable[[], None]:
@@ -51,7 +53,13 @@ def _calls(node: Node, namespace: str, plant: str) -> Callable[[], None]:
     return lambda: client.remove_pending_request(client.call_async(Trigger.Request()))
 
 
-_KINDS = {"commands": _commands, "trajectories": _trajectories, "parameters": _parameters, "calls": _calls}
+_KINDS: dict[str, Callable[[Node, str, str], Callable[[], None]]] = {
+    "commands": _commands,
+    "trajectories": _trajectories(2000),
+    "long_trajectories": _trajectories(200_000),
+    "parameters": _parameters,
+    "calls": _calls,
+}
 
 
 def main(namespace: str, plant: str, kind: str) -> int:
@@ -66,9 +74,8 @@ def main(namespace: str, plant: str, kind: str) -> int:
     sent, started = 0, time.monotonic()
     print("flooding", flush=True)
     while not stopped:
-        for _ in range(_BATCH):
-            send()
-        sent += _BATCH
+        send()
+        sent += 1
     print(f"sent {sent / (time.monotonic() - started):.0f} a second", flush=True)
     node.destroy_node()
     rclpy.try_shutdown()

@@ -10,10 +10,8 @@ from contextlib import AbstractContextManager, contextmanager
 
 from rclpy.client import Client
 from std_srvs.srv import SetBool, Trigger
-from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
 from pendulum_msgs_py.contract import names
-from pendulum_msgs_py.ros import qos
 from tests.faults.live import START_TIMEOUT, LiveSystem
 from tests.faults.outcome import Fault, Outcome, demand_rest
 
@@ -21,7 +19,6 @@ __all__ = ["LATEST_ANSWER", "PRESSES"]
 
 LATEST_ANSWER = 0.1
 """Time within which the e-stop must have answered, whatever else is being said to the plant [s]."""
-_POINTS = 200_000
 _PRESSES = 10
 
 Load = Callable[[LiveSystem, random.Random], AbstractContextManager[None]]
@@ -76,19 +73,6 @@ def _quiet(_system: LiveSystem, _generator: random.Random) -> Iterator[None]:
     yield
 
 
-@contextmanager
-def _long_trajectory(system: LiveSystem, _generator: random.Random) -> Iterator[None]:
-    """Send a trajectory of 200 000 points just before."""
-    topic = f"{system.plant.namespace}/{names.JOINT_TRAJECTORY}"
-    publisher = system.conductor.node.create_publisher(JointTrajectory, topic, qos.TRAJECTORY)
-    system.wait_for("the plant to hear the probe", lambda: publisher.get_subscription_count() > 0, START_TIMEOUT)
-    message = JointTrajectory(joint_names=[names.JOINT])
-    message.points = [JointTrajectoryPoint(positions=[0.0]) for _ in range(_POINTS)]
-    publisher.publish(message)
-    yield
-    system.conductor.node.destroy_publisher(publisher)
-
-
 def _flooded(kind: str) -> Load:
     """Let a process of its own send as fast as it can: the probe, which measures, has nothing to do with it."""
 
@@ -120,7 +104,7 @@ def _arming(system: LiveSystem, generator: random.Random) -> Iterator[None]:
 
 PRESSES: tuple[Fault, ...] = (
     Fault("e-stop", _press(_quiet)),
-    Fault("e-stop behind a trajectory of 200 000 points", _press(_long_trajectory)),
+    Fault("e-stop among trajectories of 200 000 points", _press(_flooded("long_trajectories"))),
     Fault("e-stop in a flood of commands", _press(_flooded("commands"))),
     Fault("e-stop in a flood of trajectories", _press(_flooded("trajectories"))),
     Fault("e-stop in a flood of parameters", _press(_flooded("parameters"))),
