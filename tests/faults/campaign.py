@@ -22,7 +22,7 @@ from tests.faults.doubles import DOUBLES
 from tests.faults.impostor import IMPOSTORS
 from tests.faults.live import MODULE, START_TIMEOUT, LiveSystem
 from tests.faults.outcome import MAX_LOSS, Fault, Outcome, demand_rest, demand_zero
-from tests.faults.plants import BRIDGE, SIMULATOR
+from tests.faults.plants import BRIDGE, PLANTS, SIMULATOR
 from tests.faults.presses import PRESSES
 
 __all__ = ["CAMPAIGN"]
@@ -248,10 +248,10 @@ def _strange_messages(generator: random.Random) -> Iterator[JointState]:
 
 
 CAMPAIGN: tuple[Fault, ...] = (
-    Fault("controller: SIGKILL", _lose_controller(signal.SIGKILL), short=True),
+    Fault("controller: SIGKILL", _lose_controller(signal.SIGKILL), short=PLANTS),
     Fault("controller: SIGTERM", _lose_controller(signal.SIGTERM)),
     Fault("controller: SIGINT", _lose_controller(signal.SIGINT)),
-    Fault("controller: SIGSTOP for 10 ms to 5 s", _freeze_controller, short=True),
+    Fault("controller: SIGSTOP for 10 ms to 5 s", _freeze_controller, short=(SIMULATOR,)),
     Fault("plant: SIGSTOP for 10 ms to 2 s", _freeze_plant("", 2.0)),
     Fault("plant: SIGKILL, started again", _restart_plant("", signal.SIGKILL)),
     Fault("plant: SIGINT, started again", _restart_plant("", signal.SIGINT)),
@@ -262,7 +262,7 @@ CAMPAIGN: tuple[Fault, ...] = (
     Fault("disturbance: SIGINT, started again", _restart("disturbance", signal.SIGINT)),
     Fault("disturbance: SIGTERM, started again", _restart("disturbance", signal.SIGTERM)),
     Fault("disturbance: SIGSTOP for 10 ms to 5 s", _freeze("disturbance", 5.0)),
-    Fault("recorder: SIGKILL, its bag read", _kill_recorder, short=True, plants=(SIMULATOR,)),
+    Fault("recorder: SIGKILL, its bag read", _kill_recorder, short=(SIMULATOR,), plants=(SIMULATOR,)),
     Fault("recorder: SIGINT, its bag read", _end_recorder(signal.SIGINT), plants=(SIMULATOR,)),
     Fault("recorder: SIGTERM, its bag read", _end_recorder(signal.SIGTERM), plants=(SIMULATOR,)),
     Fault("recorder: SIGSTOP for 10 ms to 3 s", _freeze("recorder", 3.0), plants=(SIMULATOR,)),
@@ -270,7 +270,7 @@ CAMPAIGN: tuple[Fault, ...] = (
     *IMPOSTORS,
     *PRESSES,
     *(
-        Fault(f"strange messages on {topic}", _malformed(topic), short=topic == "effort_command")
+        Fault(f"strange messages on {topic}", _malformed(topic), short=PLANTS if topic == "effort_command" else ())
         for topic in ("effort_command", "disturbance", "push")
     ),
     *(Fault(f"flood of a stranger on {topic}", _flood(topic)) for topic in ("effort_command", "disturbance")),

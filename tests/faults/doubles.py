@@ -64,7 +64,9 @@ def _twin_plant(name: str) -> Fault:
         return outcome
 
     kind = "one name" if name == "simulator" else "two names"
-    return Fault(f"two simulators under {kind}", act, short=name == "simulator", plants=(SIMULATOR,))
+    return Fault(
+        f"two simulators under {kind}", act, short=(SIMULATOR,) if name == "simulator" else (), plants=(SIMULATOR,)
+    )
 
 
 def _twin_controller(system: LiveSystem, _: random.Random) -> Outcome:
@@ -267,13 +269,13 @@ def _back_to_four(system: LiveSystem, _: random.Random) -> Outcome:
 DOUBLES: tuple[Fault, ...] = (
     _twin_plant("simulator"),
     _twin_plant("impostor"),
-    Fault("two controllers under one name", _twin_controller, short=True, own_torque=True),
-    Fault("two controllers under two names", _second_controller, short=True),
+    Fault("two controllers under one name", _twin_controller, short=(BRIDGE,), own_torque=True),
+    Fault("two controllers under two names", _second_controller, short=(SIMULATOR,)),
     Fault("two bridges on one module", _second_bridge, plants=(BRIDGE,)),
-    Fault("two recorders into two folders", _two_recorders, short=True, plants=(SIMULATOR,)),
+    Fault("two recorders into two folders", _two_recorders, short=(SIMULATOR,), plants=(SIMULATOR,)),
     Fault("two recorders into one folder", _two_recorders_in_one_folder, plants=(SIMULATOR,)),
     Fault("every node killed and started again, in any order", _restart_all),
-    Fault("five nodes started all at once, in any order", _random_orders, short=True, plants=(SIMULATOR,)),
+    Fault("five nodes started all at once, in any order", _random_orders, short=(SIMULATOR,), plants=(SIMULATOR,)),
     Fault("five nodes started one by one, in all 120 orders", _EveryOrder(), tries=len(ORDERS), plants=(SIMULATOR,)),
     Fault("viewer: SIGINT", _back_to_four, tries=1, plants=(SIMULATOR,)),
 )

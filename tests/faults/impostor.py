@@ -20,6 +20,7 @@ from pendulum_msgs_py.ros import qos
 from tests.faults.live import START_TIMEOUT, LiveSystem
 from tests.faults.motor import ROUNDING
 from tests.faults.outcome import Fault, Outcome, demand_rest
+from tests.faults.plants import SIMULATOR
 
 __all__ = ["IMPOSTORS"]
 
@@ -227,11 +228,13 @@ def _half_refused(
 
 IMPOSTORS: tuple[Fault, ...] = (
     Fault("controller answers 20 ms late", _a_little_late),
-    Fault("controller answers 80 ms late", _no_longer_valid(_late(0.08), "too_old"), short=True),
+    Fault("controller answers 80 ms late", _no_longer_valid(_late(0.08), "too_old"), short=(SIMULATOR,)),
     Fault("controller answers twice, differently", _half_refused(_send_twice, "duplicate", 0.2)),
     Fault("controller answers never", _no_longer_valid(_never, "")),
     Fault("controller answers with stamps of a minute ago", _no_longer_valid(_of_last_minute, "too_old")),
     Fault("controller answers with a stamp of zero", _no_longer_valid(_zero_stamp, "too_old")),
-    Fault("controller answers with stamps 1 s ahead", _no_longer_valid(_shifted(1000), "from_future"), short=True),
+    Fault(
+        "controller answers with stamps 1 s ahead", _no_longer_valid(_shifted(1000), "from_future"), short=(SIMULATOR,)
+    ),
     Fault("controller answers out of order", _half_refused(_send_backwards, "out_of_order", 0.1)),
 )

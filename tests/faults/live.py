@@ -20,6 +20,7 @@ from pendulum_bags.experiments.processes import Child, ProcessSet, ros_environme
 from pendulum_bags.runs.run_folder import write_json
 from pendulum_msgs_py.contract import names
 from pendulum_msgs_py.contract.cdr import decode_joint_state, encode_joint_state
+from pendulum_msgs_py.contract.values import NANOSECONDS
 from pendulum_msgs_py.errors import FaultError
 from pendulum_msgs_py.programs import graph
 from pendulum_msgs_py.programs.graph import NodeProgram
@@ -276,7 +277,10 @@ class LiveSystem:
     def beyond_asked(self, since_ns: int) -> Drive:
         """Return by how much the motor drove beyond what was rightfully asked for since an instant [ns, N m]."""
         drives = [one for one in self.drives() if one.time_ns >= since_ns]
-        commands, disturbances = (sorted(self.asked[topic]) for topic in (names.EFFORT_COMMAND, names.DISTURBANCE))
+        commands, disturbances = (
+            sorted(one for one in self.asked[topic] if one.stamp_ns > since_ns - NANOSECONDS)
+            for topic in (names.EFFORT_COMMAND, names.DISTURBANCE)
+        )
         return beyond_asked(drives, commands, disturbances, EFFORT_LIMIT)
 
     # --- what a person does ---------------------------------------------------------------------------------

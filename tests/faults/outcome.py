@@ -64,7 +64,7 @@ class Fault:
     Attributes:
         name: What is done, as the table says it.
         act: Does it and says what it saw.
-        short: Part of the short form.
+        short: On which plants it is part of the short form.
         tries: How often the long form tries it, whatever is asked for; 0 for as often as is asked for.
         plants: On which plants it is tried.
         own_torque: Somebody else than the running controller rightfully asks for torque meanwhile: the fault itself
@@ -73,7 +73,7 @@ class Fault:
 
     name: str
     act: Callable[[LiveSystem, random.Random], Outcome]
-    short: bool = False
+    short: tuple[Plant, ...] = ()
     tries: int = 0
     plants: tuple[Plant, ...] = PLANTS
     own_torque: bool = False

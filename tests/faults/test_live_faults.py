@@ -21,7 +21,7 @@ def system(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFact
         yield running
 
 
-_SHORT = [(plant, fault) for plant in PLANTS for fault in CAMPAIGN if fault.short and plant in fault.plants]
+_SHORT = [(plant, fault) for plant in PLANTS for fault in CAMPAIGN if plant in fault.short]
 
 
 @pytest.mark.timeout(150)
