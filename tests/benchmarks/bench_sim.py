@@ -11,13 +11,16 @@ import numpy as np
 
 from pendulum_msgs_py.contract import noise
 from pendulum_msgs_py.contract.angles import from_upright
+from pendulum_msgs_py.plants.mechanism_parameters import load_mechanism
 from pendulum_msgs_py.plants.plant_parameters import load_plant
+from pendulum_sim.mechanism_files import mechanism_mjcf
 from tests.benchmarks import Peer, Row, measured, peer
 
 __all__ = ["rows"]
 
 GAIN = (33.345265, 0.158993)
 PENDULUMS = 10_240
+_ACROBOT = "acrobot_frictionless"
 SECONDS = float(os.environ.get("PENDULUM_BENCH_SECONDS", "60"))
 """Length of the longest realtime run [s]."""
 
@@ -43,6 +46,9 @@ def _batch() -> Iterator[Row]:
     yield measured(what, speed, "steps/s", peer=numpy_peer, at_least_times_peer=4.0)
     for method in ("etd2", "etd4"):
         yield measured(f"batch, the same with {method}", _batch_speed(method), "steps/s", peer=numpy_peer)
+    acrobots = peer("mujoco.rollout", lambda: _mujoco_rollout(mechanism_mjcf(load_mechanism(_ACROBOT)), 2))
+    what = "batch, closed loop with noise, 10 240 acrobots, RK4 2 ms"
+    yield measured(what, _acrobot_speed(), "steps/s", peer=acrobots, at_least_times_peer=50.0)
 
 
 def _check_batch() -> None:
@@ -77,6 +83,27 @@ def _batch_speed(method: str) -> float:
     return _best(lambda: run(2000), work=2000 * PENDULUMS, warm_up=lambda: run(2))
 
 
+def _acrobot_speed() -> float:
+    from pendulum_sim.mechanism_batch import simulate_mechanisms
+    from pendulum_sim.mechanism_plant import MechanismPlant
+
+    plant, seeds = load_mechanism(_ACROBOT), np.arange(PENDULUMS)
+    gain = np.array([[-295.0, -124.0, -63.0, -28.5]])
+
+    def run(steps: int) -> np.ndarray:
+        return simulate_mechanisms(plant, steps=steps, gain=gain, seeds=seeds, amplitude=0.5).position
+
+    single = MechanismPlant(plant, 2e-3)
+    state = single.reset(plant.coordinates.goal)
+    for k in range(100):
+        x = np.array([*plant.coordinates.deviation(state.position), *state.velocity])
+        state = single.step((float((-gain @ x)[0]) + noise.uniform(PENDULUMS - 1, k, 0.5),))
+    worst = float(np.abs(run(100)[-1] - state.position).max())
+    if not worst < 1e-8:
+        raise AssertionError(f"batch and plant differ by {worst} rad; expected less than 1e-8")
+    return _best(lambda: run(500), work=500 * PENDULUMS)
+
+
 def _numpy_speed() -> float:
     generator = np.random.default_rng(0)
     x, v = np.full(PENDULUMS, math.pi), np.zeros(PENDULUMS)
@@ -92,18 +119,19 @@ def _numpy_speed() -> float:
     return _best(run, work=100 * PENDULUMS)
 
 
-def _mujoco_rollout() -> float:
+def _mujoco_rollout(file: str | None = None, joints: int = 1) -> float:
+    """Return the steps a second of MuJoCo's own batch; of the thesis's pendulum, or of another file."""
     import mujoco
     from mujoco import rollout
 
     from pendulum_sim.model_files import mjcf
 
-    model = mujoco.MjModel.from_xml_string(mjcf(load_plant("thesis")))
+    model = mujoco.MjModel.from_xml_string(file or mjcf(load_plant("thesis")))
     data = [mujoco.MjData(model) for _ in range(2)]
     count, steps = 1024, 200
     size = mujoco.mj_stateSize(model, mujoco.mjtState.mjSTATE_FULLPHYSICS)
     initial = np.zeros((count, size))
-    initial[:, 1] = 0.5
+    initial[:, 1 : 1 + joints] = 0.5
     control = np.random.default_rng(0).uniform(-2.5, 2.5, (count, steps, 1))
     return _best(lambda: rollout.rollout(model, data, initial, control), work=count * steps)
 

@@ -1,0 +1,238 @@
+"""Many plants of several joints at once: compiled, closed loop under linear state feedback and seeded noise.
+
+Each plant has its own parameters, gain, start, seed and noise amplitude; of driven joint a::
+
+    u_a = clamp(-K_a [q - goal (wrapped where it turns), v] + noise(seed, (k // hold) m + a), effort limit of a)
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from pendulum_msgs_py.contract.noise import stream_key
+from pendulum_msgs_py.dynamics.arithmetic import in_arithmetic
+from pendulum_msgs_py.errors import ParameterError
+from pendulum_msgs_py.plants.mechanism_parameters import MechanismParameters, actuator_specs, joint_specs
+from pendulum_sim.joint_steps import pack_joints
+from pendulum_sim.mechanism_plant import check_stable_step, common_delay, is_smooth_mechanism
+from pendulum_sim.plant import check_step
+
+__all__ = ["MechanismBatch", "simulate_mechanisms"]
+
+Array = NDArray[np.float64]
+_TABLE = ("coulomb_friction", "static_friction", "stribeck_velocity", "lower_stop", "upper_stop", "time_constant")
+
+
+@dataclass(frozen=True)
+class MechanismBatch:
+    """What came of a batch of B plants of n joints, m of them driven.
+
+    Attributes:
+        position: Final positions, shape (B, n), not wrapped [rad or m].
+        velocity: Final velocities, shape (B, n).
+        max_effort: Largest |K x| before noise and limit, shape (B, m) [N m or N].
+        max_deviation: Largest |q - goal|, wrapped where it turns, shape (B, n).
+        mean_deviation: Mean of q - goal over the steps, shape (B, n).
+        std_deviation: Its standard deviation, shape (B, n).
+        trajectories: Positions, velocities and applied efforts of all joints at the start of each step, shape
+            (steps, 3 n, B); None unless asked for.
+    """
+
+    position: Array
+    velocity: Array
+    max_effort: Array
+    max_deviation: Array
+    mean_deviation: Array
+    std_deviation: Array
+    trajectories: Array | None = None
+
+
+def simulate_mechanisms(
+    parameters: MechanismParameters,
+    *,
+    variations: Mapping[str, ArrayLike] | None = None,
+    steps: int,
+    dt: float = 2e-3,
+    substeps: int = 1,
+    position: ArrayLike | None = None,
+    velocity: ArrayLike = 0.0,
+    gain: ArrayLike | None = None,
+    goal: Sequence[float] | None = None,
+    seeds: ArrayLike = 0,
+    amplitude: ArrayLike = 0.0,
+    hold: int = 1,
+    record: bool = False,
+    threads: int | None = None,
+) -> MechanismBatch:
+    """Integrate a batch; its size B is that of the longest argument, and single values hold for all.
+
+    Args:
+        parameters: The plant.
+        variations: Values of its parameters, each scalar or (B,), by the names that its ``with_values`` takes.
+        steps: Steps to take, >= 1.
+        dt: Step, over which control and noise are held [s].
+        substeps: Integration steps in a step.
+        position: Initial positions, (n,) or (B, n); None for upright [rad or m].
+        velocity: Initial velocities, scalar, (n,) or (B, n).
+        gain: K, shape (m, 2n) or (B, m, 2n); None for an open loop.
+        goal: n positions to regulate to; None for upright.
+        seeds: Seeds of the noise, scalar or (B,), 0 to 2^64 - 1.
+        amplitude: Half width of the uniform noise on each driven joint, scalar, (m,) or (B, m) [N m or N].
+        hold: Steps for which a noise sample is held, >= 1.
+        record: Return the trajectories.
+        threads: Threads to use; None for numba's default.
+
+    Raises:
+        ParameterError: Shapes do not go together, or a value is outside its domain.
+    """
+    import numba
+
+    from pendulum_sim.mechanism_kernels import Layout, general_joints_kernel, smooth_joints_kernel
+
+    check_step(dt, substeps)
+    for name, value in (("steps", steps), ("hold", hold), *((("threads", threads),) if threads is not None else ())):
+        if isinstance(value, bool) or not isinstance(value, (int, np.integer)) or value < 1:
+            raise ParameterError(f"{name} is {value!r}; expected a whole number >= 1")
+    coordinates = parameters.coordinates
+    n, m = len(coordinates.joints), len(coordinates.driven)
+    aim = np.array(coordinates.goal if goal is None else goal, dtype=np.float64)
+    if aim.shape != (n,) or not np.isfinite(aim).all():
+        raise ParameterError(f"goal is {aim.tolist()}; expected {n} finite numbers")
+    seed_list = [_checked_seed(seed) for seed in np.atleast_1d(np.asarray(seeds, dtype=object))]
+    columns = {
+        "q": _table("position", aim if position is None else position, n),
+        "v": _table("velocity", np.full(n, velocity) if np.ndim(velocity) == 0 else velocity, n),
+        "gain": _table("gain", _flat_gain(gain, m, n), m * 2 * n),
+        "amplitude": _table("amplitude", np.full(m, amplitude) if np.ndim(amplitude) == 0 else amplitude, m),
+        "limit": np.array([parameters.effort_limits]),
+        "p": np.array([parameters.packed]),
+        "table": np.concatenate([np.array(row) for row in pack_joints(parameters)])[None, :],
+    }
+    if columns["amplitude"].size and columns["amplitude"].min() < 0.0:
+        raise ParameterError(f"amplitude has a value of {columns['amplitude'].min()}; expected >= 0")
+    varied = {name: _table(name, np.reshape(values, (-1, 1)), 1)[:, 0] for name, values in (variations or {}).items()}
+    lengths = {name: len(column) for name, column in {**columns, **varied}.items()} | {"seeds": len(seed_list)}
+    size = max(lengths.values())
+    for name, length in lengths.items():
+        if length not in {1, size}:
+            raise ParameterError(f"{name} has {length} entries; expected 1 or {size}")
+    wide = {name: np.repeat(column, size, axis=0) if len(column) == 1 else column for name, column in columns.items()}
+    wide = {name: np.array(column) for name, column in wide.items()}
+    for name, values in varied.items():
+        _vary(parameters, wide, name, values)
+    if varied:
+        _check_varied(parameters, wide)
+    check_stable_step(parameters, dt / substeps)
+
+    layout = Layout(parameters.mechanism.name, coordinates.driven)
+    starts = layout.starts
+    w = np.zeros((starts["end"], size))
+    for name, column in wide.items():
+        w[starts[name] : starts[name] + column.shape[1]] = column.T
+    keys = np.broadcast_to(np.array([stream_key(seed) for seed in seed_list], dtype=np.uint64), (size,)).copy()
+    recorded = np.empty((steps, 3 * n, size)) if record else np.empty((0, 3 * n, size))
+    smooth = is_smooth_mechanism(parameters) and not any(name.partition(".")[2] in _TABLE for name in varied)
+    before = numba.get_num_threads()
+    numba.set_num_threads(min(threads or before, numba.config.NUMBA_NUM_THREADS))
+    try:
+        if smooth:
+            smooth_joints_kernel(layout)(w, keys, aim, dt, steps, hold, substeps, recorded)
+        else:
+            more = np.array([float(substeps), common_delay(parameters)])
+            general_joints_kernel(layout)(w, keys, aim, dt, steps, hold, more, recorded)
+    finally:
+        numba.set_num_threads(before)
+
+    def rows(name: str, count: int) -> Array:
+        return w[starts[name] : starts[name] + count].T.copy()
+
+    mean = rows("sum", n) / steps
+    return MechanismBatch(
+        position=rows("q", n),
+        velocity=rows("v", n),
+        max_effort=rows("max_effort", m),
+        max_deviation=rows("max", n),
+        mean_deviation=mean,
+        std_deviation=np.sqrt(np.maximum(0.0, rows("square", n) / steps - mean**2)),
+        trajectories=recorded if record else None,
+    )
+
+
+def _flat_gain(gain: ArrayLike | None, m: int, n: int) -> Array:
+    if gain is None:
+        return np.zeros((1, m * 2 * n))
+    K = np.asarray(gain, dtype=np.float64)
+    if K.shape[-2:] != (m, 2 * n) or K.ndim not in {2, 3}:
+        raise ParameterError(f"gain has shape {K.shape}; expected ({m}, {2 * n}) or (B, {m}, {2 * n})")
+    return K.reshape(-1, m * 2 * n)
+
+
+def _table(name: str, values: ArrayLike, width: int) -> Array:
+    """Return values as rows of a given width, (1, width) or (B, width)."""
+    table = np.atleast_2d(np.asarray(values, dtype=np.float64))
+    if table.ndim != 2 or table.shape[1] != width:
+        raise ParameterError(f"{name} has shape {np.shape(values)}; expected ({width},) or (B, {width})")
+    if not np.isfinite(table).all():
+        raise ParameterError(f"{name} has a value that is not finite; expected numbers")
+    return table
+
+
+def _checked_seed(seed: object) -> int:
+    if isinstance(seed, bool) or not isinstance(seed, (int, np.integer)) or not 0 <= seed < 2**64:
+        raise ParameterError(f"seeds has {seed!r}; expected whole numbers from 0 to 2^64 - 1")
+    return int(seed)
+
+
+def _vary(parameters: MechanismParameters, wide: dict[str, Array], name: str, values: Array) -> None:
+    """Put values in the place of one parameter, by its name."""
+    # Both ends of the values are checked as a plant's own would be, and the name too.
+    for value in {float(values.min()), float(values.max())}:
+        _checked_value(parameters, name, value)
+    names = parameters.mechanism.parameter_names
+    joint, _, key = name.partition(".")
+    if name in names:
+        wide["p"][:, names.index(name)] = values
+        return
+    index = parameters.coordinates.names.index(joint)
+    if key == "effort_limit":
+        wide["limit"][:, parameters.coordinates.driven.index(index)] = values
+        return
+    if key == "transport_delay":
+        raise ParameterError(f"variation {name!r} is one delay for all; expected it in the plant, or a batch for each")
+    n = len(parameters.joints)
+    wide["table"][:, _TABLE.index(key) * n + index] = values
+    if key == "coulomb_friction" and parameters.joints[index].static_friction is None:
+        wide["table"][:, _TABLE.index("static_friction") * n + index] = values
+
+
+def _checked_value(parameters: MechanismParameters, name: str, value: float) -> None:
+    specs = {spec.name: spec for spec in parameters.mechanism.parameters}
+    for each, own in zip(parameters.mechanism.joints, parameters.joints, strict=True):
+        mine = joint_specs(each) + (actuator_specs(each) if own.actuator is not None else ())
+        specs |= {f"{each.name}.{spec.name}": spec for spec in mine}
+    if name not in specs:
+        raise ParameterError(f"variation {name!r} is unknown; expected one of {', '.join(specs)}")
+    specs[name].check(value, where="variations")
+
+
+def _check_varied(parameters: MechanismParameters, wide: Mapping[str, Array]) -> None:
+    n = len(parameters.joints)
+    coulomb, static = wide["table"][:, :n], wide["table"][:, n : 2 * n]
+    if (static < coulomb).any():
+        row, joint = (int(value[0]) for value in np.nonzero(static < coulomb))
+        raise ParameterError(
+            f"static_friction of {parameters.coordinates.names[joint]} of plant {row} is {static[row, joint]}; "
+            f"expected >= coulomb_friction = {coulomb[row, joint]}"
+        )
+    mass = in_arithmetic(parameters.mechanism.mass, np)
+    p = tuple(wide["p"].T)
+    for angle in np.linspace(0.0, 2.0 * math.pi, 16, endpoint=False):
+        entries = [np.broadcast_to(value, (len(wide["p"]),)) for row in mass((float(angle),) * n, p) for value in row]
+        lowest = np.linalg.eigvalsh(np.array(entries).T.reshape(-1, n, n))[:, 0]
+        if (worst := int(np.argmin(lowest))) >= 0 and not lowest[worst] > 0.0:
+            raise ParameterError(f"the masses and inertias of plant {worst} of the batch give no positive inertia")
