@@ -1,0 +1,413 @@
+"""Gymnasium environments of plants of several joints: ``PendulumAcrobot-v0`` and its sisters, single and vector.
+
+Observation: x = [deviation of each joint from upright, velocity of each], what turns wrapped: 0 is upright.
+Action: one effort per driven joint [N m or N], clamped to its limit.
+Reward: -(x' Q x + u' R u) dt at the state in which the action was chosen, with the mechanism's weights.
+Episodes never terminate; they are truncated after 10 s by default, whatever the step.
+
+Importing this module registers them, and so does ``gymnasium.make("pendulum_sim.mechanism_environment:ID")``.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Any, ClassVar
+
+import gymnasium
+import numpy as np
+from gymnasium import spaces
+from gymnasium.vector import AutoresetMode, VectorEnv
+from gymnasium.vector.utils import batch_space
+from numpy.typing import NDArray
+
+from pendulum_msgs_py.contract import noise
+from pendulum_msgs_py.dynamics.arithmetic import in_arithmetic
+from pendulum_msgs_py.errors import ParameterError
+from pendulum_msgs_py.plants.mechanism_parameters import MechanismParameters, load_mechanism
+from pendulum_sim.joint_steps import joint_functions, rk4_joints
+from pendulum_sim.mechanism_plant import MechanismPlant, check_stable_step, is_smooth_mechanism
+from pendulum_sim.plant import check_step
+
+__all__ = ["IDS", "MechanismEnv", "MechanismVectorEnv", "register"]
+
+IDS = {
+    "PendulumCartPole-v0": "cart_pole",
+    "PendulumAcrobot-v0": "acrobot",
+    "PendulumPendubot-v0": "pendubot",
+    "PendulumDouble-v0": "double_pendulum",
+    "PendulumFuruta-v0": "furuta",
+}
+"""Environments and the presets that they run where none is given."""
+EPISODE_TIME = 10.0
+STARTS = ("bottom", "top", "random")
+Array = NDArray[np.float64]
+
+
+class _Task:
+    """What a single environment and a vector of them share: plant, spaces, reward, starts and noise."""
+
+    def __init__(
+        self,
+        plant: str | MechanismParameters,
+        dt: float,
+        start: str,
+        disturbance: float,
+        q: Sequence[float] | None,
+        r: float | None,
+        episode_time: float,
+    ) -> None:
+        parameters = plant if isinstance(plant, MechanismParameters) else load_mechanism(plant)
+        check_step(dt, 1)
+        check_stable_step(parameters, dt)
+        if not parameters.coordinates.driven:
+            raise ParameterError(f"plant {parameters.name!r} has no driven joint; expected an actuator at one of them")
+        if start not in STARTS:
+            raise ParameterError(f"start is {start!r}; expected one of {', '.join(STARTS)}")
+        if not (math.isfinite(disturbance) and disturbance >= 0.0):
+            raise ParameterError(f"disturbance is {disturbance}; expected a finite number >= 0")
+        if not episode_time > 0.0:
+            raise ParameterError(f"episode_time is {episode_time} s; expected > 0")
+        n = len(parameters.joints)
+        weights, cost = parameters.mechanism.weights
+        self.q = np.asarray(weights if q is None else q, dtype=np.float64)
+        if self.q.shape != (2 * n,) or not np.isfinite(self.q).all():
+            raise ParameterError(f"q is {q}; expected {2 * n} finite numbers, of each joint and of each velocity")
+        self.r = float(cost if r is None else r)
+        if not math.isfinite(self.r):
+            raise ParameterError(f"r is {r}; expected a finite number")
+        self.parameters, self.dt, self.start, self.disturbance = parameters, dt, start, disturbance
+        self.joints = n
+        self.last = math.inf if math.isinf(episode_time) else max(1, math.ceil(episode_time / dt - 1e-9))
+        self.limits = np.array(parameters.effort_limits)
+        self.goal = np.array(parameters.coordinates.goal)
+        self.turns = np.array([joint.turns for joint in parameters.mechanism.joints])
+        high = np.full(2 * n, np.inf)
+        high[:n][self.turns] = np.pi
+        self.observation_space = spaces.Box(-high, high, dtype=np.float64)
+        limits = self.limits.astype(np.float32)
+        self.action_space = spaces.Box(-limits, limits, dtype=np.float32)
+
+    def observe(self, position: Array, velocity: Array) -> Array:
+        """Return x of shape (..., 2n)."""
+        deviation = position - self.goal
+        wrapped = np.where(self.turns, (deviation + np.pi) % (2.0 * np.pi) - np.pi, deviation)
+        return np.concatenate([wrapped, velocity], axis=-1)
+
+    def reward(self, x: Array, effort: Array) -> Array:
+        """Return the rewards of states (..., 2n) and efforts (..., m)."""
+        cost: Array = (x * x) @ self.q + self.r * (effort * effort).sum(axis=-1)
+        return -self.dt * cost
+
+    def draw(self, start: object, generator: np.random.Generator) -> tuple[Array, Array]:
+        """Return positions and velocities of a start: hanging, upright, or anywhere with up to 1 rad/s or m/s."""
+        if start not in STARTS:
+            raise ParameterError(f"start is {start!r}; expected one of {', '.join(STARTS)}")
+        position, velocity = (self.goal.copy() if start == "top" else np.zeros(self.joints)), np.zeros(self.joints)
+        if start == "random":
+            position = generator.uniform(-math.pi, math.pi, self.joints)
+            for i, own in enumerate(self.parameters.joints):
+                if not self.turns[i]:
+                    low, high = own.lower_stop, own.upper_stop
+                    bounds = (-1.0 if low is None else 0.9 * low, 1.0 if high is None else 0.9 * high)
+                    position[i] = bounds[0] + (bounds[1] - bounds[0]) * (position[i] / (2.0 * math.pi) + 0.5)
+            velocity = generator.uniform(-1.0, 1.0, self.joints)
+        return position, velocity
+
+    def given(self, state: object) -> tuple[Array, Array]:
+        """Return positions and velocities of a state in the observation's convention."""
+        x = np.asarray(state, dtype=np.float64)
+        if x.shape != (2 * self.joints,) or not np.isfinite(x).all():
+            raise ParameterError(f"start state has shape {x.shape}; expected {2 * self.joints} finite numbers")
+        return x[: self.joints] + self.goal, x[self.joints :]
+
+    def efforts(self, actions: Array) -> Array:
+        """Return clamped actions (..., m)."""
+        if not np.isfinite(actions).all():
+            raise ParameterError(f"action is {np.asarray(actions).tolist()}; expected finite numbers")
+        return np.clip(np.asarray(actions, dtype=np.float64), -self.limits, self.limits)
+
+    def noise(self, key: int, count: int) -> list[float]:
+        """Return the disturbance of each driven joint in a step, as a batch of plants draws it."""
+        m = len(self.limits)
+        return [self.disturbance * noise.unit_interval(noise.scramble(key, count * m + i)) for i in range(m)]
+
+
+def _checked_options(options: dict[str, Any] | None) -> dict[str, Any]:
+    known = options or {}
+    unknown = set(known) - {"state", "start"}
+    if unknown:
+        raise ParameterError(f"reset option {min(unknown)!r} is unknown; expected state or start")
+    return known
+
+
+class MechanismEnv(gymnasium.Env[Array, Array]):
+    """One plant of several joints.
+
+    Args:
+        plant: Preset, path of a plant file, or parameters.
+        dt: Step over which an action is held [s].
+        substeps: Integration steps in a step.
+        start: ``bottom``, ``top`` or ``random``; ``reset(options={"state": x})`` overrides it.
+        disturbance: Half width of uniform noise on each driven joint [N m or N].
+        q: Weights of each deviation and velocity in the reward; None for the mechanism's.
+        r: Weight of the efforts; None for the mechanism's.
+        render_mode: None or ``rgb_array``.
+        screen_size: Width and height of the picture [px].
+        episode_time: Time after which an episode is truncated, inf for never [s].
+
+    Raises:
+        ParameterError: An argument is outside its domain.
+    """
+
+    metadata: dict[str, Any] = {"render_modes": ["rgb_array"], "render_fps": 500}  # noqa: RUF012  # gymnasium's
+
+    def __init__(
+        self,
+        plant: str | MechanismParameters = "acrobot",
+        *,
+        dt: float = 2e-3,
+        substeps: int = 1,
+        start: str = "bottom",
+        disturbance: float = 0.0,
+        q: Sequence[float] | None = None,
+        r: float | None = None,
+        render_mode: str | None = None,
+        screen_size: tuple[int, int] = (600, 600),
+        episode_time: float = EPISODE_TIME,
+    ) -> None:
+        if render_mode not in {None, "rgb_array"}:
+            raise ParameterError(f"render_mode is {render_mode!r}; expected None or rgb_array")
+        self._task = _Task(plant, dt, start, disturbance, q, r, episode_time)
+        self.parameters = self._task.parameters
+        self._plant = MechanismPlant(self.parameters, dt, substeps=substeps)
+        self.metadata = {**self.metadata, "render_fps": max(1, round(1.0 / dt))}
+        self.render_mode = render_mode
+        self.observation_space = self._task.observation_space
+        self.action_space = self._task.action_space
+        self._screen_size = screen_size
+        self._picture: Any = None
+        self._key = 0
+        self._steps = 0
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Array, dict[str, Any]]:
+        """Start an episode.
+
+        Args:
+            seed: Seed of starts and noise.
+            options: ``state``: the start x in the observation's convention; ``start``: one of ``STARTS``.
+
+        Returns:
+            Observation, shape (2n,), and an empty dict.
+        """
+        super().reset(seed=seed)
+        known = _checked_options(options)
+        if known.get("state") is not None:
+            position, velocity = self._task.given(known["state"])
+        else:
+            position, velocity = self._task.draw(known.get("start", self._task.start), self.np_random)
+        self._key = noise.stream_key(int(self.np_random.integers(2**63)))
+        self._steps = 0
+        self._plant.reset(tuple(position.tolist()), tuple(velocity.tolist()))
+        return self._observe(), {}
+
+    def step(self, action: Array) -> tuple[Array, float, bool, bool, dict[str, Any]]:
+        """Hold efforts for one step.
+
+        Args:
+            action: u, shape (m,) [N m or N].
+
+        Returns:
+            Observation (2n,), reward, terminated (never), truncated (when its time is over), and an empty dict.
+        """
+        action = np.asarray(action)
+        if action.shape != self._task.limits.shape:
+            raise ParameterError(f"action has shape {action.shape}; expected {self._task.limits.shape}")
+        effort = self._task.efforts(action)
+        reward = float(self._task.reward(self._observe(), effort))
+        disturbed = effort
+        if self._task.disturbance > 0.0:
+            disturbed = effort + self._task.noise(self._key, self._steps)
+        self._plant.step(tuple(disturbed.tolist()))
+        self._steps += 1
+        return self._observe(), reward, False, self._steps >= self._task.last, {}
+
+    def render(self) -> NDArray[np.uint8] | None:
+        """Draw the present state as an array of shape (height, width, 3)."""
+        if self.render_mode is None:
+            gymnasium.logger.warn("render() was called, but render_mode is None; expected rgb_array")
+            return None
+        # Imported late: training runs without pictures.
+        from pendulum_sim.mechanism_drawing import MechanismPicture
+
+        if self._picture is None:
+            self._picture = MechanismPicture(self.parameters, self._screen_size)
+        state = self._plant.state
+        self._picture.draw(state.position, time=state.time)
+        picture: NDArray[np.uint8] = self._picture.array()
+        return picture
+
+    def _observe(self) -> Array:
+        state = self._plant.state
+        return self._task.observe(np.array(state.position), np.array(state.velocity))
+
+
+class MechanismVectorEnv(VectorEnv[Array, Array, NDArray[Any]]):
+    """Many equal plants of several joints; those without friction, stops, lag and delay all in one step of arrays.
+
+    Plant i, reset with a list of seeds, starts and is disturbed as a single environment reset with seed i.
+
+    Args:
+        num_envs: Plants, >= 1.
+        max_episode_steps: Steps after which an episode is truncated; it restarts with the step after that. None for
+            ``episode_time``.
+        plant: As for :class:`MechanismEnv`.
+        dt: As for :class:`MechanismEnv`.
+        start: As for :class:`MechanismEnv`.
+        disturbance: As for :class:`MechanismEnv`.
+        q: As for :class:`MechanismEnv`.
+        r: As for :class:`MechanismEnv`.
+        episode_time: As for :class:`MechanismEnv`.
+
+    Raises:
+        ParameterError: An argument is outside its domain.
+    """
+
+    metadata: ClassVar[dict[str, Any]] = {"autoreset_mode": AutoresetMode.NEXT_STEP, "render_modes": []}
+
+    def __init__(
+        self,
+        num_envs: int = 1,
+        *,
+        max_episode_steps: int | None = None,
+        plant: str | MechanismParameters = "acrobot",
+        dt: float = 2e-3,
+        start: str = "bottom",
+        disturbance: float = 0.0,
+        q: Sequence[float] | None = None,
+        r: float | None = None,
+        render_mode: str | None = None,
+        episode_time: float = EPISODE_TIME,
+    ) -> None:
+        self._task = task = _Task(plant, dt, start, disturbance, q, r, episode_time)
+        self._last = task.last if max_episode_steps is None else max_episode_steps
+        if num_envs < 1 or self._last < 1:
+            raise ParameterError(
+                f"num_envs is {num_envs} and max_episode_steps {max_episode_steps}; expected both >= 1"
+            )
+        if render_mode is not None:
+            raise ParameterError(f"render_mode is {render_mode!r}; expected None: draw one MechanismEnv instead")
+        self.num_envs = num_envs
+        self.parameters = task.parameters
+        self.single_observation_space = task.observation_space
+        self.single_action_space = task.action_space
+        self.observation_space = batch_space(self.single_observation_space, num_envs)
+        self.action_space = batch_space(self.single_action_space, num_envs)
+        smooth = is_smooth_mechanism(task.parameters)
+        self._plants = [] if smooth else [MechanismPlant(task.parameters, dt) for _ in range(num_envs)]
+        self._forward = in_arithmetic(task.parameters.mechanism.forward, np)
+        self._along = joint_functions(task.joints)[0]
+        self._position = np.zeros((num_envs, task.joints))
+        self._velocity = np.zeros((num_envs, task.joints))
+        self._keys = [0] * num_envs
+        self._counts = np.zeros(num_envs, dtype=np.int64)
+        self._done = np.zeros(num_envs, dtype=np.bool_)
+        self._generators: list[np.random.Generator] | None = None
+
+    def reset(
+        self, *, seed: int | list[int | None] | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Array, dict[str, Any]]:
+        """Start all episodes.
+
+        Args:
+            seed: One seed for all, whose plants then share a generator, or one for each.
+            options: ``start``: one of ``STARTS``; ``state``: the start x of all.
+
+        Returns:
+            Observations, shape (N, 2n), and an empty dict.
+        """
+        known = _checked_options(options)
+        if isinstance(seed, (list, tuple, np.ndarray)):
+            if len(seed) != self.num_envs:
+                raise ParameterError(f"seed has {len(seed)} entries; expected one for each of {self.num_envs} plants")
+            self._generators = [np.random.Generator(np.random.PCG64(each)) for each in seed]
+        elif seed is not None:
+            super().reset(seed=seed)
+            self._generators = None
+        for index in range(self.num_envs):
+            self._restart(index, known)
+        self._done[:] = False
+        return self._observe(), {}
+
+    def step(self, actions: Array) -> tuple[Array, NDArray[Any], NDArray[Any], NDArray[Any], dict[str, Any]]:
+        """Hold efforts for one step.
+
+        Args:
+            actions: Shape (N, m) [N m or N].
+
+        Returns:
+            Observations (N, 2n), rewards (N,), terminated (N,), truncated (N,), and an empty dict.
+        """
+        task = self._task
+        if np.shape(actions) != (self.num_envs, len(task.limits)):
+            raise ParameterError(
+                f"actions have shape {np.shape(actions)}; expected ({self.num_envs}, {len(task.limits)})"
+            )
+        effort = task.efforts(actions)
+        reward = task.reward(self._observe(), effort)
+        if task.disturbance > 0.0:
+            effort = effort + [task.noise(*each) for each in zip(self._keys, self._counts.tolist(), strict=True)]
+        if self._plants:
+            for index, plant in enumerate(self._plants):
+                state = plant.step(tuple(effort[index].tolist()))
+                self._position[index], self._velocity[index] = state.position, state.velocity
+        else:
+            self._advance(np.clip(effort, -task.limits, task.limits))
+        self._counts += 1
+        # By gymnasium's rule for NEXT_STEP this step starts the next episodes of those that ended; its action counts
+        # for nothing.
+        for index in np.flatnonzero(self._done):
+            self._restart(int(index), {})
+            reward[index] = 0.0
+        truncated = self._counts >= self._last
+        self._done = truncated
+        return self._observe(), reward, np.zeros(self.num_envs, dtype=np.bool_), truncated.copy(), {}
+
+    def _advance(self, effort: Array) -> None:
+        torque = np.zeros_like(self._position)
+        torque[:, list(self._task.parameters.coordinates.driven)] = effort
+        q, v, tau = (tuple(each.T) for each in (self._position, self._velocity, torque))
+        p = self._task.parameters.packed
+        q, v = rk4_joints(self._forward, self._along, q, v, tau, tau, tau, self._task.dt, p)
+        self._position, self._velocity = np.stack(q, axis=1), np.stack(v, axis=1)
+
+    def _restart(self, index: int, options: dict[str, Any]) -> None:
+        task = self._task
+        generator = self.np_random if self._generators is None else self._generators[index]
+        if options.get("state") is not None:
+            position, velocity = task.given(options["state"])
+        else:
+            position, velocity = task.draw(options.get("start", task.start), generator)
+        self._keys[index] = noise.stream_key(int(generator.integers(2**63)))
+        self._counts[index] = 0
+        self._position[index], self._velocity[index] = position, velocity
+        if self._plants:
+            self._plants[index].reset(tuple(position.tolist()), tuple(velocity.tolist()))
+
+    def _observe(self) -> Array:
+        return self._task.observe(self._position, self._velocity)
+
+
+def register() -> None:
+    """Register the environments with gymnasium; done on import, and harmless twice."""
+    for name, plant in IDS.items():
+        if name not in gymnasium.registry:
+            gymnasium.register(
+                name,
+                entry_point="pendulum_sim.mechanism_environment:MechanismEnv",
+                vector_entry_point="pendulum_sim.mechanism_environment:MechanismVectorEnv",
+                kwargs={"plant": plant},
+            )
+
+
+register()
