@@ -60,7 +60,7 @@ show that the bridge was armed, that it gave this reason, and that no torque act
 the emulator and nothing else. One terminal each:
 
     python -m pendulum_hw_bridge emulator
-    python -m pendulum_hw_bridge bridge --ros-args -r __ns:=/hw -p backend:=emulator_process
+    python -m pendulum_hw_bridge bridge --ros-args -r __ns:=/hw -p backend:=emulator_process -p feedback_watchdog:=20
     python -m pendulum_bags record -o {course}/broken /hw/joint_states /hw/applied_effort /hw/events
     python -m pendulum_bags move upright --namespace /hw
     python -m pendulum_hw_bridge emulator_fault NAME

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import ctypes
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -29,6 +30,21 @@ _PATIENCE = 8.0
 """Time that a child has to end after SIGINT before it is killed [s]."""
 
 
+_PREFIX = re.compile(r"^(?:\[[A-Z]+\] \[[\d.]+\] \[[^\]]+\]: |error: )")
+"""What rclpy's log, or the end of a program, puts before a sentence."""
+
+
+def _busy_note() -> str:
+    """Return a remark for messages where other programs may be the cause, else nothing."""
+    load, cores = os.getloadavg()[0], os.cpu_count() or 1
+    if load <= 2.0 * cores:
+        return ""
+    return (
+        f". This computer is busy (load {load:.0f} on {cores} cores), and that alone can cause this: "
+        "end other programs, then run it again"
+    )
+
+
 @dataclass
 class Child:
     """One running program."""
@@ -40,9 +56,14 @@ class Child:
     ends_by_itself: bool = False
 
     def last_words(self, lines: int = 3) -> str:
-        """Return the end of its output, for messages."""
+        """Return the end of its output, for messages; what a node logs and then ends with is told once."""
         with contextlib.suppress(OSError):
-            text = [line for line in self.log.read_text(errors="replace").splitlines() if line.strip()]
+            text: list[str] = []
+            for line in self.log.read_text(errors="replace").splitlines():
+                if text and _PREFIX.sub("", line) == _PREFIX.sub("", text[-1]):
+                    text[-1] = line
+                elif line.strip():
+                    text.append(line)
             return " / ".join(text[-lines:])
         return ""
 
@@ -135,7 +156,7 @@ class ProcessSet:
             code = child.process.poll()
             if code is not None and not (child.ends_by_itself and code == 0):
                 ending = f"was ended by {signal.Signals(-code).name}" if code < 0 else f"ended with code {code}"
-                raise FaultError(f"{child.name} {ending}; its last words: {child.last_words() or 'none'}")
+                raise FaultError(f"{child.name} {ending}; its last words: {child.last_words() or 'none'}{_busy_note()}")
 
     def finish(self, child: Child, patience: float = _PATIENCE) -> int:
         """End one program by SIGINT, then by SIGKILL; return its exit code."""

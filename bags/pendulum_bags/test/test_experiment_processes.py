@@ -1,0 +1,41 @@
+"""What an experiment says of a program that ended under it."""
+
+from __future__ import annotations
+
+import os
+import sys
+from pathlib import Path
+
+import pytest
+
+from pendulum_bags.experiments.processes import ProcessSet
+from pendulum_msgs_py.errors import FaultError
+
+_LOGS_AND_ENDS = """
+import sys
+print("[ERROR] [1795326665.885562565] [hw.bridge]: actuator thread did not answer within 30 s")
+print("error: actuator thread did not answer within 30 s")
+sys.exit(2)
+"""
+
+
+def _message(folder: Path) -> str:
+    with ProcessSet(folder, {}) as processes:
+        child = processes.start("hw_bridge", [sys.executable, "-c", _LOGS_AND_ENDS])
+        child.process.wait(20)
+        with pytest.raises(FaultError) as caught:
+            processes.check()
+    return str(caught.value)
+
+
+def test_what_a_node_logs_and_then_ends_with_is_told_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(os, "getloadavg", lambda: (0.1, 0.1, 0.1))
+    assert _message(tmp_path) == (
+        "hw_bridge ended with code 2; its last words: error: actuator thread did not answer within 30 s"
+    )
+
+
+def test_a_busy_computer_is_named_where_a_program_ended(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(os, "getloadavg", lambda: (23.4, 1.0, 1.0))
+    monkeypatch.setattr(os, "cpu_count", lambda: 2)
+    assert "This computer is busy (load 23 on 2 cores)" in _message(tmp_path)
