@@ -42,7 +42,7 @@ TERMS: Mapping[str, Term] = {
     ),
     "interval": Term(
         "90 % interval, 95 % interval",
-        r"9\d % interval|intervals?|95 % from",
+        r"9\d % interval|intervals?(?! at the recorder)|95 % from",
         "Procedures that make such intervals cover the true value in 90 (or 95) of 100 repetitions.",
     ),
     "bootstrap": Term(
