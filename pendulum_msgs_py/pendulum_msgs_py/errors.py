@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-__all__ = ["BagError", "DataError", "FaultError", "ParameterError", "PendulumError"]
+__all__ = ["BagError", "DataError", "FaultError", "ParameterError", "PendulumError", "PlantStoppedError"]
 
 
 class PendulumError(Exception):
@@ -23,3 +23,19 @@ class BagError(PendulumError, OSError):
 
 class FaultError(PendulumError, RuntimeError):
     """A plant, a node or a process is in a state in which it cannot do what was asked."""
+
+
+class PlantStoppedError(FaultError):
+    """A plant gave up torque by itself: a fault, an e-stop, or no command for long.
+
+    Args:
+        namespace: Of the plant.
+        mode: In which it is: ``fault``, ``e_stop`` or ``disarmed``.
+        reason: Why, in its own words; a fault of the bridge begins with its name.
+    """
+
+    def __init__(self, namespace: str, mode: str, reason: str) -> None:
+        super().__init__(f"{namespace} went to {mode}: {reason}")
+        self.namespace = namespace
+        self.mode = mode
+        self.reason = reason

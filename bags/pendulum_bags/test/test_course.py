@@ -11,11 +11,11 @@ from pathlib import Path
 
 import pytest
 
-from pendulum_bags.course import checks
+from pendulum_bags.course import checks, winner
 from pendulum_bags.course.course_cli import main
 from pendulum_bags.course.exercises import answers
 from pendulum_bags.course.tasks import FAULTS, draw_plant, draw_tasks, read_tasks, write_tasks
-from pendulum_msgs_py.errors import ParameterError
+from pendulum_msgs_py.errors import FaultError, ParameterError, PlantStoppedError
 from pendulum_msgs_py.plants.plant_parameters import load_plant, write_plant
 from pendulum_msgs_py.plants.sealed_plant import load_plant_to_run, seal_plant
 from tests.synthetic_runs import write_events_and_torque
@@ -213,3 +213,26 @@ def test_a_recording_that_was_thinned_out_proves_nothing(
     bag = write_events_and_torque(tmp_path / "bag", "/hw", events, lambda t: 0.0, 2.0, leave_out=leave_out)
     found = checks.check_fault(tasks, bag)
     assert (found.right, reason in found.reason) == (False, True), found
+
+
+@pytest.mark.parametrize(
+    ("error", "answered"),
+    [
+        (PlantStoppedError("/hw", "fault", "position_limit: 400 deg"), True),
+        (PlantStoppedError("/hw", "e_stop", "somebody's hand, in fear of a fault: none was there"), False),
+        (FaultError("bridge ended with code 1; its last words: fault: no emulator"), False),
+    ],
+)
+def test_a_controller_loses_by_a_fault_of_the_bridge_and_by_no_other_stop(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, error: FaultError, answered: bool
+) -> None:
+    def record_run(*_: object) -> Path:
+        raise error
+
+    monkeypatch.setattr(winner, "record_run", record_run)
+    if answered:
+        assert winner.spread_on_machine(tmp_path / "a", 0.1, 1) == math.inf
+    else:
+        with pytest.raises(FaultError) as caught:
+            winner.spread_on_machine(tmp_path / "a", 0.1, 1)
+        assert caught.value is error

@@ -8,14 +8,13 @@ from pathlib import Path
 import pytest
 
 from pendulum_bags.comparison import compare_folders
-from pendulum_bags.experiments.conductor_node import PlantStoppedError
 from pendulum_bags.experiments.experiment_cli import _print_summary, _summary
 from pendulum_bags.experiments.settings import RegulationSettings
 from pendulum_bags.experiments.stalls import ATTEMPTS, is_stall, run_undisturbed
 from pendulum_bags.report import write_report
 from pendulum_bags.runs.run_folder import create_run_folder, discard_if_empty, read_stalls
 from pendulum_bags.verdict.answer import answer_of
-from pendulum_msgs_py.errors import FaultError
+from pendulum_msgs_py.errors import FaultError, PlantStoppedError
 from pendulum_msgs_py.programs.terminal import make_console
 from tests.synthetic_runs import write_run_folder
 

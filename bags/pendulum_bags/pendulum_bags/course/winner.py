@@ -11,11 +11,10 @@ from pendulum_bags.course.tasks import Tasks
 from pendulum_bags.experiments.lockstep import record_run
 from pendulum_bags.experiments.run_spec import RunSpec
 from pendulum_bags.runs.run_data import read_run
-from pendulum_msgs_py.errors import FaultError, ParameterError
+from pendulum_msgs_py.errors import ParameterError, PlantStoppedError
 
 __all__ = ["check_winner", "spread_on_machine"]
 
-_FAULTED = " fault: "
 DURATION = 5.0
 """Length of each run [s]."""
 
@@ -68,9 +67,9 @@ def spread_on_machine(bag: Path, r: float, seed: int) -> float:
     )
     try:
         recorded = record_run(bag, spec)
-    except FaultError as error:
-        # The bridge's own fault is an answer; that a program did not start is none.
-        if _FAULTED in str(error):
+    except PlantStoppedError as error:
+        # The bridge's own fault is an answer; that somebody stopped it, or a program did not start, is none.
+        if error.mode == "fault":
             return math.inf
         raise
     return float(read_run(recorded).window.position.std(ddof=1))

@@ -28,32 +28,16 @@ from pendulum_msgs_py.contract.drive import Mode
 from pendulum_msgs_py.contract.names import Event
 from pendulum_msgs_py.contract.trajectory import Trajectory
 from pendulum_msgs_py.contract.values import JointSample
-from pendulum_msgs_py.errors import FaultError
+from pendulum_msgs_py.errors import FaultError, PlantStoppedError
 from pendulum_msgs_py.ros import qos
 from pendulum_msgs_py.ros.convert import event_message, sample_from_bytes, trajectory_to_message
 from pendulum_msgs_py.ros.middleware import check_closed, set_middleware_defaults
 
-__all__ = ["Conductor", "PlantClient", "PlantStoppedError", "RecorderClient"]
+__all__ = ["Conductor", "PlantClient", "RecorderClient"]
 
 _SLICE = 0.05
 _QUIET_POLLS = 3
 _T = TypeVar("_T")
-
-
-class PlantStoppedError(FaultError):
-    """A plant gave up torque by itself: a fault, an e-stop, or no command for long.
-
-    Args:
-        namespace: Of the plant.
-        mode: In which it is: ``fault``, ``e_stop`` or ``disarmed``.
-        reason: Why, in its own words; a fault of the bridge begins with its name.
-    """
-
-    def __init__(self, namespace: str, mode: str, reason: str) -> None:
-        super().__init__(f"{namespace} went to {mode}: {reason}")
-        self.namespace = namespace
-        self.mode = mode
-        self.reason = reason
 
 
 class Conductor:

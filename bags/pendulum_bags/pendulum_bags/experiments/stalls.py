@@ -10,9 +10,8 @@ import shutil
 from collections.abc import Callable
 from pathlib import Path
 
-from pendulum_bags.experiments.conductor_node import PlantStoppedError
 from pendulum_bags.runs.run_folder import REPEATS, write_stall
-from pendulum_msgs_py.errors import FaultError
+from pendulum_msgs_py.errors import FaultError, PlantStoppedError
 
 __all__ = ["ATTEMPTS", "is_stall", "run_undisturbed"]
 
