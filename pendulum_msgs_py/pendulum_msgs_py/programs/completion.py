@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterable, Sequence
-from importlib.metadata import distributions
 from importlib.util import find_spec
 from typing import TYPE_CHECKING, Any
 
@@ -75,6 +74,9 @@ def script(shell: str) -> str:
     """
     if shell not in SHELLS:
         raise ParameterError(f"shell is {shell!r}; expected one of {', '.join(SHELLS)}")
+    # Imported late: every program asks this module whether a shell wants an answer, and few print a script.
+    from importlib.metadata import distributions
+
     names = {str(found.metadata["Name"]).replace("-", "_") for found in distributions()}
     ours = sorted(name for name in names if name.startswith("pendulum_") and find_spec(f"{name}.__main__"))
     values = {"packages": " ".join(ours), "variable": VARIABLE}
