@@ -17,6 +17,7 @@ from dataclasses import dataclass, field
 
 from pendulum_msgs_py.contract.commands import COMMANDER_HOLD, CommandGate, Refusal
 from pendulum_msgs_py.contract.drive import Drive, DriveKind, Input, Mode, PlantLimits
+from pendulum_msgs_py.contract.handover import Handover
 from pendulum_msgs_py.contract.trajectory import MAX_RAMP_VELOCITY, Trajectory
 from pendulum_msgs_py.contract.values import NANOSECONDS, JointCommand, JointSample
 
@@ -28,24 +29,6 @@ PUSH_LIMIT_FACTOR = 10.0
 _KEPT_TRANSITIONS = 50
 _LONGEST_STEP_NS = NANOSECONDS // 10
 """Largest step in time by which one decision moves a trajectory or a fade on [ns]."""
-
-
-@dataclass
-class _Handover:
-    """Fade from the torque before a change of control to the one after it, and of the setpoint likewise."""
-
-    start_ns: int
-    effort: float
-    offset: float = 0.0
-    offset_time: float = 0.0
-
-    def remaining(self, now_ns: int, duration: float) -> float:
-        if duration <= 0.0:
-            return 0.0
-        return min(1.0, max(0.0, 1.0 - (now_ns - self.start_ns) / (duration * NANOSECONDS)))
-
-    def remaining_offset(self, now_ns: int) -> float:
-        return self.offset * self.remaining(now_ns, self.offset_time)
 
 
 @dataclass
@@ -76,7 +59,7 @@ class PlantSupervisor:
         self.commander_conflict = ""
         self._trajectory: Trajectory | None = None
         self._trajectory_start_ns = 0
-        self._handover: _Handover | None = None
+        self._handover: Handover | None = None
         self._applied = 0.0
         self._last_effort = 0.0
         self._last_decision_ns: int | None = None
@@ -130,7 +113,7 @@ class PlantSupervisor:
         self._keep_pace(now_ns)
         self._trajectory = trajectory
         self._trajectory_start_ns = now_ns
-        self._handover = _Handover(now_ns, self._applied, offset=-gap, offset_time=offset_time)
+        self._handover = Handover(now_ns, self._applied, offset=-gap, offset_time=offset_time)
         self._commanding = None
         self._enter(Mode.POSITION, "following a trajectory", now_ns)
         return ""
@@ -262,7 +245,7 @@ class PlantSupervisor:
                     )
                     return self._hold(handover, remaining, position, velocity, push)
                 self._trajectory = None
-                self._handover = _Handover(now_ns, self._applied)
+                self._handover = Handover(now_ns, self._applied)
                 self._last_effort = self._applied
                 self._last_decision_ns = self._commanded_ns = now_ns
                 self._commanding = command.source
@@ -271,7 +254,7 @@ class PlantSupervisor:
         return self._hold(handover, remaining, position, velocity, push)
 
     def _hold(
-        self, handover: _Handover | None, remaining: float, position: float, velocity: float, push: float
+        self, handover: Handover | None, remaining: float, position: float, velocity: float, push: float
     ) -> Drive:
         effort = handover.effort * remaining if handover else 0.0
         effort = self._clamp(effort)

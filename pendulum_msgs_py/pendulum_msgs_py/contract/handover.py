@@ -1,0 +1,29 @@
+"""Change of control without a jump: what was there before fades out."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from pendulum_msgs_py.contract.values import NANOSECONDS
+
+__all__ = ["Handover"]
+
+
+@dataclass
+class Handover:
+    """Fade from the torque before a change of control to the one after it, and of the setpoint likewise."""
+
+    start_ns: int
+    effort: float
+    offset: float = 0.0
+    offset_time: float = 0.0
+
+    def remaining(self, now_ns: int, duration: float) -> float:
+        """Return the share of a fade of this duration [s] that is still to come, 1 at its start to 0."""
+        if duration <= 0.0:
+            return 0.0
+        return min(1.0, max(0.0, 1.0 - (now_ns - self.start_ns) / (duration * NANOSECONDS)))
+
+    def remaining_offset(self, now_ns: int) -> float:
+        """Return what is left of the offset of the setpoint [rad]."""
+        return self.offset * self.remaining(now_ns, self.offset_time)
