@@ -1,7 +1,8 @@
-"""``make test``: on two cores at once what computes, then, one test after the other, what keeps a plant's time.
+"""``make test``: on two cores at once what computes and, before it, what keeps a plant's time.
 
-Tests of one file stay together, so that what a file prepares is prepared once. Named files or folders run as pytest is
-told.
+Tests that keep a plant's time mostly wait for it, so two of them run at a time, and what computes takes the rest of
+both cores at a lower priority. Tests of one file stay together, so that what a file prepares is prepared once. Named
+files or folders run as pytest is told.
 """
 
 from __future__ import annotations
@@ -10,7 +11,11 @@ import os
 import signal
 import subprocess
 import sys
+import tempfile
+import time
 from collections.abc import Sequence
+from pathlib import Path
+from typing import IO
 
 import pytest
 
@@ -19,21 +24,31 @@ from tests.fixtures import PROJECT
 __all__ = ["main"]
 
 _KEEPS_TIME = (
-    "tests/acceptance/test_console.py",
     "tests/acceptance/test_experiment.py",
+    "tests/integration/test_experiments.py",
+    "tests/acceptance/test_console.py",
+    "tests/integration/test_plant_interface.py",
+    "tests/integration",
     "tests/faults/test_bridge_faults.py",
     "tests/faults/test_disk_faults.py",
     "tests/faults/test_live_faults.py",
     "tests/faults/test_network_faults.py",
     "tests/faults/test_security_policy.py",
     "tests/faults/test_system_faults.py",
-    "tests/integration",
     "pendulum_lqr/test/test_lqr_nodes.py",
     "pendulum_lqr/test/test_running_plant.py",
 )
-"""Tests with processes that run in real time: a neighbour on the same cores would be measured with them."""
-_LONGEST = "tests/acceptance/test_readme.py"
-"""The file that takes longest comes first, so that the others fill the core beside it."""
+"""Tests with processes that run in real time, longest first: what computes must not take their cores."""
+_COMPUTES = (
+    "tests/acceptance/test_readme.py",
+    "tests/acceptance/test_docs.py",
+    "bags/pendulum_bags/test/test_identification_intervals.py",
+    "bags/pendulum_bags/test",
+    "tests",
+)
+"""What comes first of all others, longest first too: a long file at the end would leave a core idle."""
+_NICENESS = 10
+"""Of what computes. Not 19: beside somebody else's work it would starve."""
 _NOTHING_SELECTED = int(pytest.ExitCode.NO_TESTS_COLLECTED)
 
 
@@ -45,37 +60,45 @@ def main(arguments: Sequence[str]) -> int:
     """
     # A shell starts what it puts into the background deaf to Ctrl-C, and so would be all that the tests start.
     signal.signal(signal.SIGINT, signal.default_int_handler)
-    # A test that calls make must not hand on what this run was asked for.
-    for name in ("MAKEFLAGS", "MAKEOVERRIDES", "MFLAGS", "ARGS"):
+    # A test that calls make must not hand on what this run was asked for; and hundreds of processes start faster from
+    # modules that were compiled once.
+    for name in ("MAKEFLAGS", "MAKEOVERRIDES", "MFLAGS", "ARGS", "PYTHONDONTWRITEBYTECODE"):
         os.environ.pop(name, None)
     if any((PROJECT / argument.split("::")[0]).exists() for argument in arguments):
-        return _pytest(*arguments)
+        return _start(*arguments).wait()
+    in_time = _files(_KEEPS_TIME)
     packages = sorted(str(path) for top in ("", "bags/") for path in PROJECT.glob(f"{top}pendulum_*/test"))
-    workers = str(min(2, os.cpu_count() or 1))
-    others = [f"--ignore={name}" for name in _KEEPS_TIME]
-    codes = [
-        _pytest(
-            "-n",
-            workers,
-            "--dist",
-            "loadfile",
-            "--no-loadscope-reorder",
-            *others,
-            _LONGEST,
-            "tests",
-            *packages,
-            *arguments,
-        ),
-        _pytest(*_KEEPS_TIME, *arguments),
-    ]
+    others = [name for name in _files((*_COMPUTES, *packages)) if name not in in_time]
+    workers = ("-n", str(min(2, os.cpu_count() or 1)), "--dist", "loadfile", "--no-loadscope-reorder")
+    with tempfile.NamedTemporaryFile() as report, Path(report.name).open(encoding="utf-8", errors="replace") as written:
+        print("What computes runs beside what keeps a plant's time, and is reported after it.", flush=True)
+        computing = _start(*workers, *others, *arguments, output=report, niceness=_NICENESS)
+        try:
+            codes = [_start(*workers, *in_time, *arguments).wait()]
+        finally:
+            # Also after Ctrl-C, which has reached both.
+            running = True
+            while running:
+                running = computing.poll() is None
+                sys.stdout.write(written.read())
+                sys.stdout.flush()
+                time.sleep(0.2)
+    codes.append(computing.returncode)
     # A name may be in one part only.
     counted = [code for code in codes if code != _NOTHING_SELECTED] or [_NOTHING_SELECTED]
     return next((code for code in counted if code), 0)
 
 
-def _pytest(*arguments: str) -> int:
-    """Run pytest in a process of its own: what the first run has imported must not slow the second."""
-    return subprocess.run([sys.executable, "-m", "pytest", *arguments], cwd=PROJECT, check=False).returncode
+def _files(names: Sequence[str]) -> list[str]:
+    """Return files of tests, each once, in this order; pytest would sort a folder's among those that it is told."""
+    found = [path for name in names for path in (sorted((PROJECT / name).rglob("test_*.py")) or [PROJECT / name])]
+    return list(dict.fromkeys(str(path.relative_to(PROJECT)) for path in found))
+
+
+def _start(*arguments: str, output: IO[bytes] | None = None, niceness: int = 0) -> subprocess.Popen[bytes]:
+    """Start pytest in a process of its own."""
+    command = ["nice", "-n", str(niceness), sys.executable, "-m", "pytest", *arguments]
+    return subprocess.Popen(command, cwd=PROJECT, stdout=output, stderr=subprocess.STDOUT if output else None)
 
 
 if __name__ == "__main__":

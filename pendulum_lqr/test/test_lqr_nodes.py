@@ -294,11 +294,3 @@ def test_a_bad_parameter_at_start_ends_the_program_with_one_sentence(
     assert program.wait(30) == 2
     assert message in program.output
     assert "Traceback" not in program.output
-
-
-@pytest.mark.parametrize("executable", ["controller", "disturbance"])
-def test_help_lists_the_parameters_with_units(executable, processes):
-    program = processes.start("pendulum_lqr", executable, "--help")
-    assert program.wait(30) == 0
-    assert "N m" in program.output
-    assert "example:" in program.output

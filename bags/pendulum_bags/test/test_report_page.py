@@ -192,16 +192,6 @@ def test_ratios_are_said_in_words() -> None:
     assert ratio_in_words(2.2) == "2.2 times as large"
 
 
-def test_several_runs_are_pooled_into_one_report(
-    folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    second = write_run_folder(tmp_path / "second", seed=2, ramps=False)
-    assert main([str(folder), str(second), "-o", str(tmp_path / "pooled"), "--png-only"]) == 0
-    assert "report" in capsys.readouterr().out
-    assert (tmp_path / "pooled" / "figures" / "pooled_runs.png").exists()
-    assert "2 runs" in (tmp_path / "pooled" / "report.html").read_text(encoding="utf-8")
-
-
 def test_two_bags_make_a_report_too(folder: Path, tmp_path: Path) -> None:
     shutil.copytree(folder / "sim", tmp_path / "a")
     shutil.copytree(folder / "hw", tmp_path / "b")
@@ -262,13 +252,19 @@ def staircase_trials(folder: Path) -> Path:
     return folder
 
 
-def test_identification_experiments_join_the_report(folder: Path, tmp_path: Path) -> None:
+def test_several_runs_are_pooled_and_identification_experiments_join_the_report(
+    folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    second = write_run_folder(tmp_path / "second", seed=2, ramps=False)
     trials = [str(hand_trials(tmp_path / "table")), str(staircase_trials(tmp_path / "staircase"))]
-    assert main([str(folder), *trials, "-o", str(tmp_path / "out"), "--png-only"]) == 0
+    assert main([str(folder), str(second), *trials, "-o", str(tmp_path / "out"), "--png-only"]) == 0
+    assert "report" in capsys.readouterr().out
     text = (tmp_path / "out" / "report.html").read_text(encoding="utf-8")
+    assert "2 runs" in text
     assert re.search(r"damping 11\.77 N m s/rad", text)
     assert re.search(r"gravity 1\.6[678]\d* N m", text)
     for name in (
+        "pooled_runs",
         "effort_over_velocity",
         "effort_over_acceleration",
         "trials",
