@@ -121,7 +121,7 @@ parameters:
         ("unit: kg m^2", "unit: kg m^2, interval: [2, 1]", "interval is [2, 1]; expected [low, high] in kg m^2"),
         ("unit: kg m^2", "unit: kg m^2, interval: [.nan, 1]", "expected [low, high] in kg m^2"),
         ("unit: kg m^2", f"unit: kg m^2, interval: [1, {'9' * 400}]", "expected [low, high] in kg m^2"),
-        ("pendulum_plant/1", "pendulum_plant/2", "format is 'pendulum_plant/2'; expected 'pendulum_plant/1'"),
+        ("pendulum_plant/1", "pendulum_plant/3", "format is 'pendulum_plant/3'; expected 'pendulum_plant/1'"),
         ("name: test", "name: [a]", "name is ['a']; expected text"),
         ("name: test", "nmae: test", "unknown parameter 'nmae'; did you mean 'name'?"),
         ("name: test", "drivetrain: [1]", "drivetrain is a list; expected a mapping"),

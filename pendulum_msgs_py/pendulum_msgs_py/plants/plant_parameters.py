@@ -247,11 +247,6 @@ def load_plant_file(preset_or_path: str | Path) -> tuple[PlantParameters, dict[s
             f"plant file {path} is sealed for an exercise, and only a simulator runs it; "
             "expected a plant that you identified"
         )
-    if document.get("format") == MECHANISM_FORMAT:
-        raise ParameterError(
-            f"plant file {path} describes a mechanism ({document.get('model')}); expected a plant of one joint here, "
-            f"as {PRESET_NAMES}"
-        )
     return read_plant_document(document, path)
 
 
@@ -266,9 +261,15 @@ def read_plant_document(document: Mapping[str, Any], path: Path) -> tuple[PlantP
         ParameterError: as :func:`load_plant`.
     """
     where = str(path)
-    reject_unknown(document, ("format", "name", "parameters", "drivetrain", "provenance"), where=where)
+    if document.get("format") == MECHANISM_FORMAT:
+        raise ParameterError(
+            f"plant file {path} describes a mechanism ({document.get('model')}); expected a plant of one joint here, "
+            f"as {PRESET_NAMES}"
+        )
+    # What the other names may be depends on the format.
     if document.get("format") != FORMAT:
         raise ParameterError(f"{where}: format is {document.get('format')!r}; expected {FORMAT!r}")
+    reject_unknown(document, ("format", "name", "parameters", "drivetrain", "provenance"), where=where)
     if "parameters" not in document:
         raise ParameterError(f"{where}: parameters is missing; expected a mapping of {_names(PLANT_SPECS)}")
     values, intervals = read_quantities(document["parameters"], PLANT_SPECS, f"{where}: parameters")
