@@ -138,6 +138,20 @@ def test_outside_of_its_box_it_gives_up_for_good_and_says_so(tmp_path, x):
     assert learned.command(0.0, (0.1, 0.0)) != 0.0
 
 
+@pytest.mark.parametrize("period", [0.002, 0.02, 0.0125, 0.0])
+def test_states_at_another_rate_than_said_make_it_give_up(tmp_path, period):
+    learned = controller(tmp_path, random_policy(DFKI, seed=4))
+    efforts = [learned.command(period * k, (0.1, 0.0)) for k in range(40)]
+    assert efforts[0] != 0.0
+    assert efforts[-1] == 0.0
+    assert f"states come every {period:g} s; it answers for every 0.01 s" in learned.notice
+    # A state that is late, or lost, now and then is no other rate.
+    learned.reset()
+    for k in range(200):
+        learned.command(0.01 * k + (0.004 if k % 3 == 0 else 0.0) + 0.01 * (k // 10), (0.1, 0.0))
+    assert learned.notice == ""
+
+
 def test_a_chosen_fallback_answers_after_it_gave_up(tmp_path):
     learned = controller(tmp_path, random_policy(DFKI, seed=4, velocity_box=(2.0,)), fallback="energy_swing_up")
     learned.command(0.0, (0.1, 2.5))

@@ -26,8 +26,10 @@ from pendulum_bags.studies.leaderboard import (
 from pendulum_bags.studies.leaderboard_hardware import HARDWARE_PERTURBATIONS, arrays_of_bag
 from pendulum_bags.studies.leaderboard_page import write_page
 from pendulum_lqr.controller import CONTROLLERS
+from pendulum_lqr.policy_file import write_policy
 from pendulum_msgs_py.plants.plant_parameters import load_plant
 from pendulum_rosbag.reader import read_bag
+from tests.policies import linear_policy
 
 BROWSER = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
 
@@ -127,6 +129,19 @@ def test_a_controller_that_is_added_to_the_table_is_on_the_board(
     page = (out / "leaderboard.html").read_text(encoding="utf-8")
     assert 'id="thesis-mine"' in page
     assert main([*arguments[:3], "--controllers", "mein"]) == 2
+
+
+def test_a_policy_file_is_on_the_board_by_its_name(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    policy = write_policy(tmp_path / "learned.npz", linear_policy(load_plant("thesis"), 60.0, 1.0))
+    out = tmp_path / "board"
+    arguments = ["leaderboard", "--plants", "thesis", "--no-robustness", "--duration", "6", "--workers", "1"]
+    assert main([*arguments, "--controllers", f"{policy},lqr", "--out", str(out)]) == 0
+    rows = {row["controller"]: row for row in json.loads((out / "leaderboard.json").read_text(encoding="utf-8"))}
+    assert set(rows) == {"learned", "lqr"}
+    assert rows["learned"]["success"]
+    assert main([*arguments, "--controllers", f"{policy},{policy}"]) == 2
+    assert "shares its name with another" in capsys.readouterr().err
+    assert main([*arguments, "--controllers", str(tmp_path / "none.npz")]) == 2
 
 
 def test_a_recorded_run_of_the_machine_is_scored_as_a_simulated_one_is() -> None:

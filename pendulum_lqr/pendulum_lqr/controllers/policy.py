@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import math
+import statistics
 from collections.abc import Mapping, Sequence
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -23,6 +25,9 @@ _ZERO = "zero"
 _FALLBACKS = (_ZERO, "lqr", "pd_gravity", "energy_swing_up")
 _SAME_PERIOD = 0.05
 """Share by which a period may differ from a whole part of the policy's."""
+_LATE = 0.2
+_INTERVALS = 15
+"""Intervals between states whose median may be off by this share at most while it runs."""
 
 
 class LearnedPolicy(BaseController):
@@ -101,12 +106,15 @@ class LearnedPolicy(BaseController):
         self._observation: Any = None
         self._effort = 0.0
         self._wait = 0
+        self._times: list[float] = []
         if self.fallback is not None:
             self.fallback.reset()
 
     def command(self, t: float, x: Sequence[float]) -> float:
         """Return the policy's torque, or the fallback's after it gave up [N m]."""
         angle, velocity = x[0], x[1]
+        if not self.notice:
+            self._watch_period(t)
         if not self.notice and not (abs(velocity) <= self._velocity_box and abs(angle) <= self._angle_box):
             self._give_up(
                 t, f"angle {angle:.3g} rad, velocity {velocity:.3g} rad/s is outside of what it was trained for "
@@ -172,6 +180,17 @@ class LearnedPolicy(BaseController):
         if not math.isfinite(answer):
             return answer
         return math.tanh(answer) if self._squash else min(1.0, max(-1.0, answer))
+
+    def _watch_period(self, t: float) -> None:
+        """Give up where states come at another rate, whatever was said of it: the network knows no other time."""
+        self._times.append(t)
+        if len(self._times) <= _INTERVALS:
+            return
+        median = statistics.median(later - earlier for earlier, later in pairwise(self._times))
+        self._times = [t]
+        if not abs(median * self.hold / self.policy.period - 1.0) <= _LATE:
+            own = self.policy.period / self.hold
+            self._give_up(t, f"states come every {median:.3g} s; it answers for every {own:.3g} s")
 
     def _give_up(self, t: float, reason: str) -> None:
         self.notice = f"gave up after {t:.3f} s: {reason}"

@@ -183,7 +183,10 @@ class RunSpec:
         return graph.controller(
             self.namespace,
             **{
-                **self.controller_parameters,
+                **{
+                    name: str(Path(value).resolve()) if name == "policy" and value else value
+                    for name, value in self.controller_parameters.items()
+                },
                 "controller": self.controller,
                 "plant": _absolute(self.design_plant),
                 "period": self.period,

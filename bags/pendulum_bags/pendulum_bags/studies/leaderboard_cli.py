@@ -5,16 +5,20 @@ from __future__ import annotations
 import json
 import os
 from concurrent.futures import ProcessPoolExecutor
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
+from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.programs.counted_progress import counting_bar
 from pendulum_msgs_py.programs.executables import EXIT_INTERRUPTED
 from pendulum_msgs_py.programs.terminal import WholeTable, make_console
 
 __all__ = ["leaderboard"]
+
+_POLICY = ".npz"
 
 
 def leaderboard(
@@ -22,7 +26,9 @@ def leaderboard(
     plants: Annotated[
         str, typer.Option(help="Rigid plants (presets or files) and hw, the emulated X5-9, separated by commas.")
     ] = "thesis,dfki",
-    controllers: Annotated[str, typer.Option(help="Controllers, separated by commas; empty for all.")] = "",
+    controllers: Annotated[
+        str, typer.Option(help="Controllers and policy files (.npz), separated by commas; empty for all controllers.")
+    ] = "",
     duration: Annotated[float, typer.Option(help="Length of each run [s].", min=1.0)] = 10.0,
     robustness: Annotated[bool, typer.Option(help="Try model errors, noise, delay, lag and pushes too.")] = True,
     workers: Annotated[int, typer.Option(help="Runs at once; 0 for one a core.", min=0)] = 0,
@@ -39,12 +45,18 @@ def leaderboard(
     from pendulum_bags.studies.leaderboard_hardware import evaluate_hardware
     from pendulum_bags.studies.leaderboard_page import best_sentence, to_json, write_page
     from pendulum_lqr.controller import controller_class
+    from pendulum_lqr.policy_file import load_policy
     from pendulum_msgs_py.plants.plant_parameters import load_plant
 
     names = [name.strip() for name in controllers.split(",") if name.strip()] or contenders()
     machines = [name.strip() for name in plants.split(",") if name.strip()]
     for name in names:
-        controller_class(name)
+        if not name.endswith(_POLICY):
+            controller_class(name)
+        elif [Path(other).name for other in names].count(Path(name).name) > 1:
+            raise ParameterError(f"policy file {name} shares its name with another; expected a name for each")
+        else:
+            load_policy(name)
     for name in machines:
         if name != HARDWARE:
             load_plant(name)
@@ -55,14 +67,16 @@ def leaderboard(
         with counting_bar(console) as bar:
             task = bar.add_task("controllers", total=len(names) * len(machines))
             jobs = [
-                pool.submit(evaluate_hardware, name, duration=duration, robustness=robustness)
+                pool.submit(evaluate_hardware, kind, parameters=parameters, duration=duration, robustness=robustness)
                 if machine == HARDWARE
-                else pool.submit(evaluate, machine, name, duration=duration, robustness=robustness)
+                else pool.submit(
+                    evaluate, machine, kind, parameters=parameters, duration=duration, robustness=robustness
+                )
                 for machine in machines
-                for name in names
+                for kind, parameters in map(_contender, names)
             ]
-            for job in jobs:
-                entries.append(job.result())
+            for job, name in zip(jobs, names * len(machines), strict=True):
+                entries.append(replace(job.result(), controller=Path(name).stem if name.endswith(_POLICY) else name))
                 bar.advance(task)
     except KeyboardInterrupt:
         pool.shutdown(wait=False, cancel_futures=True)
@@ -91,3 +105,8 @@ def leaderboard(
     console.print(table)
     console.print(best_sentence(entries))
     console.print(f"page    {page}", soft_wrap=True)
+
+
+def _contender(name: str) -> tuple[str, dict[str, str]]:
+    """Return kind and parameters of a controller, or of the one that answers with a policy file."""
+    return ("policy", {"policy": str(Path(name).resolve())}) if name.endswith(_POLICY) else (name, {})
