@@ -20,10 +20,12 @@ FAULTS = {
     "voltage": "voltage_low",
     "locked_by_other": "locked_by_other",
     "module_restarted": "module_reboot",
-    "feedback_frozen": "feedback_frozen",
     "motion_disagreement": "position_frozen",
 }
-"""Faults that the last exercise may ask for, with the emulator's fault that leads to each."""
+"""Faults that the last exercise may ask for, with the emulator's fault that leads to each.
+
+Feedback that is frozen is none of them: a bridge without measurements tells no torque, so no recording could show it.
+"""
 CAUSES = {
     "power": "noise that is held longer has more power at low frequencies, and the loop answers to those alone",
     "plant": "the machine is less damped than its model",
