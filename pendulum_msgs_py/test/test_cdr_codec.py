@@ -73,6 +73,30 @@ def test_equal_messages_are_equal_bytes() -> None:
     assert encode_joint_state(7, frame_id="abc", effort=1.0) == encode_joint_state(7, frame_id="abc", effort=1.0)
 
 
+@pytest.mark.parametrize(
+    ("fields", "data"),
+    [
+        (
+            {"frame_id": "/sim/simulator", "position": 3.0, "velocity": -0.25, "effort": 1.5},
+            (
+                "00010000 002f6859 15cd5b07 0f000000 2f73696d 2f73696d 756c6174 6f720000 01000000 0f000000 70656e64"
+                "756c756d 5f6a6f69 6e740000 01000000 00000000 00000840 01000000 00000000 00000000 0000d0bf 01000000"
+                "00000000 00000000 0000f83f"
+            ),
+        ),
+        (
+            {"frame_id": "/sim/controller", "effort": -0.5},
+            (
+                "00010000 002f6859 15cd5b07 10000000 2f73696d 2f636f6e 74726f6c 6c657200 01000000 0f000000 70656e64"
+                "756c756d 5f6a6f69 6e740000 00000000 00000000 01000000 00000000 0000e0bf"
+            ),
+        ),
+    ],
+)
+def test_the_bytes_of_states_and_commands_of_one_joint_stay_as_bags_hold_them(fields: dict, data: str) -> None:
+    assert encode_joint_state(1_500_000_000_123_456_789, **fields).hex() == data.replace(" ", "")
+
+
 def test_not_a_number_travels() -> None:
     fields = decode_joint_state(encode_joint_state(0, position=math.nan, effort=math.inf))
     assert fields is not None
