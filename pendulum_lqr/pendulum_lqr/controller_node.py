@@ -18,7 +18,14 @@ from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64MultiArray
 
 from pendulum_lqr.answering import AnswerLoop
-from pendulum_lqr.controller import COMMON_PARAMETERS, CONTROLLERS, controller_class, make_controller
+from pendulum_lqr.controller import (
+    COMMON_PARAMETERS,
+    CONTROLLERS,
+    BaseController,
+    controller_class,
+    make_controller,
+    unwrapped,
+)
 from pendulum_lqr.interface import Controller
 from pendulum_lqr.sampling import ASSUMED_PERIOD, PeriodWatch, differs, rate_problem, uses_period
 from pendulum_msgs_py.contract import names
@@ -103,6 +110,7 @@ class ControllerNode(LifecycleNode, PollingNode):
         self._period_known = False
         self._told_other_rate = False
         self._refusal = ""
+        self._told_notice = ""
         self._now = SteadyWallClock()
         self._full_name = self.get_fully_qualified_name()
         self._told_refusals = 0
@@ -262,6 +270,8 @@ class ControllerNode(LifecycleNode, PollingNode):
                 self._design_for(measured)
             elif not values["period"] and self._uses_period():
                 self._design(values)
+            if (own := self._own_controller()) is not None:
+                own.check(self._plant, measured)
             self._refusal = rate_problem(
                 lambda: self._design(values), values["controller"], self._plant, self._period, measured,
                 uses=self._uses_period(), set_point=values["set_point"],
@@ -273,6 +283,11 @@ class ControllerNode(LifecycleNode, PollingNode):
             return False
         self._period_known = True
         return True
+
+    def _own_controller(self) -> BaseController | None:
+        """Return the controller that answers, without what estimates its velocity."""
+        inner = None if self._loop is None else unwrapped(self._loop.controller)
+        return inner if isinstance(inner, BaseController) else None
 
     def _autostart(self) -> None:
         if self.trigger_configure() != TransitionCallbackReturn.SUCCESS:
@@ -322,6 +337,14 @@ class ControllerNode(LifecycleNode, PollingNode):
                 if not self._told_other_rate:
                     self.get_logger().warning(text)
             self._told_other_rate = other_rate
+        own = self._own_controller()
+        notice = "" if own is None else own.notice
+        if notice:
+            level = max(level, DiagnosticStatus.WARN)
+            text = f"{text}; {notice}"
+            if notice != self._told_notice:
+                self.get_logger().warning(notice)
+        self._told_notice = notice
         if self._running_plant.mismatch:
             level = max(level, DiagnosticStatus.WARN)
             text = f"{text}; {self._running_plant.mismatch}"

@@ -17,9 +17,12 @@ from std_msgs.msg import Float64MultiArray, String
 from std_srvs.srv import Trigger
 
 from pendulum_lqr.disturbance import make_disturbance
+from pendulum_lqr.policy_file import write_policy
 from pendulum_msgs_py.contract.cdr import decode_joint_state, encode_joint_state
+from pendulum_msgs_py.plants.plant_parameters import load_plant
 from pendulum_msgs_py.ros import qos
 from tests.graph_peer import GraphPeer
+from tests.policies import linear_policy
 
 STATE = {"position": math.pi + 0.1, "velocity": 0.2, "effort": 0.0}
 # A busy machine delivers states late; how old is too old is judged by tests that need no middleware.
@@ -184,6 +187,50 @@ def test_the_period_is_taken_from_the_states_or_refused_where_the_loop_would_be_
     assert not plant.call(ChangeState, "controller/change_state", request).success
 
 
+def test_a_policy_answers_at_its_own_period_and_says_when_it_gives_up(plant, processes, tmp_path):
+    thesis = load_plant("thesis")
+    path = write_policy(tmp_path / "policy.npz", linear_policy(thesis, 20.0, 1.0, velocity_box=(8.0,)))
+
+    def publish(seen: Callable[[], object], what: str, spacing_ns: int, **state: float) -> None:
+        first, count = time.time_ns(), iter(range(10_000))
+
+        def answered() -> object:
+            plant.publish(first + spacing_ns * next(count), **state)
+            plant.spin(0.01)
+            return seen()
+
+        plant.until(answered, what)
+
+    def told() -> dict:
+        return plant.diagnostics.get("/sim/controller: controller", {})
+
+    policy = ("controller:=policy", f"policy:={path}", "state_timeout:=60.0")
+    program = processes.start("pendulum_lqr", "controller", *ros(*policy))
+    program.wait_for_output(r"policy for plant thesis: test \(swing_up, 4-1\) every 0\.01 s, fallback zero torque", 30)
+    plant.connect()
+    publish(lambda: plant.commands, "the first answer", 10_000_000)
+    assert plant.commands[-1].effort == pytest.approx(-(20.0 * math.sin(0.1) + 0.2), abs=1e-5)
+    publish(lambda: plant.commands[-1].effort == 0.0, "zero torque", 10_000_000, velocity=9.0)
+    publish(lambda: "gave up" in told().get("message", ""), "the diagnostics", 10_000_000)
+    assert told()["level"] == DiagnosticStatus.WARN
+    program.wait_for_output(r"gave up after .* velocity 9 rad/s is outside of what it was trained for", 10)
+    assert plant.commands[-1].effort == 0.0
+    program.send_signal(signal.SIGTERM)
+    assert program.wait(15) == 0
+
+    plant.commands.clear()
+    for period in ((), ("period:=0.01",)):
+        program = processes.start("pendulum_lqr", "controller", *ros(*policy, *period))
+        plant.connect()
+        publish(lambda output=program: "not answering" in output.output, "the refusal", 25_000_000)
+        reason = r"not answering: states come every 0\.0\d+ s: policy 'test' was trained for a period of"
+        program.wait_for_output(reason, 1)
+        program.send_signal(signal.SIGTERM)
+        assert program.wait(15) == 0
+        # Whoever states a period is believed until the states say otherwise.
+        assert period or not any(command.effort for command in plant.commands)
+
+
 def test_a_controller_that_waits_is_silent_until_it_is_activated(plant, processes):
     program = processes.start("pendulum_lqr", "controller", *ros("autoactivate:=false", PATIENT))
     program.wait_for_output(r"waits inactive.*: /sim/controller/change_state", 30)
@@ -283,6 +330,7 @@ def test_a_stopped_process_ends_a_running_disturbance_with_zero(plant, processes
         ("controller", ["r:=1"], "write 1.0"),
         ("controller", ["plant:=nowhere"], "plant is 'nowhere'; expected one of the presets"),
         ("controller", ["controller:=playback"], "file is empty; expected the path of a CSV"),
+        ("controller", ["controller:=policy", "policy:=/dev/null"], "is a device or a pipe; expected a file"),
         ("disturbance", ["kind:=brown"], "kind is 'brown'; expected one of uniform"),
         ("disturbance", ["kind:=from_bag"], "without a file"),
     ],
