@@ -19,9 +19,9 @@ sys.exit(2)
 """
 
 
-def _message(folder: Path) -> str:
+def _message(folder: Path, program: str = _LOGS_AND_ENDS) -> str:
     with ProcessSet(folder, {}) as processes:
-        child = processes.start("hw_bridge", [sys.executable, "-c", _LOGS_AND_ENDS])
+        child = processes.start("hw_bridge", [sys.executable, "-c", program])
         child.process.wait(20)
         with pytest.raises(FaultError) as caught:
             processes.check()
@@ -38,4 +38,6 @@ def test_what_a_node_logs_and_then_ends_with_is_told_once(tmp_path: Path, monkey
 def test_a_busy_computer_is_named_where_a_program_ended(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(os, "getloadavg", lambda: (23.4, 1.0, 1.0))
     monkeypatch.setattr(os, "cpu_count", lambda: 2)
-    assert "This computer is busy (load 23 on 2 cores)" in _message(tmp_path)
+    assert "This computer is busy (load 23 on 2 cores)" in _message(tmp_path / "late")
+    # A full disk is no matter of time.
+    assert "busy" not in _message(tmp_path / "full", "import sys; sys.exit('error: no space left on device')")

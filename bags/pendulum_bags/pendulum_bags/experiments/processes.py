@@ -34,10 +34,14 @@ _PREFIX = re.compile(r"^(?:\[[A-Z]+\] \[[\d.]+\] \[[^\]]+\]: |error: )")
 """What rclpy's log, or the end of a program, puts before a sentence."""
 
 
-def _busy_note() -> str:
-    """Return a remark for messages where other programs may be the cause, else nothing."""
+_TOO_LATE = re.compile(r"\bwithin \d|did not (?:answer|run)")
+"""What the last words of a program that other programs kept waiting have in them."""
+
+
+def _busy_note(words: str) -> str:
+    """Return a remark for last words whose cause may be other programs, else nothing."""
     load, cores = os.getloadavg()[0], os.cpu_count() or 1
-    if load <= 2.0 * cores:
+    if load <= 2.0 * cores or not _TOO_LATE.search(words):
         return ""
     return (
         f". This computer is busy (load {load:.0f} on {cores} cores), and that alone can cause this: "
@@ -156,7 +160,8 @@ class ProcessSet:
             code = child.process.poll()
             if code is not None and not (child.ends_by_itself and code == 0):
                 ending = f"was ended by {signal.Signals(-code).name}" if code < 0 else f"ended with code {code}"
-                raise FaultError(f"{child.name} {ending}; its last words: {child.last_words() or 'none'}{_busy_note()}")
+                words = child.last_words() or "none"
+                raise FaultError(f"{child.name} {ending}; its last words: {words}{_busy_note(words)}")
 
     def finish(self, child: Child, patience: float = _PATIENCE) -> int:
         """End one program by SIGINT, then by SIGKILL; return its exit code."""
