@@ -48,6 +48,12 @@ class RunningProgram:
         """Send a signal to the program alone (not to what it started); nothing happens when it has ended."""
         self._popen.send_signal(number)
 
+    def type(self, text: str) -> None:
+        """Type into a program that was started with ``typed=True``."""
+        assert self._popen.stdin is not None, f"{self.name} was not started with typed=True"
+        self._popen.stdin.write(text.encode())
+        self._popen.stdin.flush()
+
     def interrupt(self) -> None:
         """Send what Ctrl-C in a terminal sends: SIGINT to all that runs in the program's process group."""
         _signal_group(self._popen, signal.SIGINT)
@@ -113,6 +119,7 @@ class ProcessGroup:
         *arguments: str | Path,
         env: Mapping[str, str] | None = None,
         cwd: Path | None = None,
+        typed: bool = False,
     ) -> RunningProgram:
         """Start ``python -m package executable arguments`` in a process group of its own.
 
@@ -122,9 +129,10 @@ class ProcessGroup:
             arguments: What follows.
             env: Variables to add to the environment of this process.
             cwd: Folder to start in instead of the repository.
+            typed: Whether the test types into it.
         """
         command = [sys.executable, "-m", package, executable, *map(str, arguments)]
-        return self.start_command(command, name=f"{package} {executable}", env=env, cwd=cwd)
+        return self.start_command(command, name=f"{package} {executable}", env=env, cwd=cwd, typed=typed)
 
     def start_command(
         self,
@@ -133,6 +141,7 @@ class ProcessGroup:
         name: str | None = None,
         env: Mapping[str, str] | None = None,
         cwd: Path | None = None,
+        typed: bool = False,
     ) -> RunningProgram:
         """Start any command in a process group of its own."""
         self._folder.mkdir(parents=True, exist_ok=True)
@@ -144,7 +153,7 @@ class ProcessGroup:
                 command,
                 cwd=cwd or self._cwd,
                 env=environment,
-                stdin=subprocess.DEVNULL,
+                stdin=subprocess.PIPE if typed else subprocess.DEVNULL,
                 stdout=sink,
                 stderr=subprocess.STDOUT,
                 start_new_session=True,

@@ -73,7 +73,7 @@ BRIDGE_SPECS: tuple[ParameterSpec, ...] = (
         "interface",
         "",
         "",
-        "Network address on which to look for the HEBI actuator; empty for all interfaces.",
+        "Network address on which to look for the HEBI actuator; empty for all; `emulator:HOST:PORT` in a rehearsal.",
     ),
     _fixed(
         "feedback_rate",

@@ -1,4 +1,4 @@
-"""``emulator``: an emulated X5-9 in a process of its own; ``emulator_fault``: starts and ends its faults."""
+"""``emulator``: an emulated X5-9 in a process of its own; its faults, and a hand for rehearsals."""
 
 from __future__ import annotations
 
@@ -18,11 +18,13 @@ from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.programs.executables import cli_main
 from pendulum_msgs_py.programs.terminal import WholeTable, make_console
 
-__all__ = ["fault_main", "main"]
+__all__ = ["fault_main", "hand_main", "main"]
 
+_HAND_PATIENCE_NS = 10 * 10**9
 _ADDRESS = "127.0.0.1:17590"
 
 app = typer.Typer(add_completion=False, no_args_is_help=False)
+hand_app = typer.Typer(add_completion=False, rich_markup_mode=None)
 fault_app = typer.Typer(add_completion=False, rich_markup_mode=None)
 
 
@@ -37,6 +39,10 @@ def emulator(
     truth: Annotated[
         Path | None, typer.Option(help="New CSV file for what link and motor really do, each millisecond.")
     ] = None,
+    family: Annotated[str, typer.Option(help="HEBI family that it tells.")] = "emulated",
+    name: Annotated[str, typer.Option(help="HEBI name that it tells; default the plant's.")] = "",
+    serial: Annotated[str, typer.Option(help="Serial number that it tells.")] = "X5-9-E0001",
+    module_type: Annotated[str, typer.Option(help="Type that it tells.")] = "X5-9",
 ) -> None:
     """Serve an emulated X5-9 that goes on when the bridge ends, as a real one does.
 
@@ -44,7 +50,7 @@ def emulator(
     """
     from pendulum_hw_bridge.emulation import wire
     from pendulum_hw_bridge.emulation.parameters import load_emulator
-    from pendulum_hw_bridge.emulation.server import EmulatorServer
+    from pendulum_hw_bridge.emulation.server import EmulatorIdentity, EmulatorServer
     from pendulum_hw_bridge.emulation.truth_log import TruthLog
     from pendulum_hw_bridge.emulation.x5 import EmulatedX5
     from pendulum_msgs_py.contract.timing import SteadyWallClock
@@ -57,7 +63,8 @@ def emulator(
     actuator = EmulatedX5(parameters, seed=seed, position=position, start_ns=clock())
     # Code is compiled before anybody listens: the first seconds are not real time otherwise.
     actuator.advance_to(clock())
-    server = EmulatorServer(actuator, wire.parse_address(address), clock)
+    identity = EmulatorIdentity(family, name, serial, module_type)
+    server = EmulatorServer(actuator, wire.parse_address(address), clock, identity)
     host, port = server.address
     print(f"emulated X5-9 ({parameters.plant.name}) listens on {host}:{port}", flush=True)
     with nullcontext() if truth is None else TruthLog(truth) as log:
@@ -99,6 +106,7 @@ def emulator_fault(
         backend.clear_faults()
     if faults:
         backend.inject(*faults)
+    # Not closed, which would stop a motor that another drives.
     if as_json:
         print(json.dumps({"in_force": backend.status()["faults"]}))
         return
@@ -108,6 +116,42 @@ def emulator_fault(
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the emulator."""
     return cli_main(app, argv, name="python -m pendulum_hw_bridge emulator")
+
+
+@hand_app.command()
+def emulator_hand(
+    clockwise: Annotated[bool, typer.Option("--clockwise", help="The other way.")] = False,
+    angle: Annotated[float, typer.Option(help="How far to turn the link [rad].", min=0.01, max=1.0)] = 0.2,
+    address: Annotated[str, typer.Option(help="HOST:PORT of the emulator.")] = _ADDRESS,
+) -> None:
+    """Turn the link of a running emulator a little, counter-clockwise, and let go: a person's hand in a rehearsal.
+
+    Example: python -m pendulum_hw_bridge emulator_hand --clockwise
+    """
+    from pendulum_hw_bridge.backends.emulator_process import EmulatorProcessBackend
+    from pendulum_hw_bridge.nudge import EmulatedHand
+
+    backend = EmulatorProcessBackend(address)
+    backend.connect()
+    hand = EmulatedHand(backend.push, -1 if clockwise else 1)
+    start = backend.status()["link"]["position"]
+    until = backend.now_ns() + _HAND_PATIENCE_NS
+    hand.begin()
+    try:
+        while abs(turned := backend.status()["link"]["position"] - start) < angle:
+            if backend.now_ns() > until:
+                raise ParameterError(f"link turned by {turned:.2f} rad; expected {angle:g} rad: is the motor driven?")
+    finally:
+        hand.end()
+        # An answer to a later request shows that the hand has let go.
+        backend.status()
+        backend.let_go()
+    print(f"turned by {turned:+.2f} rad, and let go")
+
+
+def hand_main(argv: Sequence[str] | None = None) -> int:
+    """Run the hand."""
+    return cli_main(hand_app, argv, name="python -m pendulum_hw_bridge emulator_hand")
 
 
 def fault_main(argv: Sequence[str] | None = None) -> int:

@@ -8,6 +8,7 @@ EXECUTABLES: dict[str, str] = {
     "convert": "pendulum_hw_bridge.convert_cli:main",
     "emulator": "pendulum_hw_bridge.emulator_cli:main",
     "emulator_fault": "pendulum_hw_bridge.emulator_cli:fault_main",
+    "emulator_hand": "pendulum_hw_bridge.emulator_cli:hand_main",
     "lab": "pendulum_hw_bridge.lab_cli:main",
     "procedure": "pendulum_hw_bridge.procedure_node:main",
     "scan": "pendulum_hw_bridge.scan_cli:main",

@@ -230,6 +230,7 @@ def _drive(port: ActuatorPort, settings: BridgeSettings, goes_on: Callable[[Feed
                 raise ActuatorError("feedback_lost", "no feedback for ten periods; expected it to flow")
             continue
         silent = 0
+        _expect_numbers(record)
         driven = driven or abs(record.pwm_command) > 0.5 * PROOF_DUTY
         if not goes_on(record, (record.stamp_ns - start_ns) / NANOSECONDS):
             break
@@ -277,7 +278,19 @@ def _listen(port: ActuatorPort, seconds: float) -> list[Feedback]:
     while port.now_ns() < end:
         record = port.read(0.1)
         if record is not None:
+            _expect_numbers(record)
             records.append(record)
     if len(records) < 2:
         raise ActuatorError("feedback_lost", f"{len(records)} records in {seconds:g} s; expected feedback to flow")
     return records
+
+
+def _expect_numbers(record: Feedback) -> None:
+    """Refuse feedback that is no number: no angle can be judged by it, and none may reach the lab file."""
+    for what, value, unit in (
+        ("position", record.position, "rad"),
+        ("velocity", record.velocity, "rad/s"),
+        ("effort", record.effort, "N m"),
+    ):
+        if not math.isfinite(value):
+            raise ActuatorError("feedback_not_finite", f"{what} is {value} {unit}; expected a finite number")

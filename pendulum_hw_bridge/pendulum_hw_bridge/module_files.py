@@ -6,11 +6,16 @@ gains in the same format and its limits in JSON.
 
 from __future__ import annotations
 
+import contextlib
+import errno
 import json
 import math
-from collections.abc import Callable
+import shutil
+import tempfile
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
+from xml.etree import ElementTree
 
 from pendulum_hw_bridge.actuator import ActuatorError, ActuatorPort
 from pendulum_hw_bridge.emulation.wire import limits_from_json, limits_to_json
@@ -23,6 +28,9 @@ __all__ = ["backup_emulator", "backup_group", "restore_emulator", "restore_group
 GAINS = "gains.xml"
 SAFETY = "safety.xml"
 LIMITS = "limits.json"
+ENDS = "position_limit_strategies.json"
+"""What happens at either end of the position limits: hebi-py's file has one entry for both."""
+_END_NAMES = ("min_position_limit_strategy", "max_position_limit_strategy")
 _ANSWER_MS = 500
 _ATTEMPTS = 3
 
@@ -39,10 +47,15 @@ def backup_group(group: Any, folder: Path) -> list[Path]:
         ParameterError: The folder is there already, or cannot be made.
     """
     info = _info(group)
-    _make(folder)
-    info.write_gains(str(folder / GAINS))
-    info.write_safety_params(str(folder / SAFETY))
-    return [folder / GAINS, folder / SAFETY]
+    with _new(folder):
+        info.write_gains(str(folder / GAINS))
+        info.write_safety_params(str(folder / SAFETY))
+        (folder / ENDS).write_text(json.dumps(_ends_of(info), indent=2) + "\n", encoding="utf-8")
+        files = [folder / GAINS, folder / SAFETY, folder / ENDS]
+        # hebi-py says nothing where a disk is full.
+        if not all(file.is_file() and file.stat().st_size for file in files):
+            raise OSError(errno.ENOSPC, "not all of it was written: is the disk full?")
+    return files
 
 
 def restore_group(group: Any, folder: Path, make_command: Callable[[], Any]) -> None:
@@ -59,6 +72,7 @@ def restore_group(group: Any, folder: Path, make_command: Callable[[], Any]) -> 
         ActuatorError: The module does not acknowledge, or other values read back.
         ParameterError: A file is missing or not understood.
     """
+    ends = _read_ends(folder / ENDS)
     for name, read in ((GAINS, "read_gains"), (SAFETY, "read_safety_params")):
         read_text(folder / name, "backup")
         command = make_command()
@@ -66,21 +80,26 @@ def restore_group(group: Any, folder: Path, make_command: Callable[[], Any]) -> 
             getattr(command, read)(str(folder / name))
         except Exception as error:
             raise ParameterError(f"backup {folder / name} is not understood: {error}") from error
+        if name == SAFETY:
+            _set_open_ends(command, folder / name)
+            for end, strategy in ends.items():
+                setattr(command, end, strategy)
         # An empty command of hebi-py reads as position 0; said to be none, nothing can be taken for a wish to move.
         command.position = command.velocity = command.effort = math.nan
         if not any(group.send_command_with_acknowledgement(command, _ANSWER_MS) for _ in range(_ATTEMPTS)):
             raise ActuatorError("no_acknowledgement", f"HEBI module did not acknowledge {name} within {_ANSWER_MS} ms")
     info = _info(group)
-    for name, write in ((GAINS, "write_gains"), (SAFETY, "write_safety_params")):
-        now = folder / f".now_{name}"
-        try:
+    # Not beside the backup, which may lie on a medium that is full or read-only.
+    with tempfile.TemporaryDirectory(prefix="pendulum_module_") as temporary:
+        for name, write in ((GAINS, "write_gains"), (SAFETY, "write_safety_params")):
+            now = Path(temporary, name)
             getattr(info, write)(str(now))
             if now.read_text(encoding="utf-8") != (folder / name).read_text(encoding="utf-8"):
                 raise ActuatorError(
                     "no_acknowledgement", f"HEBI module reads back other values than those of {folder / name}"
                 )
-        finally:
-            now.unlink(missing_ok=True)
+    if ends and _ends_of(info) != ends:
+        raise ActuatorError("no_acknowledgement", f"HEBI module reads back {_ends_of(info)}; expected {ends}")
 
 
 def backup_emulator(port: ActuatorPort, folder: Path) -> list[Path]:
@@ -88,9 +107,9 @@ def backup_emulator(port: ActuatorPort, folder: Path) -> list[Path]:
     info = port.connect()
     if info.gains is None:
         raise ActuatorError("not_connected", f"{info.backend} does not tell its gains; expected hebi or an emulator")
-    _make(folder)
-    write_gains(folder / GAINS, info.gains)
-    (folder / LIMITS).write_text(json.dumps(limits_to_json(info.limits), indent=2) + "\n", encoding="utf-8")
+    with _new(folder):
+        write_gains(folder / GAINS, info.gains)
+        (folder / LIMITS).write_text(json.dumps(limits_to_json(info.limits), indent=2) + "\n", encoding="utf-8")
     return [folder / GAINS, folder / LIMITS]
 
 
@@ -106,6 +125,36 @@ def restore_emulator(port: ActuatorPort, folder: Path) -> None:
         raise ActuatorError("no_acknowledgement", f"emulator reads back other values than those of {folder}")
 
 
+def _set_open_ends(command: Any, path: Path) -> None:
+    """Set position limits that a file has as infinite: hebi-py reads them as no number, and would send that."""
+    try:
+        position = ElementTree.parse(path).getroot().find("position")
+        ends = {} if position is None else {end: position.findtext(f"{end}_limit") for end in ("min", "max")}
+        limits = {end: float(text) for end, text in ends.items() if text is not None}
+    except (ElementTree.ParseError, ValueError) as error:
+        raise ParameterError(f"backup {path} is not understood: {error}") from error
+    for end, limit in limits.items():
+        if math.isnan(limit):
+            raise ParameterError(f"backup {path}: {end}_limit of the position is no number; expected one, or inf")
+        if math.isinf(limit):
+            setattr(command, f"position_limit_{end}", limit)
+
+
+def _ends_of(info: Any) -> dict[str, int]:
+    return {name: int(getattr(info, name)[0]) for name in _END_NAMES}
+
+
+def _read_ends(path: Path) -> dict[str, int]:
+    if not path.exists():
+        # Kept before there was such a file: one strategy for both ends, in the file of safety parameters.
+        return {}
+    try:
+        content = json.loads(read_text(path, "backup"))
+        return {name: int(content[name]) for name in _END_NAMES}
+    except (KeyError, TypeError, ValueError) as error:
+        raise ParameterError(f"backup {path} is not understood: {error}") from error
+
+
 def _info(group: Any) -> Any:
     for _ in range(_ATTEMPTS):
         info = group.request_info(_ANSWER_MS)
@@ -114,10 +163,18 @@ def _info(group: Any) -> Any:
     raise ActuatorError("module_lost", f"HEBI module did not tell its settings within {_ANSWER_MS} ms")
 
 
-def _make(folder: Path) -> None:
+@contextlib.contextmanager
+def _new(folder: Path) -> Iterator[None]:
+    """Make a folder for a backup; half of one is no backup, and is taken away."""
     try:
         folder.mkdir(parents=True)
     except FileExistsError:
         raise ParameterError(f"backup {folder} is there already; expected a new folder") from None
     except OSError as error:
         raise ParameterError(f"backup {folder} cannot be made: {error.strerror}") from error
+    try:
+        yield
+    except (OSError, RuntimeError, ParameterError) as error:
+        shutil.rmtree(folder, ignore_errors=True)
+        why = getattr(error, "strerror", None) or error
+        raise ParameterError(f"backup {folder} cannot be written: {why}") from error

@@ -27,8 +27,8 @@ class Hand(Protocol):
     def begin(self) -> None:
         """Begin to turn."""
 
-    def end(self) -> None:
-        """Let go."""
+    def end(self, *, seen: bool = True) -> None:
+        """Let go; the turn was seen or not."""
 
 
 @dataclass
@@ -50,9 +50,9 @@ class Person:
             f"(about 10 degrees), then let go. Waiting for {_PATIENCE:g} s."
         )
 
-    def end(self) -> None:
-        """Say that it was seen."""
-        self.say("Seen; let go.")
+    def end(self, *, seen: bool = True) -> None:
+        """Say whether it was seen."""
+        self.say("Seen; let go." if seen else "Nothing was seen; let go.")
 
 
 @dataclass
@@ -71,7 +71,7 @@ class EmulatedHand:
         """Push."""
         self.push(self.direction * EMULATED_NUDGE)
 
-    def end(self) -> None:
+    def end(self, *, seen: bool = True) -> None:
         """Let go."""
         self.push(0.0)
 
@@ -96,6 +96,7 @@ def watch_nudge(port: ActuatorPort, hand: Hand, *, patience: float = _PATIENCE) 
     """
     deadline = port.now_ns() + round(patience * NANOSECONDS)
     start: float | None = None
+    seen = False
     hand.begin()
     try:
         while port.now_ns() < deadline:
@@ -103,8 +104,9 @@ def watch_nudge(port: ActuatorPort, hand: Hand, *, patience: float = _PATIENCE) 
             if record is None:
                 continue
             start = record.position if start is None else start
-            if abs(record.position - start) > NUDGE_ANGLE:
+            seen = abs(record.position - start) > NUDGE_ANGLE
+            if seen:
                 return record.position - start
         return 0.0
     finally:
-        hand.end()
+        hand.end(seen=seen)

@@ -38,7 +38,9 @@ app = typer.Typer(add_completion=False, rich_markup_mode=None)
 def scan(
     lab: Annotated[Path | None, typer.Option(help="Lab file that says which module is meant.")] = None,
     backend: Annotated[str | None, typer.Option(help="hebi, or emulator_process for an emulator.")] = None,
-    interface: Annotated[str | None, typer.Option(help="Network address to look on; default all.")] = None,
+    interface: Annotated[
+        str | None, typer.Option(help="Network address to look on; default all; emulator:HOST:PORT in a rehearsal.")
+    ] = None,
     family: Annotated[str | None, typer.Option(help="HEBI family that is meant.")] = None,
     name: Annotated[str | None, typer.Option(help="HEBI name that is meant.")] = None,
     serial: Annotated[str | None, typer.Option(help="Serial number that is meant.")] = None,
@@ -96,22 +98,23 @@ def _modules(values: dict[str, Any], look_time: float) -> list[ModuleRecord]:
         raise ParameterError(f"backend is {values['backend']!r}; expected hebi or emulator_process, which can be found")
     from pendulum_hw_bridge.backends.emulator_process import EmulatorProcessBackend
 
-    port = EmulatorProcessBackend(values["emulator_address"])
+    port = EmulatorProcessBackend(values["emulator_address"], attempts=max(1, round(4 * look_time)))
     try:
-        info = port.connect()
+        port.connect()
+        tells = port.status()
     except ActuatorError:
         return []
     finally:
-        port.close()
+        port.let_go()
     # An emulator has no network card; it is known by where it listens.
     return [
         ModuleRecord(
-            info.family,
-            info.name,
+            tells["family"],
+            tells["name"],
             "",
-            info.serial,
-            info.firmware.split()[-1],
-            info.firmware,
+            tells["serial"],
+            tells["type"],
+            tells["firmware"],
             values["emulator_address"],
         )
     ]

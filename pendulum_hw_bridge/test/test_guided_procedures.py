@@ -16,7 +16,7 @@ from pendulum_hw_bridge.emulation.faults import ActuatorFault
 from pendulum_hw_bridge.emulation.parameters import load_emulator
 from pendulum_hw_bridge.emulation.x5 import EmulatedX5
 from pendulum_hw_bridge.module_files import backup_emulator, backup_group, restore_emulator, restore_group
-from pendulum_hw_bridge.nudge import EmulatedHand
+from pendulum_hw_bridge.nudge import EmulatedHand, Person, watch_nudge
 from pendulum_hw_bridge.settings import BridgeSettings
 from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.plants.lab_file import load_lab
@@ -188,6 +188,33 @@ def test_lost_feedback_ends_a_proof_with_the_motor_off() -> None:
     assert rig.actuator.strategy is Strategy.OFF
 
 
+@pytest.mark.parametrize(
+    ("fault", "what"), [(ActuatorFault.POSITION_NAN, "position"), (ActuatorFault.EFFORT_NAN, "effort")]
+)
+def test_what_is_no_number_is_told_at_once_and_reaches_no_lab_file(fault: ActuatorFault, what: str) -> None:
+    rig = Rig()
+    rig.actuator.inject(fault)
+    begin_ns = rig.port.now_ns()
+    with pytest.raises(ActuatorError, match=f"{what} is nan"):
+        guided.measure_tare(rig.port, BridgeSettings(), rig.parameters.plant, rig)
+    with pytest.raises(ActuatorError, match=f"{what} is nan"):
+        guided.find_zero_and_sign(rig.port, rig, *rig.hands())
+    with pytest.raises(ActuatorError, match=f"{what} is nan"):
+        guided.prove_lifetime(rig.port, BridgeSettings(), rig)
+    assert rig.port.now_ns() - begin_ns < 10e9
+    assert rig.actuator.strategy is Strategy.OFF
+
+
+def test_a_person_is_told_that_a_turn_was_seen_only_where_it_was() -> None:
+    rig = Rig()
+    said: list[str] = []
+    assert watch_nudge(rig.port, Person(said.append), patience=1.0) == 0.0
+    assert not any("Seen" in sentence for sentence in said)
+    rig.port.push(6.0)
+    assert watch_nudge(rig.port, Person(said.append)) > 0.0
+    assert "Seen" in said[-1]
+
+
 # --- settings of a module, kept and given back ------------------------------------------------------------------
 
 
@@ -233,7 +260,7 @@ def test_gains_safety_parameters_and_m_stop_action_of_a_module_are_given_back(tm
     module = Module(hebi)
     module.state.position_kp, module.state.effort_limit_max, module.state.effort_limit_min = 2.5, 7.0, -7.0
     module.state.mstop_strategy = "HoldPosition"
-    gains, safety = backup_group(module, tmp_path / "before")
+    gains, safety, _ = backup_group(module, tmp_path / "before")
     assert "<kp>2.5" in gains.read_text()
     assert "motor_hold" in safety.read_text()
     module.state.position_kp, module.state.effort_limit_max = 1.5, 1.0

@@ -39,12 +39,14 @@ class EmulatorProcessBackend:
     Args:
         address: ``HOST:PORT``.
         clock: Host clock; feedback is stamped with it on receipt.
+        attempts: How often to ask one that is just starting for its settings, four times a second [-].
     """
 
     name = "emulator_process"
 
-    def __init__(self, address: str, clock: Clock | None = None) -> None:
+    def __init__(self, address: str, clock: Clock | None = None, *, attempts: int = _CONNECT_ATTEMPTS) -> None:
         self._address = wire.parse_address(address)
+        self._attempts = attempts
         self._clock = clock or WallClock()
         self._socket: socket.socket | None = None
         self._strategy = Strategy.OFF
@@ -72,15 +74,15 @@ class EmulatorProcessBackend:
             self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
             self._socket.connect(self._address)
             self._socket.setblocking(False)
-            attempts = _CONNECT_ATTEMPTS
+            attempts = self._attempts
         status = self._request({}, attempts=attempts)
         self._strategy = Strategy(status["strategy"])
         return ActuatorInfo(
             backend=self.name,
-            family="emulated",
+            family=str(status["family"]),
             name=str(status["name"]),
-            serial="X5-9-E0001",
-            firmware="emulated X5-9",
+            serial=str(status["serial"]),
+            firmware=str(status["firmware"]),
             strategy=self._strategy,
             feedback_rate=float(status["feedback_rate"]),
             command_lifetime=float(status["command_lifetime"]),
@@ -169,13 +171,33 @@ class EmulatorProcessBackend:
         try:
             self.stop()
         finally:
-            if self._socket is not None:
-                self._socket.close()
-            self._socket = None
+            self.let_go()
+
+    def let_go(self) -> None:
+        """Let go without stopping: who only looked has nothing to stop, and another may be driving."""
+        if self._socket is not None:
+            self._socket.close()
+        self._socket = None
 
     def status(self) -> dict[str, Any]:
         """Return what the emulator knows of itself, the truth behind the feedback included."""
         return self._request({})
+
+    def configure(self, *, patience: float = _ACKNOWLEDGE, **settings: Any) -> dict[str, Any]:
+        """Change settings as they stand in a packet, asking once; return the emulator's status.
+
+        Args:
+            patience: Time to wait for the acknowledgement [s].
+            settings: ``strategy``, ``gains``, ``limits``, ``command_lifetime`` [s], ``feedback_rate`` [Hz].
+
+        Raises:
+            ActuatorError: Not acknowledged, or refused.
+        """
+        return self._request({"settings": settings}, attempts=1, patience=patience)
+
+    def transmit(self, command: Command) -> None:
+        """Send setpoints as they are: what is wrong with them is for the emulated firmware to find."""
+        self._send(wire.encode_command(command))
 
     def inject(self, *faults: str) -> None:
         """Let faults begin, by name."""

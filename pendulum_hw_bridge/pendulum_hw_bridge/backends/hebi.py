@@ -31,6 +31,7 @@ from pendulum_hw_bridge.actuator import (
     check_lifetime,
 )
 from pendulum_hw_bridge.backends.hebi_discovery import LOOK_TIME, ModuleSelection, discover, select_module
+from pendulum_hw_bridge.backends.hebi_emulated import EmulatedLookup
 from pendulum_hw_bridge.backends.hebi_log import start_log, stop_log
 from pendulum_hw_bridge.backends.hebi_settings import fill_gains, fill_limits, gains_of, limits_of
 from pendulum_hw_bridge.clocks import Clock, WallClock
@@ -38,6 +39,7 @@ from pendulum_hw_bridge.emulation.parameters import load_emulator
 from pendulum_hw_bridge.gains import GainSet
 from pendulum_msgs_py.contract.values import NANOSECONDS
 from pendulum_msgs_py.errors import ParameterError
+from pendulum_msgs_py.plants.lab_file import EMULATED_NETWORK
 
 __all__ = ["HebiBackend", "connect_group", "new_command", "open_lookup"]
 
@@ -104,12 +106,15 @@ def connect_group(wanted: ModuleSelection, interface: str = "", look_time: float
 
 
 def open_lookup(interface: str = "") -> Any:
-    """Return hebi-py's ``Lookup``, on one network address or on all.
+    """Return hebi-py's ``Lookup``, on one network address or on all; on emulators for ``emulator:HOST:PORT``.
 
     Raises:
         ActuatorError: hebi-py is not installed.
+        ParameterError: The address of an emulator is not understood.
     """
     hebi = _import_hebi()
+    if interface.startswith(EMULATED_NETWORK):
+        return EmulatedLookup(interface, hebi)
     return hebi.Lookup([interface]) if interface else hebi.Lookup()
 
 

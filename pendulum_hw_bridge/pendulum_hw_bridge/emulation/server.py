@@ -6,7 +6,7 @@ import math
 import select
 import socket
 from collections.abc import Callable
-from dataclasses import asdict
+from dataclasses import asdict, dataclass
 from typing import Any
 
 from pendulum_hw_bridge.actuator import Strategy
@@ -17,7 +17,7 @@ from pendulum_msgs_py.contract.timing import SteadyWallClock
 from pendulum_msgs_py.contract.values import NANOSECONDS
 from pendulum_msgs_py.errors import ParameterError, PendulumError
 
-__all__ = ["EmulatorServer"]
+__all__ = ["EmulatorIdentity", "EmulatorServer"]
 
 _LEASE = 2.0
 """Time for which a listener gets feedback after its last packet [s]."""
@@ -27,6 +27,25 @@ _UNREACHABLE = {ActuatorFault.COMMANDS_LOST, ActuatorFault.LOCKED_BY_OTHER}
 Address = tuple[str, int]
 
 
+@dataclass(frozen=True)
+class EmulatorIdentity:
+    """What an emulated module says of itself.
+
+    Attributes:
+        family: HEBI family.
+        name: HEBI name; empty for that of its plant.
+        serial: Serial number.
+        type: Mechanical type.
+        firmware: Firmware revision.
+    """
+
+    family: str = "emulated"
+    name: str = ""
+    serial: str = "X5-9-E0001"
+    type: str = "X5-9"
+    firmware: str = "emulated"
+
+
 class EmulatorServer:
     """Serves one emulated actuator.
 
@@ -34,13 +53,21 @@ class EmulatorServer:
         actuator: The actuator; its clock must start at the present of ``clock``.
         address: Host and port to listen on; port 0 takes any.
         clock: Wall time [ns].
+        identity: What it says of itself.
 
     Raises:
         PendulumError: The address is in use or not ours.
     """
 
-    def __init__(self, actuator: EmulatedX5, address: Address, clock: Callable[[], int] | None = None) -> None:
+    def __init__(
+        self,
+        actuator: EmulatedX5,
+        address: Address,
+        clock: Callable[[], int] | None = None,
+        identity: EmulatorIdentity | None = None,
+    ) -> None:
         self.actuator = actuator
+        self._identity = identity or EmulatorIdentity()
         self._clock = clock or SteadyWallClock()
         self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         try:
@@ -150,7 +177,8 @@ class EmulatorServer:
     def _status(self) -> dict[str, Any]:
         actuator = self.actuator
         return {
-            "name": actuator.parameters.plant.name,
+            **asdict(self._identity),
+            "name": self._identity.name or actuator.parameters.plant.name,
             "strategy": int(actuator.strategy),
             "feedback_rate": actuator.feedback_rate,
             "command_lifetime": actuator.command_lifetime,

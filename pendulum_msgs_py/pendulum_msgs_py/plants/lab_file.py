@@ -29,12 +29,23 @@ from typing import Any
 from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.parameters import dump_yaml, load_yaml, reject_unknown, require_mapping
 
-__all__ = ["EMULATED_BACKENDS", "FORMAT", "LAB_ENTRIES", "LabEntry", "LabFile", "load_lab", "write_lab"]
+__all__ = [
+    "EMULATED_BACKENDS",
+    "EMULATED_NETWORK",
+    "FORMAT",
+    "LAB_ENTRIES",
+    "LabEntry",
+    "LabFile",
+    "load_lab",
+    "write_lab",
+]
 
 FORMAT = "pendulum_lab/1"
 EMULATED_BACKENDS = frozenset({"emulator", "emulator_process"})
 """Backends of the bridge behind which a pendulum is emulated: it may be pushed, and started again with nobody asked.
 Any other name is a machine, since what is taken for an emulator by mistake moves by itself."""
+EMULATED_NETWORK = "emulator:"
+"""What ``interface`` begins with where backend ``hebi`` finds emulators in place of modules: ``emulator:HOST:PORT``."""
 _HEADER = """\
 # Lab file: read by bridge, check, scan, lab, launch files and `experiment --hardware hebi --lab FILE`.
 # The guided procedures of `python -m pendulum_hw_bridge lab` rewrite it; remarks of your own go under `notes`.
@@ -141,6 +152,13 @@ class LabFile:
     def proved(self, procedure: str, date: str, result: str) -> LabFile:
         """Return the lab with the result of a guided procedure."""
         return replace(self, proofs={**self.proofs, procedure: {"date": date, "result": result}})
+
+    @property
+    def emulated(self) -> bool:
+        """Whether a pendulum is emulated behind it: an emulator, or HEBI's network with emulators on it."""
+        backend = self.values.get("backend", "hebi")
+        on_network = backend == "hebi" and str(self.values.get("interface", "")).startswith(EMULATED_NETWORK)
+        return on_network or backend in EMULATED_BACKENDS
 
     def describe(self) -> str:
         """Return which actuator it is, in a few words, for a question to the operator."""

@@ -1,16 +1,16 @@
-"""``python -m pendulum_bags move``: bring a running pendulum upright or down, and say each step before it is taken."""
+"""``python -m pendulum_bags move``: bring a running pendulum upright, down or to an angle, and stop it."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from pendulum_msgs_py.contract import names
 from pendulum_msgs_py.contract.trajectory import thesis_ramp
-from pendulum_msgs_py.errors import FaultError
+from pendulum_msgs_py.errors import FaultError, ParameterError
 from pendulum_msgs_py.programs.executables import EXIT_INTERRUPTED, cli_main
 
 if TYPE_CHECKING:
@@ -18,15 +18,24 @@ if TYPE_CHECKING:
 
 __all__ = ["app", "main"]
 
+_STOPS = {
+    "stop": (names.E_STOP, "e-stop, latched; end it with: move reset"),
+    "reset": (names.E_STOP_RESET, "e-stop ended; the plant is disarmed"),
+}
+"""Goals that are no place: service of the plant, and what is said then."""
 _PATIENCE = 20.0
 """Longest wait for a node that is to answer [s]."""
 
 app = typer.Typer(add_completion=False, rich_markup_mode=None)
 
 
-@app.command(epilog="Example: python -m pendulum_bags move upright --namespace /sim")
+@app.command(
+    epilog="Example: python -m pendulum_bags move upright --namespace /sim",
+    # A negative angle is no option.
+    context_settings={"ignore_unknown_options": True},
+)
 def move(
-    goal: Annotated[Literal["upright", "down"], typer.Argument(help="Where to.")],
+    goal: Annotated[str, typer.Argument(help="upright, down, an angle [rad]; or stop (latches the e-stop), reset.")],
     namespace: Annotated[str, typer.Option(help="Of the plant.")] = "/sim",
     control: Annotated[
         bool, typer.Option(help="upright: let the controller take over at the end. Without it the plant holds.")
@@ -36,20 +45,28 @@ def move(
     """Move a pendulum under position control along the thesis's ramp: at most 0.3 rad/s.
 
     The controller is deactivated and the plant armed where that is not so. At the end of `upright` the controller is
-    activated and takes over from position control; at the end of `down` the plant is disarmed. Ctrl-C disarms it.
+    activated and takes over from position control; at the end of `down` the plant is disarmed; at an angle it holds.
+    Ctrl-C disarms it. `stop` latches the plant's e-stop, and `reset` ends it without arming. It goes by way of the
+    network and this computer: the motion stop of a real machine comes first.
     """
     from pendulum_bags.experiments.conductor_node import Conductor, PlantClient
     from pendulum_bags.experiments.domain import check_domain
 
+    place = goal if goal in {*_STOPS, "upright", "down"} else _angle(goal)
     with Conductor(check_domain(domain) or 0) as conductor:
         node = _find_plant(conductor, namespace)
+        if place in _STOPS:
+            service, said = _STOPS[str(place)]
+            PlantClient(conductor, namespace, node, watch=False).call(f"{node}/{service.removeprefix('~/')}")
+            print(f"{namespace}: {said}", flush=True)
+            return 0
         plant = PlantClient(conductor, namespace, node)
         plant.wait_until_ready(_PATIENCE, controller=False, disturbance=False)
         # What is on the graph by then has been met: the plant's own services are no older.
         conductor.spin(0.5)
         controlled = plant.has_controller()
         try:
-            _move(plant, goal, controlled=controlled, control=control)
+            _move(plant, place, controlled=controlled, control=control)
         except KeyboardInterrupt:
             plant.disarm_quietly()
             print(f"{namespace} is disarmed", flush=True)
@@ -60,12 +77,26 @@ def move(
     return 0
 
 
-def _move(plant: PlantClient, goal: str, *, controlled: bool, control: bool) -> None:
+def _angle(text: str) -> float:
+    """Return the angle that a goal is [rad]."""
+    try:
+        angle = float(text)
+    except ValueError:
+        angle = math.nan
+    if not math.isfinite(angle):
+        raise ParameterError(f"goal is {text!r}; expected upright, down, stop, reset, or an angle in rad, such as 0.3")
+    return angle
+
+
+def _move(plant: PlantClient, goal: str | float, *, controlled: bool, control: bool) -> None:
     assert plant.sample is not None
     where, space = plant.sample.position, plant.namespace
-    # The nearest turn's goal, so that nobody winds a cable up.
-    turns = round((where - (math.pi if goal == "upright" else 0.0)) / (2 * math.pi))
-    end = 2 * math.pi * turns + (math.pi if goal == "upright" else 0.0)
+    if isinstance(goal, float):
+        end = goal
+    else:
+        # The nearest turn's goal, so that nobody winds a cable up.
+        turns = round((where - (math.pi if goal == "upright" else 0.0)) / (2 * math.pi))
+        end = 2 * math.pi * turns + (math.pi if goal == "upright" else 0.0)
     ramp = thesis_ramp(where, end)
     duration = ramp.duration
     if not plant.is_armed():
@@ -76,7 +107,7 @@ def _move(plant: PlantClient, goal: str, *, controlled: bool, control: bool) -> 
         print(f"{space}: arming; it holds where it is", flush=True)
         plant.arm()
     print(f"{space}: moving from {where:.2f} to {end:.2f} rad in {duration:.0f} s, at most 0.3 rad/s", flush=True)
-    plant.follow(ramp, f"move_{goal}")
+    plant.follow(ramp, "move" if isinstance(goal, float) else f"move_{goal}")
     wait = plant.conductor.wait_for
     wait(f"{space} to follow the ramp", plant.is_following, _PATIENCE)
     # A controller that is awake at the end would take over there; until now it may have held the pendulum.
@@ -87,6 +118,9 @@ def _move(plant: PlantClient, goal: str, *, controlled: bool, control: bool) -> 
     if goal == "down":
         print(f"{space}: down; disarming", flush=True)
         plant.disarm()
+    elif isinstance(goal, float):
+        assert plant.sample is not None
+        print(f"{space}: at {plant.sample.position:.2f} rad; held under position control", flush=True)
     elif controlled and control:
         print(f"{space}: upright; activating the controller", flush=True)
         plant.switch_controller(on=True)

@@ -45,13 +45,18 @@ class RealMachine:
 
     def log_parameters(self, bag: Path | None) -> dict[str, ParameterArgument]:
         """Return what makes hebi-py write its own log beside a bag; nothing for an emulator, which has none."""
-        if bag is None or self.lab.values["backend"] != "hebi":
+        if bag is None or self.emulated or self.lab.values["backend"] != "hebi":
             return {}
         return {"hebi_log": str(bag.resolve().with_suffix(".hebilog"))}
 
     @property
     def emulated(self) -> bool:
-        """Whether the lab file names an emulator: a rehearsal."""
+        """Whether the lab file names an emulator, or HEBI's network with emulators on it: a rehearsal."""
+        return self.lab.emulated
+
+    @property
+    def patient(self) -> bool:
+        """Whether the bridge may be told to wait for a busy computer: not where it keeps a real machine's limits."""
         return self.lab.values["backend"] in EMULATED_BACKENDS
 
     @property

@@ -153,7 +153,7 @@ class RegulationSettings:
         machine = self.machine
         if machine is None:
             return graph.bridge("/hw", backend=self.hardware, effort_strategy=self.strategy, **patience)
-        told = machine.bridge_parameters(**(patience if machine.emulated else {}))
+        told = machine.bridge_parameters(**(patience if machine.patient else {}))
         return graph.bridge("/hw", **told, **machine.log_parameters(bag), effort_strategy=self.strategy)
 
     def arguments(self) -> list[str]:

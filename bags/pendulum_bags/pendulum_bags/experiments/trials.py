@@ -129,7 +129,7 @@ class TrialSettings:
                 "feedback_watchdog": EMULATOR_WATCHDOG,
                 "command_lifetime": EMULATOR_LIFETIME,
             }
-            told = machine.bridge_parameters(**(patience if machine.emulated else {}))
+            told = machine.bridge_parameters(**(patience if machine.patient else {}))
             return graph.bridge("/hw", **told, **machine.log_parameters(bag), effort_strategy="direct_pwm")
         parameters: dict[str, graph.ParameterArgument] = {"plant": self.plant, "effort_strategy": "direct_pwm"}
         if self.hardware == "emulator":

@@ -1,0 +1,318 @@
+"""HEBI's network with emulated modules on it, for rehearsals: ``interface`` is ``emulator:HOST:PORT[,HOST:PORT...]``.
+
+The backend ``hebi`` then runs as it is, with hebi-py's own commands and files, and only hebi-py's ``Lookup`` and
+``Group`` are ours: they speak to emulators in processes of their own. What is not imitated: the search by broadcast,
+the library's thread that asks for feedback, its feedback objects and its log, and the firmware's own checks of
+settings.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import ipaddress
+import math
+import socket
+from dataclasses import dataclass
+from functools import cache
+from types import SimpleNamespace
+from typing import Any
+
+from pendulum_hw_bridge.actuator import ActuatorError, Command, Feedback, MStopAction, Strategy
+from pendulum_hw_bridge.backends.emulator_process import EmulatorProcessBackend
+from pendulum_hw_bridge.emulation import wire
+from pendulum_hw_bridge.gains import GAIN_FIELDS, LOOPS
+from pendulum_msgs_py.contract.values import NANOSECONDS
+from pendulum_msgs_py.plants.lab_file import EMULATED_NETWORK
+
+__all__ = ["EmulatedEntry", "EmulatedGroup", "EmulatedLookup"]
+
+_LOOK_ATTEMPTS = 2
+_MOTOR_OFF = 2
+_M_STOP = (MStopAction.DISABLED, MStopAction.MOTOR_OFF, MStopAction.HOLD_POSITION)
+"""M-stop actions by hebi-py's number."""
+_THEIRS = {
+    "winding_current": "motor_winding_current",
+    "winding_temperature": "motor_winding_temperature",
+    "housing_temperature": "motor_housing_temperature",
+}
+
+
+@dataclass(frozen=True)
+class EmulatedEntry:
+    """A line of the lookup, with the names of hebi-py's.
+
+    Attributes:
+        family: HEBI family.
+        name: HEBI name.
+        mac_address: Made of the address: an emulator has no network card.
+        ip_address: Where it listens.
+        is_stale: Whether it has answered and does so no more.
+        where: ``HOST:PORT``.
+    """
+
+    family: str
+    name: str
+    mac_address: str
+    ip_address: str
+    is_stale: bool
+    where: str
+
+
+class EmulatedLookup:
+    """Stands for hebi-py's ``Lookup``.
+
+    Args:
+        interface: ``emulator:HOST:PORT``, or several with commas between.
+        hebi: The library.
+
+    Raises:
+        ParameterError: An address is not understood.
+    """
+
+    def __init__(self, interface: str, hebi: Any) -> None:
+        self._hebi = hebi
+        self._addresses = interface.removeprefix(EMULATED_NETWORK).split(",")
+        for address in self._addresses:
+            wire.parse_address(address)
+        self._seen: dict[str, EmulatedEntry] = {}
+
+    @property
+    def entrylist(self) -> list[EmulatedEntry]:
+        """Modules that answer, or have answered."""
+        entries = []
+        for where in self._addresses:
+            port = EmulatorProcessBackend(where, attempts=_LOOK_ATTEMPTS)
+            try:
+                port.connect()
+                self._seen[where] = _entry(where, port.status())
+            except ActuatorError:
+                if where in self._seen:
+                    entries.append(EmulatedEntry(**{**vars(self._seen[where]), "is_stale": True}))
+            else:
+                entries.append(self._seen[where])
+            finally:
+                port.let_go()
+        return entries
+
+    def get_group_from_macs(self, addresses: list[str], timeout_ms: float) -> EmulatedGroup | None:
+        """Return the group of the module with an address, or None where none answers."""
+        for entry in self._seen.values():
+            if entry.mac_address in addresses:
+                try:
+                    return EmulatedGroup(entry.where, self._hebi)
+                except ActuatorError:
+                    return None
+        return None
+
+
+class EmulatedGroup:
+    """Stands for hebi-py's ``Group`` of one module.
+
+    Args:
+        where: ``HOST:PORT`` of an emulator.
+        hebi: The library.
+
+    Raises:
+        ActuatorError: It does not answer.
+    """
+
+    size = 1
+
+    def __init__(self, where: str, hebi: Any) -> None:
+        self._hebi = hebi
+        self._port = EmulatorProcessBackend(where, attempts=_LOOK_ATTEMPTS)
+        self._port.connect()
+        self._strategy = Strategy.OFF
+        self._status: dict[str, Any] = {}
+        self._note(self._port.status())
+
+    def __del__(self) -> None:
+        """Let the socket go, as the library lets its group go."""
+        if "_port" in self.__dict__:
+            self._port.let_go()
+
+    @property
+    def command_lifetime(self) -> int:
+        """Command lifetime [ms]."""
+        return round(1000.0 * float(self._status["command_lifetime"]))
+
+    @command_lifetime.setter
+    def command_lifetime(self, milliseconds: int) -> None:
+        self._configure(500.0, command_lifetime=1e-3 * milliseconds)
+
+    @property
+    def feedback_frequency(self) -> float:
+        """Feedback records per second [Hz]."""
+        return float(self._status["feedback_rate"])
+
+    @feedback_frequency.setter
+    def feedback_frequency(self, rate: float) -> None:
+        self._configure(500.0, feedback_rate=rate)
+
+    def send_command(self, command: Any) -> bool:
+        """Send what a command asks for; nobody says whether it came."""
+        settings = self._settings_of(command)
+        if settings:
+            with contextlib.suppress(ActuatorError):
+                self._configure(0.0, **settings)
+        try:
+            self._send_setpoints(command)
+        except ActuatorError:
+            return False
+        return True
+
+    def send_command_with_acknowledgement(self, command: Any, timeout_ms: float) -> bool:
+        """Send what a command asks for, and tell whether the module said so in time."""
+        try:
+            self._configure(timeout_ms, **self._settings_of(command))
+            self._send_setpoints(command)
+        except ActuatorError:
+            return False
+        return True
+
+    def get_next_feedback(self, timeout_ms: float, reuse_fbk: Any = None) -> Any:
+        """Return the newest record under hebi-py's names, or None where none comes in time."""
+        record = self._port.read(1e-3 * timeout_ms)
+        return None if record is None else _feedback(record)
+
+    def request_info(self, timeout_ms: float) -> Any:
+        """Return all settings in one of hebi-py's own commands, or None where the module does not answer."""
+        try:
+            self._note(self._port.configure(patience=1e-3 * timeout_ms))
+        except ActuatorError:
+            return None
+        return _Info(self._status, self._hebi)
+
+    def start_log(self, directory: str, name: str) -> str:
+        """Refuse: hebi-py logs what its own network brings."""
+        raise OSError(f"{directory}/{name}: hebi-py logs real modules only")
+
+    def stop_log(self) -> None:
+        """Nothing was begun."""
+
+    # --- inside ---------------------------------------------------------------------------------------------
+
+    def _note(self, status: dict[str, Any]) -> None:
+        self._status = status
+        self._strategy = Strategy(status["strategy"])
+
+    def _configure(self, timeout_ms: float, **settings: Any) -> None:
+        self._note(self._port.configure(patience=1e-3 * timeout_ms, **settings))
+
+    def _send_setpoints(self, command: Any) -> None:
+        """Send the setpoints that a command has, if any."""
+        has = {name: _holds(command, name, self._hebi) for name in ("position", "velocity", "effort")}
+        if not any(has.values()):
+            return
+        values = {name: float(getattr(command, name)[0]) if held else math.nan for name, held in has.items()}
+        # Under direct PWM the effort field carries the duty.
+        direct = self._strategy is Strategy.DIRECT_PWM
+        self._port.transmit(
+            Command(
+                values["position"],
+                values["velocity"],
+                math.nan if direct else values["effort"],
+                values["effort"] if direct else math.nan,
+            )
+        )
+
+    def _settings_of(self, command: Any) -> dict[str, Any]:
+        """Return the settings that a command has, as they stand in a packet to the emulator."""
+        settings: dict[str, Any] = {}
+        if _holds(command, "control_strategy", self._hebi):
+            settings["strategy"] = int(command.control_strategy[0])
+        limits = self._limits_of(command)
+        if limits:
+            settings["limits"] = _finite({**self._status["limits"], **limits})
+        gains = {
+            loop: {
+                name: float(getattr(command, f"{loop}_{name}")[0])
+                for name in GAIN_FIELDS
+                if _holds(command, f"{loop}_{name}", self._hebi)
+            }
+            for loop in LOOPS
+        }
+        if any(gains.values()):
+            now = self._status["gains"]
+            merged = {loop: _finite({**now[loop], **given}) for loop, given in gains.items()}
+            settings["gains"] = {"strategy": now["strategy"], **merged}
+        return settings
+
+    def _limits_of(self, command: Any) -> dict[str, Any]:
+        limits: dict[str, Any] = {}
+        for name in ("effort", "velocity"):
+            if _holds(command, f"{name}_limit_max", self._hebi):
+                limits[name] = float(getattr(command, f"{name}_limit_max")[0])
+        for end in ("min", "max"):
+            if _holds(command, f"position_limit_{end}", self._hebi):
+                value = float(getattr(command, f"position_limit_{end}")[0])
+                # What is no number changes nothing here; what a real module makes of it, nobody says.
+                limits |= {} if math.isnan(value) else {f"position_{end}": value}
+        if _holds(command, "mstop_strategy", self._hebi):
+            limits["m_stop"] = _M_STOP[int(command.mstop_strategy[0])].value
+        return limits
+
+
+class _Info:
+    """Settings in one of hebi-py's own commands, and who the module is, under the names of its ``GroupInfo``."""
+
+    def __init__(self, status: dict[str, Any], hebi: Any) -> None:
+        self.family, self.name = [status["family"]], [status["name"]]
+        self.serial, self.mechanical_type = [status["serial"]], [status["type"]]
+        self.firmware_revision = [status["firmware"]]
+        settings = self._settings = hebi.GroupCommand(1)
+        settings.control_strategy = int(status["strategy"])
+        gains = wire.gains_from_json(status["gains"])
+        for loop in LOOPS:
+            for name in GAIN_FIELDS:
+                value = getattr(gains.loop(loop), name)
+                setattr(settings, f"{loop}_{name}", bool(value) if name == "d_on_error" else value)
+        limits = wire.limits_from_json(status["limits"])
+        settings.effort_limit_min, settings.effort_limit_max = -limits.effort, limits.effort
+        settings.velocity_limit_min, settings.velocity_limit_max = -limits.velocity, limits.velocity
+        settings.position_limit_min, settings.position_limit_max = limits.position_min, limits.position_max
+        settings.mstop_strategy = _M_STOP.index(limits.m_stop)
+        settings.min_position_limit_strategy = settings.max_position_limit_strategy = _MOTOR_OFF
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._settings, name)
+
+
+@cache
+def _bits(name: str, hebi: Any) -> tuple[int, ...]:
+    """Return the bits by which hebi-py notes that a command has a field: where none is given, many read as 0."""
+    probe = hebi.GroupCommand(1)
+    setattr(probe, name, True if name.endswith("d_on_error") else 1)
+    return tuple(int(probe.refs[0].message_bitfield_[word]) for word in range(3))
+
+
+def _holds(command: Any, name: str, hebi: Any) -> bool:
+    given = command.refs[0].message_bitfield_
+    return all(int(given[word]) & bits == bits for word, bits in enumerate(_bits(name, hebi)))
+
+
+def _finite(settings: dict[str, Any]) -> dict[str, Any]:
+    """Return settings without open ends, which have no place in a packet: what is left out is open."""
+    return {name: value for name, value in settings.items() if isinstance(value, str) or math.isfinite(value)}
+
+
+def _entry(where: str, status: dict[str, Any]) -> EmulatedEntry:
+    host, number = wire.parse_address(where)
+    packed = ipaddress.IPv4Address(socket.gethostbyname(host)).packed[2:] + number.to_bytes(2, "big")
+    # Locally administered, so that it is no real card's.
+    mac = ":".join(f"{part:02X}" for part in (0x02, 0x00, *packed))
+    return EmulatedEntry(status["family"], status["name"], mac, where, False, where)
+
+
+def _feedback(record: Feedback) -> Any:
+    values = {_THEIRS.get(name, name): value for name, value in record._asdict().items()}
+    values |= {
+        "receive_time_us": record.stamp_ns * 1_000_000 // NANOSECONDS,
+        "hardware_transmit_time_us": record.hardware_ns * 1_000_000 // NANOSECONDS,
+        "mstop_state": int(not record.m_stop),
+        "command_lifetime_state": int(record.lock),
+        "position_limit_state": int(record.position_limit),
+        "velocity_limit_state": int(record.velocity_limit),
+        "effort_limit_state": int(record.effort_limit),
+    }
+    return SimpleNamespace(**{name: [value] for name, value in values.items()})
