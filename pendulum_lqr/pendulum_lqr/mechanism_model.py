@@ -14,7 +14,7 @@ import cmath
 from collections.abc import Sequence
 
 import numpy as np
-import scipy.linalg
+import scipy
 from numpy.typing import ArrayLike
 
 from pendulum_lqr.design import DesignError, Gain, cost_matrices, no_solution, require_controllable
