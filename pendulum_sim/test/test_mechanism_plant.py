@@ -167,6 +167,8 @@ def test_effort_is_clamped_delayed_and_lags() -> None:
     assert efforts[-1] == pytest.approx((0.0, expected))
 
 
+# Compiles for five seconds of a free core.
+@pytest.mark.timeout(300)
 def test_compiled_steps_are_those_of_python() -> None:
     plants = [MechanismPlant(load_mechanism("acrobot"), 2e-3, compiled=compiled) for compiled in (False, True)]
     for plant in plants:
