@@ -1,0 +1,88 @@
+"""The judge of the live faults: what a motor did against what had rightfully been asked for."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+from pathlib import Path
+
+import pytest
+
+from pendulum_hw_bridge.actuator import Command, Strategy
+from pendulum_hw_bridge.emulation.parameters import load_emulator
+from pendulum_hw_bridge.emulation.truth_log import TruthLog
+from pendulum_hw_bridge.emulation.x5 import EmulatedX5
+from pendulum_msgs_py.errors import PendulumError
+from tests.faults.motor import Asked, Drive, ModuleTruth, beyond_asked, driving_torque
+
+MS = 1_000_000
+LIMIT = 5.0
+COMMANDS = [Asked(10 * MS * number, 1.0) for number in range(100)]
+DISTURBANCES = [Asked(10 * MS * number, -2.0) for number in range(100)]
+
+
+def excess(time_ms: float, torque: float, commands: list[Asked], disturbances: list[Asked]) -> float:
+    return beyond_asked([Drive(round(time_ms * MS), torque)], commands, disturbances, LIMIT).torque
+
+
+@pytest.mark.parametrize(
+    ("torque", "beyond"), [(1.0, 0.0), (1.19, 0.0), (-2.19, 0.0), (0.0, 0.0), (5.0, 3.8), (-5.0, 2.8)]
+)
+def test_a_motor_may_drive_as_controller_and_disturbance_asked_and_no_further(torque: float, beyond: float) -> None:
+    assert excess(500.0, torque, COMMANDS, DISTURBANCES) == pytest.approx(beyond)
+
+
+def test_nothing_is_right_long_after_the_last_command_or_by_a_disturbance_alone() -> None:
+    assert excess(990 + 129, 1.0, COMMANDS, []) == 0.0
+    assert excess(990 + 131, 1.0, COMMANDS, []) == pytest.approx(0.8)
+    assert excess(500.0, -1.0, [], DISTURBANCES) == pytest.approx(0.8)
+    assert excess(500.0, 1.0, [Asked(600 * MS, 1.0)], []) == pytest.approx(0.8)
+    assert excess(500.0, 0.0, [], []) == 0.0
+
+
+def test_the_limit_holds_whatever_was_asked_for_and_the_worst_instant_is_told() -> None:
+    commands = [Asked(500 * MS, 100.0)]
+    drives = [Drive(505 * MS, 5.1), Drive(510 * MS, 7.2), Drive(515 * MS, 6.2)]
+    when, torque = beyond_asked(drives, commands, [], LIMIT)
+    assert when == 510 * MS
+    assert torque == pytest.approx(2.0)
+
+
+def test_a_motor_that_is_turned_brakes_and_drives_with_what_its_duty_makes_at_most() -> None:
+    assert driving_torque(0.1, -3.0, 40.0) == 0.0
+    assert driving_torque(0.1, 9.0, 40.0) == pytest.approx(4.0)
+    assert driving_torque(-0.1, -3.0, 40.0) == pytest.approx(-3.0)
+    assert driving_torque(0.0, 3.0, 40.0) == 0.0
+
+
+def test_the_truth_of_an_emulator_is_on_file_each_millisecond_and_read_as_far_as_it_goes(tmp_path: Path) -> None:
+    path = tmp_path / "truth.csv"
+    truth = ModuleTruth(path)
+    assert truth.read() == []
+    actuator = EmulatedX5(load_emulator("thesis"))
+    actuator.configure(strategy=Strategy.DIRECT_PWM, command_lifetime=0.05)
+    with TruthLog(path) as log:
+        actuator.trace = log.note
+        actuator.deliver(Command(pwm=0.1), 0)
+        actuator.advance_to(20 * MS)
+        first = truth.read()
+        steps = [after.time_ns - before.time_ns for before, after in pairwise(first)]
+        assert first[-1].time_ns == 20 * MS
+        assert max(first[0].time_ns, *steps) <= MS
+        assert all(drive.torque > 1.0 for drive in first if drive.time_ns > 3 * MS)
+        actuator.advance_to(100 * MS)
+    second = truth.read()
+    assert second[-1] == Drive(100 * MS, 0.0)
+    # The command lifetime, by the motor's own clock.
+    assert max(drive.time_ns for drive in second if drive.torque != 0.0) == 50 * MS
+    # A line that is still being written waits for its end.
+    with path.open("a", encoding="ascii") as file:
+        file.write("101000000,0.0,0.0,1.0,")
+        file.flush()
+        assert truth.read() == []
+        file.write("0.5\n")
+    assert truth.read() == [Drive(101 * MS, 1.0)]
+
+
+def test_a_truth_that_cannot_be_written_is_a_sentence(tmp_path: Path) -> None:
+    with pytest.raises(PendulumError, match=r"truth of the emulator cannot be written to .*: No such file"):
+        TruthLog(tmp_path / "nowhere" / "truth.csv")
