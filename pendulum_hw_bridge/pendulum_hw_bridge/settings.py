@@ -5,7 +5,8 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, field
 
-from pendulum_hw_bridge.actuator import ActuatorError, ActuatorPort, HardwareLimits, check_lifetime
+from pendulum_hw_bridge.actuator import ActuatorError, ActuatorPort, HardwareLimits
+from pendulum_hw_bridge.command_check import check_lifetime
 from pendulum_hw_bridge.gains import GainSet, differing_gain
 
 __all__ = ["BridgeSettings", "write_settings"]

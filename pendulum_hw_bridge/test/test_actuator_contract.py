@@ -14,7 +14,6 @@ from pendulum_hw_bridge.actuator import (
     Feedback,
     HardwareLimits,
     Strategy,
-    check_command,
 )
 from pendulum_hw_bridge.backends.emulator import EmulatorBackend
 from pendulum_hw_bridge.backends.emulator_process import EmulatorProcessBackend
@@ -22,6 +21,7 @@ from pendulum_hw_bridge.backends.hebi import HebiBackend
 from pendulum_hw_bridge.backends.hebi_emulated import EmulatedGroup
 from pendulum_hw_bridge.backends.replay import FeedbackRecording, ReplayBackend
 from pendulum_hw_bridge.clocks import SteppedClock
+from pendulum_hw_bridge.command_check import check_command
 from pendulum_hw_bridge.emulation.parameters import load_emulator
 from pendulum_hw_bridge.emulation.server import EmulatorServer
 from pendulum_hw_bridge.emulation.x5 import EmulatedX5

@@ -14,9 +14,9 @@ from pendulum_hw_bridge.actuator import (
     Feedback,
     HardwareLimits,
     Strategy,
-    check_command,
 )
 from pendulum_hw_bridge.bridge import Bridge, BridgeSettings
+from pendulum_hw_bridge.command_check import check_command
 from pendulum_hw_bridge.effort_mapping import EffortMapping, EffortStrategy
 from pendulum_hw_bridge.gains import GainSet
 from pendulum_hw_bridge.safety import SafetyLimits, SafetyMonitor

@@ -17,10 +17,9 @@ from pendulum_hw_bridge.actuator import (
     Feedback,
     HardwareLimits,
     Strategy,
-    check_command,
-    check_lifetime,
 )
 from pendulum_hw_bridge.clocks import Clock, WallClock
+from pendulum_hw_bridge.command_check import check_command, check_lifetime
 from pendulum_hw_bridge.emulation.faults import ActuatorFault
 from pendulum_hw_bridge.emulation.parameters import TimingParameters, load_emulator
 from pendulum_hw_bridge.emulation.x5 import EmulatedX5

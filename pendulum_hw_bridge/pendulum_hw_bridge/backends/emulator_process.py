@@ -16,10 +16,9 @@ from pendulum_hw_bridge.actuator import (
     Feedback,
     HardwareLimits,
     Strategy,
-    check_command,
-    check_lifetime,
 )
 from pendulum_hw_bridge.clocks import Clock, WallClock
+from pendulum_hw_bridge.command_check import check_command, check_lifetime
 from pendulum_hw_bridge.emulation import wire
 from pendulum_hw_bridge.gains import GainSet
 from pendulum_msgs_py.contract.values import NANOSECONDS

@@ -27,14 +27,13 @@ from pendulum_hw_bridge.actuator import (
     LimitState,
     Strategy,
     TemperatureState,
-    check_command,
-    check_lifetime,
 )
 from pendulum_hw_bridge.backends.hebi_discovery import LOOK_TIME, ModuleSelection, discover, select_module
 from pendulum_hw_bridge.backends.hebi_emulated import EmulatedLookup
 from pendulum_hw_bridge.backends.hebi_log import start_log, stop_log
 from pendulum_hw_bridge.backends.hebi_settings import fill_gains, fill_limits, gains_of, limits_of
 from pendulum_hw_bridge.clocks import Clock, WallClock
+from pendulum_hw_bridge.command_check import check_command, check_lifetime
 from pendulum_hw_bridge.emulation.parameters import load_emulator
 from pendulum_hw_bridge.gains import GainSet
 from pendulum_msgs_py.contract.values import NANOSECONDS

@@ -25,12 +25,11 @@ from pendulum_hw_bridge.actuator import (
     Feedback,
     HardwareLimits,
     Strategy,
-    check_command,
-    check_lifetime,
 )
 from pendulum_hw_bridge.backends.bag_feedback import read_bag_feedback
 from pendulum_hw_bridge.backends.hebi_log import read_hebilog
 from pendulum_hw_bridge.clocks import Clock, WallClock
+from pendulum_hw_bridge.command_check import check_command, check_lifetime
 from pendulum_hw_bridge.gains import GainSet
 from pendulum_msgs_py.contract.values import NANOSECONDS
 from pendulum_msgs_py.errors import DataError, ParameterError
