@@ -50,7 +50,7 @@ def equivalence(data: ReportData) -> Figure:
     names = [test.quantity for test in tests]
     reach = max(1.3, *(abs(value) * 1.08 for test in tests for value in _relative(test)))
     panel = Panel(
-        "difference in margins: ±1 is the margin",
+        "difference [margins]",
         "",
         traces,
         marks=[Mark(-1.0, "x", "−margin"), Mark(1.0, "x", "+margin"), Mark(0.0, "x")],
