@@ -103,10 +103,13 @@ class ProcessGroup:
     Args:
         folder: Where their output is kept.
         cwd: Folder to start them in.
+
+    Attributes:
+        folder: The first argument.
     """
 
     def __init__(self, folder: Path, cwd: Path) -> None:
-        self._folder = folder
+        self.folder = folder
         self._cwd = cwd
         self._mark = uuid.uuid4().hex
         self._programs: list[RunningProgram] = []
@@ -144,9 +147,9 @@ class ProcessGroup:
         typed: bool = False,
     ) -> RunningProgram:
         """Start any command in a process group of its own."""
-        self._folder.mkdir(parents=True, exist_ok=True)
+        self.folder.mkdir(parents=True, exist_ok=True)
         name = name or Path(command[0]).name
-        log = self._folder / f"{len(self._programs):02}_{re.sub(r'[^A-Za-z0-9]+', '_', name)}.log"
+        log = self.folder / f"{len(self._programs):02}_{re.sub(r'[^A-Za-z0-9]+', '_', name)}.log"
         environment = {**os.environ, "PYTHONUNBUFFERED": "1", **(env or {}), _MARK: self._mark}
         with log.open("wb") as sink:
             popen = subprocess.Popen(

@@ -7,10 +7,14 @@ import time
 from collections.abc import Iterator
 
 import pytest
+from builtin_interfaces.msg import Duration
+from diagnostic_msgs.msg import DiagnosticArray
+from rclpy.duration import Duration as RclpyDuration
 from sensor_msgs.msg import JointState
 from std_srvs.srv import SetBool, Trigger
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
+from pendulum_msgs_py.contract import names
 from pendulum_msgs_py.contract.names import JOINT
 from pendulum_msgs_py.ros import qos
 from tests.integration.test_bridge_processes import Lab
@@ -77,6 +81,48 @@ def test_the_e_stop_answers_while_the_bridge_waits_for_a_module_that_does_not_an
     assert not arming.result().success
     assert not lab.call(SetBool, "bridge/arm", SetBool.Request(data=True)).success
     lab.until(lambda: lab.truth.status()["strategy"] == 0, "a drive that is off")
+
+
+def test_a_trajectory_that_comes_while_the_bridge_arms_is_refused_and_moves_nothing(lab: Lab) -> None:
+    told: list[dict[str, str]] = []
+    lab.node.create_subscription(
+        DiagnosticArray,
+        names.DIAGNOSTICS,
+        lambda message: told.extend({pair.key: pair.value for pair in each.values} for each in message.status),
+        qos.DIAGNOSTICS,
+    )
+    lab.bridge()
+    publisher = lab.node.create_publisher(JointTrajectory, "joint_trajectory", qos.TRAJECTORY)
+    arm = lab.node.create_client(SetBool, "bridge/arm")
+    lab.until(lambda: arm.service_is_ready() and publisher.get_subscription_count(), "the bridge", 60.0)
+    move = JointTrajectory(joint_names=[names.JOINT])
+    move.points = [JointTrajectoryPoint(positions=[3.0], time_from_start=Duration(sec=1))]
+
+    def came_while_it_armed() -> bool:
+        lab.call(SetBool, "bridge/arm", SetBool.Request(data=False))
+        count = len(lab.states)
+        lab.until(lambda: len(lab.states) > count + 2, "states")
+        # A module that does not answer: the bridge waits for it, and what comes meanwhile waits for the bridge.
+        lab.emulator.send_signal(signal.SIGSTOP)
+        try:
+            arming = arm.call_async(SetBool.Request(data=True))
+            lab.spin(0.02)
+            publisher.publish(move)
+            assert publisher.wait_for_all_acked(RclpyDuration(seconds=10.0))
+            waits = not arming.done()
+        finally:
+            lab.emulator.send_signal(signal.SIGCONT)
+        lab.until(arming.done, "the answer to arming")
+        told.clear()
+        lab.until(lambda: told, "diagnostics")
+        assert told[-1]["mode"] != "armed_position", "the bridge follows a trajectory of before it was armed"
+        # Before the request was read it is one for a plant that is not armed, and a busy machine loses the module.
+        return waits and bool(arming.result().success) and "joint_trajectory.refused.invalid" in told[-1]
+
+    lab.until(came_while_it_armed, "a trajectory that comes while the bridge arms", 90.0)
+    lab.spin(0.3)
+    assert told[-1]["mode"] == "armed_effort"
+    assert not lab.duties()[1].any()
 
 
 def test_the_e_stop_answers_in_a_flood_of_commands_and_trajectories(lab: Lab) -> None:
