@@ -68,15 +68,32 @@ def identify(
     ] = None,
     name: Annotated[str, typer.Option(help="Name of the plant in that file.")] = "identified",
     effort_limit: Annotated[float, typer.Option(help="Largest torque of the actuator [N m].")] = 13.0,
+    plant: Annotated[
+        str | None,
+        typer.Option(
+            help="For several joints: mechanism to start from, such as double_pendulum, or a plant file; data are "
+            "CSV files with all joints."
+        ),
+    ] = None,
     page: Annotated[bool, typer.Option(help="With --out: write figures and a page too.")] = True,
     as_json: Annotated[bool, typer.Option("--json", help="Print the result as JSON.")] = False,
 ) -> None:
     """Identify a pendulum from recordings.
 
     Example: python -m pendulum_bags identify run1.csv run2.csv --mass 0.6 --length 0.5 --out plant.yaml
+
+    Several joints: python -m pendulum_bags identify run1.csv run2.csv --plant double_pendulum --mapping columns.yaml
+    --held-out run3.csv --out plant.yaml
     """
     from pendulum_bags.runs.read_recording import read_recording
 
+    if plant is not None:
+        from pendulum_bags.identification.mechanism_cli import run as run_mechanism
+
+        others = held_out or []
+        rules_of = _mappings(mapping, len(data), len(data) + len(others))
+        run_mechanism(plant, data, rules_of, others, window, out, name, as_json)
+        return
     if method not in {"output_error", "thesis"}:
         raise DataError(f"method is {method!r}; expected output_error or thesis")
     if effort not in {"applied", "measured"}:

@@ -13,7 +13,7 @@ The unit of ``input`` says what drives the joint: a torque, a voltage, or an ang
 ``input`` the pendulum swings freely. ``hold`` says what the input does between two samples: ``zero`` stays (a
 command), ``linear`` goes straight to the next (a measurement; the default for a torque). ``detrend: constant`` or
 ``linear`` takes a mean or a drift from the input of a bad torque sensor. ``skip`` lines before the header, if any,
-are left out. An angle that jumps by whole turns is unwrapped.
+are left out; ``drop_nan: true`` leaves out rows with a NaN. An angle that jumps by whole turns is unwrapped.
 """
 
 from __future__ import annotations
@@ -78,7 +78,7 @@ _SECTION_KEYS = {
     "velocity": {"column", "unit", "sign", "offset", "optional"},
     "input": {"column", "unit", "sign", "offset", "hold", "detrend"},
 }
-_TOP_KEYS = {"format", "delimiter", "skip", "rows", "meta", *_SECTION_KEYS}
+_TOP_KEYS = {"format", "delimiter", "skip", "rows", "drop_nan", "meta", *_SECTION_KEYS}
 
 
 def read_csv(
@@ -111,6 +111,10 @@ def read_csv(
     meta = {"source": str(source), "mapping": origin, **given}
     if first or last < len(table) + first:
         meta["rows"] = [first, last]
+    if rules.get("drop_nan") is True:
+        whole = np.isfinite(table).all(axis=1)
+        meta["nan_rows"] = int(np.sum(~whole))
+        table = table[whole]
     time = _time(rules["time"], names, table, source, origin, first)
     position = _column("position", rules["position"], "angle", names, table, source, origin, first)
     assert position is not None

@@ -1,0 +1,207 @@
+"""Recordings of all joints of a mechanism, from CSV files of any columns by a mapping file.
+
+Example::
+
+    format: pendulum_joint_columns/1
+    time: {column: time, unit: s}
+    joints:
+      shoulder:
+        position: {column: pos_meas1, unit: rad}
+        velocity: {column: vel_meas1, unit: rad/s}        # optional: checks the unit of the position
+        effort: {column: tau_meas1, unit: N m, hold: linear}
+      elbow:
+        position: {column: pos_meas2, unit: rad}          # no effort: nothing drives this joint
+
+Each joint is read as one pendulum is (:mod:`~pendulum_bags.runs.csv_mapping`): units, signs, offsets, unwrapping, the
+check of the velocity against the position. Rows with a NaN are left out and counted.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pendulum_bags.runs.csv_mapping import read_csv
+from pendulum_bags.runs.datasets import Recording, check_consistency, unwrap
+from pendulum_msgs_py.errors import DataError
+from pendulum_msgs_py.joints import Coordinates
+from pendulum_msgs_py.parameters import load_yaml, reject_unknown, require_mapping
+
+__all__ = ["FORMAT", "JointRecording", "read_joints"]
+
+Array = NDArray[np.float64]
+
+FORMAT = "pendulum_joint_columns/1"
+
+_STILL = 1e-3
+"""Travel below which a joint counts as not moving [rad or m]."""
+
+
+@dataclass(frozen=True)
+class JointRecording:
+    """A run of a mechanism with n joints, measured.
+
+    Attributes:
+        name: Of the file, for messages.
+        time: Strictly increasing, shape (s,) [s].
+        position: Shape (s, n) [rad or m].
+        effort: What drives each joint, 0 where nothing does, shape (s, n) [N m or N].
+        hold: ``zero`` or ``linear``, per joint.
+        source: Where it was read.
+        left_out: Rows with a NaN or a repeated stamp that were left out.
+    """
+
+    name: str
+    time: Array
+    position: Array
+    effort: Array
+    hold: tuple[str, ...]
+    source: str = ""
+    left_out: int = 0
+
+    def __post_init__(self) -> None:
+        """Check that the arrays fit together."""
+        size = self.time.size
+        if self.position.shape != self.effort.shape or self.position.shape[0] != size:
+            raise DataError(
+                f"{self.name}: position has shape {self.position.shape}, effort {self.effort.shape}; "
+                f"expected both ({size}, joints)"
+            )
+        values = np.column_stack((self.time, self.position, self.effort))
+        if size < 10 or not np.isfinite(values).all() or np.any(np.diff(self.time) <= 0.0):
+            raise DataError(f"{self.name}: expected at least 10 samples, finite numbers and increasing stamps")
+
+    def check(self, coordinates: Coordinates) -> None:
+        """Refuse a recording that cannot be of this mechanism.
+
+        Raises:
+            DataError: Another number of joints, or a joint that does not move.
+        """
+        names = coordinates.names
+        if self.position.shape[1] != len(names):
+            raise DataError(
+                f"{self.name} has {self.position.shape[1]} joints; expected {len(names)}: {', '.join(names)}"
+            )
+        for index, joint in enumerate(coordinates.joints):
+            travel = float(np.ptp(self.position[:, index]))
+            if travel < _STILL:
+                raise DataError(
+                    f"{self.name}: joint {joint.name} moves by {travel:.2g} {joint.unit}; expected a joint that moves: "
+                    "is its column another one, or was it locked?"
+                )
+
+
+def read_joints(path: str | Path, coordinates: Coordinates, mapping: str | Path | None = None) -> JointRecording:
+    """Read a CSV file with the columns of every joint.
+
+    Args:
+        path: The file.
+        coordinates: Joints of the plant, and which are driven.
+        mapping: Mapping file; by default the columns are ``time`` and, for each joint, ``JOINT.position`` and, where it
+            is driven, ``JOINT.effort`` in SI units (``JOINT.velocity`` is used where it is there).
+
+    Raises:
+        DataError: A column, a unit or a joint is not as the mapping says, joints are missing, foreign or in another
+            order, or the input is not an effort.
+    """
+    source = Path(path)
+    if source.suffix.lower() not in {".csv", ".txt"} or not source.is_file():
+        raise DataError(f"{source} is no CSV file; expected a CSV file with the columns of all joints")
+    rules, origin = _rules(coordinates, mapping)
+    common = {key: value for key, value in rules.items() if key not in {"format", "joints"}}
+    parts: list[Recording] = []
+    for index, joint in enumerate(coordinates.joints):
+        section = require_mapping(rules["joints"][joint.name], f"{origin}: joints.{joint.name}")
+        reject_unknown(section, ("position", "velocity", "effort"), where=f"{origin}: joints.{joint.name}")
+        own = {key: value for key, value in section.items() if key != "effort"}
+        if "effort" in section:
+            own["input"] = section["effort"]
+            if index not in coordinates.driven:
+                raise DataError(
+                    f"{origin}: joints.{joint.name} has an effort, but the plant has no actuator there; expected an "
+                    "actuator in the plant file, or no effort"
+                )
+        elif index in coordinates.driven:
+            raise DataError(
+                f"{origin}: joints.{joint.name} has no effort, but the plant has an actuator there; expected the "
+                "column of its torque or force"
+            )
+        scale = _force(own, joint.effort_unit)
+        part = read_csv(source, {**common, "drop_nan": True, **own})
+        if part.input_kind not in {"effort", "none"}:
+            raise DataError(
+                f"{origin}: the input of {joint.name} is a {part.input_kind}; expected an effort in {joint.effort_unit}"
+            )
+        part = check_consistency(unwrap(part)) if joint.turns else check_consistency(part)
+        parts.append(Recording(part.time, part.position, None, scale * part.input, hold=part.hold, meta=part.meta))
+    return JointRecording(
+        source.name,
+        parts[0].time,
+        np.stack([part.position for part in parts], axis=1),
+        np.stack([part.input for part in parts], axis=1),
+        tuple(part.hold for part in parts),
+        str(source),
+        sum(int(parts[0].meta.get(key, 0)) for key in ("repeated_stamps", "nan_rows")),
+    )
+
+
+_SLIDING = {"m": "rad", "mm": "rad", "m/s": "rad/s", "N": "N m"}
+"""Units of a joint that slides, and what the reader of one hinge calls them."""
+
+
+def _force(own: dict[str, Any], unit: str) -> float:
+    """Rewrite the units of a joint that slides into those that the reader knows; return the factor of its input."""
+    if unit != "N":
+        return 1.0
+    for key, section in own.items():
+        if isinstance(section, Mapping) and section.get("unit") in {"m", "m/s", "N"}:
+            own[key] = {**section, "unit": _SLIDING[section["unit"]]}
+        else:
+            raise DataError(f"unit of {key} is {section!r}; expected m, m/s or N: this joint slides")
+    return 1.0
+
+
+def _rules(coordinates: Coordinates, mapping: str | Path | None) -> tuple[dict[str, Any], str]:
+    names = coordinates.names
+    if mapping is None:
+        joints: dict[str, Any] = {}
+        for index, joint in enumerate(coordinates.joints):
+            joints[joint.name] = {
+                "position": {"column": [f"{joint.name}.position", f"{joint.name}_position"], "unit": joint.unit},
+                "velocity": {
+                    "column": [f"{joint.name}.velocity", f"{joint.name}_velocity"],
+                    "unit": joint.velocity_unit,
+                    "optional": True,
+                },
+            }
+            if index in coordinates.driven:
+                columns = [f"{joint.name}.effort", f"{joint.name}_effort"]
+                joints[joint.name]["effort"] = {"column": columns, "unit": joint.effort_unit, "hold": "linear"}
+        return {"time": {"column": "time", "unit": "s"}, "joints": joints}, "names of the joints"
+    rules = load_yaml(Path(mapping), "mapping file")
+    origin = str(mapping)
+    if rules.get("format") != FORMAT:
+        raise DataError(f"{origin}: format is {rules.get('format')!r}; expected {FORMAT!r}")
+    joints = dict(require_mapping(rules.get("joints"), f"{origin}: joints"))
+    _check_names(list(joints), names, origin)
+    _check_distinct_columns(joints, origin)
+    return {**rules, "joints": joints}, origin
+
+
+def _check_names(given: Sequence[str], names: Sequence[str], origin: str) -> None:
+    if list(given) != list(names):
+        raise DataError(f"{origin}: joints are {', '.join(given)}; expected {', '.join(names)}, in this order")
+
+
+def _check_distinct_columns(joints: Mapping[str, Any], origin: str) -> None:
+    seen: dict[str, str] = {}
+    for joint, section in joints.items():
+        column = (section or {}).get("position", {}).get("column")
+        if isinstance(column, str) and column in seen:
+            raise DataError(f"{origin}: {seen[column]} and {joint} have the same column {column!r}; expected two")
+        seen[str(column)] = joint

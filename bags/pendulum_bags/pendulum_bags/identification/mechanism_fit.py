@@ -1,0 +1,354 @@
+"""Output error for a mechanism: windows of free run, the state at the start of each fitted, by Levenberg-Marquardt.
+
+As for one joint (:mod:`~pendulum_bags.identification.solver`), parameters and start states make an arrowhead, and the
+states are eliminated window by window. Sensitivities go along the simulated motion: the equation's derivatives in the
+middle of each step, and the exponential series of the step to third order.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pendulum_bags.identification.joint_recordings import JointRecording
+from pendulum_bags.identification.mechanism_model import MechanismModel, step_functions
+from pendulum_bags.identification.problem import cut_windows
+from pendulum_msgs_py.errors import DataError
+
+__all__ = ["Blocks", "MechanismFit", "Windows", "fit", "line_errors", "prepare_windows", "scores"]
+
+Array = NDArray[np.float64]
+
+
+_LONGEST = 0.006
+"""Longest step; between samples that lie further apart the motion is simulated in several equal ones [s]."""
+
+
+@dataclass(frozen=True)
+class Windows:
+    """One recording cut into windows of equal length, the last ones padded.
+
+    Attributes:
+        recording: The data.
+        time: Instants of the simulation, shape (w, l); padding repeats the last one [s].
+        inside: Which of them are samples, neither between two nor padding, shape (w, l).
+        position: Shape (w, l, n) [rad or m].
+        states: First guess of the start states, shape (w, 2 n).
+        area: Integral of the effort up to each sample of the recording, shape (s, n).
+    """
+
+    recording: JointRecording
+    time: Array
+    inside: NDArray[np.bool_]
+    position: Array
+    states: Array
+    area: Array
+
+    def subset(self, chosen: Sequence[int] | NDArray[np.int64]) -> Windows:
+        """Return some of the windows."""
+        at = np.asarray(chosen, dtype=int)
+        return Windows(self.recording, self.time[at], self.inside[at], self.position[at], self.states[at], self.area)
+
+    def input(self, delay: float) -> tuple[Array, Array, Array]:
+        """Return mean effort of each step and its derivative by the delay, shape (n, w, l - 1), and the steps [s]."""
+        r = self.recording
+        wanted = self.time - delay
+        at = np.clip(wanted, r.time[0], r.time[-1])
+        k = np.clip(np.searchsorted(r.time, at, side="right") - 1, 0, r.time.size - 2)
+        since = (at - r.time[k])[..., None]
+        linear = np.array([hold == "linear" for hold in r.hold])
+        rise = np.where(linear, (r.effort[k + 1] - r.effort[k]) / (r.time[k + 1] - r.time[k])[..., None], 0.0)
+        level = r.effort[k] + rise * since
+        area = self.area[k] + (r.effort[k] + 0.5 * rise * since) * since
+        # Before the first sample and after the last the effort stays as it is there.
+        beyond = (wanted - at)[..., None]
+        area = area + beyond * np.where(beyond < 0.0, r.effort[0], r.effort[-1])
+        steps = np.diff(self.time, axis=1)
+        length = np.where(steps > 0.0, steps, 1.0)[..., None]
+        mean, slope = np.diff(area, axis=1) / length, -np.diff(level, axis=1) / length
+        return mean.transpose(2, 0, 1), slope.transpose(2, 0, 1), steps
+
+
+def prepare_windows(recording: JointRecording, window: float, *, stride: int = 1) -> Windows:
+    """Cut a recording into windows.
+
+    Args:
+        recording: The data.
+        window: Length [s].
+        stride: Take every so manieth sample; the effort between them is not lost, its mean drives the step.
+    """
+    cuts = cut_windows(recording.time, window)
+    parts = [np.arange(first, stop, stride) for first, stop in cuts]
+    # No window reaches across a gap.
+    period = float(np.median(np.diff(recording.time)))
+    longest = max(10.0 * period, 0.1)
+    steps = np.diff(recording.time)
+    parts = [p for p in parts if p.size >= 8 and steps[p[0] : p[-1]].max() <= longest]
+    if not parts:
+        raise DataError(
+            f"{recording.name} has no window of {window} s with 8 samples and no gap; expected a longer recording or a "
+            "higher rate"
+        )
+    several = max(1, math.ceil(stride * period / _LONGEST - 1e-6))
+    size = (max(part.size for part in parts) - 1) * several + 1
+    time, inside = np.empty((len(parts), size)), np.zeros((len(parts), size), dtype=bool)
+    position = np.zeros((len(parts), size, recording.position.shape[1]))
+    for w, part in enumerate(parts):
+        at = np.minimum(np.arange(size) / several, part.size - 1.0)
+        time[w] = np.interp(at, np.arange(part.size), recording.time[part])
+        inside[w, : part.size * several : several] = True
+        position[w, inside[w]] = recording.position[part]
+    mean = np.where(
+        [hold == "linear" for hold in recording.hold],
+        0.5 * (recording.effort[1:] + recording.effort[:-1]),
+        recording.effort[:-1],
+    )
+    area = np.concatenate((np.zeros((1, mean.shape[1])), np.cumsum(mean * steps[:, None], axis=0)))
+    states = np.array([_first_state(recording, int(part[0])) for part in parts])
+    return Windows(recording, time, inside, position, states, area)
+
+
+def _first_state(recording: JointRecording, first: int) -> Array:
+    low, high = max(first - 5, 0), min(first + 6, recording.time.size)
+    t = recording.time[low:high] - recording.time[first]
+    scale = float(np.max(np.abs(t)))
+    found = np.polynomial.polynomial.polyfit(t / scale, recording.position[low:high], 2)
+    return np.concatenate((found[0], found[1] / scale))
+
+
+@dataclass(frozen=True)
+class Blocks:
+    """Normal equations of one recording with the start states eliminated.
+
+    Attributes:
+        matrices: By window, shape (w, k, k).
+        gradients: By window, shape (w, k).
+        samples: Positions inside the windows.
+    """
+
+    matrices: Array
+    gradients: Array
+    samples: int
+
+
+@dataclass(frozen=True)
+class MechanismFit:
+    """A fit.
+
+    Attributes:
+        model: Parameters at the minimum.
+        free: Names of what was fitted.
+        states: Start states by recording, shape (w, 2 n).
+        cost: Weighted sum of squares.
+        blocks: Normal equations by recording, at the minimum.
+        residuals: Simulated minus measured positions by recording, shape (w, l, n), 0 in the padding.
+    """
+
+    model: MechanismModel
+    free: tuple[str, ...]
+    states: list[Array]
+    cost: float
+    blocks: list[Blocks]
+    residuals: list[Array]
+
+
+class _Simulator:
+    """The compiled steps of one set of free parameters, over windows of any number and length."""
+
+    def __init__(self, model: MechanismModel, free: Sequence[str]) -> None:
+        self.count = len(model.plant.joints)
+        self.forward, self.derivative = step_functions(model, free)
+        self.free = len(free)
+        self.made: dict[tuple[str, int, int], Any] = {}
+
+    def _many(self, windows: int, steps: int) -> Any:
+        key = ("runs", windows, steps)
+        if key not in self.made:
+            self.made[key] = self.forward.mapaccum("run", steps).map(windows)
+        return self.made[key]
+
+    def run(self, model: MechanismModel, data: Windows, states: Array, want: bool) -> tuple[Array, Array | None]:
+        """Return the positions, shape (w, l, n), and if wanted their sensitivities, shape (w, l, n, k + 2 n)."""
+        n, (w, size) = self.count, data.time.shape
+        mean, slope, h = data.input(model["delay"])
+        flat = (mean.reshape(n, -1), h.reshape(1, -1))
+        p = np.repeat(model.values[:, None], w * (size - 1), axis=1)
+        later = self._many(w, size - 1)(states.T, *flat, p).full().T.reshape(w, size - 1, 2 * n)
+        path = np.concatenate((states[:, None], later), axis=1)
+        if not want or not np.isfinite(path).all():
+            return path[..., :n], None
+        middle = (0.5 * (path[:, :-1] + path[:, 1:])).reshape(-1, 2 * n).T
+        total = w * (size - 1)
+        key = ("derivatives", total, 0)
+        if key not in self.made:
+            self.made[key] = self.derivative.map(total)
+        by_x, by_p = self.made[key](middle, flat[0], slope.reshape(n, -1), p)
+        step = h[:, :, None, None]
+        a = by_x.full().reshape(2 * n, total, 2 * n).transpose(1, 0, 2).reshape(w, size - 1, 2 * n, 2 * n) * step
+        b = (
+            by_p.full().reshape(2 * n, total, self.free).transpose(1, 0, 2).reshape(w, size - 1, 2 * n, self.free)
+            * step
+        )
+        unit = np.eye(2 * n)
+        square = a @ a
+        gain, b = unit + a + 0.5 * square + (square @ a) / 6.0, (unit + 0.5 * a + square / 6.0) @ b
+        result = np.zeros((w, size, 2 * n, self.free + 2 * n))
+        result[:, 0, :, self.free :] = unit
+        for i in range(size - 1):
+            result[:, i + 1] = gain[:, i] @ result[:, i]
+            result[:, i + 1, :, : self.free] += b[:, i]
+        return path[..., :n], result[:, :, :n]
+
+
+def fit(
+    model: MechanismModel,
+    data: Sequence[Windows],
+    free: Sequence[str],
+    weights: Array,
+    *,
+    states: Sequence[Array] | None = None,
+    most: int = 30,
+    tolerance: float = 1e-5,
+) -> MechanismFit:
+    """Minimise the weighted squares of the position errors over free parameters and start states.
+
+    Args:
+        model: Start.
+        data: Windows of each recording.
+        free: Names of what to fit; none fits the start states alone.
+        weights: Of each joint's error, shape (n,).
+        states: Start of the start states; by default the windows' first guesses.
+        most: Most steps to try.
+        tolerance: Relative decrease of the cost below which the fit ends.
+    """
+    simulator = _Simulator(model, free)
+    index = model.index(free)
+    size = np.array([model.size(name) for name in free])
+    low = np.array([model.lowest(name) for name in free])
+    values = model.values.copy()
+    values[index] = np.maximum(values[index], low)
+    best, x = model.with_values(values), [np.array(s) for s in (states or [part.states for part in data])]
+    damping, k = 1e-4, len(index)
+    cost, normal, errors = _linearise(simulator, best, data, x, weights)
+    if not np.isfinite(cost):
+        raise DataError("the starting plant's motion leaves all bounds within a window; expected a plant that is near")
+    for _ in range(most):
+        step = _step(normal, values[index], size, low, damping)
+        trial = values.copy()
+        trial[index] = np.maximum(values[index] + step[0], low)
+        candidate = best.with_values(trial)
+        moved = [a + b for a, b in zip(x, step[1], strict=True)]
+        new = _cost(simulator, candidate, data, moved, weights)
+        if new < cost:
+            done = (cost - new) < tolerance * cost
+            values, best, x = trial, candidate, moved
+            damping = max(0.2 * damping, 1e-9)
+            cost, normal, errors = _linearise(simulator, best, data, x, weights)
+            if done:
+                break
+        else:
+            damping *= 8.0
+            if damping > 1e8:
+                break
+    blocks = []
+    for matrix, gradient, part in zip(normal[0], normal[1], data, strict=True):
+        coupling, own = matrix[:, :k, k:], matrix[:, k:, k:]
+        solved = np.linalg.pinv(own, hermitian=True) @ coupling.transpose(0, 2, 1)
+        reduced = matrix[:, :k, :k] - coupling @ solved
+        along = gradient[:, :k] - np.einsum("wxk,wx->wk", solved, gradient[:, k:])
+        blocks.append(Blocks(reduced, along, int(part.inside.sum()) * simulator.count))
+    return MechanismFit(best, tuple(free), x, cost, blocks, errors)
+
+
+def _cost(
+    simulator: _Simulator, model: MechanismModel, data: Sequence[Windows], states: Sequence[Array], weights: Array
+) -> float:
+    total = 0.0
+    for part, x in zip(data, states, strict=True):
+        path, _ = simulator.run(model, part, x, want=False)
+        error = (path - part.position) * part.inside[..., None] * weights
+        total += float(np.sum(error**2)) if np.isfinite(error).all() else np.inf
+    return total
+
+
+def _linearise(
+    simulator: _Simulator, model: MechanismModel, data: Sequence[Windows], states: Sequence[Array], weights: Array
+) -> tuple[float, tuple[list[Array], list[Array]], list[Array]]:
+    cost, matrices, gradients, errors = 0.0, [], [], []
+    for part, x in zip(data, states, strict=True):
+        path, sensitivity = simulator.run(model, part, x, want=True)
+        if sensitivity is None:
+            return np.inf, ([], []), []
+        plain = (path - part.position) * part.inside[..., None]
+        error = plain * weights
+        scaled = sensitivity * (part.inside[..., None] * weights)[..., None]
+        flat = scaled.reshape(len(x), -1, scaled.shape[-1])
+        matrices.append(flat.transpose(0, 2, 1) @ flat)
+        gradients.append(np.einsum("wia,wi->wa", flat, error.reshape(len(x), -1)))
+        errors.append(plain)
+        cost += float(np.sum(error**2))
+    return cost, (matrices, gradients), errors
+
+
+def _step(
+    normal: tuple[list[Array], list[Array]], values: Array, size: Array, low: Array, damping: float
+) -> tuple[Array, list[Array]]:
+    """Return the damped step of parameters and start states; what would leave its domain stops at the edge."""
+    k = values.size
+    reduced, gradient, solved = np.zeros((k, k)), np.zeros(k), []
+    for matrix, own_gradient in zip(*normal, strict=True):
+        states = matrix[:, k:, k:].copy()
+        # A start that a wrong model's motion hardly shows must not stop the search.
+        diagonal = np.einsum("wii->wi", states)
+        diagonal[:] = (1.0 + damping) * diagonal + 1e-12 * diagonal.max(axis=1, keepdims=True)
+        right = np.concatenate((matrix[:, k:, :k], own_gradient[:, k:, None]), axis=2)
+        found = np.linalg.solve(states, right)
+        solved.append(found)
+        both = matrix[:, :k, k:] @ found
+        reduced += matrix[:, :k, :k].sum(axis=0) - both[:, :, :k].sum(axis=0)
+        gradient += own_gradient[:, :k].sum(axis=0) - both[:, :, k].sum(axis=0)
+    step = np.zeros(k)
+    if k:
+        # In shares of the parameters' scales. The little that is added keeps what the data do not see where it is.
+        system = reduced * np.outer(size, size)
+        system += np.diag(damping * np.diag(system) + 1e-10 * np.trace(system) / k)
+        active = np.zeros(k, dtype=bool)
+        for _ in range(k):
+            idle = np.flatnonzero(~active)
+            if not idle.size:
+                break
+            right = -(size * gradient + system @ np.where(active, step / size, 0.0))[idle]
+            step[idle] = size[idle] * np.linalg.solve(system[np.ix_(idle, idle)], right)
+            outside = (values + step < low) & ~active
+            if not outside.any():
+                break
+            step[outside] = (low - values)[outside]
+            active |= outside
+    return step, [-(found[:, :, k] + found[:, :, :k] @ step) for found in solved]
+
+
+def scores(model: MechanismModel, data: Sequence[Windows]) -> list[Array]:
+    """Return the rms errors of each joint of each recording with the start of each window fitted, shape (n,)."""
+    weights = np.ones(len(model.plant.joints))
+    found = [fit(model, [part], (), weights, most=12, tolerance=1e-6) for part in data]
+    return [_rms(one.residuals[0], part) for one, part in zip(found, data, strict=True)]
+
+
+def line_errors(data: Windows) -> Array:
+    """Return the rms errors of the best straight lines through each joint of each window, shape (n,)."""
+    errors = np.zeros_like(data.position)
+    for i, inside in enumerate(data.inside):
+        t = data.time[i, inside] - data.time[i, 0]
+        base = np.column_stack((np.ones_like(t), t))
+        y = data.position[i, inside]
+        errors[i, inside] = y - base @ np.linalg.lstsq(base, y, rcond=None)[0]
+    return _rms(errors, data)
+
+
+def _rms(errors: Array, data: Windows) -> Array:
+    return np.asarray(np.sqrt(np.mean(errors[data.inside] ** 2, axis=0)))

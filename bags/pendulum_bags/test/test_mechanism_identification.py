@@ -1,0 +1,228 @@
+"""Mechanisms of several joints are identified from recordings of all their joints, or refused in a sentence."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from pendulum_bags.identification import identify_cli
+from pendulum_bags.identification.joint_recordings import FORMAT, JointRecording, read_joints
+from pendulum_bags.identification.mechanism_fit import fit, prepare_windows, scores
+from pendulum_bags.identification.mechanism_model import MechanismModel, tellable
+from pendulum_bags.identification.mechanism_result import identify_mechanism
+from pendulum_msgs_py.errors import DataError
+from pendulum_msgs_py.plants.mechanism_parameters import load_mechanism, load_mechanism_file
+
+PERIOD = 0.01
+NOISE = 2e-4
+DRIVE = {"double_pendulum": (1.0, 0.6), "acrobot": (0.0, 0.8), "cart_pole": (4.0, 0.0), "furuta": (0.01, 0.0)}
+OFF = {
+    "double_pendulum": {"inertia_1": 0.026, "centre_1": 0.17, "inertia_2": 0.055, "centre_2": 0.24},
+    "acrobot": {"inertia_1": 0.029, "inertia_2": 0.055},
+    "cart_pole": {"cart_mass": 1.3, "pole_inertia": 0.04, "cart.damping": 0.3},
+    "furuta": {"pendulum_inertia": 1.6e-4, "arm_inertia": 1.8e-4},
+}
+
+
+def truth(name):
+    plant = load_mechanism(name)
+    if name == "cart_pole":
+        return plant.with_values({"cart.damping": 0.5, "pole.damping": 0.003, "cart.coulomb_friction": 0.2})
+    return plant
+
+
+def motion(plant, seed, seconds=8.0, period=PERIOD, amplitude=None):
+    """Return a noisy recording of a plant under slow multisines, by an integrator of its own with small steps."""
+    rng = np.random.default_rng(seed)
+    time = np.cumsum(period * (1.0 + rng.uniform(-0.1, 0.1, round(seconds / period))))
+    drives = amplitude or DRIVE[plant.name]
+    count = len(plant.joints)
+    effort = np.zeros((time.size, count))
+    for i, size in enumerate(drives):
+        for rate in rng.uniform(0.4, 2.0, 4):
+            effort[:, i] += 0.5 * size * np.sin(2.0 * np.pi * rate * time + rng.uniform(0.0, 6.3))
+    friction = np.array([joint.coulomb_friction for joint in plant.joints])
+    q, v = rng.normal(0.0, 0.3, count), np.zeros(count)
+    path = np.empty((time.size, count))
+    path[0] = q
+    for k in range(time.size - 1):
+        h = (time[k + 1] - time[k]) / 8
+        for step in range(8):
+            torque = effort[k] + (step + 0.5) / 8 * (effort[k + 1] - effort[k])
+            a = np.array(plant.acceleration(tuple(q), tuple(v), tuple(torque - friction * np.tanh(v / 0.02))))
+            middle = v + 0.5 * h * a
+            half = q + 0.5 * h * v
+            a = np.array(
+                plant.acceleration(tuple(half), tuple(middle), tuple(torque - friction * np.tanh(middle / 0.02)))
+            )
+            q, v = q + h * middle, v + h * a
+        path[k + 1] = q
+    noisy = path + rng.normal(0.0, NOISE, path.shape)
+    return JointRecording(f"{plant.name}_{seed}.csv", time, noisy, effort, ("linear",) * count, f"{plant.name}_{seed}")
+
+
+def save(path, recording, names, driven, order=None):
+    columns = {"time": recording.time}
+    for i, name in enumerate(names):
+        columns[f"{name}.position"] = recording.position[:, (order or range(len(names)))[i]]
+        if i in driven:
+            columns[f"{name}.effort"] = recording.effort[:, (order or range(len(names)))[i]]
+    np.savetxt(path, np.column_stack(list(columns.values())), delimiter=",", header=",".join(columns), comments="")
+    return path
+
+
+@pytest.fixture(scope="module")
+def both_driven():
+    plant = truth("double_pendulum")
+    return [motion(plant, seed) for seed in (1, 2)]
+
+
+@pytest.mark.parametrize("name", ["acrobot", "cart_pole", "furuta"])
+def test_a_mechanism_is_found_again_within_its_intervals(name):
+    plant = truth(name)
+    result = identify_mechanism(plant.with_values(OFF[name]), [motion(plant, 3)], extras="friction")
+    assert not result.refused, result.refusal
+    for key in tellable(plant):
+        interval = result.intervals[key]
+        width = 0.5 * (interval.high - interval.low)
+        assert abs(interval.value - plant.value(key)) <= 1.5 * width + 0.005 * plant.value(key), key
+        assert width < 0.25 * plant.value(key), key
+
+
+def test_two_driven_joints_are_found_from_a_start_that_is_off_and_a_held_out_run_is_predicted_to_the_noise(both_driven):
+    plant = truth("double_pendulum")
+    start = plant.with_values(OFF["double_pendulum"])
+    result = identify_mechanism(start, both_driven[:1], held_out=both_driven[1:], extras="friction")
+    (score,) = result.held_out.values()
+    assert score.total < 10.0 * NOISE
+    assert result.plant().value("inertia_2") == pytest.approx(plant.value("inertia_2"), rel=0.03)
+    assert "mass_2" in " ".join(result.sentences())
+
+
+def test_sensitivities_are_the_derivatives_of_the_simulated_motion(both_driven):
+    from pendulum_bags.identification.mechanism_fit import _Simulator
+
+    # Without dry friction: where a joint turns round, its smoothed step is as short as a few steps of the simulation.
+    model = MechanismModel.of(
+        truth("double_pendulum").with_values({f"{j}.coulomb_friction": 0.0 for j in ("shoulder", "elbow")})
+    )
+    free = model.fitted(offsets=True, zeros=True, delay=True)
+    data = prepare_windows(both_driven[0], 0.4).subset([0, 3])
+    simulator = _Simulator(model, free)
+    path, sensitivity = simulator.run(model, data, data.states, True)
+    for column, name in enumerate(free):
+        if name.endswith("coulomb_friction"):
+            continue
+        step = 1e-4 * model.size(name)
+        values = model.values.copy()
+        values[model.index([name])] += step
+        moved, _ = simulator.run(model.with_values(values), data, data.states, False)
+        difference = (moved - path) / step
+        assert np.max(np.abs(difference - sensitivity[..., column])) < 0.005 * np.max(np.abs(difference)) + 1e-6, name
+
+
+def test_what_a_recording_cannot_be_is_refused_in_a_sentence(both_driven, tmp_path):
+    plant = truth("double_pendulum")
+    one = both_driven[0]
+    still = replace(one, position=one.position * [1.0, 0.0])
+    with pytest.raises(DataError, match="joint elbow moves by 0 rad"):
+        identify_mechanism(plant, [still])
+    with pytest.raises(DataError, match="1 joints; expected 2: shoulder, elbow"):
+        identify_mechanism(plant, [replace(one, position=one.position[:, :1], effort=one.effort[:, :1])])
+    short = replace(one, time=one.time[:200], position=one.position[:200], effort=one.effort[:200])
+    with pytest.raises(DataError, match="expected at least 8"):
+        identify_mechanism(plant, [short])
+    with pytest.raises(DataError, match="the same samples"):
+        identify_mechanism(plant, [one, one])
+
+
+def test_swapped_columns_are_refused_by_name(both_driven):
+    one = both_driven[0]
+    swapped = replace(one, position=one.position[:, ::-1], effort=one.effort[:, ::-1])
+    result = identify_mechanism(truth("double_pendulum"), [swapped], extras="friction")
+    assert result.refused
+    assert "columns of shoulder and elbow exchanged" in result.sentences()[0]
+
+
+def test_a_held_out_run_that_straight_lines_predict_as_well_is_a_refusal_with_its_own_exit_code(
+    both_driven, tmp_path, capsys
+):
+    names = ("shoulder", "elbow")
+    good = save(tmp_path / "good.csv", both_driven[0], names, (0, 1))
+    foreign = replace(both_driven[1], position=-0.5 * both_driven[1].position[::-1])
+    bad = save(tmp_path / "foreign.csv", foreign, names, (0, 1))
+    out = tmp_path / "plant.yaml"
+    command = [str(good), "--plant", "double_pendulum", "--out", str(out)]
+    assert identify_cli.main([*command, "--held-out", str(bad)]) == 3
+    assert "REFUSED: foreign.csv, held out" in capsys.readouterr().out
+    assert not out.exists()
+    assert identify_cli.main([*command, "--json"]) == 0
+    said = json.loads(capsys.readouterr().out)
+    plant, provenance = load_mechanism_file(out)
+    assert plant.value("inertia_2") == pytest.approx(said["parameters"]["inertia_2"])
+    assert set(tellable(plant)) <= set(provenance["intervals"])
+    assert plant.coordinates.driven_names == names
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (lambda joints: dict(reversed(joints.items())), "joints are elbow, shoulder; expected shoulder, elbow"),
+        (lambda joints: {**joints, "wrist": joints["elbow"]}, "expected shoulder, elbow, in this order"),
+        (lambda joints: {**joints, "elbow": joints["shoulder"]}, "the same column 'a'"),
+        (lambda joints: {**joints, "elbow": {"position": joints["elbow"]["position"]}}, "has no effort, but the plant"),
+    ],
+)
+def test_joints_of_a_mapping_that_are_swapped_foreign_repeated_or_without_their_effort_are_refused(
+    change, words, tmp_path
+):
+    joints = {
+        "shoulder": {"position": {"column": "a", "unit": "rad"}, "effort": {"column": "u", "unit": "N m"}},
+        "elbow": {"position": {"column": "b", "unit": "rad"}, "effort": {"column": "w", "unit": "N m"}},
+    }
+    data = tmp_path / "run.csv"
+    table = np.column_stack((np.arange(50) * 0.01, np.random.default_rng(0).normal(0.0, 0.1, (50, 4))))
+    np.savetxt(data, table, delimiter=",", header="time,a,b,u,w", comments="")
+    rules = {"format": FORMAT, "time": {"column": "time", "unit": "s"}, "joints": change(joints)}
+    mapping = tmp_path / "columns.yaml"
+    mapping.write_text(json.dumps(rules))
+    with pytest.raises(DataError, match=words):
+        read_joints(data, truth("double_pendulum").coordinates, mapping)
+
+
+def test_rows_with_nan_are_left_out_and_counted(both_driven, tmp_path):
+    one = both_driven[0]
+    position = one.position.copy()
+    position[[50, 51, 300], 1] = np.nan
+    table = np.column_stack((one.time, position[:, 0], one.effort[:, 0], position[:, 1], one.effort[:, 1]))
+    path = tmp_path / "gaps.csv"
+    header = "time,shoulder.position,shoulder.effort,elbow.position,elbow.effort"
+    np.savetxt(path, table, delimiter=",", header=header, comments="")
+    read = read_joints(path, truth("double_pendulum").coordinates)
+    assert (read.left_out, read.time.size) == (3, one.time.size - 3)
+    assert np.isfinite(read.position).all()
+    assert scores(MechanismModel.of(truth("double_pendulum")), [prepare_windows(read, 1.0)])[0].max() < 20.0 * NOISE
+
+
+def test_a_real_double_pendulum_is_predicted_far_better_than_by_its_published_parameters(shared_data, tmp_path):
+    folder = shared_data / "dfki_double_pendulum"
+    start = load_mechanism("double_pendulum")
+    joint = {
+        name: {
+            "position": {"column": f"pos_meas{i}", "unit": "rad"},
+            "effort": {"column": f"tau_meas{i}", "unit": "N m", "hold": "linear"},
+        }
+        for i, name in ((1, "shoulder"), (2, "elbow"))
+    }
+    mapping = tmp_path / "columns.yaml"
+    mapping.write_text(json.dumps({"format": FORMAT, "time": {"column": "time", "unit": "s"}, "joints": joint}))
+    one, other = (read_joints(folder / f"c1_{key}.csv", start.coordinates, mapping) for key in ("143339", "143524"))
+    third = read_joints(folder / "c1_143704.csv", start.coordinates, mapping)
+    data = [prepare_windows(recording, 2.0, stride=5) for recording in (one, third)]
+    model = MechanismModel.of(start)
+    found = fit(model, data, model.fitted(), np.ones(2), most=10, tolerance=1e-3)
+    held_out = [prepare_windows(other, 0.5, stride=5)]
+    ours, published = (float(np.sqrt(np.mean(scores(m, held_out)[0] ** 2))) for m in (found.model, model))
+    assert published > 0.03
+    assert ours < 0.7 * published
