@@ -135,13 +135,12 @@ def tellable(plant: MechanismParameters) -> tuple[str, ...]:
     found = casadi.jacobian(_rate(model, x, u, p)[count:], p)
     rows = casadi.Function("rows", [x, u, p], [casadi.densify(found)])
     rng = np.random.default_rng(0)
+    largest = float(np.max(plant.effort_limits)) if plant.actuators else 1.0
     samples = []
     for _ in range(80):
         state = np.concatenate((rng.uniform(-3.0, 3.0, count), rng.normal(0.0, 5.0, count)))
         drive = np.zeros(count)
-        drive[list(plant.coordinates.driven)] = rng.normal(
-            0.0, max(plant.effort_limits, default=1.0), len(plant.actuators)
-        )
+        drive[list(plant.coordinates.driven)] = rng.normal(0.0, largest, len(plant.actuators))
         values = rows(state, drive, model.values).full()
         samples.append(values / np.maximum(np.linalg.norm(values, axis=1, keepdims=True), 1e-12))
     table = np.concatenate(samples)
