@@ -150,7 +150,7 @@ def tellable(plant: MechanismParameters) -> tuple[str, ...]:
         column = table[:, model.names.index(name)] * model.size(name)
         rest = column - basis @ (basis.T @ column)
         rest -= basis @ (basis.T @ rest)
-        if np.linalg.norm(rest) > _WEAK * max(np.linalg.norm(column), 1e-12) and np.linalg.norm(column) > 1e-9:
+        if np.linalg.norm(rest) > _WEAK * float(np.linalg.norm(column)) and np.linalg.norm(column) > 1e-9:
             kept.append(name)
             basis = np.column_stack((basis, rest / np.linalg.norm(rest)))
     return tuple(spec.name for spec in plant.mechanism.parameters if spec.name in kept)
