@@ -131,7 +131,7 @@ def test_what_a_recording_cannot_be_is_refused_in_a_sentence(both_driven, tmp_pa
     with pytest.raises(DataError, match="1 joints; expected 2: shoulder, elbow"):
         identify_mechanism(plant, [replace(one, position=one.position[:, :1], effort=one.effort[:, :1])])
     short = replace(one, time=one.time[:200], position=one.position[:200], effort=one.effort[:200])
-    with pytest.raises(DataError, match="expected at least 8"):
+    with pytest.raises(DataError, match="expected at least 5"):
         identify_mechanism(plant, [short])
     with pytest.raises(DataError, match="the same samples"):
         identify_mechanism(plant, [one, one])

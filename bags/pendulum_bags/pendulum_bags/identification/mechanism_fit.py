@@ -271,8 +271,10 @@ def _cost(
     total = 0.0
     for part, x in zip(data, states, strict=True):
         path, _ = simulator.run(model, part, x, want=False)
+        if not np.isfinite(path).all():
+            return np.inf
         error = (path - part.position) * part.inside[..., None] * weights
-        total += float(np.sum(error**2)) if np.isfinite(error).all() else np.inf
+        total += float(np.sum(error**2))
     return total
 
 

@@ -48,11 +48,11 @@ EXTRAS: Mapping[str, Mapping[str, bool]] = {
 _WORTH = 0.98
 """A candidate with more parameters must bring the held-out error below this share of that of one with fewer."""
 
-_WINDOW = (0.5, 2.0)
+_WINDOW = (0.5, 5.0)
 """Shortest and longest window by default [s]. Each window's start takes up two numbers per joint: parameters from long
 windows predict short ones better than those from short ones."""
 
-_FEWEST = 8
+_FEWEST = 5
 """Windows below which no fit is tried."""
 
 _WIDE = 0.5
@@ -227,7 +227,7 @@ def identify_mechanism(
         plant: Start, and what is held: lengths, gears, gravity, masses that the motion cannot tell.
         recordings: Data to fit, all of one machine.
         held_out: Recordings to score only.
-        window: Length of the windows [s]; by default a twelfth of the data, between 0.5 and 2 s.
+        window: Length of the windows [s]; by default a sixth of the data, between 0.5 and 5 s.
         extras: One of ``EXTRAS``; None lets held-out windows choose.
         stride: Take every so manieth position.
 
@@ -237,7 +237,7 @@ def identify_mechanism(
     if window is not None and not (np.isfinite(window) and window > 0.0):
         raise DataError(f"window is {window} s; expected > 0")
     seconds = sum(float(recording.time[-1] - recording.time[0]) for recording in recordings)
-    length = window or float(np.clip(seconds / 12.0, *_WINDOW))
+    length = window or float(np.clip(seconds / 6.0, *_WINDOW))
     for recording in (*recordings, *held_out):
         recording.check(plant.coordinates)
     _check_distinct(recordings, held_out)
