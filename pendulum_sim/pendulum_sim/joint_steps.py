@@ -306,9 +306,15 @@ def advance_joints(
         q, v = _step(
             forward, along, put, lag, q, v, torque, command, push, begin, first, direction, held, p, table
         )  # fmt: skip
+        # A joint that turned round within the step may have been at a stop before: it is no further than that.
+        q = put(q, joint, min(max(q[joint], table[3][joint]), table[4][joint]))
         if which > 0:
             q = put(q, joint, table[3][joint] if which == 1 else table[4][joint])
-            # A plastic impact: the impulse that takes this joint's velocity moves those that are not held, too.
+            # A plastic impact: the impulse that takes this joint's velocity moves the others too. Dry friction holds
+            # no joint against it, for it is a finite effort in no time; an end stop does.
+            for i in range(n):
+                if table[3][i] < q[i] < table[4][i]:
+                    held = put(held, i, 0.0)
             a = _constrained(forward, along, put, q, v, now, direction, held, p, table)
             more = _constrained(forward, along, put, q, v, put(now, joint, now[joint] + 1.0), direction, held, p, table)
             column = along(more, -1.0, a)

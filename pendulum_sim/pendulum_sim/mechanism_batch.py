@@ -19,7 +19,7 @@ from pendulum_msgs_py.dynamics.arithmetic import in_arithmetic
 from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.plants.mechanism_parameters import MechanismParameters, actuator_specs, joint_specs
 from pendulum_sim.joint_steps import pack_joints
-from pendulum_sim.mechanism_plant import check_stable_step, common_delay, is_smooth_mechanism
+from pendulum_sim.mechanism_plant import check_decay, check_stable_step, common_delay, is_smooth_mechanism
 from pendulum_sim.plant import check_step
 
 __all__ = ["MechanismBatch", "simulate_mechanisms"]
@@ -126,7 +126,8 @@ def simulate_mechanisms(
     for name, values in varied.items():
         _vary(parameters, wide, name, values)
     if varied:
-        _check_varied(parameters, wide)
+        _check_varied(parameters, wide, dt / substeps)
+    _check_starts(parameters, wide)
     check_stable_step(parameters, dt / substeps)
 
     layout = Layout(parameters.mechanism.name, coordinates.driven)
@@ -220,7 +221,20 @@ def _checked_value(parameters: MechanismParameters, name: str, value: float) -> 
     specs[name].check(value, where="variations")
 
 
-def _check_varied(parameters: MechanismParameters, wide: Mapping[str, Array]) -> None:
+def _check_starts(parameters: MechanismParameters, wide: Mapping[str, Array]) -> None:
+    n = len(parameters.joints)
+    low, high = (wide["table"][:, k * n : (k + 1) * n] for k in (3, 4))
+    outside = ~((low <= wide["q"]) & (wide["q"] <= high) & (low < high))
+    if outside.any():
+        row, joint = (int(value[0]) for value in np.nonzero(outside))
+        each = parameters.mechanism.joints[joint]
+        raise ParameterError(
+            f"position of {each.name} of plant {row} is {wide['q'][row, joint]} {each.unit}; expected "
+            f"{low[row, joint]:g} to {high[row, joint]:g}, between its stops"
+        )
+
+
+def _check_varied(parameters: MechanismParameters, wide: Mapping[str, Array], h: float) -> None:
     n = len(parameters.joints)
     coulomb, static = wide["table"][:, :n], wide["table"][:, n : 2 * n]
     if (static < coulomb).any():
@@ -233,6 +247,10 @@ def _check_varied(parameters: MechanismParameters, wide: Mapping[str, Array]) ->
     p = tuple(wide["p"].T)
     for angle in np.linspace(0.0, 2.0 * math.pi, 16, endpoint=False):
         entries = [np.broadcast_to(value, (len(wide["p"]),)) for row in mass((float(angle),) * n, p) for value in row]
-        lowest = np.linalg.eigvalsh(np.array(entries).T.reshape(-1, n, n))[:, 0]
+        rows = np.array(entries).T.reshape(-1, n, n)
+        lowest = np.linalg.eigvalsh(rows)[:, 0]
         if (worst := int(np.argmin(lowest))) >= 0 and not lowest[worst] > 0.0:
             raise ParameterError(f"the masses and inertias of plant {worst} of the batch give no positive inertia")
+        decay = np.linalg.solve(rows, wide["p"][:, -n:, None] * np.eye(n))
+        rate = np.max(np.linalg.eigvals(decay).real, axis=1)
+        check_decay(float(rate.max()), h, f"plant {int(np.argmax(rate))} of the batch")

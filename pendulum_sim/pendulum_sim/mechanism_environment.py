@@ -26,7 +26,7 @@ from pendulum_msgs_py.dynamics.arithmetic import in_arithmetic
 from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.plants.mechanism_parameters import MechanismParameters, load_mechanism
 from pendulum_sim.joint_steps import joint_functions, rk4_joints
-from pendulum_sim.mechanism_plant import MechanismPlant, check_stable_step, is_smooth_mechanism
+from pendulum_sim.mechanism_plant import MechanismPlant, check_stable_step, check_start_state, is_smooth_mechanism
 from pendulum_sim.plant import check_step
 
 __all__ = ["IDS", "MechanismEnv", "MechanismVectorEnv", "register"]
@@ -81,6 +81,8 @@ class _Task:
         self.last = math.inf if math.isinf(episode_time) else max(1, math.ceil(episode_time / dt - 1e-9))
         self.limits = np.array(parameters.effort_limits)
         self.goal = np.array(parameters.coordinates.goal)
+        if start != "random":
+            check_start_state(parameters, tuple(self.goal) if start == "top" else (0.0,) * n)
         self.turns = np.array([joint.turns for joint in parameters.mechanism.joints])
         high = np.full(2 * n, np.inf)
         high[:n][self.turns] = np.pi
@@ -107,10 +109,17 @@ class _Task:
         if start == "random":
             position = generator.uniform(-math.pi, math.pi, self.joints)
             for i, own in enumerate(self.parameters.joints):
-                if not self.turns[i]:
-                    low, high = own.lower_stop, own.upper_stop
-                    bounds = (-1.0 if low is None else 0.9 * low, 1.0 if high is None else 0.9 * high)
-                    position[i] = bounds[0] + (bounds[1] - bounds[0]) * (position[i] / (2.0 * math.pi) + 0.5)
+                # Without a stop on one side, half a turn or 1 m from the other, or from 0.
+                reach = math.pi if self.turns[i] else 1.0
+                low, high = own.lower_stop, own.upper_stop
+                if low is None:
+                    low = -reach if high is None else min(-reach, high - reach)
+                if high is None:
+                    high = max(reach, low + reach)
+                middle, half = 0.5 * (low + high), 0.5 * (high - low)
+                if own.lower_stop is not None or own.upper_stop is not None:
+                    half *= 0.9
+                position[i] = middle + half * position[i] / math.pi
             velocity = generator.uniform(-1.0, 1.0, self.joints)
         return position, velocity
 

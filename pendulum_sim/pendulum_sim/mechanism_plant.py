@@ -19,7 +19,7 @@ from pendulum_sim.compiling import compile_tree
 from pendulum_sim.joint_steps import advance_joints, joint_functions, pack_joints, rk4_joints
 from pendulum_sim.plant import DelayLine, check_step, period_segments
 
-__all__ = ["MechanismPlant", "MechanismState", "check_stable_step", "check_start_state", "is_smooth_mechanism"]
+__all__ = ["MechanismPlant", "MechanismState", "check_decay", "check_stable_step", "check_start_state", "is_smooth_mechanism"]
 
 _RK4_STABLE = 2.78
 """Largest damping rate times step at which Runge-Kutta of order four decays."""
@@ -114,7 +114,7 @@ class MechanismPlant:
             push: n efforts on the joints themselves, neither clamped nor delayed; None for none.
 
         Raises:
-            ParameterError: There are more or fewer than m, or n.
+            ParameterError: There are more or fewer than m, or n, or one is not finite (nothing moves then).
         """
         if len(effort) != len(self._limits):
             self._spread(effort)
@@ -122,6 +122,9 @@ class MechanismPlant:
             push = self._still
         elif len(push) != len(self._still):
             raise ParameterError(f"push has {len(push)} values; expected {len(self._still)}, one per joint")
+        # Clamping would make the full effort of a command that is no number.
+        if not all(map(math.isfinite, (*effort, *push))):
+            raise ParameterError(f"effort is {list(effort)} and push {list(push)}; expected finite numbers")
         ends = [
             line.push(min(limit, max(-limit, value)))
             for line, limit, value in zip(self._delays, self._limits, effort, strict=True)
@@ -205,9 +208,18 @@ def check_stable_step(parameters: MechanismParameters, h: float) -> None:
     for angle in np.linspace(0.0, np.pi, 9):
         rows = np.array(parameters.mechanism.mass((float(angle),) * n, parameters.packed))
         rate = max(rate, float(np.max(np.linalg.eigvals(np.linalg.solve(rows, damping)).real)))
+    check_decay(rate, h, f"plant {parameters.name!r}")
+
+
+def check_decay(rate: float, h: float, whose: str) -> None:
+    """Refuse a step that is too long for a rate of decay [1/s].
+
+    Raises:
+        ParameterError: Names the largest step that would do.
+    """
     if rate * h > _RK4_STABLE:
         raise ParameterError(
-            f"step is {h} s on plant {parameters.name!r}, whose damping decays at {rate:.4g} 1/s; expected at most "
+            f"step is {h} s on {whose}, whose damping decays at {rate:.4g} 1/s; expected at most "
             f"{_RK4_STABLE / rate:.3g} s: more substeps"
         )
 

@@ -74,6 +74,8 @@ def test_a_plant_of_a_batch_moves_as_it_does_alone(name: str, gain: list, amplit
         ({"variations": {"mass_2": [1.0, -1.0]}}, "mass_2 is -1.0 kg; expected > 0"),
         ({"variations": {"inertia_2": [0.05, 1e-4]}}, "plant 1 of the batch give no positive inertia"),
         ({"variations": {"elbow.static_friction": 0.01}}, "static_friction of elbow of plant 0 is 0.01; expected >="),
+        ({"variations": {"elbow.damping": [0.0, 500.0]}, "dt": 2e-3}, "on plant 1 of the batch, whose damping decays"),
+        ({"variations": {"elbow.upper_stop": [3.0, -1.0]}}, "position of elbow of plant 1 is 0.0 rad; expected"),
     ],
 )
 def test_what_makes_no_batch_is_refused(arguments: dict, message: str) -> None:

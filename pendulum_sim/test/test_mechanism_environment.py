@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 import warnings
 
@@ -89,6 +90,24 @@ def test_arguments_that_make_no_environment_are_refused(arguments: dict, message
     for kind in (MechanismEnv, MechanismVectorEnv):
         with pytest.raises(ParameterError, match=message):
             kind(**arguments)
+
+
+@pytest.mark.parametrize("stops", [(-1.0, 0.5), (0.5, 1.0), (-4.0, -3.5), (None, -2.0), (4.0, None)])
+@pytest.mark.parametrize("joint", ["cart_pole.cart", "cart_pole.pole"])
+def test_random_starts_lie_between_the_stops_and_others_beyond_them_are_refused_at_once(joint: str, stops: tuple) -> None:
+    name, _, own = joint.partition(".")
+    plant = load_mechanism(name)
+    joints = [
+        dataclasses.replace(each, lower_stop=stops[0], upper_stop=stops[1]) if known == own else each
+        for known, each in zip(plant.coordinates.names, plant.joints, strict=True)
+    ]
+    plant = dataclasses.replace(plant, joints=tuple(joints))
+    env = MechanismEnv(plant, start="random")
+    for seed in range(20):
+        env.reset(seed=seed)
+    if stops != (-1.0, 0.5):
+        with pytest.raises(ParameterError, match=f"initial {own} is 0.0 "):
+            MechanismVectorEnv(2, plant=plant, start="bottom")
 
 
 def test_actions_and_starts_of_another_shape_are_refused() -> None:

@@ -195,3 +195,36 @@ def test_starts_steps_and_efforts_that_no_plant_can_take_are_refused() -> None:
     uneven = load_mechanism("double_pendulum").with_values({"elbow.transport_delay": 0.01})
     with pytest.raises(ParameterError, match=r"transport_delay is 0.0 s and 0.01 s on plant 'double_pendulum'"):
         MechanismPlant(uneven, 2e-3)
+
+
+@pytest.mark.parametrize("bad", [math.nan, math.inf, -math.inf])
+def test_no_effort_is_made_of_a_command_that_is_no_number(bad: float) -> None:
+    plant = MechanismPlant(load_mechanism("acrobot"), 2e-3)
+    start = plant.reset((0.3, 0.2))
+    for effort, push in (((bad,), None), ((0.0,), (bad, 0.0))):
+        with pytest.raises(ParameterError, match="expected finite numbers"):
+            plant.step(effort, push)
+        assert plant.state == start
+
+
+def test_a_joint_that_turns_round_at_its_stop_within_a_step_is_not_beyond_it() -> None:
+    arm = load_mechanism("furuta").with_values({"pendulum.coulomb_friction": 0.3, "pendulum.upper_stop": 1.0})
+    # Friction brings it to rest past the stop within the step, however short the way is.
+    plant = MechanismPlant(arm, 2e-3)
+    for start in np.linspace(0.05, 1.5, 30):
+        plant.reset((0.0, 1.0 - 1e-5), (0.0, float(start)))
+        assert plant.step((0.0,)).position[1] <= 1.0
+
+
+def test_dry_friction_holds_no_joint_against_an_impact() -> None:
+    def after(friction: float) -> tuple:
+        cart = load_mechanism("cart_pole").with_values(
+            {"cart.coulomb_friction": friction, "pole.upper_stop": 1.0, "pole.damping": 0.0}
+        )
+        plant = MechanismPlant(cart, 1e-4)
+        plant.reset((0.0, 0.999), (0.0, 20.0))
+        return plant.step((0.0,)).velocity
+
+    # Friction that holds the cart while the pole swings, and the one of it that hardly slows it after the blow.
+    assert after(1.0)[0] == pytest.approx(after(0.0)[0], rel=0.5)
+    assert abs(after(50.0)[0]) > 0.1 * abs(after(0.0)[0])
