@@ -19,7 +19,14 @@ from pendulum_sim.compiling import compile_tree
 from pendulum_sim.joint_steps import advance_joints, joint_functions, pack_joints, rk4_joints
 from pendulum_sim.plant import DelayLine, check_step, period_segments
 
-__all__ = ["MechanismPlant", "MechanismState", "check_decay", "check_stable_step", "check_start_state", "is_smooth_mechanism"]
+__all__ = [
+    "MechanismPlant",
+    "MechanismState",
+    "check_decay",
+    "check_stable_step",
+    "check_start_state",
+    "is_smooth_mechanism",
+]
 
 _RK4_STABLE = 2.78
 """Largest damping rate times step at which Runge-Kutta of order four decays."""

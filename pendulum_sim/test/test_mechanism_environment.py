@@ -94,7 +94,9 @@ def test_arguments_that_make_no_environment_are_refused(arguments: dict, message
 
 @pytest.mark.parametrize("stops", [(-1.0, 0.5), (0.5, 1.0), (-4.0, -3.5), (None, -2.0), (4.0, None)])
 @pytest.mark.parametrize("joint", ["cart_pole.cart", "cart_pole.pole"])
-def test_random_starts_lie_between_the_stops_and_others_beyond_them_are_refused_at_once(joint: str, stops: tuple) -> None:
+def test_random_starts_lie_between_the_stops_and_others_beyond_them_are_refused_at_once(
+    joint: str, stops: tuple
+) -> None:
     name, _, own = joint.partition(".")
     plant = load_mechanism(name)
     joints = [
