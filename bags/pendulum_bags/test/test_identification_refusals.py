@@ -332,3 +332,19 @@ def test_a_file_without_a_torque_says_how_a_free_swing_is_read(tmp_path):
     with pytest.raises(DataError, match=r"--mapping free_swing"):
         read_recording(path)
     assert read_recording(path, "free_swing").input_kind == "none"
+
+
+@pytest.mark.parametrize(
+    ("way", "unheeded"),
+    [
+        (["--plant", "acrobot"], ["--friction", "coulomb", "--mass", "0.6"]),
+        (["--plant", "acrobot"], ["--no-page"]),
+        (["--method", "thesis"], ["--held-out", "other.csv"]),
+        (["--method", "thesis"], ["--window", "2"]),
+    ],
+)
+def test_an_option_that_would_change_nothing_is_refused_by_its_name(way, unheeded, capsys):
+    assert identify_cli.main(["recording.csv", *way, *unheeded]) == 2
+    said = " ".join(capsys.readouterr().err.split())
+    name = unheeded[0].replace("--no-", "--")
+    assert f"{name} has no effect with {way[0]}" in said

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import os
 import re
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -21,11 +21,15 @@ if TYPE_CHECKING:
 
 __all__ = ["app", "main"]
 
+_FOR_SEVERAL_JOINTS = frozenset({"plant", "mapping", "window", "held_out", "out", "name", "as_json"})
+_FOR_REGRESSION = frozenset({"method", "mapping", "hold", "experiment", "skew", "out", "page", "as_json"})
+
 app = typer.Typer(add_completion=False, rich_markup_mode=None)
 
 
 @app.command()
 def identify(
+    context: typer.Context,
     data: Annotated[
         list[Path], typer.Argument(help="Bags, CSV files, HEBI logs or friction-study JSON logs of one pendulum.")
     ],
@@ -90,6 +94,7 @@ def identify(
     if plant is not None:
         from pendulum_bags.identification.mechanism_cli import run as run_mechanism
 
+        _refuse_unheeded(context, "--plant", _FOR_SEVERAL_JOINTS)
         others = held_out or []
         rules_of = _mappings(mapping, len(data), len(data) + len(others))
         run_mechanism(plant, data, rules_of, others, window, out, name, as_json)
@@ -99,6 +104,7 @@ def identify(
     if effort not in {"applied", "measured"}:
         raise DataError(f"effort is {effort!r}; expected applied or measured")
     if method == "thesis":
+        _refuse_unheeded(context, "--method thesis", _FOR_REGRESSION)
         recordings = [
             read_recording(path, rules, effort="measured", hold=hold)
             for path, rules in zip(data, _mappings(mapping, len(data)), strict=True)
@@ -129,6 +135,18 @@ def identify(
         _print_result(result, out)
     if result.refused or (result.geometry is not None and result.geometry.contradicts):
         raise typer.Exit(3)
+
+
+def _refuse_unheeded(context: typer.Context, way: str, heeded: Collection[str]) -> None:
+    """Refuse options that were given and would change nothing: whoever gives one relies on it."""
+    given = {name for name in context.params if str(context.get_parameter_source(name)).endswith("COMMANDLINE")}
+    unheeded = sorted(given - {"data", *heeded})
+    if unheeded:
+        options = ", ".join(f"--{name.replace('_', '-')}" for name in unheeded)
+        raise DataError(
+            f"{options} has no effect with {way}; expected none but "
+            + ", ".join(f"--{name.replace('as_', '').replace('_', '-')}" for name in sorted(heeded))
+        )
 
 
 def _mappings(given: Sequence[str] | None, recordings: int, total: int | None = None) -> list[str | None]:
