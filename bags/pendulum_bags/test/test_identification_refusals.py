@@ -337,7 +337,7 @@ def test_a_file_without_a_torque_says_how_a_free_swing_is_read(tmp_path):
 @pytest.mark.parametrize(
     ("way", "unheeded"),
     [
-        (["--plant", "acrobot"], ["--friction", "coulomb", "--mass", "0.6"]),
+        (["--plant", "acrobot"], ["--friction", "coulomb"]),
         (["--plant", "acrobot"], ["--no-page"]),
         (["--method", "thesis"], ["--held-out", "other.csv"]),
         (["--method", "thesis"], ["--window", "2"]),
