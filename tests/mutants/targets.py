@@ -38,7 +38,8 @@ class Target:
 
 
 TARGETS: tuple[Target, ...] = (
-    Target("pendulum_msgs_py.contract.supervisor", ("PlantSupervisor", "_Handover"), _RULES),
+    Target("pendulum_msgs_py.contract.supervisor", ("PlantSupervisor",), _RULES),
+    Target("pendulum_msgs_py.contract.handover", ("Handover",), _RULES),
     Target("pendulum_msgs_py.contract.commands", ("CommandGate",), _RULES),
     Target("pendulum_msgs_py.contract.drive", ("PlantLimits", "Mode"), _RULES),
     Target(
