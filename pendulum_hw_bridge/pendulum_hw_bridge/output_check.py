@@ -31,6 +31,8 @@ _STILL = 5e-4
 """Change of what is asked for at which a duty that does not change at all is stuck; its steps are 2.4e-4 [-]."""
 _STILL_EFFORT = 0.02
 """The same under the torque loop: noise of the measured torque moves what is asked for [-]."""
+_CYCLES = 4
+"""Cycles of the firmware after which a low-pass has forgotten that the output was thrown against a clamp [-]."""
 _OPPOSED_TIME = 0.008
 """Time for which a duty that stands still may be the opposite of what is asked for [s]."""
 _EFFORT_MARGIN = (1.1, 0.5)
@@ -109,11 +111,7 @@ class OutputCheck:
         # Of any: a record may still show the torque loop that the newest setpoints switched off.
         if any(math.isfinite(candidate.effort) for candidate in candidates):
             loop = self.gains.effort
-            # A setpoint that steps throws the derivative against the clamp for a cycle, from wherever the output was;
-            # what its low-pass leaves of that is the same each time.
-            thrown = 2.0 * loop.output_lowpass - 1.0
-            clamped = not thrown * loop.min_output + _STILL < pwm < thrown * loop.max_output - _STILL
-            threshold = math.inf if clamped else _STILL_EFFORT
+            threshold = math.inf if _clamped(loop, pwm) else _STILL_EFFORT
         if self._opposes(feedback, likeliest, still):
             return Fault("output_disagreement", f"{text}, the other way, and has not moved: is it stuck?")
         if still and _memoryless(self.gains) and max(asked) - min(asked) > threshold:
@@ -164,6 +162,22 @@ def _output(gains: PidGains, target: float, measured: float, normaliser: float) 
     target = min(gains.max_target, max(gains.min_target, target))
     output = gains.kp * (target - measured) + gains.feed_forward * target * normaliser
     return min(gains.max_output, max(gains.min_output, output))
+
+
+def _clamped(gains: PidGains, duty: float) -> bool:
+    """Whether a duty stands at a clamp, or is what the low-pass leaves where the output goes from clamp to clamp.
+
+    A setpoint that steps throws the derivative against the other clamp for a cycle, and back: records of one phase of
+    that read one duty each time, whether it happens once in long or every few cycles. Any other duty between the
+    clamps has no reason to stand still.
+    """
+    new, old = gains.output_lowpass, 1.0 - gains.output_lowpass
+    shares = [new * old**cycle for cycle in range(_CYCLES)]
+    # Every few cycles: what is left of the throw before adds up.
+    shares += [new * old**cycle / (1.0 - old**every) for every in range(2, _CYCLES + 1) for cycle in range(every)]
+    low, high = gains.min_output, gains.max_output
+    left = [each for share in shares for each in (high - share * (high - low), low + share * (high - low))]
+    return not low + _STILL < duty < high - _STILL or any(abs(duty - each) <= _STILL for each in left)
 
 
 def _memoryless(gains: GainSet) -> bool:

@@ -293,10 +293,24 @@ def test_what_the_low_pass_leaves_of_an_output_at_its_clamp_is_no_stuck_duty() -
         checked = Checked(gains)
         return [checked.see(duty, Command(effort=0.0), effort=0.1 * (number % 2)) for number in range(4)]
 
-    for duty in (0.5, 0.25, 0.2496, -0.25, -0.125, -0.1246):
+    # Once, and after one, two or more cycles back.
+    for duty in (0.5, 0.3125, 0.3129, 0.3121, 0.359375, -0.25, -0.0625, -0.109375):
         assert faults(duty) == [""] * 4
-    for duty in (0.2494, -0.1244):
+    # Every other cycle: four fifths of one and a fifth of the other.
+    for duty in (0.35, 0.3504, 0.3496, -0.1):
+        assert faults(duty) == [""] * 4
+    # Between those nothing excuses a duty that stands still, near the limit as little as near none.
+    for duty in (0.47, 0.42, 0.1, -0.0631, -0.0619, -0.22):
         assert faults(duty) == ["", "", "", "output_disagreement"]
+
+
+@pytest.mark.parametrize("lowpass", [0.1, 0.5, 0.9, 1.0])
+def test_however_slow_the_low_pass_a_duty_between_the_clamps_has_no_reason_to_stand_still(lowpass: float) -> None:
+    gains = replace(GAINS, effort=PidGains(kp=0.25, min_output=-0.5, max_output=0.5, output_lowpass=lowpass))
+    for duty in (0.47, 0.19, -0.22, -0.42):
+        checked = Checked(gains)
+        found = [checked.see(duty, Command(effort=0.0), effort=0.1 * (number % 2)) for number in range(4)]
+        assert found == ["", "", "", "output_disagreement"]
 
 
 # --- opposed ---------------------------------------------------------------------------------------------------
