@@ -280,7 +280,7 @@ class Bridge:
         elif fault.name == "feedback_late" and self.last_fault == "feedback_lost":
             # Until it came, nobody could tell late from lost.
             self.last_fault = self._note(fault.name)
-            if self.supervisor.mode is Mode.FAULT:
+            if self.supervisor.mode is Mode.FAULT and self.supervisor.reason.startswith("feedback_lost: "):
                 self.supervisor.reason = f"{fault.name}: {fault.message}"
 
     def _turn(self) -> bool:

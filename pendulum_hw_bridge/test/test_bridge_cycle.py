@@ -504,6 +504,14 @@ def test_feedback_that_seemed_lost_and_comes_late_is_told_so_once_in_the_fault_s
     rig.supervisor.disarm(rig.port.time_ns, "acknowledged")
     late(rig)
     assert (rig.bridge.last_fault, rig.supervisor.reason) == ("feedback_late", "acknowledged")
+    # Nor does it hide a stop that nobody confirmed since.
+    rig = Rig().armed()
+    rig.bridge.fail("feedback_lost", "gone")
+    rig.supervisor.disarm(rig.port.time_ns, "acknowledged")
+    rig.port.fails["stop"] = ActuatorError("stop_unacknowledged", "press the motion stop")
+    rig.bridge.release()
+    late(rig)
+    assert rig.supervisor.reason == "stop_unacknowledged: press the motion stop"
     # A late record after another fault explains nothing.
     rig = Rig().armed()
     rig.bridge.fail("m_stop", "pressed")
