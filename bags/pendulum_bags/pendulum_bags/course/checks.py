@@ -152,6 +152,8 @@ def check_noise(tasks: Tasks, ratio: float, cause: str) -> Judgement:
         f"the ratio {ratio:g} is {'near enough' if near else f'off by more than {_RATIO_TOLERANCE:.0%}'}, and {cause} "
         f"{'explains it' if explained else 'does not explain it'}"
     )
+    if not near:
+        words += " (one minute of recording leaves the ratio uncertain by 8 %: the hints say more)"
     return Judgement(near and explained, words)
 
 

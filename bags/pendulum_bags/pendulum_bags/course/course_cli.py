@@ -94,7 +94,7 @@ def solution(
 
 @check.command()
 def gains(
-    q: Annotated[tuple[float, float], typer.Option(help="Diagonal of Q.")],
+    q: Annotated[tuple[float, float], typer.Option(help="Diagonal of Q: two numbers, separated by a space.")],
     r: Annotated[float, typer.Option(help="R.")],
     course: Course = DEFAULT,
     as_json: AsJson = False,
