@@ -200,6 +200,11 @@ def _bounds(text: str, value: str, own: float) -> tuple[float, float]:
         low = high = math.nan
     if not (math.isfinite(low) and math.isfinite(high) and low <= high):
         raise ParameterError(f"--uncertainty is {text!r}; expected as inertia=10% or transport_delay=0:0.01")
+    if own == 0.0 and value.endswith("%"):
+        raise ParameterError(
+            f"--uncertainty {text} is a share of 0, the plant's own value; expected lowest and highest value, such as "
+            "transport_delay=0:0.01"
+        )
     return low, high
 
 

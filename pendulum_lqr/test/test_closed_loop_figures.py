@@ -58,6 +58,23 @@ def test_a_delay_counts_in_time_as_it_does_in_a_simulation_of_python_control():
     assert time_figures(linearise(PLAIN.with_values(transport_delay=0.5)), gain) is None
 
 
+def test_a_loop_near_its_delay_margin_is_followed_until_it_rests(simulate):
+    gain = np.array([PLAIN.gravity + 8.0, 2.0])
+    delay = 0.8 * loop_margins(linearise(PLAIN), gain).delay
+    plant = PLAIN.with_values(transport_delay=delay)
+    found = time_figures(linearise(plant), gain)
+    step, period = 1e-3, delay / 50.0
+    controller = make_controller("lqr", PLAIN, 0.002)
+    # Its own law with another gain, about a set-point a small step away.
+    controller.command = lambda _t, x: (gain[0] - PLAIN.gravity) * step - gain @ x
+    run = simulate(plant, controller, theta=UPRIGHT, duration=1.3 * found.settling_time, period=period)
+    share = run.angle / step
+    assert found.overshoot == pytest.approx(share.max() - 1.0, abs=0.03)
+    late = period * np.flatnonzero(np.abs(share - 1.0) > 0.02)[-1]
+    assert found.settling_time == pytest.approx(late, rel=0.15)
+    assert found.settling_time > 3.0 * time_figures(linearise(PLAIN), gain).settling_time
+
+
 def _pade(delay):
     numerator, denominator = control.pade(delay, 6)
     system = control.tf2ss(numerator, denominator)
@@ -75,6 +92,16 @@ def test_dry_friction_holds_the_pendulum_within_the_band_that_is_said_and_not_be
     assert np.ptp(held.angle) < 0.1 * band
     moved = simulate(plant, controller, theta=UPRIGHT + 3.0 * band, duration=4.0, period=0.002)
     assert abs(moved.angle[-1]) < 1.1 * band
+
+
+def test_the_band_counts_friction_that_grows_with_the_weight_at_the_true_angle(simulate):
+    plant = DFKI.with_values(coulomb_friction=0.02, static_friction=0.02, load_friction=0.15, angle_offset=0.25)
+    controller = make_controller("lqr", plant, 0.002, {"set_point": 0.5})
+    band = time_figures(linearise(plant, UPRIGHT + 0.5), controller.gain.K, plant).friction_band
+    for share, holds in ((0.85, True), (1.25, False)):
+        start = UPRIGHT + 0.5 + share * band
+        run = simulate(plant, controller, theta=start, duration=0.5, period=0.002)
+        assert (np.ptp(run.angle) < 1e-9) == holds, share
 
 
 def test_margins_of_a_loop_with_delay_are_those_of_its_frequency_response():
@@ -150,6 +177,7 @@ def test_an_ellipsoid_never_asks_for_a_plant_that_is_none():
     [
         (["inertai=10%"], r"'inertai'; .*inertia"),
         (["inertia"], r"'inertia'; expected as inertia=10%"),
+        (["transport_delay=10%"], "is a share of 0, the plant's own value; expected lowest and highest value"),
         (["inertia=10"], "expected as inertia=10%"),
         (["inertia=-10%"], "expected as inertia=10%"),
         (["inertia=nan%"], "expected as inertia=10%"),

@@ -75,6 +75,8 @@ def test_a_plant_file_of_one_joint_is_read_as_the_mechanism_pendulum(preset: str
             "model: double_pendulm",
             "model is 'double_pendulm'; did you mean 'double_pendulum'",
         ),
+        ("model: double_pendulum\n", "model: [cart_pole]\n", "model is ['cart_pole']; did you mean 'cart_pole'"),
+        ("format: pendulum_plant/2\n", "format: [1]\n", "format is [1]; expected 'pendulum_plant/1' or"),
         ("model: double_pendulum\n", "", "model is missing; expected one of pendulum, cart_pole"),
         ("unit: kg m^2", "unit: g m^2", "inertia_1: unit is 'g m^2'; expected 'kg m^2'"),
         ("value: 0.001, unit: N m s/rad", "value: 0.001, unit: N s/m", "damping: unit is 'N s/m'"),

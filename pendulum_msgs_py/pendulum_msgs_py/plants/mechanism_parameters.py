@@ -301,7 +301,7 @@ def load_mechanism_file(preset_or_path: str | Path) -> tuple[MechanismParameters
     """
     path = resolve_plant(preset_or_path)
     document = load_yaml(path, "plant file")
-    if document.get("format") not in {FORMAT, MECHANISM_FORMAT}:
+    if document.get("format") not in (FORMAT, MECHANISM_FORMAT):
         raise ParameterError(
             f"{path}: format is {document.get('format')!r}; expected {FORMAT!r} or {MECHANISM_FORMAT!r}"
         )
@@ -394,7 +394,8 @@ def _read_document(document: Mapping[str, Any], path: Path) -> tuple[MechanismPa
     where = str(path)
     reject_unknown(document, ("format", "name", "model", "parameters", "joints", "provenance"), where=where)
     model = document.get("model")
-    if model not in MECHANISMS:
+    # Lists and mappings are no names, and no keys to look up either.
+    if not isinstance(model, str) or model not in MECHANISMS:
         given = "missing" if model is None else repr(model)
         raise ParameterError(f"{where}: model is {given}; {suggestion(model, MECHANISMS)}")
     mechanism = MECHANISMS[model]
