@@ -13,10 +13,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from pendulum_hw_bridge.actuator import ActuatorError, Command, HardwareLimits, Strategy
+from pendulum_hw_bridge.actuator import ActuatorError, Command, HardwareLimits, MStopAction, Strategy
 from pendulum_hw_bridge.backends import hebi as backend_module
 from pendulum_hw_bridge.backends.hebi import HebiBackend, connect_group
 from pendulum_hw_bridge.backends.hebi_discovery import ModuleSelection
+from pendulum_hw_bridge.backends.hebi_settings import fill_limits
 from pendulum_hw_bridge.clocks import SteppedClock
 from pendulum_hw_bridge.gains import DEFAULT_GAINS, GAIN_FIELDS, LOOPS
 from pendulum_msgs_py.errors import ParameterError
@@ -355,6 +356,15 @@ def test_a_feedback_rate_is_above_0_and_up_to_1000_hz() -> None:
         with pytest.raises(ParameterError, match="feedback_rate is"):
             port.set_feedback_rate(rate)
     assert group.feedback_frequency == 1000.0
+
+
+@pytest.mark.parametrize(
+    ("action", "number"), [(MStopAction.DISABLED, 0), (MStopAction.MOTOR_OFF, 1), (MStopAction.HOLD_POSITION, 2)]
+)
+def test_what_the_motion_stop_shall_do_is_written_as_hebi_numbers_it(action: MStopAction, number: int) -> None:
+    command = hebi.GroupCommand(1)
+    fill_limits(command, replace(WINDOW, m_stop=action))
+    assert int(command.mstop_strategy[0]) == number
 
 
 @pytest.mark.parametrize("low", [-3.0, -math.inf])
