@@ -24,8 +24,9 @@ THESIS = load_plant("thesis")
 
 
 def controller(tmp_path, learned, plant=DFKI, period=0.01, **values):
+    """Return the controller of a policy, with all of its torque from the start unless told otherwise."""
     path = write_policy(tmp_path / "policy.npz", learned)
-    return make_controller("policy", plant, period, {"policy": str(path), **values})
+    return make_controller("policy", plant, period, {"policy": str(path), "start_time": 0.0, **values})
 
 
 def entries(content):
@@ -106,6 +107,29 @@ def test_answers_change_no_faster_than_the_policy_was_trained_for(tmp_path):
     assert steps.max() == pytest.approx(0.3)
     tight = controller(tmp_path, policy, effort_limit=0.4)
     assert max(abs(tight.command(0.01 * k, tuple(rng.uniform(-3.0, 3.0, 2)))) for k in range(200)) <= 0.4
+
+
+@pytest.mark.parametrize("period", [0.01, 0.002])
+@pytest.mark.parametrize("gain", [100.0, -100.0])
+def test_torque_begins_at_zero_and_rises_to_the_limit_in_its_start_time(tmp_path, gain, period):
+    own = controller(tmp_path, linear_policy(THESIS, gain, 0.0), THESIS, period, start_time=0.2)
+    times = period * np.arange(round(0.5 / period))
+    for _ in range(2):  # a restart begins anew
+        efforts = np.array([own.command(t, (1.0, 0.0)) for t in times])
+        assert efforts[0] == 0.0
+        assert np.all(np.abs(efforts) <= THESIS.effort_limit * np.minimum(1.0, times / 0.2) + 1e-12)
+        assert abs(efforts[times <= 0.02][-1]) <= 2.0  # a bridge lets a first command in up to here
+        np.testing.assert_allclose(efforts[times > 0.215], -np.sign(gain) * THESIS.effort_limit)
+        own.reset()
+
+
+def test_a_fallback_begins_at_zero_torque_too(tmp_path):
+    own = controller(tmp_path, linear_policy(DFKI, 1.0, 0.0, velocity_box=(1.0,)), fallback="energy_swing_up", start_time=0.2)
+    efforts = [own.command(0.01 * k, (3.0, 2.0)) for k in range(30)]
+    assert "gave up after 0.000 s" in own.notice
+    assert efforts[0] == 0.0
+    assert abs(efforts[1]) <= 0.05 * DFKI.effort_limit + 1e-12
+    assert abs(efforts[-1]) == pytest.approx(DFKI.effort_limit)
 
 
 def test_faster_states_get_each_answer_as_often_and_other_periods_are_refused(tmp_path):

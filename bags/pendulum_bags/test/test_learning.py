@@ -92,7 +92,7 @@ def test_what_a_policy_sees_and_does_in_training_is_what_it_sees_and_does_as_a_c
     rate = 2.0 * DFKI.effort_limit / QUIET.rate_time
     policy = random_policy(DFKI, seed=5, effort_rate=(rate,), velocity_scale=(env.scale,), velocity_box=(50.0,))
     # The same integrator as in training, at its step.
-    rows, notice = run_trial(policy, Trial(DFKI, 0.4, 0.3, np.zeros(300)))
+    rows, notice = run_trial(policy, Trial(DFKI, 0.4, 0.3, np.zeros(300)), start_time=0.0)
     assert notice == ""
     for k in range(300):
         x = (env.motion[0, 0] + math.pi) % (2.0 * math.pi) - math.pi

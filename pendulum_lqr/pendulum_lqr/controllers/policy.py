@@ -19,8 +19,10 @@ from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.parameters import ParameterSpec
 from pendulum_msgs_py.plants.plant_parameters import PlantParameters
 
-__all__ = ["LearnedPolicy"]
+__all__ = ["START_TIME", "LearnedPolicy"]
 
+START_TIME = 0.2
+"""Time from the first state until a policy has all of its torque, by default [s]."""
 _ZERO = "zero"
 _FALLBACKS = (_ZERO, "lqr", "pd_gravity", "energy_swing_up")
 _SAME_PERIOD = 0.05
@@ -37,11 +39,15 @@ class LearnedPolicy(BaseController):
     many states. Outside of the box of states that training visited, or where the network gives no finite number, it
     gives up: the fallback answers from then on, until the next start.
 
+    Its torque, and its fallback's, begins at zero and may reach the limit after ``start_time``: a hanging pendulum asks a
+    swing-up for much at once, and a plant lets nobody begin so (``start_effort_limit``, arming, position control).
+
     Args:
         policy: The policy, of one joint.
         hold: States for which an answer holds.
         effort_limit: Largest torque [N m].
         fallback: Who answers after it gave up; None for zero torque.
+        start_time: Time from the first state until it has all of its torque [s].
     """
 
     FEEDBACK = False  # the linear model tells nothing of it: it is judged by what it visited in training
@@ -50,13 +56,24 @@ class LearnedPolicy(BaseController):
         ParameterSpec("policy", "", "", "Policy file (.npz)."),
         ParameterSpec("fallback", _ZERO, "", "Who answers where the policy gives up: zero torque, or a controller at "
                       "its defaults.", choices=_FALLBACKS),
+        ParameterSpec("start_time", START_TIME, "s", "Time in which the torque that it may ask for rises from zero to its "
+                      "limit, after the first state; 0 for at once.", minimum=0.0, maximum=5.0),
     )  # fmt: skip
 
-    def __init__(self, policy: Policy, hold: int, effort_limit: float, fallback: Controller | None = None) -> None:
+    def __init__(
+        self,
+        policy: Policy,
+        hold: int,
+        effort_limit: float,
+        fallback: Controller | None = None,
+        *,
+        start_time: float = START_TIME,
+    ) -> None:
         super().__init__(min(effort_limit, policy.effort_limit[0]))
         self.policy = policy
         self.hold = hold
         self.fallback = fallback
+        self.start_time = start_time
         self._layers = tuple(zip(policy.network.weights, policy.network.biases, strict=True))
         self._relu, self._squash = policy.network.activation == "relu", policy.network.output == "tanh"
         self._scale = policy.effort_limit[0]
@@ -80,7 +97,7 @@ class LearnedPolicy(BaseController):
         if p["fallback"] != _ZERO:
             values = {"effort_limit": p["effort_limit"]}
             fallback = make_controller(p["fallback"], plant, period, values, checked=False)
-        return cls(policy, max(1, round(policy.period / period)), p["effort_limit"], fallback)
+        return cls(policy, max(1, round(policy.period / period)), p["effort_limit"], fallback, start_time=p["start_time"])
 
     def check(self, plant: PlantParameters, period: float) -> None:
         """Refuse a period that the policy's is no whole multiple of, and a fallback that is unstable at it.
@@ -131,7 +148,7 @@ class LearnedPolicy(BaseController):
             self._give_up(t, f"its network answered {answer}")
             return self._fall_back(t, x)
         step = self._scale * answer - self._effort
-        self._effort = self.clamp(self._effort + min(self._step, max(-self._step, step)))
+        self._effort = self._begun(t, self._effort + min(self._step, max(-self._step, step)))
         return self._effort
 
     def describe(self) -> str:
@@ -199,4 +216,9 @@ class LearnedPolicy(BaseController):
         if self.fallback is None:
             return 0.0
         effort = self.fallback.command(t, x)
-        return self.clamp(effort) if math.isfinite(effort) else 0.0
+        return self._begun(t, effort) if math.isfinite(effort) else 0.0
+
+    def _begun(self, t: float, effort: float) -> float:
+        """Return the torque within what it may have so long after its start [N m]."""
+        bound = self.effort_limit if t >= self.start_time else self.effort_limit * max(0.0, t) / self.start_time
+        return min(bound, max(-bound, effort))

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pendulum_bags.learning.task import SwingUpTask
-from pendulum_lqr.controllers.policy import LearnedPolicy
+from pendulum_lqr.controllers.policy import START_TIME, LearnedPolicy
 from pendulum_lqr.policy import Policy
 from pendulum_msgs_py.contract.angles import from_upright
 from pendulum_msgs_py.plants.plant_parameters import PlantParameters
@@ -66,9 +66,9 @@ def trials_of(policy: Policy, task: SwingUpTask, count: int, seed: int, duration
     return found
 
 
-def run_trial(policy: Policy, trial: Trial) -> tuple[NDArray[np.float64], str]:
+def run_trial(policy: Policy, trial: Trial, start_time: float = START_TIME) -> tuple[NDArray[np.float64], str]:
     """Return angle from upright, velocity and torque at each step, shape (3, n), and why it gave up, if it did."""
-    controller = LearnedPolicy(policy, 1, policy.effort_limit[0])
+    controller = LearnedPolicy(policy, 1, policy.effort_limit[0], start_time=start_time)
     plant = make_plant(trial.plant, policy.period)
     state = plant.reset(trial.theta, trial.theta_dot)
     rows = np.empty((3, trial.kicks.size))
