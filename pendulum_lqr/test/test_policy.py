@@ -124,7 +124,9 @@ def test_torque_begins_at_zero_and_rises_to_the_limit_in_its_start_time(tmp_path
 
 
 def test_a_fallback_begins_at_zero_torque_too(tmp_path):
-    own = controller(tmp_path, linear_policy(DFKI, 1.0, 0.0, velocity_box=(1.0,)), fallback="energy_swing_up", start_time=0.2)
+    own = controller(
+        tmp_path, linear_policy(DFKI, 1.0, 0.0, velocity_box=(1.0,)), fallback="energy_swing_up", start_time=0.2
+    )
     efforts = [own.command(0.01 * k, (3.0, 2.0)) for k in range(30)]
     assert "gave up after 0.000 s" in own.notice
     assert efforts[0] == 0.0

@@ -39,8 +39,8 @@ class LearnedPolicy(BaseController):
     many states. Outside of the box of states that training visited, or where the network gives no finite number, it
     gives up: the fallback answers from then on, until the next start.
 
-    Its torque, and its fallback's, begins at zero and may reach the limit after ``start_time``: a hanging pendulum asks a
-    swing-up for much at once, and a plant lets nobody begin so (``start_effort_limit``, arming, position control).
+    Its torque, and its fallback's, begins at zero and may reach the limit after ``start_time``: a hanging pendulum asks
+    a swing-up for much at once, and a plant lets nobody begin so (``start_effort_limit``, arming, position control).
 
     Args:
         policy: The policy, of one joint.
@@ -56,8 +56,8 @@ class LearnedPolicy(BaseController):
         ParameterSpec("policy", "", "", "Policy file (.npz)."),
         ParameterSpec("fallback", _ZERO, "", "Who answers where the policy gives up: zero torque, or a controller at "
                       "its defaults.", choices=_FALLBACKS),
-        ParameterSpec("start_time", START_TIME, "s", "Time in which the torque that it may ask for rises from zero to its "
-                      "limit, after the first state; 0 for at once.", minimum=0.0, maximum=5.0),
+        ParameterSpec("start_time", START_TIME, "s", "Time in which the torque that it may ask for rises from zero to "
+                      "its limit, after the first state; 0 for at once.", minimum=0.0, maximum=5.0),
     )  # fmt: skip
 
     def __init__(
@@ -97,7 +97,9 @@ class LearnedPolicy(BaseController):
         if p["fallback"] != _ZERO:
             values = {"effort_limit": p["effort_limit"]}
             fallback = make_controller(p["fallback"], plant, period, values, checked=False)
-        return cls(policy, max(1, round(policy.period / period)), p["effort_limit"], fallback, start_time=p["start_time"])
+        return cls(
+            policy, max(1, round(policy.period / period)), p["effort_limit"], fallback, start_time=p["start_time"]
+        )
 
     def check(self, plant: PlantParameters, period: float) -> None:
         """Refuse a period that the policy's is no whole multiple of, and a fallback that is unstable at it.
