@@ -28,6 +28,7 @@ _KEEPS_TIME = (
     "tests/integration/test_experiments.py",
     "tests/acceptance/test_console.py",
     "tests/integration/test_plant_interface.py",
+    "tests/acceptance/test_first_day.py",
     "tests/integration",
     "tests/faults/test_bridge_faults.py",
     "tests/faults/test_disk_faults.py",
