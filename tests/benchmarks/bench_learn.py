@@ -1,0 +1,90 @@
+"""Learning: time to a solved Pendulum-v1; the default policy for ``dfki``, its trials, hold and time per answer."""
+
+from __future__ import annotations
+
+# isort: off
+import pendulum_msgs_py.programs.one_thread  # noqa: F401  # as the nodes do, before numpy
+# isort: on
+
+import json
+import os
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from pendulum_bags.learning.evaluation import run_trial, trials_of
+from pendulum_bags.learning.task import SwingUpTask
+from pendulum_lqr.controllers.policy import LearnedPolicy
+from pendulum_lqr.policy_file import load_policy
+from tests.benchmarks import Peer, Row, measured
+
+__all__ = ["rows"]
+
+PUBLISHED_SAC = 480.0
+"""Time of Stable-Baselines3's SAC to a solved Pendulum-v1, some 8 minutes on 8 cores; published, not measured [s]."""
+HOLD, SETTLE = 60.0, 5.0
+OTHER_SEED = 20_000
+"""Trials that are not those with which the training ends."""
+
+
+def rows() -> Iterator[Row]:
+    """Yield the rows of this area."""
+    with tempfile.TemporaryDirectory(prefix="pendulum_learn_") as folder:
+        yield from _pendulum_v1(Path(folder) / "v1.npz")
+        yield from _swing_up(Path(folder) / "dfki.npz")
+
+
+def _pendulum_v1(out: Path) -> Iterator[Row]:
+    told, wall, cpu = _train("--task", "pendulum_v1", out=out)
+    yield measured("Pendulum-v1: mean return over 100 episodes of Gymnasium's own", told["return_mean"], "",
+                   at_least=-160.0, note=f"standard deviation {told['return_std']:.1f}")  # fmt: skip
+    yield measured("Pendulum-v1: training from start to file, wall time", wall, "s", at_most=60.0,
+                   peer=Peer("published SAC of SB3", PUBLISHED_SAC), note="peer: 8 cores")  # fmt: skip
+    yield measured("Pendulum-v1: training from start to file, CPU time", cpu, "s", at_most=60.0)
+
+
+def _swing_up(out: Path) -> Iterator[Row]:
+    told, wall, cpu = _train("--plant", "dfki", out=out)
+    what = "dfki: upright at the end, any start, kicks, parameters off by 25 %, delay"
+    yield measured(f"{what}; trials of the training", told["up"], f"of {told['trials']}", at_least=told["trials"])
+    yield measured("dfki: training from start to file, wall time", wall, "s", at_most=300.0)
+    yield measured("dfki: training from start to file, CPU time", cpu, "s", at_most=300.0)
+    policy = load_policy(str(out))
+    trials = trials_of(policy, SwingUpTask(), 60, OTHER_SEED)
+    last = round(1.0 / policy.period)
+    up = sum(bool(np.all(np.abs(run_trial(policy, trial)[0][0, -last:]) <= 0.3)) for trial in trials)
+    yield measured(f"{what}; other trials", up, f"of {len(trials)}", at_least=len(trials))
+    still = np.zeros(round((SETTLE + HOLD) / policy.period))
+    worst = max(
+        float(np.abs(run_trial(policy, replace(trial, kicks=still))[0][0, round(SETTLE / policy.period) :]).max())
+        for trial in trials[:12]
+    )
+    yield measured("dfki: largest deviation in 60 s upright, 12 plants off by up to 25 %", worst, "rad", at_most=0.3)
+    controller = LearnedPolicy(policy, 1, policy.effort_limit[0])
+    times = np.empty(5000)
+    for k in range(times.size):
+        x = (0.1 * np.sin(0.1 * k), 0.5 * np.cos(0.1 * k))
+        began = time.perf_counter_ns()
+        controller.command(k * policy.period, x)
+        times[k] = (time.perf_counter_ns() - began) / 1e3
+    assert controller.notice == ""
+    median, p99 = np.percentile(times, [50, 99])
+    yield measured("policy of 64 x 64: time per answer, median", float(median), "us", at_most=20.0,
+                   note=f"p99 {p99:.3g} us")  # fmt: skip
+
+
+def _train(*arguments: str, out: Path) -> tuple[dict[str, Any], float, float]:
+    """Train by the command line; return what it says, wall time and CPU time [s]."""
+    command = [sys.executable, "-m", "pendulum_bags", "train", *arguments, "--json", "--out", str(out)]
+    before, began = os.times(), time.monotonic()
+    done = subprocess.run(command, capture_output=True, text=True, check=True)
+    wall, after = time.monotonic() - began, os.times()
+    cpu = after.children_user + after.children_system - before.children_user - before.children_system
+    return json.loads(done.stdout), wall, cpu
