@@ -42,6 +42,7 @@ from pendulum_msgs_py.ros.lifecycle import LifecycleNode
 from pendulum_msgs_py.ros.parameters import NodeParameters
 from pendulum_msgs_py.ros.plant_interface import PlantInterface
 from pendulum_msgs_py.ros.plant_loop import LockstepLoop
+from pendulum_msgs_py.ros.polled import PollingNode
 from pendulum_msgs_py.ros.runner import run_node
 from pendulum_msgs_py.ros.timers import create_wall_timer
 
@@ -71,7 +72,7 @@ def _logged(transition: Callable[..., TransitionCallbackReturn]) -> Callable[...
     return guarded
 
 
-class BridgeNode(LifecycleNode):
+class BridgeNode(LifecycleNode, PollingNode):
     """An actuator as a plant.
 
     Args:

@@ -8,6 +8,8 @@ from collections.abc import Callable
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.node import Node
 
+from pendulum_msgs_py.ros.answers import answer_who_listens
+
 __all__ = ["EStopThread"]
 
 _JOIN = 2.0
@@ -45,6 +47,7 @@ class EStopThread:
 
     def start(self) -> None:
         """Begin to serve."""
+        answer_who_listens(self.node)
         self._thread.start()
 
     def close(self) -> None:

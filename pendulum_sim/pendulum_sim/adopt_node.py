@@ -8,7 +8,7 @@ from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 
 from rclpy.clock import Clock, ClockType
-from rclpy.node import Node
+from pendulum_msgs_py.ros.polled import PollingNode
 from rclpy.qos import HistoryPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.serialization import deserialize_message
 from sensor_msgs.msg import JointState
@@ -71,7 +71,7 @@ _LAST_ZEROS = 5
 """Zero efforts that are sent at the end."""
 
 
-class AdoptNode(Node):
+class AdoptNode(PollingNode):
     """Stands between a plant that knows no rules and everybody else.
 
     Each of its states goes out with the time at which it came, and is answered with the torque that the rules allow.

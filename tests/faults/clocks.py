@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 import rclpy
 from rclpy.context import Context
-from rclpy.node import Node
+from pendulum_msgs_py.ros.polled import PollingNode
 from rosgraph_msgs.msg import Clock
 
 from pendulum_bags.experiments.domain import reserve_domain
@@ -190,7 +190,7 @@ def simulate_hours(hours: float, rate_hz: float = 50.0) -> Outcome:
     steps = round(hours * _HOUR * rate_hz)
     context = Context()
     rclpy.init(context=context)
-    node = Node("day", context=context, namespace="/day", start_parameter_services=False)
+    node = PollingNode("day", context=context, namespace="/day", start_parameter_services=False)
     try:
         parameters = load_plant("thesis")
         supervisor = PlantSupervisor(limits_from_parameters(dict(validate(LIMIT_SPECS, {})), parameters.effort_limit))

@@ -144,7 +144,7 @@ def test_a_trajectory_that_waited_while_the_plant_armed_is_refused(early_ns: int
         move = JointTrajectory(joint_names=[names.JOINT])
         move.points = [JointTrajectoryPoint(positions=[0.0], time_from_start=Duration(sec=1))]
         # A stamp of an hour ago is that of a system clock which was set back since.
-        interface._on_trajectory(serialize_message(move), {"received_timestamp": interface._armed_ns - early_ns})
+        interface._on_trajectory(serialize_message(move), interface._armed_ns - early_ns)
         rig.run(0.1)
         assert rig.supervisor.mode is mode
         assert interface.refused_trajectories.total() == (mode is Mode.EFFORT)

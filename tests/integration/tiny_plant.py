@@ -9,7 +9,7 @@ import sys
 import time
 from collections.abc import Callable
 
-from rclpy.node import Node
+from pendulum_msgs_py.ros.polled import PollingNode
 
 from pendulum_msgs_py.contract.plant_specs import LIMIT_SPECS, limits_from_parameters
 from pendulum_msgs_py.contract.supervisor import DriveKind, PlantSupervisor
@@ -31,7 +31,7 @@ SPECS = (
 )
 
 
-class TinyPlant(Node):
+class TinyPlant(PollingNode):
     """The plant."""
 
     def __init__(self, stop: Callable[[], None]) -> None:

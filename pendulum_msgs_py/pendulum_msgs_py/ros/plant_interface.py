@@ -11,7 +11,6 @@ from collections.abc import Callable, Mapping
 from typing import Protocol
 
 from diagnostic_msgs.msg import DiagnosticStatus
-from rclpy.node import Node
 from sensor_msgs.msg import JointState
 from std_msgs.msg import String
 from std_srvs.srv import SetBool, Trigger
@@ -43,6 +42,10 @@ _LEAST_BETWEEN_LINES = 1.0
 """Time between two lines of the log about one mode [s]."""
 _WAITED_NS = 10 * NANOSECONDS
 """Longest time for which a message may wait while a plant arms [ns]; more is a system clock that was set back."""
+_LOOK_FOR_TRAJECTORY = 0.02
+"""Time between two looks for a trajectory [s]: whoever sends without pause has the newest read then, and no other."""
+_REST_AFTER_TRAJECTORY = 4.0
+"""Time without a look after a trajectory was read, in the time that it took the processor: a fifth of it at most."""
 TRAJECTORY_AGE_LIMIT = 1.0
 """Largest distance of a trajectory's stamp from the plant's time [s]: an old wish should not move a machine."""
 
@@ -60,8 +63,7 @@ class PlantInterface:
         clock: The plant's time [ns]: wall clock or simulated.
         push: Whether the plant can take a torque on the link itself.
         e_stop: Whether the e-stop is served here; else the plant serves it, on a path that nothing else can block.
-        polled: Whether torque inputs wait for :meth:`take_inputs` instead of waking the node; it is a
-            :class:`PollingNode` then.
+        polled: Whether torque inputs wait for :meth:`take_inputs` instead of waking the node.
         statistics: The loop's figures, shown in diagnostics.
         more_diagnostics: Further key-value pairs for diagnostics.
         on_command: Called after each accepted command of any torque input.
@@ -75,7 +77,7 @@ class PlantInterface:
 
     def __init__(
         self,
-        node: Node,
+        node: PollingNode,
         supervisor: PlantSupervisor,
         clock: Callable[[], int],
         *,
@@ -115,7 +117,6 @@ class PlantInterface:
         for kind in inputs:
             receive = self._receiver(kind)
             if polled:
-                assert isinstance(node, PollingNode)
                 source = node.create_polled_input(JointState, kind.value, qos.COMMAND_INPUT)
                 self._polled.append((source, receive))
                 self._inputs[kind] = source.subscription
@@ -123,9 +124,9 @@ class PlantInterface:
                 self._inputs[kind] = node.create_subscription(
                     JointState, kind.value, receive, qos.COMMAND_INPUT, raw=True
                 )
-        self._trajectories = node.create_subscription(
-            JointTrajectory, names.JOINT_TRAJECTORY, self._receive_trajectory, qos.TRAJECTORY, raw=True
-        )
+        self._trajectories = node.create_polled_input(JointTrajectory, names.JOINT_TRAJECTORY, qos.TRAJECTORY)
+        self._next_trajectory = 0.0
+        create_wall_timer(node, _LOOK_FOR_TRAJECTORY, self._look_for_trajectory)
         node.create_service(SetBool, names.ARM, self._on_arm)
         if e_stop:
             node.create_service(Trigger, names.E_STOP, self._on_e_stop)
@@ -234,20 +235,18 @@ class PlantInterface:
 
         return receive
 
-    def _receive_trajectory(self, data: bytes) -> None:
-        # The events executor of rclpy 7.1 ends with a SystemError where a callback asks for the time of arrival too.
-        # What waited while the plant armed was taken by then (`_on_arm`); this came later.
-        self._on_trajectory(data, {"received_timestamp": time.time_ns()})
+    def _look_for_trajectory(self) -> None:
+        """Take the newest trajectory, and leave others the time: reading one holds Python's lock, and many may come."""
+        if time.monotonic() < self._next_trajectory:
+            return
+        began = time.thread_time()
+        self._trajectories.take(self._on_trajectory)
+        spent = time.thread_time() - began
+        self._next_trajectory = time.monotonic() + _REST_AFTER_TRAJECTORY * spent
 
-    def _take_waiting_trajectories(self) -> None:
-        handle = self._trajectories.handle
-        with handle:
-            while (taken := handle.take_message(JointTrajectory, True)) is not None:
-                self._on_trajectory(taken[0], taken[1])
-
-    def _on_trajectory(self, data: bytes, info: Mapping[str, int]) -> None:
+    def _on_trajectory(self, data: bytes, arrived_ns: int) -> None:
         try:
-            if self.supervisor.mode.armed and 0 < self._armed_ns - info["received_timestamp"] < _WAITED_NS:
+            if self.supervisor.mode.armed and 0 < self._armed_ns - arrived_ns < _WAITED_NS:
                 raise ParameterError("it came before the plant was armed; expected it after: send it again")
             stamp_ns, trajectory = decode_joint_trajectory(data)
             if self.sample is None:
@@ -280,7 +279,7 @@ class PlantInterface:
             if not was_armed:
                 # Arming takes its time; what waited in the meantime was not meant for an armed plant.
                 self._armed_ns = time.time_ns()
-                self._take_waiting_trajectories()
+                self._trajectories.take(self._on_trajectory)
             response.success, response.message = not refusal, refusal or self.supervisor.mode.value
         else:
             self.supervisor.disarm(self.clock())

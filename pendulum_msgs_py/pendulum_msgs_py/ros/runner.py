@@ -39,6 +39,7 @@ from pendulum_msgs_py.programs.executables import (
     report_exhaustion,
     split_ros_arguments,
 )
+from pendulum_msgs_py.ros.answers import answer_who_listens
 from pendulum_msgs_py.ros.middleware import check_closed, set_middleware_defaults
 
 __all__ = ["Closeable", "Paced", "run_node"]
@@ -139,6 +140,7 @@ def _run(make_node: Callable[[Callable[[], None]], Node], arguments: Sequence[st
     exit_code = 0
     try:
         node = _make(make_node, stop)
+        answer_who_listens(node)
         check_closed(node.context.get_domain_id())
         # The first line that rclpy logs takes 30 ms; said now, it does not come in the middle of a loop.
         node.get_logger().info("ready")

@@ -1,0 +1,99 @@
+"""Answers of services that wait for nobody: a client that has gone must not hold up the process that serves it.
+
+Where the client's half of a service is not there, rmw_fastrtps waits 100 ms for it before each answer, and rclpy holds
+Python's lock all the while: no thread of the process runs, neither an actuator's nor an e-stop's. A client that ended
+with a thousand requests unread stopped a plant for 100 s.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import threading
+import time
+from collections import deque
+from collections.abc import Callable
+from typing import Any
+
+from rclpy.impl.implementation_singleton import rclpy_implementation
+from rclpy.node import Node
+from rclpy.service import Service
+
+__all__ = ["answer_who_listens"]
+
+_PATIENCE = 1.0
+"""Time for which an answer is kept for a client that discovery has not told of yet [s]."""
+_LOOK_AGAIN = 0.005
+"""Time between two looks for such clients [s]."""
+_MOST_KEPT = 100
+"""Answers kept for clients at once, for each service."""
+_WAITED = 0.09
+"""Time from which on the middleware has waited for a client in vain [s]."""
+_FARTHEST = 100
+"""Largest distance of the numbers of two requests that are taken for one client's."""
+
+
+def answer_who_listens(node: Node) -> None:
+    """Let each service of a node send its answers to clients that are there; call it once all services are made."""
+    for service in node.services:
+        service.send_response = _Answers(node, service).send
+
+
+class _Answers:
+    """What a service sends.
+
+    Args:
+        node: Its node.
+        service: The service.
+    """
+
+    def __init__(self, node: Node, service: Service) -> None:
+        self._name = name = service.handle.name
+        self._count: Callable[[], int] = lambda: node.count_clients(name)
+        self._send: Callable[[Any, Any], None] = service.send_response
+        self._kept: deque[tuple[float, Any, Any]] = deque()
+        self._lock = threading.Lock()
+        self._gone: int | None = None
+        self._gone_ns = 0
+
+    def send(self, response: Any, header: Any) -> None:
+        """Send an answer, keep it for a while where no client is known yet, or drop it where the client has gone."""
+        if self._count():
+            self._send_now(response, header)
+            return
+        with self._lock:
+            if len(self._kept) >= _MOST_KEPT:
+                return
+            self._kept.append((time.monotonic() + _PATIENCE, response, header))
+            if len(self._kept) == 1:
+                threading.Thread(target=self._wait, name=f"answers of {self._name}", daemon=True).start()
+
+    def _send_now(self, response: Any, header: Any) -> None:
+        if self._follows_gone(header):
+            self._gone = header.request_id.sequence_number
+            return
+        began = time.monotonic()
+        self._send(response, header)
+        if time.monotonic() - began > _WAITED:
+            self._gone, self._gone_ns = header.request_id.sequence_number, time.time_ns()
+
+    def _follows_gone(self, header: Any) -> bool:
+        """Tell whether a request is the next of a client that has just been waited for in vain."""
+        if self._gone is None or header.source_timestamp > self._gone_ns:
+            return False
+        return 0 < header.request_id.sequence_number - self._gone <= _FARTHEST
+
+    def _wait(self) -> None:
+        while True:
+            time.sleep(_LOOK_AGAIN)
+            # A node that is destroyed has nobody to answer any more.
+            with contextlib.suppress(rclpy_implementation.InvalidHandle):
+                there = self._count() > 0
+                while there and self._kept:
+                    self._send_now(*self._kept[0][1:])
+                    with self._lock:
+                        self._kept.popleft()
+            with self._lock:
+                while self._kept and self._kept[0][0] < time.monotonic():
+                    self._kept.popleft()
+                if not self._kept:
+                    return

@@ -1,0 +1,78 @@
+"""A client that has gone holds up neither the service nor the process, on real DDS."""
+
+from __future__ import annotations
+
+import time
+import warnings
+from collections.abc import Iterator
+
+import pytest
+from rcl_interfaces.srv import SetParameters
+from rclpy.client import Client
+from rclpy.experimental import EventsExecutor
+
+from pendulum_msgs_py.ros.answers import answer_who_listens
+from tests.graph_peer import GraphPeer
+
+REQUESTS = 30
+SERVICE = "/server/set_parameters"
+
+
+@pytest.fixture
+def server(domain_id: int) -> Iterator[GraphPeer]:
+    peer = GraphPeer("server", domain=domain_id, make_executor=EventsExecutor)
+    answer_who_listens(peer.node)
+    yield peer
+    peer.close()
+
+
+def client_of(peer: GraphPeer) -> Client:
+    client = peer.node.create_client(SetParameters, SERVICE)
+    peer.until(client.service_is_ready, "the service")
+    return client
+
+
+def asked_and_gone(server: GraphPeer, domain_id: int, left: int) -> None:
+    """Let a client leave its requests unread and go; wait until the server's graph says so."""
+    peer = GraphPeer("caller", domain=domain_id)
+    client = client_of(peer)
+    for _ in range(REQUESTS):
+        client.remove_pending_request(client.call_async(SetParameters.Request()))
+    deadline = time.monotonic() + 30.0
+    peer.close()
+    while server.node.count_clients(SERVICE) > left:
+        assert time.monotonic() < deadline, "the client is still on the graph"
+        time.sleep(0.01)
+
+
+def in_vain(caught: list[warnings.WarningMessage]) -> int:
+    """Return how often the middleware has waited for a client, holding Python's lock."""
+    return sum("client will not receive response" in str(each.message) for each in caught)
+
+
+def test_a_client_that_went_with_requests_unread_is_not_waited_for(server: GraphPeer, domain_id: int) -> None:
+    asked_and_gone(server, domain_id, left=0)
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        server.spin(0.3)
+    assert in_vain(caught) == 0
+    peer = GraphPeer("next", domain=domain_id)
+    future = client_of(peer).call_async(SetParameters.Request())
+    try:
+        server.until(lambda: peer.spin_once(0.0) or future.done(), "the answer to who comes next")
+    finally:
+        peer.close()
+
+
+def test_a_client_that_went_is_waited_for_once_where_another_is_there(server: GraphPeer, domain_id: int) -> None:
+    peer = GraphPeer("other", domain=domain_id)
+    client = client_of(peer)
+    try:
+        asked_and_gone(server, domain_id, left=1)
+        future = client.call_async(SetParameters.Request())
+        with warnings.catch_warnings(record=True) as caught:
+            warnings.simplefilter("always")
+            server.until(lambda: peer.spin_once(0.0) or future.done(), "the answer to the other client")
+        assert in_vain(caught) <= 1
+    finally:
+        peer.close()
