@@ -8,7 +8,6 @@ from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 
 from rclpy.clock import Clock, ClockType
-from pendulum_msgs_py.ros.polled import PollingNode
 from rclpy.qos import HistoryPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.serialization import deserialize_message
 from sensor_msgs.msg import JointState
@@ -25,6 +24,7 @@ from pendulum_msgs_py.parameters import ParameterSpec
 from pendulum_msgs_py.plants.plant_parameters import PRESET_NAMES, load_plant
 from pendulum_msgs_py.ros.parameters import NodeParameters
 from pendulum_msgs_py.ros.plant_interface import PlantInterface
+from pendulum_msgs_py.ros.polled import PollingNode
 from pendulum_msgs_py.ros.runner import run_node
 from pendulum_sim.servo import PositionServo
 

@@ -16,7 +16,6 @@ from pathlib import Path
 import numpy as np
 import rclpy
 from rclpy.context import Context
-from pendulum_msgs_py.ros.polled import PollingNode
 from rosgraph_msgs.msg import Clock
 
 from pendulum_bags.experiments.domain import reserve_domain
@@ -39,6 +38,7 @@ from pendulum_msgs_py.ros import qos
 from pendulum_msgs_py.ros.convert import stamp_to_message
 from pendulum_msgs_py.ros.plant_interface import PlantInterface
 from pendulum_msgs_py.ros.plant_loop import LockstepLoop
+from pendulum_msgs_py.ros.polled import PollingNode
 from pendulum_rosbag.reader import read_bag
 from pendulum_sim.plants import make_plant
 from tests.faults.live import NAMESPACE, LiveSystem

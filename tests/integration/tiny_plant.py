@@ -9,8 +9,6 @@ import sys
 import time
 from collections.abc import Callable
 
-from pendulum_msgs_py.ros.polled import PollingNode
-
 from pendulum_msgs_py.contract.plant_specs import LIMIT_SPECS, limits_from_parameters
 from pendulum_msgs_py.contract.supervisor import DriveKind, PlantSupervisor
 from pendulum_msgs_py.contract.timing import SteadyWallClock
@@ -18,6 +16,7 @@ from pendulum_msgs_py.contract.values import JointSample
 from pendulum_msgs_py.parameters import ParameterSpec
 from pendulum_msgs_py.ros.parameters import NodeParameters
 from pendulum_msgs_py.ros.plant_interface import PlantInterface
+from pendulum_msgs_py.ros.polled import PollingNode
 from pendulum_msgs_py.ros.runner import run_node
 
 SPECS = (
