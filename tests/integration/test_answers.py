@@ -10,6 +10,7 @@ import pytest
 from rcl_interfaces.srv import SetParameters
 from rclpy.client import Client
 from rclpy.experimental import EventsExecutor
+from rclpy.task import Future
 
 from pendulum_msgs_py.ros.answers import answer_who_listens
 from tests.graph_peer import GraphPeer
@@ -45,6 +46,14 @@ def asked_and_gone(server: GraphPeer, domain_id: int, left: int) -> None:
         time.sleep(0.01)
 
 
+def until_done(server: GraphPeer, peer: GraphPeer, future: Future, what: str) -> None:
+    def done() -> bool:
+        peer.spin_once(0.0)
+        return bool(future.done())
+
+    server.until(done, what)
+
+
 def in_vain(caught: list[warnings.WarningMessage]) -> int:
     """Return how often the middleware has waited for a client, holding Python's lock."""
     return sum("client will not receive response" in str(each.message) for each in caught)
@@ -59,7 +68,7 @@ def test_a_client_that_went_with_requests_unread_is_not_waited_for(server: Graph
     peer = GraphPeer("next", domain=domain_id)
     future = client_of(peer).call_async(SetParameters.Request())
     try:
-        server.until(lambda: peer.spin_once(0.0) or future.done(), "the answer to who comes next")
+        until_done(server, peer, future, "the answer to who comes next")
     finally:
         peer.close()
 
@@ -72,7 +81,7 @@ def test_a_client_that_went_is_waited_for_once_where_another_is_there(server: Gr
         future = client.call_async(SetParameters.Request())
         with warnings.catch_warnings(record=True) as caught:
             warnings.simplefilter("always")
-            server.until(lambda: peer.spin_once(0.0) or future.done(), "the answer to the other client")
+            until_done(server, peer, future, "the answer to the other client")
         assert in_vain(caught) <= 1
     finally:
         peer.close()
