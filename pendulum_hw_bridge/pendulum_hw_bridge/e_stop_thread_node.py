@@ -1,10 +1,16 @@
-"""A node with an executor and a thread of its own for an e-stop; an error in it is a press, and does not end it."""
+"""A node with participant, executor and thread of its own for an e-stop; an error in it is a press, not its end.
+
+A participant has one socket and one thread that empties it: behind a flood of requests or trajectories to the owner a
+press would wait there, or be lost and come again when DDS asks for it.
+"""
 
 from __future__ import annotations
 
+import sys
 import threading
 from collections.abc import Callable
 
+import rclpy
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.node import Node
 
@@ -13,6 +19,8 @@ from pendulum_msgs_py.ros.answers import answer_who_listens
 __all__ = ["EStopThread"]
 
 _JOIN = 2.0
+_SWITCH = 0.001
+"""Time after which a thread that computes hands Python's lock to one that waits [s]; by default it is 5 ms."""
 _PAUSE = 0.01
 """Time after an error before the thread serves again [s]."""
 
@@ -31,16 +39,19 @@ class EStopThread:
 
     def __init__(self, owner: Node, suffix: str, press: Callable[[str], None]) -> None:
         self._press = press
+        self._context = rclpy.Context()
+        # With the process's arguments, which may name a security enclave.
+        rclpy.init(args=sys.argv, context=self._context, domain_id=owner.context.get_domain_id())
         # Without the process's remaps: they were for the owner, whose names are resolved there already.
         self.node = Node(
             f"{owner.get_name()}_{suffix}",
-            context=owner.context,
+            context=self._context,
             namespace=owner.get_namespace(),
             use_global_arguments=False,
             enable_rosout=False,
             start_parameter_services=False,
         )
-        self._executor = SingleThreadedExecutor(context=owner.context)
+        self._executor = SingleThreadedExecutor(context=self._context)
         self._executor.add_node(self.node)
         self._closing = threading.Event()
         self._thread = threading.Thread(target=self._run, name=suffix, daemon=True)
@@ -48,6 +59,7 @@ class EStopThread:
     def start(self) -> None:
         """Begin to serve."""
         answer_who_listens(self.node)
+        sys.setswitchinterval(min(_SWITCH, sys.getswitchinterval()))
         self._thread.start()
 
     def close(self) -> None:
@@ -56,6 +68,7 @@ class EStopThread:
         self._executor.shutdown()
         self._thread.join(_JOIN)
         self.node.destroy_node()
+        rclpy.try_shutdown(context=self._context)
 
     def _run(self) -> None:
         while not self._closing.is_set():

@@ -9,12 +9,11 @@ from collections.abc import Callable
 
 import rclpy
 from rcl_interfaces.msg import Parameter, ParameterValue
-from rcl_interfaces.srv import SetParameters
+from rcl_interfaces.srv import ListParameters, SetParameters
 from rclpy.node import Node
 from rclpy.serialization import serialize_message
 from rclpy.signals import SignalHandlerOptions
 from sensor_msgs.msg import JointState
-from std_srvs.srv import Trigger
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
 from pendulum_msgs_py.contract import names
@@ -48,9 +47,10 @@ def _parameters(node: Node, namespace: str, plant: str) -> Callable[[], None]:
 
 
 def _calls(node: Node, namespace: str, plant: str) -> Callable[[], None]:
-    client = node.create_client(Trigger, names.E_STOP_RESET.replace("~", f"{namespace}/{plant}"))
+    # A question that changes nothing: a flood of resets would rightly let the plant be armed after the press.
+    client = node.create_client(ListParameters, f"{namespace}/{plant}/list_parameters")
     client.wait_for_service(20.0)
-    return lambda: client.remove_pending_request(client.call_async(Trigger.Request()))
+    return lambda: client.remove_pending_request(client.call_async(ListParameters.Request()))
 
 
 _KINDS: dict[str, Callable[[Node, str, str], Callable[[], None]]] = {
