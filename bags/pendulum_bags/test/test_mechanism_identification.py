@@ -79,7 +79,7 @@ def both_driven():
 
 
 @pytest.mark.parametrize("name", ["acrobot", "cart_pole", "furuta"])
-def test_a_mechanism_is_found_again_within_its_intervals(name):
+def test_a_mechanism_is_found_again_within_one_and_a_half_times_its_intervals(name):
     plant = truth(name)
     result = identify_mechanism(plant.with_values(OFF[name]), [motion(plant, 3)], extras="friction")
     assert not result.refused, result.refusal
@@ -143,6 +143,44 @@ def test_swapped_columns_are_refused_by_name(both_driven):
     result = identify_mechanism(truth("double_pendulum"), [swapped], extras="friction")
     assert result.refused
     assert "columns of shoulder and elbow exchanged" in result.sentences()[0]
+
+
+@pytest.mark.parametrize(
+    ("name", "position", "effort", "words"),
+    [
+        ("double_pendulum", [[1, 0], [0, 1]], (-1, -1), "with every effort negated"),
+        ("double_pendulum", [[1, 0], [0, 1]], (1, -1), "with the effort of elbow negated"),
+        ("acrobot", [[1, 0], [0, 1]], (1, -1), "with the effort of elbow negated"),
+        ("acrobot", [[1, 0], [1, 1]], (1, 1), "with the angle of elbow less that of shoulder"),
+        ("cart_pole", [[1, 0], [0, 1]], (-1, 1), "with the effort of cart negated"),
+    ],
+)
+def test_a_wrong_sign_and_an_angle_against_the_world_are_refused_by_name(name, position, effort, words):
+    plant = truth(name)
+    one = motion(plant, 3, seconds=6.0)
+    wrong = replace(one, position=one.position @ np.array(position, dtype=float).T, effort=one.effort * effort)
+    result = identify_mechanism(plant, [wrong], extras="friction")
+    assert result.refused
+    assert words in result.sentences()[0]
+
+
+def test_a_value_ten_times_off_the_start_is_refused():
+    plant = truth("furuta")
+    far = plant.with_values({"arm_inertia": plant.value("arm_inertia") / 15.0})
+    result = identify_mechanism(far, [motion(plant, 3, seconds=6.0)], extras="friction")
+    assert "arm_inertia is" in result.sentences()[0]
+    assert "expected a plant that is near, or a start that is" in result.sentences()[0]
+
+
+@pytest.mark.parametrize(("turn", "scale", "words"), [(57.3, 1.0, "is it in degrees"), (1.0, 1000.0, "is it in mN m")])
+def test_degrees_and_milli_newton_metres_are_refused_by_their_unit(both_driven, turn, scale, words):
+    one = both_driven[0]
+    wrong = replace(one, position=turn * one.position, effort=scale * one.effort)
+    try:
+        said = identify_mechanism(truth("double_pendulum"), [wrong], extras="friction").refusal or "accepted"
+    except DataError as error:
+        said = str(error)
+    assert words in said
 
 
 def test_a_held_out_run_that_straight_lines_predict_as_well_is_a_refusal_with_its_own_exit_code(

@@ -14,8 +14,9 @@ import scipy
 from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
-from pendulum_bags.identification.explained import LARGEST_SHARE, REFUSED
+from pendulum_bags.identification.explained import REFUSED
 from pendulum_bags.identification.joint_recordings import JointRecording
+from pendulum_bags.identification.mechanism_doubt import Score, refusal, unit_hint
 from pendulum_bags.identification.mechanism_fit import (
     MechanismFit,
     Windows,
@@ -57,29 +58,6 @@ _FEWEST = 5
 
 _WIDE = 0.5
 """Half width over value from which on the recordings do not determine a parameter."""
-
-
-@dataclass(frozen=True)
-class Score:
-    """How well a recording is predicted, the start of each window fitted.
-
-    Attributes:
-        rms: Of each joint, shape (n,) [rad or m].
-        lines: What straight lines through the windows would leave, shape (n,).
-    """
-
-    rms: Array
-    lines: Array
-
-    @property
-    def total(self) -> float:
-        """Rms over all joints [rad or m]."""
-        return float(np.sqrt(np.mean(self.rms**2)))
-
-    @property
-    def share(self) -> float:
-        """Error over that of straight lines, of the joint where it is worst."""
-        return float(np.max(self.rms / np.maximum(self.lines, 1e-12)))
 
 
 @dataclass(frozen=True)
@@ -250,7 +228,11 @@ def identify_mechanism(
         )
     start = MechanismModel.of(plant)
     lines = np.sqrt(np.mean([line_errors(part) ** 2 for part in data], axis=0))
-    found, chosen, candidates = _choose(start, data, 1.0 / np.maximum(lines, 1e-9), extras)
+    try:
+        found, chosen, candidates = _choose(start, data, 1.0 / np.maximum(lines, 1e-9), extras)
+    except DataError as error:
+        hint = unit_hint(plant, recordings)
+        raise DataError(f"{error}: {hint}") if hint else error from None
     # Now that the errors are known, each joint counts by its own.
     rms = np.sqrt(np.mean([s**2 for s in _training(found, data)], axis=0))
     found = fit(found.model, data, found.free, 1.0 / np.maximum(rms, 1e-9), states=found.states)
@@ -262,13 +244,13 @@ def identify_mechanism(
         for n, s, p in zip(names[len(data) :], scores(found.model, others), others, strict=True)
     }
     intervals = _intervals(found)
-    refusal = _refusal(plant, found, data, training, outside)
+    refused = refusal(plant, found, data, training, outside)
     notes = _notes(plant, found, recordings, intervals, training)
     sources = tuple(recording.source or recording.name for recording in recordings)
     result = MechanismResult(
-        found, chosen, candidates, intervals, training, outside, length, refusal, tuple(notes), sources
+        found, chosen, candidates, intervals, training, outside, length, refused, tuple(notes), sources
     )
-    if refusal is None:
+    if refused is None:
         try:
             result.plant()
         except ParameterError as error:
@@ -389,65 +371,6 @@ def _intervals(found: MechanismFit) -> dict[str, Interval]:
         )
         for name, e, w in zip(free, largest, white, strict=True)
     }
-
-
-def _refusal(
-    plant: MechanismParameters,
-    found: MechanismFit,
-    data: Sequence[Windows],
-    training: Mapping[str, Score],
-    held_out: Mapping[str, Score],
-) -> str | None:
-    share = max(score.share for score in training.values())
-    if share > DOUBTFUL_SHARE and len(plant.joints) > 1 and _swapped_is_better(plant, found, data):
-        joints = plant.coordinates.names
-        return (
-            f"{REFUSED}: with the columns of {joints[0]} and {joints[1]} exchanged the motion is explained far better; "
-            "expected each joint's own columns: correct the mapping file"
-        )
-    for name, score in [*training.items(), *((f"{n}, held out", s) for n, s in held_out.items())]:
-        if score.share > LARGEST_SHARE:
-            worst = int(np.argmax(score.rms / np.maximum(score.lines, 1e-12)))
-            joint = plant.coordinates.joints[worst]
-            return (
-                f"{REFUSED}: {name}: the model misses {joint.name} by {score.rms[worst]:.3g} {joint.unit}, "
-                f"{100.0 * score.share:.0f} % of what straight lines miss; expected less than "
-                f"{100.0 * LARGEST_SHARE:.0f} %: is the plant's mechanism, a unit, a sign or a column another one?"
-            )
-    return None
-
-
-def _swapped_is_better(plant: MechanismParameters, found: MechanismFit, data: Sequence[Windows]) -> bool:
-    """Tell whether exchanged columns of the first two joints fit far better, by a quick fit to a few windows."""
-    order = [1, 0, *range(2, len(plant.joints))]
-    few = [part.subset(range(0, len(part.time), max(1, len(part.time) // 6))) for part in data]
-    others = []
-    for part in few:
-        r = part.recording
-        driven = set(plant.coordinates.driven)
-        effort = r.effort[:, order] if {0, 1} <= driven else r.effort
-        area = part.area[:, order] if {0, 1} <= driven else part.area
-        half = part.states.shape[1] // 2
-        columns = [*order, *(half + i for i in order)]
-        swapped = replace(r, position=r.position[:, order], effort=effort)
-        others.append(
-            replace(
-                part, recording=swapped, position=part.position[..., order], states=part.states[:, columns], area=area
-            )
-        )
-    weights = 1.0 / np.maximum(np.mean([line_errors(part) for part in others], axis=0), 1e-9)
-    try:
-        quick = fit(MechanismModel.of(plant), others, found.free, weights, most=15, tolerance=1e-3)
-    except (DataError, np.linalg.LinAlgError):
-        return False
-    own = np.mean([_share(e, p) for e, p in zip(found.residuals, data, strict=True)])
-    other = np.mean([_share(e, p) for e, p in zip(quick.residuals, others, strict=True)])
-    return bool(other < 0.5 * own)
-
-
-def _share(errors: Array, data: Windows) -> float:
-    rms = np.sqrt(np.mean(errors[data.inside] ** 2, axis=0))
-    return float(np.max(rms / np.maximum(line_errors(data), 1e-12)))
 
 
 def _notes(
