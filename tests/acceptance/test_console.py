@@ -109,6 +109,8 @@ def test_two_clients_see_stop_tune_and_meet_a_new_simulator(
     box = phone.locator("#e_stop").bounding_box()
     assert box["y"] + box["height"] <= 844
     assert box["width"] > 300
+    popup = phone.locator("#popup").bounding_box()  # says that the connection is lost; it has its place before that
+    assert popup["y"] + popup["height"] <= box["y"], (popup, box)
 
     # A refused value is explained, and the value in force comes back.
     field = desk.locator("input[aria-label='r of /sim']")
