@@ -83,7 +83,8 @@ def test_each_drawn_course_can_be_solved_and_needs_work(seed: int) -> None:
     assert "has fallen" in checks.check_delay(tasks, 1.1 * edge).reason
     ratio, letter = checks.noise_ratio(tasks), "abcd"[tasks.causes.index("power")]
     assert [cause for cause in "abcd" if checks.check_noise(tasks, ratio, cause).right] == [letter]
-    assert not checks.check_noise(tasks, 1.0, letter).right
+    assert checks.check_noise(tasks, 0.85 * ratio, letter).right  # as two runs of a minute may be
+    assert not checks.check_noise(tasks, 0.7 * ratio, letter).right
     assert tasks.fault in FAULTS
 
 

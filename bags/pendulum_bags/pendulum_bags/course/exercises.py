@@ -40,7 +40,7 @@ the torque be late before the loop becomes unstable (within 5 %)?
 ## 4. Explain why noise at 500 Hz looks calmer
 The thesis's simulation gets new noise every 2 ms. Hold the noise for **{hold_ms:g} ms** instead, with the same loop
 (plant `thesis`, Q = diag(100, 0.01), R = 0.1) and the same amplitude. By what factor does the standard deviation of
-theta grow (within 8 %)? And why?
+theta grow (within 20 %)? And why?
 
 {causes}
 
