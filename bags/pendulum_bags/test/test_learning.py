@@ -179,6 +179,31 @@ def test_a_checkpoint_of_other_settings_or_of_nothing_is_refused(tmp_path):
             train(SMALL, out)
 
 
+def test_a_checkpoint_whose_arrays_have_other_shapes_is_refused(tmp_path):
+    out = tmp_path / "policy.npz"
+    with pytest.raises(KeyboardInterrupt):
+        train(SMALL, out, on_update=_interrupt_at(11))
+    with np.load(checkpoint_path(out)) as kept:
+        arrays = dict(kept)
+    for name in ("learner/actor_0", "environment/motion"):
+        np.savez(checkpoint_path(out), **{**arrays, name: arrays[name][:1]})
+        with pytest.raises(DataError, match=rf"{name} has shape \(1, \d+\); expected \(\d+, \d+\)"):
+            train(SMALL, out)
+
+
+def test_ctrl_c_while_a_checkpoint_is_written_leaves_no_half_of_it(tmp_path, monkeypatch):
+    write = Path.write_bytes
+
+    def interrupted(path, data):
+        write(path, data[:100])
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(Path, "write_bytes", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        train(SMALL, tmp_path / "policy.npz")
+    assert not list(tmp_path.iterdir())
+
+
 def test_a_full_disk_leaves_the_checkpoint_before_it(tmp_path, monkeypatch):
     out = tmp_path / "policy.npz"
     write = Path.write_bytes
@@ -222,6 +247,11 @@ def test_ctrl_c_is_one_sentence(tmp_path, monkeypatch, capsys):
         (["--share", "1.5"], "share is 1.5; expected less than 1"),
         (["--hidden", "64", "0"], "hidden is 64 0; expected widths of 1 to 512"),
         (["--history", "0"], "history is 0; expected 1 to 50 samples"),
+        (
+            ["--task", "pendulum_v1", "--plant", "thesis"],
+            "--plant is given, but the task pendulum_v1 is Gymnasium's own",
+        ),
+        (["--task", "pendulum_v1", "--angle-noise", "0"], "--angle-noise is given, but the task pendulum_v1"),
         (["--period", "nan"], "period is nan; expected a finite number"),
     ],
 )

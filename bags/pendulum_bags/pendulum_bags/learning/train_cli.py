@@ -22,11 +22,17 @@ if TYPE_CHECKING:
 
 __all__ = ["main"]
 
+_OF_SWING_UP = (
+    "plant", "share", "delay", "jitter", "angle_noise", "velocity_noise", "kick", "period", "history"
+)  # fmt: skip
+"""Options that Gymnasium's pendulum has no use for."""
+
 app = typer.Typer(add_completion=False, rich_markup_mode=None)
 
 
 @app.command()
 def train(
+    context: typer.Context,
     out: Annotated[Path, typer.Option("--out", "-o", help="Policy file (.npz); it must be new.")],
     plant: Annotated[
         str, typer.Option(help="Preset or plant file; intervals in the file widen what is trained on.")
@@ -61,6 +67,8 @@ def train(
         raise ParameterError(f"policy file {out} exists; expected a new one")
     if min(hidden) < 1 or max(hidden) > 512:
         raise ParameterError(f"hidden is {hidden[0]} {hidden[1]}; expected widths of 1 to 512")
+    if task == "pendulum_v1":
+        _refuse_ignored(context)
     swing_up = SwingUpTask(
         period=period, share=share, delay=delay, jitter=jitter, angle_noise=angle_noise,
         velocity_noise=velocity_noise, kick=kick, history=history,
@@ -93,6 +101,16 @@ def train(
         return
     console.print(_sentence(measured))
     console.print(f"policy  {out}\ncurves  {figure}\n({time.monotonic() - began:.0f} s)", soft_wrap=True)
+
+
+def _refuse_ignored(context: typer.Context) -> None:
+    for name in _OF_SWING_UP:
+        source = context.get_parameter_source(name)
+        if source is not None and source.name != "DEFAULT":
+            raise ParameterError(
+                f"--{name.replace('_', '-')} is given, but the task pendulum_v1 is Gymnasium's own pendulum; "
+                "expected no such option, or --task swing_up"
+            )
 
 
 def _settings(task: str, plant: str, seed: int, updates: int, swing_up: Any, hidden: tuple[int, int]) -> Training:

@@ -208,9 +208,24 @@ def _keep(
         temporary.write_bytes(buffer.getvalue())
         temporary.replace(path)
     except OSError as error:
+        raise DataError(f"checkpoint {path} cannot be written: {error.strerror}; the one before it stays") from error
+    finally:
+        # Also where Ctrl-C comes in between.
         with suppress(OSError):
             temporary.unlink(missing_ok=True)
-        raise DataError(f"checkpoint {path} cannot be written: {error.strerror}; the one before it stays") from error
+
+
+def _check_shapes(path: Path, kept: Mapping[str, NDArray[Any]], learner: Ppo) -> None:
+    """Refuse arrays that are not those of the settings; numpy would stretch or keep them in silence."""
+    expected = {f"learner/{name}": np.shape(each) for name, each in learner.state().items()}
+    expected |= {f"environment/{name}": np.shape(each) for name, each in learner.environment.state().items()}
+    expected |= {"fastest": (), "curves": (len(kept["curves"]), 4)}
+    for name, shape in expected.items():
+        if kept[name].shape != shape:
+            raise DataError(
+                f"checkpoint {path}: {name} has shape {kept[name].shape}; expected {shape}, as the settings say: "
+                "another --out, or the checkpoint removed"
+            )
 
 
 def _restore(path: Path, told: str, learner: Ppo, generator: np.random.Generator) -> tuple[list[list[float]], float]:
@@ -224,6 +239,7 @@ def _restore(path: Path, told: str, learner: Ppo, generator: np.random.Generator
                     f"checkpoint {path} is of a training with other settings; expected the same ones, another --out, "
                     "or the checkpoint removed"
                 )
+            _check_shapes(path, kept, learner)
             learner.restore({key[8:]: kept[key] for key in kept.files if key.startswith("learner/")})
             learner.environment.restore({key[12:]: kept[key] for key in kept.files if key.startswith("environment/")})
             generator.bit_generator.state = json.loads(kept["generator"].tobytes().decode())
