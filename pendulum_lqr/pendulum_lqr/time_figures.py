@@ -23,7 +23,7 @@ __all__ = ["TimeFigures", "friction_band", "time_figures"]
 Array = NDArray[np.float64]
 
 _SAMPLES = 2000
-"""Samples of a response; without delay they are exact, with one the feedback is held from sample to sample."""
+"""Samples of a response; without delay they are exact, with one the feedback is linear between samples."""
 _PER_DELAY = 20
 _SETTLED = 0.002
 """Share of the final value within which a response counts as ended."""
@@ -147,10 +147,11 @@ def _simulate(
     # Without delay the feedback acts within the step, exactly; with one it is what was sent that long ago.
     A = model.A if late else model.A - model.B @ on_measured[None, :]
     drive = model.E[:, 0] * push + (0.0 if late else model.B[:, 0] * forward)
-    block = np.zeros((n + 2, n + 2))
-    block[:n, :n], block[:n, n], block[:n, n + 1] = A, drive, model.B[:, 0]
+    # Held from sample to sample it would act half a sample late, which counts near the delay margin.
+    block = np.zeros((n + 3, n + 3))
+    block[:n, :n], block[:n, n], block[:n, n + 1], block[n + 1, n + 2] = A, drive, model.B[:, 0], 1.0 / dt
     step = scipy.linalg.expm(block * dt)
-    phi, gamma, through = step[:n, :n], step[:n, n], step[:n, n + 1]
+    phi, gamma, through, rise = step[:n, :n], step[:n, n], step[:n, n + 1], step[:n, n + 2]
     x = np.zeros(n)
     angle, torque = np.zeros(count), np.zeros(count)
     sent = np.zeros(late + 1)
@@ -158,8 +159,9 @@ def _simulate(
         angle[k] = x[0]
         torque[k] = sent[k % (late + 1)] = forward - on_measured @ x
         x = phi @ x + gamma
-        if late:
-            x = x + through * (sent[(k - late) % (late + 1)] if k >= late else 0.0)
+        if late and k >= late:
+            first, last = sent[(k - late) % (late + 1)], sent[(k - late + 1) % (late + 1)]
+            x = x + through * first + rise * (last - first)
         if not abs(x[0]) < 1e9:
             angle[k:] = np.inf
             break

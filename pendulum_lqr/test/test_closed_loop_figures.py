@@ -58,12 +58,13 @@ def test_a_delay_counts_in_time_as_it_does_in_a_simulation_of_python_control():
     assert time_figures(linearise(PLAIN.with_values(transport_delay=0.5)), gain) is None
 
 
-def test_a_loop_near_its_delay_margin_is_followed_until_it_rests(simulate):
+@pytest.mark.parametrize("share_of_margin", [0.8, 0.9])
+def test_a_loop_near_its_delay_margin_is_followed_until_it_rests(share_of_margin, simulate):
     gain = np.array([PLAIN.gravity + 8.0, 2.0])
-    delay = 0.8 * loop_margins(linearise(PLAIN), gain).delay
+    delay = share_of_margin * loop_margins(linearise(PLAIN), gain).delay
     plant = PLAIN.with_values(transport_delay=delay)
     found = time_figures(linearise(plant), gain)
-    step, period = 1e-3, delay / 50.0
+    step, period = 1e-3, delay / 100.0
     controller = make_controller("lqr", PLAIN, 0.002)
     # Its own law with another gain, about a set-point a small step away.
     controller.command = lambda _t, x: (gain[0] - PLAIN.gravity) * step - gain @ x
@@ -71,8 +72,9 @@ def test_a_loop_near_its_delay_margin_is_followed_until_it_rests(simulate):
     share = run.angle / step
     assert found.overshoot == pytest.approx(share.max() - 1.0, abs=0.03)
     late = period * np.flatnonzero(np.abs(share - 1.0) > 0.02)[-1]
-    assert found.settling_time == pytest.approx(late, rel=0.15)
-    assert found.settling_time > 3.0 * time_figures(linearise(PLAIN), gain).settling_time
+    # The simulated controller holds its torque for a period: half of one is delay, 5 % in time at 0.9 of the margin.
+    assert found.settling_time == pytest.approx(late, rel=0.06)
+    assert found.settling_time > 2.5 * time_figures(linearise(PLAIN), gain).settling_time
 
 
 def _pade(delay):
