@@ -46,7 +46,7 @@ _TRIES = 8
 """How often a step is tried anew that a busy computer has broken off [-]."""
 _BUSY = re.compile(
     r"host_stalled|command_not_in_force|output_disagreement|tracking|feedback_late|feedback_lost|feedback_frozen"
-    r"|too busy|is silent for|not answer|age"
+    r"|too busy|is silent for|not answer|\bms old"
 )
 EXIT_BUSY = 3
 
