@@ -369,23 +369,32 @@ def test_what_the_motion_stop_shall_do_is_written_as_hebi_numbers_it(action: MSt
 
 @pytest.mark.parametrize("low", [-3.0, -math.inf])
 @pytest.mark.parametrize("high", [2.0, math.inf])
-def test_each_end_of_a_position_window_that_is_not_open_is_written_and_read_back(low: float, high: float) -> None:
-    port, _ = port_on(group := Group(**{**LIMITS_READ, "position_limit_min": -2.5, "position_limit_max": 1.5}))
+def test_each_end_of_a_position_window_is_written_and_read_back_and_disabled_where_it_is_open(
+    low: float, high: float
+) -> None:
+    ends = {"min": low, "max": high}
+    # As hebi-py numbers them: 2 switches the motor off, 3 does nothing; 0 holds the position, with a torque of its own.
+    numbers = {end: 2 if math.isfinite(angle) else 3 for end, angle in ends.items()}
+    strategies = {f"{end}_position_limit_strategy": number for end, number in numbers.items()}
+    group = Group(**{**LIMITS_READ, "position_limit_min": -2.5, "position_limit_max": 1.5, **strategies})
+    port, _ = port_on(group)
     read = port.set_limits(replace(WINDOW, position_min=low, position_max=high))
-    ends = {end for end, angle in (("min", low), ("max", high)) if math.isfinite(angle)}
-    assert (read.position_min, read.position_max) == (-2.5 if "min" in ends else low, 1.5 if "max" in ends else high)
+    closed = {end for end, number in numbers.items() if number == 2}
+    assert (read.position_min, read.position_max) == (
+        -2.5 if "min" in closed else low,
+        1.5 if "max" in closed else high,
+    )
     assert given(group.sent[-1]) == {
         f"{what}_limit_{end}" for what in ("effort", "velocity") for end in ("min", "max")
-    } | {f"position_limit_{end}" for end in ends}
-    # An end at which the module does not switch off is no limit; at an open one nobody asks.
-    for end in ("min", "max"):
-        group.info.update({f"{each}_position_limit_strategy": 2 for each in ("min", "max")})
-        group.info[f"{end}_position_limit_strategy"] = 0
-        if end in ends:
-            with pytest.raises(ActuatorError, match=f"strategy at the {end} position limit reads back as 0"):
+    } | {f"position_limit_{end}" for end in closed}
+    for end, number in numbers.items():
+        assert int(getattr(group.sent[-1], f"{end}_position_limit_strategy")[0]) == number
+        for other in {0, 1, 2, 3} - {number}:
+            group.info.update({**strategies, f"{end}_position_limit_strategy": other})
+            with pytest.raises(
+                ActuatorError, match=f"strategy at the {end} position limit reads back as {other}; expected {number}"
+            ):
                 port.set_limits(replace(WINDOW, position_min=low, position_max=high))
-        else:
-            port.set_limits(replace(WINDOW, position_min=low, position_max=high))
 
 
 @pytest.mark.parametrize("name", ["effort_limit_min", "effort_limit_max", "velocity_limit_min", "velocity_limit_max"])

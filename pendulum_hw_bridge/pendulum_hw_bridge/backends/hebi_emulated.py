@@ -27,7 +27,7 @@ from pendulum_msgs_py.plants.lab_file import EMULATED_NETWORK
 __all__ = ["EmulatedEntry", "EmulatedGroup", "EmulatedLookup"]
 
 _LOOK_ATTEMPTS = 2
-_MOTOR_OFF = 2
+_MOTOR_OFF, _DISABLED = 2, 3
 _M_STOP = (MStopAction.DISABLED, MStopAction.MOTOR_OFF, MStopAction.HOLD_POSITION)
 """M-stop actions by hebi-py's number."""
 _THEIRS = {
@@ -248,6 +248,9 @@ class EmulatedGroup:
                 value = float(getattr(command, f"position_limit_{end}")[0])
                 # What is no number changes nothing here; what a real module makes of it, nobody says.
                 limits |= {} if math.isnan(value) else {f"position_{end}": value}
+            strategy = f"{end}_position_limit_strategy"
+            if _holds(command, strategy, self._hebi) and int(getattr(command, strategy)[0]) == _DISABLED:
+                limits[f"position_{end}"] = -math.inf if end == "min" else math.inf
         if _holds(command, "mstop_strategy", self._hebi):
             limits["m_stop"] = _M_STOP[int(command.mstop_strategy[0])].value
         return limits
@@ -272,7 +275,8 @@ class _Info:
         settings.velocity_limit_min, settings.velocity_limit_max = -limits.velocity, limits.velocity
         settings.position_limit_min, settings.position_limit_max = limits.position_min, limits.position_max
         settings.mstop_strategy = _M_STOP.index(limits.m_stop)
-        settings.min_position_limit_strategy = settings.max_position_limit_strategy = _MOTOR_OFF
+        for end, angle in (("min", limits.position_min), ("max", limits.position_max)):
+            setattr(settings, f"{end}_position_limit_strategy", _MOTOR_OFF if math.isfinite(angle) else _DISABLED)
 
     def __getattr__(self, name: str) -> Any:
         return getattr(self._settings, name)

@@ -18,7 +18,8 @@ _PASCAL_M_STOP = {
     MStopAction.MOTOR_OFF: "MotorOff",
     MStopAction.HOLD_POSITION: "HoldPosition",
 }
-_LIMIT_MOTOR_OFF = 2
+_LIMIT_MOTOR_OFF = (2, "motor off")
+_LIMIT_DISABLED = (3, "disabled")
 _M_STOP_BY_NUMBER = {0: MStopAction.DISABLED, 1: MStopAction.MOTOR_OFF, 2: MStopAction.HOLD_POSITION}
 
 
@@ -50,29 +51,35 @@ def gains_of(info: Any, wanted: GainSet) -> GainSet:
 
 
 def fill_limits(command: Any, limits: HardwareLimits) -> None:
-    """Put the safety parameters into a command; an end of the position window that is open stays out."""
+    """Put the safety parameters into a command; an end of the position window that is open is disabled.
+
+    Left as it is, the module might hold its position at a limit of its own there, with a torque that nobody asked for.
+    """
     command.effort_limit_min, command.effort_limit_max = -limits.effort, limits.effort
     command.velocity_limit_min, command.velocity_limit_max = -limits.velocity, limits.velocity
     for end, angle in _window(limits).items():
-        setattr(command, f"position_limit_{end}", angle)
-        setattr(command, f"{end}_position_limit_strategy", "MotorOff")
+        if math.isfinite(angle):
+            setattr(command, f"position_limit_{end}", angle)
+        setattr(command, f"{end}_position_limit_strategy", "MotorOff" if math.isfinite(angle) else "Disabled")
     command.mstop_strategy = _PASCAL_M_STOP[limits.m_stop]
 
 
 def limits_of(info: Any, wanted: HardwareLimits) -> HardwareLimits:
-    """Return the safety parameters that a module tells; an end of the position window that is open is not asked.
+    """Return the safety parameters that a module tells; an end of the position window that is open is told as asked.
 
     Raises:
-        ActuatorError: It tells none, or switches no motor off at an end of the window.
+        ActuatorError: It tells none, or does not switch off at an end of the window, or acts at an open one.
     """
-    ends = {"min": wanted.position_min, "max": wanted.position_max}
-    for end in _window(wanted):
+    ends = _window(wanted)
+    for end, angle in ends.items():
+        number, name = _LIMIT_MOTOR_OFF if math.isfinite(angle) else _LIMIT_DISABLED
         strategy = int(getattr(info, f"{end}_position_limit_strategy")[0])
-        if strategy != _LIMIT_MOTOR_OFF:
+        if strategy != number:
             raise ActuatorError(
-                "settings", f"strategy at the {end} position limit reads back as {strategy}; expected 2 (motor off)"
+                "settings", f"strategy at the {end} position limit reads back as {strategy}; expected {number} ({name})"
             )
-        ends[end] = float(getattr(info, f"position_limit_{end}")[0])
+        if math.isfinite(angle):
+            ends[end] = float(getattr(info, f"position_limit_{end}")[0])
     return HardwareLimits(
         effort=_wider(info.effort_limit_min[0], info.effort_limit_max[0], "effort"),
         velocity=_wider(info.velocity_limit_min[0], info.velocity_limit_max[0], "velocity"),
@@ -84,9 +91,8 @@ def limits_of(info: Any, wanted: HardwareLimits) -> HardwareLimits:
 
 
 def _window(limits: HardwareLimits) -> dict[str, float]:
-    """Return the ends of the position window that are not open [rad]."""
-    ends = {"min": limits.position_min, "max": limits.position_max}
-    return {end: angle for end, angle in ends.items() if math.isfinite(angle)}
+    """Return the ends of the position window, infinite where it is open [rad]."""
+    return {"min": limits.position_min, "max": limits.position_max}
 
 
 def _wider(low: Any, high: Any, what: str) -> float:
