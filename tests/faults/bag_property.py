@@ -20,15 +20,24 @@ import typer
 
 from pendulum_msgs_py.contract import names
 from pendulum_msgs_py.contract.cdr import decode_joint_state
+from pendulum_msgs_py.contract.drive import Mode
 from pendulum_msgs_py.contract.values import NANOSECONDS
 from pendulum_msgs_py.errors import DataError
 from pendulum_msgs_py.programs.executables import cli_main
 from pendulum_rosbag.reader import Bag, read_bag
 
-__all__ = ["COMMAND_LIFE", "TorqueRecord", "check_bag"]
+__all__ = ["COMMAND_LIFE", "EARLY_TIME", "POSITION_MARK", "TorqueRecord", "check_bag"]
 
 COMMAND_LIFE = 0.060
 """Time from the last valid command to zero torque [s]."""
+EARLY_TIME = 0.5
+"""Time for which, in all, commands that the recorder heard of too late explain torque, and from which on before a
+recorded command [s]."""
+POSITION_MARK = "pendulum.position_control"
+"""Metadata of a bag that has no word of the plant's mode: by plant, pairs of log times [ns] between which it made its
+own torque."""
+_TOLD_EVERY = 1.5
+"""Longest time before a first diagnostics for which it tells the mode too: its period and a half [s]."""
 
 app = typer.Typer(add_completion=False, rich_markup_mode=None, pretty_exceptions_enable=False)
 
@@ -40,11 +49,12 @@ class TorqueRecord:
     Attributes:
         plant: Namespace of the plant.
         samples: Recorded torques.
-        judged: Those under torque control, to which the rule of the last command applies.
+        judged: Those not under position control, to which the rule of the last command applies.
         largest: Largest absolute torque [N m].
-        longest: Longest time from a command to a torque that was not zero yet [s].
-        missing: Commands that the recorder says it lost: an unrecorded one may stand behind any torque, so with some
-            missing the rule of the last command cannot be judged, and only the limit is.
+        longest: Longest time from a command, or from the first record where none came before, to a torque that was not
+            zero yet [s].
+        missing: Commands that the recorder says it lost: each may stand behind the torque of one command's life,
+            wherever that was, and behind no more.
         violations: One sentence for each broken rule.
     """
 
@@ -60,12 +70,14 @@ class TorqueRecord:
 def check_bag(path: Path, *, limit: float, allowance: float = 0.0) -> list[TorqueRecord]:
     """Check the torque of every plant in a bag.
 
-    Under position control (from a trajectory to the next torque command) the plant makes its own torque: there only
-    the limit is checked. Else a torque is excused by a command that a plant may believe and by nothing else: of the
-    plant's own controller (or, where there is none of that name, of who commanded first), for this joint, finite, not
-    from the future and not too old when it came. It must be recent in log times, which are of one clock, or in stamps,
-    which are of the plant's: a message that had to be sent again comes late in the one, and a bag of two machines has
-    two clocks. A disturbance or a push alone excuses nothing.
+    Under position control the plant makes its own torque: there only the limit is checked. That it was under position
+    control is for the plant to say, in its events and diagnostics, or, where a bag has neither, for ``POSITION_MARK``:
+    a trajectory on its topic may have been refused. Else, from the first record on, a torque is excused by a command
+    that a plant may believe and by nothing else: of the plant's own controller (or, where there is none of that name,
+    of who commanded first), for this joint, finite, not from the future and not too old when it came. It must be recent
+    in log times, which are of one clock, or in stamps, which are of the plant's: a message that had to be sent again
+    comes late in the one, and a bag of two machines has two clocks. A disturbance or a push alone excuses nothing; a
+    command from before the recording may stand behind the torque of its first life.
 
     Args:
         path: The bag.
@@ -105,10 +117,11 @@ def _check_plant(bag: Bag, plant: str, limit: float, allowance: float) -> Torque
     believed = answers - then <= tolerance
     command = _last_before(times, logged[believed & (then - answers <= tolerance)])
     answered = _last_before(stamps, np.sort(answers[believed]))
-    trajectory = _last_before(times, _log_times(bag, plant, names.JOINT_TRAJECTORY))
-    judged = (_last_before(times, logged) > trajectory) & (len(logged) > 0)
+    judged = ~_under_position_control(bag, plant, times, tolerance)
     # From the state with this stamp on, a torque acts for a period.
-    age = np.minimum((times - command) * 1e-9, (stamps - answered) * 1e-9 + period)
+    age = np.minimum(
+        (times - np.maximum(command, times[0])) * 1e-9, (stamps - np.maximum(answered, stamps[0])) * 1e-9 + period
+    )
     driven = judged & (efforts != 0.0)
     longest = float(np.max(age[driven], initial=0.0))
     allowed = COMMAND_LIFE + period + allowance
@@ -118,17 +131,59 @@ def _check_plant(bag: Bag, plant: str, limit: float, allowance: float) -> Torque
         return int(counts.get(f"{plant}/{names.EFFORT_COMMAND}", {}).get(kind, 0))
 
     missing = counted("lost")
-    # A command that the recorder heard of too late explains the torque after one state.
-    unexplained = int(np.count_nonzero(driven & (age > allowed))) - counted("early")
-    if unexplained > 0 and not missing:
+    unexplained = times[driven & (age > allowed)]
+    unexplained = _without_early(unexplained, logged, counted("early"), period)
+    if _lives_needed(unexplained, tolerance) > missing:
         late = f"torque {longest * 1e3:.0f} ms after the last command"
         violations.append(f"{late}; expected at most {allowed * 1e3:.0f} ms")
     return TorqueRecord(plant, len(times), int(judged.sum()), largest, longest, missing, tuple(violations))
 
 
-def _log_times(bag: Bag, plant: str, topic: str) -> np.ndarray:
-    name = f"{plant}/{topic}"
-    return bag.log_times(name) if name in bag else np.empty(0, np.int64)
+def _without_early(times: np.ndarray, commands: np.ndarray, early: int, period: float) -> np.ndarray:
+    """Leave out the torques that commands explain of which the recorder heard too late.
+
+    Each explains the torque after one state, and comes shortly before one that was recorded.
+    """
+    if len(commands) == 0:
+        return times
+    waiting = commands[np.minimum(np.searchsorted(commands, times), len(commands) - 1)] - times
+    soon = (waiting >= 0) & (waiting <= EARLY_TIME * NANOSECONDS)
+    most = min(early, round(EARLY_TIME / period)) if period > 0.0 else early
+    return times[~(soon & (np.cumsum(soon) <= most))]
+
+
+def _lives_needed(times: np.ndarray, life_ns: int) -> int:
+    """Return how many commands, each of this life, there must have been at least for torque at these times."""
+    needed = 0
+    while len(times):
+        needed += 1
+        times = times[times > times[0] + life_ns]
+    return needed
+
+
+def _under_position_control(bag: Bag, plant: str, times: np.ndarray, margin_ns: int) -> np.ndarray:
+    """Tell for each time whether the plant said that it held or followed a position, give or take a margin."""
+    told_every = round(_TOLD_EVERY * NANOSECONDS)
+    # When, what, and for how long before, if it is the first word.
+    told = [
+        (event["log_time_ns"], str(event.get("mode")), 0)
+        for event in bag.events()
+        if event["topic"] == f"{plant}/{names.EVENTS}" and event["name"] == names.Event.PLANT_MODE
+    ]
+    for stored in bag.messages(names.DIAGNOSTICS) if names.DIAGNOSTICS in bag else ():
+        for status in stored.message.status:
+            if status.name.startswith(f"{plant}/") and status.name.endswith(": plant"):
+                told += [(stored.log_time_ns, pair.value, told_every) for pair in status.values if pair.key == "mode"]
+    told.sort(key=lambda each: each[0])
+    spans = [] if told else bag.metadata.get(POSITION_MARK, {}).get(plant, [])
+    for index, (since, mode, before) in enumerate(told):
+        if mode == Mode.POSITION.value:
+            until = told[index + 1][0] if index + 1 < len(told) else int(times[-1])
+            spans.append((since - (0 if index else before), until))
+    inside = np.zeros(len(times), np.bool_)
+    for since, until in spans:
+        inside |= (times >= since - margin_ns) & (times <= until + margin_ns)
+    return inside
 
 
 def _commands(bag: Bag, plant: str) -> tuple[np.ndarray, np.ndarray]:

@@ -20,6 +20,7 @@ __all__ = [
     "Fault",
     "Outcome",
     "Trial",
+    "demand_limit",
     "demand_rest",
     "demand_zero",
     "is_at_rest",
@@ -114,17 +115,27 @@ def try_fault(system: LiveSystem, fault: Fault, generator: random.Random) -> Out
 
 def _judge_motor(outcome: Outcome, system: LiveSystem, fault: Fault, begin_ns: int) -> None:
     """Take note of torque beyond the limit, and beyond what the rightful nodes asked for."""
-    largest = system.largest_torque()
-    outcome.demand(
-        largest <= EFFORT_LIMIT + (ROUNDING if system.plant.has_module else 0.0),
-        f"{largest:.3f} N m applied; expected at most {EFFORT_LIMIT} N m",
-    )
+    demand_limit(outcome, system.largest_torque(), measured=system.plant.has_module)
     if not fault.own_torque:
         when, excess = system.beyond_asked(begin_ns)
         outcome.demand(
             excess <= 0.0,
             f"{excess:.2f} N m beyond what was asked for, {(when - begin_ns) * 1e-6:.0f} ms after the fault began",
         )
+
+
+def demand_limit(outcome: Outcome, largest: float, *, measured: bool) -> None:
+    """Take note of a torque beyond the limit.
+
+    Args:
+        outcome: Notes it.
+        largest: Largest absolute torque [N m].
+        measured: It is a module's, with the rounding of one; else what a simulator applied.
+    """
+    outcome.demand(
+        largest <= EFFORT_LIMIT + (ROUNDING if measured else 0.0),
+        f"{largest:.3f} N m applied; expected at most {EFFORT_LIMIT} N m",
+    )
 
 
 def demand_rest(outcome: Outcome, system: LiveSystem, since_ns: int) -> None:

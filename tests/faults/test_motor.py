@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from itertools import pairwise
 from pathlib import Path
 
@@ -12,7 +13,9 @@ from pendulum_hw_bridge.emulation.parameters import load_emulator
 from pendulum_hw_bridge.emulation.truth_log import TruthLog
 from pendulum_hw_bridge.emulation.x5 import EmulatedX5
 from pendulum_msgs_py.errors import PendulumError
-from tests.faults.motor import Asked, Drive, ModuleTruth, beyond_asked, driving_torque
+from tests.faults.live import EFFORT_LIMIT
+from tests.faults.motor import ROUNDING, Asked, Drive, ModuleTruth, beyond_asked, driving_torque
+from tests.faults.outcome import Outcome, demand_limit
 
 MS = 1_000_000
 LIMIT = 5.0
@@ -37,6 +40,9 @@ def test_nothing_is_right_long_after_the_last_command_or_by_a_disturbance_alone(
     assert excess(500.0, -1.0, [], DISTURBANCES) == pytest.approx(0.8)
     assert excess(500.0, 1.0, [Asked(600 * MS, 1.0)], []) == pytest.approx(0.8)
     assert excess(500.0, 0.0, [], []) == 0.0
+    # A simulator's torque acts 2 ms before the command that answers its state, and no sooner.
+    assert excess(500.0, 1.0, [Asked(502 * MS, 1.0)], []) == 0.0
+    assert excess(500.0, 1.0, [Asked(503 * MS, 1.0)], []) == pytest.approx(0.8)
 
 
 def test_the_limit_holds_whatever_was_asked_for_and_the_worst_instant_is_told() -> None:
@@ -45,6 +51,22 @@ def test_the_limit_holds_whatever_was_asked_for_and_the_worst_instant_is_told() 
     when, torque = beyond_asked(drives, commands, [], LIMIT)
     assert when == 510 * MS
     assert torque == pytest.approx(2.0)
+    assert excess(505.0, -7.2, [Asked(500 * MS, -100.0)], []) == pytest.approx(2.0)
+    assert excess(505.0, -5.1, [Asked(500 * MS, -100.0)], []) == 0.0
+
+
+def test_a_torque_beyond_the_limit_is_noted_but_for_the_rounding_of_a_module() -> None:
+    for largest, measured, survived in (
+        (EFFORT_LIMIT, False, True),
+        (EFFORT_LIMIT + 0.001, False, False),
+        (EFFORT_LIMIT + 0.9 * ROUNDING, True, True),
+        (EFFORT_LIMIT + 1.1 * ROUNDING, True, False),
+        (math.nan, True, False),
+    ):
+        outcome = Outcome()
+        demand_limit(outcome, largest, measured=measured)
+        assert outcome.survived is survived, largest
+        assert ("N m applied; expected at most" in outcome.detail) is not survived
 
 
 def test_a_motor_that_is_turned_brakes_and_drives_with_what_its_duty_makes_at_most() -> None:
