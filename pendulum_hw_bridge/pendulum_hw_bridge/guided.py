@@ -14,6 +14,7 @@ import numpy as np
 
 from pendulum_hw_bridge.actuator import ActuatorError, ActuatorPort, Command, Feedback, Strategy
 from pendulum_hw_bridge.nudge import Hand, watch_nudge
+from pendulum_hw_bridge.safety import SafetyLimits, SafetyMonitor
 from pendulum_hw_bridge.settings import BridgeSettings
 from pendulum_msgs_py.contract.values import NANOSECONDS
 from pendulum_msgs_py.plants.plant_parameters import PlantParameters
@@ -37,6 +38,8 @@ _REST_PATIENCE = 120.0
 _LARGEST_TARE = 1.0
 _PROOF_SECONDS = 0.3
 _PRESS_SECONDS = 20.0
+_LARGEST_TRAVEL = 1.0
+"""Largest turn of the link under the duty for proofs [rad]: twice what a swing of the thesis's pendulum overshoots."""
 _ENDS_WITHIN = 0.06
 """Time within which the M-stop must end the duty [s]."""
 _MARGIN_PERIODS = 2
@@ -139,16 +142,19 @@ def measure_tare(port: ActuatorPort, settings: BridgeSettings, plant: PlantParam
     return tare
 
 
-def prove_lifetime(port: ActuatorPort, settings: BridgeSettings, dialogue: Dialogue) -> float:
+def prove_lifetime(
+    port: ActuatorPort, settings: BridgeSettings, dialogue: Dialogue, checks: SafetyLimits | None = None
+) -> float:
     """Drive gently, fall silent, and return for how long the motor kept its duty [s].
 
     Args:
         port: Connected, strategy off.
         settings: The command lifetime and the limits that the bridge will set.
         dialogue: The person.
+        checks: Limits of the checks of feedback; None for the usual ones.
 
     Raises:
-        ActuatorError: The duty never came, or did not end by itself in time.
+        ActuatorError: The duty never came, a limit was left, or it did not end by itself in time.
     """
     dialogue.go_on(
         f"Proof of the command lifetime. THE MOTOR WILL TURN GENTLY: duty {PROOF_DUTY:g} (about 0.4 N m) for "
@@ -157,7 +163,7 @@ def prove_lifetime(port: ActuatorPort, settings: BridgeSettings, dialogue: Dialo
         "plane."
     )
     try:
-        last_ns = _drive(port, settings, lambda record, now: now < _PROOF_SECONDS)
+        last_ns = _drive(port, settings, checks, lambda record, now: now < _PROOF_SECONDS)
         limit = settings.command_lifetime + _MARGIN_PERIODS / settings.feedback_rate
         ended = _duty_ends(port, last_ns, 10.0 * limit)
     finally:
@@ -175,16 +181,19 @@ def prove_lifetime(port: ActuatorPort, settings: BridgeSettings, dialogue: Dialo
     return ended
 
 
-def prove_m_stop(port: ActuatorPort, settings: BridgeSettings, dialogue: Dialogue) -> float:
+def prove_m_stop(
+    port: ActuatorPort, settings: BridgeSettings, dialogue: Dialogue, checks: SafetyLimits | None = None
+) -> float:
     """Drive gently until somebody presses the motion stop, and return for how long the motor kept its duty [s].
 
     Args:
         port: Connected, strategy off.
         settings: The command lifetime and the limits that the bridge will set.
         dialogue: The person.
+        checks: Limits of the checks of feedback; None for the usual ones.
 
     Raises:
-        ActuatorError: Nobody pressed it in time, or it did not end the duty.
+        ActuatorError: Nobody pressed it in time, a limit was left, or it did not end the duty.
     """
     dialogue.go_on(
         f"Proof of the motion stop. THE MOTOR WILL TURN GENTLY: duty {PROOF_DUTY:g} (about 0.4 N m) for at most "
@@ -199,7 +208,7 @@ def prove_m_stop(port: ActuatorPort, settings: BridgeSettings, dialogue: Dialogu
 
     try:
         dialogue.say("Press the motion stop NOW.")
-        _drive(port, settings, unpressed)
+        _drive(port, settings, checks, unpressed)
         if not pressed_ns:
             raise ActuatorError("m_stop", f"motion stop was not pressed within {_PRESS_SECONDS:g} s")
         ended = _duty_ends(port, pressed_ns, 10.0 * _ENDS_WITHIN)
@@ -215,7 +224,12 @@ def prove_m_stop(port: ActuatorPort, settings: BridgeSettings, dialogue: Dialogu
     return ended
 
 
-def _drive(port: ActuatorPort, settings: BridgeSettings, goes_on: Callable[[Feedback, float], bool]) -> int:
+def _drive(
+    port: ActuatorPort,
+    settings: BridgeSettings,
+    checks: SafetyLimits | None,
+    goes_on: Callable[[Feedback, float], bool],
+) -> int:
     """Keep the duty for proofs while told to; return when the last command was sent [ns]."""
     port.set_command_lifetime(settings.command_lifetime)
     port.set_feedback_rate(settings.feedback_rate)
@@ -223,7 +237,8 @@ def _drive(port: ActuatorPort, settings: BridgeSettings, goes_on: Callable[[Feed
     reads = port.set_strategy(Strategy.DIRECT_PWM, Command(pwm=0.0))
     if reads is not Strategy.DIRECT_PWM:
         raise ActuatorError("strategy", f"strategy reads back as {reads.name}; expected DIRECT_PWM")
-    start_ns = port.now_ns()
+    monitor = SafetyMonitor(checks or SafetyLimits(), 1.0 / settings.feedback_rate)
+    start_ns, begin = port.now_ns(), math.nan
     last_ns, silent, driven = start_ns, 0, False
     while True:
         record = port.read(1.0 / settings.feedback_rate)
@@ -237,12 +252,38 @@ def _drive(port: ActuatorPort, settings: BridgeSettings, goes_on: Callable[[Feed
         driven = driven or abs(record.pwm_command) > 0.5 * PROOF_DUTY
         if not goes_on(record, (record.stamp_ns - start_ns) / NANOSECONDS):
             break
+        begin = record.position if math.isnan(begin) else begin
+        _expect_inside(record, settings, begin)
+        fault = monitor.check(record)
+        if fault is not None:
+            raise ActuatorError(fault.name, fault.message)
         last_ns = port.write(Command(pwm=PROOF_DUTY)).sent_ns
     if not driven:
         raise ActuatorError(
             "command_not_in_force", f"motor never had the duty {PROOF_DUTY:g}; is the motion stop pressed already?"
         )
     return last_ns
+
+
+def _expect_inside(record: Feedback, settings: BridgeSettings, begin: float) -> None:
+    """Refuse to drive on outside the limits that the bridge keeps, or where the link turns on and on."""
+    limits, turned = settings.limits, abs(record.position - begin)
+    if not limits.position_min <= record.position <= limits.position_max:
+        raise ActuatorError(
+            "supervisor",
+            f"actuator's position is {record.position:.2f} rad; expected {limits.position_min:g} to "
+            f"{limits.position_max:g} rad",
+        )
+    if abs(record.velocity) > limits.velocity:
+        raise ActuatorError(
+            "supervisor", f"velocity is {record.velocity:.2f} rad/s; expected at most {limits.velocity:g} rad/s"
+        )
+    if turned > _LARGEST_TRAVEL:
+        raise ActuatorError(
+            "supervisor",
+            f"link turned by {turned:.2f} rad under the duty {PROOF_DUTY:g}; expected at most {_LARGEST_TRAVEL:g} rad: "
+            "is the pendulum mounted?",
+        )
 
 
 def _duty_ends(port: ActuatorPort, since_ns: int, patience: float) -> float:

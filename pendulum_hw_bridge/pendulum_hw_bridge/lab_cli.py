@@ -177,7 +177,7 @@ def prove_lifetime(file: File, yes: Yes = False) -> None:
     Example: python -m pendulum_hw_bridge lab prove_lifetime lab.yaml
     """
     with _machine(file) as (port, bridge):
-        took = guided.prove_lifetime(port, bridge.settings, _Terminal(yes=yes))
+        took = guided.prove_lifetime(port, bridge.settings, _Terminal(yes=yes), bridge.limits)
     _keep(file, "command_lifetime", f"torque ended {1e3 * took:.0f} ms after the last command")
 
 
@@ -188,7 +188,7 @@ def prove_m_stop(file: File, yes: Yes = False) -> None:
     Example: python -m pendulum_hw_bridge lab prove_m_stop lab.yaml
     """
     with _machine(file) as (port, bridge):
-        took = guided.prove_m_stop(port, bridge.settings, _Terminal(yes=yes))
+        took = guided.prove_m_stop(port, bridge.settings, _Terminal(yes=yes), bridge.limits)
     _keep(file, "m_stop", f"torque ended within {1e3 * took:.0f} ms")
 
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from pendulum_hw_bridge import guided, lab_cli
-from pendulum_hw_bridge.actuator import ActuatorError, Command, MStopAction, Strategy
+from pendulum_hw_bridge.actuator import ActuatorError, Command, HardwareLimits, MStopAction, Strategy
 from pendulum_hw_bridge.backends import hebi as backend_module
 from pendulum_hw_bridge.backends.emulator import EmulatorBackend
 from pendulum_hw_bridge.clocks import SteppedClock
@@ -178,6 +178,51 @@ def test_a_motion_stop_that_nobody_presses_or_that_is_pressed_already_proves_not
     rig.actuator.inject(ActuatorFault.M_STOP)
     with pytest.raises(ActuatorError, match="is the motion stop pressed already"):
         guided.prove_m_stop(rig.port, BridgeSettings(), rig)
+
+
+@pytest.mark.parametrize("proof", [guided.prove_lifetime, guided.prove_m_stop])
+@pytest.mark.parametrize(
+    ("fault", "message"),
+    [
+        (ActuatorFault.OUTSIDE_WINDOW, r"position is 20\.00 rad; expected -4 to 4 rad"),
+        (ActuatorFault.OVERSPEED, r"velocity is 1\.55 rad/s; expected at most 1\.5 rad/s"),
+        (ActuatorFault.WINDING_HOT, "winding is at 150 degC"),
+        (ActuatorFault.VOLTAGE_LOW, r"supply is 18\.0 V"),
+    ],
+)
+def test_a_proof_that_leaves_its_limits_gets_no_more_duty(proof: Any, fault: ActuatorFault, message: str) -> None:
+    rig = Rig()
+    rig.actuator.inject(fault)
+    settings = BridgeSettings(limits=HardwareLimits(position_min=-4.0, position_max=4.0))
+    driven: list[float] = []
+    write = rig.port.write
+
+    def noted(command: Command) -> Any:
+        driven.append(command.pwm)
+        return write(command)
+
+    rig.port.write = noted  # type: ignore[method-assign]
+    with pytest.raises(ActuatorError, match=message):
+        proof(rig.port, settings, rig)
+    assert driven == []
+    assert rig.actuator.limits == settings.limits
+    assert rig.actuator.strategy is Strategy.OFF
+
+
+def test_a_link_that_turns_on_under_the_gentle_duty_is_stopped(monkeypatch: pytest.MonkeyPatch) -> None:
+    rig = Rig()
+    read, speed = rig.port.read, 1.0
+
+    def turning(timeout: float) -> Any:
+        record = read(timeout)
+        return record and record._replace(position=speed * record.hardware_ns / 1e9, velocity=speed)
+
+    monkeypatch.setattr(rig.port, "read", turning)
+    begin_ns = rig.port.now_ns()
+    with pytest.raises(ActuatorError, match=r"turned by 1\.0. rad under the duty 0\.01; expected at most 1 rad"):
+        guided.prove_m_stop(rig.port, BridgeSettings(), rig)
+    assert rig.port.now_ns() - begin_ns < 2.5e9
+    assert rig.actuator.strategy is Strategy.OFF
 
 
 def test_lost_feedback_ends_a_proof_with_the_motor_off() -> None:
