@@ -225,6 +225,40 @@ def test_a_link_that_turns_on_under_the_gentle_duty_is_stopped(monkeypatch: pyte
     assert rig.actuator.strategy is Strategy.OFF
 
 
+def test_a_lifetime_of_four_times_what_was_set_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    rig = Rig()
+    monkeypatch.setattr(rig.port, "set_command_lifetime", lambda lifetime: lifetime)
+    rig.actuator.configure(command_lifetime=0.2)
+    with pytest.raises(ActuatorError, match=r"kept its duty for (19|20|21)\d ms .* expected at most 70 ms"):
+        guided.prove_lifetime(rig.port, BridgeSettings(), rig)
+
+
+def test_a_motion_stop_that_shows_but_does_not_end_the_duty_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    rig = Rig()
+    read, begin_ns = rig.port.read, rig.port.now_ns()
+
+    def pressed_after_a_second(timeout: float) -> Any:
+        record = read(timeout)
+        return record and record._replace(m_stop=record.stamp_ns - begin_ns > 1_000_000_000)
+
+    monkeypatch.setattr(rig.port, "read", pressed_after_a_second)
+    with pytest.raises(ActuatorError, match=r"after the motion stop; expected at most 60 ms. Do not arm"):
+        guided.prove_m_stop(rig.port, BridgeSettings(command_lifetime=0.25), rig)
+    assert rig.actuator.strategy is Strategy.OFF
+
+
+def test_the_tare_of_a_link_that_hangs_aside_leaves_its_weight_out(monkeypatch: pytest.MonkeyPatch) -> None:
+    rig = Rig()
+    read, weight = rig.port.read, rig.parameters.plant.gravity * math.sin(0.3)
+
+    def aside(timeout: float) -> Any:
+        record = read(timeout)
+        return record and record._replace(position=record.position + 0.3, effort=record.effort + weight)
+
+    monkeypatch.setattr(rig.port, "read", aside)
+    assert guided.measure_tare(rig.port, BridgeSettings(), rig.parameters.plant, rig) == pytest.approx(0.0, abs=0.05)
+
+
 def test_lost_feedback_ends_a_proof_with_the_motor_off() -> None:
     rig = Rig()
     rig.actuator.inject(ActuatorFault.FEEDBACK_LOST)
@@ -348,6 +382,7 @@ def test_a_lab_file_is_written_step_by_step_and_shown(
     values, proofs = load_lab(lab).values, load_lab(lab).proofs
     assert values["joint_sign"] == 1
     assert values["joint_offset"] == pytest.approx(0.0, abs=0.03)
+    assert abs(values["effort_tare"]) < 0.1
     assert set(proofs) == {"zero", "effort_tare", "command_lifetime"}
     assert lab_cli.main(["backup", lab, "--out", str(tmp_path / "before")]) == 0
     assert lab_cli.main(["restore", lab, str(tmp_path / "before"), "--yes"]) == 0
