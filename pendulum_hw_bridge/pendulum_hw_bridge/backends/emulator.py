@@ -32,6 +32,7 @@ _CUT_OFF = {ActuatorFault.COMMANDS_LOST, ActuatorFault.SEND_FAILED, ActuatorFaul
 """Faults in which settings do not reach the actuator either."""
 _LOCKSTEP_LEAD_NS = 500_000
 """In lockstep, feedback is measured this long before the state that shows it [ns]."""
+_FIRST_STEP_NS = 1_000_000
 
 
 class EmulatorBackend:
@@ -57,6 +58,8 @@ class EmulatorBackend:
     def from_parameters(cls, values: Mapping[str, Any], clock: Clock, *, lockstep: bool = False) -> EmulatorBackend:
         """Return the emulator that the bridge's parameters describe; in lockstep, one that keeps time exactly."""
         parameters = replace(load_emulator(values["plant"]), flat=values["flat"])
+        # A first step compiles the code, for tens of seconds on a busy machine: here, where nobody waits for a cycle.
+        EmulatedX5(parameters).advance_to(_FIRST_STEP_NS)
         start_ns = clock.now_ns()
         if lockstep:
             # At this rate from the start: one that is set later begins a new raster, without the lead.
