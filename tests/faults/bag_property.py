@@ -132,24 +132,26 @@ def _check_plant(bag: Bag, plant: str, limit: float, allowance: float) -> Torque
 
     missing = counted("lost")
     unexplained = times[driven & (age > allowed)]
-    unexplained = _without_early(unexplained, logged, counted("early"), period)
+    unexplained = _without_early(unexplained, logged, counted("early"), tolerance)
     if _lives_needed(unexplained, tolerance) > missing:
         late = f"torque {longest * 1e3:.0f} ms after the last command"
         violations.append(f"{late}; expected at most {allowed * 1e3:.0f} ms")
     return TorqueRecord(plant, len(times), int(judged.sum()), largest, longest, missing, tuple(violations))
 
 
-def _without_early(times: np.ndarray, commands: np.ndarray, early: int, period: float) -> np.ndarray:
+def _without_early(times: np.ndarray, commands: np.ndarray, early: int, life_ns: int) -> np.ndarray:
     """Leave out the torques that commands explain of which the recorder heard too late.
 
-    Each explains the torque after one state, and comes shortly before one that was recorded.
+    Such a command comes shortly before one that was recorded. It may stand behind several torques: a simulator that
+    catches up applies one for each period that passed.
     """
     if len(commands) == 0:
         return times
     waiting = commands[np.minimum(np.searchsorted(commands, times), len(commands) - 1)] - times
     soon = (waiting >= 0) & (waiting <= EARLY_TIME * NANOSECONDS)
-    most = min(early, round(EARLY_TIME / period)) if period > 0.0 else early
-    return times[~(soon & (np.cumsum(soon) <= most))]
+    # As many lives as there were such commands, and no longer in all than the time for which there may be any.
+    most = min(early, math.ceil(EARLY_TIME * NANOSECONDS / life_ns))
+    return times[~soon] if _lives_needed(times[soon], life_ns) <= most else times
 
 
 def _lives_needed(times: np.ndarray, life_ns: int) -> int:

@@ -86,6 +86,7 @@ def _judge(
     *,
     modes: Iterable[tuple[float, str]] = (),
     told: Iterable[tuple[float, str]] = (),
+    teller: str = "/hw/bridge: plant",
     trajectories: Iterable[float] = (),
     joint: str = names.JOINT,
     limit: float = 5.0,
@@ -111,7 +112,7 @@ def _judge(
         data = bytes(STORE.serialize_cdr(text, "std_msgs/msg/String"))
         rows.append((instant(seconds), f"/hw/{names.EVENTS}", "std_msgs/msg/String", data))
     for seconds, mode in told:
-        rows.append((instant(seconds), names.DIAGNOSTICS, _DIAGNOSTICS, _diagnostics(instant(seconds), mode)))
+        rows.append((instant(seconds), names.DIAGNOSTICS, _DIAGNOSTICS, _diagnostics(instant(seconds), mode, teller)))
     for seconds in trajectories:
         data = encode_joint_state(instant(seconds))
         rows.append((instant(seconds), f"/hw/{names.JOINT_TRAJECTORY}", JOINT_STATE, data))
@@ -131,12 +132,12 @@ def _judge(
 _DIAGNOSTICS = "diagnostic_msgs/msg/DiagnosticArray"
 
 
-def _diagnostics(stamp_ns: int, mode: str) -> bytes:
+def _diagnostics(stamp_ns: int, mode: str, teller: str) -> bytes:
     kinds = STORE.types
     stamp = kinds["builtin_interfaces/msg/Time"](sec=stamp_ns // _SECOND, nanosec=stamp_ns % _SECOND)
     value = kinds["diagnostic_msgs/msg/KeyValue"](key="mode", value=mode)
     status = kinds["diagnostic_msgs/msg/DiagnosticStatus"](
-        level=0, name="/hw/bridge: plant", message="", hardware_id="", values=[value]
+        level=0, name=teller, message="", hardware_id="", values=[value]
     )
     header = kinds["std_msgs/msg/Header"](stamp=stamp, frame_id="")
     return bytes(STORE.serialize_cdr(kinds[_DIAGNOSTICS](header=header, status=[status]), _DIAGNOSTICS))
@@ -187,13 +188,13 @@ def test_a_lost_command_explains_the_torque_of_one_life_and_no_more(tmp_path: Pa
         assert record.missing == lost
 
 
-def test_commands_heard_of_too_late_explain_as_many_torques_and_only_shortly_before_a_recorded_one(
+def test_commands_heard_of_too_late_explain_as_many_lives_and_only_shortly_before_a_recorded_one(
     tmp_path: Path,
 ) -> None:
     # Torque from the first record on; commands later.
     for name, first, early, late in (
-        ("as many", 0.4, 40, False),
-        ("too few", 0.4, 20, True),
+        ("as many", 0.4, 5, False),
+        ("too few", 0.4, 4, True),
         ("none", 0.4, 0, True),
         ("too long", EARLY_TIME + 0.5, 1000, True),
         ("no command follows", 9.0, 1000, True),
@@ -204,7 +205,14 @@ def test_commands_heard_of_too_late_explain_as_many_torques_and_only_shortly_bef
 
 
 def test_early_commands_explain_no_more_than_their_time_however_many_gaps_there_are(tmp_path: Path) -> None:
-    record = _judge(tmp_path, _steady, lambda seconds: seconds % 0.4 < 0.005, counts={"early": 1000})
+    record = _judge(
+        tmp_path, _steady, lambda seconds: round(100 * seconds) % 40 == 0 or seconds > 2.7, counts={"early": 1000}
+    )
+    assert _late(record)
+
+
+def test_an_early_command_long_before_a_recorded_one_explains_nothing(tmp_path: Path) -> None:
+    record = _judge(tmp_path, lambda seconds: 3.0 * (0.3 < seconds < 0.4), partial(le, 1.0), counts={"early": 1000})
     assert _late(record)
 
 
@@ -228,6 +236,11 @@ def test_a_first_diagnostics_tells_the_mode_of_its_period_before_and_an_event_on
     ):
         (tmp_path / name).mkdir()
         assert _late(_judge(tmp_path / name, _steady, modes=modes, told=told)) is late, name
+
+
+@pytest.mark.parametrize("teller", ["/sim/simulator: plant", "/hw/controller: controller"])
+def test_what_another_says_of_its_mode_excuses_nothing(tmp_path: Path, teller: str) -> None:
+    assert _late(_judge(tmp_path, _steady, told=[(0.0, "armed_position")], teller=teller))
 
 
 def test_a_trajectory_that_the_plant_did_not_follow_excuses_nothing(tmp_path: Path) -> None:
