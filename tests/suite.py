@@ -1,8 +1,7 @@
-"""``make test``: on two cores at once what computes and, before it, what keeps a plant's time.
+"""``make test``: on two cores at once what computes, then, one test after the other, what keeps a plant's time.
 
-Tests that keep a plant's time mostly wait for it, so two of them run at a time, and what computes takes the rest of
-both cores at a lower priority. Tests of one file stay together, so that what a file prepares is prepared once. Named
-files or folders run as pytest is told.
+Tests of one file stay together, so that what a file prepares is prepared once. Named files or folders run as pytest is
+told.
 """
 
 from __future__ import annotations
@@ -11,11 +10,7 @@ import os
 import signal
 import subprocess
 import sys
-import tempfile
-import time
 from collections.abc import Sequence
-from pathlib import Path
-from typing import IO
 
 import pytest
 
@@ -48,8 +43,6 @@ _COMPUTES = (
     "tests",
 )
 """What comes first of all others, longest first too: a long file at the end would leave a core idle."""
-_NICENESS = 10
-"""Of what computes. Not 19: beside somebody else's work it would starve."""
 _NOTHING_SELECTED = int(pytest.ExitCode.NO_TESTS_COLLECTED)
 
 
@@ -66,25 +59,12 @@ def main(arguments: Sequence[str]) -> int:
     for name in ("MAKEFLAGS", "MAKEOVERRIDES", "MFLAGS", "ARGS", "PYTHONDONTWRITEBYTECODE"):
         os.environ.pop(name, None)
     if any((PROJECT / argument.split("::")[0]).exists() for argument in arguments):
-        return _start(*arguments).wait()
+        return _pytest(*arguments)
     in_time = _files(_KEEPS_TIME)
     packages = sorted(str(path) for top in ("", "bags/") for path in PROJECT.glob(f"{top}pendulum_*/test"))
     others = [name for name in _files((*_COMPUTES, *packages)) if name not in in_time]
     workers = ("-n", str(min(2, os.cpu_count() or 1)), "--dist", "loadfile", "--no-loadscope-reorder")
-    with tempfile.NamedTemporaryFile() as report, Path(report.name).open(encoding="utf-8", errors="replace") as written:
-        print("What computes runs beside what keeps a plant's time, and is reported after it.", flush=True)
-        computing = _start(*workers, *others, *arguments, output=report, niceness=_NICENESS)
-        try:
-            codes = [_start(*workers, *in_time, *arguments).wait()]
-        finally:
-            # Also after Ctrl-C, which has reached both.
-            running = True
-            while running:
-                running = computing.poll() is None
-                sys.stdout.write(written.read())
-                sys.stdout.flush()
-                time.sleep(0.2)
-    codes.append(computing.returncode)
+    codes = [_pytest(*workers, *others, *arguments), _pytest(*in_time, *arguments)]
     # A name may be in one part only.
     counted = [code for code in codes if code != _NOTHING_SELECTED] or [_NOTHING_SELECTED]
     return next((code for code in counted if code), 0)
@@ -96,10 +76,9 @@ def _files(names: Sequence[str]) -> list[str]:
     return list(dict.fromkeys(str(path.relative_to(PROJECT)) for path in found))
 
 
-def _start(*arguments: str, output: IO[bytes] | None = None, niceness: int = 0) -> subprocess.Popen[bytes]:
-    """Start pytest in a process of its own."""
-    command = ["nice", "-n", str(niceness), sys.executable, "-m", "pytest", *arguments]
-    return subprocess.Popen(command, cwd=PROJECT, stdout=output, stderr=subprocess.STDOUT if output else None)
+def _pytest(*arguments: str) -> int:
+    """Run pytest in a process of its own: what the first run has imported must not slow the second."""
+    return subprocess.run([sys.executable, "-m", "pytest", *arguments], cwd=PROJECT, check=False).returncode
 
 
 if __name__ == "__main__":
