@@ -195,7 +195,7 @@ def test_the_layer_says_what_differs_and_what_to_do() -> None:
     late = same_run_layer(compare([pair(5, late=0.01)]))
     assert late.mark is Mark.NO
     assert late.reason.startswith("the hardware answers 10")
-    assert late.reason.split(";")[0].endswith("ms later")
+    assert late.reason.split(";")[0].endswith("ms later than the simulation")
     assert "transport_delay, 10" in late.next_steps[0]
     slack = same_run_layer(compare([pair(5, plant=SIMULATED.with_values(damping=2 * 11.77))]))
     assert "the velocity of the hardware spreads 47 % narrower" in slack.reason

@@ -185,6 +185,7 @@ class EmulatorServer:
             "limits": wire.limits_to_json(actuator.limits),
             "gains": wire.gains_to_json(actuator.gains),
             "lifetime_expiries": actuator.lifetime_expiries,
+            "last_command_ns": actuator.last_command_ns,
             "faults": sorted(fault.value for fault in actuator.faults),
             "link": asdict(actuator.link),
         }

@@ -73,6 +73,7 @@ class EmulatedX5:
         self.hand: HandTorque | None = None
         self.faults: set[ActuatorFault] = set()
         self.lifetime_expiries = 0
+        self.last_command_ns: int | None = None
         self.trace: Callable[[LinkState], None] | None = None
         self._random = np.random.Generator(np.random.Philox(key=seed))
         self._start_ns = start_ns
@@ -315,6 +316,7 @@ class EmulatedX5:
             # The sender still speaks the old strategy: one field of the packet carries torque or PWM.
             effort = command.effort if math.isnan(command.pwm) else command.pwm
         self._setpoints[:] = (command.position, command.velocity, effort)
+        self.last_command_ns = time_ns
         self._expires_ns = time_ns + round(self.command_lifetime * NANOSECONDS)
         self._lock_holder = sender
 
