@@ -1,4 +1,4 @@
-"""``emulator``: an emulated X5-9 in a process of its own; its faults, and a hand for rehearsals."""
+"""``emulator``: an emulated X5-9; ``emulator_fault``: gives it a fault; ``emulator_hand``: turns its link by hand."""
 
 from __future__ import annotations
 

@@ -4,12 +4,20 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterable, Mapping
-from typing import TYPE_CHECKING, NamedTuple
+from html import escape
+from typing import NamedTuple
 
-if TYPE_CHECKING:
-    from markupsafe import Markup
+__all__ = ["TERMS", "Html", "Term", "Terms"]
 
-__all__ = ["TERMS", "Term", "Terms"]
+
+class Html(str):
+    """Text that is HTML already; templates do not escape it again."""
+
+    __slots__ = ()
+
+    def __html__(self) -> str:
+        """Return itself, as templates ask."""
+        return self
 
 
 class Term(NamedTuple):
@@ -189,22 +197,18 @@ class Terms:
         """Return the terms that texts of the page named so far, with their anchors."""
         return [(key, term) for key, term in TERMS.items() if key in self._used]
 
-    def mark(self, text: str) -> Markup:
+    def mark(self, text: str) -> Html:
         """Return a text as HTML: commands as code, the first mention of each term linked to its sentence."""
-        from markupsafe import Markup, escape
-
         pieces = []
         seen: set[str] = set()
         end = 0
         for found in _COMMANDS.finditer(text):
-            pieces += [self._linked(text[end : found.start()], seen), Markup("<code>{}</code>").format(found[0])]
+            pieces += [self._linked(text[end : found.start()], seen), f"<code>{escape(found[0])}</code>"]
             end = found.end()
         pieces.append(self._linked(text[end:], seen))
-        return Markup("").join(escape(piece) for piece in pieces)
+        return Html("".join(pieces))
 
-    def _linked(self, text: str, seen: set[str]) -> Markup:
-        from markupsafe import Markup, escape
-
+    def _linked(self, text: str, seen: set[str]) -> str:
         pieces = []
         end = 0
         for found in self._words.finditer(text):
@@ -213,7 +217,7 @@ class Terms:
                 continue
             seen.add(key)
             self._used.add(key)
-            link = Markup('<a class="term" href="#term-{}">{}</a>').format(key, found[0])
+            link = f'<a class="term" href="#term-{key}">{escape(found[0])}</a>'
             pieces += [escape(text[end : found.start()]), link]
             end = found.end()
-        return Markup("").join([*pieces, escape(text[end:])])
+        return "".join([*pieces, escape(text[end:])])
