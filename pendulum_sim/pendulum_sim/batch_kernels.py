@@ -19,7 +19,7 @@ from pendulum_sim.compiling import compile_tree, tuple_loader
 from pendulum_sim.dry_friction import PACKED, acceleration_with_friction, actuator_torque, advance_dry
 from pendulum_sim.integrators import get_integrator
 
-__all__ = ["BLOCK", "coefficients_kernel", "general_kernel", "smooth_kernel"]
+__all__ = ["BLOCK", "block_loop", "coefficients_kernel", "general_kernel", "smooth_kernel"]
 
 BLOCK = 256
 """Pendulums in a block."""
@@ -38,6 +38,35 @@ _COEFFICIENTS = len(ROWS) * BLOCK
 _scramble = compile_tree(noise.scramble)
 _unit_interval = compile_tree(noise.unit_interval)
 _wrap = compile_tree(vector_math.wrap)
+
+
+def block_loop(run_block: Any, lanes: int) -> Any:
+    """Return the loop over blocks, in parallel.
+
+    Args:
+        run_block: Compiled loop of one block: (array, keys, target, step [s], steps, hold, more, record); ``more`` is
+            its own, as a number of sub-steps.
+        lanes: Plants in a block.
+    """
+
+    @numba.njit(parallel=True)
+    def run(columns: Any, keys: Any, target: Any, step: float, steps: int, hold: int, more: Any, record: Any) -> None:
+        rows, size = columns.shape
+        for block in numba.prange((size + lanes - 1) // lanes):
+            first = block * lanes
+            last = min(first + lanes, size)
+            # One array with rows at fixed distances: the compiler sees that no row overlaps another.
+            w = np.empty((rows, lanes))
+            block_keys = np.empty(lanes, dtype=np.uint64)
+            for j in range(lanes):
+                # A block that is not full repeats its last plant.
+                source = min(first + j, size - 1)
+                w[:, j] = columns[:, source]
+                block_keys[j] = keys[source]
+            run_block(w.reshape(-1), block_keys, target, step, steps, hold, more, record[:, :, first:last])
+            columns[:, first:last] = w[:, : last - first]
+
+    return run
 
 
 @cache
@@ -86,26 +115,7 @@ def smooth_kernel(method: str, coefficient_rows: int) -> Any:
                         load_coefficients(w, _COEFFICIENTS + j), load_plant(w, _PLANT + j),
                     )  # fmt: skip
 
-    @numba.njit(parallel=True)
-    def run(
-        columns: Any, keys: Any, target: float, h: float, steps: int, hold: int, substeps: int, record: Any
-    ) -> None:
-        rows, size = columns.shape
-        for block in numba.prange((size + BLOCK - 1) // BLOCK):
-            first = block * BLOCK
-            last = min(first + BLOCK, size)
-            # One array with rows at fixed distances: the compiler sees that no row overlaps another.
-            w = np.empty((rows, BLOCK))
-            block_keys = np.empty(BLOCK, dtype=np.uint64)
-            for j in range(BLOCK):
-                # A block that is not full repeats its last pendulum.
-                source = min(first + j, size - 1)
-                w[:, j] = columns[:, source]
-                block_keys[j] = keys[source]
-            run_block(w.reshape(-1), block_keys, target, h, steps, hold, substeps, record[:, :, first:last])
-            columns[:, first:last] = w[:, : last - first]
-
-    return run
+    return block_loop(run_block, BLOCK)
 
 
 @cache

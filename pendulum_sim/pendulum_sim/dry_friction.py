@@ -26,6 +26,7 @@ __all__ = [
     "acceleration_with_friction",
     "actuator_torque",
     "advance_dry",
+    "narrowed",
     "static_friction_balance",
 ]
 
@@ -90,6 +91,30 @@ def actuator_torque(torque: float, command: float, elapsed: float, time_constant
     if time_constant == 0.0:
         return command
     return command + (torque - command) * math.exp(-elapsed / time_constant)
+
+
+def narrowed(
+    low: float, g_low: float, high: float, g_high: float, side: int, root: float, g: float, before: bool
+) -> tuple[float, float, float, float, int]:
+    """Return the bracket of a root, narrowed: (low, g_low, high, g_high, side).
+
+    Args:
+        low: Time before the root [s].
+        g_low: The function there.
+        high: Time after it [s].
+        g_high: The function there.
+        side: Which end moved last, -1 or 1; 0 for none.
+        root: Time at which the function was looked at [s].
+        g: The function there.
+        before: Whether that is before the root.
+
+    Source:
+        The Illinois method: M. Dowell and P. Jarratt, A modified regula falsi method, BIT 11, 1971. The end that stays
+        twice counts half, else it would stay for ever.
+    """
+    if before:
+        return root, g, high, g_high * 0.5 if side == 1 else g_high, 1
+    return low, g_low * 0.5 if side == -1 else g_low, root, g, -1
 
 
 def advance_dry(
@@ -177,16 +202,9 @@ def advance_dry(
             )
             if abs(v_root) <= 1e-14 * (abs(theta_dot) + abs(v_1)):
                 break
-            if v_root * direction > 0.0:
-                low, v_low = root, v_root
-                if side == 1:
-                    v_high *= 0.5
-                side = 1
-            else:
-                high, v_high = root, v_root
-                if side == -1:
-                    v_low *= 0.5
-                side = -1
+            low, v_low, high, v_high, side = narrowed(
+                low, v_low, high, v_high, side, root, v_root, v_root * direction > 0.0
+            )
         theta = theta_root
         theta_dot = 0.0
         left -= root

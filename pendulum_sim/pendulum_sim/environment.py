@@ -12,7 +12,7 @@ Importing ``pendulum_sim.environment`` registers it, and so does
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import gymnasium
@@ -24,6 +24,14 @@ from pendulum_msgs_py.contract import noise
 from pendulum_msgs_py.contract.angles import UPRIGHT, from_upright
 from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.plants.plant_parameters import PlantParameters, load_plant
+from pendulum_sim.environment_arguments import (
+    Array,
+    check_disturbance,
+    check_reset_options,
+    check_start_name,
+    check_weights,
+    episode_steps,
+)
 from pendulum_sim.environment_kernel import is_smooth, lane_table, step_kernel
 from pendulum_sim.integrators import get_integrator
 from pendulum_sim.plant import check_start, check_step
@@ -32,13 +40,10 @@ from pendulum_sim.plants import make_plant
 __all__ = [
     "ENVIRONMENT_ID",
     "EPISODE_TIME",
-    "STARTS",
     "PendulumEnv",
     "action_space",
     "check_arguments",
-    "check_reset_options",
     "draw_start",
-    "episode_steps",
     "observation_space",
     "register",
 ]
@@ -48,10 +53,8 @@ EPISODE_TIME = 5.0
 """Time after which an episode is truncated: the length of the thesis's runs [s]."""
 _WINDOW_FPS = 50.0
 """Pictures a second in a window, which follows real time; a picture of each step would be ten times too many."""
-STARTS = ("bottom", "top", "random")
 THESIS_Q = (100.0, 0.01)
 THESIS_R = 0.1
-Array = NDArray[np.float64]
 
 
 class PendulumEnv(gymnasium.Env[Array, Array]):
@@ -150,7 +153,7 @@ class PendulumEnv(gymnasium.Env[Array, Array]):
         """
         super().reset(seed=seed)
         options = options or {}
-        check_reset_options(options, ("state", "start"))
+        check_reset_options(options)
         self._steps = 0
         state = options.get("state")
         if state is None:
@@ -276,8 +279,7 @@ def action_space(parameters: PlantParameters) -> spaces.Box:
 
 def draw_start(start: str, generator: np.random.Generator, count: int) -> Array:
     """Return starts x of shape (count, 2): at the bottom or top, or at a random angle and up to 1 rad/s."""
-    if start not in STARTS:
-        raise ParameterError(f"start is {start!r}; expected one of {', '.join(STARTS)}")
+    check_start_name(start)
     x = np.zeros((count, 2))
     if start == "bottom":
         x[:, 0] = -math.pi
@@ -296,21 +298,6 @@ def register() -> None:
         )
 
 
-def episode_steps(episode_time: float, dt: float) -> float:
-    """Return after how many steps an episode is over; inf for never."""
-    if not episode_time > 0.0:
-        raise ParameterError(f"episode_time is {episode_time} s; expected > 0")
-    return math.inf if math.isinf(episode_time) else max(1, math.ceil(episode_time / dt - 1e-9))
-
-
-def check_reset_options(options: Mapping[str, Any], known: Sequence[str]) -> None:
-    """Refuse an option that nobody would heed."""
-    unknown = set(options) - set(known)
-    if unknown:
-        expected = f"{', '.join(known[:-1])} or {known[-1]}"
-        raise ParameterError(f"reset option {min(unknown)!r} is unknown; expected {expected}")
-
-
 def check_arguments(
     dt: float,
     substeps: int,
@@ -322,18 +309,12 @@ def check_arguments(
     r: float,
 ) -> None:
     """Refuse arguments that make no environment."""
-    weights = np.asarray(q, dtype=np.float64)
-    if weights.shape != (2,) or not np.isfinite(weights).all():
-        raise ParameterError(f"q is {q}; expected two finite numbers, the weights of angle and velocity")
-    if not math.isfinite(r):
-        raise ParameterError(f"r is {r}; expected a finite number")
+    check_weights(q, r, 2, "two finite numbers, the weights of angle and velocity")
     check_step(dt, substeps)
     if method != "auto":
         get_integrator(method)
-    if start not in STARTS:
-        raise ParameterError(f"start is {start!r}; expected one of {', '.join(STARTS)}")
-    if not (math.isfinite(disturbance) and disturbance >= 0.0):
-        raise ParameterError(f"disturbance is {disturbance} N m; expected a finite number >= 0")
+    check_start_name(start)
+    check_disturbance(disturbance, "N m")
     if hold < 1:
         raise ParameterError(f"hold is {hold} steps; expected >= 1")
 

@@ -20,7 +20,7 @@ from typing import Any
 from pendulum_msgs_py.dynamics import friction_magnitude
 from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.plants.mechanism_parameters import MechanismParameters
-from pendulum_sim.dry_friction import actuator_torque
+from pendulum_sim.dry_friction import actuator_torque, narrowed
 
 __all__ = ["JOINT_FUNCTIONS", "JointTable", "advance_joints", "joint_functions", "pack_joints", "rk4_joints"]
 
@@ -289,16 +289,7 @@ def advance_joints(
                     g = _passed(kind, i, q_r, v_r, direction, table)
                     if abs(g) <= 1e-15:
                         break
-                    if g > 0.0:
-                        low, g_low = root, g
-                        if side == 1:
-                            g_high *= 0.5
-                        side = 1
-                    else:
-                        high, g_high = root, g
-                        if side == -1:
-                            g_low *= 0.5
-                        side = -1
+                    low, g_low, high, g_high, side = narrowed(low, g_low, high, g_high, side, root, g, g > 0.0)
                 if joint < 0 or root < first:
                     first, joint, which = root, i, kind
         if joint < 0:

@@ -10,24 +10,21 @@ Importing this module registers them, and so does ``gymnasium.make("pendulum_sim
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
-from typing import Any, ClassVar
+from typing import Any
 
 import gymnasium
 import numpy as np
-from gymnasium import spaces
-from gymnasium.vector import AutoresetMode, VectorEnv
-from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
 from pendulum_msgs_py.contract import noise
 from pendulum_msgs_py.dynamics.arithmetic import in_arithmetic
 from pendulum_msgs_py.errors import ParameterError
-from pendulum_msgs_py.plants.mechanism_parameters import MechanismParameters, load_mechanism
+from pendulum_msgs_py.plants.mechanism_parameters import MechanismParameters
+from pendulum_sim.environment_arguments import Array, PlantVectorEnv, check_reset_options
 from pendulum_sim.joint_steps import joint_functions, rk4_joints
-from pendulum_sim.mechanism_plant import MechanismPlant, check_stable_step, check_start_state, is_smooth_mechanism
-from pendulum_sim.plant import check_step
+from pendulum_sim.mechanism_plant import MechanismPlant, is_smooth_mechanism
+from pendulum_sim.mechanism_task import MechanismTask
 
 __all__ = ["IDS", "MechanismEnv", "MechanismVectorEnv", "register"]
 
@@ -40,114 +37,6 @@ IDS = {
 }
 """Environments and the presets that they run where none is given."""
 EPISODE_TIME = 10.0
-STARTS = ("bottom", "top", "random")
-Array = NDArray[np.float64]
-
-
-class _Task:
-    """What a single environment and a vector of them share: plant, spaces, reward, starts and noise."""
-
-    def __init__(
-        self,
-        plant: str | MechanismParameters,
-        dt: float,
-        start: str,
-        disturbance: float,
-        q: Sequence[float] | None,
-        r: float | None,
-        episode_time: float,
-    ) -> None:
-        parameters = plant if isinstance(plant, MechanismParameters) else load_mechanism(plant)
-        check_step(dt, 1)
-        check_stable_step(parameters, dt)
-        if not parameters.coordinates.driven:
-            raise ParameterError(f"plant {parameters.name!r} has no driven joint; expected an actuator at one of them")
-        if start not in STARTS:
-            raise ParameterError(f"start is {start!r}; expected one of {', '.join(STARTS)}")
-        if not (math.isfinite(disturbance) and disturbance >= 0.0):
-            raise ParameterError(f"disturbance is {disturbance}; expected a finite number >= 0")
-        if not episode_time > 0.0:
-            raise ParameterError(f"episode_time is {episode_time} s; expected > 0")
-        n = len(parameters.joints)
-        weights, cost = parameters.mechanism.weights
-        self.q = np.asarray(weights if q is None else q, dtype=np.float64)
-        if self.q.shape != (2 * n,) or not np.isfinite(self.q).all():
-            raise ParameterError(f"q is {q}; expected {2 * n} finite numbers, of each joint and of each velocity")
-        self.r = float(cost if r is None else r)
-        if not math.isfinite(self.r):
-            raise ParameterError(f"r is {r}; expected a finite number")
-        self.parameters, self.dt, self.start, self.disturbance = parameters, dt, start, disturbance
-        self.joints = n
-        self.last = math.inf if math.isinf(episode_time) else max(1, math.ceil(episode_time / dt - 1e-9))
-        self.limits = np.array(parameters.effort_limits)
-        self.goal = np.array(parameters.coordinates.goal)
-        if start != "random":
-            check_start_state(parameters, tuple(self.goal) if start == "top" else (0.0,) * n)
-        self.turns = np.array([joint.turns for joint in parameters.mechanism.joints])
-        high = np.full(2 * n, np.inf)
-        high[:n][self.turns] = np.pi
-        self.observation_space = spaces.Box(-high, high, dtype=np.float64)
-        limits = self.limits.astype(np.float32)
-        self.action_space = spaces.Box(-limits, limits, dtype=np.float32)
-
-    def observe(self, position: Array, velocity: Array) -> Array:
-        """Return x of shape (..., 2n)."""
-        deviation = position - self.goal
-        wrapped = np.where(self.turns, (deviation + np.pi) % (2.0 * np.pi) - np.pi, deviation)
-        return np.concatenate([wrapped, velocity], axis=-1)
-
-    def reward(self, x: Array, effort: Array) -> Array:
-        """Return the rewards of states (..., 2n) and efforts (..., m)."""
-        cost: Array = (x * x) @ self.q + self.r * (effort * effort).sum(axis=-1)
-        return -self.dt * cost
-
-    def draw(self, start: object, generator: np.random.Generator) -> tuple[Array, Array]:
-        """Return positions and velocities of a start: hanging, upright, or anywhere with up to 1 rad/s or m/s."""
-        if start not in STARTS:
-            raise ParameterError(f"start is {start!r}; expected one of {', '.join(STARTS)}")
-        position, velocity = (self.goal.copy() if start == "top" else np.zeros(self.joints)), np.zeros(self.joints)
-        if start == "random":
-            position = generator.uniform(-math.pi, math.pi, self.joints)
-            for i, own in enumerate(self.parameters.joints):
-                # Without a stop on one side, half a turn or 1 m from the other, or from 0.
-                reach = math.pi if self.turns[i] else 1.0
-                low, high = own.lower_stop, own.upper_stop
-                if low is None:
-                    low = -reach if high is None else min(-reach, high - reach)
-                if high is None:
-                    high = max(reach, low + reach)
-                middle, half = 0.5 * (low + high), 0.5 * (high - low)
-                if own.lower_stop is not None or own.upper_stop is not None:
-                    half *= 0.9
-                position[i] = middle + half * position[i] / math.pi
-            velocity = generator.uniform(-1.0, 1.0, self.joints)
-        return position, velocity
-
-    def given(self, state: object) -> tuple[Array, Array]:
-        """Return positions and velocities of a state in the observation's convention."""
-        x = np.asarray(state, dtype=np.float64)
-        if x.shape != (2 * self.joints,) or not np.isfinite(x).all():
-            raise ParameterError(f"start state has shape {x.shape}; expected {2 * self.joints} finite numbers")
-        return x[: self.joints] + self.goal, x[self.joints :]
-
-    def efforts(self, actions: Array) -> Array:
-        """Return clamped actions (..., m)."""
-        if not np.isfinite(actions).all():
-            raise ParameterError(f"action is {np.asarray(actions).tolist()}; expected finite numbers")
-        return np.clip(np.asarray(actions, dtype=np.float64), -self.limits, self.limits)
-
-    def noise(self, key: int, count: int) -> list[float]:
-        """Return the disturbance of each driven joint in a step, as a batch of plants draws it."""
-        m = len(self.limits)
-        return [self.disturbance * noise.unit_interval(noise.scramble(key, count * m + i)) for i in range(m)]
-
-
-def _checked_options(options: dict[str, Any] | None) -> dict[str, Any]:
-    known = options or {}
-    unknown = set(known) - {"state", "start"}
-    if unknown:
-        raise ParameterError(f"reset option {min(unknown)!r} is unknown; expected state or start")
-    return known
 
 
 class MechanismEnv(gymnasium.Env[Array, Array]):
@@ -187,7 +76,7 @@ class MechanismEnv(gymnasium.Env[Array, Array]):
     ) -> None:
         if render_mode not in {None, "rgb_array"}:
             raise ParameterError(f"render_mode is {render_mode!r}; expected None or rgb_array")
-        self._task = _Task(plant, dt, start, disturbance, q, r, episode_time)
+        self._task = MechanismTask(plant, dt, start, disturbance, q, r, episode_time)
         self.parameters = self._task.parameters
         self._plant = MechanismPlant(self.parameters, dt, substeps=substeps)
         self.metadata = {**self.metadata, "render_fps": max(1, round(1.0 / dt))}
@@ -210,7 +99,8 @@ class MechanismEnv(gymnasium.Env[Array, Array]):
             Observation, shape (2n,), and an empty dict.
         """
         super().reset(seed=seed)
-        known = _checked_options(options)
+        known = options or {}
+        check_reset_options(known)
         if known.get("state") is not None:
             position, velocity = self._task.given(known["state"])
         else:
@@ -261,7 +151,7 @@ class MechanismEnv(gymnasium.Env[Array, Array]):
         return self._task.observe(np.array(state.position), np.array(state.velocity))
 
 
-class MechanismVectorEnv(VectorEnv[Array, Array, NDArray[Any]]):
+class MechanismVectorEnv(PlantVectorEnv):
     """Many equal plants of several joints; those without friction, stops, lag and delay all in one step of arrays.
 
     Plant i, reset with a list of seeds, starts and is disturbed as a single environment reset with seed i.
@@ -282,8 +172,6 @@ class MechanismVectorEnv(VectorEnv[Array, Array, NDArray[Any]]):
         ParameterError: An argument is outside its domain.
     """
 
-    metadata: ClassVar[dict[str, Any]] = {"autoreset_mode": AutoresetMode.NEXT_STEP, "render_modes": []}
-
     def __init__(
         self,
         num_envs: int = 1,
@@ -298,20 +186,17 @@ class MechanismVectorEnv(VectorEnv[Array, Array, NDArray[Any]]):
         render_mode: str | None = None,
         episode_time: float = EPISODE_TIME,
     ) -> None:
-        self._task = task = _Task(plant, dt, start, disturbance, q, r, episode_time)
-        self._last = task.last if max_episode_steps is None else max_episode_steps
-        if num_envs < 1 or self._last < 1:
-            raise ParameterError(
-                f"num_envs is {num_envs} and max_episode_steps {max_episode_steps}; expected both >= 1"
-            )
-        if render_mode is not None:
-            raise ParameterError(f"render_mode is {render_mode!r}; expected None: draw one MechanismEnv instead")
-        self.num_envs = num_envs
+        self._task = task = MechanismTask(plant, dt, start, disturbance, q, r, episode_time)
+        super().__init__(
+            num_envs,
+            task.observation_space,
+            task.action_space,
+            task.last,
+            max_episode_steps,
+            render_mode,
+            "MechanismEnv",
+        )
         self.parameters = task.parameters
-        self.single_observation_space = task.observation_space
-        self.single_action_space = task.action_space
-        self.observation_space = batch_space(self.single_observation_space, num_envs)
-        self.action_space = batch_space(self.single_action_space, num_envs)
         smooth = is_smooth_mechanism(task.parameters)
         self._plants = [] if smooth else [MechanismPlant(task.parameters, dt) for _ in range(num_envs)]
         self._forward = in_arithmetic(task.parameters.mechanism.forward, np)
@@ -320,8 +205,6 @@ class MechanismVectorEnv(VectorEnv[Array, Array, NDArray[Any]]):
         self._velocity = np.zeros((num_envs, task.joints))
         self._keys = [0] * num_envs
         self._counts = np.zeros(num_envs, dtype=np.int64)
-        self._done = np.zeros(num_envs, dtype=np.bool_)
-        self._generators: list[np.random.Generator] | None = None
 
     def reset(
         self, *, seed: int | list[int | None] | None = None, options: dict[str, Any] | None = None
@@ -335,14 +218,9 @@ class MechanismVectorEnv(VectorEnv[Array, Array, NDArray[Any]]):
         Returns:
             Observations, shape (N, 2n), and an empty dict.
         """
-        known = _checked_options(options)
-        if isinstance(seed, (list, tuple, np.ndarray)):
-            if len(seed) != self.num_envs:
-                raise ParameterError(f"seed has {len(seed)} entries; expected one for each of {self.num_envs} plants")
-            self._generators = [np.random.Generator(np.random.PCG64(each)) for each in seed]
-        elif seed is not None:
-            super().reset(seed=seed)
-            self._generators = None
+        known = options or {}
+        check_reset_options(known)
+        self._take_seeds(seed)
         for index in range(self.num_envs):
             self._restart(index, known)
         self._done[:] = False

@@ -16,13 +16,12 @@ import numpy as np
 from pendulum_msgs_py.contract import noise
 from pendulum_msgs_py.mechanisms import MECHANISMS
 from pendulum_sim import vector_math
+from pendulum_sim.batch_kernels import BLOCK, block_loop
 from pendulum_sim.compiling import compile_tree, tuple_loader
 from pendulum_sim.joint_steps import advance_joints, joint_functions, rk4_joints
 
-__all__ = ["BLOCK", "TABLE_ROWS", "Layout", "general_joints_kernel", "smooth_joints_kernel"]
+__all__ = ["TABLE_ROWS", "Layout", "general_joints_kernel", "smooth_joints_kernel"]
 
-BLOCK = 256
-"""Plants in a block."""
 TABLE_ROWS = 6
 """Rows of :func:`~pendulum_sim.joint_steps.pack_joints`."""
 _scramble = compile_tree(noise.scramble)
@@ -119,27 +118,6 @@ def _control(layout: Layout, lanes: int) -> Any:
     return control
 
 
-def _blocks(run_block: Any, lanes: int) -> Any:
-    """Return the loop over blocks, in parallel; a block that is not full repeats its last plant."""
-
-    @numba.njit(parallel=True)
-    def run(columns: Any, keys: Any, goal: Any, dt: float, steps: int, hold: int, more: Any, record: Any) -> None:
-        rows, size = columns.shape
-        for block in numba.prange((size + lanes - 1) // lanes):
-            first = block * lanes
-            last = min(first + lanes, size)
-            w = np.empty((rows, lanes))
-            block_keys = np.empty(lanes, dtype=np.uint64)
-            for j in range(lanes):
-                source = min(first + j, size - 1)
-                w[:, j] = columns[:, source]
-                block_keys[j] = keys[source]
-            run_block(w.reshape(-1), block_keys, goal, dt, steps, hold, more, record[:, :, first:last])
-            columns[:, first:last] = w[:, : last - first]
-
-    return run
-
-
 @cache
 def smooth_joints_kernel(layout: Layout) -> Any:
     """Return the loop for plants without dry friction, stops, lag and delay; ``more`` is the number of sub-steps."""
@@ -170,7 +148,7 @@ def smooth_joints_kernel(layout: Layout) -> Any:
                     store(w, o_q + j, BLOCK, q)
                     store(w, o_v + j, BLOCK, v)
 
-    return _blocks(run_block, BLOCK)
+    return block_loop(run_block, BLOCK)
 
 
 @cache
@@ -221,4 +199,4 @@ def general_joints_kernel(layout: Layout) -> Any:
             store(w, o_q, 1, q)
             store(w, o_v, 1, v)
 
-    return _blocks(run_block, 1)
+    return block_loop(run_block, 1)

@@ -2,12 +2,9 @@
 
 from __future__ import annotations
 
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
-from gymnasium.utils import seeding
-from gymnasium.vector import AutoresetMode, VectorEnv
-from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
 from pendulum_msgs_py.contract import noise
@@ -18,14 +15,12 @@ from pendulum_sim.environment import (
     EPISODE_TIME,
     THESIS_Q,
     THESIS_R,
-    Array,
     action_space,
     check_arguments,
-    check_reset_options,
     draw_start,
-    episode_steps,
     observation_space,
 )
+from pendulum_sim.environment_arguments import Array, PlantVectorEnv, check_reset_options, episode_steps
 from pendulum_sim.environment_kernel import is_smooth, lane_table, step_kernel
 
 __all__ = ["PendulumVectorEnv"]
@@ -33,7 +28,7 @@ __all__ = ["PendulumVectorEnv"]
 _LANES = 256
 
 
-class PendulumVectorEnv(VectorEnv[Array, Array, NDArray[Any]]):
+class PendulumVectorEnv(PlantVectorEnv):
     """Many equal pendulums in one compiled step, for learning libraries; rigid plants without dry friction or lag.
 
     Args:
@@ -55,8 +50,6 @@ class PendulumVectorEnv(VectorEnv[Array, Array, NDArray[Any]]):
         ParameterError: An argument is outside its domain.
     """
 
-    metadata: ClassVar[dict[str, Any]] = {"autoreset_mode": AutoresetMode.NEXT_STEP, "render_modes": []}
-
     def __init__(
         self,
         num_envs: int = 1,
@@ -76,13 +69,6 @@ class PendulumVectorEnv(VectorEnv[Array, Array, NDArray[Any]]):
     ) -> None:
         parameters = plant if isinstance(plant, PlantParameters) else load_plant(plant)
         check_arguments(dt, substeps, start, disturbance, hold, method, q, r)
-        last = episode_steps(episode_time, dt) if max_episode_steps is None else max_episode_steps
-        if num_envs < 1 or last < 1:
-            raise ParameterError(
-                f"num_envs is {num_envs} and max_episode_steps {max_episode_steps}; expected both >= 1"
-            )
-        if render_mode is not None:
-            raise ParameterError(f"render_mode is {render_mode!r}; expected None: draw one PendulumEnv instead")
         if not is_smooth(parameters):
             raise ParameterError(
                 f"plant {parameters.name!r} has dry friction, lag, delay or a drivetrain; expected none of them here: "
@@ -91,16 +77,19 @@ class PendulumVectorEnv(VectorEnv[Array, Array, NDArray[Any]]):
         method = "etd4" if method == "auto" else method
         if method == "adaptive":
             raise ParameterError("method is 'adaptive'; expected a compiled one, such as etd4")
-        self.num_envs = num_envs
+        super().__init__(
+            num_envs,
+            observation_space(parameters, disturbance),
+            action_space(parameters),
+            episode_steps(episode_time, dt),
+            max_episode_steps,
+            render_mode,
+            "PendulumEnv",
+        )
         self.parameters = parameters
-        self.single_observation_space = observation_space(parameters, disturbance)
-        self.single_action_space = action_space(parameters)
-        self.observation_space = batch_space(self.single_observation_space, num_envs)
-        self.action_space = batch_space(self.single_action_space, num_envs)
         self._start = start
         self._hold = hold
         self._h, self._substeps = dt / substeps, substeps
-        self._max_steps = last
         blocks = -(-num_envs // _LANES)
         table = lane_table(parameters, method, self._h, _LANES, disturbance, q, r)
         self._w = np.repeat(table.reshape(1, -1), blocks, axis=0)
@@ -108,8 +97,6 @@ class PendulumVectorEnv(VectorEnv[Array, Array, NDArray[Any]]):
         self._counts = np.zeros((blocks, _LANES), dtype=np.int64)
         self._actions = np.zeros((blocks, _LANES))
         self._kernel = step_kernel(method, _LANES)
-        self._done = np.zeros(num_envs, dtype=np.bool_)
-        self._generators: list[np.random.Generator] | None = None
 
     def reset(
         self, *, seed: int | list[int | None] | None = None, options: dict[str, Any] | None = None
@@ -131,19 +118,7 @@ class PendulumVectorEnv(VectorEnv[Array, Array, NDArray[Any]]):
         options = options or {}
         check_reset_options(options, ("state", "start", "reset_mask"))
         n = self.num_envs
-        if isinstance(seed, (list, tuple, np.ndarray)):
-            if len(seed) != n:
-                raise ParameterError(f"seed has {len(seed)} entries; expected one for each of {n} pendulums")
-            before = self._generators
-            self._generators = [
-                before[index]
-                if given is None and before is not None
-                else seeding.np_random(None if given is None else int(given))[0]
-                for index, given in enumerate(seed)
-            ]
-        elif seed is not None:
-            super().reset(seed=seed)
-            self._generators = None
+        self._take_seeds(seed)
         mask = np.asarray(options.get("reset_mask", np.ones(n, dtype=np.bool_)))
         if mask.shape != (n,) or mask.dtype != np.bool_:
             raise ParameterError(f"reset_mask has shape {mask.shape} of {mask.dtype}; expected ({n},) of bool")
@@ -191,7 +166,7 @@ class PendulumVectorEnv(VectorEnv[Array, Array, NDArray[Any]]):
             self._restart(restart, self._start)
             result[restart] = self._observe()[restart]
             reward[restart] = 0.0
-        truncated = self._counts.reshape(-1)[:n] >= self._max_steps
+        truncated = self._counts.reshape(-1)[:n] >= self._last
         self._done = truncated
         return result, reward, np.zeros(n, dtype=np.bool_), truncated, {}
 

@@ -180,7 +180,7 @@ def test_a_list_of_seeds_gives_each_pendulum_its_own_episode() -> None:
         (None, {"state": [math.nan, 0.0]}, "expected finite numbers"),
         (None, {"reset_mask": [True]}, r"reset_mask has shape \(1,\) of bool; expected \(3,\) of bool"),
         (None, {"reset_mask": [0, 1, 2]}, r"expected \(3,\) of bool"),
-        ([1, 2], None, "seed has 2 entries; expected one for each of 3 pendulums"),
+        ([1, 2], None, "seed has 2 entries; expected one for each of 3 plants"),
     ],
 )
 def test_a_reset_of_many_refuses_what_it_would_not_heed(seed: object, options: dict | None, message: str) -> None:

@@ -50,6 +50,16 @@ def test_a_vector_of_them_moves_as_the_single_ones_do(name: str) -> None:
             np.testing.assert_allclose(rewards, [result[1] for result in results], rtol=1e-9)
 
 
+def test_a_plant_without_a_new_seed_goes_on_drawing_from_its_own() -> None:
+    vector = MechanismVectorEnv(2, plant="furuta", start="random")
+    vector.reset(seed=[3, 4])
+    observations, _ = vector.reset(seed=[3, None])
+    singles = [MechanismEnv("furuta", start="random") for _ in range(2)]
+    for env, seed in zip(singles, (3, 4), strict=True):
+        env.reset(seed=seed)
+    np.testing.assert_array_equal(observations, [singles[0].reset(seed=3)[0], singles[1].reset()[0]])
+
+
 def test_an_environment_is_the_plant_with_its_noise_clamped() -> None:
     env = MechanismEnv("pendubot", disturbance=0.0)
     x, _ = env.reset(seed=1, options={"state": [0.1, -0.2, 0.3, 0.4]})

@@ -13,7 +13,7 @@ from typing import Any
 
 from pendulum_msgs_py.contract.angles import UPRIGHT
 from pendulum_msgs_py.joints import Joint
-from pendulum_msgs_py.mechanisms.mechanism import Body, Mechanism, Point, Rotor, gravity_spec
+from pendulum_msgs_py.mechanisms.mechanism import Body, Mechanism, Point, gravity_spec, positive
 from pendulum_msgs_py.parameters import ParameterSpec
 
 __all__ = ["CART_POLE"]
@@ -62,23 +62,16 @@ def bodies(p: Any) -> tuple[Body, ...]:
     )  # fmt: skip
 
 
-def rotors(_p: Any) -> tuple[Rotor, ...]:
-    """Return none: a motor's inertia is part of the cart's mass."""
-    return ()
-
-
 CART_POLE = Mechanism(
     name="cart_pole",
     title="A pole on a hinge on a cart that slides.",
     joints=(Joint("cart", unit="m", turns=False), Joint("pole", goal=UPRIGHT)),
     parameters=(
-        ParameterSpec("cart_mass", 1.0, "kg", "Cart, motor included, M.", minimum=0.0, exclusive_minimum=True),
-        ParameterSpec("pole_mass", 0.1, "kg", "Pole, m.", minimum=0.0, exclusive_minimum=True),
-        ParameterSpec("pole_length", 1.0, "m", "Pole, to its tip: to draw it.", minimum=0.0, exclusive_minimum=True),
+        positive("cart_mass", 1.0, "kg", "Cart, motor included, M."),
+        positive("pole_mass", 0.1, "kg", "Pole, m."),
+        positive("pole_length", 1.0, "m", "Pole, to its tip: to draw it."),
         ParameterSpec("pole_centre", 0.5, "m", "Hinge to the pole's centre of mass, c.", minimum=0.0),
-        ParameterSpec(
-            "pole_inertia", 1.0 / 30.0, "kg m^2", "Pole about the hinge, J.", minimum=0.0, exclusive_minimum=True
-        ),
+        positive("pole_inertia", 1.0 / 30.0, "kg m^2", "Pole about the hinge, J."),
         gravity_spec(),
     ),
     forward=forward,
@@ -86,7 +79,6 @@ CART_POLE = Mechanism(
     potential=potential,
     chain=chain,
     bodies=bodies,
-    rotors=rotors,
     weights=((10.0, 100.0, 1.0, 1.0), 0.1),
     source="R. Tedrake, Underactuated Robotics, chapter 3.2, with the pole's own inertia.",
 )

@@ -20,7 +20,7 @@ from typing import Any
 
 from pendulum_msgs_py.contract.angles import UPRIGHT
 from pendulum_msgs_py.joints import Joint
-from pendulum_msgs_py.mechanisms.mechanism import Body, Mechanism, Point, Rotor, gravity_spec
+from pendulum_msgs_py.mechanisms.mechanism import Body, Mechanism, Point, Rotor, gravity_spec, positive
 from pendulum_msgs_py.parameters import ParameterSpec
 
 __all__ = ["DOUBLE_PENDULUM"]
@@ -88,23 +88,19 @@ def rotors(p: Any) -> tuple[Rotor, ...]:
     return (Rotor(rotor, (gear, 0.0)), Rotor(rotor, (1.0, -gear)))
 
 
-def _positive(name: str, default: float, unit: str, description: str) -> ParameterSpec:
-    return ParameterSpec(name, default, unit, description, minimum=0.0, exclusive_minimum=True)
-
-
 DOUBLE_PENDULUM = Mechanism(
     name="double_pendulum",
     title="Two links in a plane, a hinge at the shoulder and one at the elbow.",
     joints=(Joint("shoulder", goal=UPRIGHT), Joint("elbow")),
     parameters=(
-        _positive("mass_1", 0.523, "kg", "First link, m_1."),
-        _positive("length_1", 0.2, "m", "Shoulder to elbow, l_1."),
+        positive("mass_1", 0.523, "kg", "First link, m_1."),
+        positive("length_1", 0.2, "m", "Shoulder to elbow, l_1."),
         ParameterSpec("centre_1", 0.2, "m", "Shoulder to the first link's centre of mass, r_1.", minimum=0.0),
-        _positive("inertia_1", 0.0319, "kg m^2", "First link about the shoulder, I_1."),
-        _positive("mass_2", 0.626, "kg", "Second link, m_2."),
-        _positive("length_2", 0.3, "m", "Elbow to the tip, l_2: to draw it, and its height."),
+        positive("inertia_1", 0.0319, "kg m^2", "First link about the shoulder, I_1."),
+        positive("mass_2", 0.626, "kg", "Second link, m_2."),
+        positive("length_2", 0.3, "m", "Elbow to the tip, l_2: to draw it, and its height."),
         ParameterSpec("centre_2", 0.256, "m", "Elbow to the second link's centre of mass, r_2.", minimum=0.0),
-        _positive("inertia_2", 0.0509, "kg m^2", "Second link about the elbow, I_2."),
+        positive("inertia_2", 0.0509, "kg m^2", "Second link about the elbow, I_2."),
         gravity_spec(),
         ParameterSpec("rotor_inertia", 0.0, "kg m^2", "Rotor of each motor, at the motor, J_r.", minimum=0.0),
         ParameterSpec("gear_ratio", 1.0, "-", "Motor turns per turn of a joint, N.", minimum=0.0),

@@ -16,7 +16,7 @@ from typing import Any
 
 from pendulum_msgs_py.contract.angles import UPRIGHT
 from pendulum_msgs_py.joints import Joint
-from pendulum_msgs_py.mechanisms.mechanism import Body, Mechanism, Point, Rotor, gravity_spec
+from pendulum_msgs_py.mechanisms.mechanism import Body, Mechanism, Point, gravity_spec, positive
 from pendulum_msgs_py.parameters import ParameterSpec
 
 __all__ = ["FURUTA"]
@@ -76,26 +76,17 @@ def bodies(p: Any) -> tuple[Body, ...]:
     )  # fmt: skip
 
 
-def rotors(_p: Any) -> tuple[Rotor, ...]:
-    """Return none: a motor's inertia is part of the arm's."""
-    return ()
-
-
-def _positive(name: str, default: float, unit: str, description: str) -> ParameterSpec:
-    return ParameterSpec(name, default, unit, description, minimum=0.0, exclusive_minimum=True)
-
-
 FURUTA = Mechanism(
     name="furuta",
     title="A pendulum on the end of an arm that turns about the vertical.",
     joints=(Joint("arm"), Joint("pendulum", goal=UPRIGHT)),
     parameters=(
-        _positive("arm_inertia", 2.3e-4, "kg m^2", "Arm about its axis, motor included, J_1."),
-        _positive("arm_length", 0.085, "m", "Axis to the pendulum's hinge, L."),
-        _positive("pendulum_mass", 0.024, "kg", "Pendulum, m."),
-        _positive("pendulum_length", 0.129, "m", "Pendulum, to its tip: to draw it."),
+        positive("arm_inertia", 2.3e-4, "kg m^2", "Arm about its axis, motor included, J_1."),
+        positive("arm_length", 0.085, "m", "Axis to the pendulum's hinge, L."),
+        positive("pendulum_mass", 0.024, "kg", "Pendulum, m."),
+        positive("pendulum_length", 0.129, "m", "Pendulum, to its tip: to draw it."),
         ParameterSpec("pendulum_centre", 0.0645, "m", "Hinge to the pendulum's centre of mass, c.", minimum=0.0),
-        _positive("pendulum_inertia", 1.33e-4, "kg m^2", "Pendulum about its hinge, J_2."),
+        positive("pendulum_inertia", 1.33e-4, "kg m^2", "Pendulum about its hinge, J_2."),
         gravity_spec(),
     ),
     forward=forward,
@@ -103,7 +94,6 @@ FURUTA = Mechanism(
     potential=potential,
     chain=chain,
     bodies=bodies,
-    rotors=rotors,
     weights=((1.0, 10.0, 0.1, 0.1), 100.0),
     source="B. S. Cazzolato and Z. Prime, On the dynamics of the Furuta pendulum, J. Control Sci. Eng., 2011, eq. 33.",
 )

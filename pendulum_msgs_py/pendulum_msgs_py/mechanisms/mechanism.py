@@ -9,13 +9,18 @@ from typing import Any, NamedTuple
 from pendulum_msgs_py.joints import Joint
 from pendulum_msgs_py.parameters import ParameterSpec
 
-__all__ = ["STANDARD_GRAVITY", "Body", "Mechanism", "Point", "Rotor", "gravity_spec"]
+__all__ = ["STANDARD_GRAVITY", "Body", "Mechanism", "Point", "Rotor", "gravity_spec", "positive"]
 
 STANDARD_GRAVITY = 9.81
 """Acceleration of gravity where a plant file gives none [m/s^2]."""
 
 Point = tuple[float, float, float]
 """x to the right, y away from who looks, z up [m]."""
+
+
+def positive(name: str, default: float, unit: str, description: str) -> ParameterSpec:
+    """Return a parameter that must be above zero, as a mass or a length."""
+    return ParameterSpec(name, default, unit, description, minimum=0.0, exclusive_minimum=True)
 
 
 def gravity_spec() -> ParameterSpec:
@@ -57,6 +62,10 @@ class Rotor(NamedTuple):
     rates: tuple[float, ...]
 
 
+def _no_rotors(_p: Any) -> tuple[Rotor, ...]:
+    return ()
+
+
 @dataclass(frozen=True)
 class Mechanism:
     """Equations and joints, without numbers.
@@ -77,9 +86,10 @@ class Mechanism:
         potential: ``potential(q, p)`` [J].
         chain: ``chain(q, p)``, points from the base to the tip, to draw [m].
         bodies: ``bodies(p)``, one :class:`Body` per joint, for URDF and MJCF.
-        rotors: ``rotors(p)``, what turns with more than one joint, or faster than its own.
         weights: Diagonal of Q [deviation of each joint, then velocity of each] and of R, where a design has none.
         source: Where the equations are published.
+        rotors: ``rotors(p)``, what turns with more than one joint, or faster than its own; none where a motor's inertia
+            is part of its link's.
     """
 
     name: str
@@ -91,9 +101,9 @@ class Mechanism:
     potential: Callable[[Any, Any], Any]
     chain: Callable[[Any, Any], tuple[Point, ...]]
     bodies: Callable[[Any], tuple[Body, ...]]
-    rotors: Callable[[Any], tuple[Rotor, ...]]
     weights: tuple[tuple[float, ...], float]
     source: str
+    rotors: Callable[[Any], tuple[Rotor, ...]] = _no_rotors
 
     @property
     def parameter_names(self) -> tuple[str, ...]:

@@ -14,7 +14,7 @@ from pendulum_msgs_py.contract.angles import UPRIGHT
 from pendulum_msgs_py.contract.names import JOINT
 from pendulum_msgs_py.dynamics.rigid import rigid_acceleration, rigid_energy
 from pendulum_msgs_py.joints import Joint
-from pendulum_msgs_py.mechanisms.mechanism import STANDARD_GRAVITY, Body, Mechanism, Point, Rotor
+from pendulum_msgs_py.mechanisms.mechanism import STANDARD_GRAVITY, Body, Mechanism, Point, positive
 from pendulum_msgs_py.parameters import ParameterSpec
 
 __all__ = ["PENDULUM"]
@@ -62,17 +62,12 @@ def bodies(p: Any) -> tuple[Body, ...]:
     )  # fmt: skip
 
 
-def rotors(_p: Any) -> tuple[Rotor, ...]:
-    """Return none."""
-    return ()
-
-
 PENDULUM = Mechanism(
     name="pendulum",
     title="One link on a driven hinge.",
     joints=(Joint(JOINT, goal=UPRIGHT),),
     parameters=(
-        ParameterSpec("inertia", 0.055, "kg m^2", "Inertia about the joint, M.", minimum=0.0, exclusive_minimum=True),
+        positive("inertia", 0.055, "kg m^2", "Inertia about the joint, M."),
         ParameterSpec("gravity", 1.678, "N m", "Gravity coefficient, G = m g l; 0 lies flat.", minimum=0.0),
     ),
     forward=forward,
@@ -80,7 +75,6 @@ PENDULUM = Mechanism(
     potential=potential,
     chain=chain,
     bodies=bodies,
-    rotors=rotors,
     weights=((100.0, 0.01), 0.1),
     source='Thesis, "Control of a Pendulum System: From Simulation to Reality", section 4.',
 )
