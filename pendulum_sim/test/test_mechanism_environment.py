@@ -91,7 +91,7 @@ def test_episodes_end_after_their_time_and_start_again_with_the_next_step() -> N
     [
         ({"start": "side"}, "start is 'side'; expected one of bottom, top, random"),
         ({"q": (1.0, 1.0)}, r"q is \(1.0, 1.0\); expected 4 finite numbers"),
-        ({"disturbance": -1.0}, "disturbance is -1.0; expected a finite number >= 0"),
+        ({"disturbance": -1.0}, "disturbance is -1.0 N m or N; expected a finite number >= 0"),
         ({"episode_time": 0.0}, "episode_time is 0.0 s; expected > 0"),
         ({"render_mode": "ascii"}, "render_mode is 'ascii'; expected None"),
     ],
