@@ -13,6 +13,7 @@ from typing import Protocol
 import numpy as np
 
 from pendulum_hw_bridge.actuator import ActuatorError, ActuatorPort, Command, Feedback, Strategy
+from pendulum_hw_bridge.feedback_stream import feedback_for
 from pendulum_hw_bridge.nudge import Hand, watch_nudge
 from pendulum_hw_bridge.safety import SafetyLimits, SafetyMonitor
 from pendulum_hw_bridge.settings import BridgeSettings
@@ -42,6 +43,7 @@ _LARGEST_TRAVEL = 1.0
 """Largest turn of the link under the duty for proofs [rad]: twice what a swing of the thesis's pendulum overshoots."""
 _ENDS_WITHIN = 0.06
 """Time within which the M-stop must end the duty [s]."""
+_NO_DUTY = 1e-9
 _MARGIN_PERIODS = 2
 """Feedback periods by which the end of the duty may be seen late [-]."""
 
@@ -288,10 +290,17 @@ def _expect_inside(record: Feedback, settings: BridgeSettings, begin: float) -> 
 
 def _duty_ends(port: ActuatorPort, since_ns: int, patience: float) -> float:
     """Return when the duty had ended, after a time [s]; the patience and more where it did not."""
+    heard_ns = since_ns
     while (port.now_ns() - since_ns) / NANOSECONDS < patience:
         record = port.read(0.01)
-        if record is not None and record.stamp_ns >= since_ns and abs(record.pwm_command) < 1e-9:
-            return (record.stamp_ns - since_ns) / NANOSECONDS
+        if record is None:
+            continue
+        heard_ns = record.stamp_ns
+        if heard_ns >= since_ns and abs(record.pwm_command) < _NO_DUTY:
+            return (heard_ns - since_ns) / NANOSECONDS
+    silence = (port.now_ns() - heard_ns) / NANOSECONDS
+    if silence > 0.5 * patience:
+        raise ActuatorError("feedback_lost", f"no feedback for {silence:.1f} s; expected to see the duty end")
     return (port.now_ns() - since_ns) / NANOSECONDS
 
 
@@ -318,12 +327,9 @@ def _rest(port: ActuatorPort, dialogue: Dialogue) -> float:
 
 def _listen(port: ActuatorPort, seconds: float) -> list[Feedback]:
     records = []
-    end = port.now_ns() + round(seconds * NANOSECONDS)
-    while port.now_ns() < end:
-        record = port.read(0.1)
-        if record is not None:
-            _expect_numbers(record)
-            records.append(record)
+    for record in feedback_for(port, seconds):
+        _expect_numbers(record)
+        records.append(record)
     if len(records) < 2:
         raise ActuatorError("feedback_lost", f"{len(records)} records in {seconds:g} s; expected feedback to flow")
     return records

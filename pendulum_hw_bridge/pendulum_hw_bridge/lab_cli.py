@@ -226,15 +226,16 @@ def restore(
     lab = load_lab(file)
     if not folder.is_dir():
         raise ParameterError(f"backup {folder} does not exist; expected a folder that lab backup wrote")
-    _Terminal(yes=yes).go_on(
+    terminal = _Terminal(yes=yes)
+    terminal.go_on(
         f"Restore. Gains, safety parameters and M-stop action of {lab.describe()} become those of {folder}. Nothing "
         "moves."
     )
     if lab.values["backend"] == "hebi":
-        module_files.restore_group(_group(lab), folder, hebi.new_command)
+        module_files.restore_group(_group(lab), folder, hebi.new_command, terminal.say)
     else:
         with _machine(file) as (port, _):
-            module_files.restore_emulator(port, folder)
+            module_files.restore_emulator(port, folder, terminal.say)
     print("restored, and read back")
 
 

@@ -58,7 +58,7 @@ def backup_group(group: Any, folder: Path) -> list[Path]:
     return files
 
 
-def restore_group(group: Any, folder: Path, make_command: Callable[[], Any]) -> None:
+def restore_group(group: Any, folder: Path, make_command: Callable[[], Any], say: Callable[[str], None]) -> None:
     """Send a module the gains, safety parameters and M-stop action of :func:`backup_group`, and read them back.
 
     No setpoint is sent, so nothing moves.
@@ -67,12 +67,14 @@ def restore_group(group: Any, folder: Path, make_command: Callable[[], Any]) -> 
         group: hebi-py's group of the one module.
         folder: Where they are.
         make_command: Makes an empty ``GroupCommand`` for one module.
+        say: Shows a sentence, where it is broken off with some of it in force.
 
     Raises:
         ActuatorError: The module does not acknowledge, or other values read back.
-        ParameterError: A file is missing or not understood.
+        ParameterError: A file is missing or not understood; nothing was sent then.
     """
     ends = _read_ends(folder / ENDS)
+    commands = []
     for name, read in ((GAINS, "read_gains"), (SAFETY, "read_safety_params")):
         read_text(folder / name, "backup")
         command = make_command()
@@ -86,9 +88,17 @@ def restore_group(group: Any, folder: Path, make_command: Callable[[], Any]) -> 
                 setattr(command, end, strategy)
         # An empty command of hebi-py reads as position 0; said to be none, nothing can be taken for a wish to move.
         command.position = command.velocity = command.effort = math.nan
-        if not any(group.send_command_with_acknowledgement(command, _ANSWER_MS) for _ in range(_ATTEMPTS)):
-            raise ActuatorError("no_acknowledgement", f"HEBI module did not acknowledge {name} within {_ANSWER_MS} ms")
-    info = _info(group)
+        commands.append((name, command))
+    with _told_if_broken_off(folder, say):
+        for name, command in commands:
+            if not any(group.send_command_with_acknowledgement(command, _ANSWER_MS) for _ in range(_ATTEMPTS)):
+                raise ActuatorError(
+                    "no_acknowledgement", f"HEBI module did not acknowledge {name} within {_ANSWER_MS} ms"
+                )
+        _expect_group(_info(group), folder, ends)
+
+
+def _expect_group(info: Any, folder: Path, ends: dict[str, int]) -> None:
     # Not beside the backup, which may lie on a medium that is full or read-only.
     with tempfile.TemporaryDirectory(prefix="pendulum_module_") as temporary:
         for name, write in ((GAINS, "write_gains"), (SAFETY, "write_safety_params")):
@@ -113,16 +123,30 @@ def backup_emulator(port: ActuatorPort, folder: Path) -> list[Path]:
     return [folder / GAINS, folder / LIMITS]
 
 
-def restore_emulator(port: ActuatorPort, folder: Path) -> None:
-    """Give an emulator the gains and limits of :func:`backup_emulator`, and read them back."""
+def restore_emulator(port: ActuatorPort, folder: Path, say: Callable[[str], None]) -> None:
+    """Give an emulator the gains and limits of :func:`backup_emulator`, and read them back; ``say`` as for a group."""
     gains = load_gains(folder / GAINS)
     try:
         limits = limits_from_json(json.loads(read_text(folder / LIMITS, "backup")))
     except ValueError as error:
         raise ParameterError(f"backup {folder / LIMITS} is not understood: {error}") from error
     port.connect()
-    if port.set_gains(gains) != gains or port.set_limits(limits) != limits:
-        raise ActuatorError("no_acknowledgement", f"emulator reads back other values than those of {folder}")
+    with _told_if_broken_off(folder, say):
+        if port.set_gains(gains) != gains or port.set_limits(limits) != limits:
+            raise ActuatorError("no_acknowledgement", f"emulator reads back other values than those of {folder}")
+
+
+@contextlib.contextmanager
+def _told_if_broken_off(folder: Path, say: Callable[[str], None]) -> Iterator[None]:
+    """Say what a module may be left with, whether it or the person (Ctrl-C) broke off: half of two sets is neither."""
+    try:
+        yield
+    except BaseException:
+        say(
+            f"Broken off: the module may hold some settings of {folder} and some that it had before. Do not arm it; "
+            "restore again."
+        )
+        raise
 
 
 def _set_open_ends(command: Any, path: Path) -> None:

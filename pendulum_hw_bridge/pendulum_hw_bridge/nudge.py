@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from typing import Protocol
 
 from pendulum_hw_bridge.actuator import ActuatorPort
-from pendulum_msgs_py.contract.values import NANOSECONDS
+from pendulum_hw_bridge.feedback_stream import feedback_for
 
 __all__ = ["EMULATED_NUDGE", "NUDGE_ANGLE", "EmulatedHand", "Hand", "Person", "hand_of", "watch_nudge"]
 
@@ -93,16 +93,15 @@ def watch_nudge(port: ActuatorPort, hand: Hand, *, patience: float = _PATIENCE) 
         port: The actuator, with its strategy off.
         hand: Who turns.
         patience: Longest time to wait [s].
+
+    Raises:
+        ActuatorError: Feedback stays away.
     """
-    deadline = port.now_ns() + round(patience * NANOSECONDS)
     start: float | None = None
     seen = False
     hand.begin()
     try:
-        while port.now_ns() < deadline:
-            record = port.read(0.05)
-            if record is None:
-                continue
+        for record in feedback_for(port, patience):
             start = record.position if start is None else start
             seen = abs(record.position - start) > NUDGE_ANGLE
             if seen:

@@ -1,24 +1,20 @@
-"""The guided procedures, on the emulator and with a scripted person; and on hebi-py's own files of settings."""
+"""The guided procedures, on the emulator and with a scripted person."""
 
 import math
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 
 from pendulum_hw_bridge import guided, lab_cli
-from pendulum_hw_bridge.actuator import ActuatorError, Command, HardwareLimits, MStopAction, Strategy
-from pendulum_hw_bridge.backends import hebi as backend_module
+from pendulum_hw_bridge.actuator import ActuatorError, Command, HardwareLimits, Strategy
 from pendulum_hw_bridge.backends.emulator import EmulatorBackend
 from pendulum_hw_bridge.clocks import SteppedClock
 from pendulum_hw_bridge.emulation.faults import ActuatorFault
 from pendulum_hw_bridge.emulation.parameters import load_emulator
 from pendulum_hw_bridge.emulation.x5 import EmulatedX5
-from pendulum_hw_bridge.module_files import backup_emulator, backup_group, restore_emulator, restore_group
 from pendulum_hw_bridge.nudge import EmulatedHand, Person, watch_nudge
 from pendulum_hw_bridge.settings import BridgeSettings
-from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.plants.lab_file import load_lab
 
 
@@ -267,6 +263,48 @@ def test_lost_feedback_ends_a_proof_with_the_motor_off() -> None:
     assert rig.actuator.strategy is Strategy.OFF
 
 
+@pytest.mark.parametrize("begun", [0.0, 3.0])
+def test_a_module_that_goes_while_somebody_waits_for_it_is_missed_within_two_seconds(begun: float) -> None:
+    def lost(procedure: Any) -> float:
+        rig = Rig()
+        read, start_ns = rig.port.read, rig.port.now_ns()
+
+        def going(timeout: float) -> Any:
+            if rig.port.now_ns() - start_ns > begun * 1e9:
+                rig.actuator.inject(ActuatorFault.FEEDBACK_LOST)
+            return read(timeout)
+
+        rig.port.read = going  # type: ignore[method-assign]
+        with pytest.raises(ActuatorError, match=r"no feedback for 1 s; expected it to flow"):
+            procedure(rig)
+        return (rig.port.now_ns() - start_ns) / 1e9 - begun
+
+    still = EmulatedHand(lambda torque: None)
+    for procedure in (
+        lambda rig: guided.find_zero_and_sign(rig.port, rig, still, still),
+        lambda rig: guided.measure_tare(rig.port, BridgeSettings(), rig.parameters.plant, rig),
+        lambda rig: watch_nudge(rig.port, still),
+    ):
+        # Half a second goes by until the person agrees.
+        assert lost(procedure) < 2.0
+
+
+def test_a_module_that_goes_while_the_duty_should_end_is_not_said_to_have_kept_it(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    rig, drive = Rig(), guided._drive
+
+    def then_gone(*arguments: Any) -> int:
+        last_ns = drive(*arguments)
+        rig.actuator.inject(ActuatorFault.FEEDBACK_LOST)
+        return last_ns
+
+    monkeypatch.setattr(guided, "_drive", then_gone)
+    with pytest.raises(ActuatorError, match=r"no feedback for 0\.. s; expected to see the duty end"):
+        guided.prove_lifetime(rig.port, BridgeSettings(), rig)
+    assert rig.actuator.strategy is Strategy.OFF
+
+
 @pytest.mark.parametrize(
     ("fault", "what"), [(ActuatorFault.POSITION_NAN, "position"), (ActuatorFault.EFFORT_NAN, "effort")]
 )
@@ -292,74 +330,6 @@ def test_a_person_is_told_that_a_turn_was_seen_only_where_it_was() -> None:
     rig.port.push(6.0)
     assert watch_nudge(rig.port, Person(said.append)) > 0.0
     assert "Seen" in said[-1]
-
-
-# --- settings of a module, kept and given back ------------------------------------------------------------------
-
-
-def test_what_an_emulator_was_set_to_is_given_back(tmp_path: Path) -> None:
-    rig = Rig()
-    before = rig.port.connect()
-    backup_emulator(rig.port, tmp_path / "before")
-    rig.port.set_limits(BridgeSettings().limits.__class__(effort=1.0, m_stop=MStopAction.HOLD_POSITION))
-    assert rig.port.connect().limits != before.limits
-    restore_emulator(rig.port, tmp_path / "before")
-    assert rig.port.connect().limits == before.limits
-    assert rig.port.connect().gains == before.gains
-    with pytest.raises(ParameterError, match="is there already; expected a new folder"):
-        backup_emulator(rig.port, tmp_path / "before")
-
-
-class Module:
-    """A group whose module keeps what hebi-py's own command objects say, and tells it through hebi-py's own files."""
-
-    def __init__(self, hebi: Any) -> None:
-        self._hebi = hebi
-        self.state = hebi.GroupCommand(1)
-        self.keeps = self.answers = True
-        self.sent_setpoints = False
-
-    def request_info(self, timeout_ms: int) -> Any:
-        return self.state if self.answers else None
-
-    def send_command_with_acknowledgement(self, command: Any, timeout_ms: int) -> bool:
-        self.sent_setpoints |= bool(np.isfinite([command.position[0], command.velocity[0], command.effort[0]]).any())
-        if self.keeps:
-            for name in ("position_kp", "velocity_kp", "effort_kp", "effort_limit_max", "effort_limit_min"):
-                value = float(getattr(command, name)[0])
-                if not math.isnan(value):
-                    setattr(self.state, name, value)
-            if command.mstop_strategy[0]:
-                self.state.mstop_strategy = ["Disabled", "MotorOff", "HoldPosition"][int(command.mstop_strategy[0])]
-        return True
-
-
-def test_gains_safety_parameters_and_m_stop_action_of_a_module_are_given_back(tmp_path: Path) -> None:
-    hebi = pytest.importorskip("hebi", reason="hebi-py is not installed")
-    module = Module(hebi)
-    module.state.position_kp, module.state.effort_limit_max, module.state.effort_limit_min = 2.5, 7.0, -7.0
-    module.state.mstop_strategy = "HoldPosition"
-    gains, safety, _ = backup_group(module, tmp_path / "before")
-    assert "<kp>2.5" in gains.read_text()
-    assert "motor_hold" in safety.read_text()
-    module.state.position_kp, module.state.effort_limit_max = 1.5, 1.0
-    module.state.mstop_strategy = "MotorOff"
-    restore_group(module, tmp_path / "before", backend_module.new_command)
-    assert module.state.position_kp[0] == 2.5
-    assert module.state.effort_limit_max[0] == 7.0
-    assert int(module.state.mstop_strategy[0]) == 2
-    assert not module.sent_setpoints
-
-    module.state.position_kp = 1.5
-    module.keeps = False
-    with pytest.raises(ActuatorError, match=r"reads back other values than those of .*gains.xml"):
-        restore_group(module, tmp_path / "before", backend_module.new_command)
-    module.answers = False
-    with pytest.raises(ActuatorError, match="did not tell its settings"):
-        backup_group(module, tmp_path / "other")
-    (tmp_path / "before" / "safety.xml").unlink()
-    with pytest.raises(ParameterError, match=r"safety.xml does not exist"):
-        restore_group(module, tmp_path / "before", backend_module.new_command)
 
 
 # --- command line -----------------------------------------------------------------------------------------------
@@ -416,3 +386,33 @@ def test_a_step_that_fails_or_is_left_keeps_the_lab_file_as_it_was(
     assert "a person is needed" in capsys.readouterr().err
     assert lab.read_text() == before
     assert not rig.driven_before_agreed
+
+
+@pytest.mark.parametrize("way", ["done", "failed", "left", "not connected"])
+def test_the_module_is_let_go_of_on_every_way_out_of_a_step(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, way: str
+) -> None:
+    lab = tmp_path / "lab.yaml"
+    lab.write_text("format: pendulum_lab/1\nmodule: {backend: emulator}\n")
+    rig, closed = Rig(), list[Strategy]()
+    close = rig.port.close
+
+    def noted() -> None:
+        close()
+        closed.append(rig.actuator.strategy)
+
+    def break_off(*_: object, **__: object) -> Any:
+        raise KeyboardInterrupt if way == "left" else ActuatorError("module_lost", "no answer")
+
+    monkeypatch.setattr(rig.port, "close", noted)
+    monkeypatch.setattr("pendulum_hw_bridge.bridge_parameters.make_port", lambda *_, **__: rig.port)
+    if way == "not connected":
+        monkeypatch.setattr(rig.port, "connect", break_off)
+    elif way != "done":
+        # In the middle of it: the motor has a strategy then, and nothing but the way out switches it off.
+        monkeypatch.setattr(guided, "_drive", break_off)
+        monkeypatch.setattr(rig.port, "stop", lambda: None)
+        rig.port.set_strategy(Strategy.DIRECT_PWM, Command(pwm=0.0))
+        monkeypatch.setattr(rig.port, "close", lambda: (EmulatorBackend.stop(rig.port), noted()))
+    assert lab_cli.main(["prove_lifetime", str(lab), "--yes"]) == {"done": 0, "left": 130}.get(way, 2)
+    assert closed == [Strategy.OFF]

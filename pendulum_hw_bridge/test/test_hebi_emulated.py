@@ -107,12 +107,12 @@ def test_open_position_limits_are_given_back(served: Served, tmp_path: Path) -> 
     assert served.actuator.limits.position_max == math.inf
     backup_group(group, tmp_path / "before")
     served.actuator.configure(limits=HardwareLimits(effort=1.0, position_min=-4.0, position_max=4.0))
-    restore_group(group, tmp_path / "before", backend_module.new_command)
+    restore_group(group, tmp_path / "before", backend_module.new_command, print)
     assert (served.actuator.limits.position_min, served.actuator.limits.position_max) == (-math.inf, math.inf)
     safety = tmp_path / "before" / "safety.xml"
     safety.write_text(safety.read_text().replace("-inf", "-nan"))
     with pytest.raises(ParameterError, match="min_limit of the position is no number"):
-        restore_group(group, tmp_path / "before", backend_module.new_command)
+        restore_group(group, tmp_path / "before", backend_module.new_command, print)
 
 
 class TwoEnds(EmulatedGroup):
@@ -136,7 +136,7 @@ def test_what_a_module_does_at_either_end_of_its_limits_is_given_back(served: Se
     group = TwoEnds(served.where, hebi)
     backup_group(group, tmp_path / "before")
     group.ends = 2, 2
-    restore_group(group, tmp_path / "before", backend_module.new_command)
+    restore_group(group, tmp_path / "before", backend_module.new_command, print)
     assert group.ends == (2, 1)
 
 

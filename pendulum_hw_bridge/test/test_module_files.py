@@ -1,0 +1,136 @@
+"""What a module was set to is kept in files and given back: emulators, and hebi-py's own commands and files."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from pendulum_hw_bridge.actuator import ActuatorError, MStopAction
+from pendulum_hw_bridge.backends import hebi as backend_module
+from pendulum_hw_bridge.backends.emulator import EmulatorBackend
+from pendulum_hw_bridge.clocks import SteppedClock
+from pendulum_hw_bridge.emulation.parameters import load_emulator
+from pendulum_hw_bridge.emulation.x5 import EmulatedX5
+from pendulum_hw_bridge.module_files import backup_emulator, backup_group, restore_emulator, restore_group
+from pendulum_hw_bridge.settings import BridgeSettings
+from pendulum_msgs_py.errors import ParameterError
+
+
+def emulator() -> EmulatorBackend:
+    port = EmulatorBackend(EmulatedX5(load_emulator("thesis"), seed=3), SteppedClock())
+    port.connect()
+    return port
+
+
+def test_what_an_emulator_was_set_to_is_given_back(tmp_path: Path) -> None:
+    port, said = emulator(), list[str]()
+    before = port.connect()
+    backup_emulator(port, tmp_path / "before")
+    port.set_limits(BridgeSettings().limits.__class__(effort=1.0, m_stop=MStopAction.HOLD_POSITION))
+    assert port.connect().limits != before.limits
+    restore_emulator(port, tmp_path / "before", said.append)
+    assert port.connect().limits == before.limits
+    assert port.connect().gains == before.gains
+    with pytest.raises(ParameterError, match="is there already; expected a new folder"):
+        backup_emulator(port, tmp_path / "before")
+
+
+class Module:
+    """A group whose module keeps what hebi-py's own command objects say, and tells it through hebi-py's own files."""
+
+    def __init__(self, hebi: Any) -> None:
+        self._hebi = hebi
+        self.state = hebi.GroupCommand(1)
+        self.keeps = self.answers = True
+        self.sent_setpoints = False
+
+    def request_info(self, timeout_ms: int) -> Any:
+        return self.state if self.answers else None
+
+    def send_command_with_acknowledgement(self, command: Any, timeout_ms: int) -> bool:
+        self.sent_setpoints |= bool(np.isfinite([command.position[0], command.velocity[0], command.effort[0]]).any())
+        if self.keeps:
+            for name in ("position_kp", "velocity_kp", "effort_kp", "effort_limit_max", "effort_limit_min"):
+                value = float(getattr(command, name)[0])
+                if not math.isnan(value):
+                    setattr(self.state, name, value)
+            if command.mstop_strategy[0]:
+                self.state.mstop_strategy = ["Disabled", "MotorOff", "HoldPosition"][int(command.mstop_strategy[0])]
+        return True
+
+
+def test_gains_safety_parameters_and_m_stop_action_of_a_module_are_given_back(tmp_path: Path) -> None:
+    hebi = pytest.importorskip("hebi", reason="hebi-py is not installed")
+    module = Module(hebi)
+    said: list[str] = []
+    module.state.position_kp, module.state.effort_limit_max, module.state.effort_limit_min = 2.5, 7.0, -7.0
+    module.state.mstop_strategy = "HoldPosition"
+    gains, safety, _ = backup_group(module, tmp_path / "before")
+    assert "<kp>2.5" in gains.read_text()
+    assert "motor_hold" in safety.read_text()
+    module.state.position_kp, module.state.effort_limit_max = 1.5, 1.0
+    module.state.mstop_strategy = "MotorOff"
+    restore_group(module, tmp_path / "before", backend_module.new_command, said.append)
+    assert module.state.position_kp[0] == 2.5
+    assert module.state.effort_limit_max[0] == 7.0
+    assert int(module.state.mstop_strategy[0]) == 2
+    assert not module.sent_setpoints
+    assert said == []
+
+    module.state.position_kp = 1.5
+    module.keeps = False
+    with pytest.raises(ActuatorError, match=r"reads back other values than those of .*gains.xml"):
+        restore_group(module, tmp_path / "before", backend_module.new_command, said.append)
+    module.answers = False
+    with pytest.raises(ActuatorError, match="did not tell its settings"):
+        backup_group(module, tmp_path / "other")
+    (tmp_path / "before" / "safety.xml").unlink()
+    with pytest.raises(ParameterError, match=r"safety.xml does not exist"):
+        restore_group(module, tmp_path / "before", backend_module.new_command, said.append)
+
+
+@pytest.mark.parametrize("error", [KeyboardInterrupt, ActuatorError("module_lost", "no answer")])
+def test_a_restore_that_is_broken_off_between_its_writes_says_that_half_of_it_may_be_in_force(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, error: BaseException
+) -> None:
+    port, words = emulator(), list[str]()
+    backup_emulator(port, tmp_path / "before")
+
+    def break_off(_: object) -> Any:
+        raise error
+
+    monkeypatch.setattr(port, "set_limits", break_off)
+    with pytest.raises((KeyboardInterrupt, ActuatorError)):
+        restore_emulator(port, tmp_path / "before", words.append)
+    assert words[-1].startswith("Broken off: the module may hold some settings of ")
+    assert "restore again" in words[-1]
+
+    hebi = pytest.importorskip("hebi", reason="hebi-py is not installed")
+    module, said, sent = Module(hebi), list[str](), list[Any]()
+    backup_group(module, tmp_path / "module")
+
+    def second_breaks_off(command: Any, timeout_ms: int) -> bool:
+        sent.append(command)
+        if len(sent) == 2:
+            raise error
+        return True
+
+    module.send_command_with_acknowledgement = second_breaks_off  # type: ignore[method-assign]
+    with pytest.raises((KeyboardInterrupt, ActuatorError)):
+        restore_group(module, tmp_path / "module", backend_module.new_command, said.append)
+    assert said[-1].startswith("Broken off: the module may hold")
+
+
+def test_a_backup_of_which_one_file_cannot_be_read_is_sent_to_no_module(tmp_path: Path) -> None:
+    hebi = pytest.importorskip("hebi", reason="hebi-py is not installed")
+    module, said, sent = Module(hebi), list[str](), list[Any]()
+    _, safety, _ = backup_group(module, tmp_path / "before")
+    safety.write_text("<safety_params", encoding="utf-8")
+    module.send_command_with_acknowledgement = lambda command, timeout_ms: sent.append(command)  # type: ignore[assignment,func-returns-value]
+    with pytest.raises(ParameterError, match=r"safety.xml is not understood"):
+        restore_group(module, tmp_path / "before", backend_module.new_command, said.append)
+    assert (sent, said) == ([], [])
