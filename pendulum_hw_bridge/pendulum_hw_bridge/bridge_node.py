@@ -23,13 +23,12 @@ from pendulum_hw_bridge.bridge_consistency import check_consistency
 from pendulum_hw_bridge.clocks import Clock, SteppedClock, WallClock
 from pendulum_hw_bridge.derating import Derating
 from pendulum_hw_bridge.e_stop_input_node import EStopInputServer
-from pendulum_hw_bridge.e_stop_node import EStopServer
 from pendulum_hw_bridge.feedback_message import encode_feedback
 from pendulum_hw_bridge.lab_node import with_lab_file
 from pendulum_hw_bridge.node_specs import SPECS
 from pendulum_hw_bridge.safety import SafetyMonitor
-from pendulum_hw_bridge.shared_supervisor import SharedSupervisor
 from pendulum_msgs_py.contract.plant_specs import LOCKSTEP_EPOCH_NS, limits_from_parameters
+from pendulum_msgs_py.contract.shared_supervisor import SharedSupervisor
 from pendulum_msgs_py.contract.supervisor import Drive, DriveKind, Input, Mode
 from pendulum_msgs_py.contract.timing import LoopStatistics
 from pendulum_msgs_py.contract.values import NANOSECONDS, JointCommand, JointSample
@@ -110,7 +109,6 @@ class BridgeNode(LifecycleNode, PollingNode):
             if self._lockstep
             else self._port_clock.now_ns,
             push=values["backend"] in EMULATED_BACKENDS,
-            e_stop=False,
             statistics=None if self._lockstep else self._statistics,
             more_diagnostics=self._diagnostics,
             on_command=self._on_command,
@@ -144,21 +142,15 @@ class BridgeNode(LifecycleNode, PollingNode):
         )
         self._safety = bridge_parameters.safety_limits(values, limits.effort)
         self._derating = Derating(values["derating_temperature"], values["winding_temperature_limit"])
-        self._e_stop = EStopServer(self, self._latch)
         if values["e_stop_input_timeout"] > 0.0:
             self._e_stop_input = EStopInputServer(
                 self,
                 values["e_stop_input_timeout"],
-                self._latch,
+                self._interface.e_stop,
                 lambda: self._supervisor.mode is Mode.E_STOP,
             )
         if values["autostart"]:
-            try:
-                self._autostart()
-            except BaseException:
-                # A node that was not made is not closed either, and a thread that spins ends no process cleanly.
-                self._close_e_stops()
-                raise
+            self._autostart()
 
     def close(self) -> None:
         """Disarm, effort zero, strategy off; a last zero torque is published, so that a recording shows it."""
@@ -166,13 +158,7 @@ class BridgeNode(LifecycleNode, PollingNode):
         self._interface.safe_stop("bridge ends")
         self.release_actuator()
         self._interface.publish_applied(stamp_ns, 0.0)
-        self._close_e_stops()
-
-    def _latch(self, reason: str) -> None:
-        self._supervisor.e_stop(self._interface.clock(), reason)
-
-    def _close_e_stops(self) -> None:
-        self._e_stop.close()
+        self._interface.close()
         if self._e_stop_input is not None:
             self._e_stop_input.close()
 

@@ -11,8 +11,8 @@ from rclpy.qos import QoSProfile, ReliabilityPolicy
 from std_msgs.msg import Bool
 
 from pendulum_hw_bridge.e_stop_input import EStopInput
-from pendulum_hw_bridge.e_stop_thread_node import EStopThread
 from pendulum_msgs_py.contract import names
+from pendulum_msgs_py.ros.e_stop_thread import EStopThread
 
 __all__ = ["EStopInputServer"]
 

@@ -18,7 +18,7 @@ from pendulum_hw_bridge.emulation.x5 import EmulatedX5
 from pendulum_hw_bridge.gains import DEFAULT_GAINS
 from pendulum_hw_bridge.safety import SafetyLimits, SafetyMonitor
 from pendulum_hw_bridge.settings import BridgeSettings
-from pendulum_hw_bridge.shared_supervisor import SharedSupervisor
+from pendulum_msgs_py.contract.shared_supervisor import SharedSupervisor
 from pendulum_msgs_py.contract.supervisor import Drive, Input, Mode, PlantLimits
 from pendulum_msgs_py.contract.timing import LoopStatistics
 from pendulum_msgs_py.contract.values import JointCommand, JointSample

@@ -16,8 +16,8 @@ from pendulum_hw_bridge.gains import DEFAULT_GAINS
 from pendulum_hw_bridge.motor_state import MotorState
 from pendulum_hw_bridge.safety import SafetyLimits, SafetyMonitor
 from pendulum_hw_bridge.settings import BridgeSettings
-from pendulum_hw_bridge.shared_supervisor import SharedSupervisor
 from pendulum_msgs_py.contract.angles import UPRIGHT, from_upright
+from pendulum_msgs_py.contract.shared_supervisor import SharedSupervisor
 from pendulum_msgs_py.contract.supervisor import Input, Mode, PlantLimits
 from pendulum_msgs_py.contract.trajectory import Trajectory, TrajectoryPoint, thesis_ramp
 from pendulum_msgs_py.contract.values import JointCommand

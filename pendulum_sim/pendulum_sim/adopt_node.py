@@ -16,7 +16,8 @@ from std_msgs.msg import Float64MultiArray
 from pendulum_msgs_py.contract.angles import wrap
 from pendulum_msgs_py.contract.names import JOINT
 from pendulum_msgs_py.contract.plant_specs import LIMIT_SPECS, limits_from_parameters
-from pendulum_msgs_py.contract.supervisor import Drive, DriveKind, PlantSupervisor
+from pendulum_msgs_py.contract.shared_supervisor import SharedSupervisor
+from pendulum_msgs_py.contract.supervisor import Drive, DriveKind
 from pendulum_msgs_py.contract.timing import SteadyWallClock, Throttle
 from pendulum_msgs_py.contract.values import NANOSECONDS, JointSample
 from pendulum_msgs_py.errors import ParameterError
@@ -99,7 +100,7 @@ class AdoptNode(PollingNode):
             feedback_timeout=values["state_timeout"],
             least_command_timeout=_LATENESS * values["period"],
         )
-        self._supervisor = PlantSupervisor(limits, preflight=self._preflight)
+        self._supervisor = SharedSupervisor(limits, self._preflight)
         self._odd: Counter[str] = Counter()
         self._lines = Throttle(1.0)
         self._applied = 0.0
@@ -124,6 +125,7 @@ class AdoptNode(PollingNode):
             time.sleep(0.01)
         if self._interface.sample is not None:
             self._interface.publish_applied(self._interface.sample.stamp_ns, 0.0)
+        self._interface.close()
 
     def _on_state(self, data: bytes) -> None:
         now_ns = self._clock_ns()

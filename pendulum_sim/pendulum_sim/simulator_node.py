@@ -16,7 +16,8 @@ from std_srvs.srv import SetBool, Trigger
 
 from pendulum_msgs_py.contract.names import JOINT
 from pendulum_msgs_py.contract.plant_specs import LIMIT_SPECS, LOCKSTEP_EPOCH_NS, LOOP_SPECS, limits_from_parameters
-from pendulum_msgs_py.contract.supervisor import Drive, DriveKind, Input, Mode, PlantSupervisor
+from pendulum_msgs_py.contract.shared_supervisor import SharedSupervisor
+from pendulum_msgs_py.contract.supervisor import Drive, DriveKind, Input, Mode
 from pendulum_msgs_py.contract.timing import LoopStatistics, SteadyWallClock
 from pendulum_msgs_py.contract.values import NANOSECONDS, JointCommand, JointSample
 from pendulum_msgs_py.errors import FaultError, ParameterError
@@ -92,7 +93,7 @@ class SimulatorNode(PollingNode):
         # Where a file's timestep makes periods as long as that, each command would be too old when it is applied.
         least = _LEAST_PERIODS * self._dt
         limits = limits_from_parameters(values, parameters.effort_limit, least_command_timeout=least)
-        self._supervisor = PlantSupervisor(limits, preflight=self._preflight)
+        self._supervisor = SharedSupervisor(limits, self._preflight)
         self._lockstep = values["clock"] == "lockstep"
         self._wall = wall = SteadyWallClock()
         self._pace = PaceWatch(self._dt) if engine.foreign and not self._lockstep else None
@@ -100,10 +101,11 @@ class SimulatorNode(PollingNode):
         if engine.foreign:
             self._stall = StallWatch(values["step_timeout"], self._end_stalled)
         self._state: PlantState = self._plant.state
+        self._loop: Any = None
         self._interface = PlantInterface(
             self,
             self._supervisor,
-            (lambda: self._loop.now_ns) if self._lockstep else wall,
+            (lambda: self._loop.now_ns if self._loop else LOCKSTEP_EPOCH_NS) if self._lockstep else wall,
             polled=not self._lockstep,
             statistics=None if self._lockstep else self._statistics,
             more_diagnostics=self._diagnostics,
@@ -111,7 +113,7 @@ class SimulatorNode(PollingNode):
         )
         self._interface.hardware_id = f"simulated {parameters.name}"
         if self._lockstep:
-            self._loop: Any = LockstepLoop(
+            self._loop = LockstepLoop(
                 self._interface,
                 self._advance,
                 period_ns,
@@ -143,6 +145,7 @@ class SimulatorNode(PollingNode):
         """Stop the plant: a last zero torque is published, so that a recording shows it."""
         self._interface.safe_stop("simulator ends")
         self._interface.publish_applied(self._stamp_ns, 0.0)
+        self._interface.close()
 
     # --- the loop ------------------------------------------------------------------------------------------
 

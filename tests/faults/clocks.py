@@ -29,6 +29,7 @@ from pendulum_lqr.disturbing import DisturbanceLoop
 from pendulum_msgs_py.contract import names
 from pendulum_msgs_py.contract.angles import UPRIGHT, from_upright
 from pendulum_msgs_py.contract.plant_specs import LIMIT_SPECS, LOCKSTEP_EPOCH_NS, limits_from_parameters
+from pendulum_msgs_py.contract.shared_supervisor import SharedSupervisor
 from pendulum_msgs_py.contract.supervisor import Drive, Input, PlantSupervisor
 from pendulum_msgs_py.contract.values import NANOSECONDS, JointCommand, JointSample
 from pendulum_msgs_py.errors import FaultError
@@ -193,7 +194,7 @@ def simulate_hours(hours: float, rate_hz: float = 50.0) -> Outcome:
     node = PollingNode("day", context=context, namespace="/day", start_parameter_services=False)
     try:
         parameters = load_plant("thesis")
-        supervisor = PlantSupervisor(limits_from_parameters(dict(validate(LIMIT_SPECS, {})), parameters.effort_limit))
+        supervisor = SharedSupervisor(limits_from_parameters(dict(validate(LIMIT_SPECS, {})), parameters.effort_limit))
         plant = make_plant(parameters, period_ns / NANOSECONDS)
         plant.reset(UPRIGHT, 0.0)
         positions = np.empty(steps)
@@ -226,6 +227,7 @@ def simulate_hours(hours: float, rate_hz: float = 50.0) -> Outcome:
             measured = interface.sample
             assert measured is not None
             positions[index] = measured.position
+        interface.close()
     finally:
         node.destroy_node()
         rclpy.try_shutdown(context=context)

@@ -95,7 +95,7 @@ class NodeRig(Rig):
         self._ask_to_arm(False)
 
     def e_stop(self) -> None:
-        self.node._e_stop._on_e_stop(Trigger.Request(), Trigger.Response())
+        self.node._interface._e_stop._on_e_stop(Trigger.Request(), Trigger.Response())
 
     def close(self) -> None:
         self.node.close()

@@ -52,10 +52,21 @@ def _press(load: Load) -> Callable[[LiveSystem, random.Random], Outcome]:
         for each in (client, reset):
             node.destroy_client(each)
         if not system.plant.has_module:
-            system.arm()
+            _arm_upright(system)
         return outcome
 
     return act
+
+
+def _arm_upright(system: LiveSystem) -> None:
+    """Put a simulated pendulum upright and arm it: it has fallen, and no plant is armed into full torque."""
+    client = system.conductor.node.create_client(Trigger, system.service("~/reset"))
+
+    def armed() -> bool:
+        return system.conductor.call(client, Trigger.Request(), "the reset").success and not system.arm()
+
+    system.wait_for("the simulator to be armed upright", armed, START_TIMEOUT)
+    system.conductor.node.destroy_client(client)
 
 
 def _answer_time(system: LiveSystem, client: Client) -> float:

@@ -97,7 +97,7 @@ def test_nodes_do_what_the_policy_allows_and_nothing_else(tmp_path: Path, monkey
             conductor.wait_for("the console to see both plants", lambda: set(hub.plants()) == set(PLANTS), 20.0)
             asyncio.run(_drive(hub))
             here = {program.full_name for program in programs}
-            here |= {"/hw/recorder", "/conductor", "/console", "/hw/bridge_e_stop"}
+            here |= {"/hw/recorder", "/conductor", "/console", "/hw/bridge_e_stop", "/sim/simulator_e_stop"}
             # Services of nodes that are not there, and of a trial that is not begun here.
             absent = {"/sim/recorder/status", "/hw/procedure/start", "/sim/joint_commands"}
             found: dict[str, tuple[Any, Any]] = {}
@@ -132,7 +132,7 @@ def test_the_policy_is_what_sros_2_reads_and_gives_each_process_an_enclave() -> 
     profiles = {f"{profile.get('ns').rstrip('/')}/{profile.get('node')}" for profile in root.iter("profile")}  # type: ignore[union-attr]
     assert profiles == set(granted())
     # Each node is a process, but for the e-stop's, which must not wait for another process to be there.
-    assert len(enclaves()) == len(granted()) - 2
+    assert len(enclaves()) == len(granted()) - 3
     assert enclaves()["/hw/bridge"].keys() == {"/hw/bridge", "/hw/bridge_e_stop", "/hw/bridge_e_stop_input"}
     assert "/hw/e_stop_input" in granted()["/hw/bridge_e_stop_input"].subscribe
     assert "/hw/bridge/e_stop" in granted()["/hw/bridge_e_stop"].reply

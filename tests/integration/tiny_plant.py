@@ -10,7 +10,8 @@ import time
 from collections.abc import Callable
 
 from pendulum_msgs_py.contract.plant_specs import LIMIT_SPECS, limits_from_parameters
-from pendulum_msgs_py.contract.supervisor import DriveKind, PlantSupervisor
+from pendulum_msgs_py.contract.shared_supervisor import SharedSupervisor
+from pendulum_msgs_py.contract.supervisor import DriveKind
 from pendulum_msgs_py.contract.timing import SteadyWallClock
 from pendulum_msgs_py.contract.values import JointSample
 from pendulum_msgs_py.parameters import ParameterSpec
@@ -37,7 +38,7 @@ class TinyPlant(PollingNode):
         super().__init__("tiny_plant")
         self.parameters = NodeParameters(self, SPECS, self._prepare)
         self.clock = SteadyWallClock()
-        self.supervisor = PlantSupervisor(limits_from_parameters(self.parameters.values, 5.0))
+        self.supervisor = SharedSupervisor(limits_from_parameters(self.parameters.values, 5.0))
         self.interface = PlantInterface(self, self.supervisor, self.clock)
         self.position = self.velocity = 0.0
         self.stop = stop
@@ -48,6 +49,7 @@ class TinyPlant(PollingNode):
         time.sleep(self.parameters["stubborn"])
         self.interface.safe_stop("plant ends")
         self.interface.publish_applied(self.clock(), 0.0)
+        self.interface.close()
         print("closed", flush=True)
 
     @staticmethod

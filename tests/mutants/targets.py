@@ -48,7 +48,7 @@ TARGETS: tuple[Target, ...] = (
         (f"{_BRIDGE}/test_settings_read_back.py",),
     ),
     Target(
-        "pendulum_hw_bridge.shared_supervisor",
+        "pendulum_msgs_py.contract.shared_supervisor",
         ("SharedSupervisor",),
         (f"{_BRIDGE}/test_settings_read_back.py", f"{_BRIDGE}/test_bridge_states.py"),
     ),

@@ -42,7 +42,7 @@ _EVERY_PUBLISHER = (*_SILENT_PUBLISHER, "/rosout")
 _EVERY_SUBSCRIPTION = (names.CLOCK, "/parameter_events")
 _PLANT_SUBSCRIPTIONS = (names.EFFORT_COMMAND, names.DISTURBANCE, names.PUSH, names.JOINT_TRAJECTORY)
 _PLANT_PUBLISHERS = (names.JOINT_STATES, names.APPLIED_EFFORT, names.EVENTS, names.DIAGNOSTICS)
-_PLANT_SERVICES = (names.ARM, names.E_STOP, names.E_STOP_RESET)
+_PLANT_SERVICES = (names.ARM, names.E_STOP_RESET)
 
 
 _PLANT = "{plant}/"
@@ -91,6 +91,7 @@ NODES: dict[str, Permissions] = {
         subscribe=(*_PLANT_SUBSCRIPTIONS, "~/set_state"),
         reply=(*_PLANT_SERVICES, "~/reset", "~/pause", "~/step", *_LOGGER),
     ),
+    "simulator_e_stop": Permissions(reply=(_PLANT + "e_stop",)),
     "bridge": Permissions(
         publish=(
             *_PLANT_PUBLISHERS,
@@ -101,7 +102,7 @@ NODES: dict[str, Permissions] = {
             "~/transition_event",
         ),
         subscribe=_PLANT_SUBSCRIPTIONS,
-        reply=(names.ARM, names.E_STOP_RESET, *_LIFECYCLE, *_LOGGER),
+        reply=(*_PLANT_SERVICES, *_LIFECYCLE, *_LOGGER),
     ),
     "bridge_e_stop": Permissions(reply=(_PLANT + "e_stop",)),
     "bridge_e_stop_input": Permissions(subscribe=(names.E_STOP_INPUT,)),
@@ -171,9 +172,12 @@ BESIDE_PLANTS = {"conductor": "/conductor", "console": "/console", "recorder": "
 """Nodes that have to do with all sides, in the root namespace, and the enclave of each: that of its process."""
 
 _SIDE_NODES = ("controller", "effort_controller", "disturbance", "recorder", "viewer", "markers")
-_IN_PROCESS = {"bridge_e_stop": "bridge", "bridge_e_stop_input": "bridge"}
+_IN_PROCESS = {"simulator_e_stop": "simulator", "bridge_e_stop": "bridge", "bridge_e_stop_input": "bridge"}
 """Nodes that run in the process of another, whose enclave is theirs too; they have no log of their own."""
-_WITH_PLANT = {"bridge": ("procedure", *_IN_PROCESS)}
+_WITH_PLANT = {
+    "simulator": ("simulator_e_stop",),
+    "bridge": ("procedure", "bridge_e_stop", "bridge_e_stop_input"),
+}
 _WITHOUT_PARAMETERS = {"conductor", *_IN_PROCESS}
 
 

@@ -5,6 +5,7 @@ A plant (simulator, bridge) owns its clock and its loop; it asks ``decide`` what
 
 from __future__ import annotations
 
+import threading
 import time
 from collections import Counter
 from collections.abc import Callable, Mapping
@@ -21,7 +22,8 @@ from pendulum_msgs_py.contract.cdr import encode_joint_state
 from pendulum_msgs_py.contract.cdr_trajectory import decode_joint_trajectory
 from pendulum_msgs_py.contract.commands import Refusal
 from pendulum_msgs_py.contract.names import Event
-from pendulum_msgs_py.contract.supervisor import Drive, Input, Mode, PlantSupervisor
+from pendulum_msgs_py.contract.shared_supervisor import SharedSupervisor
+from pendulum_msgs_py.contract.supervisor import Drive, Input, Mode
 from pendulum_msgs_py.contract.timing import LoopStatistics, Throttle
 from pendulum_msgs_py.contract.values import NANOSECONDS, JointCommand, JointSample
 from pendulum_msgs_py.errors import ParameterError
@@ -33,6 +35,7 @@ from pendulum_msgs_py.ros.convert import (
     problem_of_command,
 )
 from pendulum_msgs_py.ros.diagnostics import DIAGNOSTICS_PERIOD, Diagnostics
+from pendulum_msgs_py.ros.e_stop import EStopServer
 from pendulum_msgs_py.ros.polled import PolledInput, PollingNode
 from pendulum_msgs_py.ros.timers import create_wall_timer
 
@@ -42,8 +45,8 @@ _LEAST_BETWEEN_LINES = 1.0
 """Time between two lines of the log about one mode [s]."""
 _WAITED_NS = 10 * NANOSECONDS
 """Longest time for which a message may wait while a plant arms [ns]; more is a system clock that was set back."""
-_LOOK_FOR_TRAJECTORY = 0.02
-"""Time between two looks for a trajectory [s]: whoever sends without pause has the newest read then, and no other."""
+_LOOK = 0.02
+"""Time between two looks for a press or a trajectory [s]; of trajectories without pause the newest is read then."""
 _REST_AFTER_TRAJECTORY = 4.0
 """Time without a look after a trajectory was read, in the time that it took the processor: a fifth of it at most."""
 TRAJECTORY_AGE_LIMIT = 1.0
@@ -60,9 +63,8 @@ class PlantInterface:
     Args:
         node: The plant's node.
         supervisor: Its rules and state.
-        clock: The plant's time [ns]: wall clock or simulated.
+        clock: The plant's time [ns]: wall clock or simulated; asked by the thread of the e-stop too, from the start.
         push: Whether the plant can take a torque on the link itself.
-        e_stop: Whether the e-stop is served here; else the plant serves it, on a path that nothing else can block.
         polled: Whether torque inputs wait for :meth:`take_inputs` instead of waking the node.
         statistics: The loop's figures, shown in diagnostics.
         more_diagnostics: Further key-value pairs for diagnostics.
@@ -78,11 +80,10 @@ class PlantInterface:
     def __init__(
         self,
         node: PollingNode,
-        supervisor: PlantSupervisor,
+        supervisor: SharedSupervisor,
         clock: Callable[[], int],
         *,
         push: bool = True,
-        e_stop: bool = True,
         polled: bool = False,
         statistics: LoopStatistics | None = None,
         more_diagnostics: Callable[[], Mapping[str, object]] = dict,
@@ -126,13 +127,13 @@ class PlantInterface:
                 )
         self._trajectories = node.create_polled_input(JointTrajectory, names.JOINT_TRAJECTORY, qos.TRAJECTORY)
         self._next_trajectory = 0.0
-        create_wall_timer(node, _LOOK_FOR_TRAJECTORY, self._look_for_trajectory)
+        create_wall_timer(node, _LOOK, self._on_look)
         node.create_service(SetBool, names.ARM, self._on_arm)
-        if e_stop:
-            node.create_service(Trigger, names.E_STOP, self._on_e_stop)
         node.create_service(Trigger, names.E_STOP_RESET, self._on_e_stop_reset)
         # Steady time: it must go on where simulated time stands still, or where the system clock is set back.
         create_wall_timer(node, DIAGNOSTICS_PERIOD, self._on_housekeeping)
+        self._pressed = threading.Event()
+        self._e_stop = EStopServer(node, self.e_stop)
 
     # --- the plant's loop calls these ----------------------------------------------------------------------
 
@@ -184,12 +185,21 @@ class PlantInterface:
         """Return how many publishers are matched with an input."""
         return self._inputs[kind].get_publisher_count()
 
+    def e_stop(self, reason: str) -> None:
+        """Latch the e-stop; from any thread, waiting for nobody."""
+        self.supervisor.e_stop(self.clock(), reason)
+        self._pressed.set()
+
     def safe_stop(self, reason: str) -> None:
         """Disarm, say so in diagnostics; the plant then applies zero torque and publishes that, to be heard too."""
         self.supervisor.disarm(self.clock(), reason)
         self.publish_diagnostics()
         self._diagnostics.publisher.wait_for_all_acked(qos.LAST_WORDS)
         self._stopping = True
+
+    def close(self) -> None:
+        """Serve the e-stop no longer: the plant is safe."""
+        self._e_stop.close()
 
     def publish_diagnostics(self) -> None:
         """Publish the state of the plant."""
@@ -234,6 +244,12 @@ class PlantInterface:
                 self.on_command(kind, command)
 
         return receive
+
+    def _on_look(self) -> None:
+        if self._pressed.is_set():
+            self._pressed.clear()
+            self.publish_diagnostics()
+        self._look_for_trajectory()
 
     def _look_for_trajectory(self) -> None:
         """Take the newest trajectory, and leave others the time: reading one holds Python's lock, and many may come."""
@@ -285,12 +301,6 @@ class PlantInterface:
             self.supervisor.disarm(self.clock())
             response.success = self.supervisor.mode is Mode.DISARMED
             response.message = self.supervisor.mode.value
-        self.publish_diagnostics()
-        return response
-
-    def _on_e_stop(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
-        self.supervisor.e_stop(self.clock())
-        response.success, response.message = True, "e-stop latched: zero torque"
         self.publish_diagnostics()
         return response
 

@@ -1,4 +1,4 @@
-"""The supervisor, used from two threads: messages arrive in one, the actuator's cycle runs in the other."""
+"""The supervisor, used from several threads: messages arrive in one, the e-stop and an actuator's cycle in others."""
 
 from __future__ import annotations
 
@@ -18,13 +18,16 @@ class SharedSupervisor(PlantSupervisor):
 
     Args:
         limits: The limits to keep.
-        prepare: Sets and confirms the drive's strategy; returns why it could not, or an empty string. Called outside
-            the lock, because it waits for the actuator's thread.
+        prepare: Makes the plant ready to be armed, such as the drive's strategy set and confirmed; returns why it could
+            not, or an empty string. Called outside the lock, because it may wait for another thread.
         withdraw: Called where the plant was prepared but then not armed.
     """
 
     def __init__(
-        self, limits: PlantLimits, prepare: Callable[[], str], withdraw: Callable[[], None] = lambda: None
+        self,
+        limits: PlantLimits,
+        prepare: Callable[[], str] = lambda: "",
+        withdraw: Callable[[], None] = lambda: None,
     ) -> None:
         self._lock = threading.RLock()
         self._prepare = prepare

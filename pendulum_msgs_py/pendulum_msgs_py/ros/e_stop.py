@@ -1,7 +1,7 @@
-"""The e-stop on a path of its own: a node, an executor and a thread that do nothing else.
+"""The e-stop of a plant on a path of its own: a node, an executor and a thread that do nothing else.
 
-The bridge's own thread waits for the actuator while it arms, and reads whatever others send. The e-stop must not stand
-in that queue.
+A plant's own thread steps or waits for an actuator, and reads whatever others send. The e-stop must not stand in that
+queue.
 """
 
 from __future__ import annotations
@@ -11,8 +11,8 @@ from collections.abc import Callable
 from rclpy.node import Node
 from std_srvs.srv import Trigger
 
-from pendulum_hw_bridge.e_stop_thread_node import EStopThread
 from pendulum_msgs_py.contract import names
+from pendulum_msgs_py.ros.e_stop_thread import EStopThread
 
 __all__ = ["EStopServer"]
 

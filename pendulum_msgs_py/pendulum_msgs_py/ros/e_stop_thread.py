@@ -55,6 +55,8 @@ class EStopThread:
         self._executor.add_node(self.node)
         self._closing = threading.Event()
         self._thread = threading.Thread(target=self._run, name=suffix, daemon=True)
+        # An owner that could not be made is not closed, and a thread that spins ends no process cleanly.
+        owner.context.on_shutdown(self.close)
 
     def start(self) -> None:
         """Begin to serve."""
@@ -63,10 +65,13 @@ class EStopThread:
         self._thread.start()
 
     def close(self) -> None:
-        """Stop to serve."""
+        """Stop to serve; at the latest the end of the owner's context does so."""
+        if self._closing.is_set():
+            return
         self._closing.set()
         self._executor.shutdown()
-        self._thread.join(_JOIN)
+        if self._thread.is_alive():
+            self._thread.join(_JOIN)
         self.node.destroy_node()
         rclpy.try_shutdown(context=self._context)
 
