@@ -10,12 +10,12 @@ from rich.console import Console
 
 from pendulum_lqr.certificate import Certificate, Certifier
 from pendulum_lqr.design import Gain
+from pendulum_lqr.design_tables import RowTable
 from pendulum_lqr.machine_response import Machine
 from pendulum_lqr.measured_response import read_response
 from pendulum_lqr.model import LinearModel
 from pendulum_msgs_py.contract.angles import UPRIGHT
 from pendulum_msgs_py.errors import ParameterError
-from pendulum_msgs_py.programs.terminal import WholeTable
 
 __all__ = ["certificate_document", "certify_rows", "print_certificates"]
 
@@ -50,18 +50,17 @@ def print_certificates(console: Console, certifier: Certifier, found: Sequence[C
         chosen: Row that is marked.
     """
     profile, machine = certifier.profile, certifier.machine
-    table = WholeTable(title="Certified for this machine", title_justify="left", header_style="bold")
-    for heading in ("#", "margin b", "loop distance", "modulus there", "certified"):
-        table.add_column(heading, justify="right")
+    headings = ("#", "margin b", "loop distance", "modulus there", "certified")
+    table = RowTable("Certified for this machine", headings)
     for index, one in enumerate(found, start=1):
         how = "by its margin" if one.by_gap else "by frequency"
-        table.add_row(
-            f"{index}",
+        table.add(
+            index,
             f"{one.margin:.3f}",
             f"{one.distance:.3f} at {one.at:.2g} Hz" if one.stable_on_model else "unstable on the model",
             f"{one.worst_modulus:.3f}",
             f"yes, {how}" if one.certified else "measure longer" if one.undecided else "no",
-            style="bold cyan" if index == chosen else "",
+            chosen=chosen,
         )
     console.print(table)
     console.print(

@@ -19,7 +19,7 @@ from rich.console import Console
 from pendulum_lqr.analysis import LoopReport, analyse
 from pendulum_lqr.certificate_table import certificate_document, certify_rows, print_certificates
 from pendulum_lqr.design import Gain, output_lqr
-from pendulum_lqr.design_tables import print_time_figures, print_worst_cases
+from pendulum_lqr.design_tables import RowTable, margin_cells, print_time_figures, print_worst_cases
 from pendulum_lqr.mechanism_design import design_mechanism
 from pendulum_lqr.model import LinearModel, linearise
 from pendulum_lqr.parameter_box import UNCERTAIN, parse_box, worst_case
@@ -29,7 +29,7 @@ from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.plants.mechanism_parameters import load_mechanism
 from pendulum_msgs_py.plants.plant_parameters import MECHANISM_PRESETS, PRESET_NAMES, is_mechanism, load_plant
 from pendulum_msgs_py.programs.executables import cli_main
-from pendulum_msgs_py.programs.terminal import WholeTable, make_console
+from pendulum_msgs_py.programs.terminal import make_console
 
 __all__ = ["THESIS_CHOICE", "THESIS_WEIGHTS", "app", "main"]
 
@@ -178,38 +178,35 @@ def _print(
 ) -> None:
     for line in _plant_lines(name, model):
         console.print(line)
-    table = WholeTable(title="Eigenvalues and gains", title_justify="left", header_style="bold")
-    for heading in ("#", "q11", "q22", "r", "eigenvalues \\[1/s]", "computed", "K", "tau \\[s]", "damping"):
-        table.add_column(heading, justify="left" if heading.startswith("eig") else "right", no_wrap=True)
-    margins_table = WholeTable(title="Robustness of the loop", title_justify="left", header_style="bold")
-    for heading in ("#", "gain up", "gain down", "phase margin", "delay margin", "modulus", "largest period"):
-        margins_table.add_column(heading, justify="right")
+    poles = "eigenvalues \\[1/s]"
+    table = RowTable(
+        "Eigenvalues and gains",
+        ("#", "q11", "q22", "r", poles, "computed", "K", "tau \\[s]", "damping"),
+        left={poles},
+        no_wrap=True,
+    )
+    margins_table = RowTable(
+        "Robustness of the loop",
+        ("#", "gain up", "gain down", "phase margin", "delay margin", "modulus", "largest period"),
+    )
     for index, report in enumerate(reports):
         (q11, q22), cost = weights[index - 1] if index else ((math.nan, math.nan), math.nan)
         cells = [f"{value:g}" if index else "\u2013" for value in (q11, q22, cost)]
         stable = math.isfinite(report.time_constant) and report.stable
-        table.add_row(
-            f"{index}",
+        table.add(
+            index,
             *cells,
             _poles(report.poles, 2),
             _poles(report.poles, 6),
             ", ".join(f"{value:.6f}" for value in report.K) if index else "\u2013",
             f"{report.time_constant:.4f}" if stable else "unstable",
             f"{report.damping_ratio:.3f}",
-            style="bold cyan" if index == chosen else "",
+            chosen=chosen,
         )
         margins = report.margins
         if margins is not None:
-            margins_table.add_row(
-                f"{index}",
-                "any" if math.isinf(margins.gain_up) else f"{margins.gain_up:.3f}",
-                f"{margins.gain_down:.4f}",
-                f"{math.degrees(margins.phase):.2f}\u00b0",
-                f"{margins.delay:.4f} s" if math.isfinite(margins.delay) else "any",
-                f"{margins.modulus:.3f}",
-                "none" if report.largest_period is None else _period(report.largest_period),
-                style="bold cyan" if index == chosen else "",
-            )
+            period = "none" if report.largest_period is None else _period(report.largest_period)
+            margins_table.add(index, *margin_cells(margins), period, chosen=chosen)
     console.print(table)
     console.print(margins_table)
     K = ", ".join(f"{value:.3f}" for value in reports[chosen].K)

@@ -1,20 +1,52 @@
-"""Further tables of ``design``: the closed loop in time, and the worst case over what is not known of the plant."""
+"""Tables of ``design``: one row a combination; the loop in time, the worst case over what is not known of the plant."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 
 from rich.console import Console
 
+from pendulum_lqr.analysis import Margins
 from pendulum_lqr.parameter_box import ParameterBox, WorstCase
 from pendulum_lqr.time_figures import TimeFigures
 from pendulum_msgs_py.plants.plant_parameters import PLANT_SPECS
 from pendulum_msgs_py.programs.terminal import WholeTable
 
-__all__ = ["print_time_figures", "print_worst_cases"]
+__all__ = ["RowTable", "margin_cells", "print_time_figures", "print_worst_cases"]
 
 _UNITS = {spec.name: spec.unit for spec in PLANT_SPECS}
+
+
+class RowTable(WholeTable):
+    """A table of combinations, one of them marked.
+
+    Args:
+        title: What it shows.
+        headings: Of the columns, that of the combination's number first.
+        left: Those of them whose cells stand at the left.
+        no_wrap: Break no cell.
+    """
+
+    def __init__(self, title: str, headings: Sequence[str], *, left: Collection[str] = (), no_wrap: bool = False):
+        super().__init__(title=title, title_justify="left", header_style="bold")
+        for heading in headings:
+            self.add_column(heading, justify="left" if heading in left else "right", no_wrap=no_wrap)
+
+    def add(self, index: int, *cells: str, chosen: int | None = None) -> None:
+        """Add a combination, marked where it is the chosen one."""
+        self.add_row(f"{index}", *cells, style="bold cyan" if index == chosen else "")
+
+
+def margin_cells(margins: Margins) -> list[str]:
+    """Return the cells of gain margins up and down, phase margin, delay margin and modulus."""
+    return [
+        "any" if math.isinf(margins.gain_up) else f"{margins.gain_up:.3f}",
+        f"{margins.gain_down:.4f}",
+        f"{math.degrees(margins.phase):.2f}\u00b0",
+        f"{margins.delay:.4f} s" if math.isfinite(margins.delay) else "any",
+        f"{margins.modulus:.3f}",
+    ]
 
 
 def print_time_figures(console: Console, found: Sequence[TimeFigures | None], chosen: int, limit: float) -> None:
@@ -26,10 +58,11 @@ def print_time_figures(console: Console, found: Sequence[TimeFigures | None], ch
         chosen: Row that is marked.
         limit: Of the torque [N m].
     """
-    table = WholeTable(title="In time (linear, delay included)", title_justify="left", header_style="bold")
-    headings = ("#", "rise \\[s]", "settling \\[s]", "overshoot", "torque \\[N m/rad]", "push rests \\[rad/(N m)]")
-    for heading in (*headings, "push peak \\[rad/(N m)]", "friction holds \\[rad]"):
-        table.add_column(heading, justify="right")
+    table = RowTable(
+        "In time (linear, delay included)",
+        ("#", "rise \\[s]", "settling \\[s]", "overshoot", "torque \\[N m/rad]", "push rests \\[rad/(N m)]",
+         "push peak \\[rad/(N m)]", "friction holds \\[rad]"),
+    )  # fmt: skip
     for index, one in enumerate(found, start=1):
         if one is None:
             cells = ["unstable", *["\u2013"] * 6]
@@ -37,7 +70,7 @@ def print_time_figures(console: Console, found: Sequence[TimeFigures | None], ch
             cells = [f"{one.rise_time:.3f}", f"{one.settling_time:.3f}", f"{100.0 * one.overshoot:.1f} %"]
             cells += [f"{one.step_torque:.4g}", f"{one.push_rest:.4g}", f"{one.push_peak:.4g}"]
             cells.append("none" if one.friction_band == 0.0 else f"{one.friction_band:.4g}")
-        table.add_row(f"{index}", *cells, style="bold cyan" if index == chosen else "")
+        table.add(index, *cells, chosen=chosen)
     console.print(table)
     one = found[chosen - 1]
     if one is None:
@@ -62,23 +95,15 @@ def print_worst_cases(console: Console, box: ParameterBox, found: Sequence[Worst
         found: One for each row, from row 1.
         chosen: Row that is marked.
     """
-    title = f"Worst case over {found[0].plants} plants ({box.source})"
-    table = WholeTable(title=title, title_justify="left", header_style="bold")
-    for heading in ("#", "not held", "gain up", "gain down", "phase margin", "delay margin", "modulus", "worst at"):
-        table.add_column(heading, justify="left" if heading == "worst at" else "right")
+    headings = ("#", "not held", "gain up", "gain down", "phase margin", "delay margin", "modulus", "worst at")
+    table = RowTable(f"Worst case over {found[0].plants} plants ({box.source})", headings, left={"worst at"})
     for index, one in enumerate(found, start=1):
         margins = one.margins
         cells = ["\u2013"] * 5
         if margins is not None and not one.unstable:
-            cells = [
-                "any" if math.isinf(margins.gain_up) else f"{margins.gain_up:.3f}",
-                f"{margins.gain_down:.4f}",
-                f"{math.degrees(margins.phase):.2f}\u00b0",
-                f"{margins.delay:.4f} s" if math.isfinite(margins.delay) else "any",
-                f"{margins.modulus:.3f}",
-            ]
+            cells = margin_cells(margins)
         held = f"{one.unstable}" if one.unstable else "none"
-        table.add_row(f"{index}", held, *cells, _place(one.where), style="bold cyan" if index == chosen else "")
+        table.add(index, held, *cells, _place(one.where), chosen=chosen)
     console.print(table)
     ranges = ", ".join(f"{name} {low:.4g} to {high:.4g} {_UNITS[name]}" for name, (low, high) in box.bounds.items())
     one = found[chosen - 1]

@@ -11,11 +11,12 @@ from typing import Any
 
 from pendulum_lqr.analysis import LoopReport, analyse
 from pendulum_lqr.design import Gain
+from pendulum_lqr.design_tables import RowTable
 from pendulum_lqr.mechanism_model import linearise_mechanism, mechanism_lqr
 from pendulum_lqr.model import LinearModel, sort_poles
 from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.plants.mechanism_parameters import MechanismParameters
-from pendulum_msgs_py.programs.terminal import WholeTable, make_console
+from pendulum_msgs_py.programs.terminal import make_console
 
 __all__ = ["design_mechanism"]
 
@@ -74,13 +75,13 @@ def _print(plant: MechanismParameters, model: LinearModel, rows: Sequence[_Row])
         console.print(
             "dry friction has no derivative at rest and is not in the model: simulate the loop to see its cost"
         )
-    table = WholeTable(title="LQR gains, u = -K x", title_justify="left", header_style="bold")
-    for heading in ("#", "Q", "r", "eigenvalues \\[1/s]", "K", "tau \\[s]", "delay margin", "largest period"):
-        table.add_column(heading, justify="right" if heading in {"#", "r", "tau \\[s]"} else "left", no_wrap=True)
+    headings = ("#", "Q", "r", "eigenvalues \\[1/s]", "K", "tau \\[s]", "delay margin", "largest period")
+    left = {"Q", "eigenvalues \\[1/s]", "K", "delay margin", "largest period"}
+    table = RowTable("LQR gains, u = -K x", headings, left=left, no_wrap=True)
     for count, row in enumerate(rows, 1):
         report = row.report
-        table.add_row(
-            f"{count}",
+        table.add(
+            count,
             ", ".join(f"{value:g}" for value in row.q),
             f"{row.r:g}",
             _poles(row.gain.poles),

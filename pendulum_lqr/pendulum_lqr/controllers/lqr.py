@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import Any, ClassVar
 
 from pendulum_lqr.controller import BaseController
 from pendulum_lqr.controllers.specs import FEEDFORWARD, Q, R
 from pendulum_lqr.design import Gain, output_lqr
 from pendulum_lqr.model import linearise
 from pendulum_msgs_py.contract.angles import UPRIGHT
+from pendulum_msgs_py.parameters import ParameterSpec
 from pendulum_msgs_py.plants.plant_parameters import PlantParameters
 
 __all__ = ["Lqr"]
@@ -28,7 +29,7 @@ class Lqr(BaseController):
     """
 
     SUMMARY = "linear quadratic regulator of the thesis, u = u* - K (x - x*)"
-    PARAMETERS = (Q, R, FEEDFORWARD)
+    PARAMETERS: ClassVar[tuple[ParameterSpec, ...]] = (Q, R, FEEDFORWARD)
 
     def __init__(self, gain: Gain, effort_limit: float, set_point: float = 0.0, hold: float = 0.0) -> None:
         super().__init__(effort_limit, set_point)

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from pendulum_lqr.analysis import delayed_spectral_radius
-from pendulum_lqr.controller import BaseController
+from pendulum_lqr.controllers.lqr import Lqr
 from pendulum_lqr.controllers.specs import FEEDFORWARD, Q, R
 from pendulum_lqr.design import DesignError, Gain, output_lqr
 from pendulum_lqr.model import LinearModel, linearise, torque_gain
@@ -27,7 +27,7 @@ _LARGEST = 0.5
 """Most of the torque limit that friction may be fed forward with."""
 
 
-class LqrFriction(BaseController):
+class LqrFriction(Lqr):
     """u = u* - K (x - x*) - c tanh((theta - theta*) / w), with c below the friction that the plant has.
 
     Back to the set-point the pendulum moves against its deviation: the smooth sign is that of the way, not that of
@@ -69,12 +69,9 @@ class LqrFriction(BaseController):
         set_point: float = 0.0,
         hold: float = 0.0,
     ) -> None:
-        super().__init__(effort_limit, set_point)
-        self.gain = gain
+        super().__init__(gain, effort_limit, set_point, hold)
         self.friction = friction
         self.width = width
-        self.hold = hold
-        self._k0, self._k1 = (float(value) for value in gain.K)
 
     @classmethod
     def design(cls, plant: PlantParameters, period: float, p: Mapping[str, Any]) -> LqrFriction:
