@@ -17,7 +17,8 @@ from numpy.typing import ArrayLike, NDArray
 from pendulum_msgs_py.contract.noise import stream_key
 from pendulum_msgs_py.dynamics.arithmetic import in_arithmetic
 from pendulum_msgs_py.errors import ParameterError
-from pendulum_msgs_py.plants.mechanism_parameters import MechanismParameters, actuator_specs, joint_specs
+from pendulum_msgs_py.plants.joint_parameters import actuator_specs, joint_specs
+from pendulum_msgs_py.plants.mechanism_parameters import MechanismParameters
 from pendulum_sim.joint_steps import pack_joints
 from pendulum_sim.mechanism_plant import check_decay, check_stable_step, common_delay, is_smooth_mechanism
 from pendulum_sim.plant import check_step

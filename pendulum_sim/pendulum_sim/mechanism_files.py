@@ -12,7 +12,8 @@ from xml.etree import ElementTree
 from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.joints import Joint
 from pendulum_msgs_py.mechanisms import Body
-from pendulum_msgs_py.plants.mechanism_parameters import JointParameters, MechanismParameters
+from pendulum_msgs_py.plants.joint_parameters import JointParameters
+from pendulum_msgs_py.plants.mechanism_parameters import MechanismParameters
 from pendulum_sim.xml_files import add, document_text, number, safe_name
 
 __all__ = ["mechanism_mjcf", "mechanism_urdf"]

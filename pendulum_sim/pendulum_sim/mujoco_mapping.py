@@ -19,7 +19,7 @@ from pathlib import Path
 
 from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.parameters import ParameterSpec, load_yaml, reject_unknown
-from pendulum_msgs_py.plants.plant_parameters import read_quantities
+from pendulum_msgs_py.plants.quantities import read_quantities
 
 __all__ = ["FORMAT", "NO_ACTUATOR", "MujocoMapping", "load_mujoco_mapping"]
 

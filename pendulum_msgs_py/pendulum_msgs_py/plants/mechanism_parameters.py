@@ -29,26 +29,36 @@ from typing import Any
 from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.joints import Coordinates, Joint, Vector
 from pendulum_msgs_py.mechanisms import MECHANISMS, Mechanism
-from pendulum_msgs_py.parameters import ParameterSpec, load_yaml, reject_unknown, require_mapping, suggestion
+from pendulum_msgs_py.parameters import load_yaml, reject_unknown, require_mapping, suggestion
+from pendulum_msgs_py.plants.joint_parameters import (
+    Actuator,
+    JointParameters,
+    actuator_specs,
+    check_joint,
+    joint_specs,
+    read_joint,
+)
 from pendulum_msgs_py.plants.plant_parameters import (
     FORMAT,
     MECHANISM_FORMAT,
     MECHANISM_PRESETS,
     PlantParameters,
     read_plant_document,
-    read_quantities,
     resolve_plant,
     save_document,
+)
+from pendulum_msgs_py.plants.quantities import (
+    build_plant,
+    read_name,
+    read_provenance,
+    read_quantities,
+    write_quantities,
 )
 
 __all__ = [
     "MECHANISM_FORMAT",
     "MECHANISM_PRESETS",
-    "Actuator",
-    "JointParameters",
     "MechanismParameters",
-    "actuator_specs",
-    "joint_specs",
     "load_mechanism",
     "load_mechanism_file",
     "mechanism_from_pendulum",
@@ -57,77 +67,6 @@ __all__ = [
 
 _ANGLES = 16
 """Angles of each turning joint at which the mass matrix must be positive definite."""
-
-
-@dataclass(frozen=True)
-class Actuator:
-    """The motor of one joint.
-
-    Attributes:
-        effort_limit: Largest torque or force, > 0 [N m or N].
-        time_constant: First-order lag between command and effort; 0 for none [s].
-        transport_delay: Time between a command and its first effect [s].
-    """
-
-    effort_limit: float
-    time_constant: float = 0.0
-    transport_delay: float = 0.0
-
-
-@dataclass(frozen=True)
-class JointParameters:
-    """Friction, ends of travel and actuator of one joint.
-
-    Attributes:
-        damping: Viscous friction [N m s/rad or N s/m].
-        coulomb_friction: Dry friction while sliding fast [N m or N].
-        static_friction: Dry friction at which sliding starts; None for the same [N m or N].
-        stribeck_velocity: Velocity over which the one falls to the other [rad/s or m/s].
-        lower_stop: Lowest position, where an end stop holds; None for none [rad or m].
-        upper_stop: Highest position [rad or m].
-        actuator: The motor; None for a passive joint.
-    """
-
-    damping: float = 0.0
-    coulomb_friction: float = 0.0
-    static_friction: float | None = None
-    stribeck_velocity: float = 0.01
-    lower_stop: float | None = None
-    upper_stop: float | None = None
-    actuator: Actuator | None = None
-
-    @property
-    def breakaway(self) -> float:
-        """Dry friction at which sliding starts [N m or N]."""
-        return self.coulomb_friction if self.static_friction is None else self.static_friction
-
-
-def joint_specs(joint: Joint) -> tuple[ParameterSpec, ...]:
-    """Return the table of what a plant file may say of a joint, in its units."""
-    effort = joint.effort_unit
-    return (
-        ParameterSpec("damping", 0.0, joint.damping_unit, "Viscous friction.", minimum=0.0),
-        ParameterSpec("coulomb_friction", 0.0, effort, "Dry friction while sliding fast.", minimum=0.0),
-        ParameterSpec("static_friction", 0.0, effort, "Dry friction at which sliding starts.", minimum=0.0),
-        ParameterSpec(
-            "stribeck_velocity", 0.01, joint.velocity_unit, "Velocity over which the static friction falls to Coulomb.",
-            minimum=0.0, exclusive_minimum=True,
-        ),
-        ParameterSpec("lower_stop", 0.0, joint.unit, "Lowest position, at an end stop."),
-        ParameterSpec("upper_stop", 0.0, joint.unit, "Highest position, at an end stop."),
-    )  # fmt: skip
-
-
-def actuator_specs(joint: Joint) -> tuple[ParameterSpec, ...]:
-    """Return the table of what a plant file may say of a joint's actuator, in its units."""
-    return (
-        ParameterSpec(
-            "effort_limit", 1.0, joint.effort_unit, "Largest effort of the actuator.",
-            minimum=0.0, exclusive_minimum=True,
-        ),
-        ParameterSpec("time_constant", 0.0, "s", "First-order lag between command and effort.", minimum=0.0),
-        ParameterSpec("transport_delay", 0.0, "s", "Time between a command and its first effect.", minimum=0.0),
-    )  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -160,7 +99,7 @@ class MechanismParameters:
         checked = tuple(spec.check(value) for spec, value in zip(specs, self.values, strict=True))
         object.__setattr__(self, "values", checked)
         for joint, own in zip(self.mechanism.joints, self.joints, strict=True):
-            _check_joint(joint, own)
+            check_joint(joint, own)
         self._check_mass()
 
     def _check_mass(self) -> None:
@@ -355,34 +294,20 @@ def write_mechanism(
     Raises:
         ParameterError: The file cannot be written.
     """
-    known = dict(intervals or {})
-
-    def entry(name: str, value: float, unit: str) -> dict[str, Any]:
-        bounds = {"interval": [float(bound) for bound in known[name]]} if name in known else {}
-        return {"value": float(value), "unit": unit, **bounds}
-
-    mechanism = parameters.mechanism
+    mechanism, known = parameters.mechanism, intervals or {}
     joints: dict[str, Any] = {}
     for joint, own in zip(mechanism.joints, parameters.joints, strict=True):
-        content: dict[str, Any] = {
-            spec.name: entry(f"{joint.name}.{spec.name}", value, spec.unit)
-            for spec in joint_specs(joint)
-            if (value := getattr(own, spec.name)) is not None
-        }
+        content: dict[str, Any] = write_quantities(vars(own), joint_specs(joint), known, f"{joint.name}.")
         if own.actuator is not None:
-            content["actuator"] = {
-                spec.name: entry(f"{joint.name}.{spec.name}", getattr(own.actuator, spec.name), spec.unit)
-                for spec in actuator_specs(joint)
-            }
+            drive = write_quantities(vars(own.actuator), actuator_specs(joint), known, f"{joint.name}.")
+            content["actuator"] = drive
         joints[joint.name] = content
+    values = dict(zip(mechanism.parameter_names, parameters.values, strict=False))
     document: dict[str, Any] = {
         "format": MECHANISM_FORMAT,
         "name": parameters.name,
         "model": mechanism.name,
-        "parameters": {
-            spec.name: entry(spec.name, value, spec.unit)
-            for spec, value in zip(mechanism.parameters, parameters.values, strict=True)
-        },
+        "parameters": write_quantities(values, mechanism.parameters, known),
         "joints": joints,
     }
     if provenance:
@@ -427,54 +352,11 @@ def _read_document(document: Mapping[str, Any], path: Path) -> tuple[MechanismPa
         )
     joints = []
     for joint in mechanism.joints:
-        own, more = _read_joint(joint, entries[joint.name], f"{where}: joints.{joint.name}")
+        own, more = read_joint(joint, entries[joint.name], f"{where}: joints.{joint.name}")
         joints.append(own)
         intervals.update({f"{joint.name}.{key}": interval for key, interval in more.items()})
-    name = document.get("name", path.stem)
-    if not isinstance(name, str):
-        raise ParameterError(f"{where}: name is {name!r}; expected text")
-    try:
-        parameters = MechanismParameters(mechanism, values, tuple(joints), name)
-    except ParameterError as error:
-        raise ParameterError(f"{where}: {error}") from error
-    provenance = dict(require_mapping(document.get("provenance") or {}, f"{where}: provenance"))
-    provenance["intervals"] = intervals
-    return parameters, provenance
-
-
-def _read_joint(joint: Joint, entry: object, where: str) -> tuple[JointParameters, dict[str, list[float]]]:
-    content = dict(require_mapping(entry if entry is not None else {}, where))
-    has_actuator = "actuator" in content
-    block = content.pop("actuator", None)
-    reject_unknown(content, (*(spec.name for spec in joint_specs(joint)), "actuator"), where=where)
-    values, intervals = read_quantities(content, joint_specs(joint), where)
-    actuator = None
-    if has_actuator:
-        drive, more = read_quantities(block, actuator_specs(joint), f"{where}.actuator")
-        if "effort_limit" not in drive:
-            raise ParameterError(f"{where}.actuator.effort_limit is missing; expected a value in {joint.effort_unit}")
-        actuator = Actuator(**drive)
-        intervals.update(more)
-    return JointParameters(**values, actuator=actuator), intervals
-
-
-def _check_joint(joint: Joint, own: JointParameters) -> None:
-    for spec in joint_specs(joint):
-        value = getattr(own, spec.name)
-        if value is not None:
-            spec.check(value, where=joint.name)
-    if own.actuator is not None:
-        for spec in actuator_specs(joint):
-            spec.check(getattr(own.actuator, spec.name), where=f"{joint.name}.actuator")
-    if own.breakaway < own.coulomb_friction:
-        unit = joint.effort_unit
-        raise ParameterError(
-            f"{joint.name}: static_friction is {own.static_friction} {unit}; "
-            f"expected >= coulomb_friction = {own.coulomb_friction} {unit}"
-        )
-    low, high = own.lower_stop, own.upper_stop
-    if low is not None and high is not None and not low < high:
-        raise ParameterError(f"{joint.name}: lower_stop is {low} {joint.unit}; expected < upper_stop = {high}")
+    parts = {"mechanism": mechanism, "values": values, "joints": tuple(joints), "name": read_name(document, path)}
+    return build_plant(MechanismParameters, parts, where), read_provenance(document, where, intervals)
 
 
 def _positive_definite(rows: Sequence[Sequence[float]]) -> bool:

@@ -15,21 +15,24 @@ The file gives each value with its unit, so that a file in other units is refuse
 from __future__ import annotations
 
 import os
-import sys
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, field, replace
 from importlib import resources
 from pathlib import Path
-from typing import Annotated, Any, NamedTuple, get_type_hints
+from typing import Annotated, Any
 
 from pendulum_msgs_py.errors import ParameterError
-from pendulum_msgs_py.parameters import (
-    ParameterSpec,
-    dump_yaml,
-    load_yaml,
-    reject_unknown,
-    require_mapping,
+from pendulum_msgs_py.parameters import ParameterSpec, dump_yaml, load_yaml, reject_unknown
+from pendulum_msgs_py.plants.quantities import (
+    Quantity,
+    build_plant,
+    check_fields,
+    read_name,
+    read_provenance,
+    read_quantities,
+    specs_of,
+    write_quantities,
 )
 
 __all__ = [
@@ -43,14 +46,12 @@ __all__ = [
     "SEALED_FORMAT",
     "SERIES_ELASTIC_PRESETS",
     "PlantParameters",
-    "Quantity",
     "SeriesElasticParameters",
     "is_mechanism",
     "load_plant",
     "load_plant_file",
     "plant_document",
     "read_plant_document",
-    "read_quantities",
     "resolve_plant",
     "save_document",
     "write_plant",
@@ -76,24 +77,6 @@ PRESET_NAMES = ", ".join(PRESETS)
 """The same for help texts."""
 SERIES_ELASTIC_PRESETS = tuple(name for name in PRESETS if "\ndrivetrain:" in _PRESET_TEXTS[name])
 """Those of them that have motor, gears and spring."""
-
-
-class Quantity(NamedTuple):
-    """What a physical parameter is; it annotates the field that holds one, whose default is that of plant files too.
-
-    Attributes:
-        unit: SI unit, ``-`` where it has none.
-        description: What it means, one sentence.
-        positive: Zero is refused.
-        signed: Below zero is allowed.
-        example: Shown as the default where a value must be given.
-    """
-
-    unit: str
-    description: str
-    positive: bool = False
-    signed: bool = False
-    example: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -143,7 +126,7 @@ class SeriesElasticParameters:
 
     def __post_init__(self) -> None:
         """Check every value; a static friction below the sliding one would feed energy in."""
-        _check_fields(self, DRIVETRAIN_SPECS)
+        check_fields(self, DRIVETRAIN_SPECS)
         if self.motor_static_friction < self.motor_coulomb_friction:
             raise ParameterError(
                 f"motor_static_friction is {self.motor_static_friction} N m; "
@@ -185,7 +168,7 @@ class PlantParameters:
         """Check every value and fill in the static friction."""
         if self.static_friction is None:
             object.__setattr__(self, "static_friction", self.coulomb_friction)  # type: ignore[unreachable]
-        _check_fields(self, PLANT_SPECS)
+        check_fields(self, PLANT_SPECS)
         if self.static_friction < self.coulomb_friction:
             raise ParameterError(
                 f"static_friction is {self.static_friction} N m; "
@@ -202,26 +185,9 @@ class PlantParameters:
         return replace(self, **changes)
 
 
-def _specs(kind: type[Any]) -> tuple[ParameterSpec, ...]:
-    """Return the table of a dataclass's quantities: name and default are the field's, the rest its annotation's."""
-    found = []
-    hints = get_type_hints(kind, include_extras=True)
-    for entry in fields(kind):
-        for quantity in getattr(hints[entry.name], "__metadata__", ()):
-            default = entry.default if isinstance(entry.default, float) else quantity.example
-            minimum = None if quantity.signed else 0.0
-            found.append(
-                ParameterSpec(
-                    entry.name, default, quantity.unit, quantity.description,
-                    minimum=minimum, exclusive_minimum=quantity.positive,
-                )
-            )  # fmt: skip
-    return tuple(found)
-
-
-DRIVETRAIN_SPECS = _specs(SeriesElasticParameters)
+DRIVETRAIN_SPECS = specs_of(SeriesElasticParameters)
 """Quantities of a plant file's section ``drivetrain``."""
-PLANT_SPECS = _specs(PlantParameters)
+PLANT_SPECS = specs_of(PlantParameters)
 """Quantities of a plant file's section ``parameters``."""
 
 
@@ -281,14 +247,9 @@ def read_plant_document(document: Mapping[str, Any], path: Path) -> tuple[PlantP
     if document.get("drivetrain") is not None:
         drivetrain_values, more = read_quantities(document["drivetrain"], DRIVETRAIN_SPECS, f"{where}: drivetrain")
         intervals.update({f"drivetrain.{name}": interval for name, interval in more.items()})
-        drivetrain = _build(SeriesElasticParameters, drivetrain_values, where)
-    name = document.get("name", path.stem)
-    if not isinstance(name, str):
-        raise ParameterError(f"{where}: name is {name!r}; expected text")
-    parameters = _build(PlantParameters, {**values, "drivetrain": drivetrain, "name": name}, where)
-    provenance = dict(require_mapping(document.get("provenance") or {}, f"{where}: provenance"))
-    provenance["intervals"] = intervals
-    return parameters, provenance
+        drivetrain = build_plant(SeriesElasticParameters, drivetrain_values, where)
+    parts = {**values, "drivetrain": drivetrain, "name": read_name(document, path)}
+    return build_plant(PlantParameters, parts, where), read_provenance(document, where, intervals)
 
 
 def write_plant(
@@ -345,10 +306,10 @@ def plant_document(
     document: dict[str, Any] = {
         "format": FORMAT,
         "name": parameters.name,
-        "parameters": _quantities(parameters, PLANT_SPECS, intervals or {}),
+        "parameters": write_quantities(vars(parameters), PLANT_SPECS, intervals or {}),
     }
     if parameters.drivetrain is not None:
-        document["drivetrain"] = _quantities(parameters.drivetrain, DRIVETRAIN_SPECS, {})
+        document["drivetrain"] = write_quantities(vars(parameters.drivetrain), DRIVETRAIN_SPECS, {})
     return document
 
 
@@ -373,76 +334,6 @@ def is_mechanism(preset_or_path: str | Path) -> bool:
         ParameterError: No such preset or file.
     """
     return load_yaml(resolve_plant(preset_or_path), "plant file").get("format") == MECHANISM_FORMAT
-
-
-def read_quantities(
-    entries: object, specs: Sequence[ParameterSpec], where: str
-) -> tuple[dict[str, float], dict[str, list[float]]]:
-    """Return values and intervals by name of entries written ``{value: NUMBER, unit: UNIT}``, as in a plant file.
-
-    Args:
-        entries: What a YAML file holds.
-        specs: The quantities that there may be.
-        where: Prefix of messages.
-
-    Raises:
-        ParameterError: An entry is unknown, without its unit, or refused.
-    """
-    mapping = require_mapping(entries, where)
-    table = {spec.name: spec for spec in specs}
-    reject_unknown(mapping, table, where=where)
-    values: dict[str, float] = {}
-    intervals: dict[str, list[float]] = {}
-    for name, entry in mapping.items():
-        spec = table[name]
-        if not isinstance(entry, dict):
-            raise ParameterError(f"{where}.{name} is {entry!r}; expected {{value: NUMBER, unit: {spec.unit}}}")
-        reject_unknown(entry, ("value", "unit", "interval"), where=f"{where}.{name}")
-        unit = entry.get("unit")
-        if unit != spec.unit:
-            given = "missing" if unit is None else repr(unit)
-            raise ParameterError(f"{where}.{name}: unit is {given}; expected {spec.unit!r}")
-        if "value" not in entry:
-            raise ParameterError(f"{where}.{name}: value is missing; expected a number in {spec.unit}")
-        values[name] = spec.check(entry["value"], where=where)
-        if entry.get("interval") is not None:
-            intervals[name] = _check_interval(entry["interval"], f"{where}.{name}", spec.unit)
-    return values, intervals
-
-
-def _check_interval(interval: object, where: str, unit: str) -> list[float]:
-    if (
-        isinstance(interval, list)
-        and len(interval) == 2
-        and all(type(bound) in {int, float} and abs(bound) <= sys.float_info.max for bound in interval)
-        and interval[0] <= interval[1]
-    ):
-        return [float(bound) for bound in interval]
-    raise ParameterError(f"{where}: interval is {interval!r}; expected [low, high] in {unit}")
-
-
-def _quantities(
-    parameters: object, specs: Sequence[ParameterSpec], intervals: Mapping[str, Sequence[float]]
-) -> dict[str, dict[str, Any]]:
-    quantities: dict[str, dict[str, Any]] = {}
-    for spec in specs:
-        entry: dict[str, Any] = {"value": float(getattr(parameters, spec.name)), "unit": spec.unit}
-        if spec.name in intervals:
-            entry["interval"] = [float(bound) for bound in intervals[spec.name]]
-        quantities[spec.name] = entry
-    return quantities
-
-
-def _build(kind: type[Any], values: Mapping[str, Any], where: str) -> Any:
-    try:
-        return kind(**values)
-    except ParameterError as error:
-        raise ParameterError(f"{where}: {error}") from error
-
-
-def _check_fields(instance: object, specs: Sequence[ParameterSpec]) -> None:
-    for spec in specs:
-        object.__setattr__(instance, spec.name, spec.check(getattr(instance, spec.name)))
 
 
 def _names(specs: Sequence[ParameterSpec]) -> str:
