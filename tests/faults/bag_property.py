@@ -132,7 +132,7 @@ def _check_plant(bag: Bag, plant: str, limit: float, allowance: float) -> Torque
 
     missing = counted("lost")
     unexplained = times[driven & (age > allowed)]
-    unexplained = _without_early(unexplained, logged, counted("early"), tolerance)
+    unexplained = _without_early(unexplained, logged, counted("early") + counted("before"), tolerance)
     if _lives_needed(unexplained, tolerance) > missing:
         late = f"torque {longest * 1e3:.0f} ms after the last command"
         violations.append(f"{late}; expected at most {allowed * 1e3:.0f} ms")

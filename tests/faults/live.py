@@ -25,7 +25,8 @@ from pendulum_msgs_py.errors import FaultError
 from pendulum_msgs_py.programs import graph
 from pendulum_msgs_py.programs.graph import NodeProgram
 from pendulum_msgs_py.ros import qos
-from tests.faults.motor import NO_TORQUE, Asked, Drive, ModuleTruth, beyond_asked
+from pendulum_msgs_py.ros.polled import PollingNode
+from tests.faults.motor import NO_TORQUE, Asked, Drive, ModuleTruth, Witness, beyond_asked
 from tests.faults.plants import EFFORT_LIMIT, SIMULATOR, Plant
 from tests.udp_address import free_udp_address
 
@@ -37,6 +38,8 @@ NODES = SIMULATOR.nodes
 """The nodes of the simulator's system, in the order in which they usually start."""
 MODULE = "emulator"
 """Name of the process behind a plant that has a module."""
+_RIGHTFUL = {names.EFFORT_COMMAND: "controller", names.DISTURBANCE: "disturbance"}
+"""Who may ask for torque, by topic."""
 _KEPT_NS = 120_000_000_000
 """How long what the motor did is kept [ns]."""
 
@@ -70,7 +73,8 @@ class LiveSystem:
 
     Attributes:
         applied: Every torque that the plant said it applied.
-        commands: When the controller's commands were heard, on the probe's monotonic clock [s].
+        heard: When the last message of controller and disturbance reached the probe, by topic, on the system's
+            clock [ns].
         asked: What controller and disturbance asked for, by the name of their topic.
         diagnostics: Newest key-value pairs by name of the status, such as ``/sim/simulator: plant``.
         diagnosed: When each status was heard last, on the probe's monotonic clock [s].
@@ -91,8 +95,8 @@ class LiveSystem:
         self.plant = plant
         self.children: dict[str, Child] = {}
         self.applied: list[Applied] = []
-        self.commands: list[float] = []
-        self.asked: dict[str, list[Asked]] = {names.EFFORT_COMMAND: [], names.DISTURBANCE: []}
+        self.heard = dict.fromkeys(_RIGHTFUL, 0)
+        self.asked = {topic: Witness(EFFORT_LIMIT) for topic in _RIGHTFUL}
         self.diagnostics: dict[str, dict[str, str]] = {}
         self.diagnosed: dict[str, float] = {}
         self._order = plant.nodes if order is None else order
@@ -110,16 +114,18 @@ class LiveSystem:
         logs = self.folder / "logs"
         self.processes = ProcessSet(logs, {**ros_environment(self.domain, logs), **self._environment})
         self.processes.__enter__()
-        self.conductor = Conductor(self.domain)
+        self.conductor = Conductor(self.domain, watch=self._hear)
         self.conductor.__enter__()
         node, namespace = self.conductor.node, self.plant.namespace
         node.create_subscription(
             JointState, f"{namespace}/{names.APPLIED_EFFORT}", self._on_applied, qos.STATE, raw=True
         )
-        for topic, name in ((names.EFFORT_COMMAND, "controller"), (names.DISTURBANCE, "disturbance")):
-            node.create_subscription(
-                JointState, f"{namespace}/{topic}", self._listener(topic, f"{namespace}/{name}"), qos.COMMAND, raw=True
-            )
+        # The numbers of messages, which tell what was not heard, come with those that are taken by hand alone.
+        self._witness = PollingNode("witness", context=self.conductor.context, start_parameter_services=False)
+        self._inputs = {
+            topic: self._witness.create_polled_input(JointState, f"{namespace}/{topic}", qos.COMMAND)
+            for topic in _RIGHTFUL
+        }
         node.create_subscription(DiagnosticArray, names.DIAGNOSTICS, self._on_diagnostics, qos.DIAGNOSTICS)
         self._arming = node.create_client(SetBool, self.service(names.ARM))
         if self.plant.has_module and self._order:
@@ -136,6 +142,7 @@ class LiveSystem:
             # A stopped process does not hear a polite signal.
             child.process.send_signal(signal.SIGCONT)
         self.processes.stop()
+        self._witness.destroy_node()
         self.conductor.__exit__(None, None, None)
 
     # --- processes -----------------------------------------------------------------------------------------
@@ -226,7 +233,7 @@ class LiveSystem:
         """Let the probe listen for a while [s]."""
         deadline = time.monotonic() + duration
         while (left := deadline - time.monotonic()) > 0.0:
-            self.conductor.listen(min(0.02, left))
+            self._listen_once(min(0.02, left))
 
     def wait_for(self, what: str, predicate: Callable[[], bool], timeout: float) -> None:
         """Wait until a predicate holds; raises FaultError with ``what`` otherwise."""
@@ -237,9 +244,9 @@ class LiveSystem:
         now = time.monotonic()
         return any(applied.effort != 0.0 for applied in self.applied[-40:] if now - applied.when < 0.05)
 
-    def hears_controller(self) -> bool:
-        """Tell whether the probe has heard the controller within the last 50 ms: it is matched to this very process."""
-        return bool(self.commands) and time.monotonic() - self.commands[-1] < 0.05
+    def hears_all(self) -> bool:
+        """Tell whether the probe has heard controller and disturbance within the last 50 ms: it knows these processes."""
+        return time.time_ns() - min(self.heard.values()) < 50_000_000
 
     def time_to_zero(self, patience: float = 1.0) -> float:
         """Listen for a while; return the time from the last command to the end of all torque [s].
@@ -247,7 +254,7 @@ class LiveSystem:
         By the motor's own clock, from the stamp of the state that the last command answers: no busy machine adds to it.
         """
         self.listen(patience)
-        asked = self.asked[names.EFFORT_COMMAND]
+        asked = self.asked[names.EFFORT_COMMAND].asked
         last_ns = asked[-1].stamp_ns if asked else 0
         return max(0.0, (self.driven_until_ns(last_ns) - last_ns) * 1e-9)
 
@@ -278,8 +285,8 @@ class LiveSystem:
         """Return by how much the motor drove beyond what was rightfully asked for since an instant [ns, N m]."""
         drives = [one for one in self.drives() if one.time_ns >= since_ns]
         commands, disturbances = (
-            sorted(one for one in self.asked[topic] if one.stamp_ns > since_ns - NANOSECONDS)
-            for topic in (names.EFFORT_COMMAND, names.DISTURBANCE)
+            sorted(one for one in witness.asked if one.stamp_ns > since_ns - NANOSECONDS)
+            for witness in self.asked.values()
         )
         return beyond_asked(drives, commands, disturbances, EFFORT_LIMIT)
 
@@ -352,9 +359,9 @@ class LiveSystem:
             sent += 1
             if rate is not None:
                 while time.monotonic() - started < sent / rate:
-                    self.conductor.listen(0.0005)
+                    self._listen_once(0.0005)
             elif sent % 200 == 0:
-                self.conductor.listen(0.0)
+                self._listen_once(0.0)
         self.listen(0.2)
         self.conductor.node.destroy_publisher(publisher)
         return sent
@@ -369,17 +376,20 @@ class LiveSystem:
         if fields is not None and fields.effort is not None:
             self.applied.append(Applied(time.monotonic(), fields.effort, fields.stamp_ns))
 
-    def _listener(self, topic: str, frame: str) -> Callable[[bytes], None]:
-        """Return what takes note of the messages of the one who may ask for torque on a topic."""
+    def _listen_once(self, duration: float) -> None:
+        self.conductor.listen(duration)
+        self._hear()
 
-        def listen(data: bytes) -> None:
-            fields = decode_joint_state(data)
-            if fields is not None and fields.frame_id == frame and fields.effort is not None:
-                self.asked[topic].append(Asked(fields.stamp_ns, fields.effort))
-                if topic == names.EFFORT_COMMAND:
-                    self.commands.append(time.monotonic())
-
-        return listen
+    def _hear(self) -> None:
+        """Take note of the messages of those who may ask for torque."""
+        for topic, polled in self._inputs.items():
+            frame = f"{self.plant.namespace}/{_RIGHTFUL[topic]}"
+            for data, info in polled.messages():
+                fields = decode_joint_state(data)
+                if fields is not None and fields.frame_id == frame and fields.effort is not None:
+                    asked = Asked(fields.stamp_ns, fields.effort)
+                    self.asked[topic].hear(asked, info["publication_sequence_number"])
+                    self.heard[topic] = info["received_timestamp"]
 
     def _on_diagnostics(self, message: DiagnosticArray) -> None:
         for status in message.status:

@@ -15,7 +15,7 @@ from typing import NamedTuple
 from pendulum_hw_bridge.emulation.parameters import load_emulator
 from pendulum_hw_bridge.emulation.truth_log import COLUMNS
 
-__all__ = ["ROUNDING", "Asked", "Drive", "ModuleTruth", "beyond_asked", "driving_torque"]
+__all__ = ["ROUNDING", "Asked", "Drive", "ModuleTruth", "Witness", "beyond_asked", "driving_torque"]
 
 ROUNDING = 0.2
 """Difference of torques that is none: rounding of the duty, noise of sensors [N m]."""
@@ -24,6 +24,10 @@ NO_TORQUE = 1e-3
 _REMEMBERED_NS = 130_000_000
 """Time for which a torque may act after the state that its command answers: 50 ms that a command counts, a cycle, and
 what a busy machine may add before the module's command lifetime ends it [ns]."""
+_LIFE_NS = 50_000_000
+"""Time that a command counts [ns]."""
+_UNHEARD_NS = 500_000_000
+"""Time for which somebody may ask for torque, and be obeyed, before a witness knows of them [ns]."""
 _AHEAD_NS = 2_000_000
 """A simulator's torque acts from its state's stamp on, before the command that answers this state is there [ns]."""
 
@@ -40,6 +44,37 @@ class Asked(NamedTuple):
 
     stamp_ns: int
     effort: float
+
+
+class Witness:
+    """Takes note of what the rightful ask for on a topic, and of how much they asked for before they were heard.
+
+    A plant may meet a new node half a second before a witness does. What was said meanwhile is counted: a publisher
+    numbers its messages from 1 on. Each may have asked for anything, at any time in as many lives of a command.
+
+    Args:
+        limit: Largest torque that a plant lets through [N m].
+
+    Attributes:
+        asked: What was asked for; what was not heard as both of the largest torques.
+    """
+
+    def __init__(self, limit: float) -> None:
+        self.asked: list[Asked] = []
+        self._limit = limit
+        self._last: dict[int, int] = {}
+
+    def hear(self, asked: Asked, sequence: int) -> None:
+        """Take note of a message, by its number at its publisher."""
+        # Who has been silent for long is gone, and not continued by somebody new whose numbers are near.
+        self._last = {last: when for last, when in self._last.items() if asked.stamp_ns - when < _UNHEARD_NS}
+        before = max((last for last in self._last if last < sequence), default=0)
+        unheard_ns = min((sequence - before - 1) * _LIFE_NS, _UNHEARD_NS)
+        begin_ns = max(asked.stamp_ns - unheard_ns, self._last.pop(before, 0))
+        self._last[sequence] = asked.stamp_ns
+        for stamp_ns in range(begin_ns, asked.stamp_ns, _LIFE_NS) if unheard_ns else ():
+            self.asked += [Asked(stamp_ns, -self._limit), Asked(stamp_ns, self._limit)]
+        self.asked.append(asked)
 
 
 def driving_torque(duty: float, torque: float, per_duty: float) -> float:

@@ -199,9 +199,9 @@ def test_commands_heard_of_too_late_explain_as_many_lives_and_only_shortly_befor
         ("too long", EARLY_TIME + 0.5, 1000, True),
         ("no command follows", 9.0, 1000, True),
     ):
-        (tmp_path / name).mkdir()
-        record = _judge(tmp_path / name, _steady, partial(le, first), counts={"early": early})
-        assert _late(record) is late, name
+        for kind in ("early", "before"):
+            record = _judge(tmp_path / name / kind, _steady, partial(le, first), counts={kind: early})
+            assert _late(record) is late, (name, kind)
 
 
 def test_early_commands_explain_no_more_than_their_time_however_many_gaps_there_are(tmp_path: Path) -> None:

@@ -14,7 +14,7 @@ from pendulum_hw_bridge.emulation.truth_log import TruthLog
 from pendulum_hw_bridge.emulation.x5 import EmulatedX5
 from pendulum_msgs_py.errors import PendulumError
 from tests.faults.live import EFFORT_LIMIT
-from tests.faults.motor import ROUNDING, Asked, Drive, ModuleTruth, beyond_asked, driving_torque
+from tests.faults.motor import ROUNDING, Asked, Drive, ModuleTruth, Witness, beyond_asked, driving_torque
 from tests.faults.outcome import Outcome, demand_limit
 
 MS = 1_000_000
@@ -53,6 +53,41 @@ def test_the_limit_holds_whatever_was_asked_for_and_the_worst_instant_is_told() 
     assert torque == pytest.approx(2.0)
     assert excess(505.0, -7.2, [Asked(500 * MS, -100.0)], []) == pytest.approx(2.0)
     assert excess(505.0, -5.1, [Asked(500 * MS, -100.0)], []) == 0.0
+
+
+def test_what_a_witness_did_not_hear_is_counted_and_may_have_been_anything_for_as_long() -> None:
+    witness = Witness(LIMIT)
+    witness.hear(Asked(1000 * MS, 1.0), 4)
+    witness.hear(Asked(1010 * MS, 1.0), 5)
+    # Three lives of 50 ms before the first.
+    for time_ms, beyond in ((845.0, 4.7), (851.0, 0.0), (1050.0, 0.0), (1031.0 + 50.0, 3.7)):
+        for sign in (1.0, -1.0):
+            expected = beyond + (1.0 if beyond == 3.7 and sign < 0.0 else 0.0)
+            assert excess(time_ms, sign * 4.9, sorted(witness.asked), []) == pytest.approx(expected), time_ms
+    # One is lost between two.
+    witness.hear(Asked(2000 * MS, 1.0), 104)
+    witness.hear(Asked(2010 * MS, 1.0), 105)
+    witness.hear(Asked(2030 * MS, 1.0), 107)
+    assert [asked for asked in witness.asked if 2000 * MS < asked.stamp_ns < 2030 * MS] == [
+        Asked(2010 * MS, 1.0),
+        Asked(2010 * MS, -LIMIT),
+        Asked(2010 * MS, LIMIT),
+    ]
+
+
+def test_a_witness_excuses_half_a_second_and_no_more_of_somebody_who_was_there_for_long() -> None:
+    witness = Witness(LIMIT)
+    witness.hear(Asked(5000 * MS, 1.0), 4000)
+    assert min(witness.asked).stamp_ns == 4500 * MS
+    # The new one of two under one name, and an old one whose numbers go on: neither has missed anything.
+    heard = len(witness.asked)
+    witness.hear(Asked(5005 * MS, 1.0), 1)
+    witness.hear(Asked(5010 * MS, 1.0), 4001)
+    witness.hear(Asked(5015 * MS, 1.0), 2)
+    assert len(witness.asked) == heard + 3
+    # Who comes anew is not taken for one who has ended at a number below.
+    witness.hear(Asked(9000 * MS, 1.0), 6)
+    assert min(asked.stamp_ns for asked in witness.asked if asked.stamp_ns > 6000 * MS) == 8750 * MS
 
 
 def test_a_torque_beyond_the_limit_is_noted_but_for_the_rounding_of_a_module() -> None:

@@ -210,12 +210,14 @@ def test_a_topic_that_nobody_publishes_is_named_and_fails(
     assert len(read_bag(tmp_path / "run")["/there"]) == 1
 
 
-@pytest.mark.parametrize("log_time", ["receive", "header"])
+@pytest.mark.parametrize(
+    ("log_time", "settling", "kind"), [("receive", 0.0, "early"), ("header", 0.0, "early"), ("receive", 60.0, "before")]
+)
 def test_a_topic_whose_beginning_was_missed_is_announced_before_that_is_told(
-    tmp_path: Path, domain_id: int, monkeypatch: pytest.MonkeyPatch, log_time: str
+    tmp_path: Path, domain_id: int, monkeypatch: pytest.MonkeyPatch, log_time: str, settling: float, kind: str
 ) -> None:
     """Messages without a stamp wait for the first that has one: till then the bag does not know their topic."""
-    monkeypatch.setattr(recorder_tap_node, "SETTLING", 0.0)
+    monkeypatch.setattr(recorder_tap_node, "SETTLING", settling)
     rclpy.init(domain_id=domain_id)
     recorder = source = None
     try:
@@ -232,13 +234,14 @@ def test_a_topic_whose_beginning_was_missed_is_announced_before_that_is_told(
 
         def told() -> int:
             plain.publish(Float64(data=2.0))
-            return bool(stops) or getattr(session.counts().get("/plain"), "early", 0)
+            return bool(stops) or getattr(session.counts().get("/plain"), kind, 0)
 
         wait_for(told, 30.0, "what came before to be told")
         assert not stops, session.failure
         recorder.close()
         assert recorder.exit_code == 0
-        assert recorder.reports[0].topics["/plain"].early == 20
+        count = recorder.reports[0].topics["/plain"]
+        assert (count.early + count.before, getattr(count, kind)) == (20, 20)
     finally:
         for each in (recorder, source):
             if each is not None:

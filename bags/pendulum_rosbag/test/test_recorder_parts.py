@@ -126,6 +126,33 @@ def test_messages_before_the_subscription_was_complete_are_told_and_are_no_loss(
     assert read_bag(tmp_path / "bag").metadata["pendulum.recorder.counts"]["/a"]["early"] == 905
 
 
+def test_a_bag_that_was_not_closed_tells_what_is_missing_in_it(tmp_path: Path) -> None:
+    session = RecordingSession(open_writer(tmp_path / "bag"), seal_interval=0.02)
+    try:
+        session.add_topic("/a", message_type(JOINT_STATE), ())
+        session.offer("/a", [(1, encode_joint_state(1, position=1.0))])
+        session.note_missing("/a", 3)
+        session.note_early("/a", 4)
+        session.note_before("/a", 5)
+
+        def told() -> object:
+            return read_bag(tmp_path / "bag").metadata.get("pendulum.recorder.counts")
+
+        wait_for(told, 10.0, "the counts to be in the bag")
+        wait_for(lambda: told() == {"/a": {"lost": 3, "early": 4, "before": 5}}, 10.0, "all of them")
+    finally:
+        report = session.close()
+    assert (report.topics["/a"].before, report.lost) == (5, 3)
+    assert "5" not in report.sentence().split("/a", 1)[1]
+    assert read_bag(tmp_path / "bag").metadata["pendulum.recorder.counts"]["/a"] == {
+        "received": 1,
+        "written": 1,
+        "lost": 3,
+        "early": 4,
+        "before": 5,
+    }
+
+
 def test_a_disk_that_fails_ends_the_session_in_a_sentence(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     writer = open_writer(tmp_path / "bag")
     reasons: list[str] = []

@@ -200,7 +200,10 @@ class Recorder(PollingNode):
             return
         if items or missing:
             self._offer(tap, session, items, missing)
-        if unheard:
+        if unheard and tap.is_new:
+            tap.announce(session)
+            session.note_before(tap.topic, unheard)
+        elif unheard:
             self._tell_early(tap, session, unheard)
 
     def _offer(self, tap: Tap, session: RecordingSession, items: Sequence[tuple[int, bytes]], missing: int = 0) -> None:

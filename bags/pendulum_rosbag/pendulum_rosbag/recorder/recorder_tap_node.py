@@ -86,6 +86,11 @@ class Tap:
             self._gaps.go_on_from(before._gaps)
 
     @property
+    def is_new(self) -> bool:
+        """Whether the topic is so new to us that nobody expects to hear its publishers from their first message on."""
+        return time.monotonic() - self._first_opened < SETTLING
+
+    @property
     def is_settling(self) -> bool:
         """Whether some publisher may not know of us yet."""
         return time.monotonic() - self._opened < SETTLING
@@ -112,13 +117,10 @@ class Tap:
             yield info["received_timestamp"], trim(data), see(sequence) if sequence else 0
 
     def unheard(self) -> int:
-        """Return how many messages were sent by publishers that came later before the first that was heard of them.
-
-        Those since the last call; of publishers that were there before the subscription nobody expects the beginning.
-        """
-        late = self._gaps.unmet - self._told_unmet
+        """Return how many messages publishers had sent before the first that was heard of them, since the last call."""
+        unheard = self._gaps.unmet - self._told_unmet
         self._told_unmet = self._gaps.unmet
-        return late if time.monotonic() - self._first_opened > SETTLING else 0
+        return unheard
 
     def close(self) -> None:
         """Let go of the middleware before the source is destroyed."""

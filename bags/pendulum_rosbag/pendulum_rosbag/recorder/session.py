@@ -22,6 +22,8 @@ SEAL_INTERVAL = 0.05
 SYNC_INTERVAL = 5.0
 """Time between two requests to the disk to keep what it was given [s]: what a power failure may cost."""
 
+_COUNTS = "pendulum.recorder.counts"
+
 
 @dataclass(slots=True)
 class TopicCount:
@@ -29,6 +31,7 @@ class TopicCount:
 
     ``early`` are those that were published between the first message that arrived and the moment at which the
     subscription was complete: the recording of the topic begins with a gap, but nothing that was due is lost.
+    ``before`` are those that its publishers had sent before the recording of the topic began.
     """
 
     received: int = 0
@@ -36,6 +39,7 @@ class TopicCount:
     missing: int = 0
     written: int = 0
     early: int = 0
+    before: int = 0
 
     @property
     def lost(self) -> int:
@@ -117,6 +121,7 @@ class RecordingSession:
         self._sync_interval = sync_interval
         self._on_failure = on_failure
         self._counts: dict[str, TopicCount] = {}
+        self._told: dict[str, dict[str, int]] = {}
         self._queue: list[tuple[str, int, bytes]] = []
         self._queued_bytes = 0
         self._lock = threading.Lock()
@@ -182,6 +187,10 @@ class RecordingSession:
         """Count messages that were published before the subscription was complete."""
         self._counts[topic].early += number
 
+    def note_before(self, topic: str, number: int) -> None:
+        """Count messages that were published before the recording of their topic began."""
+        self._counts[topic].before += number
+
     def counts(self) -> dict[str, TopicCount]:
         """Return the counts so far; ``written`` are those that are safe on disk."""
         sealed = self.writer.sealed
@@ -235,14 +244,23 @@ class RecordingSession:
         if items:
             self.writer.write_many(items)
         self.writer.seal()
+        # A recorder that is killed has told what is missing, too.
+        gaps = {
+            name: {"lost": count.missing + count.refused, "early": count.early, "before": count.before}
+            for name, count in self._counts.copy().items()
+            if count.missing or count.refused or count.early or count.before
+        }
+        if gaps != self._told:
+            self.writer.update_metadata({_COUNTS: gaps})
+            self._told = gaps
 
     def _store_counts(self) -> None:
         self.writer.seal()
         self.writer.update_metadata(
             {
-                "pendulum.recorder.counts": {
-                    name: {"received": c.received, "written": c.written, "lost": c.lost, "early": c.early}
-                    for name, c in self.counts().items()
+                _COUNTS: {
+                    name: {kind: getattr(count, kind) for kind in ("received", "written", "lost", "early", "before")}
+                    for name, count in self.counts().items()
                 }
             }
         )
