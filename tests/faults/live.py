@@ -245,7 +245,7 @@ class LiveSystem:
         return any(applied.effort != 0.0 for applied in self.applied[-40:] if now - applied.when < 0.05)
 
     def hears_all(self) -> bool:
-        """Tell whether the probe has heard controller and disturbance within the last 50 ms: it knows these processes."""
+        """Tell whether controller and disturbance were heard within the last 50 ms: the probe knows these processes."""
         return time.time_ns() - min(self.heard.values()) < 50_000_000
 
     def time_to_zero(self, patience: float = 1.0) -> float:
