@@ -13,6 +13,7 @@ import uvicorn
 from fastapi import FastAPI, WebSocket, WebSocketDisconnect
 from fastapi.responses import JSONResponse
 from fastapi.staticfiles import StaticFiles
+from nicegui import app as pages
 from nicegui import ui
 
 from pendulum_bags.console.graph import Graph
@@ -89,6 +90,8 @@ def serve(
         Layout(graph, jobs).build()
 
     ui.run_with(app, dark=None, show_welcome_message=False)
+    # Quasar's bar for requests has no name for a screen reader, and says nothing that the page does not say itself.
+    pages.config.quasar_config["loadingBar"]["skipHijack"] = True
     uvicorn.run(
         Guard(app, token),
         host=host,
