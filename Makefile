@@ -8,17 +8,24 @@ VENV := .venv
 PY := $(VENV)/bin/python
 PIP := $(PY) -m pip --disable-pip-version-check --no-input --quiet --quiet
 
+# The lock in layers, so that each target installs what it needs: requirements/LAYER.in says what that is. A layer holds
+# nothing that `run` has, and one version of each package stands in all of them.
+LAYERS := run extras build checks docs test
+INSTALLED := $(LAYERS:%=$(VENV)/.%)
+
 # Everything that decides what an editable install looks like; the modules themselves are read in place.
 LINKED := $(foreach p,$(PACKAGES),$(wildcard $(p)/setup.py $(p)/setup.cfg $(p)/package.xml $(p)/*/executables.py))
 
-.PHONY: help venv experiment course test bench lint format types imports build faults mutants lock audit docs clean
+.PHONY: help venv extras experiment course test bench lint format types imports build faults mutants lock audit docs clean
 
 help: # Print the targets, one line each
 	@awk -F ':[^#]*# ' '/^[a-z]+:[^#=]*# / {printf "make %-11s %s\n", $$1, $$2}' Makefile
 
-venv: $(VENV)/.linked # Make or renew .venv from the lock, with the packages linked into it (PYTHON=... chooses the interpreter)
+venv: $(VENV)/.linked $(INSTALLED) # Make or renew .venv with all layers of the lock (PYTHON=... chooses the interpreter)
 
-# Three stamps, so that an interrupted step is done again and a finished one is not.
+extras: $(VENV)/.linked $(VENV)/.extras # Install what every program needs: console, studies, MuJoCo, HEBI, ...
+
+# One stamp for each step, so that an interrupted one is done again and a finished one is not.
 $(VENV)/.made:
 	@for python in $(PYTHON) python3.12 python3.11 python3.10 python3 none; do \
 	  if $$python -c 'import sys; sys.exit(sys.implementation.name != "cpython" or not (3, 10) <= sys.version_info[:2] <= (3, 12))' 2>/dev/null; \
@@ -28,17 +35,18 @@ $(VENV)/.made:
 	echo "making $(VENV) with $$($$python --version)" && $$python -m venv $(VENV)
 	@touch $@
 
-# The lock is complete, so pip has nothing to resolve: faster, and the same on every version of pip.
-$(VENV)/.locked: requirements.txt | $(VENV)/.made
-	@echo "installing $$(grep -c == requirements.txt) locked packages into $(VENV) (some minutes the first time)"
-	@$(PIP) install --prefer-binary --no-deps --require-hashes -r requirements.txt || { \
+# The lock is complete, so pip has nothing to resolve: faster, and the same on every version of pip. Modules are compiled
+# when they are first imported, which most never are.
+$(INSTALLED): $(VENV)/.%: requirements/%.txt | $(VENV)/.made
+	@echo "installing $$(sed -n 's/==.*//p' $< | sort -u | wc -l) locked packages into $(VENV) (layer $*; some minutes the first time)"
+	@$(PIP) install --prefer-binary --no-deps --no-compile --require-hashes -r $< || { \
 	  echo "error: the locked packages could not be installed; pip says why above. The first time needs the network (or a mirror that pip is" \
 	  "told of, PIP_INDEX_URL) and some GB of disk. What pip has fetched it keeps: make the same target again." >&2; exit 1; }
 	@touch $@
 
 # Compatible mode writes plain path entries. Those alone win over the folders of the repository that bear the packages'
 # names, which Python would otherwise take for namespace packages when it starts in this folder.
-$(VENV)/.linked: $(VENV)/.locked $(LINKED)
+$(VENV)/.linked: $(VENV)/.run $(LINKED)
 	@echo "linking $(PACKAGES) into $(VENV)"
 	@$(PIP) install --no-deps --no-build-isolation --config-settings editable_mode=compat $(addprefix --editable ./,$(PACKAGES))
 	@touch $@
@@ -49,56 +57,61 @@ experiment: $(VENV)/.linked # Run the thesis's experiment on simulator and emula
 course: $(VENV)/.linked # Make six exercises with a hidden plant from a seed (SEED=2027 OUT=build/course)
 	@$(PY) -m pendulum_bags course make $(if $(SEED),--seed "$(SEED)") $(if $(OUT),--out "$(OUT)")
 
-test: $(VENV)/.linked # Run every test (ARGS="-k name" chooses)
+test: venv # Run every test (ARGS="-k name" chooses)
 	@$(PY) -m tests.suite $(ARGS)
 
-bench: $(VENV)/.linked $(VENV)/.peers # Measure beside the peers, print a table, write build/bench.json (ONLY=area ARGS=...)
+bench: venv $(VENV)/.peers # Measure beside the peers, print a table, write build/bench.json (ONLY=area ARGS=...)
 	@PYTHONPATH="$(CURDIR)/$(VENV)/peers$${PYTHONPATH:+:$$PYTHONPATH}" $(PY) -m tests.benchmarks.run $(if $(ONLY),--only "$(ONLY)") $(ARGS)
 
 # A peer that cannot be had here is reported in its rows; it must not keep the others from being measured.
-$(VENV)/.peers: requirements-bench.txt | $(VENV)/.locked
-	@echo "installing $$(grep -c == requirements-bench.txt) peers into $(VENV)/peers"
+$(VENV)/.peers: requirements/bench.txt | $(VENV)/.run
+	@echo "installing $$(grep -c == requirements/bench.txt) peers into $(VENV)/peers"
 	@rm -rf $(VENV)/peers
-	@if $(PIP) install --prefer-binary --no-deps --require-hashes --target $(VENV)/peers -r requirements-bench.txt; then touch $@; \
+	@if $(PIP) install --prefer-binary --no-deps --require-hashes --target $(VENV)/peers -r requirements/bench.txt; then touch $@; \
 	else echo "note: some peers could not be installed; their rows will say so" >&2; fi
 
-lint: $(VENV)/.linked # Check style and format with ruff
+lint: $(VENV)/.checks # Check style and format with ruff
 	@$(PY) -m ruff check $(ARGS)
 	@$(PY) -m ruff format --check || { echo "make format does it" >&2; exit 1; }
 
-format: $(VENV)/.linked # Format every file with ruff
+format: $(VENV)/.checks # Format every file with ruff
 	@$(PY) -m ruff format
 
-types: $(VENV)/.linked # Check types with mypy
+types: $(VENV)/.linked $(VENV)/.checks # Check types with mypy
 	@$(PY) -m mypy $(ARGS)
 
-imports: $(VENV)/.linked # Check which package and which module may import what
+imports: $(VENV)/.linked $(VENV)/.checks # Check which package and which module may import what
 	@$(VENV)/bin/lint-imports --no-logo $(ARGS)
 
-build: $(VENV)/.linked # Build the packages with colcon into install/, as for ros2 run
+build: $(VENV)/.run $(VENV)/.build # Build the packages with colcon into install/, as for ros2 run
 	@unset PYTHONDONTWRITEBYTECODE; exec $(VENV)/bin/colcon build --base-paths $(PACKAGES) $(ARGS)
 
-faults: $(VENV)/.linked # Attack the running system, count what it stood, print a table (the long form of tests/faults)
+faults: venv # Attack the running system, count what it stood, print a table (the long form of tests/faults)
 	@$(PY) -m tests.faults.run $(ARGS)
 
-mutants: $(VENV)/.linked # Break the safety rules in every small way; fail if no test notices one (build/mutants.md)
+mutants: venv # Break the safety rules in every small way; fail if no test notices one (build/mutants.md)
 	@$(PY) -m tests.mutants.run $(ARGS)
 
-# The lock covers CPython 3.10 to 3.12 at once. The peers of the benchmarks are locked on the same versions, less what
-# the lock has already.
+# The lock covers CPython 3.10 to 3.12 at once. All layers are compiled together first, for one version of each package;
+# then each by itself on those versions, less what `run` has. The peers of the benchmarks come last, less what all have.
 LOCK := $(VENV)/.uv/bin/uv pip compile --quiet --universal --python-version 3.10 --generate-hashes --no-header --no-annotate --no-emit-index-url
+without = $$(sed -n 's/^\([A-Za-z0-9._-]*\)==.*/--no-emit-package \1/p' $(1))
 
-lock: $(VENV)/.made # Compile requirements*.in into requirements*.txt with hashes (ARGS=--upgrade renews the versions)
+lock: $(VENV)/.made # Compile requirements/*.in into requirements/*.txt with hashes (ARGS=--upgrade renews the versions)
 	@test -x $(VENV)/.uv/bin/uv || { $(PY) -m venv $(VENV)/.uv && $(VENV)/.uv/bin/pip --quiet --quiet --disable-pip-version-check install uv; }
-	@$(LOCK) $(ARGS) requirements.in --output-file requirements.txt
-	@$(LOCK) $(ARGS) requirements-bench.in --constraint requirements.txt --output-file requirements-bench.txt \
-	  $$(sed -n 's/^\([A-Za-z0-9._-]*\)==.*/--no-emit-package \1/p' requirements.txt)
+	@mkdir -p build && cat $(LAYERS:%=requirements/%.txt) > build/lock.txt
+	@$(LOCK) $(ARGS) $(LAYERS:%=requirements/%.in) --output-file build/lock.txt
+	@for layer in $(LAYERS); do \
+	  if [ $$layer = run ]; then set --; else set -- $(call without,requirements/run.txt); fi; \
+	  $(LOCK) requirements/$$layer.in --constraint build/lock.txt --output-file requirements/$$layer.txt "$$@" || exit 1; \
+	done
+	@$(LOCK) $(ARGS) requirements/bench.in --constraint build/lock.txt --output-file requirements/bench.txt $(call without,build/lock.txt)
 
 audit: $(VENV)/.linked # Look the locked versions up for known vulnerabilities (ARGS="--advisories all.zip" without a network)
 	@test -x $(VENV)/.audit/bin/pip-audit || { $(PY) -m venv $(VENV)/.audit && $(VENV)/.audit/bin/pip --quiet --quiet --disable-pip-version-check install pip-audit; }
 	@$(PY) -m tests.audit $(ARGS)
 
-docs: $(VENV)/.linked # Build the documentation site into build/site
+docs: $(VENV)/.linked $(VENV)/.extras $(VENV)/.docs # Build the documentation site into build/site
 	@$(PY) .docs/build.py
 
 clean: # Remove what was built; .venv and bags/runs stay

@@ -18,6 +18,7 @@ from pendulum_msgs_py.contract.angles import wrap
 from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.parameters import ParameterSpec, suggestion, validate
 from pendulum_msgs_py.plants.plant_parameters import PlantParameters
+from pendulum_msgs_py.programs.extras import how_to_install
 
 __all__ = [
     "COMMON_PARAMETERS",
@@ -194,12 +195,17 @@ def controller_class(name: str) -> type[BaseController]:
     """Return the class behind a name of ``CONTROLLERS``.
 
     Raises:
-        ParameterError: No such controller; the message lists those there are.
+        ParameterError: No such controller; the message lists those there are. Or a library of it is not installed.
     """
     if not isinstance(name, str) or name not in CONTROLLERS:  # a file may say 7
         raise ParameterError(f"controller is {name!r}; {suggestion(name, CONTROLLERS)}")
     module, kind = CONTROLLERS[name].split(":")
-    return cast("type[BaseController]", getattr(importlib.import_module(module), kind))
+    try:
+        return cast("type[BaseController]", getattr(importlib.import_module(module), kind))
+    except ImportError as error:
+        if text := how_to_install(error):
+            raise ParameterError(f"controller {name}: {text}") from error
+        raise
 
 
 def controller_parameters(name: str) -> tuple[ParameterSpec, ...]:

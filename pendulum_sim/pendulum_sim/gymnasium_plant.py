@@ -30,6 +30,7 @@ from pendulum_msgs_py.contract.angles import wrap
 from pendulum_msgs_py.errors import FaultError, ParameterError
 from pendulum_msgs_py.parameters import load_yaml, reject_unknown, require_mapping
 from pendulum_msgs_py.plants.plant_parameters import PlantParameters, load_plant
+from pendulum_msgs_py.programs.extras import how_to_install
 from pendulum_sim.mujoco_mapping import FORMAT
 from pendulum_sim.plant import PlantState, check_start
 
@@ -110,9 +111,7 @@ def load_gymnasium_plant(
     try:
         import gymnasium
     except ImportError as error:
-        raise ParameterError(
-            "Gymnasium is not installed; expected it for environments: python -m pip install gymnasium"
-        ) from error
+        raise ParameterError(how_to_install(error) or f"Gymnasium cannot be imported: {error}") from error
     if env_id == "PendulumX59-v0":
         import pendulum_sim.environment  # noqa: F401  # registers it
     told = {**KNOWN.get(env_id.rpartition(":")[2], {}), **(adapter or {})}

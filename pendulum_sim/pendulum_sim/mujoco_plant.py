@@ -17,6 +17,7 @@ from pendulum_msgs_py.contract.angles import wrap
 from pendulum_msgs_py.contract.names import JOINT
 from pendulum_msgs_py.errors import FaultError, ParameterError
 from pendulum_msgs_py.plants.plant_parameters import PlantParameters
+from pendulum_msgs_py.programs.extras import how_to_install
 from pendulum_sim.mujoco_mapping import NO_ACTUATOR, MujocoMapping
 from pendulum_sim.plant import PlantState, check_start
 
@@ -61,9 +62,7 @@ def _import_mujoco() -> Any:
     try:
         import mujoco
     except ImportError as error:
-        raise ParameterError(
-            "MuJoCo is not installed; expected it for model files: python -m pip install mujoco"
-        ) from error
+        raise ParameterError(how_to_install(error) or f"MuJoCo cannot be imported: {error}") from error
     # It would write its warnings to a file of its own in the working folder; what they say is raised here.
     mujoco.set_mju_user_warning(lambda _text: None)
     return mujoco

@@ -21,6 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pendulum_msgs_py.errors import DataError
+from pendulum_msgs_py.programs.extras import how_to_install
 
 __all__ = ["read_bag_feedback"]
 
@@ -73,9 +74,7 @@ def _columns(folder: Path) -> dict[str, list[float]]:
         from rosbags.rosbag2 import Reader
         from rosbags.typesys import Stores, get_typestore
     except ImportError as error:
-        raise DataError(
-            f"bag {folder} needs rosbags to be read ({error}); install it with: pip install rosbags"
-        ) from error
+        raise DataError(how_to_install(error) or f"bag {folder} needs rosbags to be read: {error}") from error
     store = get_typestore(Stores.ROS2_JAZZY)
     _bound()
     columns: dict[str, list[float]] = {}

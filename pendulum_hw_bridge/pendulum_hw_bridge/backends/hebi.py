@@ -39,6 +39,7 @@ from pendulum_hw_bridge.gains import GainSet
 from pendulum_msgs_py.contract.values import NANOSECONDS
 from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.plants.lab_file import EMULATED_NETWORK
+from pendulum_msgs_py.programs.extras import how_to_install
 
 __all__ = ["HebiBackend", "connect_group", "new_command", "open_lookup"]
 
@@ -77,9 +78,7 @@ def _import_hebi() -> Any:
         with contextlib.redirect_stdout(io.StringIO()):
             import hebi
     except ImportError as error:
-        raise ActuatorError(
-            "not_installed", f"hebi-py cannot be imported ({error}); install it with: pip install hebi-py"
-        ) from error
+        raise ActuatorError("not_installed", how_to_install(error) or f"hebi-py cannot be imported: {error}") from error
     return hebi
 
 

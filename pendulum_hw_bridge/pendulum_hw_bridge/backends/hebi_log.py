@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from pendulum_hw_bridge.actuator import FEEDBACK_QUANTITIES, ActuatorError
 from pendulum_msgs_py.errors import DataError
+from pendulum_msgs_py.programs.extras import how_to_install
 
 __all__ = ["ATTRIBUTES", "read_hebilog", "start_log", "stop_log", "to_joint"]
 
@@ -117,9 +118,7 @@ def _open(path: Path) -> Any:
         with contextlib.redirect_stdout(io.StringIO()):
             from hebi.util import load_log
     except ImportError as error:
-        raise ActuatorError(
-            "not_installed", f"hebi-py cannot be imported ({error}); install it with: pip install hebi-py"
-        ) from error
+        raise ActuatorError("not_installed", how_to_install(error) or f"hebi-py cannot be imported: {error}") from error
     try:
         return load_log(str(path), load=False)
     except (OSError, RuntimeError) as error:

@@ -18,8 +18,9 @@ from difflib import get_close_matches
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from pendulum_msgs_py.errors import PendulumError
+from pendulum_msgs_py.errors import ParameterError, PendulumError
 from pendulum_msgs_py.programs import completion
+from pendulum_msgs_py.programs.extras import how_to_install
 
 if TYPE_CHECKING:
     import typer
@@ -32,6 +33,7 @@ __all__ = [
     "print_text",
     "report_error",
     "report_exhaustion",
+    "report_missing",
     "run_package",
     "summary",
 ]
@@ -81,7 +83,7 @@ def run_package(package: str, argv: Sequence[str] | None = None) -> int:
         print("interrupted", file=sys.stderr)
         return EXIT_INTERRUPTED
     except Exception as error:
-        if code := report_exhaustion(error):
+        if code := report_exhaustion(error) or report_missing(error):
             return code
         raise
 
@@ -120,6 +122,10 @@ def cli_main(
         sys.stdout.flush()
     except PendulumError as error:
         return report_error(error)
+    except ImportError as error:
+        if code := report_missing(error):
+            return code
+        raise
     except (typer.Abort, KeyboardInterrupt):
         print("interrupted", file=sys.stderr)
         return EXIT_INTERRUPTED
@@ -178,6 +184,12 @@ def report_exhaustion(error: BaseException) -> int:
     first = text.splitlines()[0] if text else "no more could be had"
     print(f"error: memory is exhausted: {first}", file=sys.stderr, flush=True)
     return 1
+
+
+def report_missing(error: BaseException) -> int:
+    """Say in one sentence which library is missing and how to get it; return the exit code, 0 for other errors."""
+    text = how_to_install(error) if isinstance(error, ImportError) else ""
+    return report_error(ParameterError(text)) if text else 0
 
 
 _SIGNS_OF_EXHAUSTION = (

@@ -37,6 +37,7 @@ from pendulum_msgs_py.programs.executables import (
     print_text,
     report_error,
     report_exhaustion,
+    report_missing,
     split_ros_arguments,
 )
 from pendulum_msgs_py.ros.answers import answer_who_listens
@@ -159,9 +160,10 @@ def _run(make_node: Callable[[Callable[[], None]], Node], arguments: Sequence[st
     except PendulumError as error:
         exit_code = report_error(error)
     except Exception as error:  # noqa: BLE001  # printed in full, and the plant is made safe
-        if not report_exhaustion(error):
+        exit_code = report_exhaustion(error) or report_missing(error)
+        if not exit_code:
             traceback.print_exc()
-        exit_code = 1
+            exit_code = 1
     finally:
         exit_code = _close(node, executor) or exit_code
         # The interpreter gives signals their default back while it ends, and a launcher repeats the terminal's SIGINT:

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from pendulum_bags.runs.run_folder import write_json
 from pendulum_msgs_py.errors import BagError, FaultError, ParameterError
+from pendulum_msgs_py.programs.extras import how_to_install
 
 __all__ = [
     "Connect",
@@ -124,7 +125,9 @@ def cluster_client(scheduler: str = "", workers: int = 0) -> Iterator[Any]:
     try:
         from distributed import Client, LocalCluster
     except ImportError as error:
-        raise ParameterError(f"workers and schedulers need dask.distributed: {error}") from error
+        raise ParameterError(
+            how_to_install(error) or f"workers and schedulers need dask.distributed: {error}"
+        ) from error
     if scheduler:
         try:
             client = Client(scheduler, timeout=_CONNECT_TIMEOUT)
@@ -244,5 +247,6 @@ def _arrow() -> tuple[Any, Any]:
         import pyarrow.parquet
     except ImportError as error:
         reason = str(error).splitlines()[0]
-        raise ParameterError(f"Parquet needs pyarrow, which cannot be imported: {reason}") from error
+        text = how_to_install(error) or f"Parquet needs pyarrow, which cannot be imported: {reason}"
+        raise ParameterError(text) from error
     return pyarrow, pyarrow.parquet

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pendulum_msgs_py.errors import BagError, ParameterError
+from pendulum_msgs_py.programs.extras import how_to_install
 from pendulum_rosbag.reader.bag import Bag
 from pendulum_rosbag.reader.decode import store_for
 from pendulum_rosbag.reader.topic_info import TopicInfo
@@ -154,7 +155,8 @@ def _require_pyarrow() -> None:
         import pyarrow  # noqa: F401
     except ImportError as error:
         reason = str(error).splitlines()[0]
-        raise ParameterError(f"format parquet needs pyarrow, which cannot be imported: {reason}") from error
+        text = how_to_install(error) or f"format parquet needs pyarrow, which cannot be imported: {reason}"
+        raise ParameterError(text) from error
 
 
 def _flat(value: Any, prefix: str = "") -> dict[str, Any]:

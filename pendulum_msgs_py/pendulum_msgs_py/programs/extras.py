@@ -1,0 +1,66 @@
+"""What to install where a library is missing: the extra of one of our packages that brings it, in a sentence."""
+
+from __future__ import annotations
+
+import re
+from importlib.metadata import PackageNotFoundError, requires
+
+__all__ = ["extra_of", "how_to_install"]
+
+_PACKAGES = (
+    "pendulum_msgs_py",
+    "pendulum_rosbag",
+    "pendulum_sim",
+    "pendulum_lqr",
+    "pendulum_hw_bridge",
+    "pendulum_bags",
+)
+_DISTRIBUTIONS = {"hebi": "hebi-py", "PIL": "pillow", "dask": "distributed"}
+"""Module -> what pip calls it, where the names differ."""
+_REQUIREMENT = re.compile(r"^([A-Za-z0-9._-]+)[^;]*(?:;.*extra\s*==\s*[\"']([\w-]+)[\"'])?")
+
+
+def extra_of(module: str) -> str:
+    """Return the extra that brings a module, as ``pendulum_bags[console]``; the package alone where it always does.
+
+    Args:
+        module: What is imported; of ``a.b`` only ``a`` counts.
+
+    Returns:
+        Empty where no installed package of ours needs it.
+    """
+    top = module.partition(".")[0]
+    wanted = {_plain(_DISTRIBUTIONS.get(top, top)), _plain(f"ros-{top}")}
+    for package in _PACKAGES:
+        try:
+            entries = requires(package) or []
+        except PackageNotFoundError:
+            continue
+        for entry in entries:
+            found = _REQUIREMENT.match(entry)
+            if found and _plain(found[1]) in wanted:
+                return f"{package}[{found[2]}]" if found[2] else package
+    return ""
+
+
+def how_to_install(error: ImportError) -> str:
+    """Return a sentence that says which library is missing and how to get it.
+
+    Args:
+        error: What an import of it raised.
+
+    Returns:
+        Empty where the library is none that a package of ours names.
+    """
+    module = error.name if isinstance(error, ModuleNotFoundError) else None
+    extra = extra_of(module) if module else ""
+    if not module or not extra:
+        return ""
+    return (
+        f"{module.partition('.')[0]} is not installed; expected what this program needs beyond the rest: "
+        f"make extras, or python -m pip install '{extra}'"
+    )
+
+
+def _plain(name: str) -> str:
+    return re.sub(r"[-_.]+", "-", name).lower()
