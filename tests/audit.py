@@ -25,6 +25,7 @@ from packaging.version import InvalidVersion, Version
 from pendulum_msgs_py.errors import DataError
 from pendulum_msgs_py.programs.executables import cli_main
 from pendulum_msgs_py.programs.terminal import WholeTable, make_console
+from tests.fixtures import PROJECT
 
 __all__ = ["Finding", "from_advisories", "from_pip_audit", "pinned"]
 
@@ -128,8 +129,9 @@ def _version(text: str) -> Version:
         return Version("0")
 
 
-def _ask_pip_audit(program: Path, lock: Path) -> Mapping[str, Any]:
-    command = [str(program), "--no-deps", "--disable-pip", "--progress-spinner", "off", "-r", str(lock), "-f", "json"]
+def _ask_pip_audit(program: Path, locks: Sequence[Path]) -> Mapping[str, Any]:
+    asked = [word for lock in locks for word in ("-r", str(lock))]
+    command = [str(program), "--no-deps", "--disable-pip", "--progress-spinner", "off", *asked, "-f", "json"]
     try:
         done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=600)
     except (OSError, subprocess.TimeoutExpired) as error:
@@ -144,9 +146,9 @@ def _ask_pip_audit(program: Path, lock: Path) -> Mapping[str, Any]:
     return report
 
 
-@app.command(epilog="Example: python -m tests.audit --advisories all.zip requirements.txt")
+@app.command(epilog="Example: python -m tests.audit --advisories all.zip requirements/run.txt")
 def audit(
-    lock: Annotated[Path, typer.Argument(help="Lock to audit.")] = Path("requirements.txt"),
+    locks: Annotated[list[Path] | None, typer.Argument(help="Locks to audit; by default all layers.")] = None,
     program: Annotated[Path, typer.Option(help="pip-audit.")] = Path(sys.prefix, ".audit", "bin", "pip-audit"),
     advisories: Annotated[
         Path | None, typer.Option(help="Look there instead of on PyPI: PyPI/all.zip of osv.dev.")
@@ -154,29 +156,34 @@ def audit(
     as_json: Annotated[bool, typer.Option("--json", help="Print the result as JSON.")] = False,
 ) -> int:
     """Look the pinned versions up; code 1 for known vulnerabilities, 2 where they could not be looked up."""
-    try:
-        pins = pinned(lock.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise DataError(f"lock {lock} cannot be read: {error.strerror}") from error
-    if not pins:
-        raise DataError(f"lock {lock} pins nothing; expected lines such as numpy==1.26.4")
+    locks = locks or sorted((PROJECT / "requirements").glob("*.txt"))
+    pins: dict[str, str] = {}
+    for lock in locks:
+        try:
+            found = pinned(lock.read_text(encoding="utf-8"))
+        except OSError as error:
+            raise DataError(f"lock {lock} cannot be read: {error.strerror}") from error
+        if not found:
+            raise DataError(f"lock {lock} pins nothing; expected lines such as numpy==1.26.4")
+        pins.update(found)
     if advisories is not None:
         looked_up, findings = set(pins), from_advisories(advisories, pins)
     else:
-        looked_up, findings = from_pip_audit(_ask_pip_audit(program, lock))
+        looked_up, findings = from_pip_audit(_ask_pip_audit(program, locks))
         if not looked_up:
             raise DataError(
-                f"none of the {len(pins)} pins of {lock} could be looked up: PyPI's data on vulnerabilities "
-                "(https://pypi.org/pypi/NAME/VERSION/json) cannot be reached from here; nothing was audited"
+                f"none of the {len(pins)} pins of {', '.join(map(str, locks))} could be looked up: PyPI's data on "
+                "vulnerabilities (https://pypi.org/pypi/NAME/VERSION/json) cannot be reached from here; "
+                "nothing was audited"
             )
     if as_json:
-        content = {"pins": len(pins), "looked_up": len(looked_up), "findings": [vars(found) for found in findings]}
+        content = {"pins": len(pins), "looked_up": len(looked_up), "findings": [vars(finding) for finding in findings]}
         print(json.dumps(content, indent=2))
         return 1 if findings else 0
     if findings:
         table = WholeTable("package", "version", "advisory", "fixed in", title="Known vulnerabilities")
-        for found in findings:
-            table.add_row(found.package, found.version, found.advisory, found.fixed_in)
+        for finding in findings:
+            table.add_row(finding.package, finding.version, finding.advisory, finding.fixed_in)
         make_console().print(table)
     # Wheels of ROS come from another index; nobody collects advisories on them.
     left_out = f"; not known there: {', '.join(missing)}" if (missing := sorted(set(pins) - looked_up)) else ""

@@ -60,7 +60,7 @@ def test_the_page_installs_what_rosdep_has_no_key_for() -> None:
 
 
 def test_what_the_page_says_of_other_processors_is_about_pins_of_the_lock() -> None:
-    lock = (PROJECT / "requirements.txt").read_text(encoding="utf-8")
+    lock = "".join(path.read_text(encoding="utf-8") for path in (PROJECT / "requirements").glob("*.txt"))
     table = PAGE.split("## arm64")[1]
     named = re.findall(r"^\| `([a-z0-9-]+)==([^`]+)`", table, re.MULTILINE)
     assert named

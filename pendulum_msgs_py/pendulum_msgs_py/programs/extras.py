@@ -57,8 +57,8 @@ def how_to_install(error: ImportError) -> str:
     if not module or not extra:
         return ""
     return (
-        f"{module.partition('.')[0]} is not installed; expected what this program needs beyond the rest: "
-        f"make extras, or python -m pip install '{extra}'"
+        f"{module.partition('.')[0]} is not installed, which this needs; "
+        f"install it with make extras, or python -m pip install '{extra}'"
     )
 
 

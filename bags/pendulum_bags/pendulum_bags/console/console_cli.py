@@ -11,6 +11,8 @@ import os
 import threading
 from collections.abc import Sequence
 
+from pendulum_msgs_py.programs.executables import report_missing
+
 __all__ = ["main"]
 
 _NICENESS = 10
@@ -28,7 +30,13 @@ def main(argv: Sequence[str] | None = None) -> int:
     loading = threading.Thread(target=_load)
     loading.start()
     loading.join()
-    return int(importlib.import_module(_CONSOLE).main(list(argv) if argv is not None else None))
+    try:
+        console = importlib.import_module(_CONSOLE)
+    except ImportError as error:
+        if code := report_missing(error):
+            return code
+        raise
+    return int(console.main(list(argv) if argv is not None else None))
 
 
 def _load() -> None:
