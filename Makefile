@@ -77,7 +77,7 @@ lint: $(VENV)/.checks # Check style and format with ruff
 format: $(VENV)/.checks # Format every file with ruff
 	@$(PY) -m ruff format
 
-types: $(VENV)/.linked $(VENV)/.checks # Check types with mypy
+types: $(VENV)/.linked $(VENV)/.extras $(VENV)/.checks $(VENV)/.test # Check types with mypy
 	@$(PY) -m mypy $(ARGS)
 
 imports: $(VENV)/.linked $(VENV)/.checks # Check which package and which module may import what
