@@ -55,16 +55,20 @@ def block_loop(run_block: Any, lanes: int) -> Any:
         for block in numba.prange((size + lanes - 1) // lanes):
             first = block * lanes
             last = min(first + lanes, size)
-            # One array with rows at fixed distances: the compiler sees that no row overlaps another.
-            w = np.empty((rows, lanes))
+            # One array with rows at fixed distances: the compiler sees that no row overlaps another. Loops, because
+            # assignments of slices take it far longer to compile.
+            w = np.empty(rows * lanes)
             block_keys = np.empty(lanes, dtype=np.uint64)
             for j in range(lanes):
                 # A block that is not full repeats its last plant.
                 source = min(first + j, size - 1)
-                w[:, j] = columns[:, source]
                 block_keys[j] = keys[source]
-            run_block(w.reshape(-1), block_keys, target, step, steps, hold, more, record[:, :, first:last])
-            columns[:, first:last] = w[:, : last - first]
+                for row in range(rows):
+                    w[row * lanes + j] = columns[row, source]
+            run_block(w, block_keys, target, step, steps, hold, more, record[:, :, first:last])
+            for row in range(rows):
+                for j in range(last - first):
+                    columns[row, first + j] = w[row * lanes + j]
 
     return run
 
@@ -195,7 +199,8 @@ def general_kernel(method: str) -> Any:
             wanted = min(limit, max(-limit, control + disturbance))
             if record.shape[0] > 0:
                 record[k, 0], record[k, 1], record[k, 2] = x, v, wanted
-            line[:-1] = line[1:]
+            for index in range(whole + 1):
+                line[index] = line[index + 1]
             line[whole + 1] = wanted
             for part in range(2):
                 command = line[part]
@@ -217,10 +222,13 @@ def general_kernel(method: str) -> Any:
         columns: Any, delays: Any, keys: Any, target: float, dt: float, steps: int, hold: int, substeps: int,
         record: Any,
     ) -> None:  # fmt: skip
-        size = columns.shape[1]
+        rows, size = columns.shape
         for j in numba.prange(size):
-            w = columns[:, j].copy()
+            w = np.empty(rows)
+            for row in range(rows):
+                w[row] = columns[row, j]
             run_one(w, delays[j], keys[j], target, dt, steps, hold, substeps, record[:, :, j])
-            columns[:, j] = w
+            for row in range(rows):
+                columns[row, j] = w[row]
 
     return run

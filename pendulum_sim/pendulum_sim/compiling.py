@@ -46,8 +46,11 @@ def compile_tree(function: Callable[..., Any], *, vector: bool = False) -> Any:
             elif vector and isinstance(value, ModuleType) and value is math:
                 scope[name] = _vector_module
         copy = FunctionType(function.__code__, scope, function.__name__, function.__defaults__, function.__closure__)
-        # Contraction (a fused multiply-add) changes the last bit at most; nothing else of fastmath is allowed.
-        _cache[key] = numba.njit(copy, fastmath={"contract"}, error_model="numpy", forceinline=vector)
+        # Contraction (a fused multiply-add) changes the last bit at most; nothing else of fastmath is allowed. C code
+        # calls none of these: a wrapper for it would only cost time to compile.
+        _cache[key] = numba.njit(
+            copy, fastmath={"contract"}, error_model="numpy", forceinline=vector, no_cfunc_wrapper=True
+        )
     return _cache[key]
 
 
@@ -72,4 +75,4 @@ def tuple_loader(length: int, stride: int) -> Any:
             # Not (*others, x): compilers of Python 3.10 to 3.12 spell that differently, and numba follows late.
             return others(array, start) + (array[start + offset],)  # noqa: RUF005
 
-    return numba.njit(load, forceinline=True)
+    return numba.njit(load, forceinline=True, no_cfunc_wrapper=True)

@@ -183,8 +183,11 @@ def general_joints_kernel(layout: Layout) -> Any:
         torque = still
         for k in range(steps):
             control(w, keys, goal, k, hold, record)
-            line[:-1] = line[1:].copy()
-            line[whole + 1] = w[o_effort : o_effort + n]
+            for index in range(whole + 1):
+                for i in range(n):
+                    line[index, i] = line[index + 1, i]
+            for i in range(n):
+                line[whole + 1, i] = w[o_effort + i]
             q, v = load(w, o_q), load(w, o_v)
             for part in range(2):
                 share = periods - whole if part == 0 else 1.0 - (periods - whole)
