@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import re
 import shutil
+from dataclasses import replace
 from pathlib import Path
 from xml.etree import ElementTree
 
@@ -19,8 +20,9 @@ from pendulum_bags.figures.render_plotly import graphs_of
 from pendulum_bags.report import FIGURES, write_report
 from pendulum_bags.report.data import ReportData
 from pendulum_bags.report.figures import comparison_figures, make_figures
+from pendulum_bags.report.provenance import provenance_table, settings_table
 from pendulum_bags.report.report_cli import main
-from pendulum_bags.report.tables import make_tables, provenance_table
+from pendulum_bags.report.tables import make_tables
 from pendulum_bags.report.terms import Terms
 from pendulum_bags.report.wording import name_in
 from pendulum_bags.report.write import _title
@@ -77,6 +79,50 @@ def test_a_figure_that_the_data_do_not_allow_says_why(comparison: Comparison) ->
     made, missing = make_figures(ReportData(comparison, comparison.to_json()))
     assert len(made) + len(missing) == len(FIGURES)
     assert dict(missing)["All runs"] == "needs at least two runs"
+
+
+def test_provenance_tells_when_where_and_by_which_command_and_what_every_node_was_set_to(
+    comparison: Comparison,
+) -> None:
+    told = {
+        "pendulum.run": {"command": "python -m pendulum_bags experiment thesis"},
+        "pendulum.recorder": {
+            "started_ns": 1_795_309_798_590_099_724,
+            "host": "bench",
+            "system": "Linux-6",
+            "rmw": "dds",
+        },
+        "pendulum.parameters": {"/sim/simulator": {"rate_hz": 500.0, "plant": "thesis"}},
+    }
+    pair = comparison.pairs[0]
+    other = {"pendulum.recorder": {"host": "robot"}, "pendulum.parameters": {"/hw/bridge": {"velocity_limit": 1.5}}}
+    pairs = [
+        replace(
+            pair, simulation=replace(pair.simulation, metadata=told), hardware=replace(pair.hardware, metadata=other)
+        )
+    ]
+    data = ReportData(replace(comparison, pairs=pairs), {})
+    rows = provenance_table(data).rows
+    assert ("recorded", "2026-11-22 01:09 UTC") in rows
+    assert ("command", "python -m pendulum_bags experiment thesis") in rows
+    assert [value for what, value in rows if what == "computer"] == ["bench · Linux-6 · dds", "robot"]
+    settings = settings_table(data)
+    assert settings is not None
+    assert dict(settings.rows) == {
+        "/sim/simulator": "plant 'thesis'; rate_hz 500.0",
+        "/hw/bridge": "velocity_limit 1.5",
+    }
+    # A foreign bag may have anything under these names.
+    strange = {"pendulum.recorder": "by hand", "pendulum.parameters": {"/a": 3}}
+    pairs = [
+        replace(
+            each, simulation=replace(each.simulation, metadata=strange), hardware=replace(each.hardware, metadata={})
+        )
+        for each in pairs
+    ]
+    data = ReportData(replace(comparison, pairs=pairs), {})
+    assert settings_table(data) is None
+    assert not {"recorded", "command", "computer"} & {what for what, _ in provenance_table(data).rows}
 
 
 def test_page_is_complete_in_itself_and_small(page: Path) -> None:

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from pendulum_bags.experiments.simulation import ForeignSimulation
-from pendulum_bags.runs.run_folder import git_revision, versions
+from pendulum_bags.runs.run_folder import provenance
 from pendulum_bags.runs.run_record import RUN_RECORD
 from pendulum_lqr.controller import controller_parameters
 from pendulum_lqr.disturbance import DISTURBANCE_SPECS
@@ -216,8 +216,7 @@ class RunSpec:
                 "namespace": self.namespace,
                 "disturbance": self.disturbance_parameters(),
                 "controller": {"kind": self.controller, **self.controller_parameters},
-                "versions": versions(),
-                "git_revision": git_revision(),
+                **provenance(),
             }
         }
 

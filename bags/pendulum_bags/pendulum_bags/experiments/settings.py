@@ -10,7 +10,7 @@ from typing import Any
 from pendulum_bags.experiments.operator import RealMachine, real_machine
 from pendulum_bags.experiments.run_spec import EMULATOR_LIFETIME, EMULATOR_WATCHDOG, THESIS_METHOD, integrator_of
 from pendulum_bags.experiments.simulation import ForeignSimulation
-from pendulum_bags.runs.run_folder import git_revision, versions
+from pendulum_bags.runs.run_folder import provenance
 from pendulum_bags.runs.run_record import RUN_RECORD
 from pendulum_lqr.controller import controller_parameters
 from pendulum_msgs_py.errors import ParameterError
@@ -194,8 +194,7 @@ class RegulationSettings:
                 "seed": self.noise.seed,
                 "disturbance": {"kind": "uniform", **asdict(self.noise)},
                 "controller": {"kind": self.controller, **self.tuning},
-                "versions": versions(),
-                "git_revision": git_revision(),
+                **provenance(),
                 **({} if (foreign := self.foreign) is None else {"simulation": foreign.to_json()}),
                 **({} if (machine := self.machine) is None else {"lab": dict(machine.lab.values)}),
                 **more,

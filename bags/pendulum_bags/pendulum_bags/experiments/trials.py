@@ -16,7 +16,7 @@ from pendulum_bags.experiments.progress import PhaseProgress
 from pendulum_bags.experiments.run_spec import EMULATOR_LIFETIME, EMULATOR_WATCHDOG
 from pendulum_bags.experiments.settings import HARDWARE
 from pendulum_bags.experiments.thesis import LOOP_NICENESS, START_TIMEOUT
-from pendulum_bags.runs.run_folder import git_revision, versions, write_json
+from pendulum_bags.runs.run_folder import provenance, write_json
 from pendulum_bags.runs.run_record import RUN_RECORD
 from pendulum_msgs_py.contract import names
 from pendulum_msgs_py.contract.names import Event
@@ -282,7 +282,6 @@ def _metadata(settings: TrialSettings, trial: int) -> dict[str, object]:
             "flat": kind.flat,
             "clock": "lockstep" if settings.lockstep else "realtime",
             "namespace": "/hw",
-            "versions": versions(),
-            "git_revision": git_revision(),
+            **provenance(),
         }
     }

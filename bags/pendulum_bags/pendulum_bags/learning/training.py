@@ -21,7 +21,7 @@ from pendulum_bags.learning.evaluation import gymnasium_return, measured_success
 from pendulum_bags.learning.pendulum_v1 import PLANT, STEP, PendulumV1
 from pendulum_bags.learning.ppo import Ppo, PpoSettings
 from pendulum_bags.learning.task import SwingUpTask, ranges_of
-from pendulum_bags.runs.run_folder import git_revision, versions
+from pendulum_bags.runs.run_folder import provenance
 from pendulum_lqr.policy import Network, Policy
 from pendulum_lqr.policy_file import write_policy
 from pendulum_msgs_py.contract.names import JOINT
@@ -172,15 +172,15 @@ def _policy(settings: Training, learner: Ppo, fastest: float, evaluation: Mappin
     network = Network(
         tuple(np.ascontiguousarray(each.T) for each in parameters[::2]), tuple(each.copy() for each in parameters[1::2])
     )
-    provenance = {
+    origin = {
         "training": settings.to_json(), "steps": settings.steps, "evaluation": dict(evaluation),
-        "versions": versions(), "git_revision": git_revision(),
+        **provenance(),
     }  # fmt: skip
     plant, task = settings.plant, settings.swing_up
     common: dict[str, Any] = {
         "network": network, "task": settings.task, "joints": (JOINT,), "plant": plant,
         "ranges": settings.ranges, "effort_limit": (plant.effort_limit,), "angle_box": (math.pi,),
-        "provenance": provenance, "name": f"{plant.name} {settings.task} seed {settings.seed}",
+        "provenance": origin, "name": f"{plant.name} {settings.task} seed {settings.seed}",
     }  # fmt: skip
     if settings.task == "pendulum_v1":
         return Policy(

@@ -14,7 +14,7 @@ from pendulum_bags.figures.render_plotly import graphs_of
 from pendulum_bags.figures.table import Table
 from pendulum_bags.report.animation import animation_of
 from pendulum_bags.report.data import ReportData
-from pendulum_bags.report.tables import provenance_table
+from pendulum_bags.report.provenance import provenance_table, settings_table
 from pendulum_bags.report.terms import Terms
 from pendulum_bags.report.wording import name_in
 from pendulum_bags.runs.run_data import timing_warning
@@ -106,7 +106,7 @@ def render_page(
         facts=name_in(_facts(data), emulated=emulated),
         sections=sections,
         missing=missing,
-        provenance=provenance_table(data),
+        provenance=[table for table in (provenance_table(data), settings_table(data)) if table is not None],
         animation=script_json(animation_of(data)),
         graphs=script_json(graphs),
         plotly=packed_plotly(),

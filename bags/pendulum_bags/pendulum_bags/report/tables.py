@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Mapping
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -15,14 +13,13 @@ from pendulum_bags.figures.table import Table
 from pendulum_bags.report.data import ReportData
 from pendulum_bags.report.trial_figures import GRAVITY, INERTIA, UNITS
 from pendulum_bags.report.trials import TrialSet
-from pendulum_bags.runs.run_record import run_record
 from pendulum_bags.verdict import Layer, LayerResult, Mark
 from pendulum_bags.verdict.evidence import evidence_table
 from pendulum_lqr.design import output_lqr
 from pendulum_lqr.model import linearise, sort_poles
-from pendulum_msgs_py.plants.plant_parameters import PLANT_SPECS, PlantParameters
+from pendulum_msgs_py.plants.plant_parameters import PLANT_SPECS
 
-__all__ = ["citation", "make_tables", "provenance_table"]
+__all__ = ["make_tables", "typeset"]
 
 WEIGHTS = ((1.0, 0.01, 0.1), (1.0, 0.1, 0.1), (100.0, 0.01, 0.1), (100.0, 0.1, 0.1))
 """q11, q22 and r of the combinations in the thesis."""
@@ -64,7 +61,8 @@ def _plants(data: ReportData) -> Table:
     sentence = (
         f"Torque stays below {quantity(max(sim['max_abs_u'], hw['max_abs_u']), 'N m')} on both plants; "
         f"{int(sim['missed_deadlines'])} deadlines were missed in simulation and {int(hw['missed_deadlines'])} on "
-        "hardware."
+        "hardware. These are all samples; the tests take both motions at one phase of the noise and in one band, so "
+        "their ratios may differ."
     )
     return Table("Plants under noise", sentence, ("", *(_PLANT_NAMES[name] for name in plants)), rows, "Verdict")
 
@@ -219,7 +217,7 @@ def _model(data: ReportData) -> Table | None:
     if plant is None:
         return None
     rows = [
-        (spec.name, quantity(getattr(plant, spec.name), "", 6), _typeset(spec.unit), _typeset(spec.description))
+        (spec.name, quantity(getattr(plant, spec.name), "", 6), typeset(spec.unit), typeset(spec.description))
         for spec in PLANT_SPECS
     ]
     sentence = f"Simulation and design of the controller use the plant {plant.name!r}: M θ″ + b θ′ + G sin θ = u + d."
@@ -267,72 +265,14 @@ def _regression(trials: TrialSet) -> list[Table]:
     ]
 
 
-def provenance_table(data: ReportData) -> Table:
-    """Return where the data come from: bags, seed, strategy, versions, settings."""
-    summary, run = data.summary, data.run
-    rows: list[tuple[str, str]] = [
-        ("seed", str(summary.get("seed", "unknown"))),
-        ("effort strategy", str(summary.get("strategy", "unknown"))),
-        ("revision", str(run.get("git_revision") or summary.get("git_revision") or "unknown")),
-    ]
-    for pair in data.comparison.pairs:
-        for one in (pair.simulation, pair.hardware):
-            name = run_record(one.metadata).get("plant", "unknown")
-            rows.append((f"bag of the {one.label}", f"{_short_path(one.source)} (plant {name})"))
-            rows += [(f"damage of the {one.label}'s bag", text) for text in one.damage]
-    for run_data in data.comparison.own:
-        if all(run_data is not pair.simulation for pair in data.comparison.pairs):
-            rows.append((f"bag of the {run_data.label}", _short_path(run_data.source)))
-    for key in ("controller", "disturbance"):
-        if key in run:
-            rows.append((key, json.dumps(run[key])))
-    if data.plant is not None:
-        rows.append(("plant of the design", _plant_in_words(data.plant)))
-    versions = summary.get("versions") or run.get("versions") or {}
-    rows.append(("cite as", citation(str(versions.get("pendulum_bags", "")), rows[2][1])))
-    rows += [(f"version of {name}", str(version)) for name, version in versions.items()]
-    return Table(
-        "Provenance",
-        "Everything that is needed to make these figures again: seeds, parameters, versions and the git revision of "
-        "the run (+changes: edits were not committed).",
-        ("what", "value"),
-        rows,
-        "Provenance",
-    )
-
-
-_CITED = "Pendulum maintainers: Pendulum: is your simulation good enough to design a controller on?"
-
-
-def citation(version: str, revision: str) -> str:
-    """Return how to cite the software that made a report, as CITATION.cff at the project's root says it."""
-    told = f", version {version}" if version else ""
-    return f"{_CITED}{told}, git {revision}."
-
-
-def _plant_in_words(plant: PlantParameters) -> str:
-    """Return the parameters of a plant that are not zero, with units."""
-    told = [
-        f"{spec.name} {quantity(float(value), '' if spec.unit == '-' else _typeset(spec.unit), 5)}"
-        for spec in PLANT_SPECS
-        if (value := getattr(plant, spec.name)) != 0.0
-    ]
-    return f"{plant.name}: {', '.join(told)}"
-
-
 _TYPESET = {"^2": "²", ">=": "≥", "theta'": "θ′", "theta": "θ", "tau_C": "τ_C", "tau_S": "τ_S", "1/s": "s⁻¹"}
 
 
-def _typeset(text: str) -> str:
+def typeset(text: str) -> str:
     """Return a unit or a meaning as it is printed, not as a terminal shows it."""
     for plain, printed in _TYPESET.items():
         text = text.replace(plain, printed)
     return "–" if text == "-" else text
-
-
-def _short_path(path: str) -> str:
-    """Return folder and bag: the rest of the path is nobody else's business."""
-    return "/".join(Path(path).parts[-2:])
 
 
 def _cell(value: Any, digits: int) -> str:

@@ -6,8 +6,10 @@ import importlib.metadata
 import json
 import os
 import platform
+import shlex
 import shutil
 import subprocess
+import sys
 from datetime import datetime, timezone
 from pathlib import Path
 from typing import Any
@@ -21,6 +23,7 @@ __all__ = [
     "git_revision",
     "is_repeat",
     "pair_folders",
+    "provenance",
     "read_looks",
     "read_stalls",
     "versions",
@@ -145,6 +148,15 @@ def versions() -> dict[str, str]:
         except importlib.metadata.PackageNotFoundError:
             continue
     return found
+
+
+def provenance() -> dict[str, Any]:
+    """Return what made a run or a file: versions, revision, and the command line as it was typed."""
+    return {
+        "versions": versions(),
+        "git_revision": git_revision(),
+        "command": shlex.join(["python", *sys.orig_argv[1:]]),
+    }
 
 
 def git_revision() -> str:
