@@ -7,4 +7,5 @@ EXECUTABLES: dict[str, str] = {
     "disturbance": "pendulum_lqr.disturbance_node:main",
     "effort_adapter": "pendulum_lqr.effort_adapter_node:main",
     "design": "pendulum_lqr.design_cli:main",
+    "swing_up": "pendulum_lqr.swing_up_cli:main",
 }

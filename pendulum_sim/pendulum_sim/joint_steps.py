@@ -18,6 +18,7 @@ from collections.abc import Callable
 from typing import Any
 
 from pendulum_msgs_py.dynamics import friction_magnitude
+from pendulum_msgs_py.dynamics.runge_kutta import along_1, along_2, rk4_joints
 from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.plants.mechanism_parameters import MechanismParameters
 from pendulum_sim.dry_friction import actuator_torque, narrowed
@@ -30,16 +31,6 @@ JointTable = tuple[tuple[float, ...], ...]
 _MAX_EVENTS = 12
 _MAX_ROOT_STEPS = 60
 _FAR = 1e300
-
-
-def along_1(q: Any, h: Any, v: Any) -> Any:
-    """Return q + h v, of one joint."""
-    return (q[0] + h * v[0],)
-
-
-def along_2(q: Any, h: Any, v: Any) -> Any:
-    """Return q + h v, of two joints."""
-    return q[0] + h * v[0], q[1] + h * v[1]
 
 
 def put_1(_values: Any, _index: int, value: Any) -> Any:
@@ -90,37 +81,6 @@ def pack_joints(parameters: MechanismParameters) -> JointTable:
         tuple(-_FAR if joint.lower_stop is None else joint.lower_stop for joint in joints),
         tuple(_FAR if joint.upper_stop is None else joint.upper_stop for joint in joints),
         tuple(0.0 if joint.actuator is None else joint.actuator.time_constant for joint in joints),
-    )
-
-
-def rk4_joints(
-    forward: Any, along: Any, q: Any, v: Any, torque_0: Any, torque_mid: Any, torque_1: Any, h: float, p: Any
-) -> Any:
-    """Return (q, v) after a step h of the smooth equations, by the classical Runge-Kutta method of order four.
-
-    Args:
-        forward: The mechanism's equation.
-        along: Of :func:`joint_functions`.
-        q: Positions [rad or m].
-        v: Velocities.
-        torque_0: Efforts at the start of the step, of all joints [N m or N].
-        torque_mid: In its middle.
-        torque_1: At its end.
-        h: Step [s].
-        p: The mechanism's parameters.
-    """
-    half = 0.5 * h
-    a_1 = forward(q, v, torque_0, p)
-    v_2 = along(v, half, a_1)
-    a_2 = forward(along(q, half, v), v_2, torque_mid, p)
-    v_3 = along(v, half, a_2)
-    a_3 = forward(along(q, half, v_2), v_3, torque_mid, p)
-    v_4 = along(v, h, a_3)
-    a_4 = forward(along(q, h, v_3), v_4, torque_1, p)
-    sixth, third = h / 6.0, h / 3.0
-    return (
-        along(along(along(along(q, sixth, v), third, v_2), third, v_3), sixth, v_4),
-        along(along(along(along(v, sixth, a_1), third, a_2), third, a_3), sixth, a_4),
     )
 
 

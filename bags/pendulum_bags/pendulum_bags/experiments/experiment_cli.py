@@ -28,6 +28,7 @@ from pendulum_bags.experiments.trials_cli import add_commands as add_trial_comma
 from pendulum_bags.frequency_response.frequency_response_cli import experiment as frequency_response
 from pendulum_bags.runs.run_folder import create_run_folder, discard_if_empty, versions, write_json
 from pendulum_bags.studies.leaderboard_cli import leaderboard
+from pendulum_bags.studies.mechanism_benchmark_cli import benchmark
 from pendulum_bags.studies.monte_carlo_cli import monte_carlo
 from pendulum_bags.studies.region_cli import region_of_attraction
 from pendulum_bags.studies.study_cli import add_commands as add_study_commands
@@ -229,6 +230,7 @@ add_study_commands(app)
 app.command(name="monte_carlo")(monte_carlo)
 app.command(name="region_of_attraction")(region_of_attraction)
 app.command(name="leaderboard")(leaderboard)
+app.command(name="benchmark")(benchmark)
 app.command(name="frequency_response")(frequency_response)
 
 

@@ -1,0 +1,137 @@
+"""``experiment benchmark``: the public double-pendulum benchmark, our controllers beside its published rows."""
+
+from __future__ import annotations
+
+import json
+import multiprocessing
+import os
+import time
+from collections.abc import Sequence
+from concurrent.futures import ProcessPoolExecutor
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+from rich.console import Console
+
+from pendulum_msgs_py.programs.counted_progress import counting_bar
+from pendulum_msgs_py.programs.executables import EXIT_INTERRUPTED
+from pendulum_msgs_py.programs.terminal import WholeTable, make_console
+
+if TYPE_CHECKING:
+    from pendulum_bags.studies.mechanism_benchmark import Published
+    from pendulum_bags.studies.mechanism_benchmark_table import Row
+
+__all__ = ["benchmark"]
+
+_FEW = 8
+"""Runs up to which compiling the simulation takes longer than interpreting it."""
+
+
+def benchmark(
+    plant: Annotated[str, typer.Option(help="acrobot or pendubot.")] = "acrobot",
+    controller: Annotated[str, typer.Option(help="Controllers, separated by commas; empty for all.")] = "",
+    out: Annotated[Path, typer.Option(help="Folder of the figure and the results.")] = Path("bags/runs/benchmark"),
+    robustness: Annotated[bool, typer.Option(help="Six tests of robustness: 722 runs a controller.")] = True,
+    uptime_seeds: Annotated[
+        int, typer.Option(help="Runs of 60 s with knock-downs, each with a seed of its own; 0 for none.", min=0)
+    ] = 10,
+    seed: Annotated[int, typer.Option(help="Of noise, kicks and knock-downs.", min=0)] = 1,
+    workers: Annotated[int, typer.Option(help="Runs at once; 0 for one a core.", min=0)] = 0,
+    json_output: Annotated[bool, typer.Option("--json", help="Print the results as JSON.")] = False,
+) -> None:
+    """Score controllers of acrobot or pendubot by the public benchmark's protocol, to the letter.
+
+    Swing-up from hanging in 10 s (score v2), six tests of robustness (v2), and time up under knock-downs (v3, of 2025).
+    Its published methods stand beside, as published: nothing of them was run here.
+
+    Example: python -m pendulum_bags experiment benchmark --plant pendubot --controller tvlqr --no-robustness
+    """
+    from pendulum_bags.runs.run_folder import write_json
+    from pendulum_bags.studies.mechanism_benchmark import PUBLISHED, benchmark_plant
+    from pendulum_bags.studies.mechanism_benchmark_figure import write_swing_up_figure
+    from pendulum_bags.studies.mechanism_benchmark_runs import robustness_trials
+    from pendulum_bags.studies.mechanism_benchmark_table import begin_worker, document, run_job, score_rows
+    from pendulum_lqr.mechanism_controllers import mechanism_controller_names
+
+    model = benchmark_plant(plant)
+    names = [each.strip() for each in controller.split(",") if each.strip()] or list(mechanism_controller_names())
+    console = make_console(stderr=json_output, highlight=False)
+    trials = robustness_trials(model, seed) if robustness else []
+    jobs = [("swing_up", name, 0) for name in names]
+    jobs += [("uptime", name, seed * 1000 + each) for name in names for each in range(uptime_seeds)]
+    jobs += [("trial", name, index) for name in names for index in range(len(trials))]
+    started = time.monotonic()
+    # Forked where that is possible, so that what was compiled here need not be compiled in each of them.
+    method = "fork" if "fork" in multiprocessing.get_all_start_methods() else "spawn"
+    compiled = len(jobs) > _FEW
+    console.print(f"designing {', '.join(names)}, then {len(jobs)} runs", style="dim")
+    settings = (plant, tuple(names), seed, compiled)
+    begin_worker(*settings)
+    count = min(len(jobs), workers or os.cpu_count() or 1)
+    pool = ProcessPoolExecutor(
+        count,
+        mp_context=multiprocessing.get_context(method),
+        initializer=begin_worker,
+        initargs=settings,
+    )
+    results = []
+    try:
+        with counting_bar(console) as bar:
+            task = bar.add_task("runs", total=len(jobs))
+            for result in pool.map(run_job, jobs, chunksize=4):
+                results.append(result)
+                bar.advance(task)
+    except KeyboardInterrupt:
+        pool.shutdown(wait=False, cancel_futures=True)
+        console.print("interrupted: nothing was written")
+        raise typer.Exit(EXIT_INTERRUPTED) from None
+    pool.shutdown()
+    rows = score_rows(names, jobs, results, trials)
+    out.mkdir(parents=True, exist_ok=True)
+    picture = write_swing_up_figure(out / f"{plant}.png", model, rows)
+    write_json(out / f"{plant}.json", document(plant, seed, rows))
+    if json_output:
+        print(json.dumps(document(plant, seed, rows), indent=2))
+        return
+    _print(console, plant, rows, [row for row in PUBLISHED if row.plant == plant])
+    console.print(f"figure  {picture}\nresults {out / f'{plant}.json'}", soft_wrap=True)
+    console.print(f"({time.monotonic() - started:.0f} s)")
+
+
+def _print(console: Console, plant: str, rows: Sequence[Row], published: Sequence[Published]) -> None:
+    from pendulum_bags.studies.mechanism_benchmark import CRITERIA
+    from pendulum_bags.studies.mechanism_benchmark_runs import KINDS
+
+    board = WholeTable(title=f"Double-pendulum benchmark, {plant}", title_justify="left")
+    for heading in ("controller", "score v2", "robustness v2", "score v3", ""):
+        board.add_column(heading, justify="left" if heading in {"controller", ""} else "right")
+
+    def number(value: float | None) -> str:
+        return "–" if value is None else f"{value:.3f}"
+
+    lines = [
+        (row.score, row.controller, number(row.score), number(row.robustness), row.uptime_text, "here") for row in rows
+    ]
+    lines += [
+        (row.score or 0.0, row.method, number(row.score), number(row.robustness), number(row.uptime_score), "published")
+        for row in published
+    ]
+    for _, *cells in sorted(lines, key=lambda line: -line[0]):
+        board.add_row(*cells)
+    console.print(board)
+    costs = WholeTable(title="What the swing-ups cost", title_justify="left")
+    costs.add_column("controller")
+    for one in CRITERIA:
+        costs.add_column(f"{one.title} \\[{one.unit}]", justify="right")
+    for row in rows:
+        costs.add_row(row.controller, *(f"{row.criteria[one.name]:.4g}" for one in CRITERIA))
+    console.print(costs)
+    if any(row.shares for row in rows):
+        held = WholeTable(title="Robustness: levels held \\[%]", title_justify="left")
+        held.add_column("controller")
+        for name in KINDS.values():
+            held.add_column(name, justify="right")
+        for row in rows:
+            held.add_row(row.controller, *(f"{100.0 * row.shares[kind]:.1f}" for kind in KINDS))
+        console.print(held)

@@ -1,0 +1,151 @@
+"""The benchmark's jobs, one process each, and the rows that they make."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pendulum_bags.studies.mechanism_benchmark import benchmark_plant
+from pendulum_bags.studies.mechanism_benchmark_runs import (
+    DT,
+    Stepper,
+    Trajectory,
+    Trial,
+    knock_downs,
+    make_stepper,
+    robustness_of,
+    robustness_trials,
+    swing_up,
+    try_once,
+)
+from pendulum_lqr.mechanism_controller import MechanismController
+from pendulum_lqr.mechanism_controllers import make_mechanism_controller
+from pendulum_msgs_py.plants.mechanism_parameters import MechanismParameters
+
+__all__ = ["Job", "Row", "begin_worker", "document", "run_job", "score_rows"]
+
+Array = NDArray[np.float64]
+Job = tuple[str, str, int]
+"""What is run (swing_up, uptime or trial), by which controller, with which seed or as which trial."""
+
+
+@dataclass(frozen=True)
+class Row:
+    """What a controller reached.
+
+    Attributes:
+        controller: Its name.
+        score: Score v2.
+        criteria: Of its swing-up.
+        robustness: Overall robustness, v2; None where it was not tested.
+        shares: Levels held, by kind of disturbance.
+        uptimes: Scores v3, one for each seed.
+        run: The swing-up.
+    """
+
+    controller: str
+    score: float
+    criteria: dict[str, float]
+    robustness: float | None
+    shares: dict[str, float]
+    uptimes: tuple[float, ...]
+    run: Trajectory
+
+    @property
+    def uptime_text(self) -> str:
+        """Mean of score v3 with its standard deviation over the seeds."""
+        if not self.uptimes:
+            return "–"
+        spread = f" ± {np.std(self.uptimes):.3f}" if len(self.uptimes) > 1 else ""
+        return f"{np.mean(self.uptimes):.3f}{spread}"
+
+
+@dataclass
+class _Worker:
+    plant: MechanismParameters
+    stepper: Stepper
+    controllers: dict[str, MechanismController]
+    trials: list[Trial]
+
+
+_workers: dict[tuple[str, tuple[str, ...], int], _Worker] = {}
+_mine: list[_Worker] = []
+
+
+def begin_worker(plant: str, names: tuple[str, ...], seed: int, compiled: bool = True) -> None:
+    """Build what the jobs of this process need; a forked process has it already.
+
+    Args:
+        plant: acrobot or pendubot.
+        names: Controllers.
+        seed: Of noise and kicks.
+        compiled: Compile the simulation, which is worth its seconds for more than some runs.
+    """
+    key = (plant, names, seed)
+    if key not in _workers:
+        model = benchmark_plant(plant)
+        controllers = {name: make_mechanism_controller(name, model, DT) for name in names}
+        _workers[key] = _Worker(
+            model, make_stepper(model, compiled=compiled), controllers, robustness_trials(model, seed)
+        )
+    _mine[:] = [_workers[key]]
+
+
+def run_job(job: Job) -> Any:
+    """Run one job of this process's controllers, and return what came of it."""
+    worker = _mine[0]
+    kind, name, number = job
+    controller = worker.controllers[name]
+    if kind == "swing_up":
+        return swing_up(worker.plant, worker.stepper, controller)
+    if kind == "uptime":
+        return knock_downs(worker.plant, worker.stepper, controller, number)[1]
+    return try_once(worker.plant, worker.stepper, controller, worker.trials[number])
+
+
+def score_rows(names: Sequence[str], jobs: Sequence[Job], results: Sequence[Any], trials: Sequence[Trial]) -> list[Row]:
+    """Return a row for each controller."""
+    rows = []
+    for name in names:
+        mine = [(kind, result) for (kind, owner, _), result in zip(jobs, results, strict=True) if owner == name]
+        run, criteria, score = next(result for kind, result in mine if kind == "swing_up")
+        uptimes = tuple(result for kind, result in mine if kind == "uptime")
+        held = robustness_of(trials, [result for kind, result in mine if kind == "trial"]) if trials else None
+        rows.append(Row(name, score, criteria, held.score if held else None, held.shares if held else {}, uptimes, run))
+    return rows
+
+
+def document(plant: str, seed: int, rows: Sequence[Row]) -> dict[str, Any]:
+    """Return the results as JSON would have them, the published rows among them."""
+    from pendulum_bags.studies.mechanism_benchmark import PUBLISHED
+
+    return {
+        "plant": plant,
+        "seed": seed,
+        "rows": [
+            {
+                "controller": row.controller,
+                "score_v2": row.score,
+                "criteria": row.criteria,
+                "robustness_v2": row.robustness,
+                "robustness_shares": row.shares,
+                "score_v3": float(np.mean(row.uptimes)) if row.uptimes else None,
+                "score_v3_runs": list(row.uptimes),
+            }
+            for row in rows
+        ],
+        "published": [
+            {
+                "method": row.method,
+                "score_v2": row.score,
+                "robustness_v2": row.robustness,
+                "score_v3": row.uptime_score,
+            }
+            for row in PUBLISHED
+            if row.plant == plant
+        ],
+    }

@@ -1,0 +1,155 @@
+"""LQR about upright for any mechanism, and the region from which it catches: sampled, not proven."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from pendulum_lqr.design import DesignError, Gain
+from pendulum_lqr.mechanism_model import linearise_mechanism, mechanism_lqr
+from pendulum_msgs_py.contract.angles import wrap
+from pendulum_msgs_py.dynamics.arithmetic import in_arithmetic
+from pendulum_msgs_py.dynamics.runge_kutta import along_functions, rk4_joints
+from pendulum_msgs_py.joints import Coordinates, Vector
+from pendulum_msgs_py.plants.mechanism_parameters import MechanismParameters
+
+__all__ = ["CaughtRegion", "MechanismCatch", "deviation_of", "make_mechanism_catch", "sample_caught_region"]
+
+Array = NDArray[np.float64]
+
+_STEP = 0.004
+_LONGEST = 8.0
+_FIRST = 0.05
+"""Deviation of the first ellipsoid tried, along the joint that it reaches farthest [rad or m]."""
+
+
+class CaughtRegion(NamedTuple):
+    """States x from upright with x' S x <= level, from all samples of which the limited loop came to rest upright.
+
+    Attributes:
+        level: Of x' S x.
+        samples: States tried on its edge and inside: evidence, no proof.
+    """
+
+    level: float
+    samples: int
+
+    def describe(self) -> str:
+        """Return it as a phrase."""
+        return f"x'Sx <= {self.level:.4g} (sampled from {self.samples} states, not proven)"
+
+
+def deviation_of(coordinates: Coordinates, x: Vector) -> Array:
+    """Return [q - goal (wrapped where it turns), v] of a state [q, v], shape (2n,)."""
+    n = len(coordinates.joints)
+    return np.array([*coordinates.deviation(x[:n]), *x[n:]])
+
+
+def sample_caught_region(
+    plant: MechanismParameters, gain: Gain, *, samples: int = 200, seed: int = 0, share: float = 0.9
+) -> CaughtRegion:
+    """Return the largest ellipsoid x' S x <= level from whose sampled states u = -K x, limited, comes to rest upright.
+
+    The level grows until a sampled state is lost, and is bisected then; ``share`` of what is found is returned.
+
+    Args:
+        plant: The plant; dry friction, lag and delay are left out.
+        gain: K and S.
+        samples: States per level, half of them on the edge.
+        seed: Of the states.
+        share: Of the level found that is taken.
+
+    Raises:
+        DesignError: Not even the smallest states are caught.
+    """
+    n = len(plant.joints)
+    rng = np.random.default_rng(seed)
+    directions = rng.standard_normal((samples, 2 * n))
+    directions /= np.linalg.norm(directions, axis=1)[:, None]
+    # On the edge for half of them, evenly in the volume for the rest.
+    directions[samples // 2 :] *= rng.random((samples - samples // 2, 1)) ** (0.5 / n)
+    root = np.linalg.cholesky(gain.S)
+    unit = np.linalg.solve(root.T, directions.T)
+    low, high = 0.0, _FIRST**2 / float(np.max(np.diag(np.linalg.inv(gain.S))[:n]))
+    while _all_caught(plant, gain, np.sqrt(high) * unit):
+        low, high = high, 4.0 * high
+    if low == 0.0:
+        raise DesignError(f"the LQR of {plant.name!r} catches no state near upright; expected a stable loop")
+    for _ in range(4):
+        middle = float(np.sqrt(low * high))
+        if _all_caught(plant, gain, np.sqrt(middle) * unit):
+            low = middle
+        else:
+            high = middle
+    return CaughtRegion(share * low, samples)
+
+
+def _all_caught(plant: MechanismParameters, gain: Gain, deviations: Array) -> bool:
+    n, driven = len(plant.joints), plant.coordinates.driven
+    forward = in_arithmetic(plant.mechanism.forward, np)
+    along, p, goal = along_functions(n), plant.packed, np.array(plant.coordinates.goal)
+    limits = np.array(plant.effort_limits)[:, None]
+    turns = np.array([joint.turns for joint in plant.mechanism.joints])
+    x = deviations.copy()
+    x[:n][turns] = wrap(x[:n][turns])
+    slowest = -float(np.max(gain.poles.real))
+    for k in range(round(min(_LONGEST, 6.0 / slowest) / _STEP)):
+        u = np.clip(-gain.K @ x, -limits, limits)
+        torque = [np.zeros(x.shape[1]) for _ in range(n)]
+        for index, joint in enumerate(driven):
+            torque[joint] = u[index]
+        q = tuple(goal[i] + x[i] for i in range(n))
+        q, v = rk4_joints(forward, along, q, tuple(x[n:]), torque, torque, torque, _STEP, p)
+        x = np.array([*(q[i] - goal[i] for i in range(n)), *v])
+        # What falls over is lost; a state that grows beyond all bounds ends the trial early.
+        if k % 25 == 0 and not float(np.max(np.abs(x))) < 50.0:
+            return False
+    cost = np.einsum("ij,ik,kj->j", x, gain.S, x)
+    started = np.einsum("ij,ik,kj->j", deviations, gain.S, deviations)
+    return bool(np.all(cost <= 0.2 * started))
+
+
+@dataclass
+class MechanismCatch:
+    """u = -K x within a region, with hysteresis.
+
+    Attributes:
+        plant: The plant.
+        gain: K and S.
+        region: Where it takes over.
+        leave: Multiple of the region's level at which it lets go.
+        active: Whether it is in charge.
+    """
+
+    plant: MechanismParameters
+    gain: Gain
+    region: CaughtRegion
+    leave: float = 2.0
+    active: bool = False
+
+    def holds(self, deviation: Array) -> bool:
+        """Tell whether it is in charge of a deviation from upright; it may take over or let go by this."""
+        cost = float(deviation @ self.gain.S @ deviation)
+        self.active = cost <= self.region.level * (self.leave if self.active else 1.0)
+        return self.active
+
+    def command(self, deviation: Array) -> Vector:
+        """Return the limited efforts [N m or N]."""
+        wanted = -self.gain.K @ deviation
+        limits = self.plant.effort_limits
+        return tuple(min(top, max(-top, float(u))) for u, top in zip(wanted, limits, strict=True))
+
+
+def make_mechanism_catch(plant: MechanismParameters, q: ArrayLike, r: ArrayLike) -> MechanismCatch:
+    """Return the LQR of a plant about upright with its sampled region (a second or so).
+
+    Args:
+        plant: The plant.
+        q: Weights of deviations, then velocities, shape (2n,).
+        r: Weight of the efforts.
+    """
+    gain = mechanism_lqr(linearise_mechanism(plant), q, r)
+    return MechanismCatch(plant, gain, sample_caught_region(plant, gain))

@@ -1,0 +1,85 @@
+"""The controllers of plants of several joints, by name: each written once for any mechanism."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from importlib import resources
+from pathlib import Path
+
+from pendulum_lqr.mechanism_catch import MechanismCatch, make_mechanism_catch
+from pendulum_lqr.mechanism_controller import MechanismController
+from pendulum_lqr.mechanism_mpc import MechanismMpc
+from pendulum_lqr.mechanism_trajectory import MechanismTrajectory, load_trajectory
+from pendulum_lqr.mechanism_tvlqr import MechanismTvlqr
+from pendulum_lqr.mechanism_velocity import DifferencedVelocity
+from pendulum_msgs_py.errors import ParameterError
+from pendulum_msgs_py.plants.mechanism_parameters import MechanismParameters
+
+__all__ = ["default_catch", "make_mechanism_controller", "mechanism_controller_names", "stored_trajectory"]
+
+_WEIGHTS = ((10.0, 10.0, 1.0, 1.0), 1.0)
+"""Of the LQR that catches and of the tracking, for mechanisms of two joints."""
+
+
+def stored_trajectory(plant: MechanismParameters) -> MechanismTrajectory:
+    """Return the swing-up that comes with the project for a preset.
+
+    Raises:
+        ParameterError: There is none for this plant.
+    """
+    folder = Path(str(resources.files("pendulum_lqr"))) / "trajectories"
+    path = folder / f"{plant.name}.json"
+    if not path.is_file():
+        names = ", ".join(sorted(each.stem for each in folder.glob("*.json")))
+        raise ParameterError(f"no swing-up is stored for plant {plant.name!r}; expected one of {names}")
+    return load_trajectory(path)
+
+
+def default_catch(plant: MechanismParameters) -> MechanismCatch:
+    """Return the LQR that catches, with its sampled region."""
+    weights = plant.mechanism.weights if len(plant.joints) != 2 else _WEIGHTS
+    return make_mechanism_catch(plant, *weights)
+
+
+def _tvlqr(plant: MechanismParameters, period: float) -> MechanismController:
+    catch = default_catch(plant)
+    return MechanismTvlqr(plant, period, stored_trajectory(plant), catch, q=_WEIGHTS[0], r=_WEIGHTS[1])
+
+
+def _mpc(plant: MechanismParameters, period: float) -> MechanismController:
+    return DifferencedVelocity(plant, MechanismMpc(plant, period, default_catch(plant)))
+
+
+def _tvlqr_mpc(plant: MechanismParameters, period: float) -> MechanismController:
+    catch = default_catch(plant)
+    recover = MechanismMpc(plant, period, catch)
+    both = MechanismTvlqr(plant, period, stored_trajectory(plant), catch, q=_WEIGHTS[0], r=_WEIGHTS[1], recover=recover)
+    return DifferencedVelocity(plant, both)
+
+
+_CONTROLLERS: dict[str, Callable[[MechanismParameters, float], MechanismController]] = {
+    "tvlqr": _tvlqr,
+    "mpc": _mpc,
+    "tvlqr_mpc": _tvlqr_mpc,
+}
+
+
+def mechanism_controller_names() -> tuple[str, ...]:
+    """Return the names of all controllers of plants of several joints."""
+    return tuple(_CONTROLLERS)
+
+
+def make_mechanism_controller(name: str, plant: MechanismParameters, period: float) -> MechanismController:
+    """Design a controller; mpc compiles for some ten seconds the first time.
+
+    Args:
+        name: Of :func:`mechanism_controller_names`.
+        plant: The plant that it believes in.
+        period: Sampling period [s].
+
+    Raises:
+        ParameterError: No controller has this name, or it does not go with this plant.
+    """
+    if name not in _CONTROLLERS:
+        raise ParameterError(f"controller {name!r} is unknown; expected one of {', '.join(_CONTROLLERS)}")
+    return _CONTROLLERS[name](plant, period)

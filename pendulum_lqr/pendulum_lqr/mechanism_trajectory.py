@@ -1,0 +1,194 @@
+"""Swing-up trajectories of a mechanism: from random guesses by iterative LQR, as small files, and from them again."""
+
+from __future__ import annotations
+
+import json
+import math
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pendulum_lqr.design import DesignError
+from pendulum_lqr.mechanism_catch import MechanismCatch, deviation_of
+from pendulum_lqr.mechanism_ilqr import IlqrProblem, IlqrWeights
+from pendulum_msgs_py.dynamics.runge_kutta import along_functions, rk4_joints
+from pendulum_msgs_py.errors import ParameterError
+from pendulum_msgs_py.joints import Vector
+from pendulum_msgs_py.plants.mechanism_parameters import MechanismParameters
+
+__all__ = ["FORMAT", "MechanismTrajectory", "SwingUpSearch", "load_trajectory", "search_swing_up", "write_trajectory"]
+
+Array = NDArray[np.float64]
+
+FORMAT = "pendulum_trajectory/1"
+_FIND = IlqrWeights(1.0, 0.05, 0.13, 1e-3, 0.007, 10.0)
+_NEAR = 0.3
+"""Largest deviation at which a guess's end counts as upright, in shares of the caught region's level."""
+
+
+@dataclass(frozen=True)
+class MechanismTrajectory:
+    """A motion from hanging at rest to upright.
+
+    Attributes:
+        plant: Name of the plant.
+        joints: Names of its joints.
+        times: Of the nodes, equidistant, shape (N + 1,) [s].
+        states: [q, v] there, q not wrapped, shape (N + 1, 2n).
+        efforts: Of the m motors there, linear between nodes, shape (N + 1, m) [N m or N].
+        how: What made it: settings, seed, cost.
+    """
+
+    plant: str
+    joints: tuple[str, ...]
+    times: Array
+    states: Array
+    efforts: Array
+    how: dict[str, Any] = field(default_factory=dict)
+
+    @property
+    def duration(self) -> float:
+        """Its length [s]."""
+        return float(self.times[-1])
+
+    def at(self, times: Array) -> tuple[Array, Array]:
+        """Return states (cubic between nodes) and efforts at given times; the last ones beyond its end."""
+        from scipy.interpolate import CubicHermiteSpline
+
+        n = self.states.shape[1] // 2
+        clipped = np.clip(times, 0.0, self.duration)
+        # The velocities are the slopes of the positions; those of the velocities come from their neighbours.
+        slopes = np.column_stack([self.states[:, n:], np.gradient(self.states[:, n:], self.times, axis=0)])
+        states = CubicHermiteSpline(self.times, self.states, slopes)(clipped)
+        efforts = np.column_stack([np.interp(clipped, self.times, column) for column in self.efforts.T])
+        return np.asarray(states, dtype=np.float64), efforts
+
+
+@dataclass(frozen=True)
+class SwingUpSearch:
+    """Settings of a search.
+
+    Attributes:
+        weights: Of the cost.
+        duration: Length of the trajectory [s].
+        step: Distance of its nodes [s].
+        shortest: Shortest horizon of a guess [s]; the rest of ``duration`` is the LQR's.
+        find: Weights with which a random guess is brought upright first.
+        iterations: Largest number of iterations of each solution.
+    """
+
+    weights: IlqrWeights
+    duration: float = 4.0
+    step: float = 0.02
+    shortest: float = 1.5
+    find: IlqrWeights = _FIND
+    iterations: int = 150
+
+
+def search_swing_up(
+    plant: MechanismParameters, catch: MechanismCatch, search: SwingUpSearch, seed: int
+) -> MechanismTrajectory:
+    """Return what one random guess becomes: a locally optimal swing-up.
+
+    The guess is a sine of random height, period and phase over a horizon of random length. Iterative LQR brings it
+    upright, the LQR holds it there for the rest of the duration, and the whole is optimised again.
+
+    Args:
+        plant: The plant.
+        catch: LQR with its caught region, of the same plant.
+        search: Settings.
+        seed: Of the guess.
+
+    Raises:
+        DesignError: The guess does not end upright.
+    """
+    rng = np.random.default_rng(seed)
+    m = len(plant.coordinates.driven)
+    n = len(plant.joints)
+    still = (0.0,) * n
+    none = (0.0,) * m
+    horizon = rng.uniform(search.shortest, search.duration)
+    t = np.arange(max(2, round(horizon / search.step))) * search.step
+    heights = np.array(plant.effort_limits) * rng.uniform(1.0 / 60.0, 5.0 / 12.0, m)
+    guess = heights * np.sin(2.0 * math.pi * (t[:, None] / rng.uniform(0.4, 1.6, m) + rng.random(m)))
+    S = catch.gain.S * (4.0 / np.trace(catch.gain.S))
+    found = IlqrProblem(plant, search.step, search.find, S).solve(still, still, none, guess, 120)
+    problem = IlqrProblem(plant, search.step, search.weights, S)
+    found = problem.solve(still, still, none, found.efforts, search.iterations)
+    end = deviation_of(plant.coordinates, tuple(found.states[-1][: 2 * n]))
+    if not float(end @ catch.gain.S @ end) <= _NEAR * catch.region.level:
+        raise DesignError(f"guess {seed} of {plant.name!r} does not end upright")
+    tail = _held(plant, catch, tuple(found.states[-1]), max(0, round(search.duration / search.step) - len(t)), search)
+    plan = problem.solve(still, still, none, np.vstack([found.efforts, tail]), 2 * search.iterations)
+    return MechanismTrajectory(
+        plant.name,
+        plant.coordinates.names,
+        np.arange(len(plan.states)) * search.step,
+        plan.states[:, : 2 * n].copy(),
+        plan.states[:, 2 * n :].copy(),
+        {"seed": seed, "cost": plan.cost, "search": {**asdict(search), "weights": list(search.weights),
+                                                     "find": list(search.find)}},
+    )  # fmt: skip
+
+
+def _held(plant: MechanismParameters, catch: MechanismCatch, z: Vector, count: int, search: SwingUpSearch) -> Array:
+    """Return the efforts with which the LQR holds the plant from a state on."""
+    n = len(plant.joints)
+    along, spread = along_functions(n), plant.coordinates.spread
+    q, v, u = z[:n], z[n : 2 * n], z[2 * n :]
+    efforts = np.empty((count, len(u)))
+    for k in range(count):
+        following = catch.command(deviation_of(plant.coordinates, (*q, *v)))
+        before, after = spread(u), spread(following)
+        middle = tuple(0.5 * (a + b) for a, b in zip(before, after, strict=True))
+        q, v = rk4_joints(plant.mechanism.forward, along, q, v, before, middle, after, search.step, plant.packed)
+        u = following
+        efforts[k] = u
+    return efforts
+
+
+def write_trajectory(path: Path, trajectory: MechanismTrajectory) -> None:
+    """Write a trajectory as JSON, with six digits behind the point."""
+
+    def rows(values: Array) -> list[list[float]]:
+        return [[round(float(value), 6) for value in row] for row in values]
+
+    document = {
+        "format": FORMAT,
+        "plant": trajectory.plant,
+        "joints": list(trajectory.joints),
+        "step": float(trajectory.times[1] - trajectory.times[0]),
+        "how": trajectory.how,
+        "states": rows(trajectory.states),
+        "efforts": rows(trajectory.efforts),
+    }
+    text = json.dumps(document)
+    # One node a line, so that a change shows as one.
+    path.write_text(text.replace("], [", "],\n[") + "\n", encoding="utf-8")
+
+
+def load_trajectory(path: Path) -> MechanismTrajectory:
+    """Read a trajectory.
+
+    Raises:
+        ParameterError: It is none, or its arrays do not go together.
+    """
+    try:
+        document = json.loads(path.read_text(encoding="utf-8"))
+        if document["format"] != FORMAT:
+            raise ParameterError(f"{path} has the format {document['format']!r}; expected {FORMAT}")
+        states = np.array(document["states"], dtype=np.float64)
+        efforts = np.array(document["efforts"], dtype=np.float64)
+        joints = tuple(str(name) for name in document["joints"])
+        times = np.arange(len(states)) * float(document["step"])
+    except (OSError, KeyError, TypeError, ValueError) as error:
+        raise ParameterError(f"{path} is no trajectory: {error!r}; expected a file of format {FORMAT}") from error
+    if states.ndim != 2 or efforts.ndim != 2 or len(states) != len(efforts) or states.shape[1] != 2 * len(joints):
+        raise ParameterError(
+            f"{path} has states of shape {states.shape} and efforts of shape {efforts.shape} for "
+            f"{', '.join(joints)}; expected (N, {2 * len(joints)}) and (N, m)"
+        )
+    return MechanismTrajectory(str(document["plant"]), joints, times, states, efforts, dict(document.get("how", {})))

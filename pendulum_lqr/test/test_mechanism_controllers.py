@@ -1,0 +1,159 @@
+"""Controllers that are written once for any mechanism: catch, tracking, MPC, stored swing-ups."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from pendulum_lqr.mechanism_catch import deviation_of, make_mechanism_catch
+from pendulum_lqr.mechanism_controllers import (
+    default_catch,
+    make_mechanism_controller,
+    stored_trajectory,
+)
+from pendulum_lqr.mechanism_ilqr import IlqrProblem, IlqrWeights
+from pendulum_lqr.mechanism_mpc import MechanismMpc
+from pendulum_lqr.mechanism_trajectory import load_trajectory, write_trajectory
+from pendulum_lqr.mechanism_tvlqr import MechanismTvlqr
+from pendulum_lqr.mechanism_velocity import DifferencedVelocity
+from pendulum_msgs_py.dynamics.runge_kutta import along_2, rk4_joints
+from pendulum_msgs_py.errors import ParameterError
+from pendulum_msgs_py.joints import Vector
+from pendulum_msgs_py.plants.mechanism_parameters import MechanismParameters, load_mechanism
+
+DT = 0.002
+Q, R = (10.0, 10.0, 1.0, 1.0), 1.0
+
+
+def step(plant: MechanismParameters, x: Vector, effort: Vector) -> Vector:
+    """Return the state one period later, without friction."""
+    torque = plant.coordinates.spread(effort)
+    q, v = rk4_joints(plant.mechanism.forward, along_2, x[:2], x[2:], torque, torque, torque, DT, plant.packed)
+    return (*q, *v)
+
+
+def test_the_catch_takes_over_within_its_region_where_it_catches_and_lets_go_beyond_twice_that() -> None:
+    plant = load_mechanism("pendubot_frictionless")
+    catch = make_mechanism_catch(plant, Q, R)
+    assert "not proven" in catch.region.describe()
+    rng = np.random.default_rng(99)
+
+    def caught(share: float, direction: np.ndarray) -> bool:
+        scale = math.sqrt(share * catch.region.level / float(direction @ catch.gain.S @ direction))
+        x: Vector = tuple(scale * direction + np.array([*plant.coordinates.goal, 0.0, 0.0]))
+        for _ in range(1000):
+            x = step(plant, x, catch.command(deviation_of(plant.coordinates, x)))
+        return bool(np.max(np.abs(deviation_of(plant.coordinates, x))) < 0.1)
+
+    # Other states than those that it was sampled from.
+    assert all(caught(1.0, direction) for direction in rng.standard_normal((12, 4)))
+    # The way in which the limit tells first: all of the effort for nothing.
+    assert not caught(6.0, np.linalg.solve(catch.gain.S, catch.gain.K[0]))
+    unit = np.array([1.0, 0.0, 0.0, 0.0]) / math.sqrt(catch.gain.S[0, 0] / catch.region.level)
+    assert [catch.holds(scale * unit) for scale in (1.1, 0.9, 1.1, 1.3, 1.5, 1.1)] == [
+        False, True, True, True, False, False,
+    ]  # fmt: skip
+
+
+@pytest.mark.parametrize("name", ["acrobot_frictionless", "pendubot_frictionless"])
+def test_tracking_brings_a_disturbed_swing_up_upright_and_open_loop_does_not(name: str) -> None:
+    plant = load_mechanism(name)
+    controller = make_mechanism_controller("tvlqr", plant, DT)
+    assert isinstance(controller, MechanismTvlqr)
+    feedback: Vector = (0.02, -0.02, 0.0, 0.0)
+    open_loop = feedback
+    for k in range(2500):
+        feedback = step(plant, feedback, controller.command(k * DT, feedback))
+        effort = controller.efforts[k] if k < len(controller.efforts) else (0.0,)
+        open_loop = step(plant, open_loop, tuple(float(u) for u in effort))
+    assert np.max(np.abs(deviation_of(plant.coordinates, feedback))) < 1e-3
+    assert np.max(np.abs(deviation_of(plant.coordinates, open_loop))) > 0.5
+    # Thrown far off it gives no effort where nobody recovers it, and does not jump back to the trajectory either.
+    controller.reset()
+    controller.command(0.0, (0.0,) * 4)
+    assert controller.command(DT, (1.5, 1.0, 5.0, -5.0)) == (0.0,)
+    assert controller.command(2 * DT, (0.0,) * 4) == (0.0,)
+    controller.reset()
+    assert controller.command(0.0, (0.0,) * 4) != (0.0,)
+
+
+def test_iterative_lqr_and_mpc_bring_a_cart_pole_up_within_its_limits() -> None:
+    """Takes some ten seconds: it compiles the problem of a mechanism, once for all that is asked here."""
+    plant = load_mechanism("cart_pole")
+    catch = default_catch(plant)
+    problem = IlqrProblem(plant, 0.05, IlqrWeights(terminal=0.1), catch.gain.S)
+    guess = 3.0 * np.sin(np.arange(50.0)[:, None])
+    still = (0.0, 0.0)
+    first = problem.solve(still, still, (0.0,), guess, 0)
+    costs = [first.cost] + [problem.solve(still, still, (0.0,), guess, count).cost for count in (1, 5, 40)]
+    assert all(later <= earlier for earlier, later in pairwise(costs))
+    assert costs[-1] < 0.5 * costs[0]
+    tight = replace(problem, limit=0.2).solve(still, still, (0.0,), guess, 40)
+    assert np.max(np.abs(tight.efforts)) <= 0.2 * plant.effort_limits[0]
+    # The plan is a motion of the plant: each node follows from the one before.
+    plan = problem.solve(still, still, (0.0,), guess, 40)
+    for before, after in zip(plan.states[:-1], plan.states[1:], strict=True):
+        ends = [(float(before[4]), 0.0), (0.5 * float(before[4] + after[4]), 0.0), (float(after[4]), 0.0)]
+        q, v = rk4_joints(
+            plant.mechanism.forward, along_2, tuple(before[:2]), tuple(before[2:4]), *ends, 0.05, plant.packed
+        )
+        assert (*q, *v) == pytest.approx(tuple(after[:4]), abs=1e-9)
+    controller = MechanismMpc(plant, DT, catch)
+    x: Vector = (0.0,) * 4
+    efforts = []
+    for k in range(2500):
+        efforts.append(controller.command(k * DT, x))
+        x = step(plant, x, efforts[-1])
+    assert np.max(np.abs(deviation_of(plant.coordinates, x)[1:])) < 0.05
+    assert max(abs(effort[0]) for effort in efforts) <= plant.effort_limits[0]
+    controller.reset()
+    assert controller.command(0.0, (0.0,) * 4) == efforts[0]
+
+
+def test_velocities_from_positions_are_the_true_ones_whatever_was_measured() -> None:
+    plant = load_mechanism("acrobot_frictionless")
+
+    class Listener:
+        def __init__(self) -> None:
+            self.heard: list[Vector] = []
+
+        def reset(self) -> None:
+            self.heard.clear()
+
+        def command(self, t: float, x: Vector) -> Vector:
+            self.heard.append(x)
+            return (2.0 * math.sin(9.0 * t),)
+
+    listener = Listener()
+    controller = DifferencedVelocity(plant, listener)
+    x: Vector = (0.1, 0.4, 0.0, 0.0)
+    for k in range(500):
+        noise = 0.5 * (-1) ** k if k else 0.0
+        effort = controller.command(k * DT, (*x[:2], x[2] + noise, x[3] - noise))
+        assert listener.heard[-1] == pytest.approx(x, abs=2e-3)
+        x = step(plant, x, effort)
+
+
+def test_a_trajectory_file_gives_back_what_was_written_and_says_what_is_wrong_with_another(tmp_path: Path) -> None:
+    trajectory = stored_trajectory(load_mechanism("acrobot_frictionless"))
+    write_trajectory(tmp_path / "again.json", trajectory)
+    again = load_trajectory(tmp_path / "again.json")
+    assert (again.states == trajectory.states).all()
+    assert (again.efforts == trajectory.efforts).all()
+    assert again.how == trajectory.how
+    (tmp_path / "none.json").write_text("{}", encoding="utf-8")
+    with pytest.raises(ParameterError, match="is no trajectory"):
+        load_trajectory(tmp_path / "none.json")
+    with pytest.raises(ParameterError, match="no swing-up is stored for plant 'cart_pole'; expected one of acrobot_f"):
+        stored_trajectory(load_mechanism("cart_pole"))
+    plant = load_mechanism("cart_pole")
+    catch = default_catch(plant)
+    with pytest.raises(ParameterError, match="has the joints shoulder, elbow and 1 motors; expected cart, pole and 1"):
+        MechanismTvlqr(plant, DT, trajectory, catch, q=Q, r=R)
+    with pytest.raises(ParameterError, match="controller 'lqr' is unknown; expected one of tvlqr"):
+        make_mechanism_controller("lqr", load_mechanism("acrobot_frictionless"), DT)
