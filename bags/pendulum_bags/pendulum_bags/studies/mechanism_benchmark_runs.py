@@ -170,7 +170,7 @@ def make_stepper(plant: MechanismParameters, *, compiled: bool = True) -> Steppe
         def advance(q: Any, v: Any, torque: Any, p: Any, coulomb: Any) -> Any:
             return step(forward, along, q, v, torque, torque, torque, DT, (p, coulomb))
 
-        return advance  # type: ignore[no-any-return]
+        return advance
 
     def plain(q: Any, v: Any, torque: Any, p: Any) -> Any:
         return bare(q, v, loaded(v, torque, p), p[0])
