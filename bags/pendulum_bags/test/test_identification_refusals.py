@@ -341,6 +341,8 @@ def test_a_file_without_a_torque_says_how_a_free_swing_is_read(tmp_path):
         (["--plant", "acrobot"], ["--no-page"]),
         (["--method", "thesis"], ["--held-out", "other.csv"]),
         (["--method", "thesis"], ["--window", "2"]),
+        (["--method", "output_error"], ["--verbose"]),
+        (["--method", "output_error"], ["--skew", "0.001"]),
     ],
 )
 def test_an_option_that_would_change_nothing_is_refused_by_its_name(way, unheeded, capsys):

@@ -1,10 +1,12 @@
 """The thesis's two regressions on data made from known coefficients."""
 
+import re
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
+from pendulum_bags.identification import identify_cli
 from pendulum_bags.identification.figures import thesis_figures
 from pendulum_bags.identification.page import write_thesis_page
 from pendulum_bags.identification.thesis import fit_gravity, fit_inertia_damping, static_holds
@@ -57,6 +59,26 @@ def test_inertia_and_damping_come_back_within_their_intervals():
     assert all(trial.r_squared > 0.99 for trial in result.trials)
     assert "R-squared" in result.trials[0].summary
     assert any("inertial torque is" in sentence for sentence in result.sentences)
+
+
+def test_the_result_stands_before_the_trials_and_full_tables_come_on_demand(tmp_path, capsys):
+    paths = []
+    for seed in range(2):
+        trial = hand_trial(seed)
+        paths.append(str(tmp_path / f"hand_{seed}.csv"))
+        columns = np.stack((trial.time, trial.position, trial.velocity, trial.input), axis=1)
+        np.savetxt(paths[-1], columns, delimiter=",", header="time,position,velocity,effort", comments="")
+    arguments = [*paths, "--method", "thesis", "--experiment", "inertia_damping"]
+    assert identify_cli.main(arguments) == 0
+    said = capsys.readouterr().out
+    assert (
+        said.index("Average over 2 trials") < said.index("Regression of each trial") < said.index("inertial torque is")
+    )
+    assert re.search(r"hand_1\S* +│ +11\.\d+ \+- 0\.\d+", said)
+    assert len(said.splitlines()) < 40
+    assert "OLS Regression" not in said
+    assert identify_cli.main([*arguments, "--verbose"]) == 0
+    assert capsys.readouterr().out.count("OLS Regression") == 2
 
 
 def test_the_interval_of_the_inertia_allows_for_what_is_not_known_of_the_timing():

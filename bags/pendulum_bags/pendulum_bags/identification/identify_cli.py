@@ -22,7 +22,8 @@ if TYPE_CHECKING:
 __all__ = ["app", "main"]
 
 _FOR_SEVERAL_JOINTS = frozenset({"plant", "mapping", "window", "held_out", "out", "name", "as_json"})
-_FOR_REGRESSION = frozenset({"method", "mapping", "hold", "experiment", "skew", "out", "page", "as_json"})
+_FOR_REGRESSION = frozenset({"method", "mapping", "hold", "experiment", "skew", "out", "page", "as_json", "verbose"})
+_FOR_REGRESSION_ALONE = frozenset({"experiment", "skew", "verbose"})
 
 app = typer.Typer(add_completion=False, rich_markup_mode=None)
 
@@ -81,6 +82,9 @@ def identify(
     ] = None,
     page: Annotated[bool, typer.Option(help="With --out: write figures and a page too.")] = True,
     as_json: Annotated[bool, typer.Option("--json", help="Print the result as JSON.")] = False,
+    verbose: Annotated[
+        bool, typer.Option("--verbose", help="With --method thesis: the full table of every trial's regression, too.")
+    ] = False,
 ) -> None:
     """Identify a pendulum from recordings.
 
@@ -109,8 +113,14 @@ def identify(
             read_recording(path, rules, effort="measured", hold=hold)
             for path, rules in zip(data, _mappings(mapping, len(data)), strict=True)
         ]
-        _thesis(recordings, experiment, skew, out, page, as_json)
+        result = _thesis(recordings, experiment, skew, out, page)
+        if as_json:
+            typer.echo(json.dumps(result.to_dict(), indent=2))
+        else:
+            _print_thesis(result, verbose=verbose)
         return
+    if unheeded := _given(context, _FOR_REGRESSION_ALONE):
+        raise DataError(f"{unheeded} has no effect with --method {method}; expected it with --method thesis only")
     from pendulum_bags.identification.identify import identify as run
     from pendulum_bags.identification.options import Geometry, Options
 
@@ -139,14 +149,17 @@ def identify(
 
 def _refuse_unheeded(context: typer.Context, way: str, heeded: Collection[str]) -> None:
     """Refuse options that were given and would change nothing: whoever gives one relies on it."""
-    given = {name for name in context.params if str(context.get_parameter_source(name)).endswith("COMMANDLINE")}
-    unheeded = sorted(given - {"data", *heeded})
-    if unheeded:
-        options = ", ".join(f"--{name.replace('_', '-')}" for name in unheeded)
+    if unheeded := _given(context, set(context.params) - {"data", *heeded}):
         raise DataError(
-            f"{options} has no effect with {way}; expected none but "
+            f"{unheeded} has no effect with {way}; expected none but "
             + ", ".join(f"--{name.replace('as_', '').replace('_', '-')}" for name in sorted(heeded))
         )
+
+
+def _given(context: typer.Context, names: Collection[str]) -> str:
+    """Return those of the options that were typed, as they are typed."""
+    given = sorted(name for name in names if str(context.get_parameter_source(name)).endswith("COMMANDLINE"))
+    return ", ".join(f"--{name.replace('_', '-')}" for name in given)
 
 
 def _mappings(given: Sequence[str] | None, recordings: int, total: int | None = None) -> list[str | None]:
@@ -171,8 +184,7 @@ def _thesis(
     skew: float | None,
     out: Path | None,
     page: bool,
-    as_json: bool,
-) -> None:
+) -> ThesisResult:
     from pendulum_bags.identification.thesis import fit_gravity, fit_inertia_damping, static_holds
 
     if experiment not in {"auto", "inertia_damping", "gravity"}:
@@ -188,20 +200,14 @@ def _thesis(
             from pendulum_bags.identification.page import write_thesis_page
 
             write_thesis_page(result, recordings, out.with_suffix(""))
-    if as_json:
-        typer.echo(json.dumps(result.to_dict(), indent=2))
-        return
-    _print_thesis(result)
+    return result
 
 
-def _print_thesis(result: ThesisResult) -> None:
+def _print_thesis(result: ThesisResult, *, verbose: bool) -> None:
     from pendulum_bags.identification.model import UNITS
     from pendulum_msgs_py.programs.terminal import WholeTable, make_console
 
     console = make_console()
-    for regression in result.trials:
-        console.print(f"[bold]{regression.trial}[/bold]")
-        print(_narrow(regression.summary))
     table = WholeTable(title=f"Average over {len(result.trials)} trial{'s' if len(result.trials) != 1 else ''}")
     for heading in ("coefficient", "value", "95 % interval", "unit"):
         table.add_column(heading)
@@ -209,8 +215,22 @@ def _print_thesis(result: ThesisResult) -> None:
         low, high = result.intervals[key]
         table.add_row(key, f"{value:.5g}", f"{low:.5g} to {high:.5g}", UNITS[key])
     console.print(table)
+    trials = WholeTable(title="Regression of each trial: value and standard error")
+    for heading in ("trial", *(f"{name} \\[{UNITS[name]}]" for name in result.trials[0].names), "R^2"):
+        trials.add_column(heading)
+    for regression in result.trials:
+        figures = zip(regression.values, regression.errors, strict=True)
+        cells = (f"{value:.5g} +- {error:.2g}" for value, error in figures)
+        trials.add_row(regression.trial, *cells, f"{regression.r_squared:.5f}")
+    console.print(trials)
     for sentence in result.sentences:
         console.print(f"- {sentence}", markup=False, highlight=False)
+    if not verbose:
+        console.print("--verbose prints the full table of each regression", highlight=False)
+        return
+    for regression in result.trials:
+        console.print(f"[bold]{regression.trial}[/bold]")
+        print(_narrow(regression.summary))
 
 
 def _narrow(summary: str, width: int = 78) -> str:
