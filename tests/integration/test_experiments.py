@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import re
 import socket
 import subprocess
@@ -17,7 +18,10 @@ import pytest
 from pendulum_bags.experiments.in_process import simulate
 from pendulum_bags.experiments.run_spec import EMULATOR_LIFETIME, RunSpec
 from pendulum_hw_bridge.backends.emulator_process import EmulatorProcessBackend
+from pendulum_lqr.policy_file import write_policy
+from pendulum_msgs_py.plants.plant_parameters import load_plant
 from pendulum_rosbag.reader import read_bag, same_messages
+from tests.policies import linear_policy
 from tests.processes import ProcessGroup
 
 
@@ -42,6 +46,41 @@ def test_lockstep_runs_of_the_emulated_hardware_with_one_seed_are_identical(doma
     states = first["/hw/joint_states"]
     assert len(states) == 101
     assert abs(states["position"] - 3.14159).max() < 0.05
+
+
+@pytest.mark.timeout(180)
+def test_a_policy_file_is_a_controller_like_any_other_in_an_experiment(domain_id: int, tmp_path: Path) -> None:
+    path = write_policy(tmp_path / "upright.npz", linear_policy(load_plant("thesis"), 20.0, 1.0))
+    for side in ("sim", "hw"):
+        bag = tmp_path / side
+        run_experiment("lockstep", "--side", side, "--bag", bag, "--duration", "1", "--controller", path)
+        recorded = read_bag(bag)
+        assert recorded.metadata["pendulum.run"]["controller"] == {"kind": "policy", "policy": str(path)}
+        states, commands = recorded[f"/{side}/joint_states"], recorded[f"/{side}/effort_command"]
+        assert abs(states["position"] - math.pi).max() < 0.1
+        # What it answers, wherever a state was answered: u = -20 sin(x) - 1 x', on what the policy saw every 10 ms.
+        answered = dict(zip(commands["stamp_ns"], commands["effort"], strict=True))
+        expected = 20.0 * np.sin(states["position"]) - states["velocity"]
+        pairs = [
+            (answered[stamp], u) for stamp, u in zip(states["stamp_ns"], expected, strict=True) if stamp in answered
+        ]
+        assert len(pairs) > 50
+        differences = np.abs(np.diff(np.array(pairs[len(pairs) // 2 :]), axis=1))
+        assert np.median(differences) < (1e-5 if side == "hw" else 0.05)
+
+
+def test_a_policy_that_cannot_play_is_refused_before_anything_starts(tmp_path: Path) -> None:
+    other = write_policy(tmp_path / "other.npz", linear_policy(load_plant("dfki"), 2.0, 0.1))
+    for arguments, reason in (
+        ((tmp_path / "none.npz",), "none.npz does not exist"),
+        ((other, "--q", "50", "0.01"), "which has no such parameter"),
+    ):
+        command = [sys.executable, "-m", "pendulum_bags", "experiment", "thesis", "--out", str(tmp_path / "run")]
+        command += ["--controller", *map(str, arguments)]
+        done = subprocess.run(command, capture_output=True, text=True, timeout=60.0, check=False)
+        assert done.returncode == 2
+        assert reason in done.stderr
+        assert not (tmp_path / "run").exists()
 
 
 @pytest.mark.timeout(180)

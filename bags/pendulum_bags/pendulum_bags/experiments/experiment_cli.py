@@ -64,7 +64,7 @@ Seed = Annotated[int, typer.Option(help="Seed of the noise; one seed is one sign
 Amplitude = Annotated[float, typer.Option(help="Largest torque of the noise [N m].")]
 HoldTime = Annotated[float, typer.Option(help="Time for which a noise sample is held [s].")]
 Duration = Annotated[float, typer.Option(help="Length of the noise [s].")]
-Controller = Annotated[str, typer.Option(help="Kind of controller.")]
+Controller = Annotated[str, typer.Option(help="Kind of controller, or a policy file (.npz).")]
 Q = Annotated[tuple[float, float], typer.Option(help="Diagonal of Q.")]
 R = Annotated[float, typer.Option(help="R.")]
 Storage = Annotated[str, typer.Option(help="Storage of the bags: mcap or sqlite3.")]

@@ -73,7 +73,7 @@ def lockstep_spec(settings: RegulationSettings, *, side: str, theta: float = UPR
         plant=settings.plant if side == "sim" else "thesis",
         design_plant=settings.plant,
         strategy=settings.strategy,
-        controller=settings.controller,
+        controller=settings.kind,
         controller_parameters=settings.tuning,
         disturbance={
             "kind": "uniform",

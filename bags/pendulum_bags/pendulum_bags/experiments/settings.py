@@ -13,6 +13,7 @@ from pendulum_bags.experiments.simulation import ForeignSimulation
 from pendulum_bags.runs.run_folder import provenance
 from pendulum_bags.runs.run_record import RUN_RECORD
 from pendulum_lqr.controller import controller_parameters
+from pendulum_lqr.policy_file import load_policy
 from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.programs import graph
 from pendulum_msgs_py.programs.graph import NodeProgram
@@ -66,7 +67,7 @@ class RegulationSettings:
         lab: The lab file, for ``hebi``.
         effort_strategy: How the actuator turns wanted torque into PWM; it changes the plant that a controller sees.
             Empty for that of the lab file, else ``direct_pwm``; read it from :attr:`strategy`.
-        controller: Kind of controller.
+        controller: Kind of controller, or a policy file (.npz).
         q: Diagonal of Q.
         r: R.
         noise: The disturbance.
@@ -90,7 +91,9 @@ class RegulationSettings:
     mapping: str = ""
 
     def __post_init__(self) -> None:
-        """Refuse unknown plants and backends before anything is started."""
+        """Refuse unknown plants and backends, and a policy that cannot be read, before anything is started."""
+        if self.kind == "policy":
+            load_policy(self.controller)
         object.__setattr__(self, "method", integrator_of(self.plant, self.method))
         if self.hardware not in HARDWARE:
             raise ParameterError(f"hardware is {self.hardware!r}; expected one of {', '.join(HARDWARE)}")
@@ -108,10 +111,17 @@ class RegulationSettings:
                 )
 
     @property
-    def tuning(self) -> dict[str, list[float] | float]:
-        """The weights Q and R, as far as the controller has such parameters."""
-        known = {spec.name for spec in controller_parameters(self.controller)}
-        given: dict[str, list[float] | float] = {"q": [float(value) for value in self.q], "r": float(self.r)}
+    def kind(self) -> str:
+        """Kind of controller: ``policy`` for a policy file."""
+        return "policy" if Path(self.controller).suffix == ".npz" else self.controller
+
+    @property
+    def tuning(self) -> dict[str, list[float] | float | str]:
+        """The weights Q and R or the policy file, as far as the controller has such parameters."""
+        known = {spec.name for spec in controller_parameters(self.kind)}
+        given: dict[str, list[float] | float | str] = {"q": [float(value) for value in self.q], "r": float(self.r)}
+        if self.kind == "policy":
+            given["policy"] = str(Path(self.controller).expanduser().resolve())
         return {name: value for name, value in given.items() if name in known}
 
     @property
@@ -171,7 +181,7 @@ class RegulationSettings:
     def controller_program(self, namespace: str, **changes: graph.ParameterArgument) -> NodeProgram:
         """Return the controller of one of the plants."""
         plant = self.plant if Path(self.plant).suffix == "" else str(Path(self.plant).resolve())
-        parameters: dict[str, graph.ParameterArgument] = {"controller": self.controller, "plant": plant, **self.tuning}
+        parameters: dict[str, graph.ParameterArgument] = {"controller": self.kind, "plant": plant, **self.tuning}
         return graph.controller(namespace, **{**parameters, **changes})
 
     def disturbance_program(self, namespace: str, **changes: graph.ParameterArgument) -> NodeProgram:
@@ -193,7 +203,7 @@ class RegulationSettings:
                 "strategy": self.strategy,
                 "seed": self.noise.seed,
                 "disturbance": {"kind": "uniform", **asdict(self.noise)},
-                "controller": {"kind": self.controller, **self.tuning},
+                "controller": {"kind": self.kind, **self.tuning},
                 **provenance(),
                 **({} if (foreign := self.foreign) is None else {"simulation": foreign.to_json()}),
                 **({} if (machine := self.machine) is None else {"lab": dict(machine.lab.values)}),
