@@ -50,7 +50,7 @@ def backup_group(group: Any, folder: Path) -> list[Path]:
     with _new(folder):
         info.write_gains(str(folder / GAINS))
         info.write_safety_params(str(folder / SAFETY))
-        (folder / ENDS).write_text(json.dumps(_ends_of(info), indent=2) + "\n", encoding="utf-8")
+        (folder / ENDS).write_text(json.dumps(_ends_of(info)) + "\n", encoding="utf-8")
         files = [folder / GAINS, folder / SAFETY, folder / ENDS]
         # hebi-py says nothing where a disk is full.
         if not all(file.is_file() and file.stat().st_size for file in files):
@@ -119,18 +119,17 @@ def backup_emulator(port: ActuatorPort, folder: Path) -> list[Path]:
         raise ActuatorError("not_connected", f"{info.backend} does not tell its gains; expected hebi or an emulator")
     with _new(folder):
         write_gains(folder / GAINS, info.gains)
-        (folder / LIMITS).write_text(json.dumps(limits_to_json(info.limits), indent=2) + "\n", encoding="utf-8")
+        (folder / LIMITS).write_text(json.dumps(limits_to_json(info.limits)) + "\n", encoding="utf-8")
     return [folder / GAINS, folder / LIMITS]
 
 
 def restore_emulator(port: ActuatorPort, folder: Path, say: Callable[[str], None]) -> None:
-    """Give an emulator the gains and limits of :func:`backup_emulator`, and read them back; ``say`` as for a group."""
+    """Give a connected emulator what :func:`backup_emulator` kept, and read it back; ``say`` as for a group."""
     gains = load_gains(folder / GAINS)
     try:
         limits = limits_from_json(json.loads(read_text(folder / LIMITS, "backup")))
     except ValueError as error:
         raise ParameterError(f"backup {folder / LIMITS} is not understood: {error}") from error
-    port.connect()
     with _told_if_broken_off(folder, say):
         if port.set_gains(gains) != gains or port.set_limits(limits) != limits:
             raise ActuatorError("no_acknowledgement", f"emulator reads back other values than those of {folder}")

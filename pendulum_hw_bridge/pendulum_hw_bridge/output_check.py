@@ -63,6 +63,7 @@ class OutputCheck:
         self._wrong.clear()
         self._duties.clear()
         self._too_much = 0
+        self._opposed_since_ns = None
 
     def check(self, feedback: Feedback, strategy: Strategy, candidates: Sequence[Command]) -> Fault | None:
         """Return the fault that the duty of a record shows, or None.

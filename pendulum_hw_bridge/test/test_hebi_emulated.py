@@ -132,12 +132,23 @@ class TwoEnds(EmulatedGroup):
         return super().send_command_with_acknowledgement(command, timeout_ms)
 
 
+class DeafAtTheEnds(TwoEnds):
+    """One that keeps what it does there, and acknowledges all the same."""
+
+    def send_command_with_acknowledgement(self, command: Any, timeout_ms: float) -> bool:
+        return EmulatedGroup.send_command_with_acknowledgement(self, command, timeout_ms)
+
+
 def test_what_a_module_does_at_either_end_of_its_limits_is_given_back(served: Served, tmp_path: Path) -> None:
     group = TwoEnds(served.where, hebi)
     backup_group(group, tmp_path / "before")
     group.ends = 2, 2
     restore_group(group, tmp_path / "before", backend_module.new_command, print)
     assert group.ends == (2, 1)
+    deaf = DeafAtTheEnds(served.where, hebi)
+    deaf.ends = 2, 2
+    with pytest.raises(ActuatorError, match=r"reads back .*: 2\}; expected .*: 1\}"):
+        restore_group(deaf, tmp_path / "before", backend_module.new_command, print)
 
 
 def test_a_backup_that_cannot_be_written_leaves_no_half_of_one(served: Served, tmp_path: Path) -> None:

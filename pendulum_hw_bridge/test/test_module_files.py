@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -15,7 +17,13 @@ from pendulum_hw_bridge.backends.emulator import EmulatorBackend
 from pendulum_hw_bridge.clocks import SteppedClock
 from pendulum_hw_bridge.emulation.parameters import load_emulator
 from pendulum_hw_bridge.emulation.x5 import EmulatedX5
-from pendulum_hw_bridge.module_files import backup_emulator, backup_group, restore_emulator, restore_group
+from pendulum_hw_bridge.module_files import (
+    _set_open_ends,
+    backup_emulator,
+    backup_group,
+    restore_emulator,
+    restore_group,
+)
 from pendulum_hw_bridge.settings import BridgeSettings
 from pendulum_msgs_py.errors import ParameterError
 
@@ -125,12 +133,82 @@ def test_a_restore_that_is_broken_off_between_its_writes_says_that_half_of_it_ma
     assert said[-1].startswith("Broken off: the module may hold")
 
 
-def test_a_backup_of_which_one_file_cannot_be_read_is_sent_to_no_module(tmp_path: Path) -> None:
+@pytest.mark.parametrize("name", ["gains.xml", "safety.xml", "position_limit_strategies.json"])
+def test_a_backup_of_which_one_file_cannot_be_read_is_sent_to_no_module(tmp_path: Path, name: str) -> None:
     hebi = pytest.importorskip("hebi", reason="hebi-py is not installed")
     module, said, sent = Module(hebi), list[str](), list[Any]()
-    _, safety, _ = backup_group(module, tmp_path / "before")
-    safety.write_text("<safety_params", encoding="utf-8")
+    backup_group(module, tmp_path / "before")
+    (tmp_path / "before" / name).write_text("<not this", encoding="utf-8")
     module.send_command_with_acknowledgement = lambda command, timeout_ms: sent.append(command)  # type: ignore[assignment,func-returns-value]
-    with pytest.raises(ParameterError, match=r"safety.xml is not understood"):
+    with pytest.raises(ParameterError, match=f"{name} is not understood"):
         restore_group(module, tmp_path / "before", backend_module.new_command, said.append)
     assert (sent, said) == ([], [])
+
+
+def test_a_module_that_acknowledges_nothing_is_asked_three_times_and_told(tmp_path: Path) -> None:
+    hebi = pytest.importorskip("hebi", reason="hebi-py is not installed")
+    module, said, asked = Module(hebi), list[str](), list[int]()
+    backup_group(module, tmp_path / "before")
+
+    def deaf(command: Any, timeout_ms: int) -> bool:
+        asked.append(timeout_ms)
+        return False
+
+    module.send_command_with_acknowledgement = deaf  # type: ignore[method-assign]
+    with pytest.raises(ActuatorError, match=r"did not acknowledge gains.xml within 500 ms"):
+        restore_group(module, tmp_path / "before", backend_module.new_command, said.append)
+    assert asked == [500] * 3
+    assert said
+
+
+def test_a_backup_from_before_either_end_was_kept_is_given_back_too(tmp_path: Path) -> None:
+    hebi = pytest.importorskip("hebi", reason="hebi-py is not installed")
+    module, said = Module(hebi), list[str]()
+    module.state.position_kp = 2.5
+    _, _, ends = backup_group(module, tmp_path / "before")
+    ends.unlink()
+    module.state.position_kp = 1.5
+    restore_group(module, tmp_path / "before", backend_module.new_command, said.append)
+    assert module.state.position_kp[0] == 2.5
+
+
+def test_an_emulator_that_keeps_other_values_or_files_that_say_nothing_are_told(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    port, said = emulator(), list[str]()
+    files = backup_emulator(port, tmp_path / "before")
+    assert [file.name for file in files] == ["gains.xml", "limits.json"]
+    assert all(file.is_file() for file in files)
+    before = port.connect()
+    monkeypatch.setattr(port, "set_limits", lambda limits: replace(limits, effort=1.0))
+    with pytest.raises(ActuatorError, match="emulator reads back other values than those of"):
+        restore_emulator(port, tmp_path / "before", said.append)
+    assert said
+    (tmp_path / "before" / "limits.json").write_text("[", encoding="utf-8")
+    with pytest.raises(ParameterError, match=r"limits.json is not understood"):
+        restore_emulator(port, tmp_path / "before", said.append)
+    monkeypatch.setattr(port, "connect", lambda: replace(before, gains=None))
+    with pytest.raises(ActuatorError, match="does not tell its gains; expected hebi or an emulator"):
+        backup_emulator(port, tmp_path / "other")
+    assert not (tmp_path / "other").exists()
+
+
+def test_open_ends_of_a_file_are_set_as_infinite_and_what_is_no_number_is_told(tmp_path: Path) -> None:
+    path = tmp_path / "safety.xml"
+
+    def ends_of(low: str, high: str) -> dict[str, float]:
+        text = f"<safety><position><min_limit>{low}</min_limit><max_limit>{high}</max_limit></position></safety>"
+        path.write_text(text, encoding="utf-8")
+        command = SimpleNamespace()
+        _set_open_ends(command, path)
+        return vars(command)
+
+    assert ends_of("-inf", "inf") == {"position_limit_min": -math.inf, "position_limit_max": math.inf}
+    assert ends_of("-4.0", "inf") == {"position_limit_max": math.inf}
+    assert ends_of("-4.0", "4.0") == {}
+    with pytest.raises(ParameterError, match="max_limit of the position is no number; expected one, or inf"):
+        ends_of("-inf", "nan")
+    with pytest.raises(ParameterError, match=r"safety.xml is not understood"):
+        ends_of("-inf", "far")
+    path.write_text("<safety/>", encoding="utf-8")
+    _set_open_ends(SimpleNamespace(), path)

@@ -299,6 +299,9 @@ def test_what_the_low_pass_leaves_of_an_output_at_its_clamp_is_no_stuck_duty() -
     # Every other cycle: four fifths of one and a fifth of the other.
     for duty in (0.35, 0.3504, 0.3496, -0.1):
         assert faults(duty) == [""] * 4
+    # Every third, every fourth: a 1/(1 - 4^-3) and a 1/(1 - 4^-4) of what one throw leaves.
+    for duty in (-0.0714286, 0.3214286, -0.0647059, 0.3147059):
+        assert faults(duty) == [""] * 4
     # Between those nothing excuses a duty that stands still, near the limit as little as near none.
     for duty in (0.47, 0.42, 0.1, -0.0631, -0.0619, -0.22):
         assert faults(duty) == ["", "", "", "output_disagreement"]
@@ -311,6 +314,17 @@ def test_however_slow_the_low_pass_a_duty_between_the_clamps_has_no_reason_to_st
         checked = Checked(gains)
         found = [checked.see(duty, Command(effort=0.0), effort=0.1 * (number % 2)) for number in range(4)]
         assert found == ["", "", "", "output_disagreement"]
+
+
+def test_a_step_of_the_duty_beside_what_the_low_pass_leaves_is_excused_and_no_more() -> None:
+    gains = replace(GAINS, effort=PidGains(kp=0.25, min_output=-0.5, max_output=0.5, output_lowpass=0.5))
+
+    def fault(duty: float) -> str:
+        checked = Checked(gains)
+        return [checked.see(duty, Command(effort=0.0), effort=0.1 * (number % 2)) for number in range(4)][-1]
+
+    # Half of either clamp is zero.
+    assert [fault(duty) for duty in (5e-4, 5.1e-4)] == ["", "output_disagreement"]
 
 
 # --- opposed ---------------------------------------------------------------------------------------------------

@@ -40,6 +40,8 @@ MODULE = "emulator"
 """Name of the process behind a plant that has a module."""
 _RIGHTFUL = {names.EFFORT_COMMAND: "controller", names.DISTURBANCE: "disturbance"}
 """Who may ask for torque, by topic."""
+_FALLEN = ("already commands", "firmware_limit", "position is")
+"""What a plant says that cannot be armed because its pendulum has fallen, or turned out of its window."""
 _KEPT_NS = 120_000_000_000
 """How long what the motor did is kept [ns]."""
 
@@ -315,12 +317,12 @@ class LiveSystem:
             if self.plant.has_module and self._arming.service_is_ready() and (refusal := self.arm()):
                 self.arm(False)
                 refusal = self.arm()
-                if "already commands" in refusal:
+                if any(each in refusal for each in _FALLEN):
                     self._begin_upright()
             self.listen(0.5)
 
     def _begin_upright(self) -> None:
-        """Put the pendulum upright where it has fallen so far that the controller asks for much at once."""
+        """Put the pendulum upright where it has fallen so far that the controller asks for much, or left its window."""
         commanding = [name for name in ("controller", "disturbance") if name in self.children]
         for name in commanding:
             self.processes.finish(self.children.pop(name))

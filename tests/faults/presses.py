@@ -8,12 +8,14 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager
 
-from rclpy.client import Client
+from rclpy.experimental import EventsExecutor
 from std_srvs.srv import SetBool, Trigger
 
 from pendulum_msgs_py.contract import names
+from pendulum_msgs_py.errors import FaultError
 from tests.faults.live import START_TIMEOUT, LiveSystem
 from tests.faults.outcome import Fault, Outcome, demand_rest
+from tests.graph_peer import GraphPeer
 
 __all__ = ["LATEST_ANSWER", "PRESSES"]
 
@@ -24,22 +26,52 @@ _PRESSES = 10
 Load = Callable[[LiveSystem, random.Random], AbstractContextManager[None]]
 
 
+class _Button:
+    """Presses the e-stop from a participant of its own, which hears nothing but the answer.
+
+    The probe hears every command and state: in a flood of them an answer waited in the probe, not in the plant.
+    """
+
+    def __init__(self, system: LiveSystem) -> None:
+        self._peer = GraphPeer("button", domain=system.domain, make_executor=EventsExecutor)
+        self._client = self._peer.node.create_client(Trigger, system.service(names.E_STOP))
+        self._wait_for("the e-stop", self._client.service_is_ready)
+        # A button is there before it is pressed: who has just found the service is not known to it yet.
+        self._peer.spin(0.5)
+
+    def press(self) -> float:
+        """Press once and return how long the answer took [s]."""
+        answered: list[float] = []
+        pressed = time.monotonic()
+        self._client.call_async(Trigger.Request()).add_done_callback(lambda _: answered.append(time.monotonic()))
+        self._wait_for("the answer of the e-stop", lambda: answered)
+        return answered[0] - pressed
+
+    def close(self) -> None:
+        self._peer.close()
+
+    def _wait_for(self, what: str, predicate: Callable[[], object]) -> None:
+        try:
+            self._peer.until(predicate, what)
+        except TimeoutError as error:
+            raise FaultError(str(error)) from error
+
+
 def _press(load: Load) -> Callable[[LiveSystem, random.Random], Outcome]:
     """Return a fault: press while a load lasts."""
 
     def act(system: LiveSystem, generator: random.Random) -> Outcome:
         outcome = Outcome()
-        node = system.conductor.node
-        client = node.create_client(Trigger, system.service(names.E_STOP))
-        reset = node.create_client(Trigger, system.service(names.E_STOP_RESET))
-        system.wait_for("the e-stop", client.service_is_ready, START_TIMEOUT)
-        # A button is there before it is pressed: who has just found the service is not known to it yet.
-        system.listen(0.5)
-        with load(system, generator):
-            pressed_ns = time.time_ns()
-            # The first stops the plant; a latched e-stop answers by the same path.
-            waits = [_answer_time(system, client) for _ in range(_PRESSES)]
-            system.listen(0.3)
+        reset = system.conductor.node.create_client(Trigger, system.service(names.E_STOP_RESET))
+        button = _Button(system)
+        try:
+            with load(system, generator):
+                pressed_ns = time.time_ns()
+                # The first stops the plant; a latched e-stop answers by the same path.
+                waits = [button.press() for _ in range(_PRESSES)]
+                system.listen(0.3)
+        finally:
+            button.close()
         told = f"{len(waits)} presses answered after {max(waits) * 1e3:.0f} ms at most, the first {waits[0] * 1e3:.0f}"
         outcome.demand(max(waits) <= LATEST_ANSWER, f"{told}; expected within {LATEST_ANSWER * 1e3:.0f} ms")
         outcome.detail = outcome.detail or told
@@ -49,8 +81,7 @@ def _press(load: Load) -> Callable[[LiveSystem, random.Random], Outcome]:
         outcome.demand(system.conductor.call(reset, Trigger.Request(), "the reset").success, "no e-stop to reset")
         system.listen(0.3)
         demand_rest(outcome, system, pressed_ns)
-        for each in (client, reset):
-            node.destroy_client(each)
+        system.conductor.node.destroy_client(reset)
         if not system.plant.has_module:
             _arm_upright(system)
         return outcome
@@ -67,15 +98,6 @@ def _arm_upright(system: LiveSystem) -> None:
 
     system.wait_for("the simulator to be armed upright", armed, START_TIMEOUT)
     system.conductor.node.destroy_client(client)
-
-
-def _answer_time(system: LiveSystem, client: Client) -> float:
-    """Press once and return how long the answer took [s]."""
-    answered: list[float] = []
-    pressed = time.monotonic()
-    client.call_async(Trigger.Request()).add_done_callback(lambda _: answered.append(time.monotonic()))
-    system.wait_for("the answer of the e-stop", lambda: bool(answered), START_TIMEOUT)
-    return answered[0] - pressed
 
 
 @contextmanager

@@ -11,8 +11,10 @@ from rcl_interfaces.srv import SetParameters
 from rclpy.client import Client
 from rclpy.experimental import EventsExecutor
 from rclpy.task import Future
+from std_srvs.srv import Trigger
 
 from pendulum_msgs_py.ros.answers import answer_who_listens
+from pendulum_msgs_py.ros.polled import PollingNode
 from tests.graph_peer import GraphPeer
 
 REQUESTS = 30
@@ -84,4 +86,49 @@ def test_a_client_that_went_is_waited_for_once_where_another_is_there(server: Gr
             until_done(server, peer, future, "the answer to the other client")
         assert in_vain(caught) <= 1
     finally:
+        peer.close()
+
+
+def test_requests_without_pause_are_answered_at_a_bounded_rate_and_every_service_has_its_turn(domain_id: int) -> None:
+    peer = GraphPeer("asker", domain=domain_id)
+    node = PollingNode("plant", context=peer.context)
+    answered: list[str] = []
+
+    def busy(_: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+        began = time.thread_time()
+        while time.thread_time() - began < 0.002:
+            pass
+        answered.append("busy")
+        return response
+
+    def other(_: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+        answered.append("other")
+        return response
+
+    node.create_service(Trigger, "~/busy", busy)
+    node.create_service(Trigger, "~/other", other)
+    peer.executor.add_node(node)
+    answer_who_listens(node)
+    node.poll_services()
+    try:
+        assert list(node.services) == [], "an executor is woken for requests"
+        flood, client = (peer.node.create_client(Trigger, f"/plant/{name}") for name in ("busy", "other"))
+        peer.until(lambda: flood.service_is_ready() and client.service_is_ready(), "the services")
+        waiting = [flood.call_async(Trigger.Request()) for _ in range(8)]
+        future = client.call_async(Trigger.Request())
+        peer.until(lambda: len(answered) >= 2, "the first answers")
+        # One that takes longer than a look may is the only one of it, and the other service does not stand behind all.
+        looks = answered.index("other")
+        assert looks <= 2, f"the other service was asked after {looks} requests of the first"
+        peer.until(lambda: future.done() and all(each.done() for each in waiting), "all answers")
+        node._next_look = time.monotonic() + 60.0
+        waiting = [flood.call_async(Trigger.Request()) for _ in range(3)]
+        peer.spin(0.1)
+        assert len(answered) == 9, "a look came before the rest was over"
+        node._next_look = 0.0
+        node._look_for_requests()
+        assert answered[9:] == ["busy"], "a look that had its time went on"
+        assert node._next_look > time.monotonic()
+    finally:
+        node.destroy_node()
         peer.close()

@@ -65,7 +65,7 @@ TARGETS: tuple[Target, ...] = (
     Target("pendulum_hw_bridge.motor_state", ("MotorWatch",), (f"{_BRIDGE}/test_motor_state.py",)),
     Target(
         "pendulum_hw_bridge.output_check",
-        ("OutputCheck", "_output", "_memoryless"),
+        ("OutputCheck", "_output", "_memoryless", "_clamped"),
         (f"{_BRIDGE}/test_output_check.py",),
     ),
     Target(
@@ -92,6 +92,47 @@ TARGETS: tuple[Target, ...] = (
     ),
     Target("pendulum_hw_bridge.bridge", ("Bridge",), (f"{_BRIDGE}/test_bridge_cycle.py",)),
     Target("pendulum_hw_bridge.derating", ("Derating",), (f"{_BRIDGE}/test_derating.py",)),
+    Target(
+        "pendulum_hw_bridge.command_check",
+        ("check_command", "check_lifetime", "_clip"),
+        (f"{_BRIDGE}/test_command_check.py",),
+    ),
+    Target(
+        "pendulum_hw_bridge.guided",
+        (
+            "find_zero_and_sign",
+            "measure_tare",
+            "prove_lifetime",
+            "prove_m_stop",
+            "_drive",
+            "_expect_inside",
+            "_duty_ends",
+            "_turned",
+            "_rest",
+            "_listen",
+            "_expect_numbers",
+        ),
+        (f"{_BRIDGE}/test_guided_rules.py", f"{_BRIDGE}/test_guided_procedures.py"),
+    ),
+    Target(
+        "pendulum_hw_bridge.nudge", ("watch_nudge", "hand_of", "Person", "EmulatedHand"), (f"{_BRIDGE}/test_nudge.py",)
+    ),
+    Target("pendulum_hw_bridge.feedback_stream", ("feedback_for",), (f"{_BRIDGE}/test_nudge.py",)),
+    Target(
+        "pendulum_hw_bridge.module_files",
+        (
+            "backup_group",
+            "restore_group",
+            "_expect_group",
+            "backup_emulator",
+            "restore_emulator",
+            "_set_open_ends",
+            "_ends_of",
+            "_read_ends",
+            "_info",
+        ),
+        (f"{_BRIDGE}/test_module_files.py", f"{_BRIDGE}/test_hebi_emulated.py"),
+    ),
     Target("pendulum_hw_bridge.e_stop_input", ("EStopInput",), (f"{_BRIDGE}/test_e_stop_input.py",)),
 )
 

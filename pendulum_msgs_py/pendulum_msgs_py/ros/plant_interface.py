@@ -36,7 +36,7 @@ from pendulum_msgs_py.ros.convert import (
 )
 from pendulum_msgs_py.ros.diagnostics import DIAGNOSTICS_PERIOD, Diagnostics
 from pendulum_msgs_py.ros.e_stop import EStopServer
-from pendulum_msgs_py.ros.polled import PolledInput, PollingNode
+from pendulum_msgs_py.ros.polled import REST_AFTER_READING, PolledInput, PollingNode
 from pendulum_msgs_py.ros.timers import create_wall_timer
 
 __all__ = ["PlantInterface"]
@@ -47,8 +47,6 @@ _WAITED_NS = 10 * NANOSECONDS
 """Longest time for which a message may wait while a plant arms [ns]; more is a system clock that was set back."""
 _LOOK = 0.02
 """Time between two looks for a press or a trajectory [s]; of trajectories without pause the newest is read then."""
-_REST_AFTER_TRAJECTORY = 4.0
-"""Time without a look after a trajectory was read, in the time that it took the processor: a fifth of it at most."""
 TRAJECTORY_AGE_LIMIT = 1.0
 """Largest distance of a trajectory's stamp from the plant's time [s]: an old wish should not move a machine."""
 
@@ -258,7 +256,7 @@ class PlantInterface:
         began = time.thread_time()
         self._trajectories.take(self._on_trajectory)
         spent = time.thread_time() - began
-        self._next_trajectory = time.monotonic() + _REST_AFTER_TRAJECTORY * spent
+        self._next_trajectory = time.monotonic() + REST_AFTER_READING * spent
 
     def _on_trajectory(self, data: bytes, arrived_ns: int) -> None:
         try:

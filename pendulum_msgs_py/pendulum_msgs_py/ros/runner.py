@@ -42,6 +42,7 @@ from pendulum_msgs_py.programs.executables import (
 )
 from pendulum_msgs_py.ros.answers import answer_who_listens
 from pendulum_msgs_py.ros.middleware import check_closed, set_middleware_defaults
+from pendulum_msgs_py.ros.polled import PollingNode
 
 __all__ = ["Closeable", "Paced", "run_node"]
 
@@ -142,6 +143,8 @@ def _run(make_node: Callable[[Callable[[], None]], Node], arguments: Sequence[st
     try:
         node = _make(make_node, stop)
         answer_who_listens(node)
+        if isinstance(node, PollingNode):
+            node.poll_services()
         check_closed(node.context.get_domain_id())
         # The first line that rclpy logs takes 30 ms; said now, it does not come in the middle of a loop.
         node.get_logger().info("ready")
