@@ -16,6 +16,7 @@ from threadpoolctl import threadpool_limits
 
 from pendulum_bags.identification.explained import REFUSED
 from pendulum_bags.identification.joint_recordings import JointRecording
+from pendulum_bags.identification.mechanism_choice import choose
 from pendulum_bags.identification.mechanism_doubt import Score, refusal, unit_hint
 from pendulum_bags.identification.mechanism_fit import (
     MechanismFit,
@@ -26,28 +27,16 @@ from pendulum_bags.identification.mechanism_fit import (
     scores,
 )
 from pendulum_bags.identification.mechanism_model import DELAY, MechanismModel
-from pendulum_bags.identification.readings import DOUBTFUL_SHARE
-from pendulum_bags.identification.residual_tests import INCOMPLETE
+from pendulum_bags.identification.mechanism_notes import notes_of
 from pendulum_bags.identification.wording import Interval
 from pendulum_msgs_py.errors import DataError, ParameterError
 from pendulum_msgs_py.plants.mechanism_parameters import MechanismParameters, write_mechanism
 
-__all__ = ["EXTRAS", "MechanismResult", "Score", "identify_mechanism"]
+__all__ = ["MechanismResult", "Score", "identify_mechanism"]
 
 Array = NDArray[np.float64]
 
 FORMAT = "pendulum_mechanism_identification/1"
-
-EXTRAS: Mapping[str, Mapping[str, bool]] = {
-    "friction": {},
-    "friction, offsets": {"offsets": True},
-    "friction, delay": {"delay": True},
-    "friction, offsets, delay": {"offsets": True, "delay": True},
-}
-"""Candidates: what is fitted beside masses and friction."""
-
-_WORTH = 0.98
-"""A candidate with more parameters must bring the held-out error below this share of that of one with fewer."""
 
 _WINDOW = (0.5, 5.0)
 """Shortest and longest window by default [s]. Each window's start takes up two numbers per joint: parameters from long
@@ -55,9 +44,6 @@ windows predict short ones better than those from short ones."""
 
 _FEWEST = 5
 """Windows below which no fit is tried."""
-
-_WIDE = 0.5
-"""Half width over value from which on the recordings do not determine a parameter."""
 
 
 @dataclass(frozen=True)
@@ -229,7 +215,7 @@ def identify_mechanism(
     start = MechanismModel.of(plant)
     lines = np.sqrt(np.mean([line_errors(part) ** 2 for part in data], axis=0))
     try:
-        found, chosen, candidates = _choose(start, data, 1.0 / np.maximum(lines, 1e-9), extras)
+        found, chosen, candidates = choose(start, data, 1.0 / np.maximum(lines, 1e-9), extras)
     except DataError as error:
         hint = unit_hint(plant, recordings)
         raise DataError(f"{error}: {hint}") if hint else error from None
@@ -245,7 +231,7 @@ def identify_mechanism(
     }
     intervals = _intervals(found)
     refused = refusal(plant, found, data, training, outside)
-    notes = _notes(plant, found, recordings, intervals, training)
+    notes = notes_of(plant, found, recordings, intervals, training)
     sources = tuple(recording.source or recording.name for recording in recordings)
     result = MechanismResult(
         found, chosen, candidates, intervals, training, outside, length, refused, tuple(notes), sources
@@ -275,66 +261,6 @@ def _training(found: MechanismFit, data: Sequence[Windows]) -> list[Array]:
     return [
         np.sqrt(np.mean(errors[part.inside] ** 2, axis=0)) for errors, part in zip(found.residuals, data, strict=True)
     ]
-
-
-def _choose(
-    start: MechanismModel, data: Sequence[Windows], weights: Array, extras: str | None
-) -> tuple[MechanismFit, str, dict[str, float]]:
-    """Return the fit that predicts what it has not seen best; each further parameter must be worth it."""
-    best: tuple[float, MechanismFit, str] | None = None
-    errors: dict[str, float] = {}
-    model, states = start, None
-    for name, wanted in EXTRAS.items():
-        free = start.fitted(**wanted)
-        if (extras is not None and name != extras) or free in [b[1].free for b in ([best] if best else [])]:
-            continue
-        found = fit(model, data, free, weights, states=states)
-        if extras is not None:
-            return found, name, {}
-        model, states = (found.model, found.states) if best is None else (model, states)
-        errors[name] = _held_out_error(found, data, weights)
-        if best is None or errors[name] < _WORTH * best[0]:
-            best = (errors[name], found, name)
-    if best is None:
-        raise DataError(f"extras is {extras!r}; expected one of {', '.join(EXTRAS)}")
-    return best[1], best[2], errors
-
-
-def _held_out_error(found: MechanismFit, data: Sequence[Windows], weights: Array) -> float:
-    """Return the weighted rms of windows predicted by the others: recordings in turn, or thirds of a single one.
-
-    The parameters without a fold are one Gauss-Newton step from those of all data, where their gradient is known.
-    """
-    index = found.model.index(found.free)
-    size = np.array([found.model.size(name) for name in found.free])
-    if len(data) > 1:
-        folds = [
-            [np.arange(len(p.time)) if i == j else np.zeros(0, dtype=int) for j, p in enumerate(data)]
-            for i in range(len(data))
-        ]
-    else:
-        folds = [[part] for part in np.array_split(np.arange(len(data[0].time)), 3)]
-    cost, samples = 0.0, 0
-    for fold in folds:
-        matrix, gradient = np.zeros((len(index), len(index))), np.zeros(len(index))
-        for blocks, out in zip(found.blocks, fold, strict=True):
-            stays = np.ones(len(blocks.gradients), dtype=bool)
-            stays[out] = False
-            matrix += blocks.matrices[stays].sum(axis=0)
-            gradient += blocks.gradients[stays].sum(axis=0)
-        values = found.model.values.copy()
-        values[index] -= size * (np.linalg.pinv(matrix * np.outer(size, size), rcond=1e-10) @ (size * gradient))
-        values[index] = np.maximum(values[index], [found.model.lowest(name) for name in found.free])
-        for part, states, out in zip(data, found.states, fold, strict=True):
-            if not out.size:
-                continue
-            one = fit(
-                found.model.with_values(values), [part.subset(out)], (), weights, states=[states[out]], most=8,
-                tolerance=1e-3,
-            )  # fmt: skip
-            cost += one.cost
-            samples += one.blocks[0].samples
-    return float(np.sqrt(cost / samples))
 
 
 def _intervals(found: MechanismFit) -> dict[str, Interval]:
@@ -371,63 +297,3 @@ def _intervals(found: MechanismFit) -> dict[str, Interval]:
         )
         for name, e, w in zip(free, largest, white, strict=True)
     }
-
-
-def _notes(
-    plant: MechanismParameters,
-    found: MechanismFit,
-    recordings: Sequence[JointRecording],
-    intervals: Mapping[str, Interval],
-    training: Mapping[str, Score],
-) -> list[str]:
-    model = found.model
-    notes = [
-        f"{r.name}: {r.left_out} rows with a NaN or a repeated stamp are left out." for r in recordings if r.left_out
-    ]
-    worst = max(score.share for score in training.values())
-    if worst > DOUBTFUL_SHARE:
-        notes.append(
-            f"{INCOMPLETE}: the model misses up to {100.0 * worst:.0f} % of what straight lines miss: something acts "
-            "on the machine that it has no word for."
-        )
-    edges = [n for n in found.free if model[n] <= model.lowest(n)]
-    if edges:
-        notes.append(f"At the edge of what it can be: {', '.join(edges)}; its interval is one-sided.")
-    loose = [n for n in found.free if n not in edges and n != DELAY and not n.endswith("_offset")
-             and intervals[n].relative > _WIDE]  # fmt: skip
-    if loose:
-        listing = ", ".join(f"{n} (+-{100.0 * min(intervals[n].relative, 99.0):.0f} %)" for n in loose)
-        notes.append(f"The recordings do not determine {listing}.")
-    notes.extend(_ridge(found))
-    own = [spec.name for spec in plant.mechanism.parameters]
-    held = [name for name in own if name not in found.free]
-    notes.append(
-        "Held at the values of the plant file, as known or since no motion tells them from the others: "
-        f"{', '.join(held)}. Where one of them is wrong, the fitted ones carry its error."
-    )
-    if DELAY in found.free and model[DELAY] < 0.0:
-        notes.append(
-            f"The recorded effort comes {-1e3 * model[DELAY]:.2g} ms after its effect (a filter in its measurement?); "
-            "the plant file has no such delay."
-        )
-    if any(name.endswith("effort_offset") for name in found.free):
-        listing = ", ".join(f"{n} {model[n]:+.3g} {model.unit(n)}" for n in found.free if n.endswith("effort_offset"))
-        notes.append(f"The recorded efforts have offsets, which the plant file leaves out: {listing}.")
-    return notes
-
-
-def _ridge(found: MechanismFit) -> list[str]:
-    """Return in words the direction that the data see least, where it is far weaker than the others."""
-    size = np.array([max(abs(found.model[name]), 1e-2 * found.model.size(name)) for name in found.free])
-    matrix = sum((b.matrices.sum(axis=0) for b in found.blocks), np.zeros((len(size),) * 2)) * np.outer(size, size)
-    values, vectors = np.linalg.eigh(matrix)
-    samples = sum(b.samples for b in found.blocks)
-    error = float(np.sqrt(found.cost / max(samples, 1) / max(values[0], 1e-300)))
-    if error < 0.02:
-        return []
-    direction = vectors[:, 0] / np.max(np.abs(vectors[:, 0]))
-    big = [i for i in np.argsort(-np.abs(direction)) if abs(direction[i]) > 0.25]
-    if len(big) < 2:
-        return []
-    told = ", ".join(f"{found.free[i]} by {100.0 * direction[i] * np.sign(direction[big[0]]):+.0f} %" for i in big)
-    return [f"The motion hardly changes when these change together: {told}."]

@@ -1,0 +1,100 @@
+"""Which of the possible extras of a mechanism's fit are worth their parameters: by what the fit has not seen."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pendulum_bags.identification.mechanism_fit import MechanismFit, Windows, fit
+from pendulum_bags.identification.mechanism_model import MechanismModel
+from pendulum_msgs_py.errors import DataError
+
+__all__ = ["EXTRAS", "choose"]
+
+Array = NDArray[np.float64]
+
+EXTRAS: Mapping[str, Mapping[str, bool]] = {
+    "friction": {},
+    "friction, offsets": {"offsets": True},
+    "friction, delay": {"delay": True},
+    "friction, offsets, delay": {"offsets": True, "delay": True},
+}
+"""Candidates: what is fitted beside masses and friction."""
+
+_WORTH = 0.98
+"""A candidate with more parameters must bring the held-out error below this share of that of one with fewer."""
+
+
+def choose(
+    start: MechanismModel, data: Sequence[Windows], weights: Array, extras: str | None
+) -> tuple[MechanismFit, str, dict[str, float]]:
+    """Return the fit that predicts what it has not seen best; each further parameter must be worth it.
+
+    Args:
+        start: The model to start from.
+        data: Windows of the recordings.
+        weights: Of each joint, shape (n,).
+        extras: The one candidate of ``EXTRAS`` to fit; None to choose.
+
+    Returns:
+        The fit, which candidate it is, and the held-out error of each.
+
+    Raises:
+        DataError: There is no such candidate.
+    """
+    best: tuple[float, MechanismFit, str] | None = None
+    errors: dict[str, float] = {}
+    model, states = start, None
+    for name, wanted in EXTRAS.items():
+        free = start.fitted(**wanted)
+        if (extras is not None and name != extras) or free in [b[1].free for b in ([best] if best else [])]:
+            continue
+        found = fit(model, data, free, weights, states=states)
+        if extras is not None:
+            return found, name, {}
+        model, states = (found.model, found.states) if best is None else (model, states)
+        errors[name] = _held_out_error(found, data, weights)
+        if best is None or errors[name] < _WORTH * best[0]:
+            best = (errors[name], found, name)
+    if best is None:
+        raise DataError(f"extras is {extras!r}; expected one of {', '.join(EXTRAS)}")
+    return best[1], best[2], errors
+
+
+def _held_out_error(found: MechanismFit, data: Sequence[Windows], weights: Array) -> float:
+    """Return the weighted rms of windows predicted by the others: recordings in turn, or thirds of a single one.
+
+    The parameters without a fold are one Gauss-Newton step from those of all data, where their gradient is known.
+    """
+    index = found.model.index(found.free)
+    size = np.array([found.model.size(name) for name in found.free])
+    if len(data) > 1:
+        folds = [
+            [np.arange(len(p.time)) if i == j else np.zeros(0, dtype=int) for j, p in enumerate(data)]
+            for i in range(len(data))
+        ]
+    else:
+        folds = [[part] for part in np.array_split(np.arange(len(data[0].time)), 3)]
+    cost, samples = 0.0, 0
+    for fold in folds:
+        matrix, gradient = np.zeros((len(index), len(index))), np.zeros(len(index))
+        for blocks, out in zip(found.blocks, fold, strict=True):
+            stays = np.ones(len(blocks.gradients), dtype=bool)
+            stays[out] = False
+            matrix += blocks.matrices[stays].sum(axis=0)
+            gradient += blocks.gradients[stays].sum(axis=0)
+        values = found.model.values.copy()
+        values[index] -= size * (np.linalg.pinv(matrix * np.outer(size, size), rcond=1e-10) @ (size * gradient))
+        values[index] = np.maximum(values[index], [found.model.lowest(name) for name in found.free])
+        for part, states, out in zip(data, found.states, fold, strict=True):
+            if not out.size:
+                continue
+            one = fit(
+                found.model.with_values(values), [part.subset(out)], (), weights, states=[states[out]], most=8,
+                tolerance=1e-3,
+            )  # fmt: skip
+            cost += one.cost
+            samples += one.blocks[0].samples
+    return float(np.sqrt(cost / samples))
