@@ -12,7 +12,8 @@ Memory does not depend on the number of steps, unless the trajectories are asked
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 
 import numpy as np
@@ -27,7 +28,7 @@ from pendulum_sim.integrators import get_integrator
 from pendulum_sim.plant import check_step, pack
 from pendulum_sim.stability import MOST_GROWTH, check_stability, growth_rate
 
-__all__ = ["BatchResult", "simulate_batch"]
+__all__ = ["BatchResult", "batch_size", "check_counts", "noise_keys", "on_threads", "simulate_batch"]
 
 Array = NDArray[np.float64]
 
@@ -101,18 +102,13 @@ def simulate_batch(
     Raises:
         ParameterError: Shapes do not go together, or a value is outside its domain.
     """
-    import numba
-
     from pendulum_sim.batch_kernels import ROWS, coefficients_kernel, general_kernel, smooth_kernel
 
     check_step(dt, substeps)
     integrator = get_integrator(method)
     if method == "adaptive":
         raise ParameterError("method is 'adaptive' in a batch; expected a compiled one, such as etd4")
-    _check_whole("steps", steps, 1)
-    _check_whole("hold", hold, 1)
-    if threads is not None:
-        _check_whole("threads", threads, 1)
+    check_counts(steps, hold, threads)
     if not math.isfinite(target):
         raise ParameterError(f"target is {target} rad; expected a finite number")
     plants = [parameters] if isinstance(parameters, PlantParameters) else list(parameters)
@@ -130,20 +126,15 @@ def simulate_batch(
     }
     if columns["amplitude"].min() < 0.0:
         raise ParameterError(f"amplitude has a value of {columns['amplitude'].min()} N m; expected >= 0")
-    seed_list = list(np.atleast_1d(np.asarray(seeds, dtype=object)))
-    for seed in seed_list:
-        _check_whole("seeds", seed, 0)
+    own_keys = noise_keys(seeds)
     lengths = {name: column.size for name, column in columns.items()}
     varied = {name: _column(name, values) for name, values in (variations or {}).items()}
     if "coulomb_friction" in varied and "static_friction" not in varied and _static_follows(plants):
         varied["static_friction"] = varied["coulomb_friction"]
     _check_variations(varied, plants)
     lengths |= {name: column.size for name, column in varied.items()}
-    lengths |= {"parameters": len(plants), "gain": len(gains), "seeds": len(seed_list)}
-    size = max(lengths.values())
-    for name, length in lengths.items():
-        if length not in {1, size}:
-            raise ParameterError(f"{name} has {length} entries; expected 1 or {size}")
+    lengths |= {"parameters": len(plants), "gain": len(gains), "seeds": len(own_keys)}
+    size = batch_size(lengths)
 
     packed = np.array([pack(plant) for plant in plants], dtype=np.float64)
     h = dt / substeps
@@ -169,7 +160,7 @@ def simulate_batch(
     delays = np.array([plant.transport_delay for plant in plants])
     smooth = not (delays.any() or packed[:, 4].any() or packed[:, 6].any() or packed[:, 9].any())
 
-    keys = _spread(np.array([stream_key(seed) for seed in seed_list], dtype=np.uint64), size)
+    keys = _spread(own_keys, size)
     record_of = np.empty((steps, 3, size)) if record else np.empty((0, 3, size))
     table = np.zeros((len(ROWS) + coefficients.shape[1], size))
     rows = dict(zip(ROWS, table, strict=False))
@@ -183,17 +174,13 @@ def simulate_batch(
     for name, values in zip(PACKED, packed.T, strict=True):
         rows[name][:] = values
     table[len(ROWS) :] = coefficients.T
-    before = numba.get_num_threads()
-    numba.set_num_threads(min(threads or before, numba.config.NUMBA_NUM_THREADS))
-    try:
+    with on_threads(threads):
         if smooth:
             run = smooth_kernel(method, coefficients.shape[1])
             run(table, keys, target, h, steps, hold, substeps, record_of)
         else:
             run = general_kernel(method)
             run(table, _spread(delays, size), keys, target, dt, steps, hold, substeps, record_of)
-    finally:
-        numba.set_num_threads(before)
     mean_x, mean_v = rows["sum_x"] / steps, rows["sum_v"] / steps
     return BatchResult(
         theta=rows["x"].copy(),
@@ -208,9 +195,55 @@ def simulate_batch(
     )
 
 
-def _check_whole(name: str, value: object, least: int) -> None:
-    if isinstance(value, (bool, np.bool_)) or not isinstance(value, (int, np.integer)) or value < least:
-        raise ParameterError(f"{name} is {value!r}; expected a whole number >= {least}")
+def check_counts(steps: object, hold: object, threads: object) -> None:
+    """Refuse steps, steps of a noise sample or threads (None for the default) that are no whole number >= 1."""
+    counts = {"steps": steps, "hold": hold, **({} if threads is None else {"threads": threads})}
+    for name, value in counts.items():
+        if not _is_whole(value) or value < 1:  # type: ignore[operator]
+            raise ParameterError(f"{name} is {value!r}; expected a whole number >= 1")
+
+
+def noise_keys(seeds: ArrayLike) -> NDArray[np.uint64]:
+    """Return the key of each seed's noise, shape (1,) or (B,).
+
+    Raises:
+        ParameterError: A seed is no whole number from 0 to 2^64 - 1.
+    """
+    given = np.atleast_1d(np.asarray(seeds, dtype=object))
+    for seed in given:
+        if not _is_whole(seed) or not 0 <= seed < 2**64:
+            raise ParameterError(f"seeds has {seed!r}; expected whole numbers from 0 to 2^64 - 1")
+    return np.array([stream_key(int(seed)) for seed in given], dtype=np.uint64)
+
+
+def batch_size(lengths: Mapping[str, int]) -> int:
+    """Return the size of a batch, that of its longest argument; all others have one entry, or as many.
+
+    Raises:
+        ParameterError: One has another number of them.
+    """
+    size = max(lengths.values())
+    for name, length in lengths.items():
+        if length not in {1, size}:
+            raise ParameterError(f"{name} has {length} entries; expected 1 or {size}")
+    return size
+
+
+@contextmanager
+def on_threads(threads: int | None) -> Iterator[None]:
+    """Run compiled loops on a number of threads, None for numba's default, and leave the default as it was."""
+    import numba
+
+    before = numba.get_num_threads()
+    numba.set_num_threads(min(threads or before, numba.config.NUMBA_NUM_THREADS))
+    try:
+        yield
+    finally:
+        numba.set_num_threads(before)
+
+
+def _is_whole(value: object) -> bool:
+    return isinstance(value, (int, np.integer)) and not isinstance(value, (bool, np.bool_))
 
 
 def _static_follows(plants: Sequence[PlantParameters]) -> bool:

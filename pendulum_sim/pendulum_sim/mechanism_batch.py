@@ -14,11 +14,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from pendulum_msgs_py.contract.noise import stream_key
 from pendulum_msgs_py.dynamics.arithmetic import in_arithmetic
 from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.plants.joint_parameters import actuator_specs, joint_specs
 from pendulum_msgs_py.plants.mechanism_parameters import MechanismParameters
+from pendulum_sim.batch import batch_size, check_counts, noise_keys, on_threads
 from pendulum_sim.joint_steps import pack_joints
 from pendulum_sim.mechanism_plant import check_decay, check_stable_step, common_delay, is_smooth_mechanism
 from pendulum_sim.plant import check_step
@@ -91,20 +91,16 @@ def simulate_mechanisms(
     Raises:
         ParameterError: Shapes do not go together, or a value is outside its domain.
     """
-    import numba
-
     from pendulum_sim.mechanism_kernels import Layout, general_joints_kernel, smooth_joints_kernel
 
     check_step(dt, substeps)
-    for name, value in (("steps", steps), ("hold", hold), *((("threads", threads),) if threads is not None else ())):
-        if isinstance(value, bool) or not isinstance(value, (int, np.integer)) or value < 1:
-            raise ParameterError(f"{name} is {value!r}; expected a whole number >= 1")
+    check_counts(steps, hold, threads)
     coordinates = parameters.coordinates
     n, m = len(coordinates.joints), len(coordinates.driven)
     aim = np.array(coordinates.goal if goal is None else goal, dtype=np.float64)
     if aim.shape != (n,) or not np.isfinite(aim).all():
         raise ParameterError(f"goal is {aim.tolist()}; expected {n} finite numbers")
-    seed_list = [_checked_seed(seed) for seed in np.atleast_1d(np.asarray(seeds, dtype=object))]
+    own_keys = noise_keys(seeds)
     columns = {
         "q": _table("position", aim if position is None else position, n),
         "v": _table("velocity", np.full(n, velocity) if np.ndim(velocity) == 0 else velocity, n),
@@ -117,11 +113,8 @@ def simulate_mechanisms(
     if columns["amplitude"].size and columns["amplitude"].min() < 0.0:
         raise ParameterError(f"amplitude has a value of {columns['amplitude'].min()}; expected >= 0")
     varied = {name: _table(name, np.reshape(values, (-1, 1)), 1)[:, 0] for name, values in (variations or {}).items()}
-    lengths = {name: len(column) for name, column in {**columns, **varied}.items()} | {"seeds": len(seed_list)}
-    size = max(lengths.values())
-    for name, length in lengths.items():
-        if length not in {1, size}:
-            raise ParameterError(f"{name} has {length} entries; expected 1 or {size}")
+    lengths = {name: len(column) for name, column in {**columns, **varied}.items()} | {"seeds": len(own_keys)}
+    size = batch_size(lengths)
     wide = {name: np.repeat(column, size, axis=0) if len(column) == 1 else column for name, column in columns.items()}
     wide = {name: np.array(column) for name, column in wide.items()}
     for name, values in varied.items():
@@ -136,19 +129,15 @@ def simulate_mechanisms(
     w = np.zeros((starts["end"], size))
     for name, column in wide.items():
         w[starts[name] : starts[name] + column.shape[1]] = column.T
-    keys = np.broadcast_to(np.array([stream_key(seed) for seed in seed_list], dtype=np.uint64), (size,)).copy()
+    keys = np.broadcast_to(own_keys, (size,)).copy()
     recorded = np.empty((steps, 3 * n, size)) if record else np.empty((0, 3 * n, size))
     smooth = is_smooth_mechanism(parameters) and not any(name.partition(".")[2] in _TABLE for name in varied)
-    before = numba.get_num_threads()
-    numba.set_num_threads(min(threads or before, numba.config.NUMBA_NUM_THREADS))
-    try:
+    with on_threads(threads):
         if smooth:
             smooth_joints_kernel(layout)(w, keys, aim, dt, steps, hold, substeps, recorded)
         else:
             more = np.array([float(substeps), common_delay(parameters)])
             general_joints_kernel(layout)(w, keys, aim, dt, steps, hold, more, recorded)
-    finally:
-        numba.set_num_threads(before)
 
     def rows(name: str, count: int) -> Array:
         return w[starts[name] : starts[name] + count].T.copy()
@@ -182,12 +171,6 @@ def _table(name: str, values: ArrayLike, width: int) -> Array:
     if not np.isfinite(table).all():
         raise ParameterError(f"{name} has a value that is not finite; expected numbers")
     return table
-
-
-def _checked_seed(seed: object) -> int:
-    if isinstance(seed, bool) or not isinstance(seed, (int, np.integer)) or not 0 <= seed < 2**64:
-        raise ParameterError(f"seeds has {seed!r}; expected whole numbers from 0 to 2^64 - 1")
-    return int(seed)
 
 
 def _vary(parameters: MechanismParameters, wide: dict[str, Array], name: str, values: Array) -> None:
