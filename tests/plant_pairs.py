@@ -75,10 +75,11 @@ def record(
     for i in range(count):
         push = float(noise[i // held])
         if i % per_state == 0:
-            seen = sensors.measure(i, state.theta, state.theta_dot, 0.0)
+            seen = sensors.measure(i, (state.theta,), (state.theta_dot,), (0.0,))
             assert seen is not None
-            command = -K[0] * from_upright(seen.position) - K[1] * seen.velocity
-            rows[i // per_state] = i * step, seen.position, seen.velocity, command, push
+            (position,), (velocity,) = seen.position, seen.velocity
+            command = -K[0] * from_upright(position) - K[1] * velocity
+            rows[i // per_state] = i * step, position, velocity, command, push
         torque = gain * (command + push)
         if waiting:
             waiting.append(torque)

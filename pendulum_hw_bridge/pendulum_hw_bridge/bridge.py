@@ -222,7 +222,7 @@ class Bridge:
         """
         push = getattr(self.port, "push", None)
         if push is not None:
-            push(drive.push)
+            push(drive.push[0])
         if self._driving and not self._turn():
             return Outcome(Drive(DriveKind.OFF, push=drive.push), 0.0, fault="host_stalled")
         if drive.kind is DriveKind.OFF or self.feedback is None:
@@ -321,7 +321,7 @@ class Bridge:
 
     def _to_sample(self, feedback: Feedback) -> JointSample:
         sign = self.settings.joint_sign
-        return JointSample(
+        return JointSample.of_one(
             feedback.stamp_ns,
             sign * feedback.position + self.settings.joint_offset,
             sign * feedback.velocity,
@@ -335,7 +335,7 @@ class Bridge:
             self._handover_left = 0.0
             if drive.starved:
                 return mapping.strategy, mapping.idle()
-            return mapping.strategy, mapping.command(sign * drive.effort, self._motor.state)
+            return mapping.strategy, mapping.command(sign * drive.effort[0], self._motor.state)
         if drive.handover > self._handover_left:
             # The torque in force passes on with the speed that the link has: neither the setpoints' nor zero.
             self._handover = mapping.handover(self._effort, feedback.pwm_command, feedback.velocity, self._motor.state)
@@ -343,9 +343,9 @@ class Bridge:
         offset, speed = self._handover
         # A duty that stands still while a setpoint moves is stuck: even in hold the setpoint moves, by less than shows.
         self._dither = -self._dither
-        velocity = sign * drive.velocity
+        velocity = sign * drive.velocity[0]
         return TRAJECTORY_STRATEGY, Command(
-            position=sign * (drive.position - self.settings.joint_offset) + drive.handover * offset + self._dither,
+            position=sign * (drive.position[0] - self.settings.joint_offset) + drive.handover * offset + self._dither,
             velocity=velocity + drive.handover * (speed - velocity),
         )
 

@@ -66,7 +66,7 @@ def _check_hardware(backend: str, limits: PlantLimits) -> None:
         ("effort_slew_limit", limits.slew),
         ("start_effort_limit", limits.start_effort),
         ("starvation_limit", limits.starvation),
-        ("position_window", limits.position_max - limits.position_min),
+        ("position_window", limits.position_max[0] - limits.position_min[0]),
     ):
         if math.isinf(value):
             raise ParameterError(f"{name} is none; expected one with backend {backend!r}")

@@ -31,7 +31,7 @@ from pendulum_msgs_py.contract.plant_specs import LOCKSTEP_EPOCH_NS, limits_from
 from pendulum_msgs_py.contract.shared_supervisor import SharedSupervisor
 from pendulum_msgs_py.contract.supervisor import Drive, DriveKind, Input, Mode
 from pendulum_msgs_py.contract.timing import LoopStatistics
-from pendulum_msgs_py.contract.values import NANOSECONDS, JointCommand, JointSample
+from pendulum_msgs_py.contract.values import NANOSECONDS, JointCommand, JointSample, Vector
 from pendulum_msgs_py.errors import PendulumError
 from pendulum_msgs_py.plants.lab_file import EMULATED_BACKENDS
 from pendulum_msgs_py.plants.plant_differences import PLANT_PARAMETERS, describe_plants
@@ -99,7 +99,7 @@ class BridgeNode(LifecycleNode, PollingNode):
         self._gains = bridge_parameters.trajectory_gains(values)
         # A cycle more than the monitor has, which names the fault; this one is behind it.
         patience = (values["feedback_watchdog"] + 1) * self._period_ns / NANOSECONDS
-        limits = limits_from_parameters(values, self._plant.effort_limit, feedback_timeout=patience)
+        limits = limits_from_parameters(values, (self._plant.effort_limit,), feedback_timeout=patience)
         self._supervisor = SharedSupervisor(limits, self._prepare, self._withdraw)
         self._lockstep_loop: LockstepLoop | None = None
         self._interface = PlantInterface(
@@ -135,12 +135,12 @@ class BridgeNode(LifecycleNode, PollingNode):
         self._mapping = bridge_parameters.effort_mapping(values, self._plant, self._gains, limits)
         self._settings = bridge_parameters.bridge_settings(
             values,
-            effort=limits.effort,
+            effort=limits.effort[0],
             velocity=self._mapping.velocity_limit,
             gains=self._gains,
-            window=(limits.position_min, limits.position_max),
+            window=(limits.position_min[0], limits.position_max[0]),
         )
-        self._safety = bridge_parameters.safety_limits(values, limits.effort)
+        self._safety = bridge_parameters.safety_limits(values, limits.effort[0])
         self._derating = Derating(values["derating_temperature"], values["winding_temperature_limit"])
         if values["e_stop_input_timeout"] > 0.0:
             self._e_stop_input = EStopInputServer(
@@ -157,7 +157,7 @@ class BridgeNode(LifecycleNode, PollingNode):
         stamp_ns = self._interface.clock()
         self._interface.safe_stop("bridge ends")
         self.release_actuator()
-        self._interface.publish_applied(stamp_ns, 0.0)
+        self._interface.publish_applied(stamp_ns, (0.0,))
         self._interface.close()
         if self._e_stop_input is not None:
             self._e_stop_input.close()
@@ -314,7 +314,7 @@ class BridgeNode(LifecycleNode, PollingNode):
         self._feedback.publish(encode_feedback(feedback))
 
     def _on_outcome(self, stamp_ns: int, outcome: Outcome) -> None:
-        self._interface.publish_applied(stamp_ns, outcome.effort)
+        self._interface.publish_applied(stamp_ns, (outcome.effort,))
 
     def _on_command(self, kind: Input, command: JointCommand) -> None:
         if self._lockstep_loop is not None:
@@ -322,21 +322,22 @@ class BridgeNode(LifecycleNode, PollingNode):
         elif self._loop is not None:
             self._loop.answered(kind, command)
 
-    def _advance(self, drive: Drive, stamp_ns: int) -> tuple[JointSample | None, float]:
+    def _advance(self, drive: Drive, stamp_ns: int) -> tuple[JointSample | None, Vector]:
         """Carry out a decision, let simulated time pass until a stamp, and return what is measured then."""
         bridge = self._bridge
         assert bridge is not None
         outcome = bridge.carry_out(self._derated(drive), was_armed=self._supervisor.mode.armed)
         self._port_clock.wait_until(stamp_ns)
-        return self._observe_now(stamp_ns), outcome.effort
+        return self._observe_now(stamp_ns), (outcome.effort,)
 
     def _derated(self, drive: Drive) -> Drive:
         """Return a decision with its torque within what the winding's temperature leaves of the limit."""
         feedback = None if self._bridge is None else self._bridge.feedback
         if feedback is None or drive.kind is not DriveKind.EFFORT:
             return drive
-        effort = self._derating.clamp(drive.effort, self._supervisor.limits.effort, feedback.winding_temperature)
-        return drive if effort == drive.effort else drive._replace(effort=effort)
+        (limit,) = self._supervisor.limits.effort
+        effort = self._derating.clamp(drive.effort[0], limit, feedback.winding_temperature)
+        return drive if effort == drive.effort[0] else drive._replace(effort=(effort,))
 
     def _observe_now(self, stamp_ns: int) -> JointSample | None:
         bridge = self._bridge

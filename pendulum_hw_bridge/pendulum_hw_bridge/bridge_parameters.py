@@ -291,7 +291,7 @@ def effort_mapping(
         efficiency=values["effort_efficiency"] or drivetrain.efficiency,
         compensation=values["back_emf_compensation"],
         gains=gains,
-        effort_limit=limits.effort,
+        effort_limit=limits.effort[0],
         velocity_limit=min(limits.velocity, MOTOR_SPEED_LIMIT / drivetrain.gear_ratio),
     )
 

@@ -88,19 +88,19 @@ def as_the_bridge(values: Mapping[str, Any]) -> AsTheBridge:
         ParameterError: They contradict each other.
     """
     plant = bridge_parameters.plant_of(values)
-    limits = limits_from_parameters(values, plant.effort_limit)
+    limits = limits_from_parameters(values, (plant.effort_limit,))
     check_consistency(values, limits)
     gains = bridge_parameters.trajectory_gains(values)
     mapping = bridge_parameters.effort_mapping(values, plant, gains, limits)
-    window = (limits.position_min, limits.position_max)
+    window = (limits.position_min[0], limits.position_max[0])
     settings = bridge_parameters.bridge_settings(
-        values, effort=limits.effort, velocity=mapping.velocity_limit, gains=gains, window=window
+        values, effort=limits.effort[0], velocity=mapping.velocity_limit, gains=gains, window=window
     )
     return AsTheBridge(
         values,
         bridge_parameters.make_port(values, WallClock()),
         settings,
-        bridge_parameters.safety_limits(values, limits.effort),
+        bridge_parameters.safety_limits(values, limits.effort[0]),
         plant,
         window,
     )

@@ -101,7 +101,7 @@ class HandTrial(Trial):
             events.append((sample.stamp_ns, names.Event.TRIAL_END, {"trial": self.number}))
             return TrialAnswer(push=push, events=events)
         if motion is not None:
-            push = motion.torque(time, sample.position, sample.velocity)
+            push = motion.torque(time, sample.position[0], sample.velocity[0])
         return TrialAnswer(push=push, events=events)
 
 

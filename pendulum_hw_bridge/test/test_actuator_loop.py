@@ -33,7 +33,7 @@ class Running:
         self.actuator = EmulatedX5(parameters, seed=1, start_ns=clock.now_ns())
         self.port = EmulatorBackend(self.actuator, clock)
         self.supervisor = SharedSupervisor(
-            PlantLimits(effort=13.0, command_timeout=0.5, feedback_timeout=0.5), self._prepare
+            PlantLimits(effort=(13.0,), command_timeout=0.5, feedback_timeout=0.5), self._prepare
         )
         self.bridge = Bridge(
             self.port,
@@ -101,7 +101,7 @@ def test_states_come_from_one_thread_and_each_is_acted_upon_once(running: Runnin
 def test_an_answer_is_acted_upon_in_the_cycle_of_its_state(running: Running) -> None:
     def answer(sample: JointSample) -> None:
         def later() -> None:
-            command = JointCommand(sample.stamp_ns, 0.4, "c")
+            command = JointCommand.of_one(sample.stamp_ns, 0.4, "c")
             if running.supervisor.offer(Input.EFFORT_COMMAND, command, running.port.now_ns()) is None:
                 running.loop.answered(Input.EFFORT_COMMAND, command)
 

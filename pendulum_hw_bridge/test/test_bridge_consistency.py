@@ -21,10 +21,10 @@ from pendulum_msgs_py.parameters import validate
 from pendulum_msgs_py.plants.lab_file import EMULATED_BACKENDS
 
 LIMITS: dict[str, float] = {
-    "effort": 13.0,
+    "effort": (13.0,),
     "velocity": 1.5,
-    "position_min": -4.0,
-    "position_max": 4.0,
+    "position_min": (-4.0,),
+    "position_max": (4.0,),
     "slew": 2000.0,
     "start_effort": 2.0,
     "starvation": 30.0,
@@ -95,9 +95,9 @@ def test_a_command_counts_for_a_cycle_at_least_and_never_for_long(backend: str, 
         ("effort_slew_limit", {"slew": math.inf}),
         ("start_effort_limit", {"start_effort": math.inf}),
         ("starvation_limit", {"starvation": math.inf}),
-        ("position_window", {"position_max": math.inf}),
-        ("position_window", {"position_min": -math.inf}),
-        ("position_window", {"position_min": -math.inf, "position_max": math.inf}),
+        ("position_window", {"position_max": (math.inf,)}),
+        ("position_window", {"position_min": (-math.inf,)}),
+        ("position_window", {"position_min": (-math.inf,), "position_max": (math.inf,)}),
     ],
 )
 def test_a_real_machine_needs_every_limit(name: str, limit: dict[str, float]) -> None:

@@ -117,7 +117,7 @@ class Rig:
 
     def __init__(self, kind: EffortStrategy = EffortStrategy.DIRECT_PWM, **settings: Any) -> None:
         self.port = Port()
-        self.supervisor = PlantSupervisor(PlantLimits(effort=8.0, feedback_timeout=1.0, starvation=100.0))
+        self.supervisor = PlantSupervisor(PlantLimits(effort=(8.0,), feedback_timeout=1.0, starvation=100.0))
         self.monitor = SafetyMonitor(
             SafetyLimits(winding_current=0.0, pwm_tolerance=9.0, command_tolerance=9.0), PERIOD, DRIVETRAIN
         )
@@ -151,7 +151,7 @@ class Rig:
         return self
 
     def drive(self, effort: float = 1.0, **given: Any) -> Any:
-        return self.bridge.carry_out(Drive(DriveKind.EFFORT, effort=effort, **given), was_armed=True)
+        return self.bridge.carry_out(Drive(DriveKind.EFFORT, effort=(effort,), **given), was_armed=True)
 
 
 OFF = Drive(DriveKind.OFF)
@@ -400,12 +400,7 @@ def test_a_good_record_becomes_the_sample_and_a_repeated_one_does_not() -> None:
     assert rig.bridge.feedback is record is not None
     sample = rig.bridge.sample
     assert sample is not None
-    assert (sample.stamp_ns, sample.position, sample.velocity, sample.effort) == (
-        record.stamp_ns,
-        0.25,
-        -0.125,
-        -2.25,
-    )
+    assert sample == (record.stamp_ns, (0.25,), (-0.125,), (-2.25,))
     rig.port.records = [record._replace(position=9.0), None]
     assert rig.bridge.observe(0.01) is None
     assert rig.bridge.observe(0.02) is None
@@ -414,7 +409,7 @@ def test_a_good_record_becomes_the_sample_and_a_repeated_one_does_not() -> None:
     rig = Rig(joint_sign=1, joint_offset=0.5, effort_tare=0.25)
     rig.see(position=0.25, velocity=0.125, effort=2.0)
     assert rig.bridge.sample is not None
-    assert (rig.bridge.sample.position, rig.bridge.sample.velocity, rig.bridge.sample.effort) == (0.75, 0.125, 1.75)
+    assert rig.bridge.sample[1:] == ((0.75,), (0.125,), (1.75,))
 
 
 def test_the_motor_watch_sees_each_record() -> None:
@@ -538,13 +533,13 @@ def test_a_pause_before_or_in_a_read_or_before_driving_is_a_stall_beyond_the_tim
     within.bridge.observe(0.01)
     ahead = Rig().armed()
     ahead.port.time_ns += pause_ns
-    outcome = ahead.drive(push=0.5)
+    outcome = ahead.drive(push=(0.5,))
     for rig in (before, within, ahead):
         assert rig.bridge.last_fault == fault
         assert rig.bridge._driving == (not fault)
     assert outcome.fault == fault
     assert (outcome.drive.kind is DriveKind.OFF) == bool(fault)
-    assert outcome.drive.push == 0.5
+    assert outcome.drive.push == (0.5,)
     assert (outcome.applied is None) == bool(fault)
     assert outcome.effort == (0.0 if fault else 1.0)
     assert ahead.port.commands[-1].pwm == (0.0 if fault else 0.25)
@@ -575,7 +570,7 @@ def test_at_rest_a_pause_is_no_stall_and_the_first_turn_has_none_before_it() -> 
 @pytest.mark.parametrize("sign", [1, -1])
 def test_a_torque_is_sent_in_the_motors_sign_and_told_in_the_joints(sign: int) -> None:
     rig = Rig(joint_sign=sign).armed()
-    outcome = rig.drive(1.0, push=0.5)
+    outcome = rig.drive(1.0, push=(0.5,))
     assert rig.port.pushes == [0.5]
     assert rig.port.commands[-1].pwm == sign * 0.25
     assert outcome.effort == 1.0
@@ -609,10 +604,10 @@ def test_an_armed_plant_without_a_prepared_drive_is_a_fault_that_names_what_rele
     rig.bridge.connect()
     rig.see()
     assert rig.supervisor.arm(rig.port.time_ns, rig.bridge.sample) == ""
-    outcome = rig.drive(1.0, push=0.5)
+    outcome = rig.drive(1.0, push=(0.5,))
     assert (outcome.drive.kind, outcome.drive.push, outcome.effort, outcome.fault) == (
         DriveKind.OFF,
-        0.5,
+        (0.5,),
         0.0,
         "not_prepared",
     )
@@ -636,10 +631,10 @@ def test_without_feedback_nothing_is_driven() -> None:
 def test_a_command_that_cannot_be_sent_is_a_fault_by_its_name() -> None:
     rig = Rig().armed()
     rig.port.fails["write"] = ActuatorError("send_failed", "network down")
-    outcome = rig.drive(1.0, push=0.5)
+    outcome = rig.drive(1.0, push=(0.5,))
     assert (outcome.drive.kind, outcome.drive.push, outcome.effort, outcome.fault) == (
         DriveKind.OFF,
-        0.5,
+        (0.5,),
         0.0,
         "send_failed",
     )
@@ -653,7 +648,7 @@ def test_acting_asks_the_supervisor_and_counts_a_fault_of_its_own() -> None:
     assert outcome.drive.starved
     assert outcome.effort == 0.0
     # The pendulum is outside its window from now on.
-    rig.supervisor.limits = replace(rig.supervisor.limits, position_min=0.5)
+    rig.supervisor.limits = replace(rig.supervisor.limits, position_min=(0.5,))
     outcome = rig.bridge.act()
     assert rig.supervisor.mode is Mode.FAULT
     assert outcome.fault == rig.bridge.last_fault == "supervisor"
@@ -677,7 +672,8 @@ def test_disarming_is_no_fault() -> None:
 
 def position(rig: Rig, **given: float) -> Command:
     """Carry out one decision of position control and return what was sent."""
-    rig.bridge.carry_out(Drive(DriveKind.POSITION, **{"position": 0.0, "velocity": 0.0, **given}), was_armed=True)
+    setpoints = {name: (given.pop(name, 0.0),) for name in ("position", "velocity")}
+    rig.bridge.carry_out(Drive(DriveKind.POSITION, **setpoints, **given), was_armed=True)
     return rig.port.commands[-1]
 
 
@@ -723,7 +719,7 @@ def test_the_torque_in_force_passes_into_position_control_and_fades(sign: int) -
 def test_a_drive_that_begins_with_a_trajectory_hands_over_no_torque_but_the_speed() -> None:
     rig = Rig().armed()
     rig.see(velocity=0.125, pwm_command=0.25)
-    drive = Drive(DriveKind.POSITION, position=0.0, velocity=0.0, handover=1.0)
+    drive = Drive(DriveKind.POSITION, position=(0.0,), velocity=(0.0,), handover=1.0)
     outcome = rig.bridge.carry_out(drive, was_armed=True)
     assert outcome.applied is not None
     assert not outcome.applied.limited

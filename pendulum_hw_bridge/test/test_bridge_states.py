@@ -33,7 +33,9 @@ class Plant:
         clock = SteppedClock(SECOND)
         self.actuator = EmulatedX5(parameters, seed=1, position=position, start_ns=SECOND)
         self.port = EmulatorBackend(self.actuator, clock)
-        limits = PlantLimits(effort=13.0, feedback_timeout=0.04, velocity=1.5, position_min=-4.0, position_max=4.0)
+        limits = PlantLimits(
+            effort=(13.0,), feedback_timeout=0.04, velocity=1.5, position_min=(-4.0,), position_max=(4.0,)
+        )
         self.supervisor = SharedSupervisor(limits, self._prepare, self._withdraw)
         self.bridge = Bridge(
             self.port,
@@ -61,12 +63,12 @@ class Plant:
             sample = self.bridge.sample
             assert sample is not None
             if self.regulating:
-                effort = -33.345 * from_upright(sample.position) - 0.159 * sample.velocity
+                effort = -33.345 * from_upright(sample.position[0]) - 0.159 * sample.velocity[0]
                 self.supervisor.offer(
-                    Input.EFFORT_COMMAND, JointCommand(sample.stamp_ns, effort, "c"), self.port.now_ns()
+                    Input.EFFORT_COMMAND, JointCommand.of_one(sample.stamp_ns, effort, "c"), self.port.now_ns()
                 )
             outcome = self.bridge.act()
-            self.supervisor.report_applied(outcome.effort)
+            self.supervisor.report_applied((outcome.effort,))
             self.duties.append(self.actuator.link.pwm)
 
     def arm(self) -> str:
@@ -75,7 +77,7 @@ class Plant:
     def follow(self, goal: float) -> str:
         sample = self.bridge.sample
         assert sample is not None
-        return self.supervisor.accept_trajectory(thesis_ramp(sample.position, goal), self.port.now_ns(), sample)
+        return self.supervisor.accept_trajectory(thesis_ramp(sample.position[0], goal), self.port.now_ns(), sample)
 
     @property
     def mode(self) -> Mode:
@@ -130,7 +132,7 @@ def test_every_state_answers_every_input_as_the_diagram_says(mode: Mode, what: s
     else:
         sample = plant.bridge.sample
         assert sample is not None
-        point = TrajectoryPoint(1.0, sample.position, 0.0)
+        point = TrajectoryPoint(1.0, sample.position[0], 0.0)
         plant.supervisor.accept_trajectory(Trajectory((point,)), now, sample)
     plant.cycles(3)
     assert plant.mode is EXPECTED[mode][INPUTS.index(what)]
@@ -166,7 +168,7 @@ def test_arming_is_refused_while_something_is_wrong(fault: ActuatorFault, reason
 def test_arming_is_refused_while_a_large_command_waits() -> None:
     plant = Plant()
     now = plant.port.now_ns()
-    plant.supervisor.offer(Input.EFFORT_COMMAND, JointCommand(now, 5.0, "c"), now)
+    plant.supervisor.offer(Input.EFFORT_COMMAND, JointCommand.of_one(now, 5.0, "c"), now)
     assert "already commands 5.000 N m" in plant.arm()
     assert plant.actuator.strategy is Strategy.OFF
 
@@ -215,10 +217,10 @@ def test_joint_offset_and_sign_turn_everything_that_the_joint_sees() -> None:
     sample, feedback = plant.bridge.sample, plant.bridge.feedback
     assert sample is not None
     assert feedback is not None
-    assert sample.position == pytest.approx(1.0 - feedback.position)
-    assert sample.velocity == -feedback.velocity
+    assert sample.position[0] == pytest.approx(1.0 - feedback.position)
+    assert sample.velocity[0] == -feedback.velocity
     assert plant.arm() == ""
-    plant.supervisor.offer(Input.EFFORT_COMMAND, JointCommand(sample.stamp_ns, 1.0, "c"), plant.port.now_ns())
+    plant.supervisor.offer(Input.EFFORT_COMMAND, JointCommand.of_one(sample.stamp_ns, 1.0, "c"), plant.port.now_ns())
     outcome = plant.bridge.act()
     assert outcome.effort == pytest.approx(1.0)
     assert outcome.applied is not None

@@ -300,7 +300,7 @@ def test_a_bridge_drives_a_module_arms_it_and_leaves_it_off(module: Module) -> N
     port.connect()
     drivetrain = load_emulator("thesis").drivetrain
     mapping = EffortMapping(EffortStrategy.DIRECT_PWM, drivetrain, effort_limit=2.0)
-    supervisor = PlantSupervisor(PlantLimits(effort=2.0))
+    supervisor = PlantSupervisor(PlantLimits(effort=(2.0,)))
     limits = HardwareLimits(effort=2.0, velocity=1.0, position_min=-3.0, position_max=3.0)
     bridge = Bridge(
         port,
@@ -320,7 +320,7 @@ def test_a_bridge_drives_a_module_arms_it_and_leaves_it_off(module: Module) -> N
     assert module.settings["control_strategy"] == Strategy.DIRECT_PWM
     assert 0.0 < module.settings["position_max_output"] < 2.0 * mapping.pwm_per_torque(36.0)
     assert supervisor.arm(port.now_ns(), bridge.sample) == ""
-    bridge.carry_out(Drive(DriveKind.EFFORT, effort=1.0))
+    bridge.carry_out(Drive(DriveKind.EFFORT, effort=(1.0,)))
     assert module.sent[-1][2] == pytest.approx(mapping.pwm_per_torque(36.0), rel=1e-6)
     bridge.close()
     assert module.settings["control_strategy"] == Strategy.OFF

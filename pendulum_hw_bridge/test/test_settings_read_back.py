@@ -84,8 +84,8 @@ def test_a_drive_is_prepared_for_arming_only_where_it_may_be_armed() -> None:
         prepared.append("once")
         return ""
 
-    supervisor = SharedSupervisor(PlantLimits(effort=5.0), prepare)
-    sample = JointSample(0, 0.0, 0.0)
+    supervisor = SharedSupervisor(PlantLimits(effort=(5.0,)), prepare)
+    sample = JointSample.of_one(0, 0.0, 0.0)
     supervisor.e_stop(0)
     assert "e-stop" in supervisor.arm(0, sample)
     supervisor.e_stop_reset(0)

@@ -114,14 +114,14 @@ def test_no_hand_asks_for_more_than_the_actuator_stands() -> None:
 def test_a_staircase_is_released_at_its_end_or_held() -> None:
     for release, last in ((True, 0.0), (False, None)):
         trial = StaircaseTrial(1, list(staircase(1, step=90.0, hold=0.5)), release=release)
-        trial.start(JointSample(0, 0.0, 0.0, 0.0))
-        trial.answer(JointSample(0, 0.0, 0.0, 0.0))
+        trial.start(JointSample.of_one(0, 0.0, 0.0, 0.0))
+        trial.answer(JointSample.of_one(0, 0.0, 0.0, 0.0))
         assert not trial.hear('{"name": "plant_mode", "mode": "armed_position", "stamp_ns": 0}')
-        assert trial.answer(JointSample(10_000_000, 0.0, 0.0, 0.0)).effort is None
-        end = trial.answer(JointSample(10**12, 0.0, 0.0, 0.0))
+        assert trial.answer(JointSample.of_one(10_000_000, 0.0, 0.0, 0.0)).effort is None
+        end = trial.answer(JointSample.of_one(10**12, 0.0, 0.0, 0.0))
         assert end.effort == last
         assert end.events[-1][1] == "trial_end"
-        assert trial.answer(JointSample(10**12 + 1, 0.0, 0.0, 0.0)).effort == last
+        assert trial.answer(JointSample.of_one(10**12 + 1, 0.0, 0.0, 0.0)).effort == last
 
 
 def test_a_state_in_lockstep_is_measured_just_before_it_is_shown() -> None:

@@ -7,11 +7,12 @@ import time
 from collections import Counter
 from collections.abc import Callable, Mapping
 from enum import Enum
+from typing import Any, cast
 
-from pendulum_lqr.interface import Controller
+from pendulum_lqr.interface import Controller, JointController
 from pendulum_msgs_py.contract.angles import from_upright
 from pendulum_msgs_py.contract.timing import RingOfTimes
-from pendulum_msgs_py.contract.values import NANOSECONDS, JointSample
+from pendulum_msgs_py.contract.values import NANOSECONDS, JointSample, Vector, written
 
 __all__ = ["AnswerLoop", "StateRefusal"]
 
@@ -40,7 +41,7 @@ class AnswerLoop:
 
     def __init__(
         self,
-        controller: Controller,
+        controller: Controller | JointController,
         state_timeout: float,
         *,
         simulated_time: bool = False,
@@ -52,7 +53,8 @@ class AnswerLoop:
         self.answered = 0
         self.saturated = 0
         self.restarts = 0
-        self.last_effort = 0.0
+        self._take(controller)
+        self.last_effort = self._nothing
         self.last_reason = ""
         self.age = RingOfTimes()
         self.compute_time = RingOfTimes()
@@ -72,18 +74,33 @@ class AnswerLoop:
         self.controller.reset()
         self._newest = None
         self._start_ns = None
-        self.last_effort = 0.0
+        self.last_effort = self._nothing
 
-    def replace(self, controller: Controller) -> None:
+    def replace(self, controller: Controller | JointController) -> None:
         """Swap the controller between two states; integrals and filters are carried over."""
-        controller.carry_over(self.controller)
+        # All controllers of one loop are for the same joints, so both are of one kind.
+        controller.carry_over(cast("Any", self.controller))
         self.controller = controller
+        self._take(controller)
 
-    def answer(self, sample: JointSample | None, now_ns: int, problem: str = "") -> float | None:
-        """Return the torque that answers a state, or None where the state is refused [N m].
+    def _take(self, controller: Controller | JointController) -> None:
+        """Bind what answers a state: a controller of several joints, or one that sees [angle from upright, speed]."""
+        self._command: Callable[[float, JointSample], Vector]
+        if isinstance(controller, JointController):
+            several = controller.command
+            self._limits = controller.effort_limits
+            self._command = lambda t, sample: several(t, sample.position, sample.velocity)
+        else:
+            one = controller.command
+            self._limits = (controller.effort_limit,)
+            self._command = lambda t, sample: (one(t, (from_upright(sample.position[0]), sample.velocity[0])),)
+        self._nothing = (0.0,) * len(self._limits)
+
+    def answer(self, sample: JointSample | None, now_ns: int, problem: str = "") -> Vector | None:
+        """Return the efforts that answer a state, or None where the state is refused [N m or N].
 
         Args:
-            sample: The state; None for a message that carries none of our joint.
+            sample: The state; None for a message that carries none of our joints.
             now_ns: Time of arrival on the clock of the stamps [ns]; not used in simulated time.
             problem: What is wrong with a message that carries no state.
         """
@@ -99,23 +116,24 @@ class AnswerLoop:
             self._start_ns = sample.stamp_ns
         self._newest = sample
         began = self._monotonic()
-        x = (from_upright(sample.position), sample.velocity)
         reason = ""
         try:
-            effort = self.controller.command((sample.stamp_ns - self._start_ns) / NANOSECONDS, x)
+            effort = self._command((sample.stamp_ns - self._start_ns) / NANOSECONDS, sample)
         except (ArithmeticError, ValueError, RuntimeError) as error:
             # A solver that gives up must not end the node: without an answer the plant's timeout makes it zero.
-            effort, reason = math.nan, f"{type(error).__name__}: {error}"
-        if not math.isfinite(effort):
-            self.last_reason = reason or f"controller answered {effort} N m"
+            effort, reason = (math.nan,), f"{type(error).__name__}: {error}"
+        if not all(map(math.isfinite, effort)):
+            self.last_reason = reason or f"controller answered {written(effort)} N m"
             self.refused[StateRefusal.NO_ANSWER] += 1
             return None
         self.compute_time.add(self._monotonic() - began)
         if not self.simulated_time:
             self.age.add(now_ns - sample.stamp_ns)
         self.answered += 1
-        if abs(effort) >= self.controller.effort_limit:
-            self.saturated += 1
+        for value, limit in zip(effort, self._limits, strict=True):
+            if abs(value) >= limit:
+                self.saturated += 1
+                break
         self.last_effort = effort
         return effort
 
@@ -140,7 +158,7 @@ class AnswerLoop:
             "compute_time_p50_us": compute[0],
             "compute_time_p99_us": compute[1],
             "compute_time_max_us": compute[2],
-            "effort": self.last_effort,
+            "effort": self.last_effort[0] if len(self.last_effort) == 1 else written(self.last_effort, ".6g"),
             "restarts": self.restarts,
         }
         for refusal in StateRefusal:
@@ -154,7 +172,7 @@ class AnswerLoop:
     def _judge(self, sample: JointSample | None, now_ns: int) -> StateRefusal | None:
         if sample is None:
             return StateRefusal.MALFORMED
-        if not (math.isfinite(sample.position) and math.isfinite(sample.velocity)):
+        if not all(map(math.isfinite, sample.position + sample.velocity)):
             return StateRefusal.NOT_FINITE
         if not self.simulated_time:
             age = now_ns - sample.stamp_ns
@@ -178,7 +196,8 @@ class AnswerLoop:
         age = (now_ns - sample.stamp_ns) / NANOSECONDS
         limit = f"expected at most {self._timeout_ns / NANOSECONDS:g} s"
         if refusal is StateRefusal.NOT_FINITE:
-            return f"position is {sample.position} rad, velocity {sample.velocity} rad/s; expected finite numbers"
+            where, speed = written(sample.position), written(sample.velocity)
+            return f"position is {where} rad, velocity {speed} rad/s; expected finite numbers"
         if refusal is StateRefusal.STALE:
             return f"header.stamp is {age:.6g} s old; {limit}"
         if refusal is StateRefusal.FROM_FUTURE:

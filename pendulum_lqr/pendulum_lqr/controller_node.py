@@ -26,14 +26,23 @@ from pendulum_lqr.controller import (
     make_controller,
     unwrapped,
 )
-from pendulum_lqr.interface import Controller
+from pendulum_lqr.controllers.joint_lqr import joint_parameters, make_joint_controller
+from pendulum_lqr.interface import Controller, JointController
 from pendulum_lqr.sampling import ASSUMED_PERIOD, PeriodWatch, differs, rate_problem, uses_period
 from pendulum_msgs_py.contract import names
-from pendulum_msgs_py.contract.cdr import encode_joint_state
+from pendulum_msgs_py.contract.cdr import encode_joints
 from pendulum_msgs_py.contract.timing import SteadyWallClock
 from pendulum_msgs_py.errors import PendulumError
+from pendulum_msgs_py.joints import ONE_JOINT
 from pendulum_msgs_py.parameters import ParameterSpec
-from pendulum_msgs_py.plants.plant_parameters import PRESET_NAMES, PlantParameters, load_plant
+from pendulum_msgs_py.plants.mechanism_parameters import MechanismParameters, load_mechanism
+from pendulum_msgs_py.plants.plant_parameters import (
+    MECHANISM_PRESETS,
+    PRESET_NAMES,
+    PlantParameters,
+    is_mechanism,
+    load_plant,
+)
 from pendulum_msgs_py.ros import qos
 from pendulum_msgs_py.ros.convert import (
     problem_of_state,
@@ -53,7 +62,8 @@ __all__ = ["NODE_SPECS", "ControllerNode", "main"]
 NODE_SPECS: tuple[ParameterSpec, ...] = (
     ParameterSpec("controller", "lqr", "", "Which controller.", choices=tuple(CONTROLLERS), read_only=True),
     ParameterSpec(
-        "plant", "thesis", "", f"Plant to design for: {PRESET_NAMES} or the path of a plant file.", read_only=True
+        "plant", "thesis", "", f"Plant to design for: {PRESET_NAMES} or the path of a plant file; of several joints, "
+        f"with lqr: {', '.join(MECHANISM_PRESETS)}.", read_only=True,
     ),
     ParameterSpec(
         "period", 0.0, "s", "Sampling period of the loop, which discrete designs and filters need; 0 takes it from the "
@@ -96,15 +106,22 @@ class ControllerNode(LifecycleNode, PollingNode):
         self._stop = stop
         self._active = False
         self._loop: AnswerLoop | None = None
-        kind = self._choose()
+        kind, plant = self._choose("controller"), self._choose("plant")
         self._own = {spec.name for spec in NODE_SPECS}
-        specs = NODE_SPECS + COMMON_PARAMETERS + controller_class(kind).PARAMETERS
-        self._settings = NodeParameters(self, specs, self._design, self._swap)
-        self._plant: PlantParameters = load_plant(self._settings["plant"])
+        self._plant: PlantParameters | MechanismParameters
+        self._plant = load_mechanism(plant) if is_mechanism(plant) else load_plant(plant)
+        self._coordinates = self._plant.coordinates if isinstance(self._plant, MechanismParameters) else ONE_JOINT
+        self._joints, self._driven = self._coordinates.names, self._coordinates.driven_names
+        own = (
+            joint_parameters(self._plant)
+            if isinstance(self._plant, MechanismParameters)
+            else COMMON_PARAMETERS + controller_class(kind).PARAMETERS
+        )
+        self._settings = NodeParameters(self, NODE_SPECS + own, self._design, self._swap)
         self._period = self._settings["period"] or ASSUMED_PERIOD
         self._period_measured = False
         # A bad value at start ends the node with its reason instead of waiting for a transition to fail.
-        self._pending: Controller | None = self._design(self._settings.values)
+        self._pending: Controller | JointController | None = self._design(self._settings.values)
         self._simulated_time = bool(self.get_parameter("use_sim_time").value)
         self._watch = PeriodWatch(exact=self._simulated_time)
         self._period_known = False
@@ -141,7 +158,7 @@ class ControllerNode(LifecycleNode, PollingNode):
         self._loop = AnswerLoop(controller, self._settings["state_timeout"], simulated_time=self._simulated_time)
         self.get_logger().info(
             f"{self._settings['controller']} for plant {self._plant.name}: {controller.describe()}, "
-            f"limit {controller.effort_limit:g} N m"
+            f"limit {_limit(controller)} N m"
         )
         return super().on_configure(state)
 
@@ -181,22 +198,22 @@ class ControllerNode(LifecycleNode, PollingNode):
     def _on_state(self, data: bytes) -> None:
         if self._simulated_time and self._active and not self._first_answer.may_go():
             return
-        sample = sample_from_bytes(data)
+        sample = sample_from_bytes(data, self._joints)
         if sample is not None and self._watch.add(sample.stamp_ns):
             self._period_known = False
         if not self._active or self._loop is None or not self._may_answer():
             return
-        effort = self._loop.answer(sample, self._now(), problem_of_state(data) if sample is None else "")
+        effort = self._loop.answer(sample, self._now(), problem_of_state(data, self._joints) if sample is None else "")
         if effort is None or sample is None:
             return
         if self._multi_array:
-            self._command_publisher.publish(Float64MultiArray(data=[effort]))
+            self._command_publisher.publish(Float64MultiArray(data=list(effort)))
         else:
             self._command_publisher.publish(
-                encode_joint_state(sample.stamp_ns, frame_id=self._full_name, effort=effort)
+                encode_joints(sample.stamp_ns, self._full_name, self._driven, (), (), effort)
             )
 
-    def _swap(self, controller: Controller) -> None:
+    def _swap(self, controller: Controller | JointController) -> None:
         """Take over what was designed aside; a design that fails never comes here, and leaves the old gain in force."""
         if self._loop is None:
             self._pending = controller
@@ -218,17 +235,26 @@ class ControllerNode(LifecycleNode, PollingNode):
 
     # --- pieces --------------------------------------------------------------------------------------------
 
-    def _choose(self) -> str:
-        """Return which controller is asked for, before its own parameters can be declared."""
-        spec = NODE_SPECS[0]
+    def _choose(self, name: str) -> str:
+        """Return which controller or plant is asked for, before its own parameters can be declared."""
+        spec = next(spec for spec in NODE_SPECS if spec.name == name)
         given = self._parameter_overrides.get(spec.name)
         return str(spec.check(spec.default if given is None else given.value))
 
-    def _design(self, values: Mapping[str, Any]) -> Controller:
-        own = {name: value for name, value in values.items() if name not in self._own}
+    def _design(self, values: Mapping[str, Any]) -> Controller | JointController:
         # As long as nobody knows the period, nobody can say whether the loop is stable at it.
         known = bool(values["period"]) or self._period_measured
-        return make_controller(values["controller"], self._plant, self._period, own, checked=known)
+        if isinstance(self._plant, MechanismParameters):
+            own = self._own_values(values)
+            return make_joint_controller(values["controller"], self._plant, own, self._period if known else None)
+        return self._design_one(values, self._plant, checked=known)
+
+    def _design_one(self, values: Mapping[str, Any], plant: PlantParameters, *, checked: bool = True) -> Controller:
+        return make_controller(values["controller"], plant, self._period, self._own_values(values), checked=checked)
+
+    def _own_values(self, values: Mapping[str, Any]) -> dict[str, Any]:
+        """Return the values of the controller's own parameters, without those of the node."""
+        return {name: value for name, value in values.items() if name not in self._own}
 
     def _design_for(self, period: float) -> None:
         """Take another period, and design anew where that makes a difference."""
@@ -243,7 +269,10 @@ class ControllerNode(LifecycleNode, PollingNode):
         self.get_logger().info(f"designed for states every {period:g} s: {self._loop.controller.describe()}")
 
     def _uses_period(self) -> bool:
-        return uses_period(self._settings["controller"], self._settings["velocity"])
+        # That of several joints, continuous and sampled, does not; whether it settles is seen once states come.
+        return isinstance(self._plant, PlantParameters) and uses_period(
+            self._settings["controller"], self._settings["velocity"]
+        )
 
     def _may_answer(self) -> bool:
         """Tell whether the rate of the states is one that the design is for, as far as it is known."""
@@ -264,16 +293,22 @@ class ControllerNode(LifecycleNode, PollingNode):
         """Design for the measured period where none was given; return whether the controller bears it."""
         values = self._settings.values
         self._refusal = ""
+        plant = self._plant
         try:
             self._period_measured = True
+            if isinstance(plant, MechanismParameters):
+                self._period = measured
+                self._design(values)
+                self._period_known = True
+                return True
             if not values["period"] and abs(measured / self._period - 1.0) > _SAME_PERIOD:
                 self._design_for(measured)
             elif not values["period"] and self._uses_period():
                 self._design(values)
             if (own := self._own_controller()) is not None:
-                own.check(self._plant, measured)
+                own.check(plant, measured)
             self._refusal = rate_problem(
-                lambda: self._design(values), values["controller"], self._plant, self._period, measured,
+                lambda: self._design_one(values, plant), values["controller"], plant, self._period, measured,
                 uses=self._uses_period(), set_point=values["set_point"],
             )  # fmt: skip
         except PendulumError as error:
@@ -286,7 +321,9 @@ class ControllerNode(LifecycleNode, PollingNode):
 
     def _own_controller(self) -> BaseController | None:
         """Return the controller that answers, without what estimates its velocity."""
-        inner = None if self._loop is None else unwrapped(self._loop.controller)
+        if self._loop is None or isinstance(self._loop.controller, JointController):
+            return None
+        inner = unwrapped(self._loop.controller)
         return inner if isinstance(inner, BaseController) else None
 
     def _autostart(self) -> None:
@@ -305,20 +342,21 @@ class ControllerNode(LifecycleNode, PollingNode):
         if not was_active or self._loop is None:
             return
         if self._multi_array:
-            self._command_publisher.publish(Float64MultiArray(data=[0.0]))
+            self._command_publisher.publish(Float64MultiArray(data=[0.0] * len(self._driven)))
             return
         # A second command with the stamp of the last answer would count as a duplicate, so the zero comes after it.
         newest = self._loop.newest_stamp_ns
         after = 0 if newest is None else newest + 1
         stamp = after if self._simulated_time else max(after, self._now())
-        self._command_publisher.publish(encode_joint_state(stamp, frame_id=self._full_name, effort=0.0))
+        nothing = (0.0,) * len(self._driven)
+        self._command_publisher.publish(encode_joints(stamp, self._full_name, self._driven, (), (), nothing))
 
     def _publish_diagnostics(self) -> None:
         values: dict[str, object] = {"controller": self._settings["controller"], "plant": self._plant.name}
         level, text = DiagnosticStatus.OK, "inactive"
         if self._loop is not None:
             values["gain"] = self._loop.controller.describe()
-            values["effort_limit"] = self._loop.controller.effort_limit
+            values["effort_limit"] = _limit(self._loop.controller)
             values.update(self._loop.summary(time.monotonic_ns()))
         measured = self._watch.period
         values["period"] = self._period
@@ -349,6 +387,11 @@ class ControllerNode(LifecycleNode, PollingNode):
             level = max(level, DiagnosticStatus.WARN)
             text = f"{text}; {self._running_plant.mismatch}"
         self._diagnostics.publish(self._now(), level, text, values)
+
+
+def _limit(controller: Controller | JointController) -> str:
+    limits = controller.effort_limits if isinstance(controller, JointController) else (controller.effort_limit,)
+    return ", ".join(f"{limit:g}" for limit in limits)
 
 
 def main(argv: Sequence[str] | None = None) -> int:

@@ -22,14 +22,14 @@ from std_srvs.srv import Trigger
 from pendulum_lqr.disturbance import DISTURBANCE_SPECS, Disturbance, from_bag, make_disturbance
 from pendulum_lqr.disturbing import DisturbanceLoop
 from pendulum_msgs_py.contract import names
-from pendulum_msgs_py.contract.cdr import encode_joint_state
+from pendulum_msgs_py.contract.cdr import encode_joints
 from pendulum_msgs_py.contract.names import Event
 from pendulum_msgs_py.contract.timing import SteadyWallClock
 from pendulum_msgs_py.contract.values import NANOSECONDS
 from pendulum_msgs_py.errors import DataError, ParameterError
 from pendulum_msgs_py.parameters import ParameterSpec, read_text
 from pendulum_msgs_py.ros import qos
-from pendulum_msgs_py.ros.convert import event_message, sample_from_bytes
+from pendulum_msgs_py.ros.convert import event_message, stamp_of_state
 from pendulum_msgs_py.ros.diagnostics import DIAGNOSTICS_PERIOD, Diagnostics
 from pendulum_msgs_py.ros.first_answer import FirstAnswer
 from pendulum_msgs_py.ros.parameters import NodeParameters
@@ -44,6 +44,10 @@ NODE_SPECS: tuple[ParameterSpec, ...] = (
     ParameterSpec(
         "file", "", "", "For from_bag: CSV file with a header line and the columns time since the start [s] and "
         "torque [N m].",
+    ),
+    ParameterSpec(
+        "joints", [""], "", "Joints to disturb, in the plant's order, each by a signal of its own: the seed counts up "
+        "from one to the next. Empty for the joint of a pendulum.", read_only=True,
     ),
 )  # fmt: skip
 """Parameters of the node itself, next to those of the signal."""
@@ -67,12 +71,19 @@ class DisturbanceNode(Node):
         self._now = SteadyWallClock()
         self._full_name = self.get_fully_qualified_name()
         self._simulated_time = bool(self.get_parameter("use_sim_time").value)
-        self._loop = DisturbanceLoop(
-            _signal(self._settings.values),
-            self._settings["duration"],
-            simulated_time=self._simulated_time,
-            autostart=self._settings["autostart"],
-        )
+        self._joints = _joints(self._settings.values)
+        # One for each joint; all hear the same states, so they begin and end together.
+        self._loops = [
+            DisturbanceLoop(
+                signal,
+                self._settings["duration"],
+                simulated_time=self._simulated_time,
+                autostart=self._settings["autostart"],
+            )
+            for signal in _signals(self._settings.values)
+        ]
+        self._loop = self._loops[0]
+        self._told_others = False
         self._torque_publisher = self.create_publisher(JointState, names.DISTURBANCE, qos.COMMAND)
         self._first_answer = FirstAnswer(self, self._torque_publisher)
         self._event_publisher = self.create_publisher(String, names.EVENTS, qos.EVENTS)
@@ -90,53 +101,72 @@ class DisturbanceNode(Node):
         after = 0 if newest is None else newest + 1
         if newest is not None:
             stamp = after if self._simulated_time else max(after, self._now())
-            self._torque_publisher.publish(encode_joint_state(stamp, frame_id=self._full_name, effort=0.0))
+            nothing = (0.0,) * len(self._joints)
+            self._torque_publisher.publish(encode_joints(stamp, self._full_name, self._joints, (), (), nothing))
             self._torque_publisher.wait_for_all_acked(qos.LAST_WORDS)
-        self._loop.stop()
+        for loop in self._loops:
+            loop.stop()
         self._publish_diagnostics()
 
     # --- callbacks -----------------------------------------------------------------------------------------
 
     def _on_state(self, data: bytes) -> None:
-        sample = sample_from_bytes(data)
-        if sample is None or (self._simulated_time and not self._first_answer.may_go()):
+        stamp_ns, names_of_state = stamp_of_state(data, self._joints)
+        if stamp_ns is None:
+            self._tell_others(names_of_state)
             return
-        answer = self._loop.answer(sample.stamp_ns)
-        if answer is None:
+        if self._simulated_time and not self._first_answer.may_go():
             return
-        self._torque_publisher.publish(
-            encode_joint_state(sample.stamp_ns, frame_id=self._full_name, effort=answer.torque)
-        )
-        if answer.event:
-            self._tell(answer.event, sample.stamp_ns)
+        answers = [answer for loop in self._loops if (answer := loop.answer(stamp_ns)) is not None]
+        if not answers:
+            return
+        torques = tuple(answer.torque for answer in answers)
+        self._torque_publisher.publish(encode_joints(stamp_ns, self._full_name, self._joints, (), (), torques))
+        if answers[0].event:
+            self._tell(answers[0].event, stamp_ns)
+
+    def _tell_others(self, found: tuple[str, ...]) -> None:
+        """Say once that the states are of other joints: nothing else would tell why nothing is disturbed."""
+        if found and not self._told_others:
+            self._told_others = True
+            self.get_logger().error(
+                f"states of {', '.join(found)}; expected {', '.join(self._joints)} among them: say which to disturb "
+                f"with -p joints:='[{found[-1]}]'"
+            )
 
     def _on_start(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
-        response.success = self._loop.start()
+        started = [loop.start() for loop in self._loops]
+        response.success = all(started)
         response.message = (
             "starts with the next state" if response.success else "already running; expected ~/stop first"
         )
         return response
 
     def _on_stop(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
-        response.success = self._loop.stop()
+        stopped = [loop.stop() for loop in self._loops]
+        response.success = all(stopped)
         response.message = "ends with zero torque" if response.success else "was not running"
         return response
 
-    def _prepare(self, values: Mapping[str, Any]) -> tuple[Disturbance, float]:
-        signal = _signal(values)
+    def _prepare(self, values: Mapping[str, Any]) -> tuple[tuple[Disturbance, ...], float]:
+        signals = _signals(values)
         if self._loop.running:
             raise ParameterError(
                 "the disturbance is running; expected ~/stop before a change, so that a run has one signal"
             )
-        return signal, values["duration"]
+        return signals, values["duration"]
 
-    def _swap(self, prepared: tuple[Disturbance, float]) -> None:
-        self._loop.replace(*prepared)
+    def _swap(self, prepared: tuple[tuple[Disturbance, ...], float]) -> None:
+        signals, duration = prepared
+        for loop, signal in zip(self._loops, signals, strict=True):
+            loop.replace(signal, duration)
 
     # --- pieces --------------------------------------------------------------------------------------------
 
     def _tell(self, name: str, stamp_ns: int, **more: object) -> None:
         details = {spec.name: self._settings[spec.name] for spec in DISTURBANCE_SPECS}
+        if self._joints != (names.JOINT,):
+            details["joints"] = list(self._joints)
         self._event_publisher.publish(
             event_message(stamp_ns, name, disturbance=details, duration=self._settings["duration"], **more)
         )
@@ -145,14 +175,29 @@ class DisturbanceNode(Node):
     def _publish_diagnostics(self) -> None:
         values: dict[str, object] = {spec.name: self._settings[spec.name] for spec in DISTURBANCE_SPECS}
         values.update(self._loop.summary(time.monotonic_ns()))
+        for joint, loop in zip(self._joints[1:], self._loops[1:], strict=True):
+            values[f"torque.{joint}"] = loop.last_torque
         text = "disturbing" if self._loop.running else "zero torque"
         self._diagnostics.publish(self._now(), DiagnosticStatus.OK, text, values)
 
 
-def _signal(values: Mapping[str, Any]) -> Disturbance:
+def _joints(values: Mapping[str, Any]) -> tuple[str, ...]:
+    joints = tuple(values["joints"])
+    if joints in {(), ("",)}:
+        return (names.JOINT,)
+    if len(set(joints)) < len(joints) or "" in joints:
+        raise ParameterError(f"joints is {list(joints)}; expected names, each once")
+    return joints
+
+
+def _signals(values: Mapping[str, Any]) -> tuple[Disturbance, ...]:
     own = {spec.name: values[spec.name] for spec in DISTURBANCE_SPECS}
-    recorded = _read_recording(values["file"]) if values["kind"] == "from_bag" else None
-    return make_disturbance(own, recorded)
+    joints = _joints(values)
+    if values["kind"] != "from_bag":
+        return tuple(make_disturbance({**own, "seed": own["seed"] + k}) for k in range(len(joints)))
+    if len(joints) > 1:
+        raise ParameterError(f"kind is 'from_bag' for {', '.join(joints)}; expected one joint, as the file does")
+    return (make_disturbance(own, _read_recording(values["file"])),)
 
 
 def _read_recording(file: str) -> Disturbance:

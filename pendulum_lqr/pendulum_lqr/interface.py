@@ -5,7 +5,9 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Protocol
 
-__all__ = ["Controller"]
+from pendulum_msgs_py.contract.values import Vector
+
+__all__ = ["Controller", "JointController"]
 
 
 class Controller(Protocol):
@@ -29,3 +31,34 @@ class Controller(Protocol):
 
     def carry_over(self, previous: Controller) -> None:
         """Take over integrals and filters from the controller that this one replaces, so that torque does not jump."""
+
+
+class JointController:
+    """What turns states of several joints into efforts of the driven ones.
+
+    Attributes:
+        effort_limits: Largest effort of each driven joint [N m or N].
+    """
+
+    def __init__(self, effort_limits: Vector) -> None:
+        self.effort_limits = effort_limits
+
+    def reset(self) -> None:
+        """Forget everything; nothing by default."""
+
+    def command(self, t: float, position: Vector, velocity: Vector) -> Vector:
+        """Return the m efforts [N m or N] that answer a state.
+
+        Args:
+            t: Time of the state since the controller was started [s]; it increases from call to call.
+            position: n positions, not wrapped [rad or m].
+            velocity: n velocities [rad/s or m/s].
+        """
+        raise NotImplementedError(f"{type(self).__name__}.command")
+
+    def describe(self) -> str:
+        """Return gains and figures in one line, for the log."""
+        return type(self).__name__
+
+    def carry_over(self, previous: Controller | JointController) -> None:
+        """Take over what the controller remembers that this one replaces; nothing by default."""

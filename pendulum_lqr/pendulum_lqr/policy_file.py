@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 
 from pendulum_lqr.policy import MODEL, Network, Policy, fingerprint
 from pendulum_msgs_py.errors import DataError, PendulumError
-from pendulum_msgs_py.plants.plant_differences import describe_plants, read_plants
+from pendulum_msgs_py.plants.plant_differences import describe_plants, read_pendulums
 
 __all__ = ["FORMAT", "LARGEST_FILE", "dumps_policy", "load_policy", "loads_policy", "write_policy"]
 
@@ -244,7 +244,7 @@ def _build(header: Mapping[str, Any], arrays: Mapping[str, NDArray[Any]]) -> Pol
     )
     if header["layers"] != list(network.sizes):
         raise DataError(f"layers are {_shown(header['layers'])}; the weights say {list(network.sizes)}")
-    plant = read_plants(json.dumps([header["plant"]]))[0]
+    plant = read_pendulums(json.dumps([header["plant"]]))[0]
     if header["fingerprint"] != fingerprint(plant):
         raise DataError(f"fingerprint is {_shown(header['fingerprint'])}; its plant has {fingerprint(plant)}")
     if type(header["history"]) is not int:

@@ -20,11 +20,11 @@ class DiscreteModel:
     """Sampled model ``z[k+1] = A z[k] + B u[k]`` whose state is [x; the inputs still on their way, oldest first].
 
     Attributes:
-        A: Shape (n + m, n + m).
-        B: Shape (n + m, 1).
+        A: Shape (n + p m, n + p m), of n states and m inputs.
+        B: Shape (n + p m, m).
         period: Sampling period [s].
         delay: Time from measuring a state to its torque acting, the plant's own included [s].
-        pending: m, number of inputs that are still on their way.
+        pending: p, number of samples whose inputs are still on their way.
     """
 
     A: Matrix
@@ -37,7 +37,7 @@ class DiscreteModel:
 def discretise(model: LinearModel, period: float, delay: float = 0.0) -> DiscreteModel:
     """Sample the model exactly under zero-order hold, its delay of any length included.
 
-    With delay = (m - 1) period + rest, the torque of sample k acts from rest on in interval k + m - 1, so that m past
+    With delay = (p - 1) period + rest, the input of sample k acts from rest on in interval k + p - 1, so that p past
     inputs join the state.
 
     Args:
@@ -60,25 +60,25 @@ def discretise(model: LinearModel, period: float, delay: float = 0.0) -> Discret
     # The interval is split where the newer input takes over: older input first, for ``rest``.
     phi_new, gamma_new = _hold(model, period - rest)
     phi_old, gamma_old = _hold(model, rest)
-    n = model.A.shape[0]
-    size = n + pending
+    n, m = model.B.shape
+    size = n + pending * m
     A = np.zeros((size, size))
-    B = np.zeros((size, 1))
+    B = np.zeros((size, m))
     A[:n, :n] = phi_new @ phi_old
     if pending == 0:
         B[:n] = gamma_new
         return DiscreteModel(A, B, period, delay, 0)
-    for row in range(pending - 1):
-        A[n + row, n + row + 1] = 1.0
-    B[-1, 0] = 1.0
+    shifted = (pending - 1) * m
+    A[n : n + shifted, n + m :] = np.eye(shifted)
+    B[-m:] = np.eye(m)
     if rest > 0.0:
-        A[:n, n : n + 1] = phi_new @ gamma_old
+        A[:n, n : n + m] = phi_new @ gamma_old
         if pending > 1:
-            A[:n, n + 1 : n + 2] = gamma_new
+            A[:n, n + m : n + 2 * m] = gamma_new
         else:
             B[:n] = gamma_new
     else:
-        A[:n, n : n + 1] = gamma_new
+        A[:n, n : n + m] = gamma_new
     return DiscreteModel(A, B, period, delay, pending)
 
 

@@ -22,12 +22,12 @@ def loop(**options):
 
 
 def sample(stamp_ns, angle=0.1, velocity=0.2):
-    return JointSample(stamp_ns, math.pi + angle, velocity)
+    return JointSample.of_one(stamp_ns, math.pi + angle, velocity)
 
 
 def test_each_new_state_is_answered_once_with_the_law():
     answering = loop()
-    assert answering.answer(sample(START), START) == pytest.approx(-3.3663251, abs=1e-6)
+    assert answering.answer(sample(START), START) == pytest.approx((-3.3663251,), abs=1e-6)
     assert answering.answer(sample(START), START) is None
     assert answering.refused == {StateRefusal.DUPLICATE: 1}
     assert answering.answered == 1
@@ -69,7 +69,7 @@ def test_answers_have_increasing_stamps_whatever_comes(offsets):
 def test_simulated_time_has_no_age_and_a_repeated_state_gets_the_same_answer():
     answering = loop(simulated_time=True)
     first = answering.answer(sample(5 * SECOND), START)
-    assert first == pytest.approx(-3.3663251, abs=1e-6)
+    assert first == pytest.approx((-3.3663251,), abs=1e-6)
     assert answering.answer(sample(5 * SECOND), START) == first
     assert (answering.answered, answering.restarts) == (1, 0)
 

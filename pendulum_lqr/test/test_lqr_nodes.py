@@ -104,8 +104,8 @@ def test_the_controller_answers_each_state_once_by_its_stamp_and_ends_with_zero(
     assert answered == sorted(set(answered))
     assert set(answered) <= set(stamps)
     assert plant.commands[0].frame_id == "/sim/controller"
-    assert all(command.effort == pytest.approx(ANSWER, abs=1e-5) for command in plant.commands)
-    assert all(command.position is None and command.velocity is None for command in plant.commands)
+    assert all(command.effort[0] == pytest.approx(ANSWER, abs=1e-5) for command in plant.commands)
+    assert all(not command.position and not command.velocity for command in plant.commands)
     # What must not be answered, one state at a time because only the newest is kept.
     plant.spin(0.5)
     count = len(plant.commands)
@@ -124,14 +124,14 @@ def test_the_controller_answers_each_state_once_by_its_stamp_and_ends_with_zero(
     assert refused.reason.startswith("q has the shape (3,); expected (2,)")
     assert not plant.set_parameters("controller", r=-1.0).successful
     plant.run(3)
-    assert plant.commands[-1].effort == pytest.approx(ANSWER, abs=1e-5)
+    assert plant.commands[-1].effort[0] == pytest.approx(ANSWER, abs=1e-5)
     assert plant.set_parameters("controller", q=[1.0, 0.01]).successful
     plant.run(3)
-    assert plant.commands[-1].effort == pytest.approx(-(5.257900 * 0.1 + 0.028783 * 0.2), abs=1e-5)
+    assert plant.commands[-1].effort[0] == pytest.approx(-(5.257900 * 0.1 + 0.028783 * 0.2), abs=1e-5)
     assert not plant.set_parameters("controller", plant="dfki").successful
     program.send_signal(signal.SIGTERM)
     assert program.wait(15) == 0
-    plant.until(lambda: plant.commands[-1].effort == 0.0, "the last zero")
+    plant.until(lambda: plant.commands[-1].effort[0] == 0.0, "the last zero")
     assert plant.commands[-1].stamp_ns > plant.commands[-2].stamp_ns
 
 
@@ -172,7 +172,7 @@ def test_the_period_is_taken_from_the_states_or_refused_where_the_loop_would_be_
     plant.connect()
     publish(lambda: "not answering" in program.output, "the refusal")
     program.wait_for_output(r"not answering: period is 0\.01 s, but states come every 0\.0\d+ s", 1)
-    plant.until(lambda: plant.commands and plant.commands[-1].effort == 0.0, "the last zero")
+    plant.until(lambda: plant.commands and plant.commands[-1].effort[0] == 0.0, "the last zero")
     count = len(plant.commands)
     further = iter(range(5))
     publish(lambda: next(further, None) is None, "five more states")
@@ -213,12 +213,12 @@ def test_a_policy_answers_at_its_own_period_and_says_when_it_gives_up(plant, pro
     program.wait_for_output(r"policy for plant thesis: test \(swing_up, 4-1\) every 0\.01 s, fallback zero torque", 30)
     plant.connect()
     whole = pytest.approx(-(20.0 * math.sin(0.1) + 0.2), abs=1e-5)  # what it may ask for rises from zero
-    publish(lambda: plant.commands and plant.commands[-1].effort == whole, "all of its torque", 10_000_000)
-    publish(lambda: plant.commands[-1].effort == 0.0, "zero torque", 10_000_000, velocity=9.0)
+    publish(lambda: plant.commands and plant.commands[-1].effort[0] == whole, "all of its torque", 10_000_000)
+    publish(lambda: plant.commands[-1].effort[0] == 0.0, "zero torque", 10_000_000, velocity=9.0)
     publish(lambda: "gave up" in told().get("message", ""), "the diagnostics", 10_000_000)
     assert told()["level"] == DiagnosticStatus.WARN
     program.wait_for_output(r"gave up after .* velocity 9 rad/s is outside of what it was trained for", 10)
-    assert plant.commands[-1].effort == 0.0
+    assert plant.commands[-1].effort[0] == 0.0
     program.send_signal(signal.SIGTERM)
     assert program.wait(15) == 0
 
@@ -232,7 +232,7 @@ def test_a_policy_answers_at_its_own_period_and_says_when_it_gives_up(plant, pro
         program.send_signal(signal.SIGTERM)
         assert program.wait(15) == 0
         # Whoever states a period is believed until the states say otherwise.
-        assert period or not any(command.effort for command in plant.commands)
+        assert period or not any(command.effort[0] for command in plant.commands)
 
 
 def test_a_controller_that_waits_is_silent_until_it_is_activated(plant, processes):
@@ -262,10 +262,10 @@ def test_a_manager_can_hold_the_controller_and_deactivation_sends_zero(plant, pr
     assert change(Transition.TRANSITION_ACTIVATE)
     plant.run(10)
     assert plant.commands
-    assert plant.commands[-1].effort != 0.0
+    assert plant.commands[-1].effort[0] != 0.0
     assert change(Transition.TRANSITION_DEACTIVATE)
     plant.spin(0.2)
-    assert plant.commands[-1].effort == 0.0
+    assert plant.commands[-1].effort[0] == 0.0
     count = len(plant.commands)
     plant.run(5)
     assert len(plant.commands) == count
@@ -291,7 +291,7 @@ def test_the_disturbance_follows_seed_and_stamp_between_start_and_end(plant, pro
     program = processes.start("pendulum_lqr", "disturbance", *ros("seed:=7", "duration:=0.2"))
     plant.until(lambda: plant.publish() and plant.disturbances, "the first answer")
     plant.run(20, period=0.01)
-    assert all(answer.effort == 0.0 for answer in plant.disturbances)
+    assert all(answer.effort[0] == 0.0 for answer in plant.disturbances)
     assert plant.call(Trigger, "disturbance/start", Trigger.Request()).success
     assert not plant.call(Trigger, "disturbance/start", Trigger.Request()).success
     running = plant.set_parameters("disturbance", amplitude=1.0)
@@ -308,9 +308,9 @@ def test_the_disturbance_follows_seed_and_stamp_between_start_and_end(plant, pro
     allowed = {signal_7(k * 10_000_000) for k in range(21)}
     during = [a for a in plant.disturbances[count:] if begin["stamp_ns"] <= a.stamp_ns < end["stamp_ns"]]
     assert len(during) >= 5
-    assert {answer.effort for answer in during} <= allowed
+    assert {answer.effort[0] for answer in during} <= allowed
     assert end["stamp_ns"] - begin["stamp_ns"] >= 200_000_000
-    assert all(a.effort == 0.0 for a in plant.disturbances if a.stamp_ns >= end["stamp_ns"])
+    assert all(a.effort[0] == 0.0 for a in plant.disturbances if a.stamp_ns >= end["stamp_ns"])
     assert plant.set_parameters("disturbance", amplitude=1.0).successful
     program.send_signal(signal.SIGINT)
     assert program.wait(15) == 0
@@ -319,10 +319,10 @@ def test_the_disturbance_follows_seed_and_stamp_between_start_and_end(plant, pro
 def test_a_stopped_process_ends_a_running_disturbance_with_zero(plant, processes):
     program = processes.start("pendulum_lqr", "disturbance", *ros("kind:=step", "autostart:=true"))
     plant.connect()
-    plant.until(lambda: plant.publish() and any(a.effort == 2.5 for a in plant.disturbances), "the step")
+    plant.until(lambda: plant.publish() and any(a.effort[0] == 2.5 for a in plant.disturbances), "the step")
     program.send_signal(signal.SIGTERM)
     assert program.wait(15) == 0
-    plant.until(lambda: plant.disturbances[-1].effort == 0.0, "the last zero")
+    plant.until(lambda: plant.disturbances[-1].effort[0] == 0.0, "the last zero")
     assert plant.until(lambda: [e for e in plant.events if e["name"] == "noise_end"], "the event")
 
 

@@ -6,13 +6,12 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from pendulum_msgs_py.contract.angles import wrap
+from pendulum_msgs_py.contract.angles import UPRIGHT, wrap
+from pendulum_msgs_py.contract.names import JOINT
+from pendulum_msgs_py.contract.values import Vector
 from pendulum_msgs_py.errors import ParameterError
 
-__all__ = ["Coordinates", "Joint", "Vector"]
-
-Vector = tuple[float, ...]
-"""One number per joint, in the order of the model."""
+__all__ = ["ONE_JOINT", "Coordinates", "Joint", "Vector"]
 
 
 @dataclass(frozen=True)
@@ -118,3 +117,7 @@ class Coordinates:
         for index, value in zip(self.driven, effort, strict=True):
             values[index] = value
         return tuple(values)
+
+
+ONE_JOINT = Coordinates((Joint(JOINT, goal=UPRIGHT),), (0,))
+"""The pendulum: one hinge with a motor."""

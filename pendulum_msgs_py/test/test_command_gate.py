@@ -21,7 +21,7 @@ def _gate() -> CommandGate:
 
 
 def _command(age_ms: float = 0.0, effort: float = 1.0, source: str = "lqr", joints: tuple = (JOINT,)) -> JointCommand:
-    return JointCommand(_NOW - round(age_ms * _MS), effort, source, joints)
+    return JointCommand.of_one(_NOW - round(age_ms * _MS), effort, source, joints)
 
 
 @pytest.mark.parametrize(
@@ -38,8 +38,8 @@ def _command(age_ms: float = 0.0, effort: float = 1.0, source: str = "lqr", join
         (_command(effort=-math.inf), Refusal.NOT_FINITE),
         (_command(joints=("elbow",)), Refusal.OTHER_JOINT),
         (_command(joints=(JOINT, "elbow")), Refusal.NOT_ONE_JOINT),
-        (JointCommand(0, 1.0), Refusal.TOO_OLD),
-        (JointCommand(-1, 1.0), Refusal.TOO_OLD),
+        (JointCommand.of_one(0, 1.0), Refusal.TOO_OLD),
+        (JointCommand.of_one(-1, 1.0), Refusal.TOO_OLD),
     ],
 )
 def test_each_rule_refuses_and_counts_under_its_own_name(command: JointCommand, refusal: Refusal | None) -> None:
@@ -76,28 +76,28 @@ def test_a_second_answer_to_one_state_and_an_older_one_are_refused() -> None:
     gate.offer(_command(age_ms=10.0), _NOW)
     assert gate.offer(_command(age_ms=10.0, effort=2.0), _NOW) is Refusal.DUPLICATE
     assert gate.offer(_command(age_ms=11.0), _NOW) is Refusal.OUT_OF_ORDER
-    assert gate.fresh(_NOW).effort == 1.0
+    assert gate.fresh(_NOW).effort[0] == 1.0
 
 
 def test_a_second_commander_waits_until_the_first_is_silent() -> None:
     gate = _gate()
     gate.offer(_command(), _NOW)
     later = _NOW + round(COMMANDER_HOLD * NANOSECONDS)
-    assert gate.offer(JointCommand(later, 5.0, "other"), later) is Refusal.SECOND_COMMANDER
+    assert gate.offer(JointCommand.of_one(later, 5.0, "other"), later) is Refusal.SECOND_COMMANDER
     assert gate.refused_commander == "other"
     later += 1
-    assert gate.offer(JointCommand(later, 5.0, "other"), later) is None
+    assert gate.offer(JointCommand.of_one(later, 5.0, "other"), later) is None
     assert gate.commander == "other"
-    assert gate.offer(JointCommand(later + 1, 5.0, "lqr"), later + 1) is Refusal.SECOND_COMMANDER
+    assert gate.offer(JointCommand.of_one(later + 1, 5.0, "lqr"), later + 1) is Refusal.SECOND_COMMANDER
 
 
 def test_bad_commands_of_the_holder_do_not_keep_its_place() -> None:
     gate = _gate()
     gate.offer(_command(), _NOW)
     for step in range(1, 25):
-        gate.offer(JointCommand(_NOW + step * 50 * _MS, math.nan, "lqr"), _NOW + step * 50 * _MS)
+        gate.offer(JointCommand.of_one(_NOW + step * 50 * _MS, math.nan, "lqr"), _NOW + step * 50 * _MS)
     later = _NOW + 1300 * _MS
-    assert gate.offer(JointCommand(later, 1.0, "other"), later) is None
+    assert gate.offer(JointCommand.of_one(later, 1.0, "other"), later) is None
 
 
 def test_a_reset_forgets_the_commander_and_keeps_the_counts() -> None:
@@ -116,8 +116,8 @@ def test_after_the_clock_stepped_back_commands_are_believed_again() -> None:
     gate.offer(_command(), _NOW)
     before = _NOW - 3600 * NANOSECONDS
     assert gate.fresh(before) is None
-    assert gate.offer(JointCommand(before, 2.0, "lqr"), before) is None
-    assert gate.fresh(before).effort == 2.0
+    assert gate.offer(JointCommand.of_one(before, 2.0, "lqr"), before) is None
+    assert gate.fresh(before).effort[0] == 2.0
 
 
 @given(
@@ -138,12 +138,12 @@ def test_what_is_fresh_is_always_finite_and_young_by_stamp_and_by_hearing(
     now = heard = _NOW
     for step, age, effort, source in events:
         now += step
-        if gate.offer(JointCommand(now - age, effort, source), now) is None:
+        if gate.offer(JointCommand.of_one(now - age, effort, source), now) is None:
             heard = now
         for later in (now, now + 20 * _MS, now + 60 * _MS):
             fresh = gate.fresh(later)
             if fresh is not None:
-                assert math.isfinite(fresh.effort)
+                assert math.isfinite(fresh.effort[0])
                 assert -5 * _MS <= later - fresh.stamp_ns <= 50 * _MS
                 # A plant that catches up with missed periods decides as of times before it heard the command.
                 assert -50 * _MS <= later - heard <= 50 * _MS

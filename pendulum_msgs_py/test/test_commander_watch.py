@@ -54,7 +54,7 @@ class Watched:
         self.graph = Graph()
         self.now_ns = START
         monkeypatch.setattr(commander_watch.time, "monotonic_ns", lambda: self.now_ns)
-        self.supervisor = PlantSupervisor(PlantLimits(effort=5.0))
+        self.supervisor = PlantSupervisor(PlantLimits(effort=(5.0,)))
         self.watch = CommanderWatch(self.graph, self.supervisor)  # type: ignore[arg-type]
 
     def commanders(self, *names: str) -> None:
@@ -64,7 +64,7 @@ class Watched:
         self.graph.publishers["/sim/joint_states"] = [("/sim", f"plant{number}") for number in range(count)]
 
     def command(self, source: str = "controller", effort: float = 1.0, stamp_ns: int = START) -> None:
-        self.supervisor.offer(Input.EFFORT_COMMAND, JointCommand(stamp_ns, effort, source), stamp_ns)
+        self.supervisor.offer(Input.EFFORT_COMMAND, JointCommand.of_one(stamp_ns, effort, source), stamp_ns)
 
     def conflict(self) -> str:
         self.watch.check()
@@ -78,7 +78,7 @@ def watched(monkeypatch: pytest.MonkeyPatch) -> Watched:
 
 def answer_twice(watched: Watched, effort: float, at_ns: int = START) -> None:
     """A second answer to the state that was answered with 1 N m."""
-    watched.watch.suspect_twins(JointCommand(START, effort, "controller"), at_ns)
+    watched.watch.suspect_twins(JointCommand.of_one(START, effort, "controller"), at_ns)
 
 
 def test_two_commanders_of_one_name_are_a_conflict_that_is_told_once_and_passes(watched: Watched) -> None:
@@ -175,7 +175,7 @@ def test_in_the_first_50_ms_of_a_machine_nobody_is_looked_at_on_suspicion(watche
 def test_answers_to_states_that_are_not_ours_are_a_conflict_for_a_second_where_there_are_two_plants(
     watched: Watched,
 ) -> None:
-    command = JointCommand(START, 1.0, "controller")
+    command = JointCommand.of_one(START, 1.0, "controller")
     watched.plants(2)
     for stamp in (START, START + 1):
         watched.watch.note_state(stamp)
@@ -183,7 +183,7 @@ def test_answers_to_states_that_are_not_ours_are_a_conflict_for_a_second_where_t
     assert watched.graph.looks == 0
     assert watched.conflict() == ""
     watched.now_ns += PERIOD
-    watched.watch.suspect_second_plant(JointCommand(START - 1, 1.0, "controller"))
+    watched.watch.suspect_second_plant(JointCommand.of_one(START - 1, 1.0, "controller"))
     assert watched.graph.looks == 2
     assert "2 plants on /sim/joint_states" in watched.supervisor.commander_conflict
     watched.plants(1)
@@ -199,7 +199,7 @@ def test_states_of_the_last_128_stamps_are_ours(watched: Watched) -> None:
     watched.plants(2)
     for stamp in range(129):
         watched.watch.note_state(stamp)
-    watched.watch.suspect_second_plant(JointCommand(1, 1.0, "controller"))
+    watched.watch.suspect_second_plant(JointCommand.of_one(1, 1.0, "controller"))
     assert watched.supervisor.commander_conflict == ""
-    watched.watch.suspect_second_plant(JointCommand(0, 1.0, "controller"))
+    watched.watch.suspect_second_plant(JointCommand.of_one(0, 1.0, "controller"))
     assert "2 plants" in watched.supervisor.commander_conflict

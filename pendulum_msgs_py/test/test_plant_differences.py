@@ -8,10 +8,12 @@ import pytest
 
 from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.parameters import ParameterSpec
+from pendulum_msgs_py.plants.mechanism_parameters import load_mechanism
 from pendulum_msgs_py.plants.plant_differences import (
     describe_plants,
     plant_differences,
     plant_mismatch,
+    read_pendulums,
     read_plants,
 )
 from pendulum_msgs_py.plants.plant_parameters import (
@@ -89,3 +91,25 @@ def test_one_description_that_fits_is_enough_and_none_says_nothing() -> None:
 def test_what_is_no_description_is_refused(text: str) -> None:
     with pytest.raises(ParameterError):
         read_plants(text)
+
+
+def test_plants_of_several_joints_are_described_and_compared_by_the_names_of_their_files() -> None:
+    acrobot = load_mechanism("acrobot")
+    (again,) = read_plants(describe_plants([acrobot]))
+    assert again == acrobot
+    assert plant_mismatch(acrobot, [again]) == ""
+    other = acrobot.with_values({"mass_2": 0.7, "elbow.coulomb_friction": 0.0})
+    told = plant_mismatch(acrobot, read_plants(describe_plants([other])))
+    assert "mass_2 0.625568" in told
+    assert "runs 0.7 kg" in told
+    assert "elbow.coulomb_friction 0.12, runs 0 N m" in told
+    assert "model double_pendulum, runs cart_pole" in plant_mismatch(acrobot, [load_mechanism("cart_pole")])
+    assert "model double_pendulum, runs pendulum" in plant_mismatch(acrobot, [THESIS])
+    assert "elbow.effort_limit 6, runs none" in plant_mismatch(acrobot, [load_mechanism("pendubot")])
+    with pytest.raises(ParameterError, match="'acrobot' has several joints; expected a plant of one joint"):
+        read_pendulums(describe_plants([acrobot]))
+
+
+def test_a_description_of_a_mechanism_that_nobody_knows_is_refused() -> None:
+    with pytest.raises(ParameterError, match="no description of plants"):
+        read_plants('[{"model": "triple_pendulum", "values": [], "joints": []}]')

@@ -19,18 +19,18 @@ class Plant:
 
     def __init__(self, **limits: float) -> None:
         self.now = 1000 * NANOSECONDS
-        self.supervisor = PlantSupervisor(PlantLimits(**{"effort": 13.0, "start_effort": 2.0, **limits}))
+        self.supervisor = PlantSupervisor(PlantLimits(**{"effort": (13.0,), "start_effort": 2.0, **limits}))
         assert self.supervisor.arm(self.now, self.sample()) == ""
 
     def sample(self) -> JointSample:
-        return JointSample(self.now, 0.0, 0.0, 0.0)
+        return JointSample.of_one(self.now, 0.0, 0.0, 0.0)
 
     def run(self, seconds: float, command: float | None = None, source: str = "lqr") -> list[Drive]:
         drives = []
         for _ in range(round(100 * seconds)):
             self.now += 10 * _MS
             if command is not None:
-                self.supervisor.offer(Input.EFFORT_COMMAND, JointCommand(self.now, command, source), self.now)
+                self.supervisor.offer(Input.EFFORT_COMMAND, JointCommand.of_one(self.now, command, source), self.now)
             drives.append(self.supervisor.decide(self.now, self.sample()))
             self.supervisor.report_applied(drives[-1].effort)
         return drives
@@ -38,25 +38,25 @@ class Plant:
 
 def test_the_first_command_after_arming_must_be_near_zero() -> None:
     plant = Plant()
-    assert all(drive.effort == 0.0 and drive.starved for drive in plant.run(0.5, 13.0))
+    assert all(drive.effort[0] == 0.0 and drive.starved for drive in plant.run(0.5, 13.0))
     assert "lqr asks for 13.00 N m" in plant.supervisor.reason
     assert "expected at most 2.0 N m to begin" in plant.supervisor.reason
-    assert plant.run(0.01, -2.0)[-1].effort == -2.0
+    assert plant.run(0.01, -2.0)[-1].effort[0] == -2.0
     # Once it commands, it may ask for what it likes.
-    assert plant.run(0.01, 13.0)[-1].effort == 13.0
+    assert plant.run(0.01, 13.0)[-1].effort[0] == 13.0
 
 
 @pytest.mark.parametrize("sign", [1.0, -1.0])
 def test_just_above_the_limit_does_not_begin(sign: float) -> None:
-    assert Plant().run(0.1, sign * 2.01)[-1].effort == 0.0
+    assert Plant().run(0.1, sign * 2.01)[-1].effort[0] == 0.0
 
 
 def test_another_commander_begins_near_zero_too() -> None:
     plant = Plant()
     plant.run(0.2, 1.0, "first")
     plant.run(1.1)
-    assert plant.run(0.3, 13.0, "second")[-1].effort == 0.0
-    assert plant.run(0.01, 1.5, "second")[-1].effort == 1.5
+    assert plant.run(0.3, 13.0, "second")[-1].effort[0] == 0.0
+    assert plant.run(0.01, 1.5, "second")[-1].effort[0] == 1.5
 
 
 def test_a_commander_that_was_silent_for_long_begins_near_zero_but_a_short_gap_is_none() -> None:
@@ -64,18 +64,18 @@ def test_a_commander_that_was_silent_for_long_begins_near_zero_but_a_short_gap_i
     plant.run(0.1, 1.0)
     plant.run(0.1, 9.0)
     plant.run(0.5)
-    assert plant.run(0.01, 9.0)[-1].effort == 9.0
+    assert plant.run(0.01, 9.0)[-1].effort[0] == 9.0
     plant.run(1.1)
-    assert plant.run(0.3, 9.0)[-1].effort == 0.0
+    assert plant.run(0.3, 9.0)[-1].effort[0] == 0.0
 
 
 def test_two_commanders_of_one_name_that_part_begin_near_zero() -> None:
     plant = Plant()
     plant.run(0.1, 1.0)
     plant.supervisor.set_commander_conflict("2 commanders named /lqr")
-    assert plant.run(1.2, 9.0)[-1].effort == 0.0
+    assert plant.run(1.2, 9.0)[-1].effort[0] == 0.0
     plant.supervisor.set_commander_conflict("")
-    assert plant.run(0.1, 9.0)[-1].effort == 0.0
+    assert plant.run(0.1, 9.0)[-1].effort[0] == 0.0
 
 
 def test_arming_again_starts_anew() -> None:
@@ -83,7 +83,7 @@ def test_arming_again_starts_anew() -> None:
     plant.run(0.1, 0.2)
     plant.supervisor.disarm(plant.now)
     assert plant.supervisor.arm(plant.now, plant.sample()) == ""
-    assert plant.run(0.1, 9.0)[-1].effort == 0.0
+    assert plant.run(0.1, 9.0)[-1].effort[0] == 0.0
 
 
 def test_who_took_over_from_position_control_has_begun() -> None:
@@ -92,13 +92,13 @@ def test_who_took_over_from_position_control_has_begun() -> None:
     assert plant.supervisor.accept_trajectory(hold, plant.now, plant.sample()) == ""
     plant.run(0.3, 1.0)
     assert plant.supervisor.mode is Mode.EFFORT
-    assert plant.run(0.3, 9.0)[-1].effort == 9.0
+    assert plant.run(0.3, 9.0)[-1].effort[0] == 9.0
 
 
 def test_whoever_commanded_before_a_trajectory_begins_anew_after_it() -> None:
     plant = Plant(handover_effort=2.0)
     plant.run(0.1, 1.0)
-    assert plant.run(0.1, 9.0)[-1].effort == 9.0
+    assert plant.run(0.1, 9.0)[-1].effort[0] == 9.0
     hold = from_points([0.0, 0.1], [0.0, 0.0], [0.0, 0.0])
     assert plant.supervisor.accept_trajectory(hold, plant.now, plant.sample()) == ""
     plant.run(0.3, 9.0)
@@ -106,7 +106,7 @@ def test_whoever_commanded_before_a_trajectory_begins_anew_after_it() -> None:
 
 
 def test_without_a_limit_anything_may_begin() -> None:
-    assert Plant(start_effort=math.inf).run(0.01, 13.0)[-1].effort == 13.0
+    assert Plant(start_effort=math.inf).run(0.01, 13.0)[-1].effort[0] == 13.0
 
 
 def test_a_plant_that_nobody_commands_disarms_itself() -> None:
@@ -119,7 +119,7 @@ def test_a_plant_that_nobody_commands_disarms_itself() -> None:
     assert plant.supervisor.mode is Mode.DISARMED
     assert drive.kind is DriveKind.OFF
     assert "no command for 1" in plant.supervisor.reason
-    assert plant.run(0.2, 1.0)[-1].effort == 0.0
+    assert plant.run(0.2, 1.0)[-1].effort[0] == 0.0
 
 
 def test_a_plant_that_never_was_commanded_disarms_too_and_commands_that_may_not_begin_do_not_keep_it() -> None:
@@ -141,4 +141,4 @@ def test_holding_a_position_is_no_starvation_and_commands_keep_a_plant_armed() -
 @pytest.mark.parametrize("value", [0.0, -1.0, math.nan])
 def test_limits_that_limit_nothing_or_everything_are_refused(name: str, value: float) -> None:
     with pytest.raises(ParameterError, match=f"{name} is"):
-        PlantLimits(effort=5.0, **{name: value})
+        PlantLimits(effort=(5.0,), **{name: value})

@@ -21,20 +21,20 @@ class Plant:
         self.now = 1000 * NANOSECONDS
         self.position = 0.0
         self.servo = 0.0
-        usual = {"effort": 5.0, "feedback_timeout": 0.03, "handover_effort": math.inf}
+        usual = {"effort": (5.0,), "feedback_timeout": 0.03, "handover_effort": math.inf}
         self.supervisor = PlantSupervisor(PlantLimits(**{**usual, **limits}))
         assert self.supervisor.arm(self.now, self.sample()) == ""
 
     def sample(self, *, late_ns: int = 0, velocity: float = 0.0) -> JointSample:
-        return JointSample(self.now - late_ns, self.position, velocity, 0.0)
+        return JointSample.of_one(self.now - late_ns, self.position, velocity, 0.0)
 
     def decide(self) -> Drive:
         drive = self.supervisor.decide(self.now, self.sample())
-        self.supervisor.report_applied(drive.effort + (self.servo if drive.kind is DriveKind.POSITION else 0.0))
+        self.supervisor.report_applied((drive.effort[0] + (self.servo if drive.kind is DriveKind.POSITION else 0.0),))
         return drive
 
     def offer(self, effort: float, kind: Input = Input.EFFORT_COMMAND) -> None:
-        self.supervisor.offer(kind, JointCommand(self.now, effort, "lqr"), self.now)
+        self.supervisor.offer(kind, JointCommand.of_one(self.now, effort, "lqr"), self.now)
 
     def run(self, milliseconds: int, command: float | None = None) -> Drive:
         drive = Drive(DriveKind.OFF)
@@ -72,9 +72,9 @@ def test_a_measurement_older_or_further_ahead_than_the_limit_ends_torque(late_ns
 
 @pytest.mark.parametrize(("position", "ends"), [(1.0, False), (1.001, True), (-2.0, False), (-2.001, True)])
 def test_leaving_the_position_window_ends_torque(position: float, ends: bool) -> None:
-    plant = Plant(position_min=-2.0, position_max=1.0)
+    plant = Plant(position_min=(-2.0,), position_max=(1.0,))
     plant.position = position
-    assert (plant.run(1, 1.0).effort == 0.0) == ends
+    assert (plant.run(1, 1.0).effort[0] == 0.0) == ends
     assert (plant.supervisor.mode is Mode.FAULT) == ends
 
 
@@ -107,16 +107,16 @@ def test_a_command_that_waited_while_the_plant_was_armed_makes_no_torque() -> No
     plant.supervisor.disarm(plant.now)
     plant.offer(0.4)
     assert plant.supervisor.arm(plant.now, plant.sample()) == ""
-    assert plant.run(1).effort == 0.0
+    assert plant.run(1).effort[0] == 0.0
 
 
 def test_a_torque_that_is_reported_after_the_release_starts_no_fade_when_armed_again() -> None:
     plant = Plant()
     plant.supervisor.disarm(plant.now)
-    plant.supervisor.report_applied(3.0)
+    plant.supervisor.report_applied((3.0,))
     assert plant.supervisor.arm(plant.now, plant.sample()) == ""
     plant.follow(_hold())
-    assert plant.run(1).effort == 0.0
+    assert plant.run(1).effort[0] == 0.0
 
 
 def test_each_change_of_mode_is_kept_with_time_and_reason_and_the_newest_fifty() -> None:
@@ -137,7 +137,7 @@ def test_each_change_of_mode_is_kept_with_time_and_reason_and_the_newest_fifty()
 
 
 def test_without_a_push_there_is_none() -> None:
-    assert Plant().run(1).push == 0.0
+    assert Plant().run(1).push[0] == 0.0
 
 
 def test_a_sum_within_the_limit_is_not_saturated_and_one_beyond_it_is_counted() -> None:
@@ -148,7 +148,7 @@ def test_a_sum_within_the_limit_is_not_saturated_and_one_beyond_it_is_counted() 
         plant.offer(command)
         drive = plant.decide()
         assert drive.saturated == saturated
-        assert drive.effort == min(5.0, command + disturbance)
+        assert drive.effort[0] == min(5.0, command + disturbance)
     assert plant.supervisor.saturated_periods == 1
     assert plant.supervisor.reason == "commanded by lqr"
 
@@ -161,16 +161,16 @@ def test_each_period_without_a_command_is_counted() -> None:
 
 def test_torque_rises_and_falls_at_the_slew_limit_and_not_without_time() -> None:
     plant = Plant(slew=10.0)
-    assert plant.run(10, 5.0).effort == pytest.approx(0.1)
-    assert plant.decide().effort == plant.decide().effort
-    assert plant.run(20, -5.0).effort == pytest.approx(-0.1)
+    assert plant.run(10, 5.0).effort[0] == pytest.approx(0.1)
+    assert plant.decide().effort[0] == plant.decide().effort[0]
+    assert plant.run(20, -5.0).effort[0] == pytest.approx(-0.1)
 
 
 def test_after_a_silence_torque_rises_from_zero_again() -> None:
     plant = Plant(slew=10.0)
-    assert plant.run(100, 1.0).effort == pytest.approx(1.0)
+    assert plant.run(100, 1.0).effort[0] == pytest.approx(1.0)
     assert plant.run(60).starved
-    assert plant.run(1, 1.0).effort == pytest.approx(0.01)
+    assert plant.run(1, 1.0).effort[0] == pytest.approx(0.01)
 
 
 def test_a_commander_may_go_on_after_a_silence_of_just_the_hold() -> None:
@@ -179,7 +179,7 @@ def test_a_commander_may_go_on_after_a_silence_of_just_the_hold() -> None:
         plant.run(1, 1.0)
         plant.now += pause_ns
         plant.offer(4.0)
-        return plant.decide().effort
+        return plant.decide().effort[0]
 
     assert after(NANOSECONDS) == 4.0
     assert after(NANOSECONDS + 1) == 0.0
@@ -226,18 +226,18 @@ def test_a_trajectory_is_not_finished_while_the_gap_at_its_start_is_closed() -> 
 def test_time_that_stands_still_moves_no_setpoint() -> None:
     plant = Plant()
     plant.follow(from_points([0.0, 1.0], [0.0, 0.3], [0.0, 0.0]))
-    position = plant.run(200).position
-    assert [plant.decide().position for _ in range(3)] == 3 * [position]
+    position = plant.run(200).position[0]
+    assert [plant.decide().position[0] for _ in range(3)] == 3 * [position]
 
 
 def test_a_fade_waits_while_the_plant_was_stopped() -> None:
     plant = Plant(handover_time=1.0)
     plant.run(1, 4.0)
     plant.follow(_hold(10.0))
-    assert plant.run(200).effort == pytest.approx(0.8 * 4.0)
+    assert plant.run(200).effort[0] == pytest.approx(0.8 * 4.0)
     plant.now += 5 * NANOSECONDS
     # As far as the longest step, a tenth of a second, takes it.
-    assert plant.decide().effort == pytest.approx(0.7 * 4.0)
+    assert plant.decide().effort[0] == pytest.approx(0.7 * 4.0)
 
 
 @pytest.mark.parametrize("side", [1.0, -1.0])
@@ -271,7 +271,7 @@ def test_a_trajectory_may_touch_the_ends_of_the_window_and_not_pass_them(
     position: float,
     inside: bool,
 ) -> None:
-    plant = Plant(position_min=-2.0, position_max=1.0)
+    plant = Plant(position_min=(-2.0,), position_max=(1.0,))
     plant.position = max(-2.0, min(1.0, position))
     refusal = plant.supervisor.accept_trajectory(_hold(1.0, position), plant.now, plant.sample())
     assert (refusal == "") == inside
@@ -305,31 +305,31 @@ def test_a_command_as_far_from_what_holds_as_allowed_takes_over() -> None:
 def test_who_took_over_with_more_than_a_beginner_may_ask_goes_on() -> None:
     plant = Plant(start_effort=0.5)
     plant.follow(_hold(0.1))
-    assert plant.run(300, 1.5).effort == 1.5
+    assert plant.run(300, 1.5).effort[0] == 1.5
 
 
 def test_without_a_hand_over_time_torque_is_at_once_what_is_asked_for() -> None:
     plant = Plant(handover_time=0.0)
     plant.servo = 1.7
     plant.follow(_hold(0.1))
-    assert plant.run(100, -3.0).effort == -3.0
+    assert plant.run(100, -3.0).effort[0] == -3.0
 
 
 def test_the_slew_limit_begins_at_the_torque_that_held() -> None:
     plant = Plant(handover_time=0.0, slew=10.0)
     plant.servo = 1.7
     plant.follow(_hold(0.1))
-    assert plant.run(100, -3.0).effort == pytest.approx(1.7)
-    assert plant.run(1, -3.0).effort == pytest.approx(1.69)
+    assert plant.run(100, -3.0).effort[0] == pytest.approx(1.7)
+    assert plant.run(1, -3.0).effort[0] == pytest.approx(1.69)
 
 
 def test_a_fade_that_a_silence_ended_does_not_come_back() -> None:
     plant = Plant(handover_time=1.0)
     plant.servo = 1.7
     plant.follow(_hold(0.1))
-    assert plant.run(110, 3.0).effort == pytest.approx(1.7, abs=0.05)
+    assert plant.run(110, 3.0).effort[0] == pytest.approx(1.7, abs=0.05)
     assert plant.run(60).starved
-    assert plant.run(1, 3.0).effort == 3.0
+    assert plant.run(1, 3.0).effort[0] == 3.0
 
 
 # --- limits ----------------------------------------------------------------------------------------------------
@@ -338,22 +338,22 @@ def test_a_fade_that_a_silence_ended_does_not_come_back() -> None:
 @pytest.mark.parametrize(
     "limits",
     [
-        {"effort": 0.0},
+        {"effort": (0.0,)},
         {"command_timeout": 0.0},
         {"handover_effort": 0.0},
         {"tracking_error": 0.0},
-        {"position_min": 1.0, "position_max": 1.0},
+        {"position_min": (1.0,), "position_max": (1.0,)},
     ],
 )
 def test_a_limit_of_nothing_at_all_is_refused(limits: dict[str, float]) -> None:
     with pytest.raises(ParameterError, match="expected"):
-        PlantLimits(**{"effort": 5.0, **limits})
+        PlantLimits(**{"effort": (5.0,), **limits})
 
 
 @pytest.mark.parametrize(
     "limits",
     [
-        {"effort": 0.5},
+        {"effort": (0.5,)},
         {"handover_effort": 0.5},
         {"tracking_error": 0.1},
         {"velocity": 0.5, "slew": 0.5, "start_effort": 0.5, "starvation": 0.5, "feedback_timeout": 0.5},
@@ -361,4 +361,4 @@ def test_a_limit_of_nothing_at_all_is_refused(limits: dict[str, float]) -> None:
     ],
 )
 def test_a_small_limit_is_one(limits: dict[str, float]) -> None:
-    assert PlantLimits(**{"effort": 5.0, **limits})
+    assert PlantLimits(**{"effort": (5.0,), **limits})

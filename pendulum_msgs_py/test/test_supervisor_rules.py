@@ -37,7 +37,7 @@ class PlantRules(RuleBasedStateMachine):
     def __init__(self) -> None:
         super().__init__()
         self.now = _START_NS
-        self.supervisor = PlantSupervisor(PlantLimits(effort=5.0))
+        self.supervisor = PlantSupervisor(PlantLimits(effort=(5.0,)))
         self.sample: JointSample | None = None
         self.drive = Drive(DriveKind.OFF)
         self.decided_ns = _START_NS
@@ -51,14 +51,14 @@ class PlantRules(RuleBasedStateMachine):
     )
     def make(self, slew: float, handover: float, window: tuple[float, float]) -> None:
         self.limits = PlantLimits(
-            effort=5.0,
+            effort=(5.0,),
             command_timeout=0.05,
             feedback_timeout=0.03,
             velocity=8.0,
             slew=slew,
             handover_time=handover,
-            position_min=window[0],
-            position_max=window[1],
+            position_min=(window[0],),
+            position_max=(window[1],),
             handover_effort=math.inf,
         )
         self.supervisor = PlantSupervisor(self.limits)
@@ -67,7 +67,7 @@ class PlantRules(RuleBasedStateMachine):
     # --- the world -----------------------------------------------------------------------------------------
 
     def _measure(self, position: float, velocity: float, effort: float = 0.0, late_ns: int = 0) -> None:
-        self.sample = JointSample(self.now - late_ns, position, velocity, effort)
+        self.sample = JointSample.of_one(self.now - late_ns, position, velocity, effort)
 
     def _period(self) -> None:
         before, elapsed = self.drive, self.now - self.decided_ns
@@ -76,8 +76,8 @@ class PlantRules(RuleBasedStateMachine):
         changed = {self.decided_mode, self.supervisor.mode} == {Mode.POSITION, Mode.EFFORT}
         if changed and not self.released and 0 <= elapsed <= _PERIOD_NS and self.limits.handover_time:
             # The fade from one torque to another, at most twice the limit away, over the hand-over time.
-            slope = 2.0 * self.limits.effort / self.limits.handover_time
-            assert abs(self.drive.effort - before.effort) <= slope * _PERIOD_NS / NANOSECONDS + 1e-9
+            slope = 2.0 * self.limits.effort[0] / self.limits.handover_time
+            assert abs(self.drive.effort[0] - before.effort[0]) <= slope * _PERIOD_NS / NANOSECONDS + 1e-9
         self.decided_ns, self.decided_mode, self.released = self.now, self.supervisor.mode, False
 
     @rule(position=st.floats(-0.3, 0.3), velocity=st.floats(-2.0, 2.0), periods=st.integers(1, 8))
@@ -94,7 +94,7 @@ class PlantRules(RuleBasedStateMachine):
             self.now += _PERIOD_NS
             self._measure(0.1, 0.0)
             for kind, torque in ((Input.EFFORT_COMMAND, effort), (Input.DISTURBANCE, disturbance)):
-                self._offer(kind, JointCommand(self.now, torque, "lqr"))
+                self._offer(kind, JointCommand.of_one(self.now, torque, "lqr"))
             self._period()
             self.bounds()
 
@@ -154,7 +154,7 @@ class PlantRules(RuleBasedStateMachine):
         joints=st.sampled_from([(), ("pendulum_joint",), ("elbow",), ("pendulum_joint", "elbow")]),
     )
     def any_command(self, kind: Input, effort: float, age: int, source: str, joints: tuple[str, ...]) -> None:
-        self._offer(kind, JointCommand(self.now - age, effort, source, joints))
+        self._offer(kind, JointCommand.of_one(self.now - age, effort, source, joints))
 
     @rule(kind=st.sampled_from(Input))
     def malformed(self, kind: Input) -> None:
@@ -220,15 +220,15 @@ class PlantRules(RuleBasedStateMachine):
     @invariant()
     def bounds(self) -> None:
         drive = self.drive
-        assert math.isfinite(drive.effort)
-        assert abs(drive.effort) <= self.supervisor.limits.effort
-        assert math.isfinite(drive.position)
-        assert math.isfinite(drive.velocity)
-        assert abs(drive.push) <= PUSH_LIMIT_FACTOR * self.supervisor.limits.effort
+        assert math.isfinite(drive.effort[0])
+        assert abs(drive.effort[0]) <= self.supervisor.limits.effort[0]
+        assert math.isfinite(drive.position[0])
+        assert math.isfinite(drive.velocity[0])
+        assert abs(drive.push[0]) <= PUSH_LIMIT_FACTOR * self.supervisor.limits.effort[0]
         if drive.kind is DriveKind.OFF:
-            assert drive.effort == 0.0
+            assert drive.effort[0] == 0.0
         if drive.starved:
-            assert drive.effort == 0.0
+            assert drive.effort[0] == 0.0
 
     @precondition(lambda self: not self.supervisor.mode.armed)
     @rule()
@@ -236,7 +236,7 @@ class PlantRules(RuleBasedStateMachine):
         self.now += _PERIOD_NS
         self._period()
         assert self.drive.kind is DriveKind.OFF
-        assert self.drive.effort == 0.0
+        assert self.drive.effort[0] == 0.0
 
     @precondition(lambda self: self.supervisor.mode is Mode.EFFORT)
     @rule()
@@ -246,7 +246,7 @@ class PlantRules(RuleBasedStateMachine):
             self.now += _PERIOD_NS
             self._measure(0.1, 0.0)
             self._period()
-        assert self.drive.effort == 0.0
+        assert self.drive.effort[0] == 0.0
 
     @precondition(lambda self: self.supervisor.mode in {Mode.FAULT, Mode.E_STOP})
     @rule(effort=_USUAL)
@@ -267,23 +267,23 @@ class Loop:
     def __init__(self, **limits: float) -> None:
         self.now = _START_NS
         self.position = 0.0
-        self.supervisor = PlantSupervisor(PlantLimits(**{"effort": 5.0, "feedback_timeout": 0.03, **limits}))
+        self.supervisor = PlantSupervisor(PlantLimits(**{"effort": (5.0,), "feedback_timeout": 0.03, **limits}))
         self.applied: list[float] = []
         self.drives: list[Drive] = []
         self.servo = 0.0
         assert self.supervisor.arm(self.now, self.sample()) == ""
 
     def sample(self) -> JointSample:
-        return JointSample(self.now, self.position, 0.0, 0.0)
+        return JointSample.of_one(self.now, self.position, 0.0, 0.0)
 
     def run(self, seconds: float, command: float | None = None, source: str = "lqr") -> Drive:
         for _ in range(round(seconds * 1000)):
             self.now += _MS
             if command is not None:
-                self.supervisor.offer(Input.EFFORT_COMMAND, JointCommand(self.now, command, source), self.now)
+                self.supervisor.offer(Input.EFFORT_COMMAND, JointCommand.of_one(self.now, command, source), self.now)
             drive = self.supervisor.decide(self.now, self.sample())
-            effort = drive.effort + self.servo if drive.kind is DriveKind.POSITION else drive.effort
-            self.supervisor.report_applied(effort)
+            effort = drive.effort[0] + (self.servo if drive.kind is DriveKind.POSITION else 0.0)
+            self.supervisor.report_applied((effort,))
             self.drives.append(drive)
             self.applied.append(effort)
         return self.drives[-1]
@@ -333,7 +333,7 @@ def test_a_controller_that_dies_during_the_fade_leaves_zero_torque() -> None:
     assert drive.starved
     assert loop.applied[-1] == 0.0
     # It comes back by itself, and the fade, whose torque is long gone, does not.
-    assert loop.run(0.001, command=3.0).effort == 3.0
+    assert loop.run(0.001, command=3.0).effort[0] == 3.0
 
 
 def test_commands_during_a_trajectory_wait_for_its_end() -> None:
@@ -372,7 +372,7 @@ def test_a_new_trajectory_in_the_middle_of_another_starts_at_the_pendulum() -> N
     loop.run(0.5)
     loop.position = 0.1
     assert loop.follow(_hold(1.0, 0.2)) == ""
-    assert abs(loop.run(0.001).position - 0.1) < 1e-3
+    assert abs(loop.run(0.001).position[0] - 0.1) < 1e-3
 
 
 def test_the_gap_to_a_trajectory_is_closed_no_faster_than_a_ramp() -> None:
@@ -380,7 +380,7 @@ def test_the_gap_to_a_trajectory_is_closed_no_faster_than_a_ramp() -> None:
     assert loop.follow(_hold(0.01, 0.29)) == ""
     loop.position = 0.1
     loop.run(1.2)
-    positions = [drive.position for drive in loop.drives]
+    positions = [drive.position[0] for drive in loop.drives]
     assert max(abs(b - a) for a, b in itertools.pairwise(positions)) <= 0.3e-3 + 1e-9
     assert positions[-1] == 0.29
 
@@ -391,9 +391,9 @@ def test_a_goal_of_one_point_is_a_move_from_here_as_it_is_to_a_joint_trajectory_
     assert loop.follow(goal) == ""
     assert loop.drives == []
     loop.run(0.001)
-    assert abs(loop.drives[-1].position) < 1e-3
+    assert abs(loop.drives[-1].position[0]) < 1e-3
     assert "rad/s" in Loop(velocity=1.0).follow(goal)
-    assert "trajectory covers" in Loop(position_max=3.0, position_min=-3.0).follow(goal)
+    assert "trajectory covers" in Loop(position_max=(3.0,), position_min=(-3.0,)).follow(goal)
 
 
 def test_a_gap_counts_for_the_speed_limit() -> None:
@@ -404,11 +404,11 @@ def test_a_gap_counts_for_the_speed_limit() -> None:
 def test_a_trajectory_waits_while_the_plant_was_stopped() -> None:
     loop = Loop(feedback_timeout=math.inf)
     loop.follow(from_points([0.0, 10.0], [0.0, 3.0], [0.0, 0.0]))
-    before = loop.run(0.2).position
+    before = loop.run(0.2).position[0]
     loop.now += 5 * NANOSECONDS
-    assert abs(loop.run(0.001).position - before) < 0.04
+    assert abs(loop.run(0.001).position[0] - before) < 0.04
     loop.now -= 5 * NANOSECONDS
-    assert abs(loop.run(0.001).position - before) < 0.04
+    assert abs(loop.run(0.001).position[0] - before) < 0.04
     assert loop.supervisor.mode is Mode.POSITION
 
 
@@ -417,24 +417,24 @@ def test_a_trajectory_that_comes_after_a_pause_starts_at_once() -> None:
     loop.run(0.01)
     loop.now += 5 * NANOSECONDS
     loop.follow(from_points([0.0, 1.0], [0.0, 0.2], [0.0, 0.0]))
-    assert loop.run(0.5).position > 0.09
+    assert loop.run(0.5).position[0] > 0.09
 
 
 def test_a_trajectory_is_refused_on_a_stale_measurement() -> None:
     loop = Loop()
-    stale = JointSample(loop.now - NANOSECONDS, 0.0, 0.0)
+    stale = JointSample.of_one(loop.now - NANOSECONDS, 0.0, 0.0)
     assert "ms old" in loop.supervisor.accept_trajectory(_hold(), loop.now, stale)
 
 
 def test_arming_needs_a_fresh_measurement_and_a_command_near_zero() -> None:
-    supervisor = PlantSupervisor(PlantLimits(effort=5.0, feedback_timeout=0.03))
+    supervisor = PlantSupervisor(PlantLimits(effort=(5.0,), feedback_timeout=0.03))
     now = _START_NS
-    fresh = JointSample(now, 0.0, 0.0)
+    fresh = JointSample.of_one(now, 0.0, 0.0)
     assert supervisor.arm(now, None) == "no measurement"
-    assert "ms old" in supervisor.arm(now, JointSample(now - NANOSECONDS, 0.0, 0.0))
-    assert "ahead" in supervisor.arm(now, JointSample(now + NANOSECONDS, 0.0, 0.0))
-    assert "not finite" in supervisor.arm(now, JointSample(now, math.nan, 0.0))
-    supervisor.offer(Input.EFFORT_COMMAND, JointCommand(now, 3.0, "lqr"), now)
+    assert "ms old" in supervisor.arm(now, JointSample.of_one(now - NANOSECONDS, 0.0, 0.0))
+    assert "ahead" in supervisor.arm(now, JointSample.of_one(now + NANOSECONDS, 0.0, 0.0))
+    assert "not finite" in supervisor.arm(now, JointSample.of_one(now, math.nan, 0.0))
+    supervisor.offer(Input.EFFORT_COMMAND, JointCommand.of_one(now, 3.0, "lqr"), now)
     refusal = supervisor.arm(now, fresh)
     assert "lqr already commands 3.000 N m" in refusal
     # In this order it can be armed.
@@ -443,12 +443,12 @@ def test_arming_needs_a_fresh_measurement_and_a_command_near_zero() -> None:
     supervisor.set_commander_conflict("two of them")
     assert supervisor.arm(now, fresh) == "two of them"
     supervisor.set_commander_conflict("")
-    assert supervisor.arm(now + 60 * _MS, JointSample(now + 60 * _MS, 0.0, 0.0)) == ""
+    assert supervisor.arm(now + 60 * _MS, JointSample.of_one(now + 60 * _MS, 0.0, 0.0)) == ""
 
 
 def test_preflight_can_refuse_arming() -> None:
-    supervisor = PlantSupervisor(PlantLimits(effort=5.0), preflight=lambda: "strategy not confirmed")
-    assert supervisor.arm(_START_NS, JointSample(_START_NS, 0.0, 0.0)) == "strategy not confirmed"
+    supervisor = PlantSupervisor(PlantLimits(effort=(5.0,)), preflight=lambda: "strategy not confirmed")
+    assert supervisor.arm(_START_NS, JointSample.of_one(_START_NS, 0.0, 0.0)) == "strategy not confirmed"
     assert supervisor.mode is Mode.DISARMED
 
 
@@ -458,15 +458,15 @@ def test_the_first_torque_after_arming_again_keeps_the_slew_limit() -> None:
     loop.supervisor.disarm(loop.now)
     loop.now += 10 * NANOSECONDS
     assert loop.supervisor.arm(loop.now, loop.sample()) == ""
-    assert abs(loop.run(0.001, command=5.0).effort) <= 10.0 * 0.001 + 1e-12
+    assert abs(loop.run(0.001, command=5.0).effort[0]) <= 10.0 * 0.001 + 1e-12
 
 
 def test_an_applied_torque_that_is_no_number_starts_no_fade() -> None:
     loop = Loop()
     loop.run(0.01, command=1.0)
-    loop.supervisor.report_applied(math.nan)
+    loop.supervisor.report_applied((math.nan,))
     loop.follow(_hold())
-    assert loop.run(0.001).effort == 0.0
+    assert loop.run(0.001).effort[0] == 0.0
 
 
 def test_a_push_acts_in_every_mode_and_stays_finite() -> None:
@@ -481,13 +481,13 @@ def test_a_push_acts_in_every_mode_and_stays_finite() -> None:
     ):
         enter()
         loop.now += _MS
-        supervisor.offer(Input.PUSH, JointCommand(loop.now, 0.7, "hand"), loop.now)
+        supervisor.offer(Input.PUSH, JointCommand.of_one(loop.now, 0.7, "hand"), loop.now)
         drive = supervisor.decide(loop.now, loop.sample())
-        assert drive.push == 0.7
-        assert drive.effort == 0.0
+        assert drive.push[0] == 0.7
+        assert drive.effort[0] == 0.0
     loop.now += _MS
-    supervisor.offer(Input.PUSH, JointCommand(loop.now, 1e308, "hand"), loop.now)
-    assert supervisor.decide(loop.now, loop.sample()).push == PUSH_LIMIT_FACTOR * 5.0
+    supervisor.offer(Input.PUSH, JointCommand.of_one(loop.now, 1e308, "hand"), loop.now)
+    assert supervisor.decide(loop.now, loop.sample()).push[0] == PUSH_LIMIT_FACTOR * 5.0
 
 
 def test_twins_get_no_torque_until_one_is_gone() -> None:
@@ -497,7 +497,7 @@ def test_twins_get_no_torque_until_one_is_gone() -> None:
     assert loop.run(0.01, command=1.0).starved
     assert loop.supervisor.reason == "2 commanders named /lqr"
     loop.supervisor.set_commander_conflict("")
-    assert loop.run(0.001, command=1.0).effort == 1.0
+    assert loop.run(0.001, command=1.0).effort[0] == 1.0
 
 
 def test_leaving_the_trajectory_is_a_fault() -> None:
@@ -512,9 +512,9 @@ def test_leaving_the_trajectory_is_a_fault() -> None:
 def test_two_huge_torques_of_opposite_sign_stay_finite() -> None:
     loop = Loop()
     for kind, torque in ((Input.EFFORT_COMMAND, 1.7e308), (Input.DISTURBANCE, 1.7e308)):
-        loop.supervisor.offer(kind, JointCommand(loop.now, torque, "x"), loop.now)
+        loop.supervisor.offer(kind, JointCommand.of_one(loop.now, torque, "x"), loop.now)
     drive = loop.supervisor.decide(loop.now, loop.sample())
-    assert drive.effort == 5.0
+    assert drive.effort[0] == 5.0
     assert drive.saturated
 
 
@@ -532,4 +532,6 @@ def test_two_huge_torques_of_opposite_sign_stay_finite() -> None:
 )
 def test_limits_that_limit_nothing_or_everything_are_refused(name: str, value: float) -> None:
     with pytest.raises(ParameterError, match="expected"):
-        PlantLimits(**{"effort": 5.0, name: value})
+        PlantLimits(
+            **{"effort": (5.0,), name: (value,) if name in {"effort", "position_min", "position_max"} else value}
+        )

@@ -96,7 +96,7 @@ class AdoptNode(PollingNode):
         self._clock_ns = SteadyWallClock()
         limits = limits_from_parameters(
             values,
-            plant.effort_limit,
+            (plant.effort_limit,),
             feedback_timeout=values["state_timeout"],
             least_command_timeout=_LATENESS * values["period"],
         )
@@ -124,7 +124,7 @@ class AdoptNode(PollingNode):
             self._send(0.0)
             time.sleep(0.01)
         if self._interface.sample is not None:
-            self._interface.publish_applied(self._interface.sample.stamp_ns, 0.0)
+            self._interface.publish_applied(self._interface.sample.stamp_ns, (0.0,))
         self._interface.close()
 
     def _on_state(self, data: bytes) -> None:
@@ -150,17 +150,18 @@ class AdoptNode(PollingNode):
             self._answer(drive if drive.kind is DriveKind.EFFORT else Drive(DriveKind.OFF), sample)
 
     def _answer(self, drive: Drive, sample: JointSample | None) -> None:
-        effort = drive.effort
+        (effort,) = drive.effort
         if drive.kind is DriveKind.POSITION and sample is not None:
-            limit = self._supervisor.limits.effort
-            effort = self._servo.effort(sample.position, sample.velocity, drive.position, drive.velocity, limit=limit)
+            (limit,) = self._supervisor.limits.effort
+            where, wanted = (sample.position[0], sample.velocity[0]), (drive.position[0], drive.velocity[0])
+            effort = self._servo.effort(*where, *wanted, limit=limit)
         others = self.count_publishers(self._settings.values["commands"]) - 1
         if others > 0 and self._supervisor.mode.armed:
             self._supervisor.fault(self._not_alone(others), self._clock_ns())
             effort = 0.0
         self._send(effort)
         if sample is not None:
-            self._interface.publish_applied(sample.stamp_ns, effort)
+            self._interface.publish_applied(sample.stamp_ns, (effort,))
 
     def _send(self, effort: float) -> None:
         self._applied = effort
@@ -180,10 +181,11 @@ class AdoptNode(PollingNode):
         theta = self._sign * (message.position[i] - self._zero)
         if self._interface.sample is not None and math.isfinite(theta):
             # Theirs may wrap; ours go on.
-            theta = self._interface.sample.position + wrap(theta - self._interface.sample.position)
+            before = self._interface.sample.position[0]
+            theta = before + wrap(theta - before)
         # Who measures no torque is taken to make what was asked for.
         measured = self._sign * effort if math.isfinite(effort) else self._applied
-        sample = JointSample(now_ns, theta, self._sign * message.velocity[i], measured)
+        sample = JointSample.of_one(now_ns, theta, self._sign * message.velocity[i], measured)
         if not sample.is_finite():
             self._refuse("a state is not finite")
             if self._supervisor.mode.armed:

@@ -10,11 +10,13 @@ from typing import Any, NamedTuple
 from pendulum_msgs_py.contract.values import NANOSECONDS
 from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.parameters import ParameterSpec
-from pendulum_msgs_py.plants.plant_parameters import PRESET_NAMES
+from pendulum_msgs_py.plants.mechanism_parameters import load_mechanism
+from pendulum_msgs_py.plants.plant_parameters import MECHANISM_PRESETS, PRESET_NAMES, is_mechanism
 from pendulum_msgs_py.plants.sealed_plant import load_plant_to_run
 from pendulum_sim.guarded_plant import GuardedPlant
 from pendulum_sim.gymnasium_plant import load_adapter, load_gymnasium_plant
 from pendulum_sim.integrators import METHODS
+from pendulum_sim.mechanism_plant import MechanismPlant
 from pendulum_sim.mujoco_mapping import MujocoMapping, load_mujoco_mapping
 from pendulum_sim.mujoco_plant import load_mujoco_plant
 from pendulum_sim.plant import Plant
@@ -34,11 +36,22 @@ class Simulation(NamedTuple):
         sealed: Whether its parameters are nobody's business.
     """
 
-    plant: Plant
+    plant: Plant | MechanismPlant
     name: str
     method: str
     remarks: tuple[str, ...] = ()
     sealed: bool = False
+
+    @property
+    def pendulum(self) -> Plant:
+        """The plant, where it has one joint.
+
+        Raises:
+            ParameterError: It has several.
+        """
+        if isinstance(self.plant, MechanismPlant):
+            raise ParameterError(f"simulation {self.name} has several joints; expected one")
+        return self.plant
 
 
 @dataclass(frozen=True)
@@ -79,9 +92,24 @@ _FOREIGN_SPECS = (
 
 def _make_own(values: Mapping[str, Any]) -> Simulation:
     dt = round(NANOSECONDS / values["rate_hz"]) / NANOSECONDS
+    if is_mechanism(values["plant"]):
+        return _make_mechanism(values, dt)
     parameters, sealed = load_plant_to_run(values["plant"])
     plant = make_plant(parameters, dt, method=values["method"], substeps=values["substeps"] or None)
     return Simulation(plant, values["plant"], values["method"], sealed=sealed)
+
+
+def _make_mechanism(values: Mapping[str, Any], dt: float) -> Simulation:
+    if values["method"] != "auto":
+        raise ParameterError(
+            f"method is {values['method']!r}; expected auto: plant {values['plant']!r} has several joints, which are "
+            "integrated by Runge-Kutta of order four"
+        )
+    parameters = load_mechanism(values["plant"])
+    plant = MechanismPlant(parameters, dt, substeps=values["substeps"] or 1)
+    joints = ", ".join(parameters.coordinates.names)
+    driven = ", ".join(parameters.coordinates.driven_names) or "none"
+    return Simulation(plant, values["plant"], "rk4", (f"joints {joints}; driven: {driven}",))
 
 
 def _make_mujoco(values: Mapping[str, Any]) -> Simulation:
@@ -111,12 +139,19 @@ OWN = Engine(
     program="simulator",
     description="Simulated pendulum behind the interface that simulator and hardware share.",
     specs=(
-        ParameterSpec("plant", "thesis", "", f"Preset ({PRESET_NAMES}) or path of a plant file.", read_only=True),
+        ParameterSpec(
+            "plant",
+            "thesis",
+            "",
+            f"Preset ({PRESET_NAMES}; of several joints: {', '.join(MECHANISM_PRESETS)}) or path of a plant file.",
+            read_only=True,
+        ),
         ParameterSpec(
             "method",
             "auto",
             "",
-            "Integrator; auto is etd4 for a rigid plant, semi_implicit for a series-elastic one.",
+            "Integrator; auto is etd4 for a rigid plant, semi_implicit for a series-elastic one, rk4 for several "
+            "joints.",
             choices=("auto", *METHODS),
             read_only=True,
         ),
@@ -128,6 +163,15 @@ OWN = Engine(
             "Integration steps in a period; 0 chooses by the plant.",
             minimum=0,
             read_only=True,
+        ),
+        ParameterSpec(
+            "initial_position",
+            [0.0],
+            "rad or m",
+            "Of several joints: where each is at a given start; one value stands for all.",
+        ),
+        ParameterSpec(
+            "initial_velocity", [0.0], "rad/s or m/s", "Of several joints: how fast each is at a given start."
         ),
     ),
     make=_make_own,

@@ -93,8 +93,8 @@ class MarkersNode(Node):
     def _receiver(self, topic: str) -> Callable[[bytes], None]:
         def receive(data: bytes) -> None:
             command = command_from_bytes(data)
-            if command is not None and math.isfinite(command.effort):
-                self._torques.note(topic, command.stamp_ns, command.effort)
+            if command is not None and len(command.effort) == 1 and math.isfinite(command.effort[0]):
+                self._torques.note(topic, command.stamp_ns, command.effort[0])
 
         return receive
 

@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from pendulum_msgs_py.errors import ParameterError
-from pendulum_msgs_py.joints import Vector
+from pendulum_msgs_py.joints import Coordinates, Vector
 from pendulum_msgs_py.plants.mechanism_parameters import MechanismParameters
 from pendulum_sim.compiling import compile_tree
 from pendulum_sim.joint_steps import advance_joints, joint_functions, pack_joints, rk4_joints
@@ -86,6 +86,21 @@ class MechanismPlant:
         self._still = (0.0,) * len(parameters.joints)
         self._position = self._velocity = self._effort = self._still
         self._steps = 0
+
+    @property
+    def name(self) -> str:
+        """Name of the plant."""
+        return self.parameters.name
+
+    @property
+    def coordinates(self) -> Coordinates:
+        """Its joints, and which of them are driven."""
+        return self.parameters.coordinates
+
+    @property
+    def effort_limits(self) -> Vector:
+        """Largest effort of each driven joint [N m or N]."""
+        return self._limits
 
     @property
     def state(self) -> MechanismState:

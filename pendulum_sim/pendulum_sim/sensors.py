@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from pendulum_msgs_py.contract.values import JointSample
+from pendulum_msgs_py.contract.values import JointSample, Vector
 from pendulum_msgs_py.parameters import ParameterSpec, validate
 
 __all__ = ["SENSOR_SPECS", "Sensors", "quantise"]
@@ -42,7 +42,7 @@ def quantise(value: float, step: float) -> float:
 
 
 class Sensors:
-    """Sensors of angle, velocity and torque.
+    """Sensors of position, velocity and effort, alike at each joint, in its own units.
 
     Args:
         generator: Source of all random numbers; it is spawned, never drawn from.
@@ -75,27 +75,29 @@ class Sensors:
         self.ideal = not (any(self._channels) or self._jitter or self._drop_rate)
         self.dropped = 0
 
-    def measure(self, stamp_ns: int, theta: float, theta_dot: float, effort: float) -> JointSample | None:
+    def measure(self, stamp_ns: int, position: Vector, velocity: Vector, effort: Vector) -> JointSample | None:
         """Return the measurement of a state, or None for a sample that is lost.
 
         Args:
             stamp_ns: Time of the state [ns].
-            theta: True angle [rad].
-            theta_dot: True velocity [rad/s].
-            effort: True torque at the joint [N m].
+            position: True positions of the joints [rad or m].
+            velocity: True velocities [rad/s or m/s].
+            effort: True efforts at the joints [N m or N].
         """
         if self.ideal:
-            return JointSample(stamp_ns, theta, theta_dot, effort)
+            return JointSample(stamp_ns, position, velocity, effort)
         if self._jitter:
-            theta += theta_dot * self._jitter_generator.normal(0.0, self._jitter)
-        position, velocity, torque = (
-            value if channel is None else _distort(value, *channel)
-            for value, channel in zip((theta, theta_dot, effort), self._channels, strict=True)
-        )
+            # All joints are sampled at one instant.
+            shift = self._jitter_generator.normal(0.0, self._jitter)
+            position = tuple(q + v * shift for q, v in zip(position, velocity, strict=True))
+        measured = [
+            values if channel is None else tuple(_distort(value, *channel) for value in values)
+            for values, channel in zip((position, velocity, effort), self._channels, strict=True)
+        ]
         if self._drop_rate and self._drop_generator.random() < self._drop_rate:
             self.dropped += 1
             return None
-        return JointSample(stamp_ns, position, velocity, torque)
+        return JointSample(stamp_ns, *measured)
 
 
 def _distort(value: float, bias: float, noise: float, step: float, generator: np.random.Generator) -> float:

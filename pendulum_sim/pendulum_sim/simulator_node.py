@@ -14,15 +14,15 @@ import numpy as np
 from sensor_msgs.msg import JointState
 from std_srvs.srv import SetBool, Trigger
 
-from pendulum_msgs_py.contract.names import JOINT
 from pendulum_msgs_py.contract.plant_specs import LIMIT_SPECS, LOCKSTEP_EPOCH_NS, LOOP_SPECS, limits_from_parameters
 from pendulum_msgs_py.contract.shared_supervisor import SharedSupervisor
 from pendulum_msgs_py.contract.supervisor import Drive, DriveKind, Input, Mode
 from pendulum_msgs_py.contract.timing import LoopStatistics, SteadyWallClock
-from pendulum_msgs_py.contract.values import NANOSECONDS, JointCommand, JointSample
+from pendulum_msgs_py.contract.values import NANOSECONDS, JointCommand, JointSample, Vector
 from pendulum_msgs_py.errors import FaultError, ParameterError
 from pendulum_msgs_py.parameters import ParameterSpec
 from pendulum_msgs_py.plants.plant_differences import PLANT_PARAMETERS, describe_plants
+from pendulum_msgs_py.plants.plant_parameters import PlantParameters
 from pendulum_msgs_py.programs.executables import report_error
 from pendulum_msgs_py.ros import qos
 from pendulum_msgs_py.ros.convert import sample_from_message
@@ -33,13 +33,16 @@ from pendulum_msgs_py.ros.polled import PollingNode
 from pendulum_msgs_py.ros.runner import run_node
 from pendulum_sim.engines import OWN, Engine
 from pendulum_sim.guarded_plant import PaceWatch, StallWatch
-from pendulum_sim.plant import PlantState
+from pendulum_sim.joint_plant import joint_plant
 from pendulum_sim.sensors import SENSOR_SPECS, Sensors
 from pendulum_sim.servo import PositionServo
 
 __all__ = ["SPECS", "SimulatorNode", "main", "run_engine"]
 
 _SENSOR_PREFIX = "sensor."
+_ONE_FOR_ALL = [0.0]
+_SLIDE = 0.1
+"""Largest distance from the middle at which a joint that slides starts at random [m]."""
 _LEAST_PERIODS = 2.0
 """Age in periods that a command may reach at least."""
 
@@ -77,12 +80,13 @@ class SimulatorNode(PollingNode):
         self._settings = NodeParameters(self, (*engine.specs, *_SHARED_SPECS), self._check_start)
         values = self._settings.values
         self._simulation = engine.make(values)
-        self._plant = self._simulation.plant
-        parameters = self._plant.parameters
+        self._plant = joint_plant(self._simulation.plant)
+        self._coordinates = self._plant.coordinates
+        parameters = self._simulation.plant.parameters
         self._dt = self._plant.dt
         period_ns = round(self._dt * NANOSECONDS)
         self._told_plant = describe_plants([] if self._simulation.sealed else [parameters])
-        self._servo = PositionServo(parameters, self._dt)
+        self._servo = PositionServo(parameters, self._dt) if isinstance(parameters, PlantParameters) else None
         self._failure = ""
         starts, sensor_noise = np.random.default_rng(values["seed"]).spawn(2)
         self._starts = starts
@@ -92,15 +96,20 @@ class SimulatorNode(PollingNode):
         self._statistics = LoopStatistics(period_ns)
         # Where a file's timestep makes periods as long as that, each command would be too old when it is applied.
         least = _LEAST_PERIODS * self._dt
-        limits = limits_from_parameters(values, parameters.effort_limit, least_command_timeout=least)
-        self._supervisor = SharedSupervisor(limits, self._preflight)
+        limits = limits_from_parameters(
+            values, self._plant.effort_limits, joints=len(self._coordinates.joints), least_command_timeout=least
+        )
+        self._supervisor = SharedSupervisor(
+            limits, self._preflight, coordinates=self._coordinates, follows=self._servo is not None
+        )
+        self._no_effort = (0.0,) * len(self._coordinates.driven)
         self._lockstep = values["clock"] == "lockstep"
         self._wall = wall = SteadyWallClock()
         self._pace = PaceWatch(self._dt) if engine.foreign and not self._lockstep else None
         self._stall: AbstractContextManager[object] = nullcontext()
         if engine.foreign:
             self._stall = StallWatch(values["step_timeout"], self._end_stalled)
-        self._state: PlantState = self._plant.state
+        self._state = self._plant.state
         self._loop: Any = None
         self._interface = PlantInterface(
             self,
@@ -126,6 +135,7 @@ class SimulatorNode(PollingNode):
             self._loop = RealtimeLoop(self._interface, self._advance, self._statistics, wall)
             self._stamp_ns = wall()
         self._loop.paused = values["paused"]
+        self._check_start(values)
         self._restart(*self._start_state(values))
         if values["armed_at_start"]:
             refusal = self._supervisor.arm(self._stamp_ns, self._interface.sample)
@@ -144,7 +154,7 @@ class SimulatorNode(PollingNode):
     def close(self) -> None:
         """Stop the plant: a last zero torque is published, so that a recording shows it."""
         self._interface.safe_stop("simulator ends")
-        self._interface.publish_applied(self._stamp_ns, 0.0)
+        self._interface.publish_applied(self._stamp_ns, self._no_effort)
         self._interface.close()
 
     # --- the loop ------------------------------------------------------------------------------------------
@@ -154,26 +164,32 @@ class SimulatorNode(PollingNode):
         due: float = self._loop.run_due()
         return due
 
-    def _advance(self, drive: Drive, stamp_ns: int) -> tuple[JointSample | None, float]:
+    def _advance(self, drive: Drive, stamp_ns: int) -> tuple[JointSample | None, Vector]:
         if self._failure:
-            return None, 0.0
+            return None, self._no_effort
         effort = drive.effort
         if drive.kind is DriveKind.POSITION:
+            assert self._servo is not None
             # The servo knows the weight it carries, so the hand-over's feed-forward would count it twice.
-            state, limit = self._state, self._supervisor.limits.effort
-            effort = self._servo.effort(state.theta, state.theta_dot, drive.position, drive.velocity, limit=limit)
+            (theta,), (theta_dot,), (limit,) = (
+                self._state.position,
+                self._state.velocity,
+                self._supervisor.limits.effort,
+            )
+            (position,), (velocity,) = drive.position, drive.velocity
+            effort = (self._servo.effort(theta, theta_dot, position, velocity, limit=limit),)
         try:
             problem = self._step(effort, drive.push, stamp_ns)
         except FaultError as error:
             problem = str(error)
         if problem:
             self._fail(problem)
-            return None, 0.0
+            return None, self._no_effort
         # In real time this is the deadline, not the moment at which Python got there.
         self._stamp_ns = stamp_ns
         return self._measure(), effort
 
-    def _step(self, effort: float, push: float, stamp_ns: int) -> str:
+    def _step(self, effort: Vector, push: Vector, stamp_ns: int) -> str:
         """Step the plant; return why it cannot go on though it came back, or nothing."""
         pace = self._pace
         if pace is None:
@@ -201,13 +217,13 @@ class SimulatorNode(PollingNode):
         reason = f"a step of simulation {name} did not come back within {timeout:g} s"
         self._supervisor.fault(reason, self._interface.clock())
         self._interface.publish_diagnostics()
-        self._interface.publish_applied(self._stamp_ns, 0.0)
+        self._interface.publish_applied(self._stamp_ns, self._no_effort)
         report_error(FaultError(reason))
         os._exit(1)
 
     def _measure(self) -> JointSample | None:
-        state = self._state
-        return self._sensors.measure(self._stamp_ns, state.theta, state.theta_dot, state.effort)
+        _, position, velocity, effort = self._state
+        return self._sensors.measure(self._stamp_ns, position, velocity, effort)
 
     def _on_command(self, kind: Input, command: JointCommand) -> None:
         if self._lockstep:
@@ -219,60 +235,107 @@ class SimulatorNode(PollingNode):
 
     # --- services and parameters ---------------------------------------------------------------------------
 
-    def _restart(self, theta: float, theta_dot: float) -> None:
+    def _restart(self, position: Vector, velocity: Vector) -> None:
         with self._stall:
-            self._state = self._plant.reset(theta, theta_dot)
-        state = self._state
+            self._state = self._plant.reset(position, velocity)
         # The first measurement is exact: arming and trajectories need one, and a sensor may drop it.
-        self._interface.sample = self._measure() or JointSample(
-            self._stamp_ns, state.theta, state.theta_dot, state.effort
-        )
+        self._interface.sample = self._measure() or JointSample(self._stamp_ns, *self._state[1:])
 
-    def _start_state(self, values: Mapping[str, Any]) -> tuple[float, float]:
-        start = values["start"]
+    def _start_state(self, values: Mapping[str, Any]) -> tuple[Vector, Vector]:
+        start, coordinates = values["start"], self._coordinates
+        still = (0.0,) * len(coordinates.joints)
         if start == "bottom":
-            return 0.0, 0.0
+            return still, still
         if start == "top":
-            return math.pi, 0.0
+            return coordinates.goal, still
         if start == "random":
-            return float(self._starts.uniform(-math.pi, math.pi)), float(self._starts.uniform(-1.0, 1.0))
-        return values["initial_theta"], values["initial_theta_dot"]
+            position = tuple(
+                float(self._starts.uniform(-math.pi, math.pi) if joint.turns else self._starts.uniform(-_SLIDE, _SLIDE))
+                for joint in coordinates.joints
+            )
+            return position, tuple(float(self._starts.uniform(-1.0, 1.0)) for _ in coordinates.joints)
+        if len(still) == 1:
+            return (values["initial_theta"],), (values["initial_theta_dot"],)
+        return self._given("initial_position", values), self._given("initial_velocity", values)
 
-    @staticmethod
-    def _check_start(values: Mapping[str, Any]) -> None:
+    def _given(self, name: str, values: Mapping[str, Any]) -> Vector:
+        given, joints = values.get(name, _ONE_FOR_ALL), self._coordinates.joints
+        if len(given) not in {1, len(joints)}:
+            raise ParameterError(
+                f"{name} has {len(given)} values; expected {len(joints)}, for "
+                f"{', '.join(f'{joint.name} [{joint.unit}]' for joint in joints)}, or one for all"
+            )
+        return tuple(given) if len(given) == len(joints) else (given[0],) * len(joints)
+
+    def _check_start(self, values: Mapping[str, Any]) -> None:
         for name in ("initial_theta", "initial_theta_dot"):
             if not math.isfinite(values[name]):
                 raise ParameterError(f"{name} is {values[name]}; expected a finite number")
+        if len(self._coordinates.joints) > 1:
+            if values["initial_theta"] or values["initial_theta_dot"]:
+                raise ParameterError(
+                    f"initial_theta and initial_theta_dot are for one joint, and plant {self._plant.name!r} has "
+                    f"{', '.join(self._coordinates.names)}; expected initial_position and initial_velocity"
+                )
+            self._given("initial_position", values)
+            self._given("initial_velocity", values)
+        elif any(values.get(name, _ONE_FOR_ALL) != _ONE_FOR_ALL for name in ("initial_position", "initial_velocity")):
+            raise ParameterError(
+                f"initial_position and initial_velocity are for several joints, and plant {self._plant.name!r} has "
+                "one; expected initial_theta and initial_theta_dot"
+            )
 
     def _on_reset(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         refusal = self._reset(*self._start_state(self._settings.values))
-        state = self._state
         response.success = not refusal
-        response.message = refusal or f"theta {state.theta:.6f} rad, theta_dot {state.theta_dot:.6f} rad/s"
+        response.message = refusal or self._where()
         return response
 
     def _on_set_state(self, message: JointState) -> None:
-        sample = sample_from_message(message)
+        names = self._coordinates.names
+        sample = sample_from_message(message, names)
         if sample is None or not sample.is_finite():
-            refusal = f"expected a finite position and velocity of {JOINT}"
+            refusal = f"expected a finite position and velocity of {', '.join(names)}"
         else:
             refusal = self._reset(sample.position, sample.velocity)
         if refusal:
             self.get_logger().error(f"set_state refused: {refusal}")
 
-    def _reset(self, theta: float, theta_dot: float) -> str:
+    def _reset(self, position: Vector, velocity: Vector) -> str:
         if self._supervisor.mode is Mode.POSITION:
             return "a trajectory is being followed; disarm first"
         try:
-            self._restart(theta, theta_dot)
-        except FaultError as error:
+            self._restart(position, velocity)
+        except (FaultError, ParameterError) as error:
             return str(error)
         self._failure = ""
         self._loop.halted = False
         for gate in self._supervisor.gates.values():
             gate.reset()
-        self._interface.publish_event("reset", theta=theta, theta_dot=theta_dot)
+        if len(position) == 1:
+            self._interface.publish_event("reset", theta=position[0], theta_dot=velocity[0])
+        else:
+            names = self._coordinates.names
+            told = {
+                "position": dict(zip(names, position, strict=True)),
+                "velocity": dict(zip(names, velocity, strict=True)),
+            }
+            self._interface.publish_event("reset", **told)
         return ""
+
+    def _where(self, *, speed: bool = True) -> str:
+        state = self._state
+        if len(state.position) == 1:
+            text = f"theta {state.position[0]:.6f} rad"
+            return f"{text}, theta_dot {state.velocity[0]:.6f} rad/s" if speed else text
+        joints = self._coordinates.joints
+        texts = [f"{joint.name} {q:.6f} {joint.unit}" for joint, q in zip(joints, state.position, strict=True)]
+        if speed:
+            texts += [
+                f"{joint.name}_dot {v:.6f} {joint.velocity_unit}"
+                for joint, v in zip(joints, state.velocity, strict=True)
+            ]
+        return ", ".join(texts)
 
     def _on_pause(self, request: SetBool.Request, response: SetBool.Response) -> SetBool.Response:
         self._loop.paused = request.data
@@ -285,7 +348,7 @@ class SimulatorNode(PollingNode):
             response.success, response.message = False, "not paused; call ~/pause with true first"
             return response
         self._loop.step_once()
-        response.success, response.message = True, f"theta {self._state.theta:.6f} rad"
+        response.success, response.message = True, self._where(speed=False)
         return response
 
     def _diagnostics(self) -> Mapping[str, object]:

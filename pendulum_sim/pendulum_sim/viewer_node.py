@@ -126,8 +126,8 @@ class ViewerNode(Node):
     def _receiver(self, topic: str) -> Callable[[bytes], None]:
         def receive(data: bytes) -> None:
             command = command_from_bytes(data)
-            if command is not None and np.isfinite(command.effort):
-                self._torques.note(topic, command.stamp_ns, command.effort)
+            if command is not None and len(command.effort) == 1 and np.isfinite(command.effort[0]):
+                self._torques.note(topic, command.stamp_ns, command.effort[0])
 
         return receive
 
@@ -157,16 +157,17 @@ class ViewerNode(Node):
     def _draw(self) -> None:
         sample = self._sample
         if sample is None:
-            sample, note = JointSample(0, 0.0, 0.0), f"waiting for {self._topic}"
+            sample, note = JointSample.of_one(0, 0.0, 0.0), f"waiting for {self._topic}"
             time = None
         else:
             time, note = (sample.stamp_ns - (self._start_ns or 0)) / NANOSECONDS, self._topic
         applied = self._torques.acting(names.APPLIED_EFFORT, sample.stamp_ns)
         disturbance = sum(self._torques.acting(topic, sample.stamp_ns) for topic in (names.DISTURBANCE, names.PUSH))
+        where = sample.position[0], sample.velocity[0]
         if self._window is not None:
-            self._window.show(sample.position, sample.velocity, applied, disturbance=disturbance, time=time, note=note)
+            self._window.show(*where, applied, disturbance=disturbance, time=time, note=note)
         else:
-            self._picture.draw(sample.position, sample.velocity, applied, disturbance=disturbance, time=time, note=note)
+            self._picture.draw(*where, applied, disturbance=disturbance, time=time, note=note)
 
 
 def main(argv: Sequence[str] | None = None) -> int:

@@ -184,7 +184,7 @@ print(json.dumps({
     "position": arrays.position.tolist(),
     "torques": sorted(set(arrays.disturbance.tolist())),
     "backend": make_port(values, SteppedClock()).connect().backend,
-    "slack": refused(check_consistency, values | {"command_lifetime": 0.5}, PlantLimits(13.0)),
+    "slack": refused(check_consistency, values | {"command_lifetime": 0.5}, PlantLimits((13.0,))),
     "metrics": metrics_of(Episode(arrays.stamp_ns * 1e-9, arrays.position - 3.2, arrays.position, arrays.effort)),
     "answers": json.loads(said(analyse, bag, "--ask", "length", "--json", "--out", out)),
     "page": page[page.index("</style>"):][-4_000_000:],

@@ -195,9 +195,9 @@ def _commands(bag: Bag, plant: str) -> tuple[np.ndarray, np.ndarray]:
     # One by one: among the commands there may be the strange messages of a fault, which no plant acts on.
     for log_ns, data in bag.raw(name) if name in bag else ():
         fields = decode_joint_state(data)
-        if fields is None or fields.joint not in {"", names.JOINT}:
+        if fields is None or fields.joints not in {("",), (names.JOINT,)}:
             continue
-        if fields.effort is not None and math.isfinite(fields.effort):
+        if fields.effort and math.isfinite(fields.effort[0]):
             found.setdefault(fields.frame_id, []).append((log_ns, fields.stamp_ns))
     own = f"{plant}/controller"
     commander = own if own in found else next(iter(found), own)

@@ -149,11 +149,11 @@ class Rig:
         self.actuator = EmulatedX5(parameters, seed=seed, position=start, start_ns=self.clock.now_ns())
         self.port = EmulatorBackend(self.actuator, self.clock, seed=seed)
         limits = PlantLimits(
-            effort=effort_limit,
+            effort=(effort_limit,),
             feedback_timeout=max(4.0 * self.period, 0.03),
             velocity=1.5,
-            position_min=-4.0,
-            position_max=4.0,
+            position_min=(-4.0,),
+            position_max=(4.0,),
             slew=2000.0,
         )
         self.supervisor = PlantSupervisor(limits)
@@ -170,7 +170,7 @@ class Rig:
             LoopStatistics(round(self.period * SECOND)),
             on_state=lambda sample, feedback: None,
             decide=lambda: self.supervisor.decide(self.port.now_ns(), self.bridge.sample),
-            on_outcome=lambda stamp_ns, outcome: self.supervisor.report_applied(outcome.effort),
+            on_outcome=lambda stamp_ns, outcome: self.supervisor.report_applied((outcome.effort,)),
         )
 
     @property
@@ -201,7 +201,7 @@ class Rig:
         """Ramp to an angle [rad]; return why not, or an empty string."""
         sample = self.bridge.sample
         assert sample is not None
-        ramp = thesis_ramp(sample.position, goal)
+        ramp = thesis_ramp(sample.position[0], goal)
         return self.supervisor.accept_trajectory(ramp, self.port.now_ns(), sample)
 
     # --- time -----------------------------------------------------------------------------------------------
@@ -223,12 +223,12 @@ class Rig:
         if self.controlling or self.disturbing:
             self.clock.wait_until(self.clock.now_ns() + min(_ANSWER_DELAY_NS, round(0.3e9 * self.period)))
         if self.controlling:
-            effort = -_K[0] * from_upright(sample.position) - _K[1] * sample.velocity
-            self.send(JointCommand(sample.stamp_ns, effort, "controller"))
+            effort = -_K[0] * from_upright(sample.position[0]) - _K[1] * sample.velocity[0]
+            self.send(JointCommand.of_one(sample.stamp_ns, effort, "controller"))
         noise = 0.0
         if self.disturbing:
             noise = float(self.random.uniform(-_NOISE, _NOISE))
-            self.disturb(JointCommand(sample.stamp_ns, noise, "disturbance"))
+            self.disturb(JointCommand.of_one(sample.stamp_ns, noise, "disturbance"))
         now = self.port.now_ns()
         if self.controlling:
             # What a controller asks for that sees the truth, whatever the bridge tells it.

@@ -189,7 +189,7 @@ def _freeze_stamps(rig: Rig) -> None:
 
 def _not_a_number(rig: Rig) -> None:
     offer = rig._send
-    rig.send = lambda command: offer(JointCommand(command.stamp_ns, math.nan, command.source))
+    rig.send = lambda command: offer(JointCommand.of_one(command.stamp_ns, math.nan, command.source))
 
 
 def _second_commander(rig: Rig) -> None:
@@ -197,7 +197,7 @@ def _second_commander(rig: Rig) -> None:
     offer, interrupt = rig._send, rig.break_cycle
 
     def intrude(stamp_ns: int) -> None:
-        offer(JointCommand(stamp_ns, _INTRUDER, "intruder"))
+        offer(JointCommand.of_one(stamp_ns, _INTRUDER, "intruder"))
 
     def both(command: JointCommand) -> None:
         offer(command)
@@ -219,7 +219,7 @@ def _twin_commanders(rig: Rig) -> None:
 
     def twice(command: JointCommand) -> None:
         offer(command)
-        offer(JointCommand(command.stamp_ns, -_INTRUDER, command.source))
+        offer(JointCommand.of_one(command.stamp_ns, -_INTRUDER, command.source))
 
     rig.send = twice
 

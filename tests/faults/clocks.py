@@ -31,7 +31,7 @@ from pendulum_msgs_py.contract.angles import UPRIGHT, from_upright
 from pendulum_msgs_py.contract.plant_specs import LIMIT_SPECS, LOCKSTEP_EPOCH_NS, limits_from_parameters
 from pendulum_msgs_py.contract.shared_supervisor import SharedSupervisor
 from pendulum_msgs_py.contract.supervisor import Drive, Input, PlantSupervisor
-from pendulum_msgs_py.contract.values import NANOSECONDS, JointCommand, JointSample
+from pendulum_msgs_py.contract.values import NANOSECONDS, JointCommand, JointSample, Vector
 from pendulum_msgs_py.errors import FaultError
 from pendulum_msgs_py.parameters import validate
 from pendulum_msgs_py.plants.plant_parameters import load_plant
@@ -194,18 +194,20 @@ def simulate_hours(hours: float, rate_hz: float = 50.0) -> Outcome:
     node = PollingNode("day", context=context, namespace="/day", start_parameter_services=False)
     try:
         parameters = load_plant("thesis")
-        supervisor = SharedSupervisor(limits_from_parameters(dict(validate(LIMIT_SPECS, {})), parameters.effort_limit))
+        supervisor = SharedSupervisor(
+            limits_from_parameters(dict(validate(LIMIT_SPECS, {})), (parameters.effort_limit,))
+        )
         plant = make_plant(parameters, period_ns / NANOSECONDS)
         plant.reset(UPRIGHT, 0.0)
         positions = np.empty(steps)
 
-        def step(drive: Drive, stamp_ns: int) -> tuple[JointSample, float]:
-            state = plant.step(drive.effort, drive.push)
-            return JointSample(stamp_ns, state.theta, state.theta_dot, state.effort), drive.effort
+        def step(drive: Drive, stamp_ns: int) -> tuple[JointSample, Vector]:
+            state = plant.step(drive.effort[0], drive.push[0])
+            return JointSample.of_one(stamp_ns, state.theta, state.theta_dot, state.effort), drive.effort
 
         interface = PlantInterface(node, supervisor, lambda: loop.now_ns)
         loop = LockstepLoop(interface, step, period_ns, [Input.EFFORT_COMMAND, Input.DISTURBANCE], publish_clock=False)
-        interface.publish_state(JointSample(LOCKSTEP_EPOCH_NS, UPRIGHT, 0.0, 0.0))
+        interface.publish_state(JointSample.of_one(LOCKSTEP_EPOCH_NS, UPRIGHT, 0.0, 0.0))
         supervisor.arm(LOCKSTEP_EPOCH_NS, interface.sample)
         controller = AnswerLoop(
             make_controller("lqr", parameters, period_ns / NANOSECONDS, {}), math.inf, simulated_time=True
@@ -219,10 +221,10 @@ def simulate_hours(hours: float, rate_hz: float = 50.0) -> Outcome:
             assert answer is not None
             assert noise is not None
             for kind, effort, source in (
-                (Input.EFFORT_COMMAND, answer, "controller"),
+                (Input.EFFORT_COMMAND, answer[0], "controller"),
                 (Input.DISTURBANCE, noise.torque, "disturbance"),
             ):
-                supervisor.offer(kind, JointCommand(sample.stamp_ns, effort, source), loop.now_ns)
+                supervisor.offer(kind, JointCommand.of_one(sample.stamp_ns, effort, source), loop.now_ns)
             loop.advance()
             measured = interface.sample
             assert measured is not None

@@ -158,8 +158,8 @@ class StopRig:
 
     def _feel(self, data: bytes) -> None:
         applied = decode_joint_state(data)
-        if applied is not None and applied.effort is not None:
-            self.torques.append((time.monotonic(), applied.effort))
+        if applied is not None and applied.effort:
+            self.torques.append((time.monotonic(), applied.effort[0]))
 
     def _hear(self, message: String) -> None:
         event = json.loads(message.data)

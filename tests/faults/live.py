@@ -375,8 +375,8 @@ class LiveSystem:
 
     def _on_applied(self, data: bytes) -> None:
         fields = decode_joint_state(data)
-        if fields is not None and fields.effort is not None:
-            self.applied.append(Applied(time.monotonic(), fields.effort, fields.stamp_ns))
+        if fields is not None and fields.effort:
+            self.applied.append(Applied(time.monotonic(), fields.effort[0], fields.stamp_ns))
 
     def _listen_once(self, duration: float) -> None:
         self.conductor.listen(duration)
@@ -388,8 +388,8 @@ class LiveSystem:
             frame = f"{self.plant.namespace}/{_RIGHTFUL[topic]}"
             for data, info in polled.messages():
                 fields = decode_joint_state(data)
-                if fields is not None and fields.frame_id == frame and fields.effort is not None:
-                    asked = Asked(fields.stamp_ns, fields.effort)
+                if fields is not None and fields.frame_id == frame and fields.effort:
+                    asked = Asked(fields.stamp_ns, fields.effort[0])
                     self.asked[topic].hear(asked, info["publication_sequence_number"])
                     self.heard[topic] = info["received_timestamp"]
 

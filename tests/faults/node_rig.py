@@ -111,7 +111,7 @@ class NodeRig(Rig):
     def follow(self, goal: float) -> str:
         sample = self.bridge.sample
         assert sample is not None
-        return self.supervisor.accept_trajectory(thesis_ramp(sample.position, goal), self.port.now_ns(), sample)
+        return self.supervisor.accept_trajectory(thesis_ramp(sample.position[0], goal), self.port.now_ns(), sample)
 
     def add_twin(self) -> None:
         """Let two nodes of one name stand behind the commands, as the graph tells."""
@@ -139,4 +139,4 @@ class NodeRig(Rig):
         self._tell(Input.DISTURBANCE, command)
 
     def _tell(self, kind: Input, command: JointCommand) -> None:
-        self._hear[kind](encode_joint_state(command.stamp_ns, frame_id=command.source, effort=command.effort))
+        self._hear[kind](encode_joint_state(command.stamp_ns, frame_id=command.source, effort=command.effort[0]))

@@ -264,7 +264,7 @@ def test_nothing_of_the_torque_before_an_e_stop_is_in_the_trajectory_after_it(ki
     place = rig.actuator.link.position
     rig.actuator.hand = lambda time, position, velocity: -2000.0 * (position - place) - 8.0 * velocity
     rig.disturbing = False
-    rig.send = lambda answer: rig._send(JointCommand(answer.stamp_ns, 8.0, "controller"))
+    rig.send = lambda answer: rig._send(JointCommand.of_one(answer.stamp_ns, 8.0, "controller"))
     rig.run(0.3)
     assert rig.outcomes[-1].effort > 5.0
     rig.controlling = False
@@ -279,7 +279,7 @@ def test_nothing_of_the_torque_before_an_e_stop_is_in_the_trajectory_after_it(ki
     # At once, before a cycle of effort control has told the bridge that no torque is in force.
     sample = rig.bridge.sample
     assert sample is not None
-    assert not rig.follow(sample.position)
+    assert not rig.follow(sample.position[0])
     rig.run(0.2)
     duties = [abs(duty) for time, duty, _ in rig.duties if time > begin_ns]
     assert max(duties, default=0.0) / rig.bridge.mapping.pwm_per_torque() < 0.5

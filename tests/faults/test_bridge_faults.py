@@ -95,7 +95,7 @@ def test_what_a_commander_asks_for_counts_when_it_wants_to_take_over_from_a_hold
     rig.run(1.5)
     assert rig.supervisor.trajectory_finished
     rig.controlling = True
-    rig.send = lambda answer: rig._send(JointCommand(answer.stamp_ns, 100.0, "controller for upright"))
+    rig.send = lambda answer: rig._send(JointCommand.of_one(answer.stamp_ns, 100.0, "controller for upright"))
     rig.run(0.5)
     assert rig.supervisor.mode is Mode.POSITION
     assert "asks for 100.00 N m" in rig.supervisor.reason
@@ -105,7 +105,7 @@ def test_what_a_commander_asks_for_counts_when_it_wants_to_take_over_from_a_hold
 def test_a_stuck_encoder_is_found_by_the_time_the_link_has_turned_by_two_degrees(speed: float) -> None:
     rig = Rig(start=0.5)
     rig.disturbing = False
-    rig.send = lambda answer: rig._send(JointCommand(answer.stamp_ns, 0.0, "controller"))
+    rig.send = lambda answer: rig._send(JointCommand.of_one(answer.stamp_ns, 0.0, "controller"))
     rig.actuator.hand = lambda time, position, velocity: 100.0 * (speed - velocity) + 1.678 * math.sin(position)
     rig.run(1.0)
     begin = rig.actuator.link.position
@@ -122,7 +122,7 @@ def test_a_stuck_encoder_is_found_by_the_time_the_link_has_turned_by_two_degrees
 def test_an_encoder_that_is_stuck_at_rest_drives_nothing_and_is_found_when_the_link_moves() -> None:
     rig = Rig(start=0.0)
     rig.disturbing = False
-    rig.send = lambda answer: rig._send(JointCommand(answer.stamp_ns, 0.0, "controller"))
+    rig.send = lambda answer: rig._send(JointCommand.of_one(answer.stamp_ns, 0.0, "controller"))
     rig.run(0.5)
     rig.actuator.inject(ActuatorFault.POSITION_FROZEN)
     rig.run(1.0)

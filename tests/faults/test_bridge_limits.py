@@ -48,7 +48,7 @@ def command(rig: Rig, effort: float) -> None:
 
     def send(answer: JointCommand) -> None:
         asked[0] = math.copysign(min(abs(effort), abs(asked[0]) + 0.5), effort)
-        offer(JointCommand(answer.stamp_ns, asked[0], answer.source))
+        offer(JointCommand.of_one(answer.stamp_ns, asked[0], answer.source))
 
     offer = rig._send
     rig.send = send

@@ -38,7 +38,7 @@ class TinyPlant(PollingNode):
         super().__init__("tiny_plant")
         self.parameters = NodeParameters(self, SPECS, self._prepare)
         self.clock = SteadyWallClock()
-        self.supervisor = SharedSupervisor(limits_from_parameters(self.parameters.values, 5.0))
+        self.supervisor = SharedSupervisor(limits_from_parameters(self.parameters.values, (5.0,)))
         self.interface = PlantInterface(self, self.supervisor, self.clock)
         self.position = self.velocity = 0.0
         self.stop = stop
@@ -48,7 +48,7 @@ class TinyPlant(PollingNode):
     def close(self) -> None:
         time.sleep(self.parameters["stubborn"])
         self.interface.safe_stop("plant ends")
-        self.interface.publish_applied(self.clock(), 0.0)
+        self.interface.publish_applied(self.clock(), (0.0,))
         self.interface.close()
         print("closed", flush=True)
 
@@ -61,13 +61,13 @@ class TinyPlant(PollingNode):
 
     def _step(self) -> None:
         now = self.clock()
-        self.interface.publish_state(JointSample(now, self.position, self.velocity, 0.0))
+        self.interface.publish_state(JointSample.of_one(now, self.position, self.velocity, 0.0))
         drive = self.interface.decide(now)
-        effort = drive.effort
+        (effort,) = drive.effort
         if drive.kind is DriveKind.POSITION:
-            effort += self.parameters["gain"] * (drive.position - self.position)
-        self.interface.publish_applied(now, effort)
-        acceleration = effort + drive.push - 2.0 * self.velocity
+            effort += self.parameters["gain"] * (drive.position[0] - self.position)
+        self.interface.publish_applied(now, (effort,))
+        acceleration = effort + drive.push[0] - 2.0 * self.velocity
         self.velocity += 0.01 * acceleration
         self.position += 0.01 * self.velocity
 

@@ -15,7 +15,7 @@ from mcap.writer import Writer as McapLibraryWriter
 from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin
 from rosbags.rosbag2 import Writer as RosbagsWriter
 
-from pendulum_msgs_py.contract.cdr import encode_joint_state
+from pendulum_msgs_py.contract.cdr import encode_joint_state, encode_joints
 from pendulum_msgs_py.errors import BagError, DataError
 from pendulum_rosbag.reader import read_bag, read_bags, same_messages
 from pendulum_rosbag.storage import open_writer
@@ -268,3 +268,19 @@ def test_a_bag_whose_files_were_renamed_or_lost_is_read_as_far_as_it_goes(tmp_pa
     path.mkdir()
     with pytest.raises(BagError, match="is no bag"):
         read_bag(path)
+
+
+@pytest.mark.parametrize(
+    ("names", "problem"),
+    [(["q", "p"], "message 1 is of q, p; expected p, q"), (["p"], "message 1 is of p; expected p, q")],
+)
+def test_joints_that_change_from_message_to_message_are_no_arrays(
+    tmp_path: Path, names: list[str], problem: str
+) -> None:
+    path = tmp_path / "bag"
+    with open_writer(path) as writer:
+        writer.add_topic("/many", "sensor_msgs/msg/JointState")
+        writer.write("/many", 1, encode_joints(2, "", ("p", "q"), (1.0, 2.0)))
+        writer.write("/many", 2, encode_joints(3, "", tuple(names), (1.0, 2.0)[: len(names)]))
+    with read_bag(path) as bag, pytest.raises(DataError, match=problem):
+        bag.joints("/many")

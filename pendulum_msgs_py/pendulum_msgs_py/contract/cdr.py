@@ -1,13 +1,13 @@
-"""JointState of one joint to and from CDR bytes with one precompiled struct.
+"""JointState to and from CDR bytes with one precompiled struct for each kind of message.
 
 rclpy builds, serialises and deserialises a JointState in 4, 4 and 11 us; with a fixed layout the same takes a
-fraction of a microsecond. The layout is checked in full before a byte is believed: whatever differs (another
-joint, several joints, another byte order) is left to real deserialisation.
+fraction of a microsecond. The layout is checked in full before a byte is believed: whatever differs (no names, more
+values than names, another byte order) is left to real deserialisation.
 
 Layout (XCDR1, little endian; offsets after the four bytes of encapsulation header)::
 
     0   int32 sec, uint32 nanosec, uint32 length, frame_id with NUL, padding to 4
-        uint32 1, uint32 length, joint name with NUL, padding to 4
+        uint32 joints; for each: uint32 length, its name with NUL, padding to 4
         uint32 n, padding to 8 if n, n doubles: position; likewise velocity and effort
 
 Source: OMG CDR (formal/02-06-51, section 15.3); sensor_msgs/msg/JointState.
@@ -19,9 +19,16 @@ import struct
 from typing import NamedTuple
 
 from pendulum_msgs_py.contract.names import JOINT
-from pendulum_msgs_py.contract.values import NANOSECONDS
+from pendulum_msgs_py.contract.values import NANOSECONDS, Vector
 
-__all__ = ["MAX_SECONDS", "JointStateFields", "decode_joint_state", "encode_clock", "encode_joint_state"]
+__all__ = [
+    "MAX_SECONDS",
+    "JointStateFields",
+    "decode_joint_state",
+    "encode_clock",
+    "encode_joint_state",
+    "encode_joints",
+]
 
 MAX_SECONDS = 2**31 - 1
 """Largest ``sec`` of a ROS time stamp."""
@@ -33,17 +40,48 @@ _TIME = struct.Struct("<iI")
 _MAX_TRAILING = 15
 _MOST_KNOWN = 64
 """Layouts that are remembered; a stranger's endless names must not take memory without bound."""
+_MOST_JOINTS = 32
+"""Joints that are read here; more are left to real deserialisation."""
 
 
 class JointStateFields(NamedTuple):
-    """What a JointState of one joint holds; None for a quantity that the message leaves out."""
+    """What a JointState holds: for each quantity one value per joint, or none where the message leaves it out."""
 
     stamp_ns: int
     frame_id: str
-    joint: str
-    position: float | None
-    velocity: float | None
-    effort: float | None
+    joints: tuple[str, ...]
+    position: Vector
+    velocity: Vector
+    effort: Vector
+
+
+def encode_joints(
+    stamp_ns: int,
+    frame_id: str,
+    joints: tuple[str, ...],
+    position: Vector = (),
+    velocity: Vector = (),
+    effort: Vector = (),
+) -> bytes:
+    """Return the CDR bytes of a JointState, padding zeroed, so that equal messages are equal bytes.
+
+    Args:
+        stamp_ns: Stamp, 0 to ``MAX_SECONDS`` seconds [ns].
+        frame_id: Header frame, by our contract the name of the sender.
+        joints: Joint names.
+        position: One for each joint, or none to leave them out [rad or m].
+        velocity: Likewise [rad/s or m/s].
+        effort: Likewise [N m or N].
+
+    Raises:
+        struct.error: The stamp does not fit a ROS time.
+    """
+    n_position, n_velocity, n_effort = len(position), len(velocity), len(effort)
+    layout, words = _layout(frame_id, joints, n_position, n_velocity, n_effort)
+    sec, nanosec = divmod(stamp_ns, NANOSECONDS)
+    return _HEADER + layout.pack(
+        sec, nanosec, *words, n_position, *position, n_velocity, *velocity, n_effort, *effort
+    )  # fmt: skip
 
 
 def encode_joint_state(
@@ -55,7 +93,7 @@ def encode_joint_state(
     velocity: float | None = None,
     effort: float | None = None,
 ) -> bytes:
-    """Return the CDR bytes of a JointState of one joint, padding zeroed, so that equal messages are equal bytes.
+    """Return the CDR bytes of a JointState of one joint, as :func:`encode_joints` does.
 
     Args:
         stamp_ns: Stamp, 0 to ``MAX_SECONDS`` seconds [ns].
@@ -68,17 +106,14 @@ def encode_joint_state(
     Raises:
         struct.error: The stamp does not fit a ROS time.
     """
-    layout, name_bytes = _layout(frame_id, joint, position is not None, velocity is not None, effort is not None)
-    sec, nanosec = divmod(stamp_ns, NANOSECONDS)
-    frame = frame_id.encode() + b"\x00"
-    values: list[object] = [sec, nanosec, len(frame), frame, 1, len(name_bytes), name_bytes]
-    for quantity in (position, velocity, effort):
-        if quantity is None:
-            values.append(0)
-        else:
-            values.append(1)
-            values.append(quantity)
-    return _HEADER + layout.pack(*values)
+    return encode_joints(
+        stamp_ns,
+        frame_id,
+        (joint,),
+        () if position is None else (position,),
+        () if velocity is None else (velocity,),
+        () if effort is None else (effort,),
+    )
 
 
 def encode_clock(stamp_ns: int) -> bytes:
@@ -94,7 +129,7 @@ def encode_clock(stamp_ns: int) -> bytes:
 
 
 def decode_joint_state(data: bytes) -> JointStateFields | None:
-    """Return the fields of a one-joint JointState, or None where the bytes have any other layout.
+    """Return the fields of a JointState of one joint or more, or None where the bytes have any other layout.
 
     Args:
         data: A serialised message, encapsulation header included.
@@ -104,15 +139,19 @@ def decode_joint_state(data: bytes) -> JointStateFields | None:
     if known is not None:
         values = known.layout.unpack(data)
         # All that tells one layout from another: the encapsulation, the names with their lengths, the counts.
-        if values[0] == _PLAIN_CDR and values[3:8] == known.names and values[2] < NANOSECONDS:
+        if values[0] == _PLAIN_CDR and values[3 : known.first] == known.words and values[2] < NANOSECONDS:
+            n, first = known.n, known.first
             if known.complete:
-                if values[8] == values[10] == values[12] == 1:
+                second = first + n + 1
+                third = second + n + 1
+                if values[first] == values[second] == values[third] == n:
                     return JointStateFields(
-                        values[1] * NANOSECONDS + values[2], known.frame_id, known.joint, *values[9:14:2]
-                    )
-            elif values[8:11] == _EFFORT_ALONE:
+                        values[1] * NANOSECONDS + values[2], known.frame_id, known.joints,
+                        values[first + 1 : second], values[second + 1 : third], values[third + 1 :],
+                    )  # fmt: skip
+            elif values[first : first + 3] == known.effort_alone:
                 return JointStateFields(
-                    values[1] * NANOSECONDS + values[2], known.frame_id, known.joint, None, None, values[11]
+                    values[1] * NANOSECONDS + values[2], known.frame_id, known.joints, (), (), values[first + 3 :]
                 )
     if size < 24 or data[0:2] != _PLAIN_CDR:
         return None
@@ -123,34 +162,42 @@ def decode_joint_state(data: bytes) -> JointStateFields | None:
         offset = (frame_end + 3) & ~3
         if frame_length == 0 or offset + 8 > size or data[frame_end - 1] != 0:
             return None
-        joints, name_length = struct.unpack_from("<II", data, offset)
-        name_start = offset + 8
-        name_end = name_start + name_length
-        if joints != 1 or name_length == 0 or name_end > size or data[name_end - 1] != 0:
+        (joints,) = _COUNT.unpack_from(data, offset)
+        offset += 4
+        if not 0 < joints <= _MOST_JOINTS:
             return None
-        offset = (name_end + 3) & ~3
-        quantities: list[float | None] = []
+        names: list[str] = []
+        for _ in range(joints):
+            offset = (offset + 3) & ~3
+            (name_length,) = _COUNT.unpack_from(data, offset)
+            offset += 4
+            name_end = offset + name_length
+            if name_length == 0 or name_end > size or data[name_end - 1] != 0:
+                return None
+            names.append(data[offset : name_end - 1].decode())
+            offset = name_end
+        offset = (offset + 3) & ~3
+        quantities: list[Vector] = []
         for _ in range(3):
             (count,) = _COUNT.unpack_from(data, offset)
             offset += 4
             if count == 0:
-                quantities.append(None)
-            elif count == 1:
+                quantities.append(())
+            elif count == joints:
                 offset += (4 - offset) & 7
-                quantities.append(struct.unpack_from("<d", data, offset)[0])
-                offset += 8
+                quantities.append(struct.unpack_from(f"<{joints}d", data, offset))
+                offset += 8 * joints
             else:
                 return None
         # rclpy reserves room for the alignment of each sequence, empty ones too, and leaves it at the end.
         if size - offset > _MAX_TRAILING or nanosec >= NANOSECONDS:
             return None
         frame_id = data[16 : frame_end - 1].decode()
-        joint = data[name_start : name_end - 1].decode()
     except (struct.error, UnicodeDecodeError):
         return None
-    if "\0" in frame_id or "\0" in joint:
+    if "\0" in frame_id or any("\0" in name for name in names):
         return None
-    fields = JointStateFields(sec * NANOSECONDS + nanosec, frame_id, joint, *quantities)
+    fields = JointStateFields(sec * NANOSECONDS + nanosec, frame_id, tuple(names), *quantities)
     _remember_layout(fields, size)
     return fields
 
@@ -159,14 +206,16 @@ class _KnownLayout(NamedTuple):
     """What the messages of one sender have in common; reading another then takes one call."""
 
     layout: struct.Struct
-    names: tuple[object, ...]
+    words: tuple[object, ...]
+    first: int
+    n: int
     frame_id: str
-    joint: str
+    joints: tuple[str, ...]
     complete: bool
+    effort_alone: tuple[int, int, int]
 
 
 _PLAIN_CDR = b"\x00\x01"
-_EFFORT_ALONE = (0, 0, 1)
 _known_layouts: dict[tuple[int, bytes], _KnownLayout] = {}
 """One layout for each size of message and of its sender's name; the first comer's, so that two do not take turns."""
 
@@ -177,53 +226,62 @@ def forget_layouts() -> None:
 
 
 def _remember_layout(fields: JointStateFields, size: int) -> None:
-    """Remember the layout of a state, or of a torque alone: the messages that come a thousand times a second."""
-    present = tuple(quantity is not None for quantity in fields[3:])
-    complete = present == (True, True, True)
-    frame = fields.frame_id.encode() + b"\x00"
-    key = (size, _COUNT.pack(len(frame)))
+    """Remember the layout of a state, or of efforts alone: the messages that come a thousand times a second."""
+    counts = tuple(len(quantity) for quantity in fields[3:])
+    n = len(fields.joints)
+    complete = counts == (n, n, n)
+    key = (size, _COUNT.pack(len(fields.frame_id.encode()) + 1))
     if key in _known_layouts or len(_known_layouts) >= _MOST_KNOWN:
         return
-    if not (complete or present == (False, False, True)):
+    if not (complete or counts == (0, 0, n)):
         return
-    layout, name = _layout(fields.frame_id, fields.joint, *present)
+    layout, words = _layout(fields.frame_id, fields.joints, *counts)
     trailing = size - len(_HEADER) - layout.size
     _known_layouts[key] = _KnownLayout(
         struct.Struct(f"<2s2x{layout.format[1:]}{trailing}x"),
-        (len(frame), frame, 1, len(name), name),
+        words,
+        3 + len(words),
+        n,
         fields.frame_id,
-        fields.joint,
+        fields.joints,
         complete,
+        (0, 0, n),
     )
 
 
-_layout_cache: dict[tuple[str, str, bool, bool, bool], tuple[struct.Struct, bytes]] = {}
+_layout_cache: dict[tuple[str, tuple[str, ...], int, int, int], tuple[struct.Struct, tuple[object, ...]]] = {}
 
 
 def _layout(
-    frame_id: str, joint: str, has_position: bool, has_velocity: bool, has_effort: bool
-) -> tuple[struct.Struct, bytes]:
-    key = (frame_id, joint, has_position, has_velocity, has_effort)
+    frame_id: str, joints: tuple[str, ...], n_position: int, n_velocity: int, n_effort: int
+) -> tuple[struct.Struct, tuple[object, ...]]:
+    """Return the layout of a message, and what stands in it between the stamp and the counts."""
+    key = (frame_id, joints, n_position, n_velocity, n_effort)
     cached = _layout_cache.get(key)
     if cached is not None:
         return cached
-    frame_length = len(frame_id.encode()) + 1
-    name_bytes = joint.encode() + b"\x00"
-    pieces = ["<iII", f"{frame_length}s"]
-    offset = 12 + frame_length
-    pieces.append(f"{-offset % 4}xII{len(name_bytes)}s")
-    offset += -offset % 4 + 8 + len(name_bytes)
+    frame = frame_id.encode() + b"\x00"
+    words: list[object] = [len(frame), frame, len(joints)]
+    pieces = ["<iII", f"{len(frame)}s"]
+    offset = 12 + len(frame)
+    pieces.append(f"{-offset % 4}xI")
+    offset += -offset % 4 + 4
+    for joint in joints:
+        name = joint.encode() + b"\x00"
+        words += [len(name), name]
+        pieces.append(f"{-offset % 4}xI{len(name)}s")
+        offset += -offset % 4 + 4 + len(name)
     pieces.append(f"{-offset % 4}x")
     offset += -offset % 4
-    for present in (has_position, has_velocity, has_effort):
+    for count in (n_position, n_velocity, n_effort):
         pieces.append("I")
         offset += 4
-        if present:
-            pieces.append(f"{-offset % 8}xd")
-            offset += -offset % 8 + 8
+        if count:
+            pieces.append(f"{-offset % 8}x{count}d")
+            offset += -offset % 8 + 8 * count
     layout = struct.Struct("".join(pieces))
     # A node sends under one or two names; a stranger's endless names must not grow the cache without bound.
     if len(_layout_cache) >= 256:
         _layout_cache.clear()
-    _layout_cache[key] = (layout, name_bytes)
-    return layout, name_bytes
+    _layout_cache[key] = layout, tuple(words)
+    return _layout_cache[key]

@@ -1,7 +1,8 @@
 """Which commands a plant believes: one gate per input, the same on simulator and hardware.
 
-A command that is not finite, not of one joint, for another joint, stale, from the future, a second answer to one
-state, or from a second commander is refused and counted; the plant acts on the newest one that passed.
+A command that is not finite, not of as many joints as the plant has, for other joints or for the same in another
+order, stale, from the future, a second answer to one state, or from a second commander is refused and counted; the
+plant acts on the newest one that passed.
 """
 
 from __future__ import annotations
@@ -11,7 +12,7 @@ from collections import Counter
 from enum import Enum
 
 from pendulum_msgs_py.contract.names import JOINT
-from pendulum_msgs_py.contract.values import NANOSECONDS, JointCommand
+from pendulum_msgs_py.contract.values import NANOSECONDS, JointCommand, written
 
 __all__ = ["COMMANDER_HOLD", "CommandGate", "Refusal"]
 
@@ -20,7 +21,11 @@ COMMANDER_HOLD = 1.0
 
 
 class Refusal(str, Enum):
-    """Why a command was not applied; the value is the key in diagnostics."""
+    """Why a command was not applied; the value is the key in diagnostics.
+
+    ``not_one_joint`` is a message that has not one value for each joint that it may speak to, ``other_joint`` one that
+    names other joints, or the same in another order.
+    """
 
     NOT_ONE_JOINT = "not_one_joint"
     OTHER_JOINT = "other_joint"
@@ -39,7 +44,8 @@ class CommandGate:
         timeout: Age beyond which a command counts for nothing [s], > 0.
         future_tolerance: How far ahead of the plant's clock a stamp may lie [s].
         single_commander: Refuse a second source while the first one is alive.
-        joint: The joint that commands must be for; an empty list of names means this one.
+        joints: The joints that commands must be for, in this order; an empty list of names means the only one.
+        partial: Whether a command may be for some of the joints, in their order; the others get nothing.
 
     Attributes:
         refused: How many were refused, by reason.
@@ -52,12 +58,14 @@ class CommandGate:
         *,
         future_tolerance: float = 0.005,
         single_commander: bool = True,
-        joint: str = JOINT,
+        joints: tuple[str, ...] = (JOINT,),
+        partial: bool = False,
     ) -> None:
         self.timeout_ns = round(timeout * NANOSECONDS)
         self.future_tolerance_ns = round(future_tolerance * NANOSECONDS)
         self.single_commander = single_commander
-        self.joint = joint
+        self.joints = joints
+        self.partial = partial and len(joints) > 1
         self.refused: Counter[Refusal] = Counter()
         self.problems: dict[Refusal, str] = {}
         self.accepted = 0
@@ -68,7 +76,7 @@ class CommandGate:
         self._expired = False
 
     def refuse_malformed(self, problem: str = "") -> Refusal:
-        """Count a message that was no command for one joint at all, and keep what was wrong with it."""
+        """Count a message that was no command for joints at all, and keep what was wrong with it."""
         self.refused[Refusal.NOT_ONE_JOINT] += 1
         self.problems[Refusal.NOT_ONE_JOINT] = problem
         return Refusal.NOT_ONE_JOINT
@@ -82,7 +90,7 @@ class CommandGate:
         """
         refusal = self._judge(command, now_ns)
         if refusal is None:
-            self._newest = command
+            self._newest = command if len(command.effort) == len(self.joints) else self._filled(command)
             self._heard_ns = now_ns
             self._expired = False
             self._holder = command.source
@@ -124,12 +132,14 @@ class CommandGate:
         self._holder = ""
 
     def _judge(self, command: JointCommand, now_ns: int) -> Refusal | None:
-        if len(command.joints) > 1:
+        joints = command.joints
+        if (joints != self.joints or not joints) and (refusal := self._judge_names(joints)) is not None:
+            return refusal
+        if len(command.effort) != (len(joints) or 1):
             return Refusal.NOT_ONE_JOINT
-        if command.joints and command.joints[0] != self.joint:
-            return Refusal.OTHER_JOINT
-        if not math.isfinite(command.effort):
-            return Refusal.NOT_FINITE
+        for effort in command.effort:
+            if not math.isfinite(effort):
+                return Refusal.NOT_FINITE
         if now_ns - command.stamp_ns > self.timeout_ns:
             return Refusal.TOO_OLD
         if command.stamp_ns - now_ns > self.future_tolerance_ns:
@@ -147,14 +157,43 @@ class CommandGate:
             return Refusal.OUT_OF_ORDER
         return None
 
+    def _judge_names(self, joints: tuple[str, ...]) -> Refusal | None:
+        if not joints and len(self.joints) == 1:
+            return None
+        if not self.partial:
+            return Refusal.OTHER_JOINT if joints and len(joints) == len(self.joints) else Refusal.NOT_ONE_JOINT
+        if not joints:
+            return Refusal.NOT_ONE_JOINT
+        # Each of them, in the plant's order, once.
+        return None if joints == tuple(name for name in self.joints if name in joints) else Refusal.OTHER_JOINT
+
+    def _filled(self, command: JointCommand) -> JointCommand:
+        given = dict(zip(command.joints, command.effort, strict=True))
+        effort = tuple(given.get(name, 0.0) for name in self.joints)
+        return command._replace(effort=effort, joints=self.joints)
+
+    def _expected_names(self) -> str:
+        if len(self.joints) == 1:
+            return f"expected [{self.joints[0]!r}] or none"
+        if not self.joints:
+            return "expected no command: no joint has a motor"
+        return f"expected {list(self.joints)}" + (", or some of them in this order" if self.partial else "")
+
+    def _names_problem(self, command: JointCommand) -> str:
+        if self._judge_names(command.joints) is None or command.joints == self.joints:
+            return f"effort has {len(command.effort)} values; expected {len(command.joints) or 1}"
+        return f"name is {list(command.joints)}; {self._expected_names()}"
+
     def _problem(self, refusal: Refusal, command: JointCommand, now_ns: int) -> str:
         age = (now_ns - command.stamp_ns) / NANOSECONDS
         newest_ns = self.newest_stamp_ns
         since = 0.0 if newest_ns is None else (command.stamp_ns - newest_ns) / NANOSECONDS
         return {
-            Refusal.NOT_ONE_JOINT: f"name is {list(command.joints)}; expected [{self.joint!r}] or none",
-            Refusal.OTHER_JOINT: f"name is {list(command.joints)}; expected [{self.joint!r}] or none",
-            Refusal.NOT_FINITE: f"effort is {command.effort} N m; expected a finite number",
+            Refusal.NOT_ONE_JOINT: self._names_problem(command),
+            Refusal.OTHER_JOINT: self._names_problem(command),
+            Refusal.NOT_FINITE: f"effort is {written(command.effort)} N m; expected a finite number"
+            if len(command.effort) == 1
+            else f"effort is {written(command.effort)}; expected finite numbers",
             Refusal.TOO_OLD: f"header.stamp is {age:.6g} s before the plant's time; expected at most "
             f"{self.timeout_ns / NANOSECONDS:g} s",
             Refusal.FROM_FUTURE: f"header.stamp is {-age:.6g} s after the plant's time; expected at most "

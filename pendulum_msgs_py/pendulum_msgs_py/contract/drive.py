@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import Enum
 from typing import NamedTuple
 
+from pendulum_msgs_py.contract.values import Vector
 from pendulum_msgs_py.errors import ParameterError
 
 __all__ = ["Drive", "DriveKind", "Input", "Mode", "PlantLimits"]
@@ -45,28 +46,28 @@ class DriveKind(str, Enum):
 
 
 class Drive(NamedTuple):
-    """One decision.
+    """One decision, for the m driven ones of n joints; the defaults are those of one joint.
 
     Attributes:
-        kind: Off (zero torque, drive released), torque, or position control.
-        effort: Torque to apply; under position control the feed-forward of the hand-over [N m].
-        position: Position to hold or follow [rad], for ``POSITION``.
-        velocity: Its velocity [rad/s].
-        controller: The controller's share of the effort, before limits [N m].
-        disturbance: The disturbance's share [N m].
-        push: Torque on the link itself [N m]; applied whatever the kind, as a hand would.
-        saturated: The sum was clamped.
+        kind: Off (zero effort, drive released), effort, or position control.
+        effort: m efforts to apply; under position control the feed-forward of the hand-over [N m or N].
+        position: m positions to hold or follow [rad or m], for ``POSITION``.
+        velocity: Their velocities.
+        controller: The controller's share of the efforts, before limits.
+        disturbance: The disturbance's share.
+        push: n efforts on the joints themselves; applied whatever the kind, as a hand would.
+        saturated: A sum was clamped.
         starved: Armed for effort, but without a fresh command of somebody who may command: zero torque.
         handover: Under position control, the share of the hand-over from effort that is still to go, 1 to 0 [-].
     """
 
     kind: DriveKind
-    effort: float = 0.0
-    position: float = 0.0
-    velocity: float = 0.0
-    controller: float = 0.0
-    disturbance: float = 0.0
-    push: float = 0.0
+    effort: Vector = (0.0,)
+    position: Vector = (0.0,)
+    velocity: Vector = (0.0,)
+    controller: Vector = (0.0,)
+    disturbance: Vector = (0.0,)
+    push: Vector = (0.0,)
     saturated: bool = False
     starved: bool = False
     handover: float = 0.0
@@ -74,15 +75,15 @@ class Drive(NamedTuple):
 
 @dataclass(frozen=True)
 class PlantLimits:
-    """Limits that a plant keeps.
+    """Limits that a plant keeps; those that are one number hold for each joint, in its own unit.
 
     Attributes:
-        effort: Largest torque, after the sum of controller and disturbance [N m].
+        effort: Largest effort of each driven joint, after the sum of controller and disturbance [N m or N].
         command_timeout: Age at which a command counts for nothing [s].
         feedback_timeout: Age of the measurement at which an armed plant faults [s].
         velocity: Speed at which an armed plant faults, and largest of a trajectory [rad/s].
-        position_min: Lower end of the position window [rad].
-        position_max: Upper end [rad].
+        position_min: Lower end of each joint's position window; ``(-inf,)`` for no window at any [rad or m].
+        position_max: Upper ends; ``(inf,)`` for none.
         slew: Largest rate of change of the torque [N m/s].
         handover_time: Time over which torque passes from position to effort control and back [s].
         tracking_error: Distance from the trajectory at which the plant faults [rad].
@@ -92,12 +93,12 @@ class PlantLimits:
         starvation: Time without a command after which a plant that is armed for effort disarms [s].
     """
 
-    effort: float
+    effort: Vector
     command_timeout: float = 0.05
     feedback_timeout: float = math.inf
     velocity: float = math.inf
-    position_min: float = -math.inf
-    position_max: float = math.inf
+    position_min: Vector = (-math.inf,)
+    position_max: Vector = (math.inf,)
     slew: float = math.inf
     handover_time: float = 0.1
     tracking_error: float = 0.3
@@ -108,8 +109,9 @@ class PlantLimits:
 
     def __post_init__(self) -> None:
         """Refuse limits that limit nothing or everything; NaN, which compares false, would do the first."""
-        if not (math.isfinite(self.effort) and self.effort > 0.0):
-            raise ParameterError(f"effort_limit is {self.effort} N m; expected a finite number > 0")
+        for effort in self.effort:
+            if not (math.isfinite(effort) and effort > 0.0):
+                raise ParameterError(f"effort_limit is {effort} N m; expected a finite number > 0")
         if not (math.isfinite(self.command_timeout) and self.command_timeout > 0.0):
             raise ParameterError(f"command_timeout is {self.command_timeout} s; expected a finite number > 0")
         for name, unit in (
@@ -130,7 +132,20 @@ class PlantLimits:
             raise ParameterError(f"handover_effort is {self.handover_effort} N m; expected > 0")
         if not self.tracking_error > 0.0:
             raise ParameterError(f"tracking_error is {self.tracking_error} rad; expected > 0")
-        if not self.position_min < self.position_max:
-            raise ParameterError(
-                f"position window is [{self.position_min}, {self.position_max}] rad; expected min < max"
-            )
+        for low, high in zip(self.position_min, self.position_max, strict=True):
+            if not low < high:
+                raise ParameterError(f"position window is [{low}, {high}] rad; expected min < max")
+
+    def for_joints(self, joints: int, driven: int) -> PlantLimits:
+        """Return the limits with one window for each of so many joints.
+
+        Raises:
+            ParameterError: They are limits for another number of joints.
+        """
+        if len(self.effort) != driven:
+            raise ParameterError(f"there are {len(self.effort)} effort limits; expected {driven}, one per driven joint")
+        if len(self.position_min) == joints:
+            return self
+        if self.position_min != (-math.inf,) or self.position_max != (math.inf,):
+            raise ParameterError(f"there are {len(self.position_min)} position windows; expected {joints}")
+        return replace(self, position_min=joints * self.position_min, position_max=joints * self.position_max)

@@ -4,17 +4,17 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from pendulum_msgs_py.contract.values import NANOSECONDS
+from pendulum_msgs_py.contract.values import NANOSECONDS, Vector
 
 __all__ = ["Handover"]
 
 
 @dataclass
 class Handover:
-    """Fade from the torque before a change of control to the one after it, and of the setpoint likewise."""
+    """Fade from the efforts before a change of control to those after it, and of the setpoint likewise."""
 
     start_ns: int
-    effort: float
+    effort: Vector
     offset: float = 0.0
     offset_time: float = 0.0
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 from pendulum_msgs_py.contract.drive import Input, PlantLimits
-from pendulum_msgs_py.contract.values import NANOSECONDS
+from pendulum_msgs_py.contract.values import NANOSECONDS, Vector
 from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.parameters import ParameterSpec
 
@@ -79,7 +79,7 @@ LIMIT_SPECS: tuple[ParameterSpec, ...] = (
         "position_window",
         [0.0, 0.0],
         "rad",
-        "Angles between which the armed plant must stay, [low, high]; equal for no window.",
+        "Angles between which the armed plant must stay, [low, high] of each joint; equal for no window.",
         read_only=True,
     ),
     ParameterSpec(
@@ -137,8 +137,9 @@ LIMIT_SPECS: tuple[ParameterSpec, ...] = (
 
 def limits_from_parameters(
     values: Mapping[str, object],
-    plant_effort_limit: float,
+    plant_effort_limits: Vector,
     *,
+    joints: int = 1,
     feedback_timeout: float = float("inf"),
     least_command_timeout: float = 0.0,
 ) -> PlantLimits:
@@ -146,7 +147,9 @@ def limits_from_parameters(
 
     Args:
         values: Parameter values by name.
-        plant_effort_limit: Effort limit of the plant file [N m]; the parameter can only lower it.
+        plant_effort_limits: Effort limit of each driven joint in the plant file [N m or N]; the parameter can only
+            lower them.
+        joints: How many joints the plant has.
         feedback_timeout: Age of a measurement that faults an armed plant [s].
         least_command_timeout: The shortest that the plant's own period allows; a shorter one is raised to it [s].
 
@@ -161,22 +164,27 @@ def limits_from_parameters(
 
     window = values["position_window"]
     assert isinstance(window, list)
-    if len(window) != 2:
-        raise ParameterError(f"position_window has {len(window)} values; expected [low, high] in rad")
-    if number("effort_limit") > plant_effort_limit:
+    if len(window) != 2 * joints and window != [0.0, 0.0]:
+        expected = "[low, high] in rad" if joints == 1 else f"{2 * joints}, low and high of each joint"
+        raise ParameterError(f"position_window has {len(window)} values; expected {expected}")
+    largest = max(plant_effort_limits, default=0.0)
+    wanted = number("effort_limit")
+    if wanted > largest:
         raise ParameterError(
-            f"effort_limit is {number('effort_limit')} N m; expected at most {plant_effort_limit} N m, "
-            "the limit of the plant file"
+            f"effort_limit is {wanted} N m; expected at most {largest} N m, the limit of the plant file"
         )
     unlimited = float("inf")
-    bounded = window[0] != window[1]
+    ends = [
+        (low, high) if low != high else (-unlimited, unlimited)
+        for low, high in zip(window[::2], window[1::2], strict=True)
+    ]
     return PlantLimits(
-        effort=number("effort_limit") or plant_effort_limit,
+        effort=tuple(min(wanted, limit) if wanted else limit for limit in plant_effort_limits),
         command_timeout=max(number("command_timeout"), least_command_timeout),
         feedback_timeout=feedback_timeout,
         velocity=number("velocity_limit") or unlimited,
-        position_min=window[0] if bounded else -unlimited,
-        position_max=window[1] if bounded else unlimited,
+        position_min=tuple(low for low, _ in ends),
+        position_max=tuple(high for _, high in ends),
         slew=number("effort_slew_limit") or unlimited,
         handover_time=number("handover_time"),
         tracking_error=number("tracking_error_limit"),

@@ -8,7 +8,8 @@ from collections.abc import Callable
 from pendulum_msgs_py.contract.commands import Refusal
 from pendulum_msgs_py.contract.supervisor import Drive, Input, Mode, PlantLimits, PlantSupervisor
 from pendulum_msgs_py.contract.trajectory import Trajectory
-from pendulum_msgs_py.contract.values import JointCommand, JointSample
+from pendulum_msgs_py.contract.values import JointCommand, JointSample, Vector
+from pendulum_msgs_py.joints import ONE_JOINT, Coordinates
 
 __all__ = ["SharedSupervisor"]
 
@@ -21,6 +22,8 @@ class SharedSupervisor(PlantSupervisor):
         prepare: Makes the plant ready to be armed, such as the drive's strategy set and confirmed; returns why it could
             not, or an empty string. Called outside the lock, because it may wait for another thread.
         withdraw: Called where the plant was prepared but then not armed.
+        coordinates: The plant's joints, and which of them are driven.
+        follows: Whether the plant can follow trajectories.
     """
 
     def __init__(
@@ -28,12 +31,15 @@ class SharedSupervisor(PlantSupervisor):
         limits: PlantLimits,
         prepare: Callable[[], str] = lambda: "",
         withdraw: Callable[[], None] = lambda: None,
+        *,
+        coordinates: Coordinates = ONE_JOINT,
+        follows: bool = True,
     ) -> None:
         self._lock = threading.RLock()
         self._prepare = prepare
         self._withdraw = withdraw
         self._not_prepared = ""
-        super().__init__(limits, preflight=lambda: self._not_prepared)
+        super().__init__(limits, preflight=lambda: self._not_prepared, coordinates=coordinates, follows=follows)
 
     def offer(self, kind: Input, command: JointCommand | None, now_ns: int, problem: str = "") -> Refusal | None:
         """Offer a message of an input."""
@@ -48,7 +54,7 @@ class SharedSupervisor(PlantSupervisor):
     def accept_trajectory(self, trajectory: Trajectory, now_ns: int, sample: JointSample) -> str:
         """Start to follow a trajectory."""
         # Points are made here, where nobody waits: under the lock they would keep the actuator and the e-stop.
-        trajectory = trajectory.from_position(sample.position, self.limits.tracking_error)
+        trajectory = trajectory.from_position(sample.position[0], self.limits.tracking_error)
         with self._lock:
             return super().accept_trajectory(trajectory, now_ns, sample)
 
@@ -91,7 +97,7 @@ class SharedSupervisor(PlantSupervisor):
         with self._lock:
             return super().decide(now_ns, sample)
 
-    def report_applied(self, effort: float) -> None:
-        """Tell what torque was really applied."""
+    def report_applied(self, effort: Vector) -> None:
+        """Tell what efforts were really applied."""
         with self._lock:
             super().report_applied(effort)

@@ -14,12 +14,14 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from operator import add
 
 from pendulum_msgs_py.contract.commands import COMMANDER_HOLD, CommandGate, Refusal
 from pendulum_msgs_py.contract.drive import Drive, DriveKind, Input, Mode, PlantLimits
 from pendulum_msgs_py.contract.handover import Handover
 from pendulum_msgs_py.contract.trajectory import MAX_RAMP_VELOCITY, Trajectory
-from pendulum_msgs_py.contract.values import NANOSECONDS, JointCommand, JointSample
+from pendulum_msgs_py.contract.values import NANOSECONDS, JointCommand, JointSample, Vector, written
+from pendulum_msgs_py.joints import ONE_JOINT, Coordinates, Joint
 
 __all__ = ["PUSH_LIMIT_FACTOR", "Drive", "DriveKind", "Input", "Mode", "PlantLimits", "PlantSupervisor"]
 
@@ -38,10 +40,17 @@ class PlantSupervisor:
     Args:
         limits: The limits to keep.
         preflight: Called on arming; returns why the plant is not ready, or an empty string.
+        coordinates: The plant's joints, and which of them are driven.
+        follows: Whether the plant can follow trajectories; one of several joints cannot.
+
+    Raises:
+        ParameterError: The limits are for another number of joints.
     """
 
     limits: PlantLimits
     preflight: Callable[[], str] = lambda: ""
+    coordinates: Coordinates = ONE_JOINT
+    follows: bool = True
     mode: Mode = Mode.DISARMED
     reason: str = "not armed yet"
     starved_periods: int = 0
@@ -50,8 +59,25 @@ class PlantSupervisor:
 
     def __post_init__(self) -> None:
         """Make one gate per input."""
+        joints, driven = self.coordinates.names, self.coordinates.driven_names
+        self.limits = self.limits.for_joints(len(joints), len(driven))
+        self.follows = self.follows and len(joints) == 1
         timeout = self.limits.command_timeout
-        self.gates = {kind: CommandGate(timeout) for kind in Input}
+        self.gates = {
+            Input.EFFORT_COMMAND: CommandGate(timeout, joints=driven),
+            Input.DISTURBANCE: CommandGate(timeout, joints=driven, partial=True),
+            Input.PUSH: CommandGate(timeout, joints=joints, partial=True),
+        }
+        self._joints = len(joints)
+        self._nothing = (0.0,) * len(driven)
+        self._no_push = (0.0,) * len(joints)
+        # A passive joint takes a push of the size that the strongest motor could give.
+        largest = max(self.limits.effort, default=1.0)
+        self._push_limits = tuple(
+            PUSH_LIMIT_FACTOR * (self.limits.effort[self.coordinates.driven.index(i)] if i in self.coordinates.driven
+                                 else largest)
+            for i in range(len(joints))
+        )  # fmt: skip
         # By name as well: enum hashes its members in Python, which a lookup would pay for at each decision.
         self._commands = self.gates[Input.EFFORT_COMMAND]
         self._disturbances = self.gates[Input.DISTURBANCE]
@@ -60,8 +86,8 @@ class PlantSupervisor:
         self._trajectory: Trajectory | None = None
         self._trajectory_start_ns = 0
         self._handover: Handover | None = None
-        self._applied = 0.0
-        self._last_effort = 0.0
+        self._applied = self._nothing
+        self._last_effort = self._nothing
         self._last_decision_ns: int | None = None
         self._last_time_ns: int | None = None
         self._hold_position: float | None = None
@@ -71,7 +97,7 @@ class PlantSupervisor:
     # --- messages ------------------------------------------------------------------------------------------
 
     def offer(self, kind: Input, command: JointCommand | None, now_ns: int, problem: str = "") -> Refusal | None:
-        """Offer a message of an input; None stands for no command of one joint, with its problem."""
+        """Offer a message of an input; None stands for no command at all, with its problem."""
         gate = self.gates[kind]
         return gate.refuse_malformed(problem) if command is None else gate.offer(command, now_ns)
 
@@ -86,16 +112,19 @@ class PlantSupervisor:
     def accept_trajectory(self, trajectory: Trajectory, now_ns: int, sample: JointSample) -> str:
         """Start to follow a trajectory; return why it is refused, or an empty string."""
         limits = self.limits
+        if not self.follows:
+            return f"{self.no_trajectories}; expected effort_command"
         if not self.mode.armed:
             return f"plant is {self.mode.value}; expected it armed before a trajectory"
         fault = self._measurement_fault(now_ns, sample)
         if fault:
             return fault
-        trajectory = trajectory.from_position(sample.position, limits.tracking_error)
-        gap = trajectory.start - sample.position
+        (place,) = sample.position
+        trajectory = trajectory.from_position(place, limits.tracking_error)
+        gap = trajectory.start - place
         if abs(gap) > limits.tracking_error:
             return (
-                f"trajectory starts at {trajectory.start:.4f} rad, the pendulum is at {sample.position:.4f} rad; "
+                f"trajectory starts at {trajectory.start:.4f} rad, the pendulum is at {place:.4f} rad; "
                 f"expected at most {limits.tracking_error} rad between them"
             )
         # The gap is closed while the trajectory already runs, no faster than a ramp would.
@@ -105,10 +134,11 @@ class PlantSupervisor:
             speed += abs(gap) / offset_time
         if speed > limits.velocity:
             return f"trajectory asks for {speed:.3f} rad/s; expected at most {limits.velocity} rad/s"
-        if trajectory.lowest < limits.position_min or trajectory.highest > limits.position_max:
+        low, high = limits.position_min[0], limits.position_max[0]
+        if trajectory.lowest < low or trajectory.highest > high:
             return (
                 f"trajectory covers {trajectory.lowest:.3f} to {trajectory.highest:.3f} rad; expected it inside "
-                f"{limits.position_min} to {limits.position_max} rad"
+                f"{low} to {high} rad"
             )
         self._keep_pace(now_ns)
         self._trajectory = trajectory
@@ -131,7 +161,7 @@ class PlantSupervisor:
             gate.reset()
         self._handover = None
         self._trajectory = None
-        self._applied = self._last_effort = 0.0
+        self._applied = self._last_effort = self._nothing
         self._last_decision_ns = self._commanded_ns = now_ns
         self._commanding = None
         self._enter(Mode.EFFORT, "armed", now_ns)
@@ -169,30 +199,37 @@ class PlantSupervisor:
         """
         self._keep_pace(now_ns)
         push_command = self._pushes.fresh(now_ns)
-        push_limit = PUSH_LIMIT_FACTOR * self.limits.effort
-        push = min(push_limit, max(-push_limit, push_command.effort)) if push_command else 0.0
+        push = _clamp(push_command.effort, self._push_limits) if push_command else self._no_push
         if self.mode.armed:
             fault = self._measurement_fault(now_ns, sample)
             if fault:
                 self.fault(fault, now_ns)
         if not self.mode.armed or sample is None:
-            self._last_effort = 0.0
+            self._last_effort = self._nothing
             self._last_decision_ns = now_ns
-            return Drive(DriveKind.OFF, push=push)
+            return self._off(push)
         if self.mode is Mode.POSITION:
             drive = self._decide_position(now_ns, sample, push)
             if drive is not None:
                 return drive
         return self._decide_effort(now_ns, push)
 
-    def report_applied(self, effort: float) -> None:
-        """Tell what torque the plant really applied, so that the next hand-over starts from there [N m]."""
-        self._applied = self._clamp(effort)
+    def report_applied(self, effort: Vector) -> None:
+        """Tell what efforts the plant really applied, so that the next hand-over starts from there [N m or N]."""
+        self._applied = _clamp(effort, self.limits.effort)
 
     @property
     def trajectory_finished(self) -> bool:
         """Whether position control holds the goal of a finished trajectory."""
         return self.mode is Mode.POSITION and self._hold_position is not None
+
+    @property
+    def no_trajectories(self) -> str:
+        """Why the plant follows no trajectory, or an empty string."""
+        if self.follows:
+            return ""
+        names = self.coordinates.names
+        return f"plant has {', '.join(names)} and follows no trajectory; one that does has one joint alone"
 
     # --- inside --------------------------------------------------------------------------------------------
 
@@ -211,7 +248,7 @@ class PlantSupervisor:
             if self._handover is not None:
                 self._handover.start_ns += lost
 
-    def _decide_position(self, now_ns: int, sample: JointSample, push: float) -> Drive | None:
+    def _decide_position(self, now_ns: int, sample: JointSample, push: Vector) -> Drive | None:
         trajectory = self._trajectory
         assert trajectory is not None
         elapsed = (now_ns - self._trajectory_start_ns) / NANOSECONDS
@@ -221,13 +258,13 @@ class PlantSupervisor:
         offset = handover.remaining_offset(now_ns) if handover else 0.0
         position += offset
         # Negated, so that a setpoint that is not a number is a fault too.
-        if not abs(sample.position - position) <= self.limits.tracking_error:
+        if not abs(sample.position[0] - position) <= self.limits.tracking_error:
             self.fault(
-                f"pendulum is at {sample.position:.3f} rad, the trajectory at {position:.3f} rad; "
+                f"pendulum is at {sample.position[0]:.3f} rad, the trajectory at {position:.3f} rad; "
                 f"expected at most {self.limits.tracking_error} rad between them",
                 now_ns,
             )
-            return Drive(DriveKind.OFF, push=push)
+            return self._off(push)
         if elapsed >= trajectory.duration and offset == 0.0:
             if self._hold_position is None:
                 self._hold_position = trajectory.goal
@@ -236,11 +273,11 @@ class PlantSupervisor:
             end_ns = self._trajectory_start_ns + round(trajectory.duration * NANOSECONDS)
             if command is not None and command.stamp_ns >= end_ns and not self.commander_conflict:
                 # What it asks for, not what the limit leaves of it: with a low limit all would look near.
-                jump = abs(command.effort - self._applied)
+                jump = abs(command.effort[0] - self._applied[0])
                 if not jump <= self.limits.handover_effort:
                     # A controller for another place: awake at the bottom, one for upright asks for all it has.
                     self.reason = (
-                        f"holding: {command.source or 'a controller'} asks for {command.effort:.2f} N m, "
+                        f"holding: {command.source or 'a controller'} asks for {command.effort[0]:.2f} N m, "
                         f"{jump:.2f} N m from what holds; expected at most {self.limits.handover_effort} N m"
                     )
                     return self._hold(handover, remaining, position, velocity, push)
@@ -254,13 +291,16 @@ class PlantSupervisor:
         return self._hold(handover, remaining, position, velocity, push)
 
     def _hold(
-        self, handover: Handover | None, remaining: float, position: float, velocity: float, push: float
+        self, handover: Handover | None, remaining: float, position: float, velocity: float, push: Vector
     ) -> Drive:
-        effort = handover.effort * remaining if handover else 0.0
-        effort = self._clamp(effort)
-        return Drive(DriveKind.POSITION, effort, position, velocity, push=push, handover=remaining)
+        effort = (handover.effort[0] * remaining,) if handover else self._nothing
+        effort = _clamp(effort, self.limits.effort)
+        return Drive(DriveKind.POSITION, effort, (position,), (velocity,), push=push, handover=remaining)
 
-    def _decide_effort(self, now_ns: int, push: float) -> Drive:
+    def _off(self, push: Vector) -> Drive:
+        return Drive(DriveKind.OFF, self._nothing, self._nothing, self._nothing, self._nothing, self._nothing, push)
+
+    def _decide_effort(self, now_ns: int, push: Vector) -> Drive:
         command = None if self.commander_conflict else self._commands.fresh(now_ns)
         refusal = self.commander_conflict or "no fresh command: zero torque"
         if command is not None:
@@ -269,13 +309,16 @@ class PlantSupervisor:
             return self._starve(refusal, now_ns, push)
         self._commanding, self._commanded_ns = command.source, now_ns
         disturbance_command = self._disturbances.fresh(now_ns)
-        disturbance = disturbance_command.effort if disturbance_command else 0.0
-        wanted = self._clamp(command.effort + disturbance)
-        saturated = wanted != command.effort + disturbance
+        limits = self.limits.effort
+        disturbance = disturbance_command.effort if disturbance_command else self._nothing
+        total = tuple(map(add, command.effort, disturbance))
+        wanted = _clamp(total, limits)
+        saturated = wanted is not total
         effort = wanted
         if self._handover is not None:
             remaining = self._handover.remaining(now_ns, self.limits.handover_time)
-            effort = self._clamp(remaining * self._handover.effort + (1.0 - remaining) * wanted)
+            faded = (remaining * h + (1.0 - remaining) * w for h, w in zip(self._handover.effort, wanted, strict=True))
+            effort = _clamp(tuple(faded), limits)
             if remaining == 0.0:
                 self._handover = None
         effort = self._limit_slew(effort, now_ns)
@@ -285,53 +328,57 @@ class PlantSupervisor:
         self.reason = f"commanded by {command.source or 'an unnamed node'}"
         return Drive(
             DriveKind.EFFORT,
-            effort=effort,
-            controller=command.effort,
-            disturbance=disturbance,
-            push=push,
-            saturated=saturated,
+            effort,
+            self._nothing,
+            self._nothing,
+            command.effort,
+            disturbance,
+            push,
+            saturated,
         )
 
     def _begin_refusal(self, command: JointCommand, now_ns: int) -> str:
         """Return why a commander may not begin, or an empty string; one that commands already may ask for anything."""
         lapsed = now_ns - self._commanded_ns > COMMANDER_HOLD * NANOSECONDS
         begun = self._commanding == command.source and not lapsed
-        if begun or abs(command.effort) <= self.limits.start_effort:
+        if begun or _largest(command.effort) <= self.limits.start_effort:
             return ""
         return (
-            f"zero torque: {command.source or 'a controller'} asks for {command.effort:.2f} N m; "
+            f"zero torque: {command.source or 'a controller'} asks for {written(command.effort, '.2f')} N m; "
             f"expected at most {self.limits.start_effort} N m to begin"
         )
 
-    def _starve(self, reason: str, now_ns: int, push: float) -> Drive:
+    def _starve(self, reason: str, now_ns: int, push: Vector) -> Drive:
         silence = (now_ns - self._commanded_ns) / NANOSECONDS
         if silence > self.limits.starvation:
             self.disarm(now_ns, f"disarmed: no command for {silence:.1f} s ({reason})")
-            return Drive(DriveKind.OFF, push=push)
+            return self._off(push)
         self.starved_periods += 1
         self._handover = None
-        self._last_effort = 0.0
+        self._last_effort = self._nothing
         self._last_decision_ns = now_ns
         self.reason = reason
-        return Drive(DriveKind.EFFORT, push=push, starved=True)
+        return self._off(push)._replace(kind=DriveKind.EFFORT, starved=True)
 
-    def _limit_slew(self, effort: float, now_ns: int) -> float:
+    def _limit_slew(self, effort: Vector, now_ns: int) -> Vector:
         if math.isinf(self.limits.slew) or self._last_decision_ns is None:
             return effort
         step = self.limits.slew * max(0, now_ns - self._last_decision_ns) / NANOSECONDS
-        return min(self._last_effort + step, max(self._last_effort - step, effort))
-
-    def _clamp(self, effort: float) -> float:
-        if math.isnan(effort):
-            return 0.0
-        return min(self.limits.effort, max(-self.limits.effort, effort))
+        return tuple(
+            min(last + step, max(last - step, wanted)) for last, wanted in zip(self._last_effort, effort, strict=True)
+        )
 
     def _measurement_fault(self, now_ns: int, sample: JointSample | None) -> str:
         limits = self.limits
         if sample is None:
             return "no measurement"
+        if not len(sample.position) == len(sample.velocity) == len(sample.effort) == self._joints:
+            return f"measurement has {len(sample.position)} joints; expected {self._joints}"
         if not sample.is_finite():
-            return f"measurement is not finite: {sample.position} rad, {sample.velocity} rad/s, {sample.effort} N m"
+            return (
+                f"measurement is not finite: {written(sample.position)} rad, {written(sample.velocity)} rad/s, "
+                f"{written(sample.effort)} N m"
+            )
         age = (now_ns - sample.stamp_ns) / NANOSECONDS
         if age < -limits.feedback_timeout:
             # It would look fresh for as long, even if no other ever came.
@@ -341,14 +388,33 @@ class PlantSupervisor:
                 f"measurement is {age * 1e3:.0f} ms old; expected at most {limits.feedback_timeout * 1e3:.0f} ms: "
                 "is the machine too busy, or the link to the actuator lost?"
             )
-        if not limits.position_min <= sample.position <= limits.position_max:
-            return (
-                f"position is {sample.position:.3f} rad; expected inside {limits.position_min} to "
-                f"{limits.position_max} rad"
-            )
-        if abs(sample.velocity) > limits.velocity:
-            return f"velocity is {sample.velocity:.3f} rad/s; expected at most {limits.velocity} rad/s"
+        _, positions, velocities, _ = sample
+        # As many as there are joints: seen above, so that each look at them may be the fastest there is.
+        for low, position, high in zip(limits.position_min, positions, limits.position_max):  # noqa: B905
+            if not low <= position <= high:
+                return self._outside(sample)
+        fastest = limits.velocity
+        for velocity in velocities:
+            if not -fastest <= velocity <= fastest:
+                return self._too_fast(sample)
         return ""
+
+    def _outside(self, sample: JointSample) -> str:
+        limits = self.limits
+        joints = zip(self.coordinates.joints, limits.position_min, sample.position, limits.position_max, strict=True)
+        joint, low, position, high = next(each for each in joints if not each[1] <= each[2] <= each[3])
+        return f"position{self._of(joint)} is {position:.3f} {joint.unit}; expected inside {low} to {high} {joint.unit}"
+
+    def _too_fast(self, sample: JointSample) -> str:
+        limit = self.limits.velocity
+        joint, velocity = next(
+            each for each in zip(self.coordinates.joints, sample.velocity, strict=True) if abs(each[1]) > limit
+        )
+        unit = joint.velocity_unit
+        return f"velocity{self._of(joint)} is {velocity:.3f} {unit}; expected at most {limit} {unit}"
+
+    def _of(self, joint: Joint) -> str:
+        return f" of {joint.name}" if len(self.coordinates.joints) > 1 else ""
 
     def _arm_refusal(self, now_ns: int, sample: JointSample | None) -> str:
         if self.mode is Mode.E_STOP:
@@ -361,18 +427,22 @@ class PlantSupervisor:
         if fault:
             return fault
         command = self._commands.fresh(now_ns)
-        if command is not None and abs(command.effort) > self.limits.arm_effort:
+        if command is not None and _largest(command.effort) > self.limits.arm_effort:
             return (
-                f"{command.source or 'a controller'} already commands {command.effort:.3f} N m; "
-                f"expected at most {self.limits.arm_effort} N m while arming: deactivate the controller, arm, bring "
-                "the pendulum with a joint_trajectory to where the controller balances, then activate it"
+                f"{command.source or 'a controller'} already commands {written(command.effort, '.3f')} N m; "
+                f"expected at most {self.limits.arm_effort} N m while arming: deactivate the controller, arm, "
+                + (
+                    "bring the pendulum with a joint_trajectory to where the controller balances, then activate it"
+                    if self.follows
+                    else "bring the plant to where the controller balances, then activate it"
+                )
             )
         return self.preflight()
 
     def _release(self, mode: Mode, reason: str, now_ns: int) -> None:
         self._trajectory = None
         self._handover = None
-        self._applied = self._last_effort = 0.0
+        self._applied = self._last_effort = self._nothing
         self._enter(mode, reason, now_ns)
 
     def _enter(self, mode: Mode, reason: str, now_ns: int) -> None:
@@ -382,3 +452,20 @@ class PlantSupervisor:
             del self.transitions[:-_KEPT_TRANSITIONS]
         self.mode = mode
         self.reason = reason
+
+
+def _largest(values: Vector) -> float:
+    return max(map(abs, values), default=0.0)
+
+
+def _clamp(values: Vector, limits: Vector) -> Vector:
+    """Return values within limits either way, nothing for what is no number; the very same tuple where all are."""
+    for value, limit in zip(values, limits):  # noqa: B905  # a third faster, and the rare case below compares lengths
+        if not -limit <= value <= limit:
+            break
+    else:
+        return values
+    return tuple(
+        0.0 if math.isnan(value) else min(limit, max(-limit, value))
+        for value, limit in zip(values, limits, strict=True)
+    )

@@ -1,47 +1,75 @@
-"""Typed values that travel between plant, controller and recorder."""
+"""Typed values that travel between plant, controller and recorder: tuples in the order of the joints, also for one."""
 
 from __future__ import annotations
 
 import math
 from typing import NamedTuple
 
-__all__ = ["NANOSECONDS", "JointCommand", "JointSample"]
+__all__ = ["NANOSECONDS", "JointCommand", "JointSample", "Vector", "written"]
 
 NANOSECONDS = 1_000_000_000
 """Nanoseconds in a second; stamps are integers of nanoseconds so that no time is ever rounded."""
 
+Vector = tuple[float, ...]
+"""One number per joint, in the order of the model."""
+
 
 class JointSample(NamedTuple):
-    """State of the joint at one instant.
+    """State of all n joints at one instant.
 
     Attributes:
         stamp_ns: Time of the measurement [ns].
-        position: theta, 0 hanging down, pi upright [rad].
-        velocity: theta' [rad/s].
-        effort: Measured joint torque [N m].
+        position: n positions; of the pendulum theta, 0 hanging down, pi upright [rad or m].
+        velocity: n velocities [rad/s or m/s].
+        effort: n measured efforts [N m or N].
     """
 
     stamp_ns: int
-    position: float
-    velocity: float
-    effort: float = 0.0
+    position: Vector
+    velocity: Vector
+    effort: Vector
+
+    @classmethod
+    def of_one(cls, stamp_ns: int, position: float, velocity: float, effort: float = 0.0) -> JointSample:
+        """Return the state of a plant of one joint."""
+        return cls(stamp_ns, (position,), (velocity,), (effort,))
 
     def is_finite(self) -> bool:
-        """Tell whether position, velocity and effort are all finite numbers."""
-        return math.isfinite(self.position) and math.isfinite(self.velocity) and math.isfinite(self.effort)
+        """Tell whether positions, velocities and efforts are all finite numbers."""
+        finite = math.isfinite
+        for value in self.position + self.velocity + self.effort:  # noqa: SIM110  # twice as fast as all()
+            if not finite(value):
+                return False
+        return True
 
 
 class JointCommand(NamedTuple):
-    """Torque asked for, in answer to one state.
+    """Efforts asked for, in answer to one state.
 
     Attributes:
         stamp_ns: Stamp of the state that this command answers [ns].
-        effort: Torque [N m].
+        effort: One effort for each joint that it names [N m or N].
         source: Who commands (``header.frame_id``).
         joints: Joint names that the message carried; empty means "the only joint".
     """
 
     stamp_ns: int
-    effort: float
+    effort: Vector
     source: str = ""
     joints: tuple[str, ...] = ()
+
+    @classmethod
+    def of_one(cls, stamp_ns: int, effort: float, source: str = "", joints: tuple[str, ...] = ()) -> JointCommand:
+        """Return a command for one joint."""
+        return cls(stamp_ns, (effort,), source, joints)
+
+
+def written(values: Vector, digits: str = "") -> str:
+    """Return numbers as a message has them: one alone, several in brackets.
+
+    Args:
+        values: The numbers.
+        digits: Format of each, such as ``.3f``; empty for all digits.
+    """
+    texts = [format(value, digits) if digits else str(value) for value in values]
+    return texts[0] if len(texts) == 1 else f"[{', '.join(texts)}]"

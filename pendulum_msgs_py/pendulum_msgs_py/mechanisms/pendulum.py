@@ -10,10 +10,8 @@ from __future__ import annotations
 import math
 from typing import Any
 
-from pendulum_msgs_py.contract.angles import UPRIGHT
-from pendulum_msgs_py.contract.names import JOINT
 from pendulum_msgs_py.dynamics.rigid import rigid_acceleration, rigid_energy
-from pendulum_msgs_py.joints import Joint
+from pendulum_msgs_py.joints import ONE_JOINT
 from pendulum_msgs_py.mechanisms.mechanism import STANDARD_GRAVITY, Body, Mechanism, Point, positive
 from pendulum_msgs_py.parameters import ParameterSpec
 
@@ -65,7 +63,7 @@ def bodies(p: Any) -> tuple[Body, ...]:
 PENDULUM = Mechanism(
     name="pendulum",
     title="One link on a driven hinge.",
-    joints=(Joint(JOINT, goal=UPRIGHT),),
+    joints=ONE_JOINT.joints,
     parameters=(
         positive("inertia", 0.055, "kg m^2", "Inertia about the joint, M."),
         ParameterSpec("gravity", 1.678, "N m", "Gravity coefficient, G = m g l; 0 lies flat.", minimum=0.0),

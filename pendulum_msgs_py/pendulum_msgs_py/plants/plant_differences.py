@@ -5,10 +5,13 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import asdict, dataclass, fields
 from typing import Any
 
 from pendulum_msgs_py.errors import ParameterError
+from pendulum_msgs_py.mechanisms import MECHANISMS
+from pendulum_msgs_py.plants.joint_parameters import Actuator, JointParameters, actuator_specs, joint_specs
+from pendulum_msgs_py.plants.mechanism_parameters import MechanismParameters
 from pendulum_msgs_py.plants.plant_parameters import (
     DRIVETRAIN_SPECS,
     PLANT_SPECS,
@@ -18,10 +21,12 @@ from pendulum_msgs_py.plants.plant_parameters import (
 
 __all__ = [
     "PLANT_PARAMETERS",
+    "AnyPlant",
     "PlantDifference",
     "describe_plants",
     "plant_differences",
     "plant_mismatch",
+    "read_pendulums",
     "read_plants",
 ]
 
@@ -56,12 +61,17 @@ class PlantDifference:
         return f"{self.name} {first}, runs {second}{unit}"
 
 
-def plant_differences(designed: PlantParameters, running: PlantParameters) -> tuple[PlantDifference, ...]:
+AnyPlant = PlantParameters | MechanismParameters
+
+
+def plant_differences(designed: AnyPlant, running: AnyPlant) -> tuple[PlantDifference, ...]:
     """Return the parameters in which two plants differ, in the order of the plant file.
 
     Values within 0.1 % of each other count as the same. Of a rigid plant and a series-elastic one the link is compared,
     and the drivetrain named once.
     """
+    if not (isinstance(designed, PlantParameters) and isinstance(running, PlantParameters)):
+        return _joint_differences(designed, running)
     found = [
         PlantDifference(spec.name, *values, spec.unit)
         for spec in PLANT_SPECS
@@ -80,7 +90,45 @@ def plant_differences(designed: PlantParameters, running: PlantParameters) -> tu
     return tuple(found)
 
 
-def plant_mismatch(designed: PlantParameters, running: Sequence[PlantParameters]) -> str:
+def _joint_differences(designed: AnyPlant, running: AnyPlant) -> tuple[PlantDifference, ...]:
+    first, second = (
+        plant.mechanism.name if isinstance(plant, MechanismParameters) else "pendulum" for plant in (designed, running)
+    )
+    if first != second or not (isinstance(designed, MechanismParameters) and isinstance(running, MechanismParameters)):
+        return (PlantDifference("model", first, second, ""),)
+    found = []
+    units, values, others = _units(designed), _values(designed), _values(running)
+    for name in {**values, **others}:
+        mine, theirs = values.get(name), others.get(name)
+        if mine is None or theirs is None:
+            first, second = ("none" if value is None else f"{value:.6g}" for value in (mine, theirs))
+            found.append(PlantDifference(name, first, second, ""))
+        elif _differ(mine, theirs):
+            found.append(PlantDifference(name, mine, theirs, units[name]))
+    return tuple(found)
+
+
+def _values(plant: MechanismParameters) -> dict[str, float]:
+    """Return all numbers of a plant by the names that its plant file gives them."""
+    names = [spec.name for spec in plant.mechanism.parameters]
+    values = dict(zip(names, plant.values, strict=True))
+    for joint, own in zip(plant.mechanism.joints, plant.joints, strict=True):
+        for part, specs in ((own, joint_specs(joint)), (own.actuator, actuator_specs(joint))):
+            for spec in specs:
+                value = getattr(part, spec.name, None)
+                if value is not None:
+                    values[f"{joint.name}.{spec.name}"] = value
+    return values
+
+
+def _units(plant: MechanismParameters) -> dict[str, str]:
+    units = {spec.name: spec.unit for spec in plant.mechanism.parameters}
+    for joint in plant.mechanism.joints:
+        units.update({f"{joint.name}.{spec.name}": spec.unit for spec in (*joint_specs(joint), *actuator_specs(joint))})
+    return units
+
+
+def plant_mismatch(designed: AnyPlant, running: Sequence[AnyPlant]) -> str:
     """Return in words how the plant that runs is not the one designed for, or nothing where it is.
 
     Args:
@@ -100,12 +148,12 @@ def plant_mismatch(designed: PlantParameters, running: Sequence[PlantParameters]
     )
 
 
-def describe_plants(plants: Sequence[PlantParameters]) -> str:
+def describe_plants(plants: Sequence[AnyPlant]) -> str:
     """Return what a plant says that it is, one description or several, as text for its diagnostics."""
     return json.dumps([_as_mapping(plant) for plant in plants], separators=(",", ":"))
 
 
-def read_plants(text: str) -> tuple[PlantParameters, ...]:
+def read_plants(text: str) -> tuple[AnyPlant, ...]:
     """Return the plants of a text that :func:`describe_plants` wrote.
 
     Raises:
@@ -113,11 +161,27 @@ def read_plants(text: str) -> tuple[PlantParameters, ...]:
     """
     try:
         return tuple(_from_mapping(entry) for entry in json.loads(text))
-    except (ValueError, TypeError, AttributeError, RecursionError) as error:
+    except (ValueError, TypeError, AttributeError, KeyError, RecursionError) as error:
         raise ParameterError(f"{PLANT_PARAMETERS} is no description of plants: {error}") from error
 
 
-def _as_mapping(plant: PlantParameters) -> dict[str, Any]:
+def read_pendulums(text: str) -> tuple[PlantParameters, ...]:
+    """Return the plants of a text, all of one joint.
+
+    Raises:
+        ParameterError: As :func:`read_plants`; or one is of several joints.
+    """
+    plants = read_plants(text)
+    several = [plant.name for plant in plants if not isinstance(plant, PlantParameters)]
+    if several:
+        raise ParameterError(f"plant {several[0]!r} has several joints; expected a plant of one joint")
+    return tuple(plant for plant in plants if isinstance(plant, PlantParameters))
+
+
+def _as_mapping(plant: AnyPlant) -> dict[str, Any]:
+    if isinstance(plant, MechanismParameters):
+        joints = [asdict(joint) for joint in plant.joints]
+        return {"name": plant.name, "model": plant.mechanism.name, "values": list(plant.values), "joints": joints}
     drive = plant.drivetrain
     values: dict[str, Any] = {"name": plant.name, **{spec.name: getattr(plant, spec.name) for spec in PLANT_SPECS}}
     if drive is not None:
@@ -125,7 +189,14 @@ def _as_mapping(plant: PlantParameters) -> dict[str, Any]:
     return values
 
 
-def _from_mapping(entry: Any) -> PlantParameters:
+def _from_mapping(entry: Any) -> AnyPlant:
+    if "model" in entry:
+        joints = []
+        for joint in entry["joints"]:
+            drive = joint.get("actuator")
+            joints.append(JointParameters(**{**joint, "actuator": None if drive is None else Actuator(**drive)}))
+        values = tuple(float(value) for value in entry["values"])
+        return MechanismParameters(MECHANISMS[entry["model"]], values, tuple(joints), str(entry.get("name", "unnamed")))
     drive = entry.get("drivetrain")
     built = None if drive is None else SeriesElasticParameters(**drive)
     return PlantParameters(**{**entry, "drivetrain": built, "name": str(entry.get("name", "unnamed"))})

@@ -17,10 +17,12 @@ from pendulum_msgs_py.contract.cdr import decode_joint_state
 from pendulum_msgs_py.contract.names import JOINT
 from pendulum_msgs_py.contract.trajectory import Trajectory
 from pendulum_msgs_py.contract.values import NANOSECONDS, JointCommand, JointSample
+from pendulum_msgs_py.joints import ONE_JOINT
 
 __all__ = [
     "command_from_bytes",
     "diagnostic_status",
+    "effort_from_bytes",
     "event_message",
     "plant_mode",
     "plant_value",
@@ -30,6 +32,7 @@ __all__ = [
     "sample_from_message",
     "seconds_to_duration",
     "stamp_from_message",
+    "stamp_of_state",
     "stamp_to_message",
     "trajectory_to_message",
 ]
@@ -50,66 +53,117 @@ def stamp_from_message(stamp: Time) -> int:
 
 
 def command_from_bytes(data: bytes) -> JointCommand | None:
-    """Return the command that a serialised JointState carries, or None where it is no command for one joint."""
+    """Return the command that a serialised JointState carries, or None where it has not one effort for each name."""
     fields = decode_joint_state(data)
     if fields is not None:
-        if fields.effort is None:
+        if not fields.effort:
             return None
-        return JointCommand(fields.stamp_ns, fields.effort, fields.frame_id, (fields.joint,))
+        return JointCommand(fields.stamp_ns, fields.effort, fields.frame_id, fields.joints)
     message = _deserialise(data)
-    if message is None or len(message.effort) != 1 or len(message.name) > 1:
+    if message is None or _problem_of_efforts(message):
         return None
     return JointCommand(
-        stamp_from_message(message.header.stamp), message.effort[0], message.header.frame_id, tuple(message.name)
+        stamp_from_message(message.header.stamp), tuple(message.effort), message.header.frame_id, tuple(message.name)
     )
 
 
-def sample_from_bytes(data: bytes) -> JointSample | None:
-    """Return the state that a serialised JointState carries for our joint, or None where it carries none."""
+def effort_from_bytes(data: bytes) -> float | None:
+    """Return the effort of a serialised command for one joint, to show it; None where it is for several or is none."""
+    command = command_from_bytes(data)
+    return command.effort[0] if command is not None and len(command.effort) == 1 else None
+
+
+def sample_from_bytes(data: bytes, joints: tuple[str, ...] = ONE_JOINT.names) -> JointSample | None:
+    """Return the state of a plant's joints that a serialised JointState carries, or None where it carries none.
+
+    Args:
+        data: The message.
+        joints: All joints of the plant. The one joint of a plant is found among others; several are expected alone and
+            in their order, so that nobody ever takes one for another.
+    """
     fields = decode_joint_state(data)
-    if fields is not None and fields.joint == JOINT and fields.position is not None and fields.velocity is not None:
-        return JointSample(fields.stamp_ns, fields.position, fields.velocity, fields.effort or 0.0)
-    message = _deserialise(data)
-    return None if message is None else sample_from_message(message)
-
-
-def sample_from_message(message: JointState) -> JointSample | None:
-    """Return the state of our joint among those of a message, or None where it is not there in full."""
-    try:
-        index = list(message.name).index(JOINT)
-        effort = message.effort[index] if len(message.effort) > index else 0.0
+    if fields is not None and fields.joints == joints and fields.position and fields.velocity:
         return JointSample(
-            stamp_from_message(message.header.stamp), message.position[index], message.velocity[index], effort
+            fields.stamp_ns, fields.position, fields.velocity, fields.effort or (0.0,) * len(fields.position)
         )
-    except (ValueError, IndexError):
-        return None
-
-
-def problem_of_state(data: bytes) -> str:
-    """Return which field of a serialised JointState keeps it from being a state of our joint, empty where none does."""
     message = _deserialise(data)
-    if message is None:
-        return _NO_JOINT_STATE
+    return None if message is None else sample_from_message(message, joints)
+
+
+def sample_from_message(message: JointState, joints: tuple[str, ...] = ONE_JOINT.names) -> JointSample | None:
+    """Return the state of a plant's joints that a message carries, as :func:`sample_from_bytes` does."""
+    if _problem_of_positions(message, joints):
+        return None
+    stamp_ns = stamp_from_message(message.header.stamp)
+    if len(joints) > 1:
+        efforts = tuple(message.effort) or (0.0,) * len(joints)
+        return JointSample(stamp_ns, tuple(message.position), tuple(message.velocity), efforts)
+    index = list(message.name).index(joints[0])
+    effort = message.effort[index] if len(message.effort) > index else 0.0
+    return JointSample.of_one(stamp_ns, message.position[index], message.velocity[index], effort)
+
+
+def stamp_of_state(data: bytes, joints: tuple[str, ...]) -> tuple[int | None, tuple[str, ...]]:
+    """Return the stamp of a serialised state that tells of some joints [ns], else None, and whose state it is.
+
+    Args:
+        data: The message.
+        joints: Joints that must be among its own, each with position and velocity, in this order.
+    """
+    fields = decode_joint_state(data)
+    if fields is not None:
+        stamp_ns, found = fields.stamp_ns, fields.joints
+        counts = len(fields.position), len(fields.velocity)
+    else:
+        message = _deserialise(data)
+        if message is None:
+            return None, ()
+        stamp_ns, found = stamp_from_message(message.header.stamp), tuple(message.name)
+        counts = len(message.position), len(message.velocity)
+    full = min(counts) >= len(found)
+    return (stamp_ns if full and joints == tuple(name for name in found if name in joints) else None), found
+
+
+def problem_of_state(data: bytes, joints: tuple[str, ...] = ONE_JOINT.names) -> str:
+    """Return which field of a serialised JointState keeps it from being a state of the joints, empty where none does.
+
+    Args:
+        data: The message.
+        joints: All joints of the plant.
+    """
+    message = _deserialise(data)
+    return _NO_JOINT_STATE if message is None else _problem_of_positions(message, joints)
+
+
+def _problem_of_positions(message: JointState, joints: tuple[str, ...]) -> str:
     names = list(message.name)
-    if JOINT not in names:
-        return f"name is {names}; expected {JOINT!r} among them"
+    if len(joints) > 1:
+        if tuple(names) != joints:
+            return f"name is {names}; expected {list(joints)}"
+        for field in ("position", "velocity", "effort"):
+            count = len(getattr(message, field))
+            if count != len(names) and (count or field != "effort"):
+                return f"{field} has {count} values; expected {len(names)}"
+        return ""
+    (joint,) = joints
+    if joint not in names:
+        return f"name is {names}; expected {joint!r} among them"
     for field in ("position", "velocity"):
         count = len(getattr(message, field))
-        if count <= names.index(JOINT):
-            return f"{field} has {count} values for {len(names)} names; expected one for {JOINT!r}"
+        if count <= names.index(joint):
+            return f"{field} has {count} values for {len(names)} names; expected one for {joint!r}"
     return ""
 
 
 def problem_of_command(data: bytes) -> str:
     """Return which field of a serialised JointState keeps it from being a command, empty where none does."""
     message = _deserialise(data)
-    if message is None:
-        return _NO_JOINT_STATE
-    if len(message.name) > 1:
-        return f"name is {list(message.name)}; expected [{JOINT!r}] or none"
-    if len(message.effort) != 1:
-        return f"effort has {len(message.effort)} values; expected 1"
-    return ""
+    return _NO_JOINT_STATE if message is None else _problem_of_efforts(message)
+
+
+def _problem_of_efforts(message: JointState) -> str:
+    count, expected = len(message.effort), len(message.name) or 1
+    return "" if count == expected else f"effort has {count} values; expected {expected}"
 
 
 def trajectory_to_message(trajectory: Trajectory, stamp_ns: int = 0) -> JointTrajectory:

@@ -18,14 +18,14 @@ from std_srvs.srv import SetBool, Trigger
 from trajectory_msgs.msg import JointTrajectory
 
 from pendulum_msgs_py.contract import names
-from pendulum_msgs_py.contract.cdr import encode_joint_state
+from pendulum_msgs_py.contract.cdr import encode_joints
 from pendulum_msgs_py.contract.cdr_trajectory import decode_joint_trajectory
 from pendulum_msgs_py.contract.commands import Refusal
 from pendulum_msgs_py.contract.names import Event
 from pendulum_msgs_py.contract.shared_supervisor import SharedSupervisor
 from pendulum_msgs_py.contract.supervisor import Drive, Input, Mode
 from pendulum_msgs_py.contract.timing import LoopStatistics, Throttle
-from pendulum_msgs_py.contract.values import NANOSECONDS, JointCommand, JointSample
+from pendulum_msgs_py.contract.values import NANOSECONDS, JointCommand, JointSample, Vector
 from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.ros import qos
 from pendulum_msgs_py.ros.commander_watch import CommanderWatch
@@ -98,6 +98,8 @@ class PlantInterface:
         self.on_command = on_command
         self.hardware_id = "none"
         self.refused_trajectories: Counter[str] = Counter()
+        self._joints = supervisor.coordinates.names
+        self._driven = supervisor.coordinates.driven_names
         self._more_diagnostics = more_diagnostics
         self._told_mode: tuple[Mode, bool, bool] | None = None
         self._mode_lines = Throttle(_LEAST_BETWEEN_LINES)
@@ -144,9 +146,8 @@ class PlantInterface:
         """Publish a state and remember it as the newest."""
         self.sample = sample
         self._commanders.note_state(sample.stamp_ns)
-        data = encode_joint_state(
-            sample.stamp_ns, position=sample.position, velocity=sample.velocity, effort=sample.effort
-        )
+        stamp_ns, position, velocity, effort = sample
+        data = encode_joints(stamp_ns, "", self._joints, position, velocity, effort)
         self.published_ns = time.time_ns()
         self._states.publish(data)
 
@@ -159,12 +160,12 @@ class PlantInterface:
             self._told_mode = told
         return drive
 
-    def publish_applied(self, stamp_ns: int, effort: float) -> None:
-        """Publish the torque that was really applied from the state with this stamp on, and remember it."""
+    def publish_applied(self, stamp_ns: int, effort: Vector) -> None:
+        """Publish the efforts that were really applied from the state with this stamp on, and remember them."""
         self.supervisor.report_applied(effort)
         # Building and publishing what nobody hears would be a tenth of the loop.
         if self._applied.get_subscription_count():
-            self._applied.publish(encode_joint_state(stamp_ns, effort=effort))
+            self._applied.publish(encode_joints(stamp_ns, "", self._driven, (), (), effort))
         if self._stopping:
             self._applied.wait_for_all_acked(qos.LAST_WORDS)
 
@@ -262,6 +263,8 @@ class PlantInterface:
         try:
             if self.supervisor.mode.armed and 0 < self._armed_ns - arrived_ns < _WAITED_NS:
                 raise ParameterError("it came before the plant was armed; expected it after: send it again")
+            if self.supervisor.no_trajectories:
+                raise ParameterError(self.supervisor.no_trajectories)
             stamp_ns, trajectory = decode_joint_trajectory(data)
             if self.sample is None:
                 raise ParameterError("no measurement yet")

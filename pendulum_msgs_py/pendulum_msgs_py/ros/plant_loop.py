@@ -14,7 +14,7 @@ from pendulum_msgs_py.contract.names import Event
 from pendulum_msgs_py.contract.plant_specs import LOCKSTEP_EPOCH_NS
 from pendulum_msgs_py.contract.supervisor import Drive, Input, Mode
 from pendulum_msgs_py.contract.timing import LoopStatistics, SteadyWallClock
-from pendulum_msgs_py.contract.values import NANOSECONDS, JointCommand, JointSample
+from pendulum_msgs_py.contract.values import NANOSECONDS, JointCommand, JointSample, Vector
 from pendulum_msgs_py.ros import qos
 from pendulum_msgs_py.ros.plant_interface import PlantInterface
 
@@ -24,8 +24,8 @@ __all__ = ["LockstepLoop", "RealtimeLoop", "Stepper"]
 class Stepper(Protocol):
     """What a loop needs of a plant: go on for one period, until a given time, under a decision."""
 
-    def __call__(self, drive: Drive, stamp_ns: int) -> tuple[JointSample | None, float]:
-        """Return the state at the end of the period, so stamped, and the torque that was applied on the way [N m].
+    def __call__(self, drive: Drive, stamp_ns: int) -> tuple[JointSample | None, Vector]:
+        """Return the state at the end of the period, so stamped, and the efforts that were applied on the way.
 
         None stands for a measurement that was lost: nothing is published, time goes on.
         """

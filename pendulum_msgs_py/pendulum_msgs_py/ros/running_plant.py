@@ -9,11 +9,11 @@ from pendulum_msgs_py.contract import names
 from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.plants.plant_differences import (
     PLANT_PARAMETERS,
+    AnyPlant,
     describe_plants,
     plant_mismatch,
     read_plants,
 )
-from pendulum_msgs_py.plants.plant_parameters import PlantParameters
 from pendulum_msgs_py.ros import qos
 from pendulum_msgs_py.ros.convert import plant_value
 from pendulum_msgs_py.ros.polled import PollingNode
@@ -36,7 +36,7 @@ class RunningPlant:
         mismatch: How the plant that runs is another one, in words; empty where it is not, or does not say.
     """
 
-    def __init__(self, node: PollingNode, designed: PlantParameters) -> None:
+    def __init__(self, node: PollingNode, designed: AnyPlant) -> None:
         self.mismatch = ""
         self._node = node
         self._designed = designed

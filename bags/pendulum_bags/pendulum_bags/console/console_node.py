@@ -37,7 +37,7 @@ from pendulum_msgs_py.contract.names import Event
 from pendulum_msgs_py.errors import FaultError, ParameterError
 from pendulum_msgs_py.programs.executables import cli_main
 from pendulum_msgs_py.ros import qos
-from pendulum_msgs_py.ros.convert import command_from_bytes, sample_from_bytes, stamp_from_message
+from pendulum_msgs_py.ros.convert import effort_from_bytes, sample_from_bytes, stamp_from_message
 from pendulum_msgs_py.ros.middleware import check_closed, set_middleware_defaults
 from pendulum_msgs_py.ros.polled import PolledInput, PollingNode
 from pendulum_rosbag.recorder.parameter_reader_node import ParameterReader
@@ -348,10 +348,10 @@ class Hub:
         for key, tap in plant.taps.items():
             for data, _ in tap.messages():
                 if key != "state":
-                    command = command_from_bytes(data)
-                    plant.values[key] = command.effort if command is not None else 0.0
+                    plant.values[key] = effort_from_bytes(data) or 0.0
                 elif (sample := sample_from_bytes(data)) is not None:
-                    plant.values.update(theta=sample.position, theta_dot=sample.velocity, measured=sample.effort)
+                    (theta,), (theta_dot,), (measured,) = sample[1:]
+                    plant.values.update(theta=theta, theta_dot=theta_dot, measured=measured)
                     plant.stamp_ns = sample.stamp_ns
         return {
             **plant.values,

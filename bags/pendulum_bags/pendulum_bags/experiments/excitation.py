@@ -251,11 +251,11 @@ def _require_rest(conductor: Conductor, plant: PlantClient) -> None:
         conductor.spin(0.05)
         sample = plant.sample
         assert sample is not None
-        angle = wrap(sample.position)
+        angle = wrap(sample.position[0])
         # Negated, so that a state that is not a number is refused too.
-        if not (abs(angle) <= _AT_REST_ANGLE and abs(sample.velocity) <= _AT_REST_SPEED):
+        if not (abs(angle) <= _AT_REST_ANGLE and abs(sample.velocity[0]) <= _AT_REST_SPEED):
             raise FaultError(
-                f"{plant.namespace} is at {angle:.3f} rad and {sample.velocity:.3f} rad/s; expected it hanging at "
+                f"{plant.namespace} is at {angle:.3f} rad and {sample.velocity[0]:.3f} rad/s; expected it hanging at "
                 f"rest, within {_AT_REST_ANGLE} rad and {_AT_REST_SPEED} rad/s"
             )
 
@@ -275,8 +275,8 @@ def _watch(plant: PlantClient, play: ExcitationPlay) -> bool:
     sample = plant.sample
     assert sample is not None
     for value, limit, unit in (
-        (wrap(sample.position), _ANGLE_ROOM * play.angle, "rad"),
-        (sample.velocity, _SPEED_ROOM * play.speed, "rad/s"),
+        (wrap(sample.position[0]), _ANGLE_ROOM * play.angle, "rad"),
+        (sample.velocity[0], _SPEED_ROOM * play.speed, "rad/s"),
     ):
         if not abs(value) <= limit:
             raise FaultError(

@@ -80,7 +80,7 @@ def _simulate(spec: RunSpec, plant: Plant, sensors: Sensors) -> RunArrays:
     period_ns = round(NANOSECONDS * spec.period)
     parameters = plant.parameters
     limits: dict[str, Any] = validate(LIMIT_SPECS, {})
-    supervisor = PlantSupervisor(limits_from_parameters(limits, parameters.effort_limit))
+    supervisor = PlantSupervisor(limits_from_parameters(limits, (parameters.effort_limit,)))
     values = {**spec.controller_parameters, "set_point": spec.set_point}
     design = load_plant(spec.design_plant)
     controller = AnswerLoop(
@@ -96,7 +96,7 @@ def _simulate(spec: RunSpec, plant: Plant, sensors: Sensors) -> RunArrays:
     stamps = LOCKSTEP_EPOCH_NS + period_ns * np.arange(count + 1, dtype=np.int64)
     rows = np.full((count + 1, 6), np.nan)
     state = plant.reset(spec.theta, 0.0)
-    sample = sensors.measure(LOCKSTEP_EPOCH_NS, state.theta, state.theta_dot, state.effort)
+    sample = sensors.measure(LOCKSTEP_EPOCH_NS, (state.theta,), (state.theta_dot,), (state.effort,))
     if sample is None:
         raise ParameterError("sensors drop samples; expected a drop_rate of 0 in a run in one process")
     supervisor.arm(LOCKSTEP_EPOCH_NS, sample)
@@ -107,17 +107,17 @@ def _simulate(spec: RunSpec, plant: Plant, sensors: Sensors) -> RunArrays:
         torque = push.torque if push is not None else 0.0
         if answer is not None:
             supervisor.offer(Input.EFFORT_COMMAND, JointCommand(now_ns, answer, "controller"), now_ns)
-        supervisor.offer(Input.DISTURBANCE, JointCommand(now_ns, torque, "disturbance"), now_ns)
+        supervisor.offer(Input.DISTURBANCE, JointCommand.of_one(now_ns, torque, "disturbance"), now_ns)
         row = rows[index]
-        row[:3] = sample.position, sample.velocity, sample.effort
-        row[3:5] = np.nan if answer is None else answer, torque
+        row[:3] = sample.position[0], sample.velocity[0], sample.effort[0]
+        row[3:5] = np.nan if answer is None else answer[0], torque
         if index == count:
             break
         drive = supervisor.decide(now_ns, sample)
-        state = plant.step(drive.effort, drive.push)
+        state = plant.step(drive.effort[0], drive.push[0])
         supervisor.report_applied(drive.effort)
-        row[5] = drive.effort
-        measured = sensors.measure(int(stamps[index + 1]), state.theta, state.theta_dot, state.effort)
+        row[5] = drive.effort[0]
+        measured = sensors.measure(int(stamps[index + 1]), (state.theta,), (state.theta_dot,), (state.effort,))
         if measured is None:
             raise ParameterError("sensors drop samples; expected a drop_rate of 0 in a run in one process")
         sample = measured

@@ -90,7 +90,7 @@ def _angle(text: str) -> float:
 
 def _move(plant: PlantClient, goal: str | float, *, controlled: bool, control: bool) -> None:
     assert plant.sample is not None
-    where, space = plant.sample.position, plant.namespace
+    where, space = plant.sample.position[0], plant.namespace
     if isinstance(goal, float):
         end = goal
     else:
@@ -120,7 +120,7 @@ def _move(plant: PlantClient, goal: str | float, *, controlled: bool, control: b
         plant.disarm()
     elif isinstance(goal, float):
         assert plant.sample is not None
-        print(f"{space}: at {plant.sample.position:.2f} rad; held under position control", flush=True)
+        print(f"{space}: at {plant.sample.position[0]:.2f} rad; held under position control", flush=True)
     elif controlled and control:
         print(f"{space}: upright; activating the controller", flush=True)
         plant.switch_controller(on=True)

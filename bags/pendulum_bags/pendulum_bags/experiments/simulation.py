@@ -30,7 +30,7 @@ class _Facts:
 @cache
 def _facts(name: str, mapping: str) -> _Facts:
     made = open_simulation(name, mapping)
-    return _Facts(made.plant.parameters, made.plant.dt, made.method, made.remarks)
+    return _Facts(made.pendulum.parameters, made.plant.dt, made.method, made.remarks)
 
 
 @dataclass(frozen=True)
@@ -83,7 +83,7 @@ class ForeignSimulation:
 
     def open(self) -> Plant:
         """Return the simulation in this process."""
-        return open_simulation(self.name, self.mapping).plant
+        return open_simulation(self.name, self.mapping).pendulum
 
     def program(self, namespace: str, **parameters: ParameterArgument) -> NodeProgram:
         """Return its node, which has the name of ours."""

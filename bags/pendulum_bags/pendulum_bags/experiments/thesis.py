@@ -170,7 +170,7 @@ def _start_move(
     ramps = []
     for plant in plants:
         assert plant.sample is not None
-        ramps.append(thesis_ramp(plant.sample.position, goal))
+        ramps.append(thesis_ramp(plant.sample.position[0], goal))
     progress.phase(phase.replace("_", " "), max(ramp.duration for ramp in ramps))
     for plant, ramp in zip(plants, ramps, strict=True):
         plant.follow(ramp, phase, goal=goal)

@@ -16,6 +16,7 @@ import numpy.typing as npt
 from pendulum_msgs_py.errors import DataError
 from pendulum_rosbag.reader.batches import Batch, Int64, Source, Stream
 from pendulum_rosbag.reader.joint_state import JointStateParser
+from pendulum_rosbag.reader.joint_table import JointTable, joint_table
 from pendulum_rosbag.reader.open_source import BagFolder, open_folder, open_sources
 from pendulum_rosbag.reader.topic_info import StoredMessage, TopicInfo
 
@@ -129,6 +130,14 @@ class Bag(Mapping[str, Any]):
                 "expected sensor_msgs/msg/JointState of one joint"
             )
         return values
+
+    def joints(self, topic: str) -> JointTable:
+        """Return a topic of JointState, of one joint or several, as arrays with one column for each joint.
+
+        Raises:
+            DataError: The topic is missing, its messages are something else, or not all of the same joints.
+        """
+        return joint_table(self.raw(topic), f"topic {topic} of bag {self.path}")
 
     def load(self) -> Bag:
         """Read all topics now, in one pass over the files, and return the bag."""

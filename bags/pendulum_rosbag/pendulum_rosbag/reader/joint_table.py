@@ -1,0 +1,72 @@
+"""States and commands of several joints as arrays."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pendulum_msgs_py.contract.cdr import decode_joint_state
+from pendulum_msgs_py.errors import DataError
+
+__all__ = ["JointTable", "joint_table"]
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class JointTable:
+    """The messages of one topic of n joints, ordered by log time.
+
+    Attributes:
+        names: The joints, in the order of the columns.
+        log_time_ns: Shape (k,) [ns].
+        stamp_ns: Shape (k,) [ns].
+        position: Shape (k, n), NaN where messages have none [rad or m].
+        velocity: Shape (k, n) [rad/s or m/s].
+        effort: Shape (k, n) [N m or N].
+    """
+
+    names: tuple[str, ...]
+    log_time_ns: NDArray[np.int64]
+    stamp_ns: NDArray[np.int64]
+    position: Array
+    velocity: Array
+    effort: Array
+
+
+def joint_table(messages: Iterable[tuple[int, bytes]], where: str, names: Sequence[str] | None = None) -> JointTable:
+    """Return messages of JointState as a table.
+
+    Args:
+        messages: Log time [ns] and bytes of each.
+        where: Topic and bag, for messages.
+        names: The joints that are expected; None for those of the first message.
+
+    Raises:
+        DataError: There is none, one is no JointState with a value for each of its names, or one names other joints or
+            the same in another order.
+    """
+    times: list[int] = []
+    stamps: list[int] = []
+    rows: list[list[tuple[float, ...]]] = [[], [], []]
+    expected = None if names is None else tuple(names)
+    for log_time_ns, data in messages:
+        fields = decode_joint_state(data)
+        if fields is None:
+            raise DataError(f"{where}: message {len(times)} is no JointState with one value for each of its names")
+        expected = fields.joints if expected is None else expected
+        if fields.joints != expected:
+            raise DataError(
+                f"{where}: message {len(times)} is of {', '.join(fields.joints)}; expected {', '.join(expected)}"
+            )
+        times.append(log_time_ns)
+        stamps.append(fields.stamp_ns)
+        for column, values in zip(rows, fields[3:], strict=True):
+            column.append(values or (np.nan,) * len(expected))
+    if expected is None:
+        raise DataError(f"{where}: no messages; expected at least one")
+    position, velocity, effort = (np.array(column, float).reshape(-1, len(expected)) for column in rows)
+    return JointTable(expected, np.array(times, np.int64), np.array(stamps, np.int64), position, velocity, effort)

@@ -1,0 +1,110 @@
+"""Linear quadratic regulator of a plant of several joints: u = u* - K [q - q*, v] about upright."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from pendulum_lqr.design import Gain
+from pendulum_lqr.interface import JointController
+from pendulum_lqr.mechanism_model import linearise_mechanism, mechanism_lqr
+from pendulum_lqr.sampled_design import discretise
+from pendulum_msgs_py.errors import ParameterError
+from pendulum_msgs_py.joints import Coordinates, Vector
+from pendulum_msgs_py.parameters import ParameterSpec, validate
+from pendulum_msgs_py.plants.mechanism_parameters import MechanismParameters
+
+__all__ = ["JOINT_CONTROLLERS", "JointLqr", "joint_parameters", "make_joint_controller"]
+
+JOINT_CONTROLLERS = ("lqr",)
+"""Controllers for plants of several joints."""
+_MOST_GROWTH = 1.0
+
+
+class JointLqr(JointController):
+    """Continuous LQR of n joints, sampled.
+
+    Args:
+        gain: Gain, K of shape (m, 2n).
+        coordinates: Joints of the plant; deviations wrap for those that turn.
+        effort_limits: Largest effort of each driven joint [N m or N].
+        hold: m efforts that hold the plant upright.
+    """
+
+    def __init__(self, gain: Gain, coordinates: Coordinates, effort_limits: Vector, hold: Vector) -> None:
+        super().__init__(effort_limits)
+        self.gain = gain
+        self._deviation = coordinates.deviation
+        # Plain floats: indexing an array on every state costs more than the law itself.
+        self._rows = tuple(tuple(float(value) for value in row) for row in gain.K)
+        self._hold = hold
+
+    def command(self, t: float, position: Vector, velocity: Vector) -> Vector:
+        """Return m efforts."""
+        x = self._deviation(position) + velocity
+        return tuple(
+            min(limit, max(-limit, hold - sum(k * value for k, value in zip(row, x, strict=True))))
+            for row, hold, limit in zip(self._rows, self._hold, self.effort_limits, strict=True)
+        )
+
+    def describe(self) -> str:
+        """Return gain and poles."""
+        rows = "; ".join(", ".join(f"{value:.6g}" for value in row) for row in self._rows)
+        poles = ", ".join(f"{pole:.4g}" for pole in self.gain.poles)
+        return f"K = [{rows}], poles {poles} 1/s"
+
+
+def joint_parameters(plant: MechanismParameters) -> tuple[ParameterSpec, ...]:
+    """Return the specs of what a controller of a plant of several joints takes, its own weights as defaults."""
+    q, r = plant.mechanism.weights
+    names = plant.coordinates.names
+    return (
+        ParameterSpec(
+            "q", list(q), "", f"Diagonal of Q: weights of {', '.join(names)}, then of their velocities.", minimum=0.0
+        ),
+        ParameterSpec("r", r, "", "Weight of each effort, R.", minimum=0.0, exclusive_minimum=True),
+        ParameterSpec(
+            "effort_limit", 0.0, "N m", "Largest effort of each driven joint; 0 for the plant's own.", minimum=0.0
+        ),
+    )
+
+
+def make_joint_controller(
+    name: str, plant: MechanismParameters, values: Mapping[str, Any], period: float | None = None
+) -> JointController:
+    """Design a controller for a plant of several joints.
+
+    Args:
+        name: One of ``JOINT_CONTROLLERS``.
+        plant: The plant.
+        values: Parameters of :func:`joint_parameters` by name; others at their default.
+        period: Period at which states come [s]; None where it is not known yet.
+
+    Raises:
+        ParameterError: No such controller for several joints, a value out of domain, a design that does not exist, or
+            a loop that is unstable on the linear model at this period, delay included.
+    """
+    if name not in JOINT_CONTROLLERS:
+        raise ParameterError(
+            f"{name} is for plants of one joint, and plant {plant.name!r} has {', '.join(plant.coordinates.names)}; "
+            f"expected {' or '.join(JOINT_CONTROLLERS)}"
+        )
+    p = validate(joint_parameters(plant), values)
+    model = linearise_mechanism(plant)
+    gain = mechanism_lqr(model, p["q"], p["r"])
+    limit = p["effort_limit"] or math.inf
+    if period is not None:
+        sampled = discretise(model, period)
+        n = model.A.shape[0]
+        feedback = np.zeros((sampled.B.shape[1], sampled.A.shape[0]))
+        feedback[:, :n] = gain.K
+        growth = float(np.max(np.abs(np.linalg.eigvals(sampled.A - sampled.B @ feedback))))
+        if growth >= _MOST_GROWTH:
+            raise ParameterError(
+                f"{name} asked every {period:g} s does not settle on plant {plant.name!r}: deviations grow by "
+                f"{growth:.3g} a period; expected a faster plant, or a smaller q"
+            )
+    return JointLqr(gain, plant.coordinates, tuple(min(limit, own) for own in plant.effort_limits), model.efforts)

@@ -1,0 +1,82 @@
+"""The LQR of several joints as the controller node runs it."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+import scipy.linalg
+
+from pendulum_lqr.answering import AnswerLoop
+from pendulum_lqr.controllers.joint_lqr import make_joint_controller
+from pendulum_lqr.mechanism_model import linearise_mechanism, mechanism_lqr
+from pendulum_lqr.sampled_design import discretise
+from pendulum_msgs_py.contract.values import JointSample
+from pendulum_msgs_py.errors import ParameterError
+from pendulum_msgs_py.plants.mechanism_parameters import load_mechanism
+from pendulum_sim.mechanism_plant import MechanismPlant
+
+PLANTS = ("acrobot_frictionless", "pendubot_frictionless", "double_pendulum", "cart_pole", "furuta")
+
+
+@pytest.mark.parametrize("name", PLANTS)
+def test_it_answers_with_the_law_within_each_limit_whatever_turns_were_made(name: str) -> None:
+    plant = load_mechanism(name)
+    controller = make_joint_controller("lqr", plant, {})
+    model = linearise_mechanism(plant)
+    K = mechanism_lqr(model, *plant.mechanism.weights).K
+    x = np.array([1e-3, -2e-3, 3e-3, 1e-3])
+    joints = plant.coordinates.joints
+    upright = zip(joints, plant.coordinates.goal, x[:2], strict=True)
+    turned = [goal + dq + 2.0 * math.pi * joint.turns for joint, goal, dq in upright]
+    limits = np.array(plant.effort_limits)
+    expected = np.clip(np.array(model.efforts) - K @ x, -limits, limits)
+    loop = AnswerLoop(controller, math.inf, simulated_time=True)
+    assert loop.answer(JointSample(1, tuple(turned), (3e-3, 1e-3), (0.0, 0.0)), 1) == pytest.approx(expected, rel=1e-6)
+    far = loop.answer(JointSample(2, (2.0, 1.0), (50.0, 50.0), (0.0, 0.0)), 2)
+    assert np.all(np.abs(far) <= limits)
+    assert loop.saturated == 1
+
+
+@pytest.mark.parametrize("name", PLANTS)
+def test_sampled_it_brings_the_plant_upright(name: str) -> None:
+    parameters = load_mechanism(name)
+    plant = MechanismPlant(parameters, 2e-3)
+    controller = make_joint_controller("lqr", parameters, {}, 2e-3)
+    state = plant.reset(tuple(goal + 0.02 for goal in parameters.coordinates.goal))
+    for _ in range(1500):
+        state = plant.step(controller.command(state.time, state.position, state.velocity))
+    assert np.abs(parameters.coordinates.deviation(state.position)).max() < 0.025
+
+
+def test_a_period_at_which_it_does_not_settle_is_refused() -> None:
+    acrobot = load_mechanism("acrobot_frictionless")
+    with pytest.raises(ParameterError, match=r"lqr asked every 0.2 s does not settle on plant 'acrobot_frictionless'"):
+        make_joint_controller("lqr", acrobot, {}, 0.2)
+
+
+@pytest.mark.parametrize("bad", [math.nan, math.inf])
+def test_a_state_that_is_not_finite_at_any_joint_is_not_answered(bad: float) -> None:
+    loop = AnswerLoop(make_joint_controller("lqr", load_mechanism("cart_pole"), {}), math.inf)
+    assert loop.answer(JointSample(1, (0.0, bad), (0.0, 0.0), (0.0, 0.0)), 1) is None
+    assert loop.answer(JointSample(1, (0.0, 0.0), (bad, 0.0), (0.0, 0.0)), 1) is None
+    assert loop.answered == 0
+
+
+@pytest.mark.parametrize("delay", [0.0, 0.004, 0.01, 0.013])
+def test_a_model_of_two_inputs_is_sampled_as_two_models_of_one(delay: float) -> None:
+    model = linearise_mechanism(load_mechanism("double_pendulum"))
+    whole = discretise(model, 0.01, delay)
+    rng = np.random.default_rng(3)
+    inputs = rng.normal(size=(6, 2))
+    z = np.zeros(whole.A.shape[0])
+    for u in inputs:
+        z = whole.A @ z + whole.B @ u
+    # The exact solution under held inputs, each of which begins to act after the delay.
+    x, h = np.zeros(4), 1e-3
+    step = scipy.linalg.expm(np.block([[model.A, model.B], [np.zeros((2, 6))]]) * h)
+    for k in range(60):
+        index = math.floor((k * h - delay) / 0.01 + 1e-9)
+        x = (step @ np.concatenate([x, inputs[index] if index >= 0 else np.zeros(2)]))[:4]
+    assert z[:4] == pytest.approx(x, rel=1e-9, abs=1e-12)

@@ -1,0 +1,258 @@
+"""Several joints on the graph: whose numbers are whose is said by names in every message, and never guessed."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+
+from pendulum_msgs_py.contract import cdr
+from pendulum_msgs_py.contract.cdr import decode_joint_state, encode_joints
+from pendulum_msgs_py.contract.commands import CommandGate, Refusal
+from pendulum_msgs_py.contract.supervisor import DriveKind, Input, Mode, PlantLimits, PlantSupervisor
+from pendulum_msgs_py.contract.trajectory import from_points
+from pendulum_msgs_py.contract.values import NANOSECONDS, JointCommand, JointSample
+from pendulum_msgs_py.errors import ParameterError
+from pendulum_msgs_py.joints import Coordinates, Joint
+
+serialization = pytest.importorskip("rclpy.serialization")
+JointState = pytest.importorskip("sensor_msgs.msg").JointState
+convert = pytest.importorskip("pendulum_msgs_py.ros.convert")
+
+_NOW = 1_000 * NANOSECONDS
+_MS = 1_000_000
+_TWO = (Joint("shoulder", goal=math.pi), Joint("elbow"))
+_ARM = Coordinates(_TWO, (0, 1))
+_ACROBOT = Coordinates(_TWO, (1,))
+_NAMES = ("shoulder", "elbow")
+_SO = "; expected ['shoulder', 'elbow']"
+
+
+def _command(effort: tuple[float, ...], joints: tuple[str, ...], stamp_ns: int = _NOW) -> JointCommand:
+    return JointCommand(stamp_ns, effort, "lqr", joints)
+
+
+# --- bytes -----------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("names", [_NAMES, ("a", "bc", "def"), ("",) * 4])
+@pytest.mark.parametrize("given", [(1, 1, 1), (0, 0, 1), (1, 1, 0), (0, 0, 0)])
+@pytest.mark.parametrize("frame", ["", "/sim/controller"])
+def test_the_middleware_reads_what_we_write_of_several_joints_and_we_read_what_it_writes(
+    names: tuple[str, ...], given: tuple[int, int, int], frame: str
+) -> None:
+    cdr.forget_layouts()
+    values = tuple(tuple(10.0 * k + i for i in range(len(names))) * present for k, present in enumerate(given))
+    message = JointState(name=list(names))
+    message.header.frame_id, message.header.stamp.sec, message.header.stamp.nanosec = frame, 5, 7
+    message.position, message.velocity, message.effort = (list(each) for each in values)
+    data = encode_joints(5 * NANOSECONDS + 7, frame, names, *values)
+    assert serialization.deserialize_message(data, JointState) == message
+    expected = (5 * NANOSECONDS + 7, frame, names, *values)
+    # The second time by the layout that the first has left.
+    for each in (data, serialization.serialize_message(message)):
+        assert decode_joint_state(each) == expected
+        assert decode_joint_state(each) == expected
+
+
+def test_a_message_of_as_many_bytes_with_the_names_the_other_way_round_is_read_by_its_own_names() -> None:
+    cdr.forget_layouts()
+    for names in (("left_", "right"), ("right", "left_"), ("right", "right")):
+        fields = decode_joint_state(encode_joints(1, "lqr", names, (), (), (1.0, 2.0)))
+        assert fields is not None
+        assert (fields.joints, fields.effort) == (names, (1.0, 2.0))
+
+
+@pytest.mark.parametrize(
+    ("names", "position", "velocity", "effort", "problem"),
+    [
+        (["shoulder", "elbow"], [1.0, 2.0], [3.0, 4.0], [5.0, 6.0], ""),
+        (["shoulder", "elbow"], [1.0, 2.0], [3.0, 4.0], [], ""),
+        (["elbow", "shoulder"], [1.0, 2.0], [3.0, 4.0], [], "name is ['elbow', 'shoulder']" + _SO),
+        (["shoulder"], [1.0], [3.0], [], "name is ['shoulder']" + _SO),
+        (["shoulder", "knee"], [1.0, 2.0], [3.0, 4.0], [], "name is ['shoulder', 'knee']" + _SO),
+        (["elbow", "elbow"], [1.0, 2.0], [3.0, 4.0], [], "name is ['elbow', 'elbow']" + _SO),
+        ([], [1.0, 2.0], [3.0, 4.0], [], "name is []" + _SO),
+        (["shoulder", "elbow"], [1.0], [3.0, 4.0], [], "position has 1 values; expected 2"),
+        (["shoulder", "elbow"], [1.0, 2.0], [3.0, 4.0, 5.0], [], "velocity has 3 values; expected 2"),
+        (["shoulder", "elbow"], [1.0, 2.0], [3.0, 4.0], [5.0], "effort has 1 values; expected 2"),
+    ],
+)  # fmt: skip
+def test_a_state_of_several_joints_is_believed_in_full_and_in_order_or_not_at_all(
+    names: list[str], position: list[float], velocity: list[float], effort: list[float], problem: str
+) -> None:
+    data = serialization.serialize_message(JointState(name=names, position=position, velocity=velocity, effort=effort))
+    sample = convert.sample_from_bytes(data, _NAMES)
+    assert convert.problem_of_state(data, _NAMES) == problem
+    assert (sample is None) == bool(problem)
+    if sample is not None:
+        assert sample[1:] == ((1.0, 2.0), (3.0, 4.0), tuple(effort) or (0.0, 0.0))
+
+
+def test_a_state_of_several_joints_is_none_of_the_pendulum() -> None:
+    data = encode_joints(1, "", _NAMES, (1.0, 2.0), (3.0, 4.0))
+    assert convert.sample_from_bytes(data) is None
+    assert convert.effort_from_bytes(encode_joints(1, "", _NAMES, (), (), (1.0, 2.0))) is None
+
+
+# --- the gate --------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("effort", "joints", "refusal", "problem"),
+    [
+        ((1.0, 2.0), ("shoulder", "elbow"), None, ""),
+        ((1.0, 2.0), ("elbow", "shoulder"), Refusal.OTHER_JOINT, "name is ['elbow', 'shoulder']" + _SO),
+        ((1.0, 2.0), ("shoulder", "knee"), Refusal.OTHER_JOINT, "name is ['shoulder', 'knee']" + _SO),
+        ((1.0, 2.0), ("elbow", "elbow"), Refusal.OTHER_JOINT, "name is ['elbow', 'elbow']" + _SO),
+        ((1.0,), ("shoulder",), Refusal.NOT_ONE_JOINT, "name is ['shoulder']" + _SO),
+        ((1.0,), (), Refusal.NOT_ONE_JOINT, "name is []" + _SO),
+        ((1.0, 2.0), (), Refusal.NOT_ONE_JOINT, "name is []" + _SO),
+        ((1.0, 2.0, 3.0), (*_NAMES, "knee"), Refusal.NOT_ONE_JOINT, "name is ['shoulder', 'elbow', 'knee']" + _SO),
+        ((1.0,), ("shoulder", "elbow"), Refusal.NOT_ONE_JOINT, "effort has 1 values; expected 2"),
+        ((1.0, 2.0, 3.0), ("shoulder", "elbow"), Refusal.NOT_ONE_JOINT, "effort has 3 values; expected 2"),
+        ((1.0, math.nan), ("shoulder", "elbow"), Refusal.NOT_FINITE, "effort is [1.0, nan]; expected finite numbers"),
+        ((math.inf, 0.0), ("shoulder", "elbow"), Refusal.NOT_FINITE, "effort is [inf, 0.0]; expected finite numbers"),
+    ],
+)  # fmt: skip
+def test_a_command_is_for_all_driven_joints_by_name_and_in_order_or_for_none(
+    effort: tuple[float, ...], joints: tuple[str, ...], refusal: Refusal | None, problem: str
+) -> None:
+    gate = CommandGate(0.05, joints=_NAMES)
+    assert gate.offer(_command(effort, joints), _NOW) is refusal
+    assert dict(gate.refused) == ({} if refusal is None else {refusal: 1})
+    assert gate.problems == ({} if refusal is None else {refusal: problem})
+    assert (gate.fresh(_NOW) is None) == (refusal is not None)
+
+
+@pytest.mark.parametrize(
+    ("effort", "joints", "filled"),
+    [
+        ((1.0, 2.0), ("shoulder", "elbow"), (1.0, 2.0)),
+        ((1.0,), ("shoulder",), (1.0, 0.0)),
+        ((2.0,), ("elbow",), (0.0, 2.0)),
+        ((2.0, 1.0), ("elbow", "shoulder"), None),
+        ((1.0, 1.0), ("elbow", "elbow"), None),
+        ((1.0,), ("knee",), None),
+        ((1.0,), (), None),
+        ((1.0, 2.0), ("elbow",), None),
+        ((math.nan,), ("elbow",), None),
+    ],
+)
+def test_a_disturbance_may_be_for_some_joints_and_the_others_get_nothing(
+    effort: tuple[float, ...], joints: tuple[str, ...], filled: tuple[float, ...] | None
+) -> None:
+    gate = CommandGate(0.05, joints=_NAMES, partial=True)
+    assert (gate.offer(_command(effort, joints), _NOW) is None) == (filled is not None)
+    fresh = gate.fresh(_NOW)
+    assert (None if fresh is None else (fresh.effort, fresh.joints)) == (None if filled is None else (filled, _NAMES))
+
+
+@pytest.mark.parametrize(("effort", "joints"), [((), ()), ((1.0,), ()), ((1.0,), ("elbow",))])
+def test_a_plant_without_a_motor_takes_no_command(effort: tuple[float, ...], joints: tuple[str, ...]) -> None:
+    assert CommandGate(0.05, joints=()).offer(_command(effort, joints), _NOW) is Refusal.NOT_ONE_JOINT
+
+
+# --- the rules -------------------------------------------------------------------------------------------------
+
+
+class Plant:
+    """A plant of two joints that stays where it is."""
+
+    def __init__(self, coordinates: Coordinates = _ARM, **limits: object) -> None:
+        self.now = _NOW
+        self.position, self.velocity = [0.0, 0.0], [0.0, 0.0]
+        usual = {"effort": (5.0, 2.0)[: len(coordinates.driven)], "feedback_timeout": 0.03}
+        self.supervisor = PlantSupervisor(PlantLimits(**{**usual, **limits}), coordinates=coordinates)
+        assert self.supervisor.arm(self.now, self.sample()) == ""
+
+    def sample(self) -> JointSample:
+        return JointSample(self.now, tuple(self.position), tuple(self.velocity), (0.0, 0.0))
+
+    def run(self, *offers: tuple[Input, tuple[float, ...], tuple[str, ...]]):
+        self.now += _MS
+        for kind, effort, joints in offers:
+            self.supervisor.offer(kind, _command(effort, joints, self.now), self.now)
+        drive = self.supervisor.decide(self.now, self.sample())
+        self.supervisor.report_applied(drive.effort)
+        return drive
+
+
+def test_each_joint_has_its_own_limit_and_the_disturbance_of_one_leaves_the_other_alone() -> None:
+    plant = Plant()
+    drive = plant.run(
+        (Input.EFFORT_COMMAND, (1.0, 1.5), _NAMES),
+        (Input.DISTURBANCE, (1.0,), ("elbow",)),
+        (Input.PUSH, (0.25,), ("shoulder",)),
+    )
+    assert (drive.kind, drive.effort, drive.saturated) == (DriveKind.EFFORT, (1.0, 2.0), True)
+    assert (drive.controller, drive.disturbance, drive.push) == ((1.0, 1.5), (0.0, 1.0), (0.25, 0.0))
+    assert plant.run((Input.EFFORT_COMMAND, (-9.0, -9.0), _NAMES)).effort == (-5.0, -2.0)
+
+
+def test_the_joints_rise_each_at_the_slew_limit() -> None:
+    assert Plant(slew=10.0).run((Input.EFFORT_COMMAND, (5.0, -0.005), _NAMES)).effort == pytest.approx((0.01, -0.005))
+
+
+def test_without_a_command_and_after_a_stop_every_joint_is_without_torque() -> None:
+    plant = Plant()
+    plant.run((Input.EFFORT_COMMAND, (1.0, 1.0), _NAMES))
+    plant.now += 100 * _MS
+    assert plant.run().effort == (0.0, 0.0)
+    plant.supervisor.e_stop(plant.now)
+    drive = plant.run((Input.EFFORT_COMMAND, (1.0, 1.0), _NAMES))
+    assert (drive.kind, drive.effort) == (DriveKind.OFF, (0.0, 0.0))
+
+
+@pytest.mark.parametrize(
+    ("joint", "what", "value", "reason"),
+    [
+        (0, "position", 1.5, "position of shoulder is 1.500 rad; expected inside -1.0 to 1.0 rad"),
+        (1, "position", -2.5, "position of elbow is -2.500 rad; expected inside -2.0 to 2.0 rad"),
+        (1, "velocity", -9.0, "velocity of elbow is -9.000 rad/s; expected at most 8.0 rad/s"),
+        (0, "position", math.nan, "measurement is not finite: [nan, 0.0] rad"),
+        (1, "velocity", math.inf, "measurement is not finite: [0.0, 0.0] rad, [0.0, inf] rad/s"),
+    ],
+)
+def test_any_joint_that_leaves_its_limits_ends_the_torque_of_all(
+    joint: int, what: str, value: float, reason: str
+) -> None:
+    plant = Plant(position_min=(-1.0, -2.0), position_max=(1.0, 2.0), velocity=8.0)
+    assert plant.run((Input.EFFORT_COMMAND, (1.0, 1.0), _NAMES)).effort == (1.0, 1.0)
+    getattr(plant, what)[joint] = value
+    drive = plant.run((Input.EFFORT_COMMAND, (1.0, 1.0), _NAMES))
+    assert (plant.supervisor.mode, drive.effort) == (Mode.FAULT, (0.0, 0.0))
+    assert plant.supervisor.reason.startswith(reason)
+
+
+def test_a_measurement_of_fewer_joints_ends_torque() -> None:
+    plant = Plant()
+    plant.supervisor.decide(plant.now, JointSample.of_one(plant.now, 0.0, 0.0))
+    assert plant.supervisor.mode is Mode.FAULT
+    assert plant.supervisor.reason == "measurement has 1 joints; expected 2"
+
+
+def test_of_an_acrobot_the_elbow_is_commanded_and_either_joint_pushed() -> None:
+    plant = Plant(_ACROBOT)
+    drive = plant.run((Input.EFFORT_COMMAND, (1.0,), ("elbow",)), (Input.PUSH, (0.5,), ("shoulder",)))
+    assert (drive.effort, drive.push) == ((1.0,), (0.5, 0.0))
+    assert plant.run((Input.EFFORT_COMMAND, (2.0,), ("shoulder",))).effort == (1.0,)
+    assert plant.supervisor.gates[Input.EFFORT_COMMAND].refused == {Refusal.OTHER_JOINT: 1}
+
+
+def test_a_plant_of_several_joints_follows_no_trajectory_and_says_so() -> None:
+    plant = Plant()
+    refusal = plant.supervisor.accept_trajectory(
+        from_points([0.0, 1.0], [0.0, 0.1], [0.0, 0.0]), plant.now, plant.sample()
+    )
+    assert refusal == (
+        "plant has shoulder, elbow and follows no trajectory; one that does has one joint alone; "
+        "expected effort_command"
+    )
+    assert plant.supervisor.mode is Mode.EFFORT
+
+
+@pytest.mark.parametrize("limits", [{"effort": (5.0,)}, {"position_min": (-1.0,), "position_max": (1.0,)}])
+def test_limits_for_another_number_of_joints_are_refused(limits: dict[str, tuple[float, ...]]) -> None:
+    with pytest.raises(ParameterError, match="expected 2"):
+        Plant(**limits)

@@ -1,0 +1,79 @@
+"""What the simulator's node steps: a plant of n joints of which m are driven, one joint being n = m = 1."""
+
+from __future__ import annotations
+
+from typing import Protocol
+
+from pendulum_msgs_py.joints import ONE_JOINT, Coordinates, Vector
+from pendulum_sim.mechanism_plant import MechanismPlant, MechanismState
+from pendulum_sim.plant import Plant, PlantState
+
+__all__ = ["JointPlant", "OneJoint", "joint_plant"]
+
+
+class JointPlant(Protocol):
+    """A plant whose states and efforts are tuples in the order of its joints."""
+
+    dt: float
+
+    @property
+    def name(self) -> str:
+        """Name of the plant."""
+
+    @property
+    def coordinates(self) -> Coordinates:
+        """Its joints, and which of them are driven."""
+
+    @property
+    def effort_limits(self) -> Vector:
+        """Largest effort of each driven joint [N m or N]."""
+
+    @property
+    def state(self) -> MechanismState:
+        """The present state."""
+
+    def reset(self, position: Vector, velocity: Vector) -> MechanismState:
+        """Start anew at n positions [rad or m] and n velocities."""
+
+    def step(self, effort: Vector, push: Vector) -> MechanismState:
+        """Advance by one period under m commanded efforts and n efforts on the joints themselves [N m or N]."""
+
+
+class OneJoint:
+    """A plant of one joint, its numbers as tuples.
+
+    Args:
+        plant: The plant.
+    """
+
+    def __init__(self, plant: Plant) -> None:
+        self.plant = plant
+        self.dt = plant.dt
+        self.name = plant.parameters.name
+        self.coordinates = ONE_JOINT
+        self.effort_limits = (plant.parameters.effort_limit,)
+        self._step = plant.step
+
+    @property
+    def state(self) -> MechanismState:
+        """The present state."""
+        return _as_tuples(self.plant.state)
+
+    def reset(self, position: Vector, velocity: Vector) -> MechanismState:
+        """Start anew at an angle [rad] and a velocity [rad/s]."""
+        return _as_tuples(self.plant.reset(position[0], velocity[0]))
+
+    def step(self, effort: Vector, push: Vector) -> MechanismState:
+        """Advance by one period under a commanded torque and a torque on the link [N m]."""
+        time, theta, theta_dot, torque = self._step(effort[0], push[0])
+        return MechanismState(time, (theta,), (theta_dot,), (torque,))
+
+
+def joint_plant(plant: Plant | MechanismPlant) -> JointPlant:
+    """Return a plant of any number of joints as one that takes and gives tuples."""
+    return plant if isinstance(plant, MechanismPlant) else OneJoint(plant)
+
+
+def _as_tuples(state: PlantState) -> MechanismState:
+    time, theta, theta_dot, effort = state
+    return MechanismState(time, (theta,), (theta_dot,), (effort,))

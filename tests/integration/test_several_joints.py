@@ -1,0 +1,186 @@
+"""An acrobot on the graph: simulator, LQR, disturbance and recorder as processes, and commands that are not for it."""
+
+from __future__ import annotations
+
+import json
+import math
+import signal
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from diagnostic_msgs.msg import DiagnosticArray
+from sensor_msgs.msg import JointState
+from std_msgs.msg import String
+from std_srvs.srv import Trigger
+from trajectory_msgs.msg import JointTrajectory
+
+from pendulum_msgs_py.contract import names
+from pendulum_msgs_py.ros import qos
+from pendulum_rosbag.reader import read_bag
+from tests.graph_peer import GraphPeer
+
+JOINTS = ["shoulder", "elbow"]
+
+
+class Peer(GraphPeer):
+    """Hears one plant and answers each of its states with what it is told to."""
+
+    def __init__(self) -> None:
+        super().__init__("peer", namespace="sim")
+        self.states: list[JointState] = []
+        self.applied: list[JointState] = []
+        self.events: list[dict] = []
+        self.diagnostics: dict[str, str] = {}
+        self.answer: dict[str, Any] | None = None
+        self.commands = self.node.create_publisher(JointState, names.EFFORT_COMMAND, qos.COMMAND)
+        self.trajectories = self.node.create_publisher(JointTrajectory, names.JOINT_TRAJECTORY, qos.TRAJECTORY)
+        self.node.create_subscription(JointState, names.JOINT_STATES, self._on_state, qos.STATE)
+        self.node.create_subscription(JointState, names.APPLIED_EFFORT, self.applied.append, qos.STATE)
+        self.node.create_subscription(
+            String, names.EVENTS, lambda message: self.events.append(json.loads(message.data)), qos.EVENTS
+        )
+        self.node.create_subscription(DiagnosticArray, names.DIAGNOSTICS, self._on_diagnostics, 10)
+
+    def _on_state(self, message: JointState) -> None:
+        self.states.append(message)
+        if self.answer is not None:
+            command = JointState(**self.answer)
+            command.header.stamp, command.header.frame_id = message.header.stamp, "peer"
+            self.commands.publish(command)
+
+    def _on_diagnostics(self, message: DiagnosticArray) -> None:
+        for status in message.status:
+            if status.name.endswith(": plant"):
+                self.diagnostics = {pair.key: pair.value for pair in status.values}
+
+    def known(self) -> str:
+        return f"; diagnostics {self.diagnostics}"
+
+
+@pytest.fixture
+def peer(domain_id: int) -> Iterator[Peer]:
+    peer = Peer()
+    yield peer
+    peer.close()
+
+
+def _start(processes, package: str, program: str, *parameters: str):
+    arguments = [item for parameter in parameters for item in ("-p", parameter)]
+    return processes.start(package, program, "--ros-args", "-r", "__ns:=/sim", *arguments)
+
+
+def test_an_acrobot_is_held_upright_under_noise_in_lockstep_and_its_bag_is_read_back(
+    peer: Peer, processes, tmp_path: Path
+) -> None:
+    recorder = processes.start("pendulum_rosbag", "record", "-o", str(tmp_path / "bag"), "--regex", "^/sim/")
+    recorder.wait_for_output("ready", 30)
+    controller = _start(processes, "pendulum_lqr", "controller", "plant:=acrobot_frictionless", "use_sim_time:=true")
+    noise = _start(
+        processes, "pendulum_lqr", "disturbance", "joints:=[elbow]", "amplitude:=0.2", "autostart:=true",
+        "use_sim_time:=true",
+    )  # fmt: skip
+    plant = _start(
+        processes, "pendulum_sim", "simulator", "plant:=acrobot_frictionless", "clock:=lockstep",
+        "lockstep_inputs:=[effort_command, disturbance]", "lockstep_duration:=3.0", "lockstep_subscribers:=4",
+        "initial_position:=[3.19, -0.05]",
+    )  # fmt: skip
+    peer.until(lambda: any(event["name"] == names.Event.LOCKSTEP_FINISHED for event in peer.events), "the end", 90.0)
+    controller.wait_for_output(r"lqr for plant acrobot_frictionless: K = \[.*limit 6 N m", 10)
+    for program in (noise, controller, plant, recorder):
+        program.send_signal(signal.SIGINT)
+        assert program.wait(20.0) == 0
+    with read_bag(tmp_path / "bag") as bag:
+        states = bag.joints("/sim/joint_states")
+        commands = bag.joints("/sim/effort_command")
+        pushes = bag.joints("/sim/disturbance")
+        applied = bag.joints("/sim/applied_effort")
+    assert states.names == ("shoulder", "elbow")
+    assert commands.names == pushes.names == applied.names == ("elbow",)
+    assert len(states.stamp_ns) == 1501
+    assert states.position[0] == pytest.approx([3.19, -0.05])
+    late = states.stamp_ns > 2_500_000_000
+    assert np.abs(states.position[late] - [math.pi, 0.0]).max() < 0.05
+    assert np.abs(pushes.effort).max() == pytest.approx(0.2, rel=0.2)
+    # What was applied is what was asked for, one period after another.
+    both = dict(zip(commands.stamp_ns, commands.effort[:, 0], strict=True))
+    push = dict(zip(pushes.stamp_ns, pushes.effort[:, 0], strict=True))
+    for stamp, effort in zip(applied.stamp_ns[:1000], applied.effort[:1000, 0], strict=True):
+        assert effort == pytest.approx(np.clip(both[stamp] + push[stamp], -6.0, 6.0))
+    # A passive joint has no effort.
+    assert not states.effort[:, 0].any()
+    assert states.effort[:, 1].any()
+
+
+def _until_counted(peer: Peer, key: str, before: int) -> None:
+    peer.until(lambda: int(peer.diagnostics.get(key, 0)) > before, f"{peer.answer} refused as {key}")
+
+
+def test_commands_for_other_joints_move_nothing_and_are_counted_and_the_e_stop_ends_all(peer: Peer, processes) -> None:
+    _start(processes, "pendulum_sim", "simulator", "plant:=double_pendulum", "rate_hz:=100.0", "command_timeout:=0.5")
+    peer.until(lambda: len(peer.states) > 3, "states")
+    assert [list(state.name) for state in peer.states] == [JOINTS] * len(peer.states)
+    wrong: list[tuple[dict[str, Any], str]] = [
+        ({"name": ["elbow", "shoulder"], "effort": [1.0, 2.0]}, "other_joint"),
+        ({"name": ["shoulder", "knee"], "effort": [1.0, 2.0]}, "other_joint"),
+        ({"name": ["elbow", "elbow"], "effort": [1.0, 2.0]}, "other_joint"),
+        ({"name": ["elbow"], "effort": [1.0]}, "not_one_joint"),
+        ({"name": JOINTS, "effort": [1.0]}, "not_one_joint"),
+        ({"name": [], "effort": [1.0, 2.0]}, "not_one_joint"),
+        ({"name": JOINTS, "effort": [1.0, math.nan]}, "not_finite"),
+    ]
+    for answer, reason in wrong:
+        key = f"effort_command.refused.{reason}"
+        before = int(peer.diagnostics.get(key, 0))
+        peer.answer = answer
+        _until_counted(peer, key, before)
+    peer.answer = None
+    assert all(list(message.name) == JOINTS and list(message.effort) == [0.0, 0.0] for message in peer.applied)
+
+    peer.trajectories.publish(JointTrajectory(joint_names=JOINTS))
+    refused = peer.until(lambda: [e for e in peer.events if e["name"] == names.Event.TRAJECTORY_REFUSED], "the refusal")
+    assert "follows no trajectory" in refused[0]["reason"]
+
+    peer.answer = {"name": JOINTS, "effort": [1.0, -9.0]}
+    peer.until(lambda: list(peer.applied[-1].effort) == [1.0, -6.0], "torque within each joint's limit")
+    assert peer.call(Trigger, "simulator/e_stop", Trigger.Request()).success
+    peer.until(lambda: list(peer.applied[-1].effort) == [0.0, 0.0], "no torque")
+    count = len(peer.applied)
+    peer.until(lambda: len(peer.applied) > count + 20, "more periods")
+    assert all(list(message.effort) == [0.0, 0.0] for message in peer.applied[count:])
+
+
+SIMULATOR, CONTROLLER, DISTURBANCE = (
+    ("pendulum_sim", "simulator"), ("pendulum_lqr", "controller"), ("pendulum_lqr", "disturbance"),
+)  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("program", "parameters", "sentence"),
+    [
+        (SIMULATOR, ("plant:=acrobot", "method:=etd4"), "expected auto: plant 'acrobot' has several joints"),
+        (SIMULATOR, ("plant:=acrobot", "initial_theta:=1.0"), "expected initial_position and initial_velocity"),
+        (
+            SIMULATOR,
+            ("plant:=acrobot", "initial_position:=[1.0, 2.0, 3.0]"),
+            "initial_position has 3 values; expected 2, for shoulder [rad], elbow [rad], or one for all",
+        ),
+        (SIMULATOR, ("initial_position:=[1.0]",), "expected initial_theta and initial_theta_dot"),
+        (
+            CONTROLLER,
+            ("plant:=acrobot", "controller:=pid"),
+            "pid is for plants of one joint, and plant 'acrobot' has shoulder, elbow; expected lqr",
+        ),
+        (CONTROLLER, ("plant:=acrobot", "q:=[1.0, 2.0]"), "q has the shape (2,); expected (4,)"),
+        (DISTURBANCE, ("joints:=[elbow, elbow]",), "joints is ['elbow', 'elbow']; expected names, each once"),
+    ],
+)
+def test_what_does_not_fit_several_joints_is_refused_in_one_sentence(
+    processes, domain_id: int, program: tuple[str, str], parameters: tuple[str, ...], sentence: str
+) -> None:
+    started = _start(processes, *program, *parameters)
+    assert started.wait(30.0) == 2
+    assert sentence in started.output
+    assert "Traceback" not in started.output
