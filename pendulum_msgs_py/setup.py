@@ -40,6 +40,8 @@ def share_files(name: str) -> list[tuple[str, list[str]]]:
 # For ``ros2 run`` colcon puts programs into a folder of the package; pip puts them where all commands are,
 # and must not put ``record``, ``play`` or ``info`` before those of others.
 PREFIX = "pendulum-" if {"bdist_wheel", "dist_info", "editable_wheel"} & set(sys.argv) else ""
+# One of them lists and starts all others, and has the name to itself.
+ALL = "pendulum"
 
 manifest = ElementTree.parse("package.xml")
 name = manifest.findtext("name", "")
@@ -58,6 +60,10 @@ setup(
         (f"share/{name}", ["package.xml", "LICENSE"]),
         *share_files(name),
     ],
-    entry_points={"console_scripts": [f"{PREFIX}{program} = {target}" for program, target in executables.items()]},
+    entry_points={
+        "console_scripts": [
+            f"{PREFIX * (program != ALL)}{program} = {target}" for program, target in executables.items()
+        ]
+    },
     zip_safe=False,
 )

@@ -46,6 +46,11 @@ class PlantPeer(GraphPeer):
         """Return the diagnostics, for the message about something that did not happen."""
         return f"; diagnostics {self.diagnostics}"
 
+    def leave_the_command(self) -> None:
+        """Command no more, and be seen to: others ask the graph who does."""
+        self.torque = None
+        self.node.destroy_publisher(self._commands)
+
     def ask(self, service: str) -> Trigger.Response:
         """Call one of the plant's services without arguments."""
         return self.call(Trigger, f"simulator/{service}", Trigger.Request())

@@ -22,7 +22,7 @@ from pendulum_sim.mujoco_plant import load_mujoco_plant
 from pendulum_sim.plant import Plant
 from pendulum_sim.plants import make_plant
 
-__all__ = ["GYMNASIUM", "MUJOCO", "OWN", "Engine", "Simulation", "find_engine", "open_simulation"]
+__all__ = ["GYMNASIUM", "GYMNASIUM_PREFIX", "MUJOCO", "OWN", "Engine", "Simulation", "find_engine", "open_simulation"]
 
 
 class Simulation(NamedTuple):
@@ -218,7 +218,7 @@ GYMNASIUM = Engine(
     foreign=True,
     example="python -m pendulum_sim gymnasium --ros-args -r __ns:=/sim -p env:=Pendulum-v1",
 )
-_GYMNASIUM_PREFIX = "gymnasium:"
+GYMNASIUM_PREFIX = "gymnasium:"
 
 
 def find_engine(simulation: str) -> tuple[Engine, dict[str, str]]:
@@ -227,8 +227,8 @@ def find_engine(simulation: str) -> tuple[Engine, dict[str, str]]:
     Args:
         simulation: Path of a model file, or ``gymnasium:ID``.
     """
-    if simulation.startswith(_GYMNASIUM_PREFIX):
-        return GYMNASIUM, {"env": simulation.removeprefix(_GYMNASIUM_PREFIX)}
+    if simulation.startswith(GYMNASIUM_PREFIX):
+        return GYMNASIUM, {"env": simulation.removeprefix(GYMNASIUM_PREFIX)}
     return MUJOCO, {"model": str(Path(simulation).expanduser().resolve())}
 
 

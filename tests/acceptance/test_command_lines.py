@@ -27,8 +27,12 @@ import typer.main
 
 from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.programs import completion
-from tests.acceptance.test_packaging import PROGRAMS, executables
+from tests.acceptance.test_packaging import PROGRAMS as INSTALLED
+from tests.acceptance.test_packaging import executables
 from tests.fixtures import PROJECT
+
+# ``pendulum`` has no command line of its own: it starts the others (test_pendulum_command.py).
+PROGRAMS = [(package, program) for package, program in INSTALLED if program != "pendulum"]
 
 TOOLS = sorted(
     ".".join(path.relative_to(PROJECT).with_suffix("").parts)

@@ -145,8 +145,8 @@ def test_every_program_is_an_entry_point_of_the_installed_distribution(package: 
 
     points = {point.name: point.value for point in distribution(package).entry_points}
     # Beside the commands of everybody, `record` or `info` would stand before another's.
-    assert points.get(f"pendulum-{program}") == executables(package)[program]
-    assert all(name.startswith("pendulum-") for name in points)
+    assert points.get("pendulum" if program == "pendulum" else f"pendulum-{program}") == executables(package)[program]
+    assert all(name == "pendulum" or name.startswith("pendulum-") for name in points)
 
 
 def test_the_build_scripts_are_one_and_the_same_file() -> None:

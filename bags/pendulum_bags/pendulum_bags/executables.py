@@ -3,6 +3,7 @@
 __all__ = ["COMMANDS", "EXECUTABLES"]
 
 EXECUTABLES: dict[str, str] = {
+    "pendulum": "pendulum_bags.pendulum_cli:main",
     "record": "pendulum_rosbag.recorder.record_cli:main",
     "analyse": "pendulum_bags.analyse.analyse_cli:main",
     "compare": "pendulum_bags.comparison.compare_cli:main",

@@ -12,13 +12,15 @@ import pytest
 
 from pendulum_bags.comparison import Outcome, compare_runs
 from pendulum_bags.comparison.independence import check_pairs
+from pendulum_bags.experiments import experiment_cli
 from pendulum_bags.experiments.in_process import simulate
 from pendulum_bags.experiments.lockstep import lockstep_spec
-from pendulum_bags.experiments.repeats import record_simulation
+from pendulum_bags.experiments.repeats import record_repeat, record_simulation, repeat_folder
 from pendulum_bags.experiments.settings import NoiseSettings, RegulationSettings
 from pendulum_msgs_py.errors import DataError, ParameterError
 from pendulum_msgs_py.plants.plant_differences import plant_differences
 from pendulum_msgs_py.plants.plant_parameters import load_plant, write_plant
+from pendulum_rosbag.reader import read_bag
 from pendulum_sim.model_files import mjcf
 
 pytest.importorskip("mujoco")
@@ -119,3 +121,69 @@ def test_runs_with_one_plant_file_in_two_places_are_pooled_and_other_simulations
     pairs[1][0].metadata["pendulum.run"]["simulation"]["name"] = "other.xml"
     with pytest.raises(DataError, match="runs with different simulations cannot be pooled"):
         check_pairs(pairs)  # type: ignore[arg-type]
+
+
+def test_two_simulations_of_others_are_compared_without_a_process(model: Path, tmp_path: Path) -> None:
+    noise = NoiseSettings(duration=10.0)
+    settings = RegulationSettings(noise=noise, simulation="gymnasium:PendulumX59-v0", hardware=str(model))
+    assert (settings.can_repeat, settings.is_emulated) == (True, True)
+    record_repeat(tmp_path, settings, 1)
+    place = repeat_folder(tmp_path, 1)
+    result = compare_runs(place / "sim", place / "hw")
+    assert result.verdict.outcome is Outcome.EQUIVALENT
+    # Nothing real moved, and the words say so.
+    assert result.is_emulated
+    told = read_bag(place / "hw").metadata["pendulum.run"]
+    assert (told["plant"], told["namespace"], told["stand_in"]) == ("own.xml", "/hw", "simulation")
+    assert told["simulation"]["name"] == "own.xml"
+    in_real_time = settings.metadata("thesis", side="hw", plant=settings.hardware_plant, namespace="/hw")
+    assert in_real_time["pendulum.run"]["simulation"] == told["simulation"]
+    assert settings.plant_program("hw").full_name == "/hw/simulator"  # type: ignore[union-attr]
+
+
+@pytest.mark.parametrize(
+    ("changes", "sentence"),
+    [
+        ({"hardware": "hebii"}, "hardware is 'hebii'; expected one of emulator, hebi, a model file"),
+        ({"hardware": "ros:lab"}, "plant is 'ros:lab'; expected ros:/NAMESPACE"),
+        ({"simulation": "ros:/"}, "plant is 'ros:/'; expected ros:/NAMESPACE"),
+        ({"simulation": "ros:/hw"}, "both plants are in /hw; expected two namespaces"),
+        ({"simulation": "ros:/a", "hardware": "ros:/a"}, "both plants are in /a; expected two namespaces"),
+        ({"hardware": "ros:/a", "effort_strategy": "effort_loop"}, "strategy is effort_loop for hardware ros:/a"),
+        ({"hardware": "ros:/a", "hardware_mapping": "m.yaml"}, "mapping is m.yaml without a simulation"),
+        ({"hardware": "ros:/a", "lab": "lab.yaml"}, "expected --hardware hebi"),
+        ({"hardware": "none.xml"}, "none.xml does not exist"),
+    ],
+)
+def test_sides_that_cannot_be_are_refused(changes: dict[str, str], sentence: str) -> None:
+    with pytest.raises(ParameterError, match=sentence):
+        RegulationSettings(**changes)  # type: ignore[arg-type]
+
+
+def test_a_plant_that_runs_already_is_started_by_nobody_and_measured_once() -> None:
+    settings = RegulationSettings(simulation="ros:/a", hardware="ros:/lab/b")
+    assert [settings.plant_program(side) for side in ("sim", "hw")] == [None, None]
+    assert [settings.namespace(side) for side in ("sim", "hw")] == ["/a", "/lab/b"]
+    assert (settings.can_repeat, settings.is_emulated) == (False, False)
+    # An emulator beside it is repeated by nobody either: the other side cannot be asked for a new run.
+    assert not RegulationSettings(simulation="ros:/a").can_repeat
+
+
+@pytest.mark.parametrize(
+    ("arguments", "sentence"),
+    [
+        (["--hardware", "ros:/lab"], "plant /lab runs on a ROS domain; expected --domain N, or ROS_DOMAIN_ID"),
+        (["--simulation", "ros:/lab", "--domain", "3"], "ros:/lab does not tell its equation; expected --plant FILE"),
+    ],
+)
+def test_a_running_plant_needs_its_domain_and_a_simulation_its_equation(
+    arguments: list[str],
+    sentence: str,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.delenv("ROS_DOMAIN_ID", raising=False)
+    assert experiment_cli.main(["thesis", *arguments, "--yes", "--out", str(tmp_path / "run")]) == 2
+    assert sentence in " ".join(capsys.readouterr().err.split())
+    assert not (tmp_path / "run").exists()

@@ -29,6 +29,13 @@ _pendulum_complete() {{
   {split}
   [[ "$line" == *[[:space:]] ]] && typed+=("")
   COMPREPLY=()
+  if [[ "${{typed[0]##*/}}" == pendulum ]]; then
+    while IFS= read -r candidate; do
+      COMPREPLY+=("$candidate")
+      {nospace}
+    done < <({variable}=1 "${{typed[0]/#\~/$HOME}}" "${{typed[@]:1}}" 2>/dev/null)
+    return
+  fi
   if [[ "${{typed[1]}}" != -m || -z "${{typed[2]}}" \
       || ( pendulum_ != "${{typed[2]}}"* && "${{typed[2]}}" != pendulum_* ) ]]; then
     [[ -n "$_pendulum_before" ]] && "$_pendulum_before" "$@"
@@ -50,10 +57,10 @@ _BASH = """\
 declare -F _completion_loader >/dev/null && _completion_loader python 2>/dev/null
 _pendulum_before=$(complete -p python 2>/dev/null | sed -n 's/.* -F \\([^ ]*\\) .*/\\1/p')
 [[ "$_pendulum_before" == _pendulum_complete ]] && _pendulum_before=
-complete -o default -o bashdefault -F _pendulum_complete python python3 .venv/bin/python
+complete -o default -o bashdefault -F _pendulum_complete python python3 .venv/bin/python pendulum .venv/bin/pendulum
 """
 _ZSH_HEAD = "autoload -U +X compinit && compinit -u\nautoload -U +X bashcompinit && bashcompinit\n"
-_ZSH = "complete -o default -F _pendulum_complete python python3 .venv/bin/python\n"
+_ZSH = "complete -o default -F _pendulum_complete python python3 .venv/bin/python pendulum .venv/bin/pendulum\n"
 
 SHELLS = ("bash", "zsh")
 

@@ -7,7 +7,6 @@ scripts of ``setup.py`` and ``python -m`` both read it. What would hide a progra
 
 from __future__ import annotations
 
-import ast
 import importlib
 import importlib.util
 import os
@@ -30,12 +29,15 @@ __all__ = [
     "EXIT_USAGE",
     "cli_main",
     "is_exhaustion",
+    "print_completion",
     "print_text",
     "report_error",
     "report_exhaustion",
     "report_missing",
     "run_package",
+    "run_program",
     "summary",
+    "tables_of",
 ]
 
 EXIT_USAGE = 2
@@ -53,17 +55,12 @@ def run_package(package: str, argv: Sequence[str] | None = None) -> int:
     """
     importlib.import_module("pendulum_msgs_py.programs.one_thread")
     arguments = list(sys.argv[1:] if argv is None else argv)
-    tables = importlib.import_module(f"{package}.executables")
-    table: dict[str, str] = {**tables.EXECUTABLES, **getattr(tables, "COMMANDS", {})}
+    table = tables_of(package)
     if completion.asked() and len(arguments) < 2:
         print_text("\n".join(completion.of_package(table, arguments)))
         return 0
     if arguments and arguments[0] == "--completion":
-        try:
-            print_text(completion.script(arguments[1] if len(arguments) > 1 else "bash"))
-        except PendulumError as error:
-            return report_error(error)
-        return 0
+        return print_completion(arguments[1:])
     if not arguments or arguments[0] in {"-h", "--help"}:
         print_text(_usage(package, table))
         return 0 if arguments else EXIT_USAGE
@@ -74,10 +71,29 @@ def run_package(package: str, argv: Sequence[str] | None = None) -> int:
         expected = ", ".join(sorted(table))
         print(f"error: {package} has no executable {name!r}; expected one of {expected}{hint}", file=sys.stderr)
         return EXIT_USAGE
-    module_name, function_name = table[name].split(":")
+    return run_program(table[name], rest)
+
+
+def tables_of(package: str) -> dict[str, str]:
+    """Return the programs of a package: name -> entry point."""
+    tables = importlib.import_module(f"{package}.executables")
+    return {**tables.EXECUTABLES, **getattr(tables, "COMMANDS", {})}
+
+
+def run_program(target: str, arguments: Sequence[str], *, called_as: str = "") -> int:
+    """Import a program, run it and return its exit code.
+
+    Args:
+        target: Its entry point, ``module:function``.
+        arguments: Its own.
+        called_as: How it was started, for its help; empty for ``python -m``.
+    """
+    importlib.import_module("pendulum_msgs_py.programs.one_thread")
+    module_name, function_name = target.split(":")
+    _called_as.append(called_as)
     try:
         main = getattr(importlib.import_module(module_name), function_name)
-        return int(main(rest) or 0)
+        return int(main(list(arguments)) or 0)
     except KeyboardInterrupt:
         # Ctrl-C while the modules are still loading: nothing runs yet that could say so itself.
         print("interrupted", file=sys.stderr)
@@ -86,6 +102,19 @@ def run_package(package: str, argv: Sequence[str] | None = None) -> int:
         if code := report_exhaustion(error) or report_missing(error):
             return code
         raise
+
+
+_called_as: list[str] = []
+"""How the running program was started; a help text names it."""
+
+
+def print_completion(arguments: Sequence[str]) -> int:
+    """Print what a shell is to source, as ``--completion [SHELL]`` asks; return the exit code."""
+    try:
+        print_text(completion.script(arguments[0] if arguments else "bash"))
+    except PendulumError as error:
+        return report_error(error)
+    return 0
 
 
 def split_ros_arguments(arguments: Sequence[str]) -> tuple[list[str], list[str]]:
@@ -117,7 +146,8 @@ def cli_main(
         print_text("\n".join(completion.of_command(command, own)))
         return 0
     try:
-        result = command.main(args=own, prog_name=name, standalone_mode=False, obj=ros)
+        prog_name = (_called_as and _called_as[-1]) or name
+        result = command.main(args=own, prog_name=prog_name, standalone_mode=False, obj=ros)
         # What is still buffered would else meet a broken pipe at exit, where nobody can catch it.
         sys.stdout.flush()
     except PendulumError as error:
@@ -202,6 +232,10 @@ _SIGNS_OF_EXHAUSTION = (
 )
 
 
+_DOCSTRING = re.compile(r'(?:\s*#.*\n)*\s*"""(.*?)(?:"""|\n)')
+"""First line of a module's docstring."""
+
+
 def summary(name: str, target: str) -> str:
     """Return what a program is for: the first line of its module's docstring, read without importing the module.
 
@@ -209,12 +243,13 @@ def summary(name: str, target: str) -> str:
         name: The program; where the line speaks of several (```one``: this; ``other``: that``), its part is returned.
         target: Its entry point, ``module:function``.
     """
-    try:
-        spec = importlib.util.find_spec(target.partition(":")[0])
-    except (ImportError, ValueError):  # help must not fail for want of a module that nobody runs yet
-        spec = None
-    source = Path(spec.origin).read_text(encoding="utf-8") if spec is not None and spec.origin else ""
-    text = (ast.get_docstring(ast.parse(source)) or "").partition("\n")[0]
+    top, *rest = target.partition(":")[0].split(".")
+    # By its file: to ask for the module would import the packages that it is in.
+    spec = importlib.util.find_spec(top)
+    folders = [] if spec is None else list(spec.submodule_search_locations or [])
+    files = [path for folder in folders if (path := Path(folder, *rest).with_suffix(".py")).is_file()]
+    found = _DOCSTRING.match(files[0].read_text(encoding="utf-8")) if files else None
+    text = found[1] if found else ""
     own = re.search(rf"``{re.escape(name)}``: (.*?)(?:; ``|$)", text)
     words = own.group(1) if own else text.partition(": ")[2] or text
     return words[:1].upper() + words[1:].rstrip(".").replace("``", "")

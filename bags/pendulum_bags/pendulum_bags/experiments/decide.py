@@ -40,8 +40,9 @@ def decide(
 ) -> Comparison:
     """Compare a run folder, and record repeats into it until the comparison is decided.
 
-    Only an emulator is asked for more: a machine moves when its operator wants it to. Each look costs a share of the
-    error that all looks together may make, so that stopping as soon as it is decided errs no more often than one look.
+    Only an emulator or a simulation is asked for more: a machine moves when its operator wants it to. Each look costs a
+    share of the error that all looks together may make, so that stopping as soon as it is decided errs no more often
+    than one look.
 
     Args:
         folder: Folder of the run, recorded; a repeat whose hardware's side lies in there already is used at once.
@@ -52,7 +53,7 @@ def decide(
         on_wait: Called while waiting.
         record: Records what a repeat lacks.
     """
-    if settings.hardware != "emulator" or budget.seconds <= 0.0:
+    if not settings.can_repeat or budget.seconds <= 0.0:
         return compare_folders([folder], margin=margins)
     started = budget.clock()
     number = 0

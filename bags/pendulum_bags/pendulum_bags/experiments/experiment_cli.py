@@ -16,9 +16,11 @@ from rich.console import Console
 
 from pendulum_bags.comparison.compare_cli import MarginOption, MarginsFile
 from pendulum_bags.experiments.domain import check_domain
-from pendulum_bags.experiments.operator import confirmed
+from pendulum_bags.experiments.operator import ask_for_running, confirmed
 from pendulum_bags.experiments.progress import PhaseProgress
+from pendulum_bags.experiments.run_spec import SIDES
 from pendulum_bags.experiments.settings import (
+    HARDWARE,
     SETTLE_TIME,
     TIME_BESIDE_NOISE,
     NoiseSettings,
@@ -32,7 +34,7 @@ from pendulum_bags.studies.mechanism_benchmark_cli import benchmark
 from pendulum_bags.studies.monte_carlo_cli import monte_carlo
 from pendulum_bags.studies.region_cli import region_of_attraction
 from pendulum_bags.studies.study_cli import add_commands as add_study_commands
-from pendulum_msgs_py.errors import PendulumError
+from pendulum_msgs_py.errors import ParameterError, PendulumError
 from pendulum_msgs_py.programs.executables import EXIT_INTERRUPTED, cli_main
 from pendulum_msgs_py.programs.terminal import WholeTable, make_console
 
@@ -56,6 +58,13 @@ Plant = Annotated[
 ]
 Simulation = Annotated[
     str, typer.Option(help="In the simulator's place: a model file (MJCF or URDF, run by MuJoCo), or gymnasium:ID.")
+]
+AnySimulation = Annotated[
+    str,
+    typer.Option(
+        help="In the simulator's place: a model file (MJCF or URDF, run by MuJoCo), gymnasium:ID, or ros:/NAMESPACE "
+        "for a plant that runs already on --domain; that one needs --plant, too."
+    ),
 ]
 Mapping = Annotated[
     Path | None, typer.Option(help="Mapping file of that simulation: joint, actuator, sign, zero, limit.")
@@ -86,9 +95,18 @@ def thesis(
             "--simulation the equation read off it."
         ),
     ] = None,
-    simulation: Simulation = "",
+    simulation: AnySimulation = "",
     mapping: Mapping = None,
-    hardware: Annotated[str, typer.Option(help="emulator, or hebi for the real actuator.")] = "emulator",
+    hardware: Annotated[
+        str,
+        typer.Option(
+            help="emulator, or hebi for the real actuator. Or a second simulation to compare the first with: a model "
+            "file or gymnasium:ID. Or ros:/NAMESPACE for a plant that runs already on --domain."
+        ),
+    ] = "emulator",
+    hardware_mapping: Annotated[
+        Path | None, typer.Option(help="Mapping file of a simulation that --hardware names.")
+    ] = None,
     lab: Lab = None,
     yes: Yes = False,
     strategy: Annotated[
@@ -131,6 +149,7 @@ def thesis(
         simulation=simulation,
         mapping="" if mapping is None else str(mapping),
         hardware=hardware,
+        hardware_mapping="" if hardware_mapping is None else str(hardware_mapping),
         effort_strategy=strategy or "",
         controller=controller,
         q=q,
@@ -140,8 +159,10 @@ def thesis(
         lab="" if lab is None else str(lab),
     )
     margins = Margins.of(margins_file, margin)
-    check_domain(domain)
+    domain = check_domain(domain)
     console = make_console(stderr=json_output, highlight=False)
+    running = _running(settings, domain, plant)
+    ask_for_running(running, domain or 0, _plan(settings), yes=yes)
     with confirmed(settings.machine, settings.bridge_program(), _plan(settings), yes=yes):
         folder = create_run_folder(out, "thesis")
         if (foreign := settings.foreign) is not None:
@@ -152,10 +173,15 @@ def thesis(
             with PhaseProgress(TIME_BESIDE_NOISE + duration, console) as progress:
                 run_undisturbed(
                     partial(
-                        run_thesis, folder, settings, domain, progress, repeat=hardware == "emulator" and budget > 0.0
+                        run_thesis,
+                        folder,
+                        settings,
+                        domain,
+                        progress,
+                        repeat=hardware == "emulator" and settings.can_repeat and budget > 0.0,
                     ),
                     folder,
-                    emulated=settings.hardware_plant == "emulator",
+                    emulated=settings.is_emulated,
                     tell=progress.start_again,
                 )
                 comparison, answer, summary = _analyse(folder, settings, margins, budget, progress)
@@ -204,7 +230,6 @@ def lockstep(
     Example: python -m pendulum_bags experiment lockstep --bag /tmp/seed_7 --seed 7
     """
     from pendulum_bags.experiments.lockstep import run_lockstep
-    from pendulum_msgs_py.errors import ParameterError
 
     if side not in {"sim", "hw"}:
         raise ParameterError(f"side is {side!r}; expected sim or hw")
@@ -248,6 +273,19 @@ def examples(
         print(bag)
 
 
+def _running(settings: RegulationSettings, domain: int | None, plant: str | None) -> list[str]:
+    """Return the namespaces of the plants that run already, where the rest of the command line fits them."""
+    found = [settings.namespace(side) for side in SIDES if settings.running(side) is not None]
+    if found and domain is None:
+        raise ParameterError(f"plant {found[0]} runs on a ROS domain; expected --domain N, or ROS_DOMAIN_ID")
+    if settings.running("sim") is not None and plant is None:
+        raise ParameterError(
+            f"simulation {settings.simulation} does not tell its equation; expected --plant FILE, on which the "
+            "controller is designed"
+        )
+    return found
+
+
 def _plan(settings: RegulationSettings) -> str:
     noise = settings.noise
     return (
@@ -285,6 +323,7 @@ def _summary(settings: RegulationSettings, comparison: Comparison, answer: Answe
         **comparison.to_json(),
         # What was asked for: where the first run does not count, the comparison tells the seed of a repeat.
         "experiment": "thesis",
+        "hardware": settings.hardware,
         "seed": settings.noise.seed,
         "strategy": settings.strategy,
         "versions": versions(),
@@ -307,7 +346,8 @@ def _print_summary(console: Console, summary: dict[str, Any]) -> None:
     table.add_column("")
     plants = summary["plants"]
     for name in plants:
-        table.add_column("hw (emulator)" if name == "hw" and emulated else name, justify="right")
+        stands_in = "emulator" if summary["hardware"] in HARDWARE else "a simulation"
+        table.add_column(f"hw ({stands_in})" if name == "hw" and emulated else name, justify="right")
     rows = (
         ("rate", "rate_hz", "Hz", ".1f"),
         ("missed deadlines", "missed_deadlines", "", "d"),

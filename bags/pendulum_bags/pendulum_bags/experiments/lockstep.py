@@ -67,7 +67,7 @@ def run_lockstep(
 
 def lockstep_spec(settings: RegulationSettings, *, side: str, theta: float = UPRIGHT) -> RunSpec:
     """Return one side of the thesis's experiment as a run in lockstep, for as long as the noise lasts."""
-    noise = settings.noise
+    noise, foreign = settings.noise, settings.foreign_of(side)
     return RunSpec(
         side=side,
         plant=settings.plant if side == "sim" else "thesis",
@@ -86,8 +86,8 @@ def lockstep_spec(settings: RegulationSettings, *, side: str, theta: float = UPR
         seed=noise.seed,
         method=settings.method,
         storage=settings.storage,
-        simulation=settings.simulation if side == "sim" else "",
-        mapping=settings.mapping if side == "sim" else "",
+        simulation="" if foreign is None else foreign.name,
+        mapping="" if foreign is None else foreign.mapping,
     )
 
 

@@ -14,7 +14,7 @@ from pendulum_msgs_py.errors import FaultError, ParameterError
 from pendulum_msgs_py.programs.executables import EXIT_INTERRUPTED, cli_main
 
 if TYPE_CHECKING:
-    from pendulum_bags.experiments.conductor_node import Conductor, PlantClient
+    from pendulum_bags.experiments.conductor_node import PlantClient
 
 __all__ = ["app", "main"]
 
@@ -51,10 +51,11 @@ def move(
     """
     from pendulum_bags.experiments.conductor_node import Conductor, PlantClient
     from pendulum_bags.experiments.domain import check_domain
+    from pendulum_bags.experiments.graph_plant import find_plant
 
     place = goal if goal in {*_STOPS, "upright", "down"} else _angle(goal)
     with Conductor(check_domain(domain) or 0) as conductor:
-        node = _find_plant(conductor, namespace)
+        node = find_plant(conductor, namespace)
         if place in _STOPS:
             service, said = _STOPS[str(place)]
             PlantClient(conductor, namespace, node, watch=False).call(f"{node}/{service.removeprefix('~/')}")
@@ -130,20 +131,6 @@ def _move(plant: PlantClient, goal: str | float, *, controlled: bool, control: b
         print(f"{space}: the controller holds it", flush=True)
     else:
         print(f"{space}: upright; held under position control", flush=True)
-
-
-def _find_plant(conductor: Conductor, namespace: str) -> str:
-    """Return the name of the node in a namespace that has an e-stop: that is a plant."""
-
-    def found() -> list[str]:
-        ends = f"/{names.E_STOP.removeprefix('~/')}"
-        return [
-            name.removeprefix(f"{namespace.rstrip('/')}/").removesuffix(ends)
-            for name, _ in conductor.node.get_service_names_and_types()
-            if name.startswith(f"{namespace.rstrip('/')}/") and name.endswith(ends)
-        ]
-
-    return conductor.wait_for(f"a plant in {namespace}", found, _PATIENCE)[0]
 
 
 def main(argv: Sequence[str] | None = None) -> int:

@@ -8,7 +8,7 @@ import shutil
 import subprocess
 import sys
 import tempfile
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -19,7 +19,7 @@ from pendulum_msgs_py.plants.lab_file import EMULATED_BACKENDS, LabFile, load_la
 from pendulum_msgs_py.programs.graph import NodeProgram, ParameterArgument
 from pendulum_msgs_py.programs.terminal import make_console
 
-__all__ = ["RealMachine", "ask_yes", "confirmed", "real_machine", "run_checklist"]
+__all__ = ["RealMachine", "ask_for_running", "ask_yes", "confirmed", "real_machine", "run_checklist"]
 
 _CHECK_TIMEOUT = 120.0
 _EXIT_BUSY = 3
@@ -213,6 +213,39 @@ def ask_yes(
         highlight=False,
         soft_wrap=True,
     )
+    _await_yes(console, yes=yes, read=read)
+
+
+def ask_for_running(
+    places: Sequence[str], domain: int, plan: str, *, yes: bool, read: Callable[[], str] = input
+) -> None:
+    """Ask before plants move that run already; what is behind them only the operator knows.
+
+    Args:
+        places: Their namespaces; where there are none, nobody is asked.
+        domain: ROS domain.
+        plan: What will happen, one sentence or more.
+        yes: The operator has said yes on the command line.
+        read: Reads the answer.
+
+    Raises:
+        FaultError: The answer is another, or nobody can answer.
+    """
+    if not places:
+        return
+    console = make_console(stderr=True, highlight=False)
+    console.print(
+        f"\nThis moves what runs already in {' and '.join(places)} on ROS domain {domain}: it may be a REAL machine.\n"
+        f"{plan}\nLargest torque: what that plant allows. Keep a hand on its motion stop, and nobody in the pendulum's "
+        "plane.",
+        markup=False,
+        highlight=False,
+        soft_wrap=True,
+    )
+    _await_yes(console, yes=yes, read=read)
+
+
+def _await_yes(console: Console, *, yes: bool, read: Callable[[], str]) -> None:
     if yes:
         console.print("(--yes: not asked)", markup=False)
         return

@@ -77,7 +77,10 @@ def record_repeat(
     chosen = repeat_settings(settings, number)
     place = repeat_folder(folder, number)
     if not (place / "hw").exists():
-        run_lockstep(place / "hw", chosen, side="hw", on_wait=on_wait)
+        if chosen.foreign_of("hw") is not None:
+            record_simulation(place / "hw", lockstep_spec(chosen, side="hw"))
+        else:
+            run_lockstep(place / "hw", chosen, side="hw", on_wait=on_wait)
     if not (place / "sim").exists():
         record_simulation(place / "sim", lockstep_spec(chosen, side="sim"))
 

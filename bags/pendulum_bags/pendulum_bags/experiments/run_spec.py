@@ -10,7 +10,7 @@ from typing import Any
 
 from pendulum_bags.experiments.simulation import ForeignSimulation
 from pendulum_bags.runs.run_folder import provenance
-from pendulum_bags.runs.run_record import RUN_RECORD
+from pendulum_bags.runs.run_record import RUN_RECORD, STAND_IN
 from pendulum_lqr.controller import controller_parameters
 from pendulum_lqr.disturbance import DISTURBANCE_SPECS
 from pendulum_msgs_py.contract.angles import UPRIGHT
@@ -131,8 +131,8 @@ class RunSpec:
 
     @property
     def foreign(self) -> ForeignSimulation | None:
-        """The simulation of others; None where ours or the emulated hardware runs."""
-        return ForeignSimulation(self.simulation, self.mapping) if self.simulation and self.side == "sim" else None
+        """The simulation of others, in the place of either; None where ours or the emulated hardware runs."""
+        return ForeignSimulation(self.simulation, self.mapping) if self.simulation else None
 
     @property
     def simulated_time(self) -> bool:
@@ -163,19 +163,19 @@ class RunSpec:
                 lockstep_subscribers=listeners,
                 lockstep_duration=float(self.duration),
             )
-        elif self.side == "hw":
+        elif self.side == "hw" and self.foreign is None:
             loop.update(feedback_watchdog=EMULATOR_WATCHDOG, command_lifetime=EMULATOR_LIFETIME)
         loop.update(self.plant_parameters)
         foreign = self.foreign
         if foreign is None:
             loop.setdefault("plant", _absolute(self.plant))
-        if self.side == "hw":
+        if self.side == "hw" and foreign is None:
             # No hardware is armed by a parameter: the conductor does it, before it becomes the last listener.
             loop.update(initial_position=float(self.theta), seed=self.seed)
             return graph.bridge("/hw", backend="emulator", effort_strategy=self.strategy, **loop)
         loop.update(initial_theta=float(self.theta), armed_at_start=True, paused=True)
         if foreign is not None:
-            return foreign.program("/sim", **loop)
+            return foreign.program(self.namespace, **loop)
         return graph.simulator("/sim", method=self.method, rate_hz=1.0 / self.period, **loop)
 
     def controller_program(self) -> NodeProgram:
@@ -204,15 +204,17 @@ class RunSpec:
     def metadata(self) -> dict[str, Any]:
         """Return what the bag says about its run."""
         values = self.to_json()
+        foreign = self.foreign
         # Told by what it is, not by the path that it was started from.
         del values["simulation"], values["mapping"]
         return {
             RUN_RECORD: {
                 **values,
                 "experiment": self.clock,
-                "plant": self.plant if self.side == "sim" else "emulator",
-                "emulated_plant": self.plant if self.side == "hw" else "",
-                **({} if (foreign := self.foreign) is None else {"simulation": foreign.to_json()}),
+                "plant": self.plant if self.side == "sim" else "emulator" if foreign is None else foreign.label,
+                "emulated_plant": self.plant if self.side == "hw" and foreign is None else "",
+                **({} if foreign is None else {"simulation": foreign.to_json()}),
+                **({STAND_IN: "simulation"} if self.side == "hw" and foreign is not None else {}),
                 "namespace": self.namespace,
                 "disturbance": self.disturbance_parameters(),
                 "controller": {"kind": self.controller, **self.controller_parameters},

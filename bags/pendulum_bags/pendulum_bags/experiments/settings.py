@@ -7,20 +7,23 @@ from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import Any
 
+from pendulum_bags.experiments.graph_plant import PREFIX, GraphPlant, graph_plant
 from pendulum_bags.experiments.operator import RealMachine, real_machine
 from pendulum_bags.experiments.run_spec import EMULATOR_LIFETIME, EMULATOR_WATCHDOG, THESIS_METHOD, integrator_of
 from pendulum_bags.experiments.simulation import ForeignSimulation
 from pendulum_bags.runs.run_folder import provenance
-from pendulum_bags.runs.run_record import RUN_RECORD
+from pendulum_bags.runs.run_record import RUN_RECORD, STAND_IN
 from pendulum_lqr.controller import controller_parameters
 from pendulum_lqr.policy_file import load_policy
 from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.programs import graph
 from pendulum_msgs_py.programs.graph import NodeProgram
+from pendulum_sim.engines import GYMNASIUM_PREFIX
 
 __all__ = ["HARDWARE", "SETTLE_TIME", "TIME_BESIDE_NOISE", "NoiseSettings", "RegulationSettings"]
 
 HARDWARE = ("emulator", "hebi")
+_MODEL_FILES = (".xml", ".mjcf", ".urdf")
 DEFAULT_STRATEGY = "direct_pwm"
 SETTLE_TIME = 1.0
 """Time under control before the noise starts [s]."""
@@ -63,7 +66,8 @@ class RegulationSettings:
 
     Attributes:
         plant: Preset or file of the simulated plant; the controller is designed on it too.
-        hardware: ``emulator``, or ``hebi`` for the machine of a lab file.
+        hardware: ``emulator``, or ``hebi`` for the machine of a lab file; or a second simulation of others (a model
+            file or ``gymnasium:ID``), or a plant that runs already, ``ros:/namespace``.
         lab: The lab file, for ``hebi``.
         effort_strategy: How the actuator turns wanted torque into PWM; it changes the plant that a controller sees.
             Empty for that of the lab file, else ``direct_pwm``; read it from :attr:`strategy`.
@@ -73,8 +77,10 @@ class RegulationSettings:
         noise: The disturbance.
         storage: Storage of the bags.
         method: Integrator of the simulator; Euler as in the thesis, which a plant with motor and spring has not.
-        simulation: A simulation of others in our simulator's place, a model file or ``gymnasium:ID``; empty for ours.
+        simulation: A simulation of others in our simulator's place, a model file, ``gymnasium:ID``, or
+            ``ros:/namespace`` for one that runs already; empty for ours.
         mapping: Its mapping file; empty for none.
+        hardware_mapping: Mapping file of a simulation in the hardware's place; empty for none.
     """
 
     plant: str = "thesis"
@@ -89,19 +95,33 @@ class RegulationSettings:
     lab: str = ""
     simulation: str = ""
     mapping: str = ""
+    hardware_mapping: str = ""
 
     def __post_init__(self) -> None:
         """Refuse unknown plants and backends, and a policy that cannot be read, before anything is started."""
         if self.kind == "policy":
             load_policy(self.controller)
         object.__setattr__(self, "method", integrator_of(self.plant, self.method))
-        if self.hardware not in HARDWARE:
-            raise ParameterError(f"hardware is {self.hardware!r}; expected one of {', '.join(HARDWARE)}")
+        by_name = self.hardware in HARDWARE or self.hardware.startswith((PREFIX, GYMNASIUM_PREFIX))
+        if not by_name and Path(self.hardware).suffix.lower() not in _MODEL_FILES:
+            raise ParameterError(
+                f"hardware is {self.hardware!r}; expected one of {', '.join(HARDWARE)}, a model file "
+                f"({', '.join(_MODEL_FILES)}), gymnasium:ID or ros:/NAMESPACE"
+            )
         real_machine(self.hardware, self.lab)
-        if (foreign := self.foreign) is not None:
-            foreign.check(self.noise.hold_time)
-        elif self.mapping:
-            raise ParameterError(f"mapping is {self.mapping} without a simulation; expected --simulation too")
+        for side, mapping, option in (("sim", self.mapping, "simulation"), ("hw", self.hardware_mapping, "hardware")):
+            if (foreign := self.foreign_of(side)) is not None:
+                foreign.check(self.noise.hold_time)
+            elif mapping:
+                raise ParameterError(
+                    f"mapping is {mapping} without a simulation; expected --{option} FILE or gymnasium:ID too"
+                )
+        if self.hardware not in HARDWARE and self.effort_strategy:
+            raise ParameterError(
+                f"strategy is {self.effort_strategy} for hardware {self.hardware}, which has none; expected it left out"
+            )
+        if self.namespace("sim") == self.namespace("hw"):
+            raise ParameterError(f"both plants are in {self.namespace('sim')}; expected two namespaces")
         defaults = {item.name: item.default for item in fields(self)}
         for name in ("q", "r"):
             if getattr(self, name) != defaults[name] and name not in self.tuning:
@@ -126,8 +146,36 @@ class RegulationSettings:
 
     @property
     def foreign(self) -> ForeignSimulation | None:
-        """The simulation of others; None for ours."""
-        return ForeignSimulation(self.simulation, self.mapping) if self.simulation else None
+        """The simulation of others in the simulator's place; None for ours and for one that runs already."""
+        return self.foreign_of("sim")
+
+    def foreign_of(self, side: str) -> ForeignSimulation | None:
+        """Return the simulation of others that is one side, ``sim`` or ``hw``; None where something else is."""
+        name, mapping = (self.simulation, self.mapping) if side == "sim" else (self.hardware, self.hardware_mapping)
+        if not name or (side == "hw" and name in HARDWARE) or name.startswith(PREFIX):
+            return None
+        return ForeignSimulation(name, mapping)
+
+    def running(self, side: str) -> GraphPlant | None:
+        """Return the plant that runs already as one side, ``sim`` or ``hw``; None where the experiment starts it."""
+        return graph_plant(self.simulation if side == "sim" else self.hardware)
+
+    def namespace(self, side: str) -> str:
+        """Return the namespace of one side's plant."""
+        running = self.running(side)
+        return f"/{side}" if running is None else running.namespace
+
+    @property
+    def is_emulated(self) -> bool:
+        """Whether nothing real can move: the hardware is emulated or simulated, and the experiment starts both."""
+        stands_in = self.hardware_plant == "emulator" or self.foreign_of("hw") is not None
+        return stands_in and self.running("sim") is None
+
+    @property
+    def can_repeat(self) -> bool:
+        """Whether both sides can be recorded again with new noise, in lockstep and without an operator."""
+        stands_in = self.hardware == "emulator" or self.foreign_of("hw") is not None
+        return stands_in and self.running("sim") is None
 
     @property
     def machine(self) -> RealMachine | None:
@@ -144,7 +192,20 @@ class RegulationSettings:
     @property
     def hardware_plant(self) -> str:
         """What a bag names as the hardware's plant: ``emulator``, also for the emulated machine of a lab file."""
+        if (foreign := self.foreign_of("hw")) is not None:
+            return foreign.label
         return "emulator" if self.machine is not None and self.machine.emulated else self.hardware
+
+    def plant_program(self, side: str, bag: Path | None = None) -> NodeProgram | None:
+        """Return the plant of one side in real time; None for one that runs already.
+
+        Args:
+            side: ``sim`` or ``hw``.
+            bag: The hardware's bag: a real one's own log is written beside it.
+        """
+        if self.running(side) is not None:
+            return None
+        return self.simulator_program() if side == "sim" else self.bridge_program(bag)
 
     def simulator_program(self) -> NodeProgram:
         """Return the simulation, ours or that of others, in real time."""
@@ -153,7 +214,13 @@ class RegulationSettings:
         return graph.simulator("/sim", plant=self.plant, method=self.method, clock="realtime")
 
     def bridge_program(self, bag: Path | None = None) -> NodeProgram:
-        """Return the bridge to the actuator; a real one's own log is written beside the bag, where there is one."""
+        """Return the bridge to the actuator, or the simulation in its place.
+
+        Args:
+            bag: A real actuator's own log is written beside it.
+        """
+        if (foreign := self.foreign_of("hw")) is not None:
+            return foreign.program("/hw", clock="realtime")
         # An emulator's feedback is as punctual as this machine, which may be a busy one; a real actuator keeps the
         # default.
         patience: dict[str, graph.ParameterArgument] = {
@@ -174,7 +241,7 @@ class RegulationSettings:
             *("--controller", self.controller, "--q", *map(repr, self.q), "--r", repr(self.r)),
             *("--seed", str(noise.seed), "--amplitude", repr(noise.amplitude), "--hold-time", repr(noise.hold_time)),
             *("--duration", repr(noise.duration), "--storage", self.storage),
-            *(("--simulation", self.simulation) if self.simulation else ()),
+            *(("--simulation", self.simulation) if self.simulation and self.running("sim") is None else ()),
             *(("--mapping", self.mapping) if self.mapping else ()),
         ]
 
@@ -195,8 +262,9 @@ class RegulationSettings:
         }
         return graph.disturbance(namespace, **{**parameters, **changes})
 
-    def metadata(self, experiment: str, **more: Any) -> dict[str, Any]:
-        """Return what a bag says about its run."""
+    def metadata(self, experiment: str, *, side: str = "sim", **more: Any) -> dict[str, Any]:
+        """Return what one side's bag says about its run."""
+        foreign = self.foreign_of(side) if side == "sim" or self.foreign_of("hw") is not None else self.foreign
         return {
             RUN_RECORD: {
                 "experiment": experiment,
@@ -205,7 +273,8 @@ class RegulationSettings:
                 "disturbance": {"kind": "uniform", **asdict(self.noise)},
                 "controller": {"kind": self.kind, **self.tuning},
                 **provenance(),
-                **({} if (foreign := self.foreign) is None else {"simulation": foreign.to_json()}),
+                **({} if foreign is None else {"simulation": foreign.to_json()}),
+                **({STAND_IN: "simulation"} if side == "hw" and self.foreign_of("hw") is not None else {}),
                 **({} if (machine := self.machine) is None else {"lab": dict(machine.lab.values)}),
                 **more,
             }

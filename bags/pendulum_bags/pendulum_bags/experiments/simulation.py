@@ -46,6 +46,11 @@ class ForeignSimulation:
     mapping: str = ""
 
     @property
+    def label(self) -> str:
+        """Name of the file or environment, without the place where it lies."""
+        return Path(self.name).name
+
+    @property
     def parameters(self) -> PlantParameters:
         """The equation that comes closest.
 
@@ -101,7 +106,7 @@ class ForeignSimulation:
         """Return what a bag says about it."""
         facts = _facts(self.name, self.mapping)
         return {
-            "name": Path(self.name).name,
+            "name": self.label,
             "engine": facts.method,
             "mapping": Path(self.mapping).name,
             "period": facts.period,

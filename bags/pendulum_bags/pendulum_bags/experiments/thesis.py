@@ -11,16 +11,17 @@ from pathlib import Path
 
 from pendulum_bags.experiments.conductor_node import Conductor, PlantClient
 from pendulum_bags.experiments.domain import reserve_domain
+from pendulum_bags.experiments.graph_plant import join
 from pendulum_bags.experiments.processes import Child, ProcessSet, ros_environment, start_recorder
 from pendulum_bags.experiments.progress import PhaseProgress
 from pendulum_bags.experiments.repeats import repeat_command
+from pendulum_bags.experiments.run_spec import SIDES
 from pendulum_bags.experiments.settings import SETTLE_TIME, RegulationSettings
 from pendulum_bags.runs.run_folder import write_json
 from pendulum_msgs_py.contract.angles import UPRIGHT
 from pendulum_msgs_py.contract.names import Event
 from pendulum_msgs_py.contract.trajectory import thesis_ramp
 from pendulum_msgs_py.errors import FaultError
-from pendulum_msgs_py.programs.graph import NodeProgram
 
 __all__ = ["run_thesis"]
 
@@ -59,11 +60,8 @@ def run_thesis(
         Conductor(main_domain, watch=processes.check, on_wait=progress.refresh) as conductor,
     ):
         progress.phase("starting", 6.0)
-        _refuse_occupied_domain(conductor)
-        _start(processes, folder, settings)
-        sim = PlantClient(conductor, "/sim", "simulator")
-        hw = PlantClient(conductor, "/hw", "bridge")
-        plants = (sim, hw)
+        _refuse_occupied_domain(conductor, settings)
+        plants = _start(processes, folder, settings, conductor)
         try:
             beside = _conduct(conductor, plants, settings, progress, processes, folder, repeat=repeat)
         finally:
@@ -74,22 +72,31 @@ def run_thesis(
         processes.stop()
 
 
-def _start(processes: ProcessSet, folder: Path, settings: RegulationSettings) -> None:
-    for name, plant in (("sim", settings.plant), ("hw", settings.hardware_plant)):
-        metadata = folder / "logs" / f"{name}_metadata.json"
-        write_json(metadata, settings.metadata("thesis", plant=plant, namespace=f"/{name}"))
-        start_recorder(processes, folder / name, f"/{name}", metadata, settings.storage)
-    for program in _programs(settings, folder):
-        processes.start_node(program, niceness=LOOP_NICENESS)
-
-
-def _programs(settings: RegulationSettings, folder: Path) -> list[NodeProgram]:
-    return [
-        settings.simulator_program(),
-        settings.bridge_program(folder / "hw"),
-        *(settings.controller_program(namespace, autostart=False) for namespace in ("/sim", "/hw")),
-        *(settings.disturbance_program(namespace, autostart=False) for namespace in ("/sim", "/hw")),
+def _start(
+    processes: ProcessSet, folder: Path, settings: RegulationSettings, conductor: Conductor
+) -> tuple[PlantClient, PlantClient]:
+    """Start all programs; return both plants. Those that run already are looked at first, and only looked at."""
+    joined = {side: join(conductor, running) for side in SIDES if (running := settings.running(side)) is not None}
+    for side, plant in (("sim", settings.plant), ("hw", settings.hardware_plant)):
+        metadata = folder / "logs" / f"{side}_metadata.json"
+        namespace = settings.namespace(side)
+        told = settings.simulation if side == "sim" and side in joined else plant
+        write_json(metadata, settings.metadata("thesis", side=side, plant=told, namespace=namespace))
+        start_recorder(processes, folder / side, namespace, metadata, settings.storage)
+    programs = {side: settings.plant_program(side, folder / "hw") for side in SIDES}
+    others = [
+        make(settings.namespace(side), autostart=False)
+        for make in (settings.controller_program, settings.disturbance_program)
+        for side in SIDES
     ]
+    for program in (*programs.values(), *others):
+        if program is not None:
+            processes.start_node(program, niceness=LOOP_NICENESS)
+    sim, hw = (
+        joined[side] if program is None else PlantClient(conductor, settings.namespace(side), program.node_name)
+        for side, program in programs.items()
+    )
+    return sim, hw
 
 
 def _conduct(
@@ -110,7 +117,7 @@ def _conduct(
         plant.arm()
 
     # The ramp leaves the machine idle: the thesis's own simulation runs meanwhile, in a domain of its own.
-    beside = [_start_own_protocol(processes, folder, settings)]
+    beside = [_start_own_protocol(processes, folder, settings)] if settings.running("sim") is None else []
     _wait_for_goal(conductor, plants, _start_move(conductor, plants, UPRIGHT, "ramp_up", progress))
 
     progress.phase("regulation", SETTLE_TIME)
@@ -190,12 +197,13 @@ def _rest(plants: Sequence[PlantClient]) -> None:
         plant.disarm_quietly()
 
 
-def _refuse_occupied_domain(conductor: Conductor) -> None:
+def _refuse_occupied_domain(conductor: Conductor, settings: RegulationSettings) -> None:
+    ours = {settings.namespace(side) for side in SIDES if settings.running(side) is None}
     deadline = time.monotonic() + 0.5
     while time.monotonic() < deadline:
         conductor.spin(0.1)
     for name, namespace in conductor.node.get_node_names_and_namespaces():
-        if namespace in {"/sim", "/hw"}:
+        if namespace in ours:
             raise FaultError(
                 f"ROS domain {conductor.domain} is in use: {namespace}/{name} is already there; "
                 "choose another with --domain"

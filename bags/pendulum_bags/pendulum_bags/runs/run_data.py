@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pendulum_bags.runs.correlation import effective_size
-from pendulum_bags.runs.run_record import run_record
+from pendulum_bags.runs.run_record import STAND_IN, run_record
 from pendulum_bags.runs.series import Series, Signal, unwrap_near_upright
 from pendulum_msgs_py.contract import names
 from pendulum_msgs_py.contract.names import Event
@@ -214,8 +214,9 @@ def plant_summary(run: RunData) -> dict[str, Any]:
 
 
 def is_emulated(run: RunData) -> bool:
-    """Return whether the run says that an emulator stood in for the hardware."""
-    return run_record(run.metadata).get("plant") == "emulator"
+    """Return whether the run says that an emulator, or a second simulation, stood in for the hardware."""
+    told = run_record(run.metadata)
+    return told.get("plant") == "emulator" or STAND_IN in told
 
 
 def noise_hold_time(run: RunData) -> float | None:

@@ -5,10 +5,12 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-__all__ = ["RUN_RECORD", "run_record"]
+__all__ = ["RUN_RECORD", "STAND_IN", "run_record"]
 
 RUN_RECORD = "pendulum.run"
 """Name of the record among a bag's metadata; ``RunSpec`` and the settings of experiments write it."""
+STAND_IN = "stand_in"
+"""Entry of the record that says what stood in for the hardware: ``simulation``, where a second one did."""
 
 
 def run_record(metadata: Mapping[str, Any]) -> Mapping[str, Any]:

@@ -1,4 +1,4 @@
-"""``convert``, ``merge``, ``cut`` and ``filter``: bags made of bags."""
+"""``convert``: bag to another storage; ``merge``: bags in one; ``cut``: a stretch of one; ``filter``: a few topics."""
 
 from __future__ import annotations
 

@@ -1,0 +1,107 @@
+"""A plant that runs on the graph already, as one side of an experiment: somebody else started it, and will end it."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+from pendulum_msgs_py.contract import names
+from pendulum_msgs_py.errors import FaultError, ParameterError
+
+if TYPE_CHECKING:
+    from pendulum_bags.experiments.conductor_node import Conductor, PlantClient
+
+__all__ = ["PREFIX", "GraphPlant", "find_plant", "graph_plant", "join"]
+
+PREFIX = "ros:"
+_NAMESPACE = re.compile(r"(?:/[A-Za-z][A-Za-z0-9_]*)+")
+_PATIENCE = 20.0
+"""Longest wait for a node that is to answer [s]."""
+_HALF_TURN = 3.15
+"""Farthest from hanging at 0 that a ramp to upright starts, with room for noise [rad]."""
+_COMMANDS = (names.EFFORT_COMMAND, names.DISTURBANCE, names.JOINT_TRAJECTORY)
+_OURS = ("controller", "disturbance", "recorder")
+"""Names of the nodes that an experiment starts beside a plant."""
+
+
+@dataclass(frozen=True)
+class GraphPlant:
+    """A plant behind the contract, ours or one that ``adopt`` stands before, which this experiment does not start.
+
+    Attributes:
+        namespace: Namespace of its topics, such as ``/lab``.
+    """
+
+    namespace: str
+
+
+def graph_plant(name: str) -> GraphPlant | None:
+    """Return the plant that ``ros:/namespace`` names; None for other names.
+
+    Raises:
+        ParameterError: What follows is no namespace.
+    """
+    if not name.startswith(PREFIX):
+        return None
+    namespace = name.removeprefix(PREFIX)
+    if not _NAMESPACE.fullmatch(namespace):
+        raise ParameterError(f"plant is {name!r}; expected {PREFIX}/NAMESPACE of a running plant, such as {PREFIX}/lab")
+    return GraphPlant(namespace)
+
+
+def find_plant(conductor: Conductor, namespace: str, patience: float = _PATIENCE) -> str:
+    """Return the name of the node in a namespace that has an e-stop: that is a plant.
+
+    Raises:
+        FaultError: There is none.
+    """
+    space = namespace.rstrip("/")
+
+    def found() -> list[str]:
+        ends = f"/{names.E_STOP.removeprefix('~/')}"
+        return [
+            name.removeprefix(f"{space}/").removesuffix(ends)
+            for name, _ in conductor.node.get_service_names_and_types()
+            if name.startswith(f"{space}/") and name.endswith(ends)
+        ]
+
+    return conductor.wait_for(f"a plant in {namespace}", found, patience)[0]
+
+
+def join(conductor: Conductor, plant: GraphPlant) -> PlantClient:
+    """Return a client of a running plant that is at rest and that nobody else commands.
+
+    Args:
+        conductor: Who conducts.
+        plant: The plant; whatever is found, nothing is sent to it.
+
+    Raises:
+        FaultError: There is no such plant, somebody else commands it, it is armed, or it does not hang near 0.
+    """
+    from pendulum_bags.experiments.conductor_node import PlantClient
+
+    space = plant.namespace
+    node = find_plant(conductor, space)
+    for name, namespace in conductor.node.get_node_names_and_namespaces():
+        if namespace == space and name in _OURS:
+            raise FaultError(f"{space}/{name} runs already, and this experiment starts its own; end that one first")
+    for topic in _COMMANDS:
+        if count := conductor.node.count_publishers(f"{space}/{topic}"):
+            raise FaultError(
+                f"{space}/{topic} has {count} publisher{'s' * (count > 1)}: somebody else commands this plant; "
+                "expected nobody"
+            )
+    client = PlantClient(conductor, space, node)
+    client.wait_until_ready(_PATIENCE, controller=False, disturbance=False)
+    # What is on the graph by then has been met: what it says of itself is no older than its services.
+    conductor.spin(0.5)
+    if client.is_armed():
+        raise FaultError(f"{space} is armed already; expected it at rest: disarm it first")
+    assert client.sample is not None
+    if abs(client.sample.position) > _HALF_TURN:
+        raise FaultError(
+            f"{space} is at {client.sample.position:.2f} rad; expected it within half a turn of hanging at 0: "
+            "reset its zero"
+        )
+    return client

@@ -1,0 +1,128 @@
+"""``pendulum``: every program of the project behind one name, listed by what one wants to know or do."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Sequence
+from difflib import get_close_matches
+
+from pendulum_msgs_py.programs import completion
+from pendulum_msgs_py.programs.executables import (
+    EXIT_USAGE,
+    print_completion,
+    print_text,
+    run_program,
+    summary,
+    tables_of,
+)
+
+__all__ = ["SECTIONS", "main"]
+
+SECTIONS: dict[str, dict[str, str]] = {
+    "Is a simulation good enough to design a controller on?": {
+        "experiment": "pendulum_bags experiment",
+        "compare": "pendulum_bags compare",
+        "frequency_response": "pendulum_bags frequency_response",
+        "ranking": "pendulum_bags ranking",
+        "report": "pendulum_bags report",
+        "analyse": "pendulum_bags analyse",
+    },
+    "Parameters and controllers": {
+        "excite": "pendulum_bags excite",
+        "identify": "pendulum_bags identify",
+        "replay": "pendulum_bags replay",
+        "design": "pendulum_lqr design",
+        "train": "pendulum_bags train",
+    },
+    "See, move and stop what runs": {
+        "console": "pendulum_bags console",
+        "move": "pendulum_bags move",
+        "viewer": "pendulum_sim viewer",
+        "phase_plot": "pendulum_sim phase_plot",
+        "markers": "pendulum_sim markers",
+    },
+    "Plants": {
+        "simulator": "pendulum_sim simulator",
+        "mujoco": "pendulum_sim mujoco",
+        "gymnasium": "pendulum_sim gymnasium",
+        "adopt": "pendulum_sim adopt",
+        "bridge": "pendulum_hw_bridge bridge",
+        "export_model": "pendulum_sim export_model",
+    },
+    "Who commands a plant": {
+        "controller": "pendulum_lqr controller",
+        "disturbance": "pendulum_lqr disturbance",
+        "effort_adapter": "pendulum_lqr effort_adapter",
+    },
+    "A real actuator, and one that is emulated": {
+        "scan": "pendulum_hw_bridge scan",
+        "lab": "pendulum_hw_bridge lab",
+        "check": "pendulum_hw_bridge check",
+        "procedure": "pendulum_hw_bridge procedure",
+        "emulator": "pendulum_hw_bridge emulator",
+        "emulator_fault": "pendulum_hw_bridge emulator_fault",
+        "emulator_hand": "pendulum_hw_bridge emulator_hand",
+        "convert_log": "pendulum_hw_bridge convert",
+    },
+    "Recordings": {
+        "record": "pendulum_bags record",
+        "play": "pendulum_bags play",
+        "info": "pendulum_bags info",
+        "export": "pendulum_bags export",
+        "repair": "pendulum_bags repair",
+        "convert": "pendulum_bags convert",
+        "merge": "pendulum_bags merge",
+        "cut": "pendulum_bags cut",
+        "filter": "pendulum_bags filter",
+    },
+    "Teach": {"course": "pendulum_bags course"},
+}
+"""Heading -> command -> package and program."""
+_EXAMPLES = (
+    "pendulum experiment thesis --seed 7",
+    "pendulum compare bags/examples/regulation_sim bags/examples/regulation_hw",
+    "pendulum design --preset thesis",
+    "pendulum simulator --ros-args -r __ns:=/sim -p plant:=x5_9",
+)
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run ``pendulum COMMAND ARGUMENTS`` and return the exit code.
+
+    What follows the command is the program's own and handed on untouched, arguments of ROS among it. Nothing but that
+    program is imported.
+
+    Args:
+        argv: Arguments; by default those of the process.
+    """
+    arguments = list(sys.argv[1:] if argv is None else argv)
+    commands = {name: target for section in SECTIONS.values() for name, target in section.items()}
+    if completion.asked() and len(arguments) < 2:
+        print_text("\n".join(completion.of_package(commands, arguments)))
+        return 0
+    if arguments and arguments[0] == "--completion":
+        return print_completion(arguments[1:])
+    if not arguments or arguments[0] in {"-h", "--help"}:
+        print_text(_help())
+        return 0 if arguments else EXIT_USAGE
+    name, *rest = arguments
+    if name not in commands:
+        near = get_close_matches(name, commands, n=1)
+        hint = f"; did you mean {near[0]!r}?" if near else ""
+        print(f"error: there is no command {name!r}; expected one that pendulum --help lists{hint}", file=sys.stderr)
+        return EXIT_USAGE
+    package, program = commands[name].split()
+    return run_program(tables_of(package)[program], rest, called_as=f"pendulum {name}")
+
+
+def _help() -> str:
+    width = max(len(name) for section in SECTIONS.values() for name in section)
+    lines = ["usage: pendulum COMMAND [ARGUMENTS]"]
+    for heading, section in SECTIONS.items():
+        lines += ["", heading]
+        for name, target in section.items():
+            package, program = target.split()
+            lines.append(f"  {name:<{width}}  {summary(program, tables_of(package)[program])}".rstrip())
+    lines += ["", "Examples:", *(f"  {example}" for example in _EXAMPLES)]
+    lines += ["", "pendulum COMMAND --help has more of each. Completion with the Tab key, in bash or zsh:"]
+    return "\n".join([*lines, "  source <(pendulum --completion bash)"])

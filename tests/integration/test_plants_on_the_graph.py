@@ -1,0 +1,95 @@
+"""Plants that run already as sides of an experiment: looked at first, armed by a yes alone, and left running."""
+
+from __future__ import annotations
+
+import json
+import math
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from pendulum_msgs_py.plants.plant_parameters import load_plant
+from pendulum_rosbag.reader import read_bag
+from pendulum_sim.model_files import mjcf
+from tests.plant_peer import PlantPeer
+from tests.processes import ProcessGroup, RunningProgram
+
+pytest.importorskip("mujoco")
+
+ROBOT = Path(__file__).with_name("plain_plant.py")
+
+
+@pytest.fixture
+def peer(domain_id: int) -> Iterator[PlantPeer]:
+    peer = PlantPeer("/lab")
+    yield peer
+    peer.close()
+
+
+def experiment(processes: ProcessGroup, domain: int, out: Path, *arguments: str | Path) -> RunningProgram:
+    told = ("thesis", "--out", out, "--domain", domain, "--duration", "1", "--budget", "0", *arguments)
+    return processes.start("pendulum_bags", "experiment", *told)
+
+
+@pytest.mark.timeout(200)
+def test_an_adopted_plant_is_compared_with_a_model_file_and_goes_on_running(
+    processes: ProcessGroup, domain_id: int, peer: PlantPeer, tmp_path: Path
+) -> None:
+    model = tmp_path / "model.xml"
+    model.write_text(mjcf(load_plant("thesis")), encoding="utf-8")
+    robot = processes.start_command([sys.executable, str(ROBOT)], name="robot")
+    told = {
+        "states": "/robot/joint_states", "commands": "/robot/effort_controller/commands", "joint": "shoulder",
+        "command_index": 1, "command_size": 2, "sign": -1, "zero": -math.pi / 2.0, "state_timeout": 0.5,
+    }  # fmt: skip
+    arguments = [item for name, value in told.items() for item in ("-p", f"{name}:={value}")]
+    adopter = processes.start("pendulum_sim", "adopt", "--ros-args", "-r", "__ns:=/lab", *arguments)
+    peer.until(lambda: peer.states and peer.diagnostics.get("mode"), "the adopted plant")
+    peer.leave_the_command()
+    out = tmp_path / "run"
+
+    run = experiment(processes, domain_id, out, "--simulation", model, "--hardware", "ros:/lab", "--yes")
+
+    assert run.wait(150.0) == 0, run.output
+    asked = "This moves what runs already in /lab on ROS domain"
+    assert asked in run.output
+    assert run.output.index(asked) < run.output.index("starting")
+    summary = json.loads((out / "summary.json").read_text())
+    assert (summary["hardware"], summary["emulated"]) == ("ros:/lab", False)
+    with read_bag(out / "hw") as bag:
+        # Nobody knows more of it than its name.
+        assert bag.metadata["pendulum.run"]["plant"] == "ros:/lab"
+        assert "stand_in" not in bag.metadata["pendulum.run"]
+        assert bag["/lab/joint_states"]["position"].max() == pytest.approx(math.pi, abs=0.1)
+    peer.until(lambda: peer.diagnostics.get("mode") == "disarmed", "the end")
+    assert (robot.returncode, adopter.returncode) == (None, None)
+    assert peer.states[-1].position[0] == pytest.approx(0.0, abs=0.1)
+
+
+def test_a_plant_that_is_armed_or_commanded_or_not_there_is_left_alone(
+    processes: ProcessGroup, domain_id: int, peer: PlantPeer, tmp_path: Path
+) -> None:
+    processes.start("pendulum_sim", "simulator", "--ros-args", "-r", "__ns:=/lab")
+    peer.until(lambda: peer.diagnostics.get("mode") == "disarmed", "the plant")
+    out = tmp_path / "run"
+    lab = ("--hardware", "ros:/lab")
+
+    unasked = experiment(processes, domain_id, out, *lab)
+    assert unasked.wait(60.0) == 2
+    assert "nobody is there to say yes; expected a terminal, or --yes; nothing was started" in unasked.output
+
+    commanded = experiment(processes, domain_id, out, *lab, "--yes")
+    assert commanded.wait(60.0) == 2
+    assert "/lab/effort_command has 1 publisher: somebody else commands this plant" in commanded.output
+
+    peer.leave_the_command()
+    assert peer.arm().success
+    armed = experiment(processes, domain_id, out, *lab, "--yes")
+    assert armed.wait(60.0) == 2
+    assert "/lab is armed already; expected it at rest" in armed.output
+    peer.spin(0.2)
+    # Whoever armed it has it still: a refusal disarms nobody's plant.
+    assert peer.diagnostics["mode"].startswith("armed")
+    assert not (out / "hw").exists()
