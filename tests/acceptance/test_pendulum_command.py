@@ -39,7 +39,7 @@ def test_help_says_what_each_command_is_for_and_how_to_go_on(capsys: pytest.Capt
     text = capsys.readouterr().out
     lines = {line.split()[0]: line for line in text.splitlines() if line.startswith("  ")}
     assert COMMANDS.keys() <= lines.keys()
-    assert [name for name in COMMANDS if len(lines[name].split(maxsplit=1)[1]) < 12] == []
+    assert [name for name in COMMANDS if len(lines[name].split(maxsplit=1)[1]) < 10] == []
     assert max(map(len, text.splitlines())) <= 120
     assert "pendulum experiment thesis --seed 7" in text
     assert "source <(pendulum --completion bash)" in text

@@ -71,7 +71,7 @@ def test_an_adopted_plant_is_compared_with_a_model_file_and_goes_on_running(
 def test_a_plant_that_is_armed_or_commanded_or_not_there_is_left_alone(
     processes: ProcessGroup, domain_id: int, peer: PlantPeer, tmp_path: Path
 ) -> None:
-    processes.start("pendulum_sim", "simulator", "--ros-args", "-r", "__ns:=/lab")
+    processes.start("pendulum_sim", "simulator", "--ros-args", "-r", "__ns:=/lab", "-p", "armed_at_start:=false")
     peer.until(lambda: peer.diagnostics.get("mode") == "disarmed", "the plant")
     out = tmp_path / "run"
     lab = ("--hardware", "ros:/lab")

@@ -97,7 +97,10 @@ def join(conductor: Conductor, plant: GraphPlant) -> PlantClient:
     # What is on the graph by then has been met: what it says of itself is no older than its services.
     conductor.spin(0.5)
     if client.is_armed():
-        raise FaultError(f"{space} is armed already; expected it at rest: disarm it first")
+        raise FaultError(
+            f"{space} is armed already; expected it at rest and disarmed (a pendulum that nobody else uses: "
+            f"python -m pendulum_bags move down --namespace {space})"
+        )
     assert client.sample is not None
     if abs(client.sample.position) > _HALF_TURN:
         raise FaultError(
