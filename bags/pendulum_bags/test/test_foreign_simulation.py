@@ -169,6 +169,11 @@ def test_a_plant_that_runs_already_is_started_by_nobody_and_measured_once() -> N
     assert not RegulationSettings(simulation="ros:/a").can_repeat
 
 
+def test_nobody_keeps_a_running_plant_in_step(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert experiment_cli.main(["lockstep", "--bag", str(tmp_path / "bag"), "--simulation", "ros:/lab"]) == 2
+    assert "simulation is ros:/lab, which runs already" in capsys.readouterr().err
+
+
 @pytest.mark.parametrize(
     ("arguments", "sentence"),
     [

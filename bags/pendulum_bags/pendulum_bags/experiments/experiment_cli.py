@@ -16,6 +16,7 @@ from rich.console import Console
 
 from pendulum_bags.comparison.compare_cli import MarginOption, MarginsFile
 from pendulum_bags.experiments.domain import check_domain
+from pendulum_bags.experiments.graph_plant import PREFIX as GRAPH_PREFIX
 from pendulum_bags.experiments.operator import ask_for_running, confirmed
 from pendulum_bags.experiments.progress import PhaseProgress
 from pendulum_bags.experiments.run_spec import SIDES
@@ -233,6 +234,10 @@ def lockstep(
 
     if side not in {"sim", "hw"}:
         raise ParameterError(f"side is {side!r}; expected sim or hw")
+    if simulation.startswith(GRAPH_PREFIX):
+        raise ParameterError(
+            f"simulation is {simulation}, which runs already; expected one that this command starts, in its own time"
+        )
     settings = RegulationSettings(
         plant=plant,
         simulation=simulation,

@@ -130,10 +130,10 @@ def record_run(
         if not simulated:
             _keep_time(conductor, client, spec, processes, recorder)
             return bag
-        if spec.side == "hw":
+        if spec.has_bridge:
             client.arm()
         client.watch()
-        if spec.side == "sim":
+        if not spec.has_bridge:
             client.resume(_START_TIMEOUT)
         conductor.wait_for(
             f"{spec.duration:g} s of simulated time",
@@ -148,7 +148,7 @@ def _keep_time(conductor: Conductor, plant: PlantClient, spec: RunSpec, processe
     """Let a run in real time go, wait for its length by the plant's clock, and put the plant to rest."""
     plant.watch()
     try:
-        if spec.side == "hw":
+        if spec.has_bridge:
             plant.arm()
         else:
             plant.resume(_START_TIMEOUT)

@@ -96,7 +96,7 @@ class RunSpec:
         if self.clock not in CLOCKS:
             raise ParameterError(f"clock is {self.clock!r}; expected lockstep or realtime")
         off_rest = min(abs(self.theta), abs(self.theta - UPRIGHT))
-        if self.clock == "realtime" and self.side == "hw" and off_rest > _AT_REST:
+        if self.clock == "realtime" and self.has_bridge and off_rest > _AT_REST:
             # Nobody holds it between its start and the moment in which it is armed.
             raise ParameterError(
                 f"start angle is {self.theta} rad; expected upright or bottom, where a machine in real time is at rest"
@@ -135,6 +135,11 @@ class RunSpec:
         return ForeignSimulation(self.simulation, self.mapping) if self.simulation else None
 
     @property
+    def has_bridge(self) -> bool:
+        """Whether the plant is the bridge, which no parameter arms; a simulator starts armed and paused."""
+        return self.side == "hw" and not self.simulation
+
+    @property
     def simulated_time(self) -> bool:
         """Whether time is that of the plant and not that of the wall."""
         return self.clock == "lockstep"
@@ -163,13 +168,13 @@ class RunSpec:
                 lockstep_subscribers=listeners,
                 lockstep_duration=float(self.duration),
             )
-        elif self.side == "hw" and self.foreign is None:
+        elif self.has_bridge:
             loop.update(feedback_watchdog=EMULATOR_WATCHDOG, command_lifetime=EMULATOR_LIFETIME)
         loop.update(self.plant_parameters)
         foreign = self.foreign
         if foreign is None:
             loop.setdefault("plant", _absolute(self.plant))
-        if self.side == "hw" and foreign is None:
+        if self.has_bridge:
             # No hardware is armed by a parameter: the conductor does it, before it becomes the last listener.
             loop.update(initial_position=float(self.theta), seed=self.seed)
             return graph.bridge("/hw", backend="emulator", effort_strategy=self.strategy, **loop)
