@@ -171,8 +171,9 @@ def audit(
     else:
         looked_up, findings = from_pip_audit(_ask_pip_audit(program, locks))
         if not looked_up:
+            names = ", ".join(lock.name for lock in locks)
             raise DataError(
-                f"none of the {len(pins)} pins of {', '.join(lock.name for lock in locks)} could be looked up: PyPI's data on "
+                f"none of the {len(pins)} pins of {names} could be looked up: PyPI's data on "
                 "vulnerabilities (https://pypi.org/pypi/NAME/VERSION/json) cannot be reached from here; "
                 "nothing was audited"
             )
