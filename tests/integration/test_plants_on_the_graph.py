@@ -29,7 +29,7 @@ def peer(domain_id: int) -> Iterator[PlantPeer]:
 
 
 def experiment(processes: ProcessGroup, domain: int, out: Path, *arguments: str | Path) -> RunningProgram:
-    told = ("thesis", "--out", out, "--domain", domain, "--duration", "1", "--budget", "0", *arguments)
+    told = ("thesis", "--out", out, "--domain", str(domain), "--duration", "1", "--budget", "0", *arguments)
     return processes.start("pendulum_bags", "experiment", *told)
 
 

@@ -32,6 +32,7 @@ SECTIONS: dict[str, dict[str, str]] = {
         "identify": "pendulum_bags identify",
         "replay": "pendulum_bags replay",
         "design": "pendulum_lqr design",
+        "swing_up": "pendulum_lqr swing_up",
         "train": "pendulum_bags train",
     },
     "See, move and stop what runs": {
