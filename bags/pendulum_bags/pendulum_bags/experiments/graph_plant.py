@@ -102,9 +102,10 @@ def join(conductor: Conductor, plant: GraphPlant) -> PlantClient:
             f"python -m pendulum_bags move down --namespace {space})"
         )
     assert client.sample is not None
-    if abs(client.sample.position) > _HALF_TURN:
+    if (count := len(client.sample.position)) != 1:
+        raise FaultError(f"{space} has {count} joints; expected the one of a pendulum")
+    if abs(angle := client.sample.position[0]) > _HALF_TURN:
         raise FaultError(
-            f"{space} is at {client.sample.position:.2f} rad; expected it within half a turn of hanging at 0: "
-            "reset its zero"
+            f"{space} is at {angle:.2f} rad; expected it within half a turn of hanging at 0: reset its zero"
         )
     return client
