@@ -6,7 +6,9 @@ from pathlib import Path
 
 import pytest
 
-from tests.acceptance.first_day import PAGE, Day, live_through, skeleton, steps_of, text_of
+from tests.acceptance.first_day import live_through
+from tests.acceptance.first_day_bench import Day
+from tests.acceptance.first_day_page import PAGE, skeleton, steps_of, text_of
 from tests.processes import ProcessGroup
 
 

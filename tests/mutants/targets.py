@@ -60,7 +60,7 @@ TARGETS: tuple[Target, ...] = (
     Target(
         "pendulum_hw_bridge.safety",
         ("SafetyMonitor", "_or_zero", "_same"),
-        (f"{_BRIDGE}/test_safety_monitor.py",),
+        (f"{_BRIDGE}/test_safety_monitor.py", f"{_BRIDGE}/test_safety_commands.py"),
     ),
     Target("pendulum_hw_bridge.motor_state", ("MotorWatch",), (f"{_BRIDGE}/test_motor_state.py",)),
     Target(
