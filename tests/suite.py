@@ -38,6 +38,8 @@ _KEEPS_TIME = (
 _COMPUTES = (
     "tests/acceptance/test_readme.py",
     "tests/acceptance/test_docs.py",
+    "pendulum_sim/test/test_batch.py",
+    "pendulum_sim/test/test_mechanism_batch.py",
     "bags/pendulum_bags/test/test_identification_intervals.py",
     "bags/pendulum_bags/test",
     "tests",

@@ -33,6 +33,7 @@ __all__ = [
     "design_figures",
     "phase_portrait_figure",
     "pole_map_figure",
+    "region_to_show",
     "root_locus_figure",
     "step_figure",
 ]
@@ -260,6 +261,29 @@ def phase_portrait_figure(plant: RigidPlant, gain: Gain, effort_limit: float, re
     return figure
 
 
+def region_to_show(
+    plant: RigidPlant, model: LinearModel, gain: Gain, effort_limit: float, *, points: int = 91
+) -> Region:
+    """Return the region of attraction of a loop with two states, over the speeds that are worth showing.
+
+    Args:
+        plant: Plant parameters.
+        model: Linear model, upright.
+        gain: LQR gain.
+        effort_limit: Torque limit [N m].
+        points: Angles, and velocities, that are simulated.
+    """
+    # Those of a free fall, unless damping stops the pendulum long before.
+    span = 1.2 * math.sqrt(4.0 * max(plant.gravity, 1e-6) / plant.inertia)
+    if plant.damping > 0.0:
+        span = min(span, 3.0 * effort_limit / plant.damping)
+    # At its limit the torque no longer hurries what the plant does by itself: its own slow pole sets the time.
+    slowest = analyse(model, gain.K).time_constant
+    duration = min(max(10.0 * slowest, 10.0 / max(float(model.poles[0].real), 1e-6), 4.0), 100.0)
+    rollout = rigid_rollout(plant, gain, effort_limit, duration)
+    return region_of_attraction(plant, gain, effort_limit, rollout, velocity_span=span, points=points)
+
+
 def design_figures(
     plant: RigidPlant,
     model: LinearModel,
@@ -278,28 +302,14 @@ def design_figures(
     """
     gains = {label: gain.K for label, gain in rows}
     gain = rows[chosen][1]
-    report = analyse(model, gain.K)
     figures = {
         "pole_map": pole_map_figure(model, gains),
         "root_locus": root_locus_figure(model, gain.K),
         "bode": bode_figure(model, gain.K),
-        "step_response": step_figure(model, gains, report),
+        "step_response": step_figure(model, gains, analyse(model, gain.K)),
     }
     # Plane and proof are those of two states.
     if model.theta == UPRIGHT and not model.hidden:
-        # Speeds worth showing: those of a free fall, unless damping stops the pendulum long before.
-        span = 1.2 * math.sqrt(4.0 * max(plant.gravity, 1e-6) / plant.inertia)
-        if plant.damping > 0.0:
-            span = min(span, 3.0 * effort_limit / plant.damping)
-        # At its limit the torque no longer hurries what the plant does by itself: its own slow pole sets the time.
-        duration = min(max(10.0 * report.time_constant, 10.0 / max(float(model.poles[0].real), 1e-6), 4.0), 100.0)
-        region = region_of_attraction(
-            plant,
-            gain,
-            effort_limit,
-            rigid_rollout(plant, gain, effort_limit, duration),
-            velocity_span=span,
-            points=91,
-        )
+        region = region_to_show(plant, model, gain, effort_limit)
         figures["phase_portrait"] = phase_portrait_figure(plant, gain, effort_limit, region)
     return figures
