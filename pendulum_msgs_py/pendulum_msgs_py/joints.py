@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -91,17 +90,6 @@ class Coordinates:
         return tuple(
             wrap(q - g) if joint.turns else q - g for joint, q, g in zip(self.joints, position, wanted, strict=True)
         )
-
-    def features(self, position: Sequence[float]) -> Vector:
-        """Return (sin, cos) of each joint that turns and the position of each that slides, for learning.
-
-        Args:
-            position: n positions [rad or m].
-        """
-        values: list[float] = []
-        for joint, q in zip(self.joints, position, strict=True):
-            values += [math.sin(q), math.cos(q)] if joint.turns else [q]
-        return tuple(values)
 
     def spread(self, effort: Sequence[float]) -> Vector:
         """Return m efforts of the driven joints as n, zero at passive joints [N m or N].

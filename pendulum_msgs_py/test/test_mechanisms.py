@@ -111,7 +111,6 @@ def test_the_chain_that_is_drawn_hangs_down_at_zero_and_stands_at_the_goal(name:
 def test_only_what_turns_is_wrapped() -> None:
     coordinates = load_mechanism("cart_pole").coordinates
     assert coordinates.deviation((7.0, math.pi + 2.0 * math.pi)) == pytest.approx((7.0, 0.0))
-    assert coordinates.features((7.0, math.pi)) == pytest.approx((7.0, 0.0, -1.0))
     assert coordinates.names == ("cart", "pole")
     assert coordinates.driven_names == ("cart",)
 
