@@ -95,7 +95,8 @@ mutants: venv # Break the safety rules in every small way; fail if no test notic
 # The lock covers CPython 3.10 to 3.12 at once. All layers are compiled together first, for one version of each package;
 # then each by itself on those versions, less what `run` has. The peers of the benchmarks come last, less what all have.
 LOCK := $(VENV)/.uv/bin/uv pip compile --quiet --universal --python-version 3.10 --generate-hashes --no-header --no-annotate --no-emit-index-url
-without = $$(sed -n 's/^\([A-Za-z0-9._-]*\)==.*/--no-emit-package \1/p' $(1))
+# What a lock has everywhere: without a marker, or with several that share the versions of Python among them.
+without = $$(awk -F== '/^[A-Za-z0-9]/ {n[$$1] += $$2 ~ /;/ ? 1 : 2} END {for (p in n) if (n[p] > 1) print "--no-emit-package " p}' $(1))
 
 lock: $(VENV)/.made # Compile requirements/*.in into requirements/*.txt with hashes (ARGS=--upgrade renews the versions)
 	@test -x $(VENV)/.uv/bin/uv || { $(PY) -m venv $(VENV)/.uv && $(VENV)/.uv/bin/pip --quiet --quiet --disable-pip-version-check install uv; }
@@ -105,7 +106,8 @@ lock: $(VENV)/.made # Compile requirements/*.in into requirements/*.txt with has
 	  if [ $$layer = run ]; then set --; else set -- $(call without,requirements/run.txt); fi; \
 	  $(LOCK) requirements/$$layer.in --constraint build/lock.txt --output-file requirements/$$layer.txt "$$@" || exit 1; \
 	done
-	@$(LOCK) $(ARGS) requirements/bench.in --constraint build/lock.txt --output-file requirements/bench.txt $(call without,build/lock.txt)
+	@$(LOCK) $(ARGS) requirements/bench.in --constraint build/lock.txt --output-file requirements/bench.txt \
+	  $$(sed -n 's/^\([A-Za-z0-9._-]*\)==.*/--no-emit-package \1/p' build/lock.txt)
 
 audit: $(VENV)/.linked # Look the locked versions up for known vulnerabilities (ARGS="--advisories all.zip" without a network)
 	@test -x $(VENV)/.audit/bin/pip-audit || { $(PY) -m venv $(VENV)/.audit && $(VENV)/.audit/bin/pip --quiet --quiet --disable-pip-version-check install pip-audit; }

@@ -46,10 +46,26 @@ def test_all_layers_have_one_version_of_each_package(machine: dict[str, str]) ->
 
 @pytest.mark.parametrize("layer", LAYERS)
 def test_a_layer_holds_what_it_is_asked_for_and_nothing_that_the_first_has(layer: str) -> None:
-    names = {canonicalize_name(pin.name) for pin in pins(layer)}
-    first = {canonicalize_name(pin.name) for pin in pins("run")}
+    names, first = (set(installed(each, MACHINES[3])) for each in (layer, "run"))
     assert {canonicalize_name(asked.name) for asked in requirements(layer)} <= names | first
     assert layer == "run" or not names & first
+
+
+@pytest.mark.parametrize("layer", LAYERS)
+def test_a_layer_and_the_first_hold_all_that_their_packages_need(layer: str) -> None:
+    machine = {
+        "python_version": "{}.{}".format(*sys.version_info),
+        "python_full_version": "{}.{}.{}".format(*sys.version_info),
+        "sys_platform": sys.platform,
+    }
+    there = {**installed("run", machine), **installed(layer, machine)}
+    missing = []
+    for name in there:
+        for entry in map(Requirement, requires(name) or []):
+            needed = entry.marker is None or entry.marker.evaluate({"extra": ""})
+            if needed and canonicalize_name(entry.name) not in there:
+                missing.append(f"{entry.name} of {name}")
+    assert missing == []
 
 
 def test_what_an_experiment_installs_stays_small() -> None:
