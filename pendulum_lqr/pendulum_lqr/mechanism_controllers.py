@@ -17,8 +17,10 @@ from pendulum_msgs_py.plants.mechanism_parameters import MechanismParameters
 
 __all__ = ["default_catch", "make_mechanism_controller", "mechanism_controller_names", "stored_trajectory"]
 
-_WEIGHTS = ((10.0, 10.0, 1.0, 1.0), 1.0)
-"""Of the LQR that catches and of the tracking, for mechanisms of two joints."""
+_CALM = ((1.0, 1.0, 0.1, 0.1), 100.0)
+"""Weights of catch and tracking behind a swing-up, for two joints: low gains, which bear 38 ms of unknown delay."""
+_TUBE = 100.0
+"""Width of the tube about a swing-up, which such gains need beside a plant that differs."""
 
 
 def stored_trajectory(plant: MechanismParameters) -> MechanismTrajectory:
@@ -37,13 +39,20 @@ def stored_trajectory(plant: MechanismParameters) -> MechanismTrajectory:
 
 def default_catch(plant: MechanismParameters) -> MechanismCatch:
     """Return the LQR that catches, with its sampled region."""
-    weights = plant.mechanism.weights if len(plant.joints) != 2 else _WEIGHTS
-    return make_mechanism_catch(plant, *weights)
+    return make_mechanism_catch(plant, *plant.mechanism.weights)
+
+
+def _followed(
+    plant: MechanismParameters, period: float, catch: MechanismCatch, recover: MechanismController | None
+) -> MechanismController:
+    trajectory = stored_trajectory(plant)
+    return MechanismTvlqr(
+        plant, period, trajectory, catch, q=_CALM[0], r=_CALM[1], recover=recover, tube=_TUBE
+    )  # fmt: skip
 
 
 def _tvlqr(plant: MechanismParameters, period: float) -> MechanismController:
-    catch = default_catch(plant)
-    return MechanismTvlqr(plant, period, stored_trajectory(plant), catch, q=_WEIGHTS[0], r=_WEIGHTS[1])
+    return _followed(plant, period, make_mechanism_catch(plant, *_CALM), None)
 
 
 def _mpc(plant: MechanismParameters, period: float) -> MechanismController:
@@ -51,10 +60,9 @@ def _mpc(plant: MechanismParameters, period: float) -> MechanismController:
 
 
 def _tvlqr_mpc(plant: MechanismParameters, period: float) -> MechanismController:
-    catch = default_catch(plant)
+    catch = make_mechanism_catch(plant, *_CALM)
     recover = MechanismMpc(plant, period, catch)
-    both = MechanismTvlqr(plant, period, stored_trajectory(plant), catch, q=_WEIGHTS[0], r=_WEIGHTS[1], recover=recover)
-    return DifferencedVelocity(plant, both)
+    return DifferencedVelocity(plant, _followed(plant, period, catch, recover))
 
 
 _CONTROLLERS: dict[str, Callable[[MechanismParameters, float], MechanismController]] = {

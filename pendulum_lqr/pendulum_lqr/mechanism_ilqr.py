@@ -25,6 +25,7 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from pendulum_lqr.small_matrices import copy, eliminate, newton, product
 from pendulum_msgs_py.dynamics.arithmetic import in_arithmetic
 from pendulum_msgs_py.dynamics.runge_kutta import along_functions, rk4_joints
 from pendulum_msgs_py.joints import Vector
@@ -67,6 +68,7 @@ class IlqrPlan(NamedTuple):
     Attributes:
         states: (q, v, u) at the nodes, shape (N + 1, 2n + m).
         efforts: Efforts at the ends of the intervals, shape (N, m).
+        gains: K of the efforts' feedback from (q, v, u), shape (N, m, 2n + m); 0 where nothing was iterated.
         cost: J.
         iterations: Iterations taken.
         converged: Whether the last of them changed J by less than a share of 1e-6.
@@ -74,6 +76,7 @@ class IlqrPlan(NamedTuple):
 
     states: Array
     efforts: Array
+    gains: Array
     cost: float
     iterations: int
     converged: bool
@@ -97,7 +100,9 @@ class IlqrProblem:
     terminal: Array
     limit: float = 1.0
 
-    def solve(self, q: Vector, v: Vector, u: Vector, efforts: Array, iterations: int) -> IlqrPlan:
+    def solve(
+        self, q: Vector, v: Vector, u: Vector, efforts: Array, iterations: int, around: IlqrPlan | None = None
+    ) -> IlqrPlan:
         """Improve a guess.
 
         Args:
@@ -106,6 +111,8 @@ class IlqrProblem:
             u: Efforts at the start, m values.
             efforts: The guess, shape (N, m); not changed.
             iterations: Largest number of iterations; 0 only follows the guess.
+            around: A plan whose feedback follows the guess, of as many intervals: on an unstable plant a guess
+                that begins a little beside its plan ends anywhere without.
         """
         coordinates = self.plant.coordinates
         n, m = len(q), len(u)
@@ -113,15 +120,17 @@ class IlqrProblem:
         limits = self.limit * np.array(self.plant.effort_limits)
         Z = np.zeros((len(efforts) + 1, 2 * n + m))
         Z[0] = (*q, *v, *u)
+        reference = Z if around is None else around.states
+        gains = np.zeros((len(efforts), m, 2 * n + m)) if around is None else around.gains.copy()
         U = np.clip(np.array(efforts, dtype=np.float64).reshape(-1, m), -limits, limits)
         goal = np.array(coordinates.goal)
         low = self.plant.mechanism.potential((0.0,) * n, self.plant.packed)
         high = self.plant.mechanism.potential(coordinates.goal, self.plant.packed)
         cost, count, converged = solve(
-            Z, U, self.plant.packed, goal, np.array([low, high - low]), self.step,
+            Z, U, reference, gains, self.plant.packed, goal, np.array([low, high - low]), self.step,
             np.array(self.weights, dtype=np.float64), np.ascontiguousarray(self.terminal), limits, iterations,
         )  # fmt: skip
-        return IlqrPlan(Z, U, float(cost), int(count), bool(converged))
+        return IlqrPlan(Z, U, gains, float(cost), int(count), bool(converged))
 
 
 def _tuple_1(a: Any, i: int) -> Any:
@@ -133,74 +142,6 @@ def _tuple_2(a: Any, i: int) -> Any:
 
 
 _TUPLES = {1: _tuple_1, 2: _tuple_2}
-
-
-@numba.njit(error_model="numpy", fastmath={"contract"})
-def _product(a: Any, b: Any, out: Any, transposed: bool, add: bool) -> None:
-    """Fill ``out`` with a b, or a' b, or add it: small matrices, without the price of a call to a library."""
-    for i in range(out.shape[0]):
-        for j in range(out.shape[1]):
-            total = out[i, j] if add else 0.0
-            for k in range(b.shape[0]):
-                total += (a[k, i] if transposed else a[i, k]) * b[k, j]
-            out[i, j] = total
-
-
-@numba.njit(error_model="numpy")
-def _copy(source: Any, target: Any) -> None:
-    """Copy a matrix, without numpy's words about shapes that do not fit, which take seconds to compile."""
-    for i in range(source.shape[0]):
-        for j in range(source.shape[1]):
-            target[i, j] = source[i, j]
-
-
-@numba.njit(error_model="numpy", fastmath={"contract"})
-def _newton(H: Any, g: Any, low: Any, high: Any, step: Any, free: Any, work: Any) -> None:
-    """Fill ``step`` with what minimises g' s + s' H s / 2 between limits, and which entries are free of them.
-
-    Entries that Newton's step drives beyond a limit stay there, and the others follow; exact for one effort.
-    """
-    m = g.shape[0]
-    free[:] = True
-    step[:] = 0.0
-    for _ in range(m + 1):
-        for j in range(m):
-            work[j, m] = -g[j]
-            for i in range(m):
-                work[j, i] = H[j, i] if free[i] else 0.0
-                if not free[i]:
-                    work[j, m] -= H[j, i] * step[i]
-            if not free[j]:
-                for i in range(m):
-                    work[j, i] = 1.0 if i == j else 0.0
-                work[j, m] = step[j]
-        _eliminate(work, m)
-        fixed = False
-        for j in range(m):
-            wanted = work[j, m]
-            if free[j] and not low[j] <= wanted <= high[j]:
-                step[j] = low[j] if wanted < low[j] else high[j]
-                free[j] = False
-                fixed = True
-            elif free[j]:
-                step[j] = wanted
-        if not fixed:
-            return
-
-
-@numba.njit(error_model="numpy", fastmath={"contract"})
-def _eliminate(work: Any, m: int) -> None:
-    """Solve the positive definite system whose right-hand sides stand in the columns from m on, in place."""
-    for j in range(m):
-        for i in range(m):
-            if i != j:
-                factor = work[i, j] / work[j, j]
-                for c in range(work.shape[1]):
-                    work[i, c] -= factor * work[j, c]
-    for j in range(m):
-        scale = work[j, j]
-        for c in range(work.shape[1]):
-            work[j, c] /= scale
 
 
 @cache
@@ -376,25 +317,34 @@ def _kernel(name: str, driven: tuple[int, ...]) -> Any:
             luz[j, e] = -2.0 * w[3] / h
 
     @numba.njit(error_model="numpy")
-    def rollout(Z: Any, U: Any, p: Any, goal: Any, scale: Any, h: float, w: Any, S: Any, work: Any, d: Any) -> float:
+    def rollout(
+        Z: Any, U: Any, Z_old: Any, K_old: Any, p: Any, goal: Any, scale: Any, h: float, w: Any, S: Any, limits: Any,
+        work: Any, d: Any,
+    ) -> float:  # fmt: skip
         cost = 0.0
         for k in range(U.shape[0]):
+            for j in range(m):
+                u = U[k, j]
+                for i in range(size):
+                    u += K_old[k, j, i] * (Z[k, i] - Z_old[k, i])
+                U[k, j] = min(limits[j], max(-limits[j], u))
             cost += stage(Z[k], U[k], h, p, goal, scale, w)
             advance(Z[k], U[k], h, p, work, Z[k + 1])
         return cost + final(Z[-1], goal, S, w, d)
 
     @numba.njit(error_model="numpy")
     def solve(
-        Z: Any, U: Any, p: Any, goal: Any, scale: Any, h: float, w: Any, S: Any, limits: Any, iterations: int
-    ) -> Any:
+        Z: Any, U: Any, Z_old: Any, K: Any, p: Any, goal: Any, scale: Any, h: float, w: Any, S: Any, limits: Any,
+        iterations: int,
+    ) -> Any:  # fmt: skip
         N = U.shape[0]
         work, d = np.zeros((3, n)), np.zeros(2 * n)
         work_c, zc, qc = np.zeros((3, n), np.complex128), np.zeros(size, np.complex128), np.zeros(n, np.complex128)
         lz, lu, slopes = np.zeros((size, 1)), np.zeros((m, 1)), np.zeros((3, n))
         lzz, luu, luz = np.zeros((size, size)), np.zeros((m, m)), np.zeros((m, size))
-        K, k_0 = np.zeros((N, m, size)), np.zeros((N, m))
+        k_0 = np.zeros((N, m))
         Z_new, U_new = Z.copy(), U.copy()
-        cost = rollout(Z, U, p, goal, scale, h, w, S, work, d)
+        cost = rollout(Z, U, Z_old, K, p, goal, scale, h, w, S, limits, work, d)
         Vz, Vzz = np.zeros((size, 1)), np.zeros((size, size))
         VA, VB, KQ = np.zeros((size, size)), np.zeros((size, m)), np.zeros((m, size))
         g, low, high, free = np.zeros(m), np.zeros(m), np.zeros(m), np.ones(m, np.bool_)
@@ -420,30 +370,30 @@ def _kernel(name: str, driven: tuple[int, ...]) -> Any:
                     derive(Z[k], U[k], h, p, work_c, zc, A, B)
                 expand(Z[k], U[k], h, p, goal, scale, w, qc, slopes, lz, lu, lzz, luu, luz)
                 # lz, lzz, ... become the derivatives of the cost from here on: Q in the sources.
-                _product(Vzz, A, VA, False, False)
-                _product(Vzz, B, VB, False, False)
-                _product(A, Vz, lz, True, True)
-                _product(B, Vz, lu, True, True)
-                _product(A, VA, lzz, True, True)
-                _product(B, VB, luu, True, True)
-                _product(B, VA, luz, True, True)
+                product(Vzz, A, VA, False, False)
+                product(Vzz, B, VB, False, False)
+                product(A, Vz, lz, True, True)
+                product(B, Vz, lu, True, True)
+                product(A, VA, lzz, True, True)
+                product(B, VB, luu, True, True)
+                product(B, VA, luz, True, True)
                 for j in range(m):
                     luu[j, j] += regular
                     g[j] = lu[j, 0]
                     low[j], high[j] = -limits[j] - U[k, j], limits[j] - U[k, j]
-                _newton(luu, g, low, high, k_0[k], free, small)
+                newton(luu, g, low, high, k_0[k], free, small)
                 for j in range(m):
                     for i in range(m):
                         wide[j, i] = luu[j, i] if free[i] and free[j] else (1.0 if i == j else 0.0)
                     for i in range(size):
                         wide[j, m + i] = -luz[j, i] if free[j] else 0.0
-                _eliminate(wide, m)
+                eliminate(wide, m)
                 for j in range(m):
                     gain -= g[j] * k_0[k, j]
                     for i in range(size):
                         K[k, j, i] = wide[j, m + i]
                 # Value of the step taken: V = Q + K' Quu K + K' Quz + Quz' K, of a step that limits may have cut.
-                _product(luu, K[k], KQ, False, False)
+                product(luu, K[k], KQ, False, False)
                 for i in range(size):
                     Vz[i, 0] = lz[i, 0]
                     for a in range(m):
@@ -484,8 +434,8 @@ def _kernel(name: str, driven: tuple[int, ...]) -> Any:
                 continue
             regular = max(regular * 0.2, 1e-8)
             change = cost - new
-            _copy(Z_new, Z)
-            _copy(U_new, U)
+            copy(Z_new, Z)
+            copy(U_new, U)
             cost = new
             if change < 1e-6 * max(1e-6, abs(cost)):
                 converged = True

@@ -17,7 +17,7 @@ from pendulum_msgs_py.plants.mechanism_parameters import MechanismParameters
 __all__ = ["MechanismMpc", "MpcSettings"]
 
 Array = NDArray[np.float64]
-_HURRY = IlqrWeights(1.0, 0.0, 0.004, 2e-5, 5e-4, 10.0)
+_HURRY = IlqrWeights(1.0, 0.0, 0.004, 2e-5, 5e-3, 10.0)
 
 
 @dataclass(frozen=True)
@@ -31,16 +31,18 @@ class MpcSettings:
         iterations: Of iterative LQR from plan to plan.
         guesses: Fresh guesses where there is no plan, or where the plan does not end upright.
         guess_iterations: Largest number of iterations for each of them.
-        patience: Plans after which guesses are tried again.
+        patience: Plans after which some guesses are tried again.
+        retries: How many.
     """
 
     weights: IlqrWeights = _HURRY
     step: float = 0.02
     nodes: int = 70
     iterations: int = 3
-    guesses: int = 12
-    guess_iterations: int = 25
-    patience: int = 5
+    guesses: int = 32
+    guess_iterations: int = 20
+    patience: int = 8
+    retries: int = 2
 
 
 class MechanismMpc:
@@ -87,7 +89,7 @@ class MechanismMpc:
             return self._before
         # A plan that nobody followed for a while is of no use.
         if self._plan is None or t - self._planned > 2.0 * self.settings.step:
-            self._plan = self._best(x, None)
+            self._plan = self._best(x, None, self.settings.guesses)
             self._planned, self._age = t, 0
         elif t - self._planned >= self.settings.step - 0.5 * self.period:
             self._plan_again(t, x)
@@ -102,28 +104,34 @@ class MechanismMpc:
     def _plan_again(self, t: float, x: Vector) -> None:
         assert self._plan is not None
         self._before = tuple(float(u) for u in self._plan.efforts[0])
-        shifted = np.vstack([self._plan.efforts[1:], np.zeros((1, len(self._limits)))])
-        plan = self._solve(x, shifted, self.settings.iterations)
+        plan = self._solve(x, *_shifted(self._plan), self.settings.iterations)
         self._age += 1
         if self._age % self.settings.patience == 0 and not self._arrives(plan):
-            plan = self._best(x, plan)
+            plan = self._best(x, plan, self.settings.retries)
         self._plan, self._planned = plan, t
 
-    def _best(self, x: Vector, plan: IlqrPlan | None) -> IlqrPlan:
+    def _best(self, x: Vector, plan: IlqrPlan | None, count: int) -> IlqrPlan:
         """Return the cheapest of a plan and what fresh guesses become."""
         best = plan
-        for guess in self._guesses():
-            found = self._solve(x, guess, self.settings.guess_iterations)
+        for guess in self._guesses(count):
+            found = self._solve(x, guess, None, self.settings.guess_iterations)
             if best is None or found.cost < best.cost:
                 best = found
         assert best is not None
         return best
 
-    def _guesses(self) -> Sequence[Array]:
+    def _guesses(self, count: int) -> Sequence[Array]:
         nodes, m = self.settings.nodes, len(self._limits)
         t = np.arange(nodes) * self.settings.step
         guesses = [np.zeros((nodes, m))]
-        for _ in range(self.settings.guesses - 1):
+        for index in range(count - 1):
+            if index % 2:
+                # Full effort one way, then another: what hurries.
+                switches = np.cumsum(self._rng.uniform(0.05, 0.5, 6))
+                levels = np.array(self._limits) * self._rng.uniform(-0.8, 0.8, (7, m))
+                levels[3:] *= 0.2
+                guesses.append(levels[np.searchsorted(switches, t)])
+                continue
             phase, period = self._rng.random(m), self._rng.uniform(0.3, 1.6, m)
             height = 0.7 * np.array(self._limits) * self._rng.random(m)
             # It dies away: what is pumped to the end spins.
@@ -136,6 +144,14 @@ class MechanismMpc:
         end = deviation_of(self.plant.coordinates, tuple(plan.states[-1, : 2 * n]))
         return float(end @ self.catch.gain.S @ end) <= self.catch.region.level
 
-    def _solve(self, x: Vector, guess: Array, iterations: int) -> IlqrPlan:
+    def _solve(self, x: Vector, guess: Array, around: IlqrPlan | None, iterations: int) -> IlqrPlan:
         n = len(self.plant.joints)
-        return self._problem.solve(x[:n], x[n:], self._before, guess, iterations)
+        return self._problem.solve(x[:n], x[n:], self._before, guess, iterations, around)
+
+
+def _shifted(plan: IlqrPlan) -> tuple[Array, IlqrPlan]:
+    """Return the efforts of a plan one interval later, ended by none, and the plan that its feedback follows there."""
+    states = np.vstack([plan.states[1:], plan.states[-1:]])
+    efforts = np.vstack([plan.efforts[1:], np.zeros((1, plan.efforts.shape[1]))])
+    gains = np.concatenate([plan.gains[1:], np.zeros((1, *plan.gains.shape[1:]))])
+    return efforts, plan._replace(states=states, efforts=efforts, gains=gains)

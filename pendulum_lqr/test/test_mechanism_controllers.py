@@ -76,12 +76,13 @@ def test_tracking_brings_a_disturbed_swing_up_upright_and_open_loop_does_not(nam
     # Thrown far off it gives no effort where nobody recovers it, and does not jump back to the trajectory either.
     controller.reset()
     controller.command(0.0, (0.0,) * 4)
-    assert controller.command(DT, (1.5, 1.0, 5.0, -5.0)) == (0.0,)
+    assert controller.command(DT, (1.5, 3.0, 25.0, -25.0)) == (0.0,)
     assert controller.command(2 * DT, (0.0,) * 4) == (0.0,)
     controller.reset()
     assert controller.command(0.0, (0.0,) * 4) != (0.0,)
 
 
+@pytest.mark.timeout(400)
 def test_iterative_lqr_and_mpc_bring_a_cart_pole_up_within_its_limits() -> None:
     """Takes some ten seconds: it compiles the problem of a mechanism, once for all that is asked here."""
     plant = load_mechanism("cart_pole")
@@ -135,7 +136,7 @@ def test_velocities_from_positions_are_the_true_ones_whatever_was_measured() -> 
     for k in range(500):
         noise = 0.5 * (-1) ** k if k else 0.0
         effort = controller.command(k * DT, (*x[:2], x[2] + noise, x[3] - noise))
-        assert listener.heard[-1] == pytest.approx(x, abs=5e-3)
+        assert listener.heard[-1] == pytest.approx(x, rel=1e-3, abs=2e-3)
         x = step(plant, x, effort)
 
 

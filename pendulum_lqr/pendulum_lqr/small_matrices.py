@@ -1,0 +1,77 @@
+"""Compiled algebra of matrices of a few rows, without the price of a call to a library."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numba
+
+__all__ = ["copy", "eliminate", "newton", "product"]
+
+
+@numba.njit(error_model="numpy", fastmath={"contract"})
+def product(a: Any, b: Any, out: Any, transposed: bool, add: bool) -> None:
+    """Fill ``out`` with a b, or a' b, or add it: small matrices, without the price of a call to a library."""
+    for i in range(out.shape[0]):
+        for j in range(out.shape[1]):
+            total = out[i, j] if add else 0.0
+            for k in range(b.shape[0]):
+                total += (a[k, i] if transposed else a[i, k]) * b[k, j]
+            out[i, j] = total
+
+
+@numba.njit(error_model="numpy")
+def copy(source: Any, target: Any) -> None:
+    """Copy a matrix, without numpy's words about shapes that do not fit, which take seconds to compile."""
+    for i in range(source.shape[0]):
+        for j in range(source.shape[1]):
+            target[i, j] = source[i, j]
+
+
+@numba.njit(error_model="numpy", fastmath={"contract"})
+def newton(H: Any, g: Any, low: Any, high: Any, step: Any, free: Any, work: Any) -> None:
+    """Fill ``step`` with what minimises g' s + s' H s / 2 between limits, and which entries are free of them.
+
+    Entries that Newton's step drives beyond a limit stay there, and the others follow; exact for one effort.
+    """
+    m = g.shape[0]
+    free[:] = True
+    step[:] = 0.0
+    for _ in range(m + 1):
+        for j in range(m):
+            work[j, m] = -g[j]
+            for i in range(m):
+                work[j, i] = H[j, i] if free[i] else 0.0
+                if not free[i]:
+                    work[j, m] -= H[j, i] * step[i]
+            if not free[j]:
+                for i in range(m):
+                    work[j, i] = 1.0 if i == j else 0.0
+                work[j, m] = step[j]
+        eliminate(work, m)
+        fixed = False
+        for j in range(m):
+            wanted = work[j, m]
+            if free[j] and not low[j] <= wanted <= high[j]:
+                step[j] = low[j] if wanted < low[j] else high[j]
+                free[j] = False
+                fixed = True
+            elif free[j]:
+                step[j] = wanted
+        if not fixed:
+            return
+
+
+@numba.njit(error_model="numpy", fastmath={"contract"})
+def eliminate(work: Any, m: int) -> None:
+    """Solve the positive definite system whose right-hand sides stand in the columns from m on, in place."""
+    for j in range(m):
+        for i in range(m):
+            if i != j:
+                factor = work[i, j] / work[j, j]
+                for c in range(work.shape[1]):
+                    work[i, c] -= factor * work[j, c]
+    for j in range(m):
+        scale = work[j, j]
+        for c in range(work.shape[1]):
+            work[j, c] /= scale
