@@ -77,6 +77,16 @@ def test_a_publisher_that_is_met_late_in_the_place_of_one_that_left_leaves_no_ga
     assert counter.unmet == 2 + 13
 
 
+def test_a_publisher_whose_message_comes_before_word_of_it_is_counted_from_its_beginning() -> None:
+    met = [0, 0]
+    counter = GapCounter(lambda: (met[0], met[1]))
+    assert [counter.see(sequence) for sequence in (41, 42)] == [0, 0]
+    met[:] = [1, 1]
+    # It is the one that was met: what it misses now is a gap.
+    assert [counter.see(sequence) for sequence in (43, 45)] == [0, 1]
+    assert (counter.unmet, counter.missing) == (40, 1)
+
+
 def test_a_publisher_that_is_silent_hides_no_gap_of_another() -> None:
     counter = GapCounter(lambda: (2, 2))
     assert sum(counter.see(number) for number in range(3, 10)) == 0

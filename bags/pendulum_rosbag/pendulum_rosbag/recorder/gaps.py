@@ -78,8 +78,10 @@ class GapCounter:
         before = sequence - 1
         lower = max((number for number in self._last if number < sequence), default=0)
         gap = before - lower
-        if sequence == 1 or not lower or gap > _LARGEST_GAP or self._heard < total:
-            if self._heard < total:
+        # A first sample may come before the middleware has told that its publisher was met.
+        another = self._heard < total or not self._last
+        if sequence == 1 or not lower or gap > _LARGEST_GAP or another:
+            if another:
                 self._heard += 1
                 if lower and sequence > 1 and gap <= _LARGEST_GAP:
                     self._doubts[lower] = _Doubt(gap, unmet=before)
