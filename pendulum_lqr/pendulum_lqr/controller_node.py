@@ -63,7 +63,7 @@ NODE_SPECS: tuple[ParameterSpec, ...] = (
     ParameterSpec("controller", "lqr", "", "Which controller.", choices=tuple(CONTROLLERS), read_only=True),
     ParameterSpec(
         "plant", "thesis", "", f"Plant to design for: {PRESET_NAMES} or the path of a plant file; of several joints, "
-        f"with lqr: {', '.join(MECHANISM_PRESETS)}.", read_only=True,
+        f"with lqr or tvlqr: {', '.join(MECHANISM_PRESETS)}.", read_only=True,
     ),
     ParameterSpec(
         "period", 0.0, "s", "Sampling period of the loop, which discrete designs and filters need; 0 takes it from the "
@@ -113,13 +113,15 @@ class ControllerNode(LifecycleNode, PollingNode):
         self._coordinates = self._plant.coordinates if isinstance(self._plant, MechanismParameters) else ONE_JOINT
         self._joints, self._driven = self._coordinates.names, self._coordinates.driven_names
         own = (
-            joint_parameters(self._plant)
+            joint_parameters(kind, self._plant)
             if isinstance(self._plant, MechanismParameters)
             else COMMON_PARAMETERS + controller_class(kind).PARAMETERS
         )
         self._settings = NodeParameters(self, NODE_SPECS + own, self._design, self._swap)
         self._period = self._settings["period"] or ASSUMED_PERIOD
         self._period_measured = False
+        if kind == "tvlqr" and isinstance(self._plant, MechanismParameters):
+            self.get_logger().info("tries out from where the LQR catches, which takes some seconds")
         # A bad value at start ends the node with its reason instead of waiting for a transition to fail.
         self._pending: Controller | JointController | None = self._design(self._settings.values)
         self._simulated_time = bool(self.get_parameter("use_sim_time").value)
@@ -297,8 +299,11 @@ class ControllerNode(LifecycleNode, PollingNode):
         try:
             self._period_measured = True
             if isinstance(plant, MechanismParameters):
-                self._period = measured
-                self._design(values)
+                if values["controller"] == "lqr":
+                    self._period = measured
+                    self._design(values)
+                elif differs(measured, self._period):
+                    raise PendulumError(f"the trajectory is followed every {self._period:g} s")
                 self._period_known = True
                 return True
             if not values["period"] and abs(measured / self._period - 1.0) > _SAME_PERIOD:

@@ -56,6 +56,13 @@ def test_a_period_at_which_it_does_not_settle_is_refused() -> None:
         make_joint_controller("lqr", acrobot, {}, 0.2)
 
 
+def test_a_swing_up_wants_a_period_and_a_plant_for_which_one_is_stored() -> None:
+    with pytest.raises(ParameterError, match="expected period:="):
+        make_joint_controller("tvlqr", load_mechanism("acrobot_frictionless"), {})
+    with pytest.raises(ParameterError, match="no swing-up is stored for plant 'furuta'"):
+        make_joint_controller("tvlqr", load_mechanism("furuta"), {}, 0.002)
+
+
 @pytest.mark.parametrize("bad", [math.nan, math.inf])
 def test_a_state_that_is_not_finite_at_any_joint_is_not_answered(bad: float) -> None:
     loop = AnswerLoop(make_joint_controller("lqr", load_mechanism("cart_pole"), {}), math.inf)

@@ -114,6 +114,23 @@ def test_an_acrobot_is_held_upright_under_noise_in_lockstep_and_its_bag_is_read_
     assert states.effort[:, 1].any()
 
 
+def test_an_acrobot_swings_up_in_lockstep_and_stays(peer: Peer, processes) -> None:
+    controller = _start(
+        processes, "pendulum_lqr", "controller", "plant:=acrobot_frictionless", "controller:=tvlqr", "period:=0.004",
+        "use_sim_time:=true",
+    )  # fmt: skip
+    controller.wait_for_output(r"tvlqr for plant acrobot_frictionless: swing-up of .* sampled from", 60)
+    _start(
+        processes, "pendulum_sim", "simulator", "plant:=acrobot_frictionless", "clock:=lockstep", "rate_hz:=250.0",
+        "lockstep_duration:=8.0", "lockstep_subscribers:=2",
+    )  # fmt: skip
+    peer.until(lambda: any(event["name"] == names.Event.LOCKSTEP_FINISHED for event in peer.events), "the end", 90.0)
+    assert list(peer.states[0].position) == [0.0, 0.0]
+    turned = (np.array(peer.states[-1].position) - [math.pi, 0.0] + math.pi) % (2.0 * math.pi) - math.pi
+    assert np.abs(turned).max() < 0.01
+    assert np.abs(peer.states[-1].velocity).max() < 0.05
+
+
 def _until_counted(peer: Peer, key: str, before: int) -> None:
     peer.until(lambda: int(peer.diagnostics.get(key, 0)) > before, f"{peer.answer} refused as {key}")
 
@@ -171,7 +188,7 @@ SIMULATOR, CONTROLLER, DISTURBANCE = (
         (
             CONTROLLER,
             ("plant:=acrobot", "controller:=pid"),
-            "pid is for plants of one joint, and plant 'acrobot' has shoulder, elbow; expected lqr",
+            "pid is for plants of one joint, and plant 'acrobot' has shoulder, elbow; expected lqr or tvlqr",
         ),
         (CONTROLLER, ("plant:=acrobot", "q:=[1.0, 2.0]"), "q has the shape (2,); expected (4,)"),
         (DISTURBANCE, ("joints:=[elbow, elbow]",), "joints is ['elbow', 'elbow']; expected names, each once"),

@@ -19,7 +19,7 @@ from pendulum_msgs_py.plants.mechanism_parameters import MechanismParameters
 
 __all__ = ["JOINT_CONTROLLERS", "JointLqr", "joint_parameters", "make_joint_controller"]
 
-JOINT_CONTROLLERS = ("lqr",)
+JOINT_CONTROLLERS = ("lqr", "tvlqr")
 """Controllers for plants of several joints."""
 _MOST_GROWTH = 1.0
 
@@ -57,8 +57,10 @@ class JointLqr(JointController):
         return f"K = [{rows}], poles {poles} 1/s"
 
 
-def joint_parameters(plant: MechanismParameters) -> tuple[ParameterSpec, ...]:
+def joint_parameters(name: str, plant: MechanismParameters) -> tuple[ParameterSpec, ...]:
     """Return the specs of what a controller of a plant of several joints takes, its own weights as defaults."""
+    if name != "lqr":
+        return ()
     q, r = plant.mechanism.weights
     names = plant.coordinates.names
     return (
@@ -81,7 +83,7 @@ def make_joint_controller(
         name: One of ``JOINT_CONTROLLERS``.
         plant: The plant.
         values: Parameters of :func:`joint_parameters` by name; others at their default.
-        period: Period at which states come [s]; None where it is not known yet.
+        period: Period at which states come [s]; None where it is not known yet, which tvlqr refuses.
 
     Raises:
         ParameterError: No such controller for several joints, a value out of domain, a design that does not exist, or
@@ -92,7 +94,15 @@ def make_joint_controller(
             f"{name} is for plants of one joint, and plant {plant.name!r} has {', '.join(plant.coordinates.names)}; "
             f"expected {' or '.join(JOINT_CONTROLLERS)}"
         )
-    p = validate(joint_parameters(plant), values)
+    p = validate(joint_parameters(name, plant), values)
+    if name == "tvlqr":
+        if period is None:
+            raise ParameterError(
+                "tvlqr follows its trajectory at the period of the states; expected it, as period:=0.002"
+            )
+        from pendulum_lqr.controllers.joint_swing_up import JointSwingUp
+
+        return JointSwingUp(plant, period)
     model = linearise_mechanism(plant)
     gain = mechanism_lqr(model, p["q"], p["r"])
     limit = p["effort_limit"] or math.inf

@@ -1,0 +1,44 @@
+"""Swing-up of several joints on the graph: follow a stored trajectory by TVLQR, then LQR about upright."""
+
+from __future__ import annotations
+
+from pendulum_lqr.interface import JointController
+from pendulum_lqr.mechanism_controllers import default_catch, stored_trajectory
+from pendulum_lqr.mechanism_tvlqr import MechanismTvlqr
+from pendulum_msgs_py.joints import Vector
+from pendulum_msgs_py.plants.mechanism_parameters import MechanismParameters
+
+__all__ = ["JointSwingUp"]
+
+_WEIGHTS = ((10.0, 10.0, 1.0, 1.0), 1.0)
+
+
+class JointSwingUp(JointController):
+    """From hanging along the swing-up that comes with the project for a preset; where it is lost, no effort at all.
+
+    Args:
+        plant: The plant, one for which a swing-up is stored.
+        period: Period at which states come [s].
+
+    Raises:
+        ParameterError: No swing-up is stored for this plant.
+    """
+
+    def __init__(self, plant: MechanismParameters, period: float) -> None:
+        super().__init__(plant.effort_limits)
+        trajectory = stored_trajectory(plant)
+        self._duration = trajectory.duration
+        q, r = _WEIGHTS
+        self._inner = MechanismTvlqr(plant, period, trajectory, default_catch(plant), q=q, r=r)
+
+    def reset(self) -> None:
+        """Begin anew, at hanging."""
+        self._inner.reset()
+
+    def command(self, t: float, position: Vector, velocity: Vector) -> Vector:
+        """Return m efforts."""
+        return self._inner.command(t, position + velocity)
+
+    def describe(self) -> str:
+        """Return how long it swings, and from where the LQR catches."""
+        return f"swing-up of {self._duration:.3g} s by TVLQR, then LQR within {self._inner.catch.region.describe()}"
