@@ -119,7 +119,7 @@ def test_an_acrobot_swings_up_in_lockstep_and_stays(peer: Peer, processes) -> No
         processes, "pendulum_lqr", "controller", "plant:=acrobot_frictionless", "controller:=tvlqr", "period:=0.004",
         "use_sim_time:=true",
     )  # fmt: skip
-    controller.wait_for_output(r"tvlqr for plant acrobot_frictionless: swing-up of .* sampled from", 60)
+    controller.wait_for_output(r"tvlqr for plant acrobot_frictionless: swing-up of .*sampled from", 60)
     _start(
         processes, "pendulum_sim", "simulator", "plant:=acrobot_frictionless", "clock:=lockstep", "rate_hz:=250.0",
         "lockstep_duration:=8.0", "lockstep_subscribers:=2",
