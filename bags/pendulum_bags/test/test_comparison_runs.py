@@ -148,6 +148,19 @@ def test_a_bag_of_two_plants_asks_which(tmp_path: Path) -> None:
         read_run(tmp_path / "bag")
 
 
+@pytest.mark.parametrize("still", ["sim", "hw"])
+def test_a_plant_that_never_moved_is_refused_by_name(tmp_path: Path, still: str) -> None:
+    for number, (side, rate) in enumerate((("sim", 500.0), ("hw", 100.0))):
+        columns = regulate(rate=rate, seed=3 + number, duration=2.0, hardware=side == "hw")
+        if side == still:
+            columns["position"][:] = 0.02
+            columns["velocity"][:] = 0.0
+        write_bag(tmp_path / side, columns, f"/{side}", metadata=run_metadata(3, 0.01), ramps=False)
+    name = {"sim": "simulation", "hw": "hardware"}[still]
+    with pytest.raises(DataError, match=rf"the {name} of .*{still} stood still at 0\.02 rad under the noise; expected"):
+        compare_folders([tmp_path])
+
+
 def test_a_run_folder_without_a_bag_is_refused(tmp_path: Path) -> None:
     (tmp_path / "run" / "sim").mkdir(parents=True)
     with pytest.raises(BagError, match="has no bag hw; expected the folders sim and hw"):

@@ -14,6 +14,7 @@ from pendulum_bags.comparison.spectra import Spectra, spectra_of
 from pendulum_bags.comparison.statistics import describe, kolmogorov_smirnov
 from pendulum_bags.runs.run_data import RunData, noise_hold_time
 from pendulum_bags.runs.series import Array, Series, shared_span
+from pendulum_msgs_py.errors import DataError
 
 __all__ = ["Difference", "Pair", "distribution_tests", "interpolated_difference"]
 
@@ -81,7 +82,17 @@ class Pair:
 
     @classmethod
     def of(cls, simulation: RunData, hardware: RunData) -> Pair:
-        """Compare two runs."""
+        """Compare two runs.
+
+        Raises:
+            DataError: A plant did not move, or the runs have too little in common.
+        """
+        for run in (simulation, hardware):
+            if not np.ptp(run.window.position):
+                raise DataError(
+                    f"the {run.label} of {run.source} stood still at {run.window.position[0]:.4g} rad under the noise; "
+                    "expected a plant that moves: was it armed, and free?"
+                )
         hardware = _turned(hardware, simulation)
         response = align_motion(simulation.window, hardware.window)
         shifted = hardware.window.shifted(response.delay)
