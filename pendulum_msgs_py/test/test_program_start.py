@@ -6,6 +6,7 @@ import subprocess
 import sys
 import types
 from collections.abc import Callable
+from importlib.machinery import ModuleSpec
 
 import pytest
 import typer
@@ -29,7 +30,9 @@ def package(monkeypatch: pytest.MonkeyPatch) -> Callable[..., None]:
         table.EXECUTABLES = {"node": "arm.node:main", "design": "arm.node:main"}
         node = types.ModuleType("arm.node")
         node.main = main
-        for name, module in {"arm": types.ModuleType("arm"), "arm.executables": table, "arm.node": node}.items():
+        arm = types.ModuleType("arm")
+        arm.__spec__ = ModuleSpec("arm", None)
+        for name, module in {"arm": arm, "arm.executables": table, "arm.node": node}.items():
             monkeypatch.setitem(sys.modules, name, module)
 
     return make

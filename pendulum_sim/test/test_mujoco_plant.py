@@ -199,7 +199,7 @@ def test_a_mapping_file_says_what_it_says(tmp_path: Path) -> None:
 
 def test_without_mujoco_one_sentence_says_how_to_get_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "mujoco", None)
-    with pytest.raises(ParameterError, match=r"mujoco is not installed; .* pip install 'pendulum_sim\[mujoco\]'"):
+    with pytest.raises(ParameterError, match=r"mujoco is not installed, .* pip install 'pendulum_sim\[mujoco\]'"):
         load_mujoco_plant(write(tmp_path))
 
 

@@ -2,23 +2,31 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import pytest
 
 from pendulum_bags.experiments.run_spec import RunSpec
 from pendulum_bags.experiments.settings import RegulationSettings
 from pendulum_lqr.controller import COMMON_PARAMETERS, CONTROLLERS, controller_parameters
+from pendulum_lqr.policy_file import write_policy
 from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.parameters import validate
 from pendulum_msgs_py.plants.plant_parameters import load_plant
 from pendulum_sim.plants import make_plant
+from tests.policies import linear_policy
 
 # Not those that need a file or a task of their own to be designed.
 _NODE_OWN = {"controller", "plant", "use_sim_time"}
 
 
 @pytest.mark.parametrize("kind", CONTROLLERS)
-def test_every_controller_is_started_with_parameters_that_it_has(kind: str) -> None:
-    settings = RegulationSettings(controller=kind)
+def test_every_controller_is_started_with_parameters_that_it_has(kind: str, tmp_path: Path) -> None:
+    if kind == "policy":
+        with pytest.raises(ParameterError, match=r"controller is 'policy' without a file; expected .*\.npz"):
+            RegulationSettings(controller=kind)
+        policy = write_policy(tmp_path / "policy.npz", linear_policy(load_plant("thesis"), 20.0, 1.0))
+    settings = RegulationSettings(controller=str(policy) if kind == "policy" else kind)
     given = settings.controller_program("/sim").parameters
     own = {name: value for name, value in given.items() if name not in _NODE_OWN}
     specs = {spec.name: spec for spec in (*COMMON_PARAMETERS, *controller_parameters(kind))}

@@ -99,6 +99,8 @@ class RegulationSettings:
 
     def __post_init__(self) -> None:
         """Refuse unknown plants and backends, and a policy that cannot be read, before anything is started."""
+        if self.controller == "policy":
+            raise ParameterError("controller is 'policy' without a file; expected the path of a policy file (.npz)")
         if self.kind == "policy":
             load_policy(self.controller)
         object.__setattr__(self, "method", integrator_of(self.plant, self.method))
