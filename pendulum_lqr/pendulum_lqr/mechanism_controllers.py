@@ -17,10 +17,10 @@ from pendulum_msgs_py.plants.mechanism_parameters import MechanismParameters
 
 __all__ = ["default_catch", "make_mechanism_controller", "mechanism_controller_names", "stored_trajectory"]
 
-_CALM = ((1.0, 1.0, 0.1, 0.1), 100.0)
-"""Weights of catch and tracking behind a swing-up, for two joints: low gains, which bear 38 ms of unknown delay."""
-_TUBE = 100.0
-"""Width of the tube about a swing-up, which such gains need beside a plant that differs."""
+_CALM = ((1.0, 1.0, 1.0, 1.0), 10.0)
+"""Weights of catch and tracking behind a swing-up, for two joints: of gains as low as still catch from far."""
+_TUBE = 10.0
+"""Width of the tube about a swing-up: beyond it, planning anew is better than tracking."""
 
 
 def stored_trajectory(plant: MechanismParameters) -> MechanismTrajectory:
