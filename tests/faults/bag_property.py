@@ -67,7 +67,7 @@ class TorqueRecord:
     violations: tuple[str, ...]
 
 
-def check_bag(path: Path, *, limit: float, allowance: float = 0.0) -> list[TorqueRecord]:
+def check_bag(path: Path, *, limit: float, allowance: float = 0.0, witnessed: Sequence[int] = ()) -> list[TorqueRecord]:
     """Check the torque of every plant in a bag.
 
     Under position control the plant makes its own torque: there only the limit is checked. That it was under position
@@ -83,6 +83,8 @@ def check_bag(path: Path, *, limit: float, allowance: float = 0.0) -> list[Torqu
         path: The bag.
         limit: Largest torque allowed [N m].
         allowance: Time that the recorder may have been kept waiting [s].
+        witnessed: Stamps of commands of the plant's controller that somebody else heard in time [ns]: of one that came
+            and went within half a second a recorder may never have known.
 
     Raises:
         BagError: The bag cannot be read.
@@ -93,10 +95,10 @@ def check_bag(path: Path, *, limit: float, allowance: float = 0.0) -> list[Torqu
         plants = [topic[: -len(ending)] for topic in bag.topics if topic.endswith(ending)]
         if not plants:
             raise DataError(f"{path} has no topic {names.APPLIED_EFFORT}; expected one for each plant")
-        return [_check_plant(bag, plant, limit, allowance) for plant in plants]
+        return [_check_plant(bag, plant, limit, allowance, witnessed) for plant in plants]
 
 
-def _check_plant(bag: Bag, plant: str, limit: float, allowance: float) -> TorqueRecord:
+def _check_plant(bag: Bag, plant: str, limit: float, allowance: float, witnessed: Sequence[int]) -> TorqueRecord:
     applied = bag.array(f"{plant}/{names.APPLIED_EFFORT}")
     times, efforts = applied["log_time_ns"], applied["effort"]
     violations = []
@@ -116,7 +118,7 @@ def _check_plant(bag: Bag, plant: str, limit: float, allowance: float) -> Torque
     tolerance = round((COMMAND_LIFE + period + allowance) * NANOSECONDS)
     believed = answers - then <= tolerance
     command = _last_before(times, logged[believed & (then - answers <= tolerance)])
-    answered = _last_before(stamps, np.sort(answers[believed]))
+    answered = _last_before(stamps, np.sort(np.concatenate((answers[believed], np.array(witnessed, np.int64)))))
     judged = ~_under_position_control(bag, plant, times, tolerance)
     # From the state with this stamp on, a torque acts for a period.
     age = np.minimum(

@@ -228,7 +228,7 @@ def simulate_hours(hours: float, rate_hz: float = 50.0) -> Outcome:
             loop.advance()
             measured = interface.sample
             assert measured is not None
-            positions[index] = measured.position
+            positions[index] = measured.position[0]
         interface.close()
     finally:
         node.destroy_node()

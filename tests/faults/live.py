@@ -42,6 +42,8 @@ _RIGHTFUL = {names.EFFORT_COMMAND: "controller", names.DISTURBANCE: "disturbance
 """Who may ask for torque, by topic."""
 _FALLEN = ("already commands", "firmware_limit", "position is")
 """What a plant says that cannot be armed because its pendulum has fallen, or turned out of its window."""
+_FRESH_NS = 60_000_000
+"""Age of a command that a plant may still believe [ns]."""
 _KEPT_NS = 120_000_000_000
 """How long what the motor did is kept [ns]."""
 
@@ -77,6 +79,7 @@ class LiveSystem:
         applied: Every torque that the plant said it applied.
         heard: When the last message of controller and disturbance reached the probe, by topic, on the system's
             clock [ns].
+        witnessed: Stamps of the controller's commands that came in time [ns].
         asked: What controller and disturbance asked for, by the name of their topic.
         diagnostics: Newest key-value pairs by name of the status, such as ``/sim/simulator: plant``.
         diagnosed: When each status was heard last, on the probe's monotonic clock [s].
@@ -98,6 +101,7 @@ class LiveSystem:
         self.children: dict[str, Child] = {}
         self.applied: list[Applied] = []
         self.heard = dict.fromkeys(_RIGHTFUL, 0)
+        self.witnessed: list[int] = []
         self.asked = {topic: Witness(EFFORT_LIMIT) for topic in _RIGHTFUL}
         self.diagnostics: dict[str, dict[str, str]] = {}
         self.diagnosed: dict[str, float] = {}
@@ -392,6 +396,8 @@ class LiveSystem:
                     asked = Asked(fields.stamp_ns, fields.effort[0])
                     self.asked[topic].hear(asked, info["publication_sequence_number"])
                     self.heard[topic] = info["received_timestamp"]
+                    if topic == names.EFFORT_COMMAND and abs(info["received_timestamp"] - asked.stamp_ns) < _FRESH_NS:
+                        self.witnessed.append(asked.stamp_ns)
 
     def _on_diagnostics(self, message: DiagnosticArray) -> None:
         for status in message.status:

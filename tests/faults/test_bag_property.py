@@ -91,6 +91,7 @@ def _judge(
     joint: str = names.JOINT,
     limit: float = 5.0,
     counts: Mapping[str, int] | None = None,
+    witnessed: Iterable[float] = (),
     marked: Mapping[str, Any] | None = None,
 ) -> TorqueRecord:
     """Judge three seconds of a plant at 100 Hz that tells its mode by events and by diagnostics."""
@@ -125,7 +126,7 @@ def _judge(
     for when, topic, _, data in sorted(rows, key=lambda row: row[0]):
         writer.write(topic, when, data)
     writer.close()
-    (record,) = check_bag(path / "bag", limit=limit)
+    (record,) = check_bag(path / "bag", limit=limit, witnessed=[instant(seconds) for seconds in witnessed])
     return record
 
 
@@ -202,6 +203,22 @@ def test_commands_heard_of_too_late_explain_as_many_lives_and_only_shortly_befor
         for kind in ("early", "before"):
             record = _judge(tmp_path / name / kind, _steady, partial(le, first), counts={kind: early})
             assert _late(record) is late, (name, kind)
+
+
+def test_commands_that_another_witness_heard_explain_their_lives_and_no_more(tmp_path: Path) -> None:
+    heard = [0.01 * number for number in range(100, 140)]
+    for name, until, witnessed, late in (
+        ("heard", 1.44, heard, False),
+        ("longer", 1.55, heard, True),
+        ("not heard", 1.44, [], True),
+    ):
+        (tmp_path / name).mkdir()
+        torque = partial(_pulse, 1.0, until)
+        assert _late(_judge(tmp_path / name, torque, witnessed=witnessed)) is late, name
+
+
+def _pulse(since: float, until: float, seconds: float) -> float:
+    return 3.0 * (since <= seconds < until)
 
 
 def test_early_commands_explain_no_more_than_their_time_however_many_gaps_there_are(tmp_path: Path) -> None:

@@ -22,29 +22,30 @@ def system(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFact
         yield running
 
 
-_TRIED: dict[str, set[Path]] = {}
-"""Folders of the systems on which a fault was tried, by plant: pytest may end one and start another."""
+_TRIED: dict[str, dict[Path, list[int]]] = {}
+"""Folders of the systems on which a fault was tried, with the commands that each probe heard, by plant: pytest may end
+one system and start another."""
 _SHORT = [(plant, fault) for plant in PLANTS for fault in CAMPAIGN if plant in fault.short]
 
 
 @pytest.mark.timeout(150)
 @pytest.mark.parametrize(("system", "fault"), _SHORT, ids=lambda each: each.name, indirect=["system"], scope="module")
 def test_running_system_survives(system: LiveSystem, fault: Fault) -> None:
-    _TRIED.setdefault(system.plant.name, set()).add(system.folder)
+    _TRIED.setdefault(system.plant.name, {})[system.folder] = system.witnessed
     outcome = try_fault(system, fault, random.Random(fault.name))
     assert outcome.survived, outcome.detail
 
 
 @pytest.mark.parametrize("system", PLANTS, ids=lambda plant: plant.name, indirect=True, scope="module")
 def test_every_bag_of_the_campaign_keeps_the_rule_of_the_last_command(system: LiveSystem) -> None:
-    folders = _TRIED.setdefault(system.plant.name, set())
+    folders = _TRIED.setdefault(system.plant.name, {})
     if not folders:  # run alone: the faults above have recorded none
         fault = next(fault for plant, fault in _SHORT if plant is system.plant)
         assert try_fault(system, fault, random.Random(fault.name)).survived
-        folders.add(system.folder)
+        folders[system.folder] = system.witnessed
     records = {
-        str(bag): check_bag(bag, limit=EFFORT_LIMIT, allowance=MACHINE_PATIENCE)
-        for folder in sorted(folders)
+        str(bag): check_bag(bag, limit=EFFORT_LIMIT, allowance=MACHINE_PATIENCE, witnessed=witnessed)
+        for folder, witnessed in sorted(folders.items())
         for bag in sorted(folder.glob("bag_*"))
     }
     assert records

@@ -85,6 +85,11 @@ def test_a_publisher_whose_message_comes_before_word_of_it_is_counted_from_its_b
     # It is the one that was met: what it misses now is a gap.
     assert [counter.see(sequence) for sequence in (43, 45)] == [0, 1]
     assert (counter.unmet, counter.missing) == (40, 1)
+    # The next one in its place, before word of it too.
+    assert [counter.see(sequence) for sequence in (31, 32)] == [0, 0]
+    met[:] = [2, 1]
+    assert [counter.see(sequence) for sequence in (33, 35)] == [0, 1]
+    assert (counter.unmet, counter.missing) == (70, 2)
 
 
 def test_a_publisher_that_is_silent_hides_no_gap_of_another() -> None:

@@ -78,8 +78,9 @@ class GapCounter:
         before = sequence - 1
         lower = max((number for number in self._last if number < sequence), default=0)
         gap = before - lower
-        # A first sample may come before the middleware has told that its publisher was met.
-        another = self._heard < total or not self._last
+        # A first sample may come before the middleware has told that its publisher was met; one that is no later than
+        # all others is another's in any case.
+        another = self._heard < total or not lower
         if sequence == 1 or not lower or gap > _LARGEST_GAP or another:
             if another:
                 self._heard += 1
