@@ -71,12 +71,18 @@ def _twin_plant(name: str) -> Fault:
 
 def _twin_controller(system: LiveSystem, _: random.Random) -> Outcome:
     outcome = Outcome()
-    twin = system.processes.start_node(system.program("controller", q=[1.0, 0.01]))
     topic = f"{system.plant.namespace}/{names.EFFORT_COMMAND}"
 
-    def both_are_there() -> bool:
+    def controllers() -> set[tuple[int, ...]]:
         infos = system.conductor.node.get_publishers_info_by_topic(topic)
-        return [info.node_name for info in infos].count("controller") == 2
+        return {tuple(info.endpoint_gid) for info in infos if info.node_name == "controller"}
+
+    # One that was killed shortly before is on the graph until its lease ends.
+    before = controllers()
+    twin = system.processes.start_node(system.program("controller", q=[1.0, 0.01]))
+
+    def both_are_there() -> bool:
+        return "controller" in system.alive() and bool(controllers() - before)
 
     system.wait_for("the twin to be on the graph", both_are_there, START_TIMEOUT)
     seen_ns = time.time_ns()
