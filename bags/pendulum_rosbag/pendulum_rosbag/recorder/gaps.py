@@ -81,10 +81,10 @@ class GapCounter:
         # A first sample may come before the middleware has told that its publisher was met; one that is no later than
         # all others is another's in any case.
         another = self._heard < total or not lower
-        if sequence == 1 or not lower or gap > _LARGEST_GAP or another:
+        if another or gap > _LARGEST_GAP:
             if another:
                 self._heard += 1
-                if lower and sequence > 1 and gap <= _LARGEST_GAP:
+                if lower and gap <= _LARGEST_GAP:
                     self._doubts[lower] = _Doubt(gap, unmet=before)
                 else:
                     self.unmet += before
