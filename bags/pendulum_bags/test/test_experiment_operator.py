@@ -81,7 +81,7 @@ def test_a_backend_that_nobody_knows_is_a_real_machine_whatever_its_name(
     assert machine is not None
     # A run on it is never started again by itself, its bag names a machine, and its watchdogs stay the strict ones.
     assert not machine.emulated
-    assert settings.hardware_plant == "hebi"
+    assert settings.plant_name("hw") == "hebi"
     assert "feedback_watchdog" not in settings.bridge_program().parameters
     ask_yes(machine, "It moves.", make_console(), yes=True)
     assert "This moves a REAL machine" in capsys.readouterr().out

@@ -136,7 +136,7 @@ def test_two_simulations_of_others_are_compared_without_a_process(model: Path, t
     told = read_bag(place / "hw").metadata["pendulum.run"]
     assert (told["plant"], told["namespace"], told["stand_in"]) == ("own.xml", "/hw", "simulation")
     assert told["simulation"]["name"] == "own.xml"
-    in_real_time = settings.metadata("thesis", side="hw", plant=settings.hardware_plant, namespace="/hw")
+    in_real_time = settings.metadata("thesis", side="hw", plant=settings.plant_name("hw"), namespace="/hw")
     assert in_real_time["pendulum.run"]["simulation"] == told["simulation"]
     assert settings.plant_program("hw").full_name == "/hw/simulator"  # type: ignore[union-attr]
 

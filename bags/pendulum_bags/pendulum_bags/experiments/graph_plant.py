@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from pendulum_msgs_py.contract import names
@@ -12,7 +11,7 @@ from pendulum_msgs_py.errors import FaultError, ParameterError
 if TYPE_CHECKING:
     from pendulum_bags.experiments.conductor_node import Conductor, PlantClient
 
-__all__ = ["PREFIX", "GraphPlant", "find_plant", "graph_plant", "join"]
+__all__ = ["PREFIX", "find_plant", "join", "running_namespace"]
 
 PREFIX = "ros:"
 _NAMESPACE = re.compile(r"(?:/[A-Za-z][A-Za-z0-9_]*)+")
@@ -25,19 +24,8 @@ _OURS = ("controller", "disturbance", "recorder")
 """Names of the nodes that an experiment starts beside a plant."""
 
 
-@dataclass(frozen=True)
-class GraphPlant:
-    """A plant behind the contract, ours or one that ``adopt`` stands before, which this experiment does not start.
-
-    Attributes:
-        namespace: Namespace of its topics, such as ``/lab``.
-    """
-
-    namespace: str
-
-
-def graph_plant(name: str) -> GraphPlant | None:
-    """Return the plant that ``ros:/namespace`` names; None for other names.
+def running_namespace(name: str) -> str | None:
+    """Return the namespace of the running plant that ``ros:/namespace`` names; None for other names.
 
     Raises:
         ParameterError: What follows is no namespace.
@@ -47,7 +35,7 @@ def graph_plant(name: str) -> GraphPlant | None:
     namespace = name.removeprefix(PREFIX)
     if not _NAMESPACE.fullmatch(namespace):
         raise ParameterError(f"plant is {name!r}; expected {PREFIX}/NAMESPACE of a running plant, such as {PREFIX}/lab")
-    return GraphPlant(namespace)
+    return namespace
 
 
 def find_plant(conductor: Conductor, namespace: str, patience: float = _PATIENCE) -> str:
@@ -69,19 +57,19 @@ def find_plant(conductor: Conductor, namespace: str, patience: float = _PATIENCE
     return conductor.wait_for(f"a plant in {namespace}", found, patience)[0]
 
 
-def join(conductor: Conductor, plant: GraphPlant) -> PlantClient:
+def join(conductor: Conductor, space: str) -> PlantClient:
     """Return a client of a running plant that is at rest and that nobody else commands.
 
     Args:
         conductor: Who conducts.
-        plant: The plant; whatever is found, nothing is sent to it.
+        space: Namespace of a plant behind the contract, ours or one that ``adopt`` stands before; whatever is found
+            there, nothing is sent to it.
 
     Raises:
         FaultError: There is no such plant, somebody else commands it, it is armed, or it does not hang near 0.
     """
     from pendulum_bags.experiments.conductor_node import PlantClient
 
-    space = plant.namespace
     node = find_plant(conductor, space)
     for name, namespace in conductor.node.get_node_names_and_namespaces():
         if namespace == space and name in _OURS:

@@ -57,7 +57,7 @@ def simulate(spec: RunSpec) -> RunArrays:
     Raises:
         ParameterError: The run is of the emulated hardware, or its plant has parameters beyond the plain ones.
     """
-    if (spec.side != "sim" and spec.foreign is None) or spec.plant_parameters:
+    if spec.has_bridge or spec.plant_parameters:
         raise ParameterError("a run in one process is of the plain simulator; others run as nodes")
     if (foreign := spec.foreign) is not None:
         return _simulate(spec, foreign.open(), Sensors())

@@ -217,7 +217,7 @@ class RunSpec:
                 **values,
                 "experiment": self.clock,
                 "plant": self.plant if self.side == "sim" else "emulator" if foreign is None else foreign.label,
-                "emulated_plant": self.plant if self.side == "hw" and foreign is None else "",
+                "emulated_plant": self.plant if self.has_bridge else "",
                 **({} if foreign is None else {"simulation": foreign.to_json()}),
                 **({STAND_IN: "simulation"} if self.side == "hw" and foreign is not None else {}),
                 "namespace": self.namespace,

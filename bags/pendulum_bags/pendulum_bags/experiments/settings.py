@@ -7,7 +7,7 @@ from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import Any
 
-from pendulum_bags.experiments.graph_plant import PREFIX, GraphPlant, graph_plant
+from pendulum_bags.experiments.graph_plant import PREFIX, running_namespace
 from pendulum_bags.experiments.operator import RealMachine, real_machine
 from pendulum_bags.experiments.run_spec import EMULATOR_LIFETIME, EMULATOR_WATCHDOG, THESIS_METHOD, integrator_of
 from pendulum_bags.experiments.simulation import ForeignSimulation
@@ -158,26 +158,24 @@ class RegulationSettings:
             return None
         return ForeignSimulation(name, mapping)
 
-    def running(self, side: str) -> GraphPlant | None:
-        """Return the plant that runs already as one side, ``sim`` or ``hw``; None where the experiment starts it."""
-        return graph_plant(self.simulation if side == "sim" else self.hardware)
+    def running(self, side: str) -> str | None:
+        """Return the namespace of the plant that runs already as one side; None where the experiment starts it."""
+        return running_namespace(self.simulation if side == "sim" else self.hardware)
 
     def namespace(self, side: str) -> str:
         """Return the namespace of one side's plant."""
-        running = self.running(side)
-        return f"/{side}" if running is None else running.namespace
+        return self.running(side) or f"/{side}"
 
     @property
     def is_emulated(self) -> bool:
         """Whether nothing real can move: the hardware is emulated or simulated, and the experiment starts both."""
-        stands_in = self.hardware_plant == "emulator" or self.foreign_of("hw") is not None
+        stands_in = self.plant_name("hw") == "emulator" or self.foreign_of("hw") is not None
         return stands_in and self.running("sim") is None
 
     @property
     def can_repeat(self) -> bool:
         """Whether both sides can be recorded again with new noise, in lockstep and without an operator."""
-        stands_in = self.hardware == "emulator" or self.foreign_of("hw") is not None
-        return stands_in and self.running("sim") is None
+        return self.is_emulated and self.machine is None
 
     @property
     def machine(self) -> RealMachine | None:
@@ -191,9 +189,10 @@ class RegulationSettings:
         of_lab = machine.lab.values.get("effort_strategy", "") if machine is not None else ""
         return self.effort_strategy or of_lab or DEFAULT_STRATEGY
 
-    @property
-    def hardware_plant(self) -> str:
-        """What a bag names as the hardware's plant: ``emulator``, also for the emulated machine of a lab file."""
+    def plant_name(self, side: str) -> str:
+        """Return what a bag names as a side's plant: ``emulator``, also for the emulated machine of a lab file."""
+        if side == "sim":
+            return self.plant if self.running(side) is None else self.simulation
         if (foreign := self.foreign_of("hw")) is not None:
             return foreign.label
         return "emulator" if self.machine is not None and self.machine.emulated else self.hardware
@@ -266,7 +265,7 @@ class RegulationSettings:
 
     def metadata(self, experiment: str, *, side: str = "sim", **more: Any) -> dict[str, Any]:
         """Return what one side's bag says about its run."""
-        foreign = self.foreign_of(side) if side == "sim" or self.foreign_of("hw") is not None else self.foreign
+        foreign = self.foreign_of(side) or self.foreign
         return {
             RUN_RECORD: {
                 "experiment": experiment,

@@ -77,11 +77,11 @@ def _start(
 ) -> tuple[PlantClient, PlantClient]:
     """Start all programs; return both plants. Those that run already are looked at first, and only looked at."""
     joined = {side: join(conductor, running) for side in SIDES if (running := settings.running(side)) is not None}
-    for side, plant in (("sim", settings.plant), ("hw", settings.hardware_plant)):
+    for side in SIDES:
         metadata = folder / "logs" / f"{side}_metadata.json"
         namespace = settings.namespace(side)
-        told = settings.simulation if side == "sim" and side in joined else plant
-        write_json(metadata, settings.metadata("thesis", side=side, plant=told, namespace=namespace))
+        plant = settings.plant_name(side)
+        write_json(metadata, settings.metadata("thesis", side=side, plant=plant, namespace=namespace))
         start_recorder(processes, folder / side, namespace, metadata, settings.storage)
     programs = {side: settings.plant_program(side, folder / "hw") for side in SIDES}
     others = [

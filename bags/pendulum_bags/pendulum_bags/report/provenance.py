@@ -12,7 +12,7 @@ from pendulum_bags.figures.numbers import quantity
 from pendulum_bags.figures.table import Table
 from pendulum_bags.report.data import ReportData
 from pendulum_bags.report.tables import typeset
-from pendulum_bags.runs.run_record import run_record
+from pendulum_bags.runs.run_record import record_named, run_record
 from pendulum_msgs_py.plants.plant_parameters import PLANT_SPECS, PlantParameters
 
 __all__ = ["citation", "provenance_table", "settings_table"]
@@ -59,7 +59,7 @@ def provenance_table(data: ReportData) -> Table:
 def _occasion(data: ReportData) -> list[tuple[str, str]]:
     """Return when, on which computers and by which command the first run was recorded, as far as its bags say."""
     pair = data.comparison.pairs[0]
-    tellers = [_told(one.metadata, "pendulum.recorder") for one in (pair.simulation, pair.hardware)]
+    tellers = [record_named(one.metadata, "pendulum.recorder") for one in (pair.simulation, pair.hardware)]
     begun = [began for teller in tellers if isinstance(began := teller.get("started_ns"), int)]
     rows = []
     if begun:
@@ -78,7 +78,7 @@ def settings_table(data: ReportData) -> Table | None:
     pair = data.comparison.pairs[0]
     nodes: dict[str, Mapping[str, Any]] = {}
     for one in (pair.simulation, pair.hardware):
-        nodes.update(_told(one.metadata, "pendulum.parameters"))
+        nodes.update(record_named(one.metadata, "pendulum.parameters"))
     rows = [
         (node, "; ".join(f"{name} {_setting(value)}" for name, value in sorted(parameters.items())))
         for node, parameters in sorted(nodes.items())
@@ -93,11 +93,6 @@ def settings_table(data: ReportData) -> Table | None:
         rows,
         "Provenance",
     )
-
-
-def _told(metadata: Mapping[str, Any], name: str) -> Mapping[str, Any]:
-    found = metadata.get(name)
-    return found if isinstance(found, Mapping) else {}
 
 
 def _setting(value: Any) -> str:

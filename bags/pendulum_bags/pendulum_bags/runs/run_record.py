@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-__all__ = ["RUN_RECORD", "STAND_IN", "run_record"]
+__all__ = ["RUN_RECORD", "STAND_IN", "record_named", "run_record"]
 
 RUN_RECORD = "pendulum.run"
 """Name of the record among a bag's metadata; ``RunSpec`` and the settings of experiments write it."""
@@ -19,5 +19,10 @@ def run_record(metadata: Mapping[str, Any]) -> Mapping[str, Any]:
     Args:
         metadata: Metadata of the bag, by name.
     """
-    found = metadata.get(RUN_RECORD)
+    return record_named(metadata, RUN_RECORD)
+
+
+def record_named(metadata: Mapping[str, Any], name: str) -> Mapping[str, Any]:
+    """Return a record of a bag's metadata by its name, empty where a bag has none or something else there."""
+    found = metadata.get(name)
     return found if isinstance(found, Mapping) else {}
