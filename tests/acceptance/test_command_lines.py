@@ -13,7 +13,6 @@ import json
 import os
 import pty
 import re
-import shutil
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -29,6 +28,7 @@ from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.programs import completion
 from tests.acceptance.test_packaging import PROGRAMS as INSTALLED
 from tests.acceptance.test_packaging import executables
+from tests.completing import completed
 from tests.fixtures import PROJECT
 
 # ``pendulum`` has no command line of its own: it starts the others (test_pendulum_command.py).
@@ -186,32 +186,19 @@ def test_every_command_completes_its_options(
         assert ":=" in capsys.readouterr().out, program
 
 
-_ASK = """
-ask() {{ COMP_LINE="$1"; COMP_POINT=${{#1}}; {words}COMPREPLY=(); _pendulum_complete; echo "${{COMPREPLY[*]}}"; }}
-ask "{python} -m pendul"
-ask "{python} -m pendulum_bags rep"
-ask "{python} -m pendulum_bags experiment the"
-ask "{python} -m pendulum_bags compare --js"
-ask "{python} -m pendulum_lqr controller --ros-args -p set_po"
-ask "{python} -m http.ser"
-"""
-
-
 @pytest.mark.parametrize("shell", completion.SHELLS)
 def test_the_shell_completes_what_is_typed(shell: str) -> None:
-    program = shutil.which(shell)
-    if program is None:
-        pytest.skip(f"{shell} is not installed")
-    ask = _ASK.format(python=sys.executable, words="words=(${=1}); " if shell == "zsh" else "")
-    text = completion.script(shell) + ask
-    done = subprocess.run([program, "-c", text], capture_output=True, text=True, timeout=60, check=True, cwd=PROJECT)
-    packages, programs, below, option, parameter, other = done.stdout.splitlines()[-6:]
-    assert {"pendulum_bags", "pendulum_sim"} <= set(packages.split())
-    assert programs.split() == ["repair", "replay", "report"]
-    assert below == "thesis"
-    assert option == "--json"
-    assert parameter == "set_point:="
-    assert other == ""
+    typed = (
+        "pendul",
+        "pendulum_bags rep",
+        "pendulum_bags experiment the",
+        "pendulum_bags compare --js",
+        "pendulum_lqr controller --ros-args -p set_po",
+        "http.ser",
+    )
+    packages, *others = completed(shell, completion.script(shell), *(f"{sys.executable} -m {line}" for line in typed))
+    assert {"pendulum_bags", "pendulum_sim"} <= set(packages)
+    assert others == [["repair", "replay", "report"], ["thesis"], ["--json"], ["set_point:="], []]
 
 
 def test_another_shell_is_refused_with_a_sentence(capsys: pytest.CaptureFixture[str]) -> None:

@@ -4,17 +4,8 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Sequence
-from difflib import get_close_matches
 
-from pendulum_msgs_py.programs import completion
-from pendulum_msgs_py.programs.executables import (
-    EXIT_USAGE,
-    print_completion,
-    print_text,
-    run_program,
-    summary,
-    tables_of,
-)
+from pendulum_msgs_py.programs.executables import answer_of_dispatcher, run_program, summary, tables_of
 
 __all__ = ["SECTIONS", "main"]
 
@@ -98,20 +89,15 @@ def main(argv: Sequence[str] | None = None) -> int:
     """
     arguments = list(sys.argv[1:] if argv is None else argv)
     commands = {name: target for section in SECTIONS.values() for name, target in section.items()}
-    if completion.asked() and len(arguments) < 2:
-        print_text("\n".join(completion.of_package(commands, arguments)))
-        return 0
-    if arguments and arguments[0] == "--completion":
-        return print_completion(arguments[1:])
-    if not arguments or arguments[0] in {"-h", "--help"}:
-        print_text(_help())
-        return 0 if arguments else EXIT_USAGE
+    code = answer_of_dispatcher(
+        arguments,
+        commands,
+        usage=_help,
+        unknown=lambda name: f"there is no command {name!r}; expected one that pendulum --help lists",
+    )
+    if code is not None:
+        return code
     name, *rest = arguments
-    if name not in commands:
-        near = get_close_matches(name, commands, n=1)
-        hint = f"; did you mean {near[0]!r}?" if near else ""
-        print(f"error: there is no command {name!r}; expected one that pendulum --help lists{hint}", file=sys.stderr)
-        return EXIT_USAGE
     package, program = commands[name].split()
     return run_program(tables_of(package)[program], rest, called_as=f"pendulum {name}")
 

@@ -1,10 +1,13 @@
-"""Progress of work that is counted in pieces and kept piece by piece, in the terminal."""
+"""Progress of work that is counted in pieces, in the terminal."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+import os
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor
 from contextlib import contextmanager
 from pathlib import Path
+from typing import TypeVar
 
 import typer
 from rich.console import Console
@@ -19,7 +22,9 @@ from rich.progress import (
 
 from pendulum_msgs_py.programs.executables import EXIT_INTERRUPTED
 
-__all__ = ["counted_progress", "counting_bar", "resumable"]
+__all__ = ["counted_progress", "counting_bar", "results_at_once", "resumable"]
+
+_Result = TypeVar("_Result")
 
 
 def counting_bar(console: Console, *columns: ProgressColumn) -> Progress:
@@ -33,6 +38,40 @@ def counting_bar(console: Console, *columns: ProgressColumn) -> Progress:
         TextColumn("{task.description}"), BarColumn(bar_width=None), MofNCompleteColumn(), *columns,
         console=console, transient=True, disable=not console.is_terminal,
     )  # fmt: skip
+
+
+def results_at_once(
+    console: Console, unit: str, jobs: Sequence[Callable[[], _Result]], workers: int = 0
+) -> list[_Result]:
+    """Return what each job returns, run in processes of their own beside a counting bar.
+
+    Args:
+        console: Where to draw.
+        unit: What is counted, as a plural.
+        jobs: What to run; each can be pickled.
+        workers: Jobs at once; 0 for one a core.
+
+    Raises:
+        typer.Exit: The user interrupted; nothing of the results is left.
+    """
+    pool = ProcessPoolExecutor(min(len(jobs), workers or os.cpu_count() or 1))
+    results = []
+    try:
+        with counting_bar(console) as bar:
+            task = bar.add_task(unit, total=len(jobs))
+            for result in pool.map(_call, jobs):
+                results.append(result)
+                bar.advance(task)
+    except KeyboardInterrupt:
+        pool.shutdown(wait=False, cancel_futures=True)
+        console.print("interrupted: nothing was written")
+        raise typer.Exit(EXIT_INTERRUPTED) from None
+    pool.shutdown()
+    return results
+
+
+def _call(job: Callable[[], _Result]) -> _Result:
+    return job()
 
 
 @contextmanager

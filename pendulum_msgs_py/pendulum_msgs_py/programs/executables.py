@@ -12,7 +12,7 @@ import importlib.util
 import os
 import re
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Collection, Sequence
 from difflib import get_close_matches
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -27,6 +27,7 @@ if TYPE_CHECKING:
 __all__ = [
     "EXIT_INTERRUPTED",
     "EXIT_USAGE",
+    "answer_of_dispatcher",
     "cli_main",
     "is_exhaustion",
     "print_completion",
@@ -56,22 +57,43 @@ def run_package(package: str, argv: Sequence[str] | None = None) -> int:
     importlib.import_module("pendulum_msgs_py.programs.one_thread")
     arguments = list(sys.argv[1:] if argv is None else argv)
     table = tables_of(package)
+    code = answer_of_dispatcher(
+        arguments,
+        table,
+        usage=lambda: _usage(package, table),
+        unknown=lambda name: f"{package} has no executable {name!r}; expected one of {', '.join(sorted(table))}",
+    )
+    return run_program(table[arguments[0]], arguments[1:]) if code is None else code
+
+
+def answer_of_dispatcher(
+    arguments: Sequence[str], names: Collection[str], *, usage: Callable[[], str], unknown: Callable[[str], str]
+) -> int | None:
+    """Answer what a command that only starts others answers itself: completion, help, a name that is not known.
+
+    Args:
+        arguments: All of the command's.
+        names: Programs that it starts.
+        usage: Returns its help.
+        unknown: Returns what to say of a name that is none of these.
+
+    Returns:
+        The exit code; None where the first argument is the name of a program to start.
+    """
     if completion.asked() and len(arguments) < 2:
-        print_text("\n".join(completion.of_package(table, arguments)))
+        print_text("\n".join(completion.of_package(names, arguments)))
         return 0
     if arguments and arguments[0] == "--completion":
         return print_completion(arguments[1:])
     if not arguments or arguments[0] in {"-h", "--help"}:
-        print_text(_usage(package, table))
+        print_text(usage())
         return 0 if arguments else EXIT_USAGE
-    name, *rest = arguments
-    if name not in table:
-        near = get_close_matches(name, table, n=1)
-        hint = f"; did you mean {near[0]!r}?" if near else ""
-        expected = ", ".join(sorted(table))
-        print(f"error: {package} has no executable {name!r}; expected one of {expected}{hint}", file=sys.stderr)
-        return EXIT_USAGE
-    return run_program(table[name], rest)
+    if (name := arguments[0]) in names:
+        return None
+    near = get_close_matches(name, names, n=1)
+    hint = f"; did you mean {near[0]!r}?" if near else ""
+    print(f"error: {unknown(name)}{hint}", file=sys.stderr)
+    return EXIT_USAGE
 
 
 def tables_of(package: str) -> dict[str, str]:

@@ -22,7 +22,6 @@ import csv
 import io
 import math
 from collections.abc import Mapping
-from difflib import get_close_matches
 from pathlib import Path
 from typing import Any
 
@@ -31,7 +30,7 @@ import scipy
 
 from pendulum_bags.runs.datasets import Array, Recording, first_of_each_stamp
 from pendulum_msgs_py.errors import DataError
-from pendulum_msgs_py.parameters import load_yaml
+from pendulum_msgs_py.parameters import load_yaml, suggestion
 
 __all__ = ["MAPPINGS", "UNITS", "read_csv"]
 
@@ -170,9 +169,7 @@ def _load_mapping(mapping: str | Path | Mapping[str, Any] | None) -> tuple[Mappi
 def _reject_unknown(given: Mapping[str, Any], known: set[str], where: str) -> None:
     for key in given:
         if key not in known:
-            near = get_close_matches(str(key), sorted(known), n=1)
-            hint = f"; did you mean {near[0]!r}?" if near else ""
-            raise DataError(f"{where} has an unknown key {key!r}; expected {', '.join(sorted(known))}{hint}")
+            raise DataError(f"{where} has an unknown key {key!r}; {suggestion(key, sorted(known))}")
 
 
 def _detrended(values: Array, detrend: Any, origin: str) -> Array:

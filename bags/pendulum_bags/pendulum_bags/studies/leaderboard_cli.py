@@ -3,17 +3,15 @@
 from __future__ import annotations
 
 import json
-import os
-from concurrent.futures import ProcessPoolExecutor
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
 from pendulum_msgs_py.errors import ParameterError
-from pendulum_msgs_py.programs.counted_progress import counting_bar
-from pendulum_msgs_py.programs.executables import EXIT_INTERRUPTED
+from pendulum_msgs_py.programs.counted_progress import results_at_once
 from pendulum_msgs_py.programs.terminal import WholeTable, make_console
 
 __all__ = ["leaderboard"]
@@ -61,28 +59,23 @@ def leaderboard(
         if name != HARDWARE:
             load_plant(name)
     console = make_console(stderr=json_output, highlight=False)
-    entries = []
-    pool = ProcessPoolExecutor(workers or os.cpu_count() or 1)
-    try:
-        with counting_bar(console) as bar:
-            task = bar.add_task("controllers", total=len(names) * len(machines))
-            jobs = [
-                pool.submit(evaluate_hardware, kind, parameters=parameters, duration=duration, robustness=robustness)
-                if machine == HARDWARE
-                else pool.submit(
-                    evaluate, machine, kind, parameters=parameters, duration=duration, robustness=robustness
-                )
-                for machine in machines
-                for kind, parameters in map(_contender, names)
-            ]
-            for job, name in zip(jobs, names * len(machines), strict=True):
-                entries.append(replace(job.result(), controller=Path(name).stem if name.endswith(_POLICY) else name))
-                bar.advance(task)
-    except KeyboardInterrupt:
-        pool.shutdown(wait=False, cancel_futures=True)
-        console.print("interrupted: nothing was written")
-        raise typer.Exit(EXIT_INTERRUPTED) from None
-    pool.shutdown()
+    jobs = [
+        partial(
+            evaluate_hardware if machine == HARDWARE else partial(evaluate, machine),
+            kind,
+            parameters=parameters,
+            duration=duration,
+            robustness=robustness,
+        )
+        for machine in machines
+        for kind, parameters in map(_contender, names)
+    ]
+    entries = [
+        replace(entry, controller=Path(name).stem if name.endswith(_POLICY) else name)
+        for entry, name in zip(
+            results_at_once(console, "controllers", jobs, workers), names * len(machines), strict=True
+        )
+    ]
     out.mkdir(parents=True, exist_ok=True)
     page = write_page(out / "leaderboard.html", entries, duration)
     write_json(out / "leaderboard.json", to_json(entries))

@@ -35,6 +35,7 @@ __all__ = [
     "benchmark_plant",
     "criteria_of",
     "is_above_line",
+    "line_height",
     "score_v2",
     "time_above_line",
 ]
@@ -129,7 +130,7 @@ def benchmark_plant(name: str) -> MechanismParameters:
 
 
 def is_above_line(plant: MechanismParameters, states: Array) -> NDArray[np.bool_]:
-    """Return where the tip is above nine tenths of the arms' length.
+    """Return where the tip is above the line.
 
     Args:
         plant: A double pendulum.
@@ -137,8 +138,12 @@ def is_above_line(plant: MechanismParameters, states: Array) -> NDArray[np.bool_
     """
     chain = in_arithmetic(plant.mechanism.chain, np)
     height = chain((states[:, 0], states[:, 1]), plant.packed)[-1][2]
-    above = height > _LINE * (plant.value("length_1") + plant.value("length_2"))
-    return np.asarray(above, dtype=np.bool_)
+    return np.asarray(height > line_height(plant), dtype=np.bool_)
+
+
+def line_height(plant: MechanismParameters) -> float:
+    """Return the height above the base from which a double pendulum's tip is up [m]."""
+    return _LINE * (plant.value("length_1") + plant.value("length_2"))
 
 
 def criteria_of(plant: MechanismParameters, times: Array, states: Array, efforts: Array) -> dict[str, float]:

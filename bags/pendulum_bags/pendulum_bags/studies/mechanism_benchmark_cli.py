@@ -3,19 +3,16 @@
 from __future__ import annotations
 
 import json
-import multiprocessing
-import os
 import time
 from collections.abc import Sequence
-from concurrent.futures import ProcessPoolExecutor
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 from rich.console import Console
 
-from pendulum_msgs_py.programs.counted_progress import counting_bar
-from pendulum_msgs_py.programs.executables import EXIT_INTERRUPTED
+from pendulum_msgs_py.programs.counted_progress import results_at_once
 from pendulum_msgs_py.programs.terminal import WholeTable, make_console
 
 if TYPE_CHECKING:
@@ -51,7 +48,7 @@ def benchmark(
     from pendulum_bags.studies.mechanism_benchmark import PUBLISHED, benchmark_plant
     from pendulum_bags.studies.mechanism_benchmark_figure import write_swing_up_figure
     from pendulum_bags.studies.mechanism_benchmark_runs import robustness_trials
-    from pendulum_bags.studies.mechanism_benchmark_table import begin_worker, document, run_job, score_rows
+    from pendulum_bags.studies.mechanism_benchmark_table import Bench, document, prepare, run_job, score_rows
     from pendulum_lqr.mechanism_controllers import mechanism_controller_names
 
     model = benchmark_plant(plant)
@@ -62,37 +59,18 @@ def benchmark(
     jobs += [("uptime", name, seed * 1000 + each) for name in names for each in range(uptime_seeds)]
     jobs += [("trial", name, index) for name in names for index in range(len(trials))]
     started = time.monotonic()
-    # Forked where that is possible, so that what was compiled here need not be compiled in each of them.
-    method = "fork" if "fork" in multiprocessing.get_all_start_methods() else "spawn"
-    compiled = len(jobs) > _FEW
     console.print(f"designing {', '.join(names)}, then {len(jobs)} runs", style="dim")
-    settings = (plant, tuple(names), seed, compiled)
-    begin_worker(*settings)
-    count = min(len(jobs), workers or os.cpu_count() or 1)
-    pool = ProcessPoolExecutor(
-        count,
-        mp_context=multiprocessing.get_context(method),
-        initializer=begin_worker,
-        initargs=settings,
-    )
-    results = []
-    try:
-        with counting_bar(console) as bar:
-            task = bar.add_task("runs", total=len(jobs))
-            for result in pool.map(run_job, jobs, chunksize=4):
-                results.append(result)
-                bar.advance(task)
-    except KeyboardInterrupt:
-        pool.shutdown(wait=False, cancel_futures=True)
-        console.print("interrupted: nothing was written")
-        raise typer.Exit(EXIT_INTERRUPTED) from None
-    pool.shutdown()
+    bench = Bench(plant, tuple(names), seed, compiled=len(jobs) > _FEW)
+    # A process that is forked from this one has what is prepared here.
+    prepare(bench)
+    results = results_at_once(console, "runs", [partial(run_job, bench, job) for job in jobs], workers)
     rows = score_rows(names, jobs, results, trials)
     out.mkdir(parents=True, exist_ok=True)
     picture = write_swing_up_figure(out / f"{plant}.png", model, rows)
-    write_json(out / f"{plant}.json", document(plant, seed, rows))
+    told = document(plant, seed, rows)
+    write_json(out / f"{plant}.json", told)
     if json_output:
-        print(json.dumps(document(plant, seed, rows), indent=2))
+        print(json.dumps(told, indent=2))
         return
     _print(console, plant, rows, [row for row in PUBLISHED if row.plant == plant])
     console.print(f"figure  {picture}\nresults {out / f'{plant}.json'}", soft_wrap=True)

@@ -7,7 +7,8 @@ from pathlib import Path
 
 import numpy as np
 
-from pendulum_bags.studies.mechanism_benchmark import is_above_line
+from pendulum_bags.studies.mechanism_benchmark import is_above_line, line_height
+from pendulum_bags.studies.mechanism_benchmark_runs import DURATION
 from pendulum_bags.studies.mechanism_benchmark_table import Row
 from pendulum_msgs_py.dynamics.arithmetic import in_arithmetic
 from pendulum_msgs_py.plants.mechanism_parameters import MechanismParameters
@@ -39,6 +40,7 @@ def write_swing_up_figure(path: Path, plant: MechanismParameters, rows: Sequence
     above = np.flatnonzero(is_above_line(plant, states))
     end = min(times[-1], best.criteria["swingup_time"] + 0.6) if above.size else 3.0
     reach = plant.value("length_1") + plant.value("length_2")
+    line = line_height(plant)
     for index, t in enumerate(np.linspace(0.0, end, _POSES)):
         k = int(np.searchsorted(times, t))
         points = chain(tuple(states[k, :2]), plant.packed)
@@ -46,7 +48,7 @@ def write_swing_up_figure(path: Path, plant: MechanismParameters, rows: Sequence
         z = [float(point[2]) for point in points]
         top.plot(x, z, "o-", color="black", lw=2.0, ms=3.0, markerfacecolor="white")
         top.annotate(f"{t:.2f} s", (_APART * reach * index, -1.15 * reach), ha="center", va="top", fontsize=7)
-    top.axhline(0.9 * reach, color="0.4", ls="--", lw=0.9)
+    top.axhline(line, color="0.4", ls="--", lw=0.9)
     top.set_ylim(-1.5 * reach, 1.15 * reach)
     top.set_aspect("equal")
     top.set_axis_off()
@@ -57,13 +59,13 @@ def write_swing_up_figure(path: Path, plant: MechanismParameters, rows: Sequence
         height = chain((x[:, 0], x[:, 1]), plant.packed)[-1][2]
         middle.plot(t, height, lw=1.4, label=f"{row.controller} ({row.score:.3f})", **style)
         bottom.plot(t, u[:, plant.coordinates.driven[0]], lw=1.2, **style)
-    middle.axhline(0.9 * reach, color="0.4", ls="--", lw=0.9)
-    middle.annotate("line of success", (10.0, 0.86 * reach), ha="right", va="top", fontsize=8, color="0.3")
+    middle.axhline(line, color="0.4", ls="--", lw=0.9)
+    middle.annotate("line of success", (DURATION, line - 0.04 * reach), ha="right", va="top", fontsize=8, color="0.3")
     middle.set_ylabel("height of the tip [m]")
     bottom.set_ylabel(f"torque at the {plant.coordinates.driven_names[0]} [N m]")
     bottom.set_xlabel("time [s]")
     for ax in (middle, bottom):
-        ax.set_xlim(0.0, 10.0)
+        ax.set_xlim(0.0, DURATION)
         ax.grid(color="0.9")
     figure.legend(*middle.get_legend_handles_labels(), loc="outside lower center", ncols=3, frameon=False)
     figure.savefig(path)

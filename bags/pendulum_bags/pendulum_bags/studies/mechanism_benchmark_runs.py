@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from pendulum_bags.studies.mechanism_benchmark import criteria_of, score_v2, time_above_line
 from pendulum_lqr.mechanism_controller import MechanismController
-from pendulum_msgs_py.contract.angles import wrap
+from pendulum_msgs_py.contract.angles import UPRIGHT, wrap
 from pendulum_msgs_py.dynamics.arithmetic import complex_step, in_arithmetic
 from pendulum_msgs_py.joints import Vector
 from pendulum_msgs_py.plants.mechanism_parameters import MechanismParameters
@@ -28,6 +28,7 @@ from pendulum_sim.joint_steps import joint_functions, rk4_joints
 
 __all__ = [
     "DT",
+    "DURATION",
     "KINDS",
     "Disturbances",
     "Robustness",
@@ -54,7 +55,6 @@ REPETITIONS = 10
 """Runs at each level of noise; more than half of them must succeed."""
 KICK_RUNS = 50
 """Runs with kicks."""
-GOAL = (math.pi, 0.0, 0.0, 0.0)
 TOLERANCE = (0.35, 0.35, 1.0, 1.0)
 """Largest deviation of the last state from upright that is a success [rad, rad, rad/s, rad/s]."""
 KINDS = {
@@ -294,7 +294,7 @@ def try_once(plant: MechanismParameters, stepper: Stepper, controller: Mechanism
     steps = round(DURATION / DT) + 1
     run = simulate(plant, stepper, _answering(plant, controller), steps, trial.disturbances, trial.seed)
     end = run.states[-1]
-    distance = np.abs(np.array([wrap(float(end[0] - GOAL[0])), wrap(float(end[1])), end[2], end[3]]))
+    distance = np.abs(np.array([wrap(float(end[0] - UPRIGHT)), wrap(float(end[1])), end[2], end[3]]))
     return bool(np.all(distance < np.array(TOLERANCE)))
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -26,7 +27,7 @@ from pendulum_lqr.mechanism_controller import MechanismController
 from pendulum_lqr.mechanism_controllers import make_mechanism_controller
 from pendulum_msgs_py.plants.mechanism_parameters import MechanismParameters
 
-__all__ = ["Job", "Row", "begin_worker", "document", "run_job", "score_rows"]
+__all__ = ["Bench", "Job", "Row", "document", "prepare", "run_job", "score_rows"]
 
 Array = NDArray[np.float64]
 Job = tuple[str, str, int]
@@ -64,47 +65,50 @@ class Row:
         return f"{np.mean(self.uptimes):.3f}{spread}"
 
 
-@dataclass
-class _Worker:
+@dataclass(frozen=True)
+class Bench:
+    """What all jobs of a benchmark share.
+
+    Attributes:
+        plant: acrobot or pendubot.
+        names: Controllers.
+        seed: Of noise and kicks.
+        compiled: Compile the simulation, which is worth its seconds for more than some runs.
+    """
+
+    plant: str
+    names: tuple[str, ...]
+    seed: int
+    compiled: bool
+
+
+@dataclass(frozen=True)
+class _Prepared:
     plant: MechanismParameters
     stepper: Stepper
     controllers: dict[str, MechanismController]
     trials: list[Trial]
 
 
-_workers: dict[tuple[str, tuple[str, ...], int], _Worker] = {}
-_mine: list[_Worker] = []
+@cache
+def prepare(bench: Bench) -> _Prepared:
+    """Design the controllers and compile the simulation, once in a process."""
+    model = benchmark_plant(bench.plant)
+    controllers = {name: make_mechanism_controller(name, model, DT) for name in bench.names}
+    stepper = make_stepper(model, compiled=bench.compiled)
+    return _Prepared(model, stepper, controllers, robustness_trials(model, bench.seed))
 
 
-def begin_worker(plant: str, names: tuple[str, ...], seed: int, compiled: bool = True) -> None:
-    """Build what the jobs of this process need; a forked process has it already.
-
-    Args:
-        plant: acrobot or pendubot.
-        names: Controllers.
-        seed: Of noise and kicks.
-        compiled: Compile the simulation, which is worth its seconds for more than some runs.
-    """
-    key = (plant, names, seed)
-    if key not in _workers:
-        model = benchmark_plant(plant)
-        controllers = {name: make_mechanism_controller(name, model, DT) for name in names}
-        _workers[key] = _Worker(
-            model, make_stepper(model, compiled=compiled), controllers, robustness_trials(model, seed)
-        )
-    _mine[:] = [_workers[key]]
-
-
-def run_job(job: Job) -> Any:
-    """Run one job of this process's controllers, and return what came of it."""
-    worker = _mine[0]
+def run_job(bench: Bench, job: Job) -> Any:
+    """Run one job and return what came of it."""
+    ready = prepare(bench)
     kind, name, number = job
-    controller = worker.controllers[name]
+    controller = ready.controllers[name]
     if kind == "swing_up":
-        return swing_up(worker.plant, worker.stepper, controller)
+        return swing_up(ready.plant, ready.stepper, controller)
     if kind == "uptime":
-        return knock_downs(worker.plant, worker.stepper, controller, number)[1]
-    return try_once(worker.plant, worker.stepper, controller, worker.trials[number])
+        return knock_downs(ready.plant, ready.stepper, controller, number)[1]
+    return try_once(ready.plant, ready.stepper, controller, ready.trials[number])
 
 
 def score_rows(names: Sequence[str], jobs: Sequence[Job], results: Sequence[Any], trials: Sequence[Trial]) -> list[Row]:

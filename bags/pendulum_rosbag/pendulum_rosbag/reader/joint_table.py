@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
@@ -37,13 +37,12 @@ class JointTable:
     effort: Array
 
 
-def joint_table(messages: Iterable[tuple[int, bytes]], where: str, names: Sequence[str] | None = None) -> JointTable:
+def joint_table(messages: Iterable[tuple[int, bytes]], where: str) -> JointTable:
     """Return messages of JointState as a table.
 
     Args:
         messages: Log time [ns] and bytes of each.
         where: Topic and bag, for messages.
-        names: The joints that are expected; None for those of the first message.
 
     Raises:
         DataError: There is none, one is no JointState with a value for each of its names, or one names other joints or
@@ -52,7 +51,7 @@ def joint_table(messages: Iterable[tuple[int, bytes]], where: str, names: Sequen
     times: list[int] = []
     stamps: list[int] = []
     rows: list[list[tuple[float, ...]]] = [[], [], []]
-    expected = None if names is None else tuple(names)
+    expected: tuple[str, ...] | None = None
     for log_time_ns, data in messages:
         fields = decode_joint_state(data)
         if fields is None:
