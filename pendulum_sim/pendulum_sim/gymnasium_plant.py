@@ -32,7 +32,7 @@ from pendulum_msgs_py.parameters import load_yaml, reject_unknown, require_mappi
 from pendulum_msgs_py.plants.plant_parameters import PlantParameters, load_plant
 from pendulum_msgs_py.programs.extras import how_to_install
 from pendulum_sim.mujoco_mapping import FORMAT
-from pendulum_sim.plant import PlantState, check_start
+from pendulum_sim.plant import PlantState, check_start, command_within
 
 __all__ = ["KNOWN", "GymnasiumPlant", "load_adapter", "load_gymnasium_plant"]
 
@@ -217,8 +217,9 @@ class GymnasiumPlant:
 
         Raises:
             FaultError: The environment ended its episode.
+            ParameterError: A torque is not finite (nothing moves then).
         """
-        command = min(self._limit, max(-self._limit, effort))
+        command = command_within(self._limit, effort, push)
         self._action.flat[self._index] = (command + push) * self._per_torque
         observation, _, terminated, _, _ = self._env.step(self._action)
         self._steps += 1

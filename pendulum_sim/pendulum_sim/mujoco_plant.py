@@ -19,7 +19,7 @@ from pendulum_msgs_py.errors import FaultError, ParameterError
 from pendulum_msgs_py.plants.plant_parameters import PlantParameters
 from pendulum_msgs_py.programs.extras import how_to_install
 from pendulum_sim.mujoco_mapping import NO_ACTUATOR, MujocoMapping
-from pendulum_sim.plant import PlantState, check_start
+from pendulum_sim.plant import PlantState, check_start, command_within
 
 __all__ = ["MujocoPlant", "load_mujoco_plant"]
 
@@ -169,10 +169,10 @@ class MujocoPlant:
 
         Raises:
             FaultError: MuJoCo met values that are not finite, or too large.
+            ParameterError: A torque is not finite (nothing moves then).
         """
         data = self._data
-        limit = self.parameters.effort_limit
-        command = min(limit, max(-limit, effort))
+        command = command_within(self.parameters.effort_limit, effort, push)
         self._push = push
         applied = push
         if self._actuator is None:

@@ -20,7 +20,7 @@ from pendulum_sim.dry_friction import PACKED, acceleration_with_friction, actuat
 from pendulum_sim.integrators import Coefficients, PlantTuple, get_integrator
 from pendulum_sim.stability import check_stability
 
-__all__ = ["DelayLine", "Plant", "PlantState", "RigidPlant", "pack", "period_segments"]
+__all__ = ["DelayLine", "Plant", "PlantState", "RigidPlant", "command_within", "pack", "period_segments"]
 
 _MAX_DELAY_STEPS = 100_000
 
@@ -55,7 +55,11 @@ class Plant(Protocol):
         """Start anew at an angle [rad] and a velocity [rad/s], the actuator without torque."""
 
     def step(self, effort: float, push: float = 0.0) -> PlantState:
-        """Advance by one period under a commanded torque and a torque on the link [N m]."""
+        """Advance by one period under a commanded torque and a torque on the link [N m].
+
+        Raises:
+            ParameterError: One of them is not finite (nothing moves then).
+        """
 
 
 class DelayLine:
@@ -178,9 +182,11 @@ class RigidPlant:
         Args:
             effort: Commanded torque, held over the period; clamped to the effort limit [N m].
             push: Torque on the link itself, neither clamped nor delayed [N m].
+
+        Raises:
+            ParameterError: One of them is not finite (nothing moves then).
         """
-        limit = self._limit
-        older, newer = self._delay.push(min(limit, max(-limit, effort)))
+        older, newer = self._delay.push(command_within(self._limit, effort, push))
         theta, theta_dot, torque = self.theta, self.theta_dot, self.effort
         lag = self._lag
         for is_newer, h, c in self._segments:
@@ -213,6 +219,17 @@ class RigidPlant:
         return rigid_energy(
             self.theta - parameters.angle_offset, self.theta_dot, parameters.inertia, parameters.gravity
         )
+
+
+def command_within(limit: float, effort: float, push: float) -> float:
+    """Return a commanded torque within the limit [N m].
+
+    Raises:
+        ParameterError: It, or the push beside it, is not finite: clamping would make all the torque of what is no number.
+    """
+    if not (math.isfinite(effort) and math.isfinite(push)):
+        raise ParameterError(f"effort is {effort} N m and push {push} N m; expected finite numbers")
+    return limit if effort > limit else max(effort, -limit)
 
 
 def check_step(dt: float, substeps: int) -> None:

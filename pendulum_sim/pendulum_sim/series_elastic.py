@@ -29,7 +29,7 @@ from pendulum_msgs_py.dynamics.series_elastic import (
 from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.plants.plant_parameters import PlantParameters
 from pendulum_sim.dry_friction import actuator_torque
-from pendulum_sim.plant import DelayLine, PlantState, check_start, check_step, period_segments
+from pendulum_sim.plant import DelayLine, PlantState, check_start, check_step, command_within, period_segments
 from pendulum_sim.stability import MOST_GROWTH, growth_of_map
 
 __all__ = [
@@ -217,10 +217,12 @@ class SeriesElasticPlant:
         Args:
             effort: Commanded torque, held over the period; clamped to the effort limit [N m].
             push: Torque on the link itself [N m].
+
+        Raises:
+            ParameterError: One of them is not finite (nothing moves then).
         """
         parameters = self.parameters
-        limit = parameters.effort_limit
-        older, newer = self._delay.push(min(limit, max(-limit, effort)))
+        older, newer = self._delay.push(command_within(parameters.effort_limit, effort, push))
         disturbance = push + parameters.torque_offset
         x = (self.q_m, self.v_m, self.theta, self.theta_dot, self.z)
         for is_newer, h in self._segments:

@@ -5,13 +5,19 @@ from __future__ import annotations
 import math
 import threading
 import time
+from collections.abc import Callable
+from pathlib import Path
 
 import pytest
 
-from pendulum_msgs_py.errors import FaultError
+from pendulum_msgs_py.errors import FaultError, ParameterError
 from pendulum_msgs_py.plants.plant_parameters import load_plant
 from pendulum_sim.guarded_plant import GuardedPlant, PaceWatch, StallWatch
-from pendulum_sim.plant import PlantState, RigidPlant
+from pendulum_sim.gymnasium_plant import load_gymnasium_plant
+from pendulum_sim.model_files import mjcf
+from pendulum_sim.mujoco_plant import load_mujoco_plant
+from pendulum_sim.plant import Plant, PlantState, RigidPlant
+from pendulum_sim.plants import make_plant
 
 
 class Broken(RigidPlant):
@@ -50,6 +56,31 @@ def test_a_sound_plant_passes_unchanged() -> None:
     guarded = GuardedPlant(one, "lab")
     assert guarded.reset(1.0) == other.reset(1.0)
     assert guarded.step(0.3, 0.1) == other.step(0.3, 0.1) == guarded.state
+
+
+def _mujoco(folder: Path) -> Plant:
+    pytest.importorskip("mujoco")
+    (folder / "lab.xml").write_text(mjcf(load_plant("thesis")), encoding="utf-8")
+    return load_mujoco_plant(folder / "lab.xml")
+
+
+_PLANTS: dict[str, Callable[[Path], Plant]] = {
+    "rigid": lambda _: make_plant(load_plant("thesis"), 0.002),
+    "series_elastic": lambda _: make_plant(load_plant("x5_9"), 0.002),
+    "gymnasium": lambda _: load_gymnasium_plant("Pendulum-v1"),
+    "mujoco": _mujoco,
+}
+
+
+@pytest.mark.parametrize("kind", _PLANTS)
+def test_no_torque_is_made_of_a_command_that_is_no_number(kind: str, tmp_path: Path) -> None:
+    plant = _PLANTS[kind](tmp_path)
+    start = plant.reset(0.3, 0.2)
+    for effort, push in ((math.nan, 0.0), (math.inf, 0.0), (0.0, math.nan), (0.0, -math.inf)):
+        with pytest.raises(ParameterError, match=f"effort is {effort} N m and push {push} N m; expected finite"):
+            plant.step(effort, push)
+        assert plant.state == start
+    assert plant.step(0.0).time == pytest.approx(plant.dt)
 
 
 def test_slow_steps_are_told_from_one_pause() -> None:
