@@ -59,6 +59,7 @@ class AnswerLoop:
         self.age = RingOfTimes()
         self.compute_time = RingOfTimes()
         self._newest: JointSample | None = None
+        self._answer: Vector | None = None
         self._monotonic = monotonic
         self._timeout_ns = math.inf if simulated_time else state_timeout * NANOSECONDS
         self._start_ns: int | None = None
@@ -108,13 +109,13 @@ class AnswerLoop:
         if refusal is not None:
             self.refused[refusal] += 1
             self.last_reason = problem if sample is None else self._problem(refusal, sample, now_ns)
-            # A plant in lockstep repeats a state when the answer did not reach it: the same answer again.
+            # A plant in lockstep repeats a state when the answer did not reach it: the same answer again, if it had one.
             repeated = refusal is StateRefusal.DUPLICATE and self.simulated_time
-            return self.last_effort if repeated else None
+            return self._answer if repeated else None
         assert sample is not None
         if self._start_ns is None:
             self._start_ns = sample.stamp_ns
-        self._newest = sample
+        self._newest, self._answer = sample, None
         began = self._monotonic()
         reason = ""
         try:
@@ -134,7 +135,7 @@ class AnswerLoop:
             if abs(value) >= limit:
                 self.saturated += 1
                 break
-        self.last_effort = effort
+        self.last_effort = self._answer = effort
         return effort
 
     def summary(self, now_ns: int) -> Mapping[str, object]:

@@ -118,6 +118,18 @@ def test_a_controller_that_fails_or_answers_nonsense_gives_no_answer_and_a_reaso
     assert answering.refused == {StateRefusal.NO_ANSWER: 2}
 
 
+def test_a_repeated_state_that_had_no_answer_gets_none_and_not_that_of_the_state_before():
+    class GivesUp(BaseController):
+        def command(self, t, x):
+            return 0.7 if t == 0.0 else math.nan
+
+    answering = AnswerLoop(GivesUp(1.0), 0.05, simulated_time=True)
+    assert answering.answer(sample(START), START) == (0.7,)
+    for _ in range(2):
+        assert answering.answer(sample(START + MS), START) is None
+    assert answering.refused == {StateRefusal.NO_ANSWER: 1, StateRefusal.DUPLICATE: 1}
+
+
 def test_time_counts_from_the_first_state():
     times = []
 
