@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from pendulum_lqr.design import DesignError, Gain
+from pendulum_lqr.mechanism_controller import within_limits
 from pendulum_lqr.mechanism_model import linearise_mechanism, mechanism_lqr
 from pendulum_msgs_py.contract.angles import wrap
 from pendulum_msgs_py.dynamics.arithmetic import in_arithmetic
@@ -138,9 +139,7 @@ class MechanismCatch:
 
     def command(self, deviation: Array) -> Vector:
         """Return the limited efforts [N m or N]."""
-        wanted = -self.gain.K @ deviation
-        limits = self.plant.effort_limits
-        return tuple(min(top, max(-top, float(u))) for u, top in zip(wanted, limits, strict=True))
+        return within_limits(-self.gain.K @ deviation, self.plant.effort_limits)
 
 
 def make_mechanism_catch(plant: MechanismParameters, q: ArrayLike, r: ArrayLike) -> MechanismCatch:

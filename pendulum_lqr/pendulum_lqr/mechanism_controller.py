@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from typing import Protocol
 
 from pendulum_msgs_py.joints import Vector
 
-__all__ = ["MechanismController"]
+__all__ = ["MechanismController", "within_limits"]
 
 
 class MechanismController(Protocol):
@@ -22,3 +23,8 @@ class MechanismController(Protocol):
             t: Time since the controller was started [s]; it increases from call to call.
             x: n positions, hanging at 0 and not wrapped, then n velocities.
         """
+
+
+def within_limits(wanted: Iterable[float], limits: Vector) -> Vector:
+    """Return efforts within limits either way; of what is no number no effort is made: who sends it refuses it."""
+    return tuple(top if u > top else max(float(u), -top) for u, top in zip(wanted, limits, strict=True))

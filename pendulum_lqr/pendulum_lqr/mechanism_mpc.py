@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pendulum_lqr.mechanism_catch import MechanismCatch, deviation_of
+from pendulum_lqr.mechanism_controller import within_limits
 from pendulum_lqr.mechanism_ilqr import IlqrPlan, IlqrProblem, IlqrWeights
 from pendulum_msgs_py.joints import Vector
 from pendulum_msgs_py.plants.mechanism_parameters import MechanismParameters
@@ -97,8 +98,7 @@ class MechanismMpc:
         share = min(1.0, (t + 0.5 * self.period - self._planned) / self.settings.step)
         n = len(self.plant.joints)
         first = plan.states[0, 2 * n :]
-        wanted = first + share * (plan.efforts[0] - first)
-        self._before = tuple(min(top, max(-top, float(u))) for u, top in zip(wanted, self._limits, strict=True))
+        self._before = within_limits(first + share * (plan.efforts[0] - first), self._limits)
         return self._before
 
     def _plan_again(self, t: float, x: Vector) -> None:

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from pendulum_lqr.mechanism_catch import MechanismCatch, deviation_of
-from pendulum_lqr.mechanism_controller import MechanismController
+from pendulum_lqr.mechanism_controller import MechanismController, within_limits
 from pendulum_lqr.mechanism_trajectory import MechanismTrajectory
 from pendulum_msgs_py.dynamics.arithmetic import complex_step, in_arithmetic
 from pendulum_msgs_py.errors import ParameterError
@@ -133,8 +133,7 @@ class MechanismTvlqr:
         if self._following:
             error = np.array(x) - self.states[k]
             if float(error @ self.costs[k] @ error) <= self._tube:
-                wanted = self.efforts[k] - self.gains[k] @ error
-                return tuple(min(top, max(-top, float(u))) for u, top in zip(wanted, self._limits, strict=True))
+                return within_limits(self.efforts[k] - self.gains[k] @ error, self._limits)
             self._following = False
         if self.catch.holds(deviation):
             return self.catch.command(deviation)

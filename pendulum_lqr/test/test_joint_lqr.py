@@ -87,3 +87,12 @@ def test_a_model_of_two_inputs_is_sampled_as_two_models_of_one(delay: float) -> 
         index = math.floor((k * h - delay) / 0.01 + 1e-9)
         x = (step @ np.concatenate([x, inputs[index] if index >= 0 else np.zeros(2)]))[:4]
     assert z[:4] == pytest.approx(x, rel=1e-9, abs=1e-12)
+
+
+def test_no_effort_is_made_of_a_law_that_has_no_number() -> None:
+    controller = make_joint_controller("lqr", load_mechanism("cart_pole"), {})
+    answering = AnswerLoop(controller, math.inf)
+    # Finite velocities whose terms are inf and -inf.
+    first, second = (math.copysign(1e308, float(k)) for k in controller.gain.K[0, 2:])
+    assert answering.answer(JointSample(1, (0.0, 0.0), (first, -second), (0.0, 0.0)), 1) is None
+    assert answering.last_reason == "controller answered nan N m"

@@ -10,6 +10,7 @@ import numpy as np
 
 from pendulum_lqr.design import Gain
 from pendulum_lqr.interface import JointController
+from pendulum_lqr.mechanism_controller import within_limits
 from pendulum_lqr.mechanism_model import linearise_mechanism, mechanism_lqr
 from pendulum_lqr.sampled_design import discretise
 from pendulum_msgs_py.errors import ParameterError
@@ -45,10 +46,11 @@ class JointLqr(JointController):
     def command(self, t: float, position: Vector, velocity: Vector) -> Vector:
         """Return m efforts."""
         x = self._deviation(position) + velocity
-        return tuple(
-            min(limit, max(-limit, hold - sum(k * value for k, value in zip(row, x, strict=True))))
-            for row, hold, limit in zip(self._rows, self._hold, self.effort_limits, strict=True)
+        wanted = (
+            hold - sum(k * value for k, value in zip(row, x, strict=True))
+            for row, hold in zip(self._rows, self._hold, strict=True)
         )
+        return within_limits(wanted, self.effort_limits)
 
     def describe(self) -> str:
         """Return gain and poles."""
