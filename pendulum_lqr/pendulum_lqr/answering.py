@@ -109,7 +109,7 @@ class AnswerLoop:
         if refusal is not None:
             self.refused[refusal] += 1
             self.last_reason = problem if sample is None else self._problem(refusal, sample, now_ns)
-            # A plant in lockstep repeats a state when the answer did not reach it: the same answer again, if it had one.
+            # A plant in lockstep repeats a state when the answer did not reach it: the same answer again, if any.
             repeated = refusal is StateRefusal.DUPLICATE and self.simulated_time
             return self._answer if repeated else None
         assert sample is not None

@@ -225,7 +225,7 @@ def command_within(limit: float, effort: float, push: float) -> float:
     """Return a commanded torque within the limit [N m].
 
     Raises:
-        ParameterError: It, or the push beside it, is not finite: clamping would make all the torque of what is no number.
+        ParameterError: It, or the push beside it, is not finite: clamped, no number would be the full torque.
     """
     if not (math.isfinite(effort) and math.isfinite(push)):
         raise ParameterError(f"effort is {effort} N m and push {push} N m; expected finite numbers")
