@@ -1,4 +1,4 @@
-"""``make test``: on two cores at once what computes, then, one test after the other, what keeps a plant's time.
+"""``make test``: what keeps a plant's time, and beside it, with the time that this leaves, what computes.
 
 Tests of one file stay together, so that what a file prepares is prepared once. Named files or folders run as pytest is
 told.
@@ -6,17 +6,25 @@ told.
 
 from __future__ import annotations
 
+import contextlib
+import json
 import os
 import signal
 import subprocess
 import sys
+import tempfile
+import threading
+import time
+from collections import Counter, defaultdict
 from collections.abc import Sequence
+from pathlib import Path
 
 import pytest
 
 from tests.fixtures import PROJECT
+from tests.suite_events import PIPE
 
-__all__ = ["main"]
+__all__ = ["Part", "exit_code", "halves", "main", "run_parts"]
 
 _KEEPS_TIME = (
     "tests/acceptance/test_experiment.py",
@@ -34,7 +42,7 @@ _KEEPS_TIME = (
     "pendulum_lqr/test/test_lqr_nodes.py",
     "pendulum_lqr/test/test_running_plant.py",
 )
-"""Tests with processes that run in real time, longest first: what computes must not take their cores."""
+"""Tests with processes that run in real time, longest first."""
 _COMPUTES = (
     "tests/acceptance/test_readme.py",
     "tests/acceptance/test_docs.py",
@@ -46,6 +54,15 @@ _COMPUTES = (
 )
 """What comes first of all others, longest first too: a long file at the end would leave a core idle."""
 _NOTHING_SELECTED = int(pytest.ExitCode.NO_TESTS_COLLECTED)
+_AT_A_TIME = 1
+"""Files of tests in real time that run at once: one waits mostly while the other works."""
+_NICE = 5
+"""Priority of what computes: real time goes before it, and beside a busy machine it still gets a quarter of a core."""
+_TELLS_EVERY = 20.0
+"""Time between two lines of progress [s]."""
+_GRAVITY = ("", "passed", "skipped", "failed")
+_PATIENCE = 20.0
+"""Time to end after Ctrl-C [s]; then a part is killed."""
 
 
 def main(arguments: Sequence[str]) -> int:
@@ -61,26 +78,150 @@ def main(arguments: Sequence[str]) -> int:
     for name in ("MAKEFLAGS", "MAKEOVERRIDES", "MFLAGS", "ARGS", "PYTHONDONTWRITEBYTECODE"):
         os.environ.pop(name, None)
     if any((PROJECT / argument.split("::")[0]).exists() for argument in arguments):
-        return _pytest(*arguments)
+        return subprocess.run([sys.executable, "-m", "pytest", *arguments], cwd=PROJECT, check=False).returncode
+    in_time, others = halves()
+    parts = [
+        Part("in real time", [*in_time, *arguments], workers=_AT_A_TIME),
+        Part("computing", [*others, *arguments], workers=2, nice=_NICE),
+    ]
+    return run_parts(parts)
+
+
+def halves() -> tuple[list[str], list[str]]:
+    """Return the files of tests that keep a plant's time, and all others, in the order to start them in."""
     in_time = _files(_KEEPS_TIME)
     packages = sorted(str(path) for top in ("", "bags/") for path in PROJECT.glob(f"{top}pendulum_*/test"))
-    others = [name for name in _files((*_COMPUTES, *packages)) if name not in in_time]
-    workers = ("-n", str(min(2, os.cpu_count() or 1)), "--dist", "loadfile", "--no-loadscope-reorder")
-    codes = [_pytest(*workers, *others, *arguments), _pytest(*in_time, *arguments)]
-    # A name may be in one part only.
+    return in_time, [name for name in _files((*_COMPUTES, *packages)) if name not in in_time]
+
+
+class Part:
+    """Some files of tests, which one pytest runs with its workers.
+
+    Args:
+        name: Stands in the progress and above the part's output.
+        arguments: Pytest's own.
+        workers: How many files run at a time, but not more than there are cores.
+        nice: Priority as of ``nice``; 0 is the usual one, more is less.
+    """
+
+    def __init__(self, name: str, arguments: Sequence[str], *, workers: int, nice: int = 0) -> None:
+        self.name = name
+        self.collected = 0
+        self.outcomes: dict[str, str] = {}
+        self.durations: defaultdict[str, float] = defaultdict(float)
+        self._arguments = arguments
+        self._workers = min(workers, os.cpu_count() or 1)
+        self._nice = nice
+        self._output = tempfile.TemporaryFile()  # noqa: SIM115  (lives as long as the part)
+
+    def start(self) -> None:
+        """Start pytest, in a session of its own: Linux shares the cores among sessions first."""
+        reader, writer = os.pipe()
+        command = [sys.executable, "-m", "pytest", "-p", "tests.suite_events", "-n", str(self._workers)]
+        self._popen = subprocess.Popen(
+            [*command, "--dist", "loadfile", "--no-loadscope-reorder", *self._arguments],
+            cwd=PROJECT,
+            env={**os.environ, PIPE: str(writer)},
+            stdin=subprocess.DEVNULL,
+            stdout=self._output,
+            stderr=subprocess.STDOUT,
+            pass_fds=[writer],
+            start_new_session=True,
+        )
+        os.close(writer)
+        if self._nice:
+            os.setpriority(os.PRIO_PGRP, self._popen.pid, self._nice)
+            # Where each session has its share whatever its processes' priorities are, it is the session's that counts.
+            with contextlib.suppress(OSError):
+                Path(f"/proc/{self._popen.pid}/autogroup").write_text(str(self._nice), encoding="ascii")
+        self._listener = threading.Thread(target=self._listen, args=(reader,), daemon=True)
+        self._listener.start()
+
+    @property
+    def code(self) -> int | None:
+        """Return pytest's exit code, None while it runs."""
+        return self._popen.poll()
+
+    def end(self) -> None:
+        """End all that runs, as Ctrl-C does in a terminal; what does not end in time is killed."""
+        for number in (signal.SIGINT, signal.SIGKILL):
+            with contextlib.suppress(ProcessLookupError):
+                os.killpg(self._popen.pid, number)
+            with contextlib.suppress(subprocess.TimeoutExpired):
+                self._popen.wait(_PATIENCE)
+
+    def output(self) -> str:
+        """Return what pytest has printed, once it has ended."""
+        self._listener.join(_PATIENCE)
+        self._output.seek(0)
+        return self._output.read().decode(errors="replace")
+
+    def _listen(self, reader: int) -> None:
+        with os.fdopen(reader, encoding="utf-8") as events:
+            for line in events:
+                event = json.loads(line)
+                if "collected" in event:
+                    self.collected = event["collected"]
+                    continue
+                test, outcome = event["test"], event["outcome"]
+                self.durations[test] += event["duration"]
+                if outcome == "failed" and self.outcomes.get(test) != "failed":
+                    print(f"FAILED {test} ({self.name}; why stands below at the end)", flush=True)
+                if outcome != "passed" or event["when"] == "call":
+                    self.outcomes[test] = max(self.outcomes.get(test, ""), outcome, key=_GRAVITY.index)
+
+
+def run_parts(parts: Sequence[Part]) -> int:
+    """Run all parts at once, print how far they are and what each printed, and return the first code that is not 0."""
+    begin = told = time.monotonic()
+    for number in (signal.SIGTERM, signal.SIGHUP):
+        signal.signal(number, signal.default_int_handler)
+    try:
+        for part in parts:
+            part.start()
+        while any(part.code is None for part in parts):
+            time.sleep(0.2)
+            if time.monotonic() - told >= _TELLS_EVERY:
+                told += _TELLS_EVERY
+                print(f"{_clock(told - begin)}  {'; '.join(map(_progress, parts))}", flush=True)
+    except KeyboardInterrupt:
+        print("interrupted: ending what runs", flush=True)
+        for part in parts:
+            part.end()
+        for part in parts:
+            print(part.output())
+        return int(pytest.ExitCode.INTERRUPTED)
+    for part in parts:
+        print(f"\n{f' {part.name} ':=^100}\n{part.output()}")
+    durations = Counter({test: time for part in parts for test, time in part.durations.items()})
+    print("ten slowest:")
+    for test, duration in durations.most_common(10):
+        print(f"{duration:7.1f} s  {test}")
+    print(f"{'; '.join(map(_progress, parts))}; took {_clock(time.monotonic() - begin)} min")
+    return exit_code([part.code or 0 for part in parts])
+
+
+def exit_code(codes: Sequence[int]) -> int:
+    """Return the first code of the parts that is not 0; a name may be in one part only."""
     counted = [code for code in codes if code != _NOTHING_SELECTED] or [_NOTHING_SELECTED]
     return next((code for code in counted if code), 0)
+
+
+def _progress(part: Part) -> str:
+    outcomes = Counter(part.outcomes.values())
+    failed = f", {outcomes['failed']} FAILED" if outcomes["failed"] else ""
+    skipped = f", {outcomes['skipped']} skipped" if outcomes["skipped"] else ""
+    return f"{part.name} {len(part.outcomes)} of {part.collected or '?'}{skipped}{failed}"
+
+
+def _clock(seconds: float) -> str:
+    return f"{int(seconds) // 60}:{int(seconds) % 60:02}"
 
 
 def _files(names: Sequence[str]) -> list[str]:
     """Return files of tests, each once, in this order; pytest would sort a folder's among those that it is told."""
     found = [path for name in names for path in (sorted((PROJECT / name).rglob("test_*.py")) or [PROJECT / name])]
     return list(dict.fromkeys(str(path.relative_to(PROJECT)) for path in found))
-
-
-def _pytest(*arguments: str) -> int:
-    """Run pytest in a process of its own: what the first run has imported must not slow the second."""
-    return subprocess.run([sys.executable, "-m", "pytest", *arguments], cwd=PROJECT, check=False).returncode
 
 
 if __name__ == "__main__":
