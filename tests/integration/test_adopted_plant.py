@@ -4,9 +4,7 @@ from __future__ import annotations
 
 import math
 import signal
-import sys
 from collections.abc import Iterator
-from pathlib import Path
 
 import pytest
 from sensor_msgs.msg import JointState
@@ -17,11 +15,9 @@ from pendulum_msgs_py.contract import names
 from pendulum_msgs_py.contract.trajectory import from_points
 from pendulum_msgs_py.ros import qos
 from pendulum_msgs_py.ros.convert import stamp_from_message, trajectory_to_message
+from tests.integration.adopting import EFFORTS, adopt, start_robot
 from tests.plant_peer import PlantPeer
 from tests.processes import ProcessGroup, RunningProgram
-
-ROBOT = Path(__file__).with_name("plain_plant.py")
-EFFORTS = "/robot/effort_controller/commands"
 
 
 class Peer(PlantPeer):
@@ -48,18 +44,12 @@ def peer(domain_id: int) -> Iterator[Peer]:
 
 @pytest.fixture
 def robot(processes: ProcessGroup, peer: Peer) -> RunningProgram:
-    return processes.start_command([sys.executable, str(ROBOT)], name="robot")
+    return start_robot(processes)
 
 
 @pytest.fixture
 def adopter(processes: ProcessGroup, peer: Peer, robot: RunningProgram) -> RunningProgram:
-    told = {
-        "states": "/robot/joint_states", "commands": EFFORTS, "joint": "shoulder", "command_index": 1,
-        "command_size": 2, "sign": -1, "zero": -math.pi / 2.0, "state_timeout": 0.5,
-    }  # fmt: skip
-    arguments = [item for name, value in told.items() for item in ("-p", f"{name}:={value}")]
-    program = processes.start("pendulum_sim", "adopt", "--ros-args", "-r", "__ns:=/sim", *arguments)
-    peer.program = program
+    peer.program = program = adopt(processes, "/sim")
     peer.until(lambda: peer.states and peer.sent and peer.diagnostics.get("mode"), "the adopted plant")
     return program
 
@@ -110,7 +100,7 @@ def test_a_robot_that_dies_is_a_fault_and_a_new_one_gets_no_torque_by_itself(
     assert "ms old; expected at most 500 ms" in peer.diagnostics["reason"]
     peer.until(lambda: peer.sent[-1] == 0.0, "zero torque")
     states, count = len(peer.states), len(peer.sent)
-    processes.start_command([sys.executable, str(ROBOT)], name="robot again")
+    start_robot(processes, "robot again")
     peer.until(lambda: len(peer.states) > states + 30, "states of the new one")
     assert set(peer.sent[count:]) == {0.0}
     adopter.interrupt()
@@ -141,19 +131,7 @@ def test_somebody_else_at_its_efforts_is_refused_and_faults(adopter: RunningProg
 def test_states_that_are_not_finite_or_of_another_joint_are_refused(processes: ProcessGroup, peer: Peer) -> None:
     robot = peer.node.create_publisher(JointState, "/robot/joint_states", 10)
     peer.node.create_subscription(Float64MultiArray, EFFORTS, lambda message: None, 10)
-    arguments = ("-p", "states:=/robot/joint_states", "-p", f"commands:={EFFORTS}", "-p", "state_timeout:=2.0")
-    processes.start(
-        "pendulum_sim",
-        "adopt",
-        "--ros-args",
-        "-r",
-        "__ns:=/sim",
-        *arguments,
-        "-p",
-        "command_size:=2",
-        "-p",
-        "joint:=hip",
-    )
+    adopt(processes, "/sim", joint="hip", command_index=0, sign=1, zero=0.0, state_timeout=2.0)
 
     def speak(name: str, position: float, velocity: tuple[float, ...] = (0.0,)) -> None:
         robot.publish(JointState(name=[name], position=[position], velocity=velocity))

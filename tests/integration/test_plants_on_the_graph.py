@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import math
-import sys
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -13,12 +12,11 @@ import pytest
 from pendulum_msgs_py.plants.plant_parameters import load_plant
 from pendulum_rosbag.reader import read_bag
 from pendulum_sim.model_files import mjcf
+from tests.integration.adopting import adopt, start_robot
 from tests.plant_peer import PlantPeer
 from tests.processes import ProcessGroup, RunningProgram
 
 pytest.importorskip("mujoco")
-
-ROBOT = Path(__file__).with_name("plain_plant.py")
 
 
 @pytest.fixture
@@ -39,13 +37,7 @@ def test_an_adopted_plant_is_compared_with_a_model_file_and_goes_on_running(
 ) -> None:
     model = tmp_path / "model.xml"
     model.write_text(mjcf(load_plant("thesis")), encoding="utf-8")
-    robot = processes.start_command([sys.executable, str(ROBOT)], name="robot")
-    told = {
-        "states": "/robot/joint_states", "commands": "/robot/effort_controller/commands", "joint": "shoulder",
-        "command_index": 1, "command_size": 2, "sign": -1, "zero": -math.pi / 2.0, "state_timeout": 0.5,
-    }  # fmt: skip
-    arguments = [item for name, value in told.items() for item in ("-p", f"{name}:={value}")]
-    adopter = processes.start("pendulum_sim", "adopt", "--ros-args", "-r", "__ns:=/lab", *arguments)
+    robot, adopter = start_robot(processes), adopt(processes, "/lab")
     peer.until(lambda: peer.states and peer.diagnostics.get("mode"), "the adopted plant")
     peer.leave_the_command()
     out = tmp_path / "run"
