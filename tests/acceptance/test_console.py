@@ -26,7 +26,9 @@ IN_SHORT = (
     "stop while the plant is killed and started anew",
     "stop while the console's server is frozen",
     "stop while the console's server is killed and started anew",
+    "stop, then the console's server is killed and started anew",
     "stop while the link to the server is cut",
+    "stop of one plant alone, by its own button, while it is frozen",
 )
 """Ways to lose a stop that each run tries once; all of them, 20 times: ``python -m tests.faults.console_stops``."""
 STOP_LIMIT_MS = 100.0

@@ -251,6 +251,32 @@ def _killed_server(rig: StopRig) -> Outcome:
     return _judge(rig, outcome, time.monotonic())
 
 
+def _server_dies_after_the_answer(rig: StopRig) -> Outcome:
+    outcome = Outcome()
+    since = time.monotonic()
+    rig.page.keyboard.press("Escape")
+    outcome.demand(_soon(lambda: rig.page.locator("#alarms .good").count() > 0, 6.0), "no answer is shown")
+    rig.console.send_signal(signal.SIGKILL)
+    rig.console.wait(10.0)
+    outcome.demand(rig.sees("UNCONFIRMED"), "the page does not say that the answer is no longer confirmed")
+    outcome.demand(rig.page.locator("#alarms .good").count() == 0, "what nobody confirms stays green")
+    rig.console = rig.start_console()
+    return _judge(rig, outcome, since)
+
+
+def _one_frozen_plant(rig: StopRig) -> Outcome:
+    outcome = Outcome()
+    rig.simulator.send_signal(signal.SIGSTOP)
+    try:
+        rig.page.get_by_role("button", name="Stop /sim", exact=True).click()
+        outcome.demand(rig.sees("HAS NOT ANSWERED"), "the page does not say that the plant has not answered")
+        time.sleep(_HELD)
+    finally:
+        since = time.monotonic()
+        rig.simulator.send_signal(signal.SIGCONT)
+    return _judge(rig, outcome, since)
+
+
 def _cut_link(rig: StopRig) -> Outcome:
     outcome = Outcome()
     session = rig.page.context.new_cdp_session(rig.page)
@@ -342,7 +368,9 @@ STOPS: dict[str, Callable[[StopRig], Outcome]] = {
     "stop after the plant was gone for long": _plant_gone_for_long,
     "stop while the console's server is frozen": _frozen_server,
     "stop while the console's server is killed and started anew": _killed_server,
+    "stop, then the console's server is killed and started anew": _server_dies_after_the_answer,
     "stop while the link to the server is cut": _cut_link,
+    "stop of one plant alone, by its own button, while it is frozen": _one_frozen_plant,
     "stop, then the page goes to the background, plant frozen": _page_in_the_background,
     "stop, then the page that pressed is closed, plant frozen": _closed_page,
 }

@@ -131,3 +131,13 @@ def test_no_sequence_of_events_loses_a_plant_that_has_not_answered(steps: list[t
         assert owed <= shown
     # A sum of floats may fall short by a rounding.
     assert owed <= set(order.due([], now + ASK_AGAIN + 1e-9))
+
+
+def test_a_stop_of_one_plant_is_asked_again_like_that_of_all_and_leaves_the_others_alone() -> None:
+    order = StopOrder()
+    order.press_one(SIM, 0.0)
+    assert order.due([SIM, HW], 0.0) == [SIM]
+    assert order.due([SIM, HW], ASK_AGAIN + 0.01) == [SIM]
+    order.press([SIM, HW], 1.0)
+    order.press_one(SIM, 1.1)
+    assert sorted(order.due([SIM, HW], 1.1)) == [HW, SIM], "a stop of all stays one of all"

@@ -8,6 +8,7 @@ import secrets
 import sys
 import threading
 import time
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any
@@ -138,10 +139,13 @@ class Hub:
 
     # --- what a person asks for ----------------------------------------------------------------------------
 
-    async def e_stop(self) -> dict[str, Any] | None:
-        """Order every plant to stop until a person has seen that it has; return the state of the order."""
+    async def e_stop(self, nodes: Sequence[str] = ()) -> dict[str, Any] | None:
+        """Order these plants, or all, to stop until a person has seen that they have; return the order's state."""
         with self._order_lock:
-            self._order.press(self.plants().values(), time.monotonic())
+            for node in nodes:
+                self._order.press_one(node, time.monotonic())
+            if not nodes:
+                self._order.press(self.plants().values(), time.monotonic())
         self._order_changed.set()
         deadline = time.monotonic() + _STOP_WAIT
         while time.monotonic() < deadline:

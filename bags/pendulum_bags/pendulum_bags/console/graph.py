@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any, NamedTuple, Protocol
 
 __all__ = ["Description", "Graph"]
@@ -28,8 +29,8 @@ class Graph(Protocol):
     def plants(self) -> dict[str, str]:
         """Return namespace -> full node name."""
 
-    async def e_stop(self) -> dict[str, Any] | None:
-        """Order every plant to stop; return what each has answered."""
+    async def e_stop(self, nodes: Sequence[str] = ()) -> dict[str, Any] | None:
+        """Order these plants, or all, to stop; return what each has answered."""
 
     def stop_state(self) -> dict[str, Any] | None:
         """Return the state of the stop that is in force."""

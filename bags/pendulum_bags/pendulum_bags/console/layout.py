@@ -96,7 +96,8 @@ class Layout:
             with ui.row():
                 _button("Arm", lambda: self._one(self._graph.arm(node, on=True)), filled=True, of=space)
                 _button("Disarm", lambda: self._one(self._graph.arm(node, on=False)), of=space)
-                _button("Stop", lambda: self._one(self._graph.trigger(f"{node}/e_stop")), of=space, danger=True)
+                # The page's script sends it, as it does the e-stop of all: repeated until it is answered.
+                _button("Stop", lambda: None, of=space, danger=True).props(f'data-stop="{node}"')
                 _button("Reset e-stop", lambda: self._one(self._graph.reset(node)), of=space)
             with ui.row():
                 for goal in ("upright", "down"):

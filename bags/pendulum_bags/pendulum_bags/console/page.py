@@ -4,13 +4,15 @@ from __future__ import annotations
 
 import asyncio
 import json
+import secrets
 import time
 from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager
 from pathlib import Path
+from typing import Annotated
 
 import uvicorn
-from fastapi import FastAPI, WebSocket, WebSocketDisconnect
+from fastapi import FastAPI, Query, WebSocket, WebSocketDisconnect
 from fastapi.responses import JSONResponse
 from fastapi.staticfiles import StaticFiles
 from nicegui import app as pages
@@ -53,13 +55,15 @@ def serve(
         yield
 
     app = FastAPI(lifespan=lifespan, docs_url=None, redoc_url=None, openapi_url=None)
+    # Tells a page that this server knows nothing of what the last one was told.
+    server = secrets.token_hex(4)
     jobs.runs.mkdir(parents=True, exist_ok=True)
     app.mount("/runs", StaticFiles(directory=jobs.runs), name="runs")
     app.mount("/console", StaticFiles(directory=_STATIC), name="console")
 
     @app.post("/e_stop")
-    async def e_stop() -> JSONResponse:
-        return JSONResponse(await graph.e_stop())
+    async def e_stop(node: Annotated[list[str] | None, Query()] = None) -> JSONResponse:
+        return JSONResponse(await graph.e_stop(node or ()))
 
     @app.post("/e_stop/acknowledge")
     async def acknowledge() -> JSONResponse:
@@ -77,7 +81,7 @@ def serve(
         try:
             while True:
                 now = time.monotonic()
-                picture = {"t": now, "plants": graph.frame(), "stop": graph.stop_state()}
+                picture = {"t": now, "server": server, "plants": graph.frame(), "stop": graph.stop_state()}
                 await socket.send_text(json.dumps(picture, separators=(",", ":")))
                 # Counted from the last due time: the work does not add to the period, and what was missed is missed.
                 due = max(due + FRAME_PERIOD, now)

@@ -39,6 +39,7 @@ class StopOrder:
         self._rows: dict[str, _Row] = {}
         self._left_alone: set[str] = set()
         self._pressed: float | None = None
+        self._everybody = False
 
     @property
     def in_force(self) -> bool:
@@ -53,20 +54,32 @@ class StopOrder:
             now: Time [s].
         """
         self._pressed = now
+        self._everybody = True
         self._left_alone.clear()
         for plant in {*plants, *self._rows}:
             self._rows[plant] = _Row(now)
+
+    def press_one(self, plant: str, now: float) -> None:
+        """Order one plant to stop, whether it is on the graph or not; what others were told stands.
+
+        Args:
+            plant: Its node name.
+            now: Time [s].
+        """
+        self._pressed = now
+        self._left_alone.discard(plant)
+        self._rows[plant] = _Row(now)
 
     def due(self, plants: Iterable[str], now: float) -> list[str]:
         """Return the plants to ask now, and note that they were asked.
 
         Args:
-            plants: Node names of the plants on the graph. Who comes while the order stands is stopped, too.
+            plants: Node names of the plants on the graph. Who comes while an order to all stands is stopped, too.
             now: Time [s].
         """
         if self._pressed is None:
             return []
-        for plant in plants:
+        for plant in plants if self._everybody else ():
             if plant not in self._rows and plant not in self._left_alone:
                 self._rows[plant] = _Row(now)
         found = []
@@ -105,8 +118,9 @@ class StopOrder:
         return list(self._rows)
 
     def state(self, now: float) -> dict[str, Any] | None:
-        """Return what a person has to see, None where no stop is in force: seconds since the press, a row a plant.
+        """Return what a person has to see: seconds since the press, whether it was for all plants, a row for each plant.
 
+        None where no stop is in force.
         A row's ``state`` is ``asked`` (no answer yet), ``stopped`` or ``silent`` (answered once, no longer), its
         ``after`` the time from the press to the first answer and ``silent_for`` the time without one [s].
         """
@@ -122,9 +136,10 @@ class StopOrder:
                 "silent_for": round(silent, 1),
                 "text": row.text,
             }
-        return {"since": round(now - self._pressed, 1), "rows": rows}
+        return {"since": round(now - self._pressed, 1), "all": self._everybody, "rows": rows}
 
     def _end_without_rows(self) -> None:
         if not self._rows:
             self._pressed = None
+            self._everybody = False
             self._left_alone.clear()

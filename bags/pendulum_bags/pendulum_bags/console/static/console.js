@@ -20,7 +20,7 @@
   // A press is an order. The page repeats it until the server has taken it, the server until each plant has answered, and what
   // each answered stands until somebody acknowledges it.
   const LIMIT = 500; // ms after which a server that does not answer is shown as such
-  const alarms = { sending: null, tries: 0, why: "", order: null, lost: null, notes: [] };
+  const alarms = { sending: null, tries: 0, why: "", order: null, lost: null, server: null, only: [], notes: [] };
   state.alarms = alarms;
 
   async function request(path) {
@@ -37,14 +37,17 @@
     }
   }
 
-  function stop() {
+  // Stops one plant, or all where none is named.
+  function stop(node = "", button = document.getElementById("e_stop")) {
     // A touch is a pointerdown and a click: one press.
-    if (Date.now() - state.stopPressed < 50) return;
+    if (Date.now() - state.stopPressed < 50 && state.stopNode === node) return;
     state.stopPressed = Date.now();
-    sessionStorage.setItem("stop", String(state.stopPressed));
-    const button = document.getElementById("e_stop");
+    state.stopNode = node;
     if (button) { button.classList.add("pressed"); setTimeout(() => button.classList.remove("pressed"), 400); }
     const first = alarms.sending === null;
+    // A stop of all that is still under way stays one of all.
+    alarms.only = !node || (!first && !alarms.only.length) ? [] : [...new Set([...(first ? [] : alarms.only), node])];
+    sessionStorage.setItem("stops", JSON.stringify([state.stopPressed, alarms.only]));
     alarms.sending = state.stopPressed;
     alarms.tries = 0;
     showAlarms();
@@ -56,9 +59,9 @@
       const pressed = alarms.sending;
       alarms.tries += 1;
       try {
-        alarms.order = await request("/e_stop");
+        alarms.order = await request(`/e_stop?${alarms.only.map((node) => `node=${encodeURIComponent(node)}`).join("&")}`);
         state.stopAnswered = Date.now();
-        if (alarms.sending === pressed) { alarms.sending = null; alarms.why = ""; sessionStorage.removeItem("stop"); }
+        if (alarms.sending === pressed) { alarms.sending = null; alarms.why = ""; sessionStorage.removeItem("stops"); }
       } catch (error) {
         alarms.why = state.failure = String(error.message || error);
         showAlarms();
@@ -82,9 +85,16 @@
   }, true);
   // pointerdown is 100 ms earlier than click; click is what screen readers, voice control and scripts send.
   for (const kind of ["pointerdown", "click"]) {
-    document.addEventListener(kind, (event) => { if (event.target.closest && event.target.closest("#e_stop")) stop(); }, true);
+    document.addEventListener(kind, (event) => {
+      const button = event.target.closest && event.target.closest("#e_stop, [data-stop]");
+      if (button) stop(button.dataset.stop || "", button);
+    }, true);
   }
-  if (sessionStorage.getItem("stop")) { alarms.sending = state.stopPressed = Number(sessionStorage.getItem("stop")); send(); }
+  if (sessionStorage.getItem("stops")) {
+    [state.stopPressed, alarms.only] = JSON.parse(sessionStorage.getItem("stops"));
+    alarms.sending = state.stopPressed;
+    send();
+  }
 
   const clock = (time) => new Date(time).toLocaleTimeString();
   const seconds = (ms) => `${(ms / 1000).toFixed(1)} s`;
@@ -101,7 +111,12 @@
       rows.push(["bad", `NO ANSWER FROM THE CONSOLE'S SERVER for ${seconds(performance.now() - alarms.lost)}: what is drawn is old. Use the hardware's own stop.`]);
     }
     const order = alarms.order;
-    if (order) {
+    // What was answered once is no longer known to hold while nobody says so.
+    const unknown = rows.length > 0;
+    if (order && unknown) {
+      const said = Object.entries(order.rows).map(([node, row]) => `${spaceOf(node)} ${row.state === "stopped" ? "was stopped" : "had not answered"}`);
+      rows.push(["bad", `UNCONFIRMED. Last known: ${said.join(", ") || "no plant on the graph"}.`]);
+    } else if (order) {
       const entries = Object.entries(order.rows), stopped = entries.filter(([, row]) => row.state === "stopped");
       const all = stopped.length === entries.length;
       rows.push([all ? "good" : "bad", all
@@ -195,7 +210,12 @@
       alarms.lost = null;
     }
     heard = performance.now();
-    alarms.order = message.stop;
+    // An order that nobody has acknowledged outlives the server that took it: one that was started anew is given it again.
+    if (alarms.server !== null && alarms.server !== message.server && alarms.order && !message.stop) {
+      if (alarms.order.all) stop();
+      else Object.keys(alarms.order.rows).forEach((node) => stop(node, null));
+    } else if (alarms.sending === null || message.stop) alarms.order = message.stop;
+    alarms.server = message.server;
     behind = Math.min(behind, performance.now() / 1000 - now);
     state.frames += 1;
     for (const [name, plant] of Object.entries(frame)) {
