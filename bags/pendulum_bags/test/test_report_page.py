@@ -12,6 +12,8 @@ from xml.etree import ElementTree
 import numpy as np
 import pytest
 import yaml
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
+from rclpy.serialization import serialize_message
 
 from pendulum_bags.comparison import Comparison, compare_folders
 from pendulum_bags.figures.figure import ROLES, Figure, Panel, thinned
@@ -19,6 +21,7 @@ from pendulum_bags.figures.numbers import quantity, ratio_in_words
 from pendulum_bags.figures.render_plotly import graphs_of
 from pendulum_bags.report import FIGURES, write_report
 from pendulum_bags.report.data import ReportData
+from pendulum_bags.report.emulator_table import emulator_table
 from pendulum_bags.report.figures import comparison_figures, make_figures
 from pendulum_bags.report.provenance import provenance_table, settings_table
 from pendulum_bags.report.report_cli import main
@@ -29,6 +32,8 @@ from pendulum_bags.report.write import _title
 from pendulum_bags.verdict import Evidence, Layer, LayerResult, Mark, write_layer
 from pendulum_bags.verdict.answer import answer_of
 from pendulum_msgs_py.contract.cdr import encode_joint_state
+from pendulum_msgs_py.plants.plant_differences import PLANT_PARAMETERS, describe_plants
+from pendulum_msgs_py.plants.plant_parameters import load_plant
 from pendulum_rosbag.storage import open_writer
 from tests.fixtures import PROJECT
 from tests.synthetic_runs import write_run_folder
@@ -104,6 +109,7 @@ def test_provenance_tells_when_where_and_by_which_command_and_what_every_node_wa
     data = ReportData(replace(comparison, pairs=pairs), {})
     rows = provenance_table(data).rows
     assert ("recorded", "2026-11-22 01:09 UTC") in rows
+    assert "Pendulum maintainers (2026). " in dict(rows)["cite as"]
     assert ("command", "python -m pendulum_bags experiment thesis") in rows
     assert [value for what, value in rows if what == "computer"] == ["bench · Linux-6 · dds", "robot"]
     settings = settings_table(data)
@@ -369,6 +375,38 @@ def test_provenance_names_plant_and_citation_and_the_file_at_the_root_agrees(com
     rows = dict(provenance_table(ReportData(comparison, {"versions": {"pendulum_bags": "0.1.0"}})).rows)
     assert rows["plant of the design"].startswith("thesis: inertia 0.055 kg m², damping 11.77 N m s/rad, gravity 1.6")
     told = yaml.safe_load((PROJECT / "CITATION.cff").read_text(encoding="utf-8"))
-    assert rows["cite as"].startswith(f"{told['authors'][0]['name']}: {told['title']}, version {told['version']}, git ")
+    name, title, version = told["authors"][0]["name"], told["title"], told["version"]
+    assert rows["cite as"].startswith(f"{name} (n.d.). {title} (version {version}) [Computer software]. Git revision ")
     manifest = ElementTree.parse(PROJECT / "bags" / "pendulum_bags" / "package.xml").getroot()
     assert told["version"] == manifest.findtext("version")
+
+
+def test_a_report_on_emulated_hardware_lists_the_constants_of_the_emulator(
+    comparison: Comparison, tmp_path: Path
+) -> None:
+    data = ReportData(comparison, {})
+    assert emulator_table(data) is None, "this hardware is no emulator"
+    told = {"pendulum.run": {"plant": "emulator", "namespace": "/hw", "strategy": "direct_pwm"}}
+    plants = {"/sim/simulator": load_plant("thesis"), "/hw/bridge": load_plant("x5_9")}
+    with open_writer(tmp_path / "hw") as bag:
+        bag.add_topic("/diagnostics", "diagnostic_msgs/msg/DiagnosticArray")
+        for node, plant in plants.items():
+            pair = KeyValue(key=PLANT_PARAMETERS, value=describe_plants([plant]))
+            status = DiagnosticStatus(name=f"{node}: plant", values=[pair])
+            bag.write("/diagnostics", 1, serialize_message(DiagnosticArray(status=[status])))
+    pair = comparison.pairs[0]
+    hardware = replace(pair.hardware, metadata=told, source=str(tmp_path / "hw"))
+    data = ReportData(replace(comparison, pairs=[replace(pair, hardware=hardware)]), {})
+    table = emulator_table(data)
+    assert table is not None
+    assert "x5_9" in table.sentence
+    assert ("drivetrain", "gear_ratio", "1742.22") in [row[:3] for row in table.rows]
+    assert "unit" in table.head
+    missing = replace(hardware, source=str(tmp_path / "gone"))
+    data = ReportData(replace(comparison, pairs=[replace(pair, hardware=missing)]), {})
+    assert emulator_table(data) is None
+
+
+def test_two_dampings_that_cannot_be_compared_are_not_shown_without_a_word(comparison: Comparison) -> None:
+    data = ReportData(comparison, {})
+    assert "b is not" in next(it.sentence for it in make_figures(data)[0] if it.name == "gravity_fit")

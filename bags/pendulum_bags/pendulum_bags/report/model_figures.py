@@ -9,6 +9,7 @@ import numpy as np
 from pendulum_bags.figures.figure import Figure, Panel, Trace
 from pendulum_bags.figures.numbers import quantity
 from pendulum_bags.report.data import ReportData
+from pendulum_bags.runs.run_record import run_record
 from pendulum_bags.runs.series import Array
 from pendulum_lqr.model import overdamped_velocity
 
@@ -85,6 +86,12 @@ def gravity_fit(data: ReportData) -> Figure | str:
         return "needs ramps with measured torque"
     gives = "; ".join(words)
     sentence = f"Least squares of the measured torque on sin θ, θ′ and a constant over the way up gives {gives}."
+    if len(panels) == 2 and "strategy" in run_record(data.comparison.pairs[0].hardware.metadata):
+        # 11.8 beside 0.002 would look like a wrong model.
+        sentence += (
+            " G is comparable, b is not: the simulation's torque overcomes the motor's damping as well, while the "
+            "spring of a series-elastic actuator measures only what reaches the link."
+        )
     return Figure(
         "gravity_fit",
         "Torque over sin θ",

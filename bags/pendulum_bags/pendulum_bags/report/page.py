@@ -14,6 +14,7 @@ from pendulum_bags.figures.render_plotly import graphs_of
 from pendulum_bags.figures.table import Table
 from pendulum_bags.report.animation import animation_of
 from pendulum_bags.report.data import ReportData
+from pendulum_bags.report.emulator_table import emulator_table
 from pendulum_bags.report.provenance import provenance_table, settings_table
 from pendulum_bags.report.terms import Terms
 from pendulum_bags.report.wording import name_in
@@ -106,7 +107,11 @@ def render_page(
         facts=name_in(_facts(data), emulated=emulated),
         sections=sections,
         missing=missing,
-        provenance=[table for table in (provenance_table(data), settings_table(data)) if table is not None],
+        provenance=[
+            name_in(table, emulated=emulated)
+            for table in (provenance_table(data), emulator_table(data), settings_table(data))
+            if table is not None
+        ],
         animation=script_json(animation_of(data)),
         graphs=script_json(graphs),
         plotly=packed_plotly(),

@@ -17,7 +17,8 @@ from pendulum_msgs_py.plants.plant_parameters import PLANT_SPECS, PlantParameter
 
 __all__ = ["citation", "provenance_table", "settings_table"]
 
-_CITED = "Pendulum maintainers: Pendulum: is your simulation good enough to design a controller on?"
+_AUTHORS = "Pendulum maintainers"
+_TITLE = "Pendulum: is your simulation good enough to design a controller on?"
 
 
 def provenance_table(data: ReportData) -> Table:
@@ -44,7 +45,9 @@ def provenance_table(data: ReportData) -> Table:
     if data.plant is not None:
         rows.append(("plant of the design", _plant_in_words(data.plant)))
     versions = summary.get("versions") or run.get("versions") or {}
-    rows.append(("cite as", citation(str(versions.get("pendulum_bags", "")), revision)))
+    began = _began(data)
+    year = f"{began:%Y}" if began else "n.d."
+    rows.append(("cite as", citation(str(versions.get("pendulum_bags", "")), revision, year)))
     rows += [(f"version of {name}", str(version)) for name, version in versions.items()]
     return Table(
         "Provenance",
@@ -60,10 +63,8 @@ def _occasion(data: ReportData) -> list[tuple[str, str]]:
     """Return when, on which computers and by which command the first run was recorded, as far as its bags say."""
     pair = data.comparison.pairs[0]
     tellers = [record_named(one.metadata, "pendulum.recorder") for one in (pair.simulation, pair.hardware)]
-    begun = [began for teller in tellers if isinstance(began := teller.get("started_ns"), int)]
     rows = []
-    if begun:
-        when = datetime.fromtimestamp(min(begun) * 1e-9, timezone.utc)
+    if when := _began(data):
         rows.append(("recorded", f"{when:%Y-%m-%d %H:%M} UTC"))
     if "command" in data.run:
         rows.append(("command", str(data.run["command"])))
@@ -71,6 +72,13 @@ def _occasion(data: ReportData) -> list[tuple[str, str]]:
         " · ".join(str(teller[key]) for key in ("host", "system", "rmw") if key in teller) for teller in tellers
     )
     return [*rows, *(("computer", text) for text in dict.fromkeys(computers) if text)]
+
+
+def _began(data: ReportData) -> datetime | None:
+    pair = data.comparison.pairs[0]
+    tellers = [record_named(one.metadata, "pendulum.recorder") for one in (pair.simulation, pair.hardware)]
+    begun = [began for teller in tellers if isinstance(began := teller.get("started_ns"), int)]
+    return datetime.fromtimestamp(min(begun) * 1e-9, timezone.utc) if begun else None
 
 
 def settings_table(data: ReportData) -> Table | None:
@@ -99,10 +107,16 @@ def _setting(value: Any) -> str:
     return repr(value) if isinstance(value, str) else json.dumps(value)
 
 
-def citation(version: str, revision: str) -> str:
-    """Return how to cite the software that made a report, as CITATION.cff at the project's root says it."""
-    told = f", version {version}" if version else ""
-    return f"{_CITED}{told}, git {revision}."
+def citation(version: str, revision: str, year: str = "n.d.") -> str:
+    """Return how to cite the software that made a report, in APA style, with what CITATION.cff says.
+
+    Args:
+        version: Of the software; empty where it is unknown.
+        revision: Of its source code.
+        year: In which the run was recorded.
+    """
+    told = f" (version {version})" if version else ""
+    return f"{_AUTHORS} ({year}). {_TITLE}{told} [Computer software]. Git revision {revision}. No DOI is assigned."
 
 
 def _plant_in_words(plant: PlantParameters) -> str:

@@ -59,7 +59,7 @@ def _plants(data: ReportData) -> Table:
     ]
     sim, hw = plants["sim"], plants["hw"]
     sentence = (
-        f"Torque stays below {quantity(max(sim['max_abs_u'], hw['max_abs_u']), 'N m')} on both plants; "
+        f"The controllers ask for at most {quantity(max(sim['max_abs_u'], hw['max_abs_u']), 'N m')}; "
         f"{int(sim['missed_deadlines'])} deadlines were missed in simulation and {int(hw['missed_deadlines'])} on "
         "hardware. These are all samples; the tests take both motions at one phase of the noise and in one band, so "
         "their ratios may differ."
