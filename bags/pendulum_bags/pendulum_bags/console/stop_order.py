@@ -120,8 +120,9 @@ class StopOrder:
     def state(self, now: float) -> dict[str, Any] | None:
         """Return what a person has to see; None where no stop is in force.
 
-        That is the time since the press [s], whether it was for all plants, and a row for each plant. A row's ``state`` is ``asked`` (no answer yet), ``stopped`` or ``silent`` (answered once, no longer), its
-        ``after`` the time from the press to the first answer and ``silent_for`` the time without one [s].
+        That is the time since the press [s], whether it was for all plants, and a row for each plant. A row's
+        ``state`` is ``asked`` (no answer yet), ``stopped`` or ``silent`` (answered once, no longer), its ``after`` the
+        time from the press to the first answer and ``silent_for`` the time without one [s].
         """
         if self._pressed is None:
             return None

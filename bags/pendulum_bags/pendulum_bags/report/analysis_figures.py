@@ -99,7 +99,8 @@ def alignment(data: ReportData) -> Figure:
         same = "are one signal" if pair.is_paired else "are not one signal"
         if pair.is_paired and clock.correlation < 0.98:
             same = "are one signal, but for samples that a plant skipped or repeated"
-        text = f"The recorded disturbances {same}: correlation {clock.correlation:.3f} at {quantity(1e3 * clock.delay, 'ms')}. "
+        shift = quantity(1e3 * clock.delay, "ms")
+        text = f"The recorded disturbances {same}: correlation {clock.correlation:.3f} at {shift}. "
     sentence = (
         f"{text}The hardware's velocity follows the simulation's {abs(1e3 * response.delay):.2f} ms "
         f"{'later' if response.delay >= 0.0 else 'earlier'}, with correlation {response.correlation:.3f} there and "

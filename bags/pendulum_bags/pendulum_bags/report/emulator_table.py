@@ -31,8 +31,8 @@ def emulator_table(data: ReportData) -> Table | None:
     ]
     return Table(
         "Constants of the emulator",
-        f"No machine was measured: these constants ({plant.name}) took the place of one. Noise, steps and timing of the "
-        "feedback are those of the named version of pendulum_hw_bridge.",
+        f"No machine was measured: these constants ({plant.name}) took the place of one. Noise, steps and timing of "
+        "the feedback are those of the named version of pendulum_hw_bridge.",
         ("part", "constant", "value", "unit", "meaning"),
         rows,
         "Provenance",
