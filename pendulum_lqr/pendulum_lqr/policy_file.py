@@ -10,12 +10,10 @@ from __future__ import annotations
 import io
 import json
 import math
-import os
 import stat
 import zipfile
 import zlib
 from collections.abc import Mapping, Sequence
-from contextlib import suppress
 from pathlib import Path
 from typing import Any, NoReturn
 
@@ -25,6 +23,7 @@ from numpy.typing import NDArray
 from pendulum_lqr.policy import MODEL, Network, Policy, fingerprint
 from pendulum_msgs_py.errors import DataError, PendulumError
 from pendulum_msgs_py.plants.plant_differences import describe_plants, read_pendulums
+from pendulum_msgs_py.whole_file import write_whole
 
 __all__ = ["FORMAT", "LARGEST_FILE", "dumps_policy", "load_policy", "loads_policy", "write_policy"]
 
@@ -51,14 +50,9 @@ def write_policy(path: str | Path, policy: Policy) -> Path:
     """
     path = Path(path)
     content = dumps_policy(policy)
-    temporary = path.with_name(f".{path.name}.{os.getpid()}")
     try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        temporary.write_bytes(content)
-        temporary.replace(path)
+        write_whole(path, content)
     except (OSError, ValueError) as error:
-        with suppress(OSError, ValueError):
-            temporary.unlink(missing_ok=True)
         reason = error.strerror if isinstance(error, OSError) else str(error)
         raise DataError(f"policy file {path} cannot be written: {reason}") from error
     return path

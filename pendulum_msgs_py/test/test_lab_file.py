@@ -103,8 +103,9 @@ def test_an_entry_that_is_not_understood_is_refused_with_its_place(
 def test_a_file_that_is_not_there_or_cannot_be_written_is_told(tmp_path: Path) -> None:
     with pytest.raises(ParameterError, match=r"lab file .*none.yaml does not exist"):
         load_lab(tmp_path / "none.yaml")
-    with pytest.raises(ParameterError, match=r"cannot be written: No such file"):
-        write_lab(tmp_path / "no" / "lab.yaml", LabFile())
+    (tmp_path / "file").write_text("", encoding="utf-8")
+    with pytest.raises(ParameterError, match=r"lab.yaml cannot be written: File exists"):
+        write_lab(tmp_path / "file" / "lab.yaml", LabFile())
 
 
 def test_a_lab_has_no_parameter_that_it_does_not_know() -> None:

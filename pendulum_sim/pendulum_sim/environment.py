@@ -309,7 +309,7 @@ def check_arguments(
     r: float,
 ) -> None:
     """Refuse arguments that make no environment."""
-    check_weights(q, r, 2, "two finite numbers, the weights of angle and velocity")
+    check_weights(q, r, 2, "two finite numbers >= 0, the weights of angle and velocity")
     check_step(dt, substeps)
     if method != "auto":
         get_integrator(method)

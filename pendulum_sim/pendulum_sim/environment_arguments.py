@@ -52,10 +52,11 @@ def check_weights(q: object, r: float, count: int, expected: str) -> None:
         expected: That in words.
     """
     weights = np.asarray(q, dtype=np.float64)
-    if weights.shape != (count,) or not np.isfinite(weights).all():
+    # Below zero they would pay for what they are to keep small.
+    if weights.shape != (count,) or not (np.isfinite(weights) & (weights >= 0.0)).all():
         raise ParameterError(f"q is {q}; expected {expected}")
-    if not math.isfinite(r):
-        raise ParameterError(f"r is {r}; expected a finite number")
+    if not (math.isfinite(r) and r >= 0.0):
+        raise ParameterError(f"r is {r}; expected a finite number >= 0")
 
 
 def check_reset_options(options: Mapping[str, Any], known: Sequence[str] = ("state", "start")) -> None:

@@ -47,7 +47,7 @@ class MechanismTask:
         n = len(parameters.joints)
         weights, cost = parameters.mechanism.weights
         given, self.r = weights if q is None else q, float(cost if r is None else r)
-        check_weights(given, self.r, 2 * n, f"{2 * n} finite numbers, of each joint and of each velocity")
+        check_weights(given, self.r, 2 * n, f"{2 * n} finite numbers >= 0, of each joint and of each velocity")
         self.q = np.asarray(given, dtype=np.float64)
         self.parameters, self.dt, self.start, self.disturbance = parameters, dt, start, disturbance
         self.joints = n

@@ -19,7 +19,6 @@ bridge's own table. Text that is a path is taken from the lab file's folder.
 from __future__ import annotations
 
 import math
-import os
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -28,6 +27,7 @@ from typing import Any
 
 from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.parameters import dump_yaml, load_yaml, reject_unknown, require_mapping
+from pendulum_msgs_py.whole_file import write_whole
 
 __all__ = [
     "EMULATED_BACKENDS",
@@ -223,12 +223,9 @@ def write_lab(path: str | Path, lab: LabFile) -> Path:
             document[section] = content
     if lab.proofs:
         document["proofs"] = {name: dict(proof) for name, proof in lab.proofs.items()}
-    beside = path.with_name(f".{path.name}.{os.getpid()}")
     try:
-        beside.write_text(_HEADER + dump_yaml(document, "lab file"), encoding="utf-8")
-        beside.replace(path)
+        write_whole(path, _HEADER + dump_yaml(document, "lab file"))
     except OSError as error:
-        beside.unlink(missing_ok=True)
         raise ParameterError(f"lab file {path} cannot be written: {error.strerror}") from error
     return path
 

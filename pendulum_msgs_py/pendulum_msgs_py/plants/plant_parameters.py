@@ -14,9 +14,7 @@ The file gives each value with its unit, so that a file in other units is refuse
 
 from __future__ import annotations
 
-import os
 from collections.abc import Mapping, Sequence
-from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from importlib import resources
 from pathlib import Path
@@ -34,6 +32,7 @@ from pendulum_msgs_py.plants.quantities import (
     specs_of,
     write_quantities,
 )
+from pendulum_msgs_py.whole_file import write_whole
 
 __all__ = [
     "DRIVETRAIN_SPECS",
@@ -286,14 +285,9 @@ def save_document(path: str | Path, document: Mapping[str, Any]) -> Path:
     """
     path = Path(path)
     text = dump_yaml(document, f"plant file {path}")
-    temporary = path.with_name(f".{path.name}.{os.getpid()}")
     try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        temporary.write_text(text, encoding="utf-8")
-        temporary.replace(path)
+        write_whole(path, text)
     except (OSError, ValueError) as error:
-        with suppress(OSError, ValueError):
-            temporary.unlink(missing_ok=True)
         reason = error.strerror if isinstance(error, OSError) else str(error)
         raise ParameterError(f"plant file {path} cannot be written: {reason}") from error
     return path

@@ -5,7 +5,6 @@ from __future__ import annotations
 import io
 import json
 import math
-import os
 from collections.abc import Callable, Mapping
 from contextlib import suppress
 from dataclasses import asdict, dataclass, field
@@ -28,6 +27,7 @@ from pendulum_msgs_py.contract.names import JOINT
 from pendulum_msgs_py.errors import DataError, ParameterError
 from pendulum_msgs_py.plants.plant_differences import describe_plants
 from pendulum_msgs_py.plants.plant_parameters import PlantParameters
+from pendulum_msgs_py.whole_file import write_whole
 
 __all__ = ["EPISODES", "TASKS", "TRIALS", "Training", "checkpoint_path", "train"]
 
@@ -202,17 +202,10 @@ def _keep(
     arrays |= {name: np.frombuffer(text.encode(), dtype=np.uint8) for name, text in words.items()}
     buffer = io.BytesIO()
     np.savez(buffer, curves=np.array(curves), fastest=np.array(fastest), **arrays)
-    temporary = path.with_name(f".{path.name}.{os.getpid()}")
     try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        temporary.write_bytes(buffer.getvalue())
-        temporary.replace(path)
+        write_whole(path, buffer.getvalue())
     except OSError as error:
         raise DataError(f"checkpoint {path} cannot be written: {error.strerror}; the one before it stays") from error
-    finally:
-        # Also where Ctrl-C comes in between.
-        with suppress(OSError):
-            temporary.unlink(missing_ok=True)
 
 
 def _check_shapes(path: Path, kept: Mapping[str, NDArray[Any]], learner: Ppo) -> None:
