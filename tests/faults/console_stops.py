@@ -386,13 +386,14 @@ def main() -> int:
     parser = argparse.ArgumentParser(
         prog="python -m tests.faults.console_stops",
         description=main.__doc__,
-        epilog="Example: python -m tests.faults.console_stops 20 frozen",
+        epilog="Example: python -m tests.faults.console_stops 20 frozen mouse",
     )
     parser.add_argument("tries", nargs="?", type=int, default=20, help="how often each way is tried")
-    parser.add_argument("name", nargs="?", default="", help="only the ways whose names have this in them")
+    parser.add_argument("names", nargs="*", help="only the ways whose names have one of these in them")
     parser.add_argument("--list", action="store_true", help="print the names of the ways and end")
     options = parser.parse_args()
-    chosen = {name: act for name, act in STOPS.items() if options.name in name}
+    wanted = options.names or [""]
+    chosen = {name: act for name, act in STOPS.items() if any(part in name for part in wanted)}
     if options.list or not chosen:
         print("\n".join(STOPS))
         return int(not options.list)

@@ -313,6 +313,7 @@ def test_several_runs_are_pooled_and_identification_experiments_join_the_report(
     assert "report" in capsys.readouterr().out
     text = (tmp_path / "out" / "report.html").read_text(encoding="utf-8")
     assert "2 runs" in text
+    assert '"dtick":1' in text.replace(" ", ""), "runs are counted in whole numbers"
     assert re.search(r"damping 11\.77 N m s/rad", text)
     assert re.search(r"gravity 1\.6[678]\d* N m", text)
     for name in (

@@ -112,6 +112,7 @@ class Panel:
         x_range, y_range: Limits; None to fit the data.
         y_ticks: Names at 0, 1, 2, ... in place of numbers; empty for numbers.
         square: Whether a unit is as long on both axes.
+        x_step: Distance of the numbers on the x axis; None to leave it to the renderer.
     """
 
     x_label: str
@@ -125,6 +126,7 @@ class Panel:
     y_range: tuple[float, float] | None = None
     y_ticks: Sequence[str] = ()
     square: bool = False
+    x_step: float | None = None
 
 
 @dataclass(frozen=True)

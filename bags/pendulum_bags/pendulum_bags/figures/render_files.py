@@ -163,6 +163,10 @@ def _draw_panel(ax: Axes, panel: Panel) -> None:
         ax.set_ylim(*panel.y_range)
     if panel.y_ticks:
         ax.set_yticks(range(len(panel.y_ticks)), panel.y_ticks)
+    if panel.x_step:
+        from matplotlib.ticker import MultipleLocator
+
+        ax.xaxis.set_major_locator(MultipleLocator(panel.x_step))
     if panel.square:
         ax.set_aspect("equal", adjustable="datalim")
 

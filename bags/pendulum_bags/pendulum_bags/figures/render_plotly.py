@@ -89,6 +89,8 @@ def _graph(figure: Figure, panels: list[Panel]) -> dict[str, Any]:
                 target.update(_log_ticks([getattr(trace, letter) for trace in panel.traces]))
         if panel.y_ticks:
             y_axis.update(tickmode="array", tickvals=list(range(len(panel.y_ticks))), ticktext=list(panel.y_ticks))
+        if panel.x_step:
+            x_axis["dtick"] = panel.x_step
         if panel.square:
             y_axis["scaleanchor"] = f"x{suffix}"
         layout[f"xaxis{suffix}"], layout[f"yaxis{suffix}"] = x_axis, y_axis

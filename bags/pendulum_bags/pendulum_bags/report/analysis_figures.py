@@ -288,7 +288,8 @@ def pooled_runs(data: ReportData) -> Figure | str:
                 ("hardware", "hw", [pair.hardware for pair in pairs]),
             )
         ]
-        panels.append(Panel("run", unit, traces))
+        # There is no run 1.5.
+        panels.append(Panel("run", unit, traces, x_range=(0.5, number.size + 0.5), x_step=math.ceil(number.size / 10)))
     spreads = [pair.hardware.window.position.std(ddof=1) for pair in pairs]
     total = sum(effective_size(pair.hardware.window.position) for pair in pairs)
     sentence = (
