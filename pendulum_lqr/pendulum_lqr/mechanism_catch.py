@@ -131,10 +131,19 @@ class MechanismCatch:
     leave: float = 2.0
     active: bool = False
 
+    @property
+    def terminal(self) -> Array:
+        """S of trace 4: the last deviation's share of the cost of a plan, whatever the weights of the LQR."""
+        S: Array = self.gain.S * (4.0 / float(np.trace(self.gain.S)))
+        return S
+
+    def share(self, deviation: Array) -> float:
+        """Return x' S x of a deviation from upright as a multiple of the region's level: at most 1 within."""
+        return float(deviation @ self.gain.S @ deviation) / self.region.level
+
     def holds(self, deviation: Array) -> bool:
         """Tell whether it is in charge of a deviation from upright; it may take over or let go by this."""
-        cost = float(deviation @ self.gain.S @ deviation)
-        self.active = cost <= self.region.level * (self.leave if self.active else 1.0)
+        self.active = self.share(deviation) <= (self.leave if self.active else 1.0)
         return self.active
 
     def command(self, deviation: Array) -> Vector:

@@ -45,10 +45,8 @@ def default_catch(plant: MechanismParameters) -> MechanismCatch:
 def _followed(
     plant: MechanismParameters, period: float, catch: MechanismCatch, recover: MechanismController | None
 ) -> MechanismController:
-    trajectory = stored_trajectory(plant)
-    return MechanismTvlqr(
-        plant, period, trajectory, catch, q=_CALM[0], r=_CALM[1], recover=recover, tube=_TUBE
-    )  # fmt: skip
+    q, r = _CALM
+    return MechanismTvlqr(plant, period, stored_trajectory(plant), catch, q=q, r=r, recover=recover, tube=_TUBE)
 
 
 def _tvlqr(plant: MechanismParameters, period: float) -> MechanismController:

@@ -67,8 +67,7 @@ class MechanismMpc:
     ) -> None:
         self.plant, self.period, self.catch, self.seed = plant, period, catch, seed
         self.settings = settings or MpcSettings()
-        S = catch.gain.S * (4.0 / float(np.trace(catch.gain.S)))
-        self._problem = IlqrProblem(plant, self.settings.step, self.settings.weights, S)
+        self._problem = IlqrProblem(plant, self.settings.step, self.settings.weights, catch.terminal)
         self._limits = plant.effort_limits
         self.reset()
 
@@ -141,8 +140,7 @@ class MechanismMpc:
 
     def _arrives(self, plan: IlqrPlan) -> bool:
         n = len(self.plant.joints)
-        end = deviation_of(self.plant.coordinates, tuple(plan.states[-1, : 2 * n]))
-        return float(end @ self.catch.gain.S @ end) <= self.catch.region.level
+        return self.catch.share(deviation_of(self.plant.coordinates, tuple(plan.states[-1, : 2 * n]))) <= 1.0
 
     def _solve(self, x: Vector, guess: Array, around: IlqrPlan | None, iterations: int) -> IlqrPlan:
         n = len(self.plant.joints)

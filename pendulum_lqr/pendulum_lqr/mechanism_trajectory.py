@@ -114,12 +114,10 @@ def search_swing_up(
     t = np.arange(max(2, round(horizon / search.step))) * search.step
     heights = np.array(plant.effort_limits) * rng.uniform(1.0 / 60.0, 5.0 / 12.0, m)
     guess = heights * np.sin(2.0 * math.pi * (t[:, None] / rng.uniform(0.4, 1.6, m) + rng.random(m)))
-    S = catch.gain.S * (4.0 / np.trace(catch.gain.S))
-    found = IlqrProblem(plant, search.step, search.find, S).solve(still, still, none, guess, 120)
-    problem = IlqrProblem(plant, search.step, search.weights, S)
+    found = IlqrProblem(plant, search.step, search.find, catch.terminal).solve(still, still, none, guess, 120)
+    problem = IlqrProblem(plant, search.step, search.weights, catch.terminal)
     found = problem.solve(still, still, none, found.efforts, search.iterations)
-    end = deviation_of(plant.coordinates, tuple(found.states[-1][: 2 * n]))
-    if not float(end @ catch.gain.S @ end) <= _NEAR * catch.region.level:
+    if not catch.share(deviation_of(plant.coordinates, tuple(found.states[-1][: 2 * n]))) <= _NEAR:
         raise DesignError(f"guess {seed} of {plant.name!r} does not end upright")
     tail = _held(plant, catch, tuple(found.states[-1]), max(0, round(search.duration / search.step) - len(t)), search)
     plan = problem.solve(still, still, none, np.vstack([found.efforts, tail]), 2 * search.iterations)

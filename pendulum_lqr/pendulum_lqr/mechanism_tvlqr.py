@@ -127,14 +127,12 @@ class MechanismTvlqr:
         if self._began is None:
             self._began = t
         k = round((t - self._began) / self.period)
-        deviation = deviation_of(self.plant.coordinates, x)
-        if self._following and k >= len(self.efforts):
-            self._following = False
-        if self._following:
+        if self._following and k < len(self.efforts):
             error = np.array(x) - self.states[k]
             if float(error @ self.costs[k] @ error) <= self._tube:
                 return within_limits(self.efforts[k] - self.gains[k] @ error, self._limits)
-            self._following = False
+        self._following = False
+        deviation = deviation_of(self.plant.coordinates, x)
         if self.catch.holds(deviation):
             return self.catch.command(deviation)
         if self.recover is None:

@@ -5,8 +5,9 @@ from __future__ import annotations
 from typing import Any
 
 import numba
+import numpy as np
 
-__all__ = ["copy", "eliminate", "newton", "product"]
+__all__ = ["copy", "eliminate", "keep_convex", "newton", "product"]
 
 
 @numba.njit(error_model="numpy", fastmath={"contract"})
@@ -75,3 +76,22 @@ def eliminate(work: Any, m: int) -> None:
         scale = work[j, j]
         for c in range(work.shape[1]):
             work[j, c] /= scale
+
+
+@numba.njit(error_model="numpy")
+def keep_convex(M: Any, n: int) -> None:
+    """Leave out of the symmetric part of the first n (1 or 2) rows and columns what is concave, in place."""
+    if n == 1:
+        M[0, 0] = max(M[0, 0], 0.0)
+    else:
+        a, b, c = M[0, 0], 0.5 * (M[0, 1] + M[1, 0]), M[1, 1]
+        middle, radius = 0.5 * (a + c), np.sqrt((0.5 * (a - c)) ** 2 + b * b)
+        high, low = max(middle + radius, 0.0), max(middle - radius, 0.0)
+        if radius > 1e-15:
+            mean, half = 0.5 * (high + low), 0.5 * (high - low)
+            M[0, 0] = mean + half * 0.5 * (a - c) / radius
+            M[1, 1] = mean - half * 0.5 * (a - c) / radius
+            M[0, 1] = M[1, 0] = half * b / radius
+        else:
+            M[0, 0] = M[1, 1] = high
+            M[0, 1] = M[1, 0] = 0.0
