@@ -47,6 +47,15 @@ def test_acrobot_pendubot_and_both_motors_are_one_model_in_three_files() -> None
     assert driven == {"acrobot": ("elbow",), "pendubot": ("shoulder",), "double_pendulum": ("shoulder", "elbow")}
 
 
+def test_a_whole_number_is_a_value_too() -> None:
+    plant = load_mechanism("acrobot").with_values({"elbow.damping": 1, "elbow.effort_limit": 5, "elbow.upper_stop": 2})
+    assert [plant.value(f"elbow.{key}") for key in ("damping", "effort_limit", "upper_stop")] == [1.0, 5.0, 2.0]
+    with pytest.raises(ParameterError, match=r"'shoulder.effort_limit' is not given for plant 'acrobot'"):
+        plant.value("shoulder.effort_limit")
+    with pytest.raises(ParameterError, match=r"'elbow.actuator' is not given"):
+        plant.value("elbow.actuator")
+
+
 def test_the_benchmarks_plants_come_with_and_without_friction() -> None:
     plain, rough = load_mechanism("acrobot_frictionless"), load_mechanism("acrobot")
     assert not plain.has_dry_friction

@@ -2,51 +2,45 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import cache
+from typing import Annotated
 
 from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.joints import Joint
 from pendulum_msgs_py.parameters import ParameterSpec, reject_unknown, require_mapping
-from pendulum_msgs_py.plants.quantities import read_quantities
+from pendulum_msgs_py.plants.quantities import Quantity, read_quantities, specs_of
 
 __all__ = ["Actuator", "JointParameters", "actuator_specs", "check_joint", "joint_specs", "read_joint"]
 
 
 @dataclass(frozen=True)
 class Actuator:
-    """The motor of one joint.
+    """The motor of one joint; ``effort_unit`` is the joint's."""
 
-    Attributes:
-        effort_limit: Largest torque or force, > 0 [N m or N].
-        time_constant: First-order lag between command and effort; 0 for none [s].
-        transport_delay: Time between a command and its first effect [s].
-    """
-
-    effort_limit: float
-    time_constant: float = 0.0
-    transport_delay: float = 0.0
+    effort_limit: Annotated[
+        float, Quantity("effort_unit", "Largest effort of the actuator.", positive=True, example=1.0)
+    ]
+    time_constant: Annotated[float, Quantity("s", "First-order lag between command and effort.")] = 0.0
+    transport_delay: Annotated[float, Quantity("s", "Time between a command and its first effect.")] = 0.0
 
 
 @dataclass(frozen=True)
 class JointParameters:
-    """Friction, ends of travel and actuator of one joint.
+    """Friction, ends of travel and actuator of one joint; units such as ``effort_unit`` are the joint's.
 
-    Attributes:
-        damping: Viscous friction [N m s/rad or N s/m].
-        coulomb_friction: Dry friction while sliding fast [N m or N].
-        static_friction: Dry friction at which sliding starts; None for the same [N m or N].
-        stribeck_velocity: Velocity over which the one falls to the other [rad/s or m/s].
-        lower_stop: Lowest position, where an end stop holds; None for none [rad or m].
-        upper_stop: Highest position [rad or m].
-        actuator: The motor; None for a passive joint.
+    Where ``static_friction`` is None it is the Coulomb friction; a stop or an actuator that is None is not there.
     """
 
-    damping: float = 0.0
-    coulomb_friction: float = 0.0
-    static_friction: float | None = None
-    stribeck_velocity: float = 0.01
-    lower_stop: float | None = None
-    upper_stop: float | None = None
+    damping: Annotated[float, Quantity("damping_unit", "Viscous friction.")] = 0.0
+    coulomb_friction: Annotated[float, Quantity("effort_unit", "Dry friction while sliding fast.")] = 0.0
+    static_friction: Annotated[float | None, Quantity("effort_unit", "Dry friction at which sliding starts.")] = None
+    stribeck_velocity: Annotated[
+        float,
+        Quantity("velocity_unit", "Velocity over which the static friction falls to Coulomb.", positive=True),
+    ] = 0.01
+    lower_stop: Annotated[float | None, Quantity("unit", "Lowest position, at an end stop.", signed=True)] = None
+    upper_stop: Annotated[float | None, Quantity("unit", "Highest position, at an end stop.", signed=True)] = None
     actuator: Actuator | None = None
 
     @property
@@ -55,32 +49,20 @@ class JointParameters:
         return self.coulomb_friction if self.static_friction is None else self.static_friction
 
 
+@cache
 def joint_specs(joint: Joint) -> tuple[ParameterSpec, ...]:
     """Return the table of what a plant file may say of a joint, in its units."""
-    effort = joint.effort_unit
-    return (
-        ParameterSpec("damping", 0.0, joint.damping_unit, "Viscous friction.", minimum=0.0),
-        ParameterSpec("coulomb_friction", 0.0, effort, "Dry friction while sliding fast.", minimum=0.0),
-        ParameterSpec("static_friction", 0.0, effort, "Dry friction at which sliding starts.", minimum=0.0),
-        ParameterSpec(
-            "stribeck_velocity", 0.01, joint.velocity_unit, "Velocity over which the static friction falls to Coulomb.",
-            minimum=0.0, exclusive_minimum=True,
-        ),
-        ParameterSpec("lower_stop", 0.0, joint.unit, "Lowest position, at an end stop."),
-        ParameterSpec("upper_stop", 0.0, joint.unit, "Highest position, at an end stop."),
-    )  # fmt: skip
+    return _in_units_of(joint, JointParameters)
 
 
+@cache
 def actuator_specs(joint: Joint) -> tuple[ParameterSpec, ...]:
     """Return the table of what a plant file may say of a joint's actuator, in its units."""
-    return (
-        ParameterSpec(
-            "effort_limit", 1.0, joint.effort_unit, "Largest effort of the actuator.",
-            minimum=0.0, exclusive_minimum=True,
-        ),
-        ParameterSpec("time_constant", 0.0, "s", "First-order lag between command and effort.", minimum=0.0),
-        ParameterSpec("transport_delay", 0.0, "s", "Time between a command and its first effect.", minimum=0.0),
-    )  # fmt: skip
+    return _in_units_of(joint, Actuator)
+
+
+def _in_units_of(joint: Joint, kind: type) -> tuple[ParameterSpec, ...]:
+    return tuple(replace(spec, unit=getattr(joint, spec.unit, spec.unit)) for spec in specs_of(kind))
 
 
 def read_joint(joint: Joint, entry: object, where: str) -> tuple[JointParameters, dict[str, list[float]]]:

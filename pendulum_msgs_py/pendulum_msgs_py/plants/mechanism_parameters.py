@@ -27,7 +27,7 @@ from pathlib import Path
 from typing import Any
 
 from pendulum_msgs_py.errors import ParameterError
-from pendulum_msgs_py.joints import Coordinates, Joint, Vector
+from pendulum_msgs_py.joints import Coordinates, Vector
 from pendulum_msgs_py.mechanisms import MECHANISMS, Mechanism
 from pendulum_msgs_py.parameters import load_yaml, reject_unknown, require_mapping, suggestion
 from pendulum_msgs_py.plants.joint_parameters import (
@@ -152,11 +152,10 @@ class MechanismParameters:
                 return value
         joint, _, key = name.partition(".")
         own = self.joints[self._joint_index(joint, name)]
-        found = getattr(own.actuator, key, None) if hasattr(Actuator, key) or key == "effort_limit" else None
-        found = getattr(own, key, None) if found is None else found
-        if not isinstance(found, float):
+        found = getattr(own.actuator, key, getattr(own, key, None))
+        if not isinstance(found, (float, int)):
             raise ParameterError(f"{name!r} is not given for plant {self.name!r}; expected {self._expected_names()}")
-        return found
+        return float(found)
 
     def with_values(self, changes: Mapping[str, float]) -> MechanismParameters:
         """Return a copy with some values changed, checked again.
@@ -169,7 +168,6 @@ class MechanismParameters:
         """
         values = list(self.values)
         joints = list(self.joints)
-        change: dict[str, Any]
         names = [spec.name for spec in self.mechanism.parameters]
         for name, value in changes.items():
             if name in names:
@@ -177,12 +175,12 @@ class MechanismParameters:
                 continue
             joint, _, key = name.partition(".")
             index = self._joint_index(joint, name)
-            own = joints[index]
-            if key in {spec.name for spec in joint_specs(self.mechanism.joints[index])}:
-                change = {key: value}
+            own, kind = joints[index], self.mechanism.joints[index]
+            change: dict[str, Any] = {key: value}
+            if key in {spec.name for spec in joint_specs(kind)}:
                 joints[index] = replace(own, **change)
-            elif own.actuator is not None and key in {spec.name for spec in actuator_specs(Joint(joint))}:
-                joints[index] = replace(own, actuator=replace(own.actuator, **{key: value}))
+            elif own.actuator is not None and key in {spec.name for spec in actuator_specs(kind)}:
+                joints[index] = replace(own, actuator=replace(own.actuator, **change))
             else:
                 raise ParameterError(f"unknown parameter {name!r}; expected {self._expected_names()}")
         return replace(self, values=tuple(values), joints=tuple(joints))
