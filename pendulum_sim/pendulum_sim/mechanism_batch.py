@@ -16,7 +16,6 @@ from numpy.typing import ArrayLike, NDArray
 
 from pendulum_msgs_py.dynamics.arithmetic import in_arithmetic
 from pendulum_msgs_py.errors import ParameterError
-from pendulum_msgs_py.plants.joint_parameters import actuator_specs, joint_specs
 from pendulum_msgs_py.plants.mechanism_parameters import MechanismParameters
 from pendulum_sim.batch import batch_size, check_counts, noise_keys, on_threads
 from pendulum_sim.joint_steps import pack_joints
@@ -115,8 +114,7 @@ def simulate_mechanisms(
     varied = {name: _table(name, np.reshape(values, (-1, 1)), 1)[:, 0] for name, values in (variations or {}).items()}
     lengths = {name: len(column) for name, column in {**columns, **varied}.items()} | {"seeds": len(own_keys)}
     size = batch_size(lengths)
-    wide = {name: np.repeat(column, size, axis=0) if len(column) == 1 else column for name, column in columns.items()}
-    wide = {name: np.array(column) for name, column in wide.items()}
+    wide = {name: np.repeat(column, size // len(column), axis=0) for name, column in columns.items()}
     for name, values in varied.items():
         _vary(parameters, wide, name, values)
     if varied:
@@ -175,9 +173,10 @@ def _table(name: str, values: ArrayLike, width: int) -> Array:
 
 def _vary(parameters: MechanismParameters, wide: dict[str, Array], name: str, values: Array) -> None:
     """Put values in the place of one parameter, by its name."""
-    # Both ends of the values are checked as a plant's own would be, and the name too.
-    for value in {float(values.min()), float(values.max())}:
-        _checked_value(parameters, name, value)
+    if name not in parameters.specs:
+        raise ParameterError(f"variation {name!r} is unknown; expected one of {', '.join(parameters.specs)}")
+    for value in (float(values.min()), float(values.max())):
+        parameters.specs[name].check(value, where="variations")
     names = parameters.mechanism.parameter_names
     joint, _, key = name.partition(".")
     if name in names:
@@ -193,16 +192,6 @@ def _vary(parameters: MechanismParameters, wide: dict[str, Array], name: str, va
     wide["table"][:, _TABLE.index(key) * n + index] = values
     if key == "coulomb_friction" and parameters.joints[index].static_friction is None:
         wide["table"][:, _TABLE.index("static_friction") * n + index] = values
-
-
-def _checked_value(parameters: MechanismParameters, name: str, value: float) -> None:
-    specs = {spec.name: spec for spec in parameters.mechanism.parameters}
-    for each, own in zip(parameters.mechanism.joints, parameters.joints, strict=True):
-        mine = joint_specs(each) + (actuator_specs(each) if own.actuator is not None else ())
-        specs |= {f"{each.name}.{spec.name}": spec for spec in mine}
-    if name not in specs:
-        raise ParameterError(f"variation {name!r} is unknown; expected one of {', '.join(specs)}")
-    specs[name].check(value, where="variations")
 
 
 def _check_starts(parameters: MechanismParameters, wide: Mapping[str, Array]) -> None:

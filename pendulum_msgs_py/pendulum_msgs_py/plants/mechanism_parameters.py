@@ -29,7 +29,7 @@ from typing import Any
 from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.joints import Coordinates, Vector
 from pendulum_msgs_py.mechanisms import MECHANISMS, Mechanism
-from pendulum_msgs_py.parameters import load_yaml, reject_unknown, require_mapping, suggestion
+from pendulum_msgs_py.parameters import ParameterSpec, load_yaml, reject_unknown, require_mapping, suggestion
 from pendulum_msgs_py.plants.joint_parameters import (
     Actuator,
     JointParameters,
@@ -141,21 +141,34 @@ class MechanismParameters:
         """Whether any joint has dry friction."""
         return any(joint.breakaway > 0.0 for joint in self.joints)
 
+    @cached_property
+    def specs(self) -> dict[str, ParameterSpec]:
+        """Table of what :meth:`with_values` takes, by name."""
+        found = {spec.name: spec for spec in self.mechanism.parameters}
+        for joint, own in zip(self.mechanism.joints, self.joints, strict=True):
+            mine = joint_specs(joint) + (actuator_specs(joint) if own.actuator is not None else ())
+            found |= {f"{joint.name}.{spec.name}": spec for spec in mine}
+        return found
+
+    @cached_property
+    def numbers(self) -> dict[str, float]:
+        """All values that are given, by the names of :attr:`specs`."""
+        found = {spec.name: value for spec, value in zip(self.mechanism.parameters, self.values, strict=True)}
+        for joint, own in zip(self.mechanism.joints, self.joints, strict=True):
+            given = {**vars(own), **({} if own.actuator is None else vars(own.actuator))}
+            numbers = {key: float(value) for key, value in given.items() if isinstance(value, (int, float))}
+            found |= {f"{joint.name}.{key}": value for key, value in numbers.items()}
+        return found
+
     def value(self, name: str) -> float:
         """Return a parameter by the name that :meth:`with_values` takes.
 
         Raises:
             ParameterError: There is none of that name, or it is not given.
         """
-        for spec, value in zip(self.mechanism.parameters, self.values, strict=True):
-            if spec.name == name:
-                return value
-        joint, _, key = name.partition(".")
-        own = self.joints[self._joint_index(joint, name)]
-        found = getattr(own.actuator, key, getattr(own, key, None))
-        if not isinstance(found, (float, int)):
+        if name not in self.numbers:
             raise ParameterError(f"{name!r} is not given for plant {self.name!r}; expected {self._expected_names()}")
-        return float(found)
+        return self.numbers[name]
 
     def with_values(self, changes: Mapping[str, float]) -> MechanismParameters:
         """Return a copy with some values changed, checked again.
@@ -166,23 +179,21 @@ class MechanismParameters:
         Raises:
             ParameterError: A name is unknown, a joint is passive, or a value is outside its domain.
         """
-        values = list(self.values)
-        joints = list(self.joints)
-        names = [spec.name for spec in self.mechanism.parameters]
+        values, joints = list(self.values), list(self.joints)
+        change: dict[str, Any]
         for name, value in changes.items():
-            if name in names:
-                values[names.index(name)] = value
-                continue
-            joint, _, key = name.partition(".")
-            index = self._joint_index(joint, name)
-            own, kind = joints[index], self.mechanism.joints[index]
-            change: dict[str, Any] = {key: value}
-            if key in {spec.name for spec in joint_specs(kind)}:
-                joints[index] = replace(own, **change)
-            elif own.actuator is not None and key in {spec.name for spec in actuator_specs(kind)}:
-                joints[index] = replace(own, actuator=replace(own.actuator, **change))
-            else:
+            if name not in self.specs:
                 raise ParameterError(f"unknown parameter {name!r}; expected {self._expected_names()}")
+            joint, _, key = name.partition(".")
+            if not key:
+                values[list(self.specs).index(name)] = value
+                continue
+            index = self.coordinates.names.index(joint)
+            own, change = joints[index], {key: value}
+            if not hasattr(own, key):
+                assert own.actuator is not None
+                change = {"actuator": replace(own.actuator, **change)}
+            joints[index] = replace(own, **change)
         return replace(self, values=tuple(values), joints=tuple(joints))
 
     def without_friction(self) -> MechanismParameters:
@@ -208,12 +219,6 @@ class MechanismParameters:
             a * m * b for a, row in zip(velocity, rows, strict=True) for m, b in zip(row, velocity, strict=True)
         )
         return float(0.5 * kinetic + self.mechanism.potential(position, self.packed))
-
-    def _joint_index(self, joint: str, name: str) -> int:
-        names = self.coordinates.names
-        if joint not in names:
-            raise ParameterError(f"unknown parameter {name!r}; expected {self._expected_names()}")
-        return names.index(joint)
 
     def _expected_names(self) -> str:
         own = ", ".join(spec.name for spec in self.mechanism.parameters)

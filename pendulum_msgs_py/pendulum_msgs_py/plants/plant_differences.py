@@ -10,7 +10,7 @@ from typing import Any
 
 from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.mechanisms import MECHANISMS
-from pendulum_msgs_py.plants.joint_parameters import Actuator, JointParameters, actuator_specs, joint_specs
+from pendulum_msgs_py.plants.joint_parameters import Actuator, JointParameters
 from pendulum_msgs_py.plants.mechanism_parameters import MechanismParameters
 from pendulum_msgs_py.plants.plant_parameters import (
     DRIVETRAIN_SPECS,
@@ -97,35 +97,14 @@ def _joint_differences(designed: AnyPlant, running: AnyPlant) -> tuple[PlantDiff
     if first != second or not (isinstance(designed, MechanismParameters) and isinstance(running, MechanismParameters)):
         return (PlantDifference("model", first, second, ""),)
     found = []
-    units, values, others = _units(designed), _values(designed), _values(running)
-    for name in {**values, **others}:
-        mine, theirs = values.get(name), others.get(name)
+    for name in {**designed.numbers, **running.numbers}:
+        mine, theirs = designed.numbers.get(name), running.numbers.get(name)
         if mine is None or theirs is None:
             first, second = ("none" if value is None else f"{value:.6g}" for value in (mine, theirs))
             found.append(PlantDifference(name, first, second, ""))
         elif _differ(mine, theirs):
-            found.append(PlantDifference(name, mine, theirs, units[name]))
+            found.append(PlantDifference(name, mine, theirs, designed.specs[name].unit))
     return tuple(found)
-
-
-def _values(plant: MechanismParameters) -> dict[str, float]:
-    """Return all numbers of a plant by the names that its plant file gives them."""
-    names = [spec.name for spec in plant.mechanism.parameters]
-    values = dict(zip(names, plant.values, strict=True))
-    for joint, own in zip(plant.mechanism.joints, plant.joints, strict=True):
-        for part, specs in ((own, joint_specs(joint)), (own.actuator, actuator_specs(joint))):
-            for spec in specs:
-                value = getattr(part, spec.name, None)
-                if value is not None:
-                    values[f"{joint.name}.{spec.name}"] = value
-    return values
-
-
-def _units(plant: MechanismParameters) -> dict[str, str]:
-    units = {spec.name: spec.unit for spec in plant.mechanism.parameters}
-    for joint in plant.mechanism.joints:
-        units.update({f"{joint.name}.{spec.name}": spec.unit for spec in (*joint_specs(joint), *actuator_specs(joint))})
-    return units
 
 
 def plant_mismatch(designed: AnyPlant, running: Sequence[AnyPlant]) -> str:
