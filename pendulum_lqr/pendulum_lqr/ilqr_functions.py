@@ -50,7 +50,8 @@ def step_functions(mechanism: Mechanism, driven: tuple[int, ...]) -> Any:
     where = np.array(driven)
     along = numba.njit(along_functions(n))
     pick = numba.njit(_TUPLES[n])
-    rk4 = numba.njit(_fresh(rk4_joints))
+    # Written into its callers: machine code that is told no functions can be kept on disk.
+    rk4 = numba.njit(_fresh(rk4_joints), forceinline=True)
     forward = numba.njit(_fresh(mechanism.forward), error_model="numpy")
     forward_c = numba.njit(in_arithmetic(mechanism.forward, cmath), error_model="numpy")
 

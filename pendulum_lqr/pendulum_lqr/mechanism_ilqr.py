@@ -28,6 +28,7 @@ from pendulum_lqr.small_matrices import copy, eliminate, newton, product
 from pendulum_msgs_py.joints import Vector
 from pendulum_msgs_py.mechanisms import MECHANISMS
 from pendulum_msgs_py.plants.mechanism_parameters import MechanismParameters
+from pendulum_msgs_py.programs.kept_kernels import keep_kernel
 
 __all__ = ["IlqrPlan", "IlqrProblem", "IlqrWeights"]
 
@@ -256,4 +257,4 @@ def _kernel(name: str, driven: tuple[int, ...]) -> Any:
                 return cost, count, True
         return cost, count, False
 
-    return solve
+    return keep_kernel(solve, "ilqr", mechanism.forward, mechanism.potential, name, driven)

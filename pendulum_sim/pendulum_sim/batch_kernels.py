@@ -14,6 +14,7 @@ import numba
 import numpy as np
 
 from pendulum_msgs_py.contract import noise
+from pendulum_msgs_py.programs.kept_kernels import keep_kernel
 from pendulum_sim import vector_math
 from pendulum_sim.compiling import compile_tree, tuple_loader
 from pendulum_sim.dry_friction import PACKED, acceleration_with_friction, actuator_torque, advance_dry
@@ -81,7 +82,8 @@ def smooth_kernel(method: str, coefficient_rows: int) -> Any:
         method: Integrator.
         coefficient_rows: How many numbers its coefficients are.
     """
-    step = compile_tree(get_integrator(method).step, vector=True)
+    integrator = get_integrator(method)
+    step = compile_tree(integrator.step, vector=True)
     acceleration = compile_tree(acceleration_with_friction, vector=True)
     load_plant = tuple_loader(_PLANT_ROWS, BLOCK)
     load_coefficients = tuple_loader(coefficient_rows, BLOCK)
@@ -119,13 +121,14 @@ def smooth_kernel(method: str, coefficient_rows: int) -> Any:
                         load_coefficients(w, _COEFFICIENTS + j), load_plant(w, _PLANT + j),
                     )  # fmt: skip
 
-    return block_loop(run_block, BLOCK)
+    return keep_kernel(block_loop(run_block, BLOCK), "smooth_kernel", integrator.step, coefficient_rows)
 
 
 @cache
 def coefficients_kernel(method: str) -> Any:
     """Return the loop that fills ``out``, shape (coefficients, B), for damping rates of shape (B,) and one step."""
-    coefficients_of = compile_tree(get_integrator(method).coefficients)
+    integrator = get_integrator(method)
+    coefficients_of = compile_tree(integrator.coefficients, inline=True)
 
     @numba.njit(parallel=True, error_model="numpy")
     def run(rates: Any, h: float, out: Any) -> None:
@@ -133,7 +136,7 @@ def coefficients_kernel(method: str) -> Any:
             for row, value in enumerate(coefficients_of(rates[j], h)):
                 out[row, j] = value
 
-    return run
+    return keep_kernel(run, "coefficients_kernel", integrator.coefficients)
 
 
 @cache
@@ -145,11 +148,11 @@ def general_kernel(method: str) -> Any:
         coefficient_rows: How many numbers its coefficients are.
     """
     integrator = get_integrator(method)
-    step = compile_tree(integrator.step)
-    coefficients_of = compile_tree(integrator.coefficients)
-    acceleration = compile_tree(acceleration_with_friction)
-    advance = compile_tree(advance_dry)
-    lagged = compile_tree(actuator_torque)
+    step = compile_tree(integrator.step, inline=True)
+    coefficients_of = compile_tree(integrator.coefficients, inline=True)
+    acceleration = compile_tree(acceleration_with_friction, inline=True)
+    advance = compile_tree(advance_dry, inline=True)
+    lagged = compile_tree(actuator_torque, inline=True)
     load_plant = tuple_loader(_PLANT_ROWS, 1)
 
     @numba.njit(fastmath={"contract"}, error_model="numpy")
@@ -231,4 +234,4 @@ def general_kernel(method: str) -> Any:
             for row in range(rows):
                 columns[row, j] = w[row]
 
-    return run
+    return keep_kernel(run, "general_kernel", integrator.step, integrator.coefficients)

@@ -19,7 +19,7 @@ from pendulum_sim import vector_math
 __all__ = ["compile_tree", "tuple_loader"]
 
 _OWN = ("pendulum_msgs_py", "pendulum_sim")
-_cache: dict[tuple[Any, bool], Any] = {}
+_cache: dict[tuple[Any, bool, bool], Any] = {}
 
 # What compiled code finds under the name ``math``; its attributes must be compiled themselves.
 _vector_module = ModuleType("vector_math_compiled")
@@ -28,28 +28,30 @@ _vector_module.cos = numba.njit(vector_math.cos, fastmath={"contract"}, forceinl
 _vector_module.exp = math.exp  # type: ignore[attr-defined]
 
 
-def compile_tree(function: Callable[..., Any], *, vector: bool = False) -> Any:
+def compile_tree(function: Callable[..., Any], *, vector: bool = False, inline: bool = False) -> Any:
     """Return a function, and those it calls, compiled.
 
     Args:
         function: A plain function of this project that uses scalars, tuples and ``math``.
-        vector: Take ``pendulum_sim.vector_math`` in the place of ``math``.
+        vector: Take ``pendulum_sim.vector_math`` in the place of ``math``, and write each function into its caller.
+        inline: Write each function into its caller: machine code that is told no functions can be kept on disk.
     """
-    key = (function, vector)
+    inline = inline or vector
+    key = (function, vector, inline)
     if key not in _cache:
         assert isinstance(function, FunctionType)
         scope = dict(function.__globals__)
         for name in function.__code__.co_names:
             value = scope.get(name)
             if isinstance(value, FunctionType) and value.__module__.startswith(_OWN):
-                scope[name] = compile_tree(value, vector=vector)
+                scope[name] = compile_tree(value, vector=vector, inline=inline)
             elif vector and isinstance(value, ModuleType) and value is math:
                 scope[name] = _vector_module
         copy = FunctionType(function.__code__, scope, function.__name__, function.__defaults__, function.__closure__)
         # Contraction (a fused multiply-add) changes the last bit at most; nothing else of fastmath is allowed. C code
         # calls none of these: a wrapper for it would only cost time to compile.
         _cache[key] = numba.njit(
-            copy, fastmath={"contract"}, error_model="numpy", forceinline=vector, no_cfunc_wrapper=True
+            copy, fastmath={"contract"}, error_model="numpy", forceinline=inline, no_cfunc_wrapper=True
         )
     return _cache[key]
 

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from pendulum_msgs_py.contract import noise
 from pendulum_msgs_py.contract.angles import UPRIGHT
 from pendulum_msgs_py.plants.plant_parameters import PlantParameters
+from pendulum_msgs_py.programs.kept_kernels import keep_kernel
 from pendulum_sim import vector_math
 from pendulum_sim.compiling import compile_tree, tuple_loader
 from pendulum_sim.dry_friction import PACKED, acceleration_with_friction
@@ -74,8 +75,9 @@ def step_kernel(method: str, lanes: int) -> Any:
         lanes: Pendulums side by side; the length of a row of ``w``.
     """
     plant_rows = len(PACKED)
-    coefficient_rows = len(get_integrator(method).coefficients(1.0, 1e-3))
-    step = compile_tree(get_integrator(method).step, vector=True)
+    integrator = get_integrator(method)
+    coefficient_rows = len(integrator.coefficients(1.0, 1e-3))
+    step = compile_tree(integrator.step, vector=True)
     acceleration = compile_tree(acceleration_with_friction, vector=True)
     scramble, unit = compile_tree(noise.scramble), compile_tree(noise.unit_interval)
     wrap = compile_tree(vector_math.wrap)
@@ -123,4 +125,4 @@ def step_kernel(method: str, lanes: int) -> Any:
             observations[2 * j] = wrap(w[j] - UPRIGHT)
             observations[2 * j + 1] = w[o_v + j]
 
-    return run
+    return keep_kernel(run, "step_kernel", integrator.step, lanes)

@@ -15,6 +15,7 @@ import numpy as np
 
 from pendulum_msgs_py.contract import noise
 from pendulum_msgs_py.mechanisms import MECHANISMS
+from pendulum_msgs_py.programs.kept_kernels import keep_kernel
 from pendulum_sim import vector_math
 from pendulum_sim.batch_kernels import BLOCK, block_loop
 from pendulum_sim.compiling import compile_tree, tuple_loader
@@ -148,7 +149,7 @@ def smooth_joints_kernel(layout: Layout) -> Any:
                     store(w, o_q + j, BLOCK, q)
                     store(w, o_v + j, BLOCK, v)
 
-    return block_loop(run_block, BLOCK)
+    return keep_kernel(block_loop(run_block, BLOCK), "smooth_joints_kernel", mechanism.forward, layout)
 
 
 @cache
@@ -158,9 +159,9 @@ def general_joints_kernel(layout: Layout) -> Any:
     s = layout.starts
     o_q, o_v, o_effort, o_p, o_table = (s[key] for key in ("q", "v", "effort", "p", "table"))
     mechanism = MECHANISMS[layout.name]
-    forward = compile_tree(mechanism.forward)
-    along, put, lag = (compile_tree(function) for function in joint_functions(n))
-    advance = compile_tree(advance_joints)
+    forward = compile_tree(mechanism.forward, inline=True)
+    along, put, lag = (compile_tree(function, inline=True) for function in joint_functions(n))
+    advance = compile_tree(advance_joints, inline=True)
     load = tuple_loader(n, 1)
     load_p = tuple_loader(len(mechanism.parameter_names), 1)
     store = numba.njit(_STORES[n])
@@ -202,4 +203,4 @@ def general_joints_kernel(layout: Layout) -> Any:
             store(w, o_q, 1, q)
             store(w, o_v, 1, v)
 
-    return block_loop(run_block, 1)
+    return keep_kernel(block_loop(run_block, 1), "general_joints_kernel", mechanism.forward, layout)

@@ -1,0 +1,92 @@
+"""Machine code kept on disk: taken by who makes the same kernel, and by nobody else."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numba
+import numpy as np
+import pytest
+
+from pendulum_msgs_py.plants.plant_parameters import load_plant
+from pendulum_msgs_py.programs import kept_kernels
+from pendulum_msgs_py.programs.kept_kernels import keep_kernel
+from pendulum_sim import batch_kernels
+from pendulum_sim.batch import simulate_batch
+
+
+@pytest.fixture
+def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.setattr(numba.config, "CACHE_DIR", str(tmp_path))
+    return tmp_path
+
+
+def double(x: float) -> float:
+    return 2.0 * x
+
+
+def triple(x: float) -> float:
+    return 3.0 * x
+
+
+def kernel(function: Callable[[float], float], name: str = "kernel") -> numba.core.dispatcher.Dispatcher:
+    inner = numba.njit(function, forceinline=True)
+    return keep_kernel(numba.njit(lambda x: inner(x) + 1.0), name, function)
+
+
+def taken(dispatcher: numba.core.dispatcher.Dispatcher) -> bool:
+    """Tell whether the machine code for the arguments so far came from disk."""
+    return sum(dispatcher.stats.cache_hits.values()) > 0
+
+
+def test_what_one_has_compiled_the_next_takes_and_no_other_kernel(folder: Path) -> None:
+    first, second = kernel(double), kernel(double)
+    assert (first(2.0), taken(first)) == (5.0, False)
+    assert (second(2.0), taken(second)) == (5.0, True)
+    # Made of another function, called otherwise, or for other arguments: not the same.
+    for other, argument, expected in (
+        (kernel(triple), 2.0, 7.0),
+        (kernel(double, "other"), 2.0, 5.0),
+        (kernel(double), 2, 5),
+    ):
+        assert (other(argument), taken(other)) == (expected, False)
+
+
+def test_nothing_is_taken_that_other_source_was_compiled_to(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    kernel(double)(2.0)
+    monkeypatch.setattr(kept_kernels, "_source_of", lambda package: "changed")
+    changed, after = kernel(double), kernel(double)
+    assert (changed(2.0), taken(changed)) == (5.0, False)
+    assert (after(2.0), taken(after)) == (5.0, True)
+    assert len(list(folder.rglob("*.nbk"))) == 1
+
+
+@pytest.mark.parametrize("damage", [b"", b"no code", b"0" * 64 + b"\nno code"])
+def test_a_damaged_file_is_compiled_anew_and_mended(folder: Path, damage: bytes) -> None:
+    kernel(double)(2.0)
+    (file,) = folder.rglob("*.nbk")
+    whole = file.read_bytes()
+    for content in (damage, whole[:-1], whole[:-1] + bytes([whole[-1] ^ 1])):
+        file.write_bytes(content)
+        mended, after = kernel(double), kernel(double)
+        assert (mended(2.0), taken(mended)) == (5.0, False)
+        assert (after(2.0), taken(after)) == (5.0, True)
+
+
+def test_where_no_folder_can_be_written_a_kernel_works_all_the_same(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(numba.core.caching.CompileResultCacheImpl, "_locator_classes", [])
+    assert kernel(double)(2.0) == 5.0
+    assert list(folder.rglob("*.nbk")) == []
+
+
+def test_the_loop_of_a_batch_is_kept_with_its_numbers(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The general one: what is told functions keeps addresses of its process unless all is written into one."""
+    factory, made = batch_kernels.general_kernel.__wrapped__, []
+    monkeypatch.setattr(batch_kernels, "general_kernel", lambda method: made.append(factory(method)) or made[-1])
+    plant = load_plant("dfki").with_values(transport_delay=0.0033, effort_limit=20.0)
+    runs = [simulate_batch(plant, steps=50, method="euler", seeds=[1, 2], amplitude=2.5, record=True) for _ in range(2)]
+    assert [taken(each) for each in made] == [False, True]
+    assert np.array_equal(runs[0].trajectories, runs[1].trajectories)
