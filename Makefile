@@ -54,7 +54,7 @@ $(VENV)/.linked: $(VENV)/.run $(LINKED)
 experiment: $(VENV)/.linked # Run the thesis's experiment on simulator and emulated hardware, and compare them (OUT=DIR ARGS=...)
 	@$(PY) -m pendulum_bags experiment thesis $(if $(OUT),--out "$(OUT)") $(ARGS)
 
-course: $(VENV)/.linked # Make six exercises with a hidden plant from a seed (SEED=2027 OUT=build/course)
+course: $(VENV)/.linked $(VENV)/.extras # Make six exercises with a hidden plant from a seed (SEED=2027 OUT=build/course)
 	@$(PY) -m pendulum_bags course make $(if $(SEED),--seed "$(SEED)") $(if $(OUT),--out "$(OUT)")
 
 test: venv # Run every test (ARGS="-k name" chooses)

@@ -31,7 +31,7 @@ from pendulum_msgs_py.plants.plant_parameters import MECHANISM_PRESETS, PRESET_N
 from pendulum_msgs_py.programs.executables import cli_main
 from pendulum_msgs_py.programs.terminal import make_console
 
-__all__ = ["THESIS_CHOICE", "THESIS_WEIGHTS", "app", "main"]
+__all__ = ["THESIS_CHOICE", "THESIS_WEIGHTS", "app", "main", "read_diagonal"]
 
 THESIS_WEIGHTS: tuple[tuple[tuple[float, float], float], ...] = (
     ((1.0, 0.01), 0.1),
@@ -147,19 +147,22 @@ def _limit(given: float, plants_own: float) -> float:
 def _weights(q: Sequence[str] | None, r: Sequence[float] | None) -> list[tuple[tuple[float, ...], float]]:
     if not q and not r:
         return [*THESIS_WEIGHTS]
-    diagonals = [_diagonal(text) for text in q] if q else sorted({weights for weights, _ in THESIS_WEIGHTS})
+    diagonals = [read_diagonal(text) for text in q] if q else sorted({weights for weights, _ in THESIS_WEIGHTS})
     costs = list(r) if r else [0.1]
     return [(diagonal, cost) for diagonal in diagonals for cost in costs]
 
 
-def _diagonal(text: str) -> tuple[float, ...]:
+def read_diagonal(text: str) -> tuple[float, float]:
+    """Return the diagonal of Q that a command line names as ``100,0.01`` [1/rad^2, s^2/rad^2].
+
+    Raises:
+        ParameterError: The text is something else.
+    """
     try:
-        values = tuple(float(part) for part in text.split(","))
+        q_11, q_22 = (float(part) for part in text.split(","))
     except ValueError as error:
         raise ParameterError(f"--q is {text!r}; expected two numbers, as 100,0.01") from error
-    if len(values) != 2:
-        raise ParameterError(f"--q is {text!r}; expected two numbers, as 100,0.01")
-    return values
+    return q_11, q_22
 
 
 def _chosen_row(row: int, count: int, default: int) -> int:

@@ -109,7 +109,7 @@ def test_a_parameter_that_is_too_far_is_named_and_the_hidden_one_is_not() -> Non
     truth = draw_plant(3)
     found = checks.check_plant(truth, truth.with_values(gravity=1.1 * truth.gravity))
     assert not found.right
-    assert found.reason.startswith("too far from the hidden plant: gravity (")
+    assert found.reason.startswith("outside of the tolerance: gravity (")
     assert f"{truth.gravity:.4g}" not in found.reason
 
 
@@ -147,10 +147,14 @@ def test_a_check_says_right_or_wrong_by_its_exit_code_too(course: Path, capsys: 
     assert capsys.readouterr().out.startswith("right: ")
     assert main(["check", "delay", "0.01", "--course", str(course), "--json"]) == 1
     assert json.loads(capsys.readouterr().out)["right"] is False
+    assert main(["check", "gains", "--q", "100,0.01", "--r", "1e6", "--course", str(course)]) == 1
+    assert capsys.readouterr().out.startswith("wrong: the time constant of this loop is ")
+    assert main(["check", "gains", "--q", "100", "--r", "0.1", "--course", str(course)]) == 2
+    assert "--q is '100'; expected two numbers, as 100,0.01" in capsys.readouterr().err
     assert main(["check", "noise", "2", "--because", "e", "--course", str(course)]) == 2
     assert "cause is 'e'; expected one of a, b, c, d" in capsys.readouterr().err
     assert main(["check", "delay", "0.1", "--course", str(course.parent / "none")]) == 2
-    assert "make one by: python -m pendulum_bags course make" in capsys.readouterr().err
+    assert "make one with: python -m pendulum_bags course make" in capsys.readouterr().err
     assert main(["solution", "--seed", "2027", "--json"]) == 0
     assert json.loads(capsys.readouterr().out)["6 fault"] == f"emulator_fault {FAULTS[draw_tasks(2027).fault]}"
 
@@ -178,12 +182,12 @@ def test_a_safely_broken_bridge_is_right_and_every_other_way_is_wrong(tmp_path: 
     words = "m_stop: the motion stop is pressed"
     cases = (
         (_broken(tmp_path / "good", words, 0.0), True, "no torque acted"),
-        (_broken(tmp_path / "other", "voltage: 18 V", 0.0), False, "asked is m_stop"),
+        (_broken(tmp_path / "other", "voltage: 18 V", 0.0), False, "expected m_stop"),
         (_broken(tmp_path / "driven", words, 0.4), False, "0.4 N m acted later than 60 ms"),
         (_broken(tmp_path / "short", words, 0.0, length=1.2), False, "ends too early"),
         (_broken(tmp_path / "asleep", words, 0.0, armed=False), False, "was not armed before"),
         (_broken(tmp_path / "unknown", words, math.nan), False, "is not a number"),
-        (_broken(tmp_path / "longer", "m_stop_other: a button", 0.0), False, "asked is m_stop"),
+        (_broken(tmp_path / "longer", "m_stop_other: a button", 0.0), False, "expected m_stop"),
         (_broken(tmp_path / "rearmed", words, 0.0, rearmed=1.2), False, "was armed again 0.2 s after the fault; leave"),
         (_broken(tmp_path / "rearmed later", words, 0.0, rearmed=1.7), True, "no torque acted"),
     )
@@ -199,9 +203,9 @@ def test_a_safely_broken_bridge_is_right_and_every_other_way_is_wrong(tmp_path: 
     [
         (
             lambda topic, t: topic == "applied_effort" and 1.06 < t < 1.085,
-            "states near the fault have no torque beside",
+            "states near the fault have no torque at their time",
         ),
-        (lambda topic, t: 1.06 < t < 1.2, "no torque is told for 140 ms near the fault"),
+        (lambda topic, t: 1.06 < t < 1.2, "no torque was recorded for 140 ms near the fault"),
         (lambda topic, t: round(100 * t) % 4 != 0, "only 25 torques a second"),
     ],
     ids=["torques alone", "a piece", "three of four"],

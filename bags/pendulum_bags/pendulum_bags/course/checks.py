@@ -91,7 +91,8 @@ def check_gains(tasks: Tasks, q: tuple[float, float], r: float) -> Judgement:
     asked = tasks.time_constant
     near = abs(found / asked - 1.0) <= _TIME_TOLERANCE
     return Judgement(
-        near, f"this loop has a time constant of {found:.3g} s; asked is {asked:g} s within {_TIME_TOLERANCE:.0%}"
+        near,
+        f"the time constant of this loop is {found:.3g} s; expected {asked:g} s within {_percent(_TIME_TOLERANCE)}",
     )
 
 
@@ -108,13 +109,13 @@ def check_plant(truth: PlantParameters, found: PlantParameters) -> Judgement:
         for name, share in PLANT_TOLERANCES.items()
         if abs(getattr(found, name) / getattr(truth, name) - 1.0) > share
     ]
-    limits = ", ".join(f"{name} {share:.0%}" for name, share in PLANT_TOLERANCES.items())
+    limits = ", ".join(f"{name} {_percent(share)}" for name, share in PLANT_TOLERANCES.items())
     if not off:
-        return Judgement(True, f"every parameter is as near to the hidden one as is asked ({limits})")
+        return Judgement(True, f"every parameter is within its tolerance ({limits})")
     words = ", ".join(f"{name} ({getattr(found, name):.4g} {units[name]})" for name in off)
     good = [name for name in PLANT_TOLERANCES if name not in off]
-    kept = f"; near enough: {', '.join(good)}" if good else ""
-    return Judgement(False, f"too far from the hidden plant: {words}{kept}; asked is {limits}")
+    kept = f"; within tolerance: {', '.join(good)}" if good else ""
+    return Judgement(False, f"outside of the tolerance: {words}{kept}; the tolerances are {limits}")
 
 
 def check_delay(tasks: Tasks, delay: float) -> Judgement:
@@ -128,8 +129,9 @@ def check_delay(tasks: Tasks, delay: float) -> Judgement:
     edge = critical_delay(tasks)
     stands = "still stands" if delay < edge else "has fallen"
     right = abs(delay / edge - 1.0) <= _DELAY_TOLERANCE
-    side = f"at the edge, within {_DELAY_TOLERANCE:.0%}" if right else f"not at the edge: with it the loop {stands}"
-    return Judgement(right, f"a delay of {delay:g} s is {side}")
+    near = f"is the stability limit, within {_percent(_DELAY_TOLERANCE)}"
+    far = f"is not the stability limit: with it the pendulum {stands}"
+    return Judgement(right, f"a delay of {delay:g} s {near if right else far}")
 
 
 def check_noise(tasks: Tasks, ratio: float, cause: str) -> Judgement:
@@ -150,8 +152,8 @@ def check_noise(tasks: Tasks, ratio: float, cause: str) -> Judgement:
     near = abs(ratio / noise_ratio(tasks) - 1.0) <= _RATIO_TOLERANCE
     explained = tasks.causes[letters.index(cause)] == "power"
     words = (
-        f"the ratio {ratio:g} is {'near enough' if near else f'off by more than {_RATIO_TOLERANCE:.0%}'}, and {cause} "
-        f"{'explains it' if explained else 'does not explain it'}"
+        f"the factor {ratio:g} is {'within' if near else 'off by more than'} {_percent(_RATIO_TOLERANCE)}, and "
+        f"explanation {cause} is {'correct' if explained else 'not correct'}"
     )
     return Judgement(near and explained, words)
 
@@ -184,7 +186,7 @@ def check_fault(tasks: Tasks, bag: Path) -> Judgement:
     if not any(str(event.get("mode", "")).startswith("armed") for event in modes[:index]):
         return Judgement(False, f"the bridge was not armed before its fault ({reason}); arm it, and break it then")
     if reason.split(":", maxsplit=1)[0] != tasks.fault:
-        return Judgement(False, f"the fault is {reason!r}; asked is {tasks.fault}")
+        return Judgement(False, f"the fault is {reason!r}; expected {tasks.fault}")
     since = (applied["stamp_ns"] - int(modes[index]["stamp_ns"])) / NANOSECONDS
     rearmed = next((e for e in modes[index:] if str(e.get("mode", "")).startswith("armed")), None)
     until = math.inf if rearmed is None else (rearmed["stamp_ns"] - modes[index]["stamp_ns"]) / NANOSECONDS
@@ -196,13 +198,17 @@ def check_fault(tasks: Tasks, bag: Path) -> Judgement:
         return Judgement(False, f"the recording ends too early; let it go on for {_WATCHED:g} s after the fault")
     untold = np.setdiff1d(states, applied["stamp_ns"])
     if lacking := _what_is_missing(since, (untold - int(modes[index]["stamp_ns"])) / NANOSECONDS, until):
-        return Judgement(False, f"{lacking}; record all of {topic}, and thin nothing out")
+        return Judgement(False, f"{lacking}; record all of {topic}, and leave nothing out")
     worst = float(np.max(np.abs(applied["effort"][later])))
     if not math.isfinite(worst):
         return Judgement(False, f"the torque later than {1e3 * _STOPPED_WITHIN:.0f} ms after the fault is not a number")
     if worst > 0.0:
         return Judgement(False, f"{worst:.3g} N m acted later than {1e3 * _STOPPED_WITHIN:.0f} ms after the fault")
     return Judgement(True, f"{reason}; from {1e3 * _STOPPED_WITHIN:.0f} ms after it no torque acted")
+
+
+def _percent(share: float) -> str:
+    return f"{100.0 * share:.0f} %"
 
 
 def _what_is_missing(since: Any, untold: Any, until: float) -> str:
@@ -217,14 +223,14 @@ def _what_is_missing(since: Any, untold: Any, until: float) -> str:
     watched = np.sort(since[(since > start) & (since <= end)])
     lacking = int(np.count_nonzero((untold > start) & (untold <= end)))
     if lacking:
-        return f"{lacking} states near the fault have no torque beside them"
+        return f"{lacking} states near the fault have no torque at their time"
     longest = float(np.max(np.diff(watched, prepend=start, append=end)))
     if longest > _LONGEST_GAP:
         allowed = f"expected one at least every {1e3 * _LONGEST_GAP:.0f} ms"
-        return f"no torque is told for {1e3 * longest:.0f} ms near the fault; {allowed}"
+        return f"no torque was recorded for {1e3 * longest:.0f} ms near the fault; {allowed}"
     rate = len(watched) / (end - start)
     if rate < _LEAST_RATE:
-        return f"only {rate:.0f} torques a second are told near the fault; expected at least {_LEAST_RATE:.0f}"
+        return f"only {rate:.0f} torques a second were recorded near the fault; expected at least {_LEAST_RATE:.0f}"
     return ""
 
 

@@ -31,7 +31,7 @@ app = typer.Typer(
 )
 check = typer.Typer(
     help="Check the answer to an exercise: right (exit code 0) or wrong (1).\n\n"
-    "Example: python -m pendulum_bags course check gains --q 100 0.01 --r 0.1",
+    "Example: python -m pendulum_bags course check gains --q 100,0.01 --r 0.1",
     no_args_is_help=True,
     rich_markup_mode=None,
     pretty_exceptions_enable=False,
@@ -45,10 +45,12 @@ AsJson = Annotated[bool, typer.Option("--json", help="Print the judgement as JSO
 
 @app.command()
 def make(
-    seed: Annotated[int, typer.Option(help="Another seed is another course: a year, for instance.", min=0)] = 1,
+    seed: Annotated[
+        int, typer.Option(help="Another seed makes another course; use the year, for instance.", min=0)
+    ] = 1,
     out: Annotated[Path, typer.Option("--out", "-o", help="Folder to write; it must be new or empty.")] = DEFAULT,
 ) -> None:
-    """Write exercises.md, course.yaml and the sealed plant of a seed. The seed itself stands in none of them.
+    """Write exercises.md, course.yaml and the sealed plant of a seed. None of them contains the seed.
 
     Example: python -m pendulum_bags course make --seed 2027 --out build/course
     """
@@ -94,18 +96,19 @@ def solution(
 
 @check.command()
 def gains(
-    q: Annotated[tuple[float, float], typer.Option(help="Diagonal of Q: two numbers, separated by a space.")],
-    r: Annotated[float, typer.Option(help="R.")],
+    q: Annotated[str, typer.Option(help="Diagonal of Q, as `design` takes it: 100,0.01 [1/rad^2, s^2/rad^2].")],
+    r: Annotated[float, typer.Option(help="R [1/(N m)^2].")],
     course: Course = DEFAULT,
     as_json: AsJson = False,
 ) -> int:
     """Exercise 1: weights for a given time constant.
 
-    Example: python -m pendulum_bags course check gains --q 100 0.01 --r 0.1
+    Example: python -m pendulum_bags course check gains --q 100,0.01 --r 0.1
     """
     from pendulum_bags.course.checks import check_gains
+    from pendulum_lqr.design_cli import read_diagonal
 
-    return _told(check_gains(_tasks(course), q, r), as_json=as_json)
+    return _told(check_gains(_tasks(course), read_diagonal(q), r), as_json=as_json)
 
 
 @check.command()
@@ -132,7 +135,7 @@ def plant(
 
 @check.command()
 def delay(
-    delay: Annotated[float, typer.Argument(help="Delay at which the loop falls [s].")],
+    delay: Annotated[float, typer.Argument(help="Delay at which the loop becomes unstable [s].")],
     course: Course = DEFAULT,
     as_json: AsJson = False,
 ) -> int:
@@ -147,7 +150,7 @@ def delay(
 
 @check.command()
 def noise(
-    ratio: Annotated[float, typer.Argument(help="How much more theta spreads under the longer hold [-].")],
+    ratio: Annotated[float, typer.Argument(help="Factor by which the standard deviation of theta grows [-].")],
     because: Annotated[str, typer.Option(help="Explanation: a, b, c or d.")],
     course: Course = DEFAULT,
     as_json: AsJson = False,
@@ -206,7 +209,7 @@ def _tasks(course: Path) -> Tasks:
 
     path = course / "course.yaml"
     if not path.is_file():
-        raise BagError(f"course folder {course} has no course.yaml; make one by: python -m pendulum_bags course make")
+        raise BagError(f"course folder {course} has no course.yaml; make one with: python -m pendulum_bags course make")
     return read_tasks(path)
 
 

@@ -11,18 +11,19 @@ __all__ = ["answers", "exercises_text"]
 _TEXT = """\
 # Six exercises
 
-Work in the project's folder with its environment active (`. .venv/bin/activate`). Each exercise ends with a command
-that says *right* or *wrong*. Background and hints: `bags/pendulum_bags/docs/course.md`.
+Work in the project's folder. Run `make extras` once, and activate the environment in each terminal:
+`. .venv/bin/activate`. Each exercise ends with a command that says *right* or *wrong*; the answer in it is a
+placeholder for yours. Background and hints: `bags/pendulum_bags/docs/course.md`.
 
 ## 1. Choose Q and R
 The plant is `thesis`. Choose Q and R of an LQR so that the time constant of the closed loop is
 **{time_constant:g} s** (within 5 %).
 
     python -m pendulum_lqr design --preset thesis --q 100,0.01 --r 0.1
-    python -m pendulum_bags course check gains --q 100 0.01 --r 0.1 --course {course}
+    python -m pendulum_bags course check gains --q 100,0.01 --r 0.1 --course {course}
 
 ## 2. Identify an unknown pendulum
-`{course}/hidden.yaml` is a sealed plant: the simulator runs it, no other program reads it. It resembles `dfki`.
+`{course}/hidden.yaml` is a sealed plant: the simulator runs it, and no other program reads it. It resembles `dfki`.
 Design an excitation, play it on the hidden plant, and identify the parameters: inertia and gravity within 3 %,
 damping and Coulomb friction within 15 %.
 
@@ -32,9 +33,10 @@ damping and Coulomb friction within 15 %.
     python -m pendulum_bags course check plant {course}/found.yaml --course {course}
 
 ## 3. Find the delay at which it falls
-Plant `thesis`, LQR with Q = diag({q[0]:g}, {q[1]:g}) and R = **{delay_weight:g}**, sampled at 100 Hz. By how much may
-the torque be late before the loop becomes unstable (within 5 %)?
+Plant `thesis`, LQR with Q = diag({q[0]:g}, {q[1]:g}) and R = **{delay_weight:g}**, sampled at 100 Hz. How
+long a delay of the torque makes the loop unstable (within 5 %)?
 
+    python -m pendulum_lqr design --preset thesis --q {q[0]:g},{q[1]:g} --r {delay_weight:g}
     python -m pendulum_bags course check delay 0.1 --course {course}
 
 ## 4. Explain why noise at 500 Hz looks calmer
@@ -44,6 +46,9 @@ theta grow (within 20 %)? And why?
 
 {causes}
 
+    python -m pendulum_bags experiment lockstep --bag {course}/noise/short --hold-time 0.002 --duration 60
+    python -m pendulum_bags experiment lockstep --bag {course}/noise/long --hold-time {hold_s:g} --duration 60
+    python -m pendulum_bags analyse {course}/noise --ask metrics
     python -m pendulum_bags course check noise 1.5 --because a --course {course}
 
 ## 5. Predict the winner
@@ -57,7 +62,8 @@ emulated machine.
 ## 6. Break the bridge, safely
 Arm the bridge on an emulated actuator, record it, and make it fault for the reason **`{fault}`**. The recording must
 show that the bridge was armed, that it gave this reason, and that no torque acted from 60 ms after the fault on. Use
-the emulator and nothing else. One terminal each:
+the emulator and nothing else. Give each line a terminal of its own, in this order; start the last one while the
+pendulum moves. NAME is for you to find: `python -m pendulum_hw_bridge emulator_fault` lists what can fail.
 
     python -m pendulum_hw_bridge emulator
     python -m pendulum_hw_bridge bridge --ros-args -r __ns:=/hw -p backend:=emulator_process -p feedback_watchdog:=20
@@ -83,6 +89,7 @@ def exercises_text(tasks: Tasks, course: str) -> str:
         time_constant=tasks.time_constant,
         delay_weight=tasks.delay_weight,
         hold_ms=1e3 * tasks.hold_time,
+        hold_s=tasks.hold_time,
         causes=causes,
         controller_a=tasks.controller_a,
         controller_b=tasks.controller_b,
@@ -99,7 +106,7 @@ def answers(tasks: Tasks, plant: PlantParameters) -> dict[str, str]:
     winner = "a" if tasks.controller_a > tasks.controller_b else "b"
     letter = "abcd"[tasks.causes.index("power")]
     return {
-        "1 gains": f"--q {WEIGHTS[0]:g} {WEIGHTS[1]:g} --r {_weight_for(tasks.time_constant):.3g} (one of many)",
+        "1 gains": f"--q {WEIGHTS[0]:g},{WEIGHTS[1]:g} --r {_weight_for(tasks.time_constant):.3g} (one of many)",
         "2 plant": ", ".join(f"{name} {getattr(plant, name):.4g} {units[name]}" for name in named),
         "3 delay": f"{critical_delay(tasks):.3g} s",
         "4 noise": f"{noise_ratio(tasks):.3g}, because {letter}: {CAUSES['power']}",
