@@ -18,15 +18,31 @@ from collections.abc import Callable
 from typing import Any
 
 from pendulum_msgs_py.dynamics import friction_magnitude
-from pendulum_msgs_py.dynamics.runge_kutta import along_1, along_2, rk4_joints
+from pendulum_msgs_py.dynamics.runge_kutta import along_functions, rk4_joints
 from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.plants.mechanism_parameters import MechanismParameters
 from pendulum_sim.dry_friction import actuator_torque, narrowed
 
-__all__ = ["JOINT_FUNCTIONS", "JointTable", "advance_joints", "joint_functions", "pack_joints", "rk4_joints"]
+__all__ = [
+    "COULOMB",
+    "JOINT_ROWS",
+    "LAG",
+    "LOWER",
+    "STATIC",
+    "STRIBECK",
+    "UPPER",
+    "JointTable",
+    "advance_joints",
+    "joint_functions",
+    "pack_joints",
+    "rk4_joints",
+]
 
+JOINT_ROWS = ("coulomb_friction", "static_friction", "stribeck_velocity", "lower_stop", "upper_stop", "time_constant")
+"""What a row of a ``JointTable`` holds, by the names of plant files."""
+COULOMB, STATIC, STRIBECK, LOWER, UPPER, LAG = range(len(JOINT_ROWS))
 JointTable = tuple[tuple[float, ...], ...]
-"""Rows of one number per joint: Coulomb and static friction, Stribeck velocity, lower and upper stop, lag."""
+"""Rows of one number per joint, in the order of ``JOINT_ROWS``."""
 
 _MAX_EVENTS = 12
 _MAX_ROOT_STEPS = 60
@@ -56,19 +72,19 @@ def lag_2(torque: Any, command: Any, elapsed: float, constants: Any) -> Any:
     )
 
 
-JOINT_FUNCTIONS: dict[int, tuple[Callable[..., Any], ...]] = {1: (along_1, put_1, lag_1), 2: (along_2, put_2, lag_2)}
-"""By number of joints, what loops over tuples would do: compiled code wants it written out."""
+_PUT = {1: put_1, 2: put_2}
+_LAG_FUNCTIONS = {1: lag_1, 2: lag_2}
 
 
 def joint_functions(count: int) -> tuple[Callable[..., Any], ...]:
-    """Return (along, put, lag) for a number of joints.
+    """Return (along, put, lag) for a number of joints: what loops over tuples would do, written out to be compiled.
 
     Raises:
         ParameterError: Nobody has written them for so many.
     """
-    if count not in JOINT_FUNCTIONS:
+    if count not in _PUT:
         raise ParameterError(f"a mechanism of {count} joints is not stepped yet; expected 1 or 2")
-    return JOINT_FUNCTIONS[count]
+    return along_functions(count), _PUT[count], _LAG_FUNCTIONS[count]
 
 
 def pack_joints(parameters: MechanismParameters) -> JointTable:
@@ -88,7 +104,7 @@ def _loaded(put: Any, v: Any, torque: Any, direction: Any, table: Any) -> Any:
     """Return the efforts less the dry friction of what slides."""
     for i in range(len(torque)):
         if direction[i] != 0.0:
-            friction = friction_magnitude(v[i], table[0][i], table[1][i], table[2][i])
+            friction = friction_magnitude(v[i], table[COULOMB][i], table[STATIC][i], table[STRIBECK][i])
             torque = put(torque, i, torque[i] - direction[i] * friction)
     return torque
 
@@ -121,7 +137,7 @@ def _step(
 ) -> Any:  # fmt: skip
     """Return (q, v) after h with the joints in one mode; ``begin`` is the time since the effort was ``torque``."""
     half = 0.5 * h
-    constants = table[5]
+    constants = table[LAG]
     t_0 = along(lag(torque, command, begin, constants), 1.0, push)
     t_m = along(lag(torque, command, begin + half, constants), 1.0, push)
     t_1 = along(lag(torque, command, begin + h, constants), 1.0, push)
@@ -147,9 +163,9 @@ def _modes(forward: Any, along: Any, put: Any, q: Any, v: Any, torque: Any, p: A
     rest = 0
     for i in range(n):
         if v[i] != 0.0:
-            if table[1][i] > 0.0:
+            if table[STATIC][i] > 0.0:
                 direction = put(direction, i, 1.0 if v[i] > 0.0 else -1.0)
-        elif table[1][i] > 0.0 or q[i] <= table[3][i] or q[i] >= table[4][i]:
+        elif table[STATIC][i] > 0.0 or q[i] <= table[LOWER][i] or q[i] >= table[UPPER][i]:
             held = put(held, i, 1.0)
             rest += 1
     # Let go of whatever cannot be held, one joint at a time, the one that is pulled hardest beyond its friction first.
@@ -166,9 +182,9 @@ def _modes(forward: Any, along: Any, put: Any, q: Any, v: Any, torque: Any, p: A
                     forward, along, put, q, v, put(torque, i, torque[i] + 1.0), direction, free, p, table
                 )
                 needed = loose[i] / (pulled[i] - loose[i])
-                limit = table[1][i]
+                limit = table[STATIC][i]
                 over = abs(needed) - limit
-                if (needed > 0.0 and q[i] >= table[4][i]) or (needed < 0.0 and q[i] <= table[3][i]):
+                if (needed > 0.0 and q[i] >= table[UPPER][i]) or (needed < 0.0 and q[i] <= table[LOWER][i]):
                     over = -1.0
                 if over > excess:
                     worst, excess, way = i, over, 1.0 if needed > 0.0 else -1.0
@@ -176,7 +192,7 @@ def _modes(forward: Any, along: Any, put: Any, q: Any, v: Any, torque: Any, p: A
             break
         held = put(held, worst, 0.0)
         rest -= 1
-        if table[1][worst] > 0.0:
+        if table[STATIC][worst] > 0.0:
             direction = put(direction, worst, way)
     return direction, held
 
@@ -186,8 +202,8 @@ def _passed(kind: int, i: int, q: Any, v: Any, direction: Any, table: Any) -> fl
     if kind == 0:
         return float(v[i] * direction[i])
     if kind == 1:
-        return float(q[i] - table[3][i])
-    return float(table[4][i] - q[i])
+        return float(q[i] - table[LOWER][i])
+    return float(table[UPPER][i] - q[i])
 
 
 def advance_joints(
@@ -214,7 +230,7 @@ def advance_joints(
     n = len(q)
     for _ in range(_MAX_EVENTS):
         begin = h - left
-        now = along(lag(torque, command, begin, table[5]), 1.0, push)
+        now = along(lag(torque, command, begin, table[LAG]), 1.0, push)
         direction, held = _modes(forward, along, put, q, v, now, p, table)
         q_1, v_1 = _step(
             forward, along, put, lag, q, v, torque, command, push, begin, left, direction, held, p, table
@@ -258,13 +274,13 @@ def advance_joints(
             forward, along, put, lag, q, v, torque, command, push, begin, first, direction, held, p, table
         )  # fmt: skip
         # A joint that turned round within the step may have been at a stop before: it is no further than that.
-        q = put(q, joint, min(max(q[joint], table[3][joint]), table[4][joint]))
+        q = put(q, joint, min(max(q[joint], table[LOWER][joint]), table[UPPER][joint]))
         if which > 0:
-            q = put(q, joint, table[3][joint] if which == 1 else table[4][joint])
+            q = put(q, joint, table[LOWER][joint] if which == 1 else table[UPPER][joint])
             # A plastic impact: the impulse that takes this joint's velocity moves the others too. Dry friction holds
             # no joint against it, for it is a finite effort in no time; an end stop does.
             for i in range(n):
-                if table[3][i] < q[i] < table[4][i]:
+                if table[LOWER][i] < q[i] < table[UPPER][i]:
                     held = put(held, i, 0.0)
             a = _constrained(forward, along, put, q, v, now, direction, held, p, table)
             more = _constrained(forward, along, put, q, v, put(now, joint, now[joint] + 1.0), direction, held, p, table)

@@ -18,14 +18,13 @@ from pendulum_msgs_py.dynamics.arithmetic import in_arithmetic
 from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.plants.mechanism_parameters import MechanismParameters
 from pendulum_sim.batch import batch_size, check_counts, noise_keys, on_threads
-from pendulum_sim.joint_steps import pack_joints
+from pendulum_sim.joint_steps import COULOMB, JOINT_ROWS, LOWER, STATIC, UPPER, pack_joints
 from pendulum_sim.mechanism_plant import check_decay, check_stable_step, common_delay, is_smooth_mechanism
 from pendulum_sim.plant import check_step
 
 __all__ = ["MechanismBatch", "simulate_mechanisms"]
 
 Array = NDArray[np.float64]
-_TABLE = ("coulomb_friction", "static_friction", "stribeck_velocity", "lower_stop", "upper_stop", "time_constant")
 
 
 @dataclass(frozen=True)
@@ -129,7 +128,7 @@ def simulate_mechanisms(
         w[starts[name] : starts[name] + column.shape[1]] = column.T
     keys = np.broadcast_to(own_keys, (size,)).copy()
     recorded = np.empty((steps, 3 * n, size)) if record else np.empty((0, 3 * n, size))
-    smooth = is_smooth_mechanism(parameters) and not any(name.partition(".")[2] in _TABLE for name in varied)
+    smooth = is_smooth_mechanism(parameters) and not any(name.partition(".")[2] in JOINT_ROWS for name in varied)
     with on_threads(threads):
         if smooth:
             smooth_joints_kernel(layout)(w, keys, aim, dt, steps, hold, substeps, recorded)
@@ -189,14 +188,14 @@ def _vary(parameters: MechanismParameters, wide: dict[str, Array], name: str, va
     if key == "transport_delay":
         raise ParameterError(f"variation {name!r} is one delay for all; expected it in the plant, or a batch for each")
     n = len(parameters.joints)
-    wide["table"][:, _TABLE.index(key) * n + index] = values
+    wide["table"][:, JOINT_ROWS.index(key) * n + index] = values
     if key == "coulomb_friction" and parameters.joints[index].static_friction is None:
-        wide["table"][:, _TABLE.index("static_friction") * n + index] = values
+        wide["table"][:, STATIC * n + index] = values
 
 
 def _check_starts(parameters: MechanismParameters, wide: Mapping[str, Array]) -> None:
     n = len(parameters.joints)
-    low, high = (wide["table"][:, k * n : (k + 1) * n] for k in (3, 4))
+    low, high = (wide["table"][:, row * n : (row + 1) * n] for row in (LOWER, UPPER))
     outside = ~((low <= wide["q"]) & (wide["q"] <= high) & (low < high))
     if outside.any():
         row, joint = (int(value[0]) for value in np.nonzero(outside))
@@ -209,7 +208,7 @@ def _check_starts(parameters: MechanismParameters, wide: Mapping[str, Array]) ->
 
 def _check_varied(parameters: MechanismParameters, wide: Mapping[str, Array], h: float) -> None:
     n = len(parameters.joints)
-    coulomb, static = wide["table"][:, :n], wide["table"][:, n : 2 * n]
+    coulomb, static = (wide["table"][:, row * n : (row + 1) * n] for row in (COULOMB, STATIC))
     if (static < coulomb).any():
         row, joint = (int(value[0]) for value in np.nonzero(static < coulomb))
         raise ParameterError(

@@ -19,10 +19,10 @@ from numpy.typing import NDArray
 
 from pendulum_msgs_py.contract import noise
 from pendulum_msgs_py.dynamics.arithmetic import in_arithmetic
+from pendulum_msgs_py.dynamics.runge_kutta import along_functions, rk4_joints
 from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.plants.mechanism_parameters import MechanismParameters
 from pendulum_sim.environment_arguments import Array, PlantVectorEnv, check_reset_options
-from pendulum_sim.joint_steps import joint_functions, rk4_joints
 from pendulum_sim.mechanism_plant import MechanismPlant, is_smooth_mechanism
 from pendulum_sim.mechanism_task import MechanismTask
 
@@ -200,7 +200,7 @@ class MechanismVectorEnv(PlantVectorEnv):
         smooth = is_smooth_mechanism(task.parameters)
         self._plants = [] if smooth else [MechanismPlant(task.parameters, dt) for _ in range(num_envs)]
         self._forward = in_arithmetic(task.parameters.mechanism.forward, np)
-        self._along = joint_functions(task.joints)[0]
+        self._along = along_functions(task.joints)
         self._position = np.zeros((num_envs, task.joints))
         self._velocity = np.zeros((num_envs, task.joints))
         self._keys = [0] * num_envs

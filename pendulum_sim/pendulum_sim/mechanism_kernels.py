@@ -14,17 +14,16 @@ import numba
 import numpy as np
 
 from pendulum_msgs_py.contract import noise
+from pendulum_msgs_py.dynamics.runge_kutta import along_functions, rk4_joints
 from pendulum_msgs_py.mechanisms import MECHANISMS
 from pendulum_msgs_py.programs.kept_kernels import keep_kernel
 from pendulum_sim import vector_math
 from pendulum_sim.batch_kernels import BLOCK, block_loop
 from pendulum_sim.compiling import compile_tree, tuple_loader
-from pendulum_sim.joint_steps import advance_joints, joint_functions, rk4_joints
+from pendulum_sim.joint_steps import JOINT_ROWS, LAG, advance_joints, joint_functions
 
-__all__ = ["TABLE_ROWS", "Layout", "general_joints_kernel", "smooth_joints_kernel"]
+__all__ = ["Layout", "general_joints_kernel", "smooth_joints_kernel"]
 
-TABLE_ROWS = 6
-"""Rows of :func:`~pendulum_sim.joint_steps.pack_joints`."""
 _scramble = compile_tree(noise.scramble)
 _unit_interval = compile_tree(noise.unit_interval)
 _wrap = compile_tree(vector_math.wrap)
@@ -54,7 +53,7 @@ class Layout:
         sizes = {
             "q": n, "v": n, "effort": n, "deviation": n, "noise": m, "amplitude": m, "limit": m, "gain": m * 2 * n,
             "max_effort": m, "max": n, "sum": n, "square": n, "p": len(MECHANISMS[self.name].parameter_names),
-            "table": TABLE_ROWS * n,
+            "table": len(JOINT_ROWS) * n,
         }  # fmt: skip
         starts, row = {}, 0
         for key, size in sizes.items():
@@ -127,7 +126,7 @@ def smooth_joints_kernel(layout: Layout) -> Any:
     o_q, o_v, o_effort, o_p = (s[key] * BLOCK for key in ("q", "v", "effort", "p"))
     mechanism = MECHANISMS[layout.name]
     forward = compile_tree(mechanism.forward, vector=True)
-    along = compile_tree(joint_functions(n)[0], vector=True)
+    along = compile_tree(along_functions(n), vector=True)
     step = compile_tree(rk4_joints, vector=True)
     load = tuple_loader(n, BLOCK)
     load_p = tuple_loader(len(mechanism.parameter_names), BLOCK)
@@ -199,7 +198,7 @@ def general_joints_kernel(layout: Layout) -> Any:
                 command = load(line[part], 0)
                 for _ in range(count):
                     q, v = advance(forward, along, put, lag, q, v, torque, command, still, h, p, table)
-                    torque = lag(torque, command, h, table[5])
+                    torque = lag(torque, command, h, table[LAG])
             store(w, o_q, 1, q)
             store(w, o_v, 1, v)
 

@@ -8,15 +8,15 @@ effort on the joints themselves.
 from __future__ import annotations
 
 import math
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
+from pendulum_msgs_py.dynamics.runge_kutta import rk4_joints
 from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.joints import Coordinates, Vector
 from pendulum_msgs_py.plants.mechanism_parameters import MechanismParameters
-from pendulum_sim.compiling import compile_tree
-from pendulum_sim.joint_steps import advance_joints, joint_functions, pack_joints, rk4_joints
+from pendulum_sim.joint_steps import LAG, advance_joints, joint_functions, pack_joints
 from pendulum_sim.plant import DelayLine, check_step, period_segments
 
 __all__ = [
@@ -55,27 +55,21 @@ class MechanismPlant:
         parameters: The plant.
         dt: Period over which commands are held [s], > 0.
         substeps: Integration steps in a period, >= 1.
-        compiled: Step with numba: three to ten times as fast after some seconds of compiling, equal to rounding.
 
     Raises:
         ParameterError: An argument is outside its domain, the integrator would be unstable, or actuators have different
             transport delays.
     """
 
-    def __init__(
-        self, parameters: MechanismParameters, dt: float, *, substeps: int = 1, compiled: bool = False
-    ) -> None:
+    def __init__(self, parameters: MechanismParameters, dt: float, *, substeps: int = 1) -> None:
         check_step(dt, substeps)
         check_stable_step(parameters, dt / substeps)
         self.parameters = parameters
         self.dt = dt
         self._p = parameters.packed
         self._table = pack_joints(parameters)
-        functions = (parameters.mechanism.forward, *joint_functions(len(parameters.joints)))
-        chosen: list[Any] = [compile_tree(function) if compiled else function for function in functions]
-        self._forward, self._along, self._put, self._lag = chosen
-        self._advance = compile_tree(advance_joints) if compiled else advance_joints
-        self._rk4 = compile_tree(rk4_joints) if compiled else rk4_joints
+        self._forward = parameters.mechanism.forward
+        self._along, self._put, self._lag = joint_functions(len(parameters.joints))
         self._plain = not _has_events(parameters)
         self._limits = parameters.effort_limits
         self._spread = parameters.coordinates.spread
@@ -158,13 +152,13 @@ class MechanismPlant:
             command = newer if is_newer else older
             if self._plain:
                 total = self._along(command, 1.0, push)
-                q, v = self._rk4(self._forward, self._along, q, v, total, total, total, h, self._p)
+                q, v = rk4_joints(self._forward, self._along, q, v, total, total, total, h, self._p)
                 torque = command
                 continue
-            q, v = self._advance(
+            q, v = advance_joints(
                 self._forward, self._along, self._put, self._lag, q, v, torque, command, push, h, self._p, self._table
             )
-            torque = self._lag(torque, command, h, self._table[5])
+            torque = self._lag(torque, command, h, self._table[LAG])
         self._position, self._velocity, self._effort = q, v, torque
         self._steps += 1
         return MechanismState(self._steps * self.dt, q, v, torque)

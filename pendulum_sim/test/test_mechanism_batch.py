@@ -58,6 +58,21 @@ def test_a_plant_of_a_batch_moves_as_it_does_alone(name: str, gain: list, amplit
     assert batch.max_effort.shape == (size, len(driven))
 
 
+def test_compiled_steps_are_those_of_python_at_large_efforts() -> None:
+    plant = load_mechanism("acrobot")
+    start, limit = (1.0, 0.5, 2.0, -1.0), plant.effort_limits[0]
+    batch = simulate_mechanisms(
+        plant, steps=200, position=start[:2], velocity=start[2:], seeds=3, amplitude=limit, hold=20, record=True
+    )
+    assert batch.trajectories is not None
+    single, key = MechanismPlant(plant, 2e-3), stream_key(3)
+    single.reset(start[:2], start[2:])
+    for k in range(200):
+        assert batch.trajectories[k, :2, 0] == pytest.approx(single.state.position, abs=1e-7)
+        single.step((limit * unit_interval(scramble(key, k // 20)),))
+    assert np.ptp(batch.trajectories[:, 3, 0]) > 10.0
+
+
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [

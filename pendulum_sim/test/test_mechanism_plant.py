@@ -167,18 +167,6 @@ def test_effort_is_clamped_delayed_and_lags() -> None:
     assert efforts[-1] == pytest.approx((0.0, expected))
 
 
-# Compiles for five seconds of a free core.
-@pytest.mark.timeout(300)
-def test_compiled_steps_are_those_of_python() -> None:
-    plants = [MechanismPlant(load_mechanism("acrobot"), 2e-3, compiled=compiled) for compiled in (False, True)]
-    for plant in plants:
-        plant.reset((1.0, 0.5), (2.0, -1.0))
-    limit = plants[0].parameters.effort_limits[0]
-    for k in range(200):
-        states = [plant.step((limit * math.sin(0.05 * k),)) for plant in plants]
-        assert states[1].position == pytest.approx(states[0].position, abs=1e-7)
-
-
 def test_starts_steps_and_efforts_that_no_plant_can_take_are_refused() -> None:
     plant = MechanismPlant(load_mechanism("cart_pole"), 2e-3)
     with pytest.raises(ParameterError, match=r"initial cart is 2.0 m; expected -1.8 to 1.8, between its stops"):
