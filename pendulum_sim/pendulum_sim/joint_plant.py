@@ -2,13 +2,19 @@
 
 from __future__ import annotations
 
+import math
 from typing import Protocol
+
+import numpy as np
 
 from pendulum_msgs_py.joints import ONE_JOINT, Coordinates, Vector
 from pendulum_sim.mechanism_plant import MechanismPlant, MechanismState
 from pendulum_sim.plant import Plant, PlantState
 
-__all__ = ["JointPlant", "OneJoint", "joint_plant"]
+__all__ = ["JointPlant", "OneJoint", "joint_plant", "random_start"]
+
+_SLIDE = 0.1
+"""Largest distance from the middle at which a joint that slides starts at random [m]."""
 
 
 class JointPlant(Protocol):
@@ -23,6 +29,10 @@ class JointPlant(Protocol):
     @property
     def coordinates(self) -> Coordinates:
         """Its joints, and which of them are driven."""
+
+    @property
+    def stops(self) -> tuple[tuple[float, float], ...]:
+        """Lowest and highest position of each joint, infinite where nothing stops it [rad or m]."""
 
     @property
     def effort_limits(self) -> Vector:
@@ -51,6 +61,7 @@ class OneJoint:
         self.dt = plant.dt
         self.name = plant.parameters.name
         self.coordinates = ONE_JOINT
+        self.stops = ((-math.inf, math.inf),)
         self.effort_limits = (plant.parameters.effort_limit,)
         self._step = plant.step
 
@@ -72,6 +83,16 @@ class OneJoint:
 def joint_plant(plant: Plant | MechanismPlant) -> JointPlant:
     """Return a plant of any number of joints as one that takes and gives tuples."""
     return plant if isinstance(plant, MechanismPlant) else OneJoint(plant)
+
+
+def random_start(plant: JointPlant, generator: np.random.Generator) -> tuple[Vector, Vector]:
+    """Return positions and velocities of a start: in a turn, or near the middle, between stops; at most 1 rad/s."""
+    joints = plant.coordinates.joints
+    position = []
+    for joint, (low, high) in zip(joints, plant.stops, strict=True):
+        reach = math.pi if joint.turns else _SLIDE
+        position.append(generator.uniform(min(max(-reach, low), high), max(min(reach, high), low)))
+    return tuple(position), tuple(generator.uniform(-1.0, 1.0) for _ in joints)
 
 
 def _as_tuples(state: PlantState) -> MechanismState:

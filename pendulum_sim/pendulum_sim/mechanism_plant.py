@@ -8,6 +8,7 @@ effort on the joints themselves.
 from __future__ import annotations
 
 import math
+from itertools import chain
 from typing import NamedTuple
 
 import numpy as np
@@ -90,6 +91,11 @@ class MechanismPlant:
     def coordinates(self) -> Coordinates:
         """Its joints, and which of them are driven."""
         return self.parameters.coordinates
+
+    @property
+    def stops(self) -> tuple[tuple[float, float], ...]:
+        """Lowest and highest position of each joint, infinite where nothing stops it [rad or m]."""
+        return self.parameters.stops
 
     @property
     def effort_limits(self) -> Vector:
@@ -202,9 +208,7 @@ def check_start_state(parameters: MechanismParameters, position: Vector) -> Vect
             f"initial position is {list(values)}; expected {len(joints)} finite numbers, for "
             f"{', '.join(f'{joint.name} [{joint.unit}]' for joint in joints)}"
         )
-    for joint, own, value in zip(joints, parameters.joints, values, strict=True):
-        low = -math.inf if own.lower_stop is None else own.lower_stop
-        high = math.inf if own.upper_stop is None else own.upper_stop
+    for joint, (low, high), value in zip(joints, parameters.stops, values, strict=True):
         if not low <= value <= high:
             raise ParameterError(
                 f"initial {joint.name} is {value} {joint.unit}; expected {low} to {high}, between its stops"
@@ -241,9 +245,5 @@ def check_decay(rate: float, h: float, whose: str) -> None:
 
 
 def _has_events(parameters: MechanismParameters) -> bool:
-    return parameters.has_dry_friction or any(
-        joint.lower_stop is not None
-        or joint.upper_stop is not None
-        or (joint.actuator is not None and joint.actuator.time_constant > 0.0)
-        for joint in parameters.joints
-    )
+    lagging = any(actuator.time_constant > 0.0 for actuator in parameters.actuators)
+    return parameters.has_dry_friction or lagging or any(map(math.isfinite, chain(*parameters.stops)))

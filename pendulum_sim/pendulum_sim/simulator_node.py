@@ -33,7 +33,7 @@ from pendulum_msgs_py.ros.polled import PollingNode
 from pendulum_msgs_py.ros.runner import run_node
 from pendulum_sim.engines import OWN, Engine
 from pendulum_sim.guarded_plant import PaceWatch, StallWatch
-from pendulum_sim.joint_plant import joint_plant
+from pendulum_sim.joint_plant import joint_plant, random_start
 from pendulum_sim.sensors import SENSOR_SPECS, Sensors
 from pendulum_sim.servo import PositionServo
 
@@ -41,8 +41,6 @@ __all__ = ["SPECS", "SimulatorNode", "main", "run_engine"]
 
 _SENSOR_PREFIX = "sensor."
 _ONE_FOR_ALL = [0.0]
-_SLIDE = 0.1
-"""Largest distance from the middle at which a joint that slides starts at random [m]."""
 _LEAST_PERIODS = 2.0
 """Age in periods that a command may reach at least."""
 
@@ -249,11 +247,7 @@ class SimulatorNode(PollingNode):
         if start == "top":
             return coordinates.goal, still
         if start == "random":
-            position = tuple(
-                float(self._starts.uniform(-math.pi, math.pi) if joint.turns else self._starts.uniform(-_SLIDE, _SLIDE))
-                for joint in coordinates.joints
-            )
-            return position, tuple(float(self._starts.uniform(-1.0, 1.0)) for _ in coordinates.joints)
+            return random_start(self._plant, self._starts)
         if len(still) == 1:
             return (values["initial_theta"],), (values["initial_theta_dot"],)
         return self._given("initial_position", values), self._given("initial_velocity", values)

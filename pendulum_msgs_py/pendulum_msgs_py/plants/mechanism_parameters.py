@@ -137,6 +137,17 @@ class MechanismParameters:
         return tuple(actuator.effort_limit for actuator in self.actuators)
 
     @property
+    def stops(self) -> tuple[tuple[float, float], ...]:
+        """Lowest and highest position of each joint, infinite where nothing stops it [rad or m]."""
+        return tuple(
+            (
+                -math.inf if joint.lower_stop is None else joint.lower_stop,
+                math.inf if joint.upper_stop is None else joint.upper_stop,
+            )
+            for joint in self.joints
+        )
+
+    @property
     def has_dry_friction(self) -> bool:
         """Whether any joint has dry friction."""
         return any(joint.breakaway > 0.0 for joint in self.joints)
