@@ -17,7 +17,6 @@ import gymnasium
 import numpy as np
 from numpy.typing import NDArray
 
-from pendulum_msgs_py.contract import noise
 from pendulum_msgs_py.dynamics.arithmetic import in_arithmetic
 from pendulum_msgs_py.dynamics.runge_kutta import along_functions, rk4_joints
 from pendulum_msgs_py.errors import ParameterError
@@ -101,11 +100,7 @@ class MechanismEnv(gymnasium.Env[Array, Array]):
         super().reset(seed=seed)
         known = options or {}
         check_reset_options(known)
-        if known.get("state") is not None:
-            position, velocity = self._task.given(known["state"])
-        else:
-            position, velocity = self._task.draw(known.get("start", self._task.start), self.np_random)
-        self._key = noise.stream_key(int(self.np_random.integers(2**63)))
+        position, velocity, self._key = self._task.begin(known, self.np_random)
         self._steps = 0
         self._plant.reset(tuple(position.tolist()), tuple(velocity.tolist()))
         return self._observe(), {}
@@ -269,13 +264,8 @@ class MechanismVectorEnv(PlantVectorEnv):
         self._position, self._velocity = np.stack(q, axis=1), np.stack(v, axis=1)
 
     def _restart(self, index: int, options: dict[str, Any]) -> None:
-        task = self._task
         generator = self.np_random if self._generators is None else self._generators[index]
-        if options.get("state") is not None:
-            position, velocity = task.given(options["state"])
-        else:
-            position, velocity = task.draw(options.get("start", task.start), generator)
-        self._keys[index] = noise.stream_key(int(generator.integers(2**63)))
+        position, velocity, self._keys[index] = self._task.begin(options, generator)
         self._counts[index] = 0
         self._position[index], self._velocity[index] = position, velocity
         if self._plants:

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from typing import Any
 
 import numpy as np
 from gymnasium import spaces
@@ -74,7 +75,21 @@ class MechanismTask:
         cost: Array = (x * x) @ self.q + self.r * (effort * effort).sum(axis=-1)
         return -self.dt * cost
 
-    def draw(self, start: object, generator: np.random.Generator) -> tuple[Array, Array]:
+    def begin(self, options: Mapping[str, Any], generator: np.random.Generator) -> tuple[Array, Array, int]:
+        """Return positions, velocities and the key of the noise of an episode.
+
+        Args:
+            options: ``state``, the start in the observation's convention, or ``start``, one of ``STARTS``.
+            generator: Of starts and noise.
+        """
+        state = options.get("state")
+        if state is None:
+            position, velocity = self._draw(options.get("start", self.start), generator)
+        else:
+            position, velocity = self._given(state)
+        return position, velocity, noise.stream_key(int(generator.integers(2**63)))
+
+    def _draw(self, start: object, generator: np.random.Generator) -> tuple[Array, Array]:
         """Return positions and velocities of a start: hanging, upright, or anywhere with up to 1 rad/s or m/s."""
         check_start_name(start)
         position, velocity = (self.goal.copy() if start == "top" else np.zeros(self.joints)), np.zeros(self.joints)
@@ -95,7 +110,7 @@ class MechanismTask:
             velocity = generator.uniform(-1.0, 1.0, self.joints)
         return position, velocity
 
-    def given(self, state: object) -> tuple[Array, Array]:
+    def _given(self, state: object) -> tuple[Array, Array]:
         """Return positions and velocities of a state in the observation's convention."""
         x = np.asarray(state, dtype=np.float64)
         if x.shape != (2 * self.joints,) or not np.isfinite(x).all():
