@@ -8,7 +8,8 @@ from pathlib import Path
 
 import pytest
 
-from tests.benchmarks import Row, measured, peer, run
+from tests.benchmarks import Peer, Row, measured, peer, run
+from tests.benchmarks.limit_loop import build_limit
 
 
 def test_a_ratio_above_one_always_means_that_we_are_better() -> None:
@@ -16,6 +17,20 @@ def test_a_ratio_above_one_always_means_that_we_are_better() -> None:
     assert (faster.ratio, faster.holds, faster.target) == (4.0, True, ">= 4 x them")
     shorter = measured("time", 2.0, "s", peer=peer("them", lambda: 8.0), at_most=1.0)
     assert (shorter.ratio, shorter.holds, shorter.target) == (4.0, False, "<= 1 s")
+
+
+def test_a_limit_is_a_peer_that_ours_may_cost_so_much_more_than() -> None:
+    limit = peer("the limit", lambda: 10.0)
+    row = measured("cost", 12.5, "%", peer=limit, at_most_times_peer=1.2)
+    assert (row.ratio, row.holds, row.target) == (0.8, False, "<= 1.2 x the limit")
+    assert measured("cost", 11.5, "%", peer=limit, at_most_times_peer=1.2).holds is True
+    assert measured("cost", 11.5, "%", peer=Peer("the limit", None), at_most_times_peer=1.2).holds is None
+
+
+def test_the_loop_in_c_says_why_it_is_not_there(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("PATH", str(tmp_path))
+    with pytest.raises(FileNotFoundError, match="no C compiler is installed"):
+        build_limit(tmp_path)
 
 
 def test_a_missing_peer_is_reported_and_leaves_the_verdict_open() -> None:

@@ -92,6 +92,7 @@ def measured(
     at_least: float | None = None,
     at_most: float | None = None,
     at_least_times_peer: float | None = None,
+    at_most_times_peer: float | None = None,
     less_is_better: bool | None = None,
     note: str = "",
 ) -> Row:
@@ -105,10 +106,11 @@ def measured(
         at_least: Smallest figure that is good enough.
         at_most: Largest figure that is good enough.
         at_least_times_peer: How many times better than the peer we must be.
-        less_is_better: True for times and errors; by default when ``at_most`` is given.
+        at_most_times_peer: What is good enough of a time or a cost, in the peer's: for a peer that is a limit.
+        less_is_better: True for times and errors; by default when an ``at_most`` is given.
         note: Anything that a reader must know.
     """
-    less = at_most is not None if less_is_better is None else less_is_better
+    less = (at_most is not None or at_most_times_peer is not None) if less_is_better is None else less_is_better
     theirs = peer.value if peer else None
     ratio = None
     if theirs is not None and theirs > 0.0 and ours > 0.0:
@@ -124,6 +126,9 @@ def measured(
     if at_least_times_peer is not None:
         targets.append(f">= {at_least_times_peer:g} x {peer.name if peer else 'peer'}")
         verdicts.append(None if ratio is None else ratio >= at_least_times_peer)
+    if at_most_times_peer is not None:
+        targets.append(f"<= {at_most_times_peer:g} x {peer.name if peer else 'peer'}")
+        verdicts.append(None if theirs is None else ours <= at_most_times_peer * theirs)
     if not math.isfinite(ours) or False in verdicts:
         holds: bool | None = False
     else:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import math
 import os
 import statistics
@@ -10,21 +11,29 @@ import time
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
+import numpy as np
 import psutil
 
 from pendulum_bags.experiments.domain import reserve_domain
 from pendulum_msgs_py.programs import graph
 from pendulum_msgs_py.programs.graph import NodeProgram
+from tests.benchmarks.limit_loop import build_limit
 from tests.benchmarks.plant_listener import PlantListener, cpu_time, domain_environment
 from tests.processes import ProcessGroup, RunningProgram
 
-__all__ = ["LoopFigures", "lockstep_speed", "peer_cpu", "realtime_figures"]
+__all__ = [
+    "LimitFigures", "LoopFigures", "limit_figures", "limit_lockstep_speed", "lockstep_speed", "peer_cpu",
+    "realtime_figures",
+]  # fmt: skip
 
 _ROOT = Path(__file__).parents[2]
 _WARM_UP = 6.0
 _DIAGNOSTICS_PERIOD = 0.5
 _SIMULATOR = "/sim/simulator"
+_WINDOW = 4096
+"""Round trips that the simulator's percentiles are of; the limit's are of as many."""
 
 
 @dataclass(frozen=True)
@@ -46,6 +55,102 @@ class LoopFigures:
     cpu: float
     memory: float
     growth: float
+
+
+@dataclass(frozen=True)
+class LimitFigures:
+    """What the same loop in C showed.
+
+    Attributes:
+        p50: Median of the round trip from state to answer [us].
+        p99: 99th percentile [us].
+        missed: Share of deadlines missed by a period or more [%].
+        unanswered: Share of states without an answer within nine tenths of a period [%].
+        cpu: CPU of both processes together [% of a core].
+    """
+
+    p50: float
+    p99: float
+    missed: float
+    unanswered: float
+    cpu: float
+
+
+def limit_figures(duration: float, *, rate: float = 1000.0, cores: Sequence[int] | None = None) -> LimitFigures:
+    """Run a plant and a controller in C on ``rcl`` and return what they cost.
+
+    Args:
+        duration: Length of the measurement [s].
+        rate: States per second [Hz].
+        cores: Cores that both are pinned to; None leaves them to the scheduler.
+
+    Raises:
+        FileNotFoundError: They cannot be compiled here.
+    """
+    states = round((duration + _WARM_UP) * rate)
+    with tempfile.TemporaryDirectory() as folder, reserve_domain(None) as domain:
+        group = ProcessGroup(Path(folder), _ROOT)
+        try:
+            programs = _start_limit(group, domain, build_limit(Path(folder)), rate, states, 1)
+            time.sleep(_WARM_UP)
+            processes = [psutil.Process(program.pid) for program in programs]
+            if cores is not None:
+                for process in processes:
+                    _pin(process, cores)
+            busy, wall = cpu_time(processes), time.monotonic()
+            # Less than the plant has left, which began a little later.
+            time.sleep(duration - 2.0)
+            cpu = 100.0 * (cpu_time(processes) - busy) / (time.monotonic() - wall)
+            told = _told_by_limit(programs[0])
+            trips = np.array(told["round_trips_ns"][round(_WARM_UP * rate) :]) / 1e3
+            windows = [window[window > 0.0] for window in np.array_split(trips, max(1, len(trips) // _WINDOW))]
+            return LimitFigures(
+                p50=statistics.median(float(np.percentile(window, 50)) for window in windows),
+                p99=statistics.median(float(np.percentile(window, 99)) for window in windows),
+                missed=100.0 * told["missed"] / states,
+                unanswered=100.0 * float((trips == 0.0).mean()),
+                cpu=cpu,
+            )
+        finally:
+            group.close()
+
+
+def limit_lockstep_speed(states: int = 20_000, *, rate: float = 500.0) -> float:
+    """Return simulated time per wall time of a plant and two answerers in C, in lockstep [-].
+
+    Args:
+        states: How many states to publish.
+        rate: States per simulated second [Hz].
+
+    Raises:
+        FileNotFoundError: They cannot be compiled here.
+    """
+    with tempfile.TemporaryDirectory() as folder, reserve_domain(None) as domain:
+        group = ProcessGroup(Path(folder), _ROOT)
+        try:
+            programs = _start_limit(group, domain, build_limit(Path(folder)), 0.0, states, 2)
+            trips = np.array(_told_by_limit(programs[0])["round_trips_ns"][states // 10 :]) / 1e9
+            return float((trips > 0.0).sum() / rate / trips.sum())
+        finally:
+            group.close()
+
+
+def _start_limit(
+    group: ProcessGroup, domain: int, library: Path, rate: float, states: int, answerers: int
+) -> list[RunningProgram]:
+    """Start plant and answerers; return them once the plant is about to run, the plant first."""
+    roles = [("plant", str(rate), str(states), str(answerers))]
+    roles += [("answerer", str(index), "", "") for index in range(answerers)]
+    module, environment = "tests.benchmarks.limit_loop", domain_environment(domain)
+    programs = [group.start(module, str(library), *role, env=environment) for role in roles]
+    programs[0].wait_for_output("running", 30.0)
+    return programs
+
+
+def _told_by_limit(plant: RunningProgram) -> dict[str, Any]:
+    found = plant.wait_for_output(r"^\{.*\}$", 120.0)
+    told: dict[str, Any] = json.loads(found.group(0))
+    return told
 
 
 def realtime_figures(duration: float, *, rate: float = 1000.0, cores: Sequence[int] | None = None) -> LoopFigures:
