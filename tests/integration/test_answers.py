@@ -13,6 +13,7 @@ from rclpy.experimental import EventsExecutor
 from rclpy.task import Future
 from std_srvs.srv import Trigger
 
+from pendulum_msgs_py.ros import arrivals
 from pendulum_msgs_py.ros.answers import answer_who_listens
 from pendulum_msgs_py.ros.polled import PollingNode
 from tests.graph_peer import GraphPeer
@@ -89,7 +90,12 @@ def test_a_client_that_went_is_waited_for_once_where_another_is_there(server: Gr
         peer.close()
 
 
-def test_requests_without_pause_are_answered_at_a_bounded_rate_and_every_service_has_its_turn(domain_id: int) -> None:
+@pytest.mark.parametrize("told", [True, False], ids=["told by the middleware", "looked for"])
+def test_requests_without_pause_are_answered_at_a_bounded_rate_and_every_service_has_its_turn(
+    domain_id: int, told: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    if not told:
+        monkeypatch.setattr(arrivals, "_count", lambda *_: False)
     peer = GraphPeer("asker", domain=domain_id)
     node = PollingNode("plant", context=peer.context)
     answered: list[str] = []
@@ -110,6 +116,7 @@ def test_requests_without_pause_are_answered_at_a_bounded_rate_and_every_service
     peer.executor.add_node(node)
     answer_who_listens(node)
     node.poll_services()
+    assert node.told_of_requests is told
     try:
         assert list(node.services) == [], "an executor is woken for requests"
         flood, client = (peer.node.create_client(Trigger, f"/plant/{name}") for name in ("busy", "other"))

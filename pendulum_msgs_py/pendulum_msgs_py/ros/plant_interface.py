@@ -126,6 +126,7 @@ class PlantInterface:
                     JointState, kind.value, receive, qos.COMMAND_INPUT, raw=True
                 )
         self._trajectories = node.create_polled_input(JointTrajectory, names.JOINT_TRAJECTORY, qos.TRAJECTORY)
+        self._trajectories.watch()
         self._next_trajectory = 0.0
         create_wall_timer(node, _LOOK, self._on_look)
         node.create_service(SetBool, names.ARM, self._on_arm)
@@ -210,6 +211,7 @@ class PlantInterface:
             "refused_commander": supervisor.gates[Input.EFFORT_COMMAND].refused_commander,
             "starved_periods": supervisor.starved_periods,
             "saturated_periods": supervisor.saturated_periods,
+            "requests": "told by the middleware" if self.node.told_of_requests else "looked for",
         }
         for kind in self._inputs:
             gate = supervisor.gates[kind]
@@ -252,7 +254,7 @@ class PlantInterface:
 
     def _look_for_trajectory(self) -> None:
         """Take the newest trajectory, and leave others the time: reading one holds Python's lock, and many may come."""
-        if time.monotonic() < self._next_trajectory:
+        if time.monotonic() < self._next_trajectory or not self._trajectories.came():
             return
         began = time.thread_time()
         self._trajectories.take(self._on_trajectory)

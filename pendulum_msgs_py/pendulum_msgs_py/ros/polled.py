@@ -17,6 +17,7 @@ from rclpy.qos import QoSProfile
 from rclpy.service import Service
 from rclpy.subscription import Subscription
 
+from pendulum_msgs_py.ros.arrivals import ArrivalSignal
 from pendulum_msgs_py.ros.timers import create_wall_timer
 
 __all__ = ["REST_AFTER_READING", "PolledInput", "PollingNode"]
@@ -44,6 +45,15 @@ class PolledInput:
         self._take = subscription.handle.take_message
         self._type = subscription.msg_type
         self._looks = range(depth)
+        self._signal: ArrivalSignal | None = None
+
+    def watch(self) -> None:
+        """Have the middleware say when something comes, for an owner who looks often at what seldom comes."""
+        self._signal = ArrivalSignal([self.subscription])
+
+    def came(self) -> bool:
+        """Return whether anything may have come since this was asked last; always, where nobody watches."""
+        return self._signal is None or self._signal.came()
 
     def take(self, receive: Callable[[bytes, int], object]) -> None:
         """Hand over what has come since the last look, to the thread that owns the node.
@@ -73,6 +83,8 @@ class PollingNode(Node):
     _polled: frozenset[Subscription] = frozenset()
     _served_in_turn: frozenset[Service] = frozenset()
     _in_turn: deque[Service]
+    _requests: ArrivalSignal | None = None
+    _more_requests = False
     _next_look = 0.0
 
     @property
@@ -85,15 +97,23 @@ class PollingNode(Node):
         """The services that an executor attends to."""
         return (each for each in super().services if each not in self._served_in_turn)
 
+    @property
+    def told_of_requests(self) -> bool:
+        """Whether the middleware says when a request has come; otherwise each service is looked at every 10 ms."""
+        return self._requests is not None and self._requests.works
+
     def poll_services(self) -> None:
         """Attend to the services that there are at a bounded rate from now on, one request after the other."""
         self._in_turn = deque(self.services)
         self._served_in_turn = frozenset(self._in_turn)
+        self._requests = ArrivalSignal(self._in_turn)
         create_wall_timer(self, _LOOK_FOR_REQUESTS, self._look_for_requests)
 
     def _look_for_requests(self) -> None:
         """Answer what waits, or as much of it as a look may take; DDS keeps the ten newest requests of a client."""
         if time.monotonic() < self._next_look:
+            return
+        if self._requests is not None and not (self._requests.came() or self._more_requests):
             return
         began, spent, silent = time.thread_time(), 0.0, 0
         while silent < len(self._in_turn) and spent <= _LONGEST_LOOK:
@@ -102,6 +122,7 @@ class PollingNode(Node):
             self._in_turn.rotate(-1)
             silent = 0 if _answer_one(service) else silent + 1
             spent = time.thread_time() - began
+        self._more_requests = silent < len(self._in_turn)
         if spent > _LONGEST_LOOK:
             self._next_look = time.monotonic() + min(_LONGEST_REST, REST_AFTER_READING * spent)
 
