@@ -73,11 +73,8 @@ class PlantSupervisor:
         self._no_push = (0.0,) * len(joints)
         # A passive joint takes a push of the size that the strongest motor could give.
         largest = max(self.limits.effort, default=1.0)
-        self._push_limits = tuple(
-            PUSH_LIMIT_FACTOR * (self.limits.effort[self.coordinates.driven.index(i)] if i in self.coordinates.driven
-                                 else largest)
-            for i in range(len(joints))
-        )  # fmt: skip
+        own = dict(zip(driven, self.limits.effort, strict=True))
+        self._push_limits = tuple(PUSH_LIMIT_FACTOR * own.get(name, largest) for name in joints)
         # By name as well: enum hashes its members in Python, which a lookup would pay for at each decision.
         self._commands = self.gates[Input.EFFORT_COMMAND]
         self._disturbances = self.gates[Input.DISTURBANCE]
