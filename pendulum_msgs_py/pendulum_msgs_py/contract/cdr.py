@@ -153,8 +153,15 @@ def decode_joint_state(data: bytes) -> JointStateFields | None:
                 return JointStateFields(
                     values[1] * NANOSECONDS + values[2], known.frame_id, known.joints, (), (), values[first + 3 :]
                 )
-    if size < 24 or data[0:2] != _PLAIN_CDR:
-        return None
+    fields = _decode_unknown(data) if size >= 24 and data[0:2] == _PLAIN_CDR else None
+    if fields is not None:
+        _remember_layout(fields, size)
+    return fields
+
+
+def _decode_unknown(data: bytes) -> JointStateFields | None:
+    """Return the fields of a message whose layout is not known yet, believing none of its lengths."""
+    size = len(data)
     try:
         sec, nanosec, frame_length = _PREFIX.unpack_from(data)
         # Offsets below count from the start of ``data``; CDR aligns relative to byte 4, and 4 is a multiple of 4.
@@ -162,33 +169,19 @@ def decode_joint_state(data: bytes) -> JointStateFields | None:
         offset = (frame_end + 3) & ~3
         if frame_length == 0 or offset + 8 > size or data[frame_end - 1] != 0:
             return None
-        (joints,) = _COUNT.unpack_from(data, offset)
-        offset += 4
-        if not 0 < joints <= _MOST_JOINTS:
+        names, offset = _decode_names(data, offset)
+        if not names:
             return None
-        names: list[str] = []
-        for _ in range(joints):
-            offset = (offset + 3) & ~3
-            (name_length,) = _COUNT.unpack_from(data, offset)
-            offset += 4
-            name_end = offset + name_length
-            if name_length == 0 or name_end > size or data[name_end - 1] != 0:
-                return None
-            names.append(data[offset : name_end - 1].decode())
-            offset = name_end
-        offset = (offset + 3) & ~3
         quantities: list[Vector] = []
         for _ in range(3):
             (count,) = _COUNT.unpack_from(data, offset)
             offset += 4
-            if count == 0:
-                quantities.append(())
-            elif count == joints:
-                offset += (4 - offset) & 7
-                quantities.append(struct.unpack_from(f"<{joints}d", data, offset))
-                offset += 8 * joints
-            else:
+            if count not in {0, len(names)}:
                 return None
+            if count:
+                offset += (4 - offset) & 7
+            quantities.append(struct.unpack_from(f"<{count}d", data, offset))
+            offset += 8 * count
         # rclpy reserves room for the alignment of each sequence, empty ones too, and leaves it at the end.
         if size - offset > _MAX_TRAILING or nanosec >= NANOSECONDS:
             return None
@@ -197,9 +190,22 @@ def decode_joint_state(data: bytes) -> JointStateFields | None:
         return None
     if "\0" in frame_id or any("\0" in name for name in names):
         return None
-    fields = JointStateFields(sec * NANOSECONDS + nanosec, frame_id, tuple(names), *quantities)
-    _remember_layout(fields, size)
-    return fields
+    return JointStateFields(sec * NANOSECONDS + nanosec, frame_id, names, *quantities)
+
+
+def _decode_names(data: bytes, offset: int) -> tuple[tuple[str, ...], int]:
+    """Return the names that begin at an offset, none where they are no names, and where they end."""
+    (count,) = _COUNT.unpack_from(data, offset)
+    offset += 4
+    names = []
+    for _ in range(count if count <= _MOST_JOINTS else 0):
+        offset = (offset + 3) & ~3
+        (length,) = _COUNT.unpack_from(data, offset)
+        begin, offset = offset + 4, offset + 4 + length
+        if length == 0 or offset > len(data) or data[offset - 1] != 0:
+            return (), offset
+        names.append(data[begin : offset - 1].decode())
+    return tuple(names), (offset + 3) & ~3
 
 
 class _KnownLayout(NamedTuple):
