@@ -17,8 +17,9 @@ from functools import cache
 from types import SimpleNamespace
 from typing import Any
 
-from pendulum_hw_bridge.actuator import ActuatorError, Command, Feedback, MStopAction, Strategy
+from pendulum_hw_bridge.actuator import ActuatorError, Command, Feedback, Strategy
 from pendulum_hw_bridge.backends.emulator_process import EmulatorProcessBackend
+from pendulum_hw_bridge.backends.hebi_settings import LIMIT_DISABLED, LIMIT_MOTOR_OFF, M_STOPS
 from pendulum_hw_bridge.emulation import wire
 from pendulum_hw_bridge.gains import GAIN_FIELDS, LOOPS
 from pendulum_msgs_py.contract.values import NANOSECONDS
@@ -27,9 +28,6 @@ from pendulum_msgs_py.plants.lab_file import EMULATED_NETWORK
 __all__ = ["EmulatedEntry", "EmulatedGroup", "EmulatedLookup"]
 
 _LOOK_ATTEMPTS = 2
-_MOTOR_OFF, _DISABLED = 2, 3
-_M_STOP = (MStopAction.DISABLED, MStopAction.MOTOR_OFF, MStopAction.HOLD_POSITION)
-"""M-stop actions by hebi-py's number."""
 _THEIRS = {
     "winding_current": "motor_winding_current",
     "winding_temperature": "motor_winding_temperature",
@@ -249,10 +247,10 @@ class EmulatedGroup:
                 # What is no number changes nothing here; what a real module makes of it, nobody says.
                 limits |= {} if math.isnan(value) else {f"position_{end}": value}
             strategy = f"{end}_position_limit_strategy"
-            if _holds(command, strategy, self._hebi) and int(getattr(command, strategy)[0]) == _DISABLED:
+            if _holds(command, strategy, self._hebi) and int(getattr(command, strategy)[0]) == LIMIT_DISABLED:
                 limits[f"position_{end}"] = -math.inf if end == "min" else math.inf
         if _holds(command, "mstop_strategy", self._hebi):
-            limits["m_stop"] = _M_STOP[int(command.mstop_strategy[0])].value
+            limits["m_stop"] = M_STOPS[int(command.mstop_strategy[0])].value
         return limits
 
 
@@ -274,9 +272,10 @@ class _Info:
         settings.effort_limit_min, settings.effort_limit_max = -limits.effort, limits.effort
         settings.velocity_limit_min, settings.velocity_limit_max = -limits.velocity, limits.velocity
         settings.position_limit_min, settings.position_limit_max = limits.position_min, limits.position_max
-        settings.mstop_strategy = _M_STOP.index(limits.m_stop)
+        settings.mstop_strategy = M_STOPS.index(limits.m_stop)
         for end, angle in (("min", limits.position_min), ("max", limits.position_max)):
-            setattr(settings, f"{end}_position_limit_strategy", _MOTOR_OFF if math.isfinite(angle) else _DISABLED)
+            strategy = LIMIT_MOTOR_OFF if math.isfinite(angle) else LIMIT_DISABLED
+            setattr(settings, f"{end}_position_limit_strategy", strategy)
 
     def __getattr__(self, name: str) -> Any:
         return getattr(self._settings, name)

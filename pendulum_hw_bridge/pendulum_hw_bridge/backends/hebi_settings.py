@@ -11,16 +11,18 @@ from typing import Any
 from pendulum_hw_bridge.actuator import ActuatorError, HardwareLimits, MStopAction
 from pendulum_hw_bridge.gains import GAIN_FIELDS, LOOPS, GainSet, PidGains
 
-__all__ = ["fill_gains", "fill_limits", "gains_of", "limits_of"]
+__all__ = ["LIMIT_DISABLED", "LIMIT_MOTOR_OFF", "M_STOPS", "fill_gains", "fill_limits", "gains_of", "limits_of"]
 
 _PASCAL_M_STOP = {
     MStopAction.DISABLED: "Disabled",
     MStopAction.MOTOR_OFF: "MotorOff",
     MStopAction.HOLD_POSITION: "HoldPosition",
 }
-_LIMIT_MOTOR_OFF = (2, "motor off")
-_LIMIT_DISABLED = (3, "disabled")
-_M_STOP_BY_NUMBER = {0: MStopAction.DISABLED, 1: MStopAction.MOTOR_OFF, 2: MStopAction.HOLD_POSITION}
+LIMIT_MOTOR_OFF, LIMIT_DISABLED = 2, 3
+"""What a module does at an end of its position window, by hebi-py's numbers."""
+_STRATEGIES = {LIMIT_MOTOR_OFF: "motor off", LIMIT_DISABLED: "disabled"}
+M_STOPS = (MStopAction.DISABLED, MStopAction.MOTOR_OFF, MStopAction.HOLD_POSITION)
+"""Actions of the motion stop, in the order of hebi-py's numbers."""
 
 
 def fill_gains(command: Any, gains: GainSet) -> None:
@@ -72,11 +74,13 @@ def limits_of(info: Any, wanted: HardwareLimits) -> HardwareLimits:
     """
     ends = _window(wanted)
     for end, angle in ends.items():
-        number, name = _LIMIT_MOTOR_OFF if math.isfinite(angle) else _LIMIT_DISABLED
+        number = LIMIT_MOTOR_OFF if math.isfinite(angle) else LIMIT_DISABLED
         strategy = int(getattr(info, f"{end}_position_limit_strategy")[0])
         if strategy != number:
             raise ActuatorError(
-                "settings", f"strategy at the {end} position limit reads back as {strategy}; expected {number} ({name})"
+                "settings",
+                f"strategy at the {end} position limit reads back as {strategy}; expected {number} "
+                f"({_STRATEGIES[number]})",
             )
         if math.isfinite(angle):
             ends[end] = float(getattr(info, f"position_limit_{end}")[0])
@@ -86,7 +90,7 @@ def limits_of(info: Any, wanted: HardwareLimits) -> HardwareLimits:
         position_min=ends["min"],
         position_max=ends["max"],
         pwm=wanted.pwm,
-        m_stop=_M_STOP_BY_NUMBER.get(int(info.mstop_strategy[0]), MStopAction.DISABLED),
+        m_stop=dict(enumerate(M_STOPS)).get(int(info.mstop_strategy[0]), MStopAction.DISABLED),
     )
 
 
