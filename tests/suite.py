@@ -1,4 +1,4 @@
-"""``make test``: what keeps a plant's time, and beside it, with the time that this leaves, what computes.
+"""``make test``: what keeps a plant's time, in two rows, and with what this leaves of the cores all that computes.
 
 Tests of one file stay together, so that what a file prepares is prepared once. Named files or folders run as pytest is
 told.
@@ -24,25 +24,32 @@ import pytest
 from tests.fixtures import PROJECT
 from tests.suite_events import PIPE
 
-__all__ = ["Part", "exit_code", "halves", "main", "run_parts"]
+__all__ = ["Part", "exit_code", "main", "rooms", "run_parts"]
 
-_KEEPS_TIME = (
-    "tests/acceptance/test_experiment.py",
+_EXPERIMENTS = (
     "tests/integration/test_experiments.py",
+    "tests/integration/test_plants_on_the_graph.py",
+    "tests/faults/test_live_faults.py",
+    "tests/acceptance/test_experiment.py",
+    "tests/integration/test_several_joints.py",
+    "tests/integration/test_course.py",
+    "tests/integration/test_frequency_experiment.py",
+    "tests/faults/test_security_policy.py",
+)
+"""Whole systems in real time, longest first: of these one at a time, for each asks for about one core."""
+_WAITS = (
     "tests/acceptance/test_console.py",
     "tests/integration/test_plant_interface.py",
     "tests/acceptance/test_first_day.py",
-    "tests/integration",
-    "tests/faults/test_bridge_faults.py",
-    "tests/faults/test_disk_faults.py",
-    "tests/faults/test_live_faults.py",
-    "tests/faults/test_network_faults.py",
-    "tests/faults/test_security_policy.py",
-    "tests/faults/test_system_faults.py",
     "pendulum_lqr/test/test_lqr_nodes.py",
     "pendulum_lqr/test/test_running_plant.py",
+    "tests/faults/test_bridge_faults.py",
+    "tests/faults/test_disk_faults.py",
+    "tests/faults/test_network_faults.py",
+    "tests/faults/test_system_faults.py",
+    "tests/integration",
 )
-"""Tests with processes that run in real time, longest first."""
+"""Other tests with processes that keep a plant's time, longest first: they wait for most of it."""
 _COMPUTES = (
     "tests/acceptance/test_readme.py",
     "tests/acceptance/test_docs.py",
@@ -54,8 +61,6 @@ _COMPUTES = (
 )
 """What comes first of all others, longest first too: a long file at the end would leave a core idle."""
 _NOTHING_SELECTED = int(pytest.ExitCode.NO_TESTS_COLLECTED)
-_AT_A_TIME = 1
-"""Files of tests in real time that run at once: one waits mostly while the other works."""
 _NICE = 5
 """Priority of what computes: real time goes before it, and beside a busy machine it still gets a quarter of a core."""
 _TELLS_EVERY = 20.0
@@ -79,19 +84,22 @@ def main(arguments: Sequence[str]) -> int:
         os.environ.pop(name, None)
     if any((PROJECT / argument.split("::")[0]).exists() for argument in arguments):
         return subprocess.run([sys.executable, "-m", "pytest", *arguments], cwd=PROJECT, check=False).returncode
-    in_time, others = halves()
+    experiments, waits, others = rooms()
     parts = [
-        Part("in real time", [*in_time, *arguments], workers=_AT_A_TIME),
+        Part("experiments", [*experiments, *arguments], workers=1),
+        Part("in real time", [*waits, *arguments], workers=1),
         Part("computing", [*others, *arguments], workers=2, nice=_NICE),
     ]
     return run_parts(parts)
 
 
-def halves() -> tuple[list[str], list[str]]:
-    """Return the files of tests that keep a plant's time, and all others, in the order to start them in."""
-    in_time = _files(_KEEPS_TIME)
+def rooms() -> tuple[list[str], list[str], list[str]]:
+    """Return the files of each part in the order to start them in: experiments, others in real time, what computes."""
+    experiments = _files(_EXPERIMENTS)
+    waits = [name for name in _files(_WAITS) if name not in experiments]
     packages = sorted(str(path) for top in ("", "bags/") for path in PROJECT.glob(f"{top}pendulum_*/test"))
-    return in_time, [name for name in _files((*_COMPUTES, *packages)) if name not in in_time]
+    others = [name for name in _files((*_COMPUTES, *packages)) if name not in {*experiments, *waits}]
+    return experiments, waits, others
 
 
 class Part:

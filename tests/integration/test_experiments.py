@@ -112,7 +112,7 @@ def test_lockstep_runs_of_the_simulator_are_identical_and_give_the_numbers_of_on
 @pytest.mark.timeout(240)
 def test_the_two_experiments_of_the_thesis_give_back_its_coefficients(tmp_path: Path) -> None:
     run_experiment("inertia_damping", "--out", tmp_path / "hand", "--trials", 3)
-    run_experiment("gravity", "--out", tmp_path / "stairs", "--trials", 1, "--step", 30, "--hold", 1)
+    run_experiment("gravity", "--out", tmp_path / "stairs", "--trials", 1, "--step", 20, "--top", 60, "--hold", 1)
 
     hand = json.loads((tmp_path / "hand" / "identified.json").read_text())["intervals"]
     stairs = json.loads((tmp_path / "stairs" / "identified.json").read_text())["intervals"]
