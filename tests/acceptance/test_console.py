@@ -163,11 +163,13 @@ def test_axe_finds_nothing_that_keeps_anybody_out(browser: Any, address: str) ->
     page.wait_for_timeout(1000)
     problems = []
     backgrounds = {}
+    cut = "[...document.querySelectorAll('.parameters')].filter(it => it.scrollWidth > it.clientWidth).length"
     for scheme in ("light", "dark"):
         page.emulate_media(color_scheme=scheme)
         for width in (1280, 390):
             page.set_viewport_size({"width": width, "height": 844})
             found = page.evaluate("(tags) => axe.run(document, {runOnly: tags})", tags)
+            assert page.evaluate(cut) == 0, f"a table of parameters is cut at {width} px"
             assert len(found["passes"]) > 15, "axe looked at next to nothing"
             problems += [
                 f"{scheme}, {width} px: {it['id']}: {node['html'][:120]} {node['failureSummary']}"

@@ -23,17 +23,16 @@ def emulator_table(data: ReportData) -> Table | None:
     plant = _emulated_plant(hardware) if is_emulated(hardware) else None
     if plant is None:
         return None
-    parts = (("link", PLANT_SPECS, plant), ("drivetrain", DRIVETRAIN_SPECS, plant.drivetrain))
     rows = [
-        (part, spec.name, quantity(getattr(values, spec.name), "", 6), typeset(spec.unit), typeset(spec.description))
-        for part, specs, values in parts
+        (spec.name, quantity(getattr(part, spec.name), "", 6), typeset(spec.unit), typeset(spec.description))
+        for specs, part in ((PLANT_SPECS, plant), (DRIVETRAIN_SPECS, plant.drivetrain))
         for spec in specs
     ]
     return Table(
         "Constants of the emulator",
-        f"No machine was measured: these constants ({plant.name}) took the place of one. Noise, steps and timing of "
-        "the feedback are those of the named version of pendulum_hw_bridge.",
-        ("part", "constant", "value", "unit", "meaning"),
+        f"No machine was measured: these constants ({plant.name}) took the place of one, those of the link "
+        "first, then those of motor, gears and spring. Noise, steps and timing of the feedback are those of the named version of pendulum_hw_bridge.",
+        ("constant", "value", "unit", "meaning"),
         rows,
         "Provenance",
     )

@@ -265,7 +265,20 @@ def _regression(trials: TrialSet) -> list[Table]:
     ]
 
 
-_TYPESET = {"^2": "²", ">=": "≥", "theta'": "θ′", "theta": "θ", "tau_C": "τ_C", "tau_S": "τ_S", "1/s": "s⁻¹"}
+_TYPESET = {
+    "^2": "²",
+    "^3": "³",
+    "ohm": "Ω",
+    "degC": "°C",
+    "1/K": "K⁻¹",
+    "tau_h": "τ_h",
+    ">=": "≥",
+    "theta'": "θ′",
+    "theta": "θ",
+    "tau_C": "τ_C",
+    "tau_S": "τ_S",
+    "1/s": "s⁻¹",
+}
 
 
 def typeset(text: str) -> str:

@@ -422,7 +422,7 @@
     const shown = names.filter((name) => state.plants[name]).map((name) => {
       const plant = state.plants[name];
       const age = now - plant.moved;
-      if (age > 0.5) return [name, "silent", `no state for ${age.toFixed(0)} s; it said ${plant.mode || "nothing"} before`];
+      if (age > 0.5) return [name, "silent", `no state for ${age.toFixed(0)} s; before that: ${MODES[plant.mode] || plant.mode || "unknown"}`];
       const rate = plant.rate ? ` · ${Number(plant.rate).toFixed(1)} Hz` : "";
       const jitter = plant.jitter ? ` · jitter ${(Number(plant.jitter) / 1000).toFixed(2)} ms (99 %)` : "";
       return [name, plant.mode, `${plant.reason.replace(`${plant.mode}: `, "")}${rate}${jitter}`];
