@@ -402,7 +402,7 @@ def test_a_report_on_emulated_hardware_lists_the_constants_of_the_emulator(
     assert table is not None
     assert "x5_9" in table.sentence
     assert ("gear_ratio", "1742.22", "–") in [row[:3] for row in table.rows]
-    assert "Ω" in dict((row[0], row[2]) for row in table.rows)["winding_resistance"]
+    assert "Ω" in {row[0]: row[2] for row in table.rows}["winding_resistance"]
     assert "unit" in table.head
     missing = replace(hardware, source=str(tmp_path / "gone"))
     data = ReportData(replace(comparison, pairs=[replace(pair, hardware=missing)]), {})

@@ -30,8 +30,9 @@ def emulator_table(data: ReportData) -> Table | None:
     ]
     return Table(
         "Constants of the emulator",
-        f"No machine was measured: these constants ({plant.name}) took the place of one, those of the link "
-        "first, then those of motor, gears and spring. Noise, steps and timing of the feedback are those of the named version of pendulum_hw_bridge.",
+        f"No machine was measured: these constants ({plant.name}) took the place of one, those of the link first, then "
+        "those of motor, gears and spring. Noise, steps and timing of the feedback are those of the named version of "
+        "pendulum_hw_bridge.",
         ("constant", "value", "unit", "meaning"),
         rows,
         "Provenance",
