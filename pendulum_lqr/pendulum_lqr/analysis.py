@@ -211,12 +211,12 @@ def delayed_spectral_radius(model: LinearModel, K: ArrayLike, period: float, del
 
     Args:
         model: Linear model.
-        K: Gain, shape (2,) or (n,).
+        K: Gain, shape (2,), (n,) or (m, n).
         period: Sampling period [s].
         delay: Time from state to torque, beyond the model's own [s].
     """
     sampled: DiscreteModel = discretise(model, period, delay)
-    feedback = np.zeros((1, sampled.A.shape[0]))
+    feedback = np.zeros(sampled.B.T.shape)
     feedback[:, : model.A.shape[0]] = _on_state(model, K)
     return float(np.max(np.abs(np.linalg.eigvals(sampled.A - sampled.B @ feedback))))
 
@@ -232,7 +232,7 @@ def largest_stable_period(model: LinearModel, K: ArrayLike) -> float:
 
 
 def _on_state(model: LinearModel, K: ArrayLike) -> NDArray[np.float64]:
-    """Return the gain on the whole state, shape (1, n)."""
+    """Return the gain on the whole state, shape (m, n)."""
     gain = np.atleast_2d(np.asarray(K, dtype=np.float64))
     return gain if gain.shape[1] == model.A.shape[0] else np.asarray(gain @ model.C)
 

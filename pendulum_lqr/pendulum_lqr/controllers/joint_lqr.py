@@ -6,13 +6,11 @@ import math
 from collections.abc import Mapping
 from typing import Any
 
-import numpy as np
-
+from pendulum_lqr.analysis import delayed_spectral_radius
 from pendulum_lqr.design import Gain
 from pendulum_lqr.interface import JointController
 from pendulum_lqr.mechanism_controller import within_limits
 from pendulum_lqr.mechanism_model import linearise_mechanism, mechanism_lqr
-from pendulum_lqr.sampled_design import discretise
 from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.joints import Coordinates, Vector
 from pendulum_msgs_py.parameters import ParameterSpec, validate
@@ -22,7 +20,6 @@ __all__ = ["JOINT_CONTROLLERS", "JointLqr", "joint_parameters", "make_joint_cont
 
 JOINT_CONTROLLERS = ("lqr", "tvlqr")
 """Controllers for plants of several joints."""
-_MOST_GROWTH = 1.0
 
 
 class JointLqr(JointController):
@@ -109,12 +106,8 @@ def make_joint_controller(
     gain = mechanism_lqr(model, p["q"], p["r"])
     limit = p["effort_limit"] or math.inf
     if period is not None:
-        sampled = discretise(model, period)
-        n = model.A.shape[0]
-        feedback = np.zeros((sampled.B.shape[1], sampled.A.shape[0]))
-        feedback[:, :n] = gain.K
-        growth = float(np.max(np.abs(np.linalg.eigvals(sampled.A - sampled.B @ feedback))))
-        if growth >= _MOST_GROWTH:
+        growth = delayed_spectral_radius(model, gain.K, period)
+        if growth >= 1.0:
             raise ParameterError(
                 f"{name} asked every {period:g} s does not settle on plant {plant.name!r}: deviations grow by "
                 f"{growth:.3g} a period; expected a faster plant, or a smaller q"
