@@ -7,14 +7,7 @@ from typing import Any
 
 import pytest
 
-from pendulum_hw_bridge.actuator import (
-    ActuatorError,
-    Applied,
-    Command,
-    Feedback,
-    HardwareLimits,
-    Strategy,
-)
+from pendulum_hw_bridge.actuator import ActuatorError, Applied, Command, Feedback, HardwareLimits, Strategy
 from pendulum_hw_bridge.bridge import Bridge, BridgeSettings
 from pendulum_hw_bridge.command_check import check_command
 from pendulum_hw_bridge.effort_mapping import EffortMapping, EffortStrategy
@@ -141,14 +134,27 @@ class Rig:
         self.port.records.append(self.record(**given))
         return self.bridge.observe(0.01)
 
-    def armed(self) -> Rig:
-        """Connect, see a record, prepare and arm."""
+    def connected(self) -> Rig:
+        """Connect and see a record."""
         self.bridge.connect()
         assert self.see() is not None
-        assert self.bridge.prepare() == ""
-        assert self.supervisor.arm(self.port.time_ns, self.bridge.sample) == ""
+        return self
+
+    def armed(self) -> Rig:
+        """Connect, see a record, prepare and arm."""
+        self.connected().prepare_and_arm()
         self.port.calls.clear()
         return self
+
+    def released_and_armed_again(self) -> None:
+        self.bridge.release()
+        self.supervisor.disarm(self.port.time_ns)
+        self.see()
+        self.prepare_and_arm()
+
+    def prepare_and_arm(self) -> None:
+        assert self.bridge.prepare() == ""
+        assert self.supervisor.arm(self.port.time_ns, self.bridge.sample) == ""
 
     def drive(self, effort: float = 1.0, **given: Any) -> Any:
         return self.bridge.carry_out(Drive(DriveKind.EFFORT, effort=(effort,), **given), was_armed=True)
@@ -167,7 +173,6 @@ def test_it_connects_switches_off_sets_everything_and_asks_again_who_it_is() -> 
     # The loops are limited as for the highest supply there may be, as long as none was measured.
     assert rig.port.gains == rig.bridge.mapping.limited_gains(50.0)
     assert rig.bridge._output.gains == rig.port.gains
-    assert rig.bridge.info == "connected 2"
 
 
 def test_a_module_that_does_not_switch_off_is_not_connected() -> None:
@@ -206,9 +211,7 @@ def test_a_drive_is_not_prepared_with_a_present_fault() -> None:
 
 @pytest.mark.parametrize("call", ["limits", "gains", "strategy 1"])
 def test_a_setting_that_is_refused_leaves_the_drive_off(call: str) -> None:
-    rig = Rig()
-    rig.bridge.connect()
-    rig.see()
+    rig = Rig().connected()
     rig.port.fails[call] = ActuatorError("no_acknowledgement", "did not acknowledge")
     rig.port.calls.clear()
     assert rig.bridge.prepare() == "did not acknowledge"
@@ -220,9 +223,7 @@ def test_a_setting_that_is_refused_leaves_the_drive_off(call: str) -> None:
 
 def test_settings_that_took_longer_than_a_period_are_followed_by_a_look_at_the_feedback() -> None:
     for slow_ns, looks in ((STEP, 0), (STEP + 1, 1)):
-        rig = Rig()
-        rig.bridge.connect()
-        rig.see()
+        rig = Rig().connected()
         rig.port.takes["strategy 1"] = slow_ns
         rig.port.time_ns += MILLISECOND
         rig.port.records = [rig.record(m_stop=True)]
@@ -235,9 +236,7 @@ def test_settings_that_took_longer_than_a_period_are_followed_by_a_look_at_the_f
 
 
 def test_feedback_that_stays_away_while_settings_are_written_refuses() -> None:
-    rig = Rig()
-    rig.bridge.connect()
-    rig.see()
+    rig = Rig().connected()
     rig.port.takes["strategy 1"] = TIMEOUT + 1
     assert "feedback_lost" in rig.bridge.prepare()
     assert rig.port.strategy is Strategy.OFF
@@ -246,9 +245,7 @@ def test_feedback_that_stays_away_while_settings_are_written_refuses() -> None:
 def test_whenever_feedback_gets_too_old_while_preparing_a_refused_drive_is_off() -> None:
     refused = set()
     for early_ns in range(20):
-        rig = Rig()
-        rig.bridge.connect()
-        rig.see()
+        rig = Rig().connected()
         rig.port.tick_ns = 1
         rig.port.takes.update({"strategy 1": 2 * STEP, "read": STEP - early_ns})
         refusal = rig.bridge.prepare()
@@ -258,9 +255,7 @@ def test_whenever_feedback_gets_too_old_while_preparing_a_refused_drive_is_off()
 
 
 def test_a_read_that_fails_while_preparing_releases_and_says_why() -> None:
-    rig = Rig()
-    rig.bridge.connect()
-    rig.see()
+    rig = Rig().connected()
     rig.port.takes["strategy 1"] = STEP + 1
     rig.port.fails["read"] = ActuatorError("module_lost", "gone")
     assert rig.bridge.prepare() == "released again: module_lost"
@@ -269,16 +264,12 @@ def test_a_read_that_fails_while_preparing_releases_and_says_why() -> None:
 
 def test_a_preparation_lasts_a_second_and_ends_behind_an_e_stop_or_an_armed_drive() -> None:
     for after_ns, driving in ((SECOND, True), (SECOND + 1, False)):
-        rig = Rig()
-        rig.bridge.connect()
-        rig.see()
+        rig = Rig().connected()
         assert rig.bridge.prepare() == ""
         rig.bridge._turn_ns = rig.port.time_ns = rig.port.time_ns + after_ns
         assert rig.bridge.carry_out(OFF).effort == 0.0
         assert (rig.port.strategy is Strategy.DIRECT_PWM) == driving
-    rig = Rig()
-    rig.bridge.connect()
-    rig.see()
+    rig = Rig().connected()
     assert rig.bridge.prepare() == ""
     rig.supervisor.e_stop(rig.port.time_ns)
     rig.bridge.carry_out(OFF)
@@ -366,9 +357,7 @@ def test_a_fault_while_nothing_drives_and_nobody_is_armed_counts_for_nothing() -
 
 
 def test_a_fault_of_a_prepared_drive_releases_it_without_the_fault_state_and_of_an_armed_one_with() -> None:
-    rig = Rig()
-    rig.bridge.connect()
-    rig.see()
+    rig = Rig().connected()
     assert rig.bridge.prepare() == ""
     rig.bridge.fail("m_stop", "pressed")
     assert rig.supervisor.mode is Mode.DISARMED
@@ -600,17 +589,11 @@ def test_what_is_sent_is_what_the_monitor_compares() -> None:
 
 
 def test_an_armed_plant_without_a_prepared_drive_is_a_fault_that_names_what_released_it() -> None:
-    rig = Rig()
-    rig.bridge.connect()
-    rig.see()
+    rig = Rig().connected()
     assert rig.supervisor.arm(rig.port.time_ns, rig.bridge.sample) == ""
     outcome = rig.drive(1.0, push=(0.5,))
-    assert (outcome.drive.kind, outcome.drive.push, outcome.effort, outcome.fault) == (
-        DriveKind.OFF,
-        (0.5,),
-        0.0,
-        "not_prepared",
-    )
+    told = (outcome.drive.kind, outcome.drive.push, outcome.effort, outcome.fault)
+    assert told == (DriveKind.OFF, (0.5,), 0.0, "not_prepared")
     assert rig.supervisor.reason == ("not_prepared: drive was released before it was armed; disarm, then arm again")
     assert rig.port.strategy is Strategy.OFF
     rig.supervisor.disarm(rig.port.time_ns)
@@ -632,12 +615,8 @@ def test_a_command_that_cannot_be_sent_is_a_fault_by_its_name() -> None:
     rig = Rig().armed()
     rig.port.fails["write"] = ActuatorError("send_failed", "network down")
     outcome = rig.drive(1.0, push=(0.5,))
-    assert (outcome.drive.kind, outcome.drive.push, outcome.effort, outcome.fault) == (
-        DriveKind.OFF,
-        (0.5,),
-        0.0,
-        "send_failed",
-    )
+    told = (outcome.drive.kind, outcome.drive.push, outcome.effort, outcome.fault)
+    assert told == (DriveKind.OFF, (0.5,), 0.0, "send_failed")
     assert rig.supervisor.reason == "send_failed: network down"
     assert rig.port.strategy is Strategy.OFF
 
@@ -745,11 +724,7 @@ def test_after_a_release_no_torque_of_before_is_handed_over() -> None:
     rig.drive(2.0)
     position(rig, handover=1.0)
     rig.drive(2.0)
-    rig.bridge.release()
-    rig.supervisor.disarm(rig.port.time_ns)
-    rig.see()
-    assert rig.bridge.prepare() == ""
-    assert rig.supervisor.arm(rig.port.time_ns, rig.bridge.sample) == ""
+    rig.released_and_armed_again()
     assert abs(position(rig, handover=1.0).position) == rig.bridge.mapping.dither
 
 
@@ -757,11 +732,7 @@ def test_a_release_in_a_hand_over_leaves_nothing_of_it() -> None:
     rig = Rig().armed()
     rig.drive(2.0)
     assert position(rig, handover=1.0).position > 0.1
-    rig.bridge.release()
-    rig.supervisor.disarm(rig.port.time_ns)
-    rig.see()
-    assert rig.bridge.prepare() == ""
-    assert rig.supervisor.arm(rig.port.time_ns, rig.bridge.sample) == ""
+    rig.released_and_armed_again()
     assert abs(position(rig, handover=0.5).position) == rig.bridge.mapping.dither
 
 
