@@ -17,6 +17,7 @@ from pendulum_lqr.mechanism_ilqr import IlqrProblem, IlqrWeights
 from pendulum_msgs_py.dynamics.runge_kutta import along_functions, rk4_joints
 from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.joints import Vector
+from pendulum_msgs_py.parameters import read_text
 from pendulum_msgs_py.plants.mechanism_parameters import MechanismParameters
 
 __all__ = ["FORMAT", "MechanismTrajectory", "SwingUpSearch", "load_trajectory", "search_swing_up", "write_trajectory"]
@@ -24,6 +25,7 @@ __all__ = ["FORMAT", "MechanismTrajectory", "SwingUpSearch", "load_trajectory", 
 Array = NDArray[np.float64]
 
 FORMAT = "pendulum_trajectory/1"
+_LARGEST_FILE = 50_000_000
 _FIND = IlqrWeights(1.0, 0.05, 0.13, 1e-3, 0.007, 10.0)
 _NEAR = 0.3
 """Largest deviation at which a guess's end counts as upright, in shares of the caught region's level."""
@@ -149,7 +151,11 @@ def _held(plant: MechanismParameters, catch: MechanismCatch, z: Vector, count: i
 
 
 def write_trajectory(path: Path, trajectory: MechanismTrajectory) -> None:
-    """Write a trajectory as JSON, with six digits behind the point."""
+    """Write a trajectory as JSON, with six digits behind the point.
+
+    Raises:
+        ParameterError: The file cannot be written.
+    """
 
     def rows(values: Array) -> list[list[float]]:
         return [[round(float(value), 6) for value in row] for row in values]
@@ -164,29 +170,39 @@ def write_trajectory(path: Path, trajectory: MechanismTrajectory) -> None:
         "efforts": rows(trajectory.efforts),
     }
     text = json.dumps(document)
-    # One node a line, so that a change shows as one.
-    path.write_text(text.replace("], [", "],\n[") + "\n", encoding="utf-8")
+    try:
+        # One node a line, so that a change shows as one.
+        path.write_text(text.replace("], [", "],\n[") + "\n", encoding="utf-8")
+    except OSError as error:
+        raise ParameterError(f"{path} cannot be written: {error.strerror}") from error
 
 
 def load_trajectory(path: Path) -> MechanismTrajectory:
     """Read a trajectory.
 
     Raises:
-        ParameterError: It is none, or its arrays do not go together.
+        ParameterError: It is none, has values that are not finite, or its arrays do not go together.
     """
+    text = read_text(path, "trajectory", limit=_LARGEST_FILE)
     try:
-        document = json.loads(path.read_text(encoding="utf-8"))
-        if document["format"] != FORMAT:
-            raise ParameterError(f"{path} has the format {document['format']!r}; expected {FORMAT}")
-        states = np.array(document["states"], dtype=np.float64)
-        efforts = np.array(document["efforts"], dtype=np.float64)
-        joints = tuple(str(name) for name in document["joints"])
-        times = np.arange(len(states)) * float(document["step"])
-    except (OSError, KeyError, TypeError, ValueError) as error:
-        raise ParameterError(f"{path} is no trajectory: {error!r}; expected a file of format {FORMAT}") from error
+        document = json.loads(text)
+        given, plant = document.get("format"), document.get("plant")
+        if given == FORMAT:
+            states = np.array(document["states"], dtype=np.float64)
+            efforts = np.array(document["efforts"], dtype=np.float64)
+            joints = tuple(str(name) for name in document["joints"])
+            step, how = float(document["step"]), dict(document.get("how", {}))
+    except (AttributeError, KeyError, TypeError, ValueError, RecursionError) as error:
+        raise ParameterError(f"{path} is no trajectory: {error}; expected a file of format {FORMAT}") from error
+    if given != FORMAT:
+        raise ParameterError(f"{path} has the format {given!r}; expected {FORMAT}")
+    if not isinstance(plant, str):
+        raise ParameterError(f"{path}: plant is {plant!r}; expected text")
     if states.ndim != 2 or efforts.ndim != 2 or len(states) != len(efforts) or states.shape[1] != 2 * len(joints):
         raise ParameterError(
             f"{path} has states of shape {states.shape} and efforts of shape {efforts.shape} for "
             f"{', '.join(joints)}; expected (N, {2 * len(joints)}) and (N, m)"
         )
-    return MechanismTrajectory(str(document["plant"]), joints, times, states, efforts, dict(document.get("how", {})))
+    if not (np.isfinite(states).all() and np.isfinite(efforts).all() and math.isfinite(step) and step > 0.0):
+        raise ParameterError(f"{path} has numbers that are not finite, or the step {step} s; expected one > 0")
+    return MechanismTrajectory(plant, joints, np.arange(len(states)) * step, states, efforts, how)

@@ -52,6 +52,10 @@ def swing_up(
             f"--weights is {weights!r}; expected {len(IlqrWeights._fields)} numbers, for "
             f"{', '.join(IlqrWeights._fields)}"
         ) from error
+    try:
+        output.parent.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise ParameterError(f"{output} cannot be written: {error.strerror}") from error
     plant = load_mechanism(preset)
     catch = default_catch(plant)
     search = SwingUpSearch(values, duration=duration)
@@ -69,7 +73,6 @@ def swing_up(
                 best = found
     if best is None:
         raise DesignError(f"none of {guesses} guesses of {plant.name!r} ends upright; expected more --guesses")
-    output.parent.mkdir(parents=True, exist_ok=True)
     write_trajectory(output, best)
     console.print(f"{upright} of {guesses} guesses end upright; seed {best.how['seed']} costs {best.how['cost']:.4f}")
     console.print(f"trajectory {output}", soft_wrap=True)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import math
 from dataclasses import replace
 from itertools import pairwise
@@ -10,6 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from pendulum_lqr import swing_up_cli
 from pendulum_lqr.mechanism_catch import deviation_of, make_mechanism_catch
 from pendulum_lqr.mechanism_controllers import (
     default_catch,
@@ -116,6 +118,15 @@ def test_iterative_lqr_and_mpc_bring_a_cart_pole_up_within_its_limits() -> None:
     assert controller.command(0.0, (0.0,) * 4) == efforts[0]
 
 
+def test_a_search_whose_file_cannot_be_written_ends_before_it_begins(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("pendulum_lqr.mechanism_trajectory.search_swing_up", lambda *_: pytest.fail("searched"))
+    (tmp_path / "file").touch()
+    assert swing_up_cli.main(["--guesses", "1", "--output", f"{tmp_path}/file/x.json"]) == 2
+    assert "file/x.json cannot be written: " in capsys.readouterr().err
+
+
 def test_velocities_from_positions_are_the_true_ones_whatever_was_measured() -> None:
     plant = load_mechanism("acrobot_frictionless")
 
@@ -147,9 +158,23 @@ def test_a_trajectory_file_gives_back_what_was_written_and_says_what_is_wrong_wi
     assert (again.states == trajectory.states).all()
     assert (again.efforts == trajectory.efforts).all()
     assert again.how == trajectory.how
-    (tmp_path / "none.json").write_text("{}", encoding="utf-8")
-    with pytest.raises(ParameterError, match="is no trajectory"):
-        load_trajectory(tmp_path / "none.json")
+    document = json.loads((tmp_path / "again.json").read_text(encoding="utf-8"))
+    for text, message in (
+        ("{}", "none.json has the format None; expected pendulum_trajectory/1"),
+        ("[]", "is no trajectory"),
+        ("{", "is no trajectory"),
+        (json.dumps({key: value for key, value in document.items() if key != "plant"}), "plant is None; expected text"),
+        (json.dumps({**document, "step": math.nan}), "has numbers that are not finite"),
+        (json.dumps({**document, "efforts": [[math.inf]] * len(document["states"])}), "numbers that are not finite"),
+        (json.dumps({**document, "efforts": document["efforts"][1:]}), r"expected \(N, 4\) and \(N, m\)"),
+    ):
+        (tmp_path / "none.json").write_text(text, encoding="utf-8")
+        with pytest.raises(ParameterError, match=message):
+            load_trajectory(tmp_path / "none.json")
+    with pytest.raises(ParameterError, match=r"gone.json does not exist"):
+        load_trajectory(tmp_path / "gone.json")
+    with pytest.raises(ParameterError, match=r"again.json/x.json cannot be written: Not a directory"):
+        write_trajectory(tmp_path / "again.json" / "x.json", trajectory)
     with pytest.raises(ParameterError, match="no swing-up is stored for plant 'cart_pole'; expected one of acrobot_f"):
         stored_trajectory(load_mechanism("cart_pole"))
     plant = load_mechanism("cart_pole")
