@@ -18,6 +18,8 @@ __all__ = ["COMMANDER_HOLD", "CommandGate", "Refusal"]
 
 COMMANDER_HOLD = 1.0
 """Silence after which another commander may take over [s]."""
+_FUTURE_TOLERANCE_NS = 5_000_000
+"""How far ahead of the plant's clock a stamp may lie [ns]."""
 
 
 class Refusal(str, Enum):
@@ -42,8 +44,6 @@ class CommandGate:
 
     Args:
         timeout: Age beyond which a command counts for nothing [s], > 0.
-        future_tolerance: How far ahead of the plant's clock a stamp may lie [s].
-        single_commander: Refuse a second source while the first one is alive.
         joints: The joints that commands must be for, in this order; an empty list of names means the only one.
         partial: Whether a command may be for some of the joints, in their order; the others get nothing.
 
@@ -52,18 +52,8 @@ class CommandGate:
         problems: Of each reason's newest refusal, the field of the message, its value and what was expected.
     """
 
-    def __init__(
-        self,
-        timeout: float,
-        *,
-        future_tolerance: float = 0.005,
-        single_commander: bool = True,
-        joints: tuple[str, ...] = (JOINT,),
-        partial: bool = False,
-    ) -> None:
+    def __init__(self, timeout: float, *, joints: tuple[str, ...] = (JOINT,), partial: bool = False) -> None:
         self.timeout_ns = round(timeout * NANOSECONDS)
-        self.future_tolerance_ns = round(future_tolerance * NANOSECONDS)
-        self.single_commander = single_commander
         self.joints = joints
         self.partial = partial and len(joints) > 1
         self.refused: Counter[Refusal] = Counter()
@@ -114,7 +104,7 @@ class CommandGate:
         self._expired = self._expired or age > self.timeout_ns or abs(silence) > self.timeout_ns
         # Heard a little "later than now" is not only a clock that stepped back: a plant that catches up with periods
         # it missed decides as of each of them.
-        return None if self._expired or age < -self.future_tolerance_ns else newest
+        return None if self._expired or age < -_FUTURE_TOLERANCE_NS else newest
 
     @property
     def newest_stamp_ns(self) -> int | None:
@@ -142,14 +132,14 @@ class CommandGate:
                 return Refusal.NOT_FINITE
         if now_ns - command.stamp_ns > self.timeout_ns:
             return Refusal.TOO_OLD
-        if command.stamp_ns - now_ns > self.future_tolerance_ns:
+        if command.stamp_ns - now_ns > _FUTURE_TOLERANCE_NS:
             return Refusal.FROM_FUTURE
         newest = self._newest
         # A clock that jumped back leaves a last command "from the future": it no longer orders anything.
-        if newest is None or newest.stamp_ns - now_ns > self.future_tolerance_ns:
+        if newest is None or newest.stamp_ns - now_ns > _FUTURE_TOLERANCE_NS:
             return None
         silence = now_ns - self._heard_ns
-        if self.single_commander and command.source != self._holder and 0 <= silence <= COMMANDER_HOLD * NANOSECONDS:
+        if command.source != self._holder and 0 <= silence <= COMMANDER_HOLD * NANOSECONDS:
             return Refusal.SECOND_COMMANDER
         if command.stamp_ns == newest.stamp_ns:
             return Refusal.DUPLICATE
@@ -197,7 +187,7 @@ class CommandGate:
             Refusal.TOO_OLD: f"header.stamp is {age:.6g} s before the plant's time; expected at most "
             f"{self.timeout_ns / NANOSECONDS:g} s",
             Refusal.FROM_FUTURE: f"header.stamp is {-age:.6g} s after the plant's time; expected at most "
-            f"{self.future_tolerance_ns / NANOSECONDS:g} s",
+            f"{_FUTURE_TOLERANCE_NS / NANOSECONDS:g} s",
             Refusal.OUT_OF_ORDER: f"header.stamp is {-since:.6g} s before that of the command before",
             Refusal.DUPLICATE: "header.stamp is that of the command before; expected one answer to a state",
             Refusal.SECOND_COMMANDER: f"header.frame_id is {command.source!r}; {self._holder!r} commands",
