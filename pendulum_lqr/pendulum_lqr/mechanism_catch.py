@@ -25,6 +25,10 @@ _STEP = 0.004
 _LONGEST = 8.0
 _FIRST = 0.05
 """Deviation of the first ellipsoid tried, along the joint that it reaches farthest [rad or m]."""
+_SAMPLES = 200
+"""States tried at each level, half of them on the edge."""
+_SHARE = 0.9
+"""Of the level found that is taken."""
 
 
 class CaughtRegion(NamedTuple):
@@ -49,29 +53,24 @@ def deviation_of(coordinates: Coordinates, x: Vector) -> Array:
     return np.array([*coordinates.deviation(x[:n]), *x[n:]])
 
 
-def sample_caught_region(
-    plant: MechanismParameters, gain: Gain, *, samples: int = 200, seed: int = 0, share: float = 0.9
-) -> CaughtRegion:
+def sample_caught_region(plant: MechanismParameters, gain: Gain) -> CaughtRegion:
     """Return the largest ellipsoid x' S x <= level from whose sampled states u = -K x, limited, comes to rest upright.
 
-    The level grows until a sampled state is lost, and is bisected then; ``share`` of what is found is returned.
+    The level grows until a sampled state is lost, and is bisected then; nine tenths of what is found are returned.
 
     Args:
         plant: The plant; dry friction, lag and delay are left out.
         gain: K and S.
-        samples: States per level, half of them on the edge.
-        seed: Of the states.
-        share: Of the level found that is taken.
 
     Raises:
         DesignError: Not even the smallest states are caught.
     """
     n = len(plant.joints)
-    rng = np.random.default_rng(seed)
-    directions = rng.standard_normal((samples, 2 * n))
+    rng = np.random.default_rng(0)
+    directions = rng.standard_normal((_SAMPLES, 2 * n))
     directions /= np.linalg.norm(directions, axis=1)[:, None]
     # On the edge for half of them, evenly in the volume for the rest.
-    directions[samples // 2 :] *= rng.random((samples - samples // 2, 1)) ** (0.5 / n)
+    directions[_SAMPLES // 2 :] *= rng.random((_SAMPLES - _SAMPLES // 2, 1)) ** (0.5 / n)
     root = np.linalg.cholesky(gain.S)
     unit = np.linalg.solve(root.T, directions.T)
     low, high = 0.0, _FIRST**2 / float(np.max(np.diag(np.linalg.inv(gain.S))[:n]))
@@ -85,7 +84,7 @@ def sample_caught_region(
             low = middle
         else:
             high = middle
-    return CaughtRegion(share * low, samples)
+    return CaughtRegion(_SHARE * low, _SAMPLES)
 
 
 def _all_caught(plant: MechanismParameters, gain: Gain, deviations: Array) -> bool:
