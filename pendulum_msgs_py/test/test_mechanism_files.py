@@ -14,9 +14,10 @@ from pendulum_msgs_py.plants.mechanism_parameters import (
     MechanismParameters,
     load_mechanism,
     load_mechanism_file,
+    mechanism_from_pendulum,
     write_mechanism,
 )
-from pendulum_msgs_py.plants.plant_parameters import PRESETS, load_plant, resolve_plant
+from pendulum_msgs_py.plants.plant_parameters import PLANT_SPECS, PRESETS, load_plant, resolve_plant
 from pendulum_msgs_py.plants.sealed_plant import load_plant_to_run
 
 
@@ -132,6 +133,17 @@ def test_a_plant_of_one_joint_with_what_no_mechanism_has_says_what(tmp_path: Pat
     path = _changed(tmp_path, "parameters:\n", "parameters:\n  angle_offset: {value: 0.1, unit: rad}\n", "thesis")
     with pytest.raises(ParameterError, match=r"angle_offset of plant 'thesis' is 0.1 rad; expected 0"):
         load_mechanism(path)
+
+
+@pytest.mark.parametrize("name", [spec.name for spec in PLANT_SPECS])
+def test_a_plant_of_one_joint_loses_nothing_when_it_is_read_as_a_mechanism(name: str) -> None:
+    plant = load_plant("dfki")
+    changed = plant.with_values(**{name: getattr(plant, name) + 0.5})
+    if name in {"load_friction", "torque_offset", "angle_offset"}:
+        with pytest.raises(ParameterError, match=f"{name} of plant 'dfki' is 0.5.*; expected 0 to be read"):
+            mechanism_from_pendulum(changed)
+    else:
+        assert mechanism_from_pendulum(changed) != mechanism_from_pendulum(plant)
 
 
 def test_a_program_for_one_joint_says_that_a_plant_has_several() -> None:

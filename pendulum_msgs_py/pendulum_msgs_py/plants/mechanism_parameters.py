@@ -27,7 +27,7 @@ from pathlib import Path
 from typing import Any
 
 from pendulum_msgs_py.errors import ParameterError
-from pendulum_msgs_py.joints import Coordinates, Vector
+from pendulum_msgs_py.joints import ONE_JOINT, Coordinates, Vector
 from pendulum_msgs_py.mechanisms import MECHANISMS, Mechanism
 from pendulum_msgs_py.parameters import ParameterSpec, load_yaml, reject_unknown, require_mapping, suggestion
 from pendulum_msgs_py.plants.joint_parameters import (
@@ -42,6 +42,7 @@ from pendulum_msgs_py.plants.plant_parameters import (
     FORMAT,
     MECHANISM_FORMAT,
     MECHANISM_PRESETS,
+    PLANT_SPECS,
     PlantParameters,
     read_plant_document,
     resolve_plant,
@@ -274,20 +275,19 @@ def mechanism_from_pendulum(parameters: PlantParameters) -> MechanismParameters:
     name = parameters.name
     if parameters.drivetrain is not None:
         raise ParameterError(f"plant {name!r} is series elastic; expected a rigid one to be read as a mechanism")
-    for key, unit in (("load_friction", "-"), ("torque_offset", "N m"), ("angle_offset", "rad")):
-        value = getattr(parameters, key)
-        if value != 0.0:
-            told = f"{value} {unit}" if unit != "-" else f"{value}"
-            raise ParameterError(f"{key} of plant {name!r} is {told}; expected 0 to be read as a mechanism")
-    static = parameters.static_friction
-    joint = JointParameters(
-        damping=parameters.damping,
-        coulomb_friction=parameters.coulomb_friction,
-        static_friction=None if static == parameters.coulomb_friction else static,
-        stribeck_velocity=parameters.stribeck_velocity,
-        actuator=Actuator(parameters.effort_limit, parameters.actuator_time_constant, parameters.transport_delay),
-    )
-    return MechanismParameters(MECHANISMS["pendulum"], (parameters.inertia, parameters.gravity), (joint,), name)
+    given = {spec.name: getattr(parameters, spec.name) for spec in PLANT_SPECS}
+    values = (given.pop("inertia"), given.pop("gravity"))
+    actuator = Actuator(*(given.pop(name) for name in ("effort_limit", "actuator_time_constant", "transport_delay")))
+    joint = {spec.name: given.pop(spec.name) for spec in joint_specs(ONE_JOINT.joints[0]) if spec.name in given}
+    if joint["static_friction"] == joint["coulomb_friction"]:
+        joint["static_friction"] = None
+    for spec in PLANT_SPECS:
+        if given.get(spec.name, spec.default) != spec.default:
+            told = f"{given[spec.name]} {spec.unit}".removesuffix(" -")
+            raise ParameterError(
+                f"{spec.name} of plant {name!r} is {told}; expected {spec.default:g} to be read as a mechanism"
+            )
+    return MechanismParameters(MECHANISMS["pendulum"], values, (JointParameters(**joint, actuator=actuator),), name)
 
 
 def write_mechanism(
