@@ -1,4 +1,4 @@
-"""``bridge``: a HEBI actuator, or its emulator, behind the contract that simulator and hardware share.
+"""``bridge``: connect a HEBI actuator, or its emulator, to ROS.
 
 A lifecycle node. ``configure`` connects the actuator and reads its settings back, ``activate`` lets states flow and
 arming be asked for; ``deactivate``, ``cleanup``, ``shutdown``, SIGINT, SIGTERM and every error end with effort zero

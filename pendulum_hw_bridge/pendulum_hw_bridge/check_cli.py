@@ -1,4 +1,4 @@
-"""``check``: what a lab runs before arming."""
+"""``check``: run the checklist before arming; it sends no torque."""
 
 from __future__ import annotations
 

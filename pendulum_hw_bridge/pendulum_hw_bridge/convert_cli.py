@@ -1,4 +1,4 @@
-"""``convert``: a HEBI log as a CSV file in joint coordinates, for ``identify``, ``replay`` and the bridge's replay."""
+"""``convert``: convert a HEBI log to a CSV file in joint coordinates."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""``lab``: write the lab file by guided procedures; keep and give back what a module was set to."""
+"""``lab``: write the lab file by guided procedures; save and restore the settings of a module."""
 
 from __future__ import annotations
 

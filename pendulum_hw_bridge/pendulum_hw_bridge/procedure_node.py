@@ -1,4 +1,4 @@
-"""``procedure``: plays one trial of the thesis's two identification experiments on the bridge.
+"""``procedure``: play one trial of the thesis's two identification experiments on the bridge.
 
 ``hand``: the drive is held at zero torque while a simulated hand turns the link through ``push``, or a person does.
 ``staircase``: the bridge follows steps of 10 degrees. Phases stand in the bag as events with exact stamps.

@@ -1,4 +1,4 @@
-"""``scan``: which actuators answer, who they are, and which of them the bridge would drive."""
+"""``scan``: list the actuators that answer, and which of them the bridge would drive."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The ``controller`` node: answers each new state of a plant once, with the state's stamp."""
+"""``controller``: answer each state of a plant with a torque."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""``python -m pendulum_lqr design``: a table of gains for lists of weights, and the figures of one of them."""
+"""``python -m pendulum_lqr design``: design gains for lists of weights, and draw the figures of one."""
 
 from __future__ import annotations
 

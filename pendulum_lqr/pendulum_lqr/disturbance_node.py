@@ -1,4 +1,4 @@
-"""The ``disturbance`` node: answers each state of a plant with the disturbance torque of its stamp."""
+"""``disturbance``: answer each state of a plant with a disturbance torque."""
 
 from __future__ import annotations
 

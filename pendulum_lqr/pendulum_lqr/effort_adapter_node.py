@@ -1,4 +1,4 @@
-"""``effort_adapter``: lets ros2_control, or who commands its effort controllers, drive our plants."""
+"""``effort_adapter``: let ros2_control, or clients of its effort controllers, drive a plant."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""``python -m pendulum_lqr swing_up``: search a swing-up of a plant of several joints, and store it."""
+"""``python -m pendulum_lqr swing_up``: search a swing-up for a plant of several joints, and store it."""
 
 from __future__ import annotations
 

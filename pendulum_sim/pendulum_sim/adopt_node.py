@@ -1,4 +1,4 @@
-"""``adopt``: a plant of others on the ROS graph, states out and efforts in, behind the contract and its rules."""
+"""``adopt``: add arming, limits and an e-stop to a plant that is on the ROS graph already."""
 
 from __future__ import annotations
 

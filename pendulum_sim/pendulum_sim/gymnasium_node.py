@@ -1,4 +1,4 @@
-"""``gymnasium``: an environment of Gymnasium in the simulator's place, behind the same contract."""
+"""``gymnasium``: run a Gymnasium environment in place of the simulator."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""``markers``: torque and disturbance of a plant as arcs about its joint, for RViz and Foxglove.
+"""``markers``: show torque and disturbance as arcs about the joint, in RViz and Foxglove.
 
 RViz has an Effort display of its own, but it draws revolute joints only (ours turns without end, so it is a
 continuous one) and drops messages whose ``frame_id`` is no frame (in ours it is who commands).

@@ -1,4 +1,4 @@
-"""URDF and MJCF of a plant, written from the same parameters as the simulation.
+"""``export_model``: write a plant as URDF or MJCF.
 
 The parameters say M_c and G_c, not mass and length: any link with m l^2 <= M_c and m g l = G_c moves the same. The
 one drawn has nine tenths of its inertia in the bob. Angle 0 hangs down along -z; positive turns the bob towards +x,

@@ -1,4 +1,4 @@
-"""``mujoco``: a hinge of a MuJoCo model in the simulator's place, behind the same contract."""
+"""``mujoco``: run a hinge of a MuJoCo model in place of the simulator."""
 
 from __future__ import annotations
 

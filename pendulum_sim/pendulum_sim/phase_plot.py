@@ -1,4 +1,4 @@
-"""``phase_plot``: the overdamped phase plot of the thesis, with its fixed points and their stability."""
+"""``phase_plot``: draw the thesis's overdamped phase plot, with fixed points and their stability."""
 
 from __future__ import annotations
 

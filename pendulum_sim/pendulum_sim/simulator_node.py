@@ -1,4 +1,4 @@
-"""``simulator``: the plant behind the contract that simulator and hardware share."""
+"""``simulator``: run the simulated pendulum, with the interface that the bridge has too."""
 
 from __future__ import annotations
 

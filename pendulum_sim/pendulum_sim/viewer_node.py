@@ -1,4 +1,4 @@
-"""``viewer``: a window, PNG and GIF of any plant's ``joint_states``, simulated or real."""
+"""``viewer``: show any plant's ``joint_states`` in a window, as PNG or as GIF."""
 
 from __future__ import annotations
 

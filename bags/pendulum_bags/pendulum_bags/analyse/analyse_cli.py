@@ -1,4 +1,4 @@
-"""``analyse``: the same questions to many bags, as a table with a row for each."""
+"""``analyse``: ask many bags the same questions, and print one table."""
 
 from __future__ import annotations
 

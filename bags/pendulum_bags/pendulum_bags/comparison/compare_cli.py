@@ -1,4 +1,4 @@
-"""``compare``: is the simulation good enough? Tables and a verdict from two bags or from run folders."""
+"""``compare``: compare simulation and hardware from two bags or from run folders, with a verdict."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ MarginOption = Annotated[
     list[str] | None,
     typer.Option(
         "--margin",
-        help="What difference does not matter, in words of the task: mean_angle=0.3deg, spread_angle=20%, delay=8ms, "
+        help="Largest difference that does not matter to your task: mean_angle=0.3deg, spread_angle=20%, delay=8ms, "
         "path_angle=0.2deg ...; may be given several times.",
     ),
 ]

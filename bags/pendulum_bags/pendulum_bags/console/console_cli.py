@@ -1,4 +1,4 @@
-"""``console``: a web page on which the plants of a ROS domain are seen live, tuned, armed and stopped.
+"""``console``: serve a web page to watch, tune, arm and stop the plants of a ROS domain.
 
 Loads what it needs at low priority, because the loops that it is to show may be running.
 """

@@ -1,4 +1,4 @@
-"""``python -m pendulum_bags excite``: design an excitation, show what it will tell, and play it."""
+"""``python -m pendulum_bags excite``: design an excitation, predict what it will determine, and play it."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ app = typer.Typer(add_completion=False, rich_markup_mode=None)
 def excite(
     plant: Annotated[str, typer.Option(help="Prior guess: preset or plant file.")] = "dfki",
     parameters: Annotated[
-        str, typer.Option(help="What to learn, separated by commas.")
+        str, typer.Option(help="Parameters to determine, separated by commas.")
     ] = "inertia,damping,gravity,coulomb_friction",
     kind: Annotated[str, typer.Option(help="multisine, chirp, prbs, or best of all.")] = "best",
     duration: Annotated[float, typer.Option(help="[s]")] = 20.0,
@@ -59,9 +59,9 @@ def excite(
     domain: Annotated[int | None, typer.Option(help="ROS domain; by default ROS_DOMAIN_ID.")] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print the result as JSON.")] = False,
 ) -> None:
-    """Design the torque over time that tells most about a plant within limits, starting at rest.
+    """Design the torque signal that determines a plant's parameters best within limits, from rest.
 
-    A played excitation starts and ends at rest, with nobody else commanding the plant, and ends by itself.
+    With --play it is played once, from rest to rest. No other program may command the plant meanwhile.
 
     Example: python -m pendulum_bags excite --plant dfki --max-effort 1.5 --max-angle 2 --out excitation.csv --play
     """

@@ -1,4 +1,4 @@
-"""``experiment``: run an experiment from the first process to the last figure."""
+"""``experiment``: run an experiment, from the start of the plants to the report."""
 
 from __future__ import annotations
 

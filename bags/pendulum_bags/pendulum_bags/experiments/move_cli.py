@@ -1,4 +1,4 @@
-"""``python -m pendulum_bags move``: bring a running pendulum upright, down or to an angle, and stop it."""
+"""``python -m pendulum_bags move``: move a running pendulum upright, down or to an angle, or stop it."""
 
 from __future__ import annotations
 
@@ -44,10 +44,10 @@ def move(
 ) -> int:
     """Move a pendulum under position control along the thesis's ramp: at most 0.3 rad/s.
 
-    The controller is deactivated and the plant armed where that is not so. At the end of `upright` the controller is
-    activated and takes over from position control; at the end of `down` the plant is disarmed; at an angle it holds.
-    Ctrl-C disarms it. `stop` latches the plant's e-stop, and `reset` ends it without arming. It goes by way of the
-    network and this computer: the motion stop of a real machine comes first.
+    Deactivates the controller and arms the plant if necessary. At the end of `upright` it activates the controller,
+    which takes over from position control; at the end of `down` it disarms the plant; at an angle the plant holds.
+    Ctrl-C disarms it. `stop` latches the plant's e-stop, and `reset` releases it without arming. `stop` needs the
+    network and this computer: on a real machine use the motion stop first.
     """
     from pendulum_bags.experiments.conductor_node import Conductor, PlantClient
     from pendulum_bags.experiments.domain import check_domain

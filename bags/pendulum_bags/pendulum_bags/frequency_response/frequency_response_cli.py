@@ -1,4 +1,4 @@
-"""``frequency_response``: measure plants from recordings, compare them, certify designs; and the experiment for it."""
+"""``frequency_response``: measure plants from recordings, compare them and certify designs."""
 
 from __future__ import annotations
 

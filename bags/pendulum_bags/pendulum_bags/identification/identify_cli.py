@@ -1,4 +1,4 @@
-"""``python -m pendulum_bags identify``: parameters from recordings."""
+"""``python -m pendulum_bags identify``: find the parameters of a pendulum from recordings."""
 
 from __future__ import annotations
 

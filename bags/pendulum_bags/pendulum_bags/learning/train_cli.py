@@ -1,4 +1,4 @@
-"""``train``: from an identified plant to a policy file."""
+"""``train``: train a policy file for a plant."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""``ranking``: would the simulation have picked the right controller? From any folder of runs."""
+"""``ranking``: check whether the simulation would have picked the right controller."""
 
 from __future__ import annotations
 

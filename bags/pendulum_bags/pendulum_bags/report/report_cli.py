@@ -1,4 +1,4 @@
-"""``report``: a page with a verdict, figures and provenance, from one run folder or from several, pooled."""
+"""``report``: write a page with verdict, figures and provenance, from one run folder or several."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""``convert``: bag to another storage; ``merge``: bags in one; ``cut``: a stretch of one; ``filter``: a few topics."""
+"""``convert``: rewrite a bag elsewhere; ``merge``: join bags; ``cut``: keep a time span; ``filter``: keep some topics."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""``play``: publish the topics of a bag again over DDS, with ``/clock``, to run any node against a recording."""
+"""``play``: publish the topics of a bag again over DDS, with ``/clock``."""
 
 from __future__ import annotations
 

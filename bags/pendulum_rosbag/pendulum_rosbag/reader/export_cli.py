@@ -1,4 +1,4 @@
-"""``export``: a bag as Parquet or CSV files."""
+"""``export``: write a bag as Parquet or CSV files."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""``info``: what is in a bag, and how good its timing is."""
+"""``info``: show what is in a bag, and how good its timing is."""
 
 from __future__ import annotations
 

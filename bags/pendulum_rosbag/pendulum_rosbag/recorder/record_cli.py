@@ -1,4 +1,4 @@
-"""``record``: write topics to a bag that survives anything that happens to the recorder."""
+"""``record``: write topics to a bag that stays readable if the recorder is killed."""
 
 from __future__ import annotations
 

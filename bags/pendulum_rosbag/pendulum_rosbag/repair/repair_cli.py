@@ -1,4 +1,4 @@
-"""``repair``: mend bags that a recorder left broken."""
+"""``repair``: repair bags that a recorder left broken."""
 
 from __future__ import annotations
 
