@@ -1,4 +1,4 @@
-"""``convert``: rewrite one bag; ``merge``: join several bags; ``cut``: keep a time span; ``filter``: keep some topics."""
+"""``convert``: rewrite one bag; ``merge``: join many bags; ``cut``: cut out a span; ``filter``: keep some topics."""
 
 from __future__ import annotations
 
