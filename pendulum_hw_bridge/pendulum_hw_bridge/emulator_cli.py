@@ -1,4 +1,4 @@
-"""``emulator``: run an emulated X5-9; ``emulator_fault``: inject one fault; ``emulator_hand``: turn it by hand."""
+"""``emulator``: emulate one X5-9; ``emulator_fault``: inject one fault; ``emulator_hand``: turn its link by hand."""
 
 from __future__ import annotations
 
