@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from pendulum_lqr.policy import SIGNALS, Network, Policy
+from pendulum_lqr.policy import DEFAULT_SIGNALS, Network, Policy
 from pendulum_msgs_py.contract.names import JOINT
 from pendulum_msgs_py.plants.plant_parameters import PlantParameters
 
@@ -19,14 +19,14 @@ def random_policy(
     plant: PlantParameters, *, hidden: tuple[int, ...] = (8, 8), history: int = 3, seed: int = 0, **changes: Any
 ) -> Policy:
     """Return a policy of random weights for a plant."""
-    sizes = (history * len(changes.get("signals", SIGNALS)), *hidden, 1)
+    sizes = (history * len(changes.get("signals", DEFAULT_SIGNALS)), *hidden, 1)
     return _policy(plant, _network(sizes, seed, changes.pop("activation", "tanh"), changes.pop("output", "clip")),
                    history=history, **changes)  # fmt: skip
 
 
 def linear_policy(plant: PlantParameters, angle_gain: float, velocity_gain: float, **changes: Any) -> Policy:
     """Return the policy u = -angle_gain sin(x) - velocity_gain theta_dot, within the plant's limit."""
-    weight = np.zeros((1, len(SIGNALS)), dtype=np.float32)
+    weight = np.zeros((1, len(DEFAULT_SIGNALS)), dtype=np.float32)
     weight[0, 1:3] = -angle_gain / plant.effort_limit, -velocity_gain / plant.effort_limit
     return _policy(plant, Network((weight,), (np.zeros(1, dtype=np.float32),)), **changes)
 

@@ -8,4 +8,5 @@ EXECUTABLES: dict[str, str] = {
     "effort_adapter": "pendulum_lqr.effort_adapter_node:main",
     "design": "pendulum_lqr.design_cli:main",
     "swing_up": "pendulum_lqr.swing_up_cli:main",
+    "convert_policy": "pendulum_lqr.convert_policy_cli:main",
 }

@@ -6,8 +6,9 @@ A policy sees the last ``history`` samples of its joints and answers with a torq
     y_k = bounded(network([sample_(k-history+1), ..., sample_k])),  |y_k| <= 1
     u_k = u_(k-1) + clamp(effort_limit y_k - u_(k-1), effort_rate period)
 
-with x the angle from upright. Before the first sample there was the first sample, at zero torque. All vectors hold one
-value for each joint, in the order of ``joints``; training and controller share this module, so that they agree.
+with x the angle from upright, in [-pi, pi); a policy may see a part of these, or x itself. Before the
+first sample there was the first sample, at zero torque. All vectors hold one value for each joint, in the order of
+``joints``; training and controller share this module, so that they agree.
 """
 
 from __future__ import annotations
@@ -27,6 +28,7 @@ from pendulum_msgs_py.plants.plant_parameters import DRIVETRAIN_SPECS, PLANT_SPE
 
 __all__ = [
     "ACTIVATIONS",
+    "DEFAULT_SIGNALS",
     "MODEL",
     "OUTPUTS",
     "SIGNALS",
@@ -41,8 +43,10 @@ Floats = NDArray[np.float32]
 
 MODEL = "rigid_pendulum"
 """Equation of motion that policies of this version are for."""
-SIGNALS = ("cos", "sin", "velocity", "effort")
+SIGNALS = ("angle", "cos", "sin", "velocity", "effort")
 """What a sample may hold of each joint, in this order; ``effort`` is the torque of the last answer."""
+DEFAULT_SIGNALS = SIGNALS[1:]
+"""What policies of our own training see: an angle jumps where cosine and sine do not."""
 ACTIVATIONS = ("tanh", "relu")
 OUTPUTS = ("clip", "tanh")
 _SAME = 1e-3
@@ -144,7 +148,7 @@ class Policy:
     velocity_scale: tuple[float, ...]
     angle_box: tuple[float, ...]
     velocity_box: tuple[float, ...]
-    signals: tuple[str, ...] = SIGNALS
+    signals: tuple[str, ...] = DEFAULT_SIGNALS
     history: int = 1
     provenance: Mapping[str, Any] = field(default_factory=dict)
 

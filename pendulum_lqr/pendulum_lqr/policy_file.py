@@ -10,9 +10,7 @@ from __future__ import annotations
 import io
 import json
 import math
-import stat
 import zipfile
-import zlib
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, NoReturn
@@ -20,12 +18,13 @@ from typing import Any, NoReturn
 import numpy as np
 from numpy.typing import NDArray
 
+from pendulum_lqr.bounded_files import read_bounded, read_parts, sentence_of, shown
 from pendulum_lqr.policy import MODEL, Network, Policy, fingerprint
 from pendulum_msgs_py.errors import DataError, PendulumError
 from pendulum_msgs_py.plants.plant_differences import describe_plants, read_pendulums
 from pendulum_msgs_py.whole_file import write_whole
 
-__all__ = ["FORMAT", "LARGEST_FILE", "dumps_policy", "load_policy", "loads_policy", "write_policy"]
+__all__ = ["FORMAT", "LARGEST_FILE", "dumps_policy", "header_of", "load_policy", "loads_policy", "write_policy"]
 
 FORMAT = "pendulum_policy/1"
 LARGEST_FILE = 4_000_000
@@ -62,7 +61,7 @@ def dumps_policy(policy: Policy) -> bytes:
     """Return the content of a policy file; equal policies give equal bytes."""
     network = policy.network
     vectors = np.random.default_rng(0).uniform(-1.0, 1.0, (_TEST_VECTORS, network.sizes[0])).astype(np.float32)
-    arrays: dict[str, NDArray[Any]] = {"header": np.frombuffer(_header(policy).encode(), dtype=np.uint8)}
+    arrays: dict[str, NDArray[Any]] = {"header": np.frombuffer(_header_text(policy).encode(), dtype=np.uint8)}
     for k, (weight, bias) in enumerate(zip(network.weights, network.biases, strict=True)):
         arrays[f"weight_{k}"] = np.ascontiguousarray(weight, dtype=np.float32)
         arrays[f"bias_{k}"] = np.ascontiguousarray(bias, dtype=np.float32)
@@ -89,23 +88,7 @@ def load_policy(path: str | Path) -> Policy:
     """
     path = Path(path).expanduser()
     where = f"policy file {path}"
-    try:
-        status = path.stat()
-        if not stat.S_ISREG(status.st_mode):
-            kind = "a folder" if stat.S_ISDIR(status.st_mode) else "a device or a pipe"
-            raise DataError(f"{where} is {kind}; expected a file")
-        if status.st_size > LARGEST_FILE:
-            raise DataError(f"{where} has {status.st_size} bytes; expected at most {LARGEST_FILE}")
-        with path.open("rb") as file:
-            content = file.read(LARGEST_FILE + 1)
-    except FileNotFoundError as error:
-        raise DataError(f"{where} does not exist") from error
-    except (OSError, ValueError) as error:
-        if isinstance(error, DataError):
-            raise
-        reason = error.strerror if isinstance(error, OSError) else str(error)
-        raise DataError(f"{where} cannot be read: {reason}") from error
-    return loads_policy(content, where)
+    return loads_policy(read_bounded(path, where, LARGEST_FILE), where)
 
 
 def loads_policy(content: bytes, where: str = "policy") -> Policy:
@@ -129,9 +112,10 @@ def loads_policy(content: bytes, where: str = "policy") -> Policy:
     return policy
 
 
-def _header(policy: Policy) -> str:
+def header_of(policy: Policy) -> dict[str, Any]:
+    """Return all that a file says of a policy beside its weights, as JSON values."""
     network = policy.network
-    header = {
+    return {
         "format": FORMAT,
         "model": MODEL,
         "name": policy.name,
@@ -150,8 +134,11 @@ def _header(policy: Policy) -> str:
         "layers": list(network.sizes),
         "provenance": dict(policy.provenance),
     }
+
+
+def _header_text(policy: Policy) -> str:
     try:
-        text = json.dumps(header, allow_nan=False, sort_keys=True)
+        text = json.dumps(header_of(policy), allow_nan=False, sort_keys=True)
     except (TypeError, ValueError, RecursionError) as error:
         raise DataError(f"provenance of policy {policy.name!r} holds what JSON has no word for: {error}") from error
     if len(text) > _LARGEST_HEADER:
@@ -163,29 +150,25 @@ def _read_arrays(content: bytes) -> dict[str, NDArray[Any]]:
     """Return the arrays of an archive, whose names and sizes are checked before it is unpacked."""
     if len(content) > LARGEST_FILE:
         raise DataError(f"it has {len(content)} bytes; expected at most {LARGEST_FILE}")
-    arrays = {}
-    try:
-        with zipfile.ZipFile(io.BytesIO(content)) as archive:
-            entries = archive.infolist()
-            names = [entry.filename.removesuffix(".npy") for entry in entries]
-            layers = sum(name.startswith("weight_") for name in names)
-            expected = {"header", "test_observations", "test_actions"}
-            expected |= {f"{kind}_{k}" for kind in ("weight", "bias") for k in range(layers)}
-            if len(names) != len(set(names)) or set(names) != expected or not 1 <= layers <= _MOST_LAYERS:
-                raise DataError(f"it holds {_shown(names)}; expected header, weight_k, bias_k and test vectors")
-            total = sum(entry.file_size for entry in entries)
-            if total > LARGEST_FILE:
-                raise DataError(f"its arrays take {total} bytes; expected at most {LARGEST_FILE}")
-            for name, entry in zip(names, entries, strict=True):
-                with archive.open(entry) as file:
-                    # What the directory says of the size is not believed either.
-                    data = file.read(entry.file_size + 1)
-                arrays[name] = _read_array(name, data, np.uint8 if name == "header" else np.float32)
-    except DataError:
-        raise
-    except (zipfile.BadZipFile, zlib.error, OSError, ValueError, NotImplementedError, RuntimeError, EOFError) as error:
-        raise DataError(f"it is no whole .npz archive ({_sentence(error)})") from error
-    return arrays
+    names: list[str] = []
+
+    def check(entries: list[zipfile.ZipInfo]) -> list[zipfile.ZipInfo]:
+        names[:] = [entry.filename.removesuffix(".npy") for entry in entries]
+        layers = sum(name.startswith("weight_") for name in names)
+        expected = {"header", "test_observations", "test_actions"}
+        expected |= {f"{kind}_{k}" for kind in ("weight", "bias") for k in range(layers)}
+        if len(names) != len(set(names)) or set(names) != expected or not 1 <= layers <= _MOST_LAYERS:
+            raise DataError(f"it holds {shown(names)}; expected header, weight_k, bias_k and test vectors")
+        total = sum(entry.file_size for entry in entries)
+        if total > LARGEST_FILE:
+            raise DataError(f"its arrays take {total} bytes; expected at most {LARGEST_FILE}")
+        return entries
+
+    parts = read_parts(content, ".npz", check)
+    return {
+        name: _read_array(name, data, np.uint8 if name == "header" else np.float32)
+        for name, data in zip(names, parts, strict=True)
+    }
 
 
 def _read_array(name: str, data: bytes, kind: type[np.generic]) -> NDArray[Any]:
@@ -199,12 +182,12 @@ def _read_array(name: str, data: bytes, kind: type[np.generic]) -> NDArray[Any]:
     except (ValueError, TypeError, SyntaxError, RecursionError, MemoryError) as error:
         if isinstance(error, DataError):
             raise
-        raise DataError(f"array {name} has no header that numpy reads ({_sentence(error)})") from error
+        raise DataError(f"array {name} has no header that numpy reads ({sentence_of(error)})") from error
     if dtype != np.dtype(kind) or fortran:
         raise DataError(f"array {name} holds {dtype}; expected {np.dtype(kind)} in C order")
     left = len(data) - stream.tell()
     if any(type(size) is not int or size < 0 for size in shape) or math.prod(shape) * dtype.itemsize != left:
-        raise DataError(f"array {name} of shape {_shown(shape)} has {left} bytes; expected as many as its shape says")
+        raise DataError(f"array {name} of shape {shown(shape)} has {left} bytes; expected as many as its shape says")
     return np.frombuffer(data, dtype=kind, offset=stream.tell()).reshape(shape)
 
 
@@ -216,15 +199,15 @@ def _read_header(raw: NDArray[Any]) -> dict[str, Any]:
     except DataError:
         raise
     except (ValueError, RecursionError) as error:
-        raise DataError(f"header is no JSON ({_sentence(error)})") from error
+        raise DataError(f"header is no JSON ({sentence_of(error)})") from error
     if not isinstance(header, dict):
         raise DataError(f"header is a {type(header).__name__}; expected a mapping")
     for key, wanted in (("format", FORMAT), ("model", MODEL)):
         if header.get(key) != wanted:
-            raise DataError(f"{key} is {_shown(header.get(key))}; expected {wanted!r}")
+            raise DataError(f"{key} is {shown(header.get(key))}; expected {wanted!r}")
     if set(header) != _KEYS:
         wrong = min(set(header) ^ _KEYS)
-        raise DataError(f"header {'lacks' if wrong in _KEYS else 'has the unknown key'} {_shown(wrong)}")
+        raise DataError(f"header {'lacks' if wrong in _KEYS else 'has the unknown key'} {shown(wrong)}")
     return header
 
 
@@ -237,18 +220,18 @@ def _build(header: Mapping[str, Any], arrays: Mapping[str, NDArray[Any]]) -> Pol
         output=_text(header, "output"),
     )
     if header["layers"] != list(network.sizes):
-        raise DataError(f"layers are {_shown(header['layers'])}; the weights say {list(network.sizes)}")
+        raise DataError(f"layers are {shown(header['layers'])}; the weights say {list(network.sizes)}")
     plant = read_pendulums(json.dumps([header["plant"]]))[0]
     if header["fingerprint"] != fingerprint(plant):
-        raise DataError(f"fingerprint is {_shown(header['fingerprint'])}; its plant has {fingerprint(plant)}")
+        raise DataError(f"fingerprint is {shown(header['fingerprint'])}; its plant has {fingerprint(plant)}")
     if type(header["history"]) is not int:
-        raise DataError(f"history is {_shown(header['history'])}; expected a whole number")
+        raise DataError(f"history is {shown(header['history'])}; expected a whole number")
     ranges, provenance = header["ranges"], header["provenance"]
     if not isinstance(ranges, dict) or not isinstance(provenance, dict):
         raise DataError("ranges or provenance is no mapping")
     pairs = {name: _numbers(pair, f"range of {name}", "") for name, pair in ranges.items()}
     if any(len(pair) != 2 for pair in pairs.values()):
-        raise DataError(f"ranges are {_shown(ranges)}; expected [low, high] for each")
+        raise DataError(f"ranges are {shown(ranges)}; expected [low, high] for each")
     vectors = {name: _numbers(header[name], name, name) for name in _VECTORS}
     return Policy(
         network=network,
@@ -295,28 +278,18 @@ def _numbers(values: Any, what: str, name: str) -> tuple[float, ...]:
         good = [type(value) in {int, float} and (abs(value) < 1e300 or (free and value == math.inf)) for value in given]
         if all(good):
             return tuple(float(value) for value in given)
-    raise DataError(f"{what} is {_shown(values)}; expected finite numbers")
+    raise DataError(f"{what} is {shown(values)}; expected finite numbers")
 
 
 def _text(header: Mapping[str, Any], key: str) -> str:
     value = header[key]
     if not isinstance(value, str) or not value.isprintable() or len(value) > 200:
-        raise DataError(f"{key} is {_shown(value)}; expected a line of text")
+        raise DataError(f"{key} is {shown(value)}; expected a line of text")
     return value
 
 
 def _texts(header: Mapping[str, Any], key: str) -> tuple[str, ...]:
     values = header[key]
     if not isinstance(values, list):
-        raise DataError(f"{key} is {_shown(values)}; expected a list")
+        raise DataError(f"{key} is {shown(values)}; expected a list")
     return tuple(_text({key: value}, key) for value in values)
-
-
-def _shown(value: Any) -> str:
-    text = repr(value)
-    return text if len(text) <= 100 else f"{text[:97]}..."
-
-
-def _sentence(error: BaseException) -> str:
-    text = " ".join(str(error).split()) or type(error).__name__
-    return text if len(text) <= 160 else f"{text[:157]}..."

@@ -25,6 +25,7 @@ SECTIONS: dict[str, dict[str, str]] = {
         "design": "pendulum_lqr design",
         "swing_up": "pendulum_lqr swing_up",
         "train": "pendulum_bags train",
+        "convert_policy": "pendulum_lqr convert_policy",
     },
     "See, move and stop what runs": {
         "console": "pendulum_bags console",

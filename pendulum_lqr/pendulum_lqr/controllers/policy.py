@@ -13,7 +13,7 @@ import numpy as np
 from pendulum_lqr.controller import BaseController, make_controller
 from pendulum_lqr.design import DesignError
 from pendulum_lqr.interface import Controller
-from pendulum_lqr.policy import Policy, require_plant
+from pendulum_lqr.policy import SIGNALS, Policy, require_plant
 from pendulum_lqr.policy_file import load_policy
 from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.parameters import ParameterSpec
@@ -79,7 +79,7 @@ class LearnedPolicy(BaseController):
         self._scale = policy.effort_limit[0]
         self._step = policy.effort_rate[0] * policy.period
         self._angle_box, self._velocity_box = policy.angle_box[0], policy.velocity_box[0]
-        self._signals = tuple(name in policy.signals for name in ("cos", "sin", "velocity", "effort"))
+        self._signals = tuple(name in policy.signals for name in SIGNALS)
         self.reset()
 
     @classmethod
@@ -177,6 +177,7 @@ class LearnedPolicy(BaseController):
     def _answer(self, angle: float, velocity: float) -> float:
         """Return the network's answer to the samples up to this one, within [-1, 1]."""
         values = (
+            angle,
             math.cos(angle),
             math.sin(angle),
             velocity / self.policy.velocity_scale[0],

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pendulum_bags.learning.task import SwingUpTask
-from pendulum_lqr.policy import SIGNALS
+from pendulum_lqr.policy import DEFAULT_SIGNALS
 from pendulum_msgs_py.contract.angles import wrap
 from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.plants.plant_parameters import PlantParameters
@@ -72,7 +72,7 @@ class SwingUp:
         self.count = count
         self.plant, self.task, self._ranges = plant, task, dict(ranges)
         self._generator = generator
-        self.observation_size = task.history * len(SIGNALS)
+        self.observation_size = task.history * len(DEFAULT_SIGNALS)
         self.limit = plant.effort_limit
         self.scale = velocity_scale(plant)
         self.step_limit = 2.0 * plant.effort_limit * task.period / task.rate_time
@@ -182,7 +182,7 @@ class SwingUp:
         return sample.astype(np.float32)
 
     def _sample(self) -> None:
-        size = len(SIGNALS)
+        size = len(DEFAULT_SIGNALS)
         self._samples[:, :-size] = self._samples[:, size:].copy()
         self._samples[:, -size:] = self._measure(slice(None))
 
