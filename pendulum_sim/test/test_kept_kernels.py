@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+import hashlib
+import importlib
+import math
 from collections.abc import Callable
 from pathlib import Path
+from types import FunctionType
 
 import numba
 import numpy as np
@@ -24,6 +28,18 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 def double(x: float) -> float:
     return 2.0 * x
+
+
+THEIRS = """
+import numba
+
+@numba.njit(forceinline=True)
+def inner(x):
+    return {factor} * x
+
+def law(x):
+    return inner(x)
+"""
 
 
 def triple(x: float) -> float:
@@ -60,6 +76,54 @@ def test_nothing_is_taken_that_other_source_was_compiled_to(folder: Path, monkey
     assert (changed(2.0), taken(changed)) == (5.0, False)
     assert (after(2.0), taken(after)) == (5.0, True)
     assert len(list(folder.rglob("*.nbk"))) == 1
+
+
+def test_what_another_version_kept_is_not_read_where_its_modules_are_gone(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    kernel(double)(2.0)
+    (file,) = folder.rglob("*.nbk")
+    head, _, _ = file.read_bytes().partition(b"\n")
+    content = b"cpendulum_msgs_py.no_longer_there\nkernel\n."
+    file.write_bytes(head.split()[0] + b" " + hashlib.sha256(content).hexdigest().encode() + b"\n" + content)
+    monkeypatch.setattr(kept_kernels, "_source_of", lambda package: "of another version")
+    changed = kernel(double)
+    assert (changed(2.0), taken(changed)) == (5.0, False)
+
+
+def test_functions_that_differ_in_a_name_or_in_what_they_keep_are_not_the_same() -> None:
+    def scaled(by: float) -> Callable[[float], float]:
+        return lambda x: by * x
+
+    def sine(x: float) -> float:
+        return math.sin(x)
+
+    cosine = FunctionType(
+        sine.__code__.replace(co_names=tuple(name.replace("sin", "cos") for name in sine.__code__.co_names)),
+        globals(),
+        "sine",
+    )
+    cosine.__qualname__ = sine.__qualname__
+    assert cosine(0.0) == 1.0
+    words = kept_kernels._words
+    assert words(sine) != words(cosine)
+    assert words(scaled(2.0)) != words(scaled(3.0))
+    assert words(scaled(2.0)) == words(scaled(2.0))
+
+
+def test_a_module_of_somebody_else_is_known_by_its_source(
+    folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As a plug-in has it: the function is the same, what it calls is not."""
+    (tmp_path / "their_law.py").write_text(THEIRS.format(factor=2.0), encoding="utf-8")
+    monkeypatch.syspath_prepend(str(tmp_path))
+    theirs = importlib.import_module("their_law")
+    kernel(theirs.law)(2.0)
+    (tmp_path / "their_law.py").write_text(THEIRS.format(factor=30.0), encoding="utf-8")
+    kept_kernels._source_of.cache_clear()
+    importlib.invalidate_caches()
+    changed = kernel(importlib.reload(theirs).law)
+    assert (changed(2.0), taken(changed)) == (61.0, False)
 
 
 @pytest.mark.parametrize("damage", [b"", b"no code", b"0" * 64 + b"\nno code"])

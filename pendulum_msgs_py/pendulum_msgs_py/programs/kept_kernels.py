@@ -13,7 +13,6 @@ import pickle
 import sys
 import tempfile
 from functools import cache
-from importlib.util import find_spec
 from pathlib import Path
 from types import FunctionType
 from typing import Any
@@ -52,10 +51,11 @@ class KernelStore:
         self._numba = sys.modules["numba.core"]
         self._folder = Path(self._numba.caching.CompileResultCacheImpl(function).locator.get_cache_path())
         self._name = name
-        packages = ("pendulum_msgs_py", function.__module__.partition(".")[0])
+        made_of = [function, *(each for each in choice if isinstance(each, FunctionType))]
+        packages = sorted({"pendulum_msgs_py", *(each.__module__.partition(".")[0] for each in made_of)})
         versions = (sys.version, sys.modules["numba"].__version__, sys.modules["llvmlite"].__version__)
         self._known = (name, packages, tuple(map(_words, choice)), versions)
-        self._source = tuple(_source_of(package) for package in packages)
+        self._source = _digest("".join(map(_source_of, packages)).encode())
 
     @property
     def cache_path(self) -> str:
@@ -67,23 +67,23 @@ class KernelStore:
         target.refresh()
         # Whatever a damaged file holds, compiling again mends it.
         with contextlib.suppress(OSError, ValueError, EOFError, pickle.UnpicklingError):
-            digest, _, content = self._path(signature, target.codegen()).read_bytes().partition(b"\n")
-            if digest == _digest(content):
-                source, payload = pickle.loads(content)  # noqa: S301  (our own, as the compiled modules beside it)
-                if source == self._source:
-                    return self._numba.compiler.CompileResult._rebuild(target, *payload)
+            head, _, content = self._path(signature, target.codegen()).read_bytes().partition(b"\n")
+            # Of other source it is not even read: what it names may be gone.
+            if head == self._head(content):
+                payload = pickle.loads(content)  # noqa: S301  (our own, as the compiled modules beside it)
+                return self._numba.compiler.CompileResult._rebuild(target, *payload)
         return None
 
     def save_overload(self, signature: Any, compiled: Any) -> None:
         """Keep a kernel, unless its code has addresses of this process."""
         if compiled.library.has_dynamic_globals or compiled.lifted:
             return
-        content = self._numba.serialize.dumps((self._source, compiled._reduce()))
+        content = self._numba.serialize.dumps(compiled._reduce())
         path = self._path(signature, compiled.library.codegen)
         with contextlib.suppress(OSError):
             # Whole or not at all: others may compile the same at this moment.
             with tempfile.NamedTemporaryFile(dir=self._folder, prefix=path.name, delete=False) as file:
-                file.write(_digest(content) + b"\n" + content)
+                file.write(self._head(content) + b"\n" + content)
             os.replace(file.name, path)
 
     def enable(self) -> None:
@@ -95,6 +95,9 @@ class KernelStore:
     def flush(self) -> None:
         """Do nothing: what is old is not taken, and written over."""
 
+    def _head(self, content: bytes) -> bytes:
+        return self._source + b" " + _digest(content)
+
     def _path(self, signature: Any, codegen: Any) -> Path:
         asked = repr((self._known, str(signature), codegen.magic_tuple()))
         return self._folder / f"{self._name}-{hashlib.sha256(asked.encode()).hexdigest()[:24]}.nbk"
@@ -102,8 +105,10 @@ class KernelStore:
 
 def _words(choice: object) -> str:
     if isinstance(choice, FunctionType):
-        code = hashlib.sha256(choice.__code__.co_code + repr(choice.__code__.co_consts).encode())
-        return f"{choice.__module__}.{choice.__qualname__} {code.hexdigest()}"
+        code = choice.__code__
+        kept = [_words(cell.cell_contents) for cell in choice.__closure__ or ()]
+        told = repr((code.co_code, code.co_consts, code.co_names, choice.__defaults__, kept))
+        return f"{choice.__module__}.{choice.__qualname__} {_digest(told.encode()).decode()}"
     return repr(choice)
 
 
@@ -113,10 +118,13 @@ def _digest(content: bytes) -> bytes:
 
 @cache
 def _source_of(package: str) -> str:
-    """Return what identifies all Python source of a package."""
-    spec = find_spec(package)
+    """Return what identifies all Python source of a package, or of a module that stands alone."""
+    module = sys.modules[package]
+    folders = [Path(each) for each in getattr(module, "__path__", ())]
+    files = [path for folder in folders for path in sorted(folder.rglob("*.py"))]
+    if not folders and (alone := getattr(module, "__file__", None)):
+        files = [Path(alone)]
     total = hashlib.sha256()
-    for folder in spec.submodule_search_locations or () if spec else ():
-        for path in sorted(Path(folder).rglob("*.py")):
-            total.update(f"{path.relative_to(folder)}\n".encode() + path.read_bytes())
+    for path in files:
+        total.update(f"{path}\n".encode() + path.read_bytes())
     return total.hexdigest()
