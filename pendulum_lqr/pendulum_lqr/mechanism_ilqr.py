@@ -15,6 +15,7 @@ differential dynamic programming, ICRA 2014.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from functools import cache
 from typing import Any, NamedTuple
@@ -25,6 +26,8 @@ from numpy.typing import NDArray
 
 from pendulum_lqr.ilqr_functions import cost_functions, step_functions
 from pendulum_lqr.small_matrices import copy, eliminate, newton, product
+from pendulum_msgs_py.contract.values import written
+from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.joints import Vector
 from pendulum_msgs_py.mechanisms import MECHANISMS
 from pendulum_msgs_py.plants.mechanism_parameters import MechanismParameters
@@ -106,7 +109,12 @@ class IlqrProblem:
             iterations: Largest number of iterations; 0 only follows the guess.
             around: A plan whose feedback follows the guess, of as many intervals: on an unstable plant a guess
                 that begins a little beside its plan ends anywhere without.
+
+        Raises:
+            ParameterError: The start is not finite: limits would make efforts of what is no number.
         """
+        if not all(map(math.isfinite, (*q, *v, *u))):
+            raise ParameterError(f"plan begins at {written((*q, *v, *u))}; expected finite numbers")
         coordinates = self.plant.coordinates
         n, m = len(q), len(u)
         solve = _kernel(self.plant.mechanism.name, coordinates.driven)

@@ -12,13 +12,14 @@ import numpy as np
 import pytest
 
 from pendulum_lqr import swing_up_cli
-from pendulum_lqr.mechanism_catch import deviation_of, make_mechanism_catch
+from pendulum_lqr.mechanism_catch import CaughtRegion, MechanismCatch, deviation_of, make_mechanism_catch
 from pendulum_lqr.mechanism_controllers import (
     default_catch,
     make_mechanism_controller,
     stored_trajectory,
 )
 from pendulum_lqr.mechanism_ilqr import IlqrProblem, IlqrWeights
+from pendulum_lqr.mechanism_model import linearise_mechanism, mechanism_lqr
 from pendulum_lqr.mechanism_mpc import MechanismMpc
 from pendulum_lqr.mechanism_trajectory import load_trajectory, write_trajectory
 from pendulum_lqr.mechanism_tvlqr import MechanismTvlqr
@@ -116,6 +117,15 @@ def test_iterative_lqr_and_mpc_bring_a_cart_pole_up_within_its_limits() -> None:
     assert max(abs(effort[0]) for effort in efforts) <= plant.effort_limits[0]
     controller.reset()
     assert controller.command(0.0, (0.0,) * 4) == efforts[0]
+
+
+def test_nothing_is_planned_from_a_state_that_is_no_number() -> None:
+    plant = load_mechanism("cart_pole")
+    gain = mechanism_lqr(linearise_mechanism(plant), *plant.mechanism.weights)
+    controller = MechanismMpc(plant, DT, MechanismCatch(plant, gain, CaughtRegion(1.0, 0)))
+    for x in ((0.0, math.nan, 0.0, 0.0), (0.0, 0.0, 0.0, math.inf)):
+        with pytest.raises(ParameterError, match=r"plan begins at .*(nan|inf).*; expected finite numbers"):
+            controller.command(0.0, x)
 
 
 def test_a_search_whose_file_cannot_be_written_ends_before_it_begins(

@@ -10,8 +10,6 @@ from pendulum_msgs_py.plants.mechanism_parameters import MechanismParameters
 
 __all__ = ["JointSwingUp"]
 
-_WEIGHTS = ((10.0, 10.0, 1.0, 1.0), 1.0)
-
 
 class JointSwingUp(JointController):
     """From hanging along the swing-up that comes with the project for a preset; where it is lost, no effort at all.
@@ -28,7 +26,7 @@ class JointSwingUp(JointController):
         super().__init__(plant.effort_limits)
         trajectory = stored_trajectory(plant)
         self._duration = trajectory.duration
-        q, r = _WEIGHTS
+        q, r = plant.mechanism.weights
         self._inner = MechanismTvlqr(plant, period, trajectory, default_catch(plant), q=q, r=r)
 
     def reset(self) -> None:
