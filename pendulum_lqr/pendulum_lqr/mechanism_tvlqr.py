@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import cmath
+import math
 from collections.abc import Sequence
 
 import numpy as np
@@ -112,6 +113,7 @@ class MechanismTvlqr:
         self.gains, self.costs = tracking_gains(plant, self.states, self.efforts, period, q, r, catch.gain.S)
         self._tube = tube * catch.region.level
         self._limits = plant.effort_limits
+        self._turning = np.array([joint.turns for joint in plant.mechanism.joints] + [False] * len(names))
         self.reset()
 
     def reset(self) -> None:
@@ -119,16 +121,18 @@ class MechanismTvlqr:
         self.catch.active = False
         self._following = True
         self._began: float | None = None
+        self._turned = np.zeros(len(self._turning))
         if self.recover is not None:
             self.recover.reset()
 
     def command(self, t: float, x: Vector) -> Vector:
         """Return the efforts [N m or N]."""
         if self._began is None:
-            self._began = t
+            # Hanging is hanging, however often it has turned before: the trajectory knows nothing of whole turns.
+            self._began, self._turned = t, 2.0 * math.pi * np.rint(np.array(x) / (2.0 * math.pi)) * self._turning
         k = round((t - self._began) / self.period)
         if self._following and k < len(self.efforts):
-            error = np.array(x) - self.states[k]
+            error = np.array(x) - self._turned - self.states[k]
             if float(error @ self.costs[k] @ error) <= self._tube:
                 return within_limits(self.efforts[k] - self.gains[k] @ error, self._limits)
         self._following = False

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 from pendulum_lqr import swing_up_cli
+from pendulum_lqr.controllers.joint_lqr import make_joint_controller
 from pendulum_lqr.mechanism_catch import CaughtRegion, MechanismCatch, deviation_of, make_mechanism_catch
 from pendulum_lqr.mechanism_controllers import (
     default_catch,
@@ -83,6 +84,18 @@ def test_tracking_brings_a_disturbed_swing_up_upright_and_open_loop_does_not(nam
     assert controller.command(2 * DT, (0.0,) * 4) == (0.0,)
     controller.reset()
     assert controller.command(0.0, (0.0,) * 4) != (0.0,)
+
+
+def test_a_swing_up_begins_at_hanging_whatever_turns_were_made_before() -> None:
+    plant = load_mechanism("acrobot_frictionless")
+    controller = make_joint_controller("tvlqr", plant, {}, DT)
+    fresh = [controller.command(k * DT, (0.0, 0.0), (0.0, 0.0)) for k in range(5)]
+    for turns in ((1, 0), (-1, 2)):
+        controller.reset()
+        hanging = (2.0 * math.pi * turns[0], 2.0 * math.pi * turns[1])
+        again = [controller.command(k * DT, hanging, (0.0, 0.0)) for k in range(5)]
+        assert again == [pytest.approx(effort, abs=1e-9) for effort in fresh]
+    assert any(effort != (0.0,) for effort in fresh)
 
 
 @pytest.mark.timeout(400)
