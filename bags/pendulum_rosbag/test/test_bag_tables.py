@@ -106,15 +106,17 @@ def test_bursts_of_events_leave_no_gaps_but_a_periodic_topic_without_stamps_does
     assert (result.gaps, result.missing) == (1, 2)
 
 
-def test_latencies_are_matched_by_echoed_stamps(tmp_path: Path) -> None:
+@pytest.mark.parametrize("joints", [["pendulum_joint"], ["shoulder", "elbow"]], ids=["one joint", "two joints"])
+def test_latencies_are_matched_by_echoed_stamps(tmp_path: Path, joints: list[str]) -> None:
     path = tmp_path / "bag"
     with open_writer(path) as writer:
         writer.add_topic("/joint_states", JOINT_STATE)
         writer.add_topic("/effort_command", JOINT_STATE)
         for index in range(1, 200):
             stamp = index * 2_000_000
-            writer.write("/joint_states", stamp + 100_000, encode_joint_state(stamp, position=1.0))
-            writer.write("/effort_command", stamp + 350_000, encode_joint_state(stamp, frame_id="lqr", effort=1.0))
+            ones = [1.0] * len(joints)
+            writer.write("/joint_states", stamp + 100_000, joint_state(stamp, "", joints, ones, ones, ones))
+            writer.write("/effort_command", stamp + 350_000, joint_state(stamp, "lqr", joints, [], [], ones))
     statistics = bag_statistics(read_bag(path))
     (latency,) = statistics.latencies
     assert (latency.source, latency.answer, latency.matched) == ("/joint_states", "/effort_command", 199)

@@ -195,19 +195,19 @@ def clock_jumps(log_times: Int64, stamps: Int64) -> list[int]:
     return found
 
 
-def _latencies(arrays: dict[str, npt.NDArray[Any]]) -> list[Latency]:
-    """Match stamps between all topics that echo each other."""
+def _latencies(times: dict[str, tuple[Int64, Int64]]) -> list[Latency]:
+    """Match stamps between all topics that echo each other; log times and stamps by topic [ns]."""
     found = []
-    for source, a in arrays.items():
-        for answer, b in arrays.items():
-            if source == answer or len(a) == 0 or len(b) == 0:
+    for source, (sent_at, sent) in times.items():
+        stamps, first = np.unique(sent, return_index=True)
+        for answer, (answered_at, answered) in times.items():
+            if source == answer or len(sent) == 0 or len(answered) == 0:
                 continue
-            stamps, first = np.unique(a["stamp_ns"], return_index=True)
-            place = np.minimum(np.searchsorted(stamps, b["stamp_ns"]), len(stamps) - 1)
-            same = stamps[place] == b["stamp_ns"]
-            if same.sum() < max(2, _LEAST_SHARE * len(b)):
+            place = np.minimum(np.searchsorted(stamps, answered), len(stamps) - 1)
+            same = stamps[place] == answered
+            if same.sum() < max(2, _LEAST_SHARE * len(answered)):
                 continue
-            delays = (b["log_time_ns"][same] - a["log_time_ns"][first[place[same]]]) * _MS
+            delays = (answered_at[same] - sent_at[first[place[same]]]) * _MS
             if np.median(delays) <= 0:
                 continue  # the other direction is the answer (or all log times are the stamps themselves)
             median, p99 = np.quantile(delays, [0.5, 0.99])
@@ -233,15 +233,20 @@ def bag_statistics(bag: Bag) -> BagStatistics:
     result = BagStatistics(
         str(bag.path), bag.storage, (bag.stop_ns - bag.start_ns) * 1e-9, total, damage=list(bag.damage)
     )
-    arrays: dict[str, npt.NDArray[Any]] = {}
+    echoes: dict[str, tuple[Int64, Int64]] = {}
     for name, info in bag.topics.items():
-        values = bag[name] if info.type == "sensor_msgs/msg/JointState" and info.serialization == "cdr" else None
+        is_joint_state = info.type == "sensor_msgs/msg/JointState" and info.serialization == "cdr"
+        values = bag[name] if is_joint_state else None
+        stamps: Int64 | None
         if isinstance(values, np.ndarray):
-            arrays[name] = values
+            log_times, stamps = values["log_time_ns"], values["stamp_ns"]
             senders = values["frame_id"] if "frame_id" in (values.dtype.names or ()) else None
-            result.topics[name] = time_statistics(info.type, values["log_time_ns"], values["stamp_ns"], senders)
+            result.topics[name] = time_statistics(info.type, log_times, stamps, senders)
         else:
-            result.topics[name] = time_statistics(info.type, *_times(bag, info))
-    result.latencies = _latencies(arrays)
+            log_times, stamps = _times(bag, info)
+            result.topics[name] = time_statistics(info.type, log_times, stamps)
+        if is_joint_state and stamps is not None:
+            echoes[name] = log_times, stamps
+    result.latencies = _latencies(echoes)
     result.events = bag.events()
     return result

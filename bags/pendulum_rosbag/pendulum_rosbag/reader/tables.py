@@ -21,9 +21,11 @@ if TYPE_CHECKING:
     import pandas as pd
     from rosbags.typesys.store import Typestore
 
-__all__ = ["FORMATS", "export_bag", "to_pandas"]
+__all__ = ["FORMATS", "LEROBOT", "export_bag", "require_pyarrow", "to_pandas"]
 
 FORMATS = ("parquet", "csv")
+LEROBOT = "lerobot"
+"""Format of :mod:`pendulum_rosbag.reader.lerobot`."""
 _ARROW_NAMES = {"bool": "bool_", "byte": "uint8", "char": "uint8", "octet": "uint8", "wstring": "string"}
 """Names of ROS's types at Arrow, where they differ."""
 
@@ -64,9 +66,9 @@ def export_bag(bag: Bag, folder: Path, format: str = "parquet") -> list[Path]:
         DataError: A topic cannot be read.
     """
     if format not in FORMATS:
-        raise ParameterError(f"format is {format!r}; expected one of {', '.join(FORMATS)}")
+        raise ParameterError(f"format is {format!r}; expected one of {', '.join((*FORMATS, LEROBOT))}")
     if format == "parquet":
-        _require_pyarrow()
+        require_pyarrow(format)
     if folder.exists():
         raise BagError(f"{folder} exists already; expected a new folder")
     files = []
@@ -150,12 +152,13 @@ def _arrow_fields(kind: str, store: Typestore, prefix: str = "") -> Iterator[tup
             yield f"{prefix}{name}", item(node, detail)
 
 
-def _require_pyarrow() -> None:
+def require_pyarrow(format: str) -> None:
+    """Check that the library of Parquet is there; raise a ParameterError that says how to get it."""
     try:
         import pyarrow  # noqa: F401
     except ImportError as error:
         reason = str(error).splitlines()[0]
-        text = how_to_install(error) or f"format parquet needs pyarrow, which cannot be imported: {reason}"
+        text = how_to_install(error) or f"format {format} needs pyarrow, which cannot be imported: {reason}"
         raise ParameterError(text) from error
 
 
