@@ -71,7 +71,8 @@ def test_the_six_packages_are_wheels_with_launch_files_and_layouts(wheels: Path)
     for ending in (
         "share/pendulum_lqr/launch/bringup.launch.py",
         "share/pendulum_sim/rviz/pendulum.rviz",
-        "share/pendulum_bags/config/foxglove_layout.json",
+        "share/pendulum_bags/config/plotjuggler_layout.xml",
+        "pendulum_bags/live/foxglove_layout.json",
         "pendulum_bags/console/static/console.js",
         "pendulum_msgs_py/plants/presets/thesis.yaml",
     ):

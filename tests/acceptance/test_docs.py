@@ -16,6 +16,7 @@ from xml.etree import ElementTree
 import pytest
 import yaml
 
+from pendulum_bags.live.foxglove_cli import LAYOUT
 from pendulum_msgs_py.contract import names
 from tests.fixtures import PROJECT
 from tests.processes import ProcessGroup, RunningProgram
@@ -123,14 +124,17 @@ def test_layouts_show_signals_that_exist() -> None:
     plotjuggler = {str(curve.get("name")) for curve in curves}
     assert {name.split("/")[2] for name in plotjuggler} == known
     assert {name.split("/")[1] for name in plotjuggler} == {"sim", "hw"}
-    layout = json.loads((folder / "foxglove_layout.json").read_text(encoding="utf-8"))
+    layout = json.loads(LAYOUT.read_text(encoding="utf-8"))
     # Panels are named by their type; the layout may show those only that are configured.
     kinds = {name.partition("!")[0] for name in layout["configById"]}
-    assert kinds == {"Plot", "3D", "DiagnosticSummary"}
+    assert kinds == {"Plot", "3D", "DiagnosticSummary", "CallService", "Parameters"}
     assert set(re.findall(r"\w+![\w]+", json.dumps(layout["layout"]))) <= set(layout["configById"])
     panels = [panel for name, panel in layout["configById"].items() if name.startswith("Plot!")]
     paths = {path["value"].split(".")[0] for panel in panels for path in panel["paths"]}
     assert paths == {f"/{side}/{topic}" for side in ("sim", "hw") for topic in known}
+    called = {panel["serviceName"] for name, panel in layout["configById"].items() if name.startswith("CallService!")}
+    services = [name.removeprefix("~/") for name in (names.ARM, names.E_STOP, names.E_STOP_RESET)]
+    assert called == {f"{plant}/{service}" for plant in ("/sim/simulator", "/hw/bridge") for service in services}
 
 
 def test_the_controller_manager_is_told_our_joint() -> None:

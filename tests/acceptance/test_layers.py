@@ -165,6 +165,7 @@ def test_an_experiment_comes_to_its_verdict_and_report_with_the_first_layer_alon
     ("command", "library", "extra"),
     [
         ("pendulum_bags console", "uvicorn", "pendulum_bags[console]"),
+        ("pendulum_bags foxglove", "foxglove", "pendulum_bags[foxglove]"),
         ("pendulum_sim mujoco --ros-args -p model:=m.xml", "mujoco", "pendulum_sim[mujoco]"),
         (
             "pendulum_bags experiment lockstep --bag b --simulation gymnasium:Pendulum-v1",

@@ -18,6 +18,7 @@ EXECUTABLES: dict[str, str] = {
     "export": "pendulum_rosbag.reader.export_cli:main",
     "play": "pendulum_rosbag.player.player_node:main",
     "console": "pendulum_bags.console.console_cli:main",
+    "foxglove": "pendulum_bags.live.foxglove_cli:main",
     "info": "pendulum_rosbag.reader.info_cli:main",
     "repair": "pendulum_rosbag.repair.repair_cli:main",
 }

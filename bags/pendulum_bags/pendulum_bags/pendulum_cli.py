@@ -29,6 +29,7 @@ SECTIONS: dict[str, dict[str, str]] = {
     },
     "See, move and stop what runs": {
         "console": "pendulum_bags console",
+        "foxglove": "pendulum_bags foxglove",
         "move": "pendulum_bags move",
         "viewer": "pendulum_sim viewer",
         "phase_plot": "pendulum_sim phase_plot",

@@ -15,7 +15,7 @@ _PACKAGES = (
     "pendulum_hw_bridge",
     "pendulum_bags",
 )
-_DISTRIBUTIONS = {"hebi": "hebi-py", "PIL": "pillow", "dask": "distributed"}
+_DISTRIBUTIONS = {"foxglove": "foxglove-sdk", "hebi": "hebi-py", "PIL": "pillow", "dask": "distributed"}
 """Module -> what pip calls it, where the names differ."""
 _REQUIREMENT = re.compile(r"^([A-Za-z0-9._-]+)[^;]*(?:;.*extra\s*==\s*[\"']([\w-]+)[\"'])?")
 

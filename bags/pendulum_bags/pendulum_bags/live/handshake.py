@@ -1,0 +1,105 @@
+"""Who may open a websocket: programs and viewers of this machine, pages that the user named, bearers of the token.
+
+A page of any site that is open in a browser here can reach ``localhost``, and would find a service that arms a plant.
+The browser sends the page's ``Origin`` with it, which is what tells it from a viewer.
+"""
+
+from __future__ import annotations
+
+import hmac
+from collections.abc import Collection, Mapping
+from dataclasses import dataclass
+from urllib.parse import parse_qs, urlsplit
+
+from pendulum_bags.console.security import is_loopback
+from pendulum_msgs_py.errors import FaultError
+
+__all__ = ["VIEWERS", "Request", "as_asked", "parse", "refusal", "to_server"]
+
+VIEWERS = frozenset({"https://app.foxglove.dev", "file://"})
+"""Origins that are let in besides those of this machine: Foxglove in a browser, and desktop programs (Electron)."""
+NEWER = "foxglove.sdk.v1"
+OLDER = "foxglove.websocket.v1"
+"""Name under which the same messages went before, and by which Lichtblick asks for them."""
+_PROTOCOL = "sec-websocket-protocol"
+
+
+@dataclass(frozen=True)
+class Request:
+    """A request for a websocket.
+
+    Args:
+        query: Of the address, without the question mark.
+        headers: By their names in lower case.
+    """
+
+    query: str
+    headers: Mapping[str, str]
+
+    @property
+    def is_websocket(self) -> bool:
+        """Whether a websocket is asked for, and not a page."""
+        return self.headers.get("upgrade", "").lower() == "websocket"
+
+    @property
+    def protocols(self) -> list[str]:
+        """Names of the protocols that the client speaks, in its order."""
+        return [name.strip() for name in self.headers.get(_PROTOCOL, "").split(",") if name.strip()]
+
+
+def parse(head: bytes) -> Request:
+    """Read the head of a request.
+
+    Args:
+        head: Up to and with the empty line.
+
+    Raises:
+        FaultError: It is none of HTTP.
+    """
+    first, *lines = head.decode("latin-1").split("\r\n")
+    words = first.split(" ")
+    if len(words) != 3 or not words[2].startswith("HTTP/"):
+        raise FaultError("this is no request of HTTP; expected one for a websocket")
+    pairs = (line.partition(":") for line in lines if line)
+    return Request(urlsplit(words[1]).query, {name.strip().lower(): value.strip() for name, _, value in pairs})
+
+
+def refusal(request: Request, token: str, origins: Collection[str] = ()) -> str:
+    """Return why a request is refused, or an empty text.
+
+    Args:
+        request: The request.
+        token: What it must bear; empty where only loopback is served.
+        origins: Origins of pages that may connect without a token, besides the known viewers.
+    """
+    if token:
+        given = parse_qs(request.query).get("token", [""])[0]
+        if hmac.compare_digest(given.encode(), token.encode()):
+            return ""
+        return "the token is missing or wrong; open the address that was printed at the start"
+    origin = request.headers.get("origin")
+    if origin is None or origin in VIEWERS or origin in origins or is_loopback(urlsplit(origin).hostname or ""):
+        return ""
+    return f"the page of {origin} is none of this machine; --origin {origin} lets it in"
+
+
+def to_server(head: bytes) -> bytes:
+    """Return the head of a request as the server understands it, the protocol by its newer name."""
+    return _rename(head, OLDER, NEWER)
+
+
+def as_asked(head: bytes, request: Request) -> bytes:
+    """Return the head of the server's answer with the name of the protocol that the client asked for."""
+    if NEWER in request.protocols or OLDER not in request.protocols:
+        return head
+    return _rename(head, NEWER, OLDER)
+
+
+def _rename(head: bytes, old: str, new: str) -> bytes:
+    lines = head.decode("latin-1").split("\r\n")
+    for index, line in enumerate(lines):
+        name, colon, value = line.partition(":")
+        if colon and name.strip().lower() == _PROTOCOL:
+            names = dict.fromkeys(new if each.strip() == old else each.strip() for each in value.split(","))
+            lines[index] = f"{name}: {', '.join(names)}"
+    return "\r\n".join(lines).encode("latin-1")

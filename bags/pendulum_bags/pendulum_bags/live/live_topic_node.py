@@ -1,0 +1,96 @@
+"""One topic as viewers get it: the bytes of the graph, subscribed to while somebody looks."""
+
+from __future__ import annotations
+
+import importlib
+from typing import Any
+
+import foxglove
+from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+
+from pendulum_msgs_py.ros.polled import PolledInput, PollingNode
+from pendulum_rosbag.reader.joint_state import Trimmer
+from pendulum_rosbag.recorder.recorder_tap_node import wanted_qos
+from pendulum_rosbag.storage.message_types import message_type
+
+__all__ = ["LiveTopic"]
+
+_DEPTH = 2000
+"""Messages that the middleware holds between two visits: four seconds at 500 Hz."""
+
+
+class LiveTopic:
+    """A topic and its channel.
+
+    Args:
+        node: The node that subscribes.
+        topic: Full name.
+        type_name: ``package/msg/Name``.
+        context: Context of the viewers' server.
+
+    Raises:
+        ImportError: The type of the messages is not installed.
+
+    Attributes:
+        sent: Messages that were handed on.
+        lost: Messages that are missing between them, as their numbers tell; counted while one publisher is there.
+    """
+
+    def __init__(self, node: PollingNode, topic: str, type_name: str, context: Any) -> None:
+        package, _, short = type_name.split("/")
+        module = importlib.import_module(f"{package}.msg")
+        if not hasattr(module, short):
+            raise ImportError(f"{package}.msg has no {short}")
+        self._class = getattr(module, short)
+        self._node = node
+        self._topic = topic
+        self._trim = Trimmer() if type_name == "sensor_msgs/msg/JointState" else bytes
+        text = message_type(type_name).definition.encode()
+        schema = foxglove.Schema(name=type_name, encoding="ros2msg", data=text)
+        self._channel = foxglove.Channel(topic, message_encoding="cdr", schema=schema, context=context)
+        self._source: PolledInput | None = None
+        self._has_one_publisher = False
+        self._newest: int | None = None
+        self.sent = 0
+        self.lost = 0
+
+    def take(self) -> None:
+        """Hand on what has arrived, if anybody looks; subscribe to the topic, or let go of it, as that changes."""
+        if not self._channel.has_sinks():
+            self._let_go()
+            return
+        if self._source is None:
+            self._source = self._subscribe()
+        log, trim = self._channel.log, self._trim
+        for data, info in self._source.messages():
+            log(trim(data), log_time=info["received_timestamp"] or None)
+            self.sent += 1
+            number = info["publication_sequence_number"]
+            if self._has_one_publisher and self._newest is not None and number > self._newest:
+                self.lost += number - self._newest - 1
+            self._newest = number
+
+    def look(self) -> None:
+        """Take note of who publishes: the numbers of several count nothing."""
+        self._has_one_publisher = self._node.count_publishers(self._topic) == 1
+
+    def close(self) -> None:
+        """Tell viewers that the topic is gone."""
+        self._let_go()
+        self._channel.close()
+
+    def _let_go(self) -> None:
+        if self._source is not None:
+            self._node.destroy_polled_input(self._source)
+            self._source = self._newest = None
+
+    def _subscribe(self) -> PolledInput:
+        # What is kept for latecomers comes to reliable subscribers alone. Of the rest nothing is acknowledged: that
+        # would cost the plants time, for a picture.
+        _, latched = wanted_qos(self._node.get_publishers_info_by_topic(self._topic))
+        profile = QoSProfile(
+            depth=_DEPTH,
+            reliability=ReliabilityPolicy.RELIABLE if latched else ReliabilityPolicy.BEST_EFFORT,
+            durability=DurabilityPolicy.TRANSIENT_LOCAL if latched else DurabilityPolicy.VOLATILE,
+        )
+        return self._node.create_polled_input(self._class, self._topic, profile)
