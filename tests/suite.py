@@ -120,6 +120,7 @@ class Part:
         self._arguments = arguments
         self._workers = min(workers, os.cpu_count() or 1)
         self._nice = nice
+        self._popen: subprocess.Popen[bytes] | None = None
         self._output = tempfile.TemporaryFile()  # noqa: SIM115  (lives as long as the part)
 
     def start(self) -> None:
@@ -148,15 +149,19 @@ class Part:
     @property
     def code(self) -> int | None:
         """Return pytest's exit code, None while it runs."""
-        return self._popen.poll()
+        return None if self._popen is None else self._popen.poll()
 
-    def end(self) -> None:
-        """End all that runs, as Ctrl-C does in a terminal; what does not end in time is killed."""
-        for number in (signal.SIGINT, signal.SIGKILL):
+    def send(self, number: int) -> None:
+        """Send a signal to all of its processes, as a terminal does on Ctrl-C; what tests started ends with them."""
+        if self._popen is not None:
             with contextlib.suppress(ProcessLookupError):
                 os.killpg(self._popen.pid, number)
+
+    def wait(self, timeout: float) -> None:
+        """Wait for its end, but no longer than a time [s]."""
+        if self._popen is not None:
             with contextlib.suppress(subprocess.TimeoutExpired):
-                self._popen.wait(_PATIENCE)
+                self._popen.wait(timeout)
 
     def output(self) -> str:
         """Return what pytest has printed, once it has ended."""
@@ -194,10 +199,10 @@ def run_parts(parts: Sequence[Part]) -> int:
                 print(f"{_clock(told - begin)}  {'; '.join(map(_progress, parts))}", flush=True)
     except KeyboardInterrupt:
         print("interrupted: ending what runs", flush=True)
+        _end(parts)
         for part in parts:
-            part.end()
-        for part in parts:
-            print(part.output())
+            if "failed" in part.outcomes.values():
+                print(part.output())
         return int(pytest.ExitCode.INTERRUPTED)
     for part in parts:
         print(f"\n{f' {part.name} ':=^100}\n{part.output()}")
@@ -207,6 +212,16 @@ def run_parts(parts: Sequence[Part]) -> int:
         print(f"{duration:7.1f} s  {test}")
     print(f"{'; '.join(map(_progress, parts))}; took {_clock(time.monotonic() - begin)} min")
     return exit_code([part.code or 0 for part in parts])
+
+
+def _end(parts: Sequence[Part]) -> None:
+    for number in (signal.SIGINT, signal.SIGKILL):
+        for part in parts:
+            part.send(number)
+        # Who asks again wants it at once.
+        with contextlib.suppress(KeyboardInterrupt):
+            for part in parts:
+                part.wait(_PATIENCE)
 
 
 def exit_code(codes: Sequence[int]) -> int:
