@@ -6,6 +6,7 @@ import socket
 import urllib.error
 import urllib.request
 from collections.abc import Iterator
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -128,13 +129,17 @@ def test_two_clients_see_stop_tune_and_meet_a_new_simulator(
     delays = []
     desk.get_by_role("heading", name="Pendulum console").click()  # out of the field, which takes a space as text
     for _ in range(5):
+        # What is shown may still be of the stop before: this one is a key pressed later, and a mode that began later.
+        before = desk.evaluate("pendulumConsole.stopPressed")
         desk.keyboard.press("Space")
-        wait_for(lambda: _mode(desk) == "e_stop", 5, "the e-stop")
+        plant = "pendulumConsole.plants['/sim']"
+        told = f"pendulumConsole.stopPressed > {before} && {plant}.mode === 'e_stop'"
+        told += f" && {plant}.mode_ms >= pendulumConsole.stopPressed"
+        wait_for(partial(desk.evaluate, told), 20, "the e-stop")
         delays.append(float(desk.evaluate("pendulumConsole.plants['/sim'].mode_ms - pendulumConsole.stopPressed")))
         wait_for(lambda: _mode(phone) == "e_stop", 5, "the other client to see it")
         desk.get_by_role("button", name="Reset e-stop /sim").click()
         wait_for(lambda: _mode(desk) == "disarmed", 10, "the reset")
-    assert min(delays) >= 0.0, delays
     assert min(delays) <= STOP_LIMIT_MS, delays
     desk.get_by_role("button", name="Arm /sim", exact=True).click()
     wait_for(lambda: _mode(desk) == "armed_effort", 10, "the plant to be armed")
