@@ -9,6 +9,8 @@ run, at the measured velocity, both by a small multisine. The two answers give b
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
@@ -35,32 +37,41 @@ _ANGLE, _VELOCITY = 1e-4, 1e-2
 _FALLEN = 0.5
 
 
-def controller_response(name: str, plant: PlantParameters, frequency: ArrayLike, period: float) -> tuple[Complex, bool]:
+def controller_response(
+    name: str,
+    plant: PlantParameters,
+    frequency: ArrayLike,
+    period: float,
+    values: Mapping[str, object] | None = None,
+    size: float = 1.0,
+) -> tuple[Complex, bool]:
     """Return K at some frequencies, shape (2, n) [N m/rad, N m s/rad], and whether the loop with the model is stable.
 
     Args:
-        name: Controller, with its default parameters.
+        name: Controller.
         plant: Plant that it is designed for.
         frequency: Shape (n,), below the Nyquist frequency [Hz]; interpolated between lines 0.05 Hz apart.
         period: Sampling period [s].
+        values: Its parameters by name; others at their default.
+        size: Of the disturbances, as a factor on 0.1 mrad and 0.01 rad/s.
 
     Raises:
-        ParameterError: No such controller.
+        ParameterError: No such controller, or it is not for this plant or period.
     """
     model = discretise(linearise(plant), period)
-    size = round(_LENGTH / period)
-    lines = np.arange(1, size // 2)
+    samples = round(_LENGTH / period)
+    lines = np.arange(1, samples // 2)
     generator = np.random.default_rng(1)
-    spectrum = np.zeros(size // 2 + 1, dtype=np.complex128)
+    spectrum = np.zeros(samples // 2 + 1, dtype=np.complex128)
     spectrum[lines] = np.exp(2j * np.pi * generator.uniform(size=lines.size))
-    wave = np.fft.irfft(spectrum, size)
+    wave = np.fft.irfft(spectrum, samples)
     wave /= np.abs(wave).max()
     wanted = np.asarray(frequency, dtype=np.float64)
     answers = np.empty((1, 2, lines.size), dtype=np.complex128)
     seen = np.empty((2, 2, lines.size), dtype=np.complex128)
     for run, scale in enumerate((_ANGLE, _VELOCITY)):
-        controller = make_controller(name, plant, period)
-        found = _closed_loop(controller, model, scale * wave, run, period)
+        controller = make_controller(name, plant, period, values)
+        found = _closed_loop(controller, model, size * scale * wave, run, period)
         if found is None:
             return np.zeros((2, wanted.size), dtype=np.complex128), False
         effort, measured = found

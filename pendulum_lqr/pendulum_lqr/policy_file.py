@@ -7,6 +7,7 @@ file shows. Nothing in it is executed: arrays of numbers alone, no pickles. Size
 
 from __future__ import annotations
 
+import hashlib
 import io
 import json
 import math
@@ -24,9 +25,22 @@ from pendulum_msgs_py.errors import DataError, PendulumError
 from pendulum_msgs_py.plants.plant_differences import describe_plants, read_pendulums
 from pendulum_msgs_py.whole_file import write_whole
 
-__all__ = ["FORMAT", "LARGEST_FILE", "dumps_policy", "header_of", "load_policy", "loads_policy", "write_policy"]
+__all__ = [
+    "FORMAT",
+    "LARGEST_FILE",
+    "POLICY_SUFFIX",
+    "dumps_policy",
+    "header_of",
+    "load_policy",
+    "loads_policy",
+    "named_controller",
+    "policy_record",
+    "write_policy",
+]
 
 FORMAT = "pendulum_policy/1"
+POLICY_SUFFIX = ".npz"
+"""What the name of a policy file ends with, where a controller's name may stand too."""
 LARGEST_FILE = 4_000_000
 """Largest file accepted, and largest sum of its arrays [bytes]: a network of 64 x 64 takes 20 thousand."""
 _LARGEST_HEADER = 100_000
@@ -89,6 +103,40 @@ def load_policy(path: str | Path) -> Policy:
     path = Path(path).expanduser()
     where = f"policy file {path}"
     return loads_policy(read_bounded(path, where, LARGEST_FILE), where)
+
+
+def named_controller(text: str) -> tuple[str, dict[str, str]]:
+    """Return kind and parameters of a controller that is named, or of the one that answers with a policy file.
+
+    Args:
+        text: A name, or the path of a policy file, known by ``POLICY_SUFFIX``.
+
+    Raises:
+        DataError: The file cannot be read.
+    """
+    if not text.endswith(POLICY_SUFFIX):
+        return text, {}
+    load_policy(text)
+    return "policy", {"policy": str(Path(text).expanduser().resolve())}
+
+
+def policy_record(parameters: Mapping[str, Any]) -> dict[str, str]:
+    """Return what the record of a run says of a policy file beside its path: the file may be another one tomorrow.
+
+    Args:
+        parameters: Of the controller.
+
+    Returns:
+        The digest of the file under ``policy_sha256``; nothing where no policy answers or its file cannot be read.
+    """
+    path = parameters.get("policy")
+    if not isinstance(path, str) or not path:
+        return {}
+    try:
+        content = read_bounded(Path(path).expanduser(), f"policy file {path}", LARGEST_FILE)
+    except DataError:
+        return {}
+    return {"policy_sha256": hashlib.sha256(content).hexdigest()}
 
 
 def loads_policy(content: bytes, where: str = "policy") -> Policy:

@@ -5,22 +5,25 @@ from __future__ import annotations
 import json
 import re
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
 from pendulum_bags.comparison.compare_cli import main as compare
 from pendulum_bags.frequency_response.analyse import MACHINE, NUMBERS, analyse_responses
-from pendulum_bags.frequency_response.designs import design_text
+from pendulum_bags.frequency_response.designs import design_rows, design_text
 from pendulum_bags.report.report_cli import main as report
 from pendulum_bags.runs.run_folder import write_json
 from pendulum_bags.verdict import write_layer
 from pendulum_lqr.gap_metric import Scaling
 from pendulum_lqr.measured_response import MeasuredResponse, read_response, write_response
 from pendulum_lqr.model import linearise
+from pendulum_lqr.policy_file import write_policy
 from pendulum_lqr.sampled_response import model_response
 from pendulum_msgs_py.plants.plant_parameters import load_plant
-from tests.synthetic_runs import write_run_folder
+from tests.policies import linear_policy
+from tests.synthetic_runs import regulate, run_metadata, write_bag, write_run_folder
 
 GOOD, BAD = "q=100,0.01 r=0.1", "k=400,0.1"
 
@@ -111,3 +114,67 @@ def test_the_report_draws_the_certified_gains_of_a_measured_machine(
 def test_the_name_of_a_design_says_how_to_ask_for_it_again(machine: Path, text: str) -> None:
     (design,) = analyse_responses([read_response(machine)], "thesis", [text]).designs
     assert design_text(design.name) == text
+
+
+def policy_file(folder: Path, gains: tuple[float, float], **changes: Any) -> Path:
+    policy = linear_policy(load_plant("thesis"), *gains, **changes)
+    return write_policy(folder / "policy.npz", policy)
+
+
+def test_a_policy_that_is_a_gain_near_upright_is_certified_as_that_gain(machine: Path, tmp_path: Path) -> None:
+    policy = policy_file(tmp_path, (33.0, 1.0))
+    gain, learned = analyse_responses([read_response(machine)], "thesis", ["k=33,1", str(policy)]).designs
+    assert gain.certified
+    assert (learned.name, learned.certified, learned.unknown) == ("policy policy.npz", True, "")
+    for name in ("margin", "distance", "worst_modulus"):
+        assert getattr(learned.certificate, name) == pytest.approx(getattr(gain.certificate, name), abs=2e-3)
+    weak = analyse_responses([read_response(machine)], "thesis", [str(policy_file(tmp_path, (400.0, 0.1)))])
+    assert [one.certified for one in weak.designs] == [False]
+    assert weak.layers[0].mark.value in {"no", "undecided"}
+
+
+@pytest.mark.parametrize(
+    ("gains", "changes", "words"),
+    [
+        # Beyond 1 mrad it is at its limit: a switch, of which no linear certificate speaks.
+        ((4e4, 40.0), {}, "is no linear law near upright|does not settle near upright"),
+        ((1.0, 0.0), {}, "does not settle near upright"),
+        ((33.0, 1.0), {"period": 0.05}, "answers every 0.05 s, and the hardware was measured every 0.01 s"),
+    ],
+)
+def test_a_policy_without_a_linear_law_is_unknown_and_never_certified(
+    machine: Path, tmp_path: Path, gains: tuple[float, float], changes: dict[str, float], words: str
+) -> None:
+    path = policy_file(tmp_path, gains, **changes)
+    analysis = analyse_responses([read_response(machine)], "thesis", [GOOD, str(path)])
+    good, learned = analysis.designs
+    assert (good.certified, learned.certified, learned.undecided) == (True, False, True)
+    assert re.search(words, learned.unknown)
+    layer = analysis.layers[0]
+    assert layer.mark.value == "undecided"
+    assert [row.note for row in layer.evidence if "policy" in row.quantity] == [f"unknown: {learned.unknown}"]
+    assert any("experiment thesis --controller" in step for step in layer.next_steps)
+    assert design_rows(analysis.designs)[1][-1] == f"unknown: {learned.unknown}"
+
+
+def test_compare_asks_about_the_policy_that_ran_even_after_its_file_is_gone(
+    machine: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    policy = policy_file(tmp_path, (33.0, 1.0))
+    for side in ("sim", "hw"):
+        metadata = run_metadata(1)
+        metadata["pendulum.run"].update(controller={"kind": "policy", "policy": str(policy)})
+        columns = regulate(rate=100.0, seed=1, hardware=side == "hw")
+        write_bag(tmp_path / "run" / side, columns, f"/{side}", metadata=metadata, ramps=False)
+    arguments = [str(tmp_path / "run"), "--machine", str(machine), "--json"]
+    assert compare(arguments) == 0
+    found = json.loads(capsys.readouterr().out)["designs"]
+    assert [(one["name"], one["certified"]) for one in found][-1] == ("policy policy.npz", True)
+    assert len(found) == 4
+    policy.unlink()
+    assert compare(arguments) == 0
+    last = json.loads(capsys.readouterr().out)["designs"][-1]
+    assert (last["certified"], last["unknown"]) == (False, f"policy file {policy} does not exist")
+    # Who asks for it by name is told at once.
+    assert compare([*arguments, "--design", str(policy)]) == 2
+    assert "does not exist" in capsys.readouterr().err

@@ -19,10 +19,13 @@ from pendulum_bags.ranking.present import same_choice, write_ranking
 from pendulum_bags.ranking.ranking import Ranking, mmrv, rank
 from pendulum_bags.ranking.ranking_cli import main
 from pendulum_bags.verdict import Layer, Mark
+from pendulum_lqr.policy_file import write_policy
 from pendulum_msgs_py.errors import DataError, ParameterError
+from pendulum_msgs_py.plants.plant_parameters import load_plant
 from pendulum_rosbag.reader.mcap_source import McapSource
 from pendulum_rosbag.repair.repair import repair_bag
 from pendulum_rosbag.storage import open_writer
+from tests.policies import linear_policy
 from tests.synthetic_runs import regulate, run_metadata, write_bag, write_events_and_torque
 
 COSTS = st.lists(st.tuples(st.floats(0.1, 10.0), st.floats(0.1, 10.0)), min_size=3, max_size=8)
@@ -400,3 +403,18 @@ def test_the_page_names_the_pairs(tmp_path):
     found = rank([contender("stiff", 1.0, 4.0), contender("soft", 2.0, 2.0), contender("slack", 6.0, 6.5)])
     text = write_ranking(tmp_path, found, formats=("png",)).read_text(encoding="utf-8")
     assert "Pairs in the wrong order" in text
+
+
+def test_two_policies_of_one_file_name_are_two_and_named_by_their_files(tmp_path):
+    plant = load_plant("thesis")
+    for number, gains in enumerate(((33.0, 1.0), (20.0, 1.0), (50.0, 2.0))):
+        # Trained anew, to the same file: the record tells them apart.
+        path = write_policy(tmp_path / "trained.npz", linear_policy(plant, *gains))
+        for side in ("sim", "hw"):
+            spec = RunSpec(side=side, controller="policy", controller_parameters={"policy": str(path)})
+            columns = regulate(rate=100, seed=1, duration=0.5, hardware=side == "hw")
+            bag = tmp_path / f"{side}_{number}"
+            write_bag(bag, columns, f"/{side}", metadata=spec.metadata(), ramps=False)
+    names = {one.name for one in collect_contenders([tmp_path])}
+    assert len(names) == 3
+    assert all(name.startswith("policy trained (file=") and str(tmp_path) not in name for name in names)

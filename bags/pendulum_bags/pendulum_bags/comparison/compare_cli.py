@@ -38,8 +38,9 @@ DesignOption = Annotated[
     list[str] | None,
     typer.Option(
         "--design",
-        help="Design whose certificate for the measured machine is wanted: 'q=100,0.01 r=0.1', 'k=33,0.2' or a "
-        "controller's name; several times if wanted. By default those that were certified when it was measured.",
+        help="Design whose certificate for the measured machine is wanted: 'q=100,0.01 r=0.1', 'k=33,0.2', a "
+        "controller's name or a policy file (.npz); several times if wanted. By default those that were certified when "
+        "it was measured, and the policy that ran.",
     ),
 ]
 MachineOption = Annotated[

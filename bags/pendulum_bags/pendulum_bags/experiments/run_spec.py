@@ -13,6 +13,7 @@ from pendulum_bags.runs.run_folder import provenance
 from pendulum_bags.runs.run_record import RUN_RECORD, STAND_IN
 from pendulum_lqr.controller import controller_parameters
 from pendulum_lqr.disturbance import DISTURBANCE_SPECS
+from pendulum_lqr.policy_file import policy_record
 from pendulum_msgs_py.contract.angles import UPRIGHT
 from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.parameters import reject_unknown, validate
@@ -223,6 +224,7 @@ class RunSpec:
                 "namespace": self.namespace,
                 "disturbance": self.disturbance_parameters(),
                 "controller": {"kind": self.controller, **self.controller_parameters},
+                **policy_record(self.controller_parameters),
                 **provenance(),
             }
         }

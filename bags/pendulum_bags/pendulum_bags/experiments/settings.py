@@ -14,7 +14,7 @@ from pendulum_bags.experiments.simulation import ForeignSimulation
 from pendulum_bags.runs.run_folder import provenance
 from pendulum_bags.runs.run_record import RUN_RECORD, STAND_IN
 from pendulum_lqr.controller import controller_parameters
-from pendulum_lqr.policy_file import load_policy
+from pendulum_lqr.policy_file import POLICY_SUFFIX, load_policy, policy_record
 from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.programs import graph
 from pendulum_msgs_py.programs.graph import NodeProgram
@@ -135,7 +135,7 @@ class RegulationSettings:
     @property
     def kind(self) -> str:
         """Kind of controller: ``policy`` for a policy file."""
-        return "policy" if Path(self.controller).suffix == ".npz" else self.controller
+        return "policy" if self.controller.endswith(POLICY_SUFFIX) else self.controller
 
     @property
     def tuning(self) -> dict[str, list[float] | float | str]:
@@ -273,6 +273,7 @@ class RegulationSettings:
                 "seed": self.noise.seed,
                 "disturbance": {"kind": "uniform", **asdict(self.noise)},
                 "controller": {"kind": self.kind, **self.tuning},
+                **policy_record(self.tuning),
                 **provenance(),
                 **({} if foreign is None else {"simulation": foreign.to_json()}),
                 **({STAND_IN: "simulation"} if side == "hw" and self.foreign_of("hw") is not None else {}),

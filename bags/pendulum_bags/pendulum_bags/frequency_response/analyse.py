@@ -12,7 +12,7 @@ from threadpoolctl import threadpool_limits
 
 from pendulum_bags.figures.render_files import write_figures
 from pendulum_bags.frequency_response.compare import compare_responses
-from pendulum_bags.frequency_response.designs import DesignResult, certify_designs, design_text
+from pendulum_bags.frequency_response.designs import DesignResult, certify_designs, design_text, policies_of
 from pendulum_bags.frequency_response.estimate import estimate
 from pendulum_bags.frequency_response.figures import response_figures
 from pendulum_bags.frequency_response.layers import GAP_MARGIN, same_plant, which_controllers
@@ -45,7 +45,7 @@ NUMBERS = "frequency_response.json"
 """File in which it keeps what was found."""
 
 
-def read_responses(paths: Sequence[Path]) -> tuple[list[MeasuredResponse], str]:
+def read_responses(paths: Sequence[Path]) -> tuple[list[MeasuredResponse], str, list[str]]:
     """Return the measured responses of bags or of a run folder, simulation first, and the plant they were designed on.
 
     Args:
@@ -66,17 +66,19 @@ def read_responses(paths: Sequence[Path]) -> tuple[list[MeasuredResponse], str]:
     runs = [read_run(path) for path in paths]
     found = []
     plant = "thesis"
+    policies: dict[str, None] = {}
     for i, run in enumerate(runs):
         facts = run_record(run.metadata)
         side = str(facts.get("side") or str(facts.get("namespace", "")).strip("/"))
         label = side if side in {"sim", "hw"} else ("hw" if len(runs) == 1 or i else "sim")
         plant = str(facts.get("design_plant") or plant)
+        policies |= dict.fromkeys(policies_of(facts))
         measured = estimate(record_of_run(run))
         found.append(_labelled(measured, label))
     if len(found) == 2 and found[0].label == found[1].label:
         # Two of one kind: the order in which they were given tells which is held against which.
         found = [_labelled(found[0], "sim"), _labelled(found[1], "hw")]
-    return sorted(found, key=lambda response: response.label, reverse=True), plant
+    return sorted(found, key=lambda response: response.label, reverse=True), plant, list(policies)
 
 
 def _labelled(measured: MeasuredResponse, label: str) -> MeasuredResponse:
@@ -90,6 +92,7 @@ def analyse_responses(
     *,
     scaling: Scaling = DEFAULT_SCALING,
     margin: float = GAP_MARGIN,
+    recorded: bool = False,
 ) -> Analysis:
     """Return what responses tell.
 
@@ -99,6 +102,7 @@ def analyse_responses(
         designs: As :func:`pendulum_bags.frequency_response.designs.certify_designs` reads them.
         scaling: Units of the gap.
         margin: Gap between the plants that does not matter.
+        recorded: Whether the designs come from a recording, not from who asks now.
     """
     parameters = load_plant(plant)
     model = linearise(parameters)
@@ -111,7 +115,7 @@ def analyse_responses(
         layers.append(same_plant(by_label["sim"], by_label["hw"], difference, margin))
     if "hw" in by_label:
         certifier = Certifier(model, Machine.of(by_label["hw"]), scaling)
-        results = certify_designs(designs, parameters, model, certifier)
+        results = certify_designs(designs, parameters, model, certifier, recorded=recorded)
         layers.append(which_controllers(certifier, results))
     return Analysis(responses, model, plant, difference, certifier, results, layers, scaling)
 
@@ -121,7 +125,7 @@ def find_machine(folders: Sequence[Path]) -> Path | None:
     return next((folder for folder in folders if (folder / MACHINE).is_file()), None)
 
 
-def analyse_machine(machine: Path, plant: str, designs: Sequence[str] = ()) -> Analysis:
+def analyse_machine(machine: Path, plant: str, designs: Sequence[str] = (), ran: Sequence[str] = ()) -> Analysis:
     """Return which designs carry over to a machine that was measured before.
 
     Args:
@@ -129,6 +133,7 @@ def analyse_machine(machine: Path, plant: str, designs: Sequence[str] = ()) -> A
         plant: Preset or file of the plant that designs are made on.
         designs: As :func:`pendulum_bags.frequency_response.designs.certify_designs` reads them; by default those that
             were certified when it was measured, and else the four combinations of the thesis.
+        ran: Policy files that ran in the recording; they are asked about too, unless ``designs`` says of what.
 
     Raises:
         DataError: The file holds no response.
@@ -136,7 +141,13 @@ def analyse_machine(machine: Path, plant: str, designs: Sequence[str] = ()) -> A
     """
     measured = replace(read_response(machine), label="hw")
     kept = _kept(machine)
-    return analyse_responses([measured], plant, designs or kept.designs, scaling=kept.scaling)
+    return analyse_responses(
+        [measured],
+        plant,
+        designs or list(dict.fromkeys([*kept.designs, *ran])),
+        scaling=kept.scaling,
+        recorded=not designs,
+    )
 
 
 class _Kept(NamedTuple):
@@ -151,7 +162,9 @@ def _kept(machine: Path) -> _Kept:
     path = (machine if machine.is_dir() else machine.parent) / NUMBERS
     try:
         content = json.loads(path.read_text(encoding="utf-8"))
-        return _Kept([design_text(one["name"]) for one in content["designs"]], Scaling(**content["scaling"]))
+        return _Kept(
+            [one.get("text") or design_text(one["name"]) for one in content["designs"]], Scaling(**content["scaling"])
+        )
     except (OSError, ValueError, KeyError, TypeError):
         return _Kept()
 

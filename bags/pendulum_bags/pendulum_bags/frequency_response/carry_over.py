@@ -7,6 +7,7 @@ from pathlib import Path
 
 from pendulum_bags.comparison import Comparison
 from pendulum_bags.frequency_response.analyse import analyse_machine, find_machine
+from pendulum_bags.frequency_response.designs import policies_of
 from pendulum_bags.frequency_response.result import Analysis
 from pendulum_bags.runs.run_record import run_record
 from pendulum_bags.verdict import Layer, LayerResult
@@ -43,7 +44,7 @@ def carry_over(
             )
         return None
     facts = run_record(comparison.pairs[0].simulation.metadata)
-    return analyse_machine(place, str(facts.get("plant") or "thesis"), designs)
+    return analyse_machine(place, str(facts.get("plant") or "thesis"), designs, policies_of(facts))
 
 
 def layers_of(analysis: Analysis | None) -> list[LayerResult]:

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -14,13 +15,18 @@ from pendulum_lqr.controller_response import controller_response
 from pendulum_lqr.design import output_lqr
 from pendulum_lqr.design_cli import THESIS_WEIGHTS
 from pendulum_lqr.model import LinearModel
-from pendulum_msgs_py.errors import ParameterError
+from pendulum_lqr.policy_file import POLICY_SUFFIX, load_policy
+from pendulum_msgs_py.errors import ParameterError, PendulumError
 from pendulum_msgs_py.plants.plant_parameters import PlantParameters
 
-__all__ = ["DesignResult", "certify_designs", "design_rows", "design_text"]
+__all__ = ["DesignResult", "certify_designs", "design_rows", "design_text", "policies_of"]
 
 _NUMBER = r"[-+0-9.eE]+"
 _WEIGHTS = re.compile(rf"q=({_NUMBER}),({_NUMBER})(?:[ ;]+r=({_NUMBER}))?")
+_LARGER = 10.0
+"""A law is linear near upright if it answers to disturbances of this size as to those of size 1 ..."""
+_NOT_LINEAR = 0.1
+"""... within this share at each frequency, angle and velocity counted in units of the task."""
 _GAIN = re.compile(rf"k=({_NUMBER}),({_NUMBER})")
 
 
@@ -32,11 +38,25 @@ class DesignResult:
         name: As in tables.
         K: Gain on [theta, theta_dot] [N m/rad, N m s/rad]; None for a controller that is no gain.
         certificate: What is known of it.
+        unknown: Why nothing is known of it, in words; empty where the certificate speaks.
+        text: What :func:`certify_designs` reads for it, where the name does not tell.
     """
 
     name: str
     K: tuple[float, float] | None
     certificate: Certificate
+    unknown: str = ""
+    text: str = ""
+
+    @property
+    def certified(self) -> bool:
+        """Whether it is certified for the measured machine."""
+        return self.certificate.certified and not self.unknown
+
+    @property
+    def undecided(self) -> bool:
+        """Whether it is neither certified nor refused."""
+        return self.certificate.undecided or bool(self.unknown)
 
     def to_json(self) -> dict[str, Any]:
         """Return it as JSON values."""
@@ -44,7 +64,9 @@ class DesignResult:
         return {
             "name": self.name,
             "K": list(self.K) if self.K is not None else None,
-            "certified": found.certified,
+            "certified": self.certified,
+            "unknown": self.unknown,
+            "text": self.text,
             "by_gap": found.by_gap,
             "by_frequency": found.by_frequency,
             "margin": found.margin,
@@ -56,22 +78,30 @@ class DesignResult:
 
 
 def certify_designs(
-    texts: Sequence[str], plant: PlantParameters, model: LinearModel, certifier: Certifier
+    texts: Sequence[str], plant: PlantParameters, model: LinearModel, certifier: Certifier, *, recorded: bool = False
 ) -> list[DesignResult]:
     """Return the certificates of designs that were made on a plant.
 
     Args:
-        texts: ``q=100,0.01 r=0.1`` for LQR, ``k=33,0.2`` for a gain, or a controller's name; none for the four
-            combinations of the thesis.
+        texts: ``q=100,0.01 r=0.1`` for LQR, ``k=33,0.2`` for a gain, a controller's name or a policy file; none for the
+            four combinations of the thesis.
         plant: The plant.
         model: Its linear model.
         certifier: Of the model and the measured machine.
+        recorded: Whether somebody named them earlier: a policy file that cannot be read any more is then unknown.
 
     Raises:
-        ParameterError: A text is no design.
+        ParameterError: A text is no design, or a policy is not for the plant.
+        DataError: A policy file cannot be read.
     """
     asked = list(texts) or [f"q={q[0]:g},{q[1]:g} r={r:g}" for q, r in THESIS_WEIGHTS]
-    return [_one(text.strip(), plant, model, certifier) for text in asked]
+    found = []
+    for text in map(str.strip, asked):
+        if text.endswith(POLICY_SUFFIX):
+            found.append(_policy(text, plant, certifier, recorded=recorded))
+        else:
+            found.append(_one(text, plant, model, certifier))
+    return found
 
 
 def design_rows(designs: Sequence[DesignResult]) -> list[tuple[str, ...]]:
@@ -79,6 +109,9 @@ def design_rows(designs: Sequence[DesignResult]) -> list[tuple[str, ...]]:
     rows: list[tuple[str, ...]] = []
     for number, design in enumerate(designs, 1):
         found = design.certificate
+        if design.unknown:
+            rows.append((str(number), design.name, "–", "–", "–", f"unknown: {design.unknown}"))
+            continue
         how = "by its margin" if found.by_gap else "by frequency" if found.by_frequency else "no"
         if found.undecided:
             how = "undecided: measure longer"
@@ -98,6 +131,54 @@ def design_rows(designs: Sequence[DesignResult]) -> list[tuple[str, ...]]:
 def design_text(name: str) -> str:
     """Return the text that :func:`certify_designs` reads for a design of a name in a table."""
     return re.sub(r"^K=", "k=", re.sub(r"\(([^()]+), ([^()]+)\)", r"\1,\2", name.removeprefix("LQR ")))
+
+
+def policies_of(record: Mapping[str, Any]) -> list[str]:
+    """Return the policy file that answered in a recorded run, as a list; none for any other controller.
+
+    Args:
+        record: What a bag says of its run.
+    """
+    controller = record.get("controller")
+    told = controller.get("policy") if isinstance(controller, Mapping) else None
+    return [told] if isinstance(told, str) and told.endswith(POLICY_SUFFIX) else []
+
+
+def _policy(path: str, plant: PlantParameters, certifier: Certifier, *, recorded: bool) -> DesignResult:
+    """Return what is known of a learned policy around upright, by its answers to disturbances of two sizes."""
+    machine = certifier.machine
+    name, text = f"policy {Path(path).name}", str(Path(path).expanduser().resolve())
+    nothing = certifier.feedback(np.zeros((2, machine.frequency.size), dtype=np.complex128), stable=False)
+    try:
+        own = load_policy(path).period
+        if round(own / machine.period) != 1:
+            return DesignResult(
+                name, None, nothing, f"it answers every {own:g} s, and the hardware was measured every "
+                f"{machine.period:g} s", text,
+            )  # fmt: skip
+        values = {"policy": text}
+        answers = [
+            controller_response("policy", plant, machine.frequency, machine.period, values, size)
+            for size in (1.0, _LARGER)
+        ]
+    except PendulumError as error:
+        if not recorded:
+            raise
+        return DesignResult(name, None, nothing, str(error), text)
+    if not all(stable for _, stable in answers):
+        return DesignResult(
+            name, None, nothing, "its loop with the model does not settle near upright, so it has no linear law", text
+        )
+    units = np.array([[certifier.scaling.angle], [certifier.scaling.velocity]])
+    small, large = (np.linalg.norm(units * K, axis=0) for K in (answers[0][0], answers[1][0] - answers[0][0]))
+    change = float(np.max(large / small))
+    unknown = ""
+    if change > _NOT_LINEAR:
+        unknown = (
+            f"it is no linear law near upright: its answer to disturbances {_LARGER:g} times as large differs by "
+            f"{100.0 * change:.0f} %"
+        )
+    return DesignResult(name, None, certifier.feedback(answers[0][0], stable=True), unknown, text)
 
 
 def _one(text: str, plant: PlantParameters, model: LinearModel, certifier: Certifier) -> DesignResult:

@@ -143,11 +143,11 @@ def gap_figure(certifier: Certifier, difference: Difference | None, designs: Seq
     marks = [
         Mark(design.certificate.margin, "y", f"{design.name}: b = {design.certificate.margin:.2f}")
         for design in designs
-        if design.certificate.stable_on_model
+        if design.certificate.stable_on_model and not design.unknown
     ]
     # Labels on top of each other say nothing: the smallest and the largest margin serve.
     marks = [min(marks, key=lambda m: m.value), max(marks, key=lambda m: m.value)] if len(marks) > 2 else marks
-    passing = sum(design.certificate.by_gap for design in designs)
+    passing = sum(design.certificate.by_gap and not design.unknown for design in designs)
     sentence = (
         f"The nu-gap between model and hardware is {profile.value:.3f}, at most {profile.value_upper:.3f} with 95 % "
         f"confidence, largest at {profile.at:.2g} Hz: {passing} of {len(designs)} designs have a larger margin "

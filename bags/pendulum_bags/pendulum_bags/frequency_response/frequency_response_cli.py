@@ -25,8 +25,8 @@ app = typer.Typer(add_completion=False, rich_markup_mode=None)
 Design = Annotated[
     list[str] | None,
     typer.Option(
-        help="Design to certify: 'q=100,0.01 r=0.1', 'k=33,0.2' or a controller's name; may be given again. Default: "
-        "the four combinations of the thesis."
+        help="Design to certify: 'q=100,0.01 r=0.1', 'k=33,0.2', a controller's name or a policy file (.npz); may be "
+        "given again. Default: the policy that ran, or the four combinations of the thesis."
     ),
 ]
 Angle = Annotated[float, typer.Option(help="Angle that the task allows, one unit of the gap [rad].")]
@@ -65,8 +65,10 @@ def frequency_response(
     from pendulum_lqr.gap_metric import Scaling
 
     scaling = Scaling(angle, velocity, torque)
-    responses, told = read_responses(bags)
-    analysis = analyse_responses(responses, plant or told, design or (), scaling=scaling, margin=gap_margin)
+    responses, told, ran = read_responses(bags)
+    analysis = analyse_responses(
+        responses, plant or told, design or ran, scaling=scaling, margin=gap_margin, recorded=not design
+    )
     _tell(make_console(stderr=json_output, highlight=False), analysis, out, json_output=json_output)
 
 
@@ -77,7 +79,9 @@ def experiment(
     ] = None,
     plant: Annotated[str, typer.Option(help="Simulated plant, and plant of the designs: preset or file.")] = "thesis",
     strategy: Annotated[str, typer.Option(help="How the emulated actuator turns torque into PWM.")] = "direct_pwm",
-    controller: Annotated[str, typer.Option(help="Kind of controller that holds both plants meanwhile.")] = "lqr",
+    controller: Annotated[
+        str, typer.Option(help="Controller that holds both plants meanwhile, or a policy file (.npz).")
+    ] = "lqr",
     realtime: Annotated[bool, typer.Option(help="Keep the wall's time, instead of lockstep.")] = False,
     amplitude: Annotated[float, typer.Option(help="Largest torque of the multisine [N m].")] = 2.5,
     signal_period: Annotated[float, typer.Option(help="Length of one period of it [s].")] = 4.0,
@@ -108,8 +112,10 @@ def experiment(
     from pendulum_bags.frequency_response.analyse import analyse_responses, read_responses
     from pendulum_bags.runs.run_folder import create_run_folder, discard_if_empty
     from pendulum_lqr.gap_metric import Scaling
+    from pendulum_lqr.policy_file import named_controller
 
     scaling = Scaling(angle, velocity, torque)
+    kind, parameters = named_controller(controller)
     check_domain(domain)
     disturbance = {
         "kind": "multisine", "amplitude": amplitude, "signal_period": signal_period, "frequency": lowest,
@@ -122,7 +128,8 @@ def experiment(
             plant=plant if side == "sim" else "thesis",
             design_plant=plant,
             strategy=strategy,
-            controller=controller,
+            controller=kind,
+            controller_parameters=parameters,
             disturbance=disturbance,
             duration=signal_period * (periods + 1) + 0.1,
             seed=seed,
@@ -142,8 +149,8 @@ def experiment(
                 progress.phase("simulation" if spec.side == "sim" else "hardware", length)
                 record_run(folder / spec.side, spec, domain=domain, on_wait=progress.refresh)
             progress.phase("analysing", 12.0)
-            responses, told = read_responses([folder])
-            analysis = analyse_responses(responses, told, design or (), scaling=scaling, margin=gap_margin)
+            responses, told, ran = read_responses([folder])
+            analysis = analyse_responses(responses, told, design or ran, scaling=scaling, margin=gap_margin)
     except KeyboardInterrupt:
         kept = "nothing was recorded" if discard_if_empty(folder) else f"what was recorded is in {folder}"
         console.print(f"interrupted: all programs have ended; {kept}")

@@ -90,12 +90,12 @@ def which_controllers(certifier: Certifier, designs: Sequence[DesignResult]) -> 
         designs: Certified or not.
     """
     profile = certifier.profile
-    good = [design for design in designs if design.certificate.certified]
-    bad = [design for design in designs if not design.certificate.certified]
-    unsure = bool(bad) and all(design.certificate.undecided for design in bad)
+    good = [design for design in designs if design.certified]
+    bad = [design for design in designs if not design.certified]
+    unsure = bool(bad) and all(design.undecided for design in bad)
     mark = Mark.YES if designs and not bad else Mark.UNDECIDED if unsure else Mark.NO
-    rows = ", ".join(f"row {i}" for i, d in enumerate(designs, 1) if d.certificate.certified)
-    not_rows = ", ".join(f"row {i}" for i, d in enumerate(designs, 1) if not d.certificate.certified)
+    rows = ", ".join(f"row {i}" for i, d in enumerate(designs, 1) if d.certified)
+    not_rows = ", ".join(f"row {i}" for i, d in enumerate(designs, 1) if not d.certified)
     limit = (
         f"designs with a margin b above {profile.value_upper:.2f} stabilise the hardware too"
         if profile.value_upper < 1.0
@@ -114,9 +114,15 @@ def which_controllers(certifier: Certifier, designs: Sequence[DesignResult]) -> 
     steps = tuple(
         f"redesign {design.name} with more margin, or identify the hardware and design again"
         for design in bad
-        if not design.certificate.undecided
+        if not design.undecided
     )
-    if any(design.certificate.undecided for design in bad):
+    steps += tuple(
+        f"record {design.name} on simulator and emulator: python -m pendulum_bags experiment thesis --controller "
+        "FILE.npz"
+        for design in bad
+        if design.unknown
+    )
+    if any(design.undecided and not design.unknown for design in bad):
         steps += ("measure longer: python -m pendulum_bags experiment frequency_response --periods 40",)
     return LayerResult(
         Layer.WHICH_CONTROLLERS,
@@ -134,6 +140,10 @@ def which_controllers(certifier: Certifier, designs: Sequence[DesignResult]) -> 
 
 def _row(design: DesignResult, limit: float) -> Evidence:
     found = design.certificate
+    if design.unknown:
+        return Evidence(
+            f"margin b(P, K), {design.name}", "", None, mark=Mark.UNDECIDED, note=f"unknown: {design.unknown}"
+        )
     if not found.stable_on_model:
         how = "does not stabilise the model, sampled as the hardware is"
     elif found.by_gap:

@@ -157,7 +157,7 @@ def _recorded_run(bag: Path, weights: Sequence[float]) -> _Run | None:
     if not isinstance(told.get("controller"), Mapping) or side not in {"sim", "hw"}:
         return None
     run = read_run(bag)
-    name, seed = _name(told["controller"]), int(told.get("seed") or 0)
+    name, seed = _name(told), int(told.get("seed") or 0)
     episode = episode_of(run.window)
     parts = None
     # (no comparison with a number is true of NaN)
@@ -167,7 +167,13 @@ def _recorded_run(bag: Path, weights: Sequence[float]) -> _Run | None:
     return _Run(name, side, seed, parts, side == "sim" or is_emulated(run))
 
 
-def _name(controller: Mapping[str, Any]) -> str:
+def _name(told: Mapping[str, Any]) -> str:
+    """Return the name of the controller that a run tells of; two policies of one file name are two."""
+    controller = told["controller"]
+    digest, file = told.get("policy_sha256"), controller.get("policy")
+    if isinstance(digest, str) and isinstance(file, str):
+        rest = {key: value for key, value in controller.items() if key not in {"kind", "policy"}}
+        controller = {"kind": f"policy {Path(file).stem}", "file": digest[:8], **rest}
     given = ", ".join(f"{key}={_short(value)}" for key, value in controller.items() if key != "kind")
     return f"{controller.get('kind', 'controller')}" + (f" ({given})" if given else "")
 

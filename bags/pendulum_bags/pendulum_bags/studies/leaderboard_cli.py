@@ -16,8 +16,6 @@ from pendulum_msgs_py.programs.terminal import WholeTable, make_console
 
 __all__ = ["leaderboard"]
 
-_POLICY = ".npz"
-
 
 def leaderboard(
     out: Annotated[Path, typer.Option(help="Folder of the page.")] = Path("bags/runs/leaderboard"),
@@ -43,18 +41,18 @@ def leaderboard(
     from pendulum_bags.studies.leaderboard_hardware import evaluate_hardware
     from pendulum_bags.studies.leaderboard_page import best_sentence, to_json, write_page
     from pendulum_lqr.controller import controller_class
-    from pendulum_lqr.policy_file import load_policy
+    from pendulum_lqr.policy_file import POLICY_SUFFIX, named_controller
     from pendulum_msgs_py.plants.plant_parameters import load_plant
 
     names = [name.strip() for name in controllers.split(",") if name.strip()] or contenders()
     machines = [name.strip() for name in plants.split(",") if name.strip()]
     for name in names:
-        if not name.endswith(_POLICY):
+        if not name.endswith(POLICY_SUFFIX):
             controller_class(name)
         elif [Path(other).name for other in names].count(Path(name).name) > 1:
             raise ParameterError(f"policy file {name} shares its name with another; expected a name for each")
         else:
-            load_policy(name)
+            named_controller(name)
     for name in machines:
         if name != HARDWARE:
             load_plant(name)
@@ -68,10 +66,10 @@ def leaderboard(
             robustness=robustness,
         )
         for machine in machines
-        for kind, parameters in map(_contender, names)
+        for kind, parameters in map(named_controller, names)
     ]
     entries = [
-        replace(entry, controller=Path(name).stem if name.endswith(_POLICY) else name)
+        replace(entry, controller=Path(name).stem if name.endswith(POLICY_SUFFIX) else name)
         for entry, name in zip(
             results_at_once(console, "controllers", jobs, workers), names * len(machines), strict=True
         )
@@ -98,8 +96,3 @@ def leaderboard(
     console.print(table)
     console.print(best_sentence(entries))
     console.print(f"page    {page}", soft_wrap=True)
-
-
-def _contender(name: str) -> tuple[str, dict[str, str]]:
-    """Return kind and parameters of a controller, or of the one that answers with a policy file."""
-    return ("policy", {"policy": str(Path(name).resolve())}) if name.endswith(_POLICY) else (name, {})
