@@ -84,10 +84,17 @@ def _app() -> typer.Typer:
             raise ParameterError(f"gain is {gain} N m; expected >= 0")
         if gain == 3.0:
             raise KeyboardInterrupt
+        if gain == 4.0:
+            raise typer.Exit(EXIT_INTERRUPTED)
         if code:
             raise typer.Exit(code)
 
     return app
+
+
+def test_a_program_that_told_of_its_interruption_is_not_told_of_again(capsys: pytest.CaptureFixture[str]) -> None:
+    assert cli_main(_app(), ["4.0"], name="python -m arm run") == 130
+    assert capsys.readouterr().err == ""
 
 
 @pytest.mark.parametrize(

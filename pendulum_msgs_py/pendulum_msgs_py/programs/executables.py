@@ -43,8 +43,14 @@ __all__ = [
 
 EXIT_USAGE = 2
 """Exit code of a program that was asked for something it cannot do."""
-EXIT_INTERRUPTED = 130
-"""Exit code after Ctrl-C, by the shell's convention of 128 + SIGINT."""
+
+
+class _Told(int):
+    """An exit code of a program that has said itself why it ends."""
+
+
+EXIT_INTERRUPTED = _Told(130)
+"""Exit code after Ctrl-C, by the shell's convention of 128 + SIGINT; who returns it has said that and what is left."""
 
 
 def run_package(package: str, argv: Sequence[str] | None = None) -> int:
@@ -195,7 +201,8 @@ def cli_main(
             _discard_output()
             return 0
         return stop.code if isinstance(stop.code, int) else int(stop.code is not None)
-    if result == EXIT_INTERRUPTED:
+    # typer makes a bare 130 of Ctrl-C, of which nobody has told yet.
+    if result == EXIT_INTERRUPTED and not isinstance(result, _Told):
         print("interrupted", file=sys.stderr)
     return int(result) if isinstance(result, int) else 0
 

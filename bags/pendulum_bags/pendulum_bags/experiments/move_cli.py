@@ -70,7 +70,7 @@ def move(
             _move(plant, place, controlled=controlled, control=control)
         except KeyboardInterrupt:
             plant.disarm_quietly()
-            print(f"{namespace} is disarmed", flush=True)
+            print(f"interrupted: {namespace} is disarmed", flush=True)
             return EXIT_INTERRUPTED
         except FaultError:
             plant.disarm_quietly()
