@@ -99,6 +99,7 @@ def campaign(
     else:
         make_console().print(_table(rows))
     if interrupted:
+        sys.stderr.write("interrupted: the rows so far are above\n")
         return EXIT_INTERRUPTED
     # What could not be tried has not survived either.
     return 0 if rows and all(row.tried == row.survived > 0 for row in rows) else 1
