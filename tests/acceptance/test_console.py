@@ -101,7 +101,6 @@ def _mode(page: Any) -> str:
     return str(page.evaluate("(pendulumConsole.plants['/sim'] || {}).mode"))
 
 
-@pytest.mark.timeout(180)
 def test_two_clients_see_stop_tune_and_meet_a_new_simulator(
     browser: Any, address: str, simulator: RunningProgram, processes: ProcessGroup
 ) -> None:
@@ -154,7 +153,6 @@ def test_two_clients_see_stop_tune_and_meet_a_new_simulator(
     wait_for(lambda: desk.evaluate("pendulumConsole.plants['/sim'].stamp_ns") != before, 10, "new states")
 
 
-@pytest.mark.timeout(120)
 def test_axe_finds_nothing_that_keeps_anybody_out(browser: Any, address: str) -> None:
     install_packages(AXE, "axe-core")
     page = _open(browser, address, color_scheme="light")
@@ -186,7 +184,6 @@ def test_axe_finds_nothing_that_keeps_anybody_out(browser: Any, address: str) ->
     assert not problems, "\n".join(problems)
 
 
-@pytest.mark.timeout(300)
 def test_no_stop_is_lost_whatever_is_frozen_killed_or_cut_off(domain_id: int, tmp_path: Path) -> None:
     playwright = pytest.importorskip("playwright.sync_api")
     if not CHROMIUM.is_file():
@@ -203,7 +200,6 @@ def test_no_stop_is_lost_whatever_is_frozen_killed_or_cut_off(domain_id: int, tm
     assert left == []
 
 
-@pytest.mark.timeout(120)
 def test_a_foreign_page_cannot_press_the_button(address: str) -> None:
     request = urllib.request.Request(address + "e_stop", method="POST", headers={"Origin": "http://evil.example"})
     with pytest.raises(urllib.error.HTTPError) as caught:

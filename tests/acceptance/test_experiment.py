@@ -39,7 +39,6 @@ def run_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-@pytest.mark.timeout(300)
 def test_experiment_leaves_two_bags_a_summary_figures_and_a_report(run_folder: Path) -> None:
     summary = json.loads((run_folder / "summary.json").read_text())
 
@@ -104,7 +103,6 @@ def test_both_plants_got_the_same_noise(run_folder: Path) -> None:
 
 
 @pytest.mark.parametrize("moment", ["starting", "ramp up"])
-@pytest.mark.timeout(120)
 def test_ctrl_c_leaves_no_process_and_readable_bags(
     processes: ProcessGroup, domain_id: int, tmp_path: Path, moment: str
 ) -> None:

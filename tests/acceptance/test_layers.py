@@ -129,7 +129,7 @@ def test_other_programs_say_their_help_with_the_first_layer_alone(tmp_path: Path
         capture_output=True,
         text=True,
         check=False,
-        timeout=60,
+        timeout=280,
         env=environment_of(tmp_path / "hide", "run"),
     )
     assert done.stdout.strip() == "all", done.stderr
@@ -147,7 +147,7 @@ def test_an_experiment_comes_to_its_verdict_and_report_with_the_first_layer_alon
             capture_output=True,
             text=True,
             check=False,
-            timeout=100,
+            timeout=280,
             env=environment,
             cwd=tmp_path,
         )
@@ -186,7 +186,7 @@ def test_a_program_whose_library_is_missing_says_which_extra_brings_it(
         capture_output=True,
         text=True,
         check=False,
-        timeout=60,
+        timeout=280,
         cwd=tmp_path,
         env={**environment_of(tmp_path / "hide", "run"), "ROS_DOMAIN_ID": str(domain_id)},
     )

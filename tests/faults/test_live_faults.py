@@ -28,7 +28,6 @@ one system and start another."""
 _SHORT = [(plant, fault) for plant in PLANTS for fault in CAMPAIGN if plant in fault.short]
 
 
-@pytest.mark.timeout(150)
 @pytest.mark.parametrize(("system", "fault"), _SHORT, ids=lambda each: each.name, indirect=["system"], scope="module")
 def test_running_system_survives(system: LiveSystem, fault: Fault) -> None:
     _TRIED.setdefault(system.plant.name, {})[system.folder] = system.witnessed

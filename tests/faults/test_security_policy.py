@@ -63,7 +63,6 @@ async def _drive(hub: Hub) -> None:
         await hub.set_parameter(f"{space}/disturbance", "amplitude", 1.0)
 
 
-@pytest.mark.timeout(180)
 def test_nodes_do_what_the_policy_allows_and_nothing_else(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     programs = [
         graph.simulator("/sim"),

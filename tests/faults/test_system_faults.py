@@ -14,7 +14,6 @@ from tests.faults.resources import RESOURCE_TRIALS
 _SHORT = [trial for trial in RESOURCE_TRIALS if trial.name.startswith("recorder:")]
 
 
-@pytest.mark.timeout(150)
 @pytest.mark.parametrize("trial", _SHORT, ids=lambda trial: trial.name)
 def test_a_recorder_that_fails_says_so_and_keeps_what_was_sealed(trial: Trial, tmp_path: Path) -> None:
     if reason := trial.why_not():

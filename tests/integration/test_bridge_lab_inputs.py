@@ -69,7 +69,6 @@ def stops(bench: Bench) -> str:
     return bench.arm()
 
 
-@pytest.mark.timeout(120)
 def test_a_button_latches_when_it_is_pressed_or_falls_silent_and_a_warm_motor_gets_less_torque(
     processes: ProcessGroup, domain_id: int
 ) -> None:

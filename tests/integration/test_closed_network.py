@@ -194,7 +194,6 @@ def _look(namespace: str, patience: float, **variables: str) -> str:
     return ended.stdout.strip()
 
 
-@pytest.mark.timeout(120)
 def test_a_host_that_names_ours_as_its_peer_is_not_let_in(
     processes: ProcessGroup, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:

@@ -33,7 +33,6 @@ def run_experiment(*arguments: str | Path | float, timeout: float = 150.0) -> su
     return done
 
 
-@pytest.mark.timeout(180)
 def test_lockstep_runs_of_the_emulated_hardware_with_one_seed_are_identical(domain_id: int, tmp_path: Path) -> None:
     for name, seed in (("first", 5), ("second", 5), ("other", 6)):
         run_experiment("lockstep", "--side", "hw", "--bag", tmp_path / name, "--seed", seed, "--duration", "1")
@@ -48,7 +47,6 @@ def test_lockstep_runs_of_the_emulated_hardware_with_one_seed_are_identical(doma
     assert abs(states["position"] - 3.14159).max() < 0.05
 
 
-@pytest.mark.timeout(180)
 def test_a_policy_file_is_a_controller_like_any_other_in_an_experiment(domain_id: int, tmp_path: Path) -> None:
     path = write_policy(tmp_path / "upright.npz", linear_policy(load_plant("thesis"), 20.0, 1.0))
     for side in ("sim", "hw"):
@@ -83,7 +81,6 @@ def test_a_policy_that_cannot_play_is_refused_before_anything_starts(tmp_path: P
         assert not (tmp_path / "run").exists()
 
 
-@pytest.mark.timeout(180)
 def test_lockstep_runs_of_the_simulator_are_identical_and_give_the_numbers_of_one_process_to_the_last_bit(
     domain_id: int, tmp_path: Path
 ) -> None:
@@ -109,7 +106,6 @@ def test_lockstep_runs_of_the_simulator_are_identical_and_give_the_numbers_of_on
     assert np.array_equal(bag["/sim/applied_effort"]["effort"], arrays.applied)
 
 
-@pytest.mark.timeout(240)
 def test_the_two_experiments_of_the_thesis_give_back_its_coefficients(tmp_path: Path) -> None:
     run_experiment("inertia_damping", "--out", tmp_path / "hand", "--trials", 3)
     run_experiment("gravity", "--out", tmp_path / "stairs", "--trials", 1, "--step", 20, "--top", 60, "--hold", 1)
@@ -136,7 +132,6 @@ def _command_line(process: psutil.Process) -> set[str]:
         return set()
 
 
-@pytest.mark.timeout(240)
 def test_a_run_whose_bridge_stood_still_is_measured_again_and_the_result_says_so(
     processes: ProcessGroup, tmp_path: Path
 ) -> None:
@@ -177,7 +172,6 @@ def test_a_run_whose_bridge_stood_still_is_measured_again_and_the_result_says_so
     assert processes.leftovers() == []
 
 
-@pytest.mark.timeout(180)
 def test_an_excitation_is_played_alone_on_a_running_plant_and_ends_at_zero_torque(
     processes: ProcessGroup, domain_id: int, tmp_path: Path
 ) -> None:
@@ -210,7 +204,6 @@ def test_an_excitation_is_played_alone_on_a_running_plant_and_ends_at_zero_torqu
     assert {"inertia", "gravity"} <= recorded.metadata["pendulum.excitation"]["predicted"].keys()
 
 
-@pytest.mark.timeout(120)
 def test_a_study_over_dds_runs_in_parallel_and_leaves_a_table(tmp_path: Path) -> None:
     file = tmp_path / "study.yaml"
     file.write_text(
@@ -253,7 +246,6 @@ def test_twenty_seeds_reproduce_the_thesis_under_noise(
     assert np.median([run.velocity.std() for run in runs]) == pytest.approx(std_theta_dot, rel=0.05)
 
 
-@pytest.mark.timeout(120)
 def test_a_rehearsal_with_a_lab_file_checks_asks_and_moves_the_machine_of_the_file(
     domain_id: int, tmp_path: Path, processes: ProcessGroup
 ) -> None:

@@ -100,7 +100,6 @@ def client(server: tuple[RunningProgram, int], simulator: RunningProgram) -> Ite
         yield client
 
 
-@pytest.mark.timeout(180)
 def test_a_viewer_reads_sets_and_stops_a_plant_by_the_rules_of_all(
     client: FoxgloveClient, peer: PlantPeer, simulator: RunningProgram, server: tuple[RunningProgram, int]
 ) -> None:

@@ -10,7 +10,6 @@ from pendulum_lqr.measured_response import read_response
 from tests.processes import ProcessGroup
 
 
-@pytest.mark.timeout(180)
 def test_both_plants_are_measured_in_lockstep_and_designs_certified(
     processes: ProcessGroup, domain_id: int, tmp_path: Path
 ) -> None:

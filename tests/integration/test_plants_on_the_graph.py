@@ -31,7 +31,6 @@ def experiment(processes: ProcessGroup, domain: int, out: Path, *arguments: str 
     return processes.start("pendulum_bags", "experiment", *told)
 
 
-@pytest.mark.timeout(200)
 def test_an_adopted_plant_is_compared_with_a_model_file_and_goes_on_running(
     processes: ProcessGroup, domain_id: int, peer: PlantPeer, tmp_path: Path
 ) -> None:

@@ -55,7 +55,6 @@ def watcher(domain_id: int) -> Iterator[Watcher]:
     watcher.close()
 
 
-@pytest.mark.timeout(120)
 def test_our_controller_brings_our_plant_upright_through_an_effort_controllers_topic(
     processes: ProcessGroup, watcher: Watcher
 ) -> None:
@@ -78,7 +77,6 @@ def test_our_controller_brings_our_plant_upright_through_an_effort_controllers_t
     watcher.until(lambda: watcher.applied == 0.0, "zero torque after the adapter")
 
 
-@pytest.mark.timeout(120)
 def test_hardware_of_ros2_control_moves_our_plant_and_a_second_commander_nobody(
     processes: ProcessGroup, watcher: Watcher
 ) -> None:

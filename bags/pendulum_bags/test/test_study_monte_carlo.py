@@ -103,7 +103,6 @@ def test_an_interrupted_monte_carlo_goes_on_and_workers_change_no_bit(tmp_path: 
 
 
 @arrow
-@pytest.mark.timeout(180)
 def test_a_cluster_that_loses_a_worker_mid_run_gives_the_same_bits(tmp_path: Path) -> None:
     pytest.importorskip("distributed")
     settings = replace(SMALL, chunk=50)
