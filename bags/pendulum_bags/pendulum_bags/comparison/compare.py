@@ -245,8 +245,8 @@ def compare_folders(
             ]
             if place == folder and busy and len(places) > 1:
                 left_out.append(
-                    f"The run in real time does not count, since the machine was too busy ({', '.join(busy)}); it was "
-                    "measured again in lockstep, which waits for everybody."
+                    f"The run in real time does not count, because the computer was too busy ({', '.join(busy)}). "
+                    "It was repeated in lockstep, which does not depend on the computer's speed."
                 )
             else:
                 pairs.append(pair)

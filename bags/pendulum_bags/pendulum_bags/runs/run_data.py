@@ -111,7 +111,7 @@ def timing_warning(plants: Mapping[str, Mapping[str, Any]]) -> str:
     ]
     if not words:
         return ""
-    return f"The machine was too busy for these plants: {', '.join(words)}; end other programs and repeat the run."
+    return f"The computer was too busy for these plants: {', '.join(words)}; end other programs and repeat the run."
 
 
 def missed_share(missed: int, samples: int) -> float:
