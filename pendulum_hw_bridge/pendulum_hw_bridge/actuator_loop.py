@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import queue
 import threading
+import time
 from collections.abc import Callable
 from concurrent.futures import Future
 from concurrent.futures import TimeoutError as FutureTimeoutError
@@ -37,6 +38,8 @@ class ActuatorLoop:
         on_state: Called with each new sample and its feedback record.
         decide: Returns the decision for now.
         on_outcome: Called with the stamp of the state answered [ns] and what was done.
+        take_inputs: Takes the torques that have come, each into :meth:`answered`; where none has, it waits for one, for
+            as long as it is told at most [s].
         answer_window: Share of the period in which to wait for answers to a state before acting [-].
         report: Called with the text of an error that ended a cycle.
     """
@@ -49,6 +52,7 @@ class ActuatorLoop:
         on_state: Callable[[JointSample, Feedback], None],
         decide: Callable[[], Drive],
         on_outcome: Callable[[int, Outcome], None],
+        take_inputs: Callable[[float], None] = lambda wait: None,
         answer_window: float = 0.3,
         report: Callable[[str], None] = lambda text: None,
     ) -> None:
@@ -59,10 +63,10 @@ class ActuatorLoop:
         self._decide = decide
         self._on_outcome = on_outcome
         self._period = statistics.period_ns / NANOSECONDS
+        self._take_inputs = take_inputs
         self._window = answer_window * self._period
         self._report = report
         self._jobs: queue.SimpleQueue[tuple[Callable[[], Any], Future[Any]]] = queue.SimpleQueue()
-        self._answers = threading.Condition()
         self._answered: set[Input] = set()
         self._state_ns = 0
         self._closing = threading.Event()
@@ -97,10 +101,8 @@ class ActuatorLoop:
 
     def answered(self, kind: Input, command: JointCommand) -> None:
         """Take note of an accepted command; the cycle goes on when all who answer have answered."""
-        with self._answers:
-            if command.stamp_ns == self._state_ns:
-                self._answered.add(kind)
-                self._answers.notify()
+        if command.stamp_ns == self._state_ns:
+            self._answered.add(kind)
         if kind is Input.EFFORT_COMMAND:
             self.statistics.round_trip(self.bridge.port.now_ns() - command.stamp_ns)
 
@@ -108,8 +110,6 @@ class ActuatorLoop:
         """End the thread; the actuator is released and let go on the way out."""
         self._closing.set()
         self._job_waiting.set()
-        with self._answers:
-            self._answers.notify()
         self._thread.join(_JOIN)
 
     # --- in the thread --------------------------------------------------------------------------------------
@@ -162,6 +162,7 @@ class ActuatorLoop:
         bridge = self.bridge
         feedback = bridge.observe(_PATIENCE)
         if feedback is None:
+            self._take_inputs(0.0)
             self._act_between()
             return
         sample = bridge.sample
@@ -170,9 +171,8 @@ class ActuatorLoop:
         expected = now if self._last_state_ns is None else self._last_state_ns + self.statistics.period_ns
         self.statistics.cycle(now, expected)
         self._last_state_ns = now
-        with self._answers:
-            self._state_ns = sample.stamp_ns
-            self._answered.clear()
+        self._state_ns = sample.stamp_ns
+        self._answered.clear()
         self._on_state(sample, feedback)
         self._wait_for_answers(sample.stamp_ns)
         self._on_outcome(sample.stamp_ns, self._decide_and_act())
@@ -190,6 +190,7 @@ class ActuatorLoop:
 
     def _wait_for_answers(self, stamp_ns: int) -> None:
         """Wait for those who answered lately; whoever is late or has never answered is not waited for again."""
+        self._take_inputs(0.0)
         supervisor = self.bridge.supervisor
         if not supervisor.mode.armed:
             return
@@ -197,6 +198,9 @@ class ActuatorLoop:
         expected = {
             kind for kind in (Input.EFFORT_COMMAND, Input.DISTURBANCE) if supervisor.gates[kind].fresh(now) is not None
         }
-        deadline = self._window
-        with self._answers:
-            self._answers.wait_for(lambda: expected <= self._answered or self._closing.is_set(), deadline)
+        deadline = time.monotonic() + self._window
+        while not (expected <= self._answered or self._closing.is_set()):
+            left = deadline - time.monotonic()
+            if left <= 0.0:
+                break
+            self._take_inputs(left)

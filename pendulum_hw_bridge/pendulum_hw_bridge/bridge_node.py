@@ -109,6 +109,7 @@ class BridgeNode(LifecycleNode, PollingNode):
             if self._lockstep
             else self._port_clock.now_ns,
             push=values["backend"] in EMULATED_BACKENDS,
+            polled=not self._lockstep,
             statistics=None if self._lockstep else self._statistics,
             more_diagnostics=self._diagnostics,
             on_command=self._on_command,
@@ -120,6 +121,7 @@ class BridgeNode(LifecycleNode, PollingNode):
         self._supply = self.create_publisher(BatteryState, "actuator/supply", _FEEDBACK_QOS)
         if not self._lockstep:
             create_wall_timer(self, _SLOW_PERIOD, self._publish_slow)
+            create_wall_timer(self, _SLOW_PERIOD, self._take_inputs_at_rest)
         else:
             self._lockstep_loop = LockstepLoop(
                 self._interface,
@@ -200,6 +202,7 @@ class BridgeNode(LifecycleNode, PollingNode):
                 on_state=self._on_state,
                 decide=lambda: self._derated(self._interface.decide()),
                 on_outcome=self._on_outcome,
+                take_inputs=self._interface.wait_for_inputs,
                 answer_window=values["answer_window"],
                 report=self.get_logger().error,
             )
@@ -358,6 +361,11 @@ class BridgeNode(LifecycleNode, PollingNode):
         return sample
 
     # --- slow ----------------------------------------------------------------------------------------------
+
+    def _take_inputs_at_rest(self) -> None:
+        """Count who commands though no cycle does: the thread of the actuator takes torques only while states flow."""
+        if self._loop is None or not self._loop.active:
+            self._interface.take_inputs()
 
     def _publish_slow(self, stamp_ns: int | None = None) -> None:
         """Publish temperature and supply: by wall time, or in lockstep by simulated time, as all else."""

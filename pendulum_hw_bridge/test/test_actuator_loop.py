@@ -47,18 +47,23 @@ class Running:
         self.errors: list[str] = []
         self.threads: set[int] = set()
         self.on_state: Callable[[JointSample], None] = lambda sample: None
+        self.take_inputs: Callable[[float], object] = time.sleep
         self.loop = ActuatorLoop(
             self.bridge,
             LoopStatistics(10_000_000),
             on_state=self._on_state,
             decide=self._decide,
             on_outcome=lambda stamp, outcome: self.outcomes.append((stamp, outcome)),
+            take_inputs=self._take_inputs,
             report=self.errors.append,
         )
         self.loop.call(self.bridge.connect)
 
     def _prepare(self) -> str:
         return self.loop.call(self.bridge.prepare)
+
+    def _take_inputs(self, wait: float) -> None:
+        self.take_inputs(wait)
 
     def _on_state(self, sample: JointSample, feedback: Feedback) -> None:
         assert feedback.stamp_ns == sample.stamp_ns
@@ -99,20 +104,40 @@ def test_states_come_from_one_thread_and_each_is_acted_upon_once(running: Runnin
 
 
 def test_an_answer_is_acted_upon_in_the_cycle_of_its_state(running: Running) -> None:
-    def answer(sample: JointSample) -> None:
-        def later() -> None:
-            command = JointCommand.of_one(sample.stamp_ns, 0.4, "c")
-            if running.supervisor.offer(Input.EFFORT_COMMAND, command, running.port.now_ns()) is None:
-                running.loop.answered(Input.EFFORT_COMMAND, command)
-
-        threading.Thread(target=later).start()
+    def answer(wait: float) -> None:
+        command = JointCommand.of_one(running.states[-1].stamp_ns, 0.4, "c")
+        if running.supervisor.offer(Input.EFFORT_COMMAND, command, running.port.now_ns()) is None:
+            running.loop.answered(Input.EFFORT_COMMAND, command)
 
     running.arm()
-    running.on_state = answer
+    running.take_inputs = answer
     running.until(lambda: running.outcomes[-1][1].effort != 0.0, "torque")
     assert running.outcomes[-1][1].effort == pytest.approx(0.4, abs=1e-9)
     running.until(lambda: running.actuator.link.pwm != 0.0, "a duty on the motor")
     assert running.loop.statistics.latency.count > 0
+
+
+def test_a_cycle_waits_for_an_answer_only_in_its_window_and_no_longer_once_it_has_come(running: Running) -> None:
+    waits: list[float] = []
+
+    def answer(wait: float) -> None:
+        waits.append(wait)
+        command = JointCommand.of_one(running.states[-1].stamp_ns, 0.4, "c")
+        if running.supervisor.offer(Input.EFFORT_COMMAND, command, running.port.now_ns()) is None:
+            running.loop.answered(Input.EFFORT_COMMAND, command)
+
+    running.arm()
+    running.take_inputs = answer
+    running.until(lambda: running.loop.statistics.latency.count > 5, "answers")
+    # Whoever answers at the first look is not waited for.
+    assert set(waits) == {0.0}
+    waits.clear()
+    running.take_inputs = lambda wait: (waits.append(wait), time.sleep(wait))
+    count = len(running.outcomes)
+    running.until(lambda: len(running.outcomes) > count + 3, "outcomes")
+    asked = [wait for wait in waits if wait]
+    assert asked, "an answer that is late was not waited for"
+    assert max(asked) <= 0.3 * 0.01
 
 
 def test_an_error_in_a_cycle_releases_the_drive_and_is_told(running: Running) -> None:

@@ -86,7 +86,7 @@ class NodeRig(Rig):
         self.port = cast("EmulatorBackend", self.bridge.port)
         self.actuator = self.port.actuator
         self.twins: list[Node] = []
-        self._hear = {kind: subscription.callback for kind, subscription in node._interface._inputs.items()}
+        self._hear = node._interface._receivers
 
     def arm(self) -> str:
         return self._ask_to_arm(True)

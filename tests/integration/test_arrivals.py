@@ -5,6 +5,7 @@ from __future__ import annotations
 import ctypes
 import gc
 import os
+import time
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -85,6 +86,29 @@ def test_after_a_second_without_word_somebody_looks_all_the_same(
     assert (signal.came(), signal.came()) == (True, False)
     now[0] += 1.01
     assert (signal.came(), signal.came()) == (True, False)
+
+
+@pytest.mark.parametrize("told", [True, False], ids=["told by the middleware", "looked for"])
+def test_who_waits_is_woken_by_a_message(
+    peer: GraphPeer, node: PollingNode, monkeypatch: pytest.MonkeyPatch, told: bool
+) -> None:
+    if not told:
+        monkeypatch.setattr(arrivals, "_count", lambda *_: False)
+    states = peer.node.create_publisher(JointState, "states", qos.STATE)
+    source = node.create_polled_input(JointState, "states", qos.COMMAND_INPUT)
+    wait_for(lambda: states.get_subscription_count() == 1, 30.0, "the match")
+    signal = ArrivalSignal([source.subscription])
+    assert signal.works is told
+    signal.came()
+    assert signal.wait(0.001) is not told, "somebody was told of what had not come"
+    states.publish(STATE)
+    found, patience = 0, 60.0
+    while not found and patience > 0.0:
+        before = time.monotonic()
+        if signal.wait(patience):
+            found = taken(source)
+        patience -= time.monotonic() - before
+    assert found == 1
 
 
 @pytest.mark.parametrize("missing", ["librcl.so", "eventfd_write", "eventfd"])

@@ -26,6 +26,10 @@ __all__ = ["ArrivalSignal"]
 
 _LONGEST_TRUST = 1.0
 """Time after which somebody looks though no word of anything has come [s]."""
+_LOOK = 1e-4
+"""Time between two looks of who waits without being told [s]."""
+_LAST_DESCRIPTOR = 1023
+"""The largest that select(2) takes."""
 
 _free: list[int] = []
 """Counters of signals that nobody has any more, for the next: never closed, since their numbers may still be used."""
@@ -52,7 +56,8 @@ class ArrivalSignal:
             return
         weakref.finalize(self, _free.append, self._counter)
         self._waiting.register(self._counter, select.POLLIN)
-        self.works = all([_count(entity, self._counter) for entity in entities])  # noqa: C419  # each of them
+        counted = [_count(entity, self._counter) for entity in entities]
+        self.works = all(counted) and self._counter <= _LAST_DESCRIPTOR
 
     def came(self) -> bool:
         """Return whether anything may have come since this was asked last."""
@@ -66,6 +71,15 @@ class ArrivalSignal:
             return False
         self._look_anyway = time.monotonic() + _LONGEST_TRUST
         return True
+
+    def wait(self, timeout: float) -> bool:
+        """Wait until something may have come, for a time at most [s], and return whether it may have."""
+        if timeout > 0.0 and self.works:
+            # Not by poll(2), which counts whole milliseconds.
+            select.select([self._counter], [], [], timeout)
+        elif timeout > 0.0:
+            time.sleep(min(timeout, _LOOK))
+        return self.came()
 
 
 def _count(entity: Service | Subscription, counter: int) -> bool:

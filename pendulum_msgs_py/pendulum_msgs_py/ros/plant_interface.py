@@ -28,6 +28,7 @@ from pendulum_msgs_py.contract.timing import LoopStatistics, Throttle
 from pendulum_msgs_py.contract.values import NANOSECONDS, JointCommand, JointSample, Vector
 from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.ros import qos
+from pendulum_msgs_py.ros.arrivals import ArrivalSignal
 from pendulum_msgs_py.ros.commander_watch import CommanderWatch
 from pendulum_msgs_py.ros.convert import (
     command_from_bytes,
@@ -114,9 +115,11 @@ class PlantInterface:
         self._diagnostics = Diagnostics(node, "plant")
         inputs = [Input.EFFORT_COMMAND, Input.DISTURBANCE] + ([Input.PUSH] if push else [])
         self._polled: list[tuple[PolledInput, Callable[..., None]]] = []
+        self._torques: ArrivalSignal | None = None
         self._inputs = {}
+        self._receivers = {kind: self._receiver(kind) for kind in inputs}
         for kind in inputs:
-            receive = self._receiver(kind)
+            receive = self._receivers[kind]
             if polled:
                 source = node.create_polled_input(JointState, kind.value, qos.COMMAND_INPUT)
                 self._polled.append((source, receive))
@@ -142,6 +145,13 @@ class PlantInterface:
         """Take the torques that came since the last look, where inputs are polled."""
         for source, receive in self._polled:
             source.take(receive)
+
+    def wait_for_inputs(self, timeout: float) -> None:
+        """Take the torques that came since the last look, or wait for one [s], where inputs are polled."""
+        if self._torques is None:
+            self._torques = ArrivalSignal([source.subscription for source, _ in self._polled])
+        if self._torques.wait(timeout):
+            self.take_inputs()
 
     def publish_state(self, sample: JointSample) -> None:
         """Publish a state and remember it as the newest."""
