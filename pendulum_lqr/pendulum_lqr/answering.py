@@ -36,6 +36,7 @@ class AnswerLoop:
         controller: The controller.
         state_timeout: Age beyond which a state is not answered [s]; inf for any age.
         simulated_time: Stamps are those of a simulator, so that their age says nothing and they may start anew.
+        send: Called with a state and the efforts that answer it [N m or N], before anything is counted.
         monotonic: Clock for the compute time [ns].
     """
 
@@ -45,6 +46,7 @@ class AnswerLoop:
         state_timeout: float,
         *,
         simulated_time: bool = False,
+        send: Callable[[JointSample, Vector], None] = lambda sample, effort: None,
         monotonic: Callable[[], int] = time.perf_counter_ns,
     ) -> None:
         self.controller = controller
@@ -60,6 +62,7 @@ class AnswerLoop:
         self.compute_time = RingOfTimes()
         self._newest: JointSample | None = None
         self._answer: Vector | None = None
+        self._send = send
         self._monotonic = monotonic
         self._timeout_ns = math.inf if simulated_time else state_timeout * NANOSECONDS
         self._start_ns: int | None = None
@@ -98,7 +101,7 @@ class AnswerLoop:
         self._nothing = (0.0,) * len(self._limits)
 
     def answer(self, sample: JointSample | None, now_ns: int, problem: str = "") -> Vector | None:
-        """Return the efforts that answer a state, or None where the state is refused [N m or N].
+        """Send the efforts that answer a state and return them, or None where the state is refused [N m or N].
 
         Args:
             sample: The state; None for a message that carries none of our joints.
@@ -110,8 +113,11 @@ class AnswerLoop:
             self.refused[refusal] += 1
             self.last_reason = problem if sample is None else self._problem(refusal, sample, now_ns)
             # A plant in lockstep repeats a state when the answer did not reach it: the same answer again, if any.
-            repeated = refusal is StateRefusal.DUPLICATE and self.simulated_time
-            return self._answer if repeated else None
+            if sample is None or refusal is not StateRefusal.DUPLICATE or not self.simulated_time:
+                return None
+            if self._answer is not None:
+                self._send(sample, self._answer)
+            return self._answer
         assert sample is not None
         if self._start_ns is None:
             self._start_ns = sample.stamp_ns
@@ -127,7 +133,10 @@ class AnswerLoop:
             self.last_reason = reason or f"controller answered {written(effort)} N m"
             self.refused[StateRefusal.NO_ANSWER] += 1
             return None
-        self.compute_time.add(self._monotonic() - began)
+        ended = self._monotonic()
+        # Somebody waits for it, and in a process that has just woken up counting takes several times as long as later.
+        self._send(sample, effort)
+        self.compute_time.add(ended - began)
         if not self.simulated_time:
             self.age.add(now_ns - sample.stamp_ns)
         self.answered += 1

@@ -32,6 +32,7 @@ from pendulum_lqr.sampling import ASSUMED_PERIOD, PeriodWatch, differs, rate_pro
 from pendulum_msgs_py.contract import names
 from pendulum_msgs_py.contract.cdr import encode_joints
 from pendulum_msgs_py.contract.timing import SteadyWallClock
+from pendulum_msgs_py.contract.values import JointSample, Vector
 from pendulum_msgs_py.errors import PendulumError
 from pendulum_msgs_py.joints import ONE_JOINT
 from pendulum_msgs_py.parameters import ParameterSpec
@@ -157,7 +158,9 @@ class ControllerNode(LifecycleNode, PollingNode):
             self.get_logger().error(f"cannot configure: {error}")
             return TransitionCallbackReturn.FAILURE
         self._pending = None
-        self._loop = AnswerLoop(controller, self._settings["state_timeout"], simulated_time=self._simulated_time)
+        self._loop = AnswerLoop(
+            controller, self._settings["state_timeout"], simulated_time=self._simulated_time, send=self._send
+        )
         self.get_logger().info(
             f"{self._settings['controller']} for plant {self._plant.name}: {controller.describe()}, "
             f"limit {_limit(controller)} N m"
@@ -205,9 +208,9 @@ class ControllerNode(LifecycleNode, PollingNode):
             self._period_known = False
         if not self._active or self._loop is None or not self._may_answer():
             return
-        effort = self._loop.answer(sample, self._now(), problem_of_state(data, self._joints) if sample is None else "")
-        if effort is None or sample is None:
-            return
+        self._loop.answer(sample, self._now(), problem_of_state(data, self._joints) if sample is None else "")
+
+    def _send(self, sample: JointSample, effort: Vector) -> None:
         if self._multi_array:
             self._command_publisher.publish(Float64MultiArray(data=list(effort)))
         else:
