@@ -134,6 +134,7 @@ class AnswerLoop:
             self.refused[StateRefusal.NO_ANSWER] += 1
             return None
         ended = self._monotonic()
+        self.last_effort = self._answer = effort
         # Somebody waits for it, and in a process that has just woken up counting takes several times as long as later.
         self._send(sample, effort)
         self.compute_time.add(ended - began)
@@ -144,7 +145,6 @@ class AnswerLoop:
             if abs(value) >= limit:
                 self.saturated += 1
                 break
-        self.last_effort = self._answer = effort
         return effort
 
     def summary(self, now_ns: int) -> Mapping[str, object]:

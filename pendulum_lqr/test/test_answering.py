@@ -33,6 +33,24 @@ def test_each_new_state_is_answered_once_with_the_law():
     assert answering.answered == 1
 
 
+def test_an_answer_leaves_before_it_is_counted_and_what_is_refused_never_does():
+    sent = []
+    answering = loop(send=lambda state, effort: sent.append((state.stamp_ns, effort, answering.answered)))
+    first = answering.answer(sample(START), START)
+    assert sent == [(START, first, 0)]
+    for refused in (sample(START), None, sample(START + 1, angle=math.nan), sample(START - 1)):
+        assert answering.answer(refused, START) is None
+    assert len(sent) == 1
+
+
+def test_in_lockstep_a_repeated_state_is_sent_the_same_answer_again():
+    sent = []
+    answering = loop(simulated_time=True, send=lambda state, effort: sent.append((state.stamp_ns, effort)))
+    assert answering.answer(sample(START), START) == answering.answer(sample(START), START)
+    assert sent[0] == sent[1]
+    assert len(sent) == 2
+
+
 @pytest.mark.parametrize(
     ("state", "reason"),
     [
