@@ -139,3 +139,33 @@ def test_requests_without_pause_are_answered_at_a_bounded_rate_and_every_service
     finally:
         node.destroy_node()
         peer.close()
+
+
+def test_a_node_without_a_timer_answers_where_its_owner_attends_to_it(
+    domain_id: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    peer = GraphPeer("asker", domain=domain_id)
+    node = PollingNode("plant", context=peer.context)
+    node.create_service(Trigger, "~/ask", lambda _, response: response)
+    answer_who_listens(node)
+    node.poll_services(timer=False)
+    assert list(node.timers) == []
+    try:
+        client = peer.node.create_client(Trigger, "/plant/ask")
+        peer.until(client.service_is_ready, "the service")
+        future = client.call_async(Trigger.Request())
+        waits: list[float] = []
+
+        def attended() -> bool:
+            waits.append(node.attend())
+            return bool(future.done())
+
+        peer.until(attended, "the answer")
+        assert 0.0 in waits, "it never looked"
+        now = time.monotonic()
+        monkeypatch.setattr("pendulum_msgs_py.ros.polled.time.monotonic", lambda: now)
+        node.attend()
+        assert node.attend() > 0.0, "it looks without pause"
+    finally:
+        node.destroy_node()
+        peer.close()

@@ -86,6 +86,7 @@ class PollingNode(Node):
     _requests: ArrivalSignal | None = None
     _more_requests = False
     _next_look = 0.0
+    _attend_at = 0.0
 
     @property
     def subscriptions(self) -> Iterator[Subscription]:
@@ -102,12 +103,27 @@ class PollingNode(Node):
         """Whether the middleware says when a request has come; otherwise each service is looked at every 10 ms."""
         return self._requests is not None and self._requests.works
 
-    def poll_services(self) -> None:
-        """Attend to the services that there are at a bounded rate from now on, one request after the other."""
+    def poll_services(self, *, timer: bool = True) -> None:
+        """Attend to the services that there are at a bounded rate from now on, one request after the other.
+
+        Args:
+            timer: Look by a timer; without one, the owner of the node's thread calls :meth:`attend` where it wakes up
+                anyway. Each tick of a timer wakes two threads.
+        """
         self._in_turn = deque(self.services)
         self._served_in_turn = frozenset(self._in_turn)
         self._requests = ArrivalSignal(self._in_turn)
-        create_wall_timer(self, _LOOK_FOR_REQUESTS, self._look_for_requests)
+        if timer:
+            create_wall_timer(self, _LOOK_FOR_REQUESTS, self._look_for_requests)
+
+    def attend(self) -> float:
+        """Look for requests if it is time to; return the time until it is [s], 0 after a look that took some itself."""
+        left = self._attend_at - time.monotonic()
+        if left > 0.0:
+            return left
+        self._look_for_requests()
+        self._attend_at = time.monotonic() + _LOOK_FOR_REQUESTS
+        return 0.0
 
     def _look_for_requests(self) -> None:
         """Answer what waits, or as much of it as a look may take; DDS keeps the ten newest requests of a client."""

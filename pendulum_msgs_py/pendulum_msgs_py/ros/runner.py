@@ -143,8 +143,11 @@ def _run(make_node: Callable[[Callable[[], None]], Node], arguments: Sequence[st
     try:
         node = _make(make_node, stop)
         answer_who_listens(node)
+        pace = node.run_due if isinstance(node, Paced) else None
+        attend = None
         if isinstance(node, PollingNode):
-            node.poll_services()
+            node.poll_services(timer=pace is None)
+            attend = None if pace is None else node.attend
         check_closed(node.context.get_domain_id())
         # The first line that rclpy logs takes 30 ms; said now, it does not come in the middle of a loop.
         node.get_logger().info("ready")
@@ -152,9 +155,10 @@ def _run(make_node: Callable[[Callable[[], None]], Node], arguments: Sequence[st
         # What is there now stays: the collector need not look at it again in the middle of a loop.
         gc.collect()
         gc.freeze()
-        pace = node.run_due if isinstance(node, Paced) else None
         while not stopped.done() and rclpy.ok():
             left = pace() if pace is not None else None
+            if attend is not None:
+                left = min(attend(), _SPIN_SLICE if left is None else left)
             if left is None:
                 executor.spin_until_future_complete(stopped, _SPIN_SLICE)
             else:
