@@ -114,6 +114,8 @@ class BridgeNode(LifecycleNode, PollingNode):
             more_diagnostics=self._diagnostics,
             on_command=self._on_command,
         )
+        if not self._lockstep:
+            self._interface.watch_inputs()
         self._interface.hardware_id = f"X5-9, {values['backend']}"
         self._e_stop_input: EStopInputServer | None = None
         self._feedback = self.create_publisher(JointState, "actuator/feedback", _FEEDBACK_QOS)
@@ -121,7 +123,6 @@ class BridgeNode(LifecycleNode, PollingNode):
         self._supply = self.create_publisher(BatteryState, "actuator/supply", _FEEDBACK_QOS)
         if not self._lockstep:
             create_wall_timer(self, _SLOW_PERIOD, self._publish_slow)
-            create_wall_timer(self, _SLOW_PERIOD, self._take_inputs_at_rest)
         else:
             self._lockstep_loop = LockstepLoop(
                 self._interface,
@@ -179,7 +180,12 @@ class BridgeNode(LifecycleNode, PollingNode):
 
     def run_due(self) -> float | None:
         """Let the lockstep loop do what is due; return when it wants to be called again [s], None in real time."""
-        return None if self._lockstep_loop is None else self._lockstep_loop.run_due()
+        if self._lockstep_loop is not None:
+            return self._lockstep_loop.run_due()
+        # Who commands is counted at rest as well, where the actuator's thread takes no torques: no states flow.
+        if self._loop is None or not self._loop.active:
+            self._interface.wait_for_inputs(0.0)
+        return None
 
     def _make_clock(self) -> Clock:
         return WallClock()
@@ -361,11 +367,6 @@ class BridgeNode(LifecycleNode, PollingNode):
         return sample
 
     # --- slow ----------------------------------------------------------------------------------------------
-
-    def _take_inputs_at_rest(self) -> None:
-        """Count who commands though no cycle does: the thread of the actuator takes torques only while states flow."""
-        if self._loop is None or not self._loop.active:
-            self._interface.take_inputs()
 
     def _publish_slow(self, stamp_ns: int | None = None) -> None:
         """Publish temperature and supply: by wall time, or in lockstep by simulated time, as all else."""

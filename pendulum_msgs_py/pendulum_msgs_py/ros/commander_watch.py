@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 import time
 from collections import Counter, deque
 
@@ -36,6 +37,7 @@ class CommanderWatch:
         self._supervisor = supervisor
         self._commands = node.resolve_topic_name(names.EFFORT_COMMAND)
         self._states = node.resolve_topic_name(names.JOINT_STATES)
+        self._looking = threading.Lock()
         self._checked_ns = 0
         self._contradicted_ns: int | None = None
         self._own_stamps: deque[int] = deque(maxlen=_OWN_STATES)
@@ -70,12 +72,14 @@ class CommanderWatch:
             self._check_soon(self._foreign_ns)
 
     def check(self) -> None:
-        """Look at the graph and tell the supervisor what is wrong, or that nothing is."""
-        self._checked_ns = now = time.monotonic_ns()
-        conflict = self._two_commanders(now) or self._two_plants(now)
-        if conflict and conflict != self._supervisor.commander_conflict:
-            self._node.get_logger().error(conflict)
-        self._supervisor.set_commander_conflict(conflict)
+        """Look at the graph and tell the supervisor what is wrong, or that nothing is; in any thread."""
+        # One after the other: who has looked earlier must not tell later that nothing is wrong.
+        with self._looking:
+            self._checked_ns = now = time.monotonic_ns()
+            conflict = self._two_commanders(now) or self._two_plants(now)
+            if conflict and conflict != self._supervisor.commander_conflict:
+                self._node.get_logger().error(conflict)
+            self._supervisor.set_commander_conflict(conflict)
 
     def _check_soon(self, now: int) -> None:
         if now - self._checked_ns >= CHECK_PERIOD_NS:

@@ -146,10 +146,13 @@ class PlantInterface:
         for source, receive in self._polled:
             source.take(receive)
 
+    def watch_inputs(self) -> None:
+        """Have the middleware say when a torque comes, where inputs are polled, for who waits for them."""
+        self._torques = ArrivalSignal([source.subscription for source, _ in self._polled])
+
     def wait_for_inputs(self, timeout: float) -> None:
-        """Take the torques that came since the last look, or wait for one [s], where inputs are polled."""
-        if self._torques is None:
-            self._torques = ArrivalSignal([source.subscription for source, _ in self._polled])
+        """Take the torques that came since the last look, or wait for one [s], where inputs are watched."""
+        assert self._torques is not None, "inputs are not watched"
         if self._torques.wait(timeout):
             self.take_inputs()
 
