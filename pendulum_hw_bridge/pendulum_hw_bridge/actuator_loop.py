@@ -39,7 +39,7 @@ class ActuatorLoop:
         decide: Returns the decision for now.
         on_outcome: Called with the stamp of the state answered [ns] and what was done.
         take_inputs: Takes the torques that have come, each into :meth:`answered`; where none has, it waits for one, for
-            as long as it is told at most [s].
+            as long as it is told at most [s]. By default none ever comes.
         answer_window: Share of the period in which to wait for answers to a state before acting [-].
         report: Called with the text of an error that ended a cycle.
     """
@@ -52,7 +52,7 @@ class ActuatorLoop:
         on_state: Callable[[JointSample, Feedback], None],
         decide: Callable[[], Drive],
         on_outcome: Callable[[int, Outcome], None],
-        take_inputs: Callable[[float], None] = lambda wait: None,
+        take_inputs: Callable[[float], None] = time.sleep,
         answer_window: float = 0.3,
         report: Callable[[str], None] = lambda text: None,
     ) -> None:
