@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 import subprocess
 import sys
-from importlib.metadata import packages_distributions, requires
+from importlib.metadata import requires
 from pathlib import Path
 
 import pytest
@@ -16,7 +16,7 @@ from pendulum_msgs_py.programs.extras import extra_of, how_to_install
 from tests.acceptance.test_manifests import imported
 from tests.acceptance.test_packaging import FOLDERS, PROGRAMS
 from tests.fixtures import PROJECT
-from tests.layers import LAYERS, environment_of, pins, requirements
+from tests.layers import LAYERS, distributions_of_modules, environment_of, pins, requirements
 
 MACHINES = [
     {"python_version": f"3.{minor}", "python_full_version": f"3.{minor}.7", "sys_platform": platform}
@@ -86,7 +86,7 @@ def of_package(package: str) -> dict[str, set[str]]:
 @pytest.mark.parametrize("package", FOLDERS)
 def test_a_wheel_names_every_library_that_its_modules_import_and_no_other(package: str) -> None:
     # One module may come in several parts, of which a wheel names the one that brings the others.
-    of_module = packages_distributions()
+    of_module = distributions_of_modules()
     used = [{canonicalize_name(name) for name in of_module[module]} for module in imported(package)]
     named = set().union(*(names for extra, names in of_package(package).items() if extra not in {"ros", "rviz"}))
     of_others = {name for name in named if not name.startswith("pendulum-")}
