@@ -156,7 +156,7 @@ def ask(port: int, request: bytes) -> str:
     """Return what the server answers."""
     with socket.create_connection(("127.0.0.1", port), timeout=20) as connection:
         connection.sendall(request)
-        return connection.recv(4096).decode()
+        return connection.recv(4096).decode("latin-1")
 
 
 UPGRADE = {
