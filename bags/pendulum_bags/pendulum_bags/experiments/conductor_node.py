@@ -30,13 +30,15 @@ from pendulum_msgs_py.contract.trajectory import Trajectory
 from pendulum_msgs_py.contract.values import JointSample
 from pendulum_msgs_py.errors import FaultError, PlantStoppedError
 from pendulum_msgs_py.ros import qos
-from pendulum_msgs_py.ros.convert import event_message, sample_from_bytes, trajectory_to_message
+from pendulum_msgs_py.ros.convert import event_message, sample_from_bytes, stamp_of_state, trajectory_to_message
 from pendulum_msgs_py.ros.middleware import check_closed, set_middleware_defaults
 
 __all__ = ["Conductor", "PlantClient", "RecorderClient"]
 
 _SLICE = 0.05
 _QUIET_POLLS = 3
+_SILENCE = 5.0
+"""Time of listening without a state after which a plant in real time counts as gone [s]."""
 _T = TypeVar("_T")
 
 
@@ -47,6 +49,9 @@ class Conductor:
         domain: ROS domain.
         watch: Called between two slices of waiting; raises to end the experiment (a process has died).
         on_wait: Called between two slices with nothing to do but show progress.
+
+    Attributes:
+        listened: For how long it has listened [s]; a pause of this program does not count.
     """
 
     def __init__(
@@ -55,6 +60,7 @@ class Conductor:
         self.domain = domain
         self.watch = watch
         self.on_wait = on_wait
+        self.listened = 0.0
 
     def __enter__(self) -> Conductor:
         """Join the graph."""
@@ -115,6 +121,7 @@ class Conductor:
     def listen(self, duration: float) -> None:
         """Handle what arrives within a duration [s], without asking whether all is well."""
         self._executor.spin_until_future_complete(Future(executor=None), duration)
+        self.listened += duration
 
     def _slice(self, duration: float) -> None:
         self.listen(duration)
@@ -149,6 +156,8 @@ class PlantClient:
         self.namespace = namespace
         self.sample: JointSample | None = None
         self.samples = 0
+        self._foreign_joints: tuple[str, ...] = ()
+        self._heard = conductor.listened
         self.events: list[dict[str, Any]] = []
         self._arm = node.create_client(SetBool, f"{namespace}/{plant}/arm")
         self._pause = node.create_client(SetBool, f"{namespace}/{plant}/pause")
@@ -171,9 +180,13 @@ class PlantClient:
         )
 
     def wait_until_ready(self, timeout: float, *, controller: bool = True, disturbance: bool = True) -> None:
-        """Wait until states flow and all services and the trajectory topic are there."""
+        """Wait until states flow and all services and the trajectory topic are there.
+
+        Raises:
+            FaultError: One of them does not come in time, or the states are those of other joints.
+        """
         wait = self.conductor.wait_for
-        wait(f"states on {self.namespace}/{names.JOINT_STATES}", lambda: self.sample is not None, timeout)
+        wait(f"states on {self.namespace}/{names.JOINT_STATES}", self._has_state, timeout)
         clients = [self._arm, self._e_stop]
         clients += [self._change_state] if controller else []
         clients += [self._start] if disturbance else []
@@ -184,6 +197,15 @@ class PlantClient:
             lambda: self._trajectory.get_subscription_count() > 0,
             timeout,
         )
+
+    def _has_state(self) -> bool:
+        if self.sample is None and self._foreign_joints:
+            found = ", ".join(self._foreign_joints)
+            raise FaultError(
+                f"{self.namespace} has the joint{'s' * (len(self._foreign_joints) > 1)} {found}; expected the one of a "
+                f"pendulum, {names.JOINT}"
+            )
+        return self.sample is not None
 
     def arm(self) -> None:
         """Arm the plant.
@@ -241,8 +263,9 @@ class PlantClient:
 
         Raises:
             PlantStoppedError: The plant faulted, or was stopped or disarmed.
-            FaultError: It refused the move.
+            FaultError: It refused the move, or is silent.
         """
+        self.check_alive()
         for event in self.events[self._finished_before :]:
             if event["name"] == Event.TRAJECTORY_REFUSED:
                 raise FaultError(f"{self.namespace} refused the trajectory: {event.get('reason')}")
@@ -305,6 +328,18 @@ class PlantClient:
         if mode is not None and mode.get("mode") in {"fault", "e_stop"}:
             raise PlantStoppedError(self.namespace, str(mode["mode"]), str(mode.get("reason")))
 
+    def check_alive(self) -> None:
+        """Raise a FaultError where a plant in real time has sent no state for long.
+
+        A plant that this program did not start can end without a word to it.
+        """
+        silent = self.conductor.listened - self._heard
+        if silent > _SILENCE:
+            raise FaultError(
+                f"{self.namespace} has sent no state for {silent:.0f} s: its program has ended or hangs. If it moves "
+                "something real, cut the motor's supply: a torque that it was sent last may still act"
+            )
+
     def _on_event(self, message: String) -> None:
         try:
             event = json.loads(message.data)
@@ -315,9 +350,12 @@ class PlantClient:
 
     def _on_state(self, data: bytes) -> None:
         sample = sample_from_bytes(data)
-        if sample is not None:
+        if sample is None:
+            self._foreign_joints = stamp_of_state(data, (names.JOINT,))[1]
+        else:
             self.sample = sample
             self.samples += 1
+            self._heard = self.conductor.listened
 
 
 class RecorderClient:

@@ -153,6 +153,7 @@ def _conduct(
 
 def _noise_ended(plant: PlantClient) -> bool:
     plant.check_mode()
+    plant.check_alive()
     return plant.has_event(Event.NOISE_END) is not None
 
 
