@@ -25,9 +25,12 @@ __all__ = [
     "CONTROLLERS",
     "BaseController",
     "EstimatedVelocity",
+    "SoftStart",
     "controller_class",
     "controller_parameters",
     "make_controller",
+    "soft_start",
+    "specs_of",
     "unwrapped",
 ]
 
@@ -60,8 +63,30 @@ COMMON_PARAMETERS: tuple[ParameterSpec, ...] = (
         minimum=0.0,
     ),
     ParameterSpec("velocity", "measured", "", "Where the velocity comes from.", choices=tuple(VELOCITY_ESTIMATORS)),
+    ParameterSpec(
+        "start_time",
+        0.0,
+        "s",
+        "Time in which the torque that it may ask for rises from zero to its limit, after the first state, for a plant "
+        "that lets nobody begin with much (`start_effort_limit`); 0 for at once.",
+        minimum=0.0,
+        maximum=5.0,
+    ),
 )
 """Parameters that every controller has."""
+
+
+def soft_start(effort: float, limit: float, t: float, start_time: float) -> float:
+    """Return a torque within what may be asked for so long after the first state [N m].
+
+    Args:
+        effort: The torque that is wanted [N m].
+        limit: Largest torque in the end [N m].
+        t: Time since the first state [s].
+        start_time: Time in which the largest torque rises from zero to the limit [s].
+    """
+    bound = limit if t >= start_time else limit * max(0.0, t) / start_time
+    return min(bound, max(-bound, effort))
 
 
 class BaseController:
@@ -81,6 +106,8 @@ class BaseController:
     """Whether its design reckons with motor and spring; others refuse such a plant."""
     PREDICTS: ClassVar[bool] = False
     """Whether it predicts the plant from the torques that it sent, and so has to know which one holds."""
+    STARTS_SOFTLY: ClassVar[bool] = False
+    """Whether it keeps ``start_time`` by itself; for others :class:`SoftStart` does."""
     FEEDBACK: ClassVar[bool] = True
     """Whether it closes a loop whose linear model has to be stable."""
 
@@ -182,13 +209,45 @@ class EstimatedVelocity(BaseController):
         self.inner.carry_over(previous)
 
 
+class SoftStart(BaseController):
+    """A controller whose torque begins at zero and may reach its limit after a while; one that predicts does not know.
+
+    Args:
+        inner: The controller.
+        start_time: Time from the first state until it has all of its torque [s].
+    """
+
+    def __init__(self, inner: Controller, start_time: float) -> None:
+        super().__init__(inner.effort_limit)
+        self.inner = inner
+        self.start_time = start_time
+
+    def reset(self) -> None:
+        """Forget everything."""
+        self.inner.reset()
+
+    def command(self, t: float, x: Sequence[float]) -> float:
+        """Return the inner controller's torque, within what it may have so long after its start [N m]."""
+        return soft_start(self.inner.command(t, x), self.effort_limit, t, self.start_time)
+
+    def describe(self) -> str:
+        """Return the inner controller's line and the time."""
+        return f"{self.inner.describe()}, torque rises in {self.start_time:g} s"
+
+    def carry_over(self, previous: Controller) -> None:
+        """Take over what the previous controller remembers; how long ago it began is the caller's."""
+        self.inner.carry_over(previous)
+
+
 def unwrapped(controller: Controller) -> Controller:
-    """Return the controller itself, without the estimator that gives it its velocity.
+    """Return the controller itself, without what gives it its velocity and what lets its torque rise.
 
     Args:
         controller: A controller, wrapped or not.
     """
-    return controller.inner if isinstance(controller, EstimatedVelocity) else controller
+    while isinstance(controller, (EstimatedVelocity, SoftStart)):
+        controller = controller.inner
+    return controller
 
 
 def controller_class(name: str) -> type[BaseController]:
@@ -210,7 +269,13 @@ def controller_class(name: str) -> type[BaseController]:
 
 def controller_parameters(name: str) -> tuple[ParameterSpec, ...]:
     """Return the specs of a controller, common ones first."""
-    return COMMON_PARAMETERS + controller_class(name).PARAMETERS
+    return specs_of(controller_class(name))
+
+
+def specs_of(kind: type[BaseController]) -> tuple[ParameterSpec, ...]:
+    """Return the specs of a class of controllers: common ones first, but for those of which it has its own."""
+    own = {spec.name for spec in kind.PARAMETERS}
+    return (*(spec for spec in COMMON_PARAMETERS if spec.name not in own), *kind.PARAMETERS)
 
 
 def make_controller(
@@ -236,7 +301,7 @@ def make_controller(
             that is unstable on the linear model of the plant at this period, delay included.
     """
     kind = controller_class(name)
-    p = validate(COMMON_PARAMETERS + kind.PARAMETERS, values or {})
+    p = validate(specs_of(kind), values or {})
     if not (math.isfinite(period) and period > 0.0):
         raise ParameterError(f"period is {period} s; expected a finite value > 0")
     p["effort_limit"] = min(p["effort_limit"], plant.effort_limit) if p["effort_limit"] > 0.0 else plant.effort_limit
@@ -249,6 +314,8 @@ def make_controller(
     if checked:
         designed.check(plant, period)
     controller: Controller = designed
+    if p["start_time"] > 0.0 and not kind.STARTS_SOFTLY:
+        controller = SoftStart(controller, p["start_time"])
     if p["velocity"] != "measured":
         controller = EstimatedVelocity(controller, make_velocity_estimator(p["velocity"], plant, period))
     if checked and kind.FEEDBACK and p.get("tuning") != "manual":

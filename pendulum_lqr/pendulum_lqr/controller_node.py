@@ -19,11 +19,11 @@ from std_msgs.msg import Float64MultiArray
 
 from pendulum_lqr.answering import AnswerLoop
 from pendulum_lqr.controller import (
-    COMMON_PARAMETERS,
     CONTROLLERS,
     BaseController,
     controller_class,
     make_controller,
+    specs_of,
     unwrapped,
 )
 from pendulum_lqr.controllers.joint_lqr import joint_parameters, make_joint_controller
@@ -116,7 +116,7 @@ class ControllerNode(LifecycleNode, PollingNode):
         own = (
             joint_parameters(kind, self._plant)
             if isinstance(self._plant, MechanismParameters)
-            else COMMON_PARAMETERS + controller_class(kind).PARAMETERS
+            else specs_of(controller_class(kind))
         )
         self._settings = NodeParameters(self, NODE_SPECS + own, self._design, self._swap)
         self._period = self._settings["period"] or ASSUMED_PERIOD
@@ -410,7 +410,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         arguments,
         program="pendulum_lqr controller",
         description="Answers each new joint state with a torque.",
-        specs=NODE_SPECS + COMMON_PARAMETERS + _specs_for_help(arguments),
+        specs=NODE_SPECS + _specs_for_help(arguments),
         example="python -m pendulum_lqr controller --ros-args -r __ns:=/sim -p controller:=lqr -p q:=[100.0,0.01]",
     )
 
@@ -420,5 +420,5 @@ def _specs_for_help(arguments: Sequence[str]) -> tuple[ParameterSpec, ...]:
     for argument in arguments:
         name, separator, value = argument.partition(":=")
         if separator and name == "controller" and value in CONTROLLERS:
-            return controller_class(value).PARAMETERS
-    return controller_class("lqr").PARAMETERS
+            return specs_of(controller_class(value))
+    return specs_of(controller_class("lqr"))

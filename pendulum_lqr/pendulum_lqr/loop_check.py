@@ -54,7 +54,10 @@ def growth(controller: Controller, plant: RigidPlant, period: float, set_point: 
     A, B = sampled.A, sampled.B[:, 0]
     controller.reset()
     # A prediction has to be told the truth; whoever makes none may rest wherever its first answer says.
-    predicts = getattr(getattr(controller, "inner", controller), "PREDICTS", False)
+    law = controller
+    while (inner := getattr(law, "inner", None)) is not None:
+        law = inner
+    predicts = getattr(law, "PREDICTS", False)
     hold = model.effort if predicts else controller.command(0.0, (set_point, 0.0))
     controller.reset()
     spreads: list[float] = []

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from pendulum_lqr.controller import BaseController, make_controller
+from pendulum_lqr.controller import BaseController, make_controller, soft_start
 from pendulum_lqr.design import DesignError
 from pendulum_lqr.interface import Controller
 from pendulum_lqr.policy import SIGNALS, Policy, require_plant
@@ -50,6 +50,7 @@ class LearnedPolicy(BaseController):
         start_time: Time from the first state until it has all of its torque [s].
     """
 
+    STARTS_SOFTLY = True  # it sees the torque that it asked for, so it has to know
     FEEDBACK = False  # the linear model tells nothing of it: it is judged by what it visited in training
     SUMMARY = "learned policy from a file, with a fallback outside of what it was trained for"
     PARAMETERS = (
@@ -223,5 +224,4 @@ class LearnedPolicy(BaseController):
 
     def _begun(self, t: float, effort: float) -> float:
         """Return the torque within what it may have so long after its start [N m]."""
-        bound = self.effort_limit if t >= self.start_time else self.effort_limit * max(0.0, t) / self.start_time
-        return min(bound, max(-bound, effort))
+        return soft_start(effort, self.effort_limit, t, self.start_time)

@@ -342,7 +342,7 @@ class PlantSupervisor:
             return ""
         return (
             f"zero torque: {command.source or 'a controller'} asks for {written(command.effort, '.2f')} N m; "
-            f"expected at most {self.limits.start_effort} N m to begin"
+            f"expected at most {self.limits.start_effort} N m to begin (a controller's start_time lets it rise)"
         )
 
     def _starve(self, reason: str, now_ns: int, push: Vector) -> Drive:
