@@ -69,7 +69,7 @@ def test_a_plant_that_is_armed_or_commanded_or_not_there_is_left_alone(
 
     unasked = experiment(processes, domain_id, out, *lab)
     assert unasked.wait(60.0) == 2
-    assert "nobody is there to say yes; expected a terminal, or --yes; nothing was started" in unasked.output
+    assert "there is no terminal to confirm in; expected one, or --yes; nothing was started" in unasked.output
 
     commanded = experiment(processes, domain_id, out, *lab, "--yes")
     assert commanded.wait(60.0) == 2

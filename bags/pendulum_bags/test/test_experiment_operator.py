@@ -132,7 +132,7 @@ def test_the_question_says_which_machine_and_what_it_will_do(lab: Path, capsys: 
     def nobody() -> str:
         raise EOFError
 
-    with pytest.raises(FaultError, match="nobody is there to say yes; expected a terminal, or --yes"):
+    with pytest.raises(FaultError, match="there is no terminal to confirm in; expected one, or --yes"):
         ask_yes(machine, "It moves.", make_console(), yes=False, read=nobody)
     ask_yes(machine, "It moves.", make_console(), yes=True, read=nobody)
 

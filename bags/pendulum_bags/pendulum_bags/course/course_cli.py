@@ -59,7 +59,7 @@ def make(
     from pendulum_msgs_py.plants.sealed_plant import seal_plant
 
     if out.is_dir() and any(out.iterdir()):
-        raise BagError(f"course folder {out} is not empty; expected a new one, so that nobody's answers get lost")
+        raise BagError(f"course folder {out} is not empty; expected a new one, so that no answers get lost")
     tasks = draw_tasks(seed)
     try:
         out.mkdir(parents=True, exist_ok=True)

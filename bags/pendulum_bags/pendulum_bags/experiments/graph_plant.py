@@ -79,7 +79,7 @@ def join(conductor: Conductor, space: str) -> PlantClient:
         if count := conductor.node.count_publishers(f"{space}/{topic}"):
             raise FaultError(
                 f"{space}/{topic} has {count} publisher{'s' * (count > 1)}: somebody else commands this plant; "
-                "expected nobody"
+                "expected no other commander"
             )
     client = PlantClient(conductor, space, node)
     client.wait_until_ready(_PATIENCE, controller=False, disturbance=False)
@@ -87,7 +87,7 @@ def join(conductor: Conductor, space: str) -> PlantClient:
     conductor.spin(0.5)
     if client.is_armed():
         raise FaultError(
-            f"{space} is armed already; expected it at rest and disarmed (a pendulum that nobody else uses: "
+            f"{space} is armed already; expected it at rest and disarmed (if no other program uses it: "
             f"python -m pendulum_bags move down --namespace {space})"
         )
     assert client.sample is not None

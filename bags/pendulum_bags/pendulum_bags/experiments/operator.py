@@ -253,6 +253,6 @@ def _await_yes(console: Console, *, yes: bool, read: Callable[[], str]) -> None:
     try:
         answer = read()
     except EOFError:
-        raise FaultError("nobody is there to say yes; expected a terminal, or --yes; nothing was started") from None
+        raise FaultError("there is no terminal to confirm in; expected one, or --yes; nothing was started") from None
     if answer.strip().lower() != YES:
         raise FaultError(f"the answer is {answer.strip()!r}; expected {YES!r}; nothing was started")

@@ -170,7 +170,7 @@ def _on_cluster(
             future.release()
     except KilledWorker as error:
         raise FaultError(
-            f"workers keep dying: {str(error).splitlines()[0]}; what is done is kept, the same command goes on"
+            f"workers keep dying: {str(error).splitlines()[0]}; finished pieces are kept, and the same command resumes"
         ) from error
     finally:
         for future in jobs:
