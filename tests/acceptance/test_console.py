@@ -113,6 +113,8 @@ def test_two_clients_see_stop_tune_and_meet_a_new_simulator(
     assert box["width"] > 300
     popup = phone.locator("#popup").bounding_box()  # says that the connection is lost; it has its place before that
     assert popup["y"] + popup["height"] <= box["y"], (popup, box)
+    notices = phone.locator(".q-notifications__list--bottom").first.bounding_box()
+    assert notices["y"] + notices["height"] <= box["y"], (notices, box)
 
     # A refused value is explained, and the value in force comes back.
     field = desk.locator("input[aria-label='r of /sim']")

@@ -1,4 +1,4 @@
-"""The console's stop outlives errors: of one plant's service, and of what plants say."""
+"""The console survives what plants do: a broken service, events without sense, a torque that is no longer sent."""
 
 from __future__ import annotations
 
@@ -9,10 +9,12 @@ from collections.abc import Callable, Iterator
 from typing import Any
 
 import pytest
+from sensor_msgs.msg import JointState
 from std_msgs.msg import String
 from std_srvs.srv import Trigger
 
 from pendulum_bags.console.console_node import Hub
+from pendulum_msgs_py.contract.cdr import encode_joint_state
 from pendulum_msgs_py.ros import qos
 from tests.graph_peer import GraphPeer
 
@@ -89,3 +91,20 @@ def test_an_event_that_makes_no_sense_keeps_no_answer_to_a_stop_away(lab: Lab) -
     lab.until(lambda: lab.hub.frame()["/first"]["mode"] == "disarmed", "event after it")
     asyncio.run(lab.hub.e_stop())
     lab.until(lambda: lab.state(FIRST) == lab.state(SECOND) == "stopped", "answers of both plants")
+
+
+def test_a_torque_that_nobody_sends_any_more_is_not_shown_as_if_somebody_did(lab: Lab) -> None:
+    states = lab.peer.node.create_publisher(JointState, "/first/joint_states", qos.STATE)
+    commands = lab.peer.node.create_publisher(JointState, "/first/effort_command", qos.COMMAND)
+
+    def shown(*, commanded: bool) -> dict[str, Any]:
+        now = time.time_ns()
+        states.publish(encode_joint_state(now, position=1.0, velocity=0.0, effort=0.0))
+        if commanded:
+            commands.publish(encode_joint_state(now, frame_id="somebody", effort=0.7))
+        frame: dict[str, Any] = lab.hub.frame()["/first"]
+        return frame
+
+    lab.until(lambda: shown(commanded=True).get("command") == 0.7, "command in the picture")
+    lab.until(lambda: "command" not in shown(commanded=False), "picture without it")
+    assert shown(commanded=False)["theta"] == 1.0

@@ -1,8 +1,12 @@
-"""What the console knows of the folders that its programs write."""
+"""What the console knows of the folders that its programs write, and where it refuses to listen."""
 
 import os
+import socket
 from pathlib import Path
 
+import pytest
+
+from pendulum_bags.console.console_node import main
 from pendulum_bags.console.jobs import Jobs
 
 
@@ -16,3 +20,16 @@ def test_the_newest_page_of_a_kind_is_found_among_all_runs(tmp_path: Path) -> No
         os.utime(page, (written, written))
     assert jobs.newest("frequency_response.html") == tmp_path / "a_last"
     assert Jobs(tmp_path / "missing").newest("frequency_response.html") is None
+
+
+def test_a_port_that_is_taken_is_refused_before_anything_starts(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with socket.socket() as other:
+        other.bind(("127.0.0.1", 0))
+        other.listen()
+        port = other.getsockname()[1]
+        assert main(["--port", str(port), "--runs", str(tmp_path)]) == 2
+    assert f"port is {port}, which another program listens on; expected a free one" in capsys.readouterr().err
+    assert main(["--host", "nowhere.invalid", "--runs", str(tmp_path)]) == 2
+    assert "host is 'nowhere.invalid', port 8090: " in capsys.readouterr().err

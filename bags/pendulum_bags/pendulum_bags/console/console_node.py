@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import asyncio
+import errno
 import json
 import secrets
+import socket
 import sys
 import threading
 import time
@@ -54,6 +56,8 @@ _TORQUES = {
     "disturbance": names.DISTURBANCE,
     "applied": names.APPLIED_EFFORT,
 }
+_FRESH = 0.3
+"""Age at which a torque counts as no longer sent [s]; plants take none that is older than 0.05 s."""
 _STOP_SERVICE = "/e_stop"
 _STOP_TICK = 0.02
 _STOP_WAIT = 0.4
@@ -69,6 +73,7 @@ class _Plant:
     taps: dict[str, PolledInput]
     others: list[Any] = field(default_factory=list)
     values: dict[str, float] = field(default_factory=dict)
+    heard: dict[str, float] = field(default_factory=dict)
     stamp_ns: int = 0
     mode: str = ""
     reason: str = ""
@@ -353,10 +358,15 @@ class Hub:
             for data, _ in tap.messages():
                 if key != "state":
                     plant.values[key] = effort_from_bytes(data) or 0.0
+                    plant.heard[key] = time.monotonic()
                 elif (sample := sample_from_bytes(data)) is not None:
                     (theta,), (theta_dot,), (measured,) = sample[1:]
                     plant.values.update(theta=theta, theta_dot=theta_dot, measured=measured)
                     plant.stamp_ns = sample.stamp_ns
+        for key, heard in plant.heard.items():
+            # A torque that nobody sends any more is not drawn on as if somebody did.
+            if time.monotonic() - heard > _FRESH:
+                plant.values.pop(key, None)
         return {
             **plant.values,
             "stamp_ns": str(plant.stamp_ns),
@@ -403,6 +413,7 @@ def console(
     token = "" if is_loopback(host) else secrets.token_urlsafe(16)
     if runs.exists() and not runs.is_dir():
         raise ParameterError(f"runs is {runs}, a file; expected a folder")
+    _check_address(host, port)
     hub, jobs = Hub(), Jobs(runs.resolve())
     address = f"http://{'localhost' if is_loopback(host) else host}:{port}/" + (f"?token={token}" if token else "")
     try:
@@ -418,6 +429,22 @@ def console(
         jobs.close()
         hub.close()
     return 0
+
+
+def _check_address(host: str, port: int) -> None:
+    """Refuse an address that cannot be listened on, before anything starts."""
+    try:
+        family, kind, protocol, _, address = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)[0]
+        with socket.socket(family, kind, protocol) as probe:
+            # As the server does: a port that was left a moment ago may be taken again.
+            probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+            probe.bind(address)
+    except OSError as error:
+        if error.errno == errno.EADDRINUSE:
+            raise ParameterError(
+                f"port is {port}, which another program listens on; expected a free one: --port PORT"
+            ) from error
+        raise ParameterError(f"host is {host!r}, port {port}: {error.strerror or error}") from error
 
 
 def main(argv: list[str] | None = None) -> int:
