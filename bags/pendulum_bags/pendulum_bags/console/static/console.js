@@ -95,6 +95,17 @@
     alarms.sending = state.stopPressed;
     send();
   }
+  // The page is loaded anew when its server was: what was ordered of the last one is kept across that.
+  let kept = sessionStorage.getItem("order");
+  if (kept) [alarms.server, alarms.order] = JSON.parse(kept);
+
+  function keep() {
+    const now = alarms.order ? JSON.stringify([alarms.server, { ...alarms.order, since: 0 }]) : null;
+    if (now === kept) return;
+    kept = now;
+    if (now) sessionStorage.setItem("order", now);
+    else sessionStorage.removeItem("order");
+  }
 
   const clock = (time) => new Date(time).toLocaleTimeString();
   const seconds = (ms) => `${(ms / 1000).toFixed(1)} s`;
@@ -112,7 +123,7 @@
     }
     const order = alarms.order;
     // What was answered once is no longer known to hold while nobody says so.
-    const unknown = rows.length > 0;
+    const unknown = rows.length > 0 || !state.frames;
     if (order && unknown) {
       const said = Object.entries(order.rows).map(([node, row]) => `${spaceOf(node)} ${row.state === "stopped" ? "was stopped" : "had not answered"}`);
       rows.push(["bad", `UNCONFIRMED. Last known: ${said.join(", ") || "no plant on the graph"}.`]);
@@ -216,6 +227,7 @@
       else Object.keys(alarms.order.rows).forEach((node) => stop(node, null));
     } else if (alarms.sending === null || message.stop) alarms.order = message.stop;
     alarms.server = message.server;
+    keep();
     behind = Math.min(behind, performance.now() / 1000 - now);
     state.frames += 1;
     for (const [name, plant] of Object.entries(frame)) {
