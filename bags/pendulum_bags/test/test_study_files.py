@@ -4,10 +4,15 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import numpy as np
 import pytest
 
+from pendulum_bags.experiments.in_process import simulate
 from pendulum_bags.studies.study_file import load_study, shipped_studies
+from pendulum_lqr.policy_file import write_policy
 from pendulum_msgs_py.errors import ParameterError
+from pendulum_msgs_py.plants.plant_parameters import load_plant
+from tests.policies import linear_policy
 
 HEAD = "format: pendulum_study/1\nname: small\n"
 BODY = "plants:\n  sim: {}\ncontrollers:\n  lqr: {}\n"
@@ -99,3 +104,25 @@ def test_a_study_says_whether_it_keeps_the_time_of_the_wall(tmp_path: Path) -> N
     assert named.runs[0].arguments[-1] == "--realtime"
     assert not load_study("gravity").realtime
     assert load_study("thesis").realtime
+
+
+def test_a_policy_file_beside_the_study_is_a_controller_of_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "study").mkdir()
+    write_policy(tmp_path / "study" / "mine.npz", linear_policy(load_plant("thesis"), 20.0, 1.0))
+    text = HEAD + (
+        "plants:\n  sim: {engine: process}\ncontrollers:\n  lqr: {}\n  mine: {kind: policy, policy: mine.npz}\n"
+        "disturbances:\n  noise: {kind: uniform, amplitude: 2.5, hold_time: 0.01}\nduration: 0.5\n"
+    )
+    monkeypatch.chdir(tmp_path)  # the path begins at the study's folder, wherever it is called from
+    lqr, mine = load_study(study_file(tmp_path / "study", text)).runs
+    assert (mine.labels["controller"], mine.name) == ("mine", "00002_sim_mine_noise_upright_seed1")
+    assert lqr.spec is not None
+    assert mine.spec is not None
+    arrays = simulate(mine.spec)
+    seen = arrays.position - np.pi, arrays.velocity
+    # Every fifth state is answered anew, within what a policy may ask for in its first 0.2 s.
+    late = slice(100, 250, 5)
+    np.testing.assert_allclose(arrays.command[late], -20.0 * np.sin(seen[0][late]) - seen[1][late], atol=1e-4)
+    (tmp_path / "study" / "mine.npz").unlink()
+    with pytest.raises(ParameterError, match=r"study\.yaml:\d+.*mine\.npz does not exist"):
+        load_study(tmp_path / "study" / "study.yaml")

@@ -16,9 +16,10 @@ from typing import Any
 from pendulum_bags.experiments.run_spec import CLOCKS, PERIODS, RunSpec
 from pendulum_bags.experiments.settings import TIME_BESIDE_NOISE
 from pendulum_bags.studies.located import LocatedMapping
+from pendulum_lqr.policy_file import load_policy
 from pendulum_msgs_py.contract import noise
 from pendulum_msgs_py.contract.angles import UPRIGHT
-from pendulum_msgs_py.errors import ParameterError
+from pendulum_msgs_py.errors import DataError, ParameterError
 
 __all__ = ["ANALYSES", "EXPERIMENTS", "Study", "StudyRun", "load_study", "shipped_studies"]
 
@@ -196,6 +197,19 @@ def load_study(source: str | Path, *, seeds: Sequence[int] | None = None) -> Stu
     )
 
 
+def _law(file: LocatedMapping, name: str, entry: LocatedMapping) -> tuple[str, dict[str, Any]]:
+    """Return kind and parameters of a controller; the path of a policy begins at the study's folder."""
+    values = dict(entry.values)
+    if (kind := values.pop("kind", name)) == "policy":
+        path = file.path.resolve().parent / Path(str(values.get("policy", ""))).expanduser()
+        try:
+            load_policy(path)
+        except DataError as error:
+            file.fail(str(error), "controllers", name)
+        values["policy"] = str(path)
+    return kind, values
+
+
 def _plain_runs(file: LocatedMapping, _: str, clock: str, seeds: Sequence[int], repeats: int) -> list[StudyRun]:
     duration = _duration(file)
     plants, controllers = _axis(file, "plants"), _axis(file, "controllers")
@@ -211,12 +225,12 @@ def _plain_runs(file: LocatedMapping, _: str, clock: str, seeds: Sequence[int], 
     axes = (plants, controllers, disturbances, set_points, starts, seeds, range(1, repeats + 1))
     _limit_runs(file, axes)
     runs = []
+    laws = {name: _law(file, name, entry) for name, entry in controllers.items()}
     for number, (plant, controller, disturbance, set_point, start, seed, repeat) in enumerate(
         itertools.product(*axes), start=1
     ):
         settings = plants[plant].values
-        parameters = dict(controllers[controller].values)
-        kind = parameters.pop("kind", controller)
+        kind, parameters = laws[controller]
         try:
             spec = RunSpec(
                 side=settings.get("side", "sim"),
