@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib
 import json
+import shutil
 from pathlib import Path
 
 import pytest
@@ -31,6 +32,12 @@ def test_the_loop_in_c_says_why_it_is_not_there(tmp_path: Path, monkeypatch: pyt
     monkeypatch.setenv("PATH", str(tmp_path))
     with pytest.raises(FileNotFoundError, match="no C compiler is installed"):
         build_limit(tmp_path)
+
+
+@pytest.mark.skipif(shutil.which("cc") is None, reason="no C compiler is installed")
+def test_the_loop_in_c_compiles_against_the_headers_that_came_with_rclpy(tmp_path: Path) -> None:
+    library = build_limit(tmp_path)
+    assert {b"run_plant", b"run_answerer"} <= set(library.read_bytes().split(b"\0"))
 
 
 def test_a_missing_peer_is_reported_and_leaves_the_verdict_open() -> None:
