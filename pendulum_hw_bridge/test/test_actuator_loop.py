@@ -140,6 +140,42 @@ def test_a_cycle_waits_for_an_answer_only_in_its_window_and_no_longer_once_it_ha
     assert max(asked) <= 0.3 * 0.01
 
 
+class _PassingTime(WallClock):
+    """Wall time that passes when somebody waits; keeps what each wait was for."""
+
+    def __init__(self, on_wait: Callable[[int], None]) -> None:
+        self.now = 0
+        self._on_wait = on_wait
+
+    def now_ns(self) -> int:
+        return self.now
+
+    def wait_until(self, time_ns: int) -> None:
+        self._on_wait(time_ns)
+        self.now = max(self.now, time_ns)
+
+
+def test_a_record_is_computed_while_it_is_on_its_way_and_not_when_it_should_be_there():
+    under_way: list[tuple[int, int | None]] = []
+    clock = _PassingTime(lambda target: under_way.append((target, actuator.next_delivery_ns)))
+    actuator = EmulatedX5(load_emulator("thesis"), seed=1, start_ns=0)
+    port = EmulatorBackend(actuator, clock)
+    port.connect()
+    waited_for = 0
+    for _ in range(50):
+        under_way.clear()
+        feedback = port.read(0.1)
+        assert feedback is not None
+        if under_way[-1][1] is not None:
+            # The last wait was for a record that is there already, and for nothing longer.
+            assert under_way[-1] == (feedback.stamp_ns, feedback.stamp_ns) == (clock.now, clock.now)
+            waited_for += 1
+        else:
+            # Measured at the begin of a step of the emulation, it may be due before the measurement is.
+            assert feedback.stamp_ns <= clock.now < feedback.stamp_ns + 250_000
+    assert waited_for > 25
+
+
 def test_an_error_in_a_cycle_releases_the_drive_and_is_told(running: Running) -> None:
     running.arm()
 

@@ -50,6 +50,8 @@ class EmulatorBackend:
         self.actuator = actuator
         self.clock = clock or WallClock()
         self._random = np.random.Generator(np.random.Philox(key=[seed, 1]))
+        # Where time passes by itself; simulated time waits for whoever computes.
+        self._computes_ahead = isinstance(self.clock, WallClock)
         self._feedback_delay_ns = round(actuator.parameters.timing.feedback_delay * NANOSECONDS)
         self._connected = False
         self._strategy = Strategy.OFF
@@ -114,6 +116,9 @@ class EmulatorBackend:
             sample = self.actuator.next_sample_ns + self._feedback_delay_ns
             # A record on its way comes before the next one, unless it is held back.
             target = sample if delivery is None else min(delivery, sample)
+            if delivery is None and self._computes_ahead:
+                # Measured while it is on its way, not when it should be there: that takes a tenth of a millisecond.
+                target = self.actuator.next_sample_ns
             if target > deadline or self.clock.now_ns() > deadline:
                 self.clock.wait_until(deadline)
                 self._catch_up()
