@@ -30,7 +30,7 @@ from pendulum_msgs_py.errors import DataError, PendulumError
 
 __all__ = ["LARGEST_ARCHIVE", "Actor", "Space", "load_actor"]
 
-LARGEST_ARCHIVE = 100_000_000
+LARGEST_ARCHIVE = 40_000_000
 """Largest archive accepted [bytes]: optimisers of all networks are in it too."""
 _LARGEST_DATA = 20_000_000
 _PARTS = ("data", "policy.pth")

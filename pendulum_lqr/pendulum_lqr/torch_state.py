@@ -23,7 +23,7 @@ from pendulum_msgs_py.errors import DataError
 
 __all__ = ["LARGEST_STATE", "read_state"]
 
-LARGEST_STATE = 64_000_000
+LARGEST_STATE = 32_000_000
 """Largest sum of a file's parts [bytes]: actor and critics of 400 x 300 take 4 million."""
 _LARGEST_PICKLE = 1_000_000
 _MOST_TENSORS = 1000
