@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import shutil
 import socket
+import subprocess
 import urllib.error
 import urllib.request
 from collections.abc import Iterator
@@ -184,6 +186,17 @@ def test_axe_finds_nothing_that_keeps_anybody_out(browser: Any, address: str) ->
         backgrounds[scheme] = page.evaluate("getComputedStyle(document.body).backgroundColor")
     assert backgrounds["light"] != backgrounds["dark"], "the page did not change its colours"
     assert not problems, "\n".join(problems)
+
+
+def test_the_page_doubts_a_silent_server_and_gives_its_orders_to_the_next() -> None:
+    """The page's script alone: what it sends and shows while servers come and go, and when it is loaded anew."""
+    if (node := shutil.which("node")) is None:
+        pytest.skip("no node on this machine")
+    script = PROJECT / "bags" / "pendulum_bags" / "pendulum_bags" / "console" / "static" / "console.js"
+    ended = subprocess.run(
+        [node, Path(__file__).with_name("console_page.cjs"), script], capture_output=True, text=True, timeout=60
+    )
+    assert ended.returncode == 0, ended.stderr
 
 
 def test_no_stop_is_lost_whatever_is_frozen_killed_or_cut_off(domain_id: int, tmp_path: Path) -> None:
