@@ -19,6 +19,7 @@ from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.joints import Vector
 from pendulum_msgs_py.parameters import read_text
 from pendulum_msgs_py.plants.mechanism_parameters import MechanismParameters
+from pendulum_msgs_py.whole_file import write_whole
 
 __all__ = ["FORMAT", "MechanismTrajectory", "SwingUpSearch", "load_trajectory", "search_swing_up", "write_trajectory"]
 
@@ -151,7 +152,7 @@ def _held(plant: MechanismParameters, catch: MechanismCatch, z: Vector, count: i
 
 
 def write_trajectory(path: Path, trajectory: MechanismTrajectory) -> None:
-    """Write a trajectory as JSON, with six digits behind the point.
+    """Write a trajectory as JSON, with six digits behind the point; the file appears whole or not at all.
 
     Raises:
         ParameterError: The file cannot be written.
@@ -172,7 +173,7 @@ def write_trajectory(path: Path, trajectory: MechanismTrajectory) -> None:
     text = json.dumps(document)
     try:
         # One node a line, so that a change shows as one.
-        path.write_text(text.replace("], [", "],\n[") + "\n", encoding="utf-8")
+        write_whole(path, text.replace("], [", "],\n[") + "\n")
     except OSError as error:
         raise ParameterError(f"{path} cannot be written: {error.strerror}") from error
 
