@@ -1,4 +1,4 @@
-"""``make test``: what keeps a plant's time, in two rows, and with what this leaves of the cores all that computes.
+"""``make test``: what keeps a plant's time, one after the other, and with what this leaves of the cores what computes.
 
 Tests of one file stay together, so that what a file prepares is prepared once. Named files or folders run as pytest is
 told.
@@ -36,7 +36,7 @@ _EXPERIMENTS = (
     "tests/integration/test_frequency_experiment.py",
     "tests/faults/test_security_policy.py",
 )
-"""Whole systems in real time, longest first: of these one at a time, for each asks for about one core."""
+"""Whole systems in real time, longest first; each asks for about one core."""
 _WAITS = (
     "tests/acceptance/test_console.py",
     "tests/integration/test_plant_interface.py",
@@ -84,22 +84,19 @@ def main(arguments: Sequence[str]) -> int:
         os.environ.pop(name, None)
     if any((PROJECT / argument.split("::")[0]).exists() for argument in arguments):
         return subprocess.run([sys.executable, "-m", "pytest", *arguments], cwd=PROJECT, check=False).returncode
-    experiments, waits, others = rooms()
+    in_time, others = rooms()
     parts = [
-        Part("experiments", [*experiments, *arguments], workers=1),
-        Part("in real time", [*waits, *arguments], workers=1),
+        Part("in real time", [*in_time, *arguments], workers=1),
         Part("computing", [*others, *arguments], workers=2, nice=_NICE),
     ]
     return run_parts(parts)
 
 
-def rooms() -> tuple[list[str], list[str], list[str]]:
-    """Return the files of each part in the order to start them in: experiments, others in real time, what computes."""
-    experiments = _files(_EXPERIMENTS)
-    waits = [name for name in _files(_WAITS) if name not in experiments]
+def rooms() -> tuple[list[str], list[str]]:
+    """Return the files of each part in the order to start them in: what keeps a plant's time, and all others."""
+    in_time = _files((*_EXPERIMENTS, *_WAITS))
     packages = sorted(str(path) for top in ("", "bags/") for path in PROJECT.glob(f"{top}pendulum_*/test"))
-    others = [name for name in _files((*_COMPUTES, *packages)) if name not in {*experiments, *waits}]
-    return experiments, waits, others
+    return in_time, [name for name in _files((*_COMPUTES, *packages)) if name not in in_time]
 
 
 class Part:
