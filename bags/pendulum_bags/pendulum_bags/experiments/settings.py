@@ -167,15 +167,15 @@ class RegulationSettings:
         return self.running(side) or f"/{side}"
 
     @property
-    def is_emulated(self) -> bool:
-        """Whether nothing real can move: the hardware is emulated or simulated, and the experiment starts both."""
-        stands_in = self.plant_name("hw") == "emulator" or self.foreign_of("hw") is not None
+    def can_repeat(self) -> bool:
+        """Whether both sides can be recorded again with new noise, in lockstep and without an operator."""
+        stands_in = self.hardware == "emulator" or self.foreign_of("hw") is not None
         return stands_in and self.running("sim") is None
 
     @property
-    def can_repeat(self) -> bool:
-        """Whether both sides can be recorded again with new noise, in lockstep and without an operator."""
-        return self.is_emulated and self.machine is None
+    def is_emulated(self) -> bool:
+        """Whether nothing real can move: the hardware is emulated or simulated, and the experiment starts both."""
+        return self.can_repeat or (self.plant_name("hw") == "emulator" and self.running("sim") is None)
 
     @property
     def machine(self) -> RealMachine | None:
