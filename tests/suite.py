@@ -123,11 +123,13 @@ class Part:
     def start(self) -> None:
         """Start pytest, in a session of its own: Linux shares the cores among sessions first."""
         reader, writer = os.pipe()
+        # Within a worker's test this is no worker.
+        environment = {name: value for name, value in os.environ.items() if not name.startswith("PYTEST_XDIST")}
         command = [sys.executable, "-m", "pytest", "-p", "tests.suite_events", "-n", str(self._workers)]
         self._popen = subprocess.Popen(
             [*command, "--dist", "loadfile", "--no-loadscope-reorder", *self._arguments],
             cwd=PROJECT,
-            env={**os.environ, PIPE: str(writer)},
+            env={**environment, PIPE: str(writer)},
             stdin=subprocess.DEVNULL,
             stdout=self._output,
             stderr=subprocess.STDOUT,
