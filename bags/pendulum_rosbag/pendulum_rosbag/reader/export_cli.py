@@ -19,7 +19,7 @@ app = typer.Typer(add_completion=False, rich_markup_mode=None)
 
 
 @app.command(
-    epilog="Examples: python -m pendulum_rosbag export runs/today/sim -o today_sim --format csv; "
+    epilog="Example: python -m pendulum_rosbag export runs/today/sim -o today_sim --format csv; or "
     "python -m pendulum_rosbag export runs/today/sim runs/today/hw -o dataset --format lerobot"
 )
 def export(
