@@ -116,7 +116,8 @@ class Bridge:
         A module that was without power since the last time has lost its settings, and nobody would notice. If nobody
         arms within a second, the strategy goes off again.
         """
-        if self.stop_pending:
+        # A drive that was disarmed in this very cycle is in force still: it ends before anything is written.
+        if self._driving or self.stop_pending:
             self.release()
         if self.stop_pending:
             return "the module has not confirmed that it is off"

@@ -100,7 +100,9 @@ class BridgeNode(LifecycleNode, PollingNode):
         # A cycle more than the monitor has, which names the fault; this one is behind it.
         patience = (values["feedback_watchdog"] + 1) * self._period_ns / NANOSECONDS
         limits = limits_from_parameters(values, (self._plant.effort_limit,), feedback_timeout=patience)
-        self._supervisor = SharedSupervisor(limits, self._prepare, self._withdraw)
+        self._supervisor = SharedSupervisor(
+            limits, self._prepare, self._withdraw, lambda: (self._interface.clock(), self._interface.sample)
+        )
         self._lockstep_loop: LockstepLoop | None = None
         self._interface = PlantInterface(
             self,
@@ -305,9 +307,17 @@ class BridgeNode(LifecycleNode, PollingNode):
         if not self._active or self._bridge is None:
             return "bridge is not active; configure and activate it first"
         try:
-            return self._call(self._bridge.prepare, timeout=2.0)
+            return self._call(functools.partial(self._prepare_drive, self._bridge), timeout=2.0)
         except ActuatorError as error:
             return str(error)
+
+    def _prepare_drive(self, bridge: Bridge) -> str:
+        """Prepare in the thread of the actuator; what was measured meanwhile is the newest that anybody knows."""
+        refusal = bridge.prepare()
+        # In lockstep no time passes meanwhile, and samples have stamps of their own.
+        if not self._lockstep:
+            self._interface.sample = bridge.sample
+        return refusal
 
     def _withdraw(self) -> None:
         if self._bridge is not None:

@@ -4,7 +4,7 @@ import itertools
 
 import pytest
 
-from pendulum_hw_bridge.actuator import ActuatorError, Strategy
+from pendulum_hw_bridge.actuator import ActuatorError, HardwareLimits, Strategy
 from pendulum_hw_bridge.backends.emulator import EmulatorBackend
 from pendulum_hw_bridge.bridge import Bridge
 from pendulum_hw_bridge.clocks import SteppedClock
@@ -101,6 +101,34 @@ def in_mode(mode: Mode) -> Plant:
     plant.cycles(2)
     assert plant.mode is mode
     return plant
+
+
+@pytest.mark.parametrize("moving", [False, True])
+def test_arming_again_before_a_cycle_ends_the_old_drive_before_settings_are_written(moving: bool) -> None:
+    plant = Plant()
+    assert plant.arm() == ""
+    if moving:
+        assert plant.follow(1.0) == ""
+        plant.cycles(20)
+    else:
+        sample = plant.bridge.sample
+        assert sample is not None
+        # Little enough for arming not to be refused because of it.
+        command = JointCommand.of_one(sample.stamp_ns, 0.4, "c")
+        assert plant.supervisor.offer(Input.EFFORT_COMMAND, command, plant.port.now_ns()) is None
+        plant.cycles(2)
+    assert plant.actuator.link.pwm != 0.0
+    seen: list[Strategy] = []
+    set_limits = plant.port.set_limits
+
+    def watch(limits: HardwareLimits) -> HardwareLimits:
+        seen.append(plant.actuator.strategy)
+        return set_limits(limits)
+
+    plant.port.set_limits = watch  # type: ignore[method-assign]
+    plant.supervisor.disarm(plant.port.now_ns())
+    assert plant.arm() == ""
+    assert seen == [Strategy.OFF]
 
 
 EXPECTED = {

@@ -96,3 +96,24 @@ def test_a_drive_is_prepared_for_arming_only_where_it_may_be_armed() -> None:
     assert supervisor.arm(0, sample) == ""
     assert supervisor.arm(0, sample) == ""
     assert prepared == ["once"]
+
+
+def test_what_was_measured_before_the_drive_was_prepared_decides_nothing() -> None:
+    now, newest = 0, JointSample.of_one(0, 0.0, 0.0)
+
+    def prepare() -> str:
+        nonlocal now
+        now += 100_000_000
+        return ""
+
+    limits = PlantLimits(effort=(5.0,), feedback_timeout=0.04, position_min=(-1.0,), position_max=(1.0,))
+    supervisor = SharedSupervisor(limits, prepare, measure=lambda: (now, newest))
+    assert "old" in supervisor.arm(now, JointSample.of_one(0, 0.0, 0.0))
+    newest = JointSample.of_one(195_000_000, 2.0, 0.0)
+    assert "position" in supervisor.arm(now, JointSample.of_one(now, 0.0, 0.0))
+    newest = JointSample.of_one(295_000_000, 0.0, 0.0)
+    assert supervisor.arm(now, JointSample.of_one(0, 0.0, 0.0)) == ""
+    assert supervisor.mode.armed
+    # Judged by what was measured while it was prepared, it is no fault at once.
+    supervisor.decide(now, newest)
+    assert supervisor.mode.armed

@@ -15,6 +15,7 @@ from pendulum_hw_bridge.gains import GainSet
 from pendulum_msgs_py.contract.supervisor import Mode
 from pendulum_msgs_py.contract.values import JointCommand
 from tests.faults.bridge_rig import MILLISECOND, Rig
+from tests.faults.node_rig import NodeRig, ros_of_its_own
 
 KINDS = pytest.mark.parametrize("kind", list(EffortStrategy), ids=lambda kind: kind.value)
 
@@ -314,3 +315,27 @@ def test_a_preparation_that_has_lapsed_is_none() -> None:
     assert rig.supervisor.mode is Mode.FAULT
     assert "not_prepared" in rig.supervisor.reason
     assert int(rig.actuator.strategy) == 0
+
+
+@KINDS
+@pytest.mark.parametrize("delay", [30, 50, 100], ids=lambda delay: f"{delay} ms")
+def test_a_module_that_is_slow_to_set_is_armed_and_stays_so(domain_id: int, kind: EffortStrategy, delay: int) -> None:
+    with ros_of_its_own(domain_id):
+        rig = NodeRig(kind=kind, start=0.0)
+        try:
+            rig.controlling = rig.disturbing = False
+            rig.run(0.1)
+            rig.disarm()
+            rig.run(0.1)
+            set_limits = rig.port.set_limits
+
+            def slow(limits: HardwareLimits) -> HardwareLimits:
+                rig.clock.wait_until(rig.clock.now_ns() + delay * MILLISECOND)
+                return set_limits(limits)
+
+            rig.port.set_limits = slow  # type: ignore[method-assign]
+            assert rig.arm() == ""
+            rig.run(0.1)
+            assert rig.supervisor.mode.armed, rig.supervisor.reason
+        finally:
+            rig.end()

@@ -22,6 +22,8 @@ class SharedSupervisor(PlantSupervisor):
         prepare: Makes the plant ready to be armed, such as the drive's strategy set and confirmed; returns why it could
             not, or an empty string. Called outside the lock, because it may wait for another thread.
         withdraw: Called where the plant was prepared but then not armed.
+        measure: Returns the time [ns] and the newest measurement once the plant is prepared, for preparing takes its
+            time; None where it takes none.
         coordinates: The plant's joints, and which of them are driven.
         follows: Whether the plant can follow trajectories.
     """
@@ -31,6 +33,7 @@ class SharedSupervisor(PlantSupervisor):
         limits: PlantLimits,
         prepare: Callable[[], str] = lambda: "",
         withdraw: Callable[[], None] = lambda: None,
+        measure: Callable[[], tuple[int, JointSample | None]] | None = None,
         *,
         coordinates: Coordinates = ONE_JOINT,
         follows: bool = True,
@@ -38,6 +41,7 @@ class SharedSupervisor(PlantSupervisor):
         self._lock = threading.RLock()
         self._prepare = prepare
         self._withdraw = withdraw
+        self._measure = measure
         self._not_prepared = ""
         super().__init__(limits, preflight=lambda: self._not_prepared, coordinates=coordinates, follows=follows)
 
@@ -66,6 +70,8 @@ class SharedSupervisor(PlantSupervisor):
         self._not_prepared = self._prepare()
         if self._not_prepared:
             return self._not_prepared
+        if self._measure is not None:
+            now_ns, sample = self._measure()
         with self._lock:
             refusal = super().arm(now_ns, sample)
         if refusal:
