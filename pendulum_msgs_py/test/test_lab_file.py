@@ -100,6 +100,41 @@ def test_an_entry_that_is_not_understood_is_refused_with_its_place(
     assert str(path) in str(caught.value)
 
 
+@pytest.mark.parametrize(
+    ("section", "entry", "value", "message"),
+    [
+        ("limits", "effort", "{value: 0.0, unit: N m}", r"limits.effort is 0.0 N m; .*leave it out .*13 N m"),
+        ("limits", "effort", "{value: -0.0, unit: N m}", r"limits.effort is -0.0 N m; expected > 0"),
+        ("limits", "effort", "{value: -5, unit: N m}", r"limits.effort is -5.0 N m; expected > 0"),
+        ("limits", "measured_effort", "{value: 0, unit: N m}", r"limits.measured_effort is 0.0 N m; expected > 0"),
+        ("limits", "velocity", "{value: 0, unit: rad/s}", r"limits.velocity is 0.0 rad/s; expected > 0"),
+        ("limits", "effort_slew", "{value: 0, unit: N m/s}", r"limits.effort_slew is 0.0 N m/s; expected > 0"),
+        ("limits", "derating_temperature", "{value: 0, unit: degC}", r"limits.derating_temperature is 0.0 degC"),
+        (
+            "limits",
+            "position_window",
+            "{value: [0, 0], unit: rad}",
+            r"position_window is \[0.0, 0.0\] rad; .*low < high",
+        ),
+        ("drive", "e_stop_input_timeout", "{value: 0, unit: s}", r"e_stop_input_timeout is 0.0 s; expected > 0"),
+    ],
+)
+def test_a_limit_of_nothing_is_not_taken_for_no_limit(
+    tmp_path: Path, section: str, entry: str, value: str, message: str
+) -> None:
+    path = tmp_path / "lab.yaml"
+    path.write_text(f"format: pendulum_lab/1\n{section}:\n  {entry}: {value}\n")
+    with pytest.raises(ParameterError, match=message):
+        load_lab(path)
+
+
+@pytest.mark.parametrize("value", [0.0, -1.0])
+def test_a_limit_of_nothing_is_not_written_either(tmp_path: Path, value: float) -> None:
+    with pytest.raises(ParameterError, match=r"limits.effort is .* N m; expected > 0"):
+        write_lab(tmp_path / "lab.yaml", LabFile().changed(effort_limit=value))
+    assert not (tmp_path / "lab.yaml").exists()
+
+
 def test_a_file_that_is_not_there_or_cannot_be_written_is_told(tmp_path: Path) -> None:
     with pytest.raises(ParameterError, match=r"lab file .*none.yaml does not exist"):
         load_lab(tmp_path / "none.yaml")

@@ -13,7 +13,8 @@ unit, and an entry that nobody knows is refused::
     proofs: {...}          # written by the guided procedures
 
 An entry is a parameter of the bridge under a name that a person would give it; what values are allowed says the
-bridge's own table. Text that is a path is taken from the lab file's folder.
+bridge's own table. To the bridge, 0 (or a window with equal ends) often stands for no limit or a default. Who writes
+it means the opposite, so that a lab file leaves such an entry out. Text that is a path is taken from the file's folder.
 """
 
 from __future__ import annotations
@@ -61,14 +62,17 @@ class LabEntry:
         unit: SI unit; with one, the entry is written ``{value: ..., unit: ...}``.
         kind: Type of the value: ``float``, ``int``, ``str``, or ``list`` of numbers.
         path: Whether the text may be a path, which counts from the lab file's folder.
+        left_out: What is without the entry, where the bridge's parameter says so with 0; 0 and less are then refused.
     """
 
     parameter: str
     unit: str = ""
     kind: type = str
     path: bool = False
+    left_out: str = ""
 
 
+_OWN = "the bridge's own"
 LAB_ENTRIES: Mapping[str, Mapping[str, LabEntry]] = {
     "module": {
         "backend": LabEntry("backend"),
@@ -86,14 +90,14 @@ LAB_ENTRIES: Mapping[str, Mapping[str, LabEntry]] = {
         "effort_tare": LabEntry("effort_tare", "N m", float),
     },
     "limits": {
-        "effort": LabEntry("effort_limit", "N m", float),
-        "velocity": LabEntry("velocity_limit", "rad/s", float),
-        "position_window": LabEntry("position_window", "rad", list),
-        "effort_slew": LabEntry("effort_slew_limit", "N m/s", float),
+        "effort": LabEntry("effort_limit", "N m", float, left_out="the plant file's own, 13 N m for an X5-9"),
+        "velocity": LabEntry("velocity_limit", "rad/s", float, left_out=_OWN),
+        "position_window": LabEntry("position_window", "rad", list, left_out=_OWN),
+        "effort_slew": LabEntry("effort_slew_limit", "N m/s", float, left_out=_OWN),
         "tracking_error": LabEntry("tracking_error_limit", "rad", float),
-        "measured_effort": LabEntry("measured_effort_limit", "N m", float),
+        "measured_effort": LabEntry("measured_effort_limit", "N m", float, left_out="1 N m above the effort limit"),
         "winding_temperature": LabEntry("winding_temperature_limit", "degC", float),
-        "derating_temperature": LabEntry("derating_temperature", "degC", float),
+        "derating_temperature": LabEntry("derating_temperature", "degC", float, left_out=_OWN),
         "pwm": LabEntry("pwm_limit", "", float),
     },
     "drive": {
@@ -106,7 +110,7 @@ LAB_ENTRIES: Mapping[str, Mapping[str, LabEntry]] = {
         "command_lifetime": LabEntry("command_lifetime", "s", float),
         "feedback_watchdog": LabEntry("feedback_watchdog", "", int),
         "m_stop_action": LabEntry("m_stop_action"),
-        "e_stop_input_timeout": LabEntry("e_stop_input_timeout", "s", float),
+        "e_stop_input_timeout": LabEntry("e_stop_input_timeout", "s", float, left_out="no such input"),
     },
     "supply": {
         "voltage_window": LabEntry("voltage_window", "V", list),
@@ -173,7 +177,7 @@ def load_lab(path: str | Path) -> LabFile:
 
     Raises:
         ParameterError: No such file, not YAML, an unknown section or entry (with the nearest known one), a value of
-            another type, not finite, or without its unit; the message names the place.
+            another type, not finite, without its unit, or a limit of nothing; the message names the place.
     """
     document = load_yaml(path, "lab file")
     where = str(path)
@@ -205,7 +209,7 @@ def write_lab(path: str | Path, lab: LabFile) -> Path:
     """Write a lab file that :func:`load_lab` reads back to the same; at once, so that no half of one is ever there.
 
     Raises:
-        ParameterError: It cannot be written.
+        ParameterError: It cannot be written, or a limit of nothing is in it.
     """
     path = Path(path)
     document: dict[str, Any] = {"format": FORMAT}
@@ -215,7 +219,7 @@ def write_lab(path: str | Path, lab: LabFile) -> Path:
         document["notes"] = lab.notes
     for section, entries in LAB_ENTRIES.items():
         content = {
-            name: _written(lab.values[entry.parameter], entry, path.resolve().parent)
+            name: _written(lab.values[entry.parameter], entry, path.resolve().parent, f"{path}: {section}.{name}")
             for name, entry in entries.items()
             if entry.parameter in lab.values
         }
@@ -248,9 +252,9 @@ def _read(value: object, entry: LabEntry, where: str) -> Any:
     if entry.kind is list:
         if not isinstance(value, list) or len(value) != 2:
             raise ParameterError(f"{where} is {value!r}; expected [low, high] in {entry.unit}")
-        return [_number(element, where) for element in value]
+        return _limiting([_number(element, where) for element in value], entry, where)
     if entry.kind is float:
-        return _number(value, where)
+        return _limiting(_number(value, where), entry, where)
     if not isinstance(value, entry.kind) or isinstance(value, bool):
         raise ParameterError(f"{where} is {value!r}; expected {_KINDS[entry.kind]}")
     return value
@@ -262,7 +266,19 @@ def _number(value: object, where: str) -> float:
     return float(value)
 
 
-def _written(value: Any, entry: LabEntry, folder: Path) -> Any:
+def _limiting(value: Any, entry: LabEntry, where: str) -> Any:
+    """Return a value that does not stand for no limit or a default."""
+    if entry.left_out:
+        good, expected = (value[0] < value[1], "low < high") if entry.kind is list else (value > 0.0, "> 0")
+        if not good:
+            raise ParameterError(
+                f"{where} is {value} {entry.unit}; expected {expected} (leave it out for {entry.left_out})"
+            )
+    return value
+
+
+def _written(value: Any, entry: LabEntry, folder: Path, where: str) -> Any:
+    _limiting(value, entry, where)
     if entry.path and value and Path(value).is_absolute() and Path(value).is_relative_to(folder):
         value = str(Path(value).relative_to(folder))
     return {"value": value, "unit": entry.unit} if entry.unit else value
