@@ -18,6 +18,13 @@ _SLOWEST = 1.0
 """Longest time that anything may take to be noticed, on an emulator on a busy machine [s]."""
 _SLOWEST_ON_HARDWARE = 0.1
 """The same where somebody can be hurt [s]."""
+_SUPPLY = (18.0, 52.0)
+"""Widest window of the supply [V]: an X5-9 takes 24 to 48 V, a battery sags below, a braking motor lifts it above."""
+_LARGEST_MEASURED = 15.0
+"""Largest limit of the measured torque [N m]: the peak of an X5-9, 13 N m, with room for noise and a tare."""
+_E_STOP_INPUT = (0.05, 1.0)
+"""Silence of a button that is taken for a press [s]: shorter, one late message of 20 a second is one; longer, whoever
+pulled its plug waits."""
 
 
 def check_consistency(values: Mapping[str, Any], limits: PlantLimits) -> None:
@@ -57,16 +64,42 @@ def check_consistency(values: Mapping[str, Any], limits: PlantLimits) -> None:
             f"command_timeout is {limits.command_timeout:g} s; expected {period:g} to {slowest:g} s {where}"
         )
     if hardware:
-        _check_hardware(values["backend"], limits)
+        _check_hardware(values, limits)
 
 
-def _check_hardware(backend: str, limits: PlantLimits) -> None:
-    for name, value in (
-        ("velocity_limit", limits.velocity),
-        ("effort_slew_limit", limits.slew),
-        ("start_effort_limit", limits.start_effort),
-        ("starvation_limit", limits.starvation),
-        ("position_window", limits.position_max[0] - limits.position_min[0]),
+def _check_hardware(values: Mapping[str, Any], limits: PlantLimits) -> None:
+    """Refuse what limits nothing on an X5-9; what is too small only stops it early, which hurts nobody."""
+    where = f"with backend {values['backend']!r}"
+    width = limits.position_max[0] - limits.position_min[0]
+    for name, value, largest, unit, why in (
+        ("velocity_limit", limits.velocity, 3.0, "rad/s", "twice what the motor can do, so that it limits nothing"),
+        ("effort_slew_limit", limits.slew, 26e3, "N m/s", "from -13 to 13 N m in one cycle at 1 kHz"),
+        ("start_effort_limit", limits.start_effort, 5.0, "N m", "a commander would begin with a blow"),
+        ("starvation_limit", limits.starvation, 120.0, "s", "so long nobody remembers that it is armed"),
+        ("position_window", width, 64.0, "rad", "from end to end, ten turns"),
+        ("handover_time", limits.handover_time, 1.0, "s", "so long a torque that nobody commands any more stays"),
+        ("handover_effort_limit", limits.handover_effort, 5.0, "N m", "a commander would take over with a blow"),
+        ("tracking_error_limit", limits.tracking_error, 1.0, "rad", "so far off it follows no trajectory"),
     ):
         if math.isinf(value):
-            raise ParameterError(f"{name} is none; expected one with backend {backend!r}")
+            raise ParameterError(f"{name} is none; expected one {where}")
+        if value > largest:
+            raise ParameterError(f"{name} is {value:g} {unit}; expected at most {largest:g} {unit} {where}: {why}")
+    if values["measured_effort_limit"] > _LARGEST_MEASURED:
+        raise ParameterError(
+            f"measured_effort_limit is {values['measured_effort_limit']:g} N m; expected at most "
+            f"{_LARGEST_MEASURED:g} N m {where}: the actuator makes 13 N m"
+        )
+    low, high = _SUPPLY
+    if not all(low <= voltage <= high for voltage in values["voltage_window"]):
+        raise ParameterError(
+            f"voltage_window is {values['voltage_window']} V; expected inside {low:g} to {high:g} V {where}: "
+            "the actuator takes 24 to 48 V"
+        )
+    low, high = _E_STOP_INPUT
+    silence = values["e_stop_input_timeout"]
+    if silence and not low <= silence <= high:
+        raise ParameterError(
+            f"e_stop_input_timeout is {silence:g} s; expected {low:g} to {high:g} s, or 0 for no such input {where}: "
+            "shorter, any late message is a press; longer, a lost button is none"
+        )

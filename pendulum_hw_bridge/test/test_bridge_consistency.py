@@ -106,6 +106,56 @@ def test_a_real_machine_needs_every_limit(name: str, limit: dict[str, float]) ->
         check(limit, backend="hebi")
 
 
+_BOUNDS = [
+    ("handover_time", {"handover_time": 1.001}, {"handover_time": 1.0}, "at most 1 s"),
+    ("handover_effort_limit", {"handover_effort": 5.01}, {"handover_effort": 5.0}, "at most 5 N m"),
+    ("start_effort_limit", {"start_effort": 5.01}, {"start_effort": 5.0}, "at most 5 N m"),
+    ("velocity_limit", {"velocity": 3.01}, {"velocity": 3.0}, "at most 3 rad/s"),
+    ("tracking_error_limit", {"tracking_error": 1.01}, {"tracking_error": 1.0}, "at most 1 rad"),
+    ("effort_slew_limit", {"slew": 26.1e3}, {"slew": 26e3}, "at most 26000 N m/s"),
+    ("position_window", {"position_max": (60.1,)}, {"position_max": (60.0,)}, "at most 64 rad"),
+    ("starvation_limit", {"starvation": 120.5}, {"starvation": 120.0}, "at most 120 s"),
+]
+_VALUE_BOUNDS = [
+    ("measured_effort_limit", 15.1, 15.0, "at most 15 N m"),
+    ("measured_effort_limit", 1000.0, 0.0, "at most 15 N m"),
+    ("voltage_window", [17.9, 50.0], [18.0, 50.0], "inside 18 to 52 V"),
+    ("voltage_window", [22.0, 52.1], [22.0, 52.0], "inside 18 to 52 V"),
+    ("voltage_window", [-1e9, 1e9], [30.0, 40.0], "inside 18 to 52 V"),
+    ("e_stop_input_timeout", 1e-9, 0.05, "0.05 to 1 s, or 0 for no such input"),
+    ("e_stop_input_timeout", 1.01, 1.0, "0.05 to 1 s, or 0 for no such input"),
+    ("e_stop_input_timeout", 0.049, 0.0, "0.05 to 1 s, or 0 for no such input"),
+]
+
+
+@pytest.mark.parametrize(("name", "refused", "taken", "expected"), _BOUNDS)
+def test_a_limit_of_a_real_machine_that_limits_nothing_is_refused(
+    name: str, refused: dict[str, float], taken: dict[str, float], expected: str
+) -> None:
+    check(refused, backend="emulator")
+    check(taken, backend="hebi")
+    with pytest.raises(
+        ParameterError, match=rf"^{name} is [\d.]+ \S+( m\S*)?; expected {expected} with backend 'hebi': "
+    ):
+        check(refused, backend="hebi")
+
+
+@pytest.mark.parametrize(("name", "refused", "taken", "expected"), _VALUE_BOUNDS)
+def test_a_value_that_no_real_machine_can_have_is_refused(
+    name: str, refused: float | list[float], taken: float | list[float], expected: str
+) -> None:
+    check(backend="emulator", **{name: refused})
+    check(backend="hebi", **{name: taken})
+    with pytest.raises(ParameterError, match=f"^{name} is .*; expected {expected} with backend 'hebi': "):
+        check(backend="hebi", **{name: refused})
+
+
+def test_the_cut_off_of_a_hot_winding_is_the_one_that_was_set() -> None:
+    values = validate(BRIDGE_SPECS, {"winding_temperature_limit": 80.0})
+    assert safety_limits(values, 1.0).winding_temperature == 80.0
+    assert safety_limits(validate(BRIDGE_SPECS, {}), 1.0).winding_temperature == 120.0
+
+
 @pytest.mark.parametrize(
     ("sign", "offset", "ends"), [(1, 0.0, (-3.0, 4.0)), (1, 0.5, (-3.5, 3.5)), (-1, 0.5, (-3.5, 3.5))]
 )

@@ -7,15 +7,18 @@ from collections.abc import Iterator
 
 import pytest
 from builtin_interfaces.msg import Duration
+from rclpy.parameter import Parameter
 from rclpy.serialization import serialize_message
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
 from pendulum_bags.experiments.domain import reserve_domain
+from pendulum_hw_bridge.bridge_node import BridgeNode
 from pendulum_hw_bridge.effort_mapping import EffortStrategy
 from pendulum_hw_bridge.emulation.faults import ActuatorFault
 from pendulum_msgs_py.contract import names
 from pendulum_msgs_py.contract.supervisor import Mode
 from pendulum_msgs_py.contract.values import JointCommand
+from pendulum_msgs_py.errors import ParameterError
 from tests.faults.bridge_rig import Rig
 from tests.faults.bridge_scenarios import CASES, SCENARIOS, Case, Scenario, run_scenario
 from tests.faults.node_rig import NodeRig, ros_of_its_own
@@ -157,3 +160,10 @@ def test_the_same_seed_gives_the_same_reaction_bit_by_bit() -> None:
     for rig in (first, second):
         rig.run(1.0)
     assert first.duties == second.duties
+
+
+def test_a_node_with_parameters_that_are_wrong_together_does_not_come_up() -> None:
+    values = {"clock": "lockstep", "autostart": False, "command_lifetime": 0.019}
+    overrides = [Parameter(name, value=value) for name, value in values.items()]
+    with pytest.raises(ParameterError, match=r"command_lifetime is 0.019 s; expected at least two periods"):
+        BridgeNode(lambda: None, parameter_overrides=overrides, enable_rosout=False)
