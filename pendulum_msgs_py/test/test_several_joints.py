@@ -194,6 +194,15 @@ def test_the_joints_rise_each_at_the_slew_limit() -> None:
     assert Plant(slew=10.0).run((Input.EFFORT_COMMAND, (5.0, -0.005), _NAMES)).effort == pytest.approx((0.01, -0.005))
 
 
+def test_a_joint_that_rises_slowly_keeps_no_other_from_falling_at_once() -> None:
+    plant = Plant(slew=10.0)
+    for _ in range(5):
+        plant.run((Input.EFFORT_COMMAND, (0.05, -0.05), _NAMES))
+    drive = plant.run((Input.EFFORT_COMMAND, (5.0, 0.0), _NAMES))
+    assert drive.effort == pytest.approx((0.06, 0.0))
+    assert plant.run((Input.EFFORT_COMMAND, (-5.0, 5.0), _NAMES)).effort == pytest.approx((-0.01, 0.01))
+
+
 def test_without_a_command_and_after_a_stop_every_joint_is_without_torque() -> None:
     plant = Plant()
     plant.run((Input.EFFORT_COMMAND, (1.0, 1.0), _NAMES))

@@ -25,12 +25,16 @@ class Plant:
     def sample(self) -> JointSample:
         return JointSample.of_one(self.now, 0.0, 0.0, 0.0)
 
-    def run(self, seconds: float, command: float | None = None, source: str = "lqr") -> list[Drive]:
+    def run(
+        self, seconds: float, command: float | None = None, source: str = "lqr", disturbance: float | None = None
+    ) -> list[Drive]:
         drives = []
         for _ in range(round(100 * seconds)):
             self.now += 10 * _MS
             if command is not None:
                 self.supervisor.offer(Input.EFFORT_COMMAND, JointCommand.of_one(self.now, command, source), self.now)
+            if disturbance is not None:
+                self.supervisor.offer(Input.DISTURBANCE, JointCommand.of_one(self.now, disturbance, "d"), self.now)
             drives.append(self.supervisor.decide(self.now, self.sample()))
             self.supervisor.report_applied(drives[-1].effort)
         return drives
@@ -49,6 +53,20 @@ def test_the_first_command_after_arming_must_be_near_zero() -> None:
 @pytest.mark.parametrize("sign", [1.0, -1.0])
 def test_just_above_the_limit_does_not_begin(sign: float) -> None:
     assert Plant().run(0.1, sign * 2.01)[-1].effort[0] == 0.0
+
+
+@pytest.mark.parametrize("command", [0.0, 1.5])
+def test_nobody_begins_under_a_disturbance_that_makes_the_sum_too_large(command: float) -> None:
+    plant = Plant()
+    assert all(drive.effort[0] == 0.0 and drive.starved for drive in plant.run(0.3, command, disturbance=13.0))
+    assert f"lqr asks for {command:.2f} N m and the disturbance for 13.00 N m" in plant.supervisor.reason
+    # One within the limit is part of what begins, and whoever commands already may be disturbed by any.
+    assert plant.run(0.01, command, disturbance=0.5)[-1].effort[0] == command + 0.5
+    assert plant.run(0.01, command, disturbance=11.0)[-1].effort[0] == command + 11.0
+
+
+def test_a_disturbance_against_a_large_command_lets_it_not_begin() -> None:
+    assert Plant().run(0.1, 9.0, disturbance=-9.0)[-1].starved
 
 
 def test_another_commander_begins_near_zero_too() -> None:

@@ -159,11 +159,28 @@ def test_each_period_without_a_command_is_counted() -> None:
     assert plant.supervisor.starved_periods == 7
 
 
-def test_torque_rises_and_falls_at_the_slew_limit_and_not_without_time() -> None:
+@pytest.mark.parametrize("side", [1.0, -1.0])
+def test_torque_rises_at_the_slew_limit_and_not_without_time(side: float) -> None:
     plant = Plant(slew=10.0)
-    assert plant.run(10, 5.0).effort[0] == pytest.approx(0.1)
+    assert plant.run(10, side * 5.0).effort[0] == pytest.approx(side * 0.1)
     assert plant.decide().effort[0] == plant.decide().effort[0]
-    assert plant.run(20, -5.0).effort[0] == pytest.approx(-0.1)
+    assert plant.run(10, side * 5.0).effort[0] == pytest.approx(side * 0.2)
+
+
+@pytest.mark.parametrize("side", [1.0, -1.0])
+@pytest.mark.parametrize("less", [0.0, 0.5])
+def test_torque_falls_at_once_whatever_the_slew_limit(side: float, less: float) -> None:
+    plant = Plant(slew=0.5)
+    assert plant.run(3000, side * 1.5).effort[0] == pytest.approx(side * 1.5)
+    assert plant.run(1, side * less).effort[0] == side * less
+
+
+@pytest.mark.parametrize("side", [1.0, -1.0])
+def test_torque_of_the_other_sign_rises_from_zero_at_the_slew_limit(side: float) -> None:
+    plant = Plant(slew=10.0)
+    plant.run(200, side * 2.0)
+    assert plant.run(1, side * -2.0).effort[0] == pytest.approx(side * -0.01)
+    assert plant.run(9, side * -2.0).effort[0] == pytest.approx(side * -0.1)
 
 
 def test_after_a_silence_torque_rises_from_zero_again() -> None:
@@ -319,8 +336,8 @@ def test_the_slew_limit_begins_at_the_torque_that_held() -> None:
     plant = Plant(handover_time=0.0, slew=10.0)
     plant.servo = 1.7
     plant.follow(_hold(0.1))
-    assert plant.run(100, -3.0).effort[0] == pytest.approx(1.7)
-    assert plant.run(1, -3.0).effort[0] == pytest.approx(1.69)
+    assert plant.run(100, 3.0).effort[0] == pytest.approx(1.7)
+    assert plant.run(1, 3.0).effort[0] == pytest.approx(1.71)
 
 
 def test_a_fade_that_a_silence_ended_does_not_come_back() -> None:

@@ -84,12 +84,13 @@ class PlantLimits:
         velocity: Speed at which an armed plant faults, and largest of a trajectory [rad/s].
         position_min: Lower end of each joint's position window; ``(-inf,)`` for no window at any [rad or m].
         position_max: Upper ends; ``(inf,)`` for none.
-        slew: Largest rate of change of the torque [N m/s].
+        slew: Largest rate at which a torque rises, away from zero; it falls at once [N m/s].
         handover_time: Time over which torque passes from position to effort control and back [s].
         tracking_error: Distance from the trajectory at which the plant faults [rad].
         arm_effort: Largest command that may be waiting when the plant is armed [N m].
         handover_effort: Largest distance of a command from the torque that holds, for it to take over [N m].
-        start_effort: Largest torque with which a commander may begin where nobody commands [N m].
+        start_effort: Largest torque, also with the disturbance, with which a commander may begin where nobody commands
+            [N m].
         starvation: Time without a command after which a plant that is armed for effort disarms [s].
     """
 

@@ -86,7 +86,7 @@ LIMIT_SPECS: tuple[ParameterSpec, ...] = (
         "effort_slew_limit",
         0.0,
         "N m/s",
-        "Largest rate of change of the torque; 0 for none.",
+        "Largest rate at which the torque rises, away from zero; it falls at once. 0 for none.",
         minimum=0.0,
         read_only=True,
     ),
@@ -111,7 +111,8 @@ LIMIT_SPECS: tuple[ParameterSpec, ...] = (
         "start_effort_limit",
         0.0,
         "N m",
-        "Largest torque with which a commander may begin where nobody commands; 0 for none.",
+        "Largest torque, also with the disturbance, with which a commander may begin where nobody commands; "
+        "0 for none.",
         minimum=0.0,
         read_only=True,
     ),

@@ -337,13 +337,22 @@ class PlantSupervisor:
     def _begin_refusal(self, command: JointCommand, now_ns: int) -> str:
         """Return why a commander may not begin, or an empty string; one that commands already may ask for anything."""
         lapsed = now_ns - self._commanded_ns > COMMANDER_HOLD * NANOSECONDS
-        begun = self._commanding == command.source and not lapsed
-        if begun or _largest(command.effort) <= self.limits.start_effort:
+        if self._commanding == command.source and not lapsed:
             return ""
-        return (
-            f"zero torque: {command.source or 'a controller'} asks for {written(command.effort, '.2f')} N m; "
-            f"expected at most {self.limits.start_effort} N m to begin (a controller's start_time lets it rise)"
-        )
+        largest, who = self.limits.start_effort, command.source or "a controller"
+        if not _largest(command.effort) <= largest:
+            return (
+                f"zero torque: {who} asks for {written(command.effort, '.2f')} N m; "
+                f"expected at most {largest} N m to begin (a controller's start_time lets it rise)"
+            )
+        # With its first command a disturbance that waits would act at once, however large.
+        waiting = self._disturbances.fresh(now_ns)
+        if waiting is not None and not _largest(tuple(map(add, command.effort, waiting.effort))) <= largest:
+            return (
+                f"zero torque: {who} asks for {written(command.effort, '.2f')} N m and the disturbance for "
+                f"{written(waiting.effort, '.2f')} N m; expected a sum of at most {largest} N m to begin"
+            )
+        return ""
 
     def _starve(self, reason: str, now_ns: int, push: Vector) -> Drive:
         silence = (now_ns - self._commanded_ns) / NANOSECONDS
@@ -361,8 +370,10 @@ class PlantSupervisor:
         if math.isinf(self.limits.slew) or self._last_decision_ns is None:
             return effort
         step = self.limits.slew * max(0, now_ns - self._last_decision_ns) / NANOSECONDS
+        # Away from zero alone: torque that nobody asks for any more must not stay because it may only fall slowly.
         return tuple(
-            min(last + step, max(last - step, wanted)) for last, wanted in zip(self._last_effort, effort, strict=True)
+            min(max(last, 0.0) + step, max(min(last, 0.0) - step, wanted))
+            for last, wanted in zip(self._last_effort, effort, strict=True)
         )
 
     def _measurement_fault(self, now_ns: int, sample: JointSample | None) -> str:
