@@ -7,6 +7,7 @@ and then strategy off.
 
 from __future__ import annotations
 
+import dataclasses
 import functools
 import sys
 from collections.abc import Callable, Mapping, Sequence
@@ -100,6 +101,9 @@ class BridgeNode(LifecycleNode, PollingNode):
         # A cycle more than the monitor has, which names the fault; this one is behind it.
         patience = (values["feedback_watchdog"] + 1) * self._period_ns / NANOSECONDS
         limits = limits_from_parameters(values, (self._plant.effort_limit,), feedback_timeout=patience)
+        if not self._lockstep:
+            # In lockstep, where only an emulator runs, the noise of an experiment begins with the controller.
+            limits = dataclasses.replace(limits, start_sum=limits.start_effort)
         self._supervisor = SharedSupervisor(
             limits, self._prepare, self._withdraw, lambda: (self._interface.clock(), self._interface.sample)
         )

@@ -57,7 +57,7 @@ def test_just_above_the_limit_does_not_begin(sign: float) -> None:
 
 @pytest.mark.parametrize("command", [0.0, 1.5])
 def test_nobody_begins_under_a_disturbance_that_makes_the_sum_too_large(command: float) -> None:
-    plant = Plant()
+    plant = Plant(start_sum=2.0)
     assert all(drive.effort[0] == 0.0 and drive.starved for drive in plant.run(0.3, command, disturbance=13.0))
     assert f"lqr asks for {command:.2f} N m and the disturbance for 13.00 N m" in plant.supervisor.reason
     # One within the limit is part of what begins, and whoever commands already may be disturbed by any.
@@ -65,8 +65,12 @@ def test_nobody_begins_under_a_disturbance_that_makes_the_sum_too_large(command:
     assert plant.run(0.01, command, disturbance=11.0)[-1].effort[0] == command + 11.0
 
 
+def test_where_noise_begins_with_the_controller_it_may_have_any_size() -> None:
+    assert Plant().run(0.01, 0.0, disturbance=2.5)[-1].effort[0] == 2.5
+
+
 def test_a_disturbance_against_a_large_command_lets_it_not_begin() -> None:
-    assert Plant().run(0.1, 9.0, disturbance=-9.0)[-1].starved
+    assert Plant(start_sum=2.0).run(0.1, 9.0, disturbance=-9.0)[-1].starved
 
 
 def test_another_commander_begins_near_zero_too() -> None:
@@ -155,7 +159,7 @@ def test_holding_a_position_is_no_starvation_and_commands_keep_a_plant_armed() -
     assert plant.supervisor.mode is Mode.POSITION
 
 
-@pytest.mark.parametrize("name", ["start_effort", "starvation"])
+@pytest.mark.parametrize("name", ["start_effort", "start_sum", "starvation"])
 @pytest.mark.parametrize("value", [0.0, -1.0, math.nan])
 def test_limits_that_limit_nothing_or_everything_are_refused(name: str, value: float) -> None:
     with pytest.raises(ParameterError, match=f"{name} is"):

@@ -167,3 +167,24 @@ def test_a_node_with_parameters_that_are_wrong_together_does_not_come_up() -> No
     overrides = [Parameter(name, value=value) for name, value in values.items()]
     with pytest.raises(ParameterError, match=r"command_lifetime is 0.019 s; expected at least two periods"):
         BridgeNode(lambda: None, parameter_overrides=overrides, enable_rosout=False)
+
+
+def test_a_disturbance_that_waits_for_a_commander_moves_nothing() -> None:
+    rig = NodeRig(start=0.0)
+    try:
+        rig.controlling = rig.disturbing = False
+
+        def answer() -> None:
+            sample = rig.bridge.sample
+            assert sample is not None
+            rig.disturb(JointCommand.of_one(sample.stamp_ns, 13.0, "disturbance"))
+            rig._send(JointCommand.of_one(sample.stamp_ns, 0.0, "controller"))
+
+        rig.run(0.1)
+        rig.loop.answer = answer
+        rig.run(0.3)
+        assert rig.supervisor.mode is Mode.EFFORT
+        assert "the disturbance for 13.00 N m; expected a sum of at most 2.0 N m" in rig.supervisor.reason
+        assert max(abs(duty) for _, duty, _ in rig.duties) < 0.05
+    finally:
+        rig.end()

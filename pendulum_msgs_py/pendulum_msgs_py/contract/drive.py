@@ -89,8 +89,8 @@ class PlantLimits:
         tracking_error: Distance from the trajectory at which the plant faults [rad].
         arm_effort: Largest command that may be waiting when the plant is armed [N m].
         handover_effort: Largest distance of a command from the torque that holds, for it to take over [N m].
-        start_effort: Largest torque, also with the disturbance, with which a commander may begin where nobody commands
-            [N m].
+        start_effort: Largest torque with which a commander may begin where nobody commands [N m].
+        start_sum: The same for the sum with a disturbance that waits [N m].
         starvation: Time without a command after which a plant that is armed for effort disarms [s].
     """
 
@@ -106,6 +106,7 @@ class PlantLimits:
     arm_effort: float = 0.5
     handover_effort: float = 2.0
     start_effort: float = math.inf
+    start_sum: float = math.inf
     starvation: float = math.inf
 
     def __post_init__(self) -> None:
@@ -120,6 +121,7 @@ class PlantLimits:
             ("velocity", "rad/s"),
             ("slew", "N m/s"),
             ("start_effort", "N m"),
+            ("start_sum", "N m"),
             ("starvation", "s"),
         ):
             if not getattr(self, name) > 0.0:

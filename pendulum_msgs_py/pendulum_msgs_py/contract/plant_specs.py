@@ -111,8 +111,7 @@ LIMIT_SPECS: tuple[ParameterSpec, ...] = (
         "start_effort_limit",
         0.0,
         "N m",
-        "Largest torque, also with the disturbance, with which a commander may begin where nobody commands; "
-        "0 for none.",
+        "Largest torque with which a commander may begin where nobody commands; 0 for none.",
         minimum=0.0,
         read_only=True,
     ),

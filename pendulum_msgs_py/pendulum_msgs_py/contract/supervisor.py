@@ -346,6 +346,7 @@ class PlantSupervisor:
                 f"expected at most {largest} N m to begin (a controller's start_time lets it rise)"
             )
         # With its first command a disturbance that waits would act at once, however large.
+        largest = self.limits.start_sum
         waiting = self._disturbances.fresh(now_ns)
         if waiting is not None and not _largest(tuple(map(add, command.effort, waiting.effort))) <= largest:
             return (
