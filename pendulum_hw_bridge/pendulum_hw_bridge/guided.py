@@ -13,12 +13,14 @@ from typing import Protocol
 import numpy as np
 
 from pendulum_hw_bridge.actuator import ActuatorError, ActuatorPort, Command, Feedback, Strategy
+from pendulum_hw_bridge.effort_mapping import EffortMapping, EffortStrategy
+from pendulum_hw_bridge.emulation.parameters import load_emulator
 from pendulum_hw_bridge.feedback_stream import feedback_for
 from pendulum_hw_bridge.nudge import Hand, watch_nudge
 from pendulum_hw_bridge.safety import SafetyLimits, SafetyMonitor
-from pendulum_hw_bridge.settings import BridgeSettings
+from pendulum_hw_bridge.settings import BridgeSettings, write_limits
 from pendulum_msgs_py.contract.values import NANOSECONDS
-from pendulum_msgs_py.plants.plant_parameters import PlantParameters
+from pendulum_msgs_py.plants.plant_parameters import PlantParameters, SeriesElasticParameters
 
 __all__ = [
     "PROOF_DUTY",
@@ -145,7 +147,11 @@ def measure_tare(port: ActuatorPort, settings: BridgeSettings, plant: PlantParam
 
 
 def prove_lifetime(
-    port: ActuatorPort, settings: BridgeSettings, dialogue: Dialogue, checks: SafetyLimits | None = None
+    port: ActuatorPort,
+    settings: BridgeSettings,
+    dialogue: Dialogue,
+    checks: SafetyLimits | None = None,
+    drivetrain: SeriesElasticParameters | None = None,
 ) -> float:
     """Drive gently, fall silent, and return for how long the motor kept its duty [s].
 
@@ -154,6 +160,7 @@ def prove_lifetime(
         settings: The command lifetime and the limits that the bridge will set.
         dialogue: The person.
         checks: Limits of the checks of feedback; None for the usual ones.
+        drivetrain: Which torque the duty makes; None for that of an X5-9.
 
     Raises:
         ActuatorError: The duty never came, a limit was left, or it did not end by itself in time.
@@ -165,7 +172,7 @@ def prove_lifetime(
         "plane."
     )
     try:
-        last_ns = _drive(port, settings, checks, lambda record, now: now < _PROOF_SECONDS)
+        last_ns = _drive(port, settings, checks, lambda record, now: now < _PROOF_SECONDS, drivetrain)
         limit = settings.command_lifetime + _MARGIN_PERIODS / settings.feedback_rate
         ended = _duty_ends(port, last_ns, 10.0 * limit)
     finally:
@@ -184,7 +191,11 @@ def prove_lifetime(
 
 
 def prove_m_stop(
-    port: ActuatorPort, settings: BridgeSettings, dialogue: Dialogue, checks: SafetyLimits | None = None
+    port: ActuatorPort,
+    settings: BridgeSettings,
+    dialogue: Dialogue,
+    checks: SafetyLimits | None = None,
+    drivetrain: SeriesElasticParameters | None = None,
 ) -> float:
     """Drive gently until somebody presses the motion stop, and return for how long the motor kept its duty [s].
 
@@ -193,6 +204,7 @@ def prove_m_stop(
         settings: The command lifetime and the limits that the bridge will set.
         dialogue: The person.
         checks: Limits of the checks of feedback; None for the usual ones.
+        drivetrain: Which torque the duty makes; None for that of an X5-9.
 
     Raises:
         ActuatorError: Nobody pressed it in time, a limit was left, or it did not end the duty.
@@ -210,7 +222,7 @@ def prove_m_stop(
 
     try:
         dialogue.say("Press the motion stop NOW.")
-        _drive(port, settings, checks, unpressed)
+        _drive(port, settings, checks, unpressed, drivetrain)
         if not pressed_ns:
             raise ActuatorError("m_stop", f"motion stop was not pressed within {_PRESS_SECONDS:g} s")
         ended = _duty_ends(port, pressed_ns, 10.0 * _ENDS_WITHIN)
@@ -231,11 +243,11 @@ def _drive(
     settings: BridgeSettings,
     checks: SafetyLimits | None,
     goes_on: Callable[[Feedback, float], bool],
+    drivetrain: SeriesElasticParameters | None = None,
 ) -> int:
     """Keep the duty for proofs while told to; return when the last command was sent [ns]."""
-    port.set_command_lifetime(settings.command_lifetime)
-    port.set_feedback_rate(settings.feedback_rate)
-    port.set_limits(settings.limits)
+    write_limits(port, settings)
+    mapping = EffortMapping(EffortStrategy.DIRECT_PWM, drivetrain or load_emulator("thesis").drivetrain)
     reads = port.set_strategy(Strategy.DIRECT_PWM, Command(pwm=0.0))
     if reads is not Strategy.DIRECT_PWM:
         raise ActuatorError("strategy", f"strategy reads back as {reads.name}; expected DIRECT_PWM")
@@ -259,12 +271,23 @@ def _drive(
         fault = monitor.check(record)
         if fault is not None:
             raise ActuatorError(fault.name, fault.message)
+        _expect_allowed(mapping.motor_effort(PROOF_DUTY, 0.0, record.voltage), record.voltage, settings)
         last_ns = port.write(Command(pwm=PROOF_DUTY)).sent_ns
     if not driven:
         raise ActuatorError(
             "command_not_in_force", f"motor never had the duty {PROOF_DUTY:g}; is the motion stop pressed already?"
         )
     return last_ns
+
+
+def _expect_allowed(effort: float, voltage: float, settings: BridgeSettings) -> None:
+    """Refuse a torque beyond the effort limit: the firmware's own limit does not bind a duty."""
+    if not effort <= settings.limits.effort:
+        raise ActuatorError(
+            "settings",
+            f"duty for proofs makes {effort:.2f} N m at {voltage:.0f} V; expected at most the effort limit, "
+            f"{settings.limits.effort:g} N m: this machine cannot be proved under that limit",
+        )
 
 
 def _expect_inside(record: Feedback, settings: BridgeSettings, begin: float) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import json
+import sys
 import time
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -15,6 +16,7 @@ from pendulum_hw_bridge import guided, module_files
 from pendulum_hw_bridge.actuator import ActuatorPort
 from pendulum_hw_bridge.backends import hebi
 from pendulum_hw_bridge.backends.hebi_discovery import LOOK_TIME, ModuleSelection, discover, select_module
+from pendulum_hw_bridge.bridge_parameters import drivetrain_of
 from pendulum_hw_bridge.emulation import EMULATOR_PRESET_NAMES
 from pendulum_hw_bridge.nudge import hand_of
 from pendulum_msgs_py.errors import ParameterError
@@ -29,7 +31,7 @@ __all__ = ["main"]
 
 app = typer.Typer(
     help="Write the lab file of a machine by guided procedures.\n\n"
-    "A first day: scan, lab new, lab zero, lab tare, lab prove_m_stop, lab prove_lifetime, lab backup, check.\n\n"
+    "A first day: scan, lab new, lab backup, lab zero, lab tare, lab prove_m_stop, lab prove_lifetime, check.\n\n"
     "Example: python -m pendulum_hw_bridge lab new lab.yaml --family Lab --name Pendulum",
     no_args_is_help=True,
     rich_markup_mode=None,
@@ -37,6 +39,8 @@ app = typer.Typer(
     add_completion=False,
 )
 File = Annotated[Path, typer.Argument(help="The lab file.")]
+_SETTING_PROOFS = ("m_stop", "command_lifetime")
+"""Proofs that set the module's limits; zero and tare set nothing."""
 Yes = Annotated[bool, typer.Option("--yes", help="Do not wait for Enter before each step.")]
 
 
@@ -177,7 +181,9 @@ def prove_lifetime(file: File, yes: Yes = False) -> None:
     Example: python -m pendulum_hw_bridge lab prove_lifetime lab.yaml
     """
     with _machine(file) as (port, bridge):
-        took = guided.prove_lifetime(port, bridge.settings, _Terminal(yes=yes), bridge.limits)
+        took = guided.prove_lifetime(
+            port, bridge.settings, _Terminal(yes=yes), bridge.limits, drivetrain_of(bridge.plant)
+        )
     _keep(file, "command_lifetime", f"torque ended {1e3 * took:.0f} ms after the last command")
 
 
@@ -188,7 +194,9 @@ def prove_m_stop(file: File, yes: Yes = False) -> None:
     Example: python -m pendulum_hw_bridge lab prove_m_stop lab.yaml
     """
     with _machine(file) as (port, bridge):
-        took = guided.prove_m_stop(port, bridge.settings, _Terminal(yes=yes), bridge.limits)
+        took = guided.prove_m_stop(
+            port, bridge.settings, _Terminal(yes=yes), bridge.limits, drivetrain_of(bridge.plant)
+        )
     _keep(file, "m_stop", f"torque ended within {1e3 * took:.0f} ms")
 
 
@@ -199,6 +207,8 @@ def backup(
 ) -> None:
     """Keep the module's gains, safety parameters and M-stop action in files, as they are now.
 
+    Before the proofs, and before the bridge connects: both set limits of their own, which a later backup holds.
+
     Example: python -m pendulum_hw_bridge lab backup lab.yaml --out before_us
     """
     folder = out or file.with_name(f"{file.stem}_module_{time.strftime('%Y-%m-%d_%H-%M-%S')}")
@@ -208,6 +218,13 @@ def backup(
     else:
         with _machine(file) as (port, _):
             written = module_files.backup_emulator(port, folder)
+    proved = [name for name in _SETTING_PROOFS if name in lab.proofs]
+    if proved:
+        print(
+            f"note: {' and '.join(proved)} of {file} was proved before, which set the lab file's limits in the module: "
+            "this backup holds what the module is set to now, not what it was before us",
+            file=sys.stderr,
+        )
     for path in written:
         print(path)
     print(f"give it back: python -m pendulum_hw_bridge lab restore {file} {folder}")

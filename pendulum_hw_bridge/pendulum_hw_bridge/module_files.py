@@ -33,6 +33,8 @@ ENDS = "position_limit_strategies.json"
 _END_NAMES = ("min_position_limit_strategy", "max_position_limit_strategy")
 _ANSWER_MS = 500
 _ATTEMPTS = 3
+_HALF = ".unfinished"
+"""End of the name of a folder that is not whole yet."""
 
 
 def backup_group(group: Any, folder: Path) -> list[Path]:
@@ -47,15 +49,15 @@ def backup_group(group: Any, folder: Path) -> list[Path]:
         ParameterError: The folder is there already, or cannot be made.
     """
     info = _info(group)
-    with _new(folder):
-        info.write_gains(str(folder / GAINS))
-        info.write_safety_params(str(folder / SAFETY))
-        (folder / ENDS).write_text(json.dumps(_ends_of(info)) + "\n", encoding="utf-8")
-        files = [folder / GAINS, folder / SAFETY, folder / ENDS]
+    names = (GAINS, SAFETY, ENDS)
+    with _new(folder) as half:
+        info.write_gains(str(half / GAINS))
+        info.write_safety_params(str(half / SAFETY))
+        (half / ENDS).write_text(json.dumps(_ends_of(info)) + "\n", encoding="utf-8")
         # hebi-py says nothing where a disk is full.
-        if not all(file.is_file() and file.stat().st_size for file in files):
+        if not all((half / name).is_file() and (half / name).stat().st_size for name in names):
             raise OSError(errno.ENOSPC, "not all of it was written: is the disk full?")
-    return files
+    return [folder / name for name in names]
 
 
 def restore_group(group: Any, folder: Path, make_command: Callable[[], Any], say: Callable[[str], None]) -> None:
@@ -73,6 +75,7 @@ def restore_group(group: Any, folder: Path, make_command: Callable[[], Any], say
         ActuatorError: The module does not acknowledge, or other values read back.
         ParameterError: A file is missing or not understood; nothing was sent then.
     """
+    _expect_whole(folder)
     ends = _read_ends(folder / ENDS)
     commands = []
     for name, read in ((GAINS, "read_gains"), (SAFETY, "read_safety_params")):
@@ -117,14 +120,15 @@ def backup_emulator(port: ActuatorPort, folder: Path) -> list[Path]:
     info = port.connect()
     if info.gains is None:
         raise ActuatorError("not_connected", f"{info.backend} does not tell its gains; expected hebi or an emulator")
-    with _new(folder):
-        write_gains(folder / GAINS, info.gains)
-        (folder / LIMITS).write_text(json.dumps(limits_to_json(info.limits)) + "\n", encoding="utf-8")
+    with _new(folder) as half:
+        write_gains(half / GAINS, info.gains)
+        (half / LIMITS).write_text(json.dumps(limits_to_json(info.limits)) + "\n", encoding="utf-8")
     return [folder / GAINS, folder / LIMITS]
 
 
 def restore_emulator(port: ActuatorPort, folder: Path, say: Callable[[str], None]) -> None:
     """Give a connected emulator what :func:`backup_emulator` kept, and read it back; ``say`` as for a group."""
+    _expect_whole(folder)
     gains = load_gains(folder / GAINS)
     try:
         limits = limits_from_json(json.loads(read_text(folder / LIMITS, "backup")))
@@ -169,7 +173,8 @@ def _ends_of(info: Any) -> dict[str, int]:
 
 def _read_ends(path: Path) -> dict[str, int]:
     if not path.exists():
-        # Kept before there was such a file: one strategy for both ends, in the file of safety parameters.
+        # Kept before there was such a file: one strategy for both ends, in the file of safety parameters. No backup
+        # that broke off looks like it, for a folder bears its name once it is whole.
         return {}
     try:
         content = json.loads(read_text(path, "backup"))
@@ -187,17 +192,29 @@ def _info(group: Any) -> Any:
 
 
 @contextlib.contextmanager
-def _new(folder: Path) -> Iterator[None]:
-    """Make a folder for a backup; half of one is no backup, and is taken away."""
+def _new(folder: Path) -> Iterator[Path]:
+    """Make a folder beside that of a backup, which gets its name when it is whole; half of one is taken away."""
+    if folder.exists():
+        raise ParameterError(f"backup {folder} is there already; expected a new folder")
+    # Absolute, for "." has no name.
+    whole = folder.absolute()
+    half = whole.with_name(whole.name + _HALF)
     try:
-        folder.mkdir(parents=True)
-    except FileExistsError:
-        raise ParameterError(f"backup {folder} is there already; expected a new folder") from None
+        # A program that was killed can leave one; it was never a backup.
+        shutil.rmtree(half, ignore_errors=True)
+        half.mkdir(parents=True)
     except OSError as error:
         raise ParameterError(f"backup {folder} cannot be made: {error.strerror}") from error
     try:
-        yield
+        yield half
+        half.rename(whole)
     except (OSError, RuntimeError, ParameterError) as error:
-        shutil.rmtree(folder, ignore_errors=True)
         why = getattr(error, "strerror", None) or error
         raise ParameterError(f"backup {folder} cannot be written: {why}") from error
+    finally:
+        shutil.rmtree(half, ignore_errors=True)
+
+
+def _expect_whole(folder: Path) -> None:
+    if folder.absolute().name.endswith(_HALF):
+        raise ParameterError(f"backup {folder} was interrupted and is not whole; expected one that lab backup finished")

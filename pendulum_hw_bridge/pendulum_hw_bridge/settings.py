@@ -9,7 +9,7 @@ from pendulum_hw_bridge.actuator import ActuatorError, ActuatorPort, HardwareLim
 from pendulum_hw_bridge.command_check import check_lifetime
 from pendulum_hw_bridge.gains import GainSet, differing_gain
 
-__all__ = ["BridgeSettings", "write_settings"]
+__all__ = ["BridgeSettings", "write_limits", "write_settings"]
 
 
 @dataclass(frozen=True)
@@ -46,6 +46,22 @@ def write_settings(port: ActuatorPort, settings: BridgeSettings, gains: GainSet)
     Raises:
         ActuatorError: Not acknowledged, or something reads back as another value.
     """
+    write_limits(port, settings)
+    differs = differing_gain(port.set_gains(gains), gains)
+    if differs:
+        raise ActuatorError("settings", differs)
+
+
+def write_limits(port: ActuatorPort, settings: BridgeSettings) -> None:
+    """Write lifetime, rate and limits, and refuse a module that does not keep each of them.
+
+    Args:
+        port: A connected actuator.
+        settings: What to write.
+
+    Raises:
+        ActuatorError: Not acknowledged, or something reads back as another value.
+    """
     lifetime = port.set_command_lifetime(check_lifetime(settings.command_lifetime))
     _expect("command lifetime", lifetime, settings.command_lifetime, "s")
     rate = port.set_feedback_rate(settings.feedback_rate)
@@ -61,9 +77,6 @@ def write_settings(port: ActuatorPort, settings: BridgeSettings, gains: GainSet)
             "settings",
             f"motion stop action reads back as {reads.m_stop.value}; expected {wanted.m_stop.value}",
         )
-    differs = differing_gain(port.set_gains(gains), gains)
-    if differs:
-        raise ActuatorError("settings", differs)
 
 
 def _expect(what: str, reads: float, wanted: float, unit: str) -> None:

@@ -1,8 +1,10 @@
 """The thread that owns the actuator, on the wall clock: cycles, jobs, errors, and the way out."""
 
+import queue
 import threading
 import time
 from collections.abc import Callable, Iterator
+from types import SimpleNamespace
 
 import pytest
 
@@ -19,7 +21,7 @@ from pendulum_hw_bridge.gains import DEFAULT_GAINS
 from pendulum_hw_bridge.safety import SafetyLimits, SafetyMonitor
 from pendulum_hw_bridge.settings import BridgeSettings
 from pendulum_msgs_py.contract.shared_supervisor import SharedSupervisor
-from pendulum_msgs_py.contract.supervisor import Drive, Input, Mode, PlantLimits
+from pendulum_msgs_py.contract.supervisor import Drive, DriveKind, Input, Mode, PlantLimits
 from pendulum_msgs_py.contract.timing import LoopStatistics
 from pendulum_msgs_py.contract.values import JointCommand, JointSample
 
@@ -228,3 +230,35 @@ def test_a_stop_that_was_not_confirmed_is_asked_for_again_though_the_loop_is_not
     running.loop.call(running.actuator.clear_faults)
     running.until(lambda: not running.bridge.stop_pending, "the stop to be confirmed")
     assert running.actuator.strategy is Strategy.OFF
+
+
+@pytest.mark.parametrize(
+    ("kind", "starved", "acts"),
+    [(DriveKind.OFF, False, True), (DriveKind.EFFORT, True, True), (DriveKind.EFFORT, False, False)],
+)
+def test_between_two_records_whatever_ends_torque_is_carried_out_and_nothing_else(
+    kind: DriveKind, starved: bool, acts: bool
+) -> None:
+    carried: list[object] = []
+    drive = SimpleNamespace(kind=kind, starved=starved)
+    loop = SimpleNamespace(
+        bridge=SimpleNamespace(
+            supervisor=SimpleNamespace(mode=Mode.EFFORT),
+            carry_out=lambda drive, was_armed: carried.append((drive, was_armed)),
+        ),
+        _decide=lambda: drive,
+    )
+    ActuatorLoop._act_between(loop)  # type: ignore[arg-type]
+    assert carried == ([(drive, True)] if acts else [])
+
+
+def test_a_job_that_was_not_begun_in_time_is_never_run() -> None:
+    late: list[bool] = []
+    loop = SimpleNamespace(
+        _thread=SimpleNamespace(is_alive=lambda: True), _jobs=queue.SimpleQueue(), _job_waiting=threading.Event()
+    )
+    with pytest.raises(ActuatorError, match="did not answer within 0 s"):
+        ActuatorLoop.call(loop, lambda: late.append(True), timeout=0.0)  # type: ignore[arg-type]
+    # Whoever was told that it did not run must not find it run later: arming would be such a job.
+    ActuatorLoop._run_jobs(loop)  # type: ignore[arg-type]
+    assert late == []

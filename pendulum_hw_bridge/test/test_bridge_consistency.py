@@ -12,9 +12,12 @@ from pendulum_hw_bridge.bridge_consistency import check_consistency
 from pendulum_hw_bridge.bridge_parameters import (
     BRIDGE_SPECS,
     bridge_settings,
+    effort_mapping,
     safety_limits,
     trajectory_gains,
 )
+from pendulum_hw_bridge.emulation.parameters import load_emulator
+from pendulum_hw_bridge.gains import DEFAULT_GAINS
 from pendulum_msgs_py.contract.drive import PlantLimits
 from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.parameters import validate
@@ -169,3 +172,13 @@ def test_measured_torque_is_limited_with_the_effort_limit() -> None:
     assert safety_limits(validate(BRIDGE_SPECS, {}), 1.0).measured_effort == 2.0
     assert safety_limits(validate(BRIDGE_SPECS, {})).measured_effort == 14.0
     assert safety_limits(validate(BRIDGE_SPECS, {"measured_effort_limit": 3.0}), 1.0).measured_effort == 3.0
+
+
+def test_position_control_may_ask_for_no_more_than_the_velocity_limit_nor_the_motor_s_own() -> None:
+    plant, values = load_emulator("thesis").plant, validate(BRIDGE_SPECS, {})
+    slow, fast = (
+        effort_mapping(values, plant, DEFAULT_GAINS[3], PlantLimits(**{**LIMITS, "velocity": velocity})).velocity_limit
+        for velocity in (0.5, 1e3)
+    )
+    assert slow == 0.5
+    assert fast < 10.0

@@ -355,6 +355,7 @@ def test_a_lab_file_is_written_step_by_step_and_shown(
     assert abs(values["effort_tare"]) < 0.1
     assert set(proofs) == {"zero", "effort_tare", "command_lifetime"}
     assert lab_cli.main(["backup", lab, "--out", str(tmp_path / "before")]) == 0
+    assert "this backup holds what the module is set to now, not what it was before us" in capsys.readouterr().err
     assert lab_cli.main(["restore", lab, str(tmp_path / "before"), "--yes"]) == 0
     assert lab_cli.main(["show", lab]) == 0
     assert "torque ended" in capsys.readouterr().out
@@ -416,3 +417,40 @@ def test_the_module_is_let_go_of_on_every_way_out_of_a_step(
         monkeypatch.setattr(rig.port, "close", lambda: (EmulatorBackend.stop(rig.port), noted()))
     assert lab_cli.main(["prove_lifetime", str(lab), "--yes"]) == {"done": 0, "left": 130}.get(way, 2)
     assert closed == [Strategy.OFF]
+
+
+@pytest.mark.parametrize("proof", [guided.prove_lifetime, guided.prove_m_stop])
+@pytest.mark.parametrize(("effort", "supply"), [(0.1, 36.0), (0.45, 48.0)])
+def test_no_proof_drives_with_more_than_the_effort_limit(proof: Any, effort: float, supply: float) -> None:
+    rig = Rig()
+    rig.actuator = EmulatedX5(rig.parameters.with_drivetrain(supply_voltage=supply), seed=3)
+    rig.port = EmulatorBackend(rig.actuator, SteppedClock())
+    rig.port.connect()
+    duties: list[float] = []
+    rig.actuator.trace = lambda link: duties.append(link.pwm)
+    with pytest.raises(ActuatorError, match=rf"N m at {supply:.0f} V; expected at most the effort limit, {effort:g}"):
+        proof(rig.port, BridgeSettings(limits=HardwareLimits(effort=effort)), rig)
+    assert set(duties) == {0.0}
+    assert rig.actuator.strategy is Strategy.OFF
+
+
+@pytest.mark.parametrize("proof", [guided.prove_lifetime, guided.prove_m_stop])
+@pytest.mark.parametrize(
+    ("setter", "reads", "message"),
+    [
+        ("set_command_lifetime", 0.5, "command lifetime reads back as 0.5 s"),
+        ("set_feedback_rate", 50.0, "feedback rate reads back as 50 Hz"),
+        ("set_limits", HardwareLimits(velocity=9.0), "velocity limit reads back as 9 rad/s"),
+    ],
+)
+def test_a_module_that_keeps_other_settings_gets_no_duty_for_a_proof(
+    monkeypatch: pytest.MonkeyPatch, proof: Any, setter: str, reads: object, message: str
+) -> None:
+    rig = Rig()
+    monkeypatch.setattr(rig.port, setter, lambda wanted: reads)
+    duties: list[float] = []
+    rig.actuator.trace = lambda link: duties.append(link.pwm)
+    with pytest.raises(ActuatorError, match=message):
+        proof(rig.port, BridgeSettings(), rig)
+    assert not any(duties)
+    assert rig.actuator.strategy is Strategy.OFF

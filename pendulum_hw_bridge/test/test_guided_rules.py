@@ -263,7 +263,7 @@ class Proof:
         monkeypatch.setattr(guided, "_drive", self._drive)
         monkeypatch.setattr(guided, "_duty_ends", self._duty_ends)
 
-    def _drive(self, port: object, settings: object, checks: object, goes_on: Any) -> int:
+    def _drive(self, port: object, settings: object, checks: object, goes_on: Any, drivetrain: object) -> int:
         self.goes_on = goes_on
         if self._pressed:
             goes_on(feedback_record(stamp_ns=1_000_000_000, m_stop=True), 1.0)

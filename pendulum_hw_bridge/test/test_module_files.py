@@ -212,3 +212,50 @@ def test_open_ends_of_a_file_are_set_as_infinite_and_what_is_no_number_is_told(t
         ends_of("-inf", "far")
     path.write_text("<safety/>", encoding="utf-8")
     _set_open_ends(SimpleNamespace(), path)
+
+
+@pytest.mark.parametrize("error", [KeyboardInterrupt, SystemExit, OSError])
+def test_a_backup_that_is_interrupted_leaves_nothing_that_could_be_restored(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, error: type[BaseException]
+) -> None:
+    folder, port = tmp_path / "before", emulator()
+    there: list[bool] = []
+
+    def interrupted(*_: object) -> Any:
+        there.append(folder.exists())
+        raise error
+
+    monkeypatch.setattr("pendulum_hw_bridge.module_files.limits_to_json", interrupted)
+    with pytest.raises((KeyboardInterrupt, SystemExit, ParameterError)):
+        backup_emulator(port, folder)
+    # Nor does the name exist while it is written, where the program could be killed.
+    assert there == [False]
+    assert list(tmp_path.iterdir()) == []
+
+    class Interrupted(SimpleNamespace):
+        def write_gains(self, path: str) -> None:
+            Path(path).write_text("<gains/>", encoding="utf-8")
+
+        def write_safety_params(self, path: str) -> None:
+            Path(path).write_text("<safety/>", encoding="utf-8")
+            interrupted()
+
+    with pytest.raises((KeyboardInterrupt, SystemExit, ParameterError)):
+        backup_group(SimpleNamespace(request_info=lambda ms: Interrupted()), folder)
+    assert there == [False, False]
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_what_a_killed_backup_left_is_refused_and_makes_way_for_a_new_one(tmp_path: Path) -> None:
+    port, said, sent = emulator(), list[str](), list[Any]()
+    backup_emulator(port, tmp_path / "before")
+    half = (tmp_path / "before").rename(tmp_path / "before.unfinished")
+    for restore in (
+        lambda: restore_emulator(port, half, said.append),
+        lambda: restore_group(SimpleNamespace(), half, lambda: sent.append("a command"), said.append),
+    ):
+        with pytest.raises(ParameterError, match="was interrupted and is not whole"):
+            restore()
+    assert (said, sent) == ([], [])
+    backup_emulator(port, tmp_path / "before")
+    assert [path.name for path in tmp_path.iterdir()] == ["before"]
