@@ -339,3 +339,20 @@ def test_a_module_that_is_slow_to_set_is_armed_and_stays_so(domain_id: int, kind
             assert rig.supervisor.mode.armed, rig.supervisor.reason
         finally:
             rig.end()
+
+
+def test_a_drive_that_was_prepared_and_then_not_armed_is_off_at_once(domain_id: int) -> None:
+    with ros_of_its_own(domain_id):
+        rig = NodeRig(start=0.0)
+        try:
+            rig.controlling = rig.disturbing = False
+            rig.run(0.1)
+            rig.disarm()
+            rig.run(0.1)
+            sample = rig.bridge.sample
+            assert sample is not None
+            rig._send(JointCommand.of_one(sample.stamp_ns, 6.0, "/controller"))
+            assert "already commands 6.000 N m" in rig.arm()
+            assert int(rig.actuator.strategy) == 0
+        finally:
+            rig.end()
