@@ -17,6 +17,7 @@ import pytest
 
 from pendulum_bags.experiments.in_process import simulate
 from pendulum_bags.experiments.run_spec import EMULATOR_LIFETIME, RunSpec
+from pendulum_bags.studies.leaderboard_hardware import evaluate_hardware
 from pendulum_hw_bridge.backends.emulator_process import EmulatorProcessBackend
 from pendulum_lqr.policy_file import write_policy
 from pendulum_msgs_py.plants.plant_parameters import load_plant
@@ -281,3 +282,9 @@ def test_a_rehearsal_with_a_lab_file_checks_asks_and_moves_the_machine_of_the_fi
     states = bag["/hw/joint_states"]
     assert np.degrees(states["position"]).max() == pytest.approx(10.0, abs=2.0)
     assert np.abs(bag["/hw/applied_effort"]["effort"]).max() <= 6.0
+
+
+def test_a_swing_up_brings_the_emulated_machine_up_for_the_board() -> None:
+    line = evaluate_hardware("energy_swing_up", duration=9.0, robustness=False)
+    assert line.reason == ""
+    assert line.success

@@ -30,6 +30,7 @@ from pendulum_bags.studies.leaderboard import (
     push_trains,
     scores,
 )
+from pendulum_lqr.controllers.policy import START_TIME
 from pendulum_msgs_py.contract import names
 from pendulum_msgs_py.errors import DataError, FaultError, PendulumError
 from pendulum_msgs_py.plants.plant_parameters import load_plant, write_plant
@@ -120,7 +121,8 @@ def evaluate_hardware(
             design_plant=_PLANT,
             strategy=_STRATEGY,
             controller=controller,
-            controller_parameters=parameters or {},
+            # A bridge lets nobody begin with much torque, and a hanging pendulum asks a swing-up for all of it.
+            controller_parameters={"start_time": START_TIME, **(parameters or {})},
             theta=0.01,
             duration=duration,
         )
