@@ -1,4 +1,4 @@
-"""``make test``: what keeps a plant's time, one after the other, and with what this leaves of the cores what computes.
+"""``make test``: whole systems in real time alone, then other tests in real time beside what computes.
 
 Tests of one file stay together, so that what a file prepares is prepared once. Named files or folders run as pytest is
 told.
@@ -36,7 +36,8 @@ _EXPERIMENTS = (
     "tests/integration/test_frequency_experiment.py",
     "tests/faults/test_security_policy.py",
 )
-"""Whole systems in real time, longest first; each asks for about one core."""
+"""Whole systems in real time, longest first; each asks for about one core and judges to milliseconds: nothing runs
+beside them."""
 _WAITS = (
     "tests/acceptance/test_console.py",
     "tests/integration/test_plant_interface.py",
@@ -84,19 +85,23 @@ def main(arguments: Sequence[str]) -> int:
         os.environ.pop(name, None)
     if any((PROJECT / argument.split("::")[0]).exists() for argument in arguments):
         return subprocess.run([sys.executable, "-m", "pytest", *arguments], cwd=PROJECT, check=False).returncode
-    in_time, others = rooms()
-    parts = [
-        Part("in real time", [*in_time, *arguments], workers=1),
-        Part("computing", [*others, *arguments], workers=2, nice=_NICE),
-    ]
-    return run_parts(parts)
+    systems, waits, others = rooms()
+    return run_parts(
+        [Part("whole systems", [*systems, *arguments], workers=1)],
+        [
+            Part("in real time", [*waits, *arguments], workers=1),
+            Part("computing", [*others, *arguments], workers=2, nice=_NICE),
+        ],
+    )
 
 
-def rooms() -> tuple[list[str], list[str]]:
-    """Return the files of each part in the order to start them in: what keeps a plant's time, and all others."""
-    in_time = _files((*_EXPERIMENTS, *_WAITS))
+def rooms() -> tuple[list[str], list[str], list[str]]:
+    """Return the files of each part in the order to start them in: whole systems, what waits, and all others."""
+    systems = _files(_EXPERIMENTS)
+    waits = [name for name in _files(_WAITS) if name not in systems]
     packages = sorted(str(path) for top in ("", "bags/") for path in PROJECT.glob(f"{top}pendulum_*/test"))
-    return in_time, [name for name in _files((*_COMPUTES, *packages)) if name not in in_time]
+    others = [name for name in _files((*_COMPUTES, *packages)) if name not in {*systems, *waits}]
+    return systems, waits, others
 
 
 class Part:
@@ -183,19 +188,24 @@ class Part:
                     self.outcomes[test] = max(self.outcomes.get(test, ""), outcome, key=_GRAVITY.index)
 
 
-def run_parts(parts: Sequence[Part]) -> int:
-    """Run all parts at once, print how far they are and what each printed, and return the first code that is not 0."""
+def run_parts(*stages: Sequence[Part]) -> int:
+    """Run the parts of a stage at once, stage by stage; return the first code that is not 0.
+
+    How far they are is printed on the way, and at the end what each has printed.
+    """
     begin = told = time.monotonic()
+    parts = [part for stage in stages for part in stage]
     for number in (signal.SIGTERM, signal.SIGHUP):
         signal.signal(number, signal.default_int_handler)
     try:
-        for part in parts:
-            part.start()
-        while any(part.code is None for part in parts):
-            time.sleep(0.2)
-            if time.monotonic() - told >= _TELLS_EVERY:
-                told += _TELLS_EVERY
-                print(f"{_clock(told - begin)}  {'; '.join(map(_progress, parts))}", flush=True)
+        for stage in stages:
+            for part in stage:
+                part.start()
+            while any(part.code is None for part in stage):
+                time.sleep(0.2)
+                if time.monotonic() - told >= _TELLS_EVERY:
+                    told += _TELLS_EVERY
+                    print(f"{_clock(told - begin)}  {'; '.join(map(_progress, stage))}", flush=True)
     except KeyboardInterrupt:
         print("interrupted: ending what runs", flush=True)
         _end(parts)
