@@ -19,6 +19,7 @@ __all__ = [
     "FEEDBACK_QUANTITIES",
     "MAX_COMMAND_LIFETIME",
     "NO_SETPOINT",
+    "PEAK_EFFORT",
     "ActuatorError",
     "ActuatorInfo",
     "ActuatorPort",
@@ -34,6 +35,8 @@ __all__ = [
     "state_name",
 ]
 
+PEAK_EFFORT = 13.0
+"""Peak torque of an X5-9, by its datasheet [N m]."""
 NO_SETPOINT = math.nan
 """Setpoint of a loop that is switched off, by HEBI's convention."""
 MAX_COMMAND_LIFETIME = 5.0
@@ -246,7 +249,7 @@ class HardwareLimits:
         m_stop: What the motion stop does.
     """
 
-    effort: float = 13.0
+    effort: float = PEAK_EFFORT
     velocity: float = 1.5
     position_min: float = -math.inf
     position_max: float = math.inf

@@ -6,6 +6,7 @@ import math
 from collections.abc import Mapping
 from typing import Any
 
+from pendulum_hw_bridge.actuator import PEAK_EFFORT
 from pendulum_hw_bridge.backends import BACKENDS
 from pendulum_msgs_py.contract.drive import PlantLimits
 from pendulum_msgs_py.errors import ParameterError
@@ -20,7 +21,7 @@ _SLOWEST_ON_HARDWARE = 0.1
 """The same where somebody can be hurt [s]."""
 _SUPPLY = (18.0, 52.0)
 """Widest window of the supply [V]: an X5-9 takes 24 to 48 V, a battery sags below, a braking motor lifts it above."""
-_LARGEST_MEASURED = 15.0
+_LARGEST_MEASURED = PEAK_EFFORT + 2.0
 """Largest limit of the measured torque [N m]: the peak of an X5-9, 13 N m, with room for noise and a tare."""
 _E_STOP_INPUT = (0.05, 1.0)
 """Silence of a button that is taken for a press [s]: shorter, one late message of 20 a second is one; longer, whoever
@@ -72,6 +73,7 @@ def _check_hardware(values: Mapping[str, Any], limits: PlantLimits) -> None:
     where = f"with backend {values['backend']!r}"
     width = limits.position_max[0] - limits.position_min[0]
     for name, value, largest, unit, why in (
+        ("effort_limit", limits.effort[0], PEAK_EFFORT, "N m", "the peak of an X5-9"),
         ("velocity_limit", limits.velocity, 3.0, "rad/s", "twice what the motor can do, so that it limits nothing"),
         ("effort_slew_limit", limits.slew, 26e3, "N m/s", "from -13 to 13 N m in one cycle at 1 kHz"),
         ("start_effort_limit", limits.start_effort, 5.0, "N m", "a commander would begin with a blow"),
@@ -88,7 +90,7 @@ def _check_hardware(values: Mapping[str, Any], limits: PlantLimits) -> None:
     if values["measured_effort_limit"] > _LARGEST_MEASURED:
         raise ParameterError(
             f"measured_effort_limit is {values['measured_effort_limit']:g} N m; expected at most "
-            f"{_LARGEST_MEASURED:g} N m {where}: the actuator makes 13 N m"
+            f"{_LARGEST_MEASURED:g} N m {where}: the actuator makes {PEAK_EFFORT:g} N m"
         )
     low, high = _SUPPLY
     if not all(low <= voltage <= high for voltage in values["voltage_window"]):

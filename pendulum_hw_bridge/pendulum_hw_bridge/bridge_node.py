@@ -7,7 +7,6 @@ and then strategy off.
 
 from __future__ import annotations
 
-import dataclasses
 import functools
 import sys
 from collections.abc import Callable, Mapping, Sequence
@@ -28,7 +27,7 @@ from pendulum_hw_bridge.feedback_message import encode_feedback
 from pendulum_hw_bridge.lab_node import with_lab_file
 from pendulum_hw_bridge.node_specs import SPECS
 from pendulum_hw_bridge.safety import SafetyMonitor
-from pendulum_msgs_py.contract.plant_specs import LOCKSTEP_EPOCH_NS, limits_from_parameters
+from pendulum_msgs_py.contract.plant_specs import LOCKSTEP_EPOCH_NS
 from pendulum_msgs_py.contract.shared_supervisor import SharedSupervisor
 from pendulum_msgs_py.contract.supervisor import Drive, DriveKind, Input, Mode
 from pendulum_msgs_py.contract.timing import LoopStatistics
@@ -98,12 +97,7 @@ class BridgeNode(LifecycleNode, PollingNode):
         self._plant = bridge_parameters.plant_of(values)
         self._told_plants = describe_plants(bridge_parameters.told_plants(values))
         self._gains = bridge_parameters.trajectory_gains(values)
-        # A cycle more than the monitor has, which names the fault; this one is behind it.
-        patience = (values["feedback_watchdog"] + 1) * self._period_ns / NANOSECONDS
-        limits = limits_from_parameters(values, (self._plant.effort_limit,), feedback_timeout=patience)
-        if not self._lockstep:
-            # In lockstep, where only an emulator runs, the noise of an experiment begins with the controller.
-            limits = dataclasses.replace(limits, start_sum=limits.start_effort)
+        limits = bridge_parameters.bridge_limits(values, self._plant, lockstep=self._lockstep)
         self._supervisor = SharedSupervisor(
             limits, self._prepare, self._withdraw, lambda: (self._interface.clock(), self._interface.sample)
         )

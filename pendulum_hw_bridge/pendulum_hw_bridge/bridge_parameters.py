@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from dataclasses import replace
 from typing import Any
 
 from pendulum_hw_bridge.actuator import MAX_COMMAND_LIFETIME, ActuatorPort, HardwareLimits, MStopAction
@@ -17,6 +18,7 @@ from pendulum_hw_bridge.motor_state import MOTOR_SPEED_LIMIT
 from pendulum_hw_bridge.safety_limits import SafetyLimits
 from pendulum_hw_bridge.settings import BridgeSettings
 from pendulum_msgs_py.contract.drive import PlantLimits
+from pendulum_msgs_py.contract.plant_specs import limits_from_parameters
 from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.parameters import ParameterSpec
 from pendulum_msgs_py.plants.plant_parameters import (
@@ -29,6 +31,7 @@ from pendulum_msgs_py.plants.plant_parameters import (
 __all__ = [
     "BRIDGE_SPECS",
     "POSITION_LOOP_STRATEGY",
+    "bridge_limits",
     "bridge_settings",
     "drivetrain_of",
     "effort_mapping",
@@ -294,6 +297,26 @@ def effort_mapping(
         effort_limit=limits.effort[0],
         velocity_limit=min(limits.velocity, MOTOR_SPEED_LIMIT / drivetrain.gear_ratio),
     )
+
+
+def bridge_limits(values: Mapping[str, Any], plant: PlantParameters, *, lockstep: bool = False) -> PlantLimits:
+    """Return the limits that the supervisor keeps.
+
+    Args:
+        values: Parameters of the bridge.
+        plant: Content of the plant file.
+        lockstep: Whether time is simulated.
+
+    Raises:
+        ParameterError: They contradict each other or the plant.
+    """
+    # A period more than the monitor has, which names the fault; this one is behind it.
+    patience = (values["feedback_watchdog"] + 1) / values["feedback_rate"]
+    limits = limits_from_parameters(values, (plant.effort_limit,), feedback_timeout=patience)
+    if lockstep:
+        # Here only an emulator runs, and the noise of an experiment begins with the controller.
+        return limits
+    return replace(limits, start_sum=limits.start_effort, handover_sum=limits.handover_effort)
 
 
 def bridge_settings(

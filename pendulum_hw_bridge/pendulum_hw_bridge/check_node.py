@@ -19,7 +19,6 @@ from pendulum_hw_bridge.lab_node import with_lab_file
 from pendulum_hw_bridge.node_specs import SPECS
 from pendulum_hw_bridge.safety import SafetyLimits
 from pendulum_hw_bridge.settings import BridgeSettings
-from pendulum_msgs_py.contract.plant_specs import limits_from_parameters
 from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.plants.plant_parameters import PlantParameters
 from pendulum_msgs_py.programs import graph
@@ -88,7 +87,7 @@ def as_the_bridge(values: Mapping[str, Any]) -> AsTheBridge:
         ParameterError: They contradict each other.
     """
     plant = bridge_parameters.plant_of(values)
-    limits = limits_from_parameters(values, (plant.effort_limit,))
+    limits = bridge_parameters.bridge_limits(values, plant)
     check_consistency(values, limits)
     gains = bridge_parameters.trajectory_gains(values)
     mapping = bridge_parameters.effort_mapping(values, plant, gains, limits)

@@ -20,7 +20,7 @@ import math
 from dataclasses import dataclass, replace
 from enum import Enum
 
-from pendulum_hw_bridge.actuator import Command, Strategy
+from pendulum_hw_bridge.actuator import PEAK_EFFORT, Command, Strategy
 from pendulum_hw_bridge.gains import DEFAULT_GAINS, GainSet, limit_output
 from pendulum_hw_bridge.motor_state import MotorState
 from pendulum_msgs_py.errors import ParameterError
@@ -62,7 +62,7 @@ class EffortMapping:
     efficiency: float = 1.0
     compensation: float = 0.9
     gains: GainSet = DEFAULT_GAINS[3]
-    effort_limit: float = 13.0
+    effort_limit: float = PEAK_EFFORT
     velocity_limit: float = 1.5
 
     def __post_init__(self) -> None:

@@ -11,6 +11,7 @@ from pendulum_hw_bridge.backends import BACKENDS
 from pendulum_hw_bridge.bridge_consistency import check_consistency
 from pendulum_hw_bridge.bridge_parameters import (
     BRIDGE_SPECS,
+    bridge_limits,
     bridge_settings,
     effort_mapping,
     safety_limits,
@@ -18,6 +19,7 @@ from pendulum_hw_bridge.bridge_parameters import (
 )
 from pendulum_hw_bridge.emulation.parameters import load_emulator
 from pendulum_hw_bridge.gains import DEFAULT_GAINS
+from pendulum_hw_bridge.node_specs import SPECS
 from pendulum_msgs_py.contract.drive import PlantLimits
 from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.parameters import validate
@@ -110,6 +112,7 @@ def test_a_real_machine_needs_every_limit(name: str, limit: dict[str, float]) ->
 
 
 _BOUNDS = [
+    ("effort_limit", {"effort": (13.01,)}, {"effort": (13.0,)}, "at most 13 N m"),
     ("handover_time", {"handover_time": 1.001}, {"handover_time": 1.0}, "at most 1 s"),
     ("handover_effort_limit", {"handover_effort": 5.01}, {"handover_effort": 5.0}, "at most 5 N m"),
     ("start_effort_limit", {"start_effort": 5.01}, {"start_effort": 5.0}, "at most 5 N m"),
@@ -153,6 +156,36 @@ def test_a_value_that_no_real_machine_can_have_is_refused(
         check(backend="hebi", **{name: refused})
 
 
+def test_a_plant_file_gives_a_real_machine_no_more_torque_than_its_actuator_has() -> None:
+    plant = load_emulator("thesis").plant.with_values(effort_limit=38.0)
+    for backend, wanted in (("emulator", 0.0), ("emulator", 14.0), ("hebi", 13.0)):
+        values = validate(SPECS, {"backend": backend, "effort_limit": wanted})
+        check_consistency(values, bridge_limits(values, plant))
+    for wanted in (0.0, 14.0):
+        values = validate(SPECS, {"backend": "hebi", "effort_limit": wanted})
+        with pytest.raises(ParameterError, match=r"^effort_limit is (38|14) N m; expected at most 13 N m with backend"):
+            check_consistency(values, bridge_limits(values, plant))
+
+
+@pytest.mark.parametrize(
+    ("rate", "watchdog", "patience"), [(100.0, 3, 0.04), (100.0, 10, 0.11), (1000.0, 2, 0.003), (50.0, 3, 0.08)]
+)
+def test_the_rules_of_the_plant_wait_for_feedback_one_period_longer_than_the_check_that_names_the_fault(
+    rate: float, watchdog: int, patience: float
+) -> None:
+    values = validate(SPECS, {"feedback_rate": rate, "feedback_watchdog": watchdog})
+    limits = bridge_limits(values, load_emulator("thesis").plant)
+    assert limits.feedback_timeout == pytest.approx(patience)
+
+
+@pytest.mark.parametrize("lockstep", [False, True])
+def test_a_disturbance_that_waits_is_judged_as_a_command_is_but_in_lockstep(lockstep: bool) -> None:
+    values = validate(SPECS, {"start_effort_limit": 1.5, "handover_effort_limit": 1.2})
+    limits = bridge_limits(values, load_emulator("thesis").plant, lockstep=lockstep)
+    assert (limits.start_effort, limits.handover_effort) == (1.5, 1.2)
+    assert (limits.start_sum, limits.handover_sum) == ((math.inf, math.inf) if lockstep else (1.5, 1.2))
+
+
 def test_the_cut_off_of_a_hot_winding_is_the_one_that_was_set() -> None:
     values = validate(BRIDGE_SPECS, {"winding_temperature_limit": 80.0})
     assert safety_limits(values, 1.0).winding_temperature == 80.0
@@ -166,6 +199,14 @@ def test_the_firmware_gets_the_window_in_its_own_angle(sign: int, offset: float,
     values = validate(BRIDGE_SPECS, {"joint_sign": sign, "joint_offset": offset})
     settings = bridge_settings(values, effort=1.0, velocity=1.0, gains=trajectory_gains(values), window=(-3.0, 4.0))
     assert (settings.limits.position_min, settings.limits.position_max) == ends
+
+
+def test_a_joint_that_turns_neither_way_and_a_window_of_one_voltage_are_refused() -> None:
+    values = validate(SPECS, {"joint_sign": 0, "voltage_window": [24.0]})
+    with pytest.raises(ParameterError, match="joint_sign is 0; expected 1 or -1"):
+        bridge_settings(values, effort=1.0, velocity=1.0, gains=trajectory_gains(values))
+    with pytest.raises(ParameterError, match=r"voltage_window has 1 values; expected \[low, high\] in V"):
+        safety_limits(values, 1.0)
 
 
 def test_measured_torque_is_limited_with_the_effort_limit() -> None:

@@ -265,3 +265,15 @@ def test_a_plant_of_several_joints_follows_no_trajectory_and_says_so() -> None:
 def test_limits_for_another_number_of_joints_are_refused(limits: dict[str, tuple[float, ...]]) -> None:
     with pytest.raises(ParameterError, match="expected 2"):
         Plant(**limits)
+
+
+@pytest.mark.parametrize(("low", "high"), [(-1.0, math.inf), (-math.inf, 1.0), (-1.0, 1.0)])
+def test_one_window_is_none_for_two_joints_whichever_end_it_has(low: float, high: float) -> None:
+    limits = PlantLimits((5.0,), position_min=(low,), position_max=(high,))
+    with pytest.raises(ParameterError, match="there are 1 position windows; expected 2"):
+        limits.for_joints(2, 1)
+
+
+def test_a_window_with_one_end_too_few_is_refused() -> None:
+    with pytest.raises(ValueError, match="shorter"):
+        PlantLimits((5.0,), position_min=(-1.0, -2.0), position_max=(1.0,))

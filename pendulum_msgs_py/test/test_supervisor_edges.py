@@ -36,12 +36,14 @@ class Plant:
     def offer(self, effort: float, kind: Input = Input.EFFORT_COMMAND) -> None:
         self.supervisor.offer(kind, JointCommand.of_one(self.now, effort, "lqr"), self.now)
 
-    def run(self, milliseconds: int, command: float | None = None) -> Drive:
+    def run(self, milliseconds: int, command: float | None = None, disturbance: float | None = None) -> Drive:
         drive = Drive(DriveKind.OFF)
         for _ in range(milliseconds):
             self.now += _MS
             if command is not None:
                 self.offer(command)
+            if disturbance is not None:
+                self.offer(disturbance, Input.DISTURBANCE)
             drive = self.decide()
         return drive
 
@@ -319,6 +321,41 @@ def test_a_command_as_far_from_what_holds_as_allowed_takes_over() -> None:
     assert plant.supervisor.mode is Mode.EFFORT
 
 
+@pytest.mark.parametrize("side", [1.0, -1.0])
+def test_a_sum_with_a_disturbance_as_far_from_what_holds_as_allowed_takes_over_and_one_further_does_not(
+    side: float,
+) -> None:
+    plant = Plant(handover_sum=2.0)
+    plant.servo = side
+    plant.follow(_hold(0.1))
+    plant.run(150, 0.5 * side, disturbance=2.501 * side)
+    assert plant.supervisor.mode is Mode.POSITION
+    wanted = (
+        "lqr asks for 0.50 N m and the disturbance for 2.50 N m, 2.00 N m from what holds; expected at most 2.0 N m"
+    )
+    assert (side < 0.0) or wanted in plant.supervisor.reason
+    plant.run(1, 0.5 * side, disturbance=2.5 * side)
+    assert plant.supervisor.mode is Mode.EFFORT
+    # Whoever commands already may be disturbed by any.
+    assert plant.run(200, 0.0, disturbance=-4.0 * side).effort[0] == -4.0 * side
+
+
+def test_a_disturbance_that_has_fallen_silent_keeps_nobody_from_taking_over() -> None:
+    plant = Plant(handover_sum=2.0)
+    plant.follow(_hold(0.1))
+    plant.run(150, 0.5, disturbance=4.0)
+    assert plant.supervisor.mode is Mode.POSITION
+    plant.run(60, 0.5)
+    assert plant.supervisor.mode is Mode.EFFORT
+
+
+def test_where_noise_begins_with_the_controller_it_may_have_any_size_at_a_hand_over_too() -> None:
+    plant = Plant(handover_effort=2.0)
+    plant.follow(_hold(0.1))
+    plant.run(150, 0.5, disturbance=4.0)
+    assert plant.supervisor.mode is Mode.EFFORT
+
+
 def test_who_took_over_with_more_than_a_beginner_may_ask_goes_on() -> None:
     plant = Plant(start_effort=0.5)
     plant.follow(_hold(0.1))
@@ -358,6 +395,7 @@ def test_a_fade_that_a_silence_ended_does_not_come_back() -> None:
         {"effort": (0.0,)},
         {"command_timeout": 0.0},
         {"handover_effort": 0.0},
+        {"handover_sum": 0.0},
         {"tracking_error": 0.0},
         {"position_min": (1.0,), "position_max": (1.0,)},
     ],
@@ -372,6 +410,7 @@ def test_a_limit_of_nothing_at_all_is_refused(limits: dict[str, float]) -> None:
     [
         {"effort": (0.5,)},
         {"handover_effort": 0.5},
+        {"handover_sum": 0.5},
         {"tracking_error": 0.1},
         {"velocity": 0.5, "slew": 0.5, "start_effort": 0.5, "starvation": 0.5, "feedback_timeout": 0.5},
         {"handover_time": 0.0, "arm_effort": 0.0},

@@ -19,7 +19,7 @@ from pendulum_msgs_py.contract import names
 from pendulum_msgs_py.contract.supervisor import Mode
 from pendulum_msgs_py.contract.values import JointCommand
 from pendulum_msgs_py.errors import ParameterError
-from tests.faults.bridge_rig import Rig
+from tests.faults.bridge_rig import MILLISECOND, Rig
 from tests.faults.bridge_scenarios import CASES, SCENARIOS, Case, Scenario, run_scenario
 from tests.faults.node_rig import NodeRig, ros_of_its_own
 
@@ -186,5 +186,45 @@ def test_a_disturbance_that_waits_for_a_commander_moves_nothing() -> None:
         assert rig.supervisor.mode is Mode.EFFORT
         assert "the disturbance for 13.00 N m; expected a sum of at most 2.0 N m" in rig.supervisor.reason
         assert max(abs(duty) for _, duty, _ in rig.duties) < 0.05
+    finally:
+        rig.end()
+
+
+def test_a_disturbance_that_waits_for_a_hand_over_moves_nothing() -> None:
+    rig = NodeRig(start=0.0, moving=True, goal=0.1)
+    try:
+
+        def answer() -> None:
+            sample = rig.bridge.sample
+            assert sample is not None
+            rig.disturb(JointCommand.of_one(sample.stamp_ns, 13.0, "disturbance"))
+            rig._send(JointCommand.of_one(sample.stamp_ns, 0.0, "controller"))
+
+        rig.run(1.0)
+        assert rig.supervisor.trajectory_finished
+        rig.loop.answer = answer
+        rig.run(0.3)
+        assert rig.supervisor.mode is Mode.POSITION
+        assert "controller asks for 0.00 N m and the disturbance for 13.00 N m" in rig.supervisor.reason
+    finally:
+        rig.end()
+
+
+def test_where_the_check_of_feedback_is_blind_the_rules_behind_it_end_torque_one_period_later() -> None:
+    rig = NodeRig()
+    try:
+        rig.run(0.5)
+        rig.bridge.monitor.silence = lambda now_ns: None  # type: ignore[method-assign]
+        rig.actuator.inject(ActuatorFault.FEEDBACK_LOST)
+        rig.run(0.2)
+        sample = rig.bridge.sample
+        assert sample is not None
+        ended_ns, mode, reason = rig.supervisor.transitions[-1]
+        assert mode is Mode.FAULT
+        assert "measurement is" in reason
+        # Three periods are the check's own; the loop looks every 5 ms.
+        assert 40 * MILLISECOND < ended_ns - sample.stamp_ns <= 50 * MILLISECOND
+        # Longer than a duty acts after the last command.
+        assert all(duty == 0.0 for time_ns, duty, _ in rig.duties if time_ns > ended_ns + MILLISECOND)
     finally:
         rig.end()

@@ -16,6 +16,7 @@ _RULES = (
     "pendulum_msgs_py/test/test_supervisor_begin.py",
     "pendulum_msgs_py/test/test_supervisor_edges.py",
     "pendulum_msgs_py/test/test_command_gate.py",
+    "pendulum_msgs_py/test/test_several_joints.py",
 )
 _BRIDGE = "pendulum_hw_bridge/test"
 
@@ -55,6 +56,11 @@ TARGETS: tuple[Target, ...] = (
     Target(
         "pendulum_hw_bridge.bridge_consistency",
         ("check_consistency", "_check_hardware"),
+        (f"{_BRIDGE}/test_bridge_consistency.py",),
+    ),
+    Target(
+        "pendulum_hw_bridge.bridge_parameters",
+        ("bridge_limits", "bridge_settings", "effort_mapping", "safety_limits"),
         (f"{_BRIDGE}/test_bridge_consistency.py",),
     ),
     Target(

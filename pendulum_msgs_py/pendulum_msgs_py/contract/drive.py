@@ -89,6 +89,7 @@ class PlantLimits:
         tracking_error: Distance from the trajectory at which the plant faults [rad].
         arm_effort: Largest command that may be waiting when the plant is armed [N m].
         handover_effort: Largest distance of a command from the torque that holds, for it to take over [N m].
+        handover_sum: The same for the sum with a disturbance that waits [N m].
         start_effort: Largest torque with which a commander may begin where nobody commands [N m].
         start_sum: The same for the sum with a disturbance that waits [N m].
         starvation: Time without a command after which a plant that is armed for effort disarms [s].
@@ -105,6 +106,7 @@ class PlantLimits:
     tracking_error: float = 0.3
     arm_effort: float = 0.5
     handover_effort: float = 2.0
+    handover_sum: float = math.inf
     start_effort: float = math.inf
     start_sum: float = math.inf
     starvation: float = math.inf
@@ -120,6 +122,8 @@ class PlantLimits:
             ("feedback_timeout", "s"),
             ("velocity", "rad/s"),
             ("slew", "N m/s"),
+            ("handover_effort", "N m"),
+            ("handover_sum", "N m"),
             ("start_effort", "N m"),
             ("start_sum", "N m"),
             ("starvation", "s"),
@@ -131,8 +135,6 @@ class PlantLimits:
                 raise ParameterError(f"{name} is {getattr(self, name)} {unit}; expected >= 0")
         if not math.isfinite(self.handover_time):
             raise ParameterError(f"handover_time is {self.handover_time} s; expected a finite number >= 0")
-        if not self.handover_effort > 0.0:
-            raise ParameterError(f"handover_effort is {self.handover_effort} N m; expected > 0")
         if not self.tracking_error > 0.0:
             raise ParameterError(f"tracking_error is {self.tracking_error} rad; expected > 0")
         for low, high in zip(self.position_min, self.position_max, strict=True):

@@ -269,14 +269,9 @@ class PlantSupervisor:
             command = self._commands.fresh(now_ns)
             end_ns = self._trajectory_start_ns + round(trajectory.duration * NANOSECONDS)
             if command is not None and command.stamp_ns >= end_ns and not self.commander_conflict:
-                # What it asks for, not what the limit leaves of it: with a low limit all would look near.
-                jump = abs(command.effort[0] - self._applied[0])
-                if not jump <= self.limits.handover_effort:
-                    # A controller for another place: awake at the bottom, one for upright asks for all it has.
-                    self.reason = (
-                        f"holding: {command.source or 'a controller'} asks for {command.effort[0]:.2f} N m, "
-                        f"{jump:.2f} N m from what holds; expected at most {self.limits.handover_effort} N m"
-                    )
+                refusal = self._take_over_refusal(command, now_ns)
+                if refusal:
+                    self.reason = f"holding: {refusal}"
                     return self._hold(handover, remaining, position, velocity, push)
                 self._trajectory = None
                 self._handover = Handover(now_ns, self._applied)
@@ -286,6 +281,23 @@ class PlantSupervisor:
                 self._enter(Mode.EFFORT, f"commanded by {command.source or 'an unnamed node'}", now_ns)
                 return None
         return self._hold(handover, remaining, position, velocity, push)
+
+    def _take_over_refusal(self, command: JointCommand, now_ns: int) -> str:
+        """Return why a command may not take over from position control, or an empty string."""
+        # What it asks for, not what the limit leaves of it: with a low limit all would look near.
+        largest, asked = self.limits.handover_effort, f"{command.effort[0]:.2f} N m"
+        # A controller for another place: awake at the bottom, one for upright asks for all it has.
+        jump = abs(command.effort[0] - self._applied[0])
+        waiting = self._disturbances.fresh(now_ns)
+        if jump <= largest and waiting is not None:
+            largest, asked = self.limits.handover_sum, f"{asked} and the disturbance for {waiting.effort[0]:.2f} N m"
+            jump = abs(command.effort[0] + waiting.effort[0] - self._applied[0])
+        if jump <= largest:
+            return ""
+        return (
+            f"{command.source or 'a controller'} asks for {asked}, {jump:.2f} N m from what holds; "
+            f"expected at most {largest} N m"
+        )
 
     def _hold(
         self, handover: Handover | None, remaining: float, position: float, velocity: float, push: Vector
