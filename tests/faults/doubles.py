@@ -226,7 +226,8 @@ def start_in_order(system: LiveSystem, order: tuple[str, ...], *, one_by_one: bo
     system.wait_for("torque to flow", system.torque_flows, START_TIMEOUT)
     early = [applied for applied in system.applied[heard:] if applied.when < controlled and applied.effort != 0.0]
     outcome.demand(not early, f"{len(early)} torques before there was a controller")
-    system.wait_for("the torque to be recorded", partial(_has_torque, system), START_TIMEOUT)
+    # A recorder may meet the controller later than the plant does: before, it has only half of what is judged.
+    system.wait_for("torque and commands to be recorded", partial(_has_torque_and_commands, system), START_TIMEOUT)
     died = set(order) - set(system.alive())
     outcome.demand(not died, f"{', '.join(sorted(died))} died")
     for record in check_bag(system.bag, limit=EFFORT_LIMIT, allowance=MACHINE_PATIENCE):
@@ -236,11 +237,11 @@ def start_in_order(system: LiveSystem, order: tuple[str, ...], *, one_by_one: bo
     return outcome
 
 
-def _has_torque(system: LiveSystem) -> bool:
-    topic = f"{system.plant.namespace}/{names.APPLIED_EFFORT}"
+def _has_torque_and_commands(system: LiveSystem) -> bool:
+    torque, commands = (f"{system.plant.namespace}/{name}" for name in (names.APPLIED_EFFORT, names.EFFORT_COMMAND))
     try:
-        with read_bag(system.bag, [topic]) as opened:
-            return bool(np.any(opened.array(topic)["effort"] != 0.0))
+        with read_bag(system.bag, [torque, commands]) as opened:
+            return bool(np.any(opened.array(torque)["effort"] != 0.0)) and len(opened.array(commands)) > 0
     except PendulumError:  # not yet there
         return False
 
