@@ -26,13 +26,13 @@ from pendulum_msgs_py.errors import DataError
 from pendulum_msgs_py.programs.executables import cli_main
 from pendulum_rosbag.reader import Bag, read_bag
 
-__all__ = ["COMMAND_LIFE", "EARLY_TIME", "POSITION_MARK", "TorqueRecord", "check_bag"]
+__all__ = ["COMMAND_LIFE", "POSITION_MARK", "TorqueRecord", "check_bag", "early_time"]
 
 COMMAND_LIFE = 0.060
 """Time from the last valid command to zero torque [s]."""
-EARLY_TIME = 0.5
-"""Time for which, in all, commands that the recorder heard of too late explain torque, and from which on before a
-recorded command [s]."""
+_EARLY_TIME = (0.5, 1.0)
+"""Time by which a plant usually meets a controller before somebody else does at most, and as far as the numbers of the
+controller's messages prove it [s]."""
 POSITION_MARK = "pendulum.position_control"
 """Metadata of a bag that has no word of the plant's mode: by plant, pairs of log times [ns] between which it made its
 own torque."""
@@ -65,6 +65,19 @@ class TorqueRecord:
     longest: float
     missing: int
     violations: tuple[str, ...]
+
+
+def early_time(messages: int, period: float) -> float:
+    """Return the longest time before the first command that was heard for which earlier ones explain torque [s].
+
+    Each of them answers a state: they last as many periods as they are, or longer where states were slow.
+
+    Args:
+        messages: How many there were, by their numbers.
+        period: Time between two states [s].
+    """
+    usual, longest = _EARLY_TIME
+    return max(usual, min(messages * period, longest))
 
 
 def check_bag(path: Path, *, limit: float, allowance: float = 0.0, witnessed: Sequence[int] = ()) -> list[TorqueRecord]:
@@ -134,14 +147,14 @@ def _check_plant(bag: Bag, plant: str, limit: float, allowance: float, witnessed
 
     missing = counted("lost")
     unexplained = times[driven & (age > allowed)]
-    unexplained = _without_early(unexplained, logged, counted("early") + counted("before"), tolerance)
+    unexplained = _without_early(unexplained, logged, counted("early") + counted("before"), tolerance, period)
     if _lives_needed(unexplained, tolerance) > missing:
         late = f"torque {longest * 1e3:.0f} ms after the last command"
         violations.append(f"{late}; expected at most {allowed * 1e3:.0f} ms")
     return TorqueRecord(plant, len(times), int(judged.sum()), largest, longest, missing, tuple(violations))
 
 
-def _without_early(times: np.ndarray, commands: np.ndarray, early: int, life_ns: int) -> np.ndarray:
+def _without_early(times: np.ndarray, commands: np.ndarray, early: int, life_ns: int, period: float) -> np.ndarray:
     """Leave out the torques that commands explain of which the recorder heard too late.
 
     Such a command comes shortly before one that was recorded. It may stand behind several torques: a simulator that
@@ -150,9 +163,10 @@ def _without_early(times: np.ndarray, commands: np.ndarray, early: int, life_ns:
     if len(commands) == 0:
         return times
     waiting = commands[np.minimum(np.searchsorted(commands, times), len(commands) - 1)] - times
-    soon = (waiting >= 0) & (waiting <= EARLY_TIME * NANOSECONDS)
+    span_ns = early_time(early, period) * NANOSECONDS
+    soon = (waiting >= 0) & (waiting <= span_ns)
     # As many lives as there were such commands, and no longer in all than the time for which there may be any.
-    most = min(early, math.ceil(EARLY_TIME * NANOSECONDS / life_ns))
+    most = min(early, math.ceil(span_ns / life_ns))
     return times[~soon] if _lives_needed(times[soon], life_ns) <= most else times
 
 

@@ -102,7 +102,7 @@ class LiveSystem:
         self.applied: list[Applied] = []
         self.heard = dict.fromkeys(_RIGHTFUL, 0)
         self.witnessed: list[int] = []
-        self.asked = {topic: Witness(EFFORT_LIMIT) for topic in _RIGHTFUL}
+        self.asked = {topic: Witness(EFFORT_LIMIT, plant.period) for topic in _RIGHTFUL}
         self.diagnostics: dict[str, dict[str, str]] = {}
         self.diagnosed: dict[str, float] = {}
         self._order = plant.nodes if order is None else order
@@ -287,9 +287,12 @@ class LiveSystem:
         driven = (one.time_ns + step_ns for one in self.drives() if abs(one.torque) > NO_TORQUE)
         return max([since_ns, *(time_ns for time_ns in driven if time_ns > since_ns)])
 
-    def beyond_asked(self, since_ns: int) -> Drive:
-        """Return by how much the motor drove beyond what was rightfully asked for since an instant [ns, N m]."""
-        drives = [one for one in self.drives() if one.time_ns >= since_ns]
+    def beyond_asked(self, since_ns: int, until_ns: int) -> Drive:
+        """Return by how much the motor drove beyond what was rightfully asked for between two instants [ns, N m].
+
+        The probe must have listened until after the second: what it has not taken yet it does not know.
+        """
+        drives = [one for one in self.drives() if since_ns <= one.time_ns <= until_ns]
         commands, disturbances = (
             sorted(one for one in witness.asked if one.stamp_ns > since_ns - NANOSECONDS)
             for witness in self.asked.values()

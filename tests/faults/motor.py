@@ -14,6 +14,8 @@ from typing import NamedTuple
 
 from pendulum_hw_bridge.emulation.parameters import load_emulator
 from pendulum_hw_bridge.emulation.truth_log import COLUMNS
+from pendulum_msgs_py.contract.values import NANOSECONDS
+from tests.faults.bag_property import early_time
 
 __all__ = ["ROUNDING", "Asked", "Drive", "ModuleTruth", "Witness", "beyond_asked", "driving_torque"]
 
@@ -26,8 +28,8 @@ _REMEMBERED_NS = 130_000_000
 what a busy machine may add before the module's command lifetime ends it [ns]."""
 _LIFE_NS = 50_000_000
 """Time that a command counts [ns]."""
-_UNHEARD_NS = 500_000_000
-"""Time for which somebody may ask for torque, and be obeyed, before a witness knows of them [ns]."""
+_GONE_NS = 500_000_000
+"""Silence after which somebody has ended [ns]."""
 _AHEAD_NS = 2_000_000
 """A simulator's torque acts from its state's stamp on, before the command that answers this state is there [ns]."""
 
@@ -54,22 +56,25 @@ class Witness:
 
     Args:
         limit: Largest torque that a plant lets through [N m].
+        period: Time between two states of the plant [s].
 
     Attributes:
         asked: What was asked for; what was not heard as both of the largest torques.
     """
 
-    def __init__(self, limit: float) -> None:
+    def __init__(self, limit: float, period: float) -> None:
         self.asked: list[Asked] = []
         self._limit = limit
+        self._period = period
         self._last: dict[int, int] = {}
 
     def hear(self, asked: Asked, sequence: int) -> None:
         """Take note of a message, by its number at its publisher."""
         # Who has been silent for long is gone, and not continued by somebody new whose numbers are near.
-        self._last = {last: when for last, when in self._last.items() if asked.stamp_ns - when < _UNHEARD_NS}
+        self._last = {last: when for last, when in self._last.items() if asked.stamp_ns - when < _GONE_NS}
         before = max((last for last in self._last if last < sequence), default=0)
-        unheard_ns = min((sequence - before - 1) * _LIFE_NS, _UNHEARD_NS)
+        unheard = sequence - before - 1
+        unheard_ns = min(unheard * _LIFE_NS, round(early_time(unheard, self._period) * NANOSECONDS))
         begin_ns = max(asked.stamp_ns - unheard_ns, self._last.pop(before, 0))
         self._last[sequence] = asked.stamp_ns
         for stamp_ns in range(begin_ns, asked.stamp_ns, _LIFE_NS) if unheard_ns else ():

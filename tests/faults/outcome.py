@@ -33,6 +33,8 @@ MACHINE_PATIENCE = 0.060
 """Allowance for a machine that lets the probe and the plant wait while other processes run [s]."""
 MAX_LOSS = 0.2
 """Longest stretch of data that a killed recorder may lose [s]."""
+_UNDER_WAY = 0.05
+"""Time in which the probe hears what was asked for before [s]."""
 
 
 @dataclass
@@ -112,15 +114,18 @@ def try_fault(system: LiveSystem, fault: Fault, generator: random.Random) -> Out
     if not missing:
         # A plant may meet a new node long before the probe does: only who has been heard can be told to have asked.
         system.wait_for(f"commands to be heard again after: {fault.name}", system.hears_all, START_TIMEOUT)
-    _judge_motor(outcome, system, fault, begin_ns)
+    # Until here, though the motor goes on while it is judged, and the probe listens no more.
+    end_ns = time.time_ns()
+    system.listen(_UNDER_WAY)
+    _judge_motor(outcome, system, fault, begin_ns, end_ns)
     return outcome
 
 
-def _judge_motor(outcome: Outcome, system: LiveSystem, fault: Fault, begin_ns: int) -> None:
+def _judge_motor(outcome: Outcome, system: LiveSystem, fault: Fault, begin_ns: int, end_ns: int) -> None:
     """Take note of torque beyond the limit, and beyond what the rightful nodes asked for."""
     demand_limit(outcome, system.largest_torque(), measured=system.plant.has_module)
     if not fault.own_torque:
-        when, excess = system.beyond_asked(begin_ns)
+        when, excess = system.beyond_asked(begin_ns, end_ns)
         outcome.demand(
             excess <= 0.0,
             f"{excess:.2f} N m beyond what was asked for, {(when - begin_ns) * 1e-6:.0f} ms after the fault began",
