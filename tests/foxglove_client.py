@@ -9,7 +9,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from tests.npm import install_packages
+from tests.npm import node_process
 
 __all__ = ["FoxgloveClient", "foxglove_client"]
 
@@ -63,15 +63,7 @@ class FoxgloveClient:
 @contextmanager
 def foxglove_client(address: str) -> Iterator[FoxgloveClient]:
     """Connect; skip the test where Node.js or its packages cannot be had."""
-    install_packages(_FOLDER, "the JavaScript client of the Foxglove WebSocket protocol")
-    process = subprocess.Popen(
-        ["node", str(_FOLDER / "client.mjs"), address], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
-    )
-    try:
+    with node_process(
+        _FOLDER / "client.mjs", address, what="the JavaScript client of the Foxglove WebSocket protocol"
+    ) as process:
         yield FoxgloveClient(process)
-    finally:
-        assert process.stdin is not None
-        process.stdin.close()
-        process.wait(timeout=20)
-        assert process.stdout is not None
-        process.stdout.close()

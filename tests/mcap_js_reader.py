@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from tests.npm import install_packages
+from tests.npm import node_process
 
 __all__ = ["McapJs", "mcap_js_process"]
 
@@ -45,15 +45,5 @@ class McapJs:
 @contextmanager
 def mcap_js_process() -> Iterator[McapJs]:
     """Start the readers; skip the test where Node.js or its packages cannot be had."""
-    install_packages(_FOLDER, "the JavaScript readers of MCAP")
-    process = subprocess.Popen(
-        ["node", str(_FOLDER / "read.mjs")], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
-    )
-    try:
+    with node_process(_FOLDER / "read.mjs", what="the JavaScript readers of MCAP") as process:
         yield McapJs(process)
-    finally:
-        assert process.stdin is not None
-        process.stdin.close()
-        process.wait(timeout=20)
-        assert process.stdout is not None
-        process.stdout.close()

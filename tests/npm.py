@@ -6,11 +6,13 @@ import fcntl
 import os
 import shutil
 import subprocess
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
 
-__all__ = ["install_packages"]
+__all__ = ["install_packages", "node_process"]
 
 
 def _skip(what: str, reason: str) -> None:
@@ -45,3 +47,19 @@ def install_packages(folder: Path, what: str) -> None:
         mark.write_text(lock, encoding="utf-8")
     finally:
         os.close(handle)
+
+
+@contextmanager
+def node_process(script: Path, *arguments: str, what: str) -> Iterator[subprocess.Popen[str]]:
+    """Run a script that reads lines until its input ends; skip the test where it cannot be run.
+
+    Args:
+        script: Beside the lock of the packages that it needs.
+        arguments: Its own.
+        what: What it is, for the reason of a skip.
+    """
+    install_packages(script.parent, what)
+    command = ["node", str(script), *arguments]
+    # Its input is closed on the way out, which ends it; then it is waited for.
+    with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as process:
+        yield process

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from pendulum_msgs_py.errors import ParameterError
-from pendulum_msgs_py.programs.executables import cli_main
+from pendulum_msgs_py.programs.executables import cli_main, typed_options
 from pendulum_msgs_py.programs.terminal import make_console
 
 if TYPE_CHECKING:
@@ -58,7 +58,10 @@ def convert_policy(
         raise ParameterError(f"file {out} exists; expected a new one")
     console = make_console(highlight=False)
     if out.suffix == ".onnx":
-        _refuse_ignored(context)
+        if ignored := typed_options(context, _OF_IMPORT):
+            raise ParameterError(
+                f"{', '.join(ignored)} is given, and a policy file says it itself; expected it for an archive alone"
+            )
         console.print(_export(source, out), soft_wrap=True, markup=False)
         return
     if out.suffix != ".npz" or source.suffix == ".npz":
@@ -78,16 +81,6 @@ def convert_policy(
         raise ParameterError(f"velocity_scale is {velocity_scale} rad/s; expected a finite number > 0")
     told = Told(load_plant(plant), period, observation, history, velocity_scale, velocity_box, effort_limit)
     console.print(_import(source, out, told), soft_wrap=True, markup=False)
-
-
-def _refuse_ignored(context: typer.Context) -> None:
-    for name in _OF_IMPORT:
-        given = context.get_parameter_source(name)
-        if given is not None and given.name != "DEFAULT":
-            raise ParameterError(
-                f"--{name.replace('_', '-')} is given, and a policy file says it itself; expected it for an archive "
-                "alone"
-            )
 
 
 def _export(source: Path, out: Path) -> str:

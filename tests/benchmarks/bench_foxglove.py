@@ -2,76 +2,53 @@
 
 from __future__ import annotations
 
-import math
 import os
 import socket
 import statistics
-import tempfile
 import time
 from collections.abc import Iterator
-from pathlib import Path
 from typing import Any
 
 import psutil
 
-from pendulum_bags.experiments.domain import reserve_domain
-from pendulum_msgs_py.programs import graph
 from tests.benchmarks import Peer, Row, measured
-from tests.benchmarks.plant_listener import PlantListener, cpu_time, domain_environment
-from tests.fixtures import PROJECT
+from tests.benchmarks.plant_listener import PlantListener, cpu_time
+from tests.benchmarks.two_plants import PLANTS, two_plants
 from tests.foxglove_client import FoxgloveClient, foxglove_client
-from tests.processes import ProcessGroup
 
 __all__ = ["rows"]
 
 SECONDS = float(os.environ.get("PENDULUM_BENCH_SECONDS", "20"))
 """Length of each measurement [s]."""
-RATE = 500.0
 _WARM_UP = 3.0
-_PLANTS = ("/sim/simulator", "/hw/bridge")
 _STATES = ("/sim/joint_states", "/hw/joint_states")
 
 
 def rows() -> Iterator[Row]:
     """Yield rate, jitter, missed deadlines and CPU for each way of looking, and what a client gets."""
-    with tempfile.TemporaryDirectory() as scratch, reserve_domain(None) as domain:
-        group, loops = ProcessGroup(Path(scratch), PROJECT), PlantListener(domain, *_PLANTS)
-        environment = domain_environment(domain)
-        try:
-            nodes = (
-                graph.simulator("/sim", rate_hz=RATE, start="top"),
-                graph.bridge("/hw", backend="emulator", feedback_rate=RATE, initial_position=math.pi),
-                *(graph.controller(space, period=1.0 / RATE) for space in ("/sim", "/hw")),
-                *(graph.disturbance(space, autostart=True) for space in ("/sim", "/hw")),
-            )
-            for it in nodes:
-                group.start(it.package, it.executable, *it.ros_arguments(), env=environment)
-            loops.wait_for_loops()
-            loops.arm("/hw/bridge")
-            alone = _loops("without a server", loops, None)
-            yield from _rows_of(alone, None)
+    with two_plants() as running:
+        loops = running.loops
+        alone = _loops("without a server", loops, None)
+        yield from _rows_of(alone, None)
 
-            with socket.socket() as probe:
-                probe.bind(("127.0.0.1", 0))
-                port = probe.getsockname()[1]
-            server = group.start("pendulum_bags", "foxglove", "--port", str(port), env=environment)
-            for plant in _PLANTS:
-                server.wait_for_output(rf"^plant {plant}$", 60)
-            process = psutil.Process(server.pid)
-            yield from _rows_of(_loops("server runs, nobody looks", loops, process), alone)
-            with foxglove_client(f"ws://localhost:{port}/") as client:
-                client.subscribe(*sorted(client.ask("seen")["topics"]))
-                watched = _loops("a client reads all topics", loops, process, client)
-                yield from _rows_of(watched, alone)
-                got = sum(topic["count"] for topic in client.ask("taken").values())
-                server.interrupt()
-                sent, lost = server.wait_for_output(r"handed on (\d+) messages; (\d+) were lost", 30).groups()
-                # Those on their way when it was asked came later.
-                yield measured("a client reads all topics: messages lost between plants and server", int(lost), "")
-                yield measured("a client reads all topics: messages not yet there at the end", int(sent) - got, "")
-        finally:
-            loops.close()
-            group.close()
+        with socket.socket() as probe:
+            probe.bind(("127.0.0.1", 0))
+            port = probe.getsockname()[1]
+        server = running.group.start("pendulum_bags", "foxglove", "--port", str(port), env=running.environment)
+        for plant in PLANTS:
+            server.wait_for_output(rf"^plant {plant}$", 60)
+        process = psutil.Process(server.pid)
+        yield from _rows_of(_loops("server runs, nobody looks", loops, process), alone)
+        with foxglove_client(f"ws://localhost:{port}/") as client:
+            client.subscribe(*sorted(client.ask("seen")["topics"]))
+            watched = _loops("a client reads all topics", loops, process, client)
+            yield from _rows_of(watched, alone)
+            got = sum(topic["count"] for topic in client.ask("taken").values())
+            server.interrupt()
+            sent, lost = server.wait_for_output(r"handed on (\d+) messages; (\d+) were lost", 30).groups()
+            # Those on their way when it was asked came later.
+            yield measured("a client reads all topics: messages lost between plants and server", int(lost), "")
+            yield measured("a client reads all topics: messages not yet there at the end", int(sent) - got, "")
 
 
 def _loops(

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import math
 import os
 import shutil
 import socket
@@ -19,24 +18,19 @@ from pathlib import Path
 import psutil
 import websockets
 
-from pendulum_bags.experiments.domain import reserve_domain
-from pendulum_msgs_py.programs import graph
-from tests.benchmarks.plant_listener import PlantListener, cpu_time, domain_environment
+from tests.benchmarks.plant_listener import PlantListener, cpu_time
+from tests.benchmarks.two_plants import two_plants
 from tests.processes import ProcessGroup, RunningProgram
 
 __all__ = ["CHROMIUM", "Look", "looks"]
 
 CHROMIUM = Path("/usr/bin/chromium")
-RATE = 500.0
-"""States per second of each plant [Hz]."""
-_ROOT = Path(__file__).parents[2]
 _WARM_UP = 4.0
 _START_TIMEOUT = 60.0
 _AS_A_PERSON = "setpriv --bounding-set=-sys_nice" if os.geteuid() == 0 and shutil.which("setpriv") else ""
 """Root's Chromium raises its own priority above every loop's; a person's cannot."""
 _NICENESS = 10
 """Of the browser, as a person would start one beside a loop on a small machine."""
-_PLANTS = ("/sim/simulator", "/hw/bridge")
 _BROWSER_FLAGS = ["--no-sandbox", "--disable-gpu", "--disable-background-networking", "--disable-component-update"]
 
 
@@ -72,37 +66,22 @@ def looks(duration: float, ways: Sequence[str] = ("nobody", "console", "reader",
         duration: Length of each measurement [s].
         ways: Which ways, in this order.
     """
-    with tempfile.TemporaryDirectory() as scratch, reserve_domain(None) as domain:
-        group, loops = ProcessGroup(Path(scratch), _ROOT), PlantListener(domain, *_PLANTS)
-        environment = domain_environment(domain)
-        try:
-            nodes = (
-                graph.simulator("/sim", rate_hz=RATE, start="top"),
-                graph.bridge("/hw", backend="emulator", feedback_rate=RATE, initial_position=math.pi),
-                *(graph.controller(space, period=1.0 / RATE) for space in ("/sim", "/hw")),
-                *(graph.disturbance(space, autostart=True) for space in ("/sim", "/hw")),
-            )
-            started = [group.start(it.package, it.executable, *it.ros_arguments(), env=environment) for it in nodes]
-            processes = {"loops": [psutil.Process(program.pid) for program in started]}
-            loops.wait_for_loops()
-            loops.arm("/hw/bridge")
-            address = ""
-            for way in ways:
-                if way != "nobody" and not address:
-                    console, address = _console(group, environment, Path(scratch, "runs"))
-                    processes["console"] = [psutil.Process(console.pid)]
-                with contextlib.ExitStack() as stack:
-                    count: Callable[[], float] = float
-                    processes["browser"] = []
-                    if way == "reader":
-                        count = stack.enter_context(_Reader(address)).count
-                    elif way == "browser":
-                        count, processes["browser"] = stack.enter_context(_browser(address))
-                    loops.spin(_WARM_UP)
-                    yield _measure(way, duration, loops, processes, count)
-        finally:
-            loops.close()
-            group.close()
+    with two_plants() as running:
+        processes = {"loops": [psutil.Process(program.pid) for program in running.programs]}
+        address = ""
+        for way in ways:
+            if way != "nobody" and not address:
+                console, address = _console(running.group, running.environment, running.folder / "runs")
+                processes["console"] = [psutil.Process(console.pid)]
+            with contextlib.ExitStack() as stack:
+                count: Callable[[], float] = float
+                processes["browser"] = []
+                if way == "reader":
+                    count = stack.enter_context(_Reader(address)).count
+                elif way == "browser":
+                    count, processes["browser"] = stack.enter_context(_browser(address))
+                running.loops.spin(_WARM_UP)
+                yield _measure(way, duration, running.loops, processes, count)
 
 
 def _measure(

@@ -198,17 +198,28 @@ def _soon(holds: Callable[[], bool], timeout: float) -> bool:
     return True
 
 
-def _frozen_plant(rig: StopRig) -> Outcome:
-    outcome = Outcome()
-    rig.simulator.send_signal(signal.SIGSTOP)
-    try:
-        rig.page.keyboard.press("Escape")
-        outcome.demand(rig.sees("HAS NOT ANSWERED"), "the page does not say that the plant has not answered")
-        time.sleep(_HELD)
-    finally:
-        since = time.monotonic()
-        rig.simulator.send_signal(signal.SIGCONT)
-    return _judge(rig, outcome, since)
+def _frozen_plant(press: Callable[[StopRig], None]) -> Callable[[StopRig], Outcome]:
+    def act(rig: StopRig) -> Outcome:
+        outcome = Outcome()
+        rig.simulator.send_signal(signal.SIGSTOP)
+        try:
+            press(rig)
+            outcome.demand(rig.sees("HAS NOT ANSWERED"), "the page does not say that the plant has not answered")
+            time.sleep(_HELD)
+        finally:
+            since = time.monotonic()
+            rig.simulator.send_signal(signal.SIGCONT)
+        return _judge(rig, outcome, since)
+
+    return act
+
+
+def _press_escape(rig: StopRig) -> None:
+    rig.page.keyboard.press("Escape")
+
+
+def _press_its_button(rig: StopRig) -> None:
+    rig.page.get_by_role("button", name="Stop /sim", exact=True).click()
 
 
 def _killed_plant(rig: StopRig) -> Outcome:
@@ -270,19 +281,6 @@ def _server_dies_after_the_answer(rig: StopRig) -> Outcome:
     outcome.demand(rig.sees("UNCONFIRMED"), "the page does not say that the answer is no longer confirmed")
     outcome.demand(rig.page.locator("#alarms .good").count() == 0, "what nobody confirms stays green")
     rig.console = rig.start_console()
-    return _judge(rig, outcome, since)
-
-
-def _one_frozen_plant(rig: StopRig) -> Outcome:
-    outcome = Outcome()
-    rig.simulator.send_signal(signal.SIGSTOP)
-    try:
-        rig.page.get_by_role("button", name="Stop /sim", exact=True).click()
-        outcome.demand(rig.sees("HAS NOT ANSWERED"), "the page does not say that the plant has not answered")
-        time.sleep(_HELD)
-    finally:
-        since = time.monotonic()
-        rig.simulator.send_signal(signal.SIGCONT)
     return _judge(rig, outcome, since)
 
 
@@ -372,14 +370,14 @@ STOPS: dict[str, Callable[[StopRig], Outcome]] = {
         lambda page: page.evaluate("document.getElementById('e_stop').click()")
     ),
     "stop by touch on a second client": _two_clients,
-    "stop while the plant is frozen": _frozen_plant,
+    "stop while the plant is frozen": _frozen_plant(_press_escape),
     "stop while the plant is killed and started anew": _killed_plant,
     "stop after the plant was gone for long": _plant_gone_for_long,
     "stop while the console's server is frozen": _frozen_server,
     "stop while the console's server is killed and started anew": _killed_server,
     "stop, then the console's server is killed and started anew": _server_dies_after_the_answer,
     "stop while the link to the server is cut": _cut_link,
-    "stop of one plant alone, by its own button, while it is frozen": _one_frozen_plant,
+    "stop of one plant alone, by its own button, while it is frozen": _frozen_plant(_press_its_button),
     "stop, then the page goes to the background, plant frozen": _page_in_the_background,
     "stop, then the page that pressed is closed, plant frozen": _closed_page,
 }

@@ -64,7 +64,13 @@ def ros_of_its_own(domain: int) -> Iterator[None]:
 
 
 class NodeRig(Rig):
-    """A :class:`Rig` whose bridge is a ``BridgeNode``; needs :func:`ros_of_its_own`, and :meth:`end` when done."""
+    """A :class:`Rig` whose bridge is a ``BridgeNode``; needs :func:`ros_of_its_own`, and :meth:`end` or ``with``."""
+
+    def __enter__(self) -> NodeRig:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.end()
 
     def _build(self, kind: EffortStrategy, seed: int, start: float, voltage: float | None) -> None:
         if voltage is not None:

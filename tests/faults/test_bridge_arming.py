@@ -320,39 +320,31 @@ def test_a_preparation_that_has_lapsed_is_none() -> None:
 @KINDS
 @pytest.mark.parametrize("delay", [30, 50, 100], ids=lambda delay: f"{delay} ms")
 def test_a_module_that_is_slow_to_set_is_armed_and_stays_so(domain_id: int, kind: EffortStrategy, delay: int) -> None:
-    with ros_of_its_own(domain_id):
-        rig = NodeRig(kind=kind, start=0.0)
-        try:
-            rig.controlling = rig.disturbing = False
-            rig.run(0.1)
-            rig.disarm()
-            rig.run(0.1)
-            set_limits = rig.port.set_limits
+    with ros_of_its_own(domain_id), NodeRig(kind=kind, start=0.0) as rig:
+        rig.controlling = rig.disturbing = False
+        rig.run(0.1)
+        rig.disarm()
+        rig.run(0.1)
+        set_limits = rig.port.set_limits
 
-            def slow(limits: HardwareLimits) -> HardwareLimits:
-                rig.clock.wait_until(rig.clock.now_ns() + delay * MILLISECOND)
-                return set_limits(limits)
+        def slow(limits: HardwareLimits) -> HardwareLimits:
+            rig.clock.wait_until(rig.clock.now_ns() + delay * MILLISECOND)
+            return set_limits(limits)
 
-            rig.port.set_limits = slow  # type: ignore[method-assign]
-            assert rig.arm() == ""
-            rig.run(0.1)
-            assert rig.supervisor.mode.armed, rig.supervisor.reason
-        finally:
-            rig.end()
+        rig.port.set_limits = slow  # type: ignore[method-assign]
+        assert rig.arm() == ""
+        rig.run(0.1)
+        assert rig.supervisor.mode.armed, rig.supervisor.reason
 
 
 def test_a_drive_that_was_prepared_and_then_not_armed_is_off_at_once(domain_id: int) -> None:
-    with ros_of_its_own(domain_id):
-        rig = NodeRig(start=0.0)
-        try:
-            rig.controlling = rig.disturbing = False
-            rig.run(0.1)
-            rig.disarm()
-            rig.run(0.1)
-            sample = rig.bridge.sample
-            assert sample is not None
-            rig._send(JointCommand.of_one(sample.stamp_ns, 6.0, "/controller"))
-            assert "already commands 6.000 N m" in rig.arm()
-            assert int(rig.actuator.strategy) == 0
-        finally:
-            rig.end()
+    with ros_of_its_own(domain_id), NodeRig(start=0.0) as rig:
+        rig.controlling = rig.disturbing = False
+        rig.run(0.1)
+        rig.disarm()
+        rig.run(0.1)
+        sample = rig.bridge.sample
+        assert sample is not None
+        rig._send(JointCommand.of_one(sample.stamp_ns, 6.0, "/controller"))
+        assert "already commands 6.000 N m" in rig.arm()
+        assert int(rig.actuator.strategy) == 0

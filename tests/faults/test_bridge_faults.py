@@ -140,8 +140,7 @@ def test_an_encoder_that_is_stuck_at_rest_drives_nothing_and_is_found_when_the_l
     ("early_ns", "mode"), [(1_000_000, Mode.EFFORT), (-1, Mode.POSITION), (3600 * 10**9, Mode.POSITION)]
 )
 def test_a_trajectory_that_waited_while_the_plant_armed_is_refused(early_ns: int, mode: Mode) -> None:
-    rig = NodeRig(start=0.0)
-    try:
+    with NodeRig(start=0.0) as rig:
         rig.controlling = rig.disturbing = False
         interface = rig.node._interface
         move = JointTrajectory(joint_names=[names.JOINT])
@@ -151,8 +150,6 @@ def test_a_trajectory_that_waited_while_the_plant_armed_is_refused(early_ns: int
         rig.run(0.1)
         assert rig.supervisor.mode is mode
         assert interface.refused_trajectories.total() == (mode is Mode.EFFORT)
-    finally:
-        rig.end()
 
 
 def test_the_same_seed_gives_the_same_reaction_bit_by_bit() -> None:
@@ -170,8 +167,7 @@ def test_a_node_with_parameters_that_are_wrong_together_does_not_come_up() -> No
 
 
 def test_a_disturbance_that_waits_for_a_commander_moves_nothing() -> None:
-    rig = NodeRig(start=0.0)
-    try:
+    with NodeRig(start=0.0) as rig:
         rig.controlling = rig.disturbing = False
 
         def answer() -> None:
@@ -186,13 +182,10 @@ def test_a_disturbance_that_waits_for_a_commander_moves_nothing() -> None:
         assert rig.supervisor.mode is Mode.EFFORT
         assert "the disturbance for 13.00 N m; expected a sum of at most 2.0 N m" in rig.supervisor.reason
         assert max(abs(duty) for _, duty, _ in rig.duties) < 0.05
-    finally:
-        rig.end()
 
 
 def test_a_disturbance_that_waits_for_a_hand_over_moves_nothing() -> None:
-    rig = NodeRig(start=0.0, moving=True, goal=0.1)
-    try:
+    with NodeRig(start=0.0, moving=True, goal=0.1) as rig:
 
         def answer() -> None:
             sample = rig.bridge.sample
@@ -206,13 +199,10 @@ def test_a_disturbance_that_waits_for_a_hand_over_moves_nothing() -> None:
         rig.run(0.3)
         assert rig.supervisor.mode is Mode.POSITION
         assert "controller asks for 0.00 N m and the disturbance for 13.00 N m" in rig.supervisor.reason
-    finally:
-        rig.end()
 
 
 def test_where_the_check_of_feedback_is_blind_the_rules_behind_it_end_torque_one_period_later() -> None:
-    rig = NodeRig()
-    try:
+    with NodeRig() as rig:
         rig.run(0.5)
         rig.bridge.monitor.silence = lambda now_ns: None  # type: ignore[method-assign]
         rig.actuator.inject(ActuatorFault.FEEDBACK_LOST)
@@ -226,5 +216,3 @@ def test_where_the_check_of_feedback_is_blind_the_rules_behind_it_end_torque_one
         assert 40 * MILLISECOND < ended_ns - sample.stamp_ns <= 50 * MILLISECOND
         # Longer than a duty acts after the last command.
         assert all(duty == 0.0 for time_ns, duty, _ in rig.duties if time_ns > ended_ns + MILLISECOND)
-    finally:
-        rig.end()

@@ -8,6 +8,7 @@ import socket
 import subprocess
 import sys
 from collections.abc import Iterator
+from contextlib import closing
 
 import psutil
 import pytest
@@ -66,9 +67,8 @@ def test_a_client_that_asks_by_the_older_name_of_the_protocol_is_answered_by_it(
 @pytest.fixture
 def peer(domain_id: int) -> Iterator[PlantPeer]:
     """Watch the plant itself."""
-    peer = PlantPeer("/sim")
-    yield peer
-    peer.close()
+    with closing(PlantPeer("/sim")) as peer:
+        yield peer
 
 
 @pytest.fixture
@@ -181,7 +181,7 @@ def test_who_is_refused_hears_why_and_so_does_the_terminal(processes: ProcessGro
     command = [sys.executable, "-m", "pendulum_bags", "foxglove", "--port", str(port)]
     second = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
     assert second.returncode == 2
-    said = f"port {port} of 127.0.0.1 is taken by another program; expected a free one, such as --port {port + 1}"
+    said = f"port is {port}, which another program listens on; expected a free one: --port PORT"
     assert f"error: {said}\n" in second.stderr
     program.interrupt()
     assert program.wait(20) == 0

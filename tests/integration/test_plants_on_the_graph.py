@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Iterator
+from contextlib import closing
 from pathlib import Path
 
 import pytest
@@ -21,9 +22,8 @@ pytest.importorskip("mujoco")
 
 @pytest.fixture
 def peer(domain_id: int) -> Iterator[PlantPeer]:
-    peer = PlantPeer("/lab")
-    yield peer
-    peer.close()
+    with closing(PlantPeer("/lab")) as peer:
+        yield peer
 
 
 def experiment(processes: ProcessGroup, domain: int, out: Path, *arguments: str | Path) -> RunningProgram:

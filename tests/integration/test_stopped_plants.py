@@ -7,6 +7,7 @@ import re
 import signal
 import sys
 from collections.abc import Iterator
+from contextlib import closing
 from pathlib import Path
 
 import pytest
@@ -23,9 +24,8 @@ ROBOT = Path(__file__).with_name("plain_plant.py")
 
 @pytest.fixture
 def peer(domain_id: int) -> Iterator[PlantPeer]:
-    peer = PlantPeer("/lab")
-    yield peer
-    peer.close()
+    with closing(PlantPeer("/lab")) as peer:
+        yield peer
 
 
 @pytest.fixture

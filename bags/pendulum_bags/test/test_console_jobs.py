@@ -32,4 +32,4 @@ def test_a_port_that_is_taken_is_refused_before_anything_starts(
         assert main(["--port", str(port), "--runs", str(tmp_path)]) == 2
     assert f"port is {port}, which another program listens on; expected a free one" in capsys.readouterr().err
     assert main(["--host", "nowhere.invalid", "--runs", str(tmp_path)]) == 2
-    assert "host is 'nowhere.invalid', port 8090: " in capsys.readouterr().err
+    assert "host is 'nowhere.invalid', which is no address of this machine" in capsys.readouterr().err

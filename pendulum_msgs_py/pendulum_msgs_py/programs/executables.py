@@ -39,6 +39,7 @@ __all__ = [
     "run_program",
     "summary",
     "tables_of",
+    "typed_options",
 ]
 
 EXIT_USAGE = 2
@@ -219,6 +220,17 @@ def _discard_output() -> None:
     """Send what is still buffered nowhere: the reader of our output has gone, nothing is left to say."""
     with Path(os.devnull).open("w", encoding="utf-8") as nowhere:
         os.dup2(nowhere.fileno(), sys.stdout.fileno())
+
+
+def typed_options(context: typer.Context, names: Collection[str]) -> list[str]:
+    """Return those of a command's options that were typed, as ``--effort-limit``, in alphabetical order.
+
+    Args:
+        context: Of the command.
+        names: Names of the options' variables, such as ``effort_limit``.
+    """
+    typed = {name for name in names if str(context.get_parameter_source(name)).endswith("COMMANDLINE")}
+    return sorted(max(option.opts, key=len) for option in context.command.params if option.name in typed)
 
 
 def report_error(error: BaseException) -> int:

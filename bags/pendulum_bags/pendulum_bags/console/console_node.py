@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import asyncio
-import errno
 import json
 import secrets
-import socket
 import sys
 import threading
 import time
@@ -33,7 +31,7 @@ from std_srvs.srv import SetBool, Trigger
 from pendulum_bags.console.graph import Description
 from pendulum_bags.console.jobs import Jobs
 from pendulum_bags.console.page import serve
-from pendulum_bags.console.security import is_loopback
+from pendulum_bags.console.security import is_loopback, listen
 from pendulum_bags.console.stop_order import StopOrder
 from pendulum_msgs_py.contract import names
 from pendulum_msgs_py.contract.names import Event
@@ -413,7 +411,8 @@ def console(
     token = "" if is_loopback(host) else secrets.token_urlsafe(16)
     if runs.exists() and not runs.is_dir():
         raise ParameterError(f"runs is {runs}, a file; expected a folder")
-    _check_address(host, port)
+    # An address that cannot be had is refused before anything starts.
+    listen(host, port).close()
     hub, jobs = Hub(), Jobs(runs.resolve())
     address = f"http://{'localhost' if is_loopback(host) else host}:{port}/" + (f"?token={token}" if token else "")
     try:
@@ -429,22 +428,6 @@ def console(
         jobs.close()
         hub.close()
     return 0
-
-
-def _check_address(host: str, port: int) -> None:
-    """Refuse an address that cannot be listened on, before anything starts."""
-    try:
-        family, kind, protocol, _, address = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)[0]
-        with socket.socket(family, kind, protocol) as probe:
-            # As the server does: a port that was left a moment ago may be taken again.
-            probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-            probe.bind(address)
-    except OSError as error:
-        if error.errno == errno.EADDRINUSE:
-            raise ParameterError(
-                f"port is {port}, which another program listens on; expected a free one: --port PORT"
-            ) from error
-        raise ParameterError(f"host is {host!r}, port {port}: {error.strerror or error}") from error
 
 
 def main(argv: list[str] | None = None) -> int:

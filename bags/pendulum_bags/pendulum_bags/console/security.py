@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+import errno
 import hmac
+import socket
 from collections.abc import Awaitable, Callable, MutableMapping
 from http.cookies import SimpleCookie
 from typing import Any
 from urllib.parse import parse_qs, urlsplit
 
-__all__ = ["LOOPBACK", "Guard", "is_loopback", "refusal"]
+from pendulum_msgs_py.errors import ParameterError
+
+__all__ = ["LOOPBACK", "Guard", "is_loopback", "listen", "refusal"]
 
 LOOPBACK = frozenset({"127.0.0.1", "localhost", "::1", "[::1]"})
 COOKIE = "pendulum_console"
@@ -21,6 +25,32 @@ Send = Callable[[MutableMapping[str, Any]], Awaitable[None]]
 def is_loopback(host: str) -> bool:
     """Tell whether a host to listen on can be reached from this machine only."""
     return host in LOOPBACK
+
+
+def listen(host: str, port: int, backlog: int = 1) -> socket.socket:
+    """Return a socket that listens.
+
+    Args:
+        host: Address of this machine.
+        port: Port; 0 for any.
+        backlog: How many may wait to be accepted.
+
+    Raises:
+        ParameterError: The address or the port cannot be had.
+    """
+    try:
+        family, _, _, _, address = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)[0]
+        return socket.create_server(address[:2], family=family, backlog=backlog)
+    except socket.gaierror:
+        raise ParameterError(
+            f"host is {host!r}, which is no address of this machine; expected such as 0.0.0.0"
+        ) from None
+    except OSError as error:
+        if error.errno == errno.EADDRINUSE:
+            raise ParameterError(
+                f"port is {port}, which another program listens on; expected a free one: --port PORT"
+            ) from None
+        raise ParameterError(f"host is {host!r}, port {port}: {error.strerror or error}") from None
 
 
 def refusal(headers: dict[str, str], query: str, token: str) -> str:

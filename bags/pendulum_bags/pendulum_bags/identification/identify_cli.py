@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from pendulum_msgs_py.errors import DataError
-from pendulum_msgs_py.programs.executables import cli_main
+from pendulum_msgs_py.programs.executables import cli_main, typed_options
 
 if TYPE_CHECKING:
     from pendulum_bags.identification.result import IdentificationResult
@@ -119,8 +119,10 @@ def identify(
         else:
             _print_thesis(result, verbose=verbose)
         return
-    if unheeded := _given(context, _FOR_REGRESSION_ALONE):
-        raise DataError(f"{unheeded} has no effect with --method {method}; expected it with --method thesis only")
+    if unheeded := typed_options(context, _FOR_REGRESSION_ALONE):
+        raise DataError(
+            f"{', '.join(unheeded)} has no effect with --method {method}; expected it with --method thesis only"
+        )
     from pendulum_bags.identification.identify import identify as run
     from pendulum_bags.identification.options import Geometry, Options
 
@@ -149,17 +151,11 @@ def identify(
 
 def _refuse_unheeded(context: typer.Context, way: str, heeded: Collection[str]) -> None:
     """Refuse options that were given and would change nothing: whoever gives one relies on it."""
-    if unheeded := _given(context, set(context.params) - {"data", *heeded}):
+    if unheeded := typed_options(context, set(context.params) - {"data", *heeded}):
         raise DataError(
-            f"{unheeded} has no effect with {way}; expected none but "
+            f"{', '.join(unheeded)} has no effect with {way}; expected none but "
             + ", ".join(f"--{name.replace('as_', '').replace('_', '-')}" for name in sorted(heeded))
         )
-
-
-def _given(context: typer.Context, names: Collection[str]) -> str:
-    """Return those of the options that were typed, as they are typed."""
-    given = sorted(name for name in names if str(context.get_parameter_source(name)).endswith("COMMANDLINE"))
-    return ", ".join(f"--{name.replace('_', '-')}" for name in given)
 
 
 def _mappings(given: Sequence[str] | None, recordings: int, total: int | None = None) -> list[str | None]:

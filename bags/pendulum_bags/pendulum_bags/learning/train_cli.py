@@ -14,7 +14,7 @@ from rich.progress import TextColumn, TimeRemainingColumn
 
 from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.programs.counted_progress import counting_bar
-from pendulum_msgs_py.programs.executables import EXIT_INTERRUPTED, cli_main
+from pendulum_msgs_py.programs.executables import EXIT_INTERRUPTED, cli_main, typed_options
 from pendulum_msgs_py.programs.terminal import make_console
 
 if TYPE_CHECKING:
@@ -67,8 +67,11 @@ def train(
         raise ParameterError(f"policy file {out} exists; expected a new one")
     if min(hidden) < 1 or max(hidden) > 512:
         raise ParameterError(f"hidden is {hidden[0]} {hidden[1]}; expected widths of 1 to 512")
-    if task == "pendulum_v1":
-        _refuse_ignored(context)
+    if task == "pendulum_v1" and (ignored := typed_options(context, _OF_SWING_UP)):
+        raise ParameterError(
+            f"{', '.join(ignored)} is given, but the task pendulum_v1 is Gymnasium's own pendulum; "
+            "expected no such option, or --task swing_up"
+        )
     swing_up = SwingUpTask(
         period=period, share=share, delay=delay, jitter=jitter, angle_noise=angle_noise,
         velocity_noise=velocity_noise, kick=kick, history=history,
@@ -101,16 +104,6 @@ def train(
         return
     console.print(_sentence(measured))
     console.print(f"policy  {out}\ncurves  {figure}\n({time.monotonic() - began:.0f} s)", soft_wrap=True)
-
-
-def _refuse_ignored(context: typer.Context) -> None:
-    for name in _OF_SWING_UP:
-        source = context.get_parameter_source(name)
-        if source is not None and source.name != "DEFAULT":
-            raise ParameterError(
-                f"--{name.replace('_', '-')} is given, but the task pendulum_v1 is Gymnasium's own pendulum; "
-                "expected no such option, or --task swing_up"
-            )
 
 
 def _settings(task: str, plant: str, seed: int, updates: int, swing_up: Any, hidden: tuple[int, int]) -> Training:

@@ -70,7 +70,7 @@ class LiveNode(PollingNode):
         stop: Asks the runner to end the process.
 
     Raises:
-        FaultError: The port cannot be had.
+        ParameterError: The port cannot be had.
     """
 
     def __init__(self, options: LiveOptions, stop: Callable[[], None]) -> None:

@@ -7,12 +7,12 @@ connects comes through here.
 from __future__ import annotations
 
 import contextlib
-import errno
 import socket
 import threading
 import time
 from collections.abc import Callable
 
+from pendulum_bags.console.security import listen
 from pendulum_bags.live.handshake import Request, as_asked, parse, to_server
 from pendulum_msgs_py.errors import FaultError
 
@@ -38,7 +38,7 @@ class Gate:
         tell: Gets a line about each who comes, goes or is refused; called in any thread.
 
     Raises:
-        FaultError: The address or the port cannot be had.
+        ParameterError: The address or the port cannot be had.
 
     Attributes:
         port: The port that it listens on.
@@ -58,7 +58,7 @@ class Gate:
         self._open: set[socket.socket] = set()
         self._lock = threading.Lock()
         self._closing = False
-        self._listener = _listen(host, port)
+        self._listener = listen(host, port, _MOST_CLIENTS)
         self.port: int = self._listener.getsockname()[1]
         self._start(self._accept)
 
@@ -147,20 +147,6 @@ class Gate:
             self._open.discard(each)
         _hang_up(each)
         each.close()
-
-
-def _listen(host: str, port: int) -> socket.socket:
-    try:
-        family, _, _, _, address = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)[0]
-        return socket.create_server(address[:2], family=family, backlog=_MOST_CLIENTS)
-    except socket.gaierror:
-        raise FaultError(f"host is {host!r}, which is no address of this machine; expected such as 0.0.0.0") from None
-    except OSError as error:
-        if error.errno == errno.EADDRINUSE:
-            raise FaultError(
-                f"port {port} of {host} is taken by another program; expected a free one, such as --port {port + 1}"
-            ) from None
-        raise FaultError(f"cannot listen on port {port} of {host}: {error.strerror}") from None
 
 
 def _read_head(source: socket.socket) -> tuple[bytes, bytes]:

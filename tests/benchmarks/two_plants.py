@@ -1,0 +1,63 @@
+"""Simulator and bridge at one rate, each with its controller and under noise, as what looks at them is measured."""
+
+from __future__ import annotations
+
+import math
+import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+
+from pendulum_bags.experiments.domain import reserve_domain
+from pendulum_msgs_py.programs import graph
+from tests.benchmarks.plant_listener import PlantListener, domain_environment
+from tests.fixtures import PROJECT
+from tests.processes import ProcessGroup, RunningProgram
+
+__all__ = ["PLANTS", "RATE", "TwoPlants", "two_plants"]
+
+RATE = 500.0
+"""States per second of each plant [Hz]."""
+PLANTS = ("/sim/simulator", "/hw/bridge")
+
+
+@dataclass(frozen=True)
+class TwoPlants:
+    """The running plants.
+
+    Attributes:
+        folder: For whatever is written meanwhile.
+        group: Starts more programs, and ends them with the plants.
+        environment: For these programs.
+        loops: Hears the plants' diagnostics.
+        programs: Plants, controllers and disturbances.
+    """
+
+    folder: Path
+    group: ProcessGroup
+    environment: dict[str, str]
+    loops: PlantListener
+    programs: list[RunningProgram]
+
+
+@contextmanager
+def two_plants() -> Iterator[TwoPlants]:
+    """Start them, the bridge armed, and end them with all that their group started."""
+    with tempfile.TemporaryDirectory() as scratch, reserve_domain(None) as domain:
+        group, loops = ProcessGroup(Path(scratch), PROJECT), PlantListener(domain, *PLANTS)
+        environment = domain_environment(domain)
+        try:
+            nodes = (
+                graph.simulator("/sim", rate_hz=RATE, start="top"),
+                graph.bridge("/hw", backend="emulator", feedback_rate=RATE, initial_position=math.pi),
+                *(graph.controller(space, period=1.0 / RATE) for space in ("/sim", "/hw")),
+                *(graph.disturbance(space, autostart=True) for space in ("/sim", "/hw")),
+            )
+            programs = [group.start(it.package, it.executable, *it.ros_arguments(), env=environment) for it in nodes]
+            loops.wait_for_loops()
+            loops.arm("/hw/bridge")
+            yield TwoPlants(Path(scratch), group, environment, loops, programs)
+        finally:
+            loops.close()
+            group.close()
