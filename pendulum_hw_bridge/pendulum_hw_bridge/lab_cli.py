@@ -6,20 +6,21 @@ import contextlib
 import json
 import sys
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from pendulum_hw_bridge import guided, module_files
-from pendulum_hw_bridge.actuator import ActuatorPort
+from pendulum_hw_bridge.actuator import ActuatorPort, HardwareLimits
 from pendulum_hw_bridge.backends import hebi
 from pendulum_hw_bridge.backends.hebi_discovery import LOOK_TIME, ModuleSelection, discover, select_module
 from pendulum_hw_bridge.bridge_parameters import drivetrain_of
 from pendulum_hw_bridge.emulation import EMULATOR_PRESET_NAMES
 from pendulum_hw_bridge.nudge import hand_of
-from pendulum_msgs_py.errors import ParameterError
+from pendulum_hw_bridge.settings import expect_limits
+from pendulum_msgs_py.errors import ParameterError, PendulumError
 from pendulum_msgs_py.plants.lab_file import LabFile, load_lab, write_lab
 from pendulum_msgs_py.programs.executables import cli_main
 from pendulum_msgs_py.programs.terminal import WholeTable, make_console
@@ -39,8 +40,6 @@ app = typer.Typer(
     add_completion=False,
 )
 File = Annotated[Path, typer.Argument(help="The lab file.")]
-_SETTING_PROOFS = ("m_stop", "command_lifetime")
-"""Proofs that set the module's limits; zero and tare set nothing."""
 Yes = Annotated[bool, typer.Option("--yes", help="Do not wait for Enter before each step.")]
 
 
@@ -214,15 +213,17 @@ def backup(
     folder = out or file.with_name(f"{file.stem}_module_{time.strftime('%Y-%m-%d_%H-%M-%S')}")
     lab = load_lab(file)
     if lab.values["backend"] == "hebi":
-        written = module_files.backup_group(_group(lab), folder)
+        group = _group(lab)
+        written = module_files.backup_group(group, folder)
+        ours = _ours(file, lambda limits: module_files.limits_of_group(group, limits))
     else:
         with _machine(file) as (port, _):
             written = module_files.backup_emulator(port, folder)
-    proved = [name for name in _SETTING_PROOFS if name in lab.proofs]
-    if proved:
+            ours = _ours(file, lambda _: port.connect().limits)
+    if ours:
         print(
-            f"note: {' and '.join(proved)} of {file} was proved before, which set the lab file's limits in the module: "
-            "this backup holds what the module is set to now, not what it was before us",
+            f"note: the module holds the limits of {file}, which a proof or the bridge has set: this backup holds what "
+            "the module is set to now, not what it was before us",
             file=sys.stderr,
         )
     for path in written:
@@ -256,12 +257,27 @@ def restore(
     print("restored, and read back")
 
 
+def _ours(file: Path, limits_of: Callable[[HardwareLimits], HardwareLimits]) -> bool:
+    """Whether a module tells the limits that the bridge sets with a lab file."""
+    try:
+        wanted = _as_the_bridge(file).settings.limits
+        expect_limits(limits_of(wanted), wanted)
+    except PendulumError:
+        # Others, or a lab file that the bridge does not take: nothing was set with it.
+        return False
+    return True
+
+
+def _as_the_bridge(file: Path) -> AsTheBridge:
+    from pendulum_hw_bridge.check_node import as_the_bridge, bridge_values
+
+    return as_the_bridge(bridge_values([], {"lab_file": str(file)}))
+
+
 @contextlib.contextmanager
 def _machine(file: Path) -> Iterator[tuple[ActuatorPort, AsTheBridge]]:
     """Connect the machine of a lab file; on every way out its motor is off."""
-    from pendulum_hw_bridge.check_node import as_the_bridge, bridge_values
-
-    bridge = as_the_bridge(bridge_values([], {"lab_file": str(file)}))
+    bridge = _as_the_bridge(file)
     port = bridge.port
     try:
         port.connect()

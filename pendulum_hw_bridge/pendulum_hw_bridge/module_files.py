@@ -17,13 +17,14 @@ from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree
 
-from pendulum_hw_bridge.actuator import ActuatorError, ActuatorPort
+from pendulum_hw_bridge.actuator import ActuatorError, ActuatorPort, HardwareLimits
+from pendulum_hw_bridge.backends.hebi_settings import limits_of
 from pendulum_hw_bridge.emulation.wire import limits_from_json, limits_to_json
 from pendulum_hw_bridge.gains import load_gains, write_gains
 from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.parameters import read_text
 
-__all__ = ["backup_emulator", "backup_group", "restore_emulator", "restore_group"]
+__all__ = ["backup_emulator", "backup_group", "limits_of_group", "restore_emulator", "restore_group"]
 
 GAINS = "gains.xml"
 SAFETY = "safety.xml"
@@ -99,6 +100,15 @@ def restore_group(group: Any, folder: Path, make_command: Callable[[], Any], say
                     "no_acknowledgement", f"HEBI module did not acknowledge {name} within {_ANSWER_MS} ms"
                 )
         _expect_group(_info(group), folder, ends)
+
+
+def limits_of_group(group: Any, wanted: HardwareLimits) -> HardwareLimits:
+    """Return the limits that a HEBI module tells; ``wanted`` says at which ends it should switch off.
+
+    Raises:
+        ActuatorError: The module does not answer, or does otherwise at an end.
+    """
+    return limits_of(_info(group), wanted)
 
 
 def _expect_group(info: Any, folder: Path, ends: dict[str, int]) -> None:

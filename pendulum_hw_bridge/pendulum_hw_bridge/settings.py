@@ -9,7 +9,7 @@ from pendulum_hw_bridge.actuator import ActuatorError, ActuatorPort, HardwareLim
 from pendulum_hw_bridge.command_check import check_lifetime
 from pendulum_hw_bridge.gains import GainSet, differing_gain
 
-__all__ = ["BridgeSettings", "write_limits", "write_settings"]
+__all__ = ["BridgeSettings", "expect_limits", "write_limits", "write_settings"]
 
 
 @dataclass(frozen=True)
@@ -66,8 +66,19 @@ def write_limits(port: ActuatorPort, settings: BridgeSettings) -> None:
     _expect("command lifetime", lifetime, settings.command_lifetime, "s")
     rate = port.set_feedback_rate(settings.feedback_rate)
     _expect("feedback rate", rate, settings.feedback_rate, "Hz")
-    wanted = settings.limits
-    reads = port.set_limits(wanted)
+    expect_limits(port.set_limits(settings.limits), settings.limits)
+
+
+def expect_limits(reads: HardwareLimits, wanted: HardwareLimits) -> None:
+    """Refuse limits that are others than wanted.
+
+    Args:
+        reads: What a module tells.
+        wanted: What it should tell.
+
+    Raises:
+        ActuatorError: Names the first that differs.
+    """
     for what, unit in (("effort", "N m"), ("velocity", "rad/s"), ("pwm", "of the supply")):
         _expect(f"{what} limit", getattr(reads, what), getattr(wanted, what), unit)
     for what in ("position_min", "position_max"):

@@ -347,6 +347,8 @@ def test_a_lab_file_is_written_step_by_step_and_shown(
 
     rig = Rig("thesis")
     monkeypatch.setattr("pendulum_hw_bridge.bridge_parameters.make_port", lambda *_, **__: rig.port)
+    assert lab_cli.main(["backup", lab, "--out", str(tmp_path / "before")]) == 0
+    assert "not what it was before us" not in capsys.readouterr().err
     for step in ("zero", "tare", "prove_lifetime"):
         assert lab_cli.main([step, lab, "--yes"]) == 0, capsys.readouterr().err
     values, proofs = load_lab(lab).values, load_lab(lab).proofs
@@ -354,9 +356,12 @@ def test_a_lab_file_is_written_step_by_step_and_shown(
     assert values["joint_offset"] == pytest.approx(0.0, abs=0.03)
     assert abs(values["effort_tare"]) < 0.1
     assert set(proofs) == {"zero", "effort_tare", "command_lifetime"}
-    assert lab_cli.main(["backup", lab, "--out", str(tmp_path / "before")]) == 0
+    assert lab_cli.main(["backup", lab, "--out", str(tmp_path / "proved")]) == 0
     assert "this backup holds what the module is set to now, not what it was before us" in capsys.readouterr().err
     assert lab_cli.main(["restore", lab, str(tmp_path / "before"), "--yes"]) == 0
+    # Given back, it is again what it was before us.
+    assert lab_cli.main(["backup", lab, "--out", str(tmp_path / "after")]) == 0
+    assert "not what it was before us" not in capsys.readouterr().err
     assert lab_cli.main(["show", lab]) == 0
     assert "torque ended" in capsys.readouterr().out
 

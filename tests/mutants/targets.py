@@ -45,7 +45,7 @@ TARGETS: tuple[Target, ...] = (
     Target("pendulum_msgs_py.contract.drive", ("PlantLimits", "Mode"), _RULES),
     Target(
         "pendulum_hw_bridge.settings",
-        ("write_settings", "_expect"),
+        ("write_settings", "write_limits", "expect_limits", "_expect"),
         (f"{_BRIDGE}/test_settings_read_back.py",),
     ),
     Target(
@@ -132,6 +132,7 @@ TARGETS: tuple[Target, ...] = (
             "_expect_group",
             "backup_emulator",
             "restore_emulator",
+            "limits_of_group",
             "_set_open_ends",
             "_ends_of",
             "_read_ends",
