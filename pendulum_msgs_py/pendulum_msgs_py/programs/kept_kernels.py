@@ -8,14 +8,14 @@ from __future__ import annotations
 
 import contextlib
 import hashlib
-import os
 import pickle
 import sys
-import tempfile
 from functools import cache
 from pathlib import Path
 from types import FunctionType
 from typing import Any
+
+from pendulum_msgs_py.whole_file import write_whole
 
 __all__ = ["KernelStore", "keep_kernel"]
 
@@ -79,12 +79,9 @@ class KernelStore:
         if compiled.library.has_dynamic_globals or compiled.lifted:
             return
         content = self._numba.serialize.dumps(compiled._reduce())
-        path = self._path(signature, compiled.library.codegen)
+        # Whole or not at all: others may compile the same at this moment.
         with contextlib.suppress(OSError):
-            # Whole or not at all: others may compile the same at this moment.
-            with tempfile.NamedTemporaryFile(dir=self._folder, prefix=path.name, delete=False) as file:
-                file.write(self._head(content) + b"\n" + content)
-            os.replace(file.name, path)
+            write_whole(self._path(signature, compiled.library.codegen), self._head(content) + b"\n" + content)
 
     def enable(self) -> None:
         """Do nothing: a store is always on."""
