@@ -18,7 +18,7 @@ from collections.abc import Callable
 from typing import Any
 
 from pendulum_msgs_py.dynamics import friction_magnitude
-from pendulum_msgs_py.dynamics.runge_kutta import along_functions, rk4_joints
+from pendulum_msgs_py.dynamics.runge_kutta import along_functions
 from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.plants.mechanism_parameters import MechanismParameters
 from pendulum_sim.dry_friction import actuator_torque, narrowed
@@ -35,7 +35,6 @@ __all__ = [
     "advance_joints",
     "joint_functions",
     "pack_joints",
-    "rk4_joints",
 ]
 
 JOINT_ROWS = ("coulomb_friction", "static_friction", "stribeck_velocity", "lower_stop", "upper_stop", "time_constant")

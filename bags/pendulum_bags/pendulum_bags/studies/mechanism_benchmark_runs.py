@@ -21,10 +21,10 @@ from pendulum_bags.studies.mechanism_benchmark import criteria_of, score_v2, tim
 from pendulum_lqr.mechanism_controller import MechanismController
 from pendulum_msgs_py.contract.angles import UPRIGHT, wrap
 from pendulum_msgs_py.dynamics.arithmetic import complex_step, in_arithmetic
+from pendulum_msgs_py.dynamics.runge_kutta import along_functions, rk4_joints
 from pendulum_msgs_py.joints import Vector
 from pendulum_msgs_py.plants.mechanism_parameters import MechanismParameters
 from pendulum_sim.compiling import compile_tree
-from pendulum_sim.joint_steps import joint_functions, rk4_joints
 
 __all__ = [
     "DT",
@@ -154,7 +154,7 @@ def make_stepper(plant: MechanismParameters, *, compiled: bool = True) -> Steppe
         plant: A double pendulum; its own numbers do not matter.
         compiled: Compile with numba, some seconds once.
     """
-    bare, along = plant.mechanism.forward, joint_functions(2)[0]
+    bare, along = plant.mechanism.forward, along_functions(2)
     step: Any = rk4_joints
     loaded: Any = _smooth_friction
     if compiled:
