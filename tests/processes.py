@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import re
 import signal
@@ -161,6 +162,10 @@ class ProcessGroup:
                 stderr=subprocess.STDOUT,
                 start_new_session=True,
             )
+        # What runs behind others (the suite's computing part) stays there: among sessions it is theirs that counts.
+        if nice := os.getpriority(os.PRIO_PROCESS, 0):
+            with contextlib.suppress(OSError):
+                Path(f"/proc/{popen.pid}/autogroup").write_text(str(nice), encoding="ascii")
         program = RunningProgram(name, popen, log)
         self._popens.append(popen)
         self._programs.append(program)

@@ -29,15 +29,10 @@ __all__ = ["Part", "exit_code", "main", "rooms", "run_parts"]
 _EXPERIMENTS = (
     # First, in a process that is still small: its probe must not stand still, and collecting garbage takes time.
     "tests/faults/test_live_faults.py",
-    "tests/integration/test_experiments.py",
-    "tests/integration/test_plants_on_the_graph.py",
     "tests/acceptance/test_experiment.py",
-    "tests/integration/test_several_joints.py",
-    "tests/integration/test_course.py",
-    "tests/integration/test_frequency_experiment.py",
-    "tests/faults/test_security_policy.py",
+    "tests/integration/test_plants_on_the_graph.py",
 )
-"""Whole systems in real time, longest first; each asks for about one core and judges to milliseconds: nothing runs
+"""Whole systems in real time, longest first; each asks for more than one core and judges to milliseconds: nothing runs
 beside them."""
 _WAITS = (
     "tests/acceptance/test_console.py",
@@ -52,7 +47,16 @@ _WAITS = (
     "tests/integration",
 )
 """Other tests with processes that keep a plant's time, longest first: they wait for most of it."""
+_SIMULATED_TIME = (
+    "tests/integration/test_experiments.py",
+    "tests/faults/test_security_policy.py",
+    "tests/integration/test_course.py",
+    "tests/integration/test_several_joints.py",
+    "tests/integration/test_frequency_experiment.py",
+)
+"""Whole systems whose processes wait for each other and not for a clock: they compute."""
 _COMPUTES = (
+    *_SIMULATED_TIME,
     "tests/acceptance/test_readme.py",
     "tests/acceptance/test_docs.py",
     "pendulum_sim/test/test_batch.py",
@@ -99,7 +103,7 @@ def main(arguments: Sequence[str]) -> int:
 def rooms() -> tuple[list[str], list[str], list[str]]:
     """Return the files of each part in the order to start them in: whole systems, what waits, and all others."""
     systems = _files(_EXPERIMENTS)
-    waits = [name for name in _files(_WAITS) if name not in systems]
+    waits = [name for name in _files(_WAITS) if name not in {*systems, *_SIMULATED_TIME}]
     packages = sorted(str(path) for top in ("", "bags/") for path in PROJECT.glob(f"{top}pendulum_*/test"))
     others = [name for name in _files((*_COMPUTES, *packages)) if name not in {*systems, *waits}]
     return systems, waits, others

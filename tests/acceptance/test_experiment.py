@@ -1,42 +1,92 @@
-"""``make experiment`` as its user meets it: a result, an interruption, a mistake."""
+"""``make experiment`` as its user meets it: a result, a computer that stood still, an interruption, a mistake."""
 
 from __future__ import annotations
 
 import json
 import math
-import os
-import subprocess
+import re
+import time
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
+import psutil
 import pytest
 
 from pendulum_bags.experiments.experiment_cli import main
+from pendulum_bags.experiments.run_spec import EMULATOR_LIFETIME
 from pendulum_rosbag.reader import read_bag
 from tests.fixtures import PROJECT
-from tests.processes import ProcessGroup
+from tests.processes import ProcessGroup, RunningProgram
 
 NOISE = 5.0
 RAMP = math.pi / 0.002 / 100.0
 
 
 @pytest.fixture(scope="module")
-def run_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Run the whole experiment once, through make, and return its folder."""
-    folder = tmp_path_factory.mktemp("experiment") / "run"
-    environment = {key: value for key, value in os.environ.items() if key != "ROS_DOMAIN_ID"}
-    done = subprocess.run(
-        ["make", "--no-print-directory", "experiment", f"OUT={folder}"],
-        cwd=PROJECT,
-        env=environment,
-        capture_output=True,
-        text=True,
-        timeout=240,
-        check=False,
-    )
-    assert done.returncode == 0, done.stdout + done.stderr
-    assert "report.html" in done.stdout
-    return folder
+def experiment(tmp_path_factory: pytest.TempPathFactory) -> Iterator[RunningProgram]:
+    """Run the whole experiment once, through make; while it regulates for the first time its bridge stands still."""
+    folder = tmp_path_factory.mktemp("experiment")
+    processes = ProcessGroup(folder, cwd=PROJECT)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.delenv("ROS_DOMAIN_ID", raising=False)
+        program = processes.start_command(["make", "--no-print-directory", "experiment", f"OUT={folder / 'run'}"])
+    try:
+        program.wait_for_output(r"^regulation \(1 s\)", 120)
+        (bridge,) = [
+            child
+            for child in psutil.Process(program.pid).children(recursive=True)
+            if {"pendulum_hw_bridge", "bridge"} <= _command_line(child)
+        ]
+        # The stimulus: twice as long as an emulator's bridge may stand still.
+        bridge.suspend()
+        time.sleep(2.0 * EMULATOR_LIFETIME)
+        bridge.resume()
+        assert program.wait(240) == 0, program.output
+        assert processes.leftovers() == []
+        yield program
+    finally:
+        assert processes.close() == []
+
+
+@pytest.fixture(scope="module")
+def run_folder(experiment: RunningProgram) -> Path:
+    """Return the experiment's folder."""
+    told = re.search(r"(\S+/run)/report\.html", experiment.output)
+    assert told, experiment.output
+    return Path(told[1])
+
+
+def _command_line(process: psutil.Process) -> set[str]:
+    """Return the words of a command line, none where the process has just ended."""
+    try:
+        return set(process.cmdline())
+    except psutil.Error:
+        return set()
+
+
+def test_a_run_whose_bridge_stood_still_is_measured_again_and_the_result_says_so(
+    experiment: RunningProgram, run_folder: Path
+) -> None:
+    again = r"^This machine stood still \((.*)\); measuring again, run 2 of at most 3\.$"
+    said = re.search(again, experiment.output, re.MULTILINE)
+    assert said, experiment.output
+    reason = said[1]
+    assert reason.startswith("/hw went to fault: ")
+
+    # A busy machine may have stood still once more by itself.
+    stalls = json.loads((run_folder / "summary.json").read_text(encoding="utf-8"))["stalls"]
+    assert stalls[0] == {"run": "run", "reason": reason, "logs": "logs_stalled_1"}
+    assert len(re.findall(r"^regulation \(1 s\)", experiment.output, re.MULTILINE)) > 1
+    told = re.compile(r"broke off before this one and do(es)? not count")
+    assert told.search(" ".join(experiment.output.split()))
+    assert told.search((run_folder / "report.html").read_text(encoding="utf-8"))
+    assert (run_folder / "logs_stalled_1" / "hw_bridge.log").is_file()
+    # What counts is the last run alone, whole and at zero torque in the end.
+    bag = read_bag(run_folder / "hw")
+    modes = [event.get("mode") for event in bag.events() if event["name"] == "plant_mode"]
+    assert "fault" not in modes
+    assert bag["/hw/applied_effort"]["effort"][-1] == 0.0
 
 
 def test_experiment_leaves_two_bags_a_summary_figures_and_a_report(run_folder: Path) -> None:

@@ -4,26 +4,20 @@ from __future__ import annotations
 
 import json
 import math
-import re
-import socket
 import subprocess
 import sys
-import time
 from pathlib import Path
 
 import numpy as np
-import psutil
 import pytest
 
 from pendulum_bags.experiments.in_process import simulate
-from pendulum_bags.experiments.run_spec import EMULATOR_LIFETIME, RunSpec
+from pendulum_bags.experiments.run_spec import RunSpec
 from pendulum_bags.studies.leaderboard_hardware import evaluate_hardware
-from pendulum_hw_bridge.backends.emulator_process import EmulatorProcessBackend
 from pendulum_lqr.policy_file import write_policy
 from pendulum_msgs_py.plants.plant_parameters import load_plant
 from pendulum_rosbag.reader import read_bag, same_messages
 from tests.policies import linear_policy
-from tests.processes import ProcessGroup
 
 
 def run_experiment(*arguments: str | Path | float, timeout: float = 150.0) -> subprocess.CompletedProcess[str]:
@@ -125,86 +119,6 @@ def test_the_two_experiments_of_the_thesis_give_back_its_coefficients(tmp_path: 
     assert recorded | {"pwm_command", "motor_current", "winding_current"} <= set(quantities)
 
 
-def _command_line(process: psutil.Process) -> set[str]:
-    """Return the words of a command line, none where the process has just ended."""
-    try:
-        return set(process.cmdline())
-    except psutil.Error:
-        return set()
-
-
-def test_a_run_whose_bridge_stood_still_is_measured_again_and_the_result_says_so(
-    processes: ProcessGroup, tmp_path: Path
-) -> None:
-    # Two runs of the thesis's experiment, whose ramps are as long as they are: nothing shorter has a regulation.
-    folder = tmp_path / "run"
-    program = processes.start(
-        *("pendulum_bags", "experiment", "thesis", "--out", str(folder), "--duration", "1", "--budget", "0")
-    )
-    program.wait_for_output(r"^regulation \(1 s\)", 120)
-    (bridge,) = [
-        child
-        for child in psutil.Process(program.pid).children(recursive=True)
-        if {"pendulum_hw_bridge", "bridge"} <= _command_line(child)
-    ]
-    # The stimulus: twice as long as an emulator's bridge may stand still.
-    bridge.suspend()
-    time.sleep(2.0 * EMULATOR_LIFETIME)
-    bridge.resume()
-
-    said = program.wait_for_output(r"^This machine stood still \((.*)\); measuring again, run 2 of at most 3\.$", 30)
-    assert program.wait(150) == 0, program.output
-    reason = said[1]
-    assert reason.startswith("/hw went to fault: ")
-
-    # A busy machine may have stood still once more by itself.
-    stalls = json.loads((folder / "summary.json").read_text(encoding="utf-8"))["stalls"]
-    assert stalls[0] == {"run": "run", "reason": reason, "logs": "logs_stalled_1"}
-    assert len(re.findall(r"^regulation \(1 s\)", program.output, re.MULTILINE)) > 1
-    told = re.compile(r"broke off before this one and do(es)? not count")
-    assert told.search(" ".join(program.output.split()))
-    assert told.search((folder / "report.html").read_text(encoding="utf-8"))
-    assert (folder / "logs_stalled_1" / "hw_bridge.log").is_file()
-    # What counts is the last run alone, whole and at zero torque in the end.
-    bag = read_bag(folder / "hw")
-    modes = [event.get("mode") for event in bag.events() if event["name"] == "plant_mode"]
-    assert "fault" not in modes
-    assert bag["/hw/applied_effort"]["effort"][-1] == 0.0
-    assert processes.leftovers() == []
-
-
-def test_an_excitation_is_played_alone_on_a_running_plant_and_ends_at_zero_torque(
-    processes: ProcessGroup, domain_id: int, tmp_path: Path
-) -> None:
-    zero = tmp_path / "zero.csv"
-    zero.write_text("time,effort\n0,0\n1,0\n", encoding="utf-8")
-    simulator = processes.start(
-        "pendulum_sim", "simulator", "--ros-args", "-r", "__ns:=/sim", "-p", "plant:=dfki", "-p", "rate_hz:=100.0"
-    )
-    playback = ("--ros-args", "-r", "__ns:=/sim", "-p", "controller:=playback", "-p", f"file:={zero}")
-    other = processes.start("pendulum_lqr", "controller", *playback)
-    simulator.wait_for_output("commanded by /sim/controller", 60)
-    bag = tmp_path / "excited"
-    command = [sys.executable, "-m", "pendulum_bags", "excite", "--plant", "dfki", "--max-angle", "0.5"]
-    command += ["--duration", "1", "--trials", "3", "--out", str(tmp_path / "e.csv"), "--bag", str(bag)]
-    command += ["--play", "--on", "running"]
-
-    refused = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
-    assert refused.returncode == 2
-    assert "/sim/effort_command has a publisher, /sim/controller; expected none" in refused.stderr
-    assert not bag.exists()
-
-    other.interrupt()
-    assert other.wait(20) == 0
-    done = subprocess.run(command, capture_output=True, text=True, timeout=100, check=False)
-    assert done.returncode == 0, done.stdout + done.stderr
-    recorded = read_bag(bag)
-    applied = recorded["/sim/applied_effort"]["effort"]
-    assert 0.1 < np.max(np.abs(applied)) <= 0.75
-    assert np.all(applied[-20:] == 0.0)
-    assert {"inertia", "gravity"} <= recorded.metadata["pendulum.excitation"]["predicted"].keys()
-
-
 def test_a_study_over_dds_runs_in_parallel_and_leaves_a_table(tmp_path: Path) -> None:
     file = tmp_path / "study.yaml"
     file.write_text(
@@ -245,43 +159,6 @@ def test_twenty_seeds_reproduce_the_thesis_under_noise(
     assert low < np.median([abs(run.command).max() for run in runs]) < high
     assert np.median([run.position.std() for run in runs]) == pytest.approx(std_theta, rel=0.15)
     assert np.median([run.velocity.std() for run in runs]) == pytest.approx(std_theta_dot, rel=0.05)
-
-
-def test_a_rehearsal_with_a_lab_file_checks_asks_and_moves_the_machine_of_the_file(
-    domain_id: int, tmp_path: Path, processes: ProcessGroup
-) -> None:
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as free:
-        free.bind(("127.0.0.1", 0))
-        address = f"127.0.0.1:{free.getsockname()[1]}"
-    processes.start("pendulum_hw_bridge", "emulator", "--address", address).wait_for_output("listens on", 60.0)
-    lab = tmp_path / "lab.yaml"
-    lab.write_text(
-        f"format: pendulum_lab/1\nmodule: {{backend: emulator_process, emulator_address: '{address}'}}\n"
-        "limits:\n  effort: {value: 6.0, unit: N m}\n",
-        encoding="utf-8",
-    )
-    backend = EmulatorProcessBackend(address)
-    before = backend.connect()
-    command = ["gravity", "--hardware", "hebi", "--lab", lab, "--out", tmp_path / "run", "--trials", "1"]
-    command += ["--step", "10", "--top", "10", "--hold", "0.5"]
-    done = subprocess.run(
-        [sys.executable, "-m", "pendulum_bags", "experiment", *map(str, command)],
-        input="yes\n",
-        capture_output=True,
-        text=True,
-        timeout=100,
-        check=False,
-    )
-    assert done.returncode == 0, done.stdout + done.stderr
-    assert "Type yes to arm" in done.stderr
-    # What the module was set to is given back.
-    assert before.limits.effort != 6.0
-    assert backend.connect().limits == before.limits
-    backend.close()
-    bag = read_bag(tmp_path / "run" / "trial_1")
-    states = bag["/hw/joint_states"]
-    assert np.degrees(states["position"]).max() == pytest.approx(10.0, abs=2.0)
-    assert np.abs(bag["/hw/applied_effort"]["effort"]).max() <= 6.0
 
 
 def test_a_swing_up_brings_the_emulated_machine_up_for_the_board() -> None:

@@ -41,3 +41,14 @@ def test_a_busy_computer_is_named_where_a_program_ended(tmp_path: Path, monkeypa
     assert "This computer is busy (load 23 on 2 cores)" in _message(tmp_path / "late")
     # A full disk is no matter of time.
     assert "busy" not in _message(tmp_path / "full", "import sys; sys.exit('error: no space left on device')")
+
+
+def test_a_program_that_gives_its_priority_away_is_behind_among_sessions_too(tmp_path: Path) -> None:
+    if not Path("/proc/self/autogroup").is_file():
+        pytest.skip("this kernel shares the cores among processes alone")
+    own = os.getpriority(os.PRIO_PROCESS, 0)
+    show = "print(open('/proc/self/autogroup').read())"
+    with ProcessSet(tmp_path, {}) as processes:
+        child = processes.start("behind", [sys.executable, "-c", show], ends_by_itself=True, niceness=3)
+        processes.wait(child, 20.0)
+    assert child.log.read_text().split()[1:] == ["nice", str(own + 3)]

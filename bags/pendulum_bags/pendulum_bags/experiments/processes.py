@@ -138,6 +138,10 @@ class ProcessSet:
             # Taking priority is a privilege; without it the run is as good as the machine is idle.
             with contextlib.suppress(PermissionError):
                 os.nice(niceness)
+            # Where Linux shares the cores among sessions first (autogroup), a session stays behind as a whole.
+            if (now := os.getpriority(os.PRIO_PROCESS, 0)) > 0:
+                with contextlib.suppress(OSError):
+                    Path("/proc/self/autogroup").write_text(str(now), encoding="ascii")
 
         log = self.log_folder / f"{name}.log"
         with log.open("wb") as sink:
@@ -148,7 +152,7 @@ class ProcessSet:
                 stderr=subprocess.STDOUT,
                 env={**os.environ, **self.environment, **(environment or {})},
                 start_new_session=True,
-                preexec_fn=prepare,  # noqa: PLW1509  # prctl and nice only; no lock is taken between fork and exec
+                preexec_fn=prepare,  # noqa: PLW1509  # prctl and priorities only; no lock is taken between fork and exec
             )
         child = Child(name, process, log, ends_last, ends_by_itself)
         self.children.append(child)
