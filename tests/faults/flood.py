@@ -46,6 +46,14 @@ def _parameters(node: Node, namespace: str, plant: str) -> Callable[[], None]:
     return lambda: client.remove_pending_request(client.call_async(request))
 
 
+def _large_parameters(node: Node, namespace: str, plant: str) -> Callable[[], None]:
+    client = node.create_client(SetParameters, f"{namespace}/{plant}/set_parameters")
+    client.wait_for_service(20.0)
+    unknown = Parameter(name="a", value=ParameterValue(type=3, double_value=1.0))
+    request = SetParameters.Request(parameters=[unknown] * 125_000)
+    return lambda: client.remove_pending_request(client.call_async(request))
+
+
 def _calls(node: Node, namespace: str, plant: str) -> Callable[[], None]:
     # A question that changes nothing: a flood of resets would rightly let the plant be armed after the press.
     client = node.create_client(ListParameters, f"{namespace}/{plant}/list_parameters")
@@ -58,6 +66,7 @@ _KINDS: dict[str, Callable[[Node, str, str], Callable[[], None]]] = {
     "trajectories": _trajectories(2000),
     "long_trajectories": _trajectories(200_000),
     "parameters": _parameters,
+    "large_parameters": _large_parameters,
     "calls": _calls,
 }
 

@@ -141,6 +141,7 @@ PRESSES: tuple[Fault, ...] = (
     Fault("e-stop in a flood of commands", _press(_flooded("commands"))),
     Fault("e-stop in a flood of trajectories", _press(_flooded("trajectories"))),
     Fault("e-stop in a flood of parameters", _press(_flooded("parameters"))),
+    Fault("e-stop among requests of 8 MB", _press(_flooded("large_parameters"))),
     Fault("e-stop in a flood of service calls", _press(_flooded("calls"))),
     Fault("e-stop while the plant arms", _press(_arming)),
 )

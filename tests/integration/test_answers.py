@@ -22,11 +22,19 @@ REQUESTS = 30
 SERVICE = "/server/set_parameters"
 
 
-@pytest.fixture
-def server(domain_id: int) -> Iterator[GraphPeer]:
-    peer = GraphPeer("server", domain=domain_id, make_executor=EventsExecutor)
+@pytest.fixture(params=["by an executor", "in turn"])
+def server(domain_id: int, request: pytest.FixtureRequest) -> Iterator[GraphPeer]:
+    in_turn = request.param == "in turn"
+    peer = GraphPeer("runner" if in_turn else "server", domain=domain_id, make_executor=EventsExecutor)
+    if in_turn:
+        peer.node = PollingNode("server", context=peer.context)
+        peer.executor.add_node(peer.node)
     answer_who_listens(peer.node)
+    if isinstance(peer.node, PollingNode):
+        peer.node.poll_services()
     yield peer
+    if in_turn:
+        peer.node.destroy_node()
     peer.close()
 
 

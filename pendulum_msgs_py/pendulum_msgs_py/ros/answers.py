@@ -8,6 +8,7 @@ with a thousand requests unread stopped a plant for 100 s.
 from __future__ import annotations
 
 import contextlib
+import functools
 import threading
 import time
 from collections import deque
@@ -17,6 +18,8 @@ from typing import Any
 from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.node import Node
 from rclpy.service import Service
+
+from pendulum_msgs_py.ros.requests import send_response
 
 __all__ = ["answer_who_listens"]
 
@@ -49,7 +52,7 @@ class _Answers:
     def __init__(self, node: Node, service: Service) -> None:
         self._name = name = service.handle.name
         self._count: Callable[[], int] = lambda: node.count_clients(name)
-        self._send: Callable[[Any, Any], None] = service.send_response
+        self._send: Callable[[Any, Any], None] = functools.partial(send_response, service, service.send_response)
         self._kept: deque[tuple[float, Any, Any]] = deque()
         self._lock = threading.Lock()
         self._gone: int | None = None

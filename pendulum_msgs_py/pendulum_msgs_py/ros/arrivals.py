@@ -4,7 +4,7 @@ To look for requests takes the middleware 16 us a service in a process that has 
 services of a plant, at 100 Hz, a fortieth of a processor, which is a sixth of what a plant costs at 1 kHz. An event
 counter of the kernel (eventfd(2)) tells at once that there is nothing to look for.
 
-This is the only module that calls rcl itself, and it hands rcl no memory of Python's: what the middleware's thread
+It calls rcl itself, and hands rcl no memory of Python's: what the middleware's thread
 calls is ``eventfd_write`` of the C library, and what it gives that is the number of a counter, which stays open as long
 as the process. A call that comes after its node has gone makes somebody look in vain, and nothing else.
 """

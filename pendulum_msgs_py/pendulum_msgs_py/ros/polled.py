@@ -18,6 +18,7 @@ from rclpy.service import Service
 from rclpy.subscription import Subscription
 
 from pendulum_msgs_py.ros.arrivals import ArrivalSignal
+from pendulum_msgs_py.ros.requests import MOST_BYTES, TooLarge, take_request
 from pendulum_msgs_py.ros.timers import create_wall_timer
 
 __all__ = ["REST_AFTER_READING", "PolledInput", "PollingNode"]
@@ -136,11 +137,29 @@ class PollingNode(Node):
             # Each has its turn, whoever else is asked without pause.
             service = self._in_turn[0]
             self._in_turn.rotate(-1)
-            silent = 0 if _answer_one(service) else silent + 1
+            silent = 0 if self._answer_one(service) else silent + 1
             spent = time.thread_time() - began
         self._more_requests = silent < len(self._in_turn)
         if spent > _LONGEST_LOOK:
             self._next_look = time.monotonic() + min(_LONGEST_REST, REST_AFTER_READING * spent)
+
+    def _answer_one(self, service: Service) -> bool:
+        """Answer the oldest request that waits; return whether there was one."""
+        request, header = take_request(service)
+        if header is None:
+            return False
+        response = service.srv_type.Response()
+        if isinstance(request, TooLarge):
+            # With an empty answer, so that nobody waits for another.
+            self.get_logger().error(
+                f"request to {service.srv_name} has {request.size / 1e3:.0f} kB; expected at most "
+                f"{MOST_BYTES / 1e3:.0f} kB: not read",
+                throttle_duration_sec=1.0,
+            )
+        else:
+            response = service.callback(request, response)
+        service.send_response(response, header)
+        return True
 
     def create_polled_input(self, message_type: type, topic: str, profile: QoSProfile) -> PolledInput:
         """Return an input that no executor is woken for."""
@@ -152,16 +171,6 @@ class PollingNode(Node):
         """Let go of an input."""
         self.destroy_subscription(polled.subscription)
         self._polled -= {polled.subscription}
-
-
-def _answer_one(service: Service) -> bool:
-    """Answer the oldest request that waits; return whether there was one."""
-    with service.handle:
-        request, header = service.handle.service_take_request(service.srv_type.Request)
-    if header is None:
-        return False
-    service.send_response(service.callback(request, service.srv_type.Response()), header)
-    return True
 
 
 def _never_called(_data: bytes) -> None:
