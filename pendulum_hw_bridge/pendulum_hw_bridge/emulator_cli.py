@@ -23,7 +23,7 @@ __all__ = ["fault_main", "hand_main", "main"]
 _HAND_PATIENCE_NS = 10 * 10**9
 _ADDRESS = "127.0.0.1:17590"
 
-app = typer.Typer(add_completion=False, no_args_is_help=False)
+app = typer.Typer(add_completion=False, rich_markup_mode=None)
 hand_app = typer.Typer(add_completion=False, rich_markup_mode=None)
 fault_app = typer.Typer(add_completion=False, rich_markup_mode=None)
 
@@ -39,10 +39,10 @@ def emulator(
     truth: Annotated[
         Path | None, typer.Option(help="New CSV file for what link and motor really do, each millisecond.")
     ] = None,
-    family: Annotated[str, typer.Option(help="HEBI family that it tells.")] = "emulated",
-    name: Annotated[str, typer.Option(help="HEBI name that it tells; default the plant's.")] = "",
-    serial: Annotated[str, typer.Option(help="Serial number that it tells.")] = "X5-9-E0001",
-    module_type: Annotated[str, typer.Option(help="Type that it tells.")] = "X5-9",
+    family: Annotated[str, typer.Option(help="HEBI family that it reports.")] = "emulated",
+    name: Annotated[str, typer.Option(help="HEBI name that it reports; by default the plant's.")] = "",
+    serial: Annotated[str, typer.Option(help="Serial number that it reports.")] = "X5-9-E0001",
+    module_type: Annotated[str, typer.Option(help="Module type that it reports.")] = "X5-9",
 ) -> None:
     """Serve an emulated X5-9 that goes on when the bridge ends, as a real one does.
 
@@ -90,14 +90,14 @@ def emulator_fault(
     known = [fault.value for fault in ActuatorFault]
     for name in faults or []:
         if name not in known:
-            raise ParameterError(f"unknown fault {name!r}; expected one of {', '.join(known)}")
+            raise ParameterError(f"fault is {name!r}; expected one of {', '.join(known)}")
     if not faults and not clear:
         if as_json:
             print(json.dumps({"faults": known}))
             return
-        table = WholeTable("fault", title="Faults of the emulated actuator")
-        for name in known:
-            table.add_row(name)
+        table = WholeTable("fault", "what fails", title="Faults of the emulated actuator")
+        for fault in ActuatorFault:
+            table.add_row(fault.value, fault.meaning)
         make_console().print(table)
         return
     backend = EmulatorProcessBackend(address)

@@ -146,6 +146,18 @@ def test_the_help_of_every_command_shows_an_example_of_it() -> None:
     assert not without
 
 
+def test_the_help_of_every_command_keeps_the_units_in_brackets(capsys: pytest.CaptureFixture[str]) -> None:
+    # Rich would take [rad] for a style of its own and leave it out.
+    lost = []
+    for line in command_lines():
+        with pytest.raises(SystemExit):
+            line.command.main(["--help"], prog_name=line.typed)
+        text = " ".join(capsys.readouterr().out.split())
+        helps = " ".join(getattr(option, "help", None) or "" for option in line.command.params)
+        lost += [(line.typed, unit) for unit in re.findall(r"\[[^\]]+\]", helps) if " ".join(unit.split()) not in text]
+    assert not lost
+
+
 def test_the_help_of_every_node_shows_an_example_and_its_parameters(capsys: pytest.CaptureFixture[str]) -> None:
     for package, program in nodes():
         assert run(package, program, ["--help"]) == 0

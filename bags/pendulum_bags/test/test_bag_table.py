@@ -182,3 +182,9 @@ def test_what_cannot_be_asked_is_refused(runs: Path, tmp_path: Path, capsys: pyt
     assert "does not exist; expected a folder of bags" in capsys.readouterr().err
     assert main([str(runs), "--ask", "metrics", "--out", str(tmp_path / "out")]) == 1
     assert "wednesday" in capsys.readouterr().out
+
+
+def test_the_printed_table_has_units(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main([str(EXAMPLES / "regulation_sim"), "--out", str(tmp_path / "out")]) == 0
+    text = capsys.readouterr().out
+    assert not [unit for unit in ("rate [Hz]", "rms error [rad]", "max |u| [N m]") if unit not in text]

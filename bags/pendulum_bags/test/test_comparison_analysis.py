@@ -240,7 +240,7 @@ def test_verdict_is_the_worst_outcome_in_words() -> None:
     assert verdict.outcome is Outcome.DIFFERENT
     assert "not equivalent within the default margins (none were stated): spread is 3" in verdict.sentence
     partly = conclude([good], Margins.parse(["delay=8ms", "band=10"]), "simulation", "hardware")
-    assert "within the stated margins and, for mean_angle, spread_angle" in partly.sentence
+    assert "within the stated margins (delay, band) and the default ones for the rest, in all" in partly.sentence
     whole = Margins.parse({name: 1.0 for name in default.as_dict() if name != "stated"})
     assert "within the stated margins, in all" in conclude([good], whole, "simulation", "hardware").sentence
 

@@ -212,6 +212,28 @@ def test_parquet_reads_back(tmp_path: Path) -> None:
     assert pd.read_parquet(file)["position"].tolist() == [0.1 * index for index in range(10)]
 
 
+def test_an_event_is_printed_with_what_it_says(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = tmp_path / "bag"
+    events = (
+        {"name": "plant_mode", "mode": "fault", "reason": "motion stop [m_stop] is pressed"},
+        {"name": "trial_start", "trial": 2, "reason": ""},
+        {"name": "noise_end"},
+    )
+    with open_writer(path) as writer:
+        writer.add_topic("/hw/events", "std_msgs/msg/String")
+        for index, event in enumerate(events):
+            text = json.dumps({"stamp_ns": 1 + index * 10**9, **event})
+            data = text.encode() + b"\0"
+            writer.write("/hw/events", 1 + index * 10**9, b"\0\1\0\0" + len(data).to_bytes(4, "little") + data)
+    assert info_main([str(path)]) == 0
+    lines = [line for line in capsys.readouterr().out.splitlines() if line.startswith("event")]
+    assert lines == [
+        "event    +0.000 s  plant_mode fault: motion stop [m_stop] is pressed",
+        "event    +1.000 s  trial_start 2",
+        "event    +2.000 s  noise_end",
+    ]
+
+
 def test_the_commands_print_tables_json_and_sentences(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     path = tmp_path / "bag"
     with open_writer(path, metadata={"run": {"seed": 1}}) as writer:

@@ -12,40 +12,49 @@ __all__ = ["ActuatorFault", "distort"]
 
 
 class ActuatorFault(str, Enum):
-    """A fault of actuator, sensor or link to it; the comment says what it stands for."""
+    """A fault of actuator, sensor or link to it, with what it stands for in ``meaning``."""
 
-    FEEDBACK_LOST = "feedback_lost"  # network cable pulled on the way back
-    FEEDBACK_FROZEN = "feedback_frozen"  # the module repeats its last record
-    FEEDBACK_SLOW = "feedback_slow"  # every tenth record arrives
-    FEEDBACK_LATE = "feedback_late"  # a queue holds each record back by 80 ms
-    POSITION_NAN = "position_nan"
-    VELOCITY_NAN = "velocity_nan"
-    EFFORT_NAN = "effort_nan"
-    POSITION_FROZEN = "position_frozen"  # output encoder stuck while the motor turns
-    POSITION_JUMP = "position_jump"  # output encoder slips by 0.5 rad
-    VELOCITY_SPIKE = "velocity_spike"  # velocity reads 5 rad/s
-    EFFORT_OFFSET = "effort_offset"  # spring encoder slips: effort reads 15 N m too much
-    PWM_STUCK = "pwm_stuck"  # the duty stays where it is, whatever the setpoint, until the strategy goes off
-    PWM_RUNAWAY = "pwm_runaway"  # the duty goes to its end, until the strategy goes off
-    WINDING_OPEN = "winding_open"  # a motor phase breaks: PWM without current
-    COMMANDS_LOST = "commands_lost"  # network cable pulled on the way there
-    LOCKED_BY_OTHER = "locked_by_other"  # somebody else's Scope holds the module
-    STRATEGY_CHANGED = "strategy_changed"  # the module runs another strategy than confirmed
-    GAINS_LOST = "gains_lost"  # the module forgets its gains and loops output nothing
-    MODULE_REBOOT = "module_reboot"  # the module restarts: strategy off, its clock from zero
-    M_STOP = "m_stop"  # the motion-stop button is pressed
-    OVER_TEMPERATURE_MOTOR = "over_temperature_motor"
-    OVER_TEMPERATURE_BOARD = "over_temperature_board"
-    TEMPERATURE_CRITICAL = "temperature_critical"
-    WINDING_HOT = "winding_hot"  # the winding estimate reads 150 degC
-    VOLTAGE_LOW = "voltage_low"  # the supply sags to 18 V
-    VOLTAGE_HIGH = "voltage_high"  # the supply rises to 52 V
-    POSITION_LIMIT = "position_limit"  # the firmware's own position limit acts
-    VELOCITY_LIMIT = "velocity_limit"
-    EFFORT_LIMIT = "effort_limit"
-    OVERSPEED = "overspeed"  # somebody turns the link faster than the bridge allows
-    OUTSIDE_WINDOW = "outside_window"  # the position reads outside the window
-    SEND_FAILED = "send_failed"  # the network interface refuses to send
+    meaning: str
+
+    def __new__(cls, value: str, meaning: str) -> ActuatorFault:
+        """Keep the name as the value, and the meaning beside it."""
+        fault = str.__new__(cls, value)
+        fault._value_ = value
+        fault.meaning = meaning
+        return fault
+
+    FEEDBACK_LOST = "feedback_lost", "the network cable is pulled on the way back"
+    FEEDBACK_FROZEN = "feedback_frozen", "the module repeats its last record"
+    FEEDBACK_SLOW = "feedback_slow", "every tenth record arrives"
+    FEEDBACK_LATE = "feedback_late", "a queue holds each record back by 80 ms"
+    POSITION_NAN = "position_nan", "the position reads NaN"
+    VELOCITY_NAN = "velocity_nan", "the velocity reads NaN"
+    EFFORT_NAN = "effort_nan", "the effort reads NaN"
+    POSITION_FROZEN = "position_frozen", "the output encoder is stuck while the motor turns"
+    POSITION_JUMP = "position_jump", "the output encoder slips by 0.5 rad"
+    VELOCITY_SPIKE = "velocity_spike", "the velocity reads 5 rad/s"
+    EFFORT_OFFSET = "effort_offset", "the spring encoder slips: the effort reads 15 N m too much"
+    PWM_STUCK = "pwm_stuck", "the duty stays where it is, whatever the setpoint, until the strategy goes off"
+    PWM_RUNAWAY = "pwm_runaway", "the duty goes to its end, until the strategy goes off"
+    WINDING_OPEN = "winding_open", "a motor phase breaks: PWM, but no current"
+    COMMANDS_LOST = "commands_lost", "the network cable is pulled on the way there"
+    LOCKED_BY_OTHER = "locked_by_other", "another sender, such as Scope, holds the module"
+    STRATEGY_CHANGED = "strategy_changed", "the module runs another strategy than confirmed"
+    GAINS_LOST = "gains_lost", "the module forgets its gains, and its loops output nothing"
+    MODULE_REBOOT = "module_reboot", "the module restarts: strategy off, clock from zero"
+    M_STOP = "m_stop", "the motion-stop button is pressed"
+    OVER_TEMPERATURE_MOTOR = "over_temperature_motor", "the firmware says that the motor is too hot"
+    OVER_TEMPERATURE_BOARD = "over_temperature_board", "the firmware says that the board is too hot"
+    TEMPERATURE_CRITICAL = "temperature_critical", "the firmware says that a temperature is critical"
+    WINDING_HOT = "winding_hot", "the winding estimate reads 150 degC"
+    VOLTAGE_LOW = "voltage_low", "the supply sags to 18 V"
+    VOLTAGE_HIGH = "voltage_high", "the supply rises to 52 V"
+    POSITION_LIMIT = "position_limit", "the firmware's own position limit acts"
+    VELOCITY_LIMIT = "velocity_limit", "the firmware's own velocity limit acts"
+    EFFORT_LIMIT = "effort_limit", "the firmware's own effort limit acts"
+    OVERSPEED = "overspeed", "somebody turns the link faster than the bridge allows"
+    OUTSIDE_WINDOW = "outside_window", "the position reads outside the window"
+    SEND_FAILED = "send_failed", "the network interface refuses to send"
 
 
 def distort(feedback: Feedback, faults: set[ActuatorFault], frozen: Feedback | None) -> Feedback:

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
+from rich.markup import escape
 from rich.console import Console
 
 from pendulum_bags.analyse.questions import QUESTIONS
@@ -24,10 +25,12 @@ __all__ = ["app", "main"]
 
 app = typer.Typer(add_completion=False, rich_markup_mode=None)
 
-_SHOWN = (
-    "seed", "rate_hz", "rms_error", "max_abs_u", "states_gaps", "answer_p99", "inertia", "damping", "gravity",
-    "outcome", "report",
-)  # fmt: skip
+_SHOWN = {
+    "seed": "seed", "rate_hz": "rate [Hz]", "rms_error": "rms error [rad]", "max_abs_u": "max |u| [N m]",
+    "states_gaps": "gaps", "answer_p99": "answer p99 [ms]", "inertia": "inertia [kg m^2]",
+    "damping": "damping [N m s/rad]", "gravity": "gravity [N m]", "outcome": "outcome", "report": "report",
+}  # fmt: skip
+"""Columns that are printed, with their headings; the CSV file has all."""
 _MOST_ROWS = 40
 
 
@@ -78,8 +81,10 @@ def _print(console: Console, found: BagTable, out: Path, elapsed: float) -> None
             continue
         names = [name for name in _SHOWN if any(row.get(name) is not None for row in rows)]
         table = WholeTable(title=title, title_justify="left")
-        for heading in ("bag", "plant", *names) if file == "bags" else ("run", *names):
-            table.add_column(heading.replace("_", " "), justify="left" if heading in {"bag", "run"} else "right")
+        for heading in ("bag", "plant") if file == "bags" else ("run",):
+            table.add_column(heading, justify="left")
+        for name in names:
+            table.add_column(escape(_SHOWN[name]), justify="right")
         for row in rows[:_MOST_ROWS]:
             first = [row["bag"], row["plant"]] if file == "bags" else [row["bag"]]
             table.add_row(*first, *(_cell(row.get(name)) for name in names))

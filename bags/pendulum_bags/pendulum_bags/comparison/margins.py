@@ -131,10 +131,10 @@ class Margins:
         """Whose margins these are, in words."""
         if not self.stated:
             return "the default margins (none were stated)"
-        left = [name for name in _UNITS if name not in self.stated]
-        if not left:
+        if all(name in self.stated for name in _UNITS):
             return "the stated margins"
-        return f"the stated margins and, for {', '.join(left)}, the default ones"
+        stated = ", ".join(name for name in _UNITS if name in self.stated)
+        return f"the stated margins ({stated}) and the default ones for the rest"
 
     def as_dict(self) -> dict[str, Any]:
         """Return value and unit of each for JSON, and which were stated."""

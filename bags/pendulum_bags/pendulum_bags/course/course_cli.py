@@ -59,7 +59,10 @@ def make(
     from pendulum_msgs_py.plants.sealed_plant import seal_plant
 
     if out.is_dir() and any(out.iterdir()):
-        raise BagError(f"course folder {out} is not empty; expected a new one, so that no answers get lost")
+        raise BagError(
+            f"course folder {out} is not empty; expected a new one, so that no answers get lost: name it with --out DIR "
+            "(make course OUT=DIR)"
+        )
     tasks = draw_tasks(seed)
     try:
         out.mkdir(parents=True, exist_ok=True)

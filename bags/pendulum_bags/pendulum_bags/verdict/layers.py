@@ -261,15 +261,20 @@ def sum_up(results: Iterable[LayerResult], *, emulated: bool = False) -> Answer:
     if holds and mark is not Mark.YES:
         text += f" What holds: {'; '.join(holds)}."
     if mark is Mark.YES and by_mark[Mark.NOT_MEASURED]:
-        missing = " and ".join(f"“{result.layer.title}”" for result in by_mark[Mark.NOT_MEASURED])
+        missing = _listed([f"“{result.layer.title}”" for result in by_mark[Mark.NOT_MEASURED]])
         text += f" Not measured: {missing}."
     # What mends a no comes before what decides, and that before what was left out.
     order = (*by_mark[Mark.NO], *by_mark[Mark.UNDECIDED], *by_mark[Mark.YES])
     steps = dict.fromkeys(step for result in order for step in result.next_steps)
     for how in dict.fromkeys(result.reason for result in by_mark[Mark.NOT_MEASURED]):
         titles = [f"“{result.layer.title}”" for result in by_mark[Mark.NOT_MEASURED] if result.reason == how]
-        steps[f"Measure {' and '.join(titles)}: {how}"] = None
+        steps[f"Measure {_listed(titles)}: {how}"] = None
     return Answer(mark, text, layers, tuple(steps))
+
+
+def _listed(names: Sequence[str]) -> str:
+    """Return names as a sentence lists them: a, b and c."""
+    return " and ".join(filter(None, (", ".join(names[:-1]), names[-1])))
 
 
 _HARDWARE = re.compile(r"(?<![-/\w])(?<!emulated )(H|h)ardware\b(?!/)")

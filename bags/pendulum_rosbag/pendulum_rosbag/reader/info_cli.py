@@ -82,7 +82,9 @@ def _print(statistics: BagStatistics, metadata: dict[str, Any], notes: list[str]
         console.print(table)
     for event in statistics.events:
         offset = (event["log_time_ns"] - statistics.events[0]["log_time_ns"]) * 1e-9
-        console.print(f"event {offset:+9.3f} s  {event['name']}", highlight=False, soft_wrap=True)
+        told = [str(event[key]) for key in ("mode", "reason", "trial") if event.get(key) not in (None, "")]
+        text = f"event {offset:+9.3f} s  {' '.join([str(event['name']), ': '.join(told)]).rstrip()}"
+        console.print(text, highlight=False, soft_wrap=True, markup=False)
     for key, value in metadata.items():
         text = value if isinstance(value, str) else json.dumps(value)
         console.print(
