@@ -40,7 +40,9 @@ def test_one_seed_is_one_course_and_another_seed_another(tmp_path: Path) -> None
 
 def test_a_course_does_not_overwrite_another_one(course: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["make", "--seed", "1", "--out", str(course)]) == 2
-    assert "is not empty; expected a new one, so that no answers get lost: name it with --out" in capsys.readouterr().err
+    assert (
+        "is not empty; expected a new one, so that no answers get lost: name it with --out" in capsys.readouterr().err
+    )
 
 
 def test_no_file_of_a_course_tells_seed_or_parameters(course: Path) -> None:
