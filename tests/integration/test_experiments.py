@@ -11,7 +11,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from pendulum_bags.experiments.conductor_node import Conductor
 from pendulum_bags.experiments.in_process import simulate
+from pendulum_bags.experiments.lockstep import record_run
 from pendulum_bags.experiments.run_spec import RunSpec
 from pendulum_bags.studies.leaderboard_hardware import evaluate_hardware
 from pendulum_lqr.policy_file import write_policy
@@ -99,6 +101,16 @@ def test_lockstep_runs_of_the_simulator_are_identical_and_give_the_numbers_of_on
     assert np.array_equal(bag["/sim/effort_command"]["effort"], arrays.command)
     assert np.array_equal(bag["/sim/disturbance"]["effort"], arrays.disturbance)
     assert np.array_equal(bag["/sim/applied_effort"]["effort"], arrays.applied)
+
+
+def test_a_bridge_that_still_compiles_is_waited_for_as_long_as_any_start(
+    domain_id: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    # It offers its services before its emulator is compiled: half a minute on a busy machine, the first time. Here a
+    # call that does not say how long it waits waits for nothing.
+    monkeypatch.setattr(Conductor.call, "__defaults__", (0.0,))
+    bag = record_run(tmp_path / "hw", RunSpec(side="hw", duration=0.5), domain=domain_id)
+    assert len(read_bag(bag)["/hw/joint_states"]) > 40
 
 
 def test_the_two_experiments_of_the_thesis_give_back_its_coefficients(tmp_path: Path) -> None:

@@ -10,8 +10,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
-from rich.markup import escape
 from rich.console import Console
+from rich.markup import escape
 
 from pendulum_bags.analyse.questions import QUESTIONS
 from pendulum_msgs_py.programs.counted_progress import counted_progress

@@ -60,8 +60,8 @@ def make(
 
     if out.is_dir() and any(out.iterdir()):
         raise BagError(
-            f"course folder {out} is not empty; expected a new one, so that no answers get lost: name it with --out DIR "
-            "(make course OUT=DIR)"
+            f"course folder {out} is not empty; expected a new one, so that no answers get lost: "
+            "name it with --out DIR (make course OUT=DIR)"
         )
     tasks = draw_tasks(seed)
     try:

@@ -207,13 +207,16 @@ class PlantClient:
             )
         return self.sample is not None
 
-    def arm(self) -> None:
+    def arm(self, timeout: float = 10.0) -> None:
         """Arm the plant.
 
+        Args:
+            timeout: Longest time until it answers [s]; a bridge offers the service before it is connected.
+
         Raises:
-            FaultError: It refuses; the message has its reason.
+            FaultError: It refuses, and the message has its reason; or it does not answer in time.
         """
-        response = self.conductor.call(self._arm, SetBool.Request(data=True), f"{self.namespace} to arm")
+        response = self.conductor.call(self._arm, SetBool.Request(data=True), f"{self.namespace} to arm", timeout)
         if not response.success:
             raise FaultError(f"{self.namespace} does not arm: {response.message}")
 

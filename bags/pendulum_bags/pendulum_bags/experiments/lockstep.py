@@ -131,7 +131,7 @@ def record_run(
             _keep_time(conductor, client, spec, processes, recorder)
             return bag
         if spec.has_bridge:
-            client.arm()
+            client.arm(_START_TIMEOUT)
         client.watch()
         if not spec.has_bridge:
             client.resume(_START_TIMEOUT)
@@ -149,7 +149,7 @@ def _keep_time(conductor: Conductor, plant: PlantClient, spec: RunSpec, processe
     plant.watch()
     try:
         if spec.has_bridge:
-            plant.arm()
+            plant.arm(_START_TIMEOUT)
         else:
             plant.resume(_START_TIMEOUT)
         conductor.wait_for("states", lambda: plant.sample is not None, _START_TIMEOUT)

@@ -220,7 +220,7 @@ def _run_trial(
             wait_until_all_hear_each_other(conductor, "/hw", _topics(settings), clock=settings.lockstep)
             if settings.by_person:
                 ask(f"Trial {trial} of {settings.trials}: let the pendulum lie still at 0, then press Enter to begin.")
-            plant.arm()
+            plant.arm(START_TIMEOUT)
             if settings.lockstep:
                 plant.watch()
             else:
