@@ -16,7 +16,7 @@ class ActuatorFault(str, Enum):
 
     meaning: str
 
-    def __new__(cls, value: str, meaning: str) -> ActuatorFault:
+    def __new__(cls, value: str, meaning: str = "") -> ActuatorFault:
         """Keep the name as the value, and the meaning beside it."""
         fault = str.__new__(cls, value)
         fault._value_ = value
