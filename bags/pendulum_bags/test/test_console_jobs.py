@@ -1,5 +1,6 @@
 """What the console knows of the folders that its programs write, and where it refuses to listen."""
 
+import json
 import os
 import socket
 from pathlib import Path
@@ -33,3 +34,27 @@ def test_a_port_that_is_taken_is_refused_before_anything_starts(
     assert f"port is {port}, which another program listens on; expected a free one" in capsys.readouterr().err
     assert main(["--host", "nowhere.invalid", "--runs", str(tmp_path)]) == 2
     assert "host is 'nowhere.invalid', which is no address of this machine" in capsys.readouterr().err
+
+
+def test_the_answer_of_a_run_is_its_sentence_and_what_each_layer_says_with_a_sign(tmp_path: Path) -> None:
+    pytest.importorskip("nicegui")
+    from pendulum_bags.console.layers_card import read_answer
+    from pendulum_bags.verdict.layers import Layer, LayerResult, Mark, sum_up
+
+    answer = sum_up([LayerResult(Layer.SAME_RUN, Mark.NO, "It answers 9 ms later.", [])])
+    (tmp_path / "summary.json").write_text(json.dumps({"answer": answer.to_json()}), encoding="utf-8")
+    found = read_answer(tmp_path)
+    assert found["sentence"] == answer.sentence
+    assert len(found["layers"]) == len(Layer)
+    assert found["layers"][0] == ("same run", "✗ no", "It answers 9 ms later.")
+    assert {sign for _, sign, _ in found["layers"][1:]} == {"– not measured"}
+
+
+@pytest.mark.parametrize("text", ["", "[]", "{}", '{"answer": null}', '{"answer": {"layers": [{"mark": "perhaps"}]}}'])
+def test_a_summary_without_an_answer_shows_none(text: str, tmp_path: Path) -> None:
+    pytest.importorskip("nicegui")
+    from pendulum_bags.console.layers_card import read_answer
+
+    assert read_answer(tmp_path) == {}
+    (tmp_path / "summary.json").write_text(text, encoding="utf-8")
+    assert read_answer(tmp_path) == {}

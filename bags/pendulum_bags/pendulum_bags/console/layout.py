@@ -12,6 +12,7 @@ from nicegui import ui
 from pendulum_bags.console.certified import CertifiedDesigns
 from pendulum_bags.console.graph import Graph
 from pendulum_bags.console.jobs import Jobs
+from pendulum_bags.console.layers_card import LayersCard
 from pendulum_bags.console.parameter_table import ParameterTable
 from pendulum_msgs_py.errors import PendulumError
 
@@ -37,6 +38,7 @@ class Layout:
             ParameterTable(graph, "disturbance", self._carefully),
         ]
         self._certified = CertifiedDesigns(jobs)
+        self._layers = LayersCard(jobs)
         self._job_labels: dict[str, tuple[ui.label, ui.link]] = {}
         self._cards: dict[str, str] = {}
 
@@ -119,6 +121,7 @@ class Layout:
             )
             _button("Cancel", lambda: self._finish("experiment"))
         self._job_line("experiment")
+        self._layers.build()
         self._certified.build()
 
     def _job_line(self, kind: str) -> None:
@@ -188,6 +191,7 @@ class Layout:
         for table in self._tables:
             await table.refresh(sorted(plants))
         self._certified.refresh()
+        self._layers.refresh()
         for kind, (label, link) in self._job_labels.items():
             job = self._jobs[kind]
             label.text = job.describe() if job is not None else ""

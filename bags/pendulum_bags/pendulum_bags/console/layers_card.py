@@ -1,0 +1,72 @@
+"""The console's answer of the run that was compared last: one sentence, and what each layer says."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+from nicegui import ui
+
+from pendulum_bags.console.jobs import Jobs
+from pendulum_bags.verdict.layers import Mark
+from pendulum_bags.verdict.terminal import SIGNS
+
+__all__ = ["LayersCard", "read_answer"]
+
+SUMMARY = "summary.json"
+
+
+def read_answer(folder: Path) -> dict[str, Any]:
+    """Return the answer that a run's summary holds, with ``sentence`` and ``layers``; empty where it holds none."""
+    try:
+        answer = json.loads((folder / SUMMARY).read_text(encoding="utf-8")).get("answer", {})
+        layers = [(one["name"], SIGNS[Mark(one["mark"])], one["sentence"]) for one in answer["layers"]]
+        return {"sentence": str(answer["sentence"]), "layers": layers}
+    # A summary of an older version, or of something else that was put here, is none to show.
+    except (OSError, ValueError, KeyError, TypeError, AttributeError):
+        return {}
+
+
+class LayersCard:
+    """The answer, the four layers with their marks and reasons, and which run they are of.
+
+    Args:
+        jobs: Knows the folder of runs.
+    """
+
+    def __init__(self, jobs: Jobs) -> None:
+        self._jobs = jobs
+        self._shown: tuple[Path, float] | None = None
+
+    def build(self) -> None:
+        """Lay it out, empty as long as no run was compared."""
+        with ui.element("div").classes("certified") as self._place:
+            ui.html("<h3>Is the simulation good enough to design a controller on?</h3>", sanitize=False)
+            self._sentence = ui.label().props('role="status"')
+            self._layers = ui.element("dl").classes("layers")
+            self._run = ui.label().classes("small")
+        self._place.set_visibility(False)
+
+    def refresh(self) -> None:
+        """Show the run that was compared last."""
+        folder = self._jobs.newest(SUMMARY)
+        if folder is None:
+            return
+        version = (folder / SUMMARY).stat().st_mtime
+        if self._shown == (folder, version):
+            return
+        self._shown = folder, version
+        answer = read_answer(folder)
+        self._place.set_visibility(bool(answer))
+        if not answer:
+            return
+        self._sentence.text = answer["sentence"]
+        self._run.text = f"of the run {folder.name}"
+        self._layers.clear()
+        with self._layers:
+            for number, (name, sign, sentence) in enumerate(answer["layers"], start=1):
+                with ui.element("dt"):
+                    ui.label(f"{number} {name}: {sign}")
+                with ui.element("dd"):
+                    ui.label(sentence).classes("small")
