@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import shutil
 import socket
 import subprocess
@@ -15,6 +16,7 @@ from typing import Any
 import pytest
 
 from pendulum_bags.console.security import refusal
+from pendulum_bags.verdict.layers import Layer, LayerResult, Mark, sum_up
 from tests.faults.console_stops import CHROMIUM, QUIET, STOPS, StopRig
 from tests.fixtures import PROJECT, wait_for
 from tests.npm import install_packages
@@ -99,6 +101,13 @@ def _open(browser: Any, address: str, width: int = 1280, height: int = 860, **op
     return page
 
 
+def _compare(folder: Path) -> None:
+    """Write the summary of a run that was compared."""
+    answer = sum_up([LayerResult(Layer.SAME_RUN, Mark.NO, "It answers 9 ms later.", [])])
+    folder.mkdir(parents=True)
+    (folder / "summary.json").write_text(json.dumps({"answer": answer.to_json()}), encoding="utf-8")
+
+
 def _mode(page: Any) -> str:
     return str(page.evaluate("(pendulumConsole.plants['/sim'] || {}).mode"))
 
@@ -157,9 +166,12 @@ def test_two_clients_see_stop_tune_and_meet_a_new_simulator(
     wait_for(lambda: desk.evaluate("pendulumConsole.plants['/sim'].stamp_ns") != before, 10, "new states")
 
 
-def test_axe_finds_nothing_that_keeps_anybody_out(browser: Any, address: str) -> None:
+def test_axe_finds_nothing_that_keeps_anybody_out(browser: Any, address: str, tmp_path: Path) -> None:
     install_packages(AXE, "axe-core")
     page = _open(browser, address, color_scheme="light")
+    _compare(tmp_path / "runs" / "compared")
+    page.get_by_text("1 same run: ✗ no").wait_for(timeout=10_000)
+    assert page.get_by_text("It answers 9 ms later.", exact=True).is_visible()
     page.wait_for_selector("[data-name='r']", timeout=30_000)
     page.keyboard.press("Escape")
     page.wait_for_selector("#alarms .good", timeout=10_000)
