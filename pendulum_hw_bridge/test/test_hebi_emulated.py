@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import threading
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +21,7 @@ from pendulum_hw_bridge.emulation.parameters import load_emulator
 from pendulum_hw_bridge.emulation.server import EmulatorIdentity, EmulatorServer
 from pendulum_hw_bridge.emulation.x5 import EmulatedX5
 from pendulum_hw_bridge.gains import DEFAULT_GAINS
-from pendulum_hw_bridge.module_files import backup_group, restore_group
+from pendulum_hw_bridge.module_files import backup_group, limits_of_group, restore_group
 from pendulum_msgs_py.contract.timing import SteadyWallClock
 from pendulum_msgs_py.errors import ParameterError
 
@@ -113,6 +114,15 @@ def test_open_position_limits_are_given_back(served: Served, tmp_path: Path) -> 
     safety.write_text(safety.read_text().replace("-inf", "-nan"))
     with pytest.raises(ParameterError, match="min_limit of the position is no number"):
         restore_group(group, tmp_path / "before", backend_module.new_command, print)
+
+
+def test_the_limits_that_a_module_holds_are_read_and_others_at_its_ends_refused(served: Served) -> None:
+    group = EmulatedGroup(served.where, hebi)
+    limits = HardwareLimits(effort=1.0, velocity=1.0, position_min=-4.0, position_max=4.0)
+    with pytest.raises(ActuatorError, match="strategy at the min position limit reads back as 3; expected 2"):
+        limits_of_group(group, limits)
+    served.actuator.configure(limits=limits)
+    assert limits_of_group(group, replace(limits, effort=5.0)) == limits
 
 
 class TwoEnds(EmulatedGroup):

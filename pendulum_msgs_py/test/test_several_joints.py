@@ -277,3 +277,47 @@ def test_one_window_is_none_for_two_joints_whichever_end_it_has(low: float, high
 def test_a_window_with_one_end_too_few_is_refused() -> None:
     with pytest.raises(ValueError, match="shorter"):
         PlantLimits((5.0,), position_min=(-1.0, -2.0), position_max=(1.0,))
+
+
+_THREE = (*_TWO, Joint("wrist"))
+
+
+@pytest.mark.parametrize(("driven", "effort", "largest"), [((0, 1), (5.0, 2.0), 50.0), ((), (), 10.0)])
+def test_a_passive_joint_takes_a_push_of_what_the_strongest_motor_could_give_or_of_one_newton_metre(
+    driven: tuple[int, ...], effort: tuple[float, ...], largest: float
+) -> None:
+    supervisor = PlantSupervisor(PlantLimits(effort), coordinates=Coordinates(_THREE, driven))
+    supervisor.offer(Input.PUSH, _command((1e9,), ("wrist",)), _NOW)
+    still = JointSample(_NOW, *(3 * [(0.0, 0.0, 0.0)]))
+    assert supervisor.decide(_NOW, still).push == (0.0, 0.0, largest)
+
+
+@pytest.mark.parametrize("end", [-1.0, 1.0])
+def test_the_joint_that_has_left_its_limits_is_named_and_not_one_that_is_just_there(end: float) -> None:
+    plant = Plant(position_min=(-1.0, -1.0), position_max=(1.0, 1.0))
+    plant.position = [end, 2.0]
+    plant.run()
+    assert plant.supervisor.reason.startswith("position of elbow is 2.000 rad")
+    plant = Plant(velocity=8.0)
+    plant.velocity = [8.0 * end, 9.0]
+    plant.run()
+    assert plant.supervisor.reason.startswith("velocity of elbow is 9.000 rad/s")
+
+
+def test_of_a_plant_of_one_joint_nobody_asks_which() -> None:
+    supervisor = PlantSupervisor(PlantLimits((5.0,), position_max=(1.0,)))
+    assert supervisor.no_trajectories == ""
+    assert supervisor.arm(_NOW, JointSample.of_one(_NOW, 0.0, 0.0)) == ""
+    supervisor.decide(_NOW, JointSample.of_one(_NOW, 2.0, 0.0))
+    assert supervisor.reason.startswith("position is 2.000 rad")
+
+
+def test_a_disturbance_of_two_joints_for_one_is_not_one_joint() -> None:
+    gate = CommandGate(0.05, joints=("elbow",), partial=True)
+    assert gate.offer(_command((1.0, 1.0), _NAMES), _NOW) is Refusal.NOT_ONE_JOINT
+
+
+def test_a_plant_without_a_motor_says_that_it_has_none() -> None:
+    gate = CommandGate(0.05, joints=())
+    gate.offer(_command((1.0,), ("elbow",)), _NOW)
+    assert gate.problems[Refusal.NOT_ONE_JOINT].endswith("expected no command: no joint has a motor")

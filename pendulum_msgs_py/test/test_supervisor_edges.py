@@ -340,6 +340,13 @@ def test_a_sum_with_a_disturbance_as_far_from_what_holds_as_allowed_takes_over_a
     assert plant.run(200, 0.0, disturbance=-4.0 * side).effort[0] == -4.0 * side
 
 
+def test_a_command_just_as_far_from_what_holds_as_allowed_is_judged_with_the_disturbance_too() -> None:
+    plant = Plant(handover_effort=2.0, handover_sum=2.0)
+    plant.follow(_hold(0.1))
+    plant.run(150, 2.0, disturbance=0.5)
+    assert plant.supervisor.mode is Mode.POSITION
+
+
 def test_a_disturbance_that_has_fallen_silent_keeps_nobody_from_taking_over() -> None:
     plant = Plant(handover_sum=2.0)
     plant.follow(_hold(0.1))
