@@ -13,9 +13,11 @@ from pendulum_msgs_py.errors import ParameterError
 from pendulum_rosbag.reader import read_bag
 from pendulum_rosbag.recorder import GapCounter, RecordingSession, stamp_reader
 from pendulum_rosbag.recorder.options import RecorderOptions
+from pendulum_rosbag.recorder.parameter_reader_node import ParameterReader
 from pendulum_rosbag.recorder.record_cli import main as record_main
 from pendulum_rosbag.storage import message_type, open_writer
 from tests.fixtures import wait_for
+from tests.graph_peer import GraphPeer
 
 JOINT_STATE = "sensor_msgs/msg/JointState"
 STRING = "std_msgs/msg/String"
@@ -258,3 +260,25 @@ def test_topics_are_chosen_by_name_pattern_and_exclusion() -> None:
 def test_an_existing_folder_is_refused_with_exit_code_2(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert record_main(["-o", str(tmp_path)]) == 2
     assert "exists already; expected a new folder" in capsys.readouterr().err
+
+
+def test_a_node_without_parameters_is_asked_for_none_and_its_neighbour_is_read(domain_id: int) -> None:
+    peer = GraphPeer("asks")
+    peer.add_node("silent", start_parameter_services=False)
+    peer.add_node("serves").declare_parameter("gain", 2.0)
+    reader = ParameterReader(peer.node, lambda _values, _changed: None)
+    made: set[str] = set()
+
+    def read() -> bool:
+        reader.look()
+        made.update(name for name, _ in peer.node.get_client_names_and_types_by_node("asks", "/"))
+        return "/serves" in reader.values
+
+    try:
+        peer.until(read, "the neighbour's parameters")
+        assert "silent" in peer.node.get_node_names()
+        assert reader.values["/serves"]["gain"] == 2.0
+        assert "/serves/list_parameters" in made
+        assert not [name for name in made if name.startswith("/silent/")]
+    finally:
+        peer.close()

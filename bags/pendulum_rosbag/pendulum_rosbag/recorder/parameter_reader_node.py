@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 from rcl_interfaces.msg import ParameterEvent, ParameterValue
 from rcl_interfaces.srv import GetParameters, ListParameters
+from rclpy.node import NodeNameNonExistentError
 from rclpy.parameter import parameter_value_to_python
 from rclpy.qos import qos_profile_parameter_events
 
@@ -56,7 +57,18 @@ class ParameterReader:
     def _client(self, kind: Any, full: str, service: str) -> Client:
         return self._node.create_client(kind, f"{full}/{service}")
 
+    def _offers(self, full: str) -> bool:
+        """Tell whether a node offers its parameters, as far as the graph tells: a client made in vain bothers everybody."""
+        space, _, name = full.rpartition("/")
+        try:
+            offered = self._node.get_service_names_and_types_by_node(name, space or "/")
+        except NodeNameNonExistentError:
+            return False
+        return {f"{full}/list_parameters", f"{full}/get_parameters"} <= {service for service, _ in offered}
+
     def _ask(self, full: str) -> bool:
+        if not self._offers(full):
+            return False
         lister = self._client(ListParameters, full, "list_parameters")
         getter = self._client(GetParameters, full, "get_parameters")
         if not (lister.service_is_ready() and getter.service_is_ready()):
