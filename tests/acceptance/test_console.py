@@ -72,7 +72,7 @@ def simulator(processes: ProcessGroup, domain_id: int) -> RunningProgram:
 
 
 @pytest.fixture
-def address(processes: ProcessGroup, simulator: RunningProgram, tmp_path: Path) -> str:
+def address(processes: ProcessGroup, domain_id: int, tmp_path: Path) -> str:
     """Start the console and return its address."""
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
@@ -166,6 +166,7 @@ def test_two_clients_see_stop_tune_and_meet_a_new_simulator(
     wait_for(lambda: desk.evaluate("pendulumConsole.plants['/sim'].stamp_ns") != before, 10, "new states")
 
 
+@pytest.mark.usefixtures("simulator")
 def test_axe_finds_nothing_that_keeps_anybody_out(browser: Any, address: str, tmp_path: Path) -> None:
     install_packages(AXE, "axe-core")
     page = _open(browser, address, color_scheme="light")

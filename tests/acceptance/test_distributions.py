@@ -14,6 +14,7 @@ import pytest
 
 from pendulum_rosbag.reader import read_bag
 from tests.fixtures import PROJECT
+from tests.layers import environment_of
 
 FOLDERS = (
     "pendulum_msgs_py",
@@ -105,17 +106,26 @@ def test_the_licence_is_in_every_wheel_and_every_source_archive_and_no_dead_addr
 
 
 @pytest.mark.timeout(900)
-def test_what_the_wheels_install_runs_an_experiment(wheels: Path, domain_id: int, tmp_path: Path) -> None:
+def test_what_the_wheels_install_comes_from_an_experiment_to_its_report_with_the_first_layer_alone(
+    wheels: Path, domain_id: int, tmp_path: Path
+) -> None:
+    """The one in simulated time, whose bags go through the same comparison and report; nothing waits for a clock."""
     place = tmp_path / "place"
     pip = [sys.executable, "-m", "pip", "--disable-pip-version-check", "install", "--no-deps", "--no-index"]
     _run(*pip, "--target", place, *sorted(wheels.glob("*.whl")), cwd=tmp_path)
-    env = {"PYTHONPATH": str(place)}
+    env = environment_of(tmp_path / "hide", "run")
+    env["PYTHONPATH"] = f"{place}:{env['PYTHONPATH']}"
     where = _run(sys.executable, "-c", "import pendulum_bags; print(pendulum_bags.__file__)", cwd=tmp_path, env=env)
     assert Path(where.strip()).is_relative_to(place)
 
-    command: list[str | Path] = ["experiment", "lockstep", "--bag", tmp_path / "bag", "--duration", "0.5"]
-    _run(sys.executable, "-m", "pendulum_bags", *command, cwd=tmp_path, env=env)
-    assert len(read_bag(tmp_path / "bag")["/sim/joint_states"]) == 251
+    run = [sys.executable, "-m", "pendulum_bags"]
+    for side in ("sim", "hw"):
+        _run(*run, "experiment", "lockstep", "--side", side, "--bag", side, "--duration", "1", cwd=tmp_path, env=env)
+    assert len(read_bag(tmp_path / "sim")["/sim/joint_states"]) == 501
+    _run(*run, "report", "sim", "hw", "--out", "report", cwd=tmp_path, env=env)
+    (page,) = (tmp_path / "report").glob("*.html")
+    assert "plotly-packed" in page.read_text(encoding="utf-8")
+    assert list((tmp_path / "report").rglob("*.png"))
 
 
 @pytest.mark.parametrize("module", ["pendulum_lqr", "pendulum_bags"])

@@ -135,32 +135,6 @@ def test_other_programs_say_their_help_with_the_first_layer_alone(tmp_path: Path
     assert done.stdout.strip() == "all", done.stderr
 
 
-def test_an_experiment_comes_to_its_verdict_and_report_with_the_first_layer_alone(
-    tmp_path: Path, domain_id: int
-) -> None:
-    """The one in simulated time, whose bags go through the same comparison and report; nothing waits for a clock."""
-    environment = {**environment_of(tmp_path / "hide", "run"), "ROS_DOMAIN_ID": str(domain_id)}
-
-    def run(*arguments: str) -> None:
-        done = subprocess.run(
-            [sys.executable, "-m", "pendulum_bags", *arguments],
-            capture_output=True,
-            text=True,
-            check=False,
-            timeout=280,
-            env=environment,
-            cwd=tmp_path,
-        )
-        assert done.returncode == 0, done.stderr + done.stdout
-
-    for side in ("sim", "hw"):
-        run("experiment", "lockstep", "--side", side, "--bag", side, "--duration", "1")
-    run("report", "sim", "hw", "--out", "report")
-    (page,) = (tmp_path / "report").glob("*.html")
-    assert "plotly-packed" in page.read_text(encoding="utf-8")
-    assert list((tmp_path / "report").rglob("*.png"))
-
-
 @pytest.mark.parametrize(
     ("command", "library", "extra"),
     [

@@ -184,36 +184,3 @@ def test_a_missing_actuator_is_one_sentence_and_exit_code_2(processes: ProcessGr
     assert program.wait(60.0) == 2
     assert "does not answer; start it with: python -m pendulum_hw_bridge emulator" in program.output
     assert "Traceback" not in program.output
-
-
-def lockstep_run(processes: ProcessGroup, seconds: float) -> list[tuple[int, float, float]]:
-    observer = GraphPeer("observer")
-    seen: list[tuple[int, float, float]] = []
-
-    def on_state(message: JointState) -> None:
-        seen.append((stamp_from_message(message.header.stamp), message.position[0], message.velocity[0]))
-
-    programs = [
-        processes.start(
-            "pendulum_hw_bridge",
-            "bridge",
-            *("--ros-args", "-p", "clock:=lockstep", "-p", f"initial_position:={UPRIGHT_ISH}"),
-            *("-p", "seed:=3", "-p", "lockstep_subscribers:=2", "-p", f"lockstep_duration:={seconds}"),
-        ),
-        processes.start("pendulum_lqr", "controller", "--ros-args", "-p", "use_sim_time:=true"),
-    ]
-    # Armed before the first state, which waits for this node to listen: the whole run is then the same.
-    assert observer.call(SetBool, "bridge/arm", SetBool.Request(data=True)).success
-    observer.node.create_subscription(JointState, "joint_states", on_state, qos.STATE)
-    observer.until(lambda: seen and seen[-1][0] >= (1 + seconds) * 1e9, "the last state", 60.0)
-    for program in programs:
-        program.interrupt()
-        assert program.wait(15.0) == 0
-    observer.close()
-    return seen
-
-
-def test_in_lockstep_two_runs_with_one_seed_are_the_same(processes: ProcessGroup, domain_id: int) -> None:
-    first, second = lockstep_run(processes, 3.0), lockstep_run(processes, 3.0)
-    assert len(first) == 301
-    assert first == second

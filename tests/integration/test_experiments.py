@@ -78,15 +78,11 @@ def test_a_policy_that_cannot_play_is_refused_before_anything_starts(tmp_path: P
         assert not (tmp_path / "run").exists()
 
 
-def test_lockstep_runs_of_the_simulator_are_identical_and_give_the_numbers_of_one_process_to_the_last_bit(
+def test_a_lockstep_run_of_the_simulator_gives_the_numbers_of_one_process_to_the_last_bit(
     domain_id: int, tmp_path: Path
 ) -> None:
-    for name in ("first", "second"):
-        run_experiment("lockstep", "--bag", tmp_path / name, "--seed", 7, "--duration", "1")
-    bag = read_bag(tmp_path / "first")
-    topics = [f"/sim/{topic}" for topic in ("joint_states", "effort_command", "disturbance", "applied_effort")]
-    assert same_messages(bag, read_bag(tmp_path / "second"), topics=[*topics, "/clock"])
-
+    run_experiment("lockstep", "--bag", tmp_path / "bag", "--seed", 7, "--duration", "1")
+    bag = read_bag(tmp_path / "bag")
     spec = RunSpec(
         controller_parameters={"q": [100.0, 0.01], "r": 0.1},
         disturbance={"amplitude": 2.5, "hold_time": 0.002, "duration": 1.0},
