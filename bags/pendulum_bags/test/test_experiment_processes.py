@@ -10,6 +10,7 @@ import pytest
 
 from pendulum_bags.experiments.processes import ProcessSet
 from pendulum_msgs_py.errors import FaultError
+from tests.fixtures import wait_for
 
 _LOGS_AND_ENDS = """
 import sys
@@ -31,7 +32,7 @@ def _message(folder: Path, program: str = _LOGS_AND_ENDS) -> str:
 def test_what_a_node_logs_and_then_ends_with_is_told_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(os, "getloadavg", lambda: (0.1, 0.1, 0.1))
     assert _message(tmp_path) == (
-        "hw_bridge ended with code 2; its last words: error: actuator thread did not answer within 30 s"
+        "hw_bridge ended with code 2; its last output: error: actuator thread did not answer within 30 s"
     )
 
 
@@ -52,3 +53,15 @@ def test_a_program_that_gives_its_priority_away_is_behind_among_sessions_too(tmp
         child = processes.start("behind", [sys.executable, "-c", show], ends_by_itself=True, niceness=3)
         processes.wait(child, 20.0)
     assert child.log.read_text().split()[1:] == ["nice", str(own + 3)]
+
+
+def test_a_program_that_does_not_end_in_time_is_named_with_its_output_and_progress_goes_on(tmp_path: Path) -> None:
+    refreshed: list[bool] = []
+    program = "import time; print('simulating', flush=True); time.sleep(60)"
+    with ProcessSet(tmp_path, {}) as processes:
+        child = processes.start("repeat_1", [sys.executable, "-c", program], ends_by_itself=True)
+        wait_for(lambda: child.log.read_text() != "", 20.0, "the program to print")
+        with pytest.raises(FaultError) as caught:
+            processes.wait(child, 0.3, on_wait=lambda: refreshed.append(True))
+    assert str(caught.value) == "repeat_1 still runs after 0.3 s; its last output: simulating"
+    assert refreshed

@@ -198,7 +198,7 @@ def test_the_layer_says_what_differs_and_what_to_do() -> None:
     assert late.reason.split(";")[0].endswith("ms later than the simulation")
     assert "transport_delay, 10" in late.next_steps[0]
     slack = same_run_layer(compare([pair(5, plant=SIMULATED.with_values(damping=2 * 11.77))]))
-    assert "the velocity of the hardware spreads 47 % narrower" in slack.reason
+    assert "the standard deviation of the hardware's velocity is 47 % smaller" in slack.reason
     assert "identify" in slack.next_steps[0]
     fine = same_run_layer(compare([pair(5, plant=MACHINE)]))
     assert fine.mark is Mark.YES

@@ -18,7 +18,9 @@ from pendulum_msgs_py.contract.names import Event
 from pendulum_msgs_py.contract.values import NANOSECONDS
 from pendulum_msgs_py.errors import BagError, FaultError
 
-__all__ = ["finish_recording", "lockstep_spec", "record_run", "run_lockstep", "wait_until_all_hear_each_other"]
+__all__ = [
+    "finish_recording", "lockstep_spec", "longest_run", "record_run", "run_lockstep", "wait_until_all_hear_each_other",
+]  # fmt: skip
 
 _START_TIMEOUT = 60.0
 _LOOP_NICENESS = -10
@@ -89,6 +91,11 @@ def lockstep_spec(settings: RegulationSettings, *, side: str, theta: float = UPR
         simulation="" if foreign is None else foreign.name,
         mapping="" if foreign is None else foreign.mapping,
     )
+
+
+def longest_run(duration: float) -> float:
+    """Return the longest time [s] that a run of a duration [s] may take: starting, discovery, arming, lockstep."""
+    return 4.0 * _START_TIMEOUT + _SLOWEST * duration
 
 
 def record_run(

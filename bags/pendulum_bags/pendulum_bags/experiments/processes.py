@@ -10,7 +10,7 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from types import TracebackType
@@ -122,7 +122,7 @@ class ProcessSet:
         Args:
             name: For messages and the log file.
             command: Program and arguments.
-            ends_last: Keep it until all others have ended: a recorder that hears their last words.
+            ends_last: Keep it until all others have ended: a recorder that records their last messages.
             ends_by_itself: Ending with code 0 is what it is for.
             niceness: Scheduling priority to give away, or to take where it is negative and permitted.
             environment: Variables to add for this one.
@@ -165,7 +165,7 @@ class ProcessSet:
             if code is not None and not (child.ends_by_itself and code == 0):
                 ending = f"was ended by {signal.Signals(-code).name}" if code < 0 else f"ended with code {code}"
                 words = child.last_words() or "none"
-                raise FaultError(f"{child.name} {ending}; its last words: {words}{_busy_note(words)}")
+                raise FaultError(f"{child.name} {ending}; its last output: {words}{_busy_note(words)}")
 
     def finish(self, child: Child, patience: float = _PATIENCE) -> int:
         """End one program by SIGINT, then by SIGKILL; return its exit code."""
@@ -175,16 +175,25 @@ class ProcessSet:
             self.children.remove(child)
         return code
 
-    def wait(self, child: Child, timeout: float) -> None:
+    def wait(self, child: Child, timeout: float, *, on_wait: Callable[[], None] = lambda: None) -> None:
         """Wait for a program that ends by itself.
+
+        Args:
+            child: The program.
+            timeout: Longest time to wait [s].
+            on_wait: Called while waiting, to show progress.
 
         Raises:
             FaultError: It ends with an error, or not in time.
         """
-        try:
-            child.process.wait(timeout)
-        except subprocess.TimeoutExpired:
-            raise FaultError(f"{child.name} still runs after {timeout:g} s: {child.last_words()}") from None
+        deadline = time.monotonic() + timeout
+        while child.process.poll() is None:
+            if time.monotonic() > deadline:
+                words = child.last_words() or "none"
+                raise FaultError(f"{child.name} still runs after {timeout:g} s; its last output: {words}")
+            on_wait()
+            with contextlib.suppress(subprocess.TimeoutExpired):
+                child.process.wait(0.1)
         self.check()
 
     def stop(self) -> None:

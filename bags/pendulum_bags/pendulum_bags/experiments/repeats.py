@@ -25,7 +25,7 @@ from pendulum_msgs_py.contract import names
 from pendulum_msgs_py.contract.cdr import encode_joint_state
 from pendulum_rosbag.storage import open_writer
 
-__all__ = ["record_repeat", "record_simulation", "repeat_command", "repeat_folder", "repeat_settings"]
+__all__ = ["SHORTEST", "record_repeat", "record_simulation", "repeat_command", "repeat_folder", "repeat_settings"]
 
 SEED_STEP = 10_000_000
 """Added to the seed for each repeat, so that the repeats of one seed are not another seed's run."""

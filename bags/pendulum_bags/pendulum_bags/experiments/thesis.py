@@ -12,9 +12,10 @@ from pathlib import Path
 from pendulum_bags.experiments.conductor_node import Conductor, PlantClient
 from pendulum_bags.experiments.domain import reserve_domain
 from pendulum_bags.experiments.graph_plant import join
+from pendulum_bags.experiments.lockstep import longest_run
 from pendulum_bags.experiments.processes import Child, ProcessSet, ros_environment, start_recorder
 from pendulum_bags.experiments.progress import PhaseProgress
-from pendulum_bags.experiments.repeats import repeat_command
+from pendulum_bags.experiments.repeats import SHORTEST, repeat_command
 from pendulum_bags.experiments.run_spec import SIDES
 from pendulum_bags.experiments.settings import SETTLE_TIME, RegulationSettings
 from pendulum_bags.runs.run_folder import write_json
@@ -68,7 +69,8 @@ def run_thesis(
             _rest(plants)
         progress.phase("closing the bags", 2.0)
         for child in beside:
-            processes.wait(child, 60.0)
+            # It has limits of its own and ends by itself; on a busy machine it takes minutes.
+            processes.wait(child, longest_run(max(SHORTEST, settings.noise.duration)), on_wait=progress.refresh)
         processes.stop()
 
 

@@ -60,11 +60,11 @@ def in_words(test: EquivalenceTest) -> str:
     if test.quantity.startswith("spread of "):
         what = test.quantity.removeprefix("spread of ").split(" ", maxsplit=1)[0]
         if test.unit == "-":
-            size = f"{value:.2g} times as wide" if value >= 2.0 else f"{100.0 * abs(value - 1.0):.2g} % "
-            size = size if value >= 2.0 else size + ("wider" if value >= 1.0 else "narrower")
+            size = f"{value:.2g} times as large" if value >= 2.0 else f"{100.0 * abs(value - 1.0):.2g} % "
+            size = size if value >= 2.0 else size + ("larger" if value >= 1.0 else "smaller")
         else:
-            size = f"{abs(value):.2g} {test.unit} {'wider' if value >= 0.0 else 'narrower'}"
-        return f"the {what} of the hardware spreads {size}"
+            size = f"{abs(value):.2g} {test.unit} {'larger' if value >= 0.0 else 'smaller'}"
+        return f"the standard deviation of the hardware's {what} is {size}"
     apart = "% of their spread" if test.unit == "%" else test.unit
     what = "velocities" if "velocities" in test.quantity else "angles"
     less = ", the delay taken out" if "less the delay" in test.quantity else ""
