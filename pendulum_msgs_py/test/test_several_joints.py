@@ -41,7 +41,7 @@ def _command(effort: tuple[float, ...], joints: tuple[str, ...], stamp_ns: int =
 def test_the_middleware_reads_what_we_write_of_several_joints_and_we_read_what_it_writes(
     names: tuple[str, ...], given: tuple[int, int, int], frame: str
 ) -> None:
-    cdr.forget_layouts()
+    cdr._known_layouts.clear()
     values = tuple(tuple(10.0 * k + i for i in range(len(names))) * present for k, present in enumerate(given))
     message = JointState(name=list(names))
     message.header.frame_id, message.header.stamp.sec, message.header.stamp.nanosec = frame, 5, 7
@@ -56,7 +56,7 @@ def test_the_middleware_reads_what_we_write_of_several_joints_and_we_read_what_i
 
 
 def test_a_message_of_as_many_bytes_with_the_names_the_other_way_round_is_read_by_its_own_names() -> None:
-    cdr.forget_layouts()
+    cdr._known_layouts.clear()
     for names in (("left_", "right"), ("right", "left_"), ("right", "right")):
         fields = decode_joint_state(encode_joints(1, "lqr", names, (), (), (1.0, 2.0)))
         assert fields is not None

@@ -77,7 +77,6 @@ class EmulatorServer:
             raise PendulumError(f"emulator cannot listen on {address[0]}:{address[1]}: {error.strerror}") from error
         self._socket.setblocking(False)
         self._listeners: dict[Address, int] = {}
-        self.refused_packets = 0
 
     @property
     def address(self) -> Address:
@@ -129,15 +128,12 @@ class EmulatorServer:
                 arrival = now + round(timing.command_delay * NANOSECONDS)
                 self.actuator.deliver(command, arrival, sender=hash(sender) & 0x7FFFFFFF)
                 self._listeners[sender] = now + round(_LEASE * NANOSECONDS)
-                return
         elif kind == wire.REQUEST:
             request = wire.decode_json(packet)
             if request:
                 self._listeners[sender] = now + round(_LEASE * NANOSECONDS)
                 self.actuator.advance_to(now)
                 self._answer(request, sender)
-                return
-        self.refused_packets += 1
 
     def _answer(self, request: dict[str, Any], sender: Address) -> None:
         settings = request.get("settings")

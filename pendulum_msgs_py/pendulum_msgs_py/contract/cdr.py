@@ -226,11 +226,6 @@ _known_layouts: dict[tuple[int, bytes], _KnownLayout] = {}
 """One layout for each size of message and of its sender's name; the first comer's, so that two do not take turns."""
 
 
-def forget_layouts() -> None:
-    """Forget all remembered layouts, as at the start of the process."""
-    _known_layouts.clear()
-
-
 def _remember_layout(fields: JointStateFields, size: int) -> None:
     """Remember the layout of a state, or of efforts alone: the messages that come a thousand times a second."""
     counts = tuple(len(quantity) for quantity in fields[3:])
