@@ -58,3 +58,13 @@ def test_a_summary_without_an_answer_shows_none(text: str, tmp_path: Path) -> No
     assert read_answer(tmp_path) == {}
     (tmp_path / "summary.json").write_text(text, encoding="utf-8")
     assert read_answer(tmp_path) == {}
+
+
+def test_controllers_are_offered_that_fit_the_plant_and_need_no_file(tmp_path: Path) -> None:
+    pytest.importorskip("nicegui")
+    from pendulum_bags.console.controller_choice import offered
+
+    assert offered("acrobot") == ["lqr", "tvlqr"]
+    for plant in ("", "thesis", str(tmp_path / "of_another_machine.yaml")):
+        assert {"lqr", "pid", "energy_swing_up"} <= set(offered(plant))
+        assert not {"policy", "playback"} & set(offered(plant))

@@ -13,7 +13,7 @@ from sensor_msgs.msg import JointState
 from std_msgs.msg import String
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
-from pendulum_msgs_py.contract.cdr import decode_joint_state
+from pendulum_msgs_py.contract.cdr import JointStateFields, decode_joint_state
 from pendulum_msgs_py.contract.names import JOINT
 from pendulum_msgs_py.contract.trajectory import Trajectory
 from pendulum_msgs_py.contract.values import NANOSECONDS, JointCommand, JointSample
@@ -22,8 +22,8 @@ from pendulum_msgs_py.joints import ONE_JOINT
 __all__ = [
     "command_from_bytes",
     "diagnostic_status",
-    "effort_from_bytes",
     "event_message",
+    "fields_from_bytes",
     "plant_mode",
     "plant_value",
     "problem_of_command",
@@ -67,10 +67,15 @@ def command_from_bytes(data: bytes) -> JointCommand | None:
     )
 
 
-def effort_from_bytes(data: bytes) -> float | None:
-    """Return the effort of a serialised command for one joint, to show it; None where it is for several or is none."""
-    command = command_from_bytes(data)
-    return command.effort[0] if command is not None and len(command.effort) == 1 else None
+def fields_from_bytes(data: bytes) -> JointStateFields | None:
+    """Return what a serialised JointState holds, whatever its joints, to show it; None where it is none."""
+    fields = decode_joint_state(data)
+    if fields is None and (message := _deserialise(data)) is not None:
+        fields = JointStateFields(
+            stamp_from_message(message.header.stamp), message.header.frame_id, tuple(message.name),
+            tuple(message.position), tuple(message.velocity), tuple(message.effort),
+        )  # fmt: skip
+    return fields
 
 
 def sample_from_bytes(data: bytes, joints: tuple[str, ...] = ONE_JOINT.names) -> JointSample | None:

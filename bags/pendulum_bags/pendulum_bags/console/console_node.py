@@ -16,6 +16,8 @@ from typing import Annotated, Any
 import rclpy
 import typer
 from diagnostic_msgs.msg import DiagnosticArray
+from lifecycle_msgs.msg import Transition
+from lifecycle_msgs.srv import ChangeState
 from rcl_interfaces.msg import Parameter as ParameterMessage
 from rcl_interfaces.srv import DescribeParameters, SetParameters
 from rclpy.clock import Clock, ClockType
@@ -30,6 +32,7 @@ from std_srvs.srv import SetBool, Trigger
 
 from pendulum_bags.console.graph import Description
 from pendulum_bags.console.jobs import Jobs
+from pendulum_bags.console.joint_values import JointValues
 from pendulum_bags.console.page import serve
 from pendulum_bags.console.security import is_loopback, listen
 from pendulum_bags.console.stop_order import StopOrder
@@ -38,7 +41,7 @@ from pendulum_msgs_py.contract.names import Event
 from pendulum_msgs_py.errors import FaultError, ParameterError
 from pendulum_msgs_py.programs.executables import cli_main
 from pendulum_msgs_py.ros import qos
-from pendulum_msgs_py.ros.convert import effort_from_bytes, sample_from_bytes, stamp_from_message
+from pendulum_msgs_py.ros.convert import fields_from_bytes, stamp_from_message
 from pendulum_msgs_py.ros.middleware import check_closed, set_middleware_defaults
 from pendulum_msgs_py.ros.polled import PolledInput, PollingNode
 from pendulum_rosbag.recorder.parameter_reader_node import ParameterReader
@@ -54,8 +57,8 @@ _TORQUES = {
     "disturbance": names.DISTURBANCE,
     "applied": names.APPLIED_EFFORT,
 }
-_FRESH = 0.3
-"""Age at which a torque counts as no longer sent [s]; plants take none that is older than 0.05 s."""
+_SILENT = 2.0
+"""Age at which what a node said of itself counts no more [s]; nodes say it twice a second."""
 _STOP_SERVICE = "/e_stop"
 _STOP_TICK = 0.02
 _STOP_WAIT = 0.4
@@ -70,9 +73,7 @@ class _Plant:
     node: str
     taps: dict[str, PolledInput]
     others: list[Any] = field(default_factory=list)
-    values: dict[str, float] = field(default_factory=dict)
-    heard: dict[str, float] = field(default_factory=dict)
-    stamp_ns: int = 0
+    joints: JointValues = field(default_factory=JointValues)
     mode: str = ""
     reason: str = ""
     mode_stamp_ns: int = 0
@@ -95,6 +96,7 @@ class Hub:
         self._lock = threading.Lock()
         self._plants: dict[str, _Plant] = {}
         self._clients: dict[str, Any] = {}
+        self._said: dict[str, tuple[str, float]] = {}
         self._described: dict[tuple[str, ...], dict[str, Description]] = {}
         self._reader = ParameterReader(self._node, lambda _values, _changed: None)
         self._node.create_subscription(DiagnosticArray, names.DIAGNOSTICS, self._on_diagnostics, qos.DIAGNOSTICS)
@@ -238,6 +240,22 @@ class Hub:
         """Arm or disarm a plant; raise a FaultError with its reason where it refuses."""
         return _accepted(node, await self._call(SetBool, f"{node}/arm", SetBool.Request(data=on)))
 
+    def said(self, node: str) -> str:
+        """Return what a node said of itself last; nothing once it is silent."""
+        with self._lock:
+            text, heard = self._said.get(node, ("", 0.0))
+        return text if time.monotonic() - heard < _SILENT else ""
+
+    async def activate(self, node: str, *, on: bool) -> str:
+        """Activate or deactivate a controller; raise a FaultError where its state does not allow it."""
+        label, number = (
+            ("activate", Transition.TRANSITION_ACTIVATE) if on else ("deactivate", Transition.TRANSITION_DEACTIVATE)
+        )
+        request = ChangeState.Request(transition=Transition(id=number, label=label))
+        if not (await self._call(ChangeState, f"{node}/change_state", request)).success:
+            raise FaultError(f"{node} does not {label}: it says {self.said(node) or 'nothing'!r}; its log says why")
+        return f"{node}: {label}d"
+
     async def set_parameter(self, node: str, name: str, value: Any) -> None:
         """Set a parameter; raise a FaultError with the node's reason where it refuses."""
         message: ParameterMessage = Parameter(name, value=value).to_parameter_msg()
@@ -297,7 +315,7 @@ class Hub:
 
     def _look(self) -> None:
         """Find plants by their e-stop: who has one is a plant."""
-        self._reader.look()
+        self._reader.look(forget=True)
         found = {
             name.removesuffix(_STOP_SERVICE)
             for name, types in self._node.get_service_names_and_types()
@@ -344,6 +362,7 @@ class Hub:
     def _on_diagnostics(self, message: DiagnosticArray) -> None:
         with self._lock:
             for status in message.status:
+                self._said[status.name.partition(":")[0]] = (status.message, time.monotonic())
                 plant = self._plants.get(status.name.partition(":")[0])
                 if plant is not None:
                     plant.figures = {pair.key: pair.value for pair in status.values}
@@ -352,22 +371,17 @@ class Hub:
                         plant.mode, plant.reason = plant.figures.get("mode", plant.mode), status.message
 
     def _read(self, plant: _Plant) -> dict[str, Any]:
+        now = time.monotonic()
         for key, tap in plant.taps.items():
             for data, _ in tap.messages():
-                if key != "state":
-                    plant.values[key] = effort_from_bytes(data) or 0.0
-                    plant.heard[key] = time.monotonic()
-                elif (sample := sample_from_bytes(data)) is not None:
-                    (theta,), (theta_dot,), (measured,) = sample[1:]
-                    plant.values.update(theta=theta, theta_dot=theta_dot, measured=measured)
-                    plant.stamp_ns = sample.stamp_ns
-        for key, heard in plant.heard.items():
-            # A torque that nobody sends any more is not drawn on as if somebody did.
-            if time.monotonic() - heard > _FRESH:
-                plant.values.pop(key, None)
+                fields = fields_from_bytes(data)
+                if fields is not None and key == "state":
+                    plant.joints.take_state(fields)
+                elif fields is not None:
+                    plant.joints.take_effort(key, fields, now)
         return {
-            **plant.values,
-            "stamp_ns": str(plant.stamp_ns),
+            **plant.joints.picture(now),
+            "stamp_ns": str(plant.joints.stamp_ns),
             "node": plant.node,
             "mode": plant.mode,
             "reason": plant.reason,

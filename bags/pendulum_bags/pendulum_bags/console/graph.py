@@ -50,6 +50,12 @@ class Graph(Protocol):
     async def arm(self, node: str, *, on: bool) -> str:
         """Arm or disarm a plant."""
 
+    def said(self, node: str) -> str:
+        """Return what a node said of itself last, in words; empty once it is silent."""
+
+    async def activate(self, node: str, *, on: bool) -> str:
+        """Activate or deactivate a controller."""
+
     async def set_parameter(self, node: str, name: str, value: Any) -> None:
         """Set a parameter."""
 

@@ -1,4 +1,4 @@
-"""Programs that the console starts: a recorder, an experiment. They end with it."""
+"""Programs that the console starts: a recorder, an experiment, a controller. They end with it."""
 
 from __future__ import annotations
 
@@ -107,8 +107,26 @@ class Jobs:
         """
         return self._start(f"move{namespace}", ["move", goal, "--namespace", namespace], "", os.environ)
 
+    def control(self, namespace: str, kind: str, plant: str) -> Job:
+        """Start a controller beside a plant; it waits inactive.
+
+        Args:
+            namespace: Of the plant.
+            kind: Which controller.
+            plant: Preset or plant file to design for; empty for the controller's own default.
+        """
+        given = {"controller": kind, **({"plant": plant} if plant else {}), "autoactivate": "false"}
+        arguments = ["controller", "--ros-args", "-r", f"__ns:={namespace or '/'}"]
+        arguments += [item for name, value in given.items() for item in ("-p", f"{name}:={value}")]
+        return self._start(f"control{namespace}", arguments, "", os.environ, package="pendulum_lqr")
+
     def _start(
-        self, kind: str, arguments: list[str], option: str, environment: os._Environ[str] | dict[str, str]
+        self,
+        kind: str,
+        arguments: list[str],
+        option: str,
+        environment: os._Environ[str] | dict[str, str],
+        package: str = "pendulum_bags",
     ) -> Job:
         job = self._jobs.get(kind)
         if job is not None and job.running:
@@ -116,7 +134,7 @@ class Jobs:
         self.runs.mkdir(parents=True, exist_ok=True)
         folder = self.runs / f"{time.strftime('%Y-%m-%dT%H-%M-%SZ', time.gmtime())}_console_{kind.replace('/', '_')}"
         log = folder.with_suffix(".log")
-        command = [sys.executable, "-m", "pendulum_bags", *arguments, *([option, str(folder)] if option else [])]
+        command = [sys.executable, "-m", package, *arguments, *([option, str(folder)] if option else [])]
         with log.open("wb") as sink:
             process = subprocess.Popen(
                 command, stdin=subprocess.DEVNULL, stdout=sink, stderr=subprocess.STDOUT,

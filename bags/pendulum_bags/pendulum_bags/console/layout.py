@@ -10,6 +10,7 @@ from typing import Any
 from nicegui import ui
 
 from pendulum_bags.console.certified import CertifiedDesigns
+from pendulum_bags.console.controller_choice import ControllerChoice
 from pendulum_bags.console.graph import Graph
 from pendulum_bags.console.jobs import Jobs
 from pendulum_bags.console.layers_card import LayersCard
@@ -41,6 +42,7 @@ class Layout:
         self._layers = LayersCard(jobs)
         self._job_labels: dict[str, tuple[ui.label, ui.link]] = {}
         self._cards: dict[str, str] = {}
+        self._choices: list[ControllerChoice] = []
 
     def build(self) -> None:
         """Lay the page out."""
@@ -60,6 +62,7 @@ class Layout:
             with ui.element("section").classes("card").props('aria-label="Plants"'):
                 ui.html('<canvas id="pendulum" role="img" aria-label="pendulums, drawn live"></canvas>', sanitize=False)
                 ui.html('<div id="plants"></div>', sanitize=False)
+                ui.html('<div id="joints"></div>', sanitize=False)
             with ui.element("section").classes("card wide").props('aria-label="Signals"'):
                 ui.html(
                     '<canvas id="plots" role="img" aria-label="angle, velocity and torques of the last 10 s"></canvas>',
@@ -106,6 +109,9 @@ class Layout:
                     _button(f"Bring {goal} ...", partial(self._ask_to_move, space, goal, move_text(goal)), of=space)
                 _button("Cancel the move", lambda: self._finish(f"move{space}"), of=space)
             self._job_line(f"move{space}")
+            choice = ControllerChoice(self._graph, self._jobs, space, node, self._carefully, _button)
+            choice.build()
+            self._choices.append(choice)
 
     def _job_buttons(self) -> None:
         with ui.row():
@@ -185,9 +191,12 @@ class Layout:
             for kind in [kind for kind in self._job_labels if kind.startswith("move")]:
                 del self._job_labels[kind]
             self._plants.clear()
+            self._choices.clear()
             with self._plants:
                 for space, node in sorted(plants.items()):
                     self._plant_card(space, node)
+        for choice in self._choices:
+            choice.refresh()
         for table in self._tables:
             await table.refresh(sorted(plants))
         self._certified.refresh()

@@ -39,13 +39,21 @@ class ParameterReader:
         self._finished: list[Client] = []
         node.create_subscription(ParameterEvent, "/parameter_events", self._on_event, qos_profile_parameter_events)
 
-    def look(self) -> None:
-        """Look for new nodes, and ask those whose services have appeared."""
+    def look(self, *, forget: bool = False) -> None:
+        """Look for new nodes, and ask those whose services have appeared.
+
+        Args:
+            forget: Whether nodes that are gone lose their values; one of the same name is then asked anew.
+        """
         for client in self._finished:
             self._node.destroy_client(client)
         self._finished.clear()
-        for name, namespace in self._node.get_node_names_and_namespaces():
-            full = f"{namespace.rstrip('/')}/{name}"
+        found = {f"{space.rstrip('/')}/{name}": name for name, space in self._node.get_node_names_and_namespaces()}
+        for full in [full for full in self._known if forget and full not in found]:
+            self._known.discard(full)
+            self.values.pop(full, None)
+            self._waiting.pop(full, None)
+        for full, name in found.items():
             if full not in self._known and not name.startswith("_"):
                 self._known.add(full)
                 self._waiting[full] = 0

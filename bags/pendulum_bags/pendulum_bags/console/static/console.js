@@ -6,15 +6,46 @@
   const MODES = {
     disarmed: "disarmed", armed_effort: "ARMED: follows the controller", armed_position: "ARMED: moves by itself", e_stop: "E-STOP", fault: "FAULT", silent: "SILENT",
   };
+  const away = (p) => p.theta - p.goal; // from upright; a hinge's is taken within half a turn
+  // Title by unit, and value; what slides has metres and newtons.
   const ROWS = [
-    ["angle from upright [rad]", (p) => Math.atan2(Math.sin(p.theta - Math.PI), Math.cos(p.theta - Math.PI))],
-    ["velocity [rad/s]", (p) => p.theta_dot],
-    ["command [N m]", (p) => p.command],
-    ["disturbance [N m]", (p) => p.disturbance],
-    ["applied effort [N m]", (p) => p.applied],
+    [{ rad: "angle from upright [rad]", m: "position [m]" }, (p) => (p.unit === "m" ? p.theta : Math.atan2(Math.sin(away(p)), Math.cos(away(p))))],
+    [{ rad: "velocity [rad/s]", m: "velocity [m/s]" }, (p) => p.theta_dot],
+    [{ rad: "command [N m]", m: "command [N]" }, (p) => p.command],
+    [{ rad: "disturbance [N m]", m: "disturbance [N]" }, (p) => p.disturbance],
+    [{ rad: "applied effort [N m]", m: "applied effort [N]" }, (p) => p.applied],
   ];
   const state = { plants: {}, series: {}, frames: 0, drawn: 0, connected: false, stopPressed: 0, stopAnswered: 0, fps: 0 };
   window.pendulumConsole = state;
+
+  // --- joints ---------------------------------------------------------------------------------------------
+  // A plant of several joints is drawn whole where its links hang on each other; its lines are those of one joint, chosen here.
+  const chosen = {}; // plant -> name of the joint whose lines are drawn
+  const several = (plant) => plant.joints && plant.joints.length > 1;
+
+  function choose(name, plant) {
+    const joints = plant.joints || [];
+    if (!joints.some((joint) => joint.name === chosen[name])) chosen[name] = joints.length ? joints[0].name : undefined;
+    return Object.assign(plant, joints.find((joint) => joint.name === chosen[name]), { name: undefined });
+  }
+
+  let offered = "";
+  function offerJoints() {
+    const place = document.getElementById("joints");
+    if (!place) return;
+    const plants = Object.entries(state.plants).filter(([, plant]) => several(plant)).map(([name, plant]) => [name, plant.joints.map((joint) => joint.name)]);
+    if (JSON.stringify(plants) === offered) return;
+    offered = JSON.stringify(plants);
+    place.replaceChildren(...plants.map(([name, joints]) => {
+      const label = document.createElement("label"), list = document.createElement("select");
+      label.append(`Lines of ${name || "/"}: joint `, list);
+      list.dataset.joints = name;
+      list.append(...joints.map((joint) => Object.assign(document.createElement("option"), { value: joint, textContent: joint })));
+      list.value = chosen[name];
+      list.onchange = () => { chosen[name] = list.value; state.series[name] = []; tape.stale = true; };
+      return label;
+    }));
+  }
 
   // --- the stop ---------------------------------------------------------------------------------------------
   // A press is an order. The page repeats it until the server has taken it, the server until each plant has answered, and what
@@ -231,6 +262,7 @@
     behind = Math.min(behind, performance.now() / 1000 - now);
     state.frames += 1;
     for (const [name, plant] of Object.entries(frame)) {
+      choose(name, plant);
       const before = state.plants[name];
       plant.moved = before && before.stamp_ns === plant.stamp_ns ? before.moved : now;
       const series = (state.series[name] ||= []);
@@ -239,6 +271,7 @@
     }
     for (const name of Object.keys(state.plants)) if (!(name in frame)) note(`${name || "/"} is gone from the graph (it was ${state.plants[name].mode || "in an unknown state"})`);
     state.plants = frame;
+    offerJoints();
     for (const name of Object.keys(state.series)) if (!(name in frame) && !state.series[name].length) delete state.series[name];
   }
 
@@ -274,15 +307,25 @@
     c.setLineDash([]);
     names.forEach((name, index) => {
       const plant = state.plants[name];
-      if (!plant || plant.theta === undefined) return;
+      // What slides has no angle to draw; its position is in the lines.
+      if (!plant || plant.theta === undefined || plant.unit === "m") return;
       const colour = COLOURS[index % COLOURS.length];
-      const bx = x + length * Math.sin(plant.theta), by = y + length * Math.cos(plant.theta);
+      // One link, or links that hang on each other, as long together as the one.
+      const links = plant.chain ? plant.joints.map((joint) => joint.theta) : [plant.theta];
+      const points = [[x, y]];
+      links.reduce((angle, turn) => {
+        const at = points[points.length - 1], all = angle + turn;
+        points.push([at[0] + length / links.length * Math.sin(all), at[1] + length / links.length * Math.cos(all)]);
+        return all;
+      }, 0);
+      const [bx, by] = points[points.length - 1];
       const stale = serverTime() - plant.moved > 0.5;
       c.globalAlpha = stale ? 0.3 : 0.85;
       c.setLineDash(stale ? [5, 5] : []);
       c.strokeStyle = c.fillStyle = colour;
       c.lineWidth = 7 - 3 * index;
-      c.beginPath(); c.moveTo(x, y); c.lineTo(bx, by); c.stroke();
+      c.beginPath(); c.moveTo(x, y); points.slice(1).forEach(([px, py]) => c.lineTo(px, py)); c.stroke();
+      points.slice(1, -1).forEach(([px, py]) => { c.beginPath(); c.arc(px, py, 6, 0, 7); c.fill(); });
       c.beginPath(); c.arc(bx, by, 13 - 2 * index, 0, 7);
       if (index) { c.lineWidth = 3; c.stroke(); } else c.fill();
       // Torques as arcs about the axis: 13 N m are three quarters of a turn; applied outside, disturbance inside.
@@ -418,7 +461,8 @@
     boxes.forEach(([top, bottom], row) => {
       const [low, high] = tape.ranges[row];
       c.strokeRect(left - 1.5, top - 1.5, right - left + 3, bottom - top + 3);
-      c.textAlign = "left"; c.fillText(ROWS[row][0], left, top - 4);
+      const units = [...new Set(Object.values(state.plants).map((plant) => plant.unit || "rad"))];
+      c.textAlign = "left"; c.fillText([...(units.length ? units : ["rad"])].sort().reverse().map((unit) => ROWS[row][0][unit]).join(", "), left, top - 4);
       c.textAlign = "right"; c.fillText(tick(high), left - 5, top + 9); c.fillText(tick(low), left - 5, bottom);
     });
     c.textAlign = "center";

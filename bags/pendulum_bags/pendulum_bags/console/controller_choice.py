@@ -1,0 +1,133 @@
+"""The choice of a plant's controller: which one, started to wait inactive, activated, ended."""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Awaitable, Callable
+from typing import Any
+
+from nicegui import run, ui
+
+from pendulum_bags.console.graph import Graph
+from pendulum_bags.console.jobs import Jobs
+from pendulum_lqr.controller import CONTROLLERS
+from pendulum_lqr.controllers.joint_lqr import JOINT_CONTROLLERS
+from pendulum_msgs_py.errors import FaultError, PendulumError
+from pendulum_msgs_py.plants.plant_parameters import is_mechanism
+
+__all__ = ["ControllerChoice", "offered"]
+
+_NEED_A_FILE = frozenset({"playback", "policy"})
+"""Controllers that cannot start without a file; whoever has one starts them in a terminal."""
+
+
+def offered(plant: str) -> list[str]:
+    """Return the controllers that can start for a plant with nothing but their defaults.
+
+    Args:
+        plant: Preset or plant file; empty where nobody says.
+    """
+    # A file of another machine, or an emulator's, is no reason to offer nothing: the controller says what it refuses.
+    with contextlib.suppress(PendulumError):
+        if plant and is_mechanism(plant):
+            return list(JOINT_CONTROLLERS)
+    return [kind for kind in CONTROLLERS if kind not in _NEED_A_FILE]
+
+
+class ControllerChoice:
+    """One plant's choice.
+
+    Args:
+        graph: The ROS graph.
+        jobs: Starts the controller.
+        space: Namespace of the plant.
+        node: The plant's full name.
+        carefully: Awaits work and shows what refuses it.
+        button: Makes a button with a text, what it does, and whose it is.
+    """
+
+    def __init__(
+        self,
+        graph: Graph,
+        jobs: Jobs,
+        space: str,
+        node: str,
+        carefully: Callable[[Awaitable[Any]], Awaitable[bool]],
+        button: Callable[..., ui.button],
+    ) -> None:
+        self._graph = graph
+        self._jobs = jobs
+        self._space = space
+        self._node = node
+        self._controller = f"{space}/controller"
+        self._carefully = carefully
+        self._button = button
+
+    @property
+    def _plant(self) -> str:
+        return str(self._graph.parameters.get(self._node, {}).get("plant", ""))
+
+    def build(self) -> None:
+        """Lay it out."""
+        with ui.row():
+            self._offered_for = self._plant
+            kinds = offered(self._plant)
+            self._kind = ui.select(kinds, value=kinds[0], label="Controller").props("dense outlined").classes("kind")
+            self._kind.props(f'aria-label="Controller of {self._space or "/"}"')
+            for text, work in (
+                ("Start", self._start()), ("Activate", self._activate(on=True)),
+                ("Deactivate", self._activate(on=False)), ("End", self._end()),
+            ):  # fmt: skip
+                self._button(f"{text} controller", work, of=self._space or "/")
+        self._state = ui.label().classes("small").props('role="status"')
+
+    def refresh(self) -> None:
+        """Show what the controller says of itself; offer those that fit, once the plant has said what it is."""
+        if self._plant != self._offered_for:
+            self._offered_for = self._plant
+            kinds = offered(self._plant)
+            self._kind.set_options(kinds, value=kinds[0])
+        running = self._graph.parameters.get(self._controller, {})
+        said = self._graph.said(self._controller)
+        job = self._jobs[f"control{self._space}"]
+        self._state.text = (
+            f"{running.get('controller', 'controller')}: {said or 'says nothing'}"
+            if running
+            else f"no controller · {job.describe()}"
+            if job is not None
+            else "no controller"
+        )
+
+    def _start(self) -> Callable[[], Awaitable[None]]:
+        async def work() -> None:
+            await self._carefully(self._try())
+
+        return work
+
+    async def _try(self) -> str:
+        running = self._graph.parameters.get(self._controller)
+        if running:
+            raise FaultError(
+                f"{self._controller} ({running.get('controller', 'of another kind')}) is there already; expected none: "
+                "end it, or, if it was not started here, the program that runs it"
+            )
+        self._jobs.control(self._space, str(self._kind.value), self._plant)
+        return f"{self._kind.value} starts, and waits inactive"
+
+    def _activate(self, *, on: bool) -> Callable[[], Awaitable[None]]:
+        async def work() -> None:
+            await self._carefully(self._graph.activate(self._controller, on=on))
+
+        return work
+
+    def _end(self) -> Callable[[], Awaitable[None]]:
+        async def work() -> None:
+            await self._carefully(self._ended())
+
+        return work
+
+    async def _ended(self) -> str:
+        job = self._jobs[f"control{self._space}"]
+        if job is None or not job.running:
+            raise FaultError(f"no controller of {self._space or '/'} that runs was started here; expected one to end")
+        return await run.io_bound(self._jobs.stop, f"control{self._space}")

@@ -1,0 +1,74 @@
+"""The newest of what is drawn of each joint of a plant."""
+
+from __future__ import annotations
+
+from math import isfinite
+from typing import Any
+
+from pendulum_msgs_py.contract.cdr import JointStateFields
+from pendulum_msgs_py.joints import Joint
+from pendulum_msgs_py.mechanisms import MECHANISMS
+
+__all__ = ["JointValues"]
+
+_FRESH = 0.3
+"""Age at which a torque counts as no longer sent [s]; plants take none that is older than 0.05 s."""
+_CHAIN = MECHANISMS["double_pendulum"]
+
+
+class JointValues:
+    """Positions, velocities and efforts of a plant's joints, each as it came last, by the joints' names."""
+
+    def __init__(self) -> None:
+        self.stamp_ns = 0
+        self._joints: tuple[Joint, ...] = ()
+        self._states: dict[str, dict[str, float]] = {}
+        self._efforts: dict[tuple[str, str], tuple[float, float]] = {}
+
+    def take_state(self, fields: JointStateFields) -> None:
+        """Take a state; one without a position and a velocity for each joint says nothing."""
+        if not fields.joints or not len(fields.joints) == len(fields.position) == len(fields.velocity):
+            return
+        if fields.joints != tuple(joint.name for joint in self._joints):
+            self._joints, self._states = _joints(fields.joints), {}
+        self.stamp_ns = fields.stamp_ns
+        efforts = fields.effort or (0.0,) * len(fields.joints)
+        for name, theta, theta_dot, measured in zip(
+            fields.joints, fields.position, fields.velocity, efforts, strict=True
+        ):
+            self._states[name] = {"theta": theta, "theta_dot": theta_dot, "measured": measured}
+
+    def take_effort(self, kind: str, fields: JointStateFields, now: float) -> None:
+        """Take efforts of some joints.
+
+        Args:
+            kind: Whose they are: ``command``, ``disturbance`` or ``applied``.
+            fields: The message.
+            now: When it was heard [s].
+        """
+        # One effort without a name is for the one joint there is.
+        names = fields.joints or tuple(joint.name for joint in self._joints)
+        for name, effort in zip(names, fields.effort, strict=False):
+            self._efforts[name, kind] = (effort, now)
+
+    def picture(self, now: float) -> dict[str, Any]:
+        """Return what a page draws: each joint with unit, upright position and values; an old torque is none.
+
+        Args:
+            now: The time [s].
+        """
+        self._efforts = {key: known for key, known in self._efforts.items() if now - known[1] <= _FRESH}
+        joints = []
+        for joint in self._joints:
+            efforts = {kind: effort for (name, kind), (effort, _) in self._efforts.items() if name == joint.name}
+            # JSON has no word for what is not finite: a page could read nothing more of the plant, nor of any other.
+            values = {key: value for key, value in {**self._states[joint.name], **efforts}.items() if isfinite(value)}
+            joints.append({"name": joint.name, "unit": joint.unit, "goal": joint.goal, **values})
+        # Links that hang on each other, each angle from the link before: only of these the whole can be drawn.
+        return {"joints": joints, "chain": self._joints == _CHAIN.joints}
+
+
+def _joints(names: tuple[str, ...]) -> tuple[Joint, ...]:
+    """Return the joints of the mechanism that has joints of these names; of none that is known, hinges from 0."""
+    known = {tuple(joint.name for joint in one.joints): one.joints for one in MECHANISMS.values()}
+    return known.get(names) or tuple(Joint(name) for name in names)
