@@ -72,6 +72,10 @@ def test_page_is_whole_and_usable(page: Any) -> None:
     assert page.locator("header, figure, .graph").evaluate_all(outside) == 0
     assert page.locator("#failure").is_hidden()
 
+    # Names of rows leave half of the width to the rows, on a phone too.
+    share = "n => n._fullLayout._size.w / n._fullLayout.width"
+    assert page.locator('[data-graph="equivalence-0"]').evaluate(share) > 0.45
+
     # By keyboard: a plot takes the focus, zooms, moves and comes back.
     plot = page.locator('[data-graph="both_together-0"]')
     plot.focus()

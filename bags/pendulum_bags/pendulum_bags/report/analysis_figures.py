@@ -53,7 +53,7 @@ def equivalence(data: ReportData) -> Figure:
         "difference [margins]",
         "",
         traces,
-        marks=[Mark(-1.0, "x", "−margin"), Mark(1.0, "x", "+margin"), Mark(0.0, "x")],
+        marks=[Mark(-1.0, "x"), Mark(1.0, "x"), Mark(0.0, "x")],
         y_ticks=names,
         x_range=(-reach, reach),
         y_range=(-0.6, len(tests) - 0.4),
@@ -74,7 +74,7 @@ def alignment(data: ReportData) -> Figure:
     response = pair.response
     panels = [
         Panel(
-            "hardware lags simulation by [ms]",
+            "lag of the hardware [ms]",
             "correlation [−]",
             [Trace(1e3 * response.lags, response.curve, "velocities", "hw")],
             marks=[Mark(1e3 * response.delay, "x", f"{1e3 * response.delay:.2f} ms")],
@@ -88,7 +88,7 @@ def alignment(data: ReportData) -> Figure:
         panels.insert(
             0,
             Panel(
-                "hardware lags simulation by [ms]",
+                "lag of the hardware [ms]",
                 "correlation [−]",
                 [Trace(1e3 * clock.lags, clock.curve, "disturbances", "noise")],
                 marks=[Mark(1e3 * clock.delay, "x", f"{1e3 * clock.delay:.2f} ms")],

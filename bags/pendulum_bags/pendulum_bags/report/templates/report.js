@@ -72,6 +72,10 @@
         layout.margin.r = 6;
         layout.font.size = 12;
         layout.dragmode = false; // a finger on a phone scrolls the page
+        for (const axis of Object.values(layout)) {
+          // Long names of rows would leave no room for the rows.
+          if (axis && axis.ticktext) axis.ticktext = axis.ticktext.map((name) => name.replace(/ (less the|difference|\(ratio)/, "<br>$1"));
+        }
         const names = data.filter((trace) => trace.showlegend).map((trace) => trace.name);
         const wide = names.reduce((sum, name) => sum + 52 + 6.5 * name.length, 0);
         const more = 19 * Math.max(0, Math.ceil(wide / (window.innerWidth - 70)) - 1);
