@@ -40,21 +40,21 @@ ARGUMENTS: tuple[Argument, ...] = (
     Argument(
         "plant",
         "sim",
-        "What to bring up: the simulator as /sim, the bridge to the emulated or the real X5-9 as /hw, or simulator "
-        "and emulator.",
+        "Plant to start: sim (simulator, as /sim), emulator or hebi (bridge to the emulated or the real X5-9, as "
+        "/hw), or both (simulator and emulator).",
         tuple(SIDES),
     ),
     Argument(
         "lab",
         "",
-        "Lab file, for plant:=hebi: which actuator it is, its zero, sign, limits and rate.",
+        "Lab file, for plant:=hebi: selects the actuator and sets its zero, sign, limits and rate.",
     ),
     Argument("controller", "lqr", "Controller of each plant.", (*CONTROLLERS, "none")),
     Argument(
         "controller_waits",
         "auto",
-        "Leave the controller inactive until it is activated; auto for a bridge whose pendulum does not start upright, "
-        "since a controller that already asks for torque keeps the bridge from being armed.",
+        "Leave the controller inactive until it is activated. auto does so for a bridge whose pendulum does not start "
+        "upright, because the bridge refuses to arm while a controller commands a large torque.",
         ("auto", *_YES_NO),
     ),
     Argument(
@@ -64,11 +64,11 @@ ARGUMENTS: tuple[Argument, ...] = (
         (*_KINDS, "none"),
     ),
     Argument("disturb_at_start", "false", "Start the disturbance with the first state instead.", _YES_NO),
-    Argument("seed", "1", "Seed of the disturbance; one seed, one torque."),
+    Argument("seed", "1", "Seed of the disturbance; the same seed gives the same torque."),
     Argument(
         "model",
         "thesis",
-        f"Preset ({PRESET_NAMES}) or plant file: what is simulated and what the controller is designed for.",
+        f"Preset ({PRESET_NAMES}) or plant file, for the simulation and for the design of the controller.",
     ),
     Argument("start", "bottom", "Where a simulated or emulated pendulum starts.", ("bottom", "top")),
     Argument("sim_rate", "500.0", "Rate of the simulator [Hz]."),

@@ -52,8 +52,8 @@ def _get_to_know(day: Day, *, whole: bool) -> None:
     day.run(
         f"{hw} scan --interface {day.network}",
         heading="Who is there",
-        words="Two modules of one name are on the network. `scan` sets nothing. It refuses to choose between twins "
-        "(exit code 1), and a module of another type.",
+        words="Two modules on the network have the same name. `scan` changes no setting. It refuses to choose "
+        "between two modules of one name (exit code 1), and refuses a module of another type.",
         code=1,
     )
     if whole:
@@ -62,8 +62,8 @@ def _get_to_know(day: Day, *, whole: bool) -> None:
     day.run(
         f"{hw} lab new lab.yaml --interface {day.network} --serial X5-9-00123 --effort 1",
         heading="The lab file",
-        words="It is written for that one module, with 1 N m as the largest torque for today. What the module was set "
-        "to before us is kept in HEBI's own files.",
+        words="The file is for this one module, with 1 N m as the largest torque for today. The backup keeps "
+        "the module's earlier settings in HEBI's own files.",
     )
     day.run(f"{hw} lab backup lab.yaml --out before_us")
     assert "<max_limit>inf" in (day.folder / "before_us" / "safety.xml").read_text()
@@ -91,7 +91,7 @@ def _prove_m_stop(day: Day) -> None:
     day.run(
         "pendulum_hw_bridge lab prove_m_stop lab.yaml",
         heading="Two proofs: motion stop and command lifetime",
-        words="The motor turns gently in both, for the first time.",
+        words="In both, the motor turns gently, for the first time.",
         person=day.presses_the_motion_stop,
     )
     assert day.truth.status()["strategy"] == Strategy.OFF
@@ -117,8 +117,8 @@ def _refuse(day: Day) -> None:
     day.run(
         f"{hw} check --lab lab.yaml --joint-offset 3.1 --no-nudge",
         heading="What check refuses",
-        words="A zero that is wrong, a sign that is wrong (the nudge tells), and a torque at rest that nothing "
-        "explains, here a sensor that has slipped (exit code 1 each).",
+        words="`check` refuses a wrong zero, a wrong sign (the nudge shows it), and a torque at rest that "
+        "nothing explains, here from a sensor that has slipped (exit code 1 each).",
         code=1,
         keep=wrong,
     )
@@ -137,9 +137,10 @@ def _check(day: Day) -> None:
     day.run(
         "pendulum_hw_bridge check --lab lab.yaml",
         heading="Check",
-        words="With the lab file as it is, but for two values, set by hand before: `e_stop_input_timeout` 1 s, for the "
-        "button below, and `feedback_watchdog` 10 periods instead of 3, for a computer that others use too. "
-        "You turn the link counter-clockwise when asked to.",
+        words="The lab file is the same, except for two values that were set by hand before: "
+        "`e_stop_input_timeout` 1 s, for the button below, and `feedback_watchdog` 10 periods instead of "
+        "3, because other programs use this computer too. You turn the link counter-clockwise when asked "
+        "to.",
         person=lambda program: day.turns(program, " COUNTER-CLOCKWISE"),
     )
 
@@ -150,9 +151,9 @@ def _drive(day: Day) -> None:
         day.run(
             f"{bags} 0.3 --namespace /hw",
             heading="A ramp at 1 N m, hold, e-stop",
-            words="In a second terminal; the bridge of the first one runs all the time, and what it said stands below. "
-            "The ramp is broken off by the e-stop (its service, as the console calls it); "
-            "then it is done again, and held.",
+            words="These commands run in a second terminal. The bridge runs in the first one all the time; its "
+            "output is below. The e-stop ends the first ramp (by its service, as the console calls it); "
+            "the second ramp is completed and held.",
             code=2,
             person=lambda program: _stops_in_the_ramp(day, button, program),
             said="e.stop",
@@ -165,8 +166,9 @@ def _drive(day: Day) -> None:
         day.run(
             f"{bags} reset --namespace /hw",
             heading="A button as e-stop",
-            words="`e_stop_input_timeout: 1 s` stands in the lab file, and a button says 20 times a second that it is "
-            "not pressed. It is pressed while the motor holds; later it falls silent, as with a cable pulled out.",
+            words="The lab file has `e_stop_input_timeout: 1 s`, and a button reports 20 times a second that it "
+            "is not pressed. Somebody presses it while the motor holds. Later it falls silent, as if its "
+            "cable were pulled out.",
         )
         for goal, pressed, told in ((0.4, True, "button is pressed"), (-0.2, None, "is silent for")):
             _hold(day, f"{bags} {goal} --namespace /hw", goal)
@@ -181,7 +183,7 @@ def _drive(day: Day) -> None:
         bridge.send_signal(signal.SIGINT)
         assert bridge.wait(30.0) == 0, bridge.output
         said = "".join(line for line in bridge.output.splitlines(keepends=True) if "[" in line)
-        words = "What the bridge said in its terminal, all the while; Ctrl-C at the end."
+        words = "This is the bridge's output in its terminal during all of this, until Ctrl-C."
         command = "python -m pendulum_hw_bridge bridge --ros-args -r __ns:=/hw -p lab_file:=lab.yaml"
         day.steps.append(Step("The bridge", words, command, day.tidy(said), 0))
     assert day.truth.status()["strategy"] == Strategy.OFF
@@ -230,7 +232,8 @@ def _leave(day: Day) -> None:
     day.run(
         f"{hw} lab restore lab.yaml before_us",
         heading="Give the module back as it was",
-        words="Gains, limits and M-stop action; the second backup shows that they are those of the first.",
+        words="This restores gains, limits and M-stop action; the second backup shows that they are those of "
+        "the first.",
         person=day.agrees,
     )
     day.run(f"{hw} lab backup lab.yaml --out after_us")

@@ -103,14 +103,14 @@ def _tests(data: ReportData) -> Table:
     sentence = (
         "Two one-sided tests each, intervals by block bootstrap. Ratios are hardware per simulation; "
         "distances are root mean "
-        f"squares, per standard deviation of the hardware's motion where they are in %. Held against "
+        f"squares, per standard deviation of the hardware's motion where they are in %. Compared with "
         f"{verdict.margins.whose}."
     )
     if looks := data.comparison.looks.number:
         often = "once" if looks == 1 else f"{looks} times"
         sentence += (
-            f" The data were looked at {often}, and might have been again, while more were recorded; the intervals are "
-            "wider for that, so that the answer errs no more often than one look would."
+            f" The experiment tested the data {often}, and could have tested more data after that. The intervals are "
+            "wider for this, so that all tests together are no more often wrong than a single one."
         )
     return Table("Tests against the margins", sentence, head, rows, "Verdict")
 

@@ -74,8 +74,8 @@ TERMS: Mapping[str, Term] = {
     "margin": Term(
         "margin",
         r"default margins?|margins?",
-        "The largest difference that does not matter for the purpose. It is a decision of whoever asks, not a result; "
-        "the default ones are those of this software.",
+        "The largest difference that does not matter for the purpose. You choose it; it is not a result. "
+        "The default margins are those of this software.",
     ),
     "smallest-margin": Term(
         "smallest margin that would hold",
@@ -103,12 +103,12 @@ TERMS: Mapping[str, Term] = {
     "less-delay": Term(
         "less the delay",
         r"less the delay|taken out",
-        "After one motion was shifted by the delay: what is left is not explained by lateness.",
+        "After one motion was shifted by the delay: the delay does not explain what is left.",
     ),
     "deadline": Term(
         "missed deadline",
         r"missed deadlines|deadlines were missed",
-        "A state that came later than its period allows. Missed deadlines tell of the computer, not of the pendulum.",
+        "A state that came later than its period allows. Missed deadlines reflect the computer's load, not the pendulum.",
     ),
     "held": Term(
         "noise sample held for",
@@ -118,10 +118,10 @@ TERMS: Mapping[str, Term] = {
     "effective": Term(
         "effective samples",
         r"effective samples?(?: sizes)?",
-        "Number of independent samples that would know the mean as well as these do: neighbours in time are alike, so "
+        "Number of independent samples that would determine the mean as accurately: successive samples are similar, so "
         "it is smaller than the number of samples.",
     ),
-    "fit": Term("fit", r"fits", "100 % is one curve; 0 % is no better than a constant at the mean."),
+    "fit": Term("fit", r"fits", "100 %: the curves are equal; 0 %: no better than a constant at the mean."),
     "correlation": Term(
         "correlation", r"correlation", "1: both rise and fall together; 0: unrelated; taken at a stated shift in time."
     ),
