@@ -54,7 +54,7 @@ ARGUMENTS: tuple[Argument, ...] = (
         "controller_waits",
         "auto",
         "Leave the controller inactive until it is activated. auto does so for a bridge whose pendulum does not start "
-        "upright, because the bridge refuses to arm while a controller commands a large torque.",
+        "upright, because the bridge refuses to arm while a controller commands more than 0.5 N m.",
         ("auto", *_YES_NO),
     ),
     Argument(

@@ -108,7 +108,7 @@ TERMS: Mapping[str, Term] = {
     "deadline": Term(
         "missed deadline",
         r"missed deadlines|deadlines were missed",
-        "A state that came later than its period allows. Missed deadlines reflect the computer's load, not the pendulum.",
+        "A state that came later than its period allows. It reflects the load of the computer, not the pendulum.",
     ),
     "held": Term(
         "noise sample held for",
