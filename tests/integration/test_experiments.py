@@ -111,7 +111,7 @@ def test_a_bridge_that_still_compiles_is_waited_for_as_long_as_any_start(
 
 def test_the_two_experiments_of_the_thesis_give_back_its_coefficients(tmp_path: Path) -> None:
     run_experiment("inertia_damping", "--out", tmp_path / "hand", "--trials", 3)
-    run_experiment("gravity", "--out", tmp_path / "stairs", "--trials", 1, "--step", 20, "--top", 60, "--hold", 1)
+    run_experiment("gravity", "--out", tmp_path / "stairs", "--trials", 1, "--step", 30, "--top", 60, "--hold", 0.5)
 
     hand = json.loads((tmp_path / "hand" / "identified.json").read_text())["intervals"]
     stairs = json.loads((tmp_path / "stairs" / "identified.json").read_text())["intervals"]
@@ -121,7 +121,7 @@ def test_the_two_experiments_of_the_thesis_give_back_its_coefficients(tmp_path: 
 
     bag = read_bag(tmp_path / "stairs" / "trial_1")
     steps = [event["name"] for event in bag.events() if event["name"] in {"dynamic", "static"}]
-    assert steps == ["dynamic", "static"] * 12
+    assert steps == ["dynamic", "static"] * 8
     quantities = bag["/hw/actuator/feedback"][0].message.name
     recorded = {"position", "velocity", "effort", "position_command", "velocity_command", "effort_command"}
     assert recorded | {"pwm_command", "motor_current", "winding_current"} <= set(quantities)
