@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import math
 import re
 import signal
-import sys
 from collections.abc import Iterator
 from contextlib import closing
 from pathlib import Path
@@ -14,12 +12,11 @@ import pytest
 
 from pendulum_msgs_py.plants.plant_parameters import load_plant, write_plant
 from pendulum_sim.model_files import mjcf
+from tests.integration.adopting import adopt, start_robot
 from tests.plant_peer import PlantPeer
 from tests.processes import ProcessGroup, RunningProgram
 
 pytest.importorskip("mujoco")
-
-ROBOT = Path(__file__).with_name("plain_plant.py")
 
 
 @pytest.fixture
@@ -30,17 +27,12 @@ def peer(domain_id: int) -> Iterator[PlantPeer]:
 
 @pytest.fixture
 def robot(processes: ProcessGroup, peer: PlantPeer) -> RunningProgram:
-    return processes.start_command([sys.executable, str(ROBOT)], name="robot")
+    return start_robot(processes)
 
 
 @pytest.fixture
 def adopter(processes: ProcessGroup, peer: PlantPeer, robot: RunningProgram) -> RunningProgram:
-    told = {
-        "states": "/robot/joint_states", "commands": "/robot/effort_controller/commands", "joint": "shoulder",
-        "command_index": 1, "command_size": 2, "sign": -1, "zero": -math.pi / 2.0, "state_timeout": 0.5,
-    }  # fmt: skip
-    arguments = [item for name, value in told.items() for item in ("-p", f"{name}:={value}")]
-    program = processes.start("pendulum_sim", "adopt", "--ros-args", "-r", "__ns:=/lab", *arguments)
+    program = adopt(processes, "/lab")
     peer.until(lambda: peer.states and peer.diagnostics.get("mode"), "the adopted plant")
     peer.leave_the_command()
     return program

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-from importlib.metadata import PackageNotFoundError, requires
 
 __all__ = ["extra_of", "how_to_install"]
 
@@ -29,6 +28,9 @@ def extra_of(module: str) -> str:
     Returns:
         Empty where no installed package of ours needs it.
     """
+    # Each program's start would pay for it, and few lack a library.
+    from importlib.metadata import PackageNotFoundError, requires
+
     top = module.partition(".")[0]
     wanted = {_plain(_DISTRIBUTIONS.get(top, top)), _plain(f"ros-{top}")}
     for package in _PACKAGES:
