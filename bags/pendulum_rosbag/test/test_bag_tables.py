@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pendulum_msgs_py.contract.cdr import encode_joint_state
+from pendulum_msgs_py.contract.cdr import encode_joint_state, encode_joints
 from pendulum_msgs_py.errors import BagError, DataError, ParameterError
 from pendulum_rosbag.reader import read_bag
 from pendulum_rosbag.reader.export_cli import main as export_main
@@ -134,7 +134,7 @@ def test_tables_have_the_columns_of_the_arrays(tmp_path: Path) -> None:
     assert list(to_pandas(bag, "/a").columns) == [
         "log_time_ns", "stamp_ns", "position", "velocity", "effort", "frame_id",
     ]  # fmt: skip
-    assert to_pandas(bag, "/many")["position"].tolist() == [[1.0, 2.0]]
+    assert to_pandas(bag, "/many")["position.q"].tolist() == [2.0]
     files = export_bag(bag, tmp_path / "csv", "csv")
     assert [file.name for file in files] == ["a.csv", "many.csv", "metadata.json"]
     assert files[0].read_text().splitlines()[1].startswith("1,1,1.5,,")
@@ -144,21 +144,21 @@ def test_tables_have_the_columns_of_the_arrays(tmp_path: Path) -> None:
         export_bag(bag, tmp_path / "csv", "csv")
 
 
-def multi_joint_bag(path: Path) -> Path:
-    """Write states of two joints with a hole, and messages whose lists are all empty."""
+def bag_of_lists(path: Path) -> Path:
+    """Write states of two joints without names, one with a hole, and messages whose lists are all empty."""
     array = STORE.types["diagnostic_msgs/msg/DiagnosticArray"]
     header, time = STORE.types["std_msgs/msg/Header"], STORE.types["builtin_interfaces/msg/Time"]
     empty = array(header(time(1, 2), ""), [])
     with open_writer(path) as writer:
         writer.add_topic("/many", JOINT_STATE)
         writer.add_topic("/diagnostics", array.__msgtype__)
-        writer.write("/many", 1, joint_state(2, "", ["p", "q"], [1.0, float("nan")], [], []))
+        writer.write("/many", 1, joint_state(2, "", [], [1.0, float("nan")], [], []))
         writer.write("/diagnostics", 1, bytes(STORE.serialize_cdr(empty, array.__msgtype__)))
     return path
 
 
 def test_lists_in_csv_are_json_that_every_parser_reads(tmp_path: Path) -> None:
-    bag = read_bag(multi_joint_bag(tmp_path / "bag"))
+    bag = read_bag(bag_of_lists(tmp_path / "bag"))
     export_bag(bag, tmp_path / "csv", "csv")
     with (tmp_path / "csv" / "many.csv").open(encoding="utf-8") as file:
         (row,) = csv.DictReader(file)
@@ -172,7 +172,7 @@ def test_lists_in_csv_are_json_that_every_parser_reads(tmp_path: Path) -> None:
 
 def test_lists_that_are_all_empty_keep_their_type_in_parquet(tmp_path: Path) -> None:
     parquet = pytest.importorskip("pyarrow.parquet", reason="pyarrow cannot be imported with this numpy")
-    bag = read_bag(multi_joint_bag(tmp_path / "bag"))
+    bag = read_bag(bag_of_lists(tmp_path / "bag"))
     export_bag(bag, tmp_path / "out")
     many = parquet.read_schema(tmp_path / "out" / "many.parquet")
     kinds = {name: str(many.field(name).type.value_type) for name in ("name", "position", "velocity", "effort")}
@@ -251,3 +251,23 @@ def test_the_commands_print_tables_json_and_sentences(tmp_path: Path, capsys: py
     assert capsys.readouterr().out.splitlines()[0].endswith("a.csv")
     assert info_main([str(tmp_path / "nothing")]) == 2
     assert "does not exist" in capsys.readouterr().err
+
+
+def test_several_joints_are_written_as_a_column_each_unless_messages_differ(tmp_path: Path) -> None:
+    for name, second in (("same", ("p", "q")), ("other", ("q", "p")), ("twice", ("p", "p"))):
+        with open_writer(tmp_path / name) as writer:
+            writer.add_topic("/robot/joint_states", JOINT_STATE)
+            first = second if name == "twice" else ("p", "q")
+            for index, joints in enumerate((first, second)):
+                data = encode_joints(index, "robot", joints, (1.0 + index, 2.0), (), (0.5, -0.5))
+                writer.write("/robot/joint_states", index, data)
+    table = to_pandas(read_bag(tmp_path / "same"), "/robot/joint_states")
+    assert table["position.p"].tolist() == [1.0, 2.0]
+    assert table["effort.q"].tolist() == [-0.5, -0.5]
+    assert table["velocity.q"].isna().all()
+    assert table["stamp_ns"].tolist() == [0, 1]
+    assert table["frame_id"].tolist() == ["robot", "robot"]
+    for name in ("other", "twice"):
+        assert to_pandas(read_bag(tmp_path / name), "/robot/joint_states")["position"].tolist()[1] == [2.0, 2.0]
+    with pytest.raises(DataError, match="export writes a column for each joint"):
+        read_bag(tmp_path / "same").array("/robot/joint_states")

@@ -125,9 +125,11 @@ class Bag(Mapping[str, Any]):
         """
         values = self[topic]
         if not isinstance(values, np.ndarray):
+            held = _held(self._topics[topic].info.type, values)
+            way_out = "; export writes a column for each joint" if " joints (" in held else ""
             raise DataError(
-                f"topic {topic} of bag {self.path} holds {_held(self._topics[topic].info.type, values)}; "
-                "expected sensor_msgs/msg/JointState of one joint"
+                f"topic {topic} of bag {self.path} holds {held}; "
+                f"expected sensor_msgs/msg/JointState of one joint{way_out}"
             )
         return values
 

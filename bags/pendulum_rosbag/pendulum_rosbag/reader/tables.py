@@ -5,12 +5,13 @@ from __future__ import annotations
 import dataclasses
 import json
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from pendulum_msgs_py.contract.values import NANOSECONDS
 from pendulum_msgs_py.errors import BagError, ParameterError
 from pendulum_msgs_py.programs.extras import how_to_install
 from pendulum_rosbag.reader.bag import Bag
@@ -21,11 +22,14 @@ if TYPE_CHECKING:
     import pandas as pd
     from rosbags.typesys.store import Typestore
 
+    from pendulum_rosbag.reader.topic_info import StoredMessage
+
 __all__ = ["FORMATS", "LEROBOT", "export_bag", "require_pyarrow", "to_pandas"]
 
 FORMATS = ("parquet", "csv")
 LEROBOT = "lerobot"
 """Format of :mod:`pendulum_rosbag.reader.lerobot`."""
+_JOINT_STATE = "sensor_msgs/msg/JointState"
 _ARROW_NAMES = {"bool": "bool_", "byte": "uint8", "char": "uint8", "octet": "uint8", "wstring": "string"}
 """Names of ROS's types at Arrow, where they differ."""
 
@@ -33,8 +37,9 @@ _ARROW_NAMES = {"bool": "bool_", "byte": "uint8", "char": "uint8", "octet": "uin
 def to_pandas(bag: Bag, topic: str) -> pd.DataFrame:
     """Return a topic as a table, one row a message, ordered by log time.
 
-    One-joint JointStates have the columns of the array (units as there). Messages of other types have a column for
-    each field, nested fields joined by dots, arrays as lists.
+    One-joint JointStates have the columns of the array (units as there), those of several joints a column for each
+    quantity and joint, such as ``position.elbow``, as long as all messages name the same joints. Messages of other
+    types have a column for each field, nested fields joined by dots, arrays as lists.
 
     Raises:
         DataError: The topic is missing or its messages cannot be read.
@@ -46,7 +51,26 @@ def to_pandas(bag: Bag, topic: str) -> pd.DataFrame:
         return pd.DataFrame({name: values[name] for name in values.dtype.names or ()})
     if not values:
         return pd.DataFrame({"log_time_ns": np.empty(0, np.int64)})
+    if bag.topics[topic].type == _JOINT_STATE and (columns := _joint_columns(values)):
+        return pd.DataFrame(columns)
     return pd.DataFrame([{"log_time_ns": stored.log_time_ns, **_flat(stored.message)} for stored in values])
+
+
+def _joint_columns(values: Sequence[StoredMessage]) -> dict[str, Any]:
+    """Return the columns of states of several joints; none where messages are not all of the same joints."""
+    messages = [stored.message for stored in values]
+    joints = [str(name) for name in messages[0].name]
+    if len(joints) < 2 or len(set(joints)) < len(joints) or any(list(one.name) != joints for one in messages):
+        return {}
+    stamps = [int(one.header.stamp.sec) * NANOSECONDS + int(one.header.stamp.nanosec) for one in messages]
+    columns: dict[str, Any] = {"log_time_ns": [stored.log_time_ns for stored in values], "stamp_ns": stamps}
+    absent = (math.nan,) * len(joints)
+    for quantity in ("position", "velocity", "effort"):
+        rows = [tuple(getattr(one, quantity)) or absent for one in messages]
+        if any(len(row) != len(joints) for row in rows):
+            return {}
+        columns |= {f"{quantity}.{name}": [row[index] for row in rows] for index, name in enumerate(joints)}
+    return {**columns, "frame_id": [one.header.frame_id for one in messages]}
 
 
 def export_bag(bag: Bag, folder: Path, format: str = "parquet") -> list[Path]:
