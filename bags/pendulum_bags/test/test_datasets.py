@@ -228,3 +228,23 @@ def test_a_hebi_log_that_cannot_be_read_is_told_by_the_program_that_reads_it(tmp
         read_recording(tmp_path / "hw.hebilog")
     with refused("expected the lab file of a HEBI log"):
         read_recording(tmp_path / "hw.hebilog", {"time": {"column": "t"}})
+
+
+def test_words_and_holes_in_columns_that_no_mapping_wants_are_no_matter(tmp_path):
+    path = tmp_path / "run.csv"
+    rows = [f'{t},"swing, free",{q},,{v},{v}' for t, q, v in zip(TIME, ANGLE, SPEED, strict=True)]
+    path.write_text("\n".join(["time,label,Position,gap,velocity,torque", *rows]) + "\n", encoding="utf-8")
+    np.testing.assert_allclose(read_csv(path).position, ANGLE)
+    path.write_text("time,label,position,torque\n0.0,a,1.0,0.0\n0.1,b,oops,0.0\n", encoding="utf-8")
+    with refused("line 3, column 'position' holds 'oops'; expected a number"):
+        read_csv(path)
+    path.write_text("time,label,position,torque\n0.0,a,1.0,0.0\n0.1,b,1.0\n", encoding="utf-8")
+    with refused("line 3 has 3 cells; expected 4"):
+        read_csv(path)
+
+
+def test_a_hole_in_a_column_that_no_mapping_wants_drops_no_row(tmp_path):
+    other = np.where(np.arange(TIME.size) % 2, np.nan, 1.0)
+    path = write(tmp_path / "run.csv", "time,position,other", TIME, ANGLE, other)
+    columns = {name: {"column": name, "unit": unit} for name, unit in (("time", "s"), ("position", "rad"))}
+    assert read_csv(path, {**columns, "drop_nan": True}).time.size == TIME.size

@@ -21,7 +21,7 @@ from __future__ import annotations
 import csv
 import io
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -101,7 +101,8 @@ def read_csv(
     skip = rules.get("skip", 0)
     if type(skip) is not int or skip < 0:
         raise DataError(f"{origin}: skip is {skip!r}; expected a number of lines before the header, >= 0")
-    names, table = _read_table(source, delimiter, skip)
+    wanted = _wanted_columns(rules)
+    names, table = _read_table(source, delimiter, skip, wanted)
     first, last = _row_range(rules, len(table), origin)
     table = table[first:last]
     given = rules.get("meta") or {}
@@ -111,7 +112,7 @@ def read_csv(
     if first or last < len(table) + first:
         meta["rows"] = [first, last]
     if rules.get("drop_nan") is True:
-        whole = np.isfinite(table).all(axis=1)
+        whole = np.isfinite(table[:, [name.casefold() in wanted for name in names]]).all(axis=1)
         meta["nan_rows"] = int(np.sum(~whole))
         table = table[whole]
     time = _time(rules["time"], names, table, source, origin, first)
@@ -180,7 +181,17 @@ def _detrended(values: Array, detrend: Any, origin: str) -> Array:
     return np.asarray(scipy.signal.detrend(values, type=detrend))
 
 
-def _read_table(source: Path, delimiter: str, skip: int) -> tuple[list[str], Array]:
+def _wanted_columns(rules: Mapping[str, Any]) -> set[str]:
+    """Return the columns that a mapping may take, in small letters: what stands in others is not its business."""
+    columns: list[Any] = []
+    for key in _SECTION_KEYS:
+        named = rules[key].get("column") if key in rules else None
+        columns += named if isinstance(named, (list, tuple)) else [named]
+    return {column.casefold() for column in columns if isinstance(column, str)}
+
+
+def _read_table(source: Path, delimiter: str, skip: int, wanted: set[str]) -> tuple[list[str], Array]:
+    """Return the names of all columns and their numbers, NaN for words in columns that nobody wants."""
     try:
         text = source.read_text(encoding="utf-8-sig")
     except (OSError, UnicodeDecodeError) as error:
@@ -210,7 +221,14 @@ def _read_table(source: Path, delimiter: str, skip: int) -> tuple[list[str], Arr
     try:
         table = np.loadtxt(io.StringIO(body), delimiter=delimiter, ndmin=2)
     except ValueError as error:
-        raise DataError(f"{source}: {_first_bad_cell(body, names, delimiter, skip) or error}") from error
+        used = [index for index, name in enumerate(names) if name.casefold() in wanted]
+        if bad := _first_bad_cell(body, names, delimiter, skip, used):
+            raise DataError(f"{source}: {bad}") from error
+        if not used:
+            raise DataError(f"{source}: {error}") from error
+        rows = [row for row in csv.reader(io.StringIO(body), delimiter=delimiter) if row]
+        table = np.full((len(rows), len(names)), np.nan)
+        table[:, used] = [[float(row[index]) for index in used] for row in rows]
     if table.size == 0:
         raise DataError(f"{source} has no rows below its header")
     if table.shape[1] != len(names):
@@ -218,7 +236,7 @@ def _read_table(source: Path, delimiter: str, skip: int) -> tuple[list[str], Arr
     return names, table
 
 
-def _first_bad_cell(body: str, names: list[str], delimiter: str, skip: int) -> str | None:
+def _first_bad_cell(body: str, names: list[str], delimiter: str, skip: int, used: Sequence[int]) -> str | None:
     for number, line in enumerate(io.StringIO(body), start=2 + skip):
         try:
             row = next(csv.reader([line], delimiter=delimiter), [])
@@ -228,9 +246,9 @@ def _first_bad_cell(body: str, names: list[str], delimiter: str, skip: int) -> s
             continue
         if len(row) != len(names):
             return f"line {number} has {len(row)} cells; expected {len(names)} ({', '.join(names)})"
-        for name, cell in zip(names, row, strict=True):
-            if not _is_number(cell):
-                return f"line {number}, column {name!r} holds {cell.strip()!r}; expected a number"
+        for index in used:
+            if not _is_number(row[index]):
+                return f"line {number}, column {names[index]!r} holds {row[index].strip()!r}; expected a number"
     return None
 
 
