@@ -248,3 +248,14 @@ def test_a_hole_in_a_column_that_no_mapping_wants_drops_no_row(tmp_path):
     path = write(tmp_path / "run.csv", "time,position,other", TIME, ANGLE, other)
     columns = {name: {"column": name, "unit": unit} for name, unit in (("time", "s"), ("position", "rad"))}
     assert read_csv(path, {**columns, "drop_nan": True}).time.size == TIME.size
+
+
+def test_who_has_other_columns_is_told_of_mapping_files_unless_one_asked_for_them(tmp_path):
+    path = write(tmp_path / "run.csv", "t,theta", TIME, ANGLE)
+    with refused(
+        "has no column 'time' for time (asked for by built-in mapping 'pendulum'); it has t, theta; `--mapping FILE`"
+    ):
+        read_csv(path)
+    with pytest.raises(DataError) as caught:
+        read_csv(path, {"time": {"column": "s", "unit": "s"}, "position": {"column": "q", "unit": "rad"}})
+    assert "--mapping" not in str(caught.value)

@@ -134,7 +134,7 @@ def test_tables_have_the_columns_of_the_arrays(tmp_path: Path) -> None:
     assert list(to_pandas(bag, "/a").columns) == [
         "log_time_ns", "stamp_ns", "position", "velocity", "effort", "frame_id",
     ]  # fmt: skip
-    assert to_pandas(bag, "/many")["position.q"].tolist() == [2.0]
+    assert to_pandas(bag, "/many")["q.position"].tolist() == [2.0]
     files = export_bag(bag, tmp_path / "csv", "csv")
     assert [file.name for file in files] == ["a.csv", "many.csv", "metadata.json"]
     assert files[0].read_text().splitlines()[1].startswith("1,1,1.5,,")
@@ -262,9 +262,9 @@ def test_several_joints_are_written_as_a_column_each_unless_messages_differ(tmp_
                 data = encode_joints(index, "robot", joints, (1.0 + index, 2.0), (), (0.5, -0.5))
                 writer.write("/robot/joint_states", index, data)
     table = to_pandas(read_bag(tmp_path / "same"), "/robot/joint_states")
-    assert table["position.p"].tolist() == [1.0, 2.0]
-    assert table["effort.q"].tolist() == [-0.5, -0.5]
-    assert table["velocity.q"].isna().all()
+    assert table["p.position"].tolist() == [1.0, 2.0]
+    assert table["q.effort"].tolist() == [-0.5, -0.5]
+    assert table["q.velocity"].isna().all()
     assert table["stamp_ns"].tolist() == [0, 1]
     assert table["frame_id"].tolist() == ["robot", "robot"]
     for name in ("other", "twice"):

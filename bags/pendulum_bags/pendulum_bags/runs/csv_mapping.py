@@ -309,6 +309,7 @@ def _column(
         raise DataError(
             f"{source} has no column {' or '.join(map(repr, candidates)) or '(none given)'} for {name} "
             f"(asked for by {origin}); it has {', '.join(names)}"
+            + ("; `--mapping FILE` names yours" if origin.startswith("built-in") else "")
             + ("; `--mapping free_swing` reads a pendulum that nothing drives" if name == "input" else "")
         )
     factor = _factor(name, section, quantity, origin)

@@ -38,7 +38,7 @@ def to_pandas(bag: Bag, topic: str) -> pd.DataFrame:
     """Return a topic as a table, one row a message, ordered by log time.
 
     One-joint JointStates have the columns of the array (units as there), those of several joints a column for each
-    quantity and joint, such as ``position.elbow``, as long as all messages name the same joints. Messages of other
+    quantity and joint, such as ``elbow.position``, as long as all messages name the same joints. Messages of other
     types have a column for each field, nested fields joined by dots, arrays as lists.
 
     Raises:
@@ -69,7 +69,7 @@ def _joint_columns(values: Sequence[StoredMessage]) -> dict[str, Any]:
         rows = [tuple(getattr(one, quantity)) or absent for one in messages]
         if any(len(row) != len(joints) for row in rows):
             return {}
-        columns |= {f"{quantity}.{name}": [row[index] for row in rows] for index, name in enumerate(joints)}
+        columns |= {f"{name}.{quantity}": [row[index] for row in rows] for index, name in enumerate(joints)}
     return {**columns, "frame_id": [one.header.frame_id for one in messages]}
 
 
