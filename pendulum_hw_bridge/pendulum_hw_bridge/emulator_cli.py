@@ -1,4 +1,4 @@
-"""``emulator``: emulate one X5-9; ``emulator_fault``: inject one fault; ``emulator_hand``: turn its link by hand."""
+"""``emulator``: emulate an X5-9; ``emulator_fault``: let the emulator fail; ``emulator_hand``: turn its link by hand."""
 
 from __future__ import annotations
 

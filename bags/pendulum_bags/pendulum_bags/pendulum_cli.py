@@ -1,4 +1,4 @@
-"""``pendulum``: every program of the project behind one name, listed by what one wants to know or do."""
+"""``pendulum``: start any program of the project by its name, listed by purpose."""
 
 from __future__ import annotations
 

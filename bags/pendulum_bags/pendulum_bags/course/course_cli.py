@@ -1,4 +1,4 @@
-"""``course``: six exercises from a seed, and a check for each that says right or wrong."""
+"""``course``: make six exercises from a seed, and check each answer."""
 
 from __future__ import annotations
 

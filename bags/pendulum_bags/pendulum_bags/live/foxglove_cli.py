@@ -1,4 +1,4 @@
-"""``foxglove``: the plants of a ROS domain live in Foxglove and Lichtblick, with parameters, arming and e-stop."""
+"""``foxglove``: show and stop the plants of a ROS domain live in Foxglove and Lichtblick."""
 
 from __future__ import annotations
 
