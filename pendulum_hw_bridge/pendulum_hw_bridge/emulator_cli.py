@@ -1,4 +1,4 @@
-"""``emulator``: emulate an X5-9; ``emulator_fault``: let the emulator fail; ``emulator_hand``: turn its link by hand."""
+"""``emulator``: emulate an X5-9; ``emulator_fault``: let the emulator fail; ``emulator_hand``: turn its link."""
 
 from __future__ import annotations
 

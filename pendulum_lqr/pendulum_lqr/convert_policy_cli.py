@@ -1,4 +1,4 @@
-"""``python -m pendulum_lqr convert_policy``: convert policies to ONNX, and actors of Stable-Baselines3 to policy files."""
+"""``python -m pendulum_lqr convert_policy``: convert policies to ONNX, or from Stable-Baselines3 to policy files."""
 
 from __future__ import annotations
 
