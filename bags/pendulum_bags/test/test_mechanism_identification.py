@@ -264,3 +264,22 @@ def test_a_real_double_pendulum_is_predicted_far_better_than_by_its_published_pa
     ours, published = (float(np.sqrt(np.mean(scores(m, held_out)[0] ** 2))) for m in (found.model, model))
     assert published > 0.03
     assert ours < 0.7 * published
+
+
+def test_a_hole_in_one_joints_column_leaves_its_row_out_for_all_joints(tmp_path):
+    coordinates = truth("double_pendulum").coordinates
+    rows = np.arange(40.0)
+    columns = {"time": 0.01 * rows}
+    for index, name in enumerate(coordinates.names):
+        angle = 0.5 * np.sin(0.2 * rows + index)
+        angle[[5, 9][index]] = np.nan
+        columns |= {f"{name}.position": angle}
+        if index in coordinates.driven:
+            columns |= {f"{name}.effort": rows}
+    path = tmp_path / "run.csv"
+    np.savetxt(path, np.column_stack([*columns.values()]), delimiter=",", header=",".join(columns), comments="")
+    read = read_joints(path, coordinates)
+    kept = np.delete(np.arange(40), [5, 9])
+    np.testing.assert_allclose(read.time, 0.01 * kept)
+    for index in range(len(coordinates.names)):
+        np.testing.assert_allclose(read.position[:, index], 0.5 * np.sin(0.2 * kept + index))

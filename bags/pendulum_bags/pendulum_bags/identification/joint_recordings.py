@@ -115,6 +115,12 @@ def read_joints(path: str | Path, coordinates: Coordinates, mapping: str | Path 
     rules, origin = _rules(coordinates, mapping)
     common = {key: value for key, value in rules.items() if key not in {"format", "joints"}}
     parts: list[Recording] = []
+    # A row with a hole in one joint's column is left out for all joints: their rows must stay those of one moment.
+    others = [
+        {**section, "input": section.get("effort")}
+        for section in rules["joints"].values()
+        if isinstance(section, Mapping)
+    ]
     for index, joint in enumerate(coordinates.joints):
         section = require_mapping(rules["joints"][joint.name], f"{origin}: joints.{joint.name}")
         reject_unknown(section, ("position", "velocity", "effort"), where=f"{origin}: joints.{joint.name}")
@@ -132,7 +138,7 @@ def read_joints(path: str | Path, coordinates: Coordinates, mapping: str | Path 
                 "column of its torque or force"
             )
         scale = _force(own, joint.effort_unit)
-        part = read_csv(source, {**common, "drop_nan": True, **own})
+        part = read_csv(source, {**common, "drop_nan": True, **own}, also=others)
         if part.input_kind not in {"effort", "none"}:
             raise DataError(
                 f"{origin}: the input of {joint.name} is a {part.input_kind}; expected an effort in {joint.effort_unit}"

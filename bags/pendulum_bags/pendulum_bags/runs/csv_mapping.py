@@ -21,7 +21,7 @@ from __future__ import annotations
 import csv
 import io
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -81,7 +81,11 @@ _TOP_KEYS = {"format", "delimiter", "skip", "rows", "drop_nan", "meta", *_SECTIO
 
 
 def read_csv(
-    path: str | Path, mapping: str | Path | Mapping[str, Any] | None = None, *, hold: str | None = None
+    path: str | Path,
+    mapping: str | Path | Mapping[str, Any] | None = None,
+    *,
+    hold: str | None = None,
+    also: Iterable[Mapping[str, Any]] = (),
 ) -> Recording:
     """Read a CSV file into a recording.
 
@@ -89,6 +93,7 @@ def read_csv(
         path: The file; its first line names the columns, with or without a leading ``#``.
         mapping: Mapping file, name of one of ``MAPPINGS``, or the mapping itself.
         hold: ``zero`` or ``linear``, in place of what the mapping says of the input.
+        also: Mappings of what is read from the same rows besides; a hole there is one for ``drop_nan``, too.
 
     Raises:
         DataError: naming file, column, row and what was expected.
@@ -101,7 +106,7 @@ def read_csv(
     skip = rules.get("skip", 0)
     if type(skip) is not int or skip < 0:
         raise DataError(f"{origin}: skip is {skip!r}; expected a number of lines before the header, >= 0")
-    wanted = _wanted_columns(rules)
+    wanted = set().union(*(_wanted_columns(one) for one in (rules, *also)))
     names, table = _read_table(source, delimiter, skip, wanted)
     first, last = _row_range(rules, len(table), origin)
     table = table[first:last]
@@ -185,7 +190,8 @@ def _wanted_columns(rules: Mapping[str, Any]) -> set[str]:
     """Return the columns that a mapping may take, in small letters: what stands in others is not its business."""
     columns: list[Any] = []
     for key in _SECTION_KEYS:
-        named = rules[key].get("column") if key in rules else None
+        section = rules.get(key)
+        named = section.get("column") if isinstance(section, Mapping) else None
         columns += named if isinstance(named, (list, tuple)) else [named]
     return {column.casefold() for column in columns if isinstance(column, str)}
 
