@@ -67,7 +67,8 @@ def test_what_is_not_finite_is_left_out_because_no_page_could_read_it() -> None:
 def test_a_state_of_other_joints_replaces_those_and_half_a_state_says_nothing() -> None:
     values = JointValues()
     values.take_state(_state(ACROBOT, 3.0, 0.1))
-    values.take_state(JointStateFields(9, "", ("hip",), (), (), ()))
+    for position in ((), (1.0,)):
+        values.take_state(JointStateFields(9, "", ("hip",), position, (), ()))
     assert values.stamp_ns == 7
     values.take_state(_state(("hip",), 1.0))
     assert [joint["name"] for joint in values.picture(0.0)["joints"]] == ["hip"]

@@ -271,3 +271,10 @@ def test_several_joints_are_written_as_a_column_each_unless_messages_differ(tmp_
         assert to_pandas(read_bag(tmp_path / name), "/robot/joint_states")["position"].tolist()[1] == [2.0, 2.0]
     with pytest.raises(DataError, match="export writes a column for each joint"):
         read_bag(tmp_path / "same").array("/robot/joint_states")
+
+
+def test_states_with_fewer_values_than_joints_stay_lists(tmp_path: Path) -> None:
+    with open_writer(tmp_path / "bag") as writer:
+        writer.add_topic("/many", JOINT_STATE)
+        writer.write("/many", 1, joint_state(2, "", ["p", "q"], [1.0], [], []))
+    assert to_pandas(read_bag(tmp_path / "bag"), "/many")["position"].tolist() == [[1.0]]
