@@ -1,4 +1,4 @@
-"""``emulator``: emulate an X5-9; ``emulator_fault``: let the emulator fail; ``emulator_hand``: turn its link."""
+"""``emulator``: emulate the X5-9; ``emulator_fault``: let the emulator fail; ``emulator_hand``: turn the link a bit."""
 
 from __future__ import annotations
 

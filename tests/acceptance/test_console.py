@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import re
 import shutil
 import socket
 import subprocess
@@ -211,28 +212,29 @@ def test_joints_and_controllers_are_chosen_for_each_plant(browser: Any, address:
     shown = "[pendulumConsole.plants['/robot'].goal, pendulumConsole.plants['/sim'].goal]"
     assert page.evaluate(shown) == [math.pi, math.pi]
     joints.select_option("elbow")
-    wait_for(lambda: page.evaluate(shown) == [0.0, math.pi], 10, "the elbow's values")
+    wait_for(lambda: page.evaluate(shown) == [0.0, math.pi], 60, "the elbow's values")
 
     # What runs already is not doubled.
     page.get_by_role("button", name="Start controller /sim").click()
-    page.locator(".q-notification", has_text="/sim/controller (lqr) is there already").wait_for(timeout=10_000)
+    already = re.compile(r"/sim/controller \(.+\) is there already")
+    page.locator(".q-notification", has_text=already).wait_for(timeout=60_000)
 
     # A plant of several joints is offered what can hold it; what is started waits until it is activated.
     robot = page.locator("[data-card='/robot']")
     robot.get_by_role("combobox").click()
-    wait_for(lambda: page.locator(".q-menu [role=option]").all_inner_texts() == ["lqr", "tvlqr"], 10, "the controllers")
+    wait_for(lambda: page.locator(".q-menu [role=option]").all_inner_texts() == ["lqr", "tvlqr"], 60, "the controllers")
     page.locator(".q-menu [role=option]").first.click()
     page.get_by_role("button", name="Start controller /robot").click()
     robot.get_by_text("lqr: inactive").wait_for(timeout=60_000)
     weights = page.locator("input[aria-label='q of /robot']")
-    wait_for(lambda: weights.input_value() == "10, 10, 1, 1", 20, "its own parameters")
+    wait_for(lambda: weights.input_value() == "10, 10, 1, 1", 60, "its own parameters")
     page.get_by_role("button", name="Activate controller /robot", exact=True).click()
-    robot.get_by_text("lqr: answering").wait_for(timeout=20_000)
+    robot.get_by_text("lqr: answering").wait_for(timeout=60_000)
     page.get_by_role("button", name="Deactivate controller /robot", exact=True).click()
-    robot.get_by_text("lqr: inactive").wait_for(timeout=20_000)
+    robot.get_by_text("lqr: inactive").wait_for(timeout=60_000)
     page.get_by_role("button", name="End controller /robot", exact=True).click()
-    robot.get_by_text("no controller").wait_for(timeout=20_000)
-    weights.wait_for(state="detached", timeout=20_000)
+    robot.get_by_text("no controller").wait_for(timeout=60_000)
+    weights.wait_for(state="detached", timeout=60_000)
 
 
 def test_the_page_doubts_a_silent_server_and_gives_its_orders_to_the_next() -> None:

@@ -240,6 +240,11 @@ class Hub:
         """Arm or disarm a plant; raise a FaultError with its reason where it refuses."""
         return _accepted(node, await self._call(SetBool, f"{node}/arm", SetBool.Request(data=on)))
 
+    def has_node(self, node: str) -> bool:
+        """Tell whether a node is on the graph, by its full name."""
+        found = self._node.get_node_names_and_namespaces()
+        return any(f"{space.rstrip('/')}/{name}" == node for name, space in found)
+
     def said(self, node: str) -> str:
         """Return what a node said of itself last; nothing once it is silent."""
         with self._lock:

@@ -105,10 +105,11 @@ class ControllerChoice:
         return work
 
     async def _try(self) -> str:
-        running = self._graph.parameters.get(self._controller)
-        if running:
+        # On the graph before its parameters are known: two controllers of one name would end all torque.
+        if self._graph.has_node(self._controller):
+            kind = self._graph.parameters.get(self._controller, {}).get("controller", "of a kind that is not known yet")
             raise FaultError(
-                f"{self._controller} ({running.get('controller', 'of another kind')}) is there already; expected none: "
+                f"{self._controller} ({kind}) is there already; expected none: "
                 "end it, or, if it was not started here, the program that runs it"
             )
         self._jobs.control(self._space, str(self._kind.value), self._plant)

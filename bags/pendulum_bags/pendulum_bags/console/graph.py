@@ -50,6 +50,9 @@ class Graph(Protocol):
     async def arm(self, node: str, *, on: bool) -> str:
         """Arm or disarm a plant."""
 
+    def has_node(self, node: str) -> bool:
+        """Tell whether a node is on the graph, by its full name."""
+
     def said(self, node: str) -> str:
         """Return what a node said of itself last, in words; empty once it is silent."""
 
