@@ -92,7 +92,10 @@ def test_a_state_of_several_joints_is_believed_in_full_and_in_order_or_not_at_al
 def test_a_state_of_several_joints_is_none_of_the_pendulum() -> None:
     data = encode_joints(1, "", _NAMES, (1.0, 2.0), (3.0, 4.0))
     assert convert.sample_from_bytes(data) is None
-    assert convert.effort_from_bytes(encode_joints(1, "", _NAMES, (), (), (1.0, 2.0))) is None
+    shown = convert.fields_from_bytes(encode_joints(1, "", _NAMES, (), (), (1.0, 2.0)))
+    assert shown is not None
+    assert (shown.joints, shown.effort) == (_NAMES, (1.0, 2.0))
+    assert convert.fields_from_bytes(b"no message") is None
 
 
 # --- the gate --------------------------------------------------------------------------------------------------
