@@ -28,14 +28,15 @@ class Log:
 
     def __init__(self, count: int = 200, modules: int = 1, *, clock: bool = True) -> None:
         self.number_of_modules = modules
+        # One for all: hebi-py's library does not come back from the release of one group in thousands.
+        self._group = util.create_imitation_group(modules)
         self.feedback_iterate = [self._record(step, clock=clock) for step in range(count)]
 
     def _record(self, step: int, *, clock: bool) -> Any:
-        group = util.create_imitation_group(self.number_of_modules)
         command = hebi.GroupCommand(self.number_of_modules)
         command.position, command.velocity, command.effort = 0.01 * step, 1.0, 0.1 * step
-        group.send_command(command)
-        record = group.get_next_feedback(20)
+        self._group.send_command(command)
+        record = self._group.get_next_feedback(20)
         values = {name: np.array(getattr(record, name)) for name in ATTRIBUTES.values()}
         hardware = 5_000_000 + 10_000 * step if clock else 0
         times = {"hardware_transmit_time_us": hardware, "receive_time_us": 9_000_000 + 10_000 * step + 300 * (step % 3)}
