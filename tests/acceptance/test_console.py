@@ -203,6 +203,7 @@ def test_axe_finds_nothing_that_keeps_anybody_out(browser: Any, address: str, tm
     assert not problems, "\n".join(problems)
 
 
+@pytest.mark.usefixtures("simulator")
 def test_joints_and_controllers_are_chosen_for_each_plant(browser: Any, address: str, processes: ProcessGroup) -> None:
     processes.start("pendulum_sim", "simulator", "--ros-args", "-r", "__ns:=/robot", "-p", "plant:=acrobot")
     page = _open(browser, address)
