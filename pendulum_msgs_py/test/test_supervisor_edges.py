@@ -347,6 +347,13 @@ def test_a_command_just_as_far_from_what_holds_as_allowed_is_judged_with_the_dis
     assert plant.supervisor.mode is Mode.POSITION
 
 
+def test_a_disturbance_does_not_outweigh_a_command_that_is_too_far_by_itself() -> None:
+    plant = Plant(handover_effort=2.0, handover_sum=2.0)
+    plant.follow(_hold(0.1))
+    plant.run(150, 4.0, disturbance=-4.0)
+    assert plant.supervisor.mode is Mode.POSITION
+
+
 def test_a_disturbance_that_has_fallen_silent_keeps_nobody_from_taking_over() -> None:
     plant = Plant(handover_sum=2.0)
     plant.follow(_hold(0.1))
