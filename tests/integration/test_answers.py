@@ -7,6 +7,7 @@ import warnings
 from collections.abc import Iterator
 
 import pytest
+from rcl_interfaces.msg import Parameter, ParameterValue
 from rcl_interfaces.srv import SetParameters
 from rclpy.client import Client
 from rclpy.experimental import EventsExecutor
@@ -177,3 +178,37 @@ def test_a_node_without_a_timer_answers_where_its_owner_attends_to_it(
     finally:
         node.destroy_node()
         peer.close()
+
+
+def test_a_request_that_nobody_understands_gets_an_empty_answer_and_the_next_is_served(
+    server: GraphPeer, domain_id: int
+) -> None:
+    server.node.declare_parameter("a", 1.0)
+    peer = GraphPeer("asker", domain=domain_id)
+    client = client_of(peer)
+    # A parameter of no known type, and one of a type that is known.
+    for kind, answers in ((99, []), (3, [True])):
+        value = ParameterValue(type=kind, double_value=2.0)
+        future = client.call_async(SetParameters.Request(parameters=[Parameter(name="a", value=value)]))
+        until_done(server, peer, future, f"the answer to a parameter of type {kind}")
+        assert [each.successful for each in future.result().results] == answers
+    assert server.node.get_parameter("a").value == 2.0
+    peer.close()
+
+
+def test_a_fault_in_a_service_of_the_node_itself_ends_it(domain_id: int) -> None:
+    server = GraphPeer("server", domain=domain_id, make_executor=EventsExecutor)
+
+    def fail(_request: Trigger.Request, _response: Trigger.Response) -> Trigger.Response:
+        raise RuntimeError("the file of the recording is gone")
+
+    server.node.create_service(Trigger, "~/fail", fail)
+    answer_who_listens(server.node)
+    peer = GraphPeer("asker", domain=domain_id)
+    client = peer.node.create_client(Trigger, "/server/fail")
+    peer.until(client.service_is_ready, "the service")
+    future = client.call_async(Trigger.Request())
+    with pytest.raises(RuntimeError, match="the file of the recording is gone"):
+        until_done(server, peer, future, "the fault")
+    peer.close()
+    server.close()

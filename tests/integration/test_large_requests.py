@@ -114,16 +114,3 @@ def test_where_the_library_of_ros_is_not_as_expected_requests_are_taken_as_rclpy
     future = client_of(peer).call_async(of_names(10))
     peer.until(future.done, "the answer")
     assert [each.successful for each in future.result().results] == [True, False]
-
-
-def test_a_request_that_nobody_understands_gets_an_empty_answer_and_the_next_is_served(
-    peer: GraphPeer, node: PollingNode
-) -> None:
-    client = client_of(peer)
-    strange = Parameter(name="a", value=ParameterValue(type=99))
-    future = client.call_async(SetParameters.Request(parameters=[strange]))
-    peer.until(future.done, "the answer to a parameter of no known type")
-    assert list(future.result().results) == []
-    future = client.call_async(of_names(10))
-    peer.until(future.done, "the next answer")
-    assert node.get_parameter("a").value == 2.0

@@ -1,8 +1,9 @@
-"""Answers of services that wait for nobody: a client that has gone must not hold up the process that serves it.
+"""Answers of services that neither wait for a client that has gone nor end the process that serves it.
 
 Where the client's half of a service is not there, rmw_fastrtps waits 100 ms for it before each answer, and rclpy holds
 Python's lock all the while: no thread of the process runs, neither an actuator's nor an e-stop's. A client that ended
-with a thousand requests unread stopped a plant for 100 s.
+with a thousand requests unread stopped a plant for 100 s. What rclpy's own services do not understand, such as a
+parameter of no known type, leaves their callbacks as an exception, and would end the node of a plant with its e-stop.
 """
 
 from __future__ import annotations
@@ -36,9 +37,30 @@ _FARTHEST = 100
 
 
 def answer_who_listens(node: Node) -> None:
-    """Let each service of a node send its answers to clients that are there; call it once all services are made."""
+    """Let each service of a node send its answers to clients that are there; call it once all services are made.
+
+    An exception of a service that rclpy makes itself is logged and answered with nothing; one of a node's own service
+    is a fault, and ends it as any other.
+    """
     for service in node.services:
         service.send_response = _Answers(node, service).send
+        if getattr(service.callback, "__module__", "").startswith("rclpy."):
+            service.callback = _answer_or_nothing(node, service, service.callback)
+
+
+def _answer_or_nothing(node: Node, service: Service, answer: Callable[[Any, Any], Any]) -> Callable[[Any, Any], Any]:
+    def guarded(request: Any, response: Any) -> Any:
+        try:
+            return answer(request, response)
+        # Of any kind: rclpy converts what it was sent before it looks at it.
+        except Exception as error:  # noqa: BLE001
+            node.get_logger().error(
+                f"request to {service.srv_name} is answered empty: {type(error).__name__}: {error}",
+                throttle_duration_sec=1.0,
+            )
+            return service.srv_type.Response()
+
+    return guarded
 
 
 class _Answers:

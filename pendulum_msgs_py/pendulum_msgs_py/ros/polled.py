@@ -157,15 +157,7 @@ class PollingNode(Node):
                 throttle_duration_sec=1.0,
             )
         else:
-            try:
-                response = service.callback(request, response)
-            # What rclpy does not understand, such as a parameter of no known type, must not end a plant and its e-stop.
-            except Exception as error:  # noqa: BLE001
-                self.get_logger().error(
-                    f"request to {service.srv_name} is answered empty: {type(error).__name__}: {error}",
-                    throttle_duration_sec=1.0,
-                )
-                response = service.srv_type.Response()
+            response = service.callback(request, response)
         service.send_response(response, header)
         return True
 
