@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from pendulum_bags.console.console_node import main
-from pendulum_bags.console.jobs import Jobs
+from pendulum_bags.console.jobs import Jobs, NewestPage
 
 
 def test_the_newest_page_of_a_kind_is_found_among_all_runs(tmp_path: Path) -> None:
@@ -21,6 +21,23 @@ def test_the_newest_page_of_a_kind_is_found_among_all_runs(tmp_path: Path) -> No
         os.utime(page, (written, written))
     assert jobs.newest("frequency_response.html") == tmp_path / "a_last"
     assert Jobs(tmp_path / "missing").newest("frequency_response.html") is None
+
+
+def test_the_newest_page_has_changed_when_it_is_another_or_was_written_again_or_has_gone(tmp_path: Path) -> None:
+    newest = NewestPage(Jobs(tmp_path), "summary.json")
+    assert not newest.changed()
+    pages = [tmp_path / name / "summary.json" for name in ("first", "second")]
+    for written, page in ((100.0, pages[0]), (200.0, pages[1]), (300.0, pages[0])):
+        page.parent.mkdir(exist_ok=True)
+        page.touch()
+        os.utime(page, (written, written))
+        assert newest.changed()
+        assert not newest.changed()
+        assert (newest.folder, newest.written) == (page.parent, written)
+    for page in pages:
+        page.unlink()
+    assert newest.changed()
+    assert newest.folder is None
 
 
 def test_a_port_that_is_taken_is_refused_before_anything_starts(

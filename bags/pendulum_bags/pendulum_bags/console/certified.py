@@ -6,7 +6,7 @@ from pathlib import Path
 
 from nicegui import ui
 
-from pendulum_bags.console.jobs import Jobs
+from pendulum_bags.console.jobs import Jobs, NewestPage
 from pendulum_bags.verdict import Layer, read_layers
 from pendulum_msgs_py.errors import DataError
 
@@ -29,8 +29,7 @@ class CertifiedDesigns:
     """
 
     def __init__(self, jobs: Jobs) -> None:
-        self._jobs = jobs
-        self._shown: tuple[Path, float] | None = None
+        self._newest = NewestPage(jobs, PAGE)
 
     def build(self) -> None:
         """Lay it out, without pictures as long as nothing was measured."""
@@ -43,14 +42,12 @@ class CertifiedDesigns:
 
     def refresh(self) -> None:
         """Show what was measured last."""
-        folder = self._jobs.newest(PAGE)
+        if not self._newest.changed():
+            return
+        folder = self._newest.folder
         self._place.set_visibility(folder is not None)
         if folder is None:
             return
-        version = (folder / PAGE).stat().st_mtime
-        if self._shown == (folder, version):
-            return
-        self._shown = folder, version
         self._sentence.text = _sentence(folder)
         self._link.props(f'href="/runs/{folder.name}/{PAGE}#certified_gains"')
         self._row.clear()
@@ -58,7 +55,7 @@ class CertifiedDesigns:
             for name, text in PICTURES.items():
                 if (folder / "figures" / name).is_file():
                     # The time keeps a browser from showing an older measurement under the same name.
-                    source = f"/runs/{folder.name}/figures/{name}?{version:.0f}"
+                    source = f"/runs/{folder.name}/figures/{name}?{self._newest.written:.0f}"
                     ui.element("img").props(f'src="{source}" alt="{text}" loading="lazy"')
 
 

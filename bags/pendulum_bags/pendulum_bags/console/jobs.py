@@ -12,7 +12,7 @@ from pathlib import Path
 
 from pendulum_msgs_py.errors import FaultError
 
-__all__ = ["Job", "Jobs"]
+__all__ = ["Job", "Jobs", "NewestPage"]
 
 _PATIENCE = 10.0
 
@@ -161,3 +161,29 @@ class Jobs:
         """End everything."""
         for kind in list(self._jobs):
             self.stop(kind)
+
+
+class NewestPage:
+    """The page of a name that was written last, for who shows it anew only where it changed.
+
+    Args:
+        jobs: Knows the folder of runs.
+        page: Its file name.
+
+    Attributes:
+        folder: The run folder that holds it; None where none does.
+        written: When [s of the system clock].
+    """
+
+    def __init__(self, jobs: Jobs, page: str) -> None:
+        self._jobs = jobs
+        self._page = page
+        self.folder: Path | None = None
+        self.written = 0.0
+
+    def changed(self) -> bool:
+        """Look again; return whether it is another page, or another writing of it, than at the last look."""
+        before = self.folder, self.written
+        self.folder = self._jobs.newest(self._page)
+        self.written = (self.folder / self._page).stat().st_mtime if self.folder is not None else 0.0
+        return before != (self.folder, self.written)

@@ -8,7 +8,7 @@ from typing import Any
 
 from nicegui import ui
 
-from pendulum_bags.console.jobs import Jobs
+from pendulum_bags.console.jobs import Jobs, NewestPage
 from pendulum_bags.verdict.layers import Mark
 from pendulum_bags.verdict.terminal import SIGNS
 
@@ -36,8 +36,7 @@ class LayersCard:
     """
 
     def __init__(self, jobs: Jobs) -> None:
-        self._jobs = jobs
-        self._shown: tuple[Path, float] | None = None
+        self._newest = NewestPage(jobs, SUMMARY)
 
     def build(self) -> None:
         """Lay it out, empty as long as no run was compared."""
@@ -50,16 +49,12 @@ class LayersCard:
 
     def refresh(self) -> None:
         """Show the run that was compared last."""
-        folder = self._jobs.newest(SUMMARY)
-        if folder is None:
+        if not self._newest.changed():
             return
-        version = (folder / SUMMARY).stat().st_mtime
-        if self._shown == (folder, version):
-            return
-        self._shown = folder, version
-        answer = read_answer(folder)
+        folder = self._newest.folder
+        answer = read_answer(folder) if folder is not None else {}
         self._place.set_visibility(bool(answer))
-        if not answer:
+        if folder is None or not answer:
             return
         self._sentence.text = answer["sentence"]
         self._run.text = f"of the run {folder.name}"
