@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 from collections.abc import Awaitable, Callable
+from functools import partial
 from typing import Any
 
 from nicegui import run, ui
@@ -75,10 +76,10 @@ class ControllerChoice:
             self._kind = ui.select(kinds, value=kinds[0], label="Controller").props("dense outlined").classes("kind")
             self._kind.props(f'aria-label="Controller of {self._space or "/"}"')
             for text, work in (
-                ("Start", self._start()), ("Activate", self._activate(on=True)),
-                ("Deactivate", self._activate(on=False)), ("End", self._end()),
+                ("Start", self._start), ("Activate", lambda: self._graph.activate(self._controller, on=True)),
+                ("Deactivate", lambda: self._graph.activate(self._controller, on=False)), ("End", self._end),
             ):  # fmt: skip
-                self._button(f"{text} controller", work, of=self._space or "/")
+                self._button(f"{text} controller", partial(self._press, work), of=self._space or "/")
         self._state = ui.label().classes("small").props('role="status"')
 
     def refresh(self) -> None:
@@ -98,13 +99,10 @@ class ControllerChoice:
             else "no controller"
         )
 
-    def _start(self) -> Callable[[], Awaitable[None]]:
-        async def work() -> None:
-            await self._carefully(self._try())
+    async def _press(self, work: Callable[[], Awaitable[str]]) -> None:
+        await self._carefully(work())
 
-        return work
-
-    async def _try(self) -> str:
+    async def _start(self) -> str:
         # On the graph before its parameters are known: two controllers of one name would end all torque.
         if self._graph.has_node(self._controller):
             kind = self._graph.parameters.get(self._controller, {}).get("controller", "of a kind that is not known yet")
@@ -115,19 +113,7 @@ class ControllerChoice:
         self._jobs.control(self._space, str(self._kind.value), self._plant)
         return f"{self._kind.value} starts, and waits inactive"
 
-    def _activate(self, *, on: bool) -> Callable[[], Awaitable[None]]:
-        async def work() -> None:
-            await self._carefully(self._graph.activate(self._controller, on=on))
-
-        return work
-
-    def _end(self) -> Callable[[], Awaitable[None]]:
-        async def work() -> None:
-            await self._carefully(self._ended())
-
-        return work
-
-    async def _ended(self) -> str:
+    async def _end(self) -> str:
         job = self._jobs[f"control{self._space}"]
         if job is None or not job.running:
             raise FaultError(f"no controller of {self._space or '/'} that runs was started here; expected one to end")
