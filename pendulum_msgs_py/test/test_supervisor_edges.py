@@ -340,17 +340,18 @@ def test_a_sum_with_a_disturbance_as_far_from_what_holds_as_allowed_takes_over_a
     assert plant.run(200, 0.0, disturbance=-4.0 * side).effort[0] == -4.0 * side
 
 
-def test_a_command_just_as_far_from_what_holds_as_allowed_is_judged_with_the_disturbance_too() -> None:
+@pytest.mark.parametrize(
+    ("command", "disturbance"),
+    [
+        pytest.param(2.0, 0.5, id="a command just as far from what holds as allowed"),
+        pytest.param(4.0, -4.0, id="a disturbance that outweighs the command"),
+        pytest.param(-2.0, -0.5, id="the other way"),
+    ],
+)
+def test_a_command_is_judged_by_itself_and_with_the_disturbance(command: float, disturbance: float) -> None:
     plant = Plant(handover_effort=2.0, handover_sum=2.0)
     plant.follow(_hold(0.1))
-    plant.run(150, 2.0, disturbance=0.5)
-    assert plant.supervisor.mode is Mode.POSITION
-
-
-def test_a_disturbance_does_not_outweigh_a_command_that_is_too_far_by_itself() -> None:
-    plant = Plant(handover_effort=2.0, handover_sum=2.0)
-    plant.follow(_hold(0.1))
-    plant.run(150, 4.0, disturbance=-4.0)
+    plant.run(150, command, disturbance=disturbance)
     assert plant.supervisor.mode is Mode.POSITION
 
 

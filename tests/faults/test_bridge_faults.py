@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
+from functools import partial
 
 import pytest
 from builtin_interfaces.msg import Duration
@@ -166,18 +167,18 @@ def test_a_node_with_parameters_that_are_wrong_together_does_not_come_up() -> No
         BridgeNode(lambda: None, parameter_overrides=overrides, enable_rosout=False)
 
 
+def _ask_for_nothing_beside_13_newton_metres(rig: NodeRig) -> None:
+    sample = rig.bridge.sample
+    assert sample is not None
+    rig.disturb(JointCommand.of_one(sample.stamp_ns, 13.0, "disturbance"))
+    rig._send(JointCommand.of_one(sample.stamp_ns, 0.0, "controller"))
+
+
 def test_a_disturbance_that_waits_for_a_commander_moves_nothing() -> None:
     with NodeRig(start=0.0) as rig:
         rig.controlling = rig.disturbing = False
-
-        def answer() -> None:
-            sample = rig.bridge.sample
-            assert sample is not None
-            rig.disturb(JointCommand.of_one(sample.stamp_ns, 13.0, "disturbance"))
-            rig._send(JointCommand.of_one(sample.stamp_ns, 0.0, "controller"))
-
         rig.run(0.1)
-        rig.loop.answer = answer
+        rig.loop.answer = partial(_ask_for_nothing_beside_13_newton_metres, rig)
         rig.run(0.3)
         assert rig.supervisor.mode is Mode.EFFORT
         assert "the disturbance for 13.00 N m; expected a sum of at most 2.0 N m" in rig.supervisor.reason
@@ -186,16 +187,9 @@ def test_a_disturbance_that_waits_for_a_commander_moves_nothing() -> None:
 
 def test_a_disturbance_that_waits_for_a_hand_over_moves_nothing() -> None:
     with NodeRig(start=0.0, moving=True, goal=0.1) as rig:
-
-        def answer() -> None:
-            sample = rig.bridge.sample
-            assert sample is not None
-            rig.disturb(JointCommand.of_one(sample.stamp_ns, 13.0, "disturbance"))
-            rig._send(JointCommand.of_one(sample.stamp_ns, 0.0, "controller"))
-
         rig.run(1.0)
         assert rig.supervisor.trajectory_finished
-        rig.loop.answer = answer
+        rig.loop.answer = partial(_ask_for_nothing_beside_13_newton_metres, rig)
         rig.run(0.3)
         assert rig.supervisor.mode is Mode.POSITION
         assert "controller asks for 0.00 N m and the disturbance for 13.00 N m" in rig.supervisor.reason
