@@ -19,6 +19,7 @@ __all__ = [
     "LINK",
     "PUSH",
     "Event",
+    "full_name",
 ]
 
 JOINT = "pendulum_joint"
@@ -43,6 +44,11 @@ CLOCK = "/clock"
 ARM = "~/arm"
 E_STOP = "~/e_stop"
 E_STOP_RESET = "~/e_stop_reset"
+
+
+def full_name(namespace: str, node: str) -> str:
+    """Return the full name of a node, such as ``/sim/controller``; ``/`` is the namespace of none."""
+    return f"{namespace.rstrip('/')}/{node}"
 
 
 class Event:

@@ -7,6 +7,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import TypeAlias
 
+from pendulum_msgs_py.contract.names import full_name
+
 __all__ = ["NodeProgram", "ParameterArgument", "bridge", "controller", "disturbance", "parameter_text", "simulator"]
 
 ParameterArgument: TypeAlias = bool | int | float | str | list[str] | list[float]
@@ -40,7 +42,7 @@ class NodeProgram:
     @property
     def full_name(self) -> str:
         """Name with namespace."""
-        return f"{self.namespace.rstrip('/')}/{self.node_name}"
+        return full_name(self.namespace, self.node_name)
 
     def ros_arguments(self) -> list[str]:
         """Return what follows the executable on a command line."""

@@ -91,7 +91,7 @@ class CommanderWatch:
         if self._node.count_publishers(topic) < 2:
             return ""
         found = Counter(
-            f"{info.node_namespace.rstrip('/')}/{info.node_name}"
+            names.full_name(info.node_namespace, info.node_name)
             for info in self._node.get_publishers_info_by_topic(topic)
         )
         twins = [name for name, count in found.items() if count > 1 and not name.endswith(_UNKNOWN_NODE)]

@@ -243,7 +243,7 @@ class Hub:
     def has_node(self, node: str) -> bool:
         """Tell whether a node is on the graph, by its full name."""
         found = self._node.get_node_names_and_namespaces()
-        return any(f"{space.rstrip('/')}/{name}" == node for name, space in found)
+        return any(names.full_name(space, name) == node for name, space in found)
 
     def said(self, node: str) -> str:
         """Return what a node said of itself last; nothing once it is silent."""

@@ -237,7 +237,7 @@ def _refuse_others(conductor: Conductor, namespace: str) -> None:
     for name in (names.EFFORT_COMMAND, names.DISTURBANCE):
         topic = f"{namespace}/{name}"
         others = sorted(
-            f"{info.node_namespace.rstrip('/')}/{info.node_name}"
+            names.full_name(info.node_namespace, info.node_name)
             for info in conductor.node.get_publishers_info_by_topic(topic)
         )
         if others:

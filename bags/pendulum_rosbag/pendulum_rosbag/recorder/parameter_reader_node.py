@@ -11,6 +11,8 @@ from rclpy.node import NodeNameNonExistentError
 from rclpy.parameter import parameter_value_to_python
 from rclpy.qos import qos_profile_parameter_events
 
+from pendulum_msgs_py.contract.names import full_name
+
 if TYPE_CHECKING:
     from rclpy.client import Client
     from rclpy.node import Node
@@ -48,7 +50,7 @@ class ParameterReader:
         for client in self._finished:
             self._node.destroy_client(client)
         self._finished.clear()
-        found = {f"{space.rstrip('/')}/{name}": name for name, space in self._node.get_node_names_and_namespaces()}
+        found = {full_name(space, name): name for name, space in self._node.get_node_names_and_namespaces()}
         for full in [full for full in self._known if forget and full not in found]:
             self._known.discard(full)
             self.values.pop(full, None)
