@@ -16,7 +16,7 @@ INSTALLED := $(LAYERS:%=$(VENV)/.%)
 # Everything that decides what an editable install looks like; the modules themselves are read in place.
 LINKED := $(foreach p,$(PACKAGES),$(wildcard $(p)/setup.py $(p)/setup.cfg $(p)/package.xml $(p)/*/executables.py))
 
-.PHONY: help venv extras experiment course test bench lint format types imports build faults mutants lock audit docs clean
+.PHONY: help venv extras readers experiment course test bench lint format types imports build faults mutants lock audit docs clean
 
 help: # Print the targets, one line each
 	@awk -F ':[^#]*# ' '/^[a-z]+:[^#=]*# / {printf "make %-11s %s\n", $$1, $$2}' Makefile
@@ -70,6 +70,14 @@ $(VENV)/.peers: requirements/bench.txt | $(VENV)/.run
 	@if $(PIP) install --prefer-binary --no-deps --require-hashes --target $(VENV)/peers -r requirements/bench.txt; then touch $@; \
 	else echo "note: some peers could not be installed; their rows will say so" >&2; fi
 
+readers: $(VENV)/.readers # Fetch Rerun's program (170 MB), with which tests open bags; they do so themselves where they can
+
+# Its program alone is used, so nothing that its wheel names is installed; no path of ours leads into this folder.
+$(VENV)/.readers: requirements/readers.txt | $(VENV)/.made
+	@rm -rf $(VENV)/readers
+	@$(PIP) install --prefer-binary --no-deps --no-compile --require-hashes --target $(VENV)/readers -r $<
+	@touch $@
+
 lint: $(VENV)/.checks # Check style and format with ruff
 	@$(PY) -m ruff check $(ARGS)
 	@$(PY) -m ruff format --check || { echo "make format does it" >&2; exit 1; }
@@ -93,7 +101,8 @@ mutants: venv # Break the safety rules in every small way; fail if no test notic
 	@$(PY) -m tests.mutants.run $(ARGS)
 
 # The lock covers CPython 3.10 to 3.12 at once. All layers are compiled together first, for one version of each package;
-# then each by itself on those versions, less what `run` has. The peers of the benchmarks come last, less what all have.
+# then each by itself on those versions, less what `run` has. The peers of the benchmarks come last, less what all have,
+# and before them a reader of others, without what it names.
 LOCK := $(VENV)/.uv/bin/uv pip compile --quiet --universal --python-version 3.10 --generate-hashes --no-header --no-annotate --no-emit-index-url
 # What a lock has everywhere: without a marker, or with several that share the versions of Python among them.
 without = $$(awk -F== '/^[A-Za-z0-9]/ {n[$$1] += $$2 ~ /;/ ? 1 : 2} END {for (p in n) if (n[p] > 1) print "--no-emit-package " p}' $(1))
@@ -106,6 +115,7 @@ lock: $(VENV)/.made # Compile requirements/*.in into requirements/*.txt with has
 	  if [ $$layer = run ]; then set --; else set -- $(call without,requirements/run.txt); fi; \
 	  $(LOCK) requirements/$$layer.in --constraint build/lock.txt --output-file requirements/$$layer.txt "$$@" || exit 1; \
 	done
+	@$(LOCK) $(ARGS) --no-deps requirements/readers.in --output-file requirements/readers.txt
 	@$(LOCK) $(ARGS) requirements/bench.in --constraint build/lock.txt --output-file requirements/bench.txt \
 	  $$(sed -n 's/^\([A-Za-z0-9._-]*\)==.*/--no-emit-package \1/p' build/lock.txt)
 

@@ -11,10 +11,29 @@ from rosbags.highlevel import AnyReader
 from pendulum_msgs_py.contract.cdr import encode_joint_state
 from pendulum_rosbag.reader import read_bag
 
-__all__ = ["JOINT_STATE", "STRING", "count_everywhere", "count_in_order", "state", "text_message"]
+__all__ = ["ENDLESS_WRITER", "JOINT_STATE", "STRING", "count_everywhere", "count_in_order", "state", "text_message"]
 
 JOINT_STATE = "sensor_msgs/msg/JointState"
 STRING = "std_msgs/msg/String"
+ENDLESS_WRITER = """
+import os, sys
+from pendulum_rosbag.storage import open_writer
+from pendulum_msgs_py.contract.cdr import encode_joint_state
+writer = open_writer(sys.argv[1], sys.argv[2])
+for number in range(5):
+    writer.add_topic(f"/t{number}", "sensor_msgs/msg/JointState")
+data = encode_joint_state(5, position=1.0, velocity=1.0, effort=2.0)
+print("go", flush=True)
+total = 0
+while True:
+    for number in range(5):
+        writer.write(f"/t{number}", total, data)
+        total += 1
+    if total % 25 == 0:
+        writer.seal()
+        os.write(1, b"%d\\n" % total)
+"""
+"""A program (arguments: bag, storage) that writes to five topics, commits, and tells how many messages were."""
 
 
 def text_message(text: str) -> bytes:

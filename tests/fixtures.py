@@ -17,8 +17,9 @@ import pytest
 from pendulum_bags.experiments.domain import reserve_domain
 from tests.mcap_js_reader import McapJs, mcap_js_process
 from tests.processes import ProcessGroup
+from tests.rerun_reader import RerunMcap, find_rerun
 
-__all__ = ["PROJECT", "domain_id", "mcap_js", "processes", "shared_data", "wait_for"]
+__all__ = ["PROJECT", "domain_id", "mcap_js", "processes", "rerun_mcap", "shared_data", "wait_for"]
 
 PROJECT = Path(__file__).resolve().parents[1]
 """The repository."""
@@ -66,6 +67,12 @@ def mcap_js() -> Iterator[McapJs]:
     """Offer the JavaScript readers of MCAP; tests skip where Node.js cannot be had."""
     with mcap_js_process() as readers:
         yield readers
+
+
+@pytest.fixture(scope="session")
+def rerun_mcap() -> RerunMcap:
+    """Offer Rerun's reader of MCAP; tests skip where it cannot be had."""
+    return find_rerun()
 
 
 @pytest.fixture

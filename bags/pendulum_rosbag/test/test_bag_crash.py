@@ -21,7 +21,7 @@ from pendulum_rosbag.storage import (
     sealed_mcap,
     sealed_sqlite,
 )
-from tests.bag_readers import JOINT_STATE, STRING, count_everywhere, count_in_order, state, text_message
+from tests.bag_readers import ENDLESS_WRITER, JOINT_STATE, STRING, count_everywhere, count_in_order, state, text_message
 from tests.mcap_js_reader import McapJs
 
 
@@ -196,26 +196,6 @@ def test_a_commit_head_never_straddles_two_pages(tmp_path: Path) -> None:
     assert set(count_everywhere(bag)) == {600}
 
 
-CHILD = """
-import os, sys
-from pendulum_rosbag.storage import open_writer
-from pendulum_msgs_py.contract.cdr import encode_joint_state
-writer = open_writer(sys.argv[1], sys.argv[2])
-for number in range(5):
-    writer.add_topic(f"/t{number}", "sensor_msgs/msg/JointState")
-data = encode_joint_state(5, position=1.0, velocity=1.0, effort=2.0)
-print("go", flush=True)
-total = 0
-while True:
-    for number in range(5):
-        writer.write(f"/t{number}", total, data)
-        total += 1
-    if total % 25 == 0:
-        writer.seal()
-        os.write(1, b"%d\\n" % total)
-"""
-
-
 @pytest.mark.parametrize("compression", [None, "zstd"])
 def test_foxgloves_readers_open_a_growing_file_at_every_write(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, mcap_js: McapJs, compression: str | None
@@ -270,7 +250,7 @@ def test_kill_9_at_random_moments_costs_nothing_that_was_sealed(tmp_path: Path, 
     rng = random.Random(11)
     for number in range(4):
         bag = tmp_path / f"bag{number}"
-        child = subprocess.Popen([sys.executable, "-c", CHILD, str(bag), storage], stdout=subprocess.PIPE)
+        child = subprocess.Popen([sys.executable, "-c", ENDLESS_WRITER, str(bag), storage], stdout=subprocess.PIPE)
         assert child.stdout is not None
         assert child.stdout.readline() == b"go\n"
         time.sleep(rng.uniform(0.0, 0.2))
