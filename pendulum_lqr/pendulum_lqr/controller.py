@@ -39,6 +39,7 @@ CONTROLLERS: dict[str, str] = {
     "lqi": "pendulum_lqr.controllers.lqi:Lqi",
     "lqg": "pendulum_lqr.controllers.lqg:Lqg",
     "lqr_friction": "pendulum_lqr.controllers.lqr_friction:LqrFriction",
+    "lqr_tracking": "pendulum_lqr.controllers.lqr_tracking:LqrTracking",
     "discrete_lqr": "pendulum_lqr.controllers.discrete_lqr:DiscreteLqr",
     "pid": "pendulum_lqr.controllers.pid:Pid",
     "pd_gravity": "pendulum_lqr.controllers.pd_gravity:PdGravity",
@@ -129,6 +130,17 @@ class BaseController:
             ParameterError: The values do not make a controller for this plant.
         """
         raise NotImplementedError(f"{cls.__name__}.design")
+
+    @classmethod
+    def judged_at(cls, p: Mapping[str, Any]) -> Sequence[Mapping[str, Any]]:
+        """Return what is set, one judgement after the other, where the loop is judged before it moves a plant.
+
+        Where a loop rests is one thing, whether it is stable another: the holding torque belongs to the first.
+
+        Args:
+            p: Checked values of all parameters.
+        """
+        return ({} if p.get("feedforward", True) else {"feedforward": True},)
 
     def check(self, plant: PlantParameters, period: float) -> None:
         """Refuse a period at which states come and for which this controller is not; any period by default.
@@ -308,7 +320,7 @@ def make_controller(
     if plant.drivetrain is not None and not kind.SERIES_ELASTIC:
         raise ParameterError(
             f"{name} knows rigid plants alone, and plant {plant.name!r} is series elastic; expected lqr, lqi, lqg, "
-            "lqr_friction, mpc, pid or pd_gravity, or a plant file without a drivetrain"
+            "lqr_friction, lqr_tracking, mpc, pid or pd_gravity, or a plant file without a drivetrain"
         )
     designed = kind.design(plant, period, p)
     if checked:
@@ -319,9 +331,9 @@ def make_controller(
     if p["velocity"] != "measured":
         controller = EstimatedVelocity(controller, make_velocity_estimator(p["velocity"], plant, period))
     if checked and kind.FEEDBACK and p.get("tuning") != "manual":
-        judged = controller
-        if not p.get("feedforward", True):
-            # Where a loop rests is one thing, whether it is stable another: the holding torque belongs to the first.
-            judged = kind.design(plant, period, {**p, "feedforward": True})
-        require_stable(name, judged, plant, period, p["set_point"])
+        for changed in kind.judged_at(p):
+            judged, at = controller, {**p, **changed}
+            if changed:
+                judged = make_controller(name, plant, period, {**(values or {}), **changed}, checked=False)
+            require_stable(name, judged, plant, period, at["set_point"])
     return controller

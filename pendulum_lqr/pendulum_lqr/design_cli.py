@@ -24,6 +24,7 @@ from pendulum_lqr.mechanism_design import design_mechanism
 from pendulum_lqr.model import LinearModel, linearise
 from pendulum_lqr.parameter_box import UNCERTAIN, parse_box, worst_case
 from pendulum_lqr.time_figures import time_figures
+from pendulum_lqr.tracking_table import design_tracking, print_tracking, tracking_document
 from pendulum_msgs_py.contract.angles import UPRIGHT
 from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.plants.mechanism_parameters import load_mechanism
@@ -74,6 +75,13 @@ def design(
             f"highest value); may be given again ({', '.join(UNCERTAIN)}). Or identified: intervals of the plant file."
         ),
     ] = None,
+    tracking: Annotated[
+        list[str] | None,
+        typer.Option(
+            help="Say what lqr_tracking does with the weights of the row that --row chooses: one of its parameters as "
+            "amplitude=0.3, or period=0.002 (of the loop, 0.01 s without it); may be given again."
+        ),
+    ] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON instead of tables.")] = False,
 ) -> None:
     """Design LQR gains: eigenvalues, K, margins, largest stable sampling period, figures in time, worst case.
@@ -86,16 +94,26 @@ def design(
 
         python -m pendulum_lqr design --plant identified.yaml --uncertainty identified
 
+        python -m pendulum_lqr design --preset dfki --tracking reference=sine --tracking frequency=0.3
+
     Of a plant of several joints Q has a weight for each joint and then for each velocity:
 
         python -m pendulum_lqr design --preset cart_pole --q 10,100,1,1 --r 0.1
     """
     chosen_plant = str(plant) if plant is not None else preset
     if is_mechanism(chosen_plant):
-        if figures is not None or machine is not None or theta != UPRIGHT or effort_limit or row or uncertainty:
+        if (
+            figures is not None
+            or machine is not None
+            or theta != UPRIGHT
+            or effort_limit
+            or row
+            or uncertainty
+            or tracking
+        ):
             raise ParameterError(
                 f"plant {chosen_plant!r} has several joints; expected --q, --r and --json alone: figures, --machine, "
-                "--uncertainty, --theta, --effort-limit and --row are for one joint"
+                "--uncertainty, --tracking, --theta, --effort-limit and --row are for one joint"
             )
         design_mechanism(load_mechanism(chosen_plant), q, r, as_json=as_json)
         return
@@ -107,6 +125,7 @@ def design(
     reports = [analyse(model, None), *(analyse(model, gain.K) for gain in gains)]
     chosen = _chosen_row(row, len(weights), default=THESIS_CHOICE if not (q or r) else len(weights))
     certified = certify_rows(machine, model, gains) if machine is not None else None
+    follower = design_tracking(tracking, parameters, weights[chosen - 1], limit) if tracking else None
     in_time = [time_figures(model, gain.K, parameters) for gain in gains]
     box = parse_box(uncertainty, parameters, plant) if uncertainty else None
     worst = []
@@ -122,6 +141,8 @@ def design(
             document["uncertainty"] = {"source": box.source, "bounds": {n: list(b) for n, b in box.bounds.items()}}
             for line, case in zip(document["rows"][1:], worst, strict=True):
                 line["worst_case"] = case.to_dict()
+        if follower is not None:
+            document["tracking"] = tracking_document(follower)
         if certified is not None:
             document["machine"] = certificate_document(*certified)
         sys.stdout.write(json.dumps(document, indent=2) + "\n")
@@ -131,6 +152,8 @@ def design(
         print_time_figures(console, in_time, chosen, limit)
         if box is not None:
             print_worst_cases(console, box, worst, chosen)
+        if follower is not None:
+            print_tracking(console, follower, chosen)
         if certified is not None:
             print_certificates(console, *certified, chosen)
     if figures is not None:

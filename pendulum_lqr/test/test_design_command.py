@@ -83,6 +83,22 @@ def test_the_figures_are_written(tmp_path, capsys):
     assert "phase_portrait.png" in capsys.readouterr().out
 
 
+def test_a_moving_reference_is_designed_for_with_the_weights_of_the_chosen_row(capsys):
+    arguments = ["--preset", "thesis", "--tracking", "amplitude=0.2", "--tracking", "period=0.002"]
+    assert main([*arguments, "--json"]) == 0
+    tracking = json.loads(capsys.readouterr().out)["tracking"]
+    middle = tracking["frozen"][len(tracking["frozen"]) // 2]
+    assert middle["K"] == pytest.approx([33.345265, 0.158993], abs=1e-5)
+    assert middle["radius"] == pytest.approx(0.99462, abs=1e-5)
+    assert [row["angle"] for row in tracking["frozen"]] == sorted(row["angle"] for row in tracking["frozen"])
+    # b A w, where the reference is fastest.
+    assert tracking["effort"] == pytest.approx(11.77 * 0.2 * 2.0 * 3.14159 * 0.2, rel=0.01)
+    assert main([*arguments, "--row", "1"]) == 0
+    printed = " ".join(capsys.readouterr().out.split())
+    assert "Gain along the reference" in printed
+    assert "combination 1 along sine of 0.2 rad at 0.2 Hz: takes up to 2.979 of 13 N m" in printed
+
+
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
@@ -95,6 +111,11 @@ def test_the_figures_are_written(tmp_path, capsys):
         (["--effort-limit", "-5"], "--effort-limit is -5.0 N m; expected a finite number > 0"),
         (["--effort-limit", "nan"], "--effort-limit is nan N m; expected a finite number > 0"),
         (["--theta", "nan"], "theta of the fixed point is nan rad"),
+        (["--tracking", "amplitud=1"], "--tracking is 'amplitud=1'; did you mean 'amplitude'"),
+        (["--tracking", "amplitude=big"], "--tracking is 'amplitude=big'; expected a number, as amplitude=0.3"),
+        (["--tracking", "reference=saw"], "reference is 'saw'; expected one of sine, steps"),
+        (["--tracking", "frequency=2"], "following the reference takes up to"),
+        (["--tracking", "period=0.9"], "unstable at -0.3 rad from upright with a period of 0.9 s"),
         (["--figures", "/proc/nowhere"], "figures cannot be written to /proc/nowhere"),
     ],
 )

@@ -12,7 +12,7 @@ from pendulum_lqr.analysis import delayed_spectral_radius
 from pendulum_lqr.controllers.lqr import Lqr
 from pendulum_lqr.controllers.specs import FEEDFORWARD, Q, R
 from pendulum_lqr.design import DesignError, Gain, output_lqr
-from pendulum_lqr.model import LinearModel, linearise, torque_gain
+from pendulum_lqr.model import LinearModel, friction_effort, linearise
 from pendulum_msgs_py.contract.angles import UPRIGHT
 from pendulum_msgs_py.parameters import ParameterSpec
 from pendulum_msgs_py.plants.plant_parameters import PlantParameters
@@ -78,7 +78,7 @@ class LqrFriction(Lqr):
         """Return the controller for the plant linearised at the set-point."""
         model = linearise(plant, UPRIGHT + p["set_point"])
         gain = output_lqr(model, p["q"], p["r"])
-        friction = p["share"] * _friction(plant, model.theta)
+        friction = p["share"] * friction_effort(plant, model.theta)
         if friction > _LARGEST * p["effort_limit"]:
             raise DesignError(
                 f"friction to compensate is {friction:.3g} N m, more than half of the effort_limit of "
@@ -103,14 +103,6 @@ class LqrFriction(Lqr):
             f"{text}, {self.friction:.4g} N m of dry friction fed forward over {self.width:.3g} rad; a limit cycle "
             "means play, more delay or less friction than the plant file says: lower share or widen width"
         )
-
-
-def _friction(plant: PlantParameters, theta: float) -> float:
-    """Return the commanded torque that sliding friction takes at an angle [N m]."""
-    drive = plant.drivetrain
-    weight = abs(plant.gravity * math.sin(theta - plant.angle_offset))
-    link = plant.coulomb_friction + plant.load_friction * weight
-    return (link + (drive.motor_coulomb_friction if drive is not None else 0.0)) / torque_gain(plant)
 
 
 def _width(model: LinearModel, gain: Gain, friction: float, period: float, given: float) -> float:

@@ -27,6 +27,7 @@ __all__ = [
     "drivetrain_of",
     "equilibrium_effort",
     "fixed_points",
+    "friction_effort",
     "held_torque",
     "is_overdamped",
     "offset_of",
@@ -160,6 +161,19 @@ def equilibrium_effort(plant: RigidPlant, theta: float) -> float:
         theta: Measured angle, 0 hanging down [rad].
     """
     return held_torque(plant, theta) / torque_gain(plant)
+
+
+def friction_effort(plant: PlantParameters, theta: float) -> float:
+    """Return the command that sliding dry friction takes at an angle, of link and motor together [N m].
+
+    Args:
+        plant: Plant parameters.
+        theta: Measured angle, 0 hanging down [rad].
+    """
+    drive = plant.drivetrain
+    weight = abs(plant.gravity * math.sin(theta - plant.angle_offset))
+    link = plant.coulomb_friction + plant.load_friction * weight
+    return (link + (drive.motor_coulomb_friction if drive is not None else 0.0)) / torque_gain(plant)
 
 
 def fixed_points(plant: RigidPlant, effort: float = 0.0) -> tuple[FixedPoint, ...]:

@@ -1,0 +1,254 @@
+"""LQR that follows a moving reference: the plant's own torque fed forward, gains scheduled over the angle."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from pendulum_lqr.controller import BaseController
+from pendulum_lqr.controllers.specs import Q, R
+from pendulum_lqr.design import DesignError
+from pendulum_lqr.interface import Controller
+from pendulum_lqr.reference import SHAPES, Motion, Reference, Way
+from pendulum_lqr.scheduling import Schedule, ScheduledMargins, scheduled_margins
+from pendulum_msgs_py.contract.angles import wrap
+from pendulum_msgs_py.errors import ParameterError
+from pendulum_msgs_py.parameters import ParameterSpec
+from pendulum_msgs_py.plants.plant_parameters import PlantParameters
+
+__all__ = ["LqrTracking"]
+
+_GAP = 0.1
+"""Time without a state after which the reference is joined anew [s]: twice that after which a plant gives up."""
+_LONGER = (1.0, 2.0, 4.0, 8.0, 16.0)
+"""How many times longer the way onto the reference may become where the torque does not suffice."""
+_POINTS = 40
+_AGAIN = 0.1
+"""Time after which a way onto the reference is looked for again [s]."""
+
+
+class LqrTracking(BaseController):
+    """u = u_r(t) - K(theta_r) (x - x_r(t)), where u_r moves the plant along the reference without feedback.
+
+    The reference is joined from where the pendulum is, at the first state, after a gap and after an error beyond
+    ``max_error``; a change of parameters goes on from the reference before it. The time of the reference is that of
+    the states' stamps.
+
+    Args:
+        plant: Plant parameters.
+        period: Sampling period [s].
+        reference: What it follows.
+        schedule: Gain and feedforward over the angle.
+        approach_time: Shortest time in which it is joined [s]; 0 for at once.
+        max_error: Error of the angle beyond which it is joined anew [rad].
+        reserve: Share of the limit that is left to the feedback.
+        effort_limit: Largest torque [N m].
+
+    Source:
+        Rugh, Shamma, Automatica 36(10), 2000 (gain scheduling, frozen parameters); Spong, Hutchinson, Vidyasagar,
+        Robot Modeling and Control, 2006, section 6.4 (feedforward of the computed torque).
+    """
+
+    SUMMARY = (
+        "follows a moving reference: torque of the plant's equation fed forward, LQR gain scheduled over the angle"
+    )
+    PARAMETERS = (
+        ParameterSpec("reference", "sine", "", "sine, or steps to and fro, each a motion of least jerk, with a rest "
+                      "behind it; both about the set-point.", choices=SHAPES),
+        ParameterSpec("amplitude", 0.3, "rad", "How far the reference goes to either side.", minimum=0.0,
+                      maximum=math.pi),
+        ParameterSpec("frequency", 0.2, "Hz", "How often it repeats itself.", minimum=0.01, maximum=20.0),
+        ParameterSpec("move_time", 1.5, "s", "Of steps: duration of each, at most half a period.", minimum=0.01),
+        ParameterSpec("approach_time", 1.0, "s", "Time in which the reference is joined from where the pendulum is; up "
+                      "to 16 times as long where the torque does not suffice, 0 for at once.", minimum=0.0,
+                      maximum=60.0),
+        ParameterSpec("max_error", 0.3, "rad", "Error beyond which the reference is joined anew.", minimum=0.0,
+                      exclusive_minimum=True),
+        ParameterSpec("reserve", 0.1, "-", "Share of the torque limit that is left to the feedback.", minimum=0.0,
+                      maximum=0.9),
+        ParameterSpec("share", 0.8, "-", "Share of the plant's Coulomb friction that is fed forward, by the sign of "
+                      "the reference's velocity.", minimum=0.0, maximum=1.0),
+        Q,
+        R,
+    )  # fmt: skip
+
+    def __init__(
+        self,
+        plant: PlantParameters,
+        period: float,
+        reference: Reference,
+        schedule: Schedule,
+        approach_time: float,
+        max_error: float,
+        reserve: float,
+        effort_limit: float,
+    ) -> None:
+        super().__init__(effort_limit, reference.centre)
+        self.reference = reference
+        self.schedule = schedule
+        self.margins: ScheduledMargins | None = None
+        self._approach_time = approach_time
+        self._max_error = max_error
+        self._within = (1.0 - reserve) * effort_limit
+        # A torque acts after the delay and is held for a period: it does best as that of the middle of its interval.
+        self._lead = plant.transport_delay + 0.5 * period
+        self.needed, self._needed_at = self._most_torque()
+        self.reset()
+
+    @classmethod
+    def design(cls, plant: PlantParameters, period: float, p: Mapping[str, Any]) -> LqrTracking:
+        """Return the controller, if the plant's torque suffices for the reference."""
+        reference = Reference(p["reference"], p["set_point"], p["amplitude"], p["frequency"], p["move_time"])
+        if reference.shape == "steps" and reference.move_time > 0.5 * reference.period:
+            raise ParameterError(
+                f"move_time is {reference.move_time:g} s; expected at most half a period of the reference, "
+                f"{0.5 * reference.period:g} s"
+            )
+        schedule = Schedule.design(plant, p["q"], p["r"], p["share"], reference.fastest)
+        limit, reserve = p["effort_limit"], p["reserve"]
+        made = cls(plant, period, reference, schedule, p["approach_time"], p["max_error"], reserve, limit)
+        if made.needed > made._within:
+            raise DesignError(
+                f"following the reference takes up to {made.needed:.4g} N m (at {made._needed_at:.3g} rad from "
+                f"upright), and effort_limit {limit:g} N m less a reserve of {100.0 * reserve:g} % leaves "
+                f"{made._within:.4g} N m; expected a smaller amplitude or frequency, a longer move_time, a set_point "
+                "that takes less, or a smaller reserve"
+            )
+        return made
+
+    @classmethod
+    def judged_at(cls, p: Mapping[str, Any]) -> Sequence[Mapping[str, Any]]:
+        """Return the ends and the middle of the reference, each as one that rests."""
+        ends = {wrap(p["set_point"] + side * p["amplitude"]) for side in (-1.0, 0.0, 1.0)}
+        return [{"set_point": end, "amplitude": 0.0, "approach_time": 0.0} for end in sorted(ends)]
+
+    def check(self, plant: PlantParameters, period: float) -> None:
+        """Refuse a period at which a frozen loop, or the loop along the reference, is unstable."""
+        self.margins = scheduled_margins(plant, period, self.reference, self.schedule)
+
+    def reset(self) -> None:
+        """Forget the way onto the reference."""
+        self._way: Way | None = None
+        self._joined = False
+        self._newest: float | None = None
+        self._next_try = -math.inf
+        self._lost = 0
+        self.notice = ""
+
+    def command(self, t: float, x: Sequence[float]) -> float:
+        """Return the torque [N m]; 0 where the torque does not suffice to join the reference."""
+        angle, velocity = x[0], x[1]
+        if self._newest is not None and t - self._newest > _GAP:
+            self._joined, self._next_try = False, t
+        self._newest = t
+        if self._joined:
+            now = self.motion(t)
+            error = wrap(angle - now.angle)
+            if abs(error) <= self._max_error:
+                return self._torque(t, now, error, velocity)
+            self._lost += 1
+            self.notice = (
+                f"lost the reference {self._lost} times, the last time by more than max_error, {self._max_error:g} "
+                "rad, and joined it anew"
+            )
+            self._joined, self._next_try = False, t
+        if t >= self._next_try:
+            self._join(t, angle, velocity)
+        if not self._joined:
+            return 0.0
+        now = self.motion(t)
+        return self._torque(t, now, wrap(angle - now.angle), velocity)
+
+    def motion(self, t: float) -> Motion:
+        """Return where the pendulum should be at a time since the first state [s], the way onto the reference included.
+
+        Args:
+            t: Time [s].
+        """
+        motion = self.reference.at(t)
+        if self._way is None:
+            return motion
+        off = self._way.at(t)
+        return Motion(*(a + b for a, b in zip(motion, off, strict=True)))
+
+    def take_over(self, previous: Controller) -> None:
+        """Go on from the reference before this one, so that neither it nor the torque jumps."""
+        if not isinstance(previous, LqrTracking) or previous._newest is None:
+            return
+        self._newest, self._lost, self.notice = previous._newest, previous._lost, previous.notice
+        if not previous._joined:
+            return
+        t, before = previous._newest, previous.motion(previous._newest)
+        self._way = next(iter(self._ways(t, before, [before])), None) or self._way_from(t, before, _LONGER[-1])
+        self._joined = True
+
+    def describe(self) -> str:
+        """Return the reference, the gains at its ends, the torque that it takes, and how stable it is."""
+        reference = self.reference
+        low, high = reference.centre - reference.amplitude, reference.centre + reference.amplitude
+        gains = ", ".join(f"[{k0:.6f}, {k1:.6f}]" for k0, k1 in map(self.schedule.gain, (low, reference.centre, high)))
+        text = (
+            f"{reference.shape} of {reference.amplitude:g} rad about {reference.centre:g} rad at "
+            f"{reference.frequency:g} Hz, K = {gains} at {low:.3g}, {reference.centre:.3g}, {high:.3g} rad, takes "
+            f"up to {self.needed:.4g} N m"
+        )
+        return text if self.margins is None else f"{text}, {self.margins.describe()}"
+
+    def _torque(self, t: float, now: Motion, error: float, velocity: float) -> float:
+        k0, k1 = self.schedule.gain(now.angle)
+        fed = self.schedule.feedforward(self.motion(t + self._lead))
+        return self.clamp(fed - k0 * error - k1 * (velocity - now.velocity))
+
+    def _join(self, t: float, angle: float, velocity: float) -> None:
+        """Find a way onto the reference that begins where the pendulum is, with as little torque as may be."""
+        # At its own velocity, or at rest: what damping stops within milliseconds would take torque to be kept up.
+        starts = [Motion(angle, velocity, 0.0), Motion(angle, 0.0, 0.0)]
+        starts.sort(key=lambda start: abs(self.schedule.feedforward(start)))
+        if self._approach_time == 0.0:
+            self._way, self._joined = None, True
+            return
+        for way in self._ways(t, starts[0], starts):
+            self._way, self._joined = way, True
+            if self._lost == 0:
+                self.notice = ""
+            return
+        self._next_try = t + _AGAIN
+        self.notice = (
+            f"gives no torque: from {angle:.3g} rad, {velocity:.3g} rad/s no way onto the reference takes less than "
+            f"{self._within:.4g} N m; expected a start nearer to it"
+        )
+
+    def _ways(self, t: float, first: Motion, starts: Sequence[Motion]) -> Sequence[Way]:
+        """Return the first way onto the reference that the torque suffices for, or none."""
+        for start in starts:
+            for longer in _LONGER:
+                way = self._way_from(t, start, longer)
+                if way is None or self._suffices(way):
+                    return [way] if way is not None else []
+        return []
+
+    def _way_from(self, t: float, start: Motion, longer: float) -> Way | None:
+        there = self.reference.at(t)
+        duration = longer * self._approach_time
+        if duration == 0.0:
+            return None
+        return Way(
+            t, duration, wrap(start.angle - there.angle), start.velocity - there.velocity,
+            start.acceleration - there.acceleration,
+        )  # fmt: skip
+
+    def _suffices(self, way: Way) -> bool:
+        for k in range(_POINTS + 1):
+            t = way.start + way.duration * k / _POINTS
+            motion = Motion(*(a + b for a, b in zip(self.reference.at(t), way.at(t), strict=True)))
+            if abs(self.schedule.feedforward(motion)) > self._within:
+                return False
+        return True
+
+    def _most_torque(self) -> tuple[float, float]:
+        """Return the largest torque that the reference itself takes [N m], and where [rad]."""
+        points = 200
+        motions = [self.reference.at(self.reference.period * k / points) for k in range(points)]
+        worst = max(motions, key=lambda motion: abs(self.schedule.feedforward(motion)))
+        return abs(self.schedule.feedforward(worst)), wrap(worst.angle)
