@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import platform
 import re
 import subprocess
 import sys
@@ -15,13 +16,14 @@ from packaging.utils import canonicalize_name
 from pendulum_msgs_py.programs.extras import extra_of, how_to_install
 from tests.acceptance.test_manifests import imported
 from tests.acceptance.test_packaging import FOLDERS, PROGRAMS
+from tests import wheel_sizes
 from tests.fixtures import PROJECT
 from tests.layers import LAYERS, distributions_of_modules, environment_of, pins, requirements
 
 MACHINES = [
-    {"python_version": f"3.{minor}", "python_full_version": f"3.{minor}.7", "sys_platform": platform}
+    {"python_version": f"3.{minor}", "python_full_version": f"3.{minor}.7", "sys_platform": system}
     for minor in (10, 11, 12)
-    for platform in ("linux", "darwin", "win32")
+    for system in ("linux", "darwin", "win32")
 ]
 
 
@@ -66,6 +68,20 @@ def test_a_layer_and_the_first_hold_all_that_their_packages_need(layer: str) -> 
             if needed and canonicalize_name(entry.name) not in there:
                 missing.append(f"{entry.name} of {name}")
     assert missing == []
+
+
+@pytest.mark.skipif(
+    sys.version_info[:2] != (3, 11) or platform.machine() != "x86_64", reason="the page tells of CPython 3.11 on x86_64"
+)
+def test_the_page_tells_what_each_wheel_brings() -> None:
+    told = wheel_sizes.of_page()
+    assert len(told) >= 15
+    stale = []
+    for wheel, (packages, size) in told.items():
+        there, weighed = wheel_sizes.as_installed(wheel)
+        if packages != there or abs(size - weighed) > max(2.0, 0.02 * weighed):
+            stale.append(f"{wheel}: {there} packages, {weighed:.0f} MB")
+    assert stale == [], "python -m tests.wheel_sizes prints the rows as they should be"
 
 
 def test_what_an_experiment_installs_stays_small() -> None:
