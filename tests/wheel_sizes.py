@@ -49,9 +49,11 @@ def as_installed(wheel: str) -> Row:
         if wanted == extras.get(name):
             continue
         extras[name] = wanted
-        for entry in map(Requirement, distribution(name).requires or []):
-            if entry.marker is None or any(entry.marker.evaluate({"extra": extra}) for extra in wanted):
-                asked.append(entry)
+        asked += [
+            entry
+            for entry in map(Requirement, distribution(name).requires or [])
+            if entry.marker is None or any(entry.marker.evaluate({"extra": extra}) for extra in wanted)
+        ]
     return len(extras), sum(_size(name) for name in extras) / 1e6
 
 
