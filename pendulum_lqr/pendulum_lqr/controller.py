@@ -112,6 +112,9 @@ class BaseController:
     FEEDBACK: ClassVar[bool] = True
     """Whether it closes a loop whose linear model has to be stable."""
 
+    TIME_INVARIANT: ClassVar[bool] = True
+    """Whether one state gets one answer at any time, so that the loop has a frequency response."""
+
     def __init__(self, effort_limit: float, set_point: float = 0.0) -> None:
         self.notice = ""
         self.effort_limit = effort_limit

@@ -14,14 +14,14 @@ from collections.abc import Mapping
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from pendulum_lqr.controller import make_controller
+from pendulum_lqr.controller import controller_class, make_controller
 from pendulum_lqr.interface import Controller
 from pendulum_lqr.model import linearise
 from pendulum_lqr.sampled_design import DiscreteModel, discretise
 from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.plants.plant_parameters import PlantParameters
 
-__all__ = ["controller_response"]
+__all__ = ["controller_response", "require_time_invariant"]
 
 Array = NDArray[np.float64]
 Complex = NDArray[np.complex128]
@@ -35,6 +35,22 @@ _REPEATS = 1e-3
 _ANGLE, _VELOCITY = 1e-4, 1e-2
 """Size of the excitation, small enough for limits to stay away [rad, rad/s]."""
 _FALLEN = 0.5
+
+
+def require_time_invariant(name: str) -> None:
+    """Refuse a controller that answers by the clock, and so has no frequency response.
+
+    Args:
+        name: Controller.
+
+    Raises:
+        ParameterError: It follows a reference that moves, or plays torques.
+    """
+    if not controller_class(name).TIME_INVARIANT:
+        raise ParameterError(
+            f"controller {name!r} answers by the time, and so has no frequency response; expected one that holds a "
+            "set-point, such as lqr with the same q and r"
+        )
 
 
 def controller_response(
@@ -58,6 +74,7 @@ def controller_response(
     Raises:
         ParameterError: No such controller, or it is not for this plant or period.
     """
+    require_time_invariant(name)
     model = discretise(linearise(plant), period)
     samples = round(_LENGTH / period)
     lines = np.arange(1, samples // 2)

@@ -66,6 +66,37 @@ def test_noise_held_for_another_time_is_no_pair_and_says_nothing_of_the_plants(f
     assert "the disturbance was held for 2 ms in simulation and for 10 ms on hardware" in comparison.verdict.sentence
 
 
+def test_references_that_began_apart_are_no_difference_of_the_plants(tmp_path: Path) -> None:
+    """One plant under one noise along one sine; the noise begins as long after the controller on both sides, or not."""
+    moving = {"controller": "lqr_tracking", "reference": "sine", "set_point": 0.1, "amplitude": 0.3, "frequency": 0.2,
+              "move_time": 1.5}  # fmt: skip
+
+    def record(side: str, name: str, after: float, **reference: float) -> Path:
+        columns = regulate(rate=100.0, seed=1, hardware=side == "hw")
+        columns["position"] = columns["position"] + 0.1 + 0.3 * np.sin(2.0 * np.pi * 0.2 * (columns["t"] + after))
+        metadata = {**run_metadata(1), "pendulum.parameters": {f"/{side}/controller": {**moving, **reference}}}
+        metadata["pendulum.run"]["controller"] = {"kind": "lqr_tracking"}
+        return write_bag(tmp_path / name, columns, f"/{side}", metadata=metadata, ramps=after > 0.0)
+
+    simulation = record("sim", "sim", 1.0)
+    together = compare_runs(simulation, record("hw", "hw", 1.0))
+    assert together.unlike_references == ""
+    assert together.plants["hw"]["rms_tracking_error"] == pytest.approx(
+        regulate(rate=100.0, seed=1, hardware=True)["position"].std(), rel=0.1
+    )
+    apart = compare_runs(simulation, record("hw", "late", 0.0))
+    assert apart.verdict.outcome is Outcome.UNDECIDED
+    assert "the moving references of both sides were" in apart.verdict.sentence
+    # Five seconds are a whole period: what is said is no matter of where in it the noise began.
+    assert float(apart.unlike_references.split(" were ")[1].split()[0]) == pytest.approx(
+        0.3 * np.sqrt(2.0) * np.sin(np.pi * 0.2), rel=0.05
+    )
+    told = run_metadata(1)
+    told["pendulum.run"]["controller"] = {"kind": "lqr_tracking"}
+    untold = write_bag(tmp_path / "untold", regulate(rate=100.0, seed=1, hardware=True), "/hw", metadata=told)
+    assert "not known on both sides which and since when" in compare_runs(simulation, untold).verdict.sentence
+
+
 def test_content_is_json_with_the_fields_that_a_summary_promises(folder: Path) -> None:
     content = compare_folders([folder], margin={"mean_angle": 0.5}).to_json()
     text = json.dumps(content, allow_nan=False)

@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from pendulum_bags.experiments.experiment_cli import main as experiment_main
 from pendulum_bags.experiments.in_process import simulate_plant
 from pendulum_bags.experiments.run_spec import RunSpec
 from pendulum_bags.frequency_response.analyse import analyse_responses, write_analysis
@@ -200,6 +201,13 @@ def test_what_cannot_be_measured_is_refused(measured):
         estimate(replace(one, excitation=np.zeros_like(one.excitation)))
     with pytest.raises(DataError, match=r"a signal period of 4.003 s is 400.300 sampling periods"):
         estimate(replace(one, disturbance={**MULTISINE, "signal_period": 4.003}))
+
+
+def test_a_controller_that_answers_by_the_time_has_no_frequency_response(capsys):
+    assert experiment_main(["frequency_response", "--controller", "lqr_tracking"]) == 2
+    assert "controller 'lqr_tracking' answers by the time, and so has no frequency response" in capsys.readouterr().err
+    with pytest.raises(ParameterError, match="expected one that holds a set-point"):
+        controller_response("lqr_tracking", load_plant("thesis"), [1.0], 0.01)
 
 
 @pytest.mark.parametrize("controller", ["lqr", "pd_gravity", "lqi", "lqg"])

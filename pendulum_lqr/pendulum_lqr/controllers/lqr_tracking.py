@@ -53,6 +53,7 @@ class LqrTracking(BaseController):
     SUMMARY = (
         "follows a moving reference: torque of the plant's equation fed forward, LQR gain scheduled over the angle"
     )
+    TIME_INVARIANT = False
     PARAMETERS = (
         ParameterSpec("reference", "sine", "", "sine, or steps to and fro, each a motion of least jerk, with a rest "
                       "behind it; both about the set-point.", choices=SHAPES),

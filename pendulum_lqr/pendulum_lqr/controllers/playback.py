@@ -33,6 +33,7 @@ class Playback(BaseController):
     """
 
     FEEDBACK = False
+    TIME_INVARIANT = False
     SUMMARY = "open loop: plays a recorded torque"
     PARAMETERS = (
         ParameterSpec("file", "", "", "CSV file with a header line and the columns time [s] and effort [N m]."),

@@ -73,6 +73,11 @@ class Comparison:
         return all(pair.is_paired for pair in self.pairs)
 
     @property
+    def unlike_references(self) -> str:
+        """Why the moving references of a pair are not one, see :attr:`Pair.unlike_references`; empty where they are."""
+        return next((pair.unlike_references for pair in self.pairs if pair.unlike_references), "")
+
+    @property
     def plants(self) -> dict[str, dict[str, Any]]:
         """Figures of each plant: means over runs, sums of missed deadlines, the largest torque."""
         groups = {
@@ -171,11 +176,12 @@ def compare(
     ones, others = ([run.window for run in runs] for runs in (simulations, hardware_runs))
     unpaired = conclude(unpaired_tests(ones, others, margins, looks=looks, runs_differ=differ), margins, *names)
     verdict = unpaired
-    if all(pair.is_paired for pair in compared):
+    unlike = next((pair.unlike_references for pair in compared if pair.unlike_references), "")
+    if not unlike and all(pair.is_paired for pair in compared):
         motions = [pair.motions for pair in compared]
         tests = paired_tests(motions, margins, looks=looks, runs_differ=differ)
         verdict = conclude(tests, margins, *names)
-    elif unlike := next((pair.unlike_noise for pair in compared if pair.unlike_noise), ""):
+    elif unlike := unlike or next((pair.unlike_noise for pair in compared if pair.unlike_noise), ""):
         sentence = f"Undecided: {unlike}, so that the motions say nothing of the plants."
         verdict = Verdict(Outcome.UNDECIDED, sentence, unpaired.tests, margins, None)
     thesis = interpolated_difference(simulations[0].window, compared[0].hardware.window)

@@ -150,6 +150,9 @@ def _print(result: Comparison, answer: Answer, content: dict[str, Any], designs:
         ("max |u| \\[N m]", "max_abs_u", ".4f"),
     ):
         table.add_row(label, *(_number(plant.get(key), form) for plant in plants.values()))
+    if any("rms_tracking_error" in plant for plant in plants.values()):
+        errors = (_number(plant.get("rms_tracking_error"), ".5f") for plant in plants.values())
+        table.add_row("rms of tracking error \\[rad]", *errors)
     console.print(table)
     blocks = [("paired", content["paired"])] if "position" in content["paired"] else []
     blocks.append(("unpaired", content["unpaired"]))

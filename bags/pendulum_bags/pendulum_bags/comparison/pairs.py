@@ -14,9 +14,14 @@ from pendulum_bags.comparison.spectra import Spectra, spectra_of
 from pendulum_bags.comparison.statistics import describe, kolmogorov_smirnov
 from pendulum_bags.runs.run_data import RunData, noise_hold_time
 from pendulum_bags.runs.series import Array, Series, shared_span
+from pendulum_msgs_py.contract.angles import UPRIGHT
 from pendulum_msgs_py.errors import DataError
 
 __all__ = ["Difference", "Pair", "distribution_tests", "interpolated_difference"]
+
+
+_ONE_REFERENCE = 0.05
+"""Largest distance of two references that count as one, as a share of the errors in following them."""
 
 
 @dataclass(frozen=True)
@@ -137,6 +142,29 @@ class Pair:
             first, second = (1e3 * (hold or 0.0) for hold in holds)
             return f"the disturbance was held for {first:.3g} ms in simulation and for {second:.3g} ms on hardware"
         return ""
+
+    @property
+    def unlike_references(self) -> str:
+        """Why both followed moving references that were not one under the noise; empty where they were, or none moved.
+
+        The clock of a reference begins with its controller, that of the noise later: in real time not as much later
+        on both sides. Its motion then differs between runs of one plant, and by more than the plants may.
+        """
+        ours, theirs = self.simulation, self.hardware
+        if not ours.follows_reference and not theirs.follows_reference:
+            return ""
+        if ours.reference is None or theirs.reference is None or ours.tracking_error is None:
+            return "a moving reference was followed, and it is not known on both sides which and since when"
+        common = np.interp(theirs.window.t, ours.window.t, ours.reference)
+        apart = _rms(common - theirs.reference)
+        errors = _rms(ours.tracking_error), _rms(theirs.window.position - UPRIGHT - theirs.reference)
+        if apart <= _ONE_REFERENCE * min(errors):
+            return ""
+        return (
+            f"the moving references of both sides were {apart:.2g} rad apart under one noise (rms; each begins with "
+            f"its controller; the errors in following them were {errors[0]:.2g} rad in simulation and {errors[1]:.2g} "
+            "rad on hardware)"
+        )
 
     @property
     def delay(self) -> float:

@@ -67,7 +67,8 @@ def decide(
         comparison = compare_folders([folder], margin=margins, looks=Looks(look))
         spent = budget.clock() - started
         # The next repeat has at most twice the noise of the last one.
-        if comparison.verdict.outcome is not Outcome.UNDECIDED or spent + 1.5 * slowest > budget.seconds:
+        decided = comparison.verdict.outcome is not Outcome.UNDECIDED or comparison.unlike_references
+        if decided or spent + 1.5 * slowest > budget.seconds:
             return comparison
         number += 1
         look += 1

@@ -111,11 +111,13 @@ def experiment(
     from pendulum_bags.experiments.run_spec import RunSpec
     from pendulum_bags.frequency_response.analyse import analyse_responses, read_responses
     from pendulum_bags.runs.run_folder import create_run_folder, discard_if_empty
+    from pendulum_lqr.controller_response import require_time_invariant
     from pendulum_lqr.gap_metric import Scaling
     from pendulum_lqr.policy_file import named_controller
 
     scaling = Scaling(angle, velocity, torque)
     kind, parameters = named_controller(controller)
+    require_time_invariant(kind)
     check_domain(domain)
     disturbance = {
         "kind": "multisine", "amplitude": amplitude, "signal_period": signal_period, "frequency": lowest,

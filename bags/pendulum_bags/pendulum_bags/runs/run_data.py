@@ -12,9 +12,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pendulum_bags.runs.correlation import effective_size
+from pendulum_bags.runs.moving_reference import follows_reference, recorded_reference
 from pendulum_bags.runs.run_record import STAND_IN, run_record
 from pendulum_bags.runs.series import Series, Signal, unwrap_near_upright
 from pendulum_msgs_py.contract import names
+from pendulum_msgs_py.contract.angles import UPRIGHT
 from pendulum_msgs_py.contract.names import Event
 from pendulum_msgs_py.contract.values import NANOSECONDS
 from pendulum_msgs_py.errors import DataError
@@ -56,6 +58,8 @@ class RunData:
         events: Events with ``name`` and ``t`` [s].
         source: The bag.
         damage: What is wrong with the bag.
+        follows_reference: Whether the controller followed a reference that moved.
+        reference: That reference from upright, at the times of the window [rad]; None where it is not known.
     """
 
     label: str
@@ -71,11 +75,18 @@ class RunData:
     events: Sequence[Mapping[str, Any]] = ()
     source: str = ""
     damage: Sequence[str] = ()
+    follows_reference: bool = False
+    reference: NDArray[np.float64] | None = None
 
     @property
     def is_disturbed(self) -> bool:
         """Whether so many states are missing that the run tells more of the machine than of the plant."""
         return missed_share(self.missed_deadlines, self.window.t.size) > TOLERATED
+
+    @property
+    def tracking_error(self) -> NDArray[np.float64] | None:
+        """Angle less its moving reference during the noise [rad]; None where none is known."""
+        return None if self.reference is None else self.window.position - UPRIGHT - self.reference
 
     def event_time(self, name: str) -> float | None:
         """Return when an event of a name first happened [s], None where it did not."""
@@ -176,6 +187,10 @@ def read_run(
     span = (stop - start) / NANOSECONDS
     inside = (stamps >= start) & (stamps < stop)
     window = whole.between(0.0, span)
+    reference = None
+    if commands is not None:
+        first_answer = float(commands["stamp_ns"][0] - start) / NANOSECONDS
+        reference = recorded_reference(metadata, space, window.t, first_answer)
     return RunData(
         label=name,
         window=window,
@@ -190,12 +205,15 @@ def read_run(
         events=[{**event, "t": (event["stamp_ns"] - start) / NANOSECONDS} for event in events],
         source=str(path),
         damage=damage,
+        follows_reference=follows_reference(metadata, space),
+        reference=reference,
     )
 
 
 def plant_summary(run: RunData) -> dict[str, Any]:
     """Return the figures of one plant during the noise, as ``summary.json`` holds them."""
-    window = run.window
+    window, error = run.window, run.tracking_error
+    moving = {} if error is None else {"rms_tracking_error": float(np.sqrt(np.mean(error**2)))}
     return {
         "rate_hz": run.rate_hz,
         "missed_deadlines": run.missed_deadlines,
@@ -210,6 +228,7 @@ def plant_summary(run: RunData) -> dict[str, Any]:
         "duration_s": window.duration,
         "noise_hold_time": noise_hold_time(run),
         "damage": list(run.damage),
+        **moving,
     }
 
 

@@ -42,7 +42,11 @@ __all__ = [
 HARDWARE = "hw"
 """Name of the emulated machine on the board."""
 
-EXCLUDED = {"playback": "plays a recording of another run", "policy": "is named by its file"}
+EXCLUDED = {
+    "playback": "plays a recording of another run",
+    "policy": "is named by its file",
+    "lqr_tracking": "follows a moving reference",
+}
 GOAL_ANGLE, GOAL_VELOCITY = 0.1, 0.5
 """Region that counts as up: angle from upright [rad], velocity [rad/s]."""
 HOLD_TIME = 1.0

@@ -41,7 +41,7 @@ def same_run_layer(comparison: Comparison, *, more: str = "") -> LayerResult:
         steps = _remedies(comparison, failed)
     else:
         reason = verdict.sentence.removeprefix("Undecided: ").rstrip(".")
-        if comparison.is_paired:
+        if comparison.is_paired and not comparison.unlike_references:
             open_tests = [test for test in tests if test.outcome is Outcome.UNDECIDED]
             reason = f"{runs} cannot tell yet in {', '.join(test.quantity for test in open_tests)}"
         steps = (_what_it_takes(comparison, more),)
@@ -139,6 +139,11 @@ def _foreign_simulation(comparison: Comparison) -> str:
 
 
 def _what_it_takes(comparison: Comparison, more: str) -> str:
+    if comparison.unlike_references:
+        return (
+            "Hold a set-point while both plants are compared, as lqr does with the same q and r; or record each side "
+            "in lockstep (experiment lockstep --side), where reference and noise begin together."
+        )
     if not comparison.is_paired:
         return "Record both plants under one and the same disturbance (make experiment does)."
     runs = comparison.verdict.more_runs

@@ -1,0 +1,63 @@
+"""The moving reference that a controller followed in a recorded run, from its parameters and its first answer."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pendulum_bags.runs.run_record import record_named, run_record
+from pendulum_lqr.reference import Reference
+
+__all__ = ["follows_reference", "recorded_reference"]
+
+_KIND = "lqr_tracking"
+_FIELDS = {"reference": str, "set_point": float, "amplitude": float, "frequency": float, "move_time": float}
+
+
+def follows_reference(metadata: Mapping[str, Any], space: str) -> bool:
+    """Tell whether the controller of a recorded run followed a reference that moved.
+
+    Args:
+        metadata: Metadata of the bag.
+        space: Namespace of the plant.
+    """
+    told = _parameters(metadata, space)
+    kinds = {told.get("controller"), record_named(run_record(metadata), "controller").get("kind")}
+    return _KIND in kinds and told.get("amplitude") != 0.0
+
+
+def recorded_reference(
+    metadata: Mapping[str, Any], space: str, times: NDArray[np.float64], first_answer: float
+) -> NDArray[np.float64] | None:
+    """Return the reference of the angle at some times, from upright, shape (n,) [rad].
+
+    None where none moved, or where the bag does not hold its parameters or its beginning. The way onto it, in the first
+    second or so after the first answer, is not in it.
+
+    Args:
+        metadata: Metadata of the bag.
+        space: Namespace of the plant.
+        times: Shape (n,) [s].
+        first_answer: When the controller answered its first state [s].
+    """
+    if not follows_reference(metadata, space):
+        return None
+    told = _parameters(metadata, space)
+    counts = record_named(record_named(metadata, "pendulum.recorder.counts"), f"{space}/effort_command")
+    if counts.get("before"):
+        return None
+    try:
+        values = [kind(told[name]) for name, kind in _FIELDS.items()]
+    except (KeyError, TypeError, ValueError):
+        return None
+    reference = Reference(*values)
+    if not reference.frequency > 0.0:
+        return None
+    return np.array([reference.at(float(t) - first_answer).angle for t in times])
+
+
+def _parameters(metadata: Mapping[str, Any], space: str) -> Mapping[str, Any]:
+    return record_named(record_named(metadata, "pendulum.parameters"), f"{space}/controller")
