@@ -196,6 +196,7 @@ def compare_runs(
     hw_prefix: str | None = None,
     own_protocol: PathArgument | None = None,
     margin: MarginArgument = None,
+    joint: str | None = None,
 ) -> Comparison:
     """Compare the bag of a simulation with that of hardware, during the noise.
 
@@ -206,6 +207,7 @@ def compare_runs(
         hw_prefix: Namespace of the hardware's topics.
         own_protocol: Bag of a simulation with noise of its own, for the thesis's analysis.
         margin: What difference does not matter; see :meth:`Margins.parse`.
+        joint: Joint of plants of several.
 
     Raises:
         BagError: A bag cannot be read.
@@ -213,14 +215,18 @@ def compare_runs(
         ParameterError: A margin is out of domain.
     """
     margins = Margins.parse(margin)
-    simulation = read_run(sim_bag, prefix=sim_prefix, label="simulation")
-    hardware = read_run(hw_bag, prefix=hw_prefix, label="hardware")
-    own = [] if own_protocol is None else [read_run(own_protocol, label="simulation, own noise")]
+    simulation = read_run(sim_bag, prefix=sim_prefix, label="simulation", joint=joint)
+    hardware = read_run(hw_bag, prefix=hw_prefix, label="hardware", joint=joint)
+    own = [] if own_protocol is None else [read_run(own_protocol, label="simulation, own noise", joint=joint)]
     return compare([(simulation, hardware)], own=own, margin=margins)
 
 
 def compare_folders(
-    folders: Sequence[PathArgument], *, margin: MarginArgument = None, looks: Looks | None = None
+    folders: Sequence[PathArgument],
+    *,
+    margin: MarginArgument = None,
+    looks: Looks | None = None,
+    joint: str | None = None,
 ) -> Comparison:
     """Compare and pool run folders, each with ``sim``, ``hw``, and perhaps ``sim_500hz`` and repeats of the run.
 
@@ -230,6 +236,7 @@ def compare_folders(
         folders: Run folders.
         margin: What difference does not matter; see :meth:`Margins.parse`.
         looks: How often the data have been looked at; by default what the folders say.
+        joint: Joint of plants of several.
 
     Raises:
         BagError: A folder lacks one of its bags.
@@ -243,7 +250,7 @@ def compare_folders(
             left_out.append(_in_words(broken))
         places = pair_folders(folder)
         for place in places:
-            pair = _read_pair(place)
+            pair = _read_pair(place, joint)
             busy = [
                 f"{'emulated ' * is_emulated(run)}{run.label} missed {run.missed_deadlines} states"
                 for run in pair
@@ -257,7 +264,7 @@ def compare_folders(
             else:
                 pairs.append(pair)
         if (folder / "sim_500hz").is_dir():
-            own.append(read_run(folder / "sim_500hz", label="simulation, own noise"))
+            own.append(read_run(folder / "sim_500hz", label="simulation, own noise", joint=joint))
     looked = looks or Looks(max(read_looks(Path(folder)) for folder in folders) if folders else 0)
     return replace(compare(pairs, own=own, margin=margins, looks=looked), left_out=tuple(left_out), stalls=stalls)
 
@@ -272,11 +279,14 @@ def _in_words(stalls: Sequence[Mapping[str, str]]) -> str:
     )
 
 
-def _read_pair(folder: Path) -> tuple[RunData, RunData]:
+def _read_pair(folder: Path, joint: str | None) -> tuple[RunData, RunData]:
     for name in ("sim", "hw"):
         if not (folder / name).is_dir():
             raise BagError(f"run folder {folder} has no bag {name}; expected the folders sim and hw")
-    return read_run(folder / "sim", label="simulation"), read_run(folder / "hw", label="hardware")
+    return (
+        read_run(folder / "sim", label="simulation", joint=joint),
+        read_run(folder / "hw", label="hardware", joint=joint),
+    )
 
 
 def _pool(rows: Sequence[dict[str, Any]]) -> dict[str, Any]:

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -13,6 +15,8 @@ from pendulum_msgs_py.errors import DataError
 from pendulum_msgs_py.programs.executables import cli_main
 
 if TYPE_CHECKING:
+    from rich.console import Console
+
     from pendulum_bags.comparison import Comparison
     from pendulum_bags.frequency_response.designs import DesignResult
     from pendulum_bags.verdict import Answer
@@ -75,68 +79,126 @@ def compare(
     ] = None,
     sim_prefix: Annotated[str | None, typer.Option(help="Namespace of the simulation's topics.")] = None,
     hw_prefix: Annotated[str | None, typer.Option(help="Namespace of the hardware's topics.")] = None,
+    joint: Annotated[
+        str | None, typer.Option(help="One joint of plants of several; by default all, and one answer.")
+    ] = None,
     json_output: Annotated[bool, typer.Option("--json", help="Print JSON instead of tables.")] = False,
 ) -> None:
     """Compare simulation and hardware under noise: statistics of the difference, equivalence tests, a verdict.
 
-    Where the hardware's frequency response was measured, it also lists which designs carry over.
+    Where the hardware's frequency response was measured, it also lists which designs carry over. Plants of several
+    joints are compared joint by joint.
 
     Example: python -m pendulum_bags compare runs/today/sim runs/today/hw --margin delay=8ms --margin spread_angle=20%
     """
     from pendulum_bags.comparison import Margins, compare_folders, compare_runs
-    from pendulum_bags.frequency_response.carry_over import carry_over, layers_of
-    from pendulum_bags.verdict.answer import answer_of
+    from pendulum_bags.runs.run_data import joints_of
 
     margins = Margins.of(margins_file, margin)
     if all((path / "sim").is_dir() and (path / "hw").is_dir() for path in paths):
-        result = compare_folders(paths, margin=margins)
+        run = partial(compare_folders, paths, margin=margins)
+        joints = joints_of(paths[0] / "sim")
     elif len(paths) == 2:
-        result = compare_runs(
-            paths[0],
-            paths[1],
+        run = partial(
+            compare_runs,
+            *paths,
             sim_prefix=sim_prefix,
             hw_prefix=hw_prefix,
             own_protocol=own_protocol,
             margin=margins,
         )
+        joints = joints_of(paths[0], sim_prefix)
     else:
         raise DataError(
             f"got {len(paths)} paths ({', '.join(map(str, paths))}); "
             "expected a simulation and a hardware bag, or run folders that hold sim and hw"
         )
     kept = [*(paths if len(paths) == 1 else ()), *(layers or ())]
-    certified = carry_over(result, kept, machine, design or ())
-    answer = answer_of(result, kept, anew=layers_of(certified))
-    content = {**result.to_json(), "answer": answer.to_json()}
-    if certified is not None:
-        content["designs"] = [one.to_json() for one in certified.designs]
-    if out is not None:
-        _write(out, result, content)
-    if json_output:
-        print(json.dumps(content, indent=2, allow_nan=False))
+    if joints or joint:
+        if machine or design:
+            raise DataError("--machine and --design are of plants of one joint; expected neither for several")
+        told = _tell_joints({name: run(joint=name) for name in ([joint] if joint else joints)}, kept)
     else:
-        _print(result, answer, content, certified.designs if certified else ())
+        told = _tell(run(), kept, machine, design or ())
+    if out is not None:
+        told.write(out)
+    if json_output:
+        print(json.dumps(told.content, indent=2, allow_nan=False))
+    else:
+        told.print()
         if out is not None:
             print(f"\nwritten: {out / 'comparison.json'} and figures beside it")
 
 
-def _write(out: Path, result: Comparison, content: dict[str, Any]) -> None:
-    from pendulum_bags.figures.render_files import write_figures
-    from pendulum_bags.report.figures import comparison_figures
-    from pendulum_bags.runs.run_folder import write_json
+@dataclass(frozen=True)
+class _Told:
+    """What is told of a comparison, or of those of several joints.
 
-    out.mkdir(parents=True, exist_ok=True)
-    write_json(out / "comparison.json", content)
-    write_figures(comparison_figures(result), out / "figures")
+    Args:
+        comparisons: The comparison of each joint, by its name; of a plant of one joint by no name.
+        answer: The answer.
+        content: All of it, for JSON.
+        designs: Designs and whether they carry over.
+    """
+
+    comparisons: Mapping[str, Comparison]
+    answer: Answer
+    content: dict[str, Any]
+    designs: Sequence[DesignResult] = ()
+
+    def write(self, out: Path) -> None:
+        from pendulum_bags.figures.render_files import write_figures
+        from pendulum_bags.report.figures import comparison_figures
+        from pendulum_bags.report.joint_figures import joints_together
+        from pendulum_bags.runs.run_folder import write_json
+
+        out.mkdir(parents=True, exist_ok=True)
+        write_json(out / "comparison.json", self.content)
+        alone = self.comparisons.get("")
+        write_figures(comparison_figures(alone) if alone else [joints_together(self.comparisons)], out / "figures")
+
+    def print(self) -> None:
+        from pendulum_bags.frequency_response.designs_table import designs_table
+        from pendulum_bags.verdict.terminal import print_answer
+        from pendulum_msgs_py.programs.terminal import make_console
+
+        console = make_console()
+        for joint, result in self.comparisons.items():
+            if joint:
+                console.print(f"Joint {joint}", style="bold")
+            _print(console, result, self.content["joints"][joint] if joint else self.content)
+        if self.designs:
+            console.print(designs_table(self.designs))
+        print_answer(console, self.answer)
 
 
-def _print(result: Comparison, answer: Answer, content: dict[str, Any], designs: Sequence[DesignResult]) -> None:
-    from pendulum_bags.frequency_response.designs_table import designs_table
+def _tell(result: Comparison, kept: Sequence[Path], machine: Path | None, designs: Sequence[str]) -> _Told:
+    from pendulum_bags.frequency_response.carry_over import carry_over, layers_of
+    from pendulum_bags.verdict.answer import answer_of
+
+    certified = carry_over(result, kept, machine, designs)
+    answer = answer_of(result, kept, anew=layers_of(certified))
+    content = {**result.to_json(), "answer": answer.to_json()}
+    if certified is not None:
+        content["designs"] = [one.to_json() for one in certified.designs]
+    return _Told({"": result}, answer, content, certified.designs if certified else ())
+
+
+def _tell_joints(results: Mapping[str, Comparison], kept: Sequence[Path]) -> _Told:
+    from pendulum_bags.verdict.answer import answer_of_joints
+
+    answer = answer_of_joints(results, kept)
+    joints = {joint: result.to_json() for joint, result in results.items()}
+    return _Told(results, answer, {"joints": joints, "answer": answer.to_json()})
+
+
+def _print(console: Console, result: Comparison, content: dict[str, Any]) -> None:
     from pendulum_bags.runs.run_data import timing_warning
-    from pendulum_bags.verdict.terminal import print_answer
-    from pendulum_msgs_py.programs.terminal import WholeTable, make_console
+    from pendulum_bags.verdict.terminal import tests_table
+    from pendulum_msgs_py.programs.terminal import WholeTable
 
-    console = make_console()
+    unit = result.pairs[0].simulation.window.unit
+    what, effort = ("theta", "N m") if unit == "rad" else ("x", "N")
     plants = content["plants"]
     table = WholeTable(title="Plants during the noise", title_justify="left")
     for heading in ("", *plants):
@@ -145,9 +207,9 @@ def _print(result: Comparison, answer: Answer, content: dict[str, Any], designs:
         ("rate \\[Hz]", "rate_hz", ".1f"),
         ("missed deadlines", "missed_deadlines", ".0f"),
         ("noise held for \\[s]", "noise_hold_time", ".4f"),
-        ("std of theta \\[rad]", "std_theta", ".5f"),
-        ("std of theta' \\[rad/s]", "std_theta_dot", ".5f"),
-        ("max |u| \\[N m]", "max_abs_u", ".4f"),
+        (f"std of {what} \\[{unit}]", "std_theta", ".5f"),
+        (f"std of {what}' \\[{unit}/s]", "std_theta_dot", ".5f"),
+        (f"max |u| \\[{effort}]", "max_abs_u", ".4f"),
     ):
         table.add_row(label, *(_number(plant.get(key), form) for plant in plants.values()))
     if any("rms_tracking_error" in plant for plant in plants.values()):
@@ -159,8 +221,8 @@ def _print(result: Comparison, answer: Answer, content: dict[str, Any], designs:
     statistics = WholeTable(title="Hardware minus simulation", title_justify="left")
     statistics.add_column("")
     for title, _ in blocks:
-        statistics.add_column(f"{title} \\[rad]", justify="right")
-        statistics.add_column(f"{title} \\[rad/s]", justify="right")
+        statistics.add_column(f"{title} \\[{unit}]", justify="right")
+        statistics.add_column(f"{title} \\[{unit}/s]", justify="right")
     for name in content["unpaired"]["position"]:
         cells = [f"{block[key][name]:.4g}" for _, block in blocks for key in ("position", "velocity")]
         statistics.add_row(name, *cells)
@@ -180,9 +242,7 @@ def _print(result: Comparison, answer: Answer, content: dict[str, Any], designs:
         console.print(f"Not paired: {content['paired']['reason']}.")
     for note in result.left_out:
         console.print(note, style="yellow", highlight=False, markup=False)
-    if designs:
-        console.print(designs_table(designs))
-    print_answer(console, answer, result.verdict, emulated=result.is_emulated)
+    console.print(tests_table(result.verdict, emulated=result.is_emulated))
 
 
 def _number(value: float | None, form: str) -> str:

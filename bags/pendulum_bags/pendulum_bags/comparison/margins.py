@@ -18,7 +18,16 @@ __all__ = ["Margin", "MarginArgument", "Margins"]
 
 FORMAT = "pendulum_margins/1"
 SHARE = "%"
-_FACTORS = {"deg": math.pi / 180.0, "rad": 1.0, "deg/s": math.pi / 180.0, "rad/s": 1.0, "ms": 1e-3, "s": 1.0}
+_FACTORS = {
+    "deg": math.pi / 180.0,
+    "rad": 1.0,
+    "deg/s": math.pi / 180.0,
+    "rad/s": 1.0,
+    "ms": 1e-3,
+    "s": 1.0,
+    "mm": 1e-3,
+    "m": 1.0,
+}
 """From what a user may write to SI."""
 _UNITS: Mapping[str, tuple[str, ...]] = {
     "mean_angle": ("deg", "rad"),
@@ -29,6 +38,7 @@ _UNITS: Mapping[str, tuple[str, ...]] = {
     "path_angle": (SHARE, "deg", "rad"),
     "path_velocity": (SHARE, "deg/s", "rad/s"),
     "band": ("Hz",),
+    "mean_position": ("mm", "m"),
 }
 """Units of each entry; the first is the one of a number that comes without."""
 
@@ -71,6 +81,7 @@ class Margins:
         delay: By which one plant answers the disturbance later than the other.
         path_angle, path_velocity: Root mean square distance of the motions under one disturbance.
         band: Frequency up to which velocities, torques and paths are compared.
+        mean_position: Difference of the mean positions of a joint that slides.
         stated: Names of the margins that the user stated; the others are defaults, and the verdict says so.
     """
 
@@ -82,6 +93,7 @@ class Margins:
     path_angle: Margin
     path_velocity: Margin
     band: Margin
+    mean_position: Margin
     stated: frozenset[str] = field(default=frozenset(), compare=False)
 
     @classmethod

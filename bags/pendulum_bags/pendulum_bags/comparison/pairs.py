@@ -94,9 +94,10 @@ class Pair:
         """
         for run in (simulation, hardware):
             if not np.ptp(run.window.position):
+                where = f" in {run.joint}" if run.joint else ""
                 raise DataError(
-                    f"the {run.label} of {run.source} stood still at {run.window.position[0]:.4g} rad under the noise; "
-                    "expected a plant that moves: was it armed, and free?"
+                    f"the {run.label} of {run.source} stood still{where} at {run.window.position[0]:.4g} "
+                    f"{run.window.unit} under the noise; expected a plant that moves: was it armed, and free?"
                 )
         hardware = _turned(hardware, simulation)
         response = align_motion(simulation.window, hardware.window)
@@ -193,6 +194,8 @@ class Pair:
 
 def _turned(hardware: RunData, simulation: RunData) -> RunData:
     """Return the hardware's run moved by whole turns to where the simulation is: an angle is known but for those."""
+    if hardware.window.unit != "rad":
+        return hardware
     turn = 2.0 * np.pi
     apart = float(np.median(hardware.window.position) - np.median(simulation.window.position))
     offset = turn * round(apart / turn)

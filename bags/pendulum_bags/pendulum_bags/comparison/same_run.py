@@ -19,6 +19,7 @@ from pendulum_bags.comparison.equivalence import EquivalenceTest, equivalence_te
 from pendulum_bags.comparison.margins import Margin, Margins
 from pendulum_bags.comparison.statistics import Resampled, bootstrap_interval, resample
 from pendulum_bags.runs.series import Array, Series
+from pendulum_msgs_py.errors import ParameterError
 
 __all__ = ["Looks", "paired_tests", "unpaired_tests"]
 
@@ -37,6 +38,8 @@ _UNITS = {
     "s": 1.0,
     "ms": 1e3,
     "N m": 1.0,
+    "m": 1.0,
+    "mm": 1e3,
 }
 _SIMULATION, _HARDWARE, _LIKENESS = 5, 11, 17
 """First columns of the moments of either side, and of the products and squares of velocities at each lag."""
@@ -69,8 +72,43 @@ class Looks:
 
 @dataclass(frozen=True)
 class _Kind:
+    """What all tests of some motions have in common.
+
+    Args:
+        looks: How often the data have been looked at.
+        runs: Runs that the intervals rest on.
+        slides: Whether the motions are those of a joint that slides.
+        driven: Whether any of them had a controller's torque: 0 beside 0 is no test.
+    """
+
     looks: Looks
     runs: int
+    slides: bool
+    driven: bool
+
+    @classmethod
+    def of(cls, motions: Sequence[Series], margins: Margins, looks: Looks, runs: int) -> _Kind:
+        slides = any(one.unit == "m" for one in motions)
+        if slides:
+            _refuse_angles(margins)
+        return cls(looks, runs, slides, any(np.ptp(one.effort) > 0.0 for one in motions))
+
+    def name(self, quantity: str) -> str:
+        """Return the field's word for a quantity: what slides has a position, and a force instead of a torque."""
+        return (
+            {"angle": "position", "angles": "positions", "torque": "force"}.get(quantity, quantity)
+            if self.slides
+            else quantity
+        )
+
+
+def _refuse_angles(margins: Margins) -> None:
+    for name in ("spread_angle", "spread_velocity", "spread_torque", "path_angle", "path_velocity"):
+        margin: Margin = getattr(margins, name)
+        if not margin.is_share:
+            raise ParameterError(
+                f"margin {name} is {margin}, and this joint slides; expected a share of its spread, such as 15 %"
+            )
 
 
 def paired_tests(
@@ -95,8 +133,8 @@ def paired_tests(
     centre = _find_delay(seen)
     columns = [one.columns(centre) for one in seen]
     resampled = resample(columns, runs_differ=runs_differ)
-    kind = _Kind(looks, len(pairs))
-    tests = [_mean_test(resampled, _column(0), margins.mean_angle, kind)]
+    kind = _Kind.of([one for pair in pairs for one in pair], margins, looks, len(pairs))
+    tests = [_mean_test(resampled, _column(0), margins, kind)]
     tests += _spread_tests(resampled, _SIMULATION, _HARDWARE, margins, kind)
     tests.append(_delay_test(resampled, centre, margins.delay, kind))
     for index, what, margin in (
@@ -136,8 +174,8 @@ def unpaired_tests(
         min(side.runs for side in sides),
     )
     count = sides[0].means.size
-    kind = _Kind(looks, min(len(simulations), len(hardware)))
-    mean = _mean_test(joined, lambda means: np.asarray(means[..., count] - means[..., 0]), margins.mean_angle, kind)
+    kind = _Kind.of([*simulations, *hardware], margins, looks, min(len(simulations), len(hardware)))
+    mean = _mean_test(joined, lambda means: np.asarray(means[..., count] - means[..., 0]), margins, kind)
     return [mean, *_spread_tests(joined, 0, count, margins, kind)]
 
 
@@ -245,10 +283,12 @@ def _lag(means: Array) -> Array:
 # -- tests -------------------------------------------------------------------------------------------------------
 
 
-def _mean_test(resampled: Resampled, statistic: Statistic, margin: Margin, kind: _Kind) -> EquivalenceTest:
+def _mean_test(resampled: Resampled, statistic: Statistic, margins: Margins, kind: _Kind) -> EquivalenceTest:
+    margin = margins.mean_position if kind.slides else margins.mean_angle
     scale = _UNITS[margin.unit]
     interval = bootstrap_interval(resampled, lambda means: scale * statistic(means), level=kind.looks.level)
-    return equivalence_test("mean angle difference", margin.unit, interval, -margin.value, margin.value, runs=kind.runs)
+    name = f"mean {kind.name('angle')} difference"
+    return equivalence_test(name, margin.unit, interval, -margin.value, margin.value, runs=kind.runs)
 
 
 def _spread_tests(
@@ -257,6 +297,8 @@ def _spread_tests(
     """Test the spreads; the moments of the two sides begin at the columns given."""
     tests = []
     for index, what in enumerate(_QUANTITIES):
+        if what == "torque" and not kind.driven:
+            continue
         margin: Margin = getattr(margins, f"spread_{what}")
         tests.append(_spread_test(resampled, simulation + 2 * index, hardware + 2 * index, what, margin, kind))
     return tests
@@ -273,7 +315,9 @@ def _spread_test(
             level=level,
         )
         top = 1.0 + margin.si
-        return equivalence_test(f"spread of {what} (ratio)", "-", interval, 1.0 / top, top, runs=kind.runs, ratio=True)
+        return equivalence_test(
+            f"spread of {kind.name(what)} (ratio)", "-", interval, 1.0 / top, top, runs=kind.runs, ratio=True
+        )
     scale = _UNITS[margin.unit]
     interval = bootstrap_interval(
         resampled,
@@ -281,7 +325,7 @@ def _spread_test(
         level=level,
     )
     return equivalence_test(
-        f"spread of {what} difference", margin.unit, interval, -margin.value, margin.value, runs=kind.runs
+        f"spread of {kind.name(what)} difference", margin.unit, interval, -margin.value, margin.value, runs=kind.runs
     )
 
 
@@ -305,7 +349,7 @@ def _path_test(resampled: Resampled, index: int, what: str, margin: Margin, kind
         return np.asarray(_UNITS[margin.unit] * size)
 
     interval = bootstrap_interval(resampled, distance, level=kind.looks.level)
-    name = f"distance of {'velocities' if what == 'velocity' else 'angles'}"
+    name = f"distance of {'velocities' if what == 'velocity' else kind.name('angles')}"
     if index > 2:
         name += " less the delay"
     return equivalence_test(name, margin.unit, interval, -math.inf, margin.value, runs=kind.runs)

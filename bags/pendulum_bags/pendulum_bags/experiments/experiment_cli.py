@@ -143,7 +143,7 @@ def thesis(
     from pendulum_bags.comparison import Margins
     from pendulum_bags.experiments.stalls import run_undisturbed
     from pendulum_bags.experiments.thesis import run_thesis
-    from pendulum_bags.verdict.terminal import print_answer
+    from pendulum_bags.verdict.terminal import print_answer, tests_table
 
     settings = RegulationSettings(
         plant=plant or "thesis",
@@ -197,7 +197,8 @@ def thesis(
         print(json.dumps(summary, indent=2))
     else:
         _print_summary(console, summary)
-        print_answer(console, answer, comparison.verdict, emulated=comparison.is_emulated)
+        console.print(tests_table(comparison.verdict, emulated=comparison.is_emulated))
+        print_answer(console, answer)
     elapsed = time.monotonic() - started
     console.print(
         f"\nreport  {folder / 'report.html'}\nbags    {folder / 'sim'}, {folder / 'hw'}\n({elapsed:.0f} s)",

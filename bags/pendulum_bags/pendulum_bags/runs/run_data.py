@@ -20,6 +20,7 @@ from pendulum_msgs_py.contract.angles import UPRIGHT
 from pendulum_msgs_py.contract.names import Event
 from pendulum_msgs_py.contract.values import NANOSECONDS
 from pendulum_msgs_py.errors import DataError
+from pendulum_msgs_py.mechanisms import MECHANISMS
 from pendulum_rosbag.reader import Bag, read_bag
 
 __all__ = [
@@ -29,6 +30,7 @@ __all__ = [
     "RunData",
     "find_prefix",
     "is_emulated",
+    "joints_of",
     "missed_periods",
     "missed_share",
     "plant_summary",
@@ -38,6 +40,10 @@ __all__ = [
 
 START_EVENT = Event.NOISE_START
 END_EVENT = Event.NOISE_END
+
+
+_SLIDING = frozenset(joint.name for mechanism in MECHANISMS.values() for joint in mechanism.joints if joint.unit == "m")
+"""Joints whose position is a place and no angle; a message names them, and no unit."""
 
 
 @dataclass(frozen=True)
@@ -60,6 +66,7 @@ class RunData:
         damage: What is wrong with the bag.
         follows_reference: Whether the controller followed a reference that moved.
         reference: That reference from upright, at the times of the window [rad]; None where it is not known.
+        joint: Joint whose motion this is, of a plant of several; empty of a plant of one.
     """
 
     label: str
@@ -77,6 +84,7 @@ class RunData:
     damage: Sequence[str] = ()
     follows_reference: bool = False
     reference: NDArray[np.float64] | None = None
+    joint: str = ""
 
     @property
     def is_disturbed(self) -> bool:
@@ -106,6 +114,26 @@ def find_prefix(bag: Bag) -> str:
     if not found:
         raise DataError(f"bag {bag.path} has no topic that ends in {ending}; it has {', '.join(bag.topics) or 'none'}")
     raise DataError(f"bag {bag.path} holds several plants ({', '.join(found)}); choose one by its namespace")
+
+
+def joints_of(path: str | os.PathLike[str], prefix: str | None = None) -> tuple[str, ...]:
+    """Return the joints of a bag's plant of several joints, in order; none of a plant of one, which needs no choice.
+
+    Args:
+        path: The bag.
+        prefix: As :func:`read_run` takes it.
+
+    Raises:
+        BagError: The bag cannot be read.
+        DataError: It lacks the states.
+    """
+    with read_bag(path) as bag:
+        topic = f"{_space(bag, prefix)}/{names.JOINT_STATES}"
+        return () if isinstance(bag[topic], np.ndarray) else bag.joints(topic).names
+
+
+def _space(bag: Bag, prefix: str | None) -> str:
+    return find_prefix(bag) if prefix is None else prefix.rstrip("/")
 
 
 def timing_warning(plants: Mapping[str, Mapping[str, Any]]) -> str:
@@ -146,6 +174,7 @@ def read_run(
     *,
     prefix: str | None = None,
     label: str | None = None,
+    joint: str | None = None,
     start_ns: int | None = None,
     stop_ns: int | None = None,
 ) -> RunData:
@@ -155,34 +184,39 @@ def read_run(
         path: The bag.
         prefix: Namespace of the plant's topics; None for that of its only plant.
         label: Name for tables; by default that of the bag's folder.
+        joint: Joint of a plant of several, see :func:`joints_of`. Its disturbance is the joint's own,
+            else that of the first joint that has one.
         start_ns: Start of the window by the plant's stamps [ns]; by default the event ``noise_start``, or without
             one the first sample of the disturbance.
         stop_ns: End of the window [ns]; by default ``noise_end``, or the last sample of the disturbance.
 
     Raises:
         BagError: The bag cannot be read.
-        DataError: It lacks the states or the window.
+        DataError: It lacks the states or the window, or has other joints.
     """
     with read_bag(path) as bag:
-        space = find_prefix(bag) if prefix is None else prefix.rstrip("/")
-        states = _increasing(bag.array(f"{space}/{names.JOINT_STATES}"))
+        space = _space(bag, prefix)
+        topic = f"{space}/{names.JOINT_STATES}"
+        states = _increasing(bag.array(topic) if joint is None else bag.joints(topic).of(joint))
         if len(states) < 4:
             raise DataError(f"bag {path} has {len(states)} states; expected at least 4")
-        commands = _optional(bag, f"{space}/{names.EFFORT_COMMAND}")
-        disturbance = _optional(bag, f"{space}/{names.DISTURBANCE}")
-        applied = _optional(bag, f"{space}/{names.APPLIED_EFFORT}")
+        commands = _optional(bag, f"{space}/{names.EFFORT_COMMAND}", joint)
+        disturbance = _optional(bag, f"{space}/{names.DISTURBANCE}", joint, otherwise_another=True)
+        applied = _optional(bag, f"{space}/{names.APPLIED_EFFORT}", joint)
         events = [event for event in bag.events() if event["topic"].startswith(f"{space}/")]
         metadata, damage = dict(bag.metadata), list(bag.damage)
     start, stop = _window(events, disturbance, str(path), start_ns, stop_ns)
     name = label or Path(path).stem
     stamps = states["stamp_ns"]
     times = (stamps - start) / NANOSECONDS
+    slides = joint in _SLIDING
     whole = Series(
         times,
-        unwrap_near_upright(states["position"]),
+        states["position"] if slides else unwrap_near_upright(states["position"]),
         states["velocity"],
         _answers(stamps, commands, states["effort"]),
         name,
+        "m" if slides else "rad",
     )
     span = (stop - start) / NANOSECONDS
     inside = (stamps >= start) & (stamps < stop)
@@ -207,6 +241,7 @@ def read_run(
         damage=damage,
         follows_reference=follows_reference(metadata, space),
         reference=reference,
+        joint=joint or "",
     )
 
 
@@ -257,10 +292,24 @@ def _increasing(array: NDArray[Any]) -> NDArray[Any]:
     return array[first]
 
 
-def _optional(bag: Bag, topic: str) -> NDArray[Any] | None:
+def _optional(
+    bag: Bag, topic: str, joint: str | None = None, *, otherwise_another: bool = False
+) -> NDArray[Any] | None:
     if topic not in bag.topics:
         return None
-    array = _increasing(bag.array(topic))
+    if joint is None:
+        found = bag.array(topic)
+    elif not bag.log_times(topic).size:
+        return None
+    else:
+        table = bag.joints(topic)
+        having = [one for one, effort in zip(table.names, table.effort.T, strict=True) if np.any(effort != 0.0)]
+        if otherwise_another and having and joint not in having:
+            joint = having[0]
+        if joint not in table.names:
+            return None
+        found = table.of(joint)
+    array = _increasing(found)
     array = array[np.isfinite(array["effort"])]
     return array if len(array) else None
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import scipy
@@ -78,10 +78,11 @@ class Series:
 
     Args:
         t: Stamps, strictly increasing, shape (n,) [s].
-        position: Angle, continuous (not wrapped), shape (n,) [rad].
-        velocity: Shape (n,) [rad/s].
-        effort: Torque of the controller in answer to each state, shape (n,) [N m].
+        position: Angle, continuous (not wrapped), shape (n,) [rad]; of a joint that slides, its place [m].
+        velocity: Shape (n,) [rad/s or m/s].
+        effort: Torque of the controller in answer to each state, shape (n,) [N m or N]; 0 of a joint without a motor.
         name: For messages and legends.
+        unit: Of the position, ``rad`` or ``m``.
     """
 
     t: Array
@@ -89,6 +90,7 @@ class Series:
     velocity: Array
     effort: Array
     name: str = "series"
+    unit: str = "rad"
 
     def __post_init__(self) -> None:
         """Convert and check."""
@@ -127,11 +129,17 @@ class Series:
                 f"{self.name} has {last - first} samples between {start:.3f} s and {stop:.3f} s; expected at least 4"
             )
         cut = slice(first, last)
-        return Series(self.t[cut], self.position[cut], self.velocity[cut], self.effort[cut], self.name)
+        return replace(
+            self,
+            t=self.t[cut],
+            position=self.position[cut],
+            velocity=self.velocity[cut],
+            effort=self.effort[cut],
+        )
 
     def shifted(self, delay: float) -> Series:
         """Return the same motion with all stamps earlier by ``delay`` [s]."""
-        return Series(self.t - delay, self.position, self.velocity, self.effort, self.name)
+        return replace(self, t=self.t - delay)
 
     def interpolated(self, times: Array) -> Series:
         """Return the motion at other times: cubic splines for angle and velocity, effort held as it is applied.
@@ -150,7 +158,7 @@ class Series:
         position = scipy.interpolate.CubicSpline(self.t, self.position)(times)
         velocity = scipy.interpolate.CubicSpline(self.t, self.velocity)(times)
         effort = Signal(self.t, self.effort, self.name).held_at(times)
-        return Series(times, position, velocity, effort, self.name)
+        return replace(self, t=times, position=position, velocity=velocity, effort=effort)
 
 
 def shared_span(*series: Series) -> tuple[float, float]:

@@ -1,15 +1,16 @@
-"""The answer for a comparison, with the other layers that a run folder keeps."""
+"""The answer for a comparison, or for those of several joints, with the other layers that a run folder keeps."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from pendulum_bags.comparison import Comparison
-from pendulum_bags.verdict.layers import Answer, Layer, LayerResult, read_layers, sum_up
+from pendulum_bags.verdict.joints import join_joints
+from pendulum_bags.verdict.layers import Answer, Layer, LayerResult, Mark, read_layers, sum_up
 from pendulum_bags.verdict.same_run import same_run_layer
 
-__all__ = ["answer_of"]
+__all__ = ["answer_of", "answer_of_joints"]
 
 
 def answer_of(
@@ -33,3 +34,24 @@ def answer_of(
     known = {Layer.SAME_RUN, *(one.layer for one in anew)}
     others = [one for folder in folders for one in read_layers(folder) if one.layer not in known]
     return sum_up([same_run_layer(comparison, more=more), *anew, *others], emulated=comparison.is_emulated)
+
+
+def answer_of_joints(comparisons: Mapping[str, Comparison], folders: Sequence[Path] = ()) -> Answer:
+    """Return the answer for a plant of several joints.
+
+    Args:
+        comparisons: The comparison of each joint, at least one.
+        folders: As :func:`answer_of` takes them.
+
+    Raises:
+        DataError: As of :func:`answer_of`.
+    """
+    joined = join_joints({joint: same_run_layer(one) for joint, one in comparisons.items()})
+    kept = [one for folder in folders for one in read_layers(folder) if one.layer is not Layer.SAME_RUN]
+    asked = {one.layer for one in (joined, *kept)}
+    others = [
+        LayerResult(layer, Mark.NOT_MEASURED, "Not asked: only plants of one joint are measured for it.")
+        for layer in Layer
+        if layer not in asked
+    ]
+    return sum_up([joined, *kept, *others], emulated=all(one.is_emulated for one in comparisons.values()))

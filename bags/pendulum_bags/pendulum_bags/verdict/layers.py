@@ -266,7 +266,7 @@ def sum_up(results: Iterable[LayerResult], *, emulated: bool = False) -> Answer:
     # What mends a no comes before what decides, and that before what was left out.
     order = (*by_mark[Mark.NO], *by_mark[Mark.UNDECIDED], *by_mark[Mark.YES])
     steps = dict.fromkeys(step for result in order for step in result.next_steps)
-    for how in dict.fromkeys(result.reason for result in by_mark[Mark.NOT_MEASURED]):
+    for how in dict.fromkeys(result.reason for result in by_mark[Mark.NOT_MEASURED] if result.reason):
         titles = [f"“{result.layer.title}”" for result in by_mark[Mark.NOT_MEASURED] if result.reason == how]
         steps[f"Measure {_listed(titles)}: {how}"] = None
     return Answer(mark, text, layers, tuple(steps))

@@ -55,8 +55,9 @@ def in_words(test: EquivalenceTest) -> str:
     if test.quantity == "delay":
         when = "later" if value >= 0.0 else "earlier"
         return f"the hardware answers {abs(value):.3g} {test.unit} {when} than the simulation"
-    if test.quantity.startswith("mean angle"):
-        return f"the hardware's mean angle is {abs(value):.2g} {test.unit} {'higher' if value >= 0.0 else 'lower'}"
+    if test.quantity.startswith("mean "):
+        what = test.quantity.removeprefix("mean ").split(" ", maxsplit=1)[0]
+        return f"the hardware's mean {what} is {abs(value):.2g} {test.unit} {'higher' if value >= 0.0 else 'lower'}"
     if test.quantity.startswith("spread of "):
         what = test.quantity.removeprefix("spread of ").split(" ", maxsplit=1)[0]
         if test.unit == "-":
@@ -66,7 +67,7 @@ def in_words(test: EquivalenceTest) -> str:
             size = f"{abs(value):.2g} {test.unit} {'larger' if value >= 0.0 else 'smaller'}"
         return f"the standard deviation of the hardware's {what} is {size}"
     apart = "% of their spread" if test.unit == "%" else test.unit
-    what = "velocities" if "velocities" in test.quantity else "angles"
+    what = test.quantity.removeprefix("distance of ").split(" ", maxsplit=1)[0]
     less = ", the delay taken out" if "less the delay" in test.quantity else ""
     return f"the {what} are {value:.2g} {apart} apart{less}"
 
@@ -110,9 +111,12 @@ def _remedies(comparison: Comparison, failed: Sequence[EquivalenceTest]) -> tupl
     late = next((test for test in failed if test.quantity == "delay"), None)
     foreign = _foreign_simulation(comparison)
     if any(name.startswith("spread") or "less the delay" in name for name in shapes):
+        identify = f"python -m pendulum_bags identify {source} --out plant.yaml"
+        if comparison.pairs[0].hardware.joint:
+            # States of several joints are identified from a file with columns of each.
+            identify = f"python -m pendulum_bags export {source} --output csv --format csv, then identify --plant"
         steps.append(
-            f"Identify the plant from what the hardware did (python -m pendulum_bags identify {source} "
-            "--out plant.yaml), then "
+            f"Identify the plant from what the hardware did ({identify}), then "
             + (f"carry its values over to {foreign}." if foreign else "simulate and design with --plant plant.yaml.")
         )
     elif late is not None and foreign:

@@ -64,9 +64,8 @@ def tests_table(verdict: Verdict, *, emulated: bool) -> WholeTable:
     return table
 
 
-def print_answer(console: Console, answer: Answer, verdict: Verdict, *, emulated: bool = False) -> None:
-    """Print tests, layers, the answer in one sentence, and what to do next; the answer is what is read last."""
-    console.print(tests_table(verdict, emulated=emulated))
+def print_answer(console: Console, answer: Answer) -> None:
+    """Print layers, the answer in one sentence, and what to do next; the answer is what is read last."""
     console.print(layers_table(answer))
     console.print("\nIs the simulation good enough to design a controller on?")
     console.print(Text(answer.sentence, _STYLES[answer.mark]), highlight=False)

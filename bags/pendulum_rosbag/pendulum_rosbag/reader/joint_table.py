@@ -4,12 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pendulum_msgs_py.contract.cdr import decode_joint_state
 from pendulum_msgs_py.errors import DataError
+from pendulum_rosbag.reader.joint_state import FIELDS
 
 __all__ = ["JointTable", "joint_table"]
 
@@ -35,6 +37,21 @@ class JointTable:
     position: Array
     velocity: Array
     effort: Array
+
+    def of(self, joint: str) -> NDArray[Any]:
+        """Return one joint's messages, with the columns that :meth:`Bag.array` gives of a topic of one joint.
+
+        Raises:
+            DataError: The messages are of other joints.
+        """
+        if joint not in self.names:
+            raise DataError(f"joint is {joint!r}; expected one of {', '.join(self.names)}")
+        column = self.names.index(joint)
+        rows = np.empty(self.stamp_ns.size, FIELDS)
+        rows["log_time_ns"], rows["stamp_ns"] = self.log_time_ns, self.stamp_ns
+        for name in ("position", "velocity", "effort"):
+            rows[name] = getattr(self, name)[:, column]
+        return rows
 
 
 def joint_table(messages: Iterable[tuple[int, bytes]], where: str) -> JointTable:

@@ -1,0 +1,179 @@
+"""Simulation and hardware of several joints, compared joint by joint: real plants in memory, real bags."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from pendulum_bags.comparison import Outcome, compare_runs
+from pendulum_bags.comparison.compare_cli import main
+from pendulum_bags.comparison.pairs import Pair
+from pendulum_bags.runs.run_data import joints_of, read_run
+from pendulum_bags.verdict.joints import join_joints
+from pendulum_bags.verdict.layers import Evidence, Layer, LayerResult, Mark
+from pendulum_lqr.controllers.joint_lqr import make_joint_controller
+from pendulum_msgs_py.contract.cdr import encode_joints
+from pendulum_msgs_py.contract.noise import uniform_array
+from pendulum_msgs_py.errors import DataError, ParameterError
+from pendulum_msgs_py.plants.mechanism_parameters import MechanismParameters, load_mechanism
+from pendulum_rosbag.storage import open_writer
+from pendulum_sim.mechanism_plant import MechanismPlant
+
+STATE = "sensor_msgs/msg/JointState"
+EPOCH_NS = 1_700_000_000_000_000_000
+JOINTS = ("cart", "pole")
+
+
+def regulate(plant: MechanismParameters, sensor_seed: int, *, duration: float = 8.0) -> dict[str, np.ndarray]:
+    """Hold the cart-pole upright under noise on the cart; rows of position, velocity, command and noise."""
+    period = 0.01
+    model = MechanismPlant(plant, period)
+    controller = make_joint_controller("lqr", load_mechanism("cart_pole"), {}, period)
+    state = model.reset((0.0, np.pi))
+    count = round(duration / period)
+    noise = uniform_array(5, 0, count, 3.0)
+    sensor = np.random.default_rng(sensor_seed)
+    rows = np.empty((count, 6))
+    for k in range(count):
+        q = tuple(np.asarray(state.position) + 1e-5 * sensor.standard_normal(2))
+        v = tuple(np.asarray(state.velocity) + 1e-3 * sensor.standard_normal(2))
+        (command,) = controller.command(k * period, q, v)
+        rows[k] = *q, *v, command, noise[k]
+        state = model.step((command + float(noise[k]),))
+    return {"position": rows[:, :2], "velocity": rows[:, 2:4], "command": rows[:, 4:5], "noise": rows[:, 5:]}
+
+
+def write(path: Path, columns: Mapping[str, np.ndarray], *, offset: tuple[float, float] = (0.0, 0.0)) -> Path:
+    with open_writer(path) as bag:
+        for topic in ("joint_states", "effort_command", "disturbance"):
+            bag.add_topic(f"/plant/{topic}", STATE)
+        for k in range(len(columns["noise"])):
+            stamp = EPOCH_NS + k * 10_000_000
+            q, v = (tuple(map(float, columns[name][k])) for name in ("position", "velocity"))
+            q = (q[0] + offset[0], q[1] + offset[1])
+            command, noise = float(columns["command"][k, 0]), float(columns["noise"][k, 0])
+            state = encode_joints(stamp, "plant", JOINTS, q, v, (command + noise, 0.0))
+            bag.write("/plant/joint_states", stamp + 100_000, state)
+            for topic, value in (("effort_command", command), ("disturbance", noise)):
+                bag.write(f"/plant/{topic}", stamp + 200_000, encode_joints(stamp, topic, ("cart",), effort=(value,)))
+    return path
+
+
+@pytest.fixture(scope="module")
+def recordings() -> dict[str, dict[str, np.ndarray]]:
+    plant = load_mechanism("cart_pole")
+    return {
+        "sim": regulate(plant, 1),
+        "alike": regulate(plant, 2),
+        "other": regulate(plant.with_values({"cart_mass": 3.0}), 3),
+    }
+
+
+@pytest.fixture(scope="module")
+def bags(recordings: dict[str, dict[str, np.ndarray]], tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
+    folder = tmp_path_factory.mktemp("joints")
+    return {name: write(folder / name, columns) for name, columns in recordings.items()}
+
+
+def told(capsys: pytest.CaptureFixture[str], *arguments: Any) -> dict[str, Any]:
+    assert main([*map(str, arguments), "--json"]) == 0
+    content: dict[str, Any] = json.loads(capsys.readouterr().out)
+    return content
+
+
+def test_the_same_plant_twice_is_told_alike_in_every_joint(
+    bags: dict[str, Path], capsys: pytest.CaptureFixture[str]
+) -> None:
+    content = told(capsys, bags["sim"], bags["alike"])
+    assert list(content["joints"]) == list(JOINTS) == list(joints_of(bags["sim"]))
+    tests = {joint: [test["quantity"] for test in one["verdict"]["tests"]] for joint, one in content["joints"].items()}
+    assert [one["verdict"]["outcome"] for one in content["joints"].values()] == ["equivalent", "equivalent"]
+    assert content["answer"]["mark"] == "yes"
+    # What slides has positions and a force; a joint without a motor has no torque that could be tested.
+    assert {"mean position difference", "spread of force (ratio)", "distance of positions"} <= set(tests["cart"])
+    assert {"mean angle difference", "distance of angles"} <= set(tests["pole"])
+    assert not [name for name in tests["pole"] if "torque" in name or "force" in name]
+    # Noise on the cart moves the pole too: both joints are paired by it.
+    assert all("position" in one["paired"] for one in content["joints"].values())
+
+
+def test_another_plant_is_told_by_the_joint_that_shows_it(
+    bags: dict[str, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    content = told(capsys, bags["sim"], bags["other"], "-o", tmp_path)
+    assert content["answer"]["mark"] == "no"
+    assert content["joints"]["cart"]["verdict"]["outcome"] == "not equivalent"
+    assert content["answer"]["sentence"].startswith("No: cart: ")
+    assert (tmp_path / "figures" / "joints_together.png").stat().st_size > 10_000
+    assert main([str(bags["sim"]), str(bags["other"])]) == 0
+    shown = capsys.readouterr().out
+    assert "std of x [m]" in shown
+    assert "std of theta [rad]" in shown
+    assert "experiment frequency_response" not in shown, "no layer is offered that only plants of one joint have"
+
+
+def test_one_joint_may_be_asked_alone(bags: dict[str, Path], capsys: pytest.CaptureFixture[str]) -> None:
+    assert list(told(capsys, bags["sim"], bags["other"], "--joint", "pole")["joints"]) == ["pole"]
+    assert main([str(bags["sim"]), str(bags["other"]), "--joint", "elbow"]) == 2
+    assert "joint is 'elbow'; expected one of cart, pole" in capsys.readouterr().err
+
+
+def test_only_an_angle_is_known_but_for_whole_turns(
+    recordings: dict[str, dict[str, np.ndarray]], bags: dict[str, Path], tmp_path: Path
+) -> None:
+    """A cart 6.28 m away is elsewhere; a pole a turn further is where it was."""
+    turn = 2.0 * np.pi
+    moved = write(tmp_path / "moved", recordings["alike"], offset=(turn, turn))
+    means = {
+        joint: Pair.of(read_run(bags["sim"], joint=joint), read_run(moved, joint=joint)).difference.position.mean()
+        for joint in JOINTS
+    }
+    assert means["cart"] == pytest.approx(turn, abs=0.01)
+    assert means["pole"] == pytest.approx(0.0, abs=0.01)
+
+
+def test_margins_of_what_slides_are_shares_and_millimetres(bags: dict[str, Path]) -> None:
+    wide = compare_runs(
+        bags["sim"], bags["other"], joint="cart", margin={"mean_position": "1 m", "spread_velocity": 900}
+    )
+    tests = {test.quantity: test for test in wide.verdict.tests}
+    assert tests["mean position difference"].outcome is Outcome.EQUIVALENT
+    assert tests["mean position difference"].high == 1.0
+    with pytest.raises(ParameterError, match=r"margin path_angle is 0.2 deg, and this joint slides; expected a share"):
+        compare_runs(bags["sim"], bags["other"], joint="cart", margin={"path_angle": "0.2 deg"})
+    compare_runs(bags["sim"], bags["other"], joint="pole", margin={"path_angle": "0.2 deg"})
+
+
+def test_a_joint_that_stood_still_is_named(recordings: dict[str, dict[str, np.ndarray]], tmp_path: Path) -> None:
+    still = {**recordings["sim"], "position": recordings["sim"]["position"] * np.array([0.0, 1.0])}
+    bag = write(tmp_path / "still", still)
+    with pytest.raises(DataError, match=r"stood still in cart at 0 m under the noise"):
+        compare_runs(bag, bag, joint="cart")
+
+
+@pytest.mark.parametrize(
+    ("marks", "expected"),
+    [
+        ((Mark.YES, Mark.YES), Mark.YES),
+        ((Mark.YES, Mark.UNDECIDED), Mark.UNDECIDED),
+        ((Mark.NO, Mark.UNDECIDED), Mark.NO),
+        ((Mark.UNDECIDED, Mark.NO), Mark.NO),
+    ],
+)
+def test_a_plant_is_as_alike_as_its_least_alike_joint(marks: tuple[Mark, Mark], expected: Mark) -> None:
+    results = {
+        joint: LayerResult(
+            Layer.SAME_RUN, mark, f"Says {mark.value}.", (Evidence("delay", "ms", 1.0),), reason=mark.value
+        )
+        for joint, mark in zip(JOINTS, marks, strict=True)
+    }
+    joined = join_joints(results)
+    assert joined.mark is expected
+    assert [row.quantity for row in joined.evidence] == ["cart: delay", "pole: delay"]
+    because = [joint for joint, mark in zip(JOINTS, marks, strict=True) if mark is expected]
+    assert joined.reason == "; ".join(f"{joint}: {expected.value}" for joint in because)
