@@ -6,6 +6,7 @@ import json
 import math
 import re
 import shutil
+import signal
 import socket
 import subprocess
 import urllib.error
@@ -19,6 +20,7 @@ import pytest
 
 from pendulum_bags.console.security import refusal
 from pendulum_bags.verdict.layers import Layer, LayerResult, Mark, sum_up
+from tests.faults import console_stops
 from tests.faults.console_stops import CHROMIUM, QUIET, STOPS, StopRig
 from tests.fixtures import PROJECT, wait_for
 from tests.npm import install_packages
@@ -39,6 +41,14 @@ IN_SHORT = (
 )
 """Ways to lose a stop that each run tries once; all of them, 20 times: ``python -m tests.faults.console_stops``."""
 STOP_LIMIT_MS = 100.0
+COVERED_BY_NOTICES = """() => {
+    const notices = [...document.querySelectorAll(".notices > *, .q-notification")]
+        .map((it) => it.getBoundingClientRect());
+    return [...document.querySelectorAll("button, input, select, a")].map((it) => [it, it.getBoundingClientRect()])
+        .filter(([it, box]) => box.width && notices.some((other) => box.left < other.right && other.left < box.right
+            && box.top < other.bottom && other.top < box.bottom)).map(([it]) => it.outerHTML);
+}"""
+"""Controls under a notice, as the page shows both."""
 
 
 @pytest.mark.parametrize(
@@ -126,18 +136,30 @@ def test_two_clients_see_stop_tune_and_meet_a_new_simulator(
     assert box["width"] > 300
     popup = phone.locator("#popup").bounding_box()  # says that the connection is lost; it has its place before that
     assert popup["y"] + popup["height"] <= box["y"], (popup, box)
-    notices = phone.locator(".q-notifications__list--bottom").first.bounding_box()
-    assert notices["y"] + notices["height"] <= box["y"], (notices, box)
 
     # A refused value is explained, and the value in force comes back.
     field = desk.locator("input[aria-label='r of /sim']")
     wait_for(lambda: field.input_value() == "0.1", 20, "the value in force")
     field.fill("-1")
     field.press("Tab")
-    notice = desk.locator(".q-notification", has_text="refuses r")
+    notice = desk.locator(".notices .bad", has_text="refuses r")
     notice.wait_for(timeout=10_000)
     assert "-1" in notice.inner_text()
     wait_for(lambda: field.input_value() == "0.1", 10, "the old value")
+    on_the_phone = phone.locator("input[aria-label='r of /sim']")
+    on_the_phone.fill("-1")
+    on_the_phone.press("Tab")
+    phone.locator(".notices .bad", has_text="refuses r").wait_for(timeout=10_000)
+    for page in (desk, phone):
+        assert page.evaluate(COVERED_BY_NOTICES) == []
+
+    # So it does after a field was emptied, or holds more than a parameter can.
+    seed = desk.locator("input[aria-label='seed of /sim']")
+    for emptied_or_overflowing in ("", "9" * 30):
+        seed.fill(emptied_or_overflowing)
+        seed.press("Tab")
+        wait_for(lambda: seed.input_value() == "1", 10, f"the old value after {emptied_or_overflowing!r}")
+    desk.locator(".notices .bad", has_text="is too large; expected a whole number").wait_for(timeout=10_000)
 
     # From the key to the plant, on one clock; the best of five, since neighbours on the machine are not our delay.
     delays = []
@@ -158,10 +180,16 @@ def test_two_clients_see_stop_tune_and_meet_a_new_simulator(
     desk.get_by_role("button", name="Arm /sim", exact=True).click()
     wait_for(lambda: _mode(desk) == "armed_effort", 10, "the plant to be armed")
 
-    # The node goes and comes back; the page goes on with the new one.
-    simulator.interrupt()
-    assert simulator.wait(20) == 0
+    # The node is killed: it is no longer shown as armed, and does not go without a word.
+    simulator.send_signal(signal.SIGKILL)
+    row = desk.locator("[data-plant='/sim']")
+    row.locator(".silent").wait_for(timeout=10_000)
+    assert "no state for" in row.inner_text()
     wait_for(lambda: desk.evaluate("Object.keys(pendulumConsole.plants).length") == 0, 30, "the plant to be gone")
+    gone = "/sim is gone from the graph (its last state: ARMED: follows the controller)"
+    desk.locator("#alarms .note", has_text=gone).wait_for(timeout=10_000)
+
+    # It comes back; the page goes on with the new one.
     processes.start("pendulum_sim", "simulator", "--ros-args", "-r", "__ns:=/sim", "-p", "start:=top")
     wait_for(lambda: _mode(desk) == "armed_effort", 60, "the new plant")
     before = desk.evaluate("pendulumConsole.plants['/sim'].stamp_ns")
@@ -218,7 +246,7 @@ def test_joints_and_controllers_are_chosen_for_each_plant(browser: Any, address:
     # What runs already is not doubled.
     page.get_by_role("button", name="Start controller /sim").click()
     already = re.compile(r"/sim/controller \(.+\) is there already")
-    page.locator(".q-notification", has_text=already).wait_for(timeout=60_000)
+    page.locator(".notices .bad", has_text=already).wait_for(timeout=60_000)
 
     # A plant of several joints is offered what can hold it; what is started waits until it is activated.
     robot = page.locator("[data-card='/robot']")
@@ -267,6 +295,19 @@ def test_no_stop_is_lost_whatever_is_frozen_killed_or_cut_off(domain_id: int, tm
         finally:
             left = rig.close()
     assert left == []
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [(["1", "mouse", "frozzen"], "no stop has 'frozzen' in its name"), (["0"], "tries is 0; expected at least 1")],
+)
+def test_stops_that_nobody_can_try_are_refused(
+    arguments: list[str], said: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with pytest.raises(SystemExit) as ended:
+        console_stops.main(arguments)
+    assert ended.value.code == 2
+    assert said in capsys.readouterr().err
 
 
 def test_a_foreign_page_cannot_press_the_button(address: str) -> None:

@@ -17,7 +17,7 @@ import statistics
 import tempfile
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
@@ -384,12 +384,8 @@ STOPS: dict[str, Callable[[StopRig], Outcome]] = {
 """What is done, by the name that the table gives it."""
 
 
-def main() -> int:
+def main(argv: Sequence[str] | None = None) -> int:
     """Try each stop several times and print a table; return 1 where one was lost or the page in the wrong."""
-    from playwright.sync_api import sync_playwright
-
-    from pendulum_bags.experiments.domain import reserve_domain
-
     parser = argparse.ArgumentParser(
         prog="python -m tests.faults.console_stops",
         description=main.__doc__,
@@ -398,12 +394,20 @@ def main() -> int:
     parser.add_argument("tries", nargs="?", type=int, default=20, help="how often each way is tried")
     parser.add_argument("names", nargs="*", help="only the ways whose names have one of these in them")
     parser.add_argument("--list", action="store_true", help="print the names of the ways and end")
-    options = parser.parse_args()
+    options = parser.parse_args(argv)
+    if options.list:
+        print("\n".join(STOPS))
+        return 0
+    if options.tries < 1:
+        parser.error(f"tries is {options.tries}; expected at least 1")
+    if unknown := [part for part in options.names if not any(part in name for name in STOPS)]:
+        parser.error(f"no stop has {unknown[0]!r} in its name; expected a part of one of those that --list prints")
     wanted = options.names or [""]
     chosen = {name: act for name, act in STOPS.items() if any(part in name for part in wanted)}
-    if options.list or not chosen:
-        print("\n".join(STOPS))
-        return int(not options.list)
+    from playwright.sync_api import sync_playwright
+
+    from pendulum_bags.experiments.domain import reserve_domain
+
     failed = 0
     with tempfile.TemporaryDirectory() as folder, reserve_domain() as domain, sync_playwright() as play:
         os.environ["ROS_DOMAIN_ID"] = str(domain)

@@ -14,6 +14,7 @@ from pendulum_bags.console.controller_choice import ControllerChoice
 from pendulum_bags.console.graph import Graph
 from pendulum_bags.console.jobs import Jobs
 from pendulum_bags.console.layers_card import LayersCard
+from pendulum_bags.console.notices import Notices
 from pendulum_bags.console.parameter_table import ParameterTable
 from pendulum_msgs_py.errors import PendulumError
 
@@ -38,6 +39,7 @@ class Layout:
             ParameterTable(graph, "controller", self._carefully),
             ParameterTable(graph, "disturbance", self._carefully),
         ]
+        self._notices = Notices()
         self._certified = CertifiedDesigns(jobs)
         self._layers = LayersCard(jobs)
         self._job_labels: dict[str, tuple[ui.label, ui.link]] = {}
@@ -51,6 +53,7 @@ class Layout:
         with ui.element("header").classes("bar"):
             ui.html('<h1 class="title">Pendulum console</h1>', sanitize=False)
             ui.html('<span id="link" role="status">connecting</span>', sanitize=False)
+            self._notices.build()
             # Plain HTML and a request of its own: it works while the rest of the page waits for the server.
             ui.html(
                 '<button id="e_stop" type="button" aria-keyshortcuts="Space Escape Enter"'
@@ -142,10 +145,10 @@ class Layout:
         try:
             answer = await work
         except PendulumError as error:
-            ui.notify(str(error), type="negative", multi_line=True, timeout=8000, position="bottom-left")
+            self._notices.say(str(error), bad=True)
             return False
         if answer:
-            ui.notify(str(answer), type="positive", position="bottom-left", timeout=2500)
+            self._notices.say(str(answer))
         return True
 
     async def _one(self, work: Awaitable[Any]) -> None:
@@ -176,10 +179,10 @@ class Layout:
         try:
             work()
         except PendulumError as error:
-            ui.notify(str(error), type="negative", position="bottom-left")
+            self._notices.say(str(error), bad=True)
 
     async def _finish(self, kind: str) -> None:
-        ui.notify(await asyncio.to_thread(self._jobs.stop, kind), position="bottom-left")
+        self._notices.say(await asyncio.to_thread(self._jobs.stop, kind))
 
     # --- what changes by itself ----------------------------------------------------------------------------
 

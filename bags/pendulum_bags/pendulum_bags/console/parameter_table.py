@@ -16,6 +16,8 @@ __all__ = ["ParameterTable", "parse_value", "show_value"]
 _HIDDEN = frozenset({"start_type_description_service", "use_sim_time", "autostart", "autoactivate", "command_type"})
 """Parameters that are no matter of the running experiment."""
 _ALL = "all plants"
+_SMALLEST, _LARGEST = -(2**63), 2**63 - 1
+"""What a parameter of ROS holds as a whole number."""
 _UNIT = re.compile(r"\[[^]]+\]$")
 
 
@@ -41,6 +43,8 @@ def parse_value(text: str, like: Any) -> Any:
         if isinstance(like, (list, tuple)):
             kind = like[0] if like else 0.0
             return [parse_value(part, kind) for part in text.split(",")]
+        if isinstance(like, int) and not _SMALLEST <= int(text) <= _LARGEST:
+            raise FaultError(f"{text} is too large; expected a whole number from {_SMALLEST} to {_LARGEST}")
         return type(like)(text) if isinstance(like, (int, float)) else text
     except (KeyError, ValueError):
         kinds = {bool: "true or false", int: "a whole number", float: "a number"}

@@ -269,7 +269,7 @@
       if (plant.theta !== undefined && plant.moved === now) series.push([now, ...ROWS.map(([, value]) => value(plant))]);
       while (series.length && series[0][0] < now - SPAN - 1) series.shift();
     }
-    for (const name of Object.keys(state.plants)) if (!(name in frame)) note(`${name || "/"} is gone from the graph (it was ${state.plants[name].mode || "in an unknown state"})`);
+    for (const name of Object.keys(state.plants)) if (!(name in frame)) note(`${name || "/"} is gone from the graph (its last state: ${MODES[state.plants[name].mode] || state.plants[name].mode || "unknown"})`);
     state.plants = frame;
     offerJoints();
     for (const name of Object.keys(state.series)) if (!(name in frame) && !state.series[name].length) delete state.series[name];

@@ -1,0 +1,46 @@
+"""What the page answers to a press: words in its header, where they cover no control and move none."""
+
+from __future__ import annotations
+
+from nicegui import ui
+
+__all__ = ["Notices"]
+
+_NEWEST = 3
+"""Notices that stand at once."""
+_STAYS = {"bad": 15.0, "good": 4.0}
+"""How long a notice stands [s]: a refusal long enough to be read, acted on and read again."""
+
+
+class Notices:
+    """The newest few notices, newest first; the same words once, with how often they were said."""
+
+    def __init__(self) -> None:
+        self._said: dict[str, tuple[ui.element, int]] = {}
+
+    def build(self) -> None:
+        """Make their place."""
+        # Longer ones scroll, also by keyboard; a screen reader reads them when it has finished what it says.
+        self._place = ui.element("div").classes("notices").props('role="status" tabindex="0" aria-label="Notices"')
+
+    def say(self, text: str, *, bad: bool = False) -> None:
+        """Show a notice.
+
+        Args:
+            text: One sentence.
+            bad: It says why something was refused.
+        """
+        count = self._said[text][1] + 1 if text in self._said else 1
+        self._forget(text)
+        while len(self._said) >= _NEWEST:
+            self._forget(next(iter(self._said)))
+        kind = "bad" if bad else "good"
+        with self._place, ui.element("div").classes(kind) as line:
+            ui.label(f"{text} ({count} times)" if count > 1 else text)
+            ui.timer(_STAYS[kind], lambda: self._forget(text), once=True)
+        line.move(target_index=0)
+        self._said[text] = (line, count)
+
+    def _forget(self, text: str) -> None:
+        if text in self._said:
+            self._said.pop(text)[0].delete()
