@@ -23,6 +23,7 @@ NODES = (
     ("bridge", "pendulum_hw_bridge.node_specs", ("SPECS",)),
     ("disturbance", "pendulum_lqr.disturbance_node", ("DISTURBANCE_SPECS", "NODE_SPECS")),
     ("effort_adapter", "pendulum_lqr.effort_adapter_node", ("NODE_SPECS",)),
+    ("trajectory_action", "pendulum_lqr.trajectory_action_node", ("NODE_SPECS",)),
     ("recorder", "pendulum_rosbag.recorder.recorder_node", ("SPECS",)),
     ("play", "pendulum_rosbag.player.player_node", ("SPECS",)),
 )

@@ -6,6 +6,7 @@ EXECUTABLES: dict[str, str] = {
     "controller": "pendulum_lqr.controller_node:main",
     "disturbance": "pendulum_lqr.disturbance_node:main",
     "effort_adapter": "pendulum_lqr.effort_adapter_node:main",
+    "trajectory_action": "pendulum_lqr.trajectory_action_node:main",
     "design": "pendulum_lqr.design_cli:main",
     "swing_up": "pendulum_lqr.swing_up_cli:main",
     "convert_policy": "pendulum_lqr.convert_policy_cli:main",

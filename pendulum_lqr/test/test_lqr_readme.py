@@ -29,11 +29,12 @@ def test_every_controller_is_listed_with_its_parameters(name):
 
 def test_the_tables_of_the_nodes_are_those_of_the_code():
     pytest.importorskip("rclpy")
-    from pendulum_lqr import controller_node, disturbance_node, effort_adapter_node
+    from pendulum_lqr import controller_node, disturbance_node, effort_adapter_node, trajectory_action_node
 
     assert table("common") == markdown_table(COMMON_PARAMETERS)
     assert table("node") == markdown_table(controller_node.NODE_SPECS)
     assert table("effort_adapter") == markdown_table(effort_adapter_node.NODE_SPECS)
+    assert table("trajectory_action") == markdown_table(trajectory_action_node.NODE_SPECS)
     assert table("disturbance") == markdown_table(DISTURBANCE_SPECS + disturbance_node.NODE_SPECS)
 
 

@@ -156,9 +156,10 @@ def test_only_who_drives_a_plant_may_command_torque() -> None:
 def test_every_node_has_permissions_but_the_player() -> None:
     programs = {program for _, program in nodes()}
     assert {"simulator", "bridge", "controller"} <= programs
-    named_otherwise = {"effort_adapter": "effort_controller"} | dict.fromkeys(
-        ("mujoco", "gymnasium", "adopt"), "simulator"
-    )
+    named_otherwise = {
+        "effort_adapter": "effort_controller",
+        "trajectory_action": "joint_trajectory_controller",
+    } | dict.fromkeys(("mujoco", "gymnasium", "adopt"), "simulator")
     assert {named_otherwise.get(program, program) for program in programs} <= NODES.keys()
     assert "player" not in NODES
 

@@ -47,6 +47,7 @@ SECTIONS: dict[str, dict[str, str]] = {
         "controller": "pendulum_lqr controller",
         "disturbance": "pendulum_lqr disturbance",
         "effort_adapter": "pendulum_lqr effort_adapter",
+        "trajectory_action": "pendulum_lqr trajectory_action",
     },
     "A real actuator, and one that is emulated": {
         "scan": "pendulum_hw_bridge scan",

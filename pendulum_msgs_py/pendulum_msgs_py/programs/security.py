@@ -115,6 +115,11 @@ NODES: dict[str, Permissions] = {
         publish=(names.EFFORT_COMMAND, names.DIAGNOSTICS),
         subscribe=(names.JOINT_STATES, "~/commands", "joint_commands"),
     ),
+    "joint_trajectory_controller": Permissions(
+        publish=(names.JOINT_TRAJECTORY,),
+        subscribe=(names.JOINT_TRAJECTORY, names.JOINT_STATES, names.EVENTS),
+        reply=_LOGGER,
+    ),
     "disturbance": Permissions(
         publish=(names.DISTURBANCE, names.EVENTS, names.DIAGNOSTICS),
         subscribe=(names.JOINT_STATES,),

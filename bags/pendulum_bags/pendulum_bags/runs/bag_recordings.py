@@ -52,8 +52,8 @@ def read_bag_recording(path: str | Path, *, effort: str = "applied", namespace: 
         if not np.isfinite(applied["effort"]).any():
             held = "no message" if not applied.size else f"{applied.size} messages, none with an effort"
             raise DataError(
-                f"topic {applied_topic} of bag {path} has {held}; expected the torque that drove the plant (the "
-                "measured one, in joint_states, is taken instead if you ask for it)"
+                f"topic {applied_topic} of bag {path} has {held}; expected the torque that drove the plant "
+                "(--effort measured takes the measured one instead, from joint_states)"
             )
         stamps, first = np.unique(applied["stamp_ns"], return_index=True)
         return Recording(

@@ -1,0 +1,147 @@
+"""What became of a trajectory that a plant was given as a goal, read off its events.
+
+A plant takes trajectories on a topic and tells on ``events`` what it does with them. An action has one end: reached,
+cancelled, or given up for a reason.
+"""
+
+from __future__ import annotations
+
+import enum
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from pendulum_msgs_py.contract.drive import Mode
+from pendulum_msgs_py.contract.names import JOINT, Event
+
+__all__ = ["End", "Outcome", "PlantFollowing", "goal_problem"]
+
+_POSITION, _EFFORT = Mode.POSITION.value, Mode.EFFORT.value
+
+
+class Outcome(enum.Enum):
+    """How a goal ended; the values are the error codes of ``control_msgs/action/FollowJointTrajectory``."""
+
+    REACHED = 0
+    CANCELLED = 1
+    """No error code: the action has a state for it."""
+    REFUSED = -1
+    WRONG_JOINTS = -2
+    LEFT = -4
+    """The plant stopped following."""
+
+
+@dataclass(frozen=True)
+class End:
+    """How a goal ended, and why."""
+
+    outcome: Outcome
+    reason: str
+
+
+def goal_problem(joints: list[str], other_joints: list[str], tolerances: Mapping[str, int]) -> End | None:
+    """Return why a goal is not passed on to a plant, or None. Points, limits and times are judged by the plant itself.
+
+    Args:
+        joints: Joints of its trajectory.
+        other_joints: Joints of several degrees of freedom.
+        tolerances: Name of each list of tolerances -> how many it has.
+    """
+    if joints != [JOINT] or other_joints:
+        return End(Outcome.WRONG_JOINTS, f"goal is for joints {[*joints, *other_joints][:5]}; expected [{JOINT!r}]")
+    given = [name for name, count in tolerances.items() if count]
+    if given:
+        return End(
+            Outcome.REFUSED,
+            f"goal has {', '.join(given)}; expected none: the plant has a tolerance of its own, its parameter "
+            "tracking_error, and faults beyond it",
+        )
+    return None
+
+
+class PlantFollowing:
+    """One plant, and at most one goal that it follows.
+
+    The plant says nothing of who gave it a trajectory, and nothing when a new one takes the place of one that it
+    follows. So a goal is begun only while it follows none, and given up when somebody else sends one.
+    """
+
+    def __init__(self) -> None:
+        self._busy = False
+        self._begun = False
+        self._cancelled = False
+        self.active = False
+
+    @property
+    def busy(self) -> bool:
+        """Whether the plant is on its way along a trajectory, whoever gave it."""
+        return self._busy
+
+    def begin(self) -> None:
+        """Note that a goal has been sent to the plant."""
+        self.active, self._begun, self._cancelled = True, False, False
+
+    def cancel(self) -> None:
+        """Note that the plant was asked to hold where it is."""
+        self._cancelled = True
+
+    def on_event(self, event: Mapping[str, Any]) -> End | None:
+        """Take an event of the plant and return how the goal ended, or None.
+
+        Args:
+            event: With ``name``; ``mode`` and ``reason`` where it has them.
+        """
+        name, mode, reason = event.get("name"), event.get("mode"), str(event.get("reason", ""))
+        if name == Event.PLANT_MODE:
+            self._busy = mode == _POSITION
+            if not self.active:
+                return None
+            if self._busy:
+                self._begun = True
+                return None
+            if mode == _EFFORT:
+                # Before it follows, it may be commanded by torque; afterwards, none is taken before the end.
+                return self._at_the_end(reason) if self._begun else None
+            return self._end(Outcome.LEFT, f"plant is {mode}: {reason}")
+        if name == Event.TRAJECTORY_FINISHED:
+            self._busy = False
+            if self.active and (self._begun or self._cancelled):
+                return self._at_the_end(reason)
+        elif name == Event.TRAJECTORY_REFUSED and self.active:
+            if self._cancelled:
+                return self._end(Outcome.LEFT, f"plant did not hold where it was: {reason}")
+            if not self._begun:
+                return self._end(Outcome.REFUSED, reason)
+        return None
+
+    def on_other_trajectory(self) -> End | None:
+        """Note that somebody else sent the plant a trajectory."""
+        return self._end(Outcome.LEFT, "somebody else sent the plant a trajectory") if self.active else None
+
+    def on_wait(self, seconds: float, patience: float) -> End | None:
+        """Note how long ago the plant was asked for something; give the goal up where it has told nothing of that.
+
+        Args:
+            seconds: Time since a trajectory was sent to the plant [s].
+            patience: Longest wait for it to begin, or to hold [s].
+        """
+        if not self.active or seconds <= patience or (self._begun and not self._cancelled):
+            return None
+        if self._cancelled:
+            return self._end(Outcome.LEFT, f"plant did not say within {patience:g} s that it holds where it was")
+        return self._end(Outcome.LEFT, f"plant did not begin within {patience:g} s, and did not say why")
+
+    def on_silence(self, seconds: float) -> End | None:
+        """Note that the plant has said nothing for so long [s]."""
+        if not self.active:
+            return None
+        return self._end(Outcome.LEFT, f"plant has been silent for {seconds:.1f} s; whether it moves is not known")
+
+    def _at_the_end(self, reason: str) -> End:
+        if self._cancelled:
+            return self._end(Outcome.CANCELLED, "holding where it was")
+        return self._end(Outcome.REACHED, reason)
+
+    def _end(self, outcome: Outcome, reason: str) -> End:
+        self.active = False
+        return End(outcome, reason)
