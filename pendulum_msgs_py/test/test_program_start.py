@@ -7,6 +7,7 @@ import sys
 import types
 from collections.abc import Callable
 from importlib.machinery import ModuleSpec
+from pathlib import Path
 
 import pytest
 import typer
@@ -79,7 +80,7 @@ def _app() -> typer.Typer:
     app = typer.Typer()
 
     @app.command()
-    def run(gain: float, code: int = 0) -> None:
+    def run(gain: float, code: int = 0, out: Path | None = None) -> None:
         if gain < 0:
             raise ParameterError(f"gain is {gain} N m; expected >= 0")
         if gain == 3.0:
@@ -88,6 +89,8 @@ def _app() -> typer.Typer:
             raise typer.Exit(EXIT_INTERRUPTED)
         if code:
             raise typer.Exit(code)
+        if out is not None:
+            out.mkdir()
 
     return app
 
@@ -107,6 +110,9 @@ def test_a_program_that_told_of_its_interruption_is_not_told_of_again(capsys: py
         ([], 2, "Missing argument"),
         (["1.0", "--bogus"], 2, "--bogus"),
         (["3.0"], 130, "interrupted"),
+        (["1.0", "--code", "4", "--code", "5"], 2, "error: --code is given 2 times; expected once\n"),
+        (["1.0", "--out", __file__], 2, f"error: {__file__} cannot be read or written: File exists\n"),
+        (["1.0", "--out", f"{__file__}/folder"], 2, f"error: {__file__}/folder cannot be read or written: Not a"),
     ],
 )
 def test_a_command_line_ends_with_a_sentence_and_a_code(

@@ -226,6 +226,7 @@ def test_command_prints_the_verdict_last(folder: Path, capsys: pytest.CaptureFix
         (["nowhere", "nowhere"], "nowhere"),
         (["one"], "got 1 paths"),
         (["a", "b", "--margin", "wide=1"], "margin has no 'wide'"),
+        (["a", "b", "--margin", "delay=8ms", "--margin", "delay=9ms"], "margin delay is stated twice; expected once"),
     ],
 )
 def test_command_refuses_in_one_sentence(

@@ -7,6 +7,7 @@ scripts of ``setup.py`` and ``python -m`` both read it. What would hide a progra
 
 from __future__ import annotations
 
+import errno
 import importlib
 import importlib.util
 import os
@@ -168,12 +169,13 @@ def cli_main(
 
     # typer brings a click of its own, which is no other click's: its errors are found through what it exports.
     usage_error: Any = next(kind for kind in typer.BadParameter.__mro__ if kind.__name__ == "ClickException")
-    command = typer.main.get_command(app)
+    command: Any = typer.main.get_command(app)
     arguments = list(sys.argv[1:] if argv is None else argv)
     own, ros = split_ros_arguments(arguments) if takes_ros_arguments else (arguments, [])
     if completion.asked():
         print_text("\n".join(completion.of_command(command, own)))
         return 0
+    _refuse_repeats(command)
     try:
         prog_name = (_called_as and _called_as[-1]) or name
         result = command.main(args=own, prog_name=prog_name, standalone_mode=False, obj=ros)
@@ -202,10 +204,35 @@ def cli_main(
             _discard_output()
             return 0
         return stop.code if isinstance(stop.code, int) else int(stop.code is not None)
+    except OSError as error:
+        # A path that was asked for; any other is a defect, which its traceback tells.
+        if error.errno not in _OF_A_PATH:
+            raise
+        where = f"{os.fsdecode(error.filename)} cannot be read or written: " if error.filename else ""
+        return report_error(ParameterError(f"{where}{error.strerror}"))
     # typer makes a bare 130 of Ctrl-C, of which nobody has told yet.
     if result == EXIT_INTERRUPTED and not isinstance(result, _Told):
         print("interrupted", file=sys.stderr)
     return int(result) if isinstance(result, int) else 0
+
+
+def _refuse_repeats(command: Any) -> None:
+    """Let a command and its subcommands refuse an option that is given twice but counts once.
+
+    Click takes the last without a word: whoever overlooked the first would get another result than they asked for.
+    """
+    for one in getattr(command, "commands", {}).values():
+        _refuse_repeats(one)
+    parse = command.parse_args
+
+    def parse_once(context: Any, arguments: list[str]) -> list[str]:
+        _, _, order = command.make_parser(context).parse_args(args=list(arguments))
+        for option in order:
+            if order.count(option) > 1 and not option.multiple:
+                raise ParameterError(f"{max(option.opts, key=len)} is given {order.count(option)} times; expected once")
+        return list(parse(context, arguments))
+
+    command.parse_args = parse_once
 
 
 def print_text(text: str) -> None:
@@ -263,6 +290,13 @@ def report_missing(error: BaseException) -> int:
     return report_error(ParameterError(text)) if text else 0
 
 
+_OF_A_PATH = frozenset(
+    {
+        errno.ENOENT, errno.EEXIST, errno.ENOTDIR, errno.EISDIR, errno.EACCES, errno.EPERM, errno.EROFS, errno.ENOSPC,
+        errno.EDQUOT, errno.ENAMETOOLONG, errno.ELOOP,
+    }
+)  # fmt: skip
+"""What the file system answers to a path that it cannot serve."""
 _SIGNS_OF_EXHAUSTION = (
     "failed to map segment",
     "annot allocate memory",

@@ -120,7 +120,7 @@ class Margins:
             texts = margin.split(",") if isinstance(margin, str) else margin
             if not isinstance(texts, Sequence):
                 raise ParameterError(f"margin is {margin!r}; expected NAME=VALUE, such as delay=8ms")
-            stated = dict(_parse_text(text) for text in texts)
+            stated = _parse_texts(texts)
         return cls(**{**_defaults(), **stated}, stated=frozenset(stated))
 
     @classmethod
@@ -135,7 +135,7 @@ class Margins:
             ParameterError: As :meth:`parse`.
         """
         base = cls.parse(file)
-        stated = dict(_parse_text(text) for text in texts or ())
+        stated = _parse_texts(texts or ())
         return replace(base, **stated, stated=base.stated | frozenset(stated))
 
     @property
@@ -214,6 +214,16 @@ def _margin(name: str, given: Any, where: str = "") -> Margin:
     if not (math.isfinite(value) and value > 0.0):
         raise ParameterError(f"{where}margin {name} is {value:g} {unit}; expected a finite number > 0")
     return Margin(value, unit)
+
+
+def _parse_texts(texts: Sequence[str]) -> dict[str, Margin]:
+    """Return margins by their names, each of which is stated once."""
+    stated: dict[str, Margin] = {}
+    for name, margin in map(_parse_text, texts):
+        if name in stated:
+            raise ParameterError(f"margin {name} is stated twice; expected once")
+        stated[name] = margin
+    return stated
 
 
 def _parse_text(text: str) -> tuple[str, Margin]:

@@ -123,7 +123,7 @@ def design_excitation(
     """
     for kind in kinds:
         if kind not in KINDS:
-            raise DataError(f"kind is {kind!r}; expected one of {', '.join(KINDS)}")
+            raise DataError(f"kind is {kind!r}; expected one of {', '.join(KINDS)}, or best")
     for name in parameters:
         if name not in BOUNDS or name == "input_gain":
             raise DataError(

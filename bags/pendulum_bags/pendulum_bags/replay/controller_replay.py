@@ -195,7 +195,7 @@ def parse_values(texts: Sequence[str]) -> dict[str, object]:
     """Return parameters from texts such as ``q=[100.0, 0.01]``; values are YAML.
 
     Raises:
-        DataError: A text has no ``=``.
+        DataError: A text has no ``=``, or a name stands twice.
     """
     import yaml
 
@@ -204,5 +204,7 @@ def parse_values(texts: Sequence[str]) -> dict[str, object]:
         name, sign, value = text.partition("=")
         if not sign:
             raise DataError(f"parameter is {text!r}; expected NAME=VALUE")
+        if name.strip() in values:
+            raise DataError(f"parameter {name.strip()} is given twice; expected once")
         values[name.strip()] = yaml.safe_load(value)
     return values

@@ -74,6 +74,8 @@ def report(
         target = out or _common(folders)
     else:
         bad = next(folder for folder in folders if not ((folder / "sim").exists() and (folder / "hw").exists()))
+        if not bad.exists():
+            raise BagError(f"run folder {bad} does not exist")
         raise BagError(f"run folder {bad} has no bags sim and hw; expected run folders, or two bags")
     kept = [*(folders if len(folders) == 1 else ()), *(layers or ())]
     certified = carry_over(result, kept, machine, design or ())
