@@ -5,6 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import scipy
 
 from pendulum_bags.identification import identify_cli
 from pendulum_bags.identification.figures import thesis_figures
@@ -59,6 +60,58 @@ def test_inertia_and_damping_come_back_within_their_intervals():
     assert all(trial.r_squared > 0.99 for trial in result.trials)
     assert "R-squared" in result.trials[0].summary
     assert any("inertial torque is" in sentence for sentence in result.sentences)
+
+
+def slow_noise(size, level, memory, seed):
+    """Noise of a standard deviation that is correlated over some samples."""
+    pole = np.exp(-1.0 / memory)
+    white = np.random.default_rng(seed).standard_normal(size + 20 * int(memory))
+    return level * np.sqrt(1.0 - pole**2) * scipy.signal.lfilter([1.0], [1.0, -pole], white)[-size:]
+
+
+# Of noise that remembers 1 s a trial of 12 s has a dozen independent samples, of which two are fitted.
+@pytest.mark.parametrize(
+    ("memory", "level", "least"), [(1e-3, 0.02, 0.9), (30.0, 0.02, 0.87), (30.0, 0.3, 0.87), (100.0, 0.02, 0.8)]
+)
+def test_one_trial_has_intervals_that_hold_the_truth_whatever_the_memory_of_its_noise(memory, level, least):
+    inside, independent = [], []
+    for seed in range(60):
+        trial = hand_trial(seed % 6)
+        effort = B * trial.velocity + M * np.gradient(trial.velocity, trial.time)
+        noisy = effort + slow_noise(effort.size, level, memory, seed)
+        result = fit_inertia_damping([replace(trial, input=noisy)], skew=0.0)
+        regression = result.trials[0]
+        for (name, truth), at in ((("damping", B), 0), (("inertia", M), 1)):
+            low, high = result.intervals[name]
+            inside.append(low <= truth <= high)
+            error = regression.errors[at] / regression.inflation[at]
+            independent.append(abs(regression.values[at] - truth) <= 1.96 * error)
+    assert least <= np.mean(inside) <= 0.99
+    # As if residuals were independent, a slow noise is far too surely averaged out.
+    assert (np.mean(independent) < 0.5) == (memory > 1.0)
+
+
+def test_a_loop_that_the_regression_leaves_out_widens_the_interval_and_is_told():
+    trial = hand_trial(1)
+    clean = fit_inertia_damping([trial])
+    loop = 0.05 * np.sign(np.gradient(trial.velocity, trial.time))
+    looped = fit_inertia_damping([replace(trial, input=trial.input + loop)])
+    widths = [np.ptp(result.intervals["damping"]) for result in (clean, looped)]
+    assert widths[1] > 5.0 * widths[0]
+    assert any("correlated in time" in sentence for sentence in looped.sentences)
+    assert not any("correlated in time" in sentence for sentence in clean.sentences)
+    assert any("One trial does not show" in sentence for sentence in clean.sentences)
+    assert not any("One trial" in s for s in fit_inertia_damping([hand_trial(1), hand_trial(2)]).sentences)
+
+
+def test_holds_of_one_staircase_are_as_many_as_they_are_independent():
+    inside = []
+    for seed in range(60):
+        stairs = staircase(seed)
+        drift = slow_noise(stairs.time.size, 0.03, 2000.0, seed)
+        low, high = fit_gravity([replace(stairs, input=stairs.input + drift)]).intervals["gravity"]
+        inside.append(low <= G <= high)
+    assert 0.88 <= np.mean(inside) <= 1.0
 
 
 def test_the_result_stands_before_the_trials_and_full_tables_come_on_demand(tmp_path, capsys):

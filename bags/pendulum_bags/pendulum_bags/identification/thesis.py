@@ -16,6 +16,7 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
+from pendulum_bags.runs.correlation import effective_size
 from pendulum_bags.runs.datasets import Recording
 from pendulum_msgs_py.contract.names import Event
 from pendulum_msgs_py.errors import DataError
@@ -37,6 +38,8 @@ Array = NDArray[np.float64]
 RECORD_SKEW = 0.5e-3
 """Time between two quantities of one record of an actuator: half a cycle of its firmware, which runs at 1 kHz [s]."""
 
+_CORRELATED = 1.2
+"""Inflation of an error from which it is told [-]."""
 _HOLD_EVENTS = ("static", "hold")
 _TRIAL_EVENTS = (Event.TRIAL_START, Event.TRIAL_END)
 
@@ -48,10 +51,11 @@ class Regression:
     Args:
         trial: Name of the recording.
         names: Coefficients.
-        values, errors, t, p: Per coefficient, shape (k,).
-        intervals: 95 % intervals, shape (k, 2).
+        values, errors, t, p: Per coefficient, shape (k,); errors allow for residuals that are correlated in time.
+        intervals: 95 % intervals, shape (k, 2), with as many degrees of freedom as there are independent samples.
+        inflation: By how much these errors exceed those of independent residuals, shape (k,).
         r_squared: Uncentred, as there is no intercept.
-        summary: The full table as statsmodels prints it.
+        summary: The full table as statsmodels prints it, for independent residuals.
         regressors, response: The data, shape (n, k) and (n,).
     """
 
@@ -62,6 +66,7 @@ class Regression:
     t: Array
     p: Array
     intervals: Array
+    inflation: Array
     r_squared: float
     summary: str
     regressors: Array
@@ -118,6 +123,7 @@ class ThesisResult:
                     "t": dict(zip(r.names, r.t.tolist(), strict=True)),
                     "p": dict(zip(r.names, r.p.tolist(), strict=True)),
                     "intervals": dict(zip(r.names, r.intervals.tolist(), strict=True)),
+                    "inflation": dict(zip(r.names, r.inflation.tolist(), strict=True)),
                     "r_squared": r.r_squared,
                 }
                 for r in self.trials
@@ -129,10 +135,13 @@ class ThesisResult:
 def regress(trial: str, names: Sequence[str], regressors: Array, response: Array) -> Regression:
     """Fit response = regressors @ coefficients by ordinary least squares, without intercept.
 
+    What the two terms leave out, such as hysteresis, is as slow as the motion: thousands of its samples are a few
+    independent ones, and errors of independent residuals would be several times too small.
+
     Args:
         trial: For the table.
         names: Of the regressors, length k.
-        regressors: shape (n, k).
+        regressors: In the order of time, shape (n, k).
         response: shape (n,).
     """
     # statsmodels takes a second to import: only those who ask for tables wait for it.
@@ -141,6 +150,14 @@ def regress(trial: str, names: Sequence[str], regressors: Array, response: Array
     if len(response) <= len(names):
         raise DataError(f"{trial} has {len(response)} points for {len(names)} coefficients; expected more")
     table = sm.OLS(response, regressors).fit()
+    independent = np.array([_independent(regressors, np.asarray(table.resid), i) for i in range(len(names))])
+    # The fit takes its share of few independent samples too: their residuals are smaller than the errors were.
+    inflation = np.sqrt((len(response) - len(names)) / np.maximum(independent - len(names), 1.0))
+    errors = inflation * np.asarray(table.bse)
+    freedom = np.maximum(independent - len(names), 1.0)
+    values = np.asarray(table.params)
+    t = values / np.maximum(errors, 1e-300)
+    half = scipy.stats.t.ppf(0.975, freedom) * errors
     with warnings.catch_warnings():
         # The table of few points says so itself, by a test of normality that has no value.
         warnings.simplefilter("ignore")
@@ -148,16 +165,26 @@ def regress(trial: str, names: Sequence[str], regressors: Array, response: Array
     return Regression(
         trial,
         tuple(names),
-        np.asarray(table.params),
-        np.asarray(table.bse),
-        np.asarray(table.tvalues),
-        np.asarray(table.pvalues),
-        np.asarray(table.conf_int(0.05)),
+        values,
+        errors,
+        t,
+        2.0 * scipy.stats.t.sf(np.abs(t), freedom),
+        np.stack((values - half, values + half), axis=1),
+        inflation,
         float(table.rsquared),
         summary,
         regressors,
         response,
     )
+
+
+def _independent(regressors: Array, residual: Array, index: int) -> float:
+    """Return how many independent samples determine a coefficient: of its regressor less the others, and residuals."""
+    others = np.delete(regressors, index, axis=1)
+    own = regressors[:, index]
+    if others.shape[1]:
+        own = own - others @ np.linalg.lstsq(others, own, rcond=None)[0]
+    return effective_size(own, residual)
 
 
 def fit_inertia_damping(recordings: Sequence[Recording], *, skew: float | None = None) -> ThesisResult:
@@ -208,6 +235,7 @@ def fit_inertia_damping(recordings: Sequence[Recording], *, skew: float | None =
             "A velocity that the actuator filters lags by more."
         ),
     ]
+    said += _correlated(trials)
     if low <= 0.0:
         said.append("The data are compatible with no inertia at all: this experiment cannot determine it.")
     if sign < 0:
@@ -288,6 +316,7 @@ def fit_gravity(recordings: Sequence[Recording]) -> ThesisResult:
             f"hysteresis of {0.5 * hysteresis:.3g} N m, which the average of both directions removes."
         )
     ]
+    said += _correlated(trials)
     if sign < 0:
         said.append(
             "The coefficient was negative: the actuator reports the torque of the environment; signs are turned."
@@ -312,13 +341,30 @@ def _average(trials: Sequence[Regression]) -> tuple[dict[str, float], dict[str, 
         column = sign * values[:, i]
         average[name] = float(column.mean())
         inside = float(np.sqrt(np.sum([r.errors[i] ** 2 for r in trials])) / len(trials))
-        half = 1.96 * inside
+        # One trial has its own degrees of freedom, the error of several is as good as normal.
+        half = 1.96 * inside if len(trials) > 1 else 0.5 * float(np.ptp(trials[0].intervals[i]))
         if len(trials) > 1:
             # The trials' scatter sees what a regression's own error does not: correlated residuals, other hands.
             scatter = float(column.std(ddof=1) / np.sqrt(len(trials)))
             half = max(half, float(scipy.stats.t.ppf(0.975, len(trials) - 1)) * scatter)
         intervals[name] = (average[name] - half, average[name] + half)
     return average, intervals, sign
+
+
+def _correlated(trials: Sequence[Regression]) -> list[str]:
+    """Return what the intervals allow for beside independent residuals, and what one trial cannot show."""
+    said = []
+    factor = float(np.max([r.inflation for r in trials]))
+    if factor > _CORRELATED:
+        said.append(
+            f"Residuals are correlated in time (hysteresis, friction, a hand): errors are up to {factor:.2g} times "
+            "those of independent ones, which the full tables print."
+        )
+    if len(trials) == 1:
+        said.append(
+            "One trial does not show how much trials differ: expected three or more for an interval to rely on."
+        )
+    return said
 
 
 def _share(regression: Regression) -> float:
