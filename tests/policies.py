@@ -8,18 +8,23 @@ from typing import Any
 
 import numpy as np
 
-from pendulum_lqr.policy import DEFAULT_SIGNALS, Network, Policy
-from pendulum_msgs_py.contract.names import JOINT
+from pendulum_lqr.mechanism_model import linearise_mechanism, mechanism_lqr
+from pendulum_lqr.policy import DEFAULT_SIGNALS, Network, Policy, coordinates_of, default_signals, sample_layout
+from pendulum_msgs_py.plants.mechanism_parameters import MechanismParameters
+from pendulum_msgs_py.plants.plant_differences import AnyPlant
 from pendulum_msgs_py.plants.plant_parameters import PlantParameters
 
-__all__ = ["linear_policy", "random_policy"]
+__all__ = ["linear_policy", "lqr_policy", "random_policy"]
 
 
 def random_policy(
-    plant: PlantParameters, *, hidden: tuple[int, ...] = (8, 8), history: int = 3, seed: int = 0, **changes: Any
+    plant: AnyPlant, *, hidden: tuple[int, ...] = (8, 8), history: int = 3, seed: int = 0, **changes: Any
 ) -> Policy:
     """Return a policy of random weights for a plant."""
-    sizes = (history * len(changes.get("signals", DEFAULT_SIGNALS)), *hidden, 1)
+    coordinates = coordinates_of(plant)
+    changes.setdefault("signals", default_signals(coordinates))
+    layout = sample_layout(changes["signals"], coordinates)
+    sizes = (history * len(layout), *hidden, len(coordinates.driven))
     return _policy(plant, _network(sizes, seed, changes.pop("activation", "tanh"), changes.pop("output", "clip")),
                    history=history, **changes)  # fmt: skip
 
@@ -31,6 +36,23 @@ def linear_policy(plant: PlantParameters, angle_gain: float, velocity_gain: floa
     return _policy(plant, Network((weight,), (np.zeros(1, dtype=np.float32),)), **changes)
 
 
+def lqr_policy(plant: MechanismParameters, **changes: Any) -> Policy:
+    """Return the policy that answers as the LQR of a plant of several joints does near upright, u = -K [x, q']."""
+    gain = mechanism_lqr(linearise_mechanism(plant), *plant.mechanism.weights).K
+    coordinates = plant.coordinates
+    layout = sample_layout(default_signals(coordinates), coordinates)
+    n, box = len(coordinates.joints), 0.5
+    weight = np.zeros((len(coordinates.driven), len(layout)), dtype=np.float32)
+    for column, (signal, joint) in enumerate(layout):
+        if signal in {"sin", "position"}:
+            weight[:, column] = -gain[:, joint] * (box if signal == "position" else 1.0)
+        elif signal == "velocity":
+            weight[:, column] = -gain[:, n + joint]
+    weight /= np.array(plant.effort_limits, dtype=np.float32)[:, None]
+    network = Network((weight,), (np.zeros(len(weight), dtype=np.float32),))
+    return _policy(plant, network, signals=default_signals(coordinates), **changes)
+
+
 def _network(sizes: tuple[int, ...], seed: int, activation: str, output: str) -> Network:
     rng = np.random.default_rng(seed)
     pairs = list(pairwise(sizes))
@@ -39,10 +61,14 @@ def _network(sizes: tuple[int, ...], seed: int, activation: str, output: str) ->
     return Network(weights, biases, activation, output)
 
 
-def _policy(plant: PlantParameters, network: Network, **changes: Any) -> Policy:
+def _policy(plant: AnyPlant, network: Network, **changes: Any) -> Policy:
+    coordinates = coordinates_of(plant)
+    n, m = len(coordinates.joints), len(coordinates.driven)
+    limits = plant.effort_limits if isinstance(plant, MechanismParameters) else (plant.effort_limit,)
     values: dict[str, Any] = {
-        "name": "test", "task": "swing_up", "joints": (JOINT,), "period": 0.01, "plant": plant, "ranges": {},
-        "effort_limit": (plant.effort_limit,), "effort_rate": (math.inf,), "velocity_scale": (1.0,),
-        "angle_box": (math.pi,), "velocity_box": (20.0,),
+        "name": "test", "task": "swing_up", "joints": coordinates.names, "period": 0.01, "plant": plant, "ranges": {},
+        "effort_limit": limits, "effort_rate": (math.inf,) * m, "velocity_scale": (1.0,) * n,
+        "angle_box": tuple(math.pi if joint.turns else 0.5 for joint in coordinates.joints),
+        "velocity_box": (20.0,) * n,
     }  # fmt: skip
     return Policy(network=network, **{**values, **changes})

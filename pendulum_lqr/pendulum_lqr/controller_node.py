@@ -64,7 +64,7 @@ NODE_SPECS: tuple[ParameterSpec, ...] = (
     ParameterSpec("controller", "lqr", "", "Which controller.", choices=tuple(CONTROLLERS), read_only=True),
     ParameterSpec(
         "plant", "thesis", "", f"Plant to design for: {PRESET_NAMES} or the path of a plant file; of several joints, "
-        f"with lqr or tvlqr: {', '.join(MECHANISM_PRESETS)}.", read_only=True,
+        f"with lqr, tvlqr or policy: {', '.join(MECHANISM_PRESETS)}.", read_only=True,
     ),
     ParameterSpec(
         "period", 0.0, "s", "Sampling period of the loop, which discrete designs and filters need; 0 takes it from the "
@@ -274,10 +274,10 @@ class ControllerNode(LifecycleNode, PollingNode):
         self.get_logger().info(f"designed for states every {period:g} s: {self._loop.controller.describe()}")
 
     def _uses_period(self) -> bool:
-        # That of several joints, continuous and sampled, does not; whether it settles is seen once states come.
-        return isinstance(self._plant, PlantParameters) and uses_period(
-            self._settings["controller"], self._settings["velocity"]
-        )
+        if isinstance(self._plant, MechanismParameters):
+            # An LQR of several joints, continuous and sampled, does not; whether it settles is seen once states come.
+            return bool(self._settings["controller"] == "policy")
+        return uses_period(self._settings["controller"], self._settings["velocity"])
 
     def _may_answer(self) -> bool:
         """Tell whether the rate of the states is one that the design is for, as far as it is known."""
@@ -305,6 +305,12 @@ class ControllerNode(LifecycleNode, PollingNode):
                 if values["controller"] == "lqr":
                     self._period = measured
                     self._design(values)
+                elif values["controller"] == "policy":
+                    # How many states each of its answers holds for depends on their period.
+                    if not values["period"]:
+                        self._design_for(measured)
+                    elif self._loop is not None and isinstance(self._loop.controller, JointController):
+                        self._loop.controller.check(measured)
                 elif differs(measured, self._period):
                     raise PendulumError(f"the trajectory is followed every {self._period:g} s")
                 self._period_known = True
@@ -333,6 +339,13 @@ class ControllerNode(LifecycleNode, PollingNode):
             return None
         inner = unwrapped(self._loop.controller)
         return inner if isinstance(inner, BaseController) else None
+
+    def _notice(self) -> str:
+        """Return what the user has to be told of the controller that answers."""
+        if self._loop is not None and isinstance(self._loop.controller, JointController):
+            return self._loop.controller.notice
+        own = self._own_controller()
+        return "" if own is None else own.notice
 
     def _autostart(self) -> None:
         if self.trigger_configure() != TransitionCallbackReturn.SUCCESS:
@@ -383,8 +396,7 @@ class ControllerNode(LifecycleNode, PollingNode):
                 if not self._told_other_rate:
                     self.get_logger().warning(text)
             self._told_other_rate = other_rate
-        own = self._own_controller()
-        notice = "" if own is None else own.notice
+        notice = self._notice()
         if notice:
             level = max(level, DiagnosticStatus.WARN)
             text = f"{text}; {notice}"

@@ -43,6 +43,18 @@ class JointController:
     def __init__(self, effort_limits: Vector) -> None:
         self.effort_limits = effort_limits
 
+    @property
+    def notice(self) -> str:
+        """What the user has to be told while it runs; empty for nothing."""
+        return ""
+
+    def check(self, period: float) -> None:
+        """Refuse a period at which states come and for which this controller is not; any period by default [s].
+
+        Raises:
+            ParameterError: It is not for this period.
+        """
+
     def reset(self) -> None:
         """Forget everything; nothing by default."""
 

@@ -66,10 +66,9 @@ def dumps_onnx(policy: Policy) -> bytes:
 def observation_names(policy: Policy) -> list[str]:
     """Return what each input is, as ``joint: signal, sample``; sample 0 is the newest."""
     return [
-        f"{joint}: {signal}, sample {-age}"
+        f"{policy.joints[joint]}: {signal}, sample {-age}"
         for age in range(policy.history - 1, -1, -1)
-        for signal in policy.signals
-        for joint in policy.joints
+        for signal, joint in policy.layout
     ]
 
 

@@ -1,21 +1,23 @@
 """A learned policy: what it is for, what it sees, and its network.
 
-A policy sees the last ``history`` samples of its joints and answers with a torque for each::
+A policy sees the last ``history`` samples of its joints and answers with an effort for each driven one::
 
-    sample_k = [cos(x_k), sin(x_k), theta_dot_k / velocity_scale, u_(k-1) / effort_limit]
+    sample_k = [cos(x_k), sin(x_k), q_k / angle_box, q'_k / velocity_scale, u_(k-1) / effort_limit]
     y_k = bounded(network([sample_(k-history+1), ..., sample_k])),  |y_k| <= 1
     u_k = u_(k-1) + clamp(effort_limit y_k - u_(k-1), effort_rate period)
 
-with x the angle from upright, in [-pi, pi); a policy may see a part of these, or x itself. Before the
-first sample there was the first sample, at zero torque. All vectors hold one value for each joint, in the order of
-``joints``; training and controller share this module, so that they agree.
+with x the angle from upright of each joint that turns, in [-pi, pi), q the deviation of each that slides, and u of each
+driven one; a policy may see a part of these, or x itself. Before the first sample there was the first sample, at zero
+effort. Vectors hold one value for each joint, in the order of ``joints``, those of efforts one for each driven joint;
+training and controller share this module, so that they agree.
 """
 
 from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Mapping
+import math
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -23,29 +25,36 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pendulum_msgs_py.errors import DataError, ParameterError
-from pendulum_msgs_py.plants.plant_differences import describe_plants
+from pendulum_msgs_py.joints import ONE_JOINT, Coordinates, Joint
+from pendulum_msgs_py.plants.mechanism_parameters import MechanismParameters
+from pendulum_msgs_py.plants.plant_differences import AnyPlant, describe_plants
 from pendulum_msgs_py.plants.plant_parameters import DRIVETRAIN_SPECS, PLANT_SPECS, PlantParameters
 
 __all__ = [
     "ACTIVATIONS",
     "DEFAULT_SIGNALS",
-    "MODEL",
+    "MODELS",
     "OUTPUTS",
     "SIGNALS",
     "Network",
     "Policy",
+    "coordinates_of",
+    "default_signals",
     "fingerprint",
+    "model_of",
     "plant_problem",
     "require_plant",
+    "sample_layout",
 ]
 
 Floats = NDArray[np.float32]
 
-MODEL = "rigid_pendulum"
-"""Equation of motion that policies of this version are for."""
-SIGNALS = ("angle", "cos", "sin", "velocity", "effort")
-"""What a sample may hold of each joint, in this order; ``effort`` is the torque of the last answer."""
-DEFAULT_SIGNALS = SIGNALS[1:]
+MODELS = ("rigid_pendulum", "mechanism")
+"""What a policy is for: the pendulum, or a plant file's mechanism of several joints."""
+SIGNALS = ("angle", "cos", "sin", "position", "velocity", "effort")
+"""What a sample may hold of each joint, in this order: angle, cosine and sine of those that turn, the position of those
+that slide, the velocity of all, and of those that are driven the ``effort`` of the last answer."""
+DEFAULT_SIGNALS = ("cos", "sin", "velocity", "effort")
 """What policies of our own training see: an angle jumps where cosine and sine do not."""
 ACTIVATIONS = ("tanh", "relu")
 OUTPUTS = ("clip", "tanh")
@@ -119,15 +128,15 @@ class Policy:
         network: The network.
         name: Its name, for logs.
         task: What it was trained for.
-        joints: Names of the joints, n of them; every vector below has n values.
+        joints: Names of the joints, n of them, m driven; vectors of efforts have m values, the others n.
         period: Time between two answers [s].
         plant: The plant at the centre of training.
         ranges: Lowest and highest value of each parameter of the plant that differed in training, by name.
-        effort_limit: Largest torque [N m].
-        effort_rate: Largest change of the torque; inf for none [N m/s].
-        velocity_scale: Velocity that the network sees as 1 [rad/s].
-        angle_box: Largest deviation from upright that training visited; pi for all angles [rad].
-        velocity_box: Largest speed that training visited [rad/s].
+        effort_limit: Largest effort of each driven joint [N m or N].
+        effort_rate: Largest change of it; inf for none [N m/s or N/s].
+        velocity_scale: Velocity that the network sees as 1 [rad/s or m/s].
+        angle_box: Largest deviation from upright that training visited; pi for all angles [rad or m].
+        velocity_box: Largest speed that training visited [rad/s or m/s].
         signals: What it sees of each joint, a part of ``SIGNALS`` in their order.
         history: Samples that it sees.
         provenance: How it came about: settings, seed, versions, what was measured; plain JSON values.
@@ -141,7 +150,7 @@ class Policy:
     task: str
     joints: tuple[str, ...]
     period: float
-    plant: PlantParameters
+    plant: AnyPlant
     ranges: Mapping[str, tuple[float, float]]
     effort_limit: tuple[float, ...]
     effort_rate: tuple[float, ...]
@@ -157,80 +166,172 @@ class Policy:
         n = len(self.joints)
         if n < 1 or len(set(self.joints)) != n:
             raise DataError(f"joints are {list(self.joints)}; expected one name or more, no two the same")
+        own = self.coordinates.names
+        # The one joint of a pendulum may have any name; of several, the order is part of what they are.
+        if n != len(own) or (n > 1 and self.joints != own):
+            raise DataError(f"joints are {list(self.joints)}; expected {', '.join(own)}, as plant {self.plant.name!r}")
         if not self.period > 0.0:
             raise DataError(f"period is {self.period} s; expected > 0")
-        for what, values, unit in (
-            ("effort_limit", self.effort_limit, "N m"),
-            ("effort_rate", self.effort_rate, "N m/s"),
-            ("velocity_scale", self.velocity_scale, "rad/s"),
-            ("angle_box", self.angle_box, "rad"),
-            ("velocity_box", self.velocity_box, "rad/s"),
+        m = len(self.coordinates.driven)
+        for what, values, unit, count in (
+            ("effort_limit", self.effort_limit, "N m", m),
+            ("effort_rate", self.effort_rate, "N m/s", m),
+            ("velocity_scale", self.velocity_scale, "rad/s", n),
+            ("angle_box", self.angle_box, "rad", n),
+            ("velocity_box", self.velocity_box, "rad/s", n),
         ):
-            if len(values) != n or not all(value > 0.0 for value in values):
-                raise DataError(f"{what} is {list(values)} {unit}; expected {n} value(s) > 0, one for each joint")
+            if len(values) != count or count == 0 or not all(value > 0.0 for value in values):
+                which = "joint" if count == n else "driven joint"
+                raise DataError(f"{what} is {list(values)} {unit}; expected {count} value(s) > 0, one for each {which}")
         if not self.signals or [name for name in SIGNALS if name in self.signals] != list(self.signals):
             raise DataError(f"signals are {list(self.signals)}; expected some of {', '.join(SIGNALS)}, in this order")
         if self.history < 1:
             raise DataError(f"history is {self.history}; expected >= 1")
-        known = {spec.name for spec in PLANT_SPECS}
+        known = _numbers_of(self.plant)
         for name, (low, high) in self.ranges.items():
-            if name not in known or not low <= getattr(self.plant, name) <= high:
+            if name not in known or not low <= known[name] <= high:
                 raise DataError(f"range of {name} is {low} to {high}; expected a parameter whose value lies in it")
         sizes = self.network.sizes
-        if (sizes[0], sizes[-1]) != (self.observation_size, n):
+        if (sizes[0], sizes[-1]) != (self.observation_size, m):
             raise DataError(
                 f"network takes {sizes[0]} values and gives {sizes[-1]}; expected {self.observation_size} "
-                f"({self.history} samples of {len(self.signals)} signals of {n} joint(s)) and {n}"
+                f"({self.history} samples of {', '.join(self.signals)} of {n} joint(s)) and {m}"
             )
 
     @property
-    def sample_size(self) -> int:
-        """Values of a sample."""
-        return len(self.signals) * len(self.joints)
+    def coordinates(self) -> Coordinates:
+        """Joints of the plant, and which of them are driven."""
+        return coordinates_of(self.plant)
+
+    @property
+    def layout(self) -> tuple[tuple[str, int], ...]:
+        """Signal and joint of each value of a sample."""
+        return sample_layout(self.signals, self.coordinates)
 
     @property
     def observation_size(self) -> int:
         """Values that the network sees."""
-        return self.history * self.sample_size
+        return self.history * len(self.layout)
 
 
-def fingerprint(plant: PlantParameters) -> str:
+def coordinates_of(plant: AnyPlant) -> Coordinates:
+    """Return the joints of a plant, and which of them are driven."""
+    return plant.coordinates if isinstance(plant, MechanismParameters) else ONE_JOINT
+
+
+def model_of(plant: AnyPlant) -> str:
+    """Return which of ``MODELS`` a plant is."""
+    return MODELS[isinstance(plant, MechanismParameters)]
+
+
+def default_signals(coordinates: Coordinates) -> tuple[str, ...]:
+    """Return what policies of our own training see: ``DEFAULT_SIGNALS``, and positions where a joint slides."""
+    if all(joint.turns for joint in coordinates.joints):
+        return DEFAULT_SIGNALS
+    return tuple(name for name in SIGNALS if name in {*DEFAULT_SIGNALS, "position"})
+
+
+def sample_layout(signals: Sequence[str], coordinates: Coordinates) -> tuple[tuple[str, int], ...]:
+    """Return signal and index of the joint of each value of a sample: signal by signal, for the joints that have it.
+
+    Args:
+        signals: Some of ``SIGNALS``.
+        coordinates: The joints.
+
+    Raises:
+        DataError: No joint has one of the signals.
+    """
+    found = []
+    for signal in signals:
+        own = [
+            (signal, i) for i, joint in enumerate(coordinates.joints) if _has(joint, i in coordinates.driven, signal)
+        ]
+        if not own:
+            raise DataError(
+                f"signals hold {signal!r}, which none of the joints {', '.join(coordinates.names)} has; expected it of "
+                "a plant with such a joint"
+            )
+        found += own
+    return tuple(found)
+
+
+def _has(joint: Joint, driven: bool, signal: str) -> bool:
+    if signal == "effort":
+        return driven
+    return signal == "velocity" or joint.turns != (signal == "position")
+
+
+def fingerprint(plant: AnyPlant) -> str:
     """Return 64 hexadecimal digits that two plants share if all their parameters are the same, names apart."""
     entry = json.loads(describe_plants([plant]))[0]
     del entry["name"]
     return hashlib.sha256(json.dumps(entry, sort_keys=True).encode()).hexdigest()
 
 
-def plant_problem(policy: Policy, plant: PlantParameters) -> str:
+def plant_problem(policy: Policy, plant: AnyPlant) -> str:
     """Return in words why a policy is not for a plant, or nothing where it is.
 
     Each parameter has to lie within the range that was trained, or be that of the policy's plant within 0.1 %. A larger
-    torque limit is no obstacle: the policy keeps its own.
+    effort limit is no obstacle: the policy keeps its own; nor is an end stop that its box does not reach.
     """
-    if (plant.drivetrain is None) != (policy.plant.drivetrain is None):
-        own, other = ("rigid" if one.drivetrain is None else "series elastic" for one in (policy.plant, plant))
-        return f"it was trained on a plant that is {own}, and this one is {other}"
+    own = policy.plant
+    if isinstance(own, MechanismParameters) or isinstance(plant, MechanismParameters):
+        mine, other = _kind_of(own), _kind_of(plant)
+        if mine != other:
+            return f"it was trained on {mine}, and this one is {other}"
+    elif (plant.drivetrain is None) != (own.drivetrain is None):
+        rigid, other = ("rigid" if one.drivetrain is None else "series elastic" for one in (own, plant))
+        return f"it was trained on a plant that is {rigid}, and this one is {other}"
+    trained, runs, units = _numbers_of(own), _numbers_of(plant), _units_of(plant)
     found = []
-    for spec in PLANT_SPECS:
-        centre, value = float(getattr(policy.plant, spec.name)), float(getattr(plant, spec.name))
-        low, high = policy.ranges.get(spec.name, (centre, centre))
-        if spec.name == "effort_limit":
+    for name in (*trained, *(name for name in runs if name not in trained)):
+        joint, _, key = name.rpartition(".")
+        if key in {"lower_stop", "upper_stop"}:
+            reach = policy.angle_box[policy.coordinates.names.index(joint)]
+            free = runs.get(name, math.inf) * (1.0 if key == "upper_stop" else -1.0)
+            if name in runs and free < (1.0 - _SAME) * reach:
+                found.append(f"{name} is {runs[name]:.6g} {units[name]}, trained to move {reach:.6g} {units[name]}")
+            continue
+        if name not in trained or name not in runs:
+            found.append(f"{name} is {'given' if name in runs else 'not given'}, and was not so in training")
+            continue
+        centre, value = trained[name], runs[name]
+        low, high = policy.ranges.get(name, (centre, centre))
+        if key == "effort_limit":
             high = float("inf")
         slack = _SAME * max(abs(low), abs(centre))
         if not low - slack <= value <= high + slack:
-            unit = "" if spec.unit == "-" else f" {spec.unit}"
-            trained = f"{low:.6g}" if low == high else f"{low:.6g} to {high:.6g}"
-            found.append(f"{spec.name} is {value:.6g}{unit}, trained {trained}")
-    if policy.plant.drivetrain is not None and plant.drivetrain is not None:
+            unit = "" if units[name] == "-" else f" {units[name]}"
+            span = f"{low:.6g}" if low == high else f"{low:.6g} to {high:.6g}"
+            found.append(f"{name} is {value:.6g}{unit}, trained {span}")
+    if isinstance(own, PlantParameters) and isinstance(plant, PlantParameters) and own.drivetrain and plant.drivetrain:
         for spec in DRIVETRAIN_SPECS:
-            own_value = float(getattr(policy.plant.drivetrain, spec.name))
+            own_value = float(getattr(own.drivetrain, spec.name))
             value = float(getattr(plant.drivetrain, spec.name))
             if abs(value - own_value) > _SAME * abs(own_value):
                 found.append(f"drivetrain.{spec.name} is {value:.6g}, trained {own_value:.6g}")
     return "; ".join(found)
 
 
-def require_plant(policy: Policy, plant: PlantParameters) -> None:
+def _kind_of(plant: AnyPlant) -> str:
+    if not isinstance(plant, MechanismParameters):
+        return "a plant of one joint"
+    return f"a {plant.mechanism.name} driven at {', '.join(plant.coordinates.driven_names) or 'no joint'}"
+
+
+def _numbers_of(plant: AnyPlant) -> dict[str, float]:
+    if isinstance(plant, MechanismParameters):
+        return plant.numbers
+    return {spec.name: float(getattr(plant, spec.name)) for spec in PLANT_SPECS}
+
+
+def _units_of(plant: AnyPlant) -> dict[str, str]:
+    specs = plant.specs.values() if isinstance(plant, MechanismParameters) else PLANT_SPECS
+    names = plant.specs if isinstance(plant, MechanismParameters) else [spec.name for spec in PLANT_SPECS]
+    return {name: spec.unit for name, spec in zip(names, specs, strict=True)}
+
+
+def require_plant(policy: Policy, plant: AnyPlant) -> None:
     """Refuse a plant that a policy is not for.
 
     Raises:

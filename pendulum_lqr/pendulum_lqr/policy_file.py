@@ -20,9 +20,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pendulum_lqr.bounded_files import read_bounded, read_parts, sentence_of, shown
-from pendulum_lqr.policy import MODEL, Network, Policy, fingerprint
+from pendulum_lqr.policy import MODELS, Network, Policy, fingerprint, model_of
 from pendulum_msgs_py.errors import DataError, PendulumError
-from pendulum_msgs_py.plants.plant_differences import describe_plants, read_pendulums
+from pendulum_msgs_py.plants.plant_differences import describe_plants, read_plants
 from pendulum_msgs_py.whole_file import write_whole
 
 __all__ = [
@@ -165,7 +165,7 @@ def header_of(policy: Policy) -> dict[str, Any]:
     network = policy.network
     return {
         "format": FORMAT,
-        "model": MODEL,
+        "model": model_of(policy.plant),
         "name": policy.name,
         "task": policy.task,
         "joints": list(policy.joints),
@@ -250,9 +250,10 @@ def _read_header(raw: NDArray[Any]) -> dict[str, Any]:
         raise DataError(f"header is no JSON ({sentence_of(error)})") from error
     if not isinstance(header, dict):
         raise DataError(f"header is a {type(header).__name__}; expected a mapping")
-    for key, wanted in (("format", FORMAT), ("model", MODEL)):
-        if header.get(key) != wanted:
-            raise DataError(f"{key} is {shown(header.get(key))}; expected {wanted!r}")
+    if header.get("format") != FORMAT:
+        raise DataError(f"format is {shown(header.get('format'))}; expected {FORMAT!r}")
+    if header.get("model") not in MODELS:
+        raise DataError(f"model is {shown(header.get('model'))}; expected {' or '.join(map(repr, MODELS))}")
     if set(header) != _KEYS:
         wrong = min(set(header) ^ _KEYS)
         raise DataError(f"header {'lacks' if wrong in _KEYS else 'has the unknown key'} {shown(wrong)}")
@@ -269,7 +270,9 @@ def _build(header: Mapping[str, Any], arrays: Mapping[str, NDArray[Any]]) -> Pol
     )
     if header["layers"] != list(network.sizes):
         raise DataError(f"layers are {shown(header['layers'])}; the weights say {list(network.sizes)}")
-    plant = read_pendulums(json.dumps([header["plant"]]))[0]
+    plant = read_plants(json.dumps([header["plant"]]))[0]
+    if header["model"] != model_of(plant):
+        raise DataError(f"model is {shown(header['model'])}; its plant is {model_of(plant)!r}")
     if header["fingerprint"] != fingerprint(plant):
         raise DataError(f"fingerprint is {shown(header['fingerprint'])}; its plant has {fingerprint(plant)}")
     if type(header["history"]) is not int:

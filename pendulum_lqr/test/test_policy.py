@@ -258,20 +258,6 @@ def test_a_bad_parameter_is_refused_in_a_sentence(tmp_path, values, message):
         controller(tmp_path, random_policy(DFKI), **values)
 
 
-def test_a_policy_for_two_joints_is_no_controller_of_one(tmp_path):
-    one = random_policy(DFKI)
-    network = random_policy(DFKI, hidden=(4,), history=6).network
-    weights = (*network.weights[:-1], np.vstack([network.weights[-1]] * 2))
-    both = {
-        name: getattr(one, name) * 2
-        for name in ("effort_limit", "effort_rate", "velocity_scale", "angle_box", "velocity_box")
-    }
-    policy = type(one)(**{**one.__dict__, **both, "joints": ("shoulder", "elbow"),
-                          "network": Network(weights, (*network.biases[:-1], np.zeros(2, np.float32)))})  # fmt: skip
-    with pytest.raises(ParameterError, match="is for joints shoulder, elbow; expected one joint"):
-        controller(tmp_path, policy)
-
-
 GOOD = dumps_policy(random_policy(DFKI, hidden=(4,)))
 
 

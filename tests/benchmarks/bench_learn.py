@@ -61,7 +61,7 @@ def _swing_up(out: Path) -> Iterator[Row]:
     last = round(1.0 / policy.period)
     up = sum(bool(np.all(np.abs(run_trial(policy, trial)[0][0, -last:]) <= 0.3)) for trial in trials)
     yield measured(f"{what}; other trials", up, f"of {len(trials)}", at_least=len(trials))
-    still = np.zeros(round((SETTLE + HOLD) / policy.period))
+    still = np.zeros((round((SETTLE + HOLD) / policy.period), 1))
     worst = max(
         float(np.abs(run_trial(policy, replace(trial, kicks=still))[0][0, round(SETTLE / policy.period) :]).max())
         for trial in trials[:12]

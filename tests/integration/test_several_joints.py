@@ -17,10 +17,13 @@ from std_msgs.msg import String
 from std_srvs.srv import Trigger
 from trajectory_msgs.msg import JointTrajectory
 
+from pendulum_lqr.policy_file import write_policy
 from pendulum_msgs_py.contract import names
+from pendulum_msgs_py.plants.mechanism_parameters import load_mechanism
 from pendulum_msgs_py.ros import qos
 from pendulum_rosbag.reader import read_bag
 from tests.graph_peer import GraphPeer
+from tests.policies import lqr_policy
 
 JOINTS = ["shoulder", "elbow"]
 
@@ -138,6 +141,46 @@ def test_an_acrobot_swings_up_in_lockstep_and_stays(peer: Peer, processes) -> No
     assert np.abs(peer.states[-1].velocity).max() < 0.05
 
 
+def test_a_policy_holds_a_cart_pole_in_lockstep_and_gives_up_where_it_was_never_trained(
+    peer: Peer, processes, tmp_path: Path
+) -> None:
+    plant = load_mechanism("cart_pole")
+    path = write_policy(tmp_path / "policy.npz", lqr_policy(plant))
+    arguments = ("plant:=cart_pole", "controller:=policy", f"policy:={path}", "use_sim_time:=true")
+    controller = _start(processes, "pendulum_lqr", "controller", *arguments)
+    controller.wait_for_output(
+        r"policy for plant cart_pole: test \(swing_up, 6-1\) every 0\.01 s, fallback no effort", 30
+    )
+    efforts: dict[int, float] = {}
+    peer.node.create_subscription(
+        JointState,
+        names.EFFORT_COMMAND,
+        lambda message: efforts.setdefault(
+            message.header.stamp.sec * 10**9 + message.header.stamp.nanosec, message.effort[0]
+        ),
+        qos.COMMAND,
+    )
+    simulator = _start(
+        processes, "pendulum_sim", "simulator", "plant:=cart_pole", "clock:=lockstep", "lockstep_duration:=4.0",
+        "lockstep_subscribers:=2", "initial_position:=[0.05, 3.19]",
+    )  # fmt: skip
+    peer.until(lambda: peer.states and peer.states[-1].header.stamp.sec == 5, "the last state, after 4 s", 90.0)
+    assert np.abs(np.array(peer.states[-1].position) - [0.0, math.pi]).max() < 0.02
+    first = min(efforts)
+    assert efforts[first] == 0.0  # what it may ask for rises from zero
+    # States come every 2 ms, so each answer holds for five of them, once their period is known.
+    later = [efforts[stamp] for stamp in sorted(efforts) if stamp - first > 500_000_000][:300]
+    changes = np.flatnonzero(np.diff(later))
+    assert set(np.diff(changes) % 5) == {0}
+    simulator.send_signal(signal.SIGINT)
+    assert simulator.wait(20.0) == 0
+    _start(
+        processes, "pendulum_sim", "simulator", "plant:=cart_pole", "clock:=lockstep", "lockstep_duration:=1.0",
+        "lockstep_subscribers:=2", "initial_position:=[0.55, 3.19]",
+    )  # fmt: skip
+    controller.wait_for_output(r"gave up after 0\.000 s: position of cart 0\.55 m", 60)
+
+
 def _until_counted(peer: Peer, key: str, before: int) -> None:
     peer.until(lambda: int(peer.diagnostics.get(key, 0)) > before, f"{peer.answer} refused as {key}")
 
@@ -195,8 +238,9 @@ SIMULATOR, CONTROLLER, DISTURBANCE = (
         (
             CONTROLLER,
             ("plant:=acrobot", "controller:=pid"),
-            "pid is for plants of one joint, and plant 'acrobot' has shoulder, elbow; expected lqr or tvlqr",
+            "pid is for plants of one joint, and plant 'acrobot' has shoulder, elbow; expected lqr, tvlqr or policy",
         ),
+        (CONTROLLER, ("plant:=cart_pole", "controller:=policy"), "policy is empty; expected the path of a policy file"),
         (CONTROLLER, ("plant:=acrobot", "q:=[1.0, 2.0]"), "q has the shape (2,); expected (4,)"),
         (DISTURBANCE, ("joints:=[elbow, elbow]",), "joints is ['elbow', 'elbow']; expected names, each once"),
     ],

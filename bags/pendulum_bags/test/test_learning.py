@@ -87,12 +87,12 @@ def test_what_a_policy_sees_and_does_in_training_is_what_it_sees_and_does_as_a_c
     env = SwingUp(1, DFKI, {}, QUIET, np.random.default_rng(2))
     env.motion[0] = (-math.pi + 0.4, 0.3, 0.0, 0.0, 0.0, 0.0)
     env.effort[:] = 0.0
-    first = [math.cos(env.motion[0, 0]), math.sin(env.motion[0, 0]), 0.3 / env.scale, 0.0]
+    first = [math.cos(env.motion[0, 0]), math.sin(env.motion[0, 0]), 0.3 / env.scale[0], 0.0]
     env._samples[:] = np.tile(first, 3)
     rate = 2.0 * DFKI.effort_limit / QUIET.rate_time
-    policy = random_policy(DFKI, seed=5, effort_rate=(rate,), velocity_scale=(env.scale,), velocity_box=(50.0,))
+    policy = random_policy(DFKI, seed=5, effort_rate=(rate,), velocity_scale=(env.scale[0],), velocity_box=(50.0,))
     # The same integrator as in training, at its step.
-    rows, notice = run_trial(policy, Trial(DFKI, 0.4, 0.3, np.zeros(300)), start_time=0.0)
+    rows, notice = run_trial(policy, Trial(DFKI, (0.4,), (0.3,), np.zeros((300, 1))), start_time=0.0)
     assert notice == ""
     for k in range(300):
         x = (env.motion[0, 0] + math.pi) % (2.0 * math.pi) - math.pi
@@ -108,7 +108,7 @@ def test_a_torque_acts_after_the_delay_as_in_the_simulator(delay):
     ours = SwingUp(1, plant, {}, QUIET, np.random.default_rng(0))
     ours.motion[0] = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
     ours.effort[:], ours.delay[:] = 0.0, delay
-    ours.step_limit = math.inf
+    ours.step_limit[:] = math.inf
     simulated = make_plant(plant, QUIET.period, substeps=8)
     simulated.reset(math.pi, 0.0)
     for effort in np.random.default_rng(1).uniform(-1.5, 1.5, 30):
@@ -247,6 +247,8 @@ def test_ctrl_c_is_one_sentence(tmp_path, monkeypatch, capsys):
         (["--share", "1.5"], "share is 1.5; expected less than 1"),
         (["--hidden", "64", "0"], "hidden is 64 0; expected widths of 1 to 512"),
         (["--history", "0"], "history is 0; expected 1 to 50 samples"),
+        (["--plant", "cart_pole", "--travel", "0"], "travel is 0.0; expected a finite number >= 0 (> 0 for times and"),
+        (["--plant", "double_pendulum", "--share", "nan"], "share is nan; expected a finite number"),
         (
             ["--task", "pendulum_v1", "--plant", "thesis"],
             "--plant is given, but the task pendulum_v1 is Gymnasium's own",

@@ -11,6 +11,7 @@ from pendulum_lqr.design import Gain
 from pendulum_lqr.interface import JointController
 from pendulum_lqr.mechanism_controller import within_limits
 from pendulum_lqr.mechanism_model import linearise_mechanism, mechanism_lqr
+from pendulum_lqr.policy_answers import ZERO, policy_specs
 from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.joints import Coordinates, Vector
 from pendulum_msgs_py.parameters import ParameterSpec, validate
@@ -18,8 +19,9 @@ from pendulum_msgs_py.plants.mechanism_parameters import MechanismParameters
 
 __all__ = ["JOINT_CONTROLLERS", "JointLqr", "joint_parameters", "make_joint_controller"]
 
-JOINT_CONTROLLERS = ("lqr", "tvlqr")
+JOINT_CONTROLLERS = ("lqr", "tvlqr", "policy")
 """Controllers for plants of several joints."""
+_FALLBACKS = (ZERO, "lqr")
 
 
 class JointLqr(JointController):
@@ -58,6 +60,11 @@ class JointLqr(JointController):
 
 def joint_parameters(name: str, plant: MechanismParameters) -> tuple[ParameterSpec, ...]:
     """Return the specs of what a controller of a plant of several joints takes, its own weights as defaults."""
+    limit = ParameterSpec(
+        "effort_limit", 0.0, "N m", "Largest effort of each driven joint; 0 for the plant's own.", minimum=0.0
+    )
+    if name == "policy":
+        return (*policy_specs(_FALLBACKS), limit)
     if name != "lqr":
         return ()
     q, r = plant.mechanism.weights
@@ -67,9 +74,7 @@ def joint_parameters(name: str, plant: MechanismParameters) -> tuple[ParameterSp
             "q", list(q), "", f"Diagonal of Q: weights of {', '.join(names)}, then of their velocities.", minimum=0.0
         ),
         ParameterSpec("r", r, "", "Weight of each effort, R.", minimum=0.0, exclusive_minimum=True),
-        ParameterSpec(
-            "effort_limit", 0.0, "N m", "Largest effort of each driven joint; 0 for the plant's own.", minimum=0.0
-        ),
+        limit,
     )
 
 
@@ -91,7 +96,7 @@ def make_joint_controller(
     if name not in JOINT_CONTROLLERS:
         raise ParameterError(
             f"{name} is for plants of one joint, and plant {plant.name!r} has {', '.join(plant.coordinates.names)}; "
-            f"expected {' or '.join(JOINT_CONTROLLERS)}"
+            f"expected {', '.join(JOINT_CONTROLLERS[:-1])} or {JOINT_CONTROLLERS[-1]}"
         )
     p = validate(joint_parameters(name, plant), values)
     if name == "tvlqr":
@@ -102,6 +107,13 @@ def make_joint_controller(
         from pendulum_lqr.controllers.joint_swing_up import JointSwingUp
 
         return JointSwingUp(plant, period)
+    if name == "policy":
+        from pendulum_lqr.controllers.joint_policy import design_joint_policy
+
+        fallback = None
+        if p["fallback"] != ZERO:
+            fallback = make_joint_controller(p["fallback"], plant, {"effort_limit": p["effort_limit"]}, period)
+        return design_joint_policy(plant, p, period, fallback)
     model = linearise_mechanism(plant)
     gain = mechanism_lqr(model, p["q"], p["r"])
     limit = p["effort_limit"] or math.inf

@@ -31,7 +31,7 @@ def offered(plant: str) -> list[str]:
     # A file of another machine, or an emulator's, is no reason to offer nothing: the controller says what it refuses.
     with contextlib.suppress(PendulumError):
         if plant and is_mechanism(plant):
-            return list(JOINT_CONTROLLERS)
+            return [kind for kind in JOINT_CONTROLLERS if kind not in _NEED_A_FILE]
     return [kind for kind in CONTROLLERS if kind not in _NEED_A_FILE]
 
 

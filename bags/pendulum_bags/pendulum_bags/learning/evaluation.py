@@ -4,80 +4,152 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from pendulum_bags.learning.task import SwingUpTask
-from pendulum_lqr.controllers.policy import START_TIME, LearnedPolicy
+from pendulum_bags.learning.body import can_exist, kicks_of, start_spread
+from pendulum_bags.learning.task import SwingUpTask, value_of
+from pendulum_lqr.controllers.joint_policy import JointPolicy
+from pendulum_lqr.controllers.policy import LearnedPolicy
 from pendulum_lqr.policy import Policy
+from pendulum_lqr.policy_answers import START_TIME
 from pendulum_msgs_py.contract.angles import from_upright
-from pendulum_msgs_py.plants.plant_parameters import PlantParameters
+from pendulum_msgs_py.errors import ParameterError
+from pendulum_msgs_py.joints import Vector
+from pendulum_msgs_py.plants.mechanism_parameters import MechanismParameters
+from pendulum_msgs_py.plants.plant_differences import AnyPlant
+from pendulum_sim.joint_plant import JointPlant, joint_plant
+from pendulum_sim.mechanism_plant import MechanismPlant
 from pendulum_sim.plants import make_plant
 
-__all__ = ["Trial", "gymnasium_return", "measured_success", "run_trial", "trials_of"]
+__all__ = ["HOLD", "UP", "Trial", "gymnasium_return", "is_up", "measured_success", "run_trial", "trials_of"]
 
 UP = 0.3
-"""Deviation from upright within which a pendulum is up [rad]."""
+"""Deviation from upright within which a joint that turns is up [rad]."""
 HOLD = 1.0
 """Time at the end of a trial for which it has to be up [s]."""
+_MOST_DRAWS = 50
 
 
 @dataclass(frozen=True)
 class Trial:
-    """One run from a start to its end.
+    """One run of n joints from a start to its end.
 
     Attributes:
         plant: What runs.
-        theta: Start, 0 hanging [rad].
-        theta_dot: Start [rad/s].
-        kicks: Torque on the link at each step, shape (n,) [N m].
+        position: Start, hanging at 0 [rad or m].
+        velocity: Start [rad/s or m/s].
+        kicks: Efforts on the joints themselves at each step, shape (steps, n) [N m or N].
+        travel: Largest deviation of joints that slide, which is never to be left [m].
     """
 
-    plant: PlantParameters
-    theta: float
-    theta_dot: float
+    plant: AnyPlant
+    position: Vector
+    velocity: Vector
     kicks: NDArray[np.float64]
+    travel: float = math.inf
 
 
 def trials_of(policy: Policy, task: SwingUpTask, count: int, seed: int, duration: float = 10.0) -> list[Trial]:
     """Return trials with start, plant, delay and kicks all drawn anew, each from the ranges of training.
 
-    Kicks last 50 ms and come each second, with up to the trained share of the torque limit.
+    Kicks last 50 ms and come each second, with up to the trained share of the effort limit, or of the largest torque of
+    gravity at a joint without a motor.
     """
     rng = np.random.default_rng(seed)
     found = []
+    joints = policy.coordinates.joints
+    furthest, fastest = start_spread(policy.plant, task.travel, policy.velocity_scale)
+    largest = kicks_of(policy.plant)
     steps, width = round(duration / policy.period), max(1, round(0.05 / policy.period))
     for _ in range(count):
-        changes = {name: float(rng.uniform(*pair)) for name, pair in policy.ranges.items() if name != "static_friction"}
-        if "coulomb_friction" in changes:
-            ratio = policy.plant.static_friction / policy.plant.coulomb_friction
-            changes["static_friction"] = ratio * changes["coulomb_friction"]
-        changes["transport_delay"] = float(rng.uniform(0.0, task.delay))
-        kicks = np.zeros(steps)
+        plant = _drawn(policy, task, rng)
+        kicks = np.zeros((steps, len(joints)))
         for second in range(1, math.ceil(duration)):
             first = round(second / policy.period)
-            kicks[first : first + width] = rng.uniform(-1.0, 1.0) * task.kick * policy.effort_limit[0]
-        speed = 0.7 * policy.velocity_scale[0]
-        start = float(rng.uniform(-math.pi, math.pi)), float(rng.uniform(-speed, speed))
-        found.append(Trial(policy.plant.with_values(**changes), *start, kicks))
+            kicks[first : first + width] = rng.uniform(-1.0, 1.0, len(joints)) * task.kick * largest
+        # From hanging where it turns, from the middle where it slides.
+        position = tuple(
+            float(rng.uniform(-far, far)) + (0.0 if joint.turns else joint.goal)
+            for joint, far in zip(joints, furthest, strict=True)
+        )
+        velocity = tuple(float(rng.uniform(-speed, speed)) for speed in fastest)
+        found.append(Trial(plant, position, velocity, kicks, task.travel))
     return found
 
 
+def _drawn(policy: Policy, task: SwingUpTask, rng: np.random.Generator) -> AnyPlant:
+    """Return a plant from the ranges, drawn again where its masses and inertias make none."""
+    plant = policy.plant
+    for _ in range(_MOST_DRAWS):
+        drawn = {name: float(rng.uniform(*pair)) for name, pair in policy.ranges.items() if "static" not in name}
+        for name in [name for name in policy.ranges if name.endswith("static_friction")]:
+            coulomb = name.replace("static", "coulomb")
+            if coulomb in drawn:
+                drawn[name] = value_of(plant, name) / value_of(plant, coulomb) * drawn[coulomb]
+        delay = float(rng.uniform(0.0, task.delay))
+        if not isinstance(plant, MechanismParameters):
+            return plant.with_values(**drawn, transport_delay=delay)
+        drawn |= {f"{joint}.transport_delay": delay for joint in plant.coordinates.driven_names}
+        with suppress(ParameterError):
+            found = plant.with_values(drawn)
+            if can_exist(found.mechanism, np.array([found.packed]))[0]:
+                return found
+    return plant
+
+
+def plant_of(parameters: AnyPlant, period: float) -> JointPlant:
+    """Return the simulated plant, whose states are tuples [s]."""
+    if isinstance(parameters, MechanismParameters):
+        # As fine as the simulator's own period.
+        return MechanismPlant(parameters, period, substeps=max(1, round(period / 0.002)))
+    return joint_plant(make_plant(parameters, period))
+
+
 def run_trial(policy: Policy, trial: Trial, start_time: float = START_TIME) -> tuple[NDArray[np.float64], str]:
-    """Return angle from upright, velocity and torque at each step, shape (3, n), and why it gave up, if it did."""
-    controller = LearnedPolicy(policy, 1, policy.effort_limit[0], start_time=start_time)
-    plant = make_plant(trial.plant, policy.period)
-    state = plant.reset(trial.theta, trial.theta_dot)
-    rows = np.empty((3, trial.kicks.size))
-    for k, kick in enumerate(trial.kicks):
-        x = (from_upright(state.theta), state.theta_dot)
-        effort = controller.command(k * policy.period, x)
-        rows[:, k] = *x, effort
-        state = plant.step(effort, float(kick))
+    """Return what was measured at each step, and why the policy gave up, if it did.
+
+    Returns:
+        n deviations from upright, n velocities and m efforts, shape (2 n + m, steps); and its notice.
+    """
+    coordinates, plant = policy.coordinates, plant_of(trial.plant, policy.period)
+    controller: LearnedPolicy | JointPolicy
+    if isinstance(policy.plant, MechanismParameters):
+        controller = JointPolicy(policy, 1, policy.effort_limit, start_time=start_time)
+    else:
+        controller = LearnedPolicy(policy, 1, policy.effort_limit[0], start_time=start_time)
+    state = plant.reset(trial.position, trial.velocity)
+    rows = np.empty((2 * len(policy.joints) + len(coordinates.driven), len(trial.kicks)))
+    for k, kick in enumerate(trial.kicks.tolist()):
+        t, position, velocity = k * policy.period, state.position, state.velocity
+        if isinstance(controller, JointPolicy):
+            x: Vector = coordinates.deviation(position)
+            effort = controller.command(t, position, velocity)
+        else:
+            x = (from_upright(position[0]),)
+            effort = (controller.command(t, (x[0], velocity[0])),)
+        rows[:, k] = *x, *velocity, *effort
+        state = plant.step(effort, tuple(kick))
     return rows, controller.notice
+
+
+def is_up(policy: Policy, trial: Trial, rows: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """Return at which steps it is up: what turns is upright, and what slides is, and stays, where it may.
+
+    Args:
+        policy: The policy.
+        trial: The run.
+        rows: Of :func:`run_trial`.
+    """
+    up = np.ones(rows.shape[1], dtype=np.bool_)
+    for joint, row in zip(policy.coordinates.joints, np.abs(rows), strict=False):
+        # Who has left the track once was not up before that either.
+        up &= row <= UP if joint.turns else bool(np.all(row <= trial.travel))
+    return up
 
 
 def measured_success(
@@ -88,7 +160,7 @@ def measured_success(
     last = round(HOLD / policy.period)
     for number, trial in enumerate(trials):
         rows, notice = run_trial(policy, trial)
-        down = np.flatnonzero(np.abs(rows[0]) > UP)
+        down = np.flatnonzero(~is_up(policy, trial, rows))
         gave_up += bool(notice)
         if not down.size or down[-1] < rows.shape[1] - last:
             passed += 1

@@ -7,12 +7,17 @@ from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 
 from pendulum_msgs_py.errors import ParameterError
-from pendulum_msgs_py.plants.plant_parameters import PlantParameters
+from pendulum_msgs_py.plants.mechanism_parameters import MechanismParameters
+from pendulum_msgs_py.plants.plant_differences import AnyPlant
 
-__all__ = ["VARIED", "SwingUpTask", "ranges_of"]
+__all__ = ["VARIED", "SwingUpTask", "ranges_of", "value_of"]
 
 VARIED = ("inertia", "damping", "gravity", "coulomb_friction")
 """Parameters that differ from episode to episode; static friction keeps its ratio to Coulomb friction."""
+_OF_JOINTS = ("damping", "coulomb_friction", "static_friction")
+_FIXED = ("gravity", "pole_length", "gear_ratio")
+"""What is known of a mechanism, or moves nothing."""
+_POSITIVE = ("period", "rate_time", "episode", "travel")
 
 
 @dataclass(frozen=True)
@@ -32,6 +37,7 @@ class SwingUpTask:
         kick_rate: Kicks a second.
         rate_time: Time in which the torque may go from one limit to the other [s].
         history: Samples that the policy sees.
+        travel: Largest deviation of a joint that slides [m].
         episode: Length of an episode [s].
     """
 
@@ -46,13 +52,14 @@ class SwingUpTask:
     kick_rate: float = 0.5
     rate_time: float = 0.05
     history: int = 3
+    travel: float = 0.4
     episode: float = 6.0
 
     def __post_init__(self) -> None:
         """Refuse what cannot be trained on."""
         for name, value in asdict(self).items():
-            if not math.isfinite(value) or value < 0.0 or (value == 0.0 and name in {"period", "rate_time", "episode"}):
-                raise ParameterError(f"{name} is {value}; expected a finite number >= 0 (> 0 for times)")
+            if not math.isfinite(value) or value < 0.0 or (value == 0.0 and name in _POSITIVE):
+                raise ParameterError(f"{name} is {value}; expected a finite number >= 0 (> 0 for times and travel)")
         if not 1 <= self.history <= 50:
             raise ParameterError(f"history is {self.history}; expected 1 to 50 samples")
         if self.share >= 1.0:
@@ -65,22 +72,42 @@ class SwingUpTask:
 
 
 def ranges_of(
-    plant: PlantParameters, share: float, intervals: Mapping[str, Sequence[float]]
+    plant: AnyPlant, share: float, intervals: Mapping[str, Sequence[float]]
 ) -> dict[str, tuple[float, float]]:
     """Return lowest and highest value of each parameter that differs in training, static friction among them.
+
+    Of a mechanism these are its own parameters but gravity, and the friction of its joints.
 
     Args:
         plant: The plant at the centre.
         share: Half width as a share of the value [-].
         intervals: Those of the plant file, by name.
     """
+    if isinstance(plant, MechanismParameters):
+        numbers = plant.numbers
+        varied = [name for name in numbers if name not in _FIXED and _varies(name)]
+    else:
+        numbers = {name: value_of(plant, name) for name in (*VARIED, "static_friction")}
+        varied = list(VARIED)
     found = {}
-    for name in VARIED:
-        value = float(getattr(plant, name))
+    for name in varied:
+        value = numbers[name]
         low, high = intervals.get(name, (value, value))
         found[name] = (max(0.0, min(low, (1.0 - share) * value)), max(high, (1.0 + share) * value))
-    ratio = plant.static_friction / plant.coulomb_friction if plant.coulomb_friction else 0.0
-    if ratio:
-        low, high = found["coulomb_friction"]
-        found["static_friction"] = (ratio * low, ratio * high)
+    for coulomb in [name for name in varied if name.endswith("coulomb_friction")]:
+        static = f"{coulomb.removesuffix('coulomb_friction')}static_friction"
+        ratio = numbers[static] / numbers[coulomb] if static in numbers and numbers[coulomb] else 0.0
+        if ratio:
+            low, high = found[coulomb]
+            found[static] = (ratio * low, ratio * high)
     return {name: pair for name, pair in found.items() if pair[0] < pair[1]}
+
+
+def value_of(plant: AnyPlant, name: str) -> float:
+    """Return a parameter of a plant by its name."""
+    return plant.value(name) if isinstance(plant, MechanismParameters) else float(getattr(plant, name))
+
+
+def _varies(name: str) -> bool:
+    joint, _, key = name.rpartition(".")
+    return not joint or key in _OF_JOINTS[:2]

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 __all__ = ["main"]
 
 _OF_SWING_UP = (
-    "plant", "share", "delay", "jitter", "angle_noise", "velocity_noise", "kick", "period", "history"
+    "plant", "share", "delay", "jitter", "angle_noise", "velocity_noise", "kick", "period", "history", "travel"
 )  # fmt: skip
 """Options that Gymnasium's pendulum has no use for."""
 
@@ -50,6 +50,7 @@ def train(
     kick: Annotated[float, typer.Option(help="Largest kick, as a share of the torque limit.")] = 0.7,
     period: Annotated[float, typer.Option(help="Time between two answers [s].")] = 0.01,
     history: Annotated[int, typer.Option(help="Samples that the policy sees.")] = 3,
+    travel: Annotated[float, typer.Option(help="Largest deviation of a joint that slides [m].")] = 0.4,
     hidden: Annotated[tuple[int, int], typer.Option(help="Widths of the hidden layers.")] = (64, 64),
     json_output: Annotated[bool, typer.Option("--json", help="Print what was measured as JSON.")] = False,
 ) -> None:
@@ -74,7 +75,7 @@ def train(
         )
     swing_up = SwingUpTask(
         period=period, share=share, delay=delay, jitter=jitter, angle_noise=angle_noise,
-        velocity_noise=velocity_noise, kick=kick, history=history,
+        velocity_noise=velocity_noise, kick=kick, history=history, travel=travel,
     )  # fmt: skip
     settings = _settings(task, plant, seed, updates, swing_up, hidden)
     console = make_console(stderr=json_output, highlight=False)
@@ -109,18 +110,23 @@ def train(
 def _settings(task: str, plant: str, seed: int, updates: int, swing_up: Any, hidden: tuple[int, int]) -> Training:
     from pendulum_bags.learning.ppo import PpoSettings
     from pendulum_bags.learning.training import Training
-    from pendulum_msgs_py.plants.plant_parameters import load_plant_file
+    from pendulum_msgs_py.plants.mechanism_parameters import load_mechanism_file
+    from pendulum_msgs_py.plants.plant_parameters import is_mechanism, load_plant_file
 
     if task == "pendulum_v1":
         # Few and long steps: an episode has 200, and is all but over after the swing-up.
         ppo = PpoSettings(hidden=hidden, discount=0.95, epochs=8, batches=8)
         settings = Training(task=task, swing_up=swing_up, ppo=ppo, environments=256, updates=80, seed=seed)
     else:
-        parameters, provenance = load_plant_file(plant)
+        several = is_mechanism(plant)
+        parameters, provenance = load_mechanism_file(plant) if several else load_plant_file(plant)
         settings = Training(
             task=task, plant=parameters, intervals=provenance["intervals"], swing_up=swing_up,
             ppo=PpoSettings(hidden=hidden), seed=seed,
         )  # fmt: skip
+        if several:
+            # There is more to learn: more steps, and actions that go on to vary.
+            settings = replace(settings, ppo=replace(settings.ppo, least_spread=0.1), updates=700)
     return replace(settings, updates=updates) if updates else settings
 
 

@@ -15,18 +15,18 @@ import numpy as np
 import threadpoolctl
 from numpy.typing import NDArray
 
-from pendulum_bags.learning.environment import SwingUp, velocity_scale
+from pendulum_bags.learning.body import travel_of, velocity_scales
+from pendulum_bags.learning.environment import SwingUp
 from pendulum_bags.learning.evaluation import gymnasium_return, measured_success, trials_of
 from pendulum_bags.learning.pendulum_v1 import PLANT, STEP, PendulumV1
 from pendulum_bags.learning.ppo import Ppo, PpoSettings
 from pendulum_bags.learning.task import SwingUpTask, ranges_of
 from pendulum_bags.runs.run_folder import provenance
-from pendulum_lqr.policy import Network, Policy
+from pendulum_lqr.policy import Network, Policy, coordinates_of, default_signals
 from pendulum_lqr.policy_file import write_policy
-from pendulum_msgs_py.contract.names import JOINT
 from pendulum_msgs_py.errors import DataError, ParameterError
-from pendulum_msgs_py.plants.plant_differences import describe_plants
-from pendulum_msgs_py.plants.plant_parameters import PlantParameters
+from pendulum_msgs_py.plants.mechanism_parameters import MechanismParameters
+from pendulum_msgs_py.plants.plant_differences import AnyPlant, describe_plants
 from pendulum_msgs_py.whole_file import write_whole
 
 __all__ = ["EPISODES", "TASKS", "TRIALS", "Training", "checkpoint_path", "train"]
@@ -57,7 +57,7 @@ class Training:
     """
 
     task: str = "swing_up"
-    plant: PlantParameters = PLANT
+    plant: AnyPlant = PLANT
     intervals: Mapping[str, Any] = field(default_factory=dict)
     swing_up: SwingUpTask = field(default_factory=SwingUpTask)
     ppo: PpoSettings = field(default_factory=PpoSettings)
@@ -88,6 +88,8 @@ class Training:
     def to_json(self) -> dict[str, Any]:
         """Return the settings as JSON values."""
         swing_up = asdict(self.swing_up) if self.task == "swing_up" else {}
+        if all(joint.turns for joint in coordinates_of(self.plant).joints):
+            swing_up.pop("travel", None)
         return {
             "task": self.task, "plant": json.loads(describe_plants([self.plant]))[0], "ranges": self.ranges,
             "swing_up": swing_up, "ppo": asdict(self.ppo), "environments": self.environments,
@@ -131,15 +133,16 @@ def train(
         curves: list[list[float]] = []
         checkpoint = checkpoint_path(out)
         told = json.dumps(settings.to_json(), sort_keys=True)
-        fastest = 0.0
+        fastest = np.zeros(len(coordinates_of(settings.plant).joints))
         if checkpoint.exists():
-            curves, fastest = _restore(checkpoint, told, learner, generator)
+            curves, fastest = _restore(checkpoint, told, learner, generator, fastest.size)
             if on_update is not None:
                 on_update(len(curves), {"reward": curves[-1][1]})
         for number in range(len(curves), settings.updates):
             measured = learner.update(1.0 - number / settings.updates)
             if isinstance(environment, SwingUp):
-                fastest = max(fastest, float(np.abs(environment.motion[:, 1]).max()))
+                speeds = np.abs(environment.motion[:, fastest.size : 2 * fastest.size])
+                fastest = np.maximum(fastest, speeds.max(axis=0))
             steps = float((number + 1) * settings.environments * settings.ppo.horizon)
             curves.append([steps, measured["reward"], measured["divergence"], measured["spread"]])
             if on_update is not None:
@@ -167,7 +170,7 @@ def _evaluate(settings: Training, policy: Policy, on_trial: Callable[[int, int],
     return measured_success(policy, trials_of(policy, settings.swing_up, TRIALS, _EVALUATION_SEED), on_trial)
 
 
-def _policy(settings: Training, learner: Ppo, fastest: float, evaluation: Mapping[str, Any]) -> Policy:
+def _policy(settings: Training, learner: Ppo, fastest: NDArray[np.float64], evaluation: Mapping[str, Any]) -> Policy:
     parameters = learner.actor.parameters
     network = Network(
         tuple(np.ascontiguousarray(each.T) for each in parameters[::2]), tuple(each.copy() for each in parameters[1::2])
@@ -177,10 +180,12 @@ def _policy(settings: Training, learner: Ppo, fastest: float, evaluation: Mappin
         **provenance(),
     }  # fmt: skip
     plant, task = settings.plant, settings.swing_up
+    limits = plant.effort_limits if isinstance(plant, MechanismParameters) else (plant.effort_limit,)
+    coordinates = coordinates_of(plant)
     common: dict[str, Any] = {
-        "network": network, "task": settings.task, "joints": (JOINT,), "plant": plant,
-        "ranges": settings.ranges, "effort_limit": (plant.effort_limit,), "angle_box": (math.pi,),
-        "provenance": origin, "name": f"{plant.name} {settings.task} seed {settings.seed}",
+        "network": network, "task": settings.task, "joints": coordinates.names, "plant": plant,
+        "ranges": settings.ranges, "effort_limit": limits, "provenance": origin,
+        "angle_box": travel_of(plant, task.travel), "name": f"{plant.name} {settings.task} seed {settings.seed}",
     }  # fmt: skip
     if settings.task == "pendulum_v1":
         return Policy(
@@ -188,31 +193,37 @@ def _policy(settings: Training, learner: Ppo, fastest: float, evaluation: Mappin
             signals=("cos", "sin", "velocity"),
         )  # fmt: skip
     return Policy(
-        **common, period=task.period, effort_rate=(2.0 * plant.effort_limit / task.rate_time,),
-        velocity_scale=(velocity_scale(plant),), velocity_box=(_SPEED_MARGIN * fastest,), history=task.history,
+        **common, period=task.period, effort_rate=tuple(2.0 * limit / task.rate_time for limit in limits),
+        velocity_scale=velocity_scales(plant, task.travel), history=task.history, signals=default_signals(coordinates),
+        velocity_box=tuple(float(_SPEED_MARGIN * speed) for speed in fastest),
     )  # fmt: skip
 
 
 def _keep(
-    path: Path, told: str, learner: Ppo, generator: np.random.Generator, curves: list[list[float]], fastest: float
+    path: Path,
+    told: str,
+    learner: Ppo,
+    generator: np.random.Generator,
+    curves: list[list[float]],
+    fastest: NDArray[np.float64],
 ) -> None:
     arrays: dict[str, NDArray[Any]] = {f"learner/{name}": each for name, each in learner.state().items()}
     arrays |= {f"environment/{name}": each for name, each in learner.environment.state().items()}
     words = {"settings": told, "generator": json.dumps(generator.bit_generator.state)}
     arrays |= {name: np.frombuffer(text.encode(), dtype=np.uint8) for name, text in words.items()}
     buffer = io.BytesIO()
-    np.savez(buffer, curves=np.array(curves), fastest=np.array(fastest), **arrays)
+    np.savez(buffer, curves=np.array(curves), fastest=fastest, **arrays)
     try:
         write_whole(path, buffer.getvalue())
     except OSError as error:
         raise DataError(f"checkpoint {path} cannot be written: {error.strerror}; the one before it stays") from error
 
 
-def _check_shapes(path: Path, kept: Mapping[str, NDArray[Any]], learner: Ppo) -> None:
+def _check_shapes(path: Path, kept: Mapping[str, NDArray[Any]], learner: Ppo, joints: int) -> None:
     """Refuse arrays that are not those of the settings; numpy would stretch or keep them in silence."""
     expected = {f"learner/{name}": np.shape(each) for name, each in learner.state().items()}
     expected |= {f"environment/{name}": np.shape(each) for name, each in learner.environment.state().items()}
-    expected |= {"fastest": (), "curves": (len(kept["curves"]), 4)}
+    expected |= {"fastest": (joints,), "curves": (len(kept["curves"]), 4)}
     for name, shape in expected.items():
         if kept[name].shape != shape:
             raise DataError(
@@ -221,8 +232,10 @@ def _check_shapes(path: Path, kept: Mapping[str, NDArray[Any]], learner: Ppo) ->
             )
 
 
-def _restore(path: Path, told: str, learner: Ppo, generator: np.random.Generator) -> tuple[list[list[float]], float]:
-    """Go on from a checkpoint; return the curves so far and the fastest motion [rad/s]."""
+def _restore(
+    path: Path, told: str, learner: Ppo, generator: np.random.Generator, joints: int
+) -> tuple[list[list[float]], NDArray[np.float64]]:
+    """Go on from a checkpoint; return the curves so far and the fastest motion of each joint [rad/s or m/s]."""
     try:
         if path.stat().st_size > _LARGEST_CHECKPOINT:
             raise DataError(f"checkpoint {path} has more than {_LARGEST_CHECKPOINT} bytes; expected one of ours")
@@ -232,12 +245,12 @@ def _restore(path: Path, told: str, learner: Ppo, generator: np.random.Generator
                     f"checkpoint {path} is of a training with other settings; expected the same ones, another --out, "
                     "or the checkpoint removed"
                 )
-            _check_shapes(path, kept, learner)
+            _check_shapes(path, kept, learner, joints)
             learner.restore({key[8:]: kept[key] for key in kept.files if key.startswith("learner/")})
             learner.environment.restore({key[12:]: kept[key] for key in kept.files if key.startswith("environment/")})
             generator.bit_generator.state = json.loads(kept["generator"].tobytes().decode())
             curves: list[list[float]] = kept["curves"].tolist()
-            return curves, float(kept["fastest"])
+            return curves, kept["fastest"]
     except (ParameterError, DataError):
         raise
     except Exception as error:

@@ -1,0 +1,402 @@
+"""What moves in a training: its parameters as rows of numbers, and one period of it, compiled.
+
+The equations are the simulator's own: :mod:`pendulum_sim.dry_friction` for the pendulum, and
+:mod:`pendulum_sim.joint_steps` for mechanisms, Runge-Kutta of order four both.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cache
+from typing import Any
+
+import numba
+import numpy as np
+from numpy.typing import NDArray
+
+from pendulum_bags.learning.task import VARIED
+from pendulum_lqr.policy import coordinates_of
+from pendulum_msgs_py.dynamics.arithmetic import in_arithmetic
+from pendulum_msgs_py.errors import ParameterError
+from pendulum_msgs_py.joints import Coordinates
+from pendulum_msgs_py.mechanisms import Mechanism
+from pendulum_msgs_py.plants.mechanism_parameters import MechanismParameters
+from pendulum_msgs_py.plants.plant_differences import AnyPlant
+from pendulum_msgs_py.plants.plant_parameters import PlantParameters
+from pendulum_sim.compiling import compile_tree, tuple_loader
+from pendulum_sim.dry_friction import PACKED, acceleration_with_friction, actuator_torque, advance_dry
+from pendulum_sim.integrators import get_integrator
+from pendulum_sim.joint_steps import (
+    COULOMB,
+    JOINT_ROWS,
+    LAG,
+    LOWER,
+    STATIC,
+    UPPER,
+    advance_joints,
+    joint_functions,
+    pack_joints,
+)
+from pendulum_sim.mechanism_plant import common_delay
+from pendulum_sim.plant import pack
+
+__all__ = ["Body", "body_of", "can_exist", "kicks_of", "start_spread", "travel_of", "velocity_scales"]
+
+Array = NDArray[np.float64]
+
+_GROWTH = 0.8
+"""Largest product of the damping rate and the step, far inside of where Runge-Kutta is stable [-]."""
+_LONGEST, _LONGEST_OF_SEVERAL = 0.01, 0.005
+_ANGLES = 32
+BEYOND = 1.25
+"""Where the end stops of a training stand, as a share of the travel that is allowed [-]."""
+
+
+@dataclass(frozen=True)
+class Body:
+    """A plant as a training needs it; n joints, m of them driven.
+
+    Attributes:
+        coordinates: Its joints.
+        limits: Largest effort of each driven joint, shape (m,) [N m or N].
+        kicks: Largest kick of each joint where the share is 1, shape (n,): the effort limit, or the largest torque of
+            gravity where no motor is [N m or N].
+        row: Its parameters as the kernel takes them, shape (p,).
+        columns: Which of them a parameter is, by name.
+        ratios: Columns of static and Coulomb friction, and their ratio that stays, of each joint that has any.
+        offsets: Columns of the constant effort at each driven joint.
+        longest: Longest step of the integrator [s].
+        advance: Compiled: motion, parameters, efforts, delays, kicks, period and longest step to the next motion.
+        told: From parameters (N, p) to what the critic sees of them, shape (N, k).
+        height: From deviations (N, n) to how high it stands, -1 to 1, shape (N,).
+        excess: From deviations (N, n), velocities (N, n) and parameters (N, p) to how much more energy it has
+            than upright at rest, -1 hanging at rest, shape (N,); None where each joint is driven.
+        possible: From parameters (N, p) to whether they make a plant, shape (N,).
+    """
+
+    coordinates: Coordinates
+    limits: Array
+    kicks: Array
+    row: Array
+    columns: Mapping[str, int]
+    ratios: tuple[tuple[int, int, float], ...]
+    offsets: tuple[int, ...]
+    longest: float
+    advance: Callable[..., None]
+    told: Callable[[Array], list[Array]]
+    height: Callable[[Array], Array]
+    excess: Callable[[Array, Array, Array], Array] | None
+    possible: Callable[[Array], NDArray[np.bool_]]
+
+
+def body_of(plant: AnyPlant, ranges: Mapping[str, tuple[float, float]], travel: float) -> Body:
+    """Return what a training needs of a plant.
+
+    Args:
+        plant: The plant at the centre: rigid, or of several joints.
+        ranges: Lowest and highest value of each parameter that differs.
+        travel: Largest deviation of joints that slide [m].
+
+    Raises:
+        ParameterError: The plant is series elastic, has no motor, or a delay of its own.
+    """
+    if isinstance(plant, MechanismParameters):
+        return _mechanism(plant, ranges, travel)
+    if plant.drivetrain is not None:
+        raise ParameterError(
+            f"plant {plant.name!r} is series elastic; expected a rigid one, such as the plant that `identify` fits"
+        )
+    return _pendulum(plant, ranges)
+
+
+def travel_of(plant: AnyPlant, travel: float) -> tuple[float, ...]:
+    """Return the largest deviation of each joint that a training lets it visit; pi where it turns [rad or m].
+
+    Args:
+        plant: The plant.
+        travel: Largest deviation of joints that slide [m].
+    """
+    stops = plant.stops if isinstance(plant, MechanismParameters) else ((-math.inf, math.inf),)
+    return tuple(
+        math.pi if joint.turns else min(BEYOND * travel, joint.goal - low, high - joint.goal)
+        for joint, (low, high) in zip(coordinates_of(plant).joints, stops, strict=True)
+    )
+
+
+_START_SPEED, _START_SLIDE = 0.7, 0.25
+"""Velocities at a start, as a share of the scale: of what turns, and of what slides [-]."""
+_START_TRAVEL = 0.6
+"""Largest deviation at a start of what slides, as a share of the way to its stop [-]."""
+
+
+def start_spread(plant: AnyPlant, travel: float, scales: Sequence[float]) -> tuple[Array, Array]:
+    """Return how far from upright joints may start, and how fast [rad or m, rad/s or m/s].
+
+    Args:
+        plant: The plant.
+        travel: Largest deviation of joints that slide [m].
+        scales: Of :func:`velocity_scales`.
+    """
+    turns = np.array([joint.turns for joint in coordinates_of(plant).joints])
+    furthest = np.where(turns, math.pi, _START_TRAVEL * np.array(travel_of(plant, travel)))
+    return furthest, np.where(turns, _START_SPEED, _START_SLIDE) * np.array(scales)
+
+
+def can_exist(mechanism: Mechanism, parameters: Array) -> NDArray[np.bool_]:
+    """Return whether each body has an inertia that its mass and centre can have, that about the centre being positive.
+
+    Args:
+        mechanism: Equations and bodies.
+        parameters: The ``p`` of the mechanism's functions, shape (N, p).
+
+    Returns:
+        Shape (N,).
+    """
+    good = np.ones(len(parameters), dtype=np.bool_)
+    for body in mechanism.bodies(tuple(parameters.T)):
+        for value in (body.mass, *body.inertia):
+            good &= np.asarray(value) > 0.0
+    return good
+
+
+def kicks_of(plant: AnyPlant) -> Array:
+    """Return the largest kick of each joint where the share is 1: its effort limit, or the largest torque of gravity.
+
+    Args:
+        plant: The plant.
+    """
+    if isinstance(plant, PlantParameters):
+        return np.array([plant.effort_limit])
+    limits = dict(zip(plant.coordinates.driven, plant.effort_limits, strict=True))
+    return np.array([limits.get(i, torque) for i, torque in enumerate(_gravity(plant))])
+
+
+def velocity_scales(plant: AnyPlant, travel: float) -> tuple[float, ...]:
+    """Return the velocity of each joint that is seen as 1 [rad/s or m/s].
+
+    Of a joint on which gravity acts, half of its speed after a fall from upright without friction, 1 at least; of one
+    that slides, half of that which its motor gives it on the way to the end of its travel.
+
+    Args:
+        plant: The plant.
+        travel: Largest deviation of joints that slide [m].
+    """
+    if isinstance(plant, PlantParameters):
+        return (max(1.0, math.sqrt(plant.gravity / plant.inertia)),)
+    n, driven = len(plant.joints), plant.coordinates.driven
+    masses = plant.mechanism.mass((0.0,) * n, plant.packed)
+    found = []
+    for i, (joint, torque) in enumerate(zip(plant.mechanism.joints, _gravity(plant), strict=True)):
+        if joint.turns:
+            found.append(max(1.0, math.sqrt(torque / masses[i][i])))
+        else:
+            force = plant.effort_limits[driven.index(i)] if i in driven else masses[i][i] * 9.81
+            found.append(math.sqrt(0.5 * force * travel / masses[i][i]))
+    return tuple(found)
+
+
+def _gravity(plant: MechanismParameters) -> tuple[float, ...]:
+    """Return the largest torque of gravity on each joint, hanging at the others [N m or N]."""
+    n, step = len(plant.joints), 1e-6
+    found = []
+    for i in range(n):
+        slopes = []
+        for angle in np.linspace(-math.pi, math.pi, _ANGLES, endpoint=False):
+            ends = [tuple(float(angle) + way * step if k == i else 0.0 for k in range(n)) for way in (-1.0, 1.0)]
+            low, high = (plant.mechanism.potential(q, plant.packed) for q in ends)
+            slopes.append(abs(high - low) / (2.0 * step))
+        found.append(max(slopes))
+    return tuple(found)
+
+
+def _pendulum(plant: PlantParameters, ranges: Mapping[str, tuple[float, float]]) -> Body:
+    columns = {name: k for k, name in enumerate(PACKED)}
+    inertia, damping, gravity, coulomb = (columns[each] for each in VARIED)
+    limit = plant.effort_limit
+    fastest = max(pair[1] for pair in (ranges.get("damping", (0.0, plant.damping)),))
+    lightest = ranges.get("inertia", (plant.inertia, plant.inertia))[0]
+    longest = min(_LONGEST, _GROWTH * lightest / fastest if fastest > 0.0 else _LONGEST)
+
+    def told(parameters: Array) -> list[Array]:
+        return [
+            parameters[:, gravity] / limit - plant.gravity / limit,
+            parameters[:, inertia] / plant.inertia - 1.0,
+            (parameters[:, coulomb] - plant.coulomb_friction + parameters[:, damping] - plant.damping) / limit,
+        ]
+
+    return Body(
+        coordinates=coordinates_of(plant), limits=np.array([limit]), kicks=kicks_of(plant),
+        row=np.array(pack(plant), dtype=np.float64), columns=columns,
+        ratios=_ratio(coulomb + 1, coulomb, plant.static_friction, plant.coulomb_friction),
+        offsets=(columns["torque_offset"],), longest=longest, advance=_pendulum_kernel(), told=told,
+        height=lambda x: np.cos(x[:, 0]), excess=None,
+        possible=lambda parameters: np.ones(len(parameters), dtype=np.bool_),
+    )  # fmt: skip
+
+
+def _mechanism(plant: MechanismParameters, ranges: Mapping[str, tuple[float, float]], travel: float) -> Body:
+    coordinates, mechanism = plant.coordinates, plant.mechanism
+    n, driven = len(plant.joints), coordinates.driven
+    if not driven:
+        raise ParameterError(f"plant {plant.name!r} has no driven joint; expected an actuator at one of them")
+    if common_delay(plant) > 0.0:
+        raise ParameterError(
+            f"transport_delay of plant {plant.name!r} is {common_delay(plant):g} s; expected none in the plant: a "
+            "training draws delays of its own"
+        )
+    width = len(plant.packed)
+    table = [list(row) for row in pack_joints(plant)]
+    for i, (joint, reach) in enumerate(zip(mechanism.joints, travel_of(plant, travel), strict=True)):
+        if not joint.turns:
+            table[LOWER][i], table[UPPER][i] = joint.goal - reach, joint.goal + reach
+    row = np.array([*plant.packed, *(value for each in table for value in each), *([0.0] * n)])
+    names = (*mechanism.parameter_names[: width - n], *(f"{joint.name}.damping" for joint in mechanism.joints))
+    columns = {name: k for k, name in enumerate(names)}
+    for kind in (COULOMB, STATIC):
+        for i, joint in enumerate(mechanism.joints):
+            columns[f"{joint.name}.{JOINT_ROWS[kind]}"] = width + kind * n + i
+    last = width + len(JOINT_ROWS) * n
+    scales = {columns[name]: max(0.5 * (high - low), 1e-12) for name, (low, high) in ranges.items()}
+    centre = row.copy()
+    potential = in_arithmetic(mechanism.potential, np)
+    bottom = mechanism.potential((0.0,) * n, plant.packed)
+    top = mechanism.potential(coordinates.goal, plant.packed)
+    goal = coordinates.goal
+    masses = in_arithmetic(mechanism.mass, np)
+
+    def height(x: Array) -> Array:
+        above: Array = potential(tuple((x + goal).T), plant.packed)
+        return (2.0 * above - top - bottom) / (top - bottom)
+
+    def excess(x: Array, v: Array, parameters: Array) -> Array:
+        p, q = tuple(parameters[:, :width].T), tuple((x + goal).T)
+        ends = [potential(tuple(np.full(len(x), value) for value in at), p) for at in ((0.0,) * n, goal)]
+        moving = sum(
+            0.5 * v[:, i] * entry * v[:, k] for i, entries in enumerate(masses(q, p)) for k, entry in enumerate(entries)
+        )
+        found: Array = (moving + potential(q, p) - ends[1]) / (ends[1] - ends[0])
+        return found
+
+    return Body(
+        coordinates=coordinates, limits=np.array(plant.effort_limits),
+        kicks=kicks_of(plant), row=row, columns=columns,
+        ratios=tuple(
+            each for i, joint in enumerate(plant.joints)
+            for each in _ratio(width + STATIC * n + i, width + COULOMB * n + i, joint.breakaway, joint.coulomb_friction)
+        ),
+        offsets=tuple(last + i for i in driven), longest=min(_LONGEST_OF_SEVERAL, _GROWTH / max(_decay(plant), 1.0)),
+        advance=_mechanism_kernel(mechanism.name, goal),
+        told=lambda parameters: [(parameters[:, k] - centre[k]) / half for k, half in scales.items()],
+        height=height, excess=excess if len(driven) < n else None,
+        possible=lambda parameters: can_exist(mechanism, parameters[:, :width]),
+    )  # fmt: skip
+
+
+def _ratio(static: int, coulomb: int, value: float, of: float) -> tuple[tuple[int, int, float], ...]:
+    return ((static, coulomb, value / of),) if of > 0.0 else ()
+
+
+def _decay(plant: MechanismParameters) -> float:
+    """Return the largest rate at which damping slows a joint, with half of its inertia as a margin [1/s]."""
+    n = len(plant.joints)
+    damping = np.diag([joint.damping for joint in plant.joints])
+    rates = [0.0]
+    for angle in np.linspace(0.0, np.pi, 9):
+        rows = np.array(plant.mechanism.mass((float(angle),) * n, plant.packed))
+        rates.append(2.0 * float(np.max(np.linalg.eigvals(np.linalg.solve(rows, damping)).real)))
+    return max(rates)
+
+
+@cache
+def _pendulum_kernel() -> Any:
+    integrator = get_integrator("rk4")
+    step, coefficients_of = compile_tree(integrator.step), compile_tree(integrator.coefficients)
+    acceleration, advance = compile_tree(acceleration_with_friction), compile_tree(advance_dry)
+    lagged = compile_tree(actuator_torque)
+    load_plant = tuple_loader(len(PACKED), 1)
+
+    @numba.njit(error_model="numpy")
+    def prepare(parameters: Any, longest: float) -> Any:
+        plant = load_plant(parameters, 0)
+        return plant, coefficients_of(plant[1] / plant[0], longest)
+
+    @numba.njit(error_model="numpy")
+    def forward(q: Any, v: Any, torque: Any, command: Any, push: Any, h: float, prepared: Any) -> Any:
+        plant, c = prepared
+        theta, speed = advance(
+            step, coefficients_of, acceleration, q[0], v[0], torque[0], command[0], push[0], h, c, plant
+        )
+        return (theta,), (speed,), (lagged(torque[0], command[0], h, plant[9]),)
+
+    return _kernel((math.pi,), prepare, forward)
+
+
+@cache
+def _mechanism_kernel(name: str, goal: tuple[float, ...]) -> Any:
+    from pendulum_msgs_py.mechanisms import MECHANISMS
+
+    mechanism = MECHANISMS[name]
+    n, width = len(mechanism.joints), len(mechanism.parameter_names)
+    equation = compile_tree(mechanism.forward)
+    along, put, lag = (compile_tree(function) for function in joint_functions(n))
+    advance = compile_tree(advance_joints)
+    load, load_p = tuple_loader(n, 1), tuple_loader(width, 1)
+    last = width + len(JOINT_ROWS) * n
+
+    @numba.njit(error_model="numpy")
+    def prepare(parameters: Any, _longest: float) -> Any:
+        table = (
+            load(parameters, width), load(parameters, width + n), load(parameters, width + 2 * n),
+            load(parameters, width + 3 * n), load(parameters, width + 4 * n), load(parameters, width + 5 * n),
+        )  # fmt: skip
+        return load_p(parameters, 0), table, load(parameters, last)
+
+    @numba.njit(error_model="numpy")
+    def forward(q: Any, v: Any, torque: Any, command: Any, push: Any, h: float, prepared: Any) -> Any:
+        p, table, offset = prepared
+        total = along(push, 1.0, offset)
+        q, v = advance(equation, along, put, lag, q, v, torque, command, total, h, p, table)
+        return q, v, lag(torque, command, h, table[LAG])
+
+    return _kernel(goal, prepare, forward)
+
+
+def _kernel(goal: tuple[float, ...], prepare: Any, forward: Any) -> Any:
+    """Return the compiled loop over plants, in which the effort that answers a state acts after its delay."""
+    n = len(goal)
+    load = tuple_loader(n, 1)
+
+    @numba.njit(error_model="numpy")
+    def run(motion: Any, parameters: Any, efforts: Any, late: Any, pushes: Any, period: float, longest: float) -> None:
+        for j in range(motion.shape[0]):
+            row = motion[j]
+            prepared = prepare(parameters[j], longest)
+            # Positions are those from upright; the equations count from hanging.
+            for i in range(n):
+                row[i] += goal[i]
+            q, v, torque = load(row, 0), load(row, n), load(row, 2 * n)
+            held, pending, arrives = load(row, 3 * n), load(row, 4 * n), row[5 * n]
+            push, newest = load(pushes[j], 0), load(efforts[j], 0)
+            first = min(max(arrives, 0.0), period)
+            # No answer overtakes the one before it, and none is later than two periods.
+            comes = min(max(late[j], arrives), 2.0 * period)
+            second = min(max(comes, first), period)
+            for part in range(3):
+                start = 0.0 if part == 0 else (first if part == 1 else second)
+                end = first if part == 0 else (second if part == 1 else period)
+                command = held if part == 0 else (pending if part == 1 else newest)
+                if end <= start:
+                    continue
+                count = int(np.ceil((end - start) / longest - 1e-9))
+                h = (end - start) / count
+                for _ in range(count):
+                    q, v, torque = forward(q, v, torque, command, push, h, prepared)
+            for i in range(n):
+                row[i], row[n + i], row[2 * n + i] = q[i] - goal[i], v[i], torque[i]
+                row[3 * n + i] = pending[i] if comes >= period else newest[i]
+                row[4 * n + i] = newest[i]
+            row[5 * n] = comes - period if comes >= period else 0.0
+
+    return run

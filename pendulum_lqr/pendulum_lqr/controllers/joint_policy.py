@@ -1,0 +1,113 @@
+"""A learned policy from a file for a plant of several joints, with a fallback where it was never trained."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import Any
+
+from pendulum_lqr.interface import Controller, JointController
+from pendulum_lqr.policy import Policy, require_plant
+from pendulum_lqr.policy_answers import START_TIME, PolicyAnswers, check_policy_period, states_to_hold
+from pendulum_lqr.policy_file import load_policy
+from pendulum_lqr.sampling import ASSUMED_PERIOD
+from pendulum_msgs_py.errors import ParameterError
+from pendulum_msgs_py.joints import Vector
+from pendulum_msgs_py.plants.mechanism_parameters import MechanismParameters
+
+__all__ = ["JointPolicy", "design_joint_policy"]
+
+
+class JointPolicy(JointController):
+    """Answers with the network of a policy file, as :class:`pendulum_lqr.controllers.policy.LearnedPolicy` does.
+
+    Args:
+        policy: The policy.
+        hold: States for which an answer holds.
+        effort_limits: Largest effort of each driven joint [N m or N].
+        fallback: Who answers after it gave up; None for no effort.
+        start_time: Time from the first state until it has all of its effort [s].
+    """
+
+    def __init__(
+        self,
+        policy: Policy,
+        hold: int,
+        effort_limits: Vector,
+        fallback: JointController | None = None,
+        *,
+        start_time: float = START_TIME,
+    ) -> None:
+        self._answers = PolicyAnswers(policy, hold, effort_limits, start_time)
+        super().__init__(self._answers.limits)
+        self.policy = policy
+        self.fallback = fallback
+        self._deviation = policy.coordinates.deviation
+
+    @property
+    def notice(self) -> str:
+        """Why it gave up; empty as long as it did not."""
+        return self._answers.notice
+
+    def check(self, period: float) -> None:
+        """Refuse a period that the policy's is no whole multiple of [s].
+
+        Raises:
+            DesignError: as said.
+        """
+        check_policy_period(self.policy, period)
+
+    def reset(self) -> None:
+        """Forget the past, and that it gave up."""
+        self._answers.reset()
+        if self.fallback is not None:
+            self.fallback.reset()
+
+    def command(self, t: float, position: Vector, velocity: Vector) -> Vector:
+        """Return the policy's efforts, or the fallback's after it gave up [N m or N]."""
+        efforts = self._answers.answer(t, self._deviation(position), velocity)
+        if efforts is None:
+            fallback = self.fallback
+            efforts = self._answers.fall_back(
+                t, None if fallback is None else lambda: fallback.command(t, position, velocity)
+            )
+        return efforts
+
+    def describe(self) -> str:
+        """Return which policy it is, and whether it gave up."""
+        return self._answers.describe("no effort" if self.fallback is None else self.fallback.describe())
+
+    def carry_over(self, previous: Controller | JointController) -> None:
+        """Take over samples and efforts from the same kind of policy, and that it gave up."""
+        if not isinstance(previous, JointPolicy):
+            return
+        self._answers.take_over(previous._answers)
+        if self.fallback is not None and previous.fallback is not None:
+            self.fallback.carry_over(previous.fallback)
+
+
+def design_joint_policy(
+    plant: MechanismParameters, p: Mapping[str, Any], period: float | None, fallback: JointController | None
+) -> JointPolicy:
+    """Return the controller of the parameter ``policy``.
+
+    Args:
+        plant: The plant.
+        p: Checked parameters of the controller.
+        period: Period of the states [s]; None where it is not known yet.
+        fallback: Who answers after it gave up; None for no effort.
+
+    Raises:
+        ParameterError: There is no file, or the policy is for another plant or period.
+        DataError: The file is refused.
+    """
+    if not p["policy"]:
+        raise ParameterError("policy is empty; expected the path of a policy file (.npz)")
+    policy = load_policy(p["policy"])
+    require_plant(policy, plant)
+    if period is not None:
+        check_policy_period(policy, period)
+    limit = p["effort_limit"] or math.inf
+    limits = tuple(min(limit, own) for own in plant.effort_limits)
+    hold = states_to_hold(policy, ASSUMED_PERIOD if period is None else period)
+    return JointPolicy(policy, hold, limits, fallback, start_time=p["start_time"])
