@@ -7,6 +7,7 @@ import pytest
 
 from pendulum_lqr.answering import AnswerLoop
 from pendulum_lqr.controller import make_controller
+from pendulum_lqr.controllers.lqr_tracking import LqrTracking
 from pendulum_lqr.design import DesignError, output_lqr
 from pendulum_lqr.loop_check import growth
 from pendulum_lqr.model import linearise
@@ -164,13 +165,35 @@ def test_a_change_of_parameters_makes_no_jump_of_reference_or_torque(change, at,
     assert tuple(second.motion(t + 4.01)) == pytest.approx(tuple(second.reference.at(t + 4.01)))
 
 
-def test_another_reference_that_is_never_reached_in_time_is_joined_over_longer():
-    first = tracking(THESIS, set_point=-1.5, amplitude=0.0)
-    first.command(0.0, (-1.5, 0.0))
-    second = tracking(THESIS, set_point=1.5, amplitude=0.0)
+@pytest.mark.parametrize("distance", np.linspace(0.4, 3.0, 14))
+def test_another_reference_that_is_never_reached_in_time_is_joined_over_longer(distance):
+    first = tracking(THESIS, set_point=-0.5 * distance, amplitude=0.0)
+    first.command(0.0, (-0.5 * distance, 0.0))
+    second = tracking(THESIS, set_point=0.5 * distance, amplitude=0.0)
     second.carry_over(first)
-    takes = [abs(second.schedule.feedforward(second.motion(t))) for t in np.linspace(0.0, 9.0, 200)]
-    assert max(takes) < 0.9 * THESIS.effort_limit
+    takes = [abs(second.schedule.feedforward(second.motion(t))) for t in np.linspace(0.0, 16.0, 400)]
+    assert max(takes) <= 0.9 * THESIS.effort_limit * 1.001
+
+
+def test_a_motion_that_damping_ends_at_once_is_not_kept_up():
+    # To keep up 0.5 rad/s takes 5.9 N m on the thesis's plant, where it is over within 5 ms.
+    held = linearise(THESIS, UPRIGHT + 0.1).effort
+    assert tracking(THESIS).command(0.0, (0.1, 0.5)) == pytest.approx(held, abs=0.3)
+
+
+def test_a_way_is_looked_for_ten_times_a_second_and_no_more(monkeypatch):
+    controller = tracking(DFKI)
+    looked = []
+    monkeypatch.setattr(controller, "_ways", lambda *_: looked.append(1) or [])
+    for k in range(100):
+        controller.command(0.01 * k, (-3.0, 0.0))
+    assert 9 <= len(looked) <= 11
+
+
+def test_the_loop_is_judged_at_rest_in_the_middle_and_at_both_ends_wrapped():
+    judged = LqrTracking.judged_at({"set_point": 3.0, "amplitude": 0.3})
+    assert [one["set_point"] for one in judged] == pytest.approx([3.3 - 2.0 * math.pi, 2.7, 3.0])
+    assert all(one["amplitude"] == 0.0 and one["approach_time"] == 0.0 for one in judged)
 
 
 def test_after_a_gap_and_after_an_error_too_large_it_joins_anew_from_where_the_pendulum_is():
@@ -182,6 +205,9 @@ def test_after_a_gap_and_after_an_error_too_large_it_joins_anew_from_where_the_p
         assert controller.command(t, x) == pytest.approx(hold, abs=0.15)
         assert controller.motion(t).angle == pytest.approx(x[0])
         assert ("lost the reference 1 times" in controller.notice) == (x[0] == 0.65)
+        changed = tracking(THESIS, amplitude=0.2)
+        changed.carry_over(controller)
+        assert changed.notice == controller.notice
 
 
 def test_where_the_torque_does_not_suffice_to_come_to_the_reference_it_gives_none_and_says_so(simulate):
