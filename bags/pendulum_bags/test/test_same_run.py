@@ -86,6 +86,20 @@ def test_every_test_can_fail_alone() -> None:
     }
 
 
+@pytest.mark.parametrize("late", [0.3, -0.3])
+def test_a_delay_beyond_all_that_is_looked_at_is_not_told_as_the_last_of_it(late: float) -> None:
+    """Where the likeness still grows at the end of the search there is no peak, and no delay that could be stated."""
+    rng = np.random.default_rng(4)
+    t = np.arange(0.0, 40.0, 0.005)
+    wave = sum(rng.normal() * np.sin(2.0 * math.pi * f * t + rng.uniform(0.0, 6.0)) for f in np.arange(0.1, 0.7, 0.03))
+    slow = Series(t, math.pi + 0.02 * wave, 0.1 * np.gradient(wave, t), wave)
+    tests = {test.quantity: test for test in paired_tests([(slow, replace(slow, t=t + late))], Margins.parse())}
+    assert tests["delay"].outcome is Outcome.UNDECIDED
+    assert (tests["delay"].interval.low, tests["delay"].interval.high) == (-100.0, 100.0)
+    # Nothing was taken out, so both distances are one.
+    assert tests["distance of angles"].interval == tests["distance of angles less the delay"].interval
+
+
 def test_margins_in_units_are_those_of_the_signals() -> None:
     simulation, hardware = pair(3)
     stated = ["spread_angle=0.001 deg", "spread_torque=0.5 N m", "path_velocity=10 deg/s"]
@@ -196,7 +210,11 @@ def test_the_layer_says_what_differs_and_what_to_do() -> None:
     assert late.mark is Mark.NO
     assert late.reason.startswith("the hardware answers 10")
     assert late.reason.split(";")[0].endswith("ms later than the simulation")
-    assert "transport_delay, 10" in late.next_steps[0]
+    assert late.next_steps[0].startswith("Give the simulated plant 10")
+    assert "ms more delay than now: transport_delay in its plant file" in late.next_steps[0]
+    simulation, hardware = pair(5, late=0.01)
+    early = same_run_layer(compare([(hardware, replace(simulation, metadata={}))]))
+    assert "ms less delay than now" in early.next_steps[0]
     slack = same_run_layer(compare([pair(5, plant=SIMULATED.with_values(damping=2 * 11.77))]))
     assert "the standard deviation of the hardware's velocity is 47 % smaller" in slack.reason
     assert "identify" in slack.next_steps[0]

@@ -17,7 +17,7 @@ import scipy
 from pendulum_bags.comparison.band import BandLimited, SlowClock, common_band
 from pendulum_bags.comparison.equivalence import EquivalenceTest, equivalence_test
 from pendulum_bags.comparison.margins import Margin, Margins
-from pendulum_bags.comparison.statistics import Resampled, bootstrap_interval, resample
+from pendulum_bags.comparison.statistics import Interval, Resampled, bootstrap_interval, resample
 from pendulum_bags.runs.series import Array, Series
 from pendulum_msgs_py.errors import ParameterError
 
@@ -130,13 +130,15 @@ def paired_tests(
     seen = [_Seen(*pair, band) for pair in pairs]
     # The delay is where the velocities are most alike. That is an extremum: to first order, an error of the delay does
     # not change the distances that are left, so they may be counted as if it were known.
-    centre = _find_delay(seen)
+    edge, centre = _find_delay(seen)
     columns = [one.columns(centre) for one in seen]
     resampled = resample(columns, runs_differ=runs_differ)
     kind = _Kind.of([one for pair in pairs for one in pair], margins, looks, len(pairs))
     tests = [_mean_test(resampled, _column(0), margins, kind)]
     tests += _spread_tests(resampled, _SIMULATION, _HARDWARE, margins, kind)
-    tests.append(_delay_test(resampled, centre, margins.delay, kind))
+    tests.append(
+        _delay_test(resampled, centre, margins.delay, kind) if edge is None else _no_delay(edge, margins, kind)
+    )
     for index, what, margin in (
         (1, "angle", margins.path_angle),
         (2, "velocity", margins.path_velocity),
@@ -235,8 +237,12 @@ class _Seen:
         return np.concatenate((np.stack(rows, axis=1), moving * still, moving**2), axis=1)
 
 
-def _find_delay(seen: Sequence[_Seen]) -> float:
-    """Return the delay at which the velocities are most alike, over all runs, to a whole ``LAG_STEP`` [s]."""
+def _find_delay(seen: Sequence[_Seen]) -> tuple[float | None, float]:
+    """Return the delay at which the velocities are most alike, over all runs, to a whole ``LAG_STEP`` [s].
+
+    Returns:
+        None and the delay; where they are most alike at an end of what is looked at, which is no peak, that end and 0.
+    """
     reach = LONGEST_DELAY - float(_LAGS[-1])
     lags = np.arange(-reach, reach + 0.5 * LAG_STEP, LAG_STEP)
     products = squares = np.zeros(lags.size)
@@ -244,7 +250,8 @@ def _find_delay(seen: Sequence[_Seen]) -> float:
         moving, still = one.lagged(lags)
         products = products + (moving * still).sum(axis=0)
         squares = squares + (moving**2).sum(axis=0)
-    return float(lags[np.argmax(_likeness(products, squares))])
+    best = int(np.argmax(_likeness(products, squares)))
+    return (float(lags[best]), 0.0) if best in {0, lags.size - 1} else (None, float(lags[best]))
 
 
 def _likeness(products: Array, squares: Array) -> Array:
@@ -336,6 +343,14 @@ def _delay_test(resampled: Resampled, centre: float, margin: Margin, kind: _Kind
         lambda means: scale * (centre + _lag(means)),
         level=kind.looks.level,
     )
+    return equivalence_test("delay", margin.unit, interval, -margin.value, margin.value, runs=kind.runs)
+
+
+def _no_delay(edge: float, margins: Margins, kind: _Kind) -> EquivalenceTest:
+    """Return the test of a delay that the motions do not tell: anything that was looked for may be it."""
+    margin, scale = margins.delay, _UNITS[margins.delay.unit]
+    end = scale * LONGEST_DELAY
+    interval = Interval(scale * edge, -end, end, kind.looks.level, math.nan, 1)
     return equivalence_test("delay", margin.unit, interval, -margin.value, margin.value, runs=kind.runs)
 
 

@@ -121,18 +121,21 @@ def _remedies(comparison: Comparison, failed: Sequence[EquivalenceTest]) -> tupl
         )
     elif late is not None and foreign:
         # No plant file of ours reaches into it.
-        steps.append(
-            f"Give {foreign} the delay that is missing, {late.interval.estimate:.3g} {late.unit}; measure again."
-        )
+        steps.append(f"Give {foreign} {_late(late)}; measure again.")
     elif late is not None:
         steps.append(
-            f"Give the simulated plant the delay that is missing: transport_delay, "
-            f"{late.interval.estimate:.3g} {late.unit} "
-            "more than now, in its plant file; then measure again with --plant."
+            f"Give the simulated plant {_late(late)}: transport_delay in its plant file; "
+            "then measure again with --plant."
         )
     if any(name.startswith("mean") for name in names):
         steps.append("Look for an offset: angle_offset or torque_offset in the plant file, or dry friction.")
     return tuple(steps)
+
+
+def _late(test: EquivalenceTest) -> str:
+    """Return by how much the simulation's delay is to change, in words."""
+    value = test.interval.estimate
+    return f"{abs(value):.3g} {test.unit} {'more' if value >= 0.0 else 'less'} delay than now"
 
 
 def _foreign_simulation(comparison: Comparison) -> str:
