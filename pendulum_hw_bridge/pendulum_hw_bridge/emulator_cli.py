@@ -32,7 +32,7 @@ fault_app = typer.Typer(add_completion=False, rich_markup_mode=None)
 def emulator(
     address: Annotated[str, typer.Option(help="HOST:PORT to listen on (UDP).")] = _ADDRESS,
     plant: Annotated[str, typer.Option(help=f"{EMULATOR_PRESET_NAMES}, or a plant file with a drivetrain.")] = "thesis",
-    position: Annotated[float, typer.Option(help="Angle of the pendulum at the start, 0 hanging down [rad].")] = 0.0,
+    position: Annotated[float, typer.Option(help="Where the pendulum is at the start [rad].")] = 0.0,
     seed: Annotated[int, typer.Option(min=0, help="Seed of sensor noise and timing jitter.")] = 0,
     flat: Annotated[bool, typer.Option(help="The pendulum lies flat: no gravity.")] = False,
     heating: Annotated[bool, typer.Option(help="Let the motor of the preset thesis warm up too.")] = False,

@@ -54,9 +54,9 @@ def design(
     ] = "thesis",
     plant: Annotated[Path | None, typer.Option(help="Plant file, instead of a preset.")] = None,
     q: Annotated[
-        list[str] | None, typer.Option(help="Diagonal of Q, as 100,0.01; may be repeated for more rows.")
+        list[str] | None, typer.Option(help="Diagonal of Q, as 100,0.01; may be given again for more rows.")
     ] = None,
-    r: Annotated[list[float] | None, typer.Option(help="R; may be repeated. Every Q meets every R.")] = None,
+    r: Annotated[list[float] | None, typer.Option(help="R; may be given again. Every Q meets every R.")] = None,
     theta: Annotated[float, typer.Option(help="Angle of the fixed point, 0 hanging down [rad].")] = UPRIGHT,
     effort_limit: Annotated[float, typer.Option(help="Torque limit [N m]; 0 for the plant's.")] = 0.0,
     figures: Annotated[Path | None, typer.Option(help="Folder for the figures (PNG).")] = None,
@@ -72,14 +72,14 @@ def design(
         list[str] | None,
         typer.Option(
             help="Worst margins over plants that are possible: inertia=10%, or transport_delay=0:0.01 (lowest and "
-            f"highest value); may be repeated ({', '.join(UNCERTAIN)}). Or identified: intervals of the plant file."
+            f"highest value); may be given again ({', '.join(UNCERTAIN)}). Or identified: intervals of the plant file."
         ),
     ] = None,
     tracking: Annotated[
         list[str] | None,
         typer.Option(
             help="Say what lqr_tracking does with the weights of the row that --row chooses: one of its parameters as "
-            "amplitude=0.3, or period=0.002 (of the loop, 0.01 s without it); may be repeated."
+            "amplitude=0.3, or period=0.002 (of the loop, 0.01 s without it); may be given again."
         ),
     ] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON instead of tables.")] = False,

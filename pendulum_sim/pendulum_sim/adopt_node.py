@@ -234,7 +234,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         AdoptNode,
         argv,
         program="pendulum_sim adopt",
-        description="Adds arming, limits and an e-stop to a plant that is on the ROS graph already.",
+        description="Puts a plant of others, states out and efforts in, behind the contract and its rules.",
         specs=SPECS,
         example="python -m pendulum_sim adopt --ros-args -r __ns:=/sim -p states:=/joint_states -p joint:=hinge",
     )

@@ -24,7 +24,7 @@ def phase_plot(
     output: Annotated[Path, typer.Option(help="Figure to write (.png, .svg, .pdf).")] = Path("phase_plot.png"),
     as_json: Annotated[bool, typer.Option("--json", help="Print the fixed points as JSON.")] = False,
 ) -> None:
-    """Draw theta' over theta of b theta' + G sin(theta) = u_0 and list its fixed points, for an overdamped plant.
+    """Draw x' over x of b x' + G sin(x) = u_0 and list its fixed points, for a plant that is overdamped.
 
     Example: python -m pendulum_sim phase_plot --plant thesis --torque 0.5 --output phase.png
     """

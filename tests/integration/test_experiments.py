@@ -17,6 +17,7 @@ from pendulum_bags.experiments.lockstep import record_run
 from pendulum_bags.experiments.run_spec import RunSpec
 from pendulum_bags.studies.leaderboard_hardware import evaluate_hardware
 from pendulum_lqr.policy_file import write_policy
+from pendulum_msgs_py.plants.mechanism_parameters import load_mechanism
 from pendulum_msgs_py.plants.plant_parameters import load_plant
 from pendulum_rosbag.reader import read_bag, same_messages
 from tests.policies import linear_policy
@@ -42,6 +43,32 @@ def test_lockstep_runs_of_the_emulated_hardware_with_one_seed_are_identical(doma
     states = first["/hw/joint_states"]
     assert len(states) == 101
     assert abs(states["position"] - 3.14159).max() < 0.05
+
+
+def test_several_joints_and_what_stands_in_for_their_machine_end_in_one_answer(tmp_path: Path) -> None:
+    out = tmp_path / "run"
+    done = run_experiment(
+        "joints", "--out", out, "--plant", "cart_pole", "--duration", "4", "--delay", "0.02", "--json"
+    )
+    content = json.loads(done.stdout)
+    assert list(content["joints"]) == ["cart", "pole"]
+    delays = [
+        test for one in content["joints"].values() for test in one["verdict"]["tests"] if test["quantity"] == "delay"
+    ]
+    # 20 ms in the loop, as far as the motion shows them.
+    assert [test["outcome"] for test in delays] == ["not equivalent"] * 2
+    assert all(12.0 < test["estimate"] < 25.0 for test in delays)
+    assert content["answer"]["mark"] == "no"
+    assert "emulated hardware" in content["answer"]["sentence"]
+    for side in ("sim", "hw"):
+        bag = read_bag(out / side)
+        states = bag.joints(f"/{side}/joint_states")
+        assert len(states.stamp_ns) == 2001
+        assert abs(states.position - (0.0, math.pi)).max() < 0.2
+        assert bag.joints(f"/{side}/disturbance").names == ("cart",)
+    machine, plant = load_mechanism(out / "machine.yaml"), load_mechanism("cart_pole")
+    assert machine.value("cart.transport_delay") == 0.02
+    assert 0.0 < abs(machine.value("cart_mass") / plant.value("cart_mass") - 1.0) <= 0.05
 
 
 def test_a_policy_file_is_a_controller_like_any_other_in_an_experiment(domain_id: int, tmp_path: Path) -> None:

@@ -156,6 +156,16 @@ def test_a_joint_that_stood_still_is_named(recordings: dict[str, dict[str, np.nd
         compare_runs(bag, bag, joint="cart")
 
 
+def test_plants_that_fell_are_not_compared(recordings: dict[str, dict[str, np.ndarray]], tmp_path: Path) -> None:
+    turning = recordings["sim"]["position"] + np.outer(
+        np.linspace(0.0, 20.0, len(recordings["sim"]["noise"])), (0.0, 1.0)
+    )
+    bag = write(tmp_path / "fell", {**recordings["sim"], "position": turning})
+    fallen = read_run(bag, joint="pole")
+    with pytest.raises(DataError, match=r"fell: pole turned by 20 rad under the noise"):
+        Pair.of(fallen, fallen)
+
+
 @pytest.mark.parametrize(
     ("marks", "expected"),
     [

@@ -49,7 +49,7 @@ def results_at_once(
         console: Where to draw.
         unit: What is counted, as a plural.
         jobs: What to run; each can be pickled.
-        workers: Jobs at once; 0 for one per core.
+        workers: Jobs at once; 0 for one a core.
 
     Raises:
         typer.Exit: The user interrupted; nothing of the results is left.

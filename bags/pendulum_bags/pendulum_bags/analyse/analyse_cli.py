@@ -46,7 +46,7 @@ def analyse(
         typer.Option(help=f"Questions: {_named(of_runs=False)} of each plant; {_named(of_runs=True)} of run folders."),
     ] = "metrics,timing",
     out: Annotated[
-        Path, typer.Option("--out", "-o", help="Folder for the tables; an interrupted analysis is continued there.")
+        Path, typer.Option("--out", "-o", help="Folder for the tables; an interrupted analysis goes on there.")
     ] = Path("bags", "runs", "analysed"),
     workers: Annotated[
         int, typer.Option(help="Processes of a local Dask cluster; 0: one after the other, in this process.", min=0)

@@ -31,7 +31,7 @@ MarginOption = Annotated[
     typer.Option(
         "--margin",
         help="Largest difference that does not matter to your task: mean_angle=0.3deg, spread_angle=20%, delay=8ms, "
-        "path_angle=0.2deg ...; may be repeated.",
+        "path_angle=0.2deg ...; may be given several times.",
     ),
 ]
 MarginsFile = Annotated[
@@ -43,7 +43,7 @@ DesignOption = Annotated[
     typer.Option(
         "--design",
         help="Design whose certificate for the measured machine is wanted: 'q=100,0.01 r=0.1', 'k=33,0.2', a "
-        "controller's name or a policy file (.npz); may be repeated. By default those that were certified when "
+        "controller's name or a policy file (.npz); several times if wanted. By default those that were certified when "
         "it was measured, and the policy that ran.",
     ),
 ]
@@ -57,7 +57,7 @@ MachineOption = Annotated[
 ]
 LayersOption = Annotated[
     list[Path] | None,
-    typer.Option("--layers", help="Folder of a frequency_response or ranking experiment; may be repeated."),
+    typer.Option("--layers", help="Folder of a frequency_response or ranking experiment; several times if wanted."),
 ]
 
 

@@ -90,7 +90,7 @@ class Pair:
         """Compare two runs.
 
         Raises:
-            DataError: A plant did not move, or the runs have too little in common.
+            DataError: A plant did not move, one of several joints fell, or the runs have too little in common.
         """
         for run in (simulation, hardware):
             if not np.ptp(run.window.position):
@@ -98,6 +98,12 @@ class Pair:
                 raise DataError(
                     f"the {run.label} of {run.source} stood still{where} at {run.window.position[0]:.4g} "
                     f"{run.window.unit} under the noise; expected a plant that moves: was it armed, and free?"
+                )
+            if run.joint and run.window.unit == "rad" and np.ptp(run.window.position) > np.pi:
+                raise DataError(
+                    f"the {run.label} of {run.source} fell: {run.joint} turned by "
+                    f"{np.ptp(run.window.position):.3g} rad under the noise; expected a plant that is held, since two "
+                    "that tumble say nothing of each other: choose a smaller noise or another design"
                 )
         hardware = _turned(hardware, simulation)
         response = align_motion(simulation.window, hardware.window)

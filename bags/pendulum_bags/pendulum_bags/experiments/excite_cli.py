@@ -26,18 +26,14 @@ def excite(
     parameters: Annotated[
         str, typer.Option(help="Parameters to determine, separated by commas.")
     ] = "inertia,damping,gravity,coulomb_friction",
-    kind: Annotated[
-        str, typer.Option(help="Kind of signal: multisine, chirp, prbs, or best (of these three).")
-    ] = "best",
-    duration: Annotated[float, typer.Option(help="Length of the signal [s].")] = 20.0,
+    kind: Annotated[str, typer.Option(help="multisine, chirp, prbs, or best of all.")] = "best",
+    duration: Annotated[float, typer.Option(help="[s]")] = 20.0,
     rate: Annotated[float, typer.Option(help="Samples and torque values per second [Hz].")] = 100.0,
-    max_effort: Annotated[
-        float | None, typer.Option(help="Largest torque [N m]; by default half the plant's limit.")
-    ] = None,
-    max_speed: Annotated[float, typer.Option(help="Largest speed [rad/s].")] = 10.0,
-    max_angle: Annotated[float, typer.Option(help="Largest angle from hanging down [rad].")] = 2.5,
+    max_effort: Annotated[float | None, typer.Option(help="[N m]; by default half the plant's limit.")] = None,
+    max_speed: Annotated[float, typer.Option(help="[rad/s]")] = 10.0,
+    max_angle: Annotated[float, typer.Option(help="Distance from hanging down [rad].")] = 2.5,
     noise: Annotated[float, typer.Option(help="Standard deviation of the angle sensor [rad].")] = 1e-3,
-    seed: Annotated[int, typer.Option(help="Seed of the search.")] = 0,
+    seed: Annotated[int, typer.Option(help="Of the search.")] = 0,
     trials: Annotated[int, typer.Option(help="Candidates to try, and again to improve the best.")] = 60,
     out: Annotated[Path, typer.Option(help="CSV (time, torque) to write.")] = Path("excitation.csv"),
     play: Annotated[bool, typer.Option(help="Play it when it is designed, and record.")] = False,
@@ -56,7 +52,7 @@ def excite(
         Path | None,
         typer.Option(help="With --play: bag to write; by default the name of --out without .csv."),
     ] = None,
-    namespace: Annotated[str, typer.Option(help="With --on running: namespace of the plant.")] = "/sim",
+    namespace: Annotated[str, typer.Option(help="With --on running: of the plant.")] = "/sim",
     arm: Annotated[
         bool, typer.Option(help="With --on running: arm the plant, and disarm it at the end. It will move.")
     ] = False,

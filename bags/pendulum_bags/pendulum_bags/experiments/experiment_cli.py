@@ -17,6 +17,7 @@ from rich.console import Console
 from pendulum_bags.comparison.compare_cli import MarginOption, MarginsFile
 from pendulum_bags.experiments.domain import check_domain
 from pendulum_bags.experiments.graph_plant import PREFIX as GRAPH_PREFIX
+from pendulum_bags.experiments.joints_cli import joints
 from pendulum_bags.experiments.operator import ask_for_running, confirmed
 from pendulum_bags.experiments.progress import PhaseProgress
 from pendulum_bags.experiments.run_spec import SIDES
@@ -75,8 +76,8 @@ Amplitude = Annotated[float, typer.Option(help="Largest torque of the noise [N m
 HoldTime = Annotated[float, typer.Option(help="Time for which a noise sample is held [s].")]
 Duration = Annotated[float, typer.Option(help="Length of the noise [s].")]
 Controller = Annotated[str, typer.Option(help="Kind of controller, or a policy file (.npz).")]
-Q = Annotated[tuple[float, float], typer.Option(help="Weights of angle and velocity, the diagonal of Q.")]
-R = Annotated[float, typer.Option(help="Weight of the torque, R.")]
+Q = Annotated[tuple[float, float], typer.Option(help="Diagonal of Q.")]
+R = Annotated[float, typer.Option(help="R.")]
 Storage = Annotated[str, typer.Option(help="Storage of the bags: mcap or sqlite3.")]
 Domain = Annotated[int | None, typer.Option(help="ROS domain; by default ROS_DOMAIN_ID, or the first free one.")]
 Strategy = Annotated[str, typer.Option(help="How the actuator turns wanted torque into PWM.")]
@@ -263,6 +264,7 @@ app.command(name="region_of_attraction")(region_of_attraction)
 app.command(name="leaderboard")(leaderboard)
 app.command(name="benchmark")(benchmark)
 app.command(name="frequency_response")(frequency_response)
+app.command(name="joints")(joints)
 
 
 @app.command()

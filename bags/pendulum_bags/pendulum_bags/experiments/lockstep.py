@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from pathlib import Path
+from typing import Any, Protocol
 
 from pendulum_bags.experiments.conductor_node import Conductor, PlantClient, RecorderClient
 from pendulum_bags.experiments.domain import reserve_domain
@@ -17,9 +18,11 @@ from pendulum_msgs_py.contract.angles import UPRIGHT
 from pendulum_msgs_py.contract.names import Event
 from pendulum_msgs_py.contract.values import NANOSECONDS
 from pendulum_msgs_py.errors import BagError, FaultError
+from pendulum_msgs_py.programs.graph import NodeProgram
 
 __all__ = [
-    "finish_recording", "lockstep_spec", "longest_run", "record_run", "run_lockstep", "wait_until_all_hear_each_other",
+    "GraphRun", "finish_recording", "lockstep_spec", "longest_run", "record_run", "run_lockstep",
+    "wait_until_all_hear_each_other",
 ]  # fmt: skip
 
 _START_TIMEOUT = 60.0
@@ -98,8 +101,48 @@ def longest_run(duration: float) -> float:
     return 4.0 * _START_TIMEOUT + _SLOWEST * duration
 
 
+class GraphRun(Protocol):
+    """What a run over DDS has to say of itself; a :class:`RunSpec` does."""
+
+    @property
+    def namespace(self) -> str:
+        """Namespace of the plant."""
+
+    @property
+    def storage(self) -> str:
+        """Storage of the bag."""
+
+    @property
+    def duration(self) -> float:
+        """Length [s]."""
+
+    @property
+    def steps(self) -> int:
+        """Number of steps of the plant."""
+
+    @property
+    def simulated_time(self) -> bool:
+        """Whether time is that of the plant and not that of the wall."""
+
+    @property
+    def has_bridge(self) -> bool:
+        """Whether the plant is the bridge, which no parameter arms."""
+
+    def metadata(self) -> dict[str, Any]:
+        """Return what the bag says about its run."""
+
+    def plant_program(self, listeners: int) -> NodeProgram:
+        """Return the plant, which waits for so many subscriptions to its states."""
+
+    def controller_program(self) -> NodeProgram:
+        """Return the controller."""
+
+    def disturbance_program(self) -> NodeProgram:
+        """Return the disturbance."""
+
+
 def record_run(
-    bag: Path, spec: RunSpec, *, domain: int | None = None, on_wait: Callable[[], None] = lambda: None
+    bag: Path, spec: GraphRun, *, domain: int | None = None, on_wait: Callable[[], None] = lambda: None
 ) -> Path:
     """Carry out one run over DDS, in lockstep or in real time as it says, and record it.
 
@@ -151,7 +194,9 @@ def record_run(
     return bag
 
 
-def _keep_time(conductor: Conductor, plant: PlantClient, spec: RunSpec, processes: ProcessSet, recorder: Child) -> None:
+def _keep_time(
+    conductor: Conductor, plant: PlantClient, spec: GraphRun, processes: ProcessSet, recorder: Child
+) -> None:
     """Let a run in real time go, wait for its length by the plant's clock, and put the plant to rest."""
     plant.watch()
     try:

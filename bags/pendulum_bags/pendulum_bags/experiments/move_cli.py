@@ -36,7 +36,7 @@ app = typer.Typer(add_completion=False, rich_markup_mode=None)
 )
 def move(
     goal: Annotated[str, typer.Argument(help="upright, down, an angle [rad]; or stop (latches the e-stop), reset.")],
-    namespace: Annotated[str, typer.Option(help="Namespace of the plant.")] = "/sim",
+    namespace: Annotated[str, typer.Option(help="Of the plant.")] = "/sim",
     control: Annotated[
         bool, typer.Option(help="upright: let the controller take over at the end. Without it the plant holds.")
     ] = True,

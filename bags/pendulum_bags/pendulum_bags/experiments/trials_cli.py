@@ -29,7 +29,7 @@ Hardware = Annotated[str, typer.Option(help="emulator, or hebi for the real actu
 Lab = Annotated[Path | None, typer.Option(help="Lab file of the real actuator, for --hardware hebi.")]
 Yes = Annotated[bool, typer.Option("--yes", help="Do not ask before the real machine moves.")]
 Plant = Annotated[str, typer.Option(help="What the emulator is: preset or plant file with a drivetrain.")]
-Realtime = Annotated[bool, typer.Option(help="Run in real time on the emulator too, instead of in lockstep.")]
+Realtime = Annotated[bool, typer.Option(help="Keep the wall's time on the emulator too, instead of lockstep.")]
 Seed = Annotated[int, typer.Option(help="Seed of the emulator's sensor noise and of the simulated hand.", min=0)]
 Trials = Annotated[int, typer.Option(help="Number of trials, one bag each.", min=1, max=100)]
 Storage = Annotated[str, typer.Option(help="Storage of the bags: mcap or sqlite3.")]

@@ -31,7 +31,7 @@ Design = Annotated[
 ]
 Angle = Annotated[float, typer.Option(help="Angle that the task allows, one unit of the gap [rad].")]
 Velocity = Annotated[float, typer.Option(help="Velocity that the task allows [rad/s].")]
-Torque = Annotated[float, typer.Option(help="Torque that the task may use [N m].")]
+Torque = Annotated[float, typer.Option(help="Torque that the task has for it [N m].")]
 GapMargin = Annotated[
     float, typer.Option(help="Gap between the plants that does not matter, 0 to 1.", min=0.0, max=1.0)
 ]
@@ -82,7 +82,7 @@ def experiment(
     controller: Annotated[
         str, typer.Option(help="Controller that holds both plants meanwhile, or a policy file (.npz).")
     ] = "lqr",
-    realtime: Annotated[bool, typer.Option(help="Run in real time, instead of in lockstep.")] = False,
+    realtime: Annotated[bool, typer.Option(help="Keep the wall's time, instead of lockstep.")] = False,
     amplitude: Annotated[float, typer.Option(help="Largest torque of the multisine [N m].")] = 2.5,
     signal_period: Annotated[float, typer.Option(help="Length of one period of it [s].")] = 4.0,
     periods: Annotated[int, typer.Option(help="Periods that are averaged; one more settles.", min=3, max=1000)] = 8,

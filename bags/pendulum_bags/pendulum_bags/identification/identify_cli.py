@@ -60,19 +60,14 @@ def identify(
     friction: Annotated[
         str, typer.Option(help="auto, viscous, coulomb, stribeck, load, stribeck_load, gear_load, ...")
     ] = "auto",
-    window: Annotated[
-        float | None,
-        typer.Option(help="Length of the shooting windows [s]; by default 1 s for torque, 2 to 5 s for voltage."),
-    ] = None,
+    window: Annotated[float | None, typer.Option(help="Length of the shooting windows [s].")] = None,
     mass: Annotated[float | None, typer.Option(help="Moving mass [kg], to check or fix the scale.")] = None,
-    length: Annotated[
-        float | None, typer.Option(help="Distance from the joint axis to the centre of mass [m].")
-    ] = None,
-    inertia: Annotated[
-        float | None, typer.Option(help="Moment of inertia about the joint axis [kg m^2], if known.")
-    ] = None,
+    length: Annotated[float | None, typer.Option(help="Joint axis to centre of mass [m].")] = None,
+    inertia: Annotated[float | None, typer.Option(help="About the joint axis [kg m^2], if known.")] = None,
     fix_scale: Annotated[bool, typer.Option(help="Take the scale of torque from mass and length.")] = False,
-    held_out: Annotated[list[Path] | None, typer.Option(help="Recordings to score only; may be repeated.")] = None,
+    held_out: Annotated[
+        list[Path] | None, typer.Option(help="Recordings to score only; may be given more than once.")
+    ] = None,
     out: Annotated[
         Path | None, typer.Option(help="Plant file to write (*.yaml), with a .json and figures beside it.")
     ] = None,

@@ -31,7 +31,7 @@ def report(
     ] = None,
     margin: Annotated[
         list[str] | None,
-        typer.Option("--margin", help="As for compare: NAME=VALUE, may be repeated."),
+        typer.Option("--margin", help="As for compare: NAME=VALUE, several times if wanted."),
     ] = None,
     margins_file: Annotated[Path | None, typer.Option("--margins", help="File of margins, as for compare.")] = None,
     layers: LayersOption = None,

@@ -27,7 +27,7 @@ def leaderboard(
     ] = "",
     duration: Annotated[float, typer.Option(help="Length of each run [s].", min=1.0)] = 10.0,
     robustness: Annotated[bool, typer.Option(help="Try model errors, noise, delay, lag and pushes too.")] = True,
-    workers: Annotated[int, typer.Option(help="Runs at once; 0 for one per core.", min=0)] = 0,
+    workers: Annotated[int, typer.Option(help="Runs at once; 0 for one a core.", min=0)] = 0,
     json_output: Annotated[bool, typer.Option("--json", help="Print the board as JSON.")] = False,
 ) -> None:
     """Score every controller from hanging down to upright: three public scores, costs, robustness, one page.

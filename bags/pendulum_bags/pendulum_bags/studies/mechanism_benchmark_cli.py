@@ -29,12 +29,12 @@ def benchmark(
     plant: Annotated[str, typer.Option(help="acrobot or pendubot.")] = "acrobot",
     controller: Annotated[str, typer.Option(help="Controllers, separated by commas; empty for all.")] = "",
     out: Annotated[Path, typer.Option(help="Folder of the figure and the results.")] = Path("bags/runs/benchmark"),
-    robustness: Annotated[bool, typer.Option(help="Six tests of robustness: 722 runs per controller.")] = True,
+    robustness: Annotated[bool, typer.Option(help="Six tests of robustness: 722 runs a controller.")] = True,
     uptime_seeds: Annotated[
         int, typer.Option(help="Runs of 60 s with knock-downs, each with a seed of its own; 0 for none.", min=0)
     ] = 10,
-    seed: Annotated[int, typer.Option(help="Seed of noise, kicks and knock-downs.", min=0)] = 1,
-    workers: Annotated[int, typer.Option(help="Runs at once; 0 for one per core.", min=0)] = 0,
+    seed: Annotated[int, typer.Option(help="Of noise, kicks and knock-downs.", min=0)] = 1,
+    workers: Annotated[int, typer.Option(help="Runs at once; 0 for one a core.", min=0)] = 0,
     json_output: Annotated[bool, typer.Option("--json", help="Print the results as JSON.")] = False,
 ) -> None:
     """Score controllers of acrobot or pendubot by the public benchmark's protocol, to the letter.

@@ -21,7 +21,7 @@ def monte_carlo(
     out: Annotated[
         Path | None,
         typer.Option(
-            help="Folder; an interrupted one is continued, more runs are added. Default: bags/runs/monte_carlo."
+            help="Folder; an interrupted one is gone on with, more runs are added. Default: bags/runs/monte_carlo."
         ),
     ] = None,
     plant: Annotated[str, typer.Option(help="Preset or plant file; the controller is designed on it.")] = "thesis",
@@ -35,17 +35,12 @@ def monte_carlo(
     amplitude: Annotated[float, typer.Option(help="Largest noise torque [N m].")] = 2.5,
     hold_time: Annotated[float, typer.Option(help="Time for which a noise sample is held [s].")] = 0.01,
     duration: Annotated[float, typer.Option(help="Length of each run [s].")] = 5.0,
-    q: Annotated[tuple[float, float], typer.Option(help="Weights of angle and velocity, the diagonal of Q.")] = (
-        100.0,
-        0.01,
-    ),
-    r: Annotated[float, typer.Option(help="Weight of the torque, R.")] = 0.1,
+    q: Annotated[tuple[float, float], typer.Option(help="Diagonal of Q.")] = (100.0, 0.01),
+    r: Annotated[float, typer.Option(help="R.")] = 0.1,
     sobol: Annotated[int, typer.Option(help="Base sample of Sobol indices, a power of two; 0 for none.", min=0)] = 1024,
     scheduler: Annotated[str, typer.Option(help="Dask scheduler, tcp://HOST:PORT.")] = "",
     workers: Annotated[int, typer.Option(help="Processes of a local Dask cluster; 0 for none.", min=0)] = 0,
-    replay: Annotated[
-        int, typer.Option(help="Number of a run: only replay it, and write its motion as CSV; -1 for none.")
-    ] = -1,
+    replay: Annotated[int, typer.Option(help="Only replay this run, and write its motion as CSV.")] = -1,
     json_output: Annotated[bool, typer.Option("--json", help="Print the result as JSON instead of tables.")] = False,
 ) -> None:
     """Run a million closed loops over uncertain parameters, noise and starts; probabilities, worst cases, sensitivity.

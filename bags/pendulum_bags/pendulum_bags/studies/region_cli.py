@@ -19,7 +19,7 @@ __all__ = ["region_of_attraction"]
 def region_of_attraction(
     out: Annotated[
         Path | None,
-        typer.Option(help="Folder; an interrupted map is continued. Default: bags/runs/region_of_attraction."),
+        typer.Option(help="Folder; an interrupted map is gone on with. Default: bags/runs/region_of_attraction."),
     ] = None,
     plant: Annotated[str, typer.Option(help="Preset or plant file; the controller is designed on it.")] = "thesis",
     uncertainty: Annotated[
@@ -33,11 +33,8 @@ def region_of_attraction(
     angle_span: Annotated[float, typer.Option(help="Half width of the grid about upright [rad].")] = 3.141592653589793,
     velocity_span: Annotated[float, typer.Option(help="Half width of the grid in velocity [rad/s].")] = 10.0,
     duration: Annotated[float, typer.Option(help="Length of each run [s].")] = 8.0,
-    q: Annotated[tuple[float, float], typer.Option(help="Weights of angle and velocity, the diagonal of Q.")] = (
-        100.0,
-        0.01,
-    ),
-    r: Annotated[float, typer.Option(help="Weight of the torque, R.")] = 0.1,
+    q: Annotated[tuple[float, float], typer.Option(help="Diagonal of Q.")] = (100.0, 0.01),
+    r: Annotated[float, typer.Option(help="R.")] = 0.1,
     seed: Annotated[int, typer.Option(help="Seed of the plants.", min=0)] = 1,
     scheduler: Annotated[str, typer.Option(help="Dask scheduler, tcp://HOST:PORT.")] = "",
     workers: Annotated[int, typer.Option(help="Processes of a local Dask cluster; 0 for none.", min=0)] = 0,

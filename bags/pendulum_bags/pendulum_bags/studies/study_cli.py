@@ -25,15 +25,15 @@ __all__ = ["add_commands"]
 Out = Annotated[
     Path | None,
     typer.Option(
-        help="Folder of the study; an interrupted study is continued there, and runs for more seeds or plants are "
-        "added. Default: bags/runs/<name>."
+        help="Folder of the study; an interrupted study goes on there, and one that was given more seeds or plants "
+        "carries out those. Default: bags/runs/<name>."
     ),
 ]
 Workers = Annotated[
     int,
     typer.Option(help="Runs at once, each in a ROS domain of its own; 0: one for two cores.", min=0, max=256),
 ]
-Retry = Annotated[bool, typer.Option("--retry-failed", help="Run the failed runs again.")]
+Retry = Annotated[bool, typer.Option("--retry-failed", help="Carry out again the runs that failed.")]
 DryRun = Annotated[bool, typer.Option("--dry-run", help="Show matrix, time and disk that it needs; run nothing.")]
 Yes = Annotated[bool, typer.Option("--yes", help="Do not ask before each run that moves a real machine.")]
 Seeds = Annotated[int, typer.Option(help="Number of seeds in place of the file's; 0 keeps those.", min=0)]

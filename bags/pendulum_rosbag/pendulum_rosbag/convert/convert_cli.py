@@ -1,4 +1,4 @@
-"""``convert``: rewrite a bag; ``merge``: join bags; ``cut``: cut a time span out; ``filter``: keep some topics."""
+"""``convert``: rewrite one bag; ``merge``: join many bags; ``cut``: cut out a span; ``filter``: keep some topics."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ AnySource = Annotated[Path, typer.Argument(help="Folder of the bag, or one .mcap
 Output = Annotated[Path, typer.Option("-o", "--output", help="Folder of the new bag; it must not exist.")]
 Storage = Annotated[str, typer.Option(help="mcap or sqlite3; by default that of the bag.")]
 Compression = Annotated[str, typer.Option(help="zstd or none; by default what the bag has.")]
-Topics = Annotated[list[str] | None, typer.Option("--topic", "-t", help="Topic to keep; may be repeated.")]
+Topics = Annotated[list[str] | None, typer.Option("--topic", "-t", help="Topic to keep; several times if wanted.")]
 Regex = Annotated[str, typer.Option(help="Keep topics that match this pattern, too.")]
 Exclude = Annotated[str, typer.Option(help="Leave out topics that match this pattern.")]
 Json = Annotated[bool, typer.Option("--json", help="Print the report as JSON.")]
@@ -79,15 +79,15 @@ def merge(
 def cut(
     bag: Source,
     output: Output,
-    start: Annotated[float | None, typer.Option(help="Begin this long after the first message [s].")] = None,
-    stop: Annotated[float | None, typer.Option(help="End this long after the first message [s].")] = None,
+    start: Annotated[float | None, typer.Option(help="Begin so long after the first message [s].")] = None,
+    stop: Annotated[float | None, typer.Option(help="End so long after the first message [s].")] = None,
     from_event: Annotated[str, typer.Option(help="Begin with the first event of this name.")] = "",
     to_event: Annotated[str, typer.Option(help="End with the last event of this name.")] = "",
     storage: Storage = "",
     compression: Compression = "",
     as_json: Json = False,
 ) -> None:
-    """Write the messages of a time span to a new bag, by log time."""
+    """Write the messages of a time span, by log time."""
     from pendulum_rosbag.convert.rewrite import Choice
     from pendulum_rosbag.reader import read_bag
 
@@ -123,7 +123,7 @@ def filter_topics(
     compression: Compression = "",
     as_json: Json = False,
 ) -> None:
-    """Write the messages of chosen topics to a new bag."""
+    """Write the messages of some topics."""
     from pendulum_rosbag.convert.rewrite import Choice
 
     if not (topics or regex or exclude):

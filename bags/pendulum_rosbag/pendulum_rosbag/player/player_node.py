@@ -275,10 +275,10 @@ def play(
     topics: Annotated[list[str] | None, typer.Option("-t", "--topic", help="Topic to play; by default all.")] = None,
     rate: Annotated[float, typer.Option("-r", "--rate", help="Speed relative to the recording.")] = 1.0,
     remap: Annotated[list[str] | None, typer.Option(help="RECORDED:=NEW to publish under another name.")] = None,
-    start: Annotated[float, typer.Option(help="Begin this long after the start of the bag [s].")] = 0.0,
-    duration: Annotated[float, typer.Option(help="Play this much of the recording [s]; 0 for all.")] = 0.0,
+    start: Annotated[float, typer.Option(help="Begin that long after the beginning of the bag [s].")] = 0.0,
+    duration: Annotated[float, typer.Option(help="Play that much of the recording [s]; 0 for all.")] = 0.0,
     loop: Annotated[bool, typer.Option("--loop", help="Begin again at the end.")] = False,
-    wait: Annotated[float, typer.Option(help="Wait at most this long for a subscriber on every topic [s].")] = 2.0,
+    wait: Annotated[float, typer.Option(help="Wait at most that long for a subscriber on every topic [s].")] = 2.0,
     paused: Annotated[bool, typer.Option("--paused", help="Begin when ~/pause is called with false.")] = False,
     clock_rate: Annotated[float, typer.Option(help="Messages on /clock a second; 0 for none.")] = 100.0,
 ) -> int:

@@ -1,0 +1,219 @@
+"""A plant of several joints, held upright under noise, and another plant that stands in for its machine."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from pendulum_bags.experiments.lockstep import record_run
+from pendulum_bags.runs.run_folder import provenance
+from pendulum_bags.runs.run_record import RUN_RECORD, STAND_IN
+from pendulum_msgs_py.errors import ParameterError
+from pendulum_msgs_py.plants.mechanism_parameters import MechanismParameters, load_mechanism
+from pendulum_msgs_py.plants.plant_parameters import is_mechanism
+from pendulum_msgs_py.programs import graph
+from pendulum_msgs_py.programs.graph import NodeProgram
+
+__all__ = ["JointRun", "JointSettings", "record_joints", "stand_in_for"]
+
+_UNCHANGED = frozenset(
+    {"gravity", "gear_ratio", "stribeck_velocity", "lower_stop", "upper_stop", "effort_limit", "time_constant"}
+)
+"""Values of a plant file that nobody has to identify: constants, limits, and what belongs to a model of friction."""
+_DELAY = "transport_delay"
+
+
+@dataclass(frozen=True)
+class JointSettings:
+    """Noise on one joint of a plant that an LQR holds upright.
+
+    Attributes:
+        plant: Preset or file of the simulated plant; the controller is designed on it on both sides.
+        joint: Driven joint that has the noise; empty for the first.
+        amplitude: Largest effort of the noise [N m or N].
+        hold_time: Time for which a sample is held [s].
+        duration: Length [s].
+        seed: Seed of the noise.
+        period: Time between two states [s].
+        storage: Storage of the bags.
+    """
+
+    plant: str = "cart_pole"
+    joint: str = ""
+    amplitude: float = 1.0
+    hold_time: float = 0.01
+    duration: float = 20.0
+    seed: int = 1
+    period: float = 0.002
+    storage: str = "mcap"
+
+    def __post_init__(self) -> None:
+        """Refuse what cannot be run before anything starts; the first driven joint takes the place of none."""
+        if not is_mechanism(self.plant):
+            raise ParameterError(
+                f"plant is {self.plant!r}, which has one joint; expected one of several, such as cart_pole "
+                "(experiment thesis is for one joint)"
+            )
+        driven = load_mechanism(self.plant).coordinates.driven_names
+        if self.joint and self.joint not in driven:
+            raise ParameterError(f"joint is {self.joint!r}; expected one that is driven: {', '.join(driven)}")
+        object.__setattr__(self, "joint", self.joint or driven[0])
+        for name in ("amplitude", "hold_time", "duration", "period"):
+            value = getattr(self, name)
+            if not (math.isfinite(value) and value > 0.0):
+                raise ParameterError(f"{name} is {value}; expected a finite number > 0")
+
+
+@dataclass(frozen=True)
+class JointRun:
+    """One side of it, as :func:`pendulum_bags.experiments.lockstep.record_run` carries it out.
+
+    Attributes:
+        settings: The settings.
+        side: ``sim``, or ``hw`` for the plant that stands in for the machine.
+        plant: Preset or file of what runs on this side.
+    """
+
+    settings: JointSettings
+    side: str
+    plant: str
+    has_bridge: bool = False
+    simulated_time: bool = True
+
+    @property
+    def namespace(self) -> str:
+        """Namespace of the plant."""
+        return f"/{self.side}"
+
+    @property
+    def duration(self) -> float:
+        """Length [s]."""
+        return self.settings.duration
+
+    @property
+    def steps(self) -> int:
+        """Number of steps of the plant."""
+        return round(self.duration / self.settings.period)
+
+    @property
+    def storage(self) -> str:
+        """Storage of the bag."""
+        return self.settings.storage
+
+    def plant_program(self, listeners: int) -> NodeProgram:
+        """Return the simulator, paused; it waits for so many subscriptions to its states."""
+        return graph.simulator(
+            self.namespace,
+            plant=self.plant,
+            start="top",
+            rate_hz=1.0 / self.settings.period,
+            clock="lockstep",
+            lockstep_inputs=["effort_command", "disturbance"],
+            lockstep_subscribers=listeners,
+            lockstep_duration=float(self.duration),
+            armed_at_start=True,
+            paused=True,
+        )
+
+    def controller_program(self) -> NodeProgram:
+        """Return the controller, designed on the simulated plant on both sides."""
+        return graph.controller(
+            self.namespace,
+            controller="lqr",
+            plant=self.settings.plant,
+            period=self.settings.period,
+            use_sim_time=True,
+        )
+
+    def disturbance_program(self) -> NodeProgram:
+        """Return the disturbance."""
+        return graph.disturbance(self.namespace, **self._noise(), autostart=True, use_sim_time=True)
+
+    def metadata(self) -> dict[str, Any]:
+        """Return what the bag says about its run."""
+        return {
+            RUN_RECORD: {
+                "experiment": "joints",
+                "namespace": self.namespace,
+                "side": self.side,
+                "plant": self.plant if self.side == "sim" else "another plant file",
+                "design_plant": self.settings.plant,
+                "seed": self.settings.seed,
+                "disturbance": self._noise(),
+                "controller": {"kind": "lqr"},
+                **({STAND_IN: "simulation"} if self.side == "hw" else {}),
+                "duration": self.duration,
+                "period": self.settings.period,
+                **provenance(),
+            }
+        }
+
+    def _noise(self) -> dict[str, Any]:
+        own = self.settings
+        return {
+            "kind": "uniform",
+            "joints": [own.joint],
+            "amplitude": own.amplitude,
+            "hold_time": own.hold_time,
+            "duration": own.duration,
+            "seed": own.seed,
+        }
+
+
+def stand_in_for(plant: MechanismParameters, *, share: float, delay: float, seed: int) -> MechanismParameters:
+    """Return another plant in the place of a machine: values as far off as an identification may leave them.
+
+    Args:
+        plant: The plant that is simulated.
+        share: Largest share by which a mass, length, inertia or friction is off, drawn uniformly.
+        delay: Transport delay of each motor [s].
+        seed: Of the draw.
+
+    Raises:
+        ParameterError: No plant has such values.
+    """
+    if not 0.0 <= share < 1.0:
+        raise ParameterError(f"share is {share}; expected 0 to less than 1")
+    drawn = np.random.default_rng(seed)
+    changes: dict[str, float] = {}
+    for name, value in plant.numbers.items():
+        key = name.rpartition(".")[2]
+        if key == _DELAY:
+            changes[name] = delay
+        elif key not in _UNCHANGED:
+            changes[name] = value * (1.0 + float(drawn.uniform(-share, share)))
+    return replace(plant.with_values(changes), name=f"{plant.name}_stand_in")
+
+
+def record_joints(
+    folder: Path,
+    settings: JointSettings,
+    machine: Path,
+    *,
+    on_side: Callable[[str], None] = lambda side: None,
+    on_wait: Callable[[], None] = lambda: None,
+) -> None:
+    """Record both sides over DDS, in lockstep, as the bags ``sim`` and ``hw`` of a run folder.
+
+    Args:
+        folder: The run folder.
+        settings: What to run.
+        machine: Plant file that stands in for the machine.
+        on_side: Told each side, in words, when it begins.
+        on_wait: Called while waiting.
+
+    Raises:
+        BagError: A bag exists, or cannot be written.
+        FaultError: A program ended or did not answer, or a plant faulted.
+    """
+    for side, plant, words in (
+        ("sim", settings.plant, "simulation"),
+        ("hw", str(machine), "stand-in for the machine"),
+    ):
+        on_side(words)
+        record_run(folder / side, JointRun(settings, side, plant), on_wait=on_wait)

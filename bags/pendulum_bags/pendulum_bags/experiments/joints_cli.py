@@ -1,0 +1,77 @@
+"""``experiment joints``: a plant of several joints, held upright under noise, beside what stands in for its machine."""
+
+from __future__ import annotations
+
+import time
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from pendulum_bags.comparison.compare_cli import MarginOption, MarginsFile
+from pendulum_bags.experiments.progress import PhaseProgress
+from pendulum_msgs_py.programs.executables import EXIT_INTERRUPTED
+from pendulum_msgs_py.programs.terminal import make_console
+
+__all__ = ["joints"]
+
+_STARTING, _PACE = 6.0, 0.4
+"""Wall time in which the nodes of a side start [s], and of simulated time, on two cores."""
+
+
+def joints(
+    out: Annotated[
+        Path | None, typer.Option(help="Folder of the run; it must be new. Default: bags/runs/<UTC>_joints.")
+    ] = None,
+    plant: Annotated[
+        str, typer.Option(help="Preset or plant file of several joints: simulated, and designed on.")
+    ] = "cart_pole",
+    machine: Annotated[
+        Path | None,
+        typer.Option(help="Plant file that stands in for the machine; by default drawn by --share and --delay."),
+    ] = None,
+    share: Annotated[
+        float, typer.Option(help="Largest share by which its masses, lengths, inertias and friction are off.")
+    ] = 0.05,
+    delay: Annotated[float, typer.Option(help="Transport delay of its motors [s].")] = 0.004,
+    joint: Annotated[str, typer.Option(help="Driven joint that has the noise; by default the first.")] = "",
+    amplitude: Annotated[float, typer.Option(help="Largest effort of the noise [N m or N].")] = 1.0,
+    hold_time: Annotated[float, typer.Option(help="Time for which a noise sample is held [s].")] = 0.01,
+    duration: Annotated[float, typer.Option(help="Length of the noise [s].")] = 20.0,
+    seed: Annotated[int, typer.Option(help="Seed of the noise, and of the draw.", min=0)] = 1,
+    storage: Annotated[str, typer.Option(help="Storage of the bags: mcap or sqlite3.")] = "mcap",
+    margin: MarginOption = None,
+    margins_file: MarginsFile = None,
+    json_output: Annotated[bool, typer.Option("--json", help="Print JSON instead of tables.")] = False,
+) -> None:
+    """Hold a plant of several joints upright under noise, and another one in the place of its machine; compare both.
+
+    There is no bridge for several joints yet: a second simulation stands in for the machine, and the answer says so.
+    Both sides run as nodes over DDS, in lockstep, under one LQR that is designed on the simulated plant.
+
+    Example: python -m pendulum_bags experiment joints --plant furuta --amplitude 0.02 --share 0.1
+    """
+    from pendulum_bags.comparison.compare_cli import compare
+    from pendulum_bags.experiments.joint_run import JointSettings, record_joints, stand_in_for
+    from pendulum_bags.runs.run_folder import create_run_folder, discard_if_empty
+    from pendulum_msgs_py.plants.mechanism_parameters import load_mechanism, write_mechanism
+
+    settings = JointSettings(plant, joint, amplitude, hold_time, duration, seed, storage=storage)
+    stand_in = load_mechanism(machine) if machine else None
+    drawn = stand_in or stand_in_for(load_mechanism(plant), share=share, delay=delay, seed=seed)
+    console = make_console(stderr=json_output, highlight=False)
+    folder = create_run_folder(out, "joints")
+    started = time.monotonic()
+    try:
+        made = write_mechanism(folder / "machine.yaml", drawn, provenance={"stands_in_for": f"the machine of {plant}"})
+        expected = _STARTING + _PACE * duration
+        with PhaseProgress(2.0 * expected, console) as progress:
+            record_joints(
+                folder, settings, made, on_side=lambda side: progress.phase(side, expected), on_wait=progress.refresh
+            )
+    except KeyboardInterrupt:
+        kept = "nothing was recorded" if discard_if_empty(folder) else f"what was recorded is in {folder}"
+        console.print(f"interrupted: all programs have ended; {kept}")
+        raise typer.Exit(EXIT_INTERRUPTED) from None
+    compare([folder], margin=margin, margins_file=margins_file, out=folder, json_output=json_output)
+    console.print(f"bags    {folder / 'sim'}, {folder / 'hw'}\n({time.monotonic() - started:.0f} s)", soft_wrap=True)
