@@ -126,7 +126,7 @@ def _settings(task: str, plant: str, seed: int, updates: int, swing_up: Any, hid
         )  # fmt: skip
         if several:
             # There is more to learn: more steps, and actions that go on to vary.
-            settings = replace(settings, ppo=replace(settings.ppo, least_spread=0.1), updates=700)
+            settings = replace(settings, ppo=replace(settings.ppo, least_spread=0.1), updates=600)
     return replace(settings, updates=updates) if updates else settings
 
 
