@@ -16,7 +16,7 @@ INSTALLED := $(LAYERS:%=$(VENV)/.%)
 # Everything that decides what an editable install looks like; the modules themselves are read in place.
 LINKED := $(foreach p,$(PACKAGES),$(wildcard $(p)/setup.py $(p)/setup.cfg $(p)/package.xml $(p)/*/executables.py))
 
-.PHONY: help venv extras readers experiment course test bench lint format types imports build faults mutants lock audit docs clean
+.PHONY: help venv extras experiment course test bench readers lint format types imports build faults mutants lock audit docs clean
 
 help: # Print the targets, one line each
 	@awk -F ':[^#]*# ' '/^[a-z]+:[^#=]*# / {printf "make %-11s %s\n", $$1, $$2}' Makefile
