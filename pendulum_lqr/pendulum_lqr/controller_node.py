@@ -163,7 +163,7 @@ class ControllerNode(LifecycleNode, PollingNode):
         )
         self.get_logger().info(
             f"{self._settings['controller']} for plant {self._plant.name}: {controller.describe()}, "
-            f"limit {_limit(controller)} N m"
+            f"limit {_limit(controller)} {self._coordinates.drive_unit}"
         )
         return super().on_configure(state)
 

@@ -75,6 +75,18 @@ class Coordinates:
         return tuple(self.joints[index].name for index in self.driven)
 
     @property
+    def units(self) -> tuple[str, str, str]:
+        """Units of position, velocity and effort, for messages; ``rad or m`` where joints differ."""
+        every = zip(*((joint.unit, joint.velocity_unit, joint.effort_unit) for joint in self.joints), strict=True)
+        position, velocity, effort = (" or ".join(dict.fromkeys(units)) for units in every)
+        return position, velocity, effort
+
+    @property
+    def drive_unit(self) -> str:
+        """Unit of what the motors give, for messages."""
+        return " or ".join(dict.fromkeys(self.joints[index].effort_unit for index in self.driven))
+
+    @property
     def goal(self) -> Vector:
         """The upright position [rad or m]."""
         return tuple(joint.goal for joint in self.joints)

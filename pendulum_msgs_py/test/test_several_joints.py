@@ -324,3 +324,18 @@ def test_a_plant_without_a_motor_says_that_it_has_none() -> None:
     gate = CommandGate(0.05, joints=())
     gate.offer(_command((1.0,), ("elbow",)), _NOW)
     assert gate.problems[Refusal.NOT_ONE_JOINT].endswith("expected no command: no joint has a motor")
+
+
+def test_what_slides_is_asked_for_newtons_and_not_for_a_torque() -> None:
+    cart = Coordinates((Joint("cart", unit="m", turns=False), Joint("pole")), (0,))
+    plant = Plant(cart, start_effort=1.0, start_sum=1.5)
+    plant.run((Input.EFFORT_COMMAND, (2.0,), ("cart",)))
+    assert "asks for 2.00 N; expected at most 1.0 N to begin" in plant.supervisor.reason
+    plant.run((Input.EFFORT_COMMAND, (1.0,), ("cart",)), (Input.DISTURBANCE, (0.9,), ("cart",)))
+    assert "asks for 1.00 N and the disturbance for 0.90 N; expected a sum of at most 1.5 N" in plant.supervisor.reason
+    plant.velocity = [math.nan, 0.0]
+    plant.run()
+    assert plant.supervisor.reason == (
+        "measurement is not finite: [0.0, 0.0] m or rad, [nan, 0.0] m/s or rad/s, [0.0, 0.0] N or N m"
+    )
+    assert Coordinates((Joint("cart", unit="m", turns=False), Joint("pole")), (0, 1)).drive_unit == "N or N m"

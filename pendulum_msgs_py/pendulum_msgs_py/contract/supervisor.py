@@ -351,19 +351,19 @@ class PlantSupervisor:
         lapsed = now_ns - self._commanded_ns > COMMANDER_HOLD * NANOSECONDS
         if self._commanding == command.source and not lapsed:
             return ""
-        largest, who = self.limits.start_effort, command.source or "a controller"
+        largest, who, unit = self.limits.start_effort, command.source or "a controller", self.coordinates.drive_unit
         if not _largest(command.effort) <= largest:
             return (
-                f"zero torque: {who} asks for {written(command.effort, '.2f')} N m; "
-                f"expected at most {largest} N m to begin (a controller's start_time lets it rise)"
+                f"zero torque: {who} asks for {written(command.effort, '.2f')} {unit}; "
+                f"expected at most {largest} {unit} to begin (a controller's start_time lets it rise)"
             )
         # With its first command a disturbance that waits would act at once, however large.
         largest = self.limits.start_sum
         waiting = self._disturbances.fresh(now_ns)
         if waiting is not None and not _largest(tuple(map(add, command.effort, waiting.effort))) <= largest:
             return (
-                f"zero torque: {who} asks for {written(command.effort, '.2f')} N m and the disturbance for "
-                f"{written(waiting.effort, '.2f')} N m; expected a sum of at most {largest} N m to begin"
+                f"zero torque: {who} asks for {written(command.effort, '.2f')} {unit} and the disturbance for "
+                f"{written(waiting.effort, '.2f')} {unit}; expected a sum of at most {largest} {unit} to begin"
             )
         return ""
 
@@ -396,9 +396,10 @@ class PlantSupervisor:
         if not len(sample.position) == len(sample.velocity) == len(sample.effort) == self._joints:
             return f"measurement has {len(sample.position)} joints; expected {self._joints}"
         if not sample.is_finite():
+            of_position, of_velocity, of_effort = self.coordinates.units
             return (
-                f"measurement is not finite: {written(sample.position)} rad, {written(sample.velocity)} rad/s, "
-                f"{written(sample.effort)} N m"
+                f"measurement is not finite: {written(sample.position)} {of_position}, "
+                f"{written(sample.velocity)} {of_velocity}, {written(sample.effort)} {of_effort}"
             )
         age = (now_ns - sample.stamp_ns) / NANOSECONDS
         if age < -limits.feedback_timeout:
@@ -449,9 +450,10 @@ class PlantSupervisor:
             return fault
         command = self._commands.fresh(now_ns)
         if command is not None and _largest(command.effort) > self.limits.arm_effort:
+            unit = self.coordinates.drive_unit
             return (
-                f"{command.source or 'a controller'} already commands {written(command.effort, '.3f')} N m; "
-                f"expected at most {self.limits.arm_effort} N m while arming: deactivate the controller, arm, "
+                f"{command.source or 'a controller'} already commands {written(command.effort, '.3f')} {unit}; "
+                f"expected at most {self.limits.arm_effort} {unit} while arming: deactivate the controller, arm, "
                 + (
                     "bring the pendulum with a joint_trajectory to where the controller balances, then activate it"
                     if self.follows
