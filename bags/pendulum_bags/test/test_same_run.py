@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import math
 from dataclasses import replace
 from pathlib import Path
@@ -12,6 +13,7 @@ import pytest
 from pendulum_bags.comparison import Comparison, Looks, Margins, Outcome, RunData, Series, Signal, compare
 from pendulum_bags.comparison.same_run import paired_tests
 from pendulum_bags.comparison.spectra import spectra_of
+from pendulum_bags.report.figures import comparison_figures
 from pendulum_bags.verdict import Mark
 from pendulum_bags.verdict.same_run import same_run_layer
 from pendulum_msgs_py.errors import DataError
@@ -98,6 +100,19 @@ def test_a_delay_beyond_all_that_is_looked_at_is_not_told_as_the_last_of_it(late
     assert (tests["delay"].interval.low, tests["delay"].interval.high) == (-100.0, 100.0)
     # Nothing was taken out, so both distances are one.
     assert tests["distance of angles"].interval == tests["distance of angles less the delay"].interval
+
+
+def test_no_delay_is_told_as_none_in_every_place_and_lies_within_no_margin() -> None:
+    found = compare([pair(3, late=0.09)], margin={"delay": "150 ms"})
+    tested = next(test for test in found.verdict.tests if test.quantity == "delay")
+    assert tested.outcome is Outcome.UNDECIDED
+    assert math.isnan(found.delay)
+    assert json.loads(json.dumps(found.to_json(), allow_nan=False))["verdict"]["tests"]
+    figures = {figure.name: figure for figure in comparison_figures(found)}
+    assert "there is no peak, and no delay that could be told" in figures["alignment"].sentence
+    assert "nan" not in " ".join(figure.sentence for figure in figures.values())
+    # A comparison that differs is told as such all the same.
+    assert same_run_layer(found).mark is Mark.NO
 
 
 def test_margins_in_units_are_those_of_the_signals() -> None:

@@ -61,7 +61,10 @@ class Comparison:
 
     @property
     def delay(self) -> float:
-        """By how much the hardware answers later: that of the test, else where the velocities correlate most [s]."""
+        """By how much the hardware answers later: that of the test, else where the velocities correlate most [s].
+
+        NaN where the test finds no peak of likeness, and so no delay.
+        """
         tested = next((test for test in self.verdict.tests if test.quantity == "delay"), None)
         if tested is None:
             return self.pairs[0].delay

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -232,11 +233,11 @@ def _print(console: Console, result: Comparison, content: dict[str, Any]) -> Non
     if result.is_paired:
         pair = result.pairs[0]
         delay = result.delay * 1e3
-        late = "later" if delay >= 0 else "earlier"
+        answers = f"answers {abs(delay):.2f} ms {'later' if delay >= 0 else 'earlier'} than the simulation"
         console.print(
             f"Alignment: the disturbances agree at {pair.clock.delay * 1e3:.2f} ms"  # type: ignore[union-attr]
             f" (correlation {pair.clock.correlation:.3f}); "  # type: ignore[union-attr]
-            f"{result.hardware_name} answers {abs(delay):.2f} ms {late} than the simulation."
+            f"{result.hardware_name} {answers if math.isfinite(delay) else 'shows no delay that could be told'}."
         )
     else:
         console.print(f"Not paired: {content['paired']['reason']}.")

@@ -9,13 +9,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import scipy
 
 from pendulum_bags.comparison.band import BandLimited, SlowClock, common_band
-from pendulum_bags.comparison.equivalence import EquivalenceTest, equivalence_test
+from pendulum_bags.comparison.equivalence import EquivalenceTest, Outcome, equivalence_test
 from pendulum_bags.comparison.margins import Margin, Margins
 from pendulum_bags.comparison.statistics import Interval, Resampled, bootstrap_interval, resample
 from pendulum_bags.runs.series import Array, Series
@@ -130,14 +130,14 @@ def paired_tests(
     seen = [_Seen(*pair, band) for pair in pairs]
     # The delay is where the velocities are most alike. That is an extremum: to first order, an error of the delay does
     # not change the distances that are left, so they may be counted as if it were known.
-    edge, centre = _find_delay(seen)
-    columns = [one.columns(centre) for one in seen]
+    centre = _find_delay(seen)
+    columns = [one.columns(centre or 0.0) for one in seen]
     resampled = resample(columns, runs_differ=runs_differ)
     kind = _Kind.of([one for pair in pairs for one in pair], margins, looks, len(pairs))
     tests = [_mean_test(resampled, _column(0), margins, kind)]
     tests += _spread_tests(resampled, _SIMULATION, _HARDWARE, margins, kind)
     tests.append(
-        _delay_test(resampled, centre, margins.delay, kind) if edge is None else _no_delay(edge, margins, kind)
+        _delay_test(resampled, centre, margins.delay, kind) if centre is not None else _no_delay(margins, kind)
     )
     for index, what, margin in (
         (1, "angle", margins.path_angle),
@@ -237,11 +237,11 @@ class _Seen:
         return np.concatenate((np.stack(rows, axis=1), moving * still, moving**2), axis=1)
 
 
-def _find_delay(seen: Sequence[_Seen]) -> tuple[float | None, float]:
+def _find_delay(seen: Sequence[_Seen]) -> float | None:
     """Return the delay at which the velocities are most alike, over all runs, to a whole ``LAG_STEP`` [s].
 
     Returns:
-        None and the delay; where they are most alike at an end of what is looked at, which is no peak, that end and 0.
+        The delay; None where they are most alike at an end of what is looked at, which is no peak.
     """
     reach = LONGEST_DELAY - float(_LAGS[-1])
     lags = np.arange(-reach, reach + 0.5 * LAG_STEP, LAG_STEP)
@@ -251,7 +251,7 @@ def _find_delay(seen: Sequence[_Seen]) -> tuple[float | None, float]:
         products = products + (moving * still).sum(axis=0)
         squares = squares + (moving**2).sum(axis=0)
     best = int(np.argmax(_likeness(products, squares)))
-    return (float(lags[best]), 0.0) if best in {0, lags.size - 1} else (None, float(lags[best]))
+    return None if best in {0, lags.size - 1} else float(lags[best])
 
 
 def _likeness(products: Array, squares: Array) -> Array:
@@ -346,12 +346,14 @@ def _delay_test(resampled: Resampled, centre: float, margin: Margin, kind: _Kind
     return equivalence_test("delay", margin.unit, interval, -margin.value, margin.value, runs=kind.runs)
 
 
-def _no_delay(edge: float, margins: Margins, kind: _Kind) -> EquivalenceTest:
+def _no_delay(margins: Margins, kind: _Kind) -> EquivalenceTest:
     """Return the test of a delay that the motions do not tell: anything that was looked for may be it."""
     margin, scale = margins.delay, _UNITS[margins.delay.unit]
     end = scale * LONGEST_DELAY
-    interval = Interval(scale * edge, -end, end, kind.looks.level, math.nan, 1)
-    return equivalence_test("delay", margin.unit, interval, -margin.value, margin.value, runs=kind.runs)
+    interval = Interval(math.nan, -end, end, kind.looks.level, math.nan, 1)
+    test = equivalence_test("delay", margin.unit, interval, -margin.value, margin.value, runs=kind.runs)
+    # However wide the margin, the delay may lie beyond all that was looked for.
+    return replace(test, outcome=Outcome.UNDECIDED, more_runs=None, smallest_margin=math.nan)
 
 
 def _path_test(resampled: Resampled, index: int, what: str, margin: Margin, kind: _Kind) -> EquivalenceTest:

@@ -40,7 +40,8 @@ def equivalence(data: ReportData) -> Figure:
         if rows:
             middle, low, high = (np.array(v) for v in zip(*(_relative(tests[i]) for i in rows), strict=True))
             traces.append(Trace(middle, np.array(rows, dtype=float), outcome, outcome, "interval", low, high))
-    closest = max(tests, key=lambda test: abs(_relative(test)[0]))
+    told = [test for test in tests if math.isfinite(test.interval.estimate)]
+    closest = max(told, key=lambda test: abs(_relative(test)[0]))
     sentence = (
         f"{verdict.sentence} The quantity nearest to (or farthest beyond) its margin is the {closest.quantity}: "
         f"{quantity(closest.interval.estimate, closest.unit.replace('-', ''))}, {closest.interval.title} "
@@ -108,7 +109,8 @@ def alignment(data: ReportData) -> Figure:
     )
     if data.comparison.is_paired:
         delay = 1e3 * data.comparison.delay
-        sentence += f" Seen at one phase of the noise, as the test of the delay sees it, it is {delay:.2f} ms."
+        told = f"it is {delay:.2f} ms" if math.isfinite(delay) else "there is no peak, and no delay that could be told"
+        sentence += f" Seen at one phase of the noise, as the test of the delay sees it, {told}."
     return Figure(
         "alignment",
         "Alignment of clocks and delay",

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import base64
+import math
 from collections.abc import Mapping, Sequence
 from importlib import resources
 from typing import Any
@@ -133,8 +134,8 @@ def _facts(data: ReportData) -> list[tuple[str, str]]:
     if comparison.is_paired:
         facts.append(("paths apart (rms)", quantity(float(pair.as_dict()["rms_position"]), "rad")))
     delay = 1e3 * comparison.delay
-    when = "later" if delay >= 0.0 else "earlier"
-    facts.append(("hardware answers", f"{abs(delay):.1f} ms {when} than the simulation"))
+    when = f"{abs(delay):.1f} ms {'later' if delay >= 0.0 else 'earlier'} than the simulation"
+    facts.append(("hardware answers", when if math.isfinite(delay) else "with no delay that could be told"))
     facts.append(("seed", str(data.summary.get("seed", "unknown"))))
     return facts
 

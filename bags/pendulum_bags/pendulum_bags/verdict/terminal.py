@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import textwrap
 
 from rich.console import Console
@@ -56,7 +57,7 @@ def tests_table(verdict: Verdict, *, emulated: bool) -> WholeTable:
         unit = "" if test.unit == "-" else f" \\[{test.unit}]"
         table.add_row(
             test.quantity + unit,
-            f"{interval.estimate:.3g}",
+            f"{interval.estimate:.3g}" if math.isfinite(interval.estimate) else "–",
             f"{interval.low:.3g} to {interval.high:.3g}",
             test.margin_text().removeprefix("margin "),
             test.outcome.value,
