@@ -8,6 +8,7 @@ import types
 from collections.abc import Callable
 from importlib.machinery import ModuleSpec
 from pathlib import Path
+from typing import Annotated
 
 import pytest
 import typer
@@ -80,7 +81,14 @@ def _app() -> typer.Typer:
     app = typer.Typer()
 
     @app.command()
-    def run(gain: float, code: int = 0, out: Path | None = None) -> None:
+    def run(
+        gain: float,
+        code: Annotated[int, typer.Option("-c", "--code")] = 0,
+        out: Path | None = None,
+        yes: Annotated[bool, typer.Option("--yes")] = False,
+        fast: Annotated[bool, typer.Option("--fast/--slow")] = False,
+    ) -> None:
+        del yes, fast
         if gain < 0:
             raise ParameterError(f"gain is {gain} N m; expected >= 0")
         if gain == 3.0:
@@ -111,6 +119,11 @@ def test_a_program_that_told_of_its_interruption_is_not_told_of_again(capsys: py
         (["1.0", "--bogus"], 2, "--bogus"),
         (["3.0"], 130, "interrupted"),
         (["1.0", "--code", "4", "--code", "5"], 2, "error: --code is given 2 times; expected once\n"),
+        (["1.0", "-c", "4", "--code=5"], 2, "error: --code is given 2 times; expected once\n"),
+        (["1.0", "--fast", "--slow"], 2, "error: --fast is given 2 times; expected once\n"),
+        (["1.0", "--yes", "--yes"], 0, ""),
+        (["--help", "--help"], 0, ""),
+        (["--code", "4", "--code", "5", "--help"], 0, ""),
         (["1.0", "--out", __file__], 2, f"error: {__file__} cannot be read or written: File exists\n"),
         (["1.0", "--out", f"{__file__}/folder"], 2, f"error: {__file__}/folder cannot be read or written: Not a"),
     ],
@@ -122,6 +135,22 @@ def test_a_command_line_ends_with_a_sentence_and_a_code(
     error = capsys.readouterr().err
     assert message in error
     assert "Traceback" not in error
+
+
+def test_each_of_several_commands_counts_its_own_options(capsys: pytest.CaptureFixture[str]) -> None:
+    app = typer.Typer()
+
+    @app.command()
+    def one(gains: Annotated[list[float], typer.Option("--gain")], code: int = 0) -> None:
+        raise typer.Exit(code + len(gains))
+
+    @app.command()
+    def other() -> None: ...
+
+    assert cli_main(app, ["one", "--gain", "1", "--gain", "1"], name="arm") == 2
+    assert capsys.readouterr().err == ""
+    assert cli_main(app, ["one", "--gain", "1", "--code", "4", "--code", "5"], name="arm") == EXIT_USAGE
+    assert capsys.readouterr().err == "error: --code is given 2 times; expected once\n"
 
 
 def test_an_error_is_one_sentence(capsys: pytest.CaptureFixture[str]) -> None:

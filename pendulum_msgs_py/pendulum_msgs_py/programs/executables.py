@@ -227,8 +227,10 @@ def _refuse_repeats(command: Any) -> None:
 
     def parse_once(context: Any, arguments: list[str]) -> list[str]:
         _, _, order = command.make_parser(context).parse_args(args=list(arguments))
-        for option in order:
-            if order.count(option) > 1 and not option.multiple:
+        # Whoever asks for help gets it, and a flag that cannot be taken back says the same once more.
+        counted_once = [] if any(option.name == "help" for option in order) else order
+        for option in counted_once:
+            if order.count(option) > 1 and not option.multiple and (not option.is_flag or option.secondary_opts):
                 raise ParameterError(f"{max(option.opts, key=len)} is given {order.count(option)} times; expected once")
         return list(parse(context, arguments))
 
