@@ -16,6 +16,8 @@ from pendulum_msgs_py.contract.names import JOINT, Event
 
 __all__ = ["End", "Outcome", "PlantFollowing", "goal_problem"]
 
+_COMMANDED_BY = "commanded by "
+"""How a plant begins to say that it takes torques from somebody."""
 _POSITION, _EFFORT = Mode.POSITION.value, Mode.EFFORT.value
 
 
@@ -101,7 +103,12 @@ class PlantFollowing:
                 return None
             if mode == _EFFORT:
                 # Before it follows, it may be commanded by torque; afterwards, none is taken before the end.
-                return self._at_the_end(reason) if self._begun else None
+                if not self._begun:
+                    return None
+                if reason.startswith(_COMMANDED_BY):
+                    return self._at_the_end(reason)
+                # It does not wait for torques at the end either: a plant that has just started does.
+                return self._end(Outcome.LEFT, f"plant is {mode}, as if it had started again: {reason}")
             return self._end(Outcome.LEFT, f"plant is {mode}: {reason}")
         if name == Event.TRAJECTORY_FINISHED:
             self._busy = False

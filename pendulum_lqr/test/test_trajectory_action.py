@@ -29,6 +29,9 @@ CANCEL: dict[str, Any] = {}
         ([FINISHED, FOLLOWS, FINISHED], Outcome.REACHED),
         # A controller that takes over at the end may do so before the end was told.
         ([FOLLOWS, TAKEN_OVER], Outcome.REACHED),
+        # Of a plant that started again, armed.
+        ([FOLLOWS, STARVES], Outcome.LEFT),
+        ([FOLLOWS, CANCEL, STARVES], Outcome.LEFT),
         ([REFUSED], Outcome.REFUSED),
         # That was somebody else's.
         ([FOLLOWS, REFUSED], None),

@@ -163,3 +163,13 @@ def test_an_action_that_ends_leaves_the_plant_where_it_is(client: Client) -> Non
     assert client.action_process.wait(10.0) == 0
     # Long before the six seconds of the goal.
     client.process.wait_for_output("armed_position: holding the end of a trajectory", 4.0)
+
+
+def test_a_goal_is_not_reached_by_a_plant_that_starts_again_on_the_way(client: Client, processes: ProcessGroup) -> None:
+    handle = client.send_away()
+    client.process.send_signal(signal.SIGKILL)
+    client.process.wait(10.0)
+    # Armed at its start, and so ready for torques before anybody can take it for silent.
+    processes.start(*PLANTS["sim"], "--ros-args", "-r", "__ns:=/sim")
+    status, result = client.end(handle)
+    assert status == ABORTED, result
