@@ -68,6 +68,7 @@ class TrajectoryActionNode(Node):
         self.create_subscription(JointState, names.JOINT_STATES, self._on_state, qos.NEWEST_STATE, raw=True)
         self.create_subscription(String, names.EVENTS, self._on_event, qos.EVENTS)
         self._server: ActionServer | None = None
+        self._of_goals = f"{self.resolve_service_name(_ACTION)}/_action/send_goal"
         create_wall_timer(self, _FEEDBACK_PERIOD, self._on_time)
 
     def close(self) -> None:
@@ -82,6 +83,8 @@ class TrajectoryActionNode(Node):
         refusal = ""
         if self._plant.active:
             refusal = "another goal is being followed; expected it cancelled first"
+        elif self.count_services(self._of_goals) > 1:
+            refusal = "two programs offer this action for one plant; expected one"
         elif self._plant.busy:
             refusal = "the plant follows a trajectory that somebody else sent"
         if refusal:

@@ -97,3 +97,15 @@ def test_only_what_a_plant_can_judge_is_passed_on() -> None:
     end = goal_problem([JOINT], [], none | {"path_tolerance": 1})
     assert end is not None
     assert (end.outcome, end.reason.split(";")[0]) == (Outcome.REFUSED, "goal has path_tolerance")
+
+
+def test_a_goal_after_a_cancelled_one_is_a_goal_of_its_own() -> None:
+    plant = PlantFollowing()
+    for cancelled, outcome in ((True, Outcome.CANCELLED), (False, Outcome.REACHED)):
+        plant.begin()
+        assert plant.on_event(FOLLOWS) is None
+        if cancelled:
+            plant.cancel()
+        end = plant.on_event(FINISHED)
+        assert end is not None
+        assert end.outcome is outcome

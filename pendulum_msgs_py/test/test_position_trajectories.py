@@ -58,7 +58,7 @@ def test_before_its_first_point_a_trajectory_rests() -> None:
 
 @given(_ANGLES, _ANGLES, st.floats(0.05, 20.0))
 def test_a_single_point_is_reached_from_here_without_a_jump(here: float, goal: float, time: float) -> None:
-    move = from_points([time], [goal], [0.0]).from_position(here, 0.0)
+    move = from_points([time], [goal], [0.0]).from_position(here)
     assert move.at(0.0) == (pytest.approx(here, abs=1e-12), 0.0)
     assert move.at(time) == (goal, 0.0)
     assert move.duration == time
@@ -70,12 +70,14 @@ def test_a_single_point_is_reached_from_here_without_a_jump(here: float, goal: f
         assert mean * (after.time - before.time) == pytest.approx(after.position - before.position, rel=0.25, abs=1e-6)
 
 
-def test_where_the_start_is_said_or_near_a_trajectory_stays_as_it_is() -> None:
+def test_where_the_start_is_said_a_trajectory_stays_as_it_is_and_else_takes_all_the_time_it_was_given() -> None:
     at_once = from_points([0.0], [1.0], [0.0])
-    near = from_points([2.0], [1.0], [0.0])
-    assert at_once.from_position(0.0, 0.3) is at_once
-    assert near.from_position(0.8, 0.3) is near
-    several = from_points([1.0, 2.0], [0.5, 1.0], [0.2, 0.0]).from_position(0.0, 0.3)
+    assert at_once.from_position(0.0) is at_once
+    near = from_points([8.0], [0.25], [0.0]).from_position(0.0)
+    assert near.at(0.0) == (0.0, 0.0)
+    assert near.at(4.0)[0] == pytest.approx(0.125)
+    assert near.max_speed < 0.05
+    several = from_points([1.0, 2.0], [0.5, 1.0], [0.2, 0.0]).from_position(0.0)
     assert several.at(0.5) == (0.25, 0.1)
     assert len(several.points) == 3
 

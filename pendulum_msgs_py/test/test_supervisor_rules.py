@@ -396,6 +396,15 @@ def test_a_goal_of_one_point_is_a_move_from_here_as_it_is_to_a_joint_trajectory_
     assert "trajectory covers" in Loop(position_max=(3.0,), position_min=(-3.0,)).follow(goal)
 
 
+def test_a_goal_nearby_takes_the_time_that_it_was_given() -> None:
+    """0.25 rad in 8 s were there after 1 s, and began with the velocity of a ramp at once."""
+    loop = Loop()
+    assert loop.follow(from_points([8.0], [0.25], [0.0])) == ""
+    loop.run(0.5)
+    assert all(abs(drive.velocity[0]) < 0.05 for drive in loop.drives)
+    assert loop.drives[-1].position[0] == pytest.approx(0.5 * 0.25 * (1.0 - math.cos(math.pi * 0.5 / 8.0)), abs=1e-3)
+
+
 def test_a_gap_counts_for_the_speed_limit() -> None:
     loop = Loop(velocity=0.2)
     assert "rad/s" in loop.follow(_hold(1.0, 0.29))

@@ -165,6 +165,18 @@ def test_an_action_that_ends_leaves_the_plant_where_it_is(client: Client) -> Non
     client.process.wait_for_output("armed_position: holding the end of a trajectory", 4.0)
 
 
+def test_of_two_programs_that_offer_the_action_neither_takes_a_goal(client: Client, processes: ProcessGroup) -> None:
+    """The client heard "aborted" of the one while the plant followed the goal of the other."""
+    again = processes.start("pendulum_lqr", "trajectory_action", "--ros-args", "-r", "__ns:=/sim")
+    again.wait_for_output("serving", 40.0)
+    service = "/sim/joint_trajectory_controller/follow_joint_trajectory/_action/send_goal"
+    client.until(lambda: client.node.count_services(service) == 2, "both of them")
+    assert not client.send((1.0, 0.2)).accepted
+    again.send_signal(signal.SIGINT)
+    client.until(lambda: client.node.count_services(service) == 1, "one of them alone")
+    assert client.end(client.send((1.0, 0.2)))[0] == SUCCEEDED
+
+
 def test_a_goal_is_not_reached_by_a_plant_that_starts_again_on_the_way(client: Client, processes: ProcessGroup) -> None:
     handle = client.send_away()
     client.process.send_signal(signal.SIGKILL)

@@ -58,7 +58,7 @@ class SharedSupervisor(PlantSupervisor):
     def accept_trajectory(self, trajectory: Trajectory, now_ns: int, sample: JointSample) -> str:
         """Start to follow a trajectory."""
         # Points are made here, where nobody waits: under the lock they would keep the actuator and the e-stop.
-        trajectory = trajectory.from_position(sample.position[0], self.limits.tracking_error)
+        trajectory = trajectory.from_position(sample.position[0])
         with self._lock:
             return super().accept_trajectory(trajectory, now_ns, sample)
 

@@ -117,7 +117,7 @@ class PlantSupervisor:
         if fault:
             return fault
         (place,) = sample.position
-        trajectory = trajectory.from_position(place, limits.tracking_error)
+        trajectory = trajectory.from_position(place)
         gap = trajectory.start - place
         if abs(gap) > limits.tracking_error:
             return (

@@ -103,19 +103,19 @@ class Trajectory:
         """Last position [rad]."""
         return self.points[-1].position
 
-    def from_position(self, position: float, tolerance: float) -> Trajectory:
+    def from_position(self, position: float) -> Trajectory:
         """Return the trajectory that leads there from where the joint is, if its first point lies ahead in time.
 
         That is how ``joint_trajectory_controller`` of ros2_control reads a goal of one point. A single point at rest
         is reached on half a cosine, so that velocity neither jumps at its start nor at its end; the first of several
-        points, linearly. Who starts at time 0, or within the tolerance, has said all there is to say.
+        points, linearly. Who starts at time 0 has said all there is to say; whoever does not has asked for all of the
+        time, however near the first point is.
 
         Args:
             position: Where the joint is [rad].
-            tolerance: Distance of the first point up to which the trajectory stays as it is [rad].
         """
         first = self.points[0]
-        if first.time == 0.0 or abs(first.position - position) <= tolerance:
+        if first.time == 0.0:
             return self
         start = TrajectoryPoint(0.0, position, 0.0)
         if len(self.points) > 1 or first.velocity != 0.0:
