@@ -40,7 +40,7 @@ class Peer(GraphPeer):
         self.answer: dict[str, Any] | None = None
         self.commands = self.node.create_publisher(JointState, names.EFFORT_COMMAND, qos.COMMAND)
         self.trajectories = self.node.create_publisher(JointTrajectory, names.JOINT_TRAJECTORY, qos.TRAJECTORY)
-        self.node.create_subscription(JointState, names.JOINT_STATES, self._on_state, qos.STATE)
+        self.node.create_subscription(JointState, names.JOINT_STATES, self._on_state, qos.NEWEST_STATE)
         self.node.create_subscription(JointState, names.APPLIED_EFFORT, self.applied.append, qos.STATE)
         self.node.create_subscription(
             String, names.EVENTS, lambda message: self.events.append(json.loads(message.data)), qos.EVENTS
