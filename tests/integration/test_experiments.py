@@ -7,16 +7,21 @@ import math
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+import psutil
 import pytest
 
+from pendulum_bags.experiments import lockstep
 from pendulum_bags.experiments.conductor_node import Conductor
 from pendulum_bags.experiments.in_process import simulate
 from pendulum_bags.experiments.lockstep import record_run
 from pendulum_bags.experiments.run_spec import RunSpec
+from pendulum_bags.experiments.settings import NoiseSettings, RegulationSettings
 from pendulum_bags.studies.leaderboard_hardware import evaluate_hardware
 from pendulum_lqr.policy_file import write_policy
+from pendulum_msgs_py.errors import FaultError
 from pendulum_msgs_py.plants.mechanism_parameters import load_mechanism
 from pendulum_msgs_py.plants.plant_parameters import load_plant
 from pendulum_rosbag.reader import read_bag, same_messages
@@ -43,6 +48,36 @@ def test_lockstep_runs_of_the_emulated_hardware_with_one_seed_are_identical(doma
     states = first["/hw/joint_states"]
     assert len(states) == 101
     assert abs(states["position"] - 3.14159).max() < 0.05
+
+
+def test_a_lockstep_run_is_waited_for_as_long_as_it_goes_on_and_no_longer(
+    domain_id: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    waits: list[str] = []
+    wait_for = Conductor.wait_for
+
+    def noted(conductor: Conductor, what: str, *arguments: Any) -> Any:
+        waits.append(what)
+        return wait_for(conductor, what, *arguments)
+
+    monkeypatch.setattr(Conductor, "wait_for", noted)
+    settings = RegulationSettings(noise=NoiseSettings(duration=1.0, hold_time=0.002))
+    lockstep.run_lockstep(tmp_path / "whole", settings)
+    more = "10 more states of a run of 1 s of simulated time"
+    # A wait of its own for every few of the 501 states, so that patience counts from the last of them.
+    assert waits.count(more) >= 10
+
+    def freeze() -> None:
+        if "10 more states of a run of 20 s of simulated time" in waits:
+            monkeypatch.setattr(lockstep, "_START_TIMEOUT", 2.0)
+            for one in psutil.Process().children(recursive=True):
+                if "simulator" in one.cmdline():
+                    one.suspend()
+
+    waits.clear()
+    longer = RegulationSettings(noise=NoiseSettings(duration=20.0, hold_time=0.002))
+    with pytest.raises(FaultError, match="waited 2 s for 10 more states of a run of 20 s of simulated time, in vain"):
+        lockstep.run_lockstep(tmp_path / "frozen", longer, on_wait=freeze)
 
 
 def test_several_joints_and_what_stands_in_for_their_machine_end_in_one_answer(tmp_path: Path) -> None:

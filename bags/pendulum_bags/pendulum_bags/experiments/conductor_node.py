@@ -156,6 +156,7 @@ class PlantClient:
         self.namespace = namespace
         self.sample: JointSample | None = None
         self.samples = 0
+        self.states = 0
         self._foreign_joints: tuple[str, ...] = ()
         self._heard = conductor.listened
         self.events: list[dict[str, Any]] = []
@@ -352,6 +353,7 @@ class PlantClient:
             self.events.append(event)
 
     def _on_state(self, data: bytes) -> None:
+        self.states += 1
         sample = sample_from_bytes(data)
         if sample is None:
             self._foreign_joints = stamp_of_state(data, (names.JOINT,))[1]
