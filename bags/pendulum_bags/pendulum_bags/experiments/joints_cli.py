@@ -46,7 +46,8 @@ def joints(
 ) -> None:
     """Hold a plant of several joints upright under noise, and another one in the place of its machine; compare both.
 
-    There is no bridge for several joints yet: a second simulation stands in for the machine, and the answer says so.
+    There is no bridge for several joints yet: a second simulation stands in for the machine, and is told so beside the
+    answer, which calls it emulated hardware.
     Both sides run as nodes over DDS, in lockstep, under one LQR that is designed on the simulated plant.
 
     Example: python -m pendulum_bags experiment joints --plant furuta --amplitude 0.02 --share 0.1
@@ -74,4 +75,9 @@ def joints(
         console.print(f"interrupted: all programs have ended; {kept}")
         raise typer.Exit(EXIT_INTERRUPTED) from None
     compare([folder], margin=margin, margins_file=margins_file, out=folder, json_output=json_output)
+    console.print(
+        f"The emulated hardware is a second simulation, of {made}"
+        + ("." if machine else f": values of {plant} off by up to {100.0 * share:g} %, {1e3 * delay:g} ms of delay."),
+        soft_wrap=True,
+    )
     console.print(f"bags    {folder / 'sim'}, {folder / 'hw'}\n({time.monotonic() - started:.0f} s)", soft_wrap=True)
