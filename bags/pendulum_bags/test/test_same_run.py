@@ -98,8 +98,19 @@ def test_a_delay_beyond_all_that_is_looked_at_is_not_told_as_the_last_of_it(late
     tests = {test.quantity: test for test in paired_tests([(slow, replace(slow, t=t + late))], Margins.parse())}
     assert tests["delay"].outcome is Outcome.UNDECIDED
     assert (tests["delay"].interval.low, tests["delay"].interval.high) == (-100.0, 100.0)
-    # Nothing was taken out, so both distances are one.
-    assert tests["distance of angles"].interval == tests["distance of angles less the delay"].interval
+    assert tests["delay"].sentence() == "delay: the motions are too little alike to tell it"
+    # Nothing was taken out of the distances.
+    assert not [name for name in tests if "less the delay" in name]
+
+
+@pytest.mark.parametrize("late", [0.12, 0.2])
+def test_a_machine_far_too_late_is_not_told_to_be_early_by_a_chance_peak(late: float) -> None:
+    found = compare([pair(5, late=late)])
+    assert outcomes(found)["delay"] is Outcome.UNDECIDED
+    assert found.verdict.outcome is Outcome.DIFFERENT
+    reason = same_run_layer(found).reason
+    assert "earlier" not in reason
+    assert "later" not in reason
 
 
 def test_no_delay_is_told_as_none_in_every_place_and_lies_within_no_margin() -> None:

@@ -23,6 +23,7 @@ __all__ = ["EquivalenceTest", "Outcome", "Verdict", "conclude", "equivalence_tes
 POWER = 0.8
 """Probability with which the named number of runs would decide."""
 MOST_RUNS = 10_000
+_UNTOLD = "the motions are too little alike to tell it"
 
 
 class Outcome(str, Enum):
@@ -86,6 +87,8 @@ class EquivalenceTest:
             f"{self.quantity}: {self.interval.estimate:.3g}{unit}, {self.interval.title} {self.interval.low:.3g} to "
             f"{self.interval.high:.3g}{unit}, {self.margin_text()}{unit}: {self.outcome.value}"
         )
+        if math.isnan(self.interval.estimate):
+            return f"{self.quantity}: {_UNTOLD}"
         if self.outcome is Outcome.UNDECIDED:
             text += f": {_more(self.more_runs)}"
         return text
@@ -238,7 +241,9 @@ def conclude(tests: Sequence[EquivalenceTest], margins: Margins, first: str, sec
         counts = [test.more_runs for test in undecided]
         more = None if None in counts else max(count or 0 for count in counts)
         what = ", ".join(test.quantity for test in undecided)
-        text = f"Undecided whether {first} and {second} are equivalent within {whose} in {what}: {_more(more)}."
+        untold = any(math.isnan(test.interval.estimate) for test in undecided)
+        how = _UNTOLD if untold else _more(more)
+        text = f"Undecided whether {first} and {second} are equivalent within {whose} in {what}: {how}."
     else:
         outcome = Outcome.EQUIVALENT
         text = f"{first} and {second} are equivalent within {whose}, in all {len(tests)} tests."

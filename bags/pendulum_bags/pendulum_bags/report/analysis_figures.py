@@ -34,13 +34,13 @@ def equivalence(data: ReportData) -> Figure:
     """Return every test of the verdict against its margin."""
     verdict = data.comparison.verdict
     tests = list(verdict.tests)[::-1]
+    told = [test for test in tests if math.isfinite(test.interval.estimate)]
     traces = []
     for outcome in ("equivalent", "not equivalent", "undecided"):
-        rows = [i for i, test in enumerate(tests) if test.outcome.value == outcome]
+        rows = [i for i, test in enumerate(tests) if test.outcome.value == outcome and test in told]
         if rows:
             middle, low, high = (np.array(v) for v in zip(*(_relative(tests[i]) for i in rows), strict=True))
             traces.append(Trace(middle, np.array(rows, dtype=float), outcome, outcome, "interval", low, high))
-    told = [test for test in tests if math.isfinite(test.interval.estimate)]
     closest = max(told, key=lambda test: abs(_relative(test)[0]))
     sentence = (
         f"{verdict.sentence} The quantity nearest to (or farthest beyond) its margin is the {closest.quantity}: "
@@ -48,8 +48,8 @@ def equivalence(data: ReportData) -> Figure:
         f"{quantity(closest.interval.low)} to {quantity(closest.interval.high)}, resting on "
         f"{closest.interval.blocks} independent blocks."
     )
-    names = [test.quantity for test in tests]
-    reach = max(1.3, *(abs(value) * 1.08 for test in tests for value in _relative(test)))
+    names = [test.quantity if test in told else f"{test.quantity}: not told" for test in tests]
+    reach = max(1.3, *(abs(value) * 1.08 for test in told for value in _relative(test)))
     panel = Panel(
         "difference [margins]",
         "",

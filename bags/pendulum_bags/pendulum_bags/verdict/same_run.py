@@ -154,6 +154,8 @@ def _what_it_takes(comparison: Comparison, more: str) -> str:
     if not comparison.is_paired:
         return "Record both plants under one and the same disturbance (make experiment does)."
     runs = comparison.verdict.more_runs
+    if any(math.isnan(test.interval.estimate) for test in comparison.verdict.tests):
+        return "Record both under a disturbance that moves them more: too little is alike to tell a delay."
     if runs is None:
         return "More runs would hardly decide it: a difference sits on its margin; state another margin, or mend it."
     what = f"about {runs} more run{'s' if runs != 1 else ''} of {comparison.pairs[0].hardware.window.duration:.0f} s"
