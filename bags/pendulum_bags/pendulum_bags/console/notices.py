@@ -11,6 +11,9 @@ _NEWEST = 3
 _STAYS = {"bad": 15.0, "good": 4.0}
 """How long a notice stands [s]: a refusal long enough to be read, acted on and read again."""
 
+_LONGEST = 200
+"""Characters of a notice; of a longer one the middle is left out."""
+
 
 class Notices:
     """The newest few notices, newest first; the same words once, with how often they were said."""
@@ -30,6 +33,9 @@ class Notices:
             text: One sentence.
             bad: It says why something was refused.
         """
+        if len(text) > _LONGEST:
+            # What was typed may be of any length; the reason stands behind it.
+            text = f"{text[: _LONGEST // 2]} … {text[-_LONGEST // 2 :]}"
         count = self._said[text][1] + 1 if text in self._said else 1
         self._forget(text)
         while len(self._said) >= _NEWEST:
