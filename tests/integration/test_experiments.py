@@ -61,11 +61,11 @@ def test_a_lockstep_run_is_waited_for_as_long_as_it_goes_on_and_no_longer(
         return wait_for(conductor, what, *arguments)
 
     monkeypatch.setattr(Conductor, "wait_for", noted)
-    settings = RegulationSettings(noise=NoiseSettings(duration=1.0, hold_time=0.002))
+    settings = RegulationSettings(noise=NoiseSettings(duration=5.0, hold_time=0.002))
     lockstep.run_lockstep(tmp_path / "whole", settings)
-    more = "10 more states of a run of 1 s of simulated time"
-    # A wait of its own for every few of the 501 states, so that patience counts from the last of them.
-    assert waits.count(more) >= 10
+    more = "10 more states of a run of 5 s of simulated time"
+    # Many waits for a part of the 2501 states each, so that patience counts from the last of them.
+    assert waits.count(more) >= 5
 
     def freeze() -> None:
         if "10 more states of a run of 20 s of simulated time" in waits:
