@@ -184,7 +184,7 @@ def test_a_motion_that_damping_ends_at_once_is_not_kept_up():
 def test_a_way_is_looked_for_ten_times_a_second_and_no_more(monkeypatch):
     controller = tracking(DFKI)
     looked = []
-    monkeypatch.setattr(controller, "_ways", lambda *_: looked.append(1) or [])
+    monkeypatch.setattr(controller, "_find_way", lambda *_: looked.append(1))
     for k in range(100):
         controller.command(0.01 * k, (-3.0, 0.0))
     assert 9 <= len(looked) <= 11

@@ -167,11 +167,7 @@ class LqrTracking(BaseController):
         Args:
             t: Time [s].
         """
-        motion = self.reference.at(t)
-        if self._way is None:
-            return motion
-        off = self._way.at(t)
-        return Motion(*(a + b for a, b in zip(motion, off, strict=True)))
+        return self._motion_by(self._way, t)
 
     def take_over(self, previous: Controller) -> None:
         """Go on from the reference before this one, so that neither it nor the torque jumps."""
@@ -181,7 +177,7 @@ class LqrTracking(BaseController):
         if not previous._joined:
             return
         t, before = previous._newest, previous.motion(previous._newest)
-        self._way = next(iter(self._ways(t, before, [before])), None) or self._way_from(t, before, _LONGER[-1])
+        self._way = self._find_way(t, [before]) or self._way_from(t, before, _LONGER[-1])
         self._joined = True
 
     def describe(self) -> str:
@@ -209,7 +205,8 @@ class LqrTracking(BaseController):
         if self._approach_time == 0.0:
             self._way, self._joined = None, True
             return
-        for way in self._ways(t, starts[0], starts):
+        way = self._find_way(t, starts)
+        if way is not None:
             self._way, self._joined = way, True
             if self._lost == 0:
                 self.notice = ""
@@ -220,14 +217,18 @@ class LqrTracking(BaseController):
             f"{self._within:.4g} N m; expected a start nearer to it"
         )
 
-    def _ways(self, t: float, first: Motion, starts: Sequence[Motion]) -> Sequence[Way]:
-        """Return the first way onto the reference that the torque suffices for, or none."""
+    def _find_way(self, t: float, starts: Sequence[Motion]) -> Way | None:
+        """Return the first way onto the reference that the torque suffices for; None where there is none."""
         for start in starts:
             for longer in _LONGER:
                 way = self._way_from(t, start, longer)
                 if way is None or self._suffices(way):
-                    return [way] if way is not None else []
-        return []
+                    return way
+        return None
+
+    def _motion_by(self, way: Way | None, t: float) -> Motion:
+        motion = self.reference.at(t)
+        return motion if way is None else Motion(*(a + b for a, b in zip(motion, way.at(t), strict=True)))
 
     def _way_from(self, t: float, start: Motion, longer: float) -> Way | None:
         there = self.reference.at(t)
@@ -242,8 +243,7 @@ class LqrTracking(BaseController):
     def _suffices(self, way: Way) -> bool:
         for k in range(_POINTS + 1):
             t = way.start + way.duration * k / _POINTS
-            motion = Motion(*(a + b for a, b in zip(self.reference.at(t), way.at(t), strict=True)))
-            if abs(self.schedule.feedforward(motion)) > self._within:
+            if abs(self.schedule.feedforward(self._motion_by(way, t))) > self._within:
                 return False
         return True
 
