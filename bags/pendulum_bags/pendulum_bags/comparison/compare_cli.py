@@ -198,8 +198,8 @@ def _print(console: Console, result: Comparison, content: dict[str, Any]) -> Non
     from pendulum_bags.verdict.terminal import tests_table
     from pendulum_msgs_py.programs.terminal import WholeTable
 
-    unit = result.pairs[0].simulation.window.unit
-    what, effort = ("theta", "N m") if unit == "rad" else ("x", "N")
+    motion = result.pairs[0].simulation.window
+    unit, what = motion.unit, "x" if motion.slides else "theta"
     plants = content["plants"]
     table = WholeTable(title="Plants during the noise", title_justify="left")
     for heading in ("", *plants):
@@ -210,7 +210,7 @@ def _print(console: Console, result: Comparison, content: dict[str, Any]) -> Non
         ("noise held for \\[s]", "noise_hold_time", ".4f"),
         (f"std of {what} \\[{unit}]", "std_theta", ".5f"),
         (f"std of {what}' \\[{unit}/s]", "std_theta_dot", ".5f"),
-        (f"max |u| \\[{effort}]", "max_abs_u", ".4f"),
+        (f"max |u| \\[{motion.effort_unit}]", "max_abs_u", ".4f"),
     ):
         table.add_row(label, *(_number(plant.get(key), form) for plant in plants.values()))
     if any("rms_tracking_error" in plant for plant in plants.values()):

@@ -99,7 +99,7 @@ class Pair:
                     f"the {run.label} of {run.source} stood still{where} at {run.window.position[0]:.4g} "
                     f"{run.window.unit} under the noise; expected a plant that moves: was it armed, and free?"
                 )
-            if run.joint and run.window.unit == "rad" and np.ptp(run.window.position) > np.pi:
+            if run.joint and not run.window.slides and np.ptp(run.window.position) > np.pi:
                 raise DataError(
                     f"the {run.label} of {run.source} fell: {run.joint} turned by "
                     f"{np.ptp(run.window.position):.3g} rad under the noise; expected a plant that is held, since two "
@@ -200,7 +200,7 @@ class Pair:
 
 def _turned(hardware: RunData, simulation: RunData) -> RunData:
     """Return the hardware's run moved by whole turns to where the simulation is: an angle is known but for those."""
-    if hardware.window.unit != "rad":
+    if hardware.window.slides:
         return hardware
     turn = 2.0 * np.pi
     apart = float(np.median(hardware.window.position) - np.median(simulation.window.position))

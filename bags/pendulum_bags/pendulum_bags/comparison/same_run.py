@@ -90,7 +90,7 @@ class _Kind:
 
     @classmethod
     def of(cls, motions: Sequence[Series], margins: Margins, looks: Looks, runs: int) -> _Kind:
-        slides = any(one.unit == "m" for one in motions)
+        slides = any(one.slides for one in motions)
         if slides:
             _refuse_angles(margins)
         return cls(looks, runs, slides, any(np.ptp(one.effort) > 0.0 for one in motions))

@@ -27,8 +27,7 @@ def joints_together(comparisons: Mapping[str, Comparison]) -> Figure:
         unit = sim.unit
         rows = [(f"{joint} [{unit}]", "position", "line"), (f"velocity of {joint} [{unit}/s]", "velocity", "line")]
         if np.ptp(sim.effort) > 0.0 or np.ptp(hw.effort) > 0.0:
-            effort = "torque" if unit == "rad" else "force"
-            rows.append((f"{effort} at {joint} [{'N m' if unit == 'rad' else 'N'}]", "effort", "step"))
+            rows.append((f"{'force' if sim.slides else 'torque'} at {joint} [{sim.effort_unit}]", "effort", "step"))
         panels += [
             Panel(
                 TIME,

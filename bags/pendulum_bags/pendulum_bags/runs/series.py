@@ -103,6 +103,16 @@ class Series:
             object.__setattr__(self, key, values)
 
     @property
+    def slides(self) -> bool:
+        """Whether it is the motion of a joint that slides, in metres."""
+        return self.unit == "m"
+
+    @property
+    def effort_unit(self) -> str:
+        """Unit of the effort: of a force where the joint slides."""
+        return "N" if self.slides else "N m"
+
+    @property
     def period(self) -> float:
         """Median time between two samples [s]."""
         return float(np.median(np.diff(self.t)))
