@@ -6,6 +6,7 @@ several test runs share the machine. Tests with processes take ``processes``, wh
 
 from __future__ import annotations
 
+import contextlib
 import os
 import time
 from collections.abc import Callable, Iterator
@@ -19,7 +20,7 @@ from tests.mcap_js_reader import McapJs, mcap_js_process
 from tests.processes import ProcessGroup
 from tests.rerun_reader import RerunMcap, find_rerun
 
-__all__ = ["PROJECT", "domain_id", "mcap_js", "processes", "rerun_mcap", "shared_data", "wait_for"]
+__all__ = ["PROJECT", "domain_id", "mcap_js", "own_domain", "processes", "rerun_mcap", "shared_data", "wait_for"]
 
 PROJECT = Path(__file__).resolve().parents[1]
 """The repository."""
@@ -75,21 +76,34 @@ def rerun_mcap() -> RerunMcap:
     return find_rerun()
 
 
-@pytest.fixture
-def domain_id(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iterator[int]:
-    """Reserve a ROS domain on this machine for this test, and put it into the environment."""
+@contextlib.contextmanager
+def own_domain(folder: Path) -> Iterator[int]:
+    """Reserve a ROS domain on this machine and put it into the environment, for fixtures that several tests share.
+
+    Args:
+        folder: For the logs of ROS.
+    """
     # Imported late: most tests know nothing of ROS.
     from rclpy.utilities import get_rmw_implementation_identifier
 
     from pendulum_msgs_py.ros.middleware import middleware_defaults
 
-    monkeypatch.delenv("ROS_DOMAIN_ID", raising=False)
-    with reserve_domain() as domain:
-        monkeypatch.setenv("ROS_DOMAIN_ID", str(domain))
-        # Fast DDS reads its profile once in a process: tests that join the graph themselves do so as our programs do.
-        for name, value in middleware_defaults({}, get_rmw_implementation_identifier()).items():
-            monkeypatch.setenv(name, value)
-        monkeypatch.setenv("ROS_LOG_DIR", str(tmp_path / "ros_log"))
+    with pytest.MonkeyPatch.context() as patch:
+        patch.delenv("ROS_DOMAIN_ID", raising=False)
+        with reserve_domain() as domain:
+            patch.setenv("ROS_DOMAIN_ID", str(domain))
+            # Fast DDS reads its profile once in a process: tests that join the graph themselves do so as our programs
+            # do.
+            for name, value in middleware_defaults({}, get_rmw_implementation_identifier()).items():
+                patch.setenv(name, value)
+            patch.setenv("ROS_LOG_DIR", str(folder / "ros_log"))
+            yield domain
+
+
+@pytest.fixture
+def domain_id(tmp_path: Path) -> Iterator[int]:
+    """Reserve a ROS domain on this machine for this test, and put it into the environment."""
+    with own_domain(tmp_path) as domain:
         yield domain
 
 

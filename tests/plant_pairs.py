@@ -14,7 +14,7 @@ from pendulum_msgs_py.contract.angles import UPRIGHT, from_upright
 from pendulum_msgs_py.contract.noise import uniform_array
 from pendulum_msgs_py.plants.plant_parameters import PlantParameters, load_plant
 from pendulum_sim.compiling import compile_tree
-from pendulum_sim.dry_friction import acceleration_with_friction, advance_dry
+from pendulum_sim.dry_friction import acceleration_with_friction, advance_dry, is_dry
 from pendulum_sim.integrators import get_integrator
 from pendulum_sim.plant import pack
 from pendulum_sim.plants import make_plant
@@ -151,13 +151,14 @@ def _kernel() -> Any:
     coefficients_of = compile_tree(integrator.coefficients)
     acceleration = compile_tree(acceleration_with_friction)
     advance = compile_tree(advance_dry)
+    has_dry_friction = compile_tree(is_dry)
 
     @numba.njit(error_model="numpy")
     def run(
         plant, limit, count, per_state, held, noise, seen, step, gain, late, rows
     ):  # fmt: skip
         c = coefficients_of(plant[1] / plant[0], STEP)
-        dry = plant[4] > 0.0 or plant[6] > 0.0
+        dry = has_dry_friction(plant)
         theta, theta_dot, command = UPRIGHT, 0.0, 0.0
         waiting = np.zeros(late + 1)
         for i in range(count):

@@ -26,6 +26,7 @@ __all__ = [
     "Applied",
     "Command",
     "CommandLock",
+    "EncoderPort",
     "Feedback",
     "HardwareLimits",
     "LimitState",
@@ -301,22 +302,32 @@ class ActuatorInfo:
     drivetrain: Mapping[str, float] = field(default_factory=dict)
 
 
-@runtime_checkable
-class ActuatorPort(Protocol):
-    """One actuator. Methods may be called from one thread only; all raise :class:`ActuatorError`."""
-
-    @property
-    def strategy(self) -> Strategy:
-        """Strategy in force."""
+class EncoderPort(Protocol):
+    """What is only read: there is no way to give torque. Methods may be called from one thread only."""
 
     def connect(self) -> ActuatorInfo:
-        """Find the actuator, set rate, lifetime, limits and gains, and return what reads back."""
+        """Find the module, and return what it says of itself."""
 
     def now_ns(self) -> int:
         """Return the clock of the feedback stamps [ns]."""
 
     def read(self, timeout: float) -> Feedback | None:
         """Return the next feedback record, or None where none came within the timeout [s]."""
+
+    def set_feedback_rate(self, rate: float) -> float:
+        """Set the feedback rate [Hz] and return what reads back."""
+
+    def close(self) -> None:
+        """Let go of the module; a motor is stopped first."""
+
+
+@runtime_checkable
+class ActuatorPort(EncoderPort, Protocol):
+    """One actuator. Methods may be called from one thread only; all raise :class:`ActuatorError`."""
+
+    @property
+    def strategy(self) -> Strategy:
+        """Strategy in force."""
 
     def write(self, command: Command) -> Applied:
         """Send setpoints for one command lifetime; return what was really sent, after limits."""
@@ -336,11 +347,5 @@ class ActuatorPort(Protocol):
     def set_command_lifetime(self, lifetime: float) -> float:
         """Set the command lifetime [s], > 0, and return what reads back."""
 
-    def set_feedback_rate(self, rate: float) -> float:
-        """Set the feedback rate [Hz] and return what reads back."""
-
     def stop(self) -> None:
         """Make it safe: effort zero, then strategy off. Safe to call at any time, twice, and after a failure."""
-
-    def close(self) -> None:
-        """Stop and let go of the actuator."""

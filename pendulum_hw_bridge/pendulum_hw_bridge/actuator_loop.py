@@ -35,7 +35,7 @@ class ActuatorLoop:
     Args:
         bridge: Bridge and actuator; only this thread touches the actuator.
         statistics: Gets the figures of the loop.
-        on_state: Called with each new sample and its feedback record.
+        on_state: Called with each new sample and the feedback record of each module.
         decide: Returns the decision for now.
         on_outcome: Called with the stamp of the state answered [ns] and what was done.
         take_inputs: Takes the torques that have come, each into :meth:`answered`; where none has, it waits for one, for
@@ -49,7 +49,7 @@ class ActuatorLoop:
         bridge: Bridge,
         statistics: LoopStatistics,
         *,
-        on_state: Callable[[JointSample, Feedback], None],
+        on_state: Callable[[JointSample, tuple[Feedback, ...]], None],
         decide: Callable[[], Drive],
         on_outcome: Callable[[int, Outcome], None],
         take_inputs: Callable[[float], None] = time.sleep,
@@ -104,7 +104,7 @@ class ActuatorLoop:
         if command.stamp_ns == self._state_ns:
             self._answered.add(kind)
         if kind is Input.EFFORT_COMMAND:
-            self.statistics.round_trip(self.bridge.port.now_ns() - command.stamp_ns)
+            self.statistics.round_trip(self.bridge.now_ns() - command.stamp_ns)
 
     def close(self) -> None:
         """End the thread; the actuator is released and let go on the way out."""
@@ -160,20 +160,18 @@ class ActuatorLoop:
 
     def _cycle(self) -> None:
         bridge = self.bridge
-        feedback = bridge.observe(_PATIENCE)
-        if feedback is None:
+        sample = bridge.observe(_PATIENCE)
+        if sample is None:
             self._take_inputs(0.0)
             self._act_between()
             return
-        sample = bridge.sample
-        assert sample is not None
-        now = bridge.port.now_ns()
+        now = bridge.now_ns()
         expected = now if self._last_state_ns is None else self._last_state_ns + self.statistics.period_ns
         self.statistics.cycle(now, expected)
         self._last_state_ns = now
         self._state_ns = sample.stamp_ns
         self._answered.clear()
-        self._on_state(sample, feedback)
+        self._on_state(sample, bridge.records)
         self._wait_for_answers(sample.stamp_ns)
         self._on_outcome(sample.stamp_ns, self._decide_and_act())
 
@@ -194,7 +192,7 @@ class ActuatorLoop:
         supervisor = self.bridge.supervisor
         if not supervisor.mode.armed:
             return
-        now = self.bridge.port.now_ns()
+        now = self.bridge.now_ns()
         expected = {
             kind for kind in (Input.EFFORT_COMMAND, Input.DISTURBANCE) if supervisor.gates[kind].fresh(now) is not None
         }

@@ -15,18 +15,17 @@ from typing import Any
 from rclpy.lifecycle import LifecycleState, TransitionCallbackReturn
 from sensor_msgs.msg import BatteryState, JointState, Temperature
 
-from pendulum_hw_bridge import bridge_parameters
-from pendulum_hw_bridge.actuator import ActuatorError, Feedback
+from pendulum_hw_bridge.actuator import ActuatorError, ActuatorInfo, Feedback
 from pendulum_hw_bridge.actuator_loop import ActuatorLoop
+from pendulum_hw_bridge.assembly import assemble, for_plant
 from pendulum_hw_bridge.bridge import Bridge, Outcome
-from pendulum_hw_bridge.bridge_consistency import check_consistency
 from pendulum_hw_bridge.clocks import Clock, SteppedClock, WallClock
 from pendulum_hw_bridge.derating import Derating
 from pendulum_hw_bridge.e_stop_input_node import EStopInputServer
 from pendulum_hw_bridge.feedback_message import encode_feedback
 from pendulum_hw_bridge.lab_node import with_lab_file
+from pendulum_hw_bridge.module import DrivenModule, Module
 from pendulum_hw_bridge.node_specs import SPECS
-from pendulum_hw_bridge.safety import SafetyMonitor
 from pendulum_msgs_py.contract.plant_specs import LOCKSTEP_EPOCH_NS
 from pendulum_msgs_py.contract.shared_supervisor import SharedSupervisor
 from pendulum_msgs_py.contract.supervisor import Drive, DriveKind, Input, Mode
@@ -86,7 +85,8 @@ class BridgeNode(LifecycleNode, PollingNode):
         super().__init__("bridge", enable_logger_service=True, **options)
         self._stop_runner = stop
         self.failure: Exception | None = None
-        self._values = values = NodeParameters(self, with_lab_file(self, SPECS)).values
+        specs = tuple(with_lab_file(self, for_plant(SPECS, self._given_plant())))
+        self._values = values = NodeParameters(self, specs).values
         self._lockstep = values["clock"] == "lockstep"
         self._period_ns = round(NANOSECONDS / values["feedback_rate"])
         self._statistics = LoopStatistics(self._period_ns)
@@ -94,12 +94,17 @@ class BridgeNode(LifecycleNode, PollingNode):
         self._active = False
         self._loop: ActuatorLoop | None = None
         self._bridge: Bridge | None = None
-        self._plant = bridge_parameters.plant_of(values)
-        self._told_plants = describe_plants(bridge_parameters.told_plants(values))
-        self._gains = bridge_parameters.trajectory_gains(values)
-        limits = bridge_parameters.bridge_limits(values, self._plant, lockstep=self._lockstep)
+        # Made here, so that a refused parameter ends the process with its sentence.
+        self._assembly = assembly = assemble(values, specs, lockstep=self._lockstep)
+        self._mapping = assembly.mapping
+        self._told_plants = describe_plants(assembly.told)
+        self._no_effort = (0.0,) * len(assembly.coordinates.driven)
         self._supervisor = SharedSupervisor(
-            limits, self._prepare, self._withdraw, lambda: (self._interface.clock(), self._interface.sample)
+            assembly.limits,
+            self._prepare,
+            self._withdraw,
+            lambda: (self._interface.clock(), self._interface.sample),
+            coordinates=assembly.coordinates,
         )
         self._lockstep_loop: LockstepLoop | None = None
         self._interface = PlantInterface(
@@ -116,7 +121,7 @@ class BridgeNode(LifecycleNode, PollingNode):
         )
         if not self._lockstep:
             self._interface.watch_inputs()
-        self._interface.hardware_id = f"X5-9, {values['backend']}"
+        self._interface.hardware_id = assembly.hardware
         self._e_stop_input: EStopInputServer | None = None
         self._feedback = self.create_publisher(JointState, "actuator/feedback", _FEEDBACK_QOS)
         self._temperature = self.create_publisher(Temperature, "actuator/winding_temperature", _FEEDBACK_QOS)
@@ -133,17 +138,6 @@ class BridgeNode(LifecycleNode, PollingNode):
                 duration=values["lockstep_duration"],
             )
             self._lockstep_loop.paused = True
-        # Made once here as well, so that a refused parameter ends the process with its sentence.
-        check_consistency(values, limits)
-        self._mapping = bridge_parameters.effort_mapping(values, self._plant, self._gains, limits)
-        self._settings = bridge_parameters.bridge_settings(
-            values,
-            effort=limits.effort[0],
-            velocity=self._mapping.velocity_limit,
-            gains=self._gains,
-            window=(limits.position_min[0], limits.position_max[0]),
-        )
-        self._safety = bridge_parameters.safety_limits(values, limits.effort[0])
         self._derating = Derating(values["derating_temperature"], values["winding_temperature_limit"])
         if values["e_stop_input_timeout"] > 0.0:
             self._e_stop_input = EStopInputServer(
@@ -160,7 +154,7 @@ class BridgeNode(LifecycleNode, PollingNode):
         stamp_ns = self._interface.clock()
         self._interface.safe_stop("bridge ends")
         self.release_actuator()
-        self._interface.publish_applied(stamp_ns, (0.0,))
+        self._interface.publish_applied(stamp_ns, self._no_effort)
         self._interface.close()
         if self._e_stop_input is not None:
             self._e_stop_input.close()
@@ -187,6 +181,11 @@ class BridgeNode(LifecycleNode, PollingNode):
             self._interface.wait_for_inputs(0.0)
         return None
 
+    def _given_plant(self) -> str:
+        """Return the plant that was given, whose joints decide the defaults of what is not."""
+        given = self._parameter_overrides.get("plant")
+        return "thesis" if given is None else str(given.value)
+
     def _make_clock(self) -> Clock:
         return WallClock()
 
@@ -198,9 +197,7 @@ class BridgeNode(LifecycleNode, PollingNode):
         values = self._values
         if self._lockstep:
             self._port_clock = SteppedClock(LOCKSTEP_EPOCH_NS)
-        port = bridge_parameters.make_port(values, self._port_clock, lockstep=self._lockstep)
-        monitor = SafetyMonitor(self._safety, self._period_ns / NANOSECONDS, self._plant.drivetrain)
-        self._bridge = bridge = Bridge(port, self._supervisor, self._mapping, monitor, self._settings)
+        self._bridge = bridge = Bridge(self._assembly.modules(self._port_clock), self._supervisor)
         if not self._lockstep:
             self._loop = self.loop_type(
                 bridge,
@@ -212,25 +209,8 @@ class BridgeNode(LifecycleNode, PollingNode):
                 answer_window=values["answer_window"],
                 report=self.get_logger().error,
             )
-        info = self._call(bridge.connect, timeout=30.0)
-        self._interface.publish_event(
-            "actuator_connected",
-            backend=info.backend,
-            family=info.family,
-            actuator=info.name,
-            serial=info.serial,
-            firmware=info.firmware,
-            effort_strategy=self._mapping.kind.value,
-            firmware_strategy=int(self._mapping.strategy),
-            efficiency=self._mapping.efficiency,
-            feedback_rate=info.feedback_rate,
-            command_lifetime=info.command_lifetime,
-            drivetrain=dict(info.drivetrain),
-        )
-        self.get_logger().info(
-            f"connected to {info.backend} {info.family}/{info.name} ({info.serial}), {info.feedback_rate:g} Hz, "
-            f"command lifetime {info.command_lifetime * 1e3:g} ms, effort by {self._mapping.kind.value}"
-        )
+        for module, info in zip(bridge.modules, self._call(bridge.connect, timeout=30.0), strict=True):
+            self._tell_connected(module, info)
         return TransitionCallbackReturn.SUCCESS
 
     @_logged
@@ -272,6 +252,33 @@ class BridgeNode(LifecycleNode, PollingNode):
         self._quieten("error in a transition")
         self.release_actuator()
         return TransitionCallbackReturn.SUCCESS
+
+    def _tell_connected(self, module: Module, info: ActuatorInfo) -> None:
+        driven = isinstance(module, DrivenModule)
+        self._interface.publish_event(
+            "actuator_connected",
+            **({"joint": module.joint} if module.joint else {}),
+            backend=info.backend,
+            family=info.family,
+            actuator=info.name,
+            serial=info.serial,
+            firmware=info.firmware,
+            effort_strategy=self._assembly.effort_strategy if driven else "none",
+            firmware_strategy=int(self._mapping.strategy) if driven else 0,
+            efficiency=self._mapping.efficiency if driven else 0.0,
+            feedback_rate=info.feedback_rate,
+            command_lifetime=info.command_lifetime,
+            drivetrain=dict(info.drivetrain),
+        )
+        effort = (
+            f"command lifetime {info.command_lifetime * 1e3:g} ms, effort by {self._assembly.effort_strategy}"
+            if driven
+            else "read only"
+        )
+        self.get_logger().info(
+            f"connected to {info.backend} {info.family}/{info.name} ({info.serial}), {info.feedback_rate:g} Hz, "
+            f"{effort}"
+        )
 
     def _autostart(self) -> None:
         for step in (self.trigger_configure, self.trigger_activate):
@@ -326,12 +333,13 @@ class BridgeNode(LifecycleNode, PollingNode):
 
     # --- cycle ---------------------------------------------------------------------------------------------
 
-    def _on_state(self, sample: JointSample, feedback: Feedback) -> None:
+    def _on_state(self, sample: JointSample, records: tuple[Feedback, ...]) -> None:
         self._interface.publish_state(sample)
-        self._feedback.publish(encode_feedback(feedback))
+        if len(records) == 1:
+            self._feedback.publish(encode_feedback(records[0]))
 
     def _on_outcome(self, stamp_ns: int, outcome: Outcome) -> None:
-        self._interface.publish_applied(stamp_ns, (outcome.effort,))
+        self._interface.publish_applied(stamp_ns, outcome.effort)
 
     def _on_command(self, kind: Input, command: JointCommand) -> None:
         if self._lockstep_loop is not None:
@@ -345,31 +353,34 @@ class BridgeNode(LifecycleNode, PollingNode):
         assert bridge is not None
         outcome = bridge.carry_out(self._derated(drive), was_armed=self._supervisor.mode.armed)
         self._port_clock.wait_until(stamp_ns)
-        return self._observe_now(stamp_ns), (outcome.effort,)
+        return self._observe_now(stamp_ns), outcome.effort
 
     def _derated(self, drive: Drive) -> Drive:
         """Return a decision with its torque within what the winding's temperature leaves of the limit."""
-        feedback = None if self._bridge is None else self._bridge.feedback
-        if feedback is None or drive.kind is not DriveKind.EFFORT:
+        bridge = self._bridge
+        if bridge is None or not bridge.records or drive.kind is not DriveKind.EFFORT:
             return drive
-        (limit,) = self._supervisor.limits.effort
-        effort = self._derating.clamp(drive.effort[0], limit, feedback.winding_temperature)
-        return drive if effort == drive.effort[0] else drive._replace(effort=(effort,))
+        effort = tuple(
+            self._derating.clamp(effort, limit, module.feedback.winding_temperature)
+            for effort, limit, module in zip(drive.effort, self._supervisor.limits.effort, bridge.drives, strict=True)
+            if module.feedback is not None
+        )
+        return drive if effort == drive.effort else drive._replace(effort=effort)
 
     def _observe_now(self, stamp_ns: int) -> JointSample | None:
         bridge = self._bridge
         assert bridge is not None
-        feedback = bridge.observe(0.0)
-        if feedback is None or bridge.sample is None:
+        sample = bridge.observe(0.0)
+        if sample is None:
             return None
         # Before the first step nobody need be listening yet, and two runs must publish the same.
         assert self._lockstep_loop is not None
         if self._lockstep_loop.started:
-            self._feedback.publish(encode_feedback(feedback._replace(stamp_ns=stamp_ns)))
+            if len(bridge.records) == 1:
+                self._feedback.publish(encode_feedback(bridge.records[0]._replace(stamp_ns=stamp_ns)))
             if (stamp_ns - LOCKSTEP_EPOCH_NS) % round(_SLOW_PERIOD * NANOSECONDS) < self._period_ns:
                 self._publish_slow(stamp_ns)
-        sample = bridge.sample._replace(stamp_ns=stamp_ns)
-        bridge.sample = sample
+        bridge.sample = sample = sample._replace(stamp_ns=stamp_ns)
         if self._interface.sample is None:
             self._interface.sample = sample
         return sample
@@ -378,9 +389,9 @@ class BridgeNode(LifecycleNode, PollingNode):
 
     def _publish_slow(self, stamp_ns: int | None = None) -> None:
         """Publish temperature and supply: by wall time, or in lockstep by simulated time, as all else."""
-        feedback = self._bridge.feedback if self._bridge is not None else None
-        if feedback is None or not self._active:
+        if self._bridge is None or not self._bridge.records or not self._active:
             return
+        feedback = self._hottest(self._bridge)
         stamp = stamp_to_message(feedback.stamp_ns if stamp_ns is None else stamp_ns)
         temperature = Temperature(temperature=feedback.winding_temperature)
         temperature.header.stamp = stamp
@@ -399,23 +410,29 @@ class BridgeNode(LifecycleNode, PollingNode):
         supply.header.stamp = stamp
         self._supply.publish(supply)
 
+    @staticmethod
+    def _hottest(bridge: Bridge) -> Feedback:
+        """Return the newest record of the drive with the hottest winding; there is one."""
+        records = [drive.feedback for drive in bridge.drives if drive.feedback is not None]
+        return max(records, key=lambda record: record.winding_temperature)
+
     def _diagnostics(self) -> Mapping[str, object]:
         bridge = self._bridge
         values: dict[str, object] = {
             "active": self._active,
             PLANT_PARAMETERS: self._told_plants,
             "backend": self._values["backend"],
-            "effort_strategy": self._values["effort_strategy"],
+            "effort_strategy": self._assembly.effort_strategy,
         }
         if self._lockstep_loop is not None:
             values.update(self._lockstep_loop.diagnostics())
-        if bridge is None or bridge.feedback is None:
+        if bridge is None or not bridge.records:
             return values
-        feedback = bridge.feedback
-        present = bridge.monitor.present
+        feedback = self._hottest(bridge)
+        present = next((module.monitor.present for module in bridge.modules if module.monitor.present), None)
         values.update(
             {
-                "firmware_strategy": int(bridge.port.strategy),
+                "firmware_strategy": int(bridge.drives[0].port.strategy),
                 "winding_temperature_degc": feedback.winding_temperature,
                 "torque_share_left": self._derating.share(feedback.winding_temperature),
                 "voltage_v": feedback.voltage,

@@ -19,6 +19,7 @@ from pendulum_hw_bridge.safety_limits import SafetyLimits
 from pendulum_hw_bridge.settings import BridgeSettings
 from pendulum_msgs_py.contract.drive import PlantLimits
 from pendulum_msgs_py.contract.plant_specs import limits_from_parameters
+from pendulum_msgs_py.contract.values import Vector
 from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.parameters import ParameterSpec
 from pendulum_msgs_py.plants.plant_parameters import (
@@ -38,6 +39,7 @@ __all__ = [
     "make_port",
     "plant_of",
     "safety_limits",
+    "supervisor_limits",
     "told_plants",
     "trajectory_gains",
 ]
@@ -60,7 +62,8 @@ BRIDGE_SPECS: tuple[ParameterSpec, ...] = (
         "thesis",
         "",
         f"Drivetrain and link: {EMULATOR_PRESET_NAMES}, or a plant file with a drivetrain; what the emulator is, and "
-        "for `hebi` the constants of the effort mapping.",
+        "for `hebi` the constants of the effort mapping. With `backend:=emulator` also a plant of several joints, such "
+        "as cart_pole, with quasi-direct drives.",
     ),
     _fixed("family", "", "", "HEBI family of the actuator; empty for any, if there is only one."),
     _fixed("name", "", "", "HEBI name of the actuator; empty for any, if there is only one."),
@@ -195,6 +198,12 @@ BRIDGE_SPECS: tuple[ParameterSpec, ...] = (
         maximum=0.8,
     ),
     _fixed("initial_position", 0.0, "rad", "Emulator: where the pendulum is at the start, at rest."),
+    _fixed(
+        "initial_positions",
+        [0.0],
+        "rad or m",
+        "Emulator of several joints: where each is at the start, at rest; one value for all.",
+    ),
     _fixed("seed", 0, "-", "Emulator: seed of sensor noise and timing jitter.", minimum=0),
     _fixed("flat", False, "", "Emulator: the pendulum lies flat on a table, without gravity."),
     _fixed(
@@ -310,9 +319,26 @@ def bridge_limits(values: Mapping[str, Any], plant: PlantParameters, *, lockstep
     Raises:
         ParameterError: They contradict each other or the plant.
     """
+    return supervisor_limits(values, (plant.effort_limit,), lockstep=lockstep)
+
+
+def supervisor_limits(
+    values: Mapping[str, Any], effort_limits: Vector, *, joints: int = 1, lockstep: bool = False
+) -> PlantLimits:
+    """Return the limits that the supervisor keeps on a plant of any number of joints.
+
+    Args:
+        values: Parameters of the bridge.
+        effort_limits: Those of the driven joints in the plant file [N m or N].
+        joints: How many joints the plant has.
+        lockstep: Whether time is simulated.
+
+    Raises:
+        ParameterError: They contradict each other or the plant.
+    """
     # A period more than the monitor has, which names the fault; this one is behind it.
     patience = (values["feedback_watchdog"] + 1) / values["feedback_rate"]
-    limits = limits_from_parameters(values, (plant.effort_limit,), feedback_timeout=patience)
+    limits = limits_from_parameters(values, effort_limits, joints=joints, feedback_timeout=patience)
     if lockstep:
         # Here only an emulator runs, and the noise of an experiment begins with the controller.
         return limits

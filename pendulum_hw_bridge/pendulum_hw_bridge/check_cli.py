@@ -17,6 +17,7 @@ from pendulum_hw_bridge.emulation import EMULATOR_PRESET_NAMES
 from pendulum_hw_bridge.nudge import hand_of
 from pendulum_msgs_py.programs.executables import cli_main
 from pendulum_msgs_py.programs.graph import ParameterArgument
+from pendulum_msgs_py.programs.options import Json
 from pendulum_msgs_py.programs.terminal import WholeTable, make_console
 
 __all__ = ["main"]
@@ -51,7 +52,7 @@ def check(
     nudge: Annotated[
         bool, typer.Option(help="Wait for a hand that turns the link counter-clockwise, to try the sign.")
     ] = True,
-    as_json: Annotated[bool, typer.Option("--json", help="Print JSON instead of a table.")] = False,
+    as_json: Json = False,
 ) -> int:
     """Go through the checklist before arming; the motor gets no torque.
 

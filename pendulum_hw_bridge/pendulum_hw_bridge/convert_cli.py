@@ -13,6 +13,7 @@ from pendulum_hw_bridge.backends.hebi_log import read_hebilog, to_joint
 from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.plants.lab_file import load_lab
 from pendulum_msgs_py.programs.executables import cli_main
+from pendulum_msgs_py.programs.options import out_option
 
 __all__ = ["main"]
 
@@ -22,7 +23,7 @@ app = typer.Typer(add_completion=False, rich_markup_mode=None)
 @app.command()
 def convert(
     log: Annotated[Path, typer.Argument(help="The .hebilog file.")],
-    out: Annotated[Path | None, typer.Option(help="CSV file to write. Default: beside the log.")] = None,
+    out: Annotated[Path | None, out_option("CSV file to write. Default: beside the log.")] = None,
     lab: Annotated[Path | None, typer.Option(help="Lab file, for zero, sign and tare of the joint.")] = None,
     module: Annotated[int | None, typer.Option(help="Which module of a log of several, from 0.", min=0)] = None,
 ) -> None:

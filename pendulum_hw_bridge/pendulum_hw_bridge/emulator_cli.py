@@ -16,6 +16,7 @@ from pendulum_hw_bridge.emulation import EMULATOR_PRESET_NAMES
 from pendulum_hw_bridge.emulation.faults import ActuatorFault
 from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.programs.executables import cli_main
+from pendulum_msgs_py.programs.options import Json
 from pendulum_msgs_py.programs.terminal import WholeTable, make_console
 
 __all__ = ["fault_main", "hand_main", "main"]
@@ -79,7 +80,7 @@ def emulator_fault(
     faults: Annotated[list[str] | None, typer.Argument(help="Names of faults to begin; none lists them.")] = None,
     clear: Annotated[bool, typer.Option("--clear", help="End all faults first.")] = False,
     address: Annotated[str, typer.Option(help="HOST:PORT of the emulator.")] = _ADDRESS,
-    as_json: Annotated[bool, typer.Option("--json", help="Print the list, or what is in force, as JSON.")] = False,
+    as_json: Json = False,
 ) -> None:
     """Let faults begin or end in a running emulator.
 

@@ -23,6 +23,7 @@ from pendulum_hw_bridge.settings import expect_limits
 from pendulum_msgs_py.errors import ParameterError, PendulumError
 from pendulum_msgs_py.plants.lab_file import LabFile, load_lab, write_lab
 from pendulum_msgs_py.programs.executables import cli_main
+from pendulum_msgs_py.programs.options import Json, out_option
 from pendulum_msgs_py.programs.terminal import WholeTable, make_console
 
 if TYPE_CHECKING:
@@ -123,9 +124,7 @@ def new(
 
 
 @app.command()
-def show(
-    file: File, as_json: Annotated[bool, typer.Option("--json", help="Print JSON instead of tables.")] = False
-) -> None:
+def show(file: File, as_json: Json = False) -> None:
     """Check a lab file as the bridge does, and show it with what was proved.
 
     Example: python -m pendulum_hw_bridge lab show lab.yaml
@@ -202,7 +201,7 @@ def prove_m_stop(file: File, yes: Yes = False) -> None:
 @app.command()
 def backup(
     file: File,
-    out: Annotated[Path | None, typer.Option(help="New folder. Default: beside the lab file, with the time.")] = None,
+    out: Annotated[Path | None, out_option("New folder. Default: beside the lab file, with the time.")] = None,
 ) -> None:
     """Keep the module's gains, safety parameters and M-stop action in files, as they are now.
 

@@ -24,6 +24,7 @@ from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.parameters import validate
 from pendulum_msgs_py.plants.lab_file import load_lab
 from pendulum_msgs_py.programs.executables import cli_main
+from pendulum_msgs_py.programs.options import Json
 from pendulum_msgs_py.programs.terminal import WholeTable, make_console
 
 __all__ = ["main"]
@@ -48,7 +49,7 @@ def scan(
     module_type: Annotated[str | None, typer.Option(help="Type that it must be of; default X5-9.")] = None,
     emulator_address: Annotated[str | None, typer.Option(help="HOST:PORT of an emulator process.")] = None,
     look_time: Annotated[float, typer.Option(help="Time to look for [s].", min=0.25, max=60.0)] = LOOK_TIME,
-    as_json: Annotated[bool, typer.Option("--json", help="Print JSON instead of a table.")] = False,
+    as_json: Json = False,
 ) -> int:
     """List the actuators that answer; nothing is set and nothing moves.
 

@@ -5,11 +5,11 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, field
 
-from pendulum_hw_bridge.actuator import ActuatorError, ActuatorPort, HardwareLimits
+from pendulum_hw_bridge.actuator import ActuatorError, ActuatorPort, EncoderPort, HardwareLimits
 from pendulum_hw_bridge.command_check import check_lifetime
 from pendulum_hw_bridge.gains import GainSet, differing_gain
 
-__all__ = ["BridgeSettings", "expect_limits", "write_limits", "write_settings"]
+__all__ = ["BridgeSettings", "expect_limits", "write_limits", "write_rate", "write_settings"]
 
 
 @dataclass(frozen=True)
@@ -64,9 +64,22 @@ def write_limits(port: ActuatorPort, settings: BridgeSettings) -> None:
     """
     lifetime = port.set_command_lifetime(check_lifetime(settings.command_lifetime))
     _expect("command lifetime", lifetime, settings.command_lifetime, "s")
+    write_rate(port, settings)
+    expect_limits(port.set_limits(settings.limits), settings.limits)
+
+
+def write_rate(port: EncoderPort, settings: BridgeSettings) -> None:
+    """Write the feedback rate, and refuse a module that does not keep it.
+
+    Args:
+        port: A connected module.
+        settings: What to write.
+
+    Raises:
+        ActuatorError: Not acknowledged, or another rate reads back.
+    """
     rate = port.set_feedback_rate(settings.feedback_rate)
     _expect("feedback rate", rate, settings.feedback_rate, "Hz")
-    expect_limits(port.set_limits(settings.limits), settings.limits)
 
 
 def expect_limits(reads: HardwareLimits, wanted: HardwareLimits) -> None:

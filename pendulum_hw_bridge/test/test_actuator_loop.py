@@ -18,6 +18,7 @@ from pendulum_hw_bridge.emulation.faults import ActuatorFault
 from pendulum_hw_bridge.emulation.parameters import load_emulator
 from pendulum_hw_bridge.emulation.x5 import EmulatedX5
 from pendulum_hw_bridge.gains import DEFAULT_GAINS
+from pendulum_hw_bridge.module import DrivenModule
 from pendulum_hw_bridge.safety import SafetyLimits, SafetyMonitor
 from pendulum_hw_bridge.settings import BridgeSettings
 from pendulum_msgs_py.contract.shared_supervisor import SharedSupervisor
@@ -37,13 +38,13 @@ class Running:
         self.supervisor = SharedSupervisor(
             PlantLimits(effort=(13.0,), command_timeout=0.5, feedback_timeout=0.5), self._prepare
         )
-        self.bridge = Bridge(
+        self.module = DrivenModule(
             self.port,
-            self.supervisor,
             EffortMapping(EffortStrategy.DIRECT_PWM, parameters.drivetrain),
             SafetyMonitor(SafetyLimits(feedback_cycles=50), 0.01, parameters.drivetrain),
             BridgeSettings(gains=DEFAULT_GAINS[3], command_lifetime=1.0),
         )
+        self.bridge = Bridge([self.module], self.supervisor)
         self.states: list[JointSample] = []
         self.outcomes: list[tuple[int, Outcome]] = []
         self.errors: list[str] = []
@@ -67,8 +68,8 @@ class Running:
     def _take_inputs(self, wait: float) -> None:
         self.take_inputs(wait)
 
-    def _on_state(self, sample: JointSample, feedback: Feedback) -> None:
-        assert feedback.stamp_ns == sample.stamp_ns
+    def _on_state(self, sample: JointSample, records: tuple[Feedback, ...]) -> None:
+        assert [record.stamp_ns for record in records] == [sample.stamp_ns]
         self.threads.add(threading.get_ident())
         self.states.append(sample)
         self.on_state(sample)
@@ -102,7 +103,7 @@ def test_states_come_from_one_thread_and_each_is_acted_upon_once(running: Runnin
     running.loop.call(lambda: None)
     assert running.threads == {running.loop._thread.ident}
     assert [stamp for stamp, _ in running.outcomes] == [sample.stamp_ns for sample in running.states]
-    assert all(outcome.effort == 0.0 for _, outcome in running.outcomes)
+    assert all(outcome.effort == (0.0,) for _, outcome in running.outcomes)
 
 
 def test_an_answer_is_acted_upon_in_the_cycle_of_its_state(running: Running) -> None:
@@ -113,8 +114,8 @@ def test_an_answer_is_acted_upon_in_the_cycle_of_its_state(running: Running) -> 
 
     running.arm()
     running.take_inputs = answer
-    running.until(lambda: running.outcomes[-1][1].effort != 0.0, "torque")
-    assert running.outcomes[-1][1].effort == pytest.approx(0.4, abs=1e-9)
+    running.until(lambda: running.outcomes[-1][1].effort != (0.0,), "torque")
+    assert running.outcomes[-1][1].effort == pytest.approx((0.4,), abs=1e-9)
     running.until(lambda: running.actuator.link.pwm != 0.0, "a duty on the motor")
     assert running.loop.statistics.latency.count > 0
 

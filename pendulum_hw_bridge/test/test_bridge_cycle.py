@@ -7,102 +7,16 @@ from typing import Any
 
 import pytest
 
-from pendulum_hw_bridge.actuator import ActuatorError, Applied, Command, Feedback, HardwareLimits, Strategy
-from pendulum_hw_bridge.bridge import Bridge, BridgeSettings
-from pendulum_hw_bridge.command_check import check_command
+from pendulum_hw_bridge.actuator import ActuatorError, Command, Feedback, HardwareLimits, Strategy
+from pendulum_hw_bridge.bridge import Bridge
 from pendulum_hw_bridge.effort_mapping import EffortMapping, EffortStrategy
-from pendulum_hw_bridge.gains import GainSet
+from pendulum_hw_bridge.module import DrivenModule
 from pendulum_hw_bridge.safety import SafetyLimits, SafetyMonitor
+from pendulum_hw_bridge.settings import BridgeSettings
 from pendulum_msgs_py.contract.drive import Drive, DriveKind
 from pendulum_msgs_py.contract.supervisor import Mode, PlantLimits, PlantSupervisor
-from pendulum_msgs_py.plants.plant_parameters import SeriesElasticParameters
 from tests.feedback_records import feedback_record
-
-PERIOD = 2.0**-6
-STEP = 15_625_000
-TIMEOUT = 3 * STEP
-MILLISECOND = 1_000_000
-SECOND = 1_000_000_000
-# R / (N V K_t) is 1/4 per newton metre at 32 V.
-DRIVETRAIN = SeriesElasticParameters(
-    gear_ratio=4.0, torque_constant=0.5, back_emf_constant=0.25, winding_resistance=16.0, supply_voltage=32.0
-)
-
-
-class Port:
-    """An actuator of which a test says what happens: time passes, records come, and calls fail, as it wants."""
-
-    def __init__(self) -> None:
-        self.time_ns = SECOND
-        self.tick_ns = 0
-        self.calls: list[str] = []
-        self.commands: list[Command] = []
-        self.pushes: list[float] = []
-        self.strategy = Strategy.OFF
-        self.limits = HardwareLimits()
-        self.records: list[Feedback | None] = []
-        self.fails: dict[str, Exception] = {}
-        self.takes: dict[str, int] = {}
-        self.reads_strategy: Strategy | None = None
-        self.gains: GainSet | None = None
-
-    def _called(self, name: str) -> None:
-        self.calls.append(name)
-        self.time_ns += self.takes.get(name, 0)
-        if name in self.fails:
-            raise self.fails[name]
-
-    def now_ns(self) -> int:
-        self.time_ns += self.tick_ns
-        return self.time_ns
-
-    def connect(self) -> Any:
-        self._called("connect")
-        return f"connected {self.calls.count('connect')}"
-
-    def read(self, timeout: float) -> Feedback | None:
-        self.calls.append(f"read {timeout}")
-        self.time_ns += self.takes.get("read", 0)
-        if "read" in self.fails:
-            raise self.fails["read"]
-        return self.records.pop(0) if self.records else None
-
-    def write(self, command: Command) -> Applied:
-        self._called("write")
-        limited, changed = check_command(command, self.strategy, self.limits)
-        self.commands.append(limited)
-        return Applied(limited, self.strategy, changed, self.time_ns)
-
-    def set_strategy(self, strategy: Strategy, command: Command | None = None) -> Strategy:
-        self._called(f"strategy {int(strategy)}")
-        self.strategy = strategy
-        self.commands.append(command or Command())
-        return strategy if self.reads_strategy is None else self.reads_strategy
-
-    def set_gains(self, gains: GainSet) -> GainSet:
-        self._called("gains")
-        self.gains = gains
-        return gains
-
-    def set_limits(self, limits: HardwareLimits) -> HardwareLimits:
-        self._called("limits")
-        return limits
-
-    def set_command_lifetime(self, lifetime: float) -> float:
-        return lifetime
-
-    def set_feedback_rate(self, rate: float) -> float:
-        return rate
-
-    def stop(self) -> None:
-        self._called("stop")
-        self.strategy = Strategy.OFF
-
-    def close(self) -> None:
-        self._called("close")
-
-    def push(self, effort: float) -> None:
-        self.pushes.append(effort)
+from tests.scripted_port import DRIVETRAIN, MILLISECOND, PERIOD, SECOND, STEP, TIMEOUT, Port
 
 
 class Rig:
@@ -114,13 +28,13 @@ class Rig:
         self.monitor = SafetyMonitor(
             SafetyLimits(winding_current=0.0, pwm_tolerance=9.0, command_tolerance=9.0), PERIOD, DRIVETRAIN
         )
-        self.bridge = Bridge(
+        self.module = DrivenModule(
             self.port,  # type: ignore[arg-type]
-            self.supervisor,
             EffortMapping(kind, DRIVETRAIN, effort_limit=2.0),
             self.monitor,
             BridgeSettings(**settings),
         )
+        self.bridge = Bridge([self.module], self.supervisor)
         self.count = 0
 
     def record(self, **given: Any) -> Feedback:
@@ -132,7 +46,7 @@ class Rig:
         """Let a record come and the bridge observe it."""
         self.port.time_ns += after_ns
         self.port.records.append(self.record(**given))
-        return self.bridge.observe(0.01)
+        return None if self.bridge.observe(0.01) is None else self.module.feedback
 
     def connected(self) -> Rig:
         """Connect and see a record."""
@@ -168,11 +82,11 @@ OFF = Drive(DriveKind.OFF)
 
 def test_it_connects_switches_off_sets_everything_and_asks_again_who_it_is() -> None:
     rig = Rig()
-    assert rig.bridge.connect() == rig.bridge.info == "connected 2"
+    assert rig.bridge.connect() == (rig.module.info,) == ("connected 2",)
     assert rig.port.calls == ["connect", "strategy 0", "limits", "gains", "connect"]
     # The loops are limited as for the highest supply there may be, as long as none was measured.
-    assert rig.port.gains == rig.bridge.mapping.limited_gains(50.0)
-    assert rig.bridge._output.gains == rig.port.gains
+    assert rig.port.gains == rig.module.mapping.limited_gains(50.0)
+    assert rig.module._output.gains == rig.port.gains
 
 
 def test_a_module_that_does_not_switch_off_is_not_connected() -> None:
@@ -191,7 +105,7 @@ def test_a_drive_is_prepared_with_settings_of_the_measured_supply_and_zero_torqu
     assert rig.bridge.prepare() == ""
     assert rig.port.calls == ["limits", "gains", "strategy 1"]
     assert rig.port.commands[-1].pwm == 0.0
-    assert rig.port.gains == rig.bridge.mapping.limited_gains(32.0)
+    assert rig.port.gains == rig.module.mapping.limited_gains(32.0)
 
 
 def test_a_drive_is_not_prepared_with_a_present_fault() -> None:
@@ -267,7 +181,7 @@ def test_a_preparation_lasts_a_second_and_ends_behind_an_e_stop_or_an_armed_driv
         rig = Rig().connected()
         assert rig.bridge.prepare() == ""
         rig.bridge._turn_ns = rig.port.time_ns = rig.port.time_ns + after_ns
-        assert rig.bridge.carry_out(OFF).effort == 0.0
+        assert rig.bridge.carry_out(OFF).effort == (0.0,)
         assert (rig.port.strategy is Strategy.DIRECT_PWM) == driving
     rig = Rig().connected()
     assert rig.bridge.prepare() == ""
@@ -386,7 +300,7 @@ def test_a_good_record_becomes_the_sample_and_a_repeated_one_does_not() -> None:
     rig = Rig(joint_sign=-1, joint_offset=0.5, effort_tare=0.25)
     rig.bridge.connect()
     record = rig.see(position=0.25, velocity=0.125, effort=2.0)
-    assert rig.bridge.feedback is record is not None
+    assert rig.module.feedback is record is not None
     sample = rig.bridge.sample
     assert sample is not None
     assert sample == (record.stamp_ns, (0.25,), (-0.125,), (-2.25,))
@@ -404,13 +318,12 @@ def test_a_good_record_becomes_the_sample_and_a_repeated_one_does_not() -> None:
 def test_the_motor_watch_sees_each_record() -> None:
     rig = Rig()
     rig.see(voltage=40.0)
-    assert rig.bridge._motor.state.voltage == 40.0
-    assert rig.monitor.output is rig.bridge._output
+    assert rig.module._motor.state.voltage == 40.0
+    assert rig.monitor.output is rig.module._output
     assert (
-        Bridge(
+        DrivenModule(
             rig.port,  # type: ignore[arg-type]
-            rig.supervisor,
-            rig.bridge.mapping,
+            rig.module.mapping,
             rig.monitor,
             BridgeSettings(limits=HardwareLimits(pwm=0.25)),
         )._output._pwm_limit
@@ -529,8 +442,8 @@ def test_a_pause_before_or_in_a_read_or_before_driving_is_a_stall_beyond_the_tim
     assert outcome.fault == fault
     assert (outcome.drive.kind is DriveKind.OFF) == bool(fault)
     assert outcome.drive.push == (0.5,)
-    assert (outcome.applied is None) == bool(fault)
-    assert outcome.effort == (0.0 if fault else 1.0)
+    assert (not outcome.applied) == bool(fault)
+    assert outcome.effort == (0.0 if fault else 1.0,)
     assert ahead.port.commands[-1].pwm == (0.0 if fault else 0.25)
 
 
@@ -562,20 +475,20 @@ def test_a_torque_is_sent_in_the_motors_sign_and_told_in_the_joints(sign: int) -
     outcome = rig.drive(1.0, push=(0.5,))
     assert rig.port.pushes == [0.5]
     assert rig.port.commands[-1].pwm == sign * 0.25
-    assert outcome.effort == 1.0
+    assert outcome.effort == (1.0,)
     assert outcome.fault == ""
-    assert outcome.applied is not None
+    assert len(outcome.applied) == 1
     # No more than the limit of 2 N m leaves, half of what the supply could make.
-    assert rig.drive(9.0).effort == 2.0
+    assert rig.drive(9.0).effort == (2.0,)
     assert rig.port.calls == ["write", "write"]
-    assert rig.drive(1.0, starved=True).effort == 0.0
+    assert rig.drive(1.0, starved=True).effort == (0.0,)
     assert rig.port.commands[-1].pwm == 0.0
 
 
 def test_a_port_without_a_hand_is_not_pushed() -> None:
     rig = Rig().armed()
     rig.port.push = None  # type: ignore[assignment,method-assign]
-    assert rig.drive().effort == 1.0
+    assert rig.drive().effort == (1.0,)
 
 
 def test_what_is_sent_is_what_the_monitor_compares() -> None:
@@ -593,7 +506,7 @@ def test_an_armed_plant_without_a_prepared_drive_is_a_fault_that_names_what_rele
     assert rig.supervisor.arm(rig.port.time_ns, rig.bridge.sample) == ""
     outcome = rig.drive(1.0, push=(0.5,))
     told = (outcome.drive.kind, outcome.drive.push, outcome.effort, outcome.fault)
-    assert told == (DriveKind.OFF, (0.5,), 0.0, "not_prepared")
+    assert told == (DriveKind.OFF, (0.5,), (0.0,), "not_prepared")
     assert rig.supervisor.reason == ("not_prepared: drive was released before it was armed; disarm, then arm again")
     assert rig.port.strategy is Strategy.OFF
     rig.supervisor.disarm(rig.port.time_ns)
@@ -605,9 +518,9 @@ def test_an_armed_plant_without_a_prepared_drive_is_a_fault_that_names_what_rele
 
 def test_without_feedback_nothing_is_driven() -> None:
     rig = Rig().armed()
-    rig.bridge.feedback = None
+    rig.module.feedback = None
     rig.port.calls.clear()
-    assert rig.drive().applied is None
+    assert not rig.drive().applied
     assert "write" not in rig.port.calls
 
 
@@ -616,7 +529,7 @@ def test_a_command_that_cannot_be_sent_is_a_fault_by_its_name() -> None:
     rig.port.fails["write"] = ActuatorError("send_failed", "network down")
     outcome = rig.drive(1.0, push=(0.5,))
     told = (outcome.drive.kind, outcome.drive.push, outcome.effort, outcome.fault)
-    assert told == (DriveKind.OFF, (0.5,), 0.0, "send_failed")
+    assert told == (DriveKind.OFF, (0.5,), (0.0,), "send_failed")
     assert rig.supervisor.reason == "send_failed: network down"
     assert rig.port.strategy is Strategy.OFF
 
@@ -625,7 +538,7 @@ def test_acting_asks_the_supervisor_and_counts_a_fault_of_its_own() -> None:
     rig = Rig().armed()
     outcome = rig.bridge.act()
     assert outcome.drive.starved
-    assert outcome.effort == 0.0
+    assert outcome.effort == (0.0,)
     # The pendulum is outside its window from now on.
     rig.supervisor.limits = replace(rig.supervisor.limits, position_min=(0.5,))
     outcome = rig.bridge.act()
@@ -659,7 +572,7 @@ def position(rig: Rig, **given: float) -> Command:
 @pytest.mark.parametrize("sign", [1, -1])
 def test_a_setpoint_goes_out_in_the_motors_angle_with_a_dither_that_turns_each_time(sign: int) -> None:
     rig = Rig(joint_sign=sign, joint_offset=0.5).armed()
-    dither = rig.bridge.mapping.dither
+    dither = rig.module.mapping.dither
     assert dither > 0.0
     for turn in (-1.0, 1.0, -1.0):
         command = position(rig, position=1.5, velocity=0.125)
@@ -674,7 +587,7 @@ def test_the_torque_in_force_passes_into_position_control_and_fades(sign: int) -
     rig = Rig(joint_sign=sign).armed()
     rig.drive(1.0)
     rig.see(velocity=sign * 0.125, pwm_command=sign * 0.375)
-    mapping, state = rig.bridge.mapping, rig.bridge._motor.state
+    mapping, state = rig.module.mapping, rig.module._motor.state
     offset, speed = mapping.handover(sign * 1.0, sign * 0.375, sign * 0.125, state)
     assert sign * offset > 0.0
     dither = mapping.dither
@@ -690,8 +603,8 @@ def test_the_torque_in_force_passes_into_position_control_and_fades(sign: int) -
     assert position(rig, handover=0.0).position == pytest.approx(dither)
     # The next one, which begins anew, has its own.
     rig.see(velocity=0.0, pwm_command=sign * 0.25)
-    effort = rig.bridge._effort
-    offset, _ = mapping.handover(effort, sign * 0.25, 0.0, rig.bridge._motor.state)
+    effort = rig.module._effort
+    offset, _ = mapping.handover(effort, sign * 0.25, 0.0, rig.module._motor.state)
     assert position(rig, handover=1.0).position == pytest.approx(offset - dither)
 
 
@@ -700,11 +613,11 @@ def test_a_drive_that_begins_with_a_trajectory_hands_over_no_torque_but_the_spee
     rig.see(velocity=0.125, pwm_command=0.25)
     drive = Drive(DriveKind.POSITION, position=(0.0,), velocity=(0.0,), handover=1.0)
     outcome = rig.bridge.carry_out(drive, was_armed=True)
-    assert outcome.applied is not None
-    assert not outcome.applied.limited
-    offset, speed = rig.bridge.mapping.handover(0.0, 0.25, 0.125, rig.bridge._motor.state)
+    assert len(outcome.applied) == 1
+    assert not outcome.applied[0].limited
+    offset, speed = rig.module.mapping.handover(0.0, 0.25, 0.125, rig.module._motor.state)
     command = rig.port.commands[-1]
-    assert command.position == pytest.approx(offset - rig.bridge.mapping.dither)
+    assert command.position == pytest.approx(offset - rig.module.mapping.dither)
     assert 0.0 < command.velocity <= speed
 
 
@@ -714,7 +627,7 @@ def test_effort_control_between_two_trajectories_makes_the_second_hand_over_its_
     position(rig, handover=1.0)
     rig.drive(2.0)
     rig.see(pwm_command=0.5)
-    offset, _ = rig.bridge.mapping.handover(2.0, 0.5, 0.0, rig.bridge._motor.state)
+    offset, _ = rig.module.mapping.handover(2.0, 0.5, 0.0, rig.module._motor.state)
     assert offset > 0.1
     assert position(rig, handover=0.5).position == pytest.approx(0.5 * offset, abs=0.01)
 
@@ -725,7 +638,7 @@ def test_after_a_release_no_torque_of_before_is_handed_over() -> None:
     position(rig, handover=1.0)
     rig.drive(2.0)
     rig.released_and_armed_again()
-    assert abs(position(rig, handover=1.0).position) == rig.bridge.mapping.dither
+    assert abs(position(rig, handover=1.0).position) == rig.module.mapping.dither
 
 
 def test_a_release_in_a_hand_over_leaves_nothing_of_it() -> None:
@@ -733,7 +646,7 @@ def test_a_release_in_a_hand_over_leaves_nothing_of_it() -> None:
     rig.drive(2.0)
     assert position(rig, handover=1.0).position > 0.1
     rig.released_and_armed_again()
-    assert abs(position(rig, handover=0.5).position) == rig.bridge.mapping.dither
+    assert abs(position(rig, handover=0.5).position) == rig.module.mapping.dither
 
 
 def test_a_strategy_that_does_not_read_back_ends_driving() -> None:

@@ -13,6 +13,7 @@ from pendulum_hw_bridge.emulation.faults import ActuatorFault
 from pendulum_hw_bridge.emulation.parameters import load_emulator
 from pendulum_hw_bridge.emulation.x5 import EmulatedX5
 from pendulum_hw_bridge.gains import DEFAULT_GAINS
+from pendulum_hw_bridge.module import DrivenModule
 from pendulum_hw_bridge.motor_state import MotorState
 from pendulum_hw_bridge.safety import SafetyLimits, SafetyMonitor
 from pendulum_hw_bridge.settings import BridgeSettings
@@ -37,13 +38,13 @@ class Plant:
             effort=(13.0,), feedback_timeout=0.04, velocity=1.5, position_min=(-4.0,), position_max=(4.0,)
         )
         self.supervisor = SharedSupervisor(limits, self._prepare, self._withdraw)
-        self.bridge = Bridge(
+        self.module = DrivenModule(
             self.port,
-            self.supervisor,
             EffortMapping(kind, parameters.drivetrain),
             SafetyMonitor(SafetyLimits(), 0.01, parameters.drivetrain),
             BridgeSettings(gains=DEFAULT_GAINS[3]),
         )
+        self.bridge = Bridge([self.module], self.supervisor)
         self.bridge.connect()
         self.regulating = False
         self.duties: list[float] = []
@@ -68,7 +69,7 @@ class Plant:
                     Input.EFFORT_COMMAND, JointCommand.of_one(sample.stamp_ns, effort, "c"), self.port.now_ns()
                 )
             outcome = self.bridge.act()
-            self.supervisor.report_applied((outcome.effort,))
+            self.supervisor.report_applied(outcome.effort)
             self.duties.append(self.actuator.link.pwm)
 
     def arm(self) -> str:
@@ -240,9 +241,9 @@ def test_a_settings_that_does_not_read_back_stops_the_connection() -> None:
 
 def test_joint_offset_and_sign_turn_everything_that_the_joint_sees() -> None:
     plant = Plant(position=0.3)
-    plant.bridge.settings = BridgeSettings(gains=DEFAULT_GAINS[3], joint_sign=-1, joint_offset=1.0)
+    plant.module.settings = BridgeSettings(gains=DEFAULT_GAINS[3], joint_sign=-1, joint_offset=1.0)
     plant.cycles(2)
-    sample, feedback = plant.bridge.sample, plant.bridge.feedback
+    sample, feedback = plant.bridge.sample, plant.module.feedback
     assert sample is not None
     assert feedback is not None
     assert sample.position[0] == pytest.approx(1.0 - feedback.position)
@@ -250,15 +251,14 @@ def test_joint_offset_and_sign_turn_everything_that_the_joint_sees() -> None:
     assert plant.arm() == ""
     plant.supervisor.offer(Input.EFFORT_COMMAND, JointCommand.of_one(sample.stamp_ns, 1.0, "c"), plant.port.now_ns())
     outcome = plant.bridge.act()
-    assert outcome.effort == pytest.approx(1.0)
-    assert outcome.applied is not None
-    assert outcome.applied.command.pwm < 0.0
+    assert outcome.effort == pytest.approx((1.0,))
+    assert outcome.applied[0].command.pwm < 0.0
 
 
 @pytest.mark.parametrize("kind", list(EffortStrategy))
 @pytest.mark.parametrize("voltage", [24.0, 36.0, 48.0])
 def test_torque_to_setpoint_and_back(kind: EffortStrategy, voltage: float) -> None:
-    mapping = Plant(kind=kind).bridge.mapping
+    mapping = Plant(kind=kind).module.mapping
     moving = MotorState(voltage, 0.3)
     for effort in (-5.0, 0.0, 0.3, 9.0):
         assert mapping.effort_of(mapping.command(effort, moving), moving, 0.7) == pytest.approx(effort, abs=1e-12)

@@ -52,6 +52,18 @@ def test_a_link_turned_by_hand_feels_that_damping(temperature: float) -> None:
     assert 6.0 / speed == pytest.approx(flat.shorted_winding_damping(temperature), rel=1e-3)
 
 
+def test_friction_that_grows_with_the_load_holds_the_emulated_link() -> None:
+    def swing(load: float) -> float:
+        parameters = load_emulator("thesis")
+        plant = parameters.plant.with_values(coulomb_friction=0.0, damping=0.0, load_friction=load)
+        actuator = x5(replace(parameters, plant=plant), position=0.5)
+        actuator.advance_to(actuator.now_ns + SECOND // 5)
+        return abs(actuator.link.position - 0.5)
+
+    # More than gravity itself: it stays where it was left, but for what the spring's swing moves it.
+    assert swing(2.0) < 0.05 * swing(0.0)
+
+
 def test_with_the_command_gone_the_winding_stays_shorted() -> None:
     parameters = replace(load_emulator("thesis"), flat=True)
     driven, left = x5(parameters), x5(parameters)

@@ -29,6 +29,7 @@ from pendulum_hw_bridge.clocks import SteppedClock
 from pendulum_hw_bridge.effort_mapping import EffortMapping, EffortStrategy
 from pendulum_hw_bridge.emulation.parameters import load_emulator
 from pendulum_hw_bridge.gains import DEFAULT_GAINS, GAIN_FIELDS, LOOPS
+from pendulum_hw_bridge.module import DrivenModule
 from pendulum_hw_bridge.safety import SafetyLimits, SafetyMonitor
 from pendulum_hw_bridge.settings import BridgeSettings
 from pendulum_msgs_py.contract.supervisor import Drive, DriveKind, PlantLimits, PlantSupervisor
@@ -302,13 +303,13 @@ def test_a_bridge_drives_a_module_arms_it_and_leaves_it_off(module: Module) -> N
     mapping = EffortMapping(EffortStrategy.DIRECT_PWM, drivetrain, effort_limit=2.0)
     supervisor = PlantSupervisor(PlantLimits(effort=(2.0,)))
     limits = HardwareLimits(effort=2.0, velocity=1.0, position_min=-3.0, position_max=3.0)
-    bridge = Bridge(
+    driven = DrivenModule(
         port,
-        supervisor,
         mapping,
         SafetyMonitor(SafetyLimits(winding_current=0.0), 0.01, drivetrain),
         BridgeSettings(limits=limits),
     )
+    bridge = Bridge([driven], supervisor)
     module.values = {"voltage": 36.0, "velocity": 0.0, "pwm_command": 0.0, "motor_winding_temperature": 25.0}
     bridge.connect()
     module.states.update(temperature_state=0)

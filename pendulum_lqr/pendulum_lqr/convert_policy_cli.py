@@ -11,6 +11,7 @@ import typer
 
 from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.programs.executables import cli_main, typed_options
+from pendulum_msgs_py.programs.options import out_option
 from pendulum_msgs_py.programs.terminal import make_console
 
 if TYPE_CHECKING:
@@ -26,7 +27,7 @@ _OF_IMPORT = ("plant", "period", "observation", "history", "velocity_scale", "ve
 def convert_policy(
     context: typer.Context,
     source: Annotated[Path, typer.Argument(help="Policy file (.npz), or an archive of Stable-Baselines3 (.zip).")],
-    out: Annotated[Path, typer.Option("--out", "-o", help="ONNX model or policy file; it must be new.")],
+    out: Annotated[Path, out_option("ONNX model or policy file; it must be new.")],
     plant: Annotated[str, typer.Option(help="Plant on which the archive's policy was trained: preset or file.")] = "",
     period: Annotated[float, typer.Option(help="Time between two of its answers [s]; Pendulum-v1 has 0.05.")] = 0.0,
     observation: Annotated[

@@ -30,6 +30,7 @@ from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.plants.mechanism_parameters import load_mechanism
 from pendulum_msgs_py.plants.plant_parameters import MECHANISM_PRESETS, PRESET_NAMES, is_mechanism, load_plant
 from pendulum_msgs_py.programs.executables import cli_main
+from pendulum_msgs_py.programs.options import Json
 from pendulum_msgs_py.programs.terminal import make_console
 
 __all__ = ["THESIS_CHOICE", "THESIS_WEIGHTS", "app", "main", "read_diagonal"]
@@ -82,7 +83,7 @@ def design(
             "amplitude=0.3, or period=0.002 (of the loop, 0.01 s without it); may be given again."
         ),
     ] = None,
-    as_json: Annotated[bool, typer.Option("--json", help="Print JSON instead of tables.")] = False,
+    as_json: Json = False,
 ) -> None:
     """Design LQR gains: eigenvalues, K, margins, largest stable sampling period, figures in time, worst case.
 

@@ -150,13 +150,20 @@ class MechanismCatch:
         return within_limits(-self.gain.K @ deviation, self.plant.effort_limits)
 
 
-def make_mechanism_catch(plant: MechanismParameters, q: ArrayLike, r: ArrayLike) -> MechanismCatch:
+def make_mechanism_catch(
+    plant: MechanismParameters, q: ArrayLike, r: ArrayLike, limits: Vector | None = None
+) -> MechanismCatch:
     """Return the LQR of a plant about upright with its sampled region (a second or so).
 
     Args:
         plant: The plant.
         q: Weights of deviations, then velocities, shape (2n,).
         r: Weight of the efforts.
+        limits: Largest effort of each driven joint, where less than the plant's is allowed: from fewer states they
+            suffice [N m or N].
     """
+    if limits is not None:
+        allowed = zip(plant.coordinates.driven_names, limits, plant.effort_limits, strict=True)
+        plant = plant.with_values({f"{joint}.effort_limit": min(limit, own) for joint, limit, own in allowed})
     gain = mechanism_lqr(linearise_mechanism(plant), q, r)
     return MechanismCatch(plant, gain, sample_caught_region(plant, gain))

@@ -9,6 +9,7 @@ from pathlib import Path
 from pendulum_lqr.mechanism_catch import MechanismCatch, make_mechanism_catch
 from pendulum_lqr.mechanism_controller import MechanismController
 from pendulum_lqr.mechanism_mpc import MechanismMpc
+from pendulum_lqr.mechanism_policy import CATCH_SUFFIX, MechanismPolicy, is_policy_name
 from pendulum_lqr.mechanism_trajectory import MechanismTrajectory, load_trajectory
 from pendulum_lqr.mechanism_tvlqr import MechanismTvlqr
 from pendulum_lqr.mechanism_velocity import DifferencedVelocity
@@ -79,13 +80,20 @@ def make_mechanism_controller(name: str, plant: MechanismParameters, period: flo
     """Design a controller; mpc compiles for some ten seconds the first time.
 
     Args:
-        name: Of :func:`mechanism_controller_names`.
+        name: Of :func:`mechanism_controller_names`, or the path of a policy file, ``FILE.npz``; of ``FILE.npz+lqr``
+            an LQR takes over near upright.
         plant: The plant that it believes in.
         period: Sampling period [s].
 
     Raises:
         ParameterError: No controller has this name, or it does not go with this plant.
+        DataError: A policy file is refused.
     """
+    if is_policy_name(name):
+        catch = make_mechanism_catch(plant, *_CALM) if name.endswith(CATCH_SUFFIX) else None
+        return MechanismPolicy(plant, period, name.removesuffix(CATCH_SUFFIX), catch)
     if name not in _CONTROLLERS:
-        raise ParameterError(f"controller {name!r} is unknown; expected one of {', '.join(_CONTROLLERS)}")
+        raise ParameterError(
+            f"controller {name!r} is unknown; expected one of {', '.join(_CONTROLLERS)}, or a policy file (.npz)"
+        )
     return _CONTROLLERS[name](plant, period)

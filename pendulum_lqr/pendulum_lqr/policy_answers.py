@@ -133,6 +133,10 @@ class PolicyAnswers:
         self._effort = self.begun(t, wanted)
         return self._effort
 
+    def follow(self, efforts: Vector) -> None:
+        """Take note of efforts that another controller applied in place of the last answer [N m or N]."""
+        self._effort = efforts
+
     def fall_back(self, t: float, answer: Callable[[], Sequence[float]] | None) -> Vector:
         """Return the efforts of a fallback, softly begun; none where there is none or it gives no numbers.
 

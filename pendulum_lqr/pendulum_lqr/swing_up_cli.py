@@ -17,6 +17,7 @@ from pendulum_lqr.mechanism_ilqr import IlqrWeights
 from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.programs.counted_progress import counting_bar
 from pendulum_msgs_py.programs.executables import cli_main
+from pendulum_msgs_py.programs.options import out_option
 from pendulum_msgs_py.programs.terminal import make_console
 
 __all__ = ["app", "main"]
@@ -34,11 +35,11 @@ def swing_up(
     first: Annotated[int, typer.Option(help="First seed of the random guesses.", min=0)] = 0,
     guesses: Annotated[int, typer.Option(help="Random guesses; the cheapest that ends upright is kept.", min=1)] = 100,
     duration: Annotated[float, typer.Option(help="Length of the trajectory [s].", min=0.5)] = 4.0,
-    output: Annotated[Path, typer.Option(help="File to write (JSON).")] = Path("build/swing_up.json"),
+    output: Annotated[Path, out_option("File to write (JSON).")] = Path("build/swing_up.json"),
 ) -> None:
     """Search a swing-up by iterative LQR from random guesses: half a second each, some ten seconds of compiling before.
 
-    Example: python -m pendulum_lqr swing_up --preset pendubot_frictionless --guesses 20 --output build/pendubot.json
+    Example: python -m pendulum_lqr swing_up --preset pendubot_frictionless --guesses 20 --out build/pendubot.json
     """
     from pendulum_lqr.design import DesignError
     from pendulum_lqr.mechanism_controllers import default_catch

@@ -17,6 +17,7 @@ from numpy.typing import ArrayLike, NDArray
 from pendulum_lqr.model import LinearModel, low_frequency
 from pendulum_msgs_py.dynamics.rigid import gravity_torque
 from pendulum_msgs_py.plants.equilibrium import RigidPlant, drivetrain_of, offset_of
+from pendulum_msgs_py.plants.friction_terms import friction_of_terms
 
 __all__ = ["TimeFigures", "friction_band", "time_figures"]
 
@@ -104,7 +105,7 @@ def friction_band(plant: RigidPlant, model: LinearModel, K: ArrayLike) -> float:
     """
     gain = np.asarray(K, dtype=np.float64)
     weight = abs(gravity_torque(model.theta - offset_of(plant, "angle_offset"), plant.gravity))
-    static = offset_of(plant, "static_friction") + offset_of(plant, "load_friction") * weight
+    static = offset_of(plant, "static_friction") + friction_of_terms(plant, weight)
     band = static * abs(_rest(model, gain, model.E))
     drive = drivetrain_of(plant)
     if drive is not None:

@@ -112,6 +112,62 @@ def test_a_chosen_fallback_answers_after_it_gave_up_and_begins_softly(tmp_path):
     assert efforts[-1] == lqr.command(0.0, *state)[0] != 0.0
 
 
+def test_a_catch_takes_over_near_upright_and_the_policy_goes_on_from_its_efforts(tmp_path):
+    policy = random_policy(CART_POLE, effort_rate=(20.0,), seed=5)
+    bare, caught = controller(tmp_path, policy), controller(tmp_path, policy, catch="lqr")
+    lqr = make_joint_controller("lqr", CART_POLE, {}, 0.01)
+    near, far = ((0.02, math.pi + 0.05), (0.1, 0.0)), ((0.1, 1.0), (0.1, 1.0))
+    assert "LQR within x'Sx <=" in caught.describe()
+    assert "LQR within" not in bare.describe()
+    for k in range(3):
+        assert caught.command(0.01 * k, *far) == bare.command(0.01 * k, *far)
+    effort = caught.command(0.03, *near)[0]
+    assert effort == pytest.approx(lqr.command(0.03, *near)[0])
+    assert abs(effort - bare.command(0.03, *near)[0]) > 1.0
+    # Its rate is limited from what acted, 0.2 N in a period.
+    assert caught.command(0.04, *far)[0] == pytest.approx(effort, abs=0.2 + 1e-9)
+    # Who gave up is not caught: its fallback answers.
+    caught.command(0.05, *near)
+    assert caught.catch.active
+    caught.command(0.06, (0.9, 0.0), (0.0, 0.0))
+    assert caught.command(0.07, *near) == (0.0,)
+    caught.reset()
+    assert not caught.catch.active
+    # A state between the region's edge and twice that is held on by who holds already, after new parameters too.
+    level, S = caught.catch.region.level, caught.catch.gain.S
+    away = math.sqrt(1.5 * level / S[1, 1])
+    between = ((0.0, math.pi + away), (0.0, 0.0))
+    caught.command(0.0, *near)
+    caught.command(0.01, *between)
+    assert caught.catch.active
+    changed = controller(tmp_path, policy, catch="lqr", start_time=0.3)
+    changed.carry_over(caught)
+    changed.command(0.02, *between)
+    assert changed.catch.active
+    caught.reset()
+    assert not caught.catch.active
+    caught.command(0.0, *between)
+    assert not caught.catch.active
+    soft = controller(tmp_path, policy, catch="lqr", start_time=0.2)
+    assert soft.command(0.0, *near) == (0.0,)
+    assert abs(soft.command(0.01, *near)[0]) == pytest.approx(0.5)
+
+
+def test_with_less_effort_a_catch_holds_fewer_states(tmp_path):
+    policy = random_policy(CART_POLE, seed=5)
+    whole = controller(tmp_path, policy, catch="lqr")
+    weak = controller(tmp_path, policy, catch="lqr", effort_limit=1.0)
+    # Deviations that a limited effort brings back grow with it, so the level, a square, falls by far more.
+    assert weak.catch.region.level < 0.1 * whole.catch.region.level
+    state = ((0.0, math.pi + 0.3 * math.sqrt(whole.catch.region.level / whole.catch.gain.S[1, 1])), (0.0, 0.0))
+    whole.command(0.0, *state)
+    weak.command(0.0, *state)
+    assert whole.catch.active
+    assert not weak.catch.active
+    near = ((0.0, math.pi + 0.01), (0.0, 0.0))
+    assert abs(weak.command(0.01, *near)[0]) <= 1.0
+
+
 def test_torque_begins_at_zero_and_states_at_another_rate_make_it_give_up(tmp_path):
     learned = controller(tmp_path, random_policy(CART_POLE, seed=4), start_time=0.2)
     efforts = [abs(learned.command(0.01 * k, *STILL)[0]) for k in range(15)]

@@ -146,7 +146,7 @@ def test_a_search_whose_file_cannot_be_written_ends_before_it_begins(
 ) -> None:
     monkeypatch.setattr("pendulum_lqr.mechanism_trajectory.search_swing_up", lambda *_: pytest.fail("searched"))
     (tmp_path / "file").touch()
-    assert swing_up_cli.main(["--guesses", "1", "--output", f"{tmp_path}/file/x.json"]) == 2
+    assert swing_up_cli.main(["--guesses", "1", "--out", f"{tmp_path}/file/x.json"]) == 2
     assert "file/x.json cannot be written: " in capsys.readouterr().err
 
 

@@ -165,6 +165,26 @@ def test_a_change_of_parameters_makes_no_jump_of_reference_or_torque(change, at,
     assert tuple(second.motion(t + 4.01)) == pytest.approx(tuple(second.reference.at(t + 4.01)))
 
 
+def test_after_a_change_of_parameters_the_reference_goes_on_and_is_not_joined_from_where_the_pendulum_is():
+    first = tracking(DFKI, amplitude=0.2)
+    first.command(0.0, (0.0, 0.0))
+    second = tracking(DFKI, amplitude=0.3)
+    second.carry_over(first)
+    # Behind the reference by 0.1 rad: joined anew, it would begin here.
+    behind = first.motion(0.01).angle - 0.1
+    second.command(0.01, (behind, 0.0))
+    assert second.motion(0.01).angle == pytest.approx(first.motion(0.01).angle, abs=1e-3)
+
+
+def test_a_change_of_parameters_of_one_that_gives_no_torque_makes_no_reference_where_the_pendulum_is_not():
+    first = tracking(DFKI, max_error=3.1)
+    assert first.command(0.0, (-3.0, 0.0)) == 0.0
+    second = tracking(DFKI, amplitude=0.2, max_error=3.1)
+    second.carry_over(first)
+    assert second.command(0.01, (-3.0, 0.0)) == 0.0
+    assert "no way onto the reference" in second.notice
+
+
 @pytest.mark.parametrize("distance", np.linspace(0.4, 3.0, 14))
 def test_another_reference_that_is_never_reached_in_time_is_joined_over_longer(distance):
     first = tracking(THESIS, set_point=-0.5 * distance, amplitude=0.0)

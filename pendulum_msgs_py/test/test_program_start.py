@@ -125,6 +125,8 @@ def test_a_program_that_told_of_its_interruption_is_not_told_of_again(capsys: py
         (["--help", "--help"], 0, ""),
         (["--code", "4", "--code", "5", "--help"], 0, ""),
         (["1.0", "--out", __file__], 2, f"error: {__file__} cannot be read or written: File exists\n"),
+        (["1.0", "--output", __file__], 2, f"error: {__file__} cannot be read or written: File exists\n"),
+        (["1.0", "--out", "a", "--output", "b"], 2, "error: --out is given 2 times; expected once\n"),
         (["1.0", "--out", f"{__file__}/folder"], 2, f"error: {__file__}/folder cannot be read or written: Not a"),
     ],
 )

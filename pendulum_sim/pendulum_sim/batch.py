@@ -23,7 +23,7 @@ from pendulum_msgs_py.contract.angles import UPRIGHT
 from pendulum_msgs_py.contract.noise import stream_key
 from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.plants.plant_parameters import PlantParameters
-from pendulum_sim.dry_friction import PACKED
+from pendulum_sim.dry_friction import DRY, LAG, PACKED
 from pendulum_sim.integrators import get_integrator
 from pendulum_sim.plant import check_step, pack
 from pendulum_sim.stability import MOST_GROWTH, check_stability, growth_rate
@@ -158,7 +158,7 @@ def simulate_batch(
         check_stability(integrator, plants[min(worst, len(plants) - 1)].with_values(**values), dt, substeps, h)
     limits = np.array([plant.effort_limit for plant in plants])
     delays = np.array([plant.transport_delay for plant in plants])
-    smooth = not (delays.any() or packed[:, 4].any() or packed[:, 6].any() or packed[:, 9].any())
+    smooth = not (delays.any() or packed[:, DRY].any() or packed[:, LAG].any())
 
     keys = _spread(own_keys, size)
     record_of = np.empty((steps, 3, size)) if record else np.empty((0, 3, size))

@@ -14,10 +14,11 @@ import numba
 import numpy as np
 
 from pendulum_msgs_py.contract import noise
+from pendulum_msgs_py.dynamics.steps import actuator_torque
 from pendulum_msgs_py.programs.kept_kernels import keep_kernel
 from pendulum_sim import vector_math
 from pendulum_sim.compiling import compile_tree, tuple_loader
-from pendulum_sim.dry_friction import PACKED, acceleration_with_friction, actuator_torque, advance_dry
+from pendulum_sim.dry_friction import LAG, PACKED, acceleration_with_friction, advance_dry, is_dry
 from pendulum_sim.integrators import get_integrator
 
 __all__ = ["BLOCK", "block_loop", "coefficients_kernel", "general_kernel", "smooth_kernel"]
@@ -153,6 +154,7 @@ def general_kernel(method: str) -> Any:
     acceleration = compile_tree(acceleration_with_friction, inline=True)
     advance = compile_tree(advance_dry, inline=True)
     lagged = compile_tree(actuator_torque, inline=True)
+    has_dry_friction = compile_tree(is_dry, inline=True)
     load_plant = tuple_loader(_PLANT_ROWS, 1)
 
     @numba.njit(fastmath={"contract"}, error_model="numpy")
@@ -169,8 +171,8 @@ def general_kernel(method: str) -> Any:
     ) -> None:
         plant = load_plant(w, _PLANT // BLOCK)
         rate = plant[1] / plant[0]
-        dry = plant[4] > 0.0 or plant[6] > 0.0
-        lag = plant[9]
+        dry = has_dry_friction(plant)
+        lag = plant[LAG]
         periods = delay / dt
         if abs(periods - np.rint(periods)) < 1e-9:
             periods = np.rint(periods)

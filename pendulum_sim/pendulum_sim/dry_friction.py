@@ -3,7 +3,9 @@
 ::
 
     M_c theta'' + b_c theta' + F sgn(theta') + G_c sin(theta - theta_0) = tau + tau_0 + push
-    F = tau_C' + (tau_S' - tau_C') exp(-(theta' / v_s)^2),   tau' = tau + l |G_c sin(theta - theta_0)|
+    F = tau_C' + (tau_S' - tau_C') exp(-(theta' / v_s)^2),   tau' = tau + a(|theta'|, |G_c sin(theta - theta_0)|)
+
+a is the sum of the friction terms of :mod:`pendulum_msgs_py.plants.friction_terms`.
 
 Between events the direction of friction is fixed and the equation smooth, so each integrator keeps its
 order. A zero crossing of the velocity inside a step is located, and there the link sticks if friction can
@@ -16,17 +18,18 @@ the events located instead of a velocity band, which would creep.
 
 from __future__ import annotations
 
-import math
-
 from pendulum_msgs_py.dynamics import friction_magnitude, gravity_torque, rigid_acceleration
+from pendulum_msgs_py.dynamics.steps import actuator_torque, narrowed
+from pendulum_msgs_py.plants.friction_terms import STRENGTHS, TERM_PARAMETERS, added_friction
 from pendulum_sim.integrators import Acceleration, Coefficients, PlantTuple, Step
 
 __all__ = [
+    "DRY",
+    "LAG",
     "PACKED",
     "acceleration_with_friction",
-    "actuator_torque",
     "advance_dry",
-    "narrowed",
+    "is_dry",
     "static_friction_balance",
 ]
 
@@ -37,12 +40,17 @@ PACKED = (
     "coulomb_friction",
     "static_friction",
     "stribeck_velocity",
-    "load_friction",
     "torque_offset",
     "angle_offset",
     "actuator_time_constant",
+    *TERM_PARAMETERS,
 )
 """Order of the values in a ``PlantTuple``."""
+_INERTIA, _DAMPING, _GRAVITY, _COULOMB, _STATIC, _STRIBECK, _OFFSET, _ANGLE, LAG, _TERMS = range(10)
+"""Where they stand in it; ``LAG`` is the actuator's time constant, the values of the friction terms are the last."""
+_added_friction = added_friction(PACKED)
+DRY = (_STATIC, *(_TERMS + index for index in STRENGTHS))
+"""Where the values stand that are all 0 where there is no dry friction."""
 
 _MAX_EVENTS = 8
 _MAX_ROOT_STEPS = 60
@@ -60,13 +68,17 @@ def acceleration_with_friction(
         direction: Sign of the velocity during this step.
         plant: Parameters, packed.
     """
-    inertia, damping, gravity, coulomb, static, stribeck_velocity, load, offset, angle_offset, _ = plant
-    angle = theta - angle_offset
+    # By index: a slice would cost an interpreted plant a tenth of its time.
+    gravity = plant[_GRAVITY]
+    angle = theta - plant[_ANGLE]
     friction = 0.0
     if direction != 0.0:
-        carried = load * abs(gravity_torque(angle, gravity))
-        friction = direction * friction_magnitude(theta_dot, coulomb + carried, static + carried, stribeck_velocity)
-    return rigid_acceleration(angle, theta_dot, torque + offset - friction, inertia, damping, gravity)
+        added = _added_friction(abs(theta_dot), abs(gravity_torque(angle, gravity)), plant)
+        friction = direction * friction_magnitude(
+            theta_dot, plant[_COULOMB] + added, plant[_STATIC] + added, plant[_STRIBECK]
+        )
+    torque = torque + plant[_OFFSET] - friction
+    return rigid_acceleration(angle, theta_dot, torque, plant[_INERTIA], plant[_DAMPING], gravity)
 
 
 def static_friction_balance(theta: float, torque: float, plant: PlantTuple) -> tuple[float, float]:
@@ -74,47 +86,16 @@ def static_friction_balance(theta: float, torque: float, plant: PlantTuple) -> t
 
     Args: as in :func:`acceleration_with_friction`.
     """
-    _, _, gravity, _, static, _, load, offset, angle_offset, _ = plant
-    weight = gravity_torque(theta - angle_offset, gravity)
-    return torque + offset - weight, static + load * abs(weight)
+    weight = gravity_torque(theta - plant[_ANGLE], plant[_GRAVITY])
+    return torque + plant[_OFFSET] - weight, plant[_STATIC] + _added_friction(0.0, abs(weight), plant)
 
 
-def actuator_torque(torque: float, command: float, elapsed: float, time_constant: float) -> float:
-    """Return the torque of a first-order lag, u + (tau - u) exp(-t/T); the command itself for T = 0 [N m].
-
-    Args:
-        torque: Torque at the start [N m].
-        command: Constant command u [N m].
-        elapsed: Time since the start [s].
-        time_constant: T [s].
-    """
-    if time_constant == 0.0:
-        return command
-    return command + (torque - command) * math.exp(-elapsed / time_constant)
-
-
-def narrowed(
-    low: float, g_low: float, high: float, g_high: float, side: int, root: float, g: float, before: bool
-) -> tuple[float, float, float, float, int]:
-    """Return the bracket of a root, narrowed: (low, g_low, high, g_high, side).
-
-    Args:
-        low: Time before the root [s].
-        g_low: The function there.
-        high: Time after it [s].
-        g_high: The function there.
-        side: Which end moved last, -1 or 1; 0 for none.
-        root: Time at which the function was looked at [s].
-        g: The function there.
-        before: Whether that is before the root.
-
-    Source:
-        The Illinois method: M. Dowell and P. Jarratt, A modified regula falsi method, BIT 11, 1971. The end that stays
-        twice counts half, else it would stay for ever.
-    """
-    if before:
-        return root, g, high, g_high * 0.5 if side == 1 else g_high, 1
-    return low, g_low * 0.5 if side == -1 else g_low, root, g, -1
+def is_dry(plant: PlantTuple) -> bool:
+    """Tell whether a plant has dry friction or any friction term: else its equation is smooth."""
+    dry = False
+    for index in DRY:
+        dry = dry or plant[index] > 0.0
+    return dry
 
 
 def advance_dry(
@@ -145,8 +126,8 @@ def advance_dry(
         c: Coefficients for h.
         plant: Parameters, packed.
     """
-    time_constant = plant[9]
-    rate = plant[1] / plant[0]
+    time_constant = plant[LAG]
+    rate = plant[_DAMPING] / plant[_INERTIA]
     left = h
     for _ in range(_MAX_EVENTS):
         if theta_dot == 0.0:

@@ -19,7 +19,7 @@ from pendulum_msgs_py.plants.plant_parameters import PlantParameters
 from pendulum_msgs_py.programs.kept_kernels import keep_kernel
 from pendulum_sim import vector_math
 from pendulum_sim.compiling import compile_tree, tuple_loader
-from pendulum_sim.dry_friction import PACKED, acceleration_with_friction
+from pendulum_sim.dry_friction import PACKED, acceleration_with_friction, is_dry
 from pendulum_sim.integrators import get_integrator
 from pendulum_sim.plant import pack
 from pendulum_sim.stability import check_stability
@@ -34,8 +34,7 @@ def is_smooth(parameters: PlantParameters) -> bool:
     """Tell whether a plant is free of dry friction, lag, delay and drivetrain, which the compiled step leaves out."""
     return (
         parameters.drivetrain is None
-        and parameters.static_friction == 0.0
-        and parameters.load_friction == 0.0
+        and not is_dry(pack(parameters))
         and parameters.actuator_time_constant == 0.0
         and parameters.transport_delay == 0.0
     )

@@ -12,12 +12,12 @@ from numpy.typing import NDArray
 
 from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.joints import Vector
-from pendulum_msgs_py.mechanisms.mechanism import Point
+from pendulum_msgs_py.mechanisms.mechanism import Mechanism, Point
 from pendulum_msgs_py.plants.mechanism_parameters import MechanismParameters
 
 os.environ.setdefault("PYGAME_HIDE_SUPPORT_PROMPT", "1")
 
-__all__ = ["MechanismPicture"]
+__all__ = ["MechanismPicture", "seen_from_the_side"]
 
 _BACKGROUND = (250, 250, 248)
 _INK = (40, 44, 52)
@@ -106,13 +106,17 @@ class MechanismPicture:
         return np.ascontiguousarray(np.transpose(pixels, (1, 0, 2)))
 
     def _pixel(self, point: Point) -> tuple[int, int]:
-        """Return where a point lies: seen from the side, what is in front a little lower."""
-        x, y, z = point
-        width, height = self._surface.get_size()
-        return round(width / 2 + self._scale * x), round(
-            height / 2 - self._scale * (z * math.cos(_TILT) + y * math.sin(_TILT) if self._in_space else z)
-        )
+        x, height = seen_from_the_side(self._parameters.mechanism, point)
+        width, all_height = self._surface.get_size()
+        return round(width / 2 + self._scale * x), round(all_height / 2 - self._scale * height)
 
-    @property
-    def _in_space(self) -> bool:
-        return self._parameters.mechanism.name == "furuta"
+
+def seen_from_the_side(mechanism: Mechanism, point: Point) -> tuple[float, float]:
+    """Return where a point of a plant lies in a picture, to the right and up [m]: of one in space from a little above.
+
+    Args:
+        mechanism: The plant's equations.
+        point: x, y and z [m].
+    """
+    x, y, z = point
+    return (x, z * math.cos(_TILT) + y * math.sin(_TILT)) if mechanism.name == "furuta" else (x, z)

@@ -13,11 +13,12 @@ from typing import NamedTuple
 
 import numpy as np
 
+from pendulum_msgs_py.dynamics.joint_steps import LAG, advance_joints, joint_functions
 from pendulum_msgs_py.dynamics.runge_kutta import rk4_joints
 from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.joints import Coordinates, Vector
-from pendulum_msgs_py.plants.mechanism_parameters import MechanismParameters
-from pendulum_sim.joint_steps import LAG, advance_joints, joint_functions, pack_joints
+from pendulum_msgs_py.plants.joint_table import pack_joints
+from pendulum_msgs_py.plants.mechanism_parameters import MechanismParameters, common_delay
 from pendulum_sim.plant import DelayLine, check_step, period_segments
 
 __all__ = [
@@ -178,21 +179,6 @@ class MechanismPlant:
 def is_smooth_mechanism(parameters: MechanismParameters) -> bool:
     """Tell whether a plant is free of dry friction, end stops, lag and delay."""
     return not _has_events(parameters) and not any(actuator.transport_delay for actuator in parameters.actuators)
-
-
-def common_delay(parameters: MechanismParameters) -> float:
-    """Return the transport delay of all actuators [s].
-
-    Raises:
-        ParameterError: They differ.
-    """
-    delays = {actuator.transport_delay for actuator in parameters.actuators}
-    if len(delays) > 1:
-        raise ParameterError(
-            f"transport_delay is {' and '.join(f'{delay} s' for delay in sorted(delays))} on plant "
-            f"{parameters.name!r}; expected the same for all actuators"
-        )
-    return delays.pop() if delays else 0.0
 
 
 def check_start_state(parameters: MechanismParameters, position: Vector) -> Vector:

@@ -21,6 +21,7 @@ from pendulum_msgs_py.plants.equilibrium import torque_gain, total_damping
 from pendulum_msgs_py.plants.mechanism_parameters import load_mechanism
 from pendulum_msgs_py.plants.plant_parameters import PlantParameters, is_mechanism, load_plant
 from pendulum_msgs_py.programs.executables import cli_main
+from pendulum_msgs_py.programs.options import out_option
 from pendulum_sim.mechanism_files import mechanism_mjcf, mechanism_urdf
 from pendulum_sim.ros2_control_tags import add_ros2_control
 from pendulum_sim.xml_files import add, document_text, number, safe_name
@@ -123,8 +124,8 @@ def urdf(parameters: PlantParameters, *, ros2_control: str = "none", namespace: 
 def mjcf(parameters: PlantParameters) -> str:
     """Return the MJCF of the plant for MuJoCo.
 
-    What MuJoCo has no word for is left out: Stribeck's curve, friction that grows with the load, transport delay,
-    and the spring's hysteresis and hardening. Its dry friction is regularised: it creeps where ours sticks.
+    What MuJoCo has no word for is left out: Stribeck's curve, further friction terms, transport delay, and the
+    spring's hysteresis and hardening. Its dry friction is regularised: it creeps where ours sticks.
 
     Args:
         parameters: The plant; with a drivetrain there is a second joint, the motor's, coupled by a spring.
@@ -229,7 +230,7 @@ app = typer.Typer(add_completion=False, rich_markup_mode=None)
 def export(
     plant: Annotated[str, typer.Option(help="Preset or path of a plant file.")] = "thesis",
     kind: Annotated[str, typer.Option("--format", help="urdf or mjcf.")] = "urdf",
-    output: Annotated[Path | None, typer.Option(help="File to write; standard output by default.")] = None,
+    output: Annotated[Path | None, out_option("File to write; standard output by default.")] = None,
     ros2_control: Annotated[
         str, typer.Option(help="In a URDF, hardware for ros2_control: none, gz (Gazebo) or topic_based (our plants).")
     ] = "none",
@@ -237,7 +238,7 @@ def export(
 ) -> None:
     """Write the URDF or MJCF of a plant.
 
-    Example: python -m pendulum_sim export_model --plant x5_9 --format mjcf --output x5_9.xml
+    Example: python -m pendulum_sim export_model --plant x5_9 --format mjcf --out x5_9.xml
     """
     if kind not in {"urdf", "mjcf"}:
         raise ParameterError(f"format is {kind!r}; expected urdf or mjcf")

@@ -11,6 +11,7 @@ import typer
 
 from pendulum_msgs_py.plants.plant_parameters import load_plant
 from pendulum_msgs_py.programs.executables import cli_main
+from pendulum_msgs_py.programs.options import Json, out_option
 
 __all__ = ["main"]
 
@@ -21,12 +22,12 @@ app = typer.Typer(add_completion=False, rich_markup_mode=None)
 def phase_plot(
     plant: Annotated[str, typer.Option(help="Preset or path of a plant file.")] = "thesis",
     torque: Annotated[float, typer.Option(help="Constant torque u_0 [N m].")] = 0.0,
-    output: Annotated[Path, typer.Option(help="Figure to write (.png, .svg, .pdf).")] = Path("phase_plot.png"),
-    as_json: Annotated[bool, typer.Option("--json", help="Print the fixed points as JSON.")] = False,
+    output: Annotated[Path, out_option("Figure to write (.png, .svg, .pdf).")] = Path("phase_plot.png"),
+    as_json: Json = False,
 ) -> None:
     """Draw x' over x of b x' + G sin(x) = u_0 and list its fixed points, for a plant that is overdamped.
 
-    Example: python -m pendulum_sim phase_plot --plant thesis --torque 0.5 --output phase.png
+    Example: python -m pendulum_sim phase_plot --plant thesis --torque 0.5 --out phase.png
     """
     # Imported late: --help should not wait for matplotlib.
     from pendulum_msgs_py.programs.terminal import WholeTable, make_console

@@ -14,9 +14,10 @@ from collections.abc import Sequence
 from typing import NamedTuple, Protocol
 
 from pendulum_msgs_py.dynamics import rigid_energy
+from pendulum_msgs_py.dynamics.steps import actuator_torque
 from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.plants.plant_parameters import PlantParameters
-from pendulum_sim.dry_friction import PACKED, acceleration_with_friction, actuator_torque, advance_dry
+from pendulum_sim.dry_friction import PACKED, acceleration_with_friction, advance_dry, is_dry
 from pendulum_sim.integrators import Coefficients, PlantTuple, get_integrator
 from pendulum_sim.stability import check_stability
 
@@ -148,7 +149,7 @@ class RigidPlant:
         check_stability(integrator, parameters, dt, substeps, max(h for _, h, _ in self._segments))
         self._packed = pack(parameters)
         self._limit = parameters.effort_limit
-        self._dry = parameters.static_friction > 0.0 or parameters.load_friction > 0.0
+        self._dry = is_dry(self._packed)
         self._lag = parameters.actuator_time_constant
         self._steps = 0
         self.theta = 0.0

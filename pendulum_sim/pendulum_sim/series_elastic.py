@@ -26,9 +26,10 @@ from pendulum_msgs_py.dynamics.series_elastic import (
     winding_current,
     winding_resistance_at,
 )
+from pendulum_msgs_py.dynamics.steps import actuator_torque
 from pendulum_msgs_py.errors import ParameterError
+from pendulum_msgs_py.plants.friction_terms import TERM_PARAMETERS, added_friction, terms_of, without_terms
 from pendulum_msgs_py.plants.plant_parameters import PlantParameters
-from pendulum_sim.dry_friction import actuator_torque
 from pendulum_sim.plant import DelayLine, PlantState, check_start, check_step, command_within, period_segments
 from pendulum_sim.stability import MOST_GROWTH, growth_of_map
 
@@ -44,6 +45,9 @@ MAX_SUBSTEP = 2.5e-4
 """Longest step at which the semi-implicit scheme is trusted with springs up to 1000 N m/rad [s]."""
 
 SeriesElasticTuple = tuple[float, ...]
+_TERMS = 21
+"""Where the values of the friction terms begin in it."""
+_added_friction = added_friction((*[""] * _TERMS, *TERM_PARAMETERS))
 
 
 def pack_series_elastic(parameters: PlantParameters) -> SeriesElasticTuple:
@@ -57,11 +61,12 @@ def pack_series_elastic(parameters: PlantParameters) -> SeriesElasticTuple:
     return (
         parameters.inertia, parameters.damping, parameters.gravity,
         parameters.coulomb_friction, parameters.static_friction, parameters.stribeck_velocity,
-        parameters.load_friction, parameters.angle_offset,
+        parameters.angle_offset,
         drive.gear_ratio, drive.torque_constant, drive.back_emf_constant, resistance, drive.supply_voltage,
         drive.reflected_inertia, drive.motor_damping,
         drive.motor_coulomb_friction, drive.motor_static_friction, drive.motor_stribeck_velocity,
         drive.stiffness, drive.stiffness_hardening, drive.hysteresis_torque, drive.hysteresis_deflection,
+        *terms_of(parameters),
     )  # fmt: skip
 
 
@@ -90,11 +95,11 @@ def series_elastic_step(
         plant: Parameters, packed.
     """
     (
-        inertia, damping, gravity, coulomb, static, stribeck_velocity, load, angle_offset,
+        inertia, damping, gravity, coulomb, static, stribeck_velocity, angle_offset,
         gear_ratio, torque_constant, back_emf, resistance, supply,
         motor_inertia, motor_damping, motor_coulomb, motor_static, motor_stribeck_velocity,
         stiffness, hardening, hysteresis, hysteresis_deflection,
-    ) = plant  # fmt: skip
+    ) = plant[:_TERMS]  # fmt: skip
     deflection = q_m - q
     spring = spring_torque(deflection, z, stiffness, hardening, hysteresis)
     current = winding_current(pwm, v_m, supply, back_emf, gear_ratio, resistance)
@@ -108,10 +113,8 @@ def series_elastic_step(
         h,
     )
     v_free = v + h * link_acceleration(q - angle_offset, v, spring, disturbance, inertia, damping, gravity)
-    carried = load * abs(gravity_torque(q - angle_offset, gravity))
-    v = dry_friction_step(
-        v_free, friction_magnitude(v, coulomb + carried, static + carried, stribeck_velocity), inertia, h
-    )
+    added = _added_friction(abs(v), abs(gravity_torque(q - angle_offset, gravity)), plant)
+    v = dry_friction_step(v_free, friction_magnitude(v, coulomb + added, static + added, stribeck_velocity), inertia, h)
     q_m += h * v_m
     q += h * v
     z = dahl_step(z, (q_m - q) - deflection, hysteresis_deflection)
@@ -158,7 +161,7 @@ class SeriesElasticPlant:
         drive = self.parameters.drivetrain
         assert drive is not None
         smooth = self.parameters.with_values(
-            coulomb_friction=0.0, static_friction=0.0, load_friction=0.0, angle_offset=0.0,
+            coulomb_friction=0.0, static_friction=0.0, angle_offset=0.0, **without_terms(),
             drivetrain=replace(
                 drive, motor_coulomb_friction=0.0, motor_static_friction=0.0, hysteresis_torque=0.0
             ),

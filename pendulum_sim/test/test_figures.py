@@ -60,7 +60,7 @@ def test_beyond_the_weight_there_is_no_fixed_point() -> None:
 def test_phase_plot_refuses_what_has_no_overdamped_limit(
     arguments: list[str], message: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    assert main([*arguments, "--output", str(tmp_path / "phase.png")]) == 2
+    assert main([*arguments, "--out", str(tmp_path / "phase.png")]) == 2
     assert message in capsys.readouterr().err
     assert not (tmp_path / "phase.png").exists()
 
@@ -68,7 +68,7 @@ def test_phase_plot_refuses_what_has_no_overdamped_limit(
 def test_the_phase_plot_of_the_series_elastic_plant_has_the_rate_of_all_its_damping(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    assert main(["--plant", "x5_9", "--output", str(tmp_path / "phase.svg"), "--json"]) == 0
+    assert main(["--plant", "x5_9", "--out", str(tmp_path / "phase.svg"), "--json"]) == 0
     upright = json.loads(capsys.readouterr().out)["fixed_points"][0]
     # The slow pole of the whole linear model is 0.1290 1/s.
     assert upright["rate"] == pytest.approx(1.678 / 13.196, abs=1e-4)
@@ -76,11 +76,11 @@ def test_the_phase_plot_of_the_series_elastic_plant_has_the_rate_of_all_its_damp
 
 def test_phase_plot_writes_a_figure_and_prints_the_points(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     figure = tmp_path / "phase.svg"
-    assert main(["--torque", "0.5", "--output", str(figure), "--json"]) == 0
+    assert main(["--torque", "0.5", "--out", str(figure), "--json"]) == 0
     printed = json.loads(capsys.readouterr().out)
     assert [point["stable"] for point in printed["fixed_points"]] == [True, False]
     assert figure.stat().st_size > 1000
-    assert main(["--output", str(tmp_path / "phase.bmp")]) == 2
+    assert main(["--out", str(tmp_path / "phase.bmp")]) == 2
     assert "ends in '.bmp'; expected .png, .svg or .pdf" in capsys.readouterr().err
 
 

@@ -142,7 +142,7 @@ def test_the_urdf_names_the_joint_of_the_contract_and_its_limits() -> None:
 
 
 def test_the_program_writes_a_file_and_refuses_other_formats(tmp_path, capsys) -> None:
-    assert main(["--plant", "dfki", "--format", "mjcf", "--output", str(tmp_path / "a" / "m.xml")]) == 0
+    assert main(["--plant", "dfki", "--format", "mjcf", "--out", str(tmp_path / "a" / "m.xml")]) == 0
     assert "<mujoco" in (tmp_path / "a" / "m.xml").read_text()
     assert main(["--format", "sdf"]) == 2
     assert "format is 'sdf'; expected urdf or mjcf" in capsys.readouterr().err

@@ -178,6 +178,25 @@ def test_what_prints_a_table_prints_json_too() -> None:
     assert not [line.typed for line in tables if not has_json(line)]
 
 
+def test_an_option_has_one_name_and_one_meaning_in_every_command() -> None:
+    found: dict[str, set[str]] = {}
+    for line in command_lines():
+        if "tests." in line.typed:
+            continue
+        for option in line.command.params:
+            if option.param_type_name != "option":
+                continue
+            for name in option.opts:
+                found.setdefault(name, set()).add("/".join(sorted(option.opts)))
+            if "--json" in option.opts:
+                found.setdefault("help of --json", set()).add(str(option.help))
+    assert found["--out"] == {"--out/-o"}
+    assert found["-o"] == {"--out/-o"}
+    # The other name of it, as ROS 2's own tools call it, is accepted everywhere and shown nowhere.
+    assert "--output" not in found
+    assert found["help of --json"] == {"Print JSON instead of text."}
+
+
 def test_every_command_completes_its_options(
     capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -249,7 +268,7 @@ def _in_a_terminal(arguments: list[str], **environment: str) -> str:
 
 def test_colours_are_left_out_where_nobody_wants_them(tmp_path: Path) -> None:
     colour = re.compile(r"\x1b\[[0-9;]*(?:3[0-7]|4[0-7]|9[0-7]|38;|48;)[0-9;]*m")
-    arguments = ["pendulum_sim", "phase_plot", "--output", str(tmp_path / "phase.svg")]
+    arguments = ["pendulum_sim", "phase_plot", "--out", str(tmp_path / "phase.svg")]
     assert colour.search(_in_a_terminal(arguments))
     assert not colour.search(_in_a_terminal(arguments, NO_COLOR="1"))
     # Nobody writes colours past the library that knows when not to.

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import html
 import json
 import math
 import re
@@ -15,6 +16,7 @@ import pytest
 
 from pendulum_bags.experiments.experiment_cli import main
 from pendulum_bags.experiments.run_spec import EMULATOR_LIFETIME
+from pendulum_bags.runs.run_folder import read_stalls
 from pendulum_rosbag.reader import read_bag
 from tests.fixtures import PROJECT
 from tests.processes import ProcessGroup, RunningProgram
@@ -25,24 +27,14 @@ RAMP = math.pi / 0.002 / 100.0
 
 @pytest.fixture(scope="module")
 def experiment(tmp_path_factory: pytest.TempPathFactory) -> Iterator[RunningProgram]:
-    """Run the whole experiment once, through make; while it regulates for the first time its bridge stands still."""
+    """Run the whole experiment once as its user does, through make; what it leaves is what the tests look at."""
     folder = tmp_path_factory.mktemp("experiment")
     processes = ProcessGroup(folder, cwd=PROJECT)
     with pytest.MonkeyPatch.context() as patch:
         patch.delenv("ROS_DOMAIN_ID", raising=False)
         program = processes.start_command(["make", "--no-print-directory", "experiment", f"OUT={folder / 'run'}"])
     try:
-        program.wait_for_output(r"^regulation \(1 s\)", 120)
-        (bridge,) = [
-            child
-            for child in psutil.Process(program.pid).children(recursive=True)
-            if {"pendulum_hw_bridge", "bridge"} <= _command_line(child)
-        ]
-        # The stimulus: twice as long as an emulator's bridge may stand still.
-        bridge.suspend()
-        time.sleep(2.0 * EMULATOR_LIFETIME)
-        bridge.resume()
-        assert program.wait(240) == 0, program.output
+        assert program.wait(360) == 0, program.output
         assert processes.leftovers() == []
         yield program
     finally:
@@ -57,36 +49,17 @@ def run_folder(experiment: RunningProgram) -> Path:
     return Path(told[1])
 
 
-def _command_line(process: psutil.Process) -> set[str]:
-    """Return the words of a command line, none where the process has just ended."""
-    try:
-        return set(process.cmdline())
-    except psutil.Error:
-        return set()
-
-
-def test_a_run_whose_bridge_stood_still_is_measured_again_and_the_result_says_so(
-    experiment: RunningProgram, run_folder: Path
-) -> None:
-    again = r"^This machine stood still \((.*)\); measuring again, run 2 of at most 3\.$"
-    said = re.search(again, experiment.output, re.MULTILINE)
-    assert said, experiment.output
-    reason = said[1]
-    assert reason.startswith("/hw went to fault: ")
-
-    # A busy machine may have stood still once more by itself.
-    stalls = json.loads((run_folder / "summary.json").read_text(encoding="utf-8"))["stalls"]
-    assert stalls[0] == {"run": "run", "reason": reason, "logs": "logs_stalled_1"}
-    assert len(re.findall(r"^regulation \(1 s\)", experiment.output, re.MULTILINE)) > 1
-    told = re.compile(r"broke off before this one and do(es)? not count")
-    assert told.search(" ".join(experiment.output.split()))
-    assert told.search((run_folder / "report.html").read_text(encoding="utf-8"))
-    assert (run_folder / "logs_stalled_1" / "hw_bridge.log").is_file()
-    # What counts is the last run alone, whole and at zero torque in the end.
-    bag = read_bag(run_folder / "hw")
-    modes = [event.get("mode") for event in bag.events() if event["name"] == "plant_mode"]
-    assert "fault" not in modes
-    assert bag["/hw/applied_effort"]["effort"][-1] == 0.0
+def test_what_nobody_disturbs_is_measured_once_and_answered(experiment: RunningProgram, run_folder: Path) -> None:
+    summary = json.loads((run_folder / "summary.json").read_text(encoding="utf-8"))
+    # A busy machine may stand still by itself: then that is told, and each run that broke off is on record.
+    assert len(summary["stalls"]) == experiment.output.count("; measuring again, run ")
+    assert len(re.findall(r"^regulation \(1 s\)", experiment.output, re.MULTILINE)) <= 1 + len(summary["stalls"])
+    assert summary["answer"]["mark"] in {"yes", "no", "undecided"}
+    answer = summary["answer"]["sentence"]
+    assert answer in " ".join(experiment.output.split())
+    page = html.unescape(re.sub(r"<[^>]*>", "", (run_folder / "report.html").read_text(encoding="utf-8")))
+    # (the page says yes or no by itself, and then why)
+    assert answer.partition(": ")[2].lower() in " ".join(page.split()).lower()
 
 
 def test_experiment_leaves_two_bags_a_summary_figures_and_a_report(run_folder: Path) -> None:
@@ -152,24 +125,54 @@ def test_both_plants_got_the_same_noise(run_folder: Path) -> None:
     assert equal > 0.95 * len(common)
 
 
-@pytest.mark.parametrize("moment", ["starting", "ramp up"])
-def test_ctrl_c_leaves_no_process_and_readable_bags(
-    processes: ProcessGroup, domain_id: int, tmp_path: Path, moment: str
-) -> None:
-    folder = tmp_path / "run"
-    program = processes.start("pendulum_bags", "experiment", "thesis", "--out", folder)
-    program.wait_for_output(moment, 60)
-    if moment == "ramp up":
-        program.wait_for_output("ramp up", 60)
+def test_ctrl_c_while_programs_start_leaves_no_process(processes: ProcessGroup, domain_id: int, tmp_path: Path) -> None:
+    program = processes.start("pendulum_bags", "experiment", "thesis", "--out", tmp_path / "run")
+    program.wait_for_output("starting", 60)
     program.interrupt()
-
     assert program.wait(30) == 130
     assert "interrupted" in program.output
     assert processes.leftovers() == []
-    if moment == "ramp up":
-        for name in ("sim", "hw"):
-            states = read_bag(folder / name)[f"/{name}/applied_effort"]
-            assert states["effort"][-1] == 0.0
+
+
+def test_a_run_whose_bridge_stood_still_is_measured_again_and_ctrl_c_leaves_readable_bags_and_its_record(
+    processes: ProcessGroup, domain_id: int, tmp_path: Path
+) -> None:
+    folder = tmp_path / "run"
+    program = processes.start("pendulum_bags", "experiment", "thesis", "--out", folder)
+    program.wait_for_output("ramp up", 120)
+    (bridge,) = [
+        child
+        for child in psutil.Process(program.pid).children(recursive=True)
+        if {"pendulum_hw_bridge", "bridge"} <= _command_line(child)
+    ]
+    # The stimulus: twice as long as an emulator's bridge may stand still.
+    bridge.suspend()
+    time.sleep(2.0 * EMULATOR_LIFETIME)
+    bridge.resume()
+    program.wait_for_output(r"^This machine stood still \((.*)\); measuring again, run 2 of at most 3\.$", 60)
+    program.wait_for_output(r"ramp up(?s:.*)ramp up", 120)
+    program.interrupt()
+
+    assert program.wait(30) == 130
+    assert f"interrupted: all programs have ended; what was recorded is in {folder}" in " ".join(program.output.split())
+    assert processes.leftovers() == []
+    # What was broken off first is on record (how a result tells it: test_stalls.py), and its bags do not count.
+    stall = read_stalls(folder)[0]
+    assert stall["reason"].startswith("/hw went to fault: ")
+    assert stall["logs"] == "logs_stalled_1"
+    assert (folder / "logs_stalled_1" / "hw_bridge.log").is_file()
+    for name in ("sim", "hw"):
+        bag = read_bag(folder / name)
+        assert bag[f"/{name}/applied_effort"]["effort"][-1] == 0.0
+        assert "fault" not in [event.get("mode") for event in bag.events() if event["name"] == "plant_mode"]
+
+
+def _command_line(process: psutil.Process) -> set[str]:
+    """Return the words of a command line, none where the process has just ended."""
+    try:
+        return set(process.cmdline())
+    except psutil.Error:
+        return set()
 
 
 @pytest.mark.parametrize(

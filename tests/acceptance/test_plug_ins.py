@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import os
 import re
 import shutil
@@ -82,6 +83,13 @@ def _square_wave(p, hold_ns):
     return lambda t: 0.0 if t < 0 else p["amplitude"] if t % period < p["duty"] * period else -p["amplitude"]
 """,
     ),
+    "pendulum_msgs_py/plants/friction_terms.py": (
+        "FRICTION_TERMS",
+        """
+def _drag(speed, weight, drag, drag_exponent):
+    return drag * speed**drag_exponent
+""",
+    ),
     "pendulum_bags/comparison/metrics.py": (
         "METRICS",
         """
@@ -104,6 +112,13 @@ def first_figure(data):
 """Functions of a stranger: the file, the table that they stand before, the function."""
 
 LINES = {
+    "pendulum_msgs_py/plants/friction_terms.py": (
+        "FRICTION_TERMS",
+        """"drag": FrictionTerm(_drag, {
+            "drag": (0.0, Quantity("N m", "Drag of the air at 1 rad/s.")),
+            "drag_exponent": (2.0, Quantity("-", "How it grows with the speed.", positive=True)),
+        }),""",
+    ),
     "pendulum_lqr/controller.py": ("CONTROLLERS", '"springy": "pendulum_lqr.controllers.springy:Springy",'),
     "pendulum_hw_bridge/backends/__init__.py": (
         "BACKENDS",
@@ -122,20 +137,40 @@ LINES = {
 }
 """The line that each adds to a table; a preset needs none."""
 
+DRAGGED = """
+format: pendulum_plant/1
+name: dragged
+parameters:
+  inertia: {value: 0.5, unit: kg m^2}
+  damping: {value: 0.0, unit: N m s/rad}
+  gravity: {value: 0.0, unit: N m}
+  drag: {value: 0.25, unit: N m}
+"""
+"""A plant file of theirs, whose parameter is that of their friction term."""
+
 LOOK = """
 import contextlib, io, json, sys
+from dataclasses import replace
 from pathlib import Path
+
+import numpy as np
 
 from pendulum_bags.analyse.analyse_cli import main as analyse
 from pendulum_bags.comparison import compare_folders
 from pendulum_bags.comparison.metrics import Episode, metrics_of
 from pendulum_bags.experiments.in_process import simulate
 from pendulum_bags.experiments.run_spec import RunSpec
+from pendulum_bags.identification.identify_cli import main as identify
+from pendulum_bags.identification.kernel import PARAMETER_NAMES, _derivatives_of_terms
+from pendulum_bags.identification.model import from_plant, to_plant
 from pendulum_bags.report import write_report
+from pendulum_hw_bridge.actuator import HardwareLimits
 from pendulum_hw_bridge.bridge_node import main as bridge
 from pendulum_hw_bridge.bridge_consistency import check_consistency
 from pendulum_hw_bridge.bridge_parameters import make_port
 from pendulum_hw_bridge.clocks import SteppedClock
+from pendulum_hw_bridge.emulation.kernel import STATES, STEP, advance
+from pendulum_hw_bridge.emulation.parameters import EmulatorParameters
 from pendulum_hw_bridge.node_specs import SPECS
 from pendulum_lqr.controller import controller_parameters
 from pendulum_lqr.controller_node import main as controller
@@ -144,9 +179,13 @@ from pendulum_lqr.disturbance_node import main as disturbance
 from pendulum_msgs_py.contract.drive import PlantLimits
 from pendulum_msgs_py.errors import PendulumError
 from pendulum_msgs_py.parameters import markdown_table, validate
+from pendulum_msgs_py.plants.plant_parameters import PLANT_SPECS, load_plant
+from pendulum_sim.environment_kernel import is_smooth
+from pendulum_sim.plants import make_plant
+from pendulum_sim.series_elastic import pack_series_elastic, series_elastic_step
 from pendulum_sim.simulator_node import main as simulator
 
-bag, run, out = sys.argv[1:]
+bag, run, out, dragged = sys.argv[1:]
 
 
 def said(main, *arguments):
@@ -164,6 +203,34 @@ def refused(call, *arguments):
     return ""
 
 
+def with_drag():
+    # What a drag does in each place that has an equation of its own.
+    plant = load_plant(dragged)
+    free = make_plant(plant, 0.01, method="rk4")
+    free.reset(0.0, 4.0)
+    speeds = [free.step(0.0).theta_dot for _ in range(100)]
+    geared = load_plant("x5_9")
+    steps = []
+    for own in (geared, replace(geared, drag=plant.drag)):
+        link = (0.0, 0.0, 0.0, 2.0, 0.0)
+        (_, _, _, elastic, _) = series_elastic_step(*link, 0.0, 0.0, STEP, pack_series_elastic(own))
+        state = np.zeros(len(STATES))
+        state[STATES.index("velocity")] = 2.0
+        constants = EmulatorParameters(own).constants(HardwareLimits(effort=13.0), 36.0, True)
+        # Interpreted: its own functions are compiled, the loop around them would take seconds.
+        advance.py_func(state, constants, np.zeros((3, 14)), np.zeros((3, 5)), np.full(3, np.nan), 1, 0.0, 1, 1)
+        steps.append([elastic, state[STATES.index("velocity")]])
+    model = from_plant(plant)
+    slopes = np.zeros(len(PARAMETER_NAMES))
+    slopes_of = _derivatives_of_terms(3.0, 0.5, model.vector, slopes)
+    return {
+        "table": markdown_table(PLANT_SPECS), "speeds": speeds, "steps": steps, "inertia": geared.inertia,
+        "kept": to_plant(model).drag, "slopes": [*slopes_of, *slopes[[*map(PARAMETER_NAMES.index, plant_terms)]]],
+        "wrong": refused(lambda: replace(plant, drag=-1.0)), "dry": is_smooth(plant),
+    }
+
+
+plant_terms = ("drag", "drag_exponent")
 spec = RunSpec(
     plant="heavy", design_plant="heavy", controller="springy", duration=1.0,
     disturbance={"kind": "square_wave", "duty": 0.25, "frequency": 2.0, "amplitude": 1.5},
@@ -175,6 +242,7 @@ print(json.dumps({
     "help": {
         "controller": said(controller, "--help"), "disturbance": said(disturbance, "--help"),
         "simulator": said(simulator, "--help"), "bridge": said(bridge, "--help"), "analyse": said(analyse, "--help"),
+        "identify": said(identify, "--help"),
     },
     "tables": {
         "controller": markdown_table(controller_parameters("springy")),
@@ -188,6 +256,7 @@ print(json.dumps({
     "metrics": metrics_of(Episode(arrays.stamp_ns * 1e-9, arrays.position - 3.2, arrays.position, arrays.effort)),
     "answers": json.loads(said(analyse, bag, "--ask", "length", "--json", "--out", out)),
     "page": page[page.index("</style>"):][-4_000_000:],
+    "drag": with_drag(),
 }))
 """
 
@@ -204,8 +273,9 @@ def seen(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
         _edit(folder / name, rf"^{table}\b", lambda found, function=function: f"{function}\n\n{found.group()}")
     for name, (table, line) in LINES.items():
         _edit(folder / name, rf"^{table}\b.*= [{{(]\n", lambda found, line=line: f"{found.group()}    {line}\n")
+    (folder / "dragged.yaml").write_text(DRAGGED.lstrip(), encoding="utf-8")
     write_run_folder(folder / "run", seed=1)
-    command = [sys.executable, "-c", LOOK, str(folder / "run" / "sim"), str(folder / "run"), str(folder / "out")]
+    command = [sys.executable, "-c", LOOK, *(str(folder / name) for name in ("run/sim", "run", "out", "dragged.yaml"))]
     environment = {**os.environ, "PYTHONPATH": str(folder)}
     done = subprocess.run(command, cwd=folder, env=environment, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
@@ -246,6 +316,29 @@ def test_a_new_backend_has_its_parameters_connects_and_keeps_the_limits_of_a_mac
     assert "| `colour` | `red` | – | any | `toy`: its colour. Read-only. |" in seen["tables"]["bridge"]
     assert seen["backend"] == "toy"
     assert "so long a dead bridge drives" in seen["slack"]
+
+
+def test_a_new_friction_term_has_its_parameters_and_slows_simulations_the_emulated_machine_and_the_fit(
+    seen: dict[str, Any],
+) -> None:
+    told = seen["drag"]
+    assert "| `drag` | `0.0` | N m | >= 0 | Drag of the air at 1 rad/s. |" in told["table"]
+    assert "| `drag_exponent` | `2.0` | - | > 0 | How it grows with the speed. |" in told["table"]
+    assert told["wrong"] == "drag is -1.0 N m; expected >= 0"
+    assert re.search(r"gear_load, drag, ", seen["help"]["identify"])
+    # M v' = -c v^2 has the solution v_0 / (1 + c v_0 t / M).
+    expected = [4.0 / (1.0 + 0.25 * 4.0 * 0.01 * k / 0.5) for k in range(1, 101)]
+    assert told["speeds"] == pytest.approx(expected, rel=1e-6)
+    # What needs a smooth equation does not take it for one.
+    assert told["dry"] is False
+    # Series elastic and emulated: in one step of 0.25 ms it takes c v^2 h / M from the link that it had left before.
+    without, with_drag = told["steps"]
+    assert [a - b for a, b in zip(without, with_drag, strict=True)] == pytest.approx(
+        [0.25 * 2.0**2 * 2.5e-4 / told["inertia"]] * 2, rel=1e-9
+    )
+    # Fitted: by speed, by weight, by c, by the exponent at 3 rad/s; and back into a plant file.
+    assert told["slopes"] == pytest.approx([0.25 * 2.0 * 3.0, 0.0, 9.0, 0.25 * 9.0 * math.log(3.0)], abs=1e-12)
+    assert told["kept"] == 0.25
 
 
 def test_a_new_question_is_listed_and_answered(seen: dict[str, Any]) -> None:

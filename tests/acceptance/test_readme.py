@@ -20,10 +20,6 @@ PAGES = sorted(
     if not {".venv", "build", "install", "node_modules", "runs"} & set(path.relative_to(PROJECT).parts)
 )
 NODES = {"simulator", "gymnasium", "adopt", "bridge", "controller", "disturbance", "effort_adapter"}
-TESTED_ELSEWHERE = {
-    "make experiment": "tests/acceptance/test_experiment.py",
-    "make test": "this very run",
-}
 _BLOCK = re.compile(r"^```sh\n(.*?)^```", re.MULTILINE | re.DOTALL)
 
 
@@ -40,6 +36,13 @@ def _commands() -> list[tuple[str, str]]:
 
 
 COMMANDS = _commands()
+FROM_STAIRS = next(command for _, command in COMMANDS if " experiment gravity " in command)
+"""From an unknown pendulum to a controller designed for it."""
+TESTED_ELSEWHERE = {
+    "make experiment": "tests/acceptance/test_experiment.py",
+    "make test": "this very run",
+    FROM_STAIRS: "tests/integration/test_experiments.py",
+}
 
 
 def test_readme_has_commands() -> None:

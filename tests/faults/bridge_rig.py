@@ -21,6 +21,7 @@ from pendulum_hw_bridge.effort_mapping import EffortMapping, EffortStrategy
 from pendulum_hw_bridge.emulation.link_state import LinkState
 from pendulum_hw_bridge.emulation.parameters import load_emulator
 from pendulum_hw_bridge.emulation.x5 import EmulatedX5
+from pendulum_hw_bridge.module import DrivenModule
 from pendulum_hw_bridge.safety import SafetyLimits, SafetyMonitor
 from pendulum_hw_bridge.settings import BridgeSettings
 from pendulum_msgs_py.contract.angles import UPRIGHT, from_upright
@@ -68,7 +69,7 @@ class SteppedLoop(ActuatorLoop):
         self._wait(round(self._period * SECOND))
 
     def _wait(self, duration_ns: int) -> None:
-        clock = self.bridge.port.clock  # type: ignore[attr-defined]  # the emulator's port has one
+        clock = self.bridge.modules[0].port.clock  # type: ignore[attr-defined]  # the emulator's port has one
         clock.wait_until(clock.now_ns() + duration_ns)
 
     def _wait_for_answers(self, stamp_ns: int) -> None:
@@ -130,7 +131,7 @@ class Rig:
         self._last_asked = (-SECOND, 0.0)
         self._build(kind, seed, start, voltage)
         self.actuator.trace = self._watch
-        while self.bridge.feedback is None:
+        while self.module.feedback is None:
             self.loop.turn()
         refusal = self.arm()
         assert not refusal, refusal
@@ -157,20 +158,20 @@ class Rig:
             slew=2000.0,
         )
         self.supervisor = PlantSupervisor(limits)
-        self.bridge = Bridge(
+        self.module = DrivenModule(
             self.port,
-            self.supervisor,
             EffortMapping(kind, drivetrain, effort_limit=effort_limit),
             SafetyMonitor(SafetyLimits(measured_effort=effort_limit + 1.0), self.period, drivetrain),
             BridgeSettings(feedback_rate=1.0 / self.period, limits=HardwareLimits(effort=effort_limit, pwm=0.6)),
         )
+        self.bridge = Bridge([self.module], self.supervisor)
         self.bridge.connect()
         self.loop = SteppedLoop(
             self.bridge,
             LoopStatistics(round(self.period * SECOND)),
             on_state=lambda sample, feedback: None,
             decide=lambda: self.supervisor.decide(self.port.now_ns(), self.bridge.sample),
-            on_outcome=lambda stamp_ns, outcome: self.supervisor.report_applied((outcome.effort,)),
+            on_outcome=lambda stamp_ns, outcome: self.supervisor.report_applied(outcome.effort),
         )
 
     @property

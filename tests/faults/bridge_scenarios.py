@@ -363,7 +363,7 @@ def _excesses(rig: Rig, torques: Sequence[tuple[int, float]], begin_ns: int) -> 
         allowed = before + rig.actuator.parameters.plant.gravity * 0.5 * _WATCH + _ROUNDING
         return [(time, abs(torque) - allowed) for time, torque in torques]
     tolerance = _ROUNDING
-    if rig.bridge.mapping.kind is EffortStrategy.EFFORT_LOOP:
+    if rig.module.mapping.kind is EffortStrategy.EFFORT_LOOP:
         torques, tolerance = _means(torques), _LOOP_ERROR
     excesses, first = [], 0
     for time, torque in torques:

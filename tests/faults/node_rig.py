@@ -89,7 +89,8 @@ class NodeRig(Rig):
         self.bridge = node._bridge
         self.supervisor = node._supervisor
         self.loop = cast("SteppedLoop", node._loop)
-        self.port = cast("EmulatorBackend", self.bridge.port)
+        (self.module,) = self.bridge.drives
+        self.port = cast("EmulatorBackend", self.module.port)
         self.actuator = self.port.actuator
         self.twins: list[Node] = []
         self._hear = node._interface._receivers

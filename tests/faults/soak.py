@@ -23,7 +23,7 @@ from rich.console import Console
 from pendulum_bags.experiments.conductor_node import Conductor, PlantClient, RecorderClient
 from pendulum_bags.experiments.domain import reserve_domain
 from pendulum_bags.experiments.processes import Child, ProcessSet, ros_environment, start_recorder
-from pendulum_bags.experiments.thesis import LOOP_NICENESS
+from pendulum_bags.experiments.session import LOOP_NICENESS
 from pendulum_bags.runs.run_folder import write_json
 from pendulum_msgs_py.contract import names
 from pendulum_msgs_py.programs import graph

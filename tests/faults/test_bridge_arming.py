@@ -126,8 +126,8 @@ def spoil_gain(rig: Rig, loop: str, name: str, value: float) -> None:
 @pytest.mark.parametrize("setting", list(SPOILT))
 def test_arming_is_refused_where_a_setting_reads_back_as_another(setting: str) -> None:
     rig = disarmed()
-    rig.bridge.settings = replace(
-        rig.bridge.settings, limits=replace(rig.bridge.settings.limits, position_min=-4.0, position_max=4.0)
+    rig.module.settings = replace(
+        rig.module.settings, limits=replace(rig.module.settings.limits, position_min=-4.0, position_max=4.0)
     )
     SPOILT[setting](rig)
     assert f"{setting} reads back as" in rig.bridge.prepare()
@@ -267,7 +267,7 @@ def test_nothing_of_the_torque_before_an_e_stop_is_in_the_trajectory_after_it(ki
     rig.disturbing = False
     rig.send = lambda answer: rig._send(JointCommand.of_one(answer.stamp_ns, 8.0, "controller"))
     rig.run(0.3)
-    assert rig.outcomes[-1].effort > 5.0
+    assert rig.outcomes[-1].effort[0] > 5.0
     rig.controlling = False
     rig.supervisor.e_stop(rig.port.now_ns())
     rig.run(0.2)
@@ -283,7 +283,7 @@ def test_nothing_of_the_torque_before_an_e_stop_is_in_the_trajectory_after_it(ki
     assert not rig.follow(sample.position[0])
     rig.run(0.2)
     duties = [abs(duty) for time, duty, _ in rig.duties if time > begin_ns]
-    assert max(duties, default=0.0) / rig.bridge.mapping.pwm_per_torque() < 0.5
+    assert max(duties, default=0.0) / rig.module.mapping.pwm_per_torque() < 0.5
 
 
 @KINDS

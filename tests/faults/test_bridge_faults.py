@@ -198,7 +198,7 @@ def test_a_disturbance_that_waits_for_a_hand_over_moves_nothing() -> None:
 def test_where_the_check_of_feedback_is_blind_the_rules_behind_it_end_torque_one_period_later() -> None:
     with NodeRig() as rig:
         rig.run(0.5)
-        rig.bridge.monitor.silence = lambda now_ns: None  # type: ignore[method-assign]
+        rig.module.monitor.silence = lambda now_ns: None  # type: ignore[method-assign]
         rig.actuator.inject(ActuatorFault.FEEDBACK_LOST)
         rig.run(0.2)
         sample = rig.bridge.sample

@@ -95,7 +95,7 @@ def test_a_torque_is_what_was_asked_for_up_to_the_limit_at_any_supply(
         wanted, rel=0.1 if kind is EffortStrategy.EFFORT_LOOP else 0.02
     )
     assert largest_torque(rig) <= 3.0 + TOLERANCE
-    assert rig.outcomes[-1].effort == pytest.approx(wanted, rel=0.02)
+    assert rig.outcomes[-1].effort == pytest.approx((wanted,), rel=0.02)
 
 
 WRONG_RECORDS: dict[str, Callable[[Feedback], Feedback]] = {
@@ -177,9 +177,9 @@ def test_without_a_command_there_is_no_duty_at_any_speed_and_the_torque_publishe
     rig.controlling = rig.disturbing = False
     rig.actuator.hand = lambda time, position, velocity: 8.0
     rig.run(0.5)
-    assert abs(rig.bridge.feedback.velocity) > 0.3  # type: ignore[union-attr]
+    assert abs(rig.module.feedback.velocity) > 0.3  # type: ignore[union-attr]
     assert not any(duty for _, duty, _ in rig.duties)
-    assert all(outcome.effort == 0.0 for outcome in rig.outcomes)
+    assert all(outcome.effort == (0.0,) for outcome in rig.outcomes)
 
 
 @KINDS
@@ -228,7 +228,7 @@ def test_a_moving_pendulum_passes_to_position_control_without_a_jump(kind: Effor
     assert not rig.follow(0.2)
     rig.run(0.012)
     rig.actuator.advance_to(rig.clock.now_ns())
-    per_torque = rig.bridge.mapping.pwm_per_torque()
+    per_torque = rig.module.mapping.pwm_per_torque()
     equivalents = [duty / per_torque for _, duty, _ in rig.duties]
     before = equivalents[0]
     assert rig.supervisor.mode is Mode.POSITION
@@ -238,7 +238,7 @@ def test_a_moving_pendulum_passes_to_position_control_without_a_jump(kind: Effor
 @pytest.mark.parametrize("reading", [math.nan, -math.inf, math.inf])
 def test_a_winding_temperature_that_is_no_number_is_a_fault_though_the_current_is_not_checked(reading: float) -> None:
     rig = Rig()
-    rig.bridge.monitor.limits = replace(rig.bridge.monitor.limits, winding_current=0.0)
+    rig.module.monitor.limits = replace(rig.module.monitor.limits, winding_current=0.0)
     rig.run(0.3)
     read = rig.port.read
 

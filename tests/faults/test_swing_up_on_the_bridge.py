@@ -55,4 +55,4 @@ def test_at_once_it_does_not_move_and_the_bridge_disarms_in_words() -> None:
     assert rig.supervisor.mode is Mode.DISARMED
     assert "expected at most 2.0 N m to begin (a controller's start_time lets it rise)" in rig.supervisor.reason
     assert np.abs(np.array(rig.positions)).max() < 0.05
-    assert not any(outcome.effort for outcome in rig.outcomes)
+    assert not any(any(outcome.effort) for outcome in rig.outcomes)

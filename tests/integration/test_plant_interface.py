@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import signal
 import subprocess
 import sys
@@ -22,6 +23,7 @@ from pendulum_msgs_py.contract.names import JOINT
 from pendulum_msgs_py.contract.trajectory import from_points
 from pendulum_msgs_py.ros import qos
 from pendulum_msgs_py.ros.convert import stamp_from_message, stamp_to_message, trajectory_to_message
+from tests.fixtures import PROJECT, own_domain
 from tests.graph_peer import GraphPeer
 from tests.processes import ProcessGroup, RunningProgram
 
@@ -83,11 +85,15 @@ class Peer(GraphPeer):
         return message
 
     def driven_since(self, state: JointState) -> int:
-        """Return in how many of its periods after a state the plant has applied a torque."""
+        """Return in how many of its periods after a state the plant has applied a torque, once it applies none."""
         begin = stamp_from_message(state.header.stamp)
-        later = [it for it in self.applied if stamp_from_message(it.header.stamp) > begin]
-        assert later, "nothing was applied since"
-        return sum(it.effort[0] != 0.0 for it in later)
+
+        def later() -> list[JointState]:
+            return [it for it in self.applied if stamp_from_message(it.header.stamp) > begin]
+
+        # Where this process stood still before the state, the plant may have been at rest already.
+        self.until(lambda: bool(found := later()) and found[-1].effort[0] == 0.0, "zero torque after a state")
+        return sum(it.effort[0] != 0.0 for it in later())
 
     def stream(self, effort: float, frame: str = "lqr") -> None:
         self.answer = lambda state: self.command.publish(self.message(effort, stamp=state.header.stamp, frame=frame))
@@ -144,15 +150,43 @@ def plant(processes: ProcessGroup, peer: Peer) -> RunningProgram:
     return _await(peer, _start(processes))
 
 
-@pytest.fixture(params=["tiny_plant", "mujoco"])
-def any_plant(request: pytest.FixtureRequest, processes: ProcessGroup, peer: Peer, tmp_path: Path) -> RunningProgram:
-    if request.param == "tiny_plant":
-        return _await(peer, _start(processes))
-    pytest.importorskip("mujoco")
-    return _await(peer, _start_mujoco(processes, tmp_path))
+@pytest.fixture(scope="module", params=["tiny_plant", "mujoco"])
+def running_plant(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Peer]:
+    """Start a plant for all the tests that leave it as sound as they found it, and who speaks to it."""
+    if request.param == "mujoco":
+        pytest.importorskip("mujoco")
+    folder = tmp_path_factory.mktemp(request.param)
+    processes = ProcessGroup(folder / "processes", cwd=PROJECT)
+    with own_domain(folder):
+        peer = Peer()
+        try:
+            _await(peer, _start(processes) if request.param == "tiny_plant" else _start_mujoco(processes, folder))
+            # As a plant starts: whoever uses it first finds this, too.
+            assert peer.diagnostics["mode"] == "disarmed"
+            yield peer
+        finally:
+            peer.close()
+            assert processes.close() == []
 
 
-def test_services_walk_through_the_states_and_a_reset_never_re_arms(any_plant: RunningProgram, peer: Peer) -> None:
+@pytest.fixture
+def any_peer(running_plant: Peer) -> Peer:
+    """Bring the plant back to how it started, disarmed; forget what was heard."""
+    peer = running_plant
+    peer.answer = None
+    peer.call(Trigger, "tiny_plant/e_stop_reset", Trigger.Request())
+    assert peer.arm(False).success
+    # Its counts, too, as they are now.
+    peer.diagnostics = {}
+    peer.until(lambda: peer.diagnostics.get("mode") == "disarmed", "a disarmed plant")
+    for heard in (peer.states, peer.applied):
+        heard.clear()
+    peer.until(lambda: peer.states and peer.applied, "new states")
+    return peer
+
+
+def test_services_walk_through_the_states_and_a_reset_never_re_arms(any_peer: Peer) -> None:
+    peer = any_peer
     assert peer.diagnostics["mode"] == "disarmed"
     assert peer.arm().success
     assert peer.call(Trigger, "tiny_plant/e_stop", Trigger.Request()).success
@@ -172,9 +206,12 @@ def test_services_walk_through_the_states_and_a_reset_never_re_arms(any_plant: R
     assert peer.arm().success
 
 
-def test_every_refusal_is_counted_under_its_name_and_moves_nothing(any_plant: RunningProgram, peer: Peer) -> None:
+def test_every_refusal_is_counted_under_its_name_and_moves_nothing(any_peer: Peer) -> None:
+    peer = any_peer
     assert peer.arm().success
     peer.spin(0.1)
+    expected = {"not_one_joint": 2, "not_finite": 2, "other_joint": 1, "too_old": 1, "from_future": 1}
+    before = {key: peer.count(key) for key in expected}
     stamp = peer.states[-1].header.stamp
     now_ns = stamp.sec * 10**9 + stamp.nanosec
     peer.command.publish(JointState(name=[JOINT]))
@@ -186,12 +223,35 @@ def test_every_refusal_is_counted_under_its_name_and_moves_nothing(any_plant: Ru
     peer.command.publish(elbow)
     peer.command.publish(peer.message(3.0, stamp=stamp_to_message(now_ns - 10**9)))
     peer.command.publish(peer.message(3.0, stamp=stamp_to_message(now_ns + 10**10)))
-    peer.until(lambda: peer.count("from_future") == 1, "the last refusal")
-    assert [peer.count(key) for key in ("not_one_joint", "not_finite", "other_joint", "too_old")] == [2, 2, 1, 1]
+    peer.until(lambda: peer.count("from_future") == before["from_future"] + 1, "the last refusal")
+    assert {key: peer.count(key) - before[key] for key in before} == expected
     assert all(message.effort[0] == 0.0 for message in peer.applied)
 
 
-def test_a_second_commander_is_refused_named_and_reported(any_plant: RunningProgram, peer: Peer) -> None:
+def test_a_trajectory_is_followed_and_handed_over(any_peer: Peer) -> None:
+    peer = any_peer
+    # What has driven it before may have left it elsewhere.
+    start = peer.states[-1].position[0]
+    move = trajectory_to_message(from_points([0.0, 0.3], [start, start + 0.05], [0.0, 0.0]))
+    peer.trajectory.publish(move)
+    peer.until(lambda: peer.diagnostics.get("joint_trajectory.refused.disarmed") == "1", "the refusal")
+    assert peer.arm().success
+    peer.trajectory.publish(move)
+    peer.until(lambda: peer.diagnostics["mode"] == "armed_position", "position control")
+    peer.until(lambda: "holding" in peer.diagnostics["reason"], "the end of the trajectory")
+    peer.stream(0.4)
+    peer.until(lambda: peer.diagnostics["mode"] == "armed_effort", "effort control")
+    peer.until(lambda: peer.applied[-1].effort[0] == 0.4, "the controller's torque")
+    bad = trajectory_to_message(from_points([0.0], [start + 2.0], [0.0]))
+    peer.trajectory.publish(bad)
+    peer.until(lambda: peer.diagnostics.get("joint_trajectory.refused.invalid") == "1", "the second refusal")
+    stale = trajectory_to_message(from_points([0.0, 1.0], [start, start], [0.0, 0.0]), stamp_ns=5)
+    peer.trajectory.publish(stale)
+    peer.until(lambda: peer.diagnostics.get("joint_trajectory.refused.invalid") == "2", "the third refusal")
+
+
+def test_a_second_commander_is_refused_named_and_reported(any_peer: Peer) -> None:
+    peer = any_peer
     assert peer.arm().success
     peer.stream(1.0)
     peer.until(lambda: peer.applied[-1].effort[0] == 1.0, "the first commander's torque")
@@ -229,7 +289,8 @@ def test_twins_behind_one_frame_id_get_no_torque(plant: RunningProgram, peer: Pe
     peer.until(lambda: peer.applied[-1].effort[0] == 1.0, "torque after the twin has gone")
 
 
-def test_torque_is_the_clamped_sum_and_ends_with_the_commands(any_plant: RunningProgram, peer: Peer) -> None:
+def test_torque_is_the_clamped_sum_and_ends_with_the_commands(any_peer: Peer) -> None:
+    peer = any_peer
     assert peer.arm().success
 
     def both(state: JointState) -> None:
@@ -242,29 +303,9 @@ def test_torque_is_the_clamped_sum_and_ends_with_the_commands(any_plant: Running
     peer.until(lambda: peer.applied[-1].effort[0] == 5.0, "the clamped torque")
     peer.answer = None
     last = peer.states[-1]
-    peer.until(lambda: peer.applied[-1].effort[0] == 0.0, "zero torque")
     assert peer.driven_since(last) <= PERIODS_TO_ZERO
     peer.stream(2.0)
     peer.until(lambda: peer.applied[-1].effort[0] == 2.0, "recovery by itself")
-
-
-def test_a_trajectory_is_followed_and_handed_over(any_plant: RunningProgram, peer: Peer) -> None:
-    move = trajectory_to_message(from_points([0.0, 0.3], [0.0, 0.05], [0.0, 0.0]))
-    peer.trajectory.publish(move)
-    peer.until(lambda: peer.diagnostics.get("joint_trajectory.refused.disarmed") == "1", "the refusal")
-    assert peer.arm().success
-    peer.trajectory.publish(move)
-    peer.until(lambda: peer.diagnostics["mode"] == "armed_position", "position control")
-    peer.until(lambda: "holding" in peer.diagnostics["reason"], "the end of the trajectory")
-    peer.stream(0.4)
-    peer.until(lambda: peer.diagnostics["mode"] == "armed_effort", "effort control")
-    peer.until(lambda: peer.applied[-1].effort[0] == 0.4, "the controller's torque")
-    bad = trajectory_to_message(from_points([0.0], [2.0], [0.0]))
-    peer.trajectory.publish(bad)
-    peer.until(lambda: peer.diagnostics.get("joint_trajectory.refused.invalid") == "1", "the second refusal")
-    stale = trajectory_to_message(from_points([0.0, 1.0], [0.0, 0.0], [0.0, 0.0]), stamp_ns=5)
-    peer.trajectory.publish(stale)
-    peer.until(lambda: peer.diagnostics.get("joint_trajectory.refused.invalid") == "2", "the third refusal")
 
 
 def test_commands_that_come_too_slowly_do_not_flood_the_log(plant: RunningProgram, peer: Peer) -> None:
@@ -323,8 +364,6 @@ def test_a_stop_signal_ends_torque_at_once_and_the_program_with_zero_torque_last
     assert "closed" in plant.output
     assert "Traceback" not in plant.output
     peer.answer = None
-    peer.spin(0.2)
-    assert peer.applied[-1].effort[0] == 0.0
     assert peer.driven_since(last) <= PERIODS_TO_ZERO
     assert peer.diagnostics["mode"] == "disarmed"
     assert peer.diagnostics["reason"] == "plant ends"
@@ -349,34 +388,56 @@ def test_an_echo_of_the_signal_does_not_cut_the_way_out_short_but_a_second_wish_
     assert "second SIGTERM: leaving at once" in program.output
 
 
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        (["-p", "gain:=1"], "gain is 1; expected a number >= 0; ROS tells whole numbers and decimals apart: write 1.0"),
-        (["-p", "gain:=-1.0"], "gain is -1.0 N m/rad; expected >= 0"),
-        (["-p", "gain:=.nan"], "gain is nan N m/rad; expected a finite number >= 0"),
-        (["-p", "gain:=abc"], "gain is 'abc'; expected a number >= 0"),
-        (["-p", "cycles:=2.5"], "cycles is 2.5; expected an integer 1 to 9"),
-        (["-p", "cycles:=10"], "cycles is 10; expected 1 to 9"),
-        (["-p", "method:=rk4"], "method is 'rk4'; expected one of exact, euler"),
-        (["-p", "offsets:=[1, 2]"], "offsets is [1, 2]; expected a list"),
-        (["-p", "gian:=1.0"], "/tiny_plant: unknown parameter 'gian'; did you mean 'gain'?"),
-        (["-p", "effort_limit:=6.0"], "effort_limit is 6.0 N m; expected at most 5.0 N m"),
-        (["-p", "position_window:=[1.0, 0.0]"], "position window is [1.0, 0.0] rad; expected min < max"),
-        (["-p", "gain"], "ROS arguments are not understood: Couldn't parse parameter override rule"),
-        (["-r", "__ns:=no namespace"], "ROS arguments are not understood"),
-        (["--params-file", "/nowhere.yaml"], "ROS arguments are not understood"),
-    ],
-)
-def test_a_bad_parameter_is_one_sentence_and_exit_code_2(
-    processes: ProcessGroup, domain_id: int, arguments: list[str], message: str
-) -> None:
-    program = _start(processes, "--ros-args", *arguments)
-    assert program.wait(20.0) == 2
-    errors = [line for line in program.output.splitlines() if line.startswith("error: ")]
+@pytest.fixture(scope="module")
+def refused_starts(tmp_path_factory: pytest.TempPathFactory) -> list[tuple[int, str]]:
+    """Return exit code and output of one process for each of the bad parameters; what it imports is imported once."""
+    folder = tmp_path_factory.mktemp("refused")
+    every = json.dumps([arguments for arguments, _ in BAD_PARAMETERS])
+    with own_domain(folder):
+        command = [sys.executable, "-c", _FORKS, every, str(folder)]
+        done = subprocess.run(command, cwd=PROJECT, capture_output=True, text=True, timeout=60, check=True)
+    outputs = [(folder / str(number)).read_text(encoding="utf-8") for number in range(len(BAD_PARAMETERS))]
+    return list(zip(map(int, done.stdout.split()), outputs, strict=True))
+
+
+_FORKS = """
+import json, os, sys
+from tests.integration import tiny_plant
+for number, arguments in enumerate(json.loads(sys.argv[1])):
+    child = os.fork()
+    if not child:
+        with open(os.path.join(sys.argv[2], str(number)), "wb") as sink:
+            os.dup2(sink.fileno(), 1)
+            os.dup2(sink.fileno(), 2)
+        raise SystemExit(tiny_plant.main(["--ros-args", *arguments]))
+    print(os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]), flush=True)
+"""
+BAD_PARAMETERS = [
+    (["-p", "gain:=1"], "gain is 1; expected a number >= 0; ROS tells whole numbers and decimals apart: write 1.0"),
+    (["-p", "gain:=-1.0"], "gain is -1.0 N m/rad; expected >= 0"),
+    (["-p", "gain:=.nan"], "gain is nan N m/rad; expected a finite number >= 0"),
+    (["-p", "gain:=abc"], "gain is 'abc'; expected a number >= 0"),
+    (["-p", "cycles:=2.5"], "cycles is 2.5; expected an integer 1 to 9"),
+    (["-p", "cycles:=10"], "cycles is 10; expected 1 to 9"),
+    (["-p", "method:=rk4"], "method is 'rk4'; expected one of exact, euler"),
+    (["-p", "offsets:=[1, 2]"], "offsets is [1, 2]; expected a list"),
+    (["-p", "gian:=1.0"], "/tiny_plant: unknown parameter 'gian'; did you mean 'gain'?"),
+    (["-p", "effort_limit:=6.0"], "effort_limit is 6.0 N m; expected at most 5.0 N m"),
+    (["-p", "position_window:=[1.0, 0.0]"], "position window is [1.0, 0.0] rad; expected min < max"),
+    (["-p", "gain"], "ROS arguments are not understood: Couldn't parse parameter override rule"),
+    (["-r", "__ns:=no namespace"], "ROS arguments are not understood"),
+    (["--params-file", "/nowhere.yaml"], "ROS arguments are not understood"),
+]
+
+
+@pytest.mark.parametrize("number", range(len(BAD_PARAMETERS)), ids=[arguments[-1] for arguments, _ in BAD_PARAMETERS])
+def test_a_bad_parameter_is_one_sentence_and_exit_code_2(refused_starts: list[tuple[int, str]], number: int) -> None:
+    code, output = refused_starts[number]
+    assert code == 2
+    errors = [line for line in output.splitlines() if line.startswith("error: ")]
     assert len(errors) == 1
-    assert message in errors[0]
-    assert "Traceback" not in program.output
+    assert BAD_PARAMETERS[number][1] in errors[0]
+    assert "Traceback" not in output
 
 
 def test_parameters_of_ros_itself_are_no_strangers(processes: ProcessGroup, domain_id: int) -> None:

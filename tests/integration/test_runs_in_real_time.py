@@ -10,7 +10,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from pendulum_bags.experiments.conductor_node import PlantClient
+from pendulum_bags.experiments.processes import Child
+from pendulum_bags.experiments.session import conduct
 from pendulum_hw_bridge.backends.emulator_process import EmulatorProcessBackend
+from pendulum_msgs_py.contract.trajectory import thesis_ramp
+from pendulum_msgs_py.errors import FaultError, PlantStoppedError
 from pendulum_rosbag.reader import read_bag
 from tests.processes import ProcessGroup
 
@@ -45,6 +50,52 @@ def test_an_excitation_is_played_alone_on_a_running_plant_and_ends_at_zero_torqu
     assert 0.1 < np.max(np.abs(applied)) <= 0.75
     assert np.all(applied[-20:] == 0.0)
     assert {"inertia", "gravity"} <= recorded.metadata["pendulum.excitation"]["predicted"].keys()
+
+
+@pytest.mark.parametrize("ending", [KeyboardInterrupt, FaultError])
+def test_what_breaks_a_session_off_disarms_a_plant_that_it_drives_and_no_other(
+    ending: type[BaseException], processes: ProcessGroup, domain_id: int, tmp_path: Path
+) -> None:
+    simulators = {
+        namespace: processes.start("pendulum_sim", "simulator", "--ros-args", "-r", f"__ns:={namespace}")
+        for namespace in ("/sim", "/other", "/done")
+    }
+    ended: list[Child] = []
+
+    def run() -> None:
+        with conduct(tmp_path / "logs", domain_id) as session:
+            plants = [PlantClient(session.conductor, namespace, "simulator") for namespace in simulators]
+            for plant in plants:
+                plant.wait_until_ready(60.0, controller=False, disturbance=False)
+            ended.append(session.processes.start("beside", [sys.executable, "-c", "import time; time.sleep(60)"]))
+            session.drives(plants[0], plants[2])
+            session.leaves(plants[2])
+            raise ending
+
+    with pytest.raises(ending):
+        run()
+    # Nobody else ends these: one was disarmed by whoever drove it, and the others still are armed.
+    simulators["/sim"].wait_for_output(r"\bdisarmed\b", 10.0)
+    for other in ("/other", "/done"):
+        assert "disarmed" not in simulators[other].output
+    assert [child.process.poll() is not None for child in ended] == [True]
+
+
+def test_a_move_that_a_stopped_plant_refuses_is_told_by_what_stopped_it(
+    processes: ProcessGroup, domain_id: int, tmp_path: Path
+) -> None:
+    processes.start("pendulum_sim", "simulator", "--ros-args", "-r", "__ns:=/sim")
+    with conduct(tmp_path / "logs", domain_id) as session:
+        plant = PlantClient(session.conductor, "/sim", "simulator")
+        plant.wait_until_ready(60.0, controller=False, disturbance=False)
+        plant.call("simulator/e_stop")
+        session.conductor.wait_for(
+            "the stop", lambda: any(event.get("mode") == "e_stop" for event in plant.events), 20.0
+        )
+        plant.follow(thesis_ramp(0.0, 0.5), "ramp_up")
+        with pytest.raises(PlantStoppedError) as stopped:
+            session.conductor.wait_for("the end of the move", plant.trajectory_finished, 20.0)
+    assert stopped.value.mode == "e_stop"
 
 
 def test_a_rehearsal_with_a_lab_file_checks_asks_and_moves_the_machine_of_the_file(

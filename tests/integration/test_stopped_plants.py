@@ -87,6 +87,23 @@ def test_it_ends_at_once_with_the_plant_and_the_reason(
         assert not peer.arm().success
 
 
+def test_ctrl_c_disarms_a_plant_that_somebody_else_started(
+    processes: ProcessGroup,
+    domain_id: int,
+    peer: PlantPeer,
+    robot: RunningProgram,
+    adopter: RunningProgram,
+    tmp_path: Path,
+) -> None:
+    run = begin(processes, domain_id, peer, tmp_path)
+    run.interrupt()
+    assert run.wait(60.0) == 130
+    # It was on its way up by itself: without a word it would go on to upright.
+    adopter.wait_for_output(r"armed_position: following a trajectory\n(?s:.*)\bdisarmed\b", 10.0)
+    assert robot.returncode is None
+    assert adopter.returncode is None
+
+
 def test_a_plant_of_several_joints_is_refused_before_anything_of_it_is_asked(
     processes: ProcessGroup, domain_id: int, tmp_path: Path
 ) -> None:

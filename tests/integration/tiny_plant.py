@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 from pendulum_msgs_py.contract.plant_specs import LIMIT_SPECS, limits_from_parameters
 from pendulum_msgs_py.contract.shared_supervisor import SharedSupervisor
@@ -72,14 +72,17 @@ class TinyPlant(PollingNode):
         self.position += 0.01 * self.velocity
 
 
-if __name__ == "__main__":
-    raise SystemExit(
-        run_node(
-            TinyPlant,
-            sys.argv[1:],
-            program="tests tiny_plant",
-            description="A plant for tests.",
-            specs=SPECS,
-            example="python tests/integration/tiny_plant.py --ros-args -p gain:=2.0",
-        )
+def main(argv: Sequence[str]) -> int:
+    """Run it."""
+    return run_node(
+        TinyPlant,
+        argv,
+        program="tests tiny_plant",
+        description="A plant for tests.",
+        specs=SPECS,
+        example="python tests/integration/tiny_plant.py --ros-args -p gain:=2.0",
     )
+
+
+if __name__ == "__main__":
+    raise SystemExit(main(sys.argv[1:]))

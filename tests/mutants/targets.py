@@ -19,6 +19,7 @@ _RULES = (
     "pendulum_msgs_py/test/test_several_joints.py",
 )
 _BRIDGE = "pendulum_hw_bridge/test"
+_CYCLE = (f"{_BRIDGE}/test_bridge_cycle.py", f"{_BRIDGE}/test_bridge_of_several_modules.py")
 
 
 @dataclass(frozen=True)
@@ -96,7 +97,11 @@ TARGETS: tuple[Target, ...] = (
         (f"{_BRIDGE}/test_hebi_backend.py", f"{_BRIDGE}/test_hebi_rules.py"),
         choose="not test_a_bridge_drives_a_module",
     ),
-    Target("pendulum_hw_bridge.bridge", ("Bridge",), (f"{_BRIDGE}/test_bridge_cycle.py",)),
+    Target("pendulum_hw_bridge.bridge", ("Bridge",), _CYCLE),
+    Target("pendulum_hw_bridge.module", ("Module", "DrivenModule"), _CYCLE),
+    Target(
+        "pendulum_hw_bridge.current_drive", ("CurrentMapping", "CurrentCheck"), (f"{_BRIDGE}/test_current_drive.py",)
+    ),
     Target("pendulum_hw_bridge.derating", ("Derating",), (f"{_BRIDGE}/test_derating.py",)),
     Target(
         "pendulum_hw_bridge.command_check",

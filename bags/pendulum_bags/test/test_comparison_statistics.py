@@ -44,6 +44,23 @@ def test_effective_size_of_an_autoregressive_process_is_that_of_theory(coefficie
     assert np.median(sizes) == pytest.approx(theory, rel=0.25)
 
 
+@pytest.mark.parametrize("coefficient", [0.0, 0.5, 0.9, 0.99])
+def test_a_sum_of_products_of_two_series_counts_by_the_correlation_of_both(coefficient: float) -> None:
+    # rho of the products is the product of both: 0.9 ** k times coefficient ** k.
+    sizes = [
+        effective_size(autoregressive(8000, 0.9, seed), autoregressive(8000, coefficient, 1000 + seed))
+        for seed in range(10)
+    ]
+    joint = 0.9 * coefficient
+    assert np.median(sizes) == pytest.approx(8000 * (1.0 - joint) / (1.0 + joint), rel=0.25)
+
+
+def test_a_common_offset_of_residuals_counts_as_what_all_samples_share() -> None:
+    noise = autoregressive(2000, 0.0, 3)
+    # About zero, as a regression without intercept has them, samples far from it all say the same.
+    assert effective_size(noise + 10.0, noise + 10.0) < 0.01 * effective_size(noise, noise)
+
+
 def test_blocks_grow_with_correlation() -> None:
     lengths = [
         np.median([block_length(autoregressive(1000, coefficient, seed)) for seed in range(5)])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -13,7 +14,9 @@ import pytest
 from pendulum_bags.comparison import Outcome, compare_runs
 from pendulum_bags.comparison.compare_cli import main
 from pendulum_bags.comparison.pairs import Pair
+from pendulum_bags.report.report_cli import main as report_main
 from pendulum_bags.runs.run_data import joints_of, read_run
+from pendulum_bags.runs.run_record import RUN_RECORD
 from pendulum_bags.verdict.joints import join_joints
 from pendulum_bags.verdict.layers import Evidence, Layer, LayerResult, Mark
 from pendulum_lqr.controllers.joint_lqr import make_joint_controller
@@ -48,8 +51,13 @@ def regulate(plant: MechanismParameters, sensor_seed: int, *, duration: float = 
     return {"position": rows[:, :2], "velocity": rows[:, 2:4], "command": rows[:, 4:5], "noise": rows[:, 5:]}
 
 
-def write(path: Path, columns: Mapping[str, np.ndarray], *, offset: tuple[float, float] = (0.0, 0.0)) -> Path:
-    with open_writer(path) as bag:
+def write(
+    path: Path, columns: Mapping[str, np.ndarray], *, offset: tuple[float, float] = (0.0, 0.0), stand_in: str = ""
+) -> Path:
+    record = {"namespace": "/plant", "plant": "cart_pole", "design_plant": "cart_pole", "seed": 5}
+    if stand_in:
+        record["stand_in"] = stand_in
+    with open_writer(path, metadata={RUN_RECORD: record}) as bag:
         for topic in ("joint_states", "effort_command", "disturbance"):
             bag.add_topic(f"/plant/{topic}", STATE)
         for k in range(len(columns["noise"])):
@@ -109,6 +117,8 @@ def test_another_plant_is_told_by_the_joint_that_shows_it(
     assert content["answer"]["mark"] == "no"
     assert content["joints"]["cart"]["verdict"]["outcome"] == "not equivalent"
     assert content["answer"]["sentence"].startswith("No: cart: ")
+    (step,) = [step for step in content["answer"]["next_steps"] if "identify" in step]
+    assert f"(python -m pendulum_bags identify {bags['other']} --out plant.yaml --plant cart_pole)" in step
     assert (tmp_path / "figures" / "joints_together.png").stat().st_size > 10_000
     assert main([str(bags["sim"]), str(bags["other"])]) == 0
     shown = capsys.readouterr().out
@@ -187,3 +197,105 @@ def test_a_plant_is_as_alike_as_its_least_alike_joint(marks: tuple[Mark, Mark], 
     assert [row.quantity for row in joined.evidence] == ["cart: delay", "pole: delay"]
     because = [joint for joint, mark in zip(JOINTS, marks, strict=True) if mark is expected]
     assert joined.reason == "; ".join(f"{joint}: {expected.value}" for joint in because)
+
+
+@pytest.fixture(scope="module")
+def report(bags: dict[str, Path], tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("report")
+    assert report_main([str(bags["sim"]), str(bags["alike"]), "--png-only", "-o", str(folder)]) == 0
+    return folder
+
+
+def embedded(report: Path, name: str) -> Any:
+    text = (report / "report.html").read_text(encoding="utf-8")
+    return json.loads(text.partition(f'id="{name}">')[2].partition("</script>")[0])
+
+
+def test_a_report_shows_each_joint_in_its_own_unit_below_one_answer(report: Path) -> None:
+    text = (report / "report.html").read_text(encoding="utf-8")
+    assert '<div class="verdict yes"' in text
+    assert "Tests against the margins: cart" in text
+    assert "Tests against the margins: pole" in text
+    assert "of cart [m]" in text.replace('<abbr class="term" title="', "")
+    labels = {
+        axis["title"]["text"]
+        for graph in embedded(report, "graphs").values()
+        for axis in graph["layout"].values()
+        if isinstance(axis, dict) and "title" in axis
+    }
+    assert {"cart [m]", "force at cart [N]", "pole [rad]", "Δ pole [rad]", "velocity PSD [(m/s)²/Hz]"} <= labels
+    assert "torque at pole [N m]" not in labels
+    drawn = sorted(path.stem for path in (report / "figures").iterdir())
+    joined = ["joint_differences", "joint_spectra", "joints_together", "timing"]
+    assert drawn == [*(f"equivalence_{joint}" for joint in JOINTS), *joined]
+
+
+def test_a_report_moves_the_links_of_both_plants(report: Path, recordings: dict[str, dict[str, np.ndarray]]) -> None:
+    animation = embedded(report, "animation-data")
+    sim, hw = np.array(animation["sim"]), np.array(animation["hw"])
+    assert sim.shape == hw.shape == (sim.shape[0], 2, 2), "a cart and the end of its pole"
+    assert sim.shape[0] == pytest.approx(8.0 * 50.0, abs=3)
+    for frames in (sim, hw):
+        assert frames.min() >= 0.0
+        assert frames[..., 0].max() <= 640.0
+        assert frames[..., 1].max() <= 300.0
+    # The pole's end is above the cart, and both go to and fro as the cart does.
+    assert (sim[:, 1, 1] < sim[:, 0, 1]).all()
+    moved = np.interp(np.arange(sim.shape[0]) * 0.02, np.arange(800) * 0.01, recordings["sim"]["position"][:, 0])
+    assert np.corrcoef(sim[:, 0, 0], moved)[0, 1] > 0.999
+
+
+@pytest.mark.parametrize(
+    ("stand_in", "words"), [("simulation", "a second simulation"), ("emulated machine", "an emulator")]
+)
+def test_a_report_says_what_stood_in_for_the_machine(
+    stand_in: str, words: str, recordings: dict[str, dict[str, np.ndarray]], bags: dict[str, Path], tmp_path: Path
+) -> None:
+    other = write(tmp_path / "hw", recordings["alike"], stand_in=stand_in)
+    assert report_main([str(bags["sim"]), str(other), "--png-only", "-o", str(tmp_path / "out")]) == 0
+    text = (tmp_path / "out" / "report.html").read_text(encoding="utf-8")
+    assert f"no machine was measured: {words} stood in for the hardware" in text
+
+
+def test_a_report_of_several_joints_refuses_what_is_of_one(
+    bags: dict[str, Path], capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert report_main([str(bags["sim"]), str(bags["alike"]), "--design", "lqr"]) == 2
+    assert "are of plants of one joint; expected none of them for a plant of 2 (cart, pole)" in capsys.readouterr().err
+
+
+def test_a_report_judges_by_the_margins_that_the_run_was_judged_by(
+    bags: dict[str, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    run = tmp_path / "run"
+    run.mkdir()
+    for side, name in (("sim", "sim"), ("hw", "alike")):
+        (run / side).symlink_to(bags[name])
+    assert main([str(run), "--margin", "delay=0.001ms", "-o", str(run)]) == 0
+    capsys.readouterr()
+    assert report_main([str(run), "--png-only"]) == 0
+    assert capsys.readouterr().out.startswith("No: ")
+
+
+def test_the_page_of_several_joints_is_drawn_on_a_phone(report: Path) -> None:
+    browser = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
+    if browser is None:
+        pytest.skip("no Chromium is installed")
+    playwright = pytest.importorskip("playwright.sync_api")
+    with playwright.sync_playwright() as running:
+        opened = running.chromium.launch(executable_path=browser, args=["--no-sandbox", "--disable-gpu"])
+        page = opened.new_page(viewport={"width": 390, "height": 900})
+        messages: list[str] = []
+        page.on("console", lambda message: messages.append(message.text))
+        page.on("pageerror", lambda error: messages.append(str(error)))
+        page.goto((report / "report.html").resolve().as_uri())
+        page.wait_for_function("document.documentElement.dataset.ready === 'true'", timeout=60_000)
+        inked = (
+            "() => { const c = document.getElementById('animation'); const pixels = c.getContext('2d')"
+            ".getImageData(0, 0, c.width, c.height).data;"
+            " return pixels.reduce((n, v, i) => n + (i % 4 === 3 && v > 0), 0); }"
+        )
+        assert page.evaluate(inked) > 500
+        assert page.evaluate("document.documentElement.scrollWidth") <= 390
+        assert messages == []
+        opened.close()

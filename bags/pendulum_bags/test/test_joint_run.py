@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from pendulum_bags.experiments.joint_run import JointSettings, stand_in_for
+from pendulum_bags.experiments.joint_run import JointSettings, load_stand_in, stand_in_for
 from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.plants.mechanism_parameters import load_mechanism
 
@@ -49,3 +49,20 @@ def test_a_share_that_makes_no_plant_is_refused(share: float) -> None:
 def test_the_noise_is_on_the_first_driven_joint_unless_another_is_named() -> None:
     assert JointSettings("double_pendulum").joint == "shoulder"
     assert JointSettings("double_pendulum", "elbow").joint == "elbow"
+
+
+@pytest.mark.parametrize(
+    ("plant", "other", "message"),
+    [
+        ("cart_pole", "furuta", "has model furuta; expected cart_pole"),
+        ("acrobot", "pendubot", "has driven joints shoulder; expected elbow"),
+        ("cart_pole", "thesis", "has model pendulum; expected cart_pole"),
+    ],
+)
+def test_a_machine_with_other_equations_or_other_motors_is_refused(plant: str, other: str, message: str) -> None:
+    with pytest.raises(ParameterError, match=message):
+        load_stand_in(other, load_mechanism(plant))
+
+
+def test_a_machine_with_other_values_is_taken() -> None:
+    assert load_stand_in("acrobot_frictionless", load_mechanism("acrobot")).name == "acrobot_frictionless"

@@ -41,7 +41,8 @@ def _few_trials(monkeypatch):
 
 def test_the_derivatives_of_a_network_are_those_of_finite_differences():
     rng = np.random.default_rng(0)
-    network = Mlp((3, 5, 4, 2), rng)
+    # Two layers of one width, whose arrays are not to be one.
+    network = Mlp((3, 5, 5, 2), rng)
     network.parameters = [each.astype(np.float64) for each in network.parameters]
     x, towards = rng.normal(size=(7, 3)), rng.normal(size=(7, 2))
     network.forward(x)
@@ -220,6 +221,8 @@ def test_a_full_disk_leaves_the_checkpoint_before_it(tmp_path, monkeypatch):
         train(SMALL, out)
     assert checkpoint_path(out).read_bytes() == kept[0]
     assert [path.name for path in tmp_path.iterdir()] == ["policy.checkpoint.npz"]
+    with pytest.raises(DataError, match="No space left on device; nothing was written"):
+        train(SMALL, tmp_path / "other.npz")
 
 
 def test_a_training_that_diverges_says_so_and_writes_no_policy(tmp_path, monkeypatch):

@@ -116,6 +116,37 @@ def test_at_an_end_of_the_travel_or_spinning_there_is_less_reward_than_at_rest_u
     assert rewards[4] == pytest.approx(-0.5, abs=0.01)
     assert rewards[1] < 0.5
     assert rewards[3] < 0.5
+    double = SwingUp(1, DOUBLE, {}, QUIET, np.random.default_rng(0))
+    double.motion[:] = 0.0
+    assert double._reward(np.zeros((1, 2))) == pytest.approx([0.5 + 2.0])
+
+
+def test_what_slides_pays_by_the_square_then_for_the_outer_part_of_its_way_and_most_near_its_end_the_later_the_more():
+    env = SwingUp(5, CART_POLE, {}, QUIET, np.random.default_rng(0))
+    env.motion[:] = 0.0
+    # Of the half metre to the stop, on either side.
+    slid = np.array([0.0, 0.2, -0.6, 0.74, -1.0])
+    env.motion[:, 0] = 0.5 * slid
+    for progress, most in ((0.0, 2.0), (1.0 / 3.0, 2.0), (0.5, 3.5), (2.0 / 3.0, 5.0), (1.0, 5.0)):
+        env.progress = progress
+        paid = 0.5 + np.exp(-((slid / 0.5) ** 2)) - env._reward(np.zeros((5, 1)))
+        assert paid == pytest.approx(
+            [0.0, 0.1 * 0.04, 0.1 * 0.36 + 5.0 * 0.05, 0.1 * 0.74**2 + 5.0 * 0.19 + most, 0.1 + 5.0 * 0.45 + most]
+        )
+
+
+def test_a_training_tells_its_environment_how_far_it_is(tmp_path, monkeypatch):
+    monkeypatch.setattr(training, "TRIALS", 1)
+    told = []
+
+    class Watched(SwingUp):
+        def observe(self):
+            told.append(self.progress)
+            return super().observe()
+
+    monkeypatch.setattr(training, "SwingUp", Watched)
+    train(replace(SMALL, updates=4), tmp_path / "policy.npz")
+    assert sorted(set(told)) == [0.0, 0.25, 0.5, 0.75]
 
 
 def test_scales_and_kicks_of_joints_without_a_motor_are_those_of_gravity():

@@ -23,8 +23,11 @@ from pendulum_bags.studies.mechanism_benchmark import (
     time_above_line,
 )
 from pendulum_bags.studies.mechanism_benchmark_runs import Disturbances, Trial, robustness_of, robustness_trials
+from pendulum_lqr.mechanism_controllers import make_mechanism_controller
+from pendulum_lqr.policy_file import write_policy
 from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.joints import Vector
+from tests.policies import random_policy
 
 T = 0.002 * np.arange(5000)
 ENDS = {
@@ -181,3 +184,23 @@ def test_the_stored_swing_up_scores_better_than_every_published_method(name: str
     best = max(row["score_v2"] or 0.0 for row in document["published"])
     assert document["rows"][0]["score_v2"] > best + 0.01
     assert (tmp_path / f"{name}.png").stat().st_size > 10_000
+
+
+def test_a_policy_file_is_scored_with_an_lqr_near_upright_and_without(tmp_path) -> None:  # type: ignore[no-untyped-def]
+    plant = benchmark_plant("pendubot")
+    file = write_policy(tmp_path / "weak.npz", random_policy(plant, velocity_box=(50.0, 50.0)))
+    names = f"{file},{file}+lqr"
+    arguments = ["benchmark", "--plant", "pendubot", "--controller", names, "--no-robustness", "--uptime-seeds", "0"]
+    result = CliRunner().invoke(app, [*arguments, "--workers", "1", "--out", str(tmp_path), "--json"])
+    assert result.exit_code == 0, result.output
+    rows = json.loads((tmp_path / "pendubot.json").read_text())["rows"]
+    assert [row["controller"] for row in rows] == names.split(",")
+    assert rows[0]["criteria"]["torque_cost"] > 0.0
+    # It never comes near upright: nothing is caught, both do the same.
+    assert rows[0]["criteria"] == rows[1]["criteria"]
+    answers = make_mechanism_controller(f"{file}+lqr", plant, 0.002), make_mechanism_controller(str(file), plant, 0.002)
+    near = (math.pi + 0.02, -0.01, 0.0, 0.05)
+    caught, bare = (controller.command(0.0, near) for controller in answers)
+    assert caught != bare
+    with pytest.raises(ParameterError, match="trained on a double_pendulum driven at shoulder, and this one is"):
+        make_mechanism_controller(str(file), benchmark_plant("acrobot"), 0.002)

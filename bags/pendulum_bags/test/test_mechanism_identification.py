@@ -11,8 +11,10 @@ from pendulum_bags.identification.joint_recordings import FORMAT, JointRecording
 from pendulum_bags.identification.mechanism_fit import fit, prepare_windows, scores
 from pendulum_bags.identification.mechanism_model import MechanismModel, tellable
 from pendulum_bags.identification.mechanism_result import identify_mechanism
+from pendulum_msgs_py.contract.cdr import encode_joints
 from pendulum_msgs_py.errors import DataError
-from pendulum_msgs_py.plants.mechanism_parameters import load_mechanism, load_mechanism_file
+from pendulum_msgs_py.plants.mechanism_parameters import load_mechanism, load_mechanism_file, write_mechanism
+from pendulum_rosbag.storage import open_writer
 
 PERIOD = 0.01
 NOISE = 2e-4
@@ -69,6 +71,24 @@ def save(path, recording, names, driven, order=None):
         if i in driven:
             columns[f"{name}.effort"] = recording.effort[:, (order or range(len(names)))[i]]
     np.savetxt(path, np.column_stack(list(columns.values())), delimiter=",", header=",".join(columns), comments="")
+    return path
+
+
+def record(path, recording, plant, *, joints=None, push=0.0):
+    """Write a recording as the bag of a plant: an applied effort with each state, or measured efforts alone."""
+    names, driven = plant.coordinates.names, plant.coordinates.driven_names
+    columns = [list(names).index(name) for name in driven]
+    with open_writer(path) as bag:
+        for topic in ("joint_states", "applied_effort", "push"):
+            bag.add_topic(f"/plant/{topic}", "sensor_msgs/msg/JointState")
+        for k, t in enumerate(recording.time):
+            stamp = 10**18 + round(t * 1e9)
+            q, u = recording.position[k], recording.effort[k]
+            state = encode_joints(stamp, "plant", joints or names, tuple(q), tuple(0.0 * q), tuple(0.0 * u))
+            bag.write("/plant/joint_states", stamp, state)
+            efforts = tuple(float(u[i]) for i in columns)
+            bag.write("/plant/applied_effort", stamp, encode_joints(stamp, "plant", driven, effort=efforts))
+        bag.write("/plant/push", 10**18, encode_joints(10**18, "hand", names[:1], effort=(push,)))
     return path
 
 
@@ -283,3 +303,51 @@ def test_a_hole_in_one_joints_column_leaves_its_row_out_for_all_joints(tmp_path)
     np.testing.assert_allclose(read.time, 0.01 * kept)
     for index in range(len(coordinates.names)):
         np.testing.assert_allclose(read.position[:, index], 0.5 * np.sin(0.2 * kept + index))
+
+
+def test_a_bag_of_a_plant_is_identified_by_the_efforts_that_it_says_it_applied(tmp_path):
+    from pendulum_sim.mechanism_plant import MechanismPlant
+
+    plant = truth("cart_pole")
+    model, rng = MechanismPlant(plant, PERIOD), np.random.default_rng(5)
+    rows, state = [], model.reset((0.0, 0.4))
+    for k in range(900):
+        # By cosines the cart stays near its middle, away from its end stops.
+        effort = 2.0 * np.cos(2.9 * k * PERIOD) + 3.0 * np.cos(6.1 * k * PERIOD)
+        rows.append((*state.position, effort))
+        state = model.step((effort,))
+    table = np.array(rows)
+    told = JointRecording(
+        "run", PERIOD * np.arange(900), table[:, :2] + rng.normal(0.0, NOISE, (900, 2)),
+        np.column_stack((table[:, 2], np.zeros(900))), ("zero", "zero"),
+    )  # fmt: skip
+    bag = record(tmp_path / "run", told, plant)
+    read = read_joints(bag, plant.coordinates)
+    assert read.hold == ("zero", "zero")
+    np.testing.assert_allclose(read.effort, told.effort)
+    np.testing.assert_allclose(read.time, told.time, atol=1e-9)
+    start = tmp_path / "start.yaml"
+    write_mechanism(start, plant.with_values(OFF["cart_pole"]), provenance={})
+    out = tmp_path / "found.yaml"
+    assert identify_cli.main([str(bag), "--plant", str(start), "--out", str(out)]) == 0
+    found, _ = load_mechanism_file(out)
+    for key in ("cart_mass", "pole_inertia"):
+        assert found.value(key) == pytest.approx(plant.value(key), rel=0.03), key
+
+
+def test_bags_that_are_not_of_this_plant_or_were_pushed_are_refused(both_driven, tmp_path, capsys):
+    plant = truth("double_pendulum")
+    short = replace(both_driven[0], time=both_driven[0].time[:50], position=both_driven[0].position[:50],
+                    effort=both_driven[0].effort[:50])  # fmt: skip
+    swapped = record(tmp_path / "swapped", short, plant, joints=("elbow", "shoulder"))
+    with pytest.raises(DataError, match="is of the joints elbow, shoulder; expected shoulder, elbow, in this order"):
+        read_joints(swapped, plant.coordinates)
+    pushed = record(tmp_path / "pushed", short, plant, push=0.2)
+    with pytest.raises(DataError, match=r"topic /plant/push of bag .* pushes links from outside"):
+        read_joints(pushed, plant.coordinates)
+    with pytest.raises(DataError, match="is of shoulder, elbow; expected the driven joints, elbow"):
+        read_joints(record(tmp_path / "run", short, plant), truth("acrobot").coordinates)
+    with pytest.raises(DataError, match="is a bag, whose joints have names; expected no mapping file"):
+        read_joints(swapped, plant.coordinates, "columns.yaml")
+    with pytest.raises(DataError, match="nowhere does not exist"):
+        read_joints(tmp_path / "nowhere", plant.coordinates)

@@ -28,7 +28,7 @@ from pendulum_bags.report.report_cli import main
 from pendulum_bags.report.tables import make_tables
 from pendulum_bags.report.terms import Terms
 from pendulum_bags.report.wording import name_in
-from pendulum_bags.report.write import _title
+from pendulum_bags.report.write import title_of
 from pendulum_bags.verdict import Evidence, Layer, LayerResult, Mark, write_layer
 from pendulum_bags.verdict.answer import answer_of
 from pendulum_msgs_py.contract.cdr import encode_joint_state
@@ -256,8 +256,8 @@ def test_two_bags_make_a_report_too(folder: Path, tmp_path: Path) -> None:
 
 
 def test_two_bags_of_one_name_are_told_apart_in_the_title() -> None:
-    assert _title([Path("/x/mon/sim"), Path("/x/tue/sim")], 1) == "mon/sim and tue/sim"
-    assert _title([Path("/x/mon"), Path("/x/tue")], 2) == "2 runs"
+    assert title_of([Path("/x/mon/sim"), Path("/x/tue/sim")], 1) == "mon/sim and tue/sim"
+    assert title_of([Path("/x/mon"), Path("/x/tue")], 2) == "2 runs"
 
 
 def test_a_folder_that_is_no_run_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

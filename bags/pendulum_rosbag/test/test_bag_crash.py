@@ -119,7 +119,11 @@ def test_small_chunks_become_large_ones_unseen(
 
     def check() -> None:
         with (bag / "bag_0.mcap").open("rb") as stream:
-            by_index = numbers(SeekingReader(stream, validate_crcs=True))
+            reader = SeekingReader(stream, validate_crcs=True)
+            by_index = numbers(reader)
+            summary = reader.get_summary()
+            if summary is not None and summary.statistics is not None:
+                assert summary.statistics.chunk_count == len(summary.chunk_indexes)
             stream.seek(0)
             in_order = numbers(NonSeekingReader(stream, validate_crcs=True))
         for found in (by_index, in_order):

@@ -7,14 +7,15 @@ Euler: velocities first, then positions with the new velocities; dry friction im
 from __future__ import annotations
 
 import math
-from pathlib import Path
-from typing import Any
 
 import pendulum_msgs_py.dynamics.rigid as _rigid
 import pendulum_msgs_py.dynamics.series_elastic as _sea
 from pendulum_hw_bridge.emulation import firmware as _firmware
 from pendulum_hw_bridge.emulation import thermal as _thermal
 from pendulum_hw_bridge.emulation.firmware import Array, control_pwm, njit
+from pendulum_msgs_py.plants import friction_terms as _terms
+from pendulum_msgs_py.plants.friction_terms import TERM_PARAMETERS
+from pendulum_msgs_py.programs.kept_kernels import drop_stale_code
 
 __all__ = ["CONSTANTS", "STATES", "STEP", "STEPS_PER_CYCLE", "STEP_NS", "advance"]
 
@@ -81,6 +82,7 @@ CONSTANTS = (
     "pwm_limit",
     "pwm_step",
     "enabled",
+    *TERM_PARAMETERS,
 )
 """Names of the constant vector's entries."""
 
@@ -126,7 +128,7 @@ _QM, _VM, _Q, _V, _Z, _TW, _TH, _TB, _PWM, _I, _TAU, _HEAT = range(12)
     _ULIMIT,
     _USTEP,
     _ENABLED,
-) = range(40)
+) = range(len(CONSTANTS) - len(TERM_PARAMETERS))
 
 _CLAMP_BAND = 0.05
 """Share of the velocity clamp over which the firmware takes the drive back to nothing."""
@@ -138,7 +140,9 @@ _dahl_step = njit(cache=True)(_sea.dahl_step)
 _motor_acceleration = njit(cache=True)(_sea.motor_acceleration)
 _dry_friction_step = njit(cache=True)(_sea.dry_friction_step)
 _link_acceleration = njit(cache=True)(_sea.link_acceleration)
+_gravity_torque = njit(cache=True)(_rigid.gravity_torque)
 _friction_magnitude = njit(cache=True)(_rigid.friction_magnitude)
+_added_friction = njit()(_terms.added_friction(CONSTANTS, njit()))
 _constant_at = njit(cache=True)(_thermal.torque_constant_at)
 
 
@@ -225,7 +229,8 @@ def advance(
         velocity = state[_V] + STEP * _link_acceleration(
             state[_Q], state[_V], spring, link_torque, constants[_M], constants[_BL], constants[_G]
         )
-        friction = _friction_magnitude(state[_V], constants[_LTC], constants[_LTS], constants[_LVS])
+        added = _added_friction(abs(state[_V]), abs(_gravity_torque(state[_Q], constants[_G])), constants)
+        friction = _friction_magnitude(state[_V], constants[_LTC] + added, constants[_LTS] + added, constants[_LVS])
         velocity = _dry_friction_step(velocity, friction, constants[_M], STEP)
         state[_VM] = motor_velocity
         state[_V] = velocity
@@ -244,22 +249,4 @@ def advance(
         state[_TB] += STEP * (to_body - to_ambient) / constants[_CB]
 
 
-def _drop_stale_cache(kernel: Any, modules: tuple[Any, ...]) -> None:
-    """Delete compiled code that is older than an equation that it was compiled from.
-
-    numba looks at the kernel's own file only; without this an edited equation would be ignored in silence.
-    """
-    cache = getattr(kernel, "_cache", None)
-    folder = getattr(cache, "cache_path", None)
-    if folder is None or not Path(folder).is_dir():
-        return
-    newest = max(Path(module.__file__).stat().st_mtime for module in modules)
-    for file in Path(folder).glob("kernel.*.nb[ic]"):
-        try:
-            if file.stat().st_mtime < newest:
-                file.unlink()
-        except OSError:
-            continue  # another process was faster, or the folder is read-only: numba copes with both
-
-
-_drop_stale_cache(advance, (_sea, _rigid, _firmware, _thermal))
+drop_stale_code(advance, (_sea, _rigid, _firmware, _thermal, *_terms.modules()))

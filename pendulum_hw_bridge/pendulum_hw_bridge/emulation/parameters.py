@@ -17,6 +17,7 @@ from pendulum_hw_bridge.emulation.thermal import ThermalParameters, torque_const
 from pendulum_hw_bridge.motor_state import MOTOR_SPEED_LIMIT
 from pendulum_msgs_py.dynamics.series_elastic import shorted_winding_damping, winding_resistance_at
 from pendulum_msgs_py.errors import ParameterError
+from pendulum_msgs_py.plants.friction_terms import TERM_PARAMETERS, terms_of
 from pendulum_msgs_py.plants.plant_parameters import (
     PRESETS,
     PlantParameters,
@@ -195,6 +196,7 @@ class EmulatorParameters:
             "pwm_limit": limits.pwm,
             "pwm_step": self.sensors.pwm_step,
             "enabled": 1.0 if enabled else 0.0,
+            **dict(zip(TERM_PARAMETERS, terms_of(self.plant), strict=True)),
         }
         return np.array([values[name] for name in CONSTANTS])
 

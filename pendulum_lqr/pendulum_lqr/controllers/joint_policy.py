@@ -7,8 +7,9 @@ from collections.abc import Mapping
 from typing import Any
 
 from pendulum_lqr.interface import Controller, JointController
+from pendulum_lqr.mechanism_catch import MechanismCatch, deviation_of, make_mechanism_catch
 from pendulum_lqr.policy import Policy, require_plant
-from pendulum_lqr.policy_answers import START_TIME, PolicyAnswers, check_policy_period, states_to_hold
+from pendulum_lqr.policy_answers import START_TIME, ZERO, PolicyAnswers, check_policy_period, states_to_hold
 from pendulum_lqr.policy_file import load_policy
 from pendulum_lqr.sampling import ASSUMED_PERIOD
 from pendulum_msgs_py.errors import ParameterError
@@ -27,6 +28,7 @@ class JointPolicy(JointController):
         effort_limits: Largest effort of each driven joint [N m or N].
         fallback: Who answers after it gave up; None for no effort.
         start_time: Time from the first state until it has all of its effort [s].
+        catch: LQR that takes over near upright; None for none.
     """
 
     def __init__(
@@ -37,11 +39,13 @@ class JointPolicy(JointController):
         fallback: JointController | None = None,
         *,
         start_time: float = START_TIME,
+        catch: MechanismCatch | None = None,
     ) -> None:
         self._answers = PolicyAnswers(policy, hold, effort_limits, start_time)
         super().__init__(self._answers.limits)
         self.policy = policy
         self.fallback = fallback
+        self.catch = catch
         self._deviation = policy.coordinates.deviation
 
     @property
@@ -60,28 +64,39 @@ class JointPolicy(JointController):
     def reset(self) -> None:
         """Forget the past, and that it gave up."""
         self._answers.reset()
+        if self.catch is not None:
+            self.catch.active = False
         if self.fallback is not None:
             self.fallback.reset()
 
     def command(self, t: float, position: Vector, velocity: Vector) -> Vector:
-        """Return the policy's efforts, or the fallback's after it gave up [N m or N]."""
+        """Return the policy's efforts, the catch's near upright, or the fallback's after it gave up [N m or N]."""
         efforts = self._answers.answer(t, self._deviation(position), velocity)
         if efforts is None:
             fallback = self.fallback
             efforts = self._answers.fall_back(
                 t, None if fallback is None else lambda: fallback.command(t, position, velocity)
             )
+        elif self.catch is not None:
+            x = deviation_of(self.policy.coordinates, position + velocity)
+            if self.catch.holds(x):
+                # The network hears of the efforts that act: it may have to go on from here.
+                efforts = self._answers.begun(t, self.catch.command(x))
+                self._answers.follow(efforts)
         return efforts
 
     def describe(self) -> str:
-        """Return which policy it is, and whether it gave up."""
-        return self._answers.describe("no effort" if self.fallback is None else self.fallback.describe())
+        """Return which policy it is, what catches, and whether it gave up."""
+        told = self._answers.describe("no effort" if self.fallback is None else self.fallback.describe())
+        return told if self.catch is None else f"{told}; LQR within {self.catch.region.describe()}"
 
     def carry_over(self, previous: Controller | JointController) -> None:
         """Take over samples and efforts from the same kind of policy, and that it gave up."""
         if not isinstance(previous, JointPolicy):
             return
         self._answers.take_over(previous._answers)
+        if self.catch is not None and previous.catch is not None:
+            self.catch.active = previous.catch.active
         if self.fallback is not None and previous.fallback is not None:
             self.fallback.carry_over(previous.fallback)
 
@@ -108,6 +123,7 @@ def design_joint_policy(
     if period is not None:
         check_policy_period(policy, period)
     limit = p["effort_limit"] or math.inf
-    limits = tuple(min(limit, own) for own in plant.effort_limits)
+    limits = tuple(min(limit, *both) for both in zip(plant.effort_limits, policy.effort_limit, strict=True))
     hold = states_to_hold(policy, ASSUMED_PERIOD if period is None else period)
-    return JointPolicy(policy, hold, limits, fallback, start_time=p["start_time"])
+    catch = make_mechanism_catch(plant, *plant.mechanism.weights, limits) if p["catch"] != ZERO else None
+    return JointPolicy(policy, hold, limits, fallback, start_time=p["start_time"], catch=catch)

@@ -14,7 +14,7 @@ from typing import Any
 
 __all__ = ["complex_step", "in_arithmetic"]
 
-_EQUATIONS = ("pendulum_msgs_py.dynamics", "pendulum_msgs_py.mechanisms")
+_EQUATIONS = ("pendulum_msgs_py.dynamics", "pendulum_msgs_py.mechanisms", "pendulum_msgs_py.plants.friction_terms")
 _STEP = 2.0**-64
 """Imaginary step; its square is lost in any sum, and a power of two scales without rounding."""
 

@@ -18,6 +18,7 @@ from pendulum_msgs_py.dynamics.series_elastic import (
     winding_resistance_at,
 )
 from pendulum_msgs_py.errors import ParameterError
+from pendulum_msgs_py.plants.friction_terms import friction_of_terms
 from pendulum_msgs_py.plants.plant_parameters import PlantParameters, SeriesElasticParameters
 
 __all__ = [
@@ -172,7 +173,7 @@ def friction_effort(plant: PlantParameters, theta: float) -> float:
     """
     drive = plant.drivetrain
     weight = abs(plant.gravity * math.sin(theta - plant.angle_offset))
-    link = plant.coulomb_friction + plant.load_friction * weight
+    link = plant.coulomb_friction + friction_of_terms(plant, weight)
     return (link + (drive.motor_coulomb_friction if drive is not None else 0.0)) / torque_gain(plant)
 
 

@@ -60,6 +60,7 @@ __all__ = [
     "MECHANISM_FORMAT",
     "MECHANISM_PRESETS",
     "MechanismParameters",
+    "common_delay",
     "load_mechanism",
     "load_mechanism_file",
     "mechanism_from_pendulum",
@@ -385,3 +386,18 @@ def _positive_definite(rows: Sequence[Sequence[float]]) -> bool:
             for j in range(k, len(row)):
                 row[j] -= factor * pivot_row[j]
     return True
+
+
+def common_delay(parameters: MechanismParameters) -> float:
+    """Return the transport delay of all actuators [s].
+
+    Raises:
+        ParameterError: They differ.
+    """
+    delays = {actuator.transport_delay for actuator in parameters.actuators}
+    if len(delays) > 1:
+        raise ParameterError(
+            f"transport_delay is {' and '.join(f'{delay} s' for delay in sorted(delays))} on plant "
+            f"{parameters.name!r}; expected the same for all actuators"
+        )
+    return delays.pop() if delays else 0.0

@@ -18,10 +18,11 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from importlib import resources
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.parameters import ParameterSpec, dump_yaml, load_yaml, reject_unknown
+from pendulum_msgs_py.plants.friction_terms import term_fields
 from pendulum_msgs_py.plants.quantities import (
     Quantity,
     build_plant,
@@ -133,11 +134,24 @@ class SeriesElasticParameters:
             )
 
 
+if TYPE_CHECKING:
+
+    @dataclass(frozen=True, kw_only=True)
+    class _FrictionTerms:
+        """What type checkers see of the terms' parameters: those of our own table."""
+
+        load_friction: float = 0.0
+
+else:
+    _FrictionTerms = term_fields()
+
+
 @dataclass(frozen=True)
-class PlantParameters:
+class PlantParameters(_FrictionTerms):
     """Parameters of M_c theta'' + b_c theta' + friction + G_c sin(theta) = u + d.
 
-    ``static_friction`` may be left out (None) and is then the Coulomb friction.
+    ``static_friction`` may be left out (None) and is then the Coulomb friction. Parameters of
+    :mod:`pendulum_msgs_py.plants.friction_terms` are given by name.
     """
 
     inertia: Annotated[float, Quantity("kg m^2", "Inertia about the joint, M_c.", positive=True, example=0.055)]
@@ -150,7 +164,6 @@ class PlantParameters:
     stribeck_velocity: Annotated[
         float, Quantity("rad/s", "Velocity over which tau_S falls to tau_C.", positive=True)
     ] = 0.01
-    load_friction: Annotated[float, Quantity("-", "Dry friction per torque of gravity carried, added to tau_C.")] = 0.0
     torque_offset: Annotated[
         float, Quantity("N m", "Constant torque that the sensor of effort misses.", signed=True)
     ] = 0.0

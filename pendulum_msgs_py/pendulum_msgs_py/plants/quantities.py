@@ -45,7 +45,8 @@ def specs_of(kind: type[Any]) -> tuple[ParameterSpec, ...]:
     """Return the table of a dataclass's quantities: name and default are the field's, the rest its annotation's."""
     found = []
     hints = get_type_hints(kind, include_extras=True)
-    for entry in fields(kind):
+    # What is given by name alone, such as a friction term, stands last.
+    for entry in sorted(fields(kind), key=lambda entry: bool(entry.kw_only)):
         for quantity in getattr(hints[entry.name], "__metadata__", ()):
             default = entry.default if isinstance(entry.default, float) else quantity.example
             minimum = None if quantity.signed else 0.0

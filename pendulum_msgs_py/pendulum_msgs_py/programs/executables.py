@@ -170,6 +170,7 @@ def cli_main(
     # typer brings a click of its own, which is no other click's: its errors are found through what it exports.
     usage_error: Any = next(kind for kind in typer.BadParameter.__mro__ if kind.__name__ == "ClickException")
     command: Any = typer.main.get_command(app)
+    command.context_settings["token_normalize_func"] = _one_name
     arguments = list(sys.argv[1:] if argv is None else argv)
     own, ros = split_ros_arguments(arguments) if takes_ros_arguments else (arguments, [])
     if completion.asked():
@@ -223,18 +224,31 @@ def _refuse_repeats(command: Any) -> None:
     """
     for one in getattr(command, "commands", {}).values():
         _refuse_repeats(one)
-    parse = command.parse_args
+    make_parser = command.make_parser
 
-    def parse_once(context: Any, arguments: list[str]) -> list[str]:
-        _, _, order = command.make_parser(context).parse_args(args=list(arguments))
-        # Whoever asks for help gets it, and a flag that cannot be taken back says the same once more.
-        counted_once = [] if any(option.name == "help" for option in order) else order
-        for option in counted_once:
-            if order.count(option) > 1 and not option.multiple and (not option.is_flag or option.secondary_opts):
-                raise ParameterError(f"{max(option.opts, key=len)} is given {order.count(option)} times; expected once")
-        return list(parse(context, arguments))
+    def make_strict_parser(context: Any) -> Any:
+        parser = make_parser(context)
+        parse = parser.parse_args
 
-    command.parse_args = parse_once
+        def parse_once(args: list[str]) -> Any:
+            values, left, order = parse(args)
+            # Whoever asks for help gets it, and a flag that cannot be taken back says the same once more.
+            counted_once = [] if any(option.name == "help" for option in order) else order
+            for option in counted_once:
+                count = order.count(option)
+                if count > 1 and not option.multiple and (not option.is_flag or option.secondary_opts):
+                    raise ParameterError(f"{max(option.opts, key=len)} is given {count} times; expected once")
+            return values, left, order
+
+        parser.parse_args = parse_once
+        return parser
+
+    command.make_parser = make_strict_parser
+
+
+def _one_name(name: str) -> str:
+    """Return the name that we have for an option: ``--output`` of ROS 2's own tools is ``--out`` here, not in helps."""
+    return "out" if name == "output" else name
 
 
 def print_text(text: str) -> None:

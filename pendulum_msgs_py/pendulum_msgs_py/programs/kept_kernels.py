@@ -10,14 +10,15 @@ import contextlib
 import hashlib
 import pickle
 import sys
+from collections.abc import Iterable
 from functools import cache
 from pathlib import Path
-from types import FunctionType
+from types import FunctionType, ModuleType
 from typing import Any
 
 from pendulum_msgs_py.whole_file import write_whole
 
-__all__ = ["KernelStore", "keep_kernel"]
+__all__ = ["KernelStore", "drop_stale_code", "keep_kernel"]
 
 
 def keep_kernel(dispatcher: Any, name: str, *choice: object) -> Any:
@@ -125,3 +126,23 @@ def _source_of(package: str) -> str:
     for path in files:
         total.update(f"{path}\n".encode() + path.read_bytes())
     return total.hexdigest()
+
+
+def drop_stale_code(kernel: Any, modules: Iterable[ModuleType]) -> None:
+    """Delete what numba's own ``cache=True`` keeps of a kernel where it is older than what the kernel calls.
+
+    Numba looks at the kernel's own file only; without this an edited equation would be ignored in silence.
+
+    Args:
+        kernel: The compiled function.
+        modules: Those whose functions and tables it was compiled from, beside its own.
+    """
+    folder = getattr(getattr(kernel, "_cache", None), "cache_path", None)
+    if folder is None or not Path(folder).is_dir():
+        return
+    newest = max(Path(str(module.__file__)).stat().st_mtime for module in modules)
+    for file in Path(folder).glob(f"{Path(kernel.py_func.__code__.co_filename).stem}.*.nb[ic]"):
+        # Another process was faster, or the folder is read-only: numba copes with both.
+        with contextlib.suppress(OSError):
+            if file.stat().st_mtime < newest:
+                file.unlink()

@@ -16,6 +16,7 @@ from rich.markup import escape
 from pendulum_bags.analyse.questions import QUESTIONS
 from pendulum_msgs_py.programs.counted_progress import counted_progress
 from pendulum_msgs_py.programs.executables import cli_main
+from pendulum_msgs_py.programs.options import Json, out_option
 from pendulum_msgs_py.programs.terminal import WholeTable, make_console
 
 if TYPE_CHECKING:
@@ -45,16 +46,16 @@ def analyse(
         str,
         typer.Option(help=f"Questions: {_named(of_runs=False)} of each plant; {_named(of_runs=True)} of run folders."),
     ] = "metrics,timing",
-    out: Annotated[
-        Path, typer.Option("--out", "-o", help="Folder for the tables; an interrupted analysis goes on there.")
-    ] = Path("bags", "runs", "analysed"),
+    out: Annotated[Path, out_option("Folder for the tables; an interrupted analysis goes on there.")] = Path(
+        "bags", "runs", "analysed"
+    ),
     workers: Annotated[
         int, typer.Option(help="Processes of a local Dask cluster; 0: one after the other, in this process.", min=0)
     ] = 0,
     scheduler: Annotated[
         str, typer.Option(help="Dask scheduler, tcp://HOST:PORT; its workers see the bags under the same paths.")
     ] = "",
-    json_output: Annotated[bool, typer.Option("--json", help="Print the rows as JSON.")] = False,
+    json_output: Json = False,
 ) -> None:
     """Ask many bags the same questions: metrics, timing, identified parameters, equivalence; one table."""
     from pendulum_bags.analyse.bag_table import analyse_bags, find_pieces

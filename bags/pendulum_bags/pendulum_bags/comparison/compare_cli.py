@@ -14,6 +14,7 @@ import typer
 
 from pendulum_msgs_py.errors import DataError
 from pendulum_msgs_py.programs.executables import cli_main
+from pendulum_msgs_py.programs.options import Json, out_option
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -72,7 +73,7 @@ def compare(
     design: DesignOption = None,
     out: Annotated[
         Path | None,
-        typer.Option("--out", "-o", help="Folder for comparison.json and figures; none by default."),
+        out_option("Folder for comparison.json and figures; none by default."),
     ] = None,
     own_protocol: Annotated[
         Path | None,
@@ -83,7 +84,7 @@ def compare(
     joint: Annotated[
         str | None, typer.Option(help="One joint of plants of several; by default all, and one answer.")
     ] = None,
-    json_output: Annotated[bool, typer.Option("--json", help="Print JSON instead of tables.")] = False,
+    json_output: Json = False,
 ) -> None:
     """Compare simulation and hardware under noise: statistics of the difference, equivalence tests, a verdict.
 

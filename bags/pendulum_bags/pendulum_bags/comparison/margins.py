@@ -27,6 +27,9 @@ _FACTORS = {
     "s": 1.0,
     "mm": 1e-3,
     "m": 1.0,
+    "N m": 1.0,
+    "Hz": 1.0,
+    SHARE: 0.01,
 }
 """From what a user may write to SI."""
 _UNITS: Mapping[str, tuple[str, ...]] = {
@@ -63,7 +66,12 @@ class Margin:
     @property
     def si(self) -> float:
         """Value in SI units; 0.15 for 15 %."""
-        return self.value * (0.01 if self.is_share else _FACTORS.get(self.unit, 1.0))
+        return self.value * _FACTORS[self.unit]
+
+    @property
+    def per_si(self) -> float:
+        """Factor from SI to its unit."""
+        return 1.0 / _FACTORS[self.unit]
 
     def __str__(self) -> str:
         """Return it as a user would write it."""

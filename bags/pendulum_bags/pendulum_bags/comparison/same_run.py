@@ -32,17 +32,6 @@ LAG_STEP = 0.001
 _AHEAD = LAG_STEP * np.array([1.0, 2.0, 3.0, 4.0, 6.0, 8.0, 12.0, 16.0])
 _LAGS = np.concatenate((-_AHEAD[::-1], [0.0], _AHEAD))
 _QUANTITIES = ("angle", "velocity", "torque")
-_UNITS = {
-    "rad": 1.0,
-    "deg": 180.0 / math.pi,
-    "rad/s": 1.0,
-    "deg/s": 180.0 / math.pi,
-    "s": 1.0,
-    "ms": 1e3,
-    "N m": 1.0,
-    "m": 1.0,
-    "mm": 1e3,
-}
 _SIMULATION, _HARDWARE, _LIKENESS = 5, 11, 17
 """First columns of the moments of either side, and of the products and squares of velocities at each lag."""
 
@@ -301,7 +290,7 @@ def _lag(means: Array) -> Array:
 
 def _mean_test(resampled: Resampled, statistic: Statistic, margins: Margins, kind: _Kind) -> EquivalenceTest:
     margin = margins.mean_position if kind.slides else margins.mean_angle
-    scale = _UNITS[margin.unit]
+    scale = margin.per_si
     interval = bootstrap_interval(resampled, lambda means: scale * statistic(means), level=kind.looks.level)
     name = f"mean {kind.name('angle')} difference"
     return equivalence_test(name, margin.unit, interval, -margin.value, margin.value, runs=kind.runs)
@@ -334,7 +323,7 @@ def _spread_test(
         return equivalence_test(
             f"spread of {kind.name(what)} (ratio)", "-", interval, 1.0 / top, top, runs=kind.runs, ratio=True
         )
-    scale = _UNITS[margin.unit]
+    scale = margin.per_si
     interval = bootstrap_interval(
         resampled,
         lambda means: np.asarray(scale * (np.sqrt(_variance(means, above)) - np.sqrt(_variance(means, below)))),
@@ -346,7 +335,7 @@ def _spread_test(
 
 
 def _delay_test(resampled: Resampled, centre: float, margin: Margin, kind: _Kind) -> EquivalenceTest:
-    scale = _UNITS[margin.unit]
+    scale = margin.per_si
     interval = bootstrap_interval(
         resampled,
         lambda means: scale * (centre + _lag(means)),
@@ -357,7 +346,7 @@ def _delay_test(resampled: Resampled, centre: float, margin: Margin, kind: _Kind
 
 def _no_delay(margins: Margins, kind: _Kind) -> EquivalenceTest:
     """Return the test of a delay that the motions do not tell: anything that was looked for may be it."""
-    margin, scale = margins.delay, _UNITS[margins.delay.unit]
+    margin, scale = margins.delay, margins.delay.per_si
     end = scale * LONGEST_DELAY
     interval = Interval(math.nan, -end, end, kind.looks.level, math.nan, 1)
     test = equivalence_test("delay", margin.unit, interval, -margin.value, margin.value, runs=kind.runs)
@@ -372,7 +361,7 @@ def _path_test(resampled: Resampled, index: int, what: str, margin: Margin, kind
         size = np.sqrt(np.maximum(means[..., index], 0.0))
         if margin.is_share:
             return np.asarray(100.0 * size / np.sqrt(_variance(means, own)))
-        return np.asarray(_UNITS[margin.unit] * size)
+        return np.asarray(margin.per_si * size)
 
     interval = bootstrap_interval(resampled, distance, level=kind.looks.level)
     name = f"distance of {'velocities' if what == 'velocity' else kind.name('angles')}"

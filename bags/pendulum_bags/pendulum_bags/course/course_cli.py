@@ -12,6 +12,7 @@ import typer
 
 from pendulum_msgs_py.errors import BagError, ParameterError
 from pendulum_msgs_py.programs.executables import EXIT_INTERRUPTED, cli_main
+from pendulum_msgs_py.programs.options import Json, out_option
 
 if TYPE_CHECKING:
     from pendulum_bags.course.checks import Judgement
@@ -40,7 +41,6 @@ check = typer.Typer(
 app.add_typer(check, name="check")
 
 Course = Annotated[Path, typer.Option("--course", help="Folder that `course make` wrote.")]
-AsJson = Annotated[bool, typer.Option("--json", help="Print the judgement as JSON.")]
 
 
 @app.command()
@@ -48,7 +48,7 @@ def make(
     seed: Annotated[
         int, typer.Option(help="Another seed makes another course; use the year, for instance.", min=0)
     ] = 1,
-    out: Annotated[Path, typer.Option("--out", "-o", help="Folder to write; it must be new or empty.")] = DEFAULT,
+    out: Annotated[Path, out_option("Folder to write; it must be new or empty.")] = DEFAULT,
 ) -> None:
     """Write exercises.md, course.yaml and the sealed plant of a seed. None of them contains the seed.
 
@@ -77,7 +77,7 @@ def make(
 @app.command()
 def solution(
     seed: Annotated[int, typer.Option(help="The seed of `course make`.", min=0)],
-    as_json: AsJson = False,
+    as_json: Json = False,
 ) -> None:
     """Print the answers to the course of a seed: for the teacher.
 
@@ -102,7 +102,7 @@ def gains(
     q: Annotated[str, typer.Option(help="Diagonal of Q, as `design` takes it: 100,0.01 [1/rad^2, s^2/rad^2].")],
     r: Annotated[float, typer.Option(help="R [1/(N m)^2].")],
     course: Course = DEFAULT,
-    as_json: AsJson = False,
+    as_json: Json = False,
 ) -> int:
     """Exercise 1: weights for a given time constant.
 
@@ -118,7 +118,7 @@ def gains(
 def plant(
     file: Annotated[Path, typer.Argument(help="Plant file that you identified.")],
     course: Course = DEFAULT,
-    as_json: AsJson = False,
+    as_json: Json = False,
 ) -> int:
     """Exercise 2: the parameters of the hidden plant.
 
@@ -140,7 +140,7 @@ def plant(
 def delay(
     delay: Annotated[float, typer.Argument(help="Delay at which the loop becomes unstable [s].")],
     course: Course = DEFAULT,
-    as_json: AsJson = False,
+    as_json: Json = False,
 ) -> int:
     """Exercise 3: the delay at which the pendulum falls.
 
@@ -156,7 +156,7 @@ def noise(
     ratio: Annotated[float, typer.Argument(help="Factor by which the standard deviation of theta grows [-].")],
     because: Annotated[str, typer.Option(help="Explanation: a, b, c or d.")],
     course: Course = DEFAULT,
-    as_json: AsJson = False,
+    as_json: Json = False,
 ) -> int:
     """Exercise 4: why noise at 500 Hz looks calmer.
 
@@ -171,7 +171,7 @@ def noise(
 def winner(
     name: Annotated[str, typer.Argument(help="a or b.")],
     course: Course = DEFAULT,
-    as_json: AsJson = False,
+    as_json: Json = False,
 ) -> int:
     """Exercise 5: which controller wins on the machine. Runs both on the emulated machine, some 20 s.
 
@@ -196,7 +196,7 @@ def winner(
 def fault(
     bag: Annotated[Path, typer.Argument(help="Recording of the bridge.")],
     course: Course = DEFAULT,
-    as_json: AsJson = False,
+    as_json: Json = False,
 ) -> int:
     """Exercise 6: break the bridge, safely.
 

@@ -272,6 +272,8 @@ class PlantClient:
         self.check_alive()
         for event in self.events[self._finished_before :]:
             if event["name"] == Event.TRAJECTORY_REFUSED:
+                # One that stopped just before the move was asked for refuses it: what stopped it is the cause.
+                self.check_mode()
                 raise FaultError(f"{self.namespace} refused the trajectory: {event.get('reason')}")
             if event["name"] == Event.PLANT_MODE and event.get("mode") in {"fault", "e_stop", "disarmed"}:
                 raise PlantStoppedError(self.namespace, str(event["mode"]), str(event.get("reason")))

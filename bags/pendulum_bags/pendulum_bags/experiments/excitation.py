@@ -15,21 +15,19 @@ from typing import Any
 from pendulum_bags.experiments.conductor_node import Conductor, PlantClient, RecorderClient
 from pendulum_bags.experiments.domain import check_domain
 from pendulum_bags.experiments.lockstep import record_run
-from pendulum_bags.experiments.processes import ProcessSet, ros_environment, start_recorder
 from pendulum_bags.experiments.run_spec import RunSpec
-from pendulum_bags.runs.run_folder import write_json
+from pendulum_bags.experiments.session import START_TIMEOUT, conduct, refuse_existing
 from pendulum_bags.runs.run_record import RUN_RECORD
 from pendulum_msgs_py.contract import names
 from pendulum_msgs_py.contract.angles import wrap
 from pendulum_msgs_py.contract.names import Event
-from pendulum_msgs_py.errors import BagError, FaultError, ParameterError
+from pendulum_msgs_py.errors import FaultError, ParameterError
 from pendulum_msgs_py.programs import graph
 
 __all__ = ["ExcitationPlay", "play_in_lockstep", "play_on_running_plant"]
 
 _REST = 0.5
 """Time at rest after the last torque, so that the recording has the end of the motion [s]."""
-_START_TIMEOUT = 60.0
 _FIND_TIMEOUT = 30.0
 _AT_REST_ANGLE = 0.1
 _AT_REST_SPEED = 0.3
@@ -115,8 +113,7 @@ def play_in_lockstep(
         BagError: The bag exists.
         FaultError: The plant faulted, beyond its limits for instance, or a program ended.
     """
-    if bag.exists():
-        raise BagError(f"bag {bag} exists; expected a new folder")
+    refuse_existing(bag)
     limits: dict[str, Any] = {
         "effort_limit": float(play.effort),
         "velocity_limit": _SPEED_ROOM * play.speed,
@@ -167,24 +164,21 @@ def play_on_running_plant(
         FaultError: There is no plant, somebody else commands it, it does not hang at rest, it is not armed, or it left
             the limits; it is at zero torque when this is raised.
     """
-    if bag.exists():
-        raise BagError(f"bag {bag} exists; expected a new folder")
+    refuse_existing(bag)
     logs = bag.parent / "logs" / bag.name
     chosen = check_domain(domain) or 0
-    with (
-        ProcessSet(logs, ros_environment(chosen, logs)) as processes,
-        Conductor(chosen, watch=processes.check, on_wait=on_wait) as conductor,
-    ):
+    with conduct(logs, chosen, on_wait) as session:
+        conductor = session.conductor
         node_name = _find_plant(conductor, namespace)
         _refuse_others(conductor, namespace)
         plant = PlantClient(conductor, namespace, node_name, controller="zero_torque", disturbance="excitation")
         conductor.wait_for(f"a state of {namespace}", lambda: plant.sample is not None, _FIND_TIMEOUT)
         _require_rest(conductor, plant)
         armed = _is_armed(plant, may_arm=arm)
-        metadata = logs / "metadata.json"
         run = {"experiment": "excitation", "namespace": namespace, "plant": node_name, "clock": "realtime"}
-        write_json(metadata, {RUN_RECORD: run, "pendulum.excitation": dict(play.prediction)})
-        recorder = start_recorder(processes, bag, namespace, metadata, "mcap")
+        recorder = session.record(
+            bag, namespace, {RUN_RECORD: run, "pendulum.excitation": dict(play.prediction)}, "mcap"
+        )
         zero = graph.controller(
             namespace, controller="playback", file=str(play.zero_file(logs).resolve()), period=play.period
         )
@@ -192,28 +186,25 @@ def play_on_running_plant(
             namespace, kind="from_bag", file=str(play.file.resolve()), duration=float(play.duration)
         )
         for program, name in ((zero, "zero_torque"), (signal, "excitation")):
-            processes.start_node(
+            session.processes.start_node(
                 graph.NodeProgram(program.package, program.executable, namespace, name, program.parameters)
             )
-        plant.wait_until_ready(_START_TIMEOUT)
+        plant.wait_until_ready(START_TIMEOUT)
         wanted = {f"{namespace}/{topic}" for topic in (names.JOINT_STATES, names.APPLIED_EFFORT, names.DISTURBANCE)}
         ears = RecorderClient(conductor, namespace)
-        conductor.wait_for("the recorder to hear the plant", lambda: wanted <= ears.heard(), _START_TIMEOUT)
-        try:
-            if not armed:
-                plant.arm()
-            plant.start_disturbance()
-            longest = play.duration + _START_TIMEOUT
-            conductor.wait_for("the end of the excitation", lambda: _watch(plant, play), longest)
-            conductor.spin(_REST)
-        except BaseException:
-            # Beyond its limits, or interrupted: the drive lets go now, not when the programs have ended.
-            plant.disarm_quietly()
-            raise
+        conductor.wait_for("the recorder to hear the plant", lambda: wanted <= ears.heard(), START_TIMEOUT)
+        # Beyond its limits, or interrupted: the drive lets go now, not when the programs have ended.
+        session.drives(plant)
         if not armed:
-            plant.disarm_quietly()
-        if processes.finish(recorder) != 0:
-            raise FaultError(recorder.last_words(1))
+            plant.arm()
+        plant.start_disturbance()
+        conductor.wait_for("the end of the excitation", lambda: _watch(plant, play), play.duration + START_TIMEOUT)
+        conductor.spin(_REST)
+        if not armed:
+            session.let_go()
+        # Who had armed it has it again: no trouble with the bag disarms it.
+        session.leaves(plant)
+        session.close(recorder)
     return bag
 
 

@@ -11,6 +11,7 @@ import typer
 
 from pendulum_msgs_py.errors import DataError
 from pendulum_msgs_py.programs.executables import EXIT_INTERRUPTED, cli_main
+from pendulum_msgs_py.programs.options import Json, RunningDomain, out_option
 
 if TYPE_CHECKING:
     from pendulum_bags.identification.excitation import Excitation, Limits
@@ -35,7 +36,7 @@ def excite(
     noise: Annotated[float, typer.Option(help="Standard deviation of the angle sensor [rad].")] = 1e-3,
     seed: Annotated[int, typer.Option(help="Of the search.")] = 0,
     trials: Annotated[int, typer.Option(help="Candidates to try, and again to improve the best.")] = 60,
-    out: Annotated[Path, typer.Option(help="CSV (time, torque) to write.")] = Path("excitation.csv"),
+    out: Annotated[Path, out_option("CSV (time, torque) to write.")] = Path("excitation.csv"),
     play: Annotated[bool, typer.Option(help="Play it when it is designed, and record.")] = False,
     on: Annotated[
         str,
@@ -56,8 +57,8 @@ def excite(
     arm: Annotated[
         bool, typer.Option(help="With --on running: arm the plant, and disarm it at the end. It will move.")
     ] = False,
-    domain: Annotated[int | None, typer.Option(help="ROS domain; by default ROS_DOMAIN_ID.")] = None,
-    as_json: Annotated[bool, typer.Option("--json", help="Print the result as JSON.")] = False,
+    domain: RunningDomain = None,
+    as_json: Json = False,
 ) -> None:
     """Design the torque signal that determines a plant's parameters best within limits, from rest.
 

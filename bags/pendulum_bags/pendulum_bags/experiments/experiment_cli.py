@@ -38,6 +38,7 @@ from pendulum_bags.studies.region_cli import region_of_attraction
 from pendulum_bags.studies.study_cli import add_commands as add_study_commands
 from pendulum_msgs_py.errors import ParameterError, PendulumError
 from pendulum_msgs_py.programs.executables import EXIT_INTERRUPTED, cli_main
+from pendulum_msgs_py.programs.options import Domain, Json, Lab, Storage, Yes, out_option
 from pendulum_msgs_py.programs.terminal import WholeTable, make_console
 
 if TYPE_CHECKING:
@@ -78,17 +79,14 @@ Duration = Annotated[float, typer.Option(help="Length of the noise [s].")]
 Controller = Annotated[str, typer.Option(help="Kind of controller, or a policy file (.npz).")]
 Q = Annotated[tuple[float, float], typer.Option(help="Diagonal of Q.")]
 R = Annotated[float, typer.Option(help="R.")]
-Storage = Annotated[str, typer.Option(help="Storage of the bags: mcap or sqlite3.")]
-Domain = Annotated[int | None, typer.Option(help="ROS domain; by default ROS_DOMAIN_ID, or the first free one.")]
 Strategy = Annotated[str, typer.Option(help="How the actuator turns wanted torque into PWM.")]
-Lab = Annotated[Path | None, typer.Option(help="Lab file of the real actuator, for --hardware hebi.")]
-Yes = Annotated[bool, typer.Option("--yes", help="Do not ask before the real machine moves.")]
 
 
 @app.command()
 def thesis(
     out: Annotated[
-        Path | None, typer.Option(help="Folder of the run; it must be new. Default: bags/runs/<UTC>_thesis.")
+        Path | None,
+        out_option("Folder of the run; it must be new. Default: bags/runs/<UTC>_thesis."),
     ] = None,
     plant: Annotated[
         str | None,
@@ -133,7 +131,7 @@ def thesis(
             min=0.0,
         ),
     ] = 60.0,
-    json_output: Annotated[bool, typer.Option("--json", help="Print summary.json instead of the table.")] = False,
+    json_output: Json = False,
 ) -> None:
     """Regulate the upright pendulum under noise on simulator and hardware: is the simulation good enough?
 
@@ -269,7 +267,7 @@ app.command(name="joints")(joints)
 
 @app.command()
 def examples(
-    out: Annotated[Path, typer.Option(help="Folder for the recordings.")] = Path("bags", "examples"),
+    out: Annotated[Path, out_option("Folder for the recordings.")] = Path("bags", "examples"),
 ) -> None:
     """Record anew the small recordings that come with the project, in lockstep.
 

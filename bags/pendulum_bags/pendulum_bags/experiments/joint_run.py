@@ -19,7 +19,7 @@ from pendulum_msgs_py.plants.plant_parameters import is_mechanism
 from pendulum_msgs_py.programs import graph
 from pendulum_msgs_py.programs.graph import NodeProgram
 
-__all__ = ["JointRun", "JointSettings", "record_joints", "stand_in_for"]
+__all__ = ["JointRun", "JointSettings", "load_stand_in", "record_joints", "stand_in_for"]
 
 _UNCHANGED = frozenset(
     {"gravity", "gear_ratio", "stribeck_velocity", "lower_stop", "upper_stop", "effort_limit", "time_constant"}
@@ -82,8 +82,12 @@ class JointRun:
     settings: JointSettings
     side: str
     plant: str
-    has_bridge: bool = False
     simulated_time: bool = True
+
+    @property
+    def has_bridge(self) -> bool:
+        """Whether the plant is the bridge, on an emulated machine."""
+        return self.side == "hw"
 
     @property
     def namespace(self) -> str:
@@ -106,18 +110,27 @@ class JointRun:
         return self.settings.storage
 
     def plant_program(self, listeners: int) -> NodeProgram:
-        """Return the simulator, paused; it waits for so many subscriptions to its states."""
+        """Return the simulator, paused, or the bridge; either waits for so many subscriptions to its states."""
+        rate = 1.0 / self.settings.period
+        lockstep: dict[str, Any] = {
+            "clock": "lockstep",
+            "lockstep_inputs": ["effort_command", "disturbance"],
+            "lockstep_subscribers": listeners,
+            "lockstep_duration": float(self.duration),
+        }
+        if self.has_bridge:
+            goal = list(load_mechanism(self.plant).coordinates.goal)
+            return graph.bridge(
+                self.namespace,
+                plant=self.plant,
+                backend="emulator",
+                initial_positions=goal,
+                feedback_rate=rate,
+                seed=self.settings.seed,
+                **lockstep,
+            )
         return graph.simulator(
-            self.namespace,
-            plant=self.plant,
-            start="top",
-            rate_hz=1.0 / self.settings.period,
-            clock="lockstep",
-            lockstep_inputs=["effort_command", "disturbance"],
-            lockstep_subscribers=listeners,
-            lockstep_duration=float(self.duration),
-            armed_at_start=True,
-            paused=True,
+            self.namespace, plant=self.plant, start="top", rate_hz=rate, armed_at_start=True, paused=True, **lockstep
         )
 
     def controller_program(self) -> NodeProgram:
@@ -146,7 +159,7 @@ class JointRun:
                 "seed": self.settings.seed,
                 "disturbance": self._noise(),
                 "controller": {"kind": "lqr"},
-                **({STAND_IN: "simulation"} if self.side == "hw" else {}),
+                **({STAND_IN: "emulated machine"} if self.side == "hw" else {}),
                 "duration": self.duration,
                 "period": self.settings.period,
                 **provenance(),
@@ -188,6 +201,29 @@ def stand_in_for(plant: MechanismParameters, *, share: float, delay: float, seed
         elif key not in _UNCHANGED:
             changes[name] = value * (1.0 + float(drawn.uniform(-share, share)))
     return replace(plant.with_values(changes), name=f"{plant.name}_stand_in")
+
+
+def load_stand_in(path: str | Path, plant: MechanismParameters) -> MechanismParameters:
+    """Return the plant of a file that is to stand in for a machine.
+
+    Args:
+        path: The plant file, or a preset.
+        plant: The plant that is simulated.
+
+    Raises:
+        ParameterError: It cannot be read, or has other equations or other joints than the simulated plant.
+    """
+    found = load_mechanism(path)
+    for what, ours, others in (
+        ("model", plant.mechanism.name, found.mechanism.name),
+        ("driven joints", ", ".join(plant.coordinates.driven_names), ", ".join(found.coordinates.driven_names)),
+    ):
+        if ours != others:
+            raise ParameterError(
+                f"plant file {path} has {what} {others or 'none'}; expected {ours}, as the plant that is simulated, "
+                f"{plant.name}: the controller on both sides is designed for it"
+            )
+    return found
 
 
 def record_joints(

@@ -11,6 +11,7 @@ import typer
 from pendulum_bags.comparison.compare_cli import MarginOption, MarginsFile
 from pendulum_bags.experiments.progress import PhaseProgress
 from pendulum_msgs_py.programs.executables import EXIT_INTERRUPTED
+from pendulum_msgs_py.programs.options import Json, Storage, out_option
 from pendulum_msgs_py.programs.terminal import make_console
 
 __all__ = ["joints"]
@@ -21,7 +22,8 @@ _STARTING, _PACE = 6.0, 0.4
 
 def joints(
     out: Annotated[
-        Path | None, typer.Option(help="Folder of the run; it must be new. Default: bags/runs/<UTC>_joints.")
+        Path | None,
+        out_option("Folder of the run; it must be new. Default: bags/runs/<UTC>_joints."),
     ] = None,
     plant: Annotated[
         str, typer.Option(help="Preset or plant file of several joints: simulated, and designed on.")
@@ -39,27 +41,29 @@ def joints(
     hold_time: Annotated[float, typer.Option(help="Time for which a noise sample is held [s].")] = 0.01,
     duration: Annotated[float, typer.Option(help="Length of the noise [s].")] = 20.0,
     seed: Annotated[int, typer.Option(help="Seed of the noise, and of the draw.", min=0)] = 1,
-    storage: Annotated[str, typer.Option(help="Storage of the bags: mcap or sqlite3.")] = "mcap",
+    storage: Storage = "mcap",
     margin: MarginOption = None,
     margins_file: MarginsFile = None,
-    json_output: Annotated[bool, typer.Option("--json", help="Print JSON instead of tables.")] = False,
+    json_output: Json = False,
 ) -> None:
     """Hold a plant of several joints upright under noise, and another one in the place of its machine; compare both.
 
-    There is no bridge for several joints yet: a second simulation stands in for the machine, and is told so beside the
-    answer, which calls it emulated hardware.
+    In the place of the machine the bridge drives an emulated one: quasi-direct drives, encoders and delays on a plant
+    that is a little off. The answer calls it emulated hardware.
     Both sides run as nodes over DDS, in lockstep, under one LQR that is designed on the simulated plant.
 
     Example: python -m pendulum_bags experiment joints --plant furuta --amplitude 0.02 --share 0.1
     """
     from pendulum_bags.comparison.compare_cli import compare
-    from pendulum_bags.experiments.joint_run import JointSettings, record_joints, stand_in_for
+    from pendulum_bags.experiments.joint_run import JointSettings, load_stand_in, record_joints, stand_in_for
     from pendulum_bags.runs.run_folder import create_run_folder, discard_if_empty
     from pendulum_msgs_py.plants.mechanism_parameters import load_mechanism, write_mechanism
 
     settings = JointSettings(plant, joint, amplitude, hold_time, duration, seed, storage=storage)
-    stand_in = load_mechanism(machine) if machine else None
-    drawn = stand_in or stand_in_for(load_mechanism(plant), share=share, delay=delay, seed=seed)
+    simulated = load_mechanism(plant)
+    drawn = (
+        load_stand_in(machine, simulated) if machine else stand_in_for(simulated, share=share, delay=delay, seed=seed)
+    )
     console = make_console(stderr=json_output, highlight=False)
     folder = create_run_folder(out, "joints")
     started = time.monotonic()
@@ -76,7 +80,7 @@ def joints(
         raise typer.Exit(EXIT_INTERRUPTED) from None
     compare([folder], margin=margin, margins_file=margins_file, out=folder, json_output=json_output)
     console.print(
-        f"The emulated hardware is a second simulation, of {made}"
+        f"The emulated hardware is the bridge on an emulated machine of {made}"
         + ("." if machine else f": values of {plant} off by up to {100.0 * share:g} %, {1e3 * delay:g} ms of delay."),
         soft_wrap=True,
     )

@@ -2,38 +2,31 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any, Protocol
 
-from pendulum_bags.experiments.conductor_node import Conductor, PlantClient, RecorderClient
+from pendulum_bags.experiments.conductor_node import Conductor, PlantClient
 from pendulum_bags.experiments.domain import reserve_domain
-from pendulum_bags.experiments.processes import Child, ProcessSet, ros_environment, start_recorder
 from pendulum_bags.experiments.run_spec import RunSpec
+from pendulum_bags.experiments.session import LOOP_NICENESS, START_TIMEOUT, Session, conduct, refuse_existing
 from pendulum_bags.experiments.settings import RegulationSettings
 from pendulum_bags.runs.run_data import END_EVENT, START_EVENT
-from pendulum_bags.runs.run_folder import write_json
 from pendulum_msgs_py.contract import names
 from pendulum_msgs_py.contract.angles import UPRIGHT
 from pendulum_msgs_py.contract.names import Event
 from pendulum_msgs_py.contract.values import NANOSECONDS
-from pendulum_msgs_py.errors import BagError, FaultError
 from pendulum_msgs_py.programs.graph import NodeProgram
 
-__all__ = [
-    "GraphRun", "finish_recording", "lockstep_spec", "longest_run", "record_run", "run_lockstep",
-    "wait_until_all_hear_each_other",
-]  # fmt: skip
+__all__ = ["GraphRun", "lockstep_spec", "longest_run", "record_run", "run_lockstep"]
 
-_START_TIMEOUT = 60.0
-_LOOP_NICENESS = -10
 _LAST_WORDS = 0.2
 """Time in which the recorder hears the end of a run in real time [s]."""
 _SLOWEST = 60.0
 """Slowest pace at which a lockstep run is expected to end, wall time per simulated time: 45 were seen on two cores that
 ten other programs wanted."""
 _ALIVE = 10
-"""States that must come within ``_START_TIMEOUT``; less is no slow run but one that stands still."""
+"""States that must come within ``START_TIMEOUT``; less is no slow run but one that stands still."""
 _LISTENERS = 3
 """Those who hear the plant's states: controller, disturbance, recorder. The conductor makes one more."""
 _RUN_LISTENERS = {
@@ -101,7 +94,7 @@ def lockstep_spec(settings: RegulationSettings, *, side: str, theta: float = UPR
 
 def longest_run(duration: float) -> float:
     """Return the longest time [s] that a run of a duration [s] may take: starting, discovery, arming, lockstep."""
-    return 4.0 * _START_TIMEOUT + _SLOWEST * duration
+    return 4.0 * START_TIMEOUT + _SLOWEST * duration
 
 
 class GraphRun(Protocol):
@@ -159,63 +152,52 @@ def record_run(
         BagError: The bag exists.
         FaultError: A program ended or did not answer, or the plant faulted.
     """
-    if bag.exists():
-        raise BagError(f"bag {bag} exists; expected a new folder")
-    namespace = spec.namespace
-    logs = bag.parent / "logs" / bag.name
+    refuse_existing(bag)
+    namespace, simulated = spec.namespace, spec.simulated_time
     with (
         reserve_domain(domain) as reserved,
-        ProcessSet(logs, ros_environment(reserved, logs)) as processes,
-        Conductor(reserved, watch=processes.check, on_wait=on_wait) as conductor,
+        conduct(bag.parent / "logs" / bag.name, reserved, on_wait) as session,
     ):
-        metadata = logs / "metadata.json"
-        write_json(metadata, spec.metadata())
-        simulated = spec.simulated_time
-        log_time = "header" if simulated else "receive"
-        recorder = start_recorder(processes, bag, namespace, metadata, spec.storage, log_time=log_time)
+        recorder = session.record(bag, namespace, spec.metadata(), spec.storage, simulated=simulated)
         program = spec.plant_program(_LISTENERS + 1)
-        niceness = 0 if simulated else _LOOP_NICENESS
-        processes.start_node(spec.controller_program(), niceness=niceness)
-        processes.start_node(spec.disturbance_program(), niceness=niceness)
-        processes.start_node(program, niceness=niceness)
-        client = PlantClient(conductor, namespace, program.node_name, watch=False)
-        wait_until_all_hear_each_other(conductor, namespace, _RUN_LISTENERS, clock=simulated)
+        niceness = 0 if simulated else LOOP_NICENESS
+        for node in (spec.controller_program(), spec.disturbance_program(), program):
+            session.processes.start_node(node, niceness=niceness)
+        plant = PlantClient(session.conductor, namespace, program.node_name, watch=False)
+        session.wait_until_all_hear_each_other(namespace, _RUN_LISTENERS, clock=simulated)
+        session.drives(plant)
         if not simulated:
-            _keep_time(conductor, client, spec, processes, recorder)
+            _keep_time(session, plant, spec)
+            session.close(recorder)
             return bag
         if spec.has_bridge:
-            client.arm(_START_TIMEOUT)
-        client.watch()
+            plant.arm(START_TIMEOUT)
+        plant.watch()
         if not spec.has_bridge:
-            client.resume(_START_TIMEOUT)
-        _wait_for_end(conductor, client, spec.duration)
-        finish_recording(conductor, processes, recorder, client, spec.steps + 1)
+            plant.resume(START_TIMEOUT)
+        _wait_for_end(session.conductor, plant, spec.duration)
+        session.close_in_lockstep(recorder, plant, spec.steps + 1)
     return bag
 
 
-def _keep_time(
-    conductor: Conductor, plant: PlantClient, spec: GraphRun, processes: ProcessSet, recorder: Child
-) -> None:
+def _keep_time(session: Session, plant: PlantClient, spec: GraphRun) -> None:
     """Let a run in real time go, wait for its length by the plant's clock, and put the plant to rest."""
+    conductor = session.conductor
     plant.watch()
-    try:
-        if spec.has_bridge:
-            plant.arm(_START_TIMEOUT)
-        else:
-            plant.resume(_START_TIMEOUT)
-        conductor.wait_for("states", lambda: plant.sample is not None, _START_TIMEOUT)
-        assert plant.sample is not None
-        plant.mark(START_EVENT)
-        end_ns = plant.sample.stamp_ns + round(spec.duration * NANOSECONDS)
-        conductor.wait_for(
-            f"{spec.duration:g} s of real time", lambda: _has_reached(plant, end_ns), _START_TIMEOUT + spec.duration
-        )
-        plant.mark(END_EVENT)
-        conductor.spin(_LAST_WORDS)
-    finally:
-        plant.disarm_quietly()
-    if processes.finish(recorder) != 0:
-        raise FaultError(recorder.last_words(1))
+    if spec.has_bridge:
+        plant.arm(START_TIMEOUT)
+    else:
+        plant.resume(START_TIMEOUT)
+    conductor.wait_for("states", lambda: plant.sample is not None, START_TIMEOUT)
+    assert plant.sample is not None
+    plant.mark(START_EVENT)
+    end_ns = plant.sample.stamp_ns + round(spec.duration * NANOSECONDS)
+    conductor.wait_for(
+        f"{spec.duration:g} s of real time", lambda: _has_reached(plant, end_ns), START_TIMEOUT + spec.duration
+    )
+    plant.mark(END_EVENT)
+    conductor.spin(_LAST_WORDS)
+    session.let_go()
 
 
 def _has_reached(plant: PlantClient, end_ns: int) -> bool:
@@ -230,63 +212,10 @@ def _wait_for_end(conductor: Conductor, plant: PlantClient, duration: float) -> 
         conductor.wait_for(
             f"{_ALIVE} more states of a run of {duration:g} s of simulated time",
             lambda enough=enough: plant.states >= enough or _is_finished(plant),  # type: ignore[misc]
-            _START_TIMEOUT,
+            START_TIMEOUT,
         )
 
 
 def _is_finished(plant: PlantClient) -> bool:
     plant.check_mode()
     return plant.has_event(Event.LOCKSTEP_FINISHED) is not None
-
-
-def finish_recording(
-    conductor: Conductor, processes: ProcessSet, recorder: Child, plant: PlantClient, states: int
-) -> None:
-    """Close the bag of a run in lockstep when it holds everything.
-
-    Simulated time stands still by then: what the nodes say on their way out is no part of the run.
-
-    Args:
-        conductor: Who conducts.
-        processes: The run's programs.
-        recorder: The recorder among them.
-        plant: The plant.
-        states: How many states the plant has published.
-
-    Raises:
-        FaultError: Messages were lost.
-    """
-    # The clock ticks once for each state, and neither topic waits for the other.
-    for topic in (f"{plant.namespace}/{names.JOINT_STATES}", names.CLOCK):
-        RecorderClient(conductor, plant.namespace).wait_for_all(topic, states)
-    if processes.finish(recorder) != 0:
-        raise FaultError(recorder.last_words(1))
-
-
-def wait_until_all_hear_each_other(
-    conductor: Conductor, namespace: str, listeners: Mapping[str, int], *, clock: bool = True
-) -> None:
-    """Wait until every subscription of a run is on the graph, and the recorder's are matched with a publisher.
-
-    Args:
-        conductor: Who conducts.
-        namespace: Namespace of the plant.
-        listeners: How many subscriptions each topic of the plant must have, by relative name.
-        clock: Whether the plant keeps simulated time, which is recorded too.
-    """
-    node = conductor.node
-
-    def complete() -> bool:
-        return all(
-            node.count_subscribers(f"{namespace}/{topic}") >= count
-            and node.count_publishers(f"{namespace}/{topic}") >= (1 if count else 0)
-            for topic, count in listeners.items()
-        )
-
-    conductor.wait_for("all nodes to hear each other", complete, _START_TIMEOUT)
-    recorder = RecorderClient(conductor, namespace)
-    recorded = {f"{namespace}/{topic}" for topic, count in listeners.items() if count}
-    recorded |= {names.CLOCK} if clock else set()
-    conductor.wait_for("the recorder to hear all topics", lambda: recorded <= recorder.heard(), _START_TIMEOUT)
-    # What one side of a match knows, the other side knows a moment later.
-    conductor.spin(0.5)

@@ -12,6 +12,7 @@ from pendulum_msgs_py.contract import names
 from pendulum_msgs_py.contract.trajectory import thesis_ramp
 from pendulum_msgs_py.errors import FaultError, ParameterError
 from pendulum_msgs_py.programs.executables import EXIT_INTERRUPTED, cli_main
+from pendulum_msgs_py.programs.options import RunningDomain
 
 if TYPE_CHECKING:
     from pendulum_bags.experiments.conductor_node import PlantClient
@@ -40,7 +41,7 @@ def move(
     control: Annotated[
         bool, typer.Option(help="upright: let the controller take over at the end. Without it the plant holds.")
     ] = True,
-    domain: Annotated[int | None, typer.Option(help="ROS domain; by default ROS_DOMAIN_ID.")] = None,
+    domain: RunningDomain = None,
 ) -> int:
     """Move a pendulum under position control along the thesis's ramp: at most 0.3 rad/s.
 

@@ -13,12 +13,12 @@ from pendulum_bags.experiments.conductor_node import Conductor, PlantClient
 from pendulum_bags.experiments.domain import reserve_domain
 from pendulum_bags.experiments.graph_plant import join
 from pendulum_bags.experiments.lockstep import longest_run
-from pendulum_bags.experiments.processes import Child, ProcessSet, ros_environment, start_recorder
+from pendulum_bags.experiments.processes import Child, ProcessSet
 from pendulum_bags.experiments.progress import PhaseProgress
 from pendulum_bags.experiments.repeats import SHORTEST, repeat_command
 from pendulum_bags.experiments.run_spec import SIDES
+from pendulum_bags.experiments.session import LOOP_NICENESS, START_TIMEOUT, Session, conduct
 from pendulum_bags.experiments.settings import SETTLE_TIME, RegulationSettings
-from pendulum_bags.runs.run_folder import write_json
 from pendulum_msgs_py.contract.angles import UPRIGHT
 from pendulum_msgs_py.contract.names import Event
 from pendulum_msgs_py.contract.trajectory import thesis_ramp
@@ -26,10 +26,6 @@ from pendulum_msgs_py.errors import FaultError
 
 __all__ = ["run_thesis"]
 
-START_TIMEOUT = 60.0
-"""Longest time for all programs to be up; the first start on a cold machine compiles code [s]."""
-LOOP_NICENESS = -10
-"""Priority of those who keep deadlines over all else on the machine, where we may take it."""
 OWN_PROTOCOL_SEED_STEP = 1_000_000
 """Added to the seed for the unpaired simulation, whose noise must not be that of the hardware."""
 
@@ -54,37 +50,30 @@ def run_thesis(
     Raises:
         FaultError: A program ended, a plant refused or faulted; everything is at rest again when this is raised.
     """
-    logs = folder / "logs"
     with (
         reserve_domain(domain) as main_domain,
-        ProcessSet(logs, ros_environment(main_domain, logs)) as processes,
-        Conductor(main_domain, watch=processes.check, on_wait=progress.refresh) as conductor,
+        conduct(folder / "logs", main_domain, progress.refresh) as session,
     ):
         progress.phase("starting", 6.0)
-        _refuse_occupied_domain(conductor, settings)
-        plants = _start(processes, folder, settings, conductor)
-        try:
-            beside = _conduct(conductor, plants, settings, progress, processes, folder, repeat=repeat)
-        finally:
-            _rest(plants)
+        _refuse_occupied_domain(session.conductor, settings)
+        plants = _start(session, folder, settings)
+        session.drives(*plants)
+        beside = _regulate(session, plants, settings, progress, folder, repeat=repeat)
         progress.phase("closing the bags", 2.0)
         for child in beside:
             # It has limits of its own and ends by itself; on a busy machine it takes minutes.
-            processes.wait(child, longest_run(max(SHORTEST, settings.noise.duration)), on_wait=progress.refresh)
-        processes.stop()
+            longest = longest_run(max(SHORTEST, settings.noise.duration))
+            session.processes.wait(child, longest, on_wait=progress.refresh)
 
 
-def _start(
-    processes: ProcessSet, folder: Path, settings: RegulationSettings, conductor: Conductor
-) -> tuple[PlantClient, PlantClient]:
+def _start(session: Session, folder: Path, settings: RegulationSettings) -> tuple[PlantClient, PlantClient]:
     """Start all programs; return both plants. Those that run already are looked at first, and only looked at."""
+    conductor = session.conductor
     joined = {side: join(conductor, running) for side in SIDES if (running := settings.running(side)) is not None}
     for side in SIDES:
-        metadata = folder / "logs" / f"{side}_metadata.json"
-        namespace = settings.namespace(side)
-        plant = settings.plant_name(side)
-        write_json(metadata, settings.metadata("thesis", side=side, plant=plant, namespace=namespace))
-        start_recorder(processes, folder / side, namespace, metadata, settings.storage)
+        namespace, plant = settings.namespace(side), settings.plant_name(side)
+        metadata = settings.metadata("thesis", side=side, plant=plant, namespace=namespace)
+        session.record(folder / side, namespace, metadata, settings.storage)
     programs = {side: settings.plant_program(side, folder / "hw") for side in SIDES}
     others = [
         make(settings.namespace(side), autostart=False)
@@ -93,7 +82,7 @@ def _start(
     ]
     for program in (*programs.values(), *others):
         if program is not None:
-            processes.start_node(program, niceness=LOOP_NICENESS)
+            session.processes.start_node(program, niceness=LOOP_NICENESS)
     sim, hw = (
         joined[side] if program is None else PlantClient(conductor, settings.namespace(side), program.node_name)
         for side, program in programs.items()
@@ -101,17 +90,17 @@ def _start(
     return sim, hw
 
 
-def _conduct(
-    conductor: Conductor,
+def _regulate(
+    session: Session,
     plants: Sequence[PlantClient],
     settings: RegulationSettings,
     progress: PhaseProgress,
-    processes: ProcessSet,
     folder: Path,
     *,
     repeat: bool,
 ) -> list[Child]:
-    noise = settings.noise
+    """Carry out the phases, ramp to ramp; return what was started beside them."""
+    conductor, processes, noise = session.conductor, session.processes, settings.noise
     for plant in plants:
         plant.wait_until_ready(START_TIMEOUT)
     for plant in plants:
@@ -192,12 +181,6 @@ def _start_move(
 def _wait_for_goal(conductor: Conductor, plants: Sequence[PlantClient], durations: Sequence[float]) -> None:
     for plant, duration in zip(plants, durations, strict=True):
         conductor.wait_for(f"{plant.namespace} to end its move", plant.trajectory_finished, duration + 15.0)
-
-
-def _rest(plants: Sequence[PlantClient]) -> None:
-    """Disarm on every way out; a plant that no longer answers goes to rest by its own rules."""
-    for plant in plants:
-        plant.disarm_quietly()
 
 
 def _refuse_occupied_domain(conductor: Conductor, settings: RegulationSettings) -> None:

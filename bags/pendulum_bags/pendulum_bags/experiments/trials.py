@@ -7,16 +7,14 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
-from pendulum_bags.experiments.conductor_node import Conductor, PlantClient
+from pendulum_bags.experiments.conductor_node import PlantClient
 from pendulum_bags.experiments.domain import reserve_domain
-from pendulum_bags.experiments.lockstep import finish_recording, wait_until_all_hear_each_other
 from pendulum_bags.experiments.operator import RealMachine, real_machine
-from pendulum_bags.experiments.processes import ProcessSet, ros_environment, start_recorder
 from pendulum_bags.experiments.progress import PhaseProgress
 from pendulum_bags.experiments.run_spec import EMULATOR_LIFETIME, EMULATOR_WATCHDOG
+from pendulum_bags.experiments.session import LOOP_NICENESS, START_TIMEOUT, conduct
 from pendulum_bags.experiments.settings import HARDWARE
-from pendulum_bags.experiments.thesis import LOOP_NICENESS, START_TIMEOUT
-from pendulum_bags.runs.run_folder import provenance, write_json
+from pendulum_bags.runs.run_folder import provenance
 from pendulum_bags.runs.run_record import RUN_RECORD
 from pendulum_msgs_py.contract import names
 from pendulum_msgs_py.contract.names import Event
@@ -204,40 +202,32 @@ def _run_trial(
     ask: Callable[[str], None],
 ) -> Path:
     bag = folder / f"trial_{trial}"
-    logs = folder / "logs" / bag.name
-    with (
-        ProcessSet(logs, ros_environment(domain, logs)) as processes,
-        Conductor(domain, watch=processes.check, on_wait=progress.refresh) as conductor,
-    ):
-        metadata = logs / "metadata.json"
-        write_json(metadata, _metadata(settings, trial))
-        log_time = "header" if settings.lockstep else "receive"
-        recorder = start_recorder(processes, bag, "/hw", metadata, settings.storage, log_time=log_time)
-        processes.start_node(settings.procedure_program(trial), niceness=LOOP_NICENESS)
-        processes.start_node(settings.plant_program(trial, bag), niceness=LOOP_NICENESS)
-        plant = PlantClient(conductor, "/hw", "bridge", watch=not settings.lockstep)
-        try:
-            wait_until_all_hear_each_other(conductor, "/hw", _topics(settings), clock=settings.lockstep)
-            if settings.by_person:
-                ask(f"Trial {trial} of {settings.trials}: let the pendulum lie still at 0, then press Enter to begin.")
-            plant.arm(START_TIMEOUT)
-            if settings.lockstep:
-                plant.watch()
-            else:
-                plant.call("procedure/start")
-            if settings.by_person:
-                ask("Turn it slowly to half a turn and back, in 10 to 20 s; then press Enter.")
-                plant.call("procedure/finish")
-            longest = _LONGEST_BY_HAND if settings.by_person else START_TIMEOUT + _SLOWEST * settings.expected_duration
-            conductor.wait_for(
-                f"the end of trial {trial}", lambda: _has_ended(plant, lockstep=settings.lockstep), longest
-            )
-            if settings.lockstep:
-                finished = plant.has_event(Event.LOCKSTEP_FINISHED)
-                assert finished is not None
-                finish_recording(conductor, processes, recorder, plant, 1 + int(finished["steps"]))
-        finally:
-            plant.disarm_quietly()
+    lockstep = settings.lockstep
+    with conduct(folder / "logs" / bag.name, domain, progress.refresh) as session:
+        conductor = session.conductor
+        recorder = session.record(bag, "/hw", _metadata(settings, trial), settings.storage, simulated=lockstep)
+        session.processes.start_node(settings.procedure_program(trial), niceness=LOOP_NICENESS)
+        session.processes.start_node(settings.plant_program(trial, bag), niceness=LOOP_NICENESS)
+        plant = PlantClient(conductor, "/hw", "bridge", watch=not lockstep)
+        session.drives(plant)
+        session.wait_until_all_hear_each_other("/hw", _topics(settings), clock=lockstep)
+        if settings.by_person:
+            ask(f"Trial {trial} of {settings.trials}: let the pendulum lie still at 0, then press Enter to begin.")
+        plant.arm(START_TIMEOUT)
+        if lockstep:
+            plant.watch()
+        else:
+            plant.call("procedure/start")
+        if settings.by_person:
+            ask("Turn it slowly to half a turn and back, in 10 to 20 s; then press Enter.")
+            plant.call("procedure/finish")
+        longest = _LONGEST_BY_HAND if settings.by_person else START_TIMEOUT + _SLOWEST * settings.expected_duration
+        conductor.wait_for(f"the end of trial {trial}", lambda: _has_ended(plant, lockstep=lockstep), longest)
+        if lockstep:
+            finished = plant.has_event(Event.LOCKSTEP_FINISHED)
+            assert finished is not None
+            session.close_in_lockstep(recorder, plant, 1 + int(finished["steps"]))
+        session.let_go()
         conductor.spin(0.2)
     return bag
 

@@ -15,6 +15,7 @@ from pendulum_bags.experiments.progress import PhaseProgress
 from pendulum_bags.runs.run_folder import create_run_folder, discard_if_empty
 from pendulum_msgs_py.errors import PendulumError
 from pendulum_msgs_py.programs.executables import EXIT_INTERRUPTED
+from pendulum_msgs_py.programs.options import Domain, Json, Lab, Storage, Yes, out_option
 from pendulum_msgs_py.programs.terminal import make_console
 
 if TYPE_CHECKING:
@@ -22,19 +23,12 @@ if TYPE_CHECKING:
 
 __all__ = ["add_commands"]
 
-Out = Annotated[
-    Path | None, typer.Option(help="Folder of the run; it must be new. Default: bags/runs/<UTC>_<experiment>.")
-]
+Out = Annotated[Path | None, out_option("Folder of the run; it must be new. Default: bags/runs/<UTC>_<experiment>.")]
 Hardware = Annotated[str, typer.Option(help="emulator, or hebi for the real actuator.")]
-Lab = Annotated[Path | None, typer.Option(help="Lab file of the real actuator, for --hardware hebi.")]
-Yes = Annotated[bool, typer.Option("--yes", help="Do not ask before the real machine moves.")]
 Plant = Annotated[str, typer.Option(help="What the emulator is: preset or plant file with a drivetrain.")]
 Realtime = Annotated[bool, typer.Option(help="Keep the wall's time on the emulator too, instead of lockstep.")]
 Seed = Annotated[int, typer.Option(help="Seed of the emulator's sensor noise and of the simulated hand.", min=0)]
 Trials = Annotated[int, typer.Option(help="Number of trials, one bag each.", min=1, max=100)]
-Storage = Annotated[str, typer.Option(help="Storage of the bags: mcap or sqlite3.")]
-Domain = Annotated[int | None, typer.Option(help="ROS domain; by default ROS_DOMAIN_ID, or the first free one.")]
-Json = Annotated[bool, typer.Option("--json", help="Print the regressions as JSON instead of tables.")]
 
 
 def add_commands(app: typer.Typer) -> None:

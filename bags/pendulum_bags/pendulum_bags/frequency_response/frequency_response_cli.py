@@ -13,6 +13,7 @@ from rich.console import Console
 
 from pendulum_msgs_py.errors import DataError, PendulumError
 from pendulum_msgs_py.programs.executables import EXIT_INTERRUPTED, cli_main
+from pendulum_msgs_py.programs.options import Domain, Json, Storage, out_option
 from pendulum_msgs_py.programs.terminal import make_console
 
 if TYPE_CHECKING:
@@ -35,7 +36,6 @@ Torque = Annotated[float, typer.Option(help="Torque that the task has for it [N 
 GapMargin = Annotated[
     float, typer.Option(help="Gap between the plants that does not matter, 0 to 1.", min=0.0, max=1.0)
 ]
-Json = Annotated[bool, typer.Option("--json", help="Print JSON instead of tables.")]
 
 
 @app.command()
@@ -45,7 +45,7 @@ def frequency_response(
     ],
     out: Annotated[
         Path | None,
-        typer.Option("--out", "-o", help="Folder for page, figures and measured responses; none by default."),
+        out_option("Folder for page, figures and measured responses; none by default."),
     ] = None,
     plant: Annotated[str, typer.Option(help="Plant of the designs: preset or file; default: that of the bag.")] = "",
     design: Design = None,
@@ -75,7 +75,7 @@ def frequency_response(
 def experiment(
     out: Annotated[
         Path | None,
-        typer.Option(help="Folder of the run; it must be new. Default: bags/runs/<UTC>_frequency_response."),
+        out_option("Folder of the run; it must be new. Default: bags/runs/<UTC>_frequency_response."),
     ] = None,
     plant: Annotated[str, typer.Option(help="Simulated plant, and plant of the designs: preset or file.")] = "thesis",
     strategy: Annotated[str, typer.Option(help="How the emulated actuator turns torque into PWM.")] = "direct_pwm",
@@ -95,8 +95,8 @@ def experiment(
     velocity: Velocity = 3.0,
     torque: Torque = 1.0,
     gap_margin: GapMargin = 0.2,
-    storage: Annotated[str, typer.Option(help="Storage of the bags: mcap or sqlite3.")] = "mcap",
-    domain: Annotated[int | None, typer.Option(help="ROS domain; by default the first free one.")] = None,
+    storage: Storage = "mcap",
+    domain: Domain = None,
     json_output: Json = False,
 ) -> None:
     """Excite simulator and emulated hardware by one multisine, measure both plants, and certify designs.

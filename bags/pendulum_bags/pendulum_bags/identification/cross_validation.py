@@ -33,7 +33,7 @@ class CrossValidation:
         rms: Angle error over all held-out windows, their initial states fitted [rad].
         by_fold: The same by fold, shape (f,) [rad].
         losses: Robust cost of each fold, shape (f,) [rad^2].
-        vectors: Parameters fitted without each fold, shape (f, 14).
+        vectors: Parameters fitted without each fold, shape (f, parameters).
     """
 
     rms: float

@@ -12,7 +12,9 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from pendulum_msgs_py.errors import DataError
+from pendulum_msgs_py.plants.friction_terms import FRICTION_TERMS
 from pendulum_msgs_py.programs.executables import cli_main, typed_options
+from pendulum_msgs_py.programs.options import Json, out_option
 
 if TYPE_CHECKING:
     from pendulum_bags.identification.result import IdentificationResult
@@ -58,7 +60,11 @@ def identify(
         ),
     ] = None,
     friction: Annotated[
-        str, typer.Option(help="auto, viscous, coulomb, stribeck, load, stribeck_load, gear_load, ...")
+        str,
+        typer.Option(
+            help="auto, viscous, coulomb, stribeck, load, stribeck_load, gear_load, "
+            f"{''.join(f'{name}, ' for name in FRICTION_TERMS if name != 'load')}..."
+        ),
     ] = "auto",
     window: Annotated[float | None, typer.Option(help="Length of the shooting windows [s].")] = None,
     mass: Annotated[float | None, typer.Option(help="Moving mass [kg], to check or fix the scale.")] = None,
@@ -68,20 +74,18 @@ def identify(
     held_out: Annotated[
         list[Path] | None, typer.Option(help="Recordings to score only; may be given more than once.")
     ] = None,
-    out: Annotated[
-        Path | None, typer.Option(help="Plant file to write (*.yaml), with a .json and figures beside it.")
-    ] = None,
+    out: Annotated[Path | None, out_option("Plant file to write (*.yaml), with a .json and figures beside it.")] = None,
     name: Annotated[str, typer.Option(help="Name of the plant in that file.")] = "identified",
     effort_limit: Annotated[float, typer.Option(help="Largest torque of the actuator [N m].")] = 13.0,
     plant: Annotated[
         str | None,
         typer.Option(
             help="For several joints: mechanism to start from, such as double_pendulum, or a plant file; data are "
-            "CSV files with all joints."
+            "bags, or CSV files with all joints."
         ),
     ] = None,
     page: Annotated[bool, typer.Option(help="With --out: write figures and a page too.")] = True,
-    as_json: Annotated[bool, typer.Option("--json", help="Print the result as JSON.")] = False,
+    as_json: Json = False,
     verbose: Annotated[
         bool, typer.Option("--verbose", help="With --method thesis: the full table of every trial's regression, too.")
     ] = False,

@@ -1,6 +1,6 @@
-"""Recordings of all joints of a mechanism, from CSV files of any columns by a mapping file.
+"""Recordings of all joints of a mechanism, from bags, or from CSV files of any columns by a mapping file.
 
-Example::
+Example of a mapping file::
 
     format: pendulum_joint_columns/1
     time: {column: time, unit: s}
@@ -28,9 +28,12 @@ from numpy.typing import NDArray
 
 from pendulum_bags.runs.csv_mapping import read_csv
 from pendulum_bags.runs.datasets import Recording, check_consistency, unwrap
+from pendulum_bags.runs.run_data import find_prefix
+from pendulum_msgs_py.contract.names import APPLIED_EFFORT, JOINT_STATES, PUSH
 from pendulum_msgs_py.errors import DataError
 from pendulum_msgs_py.joints import Coordinates
 from pendulum_msgs_py.parameters import load_yaml, reject_unknown, require_mapping
+from pendulum_rosbag.reader import read_bag
 
 __all__ = ["FORMAT", "JointRecording", "read_joints"]
 
@@ -97,21 +100,32 @@ class JointRecording:
 
 
 def read_joints(path: str | Path, coordinates: Coordinates, mapping: str | Path | None = None) -> JointRecording:
-    """Read a CSV file with the columns of every joint.
+    """Read a bag, or a CSV file with the columns of every joint.
+
+    Of a bag, the input is what the plant says it applied (topic ``applied_effort``, held until the next state), or
+    else the effort measured with the states.
 
     Args:
-        path: The file.
+        path: The bag or file.
         coordinates: Joints of the plant, and which are driven.
-        mapping: Mapping file; by default the columns are ``time`` and, for each joint, ``JOINT.position`` and, where it
-            is driven, ``JOINT.effort`` in SI units (``JOINT.velocity`` is used where it is there).
+        mapping: Mapping file, for CSV files; by default the columns are ``time`` and, for each joint,
+            ``JOINT.position`` and, where it is driven, ``JOINT.effort`` in SI units (``JOINT.velocity`` is used where
+            it is there).
 
     Raises:
+        BagError: The bag cannot be read.
         DataError: A column, a unit or a joint is not as the mapping says, joints are missing, foreign or in another
             order, or the input is not an effort.
     """
     source = Path(path)
-    if source.suffix.lower() not in {".csv", ".txt"} or not source.is_file():
-        raise DataError(f"{source} is no CSV file; expected a CSV file with the columns of all joints")
+    if not source.exists():
+        raise DataError(f"{source} does not exist; expected a bag or a CSV file")
+    if source.is_dir() or source.suffix.lower() in {".mcap", ".db3"}:
+        if mapping is not None:
+            raise DataError(f"{source} is a bag, whose joints have names; expected no mapping file for it")
+        return _read_bag(source, coordinates)
+    if source.suffix.lower() not in {".csv", ".txt"}:
+        raise DataError(f"{source} is neither a bag nor a CSV file; expected a recording of all joints")
     rules, origin = _rules(coordinates, mapping)
     common = {key: value for key, value in rules.items() if key not in {"format", "joints"}}
     parts: list[Recording] = []
@@ -153,6 +167,46 @@ def read_joints(path: str | Path, coordinates: Coordinates, mapping: str | Path 
         tuple(part.hold for part in parts),
         str(source),
         sum(int(parts[0].meta.get(key, 0)) for key in ("repeated_stamps", "nan_rows")),
+    )
+
+
+def _read_bag(source: Path, coordinates: Coordinates) -> JointRecording:
+    with read_bag(source) as bag:
+        space = find_prefix(bag)
+        states = bag.joints(f"{space}/{JOINT_STATES}")
+        applied_topic, push_topic = f"{space}/{APPLIED_EFFORT}", f"{space}/{PUSH}"
+        applied = bag.joints(applied_topic) if applied_topic in bag.topics else None
+        if push_topic in bag.topics and np.any(bag.joints(push_topic).effort):
+            raise DataError(f"topic {push_topic} of bag {source} pushes links from outside; expected none of that")
+    if states.names != coordinates.names:
+        raise DataError(
+            f"bag {source} is of the joints {', '.join(states.names)}; expected {', '.join(coordinates.names)}, in "
+            "this order"
+        )
+    # A plant in lockstep sends a state again when its answer was missed: the same stamp is the same state.
+    stamps, first = np.unique(states.stamp_ns, return_index=True)
+    position, effort = states.position[first], np.zeros((stamps.size, len(states.names)))
+    driven = list(coordinates.driven)
+    if applied is None:
+        effort[:, driven] = states.effort[first][:, driven]
+    else:
+        if applied.names != coordinates.driven_names:
+            raise DataError(
+                f"topic {applied_topic} of bag {source} is of {', '.join(applied.names)}; expected the driven joints, "
+                f"{', '.join(coordinates.driven_names)}"
+            )
+        told, rows = np.unique(applied.stamp_ns, return_index=True)
+        newest = np.searchsorted(told, stamps, side="right") - 1
+        # Before the first of them nothing was applied yet.
+        effort[:, driven] = np.where((newest >= 0)[:, None], applied.effort[rows][np.maximum(newest, 0)], 0.0)
+    return JointRecording(
+        source.name,
+        (stamps - stamps[0]) * 1e-9,
+        position,
+        effort,
+        ("linear" if applied is None else "zero",) * len(states.names),
+        str(source),
+        int(states.stamp_ns.size - stamps.size),
     )
 
 

@@ -5,7 +5,9 @@ The model, in measured coordinates (theta as the encoder says, u as recorded):
     J th'' = e (k m - k_b th') + tau_0 - b th' - G sin(th - th_0) - F(th', th) sgn th'
     m = u(t - d)                                  for a torque or a voltage
     m = V clip(g (u(t - d) - th), -1, 1)          for a servo that follows a set point u
-    F = c + s z + (1 + l_s z) |l G sin(th - th_0) + l_m e k m|,  z = exp(-(th'/v_s)^2)
+    F = c + s z + (1 + l_s z) |l G sin(th - th_0) + l_m e k m| + a(|th'|, |G sin(th - th_0)|),  z = exp(-(th'/v_s)^2)
+
+a is the sum of further friction terms (:mod:`pendulum_msgs_py.plants.friction_terms`).
 
 Integrator: second-order leapfrog; the linear damping is exact (exponential), dry friction is a set-valued law
 with true standstill, and a reversal inside a step is split at its instant, so that the solution and its
@@ -20,12 +22,18 @@ one there; tests hold both together.
 
 from __future__ import annotations
 
+import cmath
 import math
 from typing import Any
 
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
+
+from pendulum_msgs_py.dynamics.arithmetic import in_arithmetic
+from pendulum_msgs_py.plants import friction_terms
+from pendulum_msgs_py.plants.friction_terms import TERM_PARAMETERS, added_friction
+from pendulum_msgs_py.programs.kept_kernels import drop_stale_code
 
 __all__ = ["PARAMETER_NAMES", "cumulative_input", "normal_blocks", "simulate_windows"]
 
@@ -46,9 +54,34 @@ PARAMETER_NAMES = (
     "drive_damping",
     "drive_load_friction",
     "load_stribeck",
+    *(name for name in TERM_PARAMETERS if name != "load_friction"),
 )
-"""Order of the parameter vector; the constants below are its indices."""
+"""Order of the parameter vector; the constants below are its indices, those of further friction terms follow."""
 J, B, G, C, S, VS, LG, T0, TH0, K, D, KB, LM, LS = range(14)
+_OWN = 14
+_FURTHER = len(PARAMETER_NAMES) - _OWN
+# The load's term stands below, where it also knows the load of the drive.
+_OF_TERMS = ("", *PARAMETER_NAMES[1:LG], "", *PARAMETER_NAMES[LG + 1 :])
+_added_friction = njit(added_friction(_OF_TERMS, njit))
+_added_friction_complex = njit(added_friction(_OF_TERMS, lambda magnitude: njit(in_arithmetic(magnitude, cmath))))
+_STEP = 2.0**-64
+"""Imaginary step of their derivatives, which are exact."""
+
+
+@njit
+def _derivatives_of_terms(speed: float, weight: float, p: Array, f: Array) -> tuple[float, float]:
+    """Write the derivatives of the further friction terms with respect to their parameters into f.
+
+    Returns:
+        Those with respect to the speed [N m s/rad] and to the torque of gravity that is carried [-].
+    """
+    at = p.astype(np.complex128)
+    for i in range(_OWN, at.size):
+        at[i] += 1j * _STEP
+        f[i] = (_added_friction_complex(complex(speed), complex(weight), at) + 0j).imag / _STEP
+        at[i] = p[i]
+    by_speed = (_added_friction_complex(complex(speed, _STEP), complex(weight), at) + 0j).imag / _STEP
+    return by_speed, (_added_friction_complex(complex(speed), complex(weight, _STEP), at) + 0j).imag / _STEP
 
 
 @njit(cache=True)
@@ -103,7 +136,7 @@ def simulate_windows(
     """Simulate each window from its own initial state; write theta, omega and d theta / d(parameters, state).
 
     Args:
-        p: Parameter vector in the order of ``PARAMETER_NAMES``, shape (14,).
+        p: Parameter vector in the order of ``PARAMETER_NAMES``, shape (14 and those of further friction terms,).
         columns: Indices of the parameters to differentiate, shape (k,), int64.
         windows: First and one past last sample of each window, shape (w, 2), int64.
         states: Initial angle [rad] and velocity [rad/s] of each window, shape (w, 2).
@@ -127,9 +160,9 @@ def simulate_windows(
     dth = np.zeros(width)
     dw = np.zeros(width)
     # Direct derivatives of smooth torque, friction and damping rate with respect to each parameter.
-    f_p = np.zeros(14)
-    fr_p = np.zeros(14)
-    l_p = np.zeros(14)
+    f_p = np.zeros(p.size)
+    fr_p = np.zeros(p.size)
+    l_p = np.zeros(p.size)
     inertia, gravity = p[J], p[G]
     inv = 1.0 / inertia
     for n in range(windows.shape[0]):
@@ -178,6 +211,8 @@ def simulate_windows(
                 carried = p[LG] * gravity * sine + p[LM] * drive
                 raise_load = 1.0 + p[LS] * bump
                 friction = p[C] + p[S] * bump + raise_load * abs(carried)
+                if _FURTHER > 0:
+                    friction += _added_friction(speed, abs(gravity * sine), p)
                 x = rate * h
                 if x > 1e-4:
                     decay = math.exp(-x)
@@ -226,6 +261,13 @@ def simulate_windows(
                     f_th = drive_th - gravity * cosine
                     fr_th = s_load * gravity * cosine + s_drive * drive_th
                     fr_w = -peak * bump * 2.0 * speed / p[VS] ** 2 * sign
+                    if _FURTHER > 0:
+                        by_speed, by_weight = _derivatives_of_terms(speed, abs(gravity * sine), p, fr_p)
+                        fr_w += by_speed * sign
+                        side = by_weight if gravity * sine > 0.0 else -by_weight
+                        fr_p[G] += side * sine
+                        fr_p[TH0] -= side * gravity * cosine
+                        fr_th += side * gravity * cosine
                     for c in range(width):
                         d_mid = dth[c] + 0.5 * h * dw[c]
                         d_f = f_th * d_mid
@@ -309,3 +351,7 @@ def normal_blocks(
     for a in range(k):
         for b in range(a):
             h_pp[b, a] = h_pp[a, b]
+
+
+for _kernel in (cumulative_input, simulate_windows, normal_blocks):
+    drop_stale_code(_kernel, friction_terms.modules())

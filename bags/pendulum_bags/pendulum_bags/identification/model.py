@@ -4,17 +4,20 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pendulum_bags.identification.kernel import PARAMETER_NAMES
 from pendulum_msgs_py.errors import DataError
+from pendulum_msgs_py.plants.friction_terms import FRICTION_TERMS
 from pendulum_msgs_py.plants.plant_parameters import PlantParameters
 
 __all__ = [
     "BOUNDS",
     "FRICTION_MODELS",
+    "FURTHER_TERMS",
     "INDEX",
     "PLANT_FRICTION_MODELS",
     "SERVO_ONLY",
@@ -28,6 +31,10 @@ Array = NDArray[np.float64]
 
 INDEX: Mapping[str, int] = {name: i for i, name in enumerate(PARAMETER_NAMES)}
 """Position of each parameter in the vector."""
+
+FURTHER_TERMS = tuple(name for name in FRICTION_TERMS if name != "load")
+"""Friction terms of plants that the kernel does not know by itself; they are fitted when asked for by name."""
+_FURTHER = {name: told for term in FURTHER_TERMS for name, told in FRICTION_TERMS[term].parameters.items()}
 
 UNITS: Mapping[str, str] = {
     "inertia": "kg m^2",
@@ -44,6 +51,7 @@ UNITS: Mapping[str, str] = {
     "drive_damping": "N m s/rad",
     "drive_load_friction": "-",
     "load_stribeck": "-",
+    **{name: quantity.unit for name, (_, quantity) in _FURTHER.items()},
 }
 
 BOUNDS: Mapping[str, tuple[float, float]] = {
@@ -61,6 +69,8 @@ BOUNDS: Mapping[str, tuple[float, float]] = {
     "drive_damping": (0.0, 1e3),
     "drive_load_friction": (0.0, 0.9),
     "load_stribeck": (0.0, 10.0),
+    # A strength may be 0; what gives a term its form stays within a thousandth and a thousandfold of its default.
+    **{name: (1e-3 * default, 1e3 * default or 1e3) for name, (default, _) in _FURTHER.items()},
 }
 """Domain in which each parameter is sought; a delay below 0 means an input stamped late."""
 
@@ -85,16 +95,18 @@ FRICTION_MODELS: Mapping[str, tuple[str, ...]] = {
         "drive_load_friction",
         "load_stribeck",
     ),
+    **{name: ("coulomb_friction", *FRICTION_TERMS[name].parameters) for name in FURTHER_TERMS},
 }
 """Dry friction that each model adds to the viscous one, simplest first."""
 
 SERVO_ONLY = ("stribeck_gear_load", "gear_load_stribeck")
 """Models of geared servos that are offered, but not tried, for other drives: seldom determined there."""
 
-PLANT_FRICTION_MODELS = ("viscous", "coulomb", "stribeck", "load", "stribeck_load")
+PLANT_FRICTION_MODELS = ("viscous", "coulomb", "stribeck", "load", "stribeck_load", *FURTHER_TERMS)
 """Those that a plant file can hold: its friction knows the load of gravity, not that of the drive."""
 
-_DEFAULTS: Mapping[str, float] = {"inertia": 1.0, "gravity": 1.0, "input_gain": 1.0, "stribeck_velocity": 0.2}
+_DEFAULTS: dict[str, float] = {"inertia": 1.0, "gravity": 1.0, "input_gain": 1.0, "stribeck_velocity": 0.2}
+_DEFAULTS |= {name: default for name, (default, _) in _FURTHER.items()}
 
 
 @dataclass(frozen=True)
@@ -159,6 +171,7 @@ def from_plant(plant: PlantParameters) -> FitModel:
             "torque_offset": plant.torque_offset,
             "angle_offset": plant.angle_offset,
             "transport_delay": plant.transport_delay + plant.actuator_time_constant,
+            **{name: getattr(plant, name) for name in _FURTHER},
         },
         friction="stribeck_load",
     )
@@ -171,6 +184,7 @@ def to_plant(model: FitModel, *, name: str = "identified", effort_limit: float =
     that with the drive switched on (back-EMF included). A delay below 0 is a matter of the recording's
     stamps, not of the plant, and is left out.
     """
+    further: dict[str, Any] = {name: model[name] for name in _FURTHER}
     return PlantParameters(
         inertia=model["inertia"],
         damping=model["damping"] + (model["drive_damping"] if model.input_kind == "position_goal" else 0.0),
@@ -184,4 +198,5 @@ def to_plant(model: FitModel, *, name: str = "identified", effort_limit: float =
         effort_limit=effort_limit,
         transport_delay=max(model["transport_delay"], 0.0),
         name=name,
+        **further,
     )

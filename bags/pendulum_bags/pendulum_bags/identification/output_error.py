@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pendulum_bags.identification.cross_validation import COARSE, cross_validate
-from pendulum_bags.identification.model import FRICTION_MODELS, SERVO_ONLY, FitModel
+from pendulum_bags.identification.model import FRICTION_MODELS, FURTHER_TERMS, SERVO_ONLY, FitModel
 from pendulum_bags.identification.options import DEFAULTS, Geometry, Options, default_window
 from pendulum_bags.identification.own_zeros import OwnZeros, align
 from pendulum_bags.identification.problem import Piece, prepare
@@ -108,7 +108,8 @@ def fit_output_error(recordings: Sequence[Recording], options: Options = DEFAULT
         options, names = replace(options, angle_offset=False, torque_offset=False, folds=1), ["coulomb"]
         free = tuple(n for n in free if n not in OFFSETS)
     elif options.friction == "auto":
-        names = [n for n in FRICTION_MODELS if n not in SERVO_ONLY or fixed.input_kind == "position_goal"]
+        left_out = {*FURTHER_TERMS, *(() if fixed.input_kind == "position_goal" else SERVO_ONLY)}
+        names = [name for name in FRICTION_MODELS if name not in left_out]
     free, best, offsets = _offsets(best, pieces, free, scale, options)
     candidates: list[Candidate] = []
     inner: list[Candidate] = []

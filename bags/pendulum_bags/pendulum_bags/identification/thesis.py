@@ -144,12 +144,12 @@ def regress(trial: str, names: Sequence[str], regressors: Array, response: Array
         regressors: In the order of time, shape (n, k).
         response: shape (n,).
     """
-    # statsmodels takes a second to import: only those who ask for tables wait for it.
-    import statsmodels.api as sm
+    # This alone takes a second to import, all of statsmodels half as long again: only those who ask for tables wait.
+    from statsmodels.regression.linear_model import OLS
 
     if len(response) <= len(names):
         raise DataError(f"{trial} has {len(response)} points for {len(names)} coefficients; expected more")
-    table = sm.OLS(response, regressors).fit()
+    table = OLS(response, regressors).fit()
     independent = np.array([_independent(regressors, np.asarray(table.resid), i) for i in range(len(names))])
     # The fit takes its share of few independent samples too: their residuals are smaller than the errors were.
     inflation = np.sqrt((len(response) - len(names)) / np.maximum(independent - len(names), 1.0))

@@ -1,7 +1,7 @@
 """What moves in a training: its parameters as rows of numbers, and one period of it, compiled.
 
 The equations are the simulator's own: :mod:`pendulum_sim.dry_friction` for the pendulum, and
-:mod:`pendulum_sim.joint_steps` for mechanisms, Runge-Kutta of order four both.
+:mod:`pendulum_msgs_py.dynamics.joint_steps` for mechanisms, Runge-Kutta of order four both.
 """
 
 from __future__ import annotations
@@ -19,16 +19,7 @@ from numpy.typing import NDArray
 from pendulum_bags.learning.task import VARIED
 from pendulum_lqr.policy import coordinates_of
 from pendulum_msgs_py.dynamics.arithmetic import in_arithmetic
-from pendulum_msgs_py.errors import ParameterError
-from pendulum_msgs_py.joints import Coordinates
-from pendulum_msgs_py.mechanisms import Mechanism
-from pendulum_msgs_py.plants.mechanism_parameters import MechanismParameters
-from pendulum_msgs_py.plants.plant_differences import AnyPlant
-from pendulum_msgs_py.plants.plant_parameters import PlantParameters
-from pendulum_sim.compiling import compile_tree, tuple_loader
-from pendulum_sim.dry_friction import PACKED, acceleration_with_friction, actuator_torque, advance_dry
-from pendulum_sim.integrators import get_integrator
-from pendulum_sim.joint_steps import (
+from pendulum_msgs_py.dynamics.joint_steps import (
     COULOMB,
     JOINT_ROWS,
     LAG,
@@ -37,9 +28,19 @@ from pendulum_sim.joint_steps import (
     UPPER,
     advance_joints,
     joint_functions,
-    pack_joints,
 )
-from pendulum_sim.mechanism_plant import common_delay
+from pendulum_msgs_py.dynamics.steps import actuator_torque
+from pendulum_msgs_py.errors import ParameterError
+from pendulum_msgs_py.joints import Coordinates
+from pendulum_msgs_py.mechanisms import Mechanism
+from pendulum_msgs_py.plants.joint_table import pack_joints
+from pendulum_msgs_py.plants.mechanism_parameters import MechanismParameters, common_delay
+from pendulum_msgs_py.plants.plant_differences import AnyPlant
+from pendulum_msgs_py.plants.plant_parameters import PlantParameters
+from pendulum_sim.compiling import compile_tree, tuple_loader
+from pendulum_sim.dry_friction import LAG as LAG_OF_ONE
+from pendulum_sim.dry_friction import PACKED, acceleration_with_friction, advance_dry
+from pendulum_sim.integrators import get_integrator
 from pendulum_sim.plant import pack
 
 __all__ = ["Body", "body_of", "can_exist", "kicks_of", "start_spread", "travel_of", "velocity_scales"]
@@ -328,7 +329,7 @@ def _pendulum_kernel() -> Any:
         theta, speed = advance(
             step, coefficients_of, acceleration, q[0], v[0], torque[0], command[0], push[0], h, c, plant
         )
-        return (theta,), (speed,), (lagged(torque[0], command[0], h, plant[9]),)
+        return (theta,), (speed,), (lagged(torque[0], command[0], h, plant[LAG_OF_ONE]),)
 
     return _kernel((math.pi,), prepare, forward)
 

@@ -23,8 +23,13 @@ Floats = NDArray[np.float32]
 Array = NDArray[np.float64]
 
 _KICK_TIME = 0.05
-_EDGE, _END = 0.45, 0.7
+_EDGE, _END = 0.55, 0.7
 """Shares of the way to the stop from which on going further costs, and costs most [-]; the travel ends at 0.8."""
+_PRICE, _LAST_PRICE = 2.0, 5.0
+"""What it costs most, in the first third of a training and in the last: who may never go there does not learn to swing
+up, and who has learned it can learn to do without."""
+_MIDDLE = 0.5
+"""Share of the way to the stop within which it is near the middle: who rests far from it has no way left to recover."""
 _MOST_DRAWS = 50
 
 
@@ -37,6 +42,9 @@ class SwingUp:
         ranges: Lowest and highest value of each parameter that differs.
         task: Everything else that differs.
         generator: Draws plants, starts, delays, noise and kicks.
+
+    Attributes:
+        progress: Share of the training that is done, for what the way out costs.
 
     Raises:
         ParameterError: The plant is series elastic, has no motor, or a delay of its own.
@@ -73,6 +81,7 @@ class SwingUp:
         self.parameters = np.repeat(body.row[None, :], count, axis=0)
         self.delay, self.effort = np.zeros(count), np.zeros((count, self.action_size))
         self.push = np.zeros((count, n))
+        self.progress = 0.0
         self._zero = np.zeros((count, n))
         self._kick_left, self._left = np.zeros(count, dtype=np.int64), np.zeros(count, dtype=np.int64)
         self._steps = max(1, round(task.episode / task.period))
@@ -110,11 +119,16 @@ class SwingUp:
         return (0.05 * self._reward(change)).astype(np.float32), self._left <= 0
 
     def _reward(self, change: Array) -> Array:
-        """Return how high it stands and how near to rest upright, less what efforts, haste and the way out cost."""
+        """Return how high it stands and how near to rest upright, less what efforts, haste and the way out cost.
+
+        Each joint that turns adds as much for rest upright: of two, one that spins with the other upright is near to it
+        in height and energy.
+        """
         n, turns = self._n, self._turns
         x, v = self.motion[:, :n], self.motion[:, n : 2 * n]
-        away = np.where(turns, wrap(x) / 0.25, x / self.reach)
-        near = np.exp(-np.sum(away**2, axis=1) - np.sum((v / (0.5 * self.scale)) ** 2, axis=1))
+        away = np.where(turns, wrap(x) / 0.25, x / (_MIDDLE * self.reach))
+        far = np.sum(away**2, axis=1) + np.sum((v / (0.5 * self.scale)) ** 2, axis=1)
+        near = np.count_nonzero(turns) * np.exp(-far)
         u = self.effort / self.limit
         slid = np.abs(x[:, ~turns]) / self.reach[~turns]
         own = self.body.excess
@@ -124,8 +138,11 @@ class SwingUp:
             0.5 * self.body.height(x) + near - np.sum(0.05 * u * u, axis=1)
             - np.sum(0.2 * (change / self.step_limit) ** 2 * 0.25, axis=1)
             - np.sum(0.02 * np.maximum(0.0, np.abs(v[:, turns]) / self.scale[turns] - 2.5) ** 2, axis=1)
-            - np.sum(0.1 * slid**2 + 5.0 * np.maximum(0.0, slid - _EDGE) + 2.0 * (slid > _END), axis=1) - lost
+            - np.sum(0.1 * slid**2 + 5.0 * np.maximum(0.0, slid - _EDGE) + self._price() * (slid > _END), axis=1) - lost
         )  # fmt: skip
+
+    def _price(self) -> float:
+        return _PRICE + (_LAST_PRICE - _PRICE) * min(1.0, max(0.0, 3.0 * self.progress - 1.0))
 
     def restart(self, which: NDArray[np.bool_]) -> None:
         """Start new episodes in some of them: half anywhere, a quarter hanging, a quarter near upright."""

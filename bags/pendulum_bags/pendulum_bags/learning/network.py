@@ -31,17 +31,20 @@ class Mlp:
             self.parameters.append((scale * generator.standard_normal((before, after))).astype(np.float32))
             self.parameters.append(np.zeros(after, dtype=np.float32))
         self._inputs: list[Floats] = []
+        self._kept: dict[tuple[str, int, int], Floats] = {}
 
     def forward(self, x: Floats) -> Floats:
         """Return the output for inputs of shape (n, in), shape (n, out), and keep what :meth:`backward` needs."""
         self._inputs = []
         last = len(self.parameters) - 2
-        for k in range(0, last + 2, 2):
+        for k in range(0, last, 2):
             self._inputs.append(x)
-            x = x @ self.parameters[k]
+            x = np.matmul(x, self.parameters[k], out=self._room("values", k, x, self.parameters[k + 1].size))
             x += self.parameters[k + 1]
-            if k < last:
-                np.tanh(x, out=x)
+            np.tanh(x, out=x)
+        self._inputs.append(x)
+        x = x @ self.parameters[last]
+        x += self.parameters[last + 1]
         return x
 
     def backward(self, slope: Floats) -> list[Floats]:
@@ -55,8 +58,24 @@ class Mlp:
             x = self._inputs[k // 2]
             gradients += [slope.sum(axis=0), x.T @ slope]
             if k:
-                slope = (slope @ self.parameters[k].T) * (np.float32(1.0) - x * x)
+                slope = np.matmul(slope, self.parameters[k].T, out=self._room("slopes", k, slope, x.shape[1]))
+                square = np.multiply(x, x, out=self._room("squares", 0, x, x.shape[1]))
+                slope *= np.subtract(np.float32(1.0), square, out=square)
         return gradients[::-1]
+
+    def _room(self, what: str, layer: int, like: Floats, width: int) -> Floats:
+        """Return an array of as many rows, the same each time: fresh memory costs more than the product that fills it.
+
+        Args:
+            what: What it is for.
+            layer: Of which layer.
+            like: Array of as many rows, of the type that is wanted.
+            width: Its columns.
+        """
+        key = (f"{what} {layer}", len(like), width)
+        if key not in self._kept or self._kept[key].dtype != like.dtype:
+            self._kept[key] = np.empty((len(like), width), dtype=like.dtype)
+        return self._kept[key]
 
 
 class Adam:

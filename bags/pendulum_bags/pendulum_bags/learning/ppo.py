@@ -11,8 +11,9 @@ massively parallel deep reinforcement learning, 2022 (adaptive rate).
 from __future__ import annotations
 
 from collections.abc import Mapping
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -78,6 +79,15 @@ class PpoSettings:
     divergence: float = 0.01
     spread: float = 0.6
     least_spread: float = 0.05
+
+
+class _Old(NamedTuple):
+    """The policy that gathered the data: its actions, their means and log probabilities, and its log spread."""
+
+    actions: Floats
+    means: Floats
+    chance: Floats
+    log_spread: Floats
 
 
 class Ppo:
@@ -160,40 +170,49 @@ class Ppo:
         chance_before = _log_chance(actions, means, before)
         size = len(seen) // s.batches
         divergences, losses = [], []
-        for _ in range(s.epochs):
-            order = self.generator.permutation(len(seen))
-            for part in range(s.batches):
-                rows = order[part * size : (part + 1) * size]
-                x = seen[rows]
-                value = self.critic.forward(x)
-                error = value - returns[rows]
-                self._adam_critic.step(self.critic.backward(error / np.float32(size)), self.rate)
-                losses.append(float(np.mean(error * error)))
 
-                mean = self.actor.forward(x[:, :observed])
-                variance = np.exp(2.0 * self.log_spread)
-                deviation = actions[rows] - mean
-                ratio = np.exp(_log_chance(actions[rows], mean, self.log_spread) - chance_before[rows])
-                gain = advantages[rows]
-                blocked = ((gain > 0.0) & (ratio > 1.0 + s.clip)) | ((gain < 0.0) & (ratio < 1.0 - s.clip))
-                weight = np.where(blocked, np.float32(0.0), -gain * ratio) / np.float32(size)
-                # A mean far beyond the clip of the actions would never come back.
-                beyond = np.clip(mean, -1.1, 1.1)
-                slope = weight * deviation / variance + np.float32(0.02 / size) * (mean - beyond)
-                spread_slope = np.sum(weight * (deviation * deviation / variance - 1.0), axis=0)
-                moved = _divergence(means[rows], before, mean, self.log_spread)
-                divergences.append(moved)
-                if moved > 2.0 * s.divergence:
-                    self.rate = max(self.rate / 1.5, 1e-5)
-                elif moved < 0.5 * s.divergence:
-                    self.rate = min(self.rate * 1.5, 3e-3 * max(remaining, 0.05))
-                self._adam_actor.step([*self.actor.backward(slope), spread_slope], self.rate)
-                np.maximum(self.log_spread, np.log(s.least_spread), out=self.log_spread)
+        def criticise(rows: NDArray[np.intp], rate: float) -> float:
+            error = self.critic.forward(seen[rows]) - returns[rows]
+            self._adam_critic.step(self.critic.backward(error / np.float32(size)), rate)
+            return float(np.mean(error * error))
+
+        # Actor and critic share no numbers, so that a thread for each gives the same bits as one for both.
+        with ThreadPoolExecutor(1) as beside:
+            for _ in range(s.epochs):
+                order = self.generator.permutation(len(seen))
+                for part in range(s.batches):
+                    rows = order[part * size : (part + 1) * size]
+                    loss = beside.submit(criticise, rows, self.rate)
+                    old = _Old(actions[rows], means[rows], chance_before[rows], before)
+                    divergences.append(self._follow_advantages(seen[rows, :observed], old, advantages[rows], remaining))
+                    losses.append(loss.result())
         return {
             "divergence": float(np.mean(divergences)),
             "spread": float(np.exp(self.log_spread).mean()),
             "critic": float(np.mean(losses)),
         }
+
+    def _follow_advantages(self, x: Floats, old: _Old, gain: Floats, remaining: float) -> float:
+        """Take a step of the actor, and return how far the policy is from the old one."""
+        s, size = self.settings, len(x)
+        mean = self.actor.forward(x)
+        variance = np.exp(2.0 * self.log_spread)
+        deviation = old.actions - mean
+        ratio = np.exp(_log_chance(old.actions, mean, self.log_spread) - old.chance)
+        blocked = ((gain > 0.0) & (ratio > 1.0 + s.clip)) | ((gain < 0.0) & (ratio < 1.0 - s.clip))
+        weight = np.where(blocked, np.float32(0.0), -gain * ratio) / np.float32(size)
+        # A mean far beyond the clip of the actions would never come back.
+        beyond = np.clip(mean, -1.1, 1.1)
+        slope = weight * deviation / variance + np.float32(0.02 / size) * (mean - beyond)
+        spread_slope = np.sum(weight * (deviation * deviation / variance - 1.0), axis=0)
+        moved = _divergence(old.means, old.log_spread, mean, self.log_spread)
+        if moved > 2.0 * s.divergence:
+            self.rate = max(self.rate / 1.5, 1e-5)
+        elif moved < 0.5 * s.divergence:
+            self.rate = min(self.rate * 1.5, 3e-3 * max(remaining, 0.05))
+        self._adam_actor.step([*self.actor.backward(slope), spread_slope], self.rate)
+        np.maximum(self.log_spread, np.log(s.least_spread), out=self.log_spread)
+        return moved
 
     def state(self) -> dict[str, NDArray[Any]]:
         """Return what a checkpoint keeps."""

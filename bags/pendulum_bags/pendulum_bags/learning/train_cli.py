@@ -15,6 +15,7 @@ from rich.progress import TextColumn, TimeRemainingColumn
 from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.programs.counted_progress import counting_bar
 from pendulum_msgs_py.programs.executables import EXIT_INTERRUPTED, cli_main, typed_options
+from pendulum_msgs_py.programs.options import Json, out_option
 from pendulum_msgs_py.programs.terminal import make_console
 
 if TYPE_CHECKING:
@@ -33,7 +34,7 @@ app = typer.Typer(add_completion=False, rich_markup_mode=None)
 @app.command()
 def train(
     context: typer.Context,
-    out: Annotated[Path, typer.Option("--out", "-o", help="Policy file (.npz); it must be new.")],
+    out: Annotated[Path, out_option("Policy file (.npz); it must be new.")],
     plant: Annotated[
         str, typer.Option(help="Preset or plant file; intervals in the file widen what is trained on.")
     ] = "dfki",
@@ -52,7 +53,7 @@ def train(
     history: Annotated[int, typer.Option(help="Samples that the policy sees.")] = 3,
     travel: Annotated[float, typer.Option(help="Largest deviation of a joint that slides [m].")] = 0.4,
     hidden: Annotated[tuple[int, int], typer.Option(help="Widths of the hidden layers.")] = (64, 64),
-    json_output: Annotated[bool, typer.Option("--json", help="Print what was measured as JSON.")] = False,
+    json_output: Json = False,
 ) -> None:
     """Train a policy for a plant: on plants, delays, noise and kicks drawn anew for each episode.
 
@@ -125,8 +126,9 @@ def _settings(task: str, plant: str, seed: int, updates: int, swing_up: Any, hid
             ppo=PpoSettings(hidden=hidden), seed=seed,
         )  # fmt: skip
         if several:
-            # There is more to learn: more steps, and actions that go on to vary.
-            settings = replace(settings, ppo=replace(settings.ppo, least_spread=0.1), updates=600)
+            # There is more to learn: more steps, actions that go on to vary, and a swing-up is longer than the 2 s that
+            # the discount of one joint looks ahead.
+            settings = replace(settings, ppo=replace(settings.ppo, least_spread=0.1, discount=0.998), updates=1500)
     return replace(settings, updates=updates) if updates else settings
 
 

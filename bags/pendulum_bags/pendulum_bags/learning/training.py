@@ -139,6 +139,8 @@ def train(
             if on_update is not None:
                 on_update(len(curves), {"reward": curves[-1][1]})
         for number in range(len(curves), settings.updates):
+            if isinstance(environment, SwingUp):
+                environment.progress = number / settings.updates
             measured = learner.update(1.0 - number / settings.updates)
             if isinstance(environment, SwingUp):
                 speeds = np.abs(environment.motion[:, fastest.size : 2 * fastest.size])
@@ -216,7 +218,8 @@ def _keep(
     try:
         write_whole(path, buffer.getvalue())
     except OSError as error:
-        raise DataError(f"checkpoint {path} cannot be written: {error.strerror}; the one before it stays") from error
+        left = "the one before it stays" if path.exists() else "nothing was written"
+        raise DataError(f"checkpoint {path} cannot be written: {error.strerror}; {left}") from error
 
 
 def _check_shapes(path: Path, kept: Mapping[str, NDArray[Any]], learner: Ppo, joints: int) -> None:

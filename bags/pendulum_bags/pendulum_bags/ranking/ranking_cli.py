@@ -10,6 +10,7 @@ from typing import Annotated
 import typer
 
 from pendulum_msgs_py.programs.executables import cli_main
+from pendulum_msgs_py.programs.options import Json, out_option
 from pendulum_msgs_py.programs.terminal import make_console
 
 __all__ = ["main"]
@@ -23,9 +24,7 @@ def ranking(
         list[Path],
         typer.Argument(help="Studies, or folders with bags that say which controller ran on which side."),
     ],
-    out: Annotated[
-        Path | None, typer.Option("--out", "-o", help="Folder for page, figure and numbers; none by default.")
-    ] = None,
+    out: Annotated[Path | None, out_option("Folder for page, figure and numbers; none by default.")] = None,
     weights: Annotated[
         tuple[float, float, float], typer.Option(help="q11, q22 and r of the cost, mean of q11 e^2 + q22 v^2 + r u^2.")
     ] = (100.0, 0.01, 0.1),
@@ -36,7 +35,7 @@ def ranking(
             "seeds; by default where real hardware ran.",
         ),
     ] = None,
-    json_output: Annotated[bool, typer.Option("--json", help="Print JSON instead of tables.")] = False,
+    json_output: Json = False,
 ) -> None:
     """Rank controllers on both sides: costs, SRCC, MMRV, regret of the simulation's pick, and pairs ranked wrongly.
 

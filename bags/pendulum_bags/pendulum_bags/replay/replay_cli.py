@@ -11,6 +11,7 @@ import typer
 
 from pendulum_msgs_py.plants.plant_parameters import PRESET_NAMES
 from pendulum_msgs_py.programs.executables import cli_main
+from pendulum_msgs_py.programs.options import Json, out_option
 
 if TYPE_CHECKING:
     from pendulum_bags.replay.controller_replay import ControllerReplay
@@ -48,8 +49,8 @@ def replay(
     ] = None,
     effort: Annotated[str, typer.Option(help="Torque of a bag: applied (said by the plant) or measured.")] = "applied",
     prefix: Annotated[str, typer.Option(help="Namespace of a bag's topics, where it holds several plants: /sim.")] = "",
-    out: Annotated[Path | None, typer.Option("--out", "-o", help="Folder for figure and replay.json.")] = None,
-    json_output: Annotated[bool, typer.Option("--json", help="Print JSON instead of tables.")] = False,
+    out: Annotated[Path | None, out_option("Folder for figure and replay.json.")] = None,
+    json_output: Json = False,
 ) -> None:
     """Drive a plant with a recorded input and compare the motion; or a controller with recorded states.
 

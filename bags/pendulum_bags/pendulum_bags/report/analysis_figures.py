@@ -7,7 +7,8 @@ from collections.abc import Callable
 
 import numpy as np
 
-from pendulum_bags.comparison.equivalence import EquivalenceTest
+from pendulum_bags.comparison.equivalence import EquivalenceTest, Verdict
+from pendulum_bags.comparison.spectra import Spectra
 from pendulum_bags.comparison.statistics import kolmogorov_smirnov, quantile_pairs
 from pendulum_bags.figures.figure import Figure, Mark, Panel, Trace
 from pendulum_bags.figures.numbers import quantity, ratio_in_words
@@ -15,7 +16,18 @@ from pendulum_bags.report.data import ReportData
 from pendulum_bags.runs.correlation import effective_size
 from pendulum_bags.runs.series import Array, Series
 
-__all__ = ["alignment", "distributions", "effort", "equivalence", "pooled_runs", "spectra", "timing"]
+__all__ = [
+    "alignment",
+    "coherent_up_to",
+    "distributions",
+    "effort",
+    "equivalence",
+    "equivalence_of",
+    "pooled_runs",
+    "spectra",
+    "spectrum_panels",
+    "timing",
+]
 
 
 def _relative(test: EquivalenceTest) -> tuple[float, float, float]:
@@ -32,7 +44,11 @@ def _relative(test: EquivalenceTest) -> tuple[float, float, float]:
 
 def equivalence(data: ReportData) -> Figure:
     """Return every test of the verdict against its margin."""
-    verdict = data.comparison.verdict
+    return equivalence_of(data.comparison.verdict)
+
+
+def equivalence_of(verdict: Verdict) -> Figure:
+    """Return every test of a verdict against its margin."""
     tests = list(verdict.tests)[::-1]
     told = [test for test in tests if math.isfinite(test.interval.estimate)]
     traces = []
@@ -121,24 +137,27 @@ def alignment(data: ReportData) -> Figure:
     )
 
 
-def spectra(data: ReportData) -> Figure:
-    """Return power spectra and coherence of the velocities."""
-    pair = data.comparison.pairs[0]
-    result = pair.spectra
+def spectrum_panels(result: Spectra, unit: str = "rad", of: str = "") -> list[Panel]:
+    """Return power spectra and coherence of both velocities.
+
+    Args:
+        result: The spectra.
+        unit: Of the position.
+        of: Whose they are, for the titles, such as ``, elbow``.
+    """
     inside = slice(1, None)
     frequency = result.frequency[inside]
-    power = [float(np.sum(one[inside]) * (frequency[1] - frequency[0])) for one in (result.first, result.second)]
-    panels = [
+    return [
         Panel(
             "frequency [Hz]",
-            "velocity PSD [(rad/s)²/Hz]",
+            f"velocity PSD [({unit}/s)²/Hz]",
             [
                 Trace(frequency, result.first[inside], "simulation", "sim"),
                 Trace(frequency, result.second[inside], "hardware", "hw"),
             ],
             x_log=True,
             y_log=True,
-            title="Power spectral density",
+            title=f"Power spectral density{of}",
         ),
         Panel(
             "frequency [Hz]",
@@ -147,14 +166,28 @@ def spectra(data: ReportData) -> Figure:
             marks=[Mark(result.threshold, "y", "5 % level of independent signals")],
             x_log=True,
             y_range=(0.0, 1.02),
-            title="Coherence",
+            title=f"Coherence{of}",
         ),
     ]
+
+
+def coherent_up_to(result: Spectra) -> str:
+    """Return up to where both velocities are coherent, in words."""
     reach = result.coherent_up_to
-    held = f"up to {reach:.0f} Hz" if reach > frequency[0] else "at no frequency"
+    return f"up to {reach:.0f} Hz" if reach > result.frequency[1] else "at no frequency"
+
+
+def spectra(data: ReportData) -> Figure:
+    """Return power spectra and coherence of the velocities."""
+    pair = data.comparison.pairs[0]
+    result = pair.spectra
+    inside = slice(1, None)
+    frequency = result.frequency[inside]
+    power = [float(np.sum(one[inside]) * (frequency[1] - frequency[0])) for one in (result.first, result.second)]
+    panels = spectrum_panels(result)
     sentence = (
         f"The hardware's velocity has {quantity(power[1] / power[0])} times the power of the simulation's; the two are "
-        f"coherent {held} ({result.segments:.1f} independent segments)."
+        f"coherent {coherent_up_to(result)} ({result.segments:.1f} independent segments)."
     )
     return Figure(
         "spectra",

@@ -1,19 +1,27 @@
-"""The animated pendulum: both plants drawn over each other, small deviations enlarged and said to be."""
+"""The animation of a report: both plants drawn over each other, small deviations enlarged and said to be."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
 
+from pendulum_bags.comparison import Comparison
 from pendulum_bags.report.data import ReportData
-from pendulum_bags.runs.series import uniform_times
+from pendulum_bags.runs.series import Array, uniform_times
+from pendulum_msgs_py.errors import ParameterError
+from pendulum_msgs_py.plants.mechanism_parameters import MechanismParameters, load_mechanism
+from pendulum_sim.mechanism_drawing import seen_from_the_side
 
-__all__ = ["animation_of"]
+__all__ = ["animation_of", "joint_animation"]
 
 FRAMES_PER_SECOND = 50.0
 WIDEST_SWING = 0.5
-"""Largest drawn deviation [rad]: what is smaller is enlarged up to it."""
+"""Largest drawn deviation [rad or m]: what is smaller is enlarged up to it."""
+LARGEST_FACTOR = 200.0
+WIDTH, HEIGHT, MARGIN = 640, 300, 24
+"""Size of the picture of several joints, and what stays free at its edges [px]."""
 
 
 def animation_of(data: ReportData) -> dict[str, Any]:
@@ -28,5 +36,58 @@ def animation_of(data: ReportData) -> dict[str, Any]:
         angle = np.interp(times, series.t, series.position - np.pi)
         largest = max(largest, float(np.abs(angle).max()))
         tracks[name] = np.round(angle, 6).tolist()
-    factor = max(1.0, float(np.floor(WIDEST_SWING / largest)))
-    return {"period": 1.0 / FRAMES_PER_SECOND, "factor": min(factor, 200.0), **tracks}
+    return {"period": 1.0 / FRAMES_PER_SECOND, "factor": _enlarged(largest), **tracks}
+
+
+def joint_animation(comparisons: Mapping[str, Comparison], plant: str) -> dict[str, Any] | None:
+    """Return frames of both plants as points of their links [px].
+
+    Args:
+        comparisons: The comparison of each joint, by its name.
+        plant: Preset or file of the plant, whose links are drawn on both sides.
+
+    Returns:
+        The frames and the factor of enlargement; None where the plant is not known here, or not all its joints are.
+    """
+    try:
+        parameters = load_mechanism(plant)
+    except ParameterError:
+        return None
+    coordinates = parameters.coordinates
+    if coordinates.names != tuple(comparisons):
+        return None
+    pairs = [comparison.pairs[0] for comparison in comparisons.values()]
+    sides = {"sim": [pair.simulation.window for pair in pairs], "hw": [pair.hardware.window for pair in pairs]}
+    begin = max(float(series.t[0]) for each in sides.values() for series in each)
+    stop = min(float(series.t[-1]) for each in sides.values() for series in each)
+    times = uniform_times(max(begin, 0.0), stop, 1.0 / FRAMES_PER_SECOND)
+    goal = np.array(coordinates.goal)
+    off = {
+        side: np.column_stack([np.interp(times, one.t, one.position) for one in each]) - goal
+        for side, each in sides.items()
+    }
+    factor = _enlarged(max(1e-9, *(float(np.abs(values).max()) for values in off.values())))
+    points = {side: _chains(parameters, goal + factor * values) for side, values in off.items()}
+    low = np.min([values.min(axis=(0, 1)) for values in points.values()], axis=0)
+    high = np.max([values.max(axis=(0, 1)) for values in points.values()], axis=0)
+    room = np.array([WIDTH, HEIGHT]) - 2.0 * MARGIN
+    scale = float(np.min(room / np.maximum(high - low, 1e-9)))
+    middle, up = 0.5 * (low + high), np.array([1.0, -1.0])
+    frames = {
+        side: np.round(0.5 * np.array([WIDTH, HEIGHT]) + scale * up * (values - middle), 1).tolist()
+        for side, values in points.items()
+    }
+    return {"period": 1.0 / FRAMES_PER_SECOND, "factor": factor, **frames}
+
+
+def _chains(parameters: MechanismParameters, positions: Array) -> Array:
+    """Return where the ends of all links are, to the right and up, shape (frames, points, 2) [m]."""
+    mechanism, packed = parameters.mechanism, parameters.packed
+    return np.array(
+        [[seen_from_the_side(mechanism, point) for point in mechanism.chain(tuple(q), packed)] for q in positions]
+    )
+
+
+def _enlarged(largest: float) -> float:
+    """Return how many times a largest deviation is enlarged."""
+    return min(max(1.0, float(np.floor(WIDEST_SWING / largest))), LARGEST_FACTOR)

@@ -1,4 +1,4 @@
-"""A figure of plants of several joints: all of them under noise, simulation and hardware together."""
+"""Figures of plants of several joints, each joint in its own unit."""
 
 from __future__ import annotations
 
@@ -9,9 +9,10 @@ import numpy as np
 from pendulum_bags.comparison import Comparison
 from pendulum_bags.figures.figure import Figure, Panel, Trace
 from pendulum_bags.figures.numbers import quantity, ratio_in_words
+from pendulum_bags.report.analysis_figures import coherent_up_to, spectrum_panels
 from pendulum_bags.report.motion_figures import TIME
 
-__all__ = ["joints_together"]
+__all__ = ["joint_differences", "joint_spectra", "joints_together"]
 
 
 def joints_together(comparisons: Mapping[str, Comparison]) -> Figure:
@@ -51,5 +52,67 @@ def joints_together(comparisons: Mapping[str, Comparison]) -> Figure:
         sentence,
         panels,
         section="Paired comparison",
-        panel_height=150,
+        panel_height=170,
+    )
+
+
+def joint_differences(comparisons: Mapping[str, Comparison]) -> Figure | str:
+    """Return the difference of each joint's motion under one disturbance, as recorded and less its delay.
+
+    Args:
+        comparisons: The comparison of each joint, at least one.
+    """
+    panels: list[Panel] = []
+    words: list[str] = []
+    for joint, comparison in comparisons.items():
+        pair = comparison.pairs[0]
+        if not pair.is_paired:
+            return str(comparison.paired.get("reason", "the disturbances differ"))
+        unit = pair.simulation.window.unit
+        delay = 1e3 * pair.response.delay
+        for label, name in ((f"Δ {joint} [{unit}]", "position"), (f"Δ velocity of {joint} [{unit}/s]", "velocity")):
+            traces = [
+                Trace(one.t, getattr(one, name), title, role)
+                for one, title, role in (
+                    (pair.difference, "as recorded", "difference"),
+                    (pair.aligned, "its delay taken out", "aligned"),
+                )
+            ]
+            panels.append(Panel(TIME, label, traces))
+        before, after = (float(np.sqrt(np.mean(one.position**2))) for one in (pair.difference, pair.aligned))
+        share = 100.0 * before / float(pair.difference.hardware.position.std())
+        words.append(
+            f"of {joint} {quantity(before, unit)} apart (rms, {share:.0f} % of the hardware's spread), with the delay "
+            f"of {delay:.2f} ms taken out {quantity(after, unit)}"
+        )
+    return Figure(
+        "joint_differences",
+        "Difference under the same noise, joint by joint",
+        f"The paths are, {'; '.join(words)}.",
+        panels,
+        section="Paired comparison",
+        panel_height=165,
+    )
+
+
+def joint_spectra(comparisons: Mapping[str, Comparison]) -> Figure:
+    """Return power spectra and coherence of each joint's velocity.
+
+    Args:
+        comparisons: The comparison of each joint, at least one.
+    """
+    panels: list[Panel] = []
+    words: list[str] = []
+    for joint, comparison in comparisons.items():
+        pair = comparison.pairs[0]
+        panels += spectrum_panels(pair.spectra, pair.simulation.window.unit, f", {joint}")
+        words.append(f"{joint} {coherent_up_to(pair.spectra)}")
+    return Figure(
+        "joint_spectra",
+        "Spectra and coherence, joint by joint",
+        f"Both velocities are coherent: {', '.join(words)}.",
+        panels,
+        stacked=False,
+        section="Paired comparison",
+        panel_height=210,
     )

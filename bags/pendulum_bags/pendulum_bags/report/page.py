@@ -5,6 +5,7 @@ from __future__ import annotations
 import base64
 import math
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from importlib import resources
 from typing import Any
 
@@ -19,11 +20,11 @@ from pendulum_bags.report.emulator_table import emulator_table
 from pendulum_bags.report.provenance import provenance_table, settings_table
 from pendulum_bags.report.terms import Terms
 from pendulum_bags.report.wording import name_in
-from pendulum_bags.runs.run_data import timing_warning
+from pendulum_bags.runs.run_data import stand_in_of, timing_warning
 from pendulum_bags.verdict import Answer
 from pendulum_bags.verdict.terminal import SIGNS
 
-__all__ = ["render_page"]
+__all__ = ["Page", "page_of", "render_page"]
 
 SECTIONS = (
     "Verdict",
@@ -42,7 +43,50 @@ SECTIONS = (
 """Order of the sections; one that only a figure or table names comes after these."""
 
 
-def render_page(
+@dataclass(frozen=True)
+class Page:
+    """What stands on a report.
+
+    Attributes:
+        title: What it is about.
+        made_at: When it was made.
+        answer: The answer, with its layers.
+        hardware: What the simulation was compared with, as in sentences.
+        emulated: Whether an emulator stood in for the hardware; all texts say so then.
+        is_paired: Whether both sides had one disturbance.
+        facts: Names and values at the head.
+        notes: Sentences below the answer, such as what was left out.
+        figures: Figures, drawn on the page by a script.
+        tables: Tables.
+        provenance: Tables of where the data come from.
+        stand_in: What stood in for the hardware where none was measured.
+        animation: What moves, as :func:`pendulum_bags.report.animation.animation_of` says; None for nothing.
+        missing: Figures that the data do not allow, each with the reason.
+        unpaired: The answer without pairs, told with the thesis's analysis.
+        noise_note: A sentence about noise that was held differently, told there too.
+        pictures: The figures as PNG by name, for paper and for readers without scripts.
+    """
+
+    title: str
+    made_at: str
+    answer: Answer
+    hardware: str
+    emulated: bool
+    is_paired: bool
+    facts: Sequence[tuple[str, str]]
+    figures: Sequence[Figure]
+    tables: Sequence[Table]
+    provenance: Sequence[Table]
+    stand_in: str
+    animation: Mapping[str, Any] | None = None
+    notes: Sequence[str] = ()
+    missing: Sequence[tuple[str, str]] = ()
+    unpaired: str = ""
+    noise_note: str = ""
+    pictures: Mapping[str, bytes] = field(default_factory=dict)
+
+
+def page_of(
     data: ReportData,
     figures: Sequence[Figure],
     tables: Sequence[Table],
@@ -50,19 +94,43 @@ def render_page(
     *,
     title: str,
     made_at: str,
-    pictures: Mapping[str, bytes] | None = None,
-) -> str:
-    """Return the HTML text of the report.
+) -> Page:
+    """Return the page of plants of one joint.
 
     Args:
         data: What it is made from.
-        figures: Figures, drawn on the page by a script.
+        figures: Figures.
         tables: Tables.
         missing: Figures that the data do not allow, each with the reason.
         title: What the page is about.
         made_at: When it was made.
-        pictures: The figures as PNG by name, for paper and for readers without scripts.
     """
+    comparison = data.comparison
+    warning = timing_warning(comparison.plants)
+    return Page(
+        title=title,
+        made_at=made_at,
+        answer=data.answer,
+        hardware=comparison.hardware_name,
+        emulated=comparison.is_emulated,
+        is_paired=comparison.is_paired,
+        facts=_facts(data),
+        figures=figures,
+        tables=tables,
+        provenance=[
+            table for table in (provenance_table(data), emulator_table(data), settings_table(data)) if table is not None
+        ],
+        animation=animation_of(data),
+        notes=[*([warning] if warning else []), *comparison.left_out],
+        missing=missing,
+        unpaired=comparison.unpaired_verdict.sentence,
+        noise_note=_noise_note(data),
+        stand_in=stand_in_of(comparison.pairs[0].hardware),
+    )
+
+
+def render_page(page: Page) -> str:
+    """Return the HTML text of a report."""
     import jinja2
 
     templates = resources.files("pendulum_bags.report").joinpath("templates")
@@ -75,9 +143,12 @@ def render_page(
     )
     terms = Terms()
     environment.filters["marked"] = terms.mark
+    figures, tables, facts, noise_note, provenance = name_in(
+        (page.figures, page.tables, page.facts, page.noise_note, page.provenance), emulated=page.emulated
+    )
     sections = []
     graphs: dict[str, Any] = {}
-    packed = {name: base64.b64encode(content).decode("ascii") for name, content in (pictures or {}).items()}
+    packed = {name: base64.b64encode(content).decode("ascii") for name, content in page.pictures.items()}
     named = [figure.section for figure in figures] + [table.section for table in tables]
     for heading in dict.fromkeys((*SECTIONS, *named)):
         items: list[dict[str, Any]] = []
@@ -90,30 +161,16 @@ def render_page(
         items += [{"table": table} for table in tables if table.section == heading]
         if items:
             sections.append({"title": heading, "anchor": _anchor(heading), "entries": items})
-    emulated = data.comparison.is_emulated
     return environment.get_template("report.html.j2").render(
-        title=title,
-        emulated=emulated,
+        page=page,
         terms=terms,
-        made_at=made_at,
-        answer=data.answer,
-        sentence=_without_mark(data.answer),
+        sentence=_without_mark(page.answer),
         signs=SIGNS,
-        left_out=data.comparison.left_out,
-        unpaired=data.comparison.unpaired_verdict.sentence,
-        hardware=data.comparison.hardware_name,
-        noise_note=name_in(_noise_note(data), emulated=emulated),
-        is_paired=data.comparison.is_paired,
-        timing_warning=timing_warning(data.comparison.plants),
-        facts=name_in(_facts(data), emulated=emulated),
+        noise_note=noise_note,
+        facts=facts,
         sections=sections,
-        missing=missing,
-        provenance=[
-            name_in(table, emulated=emulated)
-            for table in (provenance_table(data), emulator_table(data), settings_table(data))
-            if table is not None
-        ],
-        animation=script_json(animation_of(data)),
+        provenance=provenance,
+        animation=script_json(page.animation),
         graphs=script_json(graphs),
         plotly=packed_plotly(),
         style=read("report.css"),

@@ -5,14 +5,16 @@ from __future__ import annotations
 import json
 import time
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
 from pendulum_bags.comparison.compare_cli import DesignOption, LayersOption, MachineOption
-from pendulum_msgs_py.errors import BagError
+from pendulum_msgs_py.errors import BagError, DataError
 from pendulum_msgs_py.programs.executables import cli_main
+from pendulum_msgs_py.programs.options import out_option
 
 __all__ = ["main"]
 
@@ -27,7 +29,7 @@ def report(
     ],
     out: Annotated[
         Path | None,
-        typer.Option("--out", "-o", help="Folder of the report; by default the run folder itself."),
+        out_option("Folder of the report; by default the run folder itself."),
     ] = None,
     margin: Annotated[
         list[str] | None,
@@ -43,15 +45,16 @@ def report(
     ] = None,
     png_only: Annotated[bool, typer.Option("--png-only", help="Leave out the PDF figures.")] = False,
 ) -> None:
-    """Write report.html and figures/ for one run, or for several runs pooled.
+    """Write report.html and figures/ for one run, or for several runs pooled; joint by joint where there are several.
 
     Example: python -m pendulum_bags report bags/runs/2026-01-31T12-00-00Z_thesis
     """
     from pendulum_bags.comparison import Margins, compare_folders, compare_runs
     from pendulum_bags.frequency_response.carry_over import carry_over, layers_of
     from pendulum_bags.report import write_report
-    from pendulum_bags.report.write import margin_of
-    from pendulum_bags.verdict.answer import answer_of
+    from pendulum_bags.report.write import margin_of, write_joint_report
+    from pendulum_bags.runs.run_data import joints_of
+    from pendulum_bags.verdict.answer import answer_of, answer_of_joints
 
     started = time.monotonic()
     trials = [folder for folder in folders if (folder / "trial_1").exists()]
@@ -61,39 +64,62 @@ def report(
             f"{trials[0]} holds trials and no run; expected a run folder beside it (identify --page shows trials alone)"
         )
     margins = Margins.of(margins_file, margin)
-    summary = None
-    if all((folder / "sim").exists() and (folder / "hw").exists() for folder in folders):
-        if not margins.stated and len(folders) == 1:
-            summary = _summary(folders[0])
-            # What the run was judged by when it was recorded.
-            margins = Margins.parse(margin_of(summary))
-        result = compare_folders(folders, margin=margins)
-        target = out or (folders[0] if len(folders) == 1 else _common(folders))
+    if pooled := all((folder / "sim").exists() and (folder / "hw").exists() for folder in folders):
+        run = partial(compare_folders, folders)
     elif len(folders) == 2:
-        result = compare_runs(folders[0], folders[1], margin=margins)
-        target = out or _common(folders)
+        run = partial(compare_runs, *folders)
     else:
         bad = next(folder for folder in folders if not ((folder / "sim").exists() and (folder / "hw").exists()))
         if not bad.exists():
             raise BagError(f"run folder {bad} does not exist")
         raise BagError(f"run folder {bad} has no bags sim and hw; expected run folders, or two bags")
-    kept = [*(folders if len(folders) == 1 else ()), *(layers or ())]
-    certified = carry_over(result, kept, machine, design or ())
-    answer = answer_of(result, kept, anew=layers_of(certified))
-    page = write_report(
-        target,
-        {key: value for key, value in (summary or {}).items() if key != "verdict"},
-        comparison=result,
-        folders=folders if len(folders) > 1 else (),
-        trials=trials,
-        recordings=recording or (),
-        formats=("png",) if png_only else ("png", "pdf"),
-        answer=answer,
-        certified=certified,
-    )
+    alone = folders[0] if pooled and len(folders) == 1 else None
+    target = out or alone or _common(folders)
+    kept = [*([alone] if alone else ()), *(layers or ())]
+    formats = ("png",) if png_only else ("png", "pdf")
+    if joints := joints_of(folders[0] / "sim" if pooled else folders[0]):
+        if trials or machine or design or recording:
+            raise DataError(
+                "folders of trials, --machine, --design and --recording are of plants of one joint; expected none of "
+                f"them for a plant of {len(joints)} ({', '.join(joints)})"
+            )
+        if alone and not margins.stated:
+            margins = Margins.parse(margin_of(_of_joint(alone, joints[0])))
+        comparisons = {joint: run(margin=margins, joint=joint) for joint in joints}
+        answer = answer_of_joints(comparisons, kept)
+        page = write_joint_report(target, comparisons, folders=folders, formats=formats, answer=answer)
+    else:
+        summary = _summary(alone) if alone and not margins.stated else None
+        if summary is not None:
+            # What the run was judged by when it was recorded.
+            margins = Margins.parse(margin_of(summary))
+        result = run(margin=margins)
+        certified = carry_over(result, kept, machine, design or ())
+        answer = answer_of(result, kept, anew=layers_of(certified))
+        page = write_report(
+            target,
+            {key: value for key, value in (summary or {}).items() if key != "verdict"},
+            comparison=result,
+            folders=folders if len(folders) > 1 else (),
+            trials=trials,
+            recordings=recording or (),
+            formats=formats,
+            answer=answer,
+            certified=certified,
+        )
     print(answer.sentence)
     print(f"report  {page} ({page.stat().st_size / 1e6:.1f} MB, {time.monotonic() - started:.1f} s)")
     print(f"figures {page.parent / 'figures'}")
+
+
+def _of_joint(folder: Path, joint: str) -> dict[str, object] | None:
+    """Return what the run's own comparison says of a joint; a damaged or missing one is no obstacle."""
+    try:
+        content = json.loads((folder / "comparison.json").read_text(encoding="utf-8"))
+        found = content["joints"][joint]
+    except (OSError, ValueError, TypeError, KeyError):
+        return None
+    return found if isinstance(found, dict) else None
 
 
 def _summary(folder: Path) -> dict[str, object] | None:

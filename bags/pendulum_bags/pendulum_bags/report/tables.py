@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from pendulum_bags.comparison import Comparison
 from pendulum_bags.figures.numbers import quantity
 from pendulum_bags.figures.table import Table
 from pendulum_bags.report.data import ReportData
@@ -19,7 +20,7 @@ from pendulum_lqr.design import output_lqr
 from pendulum_lqr.model import linearise, sort_poles
 from pendulum_msgs_py.plants.plant_parameters import PLANT_SPECS
 
-__all__ = ["make_tables", "typeset"]
+__all__ = ["make_tables", "tests_table", "typeset"]
 
 WEIGHTS = ((1.0, 0.01, 0.1), (1.0, 0.1, 0.1), (100.0, 0.01, 0.1), (100.0, 0.1, 0.1))
 """q11, q22 and r of the combinations in the thesis."""
@@ -68,8 +69,13 @@ def _plants(data: ReportData) -> Table:
 
 
 def _tests(data: ReportData) -> Table:
+    return tests_table(data.comparison)
+
+
+def tests_table(comparison: Comparison) -> Table:
+    """Return every test of a comparison against its margin."""
     rows = []
-    for test in data.comparison.verdict.tests:
+    for test in comparison.verdict.tests:
         interval = test.interval
         margin = (
             f"{quantity(test.low)} to {quantity(test.high)}"
@@ -93,20 +99,20 @@ def _tests(data: ReportData) -> Table:
     head = (
         "quantity",
         "estimate",
-        data.comparison.verdict.tests[0].interval.title,
+        comparison.verdict.tests[0].interval.title,
         "margin",
         "result",
         "smallest margin that would hold",
         "runs to add",
     )
-    verdict = data.comparison.verdict
+    verdict = comparison.verdict
     sentence = (
         "Two one-sided tests each, intervals by block bootstrap. Ratios are hardware per simulation; "
         "distances are root mean "
         f"squares, per standard deviation of the hardware's motion where they are in %. Compared with "
         f"{verdict.margins.whose}."
     )
-    if looks := data.comparison.looks.number:
+    if looks := comparison.looks.number:
         often = "once" if looks == 1 else f"{looks} times"
         sentence += (
             f" The experiment tested the data {often}, and could have tested more data after that. The intervals are "

@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import os
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from datetime import datetime, timezone
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -12,7 +13,8 @@ from typing import TYPE_CHECKING, Any
 from pendulum_bags.figures.render_files import write_figures
 from pendulum_bags.report.data import ReportData
 from pendulum_bags.report.figures import make_figures
-from pendulum_bags.report.page import render_page
+from pendulum_bags.report.joint_page import joint_page
+from pendulum_bags.report.page import Page, page_of, render_page
 from pendulum_bags.report.tables import make_tables
 from pendulum_bags.report.trials import read_trials
 from pendulum_bags.report.wording import name_in
@@ -26,7 +28,7 @@ if TYPE_CHECKING:
     from pendulum_bags.replay.result import InputReplay
     from pendulum_bags.verdict import Answer
 
-__all__ = ["find_real_recording", "margin_of", "write_report"]
+__all__ = ["find_real_recording", "margin_of", "title_of", "write_joint_report", "write_report"]
 
 REAL_RECORDING = Path("dfki_torque_limited_simple_pendulum", "ddp_measured.csv")
 
@@ -84,24 +86,56 @@ def write_report(
     answer = answer or answer_of(comparison, kept, anew=layers_of(certified))
     known = [read_trials(path) for path in trials]
     data = ReportData(comparison, content, replays, names, known, answer, certified)
-    made, missing = make_figures(data)
-    figures = [name_in(figure, emulated=comparison.is_emulated) for figure in made]
+    figures, missing = make_figures(data)
+    page = page_of(
+        data, figures, make_tables(data), missing,
+        title=title_of([Path(folder) for folder in folders] or [out], len(comparison.pairs)), made_at=_now(),
+    )  # fmt: skip
+    return _save(out, page, formats)
+
+
+def write_joint_report(
+    out: Path,
+    comparisons: Mapping[str, Comparison],
+    *,
+    folders: Sequence[Path],
+    formats: Sequence[str] = ("png", "pdf"),
+    answer: Answer,
+) -> Path:
+    """Write ``report.html`` and ``figures/`` of plants of several joints into a folder.
+
+    Args:
+        out: Where the report goes.
+        comparisons: The comparison of each joint, by its name.
+        folders: Run folders, or the two bags.
+        formats: Formats of the figures.
+        answer: The answer for all joints.
+
+    Returns:
+        Path of the page.
+
+    Raises:
+        BagError: The folder cannot be written.
+    """
+    pairs = len(next(iter(comparisons.values())).pairs)
+    return _save(out, joint_page(comparisons, answer, title=title_of(folders, pairs), made_at=_now()), formats)
+
+
+def _now() -> str:
+    return datetime.now(timezone.utc).strftime("%Y-%m-%d %H:%M UTC")
+
+
+def _save(out: Path, page: Page, formats: Sequence[str]) -> Path:
+    """Write the figures, then the page with the same figures for paper."""
+    figures = [name_in(figure, emulated=page.emulated) for figure in page.figures]
     # Paper has no scripts: whoever prints the page gets these pictures.
     drawn = write_figures(figures, out / "figures", formats)
-    page = render_page(
-        data,
-        figures,
-        [name_in(table, emulated=comparison.is_emulated) for table in make_tables(data)],
-        missing,
-        title=_title([Path(folder) for folder in folders] or [out], len(comparison.pairs)),
-        made_at=datetime.now(timezone.utc).strftime("%Y-%m-%d %H:%M UTC"),
-        pictures={path.stem: _for_paper(path) for path in drawn if path.suffix == ".png"},
-    )
+    text = render_page(replace(page, pictures={path.stem: _for_paper(path) for path in drawn if path.suffix == ".png"}))
     target = out / "report.html"
     try:
         out.mkdir(parents=True, exist_ok=True)
         partial = out / ".report.html.part"
-        partial.write_text(page, encoding="utf-8")
+        partial.write_text(text, encoding="utf-8")
         partial.replace(target)
     except OSError as error:
         raise BagError(f"report {target} cannot be written: {error.strerror or error}") from error
@@ -118,7 +152,7 @@ def _for_paper(path: Path) -> bytes:
     return buffer.getvalue()
 
 
-def _title(folders: Sequence[Path], runs: int) -> str:
+def title_of(folders: Sequence[Path], runs: int) -> str:
     """Return what a page is about: a run, the two bags of one, or how many runs."""
     if runs > 1:
         return f"{runs} runs"

@@ -35,6 +35,7 @@ __all__ = [
     "missed_share",
     "plant_summary",
     "read_run",
+    "stand_in_of",
     "timing_warning",
 ]
 
@@ -271,6 +272,16 @@ def is_emulated(run: RunData) -> bool:
     """Return whether the run says that an emulator, or a second simulation, stood in for the hardware."""
     told = run_record(run.metadata)
     return told.get("plant") == "emulator" or STAND_IN in told
+
+
+def stand_in_of(run: RunData) -> str:
+    """Return what stood in for the hardware of a run in which no machine was measured.
+
+    Args:
+        run: The hardware's side.
+    """
+    simulated = run_record(run.metadata).get(STAND_IN) == "simulation"
+    return "a second simulation" if simulated else "an emulator"
 
 
 def noise_hold_time(run: RunData) -> float | None:

@@ -12,13 +12,14 @@ import typer
 
 from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.programs.counted_progress import results_at_once
+from pendulum_msgs_py.programs.options import Json, out_option
 from pendulum_msgs_py.programs.terminal import WholeTable, make_console
 
 __all__ = ["leaderboard"]
 
 
 def leaderboard(
-    out: Annotated[Path, typer.Option(help="Folder of the page.")] = Path("bags/runs/leaderboard"),
+    out: Annotated[Path, out_option("Folder of the page.")] = Path("bags/runs/leaderboard"),
     plants: Annotated[
         str, typer.Option(help="Rigid plants (presets or files) and hw, the emulated X5-9, separated by commas.")
     ] = "thesis,dfki",
@@ -28,7 +29,7 @@ def leaderboard(
     duration: Annotated[float, typer.Option(help="Length of each run [s].", min=1.0)] = 10.0,
     robustness: Annotated[bool, typer.Option(help="Try model errors, noise, delay, lag and pushes too.")] = True,
     workers: Annotated[int, typer.Option(help="Runs at once; 0 for one a core.", min=0)] = 0,
-    json_output: Annotated[bool, typer.Option("--json", help="Print the board as JSON.")] = False,
+    json_output: Json = False,
 ) -> None:
     """Score every controller from hanging down to upright: three public scores, costs, robustness, one page.
 

@@ -13,6 +13,7 @@ import typer
 from rich.console import Console
 
 from pendulum_msgs_py.programs.counted_progress import results_at_once
+from pendulum_msgs_py.programs.options import Json, out_option
 from pendulum_msgs_py.programs.terminal import WholeTable, make_console
 
 if TYPE_CHECKING:
@@ -27,20 +28,23 @@ _FEW = 8
 
 def benchmark(
     plant: Annotated[str, typer.Option(help="acrobot or pendubot.")] = "acrobot",
-    controller: Annotated[str, typer.Option(help="Controllers, separated by commas; empty for all.")] = "",
-    out: Annotated[Path, typer.Option(help="Folder of the figure and the results.")] = Path("bags/runs/benchmark"),
+    controller: Annotated[
+        str, typer.Option(help="Controllers and policy files, separated by commas; empty for all controllers.")
+    ] = "",
+    out: Annotated[Path, out_option("Folder of the figure and the results.")] = Path("bags/runs/benchmark"),
     robustness: Annotated[bool, typer.Option(help="Six tests of robustness: 722 runs a controller.")] = True,
     uptime_seeds: Annotated[
         int, typer.Option(help="Runs of 60 s with knock-downs, each with a seed of its own; 0 for none.", min=0)
     ] = 10,
     seed: Annotated[int, typer.Option(help="Of noise, kicks and knock-downs.", min=0)] = 1,
     workers: Annotated[int, typer.Option(help="Runs at once; 0 for one a core.", min=0)] = 0,
-    json_output: Annotated[bool, typer.Option("--json", help="Print the results as JSON.")] = False,
+    json_output: Json = False,
 ) -> None:
     """Score controllers of acrobot or pendubot by the public benchmark's protocol, to the letter.
 
     Swing-up from hanging in 10 s (score v2), six tests of robustness (v2), and time up under knock-downs (v3, of 2025).
-    Its published methods stand beside, as published: nothing of them was run here.
+    Its published methods stand beside, as published: nothing of them was run here. A policy file is a controller, too;
+    of FILE.npz+lqr an LQR takes over near upright.
 
     Example: python -m pendulum_bags experiment benchmark --plant pendubot --controller tvlqr --no-robustness
     """

@@ -12,6 +12,7 @@ import typer
 from rich.console import Console
 
 from pendulum_msgs_py.programs.counted_progress import counted_progress
+from pendulum_msgs_py.programs.options import Json, out_option
 from pendulum_msgs_py.programs.terminal import WholeTable, make_console
 
 __all__ = ["monte_carlo"]
@@ -20,9 +21,7 @@ __all__ = ["monte_carlo"]
 def monte_carlo(
     out: Annotated[
         Path | None,
-        typer.Option(
-            help="Folder; an interrupted one is gone on with, more runs are added. Default: bags/runs/monte_carlo."
-        ),
+        out_option("Folder; an interrupted one is gone on with, more runs are added. Default: bags/runs/monte_carlo."),
     ] = None,
     plant: Annotated[str, typer.Option(help="Preset or plant file; the controller is designed on it.")] = "thesis",
     uncertainty: Annotated[
@@ -41,7 +40,7 @@ def monte_carlo(
     scheduler: Annotated[str, typer.Option(help="Dask scheduler, tcp://HOST:PORT.")] = "",
     workers: Annotated[int, typer.Option(help="Processes of a local Dask cluster; 0 for none.", min=0)] = 0,
     replay: Annotated[int, typer.Option(help="Only replay this run, and write its motion as CSV.")] = -1,
-    json_output: Annotated[bool, typer.Option("--json", help="Print the result as JSON instead of tables.")] = False,
+    json_output: Json = False,
 ) -> None:
     """Run a million closed loops over uncertain parameters, noise and starts; probabilities, worst cases, sensitivity.
 

@@ -11,6 +11,7 @@ from typing import Annotated
 import typer
 
 from pendulum_msgs_py.programs.counted_progress import counted_progress
+from pendulum_msgs_py.programs.options import Json, out_option
 from pendulum_msgs_py.programs.terminal import make_console
 
 __all__ = ["region_of_attraction"]
@@ -19,7 +20,7 @@ __all__ = ["region_of_attraction"]
 def region_of_attraction(
     out: Annotated[
         Path | None,
-        typer.Option(help="Folder; an interrupted map is gone on with. Default: bags/runs/region_of_attraction."),
+        out_option("Folder; an interrupted map is gone on with. Default: bags/runs/region_of_attraction."),
     ] = None,
     plant: Annotated[str, typer.Option(help="Preset or plant file; the controller is designed on it.")] = "thesis",
     uncertainty: Annotated[
@@ -38,7 +39,7 @@ def region_of_attraction(
     seed: Annotated[int, typer.Option(help="Seed of the plants.", min=0)] = 1,
     scheduler: Annotated[str, typer.Option(help="Dask scheduler, tcp://HOST:PORT.")] = "",
     workers: Annotated[int, typer.Option(help="Processes of a local Dask cluster; 0 for none.", min=0)] = 0,
-    json_output: Annotated[bool, typer.Option("--json", help="Print the result as JSON.")] = False,
+    json_output: Json = False,
 ) -> None:
     """Map the starts from which the LQR reaches upright under a torque limit, over everything not known of the plant.
 

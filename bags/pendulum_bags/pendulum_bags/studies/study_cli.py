@@ -14,6 +14,7 @@ from rich.progress import TextColumn
 
 from pendulum_msgs_py.errors import FaultError, ParameterError
 from pendulum_msgs_py.programs.counted_progress import counting_bar, resumable
+from pendulum_msgs_py.programs.options import Json, out_option
 from pendulum_msgs_py.programs.terminal import WholeTable, make_console
 
 if TYPE_CHECKING:
@@ -24,8 +25,8 @@ __all__ = ["add_commands"]
 
 Out = Annotated[
     Path | None,
-    typer.Option(
-        help="Folder of the study; an interrupted study goes on there, and one that was given more seeds or plants "
+    out_option(
+        "Folder of the study; an interrupted study goes on there, and one that was given more seeds or plants "
         "carries out those. Default: bags/runs/<name>."
     ),
 ]
@@ -37,7 +38,6 @@ Retry = Annotated[bool, typer.Option("--retry-failed", help="Carry out again the
 DryRun = Annotated[bool, typer.Option("--dry-run", help="Show matrix, time and disk that it needs; run nothing.")]
 Yes = Annotated[bool, typer.Option("--yes", help="Do not ask before each run that moves a real machine.")]
 Seeds = Annotated[int, typer.Option(help="Number of seeds in place of the file's; 0 keeps those.", min=0)]
-Json = Annotated[bool, typer.Option("--json", help="Print the result as JSON instead of tables.")]
 
 _SHOWN = (
     "rms_error",

@@ -6,6 +6,7 @@ import math
 from collections.abc import Mapping, Sequence
 
 from pendulum_bags.comparison import Comparison, EquivalenceTest, Outcome
+from pendulum_bags.runs.run_record import run_record
 from pendulum_bags.verdict.layers import Evidence, Layer, LayerResult, Mark
 
 __all__ = ["in_words", "same_run_layer"]
@@ -113,8 +114,8 @@ def _remedies(comparison: Comparison, failed: Sequence[EquivalenceTest]) -> tupl
     if any(name.startswith("spread") or "less the delay" in name for name in shapes):
         identify = f"python -m pendulum_bags identify {source} --out plant.yaml"
         if comparison.pairs[0].hardware.joint:
-            # States of several joints are identified from a file with columns of each.
-            identify = f"python -m pendulum_bags export {source} --output csv --format csv, then identify --plant"
+            plant = run_record(comparison.pairs[0].simulation.metadata).get("design_plant", "MECHANISM")
+            identify = f"{identify} --plant {plant}"
         steps.append(
             f"Identify the plant from what the hardware did ({identify}), then "
             + (f"carry its values over to {foreign}." if foreign else "simulate and design with --plant plant.yaml.")

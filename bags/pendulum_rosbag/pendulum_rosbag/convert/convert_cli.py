@@ -16,6 +16,7 @@ from rich.progress import TimeRemainingColumn
 from pendulum_msgs_py.errors import DataError, ParameterError
 from pendulum_msgs_py.programs.counted_progress import counting_bar
 from pendulum_msgs_py.programs.executables import cli_main
+from pendulum_msgs_py.programs.options import Json, out_option
 from pendulum_msgs_py.programs.terminal import make_console
 
 if TYPE_CHECKING:
@@ -28,13 +29,12 @@ _STEPS = 1000
 
 Source = Annotated[Path, typer.Argument(help="Folder of the bag, or one .mcap or .db3 file.")]
 AnySource = Annotated[Path, typer.Argument(help="Folder of the bag, or one .mcap, .db3 or ROS 1 .bag file.")]
-Output = Annotated[Path, typer.Option("-o", "--output", help="Folder of the new bag; it must not exist.")]
+Output = Annotated[Path, out_option("Folder of the new bag; it must not exist.")]
 Storage = Annotated[str, typer.Option(help="mcap or sqlite3; by default that of the bag.")]
 Compression = Annotated[str, typer.Option(help="zstd or none; by default what the bag has.")]
 Topics = Annotated[list[str] | None, typer.Option("--topic", "-t", help="Topic to keep; several times if wanted.")]
 Regex = Annotated[str, typer.Option(help="Keep topics that match this pattern, too.")]
 Exclude = Annotated[str, typer.Option(help="Leave out topics that match this pattern.")]
-Json = Annotated[bool, typer.Option("--json", help="Print the report as JSON.")]
 
 convert_app, merge_app, cut_app, filter_app = (
     typer.Typer(add_completion=False, rich_markup_mode=None) for _ in range(4)

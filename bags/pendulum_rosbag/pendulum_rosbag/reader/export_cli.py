@@ -9,6 +9,7 @@ import typer
 
 from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.programs.executables import cli_main
+from pendulum_msgs_py.programs.options import out_option
 from pendulum_rosbag.reader import read_bag
 from pendulum_rosbag.reader.lerobot import DEFAULT_TASK, export_lerobot
 from pendulum_rosbag.reader.tables import LEROBOT, export_bag, require_pyarrow
@@ -26,7 +27,7 @@ def export(
     bags: Annotated[
         list[Path], typer.Argument(help="Folder of a bag, or one .mcap or .db3 file; several for lerobot.")
     ],
-    output: Annotated[Path, typer.Option("-o", "--output", help="Folder to create.")],
+    output: Annotated[Path, out_option("Folder to create.")],
     topics: Annotated[list[str] | None, typer.Option("-t", "--topic", help="Topic to export; by default all.")] = None,
     format: Annotated[str, typer.Option(help="parquet, csv, or lerobot (dataset v3.0).")] = "parquet",
     fps: Annotated[

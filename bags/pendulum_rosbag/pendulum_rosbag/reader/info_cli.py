@@ -11,6 +11,7 @@ from typing import Annotated, Any
 import typer
 
 from pendulum_msgs_py.programs.executables import cli_main
+from pendulum_msgs_py.programs.options import Json
 from pendulum_msgs_py.programs.terminal import WholeTable, make_console
 from pendulum_rosbag.reader import read_bag
 from pendulum_rosbag.reader.statistics import BagStatistics, bag_statistics
@@ -23,7 +24,7 @@ app = typer.Typer(add_completion=False, rich_markup_mode=None)
 @app.command(epilog="Example: python -m pendulum_rosbag info runs/today/sim --json")
 def info(
     bag: Annotated[Path, typer.Argument(help="Folder of the bag, or one .mcap or .db3 file.")],
-    as_json: Annotated[bool, typer.Option("--json", help="Print everything as JSON.")] = False,
+    as_json: Json = False,
 ) -> int:
     """Print rates, gaps, jitter, latencies between topics, duplicates and clock jumps of a bag."""
     opened = read_bag(bag, verify=True)

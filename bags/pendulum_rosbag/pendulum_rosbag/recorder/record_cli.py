@@ -9,6 +9,7 @@ import typer
 
 from pendulum_msgs_py.errors import BagError
 from pendulum_msgs_py.programs.executables import cli_main
+from pendulum_msgs_py.programs.options import out_option
 from pendulum_rosbag.recorder.options import RecorderOptions, read_metadata
 
 __all__ = ["main"]
@@ -22,7 +23,7 @@ app = typer.Typer(add_completion=False, rich_markup_mode=None)
 )
 def record(
     context: typer.Context,
-    output: Annotated[Path, typer.Option("-o", "--output", help="Folder of the bag; it must not exist.")],
+    output: Annotated[Path, out_option("Folder of the bag; it must not exist.")],
     topics: Annotated[list[str] | None, typer.Argument(help="Topics by their full names; by default all.")] = None,
     regex: Annotated[str, typer.Option(help="Record topics that match this pattern, too.")] = "",
     exclude: Annotated[str, typer.Option(help="Leave out topics that match this pattern.")] = "",

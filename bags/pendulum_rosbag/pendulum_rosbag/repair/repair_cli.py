@@ -11,6 +11,7 @@ from typing import Annotated
 import typer
 
 from pendulum_msgs_py.programs.executables import cli_main
+from pendulum_msgs_py.programs.options import Json, out_option
 from pendulum_rosbag.repair.repair import repair_bag
 
 __all__ = ["main"]
@@ -23,10 +24,10 @@ def repair(
     bag: Annotated[Path, typer.Argument(help="Folder of the bag, or one .mcap or .db3 file.")],
     output: Annotated[
         Path | None,
-        typer.Option("-o", "--output", help="Folder for the sound bag; by default it takes the place of BAG."),
+        out_option("Folder for the sound bag; by default it takes the place of BAG."),
     ] = None,
     force: Annotated[bool, typer.Option("--force", help="Rewrite a sound bag, too.")] = False,
-    as_json: Annotated[bool, typer.Option("--json", help="Print the report as JSON.")] = False,
+    as_json: Json = False,
 ) -> int:
     """Save all whole messages of a broken bag to a sound one; the broken one is kept as BAG.broken."""
     report = repair_bag(bag, output, force=force)

@@ -127,7 +127,7 @@
     let started = null;
     seek.max = last;
     element("animation-text").textContent =
-      `Simulation (solid, round bob) and ${document.getElementById('animation').dataset.hardware} (dashed, square bob) about upright, deviations enlarged ${tracks.factor.toFixed(0)} times.`;
+      `Simulation (solid, round) and ${canvas.dataset.hardware} (dashed, square) about upright, deviations enlarged ${tracks.factor.toFixed(0)} times.`;
 
     const link = (angle, colour, dash, square) => {
       const x0 = canvas.width / 2;
@@ -148,7 +148,29 @@
       brush.fill();
     };
 
-    const draw = () => {
+    const chain = (points, colour, dash, square) => {
+      brush.strokeStyle = colour;
+      brush.fillStyle = colour;
+      brush.lineWidth = 4;
+      brush.setLineDash(dash);
+      brush.beginPath();
+      points.forEach(([x, y], index) => (index ? brush.lineTo(x, y) : brush.moveTo(x, y)));
+      brush.stroke();
+      for (const [x, y] of points) {
+        brush.beginPath();
+        if (square) brush.rect(x - 6, y - 6, 12, 12);
+        else brush.arc(x, y, 7, 0, 2 * Math.PI);
+        brush.fill();
+      }
+    };
+
+    const drawChains = () => {
+      brush.clearRect(0, 0, canvas.width, canvas.height);
+      chain(tracks.sim[frame], "#0072b2", [], false);
+      chain(tracks.hw[frame], "#d55e00", [10, 6], true);
+    };
+
+    const drawPendulums = () => {
       brush.clearRect(0, 0, canvas.width, canvas.height);
       brush.setLineDash([2, 4]);
       brush.strokeStyle = "#999";
@@ -162,6 +184,12 @@
       brush.setLineDash([]);
       brush.fillStyle = "#333";
       brush.fillRect(canvas.width / 2 - 22, canvas.height - 30, 44, 12);
+    };
+
+    const draw = () => {
+      // One angle, or the points of all links.
+      if (typeof tracks.sim[frame] === "number") drawPendulums();
+      else drawChains();
       element("clock").textContent = `${(frame * tracks.period).toFixed(2)} s`;
     };
 

@@ -19,12 +19,12 @@ from typing import Any
 
 from pendulum_msgs_py.dynamics import friction_magnitude
 from pendulum_msgs_py.dynamics.runge_kutta import along_functions
+from pendulum_msgs_py.dynamics.steps import actuator_torque, narrowed
 from pendulum_msgs_py.errors import ParameterError
-from pendulum_msgs_py.plants.mechanism_parameters import MechanismParameters
-from pendulum_sim.dry_friction import actuator_torque, narrowed
 
 __all__ = [
     "COULOMB",
+    "FAR",
     "JOINT_ROWS",
     "LAG",
     "LOWER",
@@ -34,7 +34,6 @@ __all__ = [
     "JointTable",
     "advance_joints",
     "joint_functions",
-    "pack_joints",
 ]
 
 JOINT_ROWS = ("coulomb_friction", "static_friction", "stribeck_velocity", "lower_stop", "upper_stop", "time_constant")
@@ -45,7 +44,8 @@ JointTable = tuple[tuple[float, ...], ...]
 
 _MAX_EVENTS = 12
 _MAX_ROOT_STEPS = 60
-_FAR = 1e300
+FAR = 1e300
+"""End stop that nothing reaches [rad or m]."""
 
 
 def put_1(_values: Any, _index: int, value: Any) -> Any:
@@ -84,19 +84,6 @@ def joint_functions(count: int) -> tuple[Callable[..., Any], ...]:
     if count not in _PUT:
         raise ParameterError(f"a mechanism of {count} joints is not stepped yet; expected 1 or 2")
     return along_functions(count), _PUT[count], _LAG_FUNCTIONS[count]
-
-
-def pack_joints(parameters: MechanismParameters) -> JointTable:
-    """Return what the joints of a plant have, in the order that the functions here take it."""
-    joints = parameters.joints
-    return (
-        tuple(joint.coulomb_friction for joint in joints),
-        tuple(joint.breakaway for joint in joints),
-        tuple(joint.stribeck_velocity for joint in joints),
-        tuple(-_FAR if joint.lower_stop is None else joint.lower_stop for joint in joints),
-        tuple(_FAR if joint.upper_stop is None else joint.upper_stop for joint in joints),
-        tuple(0.0 if joint.actuator is None else joint.actuator.time_constant for joint in joints),
-    )
 
 
 def _loaded(put: Any, v: Any, torque: Any, direction: Any, table: Any) -> Any:
@@ -223,7 +210,7 @@ def advance_joints(
         push: Efforts on the joints themselves.
         h: Step [s].
         p: The mechanism's parameters.
-        table: What the joints have, of :func:`pack_joints`.
+        table: What the joints have, of :func:`pendulum_msgs_py.plants.joint_table.pack_joints`.
     """
     left = h
     n = len(q)

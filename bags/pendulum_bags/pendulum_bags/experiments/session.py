@@ -1,0 +1,158 @@
+"""What every run over DDS has around its phases: its programs, who conducts them, its recorders, and a safe end."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from pendulum_bags.experiments.conductor_node import Conductor, PlantClient, RecorderClient
+from pendulum_bags.experiments.processes import Child, ProcessSet, ros_environment, start_recorder
+from pendulum_bags.runs.run_folder import write_json
+from pendulum_msgs_py.contract import names
+from pendulum_msgs_py.errors import BagError, FaultError
+
+__all__ = ["LOOP_NICENESS", "START_TIMEOUT", "Session", "conduct", "refuse_existing"]
+
+START_TIMEOUT = 60.0
+"""Longest time for all programs to be up; the first start on a cold machine compiles code [s]."""
+LOOP_NICENESS = -10
+"""Priority of those who keep deadlines over all else on the machine, where we may take it."""
+
+
+@dataclass
+class Session:
+    """The programs of one run and the node that conducts them; :func:`conduct` makes it.
+
+    Attributes:
+        processes: The programs.
+        conductor: Who conducts.
+        logs: Folder of their logs.
+    """
+
+    processes: ProcessSet
+    conductor: Conductor
+    logs: Path
+    _driven: list[PlantClient] = field(default_factory=list)
+
+    def record(
+        self, bag: Path, namespace: str, metadata: Mapping[str, Any], storage: str, *, simulated: bool = False
+    ) -> Child:
+        """Start the recorder of one plant.
+
+        Args:
+            bag: Folder of the bag.
+            namespace: Namespace of the plant.
+            metadata: What the bag says about its run.
+            storage: ``mcap`` or ``sqlite3``.
+            simulated: Whether time is that of the plant and not that of the wall.
+        """
+        told = self.logs / f"{bag.name}_metadata.json"
+        write_json(told, dict(metadata))
+        log_time = "header" if simulated else "receive"
+        return start_recorder(self.processes, bag, namespace, told, storage, log_time=log_time)
+
+    def close(self, recorder: Child) -> None:
+        """End a recorder now.
+
+        Raises:
+            FaultError: It could not close its bag.
+        """
+        if self.processes.finish(recorder) != 0:
+            raise FaultError(recorder.last_words(1))
+
+    def close_in_lockstep(self, recorder: Child, plant: PlantClient, states: int) -> None:
+        """Close the bag of a run in lockstep when it holds everything.
+
+        Simulated time stands still by then: what the nodes say on their way out is no part of the run.
+
+        Args:
+            recorder: The recorder.
+            plant: The plant.
+            states: How many states the plant has published.
+
+        Raises:
+            FaultError: Messages were lost.
+        """
+        # The clock ticks once for each state, and neither topic waits for the other.
+        for topic in (f"{plant.namespace}/{names.JOINT_STATES}", names.CLOCK):
+            RecorderClient(self.conductor, plant.namespace).wait_for_all(topic, states)
+        self.close(recorder)
+
+    def drives(self, *plants: PlantClient) -> None:
+        """Let whatever breaks the session off disarm these plants at once, before their programs are ended."""
+        self._driven += plants
+
+    def leaves(self, plant: PlantClient) -> None:
+        """Leave a plant as it is from now on, whatever breaks the session off."""
+        self._driven = [one for one in self._driven if one is not plant]
+
+    def let_go(self) -> None:
+        """Disarm what this session drives; a plant that no longer answers goes to rest by its own rules."""
+        for plant in self._driven:
+            plant.disarm_quietly()
+
+    def wait_until_all_hear_each_other(
+        self, namespace: str, listeners: Mapping[str, int], *, clock: bool = True
+    ) -> None:
+        """Wait until every subscription of a run is on the graph, and the recorder's are matched with a publisher.
+
+        Args:
+            namespace: Namespace of the plant.
+            listeners: How many subscriptions each topic of the plant must have, by relative name.
+            clock: Whether the plant keeps simulated time, which is recorded too.
+        """
+        conductor, node = self.conductor, self.conductor.node
+
+        def complete() -> bool:
+            return all(
+                node.count_subscribers(f"{namespace}/{topic}") >= count
+                and node.count_publishers(f"{namespace}/{topic}") >= (1 if count else 0)
+                for topic, count in listeners.items()
+            )
+
+        conductor.wait_for("all nodes to hear each other", complete, START_TIMEOUT)
+        recorder = RecorderClient(conductor, namespace)
+        recorded = {f"{namespace}/{topic}" for topic, count in listeners.items() if count}
+        recorded |= {names.CLOCK} if clock else set()
+        conductor.wait_for("the recorder to hear all topics", lambda: recorded <= recorder.heard(), START_TIMEOUT)
+        # What one side of a match knows, the other side knows a moment later.
+        conductor.spin(0.5)
+
+
+@contextmanager
+def conduct(logs: Path, domain: int, on_wait: Callable[[], None] = lambda: None) -> Iterator[Session]:
+    """Join the graph to carry out one run; leaving it ends all its programs, recorders last.
+
+    The phases of the run are its caller's. Whatever breaks them off disarms what the session drives, at once.
+
+    Args:
+        logs: Folder of the programs' logs.
+        domain: ROS domain.
+        on_wait: Called while waiting, to show progress.
+
+    Raises:
+        FaultError: The folder cannot be made; or, out of any wait, a program ended by itself.
+    """
+    with (
+        ProcessSet(logs, ros_environment(domain, logs)) as processes,
+        Conductor(domain, watch=processes.check, on_wait=on_wait) as conductor,
+    ):
+        session = Session(processes, conductor, logs)
+        try:
+            yield session
+        except BaseException:
+            session.let_go()
+            raise
+
+
+def refuse_existing(bag: Path) -> None:
+    """Refuse to record where a bag is already.
+
+    Raises:
+        BagError: It exists.
+    """
+    if bag.exists():
+        raise BagError(f"bag {bag} exists; expected a new folder")

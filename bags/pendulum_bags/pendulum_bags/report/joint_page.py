@@ -1,0 +1,115 @@
+"""The report of plants of several joints: one answer, and the figures and tests of each joint in its own unit."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import replace
+
+import numpy as np
+
+from pendulum_bags.comparison import Comparison
+from pendulum_bags.figures.figure import Figure
+from pendulum_bags.figures.numbers import quantity
+from pendulum_bags.figures.table import Table
+from pendulum_bags.report.analysis_figures import equivalence_of, timing
+from pendulum_bags.report.animation import joint_animation
+from pendulum_bags.report.data import ReportData
+from pendulum_bags.report.joint_figures import joint_differences, joint_spectra, joints_together
+from pendulum_bags.report.page import Page
+from pendulum_bags.report.provenance import provenance_table, settings_table
+from pendulum_bags.report.tables import tests_table
+from pendulum_bags.runs.run_data import stand_in_of, timing_warning
+from pendulum_bags.runs.run_record import run_record
+from pendulum_bags.verdict import Answer
+
+__all__ = ["joint_page"]
+
+
+def joint_page(comparisons: Mapping[str, Comparison], answer: Answer, *, title: str, made_at: str) -> Page:
+    """Return the page.
+
+    Args:
+        comparisons: The comparison of each joint, by its name, at least one.
+        answer: The answer for all joints.
+        title: What the page is about.
+        made_at: When it was made.
+    """
+    first = next(iter(comparisons.values()))
+    # What a bag says of its run it says of all joints.
+    data = ReportData(first, {"seed": _seed(first)}, answer=answer)
+    differences = joint_differences(comparisons)
+    figures = [
+        *(_of_joint(joint, equivalence_of(comparison.verdict)) for joint, comparison in comparisons.items()),
+        joints_together(comparisons),
+        *([] if isinstance(differences, str) else [differences]),
+        joint_spectra(comparisons),
+        timing(data),
+    ]
+    tests = [tests_table(comparison) for comparison in comparisons.values()]
+    warning = timing_warning(first.plants)
+    return Page(
+        title=title,
+        made_at=made_at,
+        answer=answer,
+        hardware=first.hardware_name,
+        emulated=first.is_emulated,
+        is_paired=all(comparison.is_paired for comparison in comparisons.values()),
+        facts=_facts(comparisons),
+        figures=figures,
+        tables=[
+            _motions(comparisons),
+            *(replace(one, title=f"{one.title}: {joint}") for joint, one in zip(comparisons, tests, strict=True)),
+        ],
+        provenance=[table for table in (provenance_table(data), settings_table(data)) if table is not None],
+        animation=joint_animation(comparisons, str(data.run.get("design_plant", ""))),
+        notes=[*([warning] if warning else []), *dict.fromkeys(n for c in comparisons.values() for n in c.left_out)],
+        stand_in=stand_in_of(first.pairs[0].hardware),
+        missing=[("Difference under the same noise", differences)] if isinstance(differences, str) else [],
+    )
+
+
+def _of_joint(joint: str, figure: Figure) -> Figure:
+    return replace(figure, name=f"{figure.name}_{joint}", title=f"{figure.title}: {joint}")
+
+
+def _seed(comparison: Comparison) -> str:
+    return str(run_record(comparison.pairs[0].simulation.metadata).get("seed", "unknown"))
+
+
+def _facts(comparisons: Mapping[str, Comparison]) -> list[tuple[str, str]]:
+    first = next(iter(comparisons.values()))
+    facts = [("runs", str(len(first.pairs))), ("seed", _seed(first))]
+    for joint, comparison in comparisons.items():
+        pair = comparison.pairs[0]
+        sim, hw = pair.simulation.window, pair.hardware.window
+        spreads = " and ".join(f"{float(one.position.std(ddof=1)):.3g}" for one in (sim, hw))
+        facts.append((f"std of {joint}, simulation and hardware", f"{spreads} {sim.unit}"))
+        delay = 1e3 * comparison.delay
+        when = f"{abs(delay):.1f} ms {'later' if delay >= 0.0 else 'earlier'}"
+        facts.append(
+            (f"hardware's {joint} answers", when if math.isfinite(delay) else "with no delay that can be told")
+        )
+    return facts
+
+
+def _motions(comparisons: Mapping[str, Comparison]) -> Table:
+    """Return spread and largest effort of each joint on both sides."""
+    rows: list[tuple[str, ...]] = []
+    for joint, comparison in comparisons.items():
+        pair = comparison.pairs[0]
+        both = (pair.simulation.window, pair.hardware.window)
+        unit = both[0].unit
+        rows.append((f"std of {joint} [{unit}]", *(quantity(float(one.position.std(ddof=1))) for one in both)))
+        rows.append((f"std of its velocity [{unit}/s]", *(quantity(float(one.velocity.std(ddof=1))) for one in both)))
+        if any(np.ptp(one.effort) > 0.0 for one in both):
+            largest = (quantity(float(np.abs(one.effort).max())) for one in both)
+            rows.append((f"largest |u| at {joint} [{both[0].effort_unit}]", *largest))
+    first = next(iter(comparisons.values())).plants
+    for label, key, digits in (("sampling rate [Hz]", "rate_hz", 4), ("missed deadlines", "missed_deadlines", 6)):
+        rows.append((label, *(quantity(float(first[side][key]), "", digits) for side in ("sim", "hw"))))
+    sentence = (
+        "These are all samples; the tests take both motions at one phase of the noise and in one band, so their ratios "
+        "may differ."
+    )
+    return Table("Joints under noise", sentence, ("", "simulation", "hardware"), rows, "Verdict")

@@ -1,0 +1,224 @@
+"""Ports of an emulated machine of several joints in this process: a drive, or an encoder alone, for each joint."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import asdict
+
+from pendulum_hw_bridge.actuator import (
+    ActuatorError,
+    ActuatorInfo,
+    Applied,
+    Command,
+    Feedback,
+    HardwareLimits,
+    Strategy,
+)
+from pendulum_hw_bridge.clocks import Clock
+from pendulum_hw_bridge.command_check import check_command
+from pendulum_hw_bridge.emulation.faults import ActuatorFault
+from pendulum_hw_bridge.emulation.machine import EmulatedMachine
+from pendulum_hw_bridge.gains import DEFAULT_GAINS, GainSet
+from pendulum_msgs_py.contract.values import NANOSECONDS
+
+__all__ = ["DrivePort", "JointPort", "machine_ports"]
+
+TORQUE_LOOP = Strategy.PARALLEL_PWM
+"""The one strategy of these drives beside off: a setpoint of effort, which a loop of current makes."""
+
+
+class JointPort:
+    """The encoder of one joint: it is read, and has no way to give torque.
+
+    Args:
+        machine: The emulated machine; its clock must start at the present of ``clock``.
+        index: Which of its joints.
+        clock: Host clock.
+    """
+
+    def __init__(self, machine: EmulatedMachine, index: int, clock: Clock) -> None:
+        self.machine = machine
+        self.clock = clock
+        self._index = index
+        self._connected = False
+
+    def connect(self) -> ActuatorInfo:
+        """Return what the emulated module says of itself."""
+        self._connected = True
+        return ActuatorInfo(
+            backend="emulator",
+            family="emulated",
+            name=self.machine.coordinates.joints[self._index].name,
+            serial=f"QDD-E{self._index:04d}",
+            firmware="emulated machine",
+            strategy=Strategy.OFF,
+            feedback_rate=self.machine.rate,
+            command_lifetime=0.0,
+            limits=HardwareLimits(),
+        )
+
+    def now_ns(self) -> int:
+        """Return the host clock [ns]."""
+        return self.clock.now_ns()
+
+    def read(self, timeout: float) -> Feedback | None:
+        """Return the newest feedback, waiting for one at most ``timeout`` [s]."""
+        self._require_connection()
+        deadline = self.now_ns() + round(timeout * NANOSECONDS)
+        while True:
+            now = self.now_ns()
+            self.machine.advance_to(now)
+            feedback = self.machine.feedback(self._index, now)
+            if feedback is not None or now >= deadline:
+                return feedback
+            target = min(deadline, max(now + 1, self.machine.next_arrival_ns(self._index)))
+            self.clock.wait_until(target)
+            if self.now_ns() < target:
+                return None  # woken up early: the program ends
+
+    def set_feedback_rate(self, rate: float) -> float:
+        """Set the feedback rate of the whole machine [Hz]."""
+        self._require_connection()
+        self.machine.advance_to(self.now_ns())
+        self.machine.set_rate(rate)
+        return self.machine.rate
+
+    def push(self, effort: float) -> None:
+        """Hold an effort on the joint itself, as a hand would [N m or N]."""
+        self.machine.hold_push(self._index, effort, self.now_ns())
+
+    def close(self) -> None:
+        """Let go."""
+        self._connected = False
+
+    def _require_connection(self) -> None:
+        if not self._connected:
+            raise ActuatorError("not_connected", "emulated module is not connected; call connect() first")
+
+
+class DrivePort(JointPort):
+    """The drive of one joint.
+
+    Args:
+        machine: The emulated machine.
+        index: Which of its joints; it has a motor.
+        clock: Host clock.
+    """
+
+    def __init__(self, machine: EmulatedMachine, index: int, clock: Clock) -> None:
+        super().__init__(machine, index, clock)
+        self._motor = machine.coordinates.driven.index(index)
+        self._limits = HardwareLimits(effort=machine.plant.effort_limits[self._motor])
+        self._gains = DEFAULT_GAINS[TORQUE_LOOP]
+        self._strategy = Strategy.OFF
+
+    @property
+    def strategy(self) -> Strategy:
+        """Strategy in force."""
+        return self._strategy
+
+    def connect(self) -> ActuatorInfo:
+        """Return what the emulated drive says of itself."""
+        info = super().connect()
+        drive = self.machine.drives[self._motor]
+        return ActuatorInfo(
+            info.backend,
+            info.family,
+            info.name,
+            info.serial,
+            info.firmware,
+            self._strategy,
+            info.feedback_rate,
+            drive.lifetime,
+            self._limits,
+            self._gains,
+            asdict(self.machine.hardware),
+        )
+
+    def write(self, command: Command) -> Applied:
+        """Send a torque; it arrives after the way there."""
+        self._require_connection()
+        if ActuatorFault.SEND_FAILED in self._faults:
+            raise ActuatorError("send_failed", "command could not be sent: the network refuses it")
+        limited, changed = self._checked(command, self._strategy)
+        now = self.now_ns()
+        self.machine.deliver(self._motor, limited.effort, now)
+        return Applied(limited, self._strategy, changed, now)
+
+    def set_strategy(self, strategy: Strategy, command: Command | None = None) -> Strategy:
+        """Switch on with a first torque, or off."""
+        self._require_reach("strategy")
+        if strategy not in {Strategy.OFF, TORQUE_LOOP}:
+            raise ActuatorError(
+                "strategy", f"strategy is {strategy.name}; expected OFF or {TORQUE_LOOP.name}, the loop of torque"
+            )
+        limited = None if command is None else self._checked(command, strategy)[0]
+        now = self.now_ns()
+        self.machine.switch(self._motor, now, on=strategy is not Strategy.OFF)
+        self._strategy = strategy
+        if limited is not None and strategy is not Strategy.OFF:
+            self.machine.deliver(self._motor, limited.effort, now)
+        return self._strategy
+
+    def set_gains(self, gains: GainSet) -> GainSet:
+        """Keep gains, of which the loop of current uses none."""
+        self._require_reach("gains")
+        self._gains = gains
+        return self._gains
+
+    def set_limits(self, limits: HardwareLimits) -> HardwareLimits:
+        """Set the limits: that of the effort can only be lower than the drive's own."""
+        self._require_reach("limits")
+        self._limits = limits
+        self.machine.drives[self._motor].effort_limit = min(
+            limits.effort, self.machine.plant.effort_limits[self._motor]
+        )
+        return self._limits
+
+    def set_command_lifetime(self, lifetime: float) -> float:
+        """Set the command lifetime [s]."""
+        self._require_reach("command_lifetime")
+        self.machine.set_lifetime(self._motor, lifetime)
+        return self.machine.drives[self._motor].lifetime
+
+    def stop(self) -> None:
+        """Effort zero, then off; both are lost where the way there is cut, and the command lifetime ends the torque."""
+        if not self._connected:
+            return
+        self._strategy = Strategy.OFF
+        if self._faults & {ActuatorFault.COMMANDS_LOST, ActuatorFault.SEND_FAILED}:
+            raise ActuatorError(
+                "stop_unacknowledged", "drive did not confirm that it is off; the command lifetime ends its torque"
+            )
+        self.machine.switch(self._motor, self.now_ns(), on=False)
+
+    def close(self) -> None:
+        """Stop and let go."""
+        try:
+            self.stop()
+        finally:
+            super().close()
+
+    @property
+    def _faults(self) -> set[ActuatorFault]:
+        return self.machine.faults[self._index]
+
+    def _checked(self, command: Command, strategy: Strategy) -> tuple[Command, bool]:
+        limited, changed = check_command(command, strategy, self._limits)
+        if not (math.isnan(limited.position) and math.isnan(limited.velocity)):
+            raise ActuatorError("strategy", "drive got a position or a velocity; expected effort alone")
+        return limited, changed
+
+    def _require_reach(self, what: str) -> None:
+        self._require_connection()
+        if self._faults & {ActuatorFault.COMMANDS_LOST, ActuatorFault.SEND_FAILED}:
+            raise ActuatorError("no_acknowledgement", f"drive did not acknowledge {what}")
+
+
+def machine_ports(machine: EmulatedMachine, clock: Clock) -> tuple[JointPort, ...]:
+    """Return one port for each joint, in the order of the model: a drive where there is a motor."""
+    driven = machine.coordinates.driven
+    return tuple(
+        (DrivePort if index in driven else JointPort)(machine, index, clock)
+        for index in range(len(machine.coordinates.joints))
+    )

@@ -1,0 +1,350 @@
+"""An emulated machine of several joints on its own clock: a mechanism, drives at some joints, encoders at all.
+
+The equations are those of the simulator, called here; the drives are its own. ``advance_to`` is the only way in which
+time passes, and two machines with one seed and one sequence of calls give the same feedback.
+"""
+
+from __future__ import annotations
+
+import heapq
+import math
+from collections import deque
+
+import numpy as np
+
+from pendulum_hw_bridge.actuator import CommandLock, Feedback
+from pendulum_hw_bridge.command_check import check_lifetime
+from pendulum_hw_bridge.emulation.faults import ActuatorFault, distort
+from pendulum_hw_bridge.emulation.quasi_direct_drive import QuasiDirectDrive
+from pendulum_msgs_py.contract.values import NANOSECONDS
+from pendulum_msgs_py.dynamics.joint_steps import LAG, advance_joints, joint_functions
+from pendulum_msgs_py.dynamics.series_elastic import winding_resistance_at
+from pendulum_msgs_py.errors import ParameterError
+from pendulum_msgs_py.joints import Vector
+from pendulum_msgs_py.plants.joint_table import pack_joints
+from pendulum_msgs_py.plants.mechanism_parameters import MechanismParameters, common_delay
+
+__all__ = ["EmulatedMachine"]
+
+_STEP_NS = 1_000_000
+"""Longest step of the integration [ns]."""
+_KEPT = 1000
+"""Records of a joint that wait to be fetched; older ones are lost, as on a network."""
+
+
+class _Drive:
+    """What one drive does: off, or with a torque in force until its lifetime ends."""
+
+    def __init__(self, effort_limit: float) -> None:
+        self.effort_limit = effort_limit
+        self.on = False
+        self.accepted = math.nan
+        self.effort = math.nan
+        self.lifetime = 0.1
+        self.expires_ns: int | None = None
+        self.expiries = 0
+        self.temperature = 0.0
+
+    def end(self) -> None:
+        self.accepted = self.effort = math.nan
+        self.expires_ns = None
+
+    @property
+    def commanded(self) -> float:
+        return self.effort if self.on and math.isfinite(self.effort) else 0.0
+
+
+class EmulatedMachine:
+    """A mechanism with drives and encoders.
+
+    Args:
+        plant: The mechanism; joints with an actuator have a drive.
+        hardware: Constants of drives and encoders.
+        seed: Seed of sensor noise.
+        position: n positions at the start, at rest; None for 0 [rad or m].
+        start_ns: Time at the start [ns].
+        rate: Feedback records per second [Hz].
+
+    Raises:
+        ParameterError: The start has another number of joints, is not finite or beyond an end stop, or the drives have
+            different delays.
+    """
+
+    def __init__(
+        self,
+        plant: MechanismParameters,
+        hardware: QuasiDirectDrive | None = None,
+        *,
+        seed: int = 0,
+        position: Vector | None = None,
+        start_ns: int = 0,
+        rate: float = 500.0,
+    ) -> None:
+        self.plant = plant
+        self.hardware = own = hardware or QuasiDirectDrive()
+        self.coordinates = plant.coordinates
+        joints = self.coordinates.joints
+        still = (0.0,) * len(joints)
+        self.push = still
+        self.faults: list[set[ActuatorFault]] = [set() for _ in joints]
+        self.drives = tuple(_Drive(limit) for limit in plant.effort_limits)
+        for drive in self.drives:
+            drive.temperature = own.ambient
+        # The same for all drives: what acts, acts in the order in which it arrived.
+        self._delay = common_delay(plant)
+        self.constants = tuple(
+            own.constants(joints[index], limit)
+            for index, limit in zip(self.coordinates.driven, plant.effort_limits, strict=True)
+        )
+        self._position = self._checked(still if position is None else position)
+        self._velocity = self._effort = still
+        table = pack_joints(plant)
+        lags = (
+            max(lag, own.current_loop if index in self.coordinates.driven else 0.0)
+            for index, lag in enumerate(table[LAG])
+        )
+        self._table = (*table[:LAG], tuple(lags))
+        self._along, self._put, self._lag = joint_functions(len(joints))
+        self._steps = [own.step(joint, driven=index in self.coordinates.driven) for index, joint in enumerate(joints)]
+        self._noise = [own.velocity_noise * own.scale(joint) for joint in joints]
+        self._random = np.random.Generator(np.random.Philox(key=seed))
+        self._now_ns = self._next_sample_ns = start_ns
+        self._period_ns = round(NANOSECONDS / rate)
+        self._inbox: list[tuple[int, int, int, float]] = []
+        self._acts: deque[tuple[int, int, float]] = deque()
+        self._deliveries = 0
+        self._sequence = 0
+        self._outboxes: tuple[deque[Feedback], ...] = tuple(deque(maxlen=_KEPT) for _ in joints)
+
+    # --- what is outside ------------------------------------------------------------------------------------
+
+    @property
+    def state(self) -> tuple[Vector, Vector, Vector]:
+        """The truth at the last event: positions, velocities and the efforts of the drives, 0 at passive joints."""
+        return self._position, self._velocity, self._effort
+
+    @property
+    def rate(self) -> float:
+        """Feedback records per second [Hz]."""
+        return NANOSECONDS / self._period_ns
+
+    def set_rate(self, rate: float) -> None:
+        """Send another number of records per second, from now on [Hz]."""
+        if not (math.isfinite(rate) and 0.0 < rate <= 1000.0):
+            raise ParameterError(f"feedback_rate is {rate} Hz; expected > 0 and <= 1000 Hz")
+        period_ns = round(NANOSECONDS / rate)
+        if period_ns != self._period_ns:
+            self._period_ns = period_ns
+            self._next_sample_ns = self._now_ns
+
+    def switch(self, index: int, now_ns: int, *, on: bool) -> None:
+        """Switch a drive on, without torque, or off; what was on its way to it is lost.
+
+        Args:
+            index: Which of the driven joints.
+            now_ns: When [ns].
+            on: Whether on.
+        """
+        self.advance_to(now_ns, wholly=True)
+        self._inbox = [item for item in self._inbox if item[2] != index]
+        heapq.heapify(self._inbox)
+        self.drives[index].on = on
+        self._end(index)
+
+    def set_lifetime(self, index: int, lifetime: float) -> None:
+        """Let a drive act on a command for so long after its arrival [s]."""
+        self.drives[index].lifetime = check_lifetime(lifetime)
+
+    def deliver(self, index: int, effort: float, sent_ns: int) -> None:
+        """Send a torque to a drive; it arrives after the way there, and acts after the drive's transport delay.
+
+        Args:
+            index: Which of the driven joints.
+            effort: [N m or N]; NaN for none.
+            sent_ns: When it is sent [ns].
+        """
+        self._deliveries += 1
+        arrival_ns = sent_ns + round(self.hardware.command_delay * NANOSECONDS)
+        heapq.heappush(self._inbox, (arrival_ns, self._deliveries, index, effort))
+
+    def hold_push(self, index: int, effort: float, now_ns: int) -> None:
+        """Hold an effort on a joint itself, as a hand would; one that is no number counts for none [N m or N]."""
+        effort = effort if math.isfinite(effort) else 0.0
+        if effort != self.push[index]:
+            self.advance_to(now_ns, wholly=True)
+            self.push = (*self.push[:index], effort, *self.push[index + 1 :])
+
+    def feedback(self, index: int, until_ns: int) -> Feedback | None:
+        """Return the newest record of a joint that has reached the host by a time, and drop older ones."""
+        newest = None
+        outbox = self._outboxes[index]
+        while outbox and outbox[0].stamp_ns <= until_ns:
+            newest = outbox.popleft()
+        return newest
+
+    def next_arrival_ns(self, index: int) -> int:
+        """Return when the next record of a joint will reach the host, as far as anybody can tell [ns]."""
+        outbox = self._outboxes[index]
+        if outbox:
+            return outbox[0].stamp_ns
+        return self._next_sample_ns + round(self.hardware.feedback_delay * NANOSECONDS)
+
+    def advance_to(self, time_ns: int, *, wholly: bool = False) -> None:
+        """Let everything happen that is due by a time.
+
+        Args:
+            time_ns: The time [ns].
+            wholly: Move the mechanism on to that very time, not only to the last event before it.
+        """
+        while True:
+            due = self._next_sample_ns
+            if self._inbox:
+                due = min(due, self._inbox[0][0])
+            if self._acts:
+                due = min(due, self._acts[0][0])
+            for drive in self.drives:
+                if drive.expires_ns is not None:
+                    due = min(due, drive.expires_ns)
+            if due > time_ns:
+                break
+            self._flow(due)
+            self._happen(due)
+        if wholly:
+            self._flow(time_ns)
+
+    # --- inside ---------------------------------------------------------------------------------------------
+
+    def _checked(self, position: Vector) -> Vector:
+        joints = self.coordinates.joints
+        if len(position) != len(joints) or not all(map(math.isfinite, position)):
+            raise ParameterError(
+                f"initial position is {list(position)}; expected {len(joints)} finite numbers, for "
+                f"{', '.join(f'{joint.name} [{joint.unit}]' for joint in joints)}"
+            )
+        for joint, (low, high), value in zip(joints, self.plant.stops, position, strict=True):
+            if not low <= value <= high:
+                raise ParameterError(
+                    f"initial {joint.name} is {value} {joint.unit}; expected {low} to {high}, between its stops"
+                )
+        return tuple(float(value) for value in position)
+
+    def _flow(self, time_ns: int) -> None:
+        """Integrate up to a time, between events."""
+        plant = self.plant
+        forward, p = plant.mechanism.forward, plant.packed
+        command = self.coordinates.spread(tuple(drive.commanded for drive in self.drives))
+        while self._now_ns < time_ns:
+            step_ns = min(_STEP_NS, time_ns - self._now_ns)
+            h = step_ns / NANOSECONDS
+            self._position, self._velocity = advance_joints(
+                forward, self._along, self._put, self._lag, self._position, self._velocity, self._effort, command,
+                self.push, h, p, self._table,
+            )  # fmt: skip
+            self._effort = self._lag(self._effort, command, h, self._table[LAG])
+            self._warm(h)
+            self._now_ns += step_ns
+
+    def _warm(self, h: float) -> None:
+        own = self.hardware
+        for index, drive in enumerate(self.drives):
+            current, resistance = self._electric(index)
+            settled = own.ambient + own.thermal_resistance * resistance * current * current
+            drive.temperature += (settled - drive.temperature) * h / own.thermal_time
+
+    def _electric(self, index: int) -> tuple[float, float]:
+        """Return current [A] and resistance [ohm] of a winding."""
+        constants = self.constants[index]
+        current = self._effort[self.coordinates.driven[index]] / (constants.gear_ratio * constants.torque_constant)
+        return current, winding_resistance_at(
+            self.drives[index].temperature, constants.winding_resistance, constants.resistance_temperature_coefficient
+        )
+
+    def _end(self, index: int) -> None:
+        """End a drive's torque, that which is still to act as well."""
+        self.drives[index].end()
+        self._acts = deque(item for item in self._acts if item[1] != index)
+
+    def _happen(self, time_ns: int) -> None:
+        # A torque that ends in the instant in which the next arrives has ended.
+        for index, drive in enumerate(self.drives):
+            if drive.expires_ns is not None and drive.expires_ns <= time_ns:
+                drive.expiries += 1
+                self._end(index)
+        while self._inbox and self._inbox[0][0] <= time_ns:
+            self._accept(*heapq.heappop(self._inbox))
+        while self._acts and self._acts[0][0] <= time_ns:
+            _, index, effort = self._acts.popleft()
+            self.drives[index].effort = effort
+        if self._next_sample_ns <= time_ns:
+            self._sample()
+            self._next_sample_ns += self._period_ns
+
+    def _accept(self, arrival_ns: int, _: int, index: int, effort: float) -> None:
+        drive, joint = self.drives[index], self.coordinates.driven[index]
+        if not drive.on or ActuatorFault.COMMANDS_LOST in self.faults[joint]:
+            return
+        limit = drive.effort_limit
+        # What is no number is no torque: clamping would make the full one of it.
+        drive.accepted = min(limit, max(-limit, effort)) if math.isfinite(effort) else math.nan
+        drive.expires_ns = arrival_ns + round(drive.lifetime * NANOSECONDS)
+        delay_ns = round(self._delay * NANOSECONDS)
+        self._acts.append((arrival_ns + delay_ns, index, drive.accepted))
+
+    def _sample(self) -> None:
+        self._sequence += 1
+        for index, faults in enumerate(self.faults):
+            # Drawn before anything may be lost: a fault of one joint changes the noise of no other.
+            noise = self._random.standard_normal(2)
+            if ActuatorFault.FEEDBACK_LOST not in faults:
+                record = self._measure(index, float(noise[0]), float(noise[1]))
+                self._outboxes[index].append(distort(record, faults, None))
+
+    def _measure(self, index: int, of_velocity: float, of_effort: float) -> Feedback:
+        own, joint = self.hardware, self.coordinates.joints[index]
+        step = self._steps[index]
+        position = step * round(self._position[index] / step)
+        velocity = self._velocity[index] + self._noise[index] * of_velocity
+        record = Feedback(
+            stamp_ns=self._now_ns + round(own.feedback_delay * NANOSECONDS),
+            hardware_ns=self._now_ns,
+            sequence=self._sequence,
+            position=position,
+            velocity=velocity,
+            effort=0.0,
+            position_command=math.nan,
+            velocity_command=math.nan,
+            effort_command=math.nan,
+            pwm_command=math.nan,
+            motor_current=0.0,
+            winding_current=0.0,
+            motor_position=position,
+            motor_velocity=velocity,
+            deflection=0.0,
+            deflection_velocity=0.0,
+            voltage=own.supply_voltage,
+            winding_temperature=own.ambient,
+            housing_temperature=own.ambient,
+            motor_sensor_temperature=own.ambient,
+            board_temperature=own.ambient,
+            processor_temperature=own.ambient,
+            m_stop=ActuatorFault.M_STOP in self.faults[index],
+        )
+        if index not in self.coordinates.driven:
+            return record
+        motor = self.coordinates.driven.index(index)
+        drive, constants = self.drives[motor], self.constants[motor]
+        current, resistance = self._electric(motor)
+        back_emf = constants.back_emf_constant * constants.gear_ratio * velocity
+        # Off, the bridge of the motor is open: there is no duty, and no current whatever the speed.
+        duty = (resistance * current + back_emf) / own.supply_voltage if drive.on else math.nan
+        return record._replace(
+            effort=self._effort[index] + own.effort_noise * drive.effort_limit * of_effort,
+            effort_command=drive.accepted,
+            pwm_command=duty,
+            motor_current=duty * current if drive.on else 0.0,
+            winding_current=current,
+            motor_position=position * own.gear_ratio / own.scale(joint),
+            motor_velocity=velocity * own.gear_ratio / own.scale(joint),
+            winding_temperature=drive.temperature,
+            lock=CommandLock.UNLOCKED if drive.expires_ns is None else CommandLock.LOCKED_BY_SENDER,
+        )
