@@ -7,6 +7,7 @@ with its own rules: an e-stop latches, and arming is refused where a plant refus
 from __future__ import annotations
 
 import importlib
+import queue
 import secrets
 import threading
 import time
@@ -81,6 +82,7 @@ class LiveNode(PollingNode):
         self._sent = self._lost = 0
         self._unknown: set[str] = set()
         self._plants: set[str] = set()
+        self._told: queue.SimpleQueue[str] = queue.SimpleQueue()
         self._began = time.monotonic()
         self._no_plant_told = False
         self._reader = ParameterReader(self, self._on_values)
@@ -94,7 +96,7 @@ class LiveNode(PollingNode):
                 options.port,
                 (server_host, self._server.port),
                 lambda request: refusal(request, options.token, options.origins),
-                lambda line: print(line, flush=True),
+                self._told.put,
             )
         except PendulumError:
             self._server.stop()
@@ -111,11 +113,18 @@ class LiveNode(PollingNode):
         self._topics.clear()
         self._server.stop()
         self._gate.close()
+        self._print_told()
         print(f"handed on {self._sent} messages; {self._lost} were lost on the way from their publishers", flush=True)
+
+    def _print_told(self) -> None:
+        """Print what the gate told: its threads would write into the middle of each other's lines and of ours."""
+        while not self._told.empty():
+            print(self._told.get(), flush=True)
 
     # -- topics ------------------------------------------------------------------------------------------------
 
     def _take(self) -> None:
+        self._print_told()
         for topic in self._topics.values():
             topic.take()
 
