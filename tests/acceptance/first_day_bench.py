@@ -33,6 +33,7 @@ TRIES = 8
 _BUSY = re.compile(
     r"host_stalled|command_not_in_force|output_disagreement|tracking|feedback_late|feedback_lost|feedback_frozen"
     r"|too busy|is silent for|not answer|\bms old"
+    r"|NO │ (this computer keeps time|feedback |no feedback gets lost|acknowledgements )"
 )
 EXIT_BUSY = 3
 

@@ -49,6 +49,10 @@ COVERED_BY_NOTICES = """() => {
             && box.top < other.bottom && other.top < box.bottom)).map(([it]) => it.outerHTML);
 }"""
 """Controls under a notice, as the page shows both."""
+PLACE_AMONG_PLANTS = """(button) => {
+    const [own, all] = [button, document.querySelector(".plants")].map((it) => it.getBoundingClientRect());
+    return [own.left - all.left, own.top - all.top];
+}"""
 
 
 @pytest.mark.parametrize(
@@ -232,8 +236,10 @@ def test_axe_finds_nothing_that_keeps_anybody_out(browser: Any, address: str, tm
 
 @pytest.mark.usefixtures("simulator")
 def test_joints_and_controllers_are_chosen_for_each_plant(browser: Any, address: str, processes: ProcessGroup) -> None:
-    processes.start("pendulum_sim", "simulator", "--ros-args", "-r", "__ns:=/robot", "-p", "plant:=acrobot")
     page = _open(browser, address)
+    of_sim = page.get_by_role("button", name="Start controller /sim")
+    place = of_sim.evaluate(PLACE_AMONG_PLANTS)
+    other = processes.start("pendulum_sim", "simulator", "--ros-args", "-r", "__ns:=/robot", "-p", "plant:=acrobot")
     joints = page.get_by_label("Lines of /robot: joint")
     joints.wait_for(timeout=60_000)
     assert joints.locator("option").all_inner_texts() == ["shoulder", "elbow"]
@@ -242,13 +248,17 @@ def test_joints_and_controllers_are_chosen_for_each_plant(browser: Any, address:
     joints.select_option("elbow")
     wait_for(lambda: page.evaluate(shown) == [0.0, math.pi], 60, "the elbow's values")
 
+    # A plant that comes moves no button: it would be pressed in the place of another.
+    robot = page.locator("[data-card='/robot']")
+    robot.wait_for(timeout=60_000)
+    assert of_sim.evaluate(PLACE_AMONG_PLANTS) == place
+
     # What runs already is not doubled.
-    page.get_by_role("button", name="Start controller /sim").click()
+    of_sim.click()
     already = re.compile(r"/sim/controller \(.+\) is there already")
     page.locator(".notices .bad", has_text=already).wait_for(timeout=60_000)
 
     # A plant of several joints is offered what can hold it; what is started waits until it is activated.
-    robot = page.locator("[data-card='/robot']")
     robot.get_by_role("combobox").click()
     wait_for(lambda: page.locator(".q-menu [role=option]").all_inner_texts() == ["lqr", "tvlqr"], 60, "the controllers")
     page.locator(".q-menu [role=option]").first.click()
@@ -263,6 +273,16 @@ def test_joints_and_controllers_are_chosen_for_each_plant(browser: Any, address:
     page.get_by_role("button", name="End controller /robot", exact=True).click()
     robot.get_by_text("no controller").wait_for(timeout=60_000)
     weights.wait_for(state="detached", timeout=60_000)
+
+    # One that has gone keeps its place, and can be stopped should it come back.
+    other.interrupt()
+    assert other.wait(20) == 0
+    page.get_by_role("button", name="Arm /robot", exact=True).wait_for(state="hidden", timeout=60_000)
+    assert page.get_by_role("button", name="Stop /robot", exact=True).is_visible()
+    assert robot.get_by_role("heading").is_visible()
+    assert of_sim.evaluate(PLACE_AMONG_PLANTS) == place
+    processes.start("pendulum_sim", "simulator", "--ros-args", "-r", "__ns:=/robot", "-p", "plant:=acrobot")
+    page.get_by_role("button", name="Arm /robot", exact=True).wait_for(timeout=60_000)
 
 
 def test_the_page_doubts_a_silent_server_and_gives_its_orders_to_the_next() -> None:

@@ -16,7 +16,7 @@ import psutil
 import pytest
 
 from pendulum_bags.experiments import lockstep
-from pendulum_bags.experiments.conductor_node import Conductor
+from pendulum_bags.experiments.conductor_node import Conductor, PlantClient
 from pendulum_bags.experiments.in_process import simulate
 from pendulum_bags.experiments.run_spec import RunSpec
 from pendulum_bags.experiments.settings import NoiseSettings, RegulationSettings
@@ -149,10 +149,29 @@ def test_a_policy_that_cannot_play_is_refused_before_anything_starts(tmp_path: P
 
 
 def test_a_lockstep_run_of_the_simulator_gives_the_numbers_of_one_process_to_the_last_bit(
-    domain_id: int, tmp_path: Path
+    domain_id: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    run_experiment("lockstep", "--bag", tmp_path / "bag", "--seed", 7, "--duration", "1")
+    log = tmp_path / "logs" / "bag" / "sim_simulator.log"
+    frozen: list[psutil.Process] = []
+    resume = PlantClient.resume
+
+    def freeze_the_controller(plant: PlantClient, timeout: float) -> None:
+        """Let it answer late, so that the plant publishes a state again."""
+        children = psutil.Process().children(recursive=True)
+        frozen.extend(one for one in children if "controller" in one.cmdline())
+        frozen[0].suspend()
+        resume(plant, timeout)
+
+    def go_on() -> None:
+        if frozen and "publishing it again" in log.read_text():
+            frozen[0].resume()
+
+    monkeypatch.setattr(PlantClient, "resume", freeze_the_controller)
+    settings = RegulationSettings(noise=NoiseSettings(seed=7, duration=1.0, hold_time=0.002))
+    lockstep.run_lockstep(tmp_path / "bag", settings, on_wait=go_on)
+    assert "publishing it again" in log.read_text()
     bag = read_bag(tmp_path / "bag")
+    assert bag.metadata["pendulum.recorder.counts"]["/sim/joint_states"]["repeated"] > 0
     spec = RunSpec(
         controller_parameters={"q": [100.0, 0.01], "r": 0.1},
         disturbance={"amplitude": 2.5, "hold_time": 0.002, "duration": 1.0},

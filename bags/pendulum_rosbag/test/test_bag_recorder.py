@@ -185,6 +185,30 @@ def test_recording_starts_and_stops_by_service_and_by_header_time(
     assert second["/joint_states"]["position"].tolist() == [2.0] * 50
 
 
+@pytest.mark.parametrize(("log_time", "kept"), [("header", [0.0, 1.0, 2.0]), ("receive", [0.0, 0.0, 1.0, 1.0, 2.0])])
+def test_a_message_that_comes_again_is_stored_once_where_stamps_are_the_time(
+    tmp_path: Path, node: Node, processes: ProcessGroup, log_time: str, kept: list[float]
+) -> None:
+    states = node.create_publisher(JointState, "/joint_states", qos.STATE)
+    recording = processes.start(
+        "pendulum_bags", "record", "-o", tmp_path / "run", "/joint_states", "--log-time", log_time
+    )
+    wait_until_matched(states)
+    # The second time of the same stamp, and of another with the same content.
+    for stamp, position in ((5, 0.0), (5, 0.0), (5, 1.0), (5, 1.0), (6, 2.0)):
+        states.publish(encode_joint_state(stamp, position=position))
+    unstamped = [encode_joint_state(0, position=3.0)] * 2
+    for message in unstamped:
+        states.publish(message)
+    wait_until_received(node, joint_states=len(kept) + len(unstamped))
+    recording.interrupt()
+    assert recording.wait(30.0) == 0, recording.output
+    bag = read_bag(tmp_path / "run")
+    assert sorted(bag["/joint_states"]["position"].tolist()) == [*kept, 3.0, 3.0]
+    counts = bag.metadata["pendulum.recorder.counts"]["/joint_states"]
+    assert (counts["repeated"], counts["lost"]) == (5 - len(kept), 0)
+
+
 @pytest.fixture
 def stranger(domain_id: int) -> Iterator[GraphPeer]:
     peer = GraphPeer("stranger", domain=domain_id)

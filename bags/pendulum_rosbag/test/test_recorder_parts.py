@@ -167,6 +167,7 @@ def test_a_bag_that_was_not_closed_tells_what_is_missing_in_it(tmp_path: Path) -
         "lost": 3,
         "early": 4,
         "before": 5,
+        "repeated": 0,
     }
 
 

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Awaitable, Callable
+from collections.abc import Awaitable, Callable, Mapping
 from functools import partial
-from typing import Any
+from typing import Any, NamedTuple
 
 from nicegui import ui
 
@@ -22,6 +22,14 @@ __all__ = ["Layout"]
 
 REFRESH_PERIOD = 0.5
 """Time between two looks at what changes by itself [s]."""
+
+
+class _Card(NamedTuple):
+    """What stands on the page for one plant."""
+
+    node: str
+    section: ui.element
+    choice: ControllerChoice
 
 
 class Layout:
@@ -43,8 +51,7 @@ class Layout:
         self._certified = CertifiedDesigns(jobs)
         self._layers = LayersCard(jobs)
         self._job_labels: dict[str, tuple[ui.label, ui.link]] = {}
-        self._cards: dict[str, str] = {}
-        self._choices: list[ControllerChoice] = []
+        self._cards: dict[str, _Card] = {}
 
     def build(self) -> None:
         """Lay the page out."""
@@ -71,7 +78,7 @@ class Layout:
                     '<canvas id="plots" role="img" aria-label="angle, velocity and torques of the last 10 s"></canvas>',
                     sanitize=False,
                 )
-        self._plants = ui.element("div").classes("cards")
+        self._plants = ui.element("div").classes("cards plants")
         with ui.element("div").classes("cards"):
             with ui.element("section").classes("card wide"):
                 _heading("Controllers")
@@ -89,8 +96,32 @@ class Layout:
 
     # --- pieces --------------------------------------------------------------------------------------------
 
-    def _plant_card(self, space: str, node: str) -> None:
-        """Buttons for one plant alone."""
+    def _show_plants(self, plants: Mapping[str, str]) -> None:
+        """Give each plant a card, the newest last; one that has gone keeps its place.
+
+        No button may move by itself: who presses one as another plant comes or goes would press that plant's.
+        """
+        for space, node in sorted(plants.items()):
+            card = self._cards.get(space)
+            if card is None:
+                with self._plants:
+                    section = ui.element("section").classes("card").props(f'aria-label="{space}" data-card="{space}"')
+            elif card.node != node:
+                section = card.section
+                section.clear()
+            else:
+                continue
+            with section:
+                self._cards[space] = _Card(node, section, self._plant_card(space, node))
+        for space, card in self._cards.items():
+            if space in plants:
+                card.section.classes(remove="gone")
+                card.choice.refresh()
+            else:
+                card.section.classes(add="gone")
+
+    def _plant_card(self, space: str, node: str) -> ControllerChoice:
+        """Make the buttons for one plant alone; return the choice of its controller."""
 
         def move_text(goal: str) -> str:
             end = "the controller takes over" if goal == "upright" else "the plant is disarmed"
@@ -99,22 +130,21 @@ class Layout:
                 f" Its controller waits meanwhile. At the end {end}. Keep clear of the pendulum; the e-stop ends it."
             )
 
-        with ui.element("section").classes("card").props(f'aria-label="{space}" data-card="{space}"'):
-            _heading(space)
-            with ui.row():
-                _button("Arm", lambda: self._one(self._graph.arm(node, on=True)), filled=True, of=space)
-                _button("Disarm", lambda: self._one(self._graph.arm(node, on=False)), of=space)
-                # The page's script sends it, as it does the e-stop of all: repeated until it is answered.
-                _button("Stop", lambda: None, of=space, danger=True).props(f'data-stop="{node}"')
-                _button("Reset e-stop", lambda: self._one(self._graph.reset(node)), of=space)
-            with ui.row():
-                for goal in ("upright", "down"):
-                    _button(f"Bring {goal} ...", partial(self._ask_to_move, space, goal, move_text(goal)), of=space)
-                _button("Cancel the move", lambda: self._finish(f"move{space}"), of=space)
-            self._job_line(f"move{space}")
-            choice = ControllerChoice(self._graph, self._jobs, space, node, self._carefully, _button)
-            choice.build()
-            self._choices.append(choice)
+        _heading(space)
+        with ui.row():
+            _button("Arm", lambda: self._one(self._graph.arm(node, on=True)), filled=True, of=space)
+            _button("Disarm", lambda: self._one(self._graph.arm(node, on=False)), of=space)
+            # The page's script sends it, as it does the e-stop of all: repeated until it is answered.
+            _button("Stop", lambda: None, of=space, danger=True).props(f'data-stop="{node}"')
+            _button("Reset e-stop", lambda: self._one(self._graph.reset(node)), of=space)
+        with ui.row():
+            for goal in ("upright", "down"):
+                _button(f"Bring {goal} ...", partial(self._ask_to_move, space, goal, move_text(goal)), of=space)
+            _button("Cancel the move", lambda: self._finish(f"move{space}"), of=space)
+        self._job_line(f"move{space}")
+        choice = ControllerChoice(self._graph, self._jobs, space, node, self._carefully, _button)
+        choice.build()
+        return choice
 
     def _job_buttons(self) -> None:
         with ui.row():
@@ -189,17 +219,7 @@ class Layout:
     async def _refresh(self) -> None:
         """Show the plants that are there, the values in force, and the jobs."""
         plants = self._graph.plants()
-        if plants != self._cards:
-            self._cards = dict(plants)
-            for kind in [kind for kind in self._job_labels if kind.startswith("move")]:
-                del self._job_labels[kind]
-            self._plants.clear()
-            self._choices.clear()
-            with self._plants:
-                for space, node in sorted(plants.items()):
-                    self._plant_card(space, node)
-        for choice in self._choices:
-            choice.refresh()
+        self._show_plants(plants)
         for table in self._tables:
             await table.refresh(sorted(plants))
         self._certified.refresh()

@@ -182,7 +182,7 @@ class Recorder(PollingNode):
 
     def _take(self, tap: Tap, session: RecordingSession | None) -> None:
         items: list[tuple[int, bytes]] = []
-        missing = 0
+        missing = repeated = 0
         by_header = self._options.log_time == "header"
         for received_ns, data, gap in tap.take():
             missing += gap
@@ -192,6 +192,9 @@ class Recorder(PollingNode):
                 if stamp is None:
                     self._unstamped.append((tap, time_ns, data))
                     continue
+                if tap.repeats(data):
+                    repeated += 1
+                    continue
                 time_ns = stamp
             items.append((time_ns, data))
         unheard = tap.unheard()
@@ -200,6 +203,9 @@ class Recorder(PollingNode):
             return
         if items or missing:
             self._offer(tap, session, items, missing)
+        if repeated:
+            tap.announce(session)
+            session.note_repeated(tap.topic, repeated)
         if unheard and tap.is_new:
             tap.announce(session)
             session.note_before(tap.topic, unheard)

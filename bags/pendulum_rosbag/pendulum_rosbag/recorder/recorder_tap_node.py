@@ -68,6 +68,7 @@ class Tap:
         self.announced: RecordingSession | None = None
         self.stamp = stamp_reader(name)
         self.type = message_type(name, type_hash if type_hash.startswith("RIHS") else "")
+        self._newest = b""
         self._trim = Trimmer() if name == "sensor_msgs/msg/JointState" else bytes
         profile = QoSProfile(
             depth=DEPTH,
@@ -115,6 +116,16 @@ class Tap:
         for data, info in self.source.messages():
             sequence = info["publication_sequence_number"]
             yield info["received_timestamp"], trim(data), see(sequence) if sequence else 0
+
+    def repeats(self, data: bytes) -> bool:
+        """Tell whether a stamped message is the one before it once more, and take note of it.
+
+        A plant in lockstep publishes a state again that nobody answers in time, and who has answered it already answers
+        the same.
+        """
+        again = data == self._newest and self.stamp is not None and (self.stamp(data) or 0) > 0
+        self._newest = data
+        return again
 
     def unheard(self) -> int:
         """Return how many messages publishers had sent before the first that was heard of them, since the last call."""

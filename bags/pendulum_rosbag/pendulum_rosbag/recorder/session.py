@@ -31,7 +31,8 @@ class TopicCount:
 
     ``early`` are those that were published between the first message that arrived and the moment at which the
     subscription was complete: the recording of the topic begins with a gap, but nothing that was due is lost.
-    ``before`` are those that its publishers had sent before the recording of the topic began.
+    ``before`` are those that its publishers had sent before the recording of the topic began. ``repeated`` are those
+    that came again, byte by byte, in a recording by header times: the bag holds each once.
     """
 
     received: int = 0
@@ -40,6 +41,7 @@ class TopicCount:
     written: int = 0
     early: int = 0
     before: int = 0
+    repeated: int = 0
 
     @property
     def lost(self) -> int:
@@ -191,6 +193,10 @@ class RecordingSession:
         """Count messages that were published before the recording of their topic began."""
         self._counts[topic].before += number
 
+    def note_repeated(self, topic: str, number: int) -> None:
+        """Count messages that came again and are in the bag already."""
+        self._counts[topic].repeated += number
+
     def counts(self) -> dict[str, TopicCount]:
         """Return the counts so far; ``written`` are those that are safe on disk."""
         sealed = self.writer.sealed
@@ -256,14 +262,9 @@ class RecordingSession:
 
     def _store_counts(self) -> None:
         self.writer.seal()
-        self.writer.update_metadata(
-            {
-                _COUNTS: {
-                    name: {kind: getattr(count, kind) for kind in ("received", "written", "lost", "early", "before")}
-                    for name, count in self.counts().items()
-                }
-            }
-        )
+        kinds = ("received", "written", "lost", "early", "before", "repeated")
+        counts = {name: {kind: getattr(count, kind) for kind in kinds} for name, count in self.counts().items()}
+        self.writer.update_metadata({_COUNTS: counts})
 
     def fail(self, error: Exception) -> None:
         """Keep what is in the bag, give back the room that it does not need, and say why; the first reason counts."""
