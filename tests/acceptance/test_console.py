@@ -305,7 +305,7 @@ def test_no_stop_is_lost_whatever_is_frozen_killed_or_cut_off(domain_id: int, tm
     if not CHROMIUM.is_file():
         pytest.skip(f"no browser at {CHROMIUM}")
     with playwright.sync_playwright() as play:
-        rig = StopRig(tmp_path, play)
+        rig = StopRig(tmp_path, play, patience=30.0)
         try:
             for name in IN_SHORT:
                 rig.rearm()

@@ -3,7 +3,7 @@
 The plant is driven by a constant torque. A try is judged by the plant's own events and torques, heard by a node that
 knows nothing of the console. It survives when the plant is stopped, and its torque zero for good, within ``MAX_DELAY``
 of the press, or of the moment at which the way to the plant was whole again, and when the page showed in red what did
-not answer.
+not answer. Where nothing is measured, on a machine that does something else as well, a rig may have more patience.
 """
 
 from __future__ import annotations
@@ -60,9 +60,11 @@ class StopRig:
     Args:
         folder: For logs.
         play: Playwright.
+        patience: Longest time until plant and page have answered [s].
     """
 
-    def __init__(self, folder: Path, play: Any) -> None:
+    def __init__(self, folder: Path, play: Any, patience: float = MAX_DELAY) -> None:
+        self.patience = patience
         self._processes = ProcessGroup(folder / "logs", folder)
         self._folder = folder
         with socket.socket() as probe:
@@ -138,9 +140,9 @@ class StopRig:
         heard, torque = self.torques[-1] if self.torques else (0.0, 0.0)
         return self.modes[-1:] == ["armed_effort"] and torque != 0.0 and time.monotonic() - heard < 0.2
 
-    def until_stopped(self, timeout: float = MAX_DELAY) -> bool:
+    def until_stopped(self) -> bool:
         """Wait until the plant says that it is stopped; tell whether it did in time."""
-        return _soon(lambda: self.modes[-1:] == ["e_stop"], timeout)
+        return _soon(lambda: self.modes[-1:] == ["e_stop"], self.patience)
 
     def time_to_zero(self, since: float) -> float | None:
         """Return the time from a moment until the torque was zero for good [s]; None if it is not."""
@@ -149,10 +151,10 @@ class StopRig:
         zero = next((heard for heard, torque in torques if heard > max(driven, since) and torque == 0.0), None)
         return None if zero is None else zero - since
 
-    def sees(self, text: str, timeout_ms: int = 4000, page: Any = None) -> bool:
+    def sees(self, text: str, page: Any = None) -> bool:
         """Tell whether the page comes to show a text among its alarms, in red."""
         with suppress(Exception):
-            (page or self.page).locator("#alarms .bad", has_text=text).first.wait_for(timeout=timeout_ms)
+            (page or self.page).locator("#alarms .bad", has_text=text).first.wait_for(timeout=1e3 * self.patience)
             return True
         return False
 
@@ -176,12 +178,12 @@ class StopRig:
 
 
 def _judge(rig: StopRig, outcome: Outcome, since: float) -> Outcome:
-    outcome.demand(rig.until_stopped(), f"the plant is not stopped {MAX_DELAY:g} s later, it is {rig.modes[-3:]}")
+    outcome.demand(rig.until_stopped(), f"the plant is not stopped {rig.patience:g} s later, it is {rig.modes[-3:]}")
     # The page says so, too, and nothing wakes armed or moves afterwards.
     outcome.demand(
-        _soon(lambda: rig.page.locator("#alarms .good").count() > 0, 6.0), "the page does not show the plant's answer"
+        _soon(lambda: rig.page.locator("#alarms .good").count() > 0, rig.patience), "the page does not show the plant's answer"
     )
-    _soon(lambda: rig.time_to_zero(since) is not None, MAX_DELAY)
+    _soon(lambda: rig.time_to_zero(since) is not None, rig.patience)
     time.sleep(_AFTER)
     outcome.demand(rig.modes[-1:] == ["e_stop"], f"the plant became {rig.modes[-1:]} again")
     outcome.time_to_zero = rig.time_to_zero(since)
@@ -275,7 +277,7 @@ def _server_dies_after_the_answer(rig: StopRig) -> Outcome:
     outcome = Outcome()
     since = time.monotonic()
     rig.page.keyboard.press("Escape")
-    outcome.demand(_soon(lambda: rig.page.locator("#alarms .good").count() > 0, 6.0), "no answer is shown")
+    outcome.demand(_soon(lambda: rig.page.locator("#alarms .good").count() > 0, rig.patience), "no answer is shown")
     rig.console.send_signal(signal.SIGKILL)
     rig.console.wait(10.0)
     outcome.demand(rig.sees("UNCONFIRMED"), "the page does not say that the answer is no longer confirmed")
@@ -308,7 +310,7 @@ def _two_clients(rig: StopRig) -> Outcome:
         since = time.monotonic()
         phone.locator("#e_stop").tap()
         _judge(rig, outcome, since)
-        seen = _soon(lambda: phone.locator("#alarms .good").count() > 0, 3.0)
+        seen = _soon(lambda: phone.locator("#alarms .good").count() > 0, rig.patience)
         outcome.demand(seen, "the client that pressed does not show the answer")
     finally:
         phone.close()
