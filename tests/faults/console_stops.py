@@ -181,7 +181,8 @@ def _judge(rig: StopRig, outcome: Outcome, since: float) -> Outcome:
     outcome.demand(rig.until_stopped(), f"the plant is not stopped {rig.patience:g} s later, it is {rig.modes[-3:]}")
     # The page says so, too, and nothing wakes armed or moves afterwards.
     outcome.demand(
-        _soon(lambda: rig.page.locator("#alarms .good").count() > 0, rig.patience), "the page does not show the plant's answer"
+        _soon(lambda: rig.page.locator("#alarms .good").count() > 0, rig.patience),
+        "the page does not show the plant's answer",
     )
     _soon(lambda: rig.time_to_zero(since) is not None, rig.patience)
     time.sleep(_AFTER)
