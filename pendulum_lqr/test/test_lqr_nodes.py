@@ -171,7 +171,7 @@ def test_the_period_is_taken_from_the_states_or_refused_where_the_loop_would_be_
     program = processes.start("pendulum_lqr", "controller", *ros("period:=0.01", *pid))
     plant.connect()
     publish(lambda: "not answering" in program.output, "the refusal")
-    program.wait_for_output(r"not answering: period is 0\.01 s, but states come every 0\.0\d+ s", 1)
+    program.wait_for_output(r"not answering: period is 0\.01 s, but states come every 0\.0\d+ s", 20)
     plant.until(lambda: plant.commands and plant.commands[-1].effort[0] == 0.0, "the last zero")
     count = len(plant.commands)
     further = iter(range(5))
@@ -228,7 +228,7 @@ def test_a_policy_answers_at_its_own_period_and_says_when_it_gives_up(plant, pro
         plant.connect()
         publish(lambda output=program: "not answering" in output.output, "the refusal", 25_000_000)
         reason = r"not answering: states come every 0\.0\d+ s: policy 'test' was trained for a period of"
-        program.wait_for_output(reason, 1)
+        program.wait_for_output(reason, 20)
         program.send_signal(signal.SIGTERM)
         assert program.wait(15) == 0
         # Whoever states a period is believed until the states say otherwise.

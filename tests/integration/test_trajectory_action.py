@@ -162,7 +162,7 @@ def test_an_action_that_ends_leaves_the_plant_where_it_is(client: Client) -> Non
     client.action_process.interrupt()
     assert client.action_process.wait(10.0) == 0
     # Long before the six seconds of the goal.
-    client.process.wait_for_output("armed_position: holding the end of a trajectory", 4.0)
+    client.process.wait_for_output("armed_position: holding the end of a trajectory", 20.0)
 
 
 def test_of_two_programs_that_offer_the_action_neither_takes_a_goal(client: Client, processes: ProcessGroup) -> None:
