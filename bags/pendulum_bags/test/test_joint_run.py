@@ -2,11 +2,26 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
 import pytest
 
-from pendulum_bags.experiments.joint_run import JointSettings, load_stand_in, stand_in_for
-from pendulum_msgs_py.errors import ParameterError
-from pendulum_msgs_py.plants.mechanism_parameters import load_mechanism
+from pendulum_bags.experiments import joint_run
+from pendulum_bags.experiments.joint_run import (
+    JointSettings,
+    design_for,
+    fall_time,
+    load_stand_in,
+    record_joints,
+    stand_in_for,
+)
+from pendulum_lqr.mechanism_model import linearise_mechanism, mechanism_lqr
+from pendulum_msgs_py.errors import FaultError, ParameterError, PlantStoppedError
+from pendulum_msgs_py.plants.mechanism_parameters import MechanismParameters, load_mechanism
+from pendulum_sim.mechanism_plant import MechanismPlant
 
 GIVEN = ("gravity", "gear_ratio", "elbow.effort_limit", "shoulder.stribeck_velocity")
 """What nobody has to identify."""
@@ -66,3 +81,91 @@ def test_a_machine_with_other_equations_or_other_motors_is_refused(plant: str, o
 
 def test_a_machine_with_other_values_is_taken() -> None:
     assert load_stand_in("acrobot_frictionless", load_mechanism("acrobot")).name == "acrobot_frictionless"
+
+
+def _longest_time_upright(plant: MechanismParameters, design: MechanismParameters, amplitude: float) -> float:
+    """Return for how long an LQR holds a plant upright under seeded noise, at most 3 s."""
+    mechanism, step = plant.mechanism, 4e-3
+    gain = np.array(mechanism_lqr(linearise_mechanism(design), *mechanism.weights).K)
+    simulated = MechanismPlant(plant, dt=step)
+    goal = np.array(plant.coordinates.goal)
+    simulated.reset(tuple(goal))
+    noise, push = np.random.default_rng(1), 0.0
+    stamps, positions, x = [], [], np.zeros(2 * len(goal))
+    for k in range(750):
+        push = noise.uniform(-amplitude, amplitude) if k % 3 == 0 else push
+        limit = np.array(plant.effort_limits)
+        state = simulated.step(tuple(np.clip(-gain @ x + push, -limit, limit)))
+        x = np.concatenate([np.array(state.position) - goal, state.velocity])
+        stamps.append(round(4e6 * k))
+        positions.append(state.position)
+    fell = fall_time(plant, np.array(stamps), np.array(positions))
+    return 3.0 if fell is None else fell
+
+
+@pytest.mark.parametrize("name", ["acrobot", "pendubot"])
+def test_the_design_of_a_run_holds_a_plant_whose_passive_joint_has_dry_friction(name: str) -> None:
+    settings, plant = JointSettings(name), load_mechanism(name)
+    assert settings.amplitude == pytest.approx(0.6)
+    assert _longest_time_upright(plant, design_for(plant), settings.amplitude) == 3.0
+
+
+def test_the_acrobot_falls_under_an_lqr_that_knows_nothing_of_its_dry_friction() -> None:
+    plant = load_mechanism("acrobot")
+    assert _longest_time_upright(plant, plant, 0.6) < 1.0
+
+
+def test_a_plant_whose_passive_joints_have_no_dry_friction_is_its_own_design() -> None:
+    for name in ("cart_pole", "furuta", "double_pendulum", "acrobot_frictionless"):
+        plant = load_mechanism(name)
+        assert design_for(plant) is plant
+
+
+def test_a_plant_has_fallen_when_half_of_its_height_is_lost() -> None:
+    plant = load_mechanism("cart_pole")
+    stamps = np.array([1_000_000_000, 1_500_000_000, 2_000_000_000])
+    held = np.column_stack([np.zeros(3), np.full(3, np.pi)])
+    assert fall_time(plant, stamps, held) is None
+    assert fall_time(plant, stamps, held - [[0.0, 0.0], [0.0, 1.5], [0.0, 1.6]]) == 1.0
+
+
+@pytest.mark.parametrize(
+    ("failing", "message"),
+    [
+        (
+            ("sim", "hw"),
+            (
+                r"both sides failed: the simulation fell after 0.20 s; the stand-in for the machine fell after 0.20 s .*"
+                r"fault \(velocity_limit: elbow\), under noise of 0.6 N m at elbow; .* a smaller --amplitude"
+            ),
+        ),
+        (
+            ("hw",),
+            r"the sides part: the stand-in for the machine fell .* \(velocity_limit: elbow\); the simulation stayed",
+        ),
+        (("sim",), "the sides part: the simulation fell after 0.20 s; the stand-in for the machine stayed upright"),
+    ],
+)
+def test_the_sides_that_fell_are_told_with_their_times(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, failing: tuple[str, ...], message: str
+) -> None:
+    recorded: list[str] = []
+
+    def record(bag: Path, run: Any, **_: Any) -> None:
+        recorded.append(bag.name)
+        assert run.design == str(tmp_path / "design.yaml")
+        # The simulator has no limits and falls without a word; the bridge faults.
+        if run.has_bridge and bag.name in failing:
+            raise PlantStoppedError("/hw", "fault", "velocity_limit: elbow")
+
+    def read(bag: Path) -> Any:
+        goal = np.array(load_mechanism("acrobot").coordinates.goal)
+        low = goal - [3.0, 0.0] if bag.name in failing else goal
+        states = SimpleNamespace(stamp_ns=np.array([0, 200_000_000]), position=np.array([goal, low]))
+        return SimpleNamespace(joints=lambda topic: states)
+
+    monkeypatch.setattr(joint_run, "record_run", record)
+    monkeypatch.setattr(joint_run, "read_bag", read)
+    with pytest.raises(FaultError, match=message):
+        record_joints(tmp_path, JointSettings("acrobot"), tmp_path / "machine.yaml")
+    assert recorded == ["sim", "hw"]

@@ -3,29 +3,41 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from pendulum_bags.experiments.lockstep import record_run
 from pendulum_bags.runs.run_folder import provenance
 from pendulum_bags.runs.run_record import RUN_RECORD, STAND_IN
-from pendulum_msgs_py.errors import ParameterError
-from pendulum_msgs_py.plants.mechanism_parameters import MechanismParameters, load_mechanism
+from pendulum_msgs_py.contract.names import JOINT_STATES
+from pendulum_msgs_py.contract.values import NANOSECONDS
+from pendulum_msgs_py.errors import FaultError, ParameterError, PlantStoppedError
+from pendulum_msgs_py.plants.mechanism_parameters import MechanismParameters, load_mechanism, write_mechanism
 from pendulum_msgs_py.plants.plant_parameters import is_mechanism
 from pendulum_msgs_py.programs import graph
 from pendulum_msgs_py.programs.graph import NodeProgram
+from pendulum_rosbag.reader.bag import read_bag
 
-__all__ = ["JointRun", "JointSettings", "load_stand_in", "record_joints", "stand_in_for"]
+__all__ = ["JointRun", "JointSettings", "design_for", "fall_time", "load_stand_in", "record_joints", "stand_in_for"]
+
+Array = NDArray[Any]
 
 _UNCHANGED = frozenset(
     {"gravity", "gear_ratio", "stribeck_velocity", "lower_stop", "upper_stop", "effort_limit", "time_constant"}
 )
 """Values of a plant file that nobody has to identify: constants, limits, and what belongs to a model of friction."""
 _DELAY = "transport_delay"
+_NOISE_SHARE = 0.1
+"""Amplitude of the noise as a share of the joint's effort limit [-]: the LQR holds every preset under it on both sides,
+the acrobot and the pendubot with dry friction up to 0.16, and their joints slide in it instead of standing still."""
+_SLIDING = 0.5
+"""Velocity at which a design takes the dry friction of passive joints [rad/s or m/s]: that of the joints under this
+noise. At 1 the pendubot falls; at 0.25 both plants stay, nearer to the end of what their LQR holds."""
 
 
 @dataclass(frozen=True)
@@ -35,7 +47,7 @@ class JointSettings:
     Attributes:
         plant: Preset or file of the simulated plant; the controller is designed on it on both sides.
         joint: Driven joint that has the noise; empty for the first.
-        amplitude: Largest effort of the noise [N m or N].
+        amplitude: Largest effort of the noise [N m or N]; None for a tenth of the joint's effort limit.
         hold_time: Time for which a sample is held [s].
         duration: Length [s].
         seed: Seed of the noise.
@@ -45,7 +57,7 @@ class JointSettings:
 
     plant: str = "cart_pole"
     joint: str = ""
-    amplitude: float = 1.0
+    amplitude: float | None = None
     hold_time: float = 0.01
     duration: float = 20.0
     seed: int = 1
@@ -59,10 +71,16 @@ class JointSettings:
                 f"plant is {self.plant!r}, which has one joint; expected one of several, such as cart_pole "
                 "(experiment thesis is for one joint)"
             )
-        driven = load_mechanism(self.plant).coordinates.driven_names
+        plant = load_mechanism(self.plant)
+        driven = plant.coordinates.driven_names
+        if not driven:
+            raise ParameterError(f"plant {plant.name!r} has no driven joint; expected an actuator at one of its joints")
         if self.joint and self.joint not in driven:
             raise ParameterError(f"joint is {self.joint!r}; expected one that is driven: {', '.join(driven)}")
         object.__setattr__(self, "joint", self.joint or driven[0])
+        if self.amplitude is None:
+            limit = plant.effort_limits[driven.index(self.joint)]
+            object.__setattr__(self, "amplitude", _NOISE_SHARE * limit)
         for name in ("amplitude", "hold_time", "duration", "period"):
             value = getattr(self, name)
             if not (math.isfinite(value) and value > 0.0):
@@ -77,11 +95,13 @@ class JointRun:
         settings: The settings.
         side: ``sim``, or ``hw`` for the plant that stands in for the machine.
         plant: Preset or file of what runs on this side.
+        design: Preset or file on which the controller is designed; empty for the simulated plant.
     """
 
     settings: JointSettings
     side: str
     plant: str
+    design: str = ""
     simulated_time: bool = True
 
     @property
@@ -134,11 +154,11 @@ class JointRun:
         )
 
     def controller_program(self) -> NodeProgram:
-        """Return the controller, designed on the simulated plant on both sides."""
+        """Return the controller, designed on one plant on both sides."""
         return graph.controller(
             self.namespace,
             controller="lqr",
-            plant=self.settings.plant,
+            plant=self.design or self.settings.plant,
             period=self.settings.period,
             use_sim_time=True,
         )
@@ -158,7 +178,7 @@ class JointRun:
                 "design_plant": self.settings.plant,
                 "seed": self.settings.seed,
                 "disturbance": self._noise(),
-                "controller": {"kind": "lqr"},
+                "controller": {"kind": "lqr", **({"linearised": Path(self.design).name} if self.design else {})},
                 **({STAND_IN: "emulated machine"} if self.side == "hw" else {}),
                 "duration": self.duration,
                 "period": self.settings.period,
@@ -203,6 +223,21 @@ def stand_in_for(plant: MechanismParameters, *, share: float, delay: float, seed
     return replace(plant.with_values(changes), name=f"{plant.name}_stand_in")
 
 
+def design_for(plant: MechanismParameters) -> MechanismParameters:
+    """Return the plant on which the LQR is designed: dry friction of passive joints as viscous friction.
+
+    A linear model has no dry friction, and no motor can make up for that of a passive joint: an LQR that knows nothing
+    of it loses acrobot and pendubot as soon as they move. b = F / v has the same force at the velocity v.
+    """
+    driven = plant.coordinates.driven_names
+    changes = {
+        f"{joint.name}.damping": own.damping + own.coulomb_friction / _SLIDING
+        for joint, own in zip(plant.mechanism.joints, plant.joints, strict=True)
+        if joint.name not in driven and own.coulomb_friction > 0.0
+    }
+    return replace(plant.with_values(changes), name=f"{plant.name}_design") if changes else plant
+
+
 def load_stand_in(path: str | Path, plant: MechanismParameters) -> MechanismParameters:
     """Return the plant of a file that is to stand in for a machine.
 
@@ -236,6 +271,8 @@ def record_joints(
 ) -> None:
     """Record both sides over DDS, in lockstep, as the bags ``sim`` and ``hw`` of a run folder.
 
+    Where the plant of the design is another than the simulated one, it is kept there as ``design.yaml``.
+
     Args:
         folder: The run folder.
         settings: What to run.
@@ -245,11 +282,59 @@ def record_joints(
 
     Raises:
         BagError: A bag exists, or cannot be written.
-        FaultError: A program ended or did not answer, or a plant faulted.
+        FaultError: A program ended or did not answer, or a plant fell or faulted; told of both sides.
     """
-    for side, plant, words in (
+    plant = load_mechanism(settings.plant)
+    design, told = "", design_for(plant)
+    if told is not plant:
+        meaning = f"{plant.name}, dry friction of its passive joints as viscous friction at {_SLIDING:g} rad/s or m/s"
+        design = str(write_mechanism(folder / "design.yaml", told, provenance={"design_of": meaning}))
+    ends: dict[str, str] = {}
+    for side, runs, words in (
         ("sim", settings.plant, "simulation"),
         ("hw", str(machine), "stand-in for the machine"),
     ):
         on_side(words)
-        record_run(folder / side, JointRun(settings, side, plant), on_wait=on_wait)
+        stopped = ""
+        try:
+            record_run(folder / side, JointRun(settings, side, runs, design), on_wait=on_wait)
+        except PlantStoppedError as error:
+            stopped = f"went to {error.mode} ({error.reason})"
+        ends[words] = _end_of(folder / side, f"/{side}", plant, stopped)
+    if any(ends.values()):
+        raise FaultError(_told(ends, settings))
+
+
+def fall_time(plant: MechanismParameters, stamps_ns: Array, position: Array) -> float | None:
+    """Return when a plant fell, from the first state on [s], or None: half of its height of potential energy is lost.
+
+    Args:
+        plant: The plant.
+        stamps_ns: Times of N states [ns].
+        position: Their positions, shape (N, n).
+    """
+    potential, p = plant.mechanism.potential, plant.packed
+    half = 0.5 * potential(plant.coordinates.goal, p)
+    for stamp_ns, q in zip(stamps_ns, position, strict=True):
+        if potential(tuple(q), p) < half:
+            return float(stamp_ns - stamps_ns[0]) / NANOSECONDS
+    return None
+
+
+def _end_of(bag: Path, namespace: str, plant: MechanismParameters, stopped: str) -> str:
+    """Return how a side failed, in words, or an empty string."""
+    states = read_bag(bag).joints(f"{namespace}/{JOINT_STATES}")
+    fell = fall_time(plant, states.stamp_ns, states.position) if len(states.stamp_ns) else None
+    said = [] if fell is None else [f"fell after {fell:.2f} s"]
+    return " and ".join([*said, stopped] if stopped else said)
+
+
+def _told(ends: Mapping[str, str], settings: JointSettings) -> str:
+    failed = [f"the {words} {end}" for words, end in ends.items() if end]
+    held = [f"the {words} stayed upright" for words, end in ends.items() if not end]
+    joint = next(joint for joint in load_mechanism(settings.plant).mechanism.joints if joint.name == settings.joint)
+    return (
+        f"{'both sides failed' if not held else 'the sides part'}: {'; '.join(failed + held)}, under noise of "
+        f"{settings.amplitude:g} {joint.effort_unit} at {settings.joint}; expected both to stay upright: compare with "
+        "a smaller --amplitude"
+    )

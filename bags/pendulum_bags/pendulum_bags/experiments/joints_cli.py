@@ -37,7 +37,10 @@ def joints(
     ] = 0.05,
     delay: Annotated[float, typer.Option(help="Transport delay of its motors [s].")] = 0.004,
     joint: Annotated[str, typer.Option(help="Driven joint that has the noise; by default the first.")] = "",
-    amplitude: Annotated[float, typer.Option(help="Largest effort of the noise [N m or N].")] = 1.0,
+    amplitude: Annotated[
+        float | None,
+        typer.Option(help="Largest effort of the noise [N m or N]; by default a tenth of the joint's effort limit."),
+    ] = None,
     hold_time: Annotated[float, typer.Option(help="Time for which a noise sample is held [s].")] = 0.01,
     duration: Annotated[float, typer.Option(help="Length of the noise [s].")] = 20.0,
     seed: Annotated[int, typer.Option(help="Seed of the noise, and of the draw.", min=0)] = 1,
@@ -50,9 +53,10 @@ def joints(
 
     In the place of the machine the bridge drives an emulated one: quasi-direct drives, encoders and delays on a plant
     that is a little off. The answer calls it emulated hardware.
-    Both sides run as nodes over DDS, in lockstep, under one LQR that is designed on the simulated plant.
+    Both sides run as nodes over DDS, in lockstep, under one LQR that is designed on the simulated plant, where the dry
+    friction of a passive joint counts as viscous: else acrobot and pendubot would fall.
 
-    Example: python -m pendulum_bags experiment joints --plant furuta --amplitude 0.02 --share 0.1
+    Example: python -m pendulum_bags experiment joints --plant acrobot --share 0.1
     """
     from pendulum_bags.comparison.compare_cli import compare
     from pendulum_bags.experiments.joint_run import JointSettings, load_stand_in, record_joints, stand_in_for
