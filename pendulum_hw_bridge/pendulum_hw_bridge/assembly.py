@@ -175,7 +175,7 @@ def _several(values: Mapping[str, Any], specs: tuple[ParameterSpec, ...], *, loc
                 f"{names}; expected it left out"
             )
     limits = bridge_parameters.supervisor_limits(
-        values, plant.effort_limits, joints=len(coordinates.joints), lockstep=lockstep
+        values, plant.effort_limits, coordinates=coordinates, lockstep=lockstep
     )
     check_consistency(values, limits)
     hardware, gains = QuasiDirectDrive(), DEFAULT_GAINS[TORQUE_LOOP]
@@ -217,6 +217,7 @@ def _several(values: Mapping[str, Any], specs: tuple[ParameterSpec, ...], *, loc
                 _safety(values, effort),
                 period_ns / NANOSECONDS,
                 mappings[driven].drivetrain if driven is not None else None,
+                coordinates.joints[index],
             )
             settings = BridgeSettings(
                 feedback_rate=values["feedback_rate"],

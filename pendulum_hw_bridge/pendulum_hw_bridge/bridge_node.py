@@ -442,6 +442,8 @@ class BridgeNode(LifecycleNode, PollingNode):
                 "present_fault": present.name if present is not None else "none",
             }
         )
+        if stood_still := getattr(bridge.modules[0].port, "stood_still", 0.0):
+            values["machine_stood_still_s"] = stood_still
         values.update({f"faults.{name}": count for name, count in sorted(bridge.faults.items())})
         return values
 

@@ -21,6 +21,7 @@ from pendulum_msgs_py.contract.drive import PlantLimits
 from pendulum_msgs_py.contract.plant_specs import limits_from_parameters
 from pendulum_msgs_py.contract.values import Vector
 from pendulum_msgs_py.errors import ParameterError
+from pendulum_msgs_py.joints import ONE_JOINT, Coordinates
 from pendulum_msgs_py.parameters import ParameterSpec
 from pendulum_msgs_py.plants.plant_parameters import (
     PRESETS,
@@ -323,14 +324,18 @@ def bridge_limits(values: Mapping[str, Any], plant: PlantParameters, *, lockstep
 
 
 def supervisor_limits(
-    values: Mapping[str, Any], effort_limits: Vector, *, joints: int = 1, lockstep: bool = False
+    values: Mapping[str, Any],
+    effort_limits: Vector,
+    *,
+    coordinates: Coordinates = ONE_JOINT,
+    lockstep: bool = False,
 ) -> PlantLimits:
     """Return the limits that the supervisor keeps on a plant of any number of joints.
 
     Args:
         values: Parameters of the bridge.
         effort_limits: Those of the driven joints in the plant file [N m or N].
-        joints: How many joints the plant has.
+        coordinates: Joints of the plant.
         lockstep: Whether time is simulated.
 
     Raises:
@@ -338,7 +343,13 @@ def supervisor_limits(
     """
     # A period more than the monitor has, which names the fault; this one is behind it.
     patience = (values["feedback_watchdog"] + 1) / values["feedback_rate"]
-    limits = limits_from_parameters(values, effort_limits, joints=joints, feedback_timeout=patience)
+    limits = limits_from_parameters(
+        values,
+        effort_limits,
+        joints=len(coordinates.joints),
+        unit=coordinates.drive_unit,
+        feedback_timeout=patience,
+    )
     if lockstep:
         # Here only an emulator runs, and the noise of an experiment begins with the controller.
         return limits

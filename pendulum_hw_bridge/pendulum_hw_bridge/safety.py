@@ -24,6 +24,7 @@ from pendulum_hw_bridge.output_check import OutputCheck
 from pendulum_hw_bridge.safety_limits import SafetyLimits
 from pendulum_msgs_py.contract.values import NANOSECONDS
 from pendulum_msgs_py.dynamics.series_elastic import winding_current, winding_resistance_at
+from pendulum_msgs_py.joints import ONE_JOINT, Joint
 from pendulum_msgs_py.plants.plant_parameters import SeriesElasticParameters
 
 __all__ = ["FAULTS", "Fault", "SafetyLimits", "SafetyMonitor"]
@@ -60,10 +61,18 @@ class SafetyMonitor:
         limits: The limits.
         period: Nominal feedback period [s].
         drivetrain: Constants for the check of the winding current, or None.
+        joint: The joint that is measured, whose units messages have.
     """
 
-    def __init__(self, limits: SafetyLimits, period: float, drivetrain: SeriesElasticParameters | None = None) -> None:
+    def __init__(
+        self,
+        limits: SafetyLimits,
+        period: float,
+        drivetrain: SeriesElasticParameters | None = None,
+        joint: Joint = ONE_JOINT.joints[0],
+    ) -> None:
         self.limits = limits
+        self.joint = joint
         self.period = period
         self.drivetrain = drivetrain
         self._last: Feedback | None = None
@@ -165,7 +174,8 @@ class SafetyMonitor:
     # --- checks ---------------------------------------------------------------------------------------------
 
     def _check_values(self, feedback: Feedback) -> Fault | None:
-        for name, unit in (("position", "rad"), ("velocity", "rad/s"), ("effort", "N m")):
+        own = self.joint
+        for name, unit in (("position", own.unit), ("velocity", own.velocity_unit), ("effort", own.effort_unit)):
             value = getattr(feedback, name)
             if not math.isfinite(value):
                 return Fault("feedback_not_finite", f"{name} reads {value} {unit}; expected a finite number")
@@ -241,7 +251,8 @@ class SafetyMonitor:
         if abs(feedback.effort) > limits.measured_effort:
             return Fault(
                 "effort_measured",
-                f"measured torque is {feedback.effort:.2f} N m; expected at most {limits.measured_effort:g} N m",
+                f"measured {'torque' if self.joint.unit == 'rad' else 'force'} is {feedback.effort:.2f} "
+                f"{self.joint.effort_unit}; expected at most {limits.measured_effort:g} {self.joint.effort_unit}",
             )
         return None
 
@@ -274,18 +285,19 @@ class SafetyMonitor:
             if abs(jump) > allowed:
                 return Fault(
                     "position_jump",
-                    f"position jumped by {jump:.3f} rad in {elapsed * 1e3:.0f} ms; "
-                    f"expected at most {allowed:.3g} rad beside the velocity",
+                    f"position jumped by {jump:.3f} {self.joint.unit} in {elapsed * 1e3:.0f} ms; "
+                    f"expected at most {allowed:.3g} {self.joint.unit} beside the velocity",
                 )
         self._travelled += expected
         self._motion.append((self._travelled, feedback.position))
         travelled = self._travelled - self._motion[0][0]
         moved = feedback.position - self._motion[0][1]
         if abs(travelled - moved) > self.limits.position_disagreement:
+            unit = self.joint.unit
             return Fault(
                 "motion_disagreement",
-                f"velocity says {travelled:.4f} rad, position {moved:.4f} rad in {_MOTION_TIME:g} s; "
-                f"expected them within {self.limits.position_disagreement:g} rad",
+                f"velocity says {travelled:.4f} {unit}, position {moved:.4f} {unit} in {_MOTION_TIME:g} s; "
+                f"expected them within {self.limits.position_disagreement:g} {unit}",
             )
         return None
 

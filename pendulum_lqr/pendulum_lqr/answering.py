@@ -130,7 +130,8 @@ class AnswerLoop:
             # A solver that gives up must not end the node: without an answer the plant's timeout makes it zero.
             effort, reason = (math.nan,), f"{type(error).__name__}: {error}"
         if not all(map(math.isfinite, effort)):
-            self.last_reason = reason or f"controller answered {written(effort)} N m"
+            unit = " N m" if len(sample.position) == 1 else ""  # of several joints, each has its own
+            self.last_reason = reason or f"controller answered {written(effort)}{unit}"
             self.refused[StateRefusal.NO_ANSWER] += 1
             return None
         ended = self._monotonic()
@@ -207,6 +208,8 @@ class AnswerLoop:
         limit = f"expected at most {self._timeout_ns / NANOSECONDS:g} s"
         if refusal is StateRefusal.NOT_FINITE:
             where, speed = written(sample.position), written(sample.velocity)
+            if len(sample.position) > 1:  # each in its own unit
+                return f"position is {where}, velocity {speed}; expected finite numbers"
             return f"position is {where} rad, velocity {speed} rad/s; expected finite numbers"
         if refusal is StateRefusal.STALE:
             return f"header.stamp is {age:.6g} s old; {limit}"

@@ -95,6 +95,7 @@ def test_a_plant_file_of_one_joint_is_read_as_the_mechanism_pendulum(preset: str
         ("mass_2:", "mass_3:", "unknown parameter 'mass_3'; did you mean 'mass_"),
         ("effort_limit: {value: 6.0, unit: N m}", "", "actuator.effort_limit is missing; expected a value in N m"),
         ("effort_limit: {value: 6.0", "effort_limit: {value: 0.0", "effort_limit is 0.0 N m; expected"),
+        ("effort_limit: {value: 6.0", "effort_limit: {value: 60000.0", "is 60000.0 N m; expected > 0 and <= 10000"),
         ("effort_limit: {value: 6.0", "effort_limit: {value: .nan", "effort_limit is nan N m; expected a finite"),
         ("    actuator:", "    motor:", "unknown parameter 'motor'; expected one of damping"),
         ("0.05086984812807257", "0.00086984812807257", "give no positive inertia at shoulder = 0 rad, elbow ="),

@@ -95,7 +95,11 @@ class SimulatorNode(PollingNode):
         # Where a file's timestep makes periods as long as that, each command would be too old when it is applied.
         least = _LEAST_PERIODS * self._dt
         limits = limits_from_parameters(
-            values, self._plant.effort_limits, joints=len(self._coordinates.joints), least_command_timeout=least
+            values,
+            self._plant.effort_limits,
+            joints=len(self._coordinates.joints),
+            unit=self._coordinates.drive_unit,
+            least_command_timeout=least,
         )
         self._supervisor = SharedSupervisor(
             limits, self._preflight, coordinates=self._coordinates, follows=self._servo is not None

@@ -212,7 +212,7 @@ def test_a_trajectory_is_refused_by_a_machine_that_cannot_be_moved_by_one() -> N
         ({"effort_strategy": "effort_loop"}, "effort_strategy is 'effort_loop', which is for one module"),
         ({"initial_positions": [0.0, 0.0, 0.0]}, "expected 2, for cart [m], pole [rad], or one for all"),
         ({"position_window": [-1.0, 1.0]}, "position_window has 2 values; expected 4"),
-        ({"effort_limit": 11.0}, "effort_limit is 11.0 N m; expected at most 10.0 N m"),
+        ({"effort_limit": 11.0}, "effort_limit is 11.0 N; expected at most 10.0 N, the limit of the plant file"),
     ],
 )
 def test_parameters_that_do_not_fit_the_joints_are_refused_in_a_sentence(given: dict[str, Any], sentence: str) -> None:
@@ -283,6 +283,24 @@ def test_a_fault_of_any_joint_ends_all_torque_in_time_and_is_told_by_its_name(
     assert not any(drive.on for drive in machine.emulated.drives)
 
 
+def test_faults_of_a_cart_are_told_in_metres_and_newtons() -> None:
+    machine = held()
+    machine.emulated.faults[0].add(ActuatorFault.VELOCITY_NAN)
+    machine.cycles(20)
+    assert "cart: velocity reads nan m/s" in machine.supervisor.reason
+    refusal = Machine(measured_effort_limit=1e-9).arm()
+    assert re.search(r"cart: measured force is \S+ N; expected at most 1e-09 N$", refusal)
+
+
+def test_an_effort_for_a_cart_that_is_no_number_is_refused_in_newtons() -> None:
+    machine = held()
+    sample = machine.bridge.sample
+    assert sample is not None
+    machine.answer(sample._replace(stamp_ns=machine.clock.now_ns()), (math.nan,))
+    problem = machine.supervisor.gates[Input.EFFORT_COMMAND].problems[Refusal.NOT_FINITE]
+    assert problem == "effort is nan N; expected a finite number"
+
+
 @pytest.mark.parametrize("joint", [0, 1])
 @pytest.mark.parametrize(
     ("fault", "name"),
@@ -305,6 +323,20 @@ def test_a_drive_that_hears_nothing_stops_by_itself_and_the_other_is_switched_of
     machine.cycles(100)
     assert {machine.bridge.stop_pending} == {False}
     assert not machine.emulated.drives[joint].on
+
+
+def test_a_machine_that_nobody_read_for_a_minute_stands_still_meanwhile_and_an_armed_bridge_calls_it_a_stall() -> None:
+    machine = held()
+    before = machine.emulated.state[0]
+    machine.clock.wait_until(machine.clock.now_ns() + 60 * SECOND)
+    machine.bridge.observe(0.0)
+    assert machine.bridge.faults == {"host_stalled": 1}
+    assert machine.supervisor.reason.startswith("host_stalled: bridge did not run for 600")
+    assert not machine.driving()
+    assert machine.emulated.stood_still == pytest.approx(59.0, abs=0.01)
+    # The second that is caught up with begins where the machine was: a pole that is 0.02 rad off falls in it, once.
+    assert machine.emulated.state[0] != before
+    assert abs(machine.emulated.state[0][0] - before[0]) < 2.0
 
 
 def test_a_bridge_that_dies_leaves_torque_for_the_lifetime_of_its_last_command() -> None:

@@ -76,6 +76,11 @@ class JointPort:
             if self.now_ns() < target:
                 return None  # woken up early: the program ends
 
+    @property
+    def stood_still(self) -> float:
+        """Time for which the machine stood still, since nobody read it [s]."""
+        return self.machine.stood_still
+
     def set_feedback_rate(self, rate: float) -> float:
         """Set the feedback rate of the whole machine [Hz]."""
         self._require_connection()

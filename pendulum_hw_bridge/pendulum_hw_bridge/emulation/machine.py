@@ -28,6 +28,9 @@ __all__ = ["EmulatedMachine"]
 
 _STEP_NS = 1_000_000
 """Longest step of the integration [ns]."""
+_CATCH_UP_NS = NANOSECONDS
+"""Longest time that is caught up with in one go [ns]: a second costs about 30 ms, a minute would block the actuator's
+thread for two seconds."""
 _KEPT = 1000
 """Records of a joint that wait to be fetched; older ones are lost, as on a network."""
 
@@ -113,6 +116,7 @@ class EmulatedMachine:
         self._inbox: list[tuple[int, int, int, float]] = []
         self._acts: deque[tuple[int, int, float]] = deque()
         self._deliveries = 0
+        self._stood_still_ns = 0
         self._sequence = 0
         self._outboxes: tuple[deque[Feedback], ...] = tuple(deque(maxlen=_KEPT) for _ in joints)
 
@@ -127,6 +131,11 @@ class EmulatedMachine:
     def rate(self) -> float:
         """Feedback records per second [Hz]."""
         return NANOSECONDS / self._period_ns
+
+    @property
+    def stood_still(self) -> float:
+        """Time for which nobody moved it on, and it stood still instead of catching up [s]."""
+        return self._stood_still_ns / NANOSECONDS
 
     def set_rate(self, rate: float) -> None:
         """Send another number of records per second, from now on [Hz]."""
@@ -190,12 +199,13 @@ class EmulatedMachine:
         return self._next_sample_ns + round(self.hardware.feedback_delay * NANOSECONDS)
 
     def advance_to(self, time_ns: int, *, wholly: bool = False) -> None:
-        """Let everything happen that is due by a time.
+        """Let everything happen that is due by a time, of a long one the last second alone.
 
         Args:
             time_ns: The time [ns].
             wholly: Move the mechanism on to that very time, not only to the last event before it.
         """
+        self._skip(time_ns - self._next_sample_ns - _CATCH_UP_NS)
         while True:
             due = self._next_sample_ns
             if self._inbox:
@@ -227,6 +237,14 @@ class EmulatedMachine:
                     f"initial {joint.name} is {value} {joint.unit}; expected {low} to {high}, between its stops"
                 )
         return tuple(float(value) for value in position)
+
+    def _skip(self, late_ns: int) -> None:
+        """Let a time pass in which the mechanism stands still [ns]; a command's lifetime goes by all the same."""
+        if late_ns > 0:
+            late_ns -= late_ns % self._period_ns
+            self._now_ns += late_ns
+            self._next_sample_ns += late_ns
+            self._stood_still_ns += late_ns
 
     def _flow(self, time_ns: int) -> None:
         """Integrate up to a time, between events."""

@@ -46,16 +46,20 @@ class CommandGate:
         timeout: Age beyond which a command counts for nothing [s], > 0.
         joints: The joints that commands must be for, in this order; an empty list of names means the only one.
         partial: Whether a command may be for some of the joints, in their order; the others get nothing.
+        unit: Unit of the efforts, for messages.
 
     Attributes:
         refused: How many were refused, by reason.
         problems: Of each reason's newest refusal, the field of the message, its value and what was expected.
     """
 
-    def __init__(self, timeout: float, *, joints: tuple[str, ...] = (JOINT,), partial: bool = False) -> None:
+    def __init__(
+        self, timeout: float, *, joints: tuple[str, ...] = (JOINT,), partial: bool = False, unit: str = "N m"
+    ) -> None:
         self.timeout_ns = round(timeout * NANOSECONDS)
         self.joints = joints
         self.partial = partial and len(joints) > 1
+        self.unit = unit
         self.refused: Counter[Refusal] = Counter()
         self.problems: dict[Refusal, str] = {}
         self.accepted = 0
@@ -181,7 +185,7 @@ class CommandGate:
         return {
             Refusal.NOT_ONE_JOINT: self._names_problem(command),
             Refusal.OTHER_JOINT: self._names_problem(command),
-            Refusal.NOT_FINITE: f"effort is {written(command.effort)} N m; expected a finite number"
+            Refusal.NOT_FINITE: f"effort is {written(command.effort)} {self.unit}; expected a finite number"
             if len(command.effort) == 1
             else f"effort is {written(command.effort)}; expected finite numbers",
             Refusal.TOO_OLD: f"header.stamp is {age:.6g} s before the plant's time; expected at most "

@@ -140,6 +140,7 @@ def limits_from_parameters(
     plant_effort_limits: Vector,
     *,
     joints: int = 1,
+    unit: str = "N m",
     feedback_timeout: float = float("inf"),
     least_command_timeout: float = 0.0,
 ) -> PlantLimits:
@@ -150,6 +151,7 @@ def limits_from_parameters(
         plant_effort_limits: Effort limit of each driven joint in the plant file [N m or N]; the parameter can only
             lower them.
         joints: How many joints the plant has.
+        unit: Unit of the efforts, for messages: the ``drive_unit`` of the plant's coordinates.
         feedback_timeout: Age of a measurement that faults an armed plant [s].
         least_command_timeout: The shortest that the plant's own period allows; a shorter one is raised to it [s].
 
@@ -171,7 +173,7 @@ def limits_from_parameters(
     wanted = number("effort_limit")
     if wanted > largest:
         raise ParameterError(
-            f"effort_limit is {wanted} N m; expected at most {largest} N m, the limit of the plant file"
+            f"effort_limit is {wanted} {unit}; expected at most {largest} {unit}, the limit of the plant file"
         )
     unlimited = float("inf")
     ends = [

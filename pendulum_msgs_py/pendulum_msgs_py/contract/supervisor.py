@@ -59,14 +59,14 @@ class PlantSupervisor:
 
     def __post_init__(self) -> None:
         """Make one gate per input."""
-        joints, driven = self.coordinates.names, self.coordinates.driven_names
+        joints, driven, unit = self.coordinates.names, self.coordinates.driven_names, self.coordinates.drive_unit
         self.limits = self.limits.for_joints(len(joints), len(driven))
         self.follows = self.follows and len(joints) == 1
         timeout = self.limits.command_timeout
         self.gates = {
-            Input.EFFORT_COMMAND: CommandGate(timeout, joints=driven),
-            Input.DISTURBANCE: CommandGate(timeout, joints=driven, partial=True),
-            Input.PUSH: CommandGate(timeout, joints=joints, partial=True),
+            Input.EFFORT_COMMAND: CommandGate(timeout, joints=driven, unit=unit),
+            Input.DISTURBANCE: CommandGate(timeout, joints=driven, partial=True, unit=unit),
+            Input.PUSH: CommandGate(timeout, joints=joints, partial=True, unit=self.coordinates.units[2]),
         }
         self._joints = len(joints)
         self._nothing = (0.0,) * len(driven)
@@ -285,18 +285,19 @@ class PlantSupervisor:
     def _take_over_refusal(self, command: JointCommand, now_ns: int) -> str:
         """Return why a command may not take over from position control, or an empty string."""
         # What it asks for, not what the limit leaves of it: with a low limit all would look near.
-        largest, asked = self.limits.handover_effort, f"{command.effort[0]:.2f} N m"
+        unit = self.coordinates.drive_unit
+        largest, asked = self.limits.handover_effort, f"{command.effort[0]:.2f} {unit}"
         # A controller for another place: awake at the bottom, one for upright asks for all it has.
         jump = abs(command.effort[0] - self._applied[0])
         waiting = self._disturbances.fresh(now_ns)
         if jump <= largest and waiting is not None:
-            largest, asked = self.limits.handover_sum, f"{asked} and the disturbance for {waiting.effort[0]:.2f} N m"
+            largest, asked = self.limits.handover_sum, f"{asked} and the disturbance for {waiting.effort[0]:.2f} {unit}"
             jump = abs(command.effort[0] + waiting.effort[0] - self._applied[0])
         if jump <= largest:
             return ""
         return (
-            f"{command.source or 'a controller'} asks for {asked}, {jump:.2f} N m from what holds; "
-            f"expected at most {largest} N m"
+            f"{command.source or 'a controller'} asks for {asked}, {jump:.2f} {unit} from what holds; "
+            f"expected at most {largest} {unit}"
         )
 
     def _hold(

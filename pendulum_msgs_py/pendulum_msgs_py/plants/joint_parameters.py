@@ -14,12 +14,17 @@ from pendulum_msgs_py.plants.quantities import Quantity, read_quantities, specs_
 __all__ = ["Actuator", "JointParameters", "actuator_specs", "check_joint", "joint_specs", "read_joint"]
 
 
+_LARGEST_EFFORT = 1e4
+"""More than any joint's drive gives, those of the largest robots included [N m or N]: beyond it a unit is wrong."""
+
+
 @dataclass(frozen=True)
 class Actuator:
     """The motor of one joint; ``effort_unit`` is the joint's."""
 
     effort_limit: Annotated[
-        float, Quantity("effort_unit", "Largest effort of the actuator.", positive=True, example=1.0)
+        float,
+        Quantity("effort_unit", "Largest effort of the actuator.", positive=True, example=1.0, largest=_LARGEST_EFFORT),
     ]
     time_constant: Annotated[float, Quantity("s", "First-order lag between command and effort.")] = 0.0
     transport_delay: Annotated[float, Quantity("s", "Time between a command and its first effect.")] = 0.0

@@ -32,6 +32,7 @@ class Quantity(NamedTuple):
         positive: Zero is refused.
         signed: Below zero is allowed.
         example: Shown as the default where a value must be given.
+        largest: What no such thing exceeds; None for any.
     """
 
     unit: str
@@ -39,6 +40,7 @@ class Quantity(NamedTuple):
     positive: bool = False
     signed: bool = False
     example: float = 0.0
+    largest: float | None = None
 
 
 def specs_of(kind: type[Any]) -> tuple[ParameterSpec, ...]:
@@ -53,7 +55,7 @@ def specs_of(kind: type[Any]) -> tuple[ParameterSpec, ...]:
             found.append(
                 ParameterSpec(
                     entry.name, default, quantity.unit, quantity.description,
-                    minimum=minimum, exclusive_minimum=quantity.positive,
+                    minimum=minimum, maximum=quantity.largest, exclusive_minimum=quantity.positive,
                 )
             )  # fmt: skip
     return tuple(found)
