@@ -123,6 +123,8 @@ class BridgeNode(LifecycleNode, PollingNode):
             self._interface.watch_inputs()
         self._interface.hardware_id = assembly.hardware
         self._e_stop_input: EStopInputServer | None = None
+        names = assembly.coordinates.names
+        self._several = names if len(names) > 1 else ()
         self._feedback = self.create_publisher(JointState, "actuator/feedback", _FEEDBACK_QOS)
         self._temperature = self.create_publisher(Temperature, "actuator/winding_temperature", _FEEDBACK_QOS)
         self._supply = self.create_publisher(BatteryState, "actuator/supply", _FEEDBACK_QOS)
@@ -335,8 +337,7 @@ class BridgeNode(LifecycleNode, PollingNode):
 
     def _on_state(self, sample: JointSample, records: tuple[Feedback, ...]) -> None:
         self._interface.publish_state(sample)
-        if len(records) == 1:
-            self._feedback.publish(encode_feedback(records[0]))
+        self._feedback.publish(encode_feedback(records, self._several))
 
     def _on_outcome(self, stamp_ns: int, outcome: Outcome) -> None:
         self._interface.publish_applied(stamp_ns, outcome.effort)
@@ -376,8 +377,7 @@ class BridgeNode(LifecycleNode, PollingNode):
         # Before the first step nobody need be listening yet, and two runs must publish the same.
         assert self._lockstep_loop is not None
         if self._lockstep_loop.started:
-            if len(bridge.records) == 1:
-                self._feedback.publish(encode_feedback(bridge.records[0]._replace(stamp_ns=stamp_ns)))
+            self._feedback.publish(encode_feedback(bridge.records, self._several, stamp_ns))
             if (stamp_ns - LOCKSTEP_EPOCH_NS) % round(_SLOW_PERIOD * NANOSECONDS) < self._period_ns:
                 self._publish_slow(stamp_ns)
         bridge.sample = sample = sample._replace(stamp_ns=stamp_ns)

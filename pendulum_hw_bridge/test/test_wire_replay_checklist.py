@@ -24,6 +24,7 @@ from pendulum_hw_bridge.feedback_message import QUANTITIES, encode_feedback
 from pendulum_hw_bridge.gains import DEFAULT_GAINS
 from pendulum_msgs_py.errors import DataError, ParameterError, PendulumError
 from pendulum_msgs_py.parameters import validate
+from tests.bag_messages import joint_state, write_bag
 
 
 def a_record() -> Feedback:
@@ -120,9 +121,21 @@ def test_an_address_in_use_is_told() -> None:
         EmulatorServer(SERVED.actuator, SERVED.address)
 
 
+def test_records_of_several_modules_are_one_message_with_the_joint_before_each_quantity() -> None:
+    first, second = a_record(), a_record()._replace(position=-0.25, stamp_ns=a_record().stamp_ns + 5)
+    message = deserialize_message(encode_feedback([second, first], ("cart", "pole")), JointState)
+    assert list(message.name) == [f"{joint}/{name}" for joint in ("cart", "pole") for name in QUANTITIES]
+    read = dict(zip(message.name, message.position, strict=True))
+    assert (read["cart/position"], read["pole/position"]) == (-0.25, first.position)
+    assert read["pole/processor_temperature"] == first.processor_temperature
+    assert message.header.stamp.nanosec == first.stamp_ns % 1_000_000_000  # as old as the oldest part
+    stamped = deserialize_message(encode_feedback([first], (), 7), JointState)
+    assert (stamped.header.stamp.sec, stamped.header.stamp.nanosec) == (0, 7)
+
+
 def test_the_full_record_is_a_joint_state_that_ros_reads() -> None:
     record = a_record()
-    message = deserialize_message(encode_feedback(record), JointState)
+    message = deserialize_message(encode_feedback([record]), JointState)
     assert tuple(message.name) == QUANTITIES
     read = dict(zip(message.name, message.position, strict=True))
     assert read["position"] == record.position
@@ -207,6 +220,16 @@ def test_a_bag_is_replayed_and_one_that_is_no_recording_is_refused(tmp_path: Pat
     (file,) = (tmp_path / "bag").glob("*.mcap")
     file.write_bytes(file.read_bytes()[:200])
     with pytest.raises(DataError, match=r"bag .* cannot be read: \S+"):
+        load_feedback(tmp_path / "bag")
+
+
+@pytest.mark.parametrize("topic", ["joint_states", "actuator/feedback"])
+def test_a_bag_of_several_joints_is_refused_instead_of_replaying_the_first(tmp_path: Path, topic: str) -> None:
+    prefix = "" if topic == "joint_states" else "/position"
+    names = [f"{joint}{prefix}" for joint in ("cart", "pole")]
+    data = joint_state(1_700_000_000_000_000_000, "", names, [0.1, 3.1], [0.0, 0.0], [0.0, 0.0])
+    write_bag(tmp_path / "bag", [(f"/hw/{topic}", 1_700_000_000_000_000_000, data)], seal_every=1)
+    with pytest.raises(DataError, match=r"is of several joints \(cart, pole\); expected feedback of one module$"):
         load_feedback(tmp_path / "bag")
 
 

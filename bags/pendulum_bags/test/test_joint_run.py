@@ -169,3 +169,24 @@ def test_the_sides_that_fell_are_told_with_their_times(
     with pytest.raises(FaultError, match=message):
         record_joints(tmp_path, JointSettings("acrobot"), tmp_path / "machine.yaml")
     assert recorded == ["sim", "hw"]
+
+
+@pytest.mark.parametrize(
+    ("command", "instead"),
+    [
+        ("thesis", "experiment joints --plant cart_pole"),
+        ("monte_carlo", "simulate_mechanisms of pendulum_sim.mechanism_batch"),
+        ("region_of_attraction", "make_mechanism_controller of pendulum_lqr.mechanism_controllers"),
+        ("frequency_response", "experiment joints --plant cart_pole, which compares in time"),
+    ],
+)
+def test_an_experiment_for_one_joint_names_what_does_it_for_several(
+    command: str, instead: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    from pendulum_bags.experiments.experiment_cli import main
+
+    assert main([command, "--plant", "cart_pole"]) == 2
+    said = capsys.readouterr().err
+    assert said.startswith("error: plant is cart_pole, which has several joints; expected one of one joint, or ")
+    assert instead in said
+    assert said.count("\n") == 1

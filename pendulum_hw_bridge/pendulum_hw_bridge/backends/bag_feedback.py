@@ -95,6 +95,12 @@ def _columns(folder: Path) -> dict[str, list[float]]:
                     "expected sensor_msgs/msg/JointState"
                 )
             message: Any = store.deserialize_cdr(raw, connection.msgtype)
+            several = sorted({name.partition("/")[0] for name in message.name if "/" in name} or set(message.name))
+            if len(several) > 1 and (ending == "joint_states" or "/" in message.name[0]):
+                raise DataError(
+                    f"bag {folder}: topic {connection.topic} is of several joints ({', '.join(several)}); expected "
+                    "feedback of one module"
+                )
             stamp = message.header.stamp.sec + message.header.stamp.nanosec * 1e-9
             if ending == "joint_states":
                 values = {name: getattr(message, name)[0] for name in ("position", "velocity", "effort")}

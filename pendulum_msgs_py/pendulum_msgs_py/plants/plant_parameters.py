@@ -52,6 +52,7 @@ __all__ = [
     "load_plant_file",
     "plant_document",
     "read_plant_document",
+    "require_one_joint",
     "resolve_plant",
     "save_document",
     "write_plant",
@@ -341,6 +342,22 @@ def is_mechanism(preset_or_path: str | Path) -> bool:
         ParameterError: No such preset or file.
     """
     return load_yaml(resolve_plant(preset_or_path), "plant file").get("format") == MECHANISM_FORMAT
+
+
+def require_one_joint(preset_or_path: str | Path, instead: str) -> None:
+    """Refuse a plant of several joints.
+
+    Args:
+        preset_or_path: Preset or plant file.
+        instead: What does something like it for several joints, for the message.
+
+    Raises:
+        ParameterError: It is one, or there is no such preset or file.
+    """
+    if is_mechanism(preset_or_path):
+        raise ParameterError(
+            f"plant is {preset_or_path}, which has several joints; expected one of one joint, or {instead}"
+        )
 
 
 def _names(specs: Sequence[ParameterSpec]) -> str:

@@ -32,8 +32,8 @@ _UNCHANGED = frozenset(
 )
 """Values of a plant file that nobody has to identify: constants, limits, and what belongs to a model of friction."""
 _DELAY = "transport_delay"
-_NOISE_SHARE = 0.1
-"""Amplitude of the noise as a share of the joint's effort limit [-]: the LQR holds every preset under it on both sides,
+_LIMIT_PER_NOISE = 10.0
+"""Effort limit of the joint per amplitude of the noise [-]: the LQR holds every preset under it on both sides,
 the acrobot and the pendubot with dry friction up to 0.16, and their joints slide in it instead of standing still."""
 _SLIDING = 0.5
 """Velocity at which a design takes the dry friction of passive joints [rad/s or m/s]: that of the joints under this
@@ -80,7 +80,7 @@ class JointSettings:
         object.__setattr__(self, "joint", self.joint or driven[0])
         if self.amplitude is None:
             limit = plant.effort_limits[driven.index(self.joint)]
-            object.__setattr__(self, "amplitude", _NOISE_SHARE * limit)
+            object.__setattr__(self, "amplitude", limit / _LIMIT_PER_NOISE)
         for name in ("amplitude", "hold_time", "duration", "period"):
             value = getattr(self, name)
             if not (math.isfinite(value) and value > 0.0):

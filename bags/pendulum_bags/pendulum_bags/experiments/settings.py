@@ -16,7 +16,7 @@ from pendulum_bags.runs.run_record import RUN_RECORD, STAND_IN
 from pendulum_lqr.controller import controller_parameters
 from pendulum_lqr.policy_file import POLICY_SUFFIX, load_policy, policy_record
 from pendulum_msgs_py.errors import ParameterError
-from pendulum_msgs_py.plants.plant_parameters import is_mechanism
+from pendulum_msgs_py.plants.plant_parameters import require_one_joint
 from pendulum_msgs_py.programs import graph
 from pendulum_msgs_py.programs.graph import NodeProgram
 from pendulum_sim.engines import GYMNASIUM_PREFIX
@@ -104,11 +104,7 @@ class RegulationSettings:
             raise ParameterError("controller is 'policy' without a file; expected the path of a policy file (.npz)")
         if self.kind == "policy":
             load_policy(self.controller)
-        if is_mechanism(self.plant):
-            raise ParameterError(
-                f"plant is {self.plant}, which has several joints; expected one of one joint here, or "
-                f"python -m pendulum_bags experiment joints --plant {self.plant}"
-            )
+        require_one_joint(self.plant, f"python -m pendulum_bags experiment joints --plant {self.plant}")
         object.__setattr__(self, "method", integrator_of(self.plant, self.method))
         by_name = self.hardware in HARDWARE or self.hardware.startswith((PREFIX, GYMNASIUM_PREFIX))
         if not by_name and Path(self.hardware).suffix.lower() not in _MODEL_FILES:

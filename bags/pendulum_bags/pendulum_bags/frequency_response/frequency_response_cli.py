@@ -114,7 +114,9 @@ def experiment(
     from pendulum_lqr.controller_response import require_time_invariant
     from pendulum_lqr.gap_metric import Scaling
     from pendulum_lqr.policy_file import named_controller
+    from pendulum_msgs_py.plants.plant_parameters import require_one_joint
 
+    require_one_joint(plant, f"python -m pendulum_bags experiment joints --plant {plant}, which compares in time")
     scaling = Scaling(angle, velocity, torque)
     kind, parameters = named_controller(controller)
     require_time_invariant(kind)

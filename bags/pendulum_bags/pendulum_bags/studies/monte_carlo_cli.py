@@ -51,7 +51,9 @@ def monte_carlo(
     from pendulum_bags.studies import monte_carlo as engine
     from pendulum_bags.studies.chunks import cluster_client
     from pendulum_bags.studies.uncertain import parse_uncertainty
+    from pendulum_msgs_py.plants.plant_parameters import require_one_joint
 
+    require_one_joint(plant, "simulate_mechanisms of pendulum_sim.mechanism_batch, which runs many plants of several")
     settings = engine.MonteCarlo(
         plant=plant,
         runs=runs,

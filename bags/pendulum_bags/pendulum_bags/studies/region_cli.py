@@ -49,7 +49,12 @@ def region_of_attraction(
     from pendulum_bags.studies.region_figure import region_sentence, write_region_figure
     from pendulum_bags.studies.region_map import RegionMap, run_region_map
     from pendulum_bags.studies.uncertain import parse_uncertainty
+    from pendulum_msgs_py.plants.plant_parameters import require_one_joint
 
+    require_one_joint(
+        plant,
+        "make_mechanism_controller of pendulum_lqr.mechanism_controllers, which samples a region",
+    )
     settings = RegionMap(
         plant=plant,
         uncertainty=parse_uncertainty(uncertainty, plant),
