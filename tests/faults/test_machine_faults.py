@@ -349,6 +349,20 @@ def test_a_bridge_that_dies_leaves_torque_for_the_lifetime_of_its_last_command()
     assert max(map(abs, machine.emulated.state[2])) < 1e-3
 
 
+def test_a_disturbance_that_is_frozen_or_killed_loses_its_share_and_the_controller_goes_on() -> None:
+    machine = held("double_pendulum")
+    sample = machine.bridge.sample
+    assert sample is not None
+    noise = JointCommand(machine.clock.now_ns(), (2.0,), "disturbance", ("shoulder",))
+    assert machine.supervisor.offer(Input.DISTURBANCE, noise, machine.clock.now_ns()) is None
+    machine.cycles(2)
+    assert machine.outcomes[-1].drive.disturbance == (2.0, 0.0)
+    machine.cycles(round(0.06 * machine.emulated.rate))
+    assert machine.outcomes[-1].drive.disturbance == (0.0, 0.0)
+    assert machine.outcomes[-1].drive.controller != (0.0, 0.0)
+    assert machine.supervisor.mode is Mode.EFFORT
+
+
 def test_without_a_controller_the_torque_is_zero_and_comes_back_with_it() -> None:
     machine = held()
     machine.answering = False
