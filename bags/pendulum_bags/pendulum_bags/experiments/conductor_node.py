@@ -306,14 +306,14 @@ class PlantClient:
         stamp_ns = self.sample.stamp_ns if self.sample else 0
         self._events.publish(event_message(stamp_ns, name, **details))
 
-    def has_event(self, name: str) -> Mapping[str, Any] | None:
+    def newest_event(self, name: str) -> Mapping[str, Any] | None:
         """Return the newest event of a name, or None."""
         return next((event for event in reversed(self.events) if event["name"] == name), None)
 
     def newest_mode(self) -> str:
         """Return the plant's mode, as its newest event says; empty where none was heard."""
-        modes = [str(event.get("mode")) for event in self.events if event["name"] == Event.PLANT_MODE]
-        return modes[-1] if modes else ""
+        event = self.newest_event(Event.PLANT_MODE)
+        return "" if event is None else str(event.get("mode"))
 
     def is_armed(self) -> bool:
         """Tell whether torque may flow."""
@@ -330,7 +330,7 @@ class PlantClient:
 
     def check_mode(self) -> None:
         """Raise a PlantStoppedError where the plant has faulted or been stopped."""
-        mode = self.has_event(Event.PLANT_MODE)
+        mode = self.newest_event(Event.PLANT_MODE)
         if mode is not None and mode.get("mode") in {"fault", "e_stop"}:
             raise PlantStoppedError(self.namespace, str(mode["mode"]), str(mode.get("reason")))
 

@@ -252,7 +252,7 @@ def _require_rest(conductor: Conductor, plant: PlantClient) -> None:
 
 
 def _is_armed(plant: PlantClient, *, may_arm: bool) -> bool:
-    mode = plant.has_event(Event.PLANT_MODE)
+    mode = plant.newest_event(Event.PLANT_MODE)
     if mode is not None and str(mode.get("mode", "")).startswith("armed"):
         return True
     if not may_arm:
@@ -274,4 +274,4 @@ def _watch(plant: PlantClient, play: ExcitationPlay) -> bool:
                 f"{plant.namespace} is at {value:.3g} {unit}; expected at most {limit:.3g} {unit}: the plant is not "
                 "what the excitation was designed for; it is disarmed"
             )
-    return plant.has_event(Event.NOISE_END) is not None
+    return plant.newest_event(Event.NOISE_END) is not None

@@ -218,4 +218,4 @@ def _wait_for_end(conductor: Conductor, plant: PlantClient, duration: float) -> 
 
 def _is_finished(plant: PlantClient) -> bool:
     plant.check_mode()
-    return plant.has_event(Event.LOCKSTEP_FINISHED) is not None
+    return plant.newest_event(Event.LOCKSTEP_FINISHED) is not None

@@ -145,7 +145,7 @@ def _regulate(
 def _noise_ended(plant: PlantClient) -> bool:
     plant.check_mode()
     plant.check_alive()
-    return plant.has_event(Event.NOISE_END) is not None
+    return plant.newest_event(Event.NOISE_END) is not None
 
 
 def _start_own_protocol(processes: ProcessSet, folder: Path, settings: RegulationSettings) -> Child:

@@ -224,7 +224,7 @@ def _run_trial(
         longest = _LONGEST_BY_HAND if settings.by_person else START_TIMEOUT + _SLOWEST * settings.expected_duration
         conductor.wait_for(f"the end of trial {trial}", lambda: _has_ended(plant, lockstep=lockstep), longest)
         if lockstep:
-            finished = plant.has_event(Event.LOCKSTEP_FINISHED)
+            finished = plant.newest_event(Event.LOCKSTEP_FINISHED)
             assert finished is not None
             session.close_in_lockstep(recorder, plant, 1 + int(finished["steps"]))
         session.let_go()
@@ -234,10 +234,10 @@ def _run_trial(
 
 def _has_ended(plant: PlantClient, *, lockstep: bool) -> bool:
     plant.check_mode()
-    if failed := plant.has_event(Event.TRIAL_FAILED):
+    if failed := plant.newest_event(Event.TRIAL_FAILED):
         raise FaultError(f"{plant.namespace}: {failed.get('reason')}")
-    ended = plant.has_event(Event.TRIAL_END) is not None
-    return ended and (not lockstep or plant.has_event(Event.LOCKSTEP_FINISHED) is not None)
+    ended = plant.newest_event(Event.TRIAL_END) is not None
+    return ended and (not lockstep or plant.newest_event(Event.LOCKSTEP_FINISHED) is not None)
 
 
 def _topics(settings: TrialSettings) -> dict[str, int]:
