@@ -46,6 +46,11 @@ def design(name, plant, playback_file, period=0.01, **values):
     return make_controller(name, plant, period, values)
 
 
+def test_playback_refuses_an_angle_to_hold(playback_file):
+    with pytest.raises(DataError, match="set_point is 0.3 rad; expected 0: a recorded torque aims at no angle"):
+        design("playback", load_plant("dfki"), playback_file, set_point=0.3)
+
+
 @pytest.mark.parametrize("name", CONTROLLERS)
 def test_every_controller_answers_within_its_limit_and_repeats_itself_after_a_reset(name, playback_file):
     controller = design(name, DFKI, playback_file, effort_limit=1.2)

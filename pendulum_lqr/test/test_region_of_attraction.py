@@ -1,6 +1,7 @@
 """The proven part of the region of attraction against simulation, and its limits."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -58,6 +59,18 @@ def test_a_larger_limit_proves_a_larger_set():
     levels = [proven_level(DFKI, gain, limit) for limit in (0.5, 1.5, 3.0)]
     assert levels == sorted(levels)
     assert levels[0] < levels[-1]
+
+
+def test_offsets_of_angle_and_torque_count_in_what_is_proven():
+    def level(plant, theta):
+        return proven_level(plant, continuous_lqr(linearise(plant, theta), (10.0, 1.0), 1.0), 1.5, theta)
+
+    straight = level(DFKI, math.pi)
+    turned = replace(DFKI, angle_offset=0.1)
+    assert level(turned, math.pi + 0.1) == pytest.approx(straight, rel=1e-6)
+    assert level(turned, math.pi) < 0.99 * straight
+    # Torque that stands against an offset is torque that is not there to catch with.
+    assert level(replace(DFKI, torque_offset=0.5), math.pi) < 0.99 * straight
 
 
 def test_the_proven_set_never_reaches_around_the_circle():

@@ -57,6 +57,8 @@ def test_what_nobody_disturbs_is_measured_once_and_answered(experiment: RunningP
     assert summary["answer"]["mark"] in {"yes", "no", "undecided"}
     answer = summary["answer"]["sentence"]
     assert answer in " ".join(experiment.output.split())
+    assert "Tests of the same run: " in experiment.output
+    assert re.search(r"^│ delay \[ms\] ", experiment.output, re.MULTILINE)
     page = html.unescape(re.sub(r"<[^>]*>", "", (run_folder / "report.html").read_text(encoding="utf-8")))
     # (the page says yes or no by itself, and then why)
     assert answer.partition(": ")[2].lower() in " ".join(page.split()).lower()

@@ -16,6 +16,7 @@ from pendulum_bags.runs.datasets import Recording, distinct_names
 from pendulum_bags.runs.read_recording import read_recording
 from pendulum_msgs_py.errors import DataError
 from pendulum_msgs_py.plants.plant_parameters import PlantParameters
+from tests.bag_messages import joint_state, write_bag
 from tests.synthetic_recordings import multisine, synthetic_recording
 
 TRUTH = PlantParameters(inertia=0.05, damping=0.03, gravity=1.5, coulomb_friction=0.05, transport_delay=0.006)
@@ -215,6 +216,22 @@ def test_a_wrapped_angle_is_unwrapped_with_a_word_in_radians_and_degrees(tmp_pat
     result = identify([again], QUICK, profiles=0)
     assert result.model["gravity"] == pytest.approx(1.5, rel=2e-2)
     assert any("it was wrapped" in sentence for sentence in result.sentences())
+
+
+def test_a_wrapped_angle_of_a_bag_is_unwrapped_too(tmp_path):
+    recording = run(4, amplitude=2.5)
+    turned = np.angle(np.exp(1j * recording.position)).tolist()
+    velocity = np.gradient(recording.position, recording.time).tolist()
+    joint = ["pendulum_joint"]
+    messages = []
+    for index, time in enumerate(recording.time):
+        stamp = 1_700_000_000_000_000_000 + round(float(time) * 1e9)
+        state = joint_state(stamp, "", joint, [turned[index]], [velocity[index]], [0.0])
+        applied = joint_state(stamp, "", joint, [], [], [float(recording.input[index])])
+        messages += [("/hw/joint_states", stamp, state), ("/hw/applied_effort", stamp, applied)]
+    read = read_recording(write_bag(tmp_path / "bag", messages, seal_every=1000))
+    assert read.meta["unwrapped"] > 0
+    np.testing.assert_allclose(np.diff(read.position), np.diff(recording.position)[: len(read.position) - 1], atol=1e-9)
 
 
 def test_an_angle_that_jumps_by_no_turn_is_refused(tmp_path, known):

@@ -57,6 +57,8 @@ class Playback(BaseController):
     @classmethod
     def design(cls, plant: PlantParameters, period: float, p: Mapping[str, Any]) -> Playback:
         """Return the playback of the parameter ``file``."""
+        if p["set_point"] != 0.0:
+            raise DataError(f"set_point is {p['set_point']:g} rad; expected 0: a recorded torque aims at no angle")
         if not p["file"]:
             raise DataError("file is empty; expected the path of a CSV with the columns time [s] and effort [N m]")
         path = Path(p["file"]).expanduser()
