@@ -47,7 +47,7 @@ def design(name, plant, playback_file, period=0.01, **values):
 
 
 def test_playback_refuses_an_angle_to_hold(playback_file):
-    with pytest.raises(DataError, match="set_point is 0.3 rad; expected 0: a recorded torque aims at no angle"):
+    with pytest.raises(DataError, match=r"set_point is 0\.3 rad; expected 0: a recorded torque aims at no angle"):
         design("playback", load_plant("dfki"), playback_file, set_point=0.3)
 
 
