@@ -95,4 +95,4 @@ def test_no_effort_is_made_of_a_law_that_has_no_number() -> None:
     # Finite velocities whose terms are inf and -inf.
     first, second = (math.copysign(1e308, float(k)) for k in controller.gain.K[0, 2:])
     assert answering.answer(JointSample(1, (0.0, 0.0), (first, -second), (0.0, 0.0)), 1) is None
-    assert answering.last_reason == "controller answered nan N m"
+    assert answering.last_reason == "controller answered nan"
