@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
+from collections import Counter
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -24,6 +25,10 @@ from pendulum_msgs_py.contract.cdr import encode_joints
 from pendulum_msgs_py.contract.noise import uniform_array
 from pendulum_msgs_py.errors import DataError, ParameterError
 from pendulum_msgs_py.plants.mechanism_parameters import MechanismParameters, load_mechanism
+from pendulum_rosbag.reader import Bag
+from pendulum_rosbag.reader import bag as bag_module
+from pendulum_rosbag.reader.joint_table import JointTable, joint_table
+from pendulum_rosbag.reader.open_source import BagFolder
 from pendulum_rosbag.storage import open_writer
 from pendulum_sim.mechanism_plant import MechanismPlant
 
@@ -108,6 +113,30 @@ def test_the_same_plant_twice_is_told_alike_in_every_joint(
     assert not [name for name in tests["pole"] if "torque" in name or "force" in name]
     # Noise on the cart moves the pole too: both joints are paired by it.
     assert all("position" in one["paired"] for one in content["joints"].values())
+
+
+def test_every_topic_of_joints_is_read_once_however_many_joints_are_compared(
+    bags: dict[str, Path], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    opened: Counter[Path] = Counter()
+    tables: Counter[str] = Counter()
+
+    def open_counted(bag: Bag, folder: BagFolder, *rest: Any) -> None:
+        opened[folder.path] += 1
+        make(bag, folder, *rest)
+
+    def table_counted(messages: Any, where: str) -> JointTable:
+        tables[where] += 1
+        return joint_table(messages, where)
+
+    make = Bag.__init__
+    monkeypatch.setattr(Bag, "__init__", open_counted)
+    monkeypatch.setattr(bag_module, "joint_table", table_counted)
+    told(capsys, bags["sim"], bags["alike"])
+    assert dict(opened) == {bags["sim"]: 1, bags["alike"]: 1}
+    # States, commands and disturbance of each bag.
+    assert len(tables) == 6
+    assert set(tables.values()) == {1}
 
 
 def test_another_plant_is_told_by_the_joint_that_shows_it(

@@ -15,10 +15,11 @@ from pendulum_bags.comparison.margins import MarginArgument, Margins
 from pendulum_bags.comparison.metrics import episode_of, summarise_metrics
 from pendulum_bags.comparison.pairs import Difference, Pair, distribution_tests, interpolated_difference
 from pendulum_bags.comparison.same_run import Looks, paired_tests, unpaired_tests
-from pendulum_bags.runs.run_data import RunData, is_emulated, noise_hold_time, plant_summary, read_run
+from pendulum_bags.runs.run_data import OpenBag, RunData, is_emulated, noise_hold_time, plant_summary, read_run
 from pendulum_bags.runs.run_folder import pair_folders, read_looks, read_stalls
 from pendulum_bags.runs.run_record import run_record
 from pendulum_msgs_py.errors import BagError, DataError
+from pendulum_rosbag.reader import read_bag
 
 __all__ = ["Comparison", "compare", "compare_folders", "compare_runs"]
 
@@ -200,6 +201,7 @@ def compare_runs(
     own_protocol: PathArgument | None = None,
     margin: MarginArgument = None,
     joint: str | None = None,
+    open_bag: OpenBag = read_bag,
 ) -> Comparison:
     """Compare the bag of a simulation with that of hardware, during the noise.
 
@@ -211,6 +213,7 @@ def compare_runs(
         own_protocol: Bag of a simulation with noise of its own, for the thesis's analysis.
         margin: What difference does not matter; see :meth:`Margins.parse`.
         joint: Joint of plants of several.
+        open_bag: How bags are opened.
 
     Raises:
         BagError: A bag cannot be read.
@@ -218,9 +221,13 @@ def compare_runs(
         ParameterError: A margin is out of domain.
     """
     margins = Margins.parse(margin)
-    simulation = read_run(sim_bag, prefix=sim_prefix, label="simulation", joint=joint)
-    hardware = read_run(hw_bag, prefix=hw_prefix, label="hardware", joint=joint)
-    own = [] if own_protocol is None else [read_run(own_protocol, label="simulation, own noise", joint=joint)]
+    simulation = read_run(sim_bag, prefix=sim_prefix, label="simulation", joint=joint, open_bag=open_bag)
+    hardware = read_run(hw_bag, prefix=hw_prefix, label="hardware", joint=joint, open_bag=open_bag)
+    own = (
+        []
+        if own_protocol is None
+        else [read_run(own_protocol, label="simulation, own noise", joint=joint, open_bag=open_bag)]
+    )
     return compare([(simulation, hardware)], own=own, margin=margins)
 
 
@@ -230,6 +237,7 @@ def compare_folders(
     margin: MarginArgument = None,
     looks: Looks | None = None,
     joint: str | None = None,
+    open_bag: OpenBag = read_bag,
 ) -> Comparison:
     """Compare and pool run folders, each with ``sim``, ``hw``, and perhaps ``sim_500hz`` and repeats of the run.
 
@@ -240,6 +248,7 @@ def compare_folders(
         margin: What difference does not matter; see :meth:`Margins.parse`.
         looks: How often the data have been looked at; by default what the folders say.
         joint: Joint of plants of several.
+        open_bag: How bags are opened.
 
     Raises:
         BagError: A folder lacks one of its bags.
@@ -253,7 +262,7 @@ def compare_folders(
             left_out.append(_in_words(broken))
         places = pair_folders(folder)
         for place in places:
-            pair = _read_pair(place, joint)
+            pair = _read_pair(place, joint, open_bag)
             busy = [
                 f"{'emulated ' * is_emulated(run)}{run.label} missed {run.missed_deadlines} states"
                 for run in pair
@@ -267,7 +276,7 @@ def compare_folders(
             else:
                 pairs.append(pair)
         if (folder / "sim_500hz").is_dir():
-            own.append(read_run(folder / "sim_500hz", label="simulation, own noise", joint=joint))
+            own.append(read_run(folder / "sim_500hz", label="simulation, own noise", joint=joint, open_bag=open_bag))
     looked = looks or Looks(max(read_looks(Path(folder)) for folder in folders) if folders else 0)
     return replace(compare(pairs, own=own, margin=margins, looks=looked), left_out=tuple(left_out), stalls=stalls)
 
@@ -282,13 +291,13 @@ def _in_words(stalls: Sequence[Mapping[str, str]]) -> str:
     )
 
 
-def _read_pair(folder: Path, joint: str | None) -> tuple[RunData, RunData]:
+def _read_pair(folder: Path, joint: str | None, open_bag: OpenBag) -> tuple[RunData, RunData]:
     for name in ("sim", "hw"):
         if not (folder / name).is_dir():
             raise BagError(f"run folder {folder} has no bag {name}; expected the folders sim and hw")
     return (
-        read_run(folder / "sim", label="simulation", joint=joint),
-        read_run(folder / "hw", label="hardware", joint=joint),
+        read_run(folder / "sim", label="simulation", joint=joint, open_bag=open_bag),
+        read_run(folder / "hw", label="hardware", joint=joint, open_bag=open_bag),
     )
 
 

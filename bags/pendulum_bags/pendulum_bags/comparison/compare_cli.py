@@ -94,34 +94,37 @@ def compare(
     Example: python -m pendulum_bags compare runs/today/sim runs/today/hw --margin delay=8ms --margin spread_angle=20%
     """
     from pendulum_bags.comparison import Margins, compare_folders, compare_runs
+    from pendulum_bags.runs.kept_bags import KeptBags
     from pendulum_bags.runs.run_data import joints_of
 
     margins = Margins.of(margins_file, margin)
-    if all((path / "sim").is_dir() and (path / "hw").is_dir() for path in paths):
-        run = partial(compare_folders, paths, margin=margins)
-        joints = joints_of(paths[0] / "sim")
-    elif len(paths) == 2:
-        run = partial(
-            compare_runs,
-            *paths,
-            sim_prefix=sim_prefix,
-            hw_prefix=hw_prefix,
-            own_protocol=own_protocol,
-            margin=margins,
-        )
-        joints = joints_of(paths[0], sim_prefix)
-    else:
-        raise DataError(
-            f"got {len(paths)} paths ({', '.join(map(str, paths))}); "
-            "expected a simulation and a hardware bag, or run folders that hold sim and hw"
-        )
-    kept = [*(paths if len(paths) == 1 else ()), *(layers or ())]
-    if joints or joint:
-        if machine or design:
-            raise DataError("--machine and --design are of plants of one joint; expected neither for several")
-        told = _tell_joints({name: run(joint=name) for name in ([joint] if joint else joints)}, kept)
-    else:
-        told = _tell(run(), kept, machine, design or ())
+    with KeptBags() as bags:
+        if all((path / "sim").is_dir() and (path / "hw").is_dir() for path in paths):
+            run = partial(compare_folders, paths, margin=margins, open_bag=bags)
+            joints = joints_of(paths[0] / "sim", open_bag=bags)
+        elif len(paths) == 2:
+            run = partial(
+                compare_runs,
+                *paths,
+                sim_prefix=sim_prefix,
+                hw_prefix=hw_prefix,
+                own_protocol=own_protocol,
+                margin=margins,
+                open_bag=bags,
+            )
+            joints = joints_of(paths[0], sim_prefix, open_bag=bags)
+        else:
+            raise DataError(
+                f"got {len(paths)} paths ({', '.join(map(str, paths))}); "
+                "expected a simulation and a hardware bag, or run folders that hold sim and hw"
+            )
+        kept = [*(paths if len(paths) == 1 else ()), *(layers or ())]
+        if joints or joint:
+            if machine or design:
+                raise DataError("--machine and --design are of plants of one joint; expected neither for several")
+            told = _tell_joints({name: run(joint=name) for name in ([joint] if joint else joints)}, kept)
+        else:
+            told = _tell(run(), kept, machine, design or ())
     if out is not None:
         told.write(out)
     if json_output:

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import AbstractContextManager
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,6 +28,7 @@ __all__ = [
     "END_EVENT",
     "START_EVENT",
     "TOLERATED",
+    "OpenBag",
     "RunData",
     "find_prefix",
     "is_emulated",
@@ -41,6 +43,9 @@ __all__ = [
 
 START_EVENT = Event.NOISE_START
 END_EVENT = Event.NOISE_END
+
+OpenBag: TypeAlias = Callable[[str | os.PathLike[str]], AbstractContextManager[Bag]]
+"""How a bag is opened: ``read_bag``, or one that keeps it open for the next joint."""
 
 
 _SLIDING = frozenset(joint.name for mechanism in MECHANISMS.values() for joint in mechanism.joints if joint.unit == "m")
@@ -117,18 +122,21 @@ def find_prefix(bag: Bag) -> str:
     raise DataError(f"bag {bag.path} holds several plants ({', '.join(found)}); choose one by its namespace")
 
 
-def joints_of(path: str | os.PathLike[str], prefix: str | None = None) -> tuple[str, ...]:
+def joints_of(
+    path: str | os.PathLike[str], prefix: str | None = None, *, open_bag: OpenBag = read_bag
+) -> tuple[str, ...]:
     """Return the joints of a bag's plant of several joints, in order; none of a plant of one, which needs no choice.
 
     Args:
         path: The bag.
         prefix: As :func:`read_run` takes it.
+        open_bag: How the bag is opened.
 
     Raises:
         BagError: The bag cannot be read.
         DataError: It lacks the states.
     """
-    with read_bag(path) as bag:
+    with open_bag(path) as bag:
         topic = f"{_space(bag, prefix)}/{names.JOINT_STATES}"
         return () if isinstance(bag[topic], np.ndarray) else bag.joints(topic).names
 
@@ -178,6 +186,7 @@ def read_run(
     joint: str | None = None,
     start_ns: int | None = None,
     stop_ns: int | None = None,
+    open_bag: OpenBag = read_bag,
 ) -> RunData:
     """Read one plant's part of a bag.
 
@@ -190,12 +199,13 @@ def read_run(
         start_ns: Start of the window by the plant's stamps [ns]; by default the event ``noise_start``, or without
             one the first sample of the disturbance.
         stop_ns: End of the window [ns]; by default ``noise_end``, or the last sample of the disturbance.
+        open_bag: How the bag is opened.
 
     Raises:
         BagError: The bag cannot be read.
         DataError: It lacks the states or the window, or has other joints.
     """
-    with read_bag(path) as bag:
+    with open_bag(path) as bag:
         space = _space(bag, prefix)
         topic = f"{space}/{names.JOINT_STATES}"
         states = _increasing(bag.array(topic) if joint is None else bag.joints(topic).of(joint))

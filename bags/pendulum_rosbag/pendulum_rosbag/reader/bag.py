@@ -80,6 +80,7 @@ class Bag(Mapping[str, Any]):
                 )
             self._topics = {topic: self._topics[topic] for topic in topics}
         self._arrays: dict[str, npt.NDArray[Any] | list[StoredMessage]] = {}
+        self._tables: dict[str, JointTable] = {}
 
     @property
     def topics(self) -> dict[str, TopicInfo]:
@@ -139,7 +140,9 @@ class Bag(Mapping[str, Any]):
         Raises:
             DataError: The topic is missing, its messages are something else, or not all of the same joints.
         """
-        return joint_table(self.raw(topic), f"topic {topic} of bag {self.path}")
+        if topic not in self._tables:
+            self._tables[topic] = joint_table(self.raw(topic), f"topic {topic} of bag {self.path}")
+        return self._tables[topic]
 
     def load(self) -> Bag:
         """Read all topics now, in one pass over the files, and return the bag."""
