@@ -9,7 +9,9 @@ from pathlib import Path
 
 import pytest
 
-from tests.benchmarks import Peer, Row, measured, peer, run
+from pendulum_bags.learning.task import VARIED, value_of
+from pendulum_msgs_py.plants.plant_parameters import PlantParameters, load_plant
+from tests.benchmarks import Peer, Row, bench_learn, measured, peer, run
 from tests.benchmarks.limit_loop import build_limit
 
 
@@ -95,3 +97,17 @@ def test_an_unknown_area_is_refused_with_the_known_ones(
 
 def test_a_table_has_a_line_for_each_row() -> None:
     assert run.table([Row(what="speed", unit="1/s", ours=1.0, area="sim")]).row_count == 1
+
+
+def test_a_stand_in_of_a_machine_is_late_and_a_little_off_and_its_equal_frictions_stay_equal() -> None:
+    plant = load_plant("dfki").with_values(coulomb_friction=0.09, static_friction=0.09)
+    found = [bench_learn._stand_in(plant, seed) for seed in range(1, 201)]
+    for each in found:
+        assert isinstance(each, PlantParameters)
+        assert each.transport_delay == 0.004
+        assert each.static_friction == each.coulomb_friction
+    shares = [
+        value_of(each, name) / value_of(plant, name) for each in found for name in VARIED if value_of(plant, name)
+    ]
+    assert 0.95 <= min(shares) < 0.96
+    assert 1.04 < max(shares) <= 1.05

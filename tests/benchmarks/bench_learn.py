@@ -25,7 +25,7 @@ import numpy as np
 
 from pendulum_bags.experiments.joint_run import stand_in_for
 from pendulum_bags.learning.evaluation import Trial, is_up, measured_success, run_trial, trials_of
-from pendulum_bags.learning.task import SwingUpTask
+from pendulum_bags.learning.task import VARIED, SwingUpTask, value_of
 from pendulum_bags.ranking.prediction import judge_prediction
 from pendulum_bags.studies.leaderboard import evaluate
 from pendulum_bags.studies.leaderboard_hardware import evaluate_hardware
@@ -33,6 +33,8 @@ from pendulum_lqr.controllers.policy import START_TIME, LearnedPolicy
 from pendulum_lqr.policy import Policy
 from pendulum_lqr.policy_file import load_policy
 from pendulum_msgs_py.plants.mechanism_parameters import MechanismParameters, load_mechanism
+from pendulum_msgs_py.plants.plant_differences import AnyPlant
+from pendulum_msgs_py.plants.plant_parameters import load_plant
 from tests.benchmarks import Peer, Row, measured
 
 __all__ = ["rows"]
@@ -64,7 +66,8 @@ def rows() -> Iterator[Row]:
         yield from _pendulum_v1(Path(folder) / "v1.npz")
         yield from _swing_up(Path(folder) / "dfki.npz")
         yield from _cart_pole(Path(folder) / "cart.npz")
-        yield from _stand_ins(Path(folder) / "cart.npz", Path(folder) / "bare.npz")
+        for plant, name in ((load_plant("dfki"), "dfki"), (load_mechanism("cart_pole"), "cart")):
+            yield from _stand_ins(plant, Path(folder) / f"{name}.npz", Path(folder) / f"{name}_bare.npz")
         yield from _machine(Path(folder))
 
 
@@ -123,23 +126,34 @@ def _cart_pole(out: Path) -> Iterator[Row]:
     yield measured("cart-pole: training from start to file, CPU time", cpu, "s", at_most=600.0)
 
 
-def _stand_ins(randomised: Path, bare: Path) -> Iterator[Row]:
-    """Yield what machines take off the score of a policy for the cart-pole: second simulations, drawn as for a run."""
-    _train("--plant", "cart_pole", *_BARE_WORDS, out=bare)
-    plant = load_mechanism("cart_pole")
-    machines = [stand_in_for(plant, share=_OFF, delay=_LATE, seed=seed) for seed in range(1, 21)]
+def _stand_ins(plant: AnyPlant, randomised: Path, bare: Path) -> Iterator[Row]:
+    """Yield what machines take off the score of a policy: second simulations, drawn as ``experiment joints`` does."""
+    _train("--plant", plant.name, *_BARE_WORDS, out=bare)
+    machines = [_stand_in(plant, seed) for seed in range(1, 21)]
     for name, out, limit in (("randomised", randomised, 5.0), ("not randomised", bare, None)):
         policy = load_policy(str(out))
         sim, *others = (_time_up(policy, each) for each in (plant, *machines))
         hw = float(np.mean(others))
-        yield measured(f"cart-pole, policy {name}: score lost, simulator to {len(machines)} stand-ins of machines",
+        yield measured(f"{plant.name}, policy {name}: score lost, simulator to {len(machines)} stand-ins of machines",
                        100.0 * (1.0 - hw / sim) if sim else float("nan"), "%", at_most=limit,
                        note=f"{sim:.3f} to {hw:.3f}, worst {min(others):.3f}; off by up to {100.0 * _OFF:g} %, "
                             f"{1e3 * _LATE:g} ms late")  # fmt: skip
 
 
-def _time_up(policy: Policy, plant: MechanismParameters) -> float:
-    """Return the share of 10 s from hanging that a policy of several joints spends up, 0 where it leaves its travel."""
+def _stand_in(plant: AnyPlant, seed: int) -> AnyPlant:
+    """Return a second simulation in the place of a machine."""
+    if isinstance(plant, MechanismParameters):
+        return stand_in_for(plant, share=_OFF, delay=_LATE, seed=seed)
+    drawn = np.random.default_rng(seed)
+    values = {name: value_of(plant, name) * (1.0 + float(drawn.uniform(-_OFF, _OFF))) for name in VARIED}
+    if plant.coulomb_friction:
+        # The ratio first: rounded, equal frictions must stay equal.
+        values["static_friction"] = plant.static_friction / plant.coulomb_friction * values["coulomb_friction"]
+    return plant.with_values(**values, transport_delay=_LATE)
+
+
+def _time_up(policy: Policy, plant: AnyPlant) -> float:
+    """Return the share of 10 s from hanging that a policy spends up, 0 where it leaves its travel."""
     n = len(policy.joints)
     trial = Trial(plant, (0.0,) * n, (0.0,) * n, np.zeros((round(10.0 / policy.period), n)), SwingUpTask().travel)
     return float(np.mean(is_up(policy, trial, run_trial(policy, trial)[0])))

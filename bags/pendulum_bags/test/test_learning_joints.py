@@ -92,6 +92,36 @@ def test_plants_of_several_joints_are_drawn_from_the_ranges_and_are_plants():
     np.testing.assert_array_equal(static, env.parameters[:, env.body.columns["elbow.coulomb_friction"]])
 
 
+def test_who_falls_or_leaves_its_travel_mostly_meets_the_same_plant_again_once_it_has_learned_to_swing_up():
+    env = SwingUp(400, CART_POLE, ranges_of(CART_POLE, 0.25, {}), SwingUpTask(), np.random.default_rng(0))
+    env.motion[:], env._astray[:] = 0.0, False
+    up, down, gone = slice(0, 100), slice(100, 250), slice(250, 400)
+    env.motion[down, 1] = -math.pi + 0.1
+    env.motion[250, 0] = 0.45
+    env.step(np.zeros((400, 1), dtype=np.float32))
+    assert np.flatnonzero(env._astray).tolist() == [250]
+    env._astray[gone] = True
+    masses = env.parameters[:, env.body.columns["pole_mass"]]
+    before, env.progress = masses.copy(), 0.6
+    env.restart(np.ones(400, dtype=np.bool_))
+    same = masses == before
+    assert not same[up].any()
+    for which in (down, gone):
+        assert 0.6 < same[which].mean() < 0.9
+    assert not env._astray.any()
+    env.motion[:, 1], before, env.progress = -math.pi, masses.copy(), 0.59
+    env.restart(np.ones(400, dtype=np.bool_))
+    assert not (masses == before).any()
+
+
+def test_with_a_motor_at_each_joint_every_episode_has_a_plant_of_its_own():
+    env = SwingUp(50, DOUBLE, ranges_of(DOUBLE, 0.25, {}), SwingUpTask(), np.random.default_rng(0))
+    env.motion[:, :2], env.progress = -math.pi, 1.0
+    before = env.parameters[:, env.body.columns["mass_1"]].copy()
+    env.restart(np.ones(50, dtype=np.bool_))
+    assert not (env.parameters[:, env.body.columns["mass_1"]] == before).any()
+
+
 def test_a_joint_that_slides_keeps_to_its_travel_and_to_the_plant_s_own_stops():
     assert travel_of(CART_POLE, 0.4) == (0.5, math.pi)
     assert travel_of(CART_POLE, 5.0) == (1.8, math.pi)

@@ -30,6 +30,10 @@ _PRICE, _LAST_PRICE = 2.0, 5.0
 up, and who has learned it can learn to do without."""
 _MIDDLE = 0.5
 """Share of the way to the stop within which it is near the middle: who rests far from it has no way left to recover."""
+_AGAIN, _UP, _LEARNED = 0.75, 0.3, 0.6
+"""With a passive joint, the chance that who did not end upright [rad], or left its travel, meets the same plant again,
+and after which share of the training: plants that are hard to swing up are rare, and else are not learned; who cannot
+swing up any plant yet has to see all of them."""
 _MOST_DRAWS = 50
 
 
@@ -82,7 +86,7 @@ class SwingUp:
         self.delay, self.effort = np.zeros(count), np.zeros((count, self.action_size))
         self.push = np.zeros((count, n))
         self.progress = 0.0
-        self._zero = np.zeros((count, n))
+        self._zero, self._astray = np.zeros((count, n)), np.zeros(count, dtype=np.bool_)
         self._kick_left, self._left = np.zeros(count, dtype=np.int64), np.zeros(count, dtype=np.int64)
         self._steps = max(1, round(task.episode / task.period))
         self._samples = np.zeros((count, self.observation_size), dtype=np.float32)
@@ -115,6 +119,8 @@ class SwingUp:
         efforts[:, self._driven] = self.effort
         self.body.advance(self.motion, self.parameters, efforts, late, self.push, task.period, self.body.longest)
         self._sample()
+        slides = ~self._turns
+        self._astray |= np.any(np.abs(self.motion[:, :n][:, slides]) > task.travel, axis=1)
         self._left -= 1
         return (0.05 * self._reward(change)).astype(np.float32), self._left <= 0
 
@@ -150,11 +156,12 @@ class SwingUp:
         if not rows.size:
             return
         draw, size, task, n = self._generator, rows.size, self.task, self._n
-        self._draw_plants(rows)
+        self._draw_plants(rows[~self._meets_again(rows)])
         offsets = draw.uniform(-1.0, 1.0, (size, self.action_size)) * task.offset * self.limit
         self.parameters[np.ix_(rows, np.array(self.body.offsets))] = offsets
         self._zero[rows] = draw.uniform(-1.0, 1.0, (size, n)) * task.offset
         self.delay[rows] = draw.uniform(0.0, 1.0, size) * task.delay
+        self._astray[rows] = False
         kind = draw.uniform(0.0, 1.0, (size, 1))
         anywhere = draw.uniform(-self._furthest, self._furthest, (size, n))
         # Hanging is as far from upright one way as the other.
@@ -167,6 +174,14 @@ class SwingUp:
         self._kick_left[rows], self._left[rows] = 0, self._steps
         first = self._measure(rows)
         self._samples[rows] = np.tile(first, (1, task.history))
+
+    def _meets_again(self, rows: NDArray[np.intp]) -> NDArray[np.bool_]:
+        """Return who gets the plant of the episode that ends once more."""
+        if self.body.excess is None or self.progress < _LEARNED:
+            return np.zeros(rows.size, dtype=np.bool_)
+        down = np.any(np.abs(wrap(self.motion[rows, : self._n][:, self._turns])) > _UP, axis=1)
+        found: NDArray[np.bool_] = (down | self._astray[rows]) & (self._generator.uniform(0.0, 1.0, rows.size) < _AGAIN)
+        return found
 
     def _draw_plants(self, rows: NDArray[np.intp]) -> None:
         """Draw parameters, again where they make no plant: masses and inertias that are drawn each by itself may."""
@@ -186,7 +201,7 @@ class SwingUp:
         return {
             "motion": self.motion, "parameters": self.parameters, "delay": self.delay, "effort": self.effort,
             "push": self.push, "zero": self._zero, "kick_left": self._kick_left, "left": self._left,
-            "samples": self._samples,
+            "samples": self._samples, "astray": self._astray,
         }  # fmt: skip
 
     def restore(self, kept: Mapping[str, NDArray[Any]]) -> None:
