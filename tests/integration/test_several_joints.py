@@ -198,7 +198,7 @@ def test_commands_for_other_joints_move_nothing_and_are_counted_and_the_e_stop_e
         own = ("pendulum_sim", "simulator", "rate_hz:=100.0")
     else:
         own = (
-            "pendulum_hw_bridge", "bridge", "feedback_rate:=100.0", "feedback_watchdog:=50", "command_lifetime:=2.0",
+            "pendulum_hw_bridge", "bridge", "feedback_rate:=50.0", "feedback_watchdog:=50", "command_lifetime:=2.0",
             "start_effort_limit:=0.0", "starvation_limit:=0.0", "velocity_limit:=0.0",
         )  # fmt: skip
     _start(processes, *own, "plant:=double_pendulum", "command_timeout:=0.5")
