@@ -115,7 +115,7 @@ def test_the_same_plant_twice_is_told_alike_in_every_joint(
     assert all("position" in one["paired"] for one in content["joints"].values())
 
 
-def test_every_topic_of_joints_is_read_once_however_many_joints_are_compared(
+def test_bags_are_opened_and_their_tables_of_joints_made_once_however_many_joints_are_compared(
     bags: dict[str, Path], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     opened: Counter[Path] = Counter()

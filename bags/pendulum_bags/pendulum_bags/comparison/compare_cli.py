@@ -100,7 +100,7 @@ def compare(
     margins = Margins.of(margins_file, margin)
     with KeptBags() as bags:
         if all((path / "sim").is_dir() and (path / "hw").is_dir() for path in paths):
-            run = partial(compare_folders, paths, margin=margins, open_bag=bags)
+            run = partial(compare_folders, paths, margin=margins)
             joints = joints_of(paths[0] / "sim", open_bag=bags)
         elif len(paths) == 2:
             run = partial(
@@ -110,7 +110,6 @@ def compare(
                 hw_prefix=hw_prefix,
                 own_protocol=own_protocol,
                 margin=margins,
-                open_bag=bags,
             )
             joints = joints_of(paths[0], sim_prefix, open_bag=bags)
         else:
@@ -122,6 +121,8 @@ def compare(
         if joints or joint:
             if machine or design:
                 raise DataError("--machine and --design are of plants of one joint; expected neither for several")
+            # Bags of one joint are closed one by one: of a hundred runs not all need be open.
+            run = partial(run, open_bag=bags)
             told = _tell_joints({name: run(joint=name) for name in ([joint] if joint else joints)}, kept)
         else:
             told = _tell(run(), kept, machine, design or ())
