@@ -166,23 +166,28 @@ def test_recording_starts_and_stops_by_service_and_by_header_time(
     choice = ("--storage", "sqlite3", "--log-time", "header", "--wait")
     recording = processes.start("pendulum_bags", "record", "-o", bag, "/joint_states", "/plain", *choice)
     wait_until_matched(states, plain)
-    states.publish(encode_joint_state(1, position=0.0))
+    first_state = encode_joint_state(999, position=0.0)
+    states.publish(first_state)
     assert not json.loads(call(node, "/recorder/status").message)["topics"]
     assert not bag.exists()
     for number in (1, 2):
         assert call(node, "/recorder/start").success
         assert not call(node, "/recorder/start").success
         plain.publish(Float64(data=1.0))
+        # Heard before, but not in this recording.
+        states.publish(first_state)
         for index in range(50):
             states.publish(encode_joint_state(1000 + index, position=float(number)))
-        wait_until_received(node, joint_states=50, plain=1)
-        assert "51 messages" in call(node, "/recorder/stop").message
+        wait_until_received(node, joint_states=51, plain=1)
+        states.publish(first_state)
+        wait_until_received(node, joint_states=52)
+        assert "53 messages" in call(node, "/recorder/stop").message
     recording.send_signal(signal.SIGTERM)
     assert recording.wait(30.0) == 0
     first, second = read_bag(bag), read_bag(tmp_path / "run_2")
-    assert first["/joint_states"]["log_time_ns"].tolist() == list(range(1000, 1050))
+    assert first["/joint_states"]["log_time_ns"].tolist() == [999, 999, *range(1000, 1050)]
     assert first["/plain"][0].log_time_ns < 1050  # wall time and header time must not mix
-    assert second["/joint_states"]["position"].tolist() == [2.0] * 50
+    assert second["/joint_states"]["position"].tolist() == [0.0, 0.0] + [2.0] * 50
 
 
 @pytest.mark.parametrize(("log_time", "kept"), [("header", [0.0, 1.0, 2.0]), ("receive", [0.0, 0.0, 1.0, 1.0, 2.0])])

@@ -192,7 +192,7 @@ class Recorder(PollingNode):
                 if stamp is None:
                     self._unstamped.append((tap, time_ns, data))
                     continue
-                if tap.repeats(data):
+                if tap.repeats(session, data):
                     repeated += 1
                     continue
                 time_ns = stamp

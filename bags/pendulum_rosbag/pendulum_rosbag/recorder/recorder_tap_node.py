@@ -68,7 +68,7 @@ class Tap:
         self.announced: RecordingSession | None = None
         self.stamp = stamp_reader(name)
         self.type = message_type(name, type_hash if type_hash.startswith("RIHS") else "")
-        self._newest = b""
+        self._newest: tuple[RecordingSession | None, bytes] = (None, b"")
         self._trim = Trimmer() if name == "sensor_msgs/msg/JointState" else bytes
         profile = QoSProfile(
             depth=DEPTH,
@@ -117,15 +117,15 @@ class Tap:
             sequence = info["publication_sequence_number"]
             yield info["received_timestamp"], trim(data), see(sequence) if sequence else 0
 
-    def repeats(self, data: bytes) -> bool:
-        """Tell whether a stamped message is the one before it once more, and take note of it.
+    def repeats(self, session: RecordingSession | None, data: bytes) -> bool:
+        """Tell whether a stamped message is the one before it in a recording once more, and take note of it.
 
         A plant in lockstep publishes a state again that nobody answers in time, and who has answered it already answers
         the same.
         """
-        again = data == self._newest and self.stamp is not None and (self.stamp(data) or 0) > 0
-        self._newest = data
-        return again
+        before, self._newest = self._newest, (session, data)
+        again = before[0] is session and before[1] == data
+        return again and self.stamp is not None and (self.stamp(data) or 0) > 0
 
     def unheard(self) -> int:
         """Return how many messages publishers had sent before the first that was heard of them, since the last call."""
