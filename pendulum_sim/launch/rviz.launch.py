@@ -14,8 +14,8 @@ from launch.substitutions import LaunchConfiguration
 from launch_ros.actions import Node
 from launch_ros.substitutions import FindPackageShare
 
-from pendulum_msgs_py.plants.plant_parameters import PRESET_NAMES, load_plant
-from pendulum_sim.model_files import urdf
+from pendulum_msgs_py.plants.plant_parameters import PRESET_NAMES
+from pendulum_sim.model_files import any_urdf
 
 
 def arguments() -> list[DeclareLaunchArgument]:
@@ -23,7 +23,8 @@ def arguments() -> list[DeclareLaunchArgument]:
     return [
         DeclareLaunchArgument("plant_namespace", default_value="sim", description="Namespace of the plant to show."),
         DeclareLaunchArgument(
-            "model", default_value="thesis", description=f"Preset ({PRESET_NAMES}) or plant file that is drawn."
+            "model", default_value="thesis",
+            description=f"Preset ({PRESET_NAMES}, or one of several joints) or plant file that is drawn.",
         ),
         DeclareLaunchArgument("y", default_value="0.0", description="Where the plant stands on the y axis [m]."),
         DeclareLaunchArgument(
@@ -44,7 +45,7 @@ def show(context: LaunchContext) -> list[LaunchDescriptionEntity]:
             package="robot_state_publisher",
             executable="robot_state_publisher",
             namespace=space,
-            parameters=[{"robot_description": urdf(load_plant(value["model"])), "frame_prefix": prefix}],
+            parameters=[{"robot_description": any_urdf(value["model"]), "frame_prefix": prefix}],
         ),
         Node(
             package="tf2_ros",

@@ -10,10 +10,8 @@ with the link hanging along -y in its own frame, and the screen's y axis pointin
 from __future__ import annotations
 
 import math
-import os
 from collections import deque
 from collections.abc import Sequence
-from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -22,22 +20,9 @@ from numpy.typing import NDArray
 
 from pendulum_msgs_py.contract.angles import from_upright
 from pendulum_msgs_py.errors import ParameterError
-
-os.environ.setdefault("PYGAME_HIDE_SUPPORT_PROMPT", "1")
+from pendulum_sim.canvas import BACKGROUND, BOB, DISTURBANCE, INK, LINK, TORQUE, Picture
 
 __all__ = ["PendulumPicture", "Window", "rotation_matrix", "save_gif", "save_png"]
-
-_BACKGROUND = (250, 250, 248)
-_INK = (40, 44, 52)
-_GREY = (190, 192, 196)
-_LINK = (92, 104, 122)
-_BOB = (208, 84, 58)
-_TORQUE = (38, 120, 178)
-_DISTURBANCE = (222, 140, 20)
-_TRAIL = (208, 84, 58)
-_MIN_SIZE, _MAX_SIZE = 120, 4096
-_OVERSAMPLING = 2
-"""Drawn twice as large and smoothed down: pygame's shapes have ragged edges."""
 
 
 def rotation_matrix(theta: float) -> NDArray[np.float64]:
@@ -50,7 +35,7 @@ def rotation_matrix(theta: float) -> NDArray[np.float64]:
     return np.array([[cos, -sin], [sin, cos]])
 
 
-class PendulumPicture:
+class PendulumPicture(Picture):
     """Draws a pendulum with its torque, disturbance, trail and numbers.
 
     Args:
@@ -63,19 +48,9 @@ class PendulumPicture:
     """
 
     def __init__(self, size: tuple[int, int], effort_limit: float, *, trail: int = 60) -> None:
-        import pygame
-
-        if len(size) != 2 or not all(_MIN_SIZE <= int(side) <= _MAX_SIZE for side in size):
-            raise ParameterError(f"screen size is {size} px; expected two numbers from {_MIN_SIZE} to {_MAX_SIZE}")
-        self.size = (int(size[0]), int(size[1]))
-        self._pygame = pygame
-        pygame.font.init()
+        super().__init__(size)
         self._limit = effort_limit
         self._trail: deque[float] = deque(maxlen=trail)
-        self._scale = _OVERSAMPLING
-        self._canvas = pygame.Surface((self.size[0] * self._scale, self.size[1] * self._scale))
-        self.surface = pygame.Surface(self.size)
-        self._font = pygame.font.Font(None, max(20, min(self.size) // 20) * self._scale)
 
     def draw(
         self,
@@ -97,25 +72,23 @@ class PendulumPicture:
             time: Time to write [s]; None for none.
             note: A line of text.
         """
-        canvas = self._canvas
-        canvas.fill(_BACKGROUND)
+        canvas = self.canvas
+        canvas.fill(BACKGROUND)
         width, height = canvas.get_size()
         origin = np.array([0.5 * width, 0.52 * height])
         length = 0.36 * min(width, height)
         self._trail.append(theta)
-        self._draw_scale(origin, length)
-        self._draw_trail(origin, length)
+        self.draw_dial(origin, length)
+        bob = np.array([[0.0, -length]])
+        self.draw_trail([self._to_screen(bob, each, origin)[0] for each in self._trail], 0.045 * length)
         self._draw_link(origin, length, theta)
-        self._draw_torque(origin, length, effort)
+        radius = 0.27 * length
+        self.draw_arc(origin, (radius, 0.0), (0.0, -radius), effort / self._limit, length)
         if disturbance:
-            self._draw_disturbance(origin, length, theta, disturbance)
+            along = np.array([math.cos(theta), -math.sin(theta)])
+            self.draw_arrow(self._to_screen(bob, theta, origin)[0], along, disturbance / self._limit, length)
         self._draw_numbers(theta, theta_dot, effort, disturbance, time, note)
-        self._pygame.transform.smoothscale(canvas, self.size, self.surface)
-
-    def array(self) -> NDArray[np.uint8]:
-        """Return the picture as red, green and blue, shape (height, width, 3)."""
-        pixels: NDArray[np.uint8] = self._pygame.surfarray.array3d(self.surface)
-        return np.ascontiguousarray(pixels.transpose(1, 0, 2))
+        self.finish()
 
     def clear_trail(self) -> None:
         """Forget where the bob has been."""
@@ -127,136 +100,64 @@ class PendulumPicture:
         turned = points @ rotation_matrix(theta).T
         return origin + turned * np.array([1.0, -1.0])
 
-    def _draw_scale(self, origin: Any, length: float) -> None:
-        line = self._pygame.draw.line
-        for degrees in range(0, 360, 15):
-            long = degrees % 90 == 0
-            ends = np.array([[0.0, -1.13 * length], [0.0, -(1.17 if not long else 1.21) * length]])
-            a, b = self._to_screen(ends, math.radians(degrees), origin)
-            line(self._canvas, _INK if long else _GREY, a, b, (3 if long else 2) * self._scale // 2)
-
-    def _draw_trail(self, origin: Any, length: float) -> None:
-        count = len(self._trail)
-        bob = np.array([[0.0, -length]])
-        for age, theta in enumerate(self._trail):
-            share = (age + 1) / count * 0.35
-            colour = [round(b + (t - b) * share) for b, t in zip(_BACKGROUND, _TRAIL, strict=True)]
-            self._pygame.draw.circle(
-                self._canvas, colour, self._to_screen(bob, theta, origin)[0], 0.045 * length * (0.4 + share)
-            )
-
     def _draw_link(self, origin: Any, length: float, theta: float) -> None:
-        draw = self._pygame.draw
+        draw = self.pygame.draw
         half = 0.028 * length
         outline = np.array([[-half, 0.0], [half, 0.0], [half, -length], [-half, -length]])
-        draw.polygon(self._canvas, _LINK, self._to_screen(outline, theta, origin))
-        draw.circle(self._canvas, _BOB, self._to_screen(np.array([[0.0, -length]]), theta, origin)[0], 0.1 * length)
-        draw.circle(self._canvas, _INK, origin, 0.055 * length)
-        draw.circle(self._canvas, _BACKGROUND, origin, 0.022 * length)
-
-    def _draw_torque(self, origin: Any, length: float, effort: float) -> None:
-        share = max(-1.0, min(1.0, effort / self._limit))
-        # A square root shows the small torques of regulation beside the full one.
-        sweep = math.copysign(math.sqrt(abs(share)), share) * 1.5 * math.pi / 2.0
-        if abs(sweep) < 0.02:
-            return
-        radius = 0.27 * length
-        angles = np.linspace(0.0, sweep, 40)
-        points = origin + radius * np.stack([np.cos(angles), -np.sin(angles)], axis=1)
-        thick = max(2, round(0.022 * length))
-        for a, b in pairwise(points):
-            self._pygame.draw.line(self._canvas, _TORQUE, a, b, thick)
-            self._pygame.draw.circle(self._canvas, _TORQUE, b, thick / 2)
-        direction = np.array([-math.sin(sweep), -math.cos(sweep)]) * math.copysign(1.0, sweep)
-        self._draw_head(points[-1], direction, 0.07 * length, _TORQUE)
-
-    def _draw_disturbance(self, origin: Any, length: float, theta: float, disturbance: float) -> None:
-        bob = self._to_screen(np.array([[0.0, -length]]), theta, origin)[0]
-        along = np.array([math.cos(theta), -math.sin(theta)]) * math.copysign(1.0, disturbance)
-        size = (0.15 + 0.35 * min(1.0, abs(disturbance) / self._limit)) * length
-        tip = bob + along * (0.12 * length + size)
-        self._pygame.draw.line(
-            self._canvas, _DISTURBANCE, bob + along * 0.12 * length, tip, max(2, round(0.02 * length))
-        )
-        self._draw_head(tip, along, 0.07 * length, _DISTURBANCE)
-
-    def _draw_head(self, at: Any, direction: Any, size: float, colour: tuple[int, int, int]) -> None:
-        across = np.array([-direction[1], direction[0]])
-        corners = [at + size * direction, at + 0.6 * size * across, at - 0.6 * size * across]
-        self._pygame.draw.polygon(self._canvas, colour, corners)
+        draw.polygon(self.canvas, LINK, self._to_screen(outline, theta, origin))
+        draw.circle(self.canvas, BOB, self._to_screen(np.array([[0.0, -length]]), theta, origin)[0], 0.1 * length)
+        draw.circle(self.canvas, INK, origin, 0.055 * length)
+        draw.circle(self.canvas, BACKGROUND, origin, 0.022 * length)
 
     def _draw_numbers(
         self, theta: float, theta_dot: float, effort: float, disturbance: float, time: float | None, note: str
     ) -> None:
         deviation = from_upright(theta)
         rows = [
-            (f"theta {theta:+.4f} rad", _INK),
-            (f"from upright {deviation:+.4f} rad", _INK),
-            (f"theta' {theta_dot:+.3f} rad/s", _INK),
-            (f"torque {effort:+.3f} N m", _TORQUE),
+            (f"theta {theta:+.4f} rad", INK),
+            (f"from upright {deviation:+.4f} rad", INK),
+            (f"theta' {theta_dot:+.3f} rad/s", INK),
+            (f"torque {effort:+.3f} N m", TORQUE),
         ]
         if disturbance:
-            rows.append((f"disturbance {disturbance:+.3f} N m", _DISTURBANCE))
+            rows.append((f"disturbance {disturbance:+.3f} N m", DISTURBANCE))
         if time is not None:
-            rows.insert(0, (f"{time:.3f} s", _INK))
-        margin = 10 * self._scale
-        for row, (text, colour) in enumerate(rows):
-            image = self._font.render(text, True, colour)
-            self._canvas.blit(image, (margin, margin + row * self._font.get_linesize()))
-        if note:
-            image = self._font.render(note, True, _INK)
-            self._canvas.blit(image, (margin, self._canvas.get_height() - margin - image.get_height()))
+            rows.insert(0, (f"{time:.3f} s", INK))
+        self.draw_text(rows, note)
 
 
 class Window:
-    """A window on the screen that shows a picture.
+    """A window on the screen that shows pictures.
 
     Args:
-        picture: What to show.
+        size: Width and height of the pictures [px].
         title: Title of the window.
 
     Raises:
         ParameterError: There is no display.
     """
 
-    def __init__(self, picture: PendulumPicture, title: str = "pendulum") -> None:
+    def __init__(self, size: tuple[int, int], title: str = "pendulum") -> None:
         import pygame
 
-        self.picture = picture
         self.closed = False
         self._pygame = pygame
         try:
             pygame.display.init()
-            self._screen = pygame.display.set_mode(picture.size)
+            self._screen = pygame.display.set_mode(size)
         except pygame.error as error:
             raise ParameterError(f"no window can be opened: {error}; expected a display") from error
         pygame.display.set_caption(title)
         self._clock = pygame.time.Clock()
 
-    def show(
-        self,
-        theta: float,
-        theta_dot: float,
-        effort: float,
-        *,
-        disturbance: float = 0.0,
-        time: float | None = None,
-        note: str = "",
-        fps: int = 0,
-    ) -> None:
-        """Draw a state and put it on the screen.
+    def show(self, picture: Picture, *, fps: int = 0) -> None:
+        """Put a picture on the screen.
 
         Args:
-            theta: Angle [rad].
-            theta_dot: Velocity [rad/s].
-            effort: Torque [N m].
-            disturbance: Disturbance torque [N m].
-            time: Time to write [s].
-            note: A line of text.
+            picture: What to show.
             fps: Wait so that there are at most this many pictures per second; 0 for no wait.
         """
-        self.picture.draw(theta, theta_dot, effort, disturbance=disturbance, time=time, note=note)
-        self._screen.blit(self.picture.surface, (0, 0))
+        self._screen.blit(picture.surface, (0, 0))
         self._pygame.display.flip()
         if fps:
             self._clock.tick(fps)

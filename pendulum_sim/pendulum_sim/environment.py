@@ -121,6 +121,7 @@ class PendulumEnv(gymnasium.Env[Array, Array]):
         self._kernel: Any = None
         self._plant: Any = None
         self._screen_size = screen_size
+        self._picture: Any = None
         self._window: Any = None
         self.effort = 0.0
         if is_smooth(parameters) and method != "adaptive":
@@ -241,23 +242,23 @@ class PendulumEnv(gymnasium.Env[Array, Array]):
         # Imported late: training runs without pictures.
         from pendulum_sim.drawing import PendulumPicture, Window
 
-        if self._window is None:
-            picture = PendulumPicture(self._screen_size, self.parameters.effort_limit)
-            self._window = Window(picture) if self.render_mode == "human" else picture
+        if self._picture is None:
+            self._picture = PendulumPicture(self._screen_size, self.parameters.effort_limit)
+            self._window = Window(self._picture.size) if self.render_mode == "human" else None
         torque = self.effort if self._plant is not None else float(self._w[2])
         time = int(self._counts[0]) * self.dt
-        if self.render_mode == "human":
-            fps = round(1.0 / (self._steps_a_picture * self.dt))
-            self._window.show(self.theta, self.theta_dot, torque, time=time, fps=fps)
+        self._picture.draw(self.theta, self.theta_dot, torque, time=time)
+        if self._window is not None:
+            self._window.show(self._picture, fps=round(1.0 / (self._steps_a_picture * self.dt)))
             return None
-        self._window.draw(self.theta, self.theta_dot, torque, time=time)
-        return self._window.array()
+        picture: NDArray[np.uint8] = self._picture.array()
+        return picture
 
     def close(self) -> None:
         """Close the window, if there is one."""
-        if self._window is not None and self.render_mode == "human":
+        if self._window is not None:
             self._window.close()
-        self._window = None
+        self._window = self._picture = None
 
 
 def observation_space(parameters: PlantParameters, disturbance: float) -> spaces.Box:

@@ -26,7 +26,7 @@ from pendulum_sim.mechanism_files import mechanism_mjcf, mechanism_urdf
 from pendulum_sim.ros2_control_tags import add_ros2_control
 from pendulum_sim.xml_files import add, document_text, number, safe_name
 
-__all__ = ["LinkShape", "link_shape", "main", "mjcf", "urdf"]
+__all__ = ["LinkShape", "any_urdf", "link_shape", "main", "mjcf", "urdf"]
 
 STANDARD_GRAVITY = 9.80665
 """Acceleration of gravity in the files [m/s^2]."""
@@ -221,6 +221,15 @@ def _urdf_visual(
     add(add(visual, "geometry"), shape, sizes)
     material = add(visual, "material", name=f"{shape}_colour")
     add(material, "color", rgba=rgba)
+
+
+def any_urdf(plant: str) -> str:
+    """Return the URDF of a preset or plant file, of one joint or more.
+
+    Raises:
+        ParameterError: No such preset or file, or the file is refused.
+    """
+    return mechanism_urdf(load_mechanism(plant)) if is_mechanism(plant) else urdf(load_plant(plant))
 
 
 app = typer.Typer(add_completion=False, rich_markup_mode=None)

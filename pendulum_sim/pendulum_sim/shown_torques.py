@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import math
+
 from pendulum_msgs_py.contract import names
 from pendulum_msgs_py.contract.drive import Mode
-from pendulum_msgs_py.contract.values import NANOSECONDS
+from pendulum_msgs_py.contract.values import NANOSECONDS, JointCommand
 
 __all__ = ["SHOWN_TOPICS", "ShownTorques"]
 
@@ -21,19 +23,25 @@ class ShownTorques:
 
     def __init__(self) -> None:
         self.mode = ""
-        self._newest: dict[str, tuple[int, float]] = {}
+        self._newest: dict[tuple[str, str], tuple[int, float]] = {}
 
-    def note(self, topic: str, stamp_ns: int, effort: float) -> None:
-        """Take a torque of one of ``SHOWN_TOPICS`` [N m], with its stamp [ns]."""
-        self._newest[topic] = (stamp_ns, effort)
+    def note(self, topic: str, command: JointCommand) -> None:
+        """Take the efforts of a message of one of ``SHOWN_TOPICS``; one without a name is the pendulum's."""
+        for joint, effort in zip(command.joints or (names.JOINT,), command.effort, strict=False):
+            if math.isfinite(effort):
+                self._newest[topic, joint] = (command.stamp_ns, effort)
+
+    def acting_on(self, topic: str, now_ns: int, joints: tuple[str, ...]) -> dict[str, float]:
+        """Return what acts on those of some joints that anybody told of, by name, as :meth:`acting` does."""
+        return {joint: self.acting(topic, now_ns, joint) for joint in joints if (topic, joint) in self._newest}
 
     @property
     def newest_ns(self) -> int:
         """Newest stamp of all [ns]; 0 before the first."""
         return max((stamp for stamp, _ in self._newest.values()), default=0)
 
-    def acting(self, topic: str, now_ns: int) -> float:
-        """Return the torque of a topic that acts on the plant, 0 for none [N m].
+    def acting(self, topic: str, now_ns: int, joint: str = names.JOINT) -> float:
+        """Return the torque of a topic that acts on the plant, 0 for none [N m; N where the joint slides].
 
         A disturbance is added by the plant to a controller's fresh command, under torque control alone, and the limit
         may take some of it away: what acts of it is what the applied torque differs from the command by.
@@ -41,14 +49,15 @@ class ShownTorques:
         Args:
             topic: ``applied_effort``, ``disturbance`` or ``push``.
             now_ns: Time by the clock of the states [ns].
+            joint: Which joint's.
         """
-        stamp_ns, effort = self._newest.get(topic, (0, 0.0))
-        if topic not in self._newest or abs(now_ns - stamp_ns) >= _STALE_NS:
+        stamp_ns, effort = self._newest.get((topic, joint), (0, 0.0))
+        if (topic, joint) not in self._newest or abs(now_ns - stamp_ns) >= _STALE_NS:
             return 0.0
         if topic != names.DISTURBANCE:
             return effort
-        applied_ns, applied = self._newest.get(names.APPLIED_EFFORT, (0, 0.0))
-        command_ns, command = self._newest.get(names.EFFORT_COMMAND, (0, 0.0))
+        applied_ns, applied = self._newest.get((names.APPLIED_EFFORT, joint), (0, 0.0))
+        command_ns, command = self._newest.get((names.EFFORT_COMMAND, joint), (0, 0.0))
         together = max(applied_ns, command_ns, stamp_ns) - min(applied_ns, command_ns, stamp_ns) <= _TOGETHER_NS
         if not together or applied == 0.0 or self.mode not in {"", Mode.EFFORT.value}:
             return 0.0

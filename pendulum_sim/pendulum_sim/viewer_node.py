@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections import deque
+from collections import Counter, deque
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
@@ -17,12 +17,23 @@ from pendulum_msgs_py.contract import names
 from pendulum_msgs_py.contract.values import NANOSECONDS, JointSample
 from pendulum_msgs_py.errors import ParameterError, PendulumError
 from pendulum_msgs_py.parameters import ParameterSpec
+from pendulum_msgs_py.plants.mechanism_parameters import MechanismParameters
+from pendulum_msgs_py.plants.plant_differences import PLANT_PARAMETERS
 from pendulum_msgs_py.ros import qos
-from pendulum_msgs_py.ros.convert import command_from_bytes, plant_mode, sample_from_bytes
+from pendulum_msgs_py.ros.convert import (
+    command_from_bytes,
+    fields_from_bytes,
+    plant_mode,
+    plant_value,
+    sample_from_bytes,
+)
 from pendulum_msgs_py.ros.parameters import NodeParameters
 from pendulum_msgs_py.ros.runner import run_node
 from pendulum_msgs_py.ros.timers import create_wall_timer
+from pendulum_sim.canvas import Picture
 from pendulum_sim.drawing import PendulumPicture, Window, save_gif, save_png
+from pendulum_sim.mechanism_drawing import MechanismPicture
+from pendulum_sim.shown_plant import ShownPlant
 from pendulum_sim.shown_torques import SHOWN_TOPICS, ShownTorques
 
 __all__ = ["SPECS", "ViewerNode", "main"]
@@ -36,7 +47,7 @@ SPECS: tuple[ParameterSpec, ...] = (
         "effort_scale",
         13.0,
         "N m",
-        "Torque at which the arc is full.",
+        "Torque at which the arc is full; with several joints it is each motor's limit.",
         minimum=0.0,
         exclusive_minimum=True,
         read_only=True,
@@ -62,6 +73,7 @@ SPECS: tuple[ParameterSpec, ...] = (
     ParameterSpec("gif_duration", 8.0, "s", "Length of the animation.", minimum=0.1, maximum=60.0, read_only=True),
     ParameterSpec("duration", 0.0, "s", "Time after which to end; 0 for never.", minimum=0.0, read_only=True),
 )
+_DISTURBING = (names.DISTURBANCE, names.PUSH)
 
 
 class ViewerNode(Node):
@@ -79,12 +91,14 @@ class ViewerNode(Node):
         self._stop = stop
         values = NodeParameters(self, SPECS).values
         self._values = values
-        self._picture = PendulumPicture(
-            (values["width"], values["height"]), values["effort_scale"], trail=values["trail"]
-        )
-        title = f"{self.get_namespace().rstrip('/')}/{names.JOINT_STATES}"
         self._topic = self.resolve_topic_name(names.JOINT_STATES)
-        self._window = Window(self._picture, title) if values["window"] else None
+        self._namespace = self._topic.rpartition("/")[0]
+        self._plant = ShownPlant(self._topic)
+        self._size: tuple[int, int] = (values["width"], values["height"])
+        self._pendulum = PendulumPicture(self._size, values["effort_scale"], trail=values["trail"])
+        self._mechanism: MechanismPicture | None = None
+        self._picture: Picture = self._pendulum
+        self._window = Window(self._size, self._topic) if values["window"] else None
         self._sample: JointSample | None = None
         self._start_ns: int | None = None
         self._torques = ShownTorques()
@@ -114,10 +128,17 @@ class ViewerNode(Node):
     # --- callbacks -----------------------------------------------------------------------------------------
 
     def _on_state(self, data: bytes) -> None:
-        sample = sample_from_bytes(data)
+        fields = fields_from_bytes(data)
+        if fields is None:
+            return
+        joints = self._plant.joints
+        self._plant.take_names(fields.joints)
+        if joints != self._plant.joints:
+            self._sample = None
+        sample = sample_from_bytes(data, self._plant.joints)
         if sample is None or not sample.is_finite():
             return
-        if self._start_ns is None or sample.stamp_ns < self._start_ns:
+        if self._sample is None or self._start_ns is None or sample.stamp_ns < self._start_ns:
             # A first state, or a plant that began again: what the trail remembers is another run.
             self._start_ns = sample.stamp_ns
             self._picture.clear_trail()
@@ -126,18 +147,24 @@ class ViewerNode(Node):
     def _receiver(self, topic: str) -> Callable[[bytes], None]:
         def receive(data: bytes) -> None:
             command = command_from_bytes(data)
-            if command is not None and len(command.effort) == 1 and np.isfinite(command.effort[0]):
-                self._torques.note(topic, command.stamp_ns, command.effort[0])
+            if command is not None:
+                self._torques.note(topic, command)
 
         return receive
 
     def _on_diagnostics(self, message: DiagnosticArray) -> None:
-        self._torques.mode = plant_mode(message, self.get_namespace()) or self._torques.mode
+        self._torques.mode = plant_mode(message, self._namespace) or self._torques.mode
+        self._plant.take_description(plant_value(message, self._namespace, PLANT_PARAMETERS))
 
     def _on_timer(self) -> None:
         self._draw()
         self._drawn += 1
-        if self._values["gif"] and self._drawn % self._every == 0 and self._sample is not None:
+        if (
+            self._values["gif"]
+            and self._drawn % self._every == 0
+            and self._sample is not None
+            and not self._plant.missing
+        ):
             self._frames.append(self._picture.array())
         if self._window is not None and self._window.closed:
             self._stop()
@@ -155,19 +182,46 @@ class ViewerNode(Node):
     # --- picture -------------------------------------------------------------------------------------------
 
     def _draw(self) -> None:
+        if self._plant.missing:
+            self._picture.show_text([], self._plant.missing)
+        elif self._plant.parameters is not None and self._sample is not None:
+            self._draw_mechanism(self._plant.parameters, self._sample)
+        else:
+            self._draw_pendulum()
+        if self._window is not None:
+            self._window.show(self._picture)
+
+    def _draw_pendulum(self) -> None:
+        self._picture = self._pendulum
         sample = self._sample
         if sample is None:
-            sample, note = JointSample.of_one(0, 0.0, 0.0), f"waiting for {self._topic}"
-            time = None
+            sample, note, time = JointSample.of_one(0, 0.0, 0.0), f"waiting for {self._topic}", None
         else:
-            time, note = (sample.stamp_ns - (self._start_ns or 0)) / NANOSECONDS, self._topic
+            time, note = self._time_of(sample), self._topic
         applied = self._torques.acting(names.APPLIED_EFFORT, sample.stamp_ns)
-        disturbance = sum(self._torques.acting(topic, sample.stamp_ns) for topic in (names.DISTURBANCE, names.PUSH))
+        disturbance = sum(self._torques.acting(topic, sample.stamp_ns) for topic in _DISTURBING)
         where = sample.position[0], sample.velocity[0]
-        if self._window is not None:
-            self._window.show(*where, applied, disturbance=disturbance, time=time, note=note)
-        else:
-            self._picture.draw(*where, applied, disturbance=disturbance, time=time, note=note)
+        self._pendulum.draw(*where, applied, disturbance=disturbance, time=time, note=note)
+
+    def _draw_mechanism(self, parameters: MechanismParameters, sample: JointSample) -> None:
+        if self._mechanism is None or self._mechanism.parameters != parameters:
+            self._mechanism = MechanismPicture(parameters, self._size, trail=self._values["trail"])
+        self._picture = self._mechanism
+        disturbance: Counter[str] = Counter()
+        for topic in _DISTURBING:
+            disturbance.update(self._torques.acting_on(topic, sample.stamp_ns, self._plant.joints))
+        driven = parameters.coordinates.driven_names
+        self._mechanism.draw(
+            sample.position,
+            velocity=sample.velocity,
+            effort=self._torques.acting_on(names.APPLIED_EFFORT, sample.stamp_ns, driven),
+            disturbance=disturbance,
+            time=self._time_of(sample),
+            note=self._topic,
+        )
+
+    def _time_of(self, sample: JointSample) -> float:
+        return (sample.stamp_ns - (self._start_ns or 0)) / NANOSECONDS
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -176,7 +230,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         ViewerNode,
         argv,
         program="pendulum_sim viewer",
-        description="Shows a plant: angle, torque, disturbance, trail and numbers; also writes PNG and GIF.",
+        description="Shows a plant: links, torques, disturbance, trail and numbers; also writes PNG and GIF.",
         specs=SPECS,
         example="python -m pendulum_sim viewer --ros-args -r __ns:=/sim -p gif:=sim.gif",
     )

@@ -248,13 +248,19 @@ def test_a_window_follows_real_time_with_at_most_50_pictures_a_second(
     monkeypatch: pytest.MonkeyPatch, dt: float, pictures: int
 ) -> None:
     monkeypatch.setenv("SDL_VIDEODRIVER", "dummy")
+    drawn: list[tuple[float, float]] = []
     shown: list[tuple[float, float, int]] = []
-    show = drawing.Window.show
+    draw, show = drawing.PendulumPicture.draw, drawing.Window.show
 
-    def watch(window: drawing.Window, theta: float, theta_dot: float, effort: float, **more: Any) -> None:
-        shown.append((theta, more["time"], more["fps"]))
-        show(window, theta, theta_dot, effort, **{**more, "fps": 0})
+    def note(picture: drawing.PendulumPicture, theta: float, *rest: float, **more: Any) -> None:
+        drawn.append((theta, more["time"]))
+        draw(picture, theta, *rest, **more)
 
+    def watch(window: drawing.Window, picture: drawing.PendulumPicture, *, fps: int) -> None:
+        shown.append((*drawn[-1], fps))
+        show(window, picture)
+
+    monkeypatch.setattr(drawing.PendulumPicture, "draw", note)
     monkeypatch.setattr(drawing.Window, "show", watch)
     env = PendulumEnv(render_mode="human", screen_size=(200, 200), dt=dt, episode_time=math.inf)
     env.reset(seed=0)

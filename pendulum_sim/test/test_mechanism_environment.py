@@ -147,5 +147,5 @@ def test_a_picture_shows_where_the_plant_is(name: str) -> None:
     red = [(image[:, :, 0].astype(int) - image[:, :, 2] > 80).nonzero()[0].mean() for image in seen]
     # The last link is red; upright it is in the upper half.
     assert red[1] < red[0]
-    with pytest.raises(ParameterError, match="expected 120 to 4096 px"):
+    with pytest.raises(ParameterError, match="expected two numbers from 120 to 4096"):
         MechanismPicture(plant, (10, 10))

@@ -5,6 +5,7 @@ from __future__ import annotations
 import pytest
 
 from pendulum_msgs_py.contract import names
+from pendulum_msgs_py.contract.values import JointCommand
 from pendulum_sim.shown_torques import ShownTorques
 
 _NOW = 10**18
@@ -35,19 +36,19 @@ def test_a_disturbance_is_shown_as_far_as_it_acts(
     for topic, effort in (
         (names.APPLIED_EFFORT, applied), (names.EFFORT_COMMAND, command), (names.DISTURBANCE, disturbance),
     ):  # fmt: skip
-        torques.note(topic, _NOW, effort)
+        torques.note(topic, JointCommand.of_one(_NOW, effort))
     assert torques.acting(names.DISTURBANCE, _NOW) == pytest.approx(acting)
     assert torques.acting(names.APPLIED_EFFORT, _NOW) == applied
 
 
 def test_a_disturbance_without_a_command_or_of_the_past_is_not_shown() -> None:
     torques = ShownTorques()
-    torques.note(names.APPLIED_EFFORT, _NOW, 3.5)
-    torques.note(names.DISTURBANCE, _NOW, 2.5)
+    torques.note(names.APPLIED_EFFORT, JointCommand.of_one(_NOW, 3.5))
+    torques.note(names.DISTURBANCE, JointCommand.of_one(_NOW, 2.5))
     assert torques.acting(names.DISTURBANCE, _NOW) == 0.0
-    torques.note(names.EFFORT_COMMAND, _NOW - 100 * _MS, 1.0)
+    torques.note(names.EFFORT_COMMAND, JointCommand.of_one(_NOW - 100 * _MS, 1.0))
     assert torques.acting(names.DISTURBANCE, _NOW) == 0.0
-    torques.note(names.EFFORT_COMMAND, _NOW, 1.0)
+    torques.note(names.EFFORT_COMMAND, JointCommand.of_one(_NOW, 1.0))
     assert torques.acting(names.DISTURBANCE, _NOW) == 2.5
     assert torques.acting(names.DISTURBANCE, _NOW + 600 * _MS) == 0.0
 
@@ -55,6 +56,17 @@ def test_a_disturbance_without_a_command_or_of_the_past_is_not_shown() -> None:
 def test_a_push_on_the_link_acts_whatever_the_plant_does() -> None:
     torques = ShownTorques()
     torques.mode = "disarmed"
-    torques.note(names.PUSH, _NOW, 0.7)
+    torques.note(names.PUSH, JointCommand.of_one(_NOW, 0.7))
     assert torques.acting(names.PUSH, _NOW) == 0.7
     assert torques.acting(names.PUSH, _NOW + 600 * _MS) == 0.0
+
+
+def test_each_joint_shows_its_own_torque() -> None:
+    torques = ShownTorques()
+    joints = ("cart", "pole")
+    for topic, effort in ((names.APPLIED_EFFORT, 3.5), (names.EFFORT_COMMAND, 1.0), (names.DISTURBANCE, 2.5)):
+        torques.note(topic, JointCommand(_NOW, (effort,), joints=("cart",)))
+    torques.note(names.PUSH, JointCommand(_NOW, (float("nan"), 0.2), joints=joints))
+    assert torques.acting_on(names.DISTURBANCE, _NOW, joints) == {"cart": 2.5}
+    assert torques.acting_on(names.PUSH, _NOW, joints) == {"pole": 0.2}
+    assert torques.acting(names.APPLIED_EFFORT, _NOW) == 0.0

@@ -1,0 +1,80 @@
+"""Which plant a picture shows: known by the names of its joints, and by what it says of itself."""
+
+from __future__ import annotations
+
+from pendulum_msgs_py.contract.names import JOINT
+from pendulum_msgs_py.errors import ParameterError
+from pendulum_msgs_py.mechanisms import MECHANISMS
+from pendulum_msgs_py.plants.mechanism_parameters import MechanismParameters
+from pendulum_msgs_py.plants.plant_differences import read_plants
+
+__all__ = ["ShownPlant", "told_mechanism"]
+
+
+class ShownPlant:
+    """The plant behind a topic of states.
+
+    Args:
+        topic: Name of the topic, for messages.
+
+    Attributes:
+        joints: The joints of which states are drawn, in their order: one where the plant is a pendulum.
+        parameters: The plant of several joints; None for a pendulum, and until the plant has said what it is.
+    """
+
+    def __init__(self, topic: str) -> None:
+        self.joints: tuple[str, ...] = (JOINT,)
+        self.parameters: MechanismParameters | None = None
+        self._topic = topic
+        self._named: tuple[str, ...] | None = None
+        self._told = ""
+
+    @property
+    def missing(self) -> str:
+        """What is not known yet of the plant whose states come, in words; empty where it can be drawn."""
+        if len(self.joints) == 1 or self.parameters is not None:
+            return ""
+        return f"waiting for the parameters of {', '.join(self.joints)}"
+
+    def take_names(self, names: tuple[str, ...]) -> None:
+        """Take the names of a state's joints.
+
+        Raises:
+            ParameterError: No plant that can be drawn has these joints.
+        """
+        if names == self._named:
+            return
+        known = [tuple(joint.name for joint in one.joints) for one in MECHANISMS.values()]
+        if JOINT not in names and names not in known:
+            listed = "; ".join(", ".join(each) for each in known)
+            raise ParameterError(
+                f"{self._topic} tells of {', '.join(names) or 'no joint'}, which cannot be drawn; expected the joints "
+                f"of a mechanism, in its order: {listed}"
+            )
+        self._named, self.joints = names, (JOINT,) if JOINT in names else names
+        self._find()
+
+    def take_description(self, text: str) -> None:
+        """Take what the plant says of itself in its diagnostics.
+
+        Raises:
+            ParameterError: It is no description of plants.
+        """
+        if text and text != self._told:
+            self._told = text
+            self._find()
+
+    def _find(self) -> None:
+        found = told_mechanism(self._told)
+        # A description of other joints is that of the plant before, or after.
+        self.parameters = found if found is not None and found.coordinates.names == self.joints else None
+
+
+def told_mechanism(text: str) -> MechanismParameters | None:
+    """Return the plant of several joints of a description that a plant gave, or None where it has one joint.
+
+    Raises:
+        ParameterError: The text is no description of plants.
+    """
+    plants = read_plants(text) if text else ()
+    return next((plant for plant in plants if isinstance(plant, MechanismParameters)), None)
