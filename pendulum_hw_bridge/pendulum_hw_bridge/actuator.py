@@ -14,6 +14,7 @@ from typing import NamedTuple, Protocol, runtime_checkable
 
 from pendulum_hw_bridge.gains import GainSet
 from pendulum_msgs_py.errors import FaultError, ParameterError
+from pendulum_msgs_py.joints import ONE_JOINT, Joint
 
 __all__ = [
     "FEEDBACK_QUANTITIES",
@@ -248,6 +249,7 @@ class HardwareLimits:
         position_max: Upper end [rad].
         pwm: Largest PWM duty [-].
         m_stop: What the motion stop does.
+        joint: The joint that is moved, whose units messages have.
     """
 
     effort: float = PEAK_EFFORT
@@ -256,10 +258,11 @@ class HardwareLimits:
     position_max: float = math.inf
     pwm: float = 1.0
     m_stop: MStopAction = MStopAction.MOTOR_OFF
+    joint: Joint = field(default=ONE_JOINT.joints[0], compare=False, repr=False)
 
     def __post_init__(self) -> None:
         """Refuse limits that limit nothing."""
-        for name, unit in (("effort", "N m"), ("velocity", "rad/s"), ("pwm", "of the supply")):
+        for name, unit in self.units:
             value = getattr(self, name)
             if not (math.isfinite(value) and value > 0.0):
                 raise ParameterError(f"{name} limit is {value} {unit}; expected a finite number > 0")
@@ -267,8 +270,13 @@ class HardwareLimits:
             raise ParameterError(f"pwm limit is {self.pwm}; expected > 0 and <= 1")
         if not self.position_min < self.position_max:
             raise ParameterError(
-                f"position window is [{self.position_min}, {self.position_max}] rad; expected min < max"
+                f"position window is [{self.position_min}, {self.position_max}] {self.joint.unit}; expected min < max"
             )
+
+    @property
+    def units(self) -> tuple[tuple[str, str], ...]:
+        """Names and units of the limits that are one number."""
+        return ("effort", self.joint.effort_unit), ("velocity", self.joint.velocity_unit), ("pwm", "of the supply")
 
 
 @dataclass(frozen=True)

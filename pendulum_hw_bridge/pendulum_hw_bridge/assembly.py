@@ -21,6 +21,7 @@ from pendulum_hw_bridge.module import DrivenModule, Module
 from pendulum_hw_bridge.safety import SafetyLimits, SafetyMonitor
 from pendulum_hw_bridge.settings import BridgeSettings
 from pendulum_msgs_py.contract.drive import PlantLimits
+from pendulum_msgs_py.contract.plant_specs import in_units_of
 from pendulum_msgs_py.contract.values import NANOSECONDS, Vector
 from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.joints import ONE_JOINT, Coordinates
@@ -103,11 +104,9 @@ def for_plant(specs: tuple[ParameterSpec, ...], plant: str) -> tuple[ParameterSp
     """
     if not is_mechanism(plant):
         return specs
-    ends = [
-        end
-        for low, high in load_mechanism(plant).stops
-        for end in ((low, high) if math.isfinite(low + high) else (0.0, 0.0))
-    ]
+    mechanism = load_mechanism(plant)
+    ends = [end for low, high in mechanism.stops for end in ((low, high) if math.isfinite(low + high) else (0.0, 0.0))]
+    specs = in_units_of(specs, mechanism.coordinates)
     defaults: dict[str, Any] = {"velocity_limit": _FASTEST, "feedback_rate": _RATE, "position_window": ends}
     return tuple(replace(spec, default=defaults.get(spec.name, spec.default)) for spec in specs)
 
@@ -195,6 +194,7 @@ def _several(values: Mapping[str, Any], specs: tuple[ParameterSpec, ...], *, loc
             hardware.constants(coordinates.joints[index], actuator.effort_limit),
             gains=gains,
             effort_limit=limit,
+            joint=coordinates.joints[index],
             # Beyond the delay, what is left of an older torque falls to a twentieth within three time constants.
             late=math.ceil((delay + 3.0 * actuator.time_constant) * values["feedback_rate"]),
         )
@@ -227,6 +227,7 @@ def _several(values: Mapping[str, Any], specs: tuple[ParameterSpec, ...], *, loc
                     position_min=limits.position_min[index],
                     position_max=limits.position_max[index],
                     m_stop=MStopAction(values["m_stop_action"]),
+                    joint=coordinates.joints[index],
                 ),
                 gains=gains,
             )

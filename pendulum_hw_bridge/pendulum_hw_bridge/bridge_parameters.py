@@ -346,8 +346,7 @@ def supervisor_limits(
     limits = limits_from_parameters(
         values,
         effort_limits,
-        joints=len(coordinates.joints),
-        unit=coordinates.drive_unit,
+        coordinates=coordinates,
         feedback_timeout=patience,
     )
     if lockstep:

@@ -108,12 +108,12 @@ def _identity(info: ActuatorInfo) -> str:
 def _settings(port: ActuatorPort, settings: BridgeSettings) -> list[CheckItem]:
     lifetime = port.set_command_lifetime(settings.command_lifetime)
     rate = port.set_feedback_rate(settings.feedback_rate)
-    limits = port.set_limits(settings.limits)
+    limits, joint = port.set_limits(settings.limits), settings.limits.joint
     items = [
         _equal("command lifetime reads back", lifetime, settings.command_lifetime, "s"),
         _equal("feedback rate reads back", rate, settings.feedback_rate, "Hz"),
-        _equal("effort limit reads back", limits.effort, settings.limits.effort, "N m"),
-        _equal("velocity limit reads back", limits.velocity, settings.limits.velocity, "rad/s"),
+        _equal("effort limit reads back", limits.effort, settings.limits.effort, joint.effort_unit),
+        _equal("velocity limit reads back", limits.velocity, settings.limits.velocity, joint.velocity_unit),
         CheckItem(
             "motion stop does what it should",
             limits.m_stop is settings.limits.m_stop,

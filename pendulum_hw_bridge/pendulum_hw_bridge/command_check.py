@@ -35,12 +35,7 @@ def check_command(command: Command, strategy: Strategy, limits: HardwareLimits) 
     Raises:
         ParameterError: A setpoint is infinite, or does not exist under this strategy.
     """
-    for name, unit in (
-        ("position", "rad"),
-        ("velocity", "rad/s"),
-        ("effort", "N m"),
-        ("pwm", "of the supply"),
-    ):
+    for name, unit in (("position", limits.joint.unit), *limits.units):
         if math.isinf(getattr(command, name)):
             raise ParameterError(f"{name} setpoint is {getattr(command, name)} {unit}; expected a finite number")
     direct = strategy is Strategy.DIRECT_PWM

@@ -86,12 +86,12 @@ class CurrentCheck(OutputCheck):
         # The loop lags: it may still be on its way from what was commanded before.
         known = [*efforts, *self._before]
         self._before.append(efforts[0])
-        room = _SHARE * self.mapping.effort_limit
+        room, unit = _SHARE * self.mapping.effort_limit, self.mapping.joint.effort_unit
         self._differs.append(not min(known) - room <= feedback.effort <= max(known) + room)
         if sum(self._differs) < _WRONG:
             return None
         return Fault(
             "output_disagreement",
-            f"measured effort is {feedback.effort:.3f}, commanded is {efforts[0]:.3f}; expected them within "
-            f"{room:.3g}: is the drive stuck?",
+            f"measured effort is {feedback.effort:.3f} {unit}, commanded is {efforts[0]:.3f} {unit}; expected them "
+            f"within {room:.3g} {unit}: is the drive stuck?",
         )

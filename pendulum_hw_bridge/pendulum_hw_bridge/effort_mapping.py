@@ -17,13 +17,14 @@ limit, and :meth:`EffortMapping.limited_gains` the firmware's own loops.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from enum import Enum
 
 from pendulum_hw_bridge.actuator import PEAK_EFFORT, Command, Strategy
 from pendulum_hw_bridge.gains import DEFAULT_GAINS, GainSet, limit_output
 from pendulum_hw_bridge.motor_state import MotorState
 from pendulum_msgs_py.errors import ParameterError
+from pendulum_msgs_py.joints import ONE_JOINT, Joint
 from pendulum_msgs_py.plants.plant_parameters import SeriesElasticParameters
 
 __all__ = ["EffortMapping", "EffortStrategy"]
@@ -55,6 +56,7 @@ class EffortMapping:
         gains: Gains of the firmware's loops under strategy 3.
         effort_limit: Largest torque that a setpoint may stand for [N m].
         velocity_limit: Largest speed that position control may be asked for [rad/s].
+        joint: The joint that is moved, whose units messages have.
     """
 
     kind: EffortStrategy
@@ -64,6 +66,7 @@ class EffortMapping:
     gains: GainSet = DEFAULT_GAINS[3]
     effort_limit: float = PEAK_EFFORT
     velocity_limit: float = 1.5
+    joint: Joint = field(default=ONE_JOINT.joints[0], compare=False, repr=False)
 
     def __post_init__(self) -> None:
         """Refuse constants that would make the torque meaningless."""
@@ -72,7 +75,8 @@ class EffortMapping:
         if not 0.0 <= self.compensation <= 1.0:
             raise ParameterError(f"back_emf_compensation is {self.compensation}; expected 0 to 1")
         if not (math.isfinite(self.effort_limit) and self.effort_limit > 0.0):
-            raise ParameterError(f"effort_limit is {self.effort_limit} N m; expected a finite number > 0")
+            unit = self.joint.effort_unit
+            raise ParameterError(f"effort_limit is {self.effort_limit} {unit}; expected a finite number > 0")
 
     @property
     def strategy(self) -> Strategy:

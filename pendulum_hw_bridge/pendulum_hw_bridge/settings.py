@@ -92,10 +92,10 @@ def expect_limits(reads: HardwareLimits, wanted: HardwareLimits) -> None:
     Raises:
         ActuatorError: Names the first that differs.
     """
-    for what, unit in (("effort", "N m"), ("velocity", "rad/s"), ("pwm", "of the supply")):
+    for what, unit in wanted.units:
         _expect(f"{what} limit", getattr(reads, what), getattr(wanted, what), unit)
     for what in ("position_min", "position_max"):
-        _expect(what, getattr(reads, what), getattr(wanted, what), "rad")
+        _expect(what, getattr(reads, what), getattr(wanted, what), wanted.joint.unit)
     if reads.m_stop is not wanted.m_stop:
         raise ActuatorError(
             "settings",

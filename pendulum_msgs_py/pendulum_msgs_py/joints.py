@@ -87,6 +87,11 @@ class Coordinates:
         return " or ".join(dict.fromkeys(self.joints[index].effort_unit for index in self.driven))
 
     @property
+    def slew_unit(self) -> str:
+        """Unit of how fast the motors' efforts change, for messages."""
+        return " or ".join(f"{unit}/s" for unit in self.drive_unit.split(" or "))
+
+    @property
     def goal(self) -> Vector:
         """The upright position [rad or m]."""
         return tuple(joint.goal for joint in self.joints)

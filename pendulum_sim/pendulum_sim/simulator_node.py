@@ -14,15 +14,22 @@ import numpy as np
 from sensor_msgs.msg import JointState
 from std_srvs.srv import SetBool, Trigger
 
-from pendulum_msgs_py.contract.plant_specs import LIMIT_SPECS, LOCKSTEP_EPOCH_NS, LOOP_SPECS, limits_from_parameters
+from pendulum_msgs_py.contract.plant_specs import (
+    LIMIT_SPECS,
+    LOCKSTEP_EPOCH_NS,
+    LOOP_SPECS,
+    in_units_of,
+    limits_from_parameters,
+)
 from pendulum_msgs_py.contract.shared_supervisor import SharedSupervisor
 from pendulum_msgs_py.contract.supervisor import Drive, DriveKind, Input, Mode
 from pendulum_msgs_py.contract.timing import LoopStatistics, SteadyWallClock
 from pendulum_msgs_py.contract.values import NANOSECONDS, JointCommand, JointSample, Vector
 from pendulum_msgs_py.errors import FaultError, ParameterError
 from pendulum_msgs_py.parameters import ParameterSpec
+from pendulum_msgs_py.plants.mechanism_parameters import load_mechanism
 from pendulum_msgs_py.plants.plant_differences import PLANT_PARAMETERS, describe_plants
-from pendulum_msgs_py.plants.plant_parameters import PlantParameters
+from pendulum_msgs_py.plants.plant_parameters import PlantParameters, is_mechanism
 from pendulum_msgs_py.programs.executables import report_error
 from pendulum_msgs_py.ros import qos
 from pendulum_msgs_py.ros.convert import sample_from_message
@@ -75,7 +82,7 @@ class SimulatorNode(PollingNode):
 
     def __init__(self, stop: Callable[[], None], engine: Engine = OWN) -> None:
         super().__init__("simulator", enable_logger_service=True)
-        self._settings = NodeParameters(self, (*engine.specs, *_SHARED_SPECS), self._check_start)
+        self._settings = NodeParameters(self, self._specs(engine), self._check_start)
         values = self._settings.values
         self._simulation = engine.make(values)
         self._plant = joint_plant(self._simulation.plant)
@@ -97,8 +104,7 @@ class SimulatorNode(PollingNode):
         limits = limits_from_parameters(
             values,
             self._plant.effort_limits,
-            joints=len(self._coordinates.joints),
-            unit=self._coordinates.drive_unit,
+            coordinates=self._coordinates,
             least_command_timeout=least,
         )
         self._supervisor = SharedSupervisor(
@@ -242,6 +248,12 @@ class SimulatorNode(PollingNode):
             self._state = self._plant.reset(position, velocity)
         # The first measurement is exact: arming and trajectories need one, and a sensor may drop it.
         self._interface.sample = self._measure() or JointSample(self._stamp_ns, *self._state[1:])
+
+    def _specs(self, engine: Engine) -> tuple[ParameterSpec, ...]:
+        """Return the parameters; the units of limits are those of the joints of the plant that was given."""
+        specs, given = (*engine.specs, *_SHARED_SPECS), self._parameter_overrides.get("plant")
+        plant = "" if given is None or engine is not OWN else str(given.value)
+        return in_units_of(specs, load_mechanism(plant).coordinates) if plant and is_mechanism(plant) else specs
 
     def _start_state(self, values: Mapping[str, Any]) -> tuple[Vector, Vector]:
         start, coordinates = values["start"], self._coordinates

@@ -54,7 +54,7 @@ class JointPort:
             strategy=Strategy.OFF,
             feedback_rate=self.machine.rate,
             command_lifetime=0.0,
-            limits=HardwareLimits(),
+            limits=HardwareLimits(joint=self.machine.coordinates.joints[self._index]),
         )
 
     def now_ns(self) -> int:
@@ -113,7 +113,9 @@ class DrivePort(JointPort):
     def __init__(self, machine: EmulatedMachine, index: int, clock: Clock) -> None:
         super().__init__(machine, index, clock)
         self._motor = machine.coordinates.driven.index(index)
-        self._limits = HardwareLimits(effort=machine.plant.effort_limits[self._motor])
+        self._limits = HardwareLimits(
+            effort=machine.plant.effort_limits[self._motor], joint=machine.coordinates.joints[index]
+        )
         self._gains = DEFAULT_GAINS[TORQUE_LOOP]
         self._strategy = Strategy.OFF
 

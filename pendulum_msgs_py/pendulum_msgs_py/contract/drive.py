@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from enum import Enum
 from typing import NamedTuple
 
 from pendulum_msgs_py.contract.values import Vector
 from pendulum_msgs_py.errors import ParameterError
+from pendulum_msgs_py.joints import ONE_JOINT, Coordinates
 
 __all__ = ["Drive", "DriveKind", "Input", "Mode", "PlantLimits"]
 
@@ -93,6 +94,7 @@ class PlantLimits:
         start_effort: Largest torque with which a commander may begin where nobody commands [N m].
         start_sum: The same for the sum with a disturbance that waits [N m].
         starvation: Time without a command after which a plant that is armed for effort disarms [s].
+        coordinates: Joints whose units messages have.
     """
 
     effort: Vector
@@ -110,36 +112,39 @@ class PlantLimits:
     start_effort: float = math.inf
     start_sum: float = math.inf
     starvation: float = math.inf
+    coordinates: Coordinates = field(default=ONE_JOINT, compare=False, repr=False)
 
     def __post_init__(self) -> None:
         """Refuse limits that limit nothing or everything; NaN, which compares false, would do the first."""
+        of_position, of_velocity, _ = self.coordinates.units
+        of_effort = self.coordinates.drive_unit
         for effort in self.effort:
             if not (math.isfinite(effort) and effort > 0.0):
-                raise ParameterError(f"effort_limit is {effort} N m; expected a finite number > 0")
+                raise ParameterError(f"effort_limit is {effort} {of_effort}; expected a finite number > 0")
         if not (math.isfinite(self.command_timeout) and self.command_timeout > 0.0):
             raise ParameterError(f"command_timeout is {self.command_timeout} s; expected a finite number > 0")
         for name, unit in (
             ("feedback_timeout", "s"),
-            ("velocity", "rad/s"),
-            ("slew", "N m/s"),
-            ("handover_effort", "N m"),
-            ("handover_sum", "N m"),
-            ("start_effort", "N m"),
-            ("start_sum", "N m"),
+            ("velocity", of_velocity),
+            ("slew", self.coordinates.slew_unit),
+            ("handover_effort", of_effort),
+            ("handover_sum", of_effort),
+            ("start_effort", of_effort),
+            ("start_sum", of_effort),
             ("starvation", "s"),
         ):
             if not getattr(self, name) > 0.0:
                 raise ParameterError(f"{name} is {getattr(self, name)} {unit}; expected > 0")
-        for name, unit in (("handover_time", "s"), ("arm_effort", "N m")):
+        for name, unit in (("handover_time", "s"), ("arm_effort", of_effort)):
             if not getattr(self, name) >= 0.0:
                 raise ParameterError(f"{name} is {getattr(self, name)} {unit}; expected >= 0")
         if not math.isfinite(self.handover_time):
             raise ParameterError(f"handover_time is {self.handover_time} s; expected a finite number >= 0")
         if not self.tracking_error > 0.0:
-            raise ParameterError(f"tracking_error is {self.tracking_error} rad; expected > 0")
+            raise ParameterError(f"tracking_error is {self.tracking_error} {of_position}; expected > 0")
         for low, high in zip(self.position_min, self.position_max, strict=True):
             if not low < high:
-                raise ParameterError(f"position window is [{low}, {high}] rad; expected min < max")
+                raise ParameterError(f"position window is [{low}, {high}] {of_position}; expected min < max")
 
     def for_joints(self, joints: int, driven: int) -> PlantLimits:
         """Return the limits with one window for each of so many joints.

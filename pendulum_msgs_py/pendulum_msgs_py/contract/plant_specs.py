@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
+from dataclasses import replace
 
 from pendulum_msgs_py.contract.drive import Input, PlantLimits
 from pendulum_msgs_py.contract.values import NANOSECONDS, Vector
 from pendulum_msgs_py.errors import ParameterError
+from pendulum_msgs_py.joints import ONE_JOINT, Coordinates
 from pendulum_msgs_py.parameters import ParameterSpec
 
-__all__ = ["LIMIT_SPECS", "LOCKSTEP_EPOCH_NS", "LOOP_SPECS", "limits_from_parameters"]
+__all__ = ["LIMIT_SPECS", "LOCKSTEP_EPOCH_NS", "LOOP_SPECS", "in_units_of", "limits_from_parameters"]
 
 LOCKSTEP_EPOCH_NS = NANOSECONDS
 """Stamp of the first state in lockstep [ns]; a stamp of zero means "no time" to ROS tools."""
@@ -135,12 +137,24 @@ LIMIT_SPECS: tuple[ParameterSpec, ...] = (
 )
 
 
+def in_units_of(specs: Iterable[ParameterSpec], coordinates: Coordinates) -> tuple[ParameterSpec, ...]:
+    """Return a table of parameters, of ``LIMIT_SPECS`` among others, with the limits in the units of a plant's joints.
+
+    Args:
+        specs: The parameters, with the units of a pendulum.
+        coordinates: Joints of the plant.
+    """
+    limits = {spec.name for spec in LIMIT_SPECS}
+    of_position, of_velocity, _ = coordinates.units
+    units = {"rad": of_position, "rad/s": of_velocity, "N m": coordinates.drive_unit, "N m/s": coordinates.slew_unit}
+    return tuple(replace(spec, unit=units.get(spec.unit, spec.unit)) if spec.name in limits else spec for spec in specs)
+
+
 def limits_from_parameters(
     values: Mapping[str, object],
     plant_effort_limits: Vector,
     *,
-    joints: int = 1,
-    unit: str = "N m",
+    coordinates: Coordinates = ONE_JOINT,
     feedback_timeout: float = float("inf"),
     least_command_timeout: float = 0.0,
 ) -> PlantLimits:
@@ -150,8 +164,7 @@ def limits_from_parameters(
         values: Parameter values by name.
         plant_effort_limits: Effort limit of each driven joint in the plant file [N m or N]; the parameter can only
             lower them.
-        joints: How many joints the plant has.
-        unit: Unit of the efforts, for messages: the ``drive_unit`` of the plant's coordinates.
+        coordinates: Joints of the plant.
         feedback_timeout: Age of a measurement that faults an armed plant [s].
         least_command_timeout: The shortest that the plant's own period allows; a shorter one is raised to it [s].
 
@@ -164,6 +177,7 @@ def limits_from_parameters(
         assert isinstance(value, float)
         return value
 
+    joints, unit = len(coordinates.joints), coordinates.drive_unit
     window = values["position_window"]
     assert isinstance(window, list)
     if len(window) != 2 * joints and window != [0.0, 0.0]:
@@ -193,4 +207,5 @@ def limits_from_parameters(
         handover_effort=number("handover_effort_limit"),
         start_effort=number("start_effort_limit") or unlimited,
         starvation=number("starvation_limit") or unlimited,
+        coordinates=coordinates,
     )
