@@ -7,8 +7,8 @@ Two certificates, both by Vinnicombe's theorem and both with the upper confidenc
 
 Both speak of the linear machine, on a grid dense enough for lightly damped loops (:mod:`pendulum_lqr.machine_response`
 says how it is made of measured lines). From the highest line to the Nyquist frequency the machine is taken to be
-smooth, or, where lines end well below, to roll off. Both take the machine to have one unstable pole, as a pendulum
-upright has. Neither speaks of saturation, or of dry friction at rest.
+smooth, or, where lines end well below, to roll off. Both take the machine to have as many unstable poles as the model,
+a pendulum upright one. Neither speaks of saturation, or of dry friction at rest.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from pendulum_lqr.gap_metric import (
     DEFAULT_SCALING,
-    Scaling,
+    SignalScaling,
     chordal_distance,
     loop_distance,
     nu_gap,
@@ -60,17 +60,17 @@ class GapProfile:
     value_upper: float
     at: float
     winding: bool
-    scaling: Scaling
+    scaling: SignalScaling
     beyond: float
 
 
-def compare_machine(plant: LinearModel, machine: Machine, scaling: Scaling = DEFAULT_SCALING) -> GapProfile:
+def compare_machine(plant: LinearModel, machine: Machine, scaling: SignalScaling = DEFAULT_SCALING) -> GapProfile:
     """Return the gap between a model, sampled as the machine is, and the machine.
 
     Args:
         plant: The model.
         machine: The measured machine.
-        scaling: Units of angle, velocity and torque.
+        scaling: Units of outputs and torque.
     """
     model = scaling.plant(model_response(plant, machine.frequency, machine.period))
     measured = scaling.plant(machine.response)
@@ -168,11 +168,11 @@ def is_stable(sampled: DiscreteModel, K: ArrayLike) -> bool:
     """Tell whether a static gain stabilises a sampled model.
 
     Args:
-        sampled: The model; its first two states are angle and velocity.
-        K: Gain, shape (2,).
+        sampled: The model; its first states are what is measured: angle and velocity, or those of k joints.
+        K: Gain, shape (2,), or (2 k,).
     """
     feedback = np.zeros((1, sampled.A.shape[0]))
-    feedback[0, :2] = np.asarray(K, dtype=np.float64)
+    feedback[0, : np.size(K)] = np.asarray(K, dtype=np.float64)
     return bool(np.max(np.abs(np.linalg.eigvals(sampled.A - sampled.B @ feedback))) < 1.0)
 
 
@@ -182,10 +182,10 @@ class Certifier:
     Args:
         plant: The model.
         machine: The machine.
-        scaling: Units of angle, velocity and torque, for the gap.
+        scaling: Units of outputs and torque, for the gap.
     """
 
-    def __init__(self, plant: LinearModel, machine: Machine, scaling: Scaling = DEFAULT_SCALING) -> None:
+    def __init__(self, plant: LinearModel, machine: Machine, scaling: SignalScaling = DEFAULT_SCALING) -> None:
         self.plant = plant
         self.machine = machine
         self.scaling = scaling
@@ -193,17 +193,19 @@ class Certifier:
         self._model = model_response(plant, machine.frequency, machine.period)
         self._sampled = discretise(plant, machine.period)
         top = 0.5 / machine.period
-        whole = np.concatenate([[0.0], np.geomspace(1e-3, top * (1.0 - 1e-9), 400)])
+        # A plant of several joints may have no response at 0: a cart rolls away.
+        lowest = machine.frequency[:1] if machine.response.shape[0] > 2 else np.zeros(1)
+        whole = np.concatenate([lowest, np.geomspace(1e-3, top * (1.0 - 1e-9), 400)])
         self._whole = scaling.plant(model_response(plant, whole, machine.period))
 
     def gain(self, K: ArrayLike) -> Certificate:
         """Return the certificate of a static gain u = -K [theta, theta_dot].
 
         Args:
-            K: Shape (2,) [N m/rad, N m s/rad].
+            K: Shape (2,) [N m/rad, N m s/rad], or (2 k,) for a plant of k joints.
         """
         stable = is_stable(self._sampled, K)
-        return self.feedback(np.asarray(K, dtype=np.complex128).reshape(2, 1), stable=stable)
+        return self.feedback(np.asarray(K, dtype=np.complex128).reshape(-1, 1), stable=stable)
 
     def feedback(self, response: ArrayLike, *, stable: bool) -> Certificate:
         """Return the certificate of any linear controller.

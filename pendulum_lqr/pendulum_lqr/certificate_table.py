@@ -79,9 +79,7 @@ def certificate_document(certifier: Certifier, found: Sequence[Certificate]) -> 
         "nu_gap_upper": profile.value_upper,
         "at_hz": profile.at,
         "scaling": {
-            "angle": profile.scaling.angle,
-            "velocity": profile.scaling.velocity,
-            "torque": profile.scaling.torque,
+            **profile.scaling.to_json(),
         },
         "rows": [
             {

@@ -16,7 +16,10 @@ Vinnicombe, Uncertainty and Feedback, Imperial College Press, 2001, sections 2.3
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from abc import ABC, abstractmethod
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -25,8 +28,10 @@ from pendulum_msgs_py.errors import ParameterError
 
 __all__ = [
     "DEFAULT_SCALING",
+    "JointScaling",
     "NuGap",
     "Scaling",
+    "SignalScaling",
     "chordal_distance",
     "loop_distance",
     "nu_gap",
@@ -38,9 +43,39 @@ Array = NDArray[np.float64]
 Complex = NDArray[np.complex128]
 
 
+class SignalScaling(ABC):
+    """What counts as one unit of each signal: the deviations that the task allows, and the torque it has for them."""
+
+    @property
+    @abstractmethod
+    def outputs(self) -> Array:
+        """One unit of each output, shape (outputs, 1)."""
+
+    @property
+    @abstractmethod
+    def input(self) -> float:
+        """One unit of the torque or force."""
+
+    @abstractmethod
+    def sentence(self) -> str:
+        """Say it in words."""
+
+    def plant(self, response: ArrayLike) -> Complex:
+        """Return a response, shape (outputs, n), in scaled units."""
+        return np.asarray(response, dtype=np.complex128) * self.input / self.outputs
+
+    def controller(self, response: ArrayLike) -> Complex:
+        """Return a feedback, shape (outputs, n) or (outputs, 1), in scaled units."""
+        return np.asarray(response, dtype=np.complex128) * self.outputs / self.input
+
+    def to_json(self) -> dict[str, Any]:
+        """Return it as JSON values."""
+        return asdict(self)  # type: ignore[call-overload]
+
+
 @dataclass(frozen=True, slots=True)
-class Scaling:
-    """What counts as one unit of each signal: the deviations that the task allows, and the torque it has for them.
+class Scaling(SignalScaling):
+    """Scaling of a plant of one joint.
 
     Attributes:
         angle: [rad].
@@ -59,15 +94,15 @@ class Scaling:
             if not (np.isfinite(value) and value > 0.0):
                 raise ParameterError(f"scale of {name} is {value} {unit}; expected a finite value > 0")
 
-    def plant(self, response: ArrayLike) -> Complex:
-        """Return a response [rad/(N m); rad/s/(N m)], shape (2, n), in scaled units."""
-        outputs = np.array([[self.angle], [self.velocity]])
-        return np.asarray(response, dtype=np.complex128) * self.torque / outputs
+    @property
+    def outputs(self) -> Array:
+        """One unit of angle [rad] and velocity [rad/s]."""
+        return np.array([[self.angle], [self.velocity]])
 
-    def controller(self, response: ArrayLike) -> Complex:
-        """Return a feedback [N m/rad; N m s/rad], shape (2, n) or (2, 1), in scaled units."""
-        outputs = np.array([[self.angle], [self.velocity]])
-        return np.asarray(response, dtype=np.complex128) * outputs / self.torque
+    @property
+    def input(self) -> float:
+        """One unit of the torque [N m]."""
+        return self.torque
 
     def sentence(self) -> str:
         """Say it in words."""
@@ -78,6 +113,61 @@ class Scaling:
 
 
 DEFAULT_SCALING = Scaling()
+
+
+@dataclass(frozen=True, slots=True)
+class JointScaling(SignalScaling):
+    """Scaling of a plant of several joints, one of them driven.
+
+    Attributes:
+        names: Of the outputs: joints, then their velocities.
+        units: Of each [rad, m, rad/s or m/s].
+        values: One unit of each, in these.
+        effort: One unit of the effort [N m or N].
+        effort_unit: Its unit.
+    """
+
+    names: tuple[str, ...]
+    units: tuple[str, ...]
+    values: tuple[float, ...]
+    effort: float
+    effort_unit: str
+
+    @classmethod
+    def of_weights(
+        cls, names: Sequence[str], units: Sequence[str], q: Sequence[float], r: float, effort_unit: str
+    ) -> JointScaling:
+        """Return the scaling that an LQR's weights stand for: deviations that cost as much as each other.
+
+        Args:
+            names: Of the outputs.
+            units: Of each.
+            q: Weights of the outputs, > 0 [1/unit^2].
+            r: Weight of the effort, > 0.
+            effort_unit: Unit of the effort.
+
+        Source:
+            Bryson and Ho, Applied Optimal Control, 1975, section 5.2 (q = 1 / largest deviation squared).
+        """
+        return cls(tuple(names), tuple(units), tuple(float(w) ** -0.5 for w in q), float(r) ** -0.5, effort_unit)
+
+    @property
+    def outputs(self) -> Array:
+        """One unit of each output."""
+        return np.array(self.values)[:, None]
+
+    @property
+    def input(self) -> float:
+        """One unit of the effort."""
+        return self.effort
+
+    def sentence(self) -> str:
+        """Say it in words."""
+        parts = [f"{v:.3g} {unit} of {name}" for name, unit, v in zip(self.names, self.units, self.values, strict=True)]
+        return (
+            f"One unit is {', '.join(parts)} and {self.effort:.3g} {self.effort_unit} of effort: what the plant's own "
+            "LQR weights count alike."
+        )
 
 
 @dataclass(frozen=True, slots=True)

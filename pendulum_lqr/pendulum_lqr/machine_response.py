@@ -3,7 +3,8 @@
 A plant is smooth between two lines where its closed loop need not be: a loop with little damping turns quickly just
 where it is about to fail. So the plant is interpolated, and loops are judged on the interpolated plant. What is
 interpolated is its inverse, torque for an angle: (-stiffness + inertia, damping times frequency) for a joint, which
-hardly bends.
+hardly bends. Of several joints each output has zeros of its own, and its inverse poles: there it is the ratio to the
+response of a model that is interpolated, 1 where the model is right.
 """
 
 from __future__ import annotations
@@ -16,6 +17,8 @@ import scipy
 from numpy.typing import NDArray
 
 from pendulum_lqr.measured_response import MeasuredResponse
+from pendulum_lqr.model import LinearModel
+from pendulum_lqr.sampled_response import model_response
 
 __all__ = ["Machine"]
 
@@ -24,6 +27,8 @@ Complex = NDArray[np.complex128]
 
 _BELOW = np.array([0.0, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9])
 """Frequencies below the lowest line at which the response is continued, as shares of that line."""
+_NEARLY_ZERO = 0.01
+"""The lowest of these for several joints: a plant that can roll away has no response at 0."""
 _FIT_UP_TO = 4.0
 """Lines up to this multiple of the lowest serve the continuation."""
 _LEAST_FIT = 4
@@ -41,9 +46,9 @@ class Machine:
     """A measured plant on a dense grid.
 
     Attributes:
-        frequency: Shape (n,), from 0 [Hz].
-        response: Sampled plant from torque to angle and velocity, shape (2, n).
-        radius: Radius of the joint confidence discs, interpolation included, shape (2, n).
+        frequency: Shape (n,), from 0 [Hz], or of several joints from nearly 0.
+        response: Sampled plant from torque to angle and velocity, shape (outputs, n).
+        radius: Radius of the joint confidence discs, interpolation included, shape (outputs, n).
         period: Sampling period [s].
         lowest: Lowest measured line [Hz].
         confidence: Of the discs.
@@ -90,29 +95,57 @@ class Machine:
             discs = np.hstack([np.vstack([disc, omega * (disc + hold)]), discs])
         return cls(inside, response, discs, measured.period, float(lines[0]), confidence)
 
+    @classmethod
+    def beside(cls, measured: MeasuredResponse, model: LinearModel, confidence: float = 0.95) -> Machine:
+        """Return the machine of a measurement of several joints, interpolated beside a model.
+
+        Args:
+            measured: The measurement.
+            model: A model of the plant, with the same outputs.
+            confidence: Probability with which all discs hold the true response.
+        """
+        lines, period = measured.frequency, measured.period
+        own = model_response(model, lines, period)
+        ratio, spread = measured.response / own, measured.radius(confidence) / np.abs(own)
+        low = lines[0] * np.concatenate([[_NEARLY_ZERO], _BELOW[1:]])
+        near = np.flatnonzero(lines <= _FIT_UP_TO * lines[0])
+        if near.size < _LEAST_FIT:
+            near = np.arange(min(_LEAST_FIT, lines.size))
+        inside = _grid(lines)
+        on_line = np.isin(inside, lines)
+        # What a spline makes of errors within these radii, however they lie.
+        weights = np.abs(scipy.interpolate.CubicSpline(lines, np.eye(lines.size))(inside))
+        rows, discs = [], []
+        for curve, radius in zip(ratio, spread, strict=True):
+            values, error = _splined(lines, curve, inside)
+            disc = weights @ radius + np.where(on_line, 0.0, np.abs(values) * _larger_neighbour(lines, error, inside))
+            values[on_line], disc[on_line] = curve, radius
+            below = _continued(2.0 * np.pi * lines[near], curve[near], radius[near], 2.0 * np.pi * low)
+            if below is not None:
+                values, disc = np.concatenate([below[0], values]), np.concatenate([below[1], disc])
+            rows.append(values)
+            discs.append(disc)
+        whole = inside if len(rows[0]) == inside.size else np.concatenate([low, inside])
+        on_grid = model_response(model, whole, period)
+        return cls(
+            whole, np.array(rows) * on_grid, np.array(discs) * np.abs(on_grid), period, float(lines[0]), confidence
+        )
+
 
 def _between(measured: MeasuredResponse, radius: Array) -> tuple[Array, Complex, Array]:
     """Return grid, response and discs from the lowest to the highest line."""
     lines = measured.frequency
     if lines.size < 5:
         return lines, measured.response, radius
-    pieces = [
-        np.geomspace(a, b, max(2, int(np.ceil(np.log(b / a) / np.log(_RATIO))) + 1))[:-1] for a, b in pairwise(lines)
-    ]
-    grid = np.concatenate([*pieces, lines[-1:]])
+    grid = _grid(lines)
     inverse = 1.0 / measured.response[0]
     ratio = measured.response[1] / measured.response[0]
     relative = radius / np.abs(measured.response)
     values, errors = [], []
     for curve in (inverse, ratio):
-        spline = scipy.interpolate.CubicSpline(lines, curve)(grid)
+        spline, error = _splined(lines, curve, grid)
         values.append(spline)
-        left_out = np.zeros(lines.size)
-        for i in range(1, lines.size - 1):
-            others = np.delete(np.arange(lines.size), i)
-            left_out[i] = abs(scipy.interpolate.CubicSpline(lines[others], curve[others])(lines[i]) / curve[i] - 1.0)
-        left_out[0], left_out[-1] = left_out[1], left_out[-2]
-        errors.append(_LEFT_OUT * left_out)
+        errors.append(error)
     on_line = np.isin(grid, lines)
     angle = 1.0 / values[0]
     response = np.vstack([angle, values[1] * angle])
@@ -122,6 +155,24 @@ def _between(measured: MeasuredResponse, radius: Array) -> tuple[Array, Complex,
     discs = np.abs(response) * (noise + np.where(on_line, 0.0, share))
     response[:, on_line], discs[:, on_line] = measured.response, radius
     return grid, response, discs
+
+
+def _grid(lines: Array) -> Array:
+    """Return the dense grid from the lowest to the highest line; the lines themselves are on it."""
+    pieces = [
+        np.geomspace(a, b, max(2, int(np.ceil(np.log(b / a) / np.log(_RATIO))) + 1))[:-1] for a, b in pairwise(lines)
+    ]
+    return np.concatenate([*pieces, lines[-1:]])
+
+
+def _splined(lines: Array, curve: Complex, grid: Array) -> tuple[Complex, Array]:
+    """Return a curve on the grid, and the error between lines as a share of it: what each tells of one left out."""
+    left_out = np.zeros(lines.size)
+    for i in range(1, lines.size - 1):
+        others = np.delete(np.arange(lines.size), i)
+        left_out[i] = abs(scipy.interpolate.CubicSpline(lines[others], curve[others])(lines[i]) / curve[i] - 1.0)
+    left_out[0], left_out[-1] = left_out[1], left_out[-2]
+    return np.asarray(scipy.interpolate.CubicSpline(lines, curve)(grid)), _LEFT_OUT * left_out
 
 
 def _larger_neighbour(lines: Array, values: Array, grid: Array) -> Array:

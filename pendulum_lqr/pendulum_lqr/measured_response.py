@@ -27,6 +27,8 @@ Complex = NDArray[np.complex128]
 class MeasuredResponse:
     """The sampled plant from torque (held over a period) to angle and velocity, measured in closed loop.
 
+    A plant of k joints, one of them driven, has 2 k outputs: all positions, then all velocities.
+
     The error at a frequency is circular complex: ``|measured - true|^2 / deviation^2`` follows F(2, 2 (blocks - 1)).
 
     Attributes:
@@ -41,6 +43,8 @@ class MeasuredResponse:
         distortion: Angle and velocity on lines that were not excited, beside those that were, shape (2,); NaN where
             that was not measured [-].
         facts: What else a reader should know: source, excitation, duration, largest angle and torque.
+        joints: Names of the k joints; none for a plant of one.
+        driven: Which of them the torque drives.
     """
 
     label: str
@@ -53,14 +57,20 @@ class MeasuredResponse:
     blocks: float
     distortion: tuple[float, float] = (float("nan"), float("nan"))
     facts: Mapping[str, Any] = field(default_factory=dict)
+    joints: tuple[str, ...] = ()
+    driven: int = 0
 
     def __post_init__(self) -> None:
         """Check shapes."""
         n = self.frequency.size
+        outputs = (self.outputs, n)
         for name, shape in (
-            ("frequency", (n,)), ("response", (2, n)), ("deviation", (2, n)), ("coherence", (2, n)),
+            ("frequency", (n,)),
+            ("response", outputs),
+            ("deviation", outputs),
+            ("coherence", outputs),
             ("sensitivity", (n,)),
-        ):  # fmt: skip
+        ):
             found = getattr(self, name)
             if found.shape != shape or not np.all(np.isfinite(found)):
                 raise DataError(f"response of {self.label}: {name} has shape {found.shape}; expected {shape}, finite")
@@ -70,14 +80,24 @@ class MeasuredResponse:
                 "expected increasing frequencies, a period > 0 and at least 2 blocks"
             )
 
+    @property
+    def outputs(self) -> int:
+        """Number of outputs: 2 of one joint, 2 k of k."""
+        return 2 * max(1, len(self.joints))
+
+    @property
+    def driven_velocity(self) -> int:
+        """Which output is the velocity of the joint that the torque drives."""
+        return self.outputs // 2 + self.driven
+
     def radius(self, confidence: float = 0.95, *, joint: bool = True) -> Array:
-        """Return the radius of the confidence disc of each value, shape (2, n).
+        """Return the radius of the confidence disc of each value, shape (outputs, n).
 
         Args:
             confidence: Probability with which the discs hold the true response.
             joint: Whether all discs together are meant (Bonferroni), or each for itself.
         """
-        tail = (1.0 - confidence) / (2 * self.frequency.size if joint else 1)
+        tail = (1.0 - confidence) / (self.response.size if joint else 1)
         quantile = float(scipy.stats.f.isf(tail, 2.0, 2.0 * (self.blocks - 1.0)))
         return np.sqrt(quantile) * self.deviation
 
@@ -97,6 +117,7 @@ class MeasuredResponse:
             "coherence": self.coherence.tolist(),
             "distortion": [value if np.isfinite(value) else None for value in self.distortion],
             "facts": dict(self.facts),
+            **({"joints": list(self.joints), "driven": self.driven} if self.joints else {}),
         }
 
     @classmethod
@@ -122,6 +143,8 @@ class MeasuredResponse:
                 float(content["blocks"]),
                 (np.nan if first is None else float(first), np.nan if second is None else float(second)),
                 dict(content["facts"]),
+                tuple(map(str, content.get("joints", ()))),
+                int(content.get("driven", 0)),
             )
         except (KeyError, TypeError, ValueError) as error:
             raise DataError(f"the content is no measured response: {error}") from error

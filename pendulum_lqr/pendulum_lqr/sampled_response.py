@@ -21,10 +21,10 @@ Complex = NDArray[np.complex128]
 
 
 def model_response(model: LinearModel, frequency: ArrayLike, period: float = 0.0) -> Complex:
-    """Return the response from torque to angle and velocity, shape (2, n) [rad/(N m), rad/s/(N m)].
+    """Return the response from torque to what is measured: angle and velocity, shape (2, n) [rad/(N m), rad/s/(N m)].
 
     Args:
-        model: Linear model, its delay included.
+        model: Linear model of one input, its delay included; of k joints the shape is (2 k, n).
         frequency: Shape (n,) [Hz], up to the Nyquist frequency.
         period: Sampling period under zero-order hold [s]; 0 for the continuous plant.
     """
@@ -38,7 +38,7 @@ def model_response(model: LinearModel, frequency: ArrayLike, period: float = 0.0
         factor = np.exp(-1j * omega * model.delay)
     pencil = points[:, None, None] * np.eye(A.shape[0]) - A
     states = np.linalg.solve(pencil, np.broadcast_to(B.astype(np.complex128), (omega.size, *B.shape)))
-    return np.asarray(states[:, :2, 0].T * factor, dtype=np.complex128)
+    return np.asarray(states[:, : model.C.shape[0], 0].T * factor, dtype=np.complex128)
 
 
 def brought_to(
@@ -49,7 +49,7 @@ def brought_to(
     Only the change of hold and folding is the model's; an error of the model enters multiplied by that small change.
 
     Args:
-        response: Measured response, shape (2, n).
+        response: Measured response, shape (outputs, n).
         model: A model of the plant.
         frequency: Shape (n,) [Hz], below both Nyquist frequencies.
         measured: Sampling period of the measurement [s].

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -96,6 +96,7 @@ class JointRun:
         side: ``sim``, or ``hw`` for the plant that stands in for the machine.
         plant: Preset or file of what runs on this side.
         design: Preset or file on which the controller is designed; empty for the simulated plant.
+        excitation: Parameters of the disturbance that differ from those of the noise.
     """
 
     settings: JointSettings
@@ -103,6 +104,7 @@ class JointRun:
     plant: str
     design: str = ""
     simulated_time: bool = True
+    excitation: Mapping[str, Any] = field(default_factory=dict)
 
     @property
     def has_bridge(self) -> bool:
@@ -195,6 +197,7 @@ class JointRun:
             "hold_time": own.hold_time,
             "duration": own.duration,
             "seed": own.seed,
+            **self.excitation,
         }
 
 
@@ -266,6 +269,7 @@ def record_joints(
     settings: JointSettings,
     machine: Path,
     *,
+    excitation: Mapping[str, Any] | None = None,
     on_side: Callable[[str], None] = lambda side: None,
     on_wait: Callable[[], None] = lambda: None,
 ) -> None:
@@ -277,6 +281,7 @@ def record_joints(
         folder: The run folder.
         settings: What to run.
         machine: Plant file that stands in for the machine.
+        excitation: Parameters of the disturbance that differ from those of the noise.
         on_side: Told each side, in words, when it begins.
         on_wait: Called while waiting.
 
@@ -297,7 +302,9 @@ def record_joints(
         on_side(words)
         stopped = ""
         try:
-            record_run(folder / side, JointRun(settings, side, runs, design), on_wait=on_wait)
+            record_run(
+                folder / side, JointRun(settings, side, runs, design, excitation=excitation or {}), on_wait=on_wait
+            )
         except PlantStoppedError as error:
             stopped = f"went to {error.mode} ({error.reason})"
         ends[words] = _end_of(folder / side, f"/{side}", plant, stopped)

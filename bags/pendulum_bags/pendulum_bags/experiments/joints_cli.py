@@ -10,6 +10,7 @@ import typer
 
 from pendulum_bags.comparison.compare_cli import MarginOption, MarginsFile
 from pendulum_bags.experiments.progress import PhaseProgress
+from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.programs.executables import EXIT_INTERRUPTED
 from pendulum_msgs_py.programs.options import Json, Storage, out_option
 from pendulum_msgs_py.programs.terminal import make_console
@@ -18,6 +19,15 @@ __all__ = ["joints"]
 
 _STARTING, _PACE = 6.0, 0.4
 """Wall time in which the nodes of a side start [s], and of simulated time, on two cores."""
+_ANALYSING = 8.0
+"""Wall time to analyse and draw frequency responses [s]."""
+Design = Annotated[
+    list[str] | None,
+    typer.Option(
+        help="Design to certify for the machine: 'q=10,100,1,1 r=0.1', positions before velocities, or 'k=...'; may be "
+        "given again. Default: the plant's own LQR, and three with another cost of the effort."
+    ),
+]
 
 
 def joints(
@@ -44,6 +54,17 @@ def joints(
     hold_time: Annotated[float, typer.Option(help="Time for which a noise sample is held [s].")] = 0.01,
     duration: Annotated[float, typer.Option(help="Length of the noise [s].")] = 20.0,
     seed: Annotated[int, typer.Option(help="Seed of the noise, and of the draw.", min=0)] = 1,
+    frequencies: Annotated[
+        bool,
+        typer.Option(
+            help="Measure both plants at many frequencies too, and certify designs: two more layers of the answer, "
+            "where one joint is driven."
+        ),
+    ] = True,
+    periods: Annotated[
+        int, typer.Option(help="Periods of 4 s that are averaged for it; one more settles.", min=3, max=1000)
+    ] = 8,
+    design: Design = None,
     storage: Storage = "mcap",
     margin: MarginOption = None,
     margins_file: MarginsFile = None,
@@ -54,12 +75,15 @@ def joints(
     In the place of the machine the bridge drives an emulated one: quasi-direct drives, encoders and delays on a plant
     that is a little off. The answer calls it emulated hardware.
     Both sides run as nodes over DDS, in lockstep, under one LQR that is designed on the simulated plant, where the dry
-    friction of a passive joint counts as viscous: else acrobot and pendubot would fall.
+    friction of a passive joint counts as viscous: else acrobot and pendubot would fall. Then a multisine measures both
+    plants, and says which designs carry over.
 
     Example: python -m pendulum_bags experiment joints --plant acrobot --share 0.1
     """
     from pendulum_bags.comparison.compare_cli import compare
     from pendulum_bags.experiments.joint_run import JointSettings, load_stand_in, record_joints, stand_in_for
+    from pendulum_bags.frequency_response.designs_table import designs_table
+    from pendulum_bags.frequency_response.joint_experiment import FOLDER, JointMultisine, measure_joints
     from pendulum_bags.runs.run_folder import create_run_folder, discard_if_empty
     from pendulum_msgs_py.plants.mechanism_parameters import load_mechanism, write_mechanism
 
@@ -68,24 +92,47 @@ def joints(
     drawn = (
         load_stand_in(machine, simulated) if machine else stand_in_for(simulated, share=share, delay=delay, seed=seed)
     )
+    measured = frequencies and len(simulated.coordinates.driven) == 1
+    if design and not measured:
+        raise ParameterError(
+            "--design needs both plants measured; expected --frequencies, and a plant with one driven joint: "
+            f"{simulated.name} has {len(simulated.coordinates.driven)}"
+        )
     console = make_console(stderr=json_output, highlight=False)
     folder = create_run_folder(out, "joints")
     started = time.monotonic()
     try:
         made = write_mechanism(folder / "machine.yaml", drawn, provenance={"stands_in_for": f"the machine of {plant}"})
         expected = _STARTING + _PACE * duration
-        with PhaseProgress(2.0 * expected, console) as progress:
+        multisine = JointMultisine(settings, periods)
+        longer = _STARTING + _PACE * multisine.run.duration if measured else 0.0
+        analysis = None
+        with PhaseProgress(2.0 * (expected + longer) + _ANALYSING * measured, console) as progress:
             record_joints(
                 folder, settings, made, on_side=lambda side: progress.phase(side, expected), on_wait=progress.refresh
             )
+            if measured:
+                analysis = measure_joints(
+                    folder,
+                    multisine,
+                    made,
+                    design or (),
+                    on_side=lambda side: progress.phase(f"{side}, multisine", longer),
+                    on_analysis=lambda what: progress.phase(what, 0.5 * _ANALYSING),
+                    on_wait=progress.refresh,
+                )
     except KeyboardInterrupt:
         kept = "nothing was recorded" if discard_if_empty(folder) else f"what was recorded is in {folder}"
         console.print(f"interrupted: all programs have ended; {kept}")
         raise typer.Exit(EXIT_INTERRUPTED) from None
+    if analysis is not None and not json_output:
+        console.print(designs_table(analysis.designs))
     compare([folder], margin=margin, margins_file=margins_file, out=folder, json_output=json_output)
     console.print(
         f"The emulated hardware is the bridge on an emulated machine of {made}"
         + ("." if machine else f": values of {plant} off by up to {100.0 * share:g} %, {1e3 * delay:g} ms of delay."),
         soft_wrap=True,
     )
+    if analysis is not None:
+        console.print(f"page    {folder / FOLDER / 'frequency_response.html'}", soft_wrap=True)
     console.print(f"bags    {folder / 'sim'}, {folder / 'hw'}\n({time.monotonic() - started:.0f} s)", soft_wrap=True)

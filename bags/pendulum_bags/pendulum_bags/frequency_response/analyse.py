@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from threadpoolctl import threadpool_limits
 
@@ -15,22 +15,26 @@ from pendulum_bags.frequency_response.compare import compare_responses
 from pendulum_bags.frequency_response.designs import DesignResult, certify_designs, design_text, policies_of
 from pendulum_bags.frequency_response.estimate import estimate
 from pendulum_bags.frequency_response.figures import response_figures
-from pendulum_bags.frequency_response.layers import GAP_MARGIN, same_plant, which_controllers
+from pendulum_bags.frequency_response.joint_designs import certify_joint_designs
+from pendulum_bags.frequency_response.layers import GAP_MARGIN, LONGER, same_plant, which_controllers
 from pendulum_bags.frequency_response.page import write_page
-from pendulum_bags.frequency_response.record import record_of_run
+from pendulum_bags.frequency_response.record import Record, record_of_joints, record_of_run
 from pendulum_bags.frequency_response.result import Analysis
 from pendulum_bags.runs.run_folder import write_json
 from pendulum_bags.runs.run_record import run_record
 from pendulum_bags.verdict import LayerResult, write_layer
 from pendulum_lqr.certificate import Certifier
-from pendulum_lqr.gap_metric import DEFAULT_SCALING, Scaling
+from pendulum_lqr.gap_metric import DEFAULT_SCALING, JointScaling, Scaling, SignalScaling
 from pendulum_lqr.machine_response import Machine
 from pendulum_lqr.measured_response import MeasuredResponse, read_response, write_response
+from pendulum_lqr.mechanism_model import linearise_mechanism, mechanism_lqr
 from pendulum_lqr.model import linearise
-from pendulum_msgs_py.errors import DataError
+from pendulum_msgs_py.errors import DataError, ParameterError
+from pendulum_msgs_py.plants.mechanism_parameters import load_mechanism
 from pendulum_msgs_py.plants.plant_parameters import load_plant
 
 __all__ = [
+    "LONGER_OF_JOINTS",
     "analyse_machine",
     "analyse_responses",
     "find_machine",
@@ -41,6 +45,8 @@ __all__ = [
 
 MACHINE = "hw_response.json"
 """File in which a run folder keeps the measured response of its hardware."""
+LONGER_OF_JOINTS = "python -m pendulum_bags experiment joints --periods 40"
+"""Measures plants of several joints longer than by default."""
 NUMBERS = "frequency_response.json"
 """File in which it keeps what was found."""
 
@@ -57,28 +63,53 @@ def read_responses(paths: Sequence[Path]) -> tuple[list[MeasuredResponse], str, 
     """
     # Late: it needs a reader, which the rest of this room does not.
     from pendulum_bags.comparison import compare_runs  # noqa: F401
-    from pendulum_bags.runs.run_data import read_run
 
     if len(paths) == 1 and (paths[0] / "sim").is_dir() and (paths[0] / "hw").is_dir():
         paths = [paths[0] / "sim", paths[0] / "hw"]
     if len(paths) not in {1, 2}:
         raise DataError(f"got {len(paths)} bags; expected one, a simulation and a hardware bag, or a run folder")
-    runs = [read_run(path) for path in paths]
     found = []
     plant = "thesis"
     policies: dict[str, None] = {}
-    for i, run in enumerate(runs):
-        facts = run_record(run.metadata)
+    for i, path in enumerate(paths):
+        record, facts = _read(path)
         side = str(facts.get("side") or str(facts.get("namespace", "")).strip("/"))
-        label = side if side in {"sim", "hw"} else ("hw" if len(runs) == 1 or i else "sim")
-        plant = str(facts.get("design_plant") or plant)
+        label = side if side in {"sim", "hw"} else ("hw" if len(paths) == 1 or i else "sim")
+        plant = _design_plant(path, facts) or plant
         policies |= dict.fromkeys(policies_of(facts))
-        measured = estimate(record_of_run(run))
-        found.append(_labelled(measured, label))
+        found.append(_labelled(estimate(record), label))
     if len(found) == 2 and found[0].label == found[1].label:
         # Two of one kind: the order in which they were given tells which is held against which.
         found = [_labelled(found[0], "sim"), _labelled(found[1], "hw")]
     return sorted(found, key=lambda response: response.label, reverse=True), plant, list(policies)
+
+
+def _read(path: Path) -> tuple[Record, Mapping[str, Any]]:
+    """Return the excited plant of a bag, of one joint or several, and what the bag says of its run."""
+    from pendulum_bags.runs.kept_bags import KeptBags
+    from pendulum_bags.runs.run_data import joints_of, read_run
+
+    with KeptBags() as bags:
+        joints = joints_of(path, open_bag=bags)
+        if not joints:
+            run = read_run(path, open_bag=bags)
+            return record_of_run(run), run_record(run.metadata)
+        runs = {joint: read_run(path, joint=joint, open_bag=bags) for joint in joints}
+    facts = run_record(runs[joints[0]].metadata)
+    disturbed = (facts.get("disturbance") or {}).get("joints") or []
+    if len(disturbed) != 1:
+        told = ", ".join(disturbed) or "nobody says which joint"
+        raise DataError(f"{path} has {told} disturbed; expected one joint, so that excitation and response are known")
+    return record_of_joints(runs, disturbed[0]), facts
+
+
+def _design_plant(bag: Path, facts: Mapping[str, Any]) -> str:
+    """Return the plant on which the controller of a run was designed, which may lie beside its bag; empty for none."""
+    controller = facts.get("controller")
+    linearised = controller.get("linearised") if isinstance(controller, Mapping) else None
+    if isinstance(linearised, str) and (bag.parent / linearised).is_file():
+        return str(bag.parent / linearised)
+    return str(facts.get("design_plant") or "")
 
 
 def _labelled(measured: MeasuredResponse, label: str) -> MeasuredResponse:
@@ -90,9 +121,10 @@ def analyse_responses(
     plant: str,
     designs: Sequence[str] = (),
     *,
-    scaling: Scaling = DEFAULT_SCALING,
-    margin: float = GAP_MARGIN,
+    scaling: SignalScaling | None = None,
+    margin: float | None = None,
     recorded: bool = False,
+    longer: str = "",
 ) -> Analysis:
     """Return what responses tell.
 
@@ -100,23 +132,72 @@ def analyse_responses(
         responses: Simulation first.
         plant: Preset or file of the plant that designs are made on.
         designs: As :func:`pendulum_bags.frequency_response.designs.certify_designs` reads them.
-        scaling: Units of the gap.
-        margin: Gap between the plants that does not matter.
+        scaling: Units of the gap; None for the thesis's task, or for those that the LQR weights of several joints are.
+        margin: Gap between the plants that does not matter; None for 0.2, of several joints for the margin of the
+            plant's own LQR: a smaller gap keeps that one stable.
         recorded: Whether the designs come from a recording, not from who asks now.
+        longer: The command that measures longer.
+
+    Raises:
+        ParameterError: A text is no design; or the plant has other joints than the responses, or several motors.
+        DataError: A policy file cannot be read.
     """
+    if responses[0].joints:
+        return _analyse_joints(
+            responses, plant, designs, scaling, margin, longer or f"{LONGER_OF_JOINTS} --plant {plant}"
+        )
     parameters = load_plant(plant)
     model = linearise(parameters)
+    scaling, margin = scaling or DEFAULT_SCALING, GAP_MARGIN if margin is None else margin
     by_label = {response.label: response for response in responses}
     difference = certifier = None
     results: list[DesignResult] = []
     layers: list[LayerResult] = []
     if "sim" in by_label and "hw" in by_label:
         difference = compare_responses(by_label["sim"], by_label["hw"], model, scaling)
-        layers.append(same_plant(by_label["sim"], by_label["hw"], difference, margin))
+        layers.append(same_plant(by_label["sim"], by_label["hw"], difference, margin, longer=longer or LONGER))
     if "hw" in by_label:
         certifier = Certifier(model, Machine.of(by_label["hw"]), scaling)
         results = certify_designs(designs, parameters, model, certifier, recorded=recorded)
-        layers.append(which_controllers(certifier, results))
+        layers.append(which_controllers(certifier, results, longer=longer or LONGER))
+    return Analysis(responses, model, plant, difference, certifier, results, layers, scaling)
+
+
+def _analyse_joints(
+    responses: Sequence[MeasuredResponse],
+    plant: str,
+    designs: Sequence[str],
+    scaling: SignalScaling | None,
+    margin: float | None,
+    longer: str,
+) -> Analysis:
+    """Return what responses of a plant of several joints tell; arguments as of :func:`analyse_responses`."""
+    parameters = load_mechanism(plant)
+    coordinates, joints = parameters.coordinates, responses[0].joints
+    driven = joints[responses[0].driven]
+    if coordinates.names != joints or coordinates.driven_names != (driven,):
+        raise ParameterError(
+            f"plant {parameters.name} has joints {', '.join(coordinates.names)}, driven: "
+            f"{', '.join(coordinates.driven_names) or 'none'}; expected {', '.join(joints)}, driven: {driven} alone, "
+            "as they were measured"
+        )
+    model = linearise_mechanism(parameters)
+    q, r = parameters.mechanism.weights
+    units = [joint.unit for joint in coordinates.joints] + [joint.velocity_unit for joint in coordinates.joints]
+    scaling = scaling or JointScaling.of_weights(model.states, units, q, r, coordinates.drive_unit)
+    by_label = {response.label: response for response in responses}
+    difference = certifier = None
+    results: list[DesignResult] = []
+    layers: list[LayerResult] = []
+    if "hw" in by_label:
+        certifier = Certifier(model, Machine.beside(by_label["hw"], model), scaling)
+        results = certify_joint_designs(designs, parameters, certifier)
+        layers.append(which_controllers(certifier, results, longer=longer))
+    if "sim" in by_label and certifier is not None:
+        if margin is None:
+            margin = certifier.gain(mechanism_lqr(model, q, r).K[0]).margin
+        difference = compare_responses(by_label["sim"], by_label["hw"], model, scaling)
+        layers.insert(0, same_plant(by_label["sim"], by_label["hw"], difference, margin, longer=longer))
     return Analysis(responses, model, plant, difference, certifier, results, layers, scaling)
 
 
@@ -154,7 +235,7 @@ class _Kept(NamedTuple):
     """With what a machine was judged when it was measured."""
 
     designs: Sequence[str] = ()
-    scaling: Scaling = DEFAULT_SCALING
+    scaling: SignalScaling = DEFAULT_SCALING
 
 
 def _kept(machine: Path) -> _Kept:
@@ -192,8 +273,6 @@ def write_analysis(
     step("drawing")
     # Thousands of small matrices: threads of the linear algebra would only get into each other's way.
     with threadpool_limits(1):
-        figures = response_figures(
-            analysis.responses, analysis.model, analysis.difference, analysis.certifier, analysis.designs
-        )
+        figures = response_figures(analysis)
     write_figures(figures, folder / "figures", formats)
     return write_page(folder / "frequency_response.html", analysis, figures)

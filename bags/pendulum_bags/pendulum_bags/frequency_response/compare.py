@@ -9,7 +9,7 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
-from pendulum_lqr.gap_metric import DEFAULT_SCALING, Scaling, chordal_distance, nu_gap
+from pendulum_lqr.gap_metric import DEFAULT_SCALING, SignalScaling, chordal_distance, nu_gap
 from pendulum_lqr.machine_response import Machine
 from pendulum_lqr.measured_response import MeasuredResponse
 from pendulum_lqr.model import LinearModel
@@ -43,11 +43,11 @@ class Difference:
 
     Attributes:
         frequency: Shape (n,) [Hz].
-        first, second: Responses, shape (2, n) [rad/(N m), rad/s/(N m)].
-        ratio: Second over first by the velocity, shape (n,).
+        first, second: Responses, shape (outputs, n) [rad/(N m), rad/s/(N m)].
+        ratio: Second over first by the velocity, of several joints that of the driven one, shape (n,).
         ratio_radius: Radius of its 95 % disc, joint over all frequencies, shape (n,).
         probability: Of a difference at least as large at a line if the plants differed by no more than ``SMALLEST``,
-            shape (2, n).
+            shape (outputs, n).
         gap: Chordal distance at each frequency, shape (n,).
         gap_low: Lower joint limit of it, shape (n,).
         gap_high: Upper one, shape (n,).
@@ -72,7 +72,7 @@ class Difference:
     gap_at: float
     delay: Estimate
     gain: Estimate
-    scaling: Scaling
+    scaling: SignalScaling
     confidence: float = 0.95
 
     @property
@@ -98,21 +98,17 @@ class Difference:
             "gain": [self.gain.value, self.gain.low, self.gain.high],
             "found": self.found,
             "lines_that_differ": self.lines_that_differ,
-            "scaling": {
-                "angle": self.scaling.angle,
-                "velocity": self.scaling.velocity,
-                "torque": self.scaling.torque,
-            },
+            "scaling": self.scaling.to_json(),
         }
 
 
 def continuous(measured: MeasuredResponse, model: LinearModel) -> Complex:
-    """Return a measured response freed from hold and folding by a model's ratio, shape (2, n)."""
+    """Return a measured response freed from hold and folding by a model's ratio, shape (outputs, n)."""
     return brought_to(measured.response, model, measured.frequency, measured=measured.period)
 
 
 def compare_responses(
-    first: MeasuredResponse, second: MeasuredResponse, model: LinearModel, scaling: Scaling = DEFAULT_SCALING
+    first: MeasuredResponse, second: MeasuredResponse, model: LinearModel, scaling: SignalScaling = DEFAULT_SCALING
 ) -> Difference:
     """Return the difference of two measured plants, at the sampling period of the second.
 
@@ -135,14 +131,15 @@ def compare_responses(
     probability = scipy.stats.f.sf(excess**2 / variance, 2.0, 2.0 * freedom)
     tail = 0.05 / probability.size
     quantile = np.sqrt(scipy.stats.f.isf(tail, 2.0, 2.0 * freedom))
-    ratio = two[1] / moved[1]
-    relative = np.sqrt(variance[1]) / np.abs(moved[1])
+    moves = second.driven_velocity
+    ratio = two[moves] / moved[moves]
+    relative = np.sqrt(variance[moves]) / np.abs(moved[moves])
     gap, low, high = _gaps(moved, two, quantile * spread_one, quantile * spread_two, scaling)
     found = nu_gap(scaling.plant(moved), scaling.plant(two))
     at = int(np.argmax(gap))
     whole = Estimate(found.value, float(low.max()), float(high.max())) if found.winding else Estimate(1.0, 1.0, 1.0)
     return Difference(
-        lines, moved, two, ratio, quantile[1] * relative, np.asarray(probability, dtype=np.float64), gap, low, high,
+        lines, moved, two, ratio, quantile[moves] * relative, np.asarray(probability, dtype=np.float64), gap, low, high,
         whole, float(lines[at]), _delay(lines, ratio, relative), _gain(ratio, relative), scaling,
     )  # fmt: skip
 
@@ -172,7 +169,7 @@ def _at_common_lines(first: MeasuredResponse, second: MeasuredResponse) -> tuple
     return lines, response, spread, second.response[:, inside], second.deviation[:, inside]
 
 
-def _gaps(first: Complex, second: Complex, a: Array, b: Array, scaling: Scaling) -> tuple[Array, Array, Array]:
+def _gaps(first: Complex, second: Complex, a: Array, b: Array, scaling: SignalScaling) -> tuple[Array, Array, Array]:
     """Return the chordal distance with its limits, from the discs of both."""
     one, two = scaling.plant(first), scaling.plant(second)
     gap = chordal_distance(one, two)

@@ -36,14 +36,15 @@ class DesignResult:
 
     Attributes:
         name: As in tables.
-        K: Gain on [theta, theta_dot] [N m/rad, N m s/rad]; None for a controller that is no gain.
+        K: Gain on [theta, theta_dot] [N m/rad, N m s/rad], or on those of k joints; None for a controller that is no
+            gain.
         certificate: What is known of it.
         unknown: Why nothing is known of it, in words; empty where the certificate speaks.
         text: What :func:`certify_designs` reads for it, where the name does not tell.
     """
 
     name: str
-    K: tuple[float, float] | None
+    K: tuple[float, ...] | None
     certificate: Certificate
     unknown: str = ""
     text: str = ""
@@ -169,7 +170,7 @@ def _policy(path: str, plant: PlantParameters, certifier: Certifier, *, recorded
         return DesignResult(
             name, None, nothing, "its loop with the model does not settle near upright, so it has no linear law", text
         )
-    units = np.array([[certifier.scaling.angle], [certifier.scaling.velocity]])
+    units = certifier.scaling.outputs
     small, large = (np.linalg.norm(units * K, axis=0) for K in (answers[0][0], answers[1][0] - answers[0][0]))
     change = float(np.max(large / small))
     unknown = ""

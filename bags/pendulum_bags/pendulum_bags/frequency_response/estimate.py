@@ -17,6 +17,7 @@ Frequency Domain Approach, 2nd ed., 2012, sections 2.5 to 2.7 and 4.3 (distortio
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -142,7 +143,7 @@ def _segments(record: Record) -> MeasuredResponse:
 
 
 def _joint(record: Record, frequency: Array, r: Complex, u: Complex, y: Complex, blocks: float) -> MeasuredResponse:
-    """Return the joint input-output estimate from the spectra of blocks, shapes (blocks, n) and (2, blocks, n)."""
+    """Return the joint input-output estimate from the spectra of blocks, shapes (blocks, n), (outputs, blocks, n)."""
     cross_ur = np.sum(u * np.conj(r), axis=0)
     cross_yr = np.sum(y * np.conj(r)[None], axis=1)
     power_r = np.sum(np.abs(r) ** 2, axis=0)
@@ -163,11 +164,13 @@ def _joint(record: Record, frequency: Array, r: Complex, u: Complex, y: Complex,
         np.clip(coherence, 0.0, 1.0),
         cross_ur / power_r,
         blocks,
+        joints=record.joints,
+        driven=record.driven,
     )
 
 
 def _distortion(y: Complex, harmonics: NDArray[np.int64]) -> tuple[float, float]:
-    """Return how strong angle and velocity are on odd lines between the excited ones, beside those."""
+    """Return how strong angle and velocity of the worst joint are on odd lines between the excited ones, beside those."""
     top = min(int(harmonics[-1]), y.shape[2] - 1)
     odd = np.setdiff1d(np.arange(1, top + 1, 2), harmonics)
     excited = harmonics[harmonics <= top]
@@ -179,7 +182,8 @@ def _distortion(y: Complex, harmonics: NDArray[np.int64]) -> tuple[float, float]
     there = np.mean(np.maximum(np.abs(mean[:, odd]) ** 2 - noise[:, odd], 0.0), axis=1)
     beside = np.mean(np.abs(mean[:, excited]) ** 2, axis=1)
     ratio = np.sqrt(there / beside)
-    return float(ratio[0]), float(ratio[1])
+    half = ratio.size // 2
+    return float(np.max(ratio[:half])), float(np.max(ratio[half:]))
 
 
 def _with(
@@ -191,11 +195,23 @@ def _with(
         "blocks": blocks,
         "block_length_s": length,
         "excitation": {k: v for k, v in record.disturbance.items() if isinstance(v, (int, float, str))},
-        "rms_angle_rad": float(np.std(record.outputs[0])),
-        "largest_angle_rad": float(np.max(np.abs(record.outputs[0] - np.mean(record.outputs[0])))),
-        "largest_torque_nm": float(np.max(np.abs(record.torque))),
+        **_extent(record),
     }
-    return MeasuredResponse(
-        result.label, result.period, result.frequency, result.response, result.deviation, result.coherence,
-        result.sensitivity, result.blocks, distortion, facts,
-    )  # fmt: skip
+    return replace(result, distortion=distortion, facts=facts)
+
+
+def _extent(record: Record) -> dict[str, Any]:
+    """Return how far the plant moved and how hard it was driven."""
+    deviations = record.outputs - record.outputs.mean(axis=1, keepdims=True)
+    largest = np.max(np.abs(deviations), axis=1)
+    effort = float(np.max(np.abs(record.torque)))
+    if record.joints:
+        return {
+            "largest_deviation": {name: float(value) for name, value in zip(record.joints, largest)},  # noqa: B905
+            "largest_effort": effort,
+        }
+    return {
+        "rms_angle_rad": float(np.std(record.outputs[0])),
+        "largest_angle_rad": float(largest[0]),
+        "largest_torque_nm": effort,
+    }

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,8 +11,10 @@ from numpy.typing import NDArray
 from pendulum_bags.figures.figure import Figure, Mark, Panel, Trace
 from pendulum_bags.frequency_response.compare import SMALLEST, Difference, continuous
 from pendulum_bags.frequency_response.designs import DesignResult
+from pendulum_bags.frequency_response.result import Analysis
 from pendulum_lqr.certificate import Certifier
 from pendulum_lqr.design import DesignError, output_lqr
+from pendulum_lqr.gap_metric import JointScaling, SignalScaling
 from pendulum_lqr.measured_response import MeasuredResponse
 from pendulum_lqr.model import LinearModel
 from pendulum_lqr.sampled_response import model_response
@@ -20,6 +22,7 @@ from pendulum_lqr.sampled_response import model_response
 __all__ = ["certified_gains_figure", "certified_weights_figure", "gap_figure", "response_figures"]
 
 Array = NDArray[np.float64]
+Complex = NDArray[np.complex128]
 
 SECTION = "Frequency response"
 _NAMES = {"sim": "simulation", "hw": "hardware"}
@@ -30,53 +33,61 @@ def _name(measured: MeasuredResponse) -> str:
     return _NAMES.get(measured.label, measured.label)
 
 
-def response_figures(
-    responses: Sequence[MeasuredResponse],
-    model: LinearModel,
-    difference: Difference | None,
-    certifier: Certifier | None,
-    designs: Sequence[DesignResult],
-) -> list[Figure]:
-    """Return the figures of one or two measured plants.
-
-    Args:
-        responses: Simulation, hardware, or both.
-        model: Model that the designs were made on.
-        difference: Of the two; None for one.
-        certifier: Of the model and the hardware.
-        designs: Certified or not.
-    """
-    figures = [_bode(responses, model, difference), _quality(responses)]
+def response_figures(analysis: Analysis) -> list[Figure]:
+    """Return the figures of one or two measured plants."""
+    certifier, designs = analysis.certifier, analysis.designs
+    figures = [_bode(analysis), _quality(analysis.responses)]
     if certifier is not None:
-        figures.append(gap_figure(certifier, difference, designs))
+        figures.append(gap_figure(certifier, analysis.difference, designs))
         figures += [_nyquist(certifier, design) for design in designs[:1] if design.K is not None]
-        figures += [certified_weights_figure(certifier, model), certified_gains_figure(certifier, designs)]
+        # Of several joints there are too many gains for a map.
+        if not analysis.responses[0].joints:
+            figures += [
+                certified_weights_figure(certifier, analysis.model),
+                certified_gains_figure(certifier, designs),
+            ]
     return figures
 
 
-def _bode(responses: Sequence[MeasuredResponse], model: LinearModel, difference: Difference | None) -> Figure:
+def _channels(measured: MeasuredResponse, scaling: SignalScaling) -> list[tuple[int, str, Callable[[Complex], Array]]]:
+    """Return which outputs a Bode plot shows, top to bottom: the output, its label, and what is drawn of it."""
+    if not isinstance(scaling, JointScaling):
+        return [
+            (0, "angle per torque\n[rad/(N m)]", np.abs),
+            (0, "its phase [deg]", _phase),
+            (1, "velocity per torque\n[rad/s/(N m)]", np.abs),
+        ]
+    effort = f"({scaling.effort_unit})" if " " in scaling.effort_unit else scaling.effort_unit
+    sizes: list[tuple[int, str, Callable[[Complex], Array]]] = [
+        (i, f"{name} per effort\n[{scaling.units[i]}/{effort}]", np.abs) for i, name in enumerate(measured.joints)
+    ]
+    return [*sizes, (measured.driven, f"phase of {measured.joints[measured.driven]}\n[deg]", _phase)]
+
+
+def _bode(analysis: Analysis) -> Figure:
     """Draw the continuous plants: what hold and folding add was taken out, so that rates may differ."""
+    responses, model, difference = analysis.responses, analysis.model, analysis.difference
+    channels = _channels(responses[0], analysis.scaling)
     grid = np.geomspace(responses[0].frequency[0], max(r.frequency[-1] for r in responses), 400)
     line = model_response(model, grid)
-    rows: list[list[Trace]] = [[], [], []]
+    rows: list[list[Trace]] = [[] for _ in channels]
     for measured in responses:
         role, name = ("sim" if measured.label == "sim" else "hw"), _name(measured)
         free = continuous(measured, model)
         share = measured.radius() / np.abs(measured.response)
-        for row, channel in ((0, 0), (2, 1)):
-            size, part = np.abs(free[channel]), np.minimum(share[channel], 0.99)
-            rows[row].append(_band(measured.frequency, size * (1.0 - part), size * (1.0 + part), role, name))
-            rows[row].append(Trace(measured.frequency, size, name, role, "points"))
-        phase = _phase(free[0])
-        turn = np.degrees(np.arcsin(np.minimum(share[0], 1.0)))
-        rows[1].append(_band(measured.frequency, phase - turn, phase + turn, role, name))
-        rows[1].append(Trace(measured.frequency, phase, name, role, "points"))
-    for row, values in ((0, np.abs(line[0])), (1, _phase(line[0])), (2, np.abs(line[1]))):
-        rows[row].append(Trace(grid, values, "model", "model"))
+        for row, (channel, _, drawn) in zip(rows, channels, strict=True):
+            values = drawn(free[channel])
+            if drawn is _phase:
+                room = np.degrees(np.arcsin(np.minimum(share[channel], 1.0)))
+            else:
+                room = values * np.minimum(share[channel], 0.99)
+            row.append(_band(measured.frequency, values - room, values + room, role, name))
+            row.append(Trace(measured.frequency, values, name, role, "points"))
+    for row, (channel, _, drawn) in zip(rows, channels, strict=True):
+        row.append(Trace(grid, drawn(line[channel]), "model", "model"))
     panels = [
-        Panel("frequency [Hz]", "angle per torque\n[rad/(N m)]", rows[0], x_log=True, y_log=True),
-        Panel("frequency [Hz]", "its phase [deg]", rows[1], x_log=True),
-        Panel("frequency [Hz]", "velocity per torque\n[rad/s/(N m)]", rows[2], x_log=True, y_log=True),
+        Panel("frequency [Hz]", label, row, x_log=True, y_log=drawn is not _phase)
+        for row, (_, label, drawn) in zip(rows, channels, strict=True)
     ]
     lowest, highest = responses[0].frequency[0], responses[-1].frequency[-1]
     count = " and ".join(dict.fromkeys(str(r.frequency.size) for r in responses))
@@ -117,15 +128,18 @@ def _quality(responses: Sequence[MeasuredResponse]) -> Figure:
     coherence, precision = [], []
     for measured in responses:
         role, name = ("sim" if measured.label == "sim" else "hw"), _name(measured)
-        coherence.append(Trace(measured.frequency, measured.coherence[0], name, role))
-        share = 100.0 * measured.radius(joint=False)[0] / np.abs(measured.response[0])
+        shown = measured.driven
+        coherence.append(Trace(measured.frequency, measured.coherence[shown], name, role))
+        share = 100.0 * measured.radius(joint=False)[shown] / np.abs(measured.response[shown])
         precision.append(Trace(measured.frequency, np.maximum(share, 1e-6), name, role))
+    joints = responses[0].joints
+    what = joints[responses[0].driven] if joints else "the angle"
     panels = [
-        Panel("frequency [Hz]", "coherence of the angle\nwith the excitation [-]", coherence, x_log=True),
+        Panel("frequency [Hz]", f"coherence of {what}\nwith the excitation [-]", coherence, x_log=True),
         Panel("frequency [Hz]", "95 % radius\n[% of the response]", precision, x_log=True, y_log=True),
     ]
-    weakest = min(float(r.coherence[0].min()) for r in responses)
-    sentence = f"The lowest coherence is {weakest:.3f}: the share of the angle's power that the excitation explains."
+    weakest = min(float(r.coherence[r.driven].min()) for r in responses)
+    sentence = f"The lowest coherence is {weakest:.3f}: the share of the power of {what} that the excitation explains."
     return Figure("response_quality", "How well it was measured", sentence, panels, section=SECTION, panel_height=150)
 
 

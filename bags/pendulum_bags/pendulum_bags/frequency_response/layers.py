@@ -10,15 +10,22 @@ from pendulum_bags.verdict import Evidence, Layer, LayerResult, Mark
 from pendulum_lqr.certificate import Certifier
 from pendulum_lqr.measured_response import MeasuredResponse
 
-__all__ = ["GAP_MARGIN", "same_plant", "which_controllers"]
+__all__ = ["GAP_MARGIN", "LONGER", "same_plant", "which_controllers"]
 
 GAP_MARGIN = 0.2
 """Gap that does not matter: a loop with a margin b(P, K) above it, as an LQR on this plant has, keeps its stability."""
 _WEAK_COHERENCE = 0.5
+LONGER = "python -m pendulum_bags experiment frequency_response --periods 40"
+"""Measures the thesis's plant longer than by default."""
 
 
 def same_plant(
-    first: MeasuredResponse, second: MeasuredResponse, difference: Difference, margin: float = GAP_MARGIN
+    first: MeasuredResponse,
+    second: MeasuredResponse,
+    difference: Difference,
+    margin: float = GAP_MARGIN,
+    *,
+    longer: str = LONGER,
 ) -> LayerResult:
     """Return layer 2.
 
@@ -27,6 +34,7 @@ def same_plant(
         second: The hardware.
         difference: Of the two.
         margin: Gap that does not matter.
+        longer: The command that measures longer.
     """
     gap = difference.nu_gap
     mark = Mark.YES if gap.high < margin else Mark.NO if gap.low > margin else Mark.UNDECIDED
@@ -56,7 +64,7 @@ def same_plant(
         ),
     ]  # fmt: skip
     for measured, name in ((first, "simulation"), (second, "hardware")):
-        weakest = float(measured.coherence[0].min())
+        weakest = float(measured.coherence[measured.driven].min())
         note = "" if weakest > _WEAK_COHERENCE else "weak: a larger amplitude or more periods would tell more"
         evidence.append(Evidence(f"lowest coherence, {name}", "", weakest, mark=told, note=note))
         if measured.distortion[1] == measured.distortion[1]:
@@ -73,7 +81,7 @@ def same_plant(
     if mark is Mark.NO:
         steps = ("identify delay, gain and friction on the hardware (python -m pendulum_bags identify)",)
     elif mark is Mark.UNDECIDED:
-        steps = ("measure longer: python -m pendulum_bags experiment frequency_response --periods 40",)
+        steps = (f"measure longer: {longer}",)
     reasons = {
         Mark.YES: f"the plants are {gap.high:.2g} apart at most in the nu-gap",
         Mark.NO: f"the plants are {gap.value:.2f} apart in the nu-gap, {where}",
@@ -82,12 +90,13 @@ def same_plant(
     return LayerResult(Layer.SAME_PLANT, mark, sentence, tuple(evidence), steps, reasons[mark])
 
 
-def which_controllers(certifier: Certifier, designs: Sequence[DesignResult]) -> LayerResult:
+def which_controllers(certifier: Certifier, designs: Sequence[DesignResult], *, longer: str = LONGER) -> LayerResult:
     """Return layer 3: yes where all given designs carry over, no where one does not.
 
     Args:
         certifier: Of the model and the measured hardware.
         designs: Certified or not.
+        longer: The command that measures longer.
     """
     profile = certifier.profile
     good = [design for design in designs if design.certified]
@@ -123,7 +132,7 @@ def which_controllers(certifier: Certifier, designs: Sequence[DesignResult]) -> 
         if design.unknown
     )
     if any(design.undecided and not design.unknown for design in bad):
-        steps += ("measure longer: python -m pendulum_bags experiment frequency_response --periods 40",)
+        steps += (f"measure longer: {longer}",)
     return LayerResult(
         Layer.WHICH_CONTROLLERS,
         mark,

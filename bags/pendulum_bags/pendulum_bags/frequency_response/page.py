@@ -15,8 +15,9 @@ __all__ = ["ASSUMPTIONS", "write_page"]
 
 _THEOREM = (
     "The certificate is Vinnicombe's theorem with the upper 95 % limit of the measurement. It speaks of the linear "
-    "machine around upright, with one unstable pole, sampled at the machine's rate under zero-order hold, so half a "
-    "period of hold and all delays are in it. It is one-sided: what is not certified may still be stable."
+    "machine around upright, with as many unstable poles as the model, sampled at the machine's rate under zero-order "
+    "hold, so half a period of hold and all delays are in it. It is one-sided: what is not certified may still be "
+    "stable."
 )
 _LIMITS = (
     "It does not speak of torque that saturates, of dry friction at rest (a stuck joint does not move as a line says), "

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass, field
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -19,7 +19,7 @@ from pendulum_msgs_py.errors import DataError
 if TYPE_CHECKING:
     from pendulum_bags.runs.run_data import RunData
 
-__all__ = ["Record", "record_of_arrays", "record_of_run"]
+__all__ = ["Record", "record_of_arrays", "record_of_joints", "record_of_run"]
 
 Array = NDArray[np.float64]
 
@@ -38,11 +38,14 @@ class Record:
     Attributes:
         label: Of the plant.
         period: Sampling period [s].
-        excitation: Known torque that was added, shape (n,) [N m].
-        torque: Torque that acted from each sample to the next, the excitation included, shape (n,) [N m].
-        outputs: Angle [rad] and velocity [rad/s] at each sample, shape (2, n).
+        excitation: Known torque that was added, shape (n,) [N m or N].
+        torque: Torque that acted from each sample to the next, the excitation included, shape (n,) [N m or N].
+        outputs: Angle [rad] and velocity [rad/s] at each sample, shape (2, n); of k joints all positions, then all
+            velocities, shape (2 k, n).
         disturbance: Parameters of the excitation; empty where they are not known.
         facts: What else is known of the run.
+        joints: Names of the k joints; none for a plant of one.
+        driven: Which of them has the excitation.
     """
 
     label: str
@@ -52,6 +55,8 @@ class Record:
     outputs: Array
     disturbance: Mapping[str, Any] = field(default_factory=dict)
     facts: Mapping[str, Any] = field(default_factory=dict)
+    joints: tuple[str, ...] = ()
+    driven: int = 0
 
     @property
     def duration(self) -> float:
@@ -84,6 +89,24 @@ def record_of_run(run: RunData) -> Record:
     Raises:
         DataError: Disturbance or applied torque were not recorded, or states are missing for long.
     """
+    return _record(run, [run])
+
+
+def record_of_joints(runs: Mapping[str, RunData], driven: str) -> Record:
+    """Return the record of a recorded plant of several joints while the disturbance of one of them acted.
+
+    Args:
+        runs: The plant's part of a bag for each joint, in order.
+        driven: The joint that was disturbed; the only one with a motor.
+
+    Raises:
+        DataError: As of :func:`record_of_run`.
+    """
+    return replace(_record(runs[driven], list(runs.values())), joints=tuple(runs), driven=list(runs).index(driven))
+
+
+def _record(run: RunData, motions: Sequence[RunData]) -> Record:
+    """Return the record of motions under the torque of one of them; all were measured in the same messages."""
     for signal, what in ((run.disturbance, "disturbance"), (run.applied, "applied torque")):
         if signal is None:
             raise DataError(
@@ -104,16 +127,16 @@ def record_of_run(run: RunData) -> Record:
     stop = min(float(t[-1]), float(run.applied.t[-1]) + period)
     count = int(np.floor((stop - t[0]) / period + 1e-6))
     raster = t[0] + period * np.arange(count)
-    if t.size >= count and np.max(np.abs(t[:count] - raster)) < _EXACT * period:
-        outputs = np.stack([run.window.position[:count], run.window.velocity[:count]])
-    else:
-        inside = np.minimum(raster, t[-1])
-        outputs = np.stack(
-            [
-                scipy.interpolate.CubicSpline(t, run.window.position)(inside),
-                scipy.interpolate.CubicSpline(t, run.window.velocity)(inside),
-            ]
-        )
+    exact = t.size >= count and bool(np.max(np.abs(t[:count] - raster)) < _EXACT * period)
+    inside = np.minimum(raster, t[-1])
+
+    def sampled(values: Array) -> Array:
+        return values[:count] if exact else np.asarray(scipy.interpolate.CubicSpline(t, values)(inside))
+
+    windows = [motion.window for motion in motions]
+    outputs = np.stack(
+        [*(sampled(window.position) for window in windows), *(sampled(window.velocity) for window in windows)]
+    )
     disturbance = run_record(run.metadata).get("disturbance")
     return Record(
         run.label,

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from typing import Any
 
 from pendulum_bags.frequency_response.compare import Difference
 from pendulum_bags.frequency_response.designs import DesignResult
 from pendulum_bags.verdict import LayerResult
 from pendulum_lqr.certificate import Certifier
-from pendulum_lqr.gap_metric import DEFAULT_SCALING, Scaling
+from pendulum_lqr.gap_metric import DEFAULT_SCALING, SignalScaling
 from pendulum_lqr.measured_response import MeasuredResponse
 from pendulum_lqr.model import LinearModel
 
@@ -39,13 +39,13 @@ class Analysis:
     certifier: Certifier | None
     designs: Sequence[DesignResult]
     layers: Sequence[LayerResult]
-    scaling: Scaling = DEFAULT_SCALING
+    scaling: SignalScaling = DEFAULT_SCALING
 
     def to_json(self) -> dict[str, Any]:
         """Return the figures as JSON values."""
         return {
             "plant": self.plant,
-            "scaling": asdict(self.scaling),
+            "scaling": self.scaling.to_json(),
             "responses": {response.label: response.facts for response in self.responses},
             "difference": self.difference.to_json() if self.difference else None,
             "gap_to_model": None

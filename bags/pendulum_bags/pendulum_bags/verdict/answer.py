@@ -13,6 +13,15 @@ from pendulum_bags.verdict.same_run import same_run_layer
 __all__ = ["answer_of", "answer_of_joints"]
 
 
+_OF_ONE_MOTOR = "Not asked: python -m pendulum_bags experiment joints measures it where one joint is driven."
+_NOT_ASKED = {
+    Layer.SAME_PLANT: _OF_ONE_MOTOR,
+    Layer.WHICH_CONTROLLERS: _OF_ONE_MOTOR,
+    Layer.SAME_CHOICE: "Not asked: only controllers of one joint are ranked.",
+}
+"""What a layer says of a plant of several joints for which nobody measured it."""
+
+
 def answer_of(
     comparison: Comparison,
     folders: Sequence[Path] = (),
@@ -49,9 +58,5 @@ def answer_of_joints(comparisons: Mapping[str, Comparison], folders: Sequence[Pa
     joined = join_joints({joint: same_run_layer(one) for joint, one in comparisons.items()})
     kept = [one for folder in folders for one in read_layers(folder) if one.layer is not Layer.SAME_RUN]
     asked = {one.layer for one in (joined, *kept)}
-    others = [
-        LayerResult(layer, Mark.NOT_MEASURED, "Not asked: only plants of one joint are measured for it.")
-        for layer in Layer
-        if layer not in asked
-    ]
+    others = [LayerResult(layer, Mark.NOT_MEASURED, _NOT_ASKED[layer]) for layer in Layer if layer not in asked]
     return sum_up([joined, *kept, *others], emulated=all(one.is_emulated for one in comparisons.values()))

@@ -1,0 +1,93 @@
+"""Measure a plant of several joints and what stands in for its machine, by one multisine at the driven joint."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from pendulum_bags.experiments.joint_run import JointSettings, record_joints
+from pendulum_bags.frequency_response.analyse import LONGER_OF_JOINTS, analyse_responses, read_responses, write_analysis
+from pendulum_bags.frequency_response.result import Analysis
+from pendulum_bags.verdict import write_layer
+
+__all__ = ["FOLDER", "JointMultisine", "measure_joints"]
+
+FOLDER = "frequency_response"
+"""Folder within a run folder that holds the recordings under the multisine, and all that they tell."""
+_SIGNAL_PERIOD = 4.0
+"""Length of one period [s]."""
+_LOWEST, _HIGHEST = 0.25, 100.0
+"""Band [Hz]. The loops of all presets are small at its end, where no line says what comes beyond."""
+_LINES = 48
+
+
+@dataclass(frozen=True)
+class JointMultisine:
+    """A multisine in the place of the noise, whole periods of it.
+
+    Attributes:
+        settings: The run.
+        periods: Periods that are averaged; one more settles.
+    """
+
+    settings: JointSettings
+    periods: int = 8
+
+    @property
+    def run(self) -> JointSettings:
+        """The settings of the run, as long as its periods."""
+        return replace(self.settings, duration=_SIGNAL_PERIOD * (self.periods + 1) + 0.1)
+
+    @property
+    def excitation(self) -> dict[str, Any]:
+        """Parameters of the disturbance."""
+        return {
+            "kind": "multisine",
+            "signal_period": _SIGNAL_PERIOD,
+            "frequency": _LOWEST,
+            "frequency_end": _HIGHEST,
+            "lines": _LINES,
+            "hold_time": self.settings.period,
+        }
+
+
+def measure_joints(
+    folder: Path,
+    multisine: JointMultisine,
+    machine: Path,
+    designs: Sequence[str] = (),
+    *,
+    on_side: Callable[[str], None] = lambda side: None,
+    on_analysis: Callable[[str], None] = lambda what: None,
+    on_wait: Callable[[], None] = lambda: None,
+) -> Analysis:
+    """Record both sides under the multisine, and keep what it tells: two layers of the run folder's answer.
+
+    Args:
+        folder: The run folder; the recordings, numbers, figures and the page go to its ``frequency_response``.
+        multisine: What to run.
+        machine: Plant file that stands in for the machine.
+        designs: As :func:`pendulum_bags.frequency_response.joint_designs.certify_joint_designs` reads them.
+        on_side: Told each side, in words, when it begins.
+        on_analysis: Told what is done with them afterwards.
+        on_wait: Called while waiting.
+
+    Raises:
+        BagError: A bag exists, or cannot be written.
+        DataError: A plant was not excited enough.
+        FaultError: A program ended or did not answer, or a plant fell or faulted.
+        ParameterError: A text is no design.
+    """
+    place = folder / FOLDER
+    place.mkdir(parents=True, exist_ok=True)
+    record_joints(place, multisine.run, machine, excitation=multisine.excitation, on_side=on_side, on_wait=on_wait)
+    on_analysis("analysing")
+    responses, plant, _ = read_responses([place])
+    longer = f"{LONGER_OF_JOINTS} --plant {multisine.settings.plant}"
+    analysis = analyse_responses(responses, plant, designs, longer=longer)
+    write_analysis(place, analysis, step=on_analysis)
+    for layer in analysis.layers:
+        write_layer(folder, layer)
+    return analysis

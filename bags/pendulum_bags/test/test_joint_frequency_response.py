@@ -1,0 +1,210 @@
+"""The frequency response of plants of several joints: estimate, gap, and which designs carry over."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from functools import cache
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from pendulum_bags.experiments.joint_run import JointSettings, stand_in_for
+from pendulum_bags.frequency_response.analyse import analyse_responses
+from pendulum_bags.frequency_response.estimate import estimate
+from pendulum_bags.frequency_response.figures import response_figures
+from pendulum_bags.frequency_response.joint_designs import certify_joint_designs
+from pendulum_bags.frequency_response.joint_experiment import JointMultisine
+from pendulum_bags.frequency_response.record import Record
+from pendulum_bags.verdict import Mark
+from pendulum_lqr.certificate import Certifier, is_stable
+from pendulum_lqr.disturbance import DISTURBANCE_SPECS, make_disturbance
+from pendulum_lqr.gap_metric import JointScaling
+from pendulum_lqr.machine_response import Machine
+from pendulum_lqr.measured_response import MeasuredResponse, read_response, write_response
+from pendulum_lqr.mechanism_model import linearise_mechanism, mechanism_lqr
+from pendulum_lqr.model import LinearModel
+from pendulum_lqr.sampled_design import discretise
+from pendulum_lqr.sampled_response import model_response
+from pendulum_msgs_py.errors import ParameterError
+from pendulum_msgs_py.parameters import validate
+from pendulum_msgs_py.plants.mechanism_parameters import MechanismParameters, load_mechanism
+from pendulum_sim.mechanism_plant import MechanismPlant
+
+PERIOD = 0.002
+DRIVEN_ALONE = ("cart_pole", "acrobot_frictionless", "furuta")
+
+
+@cache
+def _model(name: str) -> LinearModel:
+    return linearise_mechanism(load_mechanism(name))
+
+
+def _record(name: str, *, periods: int = 3, noise: float = 0.0, label: str = "sim") -> Record:
+    """Return a plant under its LQR and a multisine, by the plant's own equations."""
+    plant = load_mechanism(name)
+    multisine = JointMultisine(JointSettings(name, amplitude=0.02 * plant.effort_limits[0]), periods)
+    parameters = {**multisine.excitation, "amplitude": multisine.run.amplitude, "seed": 3}
+    wave = make_disturbance(validate(DISTURBANCE_SPECS, parameters))
+    gain = mechanism_lqr(_model(name), *plant.mechanism.weights).K[0]
+    simulated, coordinates = MechanismPlant(plant, PERIOD), plant.coordinates
+    state = simulated.reset(coordinates.goal)
+    generator = np.random.default_rng(1)
+    n = len(coordinates.joints)
+    count = round(multisine.run.duration / PERIOD)
+    r, u, y = np.zeros(count), np.zeros(count), np.zeros((2 * n, count))
+    for k in range(count):
+        x = np.array([*coordinates.deviation(state.position), *state.velocity])
+        y[:, k] = x + noise * generator.standard_normal(2 * n)
+        r[k] = wave.value(k * PERIOD)
+        u[k] = float(-gain @ y[:, k]) + r[k]
+        state = simulated.step((u[k],))
+    return Record(label, PERIOD, r, u, y, parameters, joints=coordinates.names, driven=coordinates.driven[0])
+
+
+def _exact(model: LinearModel, plant: MechanismParameters, label: str) -> MeasuredResponse:
+    """Return what a faultless measurement of a linear plant would tell."""
+    lines = np.unique(2 * np.round((np.geomspace(1, 400, 48) - 1) / 2) + 1) * 0.25
+    response = model_response(model, lines, PERIOD)
+    small = 1e-6 * np.abs(response)
+    coordinates = plant.coordinates
+    return MeasuredResponse(
+        label, PERIOD, lines, response, small, np.ones_like(small), np.ones(lines.size, dtype=complex), 8.0,
+        joints=coordinates.names, driven=coordinates.driven[0],
+    )  # fmt: skip
+
+
+def _scaling(plant: MechanismParameters, model: LinearModel) -> JointScaling:
+    q, r = plant.mechanism.weights
+    return JointScaling.of_weights(model.states, ["-"] * len(q), q, r, "-")
+
+
+@pytest.mark.parametrize("name", DRIVEN_ALONE)
+def test_a_simulated_plant_answers_as_its_linear_model_at_every_joint_and_line(name: str) -> None:
+    measured = estimate(_record(name))
+    assert measured.joints == load_mechanism(name).coordinates.names
+    expected = model_response(_model(name), measured.frequency, PERIOD)
+    assert measured.response.shape == expected.shape == (4, measured.frequency.size)
+    # What is left is the part of the motion that is not linear.
+    assert np.abs(measured.response / expected - 1.0).max() < 0.02
+
+
+def test_discs_hold_the_true_response_of_noisy_sensors() -> None:
+    measured = estimate(_record("cart_pole", periods=6, noise=1e-4, label="hw"))
+    true = model_response(_model("cart_pole"), measured.frequency, PERIOD)
+    error = np.abs(measured.response - true)
+    assert np.all(error < measured.radius())
+    # Not by being wide: single discs of 95 % leave out about one in twenty.
+    assert 0.005 < np.mean(error > measured.radius(joint=False)) < 0.15
+
+
+def test_a_response_of_several_joints_survives_its_file(tmp_path: Any) -> None:
+    measured = estimate(_record("furuta"))
+    again = read_response(write_response(tmp_path / "hw_response.json", measured))
+    assert (again.joints, again.driven, again.driven_velocity) == (("arm", "pendulum"), 0, 2)
+    assert np.array_equal(again.response, measured.response)
+
+
+def test_the_driven_joint_tells_delay_and_gain() -> None:
+    plant, model = load_mechanism("acrobot_frictionless"), _model("acrobot_frictionless")
+    later = replace(model, delay=0.007)
+    analysis = analyse_responses([_exact(model, plant, "sim"), _exact(later, plant, "hw")], "acrobot_frictionless")
+    assert analysis.difference is not None
+    assert abs(analysis.difference.delay.value - 0.007) < 1e-4
+    assert abs(analysis.difference.gain.value - 1.0) < 1e-3
+
+
+@pytest.mark.parametrize("name", DRIVEN_ALONE)
+def test_the_same_plant_is_yes_and_all_that_stabilises_it_is_certified(name: str) -> None:
+    plant, model = load_mechanism(name), _model(name)
+    analysis = analyse_responses([_exact(model, plant, "sim"), _exact(model, plant, "hw")], name)
+    assert [layer.mark for layer in analysis.layers] == [Mark.YES, Mark.YES]
+    assert len(analysis.designs) == 4
+    assert all(design.certified for design in analysis.designs)
+
+
+def _gains(model: LinearModel, weights: Sequence[float], generator: np.random.Generator) -> NDArray[np.float64]:
+    scale = 10.0 ** generator.uniform(-2.0, 2.0, len(weights))
+    return np.asarray(mechanism_lqr(model, np.array(weights) * scale, 10.0 ** generator.uniform(-3.0, 2.0)).K[0])
+
+
+@pytest.mark.parametrize("name", DRIVEN_ALONE)
+def test_no_certified_gain_fails_on_the_machine_that_was_measured(name: str) -> None:
+    plant, model = load_mechanism(name), _model(name)
+    generator = np.random.default_rng(7)
+    certified = sound = 0
+    for seed in range(6):
+        machine = stand_in_for(plant, share=0.2, delay=0.0, seed=seed)
+        other = replace(linearise_mechanism(machine), delay=float(generator.uniform(0.0, 0.03)))
+        certifier = Certifier(model, Machine.beside(_exact(other, plant, "hw"), model), _scaling(plant, model))
+        sampled = discretise(other, PERIOD)
+        for _ in range(40):
+            K = _gains(model, plant.mechanism.weights, generator)
+            found, stable = certifier.gain(K), is_stable(sampled, K)
+            assert stable or not found.certified, (seed, K, found)
+            certified += found.certified
+            # Modulus margin of the machine itself: of what keeps 0.5 from -1 most should be certified.
+            sound += stable and found.worst_modulus > 0.5
+    assert sound > 50
+    assert certified > 0.5 * sound
+
+
+def test_a_machine_that_falls_under_the_design_is_not_certified() -> None:
+    plant, model = load_mechanism("cart_pole"), _model("cart_pole")
+    late = replace(model, delay=0.15)
+    certifier = Certifier(model, Machine.beside(_exact(late, plant, "hw"), model), _scaling(plant, model))
+    K = mechanism_lqr(model, *plant.mechanism.weights).K[0]
+    assert is_stable(discretise(model, PERIOD), K)
+    assert not is_stable(discretise(late, PERIOD), K)
+    assert not certifier.gain(K).certified
+    analysis = analyse_responses([_exact(model, plant, "sim"), _exact(late, plant, "hw")], "cart_pole")
+    assert [layer.mark for layer in analysis.layers] == [Mark.NO, Mark.NO]
+    assert any("experiment joints" in step or "identify" in step for step in analysis.layers[0].next_steps)
+
+
+@pytest.mark.parametrize(
+    ("design", "words"),
+    [
+        ("q=1,2 r=1", "with 4 numbers for q or k"),
+        ("k=1,2,3", "with 4 numbers for q or k"),
+        ("q=1,1,1,1 r=1,2", "one for r"),
+        ("pid", "expected 'q=... r=...' or 'k=...'"),
+        ("q=1,1,1,e r=1", "are not all numbers"),
+        ("q=1,1,1,-1 r=1", "weight"),
+    ],
+)
+def test_what_is_no_design_of_the_plant_is_refused(design: str, words: str) -> None:
+    plant, model = load_mechanism("cart_pole"), _model("cart_pole")
+    certifier = Certifier(model, Machine.beside(_exact(model, plant, "hw"), model), _scaling(plant, model))
+    with pytest.raises(ParameterError, match=words):
+        certify_joint_designs([design], plant, certifier)
+
+
+def test_a_gain_is_certified_as_it_is_written() -> None:
+    plant, model = load_mechanism("cart_pole"), _model("cart_pole")
+    certifier = Certifier(model, Machine.beside(_exact(model, plant, "hw"), model), _scaling(plant, model))
+    K = mechanism_lqr(model, *plant.mechanism.weights).K[0]
+    own, same, wrong = certify_joint_designs(
+        ["q=10,100,1,1 r=0.1", "k=" + ",".join(map(repr, map(float, K))), "k=0,0,0,0"], plant, certifier
+    )
+    assert own.certificate == same.certificate
+    assert not wrong.certified
+
+
+@pytest.mark.parametrize(("plant", "driven"), [("acrobot", "elbow"), ("double_pendulum", "shoulder, elbow")])
+def test_a_plant_of_other_joints_or_two_motors_is_refused(plant: str, driven: str) -> None:
+    measured = _exact(_model("cart_pole"), load_mechanism("cart_pole"), "hw")
+    with pytest.raises(ParameterError, match=f"driven: {driven}; expected cart, pole, driven: cart alone"):
+        analyse_responses([measured], plant)
+
+
+def test_figures_have_a_row_for_each_joint_with_its_units() -> None:
+    plant, model = load_mechanism("cart_pole"), _model("cart_pole")
+    analysis = analyse_responses([_exact(model, plant, "sim"), _exact(model, plant, "hw")], "cart_pole")
+    figures = {figure.name: figure for figure in response_figures(analysis)}
+    assert list(figures) == ["bode", "response_quality", "gap", "nyquist"]
+    labels = [panel.y_label for panel in figures["bode"].panels]
+    assert labels == ["cart per effort\n[m/N]", "pole per effort\n[rad/N]", "phase of cart\n[deg]"]
+    assert "0.316 m of cart" in figures["gap"].sentence
