@@ -107,25 +107,23 @@ class Machine:
         lines, period = measured.frequency, measured.period
         own = model_response(model, lines, period)
         ratio, spread = measured.response / own, measured.radius(confidence) / np.abs(own)
-        low = lines[0] * np.concatenate([[_NEARLY_ZERO], _BELOW[1:]])
-        near = np.flatnonzero(lines <= _FIT_UP_TO * lines[0])
-        if near.size < _LEAST_FIT:
-            near = np.arange(min(_LEAST_FIT, lines.size))
-        inside = _grid(lines)
-        on_line = np.isin(inside, lines)
+        below = lines[0] * np.concatenate([[_NEARLY_ZERO], _BELOW[1:]])
+        whole = np.concatenate([below, _grid(lines)])
+        on_line = np.isin(whole, lines)
+        # A response at -f is the conjugate of that at f: below the lowest line there are lines on either side, too.
+        mirrored = np.concatenate([-lines[::-1], lines])
         # What a spline makes of errors within these radii, however they lie.
-        weights = np.abs(scipy.interpolate.CubicSpline(lines, np.eye(lines.size))(inside))
+        weights = np.abs(scipy.interpolate.CubicSpline(mirrored, np.eye(mirrored.size))(whole))
+        # Towards 0, where friction begins to count, half the distance does not make the error that much smaller.
+        near_zero = np.where(whole < lines[1], 1.0 / _LEFT_OUT, 1.0)
         rows, discs = [], []
         for curve, radius in zip(ratio, spread, strict=True):
-            values, error = _splined(lines, curve, inside)
-            disc = weights @ radius + np.where(on_line, 0.0, np.abs(values) * _larger_neighbour(lines, error, inside))
+            values, error = _splined(mirrored, np.concatenate([np.conj(curve[::-1]), curve]), whole)
+            between = np.abs(values) * near_zero * _larger_neighbour(mirrored, error, whole)
+            disc = weights @ np.concatenate([radius[::-1], radius]) + np.where(on_line, 0.0, between)
             values[on_line], disc[on_line] = curve, radius
-            below = _continued(2.0 * np.pi * lines[near], curve[near], radius[near], 2.0 * np.pi * low)
-            if below is not None:
-                values, disc = np.concatenate([below[0], values]), np.concatenate([below[1], disc])
             rows.append(values)
             discs.append(disc)
-        whole = inside if len(rows[0]) == inside.size else np.concatenate([low, inside])
         on_grid = model_response(model, whole, period)
         return cls(
             whole, np.array(rows) * on_grid, np.array(discs) * np.abs(on_grid), period, float(lines[0]), confidence
@@ -166,10 +164,13 @@ def _grid(lines: Array) -> Array:
 
 
 def _splined(lines: Array, curve: Complex, grid: Array) -> tuple[Complex, Array]:
-    """Return a curve on the grid, and the error between lines as a share of it: what each tells of one left out."""
+    """Return a curve on the grid, and the error between lines as a share of it: what each tells of one left out.
+
+    Of lines that are mirrored at 0 the mirror image is left out with its line: it is no measurement of its own.
+    """
     left_out = np.zeros(lines.size)
     for i in range(1, lines.size - 1):
-        others = np.delete(np.arange(lines.size), i)
+        others = np.flatnonzero(np.abs(lines) != abs(lines[i]))
         left_out[i] = abs(scipy.interpolate.CubicSpline(lines[others], curve[others])(lines[i]) / curve[i] - 1.0)
     left_out[0], left_out[-1] = left_out[1], left_out[-2]
     return np.asarray(scipy.interpolate.CubicSpline(lines, curve)(grid)), _LEFT_OUT * left_out
