@@ -21,6 +21,7 @@ from pendulum_bags.experiments.in_process import simulate
 from pendulum_bags.experiments.run_spec import RunSpec
 from pendulum_bags.experiments.settings import NoiseSettings, RegulationSettings
 from pendulum_bags.studies.leaderboard_hardware import evaluate_hardware
+from pendulum_lqr.measured_response import read_response
 from pendulum_lqr.policy_file import write_policy
 from pendulum_msgs_py.errors import FaultError
 from pendulum_msgs_py.plants.mechanism_parameters import load_mechanism
@@ -113,6 +114,17 @@ def test_several_joints_and_what_stands_in_for_their_machine_end_in_one_answer(t
         assert len(states.stamp_ns) == 2501
         assert abs(states.position - (0.0, math.pi)).max() < 0.2
         assert bag.joints(f"/{side}/disturbance").names == ("cart",)
+    layers = {layer["layer"]: layer for layer in content["answer"]["layers"]}
+    assert layers["same_plant"]["mark"] != "not measured"
+    assert layers["same_choice"]["mark"] == "not measured"
+    late = next(row for row in layers["same_plant"]["evidence"] if row["quantity"].startswith("extra delay"))
+    assert 18.0 < late["estimate"] < 28.0
+    designs = [row for row in layers["which_controllers"]["evidence"] if row["quantity"].startswith("margin b")]
+    assert len(designs) == 4
+    measured = read_response(out / "frequency_response")
+    assert measured.joints == ("cart", "pole")
+    assert measured.facts["blocks"] == 3
+    assert (out / "frequency_response" / "frequency_response.html").is_file()
     machine, plant = load_mechanism(out / "machine.yaml"), load_mechanism("cart_pole")
     assert machine.value("cart.transport_delay") == 0.02
     assert 0.0 < abs(machine.value("cart_mass") / plant.value("cart_mass") - 1.0) <= 0.05

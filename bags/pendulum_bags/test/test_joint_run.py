@@ -174,10 +174,9 @@ def test_the_sides_that_fell_are_told_with_their_times(
 @pytest.mark.parametrize(
     ("command", "instead"),
     [
-        ("thesis", "experiment joints --plant cart_pole"),
         ("monte_carlo", "simulate_mechanisms of pendulum_sim.mechanism_batch"),
         ("region_of_attraction", "make_mechanism_controller of pendulum_lqr.mechanism_controllers"),
-        ("frequency_response", "experiment joints --plant cart_pole, which compares in time"),
+        ("frequency_response", "experiment joints --plant cart_pole, which measures it, too"),
     ],
 )
 def test_an_experiment_for_one_joint_names_what_does_it_for_several(
@@ -190,3 +189,44 @@ def test_an_experiment_for_one_joint_names_what_does_it_for_several(
     assert said.startswith("error: plant is cart_pole, which has several joints; expected one of one joint, or ")
     assert instead in said
     assert said.count("\n") == 1
+
+
+def test_the_main_experiment_of_a_plant_of_several_joints_is_that_of_joints(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    from pendulum_bags.experiments import experiment_cli
+
+    asked: list[tuple[tuple[object, ...], dict[str, object]]] = []
+    monkeypatch.setattr(experiment_cli, "joints", lambda *args, **options: asked.append((args, options)))
+    assert experiment_cli.main(["thesis", "--plant", "acrobot", "--seed", "4", "--duration", "3", "--out", "x"]) == 0
+    ((args, options),) = asked
+    assert args == (Path("x"), "acrobot")
+    assert (options["seed"], options["duration"]) == (4, 3.0)
+    # Its own defaults count where nothing was typed: 2.5 N m would be far too much for an acrobot.
+    assert not {"amplitude", "hold_time"} & set(options)
+    for option, value in (("--controller", "pid"), ("--hardware", "hebi"), ("--budget", "5")):
+        assert experiment_cli.main(["thesis", "--plant", "acrobot", option, value]) == 2
+        assert f"error: {option} is for a plant of one joint, and acrobot has several" in capsys.readouterr().err
+    assert len(asked) == 1
+
+
+@pytest.mark.parametrize("options", [["--no-frequencies"], ["--plant", "double_pendulum"]])
+def test_a_design_is_refused_where_no_frequency_is_measured(
+    options: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    from pendulum_bags.experiments.experiment_cli import main
+
+    assert main(["joints", "--design", "q=1,1,1,1", "--out", str(tmp_path / "run"), *options]) == 2
+    assert "error: --design needs both plants measured" in capsys.readouterr().err
+    assert not (tmp_path / "run").exists()
+
+
+def test_a_design_that_is_none_is_refused_before_anything_runs(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    from pendulum_bags.experiments.experiment_cli import main
+
+    assert main(["joints", "--plant", "acrobot", "--design", "q=1,1,1", "--out", str(tmp_path / "run")]) == 2
+    said = capsys.readouterr().err
+    assert "with 4 numbers for q or k, for shoulder, elbow, shoulder_dot, elbow_dot" in said
+    assert not (tmp_path / "run").exists()

@@ -37,7 +37,8 @@ from pendulum_bags.studies.monte_carlo_cli import monte_carlo
 from pendulum_bags.studies.region_cli import region_of_attraction
 from pendulum_bags.studies.study_cli import add_commands as add_study_commands
 from pendulum_msgs_py.errors import ParameterError, PendulumError
-from pendulum_msgs_py.programs.executables import EXIT_INTERRUPTED, cli_main
+from pendulum_msgs_py.plants.plant_parameters import is_mechanism
+from pendulum_msgs_py.programs.executables import EXIT_INTERRUPTED, cli_main, typed_options
 from pendulum_msgs_py.programs.options import Domain, Json, Lab, Storage, Yes, out_option
 from pendulum_msgs_py.programs.terminal import WholeTable, make_console
 
@@ -82,8 +83,17 @@ R = Annotated[float, typer.Option(help="R.")]
 Strategy = Annotated[str, typer.Option(help="How the actuator turns wanted torque into PWM.")]
 
 
+_OF_SEVERAL_JOINTS = {"duration", "amplitude", "hold_time"}
+"""Options of ``thesis`` whose defaults are others for several joints."""
+_OF_ONE_JOINT = {
+    "simulation", "mapping", "hardware", "hardware_mapping", "lab", "yes", "strategy", "controller", "q", "r", "domain", "budget",
+}  # fmt: skip
+"""Options of ``thesis`` that plants of several joints do not have."""
+
+
 @app.command()
 def thesis(
+    context: typer.Context,
     out: Annotated[
         Path | None,
         out_option("Folder of the run; it must be new. Default: bags/runs/<UTC>_thesis."),
@@ -135,7 +145,8 @@ def thesis(
 ) -> None:
     """Regulate the upright pendulum under noise on simulator and hardware: is the simulation good enough?
 
-    On the emulator it goes on with new noise until the answer is yes or no, or the budget is spent.
+    On the emulator it goes on with new noise until the answer is yes or no, or the budget is spent. With a plant of
+    several joints, such as acrobot, it is the experiment joints.
 
     Example: python -m pendulum_bags experiment thesis --out /tmp/my_run --seed 7 --margin delay=8ms
     """
@@ -144,6 +155,18 @@ def thesis(
     from pendulum_bags.experiments.thesis import run_thesis
     from pendulum_bags.verdict.terminal import print_answer, tests_table
 
+    if plant is not None and is_mechanism(plant):
+        if typed := typed_options(context, _OF_ONE_JOINT):
+            raise ParameterError(
+                f"{typed[0]} is for a plant of one joint, and {plant} has several; see python -m pendulum_bags "
+                "experiment joints --help"
+            )
+        chosen = {name: context.params[name] for name in _OF_SEVERAL_JOINTS if typed_options(context, {name})}
+        joints(
+            out, plant, seed=seed, storage=storage, margin=margin, margins_file=margins_file, json_output=json_output,
+            **chosen,
+        )  # fmt: skip
+        return
     settings = RegulationSettings(
         plant=plant or "thesis",
         simulation=simulation,

@@ -81,10 +81,18 @@ def joints(
     Example: python -m pendulum_bags experiment joints --plant acrobot --share 0.1
     """
     from pendulum_bags.comparison.compare_cli import compare
-    from pendulum_bags.experiments.joint_run import JointSettings, load_stand_in, record_joints, stand_in_for
+    from pendulum_bags.experiments.joint_run import (
+        JointSettings,
+        design_for,
+        load_stand_in,
+        record_joints,
+        stand_in_for,
+    )
     from pendulum_bags.frequency_response.designs_table import designs_table
+    from pendulum_bags.frequency_response.joint_designs import joint_designs
     from pendulum_bags.frequency_response.joint_experiment import FOLDER, JointMultisine, measure_joints
     from pendulum_bags.runs.run_folder import create_run_folder, discard_if_empty
+    from pendulum_lqr.mechanism_model import linearise_mechanism
     from pendulum_msgs_py.plants.mechanism_parameters import load_mechanism, write_mechanism
 
     settings = JointSettings(plant, joint, amplitude, hold_time, duration, seed, storage=storage)
@@ -98,6 +106,10 @@ def joints(
             "--design needs both plants measured; expected --frequencies, and a plant with one driven joint: "
             f"{simulated.name} has {len(simulated.coordinates.driven)}"
         )
+    if design:
+        # Before anything runs: a slip of the pen should not cost a minute.
+        on = design_for(simulated)
+        joint_designs(design, on, linearise_mechanism(on))
     console = make_console(stderr=json_output, highlight=False)
     folder = create_run_folder(out, "joints")
     started = time.monotonic()

@@ -170,7 +170,7 @@ def _joint(record: Record, frequency: Array, r: Complex, u: Complex, y: Complex,
 
 
 def _distortion(y: Complex, harmonics: NDArray[np.int64]) -> tuple[float, float]:
-    """Return how strong angle and velocity of the worst joint are on odd lines between the excited ones, beside those."""
+    """Return how strong angle and velocity of the worst joint are on odd lines between the excited, beside those."""
     top = min(int(harmonics[-1]), y.shape[2] - 1)
     odd = np.setdiff1d(np.arange(1, top + 1, 2), harmonics)
     excited = harmonics[harmonics <= top]

@@ -4,15 +4,15 @@ from __future__ import annotations
 
 import json
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 from rich.console import Console
 
-from pendulum_msgs_py.errors import DataError, PendulumError
-from pendulum_msgs_py.programs.executables import EXIT_INTERRUPTED, cli_main
+from pendulum_msgs_py.errors import DataError, ParameterError, PendulumError
+from pendulum_msgs_py.programs.executables import EXIT_INTERRUPTED, cli_main, typed_options
 from pendulum_msgs_py.programs.options import Domain, Json, Storage, out_option
 from pendulum_msgs_py.programs.terminal import make_console
 
@@ -40,6 +40,7 @@ GapMargin = Annotated[
 
 @app.command()
 def frequency_response(
+    context: typer.Context,
     bags: Annotated[
         list[Path], typer.Argument(help="A bag, a simulation and a hardware bag, or a run folder with both.")
     ],
@@ -66,8 +67,16 @@ def frequency_response(
 
     scaling = Scaling(angle, velocity, torque)
     responses, told, ran = read_responses(bags)
+    several = bool(responses[0].joints)
+    if several and (typed := typed_options(context, {"angle", "velocity", "torque"})):
+        raise ParameterError(f"{typed[0]} is for plants of one joint; of several the LQR weights are the units")
     analysis = analyse_responses(
-        responses, plant or told, design or ran, scaling=scaling, margin=gap_margin, recorded=not design
+        responses,
+        plant or told,
+        design or ran,
+        scaling=None if several else scaling,
+        margin=None if several and not typed_options(context, {"gap_margin"}) else gap_margin,
+        recorded=not design,
     )
     _tell(make_console(stderr=json_output, highlight=False), analysis, out, json_output=json_output)
 
@@ -116,7 +125,7 @@ def experiment(
     from pendulum_lqr.policy_file import named_controller
     from pendulum_msgs_py.plants.plant_parameters import require_one_joint
 
-    require_one_joint(plant, f"python -m pendulum_bags experiment joints --plant {plant}, which compares in time")
+    require_one_joint(plant, f"python -m pendulum_bags experiment joints --plant {plant}, which measures it, too")
     scaling = Scaling(angle, velocity, torque)
     kind, parameters = named_controller(controller)
     require_time_invariant(kind)
@@ -183,7 +192,7 @@ def _tell(console: Console, analysis: Analysis, out: Path | None, *, json_output
         console.print(
             f"{response.label}: {response.frequency.size} frequencies from {response.frequency[0]:.3g} to "
             f"{response.frequency[-1]:.3g} Hz, {facts['blocks']} {facts['method']} of {facts['block_length_s']:g} s, "
-            f"largest angle {facts['largest_angle_rad']:.3f} rad, largest torque {facts['largest_torque_nm']:.2f} N m",
+            + _extent(facts),
             soft_wrap=True,
         )
     for layer in analysis.layers:
@@ -193,6 +202,14 @@ def _tell(console: Console, analysis: Analysis, out: Path | None, *, json_output
         console.print(designs_table(analysis.designs))
     if page is not None:
         console.print(f"\npage    {page}\nagain   {out}/hw_response.json for design --machine", soft_wrap=True)
+
+
+def _extent(facts: Mapping[str, Any]) -> str:
+    """Say how far a plant moved and how hard it was driven while it was measured."""
+    if "largest_deviation" in facts:
+        told = ", ".join(f"{joint} {value:.3g}" for joint, value in facts["largest_deviation"].items())
+        return f"largest deviations {told} rad or m, largest effort {facts['largest_effort']:.3g} N m or N"
+    return f"largest angle {facts['largest_angle_rad']:.3f} rad, largest torque {facts['largest_torque_nm']:.2f} N m"
 
 
 def main(argv: Sequence[str] | None = None) -> int:

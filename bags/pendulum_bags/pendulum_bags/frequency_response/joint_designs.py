@@ -4,16 +4,19 @@ from __future__ import annotations
 
 import re
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from pendulum_bags.frequency_response.designs import DesignResult
 from pendulum_lqr.certificate import Certifier
 from pendulum_lqr.mechanism_model import mechanism_lqr
+from pendulum_lqr.model import LinearModel
 from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.plants.mechanism_parameters import MechanismParameters
 
-__all__ = ["certify_joint_designs"]
+__all__ = ["JointDesign", "certify_joint_designs", "joint_designs"]
 
 _NUMBERS = r"[-+0-9.eE]+(?:,[-+0-9.eE]+)*"
 _WEIGHTS = re.compile(rf"q=({_NUMBERS})(?:[ ;]+r=({_NUMBERS}))?")
@@ -22,14 +25,29 @@ _OTHER_COSTS = (1.0, 0.1, 10.0, 100.0)
 """Costs of the effort of the designs that nobody chose, beside that of the plant's own LQR."""
 
 
-def certify_joint_designs(texts: Sequence[str], plant: MechanismParameters, certifier: Certifier) -> list[DesignResult]:
-    """Return the certificates of designs that were made on a plant of several joints, one of them driven.
+@dataclass(frozen=True)
+class JointDesign:
+    """A static gain for a plant of several joints.
+
+    Attributes:
+        name: As in tables.
+        text: As somebody wrote it.
+        K: Gain on positions and velocities, shape (2 k,).
+    """
+
+    name: str
+    text: str
+    K: NDArray[np.float64]
+
+
+def joint_designs(texts: Sequence[str], plant: MechanismParameters, model: LinearModel) -> list[JointDesign]:
+    """Return the designs that texts stand for, made on a plant of several joints, one of them driven.
 
     Args:
         texts: ``q=10,100,1,1 r=0.1`` for LQR, positions before velocities, or ``k=...`` for a gain; none for the
             plant's own LQR and three with another cost of the effort.
         plant: The plant.
-        certifier: Of its linear model and the measured machine.
+        model: Its linear model.
 
     Raises:
         ParameterError: A text is no design of this plant.
@@ -37,24 +55,37 @@ def certify_joint_designs(texts: Sequence[str], plant: MechanismParameters, cert
     q, r = plant.mechanism.weights
     own = ",".join(f"{weight:g}" for weight in q)
     asked = list(texts) or [f"q={own} r={r * share:g}" for share in _OTHER_COSTS]
-    return [_one(text, r, certifier) for text in map(str.strip, asked)]
+    return [_one(text, r, model) for text in map(str.strip, asked)]
 
 
-def _one(text: str, own_cost: float, certifier: Certifier) -> DesignResult:
-    size = certifier.plant.C.shape[0]
+def certify_joint_designs(texts: Sequence[str], plant: MechanismParameters, certifier: Certifier) -> list[DesignResult]:
+    """Return the certificates of designs; arguments and errors as of :func:`joint_designs`.
+
+    Args:
+        texts: The designs.
+        plant: The plant.
+        certifier: Of its linear model and the measured machine.
+    """
+    return [
+        DesignResult(one.name, tuple(map(float, one.K)), certifier.gain(one.K), text=one.text)
+        for one in joint_designs(texts, plant, certifier.plant)
+    ]
+
+
+def _one(text: str, own_cost: float, model: LinearModel) -> JointDesign:
+    size = model.C.shape[0]
     if match := _WEIGHTS.fullmatch(text):
         weights, (cost, *more) = _numbers(match[1], text), _numbers(match[2] or f"{own_cost}", text)
         if len(weights) == size and not more:
-            K = np.asarray(mechanism_lqr(certifier.plant, weights, cost).K[0], dtype=np.float64)
-            name = f"LQR q=({', '.join(f'{value:g}' for value in weights)}) r={cost:g}"
-            return DesignResult(name, tuple(map(float, K)), certifier.gain(K), text=text)
+            K = np.asarray(mechanism_lqr(model, weights, cost).K[0], dtype=np.float64)
+            return JointDesign(f"LQR q=({', '.join(f'{value:g}' for value in weights)}) r={cost:g}", text, K)
     elif match := _GAIN.fullmatch(text):
-        K = np.array(_numbers(match[1], text))
-        if K.size == size:
-            return DesignResult(f"K=({', '.join(f'{value:g}' for value in K)})", tuple(K), certifier.gain(K), text=text)
+        gain = _numbers(match[1], text)
+        if len(gain) == size:
+            return JointDesign(f"K=({', '.join(f'{value:g}' for value in gain)})", text, np.array(gain))
     raise ParameterError(
         f"design is {text!r}; expected 'q=... r=...' or 'k=...' with {size} numbers for q or k, for "
-        f"{', '.join(certifier.plant.states)}, and one for r"
+        f"{', '.join(model.states)}, and one for r"
     )
 
 
