@@ -85,22 +85,10 @@ Strategy = Annotated[str, typer.Option(help="How the actuator turns wanted torqu
 
 _OF_SEVERAL_JOINTS = {"duration", "amplitude", "hold_time"}
 """Options of ``thesis`` whose defaults are others for several joints."""
-_OF_ONE_JOINT = set(
-    [
-        "simulation",
-        "mapping",
-        "hardware",
-        "hardware_mapping",
-        "lab",
-        "yes",
-        "strategy",
-        "controller",
-        "q",
-        "r",
-        "domain",
-        "budget",
-    ]
-)
+_OF_ONE_JOINT = {
+    *("simulation", "mapping", "hardware", "hardware_mapping", "lab", "yes", "domain"),
+    *("strategy", "controller", "q", "r", "budget"),
+}
 """Options of ``thesis`` that plants of several joints do not have."""
 
 
