@@ -132,6 +132,29 @@ def test_plants_are_drawn_from_the_ranges_and_wider_intervals_of_the_plant_file_
     np.testing.assert_array_equal(env.parameters[:, 3], env.parameters[:, 4])
 
 
+def test_half_of_the_parameters_of_one_joint_lie_at_an_end_of_their_range():
+    ranges = ranges_of(DFKI, 0.25, {})
+    env = SwingUp(4000, DFKI, ranges, SwingUpTask(), np.random.default_rng(0))
+    for name in ("inertia", "gravity"):
+        drawn = env.parameters[:, env.body.columns[name]]
+        for end in ranges[name]:
+            assert np.mean(drawn == end) == pytest.approx(0.25, abs=0.03)
+
+
+def test_some_of_one_joint_start_spinning_and_some_where_their_effort_holds_them_on_both_sides():
+    env = SwingUp(4000, DFKI, ranges_of(DFKI, 0.25, {}), QUIET, np.random.default_rng(0))
+    spinning = np.abs(env.motion[:, 1]) > 2.5 * env.scale[0]
+    assert np.mean(spinning) == pytest.approx(0.1 / 6.0, abs=0.01)
+    held = env.effort[:, 0] != 0.0
+    assert np.mean(held) == pytest.approx(0.1, abs=0.02)
+    before = env.motion[held, 0].copy()
+    assert min(np.sum(np.cos(before) > 0.1), np.sum(np.cos(before) < -0.1)) > 100
+    assert np.mean(np.abs(env.effort[held, 0]) == env.limit[0]) == pytest.approx(1.0 / 3.0, abs=0.1)
+    for _ in range(3):
+        env.step((env.effort / env.limit).astype(np.float32))
+    np.testing.assert_allclose(env.motion[held, 0], before, atol=1e-6)
+
+
 def test_learning_improves_a_policy():
     generator = np.random.default_rng(0)
     learner = Ppo(

@@ -75,6 +75,8 @@ class Body:
         excess: From deviations (N, n), velocities (N, n) and parameters (N, p) to how much more energy it has
             than upright at rest, -1 hanging at rest, shape (N,); None where each joint is driven.
         possible: From parameters (N, p) to whether they make a plant, shape (N,).
+        held: From parameters (N, p), efforts (N, 1) and whether above the middle (N,) to the deviations at which
+            gravity and these efforts balance, shape (N, 1); None of several joints.
     """
 
     coordinates: Coordinates
@@ -90,6 +92,7 @@ class Body:
     height: Callable[[Array], Array]
     excess: Callable[[Array, Array, Array], Array] | None
     possible: Callable[[Array], NDArray[np.bool_]]
+    held: Callable[[Array, Array, NDArray[np.bool_]], Array] | None
 
 
 def body_of(plant: AnyPlant, ranges: Mapping[str, tuple[float, float]], travel: float) -> Body:
@@ -227,13 +230,17 @@ def _pendulum(plant: PlantParameters, ranges: Mapping[str, tuple[float, float]])
             (parameters[:, coulomb] - plant.coulomb_friction + parameters[:, damping] - plant.damping) / limit,
         ]
 
+    def held(parameters: Array, efforts: Array, above: NDArray[np.bool_]) -> Array:
+        x = np.arcsin(np.clip(-efforts / np.maximum(parameters[:, [gravity]], 1e-9), -1.0, 1.0))
+        return np.where(above[:, None], x, math.pi - x)
+
     return Body(
         coordinates=coordinates_of(plant), limits=np.array([limit]), kicks=kicks_of(plant),
         row=np.array(pack(plant), dtype=np.float64), columns=columns,
         ratios=_ratio(coulomb + 1, coulomb, plant.static_friction, plant.coulomb_friction),
         offsets=(columns["torque_offset"],), longest=longest, advance=_pendulum_kernel(), told=told,
         height=lambda x: np.cos(x[:, 0]), excess=None,
-        possible=lambda parameters: np.ones(len(parameters), dtype=np.bool_),
+        possible=lambda parameters: np.ones(len(parameters), dtype=np.bool_), held=held,
     )  # fmt: skip
 
 
@@ -291,7 +298,7 @@ def _mechanism(plant: MechanismParameters, ranges: Mapping[str, tuple[float, flo
         advance=_mechanism_kernel(mechanism.name, goal),
         told=lambda parameters: [(parameters[:, k] - centre[k]) / half for k, half in scales.items()],
         height=height, excess=excess if len(driven) < n else None,
-        possible=lambda parameters: can_exist(mechanism, parameters[:, :width]),
+        possible=lambda parameters: can_exist(mechanism, parameters[:, :width]), held=None,
     )  # fmt: skip
 
 

@@ -5,7 +5,7 @@ The effort that answers a state begins to act after the delay; until then the on
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import numpy as np
@@ -34,6 +34,15 @@ _AGAIN, _UP, _LEARNED = 0.75, 0.3, 0.6
 """With a passive joint, the chance that who did not end upright [rad], or left its travel, meets the same plant again,
 and after which share of the training: plants that are hard to swing up are rare, and else are not learned; who cannot
 swing up any plant yet has to see all of them."""
+_ENDS = 0.5
+"""Of one joint, the share of parameters that lie at an end of their range: drawn evenly, plants of which several are
+extreme are too rare for a policy to learn to brake them."""
+_SPUN, _FASTEST_SPIN = 0.1, 3.0
+"""Of one joint, the share of episodes that begin with any speed up to so many scales: else no policy meets what goes
+round and round with its torque."""
+_HELD, _FULL = 0.1, 1.5
+"""Of one joint, the share of episodes that begin where gravity and effort balance, which dry friction and an unchanging
+answer would keep for ever; efforts are drawn up to so many limits and clipped: most get stuck at the limit."""
 _MOST_DRAWS = 50
 
 
@@ -151,7 +160,10 @@ class SwingUp:
         return _PRICE + (_LAST_PRICE - _PRICE) * min(1.0, max(0.0, 3.0 * self.progress - 1.0))
 
     def restart(self, which: NDArray[np.bool_]) -> None:
-        """Start new episodes in some of them: half anywhere, a quarter hanging, a quarter near upright."""
+        """Start new episodes in some of them: half anywhere, a quarter hanging, a quarter near upright.
+
+        Of one joint, some of those that start anywhere spin, and some are held there by their effort.
+        """
         rows = np.flatnonzero(which)
         if not rows.size:
             return
@@ -171,9 +183,22 @@ class SwingUp:
         self.motion[rows, :n] = position + 0.05 * draw.standard_normal((size, n))
         self.motion[rows, n : 2 * n] = np.where(kind < 0.5, self._fastest, 0.1) * draw.standard_normal((size, n))
         self.effort[rows], self.push[rows] = 0.0, 0.0
+        if self.body.held is not None:
+            spun = rows[kind[:, 0] < _SPUN]
+            self.motion[spun, n : 2 * n] = draw.uniform(-_FASTEST_SPIN, _FASTEST_SPIN, (spun.size, n)) * self.scale
+            self._hold(rows[(kind[:, 0] >= 0.5 - _HELD) & (kind[:, 0] < 0.5)], self.body.held)
         self._kick_left[rows], self._left[rows] = 0, self._steps
         first = self._measure(rows)
         self._samples[rows] = np.tile(first, (1, task.history))
+
+    def _hold(self, rows: NDArray[np.intp], held: Callable[[Array, Array, NDArray[np.bool_]], Array]) -> None:
+        """Let some start at rest where their effort, of the one joint, holds them."""
+        draw, n = self._generator, self._n
+        efforts = self.limit * np.clip(draw.uniform(-_FULL, _FULL, (rows.size, n)), -1.0, 1.0)
+        above = draw.uniform(0.0, 1.0, rows.size) < 0.5
+        self.effort[rows], self.motion[rows] = efforts, 0.0
+        self.motion[rows, :n] = held(self.parameters[rows], efforts, above)
+        self.motion[rows, 2 * n : 5 * n] = np.tile(efforts, (1, 3))
 
     def _meets_again(self, rows: NDArray[np.intp]) -> NDArray[np.bool_]:
         """Return who gets the plant of the episode that ends once more."""
@@ -188,13 +213,21 @@ class SwingUp:
         for _ in range(_MOST_DRAWS):
             for name, (low, high) in self._ranges.items():
                 if name.rpartition(".")[2] != "static_friction":
-                    self.parameters[rows, self.body.columns[name]] = self._generator.uniform(low, high, rows.size)
+                    self.parameters[rows, self.body.columns[name]] = self._values(low, high, rows.size)
             for static, coulomb, ratio in self.body.ratios:
                 self.parameters[rows, static] = ratio * self.parameters[rows, coulomb]
             rows = rows[~self.body.possible(self.parameters[rows])]
             if not rows.size:
                 return
         self.parameters[rows] = self.body.row
+
+    def _values(self, low: float, high: float, size: int) -> Array:
+        """Draw values of a parameter."""
+        values = self._generator.uniform(low, high, size)
+        if self.body.held is None:
+            return values
+        nearest = np.where(values < 0.5 * (low + high), low, high)
+        return np.where(self._generator.uniform(0.0, 1.0, size) < _ENDS, nearest, values)
 
     def state(self) -> dict[str, NDArray[Any]]:
         """Return what a checkpoint keeps."""
