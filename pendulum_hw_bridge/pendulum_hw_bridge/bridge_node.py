@@ -23,7 +23,7 @@ from pendulum_hw_bridge.clocks import Clock, SteppedClock, WallClock
 from pendulum_hw_bridge.derating import Derating
 from pendulum_hw_bridge.e_stop_input_node import EStopInputServer
 from pendulum_hw_bridge.feedback_message import encode_feedback
-from pendulum_hw_bridge.lab_node import with_lab_file
+from pendulum_hw_bridge.lab_node import given_plant, with_lab_file
 from pendulum_hw_bridge.module import DrivenModule, Module
 from pendulum_hw_bridge.node_specs import SPECS
 from pendulum_msgs_py.contract.plant_specs import LOCKSTEP_EPOCH_NS
@@ -85,7 +85,7 @@ class BridgeNode(LifecycleNode, PollingNode):
         super().__init__("bridge", enable_logger_service=True, **options)
         self._stop_runner = stop
         self.failure: Exception | None = None
-        specs = tuple(with_lab_file(self, for_plant(SPECS, self._given_plant())))
+        specs = tuple(with_lab_file(self, for_plant(SPECS, given_plant(self))))
         self._values = values = NodeParameters(self, specs).values
         self._lockstep = values["clock"] == "lockstep"
         self._period_ns = round(NANOSECONDS / values["feedback_rate"])
@@ -182,11 +182,6 @@ class BridgeNode(LifecycleNode, PollingNode):
         if self._loop is None or not self._loop.active:
             self._interface.wait_for_inputs(0.0)
         return None
-
-    def _given_plant(self) -> str:
-        """Return the plant that was given, whose joints decide the defaults of what is not."""
-        given = self._parameter_overrides.get("plant")
-        return "thesis" if given is None else str(given.value)
 
     def _make_clock(self) -> Clock:
         return WallClock()

@@ -3,18 +3,23 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
+from rich.console import Console
 
 from pendulum_hw_bridge.backends import BACKENDS
 from pendulum_hw_bridge.check_item import Checklist
 from pendulum_hw_bridge.checklist import run_checklist
+from pendulum_hw_bridge.clocks import WallClock
 from pendulum_hw_bridge.emulation import EMULATOR_PRESET_NAMES
+from pendulum_hw_bridge.machine_checklist import run_machine_checklist
 from pendulum_hw_bridge.nudge import hand_of
+from pendulum_msgs_py.plants.mechanism_parameters import load_mechanism
+from pendulum_msgs_py.plants.plant_parameters import is_mechanism
 from pendulum_msgs_py.programs.executables import cli_main
 from pendulum_msgs_py.programs.graph import ParameterArgument
 from pendulum_msgs_py.programs.options import Json
@@ -40,7 +45,8 @@ def check(
     serial: Annotated[str | None, typer.Option(help="Serial number of the HEBI module.")] = None,
     interface: Annotated[str | None, typer.Option(help="Network address to look on; default all.")] = None,
     plant: Annotated[
-        str | None, typer.Option(help=f"{EMULATOR_PRESET_NAMES}, or a plant file with a drivetrain.")
+        str | None,
+        typer.Option(help=f"{EMULATOR_PRESET_NAMES}, a plant file with a drivetrain, or a plant of several joints."),
     ] = None,
     feedback_rate: Annotated[float | None, typer.Option(help="Feedback records per second [Hz].")] = None,
     gains_file: Annotated[str | None, typer.Option(help="HEBI gains file; default those of the X5-9.")] = None,
@@ -57,11 +63,12 @@ def check(
     """Go through the checklist before arming; the motor gets no torque.
 
     It is judged by the options that the bridge will use: give it the bridge's own, after --ros-args, or the lab file.
-    The pendulum must hang at rest. Exit code 0 if ready, 1 if not, 3 if this computer was too busy to tell.
+    The pendulum must hang at rest. A plant of several joints has lines for each. Exit code 0 if ready, 1 if not, 3 if
+    this computer was too busy to tell.
 
     Example: python -m pendulum_hw_bridge check --lab lab.yaml
     """
-    from pendulum_hw_bridge.check_node import as_the_bridge, bridge_values
+    from pendulum_hw_bridge.check_node import bridge_values
 
     options: dict[str, ParameterArgument | None] = {
         "lab_file": None if lab is None else str(lab),
@@ -81,18 +88,10 @@ def check(
     ros_arguments: list[str] = context.obj or []
     if not ros_arguments and lab is None:
         given.setdefault("backend", "hebi")
-    bridge = as_the_bridge(bridge_values(ros_arguments, given))
+    values = bridge_values(ros_arguments, given)
     console = make_console(stderr=True)
-    found = run_checklist(
-        bridge.port,
-        bridge.settings,
-        bridge.limits,
-        bridge.plant,
-        window=bridge.window,
-        hand=hand_of(bridge.port, lambda text: console.print(text, style="bold")) if nudge else None,
-        hangs=not bridge.values["flat"],
-        progress=(lambda text: None) if as_json else lambda text: console.print(f"{text} ...", style="dim"),
-    )
+    say = console.print if not as_json else None
+    found = _of_several(values, say) if is_mechanism(values["plant"]) else _of_one(values, say, console, nudge=nudge)
     if as_json:
         items = [asdict(item) for item in found.items]
         document = {"ready": found.ready, "host_busy": found.host_busy, "items": items, "figures": found.figures}
@@ -102,6 +101,35 @@ def check(
     if found.ready:
         return 0
     return EXIT_NOT_READY if found.refused else EXIT_BUSY
+
+
+def _of_one(values: Mapping[str, Any], say: Callable[..., None] | None, console: Console, *, nudge: bool) -> Checklist:
+    from pendulum_hw_bridge.check_node import as_the_bridge
+
+    bridge = as_the_bridge(values)
+    return run_checklist(
+        bridge.port,
+        bridge.settings,
+        bridge.limits,
+        bridge.plant,
+        window=bridge.window,
+        hand=hand_of(bridge.port, lambda text: console.print(text, style="bold")) if nudge else None,
+        hangs=not bridge.values["flat"],
+        progress=_progress(say),
+    )
+
+
+def _of_several(values: Mapping[str, Any], say: Callable[..., None] | None) -> Checklist:
+    from pendulum_hw_bridge.check_node import machine_of
+
+    machine = machine_of(values)
+    windows = list(zip(machine.limits.position_min, machine.limits.position_max, strict=True))
+    plant = load_mechanism(values["plant"])
+    return run_machine_checklist(machine.modules(WallClock()), plant, windows, progress=_progress(say))
+
+
+def _progress(say: Callable[..., None] | None) -> Callable[[str], None]:
+    return (lambda text: None) if say is None else lambda text: say(f"{text} ...", style="dim")
 
 
 def _print(found: Checklist) -> None:

@@ -13,9 +13,10 @@ from rclpy.signals import SignalHandlerOptions
 
 from pendulum_hw_bridge import bridge_parameters
 from pendulum_hw_bridge.actuator import ActuatorPort
+from pendulum_hw_bridge.assembly import Assembly, assemble, for_plant
 from pendulum_hw_bridge.bridge_consistency import check_consistency
 from pendulum_hw_bridge.clocks import WallClock
-from pendulum_hw_bridge.lab_node import with_lab_file
+from pendulum_hw_bridge.lab_node import given_plant, with_lab_file
 from pendulum_hw_bridge.node_specs import SPECS
 from pendulum_hw_bridge.safety import SafetyLimits
 from pendulum_hw_bridge.settings import BridgeSettings
@@ -25,7 +26,7 @@ from pendulum_msgs_py.programs import graph
 from pendulum_msgs_py.ros.middleware import set_middleware_defaults
 from pendulum_msgs_py.ros.parameters import NodeParameters
 
-__all__ = ["AsTheBridge", "as_the_bridge", "bridge_values"]
+__all__ = ["AsTheBridge", "as_the_bridge", "bridge_values", "machine_of"]
 
 
 @dataclass(frozen=True)
@@ -73,7 +74,7 @@ def bridge_values(ros_arguments: Sequence[str], given: Mapping[str, graph.Parame
         # Nobody talks to it: it only reads, under the bridge's own name, what the bridge would read.
         node = Node("bridge", context=context, start_parameter_services=False, enable_rosout=False)
         try:
-            return NodeParameters(node, with_lab_file(node, SPECS)).values
+            return NodeParameters(node, with_lab_file(node, for_plant(SPECS, given_plant(node)))).values
         finally:
             node.destroy_node()
     finally:
@@ -103,3 +104,12 @@ def as_the_bridge(values: Mapping[str, Any]) -> AsTheBridge:
         plant,
         window,
     )
+
+
+def machine_of(values: Mapping[str, Any]) -> Assembly:
+    """Return the machine of several modules that the bridge would make of its parameters.
+
+    Raises:
+        ParameterError: They contradict each other or the plant.
+    """
+    return assemble(values, for_plant(SPECS, values["plant"]))

@@ -18,6 +18,7 @@ from pendulum_hw_bridge.actuator import (
     ActuatorPort,
     Command,
     CommandLock,
+    EncoderPort,
     Feedback,
     Strategy,
     TemperatureState,
@@ -30,9 +31,19 @@ from pendulum_hw_bridge.safety import SafetyLimits, SafetyMonitor
 from pendulum_hw_bridge.settings import BridgeSettings
 from pendulum_msgs_py.contract.values import NANOSECONDS
 from pendulum_msgs_py.errors import PendulumError
+from pendulum_msgs_py.joints import ONE_JOINT, Joint
 from pendulum_msgs_py.plants.plant_parameters import PlantParameters
 
-__all__ = ["run_checklist"]
+__all__ = [
+    "acknowledgement_item",
+    "identity",
+    "listen",
+    "monitor_item",
+    "run_checklist",
+    "setting_items",
+    "state_items",
+    "strategy_item",
+]
 
 _LISTEN = 1.0
 _STRETCHES = 5
@@ -75,15 +86,17 @@ def run_checklist(
     try:
         progress("connecting")
         info = port.connect()
-        items.append(CheckItem("actuator answers", True, _identity(info), "the one that is meant"))
+        items.append(CheckItem("actuator answers", True, identity(info), "the one that is meant"))
         progress("setting and reading back")
-        items += _settings(port, settings)
-        records = _listen(port, settings, limits, host or HostWatch(), found, progress)
-        items.append(_acknowledgements(port, settings, found))
+        items += setting_items(port, settings)
+        records = listen(port, settings, limits, host or HostWatch(), found, progress)
+        items.append(acknowledgement_item(port, settings, found))
         if records:
-            items += _state(records, limits)
+            items += state_items(records, limits)
             if not found.host_busy:
-                items.append(_monitor(records, settings, limits, plant))
+                items.append(
+                    monitor_item(records, SafetyMonitor(limits, 1.0 / settings.feedback_rate, plant.drivetrain))
+                )
             items += rest_items(records, settings, plant, window, hangs)
         progress("trying the strategy at zero torque")
         items.append(_strategy(port))
@@ -99,13 +112,15 @@ def run_checklist(
     return found
 
 
-def _identity(info: ActuatorInfo) -> str:
+def identity(info: ActuatorInfo) -> str:
+    """Return who answers, in words."""
     serial = f", serial {info.serial}" if info.serial else ""
     firmware = f", firmware {info.firmware}" if info.firmware else ""
     return f"{info.backend} {info.family}/{info.name}{serial}{firmware}"
 
 
-def _settings(port: ActuatorPort, settings: BridgeSettings) -> list[CheckItem]:
+def setting_items(port: ActuatorPort, settings: BridgeSettings) -> list[CheckItem]:
+    """Write all settings, and judge whether each reads back."""
     lifetime = port.set_command_lifetime(settings.command_lifetime)
     rate = port.set_feedback_rate(settings.feedback_rate)
     limits, joint = port.set_limits(settings.limits), settings.limits.joint
@@ -123,13 +138,16 @@ def _settings(port: ActuatorPort, settings: BridgeSettings) -> list[CheckItem]:
     ]
     if settings.gains is not None:
         gains = port.set_gains(settings.gains)
-        items.append(_equal("position gain reads back", gains.position.kp, settings.gains.position.kp, "1/rad"))
+        items.append(
+            _equal("position gain reads back", gains.position.kp, settings.gains.position.kp, f"1/{joint.unit}")
+        )
     off = port.set_strategy(Strategy.OFF)
     items.append(CheckItem("strategy off reads back", off is Strategy.OFF, off.name, "OFF"))
     return items
 
 
-def _acknowledgements(port: ActuatorPort, settings: BridgeSettings, found: Checklist) -> CheckItem:
+def acknowledgement_item(port: ActuatorPort, settings: BridgeSettings, found: Checklist) -> CheckItem:
+    """Judge how long the module takes to answer that it is off."""
     times = []
     for _ in range(_ACKNOWLEDGEMENTS):
         start = port.now_ns()
@@ -145,8 +163,8 @@ def _acknowledgements(port: ActuatorPort, settings: BridgeSettings, found: Check
     )
 
 
-def _listen(
-    port: ActuatorPort,
+def listen(
+    port: EncoderPort,
     settings: BridgeSettings,
     limits: SafetyLimits,
     host: Punctuality,
@@ -185,7 +203,7 @@ def _listen(
     return records
 
 
-def _stretch(port: ActuatorPort, host: Punctuality) -> tuple[list[Feedback], Sequence[float]]:
+def _stretch(port: EncoderPort, host: Punctuality) -> tuple[list[Feedback], Sequence[float]]:
     records: list[Feedback] = []
     host.start()
     try:
@@ -244,11 +262,8 @@ def _timing(figures: TimingFigures, settings: BridgeSettings, limits: SafetyLimi
     ]
 
 
-def _monitor(
-    records: Sequence[Feedback], settings: BridgeSettings, limits: SafetyLimits, plant: PlantParameters
-) -> CheckItem:
+def monitor_item(records: Sequence[Feedback], monitor: SafetyMonitor) -> CheckItem:
     """Let the bridge's own monitor look at what came: what it would fault on is no state to arm in."""
-    monitor = SafetyMonitor(limits, 1.0 / settings.feedback_rate, plant.drivetrain)
     for record in records:
         fault = monitor.check(record) if monitor.is_new(record) else None
         if fault is not None:
@@ -256,12 +271,22 @@ def _monitor(
     return CheckItem("the bridge finds no fault", True, f"none in {len(records)} records", "none")
 
 
-def _state(records: list[Feedback], limits: SafetyLimits) -> list[CheckItem]:
+def state_items(
+    records: list[Feedback], limits: SafetyLimits, joint: Joint = ONE_JOINT.joints[0], name: str = "pendulum"
+) -> list[CheckItem]:
+    """Judge what a module tells of itself while nobody drives it.
+
+    Args:
+        records: What it told.
+        limits: Limits of the feedback.
+        joint: Its joint, whose units the lines have.
+        name: What is at rest.
+    """
     last = records[-1]
     finite = all(
         math.isfinite(value) for record in records for value in (record.position, record.velocity, record.effort)
     )
-    speed = max(abs(record.velocity) for record in records)
+    speed, unit = max(abs(record.velocity) for record in records), joint.velocity_unit
     return [
         CheckItem(
             "position, velocity, effort are numbers",
@@ -269,7 +294,7 @@ def _state(records: list[Feedback], limits: SafetyLimits) -> list[CheckItem]:
             "all finite" if finite else "not all",
             "all finite",
         ),
-        CheckItem("pendulum is at rest", speed <= _AT_REST, f"{speed:.3f} rad/s", f"at most {_AT_REST:g} rad/s"),
+        CheckItem(f"{name} is at rest", speed <= _AT_REST, f"{speed:.3f} {unit}", f"at most {_AT_REST:g} {unit}"),
         CheckItem("motion stop is released", not last.m_stop, "pressed" if last.m_stop else "released", "released"),
         CheckItem(
             "nobody else commands",
@@ -299,9 +324,14 @@ def _state(records: list[Feedback], limits: SafetyLimits) -> list[CheckItem]:
 
 
 def _strategy(port: ActuatorPort) -> CheckItem:
-    reads = port.set_strategy(Strategy.DIRECT_PWM, Command(pwm=0.0))
+    return strategy_item(port, Strategy.DIRECT_PWM, Command(pwm=0.0), "direct PWM can be set")
+
+
+def strategy_item(port: ActuatorPort, strategy: Strategy, idle: Command, name: str) -> CheckItem:
+    """Judge whether a strategy can be set, at no torque, and switch it off again."""
+    reads = port.set_strategy(strategy, idle)
     port.stop()
-    return CheckItem("direct PWM can be set", reads is Strategy.DIRECT_PWM, reads.name, "DIRECT_PWM")
+    return CheckItem(name, reads is strategy, reads.name, strategy.name)
 
 
 def _name(kind: type[IntEnum], number: int) -> str:
