@@ -64,7 +64,7 @@ class Machine:
         """Let the modules say other names."""
         for module, name in zip(self.modules, names, strict=True):
             connect = module.port.connect
-            module.port.connect = lambda connect=connect, name=name: replace(connect(), name=name)  # type: ignore
+            module.port.connect = lambda connect=connect, name=name: replace(connect(), name=name)  # type: ignore[method-assign]
         return self
 
     def checked(self) -> Checklist:
@@ -113,7 +113,6 @@ def test_the_lines_of_a_cart_are_in_its_units() -> None:
         (ActuatorFault.M_STOP, 1, "pole: motion stop is released"),
         (ActuatorFault.FEEDBACK_LOST, 1, "pole: feedback flows"),
         (ActuatorFault.POSITION_NAN, 1, "pole: position, velocity, effort are numbers"),
-        (ActuatorFault.VOLTAGE_LOW, 0, "cart: supply voltage"),
         (ActuatorFault.COMMANDS_LOST, 0, "cart: no_acknowledgement"),
         (ActuatorFault.EFFORT_OFFSET, 0, "cart: nothing drives it"),
     ],
