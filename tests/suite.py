@@ -44,6 +44,7 @@ _WAITS = (
     "tests/faults/test_disk_faults.py",
     "tests/faults/test_network_faults.py",
     "tests/faults/test_system_faults.py",
+    "tests/faults/test_live_machine.py",
     "tests/integration",
 )
 """Other tests with processes that keep a plant's time, longest first: they wait for most of it."""
