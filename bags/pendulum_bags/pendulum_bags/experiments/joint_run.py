@@ -23,7 +23,16 @@ from pendulum_msgs_py.programs import graph
 from pendulum_msgs_py.programs.graph import NodeProgram
 from pendulum_rosbag.reader.bag import read_bag
 
-__all__ = ["JointRun", "JointSettings", "design_for", "fall_time", "load_stand_in", "record_joints", "stand_in_for"]
+__all__ = [
+    "JointRun",
+    "JointSettings",
+    "design_file",
+    "design_for",
+    "fall_time",
+    "load_stand_in",
+    "record_joints",
+    "stand_in_for",
+]
 
 Array = NDArray[Any]
 
@@ -97,6 +106,7 @@ class JointRun:
         plant: Preset or file of what runs on this side.
         design: Preset or file on which the controller is designed; empty for the simulated plant.
         excitation: Parameters of the disturbance that differ from those of the noise.
+        tuning: Parameters of the LQR that differ from those of the plant, ``q`` and ``r``.
     """
 
     settings: JointSettings
@@ -105,6 +115,7 @@ class JointRun:
     design: str = ""
     simulated_time: bool = True
     excitation: Mapping[str, Any] = field(default_factory=dict)
+    tuning: Mapping[str, Any] = field(default_factory=dict)
 
     @property
     def has_bridge(self) -> bool:
@@ -163,6 +174,7 @@ class JointRun:
             plant=self.design or self.settings.plant,
             period=self.settings.period,
             use_sim_time=True,
+            **self.tuning,
         )
 
     def disturbance_program(self) -> NodeProgram:
@@ -180,7 +192,11 @@ class JointRun:
                 "design_plant": self.settings.plant,
                 "seed": self.settings.seed,
                 "disturbance": self._noise(),
-                "controller": {"kind": "lqr", **({"linearised": Path(self.design).name} if self.design else {})},
+                "controller": {
+                    "kind": "lqr",
+                    **self.tuning,
+                    **({"linearised": Path(self.design).name} if self.design else {}),
+                },
                 **({STAND_IN: "emulated machine"} if self.side == "hw" else {}),
                 "duration": self.duration,
                 "period": self.settings.period,
@@ -241,6 +257,15 @@ def design_for(plant: MechanismParameters) -> MechanismParameters:
     return replace(plant.with_values(changes), name=f"{plant.name}_design") if changes else plant
 
 
+def design_file(folder: Path, plant: MechanismParameters) -> str:
+    """Return the file of the plant on which the LQR is designed, kept in a folder; empty where that is the plant."""
+    told = design_for(plant)
+    if told is plant:
+        return ""
+    meaning = f"{plant.name}, dry friction of its passive joints as viscous friction at {_SLIDING:g} rad/s or m/s"
+    return str(write_mechanism(folder / "design.yaml", told, provenance={"design_of": meaning}))
+
+
 def load_stand_in(path: str | Path, plant: MechanismParameters) -> MechanismParameters:
     """Return the plant of a file that is to stand in for a machine.
 
@@ -290,10 +315,7 @@ def record_joints(
         FaultError: A program ended or did not answer, or a plant fell or faulted; told of both sides.
     """
     plant = load_mechanism(settings.plant)
-    design, told = "", design_for(plant)
-    if told is not plant:
-        meaning = f"{plant.name}, dry friction of its passive joints as viscous friction at {_SLIDING:g} rad/s or m/s"
-        design = str(write_mechanism(folder / "design.yaml", told, provenance={"design_of": meaning}))
+    design = design_file(folder, plant)
     ends: dict[str, str] = {}
     for side, runs, words in (
         ("sim", settings.plant, "simulation"),

@@ -65,6 +65,15 @@ def joints(
         int, typer.Option(help="Periods of 4 s that are averaged for it; one more settles.", min=3, max=1000)
     ] = 8,
     design: Design = None,
+    rank_seeds: Annotated[
+        int,
+        typer.Option(
+            help="Seeds of the noise under which every design (LQR, at least three) runs on both sides, for the layer "
+            "“same choice”; 0 leaves it out, 1 gives no interval.",
+            min=0,
+            max=100,
+        ),
+    ] = 0,
     storage: Storage = "mcap",
     margin: MarginOption = None,
     margins_file: MarginsFile = None,
@@ -91,7 +100,11 @@ def joints(
     from pendulum_bags.frequency_response.designs_table import designs_table
     from pendulum_bags.frequency_response.joint_designs import joint_designs
     from pendulum_bags.frequency_response.joint_experiment import FOLDER, JointMultisine, measure_joints
+    from pendulum_bags.ranking.joint_choice import COST, DURATION, rank_joints, rankable
+    from pendulum_bags.ranking.joint_choice import FOLDER as RANKING
+    from pendulum_bags.ranking.present import Words, same_choice, write_ranking
     from pendulum_bags.runs.run_folder import create_run_folder, discard_if_empty
+    from pendulum_bags.verdict import write_layer
     from pendulum_lqr.mechanism_model import linearise_mechanism
     from pendulum_msgs_py.plants.mechanism_parameters import load_mechanism, write_mechanism
 
@@ -106,9 +119,10 @@ def joints(
             "--design needs both plants measured; expected --frequencies, and a plant with one driven joint: "
             f"{simulated.name} has {len(simulated.coordinates.driven)}"
         )
+    on = design_for(simulated)
+    ranked = rankable(joint_designs(design or (), on, linearise_mechanism(on))) if rank_seeds else ()
     if design:
         # Before anything runs: a slip of the pen should not cost a minute.
-        on = design_for(simulated)
         joint_designs(design, on, linearise_mechanism(on))
     console = make_console(stderr=json_output, highlight=False)
     folder = create_run_folder(out, "joints")
@@ -119,7 +133,9 @@ def joints(
         multisine = JointMultisine(settings, periods)
         longer = _STARTING + _PACE * multisine.run.duration if measured else 0.0
         analysis = None
-        with PhaseProgress(2.0 * (expected + longer) + _ANALYSING * measured, console) as progress:
+        each = _STARTING + _PACE * min(duration, DURATION)
+        runs = 2.0 * rank_seeds * len(ranked)
+        with PhaseProgress(2.0 * (expected + longer) + _ANALYSING * measured + each * runs, console) as progress:
             record_joints(
                 folder, settings, made, on_side=lambda side: progress.phase(side, expected), on_wait=progress.refresh
             )
@@ -133,6 +149,19 @@ def joints(
                     on_analysis=lambda what: progress.phase(what, 0.5 * _ANALYSING),
                     on_wait=progress.refresh,
                 )
+            if rank_seeds:
+                found = rank_joints(
+                    folder / RANKING,
+                    settings,
+                    made,
+                    ranked,
+                    range(seed, seed + rank_seeds),
+                    on_run=lambda what: progress.phase(what, each),
+                    on_wait=progress.refresh,
+                )
+                words = Words("--rank-seeds 10", f"experiment joints --plant {plant} --periods 40", COST)
+                write_ranking(folder / RANKING, found, words=words)
+                write_layer(folder, same_choice(found, words=words))
     except KeyboardInterrupt:
         kept = "nothing was recorded" if discard_if_empty(folder) else f"what was recorded is in {folder}"
         console.print(f"interrupted: all programs have ended; {kept}")
@@ -147,4 +176,6 @@ def joints(
     )
     if analysis is not None:
         console.print(f"page    {folder / FOLDER / 'frequency_response.html'}", soft_wrap=True)
+    if rank_seeds:
+        console.print(f"page    {folder / RANKING / 'ranking.html'}", soft_wrap=True)
     console.print(f"bags    {folder / 'sim'}, {folder / 'hw'}\n({time.monotonic() - started:.0f} s)", soft_wrap=True)

@@ -33,11 +33,13 @@ class JointDesign:
         name: As in tables.
         text: As somebody wrote it.
         K: Gain on positions and velocities, shape (2 k,).
+        weights: q and r of an LQR; None for a gain.
     """
 
     name: str
     text: str
     K: NDArray[np.float64]
+    weights: tuple[tuple[float, ...], float] | None = None
 
 
 def joint_designs(texts: Sequence[str], plant: MechanismParameters, model: LinearModel) -> list[JointDesign]:
@@ -78,7 +80,8 @@ def _one(text: str, own_cost: float, model: LinearModel) -> JointDesign:
         weights, (cost, *more) = _numbers(match[1], text), _numbers(match[2] or f"{own_cost}", text)
         if len(weights) == size and not more:
             K = np.asarray(mechanism_lqr(model, weights, cost).K[0], dtype=np.float64)
-            return JointDesign(f"LQR q=({', '.join(f'{value:g}' for value in weights)}) r={cost:g}", text, K)
+            name = f"LQR q=({', '.join(f'{value:g}' for value in weights)}) r={cost:g}"
+            return JointDesign(name, text, K, (tuple(weights), cost))
     elif match := _GAIN.fullmatch(text):
         gain = _numbers(match[1], text)
         if len(gain) == size:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -17,14 +18,29 @@ from pendulum_bags.runs.run_folder import write_json
 from pendulum_bags.verdict import Evidence, Layer, LayerResult, Mark, write_layer
 from pendulum_msgs_py.programs.terminal import WholeTable
 
-__all__ = ["REGRET_MARGIN", "print_ranking", "same_choice", "write_ranking"]
+__all__ = ["REGRET_MARGIN", "Words", "print_ranking", "same_choice", "write_ranking"]
 
 REGRET_MARGIN = 0.1
 """Regret that does not matter, as a share of the hardware's best cost."""
 _SHOWN_PAIRS = 8
 
 
-def same_choice(ranking: Ranking, margin: float = REGRET_MARGIN) -> LayerResult:
+@dataclass(frozen=True)
+class Words:
+    """What a ranking is called by, which depends on how its runs were made.
+
+    Attributes:
+        more: Options that record more.
+        in_frequency: The experiment that compares the plants in frequency.
+        cost: What the cost is, as a sentence.
+    """
+
+    more: str = "--seeds 10"
+    in_frequency: str = "experiment frequency_response"
+    cost: str = "Cost: mean of q11 e² + q22 v² + r u², that of the thesis's LQR unless other weights were asked for."
+
+
+def same_choice(ranking: Ranking, margin: float = REGRET_MARGIN, words: Words = Words()) -> LayerResult:
     """Return layer 4: yes where the regret is small, no where large, undecided where its runs scatter or are few.
 
     A pick that fails on the hardware in any run is a no, whatever it costs.
@@ -32,6 +48,7 @@ def same_choice(ranking: Ranking, margin: float = REGRET_MARGIN) -> LayerResult:
     Args:
         ranking: The ranking.
         margin: Regret that does not matter, as a share of the hardware's best cost.
+        words: How its runs were made.
     """
     regret = ranking.regret_share
     share = [regret.value, regret.low, regret.high]
@@ -71,9 +88,9 @@ def same_choice(ranking: Ranking, margin: float = REGRET_MARGIN) -> LayerResult:
             for name in ranking.failures
         ),
     )  # fmt: skip
-    steps = ("record more seeds: --seeds 10",) if mark is Mark.UNDECIDED else ()
+    steps = (f"record more seeds: {words.more}",) if mark is Mark.UNDECIDED else ()
     if mark is Mark.NO:
-        steps = (f"compare the plants in frequency, where {ranking.pick} works: experiment frequency_response",)
+        steps = (f"compare the plants in frequency, where {ranking.pick} works: {words.in_frequency}",)
     percent = [100.0 * value for value in share]
     dearer = f"{percent[0]:.0f} % dearer than {ranking.best}"
     if np.isinf(share[0]):
@@ -165,10 +182,15 @@ def _pair_rows(ranking: Ranking) -> list[tuple[str, ...]]:
     ]
 
 
-def write_ranking(folder: Path, ranking: Ranking, formats: Sequence[str] = ("png", "pdf")) -> Path:
+def write_ranking(
+    folder: Path,
+    ranking: Ranking,
+    formats: Sequence[str] = ("png", "pdf"),
+    words: Words = Words(),
+) -> Path:
     """Write numbers, layer, figure and page into a folder; return the page."""
     folder.mkdir(parents=True, exist_ok=True)
-    layer = same_choice(ranking)
+    layer = same_choice(ranking, words=words)
     write_json(folder / "ranking.json", ranking.to_json())
     write_layer(folder, layer)
     figures = [ranking_figure(ranking)]
@@ -176,7 +198,7 @@ def write_ranking(folder: Path, ranking: Ranking, formats: Sequence[str] = ("png
     tables = [
         Table(
             "Controllers",
-            "Cost: mean of q11 e² + q22 v² + r u², that of the thesis's LQR unless other weights were asked for.",
+            words.cost,
             _HEAD,
             ranking_rows(ranking),
             "",

@@ -17,7 +17,7 @@ _OF_ONE_MOTOR = "Not asked: python -m pendulum_bags experiment joints measures i
 _NOT_ASKED = {
     Layer.SAME_PLANT: _OF_ONE_MOTOR,
     Layer.WHICH_CONTROLLERS: _OF_ONE_MOTOR,
-    Layer.SAME_CHOICE: "Not asked: only controllers of one joint are ranked.",
+    Layer.SAME_CHOICE: "Not asked: python -m pendulum_bags experiment joints --rank-seeds 3 measures it.",
 }
 """What a layer says of a plant of several joints for which nobody measured it."""
 
