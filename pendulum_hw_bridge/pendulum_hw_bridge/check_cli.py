@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import typer
-from rich.console import Console
 
 from pendulum_hw_bridge.backends import BACKENDS
 from pendulum_hw_bridge.check_item import Checklist
@@ -89,9 +88,16 @@ def check(
     if not ros_arguments and lab is None:
         given.setdefault("backend", "hebi")
     values = bridge_values(ros_arguments, given)
-    console = make_console(stderr=True)
-    say = console.print if not as_json else None
-    found = _of_several(values, say) if is_mechanism(values["plant"]) else _of_one(values, say, console, nudge=nudge)
+    ask = make_console(stderr=True).print
+
+    def progress(text: str) -> None:
+        if not as_json:
+            ask(f"{text} ...", style="dim")
+
+    if is_mechanism(values["plant"]):
+        found = _of_several(values, progress)
+    else:
+        found = _of_one(values, progress, (lambda text: ask(text, style="bold")) if nudge else None)
     if as_json:
         items = [asdict(item) for item in found.items]
         document = {"ready": found.ready, "host_busy": found.host_busy, "items": items, "figures": found.figures}
@@ -103,7 +109,7 @@ def check(
     return EXIT_NOT_READY if found.refused else EXIT_BUSY
 
 
-def _of_one(values: Mapping[str, Any], say: Callable[..., None] | None, console: Console, *, nudge: bool) -> Checklist:
+def _of_one(values: Mapping[str, Any], progress: Callable[[str], None], ask: Callable[[str], None] | None) -> Checklist:
     from pendulum_hw_bridge.check_node import as_the_bridge
 
     bridge = as_the_bridge(values)
@@ -113,23 +119,19 @@ def _of_one(values: Mapping[str, Any], say: Callable[..., None] | None, console:
         bridge.limits,
         bridge.plant,
         window=bridge.window,
-        hand=hand_of(bridge.port, lambda text: console.print(text, style="bold")) if nudge else None,
+        hand=None if ask is None else hand_of(bridge.port, ask),
         hangs=not bridge.values["flat"],
-        progress=_progress(say),
+        progress=progress,
     )
 
 
-def _of_several(values: Mapping[str, Any], say: Callable[..., None] | None) -> Checklist:
+def _of_several(values: Mapping[str, Any], progress: Callable[[str], None]) -> Checklist:
     from pendulum_hw_bridge.check_node import machine_of
 
     machine = machine_of(values)
     windows = list(zip(machine.limits.position_min, machine.limits.position_max, strict=True))
     plant = load_mechanism(values["plant"])
-    return run_machine_checklist(machine.modules(WallClock()), plant, windows, progress=_progress(say))
-
-
-def _progress(say: Callable[..., None] | None) -> Callable[[str], None]:
-    return (lambda text: None) if say is None else lambda text: say(f"{text} ...", style="dim")
+    return run_machine_checklist(machine.modules(WallClock()), plant, windows, progress=progress)
 
 
 def _print(found: Checklist) -> None:
