@@ -9,6 +9,7 @@ from typing import Any
 
 from pendulum_hw_bridge import bridge_parameters
 from pendulum_hw_bridge.actuator import HardwareLimits, MStopAction
+from pendulum_hw_bridge.backends import BACKENDS
 from pendulum_hw_bridge.backends.emulated_machine import TORQUE_LOOP, DrivePort, machine_ports
 from pendulum_hw_bridge.bridge_consistency import check_consistency
 from pendulum_hw_bridge.clocks import Clock
@@ -17,6 +18,7 @@ from pendulum_hw_bridge.effort_mapping import EffortMapping, EffortStrategy
 from pendulum_hw_bridge.emulation.machine import EmulatedMachine
 from pendulum_hw_bridge.emulation.quasi_direct_drive import QuasiDirectDrive
 from pendulum_hw_bridge.gains import DEFAULT_GAINS
+from pendulum_hw_bridge.group_assembly import OF_GROUPS, GroupAssembly, refuse_slides
 from pendulum_hw_bridge.module import DrivenModule, Module
 from pendulum_hw_bridge.safety import SafetyLimits, SafetyMonitor
 from pendulum_hw_bridge.settings import BridgeSettings
@@ -28,7 +30,7 @@ from pendulum_msgs_py.joints import ONE_JOINT, Coordinates
 from pendulum_msgs_py.parameters import ParameterSpec
 from pendulum_msgs_py.plants.mechanism_parameters import MechanismParameters, common_delay, load_mechanism
 from pendulum_msgs_py.plants.plant_differences import AnyPlant
-from pendulum_msgs_py.plants.plant_parameters import is_mechanism
+from pendulum_msgs_py.plants.plant_parameters import MECHANISM_PRESETS, is_mechanism
 
 __all__ = ["CURRENT_LOOP", "Assembly", "assemble", "for_plant"]
 
@@ -61,8 +63,21 @@ _OF_ONE_MODULE = (
     "back_emf_compensation",
     "emulator_address",
     "replay_file",
+    "drivetrain",
+    *OF_GROUPS,
 )
-"""Parameters that are about the only module, and mean nothing to several."""
+"""Parameters that mean nothing to an emulated machine of several joints: most are about the only module."""
+_OF_EVERY_GROUP = (
+    "effort_strategy",
+    "effort_efficiency",
+    "gains_file",
+    "interface",
+    "hebi_log",
+    "back_emf_compensation",
+    "drivetrain",
+    *OF_GROUPS,
+)
+"""Those of them that a group of HEBI modules has."""
 _SLOWEST_DRIVE = 0.1
 """Longest delay, and longest time constant, of a drive that can be watched [s]."""
 _LEAD_NS = 500_000
@@ -92,12 +107,13 @@ class Assembly:
     modules: Callable[[Clock], list[Module]]
 
 
-def for_plant(specs: tuple[ParameterSpec, ...], plant: str) -> tuple[ParameterSpec, ...]:
+def for_plant(specs: tuple[ParameterSpec, ...], plant: str, backend: str = "emulator") -> tuple[ParameterSpec, ...]:
     """Return the bridge's parameters with the defaults that a plant of several joints needs.
 
     Args:
         specs: The parameters, with the defaults of an X5-9.
         plant: Preset or file, as given.
+        backend: What stands behind the actuator port.
 
     Raises:
         ParameterError: There is no such plant.
@@ -105,9 +121,16 @@ def for_plant(specs: tuple[ParameterSpec, ...], plant: str) -> tuple[ParameterSp
     if not is_mechanism(plant):
         return specs
     mechanism = load_mechanism(plant)
-    ends = [end for low, high in mechanism.stops for end in ((low, high) if math.isfinite(low + high) else (0.0, 0.0))]
+    of_one = next(spec.default for spec in specs if spec.name == "position_window")
+    assert isinstance(of_one, list)
+    # A real joint has a window in any case, as one alone has; a joint of X5-9s is as slow as one alone, too.
+    real = backend in BACKENDS and BACKENDS[backend].is_machine
+    free = of_one if real else [0.0, 0.0]
+    ends = [end for low, high in mechanism.stops for end in ((low, high) if math.isfinite(low + high) else free)]
     specs = in_units_of(specs, mechanism.coordinates)
-    defaults: dict[str, Any] = {"velocity_limit": _FASTEST, "feedback_rate": _RATE, "position_window": ends}
+    defaults: dict[str, Any] = {"position_window": ends}
+    if not real:
+        defaults |= {"velocity_limit": _FASTEST, "feedback_rate": _RATE}
     return tuple(replace(spec, default=defaults.get(spec.name, spec.default)) for spec in specs)
 
 
@@ -126,6 +149,10 @@ def assemble(values: Mapping[str, Any], specs: tuple[ParameterSpec, ...], *, loc
         return _several(values, specs, lockstep=lockstep)
     if values["initial_positions"] != [0.0]:
         raise ParameterError("initial_positions is for several joints; expected initial_position for one")
+    defaults = {spec.name: spec.default for spec in specs}
+    for several, one in OF_GROUPS.items():
+        if values[several] != defaults[several]:
+            raise ParameterError(f"{several} is for several joints; expected {one} for one")
     return _one(values, lockstep=lockstep)
 
 
@@ -159,24 +186,30 @@ def _several(values: Mapping[str, Any], specs: tuple[ParameterSpec, ...], *, loc
     plant = load_mechanism(values["plant"])
     coordinates = plant.coordinates
     names = ", ".join(coordinates.names)
-    if values["backend"] != "emulator":
+    real = values["backend"] == "hebi"
+    if not real and values["backend"] != "emulator":
         raise ParameterError(
             f"backend {values['backend']!r} has one module, and plant {plant.name!r} has the joints {names}; expected "
-            "backend 'emulator': there is no bridge to a real group of modules yet"
+            "backend 'emulator' or 'hebi'"
         )
+    if real:
+        refuse_slides(coordinates)
     if not coordinates.driven:
         raise ParameterError(f"plant {plant.name!r} has no driven joint; expected an actuator at one of {names}")
     defaults = {spec.name: spec.default for spec in specs}
     for name in _OF_ONE_MODULE:
-        if values[name] != defaults[name]:
+        if values[name] != defaults[name] and not (real and name in _OF_EVERY_GROUP):
+            kind = "backend 'hebi'" if name in {"drivetrain", *OF_GROUPS} else "one module"
             raise ParameterError(
-                f"{name} is {values[name]!r}, which is for one module, and plant {plant.name!r} has the joints "
+                f"{name} is {values[name]!r}, which is for {kind}, and plant {plant.name!r} has the joints "
                 f"{names}; expected it left out"
             )
     limits = bridge_parameters.supervisor_limits(
         values, plant.effort_limits, coordinates=coordinates, lockstep=lockstep
     )
     check_consistency(values, limits)
+    if real:
+        return _group(values, plant, limits, lockstep=lockstep)
     hardware, gains = QuasiDirectDrive(), DEFAULT_GAINS[TORQUE_LOOP]
     period_ns = round(NANOSECONDS / values["feedback_rate"])
     start = _start(values, plant)
@@ -239,6 +272,24 @@ def _several(values: Mapping[str, Any], specs: tuple[ParameterSpec, ...], *, loc
         return made
 
     return Assembly(coordinates, limits, [plant], f"emulated machine {plant.name}", CURRENT_LOOP, mappings[0], modules)
+
+
+def _group(values: Mapping[str, Any], plant: MechanismParameters, limits: PlantLimits, *, lockstep: bool) -> Assembly:
+    bridge_parameters.require_real_time(values, lockstep=lockstep)
+    if values["initial_positions"] != [0.0]:
+        raise ParameterError("initial_positions is for the emulator; expected it left out with backend 'hebi'")
+    group = GroupAssembly(values, plant.coordinates, limits)
+    # A preset is no measurement of the machine that stands here.
+    told: list[AnyPlant] = [] if values["plant"] in MECHANISM_PRESETS else [plant]
+    return Assembly(
+        plant.coordinates,
+        limits,
+        told,
+        f"group of X5-9, {values['backend']}",
+        values["effort_strategy"],
+        group.mappings[0],
+        group.modules,
+    )
 
 
 def _safety(values: Mapping[str, Any], effort: float) -> SafetyLimits:

@@ -206,6 +206,11 @@ class Bridge:
             except ActuatorError as error:
                 self.fail(error.fault, module.words(str(error)))
                 return self._ended(drive, error.fault)
+        try:
+            self._flush()
+        except ActuatorError as error:
+            self.fail(error.fault, str(error))
+            return self._ended(drive, error.fault)
         return Outcome(drive, tuple(module.effort for module in self.drives), tuple(applied))
 
     def fail(self, name: str, message: str) -> None:
@@ -247,6 +252,13 @@ class Bridge:
     @property
     def _awake(self) -> bool:
         return self._driving or self.supervisor.mode.armed
+
+    def _flush(self) -> None:
+        """Let setpoints leave that ports have kept, so that those of all go out together."""
+        for module in self.drives:
+            flush = getattr(module.port, "flush", None)
+            if flush is not None:
+                flush()
 
     def _check_joints(self) -> None:
         coordinates = self.supervisor.coordinates

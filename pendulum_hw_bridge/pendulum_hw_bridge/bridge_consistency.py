@@ -71,9 +71,9 @@ def check_consistency(values: Mapping[str, Any], limits: PlantLimits) -> None:
 def _check_hardware(values: Mapping[str, Any], limits: PlantLimits) -> None:
     """Refuse what limits nothing on an X5-9; what is too small only stops it early, which hurts nobody."""
     where = f"with backend {values['backend']!r}"
-    width = limits.position_max[0] - limits.position_min[0]
+    width = max(high - low for low, high in zip(limits.position_min, limits.position_max, strict=True))
     for name, value, largest, unit, why in (
-        ("effort_limit", limits.effort[0], PEAK_EFFORT, "N m", "the peak of an X5-9"),
+        ("effort_limit", max(limits.effort), PEAK_EFFORT, "N m", "the peak of an X5-9"),
         ("velocity_limit", limits.velocity, 3.0, "rad/s", "twice what the motor can do, so that it limits nothing"),
         ("effort_slew_limit", limits.slew, 26e3, "N m/s", "from -13 to 13 N m in one cycle at 1 kHz"),
         ("start_effort_limit", limits.start_effort, 5.0, "N m", "a commander would begin with a blow"),

@@ -39,6 +39,7 @@ __all__ = [
     "effort_mapping",
     "make_port",
     "plant_of",
+    "require_real_time",
     "safety_limits",
     "supervisor_limits",
     "told_plants",
@@ -63,8 +64,8 @@ BRIDGE_SPECS: tuple[ParameterSpec, ...] = (
         "thesis",
         "",
         f"Drivetrain and link: {EMULATOR_PRESET_NAMES}, or a plant file with a drivetrain; what the emulator is, and "
-        "for `hebi` the constants of the effort mapping. With `backend:=emulator` also a plant of several joints, such "
-        "as cart_pole, with quasi-direct drives.",
+        "for `hebi` the constants of the effort mapping. Also a plant of several joints: with `backend:=emulator`, "
+        "such as cart_pole, with quasi-direct drives; with `hebi`, whose joints all turn, with a module for each.",
     ),
     _fixed("family", "", "", "HEBI family of the actuator; empty for any, if there is only one."),
     _fixed("name", "", "", "HEBI name of the actuator; empty for any, if there is only one."),
@@ -268,12 +269,20 @@ def make_port(values: Mapping[str, Any], clock: Clock, *, lockstep: bool = False
     Raises:
         ParameterError: A parameter of the backend is refused.
     """
-    backend = BACKENDS[values["backend"]]
-    if lockstep and not backend.in_process:
+    require_real_time(values, lockstep=lockstep)
+    return BACKENDS[values["backend"]].make(values, clock, lockstep=lockstep)
+
+
+def require_real_time(values: Mapping[str, Any], *, lockstep: bool) -> None:
+    """Refuse simulated time with a backend that keeps its own.
+
+    Raises:
+        ParameterError: It does.
+    """
+    if lockstep and not BACKENDS[values["backend"]].in_process:
         raise ParameterError(
             f"clock is 'lockstep' with backend {values['backend']!r}; expected backend 'emulator': others keep time"
         )
-    return backend.make(values, clock, lockstep=lockstep)
 
 
 def trajectory_gains(values: Mapping[str, Any]) -> GainSet:
@@ -294,9 +303,9 @@ def trajectory_gains(values: Mapping[str, Any]) -> GainSet:
 
 
 def effort_mapping(
-    values: Mapping[str, Any], plant: PlantParameters, gains: GainSet, limits: PlantLimits
+    values: Mapping[str, Any], plant: PlantParameters, gains: GainSet, limits: PlantLimits, *, joint: int = 0
 ) -> EffortMapping:
-    """Return the mapping of torque to setpoints, with the limits that it keeps."""
+    """Return the mapping of torque to setpoints of one of the driven joints, with the limits that it keeps."""
     drivetrain = drivetrain_of(plant)
     return EffortMapping(
         EffortStrategy(values["effort_strategy"]),
@@ -304,7 +313,7 @@ def effort_mapping(
         efficiency=values["effort_efficiency"] or drivetrain.efficiency,
         compensation=values["back_emf_compensation"],
         gains=gains,
-        effort_limit=limits.effort[0],
+        effort_limit=limits.effort[joint],
         velocity_limit=min(limits.velocity, MOTOR_SPEED_LIMIT / drivetrain.gear_ratio),
     )
 

@@ -110,6 +110,11 @@ def machine_of(values: Mapping[str, Any]) -> Assembly:
     """Return the machine of several modules that the bridge would make of its parameters.
 
     Raises:
-        ParameterError: They contradict each other or the plant.
+        ParameterError: They contradict each other or the plant, or name real modules.
     """
+    if values["backend"] == "hebi":
+        raise ParameterError(
+            f"backend is 'hebi' with plant {values['plant']!r}; expected 'emulator': several real modules are not "
+            "checked yet"
+        )
     return assemble(values, for_plant(SPECS, values["plant"]))

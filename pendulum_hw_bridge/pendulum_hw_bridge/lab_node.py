@@ -11,13 +11,19 @@ from rclpy.node import Node
 from pendulum_hw_bridge.lab import LAB_SPEC, check_lab
 from pendulum_msgs_py.parameters import ParameterSpec
 
-__all__ = ["given_plant", "with_lab_file"]
+__all__ = ["given_backend", "given_plant", "with_lab_file"]
 
 
 def given_plant(node: Node) -> str:
     """Return the plant that a node was given, whose joints decide the defaults of what is not."""
     given = node._parameter_overrides.get("plant")
     return "thesis" if given is None else str(given.value)
+
+
+def given_backend(node: Node) -> str:
+    """Return the backend that a node was given, which decides some of those defaults too."""
+    given = node._parameter_overrides.get("backend")
+    return "emulator" if given is None else str(given.value)
 
 
 def with_lab_file(node: Node, specs: Iterable[ParameterSpec]) -> list[ParameterSpec]:

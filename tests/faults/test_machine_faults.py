@@ -204,10 +204,11 @@ def test_a_trajectory_is_refused_by_a_machine_that_cannot_be_moved_by_one() -> N
 @pytest.mark.parametrize(
     ("given", "sentence"),
     [
-        ({"backend": "hebi"}, "backend 'hebi' has one module, and plant 'cart_pole' has the joints cart, pole"),
-        ({"backend": "replay"}, "backend 'replay' has one module"),
+        ({"backend": "hebi"}, "joint 'cart' slides, and a module of backend 'hebi' turns"),
+        ({"backend": "replay"}, "backend 'replay' has one module, and plant 'cart_pole' has the joints cart, pole"),
         ({"backend": "emulator_process"}, "backend 'emulator_process' has one module"),
         ({"serial": "X-1"}, "serial is 'X-1', which is for one module"),
+        ({"serials": ["X-1"]}, "serials is ['X-1'], which is for backend 'hebi'"),
         ({"joint_sign": -1}, "joint_sign is -1, which is for one module"),
         ({"effort_strategy": "effort_loop"}, "effort_strategy is 'effort_loop', which is for one module"),
         ({"initial_positions": [0.0, 0.0, 0.0]}, "expected 2, for cart [m], pole [rad], or one for all"),

@@ -53,6 +53,29 @@ def _fixed(name: str, default: str, description: str) -> tuple[ParameterSpec, ..
     return (ParameterSpec(name, default, "", description, read_only=True),)
 
 
+def _of_joints(name: str, default: list[str] | list[float], unit: str, what: str) -> ParameterSpec:
+    text = f"`hebi` with several joints: {what}, in the order of the joints; one value for all."
+    return ParameterSpec(name, default, unit, text, read_only=True)
+
+
+_OF_GROUPS = (
+    ParameterSpec(
+        "drivetrain",
+        "x5_9",
+        "",
+        "`hebi` with several joints: preset or plant file whose drivetrain each module has.",
+        read_only=True,
+    ),
+    _of_joints("families", [""], "", "HEBI family of each module"),
+    _of_joints("names", [""], "", "HEBI name of each module, never sorted"),
+    _of_joints("serials", [""], "", "serial number of each module"),
+    _of_joints("mac_addresses", [""], "", "MAC address of each module"),
+    _of_joints("joint_offsets", [0.0], "rad", "joint angle at which each module reads zero"),
+    _of_joints("joint_signs", [1.0], "-", "1, or -1 where a module turns the other way"),
+    _of_joints("effort_tares", [0.0], "N m", "torque that each sensor shows when nothing pulls"),
+)
+"""Parameters of several modules; those of the only one have the same names in the singular."""
+
 BACKENDS: dict[str, Backend] = {
     "emulator": Backend("pendulum_hw_bridge.backends.emulator:EmulatorBackend", is_machine=False, in_process=True),
     "emulator_process": Backend(
@@ -62,7 +85,10 @@ BACKENDS: dict[str, Backend] = {
     ),
     "hebi": Backend(
         "pendulum_hw_bridge.backends.hebi:HebiBackend",
-        _fixed("hebi_log", "", "`hebi`: new .hebilog file that hebi-py writes beside the bag; empty for none."),
+        (
+            *_fixed("hebi_log", "", "`hebi`: new .hebilog file that hebi-py writes beside the bag; empty for none."),
+            *_OF_GROUPS,
+        ),
     ),
     "replay": Backend(
         "pendulum_hw_bridge.backends.replay:ReplayBackend",

@@ -41,12 +41,22 @@ from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.plants.lab_file import EMULATED_NETWORK
 from pendulum_msgs_py.programs.extras import how_to_install
 
-__all__ = ["HebiBackend", "connect_group", "new_command", "open_lookup"]
+__all__ = [
+    "ACKNOWLEDGE_MS",
+    "LOOKUP_TIMEOUT",
+    "STOP_ACKNOWLEDGE_MS",
+    "STOP_ATTEMPTS",
+    "HebiBackend",
+    "connect_group",
+    "import_hebi",
+    "new_command",
+    "open_lookup",
+]
 
-_LOOKUP_TIMEOUT = 5.0
-_ACKNOWLEDGE_MS = 200
-_STOP_ATTEMPTS = 3
-_STOP_ACKNOWLEDGE_MS = 15
+LOOKUP_TIMEOUT = 5.0
+ACKNOWLEDGE_MS = 200
+STOP_ATTEMPTS = 3
+STOP_ACKNOWLEDGE_MS = 15
 """Ten times the round trip; together the attempts take less than the command lifetime [ms]."""
 _FLOATS = {
     "position": "position",
@@ -72,7 +82,12 @@ _FLOATS = {
 """Our quantity -> attribute of hebi-py's feedback."""
 
 
-def _import_hebi() -> Any:
+def import_hebi() -> Any:
+    """Return hebi-py, imported now and not before.
+
+    Raises:
+        ActuatorError: It is not installed.
+    """
     try:
         # The library greets on standard output when an optional module of its own is missing.
         with contextlib.redirect_stdout(io.StringIO()):
@@ -94,10 +109,10 @@ def connect_group(wanted: ModuleSelection, interface: str = "", look_time: float
         ActuatorError: hebi-py is not installed, no such module answers, several do, or it is of another type.
     """
     lookup = open_lookup(interface)
-    patience = max(look_time, min(_LOOKUP_TIMEOUT, 3.0 * look_time))
+    patience = max(look_time, min(LOOKUP_TIMEOUT, 3.0 * look_time))
     module = select_module(discover(lookup, look_time=look_time, patience=patience), wanted, seconds=patience)
     # By address, never by name: a twin may appear between looking and connecting.
-    group = lookup.get_group_from_macs([module.mac_address], round(1000 * _LOOKUP_TIMEOUT))
+    group = lookup.get_group_from_macs([module.mac_address], round(1000 * LOOKUP_TIMEOUT))
     if group is None:
         raise ActuatorError("module_lost", f"HEBI module {module} was seen but does not connect")
     return group
@@ -110,7 +125,7 @@ def open_lookup(interface: str = "") -> Any:
         ActuatorError: hebi-py is not installed.
         ParameterError: The address of an emulator is not understood.
     """
-    hebi = _import_hebi()
+    hebi = import_hebi()
     if interface.startswith(EMULATED_NETWORK):
         return EmulatedLookup(interface, hebi)
     return hebi.Lookup([interface]) if interface else hebi.Lookup()
@@ -118,7 +133,7 @@ def open_lookup(interface: str = "") -> Any:
 
 def new_command() -> Any:
     """Return an empty command of hebi-py for one module."""
-    return _import_hebi().GroupCommand(1)
+    return import_hebi().GroupCommand(1)
 
 
 class HebiBackend:
@@ -188,12 +203,12 @@ class HebiBackend:
     def connect(self) -> ActuatorInfo:
         """Find the module, once, and return what it says of itself."""
         if self._group is None:
-            self._hebi = _import_hebi()
+            self._hebi = import_hebi()
             self._owner = threading.get_ident()
             group = self._make_group()
             if group.size != 1:
                 raise ActuatorError("module_lost", f"HEBI group has {group.size} modules; expected 1")
-            self._command = self._hebi.GroupCommand(1)
+            self._command = self._new_command()
             self._feedback = self._hebi.GroupFeedback(1)
             if self._log is not None:
                 start_log(group, self._log)
@@ -321,17 +336,17 @@ class HebiBackend:
             self._command.clear()
             self._set_setpoints(zero, self._strategy)
             self._group.send_command(self._command)
-        for _ in range(_STOP_ATTEMPTS):
+        for _ in range(STOP_ATTEMPTS):
             self._command.clear()
             self._command.control_strategy = int(Strategy.OFF)
             self._set_setpoints(Command(), Strategy.OFF)
-            if self._group.send_command_with_acknowledgement(self._command, _STOP_ACKNOWLEDGE_MS):
+            if self._group.send_command_with_acknowledgement(self._command, STOP_ACKNOWLEDGE_MS):
                 self._strategy = Strategy.OFF
                 return
         self._strategy = Strategy.OFF
         raise ActuatorError(
             "stop_unacknowledged",
-            f"HEBI module did not confirm that it is off, asked {_STOP_ATTEMPTS} times; the command lifetime ends its "
+            f"HEBI module did not confirm that it is off, asked {STOP_ATTEMPTS} times; the command lifetime ends its "
             "torque. Press the motion stop",
         )
 
@@ -355,6 +370,9 @@ class HebiBackend:
                 "HEBI group was called from a second thread; expected only the one that connected",
             )
 
+    def _new_command(self) -> Any:
+        return self._hebi.GroupCommand(1)
+
     def _set_setpoints(self, command: Command, strategy: Strategy) -> None:
         self._command.position = command.position
         self._command.velocity = command.velocity
@@ -366,18 +384,18 @@ class HebiBackend:
             raise ActuatorError("send_failed", "command could not be sent to the HEBI module: network down?")
 
     def _acknowledged(self, what: str) -> None:
-        if not self._group.send_command_with_acknowledgement(self._command, _ACKNOWLEDGE_MS):
+        if not self._group.send_command_with_acknowledgement(self._command, ACKNOWLEDGE_MS):
             raise ActuatorError(
                 "no_acknowledgement",
-                f"HEBI module did not acknowledge its {what} within {_ACKNOWLEDGE_MS} ms",
+                f"HEBI module did not acknowledge its {what} within {ACKNOWLEDGE_MS} ms",
             )
 
     def _read_info(self) -> Any:
         if self._imitation:
             return None
-        info = self._group.request_info(_ACKNOWLEDGE_MS)
+        info = self._group.request_info(ACKNOWLEDGE_MS)
         if info is None:
-            raise ActuatorError("module_lost", f"HEBI module did not answer within {_ACKNOWLEDGE_MS} ms")
+            raise ActuatorError("module_lost", f"HEBI module did not answer within {ACKNOWLEDGE_MS} ms")
         return info
 
     def _copy(self, record: Any, now_ns: int) -> Feedback:

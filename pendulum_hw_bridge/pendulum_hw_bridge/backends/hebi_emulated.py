@@ -12,6 +12,7 @@ import contextlib
 import ipaddress
 import math
 import socket
+import time
 from dataclasses import dataclass
 from functools import cache
 from types import SimpleNamespace
@@ -25,7 +26,7 @@ from pendulum_hw_bridge.gains import GAIN_FIELDS, LOOPS
 from pendulum_msgs_py.contract.values import NANOSECONDS
 from pendulum_msgs_py.plants.lab_file import EMULATED_NETWORK
 
-__all__ = ["EmulatedEntry", "EmulatedGroup", "EmulatedLookup"]
+__all__ = ["EmulatedEntry", "EmulatedGroup", "EmulatedGroups", "EmulatedLookup"]
 
 _LOOK_ATTEMPTS = 2
 _THEIRS = {
@@ -92,15 +93,14 @@ class EmulatedLookup:
                 port.let_go()
         return entries
 
-    def get_group_from_macs(self, addresses: list[str], timeout_ms: float) -> EmulatedGroup | None:
-        """Return the group of the module with an address, or None where none answers."""
-        for entry in self._seen.values():
-            if entry.mac_address in addresses:
-                try:
-                    return EmulatedGroup(entry.where, self._hebi)
-                except ActuatorError:
-                    return None
-        return None
+    def get_group_from_macs(self, addresses: list[str], timeout_ms: float) -> EmulatedGroup | EmulatedGroups | None:
+        """Return the group of the modules with these addresses, in their order, or None where one does not answer."""
+        where = {entry.mac_address: entry.where for entry in self._seen.values()}
+        try:
+            groups = [EmulatedGroup(where[address], self._hebi) for address in addresses]
+        except (ActuatorError, KeyError):
+            return None
+        return groups[0] if len(groups) == 1 else EmulatedGroups(groups, self._hebi)
 
 
 class EmulatedGroup:
@@ -252,6 +252,115 @@ class EmulatedGroup:
         if _holds(command, "mstop_strategy", self._hebi):
             limits["m_stop"] = M_STOPS[int(command.mstop_strategy[0])].value
         return limits
+
+
+class EmulatedGroups:
+    """Stands for hebi-py's ``Group`` of several modules.
+
+    Each emulator sends in a rhythm of its own, where the library asks all modules at once: a frame is complete when
+    each has sent a record, and goes without one that has sent none for a period.
+
+    Args:
+        groups: One for each module, in their order.
+        hebi: The library.
+    """
+
+    def __init__(self, groups: list[EmulatedGroup], hebi: Any) -> None:
+        self._groups = groups
+        self._hebi = hebi
+        self._newest: list[Any] = [None] * len(groups)
+        self._came: set[int] = set()
+        self._since = 0.0
+
+    @property
+    def size(self) -> int:
+        """Number of modules."""
+        return len(self._groups)
+
+    @property
+    def command_lifetime(self) -> int:
+        """Longest command lifetime of a module [ms]."""
+        return max(group.command_lifetime for group in self._groups)
+
+    @command_lifetime.setter
+    def command_lifetime(self, milliseconds: int) -> None:
+        for group in self._groups:
+            group.command_lifetime = milliseconds
+
+    @property
+    def feedback_frequency(self) -> float:
+        """Lowest rate of a module [Hz]."""
+        return min(group.feedback_frequency for group in self._groups)
+
+    @feedback_frequency.setter
+    def feedback_frequency(self, rate: float) -> None:
+        for group in self._groups:
+            group.feedback_frequency = rate
+
+    def send_command(self, command: Any) -> bool:
+        """Send each module its part; nobody says whether it came."""
+        # To all of them, whatever becomes of one.
+        sent = [group.send_command(_Of(command, index)) for index, group in enumerate(self._groups)]
+        return all(sent)
+
+    def send_command_with_acknowledgement(self, command: Any, timeout_ms: float) -> bool:
+        """Send each module its part, whatever another says, and tell whether all said so in time."""
+        said = [
+            group.send_command_with_acknowledgement(_Of(command, index), timeout_ms)
+            for index, group in enumerate(self._groups)
+        ]
+        return all(said)
+
+    def get_next_feedback(self, timeout_ms: float, reuse_fbk: Any = None) -> Any:
+        """Return the next frame, with the old record of a module that has sent none, or None where none comes."""
+        deadline = time.monotonic() + 1e-3 * timeout_ms
+        for index, group in enumerate(self._groups):
+            if index in self._came:
+                continue
+            record = group.get_next_feedback(max(0.0, 1e3 * (deadline - time.monotonic())))
+            if record is not None:
+                self._since = self._since if self._came else time.monotonic()
+                self._came.add(index)
+                self._newest[index] = record
+        over = self._came and time.monotonic() - self._since > 1.0 / self.feedback_frequency
+        if None in self._newest or not (len(self._came) == self.size or over):
+            return None
+        self._came.clear()
+        names = vars(self._newest[0])
+        return SimpleNamespace(**{name: [vars(each)[name][0] for each in self._newest] for name in names})
+
+    def request_info(self, timeout_ms: float) -> Any:
+        """Return the settings of all, or None where a module does not answer."""
+        found = [group.request_info(timeout_ms) for group in self._groups]
+        return None if None in found else _Each(found)
+
+    def start_log(self, directory: str, name: str) -> str:
+        """Refuse: hebi-py logs what its own network brings."""
+        return self._groups[0].start_log(directory, name)
+
+    def stop_log(self) -> None:
+        """Nothing was begun."""
+
+
+class _Of:
+    """One module's part of a command for several, as a command for one."""
+
+    def __init__(self, command: Any, index: int) -> None:
+        self._view = command.create_view([index])
+        self.refs = [command.refs[index]]
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._view, name)
+
+
+class _Each:
+    """Settings of several modules under one name each."""
+
+    def __init__(self, infos: list[Any]) -> None:
+        self._infos = infos
+
+    def __getattr__(self, name: str) -> Any:
+        return [getattr(info, name)[0] for info in self._infos]
 
 
 class _Info:

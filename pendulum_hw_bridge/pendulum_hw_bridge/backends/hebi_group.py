@@ -1,0 +1,455 @@
+"""Several HEBI modules as one of hebi-py's groups: one round of packets carries the setpoints of all, one the feedback.
+
+Each driven joint has a :class:`GroupDrive`, the backend ``hebi`` on its part of the group; a passive one has a
+:class:`GroupEncoder`, which has no way to send. Modules are known by address, in the order of the joints.
+"""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+from pendulum_hw_bridge.actuator import (
+    NO_SETPOINT,
+    ActuatorError,
+    ActuatorInfo,
+    Applied,
+    Command,
+    Feedback,
+    Strategy,
+)
+from pendulum_hw_bridge.backends.hebi import (
+    ACKNOWLEDGE_MS,
+    LOOKUP_TIMEOUT,
+    STOP_ACKNOWLEDGE_MS,
+    STOP_ATTEMPTS,
+    HebiBackend,
+    import_hebi,
+    open_lookup,
+)
+from pendulum_hw_bridge.backends.hebi_discovery import (
+    LOOK_TIME,
+    ModuleRecord,
+    ModuleSelection,
+    discover,
+    select_module,
+)
+from pendulum_hw_bridge.backends.hebi_log import start_log, stop_log
+from pendulum_hw_bridge.clocks import Clock, WallClock
+from pendulum_hw_bridge.command_check import check_command
+
+__all__ = ["GroupDrive", "GroupEncoder", "HebiGroup"]
+
+
+class HebiGroup:
+    """The modules of a plant. All calls come from one thread.
+
+    Args:
+        joints: Name of each joint and which module it has, in the order of the model.
+        driven: Which of them have a motor that is used.
+        interface: Network address to look on; empty for all.
+        look_time: Time to look for, at least [s].
+        lookup: Returns hebi-py's ``Lookup``; by default that of the interface.
+        log: File to which the library writes all feedback while connected; None for none.
+    """
+
+    def __init__(
+        self,
+        joints: Sequence[tuple[str, ModuleSelection]],
+        driven: Sequence[int],
+        *,
+        interface: str = "",
+        look_time: float = LOOK_TIME,
+        lookup: Callable[[], Any] | None = None,
+        log: Path | None = None,
+    ) -> None:
+        self.names = [name for name, _ in joints]
+        self.driven = tuple(driven)
+        self._wanted = [wanted for _, wanted in joints]
+        self._look_time = look_time
+        self._lookup = lookup or (lambda: open_lookup(interface))
+        self._log = log
+        self.group: Any = None
+        self._records: list[ModuleRecord] = []
+        self._packet: Any = None
+        self._buffer: Any = None
+        self._frame: Any = None
+        self._asked: list[Strategy] = []
+        self._setpoints: dict[int, tuple[Command, Strategy]] = {}
+        self._stop_told: set[int] | None = None
+        self._stop_error: Exception | None = None
+        self._users = 0
+
+    # --- life -----------------------------------------------------------------------------------------------
+
+    def join(self) -> None:
+        """Count one more port; the first finds the modules, and switches all of them off.
+
+        Raises:
+            ActuatorError: One is missing, silent, of another type, meant twice, or does not switch off.
+        """
+        if self.group is None:
+            self._connect()
+        self._users += 1
+
+    def leave(self) -> None:
+        """Count one port less; the last lets the library's thread for the group go."""
+        self._users -= 1
+        if self._users == 0:
+            if self._log is not None:
+                stop_log(self.group)
+            self.group = self._packet = self._buffer = self._frame = None
+
+    def _connect(self) -> None:
+        hebi = import_hebi()
+        lookup = self._lookup()
+        patience = max(self._look_time, min(LOOKUP_TIMEOUT, 3.0 * self._look_time))
+        seen = discover(lookup, look_time=self._look_time, patience=patience)
+        records: list[ModuleRecord] = []
+        for name, wanted in zip(self.names, self._wanted, strict=True):
+            try:
+                record = select_module(seen, wanted, seconds=patience)
+            except ActuatorError as error:
+                raise ActuatorError(error.fault, f"{name}: {error}") from error
+            if record.mac_address in [each.mac_address for each in records]:
+                other = self.names[[each.mac_address for each in records].index(record.mac_address)]
+                raise ActuatorError(
+                    "module_lost", f"HEBI module {record} is meant for {other} and for {name}; expected one for each"
+                )
+            records.append(record)
+        # By address, never by name: the group has the order of the joints, whatever the modules are called.
+        group = lookup.get_group_from_macs([each.mac_address for each in records], round(1000 * LOOKUP_TIMEOUT))
+        if group is None:
+            listed = ", ".join(map(str, records))
+            raise ActuatorError("module_lost", f"HEBI modules {listed} were seen but do not connect as a group")
+        if group.size != len(records):
+            raise ActuatorError("module_lost", f"HEBI group has {group.size} modules; expected {len(records)}")
+        packet = hebi.GroupCommand(group.size)
+        self._fill_off(packet)
+        if not group.send_command_with_acknowledgement(packet, ACKNOWLEDGE_MS):
+            raise ActuatorError(
+                "no_acknowledgement", f"HEBI modules did not all confirm within {ACKNOWLEDGE_MS} ms that they are off"
+            )
+        self._records, self._asked = records, [Strategy.OFF] * group.size
+        self._check_info(_answered(group.request_info(ACKNOWLEDGE_MS)))
+        self._setpoints.clear()
+        self._stop_told = self._frame = None
+        self._packet, self._buffer = packet, hebi.GroupFeedback(group.size)
+        if self._log is not None:
+            start_log(group, self._log)
+        # Only now: a group that was refused must not count as connected the next time.
+        self.group = group
+
+    # --- packets --------------------------------------------------------------------------------------------
+
+    def keep(self, index: int, command: Command, strategy: Strategy) -> None:
+        """Keep a joint's setpoints for the next round of packets."""
+        self._setpoints[index] = (command, strategy)
+
+    def send(self) -> None:
+        """Send the setpoints that were kept, all in one round.
+
+        Raises:
+            ActuatorError: They cannot be sent.
+        """
+        if not self._setpoints:
+            return
+        self._stop_told = None
+        self._packet.clear()
+        for index, (command, strategy) in self._setpoints.items():
+            part = self._packet.create_view([index])
+            part.position, part.velocity = command.position, command.velocity
+            part.effort = command.pwm if strategy is Strategy.DIRECT_PWM else command.effort
+        self._setpoints.clear()
+        if not self.group.send_command(self._packet):
+            raise ActuatorError("send_failed", "commands could not be sent to the HEBI modules: network down?")
+
+    def acknowledged(self, index: int, packet: Any, strategy: Strategy | None, timeout_ms: float) -> bool:
+        """Send settings of one module; tell whether all modules said in time that they have theirs.
+
+        Args:
+            index: Which joint the settings are for.
+            packet: hebi-py's command for the group.
+            strategy: The strategy among the settings, or None.
+            timeout_ms: [ms].
+
+        Raises:
+            ActuatorError: The joint is passive.
+        """
+        if index not in self.driven:
+            raise ActuatorError("exception", f"{self.names[index]} is passive: nothing is sent to its module but off")
+        self._stop_told = None
+        if strategy is not None:
+            # Asked for is as good as set: the acknowledgement may be what is lost.
+            self._asked[index] = strategy
+        return bool(self.group.send_command_with_acknowledgement(packet, timeout_ms))
+
+    def info(self, index: int, timeout_ms: float) -> Any:
+        """Return the settings of all modules, or None; refuse the plant where another module is not as it was left.
+
+        Raises:
+            ActuatorError: A module is another one, or has a strategy that nobody here asked for.
+        """
+        info = self.group.request_info(timeout_ms)
+        if info is not None:
+            self._check_info(info, but=index if index in self.driven else None)
+        return info
+
+    def receive(self, timeout_ms: float) -> Any:
+        """Wait for the next frame of feedback; return it, or None."""
+        frame = self.group.get_next_feedback(timeout_ms, self._buffer)
+        if frame is not None:
+            self._frame = frame
+        return frame
+
+    @property
+    def frame(self) -> Any:
+        """The newest frame of feedback; None before the first."""
+        return self._frame
+
+    def stop(self, index: int) -> None:
+        """Effort zero, then all modules off, in one round for all joints: the next to ask is told what came of it.
+
+        Args:
+            index: Which joint asks.
+
+        Raises:
+            ActuatorError: One has not confirmed that it is off.
+        """
+        if self._stop_told is None or index in self._stop_told:
+            self._stop_told, self._stop_error = set(), None
+            try:
+                self._stop_all()
+            except Exception as error:  # noqa: BLE001  (whatever it is, each joint is told)
+                self._stop_error = error
+        self._stop_told.add(index)
+        if self._stop_error is not None:
+            raise self._stop_error
+
+    # --- inside ---------------------------------------------------------------------------------------------
+
+    def _stop_all(self) -> None:
+        self._setpoints.clear()
+        driving = [index for index, strategy in enumerate(self._asked) if strategy is not Strategy.OFF]
+        self._asked = [Strategy.OFF] * len(self._asked)
+        try:
+            if driving:
+                self._packet.clear()
+                for index in driving:
+                    self._packet.create_view([index]).effort = 0.0
+                self.group.send_command(self._packet)
+        finally:
+            self._switch_off()
+
+    def _switch_off(self) -> None:
+        for _ in range(STOP_ATTEMPTS):
+            self._fill_off(self._packet)
+            if self.group.send_command_with_acknowledgement(self._packet, STOP_ACKNOWLEDGE_MS):
+                return
+        raise ActuatorError(
+            "stop_unacknowledged",
+            f"HEBI modules did not all confirm that they are off, asked {STOP_ATTEMPTS} times; the command lifetime "
+            "ends their torque. Press the motion stop",
+        )
+
+    @staticmethod
+    def _fill_off(packet: Any) -> None:
+        packet.clear()
+        packet.control_strategy = int(Strategy.OFF)
+        packet.position = packet.velocity = packet.effort = NO_SETPOINT
+
+    def _check_info(self, info: Any, but: int | None = None) -> None:
+        """Compare what all modules tell with what they were; the strategy of one may be about to be judged."""
+        for index, record in enumerate(self._records):
+            reads = tuple(str(getattr(info, name)[index]) for name in ("family", "name", "serial"))
+            known = (record.family, record.name, record.serial)
+            if reads != known:
+                raise ActuatorError(
+                    "module_lost",
+                    f"{self.names[index]}: HEBI module reads as {'/'.join(reads[:2])} ({reads[2]}); expected "
+                    f"{'/'.join(known[:2])} ({known[2]})",
+                )
+            number, wanted = int(info.control_strategy[index]), self._asked[index]
+            if index != but and number != int(wanted):
+                raise ActuatorError(
+                    "strategy",
+                    f"{self.names[index]}: strategy reads back as {number}; expected {wanted.name} ({int(wanted)})",
+                )
+
+
+def _answered(info: Any) -> Any:
+    if info is None:
+        raise ActuatorError("module_lost", f"HEBI modules did not all answer within {ACKNOWLEDGE_MS} ms")
+    return info
+
+
+class _Row:
+    """One module's part of a frame or of settings, as hebi-py shows those of a group of one."""
+
+    def __init__(self, of_all: Any, index: int) -> None:
+        self._of_all = of_all
+        self._index = index
+
+    def __getattr__(self, name: str) -> Any:
+        return (getattr(self._of_all, name)[self._index],)
+
+
+class _Part:
+    """One module's part of a packet for all, as hebi-py's command for a group of one.
+
+    Attributes:
+        packet: hebi-py's command for the group.
+        strategy: The strategy that it holds, or None.
+    """
+
+    packet: Any
+    strategy: Strategy | None
+    _view: Any
+
+    def __init__(self, packet: Any, index: int) -> None:
+        self.__dict__.update(packet=packet, strategy=None, _view=packet.create_view([index]))
+
+    def clear(self) -> None:
+        self.packet.clear()
+        self.__dict__["strategy"] = None
+
+    def __setattr__(self, name: str, value: Any) -> None:
+        if name == "control_strategy":
+            self.__dict__["strategy"] = Strategy(value)
+        setattr(self._view, name, value)
+
+
+class _Seat:
+    """One module of the group, as hebi-py's group of one; what :class:`HebiBackend` sends goes the group's way."""
+
+    size = 1
+
+    def __init__(self, shared: HebiGroup, index: int) -> None:
+        shared.join()
+        self._shared = shared
+        self._index = index
+
+    @property
+    def command_lifetime(self) -> float:
+        return float(self._shared.group.command_lifetime)
+
+    @command_lifetime.setter
+    def command_lifetime(self, milliseconds: int) -> None:
+        self._shared.group.command_lifetime = milliseconds
+
+    @property
+    def feedback_frequency(self) -> float:
+        return float(self._shared.group.feedback_frequency)
+
+    @feedback_frequency.setter
+    def feedback_frequency(self, rate: float) -> None:
+        self._shared.group.feedback_frequency = rate
+
+    def send_command_with_acknowledgement(self, command: _Part, timeout_ms: float) -> bool:
+        return self._shared.acknowledged(self._index, command.packet, command.strategy, timeout_ms)
+
+    def request_info(self, timeout_ms: float) -> Any:
+        info = self._shared.info(self._index, timeout_ms)
+        return None if info is None else _Row(info, self._index)
+
+    def get_next_feedback(self, timeout_ms: float, reuse_fbk: Any = None) -> Any:
+        # A frame is taken at the first joint; the others look at the same one, or would see two for a state.
+        frame = self._shared.receive(timeout_ms) if self._index == 0 else self._shared.frame
+        return None if frame is None else _Row(frame, self._index)
+
+
+class _GroupPort(HebiBackend):
+    """What both kinds of port of a group have."""
+
+    def __init__(self, shared: HebiGroup, index: int, clock: Clock | None = None, **options: Any) -> None:
+        super().__init__(clock=clock, make_group=lambda: _Seat(shared, index), **options)
+        self.shared = shared
+        self._index = index
+        # A module that was never heard reads 0, which is no record.
+        self._last_receive_us = 0
+
+    def read(self, timeout: float) -> Feedback | None:
+        """Return this module's part of the newest frame, where it is new; only the first joint waits for one."""
+        return super().read(timeout if self._index == 0 else 0.0)
+
+    def let_go(self) -> None:
+        """Let go of the group without stopping."""
+        if self._group is not None:
+            self._group = self._command = self._feedback = None
+            self.shared.leave()
+
+    def _new_command(self) -> Any:
+        return _Part(self._hebi.GroupCommand(len(self.shared.names)), self._index)
+
+
+class GroupDrive(_GroupPort):
+    """The actuator port of one driven joint; setpoints leave with those of the other joints, by :meth:`flush`.
+
+    Args:
+        shared: The group.
+        index: Which of its joints.
+        clock: Host clock; feedback is stamped with it on receipt.
+        options: As those of :class:`HebiBackend`.
+    """
+
+    def write(self, command: Command) -> Applied:
+        """Keep setpoints, checked and limited, for the next :meth:`flush`."""
+        self._own()
+        limited, changed = check_command(command, self._strategy, self._limits)
+        self.shared.keep(self._index, limited, self._strategy)
+        return Applied(limited, self._strategy, changed, self._clock.now_ns())
+
+    def flush(self) -> None:
+        """Send the setpoints that all ports of the group have kept."""
+        self._own()
+        self.shared.send()
+
+    def stop(self) -> None:
+        """Effort zero, then strategy off, on all modules of the group."""
+        if self._group is None or threading.get_ident() != self._owner:
+            return
+        self._strategy = Strategy.OFF
+        self.shared.stop(self._index)
+
+    def close(self) -> None:
+        """Stop, and let go of the group."""
+        try:
+            self.stop()
+        finally:
+            self.let_go()
+
+
+class GroupEncoder:
+    """The port of a passive joint: it is read, and has no way to give torque.
+
+    Args:
+        shared: The group.
+        index: Which of its joints.
+        clock: Host clock.
+    """
+
+    def __init__(self, shared: HebiGroup, index: int, clock: Clock | None = None) -> None:
+        self._clock = clock or WallClock()
+        self._port = _GroupPort(shared, index, self._clock)
+
+    def connect(self) -> ActuatorInfo:
+        """Find the module, once, and return what it says of itself; its motor reads back as off."""
+        return self._port.connect()
+
+    def now_ns(self) -> int:
+        """Return the host clock [ns]."""
+        return self._clock.now_ns()
+
+    def read(self, timeout: float) -> Feedback | None:
+        """Return the module's part of the newest frame, where it is new."""
+        return self._port.read(timeout)
+
+    def set_feedback_rate(self, rate: float) -> float:
+        """Set the rate of the library's requests, which is that of the whole group [Hz]."""
+        return self._port.set_feedback_rate(rate)
+
+    def close(self) -> None:
+        """Let go of the group."""
+        self._port.let_go()

@@ -1,0 +1,584 @@
+"""Several HEBI modules in one group, rule by rule, on hebi-py's own commands, with modules and a clock of ours."""
+
+from __future__ import annotations
+
+import functools
+import math
+import threading
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+
+from pendulum_hw_bridge.actuator import ActuatorError, CommandLock, Strategy
+from pendulum_hw_bridge.backends import hebi as backend_module
+from pendulum_hw_bridge.backends import hebi_group
+from pendulum_hw_bridge.backends.hebi_discovery import ModuleSelection, discover
+from pendulum_hw_bridge.backends.hebi_emulated import _holds, _Of
+from pendulum_hw_bridge.backends.hebi_group import GroupDrive, GroupEncoder, HebiGroup
+from pendulum_hw_bridge.bridge import Bridge
+from pendulum_hw_bridge.clocks import SteppedClock
+from pendulum_hw_bridge.effort_mapping import EffortMapping, EffortStrategy
+from pendulum_hw_bridge.gains import GAIN_FIELDS, LOOPS
+from pendulum_hw_bridge.module import DrivenModule, Module
+from pendulum_hw_bridge.safety import SafetyLimits, SafetyMonitor
+from pendulum_hw_bridge.settings import BridgeSettings
+from pendulum_msgs_py.contract.drive import Drive, DriveKind, Mode, PlantLimits
+from pendulum_msgs_py.contract.supervisor import PlantSupervisor
+from pendulum_msgs_py.joints import Coordinates, Joint
+from tests.scripted_port import DRIVETRAIN, PERIOD, STEP
+
+hebi = pytest.importorskip("hebi", reason="hebi-py is not installed")
+
+NAMES = ("shoulder", "elbow")
+JOINTS = tuple(Joint(name) for name in NAMES)
+BOTH = Coordinates(JOINTS, (0, 1))
+ACROBOT = Coordinates(JOINTS, (1,))
+PENDUBOT = Coordinates(JOINTS, (0,))
+SETPOINTS = ("position", "velocity", "effort")
+ENDS = [f"{what}_limit_{end}" for what in ("effort", "velocity", "position") for end in ("min", "max")]
+SETTINGS = [
+    "control_strategy",
+    "mstop_strategy",
+    *ENDS,
+    "min_position_limit_strategy",
+    "max_position_limit_strategy",
+    *(f"{loop}_{name}" for loop in LOOPS for name in GAIN_FIELDS),
+]
+
+
+@pytest.fixture(autouse=True)
+def _no_look_time(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(hebi_group, "discover", functools.partial(discover, wait=lambda seconds: None))
+
+
+class Fake:
+    """One module: who it is, what was set in it, and what it sends."""
+
+    def __init__(self, name: str, serial: str, mac: str) -> None:
+        self.identity = {
+            "family": "Lab",
+            "name": name,
+            "serial": serial,
+            "firmware_revision": "1",
+            "mechanical_type": "X5-9",
+        }
+        self.mac = mac
+        self.settings: dict[str, Any] = dict.fromkeys(SETTINGS, 0.0) | {"control_strategy": 0, "mstop_strategy": 1}
+        self.deaf = False
+        self.keeps: set[str] = set()
+        """Settings that it says to take, and does not."""
+        self.record: dict[str, float] = {}
+        self.packets: list[dict[str, float]] = []
+        self.count = 0
+
+    def take(self, command: Any) -> None:
+        """Take what its part of a packet has, where it hears."""
+        has = {name: getattr(command, name)[0] for name in (*SETPOINTS, *SETTINGS) if _holds(command, name, hebi)}
+        self.packets.append(has)
+        if not self.deaf:
+            self.settings |= {
+                name: value for name, value in has.items() if name in self.settings and name not in self.keeps
+            }
+
+    def read(self, name: str) -> Any:
+        return self.identity.get(name, self.settings.get(name))
+
+
+class Network:
+    """hebi-py's lookup and its group of all modules asked for."""
+
+    def __init__(self) -> None:
+        self.clock = SteppedClock()
+        # The order of the names is not that of the joints.
+        self.modules = [Fake("z_first", "S-1", "00:00:00:00:00:0A"), Fake("a_second", "S-2", "00:00:00:00:00:0B")]
+        self.chosen: list[Fake] = []
+        self.rounds: list[str] = []
+        self.works = self.connects = True
+        self.lifetime, self.keeps_lifetime = 250, False
+        self.feedback_frequency = 100.0
+        self.breaks = ""
+        self.logs: list[str] = []
+
+    # as lookup
+    @property
+    def entrylist(self) -> list[Any]:
+        return [
+            SimpleNamespace(
+                family="Lab", name=each.identity["name"], mac_address=each.mac, ip_address="10.0.0.1", is_stale=False
+            )
+            for each in self.modules
+        ]
+
+    def get_group_from_macs(self, addresses: list[str], timeout_ms: float) -> Any:
+        found = [each for mac in addresses for each in self.modules if each.mac == mac]
+        if len(addresses) == 1:
+            return SimpleNamespace(request_info=lambda ms: _Infos(found))
+        self.chosen = found
+        return self if self.connects else None
+
+    # as group
+    @property
+    def command_lifetime(self) -> int:
+        return self.lifetime
+
+    @command_lifetime.setter
+    def command_lifetime(self, milliseconds: int) -> None:
+        self.lifetime = 250 if self.keeps_lifetime else milliseconds
+
+    @property
+    def size(self) -> int:
+        return len(self.chosen)
+
+    def send_command(self, command: Any) -> bool:
+        self.rounds.append("send")
+        if self.breaks == "send":
+            raise RuntimeError("broken")
+        for index, module in enumerate(self.chosen):
+            module.take(_Of(command, index))
+        return self.works
+
+    def send_command_with_acknowledgement(self, command: Any, timeout_ms: float) -> bool:
+        self.rounds.append("ask")
+        for index, module in enumerate(self.chosen):
+            module.take(_Of(command, index))
+        return not any(module.deaf for module in self.chosen)
+
+    def request_info(self, timeout_ms: float) -> Any:
+        return _Infos(self.chosen)
+
+    def get_next_feedback(self, timeout_ms: float, reuse: Any) -> Any:
+        assert type(reuse) is hebi.GroupFeedback
+        assert reuse.size == len(self.chosen)
+        if not any(module.record for module in self.chosen):
+            return None
+        names = {name for module in self.chosen for name in module.record}
+        return SimpleNamespace(**{name: [each.record.get(name, 0.0) for each in self.chosen] for name in names})
+
+    def start_log(self, folder: str, name: str) -> None:
+        self.logs.append(name)
+
+    def stop_log(self) -> None:
+        self.logs.append("stopped")
+
+
+class _Infos:
+    def __init__(self, modules: list[Fake]) -> None:
+        self._modules = modules
+
+    def __getattr__(self, name: str) -> Any:
+        return [module.read(name) for module in self._modules]
+
+
+class Rig:
+    """A bridge on a group of two."""
+
+    def __init__(self, coordinates: Coordinates = BOTH, *selections: ModuleSelection, **options: Any) -> None:
+        self.network = Network()
+        self.clock = self.network.clock
+        self.fakes = self.network.modules
+        self.coordinates = coordinates
+        chosen = selections or (ModuleSelection(name="z_first"), ModuleSelection(serial="S-2"))
+        self.shared = HebiGroup(
+            list(zip(NAMES, chosen, strict=True)), coordinates.driven, look_time=0.01, lookup=lambda: self.network,
+            **options,
+        )  # fmt: skip
+        limits = PlantLimits(effort=(8.0,) * len(coordinates.driven), feedback_timeout=1.0, starvation=100.0)
+        self.supervisor = PlantSupervisor(limits, coordinates=coordinates)
+        self.bridge = Bridge([self._module(index) for index in (0, 1)], self.supervisor)
+
+    def _module(self, index: int) -> Module:
+        monitor = SafetyMonitor(SafetyLimits(winding_current=0.0, pwm_tolerance=9.0, command_tolerance=9.0), PERIOD)
+        if index not in self.coordinates.driven:
+            return Module(GroupEncoder(self.shared, index, self.clock), monitor, BridgeSettings(), joint=NAMES[index])
+        mapping = EffortMapping(EffortStrategy.DIRECT_PWM, DRIVETRAIN, effort_limit=2.0)
+        port = GroupDrive(self.shared, index, self.clock)
+        return DrivenModule(port, mapping, monitor, BridgeSettings(), joint=NAMES[index])
+
+    def see(self, *given: dict[str, float] | None) -> Any:
+        """Let a period pass, each module send a record, None for none, and the bridge observe them."""
+        self.clock.wait_until(self.clock.now_ns() + STEP)
+        for module, values in zip(self.network.chosen, given or ({}, {}), strict=True):
+            if values is None:
+                continue
+            module.count += 1
+            now_us = self.clock.now_ns() // 1000
+            module.record = dict.fromkeys(backend_module._FLOATS.values(), 0.0) | {
+                "deflection": 1e-3 * module.count,
+                "voltage": 32.0,
+                "motor_winding_temperature": 30.0,
+                "pwm_command": 0.0,
+                "receive_time_us": now_us,
+                "hardware_transmit_time_us": now_us + 1_000_000,
+                "mstop_state": 1,
+                "temperature_state": 0,
+                "command_lifetime_state": 0,
+                **dict.fromkeys(("position_limit_state", "velocity_limit_state", "effort_limit_state"), 2),
+                **values,
+            }
+        return self.bridge.observe(0.0)
+
+    def connected(self) -> Rig:
+        self.bridge.connect()
+        assert self.see() is not None
+        return self
+
+    def armed(self) -> Rig:
+        self.connected()
+        assert self.bridge.prepare() == ""
+        assert self.supervisor.arm(self.clock.now_ns(), self.bridge.sample) == ""
+        self.forget()
+        return self
+
+    def forget(self) -> None:
+        self.network.rounds.clear()
+        for module in self.fakes:
+            module.packets.clear()
+
+    def drive(self, *effort: float) -> Any:
+        return self.bridge.carry_out(Drive(DriveKind.EFFORT, effort=effort, push=(0.0, 0.0)), was_armed=True)
+
+    def efforts(self, index: int) -> list[float]:
+        return [packet["effort"] for packet in self.fakes[index].packets if "effort" in packet]
+
+    def all_off(self) -> bool:
+        hearing = [module for module in self.fakes if not module.deaf]
+        offs = [module.settings["control_strategy"] == 0 for module in hearing]
+        asked = [any(packet.get("control_strategy") == 0 for packet in module.packets) for module in self.fakes]
+        return all(offs) and all(asked) and not any(drive.driving for drive in self.bridge.drives)
+
+
+# --- which modules ------------------------------------------------------------------------------------------------
+
+
+def test_each_joint_has_the_module_that_is_named_for_it_whatever_the_order_of_names() -> None:
+    rig = Rig().connected()
+    infos = [module.info for module in rig.bridge.modules]
+    assert [(info.name, info.serial) for info in infos if info] == [("z_first", "S-1"), ("a_second", "S-2")]
+    sample = rig.see({"position": 0.25}, {"position": -0.5})
+    assert sample.position == (0.25, -0.5)
+    other = Rig(BOTH, ModuleSelection(name="a_second"), ModuleSelection(name="z_first")).connected()
+    assert [module.info.name for module in other.bridge.modules if module.info] == ["a_second", "z_first"]
+
+
+@pytest.mark.parametrize(
+    ("first", "second", "sentence"),
+    [
+        ({"serial": "S-1"}, {"name": "z_first"}, r"is meant for shoulder and for elbow; expected one for each"),
+        ({"serial": "S-9"}, {"serial": "S-2"}, r"shoulder: no HEBI module \*/\* \(S-9\) answered"),
+        ({"serial": "S-1"}, {}, r"elbow: HEBI module \*/\* is not the only one"),
+        ({"serial": "S-1"}, {"serial": "S-2", "module_type": "X8-3"}, r"elbow: type of .* is 'X5-9'; expected 'X8-3'"),
+    ],
+)
+def test_a_module_that_is_meant_twice_missing_not_the_only_one_or_of_another_type_is_refused(
+    first: dict[str, str], second: dict[str, str], sentence: str
+) -> None:
+    rig = Rig(BOTH, ModuleSelection(**first), ModuleSelection(**second))
+    for _ in range(2):
+        with pytest.raises(ActuatorError, match=sentence):
+            rig.bridge.connect()
+    assert rig.network.rounds == [], "nothing is sent to modules that are not all there"
+
+
+def test_modules_that_connect_only_in_part_are_refused() -> None:
+    rig = Rig()
+    rig.network.connects = False
+    with pytest.raises(ActuatorError, match="were seen but do not connect as a group"):
+        rig.bridge.connect()
+    assert rig.network.rounds == []
+
+
+def test_a_group_of_another_size_is_refused() -> None:
+    rig = Rig()
+    every = rig.network.get_group_from_macs
+    rig.network.get_group_from_macs = lambda macs, ms: every(macs if len(macs) == 1 else [*macs, macs[0]], ms)  # type: ignore[method-assign]
+    with pytest.raises(ActuatorError, match="HEBI group has 3 modules; expected 2"):
+        rig.bridge.connect()
+    assert rig.network.rounds == []
+
+
+@pytest.mark.parametrize("swapped", [0, 1])
+def test_a_module_that_reads_as_another_one_is_refused_when_it_connects_and_when_it_arms(swapped: int) -> None:
+    rig = Rig().connected()
+    rig.forget()
+    rig.fakes[swapped].identity["serial"] = "S-7"
+    assert f"{NAMES[swapped]}: HEBI module reads as Lab/" in rig.bridge.prepare()
+    assert not any(drive.driving for drive in rig.bridge.drives)
+    rig.fakes[0].settings["control_strategy"] = 1
+    rig.bridge.release()
+    assert rig.all_off()
+
+
+def test_modules_in_another_order_than_asked_for_are_refused() -> None:
+    rig = Rig()
+    every = rig.network.get_group_from_macs
+    rig.network.get_group_from_macs = lambda macs, ms: every(list(reversed(macs)), ms)  # type: ignore[method-assign]
+    with pytest.raises(
+        ActuatorError, match=r"shoulder: HEBI module reads as Lab/a_second \(S-2\); expected Lab/z_first"
+    ):
+        rig.bridge.connect()
+
+
+# --- one round of packets -----------------------------------------------------------------------------------------
+
+
+def test_one_round_of_packets_carries_the_setpoints_of_all() -> None:
+    rig = Rig().armed()
+    outcome = rig.drive(1.0, -0.5)
+    assert outcome.effort == (1.0, -0.5)
+    assert rig.network.rounds == ["send"]
+    assert [rig.efforts(0), rig.efforts(1)] == [[0.25], [-0.125]]
+    rig.drive(0.0, 0.5)
+    assert [rig.efforts(0), rig.efforts(1)] == [[0.25, 0.0], [-0.125, 0.125]]
+
+
+@pytest.mark.parametrize(("coordinates", "passive"), [(ACROBOT, 0), (PENDUBOT, 1)])
+def test_a_passive_module_never_gets_a_strategy_but_off_nor_a_setpoint_but_none(
+    coordinates: Coordinates, passive: int
+) -> None:
+    rig = Rig(coordinates)
+    rig.fakes[passive].settings["control_strategy"] = 3
+    rig.connected()
+    assert rig.fakes[passive].settings["control_strategy"] == 0, "whoever left it on"
+    assert rig.bridge.prepare() == ""
+    assert rig.supervisor.arm(rig.clock.now_ns(), rig.bridge.sample) == ""
+    assert rig.drive(1.0).effort == (1.0,)
+    assert rig.efforts(1 - passive)[-1] == 0.25
+    rig.bridge.release()
+    rig.bridge.close()
+    packets = rig.fakes[passive].packets
+    assert {packet["control_strategy"] for packet in packets if "control_strategy" in packet} == {0}
+    given = [packet[name] for packet in packets for name in SETPOINTS if name in packet]
+    assert all(math.isnan(value) for value in given)
+    assert {name for packet in packets for name in packet} <= {"control_strategy", *SETPOINTS}
+
+
+def test_a_passive_port_has_no_way_to_send() -> None:
+    rig = Rig(ACROBOT).connected()
+    port = rig.bridge.modules[0].port
+    assert not any(
+        hasattr(port, name) for name in ("write", "set_strategy", "set_gains", "set_limits", "flush", "stop")
+    )
+    rig.forget()
+    with pytest.raises(ActuatorError, match="shoulder is passive: nothing is sent to its module but off"):
+        rig.shared.acknowledged(0, hebi.GroupCommand(2), Strategy.DIRECT_PWM, 200)
+    assert rig.network.rounds == []
+
+
+def test_settings_reach_each_driven_module_and_only_it() -> None:
+    rig = Rig().connected()
+    for module in rig.fakes:
+        assert module.settings["effort_limit_max"] == pytest.approx(13.0)
+    rig.forget()
+    drive = rig.bridge.drives[1]
+    drive.port.set_strategy(Strategy.DIRECT_PWM)
+    assert [module.settings["control_strategy"] for module in rig.fakes] == [0, 1]
+    assert rig.fakes[0].packets == [{}]
+
+
+def test_setpoints_that_were_kept_do_not_outlive_a_stop() -> None:
+    rig = Rig().armed()
+    first, second = (drive.port for drive in rig.bridge.drives)
+    rig.bridge.drives[0].send(Strategy.DIRECT_PWM, rig.bridge.drives[0].mapping.idle())
+    second.stop()
+    rig.forget()
+    first.flush()  # type: ignore[attr-defined]
+    assert rig.network.rounds == []
+
+
+# --- feedback -----------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("stale", [0, 1])
+@pytest.mark.parametrize("coordinates", [BOTH, ACROBOT])
+def test_a_frame_with_one_stale_module_is_no_state_and_a_module_that_stays_away_releases_all(
+    coordinates: Coordinates, stale: int
+) -> None:
+    rig = Rig(coordinates).armed()
+    given = [None if index == stale else {} for index in (0, 1)]
+    assert rig.see(*given) is None
+    assert rig.see() is not None
+    assert rig.supervisor.mode.armed, rig.supervisor.reason
+    rig.drive(*(1.0 for _ in coordinates.driven))
+    rig.forget()
+    assert [rig.see(*given) for _ in range(5)] == 5 * [None]
+    assert rig.all_off()
+    assert rig.supervisor.reason.startswith(f"feedback_lost: {NAMES[stale]}: "), rig.supervisor.reason
+
+
+def test_a_module_that_was_never_heard_makes_no_state_and_is_named() -> None:
+    rig = Rig()
+    rig.bridge.connect()
+    for _ in range(3):
+        assert rig.see({}, None) is None
+    assert rig.bridge.prepare() == "elbow: no feedback yet"
+
+
+def test_no_state_is_made_of_two_frames() -> None:
+    rig = Rig().connected()
+    assert rig.see({}, None) is None
+    assert rig.see(None, {}) is None
+    assert rig.see(None, {}) is None
+    assert rig.see() is not None
+
+
+@pytest.mark.parametrize("coordinates", [BOTH, ACROBOT])
+@pytest.mark.parametrize("faulty", [0, 1])
+@pytest.mark.parametrize(
+    ("given", "fault"),
+    [
+        ({"hardware_transmit_time_us": 5.0}, "module_restarted"),
+        ({"command_lifetime_state": int(CommandLock.LOCKED_BY_OTHER)}, "locked_by_other"),
+        ({"mstop_state": 0}, "m_stop"),
+        ({"position": math.nan}, "feedback_not_finite"),
+    ],
+)
+def test_a_fault_of_any_module_switches_all_off(
+    coordinates: Coordinates, faulty: int, given: dict[str, float], fault: str
+) -> None:
+    rig = Rig(coordinates).armed()
+    rig.drive(*(1.0 for _ in coordinates.driven))
+    rig.forget()
+    rig.see(*(given if index == faulty else {} for index in (0, 1)))
+    assert rig.all_off()
+    assert rig.supervisor.mode is Mode.FAULT
+    assert rig.supervisor.reason.startswith(f"{fault}: {NAMES[faulty]}: ")
+
+
+# --- settings and strategies ---------------------------------------------------------------------------------------
+
+
+def test_modules_that_do_not_all_confirm_that_they_are_off_are_no_plant() -> None:
+    rig = Rig()
+    rig.fakes[1].deaf = True
+    with pytest.raises(ActuatorError, match="did not all confirm within 200 ms that they are off"):
+        rig.bridge.connect()
+
+
+@pytest.mark.parametrize("coordinates", [BOTH, ACROBOT])
+@pytest.mark.parametrize("stuck", [0, 1])
+def test_a_module_that_does_not_go_off_is_refused(coordinates: Coordinates, stuck: int) -> None:
+    rig = Rig(coordinates)
+    rig.fakes[stuck].settings["control_strategy"] = 3
+    rig.fakes[stuck].keeps = {"control_strategy"}
+    with pytest.raises(ActuatorError, match=rf"{NAMES[stuck]}: strategy reads back as 3; expected OFF \(0\)"):
+        rig.bridge.connect()
+
+
+@pytest.mark.parametrize("coordinates", [BOTH, ACROBOT])
+@pytest.mark.parametrize("changed", [0, 1])
+def test_a_module_with_a_strategy_that_nobody_here_asked_for_is_not_armed(
+    coordinates: Coordinates, changed: int
+) -> None:
+    rig = Rig(coordinates).connected()
+    rig.fakes[changed].settings["control_strategy"] = 2
+    rig.fakes[changed].keeps = {"control_strategy"}
+    rig.forget()
+    assert "strategy reads back as" in rig.bridge.prepare()
+    assert not any(drive.driving for drive in rig.bridge.drives)
+    assert not [effort for index in (0, 1) for effort in rig.efforts(index) if abs(effort) > 0.0]
+
+
+@pytest.mark.parametrize("broken", [0, 1])
+@pytest.mark.parametrize(
+    ("setting", "sentence"), [("position_kp", "position gain kp"), ("effort_limit_max", "effort limits? read")]
+)
+def test_gains_and_limits_must_read_back_from_each(broken: int, setting: str, sentence: str) -> None:
+    rig = Rig()
+    rig.fakes[broken].keeps = {setting}
+    with pytest.raises(ActuatorError, match=sentence):
+        rig.bridge.connect()
+
+
+def test_the_command_lifetime_is_set_for_all_and_must_read_back() -> None:
+    rig = Rig().connected()
+    assert rig.network.command_lifetime == 50
+    rig.network.keeps_lifetime = True
+    rig.network.command_lifetime = 100
+    assert "command lifetime reads back as 0.25 s; expected 0.05 s" in rig.bridge.prepare()
+
+
+# --- stop ---------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("coordinates", [BOTH, ACROBOT])
+@pytest.mark.parametrize("deaf", [0, 1])
+def test_zero_and_off_are_sent_to_every_module_also_when_one_does_not_acknowledge(
+    coordinates: Coordinates, deaf: int
+) -> None:
+    rig = Rig(coordinates).armed()
+    rig.drive(*(1.0 for _ in coordinates.driven))
+    rig.forget()
+    rig.fakes[deaf].deaf = True
+    rig.bridge.fail("m_stop", "pressed")
+    # One round of zero, three of off, for all joints together: not as many for each.
+    assert rig.network.rounds == ["send", "ask", "ask", "ask"]
+    assert rig.all_off()
+    for index in coordinates.driven:
+        assert rig.fakes[index].packets[0] == {"effort": 0.0}
+    assert rig.bridge.stop_pending
+    assert rig.bridge.prepare() == "the module has not confirmed that it is off"
+    rig.fakes[deaf].deaf = False
+    rig.forget()
+    rig.clock.wait_until(rig.clock.now_ns() + 100_000_000)
+    rig.bridge.insist()
+    assert rig.network.rounds == ["ask"]
+    assert not rig.bridge.stop_pending
+    assert [module.settings["control_strategy"] for module in rig.fakes] == [0, 0]
+
+
+def test_off_is_sent_even_where_the_zero_before_it_breaks() -> None:
+    rig = Rig().armed()
+    rig.drive(1.0, 1.0)
+    rig.forget()
+    rig.network.breaks = "send"
+    rig.bridge.release()
+    assert rig.all_off()
+    assert rig.bridge.stop_pending, "whatever broke, all are asked again"
+
+
+def test_setpoints_that_cannot_be_sent_release_all() -> None:
+    rig = Rig().armed()
+    rig.network.works = False
+    rig.forget()
+    outcome = rig.drive(1.0, 1.0)
+    assert (outcome.fault, outcome.effort) == ("send_failed", (0.0, 0.0))
+    assert rig.all_off()
+
+
+def test_a_stop_from_a_second_thread_does_nothing_and_a_write_is_refused() -> None:
+    rig = Rig().armed()
+    port = rig.bridge.drives[0].port
+    caught: list[BaseException] = []
+
+    def run() -> None:
+        port.stop()
+        for call in (lambda: port.write(rig.bridge.drives[0].mapping.idle()), port.flush):  # type: ignore[attr-defined]
+            try:
+                call()
+            except ActuatorError as error:
+                caught.append(error)
+
+    thread = threading.Thread(target=run)
+    thread.start()
+    thread.join()
+    assert ["second thread" in str(error) for error in caught] == [True, True]
+    assert rig.network.rounds == []
+
+
+def test_closing_switches_all_off_and_lets_the_group_go_when_the_last_has_closed(tmp_path: Path) -> None:
+    rig = Rig(ACROBOT, log=tmp_path / "run.hebilog").armed()
+    rig.drive(1.0)
+    rig.forget()
+    rig.bridge.modules[0].port.close()
+    assert rig.shared.group is not None
+    rig.bridge.close()
+    assert rig.all_off()
+    assert rig.shared.group is None
+    assert rig.network.logs == ["run.hebilog", "stopped"]
+    rig.bridge.close()
+    rig.forget()
+    rig.shared._log = None
+    rig.bridge.connect()
+    assert rig.shared.group is rig.network
