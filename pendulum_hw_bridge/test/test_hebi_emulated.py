@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 import threading
 from collections.abc import Iterator
@@ -180,3 +181,30 @@ def test_no_emulator_is_one_sentence() -> None:
     with pytest.raises(ParameterError, match="expected HOST:PORT"):
         open_lookup("emulator:nowhere")
     assert EmulatorProcessBackend("127.0.0.1:9").strategy is Strategy.OFF
+
+
+def test_a_group_of_several_takes_its_parts_and_a_frame_waits_for_all(bench: tuple[Served, Served]) -> None:
+    lookup = open_lookup(f"emulator:{bench[0].where},{bench[1].where}")
+    macs = {one.serial: one.mac_address for one in discover(lookup, look_time=0.25)}
+    assert lookup.get_group_from_macs([macs["X5-9-1"], "02:00:00:00:00:00"], 500) is None
+    group = lookup.get_group_from_macs([macs["X5-9-2"], macs["X5-9-1"]], 500)
+    assert (group.size, group.request_info(500).serial) == (2, ["X5-9-2", "X5-9-1"])
+    group.command_lifetime = 70
+    assert [served.actuator.command_lifetime for served in bench] == [0.07, 0.07]
+    command = hebi.GroupCommand(2)
+    command.create_view([1]).control_strategy = int(Strategy.DIRECT_PWM)
+    assert group.send_command_with_acknowledgement(command, 500)
+    assert [served.actuator.strategy for served in bench] == [Strategy.DIRECT_PWM, Strategy.OFF]
+    frames = [frame for _ in range(50) if (frame := group.get_next_feedback(100.0)) is not None][:3]
+    for before, after in itertools.pairwise(frames):
+        assert all(a < b for a, b in zip(before.receive_time_us, after.receive_time_us, strict=True))
+    bench[0].end()
+    command.clear()
+    command.control_strategy = int(Strategy.OFF)
+    assert not group.send_command_with_acknowledgement(command, 50)
+    assert group.request_info(50) is None
+    # What was sent to the one that hears came, and a frame without the other one keeps its old record.
+    assert bench[1].actuator.strategy is Strategy.OFF
+    late = [frame for _ in range(20) if (frame := group.get_next_feedback(50.0)) is not None]
+    assert late[-1].receive_time_us[0] > late[-2].receive_time_us[0]
+    assert late[-1].receive_time_us[1] == late[-2].receive_time_us[1]

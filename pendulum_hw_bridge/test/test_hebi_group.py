@@ -99,6 +99,7 @@ class Network:
         self.lifetime, self.keeps_lifetime = 250, False
         self.feedback_frequency = 100.0
         self.breaks = ""
+        self.frames = 0
         self.logs: list[str] = []
 
     # as lookup
@@ -149,6 +150,7 @@ class Network:
         return _Infos(self.chosen)
 
     def get_next_feedback(self, timeout_ms: float, reuse: Any) -> Any:
+        self.frames += 1
         assert type(reuse) is hebi.GroupFeedback
         assert reuse.size == len(self.chosen)
         if not any(module.record for module in self.chosen):
@@ -417,6 +419,7 @@ def test_a_module_that_was_never_heard_makes_no_state_and_is_named() -> None:
 
 def test_no_state_is_made_of_two_frames() -> None:
     rig = Rig().connected()
+    assert rig.network.frames == 1, "one round of feedback for all"
     assert rig.see({}, None) is None
     assert rig.see(None, {}) is None
     assert rig.see(None, {}) is None
@@ -480,6 +483,13 @@ def test_a_module_with_a_strategy_that_nobody_here_asked_for_is_not_armed(
     assert not [effort for index in (0, 1) for effort in rig.efforts(index) if abs(effort) > 0.0]
 
 
+def test_a_passive_module_that_is_on_is_no_part_of_the_plant() -> None:
+    rig = Rig(ACROBOT).connected()
+    rig.fakes[0].settings["control_strategy"] = 3
+    with pytest.raises(ActuatorError, match=r"shoulder: strategy reads back as 3; expected OFF \(0\)"):
+        rig.bridge.modules[0].port.connect()
+
+
 @pytest.mark.parametrize("broken", [0, 1])
 @pytest.mark.parametrize(
     ("setting", "sentence"), [("position_kp", "position gain kp"), ("effort_limit_max", "effort limits? read")]
@@ -528,6 +538,22 @@ def test_zero_and_off_are_sent_to_every_module_also_when_one_does_not_acknowledg
     assert [module.settings["control_strategy"] for module in rig.fakes] == [0, 0]
 
 
+@pytest.mark.parametrize("sends", ["strategy", "setpoints"])
+def test_what_is_sent_after_a_stop_is_stopped_anew(sends: str) -> None:
+    rig = Rig().armed()
+    first, second = (drive.port for drive in rig.bridge.drives)
+    first.stop()
+    if sends == "strategy":
+        second.set_strategy(Strategy.DIRECT_PWM)
+    else:
+        second.write(rig.bridge.drives[1].mapping.idle())
+        second.flush()  # type: ignore[attr-defined]
+    rig.forget()
+    second.stop()
+    assert rig.network.rounds[-1:] == ["ask"]
+    assert [module.settings["control_strategy"] for module in rig.fakes] == [0, 0]
+
+
 def test_off_is_sent_even_where_the_zero_before_it_breaks() -> None:
     rig = Rig().armed()
     rig.drive(1.0, 1.0)
@@ -565,6 +591,15 @@ def test_a_stop_from_a_second_thread_does_nothing_and_a_write_is_refused() -> No
     thread.join()
     assert ["second thread" in str(error) for error in caught] == [True, True]
     assert rig.network.rounds == []
+
+
+def test_a_drive_that_is_closed_alone_switches_all_off() -> None:
+    rig = Rig().armed()
+    rig.drive(1.0, 1.0)
+    rig.forget()
+    rig.bridge.drives[1].port.close()
+    assert [rig.efforts(0)[0], rig.efforts(1)[0]] == [0.0, 0.0]
+    assert [module.settings["control_strategy"] for module in rig.fakes] == [0, 0]
 
 
 def test_closing_switches_all_off_and_lets_the_group_go_when_the_last_has_closed(tmp_path: Path) -> None:

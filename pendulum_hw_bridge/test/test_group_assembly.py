@@ -1,0 +1,89 @@
+"""What the bridge's parameters make of a plant of several joints on HEBI modules."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+
+from pendulum_hw_bridge.assembly import Assembly, assemble, for_plant
+from pendulum_hw_bridge.backends.hebi_group import GroupDrive, GroupEncoder
+from pendulum_hw_bridge.clocks import SteppedClock
+from pendulum_hw_bridge.module import DrivenModule
+from pendulum_hw_bridge.node_specs import SPECS
+from pendulum_msgs_py.errors import ParameterError
+
+
+def assembled(plant: str = "acrobot", *, lockstep: bool = False, **given: Any) -> Assembly:
+    specs = for_plant(SPECS, plant, "hebi")
+    values = {spec.name: spec.default for spec in specs} | {"plant": plant, "backend": "hebi"} | given
+    return assemble(values, specs, lockstep=lockstep)
+
+
+def test_each_joint_has_its_own_zero_sign_tare_and_window_and_a_passive_one_a_port_that_is_read() -> None:
+    assembly = assembled(
+        joint_offsets=[1.0, 0.5], joint_signs=[1.0, -1.0], effort_tares=[0.0, 0.25],
+        position_window=[-2.0, 3.0, -1.0, 4.0],
+    )  # fmt: skip
+    shoulder, elbow = assembly.modules(SteppedClock())
+    assert (type(shoulder.port), type(elbow.port)) == (GroupEncoder, GroupDrive)
+    assert (isinstance(shoulder, DrivenModule), isinstance(elbow, DrivenModule)) == (False, True)
+    assert (shoulder.joint, elbow.joint) == ("shoulder", "elbow")
+    settings = [shoulder.settings, elbow.settings]
+    assert [(own.joint_offset, own.joint_sign, own.effort_tare) for own in settings] == [(1.0, 1, 0.0), (0.5, -1, 0.25)]
+    ends = [(own.limits.position_min, own.limits.position_max) for own in settings]
+    assert ends == [(-3.0, 2.0), (-3.5, 1.5)]
+
+
+def test_all_modules_are_of_one_group_in_the_order_of_the_joints() -> None:
+    assembly = assembled("double_pendulum", names=["z", "a"], families=["Lab"], serials=["", "S-2"])
+    ports = [module.port for module in assembly.modules(SteppedClock())]
+    assert all(isinstance(port, GroupDrive) for port in ports)
+    first, second = (port.shared for port in ports if isinstance(port, GroupDrive))
+    assert first is second
+    assert [str(wanted) for wanted in first._wanted] == ["Lab/z", "Lab/a (S-2)"]
+    assert [wanted.module_type for wanted in first._wanted] == ["X5-9", "X5-9"]
+    assert first.driven == (0, 1)
+
+
+def test_the_limits_are_those_of_the_plant_file_and_of_an_x5() -> None:
+    assembly = assembled()
+    assert assembly.limits.effort == (6.0,)
+    assert (assembly.limits.velocity, assembly.limits.position_max) == (1.5, (4.0, 4.0))
+    elbow = assembly.modules(SteppedClock())[1]
+    assert isinstance(elbow, DrivenModule)
+    assert elbow.mapping.effort_limit == elbow.settings.limits.effort == 6.0
+    assert elbow.settings.feedback_rate == 100.0
+    assert elbow.mapping.drivetrain.gear_ratio == pytest.approx(1742.222)
+
+
+@pytest.mark.parametrize(
+    ("plant", "given", "sentence"),
+    [
+        ("cart_pole", {}, "joint 'cart' slides, and a module of backend 'hebi' turns"),
+        ("acrobot", {"names": ["a", "b", "c"]}, "names has 3 values; expected 2, for shoulder, elbow, or one for all"),
+        ("acrobot", {"names": []}, "names has 0 values; expected 2"),
+        ("acrobot", {"joint_signs": [0.5, 1.0]}, "joint_signs has 0.5 for shoulder; expected 1 or -1"),
+        ("acrobot", {"serial": "S-1"}, "serial is 'S-1', which is for one module"),
+        ("acrobot", {"joint_sign": -1}, "joint_sign is -1, which is for one module"),
+        ("acrobot", {"lab_file": "lab.yaml"}, "lab_file is 'lab.yaml', which is for one module"),
+        ("acrobot", {"initial_positions": [1.0]}, "initial_positions is for the emulator"),
+        (
+            "acrobot",
+            {"position_window": [-40.0, 40.0, -1.0, 1.0]},
+            "position_window is 80 rad; expected at most 64 rad",
+        ),
+        ("acrobot", {"position_window": [-1.0, 1.0, 0.0, 0.0]}, "position_window is none; expected one"),
+        ("acrobot", {"velocity_limit": 30.0}, "velocity_limit is 30 rad/s; expected at most 3 rad/s"),
+        ("thesis", {"names": ["a", "b"]}, "names is for several joints; expected name for one"),
+    ],
+)
+def test_what_does_not_fit_is_refused_in_a_sentence(plant: str, given: dict[str, Any], sentence: str) -> None:
+    with pytest.raises(ParameterError) as refused:
+        assembled(plant, **given)
+    assert sentence in str(refused.value)
+
+
+def test_real_modules_keep_time() -> None:
+    with pytest.raises(ParameterError, match="clock is 'lockstep' with backend 'hebi'"):
+        assembled(lockstep=True)
