@@ -124,6 +124,7 @@ def test_the_window_shows_whichever_plant_runs_and_refuses_what_it_cannot_draw(
         "-p", f"png:={png}", env={**os.environ, "SDL_VIDEODRIVER": "dummy"},
     )  # fmt: skip
     peer = GraphPeer()
+    peer.patience = 60.0
     try:
         for name in ("cart_pole", "acrobot", "furuta"):
             plant = load_mechanism(name)
