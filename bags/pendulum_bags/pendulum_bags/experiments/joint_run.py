@@ -29,6 +29,7 @@ __all__ = [
     "design_file",
     "design_for",
     "fall_time",
+    "identified_names",
     "load_stand_in",
     "record_joints",
     "stand_in_for",
@@ -217,6 +218,11 @@ class JointRun:
         }
 
 
+def identified_names(plant: MechanismParameters) -> list[str]:
+    """Return the names of the values that an identification finds: masses, lengths, inertias and friction."""
+    return [name for name in plant.numbers if name.rpartition(".")[2] not in {*_UNCHANGED, _DELAY}]
+
+
 def stand_in_for(plant: MechanismParameters, *, share: float, delay: float, seed: int) -> MechanismParameters:
     """Return another plant in the place of a machine: values as far off as an identification may leave them.
 
@@ -232,13 +238,10 @@ def stand_in_for(plant: MechanismParameters, *, share: float, delay: float, seed
     if not 0.0 <= share < 1.0:
         raise ParameterError(f"share is {share}; expected 0 to less than 1")
     drawn = np.random.default_rng(seed)
-    changes: dict[str, float] = {}
-    for name, value in plant.numbers.items():
-        key = name.rpartition(".")[2]
-        if key == _DELAY:
-            changes[name] = delay
-        elif key not in _UNCHANGED:
-            changes[name] = value * (1.0 + float(drawn.uniform(-share, share)))
+    changes = {name: delay for name in plant.numbers if name.rpartition(".")[2] == _DELAY}
+    changes |= {
+        name: plant.numbers[name] * (1.0 + float(drawn.uniform(-share, share))) for name in identified_names(plant)
+    }
     return replace(plant.with_values(changes), name=f"{plant.name}_stand_in")
 
 

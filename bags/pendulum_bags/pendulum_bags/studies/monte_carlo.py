@@ -38,14 +38,27 @@ from pendulum_msgs_py.errors import BagError, ParameterError
 from pendulum_msgs_py.plants.plant_parameters import PlantParameters, load_plant
 from pendulum_sim.batch import BatchResult, simulate_batch
 
-__all__ = ["COLUMNS", "MonteCarlo", "replay", "run_chunk", "run_monte_carlo", "sobol", "summarise"]
+__all__ = [
+    "COLUMNS",
+    "SEEDS",
+    "SEEDS_OF_ONE",
+    "MonteCarlo",
+    "add_runs",
+    "draw_chunk",
+    "replay",
+    "run_chunk",
+    "run_monte_carlo",
+    "sobol",
+    "summarise",
+]
 
 COLUMNS = (*VARIED, "noise_seed", "theta_0", "max_theta", "max_effort", "std_theta", "theta_end", "theta_dot_end")
 """Columns of the Parquet files; SI units."""
 
-_SEEDS_OF_ONE = 10_000_000_000
+SEEDS_OF_ONE = 10_000_000_000
 """Distance between the noise seeds of two Monte Carlos."""
-_SEEDS = 2**63 // _SEEDS_OF_ONE
+SEEDS = 2**63 // SEEDS_OF_ONE
+"""Number of seeds that a Monte Carlo may have."""
 
 Array = NDArray[np.float64]
 
@@ -92,8 +105,8 @@ class MonteCarlo:
         """Refuse what cannot be run."""
         if self.runs < 1 or self.chunk < 1:
             raise ParameterError(f"runs is {self.runs} and chunk {self.chunk}; expected both >= 1")
-        if not 0 <= self.seed < _SEEDS:
-            raise ParameterError(f"seed is {self.seed}; expected 0 to {_SEEDS - 1}")
+        if not 0 <= self.seed < SEEDS:
+            raise ParameterError(f"seed is {self.seed}; expected 0 to {SEEDS - 1}")
         if not (math.isfinite(self.bound) and self.bound > 0.0):
             raise ParameterError(f"bound is {self.bound} rad; expected > 0")
         if not (math.isfinite(self.amplitude) and self.amplitude >= 0.0):
@@ -139,7 +152,7 @@ def draw_chunk(settings: MonteCarlo, index: int, plant: PlantParameters | None =
     drawn.update(settings.uncertainty.draw(plant or load_plant(settings.plant), settings.chunk, generator))
     drawn["theta_0"] = UPRIGHT + settings.start * generator.uniform(-1.0, 1.0, settings.chunk)
     drawn = {name: values[:count] for name, values in drawn.items()}
-    drawn["noise_seed"] = settings.seed * _SEEDS_OF_ONE + first + np.arange(count, dtype=np.int64)
+    drawn["noise_seed"] = settings.seed * SEEDS_OF_ONE + first + np.arange(count, dtype=np.int64)
     return drawn
 
 
@@ -193,7 +206,7 @@ def run_monte_carlo(
     Raises:
         BagError: The folder holds something else, or more runs.
     """
-    _add_runs(folder, settings)
+    add_runs(folder, settings.runs, settings.chunk, settings.fingerprint(), asdict(settings))
     open_results(folder, "Monte Carlo", settings.fingerprint(), asdict(settings))
     job = (settings, load_plant(settings.plant))
     run_chunks(folder, _run_chunk, job, settings.chunks, connect=connect, on_progress=on_progress)
@@ -202,18 +215,26 @@ def run_monte_carlo(
     return result
 
 
-def _add_runs(folder: Path, settings: MonteCarlo) -> None:
-    """Let a folder of fewer runs hold more: only a last chunk that was not full has to be carried out again."""
-    kept = kept_settings(folder, settings.fingerprint())
-    before = int(kept.get("runs", settings.runs))
-    if before > settings.runs:
-        raise BagError(
-            f"folder {folder} holds a Monte Carlo of {before} runs; expected at most the {settings.runs} of this one"
-        )
-    if before < settings.runs:
-        if before % settings.chunk:
-            chunk_path(folder, before // settings.chunk).unlink(missing_ok=True)
-        write_results_marker(folder, settings.fingerprint(), asdict(settings))
+def add_runs(folder: Path, runs: int, chunk: int, fingerprint: str, settings: Mapping[str, Any]) -> None:
+    """Let a folder of fewer runs hold more: only a last chunk that was not full has to be carried out again.
+
+    Args:
+        folder: Of a Monte Carlo, or a new one.
+        runs: How many it shall hold.
+        chunk: Runs in a chunk.
+        fingerprint: Of all else that a run depends on.
+        settings: To keep beside the results.
+
+    Raises:
+        BagError: It holds more.
+    """
+    before = int(kept_settings(folder, fingerprint).get("runs", runs))
+    if before > runs:
+        raise BagError(f"folder {folder} holds a Monte Carlo of {before} runs; expected at most the {runs} of this one")
+    if before < runs:
+        if before % chunk:
+            chunk_path(folder, before // chunk).unlink(missing_ok=True)
+        write_results_marker(folder, fingerprint, settings)
 
 
 def summarise(folder: Path, settings: MonteCarlo) -> dict[str, Any]:

@@ -16,7 +16,7 @@ from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.parameters import load_yaml
 from pendulum_msgs_py.plants.plant_parameters import PRESETS, PlantParameters
 
-__all__ = ["VARIED", "Uncertainty", "batch_variations", "parse_uncertainty", "uncertainty_of"]
+__all__ = ["VARIED", "Uncertainty", "batch_variations", "parse_uncertainty", "share_of_interval", "uncertainty_of"]
 
 VARIED = ("inertia", "damping", "gravity", "coulomb_friction")
 """Parameters that may be uncertain."""
@@ -113,6 +113,12 @@ def batch_variations(plant: PlantParameters, drawn: Mapping[str, NDArray[Any]]) 
     return found
 
 
+def share_of_interval(interval: Sequence[float], value: float) -> float:
+    """Return the standard deviation that a 95 % interval stands for, as a share of the value, 1 at most."""
+    low, high = interval
+    return float(min(1.0, abs((high - low) / (2.0 * _NORMAL_95 * value)))) if value else 0.0
+
+
 def parse_uncertainty(text: str, plant: str) -> Uncertainty:
     """Return the uncertainty that a text names: ``identified``, or shares such as ``inertia=0.3,damping=0.05``.
 
@@ -147,8 +153,7 @@ def uncertainty_of(plant_file: str) -> Uncertainty:
     for name in VARIED:
         entry = entries.get(name)
         if isinstance(entry, dict) and "interval" in entry and entry.get("value"):
-            low, high = entry["interval"]
-            shares[name] = min(1.0, abs((high - low) / (2.0 * _NORMAL_95 * entry["value"])))
+            shares[name] = share_of_interval(entry["interval"], entry["value"])
     if not shares:
         raise ParameterError(f"plant file {plant_file} has no intervals; expected those of an identification")
     beside = Path(plant_file).with_suffix(".json")

@@ -1,0 +1,294 @@
+"""Closed-loop runs of a plant of several joints over what is not known of it: parameters, noise and start.
+
+The plant is held upright by its own LQR, as in ``experiment joints``. Chunks, seeds and files are those of
+:mod:`pendulum_bags.studies.monte_carlo`.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import math
+from collections.abc import Callable, Mapping
+from contextlib import nullcontext
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pendulum_bags.experiments.joint_run import design_for, identified_names
+from pendulum_bags.runs.run_folder import write_json
+from pendulum_bags.studies.chunks import Connect, chunk_path, open_results, read_columns, run_chunks
+from pendulum_bags.studies.monte_carlo import SEEDS, SEEDS_OF_ONE, add_runs
+from pendulum_bags.studies.shares import share_interval
+from pendulum_bags.studies.uncertain import share_of_interval
+from pendulum_lqr.mechanism_model import linearise_mechanism, mechanism_lqr
+from pendulum_msgs_py.errors import ParameterError
+from pendulum_msgs_py.plants.mechanism_parameters import MechanismParameters, load_mechanism, load_mechanism_file
+from pendulum_sim.mechanism_batch import MechanismBatch, simulate_mechanisms
+
+__all__ = ["JointMonteCarlo", "joint_shares", "replay_joints", "run_joint_chunk", "run_joint_monte_carlo"]
+
+Array = NDArray[np.float64]
+
+_LIMIT_PER_NOISE = 10.0
+"""Effort limit per amplitude of the noise where nobody chose one, as ``experiment joints`` takes it [-]."""
+
+
+@dataclass(frozen=True)
+class JointMonteCarlo:
+    """What to draw and to run.
+
+    Attributes:
+        plant: Preset or file of the plant that is believed in; the controller is designed on it.
+        runs: Number of closed-loop runs.
+        seed: Seed of everything.
+        shares: Standard deviation of parameters as a share of their value, by name; others are known.
+        amplitude: Largest noise on each driven joint [N m or N]; None for a tenth of its effort limit.
+        hold_time: Time for which a noise sample is held [s].
+        start: Largest distance of each joint's start from upright, uniform [rad or m].
+        duration: Of each run [s].
+        dt: Period of the loop [s].
+        bound: Distance from upright that no joint should leave [rad or m].
+        chunk: Runs in a chunk; part of the result's definition.
+    """
+
+    plant: str
+    runs: int = 100_000
+    seed: int = 1
+    shares: Mapping[str, float] = field(default_factory=dict)
+    amplitude: float | None = None
+    hold_time: float = 0.01
+    start: float = 0.0
+    duration: float = 5.0
+    dt: float = 0.002
+    bound: float = 0.2
+    chunk: int = 10_000
+
+    def __post_init__(self) -> None:
+        """Refuse what cannot be run."""
+        if self.runs < 1 or self.chunk < 1:
+            raise ParameterError(f"runs is {self.runs} and chunk {self.chunk}; expected both >= 1")
+        if not 0 <= self.seed < SEEDS:
+            raise ParameterError(f"seed is {self.seed}; expected 0 to {SEEDS - 1}")
+        for name, value, least in (
+            ("bound", self.bound, 1e-9),
+            ("start", self.start, 0.0),
+            ("duration", self.duration, self.dt),
+            ("hold_time", self.hold_time, self.dt),
+            ("amplitude", 0.0 if self.amplitude is None else self.amplitude, 0.0),
+        ):
+            if not (math.isfinite(value) and value >= least):
+                raise ParameterError(f"{name} is {value}; expected a finite number >= {least:g}")
+
+    @property
+    def steps(self) -> int:
+        """Steps of each run."""
+        return round(self.duration / self.dt)
+
+    @property
+    def chunks(self) -> int:
+        """How many chunks there are."""
+        return -(-self.runs // self.chunk)
+
+    def fingerprint(self) -> str:
+        """Return a hash of all that a run depends on; how many runs there are is not among that."""
+        settings = {name: value for name, value in asdict(self).items() if name != "runs"}
+        content = json.dumps([settings, load_mechanism(self.plant).numbers], sort_keys=True)
+        return hashlib.sha256(content.encode()).hexdigest()[:16]
+
+
+def joint_shares(text: str, plant: str) -> dict[str, float]:
+    """Return how far the parameters of a plant of several joints are known, by name.
+
+    Args:
+        text: ``identified`` for the intervals of the plant file, one share for all that an identification finds, such
+            as ``0.05``, or ``NAME=SHARE,...``, such as ``cart_mass=0.1,pole.damping=0.5``.
+        plant: Preset or plant file.
+
+    Raises:
+        ParameterError: A name is none of the plant, a share is none, or the file has no intervals.
+    """
+    parameters = load_mechanism(plant)
+    names = identified_names(parameters)
+    if text.strip() == "identified":
+        intervals = load_mechanism_file(plant)[1].get("intervals", {}) if Path(plant).suffix else {}
+        found = {name: share_of_interval(interval, parameters.value(name)) for name, interval in intervals.items()}
+        found = {name: share for name, share in found.items() if share > 0.0}
+        if not found:
+            raise ParameterError(f"plant {plant} has no intervals; expected the file of an identification")
+        return found
+    parts = [part.strip() for part in text.split(",") if part.strip()]
+    if len(parts) == 1 and "=" not in parts[0]:
+        parts = [f"{name}={parts[0]}" for name in names if parameters.value(name) != 0.0]
+    shares: dict[str, float] = {}
+    for part in parts:
+        name, _, value = (piece.strip() for piece in part.partition("="))
+        try:
+            share = float(value)
+        except ValueError:
+            raise ParameterError(
+                f"uncertainty has {part!r}; expected identified, one share, or NAME=SHARE, such as {names[0]}=0.05"
+            ) from None
+        if name not in names:
+            raise ParameterError(f"uncertainty of {name!r} is unknown; expected one of {', '.join(names)}")
+        if not (math.isfinite(share) and 0.0 <= share <= 1.0):
+            raise ParameterError(f"uncertainty of {name} is {share}; expected a share from 0 to 1")
+        shares[name] = share
+    return shares
+
+
+def run_joint_chunk(settings: JointMonteCarlo, index: int, threads: int | None = None) -> dict[str, NDArray[Any]]:
+    """Run a chunk and return its columns; a pure function of settings and index."""
+    return _run_chunk((settings, load_mechanism(settings.plant)), index, threads)
+
+
+def run_joint_monte_carlo(
+    folder: Path,
+    settings: JointMonteCarlo,
+    *,
+    connect: Connect = nullcontext,
+    on_progress: Callable[[int, int], None] = lambda done, total: None,
+) -> dict[str, Any]:
+    """Run all chunks that are not on disk yet, one Parquet file each, and sum up.
+
+    Args:
+        folder: Where the files go; a folder of the same settings is gone on with, one of fewer runs is added to.
+        settings: What to run.
+        connect: To a Dask cluster; by default in this process, on all cores.
+        on_progress: Called with chunks done and in all.
+
+    Raises:
+        BagError: The folder holds something else, or more runs.
+        ParameterError: A drawn plant has no positive inertia.
+    """
+    add_runs(folder, settings.runs, settings.chunk, settings.fingerprint(), asdict(settings))
+    open_results(folder, "Monte Carlo", settings.fingerprint(), asdict(settings))
+    job = (settings, load_mechanism(settings.plant))
+    run_chunks(folder, _run_chunk, job, settings.chunks, connect=connect, on_progress=on_progress)
+    result = _summarise(folder, settings)
+    write_json(folder / "monte_carlo.json", result)
+    return result
+
+
+def replay_joints(settings: JointMonteCarlo, number: int) -> tuple[dict[str, float], Array]:
+    """Run one run again, alone, and return what was drawn for it and its motion.
+
+    Args:
+        settings: As of the Monte Carlo.
+        number: Of the run, from 0.
+
+    Returns:
+        The row of the table, and positions, velocities and efforts of all joints at each step, shape (steps, 3 n).
+    """
+    if not 0 <= number < settings.runs:
+        raise ParameterError(f"run is {number}; expected 0 to {settings.runs - 1}")
+    index, offset = divmod(number, settings.chunk)
+    plant = load_mechanism(settings.plant)
+    drawn = {name: values[offset : offset + 1] for name, values in _draw(settings, index, plant).items()}
+    result = _batch(settings, plant, drawn, None, record=True)
+    assert result.trajectories is not None
+    return {name: float(v[0]) for name, v in _columns(plant, drawn, result).items()}, result.trajectories[:, :, 0]
+
+
+def _draw(settings: JointMonteCarlo, index: int, plant: MechanismParameters) -> dict[str, NDArray[Any]]:
+    """Return parameters, starts and noise seeds of a chunk; it is drawn whole and then cut."""
+    first = index * settings.chunk
+    count = min(settings.chunk, settings.runs - first)
+    generator = np.random.Generator(np.random.Philox(key=[settings.seed, index]))
+    drawn: dict[str, NDArray[Any]] = {}
+    for name, share in settings.shares.items():
+        # Log-normal, for no mass is negative; mean and deviation are those of the value.
+        spread = math.sqrt(math.log1p(share**2))
+        normals = generator.standard_normal(settings.chunk)
+        drawn[name] = plant.value(name) * np.exp(spread * normals - 0.5 * spread**2)
+    for name, goal in zip(plant.coordinates.names, plant.coordinates.goal, strict=True):
+        drawn[f"start_{name}"] = goal + settings.start * generator.uniform(-1.0, 1.0, settings.chunk)
+    drawn = {name: values[:count] for name, values in drawn.items()}
+    drawn["noise_seed"] = settings.seed * SEEDS_OF_ONE + first + np.arange(count, dtype=np.int64)
+    return drawn
+
+
+def _run_chunk(
+    job: tuple[JointMonteCarlo, MechanismParameters], index: int, threads: int | None
+) -> dict[str, NDArray[Any]]:
+    # The plant travels with the job: its file need not be where a worker runs.
+    settings, plant = job
+    drawn = _draw(settings, index, plant)
+    return _columns(plant, drawn, _batch(settings, plant, drawn, threads))
+
+
+def _batch(
+    settings: JointMonteCarlo,
+    plant: MechanismParameters,
+    drawn: Mapping[str, NDArray[Any]],
+    threads: int | None,
+    record: bool = False,
+) -> MechanismBatch:
+    gain = mechanism_lqr(linearise_mechanism(design_for(plant)), *plant.mechanism.weights).K
+    limits = np.array(plant.effort_limits)
+    return simulate_mechanisms(
+        plant,
+        variations={name: drawn[name] for name in settings.shares},
+        steps=settings.steps,
+        dt=settings.dt,
+        position=np.stack([drawn[f"start_{name}"] for name in plant.coordinates.names], axis=1),
+        gain=gain,
+        seeds=drawn["noise_seed"],
+        amplitude=limits / _LIMIT_PER_NOISE if settings.amplitude is None else settings.amplitude,
+        hold=max(1, round(settings.hold_time / settings.dt)),
+        record=record,
+        threads=threads,
+    )
+
+
+def _columns(
+    plant: MechanismParameters, drawn: Mapping[str, NDArray[Any]], result: MechanismBatch
+) -> dict[str, NDArray[Any]]:
+    """Return what was drawn and what came of it, a column each; SI units."""
+    columns = dict(drawn)
+    for i, name in enumerate(plant.coordinates.names):
+        columns[f"max_{name}"] = result.max_deviation[:, i]
+        columns[f"std_{name}"] = result.std_deviation[:, i]
+        columns[f"end_{name}"] = result.position[:, i]
+        columns[f"end_velocity_{name}"] = result.velocity[:, i]
+    for i, name in enumerate(plant.coordinates.driven_names):
+        columns[f"max_effort_{name}"] = result.max_effort[:, i]
+    return columns
+
+
+def _summarise(folder: Path, settings: JointMonteCarlo) -> dict[str, Any]:
+    """Return the probability that all joints stay within the bound, quantiles and the worst runs, from the files."""
+    coordinates = load_mechanism(settings.plant).coordinates
+    units = {f"{what}_{joint.name}": joint.unit for what in ("max", "std") for joint in coordinates.joints}
+    units |= {f"max_effort_{coordinates.joints[i].name}": coordinates.joints[i].effort_unit for i in coordinates.driven}
+    parts: dict[str, list[Array]] = {name: [] for name in units}
+    for index in range(settings.chunks):
+        for name, column in read_columns(chunk_path(folder, index), parts).items():
+            parts[name].append(column)
+    values = {name: np.concatenate(columns) for name, columns in parts.items()}
+    # NaN stays NaN, and is not inside.
+    farthest = np.max([values[f"max_{name}"] for name in coordinates.names], axis=0)
+    inside = int((farthest <= settings.bound).sum())
+    low, high = share_interval(inside, settings.runs)
+    shares = (0.05, 0.5, 0.95, 0.999)
+    worst = np.argsort(farthest, kind="stable")[::-1][:10]
+    return {
+        "settings": asdict(settings),
+        "joints": list(coordinates.names),
+        "units": units,
+        "runs": settings.runs,
+        "not_finite": int((~np.isfinite(farthest)).sum()),
+        "probability_inside": inside / settings.runs,
+        "probability_interval": [low, high],
+        "quantiles": {
+            name: dict(zip(map(str, shares), np.quantile(column, shares).tolist(), strict=True))
+            for name, column in values.items()
+        },
+        "worst": [
+            {"run": int(run), "max_deviation": float(farthest[run]), **replay_joints(settings, int(run))[0]}
+            for run in worst
+        ],
+    }
