@@ -194,7 +194,7 @@ def test_check_takes_a_plant_of_several_joints(capsys: pytest.CaptureFixture[str
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["--plant", "cart_pole"], "there is no bridge to a real group of modules yet"),
+        (["--plant", "cart_pole"], "several real modules are not checked yet"),
         (["--backend", "emulator", "--plant", "acrobot", "--joint-sign", "-1"], "joint_sign is -1, which is for one"),
         (["--backend", "emulator", "--plant", "acrobat"], "plant is 'acrobat'; expected one of the presets"),
     ],
