@@ -174,7 +174,6 @@ def test_the_sides_that_fell_are_told_with_their_times(
 @pytest.mark.parametrize(
     ("command", "instead"),
     [
-        ("region_of_attraction", "make_mechanism_controller of pendulum_lqr.mechanism_controllers"),
         ("frequency_response", "experiment joints --plant cart_pole, which measures it, too"),
     ],
 )

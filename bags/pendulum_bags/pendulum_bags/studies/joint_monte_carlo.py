@@ -29,7 +29,7 @@ from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.plants.mechanism_parameters import MechanismParameters, load_mechanism, load_mechanism_file
 from pendulum_sim.mechanism_batch import MechanismBatch, simulate_mechanisms
 
-__all__ = ["JointMonteCarlo", "joint_shares", "replay_joints", "run_joint_chunk", "run_joint_monte_carlo"]
+__all__ = ["JointMonteCarlo", "joint_shares", "replay_joints", "run_joint_chunk", "run_joint_monte_carlo", "scatter"]
 
 Array = NDArray[np.float64]
 
@@ -140,6 +140,25 @@ def joint_shares(text: str, plant: str) -> dict[str, float]:
     return shares
 
 
+def scatter(
+    plant: MechanismParameters, shares: Mapping[str, float], count: int, generator: np.random.Generator
+) -> dict[str, Array]:
+    """Return values of uncertain parameters, shape (count,) each: log-normal and independent, for no mass is negative.
+
+    Args:
+        plant: The plant that is believed in.
+        shares: Standard deviation of each value, as a share of it.
+        count: How many plants.
+        generator: Of the draw.
+    """
+    drawn = {}
+    for name, share in shares.items():
+        # Mean and deviation are those of the value, not of its logarithm.
+        spread = math.sqrt(math.log1p(share**2))
+        drawn[name] = plant.value(name) * np.exp(spread * generator.standard_normal(count) - 0.5 * spread**2)
+    return drawn
+
+
 def run_joint_chunk(settings: JointMonteCarlo, index: int, threads: int | None = None) -> dict[str, NDArray[Any]]:
     """Run a chunk and return its columns; a pure function of settings and index."""
     return _run_chunk((settings, load_mechanism(settings.plant)), index, threads)
@@ -198,12 +217,7 @@ def _draw(settings: JointMonteCarlo, index: int, plant: MechanismParameters) -> 
     first = index * settings.chunk
     count = min(settings.chunk, settings.runs - first)
     generator = np.random.Generator(np.random.Philox(key=[settings.seed, index]))
-    drawn: dict[str, NDArray[Any]] = {}
-    for name, share in settings.shares.items():
-        # Log-normal, for no mass is negative; mean and deviation are those of the value.
-        spread = math.sqrt(math.log1p(share**2))
-        normals = generator.standard_normal(settings.chunk)
-        drawn[name] = plant.value(name) * np.exp(spread * normals - 0.5 * spread**2)
+    drawn: dict[str, NDArray[Any]] = {**scatter(plant, settings.shares, settings.chunk, generator)}
     for name, goal in zip(plant.coordinates.names, plant.coordinates.goal, strict=True):
         drawn[f"start_{name}"] = goal + settings.start * generator.uniform(-1.0, 1.0, settings.chunk)
     drawn = {name: values[:count] for name, values in drawn.items()}

@@ -6,36 +6,60 @@ import json
 import time
 from functools import partial
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
+from rich.console import Console
 
+from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.programs.counted_progress import counted_progress
+from pendulum_msgs_py.programs.executables import typed_options
 from pendulum_msgs_py.programs.options import Json, out_option
 from pendulum_msgs_py.programs.terminal import make_console
+
+if TYPE_CHECKING:
+    from pendulum_bags.studies.chunks import Connect
 
 __all__ = ["region_of_attraction"]
 
 
+_OF_ONE_JOINT = {"q", "r", "effort_limit", "angle_span", "velocity_span"}
+"""Options that plants of several joints do not have."""
+
+
 def region_of_attraction(
+    context: typer.Context,
     out: Annotated[
         Path | None,
         out_option("Folder; an interrupted map is gone on with. Default: bags/runs/region_of_attraction."),
     ] = None,
     plant: Annotated[str, typer.Option(help="Preset or plant file; the controller is designed on it.")] = "thesis",
     uncertainty: Annotated[
-        str, typer.Option(help="identified (covariance of the plant file), or shares: inertia=0.3,damping=0.05.")
+        str,
+        typer.Option(
+            help="identified (covariance of the plant file), or shares: inertia=0.3,damping=0.05. Of several joints "
+            "also one share for all; default 0.05."
+        ),
     ] = "inertia=0.3,damping=0.05,gravity=0.05",
-    plants: Annotated[int, typer.Option(help="Plants tried at each start; 1 for the believed one.", min=1)] = 100,
+    plants: Annotated[
+        int, typer.Option(help="Plants tried at each start; 1 for the believed one; of several joints 10.", min=1)
+    ] = 100,
     effort_limit: Annotated[
         float, typer.Option(help="Torque limit of the loop [N m]; 0 for the plant's own.", min=0.0)
     ] = 0.0,
-    points: Annotated[int, typer.Option(help="Points along each axis of the grid.", min=3)] = 61,
+    points: Annotated[int, typer.Option(help="Points along each axis of the grid; of several joints 41.", min=3)] = 61,
     angle_span: Annotated[float, typer.Option(help="Half width of the grid about upright [rad].")] = 3.141592653589793,
     velocity_span: Annotated[float, typer.Option(help="Half width of the grid in velocity [rad/s].")] = 10.0,
     duration: Annotated[float, typer.Option(help="Length of each run [s].")] = 8.0,
     q: Annotated[tuple[float, float], typer.Option(help="Diagonal of Q.")] = (100.0, 0.01),
     r: Annotated[float, typer.Option(help="R.")] = 0.1,
+    axes: Annotated[
+        str,
+        typer.Option(help="Of several joints: both axes, as cart,pole or pole,pole_dot; default the first two joints."),
+    ] = "",
+    spans: Annotated[
+        tuple[float, float], typer.Option(help="Of several joints: half widths of the grid [rad, m, rad/s or m/s].")
+    ] = (1.0, 1.0),
     seed: Annotated[int, typer.Option(help="Seed of the plants.", min=0)] = 1,
     scheduler: Annotated[str, typer.Option(help="Dask scheduler, tcp://HOST:PORT.")] = "",
     workers: Annotated[int, typer.Option(help="Processes of a local Dask cluster; 0 for none.", min=0)] = 0,
@@ -49,12 +73,16 @@ def region_of_attraction(
     from pendulum_bags.studies.region_figure import region_sentence, write_region_figure
     from pendulum_bags.studies.region_map import RegionMap, run_region_map
     from pendulum_bags.studies.uncertain import parse_uncertainty
-    from pendulum_msgs_py.plants.plant_parameters import require_one_joint
+    from pendulum_msgs_py.plants.plant_parameters import is_mechanism
 
-    require_one_joint(
-        plant,
-        "make_mechanism_controller of pendulum_lqr.mechanism_controllers, which samples a region",
-    )
+    folder = out or Path("bags", "runs", "region_of_attraction")
+    console = make_console(stderr=json_output, highlight=False)
+    connect = partial(cluster_client, scheduler, workers)
+    if is_mechanism(plant):
+        _joints(context, console, folder, connect, axes, spans, json_output=json_output)
+        return
+    if typed := typed_options(context, {"axes", "spans"}):
+        raise ParameterError(f"{typed[0]} is for a plant of several joints, and {plant} has one")
     settings = RegionMap(
         plant=plant,
         uncertainty=parse_uncertainty(uncertainty, plant),
@@ -68,10 +96,7 @@ def region_of_attraction(
         duration=duration,
         seed=seed,
     )
-    folder = out or Path("bags", "runs", "region_of_attraction")
-    console = make_console(stderr=json_output, highlight=False)
     started = time.monotonic()
-    connect = partial(cluster_client, scheduler, workers)
     with counted_progress(console, "chunks", settings.chunks, folder) as on_progress:
         result = run_region_map(folder, settings, connect=connect, on_progress=on_progress)
     picture = write_region_figure(folder / "region.png", result)
@@ -79,5 +104,40 @@ def region_of_attraction(
         print(json.dumps(result.to_json(), indent=2))
         return
     console.print(region_sentence(result))
+    elapsed = time.monotonic() - started
+    console.print(f"\npicture {picture}\nmap     {folder / 'map.parquet'}\n({elapsed:.0f} s)", soft_wrap=True)
+
+
+def _joints(
+    context: typer.Context,
+    console: Console,
+    folder: Path,
+    connect: Connect,
+    axes: str,
+    spans: tuple[float, float],
+    *,
+    json_output: bool,
+) -> None:
+    """Map a plant of several joints, with the options that were typed."""
+    from pendulum_bags.studies.joint_monte_carlo import joint_shares
+    from pendulum_bags.studies.joint_region import JointRegion, run_joint_region
+    from pendulum_bags.studies.region_figure import joint_region_sentence, write_joint_region_figure
+
+    given, plant = context.params, context.params["plant"]
+    if typed := typed_options(context, _OF_ONE_JOINT):
+        raise ParameterError(f"{typed[0]} is for a plant of one joint, and {plant} has several: its own LQR holds it")
+    told = given["uncertainty"] if typed_options(context, {"uncertainty"}) else "0.05"
+    names = ("plants", "points", "duration", "seed")
+    chosen = {name: given[name] for name in names if typed_options(context, {name})}
+    both = tuple(part.strip() for part in axes.split(",") if part.strip())
+    settings = JointRegion(plant=plant, axes=both, spans=spans, shares=joint_shares(told, plant), **chosen)
+    started = time.monotonic()
+    with counted_progress(console, "chunks", settings.chunks, folder) as on_progress:
+        result = run_joint_region(folder, settings, connect=connect, on_progress=on_progress)
+    picture = write_joint_region_figure(folder / "region.png", result)
+    if json_output:
+        print(json.dumps(result.to_json(), indent=2))
+        return
+    console.print(joint_region_sentence(result))
     elapsed = time.monotonic() - started
     console.print(f"\npicture {picture}\nmap     {folder / 'map.parquet'}\n({elapsed:.0f} s)", soft_wrap=True)
