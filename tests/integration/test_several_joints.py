@@ -263,9 +263,10 @@ SIMULATOR, CONTROLLER, DISTURBANCE, BRIDGE = (
         (CONTROLLER, ("plant:=acrobot", "q:=[1.0, 2.0]"), "q has the shape (2,); expected (4,)"),
         (
             BRIDGE,
-            ("plant:=acrobot", "backend:=hebi"),
-            "backend 'hebi' has one module, and plant 'acrobot' has the joints shoulder, elbow; expected",
+            ("plant:=acrobot", "backend:=replay", "replay_file:=none"),
+            "backend 'replay' has one module, and plant 'acrobot' has the joints shoulder, elbow; expected",
         ),
+        (BRIDGE, ("plant:=cart_pole", "backend:=hebi"), "joint 'cart' slides, and a module of backend 'hebi' turns"),
         (BRIDGE, ("plant:=acrobto",), "acrobto"),
         (DISTURBANCE, ("joints:=[elbow, elbow]",), "joints is ['elbow', 'elbow']; expected names, each once"),
     ],

@@ -25,7 +25,7 @@ def test_each_joint_has_its_own_values_and_what_upright_means_for_it() -> None:
     values.take_effort("command", _efforts(("elbow",), 2.5), 1.0)
     picture = values.picture(1.1)
     shoulder, elbow = picture["joints"]
-    assert picture["chain"] is True
+    assert (picture["chain"], picture["cart"]) == (True, False)
     assert shoulder == {
         "name": "shoulder", "unit": "rad", "goal": math.pi, "theta": 3.0, "theta_dot": 0.5, "measured": 0.0,
     }  # fmt: skip
@@ -34,20 +34,19 @@ def test_each_joint_has_its_own_values_and_what_upright_means_for_it() -> None:
 
 
 @pytest.mark.parametrize(
-    ("joints", "unit", "goal", "chain"),
+    ("joints", "unit", "goal", "cart"),
     [
         (("pendulum_joint",), "rad", math.pi, False),
-        (("cart", "pole"), "m", 0.0, False),
+        (("cart", "pole"), "m", 0.0, True),
         (("hip", "knee", "ankle"), "rad", 0.0, False),
     ],
 )
-def test_only_known_mechanisms_say_what_upright_is(
-    joints: tuple[str, ...], unit: str, goal: float, chain: bool
-) -> None:
+def test_only_known_mechanisms_say_what_upright_is(joints: tuple[str, ...], unit: str, goal: float, cart: bool) -> None:
     values = JointValues()
     values.take_state(_state(joints, *(0.0 for _ in joints)))
     picture = values.picture(0.0)
-    assert (picture["joints"][0]["unit"], picture["joints"][0]["goal"], picture["chain"]) == (unit, goal, chain)
+    assert (picture["joints"][0]["unit"], picture["joints"][0]["goal"]) == (unit, goal)
+    assert (picture["chain"], picture["cart"]) == (False, cart)
 
 
 def test_an_effort_without_a_name_is_for_the_one_joint() -> None:

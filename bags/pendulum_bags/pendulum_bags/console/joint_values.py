@@ -14,6 +14,7 @@ __all__ = ["JointValues"]
 _FRESH = 0.3
 """Age at which a torque counts as no longer sent [s]; plants take none that is older than 0.05 s."""
 _CHAIN = MECHANISMS["double_pendulum"]
+_CART = MECHANISMS["cart_pole"]
 
 
 class JointValues:
@@ -64,8 +65,8 @@ class JointValues:
             # JSON has no word for what is not finite: a page could read nothing more of the plant, nor of any other.
             values = {key: value for key, value in {**self._states[joint.name], **efforts}.items() if isfinite(value)}
             joints.append({"name": joint.name, "unit": joint.unit, "goal": joint.goal, **values})
-        # Links that hang on each other, each angle from the link before: only of these the whole can be drawn.
-        return {"joints": joints, "chain": self._joints == _CHAIN.joints}
+        # Links that hang on each other, each angle from the link before, or a pole on a cart: these are drawn whole.
+        return {"joints": joints, "chain": self._joints == _CHAIN.joints, "cart": self._joints == _CART.joints}
 
 
 def _joints(names: tuple[str, ...]) -> tuple[Joint, ...]:

@@ -307,12 +307,14 @@
     c.setLineDash([]);
     names.forEach((name, index) => {
       const plant = state.plants[name];
-      // What slides has no angle to draw; its position is in the lines.
-      if (!plant || plant.theta === undefined || plant.unit === "m") return;
+      // What slides has no angle to draw, but for a cart with its pole; its position is in the lines.
+      if (!plant || plant.theta === undefined || (plant.unit === "m" && !plant.cart)) return;
       const colour = COLOURS[index % COLOURS.length];
       // One link, or links that hang on each other, as long together as the one.
-      const links = plant.chain ? plant.joints.map((joint) => joint.theta) : [plant.theta];
-      const points = [[x, y]];
+      const links = plant.chain ? plant.joints.map((joint) => joint.theta) : [plant.cart ? plant.joints[1].theta : plant.theta];
+      // A metre of the rail is as long as the pole, and the rail as long as the picture is wide.
+      const foot = plant.cart ? Math.max(30, Math.min(width - 30, x + length * plant.joints[0].theta)) : x;
+      const points = [[foot, y]];
       links.reduce((angle, turn) => {
         const at = points[points.length - 1], all = angle + turn;
         points.push([at[0] + length / links.length * Math.sin(all), at[1] + length / links.length * Math.cos(all)]);
@@ -324,13 +326,19 @@
       c.setLineDash(stale ? [5, 5] : []);
       c.strokeStyle = c.fillStyle = colour;
       c.lineWidth = 7 - 3 * index;
-      c.beginPath(); c.moveTo(x, y); points.slice(1).forEach(([px, py]) => c.lineTo(px, py)); c.stroke();
+      if (plant.cart) {
+        c.fillRect(foot - 26 + 3 * index, y - 9 + 2 * index, 52 - 6 * index, 18 - 4 * index);
+        c.lineWidth = 1;
+        c.beginPath(); c.moveTo(0, y + 12); c.lineTo(width, y + 12); c.stroke();
+        c.lineWidth = 7 - 3 * index;
+      }
+      c.beginPath(); c.moveTo(foot, y); points.slice(1).forEach(([px, py]) => c.lineTo(px, py)); c.stroke();
       points.slice(1, -1).forEach(([px, py]) => { c.beginPath(); c.arc(px, py, 6, 0, 7); c.fill(); });
       c.beginPath(); c.arc(bx, by, 13 - 2 * index, 0, 7);
       if (index) { c.lineWidth = 3; c.stroke(); } else c.fill();
       // Torques as arcs about the axis: 13 N m are three quarters of a turn; applied outside, disturbance inside.
       [[plant.applied, 34 + 14 * index, colour], [plant.disturbance, 27 + 14 * index, ink("--faint")]].forEach(([effort, radius, stroke]) => {
-        if (!effort) return;
+        if (!effort || plant.cart) return;
         const turn = 1.5 * Math.PI * Math.max(-1, Math.min(1, effort / 13));
         c.strokeStyle = stroke; c.lineWidth = 4;
         c.beginPath(); c.arc(x, y, radius, -Math.PI / 2, -Math.PI / 2 - turn, turn > 0); c.stroke();
@@ -339,7 +347,7 @@
       c.setLineDash([]);
     });
     c.fillStyle = ink("--ink");
-    c.beginPath(); c.arc(x, y, 4, 0, 7); c.fill();
+    if (names.some((name) => !state.plants[name]?.cart)) { c.beginPath(); c.arc(x, y, 4, 0, 7); c.fill(); }
   }
 
   // The lines are on a tape, a ring of pixel columns: what is new is drawn at its end, and a picture copies the last SPAN

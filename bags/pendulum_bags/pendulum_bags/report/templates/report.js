@@ -195,7 +195,8 @@
 
     const step = (now) => {
       if (started === null) return;
-      frame = Math.min(last, Math.floor((now - started) / 1000 / tracks.period));
+      // A picture bears the time at which the browser began it, which may lie before the press of the button.
+      frame = Math.max(0, Math.min(last, Math.floor((now - started) / 1000 / tracks.period)));
       seek.value = frame;
       draw();
       if (frame < last) requestAnimationFrame(step);
