@@ -36,6 +36,7 @@ from pendulum_msgs_py.plants.mechanism_parameters import MechanismParameters, lo
 from pendulum_msgs_py.plants.plant_differences import AnyPlant
 from pendulum_msgs_py.plants.plant_parameters import load_plant
 from tests.benchmarks import Peer, Row, measured
+from tests.benchmarks.emulated_trials import emulated_trials
 
 __all__ = ["rows"]
 
@@ -67,6 +68,7 @@ def rows() -> Iterator[Row]:
     with tempfile.TemporaryDirectory(prefix="pendulum_learn_") as folder:
         yield from _pendulum_v1(Path(folder) / "v1.npz")
         yield from _swing_up(Path(folder) / "dfki.npz")
+        yield from _emulated(Path(folder) / "dfki.npz", Path(folder) / "emulated")
         yield from _cart_pole(Path(folder) / "cart.npz")
         for plant, name in ((load_plant("dfki"), "dfki"), (load_mechanism("cart_pole"), "cart")):
             yield from _stand_ins(plant, Path(folder) / f"{name}.npz", Path(folder) / f"{name}_bare.npz")
@@ -110,6 +112,13 @@ def _swing_up(out: Path) -> Iterator[Row]:
     median, p99 = np.percentile(times, [50, 99])
     yield measured("policy of 64 x 64: time per answer, median", float(median), "us", at_most=20.0,
                    note=f"p99 {p99:.3g} us")  # fmt: skip
+
+
+def _emulated(out: Path, folder: Path) -> Iterator[Row]:
+    ends = list(emulated_trials(folder, out, "dfki", 20))
+    yield measured("dfki: upright at the end on an emulated drive, any start, kicks, parameters off by 25 %",
+                   sum(end <= 0.3 for end in ends), f"of {len(ends)}", at_least=len(ends),
+                   note=f"over DDS in lockstep; at most {max(ends):.3f} rad off in the last second")  # fmt: skip
 
 
 def _cart_pole(out: Path) -> Iterator[Row]:
