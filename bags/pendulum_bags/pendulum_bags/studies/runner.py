@@ -51,8 +51,11 @@ class StudyProgress:
 
 
 def default_workers(study: Study) -> int:
-    """Return how many runs to carry out at once: one where they keep the wall's time, else one for two cores."""
-    return 1 if study.realtime or any(run.lab for run in study.runs) else max(1, (os.cpu_count() or 2) // 2)
+    """Return how many runs to carry out at once: one where they keep the wall's time, else one a core.
+
+    The nodes of a run wait for each other, so that one run leaves half of two cores idle.
+    """
+    return 1 if study.realtime or any(run.lab for run in study.runs) else max(1, os.cpu_count() or 1)
 
 
 def open_study_folder(folder: Path, study: Study) -> Study:

@@ -32,7 +32,9 @@ Out = Annotated[
 ]
 Workers = Annotated[
     int,
-    typer.Option(help="Runs at once, each in a ROS domain of its own; 0: one for two cores.", min=0, max=256),
+    typer.Option(
+        help="Runs at once, each in a ROS domain of its own; 0: one a core, one alone in real time.", min=0, max=256
+    ),
 ]
 Retry = Annotated[bool, typer.Option("--retry-failed", help="Carry out again the runs that failed.")]
 DryRun = Annotated[bool, typer.Option("--dry-run", help="Show matrix, time and disk that it needs; run nothing.")]
