@@ -228,3 +228,23 @@ def test_a_design_that_is_none_is_refused_before_anything_runs(
     said = capsys.readouterr().err
     assert "with 4 numbers for q or k, for shoulder, elbow, shoulder_dot, elbow_dot" in said
     assert not (tmp_path / "run").exists()
+
+
+def test_a_plant_that_falls_under_the_multisine_alone_has_its_first_layer(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    from pendulum_bags.comparison import compare_cli
+    from pendulum_bags.experiments.experiment_cli import main
+    from pendulum_bags.frequency_response import joint_experiment
+
+    def falls(*_: Any, **__: Any) -> None:
+        raise FaultError("both sides failed: the simulation fell after 3.2 s")
+
+    compared: list[list[Path]] = []
+    monkeypatch.setattr(joint_run, "record_joints", lambda *_, **__: None)
+    monkeypatch.setattr(joint_experiment, "measure_joints", falls)
+    monkeypatch.setattr(compare_cli, "compare", lambda folders, **_: compared.append(folders))
+    assert main(["joints", "--plant", "pendubot", "--out", str(tmp_path / "run")]) == 0
+    assert compared == [[tmp_path / "run"]]
+    said = " ".join(capsys.readouterr().out.split())
+    assert "The frequencies were not measured: both sides failed: the simulation fell after 3.2 s" in said

@@ -10,7 +10,7 @@ import typer
 
 from pendulum_bags.comparison.compare_cli import MarginOption, MarginsFile
 from pendulum_bags.experiments.progress import PhaseProgress
-from pendulum_msgs_py.errors import ParameterError
+from pendulum_msgs_py.errors import DataError, FaultError, ParameterError
 from pendulum_msgs_py.programs.executables import EXIT_INTERRUPTED
 from pendulum_msgs_py.programs.options import Json, Storage, out_option
 from pendulum_msgs_py.programs.terminal import make_console
@@ -140,15 +140,19 @@ def joints(
                 folder, settings, made, on_side=lambda side: progress.phase(side, expected), on_wait=progress.refresh
             )
             if measured:
-                analysis = measure_joints(
-                    folder,
-                    multisine,
-                    made,
-                    design or (),
-                    on_side=lambda side: progress.phase(f"{side}, multisine", longer),
-                    on_analysis=lambda what: progress.phase(what, 0.5 * _ANALYSING),
-                    on_wait=progress.refresh,
-                )
+                try:
+                    analysis = measure_joints(
+                        folder,
+                        multisine,
+                        made,
+                        design or (),
+                        on_side=lambda side: progress.phase(f"{side}, multisine", longer),
+                        on_analysis=lambda what: progress.phase(what, 0.5 * _ANALYSING),
+                        on_wait=progress.refresh,
+                    )
+                except (FaultError, DataError) as error:
+                    # What was recorded under the noise has its answer all the same.
+                    console.print(f"The frequencies were not measured: {error}", style="yellow", soft_wrap=True)
             if rank_seeds:
                 found = rank_joints(
                     folder / RANKING,
