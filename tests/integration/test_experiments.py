@@ -17,6 +17,7 @@ import pytest
 
 from pendulum_bags.experiments import lockstep
 from pendulum_bags.experiments.conductor_node import Conductor, PlantClient
+from pendulum_bags.experiments.host_pool import HostPool
 from pendulum_bags.experiments.in_process import simulate
 from pendulum_bags.experiments.run_spec import RunSpec
 from pendulum_bags.experiments.settings import NoiseSettings, RegulationSettings
@@ -51,13 +52,22 @@ def test_lockstep_runs_of_the_emulated_hardware_with_one_seed_are_identical(
     # A bridge offers its services before its emulator is compiled, half a minute on a busy machine the first time, and
     # is waited for as long as any start. Here a call that does not say how long it waits waits for nothing.
     monkeypatch.setattr(Conductor.call, "__defaults__", (0.0,))
-    settings = RegulationSettings(noise=NoiseSettings(seed=5, duration=1.0))
-    lockstep.run_lockstep(tmp_path / "second", settings, side="hw", domain=domain_id)
-    first, second, other = (read_bag(tmp_path / name) for name in ("first", "second", "other"))
+    spec = lockstep.lockstep_spec(RegulationSettings(noise=NoiseSettings(seed=5, duration=1.0)), side="hw")
+    hosts_after = []
+    # In one domain: what is left of the first run would be counted among those who hear the second.
+    with HostPool() as hosts:
+        for name in ("second", "in_the_same_processes"):
+            lockstep.record_run(tmp_path / name, spec, domain=domain_id, hosts=hosts)
+            hosts_after.append({child.pid for child in psutil.Process().children()})
+    assert hosts_after[0] == hosts_after[1]
+    assert len(hosts_after[0]) == 4
+    names = ("first", "second", "in_the_same_processes", "other")
+    first, second, third, other = (read_bag(tmp_path / name) for name in names)
     topics = ["joint_states", "effort_command", "disturbance", "applied_effort", "actuator/feedback"]
     topics = [f"/hw/{topic}" for topic in topics] + ["/clock"]
 
     assert same_messages(first, second, topics=topics)
+    assert same_messages(first, third, topics=topics)
     assert not same_messages(first, other, topics=topics)
     states = first["/hw/joint_states"]
     assert len(states) == 101
@@ -70,20 +80,20 @@ def test_a_lockstep_run_is_waited_for_as_long_as_it_goes_on_and_no_longer(
     waits: list[str] = []
     wait_for = Conductor.wait_for
 
-    def noted(conductor: Conductor, what: str, *arguments: Any) -> Any:
+    def noted(conductor: Conductor, what: str, *arguments: Any, **more: Any) -> Any:
         waits.append(what)
-        return wait_for(conductor, what, *arguments)
+        return wait_for(conductor, what, *arguments, **more)
 
     monkeypatch.setattr(Conductor, "wait_for", noted)
-    settings = RegulationSettings(noise=NoiseSettings(duration=5.0, hold_time=0.002))
+    monkeypatch.setattr(lockstep, "_PATIENCE", 0.5)
+    settings = RegulationSettings(noise=NoiseSettings(duration=10.0, hold_time=0.002))
     lockstep.run_lockstep(tmp_path / "whole", settings)
-    more = "10 more states of a run of 5 s of simulated time"
-    # Many waits for a part of the 2501 states each, so that patience counts from the last of them.
-    assert waits.count(more) >= 5
+    # Patience counts from the last look; the run takes more than three times as long as it.
+    assert waits.count("the end of a run of 10 s of simulated time") >= 3
 
     def freeze() -> None:
-        if "10 more states of a run of 20 s of simulated time" in waits:
-            monkeypatch.setattr(lockstep, "START_TIMEOUT", 2.0)
+        if "the end of a run of 20 s of simulated time" in waits:
+            monkeypatch.setattr(lockstep, "_PATIENCE", 2.0)
             for one in psutil.Process().children(recursive=True):
                 if "simulator" in one.cmdline():
                     one.suspend()

@@ -242,8 +242,11 @@ def _listen_for_stop_signals() -> socket.socket:
     """
     reader, writer = socket.socketpair()
     writer.setblocking(False)
-    _KEPT_OPEN.append(writer)
     signal.set_wakeup_fd(writer.fileno(), warn_on_full_buffer=False)
+    # Those of a node that ran in this process before: their thread ends.
+    while _KEPT_OPEN:
+        _KEPT_OPEN.pop().close()
+    _KEPT_OPEN.append(writer)
     for stop_signal in _STOP_SIGNALS:
         signal.signal(stop_signal, lambda _number, _frame: None)
     return reader
@@ -251,21 +254,26 @@ def _listen_for_stop_signals() -> socket.socket:
 
 def _watch_signals(signals: socket.socket, stop: Callable[[], None]) -> None:
     first = _next_stop_signal(signals)
+    if not first:
+        return
     stop()
     # A launcher passes on the Ctrl-C that the terminal has sent already: only a later one is a second wish.
     patience_ends = time.monotonic() + _ECHO_TIME
     second = _next_stop_signal(signals)
-    while time.monotonic() < patience_ends:
+    while second and time.monotonic() < patience_ends:
         second = _next_stop_signal(signals)
+    if not second:
+        return
     print(f"second {signal.Signals(second).name}: leaving at once", file=sys.stderr, flush=True)
     os._exit(128 + first)
 
 
 def _next_stop_signal(signals: socket.socket) -> int:
-    while True:
-        number = signals.recv(1)[0]
-        if number in _STOP_SIGNALS:
-            return number
+    """Return the number of the next stop signal; 0 when there will be none, since the node has ended."""
+    while number := signals.recv(1):
+        if number[0] in _STOP_SIGNALS:
+            return number[0]
+    return 0
 
 
 def _help(program: str, description: str, specs: Iterable[ParameterSpec], example: str) -> str:

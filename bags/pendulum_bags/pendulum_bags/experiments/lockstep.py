@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, Protocol
 
-from pendulum_bags.experiments.conductor_node import Conductor, PlantClient
+from pendulum_bags.experiments.conductor_node import Conductor, PlantClient, RecorderClient
 from pendulum_bags.experiments.domain import reserve_domain
+from pendulum_bags.experiments.host_pool import HostPool
 from pendulum_bags.experiments.run_spec import RunSpec
 from pendulum_bags.experiments.session import LOOP_NICENESS, START_TIMEOUT, Session, conduct, refuse_existing
 from pendulum_bags.experiments.settings import RegulationSettings
@@ -16,6 +18,7 @@ from pendulum_msgs_py.contract import names
 from pendulum_msgs_py.contract.angles import UPRIGHT
 from pendulum_msgs_py.contract.names import Event
 from pendulum_msgs_py.contract.values import NANOSECONDS
+from pendulum_msgs_py.errors import FaultError
 from pendulum_msgs_py.programs.graph import NodeProgram
 
 __all__ = ["GraphRun", "lockstep_spec", "longest_run", "record_run", "run_lockstep"]
@@ -25,8 +28,10 @@ _LAST_WORDS = 0.2
 _SLOWEST = 60.0
 """Slowest pace at which a lockstep run is expected to end, wall time per simulated time: 45 were seen on two cores that
 ten other programs wanted."""
+_PATIENCE = START_TIMEOUT
+"""Time between two looks at how far a run in lockstep has come [s]."""
 _ALIVE = 10
-"""States that must come within ``START_TIMEOUT``; less is no slow run but one that stands still."""
+"""States that must come between two looks; less is no slow run but one that stands still."""
 _LISTENERS = 3
 """Those who hear the plant's states: controller, disturbance, recorder. The conductor makes one more."""
 _RUN_LISTENERS = {
@@ -138,7 +143,12 @@ class GraphRun(Protocol):
 
 
 def record_run(
-    bag: Path, spec: GraphRun, *, domain: int | None = None, on_wait: Callable[[], None] = lambda: None
+    bag: Path,
+    spec: GraphRun,
+    *,
+    domain: int | None = None,
+    on_wait: Callable[[], None] = lambda: None,
+    hosts: HostPool | None = None,
 ) -> Path:
     """Carry out one run over DDS, in lockstep or in real time as it says, and record it.
 
@@ -147,6 +157,7 @@ def record_run(
         spec: What to run.
         domain: ROS domain, or None for any free one.
         on_wait: Called while waiting.
+        hosts: Run the programs of a run in lockstep, and those of the next; without them each is a process of its own.
 
     Raises:
         BagError: The bag exists.
@@ -156,7 +167,7 @@ def record_run(
     namespace, simulated = spec.namespace, spec.simulated_time
     with (
         reserve_domain(domain) as reserved,
-        conduct(bag.parent / "logs" / bag.name, reserved, on_wait) as session,
+        conduct(bag.parent / "logs" / bag.name, reserved, on_wait, hosts=hosts if simulated else None) as session,
     ):
         recorder = session.record(bag, namespace, spec.metadata(), spec.storage, simulated=simulated)
         program = spec.plant_program(_LISTENERS + 1)
@@ -207,13 +218,22 @@ def _has_reached(plant: PlantClient, end_ns: int) -> bool:
 
 def _wait_for_end(conductor: Conductor, plant: PlantClient, duration: float) -> None:
     """Wait for the end of a run in lockstep, however slow a busy machine makes it, as long as it goes on."""
+    conductor.wait_for("the first state", lambda: plant.sample is not None or _is_finished(plant), START_TIMEOUT)
+    plant.look_away()
+    recorder, received = RecorderClient(conductor, plant.namespace), 0
+    states = f"{plant.namespace}/{names.JOINT_STATES}"
     while not _is_finished(plant):
-        enough = plant.states + _ALIVE
+        ends = time.monotonic() + _PATIENCE
         conductor.wait_for(
-            f"{_ALIVE} more states of a run of {duration:g} s of simulated time",
-            lambda enough=enough: plant.states >= enough or _is_finished(plant),  # type: ignore[misc]
-            START_TIMEOUT,
+            f"the end of a run of {duration:g} s of simulated time",
+            lambda ends=ends: _is_finished(plant) or time.monotonic() >= ends,  # type: ignore[misc]
+            2.0 * _PATIENCE,
         )
+        before, received = received, recorder.received(states)
+        if received < before + _ALIVE and not _is_finished(plant):
+            raise FaultError(
+                f"waited {_PATIENCE:g} s for {_ALIVE} more states of a run of {duration:g} s of simulated time, in vain"
+            )
 
 
 def _is_finished(plant: PlantClient) -> bool:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import ctypes
 import os
 import re
 import signal
@@ -14,13 +13,15 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from types import TracebackType
+from typing import Protocol
 
+from pendulum_bags.experiments.bound_process import start_bound_process
+from pendulum_bags.experiments.host_pool import HostPool
 from pendulum_msgs_py.errors import FaultError
 from pendulum_msgs_py.programs.graph import NodeProgram
 
 __all__ = ["Child", "ProcessSet", "ros_environment", "start_recorder"]
 
-_PR_SET_PDEATHSIG = 1
 _RECORDER_NICENESS = -5
 """Priority of a recorder, where we may take it: behind those who keep deadlines, ahead of all else on the machine.
 
@@ -49,12 +50,33 @@ def _busy_note(words: str) -> str:
     )
 
 
+class RunningProgram(Protocol):
+    """What is asked of a program that was started, as of a ``subprocess.Popen``."""
+
+    @property
+    def pid(self) -> int:
+        """Process that it runs in, the leader of a group."""
+
+    @property
+    def returncode(self) -> int | None:
+        """Exit code, negative for a signal that ended it; None as long as nobody has seen it end."""
+
+    def poll(self) -> int | None:
+        """Return the exit code, None while it runs."""
+
+    def wait(self, timeout: float | None = None) -> int:
+        """Wait for the exit code, for a time at most [s]."""
+
+    def send_signal(self, number: int, /) -> None:
+        """Send a signal to it, if it still runs."""
+
+
 @dataclass
 class Child:
     """One running program."""
 
     name: str
-    process: subprocess.Popen[bytes]
+    process: RunningProgram
     log: Path
     ends_last: bool = False
     ends_by_itself: bool = False
@@ -79,10 +101,12 @@ class ProcessSet:
     Args:
         log_folder: One log file per program goes here.
         environment: Variables to add, such as the ROS domain.
+        hosts: Processes that run programs of ours one after the other; without them each has its own.
     """
 
     log_folder: Path
     environment: Mapping[str, str]
+    hosts: HostPool | None = None
     children: list[Child] = field(default_factory=list)
 
     def __enter__(self) -> ProcessSet:
@@ -116,8 +140,11 @@ class ProcessSet:
         ends_by_itself: bool = False,
         niceness: int = 0,
         environment: Mapping[str, str] | None = None,
+        alone: bool = False,
     ) -> Child:
         """Start a command in a process group of its own, so that Ctrl-C reaches it through us, in order.
+
+        Where there are hosts and the command is a program of ours, one of them runs it.
 
         Args:
             name: For messages and the log file.
@@ -126,34 +153,16 @@ class ProcessSet:
             ends_by_itself: Ending with code 0 is what it is for.
             niceness: Scheduling priority to give away, or to take where it is negative and permitted.
             environment: Variables to add for this one.
+            alone: Give it a process of its own, hosts or not.
         """
-        parent = os.getpid()
-        libc = ctypes.CDLL(None, use_errno=True)
-
-        def prepare() -> None:
-            # SIGINT: a child of a killed experiment ends as after Ctrl-C, plants at zero torque, bags closed.
-            libc.prctl(_PR_SET_PDEATHSIG, signal.SIGINT)
-            if os.getppid() != parent:
-                os._exit(1)
-            # Taking priority is a privilege; without it the run is as good as the machine is idle.
-            with contextlib.suppress(PermissionError):
-                os.nice(niceness)
-            # Where Linux shares the cores among sessions first (autogroup), a session stays behind as a whole.
-            if (now := os.getpriority(os.PRIO_PROCESS, 0)) > 0:
-                with contextlib.suppress(OSError):
-                    Path("/proc/self/autogroup").write_text(str(now), encoding="ascii")
-
         log = self.log_folder / f"{name}.log"
+        everything = {**os.environ, **self.environment, **(environment or {})}
+        process: RunningProgram | None = None
         with log.open("wb") as sink:
-            process = subprocess.Popen(
-                list(command),
-                stdin=subprocess.DEVNULL,
-                stdout=sink,
-                stderr=subprocess.STDOUT,
-                env={**os.environ, **self.environment, **(environment or {})},
-                start_new_session=True,
-                preexec_fn=prepare,  # noqa: PLW1509  # prctl and priorities only; no lock is taken between fork and exec
-            )
+            if self.hosts is not None and not alone:
+                process = self.hosts.start(command, environment=everything, log=log, niceness=niceness)
+            if process is None:
+                process = start_bound_process(command, environment=everything, output=sink, niceness=niceness)
         child = Child(name, process, log, ends_last, ends_by_itself)
         self.children.append(child)
         return child
@@ -223,7 +232,7 @@ class ProcessSet:
                 break
             with contextlib.suppress(subprocess.TimeoutExpired):
                 child.process.wait(0.05)
-        return int(child.process.returncode)
+        return int(child.process.wait())
 
 
 def ros_environment(domain: int, log_folder: Path) -> dict[str, str]:

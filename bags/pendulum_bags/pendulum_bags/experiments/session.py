@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from pendulum_bags.experiments.conductor_node import Conductor, PlantClient, RecorderClient
+from pendulum_bags.experiments.host_pool import HostPool
 from pendulum_bags.experiments.processes import Child, ProcessSet, ros_environment, start_recorder
 from pendulum_bags.runs.run_folder import write_json
 from pendulum_msgs_py.contract import names
@@ -77,8 +78,8 @@ class Session:
             FaultError: Messages were lost.
         """
         # The clock ticks once for each state, and neither topic waits for the other.
-        for topic in (f"{plant.namespace}/{names.JOINT_STATES}", names.CLOCK):
-            RecorderClient(self.conductor, plant.namespace).wait_for_all(topic, states)
+        topics = (f"{plant.namespace}/{names.JOINT_STATES}", names.CLOCK)
+        RecorderClient(self.conductor, plant.namespace).wait_for_all(topics, states)
         self.close(recorder)
 
     def drives(self, *plants: PlantClient) -> None:
@@ -123,7 +124,9 @@ class Session:
 
 
 @contextmanager
-def conduct(logs: Path, domain: int, on_wait: Callable[[], None] = lambda: None) -> Iterator[Session]:
+def conduct(
+    logs: Path, domain: int, on_wait: Callable[[], None] = lambda: None, *, hosts: HostPool | None = None
+) -> Iterator[Session]:
     """Join the graph to carry out one run; leaving it ends all its programs, recorders last.
 
     The phases of the run are its caller's. Whatever breaks them off disarms what the session drives, at once.
@@ -132,12 +135,13 @@ def conduct(logs: Path, domain: int, on_wait: Callable[[], None] = lambda: None)
         logs: Folder of the programs' logs.
         domain: ROS domain.
         on_wait: Called while waiting, to show progress.
+        hosts: Run its programs, and those of other runs; without them each is a process of its own.
 
     Raises:
         FaultError: The folder cannot be made; or, out of any wait, a program ended by itself.
     """
     with (
-        ProcessSet(logs, ros_environment(domain, logs)) as processes,
+        ProcessSet(logs, ros_environment(domain, logs), hosts) as processes,
         Conductor(domain, watch=processes.check, on_wait=on_wait) as conductor,
     ):
         session = Session(processes, conductor, logs)

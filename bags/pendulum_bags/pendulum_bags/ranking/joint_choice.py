@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from pendulum_bags.experiments.host_pool import HostPool
 from pendulum_bags.experiments.joint_run import JointRun, JointSettings, design_file, fall_time
 from pendulum_bags.experiments.lockstep import record_run
 from pendulum_bags.frequency_response.joint_designs import JointDesign
@@ -108,20 +109,22 @@ def rank_joints(
     folder.mkdir(parents=True, exist_ok=True)
     linearised = design_file(folder, plant)
     costs: dict[str, dict[str, list[tuple[int, Array | None]]]] = {}
-    for number, design in enumerate(designs, 1):
-        assert design.weights is not None
-        tuning: dict[str, Any] = {"q": list(design.weights[0]), "r": design.weights[1]}
-        rows = costs.setdefault(design.name, {"sim": [], "hw": []})
-        for seed in seeds:
-            own = replace(settings, seed=seed, duration=min(settings.duration, DURATION))
-            for side, runs in (("sim", settings.plant), ("hw", str(machine))):
-                on_run(f"design {number} of {len(designs)}, {side}")
-                bag = folder / f"design_{number}_seed_{seed}" / side
-                run = JointRun(own, side, runs, linearised, tuning=tuning)
-                try:
-                    record_run(bag, run, on_wait=on_wait)
-                except PlantStoppedError:
-                    rows[side].append((seed, None))
-                else:
-                    rows[side].append((seed, joint_cost_parts(bag, run.namespace, plant)))
+    # Four programs a run: started once, not for each design and seed.
+    with HostPool() as hosts:
+        for number, design in enumerate(designs, 1):
+            assert design.weights is not None
+            tuning: dict[str, Any] = {"q": list(design.weights[0]), "r": design.weights[1]}
+            rows = costs.setdefault(design.name, {"sim": [], "hw": []})
+            for seed in seeds:
+                own = replace(settings, seed=seed, duration=min(settings.duration, DURATION))
+                for side, runs in (("sim", settings.plant), ("hw", str(machine))):
+                    on_run(f"design {number} of {len(designs)}, {side}")
+                    bag = folder / f"design_{number}_seed_{seed}" / side
+                    run = JointRun(own, side, runs, linearised, tuning=tuning)
+                    try:
+                        record_run(bag, run, on_wait=on_wait, hosts=hosts)
+                    except PlantStoppedError:
+                        rows[side].append((seed, None))
+                    else:
+                        rows[side].append((seed, joint_cost_parts(bag, run.namespace, plant)))
     return rank(contenders_of(costs))

@@ -14,6 +14,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
+from pendulum_bags.experiments.host_pool import HostPool
 from pendulum_bags.experiments.processes import Child, ProcessSet
 from pendulum_bags.runs.run_folder import write_json
 from pendulum_bags.studies.records import read_record
@@ -149,7 +150,11 @@ def run_study(
     pace = _Pace(waiting, workers)
     running: list[_Running] = []
     # Runs in one process hold the interpreter, but only for tenths of a second; nodes are processes of their own.
-    with ProcessSet(folder / "logs", {}) as processes, ThreadPoolExecutor(1) as threads:
+    with (
+        HostPool() as hosts,
+        ProcessSet(folder / "logs", {}, hosts) as processes,
+        ThreadPoolExecutor(1) as threads,
+    ):
         try:
             while waiting or running:
                 while waiting and len(running) < workers:
@@ -227,7 +232,9 @@ def _start(folder: Path, run: StudyRun, processes: ProcessSet, threads: ThreadPo
         command += ["run", str(place / "spec.json"), "--bag", str(place / "bag")]
     # Each finds a free domain: one that is set in our environment would be the same for all.
     environment = {"ROS_DOMAIN_ID": ""}
-    item.child = processes.start(run.name, command, ends_by_itself=True, environment=environment)
+    # What is hosted once must go well a hundred times; a machine, or an experiment of several runs, starts afresh.
+    alone = run.spec is None or not run.spec.simulated_time
+    item.child = processes.start(run.name, command, ends_by_itself=True, environment=environment, alone=alone)
     return item
 
 

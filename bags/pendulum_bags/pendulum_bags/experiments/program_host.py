@@ -1,0 +1,113 @@
+"""A process that runs programs of ours one after the other, so that a hundred runs load Python's modules once.
+
+To start a node takes half a second of a processor, nearly all of it to load numpy, numba and rclpy; to make and destroy
+the node takes a sixteenth of that. ``python -m pendulum_bags.experiments.program_host DESCRIPTOR`` takes orders, a line
+of JSON each, from the socket with that number, and answers each with a line when its program has ended. A program sees
+what it would see alone: its own variables, output and signals, a fresh ROS context, exit codes. The host ends when its
+socket does.
+
+:mod:`pendulum_bags.experiments.host_pool` is the other side.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import gc
+import json
+import os
+import signal
+import socket
+import sys
+import threading
+import traceback
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+from pendulum_bags.experiments.host_pool import AGAIN, BEGUN, LAST, HostPool, keep_pool
+from pendulum_msgs_py.programs.executables import EXIT_USAGE, run_package
+
+__all__ = ["main"]
+
+_TASKS = Path("/proc/self/task")
+_MOST_PROGRAMS = 200
+"""Programs after which a host makes place for another: what the middleware keeps of each adds up."""
+
+
+def main() -> int:
+    """Take orders until there are none."""
+    if len(sys.argv) != 2 or not sys.argv[1].isdigit():
+        print("error: a program host is started by the experiments; expected the number of a socket", file=sys.stderr)
+        return EXIT_USAGE
+    # Between two programs nobody is asked to end: the socket tells.
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    with socket.socket(fileno=int(sys.argv[1])) as connection, HostPool() as pool:
+        keep_pool(pool)
+        with connection.makefile("r", encoding="utf-8") as orders:
+            for number, line in enumerate(orders, 1):
+                code = _run(json.loads(line), lambda: connection.sendall(f"{BEGUN}\n".encode()))
+                again = number < _MOST_PROGRAMS and not _left_behind()
+                connection.sendall(f"{code} {AGAIN if again else LAST}\n".encode())
+                if not again:
+                    break
+    return 0
+
+
+def _run(order: Mapping[str, Any], on_begin: Callable[[], None]) -> int:
+    """Run one program with its own variables, output and signals; return its exit code."""
+    os.environ.clear()
+    os.environ.update(order["environment"])
+    _write_to(Path(order["log"]))
+    try:
+        signal.signal(signal.SIGINT, signal.default_int_handler)
+        on_begin()
+        code = run_package(order["package"], order["arguments"])
+    except KeyboardInterrupt:
+        code = 128 + signal.SIGINT
+    except SystemExit as end:
+        code = _exit_code(end)
+    except BaseException:  # noqa: BLE001  # an interpreter that ends by it prints it, too
+        traceback.print_exc()
+        code = 1
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    signal.set_wakeup_fd(-1)
+    signal.signal(signal.SIGTERM, signal.SIG_DFL)
+    sys.stdout.flush()
+    sys.stderr.flush()
+    # Nodes freeze what is there when they start. What is left of them must go now: a node that only the collector would
+    # destroy stays on the graph, and in that domain the next run would count it.
+    gc.unfreeze()
+    gc.collect()
+    return code
+
+
+def _exit_code(end: SystemExit) -> int:
+    if end.code is None or isinstance(end.code, int):
+        return end.code or 0
+    print(end.code, file=sys.stderr)
+    return 1
+
+
+def _write_to(log: Path) -> None:
+    descriptor = os.open(log, os.O_WRONLY | os.O_APPEND | os.O_CREAT, 0o644)
+    for stream in (1, 2):
+        os.dup2(descriptor, stream)
+    os.close(descriptor)
+
+
+def _left_behind() -> bool:
+    """Tell whether a program has left a thread that must end before the process may, or one of the middleware's.
+
+    The middleware names its threads; those of Python have the name of the process.
+    """
+    if any(not thread.daemon for thread in threading.enumerate() if thread is not threading.main_thread()):
+        return True
+    names = set()
+    for name in _TASKS.glob("*/comm"):
+        with contextlib.suppress(OSError):  # it has just ended
+            names.add(name.read_text(encoding="utf-8"))
+    return len(names) > 1
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())
