@@ -94,8 +94,8 @@ imports: $(VENV)/.linked $(VENV)/.checks # Check which package and which module 
 build: $(VENV)/.run $(VENV)/.build # Build the packages with colcon into install/, as for ros2 run
 	@unset PYTHONDONTWRITEBYTECODE; exec $(VENV)/bin/colcon build --base-paths $(PACKAGES) $(ARGS)
 
-faults: venv # Attack the running system, count what it stood, print a table (the long form of tests/faults)
-	@$(PY) -m tests.faults.run $(ARGS)
+faults: venv # Attack the running system, count what it stood, print a table (tests/tools/faults; tests/faults has the short form)
+	@$(PY) -m tests.tools.faults.run $(ARGS)
 
 mutants: venv # Break the safety rules in every small way; fail if no test notices one (build/mutants.md)
 	@$(PY) -m tests.mutants.run $(ARGS)

@@ -127,7 +127,7 @@ def prints_a_table(callback: Any) -> bool:
 def test_all_programs_are_found() -> None:
     found = {line.typed for line in command_lines()}
     assert len(found) > 25
-    for expected in ("pendulum_bags info", "pendulum_bags experiment leaderboard", "tests.faults.run"):
+    for expected in ("pendulum_bags info", "pendulum_bags experiment leaderboard", "tests.tools.faults.run"):
         assert f"python -m {expected}" in found
     assert ("pendulum_sim", "simulator") in nodes()
     assert len(nodes()) + len({typed.split()[2] + typed.split()[3] for typed in found if "tests." not in typed}) == len(

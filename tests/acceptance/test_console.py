@@ -20,11 +20,11 @@ import pytest
 
 from pendulum_bags.console.security import refusal
 from pendulum_bags.verdict.layers import Layer, LayerResult, Mark, sum_up
-from tests.faults import console_stops
-from tests.faults.console_stops import CHROMIUM, QUIET, STOPS, StopRig
 from tests.fixtures import PROJECT, wait_for
 from tests.npm import install_packages
 from tests.processes import ProcessGroup, RunningProgram
+from tests.tools.faults import console_stops
+from tests.tools.faults.console_stops import CHROMIUM, QUIET, STOPS, StopRig
 
 AXE = PROJECT / "tests" / "axe"
 IN_SHORT = (
@@ -39,7 +39,7 @@ IN_SHORT = (
     "stop while the link to the server is cut",
     "stop of one plant alone, by its own button, while it is frozen",
 )
-"""Ways to lose a stop that each run tries once; all of them, 20 times: ``python -m tests.faults.console_stops``."""
+"""Ways to lose a stop, each tried once here; all of them, 20 times: ``python -m tests.tools.faults.console_stops``."""
 STOP_LIMIT_MS = 100.0
 COVERED_BY_NOTICES = """() => {
     const notices = [...document.querySelectorAll(".notices > *, .q-notification")]

@@ -11,8 +11,8 @@ from dataclasses import replace
 import numpy as np
 
 from tests.benchmarks import Row, measured
-from tests.faults.bridge_scenarios import CASES, SCENARIOS, Scenario, run_scenario
-from tests.faults.node_rig import ros_of_its_own
+from tests.tools.faults.bridge_scenarios import CASES, SCENARIOS, Scenario, run_scenario
+from tests.tools.faults.node_rig import ros_of_its_own
 
 __all__ = ["rows"]
 

@@ -23,8 +23,8 @@ from pendulum_bags.studies.monte_carlo import MonteCarlo, run_chunk, run_monte_c
 from pendulum_bags.studies.region_map import RegionMap, run_region_map
 from tests.benchmarks import Row, measured, peer
 from tests.benchmarks.bench_sim import _mujoco_rollout, _numpy_speed
-from tests.faults.delay_margin import find_delay_margin
-from tests.faults.network import why_not
+from tests.tools.faults.delay_margin import find_delay_margin
+from tests.tools.faults.network import why_not
 
 MILLION = 1_000_000
 STUDY = """format: pendulum_study/1

@@ -1,1 +1,1 @@
-"""Attacks on the running system, counted. ``make faults`` runs the long form and prints a table."""
+"""Attacks on the running system, in the short form; the long one, and what both use, is ``tests/tools/faults``."""

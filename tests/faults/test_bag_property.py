@@ -17,7 +17,7 @@ from pendulum_msgs_py.contract.cdr import encode_joint_state
 from pendulum_msgs_py.errors import DataError
 from pendulum_rosbag.storage import open_writer
 from tests.bag_messages import JOINT_STATE, STORE, write_bag
-from tests.faults.bag_property import POSITION_MARK, TorqueRecord, check_bag
+from tests.tools.faults.bag_property import POSITION_MARK, TorqueRecord, check_bag
 
 _BEGIN = 1_700_000_000_000_000_000
 _PERIOD = 10_000_000

@@ -14,8 +14,8 @@ from pendulum_hw_bridge.emulation.faults import ActuatorFault
 from pendulum_hw_bridge.gains import GainSet
 from pendulum_msgs_py.contract.supervisor import Mode
 from pendulum_msgs_py.contract.values import JointCommand
-from tests.faults.bridge_rig import MILLISECOND, Rig
-from tests.faults.node_rig import NodeRig, ros_of_its_own
+from tests.tools.faults.bridge_rig import MILLISECOND, Rig
+from tests.tools.faults.node_rig import NodeRig, ros_of_its_own
 
 KINDS = pytest.mark.parametrize("kind", list(EffortStrategy), ids=lambda kind: kind.value)
 

@@ -20,9 +20,9 @@ from pendulum_msgs_py.contract import names
 from pendulum_msgs_py.contract.supervisor import Mode
 from pendulum_msgs_py.contract.values import JointCommand
 from pendulum_msgs_py.errors import ParameterError
-from tests.faults.bridge_rig import MILLISECOND, Rig
-from tests.faults.bridge_scenarios import CASES, SCENARIOS, Case, Scenario, run_scenario
-from tests.faults.node_rig import NodeRig, ros_of_its_own
+from tests.tools.faults.bridge_rig import MILLISECOND, Rig
+from tests.tools.faults.bridge_scenarios import CASES, SCENARIOS, Case, Scenario, run_scenario
+from tests.tools.faults.node_rig import NodeRig, ros_of_its_own
 
 
 def _tries() -> Iterator[tuple[Scenario, Case]]:

@@ -13,7 +13,7 @@ from pendulum_hw_bridge.effort_mapping import EffortStrategy
 from pendulum_hw_bridge.emulation.faults import ActuatorFault
 from pendulum_msgs_py.contract.supervisor import Mode
 from pendulum_msgs_py.contract.values import JointCommand
-from tests.faults.bridge_rig import MILLISECOND, Rig
+from tests.tools.faults.bridge_rig import MILLISECOND, Rig
 
 KINDS = pytest.mark.parametrize("kind", list(EffortStrategy), ids=lambda kind: kind.value)
 TOLERANCE = 0.15

@@ -9,11 +9,11 @@ from pathlib import Path
 import pytest
 
 from pendulum_bags.experiments.domain import reserve_domain
-from tests.faults.bag_property import check_bag
-from tests.faults.campaign import CAMPAIGN
-from tests.faults.live import EFFORT_LIMIT, LiveSystem
-from tests.faults.outcome import MACHINE_PATIENCE, Fault, try_fault
-from tests.faults.plants import PLANTS
+from tests.tools.faults.bag_property import check_bag
+from tests.tools.faults.campaign import CAMPAIGN
+from tests.tools.faults.live import EFFORT_LIMIT, LiveSystem
+from tests.tools.faults.outcome import MACHINE_PATIENCE, Fault, try_fault
+from tests.tools.faults.plants import PLANTS
 
 
 @pytest.fixture(scope="module")

@@ -13,9 +13,9 @@ from pendulum_hw_bridge.emulation.parameters import load_emulator
 from pendulum_hw_bridge.emulation.truth_log import TruthLog
 from pendulum_hw_bridge.emulation.x5 import EmulatedX5
 from pendulum_msgs_py.errors import PendulumError
-from tests.faults.live import EFFORT_LIMIT
-from tests.faults.motor import ROUNDING, Asked, Drive, ModuleTruth, Witness, beyond_asked, driving_torque
-from tests.faults.outcome import Outcome, demand_limit
+from tests.tools.faults.live import EFFORT_LIMIT
+from tests.tools.faults.motor import ROUNDING, Asked, Drive, ModuleTruth, Witness, beyond_asked, driving_torque
+from tests.tools.faults.outcome import Outcome, demand_limit
 
 MS = 1_000_000
 LIMIT = 5.0

@@ -1,6 +1,6 @@
-"""Plant and controller on two machines, and a cable pulled; ``python -m tests.faults.network`` also for 30 s.
+"""Plant and controller on two machines, and a cable pulled; ``python -m tests.tools.faults.network`` also for 30 s.
 
-``python -m tests.faults.delay_margin`` delays that cable until the pendulum falls.
+``python -m tests.tools.faults.delay_margin`` delays that cable until the pendulum falls.
 """
 
 from __future__ import annotations
@@ -16,10 +16,10 @@ from pendulum_lqr.design import continuous_lqr
 from pendulum_lqr.model import linearise
 from pendulum_msgs_py.contract.angles import UPRIGHT
 from pendulum_sim.plants import make_plant
-from tests.faults.bag_property import COMMAND_LIFE, check_bag
-from tests.faults.delay_margin import LIGHT, PERIOD, Q, R, predicted_margin
-from tests.faults.network import PLANT_ADDRESS, cut_cable, two_machines, why_not
-from tests.faults.slow_cable import SlowCable
+from tests.tools.faults.bag_property import COMMAND_LIFE, check_bag
+from tests.tools.faults.delay_margin import LIGHT, PERIOD, Q, R, predicted_margin
+from tests.tools.faults.network import PLANT_ADDRESS, cut_cable, two_machines, why_not
+from tests.tools.faults.slow_cable import SlowCable
 
 _MACHINE_PATIENCE = 0.060
 

@@ -1,4 +1,4 @@
-"""The short form of the attack on parsers; ``python -m tests.faults.fuzz --minutes 10`` is the long one."""
+"""The short form of the attack on parsers; ``python -m tests.tools.faults.fuzz --minutes 10`` is the long one."""
 
 from __future__ import annotations
 
@@ -13,9 +13,9 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from pendulum_msgs_py.errors import PendulumError
-from tests.faults.fuzz import HEADROOM
-from tests.faults.hostile_files import HOSTILE, outside_reads
-from tests.faults.parsers import PARSERS, Parser, copy_of, mutate
+from tests.tools.faults.fuzz import HEADROOM
+from tests.tools.faults.hostile_files import HOSTILE, outside_reads
+from tests.tools.faults.parsers import PARSERS, Parser, copy_of, mutate
 
 _FEW = settings(
     max_examples=25,
@@ -62,7 +62,7 @@ def test_a_bag_cannot_name_files_outside_of_its_folder(tmp_path: Path) -> None:
 
 def meet_hostile_files(place: str) -> int:
     """Let every parser meet the files made for it, in bounded memory; returns the number of findings."""
-    from tests.faults.fuzz import bound_memory
+    from tests.tools.faults.fuzz import bound_memory
 
     cases = []
     for number, hostile in enumerate(HOSTILE):

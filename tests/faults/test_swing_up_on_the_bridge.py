@@ -14,7 +14,7 @@ from pendulum_lqr.controller import make_controller
 from pendulum_msgs_py.contract.supervisor import Mode
 from pendulum_msgs_py.contract.values import JointCommand
 from pendulum_msgs_py.plants.plant_parameters import load_plant
-from tests.faults.bridge_rig import Rig
+from tests.tools.faults.bridge_rig import Rig
 
 SHIPPED: dict[str, Any] = {spec.name: spec.default for spec in SPECS}
 

@@ -7,9 +7,9 @@ from pathlib import Path
 
 import pytest
 
-from tests.faults.clocks import simulate_hours
-from tests.faults.outcome import Trial
-from tests.faults.resources import RESOURCE_TRIALS
+from tests.tools.faults.clocks import simulate_hours
+from tests.tools.faults.outcome import Trial
+from tests.tools.faults.resources import RESOURCE_TRIALS
 
 _SHORT = [trial for trial in RESOURCE_TRIALS if trial.name.startswith("recorder:")]
 

@@ -14,9 +14,9 @@ import pytest
 from pendulum_msgs_py.errors import FaultError
 from pendulum_msgs_py.ros import middleware
 from pendulum_msgs_py.ros.middleware import check_closed, middleware_defaults, participant_number
-from tests.faults.network import PLANT_ADDRESS, two_machines, why_not
 from tests.fixtures import PROJECT
 from tests.processes import ProcessGroup, RunningProgram
+from tests.tools.faults.network import PLANT_ADDRESS, two_machines, why_not
 
 _FAST = "rmw_fastrtps_cpp"
 _ROS_VARIABLES = (

@@ -15,7 +15,7 @@ from typing import NamedTuple
 from pendulum_hw_bridge.emulation.parameters import load_emulator
 from pendulum_hw_bridge.emulation.truth_log import COLUMNS
 from pendulum_msgs_py.contract.values import NANOSECONDS
-from tests.faults.bag_property import early_time
+from tests.tools.faults.bag_property import early_time
 
 __all__ = ["ROUNDING", "Asked", "Drive", "ModuleTruth", "Witness", "beyond_asked", "driving_torque"]
 

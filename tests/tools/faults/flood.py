@@ -1,4 +1,4 @@
-"""Sends messages or requests to a plant as fast as it can: ``python -m tests.faults.flood /hw bridge calls``."""
+"""Sends messages or requests to a plant as fast as it can: ``python -m tests.tools.faults.flood /hw bridge calls``."""
 
 from __future__ import annotations
 

@@ -22,7 +22,7 @@ from pendulum_bags.runs.run_folder import write_json
 from pendulum_msgs_py.contract.cdr import encode_joint_state
 from pendulum_msgs_py.ros import qos
 from pendulum_rosbag.reader import read_bag
-from tests.faults.outcome import Outcome, Trial
+from tests.tools.faults.outcome import Outcome, Trial
 
 __all__ = ["RESOURCE_TRIALS", "recorder_cannot_begin", "recorder_runs_out_of_memory"]
 

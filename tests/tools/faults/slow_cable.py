@@ -4,7 +4,7 @@ Kernels with ``sch_netem`` do it themselves (``tc qdisc ... netem``). Many have 
 and small virtual machines leave it out); there a program is the cable: it takes each Ethernet frame off a TAP device at
 the one end, holds it for the delay, and puts it on the TAP device at the other end. ROS sees a network card either way.
 
-The program: ``python -m tests.faults.slow_cable NAMESPACE NAMESPACE``; it reads ``DELAY_S LOSS`` lines.
+The program: ``python -m tests.tools.faults.slow_cable NAMESPACE NAMESPACE``; it reads ``DELAY_S LOSS`` lines.
 """
 
 from __future__ import annotations
@@ -81,7 +81,7 @@ class SlowCable:
             raise FaultError(f"the kernel has neither netem nor {_TUN}; expected one of them, to delay frames with")
         for name in self._namespaces:
             _run("ip", "-n", name, "tuntap", "add", DEVICE, "mode", "tap")
-        command = [sys.executable, "-m", "tests.faults.slow_cable", first, second]
+        command = [sys.executable, "-m", "tests.tools.faults.slow_cable", first, second]
         self._program = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
         assert self._program.stdout is not None
         if not select.select([self._program.stdout], [], [], _START_TIMEOUT)[0] or not self._program.stdout.readline():

@@ -4,7 +4,7 @@ Plant and controller stand in two network namespaces, joined by a cable whose de
 pendulum is lost. What the loop met is read from the plant's own bag: the age of each command when it arrived, on the
 plant's clock. Beside it stands the delay at which the linear analysis of pendulum_lqr says the loop turns unstable.
 
-    python -m tests.faults.delay_margin
+    python -m tests.tools.faults.delay_margin
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ from pendulum_msgs_py.errors import FaultError
 from pendulum_msgs_py.plants.plant_parameters import PlantParameters, write_plant
 from pendulum_msgs_py.programs import graph
 from pendulum_rosbag.reader import read_bag
-from tests.faults.network import (
+from tests.tools.faults.network import (
     PEER_ADDRESS,
     PLANT_ADDRESS,
     Inside,
@@ -42,7 +42,7 @@ from tests.faults.network import (
     wait_for_torque,
     why_not,
 )
-from tests.faults.slow_cable import SlowCable
+from tests.tools.faults.slow_cable import SlowCable
 
 __all__ = [
     "LIGHT",

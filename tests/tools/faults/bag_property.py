@@ -229,7 +229,7 @@ def _last_before(times: np.ndarray, events: np.ndarray, values: np.ndarray | Non
     return np.where(place > 0, (events if values is None else values)[np.maximum(place - 1, 0)], 0)
 
 
-@app.command(epilog="Example: python -m tests.faults.bag_property --limit 13 bags/examples/regulation_sim")
+@app.command(epilog="Example: python -m tests.tools.faults.bag_property --limit 13 bags/examples/regulation_sim")
 def check(
     bags: Annotated[list[Path], typer.Argument(help="Bags to check.")],
     limit: Annotated[float, typer.Option(help="Largest torque allowed [N m].")] = math.inf,
@@ -250,7 +250,7 @@ def vars_of(record: TorqueRecord) -> dict[str, object]:
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command line."""
-    return cli_main(app, argv, name="python -m tests.faults.bag_property")
+    return cli_main(app, argv, name="python -m tests.tools.faults.bag_property")
 
 
 if __name__ == "__main__":

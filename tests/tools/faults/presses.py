@@ -13,9 +13,9 @@ from std_srvs.srv import SetBool, Trigger
 
 from pendulum_msgs_py.contract import names
 from pendulum_msgs_py.errors import FaultError
-from tests.faults.live import START_TIMEOUT, LiveSystem
-from tests.faults.outcome import Fault, Outcome, demand_rest
 from tests.graph_peer import GraphPeer
+from tests.tools.faults.live import START_TIMEOUT, LiveSystem
+from tests.tools.faults.outcome import Fault, Outcome, demand_rest
 
 __all__ = ["LATEST_ANSWER", "PRESSES"]
 
@@ -111,7 +111,7 @@ def _flooded(kind: str) -> Load:
 
     @contextmanager
     def load(system: LiveSystem, generator: random.Random) -> Iterator[None]:
-        command = [sys.executable, "-m", "tests.faults.flood", system.plant.namespace, system.plant.name, kind]
+        command = [sys.executable, "-m", "tests.tools.faults.flood", system.plant.namespace, system.plant.name, kind]
         child = system.processes.start(f"flood_{kind}", command)
         system.wait_for("the flood", lambda: "flooding" in child.last_words(), START_TIMEOUT)
         system.listen(generator.uniform(0.3, 1.0))

@@ -1,4 +1,4 @@
-"""Spoil files at random and read them: ``python -m tests.faults.fuzz --minutes 10`` (each parser gets that long).
+"""Spoil files at random and read them: ``python -m tests.tools.faults.fuzz --minutes 10`` (each parser gets that long).
 
 Each parser is tried in a process of its own whose memory is bounded, so that a file that blows it up is a finding and
 not the end of the machine.
@@ -23,7 +23,7 @@ import typer
 
 from pendulum_msgs_py.programs.executables import cli_main
 from pendulum_msgs_py.programs.terminal import WholeTable, make_console
-from tests.faults.parsers import PARSERS, Parser, copy_of, mutate
+from tests.tools.faults.parsers import PARSERS, Parser, copy_of, mutate
 
 __all__ = ["HEADROOM", "PATIENCE", "bound_memory", "fuzz_all", "fuzz_one", "too_slow"]
 
@@ -100,7 +100,7 @@ def fuzz_all(seconds: float, seed: int, keep: Path | None = None, only: str = ""
         if keep is not None:
             arguments += ["--keep", str(keep)]
         done = subprocess.run(
-            [sys.executable, "-m", "tests.faults.fuzz", *arguments],
+            [sys.executable, "-m", "tests.tools.faults.fuzz", *arguments],
             capture_output=True,
             text=True,
             timeout=seconds + 120.0,
@@ -114,7 +114,7 @@ def fuzz_all(seconds: float, seed: int, keep: Path | None = None, only: str = ""
             yield {**row, "slowest_s": 0.0}
 
 
-@app.command(epilog="Example: python -m tests.faults.fuzz --minutes 10 --seed 7")
+@app.command(epilog="Example: python -m tests.tools.faults.fuzz --minutes 10 --seed 7")
 def fuzz(
     minutes: Annotated[float, typer.Option(help="Time for each parser [min].", min=0.0)] = 1.0,
     seed: Annotated[int, typer.Option(help="Seed of the spoiling.")] = 1,
@@ -145,7 +145,7 @@ def fuzz(
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command line."""
-    return cli_main(app, argv, name="python -m tests.faults.fuzz")
+    return cli_main(app, argv, name="python -m tests.tools.faults.fuzz")
 
 
 if __name__ == "__main__":

@@ -1,7 +1,7 @@
-"""Let atheris look for bags that the reader does not stand: ``python -m tests.faults.fuzz_bags --minutes 10``.
+"""Let atheris look for bags that the reader does not stand: ``python -m tests.tools.faults.fuzz_bags --minutes 10``.
 
-Where ``tests.faults.fuzz`` spoils files at random, libFuzzer watches which lines of the reader a file reaches and goes
-on from there. The tool is not part of the lock, for it is large and nothing else needs it::
+Where ``tests.tools.faults.fuzz`` spoils files at random, libFuzzer watches which lines of the reader a file reaches and
+goes on from there. The tool is not part of the lock, for it is large and nothing else needs it::
 
     .venv/bin/python -m pip install --no-deps --target .venv/atheris atheris==3.0.0
 """
@@ -34,9 +34,9 @@ STORAGES = {
     "mcap-types": "bag: own types",
     "sqlite3": "bag: SQLite",
 }
-"""What can be fuzzed, and the parser of :mod:`tests.faults.parsers` that reads it."""
+"""What can be fuzzed, and the parser of :mod:`tests.tools.faults.parsers` that reads it."""
 ATHERIS = Path(sys.prefix, "atheris")
-_PROJECT = Path(__file__).parents[2]
+_PROJECT = Path(__file__).parents[3]
 _WORDS = (
     r"\x89MCAP0\x0d\x0a", "zstd", "lz4", "cdr", "ros2msg", "ros2idl", "sensor_msgs/msg/JointState",
     "std_msgs/msg/String", r"SQLite format 3\x00", "topics", "messages", "CREATE TABLE ", "MSG: ",
@@ -80,8 +80,8 @@ def _child(storage: str, place: Path, flags: Sequence[str]) -> None:
         for module in ("rosbags.serde", "rosbags.typesys"):
             importlib.import_module(module)
         # Not above: what is imported before is not watched.
-        from tests.faults.fuzz import too_slow
-        from tests.faults.parsers import PARSERS
+        from tests.tools.faults.fuzz import too_slow
+        from tests.tools.faults.parsers import PARSERS
     parser = next(parser for parser in PARSERS if parser.name == STORAGES[storage])
     (place / "good").mkdir()
     good = parser.make(place / "good")
@@ -138,7 +138,7 @@ def fuzz_storage(storage: str, seconds: float, seed: int, keep: Path | None = No
         ]  # fmt: skip
         done = subprocess.run(
             [
-                sys.executable, "-m", "tests.faults.fuzz_bags", "--child", storage, "--place", name,
+                sys.executable, "-m", "tests.tools.faults.fuzz_bags", "--child", storage, "--place", name,
                 *(f"--flag={flag}" for flag in flags),
             ],
             cwd=_PROJECT, capture_output=True, text=True, errors="replace", timeout=seconds + 180.0, check=False,
@@ -158,7 +158,7 @@ def fuzz_storage(storage: str, seconds: float, seed: int, keep: Path | None = No
     return {"storage": storage, "tried": tried, "reached": reached, "findings": findings}
 
 
-@app.command(epilog="Example: python -m tests.faults.fuzz_bags --minutes 10 --only sqlite3")
+@app.command(epilog="Example: python -m tests.tools.faults.fuzz_bags --minutes 10 --only sqlite3")
 def fuzz(
     minutes: Annotated[float, typer.Option(help="Time for each storage [min].", min=0.0)] = 1.0,
     seed: Annotated[int, typer.Option(help="Seed of libFuzzer.")] = 1,
@@ -192,7 +192,7 @@ def fuzz(
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command line."""
-    return cli_main(app, argv, name="python -m tests.faults.fuzz_bags")
+    return cli_main(app, argv, name="python -m tests.tools.faults.fuzz_bags")
 
 
 if __name__ == "__main__":

@@ -28,9 +28,9 @@ from std_msgs.msg import String
 from pendulum_msgs_py.contract import names
 from pendulum_msgs_py.contract.cdr import decode_joint_state, encode_joint_state
 from pendulum_msgs_py.ros import qos
-from tests.faults.outcome import Outcome
 from tests.graph_peer import GraphPeer
 from tests.processes import ProcessGroup, RunningProgram
+from tests.tools.faults.outcome import Outcome
 
 __all__ = ["CHROMIUM", "MAX_DELAY", "QUIET", "STOPS", "StopRig"]
 
@@ -390,9 +390,9 @@ STOPS: dict[str, Callable[[StopRig], Outcome]] = {
 def main(argv: Sequence[str] | None = None) -> int:
     """Try each stop several times and print a table; return 1 where one was lost or the page in the wrong."""
     parser = argparse.ArgumentParser(
-        prog="python -m tests.faults.console_stops",
+        prog="python -m tests.tools.faults.console_stops",
         description=main.__doc__,
-        epilog="Example: python -m tests.faults.console_stops 20 frozen mouse",
+        epilog="Example: python -m tests.tools.faults.console_stops 20 frozen mouse",
     )
     parser.add_argument("tries", nargs="?", type=int, default=20, help="how often each way is tried")
     parser.add_argument("names", nargs="*", help="only the ways whose names have one of these in them")

@@ -17,8 +17,8 @@ from pendulum_hw_bridge.effort_mapping import EffortStrategy
 from pendulum_hw_bridge.emulation.faults import ActuatorFault
 from pendulum_msgs_py.contract.supervisor import Mode
 from pendulum_msgs_py.contract.values import JointCommand
-from tests.faults.bridge_rig import MILLISECOND, Rig
-from tests.faults.node_rig import NodeRig
+from tests.tools.faults.bridge_rig import MILLISECOND, Rig
+from tests.tools.faults.node_rig import NodeRig
 
 __all__ = ["CASES", "LIMIT", "SCENARIOS", "Case", "Phase", "Reaction", "Scenario", "run_scenario"]
 
@@ -282,7 +282,7 @@ SCENARIOS: tuple[Scenario, ...] = (
 
 
 def run_scenario(scenario: Scenario, case: Case, repetition: int) -> Reaction:
-    """Run one scenario once and return what happened; needs :func:`tests.faults.node_rig.ros_of_its_own`.
+    """Run one scenario once and return what happened; needs :func:`tests.tools.faults.node_rig.ros_of_its_own`.
 
     Args:
         scenario: Which.

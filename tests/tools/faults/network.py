@@ -20,8 +20,8 @@ from pendulum_bags.runs.run_folder import write_json
 from pendulum_msgs_py.errors import FaultError, PendulumError
 from pendulum_msgs_py.programs import graph
 from pendulum_rosbag.reader import read_bag
-from tests.faults.bag_property import COMMAND_LIFE
-from tests.faults.slow_cable import DEVICE, SlowCable
+from tests.tools.faults.bag_property import COMMAND_LIFE
+from tests.tools.faults.slow_cable import DEVICE, SlowCable
 
 __all__ = [
     "PEER_ADDRESS",
@@ -203,7 +203,7 @@ def _report(bag: Path, duration: float, pulled_ns: int, plugged_ns: int) -> CutR
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Cut the cable for 1 s and for 30 s: ``python -m tests.faults.network [SECONDS ...]``."""
+    """Cut the cable for 1 s and for 30 s: ``python -m tests.tools.faults.network [SECONDS ...]``."""
     import tempfile
 
     given = list(sys.argv[1:] if argv is None else argv)

@@ -18,12 +18,12 @@ from pendulum_msgs_py.contract import names
 from pendulum_msgs_py.contract.names import JOINT
 from pendulum_msgs_py.errors import BagError
 from pendulum_rosbag.reader import read_bag
-from tests.faults.doubles import DOUBLES
-from tests.faults.impostor import IMPOSTORS
-from tests.faults.live import MODULE, START_TIMEOUT, LiveSystem
-from tests.faults.outcome import MAX_LOSS, Fault, Outcome, demand_rest, demand_zero
-from tests.faults.plants import BRIDGE, PLANTS, SIMULATOR
-from tests.faults.presses import PRESSES
+from tests.tools.faults.doubles import DOUBLES
+from tests.tools.faults.impostor import IMPOSTORS
+from tests.tools.faults.live import MODULE, START_TIMEOUT, LiveSystem
+from tests.tools.faults.outcome import MAX_LOSS, Fault, Outcome, demand_rest, demand_zero
+from tests.tools.faults.plants import BRIDGE, PLANTS, SIMULATOR
+from tests.tools.faults.presses import PRESSES
 
 __all__ = ["CAMPAIGN"]
 

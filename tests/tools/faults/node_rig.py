@@ -29,7 +29,7 @@ from pendulum_msgs_py.contract.trajectory import thesis_ramp
 from pendulum_msgs_py.contract.values import JointCommand
 from pendulum_msgs_py.ros import qos
 from pendulum_msgs_py.ros.commander_watch import CHECK_PERIOD_NS
-from tests.faults.bridge_rig import Rig, SteppedLoop
+from tests.tools.faults.bridge_rig import Rig, SteppedLoop
 
 __all__ = ["NodeRig", "ros_of_its_own"]
 

@@ -20,18 +20,18 @@ from pendulum_bags.runs.run_folder import write_json
 from pendulum_msgs_py.errors import FaultError, PendulumError
 from pendulum_msgs_py.programs.executables import EXIT_INTERRUPTED, cli_main
 from pendulum_msgs_py.programs.terminal import WholeTable, make_console
-from tests.faults.bag_property import check_bag
-from tests.faults.bridge_table import Cell, bridge_cells, bridge_markdown
-from tests.faults.campaign import CAMPAIGN
-from tests.faults.clocks import CLOCK_TRIALS
-from tests.faults.delay_margin import LOSSES, survive_loss
-from tests.faults.fuzz import fuzz_all
-from tests.faults.live import EFFORT_LIMIT, LiveSystem
-from tests.faults.network import cut_cable, why_not
-from tests.faults.outcome import MACHINE_PATIENCE, MAX_TIME_TO_ZERO, Fault, Outcome, Trial, try_fault
-from tests.faults.plants import PLANTS, Plant
-from tests.faults.resources import RESOURCE_TRIALS
-from tests.faults.side_by_side import DOMAIN_TRIALS
+from tests.tools.faults.bag_property import check_bag
+from tests.tools.faults.bridge_table import Cell, bridge_cells, bridge_markdown
+from tests.tools.faults.campaign import CAMPAIGN
+from tests.tools.faults.clocks import CLOCK_TRIALS
+from tests.tools.faults.delay_margin import LOSSES, survive_loss
+from tests.tools.faults.fuzz import fuzz_all
+from tests.tools.faults.live import EFFORT_LIMIT, LiveSystem
+from tests.tools.faults.network import cut_cable, why_not
+from tests.tools.faults.outcome import MACHINE_PATIENCE, MAX_TIME_TO_ZERO, Fault, Outcome, Trial, try_fault
+from tests.tools.faults.plants import PLANTS, Plant
+from tests.tools.faults.resources import RESOURCE_TRIALS
+from tests.tools.faults.side_by_side import DOMAIN_TRIALS
 
 _TRIALS = (*CLOCK_TRIALS, *RESOURCE_TRIALS, *DOMAIN_TRIALS)
 
@@ -68,7 +68,7 @@ class Row:
         return self.fault, *counts, lost, to_zero, " ".join(self.remarks.split())
 
 
-@app.command(epilog="Example: python -m tests.faults.run --repetitions 3 --seed 7")
+@app.command(epilog="Example: python -m tests.tools.faults.run --repetitions 3 --seed 7")
 def campaign(
     repetitions: Annotated[int, typer.Option(help="How often each fault is tried.", min=1)] = 5,
     seed: Annotated[int, typer.Option(help="Seed of the moments at which faults come.")] = 1,
@@ -266,7 +266,7 @@ def _row(name: str, outcomes: Sequence[Outcome]) -> Row:
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command line."""
-    return cli_main(app, argv, name="python -m tests.faults.run")
+    return cli_main(app, argv, name="python -m tests.tools.faults.run")
 
 
 if __name__ == "__main__":

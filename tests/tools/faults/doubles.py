@@ -16,10 +16,10 @@ from pendulum_bags.experiments.processes import Child, start_recorder
 from pendulum_msgs_py.contract import names
 from pendulum_msgs_py.errors import PendulumError
 from pendulum_rosbag.reader import read_bag
-from tests.faults.bag_property import check_bag
-from tests.faults.live import EFFORT_LIMIT, NODES, START_TIMEOUT, LiveSystem
-from tests.faults.outcome import MACHINE_PATIENCE, Fault, Outcome
-from tests.faults.plants import BRIDGE, SIMULATOR
+from tests.tools.faults.bag_property import check_bag
+from tests.tools.faults.live import EFFORT_LIMIT, NODES, START_TIMEOUT, LiveSystem
+from tests.tools.faults.outcome import MACHINE_PATIENCE, Fault, Outcome
+from tests.tools.faults.plants import BRIDGE, SIMULATOR
 
 __all__ = ["DOUBLES", "FIVE_NODES", "ORDERS", "start_in_order"]
 

@@ -9,9 +9,9 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
-from tests.faults.live import EFFORT_LIMIT, START_TIMEOUT, LiveSystem
-from tests.faults.motor import ROUNDING
-from tests.faults.plants import PLANTS, Plant
+from tests.tools.faults.live import EFFORT_LIMIT, START_TIMEOUT, LiveSystem
+from tests.tools.faults.motor import ROUNDING
+from tests.tools.faults.plants import PLANTS, Plant
 
 __all__ = [
     "MACHINE_PATIENCE",

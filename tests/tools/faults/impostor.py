@@ -17,10 +17,10 @@ from sensor_msgs.msg import JointState
 from pendulum_msgs_py.contract import names
 from pendulum_msgs_py.contract.cdr import decode_joint_state, encode_joint_state
 from pendulum_msgs_py.ros import qos
-from tests.faults.live import START_TIMEOUT, LiveSystem
-from tests.faults.motor import ROUNDING
-from tests.faults.outcome import Fault, Outcome, demand_rest
-from tests.faults.plants import SIMULATOR
+from tests.tools.faults.live import START_TIMEOUT, LiveSystem
+from tests.tools.faults.motor import ROUNDING
+from tests.tools.faults.outcome import Fault, Outcome, demand_rest
+from tests.tools.faults.plants import SIMULATOR
 
 __all__ = ["IMPOSTORS"]
 

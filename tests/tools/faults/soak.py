@@ -1,6 +1,7 @@
 """All nodes and two recorders for half an hour: nothing lost, no memory and no file descriptor more than at first.
 
-``python -m tests.faults.soak --minutes 30`` prints what it watched and ends with code 1 if something did not hold.
+``python -m tests.tools.faults.soak --minutes 30`` prints what it watched and ends with code 1 if
+something did not hold.
 """
 
 from __future__ import annotations
@@ -31,7 +32,7 @@ from pendulum_msgs_py.programs.executables import cli_main
 from pendulum_msgs_py.programs.graph import NodeProgram
 from pendulum_msgs_py.programs.terminal import WholeTable, make_console
 from pendulum_rosbag.reader import Bag, read_bag
-from tests.faults.bag_property import check_bag
+from tests.tools.faults.bag_property import check_bag
 
 __all__ = ["MAX_GROWTH", "SoakReport", "TopicTally", "soak"]
 
@@ -337,7 +338,7 @@ def print_report(report: SoakReport, console: Console) -> None:
         console.print(sentence, soft_wrap=True)
 
 
-@app.command(epilog="Example: python -m tests.faults.soak --minutes 30")
+@app.command(epilog="Example: python -m tests.tools.faults.soak --minutes 30")
 def run_soak(
     minutes: Annotated[float, typer.Option(help="How long [min].", min=0.2)] = 30.0,
     out: Annotated[Path, typer.Option(help="Where the figures are written.")] = Path("build", "soak.json"),
@@ -365,7 +366,7 @@ def as_json(report: SoakReport) -> dict[str, Any]:
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command line."""
-    return cli_main(app, argv, name="python -m tests.faults.soak")
+    return cli_main(app, argv, name="python -m tests.tools.faults.soak")
 
 
 if __name__ == "__main__":

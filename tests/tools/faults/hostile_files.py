@@ -18,7 +18,7 @@ import zstandard
 
 from pendulum_msgs_py.contract.cdr import encode_joint_state
 from pendulum_rosbag.storage import mcap_records as rec
-from tests.faults.parsers import PARSERS, Parser, make_bag
+from tests.tools.faults.parsers import PARSERS, Parser, make_bag
 
 __all__ = ["HOSTILE", "HostileFile", "outside_reads"]
 

@@ -42,8 +42,8 @@ from pendulum_msgs_py.ros.plant_loop import LockstepLoop
 from pendulum_msgs_py.ros.polled import PollingNode
 from pendulum_rosbag.reader import read_bag
 from pendulum_sim.plants import make_plant
-from tests.faults.live import NAMESPACE, LiveSystem
-from tests.faults.outcome import Outcome, Trial
+from tests.tools.faults.live import NAMESPACE, LiveSystem
+from tests.tools.faults.outcome import Outcome, Trial
 
 __all__ = ["CLOCK_TRIALS", "jump_wall_clock", "simulate_hours", "stop_simulated_clock"]
 
@@ -84,7 +84,7 @@ def jump_wall_clock(folder: Path) -> Outcome:
         folder: For the clock, logs and the bag.
     """
     done = subprocess.run(
-        [sys.executable, "-m", "tests.faults.clocks", str(folder)],
+        [sys.executable, "-m", "tests.tools.faults.clocks", str(folder)],
         env={**os.environ, **_make_clock(folder)}, capture_output=True, text=True, check=False,
     )  # fmt: skip
     try:

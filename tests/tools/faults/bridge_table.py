@@ -10,8 +10,8 @@ from dataclasses import dataclass
 from rich.progress import track
 
 from pendulum_bags.experiments.domain import reserve_domain
-from tests.faults.bridge_scenarios import CASES, SCENARIOS, Case, Scenario, run_scenario
-from tests.faults.node_rig import ros_of_its_own
+from tests.tools.faults.bridge_scenarios import CASES, SCENARIOS, Case, Scenario, run_scenario
+from tests.tools.faults.node_rig import ros_of_its_own
 
 __all__ = ["Cell", "bridge_cells", "bridge_markdown"]
 

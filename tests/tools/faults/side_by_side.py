@@ -15,7 +15,7 @@ from pendulum_bags.experiments.in_process import simulate
 from pendulum_bags.experiments.run_spec import RunSpec
 from pendulum_msgs_py.contract import names
 from pendulum_rosbag.reader import read_bag
-from tests.faults.outcome import Outcome, Trial
+from tests.tools.faults.outcome import Outcome, Trial
 
 __all__ = ["DOMAIN_TRIALS", "run_side_by_side"]
 

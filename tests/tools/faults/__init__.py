@@ -1,0 +1,1 @@
+"""Attacks on the running system, counted: ``make faults`` (``run``) tries them all and prints a table."""
