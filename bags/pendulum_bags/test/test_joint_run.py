@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -150,6 +152,7 @@ def test_the_sides_that_fell_are_told_with_their_times(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, failing: tuple[str, ...], message: str
 ) -> None:
     recorded: list[str] = []
+    closed: list[str] = []
 
     def record(bag: Path, run: Any, **_: Any) -> None:
         recorded.append(bag.name)
@@ -158,17 +161,19 @@ def test_the_sides_that_fell_are_told_with_their_times(
         if run.has_bridge and bag.name in failing:
             raise PlantStoppedError("/hw", "fault", "velocity_limit: elbow")
 
-    def read(bag: Path) -> Any:
+    @contextmanager
+    def read(bag: Path) -> Iterator[Any]:
         goal = np.array(load_mechanism("acrobot").coordinates.goal)
         low = goal - [3.0, 0.0] if bag.name in failing else goal
         states = SimpleNamespace(stamp_ns=np.array([0, 200_000_000]), position=np.array([goal, low]))
-        return SimpleNamespace(joints=lambda topic: states)
+        yield SimpleNamespace(joints=lambda topic: states)
+        closed.append(bag.name)
 
     monkeypatch.setattr(joint_run, "record_run", record)
     monkeypatch.setattr(joint_run, "read_bag", read)
     with pytest.raises(FaultError, match=message):
         record_joints(tmp_path, JointSettings("acrobot"), tmp_path / "machine.yaml")
-    assert recorded == ["sim", "hw"]
+    assert recorded == closed == ["sim", "hw"]
 
 
 @pytest.mark.parametrize(

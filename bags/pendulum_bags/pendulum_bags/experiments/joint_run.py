@@ -355,7 +355,8 @@ def fall_time(plant: MechanismParameters, stamps_ns: Array, position: Array) -> 
 
 def _end_of(bag: Path, namespace: str, plant: MechanismParameters, stopped: str) -> str:
     """Return how a side failed, in words, or an empty string."""
-    states = read_bag(bag).joints(f"{namespace}/{JOINT_STATES}")
+    with read_bag(bag) as opened:
+        states = opened.joints(f"{namespace}/{JOINT_STATES}")
     fell = fall_time(plant, states.stamp_ns, states.position) if len(states.stamp_ns) else None
     said = [] if fell is None else [f"fell after {fell:.2f} s"]
     return " and ".join([*said, stopped] if stopped else said)
