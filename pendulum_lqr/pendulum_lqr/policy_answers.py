@@ -137,14 +137,15 @@ class PolicyAnswers:
         """Take note of efforts that another controller applied in place of the last answer [N m or N]."""
         self._effort = efforts
 
-    def fall_back(self, t: float, answer: Callable[[], Sequence[float]] | None) -> Vector:
-        """Return the efforts of a fallback, softly begun; none where there is none or it gives no numbers.
+    def fall_back(self, t: float, state: Sequence[float], answer: Callable[[], Sequence[float]] | None) -> Vector:
+        """Return the efforts of a fallback, softly begun; none where there is none, or the state or they are no numbers.
 
         Args:
             t: Time since the start [s].
+            state: What the fallback answers: limits would make a full effort of what is no number.
             answer: Asks the fallback.
         """
-        if answer is None:
+        if answer is None or not all(map(math.isfinite, state)):
             return self._still
         efforts = answer()
         return self.begun(t, efforts) if all(map(math.isfinite, efforts)) else self._still

@@ -187,6 +187,15 @@ def test_a_chosen_fallback_answers_after_it_gave_up(tmp_path):
         assert learned.command(0.01 + 0.01 * k, x) == own.command(0.01 + 0.01 * k, x) != 0.0
 
 
+@pytest.mark.parametrize("fallback", ["lqr", "pd_gravity", "energy_swing_up"])
+def test_a_fallback_answers_a_state_that_is_no_number_with_no_torque(tmp_path, fallback):
+    learned = controller(tmp_path, random_policy(DFKI, velocity_box=(2.0,)), fallback=fallback)
+    assert learned.command(0.0, (0.1, 2.5)) != 0.0
+    for x in ((math.nan, 0.0), (3.0, math.inf), (0.1, math.nan)):
+        assert learned.command(0.01, x) == 0.0
+    assert learned.command(0.02, (0.1, 2.5)) != 0.0
+
+
 def test_a_network_that_overflows_gives_up_and_never_answers_nan(tmp_path):
     weight = np.full((8, 4), 3e38, dtype=np.float32)
     out = np.array([[1.0, -1.0] * 4], dtype=np.float32)

@@ -203,16 +203,42 @@ def test_a_checkpoint_of_other_settings_or_of_nothing_is_refused(tmp_path):
             train(SMALL, out)
 
 
-def test_a_checkpoint_whose_arrays_have_other_shapes_is_refused(tmp_path):
-    out = tmp_path / "policy.npz"
+@pytest.fixture(scope="module")
+def checkpoint(tmp_path_factory):
+    out = tmp_path_factory.mktemp("checkpoint") / "policy.npz"
     with pytest.raises(KeyboardInterrupt):
         train(SMALL, out, on_update=_interrupt_at(11))
     with np.load(checkpoint_path(out)) as kept:
-        arrays = dict(kept)
-    for name in ("learner/actor_0", "environment/motion"):
-        np.savez(checkpoint_path(out), **{**arrays, name: arrays[name][:1]})
-        with pytest.raises(DataError, match=rf"{name} has shape \(1, \d+\); expected \(\d+, \d+\)"):
-            train(SMALL, out)
+        return dict(kept)
+
+
+_ACTOR = "learner/actor_0"
+
+
+@pytest.mark.parametrize(
+    ("name", "change", "message"),
+    [
+        (_ACTOR, lambda each: each[:1], rf"{_ACTOR} has shape \(1, \d+\) of float32; expected \(\d+, \d+\) of float32"),
+        ("environment/motion", lambda each: each[:1], r"motion has shape \(1, \d+\) of float64; expected \(\d+, \d+\)"),
+        (_ACTOR, lambda each: each.astype(complex), r"of complex64|of complex128; expected .* of float32"),
+        ("fastest", lambda _: np.array(["a"]), r"fastest has shape \(1,\) of <U1; expected \(1,\) of float64"),
+        ("fastest", lambda each: each * np.inf, "fastest holds a number that is not finite"),
+        (_ACTOR, lambda each: each * np.float32(np.nan), f"{_ACTOR} holds a number that is not finite"),
+        (_ACTOR, None, f"lacks {_ACTOR}; expected a whole one"),
+        ("environment/astray", None, "lacks environment/astray; expected a whole one"),
+        ("curves", lambda each: np.repeat(each, 2, axis=0), "has done 20 updates; expected 1 to 12"),
+        ("curves", lambda each: each[:0], "has done 0 updates; expected 1 to 12"),
+    ],
+)
+def test_a_checkpoint_that_lacks_an_array_or_holds_another_is_refused(tmp_path, checkpoint, name, change, message):
+    arrays = {key: each for key, each in checkpoint.items() if key != name}
+    if change is not None:
+        arrays[name] = change(checkpoint[name])
+    out = tmp_path / "policy.npz"
+    np.savez(checkpoint_path(out), **arrays)
+    with pytest.raises(DataError, match=message):
+        train(SMALL, out)
+    assert not out.exists()
 
 
 def test_ctrl_c_while_a_checkpoint_is_written_leaves_no_half_of_it(tmp_path, monkeypatch):

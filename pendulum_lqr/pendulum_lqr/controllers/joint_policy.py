@@ -74,9 +74,8 @@ class JointPolicy(JointController):
         efforts = self._answers.answer(t, self._deviation(position), velocity)
         if efforts is None:
             fallback = self.fallback
-            efforts = self._answers.fall_back(
-                t, None if fallback is None else lambda: fallback.command(t, position, velocity)
-            )
+            ask = None if fallback is None else lambda: fallback.command(t, position, velocity)
+            efforts = self._answers.fall_back(t, position + velocity, ask)
         elif self.catch is not None:
             x = deviation_of(self.policy.coordinates, position + velocity)
             if self.catch.holds(x):

@@ -109,7 +109,7 @@ class LearnedPolicy(BaseController):
         efforts = self._answers.answer(t, (x[0],), (x[1],))
         if efforts is None:
             fallback = self.fallback
-            efforts = self._answers.fall_back(t, None if fallback is None else lambda: (fallback.command(t, x),))
+            efforts = self._answers.fall_back(t, x, None if fallback is None else lambda: (fallback.command(t, x),))
         return efforts[0]
 
     def describe(self) -> str:

@@ -127,7 +127,7 @@ class Ppo:
         measured = self._improve(data, remaining)
         parameters = (*self.actor.parameters, *self.critic.parameters, self.log_spread)
         if not all(np.isfinite(each).all() for each in parameters):
-            raise FaultError("training diverged: a weight is no longer finite; expected a smaller learning rate")
+            raise FaultError("training diverged: a weight is no longer finite; expected another seed")
         return {"reward": reward, **measured}
 
     def _gather(self) -> tuple[tuple[Floats, ...], float]:

@@ -97,6 +97,10 @@ class Training:
         }  # fmt: skip
 
 
+def _told(settings: Training) -> str:
+    return json.dumps(settings.to_json(), sort_keys=True)
+
+
 def checkpoint_path(out: Path) -> Path:
     """Return where the checkpoint of a training lies."""
     return out.with_name(f"{out.stem}.checkpoint.npz")
@@ -132,10 +136,9 @@ def train(
         learner = Ppo(environment, settings.ppo, generator)
         curves: list[list[float]] = []
         checkpoint = checkpoint_path(out)
-        told = json.dumps(settings.to_json(), sort_keys=True)
         fastest = np.zeros(len(coordinates_of(settings.plant).joints))
         if checkpoint.exists():
-            curves, fastest = _restore(checkpoint, told, learner, generator, fastest.size)
+            curves, fastest = _restore(checkpoint, settings, learner, generator)
             if on_update is not None:
                 on_update(len(curves), {"reward": curves[-1][1]})
         for number in range(len(curves), settings.updates):
@@ -150,7 +153,7 @@ def train(
             if on_update is not None:
                 on_update(number + 1, measured)
             if (number + 1) % _CHECKPOINT_EVERY == 0 or number + 1 == settings.updates:
-                _keep(checkpoint, told, learner, generator, curves, fastest)
+                _keep(checkpoint, settings, learner, generator, curves, fastest)
         policy = _policy(settings, learner, fastest, {})
         policy = _policy(settings, learner, fastest, _evaluate(settings, policy, on_trial))
         write_policy(out, policy)
@@ -203,7 +206,7 @@ def _policy(settings: Training, learner: Ppo, fastest: NDArray[np.float64], eval
 
 def _keep(
     path: Path,
-    told: str,
+    settings: Training,
     learner: Ppo,
     generator: np.random.Generator,
     curves: list[list[float]],
@@ -211,7 +214,7 @@ def _keep(
 ) -> None:
     arrays: dict[str, NDArray[Any]] = {f"learner/{name}": each for name, each in learner.state().items()}
     arrays |= {f"environment/{name}": each for name, each in learner.environment.state().items()}
-    words = {"settings": told, "generator": json.dumps(generator.bit_generator.state)}
+    words = {"settings": _told(settings), "generator": json.dumps(generator.bit_generator.state)}
     arrays |= {name: np.frombuffer(text.encode(), dtype=np.uint8) for name, text in words.items()}
     buffer = io.BytesIO()
     np.savez(buffer, curves=np.array(curves), fastest=fastest, **arrays)
@@ -222,33 +225,47 @@ def _keep(
         raise DataError(f"checkpoint {path} cannot be written: {error.strerror}; {left}") from error
 
 
-def _check_shapes(path: Path, kept: Mapping[str, NDArray[Any]], learner: Ppo, joints: int) -> None:
-    """Refuse arrays that are not those of the settings; numpy would stretch or keep them in silence."""
-    expected = {f"learner/{name}": np.shape(each) for name, each in learner.state().items()}
-    expected |= {f"environment/{name}": np.shape(each) for name, each in learner.environment.state().items()}
-    expected |= {"fastest": (joints,), "curves": (len(kept["curves"]), 4)}
-    for name, shape in expected.items():
-        if kept[name].shape != shape:
-            raise DataError(
-                f"checkpoint {path}: {name} has shape {kept[name].shape}; expected {shape}, as the settings say: "
-                "another --out, or the checkpoint removed"
+def _check_arrays(path: Path, kept: Mapping[str, NDArray[Any]], learner: Ppo, joints: int, updates: int) -> None:
+    """Refuse arrays that are not those of the settings; numpy would stretch, cast or keep them in silence."""
+    expected = {f"learner/{name}": np.asarray(each) for name, each in learner.state().items()}
+    expected |= {f"environment/{name}": each for name, each in learner.environment.state().items()}
+    for name in (*expected, "curves", "fastest"):
+        if name not in kept:
+            raise DataError(f"checkpoint {path} lacks {name}; expected a whole one, another --out, or it removed")
+    expected |= {"fastest": np.zeros(joints), "curves": np.zeros((len(kept["curves"]), 4))}
+    for name, own in expected.items():
+        found = kept[name]
+        if found.shape != own.shape or found.dtype != own.dtype:
+            problem = (
+                f"has shape {found.shape} of {found.dtype}; expected {own.shape} of {own.dtype}, as the settings say"
             )
+        elif not np.isfinite(found).all():
+            problem = "holds a number that is not finite; expected finite ones"
+        else:
+            continue
+        raise DataError(f"checkpoint {path}: {name} {problem}: another --out, or the checkpoint removed")
+    if not 1 <= len(kept["curves"]) <= updates:
+        raise DataError(
+            f"checkpoint {path} has done {len(kept['curves'])} updates; expected 1 to {updates}: another --out, or the "
+            "checkpoint removed"
+        )
 
 
 def _restore(
-    path: Path, told: str, learner: Ppo, generator: np.random.Generator, joints: int
+    path: Path, settings: Training, learner: Ppo, generator: np.random.Generator
 ) -> tuple[list[list[float]], NDArray[np.float64]]:
     """Go on from a checkpoint; return the curves so far and the fastest motion of each joint [rad/s or m/s]."""
     try:
         if path.stat().st_size > _LARGEST_CHECKPOINT:
             raise DataError(f"checkpoint {path} has more than {_LARGEST_CHECKPOINT} bytes; expected one of ours")
         with np.load(path, allow_pickle=False) as kept:
-            if kept["settings"].tobytes().decode() != told:
+            if kept["settings"].tobytes().decode() != _told(settings):
                 raise ParameterError(
                     f"checkpoint {path} is of a training with other settings; expected the same ones, another --out, "
                     "or the checkpoint removed"
                 )
-            _check_shapes(path, kept, learner, joints)
+            joints = len(coordinates_of(settings.plant).joints)
+            _check_arrays(path, kept, learner, joints, settings.updates)
             learner.restore({key[8:]: kept[key] for key in kept.files if key.startswith("learner/")})
             learner.environment.restore({key[12:]: kept[key] for key in kept.files if key.startswith("environment/")})
             generator.bit_generator.state = json.loads(kept["generator"].tobytes().decode())
