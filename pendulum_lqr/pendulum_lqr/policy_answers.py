@@ -138,7 +138,7 @@ class PolicyAnswers:
         self._effort = efforts
 
     def fall_back(self, t: float, state: Sequence[float], answer: Callable[[], Sequence[float]] | None) -> Vector:
-        """Return the efforts of a fallback, softly begun; none where there is none, or the state or they are no numbers.
+        """Return the efforts of a fallback, softly begun; none without one, or where the state or they are no numbers.
 
         Args:
             t: Time since the start [s].

@@ -13,6 +13,7 @@ from hypothesis import strategies as st
 
 from pendulum_lqr.controller import make_controller
 from pendulum_lqr.controllers.policy import LearnedPolicy
+from pendulum_lqr.design import DesignError
 from pendulum_lqr.policy import Network, fingerprint
 from pendulum_lqr.policy_file import LARGEST_FILE, dumps_policy, load_policy, loads_policy, write_policy
 from pendulum_msgs_py.errors import DataError, ParameterError
@@ -231,6 +232,56 @@ def test_a_change_while_it_runs_does_not_forget_the_past(tmp_path):
     first.command(0.06, (0.5, 99.0))
     second.carry_over(first)
     assert second.command(0.07, (0.5, 1.0)) == 0.0
+
+
+def test_a_lower_limit_holds_for_the_answer_that_is_taken_over_too():
+    policy = linear_policy(DFKI, 1000.0, 0.0)
+    strong = LearnedPolicy(policy, 5, DFKI.effort_limit, start_time=0.0)
+    assert strong.command(0.0, (1.0, 0.0)) == -DFKI.effort_limit
+    weak, quick = LearnedPolicy(policy, 5, 0.3, start_time=0.0), LearnedPolicy(policy, 1, 1.5, start_time=0.0)
+    for each in (weak, quick):
+        each.carry_over(strong)
+    assert weak.command(0.002, (1.0, 0.0)) == -0.3
+    # One answer a state does not wait for the four that were left of the other's.
+    quick.command(0.002, (1.0, 0.0))
+    assert quick.command(0.012, (-1.0, 0.0)) == DFKI.effort_limit
+
+
+def test_a_fallback_is_reset_and_taken_over_with_its_policy():
+    class Fallback:
+        heard: list[object]
+
+        def reset(self):
+            self.heard = ["reset"]
+
+        def carry_over(self, previous):
+            self.heard = [previous]
+
+    first, second = (LearnedPolicy(random_policy(DFKI), 1, 1.5, Fallback()) for _ in range(2))
+    first.reset()
+    second.carry_over(first)
+    assert first.fallback.heard == ["reset"]
+    assert second.fallback.heard == [first.fallback]
+
+
+def test_a_fallback_that_is_unstable_at_the_period_is_refused(tmp_path):
+    slow = random_policy(DFKI, period=0.5)
+    with pytest.raises(DesignError, match=r"the fallback makes the loop unstable with a period of 0\.5 s"):
+        controller(tmp_path, slow, period=0.5, fallback="lqr")
+    assert controller(tmp_path, slow, period=0.5).command(0.0, (0.1, 99.0)) == 0.0
+
+
+def test_a_weight_that_changes_answers_by_a_thousandth_and_numbers_beyond_all_bounds_are_refused():
+    content = dumps_policy(random_policy(DFKI))
+    parts = entries(content)
+    bias = np.load(io.BytesIO(parts["bias_2.npy"]))
+    with pytest.raises(DataError, match=r"its test vectors come out wrong by 0\.001"):
+        loads_policy(archive_of({**parts, "bias_2.npy": npy(bias + np.float32(1e-3))}))
+    # As many bytes as before: the array keeps its shape.
+    header = parts["header.npy"].replace(b'"velocity_box": [20.0]', b'"velocity_box":[1e999]')
+    assert header != parts["header.npy"]
+    with pytest.raises(DataError, match=r"velocity_box is .*; expected finite numbers"):
+        loads_policy(archive_of({**parts, "header.npy": header}))
 
 
 @pytest.mark.parametrize(

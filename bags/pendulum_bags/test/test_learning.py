@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import errno
 import math
+from dataclasses import replace
 from pathlib import Path
 
 import gymnasium
 import numpy as np
 import pytest
 
-from pendulum_bags.learning import training
+from pendulum_bags.learning import evaluation, training
 from pendulum_bags.learning.environment import SwingUp
 from pendulum_bags.learning.evaluation import Trial, run_trial
 from pendulum_bags.learning.network import Adam, Mlp
@@ -20,6 +21,7 @@ from pendulum_bags.learning.task import SwingUpTask, ranges_of
 from pendulum_bags.learning.train_cli import main
 from pendulum_bags.learning.training import Training, checkpoint_path, train
 from pendulum_lqr.policy_file import load_policy
+from pendulum_msgs_py.contract.angles import wrap
 from pendulum_msgs_py.errors import DataError, FaultError, ParameterError
 from pendulum_msgs_py.plants.plant_parameters import load_plant
 from pendulum_sim.plants import make_plant
@@ -118,6 +120,40 @@ def test_a_torque_acts_after_the_delay_as_in_the_simulator(delay):
         assert ours.motion[0, 0] + math.pi == pytest.approx(state.theta, abs=1e-6)
 
 
+def test_no_torque_acts_before_its_answer_and_each_episode_has_a_zero_angle_of_its_own():
+    task = replace(QUIET, jitter=0.005, offset=0.01)
+    env = SwingUp(200, DFKI, {}, task, np.random.default_rng(0))
+    late, advance = [], env.body.advance
+
+    def watched(motion, parameters, efforts, delays, *rest):
+        late.append(delays.copy())
+        advance(motion, parameters, efforts, delays, *rest)
+
+    env.body = replace(env.body, advance=watched)
+    errors = []
+    for _ in range(3):
+        env.step(np.zeros((200, 1), dtype=np.float32))
+        seen = env.observe()[0][:, -4:]
+        errors.append(wrap(np.arctan2(seen[:, 1], seen[:, 0]) - env.motion[:, 0]))
+    assert np.min(late) == 0.0 < np.max(late)
+    np.testing.assert_allclose(errors[0], errors[2], atol=1e-6)
+    assert 0.009 < np.abs(errors[0]).max() <= 0.0101
+
+
+def test_a_policy_s_file_tells_the_fastest_motion_of_the_whole_training_and_its_rate(tmp_path, monkeypatch):
+    speeds = iter([1.0, 5.0, 2.0])
+
+    def update(self, remaining):
+        self.environment.motion[:, 1] = -next(speeds)
+        return {"reward": 0.0, "divergence": 0.0, "spread": 0.1}
+
+    monkeypatch.setattr(training.Ppo, "update", update)
+    policy, _ = train(replace(SMALL, updates=3), tmp_path / "policy.npz")
+    assert policy.velocity_box == pytest.approx((1.1 * 5.0,))
+    # From limit to limit in the time that training allowed.
+    assert policy.effort_rate == pytest.approx((2.0 * DFKI.effort_limit / SMALL.swing_up.rate_time,))
+
+
 def test_plants_are_drawn_from_the_ranges_and_wider_intervals_of_the_plant_file_count():
     ranges = ranges_of(DFKI, 0.25, {"inertia": [0.05, 0.16]})
     assert ranges["inertia"] == (0.05, pytest.approx(0.1869, abs=1e-4))
@@ -153,6 +189,46 @@ def test_some_of_one_joint_start_spinning_and_some_where_their_effort_holds_them
     for _ in range(3):
         env.step((env.effort / env.limit).astype(np.float32))
     np.testing.assert_allclose(env.motion[held, 0], before, atol=1e-6)
+
+
+def test_who_falls_in_the_last_second_is_not_up(monkeypatch):
+    policy = random_policy(DFKI)
+    trials = [Trial(DFKI, (0.0,), (0.0,), np.zeros((300, 1))) for _ in range(3)]
+    down = iter([(0, 150), (200, 201), (199, 200)])  # until 1.5 s, once in the last second, once just before it
+
+    def run(*_):
+        rows = np.zeros((3, 300))
+        rows[0, slice(*next(down))] = 1.0
+        return rows, ""
+
+    monkeypatch.setattr(evaluation, "run_trial", run)
+    told = evaluation.measured_success(policy, trials)
+    assert (told["up"], told["median_time"]) == (2, pytest.approx(1.75))
+
+
+def test_the_time_that_is_over_is_no_end_the_value_of_where_it_got_to_counts():
+    class Counting:
+        """Its state counts steps, and an episode begins anew at 3."""
+
+        count, observation_size, privileged_size, action_size = 1, 1, 0, 1
+        at = 0.0
+
+        def observe(self):
+            return np.array([[self.at]], dtype=np.float32), np.zeros((1, 0), dtype=np.float32)
+
+        def step(self, _actions):
+            self.at += 1.0
+            return np.zeros(1, dtype=np.float32), np.array([self.at == 3.0])
+
+        def restart(self, which):
+            self.at = 0.0 if which[0] else self.at
+
+    settings = PpoSettings(hidden=(4, 4), horizon=8, discount=1.0, trace=0.0)
+    learner = Ppo(Counting(), settings, np.random.default_rng(0))
+    learner.critic.forward = lambda x: x
+    (seen, _, _, advantages, _), _ = learner._gather()
+    assert seen[:, 0].tolist() == [0.0, 1.0, 2.0, 0.0, 1.0, 2.0, 0.0, 1.0]
+    np.testing.assert_array_equal(advantages, 1.0)
 
 
 def test_learning_improves_a_policy():
@@ -296,6 +372,7 @@ def test_ctrl_c_is_one_sentence(tmp_path, monkeypatch, capsys):
         (["--task", "juggle"], "task is 'juggle'; expected one of swing_up, pendulum_v1"),
         (["--plant", "x5_9"], "is series elastic; expected a rigid one"),
         (["--delay", "0.5"], "delay is 0.5 s with a jitter of 0.001 s; expected two periods, 0.02 s, at most"),
+        (["--jitter", "0.004"], "delay is 0.008 s with a jitter of 0.004 s; expected two periods"),
         (["--share", "1.5"], "share is 1.5; expected less than 1"),
         (["--hidden", "64", "0"], "hidden is 64 0; expected widths of 1 to 512"),
         (["--history", "0"], "history is 0; expected 1 to 50 samples"),

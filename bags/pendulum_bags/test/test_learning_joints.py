@@ -125,6 +125,8 @@ def test_with_a_motor_at_each_joint_every_episode_has_a_plant_of_its_own():
 def test_a_joint_that_slides_keeps_to_its_travel_and_to_the_plant_s_own_stops():
     assert travel_of(CART_POLE, 0.4) == (0.5, math.pi)
     assert travel_of(CART_POLE, 5.0) == (1.8, math.pi)
+    aside = CART_POLE.with_values({"cart.lower_stop": -0.2})
+    assert travel_of(aside, 0.4) == (0.2, math.pi)
     env = SwingUp(300, CART_POLE, {}, replace(SwingUpTask(), travel=0.2), np.random.default_rng(0))
     for _ in range(100):
         env.step(np.ones((300, 1), dtype=np.float32))

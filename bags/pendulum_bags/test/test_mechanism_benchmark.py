@@ -23,6 +23,7 @@ from pendulum_bags.studies.mechanism_benchmark import (
     time_above_line,
 )
 from pendulum_bags.studies.mechanism_benchmark_runs import Disturbances, Trial, robustness_of, robustness_trials
+from pendulum_lqr.design import DesignError
 from pendulum_lqr.mechanism_controllers import make_mechanism_controller
 from pendulum_lqr.policy_file import write_policy
 from pendulum_msgs_py.errors import ParameterError
@@ -204,3 +205,5 @@ def test_a_policy_file_is_scored_with_an_lqr_near_upright_and_without(tmp_path) 
     assert caught != bare
     with pytest.raises(ParameterError, match="trained on a double_pendulum driven at shoulder, and this one is"):
         make_mechanism_controller(str(file), benchmark_plant("acrobot"), 0.002)
+    with pytest.raises(DesignError, match=r"trained for a period of 0\.01 s and states come every 0\.003 s"):
+        make_mechanism_controller(str(file), plant, 0.003)
