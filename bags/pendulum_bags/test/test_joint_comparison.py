@@ -5,7 +5,8 @@ from __future__ import annotations
 import json
 import shutil
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -93,31 +94,9 @@ def bags(recordings: dict[str, dict[str, np.ndarray]], tmp_path_factory: pytest.
     return {name: write(folder / name, columns) for name, columns in recordings.items()}
 
 
-def told(capsys: pytest.CaptureFixture[str], *arguments: Any) -> dict[str, Any]:
-    assert main([*map(str, arguments), "--json"]) == 0
-    content: dict[str, Any] = json.loads(capsys.readouterr().out)
-    return content
-
-
-def test_the_same_plant_twice_is_told_alike_in_every_joint(
-    bags: dict[str, Path], capsys: pytest.CaptureFixture[str]
-) -> None:
-    content = told(capsys, bags["sim"], bags["alike"])
-    assert list(content["joints"]) == list(JOINTS) == list(joints_of(bags["sim"]))
-    tests = {joint: [test["quantity"] for test in one["verdict"]["tests"]] for joint, one in content["joints"].items()}
-    assert [one["verdict"]["outcome"] for one in content["joints"].values()] == ["equivalent", "equivalent"]
-    assert content["answer"]["mark"] == "yes"
-    # What slides has positions and a force; a joint without a motor has no torque that could be tested.
-    assert {"mean position difference", "spread of force (ratio)", "distance of positions"} <= set(tests["cart"])
-    assert {"mean angle difference", "distance of angles"} <= set(tests["pole"])
-    assert not [name for name in tests["pole"] if "torque" in name or "force" in name]
-    # Noise on the cart moves the pole too: both joints are paired by it.
-    assert all("position" in one["paired"] for one in content["joints"].values())
-
-
-def test_bags_are_opened_and_their_tables_of_joints_made_once_however_many_joints_are_compared(
-    bags: dict[str, Path], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+@contextmanager
+def each_read_once(first: Path, second: Path) -> Iterator[None]:
+    """Check that two bags are opened, and their tables of joints made, once however many joints are asked for."""
     opened: Counter[Path] = Counter()
     tables: Counter[str] = Counter()
 
@@ -130,13 +109,37 @@ def test_bags_are_opened_and_their_tables_of_joints_made_once_however_many_joint
         return joint_table(messages, where)
 
     make = Bag.__init__
-    monkeypatch.setattr(Bag, "__init__", open_counted)
-    monkeypatch.setattr(bag_module, "joint_table", table_counted)
-    told(capsys, bags["sim"], bags["alike"])
-    assert dict(opened) == {bags["sim"]: 1, bags["alike"]: 1}
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(Bag, "__init__", open_counted)
+        patch.setattr(bag_module, "joint_table", table_counted)
+        yield
+    assert dict(opened) == {first: 1, second: 1}
     # States, commands and disturbance of each bag.
     assert len(tables) == 6
     assert set(tables.values()) == {1}
+
+
+def told(capsys: pytest.CaptureFixture[str], *arguments: Any) -> dict[str, Any]:
+    assert main([*map(str, arguments), "--json"]) == 0
+    content: dict[str, Any] = json.loads(capsys.readouterr().out)
+    return content
+
+
+def test_the_same_plant_twice_is_told_alike_in_every_joint(
+    bags: dict[str, Path], capsys: pytest.CaptureFixture[str]
+) -> None:
+    with each_read_once(bags["sim"], bags["alike"]):
+        content = told(capsys, bags["sim"], bags["alike"])
+    assert list(content["joints"]) == list(JOINTS) == list(joints_of(bags["sim"]))
+    tests = {joint: [test["quantity"] for test in one["verdict"]["tests"]] for joint, one in content["joints"].items()}
+    assert [one["verdict"]["outcome"] for one in content["joints"].values()] == ["equivalent", "equivalent"]
+    assert content["answer"]["mark"] == "yes"
+    # What slides has positions and a force; a joint without a motor has no torque that could be tested.
+    assert {"mean position difference", "spread of force (ratio)", "distance of positions"} <= set(tests["cart"])
+    assert {"mean angle difference", "distance of angles"} <= set(tests["pole"])
+    assert not [name for name in tests["pole"] if "torque" in name or "force" in name]
+    # Noise on the cart moves the pole too: both joints are paired by it.
+    assert all("position" in one["paired"] for one in content["joints"].values())
 
 
 def test_another_plant_is_told_by_the_joint_that_shows_it(
@@ -231,7 +234,8 @@ def test_a_plant_is_as_alike_as_its_least_alike_joint(marks: tuple[Mark, Mark], 
 @pytest.fixture(scope="module")
 def report(bags: dict[str, Path], tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("report")
-    assert report_main([str(bags["sim"]), str(bags["alike"]), "--png-only", "-o", str(folder)]) == 0
+    with each_read_once(bags["sim"], bags["alike"]):
+        assert report_main([str(bags["sim"]), str(bags["alike"]), "--png-only", "-o", str(folder)]) == 0
     return folder
 
 

@@ -10,11 +10,13 @@ from pendulum_bags.comparison import Comparison
 from pendulum_bags.frequency_response.result import Analysis
 from pendulum_bags.replay.result import InputReplay
 from pendulum_bags.report.trials import TrialSet
+from pendulum_bags.runs.run_data import OpenBag
 from pendulum_bags.runs.run_record import run_record
 from pendulum_bags.verdict import Answer
 from pendulum_bags.verdict.answer import answer_of
 from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.plants.plant_parameters import PlantParameters, load_plant
+from pendulum_rosbag.reader import read_bag
 
 __all__ = ["ReportData"]
 
@@ -31,6 +33,7 @@ class ReportData:
         trials: The thesis's identification experiments, where they were recorded.
         answer: The sum of all layers that were measured; by default of the comparison alone.
         certified: Which designs carry over to the hardware, where its frequency response was measured.
+        open_bag: How a bag is opened that tells more than the comparison.
     """
 
     comparison: Comparison
@@ -40,6 +43,7 @@ class ReportData:
     trials: Sequence[TrialSet] = ()
     answer: Answer = None  # type: ignore[assignment]  # filled in below
     certified: Analysis | None = None
+    open_bag: OpenBag = read_bag
     plant: PlantParameters | None = field(init=False)
 
     def __post_init__(self) -> None:

@@ -6,13 +6,12 @@ from pendulum_bags.figures.numbers import quantity
 from pendulum_bags.figures.table import Table
 from pendulum_bags.report.data import ReportData
 from pendulum_bags.report.tables import typeset
-from pendulum_bags.runs.run_data import RunData, is_emulated
+from pendulum_bags.runs.run_data import OpenBag, RunData, is_emulated
 from pendulum_bags.runs.run_record import run_record
 from pendulum_msgs_py.contract import names
 from pendulum_msgs_py.errors import BagError, DataError, ParameterError
 from pendulum_msgs_py.plants.plant_differences import PLANT_PARAMETERS, read_plants
 from pendulum_msgs_py.plants.plant_parameters import DRIVETRAIN_SPECS, PLANT_SPECS, PlantParameters
-from pendulum_rosbag.reader import read_bag
 
 __all__ = ["emulator_table"]
 
@@ -20,7 +19,7 @@ __all__ = ["emulator_table"]
 def emulator_table(data: ReportData) -> Table | None:
     """Return the constants of the emulator of the first run; None where none was used, or its bag does not tell."""
     hardware = data.comparison.pairs[0].hardware
-    plant = _emulated_plant(hardware) if is_emulated(hardware) else None
+    plant = _emulated_plant(hardware, data.open_bag) if is_emulated(hardware) else None
     if plant is None:
         return None
     rows = [
@@ -39,11 +38,11 @@ def emulator_table(data: ReportData) -> Table | None:
     )
 
 
-def _emulated_plant(run: RunData) -> PlantParameters | None:
+def _emulated_plant(run: RunData, open_bag: OpenBag) -> PlantParameters | None:
     """Return the plant with a drivetrain that a run's diagnostics tell of."""
     space = str(run_record(run.metadata).get("namespace", "")).rstrip("/") + "/"
     try:
-        with read_bag(run.source) as bag:
+        with open_bag(run.source) as bag:
             told = bag.messages(names.DIAGNOSTICS) if names.DIAGNOSTICS in bag.topics else []
         texts = (
             pair.value

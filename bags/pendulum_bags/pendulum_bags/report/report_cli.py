@@ -53,6 +53,7 @@ def report(
     from pendulum_bags.frequency_response.carry_over import carry_over, layers_of
     from pendulum_bags.report import write_report
     from pendulum_bags.report.write import margin_of, write_joint_report
+    from pendulum_bags.runs.kept_bags import KeptBags
     from pendulum_bags.runs.run_data import joints_of
     from pendulum_bags.verdict.answer import answer_of, answer_of_joints
 
@@ -77,36 +78,38 @@ def report(
     target = out or alone or _common(folders)
     kept = [*([alone] if alone else ()), *(layers or ())]
     formats = ("png",) if png_only else ("png", "pdf")
-    if joints := joints_of(folders[0] / "sim" if pooled else folders[0]):
-        if trials or machine or design or recording:
-            raise DataError(
-                "folders of trials, --machine, --design and --recording are of plants of one joint; expected none of "
-                f"them for a plant of {len(joints)} ({', '.join(joints)})"
+    with KeptBags() as bags:
+        if joints := joints_of(folders[0] / "sim" if pooled else folders[0], open_bag=bags):
+            if trials or machine or design or recording:
+                raise DataError(
+                    "folders of trials, --machine, --design and --recording are of plants of one joint; expected none "
+                    f"of them for a plant of {len(joints)} ({', '.join(joints)})"
+                )
+            if alone and not margins.stated:
+                margins = Margins.parse(margin_of(_of_joint(alone, joints[0])))
+            comparisons = {joint: run(margin=margins, joint=joint, open_bag=bags) for joint in joints}
+            answer = answer_of_joints(comparisons, kept)
+            page = write_joint_report(target, comparisons, folders=folders, formats=formats, answer=answer)
+        else:
+            summary = _summary(alone) if alone and not margins.stated else None
+            if summary is not None:
+                # What the run was judged by when it was recorded.
+                margins = Margins.parse(margin_of(summary))
+            result = run(margin=margins, open_bag=bags)
+            certified = carry_over(result, kept, machine, design or ())
+            answer = answer_of(result, kept, anew=layers_of(certified))
+            page = write_report(
+                target,
+                {key: value for key, value in (summary or {}).items() if key != "verdict"},
+                comparison=result,
+                folders=folders if len(folders) > 1 else (),
+                trials=trials,
+                recordings=recording or (),
+                formats=formats,
+                answer=answer,
+                certified=certified,
+                open_bag=bags,
             )
-        if alone and not margins.stated:
-            margins = Margins.parse(margin_of(_of_joint(alone, joints[0])))
-        comparisons = {joint: run(margin=margins, joint=joint) for joint in joints}
-        answer = answer_of_joints(comparisons, kept)
-        page = write_joint_report(target, comparisons, folders=folders, formats=formats, answer=answer)
-    else:
-        summary = _summary(alone) if alone and not margins.stated else None
-        if summary is not None:
-            # What the run was judged by when it was recorded.
-            margins = Margins.parse(margin_of(summary))
-        result = run(margin=margins)
-        certified = carry_over(result, kept, machine, design or ())
-        answer = answer_of(result, kept, anew=layers_of(certified))
-        page = write_report(
-            target,
-            {key: value for key, value in (summary or {}).items() if key != "verdict"},
-            comparison=result,
-            folders=folders if len(folders) > 1 else (),
-            trials=trials,
-            recordings=recording or (),
-            formats=formats,
-            answer=answer,
-            certified=certified,
-        )
     print(answer.sentence)
     print(f"report  {page} ({page.stat().st_size / 1e6:.1f} MB, {time.monotonic() - started:.1f} s)")
     print(f"figures {page.parent / 'figures'}")

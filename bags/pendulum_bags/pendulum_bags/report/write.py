@@ -20,12 +20,14 @@ from pendulum_bags.report.trials import read_trials
 from pendulum_bags.report.wording import name_in
 from pendulum_bags.verdict.answer import answer_of
 from pendulum_msgs_py.errors import BagError, PendulumError
+from pendulum_rosbag.reader import read_bag
 
 if TYPE_CHECKING:
     from pendulum_bags.comparison import Comparison
     from pendulum_bags.comparison.margins import MarginArgument
     from pendulum_bags.frequency_response.result import Analysis
     from pendulum_bags.replay.result import InputReplay
+    from pendulum_bags.runs.run_data import OpenBag
     from pendulum_bags.verdict import Answer
 
 __all__ = ["find_real_recording", "margin_of", "title_of", "write_joint_report", "write_report"]
@@ -45,6 +47,7 @@ def write_report(
     formats: Sequence[str] = ("png", "pdf"),
     answer: Answer | None = None,
     certified: Analysis | None = None,
+    open_bag: OpenBag = read_bag,
 ) -> Path:
     """Write ``report.html`` and ``figures/`` into a folder.
 
@@ -61,6 +64,7 @@ def write_report(
         formats: Formats of the figures.
         answer: The sum of all layers; by default of the comparison and of what the run folder keeps.
         certified: Which designs carry over to the measured machine; by default as the run folder's response says.
+        open_bag: How bags are opened.
 
     Returns:
         Path of the page.
@@ -74,7 +78,9 @@ def write_report(
 
     out = Path(run_folder)
     if comparison is None:
-        comparison = compare_folders(list(folders) or [out], margin=margin_of(summary) if margin is None else margin)
+        comparison = compare_folders(
+            list(folders) or [out], margin=margin_of(summary) if margin is None else margin, open_bag=open_bag
+        )
     content = {**comparison.to_json(), **(summary or {})}
     found = [find_real_recording()] if recordings is None else list(recordings)
     replays = [
@@ -85,7 +91,7 @@ def write_report(
     certified = certified or carry_over(comparison, kept)
     answer = answer or answer_of(comparison, kept, anew=layers_of(certified))
     known = [read_trials(path) for path in trials]
-    data = ReportData(comparison, content, replays, names, known, answer, certified)
+    data = ReportData(comparison, content, replays, names, known, answer, certified, open_bag)
     figures, missing = make_figures(data)
     page = page_of(
         data, figures, make_tables(data), missing,

@@ -137,8 +137,8 @@ def joints_of(
         DataError: It lacks the states.
     """
     with open_bag(path) as bag:
-        topic = f"{_space(bag, prefix)}/{names.JOINT_STATES}"
-        return () if isinstance(bag[topic], np.ndarray) else bag.joints(topic).names
+        found = bag.joint_names(f"{_space(bag, prefix)}/{names.JOINT_STATES}")
+        return found if len(found) > 1 else ()
 
 
 def _space(bag: Bag, prefix: str | None) -> str:

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from pendulum_msgs_py.contract.cdr import decode_joint_state
 from pendulum_msgs_py.errors import DataError
 from pendulum_rosbag.reader.batches import Batch, Int64, Source, Stream
 from pendulum_rosbag.reader.joint_state import JointStateParser
@@ -143,6 +144,14 @@ class Bag(Mapping[str, Any]):
         if topic not in self._tables:
             self._tables[topic] = joint_table(self.raw(topic), f"topic {topic} of bag {self.path}")
         return self._tables[topic]
+
+    def joint_names(self, topic: str) -> tuple[str, ...]:
+        """Return the joints that the first message of a topic names; none where it has none or is no JointState."""
+        if topic not in self._topics:
+            return self[topic]  # raises
+        batches = self._batches({topic})[topic] if self._is_fixed(topic) else []
+        first = next((decode_joint_state(data) for batch in batches for _, data in batch.payloads()), None)
+        return () if first is None else first.joints
 
     def load(self) -> Bag:
         """Read all topics now, in one pass over the files, and return the bag."""
