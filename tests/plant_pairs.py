@@ -92,10 +92,18 @@ def _run(rows: NDArray[np.float64], rate: float, seed: int, label: str) -> RunDa
     t, position, velocity, effort, disturbance = rows.T
     series = Series(t, position, velocity, effort, label)
     return RunData(
-        label, series, series, Signal(t, disturbance), None, None, np.full(t.size - 1, 1.0 / rate), rate, 0,
+        label,
+        series,
+        series,
+        Signal(t, disturbance),
+        None,
+        None,
+        np.full(t.size - 1, 1.0 / rate),
+        rate,
+        0,
         metadata={"pendulum.run": {"seed": seed, "plant": "emulator" if label == "hardware" else "thesis"}},
         source=f"{label}_{seed}",
-    )  # fmt: skip
+    )
 
 
 def record_compiled(
@@ -135,9 +143,18 @@ def record_compiled(
         seen, step = generator.normal(0.0, SENSORS["velocity_noise"], states), SENSORS["position_step"]
     rows = np.empty((states, 5))
     _kernel()(
-        pack(plant), plant.effort_limit, count, per_state, round(HOLD / STEP), noise, seen, step, gain,
-        round(late / STEP), rows,
-    )  # fmt: skip
+        pack(plant),
+        plant.effort_limit,
+        count,
+        per_state,
+        round(HOLD / STEP),
+        noise,
+        seen,
+        step,
+        gain,
+        round(late / STEP),
+        rows,
+    )
     return _run(rows[: count // per_state], rate, seed, label)
 
 
@@ -154,9 +171,7 @@ def _kernel() -> Any:
     has_dry_friction = compile_tree(is_dry)
 
     @numba.njit(error_model="numpy")
-    def run(
-        plant, limit, count, per_state, held, noise, seen, step, gain, late, rows
-    ):  # fmt: skip
+    def run(plant, limit, count, per_state, held, noise, seen, step, gain, late, rows):
         c = coefficients_of(plant[1] / plant[0], STEP)
         dry = has_dry_friction(plant)
         theta, theta_dot, command = UPRIGHT, 0.0, 0.0

@@ -25,8 +25,12 @@ def random_policy(
     changes.setdefault("signals", default_signals(coordinates))
     layout = sample_layout(changes["signals"], coordinates)
     sizes = (history * len(layout), *hidden, len(coordinates.driven))
-    return _policy(plant, _network(sizes, seed, changes.pop("activation", "tanh"), changes.pop("output", "clip")),
-                   history=history, **changes)  # fmt: skip
+    return _policy(
+        plant,
+        _network(sizes, seed, changes.pop("activation", "tanh"), changes.pop("output", "clip")),
+        history=history,
+        **changes,
+    )
 
 
 def linear_policy(plant: PlantParameters, angle_gain: float, velocity_gain: float, **changes: Any) -> Policy:
@@ -66,9 +70,16 @@ def _policy(plant: AnyPlant, network: Network, **changes: Any) -> Policy:
     n, m = len(coordinates.joints), len(coordinates.driven)
     limits = plant.effort_limits if isinstance(plant, MechanismParameters) else (plant.effort_limit,)
     values: dict[str, Any] = {
-        "name": "test", "task": "swing_up", "joints": coordinates.names, "period": 0.01, "plant": plant, "ranges": {},
-        "effort_limit": limits, "effort_rate": (math.inf,) * m, "velocity_scale": (1.0,) * n,
+        "name": "test",
+        "task": "swing_up",
+        "joints": coordinates.names,
+        "period": 0.01,
+        "plant": plant,
+        "ranges": {},
+        "effort_limit": limits,
+        "effort_rate": (math.inf,) * m,
+        "velocity_scale": (1.0,) * n,
         "angle_box": tuple(math.pi if joint.turns else 0.5 for joint in coordinates.joints),
         "velocity_box": (20.0,) * n,
-    }  # fmt: skip
+    }
     return Policy(network=network, **{**values, **changes})

@@ -22,9 +22,11 @@ def assembled(plant: str = "acrobot", *, lockstep: bool = False, **given: Any) -
 
 def test_each_joint_has_its_own_zero_sign_tare_and_window_and_a_passive_one_a_port_that_is_read() -> None:
     assembly = assembled(
-        joint_offsets=[1.0, 0.5], joint_signs=[1.0, -1.0], effort_tares=[0.0, 0.25],
+        joint_offsets=[1.0, 0.5],
+        joint_signs=[1.0, -1.0],
+        effort_tares=[0.0, 0.25],
         position_window=[-2.0, 3.0, -1.0, 4.0],
-    )  # fmt: skip
+    )
     shoulder, elbow = assembly.modules(SteppedClock())
     assert (type(shoulder.port), type(elbow.port)) == (GroupEncoder, GroupDrive)
     assert (isinstance(shoulder, DrivenModule), isinstance(elbow, DrivenModule)) == (False, True)

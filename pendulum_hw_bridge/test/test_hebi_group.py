@@ -183,9 +183,12 @@ class Rig:
         self.coordinates = coordinates
         chosen = selections or (ModuleSelection(name="z_first"), ModuleSelection(serial="S-2"))
         self.shared = HebiGroup(
-            list(zip(NAMES, chosen, strict=True)), coordinates.driven, look_time=0.01, lookup=lambda: self.network,
+            list(zip(NAMES, chosen, strict=True)),
+            coordinates.driven,
+            look_time=0.01,
+            lookup=lambda: self.network,
             **options,
-        )  # fmt: skip
+        )
         limits = PlantLimits(effort=(8.0,) * len(coordinates.driven), feedback_timeout=1.0, starvation=100.0)
         self.supervisor = PlantSupervisor(limits, coordinates=coordinates)
         self.bridge = Bridge([self._module(index) for index in (0, 1)], self.supervisor)

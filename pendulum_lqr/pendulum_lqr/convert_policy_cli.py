@@ -100,9 +100,12 @@ def _import(source: Path, out: Path, told: Told) -> str:
 
     actor = load_actor(source)
     provenance = {
-        "archive": source.name, "sha256": actor.sha256, "algorithm": actor.algorithm,
-        "stable_baselines3": actor.version, "steps": actor.steps,
-    }  # fmt: skip
+        "archive": source.name,
+        "sha256": actor.sha256,
+        "algorithm": actor.algorithm,
+        "stable_baselines3": actor.version,
+        "steps": actor.steps,
+    }
     name = f"{told.plant.name} {actor.algorithm}"
     policy = policy_of_actor(actor, told, name=name, provenance=provenance)
     write_policy(out, policy)

@@ -60,9 +60,17 @@ def print_time_figures(console: Console, found: Sequence[TimeFigures | None], ch
     """
     table = RowTable(
         "In time (linear, delay included)",
-        ("#", "rise \\[s]", "settling \\[s]", "overshoot", "torque \\[N m/rad]", "push rests \\[rad/(N m)]",
-         "push peak \\[rad/(N m)]", "friction holds \\[rad]"),
-    )  # fmt: skip
+        (
+            "#",
+            "rise \\[s]",
+            "settling \\[s]",
+            "overshoot",
+            "torque \\[N m/rad]",
+            "push rests \\[rad/(N m)]",
+            "push peak \\[rad/(N m)]",
+            "friction holds \\[rad]",
+        ),
+    )
     for index, one in enumerate(found, start=1):
         if one is None:
             cells = ["unstable", *["\u2013"] * 6]

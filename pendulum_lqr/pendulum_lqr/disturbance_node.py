@@ -42,14 +42,20 @@ NODE_SPECS: tuple[ParameterSpec, ...] = (
     ParameterSpec("autostart", False, "", "Start with the first state, without a call of ~/start.", read_only=True),
     ParameterSpec("duration", 0.0, "s", "How long to disturb; 0 until ~/stop.", minimum=0.0),
     ParameterSpec(
-        "file", "", "", "For from_bag: CSV file with a header line and the columns time since the start [s] and "
-        "torque [N m].",
+        "file",
+        "",
+        "",
+        "For from_bag: CSV file with a header line and the columns time since the start [s] and torque [N m].",
     ),
     ParameterSpec(
-        "joints", [""], "", "Joints to disturb, in the plant's order, each by a signal of its own: the seed counts up "
-        "from one to the next. Empty for the joint of a pendulum.", read_only=True,
+        "joints",
+        [""],
+        "",
+        "Joints to disturb, in the plant's order, each by a signal of its own: the seed counts up "
+        "from one to the next. Empty for the joint of a pendulum.",
+        read_only=True,
     ),
-)  # fmt: skip
+)
 """Parameters of the node itself, next to those of the signal."""
 
 

@@ -124,9 +124,15 @@ def pole_map_figure(model: LinearModel, gains: Mapping[str, Array]) -> Figure:
     for index, (label, values) in enumerate(poles.items()):
         # Gains of one table often share a pole: sizes differ so that none hides another.
         ax.plot(
-            values.real, values.imag, "x", color=COLOURS[index % len(COLOURS)], ms=13 - 1.6 * index, mew=2.2,
-            label=label, zorder=5 + index,
-        )  # fmt: skip
+            values.real,
+            values.imag,
+            "x",
+            color=COLOURS[index % len(COLOURS)],
+            ms=13 - 1.6 * index,
+            mew=2.2,
+            label=label,
+            zorder=5 + index,
+        )
     ax.set_title("Poles", loc="left", fontweight="bold")
     _legend_below(ax)
     return figure
@@ -182,20 +188,31 @@ def bode_figure(model: LinearModel, K: Array) -> Figure:
         for ax in (top, bottom):
             ax.axvline(margins.crossover, color=MUTED, linewidth=0.9, linestyle=":")
         bottom.annotate(
-            "", xy=(margins.crossover, at), xytext=(margins.crossover, -180.0),
+            "",
+            xy=(margins.crossover, at),
+            xytext=(margins.crossover, -180.0),
             arrowprops={"arrowstyle": "<->", "color": COLOURS[2], "lw": 1.6},
-        )  # fmt: skip
+        )
         bottom.text(
-            1.15 * margins.crossover, 0.5 * (at - 180.0), f"phase margin {math.degrees(margins.phase):.1f}\u00b0\n"
-            f"delay margin {margins.delay * 1e3:.0f} ms", color=COLOURS[2], va="center", fontsize=9,
-        )  # fmt: skip
+            1.15 * margins.crossover,
+            0.5 * (at - 180.0),
+            f"phase margin {math.degrees(margins.phase):.1f}\u00b0\ndelay margin {margins.delay * 1e3:.0f} ms",
+            color=COLOURS[2],
+            va="center",
+            fontsize=9,
+        )
     up = "any factor" if math.isinf(margins.gain_up) else f"{margins.gain_up:.3g}"
     top.text(
-        0.98, 0.93, f"gain may grow by {up}\nand shrink to {margins.gain_down:.3f}\n"
-        f"modulus margin {margins.modulus:.3f}",
-        transform=top.transAxes, ha="right", va="top", fontsize=9, color=COLOURS[2],
+        0.98,
+        0.93,
+        f"gain may grow by {up}\nand shrink to {margins.gain_down:.3f}\nmodulus margin {margins.modulus:.3f}",
+        transform=top.transAxes,
+        ha="right",
+        va="top",
+        fontsize=9,
+        color=COLOURS[2],
         bbox={"facecolor": "white", "edgecolor": "none", "alpha": 0.85},
-    )  # fmt: skip
+    )
     return figure
 
 

@@ -130,9 +130,12 @@ def search_swing_up(
         np.arange(len(plan.states)) * search.step,
         plan.states[:, : 2 * n].copy(),
         plan.states[:, 2 * n :].copy(),
-        {"seed": seed, "cost": plan.cost, "search": {**asdict(search), "weights": list(search.weights),
-                                                     "find": list(search.find)}},
-    )  # fmt: skip
+        {
+            "seed": seed,
+            "cost": plan.cost,
+            "search": {**asdict(search), "weights": list(search.weights), "find": list(search.find)},
+        },
+    )
 
 
 def _held(plant: MechanismParameters, catch: MechanismCatch, z: Vector, count: int, search: SwingUpSearch) -> Array:

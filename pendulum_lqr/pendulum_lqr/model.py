@@ -261,15 +261,29 @@ def _elastic_flow(
         motor_angle - angle, 0.0, drive.stiffness, drive.stiffness_hardening, 0.0
     )
     current = in_arithmetic(winding_current, cmath)(
-        command_pwm(torque, drive), motor_velocity, drive.supply_voltage, drive.back_emf_constant, drive.gear_ratio,
+        command_pwm(torque, drive),
+        motor_velocity,
+        drive.supply_voltage,
+        drive.back_emf_constant,
+        drive.gear_ratio,
         resistance_of(drive),
-    )  # fmt: skip
+    )
     motor = in_arithmetic(motor_acceleration, cmath)(
-        current, motor_velocity, spring, drive.torque_constant, drive.gear_ratio, drive.motor_damping,
+        current,
+        motor_velocity,
+        spring,
+        drive.torque_constant,
+        drive.gear_ratio,
+        drive.motor_damping,
         drive.reflected_inertia,
-    )  # fmt: skip
+    )
     link = in_arithmetic(link_acceleration, cmath)(
-        angle - offset_of(plant, "angle_offset"), velocity, spring, push + offset_of(plant, "torque_offset"),
-        plant.inertia, plant.damping, plant.gravity,
-    )  # fmt: skip
+        angle - offset_of(plant, "angle_offset"),
+        velocity,
+        spring,
+        push + offset_of(plant, "torque_offset"),
+        plant.inertia,
+        plant.damping,
+        plant.gravity,
+    )
     return velocity, link, motor_velocity, motor

@@ -168,8 +168,11 @@ class PolicyAnswers:
         self.notice = previous.notice
         own, other = self.policy, previous.policy
         if (own.layout, own.history, own.velocity_scale, own.effort_limit) == (
-            other.layout, other.history, other.velocity_scale, other.effort_limit
-        ):  # fmt: skip
+            other.layout,
+            other.history,
+            other.velocity_scale,
+            other.effort_limit,
+        ):
             self._observation = None if previous._observation is None else previous._observation.copy()
             self._effort = tuple(
                 min(limit, max(-limit, effort)) for effort, limit in zip(previous._effort, self.limits, strict=True)

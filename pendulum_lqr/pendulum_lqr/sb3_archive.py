@@ -51,16 +51,20 @@ class _Kind:
 
 _KINDS = {
     "stable_baselines3.common.policies": _Kind(
-        "PPO or A2C", "tanh", "clip", "mlp_extractor.policy_net", "action_net",
+        "PPO or A2C",
+        "tanh",
+        "clip",
+        "mlp_extractor.policy_net",
+        "action_net",
         ("log_std", "mlp_extractor.value_net.", "value_net."),
     ),
     "stable_baselines3.sac.policies": _Kind(
-        "SAC", "relu", "tanh", "actor.latent_pi", "actor.mu", ("actor.log_std.", "critic.", "critic_target."),
+        "SAC", "relu", "tanh", "actor.latent_pi", "actor.mu", ("actor.log_std.", "critic.", "critic_target.")
     ),
     "sb3_contrib.tqc.policies": _Kind(
-        "TQC", "relu", "tanh", "actor.latent_pi", "actor.mu", ("actor.log_std.", "critic.", "critic_target."),
+        "TQC", "relu", "tanh", "actor.latent_pi", "actor.mu", ("actor.log_std.", "critic.", "critic_target.")
     ),
-}  # fmt: skip
+}
 """Module of the class of policies -> its actor."""
 _ACTIVATIONS = {
     "<class 'torch.nn.modules.activation.Tanh'>": "tanh",
@@ -166,9 +170,14 @@ def _read(content: bytes) -> Actor:
     version = rest[0].decode("ascii", "replace").strip() if rest else ""
     steps = told.get("num_timesteps")
     return Actor(
-        network, observations, actions, kind.algorithm, version if version.isprintable() else "",
-        steps if type(steps) is int else None, hashlib.sha256(content).hexdigest(),
-    )  # fmt: skip
+        network,
+        observations,
+        actions,
+        kind.algorithm,
+        version if version.isprintable() else "",
+        steps if type(steps) is int else None,
+        hashlib.sha256(content).hexdigest(),
+    )
 
 
 def _json(data: bytes) -> dict[str, Any]:

@@ -29,9 +29,7 @@ _LARGEST_PICKLE = 1_000_000
 _MOST_TENSORS = 1000
 _MOST_AXES = 8
 _DTYPES: dict[str, np.dtype[Any]] = {"FloatStorage": np.dtype("<f4"), "DoubleStorage": np.dtype("<f8")}
-_NAMES = {
-    "collections OrderedDict", "torch._utils _rebuild_tensor_v2", *(f"torch {name}" for name in _DTYPES)
-}  # fmt: skip
+_NAMES = {"collections OrderedDict", "torch._utils _rebuild_tensor_v2", *(f"torch {name}" for name in _DTYPES)}
 
 
 class _Name(NamedTuple):

@@ -32,10 +32,15 @@ __all__ = ["NODE_SPECS", "TrajectoryActionNode", "main"]
 
 NODE_SPECS: tuple[ParameterSpec, ...] = (
     ParameterSpec(
-        "silence_timeout", 2.0, "s", "Time without a state, or an answer to a goal, after which it is given up.",
-        minimum=0.0, exclusive_minimum=True, read_only=True,
+        "silence_timeout",
+        2.0,
+        "s",
+        "Time without a state, or an answer to a goal, after which it is given up.",
+        minimum=0.0,
+        exclusive_minimum=True,
+        read_only=True,
     ),
-)  # fmt: skip
+)
 
 _ACTION = "~/follow_joint_trajectory"
 _FEEDBACK_PERIOD = 0.05
@@ -103,10 +108,8 @@ class TrajectoryActionNode(Node):
         goal = handle.request
         tolerances = {
             name: len(getattr(goal, name))
-            for name in (
-                "path_tolerance", "component_path_tolerance", "goal_tolerance", "component_goal_tolerance",
-            )
-        }  # fmt: skip
+            for name in ("path_tolerance", "component_path_tolerance", "goal_tolerance", "component_goal_tolerance")
+        }
         end = goal_problem(list(goal.trajectory.joint_names), list(goal.multi_dof_trajectory.joint_names), tolerances)
         if end is None and self._plant.active:
             end = End(Outcome.REFUSED, "another goal came before it; expected it cancelled first")
@@ -154,9 +157,13 @@ class TrajectoryActionNode(Node):
         if self._server is None:
             # Who waits for the server waits for a plant, too.
             self._server = ActionServer(
-                self, self._action, _ACTION,
-                execute_callback=self._follow, goal_callback=self._on_goal, cancel_callback=self._on_cancel,
-            )  # fmt: skip
+                self,
+                self._action,
+                _ACTION,
+                execute_callback=self._follow,
+                goal_callback=self._on_goal,
+                cancel_callback=self._on_cancel,
+            )
             self.get_logger().info(f"serving {self.resolve_topic_name(_ACTION)}")
 
     def _on_event(self, message: String) -> None:

@@ -60,8 +60,13 @@ def test_the_catch_takes_over_within_its_region_where_it_catches_and_lets_go_bey
     assert not caught(6.0, np.linalg.solve(catch.gain.S, catch.gain.K[0]))
     unit = np.array([1.0, 0.0, 0.0, 0.0]) / math.sqrt(catch.gain.S[0, 0] / catch.region.level)
     assert [catch.holds(scale * unit) for scale in (1.1, 0.9, 1.1, 1.3, 1.5, 1.1)] == [
-        False, True, True, True, False, False,
-    ]  # fmt: skip
+        False,
+        True,
+        True,
+        True,
+        False,
+        False,
+    ]
 
 
 @pytest.mark.parametrize("name", ["acrobot_frictionless", "pendubot_frictionless"])

@@ -73,8 +73,14 @@ def taken(content):
 @pytest.mark.parametrize("output", ["clip", "tanh"])
 @pytest.mark.parametrize("activation", ["tanh", "relu"])
 def test_a_policy_comes_back_from_its_file_to_the_last_bit(tmp_path, activation, output):
-    policy = random_policy(DFKI, activation=activation, output=output, ranges={"inertia": (0.1, 0.2)},
-                           effort_rate=(60.0,), provenance={"seed": 7})  # fmt: skip
+    policy = random_policy(
+        DFKI,
+        activation=activation,
+        output=output,
+        ranges={"inertia": (0.1, 0.2)},
+        effort_rate=(60.0,),
+        provenance={"seed": 7},
+    )
     back = load_policy(write_policy(tmp_path / "a.npz", policy))
     for ours, theirs in zip(policy.network.weights, back.network.weights, strict=True):
         np.testing.assert_array_equal(ours, theirs)

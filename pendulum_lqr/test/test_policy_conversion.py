@@ -335,10 +335,12 @@ def test_the_command_converts_both_ways_and_says_what_it_took(tmp_path, capsys):
         (["sac_answers.npz", "--out", "a.onnx"], "is refused: it holds"),
         (["sac.zip", "--out", "a.npz", "--plant", "dfki", "--period", "0.05"], "largest action is 2"),
         (["sac.zip", "--out", "a.npz", "--plant", "dfki", "--period", "inf"], "expected --plant, and a finite"),
-        (["sac.zip", "--out", "a.npz", "--plant", "dfki", "--period", "0.05", "--velocity-scale", "0"],
-         "velocity_scale is 0"),
+        (
+            ["sac.zip", "--out", "a.npz", "--plant", "dfki", "--period", "0.05", "--velocity-scale", "0"],
+            "velocity_scale is 0",
+        ),
     ],
-)  # fmt: skip
+)
 def test_a_conversion_that_cannot_be_is_refused_and_leaves_nothing(tmp_path, capsys, monkeypatch, arguments, words):
     for name in ("sac.zip", "sac_answers.npz"):
         (tmp_path / name).write_bytes((IMPORTED / name).read_bytes())

@@ -106,9 +106,18 @@ def test_who_is_said_to_ignore_the_period_does(kind):
 
 def test_who_depends_on_the_period_is_known():
     assert {kind for kind in CONTROLLERS if uses_period(kind)} == {
-        "lqi", "lqg", "lqr_friction", "lqr_tracking", "discrete_lqr", "pid", "time_optimal", "tvlqr", "mpc", "nmpc",
+        "lqi",
+        "lqg",
+        "lqr_friction",
+        "lqr_tracking",
+        "discrete_lqr",
+        "pid",
+        "time_optimal",
+        "tvlqr",
+        "mpc",
+        "nmpc",
         "policy",
-    }  # fmt: skip
+    }
     assert uses_period("one_of_mine")
     fast, slow = (make_controller("discrete_lqr", THESIS, period) for period in (0.002, 0.02))
     assert fast.command(0.0, (0.1, 0.2)) != slow.command(0.0, (0.1, 0.2))

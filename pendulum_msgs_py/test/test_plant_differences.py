@@ -45,8 +45,11 @@ def test_every_parameter_of_the_plant_is_compared(spec: ParameterSpec) -> None:
     other = base.with_values(**{spec.name: getattr(base, spec.name) * 1.1 + 1e-3})
     (found,) = plant_differences(base, other)
     assert (found.name, found.designed, found.running, found.unit) == (
-        spec.name, getattr(base, spec.name), getattr(other, spec.name), spec.unit,
-    )  # fmt: skip
+        spec.name,
+        getattr(base, spec.name),
+        getattr(other, spec.name),
+        spec.unit,
+    )
 
 
 @pytest.mark.parametrize("spec", DRIVETRAIN_SPECS, ids=lambda spec: spec.name)

@@ -77,7 +77,7 @@ def test_a_message_of_as_many_bytes_with_the_names_the_other_way_round_is_read_b
         (["shoulder", "elbow"], [1.0, 2.0], [3.0, 4.0, 5.0], [], "velocity has 3 values; expected 2"),
         (["shoulder", "elbow"], [1.0, 2.0], [3.0, 4.0], [5.0], "effort has 1 values; expected 2"),
     ],
-)  # fmt: skip
+)
 def test_a_state_of_several_joints_is_believed_in_full_and_in_order_or_not_at_all(
     names: list[str], position: list[float], velocity: list[float], effort: list[float], problem: str
 ) -> None:
@@ -117,7 +117,7 @@ def test_a_state_of_several_joints_is_none_of_the_pendulum() -> None:
         ((1.0, math.nan), ("shoulder", "elbow"), Refusal.NOT_FINITE, "effort is [1.0, nan]; expected finite numbers"),
         ((math.inf, 0.0), ("shoulder", "elbow"), Refusal.NOT_FINITE, "effort is [inf, 0.0]; expected finite numbers"),
     ],
-)  # fmt: skip
+)
 def test_a_command_is_for_all_driven_joints_by_name_and_in_order_or_for_none(
     effort: tuple[float, ...], joints: tuple[str, ...], refusal: Refusal | None, problem: str
 ) -> None:

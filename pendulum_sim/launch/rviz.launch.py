@@ -23,15 +23,18 @@ def arguments() -> list[DeclareLaunchArgument]:
     return [
         DeclareLaunchArgument("plant_namespace", default_value="sim", description="Namespace of the plant to show."),
         DeclareLaunchArgument(
-            "model", default_value="thesis",
+            "model",
+            default_value="thesis",
             description=f"Preset ({PRESET_NAMES}, or one of several joints) or plant file that is drawn.",
         ),
         DeclareLaunchArgument("y", default_value="0.0", description="Where the plant stands on the y axis [m]."),
         DeclareLaunchArgument(
-            "window", default_value="true", choices=["true", "false"],
+            "window",
+            default_value="true",
+            choices=["true", "false"],
             description="Open RViz; false only publishes what it shows, for a second plant or for Foxglove.",
         ),
-    ]  # fmt: skip
+    ]
 
 
 def show(context: LaunchContext) -> list[LaunchDescriptionEntity]:

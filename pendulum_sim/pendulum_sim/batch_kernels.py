@@ -118,9 +118,17 @@ def smooth_kernel(method: str, coefficient_rows: int) -> Any:
                 for j in range(BLOCK):
                     torque = w[_TORQUE + j]
                     w[_X + j], w[_V + j] = step(
-                        acceleration, w[_X + j], w[_V + j], torque, torque, torque, 0.0, h,
-                        load_coefficients(w, _COEFFICIENTS + j), load_plant(w, _PLANT + j),
-                    )  # fmt: skip
+                        acceleration,
+                        w[_X + j],
+                        w[_V + j],
+                        torque,
+                        torque,
+                        torque,
+                        0.0,
+                        h,
+                        load_coefficients(w, _COEFFICIENTS + j),
+                        load_plant(w, _PLANT + j),
+                    )
 
     return keep_kernel(block_loop(run_block, BLOCK), "smooth_kernel", integrator.step, coefficient_rows)
 
@@ -224,9 +232,16 @@ def general_kernel(method: str) -> Any:
 
     @numba.njit(parallel=True)
     def run(
-        columns: Any, delays: Any, keys: Any, target: float, dt: float, steps: int, hold: int, substeps: int,
+        columns: Any,
+        delays: Any,
+        keys: Any,
+        target: float,
+        dt: float,
+        steps: int,
+        hold: int,
+        substeps: int,
         record: Any,
-    ) -> None:  # fmt: skip
+    ) -> None:
         rows, size = columns.shape
         for j in numba.prange(size):
             w = np.empty(rows)

@@ -117,9 +117,17 @@ def step_kernel(method: str, lanes: int) -> Any:
             for j in range(lanes):
                 torque = w[o_torque + j]
                 w[j], w[o_v + j] = step(
-                    acceleration, w[j], w[o_v + j], torque, torque, torque, 0.0, h,
-                    load_coefficients(w, o_coefficients + j), load_plant(w, o_plant + j),
-                )  # fmt: skip
+                    acceleration,
+                    w[j],
+                    w[o_v + j],
+                    torque,
+                    torque,
+                    torque,
+                    0.0,
+                    h,
+                    load_coefficients(w, o_coefficients + j),
+                    load_plant(w, o_plant + j),
+                )
         for j in range(lanes):
             observations[2 * j] = wrap(w[j] - UPRIGHT)
             observations[2 * j + 1] = w[o_v + j]

@@ -159,11 +159,7 @@ def etd2_coefficients(damping_rate: float, h: float) -> Coefficients:
     half = 0.5 * h
     e_half, p1_half, p2_half, _, _ = phi_functions(-damping_rate * half)
     e_full, p1_full, p2_full, _, _ = phi_functions(-damping_rate * h)
-    return (
-        damping_rate,
-        e_half, half * p1_half, half * half * p2_half,
-        e_full, h * p1_full, h * h * p2_full,
-    )  # fmt: skip
+    return (damping_rate, e_half, half * p1_half, half * half * p2_half, e_full, h * p1_full, h * h * p2_full)
 
 
 def etd2_step(
@@ -198,11 +194,18 @@ def etd4_coefficients(damping_rate: float, h: float) -> Coefficients:
     e_full, p_1, p_2, p_3, p_4 = phi_functions(-damping_rate * h)
     return (
         damping_rate,
-        e_half, half * p1_half, half * half * p2_half,
-        e_full, h * p_1,
-        h * (p_1 - 3.0 * p_2 + 4.0 * p_3), 2.0 * h * (p_2 - 2.0 * p_3), h * (4.0 * p_3 - p_2),
-        h * h * (p_2 - 3.0 * p_3 + 4.0 * p_4), 2.0 * h * h * (p_3 - 2.0 * p_4), h * h * (4.0 * p_4 - p_3),
-    )  # fmt: skip
+        e_half,
+        half * p1_half,
+        half * half * p2_half,
+        e_full,
+        h * p_1,
+        h * (p_1 - 3.0 * p_2 + 4.0 * p_3),
+        2.0 * h * (p_2 - 2.0 * p_3),
+        h * (4.0 * p_3 - p_2),
+        h * h * (p_2 - 3.0 * p_3 + 4.0 * p_4),
+        2.0 * h * h * (p_3 - 2.0 * p_4),
+        h * h * (4.0 * p_4 - p_3),
+    )
 
 
 def etd4_step(

@@ -53,9 +53,13 @@ def mechanism_mjcf(parameters: MechanismParameters) -> str:
         if own.lower_stop is not None or own.upper_stop is not None:
             attributes["range"] = f"{number(_stop(own.lower_stop, -1e6))} {number(_stop(own.upper_stop, 1e6))}"
         add(
-            parent, "joint", attributes, name=joint.name, damping=number(own.damping),
+            parent,
+            "joint",
+            attributes,
+            name=joint.name,
+            damping=number(own.damping),
             frictionloss=number(own.coulomb_friction),
-        )  # fmt: skip
+        )
         add(parent, "inertial", pos=_vector(body.centre), mass=number(body.mass), diaginertia=_vector(body.inertia))
         unseen = {"contype": "0", "conaffinity": "0"}
         if body.tip == (0.0, 0.0, 0.0):

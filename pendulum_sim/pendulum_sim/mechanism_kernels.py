@@ -142,9 +142,16 @@ def smooth_joints_kernel(layout: Layout) -> Any:
                 for j in range(BLOCK):
                     effort = load(w, o_effort + j)
                     q, v = step(
-                        forward, along, load(w, o_q + j), load(w, o_v + j), effort, effort, effort, h,
+                        forward,
+                        along,
+                        load(w, o_q + j),
+                        load(w, o_v + j),
+                        effort,
+                        effort,
+                        effort,
+                        h,
                         load_p(w, o_p + j),
-                    )  # fmt: skip
+                    )
                     store(w, o_q + j, BLOCK, q)
                     store(w, o_v + j, BLOCK, v)
 
@@ -175,9 +182,13 @@ def general_joints_kernel(layout: Layout) -> Any:
         whole = int(np.floor(periods))
         p = load_p(w, o_p)
         table = (
-            load(w, o_table), load(w, o_table + n), load(w, o_table + 2 * n), load(w, o_table + 3 * n),
-            load(w, o_table + 4 * n), load(w, o_table + 5 * n),
-        )  # fmt: skip
+            load(w, o_table),
+            load(w, o_table + n),
+            load(w, o_table + 2 * n),
+            load(w, o_table + 3 * n),
+            load(w, o_table + 4 * n),
+            load(w, o_table + 5 * n),
+        )
         line = np.zeros((whole + 2, n))
         still = along(load(w, o_v), -1.0, load(w, o_v))
         torque = still

@@ -165,22 +165,37 @@ def mjcf(parameters: PlantParameters) -> str:
     )
     appearance = {"contype": "0", "conaffinity": "0"}
     add(
-        link, "geom", type="capsule", fromto=f"0 0 0 0 0 {number(-shape.length)}", size=number(_ROD_RADIUS),
-        rgba="0.6 0.62 0.66 1", attributes=appearance,
-    )  # fmt: skip
+        link,
+        "geom",
+        type="capsule",
+        fromto=f"0 0 0 0 0 {number(-shape.length)}",
+        size=number(_ROD_RADIUS),
+        rgba="0.6 0.62 0.66 1",
+        attributes=appearance,
+    )
     add(
-        link, "geom", type="sphere", pos=f"0 0 {number(-shape.length)}", size=number(shape.bob_radius),
-        rgba="0.85 0.3 0.2 1", attributes=appearance,
-    )  # fmt: skip
+        link,
+        "geom",
+        type="sphere",
+        pos=f"0 0 {number(-shape.length)}",
+        size=number(shape.bob_radius),
+        rgba="0.85 0.3 0.2 1",
+        attributes=appearance,
+    )
     driven, gain = JOINT, 1.0
     if drive is not None:
         driven, gain = "motor_joint", torque_gain(parameters)
         motor = add(world, "body", name="motor")
         add(
-            motor, "joint", name=driven, type="hinge", axis="0 -1 0", armature=number(drive.reflected_inertia),
+            motor,
+            "joint",
+            name=driven,
+            type="hinge",
+            axis="0 -1 0",
+            armature=number(drive.reflected_inertia),
             damping=number(total_damping(parameters) - parameters.damping),
             frictionloss=number(drive.motor_coulomb_friction),
-        )  # fmt: skip
+        )
         add(motor, "inertial", pos="0 0 0", mass="1e-6", diaginertia="1e-9 1e-9 1e-9")
         tendons = add(model, "tendon")
         spring = add(

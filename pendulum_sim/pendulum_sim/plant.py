@@ -194,9 +194,18 @@ class RigidPlant:
             command = newer if is_newer else older
             if self._dry:
                 theta, theta_dot = advance_dry(
-                    self._step, self._coefficients_of, acceleration_with_friction,
-                    theta, theta_dot, torque, command, push, h, c, self._packed,
-                )  # fmt: skip
+                    self._step,
+                    self._coefficients_of,
+                    acceleration_with_friction,
+                    theta,
+                    theta_dot,
+                    torque,
+                    command,
+                    push,
+                    h,
+                    c,
+                    self._packed,
+                )
                 torque = actuator_torque(torque, command, h, lag)
                 continue
             if lag == 0.0:
@@ -207,8 +216,16 @@ class RigidPlant:
                 torque = actuator_torque(torque, command, h, lag)
             theta, theta_dot = self._step(
                 acceleration_with_friction,
-                theta, theta_dot, torque_0 + push, torque_mid + push, torque + push, 0.0, h, c, self._packed,
-            )  # fmt: skip
+                theta,
+                theta_dot,
+                torque_0 + push,
+                torque_mid + push,
+                torque + push,
+                0.0,
+                h,
+                c,
+                self._packed,
+            )
         self.theta, self.theta_dot, self.effort = theta, theta_dot, torque
         self._steps += 1
         return PlantState(self._steps * self.dt, theta, theta_dot, torque)

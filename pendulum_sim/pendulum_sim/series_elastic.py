@@ -148,9 +148,13 @@ class SeriesElasticPlant:
         self._segments = period_segments(dt, self._delay.fraction, substeps or 1)
         self._check_stability(substeps or 1)
         self._pwm_per_effort = feedforward_pwm(
-            1.0, drive.supply_voltage, drive.torque_constant, drive.gear_ratio, drive.efficiency,
+            1.0,
+            drive.supply_voltage,
+            drive.torque_constant,
+            drive.gear_ratio,
+            drive.efficiency,
             drive.winding_resistance,
-        )  # fmt: skip
+        )
         self._spring = (drive.stiffness, drive.stiffness_hardening)
         self._steps = 0
         self._torque = 0.0
@@ -161,11 +165,12 @@ class SeriesElasticPlant:
         drive = self.parameters.drivetrain
         assert drive is not None
         smooth = self.parameters.with_values(
-            coulomb_friction=0.0, static_friction=0.0, angle_offset=0.0, **without_terms(),
-            drivetrain=replace(
-                drive, motor_coulomb_friction=0.0, motor_static_friction=0.0, hysteresis_torque=0.0
-            ),
-        )  # fmt: skip
+            coulomb_friction=0.0,
+            static_friction=0.0,
+            angle_offset=0.0,
+            **without_terms(),
+            drivetrain=replace(drive, motor_coulomb_friction=0.0, motor_static_friction=0.0, hysteresis_torque=0.0),
+        )
         packed = pack_series_elastic(smooth)
         wound = spring_deflection(self.parameters.effort_limit, drive.stiffness, drive.stiffness_hardening)
 

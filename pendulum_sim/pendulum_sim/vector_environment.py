@@ -154,9 +154,16 @@ class PendulumVectorEnv(PlantVectorEnv):
         restart = np.flatnonzero(self._done)
         for block in range(self._w.shape[0]):
             self._kernel(
-                self._w[block], self._keys[block], self._counts[block], self._hold, self._h, self._substeps,
-                self._actions[block], observations[block], rewards[block],
-            )  # fmt: skip
+                self._w[block],
+                self._keys[block],
+                self._counts[block],
+                self._hold,
+                self._h,
+                self._substeps,
+                self._actions[block],
+                observations[block],
+                rewards[block],
+            )
         result = observations.reshape(-1, 2)[:n]
         reward = rewards.reshape(-1)[:n]
         if not np.isfinite(reward).all():

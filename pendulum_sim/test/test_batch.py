@@ -20,9 +20,14 @@ from pendulum_sim.plant import RigidPlant
 THESIS_GAIN = (33.345265, 0.158993)
 _PLAIN = load_plant("dfki").with_values(coulomb_friction=0.0, static_friction=0.0, effort_limit=20.0)
 _FULL = load_plant("dfki").with_values(
-    static_friction=0.12, load_friction=0.02, actuator_time_constant=0.003, transport_delay=0.0033,
-    angle_offset=0.02, torque_offset=-0.05, effort_limit=20.0,
-)  # fmt: skip
+    static_friction=0.12,
+    load_friction=0.02,
+    actuator_time_constant=0.003,
+    transport_delay=0.0033,
+    angle_offset=0.02,
+    torque_offset=-0.05,
+    effort_limit=20.0,
+)
 
 
 def _single(
@@ -55,9 +60,16 @@ def test_each_pendulum_of_a_batch_equals_the_single_plant_to_1e_12(
 ) -> None:
     seeds = [5, 2**64 - 1]
     result = simulate_batch(
-        parameters, steps=800, method=method, theta=math.pi + 0.3, gain=gain, seeds=seeds, amplitude=2.5,
-        hold=5, record=True,
-    )  # fmt: skip
+        parameters,
+        steps=800,
+        method=method,
+        theta=math.pi + 0.3,
+        gain=gain,
+        seeds=seeds,
+        amplitude=2.5,
+        hold=5,
+        record=True,
+    )
     assert result.trajectories is not None
     for column, seed in enumerate(seeds):
         single = _single(parameters, method, 800, seed, 5, gain)
@@ -73,9 +85,14 @@ def test_200_seeds_reproduce_the_statistics_of_the_thesis(
 ) -> None:
     # Thesis: Euler at 2 ms, 5 s, uniform noise of 2.5 N m, held for 2 ms (simulation) or 10 ms (hardware loop).
     result = simulate_batch(
-        load_plant("thesis"), steps=2500, method="euler", gain=THESIS_GAIN, seeds=np.arange(200), amplitude=2.5,
+        load_plant("thesis"),
+        steps=2500,
+        method="euler",
+        gain=THESIS_GAIN,
+        seeds=np.arange(200),
+        amplitude=2.5,
         hold=hold,
-    )  # fmt: skip
+    )
     assert np.percentile(result.max_effort, [50, 5, 95]) == pytest.approx([median, low, high], rel=0.08)
     assert np.median(result.std_theta) == pytest.approx(std_theta, rel=0.04)
     assert np.median(result.std_theta_dot) == pytest.approx(std_theta_dot, rel=0.04)
@@ -84,14 +101,24 @@ def test_200_seeds_reproduce_the_statistics_of_the_thesis(
 def test_each_pendulum_has_its_own_parameters_gain_start_seed_and_amplitude() -> None:
     plants = [load_plant("thesis").with_values(inertia=m) for m in (0.05, 0.055, 0.06)]
     together = simulate_batch(
-        plants, steps=300, theta=[3.0, 3.1, 3.2], theta_dot=[0.0, 0.1, 0.2], seeds=[1, 2, 3],
-        gain=[(30.0, 0.1), (33.0, 0.15), (36.0, 0.2)], amplitude=[1.0, 2.0, 2.5],
-    )  # fmt: skip
+        plants,
+        steps=300,
+        theta=[3.0, 3.1, 3.2],
+        theta_dot=[0.0, 0.1, 0.2],
+        seeds=[1, 2, 3],
+        gain=[(30.0, 0.1), (33.0, 0.15), (36.0, 0.2)],
+        amplitude=[1.0, 2.0, 2.5],
+    )
     for i in range(3):
         alone = simulate_batch(
-            plants[i], steps=300, theta=3.0 + 0.1 * i, theta_dot=0.1 * i, seeds=i + 1,
-            gain=[(30.0, 0.1), (33.0, 0.15), (36.0, 0.2)][i], amplitude=[1.0, 2.0, 2.5][i],
-        )  # fmt: skip
+            plants[i],
+            steps=300,
+            theta=3.0 + 0.1 * i,
+            theta_dot=0.1 * i,
+            seeds=i + 1,
+            gain=[(30.0, 0.1), (33.0, 0.15), (36.0, 0.2)][i],
+            amplitude=[1.0, 2.0, 2.5][i],
+        )
         assert alone.theta[0] == together.theta[i]
         assert alone.max_effort[0] == together.max_effort[i]
 
@@ -106,12 +133,16 @@ def test_a_batch_over_dry_friction_moves_like_plants_of_their_own(static: list[f
     for i, tau in enumerate(coulomb):
         single = RigidPlant(
             PlantParameters(
-                inertia=0.055, damping=0.02, gravity=1.678, effort_limit=13.0, coulomb_friction=tau,
+                inertia=0.055,
+                damping=0.02,
+                gravity=1.678,
+                effort_limit=13.0,
+                coulomb_friction=tau,
                 static_friction=static[i] if static else None,  # type: ignore[arg-type]
             ),
             2e-3,
             method="etd2",
-        )  # fmt: skip
+        )
         single.reset(1.0)
         for _ in range(500):
             single.step(0.0)

@@ -31,8 +31,12 @@ def _reference(parameters: PlantParameters, duration: float, effort: float) -> n
     m, b, g = parameters.inertia, parameters.damping, parameters.gravity
     solution = solve_ivp(
         lambda t, x: [x[1], (effort - b * x[1] - g * math.sin(x[0])) / m],
-        (0.0, duration), [2.5, -1.0], method="DOP853", rtol=1e-13, atol=1e-14,
-    )  # fmt: skip
+        (0.0, duration),
+        [2.5, -1.0],
+        method="DOP853",
+        rtol=1e-13,
+        atol=1e-14,
+    )
     return solution.y[:, -1]
 
 

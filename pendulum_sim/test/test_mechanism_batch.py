@@ -41,9 +41,16 @@ def test_a_plant_of_a_batch_moves_as_it_does_alone(name: str, gain: list, amplit
     starts[0], starts[-1] = (3.15, -0.01), (3.14 - 2.0 * np.pi, 0.0)
     masses, seeds = np.linspace(0.6, 0.65, size), np.arange(size)
     batch = simulate_mechanisms(
-        plant, variations={"mass_2": masses}, steps=100, position=starts, gain=gain, seeds=seeds, amplitude=amplitude,
-        hold=5, record=True,
-    )  # fmt: skip
+        plant,
+        variations={"mass_2": masses},
+        steps=100,
+        position=starts,
+        gain=gain,
+        seeds=seeds,
+        amplitude=amplitude,
+        hold=5,
+        record=True,
+    )
     for index in (0, 1, size - 1):
         own = plant.with_values({"mass_2": float(masses[index])})
         expected = _alone(own, np.array(gain), tuple(starts[index]), index, 100, amplitude, 5)

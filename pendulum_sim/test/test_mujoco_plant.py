@@ -48,9 +48,13 @@ def write(
 ) -> Path:
     path = folder / "lab.xml"
     text = STANDING.format(
-        timestep=timestep, integrator=integrator, joint=joint, more=more, friction=friction,
+        timestep=timestep,
+        integrator=integrator,
+        joint=joint,
+        more=more,
+        friction=friction,
         actuator=actuator.format(joint=joint),
-    )  # fmt: skip
+    )
     path.write_text(text, encoding="utf-8")
     return path
 

@@ -91,9 +91,14 @@ def test_energy_never_grows_without_torque(
     theta: float, theta_dot: float, coulomb: float, excess: float, damping: float, load: float
 ) -> None:
     parameters = PlantParameters(
-        inertia=0.15, damping=damping, gravity=3.0, coulomb_friction=coulomb,
-        static_friction=coulomb + excess, stribeck_velocity=0.05, load_friction=load,
-    )  # fmt: skip
+        inertia=0.15,
+        damping=damping,
+        gravity=3.0,
+        coulomb_friction=coulomb,
+        static_friction=coulomb + excess,
+        stribeck_velocity=0.05,
+        load_friction=load,
+    )
     plant = RigidPlant(parameters, 1e-3)
     plant.reset(theta, theta_dot)
     energy = plant.energy
@@ -249,11 +254,13 @@ def test_lag_delay_and_push_together_agree_with_an_independent_integration() -> 
             continue
         u = command_at(0.5 * (start + end))
         x = solve_ivp(
-            lambda t, x, u=u: [
-                x[1], rigid_acceleration(x[0], x[1], x[2] + 0.2, 0.15, 0.3, 3.0), (u - x[2]) / 0.004
-            ],
-            (start, end), x, method="DOP853", rtol=1e-12, atol=1e-13,
-        ).y[:, -1]  # fmt: skip
+            lambda t, x, u=u: [x[1], rigid_acceleration(x[0], x[1], x[2] + 0.2, 0.15, 0.3, 3.0), (u - x[2]) / 0.004],
+            (start, end),
+            x,
+            method="DOP853",
+            rtol=1e-12,
+            atol=1e-13,
+        ).y[:, -1]
     assert [plant.theta, plant.theta_dot, plant.effort] == pytest.approx(x.tolist(), abs=2e-9)
 
 

@@ -69,9 +69,15 @@ def test_without_losses_it_moves_like_the_rigid_plant_with_the_same_damping() ->
     parameters = load_plant("x5_9")
     assert parameters.drivetrain is not None
     drive = replace(
-        parameters.drivetrain, motor_coulomb_friction=0.0, motor_static_friction=0.0, motor_damping=0.0,
-        hysteresis_torque=0.0, efficiency=1.0, stiffness=1000.0, winding_temperature=20.0,
-    )  # fmt: skip
+        parameters.drivetrain,
+        motor_coulomb_friction=0.0,
+        motor_static_friction=0.0,
+        motor_damping=0.0,
+        hysteresis_torque=0.0,
+        efficiency=1.0,
+        stiffness=1000.0,
+        winding_temperature=20.0,
+    )
     elastic = make_plant(parameters.with_values(drivetrain=drive), 2e-3)
     damping = parameters.damping + shorted_winding_damping(
         drive.torque_constant, drive.back_emf_constant, drive.gear_ratio, drive.winding_resistance

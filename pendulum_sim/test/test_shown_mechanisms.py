@@ -67,8 +67,11 @@ def test_each_effort_changes_the_picture_and_is_written_in_the_unit_of_its_joint
         (0.1, 3.0), (1.0, 2.0), {"cart": -2.0}, {"pole": 1}
     )
     assert [text for text, _ in rows] == [
-        "cart +0.1000 m, +1.000 m/s", "pole +3.0000 rad, +2.000 rad/s", "cart -2.000 N", "disturbance pole +1.000 N m",
-    ]  # fmt: skip
+        "cart +0.1000 m, +1.000 m/s",
+        "pole +3.0000 rad, +2.000 rad/s",
+        "cart -2.000 N",
+        "disturbance pole +1.000 N m",
+    ]
 
 
 def test_the_rail_ends_at_the_stops() -> None:

@@ -34,8 +34,10 @@ def test_a_disturbance_is_shown_as_far_as_it_acts(
     torques = ShownTorques()
     torques.mode = mode
     for topic, effort in (
-        (names.APPLIED_EFFORT, applied), (names.EFFORT_COMMAND, command), (names.DISTURBANCE, disturbance),
-    ):  # fmt: skip
+        (names.APPLIED_EFFORT, applied),
+        (names.EFFORT_COMMAND, command),
+        (names.DISTURBANCE, disturbance),
+    ):
         torques.note(topic, JointCommand.of_one(_NOW, effort))
     assert torques.acting(names.DISTURBANCE, _NOW) == pytest.approx(acting)
     assert torques.acting(names.APPLIED_EFFORT, _NOW) == applied

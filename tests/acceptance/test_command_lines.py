@@ -250,9 +250,12 @@ def _in_a_terminal(arguments: list[str], **environment: str) -> str:
     inherited = {name: value for name, value in os.environ.items() if name not in unset}
     process = subprocess.Popen(
         [sys.executable, "-m", *arguments],
-        stdin=subprocess.DEVNULL, stdout=theirs, stderr=theirs, cwd=PROJECT,
+        stdin=subprocess.DEVNULL,
+        stdout=theirs,
+        stderr=theirs,
+        cwd=PROJECT,
         env={**inherited, "TERM": "xterm-256color", "COLUMNS": "100", **environment},
-    )  # fmt: skip
+    )
     os.close(theirs)
     told = b""
     try:

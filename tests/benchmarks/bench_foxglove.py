@@ -83,9 +83,13 @@ def _rows_of(found: dict[str, Any], alone: dict[str, Any] | None) -> Iterator[Ro
     way = found["way"]
     yield measured(f"{way}: rate of the slower loop", found["rate"], "Hz", peer=peer("rate"), at_least_times_peer=0.99)
     yield measured(
-        f"{way}: jitter of the worse loop, 99 %", found["jitter"], "us",
-        peer=peer("jitter"), less_is_better=True, at_least_times_peer=0.5,
-    )  # fmt: skip
+        f"{way}: jitter of the worse loop, 99 %",
+        found["jitter"],
+        "us",
+        peer=peer("jitter"),
+        less_is_better=True,
+        at_least_times_peer=0.5,
+    )
     yield measured(f"{way}: missed deadlines of both plants in {SECONDS:g} s", found["overruns"], "")
     if found["cpu"] is not None:
         yield measured(f"{way}: CPU of the server", found["cpu"], "% of a core", at_most=40.0)

@@ -77,10 +77,21 @@ def rows() -> Iterator[Row]:
 
 def _pendulum_v1(out: Path) -> Iterator[Row]:
     told, wall, cpu = _train("--task", "pendulum_v1", out=out)
-    yield measured("Pendulum-v1: mean return over 100 episodes of Gymnasium's own", told["return_mean"], "",
-                   at_least=-160.0, note=f"standard deviation {told['return_std']:.1f}")  # fmt: skip
-    yield measured("Pendulum-v1: training from start to file, wall time", wall, "s", at_most=60.0,
-                   peer=Peer("published SAC of SB3", PUBLISHED_SAC), note="peer: 8 cores")  # fmt: skip
+    yield measured(
+        "Pendulum-v1: mean return over 100 episodes of Gymnasium's own",
+        told["return_mean"],
+        "",
+        at_least=-160.0,
+        note=f"standard deviation {told['return_std']:.1f}",
+    )
+    yield measured(
+        "Pendulum-v1: training from start to file, wall time",
+        wall,
+        "s",
+        at_most=60.0,
+        peer=Peer("published SAC of SB3", PUBLISHED_SAC),
+        note="peer: 8 cores",
+    )
     yield measured("Pendulum-v1: training from start to file, CPU time", cpu, "s", at_most=60.0)
 
 
@@ -110,15 +121,20 @@ def _swing_up(out: Path) -> Iterator[Row]:
         times[k] = (time.perf_counter_ns() - began) / 1e3
     assert controller.notice == ""
     median, p99 = np.percentile(times, [50, 99])
-    yield measured("policy of 64 x 64: time per answer, median", float(median), "us", at_most=20.0,
-                   note=f"p99 {p99:.3g} us")  # fmt: skip
+    yield measured(
+        "policy of 64 x 64: time per answer, median", float(median), "us", at_most=20.0, note=f"p99 {p99:.3g} us"
+    )
 
 
 def _emulated(out: Path, folder: Path) -> Iterator[Row]:
     ends = list(emulated_trials(folder, out, "dfki", 20))
-    yield measured("dfki: upright at the end on an emulated drive, any start, kicks, parameters off by 25 %",
-                   sum(end <= 0.3 for end in ends), f"of {len(ends)}", at_least=len(ends),
-                   note=f"over DDS in lockstep; at most {max(ends):.3f} rad off in the last second")  # fmt: skip
+    yield measured(
+        "dfki: upright at the end on an emulated drive, any start, kicks, parameters off by 25 %",
+        sum(end <= 0.3 for end in ends),
+        f"of {len(ends)}",
+        at_least=len(ends),
+        note=f"over DDS in lockstep; at most {max(ends):.3f} rad off in the last second",
+    )
 
 
 def _cart_pole(out: Path) -> Iterator[Row]:
@@ -129,8 +145,12 @@ def _cart_pole(out: Path) -> Iterator[Row]:
     trials = trials_of(policy, SwingUpTask(), 20, OTHER_SEED)
     for name, chosen in _cart_pole_trials(policy, trials).items():
         found = measured_success(policy, chosen)
-        yield measured(f"cart-pole: upright at the end and never beyond +-0.4 m, {name}", found["up"],
-                       f"of {found['trials']}", at_least=found["trials"])  # fmt: skip
+        yield measured(
+            f"cart-pole: upright at the end and never beyond +-0.4 m, {name}",
+            found["up"],
+            f"of {found['trials']}",
+            at_least=found["trials"],
+        )
     yield measured("cart-pole: training from start to file, wall time", wall, "s", at_most=600.0)
     yield measured("cart-pole: training from start to file, CPU time", cpu, "s", at_most=600.0)
 
@@ -168,10 +188,14 @@ def _stand_ins(plant: AnyPlant, randomised: Path, bare: Path) -> Iterator[Row]:
         policy = load_policy(str(out))
         sim, *others = (_time_up(policy, each) for each in (plant, *machines))
         hw = float(np.mean(others))
-        yield measured(f"{plant.name}, policy {name}: score lost, simulator to {len(machines)} stand-ins of machines",
-                       100.0 * (1.0 - hw / sim) if sim else float("nan"), "%", at_most=limit,
-                       note=f"{sim:.3f} to {hw:.3f}, worst {min(others):.3f}; off by up to {100.0 * _OFF:g} %, "
-                            f"{1e3 * _LATE:g} ms late")  # fmt: skip
+        yield measured(
+            f"{plant.name}, policy {name}: score lost, simulator to {len(machines)} stand-ins of machines",
+            100.0 * (1.0 - hw / sim) if sim else float("nan"),
+            "%",
+            at_most=limit,
+            note=f"{sim:.3f} to {hw:.3f}, worst {min(others):.3f}; off by up to {100.0 * _OFF:g} %, "
+            f"{1e3 * _LATE:g} ms late",
+        )
 
 
 def _stand_in(plant: AnyPlant, seed: int) -> AnyPlant:
@@ -215,14 +239,22 @@ def _machine(folder: Path) -> Iterator[Row]:
         scores[name] = tuple(entry.scores.get("v3", 0.0) for entry in both)
     for name, limit in (("randomised", 0.05), ("not randomised", None)):
         sim, hw = scores[name]
-        yield measured(f"thesis, policy {name}: score lost from simulator to emulated machine",
-                       100.0 * (1.0 - hw / sim) if sim else float("nan"), "%",
-                       at_most=None if limit is None else 100.0 * limit, note=f"{sim:.3f} to {hw:.3f}")  # fmt: skip
+        yield measured(
+            f"thesis, policy {name}: score lost from simulator to emulated machine",
+            100.0 * (1.0 - hw / sim) if sim else float("nan"),
+            "%",
+            at_most=None if limit is None else 100.0 * limit,
+            note=f"{sim:.3f} to {hw:.3f}",
+        )
     predicted, reached = ([pair[side] for pair in scores.values()] for side in (0, 1))
     found = judge_prediction(predicted, reached, np.random.default_rng(0))
     for what, value in (("Spearman's rank correlation", found.spearman), ("mean maximum rank violation", found.mmrv)):
-        yield measured(f"prediction: {what} of predicted and measured scores, {found.designs} designs", value.value, "",
-                       note=f"95 %: {value.low:.3f} to {value.high:.3f}. {found.note}".strip())  # fmt: skip
+        yield measured(
+            f"prediction: {what} of predicted and measured scores, {found.designs} designs",
+            value.value,
+            "",
+            note=f"95 %: {value.low:.3f} to {value.high:.3f}. {found.note}".strip(),
+        )
 
 
 def _train(*arguments: str, out: Path) -> tuple[dict[str, Any], float, float]:

@@ -261,18 +261,26 @@ def _node() -> Iterator[Row]:
         ):
             in_c = Peer("the same loop in C", None if limit is None else getattr(limit, field), why)
             yield measured(
-                f"{name}: {what}", getattr(figures, field), unit, peer=in_c, less_is_better=True,
+                f"{name}: {what}",
+                getattr(figures, field),
+                unit,
+                peer=in_c,
+                less_is_better=True,
                 at_most_times_peer=most.get(field),
-            )  # fmt: skip
+            )
         allowed = max(_MISSED, limit.missed if limit is not None else 0.0)
         yield measured(f"{name}: missed deadlines", figures.missed, "%", at_most=allowed)
         if cores is None:
             what = f"{name}: CPU, simulator + controller"
             yield measured(what, figures.cpu, "% of a core", peer=plain, less_is_better=True, at_least_times_peer=5.0)
             yield measured(
-                what, figures.cpu, "% of a core", peer=bare, less_is_better=True,
+                what,
+                figures.cpu,
+                "% of a core",
+                peer=bare,
+                less_is_better=True,
                 note="what rclpy and Fast DDS cost before anything is done",
-            )  # fmt: skip
+            )
             yield measured(f"{name}: memory", figures.memory, "MB", at_most=100.0)
             yield measured(f"{name}: growth of memory", max(0.0, figures.growth), "MB", at_most=1.0)
     in_c = peer("the same in C", limit_lockstep_speed)

@@ -44,8 +44,13 @@ TRIALS = 100
 """Trials of each difference that must be found, and of none."""
 PERIOD = 0.01
 EXCITATION = {
-    "kind": "multisine", "signal_period": 4.0, "frequency": 0.25, "frequency_end": 47.5, "lines": 48, "hold_time": 0.01,
-}  # fmt: skip
+    "kind": "multisine",
+    "signal_period": 4.0,
+    "frequency": 0.25,
+    "frequency_end": 47.5,
+    "lines": 48,
+    "hold_time": 0.01,
+}
 """That of ``experiment frequency_response``."""
 SENSORS = {"position_step": 1e-5, "velocity_noise": 5e-4}
 """Those of the emulated X5-9."""

@@ -78,9 +78,13 @@ def main() -> None:
     loop.run_plant.restype = ctypes.c_long
     print("running", flush=True)
     missed = loop.run_plant(
-        ctypes.c_double(rate), ctypes.c_long(states), answerers, data, ctypes.c_long(len(data)),
+        ctypes.c_double(rate),
+        ctypes.c_long(states),
+        answerers,
+        data,
+        ctypes.c_long(len(data)),
         round_trips.ctypes.data_as(ctypes.POINTER(ctypes.c_long)),
-    )  # fmt: skip
+    )
     if missed < 0:
         sys.exit("the loop in C ended with an error")
     print(json.dumps({"missed": missed, "round_trips_ns": round_trips.tolist()}), flush=True)

@@ -24,9 +24,14 @@ from tests.benchmarks.plant_listener import PlantListener, cpu_time, domain_envi
 from tests.processes import ProcessGroup, RunningProgram
 
 __all__ = [
-    "LimitFigures", "LoopFigures", "limit_figures", "limit_lockstep_speed", "lockstep_speed", "peer_cpu",
+    "LimitFigures",
+    "LoopFigures",
+    "limit_figures",
+    "limit_lockstep_speed",
+    "lockstep_speed",
+    "peer_cpu",
     "realtime_figures",
-]  # fmt: skip
+]
 
 _ROOT = Path(__file__).parents[2]
 _WARM_UP = 6.0

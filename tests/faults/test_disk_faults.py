@@ -58,8 +58,11 @@ def test_experiment_into_a_place_that_is_no_folder_ends_in_a_sentence(tmp_path: 
     (tmp_path / "file").write_text("in the way", encoding="utf-8")
     done = subprocess.run(
         [sys.executable, "-m", "pendulum_bags", "experiment", "thesis", "--out", str(tmp_path / "file" / "run")],
-        capture_output=True, text=True, timeout=60.0, check=False,
-    )  # fmt: skip
+        capture_output=True,
+        text=True,
+        timeout=60.0,
+        check=False,
+    )
     assert done.returncode == 2, done.stderr[-500:]
     assert "Traceback" not in done.stderr
     assert str(tmp_path / "file") in done.stderr.replace("\n", "")

@@ -76,10 +76,17 @@ class Machine(GraphPeer):
     def start_bridge(self) -> None:
         """Start the plant upright, and arm it as soon as it lets itself be armed."""
         self.bridge = self.start(
-            "pendulum_hw_bridge", "bridge", "plant:=cart_pole", "backend:=emulator", "feedback_rate:=50.0",
-            "initial_positions:=[0.0, 3.141592653589793]", "position_window:=[-100.0, 100.0, 0.0, 0.0]",
-            "feedback_watchdog:=50", "effort_slew_limit:=0.0", "start_effort_limit:=0.0",
-        )  # fmt: skip
+            "pendulum_hw_bridge",
+            "bridge",
+            "plant:=cart_pole",
+            "backend:=emulator",
+            "feedback_rate:=50.0",
+            "initial_positions:=[0.0, 3.141592653589793]",
+            "position_window:=[-100.0, 100.0, 0.0, 0.0]",
+            "feedback_watchdog:=50",
+            "effort_slew_limit:=0.0",
+            "start_effort_limit:=0.0",
+        )
         request = SetBool.Request(data=True)
         self.until(lambda: self.call(SetBool, "bridge/arm", request).success, "the plant to arm")
         # What the one before said last may have come in the meantime.

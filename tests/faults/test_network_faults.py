@@ -91,9 +91,12 @@ def test_cable_delays_and_loses_what_it_is_told_to() -> None:
 
 def _ask(namespace: str) -> tuple[float, int]:
     done = subprocess.run(
-        ["ip", "netns", "exec", namespace, sys.executable, "-c", _ASK], capture_output=True, text=True, timeout=40,
+        ["ip", "netns", "exec", namespace, sys.executable, "-c", _ASK],
+        capture_output=True,
+        text=True,
+        timeout=40,
         check=True,
-    )  # fmt: skip
+    )
     fastest, lost = done.stdout.split()
     return float(fastest), int(lost)
 

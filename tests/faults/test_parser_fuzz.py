@@ -49,8 +49,12 @@ def test_hostile_files_cost_no_memory_and_run_nothing(tmp_path: Path) -> None:
     repository = Path(__file__).parents[2]
     done = subprocess.run(
         [sys.executable, "-c", program, str(tmp_path)],
-        cwd=repository, capture_output=True, text=True, timeout=500.0, check=False,
-    )  # fmt: skip
+        cwd=repository,
+        capture_output=True,
+        text=True,
+        timeout=500.0,
+        check=False,
+    )
     assert done.returncode == 0, done.stdout + done.stderr[-2000:]
     assert not list(tmp_path.rglob("owned"))
     assert not (repository / "owned").exists()

@@ -138,8 +138,9 @@ def test_the_policy_is_what_sros_2_reads_and_gives_each_process_an_enclave() -> 
     for rule in ("publish", "subscribe"):
         told = {topic.text for topics in root.iter("topics") if topics.get(rule) == "ALLOW" for topic in topics}
         assert told == {topic for allowed in granted().values() for topic in getattr(allowed, rule)}
-    assert all(name and name.startswith("/") and "{" not in name for element in root.iter("topic")
-               for name in [element.text])  # fmt: skip
+    assert all(
+        name and name.startswith("/") and "{" not in name for element in root.iter("topic") for name in [element.text]
+    )
 
 
 def test_only_who_drives_a_plant_may_command_torque() -> None:

@@ -22,8 +22,15 @@ def start_robot(processes: ProcessGroup, name: str = "robot") -> RunningProgram:
 def adopt(processes: ProcessGroup, namespace: str, **changes: object) -> RunningProgram:
     """Start the adopter in a namespace, told how this robot counts; further parameters as given."""
     told = {
-        "states": "/robot/joint_states", "commands": EFFORTS, "joint": "shoulder", "command_index": 1,
-        "command_size": 2, "sign": -1, "zero": -math.pi / 2.0, "state_timeout": 0.5, **changes,
-    }  # fmt: skip
+        "states": "/robot/joint_states",
+        "commands": EFFORTS,
+        "joint": "shoulder",
+        "command_index": 1,
+        "command_size": 2,
+        "sign": -1,
+        "zero": -math.pi / 2.0,
+        "state_timeout": 0.5,
+        **changes,
+    }
     arguments = [item for name, value in told.items() for item in ("-p", f"{name}:={value}")]
     return processes.start("pendulum_sim", "adopt", "--ros-args", "-r", f"__ns:={namespace}", *arguments)

@@ -189,8 +189,12 @@ print("found" if node.count_publishers("/sim/joint_states") else "nobody")
 def _look(namespace: str, patience: float, **variables: str) -> str:
     ended = subprocess.run(
         ["ip", "netns", "exec", namespace, sys.executable, "-c", _LOOK.format(patience=patience)],
-        env={**os.environ, **variables}, capture_output=True, text=True, timeout=60, check=True,
-    )  # fmt: skip
+        env={**os.environ, **variables},
+        capture_output=True,
+        text=True,
+        timeout=60,
+        check=True,
+    )
     return ended.stdout.strip()
 
 

@@ -52,9 +52,15 @@ def test_two_lockstep_runs_of_a_model_file_give_the_same_messages(
     for _ in range(2):
         peer.states.clear()
         program = start(
-            processes, "mujoco", f"model:={model}", "clock:=lockstep", "lockstep_duration:=0.3", "start:=random",
-            "seed:=4", "sensor.position_noise:=0.001",
-        )  # fmt: skip
+            processes,
+            "mujoco",
+            f"model:={model}",
+            "clock:=lockstep",
+            "lockstep_duration:=0.3",
+            "start:=random",
+            "seed:=4",
+            "sensor.position_noise:=0.001",
+        )
         peer.until(
             lambda: peer.states and stamp_from_message(peer.states[-1].header.stamp) >= 1.3e9, "the end of the run"
         )

@@ -105,10 +105,16 @@ def test_two_modules_are_held_as_one_plant_and_the_loss_of_one_switches_the_othe
         for address, angle, name, serial in zip(addresses, GOAL, ("z_first", "a_second"), ("S-1", "S-2"), strict=True)
     ]  # fmt: skip
     parameters = [
-        "plant:=double_pendulum", "backend:=hebi", f"interface:=emulator:{','.join(reversed(addresses))}",
-        "families:=[Lab]", "names:=[z_first, a_second]", "serials:=['', S-2]", "feedback_watchdog:=10",
-        "command_timeout:=0.1", "command_lifetime:=0.1",
-    ]  # fmt: skip
+        "plant:=double_pendulum",
+        "backend:=hebi",
+        f"interface:=emulator:{','.join(reversed(addresses))}",
+        "families:=[Lab]",
+        "names:=[z_first, a_second]",
+        "serials:=['', S-2]",
+        "feedback_watchdog:=10",
+        "command_timeout:=0.1",
+        "command_lifetime:=0.1",
+    ]
     controller = processes.start(
         "pendulum_lqr",
         "controller",

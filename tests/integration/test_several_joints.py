@@ -82,14 +82,25 @@ def test_an_acrobot_is_held_upright_under_noise_in_lockstep_and_its_bag_is_read_
     recorder.wait_for_output("ready", 30)
     controller = _start(processes, "pendulum_lqr", "controller", "plant:=acrobot_frictionless", "use_sim_time:=true")
     noise = _start(
-        processes, "pendulum_lqr", "disturbance", "joints:=[elbow]", "amplitude:=0.2", "autostart:=true",
+        processes,
+        "pendulum_lqr",
+        "disturbance",
+        "joints:=[elbow]",
+        "amplitude:=0.2",
+        "autostart:=true",
         "use_sim_time:=true",
-    )  # fmt: skip
+    )
     plant = _start(
-        processes, "pendulum_sim", "simulator", "plant:=acrobot_frictionless", "clock:=lockstep",
-        "lockstep_inputs:=[effort_command, disturbance]", "lockstep_duration:=3.0", "lockstep_subscribers:=4",
+        processes,
+        "pendulum_sim",
+        "simulator",
+        "plant:=acrobot_frictionless",
+        "clock:=lockstep",
+        "lockstep_inputs:=[effort_command, disturbance]",
+        "lockstep_duration:=3.0",
+        "lockstep_subscribers:=4",
         "initial_position:=[3.19, -0.05]",
-    )  # fmt: skip
+    )
     peer.until(lambda: any(event["name"] == names.Event.LOCKSTEP_FINISHED for event in peer.events), "the end", 90.0)
     controller.wait_for_output(r"lqr for plant acrobot_frictionless: K = \[.*limit 6 N m", 10)
     for program in (noise, controller, plant, recorder):
@@ -125,14 +136,25 @@ def test_an_acrobot_is_held_upright_under_noise_in_lockstep_and_its_bag_is_read_
 
 def test_an_acrobot_swings_up_in_lockstep_and_stays(peer: Peer, processes) -> None:
     controller = _start(
-        processes, "pendulum_lqr", "controller", "plant:=acrobot_frictionless", "controller:=tvlqr", "period:=0.004",
+        processes,
+        "pendulum_lqr",
+        "controller",
+        "plant:=acrobot_frictionless",
+        "controller:=tvlqr",
+        "period:=0.004",
         "use_sim_time:=true",
-    )  # fmt: skip
+    )
     controller.wait_for_output(r"tvlqr for plant acrobot_frictionless: swing-up of .*sampled from", 60)
     _start(
-        processes, "pendulum_sim", "simulator", "plant:=acrobot_frictionless", "clock:=lockstep", "rate_hz:=250.0",
-        "lockstep_duration:=8.0", "lockstep_subscribers:=2",
-    )  # fmt: skip
+        processes,
+        "pendulum_sim",
+        "simulator",
+        "plant:=acrobot_frictionless",
+        "clock:=lockstep",
+        "rate_hz:=250.0",
+        "lockstep_duration:=8.0",
+        "lockstep_subscribers:=2",
+    )
     # The event may come before the states that wait here.
     peer.until(lambda: peer.states and peer.states[-1].header.stamp.sec == 9, "the last state, after 8 s", 90.0)
     assert list(peer.states[0].position) == [0.0, 0.0]
@@ -163,9 +185,15 @@ def test_a_policy_holds_a_cart_pole_in_lockstep_and_gives_up_where_it_was_never_
     # This node could answer too, and counts as one.
     peer.until(lambda: answers.get_publisher_count() == 2, "the controller as publisher")
     simulator = _start(
-        processes, "pendulum_sim", "simulator", "plant:=cart_pole", "clock:=lockstep", "lockstep_duration:=4.0",
-        "lockstep_subscribers:=2", "initial_position:=[0.05, 3.19]",
-    )  # fmt: skip
+        processes,
+        "pendulum_sim",
+        "simulator",
+        "plant:=cart_pole",
+        "clock:=lockstep",
+        "lockstep_duration:=4.0",
+        "lockstep_subscribers:=2",
+        "initial_position:=[0.05, 3.19]",
+    )
     peer.until(lambda: peer.states and peer.states[-1].header.stamp.sec == 5, "the last state, after 4 s", 90.0)
     assert np.abs(np.array(peer.states[-1].position) - [0.0, math.pi]).max() < 0.02
     peer.until(lambda: len(efforts) > 1000, "the answers")
@@ -179,9 +207,15 @@ def test_a_policy_holds_a_cart_pole_in_lockstep_and_gives_up_where_it_was_never_
     simulator.send_signal(signal.SIGINT)
     assert simulator.wait(20.0) == 0
     _start(
-        processes, "pendulum_sim", "simulator", "plant:=cart_pole", "clock:=lockstep", "lockstep_duration:=1.0",
-        "lockstep_subscribers:=2", "initial_position:=[0.55, 3.19]",
-    )  # fmt: skip
+        processes,
+        "pendulum_sim",
+        "simulator",
+        "plant:=cart_pole",
+        "clock:=lockstep",
+        "lockstep_duration:=1.0",
+        "lockstep_subscribers:=2",
+        "initial_position:=[0.55, 3.19]",
+    )
     controller.wait_for_output(r"gave up after 0\.000 s: position of cart 0\.55 m", 60)
 
 
@@ -198,9 +232,15 @@ def test_commands_for_other_joints_move_nothing_and_are_counted_and_the_e_stop_e
         own = ("pendulum_sim", "simulator", "rate_hz:=100.0")
     else:
         own = (
-            "pendulum_hw_bridge", "bridge", "feedback_rate:=50.0", "feedback_watchdog:=50", "command_lifetime:=2.0",
-            "start_effort_limit:=0.0", "starvation_limit:=0.0", "velocity_limit:=0.0",
-        )  # fmt: skip
+            "pendulum_hw_bridge",
+            "bridge",
+            "feedback_rate:=50.0",
+            "feedback_watchdog:=50",
+            "command_lifetime:=2.0",
+            "start_effort_limit:=0.0",
+            "starvation_limit:=0.0",
+            "velocity_limit:=0.0",
+        )
     _start(processes, *own, "plant:=double_pendulum", "command_timeout:=0.5")
     peer.until(lambda: len(peer.states) > 3, "states")
     if node == "bridge":
@@ -238,9 +278,11 @@ def test_commands_for_other_joints_move_nothing_and_are_counted_and_the_e_stop_e
 
 
 SIMULATOR, CONTROLLER, DISTURBANCE, BRIDGE = (
-    ("pendulum_sim", "simulator"), ("pendulum_lqr", "controller"), ("pendulum_lqr", "disturbance"),
+    ("pendulum_sim", "simulator"),
+    ("pendulum_lqr", "controller"),
+    ("pendulum_lqr", "disturbance"),
     ("pendulum_hw_bridge", "bridge"),
-)  # fmt: skip
+)
 
 
 @pytest.mark.parametrize(

@@ -111,9 +111,17 @@ def test_a_plant_of_several_joints_is_refused_before_anything_of_it_is_asked(
     plant = processes.start("pendulum_sim", "simulator", *at)
     plant.wait_for_output(r"\[INFO\].*ready", 60)
     run = processes.start(
-        "pendulum_bags", "experiment", "thesis", "--out", tmp_path / "run", "--domain", str(domain_id),
-        "--hardware", "ros:/lab", "--yes",
-    )  # fmt: skip
+        "pendulum_bags",
+        "experiment",
+        "thesis",
+        "--out",
+        tmp_path / "run",
+        "--domain",
+        str(domain_id),
+        "--hardware",
+        "ros:/lab",
+        "--yes",
+    )
     assert run.wait(60.0) == 2
     assert "error: /lab has the joints shoulder, elbow; expected the one of a pendulum, pendulum_joint\n" in run.output
     assert plant.returncode is None

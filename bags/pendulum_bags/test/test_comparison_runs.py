@@ -68,8 +68,14 @@ def test_noise_held_for_another_time_is_no_pair_and_says_nothing_of_the_plants(f
 
 def test_references_that_began_apart_are_no_difference_of_the_plants(tmp_path: Path) -> None:
     """One plant under one noise along one sine; the noise begins as long after the controller on both sides, or not."""
-    moving = {"controller": "lqr_tracking", "reference": "sine", "set_point": 0.1, "amplitude": 0.3, "frequency": 0.2,
-              "move_time": 1.5}  # fmt: skip
+    moving = {
+        "controller": "lqr_tracking",
+        "reference": "sine",
+        "set_point": 0.1,
+        "amplitude": 0.3,
+        "frequency": 0.2,
+        "move_time": 1.5,
+    }
 
     def record(side: str, name: str, after: float, **reference: float) -> Path:
         columns = regulate(rate=100.0, seed=1, hardware=side == "hw")

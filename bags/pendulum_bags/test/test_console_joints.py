@@ -27,8 +27,13 @@ def test_each_joint_has_its_own_values_and_what_upright_means_for_it() -> None:
     shoulder, elbow = picture["joints"]
     assert (picture["chain"], picture["cart"]) == (True, False)
     assert shoulder == {
-        "name": "shoulder", "unit": "rad", "goal": math.pi, "theta": 3.0, "theta_dot": 0.5, "measured": 0.0,
-    }  # fmt: skip
+        "name": "shoulder",
+        "unit": "rad",
+        "goal": math.pi,
+        "theta": 3.0,
+        "theta_dot": 0.5,
+        "measured": 0.0,
+    }
     assert (elbow["goal"], elbow["theta"], elbow["command"]) == (0.0, 0.1, 2.5)
     assert "command" not in values.picture(1.4)["joints"][1], "a torque that nobody sends any more is drawn on"
 

@@ -28,9 +28,14 @@ from pendulum_sim.sensors import Sensors
 
 THESIS = load_plant("thesis")
 MULTISINE = {
-    "kind": "multisine", "signal_period": 4.0, "frequency": 0.25, "frequency_end": 47.5, "lines": 40,
-    "hold_time": 0.01, "amplitude": 2.5,
-}  # fmt: skip
+    "kind": "multisine",
+    "signal_period": 4.0,
+    "frequency": 0.25,
+    "frequency_end": 47.5,
+    "lines": 40,
+    "hold_time": 0.01,
+    "amplitude": 2.5,
+}
 NOISE = {"position_noise": 1e-4, "velocity_noise": 2e-3}
 
 
@@ -181,9 +186,17 @@ def test_stamps_that_jitter_and_skip_are_brought_to_the_nominal_raster():
     torque = np.where(t < 10.0, 1.0, -1.0)
     series = Series(t, angle, 0.0 * t, torque)
     run = RunData(
-        "hw", series, series, Signal(t, torque), Signal(t, torque), None, np.diff(t), 100.0, 3,
+        "hw",
+        series,
+        series,
+        Signal(t, torque),
+        Signal(t, torque),
+        None,
+        np.diff(t),
+        100.0,
+        3,
         metadata={"pendulum.run": {"disturbance": MULTISINE}},
-    )  # fmt: skip
+    )
     found = record_of_run(run)
     assert found.period == 0.01
     raster = t[0] + 0.01 * np.arange(found.torque.size)

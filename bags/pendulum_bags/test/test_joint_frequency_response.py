@@ -72,9 +72,17 @@ def _exact(model: LinearModel, plant: MechanismParameters, label: str) -> Measur
     small = 1e-6 * np.abs(response)
     coordinates = plant.coordinates
     return MeasuredResponse(
-        label, PERIOD, lines, response, small, np.ones_like(small), np.ones(lines.size, dtype=complex), 8.0,
-        joints=coordinates.names, driven=coordinates.driven[0],
-    )  # fmt: skip
+        label,
+        PERIOD,
+        lines,
+        response,
+        small,
+        np.ones_like(small),
+        np.ones(lines.size, dtype=complex),
+        8.0,
+        joints=coordinates.names,
+        driven=coordinates.driven[0],
+    )
 
 
 def _scaling(plant: MechanismParameters, model: LinearModel) -> JointScaling:

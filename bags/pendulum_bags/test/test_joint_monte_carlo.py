@@ -144,9 +144,7 @@ def test_the_command_tells_and_replays_and_refuses_options_of_one_joint(
     assert main([*own, "--replay", "7"]) == 0
     with (tmp_path / "mc" / "replay_7.csv").open(encoding="utf-8") as file:
         rows = list(csv.reader(file))
-    assert rows[0] == [
-        "time_s", "cart_m", "pole_rad", "cart_m_s", "pole_rad_s", "cart_effort_n", "pole_effort_n_m",
-    ]  # fmt: skip
+    assert rows[0] == ["time_s", "cart_m", "pole_rad", "cart_m_s", "pole_rad_s", "cart_effort_n", "pole_effort_n_m"]
     assert len(rows) == 101
     assert "cart_mass" in capsys.readouterr().out
     for option in (["--q", "1", "2"], ["--r", "1"], ["--sobol", "8"]):

@@ -148,8 +148,13 @@ def test_the_trials_are_the_benchmark_s() -> None:
     trials = robustness_trials(plant)
     counts = {kind: sum(trial.kind == kind for trial in trials) for kind in runs.KINDS}
     assert counts == {
-        "model": 210, "velocity_noise": 210, "torque_noise": 210, "torque_response": 21, "delay": 21, "kicks": 50,
-    }  # fmt: skip
+        "model": 210,
+        "velocity_noise": 210,
+        "torque_noise": 210,
+        "torque_response": 21,
+        "delay": 21,
+        "kicks": 50,
+    }
     of_mass = [trial.disturbances.values["mass_2"] for trial in trials if "mass_2" in trial.disturbances.values]
     assert (of_mass[0], of_mass[-1]) == pytest.approx((0.75 * plant.value("mass_2"), 1.25 * plant.value("mass_2")))
     # The start is the same for the same seed, and each noisy run has noise of its own.

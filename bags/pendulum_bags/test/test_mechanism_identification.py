@@ -318,9 +318,12 @@ def test_a_bag_of_a_plant_is_identified_by_the_efforts_that_it_says_it_applied(t
         state = model.step((effort,))
     table = np.array(rows)
     told = JointRecording(
-        "run", PERIOD * np.arange(900), table[:, :2] + rng.normal(0.0, NOISE, (900, 2)),
-        np.column_stack((table[:, 2], np.zeros(900))), ("zero", "zero"),
-    )  # fmt: skip
+        "run",
+        PERIOD * np.arange(900),
+        table[:, :2] + rng.normal(0.0, NOISE, (900, 2)),
+        np.column_stack((table[:, 2], np.zeros(900))),
+        ("zero", "zero"),
+    )
     bag = record(tmp_path / "run", told, plant)
     read = read_joints(bag, plant.coordinates)
     assert read.hold == ("zero", "zero")
@@ -337,8 +340,12 @@ def test_a_bag_of_a_plant_is_identified_by_the_efforts_that_it_says_it_applied(t
 
 def test_bags_that_are_not_of_this_plant_or_were_pushed_are_refused(both_driven, tmp_path, capsys):
     plant = truth("double_pendulum")
-    short = replace(both_driven[0], time=both_driven[0].time[:50], position=both_driven[0].position[:50],
-                    effort=both_driven[0].effort[:50])  # fmt: skip
+    short = replace(
+        both_driven[0],
+        time=both_driven[0].time[:50],
+        position=both_driven[0].position[:50],
+        effort=both_driven[0].effort[:50],
+    )
     swapped = record(tmp_path / "swapped", short, plant, joints=("elbow", "shoulder"))
     with pytest.raises(DataError, match="is of the joints elbow, shoulder; expected shoulder, elbow, in this order"):
         read_joints(swapped, plant.coordinates)

@@ -26,8 +26,13 @@ def study_file(folder: Path, text: str) -> Path:
 
 def test_every_shipped_study_is_valid_and_says_what_it_needs() -> None:
     assert set(shipped_studies()) >= {
-        "thesis", "pid_vs_lqr", "strategies", "inertia_damping", "gravity", "random_start",
-    }  # fmt: skip
+        "thesis",
+        "pid_vs_lqr",
+        "strategies",
+        "inertia_damping",
+        "gravity",
+        "random_start",
+    }
     for name in shipped_studies():
         study = load_study(name)
         assert study.name == name

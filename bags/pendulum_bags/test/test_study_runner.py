@@ -174,9 +174,14 @@ def test_pairs_of_controllers_are_of_one_disturbance_and_one_start() -> None:
             for seed in (1, 2, 3):
                 ise = (1.0 + seed + 10.0 * number) * (factor if controller == "lqr" else 1.0)
                 labels = {
-                    "plant": "sim", "controller": controller, "disturbance": disturbance, "set_point": 0.0,
-                    "start": "upright", "seed": seed, "repeat": 1,
-                }  # fmt: skip
+                    "plant": "sim",
+                    "controller": controller,
+                    "disturbance": disturbance,
+                    "set_point": 0.0,
+                    "start": "upright",
+                    "seed": seed,
+                    "repeat": 1,
+                }
                 records.append({"status": "done", "labels": labels, "metrics": dict.fromkeys(pid_vs_lqr.COMPARED, ise)})
     pairs = pid_vs_lqr._paired(pid_vs_lqr._by_place(records))
     assert {(pair["plant"], pair["seeds"], round(pair["ratio"], 9)) for pair in pairs} == {

@@ -140,9 +140,7 @@ def test_a_recording_holds_everything_and_says_so(tmp_path: Path, node: Node, pr
     assert set(command["frame_id"]) == {"lqr"}
     assert np.isnan(command["position"]).all()
     assert [stored.message.data for stored in opened["/sloppy"]] == [float(index) for index in range(400)]
-    assert [event["name"] for event in opened.events()] == [
-        "ramp_up", "hold", "parameters_changed", "annotation",
-    ]  # fmt: skip
+    assert [event["name"] for event in opened.events()] == ["ramp_up", "hold", "parameters_changed", "annotation"]
     assert opened.metadata["pendulum.run"] == {"seed": 42}
     assert opened.metadata["pendulum.parameters"]["/source"]["gain"] == [3.0, 4.0]
     assert opened.metadata["pendulum.recorder.counts"]["/sim/joint_states"]["written"] == 400

@@ -132,8 +132,13 @@ def test_tables_have_the_columns_of_the_arrays(tmp_path: Path) -> None:
         writer.write("/many", 1, joint_state(2, "", ["p", "q"], [1.0, 2.0], [], []))
     bag = read_bag(path)
     assert list(to_pandas(bag, "/a").columns) == [
-        "log_time_ns", "stamp_ns", "position", "velocity", "effort", "frame_id",
-    ]  # fmt: skip
+        "log_time_ns",
+        "stamp_ns",
+        "position",
+        "velocity",
+        "effort",
+        "frame_id",
+    ]
     assert to_pandas(bag, "/many")["q.position"].tolist() == [2.0]
     files = export_bag(bag, tmp_path / "csv", "csv")
     assert [file.name for file in files] == ["a.csv", "many.csv", "metadata.json"]
@@ -194,8 +199,13 @@ def test_tables_leave_out_the_constants_of_a_type_and_keep_times_whole_without_m
         writer.write("/status", 1, bytes(STORE.serialize_cdr(message, message.__msgtype__)))
     bag = read_bag(path)
     assert list(to_pandas(bag, "/status").columns) == [
-        "log_time_ns", "level", "name", "message", "hardware_id", "values",
-    ]  # fmt: skip
+        "log_time_ns",
+        "level",
+        "name",
+        "message",
+        "hardware_id",
+        "values",
+    ]
     assert to_pandas(bag, "/silent").dtypes.to_dict() == {"log_time_ns": np.dtype(np.int64)}
 
 

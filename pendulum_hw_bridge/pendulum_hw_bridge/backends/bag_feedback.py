@@ -46,9 +46,15 @@ def read_bag_feedback(folder: Path) -> dict[str, NDArray[np.float64]]:
         environment = {**os.environ, "OPENBLAS_NUM_THREADS": "1", "PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
         try:
             done = subprocess.run(
-                command, capture_output=True, text=True, errors="replace", check=False, timeout=2 * _PATIENCE,
-                env=environment, cwd=place,
-            )  # fmt: skip
+                command,
+                capture_output=True,
+                text=True,
+                errors="replace",
+                check=False,
+                timeout=2 * _PATIENCE,
+                env=environment,
+                cwd=place,
+            )
         except subprocess.TimeoutExpired:
             raise DataError(f"bag {folder} cannot be read: it took more than {2 * _PATIENCE} s") from None
         if done.returncode == _EXIT_REFUSED:

@@ -39,10 +39,15 @@ class DiscreteLqr(BaseController):
         Q,
         R,
         DELAY,
-        ParameterSpec("cost", "sampled", "", "sampled: the continuous cost collected over each period; sum: the cost "
-                      "at the samples alone.", choices=("sampled", "sum")),
+        ParameterSpec(
+            "cost",
+            "sampled",
+            "",
+            "sampled: the continuous cost collected over each period; sum: the cost at the samples alone.",
+            choices=("sampled", "sum"),
+        ),
         FEEDFORWARD,
-    )  # fmt: skip
+    )
 
     def __init__(
         self,

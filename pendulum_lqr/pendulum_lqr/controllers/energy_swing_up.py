@@ -44,15 +44,24 @@ class EnergySwingUp(BaseController):
     SERIES_ELASTIC = False
     SUMMARY = "swing-up by energy shaping, caught by LQR with hysteresis"
     PARAMETERS = (
-        ParameterSpec("gain", 50.0, "s/rad", "Pumping torque per energy error and velocity.", minimum=0.0,
-                      exclusive_minimum=True),
-        ParameterSpec("energy_margin", 0.1, "-", "Energy aimed at beyond that of upright, relative.", minimum=-0.5,
-                      maximum=1.0),
+        ParameterSpec(
+            "gain", 50.0, "s/rad", "Pumping torque per energy error and velocity.", minimum=0.0, exclusive_minimum=True
+        ),
+        ParameterSpec(
+            "energy_margin", 0.1, "-", "Energy aimed at beyond that of upright, relative.", minimum=-0.5, maximum=1.0
+        ),
         ParameterSpec("catch_q", [30.0, 0.3], "1/rad^2, s^2/rad^2", "Weights of the LQR that catches.", minimum=0.0),
         ParameterSpec("catch_r", 1.0, "1/(N m)^2", "Its weight of torque.", minimum=0.0, exclusive_minimum=True),
-        ParameterSpec("catch_share", 1.0, "-", "Share of the proven region of attraction in which it takes over.",
-                      minimum=0.0, maximum=1.0, exclusive_minimum=True),
-    )  # fmt: skip
+        ParameterSpec(
+            "catch_share",
+            1.0,
+            "-",
+            "Share of the proven region of attraction in which it takes over.",
+            minimum=0.0,
+            maximum=1.0,
+            exclusive_minimum=True,
+        ),
+    )
 
     def __init__(self, plant: PlantParameters, gain: float, margin: float, catch: Catch, effort_limit: float) -> None:
         super().__init__(effort_limit, catch.set_point)

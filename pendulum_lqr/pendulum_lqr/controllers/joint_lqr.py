@@ -64,8 +64,13 @@ def joint_parameters(name: str, plant: MechanismParameters) -> tuple[ParameterSp
         "effort_limit", 0.0, "N m", "Largest effort of each driven joint; 0 for the plant's own.", minimum=0.0
     )
     if name == "policy":
-        catch = ParameterSpec("catch", ZERO, "", "Who takes over near upright, in the region from which it catches: "
-                              "zero for nobody, or lqr.", choices=_FALLBACKS)  # fmt: skip
+        catch = ParameterSpec(
+            "catch",
+            ZERO,
+            "",
+            "Who takes over near upright, in the region from which it catches: zero for nobody, or lqr.",
+            choices=_FALLBACKS,
+        )
         return (*policy_specs(_FALLBACKS), catch, limit)
     if name != "lqr":
         return ()

@@ -34,11 +34,17 @@ class Lqi(BaseController):
     SUMMARY = "LQR with an integral state: no offset under a constant torque"
     PARAMETERS = (
         Q,
-        ParameterSpec("q_integral", 100.0, "1/(rad s)^2", "Weight of the integral of the angle.", minimum=0.0,
-                      exclusive_minimum=True),
+        ParameterSpec(
+            "q_integral",
+            100.0,
+            "1/(rad s)^2",
+            "Weight of the integral of the angle.",
+            minimum=0.0,
+            exclusive_minimum=True,
+        ),
         R,
         FEEDFORWARD,
-    )  # fmt: skip
+    )
 
     def __init__(
         self, gain: Gain, period: float, effort_limit: float, set_point: float = 0.0, hold: float = 0.0

@@ -54,11 +54,17 @@ class LqrFriction(Lqr):
         Q,
         R,
         FEEDFORWARD,
-        ParameterSpec("share", 0.8, "-", "Share of the plant's Coulomb friction that is fed forward.", minimum=0.0,
-                      maximum=0.95),
-        ParameterSpec("width", 0.0, "rad", "Deviation over which its sign changes; 0 for as little as the loop bears "
-                      "with a gain margin of 2.", minimum=0.0),
-    )  # fmt: skip
+        ParameterSpec(
+            "share", 0.8, "-", "Share of the plant's Coulomb friction that is fed forward.", minimum=0.0, maximum=0.95
+        ),
+        ParameterSpec(
+            "width",
+            0.0,
+            "rad",
+            "Deviation over which its sign changes; 0 for as little as the loop bears with a gain margin of 2.",
+            minimum=0.0,
+        ),
+    )
 
     def __init__(
         self,

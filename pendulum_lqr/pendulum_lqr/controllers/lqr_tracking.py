@@ -236,9 +236,12 @@ class LqrTracking(BaseController):
         if duration == 0.0:
             return None
         return Way(
-            t, duration, wrap(start.angle - there.angle), start.velocity - there.velocity,
+            t,
+            duration,
+            wrap(start.angle - there.angle),
+            start.velocity - there.velocity,
             start.acceleration - there.acceleration,
-        )  # fmt: skip
+        )
 
     def _suffices(self, way: Way) -> bool:
         for k in range(_POINTS + 1):

@@ -75,9 +75,14 @@ class LinearMpc(BaseController):
         self._observer: Observer | None = None
         if model.hidden or sampled.pending or p["offset_noise"] > 0.0:
             self._observer = Observer(
-                model, period, angle_noise=_ANGLE_NOISE, velocity_noise=_VELOCITY_NOISE, torque_noise=_TORQUE_NOISE,
-                offset_noise=p["offset_noise"], delay=p["delay"],
-            )  # fmt: skip
+                model,
+                period,
+                angle_noise=_ANGLE_NOISE,
+                velocity_noise=_VELOCITY_NOISE,
+                torque_noise=_TORQUE_NOISE,
+                offset_noise=p["offset_noise"],
+                delay=p["delay"],
+            )
         self.gain: Gain = discrete_lqr(sampled, q, r, cross)
         n = int(p["horizon"])
         self._free, self._forced = _predictions(sampled.A, sampled.B, n)

@@ -46,7 +46,7 @@ class NonlinearMpc(BaseController):
         ParameterSpec("iterations", 60, "-", "Largest number of solver iterations per answer.", minimum=1),
         ParameterSpec("catch_q", [100.0, 1.0], "1/rad^2, s^2/rad^2", "Weights of the LQR that catches.", minimum=0.0),
         ParameterSpec("catch_r", 0.1, "1/(N m)^2", "Its weight of torque.", minimum=0.0, exclusive_minimum=True),
-    )  # fmt: skip
+    )
 
     def __init__(self, plant: PlantParameters, period: float, p: Mapping[str, Any], catch: Catch) -> None:
         super().__init__(p["effort_limit"], catch.set_point)

@@ -29,11 +29,17 @@ class PdGravity(BaseController):
 
     SUMMARY = "PD with gravity compensation: holds any angle"
     PARAMETERS = (
-        ParameterSpec("bandwidth", 5.0, "rad/s", "Slowest pole asked for; sets the gains that are 0.", minimum=0.0,
-                      exclusive_minimum=True),
+        ParameterSpec(
+            "bandwidth",
+            5.0,
+            "rad/s",
+            "Slowest pole asked for; sets the gains that are 0.",
+            minimum=0.0,
+            exclusive_minimum=True,
+        ),
         ParameterSpec("kp", 0.0, "N m/rad", "Proportional gain; 0 for that of the bandwidth.", minimum=0.0),
         ParameterSpec("kd", 0.0, "N m s/rad", "Derivative gain; 0 for that of the bandwidth.", minimum=0.0),
-    )  # fmt: skip
+    )
 
     def __init__(
         self, plant: PlantParameters, kp: float, kd: float, effort_limit: float, set_point: float = 0.0

@@ -40,15 +40,20 @@ class Pid(BaseController):
 
     SUMMARY = "PID on the angle alone, tuned on the model for the cost that the LQR minimises"
     PARAMETERS = (
-        ParameterSpec("tuning", "numerical", "", "How the gains are found; manual takes kp, ki, kd as they are.",
-                      choices=("numerical", "ziegler_nichols", "manual")),
+        ParameterSpec(
+            "tuning",
+            "numerical",
+            "",
+            "How the gains are found; manual takes kp, ki, kd as they are.",
+            choices=("numerical", "ziegler_nichols", "manual"),
+        ),
         ParameterSpec("kp", 0.0, "N m/rad", "Proportional gain (manual).", minimum=0.0),
         ParameterSpec("ki", 0.0, "N m/(rad s)", "Integral gain (manual).", minimum=0.0),
         ParameterSpec("kd", 0.0, "N m s/rad", "Derivative gain (manual).", minimum=0.0),
         ParameterSpec("derivative_filter", 0.02, "s", "Time constant of the derivative's low-pass.", minimum=1e-6),
         Q,
         R,
-    )  # fmt: skip
+    )
 
     def __init__(
         self, gains: PidGains, period: float, filter_time: float, effort_limit: float, set_point: float = 0.0

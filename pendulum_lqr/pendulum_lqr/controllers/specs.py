@@ -20,7 +20,9 @@ DELAY = ParameterSpec(
     "delay", 0.0, "s", "Delay from state to torque, beyond the plant's own transport_delay.", minimum=0.0, maximum=1.0
 )
 OFFSET_NOISE = ParameterSpec(
-    "offset_noise", 0.0, "N m/s^0.5",
+    "offset_noise",
+    0.0,
+    "N m/s^0.5",
     "How fast an unknown constant torque may wander; > 0 observes and cancels it, so that no offset stays.",
     minimum=0.0,
-)  # fmt: skip
+)

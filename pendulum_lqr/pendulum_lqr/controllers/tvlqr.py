@@ -58,12 +58,13 @@ class Tvlqr(BaseController):
             "q", [10.0, 1.0], "1/rad^2, s^2/rad^2", "Weights of angle and velocity along the trajectory.", minimum=0.0
         ),
         ParameterSpec("r", 1.0, "1/(N m)^2", "Weight of torque.", minimum=0.0, exclusive_minimum=True),
-        ParameterSpec("reserve", 0.1, "-", "Share of the torque limit that is left to the feedback.", minimum=0.0,
-                      maximum=0.9),
+        ParameterSpec(
+            "reserve", 0.1, "-", "Share of the torque limit that is left to the feedback.", minimum=0.0, maximum=0.9
+        ),
         ParameterSpec("nodes", 100, "-", "Collocation intervals.", minimum=20, maximum=1000),
         ParameterSpec("catch_q", [100.0, 1.0], "1/rad^2, s^2/rad^2", "Weights of the LQR that catches.", minimum=0.0),
         ParameterSpec("catch_r", 0.1, "1/(N m)^2", "Its weight of torque.", minimum=0.0, exclusive_minimum=True),
-    )  # fmt: skip
+    )
 
     def __init__(
         self,

@@ -79,9 +79,7 @@ def encode_joints(
     n_position, n_velocity, n_effort = len(position), len(velocity), len(effort)
     layout, words = _layout(frame_id, joints, n_position, n_velocity, n_effort)
     sec, nanosec = divmod(stamp_ns, NANOSECONDS)
-    return _HEADER + layout.pack(
-        sec, nanosec, *words, n_position, *position, n_velocity, *velocity, n_effort, *effort
-    )  # fmt: skip
+    return _HEADER + layout.pack(sec, nanosec, *words, n_position, *position, n_velocity, *velocity, n_effort, *effort)
 
 
 def encode_joint_state(
@@ -146,9 +144,13 @@ def decode_joint_state(data: bytes) -> JointStateFields | None:
                 third = second + n + 1
                 if values[first] == values[second] == values[third] == n:
                     return JointStateFields(
-                        values[1] * NANOSECONDS + values[2], known.frame_id, known.joints,
-                        values[first + 1 : second], values[second + 1 : third], values[third + 1 :],
-                    )  # fmt: skip
+                        values[1] * NANOSECONDS + values[2],
+                        known.frame_id,
+                        known.joints,
+                        values[first + 1 : second],
+                        values[second + 1 : third],
+                        values[third + 1 :],
+                    )
             elif values[first : first + 3] == known.effort_alone:
                 return JointStateFields(
                     values[1] * NANOSECONDS + values[2], known.frame_id, known.joints, (), (), values[first + 3 :]

@@ -218,9 +218,7 @@ def advance_joints(
         begin = h - left
         now = along(lag(torque, command, begin, table[LAG]), 1.0, push)
         direction, held = _modes(forward, along, put, q, v, now, p, table)
-        q_1, v_1 = _step(
-            forward, along, put, lag, q, v, torque, command, push, begin, left, direction, held, p, table
-        )  # fmt: skip
+        q_1, v_1 = _step(forward, along, put, lag, q, v, torque, command, push, begin, left, direction, held, p, table)
         for i in range(n):
             if v[i] == 0.0 and direction[i] != 0.0 and v_1[i] * direction[i] < 0.0:
                 # It broke away and came back within the step: keep it where it is.
@@ -228,7 +226,7 @@ def advance_joints(
                 direction = put(direction, i, 0.0)
                 q_1, v_1 = _step(
                     forward, along, put, lag, q, v, torque, command, push, begin, left, direction, held, p, table
-                )  # fmt: skip
+                )
         first, joint, which = left, -1, 0
         for i in range(n):
             for kind in range(3):
@@ -247,7 +245,7 @@ def advance_joints(
                         break
                     q_r, v_r = _step(
                         forward, along, put, lag, q, v, torque, command, push, begin, root, direction, held, p, table
-                    )  # fmt: skip
+                    )
                     g = _passed(kind, i, q_r, v_r, direction, table)
                     if abs(g) <= 1e-15:
                         break
@@ -256,9 +254,7 @@ def advance_joints(
                     first, joint, which = root, i, kind
         if joint < 0:
             return q_1, v_1
-        q, v = _step(
-            forward, along, put, lag, q, v, torque, command, push, begin, first, direction, held, p, table
-        )  # fmt: skip
+        q, v = _step(forward, along, put, lag, q, v, torque, command, push, begin, first, direction, held, p, table)
         # A joint that turned round within the step may have been at a stop before: it is no further than that.
         q = put(q, joint, min(max(q[joint], table[LOWER][joint]), table[UPPER][joint]))
         if which > 0:

@@ -57,9 +57,16 @@ def bodies(p: Any) -> tuple[Body, ...]:
     small = 0.02 * cart * length * length
     return (
         Body("cart", (0.0, 0.0, 0.0), (1.0, 0.0, 0.0), cart, (0.0, 0.0, 0.0), (small, small, small), (0.0, 0.0, 0.0)),
-        Body("pole", (0.0, 0.0, 0.0), (0.0, -1.0, 0.0), pole, (0.0, 0.0, -centre),
-             (about_centre, about_centre, 0.02 * about_centre), (0.0, 0.0, -length)),
-    )  # fmt: skip
+        Body(
+            "pole",
+            (0.0, 0.0, 0.0),
+            (0.0, -1.0, 0.0),
+            pole,
+            (0.0, 0.0, -centre),
+            (about_centre, about_centre, 0.02 * about_centre),
+            (0.0, 0.0, -length),
+        ),
+    )
 
 
 CART_POLE = Mechanism(

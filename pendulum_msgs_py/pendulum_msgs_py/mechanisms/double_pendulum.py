@@ -75,11 +75,13 @@ def bodies(p: Any) -> tuple[Body, ...]:
     own_1, own_2 = i_1 - m_1 * r_1 * r_1, i_2 - m_2 * r_2 * r_2
     axis = (0.0, -1.0, 0.0)
     return (
-        Body("upper_link", (0.0, 0.0, 0.0), axis, m_1, (0.0, 0.0, -r_1), (own_1, own_1, 0.02 * own_1),
-             (0.0, 0.0, -l_1)),
-        Body("lower_link", (0.0, 0.0, -l_1), axis, m_2, (0.0, 0.0, -r_2), (own_2, own_2, 0.02 * own_2),
-             (0.0, 0.0, -l_2)),
-    )  # fmt: skip
+        Body(
+            "upper_link", (0.0, 0.0, 0.0), axis, m_1, (0.0, 0.0, -r_1), (own_1, own_1, 0.02 * own_1), (0.0, 0.0, -l_1)
+        ),
+        Body(
+            "lower_link", (0.0, 0.0, -l_1), axis, m_2, (0.0, 0.0, -r_2), (own_2, own_2, 0.02 * own_2), (0.0, 0.0, -l_2)
+        ),
+    )
 
 
 def rotors(p: Any) -> tuple[Rotor, ...]:

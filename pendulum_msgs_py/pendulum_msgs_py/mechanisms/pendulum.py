@@ -55,9 +55,16 @@ def bodies(p: Any) -> tuple[Body, ...]:
     weight, length = _shape(p)
     rest = p[0] - weight * length**2
     return (
-        Body("link", (0.0, 0.0, 0.0), (0.0, -1.0, 0.0), weight, (0.0, 0.0, -length), (rest, rest, 0.02 * rest),
-             (0.0, 0.0, -length)),
-    )  # fmt: skip
+        Body(
+            "link",
+            (0.0, 0.0, 0.0),
+            (0.0, -1.0, 0.0),
+            weight,
+            (0.0, 0.0, -length),
+            (rest, rest, 0.02 * rest),
+            (0.0, 0.0, -length),
+        ),
+    )
 
 
 PENDULUM = Mechanism(

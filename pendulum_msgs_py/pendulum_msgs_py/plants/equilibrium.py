@@ -91,9 +91,13 @@ def resistance_of(drive: SeriesElasticParameters) -> float:
 def command_pwm(torque: Any, drive: SeriesElasticParameters) -> Any:
     """Return the duty that answers a torque command [N m], a number, also a complex one, or an array [-]."""
     return feedforward_pwm(
-        torque, drive.supply_voltage, drive.torque_constant, drive.gear_ratio, drive.efficiency,
+        torque,
+        drive.supply_voltage,
+        drive.torque_constant,
+        drive.gear_ratio,
+        drive.efficiency,
         drive.winding_resistance,
-    )  # fmt: skip
+    )
 
 
 def torque_gain(plant: RigidPlant) -> float:
@@ -109,9 +113,13 @@ def torque_gain(plant: RigidPlant) -> float:
     if drive is None:
         return 1.0
     current = winding_current(
-        command_pwm(1.0, drive), 0.0, drive.supply_voltage, drive.back_emf_constant, drive.gear_ratio,
+        command_pwm(1.0, drive),
+        0.0,
+        drive.supply_voltage,
+        drive.back_emf_constant,
+        drive.gear_ratio,
         resistance_of(drive),
-    )  # fmt: skip
+    )
     return drive.torque_constant * drive.gear_ratio * current
 
 

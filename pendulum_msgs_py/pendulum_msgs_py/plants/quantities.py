@@ -54,10 +54,15 @@ def specs_of(kind: type[Any]) -> tuple[ParameterSpec, ...]:
             minimum = None if quantity.signed else 0.0
             found.append(
                 ParameterSpec(
-                    entry.name, default, quantity.unit, quantity.description,
-                    minimum=minimum, maximum=quantity.largest, exclusive_minimum=quantity.positive,
+                    entry.name,
+                    default,
+                    quantity.unit,
+                    quantity.description,
+                    minimum=minimum,
+                    maximum=quantity.largest,
+                    exclusive_minimum=quantity.positive,
                 )
-            )  # fmt: skip
+            )
     return tuple(found)
 
 

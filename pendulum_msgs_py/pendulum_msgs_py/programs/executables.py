@@ -308,10 +308,19 @@ def report_missing(error: BaseException) -> int:
 
 _OF_A_PATH = frozenset(
     {
-        errno.ENOENT, errno.EEXIST, errno.ENOTDIR, errno.EISDIR, errno.EACCES, errno.EPERM, errno.EROFS, errno.ENOSPC,
-        errno.EDQUOT, errno.ENAMETOOLONG, errno.ELOOP,
+        errno.ENOENT,
+        errno.EEXIST,
+        errno.ENOTDIR,
+        errno.EISDIR,
+        errno.EACCES,
+        errno.EPERM,
+        errno.EROFS,
+        errno.ENOSPC,
+        errno.EDQUOT,
+        errno.ENAMETOOLONG,
+        errno.ELOOP,
     }
-)  # fmt: skip
+)
 """What the file system answers to a path that it cannot serve."""
 _SIGNS_OF_EXHAUSTION = (
     "failed to map segment",

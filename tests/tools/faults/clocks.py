@@ -85,8 +85,11 @@ def jump_wall_clock(folder: Path) -> Outcome:
     """
     done = subprocess.run(
         [sys.executable, "-m", "tests.tools.faults.clocks", str(folder)],
-        env={**os.environ, **_make_clock(folder)}, capture_output=True, text=True, check=False,
-    )  # fmt: skip
+        env={**os.environ, **_make_clock(folder)},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
     try:
         return Outcome(**json.loads(done.stdout.splitlines()[-1]))
     except (IndexError, ValueError):

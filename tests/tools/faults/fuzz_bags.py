@@ -132,10 +132,15 @@ def fuzz_storage(storage: str, seconds: float, seed: int, keep: Path | None = No
         words = place / "words.dict"
         words.write_text("".join(f'"{word}"\n' for word in _WORDS), encoding="ascii")
         flags = [
-            f"-max_total_time={max(1, round(seconds))}", f"-seed={seed}", f"-max_len={_LARGEST}", f"-dict={words}",
-            f"-timeout={round(10 * PATIENCE)}", "-rss_limit_mb=1500", "-print_final_stats=1",
+            f"-max_total_time={max(1, round(seconds))}",
+            f"-seed={seed}",
+            f"-max_len={_LARGEST}",
+            f"-dict={words}",
+            f"-timeout={round(10 * PATIENCE)}",
+            "-rss_limit_mb=1500",
+            "-print_final_stats=1",
             f"-artifact_prefix={place}/finding_",
-        ]  # fmt: skip
+        ]
         done = subprocess.run(
             [
                 sys.executable, "-m", "tests.tools.faults.fuzz_bags", "--child", storage, "--place", name,

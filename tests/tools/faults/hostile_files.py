@@ -139,9 +139,15 @@ def _indexed(entries: int, chunks: int) -> bytes:
     places = [(1, index_at)]
     entry = rec.chunk_index_record(5, 5, at, len(chunk), places, len(index), "", len(records), len(records))
     statistics = rec.statistics_record(
-        message_count=entries, schema_count=1, attachment_count=0, metadata_count=0, chunk_count=chunks, start_ns=5,
-        stop_ns=5, channel_counts={1: 2**60},
-    )  # fmt: skip
+        message_count=entries,
+        schema_count=1,
+        attachment_count=0,
+        metadata_count=0,
+        chunk_count=chunks,
+        start_ns=5,
+        stop_ns=5,
+        channel_counts={1: 2**60},
+    )
     summary = _described() + entry * chunks + statistics
     return head + chunk + index + summary + rec.footer_record(summary_at, 0) + rec.MAGIC
 

@@ -177,11 +177,17 @@ def _study(folder: Path) -> Path:
 def _servo_log(folder: Path) -> Path:
     entries = [
         {
-            "timestamp": 0.01 * i, "position": 0.1 * i, "speed": 10.0, "goal_position": 0.1 * i, "torque_enable": True,
-            "load": 12, "input_volts": 12.0, "temp": 30,
+            "timestamp": 0.01 * i,
+            "position": 0.1 * i,
+            "speed": 10.0,
+            "goal_position": 0.1 * i,
+            "torque_enable": True,
+            "load": 12,
+            "input_volts": 12.0,
+            "temp": 30,
         }
         for i in range(20)
-    ]  # fmt: skip
+    ]
     path = folder / "log.json"
     log = {"mass": 0.5, "length": 0.1, "kp": 32, "vin": 12.0, "entries": entries}
     path.write_text(json.dumps(log), encoding="utf-8")
@@ -244,11 +250,16 @@ def _bag_of_own_types(folder: Path) -> Path:
     data = b"\0\1\0\0" + bytes(48) + b"\1" + bytes(47)  # the text is not longer than its end
     path = folder / "own_types.mcap"
     path.write_bytes(
-        rec.MAGIC + rec.header_record("fuzz")
-        + rec.schema_record(1, "own/msg/Whole", "ros2msg", definition) + rec.channel_record(1, 1, "/own", "cdr", {})
-        + rec.MESSAGE_HEADER.pack(rec.MESSAGE, 22 + len(data), 1, 0, 5, 5) + data
-        + rec.record(rec.DATA_END, bytes(4)) + rec.footer_record(0, 0) + rec.MAGIC
-    )  # fmt: skip
+        rec.MAGIC
+        + rec.header_record("fuzz")
+        + rec.schema_record(1, "own/msg/Whole", "ros2msg", definition)
+        + rec.channel_record(1, 1, "/own", "cdr", {})
+        + rec.MESSAGE_HEADER.pack(rec.MESSAGE, 22 + len(data), 1, 0, 5, 5)
+        + data
+        + rec.record(rec.DATA_END, bytes(4))
+        + rec.footer_record(0, 0)
+        + rec.MAGIC
+    )
     return path
 
 

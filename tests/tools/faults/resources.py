@@ -110,8 +110,12 @@ def _run(*arguments: str, memory: int | None = None) -> tuple[int | None, str]:
     try:
         done = subprocess.run(
             [sys.executable, "-m", "pendulum_bags", *arguments],
-            capture_output=True, text=True, timeout=2 * _TIMEOUT, check=False, preexec_fn=limit,
-        )  # fmt: skip
+            capture_output=True,
+            text=True,
+            timeout=2 * _TIMEOUT,
+            check=False,
+            preexec_fn=limit,
+        )
     except subprocess.TimeoutExpired:
         return None, "nothing: it did not end"
     return done.returncode, done.stdout + done.stderr

@@ -42,10 +42,13 @@ def run_side_by_side(folder: Path, duration: float, seeds: tuple[int, ...] = (11
     running = [
         subprocess.Popen(
             _command(folder / str(seed), seed, duration),
-            env=environment, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True,
+            env=environment,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.STDOUT,
+            text=True,
         )
         for seed in seeds
-    ]  # fmt: skip
+    ]
     outcome = Outcome()
     for seed, process in zip(seeds, running, strict=True):
         words, _ = process.communicate(timeout=_TIMEOUT)
@@ -79,15 +82,20 @@ def collide(folder: Path) -> Outcome:
     with reserve_domain() as domain:
         first = subprocess.Popen(
             [*_command(folder / "first", 21, 5.0), "--domain", str(domain)],
-            stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True,
-        )  # fmt: skip
+            stdout=subprocess.PIPE,
+            stderr=subprocess.STDOUT,
+            text=True,
+        )
         try:
             while not (folder / "first").exists() and first.poll() is None:
                 time.sleep(0.05)
             second = subprocess.run(
                 [*_command(folder / "second", 22, 1.0), "--domain", str(domain)],
-                capture_output=True, text=True, timeout=_TIMEOUT, check=False,
-            )  # fmt: skip
+                capture_output=True,
+                text=True,
+                timeout=_TIMEOUT,
+                check=False,
+            )
             words = second.stdout + second.stderr
             outcome.demand(second.returncode == 2, f"the second ended with {second.returncode}: {words[-200:]}")
             expected = f"ROS domain {domain} is in use"

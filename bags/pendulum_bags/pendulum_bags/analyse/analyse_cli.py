@@ -27,10 +27,18 @@ __all__ = ["app", "main"]
 app = typer.Typer(add_completion=False, rich_markup_mode=None)
 
 _SHOWN = {
-    "seed": "seed", "rate_hz": "rate [Hz]", "rms_error": "rms error [rad]", "max_abs_u": "max |u| [N m]",
-    "states_gaps": "gaps", "answer_p99": "answer p99 [ms]", "inertia": "inertia [kg m^2]",
-    "damping": "damping [N m s/rad]", "gravity": "gravity [N m]", "outcome": "outcome", "report": "report",
-}  # fmt: skip
+    "seed": "seed",
+    "rate_hz": "rate [Hz]",
+    "rms_error": "rms error [rad]",
+    "max_abs_u": "max |u| [N m]",
+    "states_gaps": "gaps",
+    "answer_p99": "answer p99 [ms]",
+    "inertia": "inertia [kg m^2]",
+    "damping": "damping [N m s/rad]",
+    "gravity": "gravity [N m]",
+    "outcome": "outcome",
+    "report": "report",
+}
 """Columns that are printed, with their headings; the CSV file has all."""
 _MOST_ROWS = 40
 

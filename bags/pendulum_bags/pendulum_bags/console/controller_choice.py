@@ -76,9 +76,11 @@ class ControllerChoice:
             self._kind = ui.select(kinds, value=kinds[0], label="Controller").props("dense outlined").classes("kind")
             self._kind.props(f'aria-label="Controller of {self._space or "/"}"')
             for text, work in (
-                ("Start", self._start), ("Activate", lambda: self._graph.activate(self._controller, on=True)),
-                ("Deactivate", lambda: self._graph.activate(self._controller, on=False)), ("End", self._end),
-            ):  # fmt: skip
+                ("Start", self._start),
+                ("Activate", lambda: self._graph.activate(self._controller, on=True)),
+                ("Deactivate", lambda: self._graph.activate(self._controller, on=False)),
+                ("End", self._end),
+            ):
                 self._button(f"{text} controller", partial(self._press, work), of=self._space or "/")
         self._state = ui.label().classes("small").props('role="status"')
 

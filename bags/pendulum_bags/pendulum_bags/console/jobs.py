@@ -137,9 +137,13 @@ class Jobs:
         command = [sys.executable, "-m", package, *arguments, *([option, str(folder)] if option else [])]
         with log.open("wb") as sink:
             process = subprocess.Popen(
-                command, stdin=subprocess.DEVNULL, stdout=sink, stderr=subprocess.STDOUT,
-                env=dict(environment), start_new_session=True,
-            )  # fmt: skip
+                command,
+                stdin=subprocess.DEVNULL,
+                stdout=sink,
+                stderr=subprocess.STDOUT,
+                env=dict(environment),
+                start_new_session=True,
+            )
         self._jobs[kind] = Job(kind, folder, process, log, time.monotonic())
         return self._jobs[kind]
 

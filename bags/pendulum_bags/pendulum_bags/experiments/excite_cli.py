@@ -123,9 +123,8 @@ def excite(
     if play:
         target = bag or out.with_suffix("")
         _play(
-            design, limits, out, target, plant, on, namespace, simulate,
-            arm=arm, noise=noise, seed=seed, domain=domain,
-        )  # fmt: skip
+            design, limits, out, target, plant, on, namespace, simulate, arm=arm, noise=noise, seed=seed, domain=domain
+        )
         typer.echo(f"played and recorded; next\n  python -m pendulum_bags identify {target}", err=as_json)
 
 

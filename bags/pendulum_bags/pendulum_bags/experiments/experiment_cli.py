@@ -164,9 +164,15 @@ def thesis(
             )
         chosen = {name: context.params[name] for name in _OF_SEVERAL_JOINTS if typed_options(context, {name})}
         joints(
-            out, plant, seed=seed, storage=storage, margin=margin, margins_file=margins_file, json_output=json_output,
+            out,
+            plant,
+            seed=seed,
+            storage=storage,
+            margin=margin,
+            margins_file=margins_file,
+            json_output=json_output,
             **chosen,
-        )  # fmt: skip
+        )
         return
     settings = RegulationSettings(
         plant=plant or "thesis",

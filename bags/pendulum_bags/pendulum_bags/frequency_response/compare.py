@@ -152,9 +152,12 @@ def _at_common_lines(first: MeasuredResponse, second: MeasuredResponse) -> tuple
     if same.sum() >= _LEAST_LINES:
         here, there = np.flatnonzero(same), nearest[same]
         return (
-            second.frequency[here], first.response[:, there], first.deviation[:, there], second.response[:, here],
+            second.frequency[here],
+            first.response[:, there],
+            first.deviation[:, there],
+            second.response[:, here],
             second.deviation[:, here],
-        )  # fmt: skip
+        )
     inside = (second.frequency >= first.frequency[0]) & (second.frequency <= first.frequency[-1])
     if inside.sum() < _LEAST_LINES or first.frequency.size < _LEAST_LINES:
         raise DataError(

@@ -154,9 +154,12 @@ def _policy(path: str, plant: PlantParameters, certifier: Certifier, *, recorded
         own = load_policy(path).period
         if round(own / machine.period) != 1:
             return DesignResult(
-                name, None, nothing, f"it answers every {own:g} s, and the hardware was measured every "
-                f"{machine.period:g} s", text,
-            )  # fmt: skip
+                name,
+                None,
+                nothing,
+                f"it answers every {own:g} s, and the hardware was measured every {machine.period:g} s",
+                text,
+            )
         values = {"policy": text}
         answers = [
             controller_response("policy", plant, machine.frequency, machine.period, values, size)

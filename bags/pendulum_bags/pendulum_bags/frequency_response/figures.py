@@ -215,9 +215,13 @@ def certified_weights_figure(certifier: Certifier, model: LinearModel) -> Figure
                 continue
             points.append((a, b, _class(certifier, np.asarray(gain.K)[:2])))
     return _set_figure(
-        "certified_weights", "LQR weights that carry over", points, "q11 / r [(N m)²/rad²]",
-        "q22 / r [(N m)² s²/rad²]", "weights",
-    )  # fmt: skip
+        "certified_weights",
+        "LQR weights that carry over",
+        points,
+        "q11 / r [(N m)²/rad²]",
+        "q22 / r [(N m)² s²/rad²]",
+        "weights",
+    )
 
 
 def certified_gains_figure(certifier: Certifier, designs: Sequence[DesignResult]) -> Figure:

@@ -131,9 +131,14 @@ def experiment(
     require_time_invariant(kind)
     check_domain(domain)
     disturbance = {
-        "kind": "multisine", "amplitude": amplitude, "signal_period": signal_period, "frequency": lowest,
-        "frequency_end": highest, "lines": lines, "hold_time": 0.01,
-    }  # fmt: skip
+        "kind": "multisine",
+        "amplitude": amplitude,
+        "signal_period": signal_period,
+        "frequency": lowest,
+        "frequency_end": highest,
+        "lines": lines,
+        "hold_time": 0.01,
+    }
     # Both hold each sample for the slower plant's period: the same torque as a function of time.
     specs = [
         RunSpec(

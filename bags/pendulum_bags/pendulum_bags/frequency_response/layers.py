@@ -115,11 +115,17 @@ def which_controllers(certifier: Certifier, designs: Sequence[DesignResult], *, 
         verdict += f"; not {not_rows}"
     evidence = [
         Evidence(
-            "nu-gap of model and hardware", "", profile.value, None, profile.value_upper, "", mark,
+            "nu-gap of model and hardware",
+            "",
+            profile.value,
+            None,
+            profile.value_upper,
+            "",
+            mark,
             f"upper 95 % limit, largest at {profile.at:.2g} Hz",
         ),
         *(_row(design, profile.value_upper) for design in designs),
-    ]  # fmt: skip
+    ]
     steps = tuple(
         f"redesign {design.name} with more margin, or identify the hardware and design again"
         for design in bad
@@ -164,6 +170,12 @@ def _row(design: DesignResult, limit: float) -> Evidence:
     else:
         how = f"loop distance {found.distance:.2f} at {found.at:.2g} Hz; expected below 1"
     return Evidence(
-        f"margin b(P, K), {design.name}", "", found.margin, None, None, f"above {limit:.3f}",
-        Mark.YES if found.certified else Mark.UNDECIDED if found.undecided else Mark.NO, how,
-    )  # fmt: skip
+        f"margin b(P, K), {design.name}",
+        "",
+        found.margin,
+        None,
+        None,
+        f"above {limit:.3f}",
+        Mark.YES if found.certified else Mark.UNDECIDED if found.undecided else Mark.NO,
+        how,
+    )

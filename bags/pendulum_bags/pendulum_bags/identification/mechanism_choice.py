@@ -92,9 +92,14 @@ def _held_out_error(found: MechanismFit, data: Sequence[Windows], weights: Array
             if not out.size:
                 continue
             one = fit(
-                found.model.with_values(values), [part.subset(out)], (), weights, states=[states[out]], most=8,
+                found.model.with_values(values),
+                [part.subset(out)],
+                (),
+                weights,
+                states=[states[out]],
+                most=8,
                 tolerance=1e-3,
-            )  # fmt: skip
+            )
             cost += one.cost
             samples += one.blocks[0].samples
     return float(np.sqrt(cost / samples))

@@ -95,8 +95,12 @@ def _readings(plant: MechanismParameters) -> Iterator[_Reading]:
         yield _Reading(words, advice, swap, swap if {0, 1} <= set(driven) else unit)
     signs = "expected an effort that is positive where it pushes the joint in its positive direction: correct its sign"
     if driven:
-        yield _Reading("every effort negated" if len(driven) > 1 else f"the effort of {names[driven[0]]} negated",
-                       signs, unit, -unit)  # fmt: skip
+        yield _Reading(
+            "every effort negated" if len(driven) > 1 else f"the effort of {names[driven[0]]} negated",
+            signs,
+            unit,
+            -unit,
+        )
     for i in driven if len(driven) > 1 else ():
         yield _Reading(f"the effort of {names[i]} negated", signs, unit, unit - 2.0 * np.diag(unit[i]))
     joints = plant.coordinates.joints

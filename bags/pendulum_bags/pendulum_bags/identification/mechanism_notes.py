@@ -50,8 +50,11 @@ def notes_of(
     edges = [n for n in found.free if model[n] <= model.lowest(n)]
     if edges:
         notes.append(f"At the edge of what it can be: {', '.join(edges)}; its interval is one-sided.")
-    loose = [n for n in found.free if n not in edges and n != DELAY and not n.endswith("_offset")
-             and intervals[n].relative > _WIDE]  # fmt: skip
+    loose = [
+        n
+        for n in found.free
+        if n not in edges and n != DELAY and not n.endswith("_offset") and intervals[n].relative > _WIDE
+    ]
     if loose:
         listing = ", ".join(f"{n} (+-{100.0 * min(intervals[n].relative, 99.0):.0f} %)" for n in loose)
         notes.append(f"The recordings do not determine {listing}.")

@@ -235,13 +235,21 @@ def _pendulum(plant: PlantParameters, ranges: Mapping[str, tuple[float, float]])
         return np.where(above[:, None], x, math.pi - x)
 
     return Body(
-        coordinates=coordinates_of(plant), limits=np.array([limit]), kicks=kicks_of(plant),
-        row=np.array(pack(plant), dtype=np.float64), columns=columns,
+        coordinates=coordinates_of(plant),
+        limits=np.array([limit]),
+        kicks=kicks_of(plant),
+        row=np.array(pack(plant), dtype=np.float64),
+        columns=columns,
         ratios=_ratio(coulomb + 1, coulomb, plant.static_friction, plant.coulomb_friction),
-        offsets=(columns["torque_offset"],), longest=longest, advance=_pendulum_kernel(), told=told,
-        height=lambda x: np.cos(x[:, 0]), excess=None,
-        possible=lambda parameters: np.ones(len(parameters), dtype=np.bool_), held=held,
-    )  # fmt: skip
+        offsets=(columns["torque_offset"],),
+        longest=longest,
+        advance=_pendulum_kernel(),
+        told=told,
+        height=lambda x: np.cos(x[:, 0]),
+        excess=None,
+        possible=lambda parameters: np.ones(len(parameters), dtype=np.bool_),
+        held=held,
+    )
 
 
 def _mechanism(plant: MechanismParameters, ranges: Mapping[str, tuple[float, float]], travel: float) -> Body:
@@ -288,18 +296,25 @@ def _mechanism(plant: MechanismParameters, ranges: Mapping[str, tuple[float, flo
         return found
 
     return Body(
-        coordinates=coordinates, limits=np.array(plant.effort_limits),
-        kicks=kicks_of(plant), row=row, columns=columns,
+        coordinates=coordinates,
+        limits=np.array(plant.effort_limits),
+        kicks=kicks_of(plant),
+        row=row,
+        columns=columns,
         ratios=tuple(
-            each for i, joint in enumerate(plant.joints)
+            each
+            for i, joint in enumerate(plant.joints)
             for each in _ratio(width + STATIC * n + i, width + COULOMB * n + i, joint.breakaway, joint.coulomb_friction)
         ),
-        offsets=tuple(last + i for i in driven), longest=min(_LONGEST_OF_SEVERAL, _GROWTH / max(_decay(plant), 1.0)),
+        offsets=tuple(last + i for i in driven),
+        longest=min(_LONGEST_OF_SEVERAL, _GROWTH / max(_decay(plant), 1.0)),
         advance=_mechanism_kernel(mechanism.name, goal),
         told=lambda parameters: [(parameters[:, k] - centre[k]) / half for k, half in scales.items()],
-        height=height, excess=excess if len(driven) < n else None,
-        possible=lambda parameters: can_exist(mechanism, parameters[:, :width]), held=None,
-    )  # fmt: skip
+        height=height,
+        excess=excess if len(driven) < n else None,
+        possible=lambda parameters: can_exist(mechanism, parameters[:, :width]),
+        held=None,
+    )
 
 
 def _ratio(static: int, coulomb: int, value: float, of: float) -> tuple[tuple[int, int, float], ...]:
@@ -356,9 +371,13 @@ def _mechanism_kernel(name: str, goal: tuple[float, ...]) -> Any:
     @numba.njit(error_model="numpy")
     def prepare(parameters: Any, _longest: float) -> Any:
         table = (
-            load(parameters, width), load(parameters, width + n), load(parameters, width + 2 * n),
-            load(parameters, width + 3 * n), load(parameters, width + 4 * n), load(parameters, width + 5 * n),
-        )  # fmt: skip
+            load(parameters, width),
+            load(parameters, width + n),
+            load(parameters, width + 2 * n),
+            load(parameters, width + 3 * n),
+            load(parameters, width + 4 * n),
+            load(parameters, width + 5 * n),
+        )
         return load_p(parameters, 0), table, load(parameters, last)
 
     @numba.njit(error_model="numpy")

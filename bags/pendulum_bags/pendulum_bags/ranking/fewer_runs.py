@@ -112,10 +112,12 @@ def narrow_all(contenders: Sequence[Contender]) -> dict[str, Narrowed]:
             continue
         # A seed that was repeated is no independent run: its mean counts once.
         sim, hw = (
-            {seed: float(np.mean([cost for at, cost in zip(seeds, rows.sum(axis=1), strict=True) if at == seed]))
-             for seed in sorted(set(seeds))}
+            {
+                seed: float(np.mean([cost for at, cost in zip(seeds, rows.sum(axis=1), strict=True) if at == seed]))
+                for seed in sorted(set(seeds))
+            }
             for seeds, rows in ((one.sim_seeds, one.sim), (one.hw_seeds, one.hw))
-        )  # fmt: skip
+        )
         both = sorted(sim.keys() & hw.keys())
         more = sorted(sim.keys() - hw.keys())
         if len(both) >= LEAST_PAIRS and more:

@@ -104,9 +104,13 @@ def _chance(sim: Array, hw: Array, generator: np.random.Generator, replicates: i
     # The correlation of ranks grows with the product of the ranks.
     against = scipy.stats.rankdata(hw)
     found = scipy.stats.permutation_test(
-        (scipy.stats.rankdata(sim),), lambda ranks, axis: np.sum(ranks * against, axis=axis),
-        permutation_type="pairings", alternative="greater", n_resamples=replicates, random_state=generator,
-    )  # fmt: skip
+        (scipy.stats.rankdata(sim),),
+        lambda ranks, axis: np.sum(ranks * against, axis=axis),
+        permutation_type="pairings",
+        alternative="greater",
+        n_resamples=replicates,
+        random_state=generator,
+    )
     return float(found.pvalue)
 
 

@@ -76,18 +76,21 @@ def same_choice(ranking: Ranking, margin: float = REGRET_MARGIN, words: Words = 
     note = fails.removeprefix("which ") or ranking.no_interval or _unbounded(ranking)
     evidence = (
         Evidence(
-            "regret of the simulation's pick", "%", ends[0], ends[1], ends[2],
-            f"at most {100.0 * margin:g} %", mark, note,
+            "regret of the simulation's pick",
+            "%",
+            ends[0],
+            ends[1],
+            ends[2],
+            f"at most {100.0 * margin:g} %",
+            mark,
+            note,
         ),
         Evidence("SRCC (Pearson)", "", ranking.srcc.value, ranking.srcc.low, ranking.srcc.high, "", mark),
         Evidence("rank correlation (Spearman)", "", ranking.spearman, mark=mark),
         Evidence("MMRV", unit, ranking.mmrv.value, ranking.mmrv.low, ranking.mmrv.high, "", mark),
         Evidence("pairs surely in the wrong order", "", float(len(sure)), None, None, f"of {ranking.pairs}", mark),
-        *(
-            Evidence("fails on one side only", "", None, mark=Mark.NO, note=name)
-            for name in ranking.failures
-        ),
-    )  # fmt: skip
+        *(Evidence("fails on one side only", "", None, mark=Mark.NO, note=name) for name in ranking.failures),
+    )
     steps = (f"record more seeds: {words.more}",) if mark is Mark.UNDECIDED else ()
     if mark is Mark.NO:
         steps = (f"compare the plants in frequency, where {ranking.pick} works: {words.in_frequency}",)
@@ -144,10 +147,9 @@ def ranking_figure(ranking: Ranking) -> Figure:
         at = [i for i, other in enumerate(ranking.names) if other == name and able[i]]
         traces.append(Trace(sim[at], hw[at], label, role, "points"))
     failed = int(np.sum(~able))
-    sentence = (
-        f"{int(able.sum())} controllers; SRCC {ranking.srcc.value:.3f}, MMRV {ranking.mmrv.value:.3g}."
-        + (f" {failed} more failed on a side and are not drawn." if failed else "")
-    )  # fmt: skip
+    sentence = f"{int(able.sum())} controllers; SRCC {ranking.srcc.value:.3f}, MMRV {ranking.mmrv.value:.3g}." + (
+        f" {failed} more failed on a side and are not drawn." if failed else ""
+    )
     panel = Panel("cost in simulation [-]", "cost on hardware [-]", traces, x_log=True, y_log=True)
     return Figure("ranking", "Costs of the controllers on both sides", sentence, [panel], panel_height=360)
 
@@ -209,12 +211,18 @@ def write_ranking(
             Table(
                 "Pairs in the wrong order",
                 f"The {min(_SHOWN_PAIRS, len(ranking.wrong))} dearest of {len(ranking.wrong)}, sure ones first.",
-                ("simulation prefers", "hardware prefers", "better in simulation by", "dearer on hardware by", "sure",
-                 "reason"),
+                (
+                    "simulation prefers",
+                    "hardware prefers",
+                    "better in simulation by",
+                    "dearer on hardware by",
+                    "sure",
+                    "reason",
+                ),
                 _pair_rows(ranking),
                 "",
             )
-        )  # fmt: skip
+        )
     return write_layer_page(folder / "ranking.html", "Ranking of controllers", [layer], figures, tables)
 
 

@@ -94,9 +94,13 @@ def write_report(
     data = ReportData(comparison, content, replays, names, known, answer, certified, open_bag)
     figures, missing = make_figures(data)
     page = page_of(
-        data, figures, make_tables(data), missing,
-        title=title_of([Path(folder) for folder in folders] or [out], len(comparison.pairs)), made_at=_now(),
-    )  # fmt: skip
+        data,
+        figures,
+        make_tables(data),
+        missing,
+        title=title_of([Path(folder) for folder in folders] or [out], len(comparison.pairs)),
+        made_at=_now(),
+    )
     return _save(out, page, formats)
 
 

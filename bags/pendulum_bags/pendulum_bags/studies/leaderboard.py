@@ -165,10 +165,17 @@ def push_trains(plant: PlantParameters, duration: float) -> list[dict[str, Any]]
     The push comes after half of a run of ``duration`` [s], so that every run has it, and time to recover.
     """
     return [
-        {"kind": "pulse_train", "amplitude": share * plant.effort_limit, "frequency": 4.0 / duration,
-         "pulse_width": 0.1, "start_time": 0.5 * duration, "hold_time": 0.0, "duration": 0.7 * duration}
+        {
+            "kind": "pulse_train",
+            "amplitude": share * plant.effort_limit,
+            "frequency": 4.0 / duration,
+            "pulse_width": 0.1,
+            "start_time": 0.5 * duration,
+            "hold_time": 0.0,
+            "duration": 0.7 * duration,
+        }
         for share in (0.1, 0.2, 0.4, 0.6)
-    ]  # fmt: skip
+    ]
 
 
 def _model_error(plant: PlantParameters, _duration: float) -> Sequence[Variation]:
@@ -223,9 +230,14 @@ def evaluate(
     true = load_plant(plant)
     # Hanging exactly down is an equilibrium that no torque of an energy controller leaves.
     spec: dict[str, Any] = {
-        "plant": plant, "design_plant": plant, "controller": controller, "controller_parameters": parameters or {},
-        "theta": 0.01, "duration": duration, "method": "etd4",
-    }  # fmt: skip
+        "plant": plant,
+        "design_plant": plant,
+        "controller": controller,
+        "controller_parameters": parameters or {},
+        "theta": 0.01,
+        "duration": duration,
+        "method": "etd4",
+    }
     began = time.perf_counter()
     try:
         arrays = simulate_plant(RunSpec(**spec), true)

@@ -159,9 +159,13 @@ def _run(spec: RunSpec) -> RunArrays:
         environment = {name: value for name, value in os.environ.items() if name != "ROS_DOMAIN_ID"}
         try:
             done = subprocess.run(
-                [*command, "--bag", str(place / "bag")], capture_output=True, text=True, timeout=_LONGEST,
-                check=False, env=environment,
-            )  # fmt: skip
+                [*command, "--bag", str(place / "bag")],
+                capture_output=True,
+                text=True,
+                timeout=_LONGEST,
+                check=False,
+                env=environment,
+            )
         except subprocess.TimeoutExpired as error:
             raise FaultError(f"a run on the emulated machine did not end within {_LONGEST:g} s") from error
         if done.returncode:

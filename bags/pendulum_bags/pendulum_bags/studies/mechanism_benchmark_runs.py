@@ -72,8 +72,13 @@ KNOCKS = 15
 _KNOCK_LENGTH = 0.2
 _KNOCK_GAINS = (10.0, 0.1, 1.0)
 _KNOCK_DT = 0.001  # what its PID takes for the period, twice too short
-_RELATIVE = {"m1r1": ("centre_1",), "I1": ("inertia_1",), "m2r2": ("centre_2",), "m2": ("mass_2",),
-             "I2": ("inertia_2",)}  # fmt: skip
+_RELATIVE = {
+    "m1r1": ("centre_1",),
+    "I1": ("inertia_1",),
+    "m2r2": ("centre_2",),
+    "m2": ("mass_2",),
+    "I2": ("inertia_2",),
+}
 
 
 class Trajectory(NamedTuple):

@@ -262,9 +262,14 @@ def _plain_runs(file: LocatedMapping, _: str, clock: str, seeds: Sequence[int], 
                 "engine is 'process'; expected nodes for a plant with parameters of its own, and in real time", "engine"
             )
         labels = {
-            "plant": plant, "controller": controller, "disturbance": disturbance, "set_point": float(set_point),
-            "start": start, "seed": seed, "repeat": repeat,
-        }  # fmt: skip
+            "plant": plant,
+            "controller": controller,
+            "disturbance": disturbance,
+            "set_point": float(set_point),
+            "start": start,
+            "seed": seed,
+            "repeat": repeat,
+        }
         steps = duration / PERIODS[spec.side]
         seconds = 0.05 + 8e-5 * steps if engine == "process" else _NODE_START + _SECONDS_PER_STEP * steps
         if clock == "realtime":
@@ -318,9 +323,14 @@ def _named_runs(
             arguments += ["--trials", str(trials), *(["--realtime"] if clock == "realtime" else [])]
             seconds, size = trials * _TRIAL_SECONDS[experiment], trials * _TRIAL_BYTES[experiment]
         labels = {
-            "plant": plant, "controller": controller, "disturbance": disturbance, "set_point": 0.0, "start": "",
-            "seed": seed, "repeat": repeat,
-        }  # fmt: skip
+            "plant": plant,
+            "controller": controller,
+            "disturbance": disturbance,
+            "set_point": 0.0,
+            "start": "",
+            "seed": seed,
+            "repeat": repeat,
+        }
         runs.append(StudyRun(number, labels, None, "nodes", tuple(arguments), seconds, size))
     return runs
 

@@ -318,11 +318,18 @@ def _fit_items(
         rows = np.arange(len(out)) if left is None else left
         rests = [
             _fit_items(
-                batch, plan, offsets[part], times[part], None if sizes is None else sizes[part], rows[part], out,
-                columns, layout,
+                batch,
+                plan,
+                offsets[part],
+                times[part],
+                None if sizes is None else sizes[part],
+                rows[part],
+                out,
+                columns,
+                layout,
             )
             for part in (slice(None, len(offsets) // 2), slice(len(offsets) // 2, None))
-        ]  # fmt: skip
+        ]
         found = [rest for rest in rests if rest is not None]
         return np.concatenate(found) if found else None
     # Every byte of the buffer as the possible start of a message: taking rows of it copies messages, nothing else.

@@ -13,9 +13,7 @@ from pendulum_rosbag.reader.batches import Int64
 from pendulum_rosbag.reader.topic_info import TopicInfo
 from pendulum_rosbag.storage.stamps import stamp_reader
 
-__all__ = [
-    "BagStatistics", "Latency", "TopicStatistics", "bag_statistics", "clock_jumps", "time_statistics",
-]  # fmt: skip
+__all__ = ["BagStatistics", "Latency", "TopicStatistics", "bag_statistics", "clock_jumps", "time_statistics"]
 
 GAP_FACTOR = 1.5
 """An interval counts as a gap when it is longer than this many median intervals."""
