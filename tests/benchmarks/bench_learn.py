@@ -26,7 +26,6 @@ import numpy as np
 from pendulum_bags.experiments.joint_run import stand_in_for
 from pendulum_bags.learning.evaluation import Trial, is_up, measured_success, run_trial, trials_of
 from pendulum_bags.learning.task import VARIED, SwingUpTask, value_of
-from pendulum_bags.ranking.prediction import judge_prediction
 from pendulum_bags.studies.leaderboard import evaluate
 from pendulum_bags.studies.leaderboard_hardware import evaluate_hardware
 from pendulum_lqr.controllers.policy import START_TIME, LearnedPolicy
@@ -37,6 +36,7 @@ from pendulum_msgs_py.plants.plant_differences import AnyPlant
 from pendulum_msgs_py.plants.plant_parameters import load_plant
 from tests.benchmarks import Peer, Row, measured
 from tests.benchmarks.emulated_trials import emulated_trials
+from tests.benchmarks.prediction import judge_prediction
 
 __all__ = ["rows"]
 

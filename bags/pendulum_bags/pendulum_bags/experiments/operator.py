@@ -6,7 +6,6 @@ import contextlib
 import json
 import shutil
 import subprocess
-import sys
 import tempfile
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
@@ -14,6 +13,7 @@ from pathlib import Path
 
 from rich.console import Console
 
+from pendulum_bags.runs.bridge_programs import last_words, run_bridge_program
 from pendulum_msgs_py.errors import FaultError, ParameterError
 from pendulum_msgs_py.plants.lab_file import EMULATED_BACKENDS, LabFile, load_lab
 from pendulum_msgs_py.programs.graph import NodeProgram, ParameterArgument
@@ -135,23 +135,12 @@ def _kept_settings(machine: RealMachine, console: Console) -> Iterator[None]:
 
 def _lab(*arguments: str) -> str:
     """Run a procedure of the lab; return why it failed, or an empty string."""
-    command = [sys.executable, "-m", "pendulum_hw_bridge", "lab", *arguments]
     try:
-        done = subprocess.run(
-            command,
-            stdin=subprocess.DEVNULL,
-            capture_output=True,
-            encoding="utf-8",
-            errors="replace",
-            timeout=_CHECK_TIMEOUT,
-            check=False,
-            # Ctrl-C is for the experiment: what gives the settings back must not die of it.
-            start_new_session=True,
-        )
+        # Ctrl-C is for the experiment: what gives the settings back must not die of it.
+        done = run_bridge_program("lab", *arguments, timeout=_CHECK_TIMEOUT, deaf_to_ctrl_c=True)
     except subprocess.TimeoutExpired:
         return f"it did not end within {_CHECK_TIMEOUT:g} s"
-    words = done.stderr.strip().splitlines()
-    return "" if done.returncode == 0 else words[-1].removeprefix("error: ") if words else f"code {done.returncode}"
+    return "" if done.returncode == 0 else last_words(done.stderr, f"code {done.returncode}")
 
 
 def run_checklist(bridge: NodeProgram, console: Console, *, flat: bool = False) -> None:
@@ -160,19 +149,10 @@ def run_checklist(bridge: NodeProgram, console: Console, *, flat: bool = False) 
     Raises:
         FaultError: It is not passed.
     """
-    command = [sys.executable, "-m", "pendulum_hw_bridge", "check", "--json", "--no-nudge", *bridge.ros_arguments()]
-    command += ["-p", "flat:=true"] if flat else []
+    arguments = ["check", "--json", "--no-nudge", *bridge.ros_arguments(), *(["-p", "flat:=true"] if flat else [])]
     console.print("checking the machine ...", style="dim")
     try:
-        done = subprocess.run(
-            command,
-            stdin=subprocess.DEVNULL,
-            capture_output=True,
-            encoding="utf-8",
-            errors="replace",
-            timeout=_CHECK_TIMEOUT,
-            check=False,
-        )
+        done = run_bridge_program(*arguments, timeout=_CHECK_TIMEOUT)
     except subprocess.TimeoutExpired:
         raise FaultError(f"the checklist did not end within {_CHECK_TIMEOUT:g} s; nothing was started") from None
     if done.returncode == 0:
@@ -187,7 +167,7 @@ def _refusals(printed: str, said: str) -> str:
     try:
         items = json.loads(printed)["items"]
     except (ValueError, KeyError):
-        return said.strip().splitlines()[-1].removeprefix("error: ") if said.strip() else "it ended without a word"
+        return last_words(said, "it ended without a word")
     wrong = [item for item in items if item["passed"] is False]
     return "; ".join(f"{item['name']}: {item['seen']} (expected {item['expected']})" for item in wrong)
 

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import subprocess
-import sys
 import tempfile
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+from pendulum_bags.runs.bridge_programs import last_words, run_bridge_program
 from pendulum_bags.runs.csv_mapping import read_csv
 from pendulum_bags.runs.datasets import Recording
 from pendulum_msgs_py.errors import DataError
@@ -33,22 +33,12 @@ def read_hebi_log(path: Path, lab: str | Path | Mapping[str, Any] | None = None)
         raise DataError(f"{path}: mapping is given as values; expected the lab file of a HEBI log")
     with tempfile.TemporaryDirectory() as folder:
         table = Path(folder) / "log.csv"
-        command = [sys.executable, "-m", "pendulum_hw_bridge", "convert", str(path), "--out", str(table)]
-        command += [] if lab is None else ["--lab", str(lab)]
+        told = [] if lab is None else ["--lab", str(lab)]
         try:
-            done = subprocess.run(
-                command,
-                stdin=subprocess.DEVNULL,
-                capture_output=True,
-                encoding="utf-8",
-                errors="replace",
-                timeout=_TIMEOUT,
-                check=False,
-            )
+            done = run_bridge_program("convert", str(path), "--out", str(table), *told, timeout=_TIMEOUT)
         except subprocess.TimeoutExpired:
             raise DataError(f"{path} was not read within {_TIMEOUT:g} s") from None
         if done.returncode != 0:
-            words = done.stderr.strip().splitlines()
-            raise DataError(words[-1].removeprefix("error: ") if words else f"{path} cannot be read")
+            raise DataError(last_words(done.stderr, f"{path} cannot be read"))
         recording = read_csv(table)
     return replace(recording, meta={**recording.meta, "source": str(path), "mapping": str(lab or "")})

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -53,18 +53,30 @@ _SHOWN = (
     "success",
 )
 
+_SHIPPED = {
+    "pid_vs_lqr": (
+        "Compare PID and LQR on simulation and hardware under the same noise and the same step, over 20 seeds.",
+        "--out /tmp/pid_vs_lqr --workers 2",
+    ),
+    "random_start": (
+        "Regulate from random starts on simulation and hardware, the thesis's future work.",
+        "--out /tmp/random --seeds 5",
+    ),
+    "ranking": (
+        "Rank every controller and twenty gains on simulation and hardware: would the simulation have picked right?",
+        "--out /tmp/ranking --workers 2",
+    ),
+}
+"""Shipped studies whose number of seeds may be chosen, with their help and an example."""
+
 
 def add_commands(app: typer.Typer) -> None:
     """Add the studies to the command line of ``experiment``."""
     app.command(name="study")(study)
     app.command(name="run", hidden=True)(run)
-    for name, command in (
-        ("strategies", strategies),
-        ("pid_vs_lqr", pid_vs_lqr),
-        ("random_start", random_start),
-        ("ranking", ranking),
-    ):
-        app.command(name=name)(command)
+    app.command(name="strategies")(strategies)
+    for name, (what, example) in _SHIPPED.items():
+        app.command(name=name)(_shipped(name, what, example))
 
 
 def study(
@@ -100,49 +112,27 @@ def strategies(
     _study("strategies", out, workers, 0, retry_failed, dry_run, json_output)
 
 
-def pid_vs_lqr(
-    out: Out = None,
-    workers: Workers = 0,
-    seeds: Seeds = 0,
-    retry_failed: Retry = False,
-    dry_run: DryRun = False,
-    json_output: Json = False,
-) -> None:
-    """Compare PID and LQR on simulation and hardware under the same noise and the same step, over 20 seeds.
+def _shipped(name: str, what: str, example: str) -> Callable[..., None]:
+    """Return the command of a shipped study.
 
-    Example: python -m pendulum_bags experiment pid_vs_lqr --out /tmp/pid_vs_lqr --workers 2
+    Args:
+        name: Of the study.
+        what: Its help, in a sentence.
+        example: How it is called, behind its name.
     """
-    _study("pid_vs_lqr", out, workers, seeds, retry_failed, dry_run, json_output)
 
+    def command(
+        out: Out = None,
+        workers: Workers = 0,
+        seeds: Seeds = 0,
+        retry_failed: Retry = False,
+        dry_run: DryRun = False,
+        json_output: Json = False,
+    ) -> None:
+        _study(name, out, workers, seeds, retry_failed, dry_run, json_output)
 
-def random_start(
-    out: Out = None,
-    workers: Workers = 0,
-    seeds: Seeds = 0,
-    retry_failed: Retry = False,
-    dry_run: DryRun = False,
-    json_output: Json = False,
-) -> None:
-    """Regulate from random starts on simulation and hardware, the thesis's future work.
-
-    Example: python -m pendulum_bags experiment random_start --out /tmp/random --seeds 5
-    """
-    _study("random_start", out, workers, seeds, retry_failed, dry_run, json_output)
-
-
-def ranking(
-    out: Out = None,
-    workers: Workers = 0,
-    seeds: Seeds = 0,
-    retry_failed: Retry = False,
-    dry_run: DryRun = False,
-    json_output: Json = False,
-) -> None:
-    """Rank every controller and twenty gains on simulation and hardware: would the simulation have picked right?
-
-    Example: python -m pendulum_bags experiment ranking --out /tmp/ranking --workers 2
-    """
-    _study("ranking", out, workers, seeds, retry_failed, dry_run, json_output)
+    command.__doc__ = f"{what}\n\nExample: python -m pendulum_bags experiment {name} {example}"
+    return command
 
 
 def run(

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 import scipy
 
-from pendulum_bags.ranking.prediction import judge_prediction
 from pendulum_bags.ranking.ranking import mmrv
 from pendulum_msgs_py.errors import DataError
+from tests.benchmarks.prediction import judge_prediction
 
 
 def judged(predicted, measured, seed=0):

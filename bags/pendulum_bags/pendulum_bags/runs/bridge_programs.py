@@ -1,0 +1,36 @@
+"""Programs of the bridge, which these packages know by their command lines alone."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+
+__all__ = ["last_words", "run_bridge_program"]
+
+
+def run_bridge_program(
+    *arguments: str, timeout: float, deaf_to_ctrl_c: bool = False
+) -> subprocess.CompletedProcess[str]:
+    """Run ``python -m pendulum_hw_bridge`` and return its code and what it printed.
+
+    Args:
+        arguments: Of its command line.
+        timeout: When it is ended [s]; then subprocess.TimeoutExpired is raised.
+        deaf_to_ctrl_c: Whether Ctrl-C of this terminal shall not reach it.
+    """
+    return subprocess.run(
+        [sys.executable, "-m", "pendulum_hw_bridge", *arguments],
+        stdin=subprocess.DEVNULL,
+        capture_output=True,
+        encoding="utf-8",
+        errors="replace",
+        timeout=timeout,
+        check=False,
+        start_new_session=deaf_to_ctrl_c,
+    )
+
+
+def last_words(said: str, otherwise: str) -> str:
+    """Return the last line of what a program said, without its mark of an error."""
+    words = said.strip().splitlines()
+    return words[-1].removeprefix("error: ") if words else otherwise
