@@ -16,7 +16,13 @@ from pendulum_lqr.mechanism_velocity import DifferencedVelocity
 from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.plants.mechanism_parameters import MechanismParameters
 
-__all__ = ["default_catch", "make_mechanism_controller", "mechanism_controller_names", "stored_trajectory"]
+__all__ = [
+    "default_catch",
+    "make_mechanism_controller",
+    "mechanism_controller_names",
+    "stored_trajectory",
+    "tracked_swing_up",
+]
 
 _CALM = ((1.0, 1.0, 1.0, 1.0), 10.0)
 """Weights of catch and tracking behind a swing-up, for two joints: of gains as low as still catch from far."""
@@ -45,12 +51,17 @@ def default_catch(plant: MechanismParameters) -> MechanismCatch:
 
 def _followed(
     plant: MechanismParameters, period: float, catch: MechanismCatch, recover: MechanismController | None
-) -> MechanismController:
+) -> MechanismTvlqr:
     q, r = _CALM
     return MechanismTvlqr(plant, period, stored_trajectory(plant), catch, q=q, r=r, recover=recover, tube=_TUBE)
 
 
-def _tvlqr(plant: MechanismParameters, period: float) -> MechanismController:
+def tracked_swing_up(plant: MechanismParameters, period: float) -> MechanismTvlqr:
+    """Return the controller that follows the stored swing-up of a plant by time-varying LQR.
+
+    Raises:
+        ParameterError: There is none for this plant.
+    """
     return _followed(plant, period, make_mechanism_catch(plant, *_CALM), None)
 
 
@@ -65,7 +76,7 @@ def _tvlqr_mpc(plant: MechanismParameters, period: float) -> MechanismController
 
 
 _CONTROLLERS: dict[str, Callable[[MechanismParameters, float], MechanismController]] = {
-    "tvlqr": _tvlqr,
+    "tvlqr": tracked_swing_up,
     "mpc": _mpc,
     "tvlqr_mpc": _tvlqr_mpc,
 }

@@ -191,6 +191,27 @@ class SwingUp:
         first = self._measure(rows)
         self._samples[rows] = np.tile(first, (1, task.history))
 
+    @property
+    def states(self) -> Array:
+        """Deviations from upright and velocities, shape (N, 2n) [rad or m, rad/s or m/s]."""
+        return self.motion[:, : 2 * self._n].copy()
+
+    def start_at(self, rows: NDArray[np.intp], states: Array, efforts: Array) -> None:
+        """Let episodes that just began start elsewhere.
+
+        Args:
+            rows: Which.
+            states: Deviations from upright and velocities, shape (k, 2n).
+            efforts: That act already, and that the last answers asked for, shape (k, m).
+        """
+        n = self._n
+        self.motion[rows] = 0.0
+        self.motion[rows, : 2 * n] = states
+        for first in (2 * n, 3 * n, 4 * n):
+            self.motion[np.ix_(rows, first + np.array(self._driven))] = efforts
+        self.effort[rows] = efforts
+        self._samples[rows] = np.tile(self._measure(rows), (1, self.task.history))
+
     def _hold(self, rows: NDArray[np.intp], held: Callable[[Array, Array, NDArray[np.bool_]], Array]) -> None:
         """Let some start at rest where their effort, of the one joint, holds them."""
         draw, n = self._generator, self._n

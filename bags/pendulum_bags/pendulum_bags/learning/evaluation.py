@@ -54,11 +54,21 @@ class Trial:
     travel: float = math.inf
 
 
-def trials_of(policy: Policy, task: SwingUpTask, count: int, seed: int, duration: float = 10.0) -> list[Trial]:
+def trials_of(
+    policy: Policy, task: SwingUpTask, count: int, seed: int, duration: float = 10.0, *, hanging: bool = False
+) -> list[Trial]:
     """Return trials with start, plant, delay and kicks all drawn anew, each from the ranges of training.
 
     Kicks last 50 ms and come each second, with up to the trained share of the effort limit, or of the largest torque of
     gravity at a joint without a motor.
+
+    Args:
+        policy: The policy.
+        task: What differed in its training.
+        count: How many.
+        seed: Of what is drawn.
+        duration: Of each [s].
+        hanging: They start hanging at rest and nobody kicks: of a policy that knows one way up and no other.
     """
     rng = np.random.default_rng(seed)
     found = []
@@ -78,6 +88,9 @@ def trials_of(policy: Policy, task: SwingUpTask, count: int, seed: int, duration
             for joint, far in zip(joints, furthest, strict=True)
         )
         velocity = tuple(float(rng.uniform(-speed, speed)) for speed in fastest)
+        if hanging:
+            position = velocity = (0.0,) * len(joints)
+            kicks = np.zeros_like(kicks)
         found.append(Trial(plant, position, velocity, kicks, task.travel))
     return found
 

@@ -10,7 +10,7 @@ massively parallel deep reinforcement learning, 2022 (adaptive rate).
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import Any, NamedTuple, Protocol
@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from pendulum_bags.learning.network import Adam, Mlp
 from pendulum_msgs_py.errors import FaultError
 
-__all__ = ["BatchEnvironment", "Ppo", "PpoSettings"]
+__all__ = ["BatchEnvironment", "Ppo", "PpoSettings", "finite_or_diverged"]
 
 Floats = NDArray[np.float32]
 
@@ -125,9 +125,7 @@ class Ppo:
         """
         data, reward = self._gather()
         measured = self._improve(data, remaining)
-        parameters = (*self.actor.parameters, *self.critic.parameters, self.log_spread)
-        if not all(np.isfinite(each).all() for each in parameters):
-            raise FaultError("training diverged: a weight is no longer finite; expected another seed")
+        finite_or_diverged((*self.actor.parameters, *self.critic.parameters, self.log_spread))
         return {"reward": reward, **measured}
 
     def _gather(self) -> tuple[tuple[Floats, ...], float]:
@@ -232,6 +230,16 @@ class Ppo:
                 each[...] = kept[f"{name}_{k}"]
         for name, adam in (("adam_actor_", self._adam_actor), ("adam_critic_", self._adam_critic)):
             adam.restore({key.removeprefix(name): each for key, each in kept.items() if key.startswith(name)})
+
+
+def finite_or_diverged(parameters: Iterable[Floats]) -> None:
+    """Refuse parameters that are no longer finite.
+
+    Raises:
+        FaultError: One is not.
+    """
+    if not all(np.isfinite(each).all() for each in parameters):
+        raise FaultError("training diverged: a weight is no longer finite; expected another seed")
 
 
 def _log_chance(actions: Floats, means: Floats, log_spread: Floats) -> Floats:

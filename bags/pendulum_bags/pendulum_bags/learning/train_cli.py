@@ -24,9 +24,18 @@ if TYPE_CHECKING:
 __all__ = ["main"]
 
 _OF_SWING_UP = (
-    "plant", "share", "delay", "jitter", "angle_noise", "velocity_noise", "kick", "period", "history", "travel"
+    "plant", "teacher", "share", "delay", "jitter", "angle_noise", "velocity_noise", "kick", "period", "history",
+    "travel",
 )  # fmt: skip
 """Options that Gymnasium's pendulum has no use for."""
+
+_TAUGHT = {
+    "period": 0.004, "share": 0.05, "delay": 0.0016, "jitter": 0.0004, "angle_noise": 2e-4, "velocity_noise": 0.005,
+    "kick": 0.05,
+}  # fmt: skip
+_TAUGHT_OFFSET = 1e-3
+"""What differs where a teacher is imitated, unless it is given: a swing-up's gains are high, and where little is known
+of plant and state there is no one answer to learn."""
 
 app = typer.Typer(add_completion=False, rich_markup_mode=None)
 
@@ -41,6 +50,7 @@ def train(
     task: Annotated[
         str, typer.Option(help="swing_up: swing up and hold upright; pendulum_v1: Gymnasium's Pendulum-v1.")
     ] = "swing_up",
+    teacher: Annotated[str, typer.Option(help="none, or tvlqr: imitate the stored swing-up of the plant.")] = "none",
     seed: Annotated[int, typer.Option(help="Seed; one seed is one file.", min=0)] = 1,
     updates: Annotated[int, typer.Option(help="Updates of the policy; 0 for as many as the task takes.", min=0)] = 0,
     share: Annotated[float, typer.Option(help="Half width of the range of each parameter, as a share.")] = 0.25,
@@ -59,7 +69,12 @@ def train(
 
     An interrupted training goes on with the same command; its checkpoint lies beside the policy file.
 
+    With --teacher tvlqr the defaults are others: period 0.004, delay 0.0016, jitter 0.0004, share 0.05, kick 0.05,
+    angle noise 0.0002, velocity noise 0.005. Its policy knows the way up from hanging, and no other.
+
     Example: python -m pendulum_bags train --plant dfki --out build/dfki.npz
+
+    Example: python -m pendulum_bags train --plant pendubot_frictionless --teacher tvlqr --out build/pendubot.npz
     """
     from pendulum_bags.learning.task import SwingUpTask
     from pendulum_bags.learning.training import checkpoint_path
@@ -74,11 +89,16 @@ def train(
             f"{', '.join(ignored)} is given, but the task pendulum_v1 is Gymnasium's own pendulum; "
             "expected no such option, or --task swing_up"
         )
-    swing_up = SwingUpTask(
-        period=period, share=share, delay=delay, jitter=jitter, angle_noise=angle_noise,
-        velocity_noise=velocity_noise, kick=kick, history=history, travel=travel,
-    )  # fmt: skip
-    settings = _settings(task, plant, seed, updates, swing_up, hidden)
+    values = {
+        "period": period, "share": share, "delay": delay, "jitter": jitter, "angle_noise": angle_noise,
+        "velocity_noise": velocity_noise, "kick": kick,
+    }  # fmt: skip
+    offset = SwingUpTask.offset
+    if teacher != "none":
+        values |= {name: value for name, value in _TAUGHT.items() if not typed_options(context, (name,))}
+        offset = _TAUGHT_OFFSET
+    swing_up = SwingUpTask(history=history, travel=travel, offset=offset, **values)
+    settings = _settings(task, plant, seed, updates, swing_up, hidden, teacher)
     console = make_console(stderr=json_output, highlight=False)
     began = time.monotonic()
     try:
@@ -108,7 +128,9 @@ def train(
     console.print(f"policy  {out}\ncurves  {figure}\n({time.monotonic() - began:.0f} s)", soft_wrap=True)
 
 
-def _settings(task: str, plant: str, seed: int, updates: int, swing_up: Any, hidden: tuple[int, int]) -> Training:
+def _settings(
+    task: str, plant: str, seed: int, updates: int, swing_up: Any, hidden: tuple[int, int], teacher: str = "none"
+) -> Training:
     from pendulum_bags.learning.ppo import PpoSettings
     from pendulum_bags.learning.training import Training
     from pendulum_msgs_py.plants.mechanism_parameters import load_mechanism_file
@@ -123,9 +145,11 @@ def _settings(task: str, plant: str, seed: int, updates: int, swing_up: Any, hid
         parameters, provenance = load_mechanism_file(plant) if several else load_plant_file(plant)
         settings = Training(
             task=task, plant=parameters, intervals=provenance["intervals"], swing_up=swing_up,
-            ppo=PpoSettings(hidden=hidden), seed=seed,
+            ppo=PpoSettings(hidden=hidden), seed=seed, teacher=teacher,
         )  # fmt: skip
-        if several:
+        if teacher != "none":
+            settings = replace(settings, updates=300)
+        elif several:
             # There is more to learn: more steps, actions that go on to vary, and a swing-up is longer than the 2 s that
             # the discount of one joint looks ahead.
             settings = replace(settings, ppo=replace(settings.ppo, least_spread=0.1, discount=0.998), updates=1500)
@@ -139,7 +163,8 @@ def _sentence(measured: Mapping[str, Any]) -> str:
             f"{measured['episodes']} episodes"
         )
     time_up = measured["median_time"]
-    told = f"{measured['up']} of {measured['trials']} trials end upright"
+    start = " from hanging at rest" if measured.get("start") == "hanging" else ""
+    told = f"{measured['up']} of {measured['trials']} trials{start} end upright"
     told += f", after {time_up:.2f} s in the median" if time_up is not None else ""
     gave_up = measured["gave_up"]
     return f"{told}; {gave_up} left the states that training visited" if gave_up else told

@@ -18,9 +18,11 @@ from numpy.typing import NDArray
 from pendulum_bags.learning.body import travel_of, velocity_scales
 from pendulum_bags.learning.environment import SwingUp
 from pendulum_bags.learning.evaluation import gymnasium_return, measured_success, trials_of
+from pendulum_bags.learning.imitation import Imitation
 from pendulum_bags.learning.pendulum_v1 import PLANT, STEP, PendulumV1
 from pendulum_bags.learning.ppo import Ppo, PpoSettings
 from pendulum_bags.learning.task import SwingUpTask, ranges_of
+from pendulum_bags.learning.teacher import Teacher
 from pendulum_bags.runs.run_folder import provenance
 from pendulum_lqr.policy import Network, Policy, coordinates_of, default_signals
 from pendulum_lqr.policy_file import write_policy
@@ -29,9 +31,11 @@ from pendulum_msgs_py.plants.mechanism_parameters import MechanismParameters
 from pendulum_msgs_py.plants.plant_differences import AnyPlant, describe_plants
 from pendulum_msgs_py.whole_file import write_whole
 
-__all__ = ["EPISODES", "TASKS", "TRIALS", "Training", "checkpoint_path", "train"]
+__all__ = ["EPISODES", "TASKS", "TEACHERS", "TRIALS", "Training", "checkpoint_path", "train"]
 
 TASKS = ("swing_up", "pendulum_v1")
+TEACHERS = ("none", "tvlqr")
+"""Whom a policy imitates: nobody, so that it learns from its reward, or the stored swing-up of its plant."""
 _CHECKPOINT_EVERY = 10
 _LARGEST_CHECKPOINT = 500_000_000
 TRIALS, EPISODES = 60, 100
@@ -54,6 +58,7 @@ class Training:
         environments: Pendulums at once.
         updates: Updates of the policy.
         seed: Seed of everything.
+        teacher: One of ``TEACHERS``.
     """
 
     task: str = "swing_up"
@@ -64,11 +69,19 @@ class Training:
     environments: int = 512
     updates: int = 240
     seed: int = 1
+    teacher: str = "none"
 
     def __post_init__(self) -> None:
         """Refuse what cannot be trained."""
         if self.task not in TASKS:
             raise ParameterError(f"task is {self.task!r}; expected one of {', '.join(TASKS)}")
+        if self.teacher not in TEACHERS:
+            raise ParameterError(f"teacher is {self.teacher!r}; expected one of {', '.join(TEACHERS)}")
+        if self.teacher != "none" and not isinstance(self.plant, MechanismParameters):
+            raise ParameterError(
+                f"teacher is {self.teacher!r}, and plant {self.plant.name!r} has one joint; expected one of several "
+                "joints with a stored swing-up, or none"
+            )
         for name in ("environments", "updates"):
             if getattr(self, name) < 1:
                 raise ParameterError(f"{name} is {getattr(self, name)}; expected >= 1")
@@ -94,6 +107,7 @@ class Training:
             "task": self.task, "plant": json.loads(describe_plants([self.plant]))[0], "ranges": self.ranges,
             "swing_up": swing_up, "ppo": asdict(self.ppo), "environments": self.environments,
             "updates": self.updates, "seed": self.seed,
+            **({} if self.teacher == "none" else {"teacher": self.teacher}),
         }  # fmt: skip
 
 
@@ -133,7 +147,7 @@ def train(
     with threadpoolctl.threadpool_limits(1):
         generator = np.random.default_rng(settings.seed)
         environment = _environment(settings, generator)
-        learner = Ppo(environment, settings.ppo, generator)
+        learner = _learner(settings, environment, generator)
         curves: list[list[float]] = []
         checkpoint = checkpoint_path(out)
         fastest = np.zeros(len(coordinates_of(settings.plant).joints))
@@ -168,14 +182,25 @@ def _environment(settings: Training, generator: np.random.Generator) -> SwingUp 
     return SwingUp(settings.environments, settings.plant, settings.ranges, settings.swing_up, generator)
 
 
+def _learner(settings: Training, environment: SwingUp | PendulumV1, generator: np.random.Generator) -> Ppo | Imitation:
+    plant = settings.plant
+    if settings.teacher == "none" or not (isinstance(environment, SwingUp) and isinstance(plant, MechanismParameters)):
+        return Ppo(environment, settings.ppo, generator)
+    return Imitation(environment, settings.ppo, generator, Teacher(plant, settings.swing_up.period))
+
+
 def _evaluate(settings: Training, policy: Policy, on_trial: Callable[[int, int], None] | None) -> dict[str, Any]:
     if settings.task == "pendulum_v1":
         mean, spread = gymnasium_return(policy, EPISODES, _EVALUATION_SEED)
         return {"episodes": EPISODES, "return_mean": mean, "return_std": spread}
-    return measured_success(policy, trials_of(policy, settings.swing_up, TRIALS, _EVALUATION_SEED), on_trial)
+    hanging = settings.teacher != "none"
+    trials = trials_of(policy, settings.swing_up, TRIALS, _EVALUATION_SEED, hanging=hanging)
+    return {**measured_success(policy, trials, on_trial), **({"start": "hanging"} if hanging else {})}
 
 
-def _policy(settings: Training, learner: Ppo, fastest: NDArray[np.float64], evaluation: Mapping[str, Any]) -> Policy:
+def _policy(
+    settings: Training, learner: Ppo | Imitation, fastest: NDArray[np.float64], evaluation: Mapping[str, Any]
+) -> Policy:
     parameters = learner.actor.parameters
     network = Network(
         tuple(np.ascontiguousarray(each.T) for each in parameters[::2]), tuple(each.copy() for each in parameters[1::2])
@@ -207,7 +232,7 @@ def _policy(settings: Training, learner: Ppo, fastest: NDArray[np.float64], eval
 def _keep(
     path: Path,
     settings: Training,
-    learner: Ppo,
+    learner: Ppo | Imitation,
     generator: np.random.Generator,
     curves: list[list[float]],
     fastest: NDArray[np.float64],
@@ -225,7 +250,9 @@ def _keep(
         raise DataError(f"checkpoint {path} cannot be written: {error.strerror}; {left}") from error
 
 
-def _check_arrays(path: Path, kept: Mapping[str, NDArray[Any]], learner: Ppo, joints: int, updates: int) -> None:
+def _check_arrays(
+    path: Path, kept: Mapping[str, NDArray[Any]], learner: Ppo | Imitation, joints: int, updates: int
+) -> None:
     """Refuse arrays that are not those of the settings; numpy would stretch, cast or keep them in silence."""
     expected = {f"learner/{name}": np.asarray(each) for name, each in learner.state().items()}
     expected |= {f"environment/{name}": each for name, each in learner.environment.state().items()}
@@ -252,7 +279,7 @@ def _check_arrays(path: Path, kept: Mapping[str, NDArray[Any]], learner: Ppo, jo
 
 
 def _restore(
-    path: Path, settings: Training, learner: Ppo, generator: np.random.Generator
+    path: Path, settings: Training, learner: Ppo | Imitation, generator: np.random.Generator
 ) -> tuple[list[list[float]], NDArray[np.float64]]:
     """Go on from a checkpoint; return the curves so far and the fastest motion of each joint [rad/s or m/s]."""
     try:
