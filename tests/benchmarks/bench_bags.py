@@ -374,7 +374,11 @@ def _truncation(folder: Path) -> Iterator[Row]:
             file.write_bytes(sound[:size])
             expected = max((count for end, count in chunks if end <= size), default=0)
             report = repair_bag(bag, folder / "mended")
-            good += sum(report.messages.values()) == expected and not read_bag(folder / "mended").damage
+            mended = read_bag(folder / "mended")
+            # Of the chunk that was cut, too, what is whole comes back: the first messages, none missing.
+            states = mended["/a"]["position"] if "/a" in mended.topics else []
+            whole = list(states) == list(range(len(states))) and len(states) == sum(report.messages.values())
+            good += len(states) >= expected and whole and not mended.damage
             shutil.rmtree(folder / "mended")
         yield measured(
             f"files of {name} cut at {TRUNCATIONS} random lengths, all whole chunks back",

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import sqlite3
 import struct
+from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
 import yaml
@@ -177,6 +179,58 @@ def test_wrong_use_is_refused_in_a_sentence(tmp_path: Path) -> None:
     writer.close()
     with pytest.raises(BagError, match="is closed"):
         writer.write("/x", 0, state(0))
+
+
+@pytest.mark.parametrize("storage", ["mcap", "sqlite3"])
+def test_many_messages_at_once_are_those_written_one_by_one_across_files_and_chunks(
+    tmp_path: Path, storage: str
+) -> None:
+    # Times go back and forth, and most chunks and files end in the middle of what is written at once.
+    items = [("/ab"[:1] + "ab"[i % 3 == 0], 10**9 + (i * 37) % 500, state(i)) for i in range(500)]
+    for name in ("one_by_one", "at_once"):
+        with open_writer(tmp_path / name, storage, chunk_size=3000, max_size=30_000, file_stem="bag") as writer:
+            writer.add_topic("/a", JOINT_STATE)
+            writer.add_topic("/b", JOINT_STATE)
+            if name == "at_once":
+                writer.write_many(iter(items))
+            else:
+                for item in items:
+                    writer.write(*item)
+            assert writer.written == {"/a": 333, "/b": 167}
+    first, second = (sorted((tmp_path / name).iterdir()) for name in ("one_by_one", "at_once"))
+    assert len(first) > 3
+    assert [path.read_bytes() for path in first] == [path.read_bytes() for path in second]
+    told = yaml.safe_load((tmp_path / "at_once" / "metadata.yaml").read_text())["rosbag2_bagfile_information"]
+    assert told["starting_time"]["nanoseconds_since_epoch"] == 10**9
+    assert told["duration"]["nanoseconds"] == 499
+    read = read_bag(tmp_path / "at_once")
+    assert (len(read["/a"]), len(read["/b"])) == (333, 167)
+
+
+@pytest.mark.parametrize("storage", ["mcap", "sqlite3"])
+@pytest.mark.parametrize("problem", ["unknown topic", "no bytes", "no time", "broken source"])
+def test_what_comes_before_a_message_that_cannot_be_written_is_kept(tmp_path: Path, storage: str, problem: str) -> None:
+    def source() -> Iterator[tuple[str, int, bytes]]:
+        for i in range(7):
+            yield "/a", i, state(i)
+        bad: dict[str, Any] = {
+            "unknown topic": ("/x", 7, state(7)),
+            "no bytes": ("/a", 7, None),
+            "no time": ("/a", "noon", state(7)),
+        }
+        if problem not in bad:
+            raise KeyError("/a")
+        yield bad[problem]
+
+    with open_writer(tmp_path / "bag", storage) as writer:
+        writer.add_topic("/a", JOINT_STATE)
+        expected = {"unknown topic": BagError, "broken source": KeyError}.get(problem, Exception)
+        with pytest.raises(expected):
+            writer.write_many(source())
+        writer.write("/a", 8, state(8))
+        assert writer.written == {"/a": 8}
+    assert set(count_everywhere(tmp_path / "bag")) == {8}
+    assert list(read_bag(tmp_path / "bag")["/a"]["position"]) == [0.1 * i for i in (*range(7), 8)]
 
 
 def test_a_type_that_nobody_knows_is_kept_as_bytes(tmp_path: Path) -> None:

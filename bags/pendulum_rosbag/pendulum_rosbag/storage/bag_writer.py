@@ -29,6 +29,17 @@ STORAGES = ("mcap", "sqlite3")
 _COMPRESSIONS = (None, "zstd")
 
 
+class _Channels(dict[str, int]):
+    """Topic -> channel of a bag; one that was not added is refused."""
+
+    def __init__(self, bag: Path) -> None:
+        super().__init__()
+        self._bag = bag
+
+    def __missing__(self, topic: str) -> int:
+        raise BagError(f"topic {topic} was not added to bag {self._bag} before its first message")
+
+
 class BagWriter:
     """One rosbag2 folder that is being written; made by :func:`open_writer`.
 
@@ -59,7 +70,7 @@ class BagWriter:
         self._max_duration_ns = max_duration_ns
         self._custom = encode_custom_data(metadata)
         self._topics: dict[str, TopicEntry] = {}
-        self._ids: dict[str, int] = {}
+        self._ids = _Channels(path)
         self._written: dict[str, int] = {}
         self._files: list[FileEntry] = []
         self._lock = threading.RLock()
@@ -158,32 +169,15 @@ class BagWriter:
             BagError: The topic was not added, or the writer is closed.
             OSError: The disk is full or fails; what was sealed remains readable.
         """
-        with self._lock:
-            try:
-                channel = self._ids[topic]
-            except KeyError:
-                raise self._unknown(topic) from None
-            self._require_open()
-            self._file.write(channel, log_time_ns, data)
-            self._written[topic] += 1
-            if self._file.pending_size >= self._chunk_size:
-                self.seal()
+        self.write_many([(topic, log_time_ns, data)])
 
     def write_many(self, items: Iterable[tuple[str, int, bytes]]) -> None:
-        """Add many messages ``(topic, log_time_ns, data)`` under one lock."""
+        """Add many messages ``(topic, log_time_ns, data)`` under one lock; raises as :meth:`write`."""
+        messages = iter(items)
         with self._lock:
             self._require_open()
-            file, ids, written = self._file, self._ids, self._written
-            for topic, log_time_ns, data in items:
-                try:
-                    channel = ids[topic]
-                except KeyError:
-                    raise self._unknown(topic) from None
-                file.write(channel, log_time_ns, data)
-                written[topic] += 1
-                if file.pending_size >= self._chunk_size:
-                    self.seal()
-                    file = self._file  # a seal may begin the next file
+            while self._file.write_many(messages, self._ids, self._written, self._chunk_size):
+                self.seal()  # which may begin the next file
 
     def keep(self, record: Attachment | Metadata) -> None:
         """Put an attachment, or metadata of somebody else, into the storage file that is open now (MCAP only).
@@ -282,9 +276,6 @@ class BagWriter:
     def _require_open(self) -> None:
         if not self._open:
             raise BagError(f"bag {self.path} is closed; nothing can be written to it any more")
-
-    def _unknown(self, topic: str) -> BagError:
-        return BagError(f"topic {topic} was not added to bag {self.path} before its first message")
 
     def _open_file(self) -> StorageFile:
         name = f"{self._file_stem}_{len(self._files)}"

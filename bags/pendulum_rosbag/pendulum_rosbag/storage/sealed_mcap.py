@@ -6,6 +6,7 @@ How the bytes are laid out for that is told in :mod:`~pendulum_rosbag.storage.mc
 from __future__ import annotations
 
 import struct
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 
 import numpy as np
@@ -107,22 +108,47 @@ class SealedMcapFile:
         self._pending_size += len(schema) + len(channel)
         self._stale = True
 
-    def write(self, channel_id: int, log_time_ns: int, data: bytes) -> None:
-        """Add one message to the chunk that is being filled."""
-        index = self._pending_index.get(channel_id)
-        if index is None:
-            index = self._pending_index[channel_id] = []
-        index += (log_time_ns, self._pending_size)
-        sequence = self._sequences[channel_id] = self._sequences[channel_id] + 1
-        size = len(data)
-        self._pending += (
-            rec.MESSAGE_HEADER.pack(rec.MESSAGE, size + 22, channel_id, sequence, log_time_ns, log_time_ns),
-            data,
-        )
-        self._pending_size += size + 31
-        start, stop = self._pending_span
-        if log_time_ns < start or log_time_ns > stop:
-            self._pending_span = (min(start, log_time_ns), max(stop, log_time_ns))
+    def write_many(
+        self, messages: Iterator[tuple[str, int, bytes]], channels: Mapping[str, int], counts: dict[str, int], most: int
+    ) -> bool:
+        """Add messages to the chunk that is being filled, until there are no more or it is full.
+
+        A loop without calls, since the time of a message is that of Python's steps.
+
+        Args:
+            messages: Topic, log time [ns] and serialised message of each; what does not fit in any more stays there.
+            channels: Topic -> channel.
+            counts: Topic -> messages, one more for each that is taken.
+            most: Size from which the chunk is full [bytes].
+
+        Returns:
+            Whether it is full, and there may be more messages.
+
+        Raises:
+            BagError: A topic has no channel; what came before is taken.
+        """
+        pending, index, sequences = self._pending, self._pending_index, self._sequences
+        pack, size, (start, stop) = rec.MESSAGE_HEADER.pack, self._pending_size, self._pending_span
+        try:
+            for topic, log_time_ns, data in messages:
+                channel, length = channels[topic], len(data)
+                sequence = sequences[channel] + 1
+                pending += (pack(rec.MESSAGE, length + 22, channel, sequence, log_time_ns, log_time_ns), data)
+                sequences[channel] = sequence
+                if channel not in index:
+                    index[channel] = []
+                index[channel] += (log_time_ns, size)
+                size += length + 31
+                if log_time_ns < start:  # noqa: PLR1730  # to call min takes longer
+                    start = log_time_ns
+                if log_time_ns > stop:  # noqa: PLR1730
+                    stop = log_time_ns
+                counts[topic] += 1
+                if size >= most:
+                    return True
+            return False
+        finally:
+            self._pending_size, self._pending_span = size, (start, stop)
 
     def keep(self, record: Attachment | Metadata) -> None:
         """Put an attachment or a metadata record behind the messages when the file is closed."""

@@ -17,6 +17,7 @@ import os
 import shutil
 import sqlite3
 import struct
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 
 from pendulum_msgs_py.errors import BagError
@@ -103,23 +104,51 @@ class SealedSqliteFile:
             self._tables["message_definitions"].append(len(self._definitions), record(row))
         self._stale = True
 
-    def write(self, channel_id: int, log_time_ns: int, data: bytes) -> None:
-        """Add one message."""
-        size = len(data)
-        head = self._heads.get((channel_id, size))
-        if head is None:
-            # Columns: id (NULL, it is the row id), topic_id (32 bit), timestamp (64 bit), data (blob).
-            types = b"\x00\x04\x06" + varint(2 * size + 12)
-            head = bytes((len(types) + 1,)) + types + struct.pack(">i", channel_id)
-            if len(self._heads) < 4096:
-                self._heads[channel_id, size] = head
-        self._pending += 1
-        row_id = self.count + self._pending
-        self._tables["messages"].append(row_id, head + log_time_ns.to_bytes(8, "big", signed=True) + data)
-        self._pending_size += size
-        start, stop = self._pending_span
-        if log_time_ns < start or log_time_ns > stop:
-            self._pending_span = (min(start, log_time_ns), max(stop, log_time_ns))
+    def write_many(
+        self, messages: Iterator[tuple[str, int, bytes]], channels: Mapping[str, int], counts: dict[str, int], most: int
+    ) -> bool:
+        """Add messages until there are no more or enough wait to be sealed.
+
+        Args:
+            messages: Topic, log time [ns] and serialised message of each; what is not taken stays there.
+            channels: Topic -> its id.
+            counts: Topic -> messages, one more for each that is taken.
+            most: Size of what waits from which it is enough [bytes].
+
+        Returns:
+            Whether it is enough, and there may be more messages.
+
+        Raises:
+            BagError: A topic has no id; what came before is taken.
+        """
+        heads, append = self._heads, self._tables["messages"].append
+        waiting, (start, stop) = self._pending_size, self._pending_span
+        try:
+            for topic, log_time_ns, data in messages:
+                key = channels[topic], len(data)
+                stamp = log_time_ns.to_bytes(8, "big", signed=True)
+                append(self.count + self._pending + 1, (heads.get(key) or self._head(*key)) + stamp + data)
+                self._pending += 1
+                waiting += key[1]
+                if log_time_ns < start:  # noqa: PLR1730  # to call min takes longer
+                    start = log_time_ns
+                if log_time_ns > stop:  # noqa: PLR1730
+                    stop = log_time_ns
+                counts[topic] += 1
+                if waiting >= most:
+                    return True
+            return False
+        finally:
+            self._pending_size, self._pending_span = waiting, (start, stop)
+
+    def _head(self, channel_id: int, size: int) -> bytes:
+        """Return what is before the time in the row of a message of this size."""
+        # Columns: id (NULL, it is the row id), topic_id (32 bit), timestamp (64 bit), data (blob).
+        types = b"\x00\x04\x06" + varint(2 * size + 12)
+        head = bytes((len(types) + 1,)) + types + struct.pack(">i", channel_id)
+        if len(self._heads) < 4096:
+            self._heads[channel_id, size] = head
+        return head
 
     def seal(self) -> None:
         """Make everything that was written visible to readers of the file.

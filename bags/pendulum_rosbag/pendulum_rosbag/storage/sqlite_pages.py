@@ -22,6 +22,10 @@ def varint(value: int) -> bytes:
     """Return a big-endian variable-length integer as SQLite writes it (0 <= value < 2**56)."""
     if value < 0x80:
         return bytes((value,))
+    if value < 0x4000:
+        return bytes((value >> 7 | 0x80, value & 0x7F))
+    if value < 0x20_0000:
+        return bytes((value >> 14 | 0x80, value >> 7 & 0x7F | 0x80, value & 0x7F))
     groups = [value & 0x7F]
     value >>= 7
     while value:
