@@ -205,6 +205,10 @@ def test_many_messages_at_once_are_those_written_one_by_one_across_files_and_chu
     assert told["duration"]["nanoseconds"] == 499
     read = read_bag(tmp_path / "at_once")
     assert (len(read["/a"]), len(read["/b"])) == (333, 167)
+    for path in (tmp_path / "at_once").glob("*.mcap"):
+        with path.open("rb") as stream:
+            found = [m.sequence for _, _, m in make_reader(stream).iter_messages(["/a"], log_time_order=False)]
+        assert found == list(range(1, len(found) + 1))
 
 
 @pytest.mark.parametrize("storage", ["mcap", "sqlite3"])
