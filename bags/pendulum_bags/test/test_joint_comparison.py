@@ -140,6 +140,8 @@ def test_the_same_plant_twice_is_told_alike_in_every_joint(
     assert not [name for name in tests["pole"] if "torque" in name or "force" in name]
     # Noise on the cart moves the pole too: both joints are paired by it.
     assert all("position" in one["paired"] for one in content["joints"].values())
+    plants = {layer["sentence"].partition("--plant ")[2].split()[0] for layer in content["answer"]["layers"][1:]}
+    assert plants == {"cart_pole"}
 
 
 def test_another_plant_is_told_by_the_joint_that_shows_it(

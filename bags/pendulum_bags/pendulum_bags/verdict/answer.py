@@ -8,18 +8,17 @@ from pathlib import Path
 from pendulum_bags.comparison import Comparison
 from pendulum_bags.verdict.joints import join_joints
 from pendulum_bags.verdict.layers import Answer, Layer, LayerResult, Mark, read_layers, sum_up
-from pendulum_bags.verdict.same_run import same_run_layer
+from pendulum_bags.verdict.same_run import design_plant, same_run_layer
 
 __all__ = ["answer_of", "answer_of_joints"]
 
 
-_OF_ONE_MOTOR = "Not asked: python -m pendulum_bags experiment joints measures it where one joint is driven."
-_NOT_ASKED = {
-    Layer.SAME_PLANT: _OF_ONE_MOTOR,
-    Layer.WHICH_CONTROLLERS: _OF_ONE_MOTOR,
-    Layer.SAME_CHOICE: "Not asked: python -m pendulum_bags experiment joints --rank-seeds 3 measures it.",
+_HOW = {
+    Layer.SAME_PLANT: "{} measures it where one joint is driven.",
+    Layer.WHICH_CONTROLLERS: "{} measures it where one joint is driven.",
+    Layer.SAME_CHOICE: "{} --rank-seeds 3 measures it.",
 }
-"""What a layer says of a plant of several joints for which nobody measured it."""
+"""How a layer is measured that nobody measured, of a plant of several joints."""
 
 
 def answer_of(
@@ -58,5 +57,10 @@ def answer_of_joints(comparisons: Mapping[str, Comparison], folders: Sequence[Pa
     joined = join_joints({joint: same_run_layer(one) for joint, one in comparisons.items()})
     kept = [one for folder in folders for one in read_layers(folder) if one.layer is not Layer.SAME_RUN]
     asked = {one.layer for one in (joined, *kept)}
-    others = [LayerResult(layer, Mark.NOT_MEASURED, _NOT_ASKED[layer]) for layer in Layer if layer not in asked]
+    command = f"python -m pendulum_bags experiment joints --plant {design_plant(next(iter(comparisons.values())))}"
+    others = [
+        LayerResult(layer, Mark.NOT_MEASURED, f"Not asked: {_HOW[layer].format(command)}")
+        for layer in Layer
+        if layer not in asked
+    ]
     return sum_up([joined, *kept, *others], emulated=all(one.is_emulated for one in comparisons.values()))

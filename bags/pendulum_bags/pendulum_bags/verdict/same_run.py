@@ -9,7 +9,7 @@ from pendulum_bags.comparison import Comparison, EquivalenceTest, Outcome
 from pendulum_bags.runs.run_record import run_record
 from pendulum_bags.verdict.layers import Evidence, Layer, LayerResult, Mark
 
-__all__ = ["in_words", "same_run_layer"]
+__all__ = ["design_plant", "in_words", "same_run_layer"]
 
 _MARKS = {Outcome.EQUIVALENT: Mark.YES, Outcome.DIFFERENT: Mark.NO, Outcome.UNDECIDED: Mark.UNDECIDED}
 _MOST_REASONS = 3
@@ -98,6 +98,11 @@ def _beyond(test: EquivalenceTest) -> float:
     return abs(value) / test.high
 
 
+def design_plant(comparison: Comparison) -> str:
+    """Return the plant that the controller of a run was designed for, as commands name it; MECHANISM if unknown."""
+    return str(run_record(comparison.pairs[0].simulation.metadata).get("design_plant", "MECHANISM"))
+
+
 def _each_once(failed: Sequence[EquivalenceTest]) -> list[EquivalenceTest]:
     """Leave out distances that a delay or a spread, which is told too, explains."""
     plain = [test for test in failed if not test.quantity.startswith("distance")]
@@ -114,8 +119,7 @@ def _remedies(comparison: Comparison, failed: Sequence[EquivalenceTest]) -> tupl
     if any(name.startswith("spread") or "less the delay" in name for name in shapes):
         identify = f"python -m pendulum_bags identify {source} --out plant.yaml"
         if comparison.pairs[0].hardware.joint:
-            plant = run_record(comparison.pairs[0].simulation.metadata).get("design_plant", "MECHANISM")
-            identify = f"{identify} --plant {plant}"
+            identify = f"{identify} --plant {design_plant(comparison)}"
         steps.append(
             f"Identify the plant from what the hardware did ({identify}), then "
             + (f"carry its values over to {foreign}." if foreign else "simulate and design with --plant plant.yaml.")
