@@ -47,19 +47,19 @@ def run_experiment(
 def test_lockstep_runs_of_the_emulated_hardware_with_one_seed_are_identical(
     domain_id: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    for name, seed in (("first", 5), ("other", 6)):
-        run_experiment("lockstep", "--side", "hw", "--bag", tmp_path / name, "--seed", seed, "--duration", "1")
+    run_experiment("lockstep", "--side", "hw", "--bag", tmp_path / "first", "--seed", 5, "--duration", "1")
     # A bridge offers its services before its emulator is compiled, half a minute on a busy machine the first time, and
     # is waited for as long as any start. Here a call that does not say how long it waits waits for nothing.
     monkeypatch.setattr(Conductor.call, "__defaults__", (0.0,))
-    spec = lockstep.lockstep_spec(RegulationSettings(noise=NoiseSettings(seed=5, duration=1.0)), side="hw")
     hosts_after = []
     # In one domain: what is left of the first run would be counted among those who hear the second.
     with HostPool() as hosts:
-        for name in ("second", "in_the_same_processes"):
+        for name, seed in (("second", 5), ("other", 6), ("in_the_same_processes", 5)):
+            settings = RegulationSettings(noise=NoiseSettings(seed=seed, duration=1.0))
+            spec = lockstep.lockstep_spec(settings, side="hw")
             lockstep.record_run(tmp_path / name, spec, domain=domain_id, hosts=hosts)
             hosts_after.append({child.pid for child in psutil.Process().children()})
-    assert hosts_after[0] == hosts_after[1]
+    assert hosts_after[0] == hosts_after[1] == hosts_after[2]
     assert len(hosts_after[0]) == 4
     names = ("first", "second", "in_the_same_processes", "other")
     first, second, third, other = (read_bag(tmp_path / name) for name in names)
