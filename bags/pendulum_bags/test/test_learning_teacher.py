@@ -66,9 +66,9 @@ def test_on_its_way_a_teacher_answers_with_the_swing_up_s_efforts_however_often_
         np.testing.assert_allclose(found.efforts, np.clip(teacher.efforts, -6.0, 6.0), atol=1e-6)
         np.testing.assert_allclose(found.cost, 0.0, atol=1e-9)
     np.testing.assert_array_equal(teacher.answer(np.zeros((1, 4))).efforts, 0.0)
-    far = teacher.answer(np.array([[0.3, -0.2, 4.0, 9.0]]))
-    assert far.cost[0] > 1.0
-    assert abs(far.efforts[0, 0]) <= 6.0
+    far = teacher.answer(np.random.default_rng(0).normal(0.0, 5.0, (200, 4)))
+    assert np.median(far.cost) > 6.0
+    assert np.abs(far.efforts).max() == 6.0
 
 
 def test_states_around_the_way_are_as_near_as_was_asked_for(teacher):
@@ -88,6 +88,38 @@ def test_a_network_learns_what_its_teacher_does_and_starts_along_its_way(teacher
     # From 0.8 on nobody is led any more: all errors are those on the pupil's own states.
     errors = [learner.update(0.8 - number / 50)["divergence"] for number in range(40)]
     assert np.mean(errors[-5:]) < 0.5 * np.mean(errors[:5])
+
+
+def test_episodes_start_at_hanging_upright_and_on_the_way_and_who_strays_starts_anew(teacher):
+    env = SwingUp(400, PENDUBOT, {}, TASK, np.random.default_rng(0))
+    learner = Imitation(env, PpoSettings(hidden=(8, 8), horizon=2), np.random.default_rng(1), teacher)
+    ends = [np.mean(np.abs(env.states[:, :2]).max(axis=1) < 0.02), np.mean(np.abs(env.states[:, 0] + math.pi) < 0.02)]
+    assert all(0.03 < share < 0.3 for share in ends)
+    astray = np.tile([2.0, 2.0, 0.0, 0.0], (400, 1))
+    env.start_at(np.arange(400), astray, np.zeros((400, 1)))
+    assert teacher.answer(env.states).cost.min() > 6.0
+    learner.update()
+    assert teacher.answer(env.states).cost.max() < 6.0
+
+
+def test_an_episode_that_starts_elsewhere_knows_the_effort_that_acts_there():
+    env = SwingUp(3, PENDUBOT, {}, TASK, np.random.default_rng(0))
+    states = np.array([[0.1, -0.2, 1.0, 2.0], [0.0, 0.0, 0.0, 0.0]])
+    env.start_at(np.array([0, 2]), states, np.array([[3.0], [-1.5]]))
+    np.testing.assert_array_equal(env.states[[0, 2]], states)
+    np.testing.assert_array_equal(env.effort[[0, 2], 0], [3.0, -1.5])
+    np.testing.assert_array_equal(env.motion[[0, 2], 4], [3.0, -1.5])
+    np.testing.assert_allclose(env.observe()[0][[0, 2]].reshape(2, 3, -1)[:, :, -1], [[0.5] * 3, [-0.25] * 3])
+
+
+def test_an_answer_beyond_a_limit_that_is_asked_for_is_right(teacher, monkeypatch):
+    env = SwingUp(4, PENDUBOT, {}, TASK, np.random.default_rng(0))
+    learner = Imitation(env, PpoSettings(hidden=(8, 8), horizon=8), np.random.default_rng(1), teacher)
+    learner.actor.parameters[-1][...] = 3.0
+    seen = np.zeros((48, env.observation_size), dtype=np.float32)
+    for right, error in ((1.0, 0.0), (-1.0, 16.0)):
+        monkeypatch.setattr(learner, "_gather", lambda _led, right=right: (seen, np.full((48, 1), right, "f4"), 0.0))
+        assert learner.update()["divergence"] == pytest.approx(error, rel=0.1)
 
 
 def test_one_seed_is_one_file_also_when_an_imitation_was_interrupted(tmp_path, monkeypatch):
