@@ -17,7 +17,7 @@ from pendulum_msgs_py.errors import FaultError
 from tests.fixtures import wait_for
 
 PROGRAMS = """
-import os, signal, socket, sys, threading, time
+import ctypes, gc, os, signal, socket, sys, threading, time
 
 def tell(argv):
     print("pid", os.getpid(), "word", os.environ.get("WORD"), *argv)
@@ -42,13 +42,42 @@ def kills(argv):
     os.kill(os.getpid(), signal.SIGKILL)
 
 def exits(argv):
-    os._exit(9)
+    os._exit(int(argv[0]))
+
+class Node:
+    def __del__(self):
+        print("the node has left the graph", flush=True)
+
+def freezes(argv):
+    node = Node()
+    node.itself = node
+    gc.collect()
+    gc.freeze()
+    return 0
+
+def handles_signals(argv):
+    reader, writer = socket.socketpair()
+    writer.setblocking(False)
+    signal.set_wakeup_fd(writer.detach())
+    signal.signal(signal.SIGTERM, lambda number, frame: None)
+    return 0
+
+def leaves_middleware(argv):
+    def receive():
+        ctypes.CDLL(None).prctl(15, b"dds.udp.7400", 0, 0, 0)
+        time.sleep(60)
+    threading.Thread(target=receive, daemon=True).start()
+    time.sleep(0.2)
+    return 0
 
 def starts_thread(argv):
     threading.Thread(target=time.sleep, args=(0.5,)).start()
     return 0
 """
-NAMES = ("tell", "fails", "leaves", "waits", "kills", "exits", "starts_thread")
+NAMES = (
+    *("tell", "fails", "leaves", "waits", "kills", "exits"),
+    *("freezes", "handles_signals", "leaves_middleware", "starts_thread"),
+)
 
 
 @pytest.fixture
@@ -85,7 +114,12 @@ def test_two_programs_share_a_process_and_nothing_else(pool: HostPool, tmp_path:
     assert "to the other stream\n" in told
     # The variable of the first is gone, and each has its own log.
     assert f"pid {first.pid} word None three\n" in (tmp_path / "second.log").read_text()
+    assert "to the other stream\n" in (tmp_path / "second.log").read_text()
     assert "three" not in told
+    # One of another kind would find what theirs has left.
+    other = _start(pool, tmp_path / "other.log", "leaves", "nothing")
+    assert other.wait(30.0) == 0
+    assert other.pid != first.pid
 
 
 def test_two_that_run_at_once_have_a_process_each(pool: HostPool, tmp_path: Path) -> None:
@@ -120,14 +154,41 @@ def test_a_program_ends_with_the_code_and_the_words_that_it_would_have_alone(
     assert _start(pool, tmp_path / "log", *arguments).pid == ended.pid
 
 
-@pytest.mark.parametrize(("name", "code"), [("kills", -signal.SIGKILL), ("exits", 9)])
+@pytest.mark.parametrize(
+    ("words", "code"),
+    # Without a word, code 0 is no success.
+    [(("kills",), -signal.SIGKILL), (("exits", "9"), 9), (("exits", "0"), 1)],
+)
 def test_a_program_that_takes_its_host_with_it_is_told_and_the_next_has_another(
-    pool: HostPool, tmp_path: Path, name: str, code: int
+    pool: HostPool, tmp_path: Path, words: tuple[str, ...], code: int
 ) -> None:
-    ended = _start(pool, tmp_path / "log", name)
+    ended = _start(pool, tmp_path / "log", *words)
     assert ended.wait(30.0) == code
     ended.send_signal(signal.SIGINT)
-    assert _start(pool, tmp_path / "log", name).pid != ended.pid
+    assert _start(pool, tmp_path / "log", *words).pid != ended.pid
+
+
+def test_what_only_the_collector_destroys_is_gone_when_its_program_has_ended(pool: HostPool, tmp_path: Path) -> None:
+    # A frozen node, as rclpy's lifecycle nodes are, would stay on the graph.
+    for _ in range(2):
+        assert _start(pool, tmp_path / "log", "freezes").wait(30.0) == 0
+    assert (tmp_path / "log").read_text().count("the node has left the graph") == 2
+
+
+def test_a_host_that_waits_ends_by_sigterm_whatever_its_programs_did_with_it(pool: HostPool, tmp_path: Path) -> None:
+    program = _start(pool, tmp_path / "log", "handles_signals")
+    assert program.wait(30.0) == 0
+    os.kill(program.pid, signal.SIGTERM)
+    wait_for(lambda: not _runs(program.pid), 20.0, "the host to end")
+
+
+def test_a_host_makes_place_for_another_after_many_programs(pool: HostPool, tmp_path: Path) -> None:
+    hosts = []
+    for _ in range(201):
+        program = _start(pool, tmp_path / "log", "tell")
+        assert program.wait(30.0) == 0
+        hosts.append(program.pid)
+    assert (len(set(hosts[:200])), len(set(hosts))) == (1, 2)
 
 
 def test_a_program_asked_to_end_at_once_ends(pool: HostPool, tmp_path: Path) -> None:
@@ -146,11 +207,14 @@ def test_a_signal_that_comes_when_a_program_has_ended_does_not_reach_the_next(po
     assert (second.pid, second.wait(30.0)) == (first.pid, 3)
 
 
-def test_a_host_with_a_thread_left_behind_is_gone_when_its_program_has_ended(pool: HostPool, tmp_path: Path) -> None:
-    program = _start(pool, tmp_path / "log", "starts_thread")
+@pytest.mark.parametrize("name", ["starts_thread", "leaves_middleware"])
+def test_a_host_with_a_thread_left_behind_is_gone_when_its_program_has_ended(
+    pool: HostPool, tmp_path: Path, name: str
+) -> None:
+    program = _start(pool, tmp_path / "log", name)
     assert program.wait(30.0) == 0
     assert not Path(f"/proc/{program.pid}").exists()
-    assert _start(pool, tmp_path / "log", "starts_thread").pid != program.pid
+    assert _start(pool, tmp_path / "log", name).pid != program.pid
 
 
 def test_a_host_that_was_ended_while_it_waited_is_replaced(pool: HostPool, tmp_path: Path) -> None:
@@ -180,7 +244,7 @@ def test_what_is_no_program_of_ours_gets_a_process_of_its_own(pool: HostPool, tm
         processes.wait(child, 30.0)
         assert isinstance(child.process, subprocess.Popen)
         alone = processes.start(
-            "alone", [sys.executable, "-m", "pendulum_probe.programs"], ends_by_itself=True, alone=True
+            "alone", [sys.executable, "-m", "pendulum_probe.programs", "tell"], ends_by_itself=True, alone=True
         )
         assert isinstance(alone.process, subprocess.Popen)
         hosted = processes.start("hosted", [sys.executable, "-m", "pendulum_probe", "fails"])

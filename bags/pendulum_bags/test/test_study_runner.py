@@ -4,14 +4,18 @@ from __future__ import annotations
 
 import json
 import math
+import sys
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 from rich.console import Console
 
 from pendulum_bags.experiments.in_process import simulate
+from pendulum_bags.experiments.processes import Child, ProcessSet
 from pendulum_bags.experiments.run_spec import RunSpec
 from pendulum_bags.studies import pid_vs_lqr, pooled, runner
 from pendulum_bags.studies.records import read_record
@@ -66,6 +70,27 @@ def test_study_resumes_where_it_stopped(tmp_path: Path, study: Study) -> None:
     end = run_study(folder, study, workers=1)
     assert (end.done, end.skipped, end.failed) == (3, 1, 0)
     assert read_record(folder, study.runs[0]) == before[0]
+
+
+@pytest.mark.parametrize(("clock", "alone"), [("lockstep", False), ("realtime", True)])
+def test_runs_in_lockstep_share_processes_and_others_start_afresh(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, clock: str, alone: bool
+) -> None:
+    path = tmp_path / "nodes.yaml"
+    path.write_text(f"clock: {clock}\n{TEXT.replace('engine: process', '')}", encoding="utf-8")
+    nodes, started, hosts = load_study(path), [], []
+    open_study_folder(tmp_path / "out", nodes)
+    start = ProcessSet.start
+
+    def note(processes: ProcessSet, name: str, command: Sequence[str], **settings: Any) -> Child:
+        started.append(settings.pop("alone"))
+        hosts.append(processes.hosts)
+        return start(processes, name, [sys.executable, "-c", ""], **settings)
+
+    monkeypatch.setattr(ProcessSet, "start", note)
+    assert run_study(tmp_path / "out", nodes, workers=1).failed == 3  # nothing was recorded
+    assert started == [alone] * 3
+    assert None not in hosts
 
 
 def test_failed_run_is_recorded_and_retried_only_on_request(

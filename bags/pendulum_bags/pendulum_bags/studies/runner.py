@@ -168,9 +168,8 @@ def run_study(
                         continue
                     running.remove(item)
                     progress.done += 1
-                    progress.failed += bool(outcome)
                     pace.learn(item.run, time.monotonic() - item.started)
-                    _record(item, outcome)
+                    progress.failed += bool(_record(item, outcome))
                 progress.running = [item.run.name for item in running]
                 progress.remaining = pace.remaining(waiting, [(item.run, item.started) for item in running])
                 on_progress(progress)
@@ -248,7 +247,8 @@ def _simulate(run: StudyRun, place: Path) -> None:
     np.savez_compressed(place / "run.npz", **vars(arrays))
 
 
-def _record(item: _Running, failure: str) -> None:
+def _record(item: _Running, failure: str) -> str:
+    """Keep how a run went; return why it failed, what cannot be read included, or an empty string."""
     run = item.run
     record: dict[str, Any] = {
         "number": run.number,
@@ -266,6 +266,7 @@ def _record(item: _Running, failure: str) -> None:
             failure = f"recorded, but cannot be read: {error}"
     record.update(status="failed" if failure else "done", reason=failure)
     write_json(item.folder / "run.json", record)
+    return failure
 
 
 class _Pace:
