@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import os
 import sys
 from collections.abc import Sequence
 from dataclasses import replace
@@ -70,6 +71,14 @@ def test_study_resumes_where_it_stopped(tmp_path: Path, study: Study) -> None:
     end = run_study(folder, study, workers=1)
     assert (end.done, end.skipped, end.failed) == (3, 1, 0)
     assert read_record(folder, study.runs[0]) == before[0]
+
+
+def test_runs_in_lockstep_fill_the_cores_and_others_have_the_machine_to_themselves(
+    study: Study, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(os, "cpu_count", lambda: 2)
+    assert runner.default_workers(study) == 3
+    assert runner.default_workers(replace(study, clock="realtime")) == 1
 
 
 @pytest.mark.parametrize(("clock", "alone"), [("lockstep", False), ("realtime", True)])

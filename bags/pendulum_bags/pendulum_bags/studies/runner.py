@@ -52,11 +52,11 @@ class StudyProgress:
 
 
 def default_workers(study: Study) -> int:
-    """Return how many runs to carry out at once: one where they keep the wall's time, else one a core.
+    """Return how many runs to carry out at once: one where they keep the wall's time, else one more than cores.
 
-    The nodes of a run wait for each other, so that one run leaves half of two cores idle.
+    The nodes of a run wait for each other, and at its start and end for the middleware: one a core leaves a third idle.
     """
-    return 1 if study.realtime or any(run.lab for run in study.runs) else max(1, os.cpu_count() or 1)
+    return 1 if study.realtime or any(run.lab for run in study.runs) else 1 + (os.cpu_count() or 1)
 
 
 def open_study_folder(folder: Path, study: Study) -> Study:

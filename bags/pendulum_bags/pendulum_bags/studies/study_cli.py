@@ -33,7 +33,9 @@ Out = Annotated[
 Workers = Annotated[
     int,
     typer.Option(
-        help="Runs at once, each in a ROS domain of its own; 0: one a core, one alone in real time.", min=0, max=256
+        help="Runs at once, each in a ROS domain of its own; 0: one more than cores, one alone in real time.",
+        min=0,
+        max=256,
     ),
 ]
 Retry = Annotated[bool, typer.Option("--retry-failed", help="Carry out again the runs that failed.")]
