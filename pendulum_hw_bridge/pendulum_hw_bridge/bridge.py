@@ -206,6 +206,9 @@ class Bridge:
             except ActuatorError as error:
                 self.fail(error.fault, module.words(str(error)))
                 return self._ended(drive, error.fault)
+        # What is kept waits for the joint that was computed last: behind a pause it answers a state long gone.
+        if not self._turn():
+            return self._ended(drive, "host_stalled")
         try:
             self._flush()
         except ActuatorError as error:

@@ -11,7 +11,7 @@ from typing import Any
 
 import pytest
 
-from pendulum_hw_bridge.actuator import ActuatorError, CommandLock, Strategy
+from pendulum_hw_bridge.actuator import ActuatorError, Command, CommandLock, Strategy
 from pendulum_hw_bridge.backends import hebi as backend_module
 from pendulum_hw_bridge.backends import hebi_group
 from pendulum_hw_bridge.backends.hebi_discovery import ModuleSelection, discover
@@ -101,6 +101,8 @@ class Network:
         self.breaks = ""
         self.frames = 0
         self.logs: list[str] = []
+        self.answers = True
+        self.timeouts: list[float] = []
 
     # as lookup
     @property
@@ -117,6 +119,7 @@ class Network:
         if len(addresses) == 1:
             return SimpleNamespace(request_info=lambda ms: _Infos(found))
         self.chosen = found
+        self.timeouts.append(timeout_ms)
         return self if self.connects else None
 
     # as group
@@ -147,10 +150,11 @@ class Network:
         return not any(module.deaf for module in self.chosen)
 
     def request_info(self, timeout_ms: float) -> Any:
-        return _Infos(self.chosen)
+        return _Infos(self.chosen) if self.answers else None
 
     def get_next_feedback(self, timeout_ms: float, reuse: Any) -> Any:
         self.frames += 1
+        self.timeouts.append(timeout_ms)
         assert type(reuse) is hebi.GroupFeedback
         assert reuse.size == len(self.chosen)
         if not any(module.record for module in self.chosen):
@@ -325,6 +329,30 @@ def test_modules_in_another_order_than_asked_for_are_refused() -> None:
         rig.bridge.connect()
 
 
+def test_modules_are_looked_for_patiently(monkeypatch: pytest.MonkeyPatch) -> None:
+    patiences: list[float] = []
+
+    def look(lookup: Any, *, look_time: float, patience: float) -> Any:
+        patiences.append(patience)
+        return discover(lookup, look_time=look_time, patience=patience, wait=lambda seconds: None)
+
+    monkeypatch.setattr(hebi_group, "discover", look)
+    for look_time in (1.0, 2.0, 9.0):
+        rig = Rig()
+        rig.shared._look_time = look_time
+        rig.bridge.connect()
+        assert rig.network.timeouts == [5000]
+    assert patiences == [3.0, 5.0, 9.0]
+
+
+def test_modules_that_do_not_tell_their_settings_are_refused() -> None:
+    rig = Rig()
+    rig.network.answers = False
+    with pytest.raises(ActuatorError, match="HEBI modules did not all answer within 200 ms"):
+        rig.bridge.connect()
+    assert rig.shared.group is None
+
+
 # --- one round of packets -----------------------------------------------------------------------------------------
 
 
@@ -382,6 +410,71 @@ def test_settings_reach_each_driven_module_and_only_it() -> None:
     assert rig.fakes[0].packets == [{}]
 
 
+def test_a_round_has_the_setpoints_of_this_round_and_nothing_else() -> None:
+    rig = Rig().armed()
+    first, second = (drive.port for drive in rig.bridge.drives)
+    rig.drive(1.0, -0.5)
+    # Neither the strategy of an earlier packet, nor the setpoint of a joint that has none in this round.
+    assert [set(packet) for module in rig.fakes for packet in module.packets] == 2 * [set(SETPOINTS)]
+    rig.forget()
+    second.write(Command(pwm=0.125))
+    first.flush()  # type: ignore[attr-defined]
+    assert [rig.fakes[0].packets, rig.efforts(1)] == [[{}], [0.125]]
+
+
+def test_what_is_set_when_it_is_armed_again_does_not_switch_a_module_on() -> None:
+    rig = Rig().armed()
+    rig.drive(1.0, -0.5)
+    rig.bridge.release()
+    rig.see()
+    rig.forget()
+    assert rig.bridge.prepare() == ""
+    for module in rig.fakes:
+        with_strategy = [packet for packet in module.packets if "control_strategy" in packet]
+        assert [(packet["control_strategy"], packet["effort"]) for packet in with_strategy] == [(1, 0.0)]
+        assert module.packets.index(with_strategy[0]) > 0, "settings come before the strategy"
+        assert not any(name in packet for packet in module.packets for name in SETPOINTS if packet not in with_strategy)
+
+
+def test_a_duty_that_was_kept_does_not_become_a_torque_under_another_strategy() -> None:
+    rig = Rig().armed()
+    first, second = (drive.port for drive in rig.bridge.drives)
+    first.write(Command(pwm=0.25))
+    first.set_strategy(Strategy.PARALLEL_PWM, Command(position=0.0))
+    rig.forget()
+    second.flush()  # type: ignore[attr-defined]
+    assert rig.efforts(0) == []
+
+
+def test_a_setpoint_that_is_kept_after_the_stop_of_another_joint_dies_with_its_own() -> None:
+    rig = Rig().armed()
+    first, second = (drive.port for drive in rig.bridge.drives)
+    first.stop()
+    second.write(Command(pwm=0.25))
+    second.stop()
+    rig.forget()
+    first.flush()  # type: ignore[attr-defined]
+    assert rig.network.rounds == []
+
+
+def test_setpoints_that_were_kept_do_not_outlive_the_connection_and_a_new_one_is_stopped_anew() -> None:
+    rig = Rig().armed()
+    first, second = (drive.port for drive in rig.bridge.drives)
+    first.stop()
+    # What the other joint has kept is still there, since it is let go without a stop.
+    rig.shared.keep(1, Command(pwm=0.25), Strategy.DIRECT_PWM)
+    rig.shared._stop_told = {0}
+    for port in (first, second):
+        port.let_go()  # type: ignore[attr-defined]
+    for port in (first, second):
+        port.connect()
+    rig.forget()
+    first.flush()  # type: ignore[attr-defined]
+    assert rig.network.rounds == []
+    second.stop()
+    assert rig.network.rounds == ["ask"]
+
+
 def test_setpoints_that_were_kept_do_not_outlive_a_stop() -> None:
     rig = Rig().armed()
     first, second = (drive.port for drive in rig.bridge.drives)
@@ -390,6 +483,25 @@ def test_setpoints_that_were_kept_do_not_outlive_a_stop() -> None:
     rig.forget()
     first.flush()  # type: ignore[attr-defined]
     assert rig.network.rounds == []
+
+
+@pytest.mark.parametrize("stalled", [0, 1])
+def test_a_host_that_stood_still_between_the_setpoints_of_two_joints_sends_none_of_them(stalled: int) -> None:
+    rig = Rig().armed()
+    port = rig.bridge.drives[stalled].port
+    write = port.write
+
+    def stall(command: Command) -> Any:
+        applied = write(command)
+        rig.clock.wait_until(rig.clock.now_ns() + 30_000_000_000)
+        return applied
+
+    port.write = stall  # type: ignore[method-assign]
+    outcome = rig.drive(1.0, -0.5)
+    assert (outcome.fault, outcome.effort) == ("host_stalled", (0.0, 0.0))
+    assert rig.all_off()
+    given = [effort for index in (0, 1) for effort in rig.efforts(index) if not math.isnan(effort)]
+    assert given == [0.0, 0.0], "only the zero before off"
 
 
 # --- feedback -----------------------------------------------------------------------------------------------------
@@ -427,6 +539,15 @@ def test_no_state_is_made_of_two_frames() -> None:
     assert rig.see(None, {}) is None
     assert rig.see(None, {}) is None
     assert rig.see() is not None
+
+
+def test_only_the_first_joint_waits_for_a_frame() -> None:
+    rig = Rig().connected()
+    rig.network.timeouts.clear()
+    start = rig.clock.now_ns()
+    rig.bridge.observe(0.25)
+    assert rig.network.timeouts == [250.0]
+    assert rig.clock.now_ns() - start == 250_000_000
 
 
 @pytest.mark.parametrize("coordinates", [BOTH, ACROBOT])
@@ -530,6 +651,13 @@ def test_zero_and_off_are_sent_to_every_module_also_when_one_does_not_acknowledg
     assert rig.all_off()
     for index in coordinates.driven:
         assert rig.fakes[index].packets[0] == {"effort": 0.0}
+    for module in rig.fakes:
+        # Off, and no setpoint that a strategy put in force by somebody else could begin with.
+        for off in module.packets[1:]:
+            assert off.pop("control_strategy") == 0
+            assert list(off) == list(SETPOINTS)
+            assert all(math.isnan(value) for value in off.values())
+    assert [drive.port.strategy for drive in rig.bridge.drives] == [Strategy.OFF] * len(coordinates.driven)
     assert rig.bridge.stop_pending
     assert rig.bridge.prepare() == "the module has not confirmed that it is off"
     rig.fakes[deaf].deaf = False

@@ -146,6 +146,7 @@ class HebiGroup:
 
     def keep(self, index: int, command: Command, strategy: Strategy) -> None:
         """Keep a joint's setpoints for the next round of packets."""
+        self._stop_told = None
         self._setpoints[index] = (command, strategy)
 
     def send(self) -> None:
@@ -156,7 +157,6 @@ class HebiGroup:
         """
         if not self._setpoints:
             return
-        self._stop_told = None
         self._packet.clear()
         for index, (command, strategy) in self._setpoints.items():
             part = self._packet.create_view([index])
@@ -184,6 +184,8 @@ class HebiGroup:
         if strategy is not None:
             # Asked for is as good as set: the acknowledgement may be what is lost.
             self._asked[index] = strategy
+            # What was kept was meant for the strategy before: a duty would become a torque.
+            self._setpoints.pop(index, None)
         return bool(self.group.send_command_with_acknowledgement(packet, timeout_ms))
 
     def info(self, index: int, timeout_ms: float) -> Any:
