@@ -94,6 +94,21 @@ def test_a_command_counts_for_a_cycle_at_least_and_never_for_long(backend: str, 
 
 
 @pytest.mark.parametrize(
+    ("limit", "message"),
+    [
+        ({"effort": (6.0, 40.0)}, "effort_limit is 40 N m; expected at most"),
+        ({"effort": (40.0, 6.0)}, "effort_limit is 40 N m; expected at most"),
+        ({"position_min": (-1.0, -40.0), "position_max": (1.0, 40.0)}, "position_window is 80 rad; expected at most"),
+        ({"position_min": (-40.0, -1.0), "position_max": (40.0, 1.0)}, "position_window is 80 rad; expected at most"),
+    ],
+)
+def test_of_several_joints_the_one_with_the_widest_limit_counts(limit: dict[str, Any], message: str) -> None:
+    check(limit, backend="emulator")
+    with pytest.raises(ParameterError, match=message):
+        check(limit, backend="hebi")
+
+
+@pytest.mark.parametrize(
     ("name", "limit"),
     [
         ("velocity_limit", {"velocity": math.inf}),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -48,6 +49,20 @@ def test_all_modules_are_of_one_group_in_the_order_of_the_joints() -> None:
     assert first.driven == (0, 1)
 
 
+@pytest.mark.parametrize("plant", ["acrobot", "double_pendulum"])
+def test_silence_of_each_module_is_judged_by_the_rate_that_it_is_set_to(plant: str) -> None:
+    modules = assembled(plant, feedback_rate=50.0).modules(SteppedClock())
+    assert [module.monitor.period for module in modules] == [0.02, 0.02]
+    assert [module.settings.feedback_rate for module in modules] == [50.0, 50.0]
+
+
+def test_the_log_of_the_group_is_the_one_that_is_named_or_none() -> None:
+    for name, path in (("", None), ("run.hebilog", Path("run.hebilog"))):
+        port = assembled(hebi_log=name).modules(SteppedClock())[1].port
+        assert isinstance(port, GroupDrive)
+        assert port.shared._log == path
+
+
 def test_the_limits_are_those_of_the_plant_file_and_of_an_x5() -> None:
     assembly = assembled()
     assert assembly.limits.effort == (6.0,)
@@ -76,6 +91,7 @@ def test_the_limits_are_those_of_the_plant_file_and_of_an_x5() -> None:
             "position_window is 80 rad; expected at most 64 rad",
         ),
         ("acrobot", {"position_window": [-1.0, 1.0, 0.0, 0.0]}, "position_window is none; expected one"),
+        ("acrobot", {"voltage_window": [40.0, 20.0]}, "voltage window is [40.0, 20.0] V; expected min < max"),
         ("acrobot", {"velocity_limit": 30.0}, "velocity_limit is 30 rad/s; expected at most 3 rad/s"),
         ("thesis", {"names": ["a", "b"]}, "names is for several joints; expected name for one"),
     ],

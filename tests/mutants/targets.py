@@ -97,7 +97,17 @@ TARGETS: tuple[Target, ...] = (
         (f"{_BRIDGE}/test_hebi_backend.py", f"{_BRIDGE}/test_hebi_rules.py"),
         choose="not test_a_bridge_drives_a_module",
     ),
-    Target("pendulum_hw_bridge.bridge", ("Bridge",), _CYCLE),
+    Target(
+        "pendulum_hw_bridge.backends.hebi_group",
+        ("HebiGroup", "_answered", "_Row", "_Part", "_Seat", "_GroupPort", "GroupDrive", "GroupEncoder"),
+        (f"{_BRIDGE}/test_hebi_group.py",),
+    ),
+    Target(
+        "pendulum_hw_bridge.group_assembly",
+        ("GroupAssembly", "refuse_slides", "_of_joint"),
+        (f"{_BRIDGE}/test_group_assembly.py",),
+    ),
+    Target("pendulum_hw_bridge.bridge", ("Bridge",), (*_CYCLE, f"{_BRIDGE}/test_hebi_group.py")),
     Target("pendulum_hw_bridge.module", ("Module", "DrivenModule"), _CYCLE),
     Target(
         "pendulum_hw_bridge.current_drive", ("CurrentMapping", "CurrentCheck"), (f"{_BRIDGE}/test_current_drive.py",)
