@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 
 import pytest
@@ -51,3 +52,10 @@ def test_a_plant_with_motor_and_spring_is_not_stepped_by_the_thesis_s_integrator
     assert RegulationSettings().method == RunSpec().method == "euler"
     for settings in (RegulationSettings(plant="x5_9"), RunSpec(plant="x5_9")):
         assert make_plant(load_plant("x5_9"), 0.002, method=settings.method).state.theta == 0.0
+
+
+@pytest.mark.parametrize("value", [math.nan, [-1.0, math.inf]])
+def test_a_parameter_of_the_plant_that_is_no_number_is_refused_before_anything_is_written(value: object) -> None:
+    # A study ended in a traceback of the JSON library, with half a folder behind it.
+    with pytest.raises(ParameterError, match=r"parameter limit of the plant is (nan|inf); expected a finite number"):
+        RunSpec(plant_parameters={"limit": value})

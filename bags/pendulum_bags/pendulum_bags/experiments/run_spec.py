@@ -111,9 +111,14 @@ class RunSpec:
             _ = foreign.parameters
         elif self.side == "sim":
             object.__setattr__(self, "method", integrator_of(self.plant, self.method))
+        for name, given in self.plant_parameters.items():
+            for value in given if isinstance(given, (list, tuple)) else (given,):
+                # The node judges what it has, but what a run is made of is written down before it starts.
+                if isinstance(value, float) and not math.isfinite(value):
+                    raise ParameterError(f"parameter {name} of the plant is {value}; expected a finite number")
         load_plant(self.design_plant)
-        given = {**self.controller_parameters, "set_point": self.set_point}
-        validate(controller_parameters(self.controller), given, where=f"controller {self.controller}")
+        law = {**self.controller_parameters, "set_point": self.set_point}
+        validate(controller_parameters(self.controller), law, where=f"controller {self.controller}")
         own = {spec.name for spec in DISTURBANCE_SPECS} | _OF_THE_NODE
         reject_unknown(self.disturbance, own, where="disturbance")
         signal = {k: v for k, v in self.disturbance.items() if k not in _OF_THE_NODE}
