@@ -158,7 +158,8 @@ def test_an_acrobot_swings_up_in_lockstep_and_stays(peer: Peer, processes) -> No
     )
     # The event may come before the states that wait here.
     peer.until(lambda: peer.states and peer.states[-1].header.stamp.sec == 9, "the last state, after 8 s", 90.0)
-    assert list(peer.states[0].position) == [0.0, 0.0]
+    # A plant knows of a listener before the listener knows of the plant, so the first states may be missed here.
+    assert np.abs(peer.states[0].position).max() < 0.01
     turned = (np.array(peer.states[-1].position) - [math.pi, 0.0] + math.pi) % (2.0 * math.pi) - math.pi
     assert np.abs(turned).max() < 0.01
     assert np.abs(peer.states[-1].velocity).max() < 0.05
