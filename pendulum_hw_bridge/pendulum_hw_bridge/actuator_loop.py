@@ -104,7 +104,7 @@ class ActuatorLoop:
         if command.stamp_ns == self._state_ns:
             self._answered.add(kind)
         if kind is Input.EFFORT_COMMAND:
-            self.statistics.round_trip(self.bridge.now_ns() - command.stamp_ns)
+            self.statistics.act_on_age(self.bridge.now_ns() - command.stamp_ns)
 
     def close(self) -> None:
         """End the thread; the actuator is released and let go on the way out."""

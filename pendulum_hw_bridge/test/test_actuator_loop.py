@@ -117,7 +117,7 @@ def test_an_answer_is_acted_upon_in_the_cycle_of_its_state(running: Running) -> 
     running.until(lambda: running.outcomes[-1][1].effort != (0.0,), "torque")
     assert running.outcomes[-1][1].effort == pytest.approx((0.4,), abs=1e-9)
     running.until(lambda: running.actuator.link.pwm != 0.0, "a duty on the motor")
-    assert running.loop.statistics.latency.count > 0
+    assert running.loop.statistics.answered_age.count > 0
 
 
 def test_a_cycle_waits_for_an_answer_only_in_its_window_and_no_longer_once_it_has_come(running: Running) -> None:
@@ -131,7 +131,7 @@ def test_a_cycle_waits_for_an_answer_only_in_its_window_and_no_longer_once_it_ha
 
     running.arm()
     running.take_inputs = answer
-    running.until(lambda: running.loop.statistics.latency.count > 5, "answers")
+    running.until(lambda: running.loop.statistics.answered_age.count > 5, "answers")
     # Whoever answers at the first look is not waited for.
     assert set(waits) == {0.0}
     waits.clear()

@@ -37,6 +37,8 @@ def test_before_the_first_cycle_figures_are_not_numbers_but_zero_counts() -> Non
     assert summary["cycles"] == summary["overruns"] == 0
     assert math.isnan(summary["rate_hz"])
     assert math.isnan(summary["jitter_p99_us"])
+    # Of a plant that measures nothing, nobody is told how old its measurements are.
+    assert not [key for key in summary if "age" in key]
 
 
 def test_rate_jitter_overruns_and_latency_are_what_happened() -> None:
@@ -45,12 +47,14 @@ def test_rate_jitter_overruns_and_latency_are_what_happened() -> None:
         late = 1_500_000 if index == 500 else 20_000
         statistics.cycle(index * _MS + late, index * _MS)
         statistics.round_trip(300_000)
+    statistics.act_on_age(700_000)
     summary = statistics.summary(1000 * _MS)
     assert summary["rate_hz"] == pytest.approx(1000.0, rel=1e-3)
     assert summary["overruns"] == 1
     assert summary["jitter_p50_us"] == 20.0
     assert summary["jitter_max_us"] == 1500.0
     assert summary["command_latency_p50_us"] == 300.0
+    assert summary["answered_age_p50_us"] == summary["answered_age_max_us"] == 700.0
     # The rate is that since the last summary; nothing ran since.
     assert statistics.summary(2000 * _MS)["rate_hz"] == 0.0
 

@@ -126,7 +126,7 @@ class SimulatorNode(PollingNode):
             polled=not self._lockstep,
             statistics=None if self._lockstep else self._statistics,
             more_diagnostics=self._diagnostics,
-            on_command=self._on_command,
+            on_command=self._on_command if self._lockstep else None,
         )
         self._interface.hardware_id = f"simulated {parameters.name}"
         if self._lockstep:
@@ -234,12 +234,7 @@ class SimulatorNode(PollingNode):
         return self._sensors.measure(self._stamp_ns, position, velocity, effort)
 
     def _on_command(self, kind: Input, command: JointCommand) -> None:
-        if self._lockstep:
-            self._loop.answered(kind, command)
-        elif kind is Input.EFFORT_COMMAND and command.stamp_ns == self._stamp_ns:
-            # Until the answer reached this process; that it waits there for the next deadline costs it nothing. Both
-            # are system time; they differ by a fraction of a period, so a step of that clock between them is unlikely.
-            self._statistics.round_trip(self._interface.arrived_ns - self._interface.published_ns)
+        self._loop.answered(kind, command)
 
     # --- services and parameters ---------------------------------------------------------------------------
 

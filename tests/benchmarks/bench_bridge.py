@@ -10,7 +10,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from tests.benchmarks import Row, measured
+from tests.benchmarks import Peer, Row, measured
 from tests.tools.faults.bridge_scenarios import CASES, SCENARIOS, Scenario, run_scenario
 from tests.tools.faults.node_rig import ros_of_its_own
 
@@ -163,9 +163,11 @@ def _row_of_fault(scenario: Scenario) -> Row:
 
 def _loop() -> Iterator[Row]:
     from tests.benchmarks.bridge_loop import loop_figures
+    from tests.benchmarks.sim_loop import realtime_figures
 
     for rate in (100.0, 500.0, 1000.0):
         figures = loop_figures(rate, SECONDS)
+        simulated = realtime_figures(SECONDS, rate=rate)
         what = f"loop on the emulator at {rate:g} Hz for {SECONDS:g} s, bridge and controller"
         yield measured(f"{what}: rate", figures.rate, "Hz", at_least=0.99 * rate, less_is_better=False)
         note = f"p99 {figures.jitter_p99:.0f} us, largest {figures.jitter_max:.0f} us; "
@@ -175,8 +177,10 @@ def _loop() -> Iterator[Row]:
             f"{what}: round trip p50",
             figures.latency_p50,
             "us",
+            peer=Peer("the simulator's", simulated.p50),
+            at_most_times_peer=1.5 if rate == 1000.0 else None,
             less_is_better=True,
-            note=f"p99 {figures.latency_p99:.0f} us",
+            note=f"p99 {figures.latency_p99:.0f} us; a record is {figures.age_p50:.0f} us old when its answer is taken",
         )
         yield measured(f"{what}: overruns", figures.overruns, "%", at_most=0.5)
         yield measured(f"{what}: CPU, bridge and controller", figures.cpu, "% of a core", less_is_better=True)

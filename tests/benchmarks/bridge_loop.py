@@ -35,6 +35,7 @@ class BridgeLoopFigures:
         jitter_max: Largest [us].
         latency_p50: Median of the round trip from state to command [us].
         latency_p99: 99th percentile [us].
+        age_p50: Median of the age of a record when its answer is taken [us].
         overruns: Share of cycles late by a period or more [%].
         cpu: CPU of bridge and controller [% of a core].
         faults: How often the bridge faulted [-].
@@ -46,6 +47,7 @@ class BridgeLoopFigures:
     jitter_max: float
     latency_p50: float
     latency_p99: float
+    age_p50: float
     overruns: float
     cpu: float
     faults: float
@@ -91,6 +93,7 @@ def loop_figures(rate: float, duration: float) -> BridgeLoopFigures:
                 jitter_max=max(float(row["jitter_max_us"]) for row in said),
                 latency_p50=_median(said, "command_latency_p50_us"),
                 latency_p99=_median(said, "command_latency_p99_us"),
+                age_p50=_median(said, "answered_age_p50_us"),
                 overruns=100.0 * (int(last["overruns"]) - int(first["overruns"])) / max(1, cycles),
                 cpu=cpu,
                 # From the start: a loop that faulted before would be measured without torque.

@@ -103,6 +103,7 @@ class LoopStatistics:
         self.period_ns = period_ns
         self.jitter = RingOfTimes()
         self.latency = RingOfTimes()
+        self.answered_age = RingOfTimes()
         self.overruns = 0
         self.cycles = 0
         self._window_start_ns = 0
@@ -120,8 +121,12 @@ class LoopStatistics:
         self._window_cycles += 1
 
     def round_trip(self, duration_ns: int) -> None:
-        """Record the time from a state to the command that answers it [ns]."""
+        """Record the time from the publication of a state until the command that answers it is there [ns]."""
         self.latency.add(duration_ns)
+
+    def act_on_age(self, age_ns: int) -> None:
+        """Record how old a measurement is when the command that answers it is taken: what a loop's delay is [ns]."""
+        self.answered_age.add(age_ns)
 
     def summary(self, now_ns: int) -> Mapping[str, float]:
         """Return the figures for diagnostics; the rate is that since the last summary."""
@@ -131,7 +136,7 @@ class LoopStatistics:
         self._window_cycles = 0
         jitter = self.jitter.percentiles_us(50, 99, 100)
         latency = self.latency.percentiles_us(50, 99, 100)
-        return {
+        figures = {
             "rate_hz": rate,
             "cycles": self.cycles,
             "overruns": self.overruns,
@@ -142,3 +147,8 @@ class LoopStatistics:
             "command_latency_p99_us": latency[1],
             "command_latency_max_us": latency[2],
         }
+        if self.answered_age.count:
+            ages = self.answered_age.percentiles_us(50, 99, 100)
+            names = ("answered_age_p50_us", "answered_age_p99_us", "answered_age_max_us")
+            figures.update(zip(names, ages, strict=True))
+        return figures

@@ -254,10 +254,20 @@ class PlantInterface:
                 self._commanders.suspect_twins(command, self.clock())
             if refusal is None and kind is Input.EFFORT_COMMAND and command is not None:
                 self._commanders.suspect_second_plant(command)
+                self._note_round_trip(command)
             if refusal is None and self.on_command is not None and command is not None:
                 self.on_command(kind, command)
 
         return receive
+
+    def _note_round_trip(self, command: JointCommand) -> None:
+        """Measure until the answer reached this process; that it waits there until it is looked at costs it nothing.
+
+        Both are system time; they differ by a fraction of a period, so a step of that clock between them is unlikely.
+        """
+        answers = self.sample is not None and command.stamp_ns == self.sample.stamp_ns
+        if answers and self.arrived_ns and self.statistics is not None:
+            self.statistics.round_trip(self.arrived_ns - self.published_ns)
 
     def _on_look(self) -> None:
         if self._pressed.is_set():
