@@ -286,6 +286,19 @@ def _node() -> Iterator[Row]:
     in_c = peer("the same in C", limit_lockstep_speed)
     what = "node, lockstep 2 ms, controller and disturbance as processes"
     yield measured(what, lockstep_speed(60.0), "x real time", peer=in_c, at_least_times_peer=_LEAST_OF_LOCKSTEP)
+    yield from _under_load()
+
+
+def _under_load() -> Iterator[Row]:
+    from tests.benchmarks.loaded_plants import loaded_plants
+
+    loaded = loaded_plants(60.0)
+    what = "two plants at 500 Hz, controlled, under noise, recorded, on the console, two busy loops, 60 s"
+    note = "; ".join(f"{plant} {share:.2f} %" for plant, share in loaded.missed.items())
+    yield measured(f"{what}: missed deadlines", max(loaded.missed.values()), "%", at_most=0.5, note=note)
+    yield measured(f"{what}: faults", len(loaded.faults), "", at_most=0.0, note="; ".join(loaded.faults))
+    note = f"of {loaded.recorded + loaded.lost} messages"
+    yield measured(f"{what}: lost in the bag", loaded.lost, "", at_most=0.0, note=note)
 
 
 def _limit(duration: float, cores: Sequence[int] | None) -> tuple[LimitFigures | None, str]:

@@ -14,6 +14,7 @@ import psutil
 from pendulum_bags.experiments.domain import reserve_domain
 from pendulum_msgs_py.programs import graph
 from tests.benchmarks.plant_listener import PlantListener, cpu_time, domain_environment
+from tests.benchmarks.two_plants import patient_watchdog
 from tests.processes import ProcessGroup
 
 __all__ = ["BridgeLoopFigures", "loop_figures"]
@@ -64,8 +65,7 @@ def loop_figures(rate: float, duration: float) -> BridgeLoopFigures:
         group = ProcessGroup(Path(folder), _ROOT)
         listener = PlantListener(domain, _BRIDGE)
         said = listener.rows[_BRIDGE]
-        # What a desktop's scheduler may sleep, 25 ms, is many cycles at a high rate.
-        watchdog = max(3, math.ceil(0.025 * rate))
+        watchdog = patient_watchdog(rate)
         bridge = graph.bridge("/hw", feedback_rate=rate, initial_position=math.pi, feedback_watchdog=watchdog)
         controller = graph.controller("/hw")
         try:

@@ -22,7 +22,7 @@ from tests.benchmarks.plant_listener import PlantListener, cpu_time
 from tests.benchmarks.two_plants import two_plants
 from tests.processes import ProcessGroup, RunningProgram
 
-__all__ = ["CHROMIUM", "Look", "looks"]
+__all__ = ["CHROMIUM", "Look", "looks", "start_console"]
 
 CHROMIUM = Path("/usr/bin/chromium")
 _WARM_UP = 4.0
@@ -71,7 +71,7 @@ def looks(duration: float, ways: Sequence[str] = ("nobody", "console", "reader",
         address = ""
         for way in ways:
             if way != "nobody" and not address:
-                console, address = _console(running.group, running.environment, running.folder / "runs")
+                console, address = start_console(running.group, running.environment, running.folder / "runs")
                 processes["console"] = [psutil.Process(console.pid)]
             with contextlib.ExitStack() as stack:
                 count: Callable[[], float] = float
@@ -113,7 +113,14 @@ def _measure(
     )
 
 
-def _console(group: ProcessGroup, environment: dict[str, str], runs: Path) -> tuple[RunningProgram, str]:
+def start_console(group: ProcessGroup, environment: dict[str, str], runs: Path) -> tuple[RunningProgram, str]:
+    """Start a console on a free port; return it with its address.
+
+    Args:
+        group: Starts and ends it.
+        environment: For its process.
+        runs: Folder of its runs.
+    """
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         port = probe.getsockname()[1]

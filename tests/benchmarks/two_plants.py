@@ -15,10 +15,12 @@ from tests.benchmarks.plant_listener import PlantListener, domain_environment
 from tests.fixtures import PROJECT
 from tests.processes import ProcessGroup, RunningProgram
 
-__all__ = ["PLANTS", "RATE", "TwoPlants", "two_plants"]
+__all__ = ["PLANTS", "RATE", "TwoPlants", "patient_watchdog", "two_plants"]
 
 RATE = 500.0
 """States per second of each plant [Hz]."""
+_LONGEST_SLEEP = 0.025
+"""What a desktop's scheduler may keep a program from running [s]: many cycles at a high rate."""
 PLANTS = ("/sim/simulator", "/hw/bridge")
 
 
@@ -41,6 +43,15 @@ class TwoPlants:
     programs: list[RunningProgram]
 
 
+def patient_watchdog(rate: float) -> int:
+    """Return the cycles without feedback after which a bridge on an emulator should fault on a busy machine [-].
+
+    Args:
+        rate: Feedback records per second [Hz].
+    """
+    return max(3, math.ceil(_LONGEST_SLEEP * rate))
+
+
 @contextmanager
 def two_plants() -> Iterator[TwoPlants]:
     """Start them, the bridge armed, and end them with all that their group started."""
@@ -50,7 +61,13 @@ def two_plants() -> Iterator[TwoPlants]:
         try:
             nodes = (
                 graph.simulator("/sim", rate_hz=RATE, start="top"),
-                graph.bridge("/hw", backend="emulator", feedback_rate=RATE, initial_position=math.pi),
+                graph.bridge(
+                    "/hw",
+                    backend="emulator",
+                    feedback_rate=RATE,
+                    initial_position=math.pi,
+                    feedback_watchdog=patient_watchdog(RATE),
+                ),
                 *(graph.controller(space, period=1.0 / RATE) for space in ("/sim", "/hw")),
                 *(graph.disturbance(space, autostart=True) for space in ("/sim", "/hw")),
             )
