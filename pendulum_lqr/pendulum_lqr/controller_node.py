@@ -26,8 +26,13 @@ from pendulum_lqr.controller import (
     specs_of,
     unwrapped,
 )
-from pendulum_lqr.controllers.joint_lqr import joint_parameters, make_joint_controller
 from pendulum_lqr.interface import Controller, JointController
+from pendulum_lqr.joint_controller import (
+    JOINT_CONTROLLER_NAMES,
+    joint_controller_class,
+    joint_parameters,
+    make_joint_controller,
+)
 from pendulum_lqr.sampling import ASSUMED_PERIOD, PeriodWatch, differs, rate_problem, uses_period
 from pendulum_msgs_py.contract import names
 from pendulum_msgs_py.contract.cdr import encode_joints
@@ -64,7 +69,7 @@ NODE_SPECS: tuple[ParameterSpec, ...] = (
     ParameterSpec("controller", "lqr", "", "Which controller.", choices=tuple(CONTROLLERS), read_only=True),
     ParameterSpec(
         "plant", "thesis", "", f"Plant to design for: {PRESET_NAMES} or the path of a plant file; of several joints, "
-        f"with lqr, tvlqr or policy: {', '.join(MECHANISM_PRESETS)}.", read_only=True,
+        f"with {JOINT_CONTROLLER_NAMES}: {', '.join(MECHANISM_PRESETS)}.", read_only=True,
     ),
     ParameterSpec(
         "period", 0.0, "s", "Sampling period of the loop, which discrete designs and filters need; 0 takes it from the "
@@ -275,8 +280,7 @@ class ControllerNode(LifecycleNode, PollingNode):
 
     def _uses_period(self) -> bool:
         if isinstance(self._plant, MechanismParameters):
-            # An LQR of several joints, continuous and sampled, does not; whether it settles is seen once states come.
-            return bool(self._settings["controller"] == "policy")
+            return joint_controller_class(self._settings["controller"], self._plant).SAMPLED
         return uses_period(self._settings["controller"], self._settings["velocity"])
 
     def _may_answer(self) -> bool:
@@ -302,17 +306,14 @@ class ControllerNode(LifecycleNode, PollingNode):
         try:
             self._period_measured = True
             if isinstance(plant, MechanismParameters):
-                if values["controller"] == "lqr":
+                if not self._uses_period():
+                    # Whether it settles at this period is seen by its design.
                     self._period = measured
                     self._design(values)
-                elif values["controller"] == "policy":
-                    # How many states each of its answers holds for depends on their period.
-                    if not values["period"]:
-                        self._design_for(measured)
-                    elif self._loop is not None and isinstance(self._loop.controller, JointController):
-                        self._loop.controller.check(measured)
-                elif differs(measured, self._period):
-                    raise PendulumError(f"the trajectory is followed every {self._period:g} s")
+                elif not values["period"]:
+                    self._design_for(measured)
+                elif self._loop is not None and isinstance(self._loop.controller, JointController):
+                    self._loop.controller.check(measured)
                 self._period_known = True
                 return True
             if not values["period"] and abs(measured / self._period - 1.0) > _SAME_PERIOD:

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import Protocol
+from collections.abc import Mapping, Sequence
+from typing import Any, ClassVar, Protocol
 
 from pendulum_msgs_py.contract.values import Vector
+from pendulum_msgs_py.parameters import ParameterSpec
+from pendulum_msgs_py.plants.mechanism_parameters import MechanismParameters
 
 __all__ = ["Controller", "JointController"]
 
@@ -40,8 +42,32 @@ class JointController:
         effort_limits: Largest effort of each driven joint [N m or N].
     """
 
+    SUMMARY: ClassVar[str] = ""
+    """One sentence for tables."""
+    SAMPLED: ClassVar[bool] = True
+    """Whether its answers depend on the period at which states come; for others the period is only judged."""
+
     def __init__(self, effort_limits: Vector) -> None:
         self.effort_limits = effort_limits
+
+    @classmethod
+    def parameters(cls, plant: MechanismParameters) -> tuple[ParameterSpec, ...]:
+        """Return what can be set, with defaults for a plant; nothing by default."""
+        return ()
+
+    @classmethod
+    def design(cls, plant: MechanismParameters, p: Mapping[str, Any], period: float | None) -> JointController:
+        """Return the controller for a plant.
+
+        Args:
+            plant: The plant.
+            p: Checked values of :meth:`parameters`.
+            period: Period at which states come [s]; None where it is not known yet.
+
+        Raises:
+            ParameterError: The values do not make a controller for this plant at this period.
+        """
+        raise NotImplementedError(f"{cls.__name__}.design")
 
     @property
     def notice(self) -> str:

@@ -9,7 +9,7 @@ import pytest
 import scipy.linalg
 
 from pendulum_lqr.answering import AnswerLoop
-from pendulum_lqr.controllers.joint_lqr import make_joint_controller
+from pendulum_lqr.joint_controller import make_joint_controller
 from pendulum_lqr.mechanism_model import linearise_mechanism, mechanism_lqr
 from pendulum_lqr.sampled_design import discretise
 from pendulum_msgs_py.contract.values import JointSample

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from pendulum_lqr import swing_up_cli
-from pendulum_lqr.controllers.joint_lqr import make_joint_controller
+from pendulum_lqr.joint_controller import make_joint_controller
 from pendulum_lqr.mechanism_catch import CaughtRegion, MechanismCatch, deviation_of, make_mechanism_catch
 from pendulum_lqr.mechanism_controllers import (
     default_catch,

@@ -19,7 +19,7 @@ from pendulum_hw_bridge.clocks import SteppedClock
 from pendulum_hw_bridge.derating import Derating
 from pendulum_hw_bridge.emulation.faults import ActuatorFault
 from pendulum_hw_bridge.node_specs import SPECS
-from pendulum_lqr.controllers.joint_lqr import make_joint_controller
+from pendulum_lqr.joint_controller import make_joint_controller
 from pendulum_msgs_py.contract.commands import Refusal
 from pendulum_msgs_py.contract.supervisor import Input, Mode, PlantSupervisor
 from pendulum_msgs_py.contract.trajectory import thesis_ramp

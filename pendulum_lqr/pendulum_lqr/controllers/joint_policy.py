@@ -2,21 +2,32 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
 from typing import Any
 
+from pendulum_lqr.controllers.joint_lqr import JOINT_LIMIT, joint_limits
 from pendulum_lqr.interface import Controller, JointController
+from pendulum_lqr.joint_controller import make_joint_controller
 from pendulum_lqr.mechanism_catch import MechanismCatch, deviation_of, make_mechanism_catch
 from pendulum_lqr.policy import Policy, require_plant
-from pendulum_lqr.policy_answers import START_TIME, ZERO, PolicyAnswers, check_policy_period, states_to_hold
+from pendulum_lqr.policy_answers import (
+    START_TIME,
+    ZERO,
+    PolicyAnswers,
+    check_policy_period,
+    policy_specs,
+    states_to_hold,
+)
 from pendulum_lqr.policy_file import load_policy
 from pendulum_lqr.sampling import ASSUMED_PERIOD
 from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.joints import Vector
+from pendulum_msgs_py.parameters import ParameterSpec
 from pendulum_msgs_py.plants.mechanism_parameters import MechanismParameters
 
-__all__ = ["JointPolicy", "design_joint_policy"]
+__all__ = ["JointPolicy"]
+
+_FALLBACKS = (ZERO, "lqr")
 
 
 class JointPolicy(JointController):
@@ -30,6 +41,8 @@ class JointPolicy(JointController):
         start_time: Time from the first state until it has all of its effort [s].
         catch: LQR that takes over near upright; None for none.
     """
+
+    SUMMARY = "a learned policy from a file"
 
     def __init__(
         self,
@@ -47,6 +60,41 @@ class JointPolicy(JointController):
         self.fallback = fallback
         self.catch = catch
         self._deviation = policy.coordinates.deviation
+
+    @classmethod
+    def parameters(cls, plant: MechanismParameters) -> tuple[ParameterSpec, ...]:
+        """Return the file, who falls back, who catches, and the limit."""
+        catch = ParameterSpec(
+            "catch",
+            ZERO,
+            "",
+            "Who takes over near upright, in the region from which it catches: zero for nobody, or lqr.",
+            choices=_FALLBACKS,
+        )
+        return (*policy_specs(_FALLBACKS), catch, JOINT_LIMIT)
+
+    @classmethod
+    def design(cls, plant: MechanismParameters, p: Mapping[str, Any], period: float | None) -> JointPolicy:
+        """Return the controller of the parameter ``policy``.
+
+        Raises:
+            ParameterError: There is no file, or the policy is for another plant or period.
+            DataError: The file is refused.
+        """
+        fallback = None
+        if p["fallback"] != ZERO:
+            fallback = make_joint_controller(p["fallback"], plant, {"effort_limit": p["effort_limit"]}, period)
+        if not p["policy"]:
+            raise ParameterError("policy is empty; expected the path of a policy file (.npz)")
+        policy = load_policy(p["policy"])
+        require_plant(policy, plant)
+        if period is not None:
+            check_policy_period(policy, period)
+        own = joint_limits(plant, p["effort_limit"])
+        limits = tuple(min(both) for both in zip(own, policy.effort_limit, strict=True))
+        hold = states_to_hold(policy, ASSUMED_PERIOD if period is None else period)
+        catch = make_mechanism_catch(plant, *plant.mechanism.weights, limits) if p["catch"] != ZERO else None
+        return cls(policy, hold, limits, fallback, start_time=p["start_time"], catch=catch)
 
     @property
     def notice(self) -> str:
@@ -98,31 +146,3 @@ class JointPolicy(JointController):
             self.catch.active = previous.catch.active
         if self.fallback is not None and previous.fallback is not None:
             self.fallback.carry_over(previous.fallback)
-
-
-def design_joint_policy(
-    plant: MechanismParameters, p: Mapping[str, Any], period: float | None, fallback: JointController | None
-) -> JointPolicy:
-    """Return the controller of the parameter ``policy``.
-
-    Args:
-        plant: The plant.
-        p: Checked parameters of the controller.
-        period: Period of the states [s]; None where it is not known yet.
-        fallback: Who answers after it gave up; None for no effort.
-
-    Raises:
-        ParameterError: There is no file, or the policy is for another plant or period.
-        DataError: The file is refused.
-    """
-    if not p["policy"]:
-        raise ParameterError("policy is empty; expected the path of a policy file (.npz)")
-    policy = load_policy(p["policy"])
-    require_plant(policy, plant)
-    if period is not None:
-        check_policy_period(policy, period)
-    limit = p["effort_limit"] or math.inf
-    limits = tuple(min(limit, *both) for both in zip(plant.effort_limits, policy.effort_limit, strict=True))
-    hold = states_to_hold(policy, ASSUMED_PERIOD if period is None else period)
-    catch = make_mechanism_catch(plant, *plant.mechanism.weights, limits) if p["catch"] != ZERO else None
-    return JointPolicy(policy, hold, limits, fallback, start_time=p["start_time"], catch=catch)

@@ -2,9 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from typing import Any
+
 from pendulum_lqr.interface import JointController
 from pendulum_lqr.mechanism_controllers import default_catch, stored_trajectory
 from pendulum_lqr.mechanism_tvlqr import MechanismTvlqr
+from pendulum_lqr.sampling import differs
+from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.joints import Vector
 from pendulum_msgs_py.plants.mechanism_parameters import MechanismParameters
 
@@ -22,12 +27,37 @@ class JointSwingUp(JointController):
         ParameterError: No swing-up is stored for this plant.
     """
 
+    SUMMARY = "swing-up along the stored trajectory of a preset by TVLQR, then LQR"
+
     def __init__(self, plant: MechanismParameters, period: float) -> None:
         super().__init__(plant.effort_limits)
+        self._period = period
         trajectory = stored_trajectory(plant)
         self._duration = trajectory.duration
         q, r = plant.mechanism.weights
         self._inner = MechanismTvlqr(plant, period, trajectory, default_catch(plant), q=q, r=r)
+
+    @classmethod
+    def design(cls, plant: MechanismParameters, p: Mapping[str, Any], period: float | None) -> JointSwingUp:
+        """Return the swing-up, which is tracked at one period.
+
+        Raises:
+            ParameterError: The period is not known, or no swing-up is stored for this plant.
+        """
+        if period is None:
+            raise ParameterError(
+                "tvlqr follows its trajectory at the period of the states; expected it, as period:=0.002"
+            )
+        return cls(plant, period)
+
+    def check(self, period: float) -> None:
+        """Refuse another period than that of the design [s].
+
+        Raises:
+            ParameterError: as said.
+        """
+        if differs(period, self._period):
+            raise ParameterError(f"the trajectory is followed every {self._period:g} s")
 
     def reset(self) -> None:
         """Begin anew, at hanging."""
