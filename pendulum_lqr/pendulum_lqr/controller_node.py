@@ -126,8 +126,10 @@ class ControllerNode(LifecycleNode, PollingNode):
         self._settings = NodeParameters(self, NODE_SPECS + own, self._design, self._swap)
         self._period = self._settings["period"] or ASSUMED_PERIOD
         self._period_measured = False
-        if kind == "tvlqr" and isinstance(self._plant, MechanismParameters):
-            self.get_logger().info("tries out from where the LQR catches, which takes some seconds")
+        if isinstance(self._plant, MechanismParameters):
+            takes_time = joint_controller_class(kind, self._plant).DESIGNING
+            if takes_time:
+                self.get_logger().info(takes_time)
         # A bad value at start ends the node with its reason instead of waiting for a transition to fail.
         self._pending: Controller | JointController | None = self._design(self._settings.values)
         self._simulated_time = bool(self.get_parameter("use_sim_time").value)
@@ -310,7 +312,7 @@ class ControllerNode(LifecycleNode, PollingNode):
                     # Whether it settles at this period is seen by its design.
                     self._period = measured
                     self._design(values)
-                elif not values["period"]:
+                elif not values["period"] and abs(measured / self._period - 1.0) > _SAME_PERIOD:
                     self._design_for(measured)
                 elif self._loop is not None and isinstance(self._loop.controller, JointController):
                     self._loop.controller.check(measured)

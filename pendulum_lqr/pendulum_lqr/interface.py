@@ -46,6 +46,8 @@ class JointController:
     """One sentence for tables."""
     SAMPLED: ClassVar[bool] = True
     """Whether its answers depend on the period at which states come; for others the period is only judged."""
+    DESIGNING: ClassVar[str] = ""
+    """What its design does where that takes seconds, for who waits."""
 
     def __init__(self, effort_limits: Vector) -> None:
         self.effort_limits = effort_limits

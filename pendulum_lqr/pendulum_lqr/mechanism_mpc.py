@@ -87,9 +87,14 @@ class MechanismMpc:
             self._plan = None
             self._before = self.catch.command(deviation)
             return self._before
-        # A plan that nobody followed for a while is of no use.
-        if self._plan is None or t - self._planned > 2.0 * self.settings.step:
+        if self._plan is None:
             self._plan = self._best(x, None, self.settings.guesses)
+            self._planned, self._age = t, 0
+        elif t - self._planned > 2.0 * self.settings.step:
+            # A plan that nobody followed for a while begins elsewhere. In real time that is one whose search took too
+            # long for its answer to be applied: it is a better start than none, and another search would be as late.
+            late = self._solve(x, self._plan.efforts, None, self.settings.guess_iterations)
+            self._plan = self._best(x, late, self.settings.retries)
             self._planned, self._age = t, 0
         elif t - self._planned >= self.settings.step - 0.5 * self.period:
             self._plan_again(t, x)

@@ -82,55 +82,57 @@ def discretise(model: LinearModel, period: float, delay: float = 0.0) -> Discret
     return DiscreteModel(A, B, period, delay, pending)
 
 
-def discrete_lqr(model: DiscreteModel, q: ArrayLike, r: float, cross: Matrix | None = None) -> Gain:
+def discrete_lqr(model: DiscreteModel, q: ArrayLike, r: float | Matrix, cross: Matrix | None = None) -> Gain:
     """Return the gain that minimises the sum of x' Q x + 2 x' N u + u' R u over the samples.
 
+    Its K has the shape (n + p m,) for one input and (m, n + p m) for several.
+
     Args:
-        model: Sampled model.
+        model: Sampled model with m inputs.
         q: Weights of the leading states, shape (k,) or (k, k): of [theta, theta_dot], or the whole matrix that
             :func:`sampled_cost` gives. What follows costs nothing.
-        r: Weight of the torque, > 0.
-        cross: N, shape (k, 1), as :func:`sampled_cost` gives it; none by default.
+        r: Weight of each input, > 0, or R of shape (m, m), as :func:`sampled_cost` gives it.
+        cross: N, shape (k, m), as :func:`sampled_cost` gives it; none by default.
 
     Raises:
         DesignError: As :func:`continuous_lqr`.
     """
-    size = model.A.shape[0]
-    Q, R = _padded_cost(q, r, size)
+    size, m = model.B.shape
+    Q, R = _padded_cost(q, r, size, m)
     N = None
     if cross is not None:
-        N = np.zeros((size, 1))
+        N = np.zeros((size, m))
         N[: cross.shape[0]] = cross
     require_controllable(model.A, model.B, discrete=True)
     try:
         S = scipy.linalg.solve_discrete_are(model.A, model.B, Q, R, s=N)
     except (np.linalg.LinAlgError, ValueError) as error:
-        raise DesignError(no_solution(Q, r, error)) from error
+        raise DesignError(no_solution(Q, float(R[0, 0]), error)) from error
     BS = model.B.T @ S
-    K = (BS @ model.A + (0.0 if N is None else N.T)) / float((R + BS @ model.B)[0, 0])
+    K = np.linalg.solve(R + BS @ model.B, BS @ model.A + (0.0 if N is None else N.T))
     poles = sort_poles(np.linalg.eigvals(model.A - model.B @ K))
     if np.max(np.abs(poles)) >= 1.0:
         raise DesignError(f"closed loop has poles {poles} on or outside the unit circle; expected smaller weights")
-    return Gain(K[0], S, poles)
+    return Gain(K[0] if m == 1 else K, S, poles)
 
 
 def sampled_cost(
     model: LinearModel, q: ArrayLike, r: float, period: float, delay: float = 0.0
-) -> tuple[Matrix, float, Matrix]:
+) -> tuple[Matrix, Matrix, Matrix]:
     """Return (Q_d, R_d, N_d), the continuous cost collected over one period of zero-order hold.
 
     A discrete LQR with these weights minimises the very cost of the continuous LQR, at any sampling period and delay.
     A torque that is still on its way costs where it moves the state, in Q_d; its own cost is counted when it is sent.
 
     Args:
-        model: Linear model with n states.
+        model: Linear model with n states and m inputs.
         q: Continuous weights of what is measured, [theta, theta_dot] of one joint.
-        r: Continuous weight of the torque.
+        r: Continuous weight of each input.
         period: Sampling period [s].
-        delay: As in :func:`discretise`, whose m inputs on their way join the state.
+        delay: As in :func:`discretise`, whose p m inputs on their way join the state.
 
     Returns:
-        Q_d of shape (n + m, n + m), R_d, and N_d of shape (n + m, 1).
+        Q_d of shape (n + p m, n + p m), R_d of shape (m, m), and N_d of shape (n + p m, m).
 
     Source:
         C. Van Loan, Computing integrals involving the matrix exponential, IEEE TAC 23(3), 1978, theorem 1;
@@ -140,41 +142,42 @@ def sampled_cost(
     if not (math.isfinite(period) and period > 0.0):
         raise DesignError(f"period is {period} s; expected a finite value > 0")
     pending, rest = _on_their_way(period, delay + model.delay)
-    n = model.A.shape[0]
-    size = n + pending + 1
+    n, m = model.B.shape
+    size = n + (pending + 1) * m
     state = np.eye(n, size)
     total = np.zeros((size, size))
-    # The period in the pieces in which one torque acts: where it is in [state; on their way; new], and for how long.
-    older, newer = (n, min(n + 1, size - 1)) if rest > 0.0 else (n, n)
+    # The period in the pieces in which one input acts: where it is in [state; on their way; new], and for how long.
+    older, newer = (n, n + m) if rest > 0.0 else (n, n)
     for column, time in ((older, rest), (newer, period - rest)):
         if time == 0.0:
             continue
-        start = np.vstack([state, np.eye(size)[column]])
+        start = np.vstack([state, np.eye(size)[column : column + m]])
         total += start.T @ _collected(model, Q, time) @ start
         phi, gamma = _hold(model, time)
         state = phi @ state + gamma @ start[n:]
-    total[-1, -1] += float(R[0, 0]) * period
+    total[-m:, -m:] += float(R[0, 0]) * period * np.eye(m)
     total = 0.5 * (total + total.T)
-    return total[:-1, :-1], float(total[-1, -1]), total[:-1, -1:]
+    return total[:-m, :-m], total[-m:, -m:], total[:-m, -m:]
 
 
 def _collected(model: LinearModel, Q: Matrix, time: float) -> Matrix:
-    """Return the cost of [x; u] over a time in which u is held, shape (n + 1, n + 1)."""
-    n = model.A.shape[0]
-    F = np.zeros((n + 1, n + 1))
+    """Return the cost of [x; u] over a time in which u is held, shape (n + m, n + m)."""
+    n, m = model.B.shape
+    size = n + m
+    F = np.zeros((size, size))
     F[:n, :n] = model.A
     F[:n, n:] = model.B
-    W = np.zeros((n + 1, n + 1))
+    W = np.zeros((size, size))
     W[:n, :n] = model.C.T @ Q @ model.C
     # Long intervals would overflow exp(+214 s): collect over short pieces and add them up.
     pieces = max(1, math.ceil(float(np.abs(F).sum(axis=1).max()) * time / 2.0))
     step = time / pieces
     block = np.block([[-F.T, W], [np.zeros_like(F), F]])
     exponential = scipy.linalg.expm(block * step)
-    forward = exponential[n + 1 :, n + 1 :]
-    piece = forward.T @ exponential[: n + 1, n + 1 :]
-    total = np.zeros((n + 1, n + 1))
-    transition = np.eye(n + 1)
+    forward = exponential[size:, size:]
+    piece = forward.T @ exponential[:size, size:]
+    total = np.zeros((size, size))
+    transition = np.eye(size)
     for _ in range(pieces):
         total += transition.T @ piece @ transition
         transition = forward @ transition
@@ -190,13 +193,13 @@ def _on_their_way(period: float, delay: float) -> tuple[int, float]:
     return whole + (1 if rest > 0.0 else 0), rest
 
 
-def _padded_cost(q: ArrayLike, r: float, size: int) -> tuple[Matrix, Matrix]:
-    """Return Q (size, size), zero beyond the states that q names, and R."""
-    given = np.asarray(q, dtype=np.float64)
-    Q2, R = cost_matrices(q, r, given.shape[0] if given.ndim == 2 else 2)
+def _padded_cost(q: ArrayLike, r: float | Matrix, size: int, m: int) -> tuple[Matrix, Matrix]:
+    """Return Q (size, size), zero beyond the states that q names, and R (m, m)."""
+    given, inputs = np.asarray(q, dtype=np.float64), np.asarray(r, dtype=np.float64)
+    Q2, _ = cost_matrices(q, float(inputs.flat[0]), given.shape[0] if given.ndim == 2 else 2)
     Q = np.zeros((size, size))
     Q[: Q2.shape[0], : Q2.shape[1]] = Q2
-    return Q, R
+    return Q, inputs * np.eye(m) if inputs.ndim == 0 else inputs
 
 
 def _hold(model: LinearModel, time: float) -> tuple[Matrix, Matrix]:

@@ -251,7 +251,7 @@ def test_sampled_cost_agrees_with_quadrature():
         step = scipy.linalg.expm(block * t)
         values.append(step.T @ np.diag([10.0, 1.0, 2.0]) @ step)
     total = scipy.integrate.trapezoid(values, times, axis=0)
-    np.testing.assert_allclose(np.block([[Q, N], [N.T, np.array([[R]])]]), total, rtol=1e-4, atol=1e-7)
+    np.testing.assert_allclose(np.block([[Q, N], [N.T, R]]), total, rtol=1e-4, atol=1e-7)
 
 
 def test_integral_action_leaves_no_offset_and_needs_a_weight():

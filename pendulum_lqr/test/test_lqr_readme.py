@@ -9,7 +9,9 @@ from pendulum_lqr.answering import StateRefusal
 from pendulum_lqr.controller import COMMON_PARAMETERS, CONTROLLERS, controller_class, make_controller
 from pendulum_lqr.design import DesignError
 from pendulum_lqr.disturbance import DISTURBANCE_SPECS
+from pendulum_lqr.joint_controller import JOINT_CONTROLLERS, joint_controller_class
 from pendulum_msgs_py.parameters import markdown_table
+from pendulum_msgs_py.plants.mechanism_parameters import load_mechanism
 from pendulum_msgs_py.plants.plant_parameters import load_plant
 
 README = (Path(__file__).resolve().parents[1] / "README.md").read_text(encoding="utf-8")
@@ -25,6 +27,15 @@ def table(name: str) -> str:
 def test_every_controller_is_listed_with_its_parameters(name):
     assert f"| `{name}` | {controller_class(name).SUMMARY} |" in README
     assert table(name) == markdown_table(controller_class(name).PARAMETERS)
+
+
+@pytest.mark.parametrize("name", JOINT_CONTROLLERS)
+def test_every_controller_of_several_joints_is_listed_with_its_parameters(name):
+    plant = load_mechanism("cart_pole")
+    chosen = joint_controller_class(name, plant)
+    assert f"| `{name}` | {chosen.SUMMARY} |" in README
+    if specs := chosen.parameters(plant):
+        assert table(f"joint {name}") == markdown_table(specs)
 
 
 def test_the_tables_of_the_nodes_are_those_of_the_code():

@@ -135,6 +135,37 @@ def test_iterative_lqr_and_mpc_bring_a_cart_pole_up_within_its_limits() -> None:
     assert max(abs(effort[0]) for effort in efforts) <= plant.effort_limits[0]
     controller.reset()
     assert controller.command(0.0, (0.0,) * 4) == efforts[0]
+    # A first plan takes so long that a plant in real time lets its answer go: the next does not search as long again.
+    solved = []
+    solve = controller._solve
+    controller._solve = lambda *asked: (solved.append(asked), solve(*asked))[1]  # type: ignore[method-assign]
+    controller.reset()
+    controller.command(0.0, (0.0,) * 4)
+    assert len(solved) == controller.settings.guesses
+    solved.clear()
+    late = controller.command(0.1, (0.0,) * 4)
+    assert len(solved) == 1 + controller.settings.retries
+    assert controller._arrives(controller._plan)
+    assert late == pytest.approx(efforts[0], abs=0.5)
+    # On the graph it is the same, and begins anew with a plant that begins anew, whatever turns were made before.
+    on_the_graph = make_joint_controller("nmpc", plant, {}, DT)
+    assert "s by iterative LQR, then LQR within" in on_the_graph.describe()
+    for turned in (0.0, 2.0 * math.pi):
+        on_the_graph.reset()
+        again = []
+        x = (0.0,) * 4
+        for k in range(30):
+            again.append(on_the_graph.command(k * DT, (x[0], x[1] + turned), x[2:]))
+            x = step(plant, x, again[-1])
+        assert np.array(again) == pytest.approx(np.array(efforts[:30]), abs=1e-6)
+    on_the_graph.check(DT)
+    with pytest.raises(ParameterError, match=r"nmpc plans for answers every 0\.002 s; expected states at that period"):
+        on_the_graph.check(0.01)
+
+
+def test_plans_without_dry_friction_are_not_for_a_passive_joint_that_has_some() -> None:
+    with pytest.raises(ParameterError, match=r"elbow of plant 'pendubot' is passive with 0\.12 N m; expected 0"):
+        make_joint_controller("nmpc", load_mechanism("pendubot"), {}, DT)
 
 
 def test_nothing_is_planned_from_a_state_that_is_no_number() -> None:

@@ -165,6 +165,29 @@ def test_an_acrobot_swings_up_in_lockstep_and_stays(peer: Peer, processes) -> No
     assert np.abs(peer.states[-1].velocity).max() < 0.05
 
 
+def test_mpc_takes_the_period_of_the_states_and_stops_a_cart_before_the_end_of_its_track(peer: Peer, processes) -> None:
+    controller = _start(
+        processes, "pendulum_lqr", "controller", "plant:=cart_pole", "controller:=mpc", "use_sim_time:=true"
+    )
+    controller.wait_for_output(r"mpc for plant cart_pole: horizon 50, positions within \[1\.71, none\]", 30)
+    _start(
+        processes,
+        "pendulum_sim",
+        "simulator",
+        "plant:=cart_pole",
+        "clock:=lockstep",
+        "rate_hz:=50.0",
+        "lockstep_duration:=4.0",
+        "lockstep_subscribers:=2",
+        "initial_position:=[1.5, 3.1415927]",
+        "initial_velocity:=[0.5, 0.0]",
+    )
+    peer.until(lambda: peer.states and peer.states[-1].header.stamp.sec == 5, "the last state, after 4 s", 90.0)
+    controller.wait_for_output(r"designed for states every 0\.02 s", 10)
+    assert max(state.position[0] for state in peer.states) < 1.79
+    assert np.abs(np.array(peer.states[-1].position) - [0.0, math.pi]).max() < 0.05
+
+
 def test_a_policy_holds_a_cart_pole_in_lockstep_and_gives_up_where_it_was_never_trained(
     peer: Peer, processes, tmp_path: Path
 ) -> None:
@@ -299,7 +322,7 @@ REFUSED: list[Refused] = [
     (
         CONTROLLER,
         ("plant:=acrobot", "controller:=pid"),
-        "pid is for plants of one joint, and plant 'acrobot' has shoulder, elbow; expected lqr, tvlqr or policy",
+        "pid is for plants of one joint, and plant 'acrobot' has shoulder, elbow; expected lqr, tvlqr, mpc, nmpc or",
     ),
     (CONTROLLER, ("plant:=cart_pole", "controller:=policy"), "policy is empty; expected the path of a policy file"),
     (CONTROLLER, ("plant:=acrobot", "q:=[1.0, 2.0]"), "q has the shape (2,); expected (4,)"),

@@ -29,6 +29,8 @@ class JointSwingUp(JointController):
 
     SUMMARY = "swing-up along the stored trajectory of a preset by TVLQR, then LQR"
 
+    DESIGNING = "tries out from where the LQR catches, which takes some seconds"
+
     def __init__(self, plant: MechanismParameters, period: float) -> None:
         super().__init__(plant.effort_limits)
         self._period = period

@@ -1,0 +1,185 @@
+"""Linear MPC of several joints: the discrete LQR where nothing limits it, and within its limits elsewhere."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import scipy.integrate
+import scipy.linalg
+
+from pendulum_lqr.answering import AnswerLoop
+from pendulum_lqr.controllers.joint_mpc import JointMpc
+from pendulum_lqr.joint_controller import joint_parameters, make_joint_controller
+from pendulum_lqr.mechanism_model import linearise_mechanism
+from pendulum_lqr.sampled_design import discrete_lqr, discretise, sampled_cost
+from pendulum_msgs_py.contract.values import JointSample
+from pendulum_msgs_py.errors import ParameterError
+from pendulum_msgs_py.plants.mechanism_parameters import MechanismParameters, load_mechanism
+from pendulum_sim.mechanism_plant import MechanismPlant
+
+PLANTS = ("acrobot_frictionless", "pendubot_frictionless", "double_pendulum", "cart_pole", "furuta")
+PERIOD = 0.01
+
+
+def _upright(plant: MechanismParameters, *off: float) -> tuple[float, ...]:
+    return tuple(goal + d for goal, d in zip(plant.coordinates.goal, off, strict=True))
+
+
+def _delayed(name: str, delay: float) -> MechanismParameters:
+    plant = load_mechanism(name)
+    joints = tuple(
+        joint if joint.actuator is None else replace(joint, actuator=replace(joint.actuator, transport_delay=delay))
+        for joint in plant.joints
+    )
+    return replace(plant, joints=joints)
+
+
+@pytest.mark.parametrize("name", PLANTS)
+def test_without_active_limits_it_is_the_discrete_lqr(name: str) -> None:
+    plant = load_mechanism(name)
+    controller = make_joint_controller("mpc", plant, {}, PERIOD)
+    model = linearise_mechanism(plant)
+    cost = sampled_cost(model, *plant.mechanism.weights, PERIOD)
+    K = np.atleast_2d(discrete_lqr(discretise(model, PERIOD), *cost).K)
+    x = np.array([1e-3, -1e-3, 2e-3, -1e-3])
+    effort = controller.command(0.0, _upright(plant, *x[:2]), tuple(x[2:]))
+    expected = np.array(model.efforts) - K @ x
+    assert np.abs(expected).max() < min(plant.effort_limits)
+    assert effort == pytest.approx(expected, rel=1e-3, abs=1e-4)
+
+
+@pytest.mark.parametrize("delay", [0.0, 0.004, 0.01, 0.013])
+def test_the_cost_of_two_inputs_is_collected_as_that_of_one(delay: float) -> None:
+    model = linearise_mechanism(load_mechanism("double_pendulum"))
+    q, r, period = (3.0, 2.0, 1.0, 0.5), 0.7, 0.01
+    Q, R, N = sampled_cost(model, q, r, period, delay)
+    sampled = discretise(model, period, delay)
+    rng = np.random.default_rng(5)
+    z, u = rng.normal(size=sampled.A.shape[0]), rng.normal(size=2)
+    told = z @ Q @ z + 2.0 * z @ N @ u + u @ R @ u
+    # By quadrature: in each piece of the period the inputs that act in it, oldest first.
+    sent = np.concatenate([z[4:], u]).reshape(-1, 2)
+    switch = delay - math.floor(delay / period + 1e-9) * period
+
+    def flow(t: float, x: np.ndarray) -> np.ndarray:
+        acting = sent[0] if t < switch or len(sent) == 1 or switch < 1e-12 else sent[1]
+        return np.append(model.A @ x[:4] + model.B @ acting, x[:4] @ np.diag(q) @ x[:4])
+
+    x = np.append(z[:4], 0.0)
+    for begin, end in ((0.0, switch), (switch, period)):
+        if end > begin + 1e-12:
+            middle = 0.5 * (begin + end)
+            solved = scipy.integrate.solve_ivp(
+                lambda t, x, at=middle: flow(at, x), (begin, end), x, rtol=1e-10, atol=1e-12
+            )
+            x = solved.y[:, -1]
+    assert told == pytest.approx(x[4] + r * period * (u @ u), rel=1e-7)
+
+
+@pytest.mark.parametrize(("place", "velocity", "tilt"), [(1.5, 0.5, 0.0), (1.3, 1.0, 0.0), (1.6, 0.0, -0.05)])
+def test_a_cart_that_an_lqr_lets_hit_the_end_of_its_track_stops_before_it(
+    place: float, velocity: float, tilt: float
+) -> None:
+    plant = load_mechanism("cart_pole")
+    farthest = {}
+    for kind in ("lqr", "mpc"):
+        controller = make_joint_controller(kind, plant, {}, PERIOD)
+        cart = MechanismPlant(plant, PERIOD)
+        state = cart.reset((place, math.pi + tilt), (velocity, 0.0))
+        way = [place]
+        for _ in range(500):
+            state = cart.step(controller.command(state.time, state.position, state.velocity))
+            way.append(state.position[0])
+        assert np.abs(plant.coordinates.deviation(state.position)).max() < 0.02, kind
+        farthest[kind] = max(way)
+    assert farthest["lqr"] > 1.76
+    assert farthest["mpc"] < 1.79
+    assert farthest["mpc"] < farthest["lqr"] - 0.02
+
+
+def test_it_asks_for_no_more_than_each_limit_and_plans_with_it() -> None:
+    plant = load_mechanism("cart_pole")
+    controller = make_joint_controller("mpc", plant, {"effort_limit": 3.0}, PERIOD)
+    cart = MechanismPlant(plant, PERIOD)
+    state, asked = cart.reset((0.0, math.pi + 0.15)), []
+    for _ in range(500):
+        asked.append(controller.command(state.time, state.position, state.velocity)[0])
+        state = cart.step((asked[-1],))
+    assert max(map(abs, asked)) == pytest.approx(3.0, abs=1e-3)
+    assert max(map(abs, asked)) <= 3.0
+    assert np.abs(plant.coordinates.deviation(state.position)).max() < 0.02
+
+
+def test_what_is_on_its_way_counts() -> None:
+    plant = _delayed("acrobot_frictionless", 0.015)
+    controller = make_joint_controller("mpc", plant, {}, PERIOD)
+    model = linearise_mechanism(plant)
+    gain = discrete_lqr(discretise(model, PERIOD), *sampled_cost(model, *plant.mechanism.weights, PERIOD))
+    x = np.array([1e-3, 0.0, 0.0, 0.0])
+    sent = [0.0, 0.0]
+    for _ in range(4):
+        effort = controller.command(0.0, _upright(plant, *x[:2]), tuple(x[2:]))[0]
+        assert effort == pytest.approx(-float(gain.K @ [*x, *sent]), rel=1e-3, abs=1e-4)
+        sent = [sent[1], effort]
+    # Designed anew at the same period, it knows what the one before has sent; begun anew, nothing is on its way.
+    after = make_joint_controller("mpc", plant, {"q": [20.0, 10.0, 1.0, 1.0]}, PERIOD)
+    assert isinstance(after, JointMpc)
+    after.carry_over(controller)
+    assert [effort for (effort,) in after._on_their_way] == pytest.approx(sent)
+    controller.reset()
+    assert controller.command(0.0, _upright(plant, *x[:2]), tuple(x[2:]))[0] == pytest.approx(
+        -float(gain.K @ [*x, 0.0, 0.0]), rel=1e-3, abs=1e-4
+    )
+
+
+@pytest.mark.parametrize("name", ["acrobot_frictionless", "furuta"])
+def test_it_settles_a_plant_with_delay(name: str) -> None:
+    plant = _delayed(name, 0.012)
+    controller = make_joint_controller("mpc", plant, {}, PERIOD)
+    simulated = MechanismPlant(plant, PERIOD)
+    state = simulated.reset(_upright(plant, 0.01, -0.01))
+    for _ in range(600):
+        state = simulated.step(controller.command(state.time, state.position, state.velocity))
+    assert np.abs(plant.coordinates.deviation(state.position)).max() < 2e-3
+
+
+def test_where_the_solver_finds_no_plan_the_limited_lqr_answers_and_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
+    plant = load_mechanism("cart_pole")
+    controller = make_joint_controller("mpc", plant, {}, PERIOD)
+    assert isinstance(controller, JointMpc)
+    assert controller.notice == ""
+    monkeypatch.setattr(controller._program, "first", lambda *_: None)
+    x = np.array([0.01, 0.02, 0.0, 0.0])
+    expected = -float(np.atleast_2d(controller.gain.K)[0] @ x)
+    assert controller.command(0.0, _upright(plant, *x[:2]), (0.0, 0.0)) == pytest.approx((expected,))
+    assert controller.command(0.0, _upright(plant, 0.0, 1.0), (0.0, 0.0)) == (-plant.effort_limits[0],)
+    assert controller.notice == "no plan for 2 states: the LQR answered"
+
+
+@pytest.mark.parametrize("bad", [math.nan, math.inf])
+def test_a_state_that_is_not_finite_is_not_answered(bad: float) -> None:
+    loop = AnswerLoop(make_joint_controller("mpc", load_mechanism("furuta"), {}, PERIOD), math.inf)
+    assert loop.answer(JointSample(1, (0.0, bad), (0.0, 0.0), (0.0, 0.0)), 1) is None
+    assert loop.answered == 0
+
+
+def test_positions_are_limited_where_there_are_end_stops_and_wherever_somebody_says() -> None:
+    defaults = {
+        name: next(s.default for s in joint_parameters("mpc", load_mechanism(name)) if s.name == "position_limits")
+        for name in ("cart_pole", "furuta")
+    }
+    assert defaults == {"cart_pole": pytest.approx([1.71, 0.0]), "furuta": [0.0, 0.0]}
+    with pytest.raises(ParameterError, match=r"position_limits has 1 values; expected 2, for cart, pole"):
+        make_joint_controller("mpc", load_mechanism("cart_pole"), {"position_limits": [1.0]}, PERIOD)
+    told = make_joint_controller("mpc", load_mechanism("cart_pole"), {"position_limits": [0.5, 0.0]}, PERIOD)
+    assert "positions within [0.5, none]" in told.describe()
+
+
+def test_another_period_than_that_of_the_design_is_refused() -> None:
+    controller = make_joint_controller("mpc", load_mechanism("cart_pole"), {}, PERIOD)
+    controller.check(0.0101)
+    with pytest.raises(ParameterError, match=r"mpc predicts every 0\.01 s; expected states at that period"):
+        controller.check(0.002)
