@@ -38,17 +38,18 @@ def _delayed(name: str, delay: float) -> MechanismParameters:
 
 
 @pytest.mark.parametrize("name", PLANTS)
-def test_without_active_limits_it_is_the_discrete_lqr(name: str) -> None:
+@pytest.mark.parametrize("period", [0.002, PERIOD])
+def test_without_active_limits_it_is_the_discrete_lqr(name: str, period: float) -> None:
     plant = load_mechanism(name)
-    controller = make_joint_controller("mpc", plant, {}, PERIOD)
+    controller = make_joint_controller("mpc", plant, {}, period)
     model = linearise_mechanism(plant)
-    cost = sampled_cost(model, *plant.mechanism.weights, PERIOD)
-    K = np.atleast_2d(discrete_lqr(discretise(model, PERIOD), *cost).K)
+    cost = sampled_cost(model, *plant.mechanism.weights, period)
+    K = np.atleast_2d(discrete_lqr(discretise(model, period), *cost).K)
     x = np.array([1e-3, -1e-3, 2e-3, -1e-3])
     effort = controller.command(0.0, _upright(plant, *x[:2]), tuple(x[2:]))
     expected = np.array(model.efforts) - K @ x
     assert np.abs(expected).max() < min(plant.effort_limits)
-    assert effort == pytest.approx(expected, rel=1e-3, abs=1e-4)
+    assert effort == pytest.approx(expected, rel=1e-3, abs=1e-4 * max(plant.effort_limits))
 
 
 @pytest.mark.parametrize("delay", [0.0, 0.004, 0.01, 0.013])
@@ -100,6 +101,44 @@ def test_a_cart_that_an_lqr_lets_hit_the_end_of_its_track_stops_before_it(
     assert farthest["mpc"] < farthest["lqr"] - 0.02
 
 
+def test_a_pole_that_may_not_lean_far_leans_less_far() -> None:
+    plant = load_mechanism("cart_pole")
+    leaned = []
+    for widest in (0.0, 0.03):
+        controller = make_joint_controller("mpc", plant, {"position_limits": [0.0, widest]}, PERIOD)
+        cart = MechanismPlant(plant, PERIOD)
+        state, way = cart.reset((0.8, math.pi)), []
+        for _ in range(800):
+            state = cart.step(controller.command(state.time, state.position, state.velocity))
+            way.append(abs(state.position[1] - math.pi))
+        assert np.abs(plant.coordinates.deviation(state.position)).max() < 0.02
+        leaned.append(max(way))
+    assert leaned[1] < 0.05 < 0.07 < leaned[0]
+
+
+def test_an_effort_that_holds_upright_is_within_the_limits_and_not_on_its_way(monkeypatch: pytest.MonkeyPatch) -> None:
+    plant = _delayed("acrobot_frictionless", PERIOD)
+    weighted = replace(linearise_mechanism(plant), efforts=(2.0,))
+    monkeypatch.setattr("pendulum_lqr.controllers.joint_mpc.linearise_mechanism", lambda _: weighted)
+    controller = make_joint_controller("mpc", plant, {}, PERIOD)
+    for _ in range(3):
+        assert controller.command(0.0, plant.coordinates.goal, (0.0, 0.0)) == pytest.approx((2.0,), abs=1e-4)
+    limit = plant.effort_limits[0]
+    far = [controller.command(0.0, _upright(plant, sign * 0.5, 0.0), (0.0, 0.0))[0] for sign in (-1.0, 1.0)]
+    assert sorted(map(abs, far)) == pytest.approx([limit, limit], abs=1e-3)
+    assert far[0] * far[1] < 0.0
+
+
+def test_begun_anew_it_gives_the_same_answers_to_the_last_bit() -> None:
+    plant = load_mechanism("cart_pole")
+    controller = make_joint_controller("mpc", plant, {}, PERIOD)
+    runs = []
+    for _ in range(2):
+        controller.reset()
+        runs.append([controller.command(0.0, (1.6 + 0.01 * k, math.pi), (0.5, 0.1)) for k in range(20)])
+    assert runs[0] == runs[1]
+
+
 def test_it_asks_for_no_more_than_each_limit_and_plans_with_it() -> None:
     plant = load_mechanism("cart_pole")
     controller = make_joint_controller("mpc", plant, {"effort_limit": 3.0}, PERIOD)
@@ -129,6 +168,11 @@ def test_what_is_on_its_way_counts() -> None:
     assert isinstance(after, JointMpc)
     after.carry_over(controller)
     assert [effort for (effort,) in after._on_their_way] == pytest.approx(sent)
+    # At another period it is another time that they take.
+    slower = make_joint_controller("mpc", plant, {}, 0.02)
+    assert isinstance(slower, JointMpc)
+    slower.carry_over(controller)
+    assert set(slower._on_their_way) == {(0.0,)}
     controller.reset()
     assert controller.command(0.0, _upright(plant, *x[:2]), tuple(x[2:]))[0] == pytest.approx(
         -float(gain.K @ [*x, 0.0, 0.0]), rel=1e-3, abs=1e-4

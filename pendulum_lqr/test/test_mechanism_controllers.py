@@ -150,6 +150,10 @@ def test_iterative_lqr_and_mpc_bring_a_cart_pole_up_within_its_limits() -> None:
     # On the graph it is the same, and begins anew with a plant that begins anew, whatever turns were made before.
     on_the_graph = make_joint_controller("nmpc", plant, {}, DT)
     assert "s by iterative LQR, then LQR within" in on_the_graph.describe()
+    # What it was compiled with is no plan.
+    elsewhere = on_the_graph.command(0.0, (0.3, 2.0), (0.5, -1.0))
+    on_the_graph.reset()
+    assert on_the_graph.command(0.0, (0.3, 2.0), (0.5, -1.0)) == elsewhere
     for turned in (0.0, 2.0 * math.pi):
         on_the_graph.reset()
         again = []

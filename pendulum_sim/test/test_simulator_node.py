@@ -112,6 +112,8 @@ def test_realtime_states_are_one_period_apart_and_diagnostics_tell_the_rate(peer
     peer.until(lambda: peer.diagnostics["command_latency_p50_us"] != "nan", "a measured latency")
     for key in ("rate_hz", "overruns", "jitter_p50_us", "jitter_p99_us", "command_latency_p99_us"):
         assert math.isfinite(float(peer.diagnostics[key])), key
+    # From a state to its answer, and no answer is applied that is older than 50 ms.
+    assert 0.0 < float(peer.diagnostics["command_latency_p50_us"]) < 5e4
 
 
 def test_two_lockstep_runs_with_one_seed_give_the_same_messages(peer: Peer, processes) -> None:
