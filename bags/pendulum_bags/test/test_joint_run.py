@@ -13,6 +13,7 @@ import pytest
 
 from pendulum_bags.experiments import joint_run
 from pendulum_bags.experiments.joint_run import (
+    JointRun,
     JointSettings,
     design_for,
     fall_time,
@@ -20,6 +21,8 @@ from pendulum_bags.experiments.joint_run import (
     record_joints,
     stand_in_for,
 )
+from pendulum_bags.frequency_response.joint_experiment import JointMultisine
+from pendulum_bags.runs.run_record import RUN_RECORD
 from pendulum_lqr.mechanism_model import linearise_mechanism, mechanism_lqr
 from pendulum_msgs_py.errors import FaultError, ParameterError, PlantStoppedError
 from pendulum_msgs_py.plants.mechanism_parameters import MechanismParameters, load_mechanism
@@ -47,6 +50,8 @@ def test_a_stand_in_is_off_in_every_value_that_has_to_be_identified_and_in_no_ot
     [
         ({"plant": "thesis"}, "plant is 'thesis', which has one joint; expected one of several, such as cart_pole"),
         ({"plant": "acrobot", "joint": "shoulder"}, "joint is 'shoulder'; expected one that is driven: elbow"),
+        ({"controller": "mcp"}, r"controller is 'mcp'; expected lqr or mpc"),
+        ({"controller": "nmpc"}, "controller is 'nmpc'; expected lqr or mpc"),
         ({"amplitude": 0.0}, "amplitude is 0.0; expected a finite number > 0"),
         ({"duration": float("nan")}, "duration is nan; expected a finite number > 0"),
         ({"hold_time": float("inf")}, "hold_time is inf; expected a finite number > 0"),
@@ -55,6 +60,16 @@ def test_a_stand_in_is_off_in_every_value_that_has_to_be_identified_and_in_no_ot
 def test_settings_that_cannot_be_run_are_refused_before_anything_starts(values: dict, message: str) -> None:
     with pytest.raises(ParameterError, match=message):
         JointSettings(**values)
+
+
+@pytest.mark.parametrize("side", ["sim", "hw"])
+def test_one_controller_is_run_and_told_of_on_both_sides_and_frequencies_are_those_of_an_lqr(side: str) -> None:
+    settings = JointSettings("cart_pole", controller="mpc")
+    run = JointRun(settings, side, "cart_pole")
+    assert "controller:='mpc'" in run.controller_program().ros_arguments()
+    assert run.metadata()[RUN_RECORD]["controller"]["kind"] == "mpc"
+    multisine = JointRun(JointMultisine(settings).run, side, "cart_pole")
+    assert "controller:='lqr'" in multisine.controller_program().ros_arguments()
 
 
 @pytest.mark.parametrize("share", [-0.1, 1.0, float("nan")])

@@ -24,6 +24,7 @@ from pendulum_msgs_py.programs.graph import NodeProgram
 from pendulum_rosbag.reader.bag import read_bag
 
 __all__ = [
+    "HOLDING",
     "JointRun",
     "JointSettings",
     "design_file",
@@ -42,6 +43,8 @@ _UNCHANGED = frozenset(
 )
 """Values of a plant file that nobody has to identify: constants, limits, and what belongs to a model of friction."""
 _DELAY = "transport_delay"
+HOLDING = ("lqr", "mpc")
+"""Controllers that hold a plant upright; ``tvlqr`` begins at hanging, and ``nmpc`` is an LQR there."""
 _LIMIT_PER_NOISE = 10.0
 """Effort limit of the joint per amplitude of the noise [-]: the LQR holds every preset under it on both sides,
 the acrobot and the pendubot with dry friction up to 0.16, and their joints slide in it instead of standing still."""
@@ -52,7 +55,7 @@ noise. At 1 the pendubot falls; at 0.25 both plants stay, nearer to the end of w
 
 @dataclass(frozen=True)
 class JointSettings:
-    """Noise on one joint of a plant that an LQR holds upright.
+    """Noise on one joint of a plant that a controller holds upright.
 
     Attributes:
         plant: Preset or file of the simulated plant; the controller is designed on it on both sides.
@@ -63,6 +66,7 @@ class JointSettings:
         seed: Seed of the noise.
         period: Time between two states [s].
         storage: Storage of the bags.
+        controller: What holds it, one of ``HOLDING``.
     """
 
     plant: str = "cart_pole"
@@ -73,6 +77,7 @@ class JointSettings:
     seed: int = 1
     period: float = 0.002
     storage: str = "mcap"
+    controller: str = "lqr"
 
     def __post_init__(self) -> None:
         """Refuse what cannot be run before anything starts; the first driven joint takes the place of none."""
@@ -91,6 +96,8 @@ class JointSettings:
         if self.amplitude is None:
             limit = plant.effort_limits[driven.index(self.joint)]
             object.__setattr__(self, "amplitude", limit / _LIMIT_PER_NOISE)
+        if self.controller not in HOLDING:
+            raise ParameterError(f"controller is {self.controller!r}; expected {' or '.join(HOLDING)}")
         for name in ("amplitude", "hold_time", "duration", "period"):
             value = getattr(self, name)
             if not (math.isfinite(value) and value > 0.0):
@@ -107,7 +114,7 @@ class JointRun:
         plant: Preset or file of what runs on this side.
         design: Preset or file on which the controller is designed; empty for the simulated plant.
         excitation: Parameters of the disturbance that differ from those of the noise.
-        tuning: Parameters of the LQR that differ from those of the plant, ``q`` and ``r``.
+        tuning: Parameters of the controller that differ from those of the plant, ``q`` and ``r``.
     """
 
     settings: JointSettings
@@ -171,7 +178,7 @@ class JointRun:
         """Return the controller, designed on one plant on both sides."""
         return graph.controller(
             self.namespace,
-            controller="lqr",
+            controller=self.settings.controller,
             plant=self.design or self.settings.plant,
             period=self.settings.period,
             use_sim_time=True,
@@ -194,7 +201,7 @@ class JointRun:
                 "seed": self.settings.seed,
                 "disturbance": self._noise(),
                 "controller": {
-                    "kind": "lqr",
+                    "kind": self.settings.controller,
                     **self.tuning,
                     **({"linearised": Path(self.design).name} if self.design else {}),
                 },

@@ -53,6 +53,13 @@ def joints(
     ] = None,
     hold_time: Annotated[float, typer.Option(help="Time for which a noise sample is held [s].")] = 0.01,
     duration: Annotated[float, typer.Option(help="Length of the noise [s].")] = 20.0,
+    controller: Annotated[
+        str,
+        typer.Option(
+            help="What holds it under the noise: lqr, or mpc, which knows the limits of efforts and of a track. "
+            "Frequencies and ranking are those of LQRs."
+        ),
+    ] = "lqr",
     seed: Annotated[int, typer.Option(help="Seed of the noise, and of the draw.", min=0)] = 1,
     frequencies: Annotated[
         bool,
@@ -83,9 +90,9 @@ def joints(
 
     In the place of the machine the bridge drives an emulated one: quasi-direct drives, encoders and delays on a plant
     that is a little off. The answer calls it emulated hardware.
-    Both sides run as nodes over DDS, in lockstep, under one LQR that is designed on the simulated plant, where the dry
-    friction of a passive joint counts as viscous: else acrobot and pendubot would fall. Then a multisine measures both
-    plants, and says which designs carry over.
+    Both sides run as nodes over DDS, in lockstep, under one LQR or MPC that is designed on the simulated plant, where
+    the dry friction of a passive joint counts as viscous: else acrobot and pendubot would fall. Then a multisine
+    measures both plants, and says which designs carry over.
 
     Example: python -m pendulum_bags experiment joints --plant acrobot --share 0.1
     """
@@ -108,7 +115,7 @@ def joints(
     from pendulum_lqr.mechanism_model import linearise_mechanism
     from pendulum_msgs_py.plants.mechanism_parameters import load_mechanism, write_mechanism
 
-    settings = JointSettings(plant, joint, amplitude, hold_time, duration, seed, storage=storage)
+    settings = JointSettings(plant, joint, amplitude, hold_time, duration, seed, storage=storage, controller=controller)
     simulated = load_mechanism(plant)
     drawn = (
         load_stand_in(machine, simulated) if machine else stand_in_for(simulated, share=share, delay=delay, seed=seed)

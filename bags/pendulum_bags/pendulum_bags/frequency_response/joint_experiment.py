@@ -37,8 +37,8 @@ class JointMultisine:
 
     @property
     def run(self) -> JointSettings:
-        """The settings of the run, as long as its periods."""
-        return replace(self.settings, duration=_SIGNAL_PERIOD * (self.periods + 1) + 0.1)
+        """The settings of the run, as long as its periods, under an LQR: a response is that of a linear loop."""
+        return replace(self.settings, controller="lqr", duration=_SIGNAL_PERIOD * (self.periods + 1) + 0.1)
 
     @property
     def excitation(self) -> dict[str, Any]:

@@ -116,7 +116,7 @@ def rank_joints(
             tuning: dict[str, Any] = {"q": list(design.weights[0]), "r": design.weights[1]}
             rows = costs.setdefault(design.name, {"sim": [], "hw": []})
             for seed in seeds:
-                own = replace(settings, seed=seed, duration=min(settings.duration, DURATION))
+                own = replace(settings, controller="lqr", seed=seed, duration=min(settings.duration, DURATION))
                 for side, runs in (("sim", settings.plant), ("hw", str(machine))):
                     on_run(f"design {number} of {len(designs)}, {side}")
                     bag = folder / f"design_{number}_seed_{seed}" / side
