@@ -25,7 +25,7 @@ def test_each_joint_has_its_own_values_and_what_upright_means_for_it() -> None:
     values.take_effort("command", _efforts(("elbow",), 2.5), 1.0)
     picture = values.picture(1.1)
     shoulder, elbow = picture["joints"]
-    assert (picture["chain"], picture["cart"]) == (True, False)
+    assert [picture[whole] for whole in ("chain", "cart", "rotary")] == [True, False, False]
     assert shoulder == {
         "name": "shoulder",
         "unit": "rad",
@@ -39,19 +39,20 @@ def test_each_joint_has_its_own_values_and_what_upright_means_for_it() -> None:
 
 
 @pytest.mark.parametrize(
-    ("joints", "unit", "goal", "cart"),
+    ("joints", "unit", "goal", "whole"),
     [
-        (("pendulum_joint",), "rad", math.pi, False),
-        (("cart", "pole"), "m", 0.0, True),
-        (("hip", "knee", "ankle"), "rad", 0.0, False),
+        (("pendulum_joint",), "rad", math.pi, ""),
+        (("cart", "pole"), "m", 0.0, "cart"),
+        (("arm", "pendulum"), "rad", 0.0, "rotary"),
+        (("hip", "knee", "ankle"), "rad", 0.0, ""),
     ],
 )
-def test_only_known_mechanisms_say_what_upright_is(joints: tuple[str, ...], unit: str, goal: float, cart: bool) -> None:
+def test_only_known_mechanisms_say_what_upright_is(joints: tuple[str, ...], unit: str, goal: float, whole: str) -> None:
     values = JointValues()
     values.take_state(_state(joints, *(0.0 for _ in joints)))
     picture = values.picture(0.0)
     assert (picture["joints"][0]["unit"], picture["joints"][0]["goal"]) == (unit, goal)
-    assert (picture["chain"], picture["cart"]) == (False, cart)
+    assert [name for name in ("chain", "cart", "rotary") if picture[name]] == ([whole] if whole else [])
 
 
 def test_an_effort_without_a_name_is_for_the_one_joint() -> None:

@@ -15,6 +15,7 @@ _FRESH = 0.3
 """Age at which a torque counts as no longer sent [s]; plants take none that is older than 0.05 s."""
 _CHAIN = MECHANISMS["double_pendulum"]
 _CART = MECHANISMS["cart_pole"]
+_ROTARY = MECHANISMS["furuta"]
 
 
 class JointValues:
@@ -65,8 +66,10 @@ class JointValues:
             # JSON has no word for what is not finite: a page could read nothing more of the plant, nor of any other.
             values = {key: value for key, value in {**self._states[joint.name], **efforts}.items() if isfinite(value)}
             joints.append({"name": joint.name, "unit": joint.unit, "goal": joint.goal, **values})
-        # Links that hang on each other, each angle from the link before, or a pole on a cart: these are drawn whole.
-        return {"joints": joints, "chain": self._joints == _CHAIN.joints, "cart": self._joints == _CART.joints}
+        # Links that hang on each other, each angle from the link before, a pole on a cart, or a pendulum across the end
+        # of an arm: these are drawn whole.
+        whole = {"chain": _CHAIN, "cart": _CART, "rotary": _ROTARY}
+        return {"joints": joints, **{name: self._joints == plant.joints for name, plant in whole.items()}}
 
 
 def _joints(names: tuple[str, ...]) -> tuple[Joint, ...]:

@@ -295,6 +295,18 @@
   window.matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => { inks = {}; tape.stale = true; });
   const ink = (name) => (inks[name] ||= getComputedStyle(document.documentElement).getPropertyValue(name));
 
+  // A rotary pendulum is looked at from a little above: its arm turns about the vertical, its pendulum swings across the
+  // arm, upwards to where the arm goes when it turns forward (counter-clockwise from above).
+  const TILT = 25 * Math.PI / 180, ARM = 0.6, ROD = 0.8;
+  function inSpace(x, y, length) {
+    return ([px, py, pz]) => [x + length * px, y - length * (py * Math.sin(TILT) + pz * Math.cos(TILT))];
+  }
+  function rotaryPoints(project, arm, rod) {
+    const end = [ARM * Math.cos(arm), ARM * Math.sin(arm), 0], swing = ROD * Math.sin(rod);
+    const tip = [end[0] - swing * Math.sin(arm), end[1] + swing * Math.cos(arm), -ROD * Math.cos(rod)];
+    return [[0, 0, 0], end, tip].map(project);
+  }
+
   function drawPendulum(names) {
     const place = context("pendulum");
     if (!place) return;
@@ -311,11 +323,12 @@
       if (!plant || plant.theta === undefined || (plant.unit === "m" && !plant.cart)) return;
       const colour = COLOURS[index % COLOURS.length];
       // One link, or links that hang on each other, as long together as the one.
+      const project = inSpace(x, y, length);
       const links = plant.chain ? plant.joints.map((joint) => joint.theta) : [plant.cart ? plant.joints[1].theta : plant.theta];
       // A metre of the rail is as long as the pole, and the rail as long as the picture is wide.
       const foot = plant.cart ? Math.max(30, Math.min(width - 30, x + length * plant.joints[0].theta)) : x;
-      const points = [[foot, y]];
-      links.reduce((angle, turn) => {
+      const points = plant.rotary ? rotaryPoints(project, plant.joints[0].theta, plant.joints[1].theta) : [[foot, y]];
+      if (!plant.rotary) links.reduce((angle, turn) => {
         const at = points[points.length - 1], all = angle + turn;
         points.push([at[0] + length / links.length * Math.sin(all), at[1] + length / links.length * Math.cos(all)]);
         return all;
@@ -330,6 +343,11 @@
         c.fillRect(foot - 26 + 3 * index, y - 9 + 2 * index, 52 - 6 * index, 18 - 4 * index);
         c.lineWidth = 1;
         c.beginPath(); c.moveTo(0, y + 12); c.lineTo(width, y + 12); c.stroke();
+        c.lineWidth = 7 - 3 * index;
+      }
+      if (plant.rotary) {
+        c.lineWidth = 1;
+        c.beginPath(); c.ellipse(x, y, ARM * length, ARM * length * Math.sin(TILT), 0, 0, 2 * Math.PI); c.stroke();
         c.lineWidth = 7 - 3 * index;
       }
       c.beginPath(); c.moveTo(foot, y); points.slice(1).forEach(([px, py]) => c.lineTo(px, py)); c.stroke();
