@@ -157,6 +157,13 @@ def test_unlimited_mpc_is_the_discrete_lqr_and_limited_mpc_keeps_the_limit():
     mpc = make_controller("mpc", THESIS, 0.01)
     for x in ((0.01, 0.1), (0.1, -1.0), (-0.2, 0.5)):
         assert mpc.command(0.0, x) == pytest.approx(lqr.command(0.0, x), abs=1e-4)
+    # Over a horizon in which the plant alone would have grown by 10^5, and the more so at a slow rate.
+    dfki = load_plant("dfki")
+    for period in (0.01, 0.05):
+        far, near = (make_controller("mpc", dfki, period, {"horizon": horizon}) for horizon in (200, 5))
+        assert far.command(0.0, (0.01, 0.02)) == pytest.approx(near.command(0.0, (0.01, 0.02)), abs=1e-6)
+        strong = (0.3, 0.5)
+        assert abs(far.command(0.0, strong)) <= dfki.effort_limit
     tight = make_controller("mpc", THESIS, 0.01, {"effort_limit": 2.0})
     assert tight.command(0.0, (0.3, 0.0)) == pytest.approx(-2.0, abs=1e-4)
 

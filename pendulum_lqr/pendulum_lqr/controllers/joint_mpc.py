@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections import deque
 from collections.abc import Mapping
 from typing import Any
@@ -54,9 +53,9 @@ class JointMpc(JointController):
         self._deviation = plant.coordinates.deviation
         self._hold = np.array(model.efforts)
         self._position_limits = _position_limits(plant, p["position_limits"])
-        widths = [width or math.inf for width in self._position_limits]
+        limits = {joint: width for joint, width in enumerate(self._position_limits) if width}
         self._program = CondensedMpc(
-            sampled, cost, self.gain.S, int(p["horizon"]), range(len(widths)), widths, _DEAR * max(p["q"])
+            sampled, self.gain, cost[1], int(p["horizon"]), limits, self.effort_limits, _DEAR * max(p["q"])
         )
         self._on_their_way: deque[Vector] = deque([(0.0,) * len(self._hold)] * sampled.pending, sampled.pending)
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -83,8 +82,10 @@ class LinearMpc(BaseController):
                 delay=p["delay"],
             )
         self.gain: Gain = discrete_lqr(sampled, *cost)
-        limits = (p["angle_limit"] or math.inf, p["velocity_limit"] or math.inf)
-        self._program = CondensedMpc(sampled, cost, self.gain.S, int(p["horizon"]), (0, 1), limits, _SLACK_WEIGHT)
+        limits = {axis: p[name] for axis, name in enumerate(("angle_limit", "velocity_limit")) if p[name]}
+        self._program = CondensedMpc(
+            sampled, self.gain, cost[1], int(p["horizon"]), limits, (self.effort_limit,), _SLACK_WEIGHT
+        )
 
     @classmethod
     def design(cls, plant: PlantParameters, period: float, p: Mapping[str, Any]) -> LinearMpc:
