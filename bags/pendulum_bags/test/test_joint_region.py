@@ -11,7 +11,7 @@ import pytest
 
 from pendulum_bags.experiments.experiment_cli import main
 from pendulum_bags.studies.chunks import chunk_path, read_columns
-from pendulum_bags.studies.joint_region import JointRegion, run_joint_region
+from pendulum_bags.studies.joint_region import JointRegion, JointRegionResult, run_joint_region
 from pendulum_msgs_py.contract.angles import wrap
 from pendulum_msgs_py.errors import BagError, ParameterError
 from pendulum_msgs_py.plants.mechanism_parameters import load_mechanism
@@ -21,8 +21,17 @@ pytest.importorskip("pyarrow")
 SMALL = JointRegion("cart_pole", plants=3, points=9, spans=(0.4, 1.2), duration=6.0, shares={"cart_mass": 0.3})
 
 
-def test_near_starts_are_caught_far_ones_are_not_and_the_sampled_region_is_inside(tmp_path: Path) -> None:
-    result = run_joint_region(tmp_path, SMALL)
+@pytest.fixture(scope="module")
+def small(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, JointRegionResult]:
+    """Return the small map and its folder, for tests that read it."""
+    folder = tmp_path_factory.mktemp("small")
+    return folder, run_joint_region(folder, SMALL)
+
+
+def test_near_starts_are_caught_far_ones_are_not_and_the_sampled_region_is_inside(
+    small: tuple[Path, JointRegionResult],
+) -> None:
+    _, result = small
     assert result.share.shape == (9, 9)
     assert result.share[4, 4] == 1.0
     # A pole that leans by 1.2 rad is lost, whichever way.
@@ -34,7 +43,6 @@ def test_near_starts_are_caught_far_ones_are_not_and_the_sampled_region_is_insid
 
 
 def test_axes_are_the_ones_that_were_asked_for(tmp_path: Path) -> None:
-    run_joint_region(tmp_path / "own", replace(SMALL, plants=1))
     there = replace(SMALL, plants=1, axes=("pole", "cart"), spans=(1.2, 0.4))
     own, other = run_joint_region(tmp_path / "own", replace(SMALL, plants=1)), run_joint_region(tmp_path / "t", there)
     assert not np.array_equal(own.believed, own.believed.T)
@@ -46,9 +54,8 @@ def test_axes_are_the_ones_that_were_asked_for(tmp_path: Path) -> None:
     assert fast.believed[(x * v) < 0].mean() > fast.believed[(x * v) > 0].mean() + 0.1
 
 
-def test_plant_0_is_the_believed_one_and_the_others_differ(tmp_path: Path) -> None:
-    run_joint_region(tmp_path, SMALL)
-    columns = read_columns(chunk_path(tmp_path, 0), ("plant", "cart_mass", "end_pole", "attracted"))
+def test_plant_0_is_the_believed_one_and_the_others_differ(small: tuple[Path, JointRegionResult]) -> None:
+    columns = read_columns(chunk_path(small[0], 0), ("plant", "cart_mass", "end_pole", "attracted"))
     mass = load_mechanism("cart_pole").value("cart_mass")
     drawn = [np.unique(columns["cart_mass"][columns["plant"] == i]) for i in range(3)]
     assert [len(values) for values in drawn] == [1, 1, 1]
@@ -57,13 +64,13 @@ def test_plant_0_is_the_believed_one_and_the_others_differ(tmp_path: Path) -> No
     assert np.abs(wrap(columns["end_pole"][columns["attracted"]])).max() < SMALL.tolerance[0]
 
 
-def test_a_map_is_gone_on_with_and_others_are_refused(tmp_path: Path) -> None:
-    first = run_joint_region(tmp_path, SMALL)
-    before = chunk_path(tmp_path, 0).stat().st_mtime_ns
-    assert np.array_equal(run_joint_region(tmp_path, SMALL).share, first.share)
-    assert chunk_path(tmp_path, 0).stat().st_mtime_ns == before
+def test_a_map_is_gone_on_with_and_others_are_refused(small: tuple[Path, JointRegionResult]) -> None:
+    folder, first = small
+    before = chunk_path(folder, 0).stat().st_mtime_ns
+    assert np.array_equal(run_joint_region(folder, SMALL).share, first.share)
+    assert chunk_path(folder, 0).stat().st_mtime_ns == before
     with pytest.raises(BagError, match="other settings"):
-        run_joint_region(tmp_path, replace(SMALL, seed=2))
+        run_joint_region(folder, replace(SMALL, seed=2))
 
 
 @pytest.mark.parametrize(
