@@ -71,7 +71,7 @@ def make_joint_controller(
         name: One of ``JOINT_CONTROLLERS``.
         plant: The plant.
         values: Parameters of :func:`joint_parameters` by name; others at their default.
-        period: Period at which states come [s]; None where it is not known yet, which tvlqr refuses.
+        period: Period at which states come [s]; None where it is not known yet.
 
     Raises:
         ParameterError: No such controller for several joints, a value out of domain, a design that does not exist, or

@@ -56,9 +56,10 @@ def test_a_period_at_which_it_does_not_settle_is_refused() -> None:
         make_joint_controller("lqr", acrobot, {}, 0.2)
 
 
-def test_a_swing_up_wants_a_period_and_a_plant_for_which_one_is_stored() -> None:
-    with pytest.raises(ParameterError, match=r"as period:=0\.002"):
-        make_joint_controller("tvlqr", load_mechanism("acrobot_frictionless"), {})
+def test_a_swing_up_wants_a_plant_for_which_one_is_stored_and_the_period_of_its_design() -> None:
+    swing_up = make_joint_controller("tvlqr", load_mechanism("acrobot_frictionless"), {})
+    with pytest.raises(ParameterError, match=r"the trajectory is followed every 0\.01 s"):
+        swing_up.check(0.002)
     with pytest.raises(ParameterError, match="no swing-up is stored for plant 'furuta'"):
         make_joint_controller("tvlqr", load_mechanism("furuta"), {}, 0.002)
 

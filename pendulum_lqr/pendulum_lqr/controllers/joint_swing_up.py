@@ -8,7 +8,7 @@ from typing import Any
 from pendulum_lqr.interface import JointController
 from pendulum_lqr.mechanism_controllers import default_catch, stored_trajectory
 from pendulum_lqr.mechanism_tvlqr import MechanismTvlqr
-from pendulum_lqr.sampling import differs
+from pendulum_lqr.sampling import ASSUMED_PERIOD, differs
 from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.joints import Vector
 from pendulum_msgs_py.plants.mechanism_parameters import MechanismParameters
@@ -44,13 +44,9 @@ class JointSwingUp(JointController):
         """Return the swing-up, which is tracked at one period.
 
         Raises:
-            ParameterError: The period is not known, or no swing-up is stored for this plant.
+            ParameterError: No swing-up is stored for this plant.
         """
-        if period is None:
-            raise ParameterError(
-                "tvlqr follows its trajectory at the period of the states; expected it, as period:=0.002"
-            )
-        return cls(plant, period)
+        return cls(plant, ASSUMED_PERIOD if period is None else period)
 
     def check(self, period: float) -> None:
         """Refuse another period than that of the design [s].
