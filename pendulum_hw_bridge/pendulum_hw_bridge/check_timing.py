@@ -2,7 +2,8 @@
 
 Each record bears two times: the module's own, when it was measured, and ours, when it arrived. The module's times say
 whether the module is regular and what was lost; ours, less theirs, how long the way took; and a pulse of our own, which
-asks to be woken every 2 ms, whether this computer could have noticed at all.
+asks to be woken every 2 ms, whether this computer could have noticed at all. So does whoever reads: a thread that has
+worked waits longer for its turn than one that slept, and what it misses looks like a module's gap.
 """
 
 from __future__ import annotations
@@ -18,9 +19,10 @@ import numpy as np
 from pendulum_hw_bridge.actuator import Feedback
 from pendulum_msgs_py.contract.values import NANOSECONDS
 
-__all__ = ["HostWatch", "Punctuality", "TimingFigures", "measure"]
+__all__ = ["PULSE", "HostWatch", "Punctuality", "TimingFigures", "measure"]
 
-_PULSE = 0.002
+PULSE = 0.002
+"""Time for which a pulse sleeps, and a reader waits for a record, at most [s]."""
 _LOST_GAP = 1.5
 """Distance of two records from which on one is missing between them, in periods [-]."""
 
@@ -31,24 +33,36 @@ class Punctuality(Protocol):
     def start(self) -> None:
         """Begin."""
 
+    def look(self) -> None:
+        """Note that whoever reads is awake, which asked to be by the end of a pulse after it was last."""
+
     def stop(self) -> Sequence[float]:
         """End, and return how late each waking was [s]."""
 
 
 class HostWatch:
-    """A thread that asks to be woken every 2 ms, and notes how late it was."""
+    """A thread that asks to be woken every 2 ms, and notes how late it was; so it does for whoever reads."""
 
     def __init__(self) -> None:
         self._stopping = threading.Event()
         self._late: list[float] = []
+        self._looked: float | None = None
         self._thread: threading.Thread | None = None
 
     def start(self) -> None:
         """Begin."""
         self._stopping.clear()
         self._late = []
+        self._looked = None
         self._thread = threading.Thread(target=self._run, name="punctuality", daemon=True)
         self._thread.start()
+
+    def look(self) -> None:
+        """Note that whoever reads is awake."""
+        now, before = time.monotonic(), self._looked
+        self._looked = now
+        if before is not None:
+            self._late.append(max(0.0, now - before - PULSE))
 
     def stop(self) -> Sequence[float]:
         """End, and return how late each waking was [s]."""
@@ -59,8 +73,8 @@ class HostWatch:
 
     def _run(self) -> None:
         while not self._stopping.is_set():
-            wanted = time.monotonic() + _PULSE
-            time.sleep(_PULSE)
+            wanted = time.monotonic() + PULSE
+            time.sleep(PULSE)
             self._late.append(time.monotonic() - wanted)
 
 

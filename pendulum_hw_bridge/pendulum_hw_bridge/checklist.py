@@ -25,7 +25,7 @@ from pendulum_hw_bridge.actuator import (
 )
 from pendulum_hw_bridge.check_item import HOST_ITEM, CheckItem, Checklist
 from pendulum_hw_bridge.check_rest import rest_items, sign_item
-from pendulum_hw_bridge.check_timing import HostWatch, Punctuality, TimingFigures, measure
+from pendulum_hw_bridge.check_timing import PULSE, HostWatch, Punctuality, TimingFigures, measure
 from pendulum_hw_bridge.nudge import Hand
 from pendulum_hw_bridge.safety import SafetyLimits, SafetyMonitor
 from pendulum_hw_bridge.settings import BridgeSettings
@@ -209,7 +209,8 @@ def _stretch(port: EncoderPort, host: Punctuality) -> tuple[list[Feedback], Sequ
     try:
         end = port.now_ns() + round(_LISTEN * NANOSECONDS)
         while port.now_ns() < end:
-            record = port.read(0.1)
+            record = port.read(PULSE)
+            host.look()
             if record is not None:
                 records.append(record)
     finally:

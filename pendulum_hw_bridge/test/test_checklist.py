@@ -2,6 +2,7 @@
 
 import json
 import math
+import time
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -13,7 +14,7 @@ from pendulum_hw_bridge.actuator import Feedback, Strategy
 from pendulum_hw_bridge.backends.emulator import EmulatorBackend
 from pendulum_hw_bridge.check_item import HOST_ITEM, Checklist
 from pendulum_hw_bridge.checklist import run_checklist
-from pendulum_hw_bridge.clocks import SteppedClock
+from pendulum_hw_bridge.clocks import SteppedClock, WallClock
 from pendulum_hw_bridge.emulation.faults import ActuatorFault
 from pendulum_hw_bridge.emulation.parameters import load_emulator
 from pendulum_hw_bridge.emulation.x5 import EmulatedX5
@@ -34,6 +35,9 @@ class Pulse:
     def start(self) -> None:
         """Begin."""
 
+    def look(self) -> None:
+        """Nothing keeps a reader of simulated time from looking."""
+
     def stop(self) -> Sequence[float]:
         """Return one lateness for all wakings."""
         return [self.late.pop(0) if len(self.late) > 1 else self.late[0]] * 100
@@ -49,6 +53,19 @@ class LateReader(EmulatorBackend):
             self.clock.wait_until(self.clock.now_ns() + 70_000_000)
             self.actuator.feedback(self.clock.now_ns())
         return super().read(timeout)
+
+
+class HeldUpReader(EmulatorBackend):
+    """An emulator on the wall clock whose reader alone is held up now and then, in its first stretch."""
+
+    records = 0
+
+    def read(self, timeout: float) -> Feedback | None:
+        record = super().read(timeout)
+        self.records += record is not None
+        if record is not None and self.records in {20, 30, 40}:
+            time.sleep(0.035)
+        return record
 
 
 def checklist(
@@ -168,6 +185,17 @@ def test_an_actuator_that_loses_records_is_blamed_by_a_punctual_computer() -> No
     found = checklist(busy_for=60.0, host=Pulse(0.0))
     assert passed(found)["no feedback gets lost"] is False
     assert not found.host_busy
+
+
+def test_a_reader_that_is_held_up_alone_is_no_gap_of_the_module() -> None:
+    parameters, clock = load_emulator("thesis"), WallClock()
+    EmulatedX5(parameters).advance_to(1_000_000)  # compiles
+    port = HeldUpReader(EmulatedX5(parameters, seed=1, start_ns=clock.now_ns()), clock)
+    found = run_checklist(port, SETTINGS, SafetyLimits(), parameters.plant)
+    assert port.records > 40
+    # Where this computer is busy all along it is told, and the module is not judged.
+    told = [item.name for item in found.items if item.passed is False and item.name != HOST_ITEM]
+    assert not {"feedback is regular", "no feedback gets lost", "feedback flows"} & set(told), told
 
 
 def test_regular_feedback_needs_no_punctual_computer() -> None:

@@ -29,6 +29,9 @@ class Punctual:
     def start(self) -> None:
         """Begin."""
 
+    def look(self) -> None:
+        """Nothing keeps a reader of simulated time from looking."""
+
     def stop(self) -> Sequence[float]:
         """Return the lateness of each waking [s]."""
         return [0.0]
