@@ -1,4 +1,4 @@
-"""``make test``: whole systems in real time, then other tests in real time, and behind both of them what computes.
+"""``make test``: whole systems in real time alone, then other tests in real time beside what computes.
 
 Tests of one file stay together, so that what a file prepares is prepared once. Named files or folders run as pytest is
 told.
@@ -22,7 +22,7 @@ from pathlib import Path
 import pytest
 
 from tests.fixtures import PROJECT
-from tests.suite_events import GATE, PIPE
+from tests.suite_events import PIPE
 
 __all__ = ["Part", "exit_code", "main", "rooms", "run_parts"]
 
@@ -32,8 +32,8 @@ _EXPERIMENTS = (
     "tests/acceptance/test_experiment.py",
     "tests/integration/test_plants_on_the_graph.py",
 )
-"""Whole systems in real time, longest first; each asks for more than one core and judges to milliseconds: beside them
-one worker alone computes, with what they leave."""
+"""Whole systems in real time, longest first; each asks for more than one core and judges to milliseconds: nothing runs
+beside them."""
 _WAITS = (
     "tests/acceptance/test_console.py",
     "tests/integration/test_plant_interface.py",
@@ -68,8 +68,8 @@ _COMPUTES = (
 )
 """What comes first of all others, longest first too: a long file at the end would leave a core idle."""
 _NOTHING_SELECTED = int(pytest.ExitCode.NO_TESTS_COLLECTED)
-_NICE = 10
-"""Priority of what computes: real time goes before it, and beside a busy machine it still gets a tenth of a core."""
+_NICE = 5
+"""Priority of what computes: real time goes before it, and beside a busy machine it still gets a quarter of a core."""
 _TELLS_EVERY = 20.0
 """Time between two lines of progress [s]."""
 _GRAVITY = ("", "passed", "skipped", "failed")
@@ -93,9 +93,11 @@ def main(arguments: Sequence[str]) -> int:
         return subprocess.run([sys.executable, "-m", "pytest", *arguments], cwd=PROJECT, check=False).returncode
     systems, waits, others = rooms()
     return run_parts(
-        Part("whole systems", [*systems, *arguments], workers=1),
-        Part("in real time", [*waits, *arguments], workers=1),
-        behind=[Part("computing", [*others, *arguments], workers=2, nice=_NICE)],
+        [Part("whole systems", [*systems, *arguments], workers=1)],
+        [
+            Part("in real time", [*waits, *arguments], workers=1),
+            Part("computing", [*others, *arguments], workers=2, nice=_NICE),
+        ],
     )
 
 
@@ -126,19 +128,11 @@ class Part:
         self._arguments = arguments
         self._workers = min(workers, os.cpu_count() or 1)
         self._nice = nice
-        self._folder = tempfile.TemporaryDirectory(prefix="suite_")
-        self._gate = Path(self._folder.name) / "gate"
         self._popen: subprocess.Popen[bytes] | None = None
         self._output = tempfile.TemporaryFile()  # noqa: SIM115  (lives as long as the part)
 
-    def start(self, *, gated: bool = False) -> None:
-        """Start pytest, in a session of its own: Linux shares the cores among sessions first.
-
-        Args:
-            gated: Let its first worker alone begin, until ``open_gate``.
-        """
-        if gated:
-            self._gate.touch()
+    def start(self) -> None:
+        """Start pytest, in a session of its own: Linux shares the cores among sessions first."""
         reader, writer = os.pipe()
         # Within a worker's test this is no worker.
         environment = {name: value for name, value in os.environ.items() if not name.startswith("PYTEST_XDIST")}
@@ -146,7 +140,7 @@ class Part:
         self._popen = subprocess.Popen(
             [*command, "--dist", "loadfile", "--no-loadscope-reorder", *self._arguments],
             cwd=PROJECT,
-            env={**environment, PIPE: str(writer), GATE: str(self._gate)},
+            env={**environment, PIPE: str(writer)},
             stdin=subprocess.DEVNULL,
             stdout=self._output,
             stderr=subprocess.STDOUT,
@@ -161,10 +155,6 @@ class Part:
                 Path(f"/proc/{self._popen.pid}/autogroup").write_text(str(self._nice), encoding="ascii")
         self._listener = threading.Thread(target=self._listen, args=(reader,), daemon=True)
         self._listener.start()
-
-    def open_gate(self) -> None:
-        """Let all of its workers begin."""
-        self._gate.unlink(missing_ok=True)
 
     @property
     def code(self) -> int | None:
@@ -204,51 +194,39 @@ class Part:
                     self.outcomes[test] = max(self.outcomes.get(test, ""), outcome, key=_GRAVITY.index)
 
 
-def run_parts(*parts: Part, behind: Sequence[Part] = ()) -> int:
-    """Run parts one after the other, and others behind all of them; return the first code that is not 0.
+def run_parts(*stages: Sequence[Part]) -> int:
+    """Run the parts of a stage at once, stage by stage; return the first code that is not 0.
 
     How far they are is printed on the way, and at the end what each has printed.
-
-    Args:
-        parts: Each begins when the one before it has ended.
-        behind: Run from the beginning, with one worker each while the first of the others runs.
     """
     begin = told = time.monotonic()
-    waiting, every = list(parts), [*parts, *behind]
-    running: list[Part] = []
+    parts = [part for stage in stages for part in stage]
     for number in (signal.SIGTERM, signal.SIGHUP):
         signal.signal(number, signal.default_int_handler)
     try:
-        for part in behind:
-            part.start(gated=bool(parts))
-        while waiting or any(part.code is None for part in every):
-            if all(part.code is not None for part in running):
-                # Nothing has run yet, or one part has ended.
-                for part in behind if running else ():
-                    part.open_gate()
-                running = [waiting.pop(0)] if waiting else []
-                for part in running:
-                    part.start()
-            time.sleep(0.2)
-            if time.monotonic() - told >= _TELLS_EVERY:
-                told += _TELLS_EVERY
-                shown = [part for part in every if part.code is None]
-                print(f"{_clock(told - begin)}  {'; '.join(map(_progress, shown))}", flush=True)
+        for stage in stages:
+            for part in stage:
+                part.start()
+            while any(part.code is None for part in stage):
+                time.sleep(0.2)
+                if time.monotonic() - told >= _TELLS_EVERY:
+                    told += _TELLS_EVERY
+                    print(f"{_clock(told - begin)}  {'; '.join(map(_progress, stage))}", flush=True)
     except KeyboardInterrupt:
         print("interrupted: ending what runs", flush=True)
-        _end(every)
-        for part in every:
+        _end(parts)
+        for part in parts:
             if "failed" in part.outcomes.values():
                 print(part.output())
         return int(pytest.ExitCode.INTERRUPTED)
-    for part in every:
+    for part in parts:
         print(f"\n{f' {part.name} ':=^100}\n{part.output()}")
-    durations = Counter({test: time for part in every for test, time in part.durations.items()})
+    durations = Counter({test: time for part in parts for test, time in part.durations.items()})
     print("ten slowest:")
     for test, duration in durations.most_common(10):
         print(f"{duration:7.1f} s  {test}")
-    print(f"{'; '.join(map(_progress, every))}; took {_clock(time.monotonic() - begin)} min")
-    return exit_code([part.code or 0 for part in every])
+    print(f"{'; '.join(map(_progress, parts))}; took {_clock(time.monotonic() - begin)} min")
+    return exit_code([part.code or 0 for part in parts])
 
 
 def _end(parts: Sequence[Part]) -> None:

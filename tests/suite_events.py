@@ -4,18 +4,15 @@ from __future__ import annotations
 
 import json
 import os
-import time
 from collections.abc import Generator
 from typing import Any
 
 import pytest
 
-__all__ = ["GATE", "PIPE"]
+__all__ = ["PIPE"]
 
 PIPE = "PENDULUM_SUITE_PIPE"
 """Environment variable with the number of the pipe's file."""
-GATE = "PENDULUM_SUITE_GATE"
-"""Environment variable with the path of a file: as long as it is there, the first worker runs alone."""
 
 
 def _tell(event: dict[str, Any]) -> None:
@@ -27,14 +24,6 @@ def _tell(event: dict[str, Any]) -> None:
 
 def _reports() -> bool:
     return PIPE in os.environ and "PYTEST_XDIST_WORKER" not in os.environ
-
-
-@pytest.hookimpl(tryfirst=True)
-def pytest_runtestloop() -> None:
-    """Wait for the suite where this is not its first worker; what is collected by then is told already."""
-    if os.environ.get("PYTEST_XDIST_WORKER", "gw0") != "gw0" and GATE in os.environ:
-        while os.path.exists(os.environ[GATE]):  # noqa: PTH110  (asked again and again)
-            time.sleep(0.2)
 
 
 @pytest.hookimpl(optionalhook=True)

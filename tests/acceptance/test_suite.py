@@ -16,7 +16,7 @@ _RUN = """
 import sys
 from tests.suite import Part, run_parts
 parts = [Part(name, ["-p", "tests.fixtures", name], workers=1, nice=nice) for name, nice in zip(sys.argv[1:], (0, 5))]
-raise SystemExit(run_parts(behind=parts))
+raise SystemExit(run_parts(parts))
 """
 
 
@@ -43,33 +43,6 @@ def test_a_failure_is_named_at_once_explained_at_the_end_and_the_exit_code(
     assert slowest.count("::test_right") == 2
     assert "1 of 1; " in last
     assert "2 of 2, 1 FAILED" in last
-
-
-def test_behind_the_first_part_one_worker_runs_alone(processes: ProcessGroup, tmp_path: Path) -> None:
-    behind = (
-        "import os, pytest\nfrom pathlib import Path\n\n"
-        "@pytest.mark.parametrize('number', range(20))\n"
-        "def test_behind(number):\n"
-        f"    folder, worker = Path({str(tmp_path)!r}), os.environ['PYTEST_XDIST_WORKER']\n"
-        "    assert worker == 'gw0' or (folder / 'first_ends').exists()\n"
-        "    (folder / f'{worker}_{number}').touch()\n"
-    )
-    first = (
-        "from pathlib import Path\nfrom tests.fixtures import wait_for\n\n"
-        "def test_first():\n"
-        f"    folder = Path({str(tmp_path)!r})\n"
-        "    wait_for((folder / 'gw0_19').exists, 60, 'the worker behind')\n"
-        "    (folder / 'first_ends').touch()\n"
-    )
-    names = _parts(tmp_path, first, behind, behind)[3:]
-    run = (
-        "import sys\nfrom tests.suite import Part, run_parts\n"
-        "behind = Part('behind', sys.argv[2:], workers=2, nice=5)\n"
-        "raise SystemExit(run_parts(Part('first', sys.argv[1:2], workers=1), behind=[behind]))"
-    )
-    program = processes.start_command([sys.executable, "-c", run, *names])
-    assert program.wait(60) == 0, program.output
-    assert "first 1 of 1; behind 40 of 40; took" in program.output
 
 
 @pytest.mark.parametrize(
