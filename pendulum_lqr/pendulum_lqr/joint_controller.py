@@ -25,6 +25,7 @@ __all__ = [
 JOINT_CONTROLLERS: dict[str, str] = {
     "lqr": "pendulum_lqr.controllers.joint_lqr:JointLqr",
     "tvlqr": "pendulum_lqr.controllers.joint_swing_up:JointSwingUp",
+    "ilqr": "pendulum_lqr.controllers.joint_ilqr:JointIlqr",
     "mpc": "pendulum_lqr.controllers.joint_mpc:JointMpc",
     "nmpc": "pendulum_lqr.controllers.joint_nmpc:JointNmpc",
     "policy": "pendulum_lqr.controllers.joint_policy:JointPolicy",

@@ -9,6 +9,7 @@ from pathlib import Path
 from pendulum_lqr.mechanism_catch import MechanismCatch, make_mechanism_catch
 from pendulum_lqr.mechanism_controller import MechanismController
 from pendulum_lqr.mechanism_mpc import MechanismMpc
+from pendulum_lqr.mechanism_planned import PlannedSwingUp
 from pendulum_lqr.mechanism_policy import CATCH_SUFFIX, MechanismPolicy, is_policy_name
 from pendulum_lqr.mechanism_trajectory import MechanismTrajectory, load_trajectory
 from pendulum_lqr.mechanism_tvlqr import MechanismTvlqr
@@ -20,6 +21,7 @@ __all__ = [
     "default_catch",
     "make_mechanism_controller",
     "mechanism_controller_names",
+    "refuse_passive_friction",
     "stored_trajectory",
     "tracked_swing_up",
 ]
@@ -49,6 +51,22 @@ def default_catch(plant: MechanismParameters) -> MechanismCatch:
     return make_mechanism_catch(plant, *plant.mechanism.weights)
 
 
+def refuse_passive_friction(controller: str, plant: MechanismParameters) -> None:
+    """Refuse a plant for a controller that plans without dry friction, if no effort can make up for it where it is.
+
+    Raises:
+        ParameterError: A passive joint has some.
+    """
+    coordinates = plant.coordinates
+    for index, (name, joint) in enumerate(zip(coordinates.names, plant.joints, strict=True)):
+        if index not in coordinates.driven and joint.breakaway > 0.0:
+            raise ParameterError(
+                f"{controller} plans without dry friction, and {name} of plant {plant.name!r} is passive with "
+                f"{joint.breakaway:g} {coordinates.joints[index].effort_unit}; "
+                "expected 0, as of a preset's frictionless twin"
+            )
+
+
 def _followed(
     plant: MechanismParameters, period: float, catch: MechanismCatch, recover: MechanismController | None
 ) -> MechanismTvlqr:
@@ -75,8 +93,13 @@ def _tvlqr_mpc(plant: MechanismParameters, period: float) -> MechanismController
     return DifferencedVelocity(plant, _followed(plant, period, catch, recover))
 
 
+def _ilqr(plant: MechanismParameters, period: float) -> MechanismController:
+    return DifferencedVelocity(plant, PlannedSwingUp(plant, period, default_catch(plant)))
+
+
 _CONTROLLERS: dict[str, Callable[[MechanismParameters, float], MechanismController]] = {
     "tvlqr": tracked_swing_up,
+    "ilqr": _ilqr,
     "mpc": _mpc,
     "tvlqr_mpc": _tvlqr_mpc,
 }
@@ -88,7 +111,7 @@ def mechanism_controller_names() -> tuple[str, ...]:
 
 
 def make_mechanism_controller(name: str, plant: MechanismParameters, period: float) -> MechanismController:
-    """Design a controller; mpc compiles for some ten seconds the first time.
+    """Design a controller; ilqr and mpc compile for some ten seconds the first time.
 
     Args:
         name: Of :func:`mechanism_controller_names`, or the path of a policy file, ``FILE.npz``; of ``FILE.npz+lqr``

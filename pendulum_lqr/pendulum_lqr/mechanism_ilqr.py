@@ -65,7 +65,7 @@ class IlqrPlan(NamedTuple):
         states: (q, v, u) at the nodes, shape (N + 1, 2n + m).
         efforts: Efforts at the ends of the intervals, shape (N, m).
         gains: K of the efforts' feedback from (q, v, u), shape (N, m, 2n + m); 0 where nothing was iterated.
-        cost: J.
+        cost: J; infinite where the plan runs away from all numbers.
         iterations: Iterations taken.
         converged: Whether the last of them changed J by less than a share of 1e-6.
     """
@@ -131,7 +131,7 @@ class IlqrProblem:
             Z, U, reference, gains, self.plant.packed, goal, np.array([low, high - low]), self.step,
             np.array(self.weights, dtype=np.float64), np.ascontiguousarray(self.terminal), limits, iterations,
         )  # fmt: skip
-        return IlqrPlan(Z, U, gains, float(cost), int(count), bool(converged))
+        return IlqrPlan(Z, U, gains, float(cost) if math.isfinite(cost) else math.inf, int(count), bool(converged))
 
 
 @cache

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+from collections.abc import Iterable
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
@@ -21,7 +22,15 @@ from pendulum_msgs_py.parameters import read_text
 from pendulum_msgs_py.plants.mechanism_parameters import MechanismParameters
 from pendulum_msgs_py.whole_file import write_whole
 
-__all__ = ["FORMAT", "MechanismTrajectory", "SwingUpSearch", "load_trajectory", "search_swing_up", "write_trajectory"]
+__all__ = [
+    "FORMAT",
+    "MechanismTrajectory",
+    "SwingUpSearch",
+    "cheapest_swing_up",
+    "load_trajectory",
+    "search_swing_up",
+    "write_trajectory",
+]
 
 Array = NDArray[np.float64]
 
@@ -106,7 +115,7 @@ def search_swing_up(
         seed: Of the guess.
 
     Raises:
-        DesignError: The guess does not end upright.
+        DesignError: The guess does not end upright, or runs into an end stop on its way.
     """
     rng = np.random.default_rng(seed)
     m = len(plant.coordinates.driven)
@@ -124,6 +133,9 @@ def search_swing_up(
         raise DesignError(f"guess {seed} of {plant.name!r} does not end upright")
     tail = _held(plant, catch, tuple(found.states[-1]), max(0, round(search.duration / search.step) - len(t)), search)
     plan = problem.solve(still, still, none, np.vstack([found.efforts, tail]), 2 * search.iterations)
+    lowest, highest = np.array(plant.stops).T
+    if np.any((plan.states[:, :n] <= lowest) | (plan.states[:, :n] >= highest)):
+        raise DesignError(f"guess {seed} of {plant.name!r} runs into an end stop")
     return MechanismTrajectory(
         plant.name,
         plant.coordinates.names,
@@ -136,6 +148,33 @@ def search_swing_up(
             "search": {**asdict(search), "weights": list(search.weights), "find": list(search.find)},
         },
     )
+
+
+def cheapest_swing_up(
+    plant: MechanismParameters, catch: MechanismCatch, search: SwingUpSearch, seeds: Iterable[int]
+) -> tuple[MechanismTrajectory, int]:
+    """Return the cheapest swing-up of several guesses, and how many of them became one.
+
+    Args:
+        plant: The plant.
+        catch: LQR with its caught region, of the same plant.
+        search: Settings.
+        seeds: Of the guesses.
+
+    Raises:
+        DesignError: None became one.
+    """
+    found = []
+    tried = 0
+    for seed in seeds:
+        tried += 1
+        try:
+            found.append(search_swing_up(plant, catch, search, seed))
+        except DesignError:
+            continue
+    if not found:
+        raise DesignError(f"none of {tried} guesses of {plant.name!r} ends upright; expected more guesses")
+    return min(found, key=lambda each: float(each.how["cost"])), len(found)
 
 
 def _held(plant: MechanismParameters, catch: MechanismCatch, z: Vector, count: int, search: SwingUpSearch) -> Array:

@@ -125,8 +125,8 @@ class MechanismTvlqr:
         if self.recover is not None:
             self.recover.reset()
 
-    def command(self, t: float, x: Vector) -> Vector:
-        """Return the efforts [N m or N]."""
+    def followed(self, t: float, x: Vector) -> Vector | None:
+        """Return the efforts that follow the trajectory; None where it has ended, or from where it was left once."""
         if self._began is None:
             # Hanging is hanging, however often it has turned before: the trajectory knows nothing of whole turns.
             self._began, self._turned = t, 2.0 * math.pi * np.rint(np.array(x) / (2.0 * math.pi)) * self._turning
@@ -136,6 +136,13 @@ class MechanismTvlqr:
             if float(error @ self.costs[k] @ error) <= self._tube:
                 return within_limits(self.efforts[k] - self.gains[k] @ error, self._limits)
         self._following = False
+        return None
+
+    def command(self, t: float, x: Vector) -> Vector:
+        """Return the efforts [N m or N]."""
+        effort = self.followed(t, x)
+        if effort is not None:
+            return effort
         deviation = deviation_of(self.plant.coordinates, x)
         if self.catch.holds(deviation):
             return self.catch.command(deviation)

@@ -41,9 +41,8 @@ def swing_up(
 
     Example: python -m pendulum_lqr swing_up --preset pendubot_frictionless --guesses 20 --out build/pendubot.json
     """
-    from pendulum_lqr.design import DesignError
     from pendulum_lqr.mechanism_controllers import default_catch
-    from pendulum_lqr.mechanism_trajectory import SwingUpSearch, search_swing_up, write_trajectory
+    from pendulum_lqr.mechanism_trajectory import SwingUpSearch, cheapest_swing_up, write_trajectory
     from pendulum_msgs_py.plants.mechanism_parameters import load_mechanism
 
     try:
@@ -60,20 +59,10 @@ def swing_up(
     plant = load_mechanism(preset)
     catch = default_catch(plant)
     search = SwingUpSearch(values, duration=duration)
-    best = None
-    upright = 0
     console = make_console(highlight=False)
     with counting_bar(console) as bar:
-        for seed in bar.track(range(first, first + guesses), description="guesses"):
-            try:
-                found = search_swing_up(plant, catch, search, seed)
-            except DesignError:
-                continue
-            upright += 1
-            if best is None or found.how["cost"] < best.how["cost"]:
-                best = found
-    if best is None:
-        raise DesignError(f"none of {guesses} guesses of {plant.name!r} ends upright; expected more --guesses")
+        seeds = bar.track(range(first, first + guesses), description="guesses")
+        best, upright = cheapest_swing_up(plant, catch, search, seeds)
     write_trajectory(output, best)
     console.print(f"{upright} of {guesses} guesses end upright; seed {best.how['seed']} costs {best.how['cost']:.4f}")
     console.print(f"trajectory {output}", soft_wrap=True)

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from pendulum_lqr.interface import JointController
-from pendulum_lqr.mechanism_controllers import default_catch
+from pendulum_lqr.mechanism_controllers import default_catch, refuse_passive_friction
 from pendulum_lqr.mechanism_mpc import MechanismMpc
 from pendulum_lqr.sampling import ASSUMED_PERIOD, differs
 from pendulum_msgs_py.errors import ParameterError
@@ -44,14 +44,7 @@ class JointNmpc(JointController):
         Raises:
             ParameterError: One has: plans leave it out, and no effort can make up for it there.
         """
-        driven = plant.coordinates.driven
-        for index, (name, joint) in enumerate(zip(plant.coordinates.names, plant.joints, strict=True)):
-            if index not in driven and joint.breakaway > 0.0:
-                unit = plant.coordinates.joints[index].effort_unit
-                raise ParameterError(
-                    f"nmpc plans without dry friction, and {name} of plant {plant.name!r} is passive with "
-                    f"{joint.breakaway:g} {unit}; expected 0, as of a preset's frictionless twin"
-                )
+        refuse_passive_friction("nmpc", plant)
         return cls(plant, ASSUMED_PERIOD if period is None else period)
 
     def check(self, period: float) -> None:
@@ -73,8 +66,8 @@ class JointNmpc(JointController):
 
     def describe(self) -> str:
         """Return its horizon, and from where the LQR catches."""
-        settings = self._inner.settings
+        plan = self._inner.settings.plan
         return (
-            f"plans of {settings.nodes * settings.step:.3g} s by iterative LQR, then LQR within "
+            f"plans of {plan.nodes * plan.step:.3g} s by iterative LQR, then LQR within "
             f"{self._inner.catch.region.describe()}"
         )

@@ -3,50 +3,67 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from pathlib import Path
 from typing import Any
 
 from pendulum_lqr.interface import JointController
 from pendulum_lqr.mechanism_controllers import default_catch, stored_trajectory
+from pendulum_lqr.mechanism_trajectory import MechanismTrajectory, load_trajectory
 from pendulum_lqr.mechanism_tvlqr import MechanismTvlqr
 from pendulum_lqr.sampling import ASSUMED_PERIOD, differs
 from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.joints import Vector
+from pendulum_msgs_py.parameters import ParameterSpec
 from pendulum_msgs_py.plants.mechanism_parameters import MechanismParameters
 
 __all__ = ["JointSwingUp"]
 
+_FILE = ParameterSpec(
+    "trajectory",
+    "",
+    "",
+    "File (.json) of `python -m pendulum_lqr swing_up`; empty for the swing-up that is stored for the preset.",
+)
+
 
 class JointSwingUp(JointController):
-    """From hanging along the swing-up that comes with the project for a preset; where it is lost, no effort at all.
+    """From hanging along a swing-up; where it is lost, no effort at all.
 
     Args:
-        plant: The plant, one for which a swing-up is stored.
+        plant: The plant.
         period: Period at which states come [s].
+        trajectory: The swing-up.
 
     Raises:
-        ParameterError: No swing-up is stored for this plant.
+        ParameterError: The trajectory is that of another mechanism.
     """
 
-    SUMMARY = "swing-up along the stored trajectory of a preset by TVLQR, then LQR"
+    SUMMARY = "swing-up along the stored trajectory of a preset, or that of a file, by TVLQR, then LQR"
 
     DESIGNING = "tries out from where the LQR catches, which takes some seconds"
 
-    def __init__(self, plant: MechanismParameters, period: float) -> None:
+    def __init__(self, plant: MechanismParameters, period: float, trajectory: MechanismTrajectory) -> None:
         super().__init__(plant.effort_limits)
         self._period = period
-        trajectory = stored_trajectory(plant)
         self._duration = trajectory.duration
         q, r = plant.mechanism.weights
         self._inner = MechanismTvlqr(plant, period, trajectory, default_catch(plant), q=q, r=r)
+
+    @classmethod
+    def parameters(cls, plant: MechanismParameters) -> tuple[ParameterSpec, ...]:
+        """Return the file."""
+        return (_FILE,)
 
     @classmethod
     def design(cls, plant: MechanismParameters, p: Mapping[str, Any], period: float | None) -> JointSwingUp:
         """Return the swing-up, which is tracked at one period.
 
         Raises:
-            ParameterError: No swing-up is stored for this plant.
+            ParameterError: No swing-up is stored for this plant and none is given, or its file is refused.
         """
-        return cls(plant, ASSUMED_PERIOD if period is None else period)
+        given = p["trajectory"]
+        trajectory = load_trajectory(Path(given).expanduser()) if given else stored_trajectory(plant)
+        return cls(plant, ASSUMED_PERIOD if period is None else period, trajectory)
 
     def check(self, period: float) -> None:
         """Refuse another period than that of the design [s].

@@ -1,0 +1,53 @@
+"""Swing-up of several joints that is planned when the controller starts: iterative LQR, TVLQR along it, then LQR."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from pendulum_lqr.controllers.joint_lqr import JOINT_LIMIT, joint_limits
+from pendulum_lqr.controllers.joint_swing_up import JointSwingUp
+from pendulum_lqr.mechanism_controllers import default_catch, refuse_passive_friction
+from pendulum_lqr.mechanism_ilqr import IlqrWeights
+from pendulum_lqr.mechanism_trajectory import SwingUpSearch, cheapest_swing_up
+from pendulum_lqr.sampling import ASSUMED_PERIOD
+from pendulum_msgs_py.parameters import ParameterSpec
+from pendulum_msgs_py.plants.mechanism_parameters import MechanismParameters
+
+__all__ = ["JointIlqr"]
+
+_WEIGHTS = IlqrWeights(far=1.0, energy=0.0, effort=0.02, rate=1e-4, velocity=5e-3, terminal=10.0)
+
+
+class JointIlqr(JointSwingUp):
+    """From hanging along the cheapest swing-up that iterative LQR makes of some random guesses.
+
+    It is searched once, while the controller is designed: nothing is planned while the plant moves.
+    """
+
+    SUMMARY = "swing-up planned by iterative LQR when it starts, followed by TVLQR, then LQR"
+
+    DESIGNING = "compiles its model and searches a swing-up, which takes some ten seconds"
+
+    @classmethod
+    def parameters(cls, plant: MechanismParameters) -> tuple[ParameterSpec, ...]:
+        """Return what the search takes, and the limit."""
+        return (
+            ParameterSpec("guesses", 16, "-", "Random guesses from which a swing-up is searched.", minimum=1, maximum=1000),
+            ParameterSpec("duration", 4.0, "s", "Longest swing-up.", minimum=1.5, maximum=20.0),
+            JOINT_LIMIT,
+        )
+
+    @classmethod
+    def design(cls, plant: MechanismParameters, p: Mapping[str, Any], period: float | None) -> JointIlqr:
+        """Return the swing-up for a plant whose passive joints have no dry friction.
+
+        Raises:
+            ParameterError: One has, or no guess ends upright under the limits and between the end stops.
+        """
+        refuse_passive_friction("ilqr", plant)
+        limits = zip(plant.coordinates.driven_names, joint_limits(plant, p["effort_limit"]), strict=True)
+        limited = plant.with_values({f"{joint}.effort_limit": limit for joint, limit in limits})
+        search = SwingUpSearch(_WEIGHTS, duration=p["duration"])
+        trajectory, _ = cheapest_swing_up(limited, default_catch(limited), search, range(p["guesses"]))
+        return cls(limited, ASSUMED_PERIOD if period is None else period, trajectory)

@@ -1,0 +1,105 @@
+"""Iterative LQR as a controller: plan from where it is, follow the plan, hand over to the LQR about upright."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+
+from pendulum_lqr.mechanism_catch import MechanismCatch, deviation_of
+from pendulum_lqr.mechanism_ilqr import IlqrPlan, IlqrWeights
+from pendulum_lqr.mechanism_search import PlanSearch, PlanSettings
+from pendulum_lqr.mechanism_trajectory import MechanismTrajectory
+from pendulum_lqr.mechanism_tvlqr import MechanismTvlqr
+from pendulum_msgs_py.joints import Vector
+from pendulum_msgs_py.plants.mechanism_parameters import MechanismParameters
+
+__all__ = ["PlannedSwingUp"]
+
+_SPRINT = IlqrWeights(1.0, 0.0, 0.0005, 2e-6, 1e-4, 3.0)
+"""Hardly anything but the time away from upright costs."""
+_PLAN = PlanSettings(_SPRINT, step=0.01, nodes=100, guesses=100, iterations=40)
+_REFINED = 100
+"""Largest number of iterations of the plan that is taken."""
+_TUBE = 10.0
+"""Width of the tube about a plan, as a multiple of the caught region's level; beyond it, it plans anew."""
+
+
+class PlannedSwingUp:
+    """Plans to the end, follows the plan by time-varying LQR, and plans anew only where that leads nowhere.
+
+    A search takes about a second: simulated time waits for it, a real plant does not.
+
+    Args:
+        plant: The plant; plans leave its dry friction out.
+        period: Sampling period [s].
+        catch: LQR with its region.
+        settings: Horizon, weights, guesses.
+        seed: Of the guesses.
+    """
+
+    def __init__(
+        self,
+        plant: MechanismParameters,
+        period: float,
+        catch: MechanismCatch,
+        settings: PlanSettings = _PLAN,
+        seed: int = 0,
+    ) -> None:
+        self.plant, self.period, self.catch = plant, period, catch
+        self.search = PlanSearch(catch, settings, seed)
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget the plan."""
+        self.catch.active = False
+        self.search.reset()
+        self._followed: MechanismTvlqr | None = None
+        self._before = (0.0,) * len(self.plant.effort_limits)
+
+    def command(self, t: float, x: Vector) -> Vector:
+        """Return the efforts [N m or N]."""
+        deviation = deviation_of(self.plant.coordinates, x)
+        if self.catch.holds(deviation):
+            self._followed = None
+            self._before = self.catch.command(deviation)
+            return self._before
+        effort = None if self._followed is None else self._followed.followed(t, x)
+        if effort is None:
+            self._followed = self._follow(self._plan(x))
+            # A plan begins where it is; one that runs away, as all may from far beyond a machine's speeds, cannot be followed.
+            effort = self._followed.followed(t, x) or (0.0,) * len(self._before)
+        self._before = effort
+        return effort
+
+    def _plan(self, x: Vector) -> IlqrPlan:
+        """Return the cheapest plan that ends where the LQR catches; the cheapest at all where none does."""
+        start = _within_a_turn(self.plant, x)
+        found = self.search.guessed(start, self._before, self.search.settings.guesses)
+        best = min(found, key=self._rank)
+        refined = self.search.solve(start, self._before, best.efforts, _REFINED)
+        return min(refined, best, key=self._rank)
+
+    def _rank(self, plan: IlqrPlan) -> tuple[bool, float]:
+        return not self.search.arrives(plan), plan.cost
+
+    def _follow(self, plan: IlqrPlan) -> MechanismTvlqr:
+        names = self.plant.coordinates.names
+        trajectory = MechanismTrajectory(
+            self.plant.name,
+            names,
+            np.arange(len(plan.states)) * self.search.settings.step,
+            plan.states[:, : 2 * len(names)],
+            plan.states[:, 2 * len(names) :],
+        )
+        q, r = self.plant.mechanism.weights
+        return MechanismTvlqr(self.plant, self.period, trajectory, replace(self.catch), q=q, r=r, tube=_TUBE)
+
+
+def _within_a_turn(plant: MechanismParameters, x: Vector) -> Vector:
+    """Return a state whose turning joints are within half a turn of hanging."""
+    n = len(plant.joints)
+    turns = (joint.turns for joint in plant.mechanism.joints)
+    q = (each - 2.0 * math.pi * round(each / (2.0 * math.pi)) if turn else each for each, turn in zip(x, turns))
+    return (*q, *x[n:])
