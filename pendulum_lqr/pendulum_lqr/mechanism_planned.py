@@ -11,7 +11,7 @@ from pendulum_lqr.mechanism_catch import MechanismCatch, deviation_of
 from pendulum_lqr.mechanism_ilqr import IlqrPlan, IlqrWeights
 from pendulum_lqr.mechanism_search import PlanSearch, PlanSettings
 from pendulum_lqr.mechanism_trajectory import MechanismTrajectory
-from pendulum_lqr.mechanism_tvlqr import MechanismTvlqr
+from pendulum_lqr.mechanism_tvlqr import MechanismTvlqr, whole_turns
 from pendulum_msgs_py.joints import Vector
 from pendulum_msgs_py.plants.mechanism_parameters import MechanismParameters
 
@@ -67,15 +67,16 @@ class PlannedSwingUp:
             return self._before
         effort = None if self._followed is None else self._followed.followed(t, x)
         if effort is None:
-            self._followed = self._follow(self._plan(x))
-            # A plan begins where it is; one that runs away, as all may from far beyond a machine's speeds, cannot be followed.
-            effort = self._followed.followed(t, x) or (0.0,) * len(self._before)
-        self._before = effort
-        return effort
+            plan = self._plan(x)
+            # From far beyond a machine's speeds every plan runs away from all numbers: there is none to follow.
+            self._followed = self._follow(plan) if math.isfinite(plan.cost) else None
+            effort = None if self._followed is None else self._followed.followed(t, x)
+        self._before = (0.0,) * len(self._before) if effort is None else effort
+        return self._before
 
     def _plan(self, x: Vector) -> IlqrPlan:
         """Return the cheapest plan that ends where the LQR catches; the cheapest at all where none does."""
-        start = _within_a_turn(self.plant, x)
+        start = tuple(float(value) for value in np.array(x) - whole_turns(self.plant, x))
         found = self.search.guessed(start, self._before, self.search.settings.guesses)
         best = min(found, key=self._rank)
         refined = self.search.solve(start, self._before, best.efforts, _REFINED)
@@ -95,11 +96,3 @@ class PlannedSwingUp:
         )
         q, r = self.plant.mechanism.weights
         return MechanismTvlqr(self.plant, self.period, trajectory, replace(self.catch), q=q, r=r, tube=_TUBE)
-
-
-def _within_a_turn(plant: MechanismParameters, x: Vector) -> Vector:
-    """Return a state whose turning joints are within half a turn of hanging."""
-    n = len(plant.joints)
-    turns = (joint.turns for joint in plant.mechanism.joints)
-    q = (each - 2.0 * math.pi * round(each / (2.0 * math.pi)) if turn else each for each, turn in zip(x, turns))
-    return (*q, *x[n:])

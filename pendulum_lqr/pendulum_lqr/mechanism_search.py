@@ -55,7 +55,9 @@ class PlanSearch:
         """Draw the same guesses again."""
         self._rng = np.random.default_rng(self.seed)
 
-    def solve(self, x: Vector, before: Vector, guess: Array, iterations: int, around: IlqrPlan | None = None) -> IlqrPlan:
+    def solve(
+        self, x: Vector, before: Vector, guess: Array, iterations: int, around: IlqrPlan | None = None
+    ) -> IlqrPlan:
         """Return what iterations make of a guess.
 
         Args:

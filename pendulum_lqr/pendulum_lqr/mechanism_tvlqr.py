@@ -17,7 +17,7 @@ from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.joints import Vector
 from pendulum_msgs_py.plants.mechanism_parameters import MechanismParameters
 
-__all__ = ["MechanismTvlqr", "tracking_gains"]
+__all__ = ["MechanismTvlqr", "tracking_gains", "whole_turns"]
 
 Array = NDArray[np.float64]
 
@@ -63,6 +63,12 @@ def tracking_gains(
         P[k] = Q + A.T @ P[k + 1] @ (A - B @ K[k])
         P[k] = 0.5 * (P[k] + P[k].T)
     return K, P
+
+
+def whole_turns(plant: MechanismParameters, x: Vector) -> Array:
+    """Return what a state [q, v] has of whole turns about hanging, shape (2n,): no motion depends on it [rad]."""
+    turns = np.array([joint.turns for joint in plant.mechanism.joints] + [False] * len(plant.joints))
+    return np.where(turns, 2.0 * math.pi * np.rint(np.array(x) / (2.0 * math.pi)), 0.0)
 
 
 class MechanismTvlqr:
@@ -113,7 +119,6 @@ class MechanismTvlqr:
         self.gains, self.costs = tracking_gains(plant, self.states, self.efforts, period, q, r, catch.gain.S)
         self._tube = tube * catch.region.level
         self._limits = plant.effort_limits
-        self._turning = np.array([joint.turns for joint in plant.mechanism.joints] + [False] * len(names))
         self.reset()
 
     def reset(self) -> None:
@@ -121,7 +126,7 @@ class MechanismTvlqr:
         self.catch.active = False
         self._following = True
         self._began: float | None = None
-        self._turned = np.zeros(len(self._turning))
+        self._turned = np.zeros(2 * len(self.plant.joints))
         if self.recover is not None:
             self.recover.reset()
 
@@ -129,7 +134,7 @@ class MechanismTvlqr:
         """Return the efforts that follow the trajectory; None where it has ended, or from where it was left once."""
         if self._began is None:
             # Hanging is hanging, however often it has turned before: the trajectory knows nothing of whole turns.
-            self._began, self._turned = t, 2.0 * math.pi * np.rint(np.array(x) / (2.0 * math.pi)) * self._turning
+            self._began, self._turned = t, whole_turns(self.plant, x)
         k = round((t - self._began) / self.period)
         if self._following and k < len(self.efforts):
             error = np.array(x) - self._turned - self.states[k]

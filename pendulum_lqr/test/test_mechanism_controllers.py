@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 from pendulum_lqr import swing_up_cli
+from pendulum_lqr.design import DesignError
 from pendulum_lqr.joint_controller import make_joint_controller
 from pendulum_lqr.mechanism_catch import CaughtRegion, MechanismCatch, deviation_of, make_mechanism_catch
 from pendulum_lqr.mechanism_controllers import (
@@ -22,13 +23,22 @@ from pendulum_lqr.mechanism_controllers import (
 from pendulum_lqr.mechanism_ilqr import IlqrProblem, IlqrWeights
 from pendulum_lqr.mechanism_model import linearise_mechanism, mechanism_lqr
 from pendulum_lqr.mechanism_mpc import MechanismMpc
-from pendulum_lqr.mechanism_trajectory import load_trajectory, write_trajectory
+from pendulum_lqr.mechanism_planned import PlannedSwingUp
+from pendulum_lqr.mechanism_search import PlanSettings
+from pendulum_lqr.mechanism_trajectory import (
+    SwingUpSearch,
+    cheapest_swing_up,
+    load_trajectory,
+    search_swing_up,
+    write_trajectory,
+)
 from pendulum_lqr.mechanism_tvlqr import MechanismTvlqr
 from pendulum_lqr.mechanism_velocity import DifferencedVelocity
 from pendulum_msgs_py.dynamics.runge_kutta import along_2, rk4_joints
 from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.joints import Vector
 from pendulum_msgs_py.plants.mechanism_parameters import MechanismParameters, load_mechanism
+from pendulum_sim.mechanism_plant import MechanismPlant
 
 DT = 0.002
 Q, R = (10.0, 10.0, 1.0, 1.0), 1.0
@@ -137,15 +147,15 @@ def test_iterative_lqr_and_mpc_bring_a_cart_pole_up_within_its_limits() -> None:
     assert controller.command(0.0, (0.0,) * 4) == efforts[0]
     # A first plan takes so long that a plant in real time lets its answer go: the next does not search as long again.
     solved = []
-    solve = controller._solve
-    controller._solve = lambda *asked: (solved.append(asked), solve(*asked))[1]  # type: ignore[method-assign]
+    solve = controller.search.solve
+    controller.search.solve = lambda *asked: (solved.append(asked), solve(*asked))[1]  # type: ignore[method-assign]
     controller.reset()
     controller.command(0.0, (0.0,) * 4)
-    assert len(solved) == controller.settings.guesses
+    assert len(solved) == controller.settings.plan.guesses
     solved.clear()
     late = controller.command(0.1, (0.0,) * 4)
     assert len(solved) == 1 + controller.settings.retries
-    assert controller._arrives(controller._plan)
+    assert controller.search.arrives(controller._plan)
     assert late == pytest.approx(efforts[0], abs=0.5)
     # On the graph it is the same, and begins anew with a plant that begins anew, whatever turns were made before.
     on_the_graph = make_joint_controller("nmpc", plant, {}, DT)
@@ -167,9 +177,116 @@ def test_iterative_lqr_and_mpc_bring_a_cart_pole_up_within_its_limits() -> None:
         on_the_graph.check(0.01)
 
 
-def test_plans_without_dry_friction_are_not_for_a_passive_joint_that_has_some() -> None:
-    with pytest.raises(ParameterError, match=r"elbow of plant 'pendubot' is passive with 0\.12 N m; expected 0"):
-        make_joint_controller("nmpc", load_mechanism("pendubot"), {}, DT)
+@pytest.mark.timeout(400)
+def test_a_planned_swing_up_is_searched_once_and_anew_only_where_it_is_thrown_off() -> None:
+    plant = load_mechanism("cart_pole")
+    few = PlanSettings(IlqrWeights(1.0, 0.0, 0.0005, 2e-6, 1e-4, 3.0), step=0.02, nodes=100, guesses=4, iterations=30)
+    controller = PlannedSwingUp(plant, DT, default_catch(plant), few)
+    searched: list[Vector] = []
+    guessed = controller.search.guessed
+    controller.search.guessed = lambda x, *asked: (searched.append(x), guessed(x, *asked))[1]  # type: ignore[method-assign]
+
+    def run(x: Vector, kick: float = 0.0) -> tuple[Vector, list[float]]:
+        controller.reset()
+        searched.clear()
+        efforts = []
+        for k in range(2500):
+            (effort,) = controller.command(k * DT, x)
+            efforts.append(effort)
+            x = step(plant, x, (effort,))
+            if k == 200:
+                x = (*x[:3], x[3] + kick)
+        return x, efforts
+
+    def upright(x: Vector) -> bool:
+        return bool(np.max(np.abs(deviation_of(plant.coordinates, x)[1:])) < 0.05)
+
+    end, efforts = run((0.0, 0.0, 0.0, 0.0))
+    assert upright(end)
+    assert searched == [(0.0, 0.0, 0.0, 0.0)]
+    assert max(map(abs, efforts)) <= plant.effort_limits[0]
+    again, same = run((0.0, 0.0, 0.0, 0.0))
+    assert same == efforts
+    assert again == end
+    # Turns made before are none of its business.
+    turned, _ = run((0.2, 0.5 + 4.0 * math.pi, 0.1, -1.0))
+    assert upright(turned)
+    assert searched[0] == pytest.approx((0.2, 0.5, 0.1, -1.0))
+    kicked, _ = run((0.0, 0.0, 0.0, 0.0), kick=6.0)
+    assert upright(kicked)
+    assert len(searched) > 1
+    controller.reset()
+    with pytest.raises(ParameterError, match=r"plan begins at .*nan.*; expected finite numbers"):
+        controller.command(0.0, (0.0, math.nan, 0.0, 0.0))
+    # From where every plan runs away from all numbers there is nothing to follow.
+    assert controller.command(0.0, (0.0, 0.0, 1e200, 1e200)) == (0.0,)
+
+
+@pytest.mark.timeout(400)
+def test_ilqr_on_the_graph_swings_up_under_the_limit_that_it_was_given_and_gives_nothing_where_it_is_lost() -> None:
+    plant = load_mechanism("cart_pole")
+    limit = 0.8 * plant.effort_limits[0]
+    controller = make_joint_controller("ilqr", plant, {"guesses": 4, "effort_limit": limit}, 0.01)
+    assert "swing-up of 4 s by TVLQR, then LQR within" in controller.describe()
+    simulated = MechanismPlant(plant, dt=0.01)
+    q, v = (0.0, 0.0), (0.0, 0.0)
+    efforts, way = [], []
+    for k in range(600):
+        (effort,) = controller.command(0.01 * k, q, v)
+        state = simulated.step((effort,))
+        q, v = state.position, state.velocity
+        efforts.append(abs(effort))
+        way.append(abs(q[0]))
+    assert np.max(np.abs(deviation_of(plant.coordinates, (*q, *v)))) < 0.1
+    assert 0.5 * limit < max(efforts) <= limit
+    assert max(way) < plant.stops[0][1]
+    controller.reset()
+    assert controller.command(0.0, (0.5, 1.0), (0.0, 3.0)) == (0.0,)
+    # It stays lost: a trajectory that was left is not found again by chance.
+    assert controller.command(0.01, (0.0, 0.0), (0.0, 0.0)) == (0.0,)
+    with pytest.raises(ParameterError, match=r"the trajectory is followed every 0\.01 s"):
+        controller.check(0.002)
+
+
+def test_a_swing_up_that_runs_into_an_end_stop_is_none() -> None:
+    plant = load_mechanism("cart_pole")
+    narrow = plant.with_values({"cart.lower_stop": -0.2, "cart.upper_stop": 0.2})
+    catch = default_catch(plant)
+    search = SwingUpSearch(IlqrWeights(1.0, 0.0, 0.02, 1e-4, 5e-3, 10.0))
+    with pytest.raises(DesignError, match=r"guess 2 of 'cart_pole' runs into an end stop"):
+        search_swing_up(narrow, catch, search, 2)
+    assert np.max(np.abs(search_swing_up(plant, catch, search, 2).states[:, 0])) < plant.stops[0][1]
+    with pytest.raises(DesignError, match=r"none of 2 guesses of 'cart_pole' ends upright; expected more guesses"):
+        cheapest_swing_up(narrow, catch, search, (2, 3))
+    best, count = cheapest_swing_up(plant, catch, search, (0, 2))
+    assert (best.how["seed"], count) == (2, 2)
+
+
+def test_tvlqr_follows_the_file_of_a_search_and_refuses_that_of_another_mechanism(tmp_path: Path) -> None:
+    plant = load_mechanism("cart_pole")
+    trajectory = search_swing_up(
+        plant, default_catch(plant), SwingUpSearch(IlqrWeights(1.0, 0.0, 0.02, 1e-4, 5e-3, 10.0), duration=3.0), 2
+    )
+    path = tmp_path / "cart_pole.json"
+    write_trajectory(path, trajectory)
+    controller = make_joint_controller("tvlqr", plant, {"trajectory": str(path)}, DT)
+    assert "swing-up of 3 s by TVLQR" in controller.describe()
+    x: Vector = (0.0, 0.0, 0.0, 0.0)
+    for k in range(2500):
+        x = step(plant, x, controller.command(k * DT, x[:2], x[2:]))
+    assert np.max(np.abs(deviation_of(plant.coordinates, x)[1:])) < 0.05
+    with pytest.raises(ParameterError, match="has the joints cart, pole and 1 motors; expected arm, pendulum and 1"):
+        make_joint_controller("tvlqr", load_mechanism("furuta"), {"trajectory": str(path)}, DT)
+    with pytest.raises(ParameterError, match=r"gone\.json does not exist"):
+        make_joint_controller("tvlqr", plant, {"trajectory": str(tmp_path / "gone.json")}, DT)
+
+
+@pytest.mark.parametrize("name", ["nmpc", "ilqr"])
+def test_plans_without_dry_friction_are_not_for_a_passive_joint_that_has_some(name: str) -> None:
+    with pytest.raises(
+        ParameterError, match=rf"{name} plans .* elbow of plant 'pendubot' is passive with 0\.12 N m; expected 0"
+    ):
+        make_joint_controller(name, load_mechanism("pendubot"), {}, DT)
 
 
 def test_nothing_is_planned_from_a_state_that_is_no_number() -> None:

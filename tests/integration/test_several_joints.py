@@ -322,7 +322,7 @@ REFUSED: list[Refused] = [
     (
         CONTROLLER,
         ("plant:=acrobot", "controller:=pid"),
-        "pid is for plants of one joint, and plant 'acrobot' has shoulder, elbow; expected lqr, tvlqr, mpc, nmpc or",
+        "pid is for plants of one joint, and plant 'acrobot' has shoulder, elbow; expected lqr, tvlqr, ilqr, mpc, nmpc or",
     ),
     (CONTROLLER, ("plant:=cart_pole", "controller:=policy"), "policy is empty; expected the path of a policy file"),
     (CONTROLLER, ("plant:=acrobot", "q:=[1.0, 2.0]"), "q has the shape (2,); expected (4,)"),

@@ -33,7 +33,9 @@ class JointIlqr(JointSwingUp):
     def parameters(cls, plant: MechanismParameters) -> tuple[ParameterSpec, ...]:
         """Return what the search takes, and the limit."""
         return (
-            ParameterSpec("guesses", 16, "-", "Random guesses from which a swing-up is searched.", minimum=1, maximum=1000),
+            ParameterSpec(
+                "guesses", 16, "-", "Random guesses from which a swing-up is searched.", minimum=1, maximum=1000
+            ),
             ParameterSpec("duration", 4.0, "s", "Longest swing-up.", minimum=1.5, maximum=20.0),
             JOINT_LIMIT,
         )
