@@ -94,7 +94,7 @@ def _tvlqr_mpc(plant: MechanismParameters, period: float) -> MechanismController
 
 
 def _ilqr(plant: MechanismParameters, period: float) -> MechanismController:
-    return DifferencedVelocity(plant, PlannedSwingUp(plant, period, default_catch(plant)))
+    return PlannedSwingUp(plant, period, default_catch(plant))
 
 
 _CONTROLLERS: dict[str, Callable[[MechanismParameters, float], MechanismController]] = {

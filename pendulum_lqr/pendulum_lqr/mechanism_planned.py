@@ -19,7 +19,7 @@ __all__ = ["PlannedSwingUp"]
 
 _SPRINT = IlqrWeights(1.0, 0.0, 0.0005, 2e-6, 1e-4, 3.0)
 """Hardly anything but the time away from upright costs."""
-_PLAN = PlanSettings(_SPRINT, step=0.01, nodes=100, guesses=100, iterations=40)
+_PLAN = PlanSettings(_SPRINT, step=0.01, nodes=100, guesses=200, iterations=40)
 _REFINED = 100
 """Largest number of iterations of the plan that is taken."""
 _TUBE = 10.0

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import signal
 import subprocess
 import sys
 import types
@@ -75,6 +76,52 @@ def test_an_interrupt_while_loading_is_no_traceback(
     package(main)
     assert run_package("arm", ["node"]) == EXIT_INTERRUPTED
     assert capsys.readouterr().err == "interrupted\n"
+
+
+_DROPS = """
+import ctypes, sys, time, types, weakref
+from importlib.machinery import ModuleSpec
+from pendulum_msgs_py.programs.executables import run_package
+
+def wait(*_):
+    print("waiting", flush=True)
+    time.sleep(60.0)
+
+class Thing:
+    if sys.argv[1] == "destructor":
+        __del__ = wait
+
+def main(_):
+    thing = Thing()
+    reference = weakref.ref(thing, wait) if sys.argv[1] == "weak reference" else None
+    if sys.argv[1] == "C":
+        ctypes.CFUNCTYPE(None)(wait)()
+    del thing
+    print("went on", flush=True)
+    time.sleep(60.0)
+    return 0
+
+table = types.ModuleType("arm.executables")
+table.EXECUTABLES = {"node": "arm.node:main"}
+node = types.ModuleType("arm.node")
+node.main = main
+arm = types.ModuleType("arm")
+arm.__spec__ = ModuleSpec("arm", None)
+sys.modules.update({"arm": arm, "arm.executables": table, "arm.node": node})
+sys.exit(run_package("arm", ["node"]))
+"""
+
+
+@pytest.mark.parametrize("where", ["destructor", "weak reference", "C"])
+def test_an_interrupt_is_not_lost_where_python_drops_what_is_raised(where: str) -> None:
+    with subprocess.Popen([sys.executable, "-c", _DROPS, where], stdout=subprocess.PIPE, stderr=subprocess.PIPE) as run:
+        assert run.stdout is not None
+        assert run.stdout.readline() == b"waiting\n"
+        run.send_signal(signal.SIGINT)
+        rest, error = run.communicate(timeout=50.0)
+    assert run.returncode == EXIT_INTERRUPTED
+    assert rest == b"went on\n"
+    assert error == b"interrupted\n"
 
 
 def _app() -> typer.Typer:

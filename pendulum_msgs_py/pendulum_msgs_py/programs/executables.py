@@ -21,6 +21,7 @@ from typing import TYPE_CHECKING, Any
 from pendulum_msgs_py.errors import ParameterError, PendulumError
 from pendulum_msgs_py.programs import completion
 from pendulum_msgs_py.programs.extras import how_to_install
+from pendulum_msgs_py.programs.interrupts import keep_interrupts
 
 if TYPE_CHECKING:
     import typer
@@ -121,6 +122,7 @@ def run_program(target: str, arguments: Sequence[str], *, called_as: str = "") -
     importlib.import_module("pendulum_msgs_py.programs.one_thread")
     module_name, function_name = target.split(":")
     _called_as.append(called_as)
+    keep_interrupts()
     try:
         main = getattr(importlib.import_module(module_name), function_name)
         return int(main(list(arguments)) or 0)
