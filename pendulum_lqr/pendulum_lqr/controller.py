@@ -12,6 +12,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any, ClassVar, cast
 
 from pendulum_lqr.interface import Controller
+from pendulum_lqr.joint_controller import JOINT_CONTROLLERS
 from pendulum_lqr.loop_check import require_stable
 from pendulum_lqr.velocity import VELOCITY_ESTIMATORS, VelocityEstimator, make_velocity_estimator
 from pendulum_msgs_py.contract.angles import wrap
@@ -272,6 +273,8 @@ def controller_class(name: str) -> type[BaseController]:
         ParameterError: No such controller; the message lists those there are. Or a library of it is not installed.
     """
     if not isinstance(name, str) or name not in CONTROLLERS:  # a file may say 7
+        if name in list(JOINT_CONTROLLERS):
+            raise ParameterError(f"{name} is for plants of several joints; expected one of {', '.join(CONTROLLERS)}")
         raise ParameterError(f"controller is {name!r}; {suggestion(name, CONTROLLERS)}")
     module, kind = CONTROLLERS[name].split(":")
     try:

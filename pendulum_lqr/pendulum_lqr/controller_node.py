@@ -29,6 +29,7 @@ from pendulum_lqr.controller import (
 from pendulum_lqr.interface import Controller, JointController
 from pendulum_lqr.joint_controller import (
     JOINT_CONTROLLER_NAMES,
+    JOINT_CONTROLLERS,
     joint_controller_class,
     joint_parameters,
     make_joint_controller,
@@ -66,7 +67,10 @@ from pendulum_msgs_py.ros.timers import create_wall_timer
 __all__ = ["NODE_SPECS", "ControllerNode", "main"]
 
 NODE_SPECS: tuple[ParameterSpec, ...] = (
-    ParameterSpec("controller", "lqr", "", "Which controller.", choices=tuple(CONTROLLERS), read_only=True),
+    ParameterSpec(
+        "controller", "lqr", "", "Which controller.", choices=tuple(dict.fromkeys((*CONTROLLERS, *JOINT_CONTROLLERS))),
+        read_only=True,
+    ),
     ParameterSpec(
         "plant", "thesis", "", f"Plant to design for: {PRESET_NAMES} or the path of a plant file; of several joints, "
         f"with {JOINT_CONTROLLER_NAMES}: {', '.join(MECHANISM_PRESETS)}.", read_only=True,

@@ -285,6 +285,7 @@ def test_playback_without_a_file_is_refused():
     ("name", "values", "message"),
     [
         ("lrq", {}, "controller is 'lrq'; did you mean 'lqr'"),
+        ("ilqr", {}, "ilqr is for plants of several joints; expected one of lqr, lqi"),
         ("lqr", {"qq": [1.0, 1.0]}, "unknown parameter 'qq'"),
         ("lqr", {"r": 0.0}, r"r is 0\.0 1/\(N m\)\^2; expected > 0"),
         ("lqr", {"set_point": 9.0}, r"set_point is 9\.0 rad"),

@@ -135,17 +135,18 @@ def test_an_acrobot_is_held_upright_under_noise_in_lockstep_and_its_bag_is_read_
     assert states.effort[:, 1].any()
 
 
-def test_an_acrobot_swings_up_in_lockstep_and_stays(peer: Peer, processes) -> None:
+@pytest.mark.parametrize("name", ["tvlqr", "ilqr"])
+def test_an_acrobot_swings_up_in_lockstep_and_stays(peer: Peer, processes, name: str) -> None:
     controller = _start(
         processes,
         "pendulum_lqr",
         "controller",
         "plant:=acrobot_frictionless",
-        "controller:=tvlqr",
+        f"controller:={name}",
         "period:=0.004",
         "use_sim_time:=true",
     )
-    controller.wait_for_output(r"tvlqr for plant acrobot_frictionless: swing-up of .*sampled from", 60)
+    controller.wait_for_output(rf"{name} for plant acrobot_frictionless: swing-up of .*sampled from", 90)
     _start(
         processes,
         "pendulum_sim",
@@ -322,7 +323,7 @@ REFUSED: list[Refused] = [
     (
         CONTROLLER,
         ("plant:=acrobot", "controller:=pid"),
-        "pid is for plants of one joint, and plant 'acrobot' has shoulder, elbow; expected lqr, tvlqr, ilqr, mpc, nmpc or",
+        "pid is for plants of one joint, and plant 'acrobot' has shoulder, elbow; expected lqr, tvlqr, ilqr,",
     ),
     (CONTROLLER, ("plant:=cart_pole", "controller:=policy"), "policy is empty; expected the path of a policy file"),
     (CONTROLLER, ("plant:=acrobot", "q:=[1.0, 2.0]"), "q has the shape (2,); expected (4,)"),
