@@ -189,7 +189,10 @@ def kalman_gain(A: Matrix, C: Matrix, process: ArrayLike, measurement: ArrayLike
     W = np.atleast_2d(np.asarray(process, dtype=np.float64))
     V = np.atleast_2d(np.asarray(measurement, dtype=np.float64))
     for name, covariance in (("process", W), ("measurement", V)):
-        if not np.all(np.isfinite(covariance)) or float(np.linalg.eigvalsh(covariance)[0]) < -1e-15:
+        if np.all(np.isfinite(covariance)):
+            variances = np.linalg.eigvalsh(covariance)
+        # A covariance of few causes has zeros, of which rounding makes small numbers of either sign.
+        if not np.all(np.isfinite(covariance)) or variances[0] < -1e-12 * np.abs(variances).max():
             raise DesignError(f"{name} noise covariance is {covariance.tolist()}; expected finite, not negative")
     if not float(np.linalg.eigvalsh(V)[0]) > 0.0:
         raise DesignError(f"measurement noise covariance is {V.tolist()}; expected every variance > 0")

@@ -24,6 +24,9 @@ __all__ = [
 
 JOINT_CONTROLLERS: dict[str, str] = {
     "lqr": "pendulum_lqr.controllers.joint_lqr:JointLqr",
+    "discrete_lqr": "pendulum_lqr.controllers.joint_discrete_lqr:JointDiscreteLqr",
+    "lqi": "pendulum_lqr.controllers.joint_lqi:JointLqi",
+    "lqg": "pendulum_lqr.controllers.joint_lqg:JointLqg",
     "tvlqr": "pendulum_lqr.controllers.joint_swing_up:JointSwingUp",
     "ilqr": "pendulum_lqr.controllers.joint_ilqr:JointIlqr",
     "mpc": "pendulum_lqr.controllers.joint_mpc:JointMpc",

@@ -9,9 +9,10 @@ from collections.abc import Callable
 from pendulum_lqr.interface import Controller
 from pendulum_lqr.loop_check import MOST_GROWTH, growth
 from pendulum_msgs_py.contract.values import NANOSECONDS
+from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.plants.plant_parameters import PlantParameters
 
-__all__ = ["ASSUMED_PERIOD", "PeriodWatch", "differs", "rate_problem", "settles", "uses_period"]
+__all__ = ["ASSUMED_PERIOD", "PeriodWatch", "differs", "rate_problem", "require_period", "settles", "uses_period"]
 
 ASSUMED_PERIOD = 0.01
 """Period of a design whose states nobody has heard yet [s]: that of the thesis's loop."""
@@ -88,6 +89,21 @@ def settles(controller: Controller, plant: PlantParameters, period: float, set_p
         set_point: Angle to hold, from upright [rad].
     """
     return growth(controller, plant, period, set_point) <= MOST_GROWTH
+
+
+def require_period(what: str, designed: float, period: float) -> None:
+    """Refuse states at another period than that of the design.
+
+    Args:
+        what: What is done at each state, such as ``the trajectory is followed``.
+        designed: The period of the design [s].
+        period: That of the states [s].
+
+    Raises:
+        ParameterError: They differ.
+    """
+    if differs(period, designed):
+        raise ParameterError(f"{what} every {designed:g} s; expected states at that period")
 
 
 def rate_problem(

@@ -120,7 +120,7 @@ def test_a_pole_that_may_not_lean_far_leans_less_far() -> None:
 def test_an_effort_that_holds_upright_is_within_the_limits_and_not_on_its_way(monkeypatch: pytest.MonkeyPatch) -> None:
     plant = _delayed("acrobot_frictionless", PERIOD)
     weighted = replace(linearise_mechanism(plant), efforts=(2.0,))
-    monkeypatch.setattr("pendulum_lqr.controllers.joint_mpc.linearise_mechanism", lambda _: weighted)
+    monkeypatch.setattr("pendulum_lqr.controllers.joint_discrete_lqr.linearise_mechanism", lambda _: weighted)
     controller = make_joint_controller("mpc", plant, {}, PERIOD)
     for _ in range(3):
         assert controller.command(0.0, plant.coordinates.goal, (0.0, 0.0)) == pytest.approx((2.0,), abs=1e-4)
@@ -226,5 +226,5 @@ def test_positions_are_limited_where_there_are_end_stops_and_wherever_somebody_s
 def test_another_period_than_that_of_the_design_is_refused() -> None:
     controller = make_joint_controller("mpc", load_mechanism("cart_pole"), {}, PERIOD)
     controller.check(0.0101)
-    with pytest.raises(ParameterError, match=r"mpc predicts every 0\.01 s; expected states at that period"):
+    with pytest.raises(ParameterError, match=r"the loop is predicted every 0\.01 s; expected states at that period"):
         controller.check(0.002)

@@ -323,7 +323,7 @@ REFUSED: list[Refused] = [
     (
         CONTROLLER,
         ("plant:=acrobot", "controller:=pid"),
-        "pid is for plants of one joint, and plant 'acrobot' has shoulder, elbow; expected lqr, tvlqr, ilqr,",
+        "pid is for plants of one joint, and plant 'acrobot' has shoulder, elbow; expected lqr, discrete_lqr, lqi,",
     ),
     (CONTROLLER, ("plant:=cart_pole", "controller:=policy"), "policy is empty; expected the path of a policy file"),
     (CONTROLLER, ("plant:=acrobot", "q:=[1.0, 2.0]"), "q has the shape (2,); expected (4,)"),

@@ -8,8 +8,7 @@ from typing import Any
 from pendulum_lqr.interface import JointController
 from pendulum_lqr.mechanism_controllers import default_catch, refuse_passive_friction
 from pendulum_lqr.mechanism_mpc import MechanismMpc
-from pendulum_lqr.sampling import ASSUMED_PERIOD, differs
-from pendulum_msgs_py.errors import ParameterError
+from pendulum_lqr.sampling import ASSUMED_PERIOD, require_period
 from pendulum_msgs_py.joints import Vector
 from pendulum_msgs_py.plants.mechanism_parameters import MechanismParameters
 
@@ -53,8 +52,7 @@ class JointNmpc(JointController):
         Raises:
             ParameterError: as said.
         """
-        if differs(period, self.period):
-            raise ParameterError(f"nmpc plans for answers every {self.period:g} s; expected states at that period")
+        require_period("nmpc plans for answers", self.period, period)
 
     def reset(self) -> None:
         """Forget the plan."""

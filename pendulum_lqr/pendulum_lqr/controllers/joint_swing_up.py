@@ -10,8 +10,7 @@ from pendulum_lqr.interface import JointController
 from pendulum_lqr.mechanism_controllers import default_catch, stored_trajectory
 from pendulum_lqr.mechanism_trajectory import MechanismTrajectory, load_trajectory
 from pendulum_lqr.mechanism_tvlqr import MechanismTvlqr
-from pendulum_lqr.sampling import ASSUMED_PERIOD, differs
-from pendulum_msgs_py.errors import ParameterError
+from pendulum_lqr.sampling import ASSUMED_PERIOD, require_period
 from pendulum_msgs_py.joints import Vector
 from pendulum_msgs_py.parameters import ParameterSpec
 from pendulum_msgs_py.plants.mechanism_parameters import MechanismParameters
@@ -71,8 +70,7 @@ class JointSwingUp(JointController):
         Raises:
             ParameterError: as said.
         """
-        if differs(period, self._period):
-            raise ParameterError(f"the trajectory is followed every {self._period:g} s")
+        require_period("the trajectory is followed", self._period, period)
 
     def reset(self) -> None:
         """Begin anew, at hanging."""

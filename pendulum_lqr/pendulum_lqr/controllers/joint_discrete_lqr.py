@@ -1,0 +1,105 @@
+"""Discrete linear quadratic regulator of a plant of several joints, with the efforts on their way as states."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pendulum_lqr.controllers.joint_lqr import JOINT_LIMIT, joint_limits, joint_weights
+from pendulum_lqr.interface import Controller, JointController
+from pendulum_lqr.mechanism_controller import within_limits
+from pendulum_lqr.mechanism_model import linearise_mechanism
+from pendulum_lqr.sampled_design import discrete_lqr, discretise, sampled_cost
+from pendulum_lqr.sampling import ASSUMED_PERIOD, require_period
+from pendulum_msgs_py.joints import Vector
+from pendulum_msgs_py.parameters import ParameterSpec
+from pendulum_msgs_py.plants.mechanism_parameters import MechanismParameters
+
+__all__ = ["JointDiscreteLqr"]
+
+Array = NDArray[np.float64]
+
+
+class JointDiscreteLqr(JointController):
+    """u = u* - K [q - q*, v, efforts on their way, oldest first] about upright, held over each period.
+
+    What is on its way is what it sent itself, limits included.
+
+    Args:
+        plant: The plant.
+        p: Checked parameters.
+        period: Sampling period [s].
+    """
+
+    SUMMARY = "discrete LQR for zero-order hold, with compensation of the plant's delay"
+
+    def __init__(self, plant: MechanismParameters, p: Mapping[str, Any], period: float) -> None:
+        super().__init__(joint_limits(plant, p["effort_limit"]))
+        model = linearise_mechanism(plant)
+        self.model = discretise(model, period)
+        self.cost = sampled_cost(model, p["q"], p["r"], period)
+        self.gain = discrete_lqr(self.model, *self.cost)
+        self.period = period
+        self._K = np.atleast_2d(self.gain.K)
+        self._hold = np.array(model.efforts)
+        self._deviation = plant.coordinates.deviation
+        self._none = (0.0,) * len(self._hold)
+        self._on_their_way: deque[Vector] = deque([self._none] * self.model.pending, self.model.pending)
+
+    @classmethod
+    def parameters(cls, plant: MechanismParameters) -> tuple[ParameterSpec, ...]:
+        """Return weights and limit."""
+        return (*joint_weights(plant), JOINT_LIMIT)
+
+    @classmethod
+    def design(cls, plant: MechanismParameters, p: Mapping[str, Any], period: float | None) -> JointDiscreteLqr:
+        """Return the controller for the plant linearised at upright."""
+        return cls(plant, p, ASSUMED_PERIOD if period is None else period)
+
+    def check(self, period: float) -> None:
+        """Refuse another period than that of the design [s].
+
+        Raises:
+            ParameterError: as said.
+        """
+        require_period("the loop is predicted", self.period, period)
+
+    def reset(self) -> None:
+        """Forget what was sent."""
+        self._on_their_way.extend([self._none] * len(self._on_their_way))
+
+    def command(self, t: float, position: Vector, velocity: Vector) -> Vector:
+        """Return m efforts [N m or N]."""
+        x = self._state(position, velocity)
+        moving = [u for sent in self._on_their_way for u in sent]
+        efforts = within_limits(self._hold + self._wanted(np.array([*x, *moving])), self.effort_limits)
+        self._move_on(x, np.array(moving), np.array(efforts) - self._hold)
+        return efforts
+
+    def _state(self, position: Vector, velocity: Vector) -> Array:
+        """Return [q - q*, v], shape (2n,)."""
+        return np.array([*self._deviation(position), *velocity])
+
+    def _move_on(self, x: Array, moving: Array, sent: Array) -> None:
+        """Take note of what was sent for a state while other efforts were on their way, beyond those that hold."""
+        self._on_their_way.append(tuple(sent))
+
+    def _wanted(self, state: Array) -> Array:
+        """Return the efforts beyond those that hold upright, limits left out, shape (m,)."""
+        return -self._K @ state
+
+    def describe(self) -> str:
+        """Return gain and efforts on their way."""
+        return f"K = [{self._gain_text()}], {len(self._on_their_way)} efforts on their way"
+
+    def _gain_text(self) -> str:
+        return "; ".join(", ".join(f"{value:.6g}" for value in row) for row in self._K)
+
+    def carry_over(self, previous: Controller | JointController) -> None:
+        """Take over what is on its way."""
+        if isinstance(previous, JointDiscreteLqr) and previous.period == self.period:
+            self._on_their_way.extend(previous._on_their_way)

@@ -1,0 +1,122 @@
+"""LQR with integrals, of a plant of several joints: no offset of the driven joints under a constant effort."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from pendulum_lqr.analysis import delayed_spectral_radius
+from pendulum_lqr.controllers.joint_lqr import JOINT_LIMIT, joint_limits, joint_weights
+from pendulum_lqr.design import Gain
+from pendulum_lqr.interface import Controller, JointController
+from pendulum_lqr.mechanism_controller import within_limits
+from pendulum_lqr.mechanism_model import linearise_mechanism, mechanism_lqr
+from pendulum_lqr.model import LinearModel
+from pendulum_lqr.sampling import ASSUMED_PERIOD, require_period
+from pendulum_msgs_py.errors import ParameterError
+from pendulum_msgs_py.joints import Coordinates, Vector
+from pendulum_msgs_py.parameters import ParameterSpec
+from pendulum_msgs_py.plants.mechanism_parameters import MechanismParameters
+
+__all__ = ["JointLqi"]
+
+
+class JointLqi(JointController):
+    """u = u* - K [q - q*, v, integrals of the driven joints' q - q*] about upright.
+
+    As many outputs as there are efforts can be brought to where they belong, whatever constant effort disturbs: those
+    of the driven joints. All integrals stand still while an effort is at its limit, so that they do not wind up.
+
+    Args:
+        gain: Gain, K of shape (m, 2n + m).
+        coordinates: Joints of the plant.
+        period: Sampling period [s].
+        effort_limits: Largest effort of each driven joint [N m or N].
+        hold: m efforts that hold the plant upright.
+    """
+
+    SUMMARY = "LQR with integrals of the driven joints: no offset of theirs under a constant effort"
+
+    def __init__(
+        self, gain: Gain, coordinates: Coordinates, period: float, effort_limits: Vector, hold: Vector
+    ) -> None:
+        super().__init__(effort_limits)
+        self.gain, self.period = gain, period
+        self._coordinates = coordinates
+        self._hold = np.array(hold)
+        self._integral = np.zeros(len(hold))
+
+    @classmethod
+    def parameters(cls, plant: MechanismParameters) -> tuple[ParameterSpec, ...]:
+        """Return weights and limit."""
+        meaning = "Weight of the integral of each driven joint's deviation."
+        integral = ParameterSpec("q_integral", 10.0, "", meaning, minimum=0.0, exclusive_minimum=True)
+        return (*joint_weights(plant), integral, JOINT_LIMIT)
+
+    @classmethod
+    def design(cls, plant: MechanismParameters, p: Mapping[str, Any], period: float | None) -> JointLqi:
+        """Return the LQI; at a period that is known, only one that settles.
+
+        Raises:
+            ParameterError: There is none for these weights, or it grows on the linear model at this period.
+        """
+        model = linearise_mechanism(plant)
+        driven = plant.coordinates.driven
+        wide = _with_integrals(model, driven)
+        gain = mechanism_lqr(wide, [*p["q"], *(p["q_integral"],) * len(driven)], p["r"])
+        if period is not None and (growth := delayed_spectral_radius(wide, gain.K, period)) >= 1.0:
+            raise ParameterError(
+                f"lqi asked every {period:g} s does not settle on plant {plant.name!r}: deviations grow by "
+                f"{growth:.3g} a period; expected a faster plant, or a smaller q"
+            )
+        limits = joint_limits(plant, p["effort_limit"])
+        return cls(gain, plant.coordinates, ASSUMED_PERIOD if period is None else period, limits, model.efforts)
+
+    def check(self, period: float) -> None:
+        """Refuse another period than that of the design [s].
+
+        Raises:
+            ParameterError: as said.
+        """
+        require_period("it is integrated", self.period, period)
+
+    def reset(self) -> None:
+        """Empty the integrals."""
+        self._integral = np.zeros(len(self._hold))
+
+    def command(self, t: float, position: Vector, velocity: Vector) -> Vector:
+        """Return m efforts [N m or N]."""
+        deviation = self._coordinates.deviation(position)
+        integral = self._integral + self.period * np.array([deviation[joint] for joint in self._coordinates.driven])
+        wanted = self._hold - self.gain.K @ np.array([*deviation, *velocity, *integral])
+        efforts = within_limits(wanted, self.effort_limits)
+        if all(abs(effort) <= limit for effort, limit in zip(wanted, self.effort_limits, strict=True)):
+            self._integral = integral
+        return efforts
+
+    def describe(self) -> str:
+        """Return the gain."""
+        rows = "; ".join(", ".join(f"{value:.6g}" for value in row) for row in self.gain.K)
+        return f"K = [{rows}]"
+
+    def carry_over(self, previous: Controller | JointController) -> None:
+        """Keep the efforts that the integrals stand for, though the gain on them has changed."""
+        if isinstance(previous, JointLqi):
+            m = len(self._hold)
+            self._integral = np.linalg.solve(self.gain.K[:, -m:], previous.gain.K[:, -m:] @ previous._integral)
+
+
+def _with_integrals(model: LinearModel, driven: tuple[int, ...]) -> LinearModel:
+    """Return the model with the integrals of the driven joints' deviations as its last states."""
+    size, m = model.B.shape
+    A = np.zeros((size + m, size + m))
+    A[:size, :size] = model.A
+    for index, joint in enumerate(driven):
+        A[size + index, joint] = 1.0
+    B = np.vstack([model.B, np.zeros((m, m))])
+    E = np.vstack([model.E, np.zeros((m, model.E.shape[1]))])
+    names = (*model.states, *(f"integral of {model.states[joint]}" for joint in driven))
+    return replace(model, A=A, B=B, C=np.eye(size + m), D=np.zeros((size + m, m)), E=E, states=names)

@@ -1,0 +1,198 @@
+"""The LQR's relatives for several joints: discrete, with integrals, and with a Kalman filter."""
+
+from __future__ import annotations
+
+import math
+import sys
+from dataclasses import replace
+
+import control
+import numpy as np
+import pytest
+
+from pendulum_lqr.design import DesignError, kalman_gain
+from pendulum_lqr.interface import JointController
+from pendulum_lqr.joint_controller import joint_parameters, make_joint_controller
+from pendulum_lqr.mechanism_model import linearise_mechanism
+from pendulum_lqr.sampled_design import discretise
+from pendulum_msgs_py.errors import ParameterError
+from pendulum_msgs_py.joints import Vector
+from pendulum_msgs_py.plants.mechanism_parameters import MechanismParameters, load_mechanism
+from pendulum_sim.mechanism_plant import MechanismPlant
+
+PLANTS = ("acrobot_frictionless", "pendubot_frictionless", "double_pendulum", "cart_pole", "furuta")
+PERIOD = 0.01
+
+
+def _delayed(name: str, delay: float) -> MechanismParameters:
+    plant = load_mechanism(name)
+    joints = tuple(
+        joint if joint.actuator is None else replace(joint, actuator=replace(joint.actuator, transport_delay=delay))
+        for joint in plant.joints
+    )
+    return replace(plant, joints=joints)
+
+
+def _upright(plant: MechanismParameters, *off: float) -> Vector:
+    return tuple(goal + d for goal, d in zip(plant.coordinates.goal, off, strict=True))
+
+
+class _Run:
+    """Ten seconds from 0.02 rad or m off upright: deviations and efforts."""
+
+    def __init__(
+        self,
+        plant: MechanismParameters,
+        controller: JointController,
+        *,
+        noise: tuple[float, float] = (0.0, 0.0),
+        push: float = 0.0,
+        period: float = PERIOD,
+    ) -> None:
+        n = len(plant.joints)
+        rng = np.random.default_rng(4)
+        simulated = MechanismPlant(plant, dt=period)
+        state = simulated.reset(_upright(plant, *(0.02,) * n))
+        pushes = tuple(push if joint == plant.coordinates.driven[0] else 0.0 for joint in range(n))
+        deviations, efforts = [], []
+        for k in range(round(10.0 / period)):
+            q = np.array(state.position) + noise[0] * rng.standard_normal(n)
+            v = np.array(state.velocity) + noise[1] * rng.standard_normal(n)
+            efforts.append(controller.command(k * period, tuple(map(float, q)), tuple(map(float, v))))
+            state = simulated.step(efforts[-1], pushes)
+            deviations.append(plant.coordinates.deviation(state.position))
+        self.deviations, self.efforts = np.array(deviations), np.array(efforts)
+
+
+def test_the_discrete_lqr_holds_a_delayed_plant_that_the_sampled_one_cannot() -> None:
+    plant = _delayed("furuta", 0.012)
+    with pytest.raises(ParameterError, match=r"lqr asked every 0\.01 s does not settle on plant 'furuta'"):
+        make_joint_controller("lqr", plant, {}, PERIOD)
+    controller = make_joint_controller("discrete_lqr", plant, {}, PERIOD)
+    assert controller.describe().endswith(", 2 efforts on their way")
+    first = _Run(plant, controller)
+    assert np.abs(first.deviations[-1]).max() < 1e-3
+    controller.reset()
+    assert (_Run(plant, controller).efforts == first.efforts).all()
+    # Who takes over knows what is on its way; who begins does not.
+    successor, stranger = (make_joint_controller("discrete_lqr", plant, {}, PERIOD) for _ in range(2))
+    asked = (_upright(plant, 0.1, 0.1), (0.0, 0.0))
+    controller.command(0.0, *asked)
+    successor.carry_over(controller)
+    expected = controller.command(0.01, *asked)
+    assert successor.command(0.01, *asked) == expected
+    assert stranger.command(0.01, *asked) != expected
+    with pytest.raises(ParameterError, match=r"the loop is predicted every 0\.01 s; expected states at that period"):
+        controller.check(0.002)
+
+
+@pytest.mark.parametrize("name", ["cart_pole", "double_pendulum"])
+def test_integrals_leave_no_offset_of_the_driven_joints_under_a_constant_effort(name: str) -> None:
+    plant = load_mechanism(name)
+    push = 0.05 * plant.effort_limits[0]
+    driven = list(plant.coordinates.driven)
+    plain = _Run(plant, make_joint_controller("lqr", plant, {}, PERIOD), push=push)
+    controller = make_joint_controller("lqi", plant, {}, PERIOD)
+    assert np.abs(plain.deviations[-1][driven]).max() > 0.01
+    assert np.abs(_Run(plant, controller, push=push).deviations[-1][driven]).max() < 0.002
+    # Beyond the limit nothing is wound up.
+    controller.reset()
+    fresh = controller.command(0.0, _upright(plant, 0.0, 0.0), (0.0, 0.0))
+    for k in range(200):
+        far = controller.command(k * PERIOD, _upright(plant, 0.0, 1.0), (0.0, 0.0))
+    assert max(map(abs, far)) == max(plant.effort_limits)
+    assert controller.command(2.0, _upright(plant, 0.0, 0.0), (0.0, 0.0)) == fresh
+    # Another weight does not let go of what the integrals hold.
+    controller.reset()
+    _Run(plant, controller, push=push)
+    other = make_joint_controller("lqi", plant, {"q_integral": 30.0}, PERIOD)
+    other.carry_over(controller)
+    upright = (plant.coordinates.goal, (0.0, 0.0))
+    held = controller.command(0.0, *upright)
+    assert held[0] < -0.8 * push
+    assert other.command(0.0, *upright) == pytest.approx(held)
+    with pytest.raises(ParameterError, match=r"it is integrated every 0\.01 s"):
+        controller.check(0.002)
+    with pytest.raises(ParameterError, match=r"lqi asked every 1 s does not settle"):
+        make_joint_controller("lqi", plant, {}, 1.0)
+
+
+@pytest.mark.parametrize("name", PLANTS)
+def test_the_gain_with_integrals_is_that_of_python_control(name: str) -> None:
+    plant = load_mechanism(name)
+    model = linearise_mechanism(plant)
+    driven, m = plant.coordinates.driven, len(plant.coordinates.driven)
+    integrated = np.eye(4)[list(driven)]
+    A = np.block([[model.A, np.zeros((4, m))], [integrated, np.zeros((m, m))]])
+    B = np.vstack([model.B, np.zeros((m, m))])
+    q, r = plant.mechanism.weights
+    K, _, _ = control.lqr(A, B, np.diag([*q, *(10.0,) * m]), r * np.eye(m))
+    controller = make_joint_controller("lqi", plant, {}, PERIOD)
+    assert pytest.approx(K, rel=1e-6, abs=1e-9) == controller.gain.K
+
+
+@pytest.mark.parametrize("name", PLANTS)
+@pytest.mark.parametrize("delay", [0.0, 0.013])
+def test_the_filter_asks_for_a_fraction_of_the_effort_where_velocities_are_noise(name: str, delay: float) -> None:
+    plant = _delayed(name, delay)
+    noise = (2e-4, 0.05)
+    plain = _Run(plant, make_joint_controller("discrete_lqr", plant, {}, PERIOD), noise=noise)
+    filtered = _Run(plant, make_joint_controller("lqg", plant, {}, PERIOD), noise=noise)
+    late = slice(-500, None)
+    assert np.abs(filtered.deviations[late]).max() < 0.03
+    if name == "furuta":  # its LQR is calm, and its dry friction hides what is left
+        return
+    assert np.std(np.diff(filtered.efforts[late], axis=0)) < 0.4 * np.std(np.diff(plain.efforts[late], axis=0))
+
+
+def test_the_filter_is_that_of_python_control_and_uses_velocities_where_their_noise_is_told() -> None:
+    plant = load_mechanism("cart_pole")
+    model = linearise_mechanism(plant)
+    sampled = discretise(model, PERIOD)
+    E = discretise(replace(model, B=model.E), PERIOD).B
+    values = {"position_noise": 1e-3, "velocity_noise": 0.02, "effort_noise": 0.3}
+    for chosen, C, V in (
+        ({**values, "velocity_noise": 0.0}, np.eye(2, 4), 1e-6 * np.eye(2)),
+        (values, np.eye(4), np.diag([1e-6, 1e-6, 4e-4, 4e-4])),
+    ):
+        controller = make_joint_controller("lqg", plant, chosen, PERIOD)
+        _, P, _ = control.dlqe(sampled.A, E, C, 0.09 * np.eye(2), V)
+        L = P @ C.T @ np.linalg.inv(C @ P @ C.T + V)
+        assert pytest.approx(L, rel=1e-6, abs=1e-9) == controller.filter.L
+    assert {spec.name for spec in joint_parameters("lqg", plant)} >= set(values)
+
+
+def test_the_filter_follows_its_model_through_delay_and_whole_turns_and_forgets_what_is_beyond_all_bounds() -> None:
+    plant = _delayed("pendubot_frictionless", 0.013)
+    controller = make_joint_controller("lqg", plant, {}, PERIOD)
+    run = _Run(plant, controller)
+    assert np.abs(run.deviations[-1]).max() < 1e-4
+    # A turn of the elbow is no surprise: its deviation jumps from one end of the circle to the other.
+    controller.reset()
+    near, beyond = (_upright(plant, 0.0, side * (math.pi - 1e-3)) for side in (1.0, -1.0))
+    controller.command(0.0, near, (0.0, 0.2))
+    estimate = controller._state(beyond, (0.0, 0.2))
+    assert abs(estimate[1]) == pytest.approx(math.pi, abs=0.1)
+    assert abs(estimate[3]) < 3.0
+    # The first velocity is believed, also where velocities are not used.
+    controller.reset()
+    assert controller._state(near, (0.3, 0.2)) == pytest.approx([0.0, math.pi - 1e-3, 0.3, 0.2])
+    controller.reset()
+    controller.command(0.0, plant.coordinates.goal, (sys.float_info.max, 0.0))
+    assert controller._state(plant.coordinates.goal, (0.1, 0.2)) == pytest.approx([0.0, 0.0, 0.1, 0.2])
+    # Who takes over goes on with the estimate.
+    controller.reset()
+    controller.command(0.0, _upright(plant, 0.01, 0.0), (0.5, 0.0))
+    successor = make_joint_controller("lqg", plant, {}, PERIOD)
+    successor.carry_over(controller)
+    here = (_upright(plant, 0.015, 0.0), (0.0, 0.0))
+    assert successor.command(0.01, *here) == controller.command(0.01, *here)
+
+
+def test_a_covariance_of_few_causes_is_taken_and_a_negative_one_refused() -> None:
+    direction = np.array([[1.0], [1e3]])
+    scaled = 0.3 * direction @ direction.T
+    assert np.isfinite(kalman_gain(np.eye(2), np.eye(2), scaled, np.eye(2)).L).all()
+    for bad in (np.diag([1.0, -1e-3]), np.diag([1.0, math.nan])):
+        with pytest.raises(DesignError, match=r"process noise covariance is .*; expected finite, not negative"):
+            kalman_gain(np.eye(2), np.eye(2), bad, np.eye(2))
