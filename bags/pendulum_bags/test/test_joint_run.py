@@ -50,8 +50,8 @@ def test_a_stand_in_is_off_in_every_value_that_has_to_be_identified_and_in_no_ot
     [
         ({"plant": "thesis"}, "plant is 'thesis', which has one joint; expected one of several, such as cart_pole"),
         ({"plant": "acrobot", "joint": "shoulder"}, "joint is 'shoulder'; expected one that is driven: elbow"),
-        ({"controller": "mcp"}, r"controller is 'mcp'; expected lqr or mpc"),
-        ({"controller": "nmpc"}, "controller is 'nmpc'; expected lqr or mpc"),
+        ({"controller": "mcp"}, r"controller is 'mcp'; expected one of lqr, discrete_lqr, lqi, lqg, mpc"),
+        ({"controller": "nmpc"}, "controller is 'nmpc'; expected one of lqr,"),
         ({"amplitude": 0.0}, "amplitude is 0.0; expected a finite number > 0"),
         ({"duration": float("nan")}, "duration is nan; expected a finite number > 0"),
         ({"hold_time": float("inf")}, "hold_time is inf; expected a finite number > 0"),

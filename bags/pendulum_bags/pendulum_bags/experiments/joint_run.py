@@ -43,8 +43,8 @@ _UNCHANGED = frozenset(
 )
 """Values of a plant file that nobody has to identify: constants, limits, and what belongs to a model of friction."""
 _DELAY = "transport_delay"
-HOLDING = ("lqr", "mpc")
-"""Controllers that hold a plant upright; ``tvlqr`` begins at hanging, and ``nmpc`` is an LQR there."""
+HOLDING = ("lqr", "discrete_lqr", "lqi", "lqg", "mpc")
+"""Controllers that hold a plant upright; ``tvlqr`` and ``ilqr`` begin at hanging, and ``nmpc`` is an LQR there."""
 _LIMIT_PER_NOISE = 10.0
 """Effort limit of the joint per amplitude of the noise [-]: the LQR holds every preset under it on both sides,
 the acrobot and the pendubot with dry friction up to 0.16, and their joints slide in it instead of standing still."""
@@ -97,7 +97,7 @@ class JointSettings:
             limit = plant.effort_limits[driven.index(self.joint)]
             object.__setattr__(self, "amplitude", limit / _LIMIT_PER_NOISE)
         if self.controller not in HOLDING:
-            raise ParameterError(f"controller is {self.controller!r}; expected {' or '.join(HOLDING)}")
+            raise ParameterError(f"controller is {self.controller!r}; expected one of {', '.join(HOLDING)}")
         for name in ("amplitude", "hold_time", "duration", "period"):
             value = getattr(self, name)
             if not (math.isfinite(value) and value > 0.0):

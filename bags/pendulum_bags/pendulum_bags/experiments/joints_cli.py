@@ -56,8 +56,8 @@ def joints(
     controller: Annotated[
         str,
         typer.Option(
-            help="What holds it under the noise: lqr, or mpc, which knows the limits of efforts and of a track. "
-            "Frequencies and ranking are those of LQRs."
+            help="What holds it under the noise: lqr, discrete_lqr, lqi, lqg, or mpc, which knows the limits of efforts "
+            "and of a track. Frequencies and ranking are those of LQRs."
         ),
     ] = "lqr",
     seed: Annotated[int, typer.Option(help="Seed of the noise, and of the draw.", min=0)] = 1,
@@ -90,7 +90,7 @@ def joints(
 
     In the place of the machine the bridge drives an emulated one: quasi-direct drives, encoders and delays on a plant
     that is a little off. The answer calls it emulated hardware.
-    Both sides run as nodes over DDS, in lockstep, under one LQR or MPC that is designed on the simulated plant, where
+    Both sides run as nodes over DDS, in lockstep, under one controller that is designed on the simulated plant, where
     the dry friction of a passive joint counts as viscous: else acrobot and pendubot would fall. Then a multisine
     measures both plants, and says which designs carry over.
 
