@@ -56,7 +56,7 @@ def joints(
     controller: Annotated[
         str,
         typer.Option(
-            help="What holds it under the noise: lqr, discrete_lqr, lqi, lqg, or mpc, which knows the limits of efforts "
+            help="What holds it under the noise: lqr, discrete_lqr, lqi, lqg, or mpc, which knows limits of efforts "
             "and of a track. Frequencies and ranking are those of LQRs."
         ),
     ] = "lqr",
