@@ -27,6 +27,7 @@ JOINT_CONTROLLERS: dict[str, str] = {
     "discrete_lqr": "pendulum_lqr.controllers.joint_discrete_lqr:JointDiscreteLqr",
     "lqi": "pendulum_lqr.controllers.joint_lqi:JointLqi",
     "lqg": "pendulum_lqr.controllers.joint_lqg:JointLqg",
+    "energy_swing_up": "pendulum_lqr.controllers.joint_energy_swing_up:JointEnergySwingUp",
     "tvlqr": "pendulum_lqr.controllers.joint_swing_up:JointSwingUp",
     "ilqr": "pendulum_lqr.controllers.joint_ilqr:JointIlqr",
     "mpc": "pendulum_lqr.controllers.joint_mpc:JointMpc",

@@ -56,7 +56,8 @@ def deviation_of(coordinates: Coordinates, x: Vector) -> Array:
 def sample_caught_region(plant: MechanismParameters, gain: Gain) -> CaughtRegion:
     """Return the largest ellipsoid x' S x <= level from whose sampled states u = -K x, limited, comes to rest upright.
 
-    The level grows until a sampled state is lost, and is bisected then; nine tenths of what is found are returned.
+    The level grows until a sampled state is lost, or hits an end stop, and is bisected then; nine tenths of what is
+    found are returned.
 
     Args:
         plant: The plant; dry friction, lag and delay are left out.
@@ -93,6 +94,7 @@ def _all_caught(plant: MechanismParameters, gain: Gain, deviations: Array) -> bo
     along, p, goal = along_functions(n), plant.packed, np.array(plant.coordinates.goal)
     limits = np.array(plant.effort_limits)[:, None]
     turns = np.array([joint.turns for joint in plant.mechanism.joints])
+    stops = np.array(plant.stops) - goal[:, None]
     x = deviations.copy()
     x[:n][turns] = wrap(x[:n][turns])
     slowest = -float(np.max(gain.poles.real))
@@ -104,6 +106,8 @@ def _all_caught(plant: MechanismParameters, gain: Gain, deviations: Array) -> bo
         q = tuple(goal[i] + x[i] for i in range(n))
         q, v = rk4_joints(forward, along, q, tuple(x[n:]), torque, torque, torque, _STEP, p)
         x = np.array([*(q[i] - goal[i] for i in range(n)), *v])
+        if not (np.all(x[:n] >= stops[:, :1]) and np.all(x[:n] <= stops[:, 1:])):
+            return False
         # What falls over is lost; a state that grows beyond all bounds ends the trial early.
         if k % 25 == 0 and not float(np.max(np.abs(x))) < 50.0:
             return False

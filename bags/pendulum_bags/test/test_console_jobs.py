@@ -81,7 +81,17 @@ def test_controllers_are_offered_that_fit_the_plant_and_need_no_file(tmp_path: P
     pytest.importorskip("nicegui")
     from pendulum_bags.console.controller_choice import offered
 
-    assert offered("acrobot") == ["lqr", "discrete_lqr", "lqi", "lqg", "tvlqr", "ilqr", "mpc", "nmpc"]
+    assert offered("acrobot") == [
+        "lqr",
+        "discrete_lqr",
+        "lqi",
+        "lqg",
+        "energy_swing_up",
+        "tvlqr",
+        "ilqr",
+        "mpc",
+        "nmpc",
+    ]
     for plant in ("", "thesis", str(tmp_path / "of_another_machine.yaml")):
         assert {"lqr", "pid", "energy_swing_up"} <= set(offered(plant))
         assert not {"policy", "playback"} & set(offered(plant))

@@ -9,15 +9,26 @@ from typing import Any
 from pendulum_lqr.catch import Catch, make_catch
 from pendulum_lqr.controller import BaseController
 from pendulum_lqr.design import DesignError
+from pendulum_lqr.energy_margin import EnergyMargin
 from pendulum_lqr.interface import Controller
 from pendulum_msgs_py.contract.angles import wrap
 from pendulum_msgs_py.parameters import ParameterSpec
 from pendulum_msgs_py.plants.plant_parameters import PlantParameters
 
-__all__ = ["EnergySwingUp"]
+__all__ = ["CATCH_SHARE", "EnergySwingUp"]
 
 _REST = 0.02
 """Velocity below which the pendulum may be held by dry friction [rad/s]."""
+CATCH_SHARE = ParameterSpec(
+    "catch_share",
+    1.0,
+    "-",
+    "Share of the proven region of attraction in which it takes over.",
+    minimum=0.0,
+    maximum=1.0,
+    exclusive_minimum=True,
+)
+"""How much of what it can catch the LQR waits for."""
 
 
 class EnergySwingUp(BaseController):
@@ -52,15 +63,7 @@ class EnergySwingUp(BaseController):
         ),
         ParameterSpec("catch_q", [30.0, 0.3], "1/rad^2, s^2/rad^2", "Weights of the LQR that catches.", minimum=0.0),
         ParameterSpec("catch_r", 1.0, "1/(N m)^2", "Its weight of torque.", minimum=0.0, exclusive_minimum=True),
-        ParameterSpec(
-            "catch_share",
-            1.0,
-            "-",
-            "Share of the proven region of attraction in which it takes over.",
-            minimum=0.0,
-            maximum=1.0,
-            exclusive_minimum=True,
-        ),
+        CATCH_SHARE,
     )
 
     def __init__(self, plant: PlantParameters, gain: float, margin: float, catch: Catch, effort_limit: float) -> None:
@@ -79,7 +82,7 @@ class EnergySwingUp(BaseController):
         self._angle_offset = plant.angle_offset
         self._torque_offset = plant.torque_offset
         self._target = plant.gravity * (1.0 + math.cos(catch.set_point - plant.angle_offset))
-        self._first_margin = margin
+        self._margin = EnergyMargin(margin)
         self.reset()
 
     @classmethod
@@ -91,14 +94,13 @@ class EnergySwingUp(BaseController):
     def reset(self) -> None:
         """Start in the swing-up phase."""
         self.catch.reset()
-        self._margin = self._first_margin
-        self._last = (math.pi, 0.0)
+        self._margin.reset()
 
     def command(self, t: float, x: Sequence[float]) -> float:
         """Return the torque [N m]."""
         if self.catch.holds(x[0], x[1]):
             return self.catch.command(x[0], x[1])
-        self._learn(x[0], x[1])
+        self._margin.learn(wrap(x[0] - self.set_point), x[1])
         return self.clamp(self.pump(x[0], x[1]))
 
     def pump(self, angle: float, velocity: float) -> float:
@@ -110,24 +112,12 @@ class EnergySwingUp(BaseController):
             return math.copysign(self.effort_limit, pull)
         energy = 0.5 * self._inertia * velocity * velocity + self._gravity * (1.0 + math.cos(angle))
         friction = self._damping * velocity + math.copysign(self._coulomb, velocity) - self._torque_offset
-        return self.gain * (self._target * (1.0 + self._margin) - energy) * velocity + friction
-
-    def _learn(self, angle: float, velocity: float) -> None:
-        """Aim lower after passing upright uncaught, higher after turning back before it: the model is never exact."""
-        angle = wrap(angle - self.set_point)
-        last_angle, last_velocity = self._last
-        self._last = (angle, velocity)
-        if abs(angle) > 1.0 or abs(last_angle) > 1.0:
-            return
-        if angle * last_angle < 0.0:
-            self._margin *= 0.5
-        elif velocity * last_velocity < 0.0:
-            self._margin = min(1.5 * max(self._margin, 0.0) + 0.01, 1.0)
+        return self.gain * (self._target * (1.0 + self._margin.value) - energy) * velocity + friction
 
     def take_over(self, previous: Controller) -> None:
         """Take over what was learnt, and whether the LQR is in charge."""
         if isinstance(previous, EnergySwingUp):
-            self._margin, self._last = previous._margin, previous._last
+            self._margin.take_over(previous._margin)
             self.catch.active = previous.catch.active
 
     def describe(self) -> str:

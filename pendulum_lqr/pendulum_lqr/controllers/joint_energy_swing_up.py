@@ -1,0 +1,139 @@
+"""Swing-up of plants of several joints by energy, caught by LQR with hysteresis."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import Any
+
+from pendulum_lqr.controllers.energy_swing_up import CATCH_SHARE
+from pendulum_lqr.controllers.joint_lqr import JOINT_LIMIT, joint_limits
+from pendulum_lqr.design import DesignError
+from pendulum_lqr.energy_margin import EnergyMargin
+from pendulum_lqr.interface import Controller, JointController
+from pendulum_lqr.mechanism_catch import MechanismCatch, deviation_of, make_mechanism_catch
+from pendulum_lqr.mechanism_pump import EnergyPump, pump_gains
+from pendulum_msgs_py.joints import Vector
+from pendulum_msgs_py.parameters import ParameterSpec
+from pendulum_msgs_py.plants.mechanism_parameters import MechanismParameters
+
+__all__ = ["JointEnergySwingUp"]
+
+_REST = 0.1
+"""Velocity below which nothing is learnt of where the pendulum turns back [rad/s]."""
+
+
+class JointEnergySwingUp(JointController):
+    """Pumps energy into a pendulum by moving its hinge until the LQR can catch it; :mod:`pendulum_lqr.mechanism_pump`.
+
+    Nothing is planned, and an answer takes microseconds: it begins from anywhere, and again wherever it is thrown to.
+
+    Args:
+        plant: The plant.
+        pump: What pumps.
+        margin: Energy aimed at beyond that of upright, as a share of it [-].
+        catch: LQR with its sampled region.
+    """
+
+    SUMMARY = "swing-up by energy from anywhere, then LQR; for a pendulum whose hinge is driven"
+    SAMPLED = False
+
+    DESIGNING = "tries out from where the LQR catches, which takes some seconds"
+
+    def __init__(self, plant: MechanismParameters, pump: EnergyPump, margin: float, catch: MechanismCatch) -> None:
+        super().__init__((pump.limit,))
+        self.pump, self.catch = pump, catch
+        self.margin = EnergyMargin(margin, _REST)
+        self._coordinates = plant.coordinates
+
+    @classmethod
+    def parameters(cls, plant: MechanismParameters) -> tuple[ParameterSpec, ...]:
+        """Return gains, with those of the mechanism as defaults, and what the LQR takes.
+
+        Raises:
+            DesignError: The plant cannot be swung up so.
+        """
+        gains = pump_gains(plant)
+        joint = _driven(plant)
+        q, r = plant.mechanism.weights
+        return (
+            ParameterSpec("gain", gains.gain, "-", "Pumping per energy error and velocity, without units.", minimum=0.0,
+                          exclusive_minimum=True),
+            ParameterSpec("energy_margin", gains.margin, "-", "Energy aimed at beyond that of upright, relative.",
+                          minimum=-0.5, maximum=1.0),
+            ParameterSpec("servo", gains.servo, "-", f"Frequency at which {joint.name} comes back, by the pendulum's.",
+                          minimum=0.0, exclusive_minimum=True, maximum=10.0),
+            ParameterSpec("servo_damping", gains.damping, "-", "Its damping ratio.", minimum=0.0, maximum=5.0),
+            ParameterSpec("reach", gains.reach, joint.unit, f"Farthest that {joint.name} may go from its goal, and the "
+                          "LQR with it; 0 for nine tenths of the way to its stops, where it has some.", minimum=0.0),
+            ParameterSpec("catch_q", list(q), "", "Weights of the LQR that catches.", minimum=0.0),
+            ParameterSpec("catch_r", r, "", "Its weight of effort.", minimum=0.0, exclusive_minimum=True),
+            replace(CATCH_SHARE, description="Share of the sampled region in which it takes over."),
+            JOINT_LIMIT,
+        )  # fmt: skip
+
+    @classmethod
+    def design(cls, plant: MechanismParameters, p: Mapping[str, Any], period: float | None) -> JointEnergySwingUp:
+        """Return the controller; its region takes a second to sample.
+
+        Raises:
+            DesignError: The plant cannot be swung up so, or its LQR catches nothing.
+        """
+        (limit,) = joint_limits(plant, p["effort_limit"])
+        joint, (index,) = _driven(plant), plant.coordinates.driven
+        if limit <= (friction := plant.joints[index].breakaway):
+            raise DesignError(
+                f"effort_limit is {limit:g} {joint.effort_unit}; expected more than the friction that holds "
+                f"{joint.name}, {friction:g} {joint.effort_unit}"
+            )
+        gains = replace(
+            pump_gains(plant), gain=p["gain"], servo=p["servo"], damping=p["servo_damping"], reach=p["reach"]
+        )
+        pump = EnergyPump(plant, gains, limit)
+        found = make_mechanism_catch(_bounded(plant, pump.reach), p["catch_q"], p["catch_r"], (limit,))
+        share = p["catch_share"]
+        region = found.region._replace(level=share * found.region.level)
+        return cls(plant, pump, p["energy_margin"], replace(found, region=region, leave=found.leave / share))
+
+    def reset(self) -> None:
+        """Start in the swing-up phase."""
+        self.catch.active = False
+        self.margin.reset()
+
+    def command(self, t: float, position: Vector, velocity: Vector) -> Vector:
+        """Return the motor's effort."""
+        deviation = deviation_of(self._coordinates, position + velocity)
+        if self.catch.holds(deviation):
+            return self.catch.command(deviation)
+        self.margin.learn(*self.pump.swing(position, velocity))
+        return (self.pump.effort(position, velocity, self.margin.value),)
+
+    def describe(self) -> str:
+        """Return how far the driven joint goes, and from where the LQR catches."""
+        joint = self._coordinates.joints[self._coordinates.driven[0]]
+        within = f" within {self.pump.reach:.3g} {joint.unit}" if math.isfinite(self.pump.reach) else ""
+        K = ", ".join(f"{value:.4g}" for value in self.catch.gain.K[0])
+        return f"pumps by {joint.name}{within}, LQR K = [{K}] within {self.catch.region.describe()}"
+
+    def carry_over(self, previous: Controller | JointController) -> None:
+        """Take over what was learnt, and whether the LQR is in charge."""
+        if isinstance(previous, JointEnergySwingUp):
+            self.margin.take_over(previous.margin)
+            self.catch.active = previous.catch.active
+
+
+def _driven(plant: MechanismParameters) -> Any:
+    (index,) = plant.coordinates.driven
+    return plant.coordinates.joints[index]
+
+
+def _bounded(plant: MechanismParameters, reach: float) -> MechanismParameters:
+    """Return the plant with stops where its driven joint may not go farther."""
+    if not math.isfinite(reach):
+        return plant
+    (index,) = plant.coordinates.driven
+    low, high = plant.stops[index]
+    name, goal = plant.coordinates.names[index], plant.coordinates.goal[index]
+    ends = {"lower_stop": max(low, goal - reach), "upper_stop": min(high, goal + reach)}
+    return plant.with_values({f"{name}.{end}": value for end, value in ends.items()})

@@ -1,0 +1,168 @@
+"""Swing-up by energy of plants whose one motor moves the hinge of a pendulum."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+from pendulum_bags.experiments.joint_run import stand_in_for
+from pendulum_lqr.design import DesignError
+from pendulum_lqr.energy_margin import EnergyMargin
+from pendulum_lqr.interface import JointController
+from pendulum_lqr.joint_controller import joint_parameters, make_joint_controller
+from pendulum_lqr.mechanism_catch import make_mechanism_catch
+from pendulum_lqr.mechanism_pump import EnergyPump, pump_gains
+from pendulum_msgs_py.joints import Vector
+from pendulum_msgs_py.plants.mechanism_parameters import MechanismParameters, load_mechanism
+from pendulum_sim.mechanism_plant import MechanismPlant
+
+PERIOD = 0.01
+
+
+def _swing(
+    controller: JointController, plant: MechanismParameters, start: Vector, duration: float
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return positions, deviations from upright, and efforts."""
+    simulated = MechanismPlant(plant, dt=PERIOD)
+    state = simulated.reset(start)
+    positions, deviations, efforts = [], [], []
+    for k in range(round(duration / PERIOD)):
+        efforts.append(controller.command(k * PERIOD, state.position, state.velocity)[0])
+        state = simulated.step((efforts[-1],))
+        positions.append(state.position)
+        deviations.append(plant.coordinates.deviation(state.position))
+    return np.array(positions), np.array(deviations), np.array(efforts)
+
+
+@pytest.mark.parametrize(
+    ("name", "duration", "limit", "reach"),
+    [
+        ("cart_pole", 8.0, 0.0, 1.62),
+        ("cart_pole", 14.0, 6.0, 1.62),
+        ("furuta", 4.0, 0.0, 2.0),
+        ("pendubot_frictionless", 12.0, 0.0, 0.0),
+    ],
+)
+def test_it_swings_up_from_hanging_within_limit_and_reach(
+    name: str, duration: float, limit: float, reach: float
+) -> None:
+    plant = load_mechanism(name)
+    controller = make_joint_controller("energy_swing_up", plant, {"effort_limit": limit}, PERIOD)
+    for start in ((0.0, 0.0), (0.1, -0.2)):
+        controller.reset()
+        positions, deviations, efforts = _swing(controller, plant, start, duration)
+        assert np.abs(deviations[-50:]).max() < 0.15
+        most = limit or plant.effort_limits[0]
+        assert 0.5 * most < np.abs(efforts).max() <= most
+        if reach:
+            assert np.abs(positions[:, plant.coordinates.driven[0]]).max() < 1.02 * reach
+    controller.reset()
+    again = _swing(controller, plant, (0.1, -0.2), 1.0)[2]
+    assert (again == efforts[: len(again)]).all()
+
+
+@pytest.mark.parametrize(("name", "seed"), [("furuta", 11), ("furuta", 19), ("cart_pole", 2)])
+def test_it_learns_to_aim_below_upright_where_the_model_has_more_friction_than_the_plant(name: str, seed: int) -> None:
+    plant = load_mechanism(name)
+    controller = make_joint_controller("energy_swing_up", plant, {}, PERIOD)
+    lighter = stand_in_for(plant, share=0.05, delay=0.0, seed=seed)
+    start = tuple(float(value) for value in np.random.default_rng(seed - 1).uniform(-0.2, 0.2, 2))
+    _, deviations, _ = _swing(controller, lighter, start, 15.0)
+    assert np.abs(deviations[-50:]).max() < 0.2
+    assert controller.margin.value < 0.0
+
+
+def test_the_margin_falls_with_each_pass_and_rises_with_each_turn_before_upright() -> None:
+    margin = EnergyMargin(0.1, rest=0.05)
+    seen = []
+    for angle, velocity in (
+        (-0.2, 1.0), (0.2, 1.0), (0.4, 1.0),  # passes once
+        (0.5, -1.0),  # turns back
+        (0.5, 0.01),  # too slow to tell
+        (-0.1, -1.0), (0.1, 1.0),  # passes twice
+    ):  # fmt: skip
+        margin.learn(angle, velocity)
+        seen.append(margin.value)
+    assert seen == pytest.approx([0.1, 0.05, 0.05, 0.085, 0.085, 0.0425, 0.02125])
+    for angle in (0.1, -0.1) * 100:
+        margin.learn(angle, 1.0)
+    assert margin.value == -0.2
+    margin.learn(0.1, -1.0)
+    margin.learn(0.2, 1.0)
+    assert margin.value == pytest.approx(-0.19)
+    far = EnergyMargin(0.1)
+    far.learn(2.0, 1.0)
+    far.learn(-2.0, 1.0)
+    far.learn(-2.0, -1.0)
+    assert far.value == 0.1
+    other = EnergyMargin(0.0)
+    other.take_over(margin)
+    assert other.value == margin.value
+    margin.reset()
+    assert margin.value == 0.1
+
+
+def test_the_driven_joint_goes_no_farther_than_it_may() -> None:
+    plant = load_mechanism("cart_pole")
+    wide, narrow = (make_joint_controller("energy_swing_up", plant, {"reach": reach}, PERIOD) for reach in (10.0, 0.8))
+    # Nine tenths of the way to the stops bound what is asked for.
+    assert wide.pump.reach == pytest.approx(1.62)
+    positions, deviations, _ = _swing(narrow, plant, (0.0, 0.1), 15.0)
+    assert np.abs(positions[:, 0]).max() < 0.82
+    assert np.abs(deviations[-50:]).max() < 0.1
+    # The LQR takes over only from where it stays within, too.
+    assert narrow.catch.region.level < wide.catch.region.level
+    # Beyond its reach it comes back, however it moves.
+    assert narrow.command(0.0, (1.2, 0.5), (0.0, 3.0))[0] < 0.0
+    assert narrow.command(0.0, (-1.2, 0.5), (-0.5, -3.0))[0] > 0.0
+
+
+def test_no_state_counts_as_caught_that_runs_into_an_end_stop() -> None:
+    plant = load_mechanism("cart_pole")
+    near = plant.with_values({"cart.lower_stop": -0.1, "cart.upper_stop": 0.1})
+    one_sided = plant.with_values({"cart.lower_stop": -0.1})
+    weights = plant.mechanism.weights
+    free, both, one = (make_mechanism_catch(each, *weights).region.level for each in (plant, near, one_sided))
+    assert both < 0.3 * free
+    assert one < 0.3 * free
+
+
+def test_what_cannot_be_swung_up_so_is_refused_with_what_to_take() -> None:
+    for name, motors in (("acrobot_frictionless", "elbow"), ("double_pendulum", "shoulder, elbow")):
+        with pytest.raises(DesignError, match=rf"{name}' is a double_pendulum with motors at {motors}; .*ilqr, nmpc"):
+            joint_parameters("energy_swing_up", load_mechanism(name))
+    stiff = load_mechanism("furuta").with_values({"arm.coulomb_friction": 0.02})
+    with pytest.raises(DesignError, match=r"effort_limit is 0\.01 N m; .* the friction that holds arm, 0\.02 N m"):
+        make_joint_controller("energy_swing_up", stiff, {"effort_limit": 0.01}, PERIOD)
+    for changed in ({"gravity": 0.0}, {"pole_centre": 0.0}):
+        floating = load_mechanism("cart_pole").with_values(changed)
+        with pytest.raises(DesignError, match="pole of plant 'cart_pole' cannot be swung up by cart"):
+            EnergyPump(floating, pump_gains(floating), 1.0)
+
+
+def test_who_takes_over_knows_what_was_learnt_and_whether_the_lqr_is_in_charge() -> None:
+    plant = load_mechanism("cart_pole")
+    old, new = (make_joint_controller("energy_swing_up", plant, {}, PERIOD) for _ in range(2))
+    old.margin.value = 0.03
+    upright = (plant.coordinates.goal, (0.0, 0.0))
+    old.command(0.0, *upright)
+    new.carry_over(old)
+    assert new.margin.value == 0.03
+    assert new.catch.active
+    shared = make_joint_controller("energy_swing_up", plant, {"catch_share": 0.1}, PERIOD)
+    level = old.catch.region.level
+    assert shared.catch.region.level == pytest.approx(0.1 * level)
+    assert shared.catch.leave * shared.catch.region.level == pytest.approx(old.catch.leave * level)
+    assert "pumps by cart within 1.62 m, LQR K" in old.describe()
+
+
+def test_its_energy_is_that_of_the_pendulum_alone_with_the_driven_joint_at_rest() -> None:
+    plant = load_mechanism("furuta")
+    pump = EnergyPump(plant, pump_gains(plant), 1.0)
+    assert pump.share((0.0, 0.0), (0.0, 0.0)) == pytest.approx(0.0, abs=1e-12)
+    assert pump.share((0.7, math.pi), (0.0, 0.0)) == pytest.approx(1.0)
+    lowest, top = (plant.energy((0.0, angle), (0.0, 0.0)) for angle in (0.0, math.pi))
+    moving = plant.energy((0.0, 1.1), (0.0, 2.5))
+    assert pump.share((0.0, 1.1), (0.0, 2.5)) == pytest.approx((moving - lowest) / (top - lowest))
