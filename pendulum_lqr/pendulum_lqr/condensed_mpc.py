@@ -25,6 +25,9 @@ __all__ = ["CondensedMpc"]
 
 Matrix = NDArray[np.float64]
 
+_TOLERANCE = 1e-4
+"""Of an input's limit and of a state's, and of the largest number in it; a hundredth of that takes ten times as long."""
+
 
 class CondensedMpc:
     """Minimises the cost of the discrete LQR under limits of inputs and states over N samples.
@@ -101,9 +104,8 @@ class CondensedMpc:
             lower,
             upper,
             verbose=False,
-            # Of an input's limit and of a state's; a hundredth of that takes ten times as long.
-            eps_abs=1e-4,
-            eps_rel=1e-4,
+            eps_abs=_TOLERANCE,
+            eps_rel=_TOLERANCE,
             max_iter=1000,
             polishing=False,
             # By iterations: an adaptation by elapsed time would make answers depend on the machine's load.
@@ -124,10 +126,16 @@ class CondensedMpc:
             # The LQR's own way meets no limit, so nothing is better: v = 0.
             lqr: Matrix = -self._scale * (self._K @ state)
             return lqr
+        if not np.abs(self._free_inputs @ state).max() * _TOLERANCE < 1.0:
+            # The LQR asks for so much that the tolerance is a whole limit: signs would be any. What is no number the
+            # solver would not take, and answer what it was told before.
+            return None
         self._solver.update(l=lower, u=upper)
         result = self._solver.solve(raise_error=False)
         plan = result.x
         if plan is None or not np.isfinite(plan[: self.inputs]).all() or result.info.status_val not in {1, 2}:
+            # It would begin the next one where it got lost.
+            self.reset()
             return None
         first: Matrix = self._scale * (plan[: self.inputs] - self._K @ state)
         return first

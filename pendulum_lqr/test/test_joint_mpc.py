@@ -204,6 +204,29 @@ def test_where_the_solver_finds_no_plan_the_limited_lqr_answers_and_says_so(monk
     assert controller.notice == "no plan for 2 states: the LQR answered"
 
 
+@pytest.mark.parametrize("wild", [1e3, 1e12, 1e300])
+def test_a_wild_state_leaves_nothing_behind(wild: float) -> None:
+    plant = load_mechanism("cart_pole")
+    controller, fresh = (make_joint_controller("mpc", plant, {}, PERIOD) for _ in range(2))
+    assert controller.command(0.0, _upright(plant, 0.1, 0.1), (wild, -wild)) == (plant.effort_limits[0],)
+    assert controller.notice == "no plan for 1 states: the LQR answered"
+    for k in range(5):
+        state = _upright(plant, 0.1 * k, 0.1 - 0.02 * k), (0.3, 0.5 - 0.1 * k)
+        assert controller.command(0.0, *state) == fresh.command(0.0, *state)
+    assert controller.notice == "no plan for 1 states: the LQR answered"
+    assert fresh.notice == ""
+
+
+def test_what_a_solver_cannot_tell_the_lqr_answers_with_its_signs() -> None:
+    plant = load_mechanism("double_pendulum")
+    for wild in (1e6, 1e12):
+        answers = [
+            make_joint_controller(kind, plant, {}, PERIOD).command(0.0, plant.coordinates.goal, (wild, -wild))
+            for kind in ("discrete_lqr", "mpc")
+        ]
+        assert answers[0] == answers[1]
+
+
 @pytest.mark.parametrize("bad", [math.nan, math.inf])
 def test_a_state_that_is_not_finite_is_not_answered(bad: float) -> None:
     loop = AnswerLoop(make_joint_controller("mpc", load_mechanism("furuta"), {}, PERIOD), math.inf)

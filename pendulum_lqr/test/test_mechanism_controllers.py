@@ -289,6 +289,22 @@ def test_plans_without_dry_friction_are_not_for_a_passive_joint_that_has_some(na
         make_joint_controller(name, load_mechanism("pendubot"), {}, DT)
 
 
+@pytest.mark.timeout(400)
+def test_a_swing_up_that_its_lqr_would_not_hold_at_this_period_is_refused() -> None:
+    # Up there it would go from limit to limit for good: plans wait for nothing, their LQR for the delay and the period.
+    plant = load_mechanism("cart_pole")
+    cart, pole = plant.joints
+    assert cart.actuator is not None
+    late = replace(plant, joints=(replace(cart, actuator=replace(cart.actuator, transport_delay=0.3)), pole))
+    refusal = r"nmpc asked every 0\.01 s does not settle on plant 'cart_pole': deviations grow by [\d.]+ a period"
+    with pytest.raises(ParameterError, match=refusal):
+        make_joint_controller("nmpc", late, {}, 0.01)
+    # As long as nobody knows the period, it is designed for one, and judged when the first states have come.
+    controller = make_joint_controller("nmpc", late, {})
+    with pytest.raises(ParameterError, match=refusal):
+        controller.check(0.01)
+
+
 def test_nothing_is_planned_from_a_state_that_is_no_number() -> None:
     plant = load_mechanism("cart_pole")
     gain = mechanism_lqr(linearise_mechanism(plant), *plant.mechanism.weights)

@@ -8,8 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from pendulum_lqr.analysis import delayed_spectral_radius
-from pendulum_lqr.controllers.joint_lqr import JOINT_LIMIT, joint_limits, joint_weights
+from pendulum_lqr.controllers.joint_lqr import JOINT_LIMIT, joint_limits, joint_weights, require_settling
 from pendulum_lqr.design import Gain
 from pendulum_lqr.interface import Controller, JointController
 from pendulum_lqr.mechanism_controller import within_limits
@@ -67,11 +66,8 @@ class JointLqi(JointController):
         driven = plant.coordinates.driven
         wide = _with_integrals(model, driven)
         gain = mechanism_lqr(wide, [*p["q"], *(p["q_integral"],) * len(driven)], p["r"])
-        if period is not None and (growth := delayed_spectral_radius(wide, gain.K, period)) >= 1.0:
-            raise ParameterError(
-                f"lqi asked every {period:g} s does not settle on plant {plant.name!r}: deviations grow by "
-                f"{growth:.3g} a period; expected a faster plant, or a smaller q"
-            )
+        if period is not None:
+            require_settling("lqi", plant.name, wide, gain, period)
         limits = joint_limits(plant, p["effort_limit"])
         return cls(gain, plant.coordinates, ASSUMED_PERIOD if period is None else period, limits, model.efforts)
 

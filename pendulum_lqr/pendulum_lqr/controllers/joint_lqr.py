@@ -11,12 +11,13 @@ from pendulum_lqr.design import Gain
 from pendulum_lqr.interface import JointController
 from pendulum_lqr.mechanism_controller import within_limits
 from pendulum_lqr.mechanism_model import linearise_mechanism, mechanism_lqr
+from pendulum_lqr.model import LinearModel
 from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.joints import Coordinates, Vector
 from pendulum_msgs_py.parameters import ParameterSpec
 from pendulum_msgs_py.plants.mechanism_parameters import MechanismParameters
 
-__all__ = ["JOINT_LIMIT", "JointLqr", "joint_limits", "joint_weights"]
+__all__ = ["JOINT_LIMIT", "JointLqr", "joint_limits", "joint_weights", "require_settling"]
 
 JOINT_LIMIT = ParameterSpec(
     "effort_limit", 0.0, "N m", "Largest effort of each driven joint; 0 for the plant's own.", minimum=0.0
@@ -38,6 +39,19 @@ def joint_weights(plant: MechanismParameters) -> tuple[ParameterSpec, ParameterS
 def joint_limits(plant: MechanismParameters, limit: float) -> Vector:
     """Return the largest effort of each driven joint: its own, and the controller's where that is not 0 [N m or N]."""
     return tuple(min(limit or math.inf, own) for own in plant.effort_limits)
+
+
+def require_settling(controller: str, plant: str, model: LinearModel, gain: Gain, period: float) -> None:
+    """Refuse a gain with which the linear model of a plant grows when asked at a period [s], delay included.
+
+    Raises:
+        ParameterError: It does.
+    """
+    if (growth := delayed_spectral_radius(model, gain.K, period)) >= 1.0:
+        raise ParameterError(
+            f"{controller} asked every {period:g} s does not settle on plant {plant!r}: deviations grow by "
+            f"{growth:.3g} a period; expected a faster plant, or a smaller q"
+        )
 
 
 class JointLqr(JointController):
@@ -75,11 +89,8 @@ class JointLqr(JointController):
         """
         model = linearise_mechanism(plant)
         gain = mechanism_lqr(model, p["q"], p["r"])
-        if period is not None and (growth := delayed_spectral_radius(model, gain.K, period)) >= 1.0:
-            raise ParameterError(
-                f"lqr asked every {period:g} s does not settle on plant {plant.name!r}: deviations grow by "
-                f"{growth:.3g} a period; expected a faster plant, or a smaller q"
-            )
+        if period is not None:
+            require_settling("lqr", plant.name, model, gain, period)
         return cls(gain, plant.coordinates, joint_limits(plant, p["effort_limit"]), model.efforts)
 
     def command(self, t: float, position: Vector, velocity: Vector) -> Vector:

@@ -5,8 +5,10 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
+from pendulum_lqr.controllers.joint_lqr import require_settling
 from pendulum_lqr.interface import JointController
 from pendulum_lqr.mechanism_controllers import default_catch, refuse_passive_friction
+from pendulum_lqr.mechanism_model import linearise_mechanism
 from pendulum_lqr.mechanism_mpc import MechanismMpc
 from pendulum_lqr.sampling import ASSUMED_PERIOD, require_period
 from pendulum_msgs_py.joints import Vector
@@ -41,18 +43,24 @@ class JointNmpc(JointController):
         """Return the controller for a plant whose passive joints have no dry friction.
 
         Raises:
-            ParameterError: One has: plans leave it out, and no effort can make up for it there.
+            ParameterError: One has: plans leave it out, and no effort can make up for it there. Or its LQR would not
+                hold what comes up, at this period and with the plant's delay.
         """
         refuse_passive_friction("nmpc", plant)
-        return cls(plant, ASSUMED_PERIOD if period is None else period)
+        controller = cls(plant, ASSUMED_PERIOD if period is None else period)
+        if period is not None:
+            controller.check(period)
+        return controller
 
     def check(self, period: float) -> None:
-        """Refuse another period than that of the design [s].
+        """Refuse another period than that of the design [s], and one at which its LQR does not settle.
 
         Raises:
             ParameterError: as said.
         """
         require_period("nmpc plans for answers", self.period, period)
+        catch = self._inner.catch
+        require_settling("nmpc", catch.plant.name, linearise_mechanism(catch.plant), catch.gain, self.period)
 
     def reset(self) -> None:
         """Forget the plan."""
