@@ -26,7 +26,7 @@ __all__ = ["CondensedMpc"]
 Matrix = NDArray[np.float64]
 
 _TOLERANCE = 1e-4
-"""Of an input's limit and of a state's, and of the largest number in it; a hundredth of that takes ten times as long."""
+"""Of the limit of an input or a state, and of the largest number in it; a hundredth takes ten times as long."""
 
 
 class CondensedMpc:
