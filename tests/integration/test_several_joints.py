@@ -146,7 +146,7 @@ def test_an_acrobot_swings_up_in_lockstep_and_stays(peer: Peer, processes, name:
         "period:=0.004",
         "use_sim_time:=true",
     )
-    controller.wait_for_output(rf"{name} for plant acrobot_frictionless: swing-up of .*sampled from", 90)
+    controller.wait_for_output(rf"{name} for plant acrobot_frictionless: swing-up of .*sampled from", 240)
     _start(
         processes,
         "pendulum_sim",
