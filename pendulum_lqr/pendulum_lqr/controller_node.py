@@ -313,12 +313,11 @@ class ControllerNode(LifecycleNode, PollingNode):
             self._period_measured = True
             if isinstance(plant, MechanismParameters):
                 if not self._uses_period():
-                    # Whether it settles at this period is seen by its design.
                     self._period = measured
-                    self._design(values)
                 elif not values["period"] and abs(measured / self._period - 1.0) > _SAME_PERIOD:
                     self._design_for(measured)
-                elif self._loop is not None and isinstance(self._loop.controller, JointController):
+                # Not by another design, which may take longer than after what a plant counts as begun anew.
+                if self._loop is not None and isinstance(self._loop.controller, JointController):
                     self._loop.controller.check(measured)
                 self._period_known = True
                 return True

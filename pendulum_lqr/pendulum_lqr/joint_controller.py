@@ -83,4 +83,7 @@ def make_joint_controller(
             a loop that is unstable on the linear model at this period, delay included.
     """
     chosen = joint_controller_class(name, plant)
-    return chosen.design(plant, validate(chosen.parameters(plant), values), period)
+    controller = chosen.design(plant, validate(chosen.parameters(plant), values), period)
+    if period is not None:
+        controller.check(period)
+    return controller

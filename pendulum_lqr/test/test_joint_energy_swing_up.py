@@ -14,6 +14,7 @@ from pendulum_lqr.interface import JointController
 from pendulum_lqr.joint_controller import joint_parameters, make_joint_controller
 from pendulum_lqr.mechanism_catch import make_mechanism_catch
 from pendulum_lqr.mechanism_pump import EnergyPump, pump_gains
+from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.joints import Vector
 from pendulum_msgs_py.plants.mechanism_parameters import MechanismParameters, load_mechanism
 from pendulum_sim.mechanism_plant import MechanismPlant
@@ -156,6 +157,18 @@ def test_who_takes_over_knows_what_was_learnt_and_whether_the_lqr_is_in_charge()
     assert shared.catch.region.level == pytest.approx(0.1 * level)
     assert shared.catch.leave * shared.catch.region.level == pytest.approx(old.catch.leave * level)
     assert "pumps by cart within 1.62 m, LQR K" in old.describe()
+
+
+@pytest.mark.parametrize("name", ["lqr", "energy_swing_up"])
+def test_a_period_that_is_measured_later_is_judged_without_another_design(
+    name: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    controller = make_joint_controller(name, load_mechanism("cart_pole"), {})
+    monkeypatch.setattr("pendulum_lqr.mechanism_catch.sample_caught_region", lambda *_: pytest.fail("designed again"))
+    monkeypatch.setattr("pendulum_lqr.controllers.joint_lqr.mechanism_lqr", lambda *_: pytest.fail("designed again"))
+    controller.check(0.01)
+    with pytest.raises(ParameterError, match=rf"{name} asked every 0\.5 s does not settle on plant 'cart_pole'"):
+        controller.check(0.5)
 
 
 def test_its_energy_is_that_of_the_pendulum_alone_with_the_driven_joint_at_rest() -> None:

@@ -281,6 +281,16 @@ def test_tvlqr_follows_the_file_of_a_search_and_refuses_that_of_another_mechanis
         make_joint_controller("tvlqr", plant, {"trajectory": str(tmp_path / "gone.json")}, DT)
 
 
+def test_a_swing_up_whose_lqr_would_not_hold_what_comes_up_is_refused() -> None:
+    plant = load_mechanism("acrobot_frictionless")
+    joints = tuple(
+        joint if joint.actuator is None else replace(joint, actuator=replace(joint.actuator, transport_delay=0.03))
+        for joint in plant.joints
+    )
+    with pytest.raises(ParameterError, match=r"tvlqr asked every 0\.002 s does not settle on plant 'acrobot_friction"):
+        make_joint_controller("tvlqr", replace(plant, joints=joints), {}, DT)
+
+
 @pytest.mark.parametrize("name", ["nmpc", "ilqr"])
 def test_plans_without_dry_friction_are_not_for_a_passive_joint_that_has_some(name: str) -> None:
     with pytest.raises(

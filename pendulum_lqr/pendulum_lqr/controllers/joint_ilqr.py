@@ -27,6 +27,7 @@ class JointIlqr(JointSwingUp):
 
     SUMMARY = "swing-up planned by iterative LQR when it starts, followed by TVLQR, then LQR"
 
+    NAME = "ilqr"
     DESIGNING = "compiles its model and searches a swing-up, which takes some ten seconds"
 
     @classmethod

@@ -13,7 +13,7 @@ from pendulum_lqr.mechanism_controller import within_limits
 from pendulum_lqr.mechanism_model import linearise_mechanism, mechanism_lqr
 from pendulum_lqr.model import LinearModel
 from pendulum_msgs_py.errors import ParameterError
-from pendulum_msgs_py.joints import Coordinates, Vector
+from pendulum_msgs_py.joints import Vector
 from pendulum_msgs_py.parameters import ParameterSpec
 from pendulum_msgs_py.plants.mechanism_parameters import MechanismParameters
 
@@ -58,22 +58,23 @@ class JointLqr(JointController):
     """Continuous LQR of n joints, sampled.
 
     Args:
+        plant: The plant.
+        model: Its linear model about upright.
         gain: Gain, K of shape (m, 2n).
-        coordinates: Joints of the plant; deviations wrap for those that turn.
         effort_limits: Largest effort of each driven joint [N m or N].
-        hold: m efforts that hold the plant upright.
     """
 
     SUMMARY = "continuous LQR, sampled"
     SAMPLED = False
 
-    def __init__(self, gain: Gain, coordinates: Coordinates, effort_limits: Vector, hold: Vector) -> None:
+    def __init__(self, plant: MechanismParameters, model: LinearModel, gain: Gain, effort_limits: Vector) -> None:
         super().__init__(effort_limits)
         self.gain = gain
-        self._deviation = coordinates.deviation
+        self._plant, self._model = plant, model
+        self._deviation = plant.coordinates.deviation
         # Plain floats: indexing an array on every state costs more than the law itself.
         self._rows = tuple(tuple(float(value) for value in row) for row in gain.K)
-        self._hold = hold
+        self._hold = model.efforts
 
     @classmethod
     def parameters(cls, plant: MechanismParameters) -> tuple[ParameterSpec, ...]:
@@ -82,16 +83,22 @@ class JointLqr(JointController):
 
     @classmethod
     def design(cls, plant: MechanismParameters, p: Mapping[str, Any], period: float | None) -> JointLqr:
-        """Return the LQR; at a period that is known, only one that settles.
+        """Return the LQR.
 
         Raises:
-            ParameterError: There is none for these weights, or it grows on the linear model at this period.
+            ParameterError: There is none for these weights.
         """
         model = linearise_mechanism(plant)
         gain = mechanism_lqr(model, p["q"], p["r"])
-        if period is not None:
-            require_settling("lqr", plant.name, model, gain, period)
-        return cls(gain, plant.coordinates, joint_limits(plant, p["effort_limit"]), model.efforts)
+        return cls(plant, model, gain, joint_limits(plant, p["effort_limit"]))
+
+    def check(self, period: float) -> None:
+        """Refuse a period at which it does not settle [s].
+
+        Raises:
+            ParameterError: as said.
+        """
+        require_settling("lqr", self._plant.name, self._model, self.gain, period)
 
     def command(self, t: float, position: Vector, velocity: Vector) -> Vector:
         """Return m efforts."""

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
+from pendulum_lqr.controllers.joint_lqr import require_settling
 from pendulum_lqr.interface import JointController
 from pendulum_lqr.mechanism_controllers import default_catch, stored_trajectory
+from pendulum_lqr.mechanism_model import linearise_mechanism
 from pendulum_lqr.mechanism_trajectory import MechanismTrajectory, load_trajectory
 from pendulum_lqr.mechanism_tvlqr import MechanismTvlqr
 from pendulum_lqr.sampling import ASSUMED_PERIOD, require_period
@@ -39,6 +41,8 @@ class JointSwingUp(JointController):
 
     SUMMARY = "swing-up along the stored trajectory of a preset, or that of a file, by TVLQR, then LQR"
 
+    NAME: ClassVar[str] = "tvlqr"
+    """What it is called in refusals."""
     DESIGNING = "tries out from where the LQR catches, which takes some seconds"
 
     def __init__(self, plant: MechanismParameters, period: float, trajectory: MechanismTrajectory) -> None:
@@ -65,12 +69,14 @@ class JointSwingUp(JointController):
         return cls(plant, ASSUMED_PERIOD if period is None else period, trajectory)
 
     def check(self, period: float) -> None:
-        """Refuse another period than that of the design [s].
+        """Refuse another period than that of the design [s], and one at which its LQR does not settle.
 
         Raises:
             ParameterError: as said.
         """
         require_period("the trajectory is followed", self._period, period)
+        catch = self._inner.catch
+        require_settling(self.NAME, catch.plant.name, linearise_mechanism(catch.plant), catch.gain, period)
 
     def reset(self) -> None:
         """Begin anew, at hanging."""
