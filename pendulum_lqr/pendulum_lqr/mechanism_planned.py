@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from dataclasses import replace
 
 import numpy as np
 
@@ -95,4 +94,4 @@ class PlannedSwingUp:
             plan.states[:, 2 * len(names) :],
         )
         q, r = self.plant.mechanism.weights
-        return MechanismTvlqr(self.plant, self.period, trajectory, replace(self.catch), q=q, r=r, tube=_TUBE)
+        return MechanismTvlqr(self.plant, self.period, trajectory, self.catch, q=q, r=r, tube=_TUBE)

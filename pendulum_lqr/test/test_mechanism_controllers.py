@@ -194,8 +194,10 @@ def test_a_planned_swing_up_is_searched_once_and_anew_only_where_it_is_thrown_of
             (effort,) = controller.command(k * DT, x)
             efforts.append(effort)
             x = step(plant, x, (effort,))
-            if k == 200:
-                x = (*x[:3], x[3] + kick)
+            if k == 200 and kick:
+                x = thrown = (*x[:3], x[3] + kick)
+        if kick:
+            assert searched[1][2:] == thrown[2:]
         return x, efforts
 
     def upright(x: Vector) -> bool:
@@ -214,8 +216,13 @@ def test_a_planned_swing_up_is_searched_once_and_anew_only_where_it_is_thrown_of
     assert searched[0] == pytest.approx((0.2, 0.5, 0.1, -1.0))
     kicked, _ = run((0.0, 0.0, 0.0, 0.0), kick=6.0)
     assert upright(kicked)
-    assert len(searched) > 1
+    assert controller.catch.active
     controller.reset()
+    assert not controller.catch.active
+    # What arrives goes before what is cheaper.
+    plan = controller.search.solve((0.0,) * 4, (0.0,), np.zeros((few.nodes, 1)), 0)
+    there = plan._replace(states=np.tile([*plant.coordinates.goal, 0.0, 0.0, 0.0], (2, 1)), cost=9.0)
+    assert min(plan._replace(cost=1.0), there, there._replace(cost=8.0), key=controller._rank).cost == 8.0
     with pytest.raises(ParameterError, match=r"plan begins at .*nan.*; expected finite numbers"):
         controller.command(0.0, (0.0, math.nan, 0.0, 0.0))
     # From where every plan runs away from all numbers there is nothing to follow.
