@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -92,6 +93,10 @@ class MechanismMpc:
         elif t - self._planned >= step - 0.5 * self.period:
             self._plan_again(t, x)
         plan = self._plan
+        if not math.isfinite(plan.cost):
+            # From far beyond a machine's speeds every plan runs away from all numbers: there is none to follow.
+            self._plan, self._before = None, (0.0,) * len(self._limits)
+            return self._before
         share = min(1.0, (t + 0.5 * self.period - self._planned) / step)
         n = len(self.plant.joints)
         first = plan.states[0, 2 * n :]
@@ -106,7 +111,9 @@ class MechanismMpc:
         self._age += 1
         if self._age % self.settings.patience == 0 and not self.search.arrives(plan):
             plan = self._best(x, plan, self.settings.retries)
-        self._plan, self._planned = plan, t
+        if math.isfinite(plan.cost):
+            self._plan, self._planned = plan, t
+        # Else a single wild state, such as an encoder's glitch: the plan before it is the better one.
 
     def _best(self, x: Vector, plan: IlqrPlan | None, count: int) -> IlqrPlan:
         """Return the cheapest of a plan and what fresh guesses become."""

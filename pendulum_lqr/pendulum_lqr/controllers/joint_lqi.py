@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from pendulum_lqr.controllers.joint_lqr import JOINT_LIMIT, joint_limits, joint_weights, require_settling
+from pendulum_lqr.controllers.joint_lqr import JOINT_LIMIT, SMALLER_Q, joint_limits, joint_weights, require_settling
 from pendulum_lqr.design import Gain
 from pendulum_lqr.interface import Controller, JointController
 from pendulum_lqr.mechanism_controller import within_limits
@@ -66,7 +66,7 @@ class JointLqi(JointController):
         wide = _with_integrals(model, driven)
         gain = mechanism_lqr(wide, [*p["q"], *(p["q_integral"],) * len(driven)], p["r"])
         if period is not None:
-            require_settling("lqi", plant.name, wide, gain, period)
+            require_settling("lqi", plant.name, wide, gain, period, SMALLER_Q)
         limits = joint_limits(plant, p["effort_limit"])
         return cls(gain, plant.coordinates, ASSUMED_PERIOD if period is None else period, limits, model.efforts)
 

@@ -17,12 +17,14 @@ from pendulum_msgs_py.joints import Vector
 from pendulum_msgs_py.parameters import ParameterSpec
 from pendulum_msgs_py.plants.mechanism_parameters import MechanismParameters
 
-__all__ = ["JOINT_LIMIT", "JointLqr", "joint_limits", "joint_weights", "require_settling"]
+__all__ = ["JOINT_LIMIT", "SMALLER_Q", "JointLqr", "joint_limits", "joint_weights", "require_settling"]
 
 JOINT_LIMIT = ParameterSpec(
     "effort_limit", 0.0, "N m", "Largest effort of each driven joint; 0 for the plant's own.", minimum=0.0
 )
 """A limit for all driven joints, beside their own."""
+SMALLER_Q = "a faster plant, or a smaller q"
+"""What helps a gain that does not settle, where its weights can be chosen."""
 
 
 def joint_weights(plant: MechanismParameters) -> tuple[ParameterSpec, ParameterSpec]:
@@ -41,7 +43,9 @@ def joint_limits(plant: MechanismParameters, limit: float) -> Vector:
     return tuple(min(limit or math.inf, own) for own in plant.effort_limits)
 
 
-def require_settling(controller: str, plant: str, model: LinearModel, gain: Gain, period: float) -> None:
+def require_settling(
+    controller: str, plant: str, model: LinearModel, gain: Gain, period: float, remedy: str = "a faster plant"
+) -> None:
     """Refuse a gain with which the linear model of a plant grows when asked at a period [s], delay included.
 
     Raises:
@@ -50,7 +54,7 @@ def require_settling(controller: str, plant: str, model: LinearModel, gain: Gain
     if (growth := delayed_spectral_radius(model, gain.K, period)) >= 1.0:
         raise ParameterError(
             f"{controller} asked every {period:g} s does not settle on plant {plant!r}: deviations grow by "
-            f"{growth:.3g} a period; expected a faster plant, or a smaller q"
+            f"{growth:.3g} a period; expected {remedy}"
         )
 
 
@@ -98,7 +102,7 @@ class JointLqr(JointController):
         Raises:
             ParameterError: as said.
         """
-        require_settling("lqr", self._plant.name, self._model, self.gain, period)
+        require_settling("lqr", self._plant.name, self._model, self.gain, period, SMALLER_Q)
 
     def command(self, t: float, position: Vector, velocity: Vector) -> Vector:
         """Return m efforts."""
