@@ -115,6 +115,9 @@ def test_integrals_leave_no_offset_of_the_driven_joints_under_a_constant_effort(
         controller.check(0.002)
     with pytest.raises(ParameterError, match=r"lqi asked every 1 s does not settle"):
         make_joint_controller("lqi", plant, {}, 1.0)
+    # Designed before anybody knows the period, it is judged when that turns out to be the assumed one.
+    with pytest.raises(ParameterError, match=r"lqi asked every 0\.01 s does not settle on plant 'furuta'"):
+        make_joint_controller("lqi", _delayed("furuta", 0.012), {}).check(PERIOD)
 
 
 @pytest.mark.parametrize("name", PLANTS)

@@ -313,7 +313,7 @@ def test_a_swing_up_that_its_lqr_would_not_hold_at_this_period_is_refused() -> N
     cart, pole = plant.joints
     assert cart.actuator is not None
     late = replace(plant, joints=(replace(cart, actuator=replace(cart.actuator, transport_delay=0.3)), pole))
-    refusal = r"nmpc asked every 0\.01 s does not settle on plant 'cart_pole': deviations grow by [\d.]+ a period; expected a faster plant$"
+    refusal = r"nmpc asked every 0\.01 s does not settle on plant 'cart_pole': .*; expected a faster plant$"
     with pytest.raises(ParameterError, match=refusal):
         make_joint_controller("nmpc", late, {}, 0.01)
     # As long as nobody knows the period, it is designed for one, and judged when the first states have come.

@@ -15,7 +15,7 @@ from pendulum_lqr.mechanism_controller import within_limits
 from pendulum_lqr.mechanism_model import linearise_mechanism, mechanism_lqr
 from pendulum_lqr.model import LinearModel
 from pendulum_lqr.sampling import ASSUMED_PERIOD, require_period
-from pendulum_msgs_py.joints import Coordinates, Vector
+from pendulum_msgs_py.joints import Vector
 from pendulum_msgs_py.parameters import ParameterSpec
 from pendulum_msgs_py.plants.mechanism_parameters import MechanismParameters
 
@@ -29,23 +29,24 @@ class JointLqi(JointController):
     of the driven joints. All integrals stand still while an effort is at its limit, so that they do not wind up.
 
     Args:
+        plant: The plant.
+        model: Its linear model about upright, with integrals.
         gain: Gain, K of shape (m, 2n + m).
-        coordinates: Joints of the plant.
         period: Sampling period [s].
         effort_limits: Largest effort of each driven joint [N m or N].
-        hold: m efforts that hold the plant upright.
     """
 
     SUMMARY = "LQR with integrals of the driven joints: no offset of theirs under a constant effort"
 
     def __init__(
-        self, gain: Gain, coordinates: Coordinates, period: float, effort_limits: Vector, hold: Vector
+        self, plant: MechanismParameters, model: LinearModel, gain: Gain, period: float, effort_limits: Vector
     ) -> None:
         super().__init__(effort_limits)
         self.gain, self.period = gain, period
-        self._coordinates = coordinates
-        self._hold = np.array(hold)
-        self._integral = np.zeros(len(hold))
+        self._plant, self._model = plant, model
+        self._coordinates = plant.coordinates
+        self._hold = np.array(model.efforts)
+        self._integral = np.zeros(len(self._hold))
 
     @classmethod
     def parameters(cls, plant: MechanismParameters) -> tuple[ParameterSpec, ...]:
@@ -56,27 +57,26 @@ class JointLqi(JointController):
 
     @classmethod
     def design(cls, plant: MechanismParameters, p: Mapping[str, Any], period: float | None) -> JointLqi:
-        """Return the LQI; at a period that is known, only one that settles.
+        """Return the LQI.
 
         Raises:
-            ParameterError: There is none for these weights, or it grows on the linear model at this period.
+            ParameterError: There is none for these weights.
         """
         model = linearise_mechanism(plant)
         driven = plant.coordinates.driven
         wide = _with_integrals(model, driven)
         gain = mechanism_lqr(wide, [*p["q"], *(p["q_integral"],) * len(driven)], p["r"])
-        if period is not None:
-            require_settling("lqi", plant.name, wide, gain, period, SMALLER_Q)
         limits = joint_limits(plant, p["effort_limit"])
-        return cls(gain, plant.coordinates, ASSUMED_PERIOD if period is None else period, limits, model.efforts)
+        return cls(plant, wide, gain, ASSUMED_PERIOD if period is None else period, limits)
 
     def check(self, period: float) -> None:
-        """Refuse another period than that of the design [s].
+        """Refuse another period than that of the design [s], and one at which it does not settle.
 
         Raises:
             ParameterError: as said.
         """
         require_period("it is integrated", self.period, period)
+        require_settling("lqi", self._plant.name, self._model, self.gain, period, SMALLER_Q)
 
     def reset(self) -> None:
         """Empty the integrals."""
