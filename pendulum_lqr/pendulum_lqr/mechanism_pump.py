@@ -37,6 +37,9 @@ _PUSH = 0.05
 """That push, as a share of the acceleration w_0^2 of the pendulum's own frequency."""
 _LEAST_COUPLING = 0.3
 """Share of the coupling of hanging below which friction is not made up for: a level pole feels nothing of its cart."""
+_MOST_FRICTION = 0.015
+"""Largest dry friction of the pendulum, by the torque of its level weight. The LQR that catches knows none, and with
+more it does not bring every mechanism to rest (pendubot: 5 of 5 at 0.015, none at 0.02)."""
 _ANGLES = 32
 
 
@@ -101,7 +104,8 @@ class EnergyPump:
         reach: Farthest that the driven joint may go from its goal, infinite where nothing bounds it [rad or m].
 
     Raises:
-        DesignError: The plant cannot be swung up so: no gravity, or the driven joint does not move the pendulum.
+        DesignError: The plant cannot be swung up so: no gravity, the driven joint does not move the pendulum, or dry
+            friction would keep the LQR from holding it.
 
     Source:
         Astrom and Furuta, Swinging up a pendulum by energy control, Automatica 36(2), 2000; Spong, Energy based control
@@ -131,7 +135,15 @@ class EnergyPump:
                 f"{names[self._p]} of plant {plant.name!r} cannot be swung up by {names[self._a]}: its weight lifts "
                 f"{self._top:.4g} J, its coupling is {coupling:.4g}; expected both other than 0"
             )
-        frequency = math.sqrt(0.5 * self._top / inertia)
+        weight, stuck = 0.5 * self._top, plant.joints[self._p].breakaway
+        if stuck > _MOST_FRICTION * weight:
+            name, unit = plant.coordinates.names[self._p], plant.coordinates.joints[self._p].effort_unit
+            raise DesignError(
+                f"energy_swing_up ends with an LQR that knows no dry friction, and {name} of plant {plant.name!r} is "
+                f"passive with {stuck:g} {unit}; expected at most {_MOST_FRICTION * weight:.3g} {unit}, as of a "
+                "preset's frictionless twin"
+            )
+        frequency = math.sqrt(weight / inertia)
         self._ratio = inertia / abs(coupling)
         self._carried = gains.carried
         self._gain = gains.gain * frequency * self._ratio / abs(coupling)

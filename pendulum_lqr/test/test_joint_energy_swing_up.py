@@ -105,6 +105,25 @@ def test_the_margin_falls_with_each_pass_and_rises_with_each_turn_before_upright
     assert margin.value == 0.1
 
 
+@pytest.mark.parametrize(
+    ("states", "learnt"),
+    [
+        (((-2.0, 1.0), (0.5, 1.0)), 0.1),  # from afar
+        (((0.5, -1.0), (-2.0, -1.0)), 0.1),  # to afar
+        (((0.5, 5.0), (-0.5, 5.0)), 0.05),  # fast
+        (((0.0, 1.0), (0.1, 1.0)), 0.1),  # begins upright
+        (((0.5, 0.5), (0.6, 0.5)), 0.1),  # goes on slowly
+        (((0.5, 0.0), (0.5, 1.0)), 0.1),  # begins at rest
+        (((-0.5, 1.0), (-0.5, -1.0)), 0.16),  # turns back
+    ],
+)
+def test_only_what_happens_near_upright_tells_how_to_aim(states: tuple[Vector, Vector], learnt: float) -> None:
+    margin = EnergyMargin(0.1)
+    for state in states:
+        margin.learn(*state)
+    assert margin.value == pytest.approx(learnt)
+
+
 def test_the_driven_joint_goes_no_farther_than_it_may() -> None:
     plant = load_mechanism("cart_pole")
     wide, narrow = (make_joint_controller("energy_swing_up", plant, {"reach": reach}, PERIOD) for reach in (10.0, 0.8))
