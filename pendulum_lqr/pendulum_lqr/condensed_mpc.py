@@ -18,7 +18,7 @@ import osqp
 import scipy.sparse
 from numpy.typing import NDArray
 
-from pendulum_lqr.design import Gain
+from pendulum_lqr.design import DesignError, Gain
 from pendulum_lqr.sampled_design import DiscreteModel
 
 __all__ = ["CondensedMpc"]
@@ -43,6 +43,9 @@ class CondensedMpc:
         limited: Largest magnitude, > 0, of each state that is limited, by its index.
         largest: Size of the largest inputs, shape (m,), > 0.
         slack_weight: Cost of the square of the most by which a limit is broken.
+
+    Raises:
+        DesignError: The numbers lie too far apart for the solver.
 
     Source:
         Rossiter, Kouvaritakis, Rice, A numerically robust state-space approach to stable-predictive control
@@ -97,21 +100,27 @@ class CondensedMpc:
         """Set the solver up anew: what it learnt from past states (start, step size) would colour the next answers."""
         lower, upper = self._bounds(np.zeros(self.size), -self._scale, self._scale)
         self._solver = osqp.OSQP()
-        self._solver.setup(
-            self._hessian,
-            np.zeros(self._hessian.shape[0]),
-            self._constraints,
-            lower,
-            upper,
-            verbose=False,
-            eps_abs=_TOLERANCE,
-            eps_rel=_TOLERANCE,
-            max_iter=1000,
-            polishing=False,
-            # By iterations: an adaptation by elapsed time would make answers depend on the machine's load.
-            adaptive_rho=1,
-            adaptive_rho_interval=50,
-        )
+        try:
+            self._solver.setup(
+                self._hessian,
+                np.zeros(self._hessian.shape[0]),
+                self._constraints,
+                lower,
+                upper,
+                verbose=False,
+                eps_abs=_TOLERANCE,
+                eps_rel=_TOLERANCE,
+                max_iter=1000,
+                polishing=False,
+                # By iterations: an adaptation by elapsed time would make answers depend on the machine's load.
+                adaptive_rho=1,
+                adaptive_rho_interval=50,
+            )
+        except osqp.OSQPException as error:
+            raise DesignError(
+                f"limits of efforts {self._scale.tolist()} and of states {sorted(set(self._limits.tolist()))} with these "
+                "weights are too far from one for the solver (OSQP); expected larger limits, or 0 for none"
+            ) from error
 
     def first(self, state: Matrix, low: Matrix, high: Matrix) -> Matrix | None:
         """Return the first inputs of the plan, shape (m,), or None where the solver finds none.

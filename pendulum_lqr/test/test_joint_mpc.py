@@ -246,6 +246,12 @@ def test_positions_are_limited_where_there_are_end_stops_and_wherever_somebody_s
     assert "positions within [0.5, none]" in told.describe()
 
 
+@pytest.mark.parametrize("given", [{"position_limits": [1e-200, 0.0]}, {"effort_limit": 1e-300}])
+def test_limits_that_no_solver_takes_are_refused_in_words(given: dict[str, object]) -> None:
+    with pytest.raises(ParameterError, match=r"limits of efforts \[.*\] and of states \[.*\] .* too far from one"):
+        make_joint_controller("mpc", load_mechanism("cart_pole"), given, PERIOD)
+
+
 def test_another_period_than_that_of_the_design_is_refused() -> None:
     controller = make_joint_controller("mpc", load_mechanism("cart_pole"), {}, PERIOD)
     controller.check(0.0101)
