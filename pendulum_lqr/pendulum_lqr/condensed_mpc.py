@@ -118,8 +118,8 @@ class CondensedMpc:
             )
         except osqp.OSQPException as error:
             raise DesignError(
-                f"limits of efforts {self._scale.tolist()} and of states {sorted(set(self._limits.tolist()))} with these "
-                "weights are too far from one for the solver (OSQP); expected larger limits, or 0 for none"
+                f"limits of efforts {self._scale.tolist()} and of states {sorted(set(self._limits.tolist()))} are with "
+                "these weights too far from one for the solver (OSQP); expected larger limits, or 0 for none"
             ) from error
 
     def first(self, state: Matrix, low: Matrix, high: Matrix) -> Matrix | None:

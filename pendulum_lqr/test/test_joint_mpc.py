@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
 import pytest
 import scipy.integrate
 import scipy.linalg
+import scipy.optimize
 
 from pendulum_lqr.answering import AnswerLoop
 from pendulum_lqr.controllers.joint_mpc import JointMpc
@@ -78,6 +80,55 @@ def test_the_cost_of_two_inputs_is_collected_as_that_of_one(delay: float) -> Non
             )
             x = solved.y[:, -1]
     assert told == pytest.approx(x[4] + r * period * (u @ u), rel=1e-7)
+
+
+def _planned(controller: JointMpc, x: np.ndarray, widths: Sequence[float], dear: float) -> np.ndarray:
+    """Return the first inputs by the plant's own powers and a solver of another kind."""
+    A, B, (Q, R, N), S = controller.model.A, controller.model.B, controller.cost, controller.gain.S
+    m, horizon = B.shape[1], controller._program.horizon
+
+    def states(u: np.ndarray) -> np.ndarray:
+        way = [x]
+        for each in u:
+            way.append(A @ way[-1] + B @ each)
+        return np.array(way)
+
+    def cost(unknown: np.ndarray) -> float:
+        u, slack = unknown[:-2].reshape(horizon, m), unknown[-2:]
+        way = states(u)
+        stages = sum(z @ Q @ z + 2.0 * z @ N @ v + v @ R @ v for z, v in zip(way, u, strict=False))
+        return float(stages + way[-1] @ S @ way[-1] + dear * slack @ slack)
+
+    def room(unknown: np.ndarray) -> np.ndarray:
+        beyond = np.abs(states(unknown[:-2].reshape(horizon, m))[1:, :2]) - unknown[-2:] - np.array(widths)
+        return -beyond.ravel()
+
+    bounds = [(-limit, limit) for _ in range(horizon) for limit in controller.effort_limits] + [(0.0, None)] * 2
+    found = scipy.optimize.minimize(
+        cost, np.zeros(horizon * m + 2), method="SLSQP", bounds=bounds, constraints={"type": "ineq", "fun": room},
+        options={"ftol": 1e-12, "maxiter": 500},
+    )  # fmt: skip
+    assert found.success
+    return np.asarray(found.x[:m])
+
+
+@pytest.mark.parametrize("sign", [-1.0, 1.0])
+@pytest.mark.parametrize(
+    "x",
+    [(-0.08, 0.0, -0.25, 0.09), (0.07, -0.18, 0.0, -0.54), (-0.07, 0.14, -0.14, 0.1), (-0.06, 0.19, -0.13, 0.64),
+     (-0.07, -0.15, -0.31, -0.72), (0.02, 0.05, -0.6, 1.35), (-0.03, -0.02, 0.67, 0.4)],
+)  # fmt: skip
+def test_two_inputs_with_limits_of_their_own_and_two_positions_are_planned_as_by_another_solver(
+    x: tuple[float, ...], sign: float
+) -> None:
+    plant = load_mechanism("double_pendulum").with_values({"shoulder.effort_limit": 3.0, "elbow.effort_limit": 1.0})
+    widths = [0.04, 0.1]
+    controller = make_joint_controller("mpc", plant, {"horizon": 6, "position_limits": widths}, 0.02)
+    assert isinstance(controller, JointMpc)
+    state = sign * np.array(x)
+    dear = 10.0 * max(plant.mechanism.weights[0])
+    answer = controller.command(0.0, _upright(plant, *state[:2]), tuple(state[2:]))
+    assert answer == pytest.approx(_planned(controller, state, widths, dear), abs=5e-3)
 
 
 @pytest.mark.parametrize(("place", "velocity", "tilt"), [(1.5, 0.5, 0.0), (1.3, 1.0, 0.0), (1.6, 0.0, -0.05)])
@@ -240,6 +291,12 @@ def test_positions_are_limited_where_there_are_end_stops_and_wherever_somebody_s
         for name in ("cart_pole", "furuta")
     }
     assert defaults == {"cart_pole": pytest.approx([1.71, 0.0]), "furuta": [0.0, 0.0]}
+    # From upright, to the nearer of two stops, or to the only one.
+    hinge = load_mechanism("furuta").with_values({"pendulum.lower_stop": 2.5, "pendulum.upper_stop": 4.0})
+    track = load_mechanism("cart_pole").with_values({"cart.upper_stop": 1.0})
+    for plant, expected in ((hinge, [0.0, 0.95 * (math.pi - 2.5)]), (track, [0.95, 0.0])):
+        widths = next(spec.default for spec in joint_parameters("mpc", plant) if spec.name == "position_limits")
+        assert widths == pytest.approx(expected)
     with pytest.raises(ParameterError, match=r"position_limits has 1 values; expected 2, for cart, pole"):
         make_joint_controller("mpc", load_mechanism("cart_pole"), {"position_limits": [1.0]}, PERIOD)
     told = make_joint_controller("mpc", load_mechanism("cart_pole"), {"position_limits": [0.5, 0.0]}, PERIOD)
