@@ -139,6 +139,15 @@ def test_the_driven_joint_goes_no_farther_than_it_may() -> None:
     assert narrow.command(0.0, (-1.2, 0.5), (-0.5, -3.0))[0] > 0.0
 
 
+def test_the_dry_friction_of_the_driven_joint_is_made_up_for_in_the_way_that_it_goes() -> None:
+    plant = load_mechanism("cart_pole")
+    rough = plant.with_values({"cart.coulomb_friction": 0.7})
+    smooth_pump, rough_pump = (EnergyPump(each, pump_gains(each), 100.0) for each in (plant, rough))
+    for speed in (0.2, -0.2):
+        state = ((0.1, 0.4), (speed, 1.0), 0.0)
+        assert rough_pump.effort(*state) - smooth_pump.effort(*state) == pytest.approx(math.copysign(0.7, speed))
+
+
 def test_no_state_counts_as_caught_that_runs_into_an_end_stop() -> None:
     plant = load_mechanism("cart_pole")
     near = plant.with_values({"cart.lower_stop": -0.1, "cart.upper_stop": 0.1})

@@ -102,8 +102,10 @@ def test_integrals_leave_no_offset_of_the_driven_joints_under_a_constant_effort(
         far = controller.command(k * PERIOD, _upright(plant, 0.0, 1.0), (0.0, 0.0))
     assert max(map(abs, far)) == max(plant.effort_limits)
     assert controller.command(2.0, _upright(plant, 0.0, 0.0), (0.0, 0.0)) == fresh
-    # Another weight does not let go of what the integrals hold.
+    # Another weight does not let go of what the integrals hold; who begins anew does.
+    _Run(plant, controller, push=push)
     controller.reset()
+    assert controller.command(0.0, _upright(plant, 0.0, 0.0), (0.0, 0.0)) == fresh
     _Run(plant, controller, push=push)
     other = make_joint_controller("lqi", plant, {"q_integral": 30.0}, PERIOD)
     other.carry_over(controller)
@@ -118,6 +120,30 @@ def test_integrals_leave_no_offset_of_the_driven_joints_under_a_constant_effort(
     # Designed before anybody knows the period, it is judged when that turns out to be the assumed one.
     with pytest.raises(ParameterError, match=r"lqi asked every 0\.01 s does not settle on plant 'furuta'"):
         make_joint_controller("lqi", _delayed("furuta", 0.012), {}).check(PERIOD)
+
+
+@pytest.mark.parametrize("name", ["lqi", "lqg", "discrete_lqr"])
+def test_the_limit_that_is_given_holds(name: str) -> None:
+    plant = load_mechanism("cart_pole")
+    controller = make_joint_controller(name, plant, {"effort_limit": 2.0}, PERIOD)
+    for side in (1.0, -1.0):
+        (effort,) = controller.command(0.0, _upright(plant, 0.0, side), (0.0, 0.0))
+        assert abs(effort) == 2.0
+
+
+@pytest.mark.parametrize("delay", [0.0, 0.004, 0.013])
+def test_what_the_filter_predicts_comes(delay: float) -> None:
+    plant = _delayed("cart_pole", delay)
+    controller = make_joint_controller("lqg", plant, {}, PERIOD)
+    simulated = MechanismPlant(plant, dt=PERIOD)
+    state = simulated.reset(_upright(plant, 0.0, 0.002))
+    surprises, states = [], []
+    for k in range(100):
+        states.append(np.array([*plant.coordinates.deviation(state.position), *state.velocity]))
+        if controller._predicted is not None:
+            surprises.append(np.abs(states[-1] - controller._predicted))
+        state = simulated.step(controller.command(k * PERIOD, state.position, state.velocity))
+    assert np.max(surprises) < 0.05 * np.max(np.abs(np.diff(states, axis=0)))
 
 
 @pytest.mark.parametrize("name", PLANTS)
