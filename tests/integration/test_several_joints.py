@@ -166,6 +166,34 @@ def test_an_acrobot_swings_up_in_lockstep_and_stays(peer: Peer, processes, name:
     assert np.abs(peer.states[-1].velocity).max() < 0.05
 
 
+def test_a_cart_swings_its_pole_up_by_energy_in_lockstep_within_its_track_and_its_motors_limit(
+    peer: Peer, processes
+) -> None:
+    controller = _start(
+        processes, "pendulum_lqr", "controller", "plant:=cart_pole", "controller:=energy_swing_up", "use_sim_time:=true"
+    )
+    controller.wait_for_output(r"energy_swing_up for plant cart_pole: pumps by cart within 1\.62 m", 60)
+    _start(
+        processes,
+        "pendulum_sim",
+        "simulator",
+        "plant:=cart_pole",
+        "clock:=lockstep",
+        "rate_hz:=100.0",
+        "lockstep_duration:=9.0",
+        "lockstep_subscribers:=2",
+    )
+    peer.until(lambda: peer.states and peer.states[-1].header.stamp.sec == 10, "the last state, after 9 s", 90.0)
+    # The first states may be missed here.
+    assert np.abs(peer.states[0].position).max() < 0.3
+    cart, pole = peer.states[-1].position
+    assert abs(cart) < 0.05
+    assert math.cos(pole) < -0.998
+    # Its track ends at 1.8 m; the controller stays within nine tenths of the way.
+    assert max(abs(state.position[0]) for state in peer.states) < 1.65
+    assert max(abs(applied.effort[0]) for applied in peer.applied) <= 10.0
+
+
 def test_mpc_takes_the_period_of_the_states_and_stops_a_cart_before_the_end_of_its_track(peer: Peer, processes) -> None:
     controller = _start(
         processes, "pendulum_lqr", "controller", "plant:=cart_pole", "controller:=mpc", "use_sim_time:=true"
@@ -324,6 +352,16 @@ REFUSED: list[Refused] = [
         CONTROLLER,
         ("plant:=acrobot", "controller:=pid"),
         "pid is for plants of one joint, and plant 'acrobot' has shoulder, elbow; expected lqr, discrete_lqr, lqi,",
+    ),
+    (
+        CONTROLLER,
+        ("plant:=acrobot_frictionless", "controller:=energy_swing_up"),
+        "is a double_pendulum with motors at elbow; expected cart_pole with a motor at the cart alone",
+    ),
+    (
+        CONTROLLER,
+        ("plant:=pendubot", "controller:=energy_swing_up"),
+        "elbow of plant 'pendubot' is passive with 0.12 N m; expected at most 0.0235 N m",
     ),
     (CONTROLLER, ("plant:=cart_pole", "controller:=policy"), "policy is empty; expected the path of a policy file"),
     (CONTROLLER, ("plant:=acrobot", "q:=[1.0, 2.0]"), "q has the shape (2,); expected (4,)"),
