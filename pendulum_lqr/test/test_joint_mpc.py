@@ -152,6 +152,21 @@ def test_a_cart_that_an_lqr_lets_hit_the_end_of_its_track_stops_before_it(
     assert farthest["mpc"] < farthest["lqr"] - 0.02
 
 
+@pytest.mark.parametrize(("period", "horizon", "enough"), [(0.002, 50, False), (0.005, 50, True), (0.01, 10, False)])
+def test_it_says_when_it_looks_less_far_ahead_than_a_pole_falls(period: float, horizon: int, enough: bool) -> None:
+    plant = load_mechanism("cart_pole")
+    controller = make_joint_controller("mpc", plant, {"horizon": horizon}, period)
+    assert ("s ahead, and to keep clear of a limit it may let fall" in controller.notice) is not enough
+    # Without limits of positions its last cost sees all that comes.
+    free = make_joint_controller("mpc", plant, {"horizon": horizon, "position_limits": [0.0, 0.0]}, period)
+    assert free.notice == ""
+    cart = MechanismPlant(plant, period)
+    state = cart.reset((1.65, math.pi), (0.3, 0.0))
+    for _ in range(round(1.5 / period)):
+        state = cart.step(controller.command(state.time, state.position, state.velocity))
+    assert (abs(plant.coordinates.deviation(state.position)[1]) < 0.5) is enough
+
+
 def test_a_pole_that_may_not_lean_far_leans_less_far() -> None:
     plant = load_mechanism("cart_pole")
     leaned = []

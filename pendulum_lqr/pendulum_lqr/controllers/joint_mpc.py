@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from typing import Any
 
@@ -42,6 +43,7 @@ class JointMpc(JointDiscreteLqr):
         self._program = CondensedMpc(
             self.model, self.gain, self.cost[1], int(p["horizon"]), limits, self.effort_limits, _DEAR * max(p["q"])
         )
+        self._enough = _enough_samples(self.model.A) if limits else 0
 
     @classmethod
     def parameters(cls, plant: MechanismParameters) -> tuple[ParameterSpec, ...]:
@@ -54,8 +56,16 @@ class JointMpc(JointDiscreteLqr):
 
     @property
     def notice(self) -> str:
-        """How often the solver found no plan."""
-        return f"no plan for {self.failures} states: the LQR answered" if self.failures else ""
+        """That it does not look far enough, and how often the solver found no plan."""
+        told = []
+        if self._program.horizon < self._enough:
+            told.append(
+                f"it looks {self._program.horizon * self.period:g} s ahead, and to keep clear of a limit it may let "
+                f"fall what falls later; expected a horizon of {self._enough} samples or more, or a slower plant"
+            )
+        if self.failures:
+            told.append(f"no plan for {self.failures} states: the LQR answered")
+        return "; ".join(told)
 
     def reset(self) -> None:
         """Forget the plan and what was sent."""
@@ -75,6 +85,12 @@ class JointMpc(JointDiscreteLqr):
         """Return horizon, limits and unlimited gain."""
         within = ", ".join(f"{width:g}" if width else "none" for width in self._position_limits)
         return f"horizon {self._program.horizon}, positions within [{within}], K without limits [{self._gain_text()}]"
+
+
+def _enough_samples(A: Array) -> int:
+    """Return the samples in which what falls grows by e: behind a shorter horizon no limit of an effort is seen."""
+    growth = float(np.max(np.abs(np.linalg.eigvals(A))))
+    return math.floor(1.0 / math.log(growth)) if growth > 1.0 else 0
 
 
 def _within_stops(plant: MechanismParameters) -> list[float]:
