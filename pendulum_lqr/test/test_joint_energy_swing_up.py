@@ -182,6 +182,9 @@ def test_who_takes_over_knows_what_was_learnt_and_whether_the_lqr_is_in_charge()
     new.carry_over(old)
     assert new.margin.value == 0.03
     assert new.catch.active
+    new.reset()
+    assert not new.catch.active
+    assert new.margin.value == 0.0
     shared = make_joint_controller("energy_swing_up", plant, {"catch_share": 0.1}, PERIOD)
     level = old.catch.region.level
     assert shared.catch.region.level == pytest.approx(0.1 * level)
