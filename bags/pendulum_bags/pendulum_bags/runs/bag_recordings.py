@@ -30,7 +30,11 @@ def read_bag_recording(path: str | Path, *, effort: str = "applied", namespace: 
     """
     if effort not in {"applied", "measured"}:
         raise DataError(f"effort is {effort!r}; expected 'applied' or 'measured'")
-    bag = read_bag(path)
+    with read_bag(path) as bag:
+        return _recording(bag, path, effort, namespace)
+
+
+def _recording(bag: Bag, path: str | Path, effort: str, namespace: str | None) -> Recording:
     states_topic = _find(bag, "joint_states", namespace)
     states = bag.array(states_topic)
     # A plant in lockstep sends a state again when its answer was missed: the same stamp is the same state.
