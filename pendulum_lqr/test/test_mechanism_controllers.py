@@ -20,7 +20,7 @@ from pendulum_lqr.mechanism_controllers import (
     make_mechanism_controller,
     stored_trajectory,
 )
-from pendulum_lqr.mechanism_ilqr import IlqrProblem, IlqrWeights
+from pendulum_lqr.mechanism_ilqr import IlqrPlan, IlqrProblem, IlqrWeights
 from pendulum_lqr.mechanism_model import linearise_mechanism, mechanism_lqr
 from pendulum_lqr.mechanism_mpc import MechanismMpc
 from pendulum_lqr.mechanism_planned import PlannedSwingUp
@@ -341,6 +341,58 @@ def test_a_wild_state_does_not_cost_a_plan_and_from_wild_states_alone_there_is_n
     # What was no plan leaves nothing behind.
     controllers[0].reset()
     assert controllers[1].command(30 * DT, x)[0] == pytest.approx(controllers[0].command(0.0, x)[0], abs=1.0)
+
+
+@pytest.mark.timeout(400)
+def test_mpc_plans_from_the_last_plan_and_searches_where_that_leads_nowhere_or_there_is_none() -> None:
+    plant = load_mechanism("cart_pole")
+    gain = mechanism_lqr(linearise_mechanism(plant), *plant.mechanism.weights)
+    controller = MechanismMpc(plant, DT, MechanismCatch(plant, gain, CaughtRegion(0.1, 0)))
+    search, settings = controller.search, controller.settings
+    nodes = round(settings.plan.step / DT)
+    asked: list[tuple[object, ...]] = []
+    solve = search.solve
+    search.solve = lambda *given: (asked.append(given), solve(*given))[1]  # type: ignore[method-assign]
+    outcomes = [True]
+    search.arrives = lambda _: outcomes[-1]  # type: ignore[method-assign]
+    x: Vector = (0.0,) * 4
+
+    def counted(k: int) -> int:
+        asked.clear()
+        nonlocal x
+        effort = controller.command(k * DT, x)
+        x = step(plant, x, effort)
+        return len(asked)
+
+    assert [counted(k) for k in range(nodes)] == [settings.plan.guesses] + [0] * (nodes - 1)
+    # At each node once, from where the plan would be, by its feedback and a few iterations.
+    plan = controller._plan
+    assert plan is not None
+    assert counted(nodes) == 1
+    _, before, guess, iterations, around = asked[0]
+    assert before == pytest.approx(plan.efforts[0])
+    assert np.array(guess) == pytest.approx(np.vstack([plan.efforts[1:], [[0.0]]]))
+    assert iterations == settings.iterations
+    assert isinstance(around, IlqrPlan)
+    assert around.gains[0] == pytest.approx(plan.gains[1])
+    # Where plans do not arrive, guesses are tried again, once in a while.
+    begin = nodes + 1
+    for outcome, tried in ((True, 1), (False, 1 + settings.retries)):
+        outcomes.append(outcome)
+        planned = [count for count in map(counted, range(begin, begin + settings.patience * nodes)) if count]
+        begin += settings.patience * nodes
+        assert len(planned) == settings.patience
+        assert max(planned) == tried
+    # Thrown off while the LQR holds it, it searches as at the start: its plan of long ago led elsewhere.
+    x = (*plant.coordinates.goal, 0.0, 0.0)
+    assert counted(begin) == 0
+    x = (0.0,) * 4
+    assert counted(begin + 1) == settings.plan.guesses
+    x = (*plant.coordinates.goal, 0.0, 0.0)
+    assert counted(begin + 2) == 0
+    assert controller.catch.active
+    controller.reset()
+    assert not controller.catch.active
 
 
 def test_nothing_is_planned_from_a_state_that_is_no_number() -> None:
