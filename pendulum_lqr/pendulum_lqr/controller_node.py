@@ -133,7 +133,8 @@ class ControllerNode(LifecycleNode, PollingNode):
         if isinstance(self._plant, MechanismParameters):
             takes_time = joint_controller_class(kind, self._plant).DESIGNING
             if takes_time:
-                self.get_logger().info(takes_time)
+                # Nothing interrupts a compiler: who asks once waits for it, and nothing is commanded.
+                self.get_logger().info(f"{takes_time}; Ctrl-C waits for it, a second one does not")
         # A bad value at start ends the node with its reason instead of waiting for a transition to fail.
         self._pending: Controller | JointController | None = self._design(self._settings.values)
         self._simulated_time = bool(self.get_parameter("use_sim_time").value)
