@@ -167,6 +167,8 @@ def test_what_cannot_be_swung_up_so_is_refused_with_what_to_take() -> None:
     stiff = load_mechanism("furuta").with_values({"arm.coulomb_friction": 0.02})
     with pytest.raises(DesignError, match=r"effort_limit is 0\.01 N m; .* the friction that holds arm, 0\.02 N m"):
         make_joint_controller("energy_swing_up", stiff, {"effort_limit": 0.01}, PERIOD)
+    with pytest.raises(DesignError, match=r"effort_limit is 0\.02 N m; expected more"):
+        make_joint_controller("energy_swing_up", stiff, {"effort_limit": 0.02}, PERIOD)
     for changed in ({"gravity": 0.0}, {"pole_centre": 0.0}):
         floating = load_mechanism("cart_pole").with_values(changed)
         with pytest.raises(DesignError, match="pole of plant 'cart_pole' cannot be swung up by cart"):

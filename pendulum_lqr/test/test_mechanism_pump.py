@@ -6,10 +6,10 @@ import math
 from dataclasses import replace
 
 import pytest
-from hypothesis import given
+from hypothesis import example, given
 from hypothesis import strategies as st
 
-from pendulum_lqr.controllers.joint_energy_swing_up import JointEnergySwingUp
+from pendulum_lqr.controllers.joint_energy_swing_up import JointEnergySwingUp, _bounded
 from pendulum_lqr.design import DesignError
 from pendulum_lqr.mechanism_catch import CaughtRegion, MechanismCatch
 from pendulum_lqr.mechanism_model import linearise_mechanism, mechanism_lqr
@@ -31,6 +31,12 @@ angles, speeds = st.floats(-10.0, 10.0), st.floats(-30.0, 30.0)
 
 def _pump(plant: MechanismParameters, limit: float | None = None, **changes: float) -> EnergyPump:
     return EnergyPump(plant, replace(pump_gains(plant), **changes), limit or plant.effort_limits[0])
+
+
+def _controller(plant: MechanismParameters) -> JointEnergySwingUp:
+    """Return a controller whose LQR catches from next to upright: nothing is sampled."""
+    gain = mechanism_lqr(linearise_mechanism(plant), *plant.mechanism.weights)
+    return JointEnergySwingUp(plant, _pump(plant), 0.01, MechanismCatch(plant, gain, CaughtRegion(1e-4, 1)))
 
 
 def _accelerations(plant: MechanismParameters, pump: EnergyPump, position: Vector, velocity: Vector, margin: float):
@@ -61,9 +67,7 @@ def test_no_state_asks_for_more_than_the_limit_whatever_it_is(
 @pytest.mark.parametrize("place", range(4))
 def test_what_is_no_number_is_answered_by_none_so_that_it_is_refused_and_forgotten(name: str, place: int) -> None:
     plant = PLANTS[name]
-    pump = _pump(plant)
-    gain = mechanism_lqr(linearise_mechanism(plant), *plant.mechanism.weights)
-    controller = JointEnergySwingUp(plant, pump, 0.01, MechanismCatch(plant, gain, CaughtRegion(0.1, 1)))
+    controller = _controller(plant)
     state = [0.3, 0.2, 0.1, -0.2]
     before = controller.command(0.0, tuple(state[:2]), tuple(state[2:]))
     broken = [*state]
@@ -201,6 +205,7 @@ def test_a_pendulum_that_hangs_still_is_pushed_and_one_that_swings_or_stands_is_
 
 
 @given(room=st.floats(0.001, 3.0), speed=st.floats(0.0, 5.0), side=st.sampled_from([-1.0, 1.0]))
+@example(room=1.0, speed=3.7, side=1.0)  # more than six tenths of the motor, less than all of it
 def test_it_brakes_where_its_motor_would_else_not_stop_it_in_time(room: float, speed: float, side: float) -> None:
     pump = _pump(FREE["cart_pole"])
     # Six tenths of 10 N on cart and pole: least where the pole is level, 1.1 kg.
@@ -222,8 +227,9 @@ def test_beyond_its_reach_it_brakes_while_it_goes_on_and_comes_back() -> None:
     plant = FREE["cart_pole"]
     pump = _pump(plant)
     for side in (-1.0, 1.0):
-        for speed in (0.0, 0.2):
-            going = _accelerations(plant, pump, (side * (pump.reach + 0.1), math.pi / 2.0), (side * speed, 0.0), 0.0)[0]
+        for speed, beyond in ((0.0, 0.1), (0.2, 0.1), (0.2, 0.0)):
+            position = (side * (pump.reach + beyond), math.pi / 2.0)
+            going = _accelerations(plant, pump, position, (side * speed, 0.0), 0.0)[0]
             assert going * side < 0.0
             if speed:
                 assert going * side == pytest.approx(-0.6 * 10.0 / 1.1, rel=1e-6)
@@ -282,3 +288,27 @@ def test_a_pump_is_refused_where_no_law_is_known(name: str) -> None:
         DesignError, match=rf"plant '{name}' is a double_pendulum with motors at .*; expected cart_pole"
     ):
         EnergyPump(plant, PumpGains(1.0, 0.3, 0.5), 1.0)
+
+
+def test_it_learns_from_passes_hands_over_upright_and_forgets_both_when_it_begins_anew() -> None:
+    controller = _controller(PLANTS["cart_pole"])
+    controller.command(0.0, (0.0, math.pi - 0.1), (0.0, 8.0))
+    pumped = controller.command(0.01, (0.0, math.pi + 0.1), (0.0, 8.0))
+    assert controller.margin.value == pytest.approx(0.005)
+    assert not controller.catch.active
+    assert pumped == (controller.pump.effort((0.0, math.pi + 0.1), (0.0, 8.0), 0.005),)
+    held = controller.command(0.02, (1e-4, math.pi), (0.0, 0.0))
+    assert controller.catch.active
+    assert held == pytest.approx((-1e-4 * controller.catch.gain.K[0, 0],))
+    controller.reset()
+    assert controller.margin.value == 0.01
+    assert not controller.catch.active
+
+
+def test_the_lqr_is_tried_between_the_nearer_of_reach_and_stop_on_either_side() -> None:
+    plant = PLANTS["cart_pole"].with_values({"cart.lower_stop": -1.0, "cart.upper_stop": 2.0})
+    assert _bounded(plant, 1.5).stops[0] == (-1.0, 1.5)
+    assert _bounded(plant, 0.5).stops[0] == (-0.5, 0.5)
+    assert _bounded(plant, math.inf) is plant
+    shoulder = _bounded(PLANTS["pendubot_frictionless"], 1.2).stops[0]
+    assert shoulder == pytest.approx((math.pi - 1.2, math.pi + 1.2))
