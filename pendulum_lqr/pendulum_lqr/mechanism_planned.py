@@ -9,7 +9,7 @@ import numpy as np
 from pendulum_lqr.mechanism_catch import MechanismCatch, deviation_of
 from pendulum_lqr.mechanism_ilqr import IlqrPlan, IlqrWeights
 from pendulum_lqr.mechanism_search import PlanSearch, PlanSettings
-from pendulum_lqr.mechanism_trajectory import MechanismTrajectory
+from pendulum_lqr.mechanism_trajectory import trajectory_of
 from pendulum_lqr.mechanism_tvlqr import MechanismTvlqr, whole_turns
 from pendulum_msgs_py.joints import Vector
 from pendulum_msgs_py.plants.mechanism_parameters import MechanismParameters
@@ -85,13 +85,6 @@ class PlannedSwingUp:
         return not self.search.arrives(plan), plan.cost
 
     def _follow(self, plan: IlqrPlan) -> MechanismTvlqr:
-        names = self.plant.coordinates.names
-        trajectory = MechanismTrajectory(
-            self.plant.name,
-            names,
-            np.arange(len(plan.states)) * self.search.settings.step,
-            plan.states[:, : 2 * len(names)],
-            plan.states[:, 2 * len(names) :],
-        )
+        trajectory = trajectory_of(self.plant, plan, self.search.settings.step)
         q, r = self.plant.mechanism.weights
         return MechanismTvlqr(self.plant, self.period, trajectory, self.catch, q=q, r=r, tube=_TUBE)

@@ -149,11 +149,10 @@ class EnergyPump:
         self._gain = gains.gain * frequency * self._ratio / abs(coupling)
         self._stiffness = (gains.servo * frequency) ** 2
         self._damping = 2.0 * gains.damping * gains.servo * frequency
-        friction = [joint.breakaway for joint in plant.joints]
         self._lost = plant.joints[self._p].damping, plant.joints[self._p].coulomb_friction
         self._least_coupling = _LEAST_COUPLING * abs(coupling)
         self._coulomb = plant.joints[self._a].coulomb_friction
-        self._push = _PUSH * frequency**2 * self._ratio + 2.0 * friction[self._p] / abs(coupling)
+        self._push = _PUSH * frequency**2 * self._ratio + 2.0 * stuck / abs(coupling)
         self._rest = 0.01 * frequency
         self._slow = 0.05 * frequency
         self._brakes = _BRAKES * limit * self._least_answer()

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from pendulum_lqr.design import DesignError
 from pendulum_lqr.mechanism_catch import MechanismCatch, deviation_of
-from pendulum_lqr.mechanism_ilqr import IlqrProblem, IlqrWeights
+from pendulum_lqr.mechanism_ilqr import IlqrPlan, IlqrProblem, IlqrWeights
 from pendulum_msgs_py.dynamics.runge_kutta import along_functions, rk4_joints
 from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.joints import Vector
@@ -29,6 +29,7 @@ __all__ = [
     "cheapest_swing_up",
     "load_trajectory",
     "search_swing_up",
+    "trajectory_of",
     "write_trajectory",
 ]
 
@@ -136,18 +137,21 @@ def search_swing_up(
     lowest, highest = np.array(plant.stops).T
     if np.any((plan.states[:, :n] <= lowest) | (plan.states[:, :n] >= highest)):
         raise DesignError(f"guess {seed} of {plant.name!r} runs into an end stop")
-    return MechanismTrajectory(
-        plant.name,
-        plant.coordinates.names,
-        np.arange(len(plan.states)) * search.step,
-        plan.states[:, : 2 * n].copy(),
-        plan.states[:, 2 * n :].copy(),
-        {
-            "seed": seed,
-            "cost": plan.cost,
-            "search": {**asdict(search), "weights": list(search.weights), "find": list(search.find)},
-        },
-    )
+    how = {
+        "seed": seed,
+        "cost": plan.cost,
+        "search": {**asdict(search), "weights": list(search.weights), "find": list(search.find)},
+    }
+    return trajectory_of(plant, plan, search.step, how)
+
+
+def trajectory_of(
+    plant: MechanismParameters, plan: IlqrPlan, step: float, how: dict[str, Any] | None = None
+) -> MechanismTrajectory:
+    """Return a plan whose nodes lie a step apart [s] as a trajectory, with what made it."""
+    names = plant.coordinates.names
+    q_v, u = np.hsplit(plan.states, [2 * len(names)])
+    return MechanismTrajectory(plant.name, names, np.arange(len(plan.states)) * step, q_v.copy(), u.copy(), how or {})
 
 
 def cheapest_swing_up(

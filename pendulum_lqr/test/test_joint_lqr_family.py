@@ -16,25 +16,12 @@ from pendulum_lqr.joint_controller import joint_parameters, make_joint_controlle
 from pendulum_lqr.mechanism_model import linearise_mechanism
 from pendulum_lqr.sampled_design import discretise
 from pendulum_msgs_py.errors import ParameterError
-from pendulum_msgs_py.joints import Vector
 from pendulum_msgs_py.plants.mechanism_parameters import MechanismParameters, load_mechanism
 from pendulum_sim.mechanism_plant import MechanismPlant
+from tests.joint_plants import delayed_plant, near_upright
 
 PLANTS = ("acrobot_frictionless", "pendubot_frictionless", "double_pendulum", "cart_pole", "furuta")
 PERIOD = 0.01
-
-
-def _delayed(name: str, delay: float) -> MechanismParameters:
-    plant = load_mechanism(name)
-    joints = tuple(
-        joint if joint.actuator is None else replace(joint, actuator=replace(joint.actuator, transport_delay=delay))
-        for joint in plant.joints
-    )
-    return replace(plant, joints=joints)
-
-
-def _upright(plant: MechanismParameters, *off: float) -> Vector:
-    return tuple(goal + d for goal, d in zip(plant.coordinates.goal, off, strict=True))
 
 
 class _Run:
@@ -52,7 +39,7 @@ class _Run:
         n = len(plant.joints)
         rng = np.random.default_rng(4)
         simulated = MechanismPlant(plant, dt=period)
-        state = simulated.reset(_upright(plant, *(0.02,) * n))
+        state = simulated.reset(near_upright(plant, *(0.02,) * n))
         pushes = tuple(push if joint == plant.coordinates.driven[0] else 0.0 for joint in range(n))
         deviations, efforts = [], []
         for k in range(round(10.0 / period)):
@@ -65,7 +52,7 @@ class _Run:
 
 
 def test_the_discrete_lqr_holds_a_delayed_plant_that_the_sampled_one_cannot() -> None:
-    plant = _delayed("furuta", 0.012)
+    plant = delayed_plant("furuta", 0.012)
     with pytest.raises(ParameterError, match=r"lqr asked every 0\.01 s does not settle on plant 'furuta'"):
         make_joint_controller("lqr", plant, {}, PERIOD)
     controller = make_joint_controller("discrete_lqr", plant, {}, PERIOD)
@@ -76,7 +63,7 @@ def test_the_discrete_lqr_holds_a_delayed_plant_that_the_sampled_one_cannot() ->
     assert (_Run(plant, controller).efforts == first.efforts).all()
     # Who takes over knows what is on its way; who begins does not.
     successor, stranger = (make_joint_controller("discrete_lqr", plant, {}, PERIOD) for _ in range(2))
-    asked = (_upright(plant, 0.1, 0.1), (0.0, 0.0))
+    asked = (near_upright(plant, 0.1, 0.1), (0.0, 0.0))
     controller.command(0.0, *asked)
     successor.carry_over(controller)
     expected = controller.command(0.01, *asked)
@@ -97,15 +84,15 @@ def test_integrals_leave_no_offset_of_the_driven_joints_under_a_constant_effort(
     assert np.abs(_Run(plant, controller, push=push).deviations[-1][driven]).max() < 0.002
     # Beyond the limit nothing is wound up.
     controller.reset()
-    fresh = controller.command(0.0, _upright(plant, 0.0, 0.0), (0.0, 0.0))
+    fresh = controller.command(0.0, near_upright(plant, 0.0, 0.0), (0.0, 0.0))
     for k in range(200):
-        far = controller.command(k * PERIOD, _upright(plant, 0.0, 1.0), (0.0, 0.0))
+        far = controller.command(k * PERIOD, near_upright(plant, 0.0, 1.0), (0.0, 0.0))
     assert max(map(abs, far)) == max(plant.effort_limits)
-    assert controller.command(2.0, _upright(plant, 0.0, 0.0), (0.0, 0.0)) == fresh
+    assert controller.command(2.0, near_upright(plant, 0.0, 0.0), (0.0, 0.0)) == fresh
     # Another weight does not let go of what the integrals hold; who begins anew does.
     _Run(plant, controller, push=push)
     controller.reset()
-    assert controller.command(0.0, _upright(plant, 0.0, 0.0), (0.0, 0.0)) == fresh
+    assert controller.command(0.0, near_upright(plant, 0.0, 0.0), (0.0, 0.0)) == fresh
     _Run(plant, controller, push=push)
     other = make_joint_controller("lqi", plant, {"q_integral": 30.0}, PERIOD)
     other.carry_over(controller)
@@ -119,7 +106,7 @@ def test_integrals_leave_no_offset_of_the_driven_joints_under_a_constant_effort(
         make_joint_controller("lqi", plant, {}, 1.0)
     # Designed before anybody knows the period, it is judged when that turns out to be the assumed one.
     with pytest.raises(ParameterError, match=r"lqi asked every 0\.01 s does not settle on plant 'furuta'"):
-        make_joint_controller("lqi", _delayed("furuta", 0.012), {}).check(PERIOD)
+        make_joint_controller("lqi", delayed_plant("furuta", 0.012), {}).check(PERIOD)
 
 
 @pytest.mark.parametrize("name", ["lqi", "lqg", "discrete_lqr"])
@@ -127,16 +114,16 @@ def test_the_limit_that_is_given_holds(name: str) -> None:
     plant = load_mechanism("cart_pole")
     controller = make_joint_controller(name, plant, {"effort_limit": 2.0}, PERIOD)
     for side in (1.0, -1.0):
-        (effort,) = controller.command(0.0, _upright(plant, 0.0, side), (0.0, 0.0))
+        (effort,) = controller.command(0.0, near_upright(plant, 0.0, side), (0.0, 0.0))
         assert abs(effort) == 2.0
 
 
 @pytest.mark.parametrize("delay", [0.0, 0.004, 0.013])
 def test_what_the_filter_predicts_comes(delay: float) -> None:
-    plant = _delayed("cart_pole", delay)
+    plant = delayed_plant("cart_pole", delay)
     controller = make_joint_controller("lqg", plant, {}, PERIOD)
     simulated = MechanismPlant(plant, dt=PERIOD)
-    state = simulated.reset(_upright(plant, 0.0, 0.002))
+    state = simulated.reset(near_upright(plant, 0.0, 0.002))
     surprises, states = [], []
     for k in range(100):
         states.append(np.array([*plant.coordinates.deviation(state.position), *state.velocity]))
@@ -163,7 +150,7 @@ def test_the_gain_with_integrals_is_that_of_python_control(name: str) -> None:
 @pytest.mark.parametrize("name", PLANTS)
 @pytest.mark.parametrize("delay", [0.0, 0.013])
 def test_the_filter_asks_for_a_fraction_of_the_effort_where_velocities_are_noise(name: str, delay: float) -> None:
-    plant = _delayed(name, delay)
+    plant = delayed_plant(name, delay)
     noise = (2e-4, 0.05)
     plain = _Run(plant, make_joint_controller("discrete_lqr", plant, {}, PERIOD), noise=noise)
     filtered = _Run(plant, make_joint_controller("lqg", plant, {}, PERIOD), noise=noise)
@@ -192,13 +179,13 @@ def test_the_filter_is_that_of_python_control_and_uses_velocities_where_their_no
 
 
 def test_the_filter_follows_its_model_through_delay_and_whole_turns_and_forgets_what_is_beyond_all_bounds() -> None:
-    plant = _delayed("pendubot_frictionless", 0.013)
+    plant = delayed_plant("pendubot_frictionless", 0.013)
     controller = make_joint_controller("lqg", plant, {}, PERIOD)
     run = _Run(plant, controller)
     assert np.abs(run.deviations[-1]).max() < 1e-4
     # A turn of the elbow is no surprise: its deviation jumps from one end of the circle to the other.
     controller.reset()
-    near, beyond = (_upright(plant, 0.0, side * (math.pi - 1e-3)) for side in (1.0, -1.0))
+    near, beyond = (near_upright(plant, 0.0, side * (math.pi - 1e-3)) for side in (1.0, -1.0))
     controller.command(0.0, near, (0.0, 0.2))
     estimate = controller._state(beyond, (0.0, 0.2))
     assert abs(estimate[1]) == pytest.approx(math.pi, abs=0.1)
@@ -211,10 +198,10 @@ def test_the_filter_follows_its_model_through_delay_and_whole_turns_and_forgets_
     assert controller._state(plant.coordinates.goal, (0.1, 0.2)) == pytest.approx([0.0, 0.0, 0.1, 0.2])
     # Who takes over goes on with the estimate.
     controller.reset()
-    controller.command(0.0, _upright(plant, 0.01, 0.0), (0.5, 0.0))
+    controller.command(0.0, near_upright(plant, 0.01, 0.0), (0.5, 0.0))
     successor = make_joint_controller("lqg", plant, {}, PERIOD)
     successor.carry_over(controller)
-    here = (_upright(plant, 0.015, 0.0), (0.0, 0.0))
+    here = (near_upright(plant, 0.015, 0.0), (0.0, 0.0))
     assert successor.command(0.01, *here) == controller.command(0.01, *here)
 
 

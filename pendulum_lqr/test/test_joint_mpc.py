@@ -19,24 +19,12 @@ from pendulum_lqr.mechanism_model import linearise_mechanism
 from pendulum_lqr.sampled_design import discrete_lqr, discretise, sampled_cost
 from pendulum_msgs_py.contract.values import JointSample
 from pendulum_msgs_py.errors import ParameterError
-from pendulum_msgs_py.plants.mechanism_parameters import MechanismParameters, load_mechanism
+from pendulum_msgs_py.plants.mechanism_parameters import load_mechanism
 from pendulum_sim.mechanism_plant import MechanismPlant
+from tests.joint_plants import delayed_plant, near_upright
 
 PLANTS = ("acrobot_frictionless", "pendubot_frictionless", "double_pendulum", "cart_pole", "furuta")
 PERIOD = 0.01
-
-
-def _upright(plant: MechanismParameters, *off: float) -> tuple[float, ...]:
-    return tuple(goal + d for goal, d in zip(plant.coordinates.goal, off, strict=True))
-
-
-def _delayed(name: str, delay: float) -> MechanismParameters:
-    plant = load_mechanism(name)
-    joints = tuple(
-        joint if joint.actuator is None else replace(joint, actuator=replace(joint.actuator, transport_delay=delay))
-        for joint in plant.joints
-    )
-    return replace(plant, joints=joints)
 
 
 @pytest.mark.parametrize("name", PLANTS)
@@ -48,7 +36,7 @@ def test_without_active_limits_it_is_the_discrete_lqr(name: str, period: float, 
     cost = sampled_cost(model, *plant.mechanism.weights, period)
     K = np.atleast_2d(discrete_lqr(discretise(model, period), *cost).K)
     x = np.array([1e-3, -1e-3, 2e-3, -1e-3])
-    effort = controller.command(0.0, _upright(plant, *x[:2]), tuple(x[2:]))
+    effort = controller.command(0.0, near_upright(plant, *x[:2]), tuple(x[2:]))
     expected = np.array(model.efforts) - K @ x
     assert np.abs(expected).max() < min(plant.effort_limits)
     assert effort == pytest.approx(expected, rel=1e-3, abs=1e-4 * max(plant.effort_limits))
@@ -127,7 +115,7 @@ def test_two_inputs_with_limits_of_their_own_and_two_positions_are_planned_as_by
     assert isinstance(controller, JointMpc)
     state = sign * np.array(x)
     dear = 10.0 * max(plant.mechanism.weights[0])
-    answer = controller.command(0.0, _upright(plant, *state[:2]), tuple(state[2:]))
+    answer = controller.command(0.0, near_upright(plant, *state[:2]), tuple(state[2:]))
     assert answer == pytest.approx(_planned(controller, state, widths, dear), abs=5e-3)
 
 
@@ -184,14 +172,14 @@ def test_a_pole_that_may_not_lean_far_leans_less_far() -> None:
 
 
 def test_an_effort_that_holds_upright_is_within_the_limits_and_not_on_its_way(monkeypatch: pytest.MonkeyPatch) -> None:
-    plant = _delayed("acrobot_frictionless", PERIOD)
+    plant = delayed_plant("acrobot_frictionless", PERIOD)
     weighted = replace(linearise_mechanism(plant), efforts=(2.0,))
     monkeypatch.setattr("pendulum_lqr.controllers.joint_discrete_lqr.linearise_mechanism", lambda _: weighted)
     controller = make_joint_controller("mpc", plant, {}, PERIOD)
     for _ in range(3):
         assert controller.command(0.0, plant.coordinates.goal, (0.0, 0.0)) == pytest.approx((2.0,), abs=1e-4)
     limit = plant.effort_limits[0]
-    far = [controller.command(0.0, _upright(plant, sign * 0.5, 0.0), (0.0, 0.0))[0] for sign in (-1.0, 1.0)]
+    far = [controller.command(0.0, near_upright(plant, sign * 0.5, 0.0), (0.0, 0.0))[0] for sign in (-1.0, 1.0)]
     assert sorted(map(abs, far)) == pytest.approx([limit, limit], abs=1e-3)
     assert far[0] * far[1] < 0.0
 
@@ -220,14 +208,14 @@ def test_it_asks_for_no_more_than_each_limit_and_plans_with_it() -> None:
 
 
 def test_what_is_on_its_way_counts() -> None:
-    plant = _delayed("acrobot_frictionless", 0.015)
+    plant = delayed_plant("acrobot_frictionless", 0.015)
     controller = make_joint_controller("mpc", plant, {}, PERIOD)
     model = linearise_mechanism(plant)
     gain = discrete_lqr(discretise(model, PERIOD), *sampled_cost(model, *plant.mechanism.weights, PERIOD))
     x = np.array([1e-3, 0.0, 0.0, 0.0])
     sent = [0.0, 0.0]
     for _ in range(4):
-        effort = controller.command(0.0, _upright(plant, *x[:2]), tuple(x[2:]))[0]
+        effort = controller.command(0.0, near_upright(plant, *x[:2]), tuple(x[2:]))[0]
         assert effort == pytest.approx(-float(gain.K @ [*x, *sent]), rel=1e-3, abs=1e-4)
         sent = [sent[1], effort]
     # Designed anew at the same period, it knows what the one before has sent; begun anew, nothing is on its way.
@@ -241,17 +229,17 @@ def test_what_is_on_its_way_counts() -> None:
     slower.carry_over(controller)
     assert set(slower._on_their_way) == {(0.0,)}
     controller.reset()
-    assert controller.command(0.0, _upright(plant, *x[:2]), tuple(x[2:]))[0] == pytest.approx(
+    assert controller.command(0.0, near_upright(plant, *x[:2]), tuple(x[2:]))[0] == pytest.approx(
         -float(gain.K @ [*x, 0.0, 0.0]), rel=1e-3, abs=1e-4
     )
 
 
 @pytest.mark.parametrize("name", ["acrobot_frictionless", "furuta"])
 def test_it_settles_a_plant_with_delay(name: str) -> None:
-    plant = _delayed(name, 0.012)
+    plant = delayed_plant(name, 0.012)
     controller = make_joint_controller("mpc", plant, {}, PERIOD)
     simulated = MechanismPlant(plant, PERIOD)
-    state = simulated.reset(_upright(plant, 0.01, -0.01))
+    state = simulated.reset(near_upright(plant, 0.01, -0.01))
     for _ in range(600):
         state = simulated.step(controller.command(state.time, state.position, state.velocity))
     assert np.abs(plant.coordinates.deviation(state.position)).max() < 2e-3
@@ -265,8 +253,8 @@ def test_where_the_solver_finds_no_plan_the_limited_lqr_answers_and_says_so(monk
     monkeypatch.setattr(controller._program, "first", lambda *_: None)
     x = np.array([0.01, 0.02, 0.0, 0.0])
     expected = -float(np.atleast_2d(controller.gain.K)[0] @ x)
-    assert controller.command(0.0, _upright(plant, *x[:2]), (0.0, 0.0)) == pytest.approx((expected,))
-    assert controller.command(0.0, _upright(plant, 0.0, 1.0), (0.0, 0.0)) == (-plant.effort_limits[0],)
+    assert controller.command(0.0, near_upright(plant, *x[:2]), (0.0, 0.0)) == pytest.approx((expected,))
+    assert controller.command(0.0, near_upright(plant, 0.0, 1.0), (0.0, 0.0)) == (-plant.effort_limits[0],)
     assert controller.notice == "no plan for 2 states: the LQR answered"
 
 
@@ -274,10 +262,10 @@ def test_where_the_solver_finds_no_plan_the_limited_lqr_answers_and_says_so(monk
 def test_a_wild_state_leaves_nothing_behind(wild: float) -> None:
     plant = load_mechanism("cart_pole")
     controller, fresh = (make_joint_controller("mpc", plant, {}, PERIOD) for _ in range(2))
-    assert controller.command(0.0, _upright(plant, 0.1, 0.1), (wild, -wild)) == (plant.effort_limits[0],)
+    assert controller.command(0.0, near_upright(plant, 0.1, 0.1), (wild, -wild)) == (plant.effort_limits[0],)
     assert controller.notice == "no plan for 1 states: the LQR answered"
     for k in range(5):
-        state = _upright(plant, 0.1 * k, 0.1 - 0.02 * k), (0.3, 0.5 - 0.1 * k)
+        state = near_upright(plant, 0.1 * k, 0.1 - 0.02 * k), (0.3, 0.5 - 0.1 * k)
         assert controller.command(0.0, *state) == fresh.command(0.0, *state)
     assert controller.notice == "no plan for 1 states: the LQR answered"
     assert fresh.notice == ""

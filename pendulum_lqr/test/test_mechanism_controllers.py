@@ -39,6 +39,7 @@ from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.joints import Vector
 from pendulum_msgs_py.plants.mechanism_parameters import MechanismParameters, load_mechanism
 from pendulum_sim.mechanism_plant import MechanismPlant
+from tests.joint_plants import delayed_plant
 
 DT = 0.002
 Q, R = (10.0, 10.0, 1.0, 1.0), 1.0
@@ -289,13 +290,8 @@ def test_tvlqr_follows_the_file_of_a_search_and_refuses_that_of_another_mechanis
 
 
 def test_a_swing_up_whose_lqr_would_not_hold_what_comes_up_is_refused() -> None:
-    plant = load_mechanism("acrobot_frictionless")
-    joints = tuple(
-        joint if joint.actuator is None else replace(joint, actuator=replace(joint.actuator, transport_delay=0.03))
-        for joint in plant.joints
-    )
     with pytest.raises(ParameterError, match=r"tvlqr asked every 0\.002 s does not settle on plant 'acrobot_friction"):
-        make_joint_controller("tvlqr", replace(plant, joints=joints), {}, DT)
+        make_joint_controller("tvlqr", delayed_plant("acrobot_frictionless", 0.03), {}, DT)
 
 
 @pytest.mark.parametrize("name", ["nmpc", "ilqr"])
@@ -309,10 +305,7 @@ def test_plans_without_dry_friction_are_not_for_a_passive_joint_that_has_some(na
 @pytest.mark.timeout(400)
 def test_a_swing_up_that_its_lqr_would_not_hold_at_this_period_is_refused() -> None:
     # Up there it would go from limit to limit for good: plans wait for nothing, their LQR for the delay and the period.
-    plant = load_mechanism("cart_pole")
-    cart, pole = plant.joints
-    assert cart.actuator is not None
-    late = replace(plant, joints=(replace(cart, actuator=replace(cart.actuator, transport_delay=0.3)), pole))
+    late = delayed_plant("cart_pole", 0.3)
     refusal = r"nmpc asked every 0\.01 s does not settle on plant 'cart_pole': .*; expected a faster plant$"
     with pytest.raises(ParameterError, match=refusal):
         make_joint_controller("nmpc", late, {}, 0.01)

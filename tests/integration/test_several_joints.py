@@ -76,6 +76,12 @@ def _start(processes, package: str, program: str, *parameters: str):
     return processes.start(package, program, "--ros-args", "-r", "__ns:=/sim", *arguments)
 
 
+def _start_lockstep(processes, plant: str, duration: float, *parameters: str):
+    """Start a simulator whose states the controller answers and this test hears, for so long in its own time [s]."""
+    lockstep = ("clock:=lockstep", f"lockstep_duration:={duration}", "lockstep_subscribers:=2")
+    return _start(processes, "pendulum_sim", "simulator", f"plant:={plant}", *lockstep, *parameters)
+
+
 def test_an_acrobot_is_held_upright_under_noise_in_lockstep_and_its_bag_is_read_back(
     peer: Peer, processes, tmp_path: Path
 ) -> None:
@@ -147,16 +153,7 @@ def test_an_acrobot_swings_up_in_lockstep_and_stays(peer: Peer, processes, name:
         "use_sim_time:=true",
     )
     controller.wait_for_output(rf"{name} for plant acrobot_frictionless: swing-up of .*sampled from", 240)
-    _start(
-        processes,
-        "pendulum_sim",
-        "simulator",
-        "plant:=acrobot_frictionless",
-        "clock:=lockstep",
-        "rate_hz:=250.0",
-        "lockstep_duration:=8.0",
-        "lockstep_subscribers:=2",
-    )
+    _start_lockstep(processes, "acrobot_frictionless", 8.0, "rate_hz:=250.0")
     # The event may come before the states that wait here.
     peer.until(lambda: peer.states and peer.states[-1].header.stamp.sec == 9, "the last state, after 8 s", 90.0)
     # A plant knows of a listener before the listener knows of the plant, so the first states may be missed here.
@@ -173,16 +170,7 @@ def test_a_cart_swings_its_pole_up_by_energy_in_lockstep_within_its_track_and_it
         processes, "pendulum_lqr", "controller", "plant:=cart_pole", "controller:=energy_swing_up", "use_sim_time:=true"
     )
     controller.wait_for_output(r"energy_swing_up for plant cart_pole: pumps by cart within 1\.62 m", 60)
-    _start(
-        processes,
-        "pendulum_sim",
-        "simulator",
-        "plant:=cart_pole",
-        "clock:=lockstep",
-        "rate_hz:=100.0",
-        "lockstep_duration:=9.0",
-        "lockstep_subscribers:=2",
-    )
+    _start_lockstep(processes, "cart_pole", 9.0, "rate_hz:=100.0")
     peer.until(lambda: peer.states and peer.states[-1].header.stamp.sec == 10, "the last state, after 9 s", 90.0)
     # The first states may be missed here.
     assert np.abs(peer.states[0].position).max() < 0.3
@@ -199,15 +187,11 @@ def test_mpc_takes_the_period_of_the_states_and_stops_a_cart_before_the_end_of_i
         processes, "pendulum_lqr", "controller", "plant:=cart_pole", "controller:=mpc", "use_sim_time:=true"
     )
     controller.wait_for_output(r"mpc for plant cart_pole: horizon 50, positions within \[1\.71, none\]", 30)
-    _start(
+    _start_lockstep(
         processes,
-        "pendulum_sim",
-        "simulator",
-        "plant:=cart_pole",
-        "clock:=lockstep",
+        "cart_pole",
+        4.0,
         "rate_hz:=50.0",
-        "lockstep_duration:=4.0",
-        "lockstep_subscribers:=2",
         "initial_position:=[1.5, 3.1415927]",
         "initial_velocity:=[0.5, 0.0]",
     )
@@ -238,16 +222,7 @@ def test_a_policy_holds_a_cart_pole_in_lockstep_and_gives_up_where_it_was_never_
     )
     # This node could answer too, and counts as one.
     peer.until(lambda: answers.get_publisher_count() == 2, "the controller as publisher")
-    simulator = _start(
-        processes,
-        "pendulum_sim",
-        "simulator",
-        "plant:=cart_pole",
-        "clock:=lockstep",
-        "lockstep_duration:=4.0",
-        "lockstep_subscribers:=2",
-        "initial_position:=[0.05, 3.19]",
-    )
+    simulator = _start_lockstep(processes, "cart_pole", 4.0, "initial_position:=[0.05, 3.19]")
     peer.until(lambda: peer.states and peer.states[-1].header.stamp.sec == 5, "the last state, after 4 s", 90.0)
     assert np.abs(np.array(peer.states[-1].position) - [0.0, math.pi]).max() < 0.02
     peer.until(lambda: len(efforts) > 1000, "the answers")
@@ -260,16 +235,7 @@ def test_a_policy_holds_a_cart_pole_in_lockstep_and_gives_up_where_it_was_never_
     assert [len(grid) == len(dict(grid)) for grid in held].count(True) == 1
     simulator.send_signal(signal.SIGINT)
     assert simulator.wait(20.0) == 0
-    _start(
-        processes,
-        "pendulum_sim",
-        "simulator",
-        "plant:=cart_pole",
-        "clock:=lockstep",
-        "lockstep_duration:=1.0",
-        "lockstep_subscribers:=2",
-        "initial_position:=[0.55, 3.19]",
-    )
+    _start_lockstep(processes, "cart_pole", 1.0, "initial_position:=[0.55, 3.19]")
     controller.wait_for_output(r"gave up after 0\.000 s: position of cart 0\.55 m", 60)
 
 

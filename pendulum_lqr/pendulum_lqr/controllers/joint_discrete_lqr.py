@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pendulum_lqr.controllers.joint_lqr import JOINT_LIMIT, joint_limits, joint_weights
+from pendulum_lqr.controllers.joint_lqr import JOINT_LIMIT, gain_text, joint_limits, joint_weights
 from pendulum_lqr.interface import Controller, JointController
 from pendulum_lqr.mechanism_controller import within_limits
 from pendulum_lqr.mechanism_model import linearise_mechanism
@@ -47,6 +47,7 @@ class JointDiscreteLqr(JointController):
         self._K = np.atleast_2d(self.gain.K)
         self._hold = np.array(model.efforts)
         self._deviation = plant.coordinates.deviation
+        self._linear = model
         self._none = (0.0,) * len(self._hold)
         self._on_their_way: deque[Vector] = deque([self._none] * self.model.pending, self.model.pending)
 
@@ -94,10 +95,7 @@ class JointDiscreteLqr(JointController):
 
     def describe(self) -> str:
         """Return gain and efforts on their way."""
-        return f"K = [{self._gain_text()}], {len(self._on_their_way)} efforts on their way"
-
-    def _gain_text(self) -> str:
-        return "; ".join(", ".join(f"{value:.6g}" for value in row) for row in self._K)
+        return f"K = [{gain_text(self._K)}], {len(self._on_their_way)} efforts on their way"
 
     def carry_over(self, previous: Controller | JointController) -> None:
         """Take over what is on its way."""

@@ -8,12 +8,11 @@ from dataclasses import replace
 from typing import Any
 
 from pendulum_lqr.controllers.energy_swing_up import CATCH_SHARE
-from pendulum_lqr.controllers.joint_lqr import JOINT_LIMIT, joint_limits, require_settling
+from pendulum_lqr.controllers.joint_lqr import JOINT_LIMIT, joint_limits, require_catching
 from pendulum_lqr.design import DesignError
 from pendulum_lqr.energy_margin import EnergyMargin
 from pendulum_lqr.interface import Controller, JointController
 from pendulum_lqr.mechanism_catch import MechanismCatch, deviation_of, make_mechanism_catch
-from pendulum_lqr.mechanism_model import linearise_mechanism
 from pendulum_lqr.mechanism_pump import EnergyPump, pump_gains
 from pendulum_msgs_py.joints import Vector
 from pendulum_msgs_py.parameters import ParameterSpec
@@ -46,7 +45,6 @@ class JointEnergySwingUp(JointController):
         super().__init__((pump.limit,))
         self.pump, self.catch = pump, catch
         self.margin = EnergyMargin(margin, _REST)
-        self._plant = plant
         self._coordinates = plant.coordinates
 
     @classmethod
@@ -104,7 +102,7 @@ class JointEnergySwingUp(JointController):
         Raises:
             ParameterError: as said.
         """
-        require_settling("energy_swing_up", self._plant.name, linearise_mechanism(self._plant), self.catch.gain, period)
+        require_catching("energy_swing_up", self.catch, period)
 
     def reset(self) -> None:
         """Start in the swing-up phase."""

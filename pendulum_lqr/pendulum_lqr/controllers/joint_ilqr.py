@@ -7,7 +7,8 @@ from typing import Any
 
 from pendulum_lqr.controllers.joint_lqr import JOINT_LIMIT, joint_limits
 from pendulum_lqr.controllers.joint_swing_up import JointSwingUp
-from pendulum_lqr.mechanism_controllers import default_catch, refuse_passive_friction
+from pendulum_lqr.mechanism_catch import make_mechanism_catch
+from pendulum_lqr.mechanism_controllers import refuse_passive_friction
 from pendulum_lqr.mechanism_ilqr import IlqrWeights
 from pendulum_lqr.mechanism_trajectory import SwingUpSearch, cheapest_swing_up
 from pendulum_lqr.sampling import ASSUMED_PERIOD
@@ -49,8 +50,7 @@ class JointIlqr(JointSwingUp):
             ParameterError: One has, or no guess ends upright under the limits and between the end stops.
         """
         refuse_passive_friction("ilqr", plant)
-        limits = zip(plant.coordinates.driven_names, joint_limits(plant, p["effort_limit"]), strict=True)
-        limited = plant.with_values({f"{joint}.effort_limit": limit for joint, limit in limits})
+        catch = make_mechanism_catch(plant, *plant.mechanism.weights, joint_limits(plant, p["effort_limit"]))
         search = SwingUpSearch(_WEIGHTS, duration=p["duration"])
-        trajectory, _ = cheapest_swing_up(limited, default_catch(limited), search, range(p["guesses"]))
-        return cls(limited, ASSUMED_PERIOD if period is None else period, trajectory)
+        trajectory, _ = cheapest_swing_up(catch.plant, catch, search, range(p["guesses"]))
+        return cls(catch, ASSUMED_PERIOD if period is None else period, trajectory)

@@ -10,12 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pendulum_lqr.controllers.joint_discrete_lqr import JointDiscreteLqr
-from pendulum_lqr.controllers.joint_lqr import JOINT_LIMIT, joint_weights
+from pendulum_lqr.controllers.joint_lqr import JOINT_LIMIT, gain_text, joint_weights
 from pendulum_lqr.design import kalman_gain
 from pendulum_lqr.interface import Controller, JointController
-from pendulum_lqr.mechanism_model import linearise_mechanism
 from pendulum_lqr.sampled_design import discretise
-from pendulum_msgs_py.contract.angles import wrap
 from pendulum_msgs_py.joints import Vector
 from pendulum_msgs_py.parameters import ParameterSpec
 from pendulum_msgs_py.plants.mechanism_parameters import MechanismParameters
@@ -37,10 +35,8 @@ class JointLqg(JointDiscreteLqr):
 
     def __init__(self, plant: MechanismParameters, p: Mapping[str, Any], period: float) -> None:
         super().__init__(plant, p, period)
-        linear = linearise_mechanism(plant)
         n = len(plant.joints)
-        self._size = 2 * n
-        disturbed = discretise(replace(linear, B=linear.E, delay=0.0), period).B
+        disturbed = discretise(replace(self._linear, B=self._linear.E, delay=0.0), period).B
         rows = 2 * n if p["velocity_noise"] > 0.0 else n
         self._A, self._late = self.model.A[: 2 * n, : 2 * n], self.model.A[: 2 * n, 2 * n :]
         self._B = self.model.B[: 2 * n]
@@ -48,7 +44,6 @@ class JointLqg(JointDiscreteLqr):
         process = p["effort_noise"] ** 2 * (disturbed @ disturbed.T)
         self.filter = kalman_gain(self._A, np.eye(rows, 2 * n), process, np.diag(variances))
         self._rows = rows
-        self._turning = np.array([joint.turns for joint in plant.mechanism.joints] + [False] * n)
         self._predicted: Array | None = None
 
     @classmethod
@@ -76,7 +71,8 @@ class JointLqg(JointDiscreteLqr):
         if self._predicted is None:
             return measured
         surprise = measured - self._predicted
-        surprise[self._turning] = wrap(surprise[self._turning])
+        n = len(position)
+        surprise[:n] = self._deviation(measured[:n].tolist(), self._predicted[:n].tolist())
         return np.asarray(self._predicted + self.filter.L @ surprise[: self._rows])
 
     def _move_on(self, x: Array, moving: Array, sent: Array) -> None:
@@ -87,8 +83,7 @@ class JointLqg(JointDiscreteLqr):
 
     def describe(self) -> str:
         """Return both gains."""
-        rows = "; ".join(", ".join(f"{value:.6g}" for value in row) for row in self.filter.L.T)
-        return f"K = [{self._gain_text()}], L = [{rows}]"
+        return f"K = [{gain_text(self._K)}], L = [{gain_text(self.filter.L.T)}]"
 
     def carry_over(self, previous: Controller | JointController) -> None:
         """Take over the estimate and what is on its way."""

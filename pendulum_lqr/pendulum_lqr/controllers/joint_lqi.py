@@ -8,7 +8,14 @@ from typing import Any
 
 import numpy as np
 
-from pendulum_lqr.controllers.joint_lqr import JOINT_LIMIT, SMALLER_Q, joint_limits, joint_weights, require_settling
+from pendulum_lqr.controllers.joint_lqr import (
+    JOINT_LIMIT,
+    SMALLER_Q,
+    gain_text,
+    joint_limits,
+    joint_weights,
+    require_settling,
+)
 from pendulum_lqr.design import Gain
 from pendulum_lqr.interface import Controller, JointController
 from pendulum_lqr.mechanism_controller import within_limits
@@ -94,8 +101,7 @@ class JointLqi(JointController):
 
     def describe(self) -> str:
         """Return the gain."""
-        rows = "; ".join(", ".join(f"{value:.6g}" for value in row) for row in self.gain.K)
-        return f"K = [{rows}]"
+        return f"K = [{gain_text(self.gain.K)}]"
 
     def carry_over(self, previous: Controller | JointController) -> None:
         """Keep the efforts that the integrals stand for, though the gain on them has changed."""

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from typing import Any
 
 from pendulum_lqr.analysis import delayed_spectral_radius
 from pendulum_lqr.design import Gain
 from pendulum_lqr.interface import JointController
+from pendulum_lqr.mechanism_catch import MechanismCatch
 from pendulum_lqr.mechanism_controller import within_limits
 from pendulum_lqr.mechanism_model import linearise_mechanism, mechanism_lqr
 from pendulum_lqr.model import LinearModel
@@ -17,7 +18,16 @@ from pendulum_msgs_py.joints import Vector
 from pendulum_msgs_py.parameters import ParameterSpec
 from pendulum_msgs_py.plants.mechanism_parameters import MechanismParameters
 
-__all__ = ["JOINT_LIMIT", "SMALLER_Q", "JointLqr", "joint_limits", "joint_weights", "require_settling"]
+__all__ = [
+    "JOINT_LIMIT",
+    "SMALLER_Q",
+    "JointLqr",
+    "gain_text",
+    "joint_limits",
+    "joint_weights",
+    "require_catching",
+    "require_settling",
+]
 
 JOINT_LIMIT = ParameterSpec(
     "effort_limit", 0.0, "N m", "Largest effort of each driven joint; 0 for the plant's own.", minimum=0.0
@@ -56,6 +66,20 @@ def require_settling(
             f"{controller} asked every {period:g} s does not settle on plant {plant!r}: deviations grow by "
             f"{growth:.3g} a period; expected {remedy}"
         )
+
+
+def require_catching(controller: str, catch: MechanismCatch, period: float) -> None:
+    """Refuse an LQR that would not hold what comes up, asked at a period [s], delay included.
+
+    Raises:
+        ParameterError: It does not settle.
+    """
+    require_settling(controller, catch.plant.name, linearise_mechanism(catch.plant), catch.gain, period)
+
+
+def gain_text(rows: Iterable[Iterable[float]]) -> str:
+    """Return the rows of a gain for a line of text."""
+    return "; ".join(", ".join(f"{value:.6g}" for value in row) for row in rows)
 
 
 class JointLqr(JointController):
@@ -115,6 +139,5 @@ class JointLqr(JointController):
 
     def describe(self) -> str:
         """Return gain and poles."""
-        rows = "; ".join(", ".join(f"{value:.6g}" for value in row) for row in self._rows)
         poles = ", ".join(f"{pole:.4g}" for pole in self.gain.poles)
-        return f"K = [{rows}], poles {poles} 1/s"
+        return f"K = [{gain_text(self._rows)}], poles {poles} 1/s"

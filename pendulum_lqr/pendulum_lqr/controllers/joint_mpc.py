@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from pendulum_lqr.condensed_mpc import CondensedMpc
 from pendulum_lqr.controllers.joint_discrete_lqr import JointDiscreteLqr
-from pendulum_lqr.controllers.joint_lqr import JOINT_LIMIT, joint_weights
+from pendulum_lqr.controllers.joint_lqr import JOINT_LIMIT, gain_text, joint_weights
 from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.parameters import ParameterSpec
 from pendulum_msgs_py.plants.mechanism_parameters import MechanismParameters
@@ -84,7 +84,7 @@ class JointMpc(JointDiscreteLqr):
     def describe(self) -> str:
         """Return horizon, limits and unlimited gain."""
         within = ", ".join(f"{width:g}" if width else "none" for width in self._position_limits)
-        return f"horizon {self._program.horizon}, positions within [{within}], K without limits [{self._gain_text()}]"
+        return f"horizon {self._program.horizon}, positions within [{within}], K without limits [{gain_text(self._K)}]"
 
 
 def _enough_samples(A: Array) -> int:

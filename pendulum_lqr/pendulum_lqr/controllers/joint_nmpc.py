@@ -5,10 +5,9 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from pendulum_lqr.controllers.joint_lqr import require_settling
+from pendulum_lqr.controllers.joint_lqr import require_catching
 from pendulum_lqr.interface import JointController
 from pendulum_lqr.mechanism_controllers import default_catch, refuse_passive_friction
-from pendulum_lqr.mechanism_model import linearise_mechanism
 from pendulum_lqr.mechanism_mpc import MechanismMpc
 from pendulum_lqr.sampling import ASSUMED_PERIOD, require_period
 from pendulum_msgs_py.joints import Vector
@@ -55,8 +54,7 @@ class JointNmpc(JointController):
             ParameterError: as said.
         """
         require_period("nmpc plans for answers", self.period, period)
-        catch = self._inner.catch
-        require_settling("nmpc", catch.plant.name, linearise_mechanism(catch.plant), catch.gain, self.period)
+        require_catching("nmpc", self._inner.catch, self.period)
 
     def reset(self) -> None:
         """Forget the plan."""

@@ -6,10 +6,10 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, ClassVar
 
-from pendulum_lqr.controllers.joint_lqr import require_settling
+from pendulum_lqr.controllers.joint_lqr import require_catching
 from pendulum_lqr.interface import JointController
+from pendulum_lqr.mechanism_catch import MechanismCatch
 from pendulum_lqr.mechanism_controllers import default_catch, stored_trajectory
-from pendulum_lqr.mechanism_model import linearise_mechanism
 from pendulum_lqr.mechanism_trajectory import MechanismTrajectory, load_trajectory
 from pendulum_lqr.mechanism_tvlqr import MechanismTvlqr
 from pendulum_lqr.sampling import ASSUMED_PERIOD, require_period
@@ -31,7 +31,7 @@ class JointSwingUp(JointController):
     """From hanging along a swing-up; where it is lost, no effort at all.
 
     Args:
-        plant: The plant.
+        catch: LQR with its region; the plant is its own.
         period: Period at which states come [s].
         trajectory: The swing-up.
 
@@ -45,12 +45,13 @@ class JointSwingUp(JointController):
     """What it is called in refusals."""
     DESIGNING = "tries out from where the LQR catches, which takes some seconds"
 
-    def __init__(self, plant: MechanismParameters, period: float, trajectory: MechanismTrajectory) -> None:
+    def __init__(self, catch: MechanismCatch, period: float, trajectory: MechanismTrajectory) -> None:
+        plant = catch.plant
         super().__init__(plant.effort_limits)
         self._period = period
         self._duration = trajectory.duration
         q, r = plant.mechanism.weights
-        self._inner = MechanismTvlqr(plant, period, trajectory, default_catch(plant), q=q, r=r)
+        self._inner = MechanismTvlqr(plant, period, trajectory, catch, q=q, r=r)
 
     @classmethod
     def parameters(cls, plant: MechanismParameters) -> tuple[ParameterSpec, ...]:
@@ -66,7 +67,7 @@ class JointSwingUp(JointController):
         """
         given = p["trajectory"]
         trajectory = load_trajectory(Path(given).expanduser()) if given else stored_trajectory(plant)
-        return cls(plant, ASSUMED_PERIOD if period is None else period, trajectory)
+        return cls(default_catch(plant), ASSUMED_PERIOD if period is None else period, trajectory)
 
     def check(self, period: float) -> None:
         """Refuse another period than that of the design [s], and one at which its LQR does not settle.
@@ -75,8 +76,7 @@ class JointSwingUp(JointController):
             ParameterError: as said.
         """
         require_period("the trajectory is followed", self._period, period)
-        catch = self._inner.catch
-        require_settling(self.NAME, catch.plant.name, linearise_mechanism(catch.plant), catch.gain, period)
+        require_catching(self.NAME, self._inner.catch, period)
 
     def reset(self) -> None:
         """Begin anew, at hanging."""

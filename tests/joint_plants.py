@@ -1,0 +1,19 @@
+"""Plants of several joints as tests want them: with a delay, and beside upright."""
+
+from __future__ import annotations
+
+from pendulum_msgs_py.joints import Vector
+from pendulum_msgs_py.plants.mechanism_parameters import MechanismParameters, load_mechanism
+
+__all__ = ["delayed_plant", "near_upright"]
+
+
+def delayed_plant(name: str, delay: float) -> MechanismParameters:
+    """Return a preset whose motors act a time after they are told [s]."""
+    plant = load_mechanism(name)
+    return plant.with_values({f"{joint}.transport_delay": delay for joint in plant.coordinates.driven_names})
+
+
+def near_upright(plant: MechanismParameters, *off: float) -> Vector:
+    """Return positions that are off upright by so much [rad or m]."""
+    return tuple(goal + each for goal, each in zip(plant.coordinates.goal, off, strict=True))
