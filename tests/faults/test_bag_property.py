@@ -93,14 +93,15 @@ def _judge(
     counts: Mapping[str, int] | None = None,
     witnessed: Iterable[float] = (),
     marked: Mapping[str, Any] | None = None,
+    duration: int = 3,
 ) -> TorqueRecord:
-    """Judge three seconds of a plant at 100 Hz that tells its mode by events and by diagnostics."""
+    """Judge some seconds of a plant at 100 Hz that tells its mode by events and by diagnostics."""
 
     def instant(seconds: float) -> int:
         return _BEGIN + round(seconds * _SECOND)
 
     rows: list[tuple[int, str, str, bytes]] = []
-    for number in range(300):
+    for number in range(100 * duration):
         now, seconds = _BEGIN + number * _PERIOD, number / 100
         applied = encode_joint_state(now, effort=torque(seconds))
         rows.append((now, f"/hw/{names.APPLIED_EFFORT}", JOINT_STATE, applied))
@@ -198,13 +199,13 @@ def test_commands_heard_of_too_late_explain_as_many_lives_and_only_shortly_befor
         ("too few", 0.4, 4, True),
         ("none", 0.4, 0, True),
         ("half a second, however few", 0.5, 20, False),
-        ("as many periods", 0.8, 80, False),
-        ("more periods", 0.8, 60, True),
-        ("too long", 1.2, 1000, True),
+        ("lives of all", 0.8, 14, False),
+        ("longer than their lives", 0.8, 11, True),
+        ("three seconds, however many", 3.2, 1000, True),
         ("no command follows", 9.0, 1000, True),
     ):
         for kind in ("early", "before"):
-            record = _judge(tmp_path / name / kind, _steady, partial(le, first), counts={kind: early})
+            record = _judge(tmp_path / name / kind, _steady, partial(le, first), counts={kind: early}, duration=4)
             assert _late(record) is late, (name, kind)
 
 
@@ -226,13 +227,18 @@ def _pulse(since: float, until: float, seconds: float) -> float:
 
 def test_early_commands_explain_no_more_than_their_time_however_many_gaps_there_are(tmp_path: Path) -> None:
     record = _judge(
-        tmp_path, _steady, lambda seconds: round(100 * seconds) % 40 == 0 or seconds > 2.7, counts={"early": 1000}
+        tmp_path,
+        _steady,
+        lambda seconds: round(100 * seconds) % 40 == 0 or seconds > 5.7,
+        counts={"early": 1000},
+        duration=6,
     )
     assert _late(record)
 
 
 def test_an_early_command_long_before_a_recorded_one_explains_nothing(tmp_path: Path) -> None:
-    record = _judge(tmp_path, lambda seconds: 3.0 * (0.3 < seconds < 0.4), partial(le, 1.5), counts={"early": 1000})
+    torque = partial(_pulse, 0.3, 0.4)
+    record = _judge(tmp_path, torque, partial(le, 3.5), counts={"early": 1000}, duration=4)
     assert _late(record)
 
 

@@ -102,7 +102,7 @@ class LiveSystem:
         self.applied: list[Applied] = []
         self.heard = dict.fromkeys(_RIGHTFUL, 0)
         self.witnessed: list[int] = []
-        self.asked = {topic: Witness(EFFORT_LIMIT, plant.period) for topic in _RIGHTFUL}
+        self.asked = {topic: Witness(EFFORT_LIMIT) for topic in _RIGHTFUL}
         self.diagnostics: dict[str, dict[str, str]] = {}
         self.diagnosed: dict[str, float] = {}
         self._order = plant.nodes if order is None else order

@@ -30,11 +30,6 @@ _LIFE_NS = 50_000_000
 """Time that a command counts [ns]."""
 _GONE_NS = 500_000_000
 """Silence after which somebody has ended [ns]."""
-_SLOW = 1.25
-"""Longest mean period of the states of a busy machine, in its own [-]."""
-_LATEST = 3.0
-"""Longest time by which a witness meets a node after the plant did [s]: of five that start at once beside three busy
-loops the last was met after 2.1 s."""
 _AHEAD_NS = 2_000_000
 """A simulator's torque acts from its state's stamp on, before the command that answers this state is there [ns]."""
 
@@ -58,20 +53,18 @@ class Witness:
 
     A plant may meet a new node before a witness does, where many start at once by two seconds. What was said meanwhile
     is counted: a publisher numbers its messages from 1 on. Each may have asked for anything, at any time in as many
-    lives of a command, and each answered a state.
+    lives of a command.
 
     Args:
         limit: Largest torque that a plant lets through [N m].
-        period: Time between two states of the plant [s].
 
     Attributes:
         asked: What was asked for; what was not heard as both of the largest torques.
     """
 
-    def __init__(self, limit: float, period: float) -> None:
+    def __init__(self, limit: float) -> None:
         self.asked: list[Asked] = []
         self._limit = limit
-        self._period = period
         self._last: dict[int, int] = {}
 
     def hear(self, asked: Asked, sequence: int) -> None:
@@ -80,8 +73,7 @@ class Witness:
         self._last = {last: when for last, when in self._last.items() if asked.stamp_ns - when < _GONE_NS}
         before = max((last for last in self._last if last < sequence), default=0)
         unheard = sequence - before - 1
-        answered = max(early_time(unheard, self._period), min(_SLOW * unheard * self._period, _LATEST))
-        unheard_ns = min(unheard * _LIFE_NS, round(answered * NANOSECONDS))
+        unheard_ns = min(unheard * _LIFE_NS, round(early_time(unheard) * NANOSECONDS))
         begin_ns = max(asked.stamp_ns - unheard_ns, self._last.pop(before, 0))
         self._last[sequence] = asked.stamp_ns
         for stamp_ns in range(begin_ns, asked.stamp_ns, _LIFE_NS) if unheard_ns else ():
