@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import signal
 import sys
 from pathlib import Path
 
@@ -13,6 +14,7 @@ from pendulum_msgs_py.errors import FaultError
 from tests.fixtures import wait_for
 
 _LOGS_AND_ENDS = """
+import signal
 import sys
 print("[ERROR] [1795326665.885562565] [hw.bridge]: actuator thread did not answer within 30 s")
 print("error: actuator thread did not answer within 30 s")
@@ -65,3 +67,13 @@ def test_a_program_that_does_not_end_in_time_is_named_with_its_output_and_progre
             processes.wait(child, 0.3, on_wait=lambda: refreshed.append(True))
     assert str(caught.value) == "repeat_1 still runs after 0.3 s; its last output: simulating"
     assert refreshed
+
+
+def test_a_program_that_stands_still_is_let_go_on_to_end_by_itself(tmp_path: Path) -> None:
+    program = "import signal, sys; print('up', flush=True); signal.sigwait([signal.SIGINT]); sys.exit(3)"
+    guarded = f"import signal; signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGINT]); {program}"
+    with ProcessSet(tmp_path, {}) as processes:
+        child = processes.start("frozen", [sys.executable, "-c", guarded])
+        wait_for(lambda: child.log.read_text() != "", 20.0, "the program to print")
+        child.process.send_signal(signal.SIGSTOP)
+        assert processes.finish(child, 20.0) == 3

@@ -144,9 +144,6 @@ class LiveSystem:
 
     def __exit__(self, *_: object) -> None:
         """End everything."""
-        for child in self.children.values():
-            # A stopped process does not hear a polite signal.
-            child.process.send_signal(signal.SIGCONT)
         self.processes.stop()
         self._witness.destroy_node()
         self.conductor.__exit__(None, None, None)

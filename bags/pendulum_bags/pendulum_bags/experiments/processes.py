@@ -178,7 +178,7 @@ class ProcessSet:
 
     def finish(self, child: Child, patience: float = _PATIENCE) -> int:
         """End one program by SIGINT, then by SIGKILL; return its exit code."""
-        self._signal(child, signal.SIGINT)
+        self._interrupt(child)
         code = self._wait(child, patience)
         if child in self.children:
             self.children.remove(child)
@@ -210,16 +210,18 @@ class ProcessSet:
         for wave in (False, True):
             children = [child for child in self.children if child.ends_last is wave]
             for child in children:
-                self._signal(child, signal.SIGINT)
+                self._interrupt(child)
             for child in children:
                 self._wait(child, _PATIENCE)
         self.children.clear()
 
     @staticmethod
-    def _signal(child: Child, number: int) -> None:
+    def _interrupt(child: Child) -> None:
         with contextlib.suppress(ProcessLookupError):
             if child.process.poll() is None:
-                child.process.send_signal(number)
+                child.process.send_signal(signal.SIGINT)
+                # One that stands still would hear it only when somebody lets it go on.
+                child.process.send_signal(signal.SIGCONT)
 
     @staticmethod
     def _wait(child: Child, patience: float) -> int:
