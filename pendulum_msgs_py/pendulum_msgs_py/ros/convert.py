@@ -52,30 +52,31 @@ def stamp_from_message(stamp: Time) -> int:
     return int(stamp.sec) * NANOSECONDS + int(stamp.nanosec)
 
 
-def command_from_bytes(data: bytes) -> JointCommand | None:
-    """Return the command that a serialised JointState carries, or None where it has not one effort for each name."""
+def fields_from_bytes(data: bytes) -> JointStateFields | None:
+    """Return what a serialised JointState holds, whatever its joints; None where it is none."""
     fields = decode_joint_state(data)
     if fields is not None:
-        if not fields.effort:
-            return None
-        return JointCommand(fields.stamp_ns, fields.effort, fields.frame_id, fields.joints)
-    message = _deserialise(data)
-    if message is None or _problem_of_efforts(message):
+        return fields
+    try:
+        message = deserialize_message(data, JointState)
+    except Exception:  # noqa: BLE001  # rclpy raises its C library's error types, which have no common base
         return None
-    return JointCommand(
-        stamp_from_message(message.header.stamp), tuple(message.effort), message.header.frame_id, tuple(message.name)
-    )
+    return _fields_from_message(message)
 
 
-def fields_from_bytes(data: bytes) -> JointStateFields | None:
-    """Return what a serialised JointState holds, whatever its joints, to show it; None where it is none."""
-    fields = decode_joint_state(data)
-    if fields is None and (message := _deserialise(data)) is not None:
-        fields = JointStateFields(
-            stamp_from_message(message.header.stamp), message.header.frame_id, tuple(message.name),
-            tuple(message.position), tuple(message.velocity), tuple(message.effort),
-        )  # fmt: skip
-    return fields
+def _fields_from_message(message: JointState) -> JointStateFields:
+    return JointStateFields(
+        stamp_from_message(message.header.stamp), message.header.frame_id, tuple(message.name),
+        tuple(message.position), tuple(message.velocity), tuple(message.effort),
+    )  # fmt: skip
+
+
+def command_from_bytes(data: bytes) -> JointCommand | None:
+    """Return the command that a serialised JointState carries, or None where it has not one effort for each name."""
+    fields = fields_from_bytes(data)
+    if fields is None or _problem_of_efforts(fields):
+        return None
+    return JointCommand(fields.stamp_ns, fields.effort, fields.frame_id, fields.joints)
 
 
 def sample_from_bytes(data: bytes, joints: tuple[str, ...] = ONE_JOINT.names) -> JointSample | None:
@@ -86,26 +87,24 @@ def sample_from_bytes(data: bytes, joints: tuple[str, ...] = ONE_JOINT.names) ->
         joints: All joints of the plant. The one joint of a plant is found among others; several are expected alone and
             in their order, so that nobody ever takes one for another.
     """
-    fields = decode_joint_state(data)
-    if fields is not None and fields.joints == joints and fields.position and fields.velocity:
-        return JointSample(
-            fields.stamp_ns, fields.position, fields.velocity, fields.effort or (0.0,) * len(fields.position)
-        )
-    message = _deserialise(data)
-    return None if message is None else sample_from_message(message, joints)
+    fields = fields_from_bytes(data)
+    return None if fields is None else _sample_from_fields(fields, joints)
 
 
 def sample_from_message(message: JointState, joints: tuple[str, ...] = ONE_JOINT.names) -> JointSample | None:
     """Return the state of a plant's joints that a message carries, as :func:`sample_from_bytes` does."""
-    if _problem_of_positions(message, joints):
+    return _sample_from_fields(_fields_from_message(message), joints)
+
+
+def _sample_from_fields(fields: JointStateFields, joints: tuple[str, ...]) -> JointSample | None:
+    stamp_ns, _, found, position, velocity, effort = fields
+    count = len(joints)
+    if found == joints and len(position) == len(velocity) == count and len(effort) in {0, count}:
+        return JointSample(stamp_ns, position, velocity, effort or (0.0,) * count)
+    if _problem_of_positions(fields, joints):
         return None
-    stamp_ns = stamp_from_message(message.header.stamp)
-    if len(joints) > 1:
-        efforts = tuple(message.effort) or (0.0,) * len(joints)
-        return JointSample(stamp_ns, tuple(message.position), tuple(message.velocity), efforts)
-    index = list(message.name).index(joints[0])
-    effort = message.effort[index] if len(message.effort) > index else 0.0
-    return JointSample.of_one(stamp_ns, message.position[index], message.velocity[index], effort)
+    index = found.index(joints[0])
+    return JointSample.of_one(stamp_ns, position[index], velocity[index], effort[index] if len(effort) > index else 0.0)
 
 
 def stamp_of_state(data: bytes, joints: tuple[str, ...]) -> tuple[int | None, tuple[str, ...]]:
@@ -115,18 +114,12 @@ def stamp_of_state(data: bytes, joints: tuple[str, ...]) -> tuple[int | None, tu
         data: The message.
         joints: Joints that must be among its own, each with position and velocity, in this order.
     """
-    fields = decode_joint_state(data)
-    if fields is not None:
-        stamp_ns, found = fields.stamp_ns, fields.joints
-        counts = len(fields.position), len(fields.velocity)
-    else:
-        message = _deserialise(data)
-        if message is None:
-            return None, ()
-        stamp_ns, found = stamp_from_message(message.header.stamp), tuple(message.name)
-        counts = len(message.position), len(message.velocity)
-    full = min(counts) >= len(found)
-    return (stamp_ns if full and joints == tuple(name for name in found if name in joints) else None), found
+    fields = fields_from_bytes(data)
+    if fields is None:
+        return None, ()
+    found = fields.joints
+    full = min(len(fields.position), len(fields.velocity)) >= len(found)
+    return (fields.stamp_ns if full and joints == tuple(name for name in found if name in joints) else None), found
 
 
 def problem_of_state(data: bytes, joints: tuple[str, ...] = ONE_JOINT.names) -> str:
@@ -136,38 +129,39 @@ def problem_of_state(data: bytes, joints: tuple[str, ...] = ONE_JOINT.names) -> 
         data: The message.
         joints: All joints of the plant.
     """
-    message = _deserialise(data)
-    return _NO_JOINT_STATE if message is None else _problem_of_positions(message, joints)
+    fields = fields_from_bytes(data)
+    return _NO_JOINT_STATE if fields is None else _problem_of_positions(fields, joints)
 
 
-def _problem_of_positions(message: JointState, joints: tuple[str, ...]) -> str:
-    names = list(message.name)
+def _problem_of_positions(fields: JointStateFields, joints: tuple[str, ...]) -> str:
+    found = list(fields.joints)
+    quantities = {"position": fields.position, "velocity": fields.velocity, "effort": fields.effort}
     if len(joints) > 1:
-        if tuple(names) != joints:
-            return f"name is {names}; expected {list(joints)}"
-        for field in ("position", "velocity", "effort"):
-            count = len(getattr(message, field))
-            if count != len(names) and (count or field != "effort"):
-                return f"{field} has {count} values; expected {len(names)}"
+        if fields.joints != joints:
+            return f"name is {found}; expected {list(joints)}"
+        for field, values in quantities.items():
+            count = len(values)
+            if count != len(found) and (count or field != "effort"):
+                return f"{field} has {count} values; expected {len(found)}"
         return ""
     (joint,) = joints
-    if joint not in names:
-        return f"name is {names}; expected {joint!r} among them"
+    if joint not in found:
+        return f"name is {found}; expected {joint!r} among them"
     for field in ("position", "velocity"):
-        count = len(getattr(message, field))
-        if count <= names.index(joint):
-            return f"{field} has {count} values for {len(names)} names; expected one for {joint!r}"
+        count = len(quantities[field])
+        if count <= found.index(joint):
+            return f"{field} has {count} values for {len(found)} names; expected one for {joint!r}"
     return ""
 
 
 def problem_of_command(data: bytes) -> str:
     """Return which field of a serialised JointState keeps it from being a command, empty where none does."""
-    message = _deserialise(data)
-    return _NO_JOINT_STATE if message is None else _problem_of_efforts(message)
+    fields = fields_from_bytes(data)
+    return _NO_JOINT_STATE if fields is None else _problem_of_efforts(fields)
 
 
-def _problem_of_efforts(message: JointState) -> str:
-    count, expected = len(message.effort), len(message.name) or 1
+def _problem_of_efforts(fields: JointStateFields) -> str:
+    count, expected = len(fields.effort), len(fields.joints) or 1
     return "" if count == expected else f"effort has {count} values; expected {expected}"
 
 
@@ -235,10 +229,3 @@ def plant_value(message: DiagnosticArray, namespace: str, key: str) -> str:
 
 def _format(value: object) -> str:
     return f"{value:.6g}" if isinstance(value, float) else str(value)
-
-
-def _deserialise(data: bytes) -> JointState | None:
-    try:
-        return deserialize_message(data, JointState)
-    except Exception:  # noqa: BLE001  # rclpy raises its C library's error types, which have no common base
-        return None
